@@ -1,0 +1,108 @@
+//! The board of a process: its latest progress and health, newest wins, readable by everybody at any time.
+
+use iceoryx2::prelude::ZeroCopySend;
+
+/// Where a process stands in the data it consumes and commits.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
+#[type_name("caraware::Progress")]
+pub struct Progress {
+    /// Number of ticks consumed: all ticks below this one may be overwritten.
+    pub consumed_ticks: u64,
+    /// Number of ticks contained in the last checkpoint that was renamed into place.
+    pub committed_ticks: u64,
+    /// Counts the replacements of the process.
+    pub incarnation: u32,
+    /// 1 once the process has opened its ports and will miss nothing, else 0.
+    pub attached: u32,
+}
+
+/// State of a process, [`Health::state`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum State {
+    /// Not there yet.
+    Starting = 0,
+    /// Ports open, waiting for data.
+    Ready = 1,
+    /// At work.
+    Running = 2,
+    /// All work done.
+    Done = 3,
+}
+
+impl State {
+    /// State from its number; unknown numbers are [`State::Starting`].
+    #[must_use]
+    pub fn from_u32(value: u32) -> Self {
+        match value {
+            1 => Self::Ready,
+            2 => Self::Running,
+            3 => Self::Done,
+            _ => Self::Starting,
+        }
+    }
+
+    /// For the process table.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Starting => "starting",
+            Self::Ready => "ready",
+            Self::Running => "running",
+            Self::Done => "done",
+        }
+    }
+}
+
+/// How a process fares.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[type_name("caraware::Health")]
+pub struct Health {
+    /// A [`State`].
+    pub state: u32,
+    /// Process id.
+    pub pid: i32,
+    /// Number of ticks produced or consumed.
+    pub ticks: u64,
+    /// Episode at work.
+    pub episode: u64,
+    /// Simulated time of the episode, nanoseconds.
+    pub sim_time_ns: u64,
+    /// Road users in the newest tick.
+    pub road_users: u32,
+    /// Connected vehicles in the newest tick.
+    pub cavs: u32,
+    /// Messages dropped towards consumers that are not required.
+    pub drops: u64,
+    /// Vehicle-steps produced so far (sensor-daemon: observations).
+    pub vehicle_steps: u64,
+    /// Mirrors set onto SUMO because no motion leads there (sim-core).
+    pub resynchronisations: u64,
+    /// Total ticks of the run, 0 if unknown.
+    pub total_ticks: u64,
+}
+
+/// How learning goes.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[type_name("caraware::TrainingStatus")]
+pub struct TrainingStatus {
+    /// Episode of the newest sample.
+    pub episode: u64,
+    /// Samples used for training so far.
+    pub env_steps: u64,
+    /// Updates of the policy so far.
+    pub updates: u64,
+    /// Samples per wall second, lately.
+    pub env_steps_per_s: f64,
+    /// Standard deviation of the policy.
+    pub policy_std: f64,
+    /// Mean reward, lately.
+    pub reward: f64,
+    /// Mean error of the policy, metres: the last evaluation, or of the samples before the first.
+    pub error_m: f64,
+    /// Mean error of the raw GNSS fix on the same samples, metres.
+    pub raw_gnss_error_m: f64,
+}

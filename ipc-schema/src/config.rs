@@ -1,0 +1,280 @@
+//! The validated configuration: what every process may rely on. Keys, units, ranges and defaults are checked by the
+//! `caraware` command before it writes these into the run file; `configs/README.md` lists them all.
+
+use serde::{Deserialize, Serialize};
+
+/// One whole configuration.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Time, seed and flow control.
+    pub run: Run,
+    /// Where traffic comes from.
+    pub traffic: Traffic,
+    /// Geodetic reference of a net that has none.
+    pub map: Map,
+    /// Length of episodes and when to evaluate.
+    pub episode: Episode,
+    /// Limits of the kinematic vehicle model.
+    pub vehicle: Vehicle,
+    /// GNSS receiver.
+    pub gnss: Gnss,
+    /// Inertial measurement unit and compass.
+    pub imu: Imu,
+    /// Wheel speed and steering angle.
+    pub speed_steering: SpeedSteering,
+    /// Fields and normalisation of the observation.
+    pub observation: Observation,
+    /// The learner.
+    pub trainer: Trainer,
+    /// Shared memory → zenoh.
+    pub fanout: Fanout,
+}
+
+/// Time, seed and flow control.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Run {
+    /// Seed of everything random.
+    pub seed: u64,
+    /// Length of a tick (one observation), seconds.
+    pub tick_s: f64,
+    /// Nanoscopic sub-steps in a tick.
+    pub sub_steps: u32,
+    /// Ticks a producer may be ahead of its required consumer.
+    pub window_ticks: u32,
+    /// Simulated seconds per wall second; 0 = as fast as possible.
+    pub real_time_factor: f64,
+}
+
+/// Where traffic comes from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Traffic {
+    /// SUMO step, seconds: an integer multiple of `run.tick_s`.
+    pub step_s: f64,
+    /// Connected vehicles kept alive (population control).
+    pub cavs: u32,
+    /// Vehicles without sensors kept alive (population control).
+    pub others: u32,
+    /// Pedestrians kept alive (population control).
+    pub pedestrians: u32,
+    /// Share of a scenario's own vehicles that carry sensors (`.sumocfg`).
+    pub cav_share: f64,
+    /// Most road users alive at once; shared memory is laid out for them.
+    pub max_road_users: u32,
+}
+
+/// Geodetic reference of a net that has none.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Map {
+    /// Latitude of the net's (0, 0), degrees; only for a net without projection.
+    pub origin_latitude_deg: Option<f64>,
+    /// Longitude of the net's (0, 0), degrees; only for a net without projection.
+    pub origin_longitude_deg: Option<f64>,
+}
+
+/// Length of episodes and when to evaluate.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Episode {
+    /// Ticks in a training episode; its end respawns everybody at random places.
+    pub ticks: u64,
+    /// Training episodes.
+    pub training_episodes: u64,
+    /// Training episodes between two evaluations; 0 = only at the end.
+    pub evaluation_interval: u64,
+    /// Ticks in an evaluation episode.
+    pub evaluation_ticks: u64,
+    /// Evaluation episodes at the end.
+    pub final_evaluations: u64,
+}
+
+/// Limits of the kinematic vehicle model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Vehicle {
+    /// Largest road-wheel angle, radians.
+    pub max_road_wheel_angle_rad: f64,
+    /// Largest rate of the road-wheel angle, rad/s.
+    pub max_road_wheel_rate_radps: f64,
+    /// Largest acceleration of the mirror, m/s².
+    pub max_accel_mps2: f64,
+    /// Largest deceleration of the mirror, m/s².
+    pub max_decel_mps2: f64,
+    /// Steering-wheel angle per road-wheel angle.
+    pub steering_ratio: f64,
+    /// Distance between mirror and SUMO beyond which the mirror is set onto SUMO, metres.
+    pub resynchronise_m: f64,
+}
+
+/// GNSS receiver.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Gnss {
+    /// Time between fixes, seconds.
+    pub period_s: f64,
+    /// Standard deviation of latitude and of longitude, degrees (5e-5 ≙ 5.57 m of latitude).
+    pub noise_std_deg: f64,
+    /// Bias of latitude and of longitude, degrees.
+    pub bias_deg: f64,
+}
+
+/// Inertial measurement unit and compass.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Imu {
+    /// Time between samples, seconds.
+    pub period_s: f64,
+    /// Standard deviation of each accelerometer axis, m/s².
+    pub accel_noise_std_mps2: f64,
+    /// Standard deviation of each gyroscope axis, rad/s.
+    pub gyro_noise_std_radps: f64,
+    /// Bias of each gyroscope axis, rad/s.
+    pub gyro_bias_radps: f64,
+    /// Standard deviation of the compass, radians.
+    pub compass_noise_std_rad: f64,
+    /// Gravity in the accelerometer, m/s²: 9.81 gives specific force, 0 kinematic acceleration.
+    pub gravity_mps2: f64,
+}
+
+/// Wheel speed and steering angle.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SpeedSteering {
+    /// Time between samples, seconds.
+    pub period_s: f64,
+    /// Standard deviation of the speed, m/s.
+    pub speed_noise_std_mps: f64,
+    /// Standard deviation of the steering-wheel angle, radians.
+    pub steering_noise_std_rad: f64,
+}
+
+/// Scale of the normalised observation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Scale {
+    /// The paper's text: 0 … 1.
+    ZeroToOne,
+    /// CarAware's code: −1 … 1.
+    MinusOneToOne,
+}
+
+/// One field of the observation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Field {
+    /// GNSS fix, x in the world frame; range: the map's bounds.
+    GnssX,
+    /// GNSS fix, y in the world frame; range: the map's bounds.
+    GnssY,
+    /// Accelerometer, forward; range ± `accel_range_mps2`.
+    AccelX,
+    /// Accelerometer, left.
+    AccelY,
+    /// Accelerometer, up.
+    AccelZ,
+    /// Gyroscope, roll rate; range ± `gyro_range_radps`.
+    GyroX,
+    /// Gyroscope, pitch rate.
+    GyroY,
+    /// Gyroscope, yaw rate.
+    GyroZ,
+    /// Heading clockwise from north; range 0 … 2π.
+    Compass,
+    /// Wheel speed; range 0 … `speed_range_mps`.
+    Speed,
+    /// Steering-wheel angle; range ± `steering_range_rad`.
+    Steering,
+}
+
+/// Fields and normalisation of the observation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Observation {
+    /// Fields in order.
+    pub fields: Vec<Field>,
+    /// Scale of every field.
+    pub scale: Scale,
+    /// Full scale of the accelerometer, m/s².
+    pub accel_range_mps2: f64,
+    /// Full scale of the gyroscope, rad/s.
+    pub gyro_range_radps: f64,
+    /// Full scale of the speed, m/s.
+    pub speed_range_mps: f64,
+    /// Full scale of the steering-wheel angle, radians.
+    pub steering_range_rad: f64,
+}
+
+/// Reward of a prediction, a function of its Euclidean distance d from the truth.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Reward {
+    /// 1 / d.
+    Inverse,
+    /// 1 / (1 + d / scale).
+    BoundedInverse,
+    /// exp(−d / scale).
+    Exponential,
+}
+
+/// The learner: PPO with the paper's hyper-parameters.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Trainer {
+    /// Python module that is run as the trainer.
+    pub module: String,
+    /// Learning rate of Adam at the start.
+    pub learning_rate: f64,
+    /// Factor on the learning rate after each update.
+    pub learning_rate_decay: f64,
+    /// Discount γ.
+    pub discount: f64,
+    /// GAE λ.
+    pub gae_lambda: f64,
+    /// Clip ε of the probability ratio.
+    pub clip_epsilon: f64,
+    /// Standard deviation of the policy at the start, in the action's −1 … 1.
+    pub initial_std: f64,
+    /// Weight of the entropy bonus.
+    pub entropy_scale: f64,
+    /// Weight of the value loss.
+    pub value_scale: f64,
+    /// Largest norm of the gradient.
+    pub max_grad_norm: f64,
+    /// Samples per update.
+    pub horizon: u64,
+    /// Samples per gradient step.
+    pub batch_size: u64,
+    /// Passes over a horizon.
+    pub epochs: u64,
+    /// Width of the hidden layers of policy and value network.
+    pub hidden: Vec<u64>,
+    /// Reward by name.
+    pub reward: Reward,
+    /// Scale of `bounded_inverse` and `exponential`, metres.
+    pub reward_scale_m: f64,
+    /// Threads of torch; 0 = one for each core.
+    pub threads: u64,
+    /// "cpu" or "auto" (a GPU if there is one).
+    pub device: String,
+    /// Precision of matrix products: "float32", "bfloat16", or "auto" (bfloat16 where the processor has AMX).
+    pub matmul_precision: String,
+    /// Updates between two checkpoints.
+    pub checkpoint_interval: u64,
+    /// Newest checkpoints that are kept.
+    pub checkpoints_kept: u64,
+}
+
+/// Shared memory → zenoh.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Fanout {
+    /// Start the fan-out process.
+    pub enabled: bool,
+    /// zenoh endpoint to listen on.
+    pub listen: String,
+    /// Most frames per wall second and topic.
+    pub rate_hz: f64,
+}

@@ -1,0 +1,52 @@
+//! The header that every message carries.
+
+use bytemuck::{Pod, Zeroable};
+use iceoryx2::prelude::ZeroCopySend;
+
+/// The episode is an evaluation: its seed is never used in training.
+pub const EVALUATION: u32 = 1;
+/// First tick of an episode: all vehicle indices and slots start anew.
+pub const FIRST_OF_EPISODE: u32 = 1 << 1;
+/// Last tick of an episode.
+pub const LAST_OF_EPISODE: u32 = 1 << 2;
+/// Last tick of the run: the producer sends nothing after it.
+pub const LAST_OF_RUN: u32 = 1 << 3;
+
+/// Identity and time of a message. 72 bytes, no implicit padding.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable, ZeroCopySend)]
+#[type_name("caraware::MessageHeader")]
+pub struct MessageHeader {
+    /// [`crate::SCHEMA_VERSION`] of the sender.
+    pub schema_version: u32,
+    /// Index of the environment, 0-based.
+    pub env_index: u32,
+    /// Random identity of the run; a message of another run is refused.
+    pub run_id: u64,
+    /// Counts the replacements of the sending process.
+    pub incarnation: u32,
+    /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`].
+    pub flags: u32,
+    /// Episode number, 0-based over the run.
+    pub episode: u64,
+    /// Seed of the episode: traffic, noise and blackouts draw from it.
+    pub episode_seed: u64,
+    /// Tick number, 0-based over the run, without gaps.
+    pub tick: u64,
+    /// Simulated time since the start of the episode, nanoseconds.
+    pub sim_time_ns: u64,
+    /// Number of rows.
+    pub count: u32,
+    /// Second dimension where a payload has one: sub-steps per vehicle (`world`), fields per row (`observation`, `prediction`).
+    pub columns: u32,
+    /// `traffic`: number of `traffic-meta` messages sent before this one. `prediction`: version of the policy.
+    pub sequence: u64,
+}
+
+impl MessageHeader {
+    /// True if all bits of `flag` are set.
+    #[must_use]
+    pub fn has(&self, flag: u32) -> bool {
+        self.flags & flag == flag
+    }
+}

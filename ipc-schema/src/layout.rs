@@ -1,0 +1,171 @@
+//! The committed layout table: size, alignment and field offsets of everything on the wire.
+
+use std::mem::{align_of, offset_of, size_of};
+
+use serde::Serialize;
+
+use crate::{
+    board::{Health, Progress, TrainingStatus},
+    header::MessageHeader,
+    traffic::{TrafficState, VehicleMeta},
+    world::{SubStep, VehicleState},
+};
+
+/// Layout of one payload type.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct TypeLayout {
+    /// Name of the type.
+    pub name: &'static str,
+    /// Bytes.
+    pub size: usize,
+    /// Bytes.
+    pub alignment: usize,
+    /// Name and offset of each field, in order.
+    pub fields: Vec<(&'static str, usize)>,
+}
+
+macro_rules! layout {
+    ($type:ident { $($field:ident),+ $(,)? }) => {
+        TypeLayout {
+            name: stringify!($type),
+            size: size_of::<$type>(),
+            alignment: align_of::<$type>(),
+            fields: vec![$((stringify!($field), offset_of!($type, $field))),+],
+        }
+    };
+}
+
+/// Layout of every payload type.
+#[must_use]
+pub fn table() -> Vec<TypeLayout> {
+    vec![
+        layout!(MessageHeader {
+            schema_version,
+            env_index,
+            run_id,
+            incarnation,
+            flags,
+            episode,
+            episode_seed,
+            tick,
+            sim_time_ns,
+            count,
+            columns,
+            sequence
+        }),
+        layout!(TrafficState {
+            front_x_m,
+            front_y_m,
+            front_z_m,
+            yaw_rad,
+            pitch_rad,
+            speed_mps,
+            accel_mps2,
+            vehicle,
+            kind,
+            signals,
+            flags
+        }),
+        layout!(VehicleMeta {
+            id_hash,
+            vehicle,
+            event,
+            kind,
+            type_index,
+            length_m,
+            width_m,
+            height_m,
+            id_len,
+            id,
+            vehicle_class
+        }),
+        layout!(VehicleState {
+            x_m,
+            y_m,
+            z_m,
+            yaw_rad,
+            id_hash,
+            roll_rad,
+            pitch_rad,
+            velocity_body_mps,
+            accel_body_mps2,
+            angular_rate_body_radps,
+            road_wheel_angle_rad,
+            tracking_lateral_m,
+            tracking_longitudinal_m,
+            length_m,
+            width_m,
+            height_m,
+            wheelbase_m,
+            rear_overhang_m,
+            vehicle,
+            kind,
+            signals,
+            flags,
+            reserved
+        }),
+        layout!(SubStep {
+            dx_m,
+            dy_m,
+            dyaw_rad,
+            speed_mps,
+            accel_body_mps2,
+            angular_rate_body_radps,
+            road_wheel_angle_rad,
+            reserved
+        }),
+        layout!(Progress {
+            consumed_ticks,
+            committed_ticks,
+            incarnation,
+            attached
+        }),
+        layout!(Health {
+            state,
+            pid,
+            ticks,
+            episode,
+            sim_time_ns,
+            road_users,
+            cavs,
+            drops,
+            vehicle_steps,
+            resynchronisations,
+            total_ticks
+        }),
+        layout!(TrainingStatus {
+            episode,
+            env_steps,
+            updates,
+            env_steps_per_s,
+            policy_std,
+            reward,
+            error_m,
+            raw_gnss_error_m
+        }),
+    ]
+}
+
+/// The table as committed in `ipc-schema/layout.json`.
+#[must_use]
+pub fn json() -> String {
+    let rows: Vec<String> = table()
+        .iter()
+        .filter_map(|row| serde_json::to_string(row).ok())
+        .collect();
+    format!("[\n  {}\n]\n", rows.join(",\n  "))
+}
+
+#[cfg(test)]
+mod tests {
+    /// `CARAWARE_BLESS=1 cargo test -p ipc-schema layout` rewrites the table after a deliberate change
+    /// (raise `SCHEMA_VERSION` with it).
+    #[test]
+    fn the_committed_layout_table_is_true() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/layout.json");
+        if std::env::var_os("CARAWARE_BLESS").is_some() {
+            std::fs::write(path, super::json()).unwrap();
+        }
+        assert_eq!(std::fs::read_to_string(path).unwrap(), super::json());
+    }
+}

@@ -1,0 +1,34 @@
+//! Everything that crosses a process border, and nothing else: payloads, the service table, flow control, the run file.
+//!
+//! | service       | payload (64-byte aligned bytes, little endian)                    | producer       | required consumer |
+//! |---------------|-------------------------------------------------------------------|----------------|-------------------|
+//! | `traffic`     | `[TrafficState]`                                                  | traffic-bridge | sim-core          |
+//! | `traffic-meta`| `[VehicleMeta]`                                                   | traffic-bridge | sim-core          |
+//! | `world`       | [`world::WorldLayout`]: `[VehicleState]`, `[SubStep]`             | sim-core       | sensor-daemon     |
+//! | `observation` | [`observation::ObservationLayout`]: obs, truth, GNSS, slots       | sensor-daemon  | trainer           |
+//! | `prediction`  | `[[f32; 2]]`, one row for each slot of the observation            | trainer        | none              |
+//! | `board`       | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`] | every process  | none (newest wins)|
+//! | `wake`        | an event without content                                          | every peer     | its process       |
+//!
+//! Every message carries a [`header::MessageHeader`]. Services are created in [`services`] by the supervisor alone;
+//! every other process opens them there. The layouts are written down in `layout.json` and asserted from Rust and Python.
+
+pub mod block;
+pub mod board;
+pub mod config;
+pub mod failure;
+pub mod flow;
+pub mod header;
+pub mod layout;
+pub mod observation;
+pub mod ports;
+pub mod process;
+pub mod run;
+pub mod schedule;
+pub mod services;
+pub mod session;
+pub mod traffic;
+pub mod world;
+
+/// Version of every payload and of the run file; raised when any of them changes.
+pub const SCHEMA_VERSION: u32 = 1;

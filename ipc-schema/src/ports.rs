@@ -1,0 +1,387 @@
+//! Sending and receiving: typed errors, no copies, no back-pressure other than credits.
+
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::Duration,
+};
+
+use iceoryx2::{
+    port::{
+        BackpressureAction, listener::ListenerWaitError, notifier::Notifier, publisher, reader, subscriber, writer,
+    },
+    prelude::{AllocationStrategy, BackpressureStrategy},
+    sample, sample_mut,
+};
+
+use crate::{
+    SCHEMA_VERSION,
+    board::{Health, Progress, TrainingStatus},
+    header::MessageHeader,
+    run::RunFile,
+    services::{
+        BoardService, Channel, DataService, HEALTH_KEY, PROGRESS_KEY, Shm, TRAINING_KEY, WakeListener, WakeService,
+    },
+};
+
+/// A message could not be sent or received.
+#[derive(Debug, thiserror::Error)]
+pub enum PortError {
+    /// iceoryx2 refused.
+    #[error("{channel}: {action} failed: {reason}")]
+    Refused {
+        /// Service.
+        channel: &'static str,
+        /// "sending", "receiving", …
+        action: &'static str,
+        /// iceoryx2's reason.
+        reason: String,
+    },
+    /// The message is longer than the service was laid out for.
+    #[error(
+        "{channel}: a message of {needed} bytes is over the {limit} bytes laid out: raise `traffic.max_road_users` (now {max_road_users})"
+    )]
+    TooLong {
+        /// Service.
+        channel: &'static str,
+        /// Bytes wanted.
+        needed: usize,
+        /// Bytes there.
+        limit: usize,
+        /// The setting to raise.
+        max_road_users: u32,
+    },
+    /// The sender speaks another version of the schema.
+    #[error("{channel}: message of schema version {found}, this program speaks {SCHEMA_VERSION}")]
+    Version {
+        /// Service.
+        channel: &'static str,
+        /// The sender's version.
+        found: u32,
+    },
+    /// A tick is missing, or came twice.
+    #[error("{channel}: expected tick {expected}, received tick {received}")]
+    Gap {
+        /// Service.
+        channel: &'static str,
+        /// The next tick in order.
+        expected: u64,
+        /// What came.
+        received: u64,
+    },
+}
+
+fn refused(channel: &'static str, action: &'static str) -> impl FnOnce(&dyn std::fmt::Debug) -> PortError {
+    move |reason| PortError::Refused {
+        channel,
+        action,
+        reason: format!("{reason:?}"),
+    }
+}
+
+/// The sending end of a data service.
+#[derive(Debug)]
+pub struct Publisher {
+    port: publisher::Publisher<Shm, [u8], MessageHeader>,
+    channel: Channel,
+    limit: usize,
+    max_road_users: u32,
+    drops: Arc<AtomicU64>,
+}
+
+impl Publisher {
+    pub(crate) fn create(service: &DataService, channel: Channel, run: &RunFile) -> Result<Self, PortError> {
+        let drops = Arc::new(AtomicU64::new(0));
+        let counter = Arc::clone(&drops);
+        let limit = channel.max_payload(run);
+        let port = service
+            .publisher_builder()
+            .initial_max_slice_len(limit.max(1))
+            .allocation_strategy(AllocationStrategy::Static)
+            .max_loaned_samples(2)
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .set_backpressure_handler(move |_| {
+                counter.fetch_add(1, Ordering::Relaxed);
+                BackpressureAction::DiscardData
+            })
+            .create()
+            .map_err(|e| refused(channel.name(), "creation of the publisher")(&e))?;
+        Ok(Self {
+            port,
+            channel,
+            limit,
+            max_road_users: run.config.traffic.max_road_users,
+            drops,
+        })
+    }
+
+    /// A zeroed message of `len` payload bytes in shared memory, to be filled and sent.
+    ///
+    /// # Errors
+    /// Longer than laid out, or all messages are in use.
+    pub fn loan(&self, header: MessageHeader, len: usize) -> Result<Draft, PortError> {
+        if len > self.limit {
+            return Err(PortError::TooLong {
+                channel: self.channel.name(),
+                needed: len,
+                limit: self.limit,
+                max_road_users: self.max_road_users,
+            });
+        }
+        let mut sample = self
+            .port
+            .loan_slice(len)
+            .map_err(|e| refused(self.channel.name(), "loan")(&e))?;
+        *sample.user_header_mut() = header;
+        Ok(Draft {
+            sample,
+            channel: self.channel,
+        })
+    }
+
+    /// Messages that a subscriber did not get because its queue was full.
+    #[must_use]
+    pub fn drops(&self) -> u64 {
+        self.drops.load(Ordering::Relaxed)
+    }
+}
+
+/// A message in shared memory that is being written.
+#[derive(Debug)]
+pub struct Draft {
+    sample: sample_mut::SampleMut<Shm, [u8], MessageHeader>,
+    channel: Channel,
+}
+
+impl Draft {
+    /// The payload.
+    pub fn payload_mut(&mut self) -> &mut [u8] {
+        self.sample.payload_mut()
+    }
+
+    /// The payload as written so far.
+    #[must_use]
+    pub fn payload(&self) -> &[u8] {
+        self.sample.payload()
+    }
+
+    /// The header.
+    pub fn header_mut(&mut self) -> &mut MessageHeader {
+        self.sample.user_header_mut()
+    }
+
+    /// Hands the message to all subscribers; never blocks. Returns how many got it.
+    ///
+    /// # Errors
+    /// A connection is broken.
+    pub fn send(self) -> Result<usize, PortError> {
+        self.sample
+            .send()
+            .map_err(|e| refused(self.channel.name(), "sending")(&e))
+    }
+}
+
+/// The receiving end of a data service.
+#[derive(Debug)]
+pub struct Subscriber {
+    port: subscriber::Subscriber<Shm, [u8], MessageHeader>,
+    channel: Channel,
+    run_id: u64,
+    refused: AtomicU64,
+}
+
+impl Subscriber {
+    pub(crate) fn create(service: &DataService, channel: Channel, run: &RunFile) -> Result<Self, PortError> {
+        let port = service
+            .subscriber_builder()
+            .create()
+            .map_err(|e| refused(channel.name(), "creation of the subscriber")(&e))?;
+        Ok(Self {
+            port,
+            channel,
+            run_id: run.run_id,
+            refused: AtomicU64::new(0),
+        })
+    }
+
+    /// The next message, if one is waiting; it stays readable until dropped. Messages of another run are refused and counted.
+    ///
+    /// # Errors
+    /// The connection is broken, or the sender speaks another schema version.
+    pub fn receive(&self) -> Result<Option<Message>, PortError> {
+        loop {
+            let Some(sample) = self
+                .port
+                .receive()
+                .map_err(|e| refused(self.channel.name(), "receiving")(&e))?
+            else {
+                return Ok(None);
+            };
+            let header = *sample.user_header();
+            if header.schema_version != SCHEMA_VERSION {
+                return Err(PortError::Version {
+                    channel: self.channel.name(),
+                    found: header.schema_version,
+                });
+            }
+            if header.run_id == self.run_id {
+                return Ok(Some(Message { header, sample }));
+            }
+            self.refused.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Messages of other runs that were refused.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.refused.load(Ordering::Relaxed)
+    }
+}
+
+/// A received message, read in place in shared memory.
+#[derive(Debug)]
+pub struct Message {
+    header: MessageHeader,
+    sample: sample::Sample<Shm, [u8], MessageHeader>,
+}
+
+impl Message {
+    /// The header, copied out before anything in it is trusted.
+    #[must_use]
+    pub fn header(&self) -> &MessageHeader {
+        &self.header
+    }
+
+    /// The payload in shared memory.
+    #[must_use]
+    pub fn payload(&self) -> &[u8] {
+        self.sample.payload()
+    }
+}
+
+/// The writing end of a process's own board.
+pub struct BoardWriter {
+    progress: writer::EntryHandleMut<Shm, u32, Progress>,
+    health: writer::EntryHandleMut<Shm, u32, Health>,
+    training: writer::EntryHandleMut<Shm, u32, TrainingStatus>,
+}
+
+impl BoardWriter {
+    pub(crate) fn create(service: &BoardService) -> Result<Self, PortError> {
+        let writer = service
+            .writer_builder()
+            .create()
+            .map_err(|e| refused("board", "creation of the writer")(&e))?;
+        Ok(Self {
+            progress: writer
+                .entry(&PROGRESS_KEY)
+                .map_err(|e| refused("board", "opening of progress")(&e))?,
+            health: writer
+                .entry(&HEALTH_KEY)
+                .map_err(|e| refused("board", "opening of health")(&e))?,
+            training: writer
+                .entry(&TRAINING_KEY)
+                .map_err(|e| refused("board", "opening of the training status")(&e))?,
+        })
+    }
+
+    /// Replaces the progress.
+    pub fn set_progress(&self, value: Progress) {
+        self.progress.update_with_copy(value);
+    }
+
+    /// Replaces the health.
+    pub fn set_health(&self, value: Health) {
+        self.health.update_with_copy(value);
+    }
+
+    /// Replaces the training status.
+    pub fn set_training(&self, value: TrainingStatus) {
+        self.training.update_with_copy(value);
+    }
+}
+
+/// The board of another process.
+pub struct BoardReader {
+    progress: reader::EntryHandle<Shm, u32, Progress>,
+    health: reader::EntryHandle<Shm, u32, Health>,
+    training: reader::EntryHandle<Shm, u32, TrainingStatus>,
+}
+
+impl BoardReader {
+    /// Reads `service`, the board of any process.
+    ///
+    /// # Errors
+    /// All readers are taken.
+    pub fn create(service: &BoardService) -> Result<Self, PortError> {
+        let reader = service
+            .reader_builder()
+            .create()
+            .map_err(|e| refused("board", "creation of the reader")(&e))?;
+        Ok(Self {
+            progress: reader
+                .entry(&PROGRESS_KEY)
+                .map_err(|e| refused("board", "opening of progress")(&e))?,
+            health: reader
+                .entry(&HEALTH_KEY)
+                .map_err(|e| refused("board", "opening of health")(&e))?,
+            training: reader
+                .entry(&TRAINING_KEY)
+                .map_err(|e| refused("board", "opening of the training status")(&e))?,
+        })
+    }
+
+    /// Newest progress.
+    #[must_use]
+    pub fn progress(&self) -> Progress {
+        *self.progress.get()
+    }
+
+    /// Newest health.
+    #[must_use]
+    pub fn health(&self) -> Health {
+        *self.health.get()
+    }
+
+    /// Newest training status.
+    #[must_use]
+    pub fn training(&self) -> TrainingStatus {
+        *self.training.get()
+    }
+}
+
+/// Wakes another process.
+#[derive(Debug)]
+pub struct Waker(Notifier<Shm>);
+
+impl Waker {
+    pub(crate) fn create(service: &WakeService) -> Result<Self, PortError> {
+        Ok(Self(
+            service
+                .notifier_builder()
+                .create()
+                .map_err(|e| refused("wake", "creation of the notifier")(&e))?,
+        ))
+    }
+
+    /// Wakes the process if it waits; harmless if it does not or is gone.
+    pub fn wake(&self) {
+        if let Err(error) = self.0.notify() {
+            tracing::trace!(?error, "wake-up not delivered");
+        }
+    }
+}
+
+/// Waits until somebody wakes this process or `timeout` has passed. Look for work before waiting, and again after.
+///
+/// # Errors
+/// The listener is broken.
+pub fn wait(listener: &WakeListener, timeout: Duration) -> Result<(), PortError> {
+    match listener.timed_wait(|_| (), timeout) {
+        // A signal ends the wait early, like a wake-up: the caller looks at its stop flag.
+        Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
+        Err(error) => Err(refused("wake", "waiting")(&error)),
+    }
+}

@@ -1,0 +1,185 @@
+//! The run file: what the supervisor tells every process at its start.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{SCHEMA_VERSION, config::Config, schedule};
+
+/// What a run is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mode {
+    /// A trainer learns.
+    Train,
+    /// No learner.
+    Simulate,
+}
+
+/// What traffic runs on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Source {
+    /// A map with population control: random routes for ever.
+    Population {
+        /// The built net.
+        net_file: PathBuf,
+        /// Vehicle types and polygons.
+        additional_files: Vec<PathBuf>,
+    },
+    /// A user's scenario, as SUMO runs it.
+    Scenario {
+        /// The `.sumocfg`.
+        sumocfg: PathBuf,
+    },
+}
+
+/// What the net file says about itself.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MapInfo {
+    /// PROJ string of the net, or of the origin given in the configuration.
+    pub projection: String,
+    /// Added to projected coordinates to give net coordinates, metres.
+    pub net_offset_m: [f64; 2],
+    /// x_min, y_min, x_max, y_max of the net with a margin of 20 m, metres: the range of positions and predictions.
+    pub bounds_m: [f64; 4],
+}
+
+/// Where the run's shared memory lives: nothing outside it is touched.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SharedMemory {
+    /// Directory of iceoryx2's files.
+    pub root: PathBuf,
+    /// Prefix of the files in `/dev/shm`.
+    pub prefix: String,
+}
+
+/// The run file, `run.json` in the run directory.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunFile {
+    /// [`SCHEMA_VERSION`] of the writer.
+    pub schema_version: u32,
+    /// Random identity.
+    pub run_id: u64,
+    /// Name of the run.
+    pub name: String,
+    /// Directory with everything the run leaves behind.
+    pub run_dir: PathBuf,
+    /// What the run is for.
+    pub mode: Mode,
+    /// Process id of the supervisor: processes end when it does.
+    pub supervisor_pid: i32,
+    /// Shared memory of the run.
+    pub shared_memory: SharedMemory,
+    /// What traffic runs on.
+    pub source: Source,
+    /// The map.
+    pub map: MapInfo,
+    /// Installation of SUMO (the `sumo` directory of the `eclipse-sumo` wheel).
+    pub sumo_home: PathBuf,
+    /// The validated configuration.
+    pub config: Config,
+    /// BLAKE3 of the configuration's canonical JSON.
+    pub config_hash: String,
+}
+
+/// The run file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RunFileError {
+    /// Not readable or not writable.
+    #[error("cannot access the run file {path}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: std::io::Error,
+    },
+    /// Not a run file.
+    #[error("{path} is not a run file")]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: serde_json::Error,
+    },
+    /// Written by another version.
+    #[error("{path} has schema version {found}, this program reads {SCHEMA_VERSION}: rebuild with `make build`")]
+    Version {
+        /// The file.
+        path: PathBuf,
+        /// Its version.
+        found: u32,
+    },
+}
+
+impl RunFile {
+    /// Reads and checks a run file.
+    ///
+    /// # Errors
+    /// Unreadable, malformed, or of another schema version.
+    pub fn read(path: &Path) -> Result<Self, RunFileError> {
+        let text = std::fs::read_to_string(path).map_err(|source| RunFileError::Io {
+            path: path.into(),
+            source,
+        })?;
+        let run: Self = serde_json::from_str(&text).map_err(|source| RunFileError::Format {
+            path: path.into(),
+            source,
+        })?;
+        if run.schema_version != SCHEMA_VERSION {
+            return Err(RunFileError::Version {
+                path: path.into(),
+                found: run.schema_version,
+            });
+        }
+        Ok(run)
+    }
+
+    /// Writes the run file to `run_dir/run.json` and returns its path.
+    ///
+    /// # Errors
+    /// Not writable.
+    pub fn write(&self) -> Result<PathBuf, RunFileError> {
+        let path = self.run_dir.join("run.json");
+        let text = serde_json::to_string_pretty(self).map_err(|source| RunFileError::Format {
+            path: path.clone(),
+            source,
+        })?;
+        std::fs::write(&path, text).map_err(|source| RunFileError::Io {
+            path: path.clone(),
+            source,
+        })?;
+        Ok(path)
+    }
+
+    /// SUMO steps per tick are 1 / this: ticks in one SUMO step.
+    #[must_use]
+    pub fn ticks_per_traffic_step(&self) -> u64 {
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "validated to be a small positive integer"
+        )]
+        let ratio = (self.config.traffic.step_s / self.config.run.tick_s).round() as u64;
+        ratio.max(1)
+    }
+
+    /// Ticks a producer may be ahead: the configured window, at least one SUMO step.
+    #[must_use]
+    pub fn window_ticks(&self) -> u64 {
+        u64::from(self.config.run.window_ticks).max(self.ticks_per_traffic_step())
+    }
+
+    /// The episodes of this run.
+    #[must_use]
+    pub fn episodes(&self) -> Vec<schedule::Episode> {
+        let (lengths, seed) = (&self.config.episode, self.config.run.seed);
+        match (&self.source, self.mode) {
+            (_, Mode::Train) => schedule::training(lengths, seed),
+            (Source::Scenario { .. }, Mode::Simulate) => schedule::scenario(seed),
+            (Source::Population { .. }, Mode::Simulate) => schedule::simulation(lengths, seed),
+        }
+    }
+}

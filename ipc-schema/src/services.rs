@@ -1,0 +1,376 @@
+//! The services of a run: names, sizes and quality of service. The supervisor creates them all and keeps them open;
+//! every other process only opens them (killing a process while it creates a service can leave its name unusable).
+
+use iceoryx2::{
+    config::Config as IpcConfig,
+    node::{Node, NodeBuilder},
+    port::listener::Listener,
+    prelude::{
+        Alignment, CallbackProgression, FileName, Path as IpcPath, SemanticString, ServiceName, SignalHandlingMode,
+    },
+    service::{
+        Service as _,
+        builder::publish_subscribe::Builder as DataBuilder,
+        ipc_threadsafe,
+        port_factory::{blackboard, event, publish_subscribe},
+    },
+};
+
+use crate::{
+    block::ALIGNMENT,
+    board::{Health, Progress, TrainingStatus},
+    header::MessageHeader,
+    observation::ObservationLayout,
+    process::Process,
+    run::{RunFile, SharedMemory},
+    traffic::{TrafficState, VehicleMeta},
+    world::WorldLayout,
+};
+
+/// The variant of iceoryx2 in use: between processes, ports usable from any thread.
+pub type Shm = ipc_threadsafe::Service;
+/// A process's place in a run's shared memory.
+pub type RunNode = Node<Shm>;
+/// An opened data service.
+pub type DataService = publish_subscribe::PortFactory<Shm, [u8], MessageHeader>;
+/// An opened board.
+pub type BoardService = blackboard::PortFactory<Shm, u32>;
+/// An opened wake-up service.
+pub type WakeService = event::PortFactory<Shm>;
+
+/// Board entry of [`Progress`].
+pub const PROGRESS_KEY: u32 = 0;
+/// Board entry of [`Health`].
+pub const HEALTH_KEY: u32 = 1;
+/// Board entry of [`TrainingStatus`].
+pub const TRAINING_KEY: u32 = 2;
+
+/// Most processes that open one service at a time: all of a run, a successor for each, and spectators (`caraware ps`).
+const MAX_NODES: usize = 24;
+/// Readers of one board.
+const MAX_READERS: usize = 32;
+/// Messages a process may hold besides those in its queue.
+const SPARE_MESSAGES: usize = 2;
+
+/// A data service.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Channel {
+    /// SUMO's road users.
+    Traffic,
+    /// Arrivals, departures and what a road user is.
+    TrafficMeta,
+    /// Road users as the nanoscopic core moves them.
+    World,
+    /// What connected vehicles sense.
+    Observation,
+    /// What the policy makes of it.
+    Prediction,
+}
+
+impl Channel {
+    /// All data services.
+    pub const ALL: [Self; 5] = [
+        Self::Traffic,
+        Self::TrafficMeta,
+        Self::World,
+        Self::Observation,
+        Self::Prediction,
+    ];
+
+    /// Name in service names and keys.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Traffic => "traffic",
+            Self::TrafficMeta => "traffic-meta",
+            Self::World => "world",
+            Self::Observation => "observation",
+            Self::Prediction => "prediction",
+        }
+    }
+
+    /// The one process that sends.
+    #[must_use]
+    pub fn producer(self) -> Process {
+        match self {
+            Self::Traffic | Self::TrafficMeta => Process::TrafficBridge,
+            Self::World => Process::SimCore,
+            Self::Observation => Process::SensorDaemon,
+            Self::Prediction => Process::Trainer,
+        }
+    }
+
+    /// The process that must not miss a message, whose credit bounds the producer.
+    #[must_use]
+    pub fn required_consumer(self) -> Option<Process> {
+        match self {
+            Self::Traffic | Self::TrafficMeta => Some(Process::SimCore),
+            Self::World => Some(Process::SensorDaemon),
+            Self::Observation => Some(Process::Trainer),
+            Self::Prediction => None,
+        }
+    }
+
+    /// Subscribers at a time: the required one, its successor, the fan-out, one spare.
+    const fn max_subscribers(self) -> usize {
+        4
+    }
+
+    /// Longest payload of a run, bytes.
+    #[must_use]
+    pub fn max_payload(self, run: &RunFile) -> usize {
+        let road_users = run.config.traffic.max_road_users as usize;
+        let fields = run.config.observation.fields.len();
+        match self {
+            Self::Traffic => road_users * size_of::<TrafficState>(),
+            // Everybody may leave and everybody may come within one step.
+            Self::TrafficMeta => 2 * road_users * size_of::<VehicleMeta>(),
+            Self::World => WorldLayout::new(road_users, run.config.run.sub_steps as usize).len,
+            Self::Observation => ObservationLayout::new(road_users, fields).len,
+            Self::Prediction => road_users * size_of::<[f32; 2]>(),
+        }
+    }
+
+    /// Messages a subscriber's queue holds.
+    #[must_use]
+    pub fn queue_length(self, run: &RunFile) -> usize {
+        usize::try_from(run.window_ticks()).unwrap_or(usize::MAX) + SPARE_MESSAGES
+    }
+
+    /// Most shared memory this service can touch, bytes: every queue full, every message of the longest size.
+    #[must_use]
+    pub fn worst_case_bytes(self, run: &RunFile) -> usize {
+        // Its queue, and twice as many in hand: a batch at work while the next one is taken.
+        let per_subscriber = 3 * self.queue_length(run);
+        let messages = 2 * per_subscriber + SPARE_MESSAGES;
+        messages * (self.max_payload(run) + size_of::<MessageHeader>() + 4 * ALIGNMENT)
+    }
+}
+
+/// A service or node could not be created or opened.
+#[derive(Debug, thiserror::Error)]
+pub enum ServiceError {
+    /// The name is not acceptable to iceoryx2.
+    #[error("\"{name}\" cannot be used as a name in shared memory: {reason}")]
+    Name {
+        /// The name.
+        name: String,
+        /// iceoryx2's reason.
+        reason: String,
+    },
+    /// iceoryx2 refused.
+    #[error("shared memory: {action} of {name} failed: {reason}")]
+    Refused {
+        /// "creation", "opening", …
+        action: &'static str,
+        /// What was to be created or opened.
+        name: String,
+        /// iceoryx2's reason.
+        reason: String,
+    },
+}
+
+fn refused(action: &'static str, name: impl Into<String>) -> impl FnOnce(&dyn std::fmt::Debug) -> ServiceError {
+    let name = name.into();
+    move |reason| ServiceError::Refused {
+        action,
+        name,
+        reason: format!("{reason:?}"),
+    }
+}
+
+fn invalid(name: &str) -> impl FnOnce(&dyn std::fmt::Debug) -> ServiceError {
+    let name = name.to_owned();
+    move |reason| ServiceError::Name {
+        name,
+        reason: format!("{reason:?}"),
+    }
+}
+
+/// A node in the run's own corner of shared memory.
+///
+/// # Errors
+/// The root directory or prefix is unusable.
+pub fn node(memory: &SharedMemory) -> Result<Node<Shm>, ServiceError> {
+    NodeBuilder::new()
+        .config(&ipc_config(memory)?)
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<Shm>()
+        .map_err(|e| refused("creation", "node")(&e))
+}
+
+fn ipc_config(memory: &SharedMemory) -> Result<IpcConfig, ServiceError> {
+    let root = memory.root.to_string_lossy();
+    let mut config = IpcConfig::default();
+    let path = IpcPath::new(root.as_bytes()).map_err(|e| invalid(&root)(&e))?;
+    config.global.set_root_path(&path);
+    config.global.prefix = FileName::new(memory.prefix.as_bytes()).map_err(|e| invalid(&memory.prefix)(&e))?;
+    // The supervisor cleans up after dead processes; a child that opens a service must not stall on it.
+    config.global.service.cleanup_dead_nodes_on_open = false;
+    config.global.node.cleanup_dead_nodes_on_creation = false;
+    config.global.node.cleanup_dead_nodes_on_destruction = false;
+    Ok(config)
+}
+
+/// Name of a service of environment `env_index`.
+fn service_name(run: &RunFile, env_index: u32, service: &str) -> Result<ServiceName, ServiceError> {
+    let name = format!("caraware/{}/{env_index}/{service}", run.name);
+    ServiceName::new(&name).map_err(|e| invalid(&name)(&e))
+}
+
+fn data_builder(
+    node: &Node<Shm>,
+    run: &RunFile,
+    env_index: u32,
+    channel: Channel,
+) -> Result<DataBuilder<[u8], MessageHeader, Shm>, ServiceError> {
+    let name = service_name(run, env_index, channel.name())?;
+    let alignment = Alignment::new(ALIGNMENT).ok_or_else(|| invalid("alignment")(&ALIGNMENT))?;
+    Ok(node
+        .service_builder(&name)
+        .publish_subscribe::<[u8]>()
+        .user_header::<MessageHeader>()
+        .payload_alignment(alignment)
+        .enable_safe_overflow(false)
+        .history_size(0)
+        .max_publishers(2)
+        .max_subscribers(channel.max_subscribers())
+        .max_nodes(MAX_NODES)
+        .subscriber_max_buffer_size(channel.queue_length(run))
+        .subscriber_max_borrowed_samples(2 * channel.queue_length(run)))
+}
+
+/// Opens a data service.
+///
+/// # Errors
+/// It does not exist, or its layout differs from this program's.
+pub fn open_data(
+    node: &Node<Shm>,
+    run: &RunFile,
+    env_index: u32,
+    channel: Channel,
+) -> Result<DataService, ServiceError> {
+    data_builder(node, run, env_index, channel)?
+        .open()
+        .map_err(|e| refused("opening", channel.name())(&e))
+}
+
+/// Opens the board of a process.
+///
+/// # Errors
+/// It does not exist.
+pub fn open_board(
+    node: &Node<Shm>,
+    run: &RunFile,
+    env_index: u32,
+    process: Process,
+) -> Result<BoardService, ServiceError> {
+    let name = service_name(run, env_index, &format!("board/{process}"))?;
+    node.service_builder(&name)
+        .blackboard_opener::<u32>()
+        .open()
+        .map_err(|e| refused("opening", format!("board of {process}"))(&e))
+}
+
+/// Opens the wake-up service of a process.
+///
+/// # Errors
+/// It does not exist.
+pub fn open_wake(
+    node: &Node<Shm>,
+    run: &RunFile,
+    env_index: u32,
+    process: Process,
+) -> Result<WakeService, ServiceError> {
+    let name = service_name(run, env_index, &format!("wake/{process}"))?;
+    node.service_builder(&name)
+        .event()
+        .open()
+        .map_err(|e| refused("opening", format!("wake-up of {process}"))(&e))
+}
+
+/// A listener that empties itself when it wakes.
+pub type WakeListener = Listener<Shm>;
+
+/// All services of one environment, held open as long as the run lives.
+#[derive(Debug)]
+pub struct ServiceHolder {
+    /// Data services, in the order of [`Channel::ALL`].
+    _data: Vec<DataService>,
+    boards: Vec<(Process, BoardService)>,
+    _wakes: Vec<WakeService>,
+}
+
+impl ServiceHolder {
+    /// Creates every service of environment `env_index`.
+    ///
+    /// # Errors
+    /// iceoryx2 refuses one.
+    pub fn create(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<Self, ServiceError> {
+        let data = Channel::ALL.into_iter().map(|channel| {
+            data_builder(node, run, env_index, channel)?
+                .create()
+                .map_err(|e| refused("creation", channel.name())(&e))
+        });
+        let boards = Process::ALL
+            .into_iter()
+            .map(|process| Ok((process, create_board(node, run, env_index, process)?)));
+        let wakes = Process::ALL
+            .into_iter()
+            .map(|process| create_wake(node, run, env_index, process));
+        Ok(Self {
+            _data: data.collect::<Result<_, _>>()?,
+            boards: boards.collect::<Result<_, ServiceError>>()?,
+            _wakes: wakes.collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// The boards of all processes.
+    pub fn boards(&self) -> impl Iterator<Item = (Process, &BoardService)> {
+        self.boards.iter().map(|(process, board)| (*process, board))
+    }
+}
+
+fn create_board(
+    node: &Node<Shm>,
+    run: &RunFile,
+    env_index: u32,
+    process: Process,
+) -> Result<BoardService, ServiceError> {
+    let name = service_name(run, env_index, &format!("board/{process}"))?;
+    node.service_builder(&name)
+        .blackboard_creator::<u32>()
+        .max_readers(MAX_READERS)
+        .max_nodes(MAX_NODES)
+        .add(PROGRESS_KEY, Progress::default())
+        .add(HEALTH_KEY, Health::default())
+        .add(TRAINING_KEY, TrainingStatus::default())
+        .create()
+        .map_err(|e| refused("creation", format!("board of {process}"))(&e))
+}
+
+fn create_wake(node: &Node<Shm>, run: &RunFile, env_index: u32, process: Process) -> Result<WakeService, ServiceError> {
+    let name = service_name(run, env_index, &format!("wake/{process}"))?;
+    node.service_builder(&name)
+        .event()
+        .max_nodes(MAX_NODES)
+        .max_notifiers(2 * Process::ALL.len())
+        .max_listeners(2)
+        .event_id_max_value(1)
+        .create()
+        .map_err(|e| refused("creation", format!("wake-up of {process}"))(&e))
+}
+
+/// Names of the services that exist under `memory`, for the process table of a run that somebody else supervises.
+///
+/// # Errors
+/// The shared memory cannot be read.
+pub fn count_services(memory: &SharedMemory) -> Result<usize, ServiceError> {
+    let mut count = 0;
+    Shm::list(&ipc_config(memory)?, |_| {
+        count += 1;
+        CallbackProgression::Continue
+    })
+    .map_err(|e| refused("listing", "services")(&e))?;
+    Ok(count)
+}

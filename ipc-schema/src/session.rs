@@ -1,0 +1,390 @@
+//! How a process takes part in a run: it joins, opens its ports, waits for data or credit, reports, and leaves.
+
+use std::{
+    path::Path,
+    process::ExitCode,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
+
+use iceoryx2::node::Node;
+
+use crate::{
+    SCHEMA_VERSION,
+    board::{Health, Progress, State},
+    failure::{Failure, FailureKind},
+    flow,
+    header::MessageHeader,
+    ports::{BoardReader, BoardWriter, PortError, Publisher, Subscriber, Waker, wait},
+    process::Process,
+    run::{RunFile, RunFileError},
+    services::{self, Channel, ServiceError, Shm, WakeListener},
+};
+
+/// Environment variable with the number of times a process has been started before.
+pub const INCARNATION: &str = "CARAWARE_INCARNATION";
+
+/// Longest wait between two looks at credit, data and the stop flag.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// A process cannot take part in the run any more.
+#[derive(Debug, thiserror::Error)]
+pub enum SessionError {
+    /// The run file cannot be used.
+    #[error(transparent)]
+    RunFile(#[from] RunFileError),
+    /// A service cannot be opened.
+    #[error(transparent)]
+    Service(#[from] ServiceError),
+    /// A port failed.
+    #[error(transparent)]
+    Port(#[from] PortError),
+    /// The signal handler or the bond to the supervisor could not be set up.
+    #[error("cannot set up {what}")]
+    System {
+        /// What.
+        what: &'static str,
+        /// Why.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The supervisor is gone.
+    #[error("the supervisor (process {pid}) is gone")]
+    Orphaned {
+        /// Its process id.
+        pid: i32,
+    },
+}
+
+/// Whether to go on after a wait.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[must_use]
+pub enum Wait {
+    /// What was waited for is there.
+    Ready,
+    /// The process was asked to stop.
+    Stopped,
+}
+
+/// One process's part in a run.
+pub struct Session {
+    /// What the supervisor said.
+    pub run: RunFile,
+    process: Process,
+    env_index: u32,
+    incarnation: u32,
+    node: Node<Shm>,
+    board: BoardWriter,
+    wake: WakeListener,
+    stop: Arc<AtomicBool>,
+    progress: Progress,
+    health: Health,
+    upstream: Vec<Waker>,
+}
+
+impl Session {
+    /// Joins the run as `process`: opens its board and wake-up, ends with the supervisor, stops at SIGTERM and SIGINT.
+    ///
+    /// # Errors
+    /// The run file, the shared memory or the supervisor is not there.
+    pub fn join(run_file: &Path, process: Process, env_index: u32) -> Result<Self, SessionError> {
+        let stop = Arc::new(AtomicBool::new(false));
+        for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
+            signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|source| SessionError::System {
+                what: "signal handling",
+                source,
+            })?;
+        }
+        Self::join_with(RunFile::read(run_file)?, process, env_index, stop)
+    }
+
+    /// Joins like [`Session::join`] but leaves signals to the caller, who sets `stop`.
+    ///
+    /// # Errors
+    /// As [`Session::join`].
+    pub fn join_with(
+        run: RunFile,
+        process: Process,
+        env_index: u32,
+        stop: Arc<AtomicBool>,
+    ) -> Result<Self, SessionError> {
+        end_with_supervisor(run.supervisor_pid)?;
+        let node = services::node(&run.shared_memory)?;
+        let board = BoardWriter::create(&services::open_board(&node, &run, env_index, process)?)?;
+        let wake = services::open_wake(&node, &run, env_index, process)?
+            .listener_builder()
+            .create()
+            .map_err(|e| PortError::Refused {
+                channel: "wake",
+                action: "creation of the listener",
+                reason: format!("{e:?}"),
+            })?;
+        let incarnation = std::env::var(INCARNATION)
+            .ok()
+            .and_then(|text| text.parse().ok())
+            .unwrap_or(0);
+        let progress = Progress {
+            incarnation,
+            ..Progress::default()
+        };
+        board.set_progress(progress);
+        let health = Health {
+            state: State::Starting as u32,
+            pid: std::process::id().try_into().unwrap_or(0),
+            ..Health::default()
+        };
+        board.set_health(health);
+        Ok(Self {
+            run,
+            process,
+            env_index,
+            incarnation,
+            node,
+            board,
+            wake,
+            stop,
+            progress,
+            health,
+            upstream: Vec::new(),
+        })
+    }
+
+    /// The sending end of `channel`.
+    ///
+    /// # Errors
+    /// The service cannot be opened.
+    pub fn publisher(&self, channel: Channel) -> Result<Publisher, SessionError> {
+        let service = services::open_data(&self.node, &self.run, self.env_index, channel)?;
+        Ok(Publisher::create(&service, channel, &self.run)?)
+    }
+
+    /// The receiving end of `channel`; its producer will be woken by [`Session::consumed`].
+    ///
+    /// # Errors
+    /// The service cannot be opened.
+    pub fn subscriber(&mut self, channel: Channel) -> Result<Subscriber, SessionError> {
+        let service = services::open_data(&self.node, &self.run, self.env_index, channel)?;
+        if channel.required_consumer() == Some(self.process) {
+            self.upstream.push(self.waker(channel.producer())?);
+        }
+        Ok(Subscriber::create(&service, channel, &self.run)?)
+    }
+
+    /// Wakes `process`.
+    ///
+    /// # Errors
+    /// The service cannot be opened.
+    pub fn waker(&self, process: Process) -> Result<Waker, SessionError> {
+        Ok(Waker::create(&services::open_wake(
+            &self.node,
+            &self.run,
+            self.env_index,
+            process,
+        )?)?)
+    }
+
+    /// The board of `process`.
+    ///
+    /// # Errors
+    /// The service cannot be opened.
+    pub fn board_of(&self, process: Process) -> Result<BoardReader, SessionError> {
+        Ok(BoardReader::create(&services::open_board(
+            &self.node,
+            &self.run,
+            self.env_index,
+            process,
+        )?)?)
+    }
+
+    /// Header for a message of this process; the caller adds episode, tick, time and sizes.
+    #[must_use]
+    pub fn header(&self) -> MessageHeader {
+        MessageHeader {
+            schema_version: SCHEMA_VERSION,
+            env_index: self.env_index,
+            run_id: self.run.run_id,
+            incarnation: self.incarnation,
+            ..MessageHeader::default()
+        }
+    }
+
+    /// All ports are open: producers may send.
+    pub fn attach(&mut self) {
+        self.progress.attached = 1;
+        self.board.set_progress(self.progress);
+        self.report(|health| health.state = State::Ready as u32);
+        self.wake_upstream();
+    }
+
+    /// All ticks below `ticks` have been consumed: their producer gets the credit.
+    pub fn consumed(&mut self, ticks: u64) {
+        self.progress.consumed_ticks = ticks;
+        self.board.set_progress(self.progress);
+        self.wake_upstream();
+    }
+
+    /// All ticks below `ticks` are in a checkpoint that has been renamed into place.
+    pub fn committed(&mut self, ticks: u64) {
+        self.progress.committed_ticks = ticks;
+        self.board.set_progress(self.progress);
+    }
+
+    fn wake_upstream(&self) {
+        self.upstream.iter().for_each(Waker::wake);
+    }
+
+    /// Changes the health on the board.
+    pub fn report(&mut self, change: impl FnOnce(&mut Health)) {
+        change(&mut self.health);
+        self.board.set_health(self.health);
+    }
+
+    /// Writes what this process adds to the run's report, `parts/<process>.json`.
+    ///
+    /// # Errors
+    /// Not writable.
+    pub fn write_part(&self, part: &impl serde::Serialize) -> Result<(), Failure> {
+        let path = self.run.run_dir.join("parts").join(format!("{}.json", self.process));
+        let failed = |reason: &dyn std::fmt::Display| {
+            Failure::new(FailureKind::Run, format!("cannot write {}: {reason}", path.display()))
+                .with_help("check permissions and free space (`caraware doctor`)")
+        };
+        let text = serde_json::to_string_pretty(part).map_err(|error| failed(&error))?;
+        std::fs::write(&path, text).map_err(|error| failed(&error))
+    }
+
+    /// The board, for the training status.
+    #[must_use]
+    pub fn board(&self) -> &BoardWriter {
+        &self.board
+    }
+
+    /// True once the process has been asked to stop.
+    #[must_use]
+    pub fn stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    /// Waits until `tick` may be sent to `consumer`, or the process is asked to stop.
+    ///
+    /// # Errors
+    /// The wake-up is broken.
+    pub fn wait_for_credit(&self, consumer: &BoardReader, tick: u64) -> Result<Wait, SessionError> {
+        let window = self.run.window_ticks();
+        self.wait_until(|| flow::has_credit(tick, &consumer.progress(), window))
+    }
+
+    /// Waits until `consumer` has consumed all ticks below `ticks`: only then may its producer leave.
+    ///
+    /// # Errors
+    /// The wake-up is broken.
+    pub fn wait_until_consumed(&self, consumer: &BoardReader, ticks: u64) -> Result<Wait, SessionError> {
+        self.wait_until(|| consumer.progress().consumed_ticks >= ticks)
+    }
+
+    /// Waits until `condition` holds or the process is asked to stop; looks again at every wake-up.
+    ///
+    /// # Errors
+    /// The wake-up is broken.
+    pub fn wait_until(&self, mut condition: impl FnMut() -> bool) -> Result<Wait, SessionError> {
+        loop {
+            if condition() {
+                return Ok(Wait::Ready);
+            }
+            if self.stopped() {
+                return Ok(Wait::Stopped);
+            }
+            wait(&self.wake, LOOK)?;
+        }
+    }
+
+    /// Waits for a wake-up, at most `timeout`.
+    ///
+    /// # Errors
+    /// The wake-up is broken.
+    pub fn wait(&self, timeout: Duration) -> Result<(), SessionError> {
+        Ok(wait(&self.wake, timeout)?)
+    }
+
+    /// The next message of `subscriber`, waiting for it; `None` once the process is asked to stop.
+    ///
+    /// # Errors
+    /// The port is broken.
+    pub fn next(&self, subscriber: &Subscriber) -> Result<Option<crate::ports::Message>, SessionError> {
+        let mut message = None;
+        let mut failure = None;
+        let waited = self.wait_until(|| match subscriber.receive() {
+            Ok(received) => {
+                message = received;
+                message.is_some()
+            }
+            Err(error) => {
+                failure = Some(error);
+                true
+            }
+        })?;
+        match (failure, waited) {
+            (Some(error), _) => Err(error.into()),
+            (None, Wait::Ready) => Ok(message),
+            (None, Wait::Stopped) => Ok(None),
+        }
+    }
+}
+
+/// Ends this process when the supervisor ends.
+fn end_with_supervisor(pid: i32) -> Result<(), SessionError> {
+    rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM)).map_err(|e| {
+        SessionError::System {
+            what: "the bond to the supervisor",
+            source: e.into(),
+        }
+    })?;
+    let parent = rustix::process::getppid().map_or(0, |p| p.as_raw_nonzero().get());
+    if parent == pid {
+        Ok(())
+    } else {
+        Err(SessionError::Orphaned { pid })
+    }
+}
+
+/// The `main` of a process binary: reads the run file named by the first argument, logs to standard error, runs `body`,
+/// and turns its failure into a failure file and an exit code.
+pub fn main(process: Process, body: impl FnOnce(&Path) -> Result<(), Failure>) -> ExitCode {
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .with_ansi(false)
+        .with_env_filter(
+            tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "info,zenoh=error".into()),
+        )
+        .init();
+    let Some(run_file) = std::env::args_os().nth(1) else {
+        tracing::error!("usage: {process} RUN_FILE   (started by `caraware`, not by hand)");
+        return ExitCode::from(FailureKind::Config.exit_code());
+    };
+    let run_file = Path::new(&run_file);
+    match body(run_file) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            tracing::error!(help = failure.help.as_deref(), "{}", failure.message);
+            if let Some(run_dir) = run_file.parent() {
+                failure.write(run_dir, process.name());
+            }
+            ExitCode::from(failure.kind.exit_code())
+        }
+    }
+}
+
+impl From<SessionError> for Failure {
+    fn from(error: SessionError) -> Self {
+        Self::from_error(FailureKind::Run, &error)
+    }
+}
+
+impl From<PortError> for Failure {
+    fn from(error: PortError) -> Self {
+        Self::from_error(FailureKind::Run, &error)
+    }
+}

@@ -1,0 +1,118 @@
+//! `traffic` and `traffic-meta`: what SUMO knows, in our units and frames.
+
+use bytemuck::{Pod, Zeroable};
+
+/// Kind of a road user, as carried in [`VehicleMeta::kind`] and [`TrafficState::kind`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Kind {
+    /// Connected vehicle: it carries sensors and gets a slot in the observation.
+    Cav = 0,
+    /// Vehicle without sensors.
+    Other = 1,
+    /// Pedestrian.
+    Person = 2,
+}
+
+/// SUMO moved this road user in a way no vehicle can (teleport, insertion, `moveToXY`): do not interpolate across it.
+pub const DISCONTINUOUS: u32 = 1;
+
+/// One road user at one SUMO step. World frame: metres in the net's own projected coordinates, x east, y north, z up.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct TrafficState {
+    /// Front-bumper centre on the ground (persons: centre), x, metres.
+    pub front_x_m: f64,
+    /// Front-bumper centre on the ground (persons: centre), y, metres.
+    pub front_y_m: f64,
+    /// Height of the road at the front bumper, metres.
+    pub front_z_m: f64,
+    /// Heading, counter-clockwise from east, radians in (-π, π].
+    pub yaw_rad: f32,
+    /// Slope, positive uphill, radians.
+    pub pitch_rad: f32,
+    /// Speed along the lane, metres per second.
+    pub speed_mps: f32,
+    /// Acceleration along the lane over the last SUMO step, m/s².
+    pub accel_mps2: f32,
+    /// Dense index of the road user within its episode, in order of appearance.
+    pub vehicle: u32,
+    /// A [`Kind`].
+    pub kind: u32,
+    /// SUMO's signal bits (blinkers, brake light, …).
+    pub signals: u32,
+    /// Bits: [`DISCONTINUOUS`].
+    pub flags: u32,
+}
+
+/// What happened to a road user, as carried in [`VehicleMeta::event`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u32)]
+pub enum MetaEvent {
+    /// It entered the network: the other fields describe it.
+    Departed = 0,
+    /// It left the network by reaching its destination (or being removed).
+    Arrived = 1,
+    /// SUMO began to teleport it.
+    Teleported = 2,
+}
+
+/// Longest id carried as text; longer ids are cut, their hash is of the whole.
+pub const ID_BYTES: usize = 64;
+
+/// Slowly changing facts about a road user.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub struct VehicleMeta {
+    /// Hash of SUMO's id ([`id_hash`]): keys the road user's random streams.
+    pub id_hash: u64,
+    /// Dense index within the episode.
+    pub vehicle: u32,
+    /// A [`MetaEvent`].
+    pub event: u32,
+    /// A [`Kind`].
+    pub kind: u32,
+    /// Index of SUMO's vehicle type in order of first appearance.
+    pub type_index: u32,
+    /// Bumper to bumper, metres.
+    pub length_m: f32,
+    /// Metres.
+    pub width_m: f32,
+    /// Metres.
+    pub height_m: f32,
+    /// Bytes of `id` in use.
+    pub id_len: u32,
+    /// SUMO's id, UTF-8.
+    pub id: [u8; ID_BYTES],
+    /// SUMO's vehicle class ("passenger", "truck", …), UTF-8, zero padded.
+    pub vehicle_class: [u8; 16],
+}
+
+impl VehicleMeta {
+    /// SUMO's id as text (cut to [`ID_BYTES`]).
+    #[must_use]
+    pub fn id_text(&self) -> String {
+        let len = (self.id_len as usize).min(ID_BYTES);
+        String::from_utf8_lossy(&self.id[..len]).into_owned()
+    }
+
+    /// Stores `id`, cut at a character border, with the hash of the whole.
+    pub fn set_id(&mut self, id: &str) {
+        let mut len = id.len().min(ID_BYTES);
+        while !id.is_char_boundary(len) {
+            len -= 1;
+        }
+        self.id = [0; ID_BYTES];
+        self.id[..len].copy_from_slice(&id.as_bytes()[..len]);
+        self.id_len = u32::try_from(len).unwrap_or(0);
+        self.id_hash = id_hash(id);
+    }
+}
+
+/// First eight bytes of the BLAKE3 hash of a SUMO id, little endian.
+#[must_use]
+pub fn id_hash(id: &str) -> u64 {
+    let mut first = [0_u8; 8];
+    first.copy_from_slice(&blake3::hash(id.as_bytes()).as_bytes()[..8]);
+    u64::from_le_bytes(first)
+}

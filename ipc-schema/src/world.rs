@@ -1,0 +1,110 @@
+//! `world`: every road user after the nanoscopic core has moved it.
+
+use bytemuck::{Pod, Zeroable};
+
+use crate::block::{Section, sections};
+
+/// The pose was set, not reached by moving: insertion, teleport or re-synchronisation.
+pub const RESYNCHRONISED: u32 = 1;
+/// First tick of this road user in the episode.
+pub const APPEARED: u32 = 1 << 1;
+
+/// One road user at the end of a tick.
+///
+/// World frame: metres in the net's projected coordinates, x east, y north, z up. Body frame: x forward, y left, z up,
+/// origin at the centre of the rear axle on the ground (persons: their centre on the ground).
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct VehicleState {
+    /// Rear-axle centre, x, world, metres.
+    pub x_m: f64,
+    /// Rear-axle centre, y, world, metres.
+    pub y_m: f64,
+    /// Rear-axle centre, z, world, metres.
+    pub z_m: f64,
+    /// Heading, counter-clockwise from east, radians in (-π, π].
+    pub yaw_rad: f64,
+    /// Hash of SUMO's id.
+    pub id_hash: u64,
+    /// Roll, positive to the right side down, radians.
+    pub roll_rad: f32,
+    /// Pitch, positive nose up, radians.
+    pub pitch_rad: f32,
+    /// Velocity of the origin in the body frame, m/s.
+    pub velocity_body_mps: [f32; 3],
+    /// Kinematic acceleration of the origin in the body frame (no gravity), m/s².
+    pub accel_body_mps2: [f32; 3],
+    /// Angular rate in the body frame, rad/s.
+    pub angular_rate_body_radps: [f32; 3],
+    /// Road-wheel steering angle, positive to the left, radians.
+    pub road_wheel_angle_rad: f32,
+    /// Reference minus moved front bumper, across the heading, positive to the left, metres.
+    pub tracking_lateral_m: f32,
+    /// Reference minus moved front bumper, along the heading, positive ahead, metres.
+    pub tracking_longitudinal_m: f32,
+    /// Bumper to bumper, metres.
+    pub length_m: f32,
+    /// Metres.
+    pub width_m: f32,
+    /// Metres.
+    pub height_m: f32,
+    /// Rear axle to front axle, metres.
+    pub wheelbase_m: f32,
+    /// Rear axle to rear bumper, metres.
+    pub rear_overhang_m: f32,
+    /// Dense index within the episode.
+    pub vehicle: u32,
+    /// A [`crate::traffic::Kind`].
+    pub kind: u32,
+    /// SUMO's signal bits.
+    pub signals: u32,
+    /// Bits [`RESYNCHRONISED`], [`APPEARED`].
+    pub flags: u32,
+    /// Zero.
+    pub reserved: u32,
+}
+
+/// Motion at one nano sub-step; the last sub-step of a tick coincides with its [`VehicleState`].
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct SubStep {
+    /// x minus the x of the tick's [`VehicleState`], metres.
+    pub dx_m: f32,
+    /// y minus the y of the tick's [`VehicleState`], metres.
+    pub dy_m: f32,
+    /// Heading minus the heading of the tick's [`VehicleState`], radians.
+    pub dyaw_rad: f32,
+    /// Speed of the rear axle along the body's x, m/s.
+    pub speed_mps: f32,
+    /// Kinematic acceleration of the origin in the body frame, m/s².
+    pub accel_body_mps2: [f32; 3],
+    /// Angular rate in the body frame, rad/s.
+    pub angular_rate_body_radps: [f32; 3],
+    /// Road-wheel steering angle, radians.
+    pub road_wheel_angle_rad: f32,
+    /// Zero.
+    pub reserved: u32,
+}
+
+/// Where the two arrays of a `world` message lie: `[VehicleState; count]`, then `[SubStep; count * sub_steps]` vehicle by vehicle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct WorldLayout {
+    /// `VehicleState [count]`.
+    pub states: Section,
+    /// `SubStep [count, sub_steps]`.
+    pub sub_steps: Section,
+    /// Length of the payload in bytes.
+    pub len: usize,
+}
+
+impl WorldLayout {
+    /// Layout for `count` road users with `sub_steps` samples each.
+    #[must_use]
+    pub fn new(count: usize, sub_steps: usize) -> Self {
+        let ([states, sub_steps], len) = sections([
+            count * size_of::<VehicleState>(),
+            count * sub_steps * size_of::<SubStep>(),
+        ]);
+        Self { states, sub_steps, len }
+    }
+}

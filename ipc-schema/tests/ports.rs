@@ -1,0 +1,244 @@
+//! Services, ports and boards over real shared memory.
+
+use std::{
+    path::Path,
+    sync::{Arc, atomic::AtomicBool},
+    time::Duration,
+};
+
+use ipc_schema::{
+    board::State,
+    config::Config,
+    header::MessageHeader,
+    ports::PortError,
+    process::Process,
+    run::{MapInfo, Mode, RunFile, SharedMemory, Source},
+    services::{self, Channel, RunNode, ServiceHolder},
+    session::{Session, SessionError},
+};
+
+/// The default preset, with small queues.
+fn config() -> Config {
+    let mut config: Config = serde_json::from_str(include_str!("town.json")).unwrap();
+    config.run.window_ticks = 4;
+    config.run.sub_steps = 2;
+    config.traffic.max_road_users = 8;
+    config
+}
+
+/// A run in a corner of shared memory of its own, removed at the end.
+struct Corner {
+    run: RunFile,
+    _services: ServiceHolder,
+    _node: RunNode,
+    _directory: tempfile::TempDir,
+}
+
+impl Drop for Corner {
+    fn drop(&mut self) {
+        // As the supervisor does: iceoryx2 leaves one small file of each corner behind.
+        for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
+            if entry
+                .file_name()
+                .to_string_lossy()
+                .starts_with(&self.run.shared_memory.prefix)
+            {
+                std::fs::remove_file(entry.path()).unwrap();
+            }
+        }
+    }
+}
+
+impl Corner {
+    fn new(run_id: u64) -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let prefix = format!("caraware_test{}_{run_id}_", std::process::id());
+        let run = RunFile {
+            schema_version: ipc_schema::SCHEMA_VERSION,
+            run_id,
+            name: "test".into(),
+            run_dir: directory.path().into(),
+            mode: Mode::Train,
+            supervisor_pid: rustix::process::getppid().unwrap().as_raw_nonzero().get(),
+            shared_memory: SharedMemory {
+                root: directory.path().into(),
+                prefix,
+            },
+            source: Source::Scenario { sumocfg: "none".into() },
+            map: MapInfo {
+                projection: String::new(),
+                net_offset_m: [0.0; 2],
+                bounds_m: [0.0; 4],
+            },
+            sumo_home: "none".into(),
+            config: config(),
+            config_hash: String::new(),
+        };
+        let node = services::node(&run.shared_memory).unwrap();
+        let services = ServiceHolder::create(&node, &run, 0).unwrap();
+        Self {
+            run,
+            _services: services,
+            _node: node,
+            _directory: directory,
+        }
+    }
+
+    fn join(&self, process: Process) -> Session {
+        Session::join_with(self.run.clone(), process, 0, Arc::new(AtomicBool::new(false))).unwrap()
+    }
+}
+
+fn tick(session: &Session, tick: u64) -> MessageHeader {
+    MessageHeader {
+        tick,
+        count: 1,
+        ..session.header()
+    }
+}
+
+#[test]
+fn a_message_arrives_as_it_was_sent_in_the_same_memory_aligned() {
+    let corner = Corner::new(1);
+    let (producer, mut consumer) = (corner.join(Process::SimCore), corner.join(Process::SensorDaemon));
+    let publisher = producer.publisher(Channel::World).unwrap();
+    let subscriber = consumer.subscriber(Channel::World).unwrap();
+    let mut draft = publisher.loan(tick(&producer, 7), 100).unwrap();
+    assert!(draft.payload().iter().all(|byte| *byte == 0), "a loan is zeroed");
+    draft.payload_mut().fill(9);
+    assert_eq!(draft.send().unwrap(), 1);
+    let message = consumer.next(&subscriber).unwrap().unwrap();
+    assert_eq!((message.header().tick, message.payload()), (7, [9_u8; 100].as_slice()));
+    assert_eq!(message.payload().as_ptr().addr() % 64, 0);
+    assert!(subscriber.receive().unwrap().is_none());
+}
+
+#[test]
+fn a_producer_waits_for_credit_and_a_full_watcher_only_misses() {
+    let corner = Corner::new(2);
+    let (producer, mut consumer, mut watcher) = (
+        corner.join(Process::SimCore),
+        corner.join(Process::SensorDaemon),
+        corner.join(Process::Fanout),
+    );
+    let publisher = producer.publisher(Channel::World).unwrap();
+    let board = producer.board_of(Process::SensorDaemon).unwrap();
+    let subscriber = consumer.subscriber(Channel::World).unwrap();
+    let idle = watcher.subscriber(Channel::World).unwrap();
+    let credit = |tick| ipc_schema::flow::has_credit(tick, &board.progress(), corner.run.window_ticks());
+    assert!(!credit(0), "not attached yet");
+    consumer.attach();
+    for number in 0..20 {
+        assert!(credit(number) && !credit(number + 4));
+        publisher.loan(tick(&producer, number), 8).unwrap().send().unwrap();
+        assert_eq!(subscriber.receive().unwrap().unwrap().header().tick, number);
+        consumer.consumed(number + 1);
+    }
+    // The watcher never read: its queue holds window + 2 messages, the rest it missed.
+    let seen = std::iter::from_fn(|| idle.receive().unwrap())
+        .map(|message| message.header().tick)
+        .collect::<Vec<_>>();
+    assert_eq!(seen, (0..6).collect::<Vec<_>>());
+    assert_eq!(publisher.drops(), 14);
+}
+
+#[test]
+fn a_message_of_another_run_or_version_is_refused() {
+    let corner = Corner::new(3);
+    let (producer, mut consumer) = (corner.join(Process::SimCore), corner.join(Process::SensorDaemon));
+    let publisher = producer.publisher(Channel::World).unwrap();
+    let subscriber = consumer.subscriber(Channel::World).unwrap();
+    publisher
+        .loan(
+            MessageHeader {
+                run_id: 99,
+                ..tick(&producer, 0)
+            },
+            8,
+        )
+        .unwrap()
+        .send()
+        .unwrap();
+    publisher.loan(tick(&producer, 1), 8).unwrap().send().unwrap();
+    assert_eq!(subscriber.receive().unwrap().unwrap().header().tick, 1);
+    assert_eq!(subscriber.refused(), 1);
+    publisher
+        .loan(
+            MessageHeader {
+                schema_version: 99,
+                ..tick(&producer, 2)
+            },
+            8,
+        )
+        .unwrap()
+        .send()
+        .unwrap();
+    assert!(matches!(
+        subscriber.receive(),
+        Err(PortError::Version { found: 99, .. })
+    ));
+}
+
+#[test]
+fn a_message_longer_than_laid_out_names_the_setting() {
+    let corner = Corner::new(4);
+    let producer = corner.join(Process::TrafficBridge);
+    let publisher = producer.publisher(Channel::Traffic).unwrap();
+    let error = publisher.loan(producer.header(), 9 * 64).unwrap_err();
+    assert!(
+        error.to_string().contains("raise `traffic.max_road_users` (now 8)"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_board_outlives_its_writer_and_a_wake_up_is_not_lost() {
+    let corner = Corner::new(5);
+    let mut writer = corner.join(Process::Trainer);
+    let reader = corner.join(Process::SensorDaemon);
+    let board = reader.board_of(Process::Trainer).unwrap();
+    let waker = reader.waker(Process::Trainer).unwrap();
+    waker.wake();
+    // A wake-up sent before the wait ends it at once; without one the wait ends at its timeout.
+    writer.wait(Duration::from_secs(60)).unwrap();
+    writer.wait(Duration::from_millis(1)).unwrap();
+    writer.attach();
+    writer.committed(5);
+    drop(writer);
+    assert_eq!(
+        (board.progress().committed_ticks, board.health().state),
+        (5, State::Ready as u32)
+    );
+    // A successor can take the place.
+    corner.join(Process::Trainer);
+}
+
+#[test]
+fn a_process_without_its_supervisor_does_not_start() {
+    let corner = Corner::new(6);
+    let run = RunFile {
+        supervisor_pid: 1_000_000_000,
+        ..corner.run.clone()
+    };
+    let result = Session::join_with(run, Process::SimCore, 0, Arc::new(AtomicBool::new(false)));
+    assert!(matches!(result, Err(SessionError::Orphaned { .. })));
+}
+
+#[test]
+fn a_run_file_of_another_version_is_refused() {
+    let corner = Corner::new(7);
+    RunFile {
+        schema_version: 99,
+        ..corner.run.clone()
+    }
+    .write()
+    .unwrap();
+    let error = RunFile::read(&corner.run.run_dir.join("run.json")).unwrap_err();
+    assert!(error.to_string().contains("schema version 99"), "{error}");
+    assert!(
+        RunFile::read(Path::new("nowhere/run.json"))
+            .unwrap_err()
+            .to_string()
+            .contains("nowhere/run.json")
+    );
+}
