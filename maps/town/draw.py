@@ -1,0 +1,99 @@
+"""Draw the built town (streets, crossings, signals, buildings) into town.png: `python draw.py TOWN.net.xml`."""
+
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.collections import LineCollection, PolyCollection
+
+HERE = Path(__file__).parent
+GROUND = {"park": "#b5d19c", "orchard": "#cbd8a0"}
+
+
+def points(shape):
+    """Corners [(x, y)] in metres of a SUMO shape attribute."""
+    return [tuple(float(c) for c in corner.split(",")[:2]) for corner in shape.split()]
+
+
+def thick_line(shape, width_m):
+    """Outline of a lane: its centre line widened to both sides, in metres."""
+    left, right = [], []
+    for i, (x, y) in enumerate(shape):
+        (x0, y0), (x1, y1) = shape[max(i - 1, 0)], shape[min(i + 1, len(shape) - 1)]
+        length = ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
+        across_x, across_y = -(y1 - y0) / length * width_m / 2, (x1 - x0) / length * width_m / 2
+        left.append((x + across_x, y + across_y))
+        right.append((x - across_x, y - across_y))
+    return left + right[::-1]
+
+
+def stripes(shape, width_m, stripe_m=0.5):
+    """Zebra stripes over a crossing, every metre along its centre line."""
+    (x0, y0), (x1, y1) = shape[0], shape[-1]
+    length = ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
+    ux, uy = (x1 - x0) / length, (y1 - y0) / length
+    starts = [0.25 + i for i in range(int(length))]
+    ends = [(s, min(s + stripe_m, length)) for s in starts]
+    return [thick_line([(x0 + ux * a, y0 + uy * a), (x0 + ux * b, y0 + uy * b)], width_m) for a, b in ends]
+
+
+def fill(axes, outlines, color, layer, **style):
+    axes.add_collection(PolyCollection(outlines, facecolors=color, zorder=layer, **style))
+
+
+def draw_net(axes, net):
+    """Carriageways, sidewalks, crossings and signals of a net."""
+    road, walk, zebra, middle = [], [], [], []
+    for edge in net.findall("edge"):
+        for lane in edge.findall("lane"):
+            shape, width_m = points(lane.get("shape")), float(lane.get("width", 3.2))
+            match edge.get("function"), lane.get("allow") == "pedestrian":
+                case "crossing", _:
+                    zebra += stripes(shape, width_m)
+                case "walkingarea", _:
+                    walk.append(shape)
+                case None, True:
+                    walk.append(thick_line(shape, width_m))
+                case None, False:
+                    road.append(thick_line(shape, width_m))
+                    if edge.get("id").startswith("-"):
+                        middle.append(thick_line(shape, width_m)[: len(shape)])
+    junctions = [j for j in net.findall("junction") if j.get("type") != "internal"]
+    road += [points(j.get("shape")) for j in junctions]
+    signals = [(float(j.get("x")), float(j.get("y"))) for j in junctions if j.get("type") == "traffic_light"]
+    fill(axes, road, "#5c6066", 2, edgecolors="#5c6066", linewidths=0.4)
+    fill(axes, walk, "#c9c5bd", 3, edgecolors="#c9c5bd", linewidths=0.4)
+    fill(axes, zebra, "#f4f4f0", 4)
+    axes.add_collection(LineCollection(middle, colors="#e8e4d4", linewidths=0.6, linestyles=(0, (5, 5)), zorder=3))
+    axes.plot(*zip(*signals), "o", ms=8, mfc="#d62f2f", mec="white", zorder=8, ls="none", label="signals")
+
+
+def draw_polygons(axes, additional):
+    """Buildings, darker the higher, and greens."""
+    for poly in additional.findall("poly"):
+        outline = points(poly.get("shape"))
+        if poly.get("type") != "building":
+            fill(axes, [outline], GROUND[poly.get("type")], 1)
+            continue
+        height_m = float(poly.find("param[@key='height']").get("value"))
+        color = plt.get_cmap("copper_r")(0.15 + height_m / 32)
+        fill(axes, [outline], [color], 5, edgecolors="#4a3a30", linewidths=0.5)
+
+
+def main(net_path):
+    figure, axes = plt.subplots(figsize=(8, 7.8), dpi=110)
+    axes.set_facecolor("#e3e6d8")
+    draw_net(axes, ET.parse(net_path).getroot())
+    draw_polygons(axes, ET.parse(HERE / "town.poly.xml").getroot())
+    axes.set(xlim=(0, 258), ylim=(0, 252), aspect="equal", xlabel="east, m", ylabel="north, m")
+    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
+    figure.tight_layout()
+    figure.savefig(HERE / "town.png")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,213 @@
+"""The town builds without a warning, hangs together, and carries sixty vehicles and thirty pedestrians for ten minutes."""
+
+import random
+import re
+import subprocess
+import xml.etree.ElementTree as ET
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.path import Path as Outline
+
+sumo = pytest.importorskip("sumo")
+
+TOWN = Path(__file__).parents[1]
+BIN = Path(sumo.SUMO_HOME) / "bin"
+SIZE_M, CENTRE_M = (258.0, 252.0), (129.0, 126.0)
+VEHICLE_TYPES = ("car_small", "car_sedan", "van", "truck", "bus")
+
+
+def points(shape):
+    return [tuple(float(c) for c in corner.split(",")[:2]) for corner in shape.split()]
+
+
+def build(net_path):
+    command = [BIN / "netconvert", "-c", TOWN / "town.netccfg", "-o", net_path]
+    return subprocess.run(command, capture_output=True, text=True, check=True)
+
+
+@pytest.fixture(scope="module")
+def net_path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("town") / "town.net.xml"
+    built = build(path)
+    assert "Warning" not in built.stderr + built.stdout, built.stderr
+    return path
+
+
+@pytest.fixture(scope="module")
+def net(net_path):
+    return ET.parse(net_path).getroot()
+
+
+@pytest.fixture(scope="module")
+def successors(net):
+    """Normal edge -> the normal edges a vehicle can take next."""
+    after = {e.get("id"): set() for e in net.findall("edge") if e.get("function") is None}
+    for link in net.findall("connection"):
+        if link.get("from") in after and link.get("to") in after and link.get("fromLane") == "1":
+            after[link.get("from")].add(link.get("to"))
+    return {edge: sorted(nexts) for edge, nexts in after.items()}
+
+
+def simulate(net_path, folder, demand, end_s, additional=(), options=()):
+    """Run `demand` (the body of a route file) at 0.1 s a step; answer SUMO's statistics."""
+    (folder / "demand.rou.xml").write_text(f"<routes>{demand}</routes>")
+    command = [BIN / "sumo", "-n", net_path, "-r", folder / "demand.rou.xml"]
+    files = [TOWN / "town.vtypes.add.xml", TOWN / "town.poly.xml", *additional]
+    command += ["-a", ",".join(map(str, files)), "--end", str(end_s)]
+    command += ["--step-length", "0.1", "--seed", "7", "--collision.check-junctions", "true"]
+    command += ["--collision.action", "warn", "--statistic-output", folder / "statistics.xml"]
+    command += ["--no-step-log", "true", *options]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return ET.parse(folder / "statistics.xml").getroot()
+
+
+def test_building_twice_gives_the_same_net(net_path, tmp_path):
+    again = tmp_path / "again.net.xml"
+    build(again)
+
+    def without_header(path):  # the leading comment holds the date and the output's name
+        return path.read_text().split("-->", 1)[1]
+
+    assert without_header(again) == without_header(net_path)
+
+
+def test_every_edge_reaches_every_other(successors):
+    for start in successors:
+        seen, frontier = {start}, [start]
+        while frontier:
+            new = set(successors[frontier.pop()]) - seen
+            seen |= new
+            frontier += new
+        assert seen == set(successors), f"from {start}"
+
+
+def test_no_street_is_a_dead_end(successors):
+    for edge, nexts in successors.items():
+        back = edge[1:] if edge.startswith("-") else "-" + edge
+        assert nexts and back not in nexts
+
+
+def test_projection_puts_the_origin_at_the_centre_of_town(net):
+    pyproj = pytest.importorskip("pyproj")
+    location = net.find("location")
+    project = pyproj.Proj(location.get("projParameter"))
+    offset_x, offset_y = map(float, location.get("netOffset").split(","))
+    assert project(CENTRE_M[0] - offset_x, CENTRE_M[1] - offset_y, inverse=True) == pytest.approx((10.52, 52.26), abs=1e-9)
+    low_lon, low_lat, high_lon, high_lat = map(float, location.get("origBoundary").split(","))
+    assert project(low_lon, low_lat) == pytest.approx((-offset_x, -offset_y), abs=0.1)
+    assert project(high_lon, high_lat) == pytest.approx((SIZE_M[0] - offset_x, SIZE_M[1] - offset_y), abs=0.1)
+
+
+def test_every_arm_of_every_junction_has_a_crossing(net):
+    arms = Counter(e.get("from") for e in net.findall("edge") if e.get("function") is None)
+    crossings = Counter(e.get("id")[1:].rsplit("_", 1)[0] for e in net.findall("edge[@function='crossing']"))
+    assert crossings == arms
+
+
+def test_buildings_stand_clear_of_streets_and_of_each_other(net):
+    """On a raster of 0.5 m: nothing walkable or drivable under a building, no two buildings on one spot."""
+    xs, ys = np.meshgrid(np.arange(0, SIZE_M[0], 0.5), np.arange(0, SIZE_M[1], 0.5))
+    spots = np.c_[xs.ravel(), ys.ravel()]
+    taken = np.zeros(len(spots), dtype=bool)
+    for junction in net.findall("junction"):
+        if junction.get("type") != "internal":
+            taken |= inside(spots, points(junction.get("shape")))
+    for edge in net.findall("edge"):
+        for lane in edge.findall("lane"):
+            corners = np.array(points(lane.get("shape")))
+            if edge.get("function") == "walkingarea":
+                taken |= inside(spots, corners)
+            elif edge.get("function") is None:
+                for a, b in pairwise(corners):
+                    taken |= near(spots, a, b, float(lane.get("width")) / 2)
+    for poly in ET.parse(TOWN / "town.poly.xml").getroot().findall("poly"):
+        covered = inside(spots, points(poly.get("shape")))
+        assert covered.any() and not (covered & taken).any(), poly.get("id")
+        taken |= covered
+        if poly.get("type") == "building":
+            assert float(poly.find("param[@key='height']").get("value")) > 2.0
+
+
+def inside(spots, outline):
+    """Which of `spots` [N, 2] lie inside a polygon; only those within its bounding box are looked at closely."""
+    outline = np.asarray(outline)
+    answer = np.all((spots >= outline.min(axis=0)) & (spots <= outline.max(axis=0)), axis=1)
+    answer[answer] = Outline(outline).contains_points(spots[answer])
+    return answer
+
+
+def near(spots, a, b, reach_m):
+    """Which of `spots` [N, 2] are closer than `reach_m` to the line from `a` to `b`."""
+    along = np.clip((spots - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+    return np.sum((spots - a - along[:, None] * (b - a)) ** 2, axis=1) < reach_m**2
+
+
+@pytest.mark.parametrize("vehicle_type", VEHICLE_TYPES)
+def test_a_vehicle_can_start_on_any_edge(vehicle_type, net_path, successors, tmp_path):
+    demand = "".join(
+        f'<vehicle id="{edge}" type="{vehicle_type}" depart="0"><route edges="{edge} {nexts[0]}"/></vehicle>'
+        for edge, nexts in successors.items()
+    )
+    statistics = simulate(net_path, tmp_path, demand, 2)
+    assert int(statistics.find("vehicles").get("inserted")) == len(successors)
+
+
+def busy_town(successors, seed):
+    """60 vehicles that drive at random for longer than the run, 30 pedestrians that walk from street to street."""
+    rng = random.Random(seed)
+    edges = sorted(successors)
+    demand = []
+    for i, start in enumerate(rng.sample(edges, 52) + rng.sample(edges, 8)):
+        route = [start]
+        while len(route) < 250:
+            route.append(rng.choice(successors[route[-1]]))
+        demand.append(
+            f'<vehicle id="vehicle_{i}" type="town_traffic" depart="{i // 52 * 5}" departPos="random_free">'
+            f'<route edges="{" ".join(route)}"/></vehicle>'
+        )
+    for i in range(30):
+        stops = [rng.choice(edges)]
+        while len(stops) < 12:
+            stops.append(rng.choice([e for e in edges if e != stops[-1]]))
+        walks = "".join(f'<walk from="{a}" to="{b}"/>' for a, b in pairwise(stops))
+        demand.append(f'<person id="walker_{i}" type="pedestrian" depart="5">{walks}</person>')
+    return "".join(demand)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_ten_busy_minutes(seed, net_path, successors, tmp_path):
+    """Three seeds that pass; README.md has the figures over forty, of which a few do not."""
+    fcd, tls = tmp_path / "fcd.xml", tmp_path / "tls.add.xml"
+    signals = [t.get("id") for t in ET.parse(net_path).getroot().findall("tlLogic")]
+    tls.write_text(
+        "<additional>"
+        + "".join(f'<timedEvent type="SaveTLSStates" source="{s}" dest="{tmp_path}/tls.xml"/>' for s in signals)
+        + "</additional>"
+    )
+    options = ["--fcd-output", fcd, "--device.fcd.period", "1"]
+    statistics = simulate(net_path, tmp_path, busy_town(successors, seed), 600, [tls], options)
+
+    assert int(statistics.find("vehicles").get("inserted")) == 60
+    assert int(statistics.find("teleports").get("total")) == 0
+    safety = statistics.find("safety")
+    assert int(safety.get("collisions")) == 0
+
+    speeds, on_crossing = [], set()
+    for step in ET.parse(fcd).getroot():
+        speeds += [float(v.get("speed")) for v in step.findall("vehicle")]
+        on_crossing |= {p.get("id") for p in step.findall("person") if re.fullmatch(r":.*_c\d+", p.get("edge"))}
+    assert np.mean(speeds) > 3.0
+    assert len(on_crossing) == 30
+
+    states = {}
+    for state in ET.parse(tmp_path / "tls.xml").getroot():
+        states.setdefault(state.get("id"), []).append(state.get("state"))
+    assert set(states) == set(signals)
+    for signal, seen in states.items():
+        changes = sum(a != b for a, b in pairwise(seen))
+        assert changes > 30, f"{signal} changed {changes} times"
