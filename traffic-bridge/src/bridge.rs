@@ -1,0 +1,293 @@
+//! The process: episode after episode, SUMO's steps go out as `traffic` and `traffic-meta` messages.
+
+use std::path::Path;
+
+use ipc_schema::{
+    board::State,
+    failure::{Failure, FailureKind},
+    header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    ports::{BoardReader, PortError, Publisher, Waker},
+    process::Process,
+    run::{RunFile, Source},
+    schedule::Episode,
+    services::Channel,
+    session::{Session as Membership, Wait},
+};
+
+use crate::{
+    error::SumoError,
+    frame::Frame,
+    options::Options,
+    pacing::Pacing,
+    population::{Population, Size},
+    session::Session,
+};
+
+/// One process serves one environment.
+const ENV_INDEX: u32 = 0;
+
+/// Runs all episodes of the run named by `run_file`, or until the process is asked to stop.
+///
+/// # Errors
+/// The user's files are wrong, the shared memory is gone, or SUMO fails.
+pub fn run(run_file: &Path) -> Result<(), Failure> {
+    let membership = Membership::join(run_file, Process::TrafficBridge, ENV_INDEX)?;
+    let episodes = membership.run.episodes();
+    let mut bridge = Bridge::open(membership)?;
+    let mut sumo = None;
+    for (place, episode) in episodes.iter().enumerate() {
+        let options = options(&bridge.membership.run, episode)?;
+        let mut session = match sumo.take() {
+            None => Session::start(options)?,
+            Some(previous) => Session::reload(previous, options)?,
+        };
+        bridge.announce(&session, &episodes);
+        let is_last = place + 1 == episodes.len();
+        if bridge.episode(&mut session, episode, is_last)? == Wait::Stopped {
+            return Ok(());
+        }
+        sumo = Some(session);
+    }
+    bridge.leave()
+}
+
+/// What SUMO is to be told for `episode`.
+fn options(run: &RunFile, episode: &Episode) -> Result<Options, SumoError> {
+    let traffic = &run.config.traffic;
+    match &run.source {
+        Source::Population {
+            net_file,
+            additional_files,
+        } => Options::population(&run.sumo_home, net_file, additional_files, traffic.step_s, episode.seed),
+        Source::Scenario { sumocfg } => {
+            let output_dir = run.run_dir.join("sumo");
+            Options::scenario(
+                &run.sumo_home,
+                sumocfg,
+                &output_dir,
+                traffic.step_s,
+                episode.seed,
+                traffic.cav_share,
+            )
+        }
+    }
+}
+
+/// The road users that we put into an empty net; a scenario brings its own.
+fn population(run: &RunFile, session: &mut Session, seed: u64) -> Result<Option<Population>, SumoError> {
+    match run.source {
+        Source::Population { .. } => Population::start(session, Size::from(&run.config.traffic), seed).map(Some),
+        Source::Scenario { .. } => Ok(None),
+    }
+}
+
+/// This process's ports, and how far the run has come.
+struct Bridge {
+    membership: Membership,
+    traffic: Publisher,
+    meta: Publisher,
+    consumer: BoardReader,
+    consumer_wake: Waker,
+    pacing: Pacing,
+    ticks_per_step: u64,
+    /// `traffic-meta` messages sent.
+    meta_messages: u64,
+    /// Ticks sent.
+    ticks: u64,
+    vehicle_steps: u64,
+}
+
+impl Bridge {
+    fn open(membership: Membership) -> Result<Self, Failure> {
+        let traffic = membership.publisher(Channel::Traffic)?;
+        let meta = membership.publisher(Channel::TrafficMeta)?;
+        let consumer = membership.board_of(Process::SimCore)?;
+        let consumer_wake = membership.waker(Process::SimCore)?;
+        let pacing = Pacing::new(membership.run.config.run.real_time_factor);
+        let ticks_per_step = membership.run.ticks_per_traffic_step();
+        Ok(Self {
+            membership,
+            traffic,
+            meta,
+            consumer,
+            consumer_wake,
+            pacing,
+            ticks_per_step,
+            meta_messages: 0,
+            ticks: 0,
+            vehicle_steps: 0,
+        })
+    }
+
+    /// Tells the length of the run.
+    fn announce(&mut self, session: &Session, episodes: &[Episode]) {
+        let per_step = self.ticks_per_step;
+        let scenario = session.duration_s().map_or(0, |duration_s| {
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a number of steps"
+            )]
+            let steps = (duration_s / session.step_s()).ceil() as u64;
+            steps * per_step
+        });
+        let ticks = |episode: &Episode| {
+            episode
+                .ticks
+                .map_or(scenario, |ticks| ticks.div_ceil(per_step) * per_step)
+        };
+        let total_ticks = episodes.iter().map(ticks).sum();
+        self.membership.report(|health| {
+            health.state = State::Running as u32;
+            health.total_ticks = total_ticks;
+        });
+    }
+
+    /// Runs one episode to its end.
+    fn episode(&mut self, session: &mut Session, episode: &Episode, is_last: bool) -> Result<Wait, Failure> {
+        let mut population = population(&self.membership.run, session, episode.seed)?;
+        let mut frame = Frame::default();
+        loop {
+            let tick = self.ticks + self.ticks_per_step - 1;
+            if self.may_send(tick, session.step_s())? == Wait::Stopped {
+                return Ok(Wait::Stopped);
+            }
+            session.step(&mut frame)?;
+            let ends = self.ends(session, episode, &frame)?;
+            self.publish(
+                &frame,
+                self.header(episode, &frame, tick, session.step_s(), ends, is_last),
+            )?;
+            if ends {
+                return Ok(Wait::Ready);
+            }
+            if let Some(population) = &mut population {
+                population.after_step(session, &frame)?;
+            }
+        }
+    }
+
+    /// Waits for credit up to `tick`, and for its time if the run is paced.
+    fn may_send(&mut self, tick: u64, step_s: f64) -> Result<Wait, Failure> {
+        match self.membership.wait_for_credit(&self.consumer, tick)? {
+            Wait::Ready => Ok(self.pacing.wait(&self.membership, step_s)?),
+            Wait::Stopped => Ok(Wait::Stopped),
+        }
+    }
+
+    fn ends(&self, session: &Session, episode: &Episode, frame: &Frame) -> Result<bool, SumoError> {
+        let full = episode
+            .ticks
+            .is_some_and(|ticks| frame.step * self.ticks_per_step >= ticks);
+        match self.membership.run.source {
+            Source::Population { .. } => Ok(full),
+            Source::Scenario { .. } => Ok(full || session.finished()?),
+        }
+    }
+
+    fn header(
+        &self,
+        episode: &Episode,
+        frame: &Frame,
+        tick: u64,
+        step_s: f64,
+        ends: bool,
+        is_last: bool,
+    ) -> MessageHeader {
+        let flag = |bit: u32, is_set: bool| if is_set { bit } else { 0 };
+        MessageHeader {
+            flags: flag(EVALUATION, episode.evaluation)
+                | flag(FIRST_OF_EPISODE, frame.step == 1)
+                | flag(LAST_OF_EPISODE, ends)
+                | flag(LAST_OF_RUN, ends && is_last),
+            episode: episode.index,
+            episode_seed: episode.seed,
+            tick,
+            sim_time_ns: frame.step * nanoseconds(step_s),
+            ..self.membership.header()
+        }
+    }
+
+    /// Sends one step: first what happened, then where everybody is.
+    fn publish(&mut self, frame: &Frame, header: MessageHeader) -> Result<(), Failure> {
+        if !frame.events.is_empty() {
+            self.meta_messages += 1;
+            let header = MessageHeader {
+                sequence: self.meta_messages,
+                ..header
+            };
+            send(
+                &self.meta,
+                header,
+                frame.events.len(),
+                bytemuck::cast_slice(&frame.events),
+            )?;
+        }
+        let header = MessageHeader {
+            sequence: self.meta_messages,
+            ..header
+        };
+        send(
+            &self.traffic,
+            header,
+            frame.states.len(),
+            bytemuck::cast_slice(&frame.states),
+        )?;
+        self.consumer_wake.wake();
+        self.ticks += self.ticks_per_step;
+        self.vehicle_steps += frame.states.len() as u64;
+        self.report(frame, &header);
+        Ok(())
+    }
+
+    fn report(&mut self, frame: &Frame, header: &MessageHeader) {
+        let (ticks, vehicle_steps) = (self.ticks, self.vehicle_steps);
+        let drops = self.traffic.drops() + self.meta.drops();
+        self.membership.report(|health| {
+            health.ticks = ticks;
+            health.episode = header.episode;
+            health.sim_time_ns = header.sim_time_ns;
+            health.road_users = header.count;
+            health.cavs = frame.cavs;
+            health.vehicle_steps = vehicle_steps;
+            health.drops = drops;
+        });
+    }
+
+    /// Leaves once everything sent has been consumed.
+    fn leave(mut self) -> Result<(), Failure> {
+        if self.membership.wait_until_consumed(&self.consumer, self.ticks)? == Wait::Ready {
+            self.membership.report(|health| health.state = State::Done as u32);
+        }
+        Ok(())
+    }
+}
+
+fn send(publisher: &Publisher, header: MessageHeader, rows: usize, bytes: &[u8]) -> Result<(), Failure> {
+    let count = u32::try_from(rows).unwrap_or(u32::MAX);
+    let mut draft = publisher
+        .loan(MessageHeader { count, ..header }, bytes.len())
+        .map_err(too_many)?;
+    draft.payload_mut().copy_from_slice(bytes);
+    draft.send()?;
+    Ok(())
+}
+
+/// More road users than the user made room for is for the user to settle.
+fn too_many(error: PortError) -> Failure {
+    match &error {
+        PortError::TooLong { .. } => Failure::from_error(FailureKind::Config, &error)
+            .with_help("raise `traffic.max_road_users`, or use a scenario with fewer road users at a time"),
+        _ => error.into(),
+    }
+}
+
+fn nanoseconds(seconds: f64) -> u64 {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a step is positive and short"
+    )]
+    let nanoseconds = (seconds * 1e9).round() as u64;
+    nanoseconds
+}

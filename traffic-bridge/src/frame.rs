@@ -1,0 +1,118 @@
+//! One SUMO step in our units.
+
+use std::collections::BTreeMap;
+
+use ipc_schema::traffic::{Kind, MetaEvent, TrafficState, VehicleMeta};
+
+use crate::{
+    convention,
+    fleet::Fleet,
+    sumo::ffi::{RawEvent, RawEventKind, RawState},
+};
+
+/// Everybody on the road after one SUMO step, and what happened in it. Reused from step to step.
+#[derive(Debug, Clone, Default)]
+pub struct Frame {
+    /// Everybody on the road, by ascending dense index.
+    pub states: Vec<TrafficState>,
+    /// Arrivals, departures and teleports of this step.
+    pub events: Vec<VehicleMeta>,
+    /// Simulated time since the start of the episode, seconds.
+    pub time_s: f64,
+    /// SUMO steps since the start of the episode.
+    pub step: u64,
+    /// Connected vehicles among `states`.
+    pub cavs: u32,
+}
+
+/// What was told about road users at their departure and is needed again, for one episode.
+#[derive(Debug)]
+pub(crate) struct Register {
+    fleet: Fleet,
+    kinds: Vec<Kind>,
+    types: BTreeMap<String, u32>,
+}
+
+impl Register {
+    pub(crate) fn new(fleet: Fleet) -> Self {
+        Self {
+            fleet,
+            kinds: Vec::new(),
+            types: BTreeMap::new(),
+        }
+    }
+
+    /// Replaces states and events of `frame`.
+    pub(crate) fn fill(&mut self, frame: &mut Frame, states: &[RawState], events: &[RawEvent], step_s: f64) {
+        frame.events.clear();
+        frame.events.extend(events.iter().map(|event| self.meta(event)));
+        frame.states.clear();
+        frame.cavs = 0;
+        for raw in states {
+            let kind = self.kind(raw.index);
+            if let Some(state) = convention::traffic_state(raw, kind, step_s) {
+                frame.cavs += u32::from(kind == Kind::Cav);
+                frame.states.push(state);
+            }
+        }
+    }
+
+    fn kind(&self, index: u32) -> Kind {
+        self.kinds.get(index as usize).copied().unwrap_or(Kind::Other)
+    }
+
+    fn meta(&mut self, event: &RawEvent) -> VehicleMeta {
+        let departed = event.kind == RawEventKind::Departed;
+        if departed {
+            // Indices are given in order of departure, without gaps.
+            self.kinds.push(if event.is_person {
+                Kind::Person
+            } else {
+                self.fleet.kind_of_vehicle(&event.id)
+            });
+        }
+        let mut meta = VehicleMeta {
+            id_hash: 0,
+            vehicle: event.index,
+            event: meta_event(event.kind) as u32,
+            kind: self.kind(event.index) as u32,
+            type_index: if departed {
+                self.type_index(&event.vehicle_type)
+            } else {
+                0
+            },
+            length_m: convention::single(event.length),
+            width_m: convention::single(event.width),
+            height_m: convention::single(event.height),
+            id_len: 0,
+            id: [0; ipc_schema::traffic::ID_BYTES],
+            vehicle_class: class_bytes(&event.vehicle_class),
+        };
+        meta.set_id(&event.id);
+        meta
+    }
+
+    fn type_index(&mut self, vehicle_type: &str) -> u32 {
+        if let Some(index) = self.types.get(vehicle_type) {
+            return *index;
+        }
+        let index = u32::try_from(self.types.len()).unwrap_or(u32::MAX);
+        self.types.insert(vehicle_type.to_owned(), index);
+        index
+    }
+}
+
+fn meta_event(kind: RawEventKind) -> MetaEvent {
+    match kind {
+        RawEventKind::Arrived => MetaEvent::Arrived,
+        RawEventKind::Teleported => MetaEvent::Teleported,
+        _ => MetaEvent::Departed,
+    }
+}
+
+fn class_bytes(class: &str) -> [u8; 16] {
+    let mut bytes = [0; 16];
+    let len = class.len().min(bytes.len());
+    bytes[..len].copy_from_slice(&class.as_bytes()[..len]);
+    bytes
+}

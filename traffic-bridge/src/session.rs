@@ -1,0 +1,279 @@
+//! SUMO as a value. A [`Session`] is a running simulation: starting gives one, closing or reloading consumes it, and
+//! there is at most one in a process because libsumo keeps its simulation in global variables.
+
+use std::{
+    path::Path,
+    pin::Pin,
+    sync::atomic::{AtomicBool, Ordering},
+};
+
+use cxx::UniquePtr;
+
+use crate::{
+    error::SumoError,
+    frame::{Frame, Register},
+    inputs::InputFiles,
+    options::Options,
+    sumo::ffi,
+};
+
+/// True while a session holds libsumo's global simulation.
+static TAKEN: AtomicBool = AtomicBool::new(false);
+
+/// libsumo says only this when it has already told standard error what is wrong.
+const SAYS_NOTHING: &str = "Process Error";
+
+/// Holds libsumo for one session.
+#[derive(Debug)]
+struct Claim;
+
+impl Claim {
+    fn take() -> Result<Self, SumoError> {
+        if TAKEN.swap(true, Ordering::AcqRel) {
+            Err(SumoError::AlreadyRunning)
+        } else {
+            Ok(Self)
+        }
+    }
+}
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        TAKEN.store(false, Ordering::Release);
+    }
+}
+
+/// Where processor time went, seconds since the session started.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Cost {
+    /// SUMO's own steps.
+    pub step_s: f64,
+    /// Finding out what happened and where everybody is.
+    pub getters_s: f64,
+}
+
+/// A running simulation. Not `Send`: libsumo stays on the thread that started it.
+pub struct Session {
+    sumo: UniquePtr<ffi::Simulation>,
+    register: Register,
+    files: InputFiles,
+    step_s: f64,
+    begin_s: f64,
+    end_s: f64,
+    steps: u64,
+    // Last: dropped after `sumo`, whose destructor still uses libsumo.
+    claim: Claim,
+}
+
+impl std::fmt::Debug for Session {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Session")
+            .field("files", &self.files)
+            .field("steps", &self.steps)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Session {
+    /// Starts SUMO. Sets `SUMO_HOME`, `PROJ_DATA` and `PROJ_LIB` of this process: no other thread may be reading the environment.
+    ///
+    /// # Errors
+    /// Another session is running, or SUMO refuses its input.
+    pub fn start(options: Options) -> Result<Self, SumoError> {
+        let claim = Claim::take()?;
+        set_environment(&options.sumo_home);
+        Self::begin(ffi::new_simulation(), claim, options)
+    }
+
+    /// Ends this simulation and starts another in its place: a new episode, where dense indices begin at 0 again.
+    ///
+    /// # Errors
+    /// SUMO refuses its input; no session is running then.
+    pub fn reload(mut self, options: Options) -> Result<Self, SumoError> {
+        called("end the simulation", self.sumo.pin_mut().close())?;
+        Self::begin(self.sumo, self.claim, options)
+    }
+
+    /// Ends the simulation and completes its output files. Dropping the session does the same but says nothing.
+    ///
+    /// # Errors
+    /// SUMO cannot finish its outputs.
+    pub fn close(mut self) -> Result<(), SumoError> {
+        called("end the simulation", self.sumo.pin_mut().close())
+    }
+
+    fn begin(mut sumo: UniquePtr<ffi::Simulation>, claim: Claim, options: Options) -> Result<Self, SumoError> {
+        sumo.pin_mut().take_messages();
+        if let Err(error) = sumo.pin_mut().start(&options.arguments) {
+            let reason = reason(&error, &sumo.pin_mut().take_messages());
+            return Err(SumoError::Refused {
+                place: options.files.place_of(&reason),
+                reason,
+            });
+        }
+        let step_s = called("tell its step", sumo.step_length())?;
+        let begin_s = called("tell the time", sumo.time())?;
+        let end_s = called("tell its end", sumo.end_time())?;
+        let register = Register::new(options.fleet);
+        Ok(Self {
+            sumo,
+            register,
+            files: options.files,
+            step_s,
+            begin_s,
+            end_s,
+            steps: 0,
+            claim,
+        })
+    }
+
+    /// Runs one step and replaces the content of `frame`, whose buffers are reused.
+    ///
+    /// # Errors
+    /// SUMO fails, for instance at an input file that it reads as it goes.
+    pub fn step(&mut self, frame: &mut Frame) -> Result<(), SumoError> {
+        if let Err(error) = self.sumo.pin_mut().step() {
+            let reason = reason(&error, &self.sumo.pin_mut().take_messages());
+            let time_s = self.sumo.time().unwrap_or(self.begin_s);
+            return Err(SumoError::Step {
+                time_s,
+                place: self.files.place_of(&reason),
+                reason,
+            });
+        }
+        self.steps += 1;
+        frame.step = self.steps;
+        frame.time_s = self.time_s()?;
+        self.register
+            .fill(frame, self.sumo.states(), self.sumo.events(), self.step_s);
+        Ok(())
+    }
+
+    /// Simulated time since the start of the episode, seconds.
+    ///
+    /// # Errors
+    /// SUMO is not loaded any more.
+    pub fn time_s(&self) -> Result<f64, SumoError> {
+        Ok(called("tell the time", self.sumo.time())? - self.begin_s)
+    }
+
+    /// Length of a step, seconds.
+    #[must_use]
+    pub fn step_s(&self) -> f64 {
+        self.step_s
+    }
+
+    /// Length of the episode by the scenario's own `end`, seconds; `None` if it names none.
+    #[must_use]
+    pub fn duration_s(&self) -> Option<f64> {
+        (self.end_s >= 0.0).then_some(self.end_s - self.begin_s)
+    }
+
+    /// True once `sumo` would end by itself: at the scenario's end or, if it names none, when nobody is left or expected.
+    ///
+    /// # Errors
+    /// SUMO is not loaded any more.
+    pub fn finished(&self) -> Result<bool, SumoError> {
+        match self.duration_s() {
+            Some(duration_s) => Ok(self.time_s()? >= duration_s),
+            None => Ok(self.min_expected()? == 0),
+        }
+    }
+
+    /// Road users on the road or known to come; 0 means that the scenario is over.
+    ///
+    /// # Errors
+    /// SUMO is not loaded any more.
+    pub fn min_expected(&self) -> Result<u32, SumoError> {
+        let expected = called("count road users", self.sumo.min_expected())?;
+        Ok(u32::try_from(expected).unwrap_or(0))
+    }
+
+    /// Processor time spent so far, over all reloads.
+    #[must_use]
+    pub fn cost(&self) -> Cost {
+        Cost {
+            step_s: self.sumo.seconds_in_step(),
+            getters_s: self.sumo.seconds_in_getters(),
+        }
+    }
+
+    /// The files this simulation was started from.
+    #[must_use]
+    pub fn files(&self) -> &InputFiles {
+        &self.files
+    }
+
+    pub(crate) fn sumo(&self) -> &ffi::Simulation {
+        &self.sumo
+    }
+
+    pub(crate) fn sumo_mut(&mut self) -> Pin<&mut ffi::Simulation> {
+        self.sumo.pin_mut()
+    }
+}
+
+/// Processor time of this thread, seconds.
+#[must_use]
+pub fn processor_time_s() -> f64 {
+    ffi::processor_seconds()
+}
+
+/// Turns the failure of a call into an error that says what was wanted.
+pub(crate) fn called<T>(action: &'static str, result: Result<T, cxx::Exception>) -> Result<T, SumoError> {
+    result.map_err(|error| SumoError::Call {
+        action,
+        reason: error.what().trim().to_owned(),
+    })
+}
+
+fn set_environment(sumo_home: &Path) {
+    ffi::set_environment("SUMO_HOME", &sumo_home.to_string_lossy());
+    // PROJ before 9.1 reads the second name; the wheel sets both.
+    for name in ["PROJ_DATA", "PROJ_LIB"] {
+        ffi::set_environment(name, &sumo_home.join("data/proj").to_string_lossy());
+    }
+}
+
+/// What SUMO has to say: the exception and the errors (not the warnings) it wrote before, on one line.
+fn reason(error: &cxx::Exception, messages: &str) -> String {
+    let errors = errors_in(messages);
+    let what = error.what().trim();
+    let parts: &[&str] = match (what, errors.as_str()) {
+        (SAYS_NOTHING, "") => &["no reason given, see the log"],
+        (SAYS_NOTHING, errors) => &[errors],
+        (what, "") => &[what],
+        (what, errors) => &[what, errors],
+    };
+    parts.join(" ").split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+fn errors_in(messages: &str) -> String {
+    let mut is_error = false;
+    let mut errors = String::new();
+    for line in messages.lines() {
+        if line.starts_with("Warning:") {
+            is_error = false;
+        }
+        if let Some(error) = line.strip_prefix("Error:") {
+            is_error = true;
+            errors.push_str(error);
+        } else if is_error {
+            errors.push_str(line);
+        }
+        errors.push(' ');
+    }
+    errors.trim().to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::errors_in;
+
+    #[test]
+    fn errors_are_told_from_warnings() {
+        let messages = "Warning: w1\n more of w1\nError: e1\n more of e1\nWarning: w2\nError: e2\n";
+        let words: Vec<_> = errors_in(messages).split_whitespace().map(str::to_owned).collect();
+        assert_eq!(words.join(" "), "e1 more of e1 e2");
+    }
+}

@@ -1,0 +1,264 @@
+// The life of the simulation, and the one pass of getters after each step.
+#include "traffic-bridge/src/shim.h"
+
+#include <cstdlib>
+#include <ctime>
+#include <utility>
+
+#include <libsumo/libsumo.h>
+
+#include "traffic-bridge/src/error_tee.h"
+#include "traffic-bridge/src/sumo.rs.h"
+#include "traffic-bridge/src/text.h"
+
+namespace caraware {
+
+// Signals change slowly: each vehicle's are read once in this many steps.
+constexpr std::uint64_t SIGNAL_PERIOD_STEPS = 4;
+
+namespace {
+
+bool net_has_elevation() {
+    for (const std::string& lane : libsumo::Lane::getIDList()) {
+        for (const libsumo::TraCIPosition& point : libsumo::Lane::getShape(lane).value) {
+            if (point.z != 0.0 && point.z != libsumo::INVALID_DOUBLE_VALUE) {
+                return true;
+            }
+        }
+    }
+    return false;
+}
+
+RawEvent event(RawEventKind kind, std::uint32_t index, bool is_person, const std::string& id) {
+    return RawEvent{kind, index, is_person, rust::String::lossy(id), rust::String(), rust::String(), 0.0, 0.0, 0.0};
+}
+
+template <typename Species>
+void describe(RawEvent& departure, const std::string& id) {
+    departure.vehicle_type = rust::String::lossy(Species::getTypeID(id));
+    departure.vehicle_class = rust::String::lossy(Species::getVehicleClass(id));
+    departure.length = Species::getLength(id);
+    departure.width = Species::getWidth(id);
+    departure.height = Species::getHeight(id);
+}
+
+}  // namespace
+
+Simulation::Simulation() : errors_(std::make_unique<ErrorTee>()) {}
+
+Simulation::~Simulation() {
+    try {
+        close();
+    } catch (const std::exception&) {
+        // Nobody is left to tell; SUMO has written its reason to standard error.
+    }
+}
+
+void Simulation::start(rust::Slice<const rust::String> arguments) {
+    std::vector<std::string> command{"sumo"};
+    const std::vector<std::string> options = texts(arguments);
+    command.insert(command.end(), options.begin(), options.end());
+    libsumo::Simulation::start(command);
+    live_.clear();
+    states_.clear();
+    events_.clear();
+    vehicle_places_.clear();
+    person_places_.clear();
+    next_index_ = 0;
+    steps_ = 0;
+    any_gone_ = false;
+    has_elevation_ = net_has_elevation();
+}
+
+void Simulation::close() {
+    if (libsumo::Simulation::isLoaded()) {
+        libsumo::Simulation::close("");
+    }
+}
+
+void Simulation::step() {
+    const double start = processor_seconds();
+    libsumo::Simulation::step();
+    const double stepped = processor_seconds();
+    events_.clear();
+    // SUMO moves first and inserts last: an id that arrives and departs in one step has arrived before.
+    note_arrivals();
+    note_departures();
+    note_teleports();
+    read_all();
+    ++steps_;
+    seconds_in_step_ += stepped - start;
+    seconds_in_getters_ += processor_seconds() - stepped;
+}
+
+void Simulation::note_arrivals() {
+    for (const std::string& id : libsumo::Simulation::getArrivedIDList()) {
+        if (const auto place = vehicle_places_.find(id); place != vehicle_places_.end()) {
+            arrive(place->second);
+        }
+    }
+    for (const std::string& id : libsumo::Simulation::getArrivedPersonIDList()) {
+        if (const auto place = person_places_.find(id); place != person_places_.end()) {
+            arrive(place->second);
+        }
+    }
+    forget_gone();
+}
+
+void Simulation::note_departures() {
+    for (const std::string& id : libsumo::Simulation::getDepartedIDList()) {
+        depart(id, false);
+    }
+    for (const std::string& id : libsumo::Simulation::getDepartedPersonIDList()) {
+        depart(id, true);
+    }
+}
+
+void Simulation::note_teleports() {
+    for (const std::string& id : libsumo::Simulation::getStartingTeleportIDList()) {
+        if (const auto place = vehicle_places_.find(id); place != vehicle_places_.end()) {
+            RawState& state = states_[place->second];
+            state.speed = libsumo::INVALID_DOUBLE_VALUE;
+            events_.push_back(event(RawEventKind::Teleported, state.index, false, id));
+        }
+    }
+}
+
+void Simulation::depart(const std::string& id, bool is_person) {
+    auto& places = is_person ? person_places_ : vehicle_places_;
+    if (places.count(id) > 0) {
+        return;
+    }
+    RawEvent departure = event(RawEventKind::Departed, next_index_, is_person, id);
+    try {
+        if (is_person) {
+            describe<libsumo::Person>(departure, id);
+        } else {
+            describe<libsumo::Vehicle>(departure, id);
+        }
+    } catch (const libsumo::TraCIException&) {
+        return;  // Departed and gone within the step.
+    }
+    const double invalid = libsumo::INVALID_DOUBLE_VALUE;
+    places.emplace(id, live_.size());
+    live_.push_back(Live{id, is_person, false});
+    states_.push_back(RawState{invalid, invalid, 0.0, 0.0, 0.0, invalid, invalid, 0, next_index_});
+    events_.push_back(std::move(departure));
+    ++next_index_;
+}
+
+void Simulation::arrive(std::size_t place) {
+    Live& road_user = live_[place];
+    if (!road_user.gone) {
+        road_user.gone = true;
+        any_gone_ = true;
+        events_.push_back(event(RawEventKind::Arrived, states_[place].index, road_user.is_person, road_user.id));
+    }
+}
+
+void Simulation::read_vehicle(const std::string& id, RawState& state) const {
+    const libsumo::TraCIPosition position = libsumo::Vehicle::getPosition3D(id);
+    state.previous_speed = state.speed;
+    state.x = position.x;
+    state.y = position.y;
+    state.z = position.z;
+    state.angle = libsumo::Vehicle::getAngle(id);
+    state.speed = libsumo::Vehicle::getSpeed(id);
+    if (position.x == libsumo::INVALID_DOUBLE_VALUE) {
+        return;
+    }
+    if (has_elevation_) {
+        state.slope = libsumo::Vehicle::getSlope(id);
+    }
+    if ((steps_ + state.index) % SIGNAL_PERIOD_STEPS == 0) {
+        state.signals = libsumo::Vehicle::getSignals(id);
+    }
+}
+
+void Simulation::read_person(const std::string& id, RawState& state) const {
+    // Whoever sits in a vehicle is not a road user of their own.
+    const bool afoot = libsumo::Person::getVehicle(id).empty();
+    const libsumo::TraCIPosition position = afoot ? libsumo::Person::getPosition3D(id) : libsumo::TraCIPosition();
+    state.previous_speed = state.speed;
+    state.x = position.x;
+    state.y = position.y;
+    state.z = position.z;
+    if (position.x == libsumo::INVALID_DOUBLE_VALUE) {
+        state.speed = libsumo::INVALID_DOUBLE_VALUE;
+        return;
+    }
+    state.angle = libsumo::Person::getAngle(id);
+    state.speed = libsumo::Person::getSpeed(id);
+    if (has_elevation_) {
+        state.slope = libsumo::Person::getSlope(id);
+    }
+}
+
+void Simulation::read_all() {
+    for (std::size_t place = 0; place < live_.size(); ++place) {
+        const Live& road_user = live_[place];
+        try {
+            if (road_user.is_person) {
+                read_person(road_user.id, states_[place]);
+            } else {
+                read_vehicle(road_user.id, states_[place]);
+            }
+        } catch (const libsumo::TraCIException&) {
+            arrive(place);  // Removed without having been in the list of arrivals.
+        }
+    }
+    forget_gone();
+}
+
+void Simulation::forget_gone() {
+    if (!any_gone_) {
+        return;
+    }
+    std::size_t kept = 0;
+    for (std::size_t place = 0; place < live_.size(); ++place) {
+        auto& places = live_[place].is_person ? person_places_ : vehicle_places_;
+        if (live_[place].gone) {
+            places.erase(live_[place].id);
+            continue;
+        }
+        if (kept != place) {
+            places[live_[place].id] = kept;
+            live_[kept] = std::move(live_[place]);
+            states_[kept] = states_[place];
+        }
+        ++kept;
+    }
+    live_.erase(live_.begin() + static_cast<std::ptrdiff_t>(kept), live_.end());
+    states_.erase(states_.begin() + static_cast<std::ptrdiff_t>(kept), states_.end());
+    any_gone_ = false;
+}
+
+rust::Slice<const RawState> Simulation::states() const { return {states_.data(), states_.size()}; }
+
+rust::Slice<const RawEvent> Simulation::events() const { return {events_.data(), events_.size()}; }
+
+rust::String Simulation::take_messages() { return rust::String::lossy(errors_->take()); }
+
+double Simulation::seconds_in_step() const { return seconds_in_step_; }
+
+double Simulation::seconds_in_getters() const { return seconds_in_getters_; }
+
+double Simulation::time() const { return libsumo::Simulation::getTime(); }
+
+double Simulation::end_time() const { return libsumo::Simulation::getEndTime(); }
+
+double Simulation::step_length() const { return libsumo::Simulation::getDeltaT(); }
+
+std::int32_t Simulation::min_expected() const { return libsumo::Simulation::getMinExpectedNumber(); }
+
+double processor_seconds() {
+    timespec now{};
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now);
+    return static_cast<double>(now.tv_sec) + 1e-9 * static_cast<double>(now.tv_nsec);
+}
+
+std::unique_ptr<Simulation> new_simulation() { return std::make_unique<Simulation>(); }
+
+void set_environment(rust::Str name, rust::Str value) { setenv(text(name).c_str(), text(value).c_str(), 1); }
+
+}  // namespace caraware

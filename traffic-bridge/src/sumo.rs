@@ -1,0 +1,124 @@
+//! The whole foreign surface: everything C++ sees of us and we see of SUMO. Values are as SUMO gives them; only
+//! [`crate::convention`] turns them into ours.
+
+#![expect(unsafe_code, reason = "cxx generates the calls; the shim's contract is in shim.h")]
+#![expect(
+    missing_docs,
+    reason = "cxx makes items of its own; ours say what is not in their names"
+)]
+#![expect(unused_qualifications, reason = "in code that cxx generates")]
+
+// SAFETY: `Simulation` is the only owner of libsumo's global state (`session` keeps one per process and never sends it
+// to another thread), every call throws `std::exception` or returns, and slices live as long as the borrow of `Simulation`.
+#[cxx::bridge(namespace = "caraware")]
+pub mod ffi {
+    /// A road user after a step, as SUMO sees it. Off the road its position is SUMO's "invalid" value.
+    #[derive(Debug, Clone, Copy, PartialEq)]
+    struct RawState {
+        x: f64,
+        y: f64,
+        z: f64,
+        /// Degrees clockwise from north.
+        angle: f64,
+        /// Degrees, positive uphill.
+        slope: f64,
+        /// m/s.
+        speed: f64,
+        /// Speed after the step before; SUMO's "invalid" value if it was not on the road or jumped since.
+        previous_speed: f64,
+        signals: i32,
+        /// Dense index within the episode.
+        index: u32,
+    }
+
+    /// What happened to a road user.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    enum RawEventKind {
+        Departed,
+        Arrived,
+        Teleported,
+    }
+
+    /// Something happened to a road user; all after `id` is filled for departures only.
+    #[derive(Debug, Clone, PartialEq)]
+    struct RawEvent {
+        kind: RawEventKind,
+        index: u32,
+        is_person: bool,
+        id: String,
+        vehicle_type: String,
+        vehicle_class: String,
+        length: f64,
+        width: f64,
+        height: f64,
+    }
+
+    /// A road that a class of road users may use.
+    #[derive(Debug, Clone, PartialEq)]
+    struct RawEdge {
+        id: String,
+        /// Metres.
+        length: f64,
+        /// m/s.
+        speed_limit: f64,
+    }
+
+    /// A way from one road to another for a class of road users.
+    #[derive(Debug, Clone, PartialEq)]
+    struct RawLink {
+        from: String,
+        to: String,
+    }
+
+    unsafe extern "C++" {
+        include!("traffic-bridge/src/shim.h");
+
+        /// SUMO, loaded or not.
+        type Simulation;
+
+        fn new_simulation() -> UniquePtr<Simulation>;
+        /// Sets an environment variable of this process, as SUMO and PROJ read it.
+        fn set_environment(name: &str, value: &str);
+
+        fn start(self: Pin<&mut Simulation>, arguments: &[String]) -> Result<()>;
+        /// Ends the simulation; its output files are complete afterwards.
+        fn close(self: Pin<&mut Simulation>) -> Result<()>;
+        /// One simulation step and one pass of getters over everybody alive.
+        fn step(self: Pin<&mut Simulation>) -> Result<()>;
+        /// Everybody alive after the last step, ordered by index.
+        fn states(self: &Simulation) -> &[RawState];
+        /// What happened in the last step.
+        fn events(self: &Simulation) -> &[RawEvent];
+        /// What SUMO wrote to standard error since the last call (the last few kilobytes).
+        fn take_messages(self: Pin<&mut Simulation>) -> String;
+        /// Processor time of this thread, seconds.
+        fn processor_seconds() -> f64;
+        /// Processor time spent in SUMO's own step and in the pass of getters since the start, seconds.
+        fn seconds_in_step(self: &Simulation) -> f64;
+        fn seconds_in_getters(self: &Simulation) -> f64;
+
+        fn time(self: &Simulation) -> Result<f64>;
+        fn end_time(self: &Simulation) -> Result<f64>;
+        fn step_length(self: &Simulation) -> Result<f64>;
+        fn min_expected(self: &Simulation) -> Result<i32>;
+
+        fn vehicle_class(self: &Simulation, vehicle_type: &str) -> Result<String>;
+        fn edges(self: &Simulation, vehicle_class: &str) -> Result<Vec<RawEdge>>;
+        fn links(self: &Simulation, vehicle_class: &str) -> Result<Vec<RawLink>>;
+
+        /// Adds a vehicle on a free place of the first edge of `route`, at the speed of traffic there.
+        fn add_vehicle(self: Pin<&mut Simulation>, id: &str, vehicle_type: &str, route: &[String]) -> Result<()>;
+        fn remove_vehicle(self: Pin<&mut Simulation>, id: &str) -> Result<()>;
+        /// Index of the edge of its route where the vehicle is; negative before it departs.
+        fn route_index(self: &Simulation, id: &str) -> Result<i32>;
+        /// Continues the vehicle's route by `more`, which begins with its last edge.
+        fn extend_route(self: Pin<&mut Simulation>, id: &str, more: &[String]) -> Result<()>;
+
+        /// Walk along sidewalks and crossings, both ends included; empty if there is none.
+        fn walk(self: &Simulation, from: &str, from_position: f64, to: &str, to_position: f64) -> Result<Vec<String>>;
+        fn add_person(self: Pin<&mut Simulation>, id: &str, person_type: &str, edge: &str, position: f64)
+        -> Result<()>;
+        fn append_walk(self: Pin<&mut Simulation>, id: &str, edges: &[String], arrival_position: f64) -> Result<()>;
+        fn remaining_stages(self: &Simulation, id: &str) -> Result<i32>;
+    }
+}

@@ -1,0 +1,8 @@
+//! The crate over real SUMO, with nets built by the wheel's own tools.
+#![expect(clippy::unwrap_used, reason = "tests assert by unwrapping, their helpers too")]
+
+mod population;
+mod process;
+mod scenario;
+mod session;
+mod support;

@@ -1,0 +1,47 @@
+//! SUMO's own scenario A10KW: a Berlin motorway whose additional files write their results beside themselves.
+
+use std::{collections::BTreeSet, path::Path, time::SystemTime};
+
+use crate::support::{Bench, run, sumo_home};
+use traffic_bridge::{options::Options, session::Session};
+
+/// Files below `folder` with their times of change.
+fn listing(folder: &Path) -> BTreeSet<(std::path::PathBuf, SystemTime)> {
+    let mut found = BTreeSet::new();
+    for entry in std::fs::read_dir(folder).unwrap().map(Result::unwrap) {
+        if entry.file_type().unwrap().is_dir() {
+            found.append(&mut listing(&entry.path()));
+        } else {
+            found.insert((entry.path(), entry.metadata().unwrap().modified().unwrap()));
+        }
+    }
+    found
+}
+
+#[test]
+fn a10kw_runs_and_writes_into_the_run_directory_alone() {
+    let bench = Bench::new();
+    let games = sumo_home().join("tools/game");
+    let before = listing(&games);
+    let output = bench.folder.path().join("sumo");
+    let options = Options::scenario(&sumo_home(), &games.join("A10KW.sumocfg"), &output, 0.5, 23423, 1.0).unwrap();
+    let mut session = Session::start(options).unwrap();
+    assert_eq!((session.step_s(), session.duration_s()), (0.5, Some(1800.0)));
+    let (mut most, mut vehicle_steps) = (0, 0);
+    run(&mut session, 120, |_, frame| {
+        most = most.max(frame.states.len());
+        vehicle_steps += frame.states.len();
+        assert!(
+            frame
+                .states
+                .iter()
+                .all(|state| state.front_x_m.is_finite() && state.yaw_rad.is_finite())
+        );
+    });
+    assert!(most > 50, "{most}");
+    session.close().unwrap();
+    assert_eq!(listing(&games), before, "nothing was written into the wheel");
+    let written: Vec<_> = listing(&output).into_iter().map(|(path, _)| path).collect();
+    assert_eq!(written, [output.join("netstate.xml"), output.join("tlsstate.xml")]);
+    println!("{vehicle_steps} vehicle-steps");
+}

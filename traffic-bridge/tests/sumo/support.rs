@@ -1,0 +1,109 @@
+//! What the tests of real SUMO share: nets built by the wheel's own tools, and one simulation at a time.
+
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+    sync::{Mutex, MutexGuard, PoisonError},
+};
+
+use tempfile::TempDir;
+use traffic_bridge::{frame::Frame, options::Options, session::Session};
+
+/// Tests run as threads of one process, SUMO runs once in a process: they take turns.
+static TURN: Mutex<()> = Mutex::new(());
+
+/// A place with nets, and the turn to run SUMO.
+pub struct Bench {
+    pub folder: TempDir,
+    _turn: MutexGuard<'static, ()>,
+}
+
+/// Where the wheel is.
+pub fn sumo_home() -> PathBuf {
+    PathBuf::from(env!("CARAWARE_BUILD_SUMO_HOME"))
+}
+
+impl Bench {
+    pub fn new() -> Self {
+        let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+        Self {
+            folder: tempfile::tempdir().unwrap(),
+            _turn,
+        }
+    }
+
+    /// A grid of 5 × 5 junctions, 100 m apart, with signals, sidewalks and crossings.
+    pub fn grid(&self) -> PathBuf {
+        let net = self.folder.path().join("grid.net.xml");
+        let options = [
+            "--grid",
+            "--grid.number",
+            "5",
+            "--grid.length",
+            "100",
+            "--sidewalks.guess",
+            "--crossings.guess",
+        ];
+        let status = tool("netgenerate")
+            .args(options)
+            .args([
+                "--default.lanenumber",
+                "2",
+                "--tls.guess",
+                "--no-turnarounds.tls",
+                "--output-file",
+            ])
+            .arg(&net)
+            .output()
+            .unwrap();
+        assert!(status.status.success(), "{}", String::from_utf8_lossy(&status.stderr));
+        net
+    }
+
+    /// Writes a file.
+    pub fn file(&self, name: &str, text: &str) -> PathBuf {
+        let path = self.folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path
+    }
+
+    /// A scenario over the grid with these routes.
+    pub fn scenario(&self, routes: &str) -> PathBuf {
+        self.grid();
+        self.file("a.rou.xml", routes);
+        self.file(
+            "a.sumocfg",
+            "<configuration><input><net-file value=\"grid.net.xml\"/><route-files value=\"a.rou.xml\"/></input></configuration>",
+        )
+    }
+
+    /// Options for a scenario whose outputs go to `sumo/`.
+    pub fn scenario_options(&self, sumocfg: &Path, step_s: f64) -> Options {
+        Options::scenario(
+            &sumo_home(),
+            sumocfg,
+            &self.folder.path().join("sumo"),
+            step_s,
+            23423,
+            0.5,
+        )
+        .unwrap()
+    }
+}
+
+fn tool(name: &str) -> Command {
+    let mut command = Command::new(sumo_home().join("bin").join(name));
+    command
+        .env("SUMO_HOME", sumo_home())
+        .env("PROJ_DATA", sumo_home().join("data/proj"));
+    command
+}
+
+/// Runs `steps` steps and calls `see` after each.
+pub fn run(session: &mut Session, steps: usize, mut see: impl FnMut(&mut Session, &Frame)) {
+    let mut frame = Frame::default();
+    for _ in 0..steps {
+        session.step(&mut frame).unwrap();
+        see(session, &frame);
+    }
+}
