@@ -1,0 +1,22 @@
+//! The nanoscopic core: geodesy, vehicle dynamics, and the mirror that tracks SUMO's traffic at the sub-step rate.
+//!
+//! Pure functions without clock, I/O or shared memory; only [`process`], the body of the `sim-core` binary, is a shell around
+//! [`mirror::Mirror`].
+
+// Values leave the core in single precision (positions excepted): the wire's precision, see `ipc_schema::world`.
+#![expect(clippy::cast_possible_truncation, reason = "see above")]
+
+pub mod curve;
+pub mod dimensions;
+pub mod displacement;
+pub mod geodesy;
+pub mod lanes;
+pub mod mirror;
+pub mod person;
+pub mod process;
+pub mod reference;
+pub mod road_user;
+pub mod spherical;
+pub mod tracking;
+pub mod trig;
+pub mod vehicle;

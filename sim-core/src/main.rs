@@ -1,0 +1,9 @@
+//! `sim-core RUN_FILE`: started by `caraware`.
+
+use std::process::ExitCode;
+
+use ipc_schema::{process::Process, session};
+
+fn main() -> ExitCode {
+    session::main(Process::SimCore, sim_core::process::run)
+}

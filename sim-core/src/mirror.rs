@@ -1,0 +1,343 @@
+//! The mirror: every road user of an episode, moved tick by tick between SUMO's states.
+//!
+//! A SUMO state that arrives is the *end* of a SUMO step. The mirror then moves through the `m` ticks of that step, the last
+//! of which ends at SUMO's own time: with `m = 1` a tick follows from each frame at once, with more the mirror knows both
+//! ends of the step it moves through. A road user is there from the tick at which SUMO first has it.
+
+use ipc_schema::{
+    block::{self, BlockError},
+    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    run::RunFile,
+    traffic::{MetaEvent, TrafficState, VehicleMeta},
+    world::{SubStep, VehicleState, WorldLayout},
+};
+
+pub use crate::road_user::Settings;
+use crate::{
+    lanes::{LANES, Lanes},
+    road_user::RoadUser,
+};
+
+/// What SUMO sent cannot be mirrored.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum MirrorError {
+    /// A road user was never announced in `traffic-meta`.
+    #[error("tick {tick}: road user {vehicle} was never announced")]
+    Unannounced {
+        /// Dense index.
+        vehicle: u32,
+        /// Tick of the frame.
+        tick: u64,
+    },
+    /// A position, speed or heading is not a number.
+    #[error("tick {tick}: road user {vehicle} has a position, heading or speed that is not a finite number")]
+    NotFinite {
+        /// Dense index.
+        vehicle: u32,
+        /// Tick of the frame.
+        tick: u64,
+    },
+    /// A road user is in a frame twice.
+    #[error("tick {tick}: road user {vehicle} came twice")]
+    Twice {
+        /// Dense index.
+        vehicle: u32,
+        /// Tick of the frame.
+        tick: u64,
+    },
+    /// The dense index of a road user is beyond all reason.
+    #[error("road user {vehicle}: more than {MAX_ANNOUNCED} road users in one episode")]
+    TooMany {
+        /// Dense index.
+        vehicle: u32,
+    },
+    /// The payload does not hold what it should.
+    #[error(transparent)]
+    Block(#[from] BlockError),
+}
+
+impl Settings {
+    /// The settings of a run.
+    #[must_use]
+    pub fn of_run(run: &RunFile) -> Self {
+        Self {
+            vehicle: run.config.vehicle.clone(),
+            tick_s: run.config.run.tick_s,
+            sub_steps: run.config.run.sub_steps,
+            ticks_per_step: u32::try_from(run.ticks_per_traffic_step()).unwrap_or(u32::MAX),
+        }
+    }
+
+    /// Header of tick `tick` (0-based within the SUMO step) from the header of the frame.
+    ///
+    /// The frame carries number and time of the last of its ticks. The first tick of the step keeps [`FIRST_OF_EPISODE`], the
+    /// last [`LAST_OF_EPISODE`] and [`LAST_OF_RUN`].
+    #[must_use]
+    pub fn tick_header(&self, frame: &MessageHeader, tick: u32, count: u32) -> MessageHeader {
+        let left = self.ticks_per_step.saturating_sub(tick + 1);
+        let mut header = *frame;
+        header.tick = frame.tick.saturating_sub(u64::from(left));
+        header.sim_time_ns = frame
+            .sim_time_ns
+            .saturating_sub(u64::from(left) * libm::round(self.tick_s * 1e9) as u64);
+        header.count = count;
+        header.columns = self.sub_steps;
+        if tick > 0 {
+            header.flags &= !FIRST_OF_EPISODE;
+        }
+        if left > 0 {
+            header.flags &= !(LAST_OF_EPISODE | LAST_OF_RUN);
+        }
+        header
+    }
+}
+
+/// Not in the slab.
+const NOWHERE: u32 = u32::MAX;
+/// Most road users announced in one episode: four bytes are kept for each.
+const MAX_ANNOUNCED: u32 = 1 << 26;
+
+/// All road users of the current episode.
+#[derive(Debug)]
+pub struct Mirror {
+    settings: Settings,
+    episode: Option<u64>,
+    /// Place in `slab` of each road user by dense index, or [`NOWHERE`].
+    places: Vec<u32>,
+    slab: Vec<RoadUser>,
+    free: Vec<u32>,
+    /// Road users of the current frame: dense index and place, in ascending order of the index.
+    present: Vec<(u32, u32)>,
+    /// How many of them have a state in all ticks of the step.
+    in_whole_step: usize,
+    frame: u64,
+    lanes: Lanes,
+    /// Place and row in the message of the vehicle in each lane.
+    loaded: Vec<(u32, usize)>,
+    resynchronisations: u64,
+}
+
+impl Mirror {
+    /// An empty mirror.
+    #[must_use]
+    pub fn new(settings: Settings) -> Self {
+        let lanes = Lanes::new(settings.sub_steps as usize);
+        Self {
+            settings,
+            episode: None,
+            places: Vec::new(),
+            slab: Vec::new(),
+            free: Vec::new(),
+            present: Vec::new(),
+            in_whole_step: 0,
+            frame: 0,
+            lanes,
+            loaded: Vec::with_capacity(LANES),
+            resynchronisations: 0,
+        }
+    }
+
+    /// Times and limits.
+    #[must_use]
+    pub fn settings(&self) -> &Settings {
+        &self.settings
+    }
+
+    /// Mirrors that were set onto SUMO because no motion leads there, over the run; entering the network does not count.
+    #[must_use]
+    pub fn resynchronisations(&self) -> u64 {
+        self.resynchronisations
+    }
+
+    /// Takes announcements: departures make road users known, arrivals let them go.
+    ///
+    /// # Errors
+    /// More road users in one episode than there are places for.
+    pub fn apply_meta(&mut self, header: &MessageHeader, metas: &[VehicleMeta]) -> Result<(), MirrorError> {
+        self.enter_episode(header.episode);
+        for meta in metas {
+            if meta.event == MetaEvent::Departed as u32 {
+                self.announce(meta)?;
+            } else if meta.event == MetaEvent::Arrived as u32 {
+                self.dismiss(meta.vehicle);
+            }
+        }
+        Ok(())
+    }
+
+    fn announce(&mut self, meta: &VehicleMeta) -> Result<(), MirrorError> {
+        let vehicle = meta.vehicle;
+        if vehicle >= MAX_ANNOUNCED {
+            return Err(MirrorError::TooMany { vehicle });
+        }
+        self.dismiss(vehicle);
+        let road_user = RoadUser::new(meta);
+        let place = match self.free.pop() {
+            Some(place) => {
+                self.slab[place as usize] = road_user;
+                place
+            }
+            None => {
+                self.slab.push(road_user);
+                self.slab.len() as u32 - 1
+            }
+        };
+        if self.places.len() <= vehicle as usize {
+            self.places.resize(vehicle as usize + 1, NOWHERE);
+        }
+        self.places[vehicle as usize] = place;
+        Ok(())
+    }
+
+    fn dismiss(&mut self, vehicle: u32) {
+        if let Some(place) = self.places.get_mut(vehicle as usize)
+            && *place != NOWHERE
+        {
+            self.free.push(std::mem::replace(place, NOWHERE));
+        }
+    }
+
+    fn place(&self, vehicle: u32) -> Option<u32> {
+        self.places
+            .get(vehicle as usize)
+            .copied()
+            .filter(|&place| place != NOWHERE)
+    }
+
+    /// Forgets everything when a new episode begins.
+    fn enter_episode(&mut self, episode: u64) {
+        if self.episode != Some(episode) {
+            self.episode = Some(episode);
+            self.places.clear();
+            self.slab.clear();
+            self.free.clear();
+            self.present.clear();
+            self.in_whole_step = 0;
+            self.frame = 0;
+        }
+    }
+
+    /// Takes the state of all road users at the end of a SUMO step. Their ticks are written by [`Mirror::write_tick`].
+    ///
+    /// # Errors
+    /// A road user that was not announced, came twice, or has values that are not finite numbers.
+    pub fn accept(&mut self, header: &MessageHeader, states: &[TrafficState]) -> Result<(), MirrorError> {
+        self.enter_episode(header.episode);
+        self.frame += 1;
+        self.present.clear();
+        self.in_whole_step = 0;
+        let tick = header.tick;
+        for now in states {
+            let vehicle = now.vehicle;
+            let place = self.place(vehicle).ok_or(MirrorError::Unannounced { vehicle, tick })?;
+            if !is_finite(now) {
+                return Err(MirrorError::NotFinite { vehicle, tick });
+            }
+            let road_user = &mut self.slab[place as usize];
+            road_user.accept(now, self.frame, &self.settings);
+            self.in_whole_step += usize::from(road_user.is_in_whole_step());
+            self.present.push((vehicle, place));
+        }
+        self.present.sort_unstable();
+        match self.present.windows(2).find(|pair| pair[0].0 == pair[1].0) {
+            Some(pair) => Err(MirrorError::Twice {
+                vehicle: pair[0].0,
+                tick,
+            }),
+            None => Ok(()),
+        }
+    }
+
+    /// Number of road users in tick `tick` (0-based within the SUMO step).
+    #[must_use]
+    pub fn count(&self, tick: u32) -> usize {
+        if self.is_last(tick) {
+            self.present.len()
+        } else {
+            self.in_whole_step
+        }
+    }
+
+    fn is_last(&self, tick: u32) -> bool {
+        tick + 1 >= self.settings.ticks_per_step
+    }
+
+    /// Where the arrays of tick `tick` lie in its message.
+    #[must_use]
+    pub fn layout(&self, tick: u32) -> WorldLayout {
+        WorldLayout::new(self.count(tick), self.settings.sub_steps as usize)
+    }
+
+    /// Moves all road users through tick `tick` and writes them into `payload`, laid out by [`Mirror::layout`], in ascending
+    /// order of their index. Call once for each tick of the step, in order; `payload` must be zeroed.
+    ///
+    /// # Errors
+    /// The payload is too short or misaligned.
+    pub fn write_tick(&mut self, tick: u32, payload: &mut [u8]) -> Result<(), MirrorError> {
+        let layout = self.layout(tick);
+        let last = self.is_last(tick);
+        let per_tick = self.settings.sub_steps as usize;
+        let [states, rows] = block::split_mut(payload, &[layout.states, layout.sub_steps])?;
+        let states: &mut [VehicleState] = cast(states, layout.states.offset)?;
+        let rows: &mut [SubStep] = cast(rows, layout.sub_steps.offset)?;
+        let mut place_in_message = 0;
+        for index in 0..self.present.len() {
+            let (_, place) = self.present[index];
+            let road_user = &mut self.slab[place as usize];
+            if !last && !road_user.is_in_whole_step() {
+                continue;
+            }
+            let row = place_in_message;
+            place_in_message += 1;
+            if road_user.moves(tick, &self.settings) {
+                road_user.load(tick, &self.settings, &mut self.lanes, self.loaded.len());
+                self.loaded.push((place, row));
+                if self.loaded.len() == LANES {
+                    self.move_loaded(tick, states, rows);
+                }
+            } else {
+                let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
+                let set = road_user.write_unmoved(tick, &self.settings, &mut states[row], sub_steps);
+                self.resynchronisations += u64::from(set);
+            }
+        }
+        self.move_loaded(tick, states, rows);
+        Ok(())
+    }
+
+    /// Moves the vehicles in the lanes through the tick and writes them.
+    fn move_loaded(&mut self, tick: u32, states: &mut [VehicleState], rows: &mut [SubStep]) {
+        if self.loaded.is_empty() {
+            return;
+        }
+        let Self {
+            settings, lanes, slab, ..
+        } = self;
+        lanes.advance(&settings.vehicle, settings.sub_step_s());
+        let per_tick = settings.sub_steps as usize;
+        for (lane, (place, row)) in self.loaded.drain(..).enumerate() {
+            let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
+            let set = slab[place as usize].store(tick, settings, lanes, lane, &mut states[row], sub_steps);
+            self.resynchronisations += u64::from(set);
+        }
+    }
+}
+
+fn is_finite(state: &TrafficState) -> bool {
+    [state.front_x_m, state.front_y_m, state.front_z_m]
+        .iter()
+        .all(|v| v.is_finite())
+        && [state.yaw_rad, state.pitch_rad, state.speed_mps]
+            .iter()
+            .all(|v| v.is_finite())
+}
+
+fn cast<T: bytemuck::Pod>(bytes: &mut [u8], offset: usize) -> Result<&mut [T], BlockError> {
+    let (actual, len) = (bytes.len(), bytes.len());
+    bytemuck::try_cast_slice_mut(bytes).map_err(|_| BlockError {
+        actual,
+        offset,
+        len,
+        element: size_of::<T>(),
+    })
+}

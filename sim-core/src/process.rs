@@ -1,0 +1,215 @@
+//! The process: `traffic` and `traffic-meta` in, one `world` for each tick out.
+
+use std::path::Path;
+
+use ipc_schema::{
+    block::{self, BlockError, Section},
+    board::State,
+    failure::{Failure, FailureKind},
+    header::{LAST_OF_RUN, MessageHeader},
+    ports::{BoardReader, Message, PortError, Publisher, Subscriber, Waker},
+    process::Process,
+    services::Channel,
+    session::{Session, Wait},
+    traffic::{Kind, TrafficState, VehicleMeta},
+};
+
+use crate::mirror::{Mirror, MirrorError, Settings};
+
+/// One process serves one environment.
+const ENV_INDEX: u32 = 0;
+
+/// What this process adds to the run's report.
+#[derive(Debug, serde::Serialize)]
+struct Part {
+    resynchronisations: u64,
+    vehicle_steps: u64,
+    drops: u64,
+}
+
+/// Mirrors until the last tick of the run, or until the process is asked to stop.
+///
+/// # Errors
+/// A port fails, or what SUMO sent cannot be mirrored.
+pub fn run(run_file: &Path) -> Result<(), Failure> {
+    let mut session = Session::join(run_file, Process::SimCore, ENV_INDEX)?;
+    let metas = session.subscriber(Channel::TrafficMeta)?;
+    let traffic = session.subscriber(Channel::Traffic)?;
+    let mut core = Core::open(session, metas)?;
+    while let Some(frame) = core.session.next(&traffic)? {
+        let header = *frame.header();
+        if core.frame(&frame)? == Wait::Stopped {
+            break;
+        }
+        drop(frame);
+        core.session.consumed(header.tick + 1);
+        if header.has(LAST_OF_RUN) {
+            return core.leave();
+        }
+    }
+    core.write_part()
+}
+
+struct Core {
+    session: Session,
+    metas: Subscriber,
+    /// `traffic-meta` messages applied.
+    meta_messages: u64,
+    mirror: Mirror,
+    world: Publisher,
+    consumer: BoardReader,
+    consumer_wake: Waker,
+    /// Ticks sent.
+    ticks: u64,
+    vehicle_steps: u64,
+}
+
+impl Core {
+    fn open(mut session: Session, metas: Subscriber) -> Result<Self, Failure> {
+        let world = session.publisher(Channel::World)?;
+        let consumer = session.board_of(Process::SensorDaemon)?;
+        let consumer_wake = session.waker(Process::SensorDaemon)?;
+        session.attach();
+        let mirror = Mirror::new(Settings::of_run(&session.run));
+        Ok(Self {
+            session,
+            metas,
+            meta_messages: 0,
+            mirror,
+            world,
+            consumer,
+            consumer_wake,
+            ticks: 0,
+            vehicle_steps: 0,
+        })
+    }
+
+    /// One SUMO step: what happened, where everybody is, and the ticks that lead there.
+    fn frame(&mut self, frame: &Message) -> Result<Wait, Failure> {
+        let ticks_per_step = self.session.run.ticks_per_traffic_step();
+        // The frame carries the number of the last of its ticks.
+        let header = MessageHeader {
+            tick: (frame.header().tick + 1).saturating_sub(ticks_per_step),
+            ..*frame.header()
+        };
+        if header.tick != self.ticks {
+            return Err(PortError::Gap {
+                channel: "traffic",
+                expected: self.ticks,
+                received: header.tick,
+            }
+            .into());
+        }
+        self.apply_metas(header.sequence)?;
+        let states: &[TrafficState] = rows(frame).map_err(unreadable)?;
+        self.mirror.accept(&header, states).map_err(unmirrored)?;
+        for tick in 0..u32::try_from(ticks_per_step).unwrap_or(u32::MAX) {
+            if self
+                .session
+                .wait_for_credit(&self.consumer, header.tick + u64::from(tick))?
+                == Wait::Stopped
+            {
+                return Ok(Wait::Stopped);
+            }
+            self.publish(&header, tick, states)?;
+        }
+        Ok(Wait::Ready)
+    }
+
+    /// Applies announcements up to the one that belongs to the frame at hand; they were sent before it.
+    fn apply_metas(&mut self, sequence: u64) -> Result<(), Failure> {
+        while self.meta_messages < sequence {
+            let Some(message) = self.session.next(&self.metas)? else {
+                return Ok(());
+            };
+            self.meta_messages += 1;
+            let received = message.header().sequence;
+            if received != self.meta_messages {
+                return Err(PortError::Gap {
+                    channel: "traffic-meta",
+                    expected: self.meta_messages,
+                    received,
+                }
+                .into());
+            }
+            let metas: &[VehicleMeta] = rows(&message).map_err(unreadable)?;
+            self.mirror.apply_meta(message.header(), metas).map_err(unmirrored)?;
+        }
+        Ok(())
+    }
+
+    fn publish(&mut self, frame: &MessageHeader, tick: u32, states: &[TrafficState]) -> Result<(), Failure> {
+        let count = self.mirror.count(tick);
+        let ours = self.session.header();
+        let header = MessageHeader {
+            run_id: ours.run_id,
+            incarnation: ours.incarnation,
+            sequence: 0,
+            ..self
+                .mirror
+                .settings()
+                .tick_header(frame, tick, u32::try_from(count).unwrap_or(u32::MAX))
+        };
+        let mut draft = self.world.loan(header, self.mirror.layout(tick).len)?;
+        self.mirror.write_tick(tick, draft.payload_mut()).map_err(unmirrored)?;
+        draft.send()?;
+        self.consumer_wake.wake();
+        self.ticks += 1;
+        self.vehicle_steps += count as u64;
+        self.report(&header, states);
+        Ok(())
+    }
+
+    fn report(&mut self, header: &MessageHeader, states: &[TrafficState]) {
+        let cavs = states.iter().filter(|state| state.kind == Kind::Cav as u32).count();
+        let (ticks, vehicle_steps, drops) = (self.ticks, self.vehicle_steps, self.world.drops());
+        let resynchronisations = self.mirror.resynchronisations();
+        self.session.report(|health| {
+            health.state = State::Running as u32;
+            health.ticks = ticks;
+            health.episode = header.episode;
+            health.sim_time_ns = header.sim_time_ns;
+            health.road_users = header.count;
+            health.cavs = cavs as u32;
+            health.vehicle_steps = vehicle_steps;
+            health.drops = drops;
+            health.resynchronisations = resynchronisations;
+        });
+    }
+
+    /// Leaves once everything sent has been consumed.
+    fn leave(mut self) -> Result<(), Failure> {
+        self.write_part()?;
+        if self.session.wait_until_consumed(&self.consumer, self.ticks)? == Wait::Ready {
+            self.session.report(|health| health.state = State::Done as u32);
+        }
+        Ok(())
+    }
+
+    fn write_part(&self) -> Result<(), Failure> {
+        self.session.write_part(&Part {
+            resynchronisations: self.mirror.resynchronisations(),
+            vehicle_steps: self.vehicle_steps,
+            drops: self.world.drops(),
+        })
+    }
+}
+
+/// The payload as `count` rows.
+fn rows<T: bytemuck::Pod>(message: &Message) -> Result<&[T], BlockError> {
+    block::view(
+        message.payload(),
+        Section {
+            offset: 0,
+            len: message.header().count as usize * size_of::<T>(),
+        },
+    )
+}
+
+fn unreadable(error: BlockError) -> Failure {
+    Failure::from_error(FailureKind::Run, &error)
+}
+
+fn unmirrored(error: MirrorError) -> Failure {
+    Failure::from_error(FailureKind::Run, &error)
+}

@@ -1,0 +1,227 @@
+//! The path a mirror follows between two SUMO states: where SUMO's front bumper is, and how fast, at any time in between.
+//!
+//! SUMO gives positions at steps; speeds and headings are only loosely tied to them (its Euler update moves by the new
+//! speed for the whole step, its heading is that of the chord from rear to front bumper). So the velocity at a step is
+//! taken from the positions themselves: the second-order backward difference `(3 c₁ − c₀) / 2T` of the last two chords
+//! c₀, c₁, which is exact for constant acceleration and for a slow turn. Between two steps runs the cubic Hermite curve with
+//! these velocities. Where the two chords disagree in direction the curve ends along its chord instead.
+//!
+//! SUMO changes lanes in one step. The sideways jump is taken out of the path and let back in over
+//! [`LANE_CHANGE_S`] with a minimum-jerk profile, as far as the vehicle moves at all.
+
+use ipc_schema::traffic::TrafficState;
+
+use crate::{curve::Curve, trig::wrap_angle};
+
+/// Time over which an instantaneous lane change is spread, seconds.
+pub const LANE_CHANGE_S: f64 = 3.0;
+/// Shortest distance over which it is spread, metres.
+const LANE_CHANGE_M: f64 = 12.0;
+/// Sideways jump within one SUMO step that counts as a lane change, metres.
+const LANE_JUMP_M: f64 = 1.0;
+/// Further than this nobody changes lanes in one step, metres.
+const LANE_JUMP_MOST_M: f64 = 5.0;
+/// A step that turns the vehicle by more than this is a turn, not a lane change, radians.
+const LANE_JUMP_TURN_RAD: f64 = 0.35;
+/// Two successive chords that differ by more than this (cosine of 60°) do not belong to one smooth curve.
+const SMOOTH_COSINE: f64 = 0.5;
+/// A step longer than this plus twice what the speed explains is no driving, metres.
+const UNEXPLAINED_M: f64 = 2.0;
+/// Slower than this at both ends of a step, a sideways jump is no lane change, m/s.
+const MOVING_MPS: f64 = 0.1;
+
+/// A sideways offset on its way to zero.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct LaneChange {
+    /// Offset to the left of SUMO's path at the start, metres; zero if there is none.
+    offset_m: f64,
+    /// Share done, 0 … 1.
+    phase: f64,
+}
+
+impl LaneChange {
+    /// Remaining offset (metres) and its derivative by the phase.
+    fn remaining(&self) -> [f64; 2] {
+        let s = self.phase;
+        let profile = s * s * s * (10.0 - s * (15.0 - 6.0 * s));
+        let slope = 30.0 * s * s * (1.0 - s) * (1.0 - s);
+        [self.offset_m * (1.0 - profile), -self.offset_m * slope]
+    }
+
+    /// Share of a lane change done per second at a speed.
+    fn rate_per_s(speed_mps: f64) -> f64 {
+        speed_mps / (speed_mps * LANE_CHANGE_S).max(LANE_CHANGE_M)
+    }
+}
+
+/// How a new SUMO state joins the path so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Join {
+    /// The path goes on.
+    Continued,
+    /// No vehicle moves like that: the mirror has to be set.
+    Broken,
+}
+
+/// The path over the current SUMO step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Path {
+    /// Without the offset of a lane change.
+    curve: Curve,
+    /// SUMO's heading at the start of the step and its rate, rad and rad/s.
+    heading: [f64; 2],
+    /// Velocity at the end, m/s.
+    end_velocity_mps: [f64; 2],
+    /// Velocity over the last chord, m/s.
+    chord_mps: [f64; 2],
+    lane_change: LaneChange,
+}
+
+impl Path {
+    /// The path of a road user seen for the first time, or set anew: straight ahead.
+    #[must_use]
+    pub fn from_here(now: &TrafficState) -> Self {
+        let (sin, cos) = libm::sincos(f64::from(now.yaw_rad));
+        let velocity = [f64::from(now.speed_mps) * cos, f64::from(now.speed_mps) * sin];
+        Self {
+            curve: Curve::straight([now.front_x_m, now.front_y_m], velocity),
+            heading: [f64::from(now.yaw_rad), 0.0],
+            end_velocity_mps: velocity,
+            chord_mps: velocity,
+            lane_change: LaneChange::default(),
+        }
+    }
+
+    /// Takes the step from `before` to `now`, `step_s` later, of a body of `length_m`.
+    pub fn advance(&mut self, before: &TrafficState, now: &TrafficState, length_m: f64, step_s: f64) -> Join {
+        let mut start_m = [before.front_x_m, before.front_y_m];
+        let mut moved_m = [now.front_x_m - start_m[0], now.front_y_m - start_m[1]];
+        let turn = wrap_angle(f64::from(now.yaw_rad) - f64::from(before.yaw_rad));
+        let speed_mps = f64::from(before.speed_mps.max(now.speed_mps));
+        if let Some(jump) = sideways_jump(moved_m, f64::from(before.yaw_rad) + 0.5 * turn, turn, length_m) {
+            if speed_mps < MOVING_MPS || jump.left_m.abs() > LANE_JUMP_MOST_M {
+                return Join::Broken;
+            }
+            for axis in 0..2 {
+                start_m[axis] += jump.vector_m[axis];
+                moved_m[axis] -= jump.vector_m[axis];
+            }
+            self.lane_change = LaneChange {
+                offset_m: self.lane_change.remaining()[0] - jump.left_m,
+                phase: 0.0,
+            };
+        }
+        if norm(moved_m) > 2.0 * speed_mps * step_s + UNEXPLAINED_M {
+            return Join::Broken;
+        }
+        self.heading = [f64::from(before.yaw_rad), turn / step_s];
+        self.bend(start_m, moved_m, step_s);
+        Join::Continued
+    }
+
+    /// Goes straight on for one step: what a road user does until it is set elsewhere.
+    pub fn coast(&mut self, before: &TrafficState) {
+        *self = Self::from_here(before);
+    }
+
+    /// Hermite curve from the last end velocity over the step's chord.
+    fn bend(&mut self, start_m: [f64; 2], moved_m: [f64; 2], step_s: f64) {
+        let chord = moved_m.map(|moved| moved / step_s);
+        let before = self.chord_mps;
+        let smooth = dot(chord, before) >= SMOOTH_COSINE * norm(chord) * norm(before);
+        let extrapolated = [1.5 * chord[0] - 0.5 * before[0], 1.5 * chord[1] - 0.5 * before[1]];
+        let start = limited(self.end_velocity_mps, chord);
+        let end = limited(if smooth { extrapolated } else { chord }, chord);
+        self.curve = Curve::hermite(start_m, moved_m, [start, end], step_s);
+        self.curve.accel_mps2 = (norm(chord) - norm(before)) / step_s;
+        self.end_velocity_mps = end;
+        self.chord_mps = chord;
+    }
+
+    /// The reference over one tick that starts `start_s` after the start of the step, for a vehicle at this speed, which
+    /// carries a lane change on.
+    pub fn tick(&mut self, start_s: f64, tick_s: f64, speed_mps: f64) -> Curve {
+        let curve = self.curve.from_time(start_s);
+        if self.lane_change.offset_m == 0.0 {
+            return curve;
+        }
+        let rate = LaneChange::rate_per_s(speed_mps);
+        let [from, u0] = self.shift(start_s, rate);
+        self.lane_change.phase = (self.lane_change.phase + rate * tick_s).min(1.0);
+        let [to, u1] = self.shift(start_s + tick_s, rate);
+        if self.lane_change.phase >= 1.0 {
+            self.lane_change = LaneChange::default();
+        }
+        curve.plus(&Curve::hermite(
+            from,
+            [to[0] - from[0], to[1] - from[1]],
+            [u0, u1],
+            tick_s,
+        ))
+    }
+
+    /// What is left of a lane change, to the left of SUMO's heading at `t_s`: offset and its velocity, world frame.
+    fn shift(&self, t_s: f64, phase_rate_per_s: f64) -> [[f64; 2]; 2] {
+        let [offset, slope] = self.lane_change.remaining();
+        let (sin, cos) = libm::sincos(self.heading_at(t_s));
+        let (closing, turning) = (slope * phase_rate_per_s, offset * self.heading[1]);
+        [
+            [-offset * sin, offset * cos],
+            [-closing * sin - turning * cos, closing * cos - turning * sin],
+        ]
+    }
+
+    /// SUMO's heading `t_s` after the start of the step, radians.
+    #[must_use]
+    pub fn heading_at(&self, t_s: f64) -> f64 {
+        self.heading[0] + self.heading[1] * t_s
+    }
+}
+
+/// A lane change in one step.
+struct Jump {
+    /// World frame, metres.
+    vector_m: [f64; 2],
+    /// Positive to the left, metres.
+    left_m: f64,
+}
+
+/// The sideways part of a chord that the heading half-way and the turn do not explain, if it is a lane change.
+///
+/// SUMO's heading is the chord of the body, so in a turn the front bumper moves `turn · length / 2` further to the inside.
+fn sideways_jump(chord_m: [f64; 2], heading_rad: f64, turn_rad: f64, length_m: f64) -> Option<Jump> {
+    let far = dot(chord_m, chord_m) > LANE_JUMP_M * LANE_JUMP_M;
+    if !far || turn_rad.abs() > LANE_JUMP_TURN_RAD {
+        return None;
+    }
+    let (sin, cos) = libm::sincos(heading_rad);
+    let left_m = -chord_m[0] * sin + chord_m[1] * cos;
+    let unexplained_m = left_m - 0.5 * turn_rad * length_m;
+    (unexplained_m.abs() > LANE_JUMP_M).then(|| Jump {
+        vector_m: [-left_m * sin, left_m * cos],
+        left_m,
+    })
+}
+
+/// A velocity no longer than three times the chord's, and none against it: the curve then never runs backwards
+/// (F. N. Fritsch and R. E. Carlson, *Monotone piecewise cubic interpolation*, 1980).
+fn limited(velocity: [f64; 2], chord: [f64; 2]) -> [f64; 2] {
+    let most = 9.0 * dot(chord, chord);
+    let square = dot(velocity, velocity);
+    if dot(velocity, chord) <= 0.0 {
+        [0.0; 2]
+    } else if square > most {
+        let factor = (most / square).sqrt();
+        [velocity[0] * factor, velocity[1] * factor]
+    } else {
+        velocity
+    }
+}
+
+fn dot(a: [f64; 2], b: [f64; 2]) -> f64 {
+    a[0] * b[0] + a[1] * b[1]
+}
+
+fn norm(a: [f64; 2]) -> f64 {
+    dot(a, a).sqrt()
+}

@@ -1,0 +1,141 @@
+//! Path tracking: the demand that keeps a vehicle's front bumper on its reference path.
+//!
+//! Input/output linearisation of the front bumper P, `d` ahead of the rear axle (A. De Luca, G. Oriolo and M. Vendittelli,
+//! *Control of wheeled mobile robots*, 2001, section 4): `P' = v t + d ψ' n` with t along and n across the heading, so any
+//! wanted P' fixes speed and yaw rate: `v = P'·t`, `ψ' = P'·n / d`. The wanted P' is the path's velocity plus a gain on the
+//! error. The curvature `ψ' / v = tan β / d` depends only on the direction β of P' in the body, which keeps its meaning
+//! down to walking pace; below [`HOLD_MPS`] the wheels are held.
+
+use crate::{
+    curve::Target,
+    trig::{atan_demand, bound, larger, pick, smaller},
+    vehicle::{ACCEL_RATE_PER_S, Input, KinematicParams, MAX_JERK_MPS3, State},
+};
+
+/// Gain of the longitudinal error, 1/s. With [`SPEED_GAIN_PER_S`] and the model's lag of 12/s: three poles at −4/s.
+const POSITION_GAIN_PER_S: f64 = 4.0 / 3.0;
+/// Gain of the speed error, 1/s.
+const SPEED_GAIN_PER_S: f64 = 4.0;
+/// Most that a position error may change the wanted speed, m/s.
+const MAX_CATCH_UP_MPS: f64 = 3.0;
+/// Gain of the lateral error, 1/s.
+const LATERAL_GAIN_PER_S: f64 = 2.5;
+/// Below this speed the lateral error is corrected per distance instead of per time, m/s.
+const LOW_SPEED_MPS: f64 = 3.0;
+/// Most that tan β may be: 55°.
+const MAX_TAN_BETA: f64 = 1.43;
+/// Largest lateral acceleration a demand may ask for, m/s²: dry asphalt with some reserve.
+const MAX_LATERAL_ACCEL_MPS2: f64 = 8.0;
+/// Below this speed of vehicle or path the wheels are held, m/s.
+const HOLD_MPS: f64 = 0.05;
+/// A standing vehicle starts only when its path moves at [`HOLD_MPS`] or is this far ahead, metres.
+const START_M: f64 = 0.5;
+/// Jerk with which a stop ends, m/s³.
+const STOP_JERK_MPS3: f64 = 0.4 * MAX_JERK_MPS3;
+/// Deceleration in the last moment before standstill, m/s².
+const LEAST_STOPPING_MPS2: f64 = 0.1;
+
+/// What the tracker knows of the vehicle it drives, whichever model moves it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Driven {
+    /// Rear axle to front bumper, metres.
+    pub front_m: f64,
+    /// Rear axle to front axle, metres.
+    pub wheelbase_m: f64,
+    /// Largest acceleration, m/s².
+    pub max_accel_mps2: f64,
+    /// Largest deceleration, m/s².
+    pub max_decel_mps2: f64,
+}
+
+impl Driven {
+    /// A vehicle of the kinematic model with its front bumper `front_m` ahead of the rear axle.
+    #[must_use]
+    #[inline(always)]
+    pub fn new(params: &KinematicParams, front_m: f64) -> Self {
+        Self {
+            front_m,
+            wheelbase_m: params.wheelbase_m,
+            max_accel_mps2: params.max_accel_mps2,
+            max_decel_mps2: params.max_decel_mps2,
+        }
+    }
+}
+
+/// Reference minus front bumper in the body frame.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Error {
+    /// Positive ahead, metres.
+    pub longitudinal_m: f64,
+    /// Positive to the left, metres.
+    pub lateral_m: f64,
+}
+
+/// How far the front bumper, `front_m` ahead of the rear axle, is from its target.
+#[must_use]
+#[inline(always)]
+pub fn error(state: &State, front_m: f64, target: &Target) -> Error {
+    let front = state.point_ahead(front_m);
+    let [cos, sin] = state.heading;
+    let (dx, dy) = (target.position_m[0] - front[0], target.position_m[1] - front[1]);
+    Error {
+        longitudinal_m: dx * cos + dy * sin,
+        lateral_m: dy * cos - dx * sin,
+    }
+}
+
+/// The demand that brings the front bumper onto its target.
+#[must_use]
+#[inline(always)]
+pub fn demand(driven: &Driven, state: &State, target: &Target) -> Input {
+    let error = error(state, driven.front_m, target);
+    let [cos, sin] = state.heading;
+    let [vx, vy] = target.velocity_mps;
+    let (along, across) = (vx * cos + vy * sin, vy * cos - vx * sin);
+    Input {
+        accel_mps2: accel_demand(driven, state, target.accel_mps2, along, error.longitudinal_m),
+        road_wheel_angle_rad: steering_demand(driven, state, [along, across], error.lateral_m),
+    }
+}
+
+/// Acceleration from the wanted speed: never backwards, at rest when the path rests, with a soft end of every stop.
+#[inline(always)]
+fn accel_demand(driven: &Driven, state: &State, path_accel: f64, along: f64, ahead_m: f64) -> f64 {
+    let catch_up = bound(POSITION_GAIN_PER_S * ahead_m, -MAX_CATCH_UP_MPS, MAX_CATCH_UP_MPS);
+    let wanted = along + catch_up;
+    let path_rests = (along < HOLD_MPS) & (ahead_m < START_M);
+    let stays = (state.speed_mps == 0.0) & (path_rests | (wanted < HOLD_MPS));
+    // A vehicle that is too far ahead waits: it does not follow the path's acceleration.
+    let path_accel = pick(wanted <= 0.0, smaller(path_accel, 0.0), path_accel);
+    let demand = path_accel + SPEED_GAIN_PER_S * (larger(wanted, 0.0) - state.speed_mps);
+    let least = smaller(stopping_decel(state), driven.max_decel_mps2);
+    pick(stays, 0.0, bound(demand, -least, driven.max_accel_mps2))
+}
+
+/// Deceleration that reaches zero together with the speed, at constant jerk, m/s². It looks at the speed that will be left
+/// when the actuator, which lags, has followed.
+#[inline(always)]
+fn stopping_decel(state: &State) -> f64 {
+    let left_mps = state.speed_mps + smaller(state.accel_mps2, 0.0) * (1.0 / ACCEL_RATE_PER_S);
+    larger(
+        (2.0 * STOP_JERK_MPS3 * larger(left_mps, 0.0)).sqrt(),
+        LEAST_STOPPING_MPS2,
+    )
+}
+
+/// Road-wheel angle from the direction in which the front bumper should move.
+#[inline(always)]
+fn steering_demand(driven: &Driven, state: &State, [along, across]: [f64; 2], left_m: f64) -> f64 {
+    let holds = (state.speed_mps < HOLD_MPS) | (along < HOLD_MPS);
+    let feed_forward = across / larger(along, 0.5 * across.abs());
+    let pace = 1.0 / larger(state.speed_mps, LOW_SPEED_MPS);
+    let tan_beta = bound(
+        feed_forward + LATERAL_GAIN_PER_S * left_m * pace,
+        -MAX_TAN_BETA,
+        MAX_TAN_BETA,
+    );
+    let most = MAX_LATERAL_ACCEL_MPS2 * pace * pace;
+    let curvature_per_m = bound(tan_beta / driven.front_m, -most, most);
+    let angle = atan_demand(driven.wheelbase_m * curvature_per_m);
+    pick(holds, state.road_wheel_angle_rad, angle)
+}

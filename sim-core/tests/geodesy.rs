@@ -1,0 +1,151 @@
+//! The projection against PROJ, and there and back over 50 km × 50 km.
+
+#![allow(clippy::unwrap_used, reason = "test code may assert by unwrapping")]
+
+use ipc_schema::run::MapInfo;
+use sim_core::geodesy::{GeodesyError, Geodetic, NetPosition, Projection, origin_projection};
+
+const A10KW: &str = "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs";
+const ORIGIN: Geodetic = Geodetic {
+    latitude_deg: 52.2773,
+    longitude_deg: 10.5391,
+};
+const SOUTH: &str = "+proj=utm +zone=23 +south +datum=WGS84 +units=m +no_defs";
+const MERCATOR: &str = "+proj=merc +lon_0=0 +datum=WGS84 +units=m +no_defs";
+const LAMBERT: &str =
+    "+proj=lcc +lat_1=49 +lat_2=44 +lat_0=46.5 +lon_0=3 +x_0=700000 +y_0=6600000 +ellps=GRS80 +units=m +no_defs";
+
+fn projection(definition: &str, net_offset_m: [f64; 2]) -> Projection {
+    Projection::new(&map(definition, net_offset_m)).unwrap()
+}
+
+fn map(definition: &str, net_offset_m: [f64; 2]) -> MapInfo {
+    MapInfo {
+        projection: definition.into(),
+        net_offset_m,
+        bounds_m: [0.0, 0.0, 1.0, 1.0],
+    }
+}
+
+fn cases() -> Vec<(Projection, Vec<[f64; 4]>)> {
+    vec![
+        (
+            projection(A10KW, [-402_990.32, -5_794_389.48]),
+            vec![
+                [0.0, 0.0, 52.291286750005, 13.577618942568],
+                [2_817.12, 3_173.89, 52.320303433354, 13.618022986958],
+                [-25_000.0, -25_000.0, 52.061646463808, 13.220227439979],
+                [25_000.0, 25_000.0, 52.519852182539, 13.938716236271],
+                [-25_000.0, 25_000.0, 52.510953179367, 13.202126274242],
+            ],
+        ),
+        (
+            projection(&origin_projection(ORIGIN), [0.0, 0.0]),
+            vec![
+                [0.0, 0.0, 52.277300000000, 10.539100000000],
+                [220.0, 220.0, 52.279277081837, 10.542323451943],
+                [-25_000.0, -25_000.0, 52.052058780661, 10.174659001019],
+                [25_000.0, 25_000.0, 52.501396494477, 10.907245348203],
+            ],
+        ),
+        (
+            projection(SOUTH, [-323_000.0, -7_394_000.0]),
+            vec![
+                [0.0, 0.0, -23.554720800442, -46.734126953105],
+                [25_000.0, 25_000.0, -23.331512186855, -46.486734607652],
+            ],
+        ),
+        (
+            projection(MERCATOR, [-1_000_000.0, -6_000_000.0]),
+            vec![
+                [0.0, 0.0, 47.545309636381, 8.983152841195],
+                [25_000.0, 25_000.0, 47.697145547199, 9.207731662225],
+            ],
+        ),
+        (
+            projection(LAMBERT, [-650_000.0, -6_860_000.0]),
+            vec![
+                [0.0, 0.0, 48.838110122583, 2.318790597038],
+                [25_000.0, 25_000.0, 49.064373196229, 2.657913351563],
+            ],
+        ),
+    ]
+}
+
+/// Latitudes and longitudes from pyproj 3.7.2 (PROJ 9.5.1): `Proj(definition)(x - offset_x, y - offset_y, inverse=True)`.
+/// 1e-9 degrees are 0.1 mm.
+#[test]
+fn agrees_with_proj() {
+    for (projection, points) in cases() {
+        for [x_m, y_m, latitude_deg, longitude_deg] in points {
+            let geodetic = projection.geodetic_from_net(NetPosition { x_m, y_m }).unwrap();
+            assert!(
+                (geodetic.latitude_deg - latitude_deg).abs() < 1e-9,
+                "{geodetic:?} for ({x_m}, {y_m})"
+            );
+            assert!(
+                (geodetic.longitude_deg - longitude_deg).abs() < 1e-9,
+                "{geodetic:?} for ({x_m}, {y_m})"
+            );
+            let net = projection
+                .net_from_geodetic(Geodetic {
+                    latitude_deg,
+                    longitude_deg,
+                })
+                .unwrap();
+            assert!(
+                (net.x_m - x_m).hypot(net.y_m - y_m) < 1e-4,
+                "{net:?} for ({x_m}, {y_m})"
+            );
+        }
+    }
+}
+
+#[test]
+fn there_and_back_over_50_km_square() {
+    for (projection, _) in cases() {
+        for i in -25..=25 {
+            for j in -25..=25 {
+                let start = NetPosition {
+                    x_m: f64::from(i) * 1000.0,
+                    y_m: f64::from(j) * 1000.0,
+                };
+                let end = projection
+                    .net_from_geodetic(projection.geodetic_from_net(start).unwrap())
+                    .unwrap();
+                assert!(
+                    (end.x_m - start.x_m).hypot(end.y_m - start.y_m) < 1e-4,
+                    "{start:?} came back as {end:?}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn unusable_projections_are_named() {
+    assert_eq!(
+        Projection::new(&map("!", [0.0; 2])).unwrap_err(),
+        GeodesyError::NoProjection("!".into())
+    );
+    for definition in [
+        "+proj=longlat +datum=WGS84",
+        "+proj=nonsense",
+        "utm",
+        "+proj=utm +zone=99",
+    ] {
+        let error = Projection::new(&map(definition, [0.0; 2])).unwrap_err();
+        assert!(error.to_string().contains(definition), "{error}");
+    }
+    let outside = projection(A10KW, [0.0; 2]).net_from_geodetic(Geodetic {
+        latitude_deg: f64::NAN,
+        longitude_deg: 0.0,
+    });
+    assert!(matches!(outside, Err(GeodesyError::OutsideDomain { .. })));
+}
+
+#[test]
+fn can_be_shared_between_threads() {
+    fn assert<T: Send + Sync>() {}
+    assert::<Projection>();
+}

@@ -1,0 +1,182 @@
+//! The collection: episodes, announcements, order, headers, persons.
+
+mod common;
+
+use common::{Road, drive, frame, limits, meta, settings};
+use ipc_schema::{
+    header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    traffic::{Kind, MetaEvent, TrafficState},
+    world::{APPEARED, RESYNCHRONISED},
+};
+use proptest::prelude::*;
+use sim_core::mirror::{Mirror, MirrorError};
+
+fn header(episode: u64, tick: u64) -> MessageHeader {
+    MessageHeader {
+        episode,
+        tick,
+        ..MessageHeader::default()
+    }
+}
+
+fn road() -> Road {
+    Road(vec![[0.0, 0.0], [1000.0, 0.0]])
+}
+
+#[test]
+fn every_tick_gets_its_own_header() {
+    let frame = MessageHeader {
+        tick: 43,
+        sim_time_ns: 5_000_000_000,
+        flags: EVALUATION | FIRST_OF_EPISODE | LAST_OF_EPISODE | LAST_OF_RUN,
+        ..MessageHeader::default()
+    };
+    let headers: Vec<MessageHeader> = (0..4).map(|t| settings(0.25, 5, 4).tick_header(&frame, t, 7)).collect();
+    assert_eq!(headers.iter().map(|h| h.tick).collect::<Vec<_>>(), [40, 41, 42, 43]);
+    let times: Vec<u64> = headers.iter().map(|h| h.sim_time_ns / 1_000_000).collect();
+    assert_eq!(times, [4250, 4500, 4750, 5000]);
+    let flags: Vec<u32> = headers.iter().map(|h| h.flags).collect();
+    let last = EVALUATION | LAST_OF_EPISODE | LAST_OF_RUN;
+    assert_eq!(flags, [EVALUATION | FIRST_OF_EPISODE, EVALUATION, EVALUATION, last]);
+    assert!(headers.iter().all(|h| h.count == 7 && h.columns == 5));
+}
+
+#[test]
+fn a_new_episode_forgets_everything_even_if_announcements_come_first() {
+    let mut mirror = Mirror::new(settings(0.1, 10, 1));
+    mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
+    frame(&mut mirror, &header(0, 0), &[road().state(0, 50.0, 5.0)]);
+    mirror.apply_meta(&header(1, 1), &[meta(0, Kind::Cav)]).unwrap();
+    let ticks = frame(&mut mirror, &header(1, 1), &[road().state(0, 500.0, 5.0)]);
+    assert_eq!(ticks[0].states[0].flags, APPEARED | RESYNCHRONISED);
+    let unknown = mirror.accept(&header(2, 2), &[road().state(0, 500.0, 5.0)]);
+    assert_eq!(unknown, Err(MirrorError::Unannounced { vehicle: 0, tick: 2 }));
+    assert_eq!(mirror.resynchronisations(), 0);
+}
+
+#[test]
+fn arrivals_make_room_and_strangers_are_refused() {
+    let mut mirror = Mirror::new(settings(0.1, 10, 1));
+    mirror
+        .apply_meta(&header(0, 0), &[meta(0, Kind::Cav), meta(7, Kind::Other)])
+        .unwrap();
+    frame(
+        &mut mirror,
+        &header(0, 0),
+        &[road().state(0, 50.0, 5.0), road().state(7, 80.0, 5.0)],
+    );
+    let mut arrived = meta(0, Kind::Cav);
+    arrived.event = MetaEvent::Arrived as u32;
+    mirror.apply_meta(&header(0, 1), &[arrived]).unwrap();
+    let ticks = frame(&mut mirror, &header(0, 1), &[road().state(7, 80.5, 5.0)]);
+    assert_eq!(ticks[0].states.len(), 1);
+    assert_eq!(ticks[0].states[0].flags, 0);
+    assert!(mirror.accept(&header(0, 2), &[road().state(0, 51.0, 5.0)]).is_err());
+}
+
+#[test]
+fn faulty_frames_are_refused_by_name() {
+    let mut mirror = Mirror::new(settings(0.1, 10, 1));
+    mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
+    let mut broken = road().state(0, 50.0, 5.0);
+    broken.front_y_m = f64::NAN;
+    assert_eq!(
+        mirror.accept(&header(0, 3), &[broken]),
+        Err(MirrorError::NotFinite { vehicle: 0, tick: 3 })
+    );
+    let twice = [road().state(0, 50.0, 5.0); 2];
+    assert_eq!(
+        mirror.accept(&header(0, 4), &twice),
+        Err(MirrorError::Twice { vehicle: 0, tick: 4 })
+    );
+    assert!(mirror.apply_meta(&header(0, 4), &[meta(u32::MAX, Kind::Cav)]).is_err());
+    mirror.accept(&header(0, 5), &[road().state(0, 50.0, 5.0)]).unwrap();
+    assert!(mirror.write_tick(0, &mut [0; 64]).is_err());
+}
+
+#[test]
+fn a_vehicle_that_was_away_is_set_and_counted() {
+    let mut mirror = Mirror::new(settings(0.1, 10, 10));
+    mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
+    frame(&mut mirror, &header(0, 0), &[road().state(0, 50.0, 5.0)]);
+    frame(&mut mirror, &header(0, 10), &[]);
+    let ticks = frame(&mut mirror, &header(0, 20), &[road().state(0, 300.0, 5.0)]);
+    let counts: Vec<usize> = ticks.iter().map(|t| t.states.len()).collect();
+    assert_eq!(counts, [0, 0, 0, 0, 0, 0, 0, 0, 0, 1]);
+    assert_eq!(ticks[9].states[0].flags, RESYNCHRONISED);
+    assert_eq!(mirror.resynchronisations(), 1);
+}
+
+#[test]
+fn persons_pass_through_with_velocities_from_differences() {
+    let mut mirror = Mirror::new(settings(0.1, 10, 2));
+    mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Person)]).unwrap();
+    let at = |y: f64, speed: f32| TrafficState {
+        front_y_m: y,
+        yaw_rad: std::f32::consts::FRAC_PI_2,
+        speed_mps: speed,
+        kind: Kind::Person as u32,
+        ..TrafficState::default()
+    };
+    frame(&mut mirror, &header(0, 0), &[at(1.0, 1.0)]);
+    let ticks = frame(&mut mirror, &header(0, 2), &[at(1.3, 1.5)]);
+    let (half, end) = (ticks[0].states[0], ticks[1].states[0]);
+    assert!((half.y_m - 1.15).abs() < 1e-12 && (end.y_m - 1.3).abs() < 1e-12);
+    assert!((end.velocity_body_mps[0] - 1.5).abs() < 1e-6 && end.velocity_body_mps[1].abs() < 1e-6);
+    assert!((ticks[1].rows[4].dy_m + 0.075).abs() < 1e-6, "{:?}", ticks[1].rows[4]);
+    let ticks = frame(&mut mirror, &header(0, 4), &[at(1.5, 1.0)]);
+    assert!(
+        (ticks[0].states[0].accel_body_mps2[0] + 2.5).abs() < 1e-5,
+        "from 1.5 to 1 m/s in 0.2 s"
+    );
+    assert_eq!(mirror.resynchronisations(), 0);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(30))]
+
+    /// Every vehicle moves the same whoever else is there and in whatever order SUMO names them; rows are ascending.
+    #[test]
+    fn order_and_company_do_not_matter(
+        count in 1_u32..12,
+        shuffle in any::<u64>(),
+        speeds in prop::collection::vec(0.0_f64..15.0, 12),
+    ) {
+        let drives: Vec<Vec<TrafficState>> = (0..count)
+            .map(|v| {
+                let mut states = drive(&road(), 10.0 + 20.0 * f64::from(v), 0.1, &vec![speeds[v as usize]; 30]);
+                states.iter_mut().for_each(|s| s.vehicle = v);
+                states
+            })
+            .collect();
+        let mut together = Mirror::new(settings(0.1, 10, 1));
+        let metas: Vec<_> = (0..count).map(|v| meta(v, Kind::Cav)).collect();
+        together.apply_meta(&header(0, 0), &metas).unwrap();
+        let mut alone: Vec<Mirror> = metas
+            .iter()
+            .map(|m| {
+                let mut mirror = Mirror::new(settings(0.1, 10, 1));
+                mirror.apply_meta(&header(0, 0), &[*m]).unwrap();
+                mirror
+            })
+            .collect();
+        for tick in 0..30 {
+            let mut states: Vec<TrafficState> = drives.iter().map(|d| d[tick]).collect();
+            states.rotate_left((shuffle as usize + tick) % count as usize);
+            if tick % 2 == 0 {
+                states.reverse();
+            }
+            let all = &frame(&mut together, &header(0, tick as u64), &states)[0];
+            for (v, mirror) in alone.iter_mut().enumerate() {
+                let one = &frame(mirror, &header(0, tick as u64), &[drives[v][tick]])[0];
+                prop_assert_eq!(all.states[v], one.states[0]);
+                prop_assert_eq!(&all.rows[10 * v..10 * v + 10], &one.rows[..]);
+            }
+        }
+    }
+}
+
+#[test]
+fn the_limits_are_the_configured_ones() {
+    assert_eq!(settings(0.1, 10, 1).vehicle, limits());
+}
