@@ -1,0 +1,197 @@
+//! The process: `world` in, `observation` out, one for one.
+
+use std::path::Path;
+
+use ipc_schema::{
+    block::{self, BlockError},
+    board::State,
+    failure::{Failure, FailureKind},
+    header::{LAST_OF_RUN, MessageHeader},
+    observation::ObservationLayout,
+    ports::{BoardReader, Message, PortError, Publisher, Waker},
+    process::Process,
+    run::Mode,
+    services::Channel,
+    session::{Session, Wait},
+    world::{VehicleState, WorldLayout},
+};
+use serde::Serialize;
+
+use crate::{
+    digest::Digest,
+    sensing::{Sensing, SensingError},
+};
+
+/// One process serves one environment.
+const ENV_INDEX: u32 = 0;
+
+/// What this process adds to the run's report.
+#[derive(Debug, Serialize)]
+struct Part {
+    observation_hash: String,
+    observations: u64,
+    ticks: u64,
+    cavs_max: u32,
+    raw_gnss_mean_error_m: Option<f64>,
+    drops: u64,
+}
+
+/// Senses until the last tick of the run, or until the process is asked to stop.
+///
+/// # Errors
+/// The map's projection is not understood, or a port fails.
+pub fn run(run_file: &Path) -> Result<(), Failure> {
+    let mut session = Session::join(run_file, Process::SensorDaemon, ENV_INDEX)?;
+    let sensing = Sensing::new(&session.run.config, &session.run.map).map_err(|error| {
+        Failure::from_error(FailureKind::Config, &error)
+            .with_help("give a net whose <location> has a projection that PROJ knows")
+    })?;
+    let world = session.subscriber(Channel::World)?;
+    let mut daemon = Daemon::open(session, sensing)?;
+    while let Some(message) = daemon.session.next(&world)? {
+        let header = *message.header();
+        if daemon.tick(&message)? == Wait::Stopped {
+            break;
+        }
+        drop(message);
+        daemon.session.consumed(header.tick + 1);
+        if header.has(LAST_OF_RUN) {
+            return daemon.leave();
+        }
+    }
+    daemon.write_part()
+}
+
+struct Daemon {
+    session: Session,
+    sensing: Sensing,
+    observations: Publisher,
+    /// Who must not miss an observation: nobody if nobody learns.
+    consumer: Option<(BoardReader, Waker)>,
+    digest: Digest,
+    ticks: u64,
+    vehicle_steps: u64,
+    cavs_max: u32,
+}
+
+impl Daemon {
+    fn open(mut session: Session, sensing: Sensing) -> Result<Self, Failure> {
+        let observations = session.publisher(Channel::Observation)?;
+        let consumer = match session.run.mode {
+            Mode::Train => Some((session.board_of(Process::Trainer)?, session.waker(Process::Trainer)?)),
+            Mode::Simulate => None,
+        };
+        session.attach();
+        Ok(Self {
+            session,
+            sensing,
+            observations,
+            consumer,
+            digest: Digest::default(),
+            ticks: 0,
+            vehicle_steps: 0,
+            cavs_max: 0,
+        })
+    }
+
+    /// One tick: waits for credit, senses, publishes.
+    fn tick(&mut self, message: &Message) -> Result<Wait, Failure> {
+        let world = message.header();
+        if world.tick != self.ticks {
+            return Err(PortError::Gap {
+                channel: "world",
+                expected: self.ticks,
+                received: world.tick,
+            }
+            .into());
+        }
+        let states = states(message).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
+        let n = self.sensing.assign(world, states);
+        if let Some((board, _)) = &self.consumer
+            && self.session.wait_for_credit(board, world.tick)? == Wait::Stopped
+        {
+            return Ok(Wait::Stopped);
+        }
+        self.publish(world, states, n)?;
+        Ok(Wait::Ready)
+    }
+
+    fn publish(&mut self, world: &MessageHeader, states: &[VehicleState], n: usize) -> Result<(), Failure> {
+        let d = self.sensing.width();
+        let ours = self.session.header();
+        let header = MessageHeader {
+            count: n as u32,
+            columns: d as u32,
+            run_id: ours.run_id,
+            incarnation: ours.incarnation,
+            sequence: 0,
+            ..*world
+        };
+        let mut draft = self.observations.loan(header, ObservationLayout::new(n, d).len)?;
+        self.sensing
+            .observe(&header, states, draft.payload_mut())
+            .map_err(too_far)?;
+        self.digest.add(&header, draft.payload());
+        draft.send()?;
+        if let Some((_, waker)) = &self.consumer {
+            waker.wake();
+        }
+        self.account(&header, states.len());
+        Ok(())
+    }
+
+    fn account(&mut self, header: &MessageHeader, road_users: usize) {
+        let before = self.vehicle_steps;
+        self.vehicle_steps = self.sensing.raw_error().count;
+        let cavs = (self.vehicle_steps - before) as u32;
+        self.cavs_max = self.cavs_max.max(cavs);
+        self.ticks += 1;
+        let (ticks, vehicle_steps, drops) = (self.ticks, self.vehicle_steps, self.observations.drops());
+        self.session.report(|health| {
+            health.state = State::Running as u32;
+            health.ticks = ticks;
+            health.episode = header.episode;
+            health.sim_time_ns = header.sim_time_ns;
+            health.road_users = road_users as u32;
+            health.cavs = cavs;
+            health.vehicle_steps = vehicle_steps;
+            health.drops = drops;
+        });
+    }
+
+    /// Leaves once everything sent has been consumed.
+    fn leave(mut self) -> Result<(), Failure> {
+        self.write_part()?;
+        if let Some((board, _)) = &self.consumer
+            && self.session.wait_until_consumed(board, self.ticks)? == Wait::Stopped
+        {
+            return Ok(());
+        }
+        self.session.report(|health| health.state = State::Done as u32);
+        Ok(())
+    }
+
+    fn write_part(&self) -> Result<(), Failure> {
+        let raw = self.sensing.raw_error();
+        #[expect(clippy::cast_precision_loss, reason = "a mean for people")]
+        let part = Part {
+            observation_hash: self.digest.hex(),
+            observations: self.vehicle_steps,
+            ticks: self.ticks,
+            cavs_max: self.cavs_max,
+            raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
+            drops: self.observations.drops(),
+        };
+        self.session.write_part(&part)
+    }
+}
+
+fn states(message: &Message) -> Result<&[VehicleState], BlockError> {
+    let header = message.header();
+    let layout = WorldLayout::new(header.count as usize, header.columns as usize);
+    block::view(message.payload(), layout.states)
+}
+
+fn too_far(error: SensingError) -> Failure {
+    Failure::from_error(FailureKind::Run, &error)
+}

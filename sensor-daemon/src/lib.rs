@@ -1,0 +1,17 @@
+//! Sensors of connected vehicles, and the assembly of what they deliver into observations.
+//!
+//! A library of pure functions without clock, I/O or shared memory; the `sensor-daemon` binary is a thin shell around
+//! [`sensing::Sensing`].
+
+// Sensor values leave in single precision: the wire's precision, see `ipc_schema::observation`.
+#![expect(clippy::cast_possible_truncation, reason = "see above")]
+
+pub mod daemon;
+pub mod digest;
+pub mod fields;
+pub mod gnss;
+pub mod imu;
+pub mod noise;
+pub mod sensing;
+pub mod slots;
+pub mod speed_steering;

@@ -1,0 +1,9 @@
+//! `sensor-daemon RUN_FILE`: started by `caraware`.
+
+use std::process::ExitCode;
+
+use ipc_schema::{process::Process, session};
+
+fn main() -> ExitCode {
+    session::main(Process::SensorDaemon, sensor_daemon::daemon::run)
+}

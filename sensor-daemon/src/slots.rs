@@ -1,0 +1,179 @@
+//! Slots: rows of the observation, each lent to one vehicle until that vehicle leaves.
+
+use std::collections::BTreeSet;
+
+use ipc_schema::observation::{EMPTY_SLOT, TERMINATED, TRUNCATED};
+
+/// One row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Slot {
+    /// Dense index of its vehicle, or [`EMPTY_SLOT`].
+    pub vehicle: u32,
+    /// Ticks since the vehicle took the slot.
+    pub step: u32,
+    /// [`TERMINATED`], [`TRUNCATED`]: what became of the vehicle that had it at the previous tick.
+    pub ended: u32,
+    seen: bool,
+}
+
+const EMPTY: Slot = Slot {
+    vehicle: EMPTY_SLOT,
+    step: 0,
+    ended: 0,
+    seen: false,
+};
+
+/// All slots of a run. The number of slots never shrinks.
+#[derive(Debug, Clone, Default)]
+pub struct Slots {
+    slots: Vec<Slot>,
+    free: BTreeSet<u32>,
+    /// Slot of each dense vehicle index, [`EMPTY_SLOT`] where it has none.
+    of_vehicle: Vec<u32>,
+    /// Slots that become free at the next tick.
+    leaving: Vec<u32>,
+}
+
+impl Slots {
+    /// Begins a tick; `new_episode` cuts every trajectory and empties all slots.
+    pub fn begin(&mut self, new_episode: bool) {
+        self.free.extend(self.leaving.drain(..));
+        for (number, slot) in (0_u32..).zip(&mut self.slots) {
+            let occupied = slot.vehicle != EMPTY_SLOT;
+            slot.ended = 0;
+            slot.seen = false;
+            if new_episode {
+                *slot = Slot {
+                    ended: if occupied { TRUNCATED } else { 0 },
+                    ..EMPTY
+                };
+                self.free.insert(number);
+            }
+        }
+        if new_episode {
+            self.of_vehicle.clear();
+        }
+    }
+
+    /// The slot of `vehicle` at this tick: its own, or the lowest free one.
+    pub fn occupy(&mut self, vehicle: u32) -> usize {
+        let index = vehicle as usize;
+        if index >= self.of_vehicle.len() {
+            self.of_vehicle.resize(index + 1, EMPTY_SLOT);
+        }
+        if self.of_vehicle[index] == EMPTY_SLOT {
+            self.of_vehicle[index] = self.take_free(vehicle);
+        } else {
+            self.slots[self.of_vehicle[index] as usize].step += 1;
+        }
+        let number = self.of_vehicle[index] as usize;
+        self.slots[number].seen = true;
+        number
+    }
+
+    fn take_free(&mut self, vehicle: u32) -> u32 {
+        let number = self.free.pop_first().unwrap_or_else(|| {
+            self.slots.push(EMPTY);
+            self.slots.len() as u32 - 1
+        });
+        let slot = &mut self.slots[number as usize];
+        *slot = Slot {
+            vehicle,
+            step: 0,
+            ..*slot
+        };
+        number
+    }
+
+    /// Ends a tick: a vehicle that was not seen has left; its slot can be taken from the next tick on.
+    pub fn end(&mut self) {
+        for (number, slot) in (0_u32..).zip(&mut self.slots) {
+            if slot.vehicle != EMPTY_SLOT && !slot.seen {
+                self.of_vehicle[slot.vehicle as usize] = EMPTY_SLOT;
+                *slot = Slot {
+                    ended: slot.ended | TERMINATED,
+                    ..EMPTY
+                };
+                self.leaving.push(number);
+            }
+        }
+    }
+
+    /// All rows.
+    #[must_use]
+    pub fn rows(&self) -> &[Slot] {
+        &self.slots
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use std::collections::BTreeMap;
+
+    fn tick(slots: &mut Slots, new_episode: bool, vehicles: &[u32]) -> Vec<usize> {
+        slots.begin(new_episode);
+        let numbers = vehicles.iter().map(|vehicle| slots.occupy(*vehicle)).collect();
+        slots.end();
+        numbers
+    }
+
+    #[test]
+    fn a_slot_is_kept_freed_and_lent_again() {
+        let mut slots = Slots::default();
+        assert_eq!(tick(&mut slots, true, &[0, 1, 2]), [0, 1, 2]);
+        assert_eq!(
+            tick(&mut slots, false, &[0, 2, 3]),
+            [0, 2, 3],
+            "a slot is not lent again at the tick it becomes free"
+        );
+        assert_eq!(
+            (slots.rows()[1].vehicle, slots.rows()[1].ended),
+            (EMPTY_SLOT, TERMINATED)
+        );
+        assert_eq!(tick(&mut slots, false, &[0, 2, 3, 4]), [0, 2, 3, 1]);
+        assert_eq!(
+            (slots.rows()[1].ended, slots.rows()[1].step, slots.rows()[0].step),
+            (0, 0, 2)
+        );
+    }
+
+    #[test]
+    fn a_new_episode_truncates_everybody() {
+        let mut slots = Slots::default();
+        tick(&mut slots, true, &[0, 1]);
+        assert_eq!(tick(&mut slots, true, &[0]), [0]);
+        assert_eq!(
+            slots.rows().iter().map(|slot| slot.ended).collect::<Vec<_>>(),
+            [TRUNCATED, TRUNCATED]
+        );
+        assert_eq!((slots.rows()[0].step, slots.rows()[1].vehicle), (0, EMPTY_SLOT));
+    }
+
+    proptest! {
+        /// Whatever comes and goes: one vehicle a slot, a vehicle keeps its slot, the number of slots never shrinks.
+        #[test]
+        fn slots_are_stable(presence in prop::collection::vec(prop::collection::btree_set(0_u32..20, 0..12), 1..40)) {
+            let mut slots = Slots::default();
+            let mut held: BTreeMap<u32, usize> = BTreeMap::new();
+            let mut count = 0;
+            for vehicles in presence {
+                let vehicles: Vec<u32> = vehicles.into_iter().collect();
+                let numbers = tick(&mut slots, false, &vehicles);
+                let now: BTreeMap<u32, usize> = vehicles.iter().copied().zip(numbers).collect();
+                let distinct: BTreeSet<usize> = now.values().copied().collect();
+                prop_assert_eq!(distinct.len(), now.len());
+                for (vehicle, number) in &now {
+                    prop_assert_eq!(slots.rows()[*number].vehicle, *vehicle);
+                    if let Some(before) = held.get(vehicle) {
+                        prop_assert_eq!(before, number);
+                    }
+                }
+                prop_assert!(slots.rows().len() >= count);
+                count = slots.rows().len();
+                held = now;
+            }
+        }
+    }
+}
