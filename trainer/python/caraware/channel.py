@@ -1,0 +1,167 @@
+"""The trainer's end of shared memory: observations as read-only tensors, credits, predictions, status."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caraware import _native
+
+
+class StreamEndedError(Exception):
+    """The last tick of the run has been received: nothing will follow."""
+
+
+class ReadOnlyTensor(Tensor):
+    """A tensor over memory that must not be written: the simulation's own shared memory.
+
+    torch has no read-only tensors, and a write to this memory would kill the process. Every in-place operation and
+    every `out=` on this tensor or a view of it raises; results in memory of their own are ordinary tensors.
+    """
+
+    @classmethod
+    def __torch_function__(cls, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        name = getattr(func, "__name__", "")
+        writes = name in {"__setitem__", "set_", "data"} or (name.endswith("_") and not name.endswith("__"))
+        in_place = name.startswith("__i") and name.endswith("__") and name not in {"__index__", "__int__", "__invert__"}
+        if (writes or in_place) and args and isinstance(args[0], cls):
+            raise RuntimeError(f"{name}: observations are read-only shared memory; write to a clone()")
+        if isinstance(kwargs.get("out"), cls):
+            raise RuntimeError(f"{name}(out=…): observations are read-only shared memory")
+        result = super().__torch_function__(func, types, args, kwargs)
+        if isinstance(result, cls) and not any(_shares_memory(result, arg) for arg in args if isinstance(arg, cls)):
+            return result.as_subclass(Tensor)
+        return result
+
+
+def _shares_memory(a: Tensor, b: Tensor) -> bool:
+    with torch._C.DisableTorchFunctionSubclass():
+        return a.untyped_storage().data_ptr() == b.untyped_storage().data_ptr()
+
+
+def read_only_tensor(array: np.ndarray) -> Tensor:
+    """A tensor over a read-only numpy array, without a copy."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+        return torch.from_numpy(array).as_subclass(ReadOnlyTensor)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One tick of one environment. n slots, d fields; a slot keeps its vehicle until that vehicle is gone.
+
+    All arrays are read-only views over shared memory, valid while this object or any of them lives.
+    """
+
+    block: _native.ObservationBlock
+    tick: int = field(init=False)
+    episode: int = field(init=False)
+    sim_time_ns: int = field(init=False)
+    evaluation: bool = field(init=False)
+    """True in an evaluation episode, whose seed training never sees."""
+    last: bool = field(init=False)
+    """True for the last tick of the run."""
+    episode_last: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        for name in ("tick", "episode", "sim_time_ns", "evaluation", "last", "episode_last"):
+            object.__setattr__(self, name, getattr(self.block, name))
+
+    def _array(self, name: str, dtype: type, columns: int | None = None) -> np.ndarray:
+        array = np.frombuffer(self.block.section(name), dtype=dtype)
+        return array if columns is None else array.reshape(self.block.slots, columns)
+
+    @cached_property
+    def observation(self) -> Tensor:
+        """f32 [n, d], normalised fields; what a policy may see."""
+        return read_only_tensor(self._array("observation", np.float32, self.block.fields))
+
+    @cached_property
+    def truth(self) -> Tensor:
+        """f32 [n, 4]: x and y of the rear axle (m, world), yaw (rad), speed (m/s). For rewards and errors only."""
+        return read_only_tensor(self._array("truth", np.float32, _native.TRUTH_COLUMNS))
+
+    @cached_property
+    def gnss_m(self) -> Tensor:
+        """f32 [n, 2]: newest raw GNSS fix (m, world), the baseline."""
+        return read_only_tensor(self._array("gnss_m", np.float32, 2))
+
+    @cached_property
+    def vehicle(self) -> np.ndarray:
+        """u32 [n]: dense index of the vehicle within its episode, 0xFFFFFFFF for an empty slot."""
+        return self._array("vehicle", np.uint32)
+
+    @cached_property
+    def id_hash(self) -> np.ndarray:
+        """u64 [n]: hash of the vehicle's SUMO id."""
+        return self._array("id_hash", np.uint64)
+
+    @cached_property
+    def age_s(self) -> np.ndarray:
+        """f32 [n, 3]: age of the newest GNSS, IMU and speed-steering sample (s)."""
+        return self._array("age_s", np.float32, 3)
+
+    @cached_property
+    def _flags(self) -> np.ndarray:
+        return self._array("flags", np.uint32)
+
+    @cached_property
+    def valid(self) -> np.ndarray:
+        """bool [n]: the slot holds a vehicle whose sensors have all delivered."""
+        return (self._flags & _native.VALID) != 0
+
+    @cached_property
+    def terminated(self) -> np.ndarray:
+        """bool [n]: the trajectory in this slot at the previous tick ended there (arrival, removal)."""
+        return (self._flags & _native.TERMINATED) != 0
+
+    @cached_property
+    def truncated(self) -> np.ndarray:
+        """bool [n]: the trajectory in this slot at the previous tick was cut there (end of episode)."""
+        return (self._flags & _native.TRUNCATED) != 0
+
+
+class Channel:
+    """A trainer's place in a run. One for each process; opening it lets the simulation start."""
+
+    def __init__(self, run_file: str) -> None:
+        self._attachment = _native.Attachment(run_file)
+        self.run: dict[str, Any] = json.loads(self._attachment.run_json)
+
+    def receive(self, timeout_s: float) -> list[Observation]:
+        """All ticks that are waiting, in order, at least one; an empty list after `timeout_s`.
+
+        Raises StreamEndedError once the last tick has been received before.
+        """
+        if self._attachment.ended:
+            raise StreamEndedError
+        return [Observation(block) for block in self._attachment.receive(timeout_s)]
+
+    def consumed(self, tick: int) -> None:
+        """Gives the simulation credit for all ticks up to and including `tick`."""
+        self._attachment.consumed(tick)
+
+    def committed(self, tick: int) -> None:
+        """All ticks up to and including `tick` are in a checkpoint that has been renamed into place."""
+        self._attachment.committed(tick)
+
+    def publish_predictions(self, observation: Observation, predictions: Tensor, policy_version: int) -> None:
+        """Predicted positions, f32 [n, 2] in world metres, for everybody who watches."""
+        rows = predictions.detach().to(torch.float32).contiguous().numpy()
+        self._attachment.publish_predictions(observation.block, rows.tobytes(), rows.shape[1], policy_version)
+
+    def report(self, **status: float) -> None:
+        """Shows episode, env_steps, updates, env_steps_per_s, policy_std, reward, error_m, raw_gnss_error_m."""
+        self._attachment.report(**status)
+
+    def done(self) -> None:
+        """All work is done: the process may end."""
+        self._attachment.done()

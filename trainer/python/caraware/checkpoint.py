@@ -1,0 +1,176 @@
+"""Checkpoints: directories of safetensors and a manifest, complete or absent, verified when read."""
+
+import hashlib
+import json
+import os
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from caraware.ppo import Ppo
+
+SCHEMA_VERSION = 1
+MANIFEST = "manifest.json"
+LATEST = "latest"
+"""File beside the checkpoints that names the newest."""
+
+
+class CheckpointError(Exception):
+    """A checkpoint that cannot be used: which file, and why."""
+
+    def __init__(self, file: Path, reason: str) -> None:
+        super().__init__(f"{file}: {reason}")
+        self.file, self.reason = file, reason
+
+
+@dataclass(frozen=True)
+class Counters:
+    """How far training has come."""
+
+    updates: int
+    env_steps: int
+    episode: int
+    committed_tick: int
+    """Newest tick that the parameters have learnt from; -1 before the first."""
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What `manifest.json` says."""
+
+    schema_version: int
+    torch_version: str
+    config_sha256: str
+    observation_size: int
+    hidden: tuple[int, ...]
+    counters: Counters
+    files: dict[str, str]
+    """Name to SHA-256."""
+
+
+def save_checkpoint(folder: Path, ppo: Ppo, counters: Counters, config_sha256: str, keep: int) -> Path:
+    """Write `folder/update-NNNNNN`, then point `folder/latest` at it; older ones beyond `keep` are removed.
+
+    Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there.
+    """
+    target = folder / f"update-{counters.updates:06d}"
+    temporary = folder / f".{target.name}.partial"
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    files = {name: _write(temporary / name, save(tensors)) for name, tensors in _tensors(ppo).items()}
+    manifest = Manifest(
+        schema_version=SCHEMA_VERSION,
+        torch_version=torch.__version__,
+        config_sha256=config_sha256,
+        observation_size=ppo.observation_size,
+        hidden=ppo.config.hidden,
+        counters=counters,
+        files=files,
+    )
+    _write(temporary / MANIFEST, json.dumps(asdict(manifest), indent=2).encode())
+    _sync_directory(temporary)
+    if target.exists():
+        shutil.rmtree(target)
+    temporary.rename(target)
+    _write(folder / f".{LATEST}.partial", target.name.encode())
+    (folder / f".{LATEST}.partial").rename(folder / LATEST)
+    _sync_directory(folder)
+    _remove_old(folder, keep)
+    return target
+
+
+def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
+    """Verify a checkpoint and continue `ppo` from it, bit for bit on a CPU. Raises `CheckpointError`."""
+    manifest = read_manifest(checkpoint)
+    for name, expected in (("observation_size", ppo.observation_size), ("hidden", ppo.config.hidden)):
+        if (found := getattr(manifest, name)) != expected:
+            raise CheckpointError(checkpoint / MANIFEST, f"its {name} is {found}, this run's is {expected}")
+    stored = {name: _read_tensors(checkpoint / name, digest) for name, digest in manifest.files.items()}
+    current = _tensors(ppo)
+    for name, tensors in current.items():
+        if set(stored.get(name, {})) != set(tensors):
+            raise CheckpointError(checkpoint / name, "does not hold the tensors of this trainer")
+        for key, tensor in tensors.items():
+            tensor.copy_(stored[name][key])
+    ppo.sampling.set_state(stored["random.safetensors"]["sampling"])
+    ppo.shuffling.set_state(stored["random.safetensors"]["shuffling"])
+    ppo.updates = manifest.counters.updates
+    return manifest.counters
+
+
+def latest_checkpoint(folder: Path) -> Path:
+    """The checkpoint that `folder/latest` names. Raises `CheckpointError` if there is none."""
+    try:
+        return folder / (folder / LATEST).read_text().strip()
+    except OSError as error:
+        raise CheckpointError(folder / LATEST, f"cannot be read ({error.strerror})") from error
+
+
+def read_manifest(checkpoint: Path) -> Manifest:
+    """The manifest of a checkpoint directory. Raises `CheckpointError`."""
+    file = checkpoint / MANIFEST
+    try:
+        raw = json.loads(file.read_bytes())
+        if raw["schema_version"] != SCHEMA_VERSION:
+            raise CheckpointError(file, f"schema version {raw['schema_version']}, this trainer reads {SCHEMA_VERSION}")
+        return Manifest(**{**raw, "counters": Counters(**raw["counters"]), "hidden": tuple(raw["hidden"])})
+    except OSError as error:
+        raise CheckpointError(file, f"cannot be read ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(file, f"is not a manifest ({error})") from error
+
+
+def _tensors(ppo: Ppo) -> dict[str, dict[str, Tensor]]:
+    """Every tensor of the trainer by file and name. Parameters and moments are views: filling them loads them."""
+    parameters: dict[str, Tensor] = {}
+    moments: dict[str, Tensor] = {}
+    for network, mlp, optimiser in (
+        ("policy", ppo.policy.mlp, ppo.policy_optimiser),
+        ("value", ppo.value.mlp, ppo.value_optimiser),
+    ):
+        parameters |= {f"{network}.{name}": tensor for name, tensor in mlp.parameters.value.items()}
+        moments[f"{network}.mean"] = optimiser.mean
+        moments[f"{network}.square"] = optimiser.square
+        moments[f"{network}.steps"] = optimiser.steps
+    random = {"sampling": ppo.sampling.get_state(), "shuffling": ppo.shuffling.get_state()}
+    return {"parameters.safetensors": parameters, "optimiser.safetensors": moments, "random.safetensors": random}
+
+
+def _read_tensors(file: Path, sha256: str) -> dict[str, Tensor]:
+    try:
+        found = hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError as error:
+        raise CheckpointError(file, f"cannot be read ({error.strerror})") from error
+    if found != sha256:
+        raise CheckpointError(file, f"is damaged: SHA-256 {found[:12]}…, the manifest says {sha256[:12]}…")
+    try:
+        return load_file(file)
+    except SafetensorError as error:
+        raise CheckpointError(file, f"is not a safetensors file ({error})") from error
+
+
+def _write(file: Path, content: bytes) -> str:
+    """Write and flush to disk; the SHA-256 of the content."""
+    with file.open("wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+    return hashlib.sha256(content).hexdigest()
+
+
+def _sync_directory(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _remove_old(folder: Path, keep: int) -> None:
+    for old in sorted(folder.glob("update-*"))[:-keep]:
+        shutil.rmtree(old)

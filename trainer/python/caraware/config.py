@@ -1,0 +1,196 @@
+"""The trainer's hyper-parameters and the map's box, read from the run file, checked once, then frozen."""
+
+import hashlib
+import json
+import math
+import os
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from caraware import rewards
+
+_KEY_OF_FIELD = {"checkpoint_interval_updates": "checkpoint_interval"}
+"""Fields whose name in the configuration file differs (there, the unit stands in the table of keys)."""
+
+
+SMALLEST = math.ulp(0.0)
+"""The smallest number greater than 0."""
+
+
+class ConfigError(Exception):
+    """A value in the run file that the trainer cannot use; `help` says what to write instead."""
+
+    def __init__(self, message: str, help: str) -> None:
+        super().__init__(message)
+        self.help = help
+
+
+@dataclass(frozen=True)
+class TrainerConfig:
+    """Hyper-parameters in the paper's words (section IV), with their defaults for the preset `town`."""
+
+    algorithm: str = "ppo"
+    learning_rate: float = 2e-3
+    """Adam's step size at the first update, for the policy and the value network."""
+    learning_rate_decay: float = 0.995
+    """Factor on the learning rate after every update."""
+    discount: float = 0.0
+    """γ. Predictions do not influence the world, so 0 (a bandit) loses nothing and has the least variance."""
+    gae_lambda: float = 0.95
+    clip_epsilon: float = 0.2
+    """ε: probability ratios beyond 1 ± ε earn nothing more."""
+    initial_std: float = 1.0
+    """Standard deviation of the policy at the start, in actions: 1 is half the map's width."""
+    entropy_scale: float = 0.001
+    value_scale: float = 1.0
+    max_grad_norm: float = 0.5
+    """Largest gradient norm, of the policy and of the value network each."""
+    horizon: int = 8192
+    """Samples (one vehicle at one tick) collected before every update."""
+    batch_size: int = 1024
+    """Samples in a gradient step."""
+    epochs: int = 4
+    hidden: tuple[int, ...] = (500, 300)
+    reward: str = "bounded_inverse"
+    reward_scale_m: float = 5.0
+    matmul_precision: str = "auto"
+    """`float32`, `bfloat16` (inputs of matrix products only), or `auto`: bfloat16 where the CPU has AMX tiles."""
+    threads: int = 0
+    """CPU threads; 0 is one per core this process may use."""
+    device: str = "cpu"
+    """`cpu`, or `auto`: a GPU if there is one."""
+    seed: int = 1
+    checkpoint_interval_updates: int = 10
+    checkpoints_kept: int = 5
+
+    @classmethod
+    def from_run(cls, run: dict) -> "TrainerConfig":
+        """Read `run["config"]["trainer"]`; the seed may stand in `run["config"]["run"]`. Raises `ConfigError`."""
+        section = dict(_table(run, "trainer"))
+        section.pop("module", None)
+        seed_of_run = run.get("config", {}).get("run", {}).get("seed")
+        if seed_of_run is not None:
+            section.setdefault("seed", seed_of_run)
+        values = {f.name: _typed(f.name, f.type, section) for f in fields(cls) if _key(f.name) in section}
+        known = {_key(f.name) for f in fields(cls)}
+        if unknown := sorted(set(section) - known):
+            raise ConfigError(f"unknown key `trainer.{unknown[0]}`", f"known keys: {', '.join(sorted(known))}")
+        config = cls(**values)
+        config._check()
+        return config
+
+    def thread_count(self) -> int:
+        """Threads to use, with 0 resolved to the cores this process may run on."""
+        return self.threads or len(os.sched_getaffinity(0))
+
+    def _check(self) -> None:
+        _choice("algorithm", self.algorithm, ("ppo",))
+        _choice("device", self.device, ("cpu", "auto"))
+        _choice("reward", self.reward, tuple(rewards.REWARDS))
+        _choice("matmul_precision", self.matmul_precision, ("auto", "float32", "bfloat16"))
+        for name in ("learning_rate", "learning_rate_decay", "initial_std", "max_grad_norm", "reward_scale_m"):
+            _range(name, getattr(self, name), SMALLEST, math.inf)
+        for name in ("discount", "gae_lambda"):
+            _range(name, getattr(self, name), 0.0, 1.0)
+        for name in ("entropy_scale", "value_scale", "threads", "seed"):
+            _range(name, getattr(self, name), 0, math.inf)
+        _range("clip_epsilon", self.clip_epsilon, SMALLEST, 1.0)
+        for name in ("horizon", "batch_size", "epochs", "checkpoint_interval_updates", "checkpoints_kept"):
+            _range(name, getattr(self, name), 1, math.inf)
+        _range("batch_size", self.batch_size, 1, self.horizon)
+        if not self.hidden or min(self.hidden) < 1:
+            raise ConfigError(f"`trainer.hidden` is {list(self.hidden)}", "give one or more widths, as [500, 300]")
+
+
+@dataclass(frozen=True)
+class MapBounds:
+    """The box of the map in world metres (ENU). Actions in [-1, 1] span it."""
+
+    x_min_m: float
+    y_min_m: float
+    x_max_m: float
+    y_max_m: float
+
+    @classmethod
+    def from_run(cls, run: dict) -> "MapBounds":
+        """Read `run["map"]["bounds_m"]` = [x_min, y_min, x_max, y_max]. Raises `ConfigError`."""
+        bounds = run.get("map", {}).get("bounds_m")
+        if not isinstance(bounds, list) or len(bounds) != 4 or not all(isinstance(v, int | float) for v in bounds):
+            raise ConfigError(f"`map.bounds_m` is {bounds}", "four numbers: [x_min, y_min, x_max, y_max] in metres")
+        box = cls(*(float(v) for v in bounds))
+        if not (box.x_min_m < box.x_max_m and box.y_min_m < box.y_max_m):
+            raise ConfigError(f"`map.bounds_m` = {bounds} is an empty box", "[x_min, y_min, x_max, y_max]")
+        return box
+
+    def to_world_m(self, action: Tensor) -> Tensor:
+        """Map actions `[..., 2]` to world metres. Affine and unclipped: ±1 is the edge, beyond it lies outside."""
+        half = action.new_tensor([self.x_max_m - self.x_min_m, self.y_max_m - self.y_min_m]) / 2
+        centre = action.new_tensor([self.x_max_m + self.x_min_m, self.y_max_m + self.y_min_m]) / 2
+        return action * half + centre
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything the trainer reads of a run file."""
+
+    run_dir: Path
+    trainer: TrainerConfig
+    bounds: MapBounds
+    config_sha256: str
+    """Of the resolved configuration, as canonical JSON: a checkpoint remembers what it was trained with."""
+    resume_from: Path | None = field(default=None)
+    """A checkpoint directory to continue from."""
+
+    @classmethod
+    def from_run(cls, run: dict) -> "RunConfig":
+        """Check the whole run file. Raises `ConfigError`."""
+        if "run_dir" not in run:
+            raise ConfigError("the run file has no `run_dir`", "start the trainer through `caraware train`")
+        canonical = json.dumps(run.get("config", {}), sort_keys=True, separators=(",", ":")).encode()
+        resume = run.get("resume_from")
+        return cls(
+            run_dir=Path(run["run_dir"]),
+            trainer=TrainerConfig.from_run(run),
+            bounds=MapBounds.from_run(run),
+            config_sha256=hashlib.sha256(canonical).hexdigest(),
+            resume_from=Path(resume) if resume else None,
+        )
+
+
+def _key(field_name: str) -> str:
+    return _KEY_OF_FIELD.get(field_name, field_name)
+
+
+def _table(run: dict, name: str) -> dict:
+    table = run.get("config", {}).get(name)
+    if not isinstance(table, dict):
+        raise ConfigError(f"the run file has no table `config.{name}`", "start the trainer through `caraware train`")
+    return table
+
+
+def _typed(name: str, kind: object, section: dict) -> Any:
+    """The value of a field, where an integer may stand for a float but nothing else is converted."""
+    value = section[_key(name)]
+    if kind == tuple[int, ...] and isinstance(value, list) and all(type(v) is int for v in value):
+        return tuple(value)
+    if kind is float and type(value) in (int, float):
+        return float(value)
+    if kind in (int, str) and type(value) is kind:
+        return value
+    wanted = "list of integers" if kind == tuple[int, ...] else getattr(kind, "__name__", str(kind))
+    raise ConfigError(f"`trainer.{_key(name)}` is {value!r}", f"give a value of type {wanted}")
+
+
+def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ConfigError(f"`trainer.{name}` is {value!r}", f"one of: {', '.join(choices)}")
+
+
+def _range(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high or math.isinf(value):
+        limit = "greater than 0" if low == SMALLEST else f"at least {low:g}"
+        limit += f" and at most {high:g}" if math.isfinite(high) else ""
+        raise ConfigError(f"`trainer.{_key(name)}` is {value}", f"give a value {limit}")

@@ -1,0 +1,50 @@
+"""The course of training: TensorBoard events, and a history for the plots."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from torch.utils.tensorboard import SummaryWriter
+
+from caraware.evaluation import EvaluationResult
+from caraware.ppo import UpdateStats
+
+
+@dataclass(frozen=True)
+class TrainingPoint:
+    """Training as it stood after one update."""
+
+    env_steps: int
+    sigma: float
+    reward: float
+    error_m: float
+    """Mean error of the deterministic policy on the horizon's samples, before it learnt from them."""
+    raw_gnss_error_m: float
+    env_steps_per_s: float
+
+
+class Metrics:
+    """Writes TensorBoard events to `folder` and keeps one point per update and per evaluation."""
+
+    def __init__(self, folder: Path) -> None:
+        self.training: list[TrainingPoint] = []
+        self.evaluations: list[EvaluationResult] = []
+        self._writer = SummaryWriter(str(folder))
+
+    def updated(self, point: TrainingPoint, stats: UpdateStats) -> None:
+        """Record one update."""
+        self.training.append(point)
+        for name, value in asdict(stats).items():
+            self._writer.add_scalar(f"update/{name}", value, point.env_steps)
+        self._writer.add_scalar("error/training_m", point.error_m, point.env_steps)
+        self._writer.add_scalar("error/training_raw_gnss_m", point.raw_gnss_error_m, point.env_steps)
+        self._writer.add_scalar("speed/env_steps_per_s", point.env_steps_per_s, point.env_steps)
+
+    def evaluated(self, result: EvaluationResult) -> None:
+        """Record one evaluation phase."""
+        self.evaluations.append(result)
+        self._writer.add_scalar("error/evaluation_m", result.ppo_mean_error_m, result.env_steps)
+        self._writer.add_scalar("error/evaluation_raw_gnss_m", result.raw_gnss_mean_error_m, result.env_steps)
+
+    def close(self) -> None:
+        """Flush everything to disk."""
+        self._writer.close()

@@ -1,0 +1,80 @@
+"""The two pictures of a run: error and exploration over training, as PNG files without a display."""
+
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, ScalarFormatter
+
+from caraware.evaluation import EvaluationResult
+from caraware.metrics import TrainingPoint
+
+POLICY, EVALUATION, RAW, REWARD = "#7fb3d5", "#1a5276", "#b03a2e", "#ca6f1e"
+
+
+def plot_error(file: Path, training: list[TrainingPoint], evaluations: list[EvaluationResult]) -> None:
+    """Mean position error of the policy in training and in evaluations, against raw GNSS, over env steps."""
+    figure, axes = _figure("Position error of the policy against raw GNSS")
+    axes.plot([p.env_steps for p in training], [p.error_m for p in training], color=POLICY, label="policy, training")
+    raw_m = _last_raw_m(training, evaluations)
+    if raw_m is not None:
+        axes.axhline(raw_m, color=RAW, linestyle="--", label=f"raw GNSS ({raw_m:.2f} m)")
+    if evaluations:
+        final = evaluations[-1]
+        axes.errorbar(
+            [e.env_steps for e in evaluations],
+            [e.ppo_mean_error_m for e in evaluations],
+            yerr=[1.96 * e.ppo_standard_error_m for e in evaluations],
+            color=EVALUATION,
+            marker="o",
+            markersize=4,
+            linewidth=1.5,
+            capsize=2,
+            label=f"policy, evaluation on unseen seeds (last {final.ppo_mean_error_m:.2f} m, bars 95 %)",
+        )
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(ScalarFormatter())
+    axes.yaxis.set_minor_formatter(ScalarFormatter())
+    axes.tick_params(axis="y", which="minor", labelsize=8)
+    axes.set_ylabel("mean position error [m]")
+    axes.legend(frameon=False)
+    _save(figure, file)
+
+
+def plot_sigma(file: Path, training: list[TrainingPoint]) -> None:
+    """Standard deviation of the policy and mean reward over env steps (the paper's figure 7)."""
+    figure, axes = _figure("Exploration and reward")
+    steps = [p.env_steps for p in training]
+    axes.plot(steps, [p.sigma for p in training], color=EVALUATION)
+    axes.set_ylabel("σ of the policy [half map widths]", color=EVALUATION)
+    axes.set_ylim(bottom=0)
+    right = axes.twinx()
+    right.plot(steps, [p.reward for p in training], color=REWARD)
+    right.set_ylabel("mean reward per sample [-]", color=REWARD)
+    right.set_ylim(bottom=0)
+    right.spines["top"].set_visible(False)
+    _save(figure, file)
+
+
+def _last_raw_m(training: list[TrainingPoint], evaluations: list[EvaluationResult]) -> float | None:
+    if evaluations:
+        return evaluations[-1].raw_gnss_mean_error_m
+    return training[-1].raw_gnss_error_m if training else None
+
+
+def _figure(title: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set_title(title, loc="left", fontweight="bold")
+    axes.set_xlabel("environment steps (one vehicle, one tick)")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(which="both", alpha=0.25)
+    return figure, axes
+
+
+def _save(figure: Figure, file: Path) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file)

@@ -1,0 +1,382 @@
+"""Proximal policy optimisation (Schulman et al., arXiv 1707.06347) for the paper's localisation task.
+
+A horizon of observations is collected; every observation gets a sampled action (a predicted position), its reward
+(from the distance to the truth) and its advantage; then, for some epochs, the policy climbs the clipped surrogate
+objective in minibatches while the value network regresses on the returns.
+
+Actions are sampled when the horizon is full, not tick by tick: predictions do not influence the world. So the
+samples depend on the seed and on the data alone, never on how many ticks happened to arrive together.
+"""
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from caraware import rewards
+from caraware.adam import Adam
+from caraware.config import MapBounds, TrainerConfig
+from caraware.gae import generalised_advantage
+from caraware.networks import FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
+from caraware.rollout import Horizon
+
+ACTIONS = 2
+SMALLEST_DEVIATION = 1e-8
+
+
+class NonFiniteLoss(Exception):
+    """A loss or gradient stopped being a number. The parameters are as before the step; the batch is saved."""
+
+    def __init__(self, what: str, update: int) -> None:
+        super().__init__(f"{what} is not finite in update {update}")
+        self.update = update
+        self.batch_file: Path | None = None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The samples of one horizon, `[s]` rows in order of tick, then slot."""
+
+    observation: Tensor
+    """f32 `[s, d]`."""
+    action: Tensor
+    """f32 `[s, 2]`, as sampled, not clipped."""
+    log_probability: Tensor
+    """f32 `[s]` of the action under the policy that sampled it."""
+    reward: Tensor
+    """f32 `[s]`."""
+    advantage: Tensor
+    """f32 `[s]`, before normalisation."""
+    value_target: Tensor
+    """f32 `[s]`."""
+    truth: Tensor
+    """f32 `[s, 4]`."""
+    vehicle: Tensor
+    """i64 `[s]`."""
+    tick: Tensor
+    """i64 `[s]`."""
+
+
+@dataclass(frozen=True)
+class UpdateStats:
+    """What one update did: means over its minibatches, unless the name says otherwise."""
+
+    policy_loss: float
+    value_loss: float
+    entropy: float
+    approximate_kl: float
+    """Mean of (ratio - 1) - log ratio, an unbiased estimate of KL(old, new) that is never negative."""
+    clip_fraction: float
+    ratio_mean: float
+    ratio_max: float
+    sigma: float
+    """Standard deviation of the policy after the update, mean over the actions, in actions."""
+    advantage_mean: float
+    advantage_std: float
+    reward_mean: float
+    explained_variance: float
+    """1 - Var(target - value) / Var(target), of the values before the update."""
+    policy_gradient_norm: float
+    value_gradient_norm: float
+    learning_rate: float
+    samples: int
+
+
+@dataclass(frozen=True)
+class _PolicyMeans:
+    loss: float
+    entropy: float
+    approximate_kl: float
+    clip_fraction: float
+    ratio_mean: float
+    ratio_max: float
+    gradient_norm: float
+
+
+@dataclass(frozen=True)
+class _ValueMeans:
+    loss: float
+    gradient_norm: float
+
+
+class Ppo:
+    """Policy, value network, their optimisers and random numbers; everything that a checkpoint must hold."""
+
+    def __init__(self, config: TrainerConfig, observation_size: int, bounds: MapBounds) -> None:
+        self.config, self.bounds = config, bounds
+        self.observation_size = observation_size
+        self.updates = 0
+        self.device = _configure_torch(config)
+        self.sampling = torch.Generator().manual_seed(config.seed)
+        self.shuffling = torch.Generator().manual_seed(config.seed + 1)
+        self.policy = GaussianPolicy(observation_size, ACTIONS, config.hidden, self.device)
+        self.value = ValueNetwork(observation_size, config.hidden, self.device)
+        self.policy.initialise(self.sampling, config.initial_std)
+        self.value.initialise(self.sampling)
+        self.policy_optimiser = Adam(self.policy.mlp.parameters)
+        self.value_optimiser = Adam(self.value.mlp.parameters)
+        self._reward = rewards.by_name(config.reward)
+        self._second_core = _worker(config, self.device)
+
+    @torch.no_grad()
+    def predict_m(self, observations: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Predicted positions `[n, 2]` in world metres for each of some `[n, d]` blocks: the policy's mean.
+
+        One forward pass over all rows; the blocks are read where they lie, which is shared memory.
+        """
+        mean = self.policy.mlp.infer(*(block.to(self.device) for block in observations))
+        return self.bounds.to_world_m(mean).cpu().split([len(block) for block in observations])
+
+    def learn(self, horizon: Horizon) -> UpdateStats:
+        """Sample, score and learn from one horizon. Raises `NonFiniteLoss` with the batch in memory."""
+        return self.update(self.score(horizon))
+
+    @torch.no_grad()
+    def score(self, horizon: Horizon) -> Batch:
+        """Give every sample of the horizon its action, reward and advantage."""
+        rows = horizon.valid.flatten().nonzero().squeeze(1)
+        observation = horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device)
+        truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
+        mean = self.policy.mlp.infer(observation)
+        noise = torch.randn(mean.shape, generator=self.sampling).to(self.device)
+        action = mean + self.policy.log_std.exp() * noise
+        reward = self._reward(rewards.distance_m(self.bounds.to_world_m(action), truth), self.config.reward_scale_m)
+        value = self.value.mlp.infer(observation).squeeze(1)
+        advantage, value_target = self._advantages(horizon, rows, reward, value)
+        return Batch(
+            observation=observation,
+            action=action,
+            log_probability=log_probability(action, mean, self.policy.log_std),
+            reward=reward,
+            advantage=advantage,
+            value_target=value_target,
+            truth=truth,
+            vehicle=horizon.vehicle.flatten()[rows],
+            tick=horizon.tick.repeat_interleave(horizon.valid.shape[1])[rows],
+        )
+
+    @torch.no_grad()
+    def update(self, batch: Batch) -> UpdateStats:
+        """All epochs of minibatches over one batch. Policy and value share nothing, so each has its own core."""
+        learning_rate = self.config.learning_rate * self.config.learning_rate_decay**self.updates
+        orders = [torch.randperm(len(batch.reward), generator=self.shuffling) for _ in range(self.config.epochs)]
+        orders = [order.to(self.device) for order in orders]
+        if self._second_core is None:
+            policy = self._improve_policy(batch, orders, learning_rate)
+            value = self._improve_value(batch, orders, learning_rate)
+        else:
+            value_job = self._second_core.submit(self._improve_value, batch, orders, learning_rate)
+            try:
+                policy = self._improve_policy(batch, orders, learning_rate)
+            finally:
+                value_job.exception()
+            value = value_job.result()
+        self.updates += 1
+        return self._stats(batch, policy, value, learning_rate)
+
+    @torch.no_grad()
+    def _improve_policy(self, batch: Batch, orders: list[Tensor], learning_rate: float) -> _PolicyMeans:
+        """Climb the clipped surrogate objective plus the entropy bonus."""
+        policy, log, ratio_max = self.policy, [], 0.0
+        for order in orders:
+            columns = (batch.observation, batch.action, batch.log_probability, batch.advantage)
+            for observation, action, old_log_probability, advantage in self._minibatches(columns, order):
+                mean = policy.mlp.forward(observation)
+                surrogate = clipped_surrogate(
+                    mean, policy.log_std, action, old_log_probability, _normalised(advantage), self.config.clip_epsilon
+                )
+                bonus = self.config.entropy_scale * entropy(policy.log_std)
+                loss = self._finite("the policy's loss", surrogate.loss - bonus)
+                policy.mlp.backward(observation, surrogate.mean_gradient)
+                policy.log_std_gradient.copy_(surrogate.log_std_gradient - self.config.entropy_scale)
+                norm = self._step("the policy's gradient", policy.mlp.parameters, self.policy_optimiser, learning_rate)
+                ratio = surrogate.ratio
+                log.append((loss, surrogate.approximate_kl(), surrogate.clip_fraction(), ratio.mean().item(), norm))
+                ratio_max = max(ratio_max, ratio.max().item())
+        loss, kl, clipped, ratio_mean, norm = _means(log)
+        spread = entropy(policy.log_std).item()
+        return _PolicyMeans(loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
+
+    @torch.no_grad()
+    def _improve_value(self, batch: Batch, orders: list[Tensor], learning_rate: float) -> _ValueMeans:
+        """Regress on the value targets with the mean squared error."""
+        network, log = self.value.mlp, []
+        for order in orders:
+            for observation, target in self._minibatches((batch.observation, batch.value_target), order):
+                error = network.forward(observation).squeeze(1) - target
+                loss = self._finite("the value network's loss", error.square().mean())
+                gradient = error.unsqueeze(1).mul_(2 * self.config.value_scale / len(target))
+                network.backward(observation, gradient)
+                norm = self._step("the value gradient", network.parameters, self.value_optimiser, learning_rate)
+                log.append((loss, norm))
+        loss, norm = _means(log)
+        return _ValueMeans(loss, norm)
+
+    def _advantages(self, horizon: Horizon, rows: Tensor, reward: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+        """Advantages and value targets `[s]` of the samples, by way of the `[T, N]` grid that GAE needs."""
+        if self.config.discount == 0.0:
+            return reward - value, reward
+        grid = horizon.valid.shape
+        on_grid = [
+            torch.zeros(grid.numel()).index_copy_(0, rows, column.cpu()).view(grid) for column in (reward, value)
+        ]
+        next_value = on_grid[1].roll(-1, 0)
+        if horizon.bootstrap is not None:
+            next_value[-1] = self.value.mlp.infer(horizon.bootstrap.to(self.device)).squeeze(1).cpu()
+        # What follows a cut is not observed; the value at the cut is the nearest estimate of it.
+        next_value = torch.where(horizon.truncated, on_grid[1], next_value)
+        results = generalised_advantage(
+            reward=on_grid[0],
+            value=on_grid[1],
+            next_value=next_value,
+            terminated=horizon.terminated,
+            truncated=horizon.truncated,
+            valid=horizon.valid,
+            discount=self.config.discount,
+            gae_lambda=self.config.gae_lambda,
+        )
+        advantage, value_target = (result.flatten()[rows].to(self.device) for result in results)
+        return advantage, value_target
+
+    def _minibatches(self, columns: tuple[Tensor, ...], order: Tensor) -> list[tuple[Tensor, ...]]:
+        """Rows of `columns` in `order`, gathered at once, cut into near-equal parts of about `batch_size`."""
+        parts = max(1, round(len(order) / self.config.batch_size))
+        return list(zip(*(column.index_select(0, order).tensor_split(parts) for column in columns), strict=True))
+
+    def _step(self, what: str, parameters: FlatParameters, optimiser: Adam, learning_rate: float) -> float:
+        """Clip the gradient to `max_grad_norm`, take one Adam step, and return the norm before clipping."""
+        norm = self._finite(what, torch.linalg.vector_norm(parameters.gradient))
+        if norm > self.config.max_grad_norm:
+            parameters.gradient.mul_(self.config.max_grad_norm / norm)
+        optimiser.step(learning_rate)
+        return norm
+
+    def _finite(self, what: str, value: Tensor) -> float:
+        number = value.item()
+        if not math.isfinite(number):
+            raise NonFiniteLoss(what, self.updates + 1)
+        return number
+
+    def _stats(self, batch: Batch, policy: _PolicyMeans, value: _ValueMeans, learning_rate: float) -> UpdateStats:
+        return UpdateStats(
+            policy_loss=policy.loss,
+            value_loss=value.loss,
+            entropy=policy.entropy,
+            approximate_kl=policy.approximate_kl,
+            clip_fraction=policy.clip_fraction,
+            ratio_mean=policy.ratio_mean,
+            ratio_max=policy.ratio_max,
+            sigma=self.sigma(),
+            advantage_mean=batch.advantage.mean().item(),
+            advantage_std=batch.advantage.std(correction=0).item(),
+            reward_mean=batch.reward.mean().item(),
+            explained_variance=_explained_variance(batch),
+            policy_gradient_norm=policy.gradient_norm,
+            value_gradient_norm=value.gradient_norm,
+            learning_rate=learning_rate,
+            samples=len(batch.reward),
+        )
+
+    def sigma(self) -> float:
+        """Standard deviation of the policy, mean over the actions; 1 is half the map."""
+        return self.policy.log_std.exp().mean().item()
+
+
+@dataclass(frozen=True)
+class Surrogate:
+    """PPO's clipped objective of a minibatch (equation 7, as a loss) and its gradient."""
+
+    loss: Tensor
+    """Scalar."""
+    mean_gradient: Tensor
+    """`[b, 2]`: dLoss/dMean."""
+    log_std_gradient: Tensor
+    """`[2]`: dLoss/dLogStd."""
+    ratio: Tensor
+    """`[b]`: new over old probability of the action."""
+    log_ratio: Tensor
+    """`[b]`."""
+    clip_epsilon: float
+
+    def approximate_kl(self) -> float:
+        """See `UpdateStats.approximate_kl`."""
+        return (self.ratio - 1 - self.log_ratio).mean().item()
+
+    def clip_fraction(self) -> float:
+        """Share of samples whose ratio left 1 ± ε."""
+        return ((self.ratio - 1).abs() > self.clip_epsilon).float().mean().item()
+
+
+def clipped_surrogate(
+    mean: Tensor, log_std: Tensor, action: Tensor, old_log_probability: Tensor, advantage: Tensor, clip_epsilon: float
+) -> Surrogate:
+    """-E[min(ratio A, clip(ratio, 1 - ε, 1 + ε) A)] and its gradient, for `[b, 2]` means and actions.
+
+    The gradient flows only through samples where the unclipped term is the smaller: d(ratio)/dθ = ratio dlogπ/dθ,
+    with dlogπ/dμ = (a - μ)/σ² and dlogπ/dlogσ = ((a - μ)/σ)² - 1.
+    """
+    inverse_std = torch.exp(-log_std)
+    deviation = (action - mean) * inverse_std
+    log_ratio = log_probability(action, mean, log_std) - old_log_probability
+    ratio = log_ratio.exp()
+    unclipped = ratio * advantage
+    clipped = ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon) * advantage
+    weight = torch.where(unclipped <= clipped, unclipped, 0.0).div_(-len(advantage)).unsqueeze(1)
+    return Surrogate(
+        loss=-torch.minimum(unclipped, clipped).mean(),
+        mean_gradient=weight * deviation * inverse_std,
+        log_std_gradient=(weight * (deviation.square() - 1)).sum(0),
+        ratio=ratio,
+        log_ratio=log_ratio,
+        clip_epsilon=clip_epsilon,
+    )
+
+
+def save_batch(batch: Batch, policy: FlatParameters, file: Path) -> None:
+    """Write a batch and the policy that met it, for whoever must find out why its loss is not a number."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    columns = {name: column.clone().cpu() for name, column in vars(batch).items()}
+    save_file(columns | {f"policy.{name}": value.clone().cpu() for name, value in policy.value.items()}, file)
+
+
+def _normalised(advantage: Tensor) -> Tensor:
+    deviation = advantage.std(correction=0) + SMALLEST_DEVIATION
+    return (advantage - advantage.mean()) / deviation
+
+
+def _means(rows: Sequence[tuple[float, ...]]) -> list[float]:
+    return [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+
+
+def _explained_variance(batch: Batch) -> float:
+    spread = batch.value_target.var(correction=0).item()
+    return 1 - batch.advantage.var(correction=0).item() / spread if spread > 0 else 0.0
+
+
+def _configure_torch(config: TrainerConfig) -> torch.device:
+    """Settings that torch keeps per process: threads within an operation, and the precision of matrix products."""
+    torch.set_num_threads(_threads_per_network(config))
+    amx = hasattr(torch.cpu, "get_capabilities") and torch.cpu.get_capabilities().get("amx_bf16", False)
+    reduced = config.matmul_precision == "bfloat16" or (config.matmul_precision == "auto" and amx)
+    torch.set_float32_matmul_precision("medium" if reduced else "highest")
+    return torch.device("cuda" if config.device == "auto" and torch.cuda.is_available() else "cpu")
+
+
+def _threads_per_network(config: TrainerConfig) -> int:
+    return max(1, config.thread_count() // 2)
+
+
+def _worker(config: TrainerConfig, device: torch.device) -> ThreadPoolExecutor | None:
+    """A thread for the value network where there is a second core for it.
+
+    Two threads, each with its own network, scale better than one network's operations spread over two threads:
+    nothing waits at the end of every operation, least of all for a core that another process is using.
+    """
+    if config.thread_count() < 2 or device.type != "cpu":
+        return None
+    return ThreadPoolExecutor(1, "value", initializer=torch.set_num_threads, initargs=(_threads_per_network(config),))

@@ -1,0 +1,172 @@
+"""The rollout buffer: every tick's rows, copied once out of shared memory, until a horizon is full."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caraware.stream import EMPTY_SLOT, Observation
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """`T` consecutive training ticks of `N` slots. Row `[t, i]` of every array is the same vehicle at the same tick.
+
+    Observation and truth are views of the buffer, valid until the rollout takes another tick.
+    """
+
+    observation: Tensor
+    """f32 `[T, N, d]`."""
+    truth: Tensor
+    """f32 `[T, N, 4]`: x_m, y_m, yaw_rad, speed_mps."""
+    vehicle: Tensor
+    """i64 `[T, N]`: dense vehicle index."""
+    tick: Tensor
+    """i64 `[T]`."""
+    valid: Tensor
+    """bool `[T, N]`: rows that are samples."""
+    terminated: Tensor
+    """bool `[T, N]`: the trajectory ended with this row."""
+    truncated: Tensor
+    """bool `[T, N]`: it went on, but the next row of the slot is not its continuation."""
+    bootstrap: Tensor | None
+    """f32 `[N, d]`: what followed the last tick; None where no discount asks for it."""
+
+    def samples(self) -> int:
+        """Rows that are samples."""
+        return int(self.valid.sum())
+
+    def last_tick(self) -> int:
+        """The newest tick that this horizon learns from."""
+        return int(self.tick[-1])
+
+
+class Rollout:
+    """Collects training ticks until `horizon` samples are there.
+
+    With `bootstrap`, one more tick is kept: what followed the last tick tells how its trajectories ended and what
+    they were still worth. That tick then opens the next horizon.
+    """
+
+    def __init__(self, horizon: int, observation_size: int, *, bootstrap: bool) -> None:
+        self._horizon, self._size, self._bootstrap = horizon, observation_size, bootstrap
+        self._ticks = 0
+        self._samples = self._newest_samples = 0
+        self._last_tick = -1
+        self._taken = 0
+        self._allocate(ticks=16, slots=1)
+
+    def add(self, obs: Observation) -> None:
+        """Copy one training tick. Ticks with no valid row are passed over."""
+        self.ended(obs)
+        rows = len(obs.vehicle)
+        if rows > self._slots:
+            self._grow(self._capacity, rows)
+        samples = int(np.count_nonzero(obs.valid))
+        if samples == 0:
+            return
+        if self._ticks == self._capacity:
+            self._grow(2 * self._capacity, self._slots)
+        t = self._ticks
+        self._observation[t, :rows].copy_(obs.observation)
+        self._truth[t, :rows].copy_(obs.truth)
+        self._set_row(self._vehicle[t], obs.vehicle, EMPTY_SLOT)
+        self._set_row(self._valid[t], obs.valid, False)
+        self._terminated[t], self._truncated[t] = False, False
+        self._tick[t] = obs.tick
+        self._close_changed_slots(t)
+        self._ticks, self._last_tick = t + 1, obs.tick
+        self._samples, self._newest_samples = self._samples + samples, samples
+
+    def ended(self, obs: Observation) -> None:
+        """Note how the trajectories of the newest row ended, which the tick after it, of any episode, tells."""
+        self._discard_taken()
+        if self._ticks == 0:
+            return
+        t = self._ticks - 1
+        if obs.tick == self._last_tick + 1:
+            rows = min(len(obs.vehicle), self._slots)
+            self._terminated[t, :rows] |= obs.terminated[:rows]
+            self._truncated[t, :rows] |= obs.truncated[:rows] & ~obs.terminated[:rows]
+        elif obs.tick != self._last_tick:
+            self._truncated[t] |= ~self._terminated[t]
+
+    def pending_samples(self) -> int:
+        """Samples that no horizon has taken."""
+        return self._samples
+
+    def full(self) -> bool:
+        """Whether `take` has a horizon to give."""
+        following = self._newest_samples if self._bootstrap else 0
+        return self._samples - following >= self._horizon
+
+    def take(self) -> Horizon:
+        """The collected horizon, to be learnt from before the next `add`, which starts anew."""
+        end = self._ticks - 1 if self._bootstrap else self._ticks
+        horizon = Horizon(
+            observation=self._observation[:end],
+            truth=self._truth[:end],
+            vehicle=torch.from_numpy(self._vehicle[:end].astype(np.int64)),
+            tick=torch.from_numpy(self._tick[:end].copy()),
+            valid=torch.from_numpy(self._valid[:end].copy()),
+            terminated=torch.from_numpy(self._terminated[:end].copy()),
+            truncated=torch.from_numpy(self._truncated[:end].copy()),
+            bootstrap=self._observation[end].clone() if self._bootstrap else None,
+        )
+        self._taken, self._samples = end, self._newest_samples if self._bootstrap else 0
+        return horizon
+
+    def _discard_taken(self) -> None:
+        """Move the tick that only served as a bootstrap, if any, to the front."""
+        if self._taken == 0:
+            return
+        for array in self._arrays():
+            array[: self._ticks - self._taken] = array[self._taken : self._ticks]
+        self._ticks -= self._taken
+        self._taken = 0
+
+    def _close_changed_slots(self, t: int) -> None:
+        """A slot that changed hands, or has a gap, without a flag: its trajectory went on unseen."""
+        if t == 0:
+            return
+        went_on = (self._vehicle[t] == self._vehicle[t - 1]) & self._valid[t]
+        self._truncated[t - 1] |= self._valid[t - 1] & ~went_on & ~self._terminated[t - 1]
+
+    @staticmethod
+    def _set_row(row: np.ndarray, values: np.ndarray, empty: int) -> None:
+        row[: len(values)] = values
+        row[len(values) :] = empty
+
+    def _arrays(self) -> tuple[Any, ...]:
+        return (
+            self._observation,
+            self._truth,
+            self._vehicle,
+            self._valid,
+            self._terminated,
+            self._truncated,
+            self._tick,
+        )
+
+    def _allocate(self, ticks: int, slots: int) -> None:
+        self._capacity, self._slots = ticks, slots
+        self._observation = torch.zeros(ticks, slots, self._size)
+        self._truth = torch.zeros(ticks, slots, 4)
+        self._vehicle = np.full((ticks, slots), EMPTY_SLOT, np.uint32)
+        self._valid = np.zeros((ticks, slots), bool)
+        self._terminated = np.zeros((ticks, slots), bool)
+        self._truncated = np.zeros((ticks, slots), bool)
+        self._tick = np.zeros(ticks, np.int64)
+
+    def _grow(self, ticks: int, slots: int) -> None:
+        """More ticks or slots. Rare: the slots in use settle early, the ticks double up to one horizon."""
+        old, t = self._arrays(), self._ticks
+        wide = self._slots
+        self._allocate(ticks, slots)
+        for new, array in zip(self._arrays(), old, strict=True):
+            if array.ndim == 1:
+                new[:t] = array[:t]
+            else:
+                new[:t, :wide] = array[:t]

@@ -1,0 +1,95 @@
+"""What the trainer needs of a stream of observations; `caraware.channel` provides it over shared memory."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from torch import Tensor
+
+EMPTY_SLOT = 0xFFFFFFFF
+"""`vehicle` of a slot that holds nobody."""
+
+
+class Observation(Protocol):
+    """One tick of one environment. The arrays are read-only views, valid while the object lives.
+
+    Row `i` is slot `i`. A slot keeps its vehicle until that vehicle is gone; `n` may grow during a run.
+    """
+
+    @property
+    def tick(self) -> int:
+        """Number of the tick in the run."""
+
+    @property
+    def episode(self) -> int:
+        """Number of its episode."""
+
+    @property
+    def sim_time_ns(self) -> int:
+        """Simulated time in the episode."""
+
+    @property
+    def evaluation(self) -> bool:
+        """True in an evaluation episode, whose seeds training never sees."""
+
+    @property
+    def last(self) -> bool:
+        """True for the very last tick of the run."""
+
+    @property
+    def episode_last(self) -> bool:
+        """True for the last tick of its episode."""
+
+    @property
+    def observation(self) -> Tensor:
+        """f32 `[n, d]`, normalised."""
+
+    @property
+    def truth(self) -> Tensor:
+        """f32 `[n, 4]`: x_m, y_m, yaw_rad, speed_mps in the world frame. Only for the reward and the error."""
+
+    @property
+    def gnss_m(self) -> Tensor:
+        """f32 `[n, 2]`: newest raw GNSS fix in world metres. Only for the baseline."""
+
+    @property
+    def vehicle(self) -> np.ndarray:
+        """u32 `[n]`: dense vehicle index within the episode, `EMPTY_SLOT` where there is none."""
+
+    @property
+    def valid(self) -> np.ndarray:
+        """bool `[n]`: the row holds a vehicle with valid sensors."""
+
+    @property
+    def terminated(self) -> np.ndarray:
+        """bool `[n]`: the trajectory in this slot at the previous tick ended there (arrival, removal)."""
+
+    @property
+    def truncated(self) -> np.ndarray:
+        """bool `[n]`: ... was cut there from outside (episode reset, time limit)."""
+
+
+class Channel(Protocol):
+    """The trainer's end of the observation stream of one run."""
+
+    @property
+    def run(self) -> dict:
+        """The parsed run file."""
+
+    def receive(self, timeout_s: float) -> Sequence[Observation]:
+        """Wait for ticks and return all that are there, oldest first; empty after `timeout_s` without any."""
+
+    def consumed(self, tick: int) -> None:
+        """Give the producer credit up to and including `tick`."""
+
+    def committed(self, tick: int) -> None:
+        """Say that all ticks up to and including `tick` are in a checkpoint: nobody needs to deliver them again."""
+
+    def publish_predictions(self, observation: Any, predictions: Tensor, policy_version: int) -> None:
+        """Send f32 `[n, 2]` predicted positions in world metres for the tick of `observation`."""
+
+    def done(self) -> None:
+        """Say that all work is done, so that the run may end."""
+
+    def report(self, **status: float) -> None:
+        """Tell the supervisor how training goes."""

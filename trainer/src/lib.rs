@@ -1,0 +1,340 @@
+//! Python extension `caraware._native`: a trainer's place in a run, observations as read-only views over shared memory.
+
+use std::{
+    path::Path,
+    sync::{Arc, Mutex, MutexGuard, atomic::AtomicBool},
+    time::{Duration, Instant},
+};
+
+use ipc_schema::{
+    block::Section,
+    board::{State, TrainingStatus},
+    header::{self, MessageHeader},
+    observation::ObservationLayout,
+    ports::{Message, Publisher, Subscriber},
+    process::Process,
+    run::RunFile,
+    services::Channel as Service,
+    session::{Session, SessionError},
+};
+use pyo3::{
+    exceptions::{PyKeyError, PyRuntimeError, PyValueError},
+    prelude::*,
+};
+
+mod view;
+use view::SectionView;
+
+/// Longest wait between two looks at Python's signals.
+const LOOK: Duration = Duration::from_millis(50);
+
+fn failed(error: &dyn std::error::Error) -> PyErr {
+    PyRuntimeError::new_err(
+        ipc_schema::failure::Failure::from_error(ipc_schema::failure::FailureKind::Run, error).message,
+    )
+}
+
+fn session_failed(error: SessionError) -> PyErr {
+    failed(&error)
+}
+
+struct Attached {
+    session: Session,
+    observations: Subscriber,
+    predictions: Publisher,
+    training: TrainingStatus,
+    ended: bool,
+}
+
+/// A trainer's place in a run: one for each process.
+#[pyclass(frozen, module = "caraware._native")]
+struct Attachment {
+    inner: Mutex<Attached>,
+    #[pyo3(get)]
+    run_json: String,
+}
+
+#[pymethods]
+impl Attachment {
+    /// Joins the run that `run_file` describes and opens its ports; producers may send from now on.
+    #[new]
+    fn new(run_file: &str) -> PyResult<Self> {
+        let run = RunFile::read(Path::new(run_file)).map_err(|error| failed(&error))?;
+        let run_json = std::fs::read_to_string(run_file).map_err(|error| failed(&error))?;
+        let stop = Arc::new(AtomicBool::new(false));
+        let mut session = Session::join_with(run, Process::Trainer, 0, stop).map_err(session_failed)?;
+        let observations = session.subscriber(Service::Observation).map_err(session_failed)?;
+        let predictions = session.publisher(Service::Prediction).map_err(session_failed)?;
+        session.attach();
+        let attached = Attached {
+            session,
+            observations,
+            predictions,
+            training: TrainingStatus::default(),
+            ended: false,
+        };
+        Ok(Self {
+            inner: Mutex::new(attached),
+            run_json,
+        })
+    }
+
+    /// All blocks that are waiting, at least one; an empty list after `timeout_s` seconds. Releases the GIL while it waits.
+    fn receive(&self, py: Python<'_>, timeout_s: f64) -> PyResult<Vec<ObservationBlock>> {
+        let deadline = Instant::now()
+            + Duration::try_from_secs_f64(timeout_s).map_err(|error| PyValueError::new_err(error.to_string()))?;
+        loop {
+            let blocks = py.detach(|| self.take_waiting())?;
+            if !blocks.is_empty() {
+                return Ok(blocks);
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(blocks);
+            }
+            py.detach(|| self.lock()?.session.wait(left.min(LOOK)).map_err(session_failed))?;
+            py.check_signals()?;
+        }
+    }
+
+    /// True once the last block of the run has been received.
+    #[getter]
+    fn ended(&self) -> PyResult<bool> {
+        Ok(self.lock()?.ended)
+    }
+
+    /// Gives the producer credit for all ticks up to and including `tick`.
+    fn consumed(&self, tick: u64) -> PyResult<()> {
+        let mut inner = self.lock()?;
+        inner.session.consumed(tick + 1);
+        inner.session.report(|health| {
+            health.ticks = tick + 1;
+            health.state = State::Running as u32;
+        });
+        Ok(())
+    }
+
+    /// Says that all ticks up to and including `tick` are in a checkpoint that has been renamed into place.
+    fn committed(&self, tick: u64) -> PyResult<()> {
+        self.lock()?.session.committed(tick + 1);
+        Ok(())
+    }
+
+    /// Says that all work is done.
+    fn done(&self) -> PyResult<()> {
+        self.lock()?.session.report(|health| health.state = State::Done as u32);
+        Ok(())
+    }
+
+    /// Publishes the predictions for `block`: `rows` is f32 `[n, columns]` in C order.
+    fn publish_predictions(
+        &self,
+        block: &ObservationBlock,
+        rows: &[u8],
+        columns: u32,
+        policy_version: u64,
+    ) -> PyResult<()> {
+        let expected = block.header.count as usize * columns as usize * size_of::<f32>();
+        if rows.len() != expected {
+            return Err(PyValueError::new_err(format!(
+                "predictions have {} bytes, [n, columns] of f32 has {expected}",
+                rows.len()
+            )));
+        }
+        let inner = self.lock()?;
+        let header = MessageHeader {
+            columns,
+            sequence: policy_version,
+            ..answer(inner.session.header(), &block.header)
+        };
+        let mut draft = inner
+            .predictions
+            .loan(header, rows.len())
+            .map_err(|error| failed(&error))?;
+        draft.payload_mut().copy_from_slice(rows);
+        draft.send().map(drop).map_err(|error| failed(&error))
+    }
+
+    /// Shows how learning goes; what is left out keeps its last value.
+    #[pyo3(signature = (*, episode=None, env_steps=None, updates=None, env_steps_per_s=None, policy_std=None, reward=None, error_m=None, raw_gnss_error_m=None))]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "keyword arguments of a Python method, one for each number of the status"
+    )]
+    fn report(
+        &self,
+        episode: Option<u64>,
+        env_steps: Option<u64>,
+        updates: Option<u64>,
+        env_steps_per_s: Option<f64>,
+        policy_std: Option<f64>,
+        reward: Option<f64>,
+        error_m: Option<f64>,
+        raw_gnss_error_m: Option<f64>,
+    ) -> PyResult<()> {
+        let mut inner = self.lock()?;
+        let old = inner.training;
+        inner.training = TrainingStatus {
+            episode: episode.unwrap_or(old.episode),
+            env_steps: env_steps.unwrap_or(old.env_steps),
+            updates: updates.unwrap_or(old.updates),
+            env_steps_per_s: env_steps_per_s.unwrap_or(old.env_steps_per_s),
+            policy_std: policy_std.unwrap_or(old.policy_std),
+            reward: reward.unwrap_or(old.reward),
+            error_m: error_m.unwrap_or(old.error_m),
+            raw_gnss_error_m: raw_gnss_error_m.unwrap_or(old.raw_gnss_error_m),
+        };
+        inner.session.board().set_training(inner.training);
+        Ok(())
+    }
+}
+
+impl Attachment {
+    fn lock(&self) -> PyResult<MutexGuard<'_, Attached>> {
+        self.inner
+            .lock()
+            .map_err(|_| PyRuntimeError::new_err("an earlier call failed in the middle: attach anew"))
+    }
+
+    fn take_waiting(&self) -> PyResult<Vec<ObservationBlock>> {
+        let mut inner = self.lock()?;
+        let mut blocks = Vec::new();
+        while let Some(message) = inner.observations.receive().map_err(|error| failed(&error))? {
+            inner.ended |= message.header().has(header::LAST_OF_RUN);
+            blocks.push(ObservationBlock::new(message)?);
+        }
+        Ok(blocks)
+    }
+}
+
+/// The header of an answer to `question`: our identity, its episode, tick, time and count.
+fn answer(ours: MessageHeader, question: &MessageHeader) -> MessageHeader {
+    MessageHeader {
+        flags: question.flags,
+        episode: question.episode,
+        episode_seed: question.episode_seed,
+        tick: question.tick,
+        sim_time_ns: question.sim_time_ns,
+        count: question.count,
+        ..ours
+    }
+}
+
+/// One tick's observations in shared memory; the memory stays valid while this object or a view of it lives.
+#[pyclass(frozen, module = "caraware._native")]
+struct ObservationBlock {
+    header: MessageHeader,
+    layout: ObservationLayout,
+    /// Address of the payload; valid as long as `_message` lives.
+    payload_address: usize,
+    /// Keeps the payload from being overwritten. Never locked: a message is Send but not Sync, Python wants both.
+    _message: Mutex<Message>,
+}
+
+impl ObservationBlock {
+    fn new(message: Message) -> PyResult<Self> {
+        let header = *message.header();
+        let payload_address = message.payload().as_ptr().expose_provenance();
+        let layout = ObservationLayout::new(header.count as usize, header.columns as usize);
+        if layout.len > message.payload().len() {
+            return Err(PyValueError::new_err(format!(
+                "tick {}: {} slots of {} fields need {} bytes, the message has {}",
+                header.tick,
+                header.count,
+                header.columns,
+                layout.len,
+                message.payload().len()
+            )));
+        }
+        Ok(Self {
+            header,
+            layout,
+            payload_address,
+            _message: Mutex::new(message),
+        })
+    }
+}
+
+#[pymethods]
+impl ObservationBlock {
+    /// Tick number, 0-based over the run.
+    #[getter]
+    fn tick(&self) -> u64 {
+        self.header.tick
+    }
+
+    /// Episode number, 0-based over the run.
+    #[getter]
+    fn episode(&self) -> u64 {
+        self.header.episode
+    }
+
+    /// Simulated time since the start of the episode, nanoseconds.
+    #[getter]
+    fn sim_time_ns(&self) -> u64 {
+        self.header.sim_time_ns
+    }
+
+    /// Number of slots n.
+    #[getter]
+    fn slots(&self) -> u32 {
+        self.header.count
+    }
+
+    /// Number of fields d.
+    #[getter]
+    fn fields(&self) -> u32 {
+        self.header.columns
+    }
+
+    /// True in an evaluation episode.
+    #[getter]
+    fn evaluation(&self) -> bool {
+        self.header.has(header::EVALUATION)
+    }
+
+    /// True for the last tick of its episode.
+    #[getter]
+    fn episode_last(&self) -> bool {
+        self.header.has(header::LAST_OF_EPISODE)
+    }
+
+    /// True for the last tick of the run.
+    #[getter]
+    fn last(&self) -> bool {
+        self.header.has(header::LAST_OF_RUN)
+    }
+
+    /// Address of the payload, to prove where it lies.
+    #[getter]
+    fn address(&self) -> usize {
+        self.payload_address
+    }
+
+    /// The bytes of one array ("observation", "truth", "gnss_m", "id_hash", "vehicle", "flags", "episode_step", "age_s")
+    /// as a read-only buffer over shared memory.
+    fn section(slf: Bound<'_, Self>, name: &str) -> PyResult<SectionView> {
+        let table = slf.get().layout.named();
+        let section: Section = table
+            .iter()
+            .find(|(known, _)| *known == name)
+            .map(|(_, section)| *section)
+            .ok_or_else(|| PyKeyError::new_err(name.to_owned()))?;
+        Ok(SectionView::new(slf.unbind(), section))
+    }
+}
+
+/// The module.
+#[pymodule]
+fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<Attachment>()?;
+    module.add_class::<ObservationBlock>()?;
+    module.add_class::<SectionView>()?;
+    module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
+    module.add("VALID", ipc_schema::observation::VALID)?;
+    module.add("TERMINATED", ipc_schema::observation::TERMINATED)?;
+    module.add("TRUNCATED", ipc_schema::observation::TRUNCATED)?;
+    module.add("CLIPPED", ipc_schema::observation::CLIPPED)?;
+    module.add("EMPTY_SLOT", ipc_schema::observation::EMPTY_SLOT)?;
+    module.add("TRUTH_COLUMNS", ipc_schema::observation::TRUTH_COLUMNS)
+}

@@ -1,0 +1,104 @@
+"""A trainer that checks instead of learning: run by `caraware train --set trainer.module=probe`.
+
+It takes the trainer's part in a real run with noiseless sensors and looks at every sample on its way from shared
+memory through the rollout buffer to the batch that PPO learns from. What it found goes to `parts/trainer.json`.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from caraware.channel import Channel, Observation
+from caraware.config import RunConfig
+from caraware.ppo import Ppo
+from caraware.rewards import REWARDS
+from caraware.rollout import Rollout
+
+
+def shared_segments() -> list[tuple[int, int]]:
+    """Address ranges of this process that are mapped from the run's shared memory."""
+    lines = Path("/proc/self/maps").read_text().splitlines()
+    ranges = [line.split()[0].split("-") for line in lines if "/dev/shm/caraware_" in line]
+    return [(int(first, 16), int(last, 16)) for first, last in ranges]
+
+
+def lies_in_shared_memory(address: int) -> bool:
+    """Whether an address belongs to a shared segment."""
+    return any(first <= address < last for first, last in shared_segments())
+
+
+def position_m(normalised: torch.Tensor, bounds: list[float]) -> torch.Tensor:
+    """World metres from the first two fields of a −1 … 1 observation."""
+    low, high = torch.tensor(bounds[:2]), torch.tensor(bounds[2:])
+    return low + (normalised[..., :2] + 1) / 2 * (high - low)
+
+
+def check_tick(obs: Observation, bounds: list[float], found: dict) -> None:
+    """Everything about one tick where it lies: in shared memory, read-only, rows of one vehicle."""
+    views = (obs.observation, obs.truth, obs.gnss_m)
+    found["in_shared_memory"] &= all(lies_in_shared_memory(view.data_ptr()) for view in views)
+    found["in_the_block"] &= obs.observation.data_ptr() == obs.block.address
+    rows = torch.from_numpy(np.flatnonzero(obs.valid))
+    error = (position_m(obs.observation[rows], bounds) - obs.truth[rows, :2]).abs()
+    found["largest_position_error_m"] = max(found["largest_position_error_m"], float(error.max()))
+    found["distinct_vehicles"] &= len(np.unique(obs.vehicle[obs.valid])) == len(rows)
+    for write in (lambda: obs.observation.add_(1), lambda: obs.observation.__setitem__(0, 1.0)):
+        try:
+            write()
+            found["writable"] = True
+        except RuntimeError:
+            found["refused_writes"] += 1
+
+
+def check_batch(ppo: Ppo, rollout: Rollout, config: RunConfig, bounds: list[float], found: dict, seen: dict) -> None:
+    """Observation, action, reward and truth of a sample belong to the same vehicle and the same tick."""
+    batch = ppo.score(rollout.take())
+    found["samples"] += len(batch.reward)
+    place = position_m(batch.observation, bounds)
+    found["largest_batch_error_m"] = max(
+        found["largest_batch_error_m"], float((place - batch.truth[:, :2]).abs().max())
+    )
+    distance = (config.bounds.to_world_m(batch.action) - batch.truth[:, :2]).norm(dim=1)
+    reward = REWARDS[config.trainer.reward](distance, config.trainer.reward_scale_m)
+    found["largest_reward_error"] = max(found["largest_reward_error"], float((reward - batch.reward).abs().max()))
+    for tick, vehicle, truth in zip(batch.tick.tolist(), batch.vehicle.tolist(), batch.truth, strict=True):
+        found["foreign_samples"] += int(not torch.equal(seen.pop((tick, vehicle)), truth))
+
+
+def main(run_file: str) -> None:
+    """Take part in the run from the first tick to the last."""
+    channel = Channel(run_file)
+    config = RunConfig.from_run(channel.run)
+    bounds = channel.run["map"]["bounds_m"]
+    found = {
+        "in_shared_memory": True, "in_the_block": True, "distinct_vehicles": True, "writable": False,
+        "refused_writes": 0, "largest_position_error_m": 0.0, "largest_batch_error_m": 0.0, "largest_reward_error": 0.0, "samples": 0,
+        "foreign_samples": 0, "ticks": [], "env_steps": 0,
+    }  # fmt: skip
+    ppo = rollout = None
+    seen: dict[tuple[int, int], torch.Tensor] = {}
+    last = False
+    while not last:
+        for obs in channel.receive(1.0):
+            check_tick(obs, bounds, found)
+            found["ticks"].append(obs.tick)
+            if ppo is None:
+                ppo = Ppo(config.trainer, obs.observation.shape[1], config.bounds)
+                rollout = Rollout(config.trainer.horizon, obs.observation.shape[1], bootstrap=False)
+            for row in np.flatnonzero(obs.valid):
+                seen[obs.tick, int(obs.vehicle[row])] = obs.truth[row].clone()
+            rollout.add(obs)
+            last = obs.last
+            channel.consumed(obs.tick)
+            if rollout.full():
+                check_batch(ppo, rollout, config, bounds, found, seen)
+    found["consecutive"] = found["ticks"] == list(range(len(found["ticks"])))
+    found["ticks"] = len(found["ticks"])
+    Path(channel.run["run_dir"], "parts", "trainer.json").write_text(json.dumps(found))
+    channel.done()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,121 @@
+"""A street map with noisy GNSS, in numpy, and a channel over it; for the trainer's unit tests."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+SIZE_M = 220.0
+STREETS_M = np.array([10.0, 75.0, 140.0, 210.0])
+FIELDS = 4
+"""Of an observation: GNSS x, y and the heading's cosine, sine; all in [-1, 1]."""
+
+
+@dataclass
+class SyntheticObservation:
+    """One tick, as `caraware.stream.Observation` describes it."""
+
+    tick: int
+    observation: Tensor
+    truth: Tensor
+    gnss_m: Tensor
+    vehicle: np.ndarray
+    valid: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    episode: int = 0
+    evaluation: bool = False
+    last: bool = False
+    episode_last: bool = False
+    sim_time_ns: int = 0
+
+
+@dataclass
+class SyntheticChannel:
+    """Hands out prepared ticks, up to `window` at a time, and remembers what the trainer sends."""
+
+    run: dict
+    ticks: Iterator[SyntheticObservation]
+    group: int = 8
+    consumed_up_to: int = -1
+    committed_up_to: int = -1
+    is_done: bool = False
+    predictions: dict[int, Tensor] = field(default_factory=dict)
+    versions: dict[int, int] = field(default_factory=dict)
+    reports: list[dict] = field(default_factory=list)
+
+    def receive(self, timeout_s: float) -> list[SyntheticObservation]:
+        """The next ticks."""
+        return [obs for _, obs in zip(range(self.group), self.ticks, strict=False)]
+
+    def consumed(self, tick: int) -> None:
+        """Remember the credit."""
+        assert tick >= self.consumed_up_to
+        self.consumed_up_to = tick
+
+    def committed(self, tick: int) -> None:
+        """Remember the commit."""
+        assert tick >= self.committed_up_to
+        self.committed_up_to = tick
+
+    def done(self) -> None:
+        """Remember the end."""
+        self.is_done = True
+
+    def publish_predictions(self, observation: SyntheticObservation, predictions: Tensor, policy_version: int) -> None:
+        """Remember the predictions."""
+        assert predictions.shape == (len(observation.vehicle), 2)
+        self.predictions[observation.tick] = predictions.clone()
+        self.versions[observation.tick] = policy_version
+
+    def report(self, **status: float) -> None:
+        """Remember the status."""
+        self.reports.append(status)
+
+
+def street_ticks(count: int, vehicles: int, noise_m: float, seed: int) -> Iterator[SyntheticObservation]:
+    """Vehicles at independent random places on the streets of a grid, anew at every tick."""
+    rng = np.random.default_rng(seed)
+    for tick in range(count):
+        along = rng.uniform(0, SIZE_M, vehicles)
+        across = rng.choice(STREETS_M, vehicles)
+        east = rng.random(vehicles) < 0.5
+        x, y = np.where(east, along, across), np.where(east, across, along)
+        yaw = np.where(east, 0.0, math.pi / 2)
+        truth = np.stack((x, y, yaw, np.full(vehicles, 8.0)), 1)
+        gnss = truth[:, :2] + rng.normal(0, noise_m, (vehicles, 2))
+        fields = np.concatenate((gnss / (SIZE_M / 2) - 1, np.cos(yaw)[:, None], np.sin(yaw)[:, None]), 1)
+        nobody = np.zeros(vehicles, bool)
+        yield SyntheticObservation(
+            tick=tick,
+            observation=torch.tensor(fields, dtype=torch.float32),
+            truth=torch.tensor(truth, dtype=torch.float32),
+            gnss_m=torch.tensor(gnss, dtype=torch.float32),
+            vehicle=np.arange(vehicles, dtype=np.uint32),
+            valid=~nobody,
+            terminated=nobody.copy(),
+            truncated=nobody.copy(),
+        )
+
+
+def with_evaluation(
+    count: int, evaluation: int, vehicles: int, noise_m: float, seed: int
+) -> Iterator[SyntheticObservation]:
+    """`evaluation` ticks before and after `count` training ticks; the very last is marked."""
+    total = count + 2 * evaluation
+    for obs in street_ticks(total, vehicles, noise_m, seed):
+        first, last = obs.tick < evaluation, obs.tick >= evaluation + count
+        episode = 0 if first else 2 if last else 1
+        boundary = obs.tick in (evaluation, evaluation + count)
+        truncated = np.full(vehicles, boundary)
+        yield replace(obs, evaluation=first or last, episode=episode, truncated=truncated, last=obs.tick == total - 1)
+
+
+def run_file(run_dir: str, **trainer: object) -> dict:
+    """A run file with small, single-threaded defaults."""
+    section = {"threads": 1, "matmul_precision": "float32", "hidden": [32, 16], "horizon": 256, "batch_size": 64}
+    bounds = [0.0, 0.0, SIZE_M, SIZE_M]
+    return {"run_dir": run_dir, "config": {"trainer": section | trainer}, "map": {"bounds_m": bounds}}

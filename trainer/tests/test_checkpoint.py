@@ -1,0 +1,151 @@
+"""Checkpoints: a round trip, bit-exact resumption, and damage that is refused."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from caraware.checkpoint import (
+    CheckpointError,
+    Counters,
+    latest_checkpoint,
+    load_checkpoint,
+    read_manifest,
+    save_checkpoint,
+)
+from caraware.config import MapBounds, TrainerConfig
+from caraware.ppo import Ppo
+from caraware.rollout import Rollout
+from synthetic import FIELDS, SIZE_M, run_file, street_ticks
+from torch import Tensor
+
+
+def fresh(**trainer: object) -> Ppo:
+    config = TrainerConfig.from_run(run_file("x", **trainer))
+    return Ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
+
+
+def train(ppo: Ppo, from_update: int, to_update: int) -> None:
+    """Updates `from_update` to `to_update` of the same stream of ticks."""
+    rollout, done = Rollout(256, FIELDS, bootstrap=False), 0
+    for obs in street_ticks(4 * to_update, 64, 5.0, seed=8):
+        rollout.add(obs)
+        if rollout.full():
+            horizon = rollout.take()
+            if done >= from_update:
+                ppo.learn(horizon)
+            done += 1
+
+
+def everything(ppo: Ppo) -> list[Tensor]:
+    networks = (ppo.policy.mlp.parameters.values, ppo.value.mlp.parameters.values)
+    moments = [
+        moment
+        for adam in (ppo.policy_optimiser, ppo.value_optimiser)
+        for moment in (adam.mean, adam.square, adam.steps)
+    ]
+    return [*networks, *moments, ppo.sampling.get_state(), ppo.shuffling.get_state()]
+
+
+def counters(ppo: Ppo) -> Counters:
+    return Counters(updates=ppo.updates, env_steps=256 * ppo.updates, episode=3, committed_tick=4 * ppo.updates - 1)
+
+
+def save(folder: Path, ppo: Ppo, keep: int = 5) -> Path:
+    return save_checkpoint(folder, ppo, counters(ppo), "abc", keep)
+
+
+def test_resuming_is_bit_exact(tmp_path: Path) -> None:
+    uninterrupted, first, second = fresh(), fresh(), fresh(seed=1)
+    train(uninterrupted, 0, 7)
+    train(first, 0, 3)
+    written = save(tmp_path, first)
+    assert load_checkpoint(written, second) == counters(first)
+    train(second, 3, 7)
+    assert second.updates == uninterrupted.updates == 7
+    for left, right in zip(everything(second), everything(uninterrupted), strict=True):
+        assert torch.equal(left, right)
+
+
+def test_what_is_in_the_directory(tmp_path: Path) -> None:
+    ppo = fresh()
+    train(ppo, 0, 2)
+    written = save(tmp_path, ppo)
+    assert written == latest_checkpoint(tmp_path) == tmp_path / "update-000002"
+    assert {file.name for file in written.iterdir()} == {
+        "manifest.json",
+        "parameters.safetensors",
+        "optimiser.safetensors",
+        "random.safetensors",
+    }
+    manifest = read_manifest(written)
+    assert manifest.counters.committed_tick == 7
+    assert (manifest.config_sha256, manifest.torch_version) == ("abc", torch.__version__)
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_a_checkpoint_before_the_first_update_can_be_resumed(tmp_path: Path) -> None:
+    written, loaded = save(tmp_path, fresh()), fresh(seed=9)
+    load_checkpoint(written, loaded)
+    train(loaded, 0, 1)
+    reference = fresh()
+    train(reference, 0, 1)
+    assert torch.equal(everything(loaded)[0], everything(reference)[0])
+
+
+def test_only_the_newest_are_kept(tmp_path: Path) -> None:
+    ppo = fresh()
+    for update in range(4):
+        train(ppo, update, update + 1)
+        save(tmp_path, ppo, keep=2)
+    assert sorted(p.name for p in tmp_path.glob("update-*")) == ["update-000003", "update-000004"]
+
+
+@pytest.mark.parametrize("name", ["parameters.safetensors", "optimiser.safetensors", "random.safetensors"])
+def test_one_flipped_bit_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    written = save(tmp_path, fresh())
+    content = bytearray((written / name).read_bytes())
+    content[-1] ^= 1
+    (written / name).write_bytes(content)
+    with pytest.raises(CheckpointError, match=f"{name}: is damaged") as caught:
+        load_checkpoint(written, fresh())
+    assert caught.value.file == written / name
+
+
+def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
+    written = save(tmp_path, fresh())
+    (written / "optimiser.safetensors").unlink()
+    with pytest.raises(CheckpointError, match=r"optimiser\.safetensors: cannot be read"):
+        load_checkpoint(written, fresh())
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]", '{"schema_version": 99}'])
+def test_a_broken_manifest_is_refused(tmp_path: Path, content: str) -> None:
+    written = save(tmp_path, fresh())
+    (written / "manifest.json").write_text(content)
+    with pytest.raises(CheckpointError, match=r"manifest\.json"):
+        load_checkpoint(written, fresh())
+
+
+def test_another_size_is_refused_with_both_sizes(tmp_path: Path) -> None:
+    written = save(tmp_path, fresh())
+    config = TrainerConfig.from_run(run_file("x"))
+    with pytest.raises(CheckpointError, match=f"observation_size is {FIELDS}, this run's is 9"):
+        load_checkpoint(written, Ppo(config, 9, MapBounds(0.0, 0.0, 1.0, 1.0)))
+    with pytest.raises(CheckpointError, match="hidden"):
+        load_checkpoint(written, fresh(hidden=[16, 16]))
+
+
+def test_a_refused_checkpoint_changes_nothing(tmp_path: Path) -> None:
+    written, ppo = save(tmp_path, fresh(seed=3)), fresh()
+    (written / "random.safetensors").write_bytes(b"x")
+    before = [tensor.clone() for tensor in everything(ppo)]
+    with pytest.raises(CheckpointError):
+        load_checkpoint(written, ppo)
+    assert all(torch.equal(a, b) for a, b in zip(before, everything(ppo), strict=True))
+
+
+def test_the_manifest_is_plain_json(tmp_path: Path) -> None:
+    manifest = json.loads((save(tmp_path, fresh()) / "manifest.json").read_text())
+    assert manifest["schema_version"] == 1
+    assert all(len(digest) == 64 for digest in manifest["files"].values())

@@ -1,0 +1,60 @@
+"""Reading the run file."""
+
+import pytest
+import torch
+from caraware.config import ConfigError, MapBounds, RunConfig, TrainerConfig
+from synthetic import run_file
+
+
+def test_defaults_and_given_values() -> None:
+    config = TrainerConfig.from_run(run_file("x", learning_rate=1, hidden=[8, 4], checkpoint_interval=3))
+    assert (config.learning_rate, config.hidden, config.checkpoint_interval_updates) == (1.0, (8, 4), 3)
+    assert config.epochs == TrainerConfig().epochs
+
+
+def test_the_seed_of_the_run_is_the_trainer_s() -> None:
+    run = run_file("x")
+    run["config"]["run"] = {"seed": 7}
+    assert TrainerConfig.from_run(run).seed == 7
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("learning_speed", 1.0, "unknown key `trainer.learning_speed`"),
+        ("learning_rate", "fast", "`trainer.learning_rate` is 'fast'"),
+        ("learning_rate", -1.0, "`trainer.learning_rate` is -1.0"),
+        ("discount", 1.5, "`trainer.discount` is 1.5"),
+        ("horizon", True, "`trainer.horizon` is True"),
+        ("batch_size", 1000, "`trainer.batch_size` is 1000"),
+        ("hidden", [], "`trainer.hidden` is"),
+        ("reward", "best", "`trainer.reward` is 'best'"),
+        ("algorithm", "sac", "`trainer.algorithm` is 'sac'"),
+    ],
+)
+def test_a_wrong_value_names_the_key_and_the_cure(key: str, value: object, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        TrainerConfig.from_run(run_file("x", **{key: value}))
+    assert message in str(caught.value)
+    assert caught.value.help
+
+
+def test_actions_span_the_map_and_may_leave_it() -> None:
+    bounds = MapBounds(-10.0, 0.0, 30.0, 100.0)
+    actions = torch.tensor([[-1.0, -1.0], [0.0, 0.0], [1.0, 1.0], [2.0, 0.0]])
+    assert bounds.to_world_m(actions).tolist() == [[-10, 0], [10, 50], [30, 100], [50, 50]]
+
+
+@pytest.mark.parametrize("bounds", [None, [1, 2, 3], [0, 0, 0, 10], ["a", 0, 1, 1]])
+def test_bad_bounds_are_refused(bounds: object) -> None:
+    run = run_file("x")
+    run["map"]["bounds_m"] = bounds
+    with pytest.raises(ConfigError, match=r"map\.bounds_m"):
+        RunConfig.from_run(run)
+
+
+def test_the_configuration_s_hash_does_not_depend_on_order() -> None:
+    run = run_file("x")
+    turned = {**run, "config": dict(reversed(run["config"].items()))}
+    assert RunConfig.from_run(run).config_sha256 == RunConfig.from_run(turned).config_sha256
+    assert RunConfig.from_run(run).config_sha256 != RunConfig.from_run(run_file("x", epochs=9)).config_sha256

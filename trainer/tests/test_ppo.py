@@ -1,0 +1,130 @@
+"""Learning: the toy task, determinism, and a loss that is not a number."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from caraware.config import MapBounds, TrainerConfig
+from caraware.ppo import NonFiniteLoss, Ppo, UpdateStats, save_batch
+from caraware.rewards import distance_m
+from caraware.rollout import Rollout
+from safetensors.torch import load_file
+from synthetic import FIELDS, SIZE_M, run_file, street_ticks
+from torch import Tensor
+
+NOISE_M = 15.0
+TOY: dict[str, object] = {
+    "hidden": [64, 48],
+    "horizon": 2048,
+    "batch_size": 256,
+    "learning_rate": 4e-3,
+    "learning_rate_decay": 0.97,
+    "initial_std": 0.6,
+    "reward": "exponential",
+    "reward_scale_m": 20.0,
+}
+
+
+def fresh(**trainer: object) -> Ppo:
+    config = TrainerConfig.from_run(run_file("x", **trainer))
+    return Ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
+
+
+def train(ppo: Ppo, updates: int) -> list[UpdateStats]:
+    """Some updates on the street map."""
+    rollout = Rollout(ppo.config.horizon, FIELDS, bootstrap=ppo.config.discount > 0)
+    stats: list[UpdateStats] = []
+    for obs in street_ticks(1_000_000, 64, NOISE_M, seed=5):
+        rollout.add(obs)
+        if rollout.full():
+            stats.append(ppo.learn(rollout.take()))
+        if len(stats) == updates:
+            break
+    return stats
+
+
+def parameters(ppo: Ppo) -> Tensor:
+    return torch.cat((ppo.policy.mlp.parameters.values, ppo.value.mlp.parameters.values))
+
+
+def errors_m(ppo: Ppo) -> tuple[float, float]:
+    """Mean error of the policy and of raw GNSS on unseen places."""
+    ticks = list(street_ticks(200, 64, NOISE_M, seed=99))
+    truth = torch.cat([obs.truth for obs in ticks])
+    predicted_m = torch.cat(ppo.predict_m([obs.observation for obs in ticks]))
+    raw_m = torch.cat([obs.gnss_m for obs in ticks])
+    return distance_m(predicted_m, truth).mean().item(), distance_m(raw_m, truth).mean().item()
+
+
+def test_the_toy_task_is_learnt() -> None:
+    ppo = fresh(**TOY)
+    before_m, raw_m = errors_m(ppo)
+    stats = train(ppo, 80)
+    after_m, _ = errors_m(ppo)
+    assert raw_m == pytest.approx(NOISE_M * (torch.pi / 2) ** 0.5, rel=0.02)
+    assert after_m < 0.25 * before_m
+    assert after_m < 0.9 * raw_m
+    assert stats[-1].reward_mean > 2 * stats[0].reward_mean
+    assert stats[-1].sigma < 0.5 * stats[0].sigma
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_same_seed_gives_the_same_parameters(threads: int) -> None:
+    first, second, other = (fresh(seed=seed, threads=threads) for seed in (1, 1, 2))
+    for ppo in (first, second, other):
+        train(ppo, 5)
+    assert torch.equal(parameters(first), parameters(second))
+    assert not torch.equal(parameters(first), parameters(other))
+
+
+def test_a_second_thread_changes_nothing() -> None:
+    one, two = fresh(threads=1), fresh(threads=2)
+    assert train(one, 3) == train(two, 3)
+    assert torch.equal(parameters(one), parameters(two))
+
+
+def test_with_a_discount_it_learns_from_every_sample_too() -> None:
+    stats = train(fresh(discount=0.9, epochs=2), 5)
+    assert [s.samples for s in stats] == [256] * 5
+    assert stats[0].value_loss > stats[-1].value_loss > 0
+
+
+def test_the_statistics_are_what_they_say() -> None:
+    ppo = fresh(epochs=1, batch_size=256, learning_rate_decay=0.5, learning_rate=1e-3)
+    first, second = train(ppo, 2)
+    assert first.ratio_mean == pytest.approx(1.0, abs=1e-5)
+    assert first.clip_fraction == 0.0
+    assert first.approximate_kl == pytest.approx(0.0, abs=1e-5)
+    assert (first.learning_rate, second.learning_rate) == (1e-3, 5e-4)
+    assert second.sigma == ppo.sigma()
+    assert first.explained_variance <= 1
+
+
+def test_a_gradient_is_clipped_to_the_largest_norm() -> None:
+    ppo = fresh(max_grad_norm=1e-3, epochs=1, batch_size=256)
+    (stats,) = train(ppo, 1)
+    assert stats.policy_gradient_norm > 1e-3
+    assert ppo.policy.mlp.parameters.gradient.norm().item() == pytest.approx(1e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_loss_that_is_no_number_stops_before_the_step(threads: int, tmp_path: Path) -> None:
+    ppo = fresh(threads=threads)
+    rollout = Rollout(ppo.config.horizon, FIELDS, bootstrap=False)
+    for obs in street_ticks(4, 64, NOISE_M, seed=5):
+        rollout.add(obs)
+    batch = ppo.score(rollout.take())
+    advantage = batch.advantage.clone()
+    advantage[7] = torch.nan
+    broken = replace(batch, advantage=advantage)
+    with pytest.raises(NonFiniteLoss, match="update 1"):
+        for _ in range(4):
+            ppo.update(broken)
+    assert ppo.updates == 0
+    assert torch.isfinite(parameters(ppo)).all()
+    file = tmp_path / "logs" / "batch.safetensors"
+    save_batch(broken, ppo.policy.mlp.parameters, file)
+    saved = load_file(file)
+    assert torch.isnan(saved["advantage"]).sum() == 1
+    assert torch.equal(saved["policy.log_std"], ppo.policy.log_std)

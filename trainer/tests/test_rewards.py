@@ -1,0 +1,40 @@
+"""The named rewards."""
+
+import math
+
+import pytest
+import torch
+from caraware import rewards
+
+
+def test_equation_5_euclidean_distance() -> None:
+    truth = torch.tensor([[3.0, 4.0, 1.0, 9.0]])
+    assert rewards.distance_m(torch.zeros(1, 2), truth).item() == 5.0
+
+
+@pytest.mark.parametrize(
+    ("name", "distance_m", "expected"),
+    [
+        ("inverse", 4.0, 0.25),
+        ("inverse", 0.0, 1.0),
+        ("bounded_inverse", 0.0, 1.0),
+        ("bounded_inverse", 5.0, 0.5),
+        ("exponential", 5.0, math.exp(-1)),
+    ],
+)
+def test_values(name: str, distance_m: float, expected: float) -> None:
+    reward = rewards.by_name(name)(torch.tensor([distance_m]), 5.0)
+    assert reward.item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("name", list(rewards.REWARDS))
+def test_closer_is_never_worse_and_the_reward_stays_in_0_1(name: str) -> None:
+    reward = rewards.by_name(name)(torch.linspace(0, 300, 1000), 10.0)
+    assert (reward.diff() <= 0).all()
+    assert reward.min() > 0
+    assert reward.max() <= 1
+
+
+def test_an_unknown_name_lists_those_there_are() -> None:
+    with pytest.raises(rewards.UnknownReward, match="inverse, bounded_inverse, exponential"):
+        rewards.by_name("best")

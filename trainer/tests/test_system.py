@@ -1,0 +1,71 @@
+"""The trainer's end of a real run: real SUMO, real processes, real shared memory."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CARAWARE = ROOT / "target" / "release" / "caraware"
+
+NOISELESS = {
+    "gnss.noise_std_deg": 0.0,
+    "traffic.cavs": 6,
+    "traffic.others": 2,
+    "traffic.pedestrians": 2,
+    "episode.ticks": 100,
+    "episode.training_episodes": 3,
+    "episode.evaluation_ticks": 20,
+    "episode.final_evaluations": 1,
+    "trainer.horizon": 500,
+    "trainer.batch_size": 250,
+    "fanout.enabled": "false",
+}
+
+
+def run_with(tmp_path: Path, module: str) -> subprocess.CompletedProcess:
+    """A run whose trainer is a module of this directory."""
+    settings = [f"--set={key}={value}" for key, value in (NOISELESS | {"trainer.module": module}).items()]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "TMPDIR": str(tmp_path)}
+    command = [CARAWARE, "train", "town", "--name", "probe", *settings]
+    return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    """What the probe saw in one run."""
+    tmp_path = tmp_path_factory.mktemp("probe")
+    finished = run_with(tmp_path, "probe")
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    return json.loads((tmp_path / "runs" / "probe" / "parts" / "trainer.json").read_text())
+
+
+def test_observation_action_reward_and_truth_belong_to_the_same_vehicle_and_tick(found: dict) -> None:
+    # Three episodes of 100 ticks with six vehicles, and the evaluation's 20 ticks; a vehicle may enter a tick late.
+    assert found["samples"] >= 1500
+    assert found["foreign_samples"] == 0
+    # Without noise the observed position is the true one; single precision over 260 m is 0.02 mm.
+    assert found["largest_position_error_m"] < 1e-3
+    assert found["largest_batch_error_m"] < 1e-3
+    assert found["largest_reward_error"] < 1e-5
+
+
+def test_the_observation_lies_in_shared_memory_and_cannot_be_written(found: dict) -> None:
+    assert found["in_shared_memory"]
+    assert found["in_the_block"]
+    assert not found["writable"]
+    assert found["refused_writes"] == 2 * found["ticks"]
+
+
+def test_every_tick_arrives_once_in_order(found: dict) -> None:
+    assert found["consecutive"]
+    assert found["ticks"] == 3 * 100 + 20
+    assert found["distinct_vehicles"]
+
+
+def test_a_trainer_that_is_no_module_ends_the_run_with_its_log(tmp_path: Path) -> None:
+    finished = run_with(tmp_path, "no_such_trainer")
+    assert finished.returncode == 1
+    assert "no_such_trainer" in finished.stderr and "its log is" in finished.stderr
