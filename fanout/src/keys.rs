@@ -1,0 +1,131 @@
+//! Keys of a run in zenoh. Names go through percent-encoding: zenoh refuses `# ? $ *` and empty parts, and `/` separates.
+
+use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
+
+/// Characters that stand for themselves: RFC 3986's unreserved ones.
+const ENCODED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b'_').remove(b'~');
+
+/// What is published under a run's prefix.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Topic {
+    /// Road users, as a frame.
+    World,
+    /// What connected vehicles sense, with the truth, as a frame.
+    Observation,
+    /// What the policy makes of it, as a frame.
+    Prediction,
+    /// How the run fares, as JSON.
+    Status,
+    /// The map and the tick, as JSON; answers queries only.
+    Map,
+}
+
+impl Topic {
+    /// All topics.
+    pub const ALL: [Self; 5] = [
+        Self::World,
+        Self::Observation,
+        Self::Prediction,
+        Self::Status,
+        Self::Map,
+    ];
+
+    /// Last part of the key.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::World => "world",
+            Self::Observation => "observation",
+            Self::Prediction => "prediction",
+            Self::Status => "status",
+            Self::Map => "map",
+        }
+    }
+}
+
+/// `name` as one part of a key; different names give different parts, and the empty name gives `%`.
+#[must_use]
+pub fn encode(name: &str) -> String {
+    if name.is_empty() {
+        return "%".to_owned();
+    }
+    utf8_percent_encode(name, ENCODED).to_string()
+}
+
+/// The keys of one environment of a run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Keys {
+    prefix: String,
+}
+
+impl Keys {
+    /// Keys of environment `env_index` of the run called `run_name`.
+    #[must_use]
+    pub fn new(run_name: &str, env_index: u32) -> Self {
+        Self {
+            prefix: format!("caraware/{}/{env_index}", encode(run_name)),
+        }
+    }
+
+    /// Key of a topic.
+    #[must_use]
+    pub fn topic(&self, topic: Topic) -> String {
+        format!("{}/{}", self.prefix, topic.name())
+    }
+
+    /// Key of the liveliness token.
+    #[must_use]
+    pub fn alive(&self) -> String {
+        format!("{}/alive", self.prefix)
+    }
+
+    /// Key expression over all topics.
+    #[must_use]
+    pub fn all(&self) -> String {
+        format!("{}/*", self.prefix)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use percent_encoding::percent_decode_str;
+    use proptest::prelude::*;
+    use zenoh::key_expr::KeyExpr;
+
+    #[test]
+    fn plain_names_stay_readable() {
+        assert_eq!(
+            Keys::new("town-2026.01_a~b", 0).topic(Topic::World),
+            "caraware/town-2026.01_a~b/0/world"
+        );
+    }
+
+    #[test]
+    fn what_zenoh_refuses_is_encoded() {
+        assert_eq!(encode("a/b#c?d$e*@ü"), "a%2Fb%23c%3Fd%24e%2A%40%C3%BC");
+        assert_eq!(encode(""), "%");
+    }
+
+    proptest! {
+        #[test]
+        fn any_name_makes_a_key_of_four_parts_and_comes_back(name in any::<String>(), env in any::<u32>()) {
+            let keys = Keys::new(&name, env);
+            for topic in Topic::ALL {
+                let key = keys.topic(topic);
+                prop_assert!(KeyExpr::new(key.as_str()).is_ok_and(|k| k.as_str() == key && !k.is_wild()), "{}", key);
+                prop_assert!(KeyExpr::new(keys.all()).is_ok_and(|all| all.includes(&KeyExpr::new(key.as_str()).unwrap())));
+                prop_assert_eq!(key.split('/').count(), 4);
+            }
+            if !name.is_empty() {
+                let part = encode(&name);
+                prop_assert_eq!(percent_decode_str(&part).decode_utf8().unwrap(), name);
+            }
+        }
+
+        #[test]
+        fn different_names_never_meet(a in ".{0,6}", b in ".{0,6}") {
+            prop_assert_eq!(encode(&a) == encode(&b), a == b);
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! When to look at shared memory and when to publish: pure functions of the time since the start.
+
+use std::time::Duration;
+
+/// Frames up to this size, bytes, go out at the full rate; longer ones leave a viewer's queue time to empty.
+pub const FULL_RATE_FRAME_BYTES: usize = 500_000;
+
+/// Sets that may be saved up: the half above one makes good the jitter of a run paced at the rate, and is no burst.
+const BURST_FRAMES: f64 = 1.5;
+
+/// A token bucket: at most `rate_hz` sets of frames per second in the long run.
+#[derive(Debug, Clone)]
+pub struct Budget {
+    rate_hz: f64,
+    tokens: f64,
+    at: Duration,
+}
+
+impl Budget {
+    /// A full budget of `rate_hz` sets per second.
+    #[must_use]
+    pub fn new(rate_hz: f64) -> Self {
+        Self {
+            rate_hz,
+            tokens: BURST_FRAMES,
+            at: Duration::ZERO,
+        }
+    }
+
+    /// True if a set may be published at `now`.
+    pub fn allows(&mut self, now: Duration) -> bool {
+        let elapsed_s = now.saturating_sub(self.at).as_secs_f64();
+        self.at = self.at.max(now);
+        self.tokens = (self.tokens + elapsed_s * self.rate_hz).min(BURST_FRAMES);
+        self.tokens >= 1.0
+    }
+
+    /// Pays for a set whose longest frame has `longest_bytes`: above [`FULL_RATE_FRAME_BYTES`] the rate falls.
+    /// Returns true if it fell.
+    pub fn spend(&mut self, longest_bytes: usize) -> bool {
+        let cost = longest_bytes.div_ceil(FULL_RATE_FRAME_BYTES).max(1);
+        self.tokens -= f64::from(u32::try_from(cost).unwrap_or(u32::MAX));
+        cost > 1
+    }
+}
+
+/// How long to leave shared memory alone: long enough to cost nothing, short enough for the queues not to overflow.
+#[derive(Debug, Clone)]
+pub struct Patience {
+    wait: Duration,
+    queue_length: usize,
+}
+
+impl Patience {
+    /// Shortest wait: 500 looks a second cost about one per cent of a core.
+    const SHORTEST: Duration = Duration::from_millis(2);
+    /// Longest wait: what a viewer sees is at most this much older.
+    const LONGEST: Duration = Duration::from_millis(20);
+
+    /// For queues of `queue_length` messages.
+    #[must_use]
+    pub fn new(queue_length: usize) -> Self {
+        Self {
+            wait: Self::SHORTEST,
+            queue_length,
+        }
+    }
+
+    /// The next wait, after a look that found `messages` in the fullest queue.
+    pub fn next(&mut self, messages: usize) -> Duration {
+        if 2 * messages > self.queue_length {
+            self.wait = (self.wait / 2).max(Self::SHORTEST);
+        } else if 5 * messages < self.queue_length {
+            self.wait = (self.wait * 5 / 4).min(Self::LONGEST);
+        }
+        self.wait
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn the_rate_is_never_exceeded(rate_hz in 0.5_f64..200.0, steps_ms in prop::collection::vec(0_u64..50, 1..400)) {
+            let mut budget = Budget::new(rate_hz);
+            let (mut now, mut sets) = (Duration::ZERO, 0);
+            for step in steps_ms {
+                now += Duration::from_millis(step);
+                if budget.allows(now) {
+                    budget.spend(1000);
+                    sets += 1;
+                }
+            }
+            prop_assert!(f64::from(sets) <= now.as_secs_f64() * rate_hz + BURST_FRAMES + 1e-6);
+        }
+
+        /// Ticks of a run paced at the rate, each seen up to a look late, all get through.
+        #[test]
+        fn jitter_costs_no_frame(late_ms in prop::collection::vec(0_u64..20, 1..300)) {
+            let mut budget = Budget::new(10.0);
+            for (tick, late) in late_ms.into_iter().enumerate() {
+                prop_assert!(budget.allows(Duration::from_millis(100 * tick as u64 + late)));
+                budget.spend(100_000);
+            }
+        }
+    }
+
+    #[test]
+    fn long_frames_halve_the_rate() {
+        let mut budget = Budget::new(10.0);
+        let published = (0..1000)
+            .filter(|i| {
+                let due = budget.allows(Duration::from_millis(10 * i));
+                due && budget.spend(800_000)
+            })
+            .count();
+        assert!((50..=52).contains(&published), "{published}");
+    }
+
+    #[test]
+    fn waits_follow_the_load_within_bounds() {
+        let mut patience = Patience::new(10);
+        let idle: Vec<Duration> = (0..30).map(|_| patience.next(0)).collect();
+        assert_eq!(idle.last(), Some(&Patience::LONGEST));
+        assert_eq!(patience.next(4), Patience::LONGEST);
+        let busy: Vec<Duration> = (0..30).map(|_| patience.next(10)).collect();
+        assert_eq!(busy.last(), Some(&Patience::SHORTEST));
+    }
+}

@@ -1,0 +1,282 @@
+//! A run without simulator or trainer: real services in a private corner of shared memory, real messages, the real binary.
+
+use std::{
+    io,
+    net::TcpListener,
+    path::PathBuf,
+    process::{Child, Command, Stdio},
+    sync::{Arc, atomic::AtomicBool},
+    time::{Duration, Instant},
+};
+
+use bytemuck::{cast_slice, cast_slice_mut};
+use fanout::keys::{Keys, Topic};
+use ipc_schema::{
+    SCHEMA_VERSION,
+    block::view_mut,
+    header::MessageHeader,
+    observation::ObservationLayout,
+    ports::Publisher,
+    process::Process,
+    run::{MapInfo, Mode, RunFile, SharedMemory, Source},
+    services::{self, Channel, ServiceHolder},
+    session::Session,
+    world::{VehicleState, WorldLayout},
+};
+use tempfile::TempDir;
+use zenoh::{Wait, handlers::RingChannelHandler, pubsub::Subscriber, sample::Sample};
+
+/// Longest wait for anything.
+pub const PATIENCE: Duration = Duration::from_secs(20);
+/// Fields of an observation in these runs.
+pub const FIELDS: u32 = 2;
+const SUB_STEPS: u32 = 10;
+
+/// Services and run file of a run; children of this test are its processes.
+pub struct Run {
+    pub file: RunFile,
+    pub port: u16,
+    path: PathBuf,
+    _holder: ServiceHolder,
+    _dir: TempDir,
+    _sweep: Sweep,
+}
+
+/// Removes what is left of a run in shared memory, be it of a killed process; dropped last.
+struct Sweep(String);
+
+impl Drop for Sweep {
+    fn drop(&mut self) {
+        for file in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if file.file_name().to_string_lossy().starts_with(&self.0) {
+                let _ = std::fs::remove_file(file.path());
+            }
+        }
+    }
+}
+
+impl Run {
+    pub fn new(name: &str, mode: Mode) -> Self {
+        Self::at_rate(name, mode, 50.0)
+    }
+
+    pub fn at_rate(name: &str, mode: Mode, rate_hz: f64) -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::create_dir(dir.path().join("logs")).unwrap();
+        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let mut file = run_file(name, mode, dir.path().into(), port);
+        file.config.fanout.rate_hz = rate_hz;
+        let path = file.write().unwrap();
+        let node = services::node(&file.shared_memory).unwrap();
+        let holder = ServiceHolder::create(&node, &file, 0).unwrap();
+        Self {
+            _sweep: Sweep(file.shared_memory.prefix.clone()),
+            file,
+            port,
+            path,
+            _holder: holder,
+            _dir: dir,
+        }
+    }
+
+    pub fn start_fanout(&self) -> Fanout {
+        let child = Command::new(env!("CARGO_BIN_EXE_fanout"))
+            .arg(&self.path)
+            .stderr(Stdio::inherit())
+            .spawn()
+            .unwrap();
+        Fanout(child)
+    }
+
+    /// Joins as another process of the run, within this test's process.
+    pub fn join(&self, process: Process) -> Session {
+        let parent = rustix::process::getppid().map_or(0, |p| p.as_raw_nonzero().get());
+        let file = RunFile {
+            supervisor_pid: parent,
+            ..self.file.clone()
+        };
+        Session::join_with(file, process, 0, Arc::new(AtomicBool::new(false))).unwrap()
+    }
+
+    pub fn key(&self, topic: Topic) -> String {
+        Keys::new(&self.file.name, 0).topic(topic)
+    }
+
+    pub fn alive_key(&self) -> String {
+        Keys::new(&self.file.name, 0).alive()
+    }
+
+    /// A viewer's zenoh session, once the fan-out listens.
+    pub fn attach(&self) -> zenoh::Session {
+        let config = zenoh::Config::from_json5(&format!(
+            r#"{{ mode: "client", connect: {{ endpoints: ["tcp/127.0.0.1:{}"], timeout_ms: 20000 }},
+                 scouting: {{ multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }} }}"#,
+            self.port
+        ));
+        zenoh::open(config.unwrap()).wait().unwrap()
+    }
+}
+
+/// The newest frames of one topic.
+pub fn watch(session: &zenoh::Session, key: String) -> Subscriber<RingChannelHandler<Sample>> {
+    session
+        .declare_subscriber(key)
+        .with(zenoh::handlers::RingChannel::new(64))
+        .wait()
+        .unwrap()
+}
+
+/// The next frame, taken apart into header and payload.
+pub fn next(frames: &Subscriber<RingChannelHandler<Sample>>) -> (MessageHeader, Vec<u8>) {
+    let sample = frames.recv_timeout(PATIENCE).unwrap().expect("no frame came");
+    let bytes = sample.payload().to_bytes();
+    let (header, payload) = fanout::frame::decode(&bytes).unwrap();
+    (header, payload.to_vec())
+}
+
+/// The answer to a query.
+pub fn ask(session: &zenoh::Session, key: &str) -> Option<Vec<u8>> {
+    let replies = session.get(key).timeout(PATIENCE).wait().unwrap();
+    let reply = replies.recv().ok()?;
+    Some(reply.result().ok()?.payload().to_bytes().into_owned())
+}
+
+/// Waits for a condition, with a deadline.
+pub fn until(what: &str, mut condition: impl FnMut() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !condition() {
+        assert!(Instant::now() < deadline, "{what} did not happen");
+        std::thread::park_timeout(Duration::from_millis(5));
+    }
+}
+
+/// A fan-out process; killed if the test fails.
+pub struct Fanout(pub Child);
+
+impl Fanout {
+    pub fn exit_code(&mut self) -> Option<i32> {
+        let mut status = None;
+        until("the end of the fan-out", || {
+            status = self.0.try_wait().unwrap();
+            status.is_some()
+        });
+        status.unwrap().code()
+    }
+
+    pub fn terminate(&self) -> io::Result<()> {
+        let pid = rustix::process::Pid::from_child(&self.0);
+        Ok(rustix::process::kill_process(pid, rustix::process::Signal::TERM)?)
+    }
+}
+
+impl Drop for Fanout {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+pub fn header(session: &Session, tick: u64, flags: u32, count: usize, columns: u32) -> MessageHeader {
+    MessageHeader {
+        tick,
+        sim_time_ns: tick * 100_000_000,
+        flags,
+        count: u32::try_from(count).unwrap(),
+        columns,
+        ..session.header()
+    }
+}
+
+pub fn states(tick: u64, count: usize) -> Vec<VehicleState> {
+    (0..count)
+        .map(|i| VehicleState {
+            x_m: tick as f64 + i as f64,
+            vehicle: u32::try_from(i).unwrap(),
+            ..VehicleState::default()
+        })
+        .collect()
+}
+
+pub fn send_world(session: &Session, publisher: &Publisher, tick: u64, flags: u32, count: usize) {
+    let layout = WorldLayout::new(count, SUB_STEPS as usize);
+    let mut draft = publisher
+        .loan(header(session, tick, flags, count, SUB_STEPS), layout.len)
+        .unwrap();
+    let rows: &mut [VehicleState] = view_mut(draft.payload_mut(), layout.states).unwrap();
+    rows.copy_from_slice(&states(tick, count));
+    draft.send().unwrap();
+}
+
+/// Payload of an observation whose truth is (tick, slot, 0, 0).
+pub fn observation(tick: u64, count: usize) -> Vec<u8> {
+    let layout = ObservationLayout::new(count, FIELDS as usize);
+    let mut words = vec![0_u64; layout.len / 8];
+    let truth: &mut [[f32; 4]] = view_mut(cast_slice_mut(&mut words), layout.truth).unwrap();
+    for (slot, row) in truth.iter_mut().enumerate() {
+        *row = [tick as f32, slot as f32, 0.0, 0.0];
+    }
+    cast_slice(&words).to_vec()
+}
+
+pub fn send(publisher: &Publisher, header: MessageHeader, payload: &[u8]) {
+    let mut draft = publisher.loan(header, payload.len()).unwrap();
+    draft.payload_mut().copy_from_slice(payload);
+    draft.send().unwrap();
+}
+
+pub fn send_observation(session: &Session, publisher: &Publisher, tick: u64, flags: u32, count: usize) {
+    send(
+        publisher,
+        header(session, tick, flags, count, FIELDS),
+        &observation(tick, count),
+    );
+}
+
+pub fn send_prediction(session: &Session, publisher: &Publisher, tick: u64, count: usize) {
+    let rows = vec![[tick as f32, 0.5]; count];
+    send(publisher, header(session, tick, 0, count, 2), cast_slice(&rows));
+}
+
+/// The publishers of a run, in the order of the data.
+pub fn publisher(run: &Run, channel: Channel) -> (Session, Publisher) {
+    let session = run.join(channel.producer());
+    let publisher = session.publisher(channel).unwrap();
+    (session, publisher)
+}
+
+fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
+    RunFile {
+        schema_version: SCHEMA_VERSION,
+        run_id: u64::from(port) << 32 | u64::from(std::process::id()),
+        name: name.to_owned(),
+        mode,
+        supervisor_pid: i32::try_from(std::process::id()).unwrap(),
+        shared_memory: SharedMemory {
+            root: run_dir.join("shm"),
+            prefix: format!("fanout_test_{}_{port}_", std::process::id()),
+        },
+        source: Source::Scenario {
+            sumocfg: "none.sumocfg".into(),
+        },
+        map: MapInfo {
+            projection: "+proj=utm +zone=32 +ellps=WGS84".into(),
+            net_offset_m: [0.0, 0.0],
+            bounds_m: [0.0, 0.0, 220.0, 200.0],
+        },
+        sumo_home: "none".into(),
+        config: serde_json::from_value(config(port)).unwrap(),
+        config_hash: String::new(),
+        run_dir,
+    }
+}
+
+/// The default preset, faster and with room for many.
+fn config(port: u16) -> serde_json::Value {
+    let mut config: serde_json::Value =
+        serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
+    config["run"]["sub_steps"] = SUB_STEPS.into();
+    config["traffic"]["max_road_users"] = 2100.into();
+    config["fanout"] =
+        serde_json::json!({ "enabled": true, "listen": format!("tcp/127.0.0.1:{port}"), "rate_hz": 50.0 });
+    config
+}

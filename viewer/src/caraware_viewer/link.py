@@ -1,0 +1,187 @@
+"""The zenoh side: find a run, listen to it, keep the newest frame of each topic.
+
+zenoh's callbacks only store: a slow display skips frames, it never holds up the network or the run.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import quote, unquote
+
+import zenoh
+
+TOPICS = ("world", "observation", "prediction", "status")
+
+RETURN_S = 2.0
+"""How long a fan-out may be away before its run counts as ended: long enough to be started again."""
+
+_EMPTY_NAME = "%"
+
+
+class LinkError(RuntimeError):
+    """There is nothing to watch; the message says where it was looked for and what to do."""
+
+
+@dataclass(frozen=True)
+class RunKey:
+    """One environment of one run."""
+
+    run: str
+    env: int
+
+    @property
+    def prefix(self) -> str:
+        """Prefix of its keys."""
+        return f"caraware/{quote(self.run, safe='') or _EMPTY_NAME}/{self.env}"
+
+    @classmethod
+    def of_alive_key(cls, key: str) -> RunKey:
+        """The run of a liveliness token `caraware/RUN/ENV/alive`."""
+        _, run, env, _ = key.split("/")
+        return cls("" if run == _EMPTY_NAME else unquote(run), int(env))
+
+
+class LatestFrames:
+    """The newest payload of each topic that has not been taken; counts those that nobody saw."""
+
+    def __init__(self) -> None:
+        self._frames: dict[str, bytes] = {}
+        self._changed = threading.Condition()
+        self._closed = False
+        self.skipped = dict.fromkeys(TOPICS, 0)
+
+    def store(self, topic: str, payload: bytes) -> None:
+        """Replaces the newest payload of `topic`."""
+        with self._changed:
+            self.skipped[topic] += topic in self._frames
+            self._frames[topic] = payload
+            self._changed.notify()
+
+    def take(self, timeout_s: float) -> dict[str, bytes]:
+        """All payloads that came since the last call, waiting at most `timeout_s` for one."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._frames or self._closed, timeout_s)
+            frames, self._frames = self._frames, {}
+            return frames
+
+    def close(self) -> None:
+        """No more frames will come: ends the wait of `take`."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    @property
+    def closed(self) -> bool:
+        """True once `close` was called."""
+        return self._closed
+
+
+def config(endpoint: str, timeout_s: float) -> zenoh.Config:
+    """A client of `endpoint` that neither scouts nor is found."""
+    settings = {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": int(timeout_s * 1000),
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+    }
+    result = zenoh.Config()
+    for key, value in settings.items():
+        result.insert_json5(key, json.dumps(value))
+    return result
+
+
+def connect(endpoint: str, timeout_s: float) -> zenoh.Session:
+    """Opens a session to the fan-out at `endpoint`."""
+    try:
+        return zenoh.open(config(endpoint, timeout_s))
+    except zenoh.ZError as error:
+        raise LinkError(
+            f"nothing answers at {endpoint} within {timeout_s:g} s.\n"
+            "  Is a run going, with `fanout.enabled = true`? Its endpoint is `fanout.listen` in its configuration.\n"
+            "  A run on another machine listens on its own loopback: open a tunnel first, "
+            "`ssh -L 7447:127.0.0.1:7447 HOST`."
+        ) from error
+
+
+def alive(session: zenoh.Session, timeout_s: float) -> list[RunKey]:
+    """The runs that are fanned out behind this session."""
+    replies = session.liveliness().get("caraware/*/*/alive", timeout=timeout_s)
+    keys = {RunKey.of_alive_key(str(reply.ok.key_expr)) for reply in replies if reply.ok}
+    return sorted(keys, key=lambda key: (key.run, key.env))
+
+
+def choose(session: zenoh.Session, endpoint: str, name: str | None, timeout_s: float) -> RunKey:
+    """The run called `name`, or the only one; waits for it at most `timeout_s`."""
+    deadline = time.monotonic() + timeout_s
+    while True:
+        runs = alive(session, max(0.5, deadline - time.monotonic()))
+        wanted = [key for key in runs if name in (None, key.run)]
+        if len(wanted) == 1 or (name is not None and wanted):
+            return wanted[0]
+        if time.monotonic() > deadline:
+            break
+        time.sleep(0.1)
+    there = ", ".join(sorted({key.run for key in runs})) or "none"
+    if wanted:
+        raise LinkError(f"several runs are fanned out at {endpoint} ({there}): name one with --run NAME")
+    what = "no run" if name is None else f"no run called {name!r}"
+    raise LinkError(f"{endpoint} answers, but {what} is fanned out there within {timeout_s:g} s (there: {there})")
+
+
+class Link:
+    """A run being watched. Use as a context manager."""
+
+    def __init__(self, session: zenoh.Session, run: RunKey) -> None:
+        self.run = run
+        self.frames = LatestFrames()
+        self._session = session
+        self._farewell: threading.Timer | None = None
+        # Subscribers end when they are collected: keep them.
+        self._subscribers = [self._subscribe(topic) for topic in TOPICS]
+        # With the history: a client is told that a killed peer's token is gone only if it knew of it.
+        self._tokens = session.liveliness().declare_subscriber(f"{run.prefix}/alive", self._on_token, history=True)
+        self._catch_up()
+
+    def __enter__(self) -> Link:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.frames.close()
+        self._session.close()
+
+    def map(self, timeout_s: float) -> dict[str, Any]:
+        """The run's map and tick settings."""
+        for reply in self._session.get(f"{self.run.prefix}/map", timeout=timeout_s):
+            if reply.ok:
+                return json.loads(bytes(reply.ok.payload))
+        raise LinkError(
+            f"run {self.run.run!r} did not tell its map within {timeout_s:g} s: is its fan-out being killed?"
+        )
+
+    def _subscribe(self, topic: str) -> zenoh.Subscriber:
+        def store(sample: zenoh.Sample) -> None:
+            self.frames.store(topic, bytes(sample.payload))
+
+        return self._session.declare_subscriber(f"{self.run.prefix}/{topic}", store)
+
+    def _catch_up(self) -> None:
+        """Asks for what was published before the subscription."""
+        for topic in TOPICS:
+            for reply in self._session.get(f"{self.run.prefix}/{topic}", timeout=2.0):
+                if reply.ok:
+                    self.frames.store(topic, bytes(reply.ok.payload))
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        if self._farewell is not None:
+            self._farewell.cancel()
+            self._farewell = None
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self._farewell = threading.Timer(RETURN_S, self.frames.close)
+            self._farewell.daemon = True
+            self._farewell.start()

@@ -1,0 +1,200 @@
+"""The wire layout: what a frame's bytes mean.
+
+A frame is a message as it stands in the simulator's shared memory: 72 bytes of header, then the payload, little endian.
+`ipc-schema/layout.json` is the committed table that the types below repeat; a test compares the two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+SCHEMA_VERSION = 1
+
+EVALUATION = 1
+"""Bit of `MessageHeader.flags`: the episode is an evaluation."""
+FIRST_OF_EPISODE = 1 << 1
+LAST_OF_EPISODE = 1 << 2
+LAST_OF_RUN = 1 << 3
+
+CAV, OTHER, PERSON = 0, 1, 2
+"""Values of `VehicleState.kind`."""
+
+EMPTY_SLOT = 0xFFFF_FFFF
+"""`vehicle` of a slot that nobody holds."""
+VALID = 1
+"""Bit of an observation's `flags`: the slot's vehicle has delivered every sensor at least once."""
+
+ALIGNMENT = 64
+"""Sections of a payload start on multiples of this, bytes from the payload's start."""
+
+HEADER = np.dtype(
+    [
+        ("schema_version", "<u4"),
+        ("env_index", "<u4"),
+        ("run_id", "<u8"),
+        ("incarnation", "<u4"),
+        ("flags", "<u4"),
+        ("episode", "<u8"),
+        ("episode_seed", "<u8"),
+        ("tick", "<u8"),
+        ("sim_time_ns", "<u8"),
+        ("count", "<u4"),
+        ("columns", "<u4"),
+        ("sequence", "<u8"),
+    ]
+)
+"""`MessageHeader`."""
+
+VEHICLE_STATE = np.dtype(
+    [
+        ("x_m", "<f8"),
+        ("y_m", "<f8"),
+        ("z_m", "<f8"),
+        ("yaw_rad", "<f8"),
+        ("id_hash", "<u8"),
+        ("roll_rad", "<f4"),
+        ("pitch_rad", "<f4"),
+        ("velocity_body_mps", "<f4", 3),
+        ("accel_body_mps2", "<f4", 3),
+        ("angular_rate_body_radps", "<f4", 3),
+        ("road_wheel_angle_rad", "<f4"),
+        ("tracking_lateral_m", "<f4"),
+        ("tracking_longitudinal_m", "<f4"),
+        ("length_m", "<f4"),
+        ("width_m", "<f4"),
+        ("height_m", "<f4"),
+        ("wheelbase_m", "<f4"),
+        ("rear_overhang_m", "<f4"),
+        ("vehicle", "<u4"),
+        ("kind", "<u4"),
+        ("signals", "<u4"),
+        ("flags", "<u4"),
+        ("reserved", "<u4"),
+    ]
+)
+"""`VehicleState`: a road user at the end of a tick; origin at the centre of the rear axle (persons: their centre)."""
+
+
+class FrameError(ValueError):
+    """A frame is not what it says it is."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a frame says about itself."""
+
+    run_id: int
+    flags: int
+    episode: int
+    tick: int
+    sim_time_ns: int
+    count: int
+    columns: int
+    sequence: int
+
+
+@dataclass(frozen=True)
+class World:
+    """Road users at the end of a tick."""
+
+    header: Header
+    states: NDArray[np.void]
+    """`VEHICLE_STATE [count]`."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What every connected vehicle senses at a tick, one row for each slot (`n` slots, `d` fields)."""
+
+    header: Header
+    observation: NDArray[np.float32]
+    """`[n, d]`, normalised."""
+    truth: NDArray[np.float32]
+    """`[n, 4]`: x, y of the rear axle (metres, world frame), yaw (radians), speed (m/s)."""
+    gnss_m: NDArray[np.float32]
+    """`[n, 2]`: newest raw fix, metres, world frame."""
+    id_hash: NDArray[np.uint64]
+    vehicle: NDArray[np.uint32]
+    flags: NDArray[np.uint32]
+    episode_step: NDArray[np.uint32]
+    age_s: NDArray[np.float32]
+    """`[n, 3]`: age of the newest GNSS, IMU and speed-steering sample, seconds."""
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """`[n]`: the slot holds a vehicle whose sensors have all delivered."""
+        return (self.vehicle != EMPTY_SLOT) & (self.flags & VALID != 0)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the policy makes of the observation of the same tick."""
+
+    header: Header
+    position_m: NDArray[np.float32]
+    """`[n, 2]`: predicted x, y, metres, world frame, one row for each slot of the observation."""
+
+
+def observation_sections(n: int, d: int) -> list[tuple[str, str, tuple[int, ...]]]:
+    """Name, element type and shape of the sections of an observation, in order; each is aligned to `ALIGNMENT`."""
+    return [
+        ("observation", "<f4", (n, d)),
+        ("truth", "<f4", (n, 4)),
+        ("gnss_m", "<f4", (n, 2)),
+        ("id_hash", "<u8", (n,)),
+        ("vehicle", "<u4", (n,)),
+        ("flags", "<u4", (n,)),
+        ("episode_step", "<u4", (n,)),
+        ("age_s", "<f4", (n, 3)),
+    ]
+
+
+def decode_header(frame: bytes) -> Header:
+    """The header of a frame; refuses what is too short and other versions of the schema."""
+    if len(frame) < HEADER.itemsize:
+        raise FrameError(f"a frame of {len(frame)} bytes is shorter than its {HEADER.itemsize} bytes of header")
+    row = np.frombuffer(frame, HEADER, count=1)[0]
+    if row["schema_version"] != SCHEMA_VERSION:
+        raise FrameError(
+            f"the run speaks schema version {row['schema_version']}, this viewer speaks {SCHEMA_VERSION}: "
+            "install the viewer of the run's version"
+        )
+    return Header(**{name: int(row[name]) for name in Header.__dataclass_fields__})
+
+
+def decode_world(frame: bytes) -> World:
+    """A `world` frame."""
+    header = decode_header(frame)
+    return World(header, _array(frame, HEADER.itemsize, VEHICLE_STATE, (header.count,)))
+
+
+def decode_observation(frame: bytes) -> Observation:
+    """An `observation` frame."""
+    header = decode_header(frame)
+    arrays = {}
+    offset = 0
+    for name, element, shape in observation_sections(header.count, header.columns):
+        array = _array(frame, HEADER.itemsize + offset, np.dtype(element), shape)
+        arrays[name] = array
+        offset = -(-(offset + array.nbytes) // ALIGNMENT) * ALIGNMENT
+    return Observation(header, **arrays)
+
+
+def decode_prediction(frame: bytes) -> Prediction:
+    """A `prediction` frame."""
+    header = decode_header(frame)
+    if header.columns != 2:
+        raise FrameError(f"a prediction has x and y, this one {header.columns} columns")
+    return Prediction(header, _array(frame, HEADER.itemsize, np.dtype("<f4"), (header.count, 2)))
+
+
+def _array(frame: bytes, offset: int, element: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+    count = 1
+    for length in shape:
+        count *= length
+    if offset + count * element.itemsize > len(frame):
+        raise FrameError(f"a frame of {len(frame)} bytes does not hold {shape} elements at byte {offset}")
+    return np.frombuffer(frame, element, count=count, offset=offset).reshape(shape)
