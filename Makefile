@@ -1,0 +1,56 @@
+# Two commands: `make train` runs the main job, `make test` runs all tests. Both install and build what they need.
+
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+CARGO_FLAGS := --release --locked
+export CARAWARE_SUMO_HOME = $(firstword $(wildcard $(CURDIR)/$(VENV)/lib/python3*/site-packages/sumo))
+export PYO3_PYTHON = $(CURDIR)/$(VENV)/bin/python
+# Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
+ARGS ?=
+
+.PHONY: train test build prerequisites lint format test-rust test-python bench clean
+
+train: build ## build everything and learn on the town
+	target/release/caraware train $(ARGS)
+
+test: build test-rust test-python ## all tests
+
+build: prerequisites $(VENV)/.installed ## virtual environment, SUMO, all programs, the Python extension
+	cargo build $(CARGO_FLAGS) --workspace
+	VIRTUAL_ENV=$(CURDIR)/$(VENV) $(VENV)/bin/maturin develop --quiet $(CARGO_FLAGS) --manifest-path trainer/Cargo.toml --skip-install
+
+prerequisites:
+	@scripts/prerequisites.sh "$(PYTHON)"
+
+# The pins are in requirements.lock; the two packages of this project are installed in place.
+$(VENV)/.installed: requirements.lock trainer/pyproject.toml viewer/pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements.lock
+	echo "$(CURDIR)/trainer/python" > $$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/caraware.pth
+	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable ./viewer
+	touch $@
+
+test-rust:
+	cargo test $(CARGO_FLAGS) --workspace --no-fail-fast
+
+test-python:
+	$(VENV)/bin/python -m pytest -q trainer/tests viewer/tests
+
+lint: $(VENV)/.installed ## formatting and lints, as errors
+	cargo fmt --all --check
+	cargo clippy --locked --workspace --all-targets -- -D warnings
+	$(VENV)/bin/ruff check trainer viewer
+	$(VENV)/bin/ruff format --check trainer viewer
+
+format: $(VENV)/.installed
+	cargo fmt --all
+	$(VENV)/bin/ruff check --fix trainer viewer
+	$(VENV)/bin/ruff format trainer viewer
+
+bench: build ## the benchmarks of docs/benchmarks.md
+	cargo bench --locked --workspace
+
+clean:
+	cargo clean
+	rm -rf $(VENV)

@@ -1,0 +1,69 @@
+//! The command line.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+
+/// Co-simulation of SUMO traffic with sensing vehicles, feeding a learner in another process.
+#[derive(Debug, Parser)]
+#[command(name = "caraware", version, about, long_about = LONG, after_help = AFTER, max_term_width = 110)]
+pub struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+const LONG: &str = "Co-simulation of SUMO traffic with sensing vehicles, feeding a learner in another process.\n\n\
+SUMO moves the traffic; a nanoscopic core mirrors every vehicle with real dynamics; sensors observe it; a PyTorch process learns \
+from the observations to tell where every vehicle is. Each part is a process of its own; they share memory.";
+
+const AFTER: &str = "Examples:
+  caraware train                                  learn on the town with the default preset
+  caraware train --set traffic.cavs=8 --set run.seed=7
+  caraware simulate my.sumocfg                    your own scenario, every vehicle sensing
+  caraware ps                                     what runs, from another terminal
+  caraware stop                                   end it; the trainer writes a checkpoint first
+
+Exit codes: 0 done, 1 the run failed, 2 usage or configuration, 3 something is missing on this machine, 130 interrupted.
+All configuration keys: configs/README.md";
+
+/// The subcommands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Simulate and learn
+    Train(RunArgs),
+    /// Simulate without learning; a `.sumocfg` runs to its end
+    Simulate(RunArgs),
+    /// Show the processes of every live run
+    Ps {
+        /// Name of a run; all live runs if not given
+        run: Option<String>,
+    },
+    /// End a run in order
+    Stop {
+        /// Name of the run; may be left out if only one is alive
+        run: Option<String>,
+    },
+    /// Say what is missing on this machine and what dead runs left
+    Doctor {
+        /// Remove what dead runs left in shared memory
+        #[arg(long)]
+        clean: bool,
+    },
+}
+
+/// What `train` and `simulate` take.
+#[derive(Debug, Args, Clone)]
+pub struct RunArgs {
+    /// Preset name, .toml file, or .sumocfg file [default: town]
+    pub config: Option<String>,
+    /// Change one setting, e.g. --set traffic.cavs=8 (repeatable; see configs/README.md)
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Name of the run [default: CONFIG and the first free number]
+    #[arg(long)]
+    pub name: Option<String>,
+    /// Directory that holds run directories
+    #[arg(long, default_value = "runs")]
+    pub runs: PathBuf,
+}

@@ -1,0 +1,128 @@
+//! What can be wrong with a configuration, each with the place and the fix.
+
+use miette::{Diagnostic, LabeledSpan, NamedSource, Severity, SourceCode};
+
+use super::{keys::Key, layer::Place};
+
+/// A configuration that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// Not TOML.
+    #[error("{}: not valid TOML: {message}", at(place))]
+    Syntax {
+        /// What the parser says.
+        message: String,
+        /// Where.
+        place: Place,
+    },
+    /// No such key.
+    #[error("{}: unknown key `{path}`", at(place))]
+    UnknownKey {
+        /// The key as written.
+        path: String,
+        /// What was probably meant.
+        nearest: Option<&'static str>,
+        /// Where.
+        place: Place,
+    },
+    /// Wrong type or out of range.
+    #[error("{}: `{}` cannot be {}", at(place), key.path, text(place))]
+    Value {
+        /// The key.
+        key: &'static Key,
+        /// Where.
+        place: Place,
+    },
+    /// Two values do not go together.
+    #[error("{}: {message}", at(place))]
+    Conflict {
+        /// Both keys with their values.
+        message: String,
+        /// What to change.
+        help: String,
+        /// Where one of them was set.
+        place: Place,
+    },
+    /// `--set` without `=`.
+    #[error("--set {assignment}: not of the form key=value")]
+    Assignment {
+        /// As given.
+        assignment: String,
+    },
+    /// A file of the user cannot be used.
+    #[error("{path}: {message}")]
+    File {
+        /// The file.
+        path: String,
+        /// What is wrong.
+        message: String,
+        /// What to do.
+        help: String,
+    },
+}
+
+/// "file:line" of a place.
+fn at(place: &Place) -> String {
+    let text = place.source.inner();
+    let line = text
+        .get(..place.span.start)
+        .map_or(1, |before| before.matches('\n').count() + 1);
+    format!("{}:{line}", place.source.name())
+}
+
+/// The value as written.
+fn text(place: &Place) -> &str {
+    place.source.inner().get(place.span.clone()).unwrap_or_default()
+}
+
+impl ConfigError {
+    fn place(&self) -> Option<&Place> {
+        match self {
+            Self::Syntax { place, .. }
+            | Self::UnknownKey { place, .. }
+            | Self::Value { place, .. }
+            | Self::Conflict { place, .. } => Some(place),
+            Self::Assignment { .. } | Self::File { .. } => None,
+        }
+    }
+
+    fn advice(&self) -> String {
+        match self {
+            Self::Syntax { .. } => "see https://toml.io for the format".into(),
+            Self::UnknownKey {
+                nearest: Some(nearest), ..
+            } => format!("did you mean `{nearest}`? All keys: configs/README.md"),
+            Self::UnknownKey { nearest: None, .. } => "all keys are listed in configs/README.md".into(),
+            Self::Value { key, .. } => {
+                let unit = if key.unit.is_empty() {
+                    String::new()
+                } else {
+                    format!(" in {}", key.unit)
+                };
+                format!("allowed: {}{unit}. {}", key.range(), key.meaning)
+            }
+            Self::Conflict { help, .. } | Self::File { help, .. } => help.clone(),
+            Self::Assignment { .. } => "for example: --set run.seed=7".into(),
+        }
+    }
+}
+
+impl Diagnostic for ConfigError {
+    fn severity(&self) -> Option<Severity> {
+        Some(Severity::Error)
+    }
+
+    fn help<'a>(&'a self) -> Option<Box<dyn std::fmt::Display + 'a>> {
+        Some(Box::new(self.advice()))
+    }
+
+    fn source_code(&self) -> Option<&dyn SourceCode> {
+        self.place()
+            .map(|place| place.source.as_ref() as &NamedSource<String> as &dyn SourceCode)
+    }
+
+    fn labels(&self) -> Option<Box<dyn Iterator<Item = LabeledSpan> + '_>> {
+        let place = self.place()?;
+        Some(Box::new(std::iter::once(LabeledSpan::underline(place.span.clone()))))
+    }
+}

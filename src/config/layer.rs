@@ -1,0 +1,167 @@
+//! One source of settings: a preset, a file, or one `--set`. Flat, with the place of every value, checked key by key.
+
+use std::{collections::BTreeMap, ops::Range, sync::Arc};
+
+use miette::NamedSource;
+use serde_json::Value;
+use toml::{
+    Spanned,
+    de::{DeTable, DeValue},
+};
+
+use super::{
+    error::ConfigError,
+    keys::{self, FIELD_NAMES, FIELD_PRESETS, Key, Kind},
+};
+
+/// Text with a name, for messages that show the line.
+pub type Source = Arc<NamedSource<String>>;
+
+/// Where a value was set.
+#[derive(Debug, Clone)]
+pub struct Place {
+    /// The text it stands in.
+    pub source: Source,
+    /// Bytes of the value.
+    pub span: Range<usize>,
+}
+
+/// A checked value and where it was set.
+#[derive(Debug, Clone)]
+pub struct Setting {
+    /// The value as the run file will hold it.
+    pub value: Value,
+    /// Where it was set.
+    pub place: Place,
+}
+
+/// Settings by dotted path.
+pub type Layer = BTreeMap<&'static str, Setting>;
+
+/// Reads a whole TOML text.
+///
+/// # Errors
+/// Not TOML, an unknown key, a wrong type, or a value out of range, each with its line.
+pub fn parse(name: &str, text: &str) -> Result<Layer, ConfigError> {
+    let source: Source = Arc::new(NamedSource::new(name, text.to_owned()).with_language("toml"));
+    let table = DeTable::parse(text).map_err(|error| ConfigError::Syntax {
+        message: error.message().to_owned(),
+        place: Place {
+            source: source.clone(),
+            span: error.span().unwrap_or(0..0),
+        },
+    })?;
+    let mut layer = Layer::new();
+    walk("", table.get_ref(), &source, &mut layer)?;
+    Ok(layer)
+}
+
+/// Reads one `key=value` of the command line; a bare word counts as text.
+///
+/// # Errors
+/// As [`parse`], or no `=`.
+pub fn parse_assignment(assignment: &str) -> Result<Layer, ConfigError> {
+    let Some((key, value)) = assignment.split_once('=') else {
+        return Err(ConfigError::Assignment {
+            assignment: assignment.to_owned(),
+        });
+    };
+    let (key, value) = (key.trim(), value.trim());
+    let plain = format!("{key} = {value}");
+    let text = if DeTable::parse(&plain).is_ok() {
+        plain
+    } else {
+        format!("{key} = {}", Value::from(value))
+    };
+    parse("--set", &text)
+}
+
+fn walk(prefix: &str, table: &DeTable<'_>, source: &Source, layer: &mut Layer) -> Result<(), ConfigError> {
+    for (name, value) in table {
+        let path = if prefix.is_empty() {
+            name.get_ref().to_string()
+        } else {
+            format!("{prefix}.{}", name.get_ref())
+        };
+        if let DeValue::Table(inner) = value.get_ref()
+            && keys::KEYS.iter().any(|key| key.path.starts_with(&format!("{path}.")))
+        {
+            walk(&path, inner, source, layer)?;
+            continue;
+        }
+        let Some(key) = keys::find(&path) else {
+            let place = Place {
+                source: source.clone(),
+                span: name.span(),
+            };
+            return Err(ConfigError::UnknownKey {
+                nearest: keys::nearest(&path),
+                path,
+                place,
+            });
+        };
+        let place = Place {
+            source: source.clone(),
+            span: value.span(),
+        };
+        let value = check(key, value).ok_or_else(|| ConfigError::Value {
+            key,
+            place: place.clone(),
+        })?;
+        layer.insert(key.path, Setting { value, place });
+    }
+    Ok(())
+}
+
+/// The value if `key` allows it.
+fn check(key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Value> {
+    let value = value.get_ref();
+    match key.kind {
+        Kind::Float { min, max } => {
+            let number = float(value)?;
+            (min..=max).contains(&number).then(|| Value::from(number))
+        }
+        Kind::Integer { min, max } => integer(value, min, max).map(Value::from),
+        Kind::Flag => value.as_bool().map(Value::from),
+        Kind::Choice(words) => value.as_str().filter(|word| words.contains(word)).map(Value::from),
+        Kind::Text => value.as_str().map(Value::from),
+        Kind::Fields => fields(value),
+        Kind::Integers { min, max } => {
+            let list: Option<Vec<Value>> = value
+                .as_array()?
+                .iter()
+                .map(|item| integer(item.get_ref(), min, max).map(Value::from))
+                .collect();
+            list.filter(|list| !list.is_empty()).map(Value::from)
+        }
+    }
+}
+
+fn float(value: &DeValue<'_>) -> Option<f64> {
+    match value {
+        DeValue::Float(number) => number.as_str().parse().ok(),
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "a whole number given for a real one; ranges are far below 2^53"
+        )]
+        DeValue::Integer(_) => integer(value, i64::MIN, i64::MAX).map(|whole| whole as f64),
+        _ => None,
+    }
+}
+
+fn integer(value: &DeValue<'_>, min: i64, max: i64) -> Option<i64> {
+    let whole = value.as_integer()?;
+    let number = i64::from_str_radix(whole.as_str(), whole.radix()).ok()?;
+    (min..=max).contains(&number).then_some(number)
+}
+
+fn fields(value: &DeValue<'_>) -> Option<Value> {
+    if let Some(preset) = value.as_str() {
+        let (_, count) = FIELD_PRESETS.iter().find(|(name, _)| *name == preset)?;
+        return Some(Value::from(&FIELD_NAMES[..*count]));
+    }
+    let names: Option<Vec<&str>> = value.as_array()?.iter().map(|item| item.get_ref().as_str()).collect();
+    let names = names?;
+    let known = !names.is_empty() && names.iter().all(|name| FIELD_NAMES.contains(name));
+    known.then(|| Value::from(names))
+}

@@ -1,0 +1,143 @@
+//! From presets, files and `--set` to one validated configuration.
+
+pub mod error;
+pub mod keys;
+pub mod layer;
+pub mod rules;
+
+use std::path::Path;
+
+use ipc_schema::config::Config;
+use serde_json::{Map, Value};
+
+pub use error::ConfigError;
+use layer::{Layer, Setting};
+
+/// Embedded presets by name; the first is the default and holds every key that must have a value.
+pub const PRESETS: [(&str, &str); 1] = [("town", include_str!("../../configs/town.toml"))];
+
+/// Merged settings, each remembering where it was set.
+#[derive(Debug, Clone)]
+pub struct Settings(Layer);
+
+impl Settings {
+    /// The default preset.
+    ///
+    /// # Errors
+    /// Never with the committed preset (a test reads it).
+    pub fn defaults() -> Result<Self, ConfigError> {
+        let (name, text) = PRESETS[0];
+        layer::parse(&format!("preset {name}"), text).map(Self)
+    }
+
+    /// Adds a preset by name; `None` if there is no such preset.
+    pub fn with_preset(mut self, name: &str) -> Option<Result<Self, ConfigError>> {
+        let (name, text) = PRESETS.iter().find(|(known, _)| *known == name)?;
+        Some(layer::parse(&format!("preset {name}"), text).map(|layer| {
+            self.0.extend(layer);
+            self
+        }))
+    }
+
+    /// Adds a user's TOML file.
+    ///
+    /// # Errors
+    /// Unreadable, or as [`layer::parse`].
+    pub fn with_file(mut self, path: &Path) -> Result<Self, ConfigError> {
+        let name = path.display().to_string();
+        let text = std::fs::read_to_string(path).map_err(|error| ConfigError::File {
+            path: name.clone(),
+            message: format!("cannot be read: {error}"),
+            help: format!("give a .toml, a .sumocfg, or one of the presets: {}", preset_names()),
+        })?;
+        self.0.extend(layer::parse(&name, &text)?);
+        Ok(self)
+    }
+
+    /// Adds `--set` assignments, in order.
+    ///
+    /// # Errors
+    /// As [`layer::parse_assignment`].
+    pub fn with_assignments(mut self, assignments: &[String]) -> Result<Self, ConfigError> {
+        for assignment in assignments {
+            self.0.extend(layer::parse_assignment(assignment)?);
+        }
+        Ok(self)
+    }
+
+    /// Replaces one value on behalf of a scenario, unless the user set it (anywhere but in the default preset).
+    pub fn suggest(&mut self, path: &'static str, value: Value, source: &str) {
+        if let Some(setting) = self.0.get_mut(path)
+            && setting.place.source.name().starts_with("preset ")
+        {
+            let text = format!("{path} = {value}");
+            let span = text.len() - value.to_string().len()..text.len();
+            let place = layer::Place {
+                source: std::sync::Arc::new(miette::NamedSource::new(source, text)),
+                span,
+            };
+            *setting = Setting { value, place };
+        }
+    }
+
+    /// True if the user set this key, in a file or by `--set`.
+    #[must_use]
+    pub fn is_set_by_user(&self, path: &str) -> bool {
+        self.0
+            .get(path)
+            .is_some_and(|setting| !setting.place.source.name().starts_with("preset "))
+    }
+
+    fn setting(&self, path: &str) -> Option<&Setting> {
+        self.0.get(path)
+    }
+
+    /// The validated configuration.
+    ///
+    /// # Errors
+    /// Values that do not go together.
+    pub fn validate(&self) -> Result<Config, ConfigError> {
+        let mut root = Map::new();
+        for key in keys::KEYS {
+            let value = self
+                .setting(key.path)
+                .map_or(Value::Null, |setting| setting.value.clone());
+            let (table, name) = key.path.split_once('.').unwrap_or(("", key.path));
+            let table = root.entry(table).or_insert_with(|| Value::Object(Map::new()));
+            if let Value::Object(table) = table {
+                table.insert(name.to_owned(), value);
+            }
+        }
+        let config: Config = serde_json::from_value(Value::Object(root)).map_err(|error| ConfigError::File {
+            path: "configuration".into(),
+            message: error.to_string(),
+            help: "the key table and the configuration types differ: this is a defect of caraware, please report it"
+                .into(),
+        })?;
+        rules::check(self, &config)?;
+        Ok(config)
+    }
+}
+
+/// Names of all presets, for messages.
+#[must_use]
+pub fn preset_names() -> String {
+    PRESETS.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
+}
+
+/// The configuration as TOML that can be given back as CONFIG.
+#[must_use]
+pub fn to_toml(config: &Config) -> String {
+    toml::to_string_pretty(config).unwrap_or_else(|error| format!("# not representable: {error}\n"))
+}
+
+/// BLAKE3 of the configuration's canonical JSON, hexadecimal.
+#[must_use]
+pub fn hash(config: &Config) -> String {
+    blake3::hash(serde_json::to_string(config).unwrap_or_default().as_bytes())
+        .to_hex()
+        .to_string()
+}
+
+#[cfg(test)]
+mod tests;

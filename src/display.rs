@@ -1,0 +1,155 @@
+//! Live progress: a bar on a terminal, otherwise one line every few seconds.
+
+use std::{
+    io::IsTerminal as _,
+    time::{Duration, Instant},
+};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use ipc_schema::{
+    ports::BoardReader,
+    process::Process,
+    run::{Mode, RunFile},
+};
+
+/// Time between two lines when there is no terminal.
+const LINE_EVERY: Duration = Duration::from_secs(5);
+
+/// Shows how a run fares.
+#[derive(Debug)]
+pub struct Display {
+    bar: Option<ProgressBar>,
+    last_line: Instant,
+    last_text: String,
+}
+
+impl Display {
+    /// A bar if standard error is a terminal.
+    #[must_use]
+    pub fn new() -> Self {
+        let bar = std::io::stderr().is_terminal().then(ProgressBar::new_spinner);
+        if let Some(bar) = &bar {
+            bar.enable_steady_tick(Duration::from_millis(200));
+        }
+        Self {
+            bar,
+            last_line: Instant::now(),
+            last_text: String::new(),
+        }
+    }
+
+    /// Shows the newest state of the boards.
+    pub fn update(&mut self, run: &RunFile, boards: &[(Process, BoardReader)], ready_at: Option<Instant>) {
+        let view = View::read(run, boards, ready_at);
+        if let Some(bar) = &self.bar {
+            if bar.length() != view.total_ticks && view.total_ticks.is_some() {
+                bar.set_style(style());
+                bar.set_length(view.total_ticks.unwrap_or(0));
+            }
+            bar.set_position(view.ticks);
+            bar.set_message(view.text());
+        } else if self.last_line.elapsed() >= LINE_EVERY {
+            self.last_line = Instant::now();
+            eprintln!("{}", view.line());
+        }
+        self.last_text = view.line();
+    }
+
+    /// Leaves the last state on the screen.
+    pub fn finish(&mut self) {
+        match &self.bar {
+            Some(bar) => bar.abandon(),
+            None => eprintln!("{}", self.last_text),
+        }
+    }
+}
+
+impl Default for Display {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+fn style() -> ProgressStyle {
+    ProgressStyle::with_template("{elapsed} [{bar:28}] {percent}%  {wide_msg}  eta {eta}")
+        .unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
+/// What is shown.
+struct View {
+    mode: Mode,
+    ticks: u64,
+    total_ticks: Option<u64>,
+    episode: u64,
+    sim_time_s: f64,
+    cavs: u32,
+    road_users: u32,
+    steps: u64,
+    steps_per_s: f64,
+    policy_std: f64,
+    reward: f64,
+    error_m: f64,
+    raw_gnss_error_m: f64,
+}
+
+impl View {
+    fn read(run: &RunFile, boards: &[(Process, BoardReader)], ready_at: Option<Instant>) -> Self {
+        let board = |process: Process| {
+            boards
+                .iter()
+                .find(|(known, _)| *known == process)
+                .map(|(_, board)| board)
+        };
+        let sensing = board(Process::SensorDaemon)
+            .map(BoardReader::health)
+            .unwrap_or_default();
+        let moving = board(Process::SimCore).map(BoardReader::health).unwrap_or_default();
+        let training = board(Process::Trainer).map(BoardReader::training).unwrap_or_default();
+        let wall_s = ready_at.map_or(0.0, |ready| ready.elapsed().as_secs_f64());
+        #[expect(clippy::cast_precision_loss, reason = "for display")]
+        let (steps, sim_time_s) = (sensing.vehicle_steps as f64, sensing.sim_time_ns as f64 * 1e-9);
+        let total: Option<u64> = run.episodes().iter().map(|episode| episode.ticks).sum();
+        Self {
+            mode: run.mode,
+            ticks: sensing.ticks,
+            total_ticks: total,
+            episode: sensing.episode,
+            sim_time_s,
+            cavs: sensing.cavs,
+            road_users: moving.road_users,
+            steps: sensing.vehicle_steps,
+            steps_per_s: if wall_s > 0.0 { steps / wall_s } else { 0.0 },
+            policy_std: training.policy_std,
+            reward: training.reward,
+            error_m: training.error_m,
+            raw_gnss_error_m: training.raw_gnss_error_m,
+        }
+    }
+
+    fn text(&self) -> String {
+        let traffic = format!(
+            "episode {:3}  {:7.1} s  {} of {} road users sensing  {:.0} steps/s",
+            self.episode, self.sim_time_s, self.cavs, self.road_users, self.steps_per_s
+        );
+        match self.mode {
+            Mode::Simulate => traffic,
+            Mode::Train => format!(
+                "episode {:3}  {:.0} steps/s  σ {:.3}  reward {:.3}  error {:.2} m (raw GNSS {:.2} m)",
+                self.episode, self.steps_per_s, self.policy_std, self.reward, self.error_m, self.raw_gnss_error_m
+            ),
+        }
+    }
+
+    fn line(&self) -> String {
+        match self.total_ticks {
+            #[expect(clippy::cast_precision_loss, reason = "for display")]
+            Some(total) if total > 0 => format!(
+                "{:5.1} %  {:8} steps  {}",
+                100.0 * self.ticks as f64 / total as f64,
+                self.steps,
+                self.text()
+            ),
+            _ => format!("{:8} steps  {}", self.steps, self.text()),
+        }
+    }
+}

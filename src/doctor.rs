@@ -1,0 +1,174 @@
+//! `caraware doctor`: what is missing on this machine, what dead runs left, and how much room there is.
+
+use std::{net::TcpListener, path::Path, process::Command};
+
+use ipc_schema::process::Process;
+
+use crate::{failure::Exit, install::Install, prepare::free_bytes, registry};
+
+/// System libraries that libsumo links, with the Debian package of each.
+const LIBRARIES: [(&str, &str); 4] = [
+    ("libX11.so.6", "libx11-6"),
+    ("libXext.so.6", "libxext6"),
+    ("libXrender.so.1", "libxrender1"),
+    ("libGL.so.1", "libgl1"),
+];
+/// Python packages that training needs.
+const PACKAGES: [&str; 7] = [
+    "torch",
+    "numpy",
+    "matplotlib",
+    "tensorboard",
+    "safetensors",
+    "caraware",
+    "sumo",
+];
+/// Least free space worth starting with, MiB.
+const SHARED_MEMORY_MIB: u64 = 64;
+const DISK_MIB: u64 = 512;
+
+struct Checks {
+    missing: u32,
+}
+
+impl Checks {
+    fn say(&mut self, good: Result<String, (String, String)>, what: &str) {
+        match good {
+            Ok(text) => println!("ok       {what}: {text}"),
+            Err((text, fix)) => {
+                self.missing += 1;
+                println!("MISSING  {what}: {text}\n         → {fix}");
+            }
+        }
+    }
+}
+
+/// Looks at everything and prints a line each; with `clean`, removes what dead runs left.
+///
+/// # Errors
+/// Something needed is missing.
+pub fn doctor(clean: bool) -> Result<(), Exit> {
+    let mut checks = Checks { missing: 0 };
+    match Install::find() {
+        Ok(install) => installation(&mut checks, &install),
+        Err(Exit::Failure(failure)) => {
+            checks.say(Err((failure.message, failure.help.unwrap_or_default())), "installation")
+        }
+        Err(other) => return Err(other),
+    }
+    space(
+        &mut checks,
+        "shared memory",
+        registry::SHARED_MEMORY,
+        SHARED_MEMORY_MIB,
+        "free it, or enlarge it (Docker: --shm-size=1g)",
+    );
+    space(&mut checks, "disk", ".", DISK_MIB, "free some disk space");
+    port(&mut checks);
+    runs(clean);
+    match checks.missing {
+        0 => Ok(()),
+        count => Err(Exit::missing(
+            format!("{count} of the checks above failed"),
+            "follow the arrows above",
+        )),
+    }
+}
+
+fn installation(checks: &mut Checks, install: &Install) {
+    for process in Process::ALL.into_iter().filter(|process| *process != Process::Trainer) {
+        let found = install.binary(process);
+        checks.say(
+            found
+                .map(|path| path.display().to_string())
+                .map_err(|_| ("not built".into(), "run `make build`".into())),
+            process.name(),
+        );
+    }
+    libraries(checks, install);
+    packages(checks, install);
+}
+
+/// Asks the dynamic linker whether everything libsumo links is there.
+fn libraries(checks: &mut Checks, install: &Install) {
+    let library = install.sumo_home.join("lib64/libsumocpp.so");
+    let listing = Command::new("ldd")
+        .arg(&library)
+        .output()
+        .map(|output| String::from_utf8_lossy(&output.stdout).into_owned())
+        .unwrap_or_default();
+    for (name, package) in LIBRARIES {
+        let absent = listing
+            .lines()
+            .any(|line| line.contains(name) && line.contains("not found"));
+        let result = if absent {
+            Err((format!("{name} is not installed"), format!("apt-get install {package}")))
+        } else {
+            Ok(name.to_owned())
+        };
+        checks.say(result, "library for SUMO");
+    }
+}
+
+fn packages(checks: &mut Checks, install: &Install) {
+    let script = format!(
+        "import importlib.util as u; print(' '.join(p for p in {:?} if u.find_spec(p) is None))",
+        PACKAGES
+    );
+    let result = match Command::new(&install.python).args(["-c", &script]).output() {
+        Ok(output) if output.status.success() => match String::from_utf8_lossy(&output.stdout).trim() {
+            "" => Ok(install.python.display().to_string()),
+            absent => Err((format!("not installed: {absent}"), "run `make build`".into())),
+        },
+        Ok(output) => Err((
+            String::from_utf8_lossy(&output.stderr).trim().to_owned(),
+            "run `make build`".into(),
+        )),
+        Err(error) => Err((
+            format!("{} cannot be started: {error}", install.python.display()),
+            "run `make build`".into(),
+        )),
+    };
+    checks.say(result, "Python packages");
+}
+
+fn space(checks: &mut Checks, what: &str, path: &str, least_mib: u64, fix: &str) {
+    let result = match free_bytes(Path::new(path)) {
+        Ok(bytes) if bytes >> 20 >= least_mib => Ok(format!("{} MiB free", bytes >> 20)),
+        Ok(bytes) => Err((format!("only {} MiB free in {path}", bytes >> 20), fix.to_owned())),
+        Err(_) => Err((format!("{path} cannot be looked at"), fix.to_owned())),
+    };
+    checks.say(result, what);
+}
+
+fn port(checks: &mut Checks) {
+    let result = match TcpListener::bind("127.0.0.1:7447") {
+        Ok(_) => Ok("127.0.0.1:7447 is free".to_owned()),
+        Err(_) => Ok(
+            "127.0.0.1:7447 is taken (by a run?): a further run needs --set fanout.listen=tcp/127.0.0.1:PORT"
+                .to_owned(),
+        ),
+    };
+    checks.say(result, "port for viewers");
+}
+
+fn runs(clean: bool) {
+    let entries = registry::entries();
+    for entry in &entries {
+        let name = entry.run.as_ref().map_or("(unreadable)", |run| run.name.as_str());
+        let size = entry.shared_memory_bytes() >> 10;
+        match (entry.alive, clean) {
+            (true, _) => println!("ok       run {name}: alive, {size} KiB of shared memory"),
+            (false, false) => println!(
+                "note     run {name}: dead, left {size} KiB of shared memory; removed by the next run or `caraware doctor --clean`"
+            ),
+            (false, true) => {
+                entry.clean();
+                println!("cleaned  run {name}: {size} KiB of shared memory removed");
+            }
+        }
+    }
+    if entries.is_empty() {
+        println!("ok       no stale run");
+    }
+}

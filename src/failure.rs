@@ -1,0 +1,110 @@
+//! Failures as the user sees them: once, with file, key or line and the fix, and an exit code.
+
+use std::process::ExitCode;
+
+use ipc_schema::{
+    failure::{Failure, FailureKind},
+    ports::PortError,
+    run::RunFileError,
+    services::ServiceError,
+};
+use miette::{Diagnostic, Report};
+
+use crate::config::ConfigError;
+
+/// Why the command ends without success.
+#[derive(Debug)]
+pub enum Exit {
+    /// Shown with its place in the source; exit code 2.
+    Config(Box<ConfigError>),
+    /// Shown with its help; exit code by kind.
+    Failure(Failure),
+    /// Ctrl-C: exit code 130.
+    Interrupted,
+}
+
+#[derive(Debug, thiserror::Error)]
+#[error("{}", .0.message)]
+struct Shown(Failure);
+
+impl Diagnostic for Shown {
+    fn help<'a>(&'a self) -> Option<Box<dyn std::fmt::Display + 'a>> {
+        self.0
+            .help
+            .as_ref()
+            .map(|help| Box::new(help) as Box<dyn std::fmt::Display>)
+    }
+}
+
+impl Exit {
+    /// Prints the failure to standard error and returns the exit code.
+    #[must_use]
+    pub fn report(self) -> ExitCode {
+        match self {
+            Self::Config(error) => {
+                eprintln!("{:?}", Report::new(*error));
+                ExitCode::from(FailureKind::Config.exit_code())
+            }
+            Self::Failure(failure) => {
+                let code = failure.kind.exit_code();
+                eprintln!("{:?}", Report::new(Shown(failure)));
+                ExitCode::from(code)
+            }
+            Self::Interrupted => ExitCode::from(130),
+        }
+    }
+
+    /// Wrong input.
+    pub fn config(message: impl Into<String>, help: impl Into<String>) -> Self {
+        Self::Failure(Failure::new(FailureKind::Config, message).with_help(help))
+    }
+
+    /// Something this machine lacks.
+    pub fn missing(message: impl Into<String>, help: impl Into<String>) -> Self {
+        Self::Failure(Failure::new(FailureKind::Missing, message).with_help(help))
+    }
+
+    /// A failed run.
+    pub fn run(message: impl Into<String>, help: impl Into<String>) -> Self {
+        Self::Failure(Failure::new(FailureKind::Run, message).with_help(help))
+    }
+
+    /// An operation on a file that the system refused.
+    pub fn io(action: &str, path: &std::path::Path, error: &std::io::Error) -> Self {
+        Self::run(
+            format!("cannot {action} {}: {error}", path.display()),
+            "check permissions and free space (`caraware doctor`)",
+        )
+    }
+}
+
+impl From<ConfigError> for Exit {
+    fn from(error: ConfigError) -> Self {
+        Self::Config(Box::new(error))
+    }
+}
+
+impl From<Failure> for Exit {
+    fn from(failure: Failure) -> Self {
+        Self::Failure(failure)
+    }
+}
+
+impl From<ServiceError> for Exit {
+    fn from(error: ServiceError) -> Self {
+        let failure = Failure::from_error(FailureKind::Run, &error);
+        Self::Failure(failure.with_help("`caraware doctor` lists and removes stale shared memory"))
+    }
+}
+
+impl From<PortError> for Exit {
+    fn from(error: PortError) -> Self {
+        Self::Failure(Failure::from_error(FailureKind::Run, &error))
+    }
+}
+
+impl From<RunFileError> for Exit {
+    fn from(error: RunFileError) -> Self {
+        Self::Failure(Failure::from_error(FailureKind::Run, &error))
+    }
+}

@@ -1,0 +1,105 @@
+//! Where the parts of caraware are on this machine: sibling binaries, the virtual environment, SUMO.
+
+use std::path::{Path, PathBuf};
+
+use ipc_schema::process::Process;
+
+use crate::failure::Exit;
+
+/// The parts, found.
+#[derive(Debug, Clone)]
+pub struct Install {
+    /// Directory of the process binaries.
+    pub bin: PathBuf,
+    /// Python of the project's virtual environment.
+    pub python: PathBuf,
+    /// The `sumo` directory of the `eclipse-sumo` wheel.
+    pub sumo_home: PathBuf,
+}
+
+impl Install {
+    /// Looks beside the running binary, then at `CARAWARE_PYTHON` and `CARAWARE_SUMO_HOME`.
+    ///
+    /// # Errors
+    /// A part is missing: which one and how to get it.
+    pub fn find() -> Result<Self, Exit> {
+        let executable = std::env::current_exe().map_err(|error| {
+            Exit::missing(
+                format!("cannot find the running program: {error}"),
+                "start caraware by its path",
+            )
+        })?;
+        let bin = executable.parent().map(Path::to_path_buf).unwrap_or_default();
+        // Test binaries lie one level below the programs.
+        let bin = if bin.ends_with("deps") {
+            bin.parent().map(Path::to_path_buf).unwrap_or_default()
+        } else {
+            bin
+        };
+        let python = python(&bin)?;
+        let sumo_home = sumo_home(&python)?;
+        Ok(Self { bin, python, sumo_home })
+    }
+
+    /// Path of a process's binary.
+    ///
+    /// # Errors
+    /// It has not been built.
+    pub fn binary(&self, process: Process) -> Result<PathBuf, Exit> {
+        let path = self.bin.join(process.name());
+        if path.is_file() {
+            return Ok(path);
+        }
+        Err(Exit::missing(
+            format!("the program {} is not there", path.display()),
+            "run `make build`",
+        ))
+    }
+
+    /// A program of the SUMO wheel ("sumo", "netconvert").
+    #[must_use]
+    pub fn sumo_program(&self, name: &str) -> PathBuf {
+        self.sumo_home.join("bin").join(name)
+    }
+}
+
+fn python(bin: &Path) -> Result<PathBuf, Exit> {
+    if let Some(path) = std::env::var_os("CARAWARE_PYTHON") {
+        return Ok(path.into());
+    }
+    bin.ancestors()
+        .map(|directory| directory.join(".venv/bin/python"))
+        .find(|path| path.exists())
+        .ok_or_else(|| {
+            Exit::missing(
+                "the Python environment .venv is not there",
+                "run `make build`, or set CARAWARE_PYTHON to a Python that has caraware installed",
+            )
+        })
+}
+
+fn sumo_home(python: &Path) -> Result<PathBuf, Exit> {
+    if let Some(path) = std::env::var_os("CARAWARE_SUMO_HOME") {
+        return Ok(path.into());
+    }
+    let library = python
+        .parent()
+        .and_then(Path::parent)
+        .map(|venv| venv.join("lib"))
+        .unwrap_or_default();
+    std::fs::read_dir(&library)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.path().join("site-packages/sumo"))
+        .find(|home| home.join("bin/sumo").is_file())
+        .ok_or_else(|| {
+            Exit::missing(
+                format!(
+                    "SUMO (the wheel eclipse-sumo) is not installed below {}",
+                    library.display()
+                ),
+                "run `make build`, or set CARAWARE_SUMO_HOME to the wheel's `sumo` directory",
+            )
+        })
+}

@@ -1,0 +1,16 @@
+//! The `caraware` command: configuration, process table, supervisor, status, doctor.
+
+pub mod cli;
+pub mod config;
+pub mod display;
+pub mod doctor;
+pub mod failure;
+pub mod install;
+pub mod prepare;
+pub mod process_table;
+pub mod registry;
+pub mod report;
+pub mod scenario;
+pub mod status;
+pub mod supervisor;
+pub mod town;

@@ -1,0 +1,265 @@
+//! From the command line to a run file: everything that can be wrong is found here, before anything is started.
+
+use std::{
+    net::TcpListener,
+    path::{Path, PathBuf},
+};
+
+use ipc_schema::{
+    SCHEMA_VERSION,
+    config::Config,
+    run::{MapInfo, Mode, RunFile, Source},
+    services::Channel,
+};
+use serde_json::Value;
+
+use crate::{
+    cli::RunArgs,
+    config::{self, ConfigError, Settings},
+    failure::Exit,
+    install::Install,
+    registry::{self, Claim},
+    scenario::{self, Scenario},
+    town,
+};
+
+/// SUMO's own default step, seconds.
+const SUMO_STEP_S: f64 = 1.0;
+/// SUMO's own default seed.
+const SUMO_SEED: u64 = 23423;
+/// Road users that shared memory is laid out for when a scenario does not say.
+const SCENARIO_ROAD_USERS: u64 = 8192;
+
+/// A run that is ready to be supervised.
+#[derive(Debug)]
+pub struct Prepared {
+    /// What every process will read.
+    pub run: RunFile,
+    /// The parts of caraware.
+    pub install: Install,
+    /// Its corner of shared memory.
+    pub claim: Claim,
+}
+
+/// What CONFIG names.
+enum Named {
+    Map,
+    Scenario(PathBuf, Scenario),
+}
+
+/// Checks everything and claims a run directory and shared memory.
+///
+/// # Errors
+/// Anything wrong with the configuration, the user's files or this machine.
+pub fn prepare(args: &RunArgs, mode: Mode) -> Result<Prepared, Exit> {
+    let (settings, named, label) = resolve(args)?;
+    let config = settings.validate()?;
+    let install = Install::find()?;
+    let origin = config.map.origin_latitude_deg.zip(config.map.origin_longitude_deg);
+    let scenario_map = match &named {
+        Named::Scenario(_, scenario) => Some(scenario::map_info(&scenario.net_file, origin)?),
+        Named::Map => None,
+    };
+    check_port(&config)?;
+    registry::sweep();
+    let run_dir = create_run_dir(args, &label)?;
+    let result = assemble(&run_dir, mode, config, &install, named, scenario_map);
+    if result.is_err() {
+        // Nothing has been started: leave nothing behind.
+        if let Err(error) = std::fs::remove_dir_all(&run_dir.path) {
+            tracing::warn!(%error, "cannot remove the run directory");
+        }
+    }
+    let (run, claim) = result?;
+    Ok(Prepared { run, install, claim })
+}
+
+fn resolve(args: &RunArgs) -> Result<(Settings, Named, String), Exit> {
+    let name = args.config.as_deref().unwrap_or("town");
+    let path = Path::new(name);
+    let defaults = Settings::defaults()?;
+    let label = path
+        .file_stem()
+        .map_or_else(|| name.to_owned(), |stem| stem.to_string_lossy().into_owned());
+    match path.extension().and_then(std::ffi::OsStr::to_str) {
+        Some("sumocfg") => {
+            let scenario = scenario::read(path)?;
+            let mut settings = defaults.with_assignments(&args.set)?;
+            suggest_scenario(&mut settings, &scenario, name);
+            let path = std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error))?;
+            Ok((settings, Named::Scenario(path, scenario), label))
+        }
+        Some("toml") => Ok((
+            defaults.with_file(path)?.with_assignments(&args.set)?,
+            Named::Map,
+            label,
+        )),
+        _ => {
+            let settings = defaults.with_preset(name).ok_or_else(|| ConfigError::File {
+                path: name.to_owned(),
+                message: "is neither a preset, a .toml nor a .sumocfg".into(),
+                help: format!("presets: {}. A path needs its extension.", config::preset_names()),
+            })??;
+            Ok((settings.with_assignments(&args.set)?, Named::Map, label))
+        }
+    }
+}
+
+/// A scenario's own step and seed count, unless the user says otherwise.
+fn suggest_scenario(settings: &mut Settings, scenario: &Scenario, source: &str) {
+    settings.suggest(
+        "traffic.step_s",
+        Value::from(scenario.step_s.unwrap_or(SUMO_STEP_S)),
+        source,
+    );
+    settings.suggest("run.seed", Value::from(scenario.seed.unwrap_or(SUMO_SEED)), source);
+    settings.suggest("traffic.max_road_users", Value::from(SCENARIO_ROAD_USERS), source);
+}
+
+fn check_port(config: &Config) -> Result<(), Exit> {
+    if !config.fanout.enabled {
+        return Ok(());
+    }
+    let listen = &config.fanout.listen;
+    let address = listen.strip_prefix("tcp/").ok_or_else(|| {
+        Exit::config(
+            format!("`fanout.listen` = \"{listen}\" is not an endpoint caraware knows"),
+            "give tcp/HOST:PORT, for example tcp/127.0.0.1:7447",
+        )
+    })?;
+    TcpListener::bind(address).map(drop).map_err(|error| {
+        Exit::config(
+            format!("`fanout.listen` = \"{listen}\" cannot be listened on: {error}"),
+            "another run or program has the port: choose another, e.g. --set fanout.listen=tcp/127.0.0.1:7448, or --set fanout.enabled=false",
+        )
+    })
+}
+
+struct RunDir {
+    name: String,
+    path: PathBuf,
+}
+
+/// `runs/<name>`, created by us alone: the name given, or the label with the first free number.
+fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDir, Exit> {
+    let runs = std::path::absolute(&args.runs).map_err(|error| Exit::io("resolve", &args.runs, &error))?;
+    std::fs::create_dir_all(&runs).map_err(|error| Exit::io("create", &runs, &error))?;
+    if let Some(name) = &args.name {
+        check_name(name)?;
+        let path = runs.join(name);
+        return match std::fs::create_dir(&path) {
+            Ok(()) => Ok(RunDir {
+                name: name.clone(),
+                path,
+            }),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => Err(Exit::config(
+                format!("the run name `{name}` is in use: {} exists", path.display()),
+                "choose another with --name, or remove that directory",
+            )),
+            Err(error) => Err(Exit::io("create", &path, &error)),
+        };
+    }
+    for number in 1_u32.. {
+        let name = format!("{label}-{number}");
+        let path = runs.join(&name);
+        match std::fs::create_dir(&path) {
+            Ok(()) => return Ok(RunDir { name, path }),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(Exit::io("create", &path, &error)),
+        }
+    }
+    Err(Exit::run("no free run number", "name the run with --name"))
+}
+
+fn check_name(name: &str) -> Result<(), Exit> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
+    if !name.is_empty() && name.len() <= 64 && name.chars().all(plain) && !name.starts_with('.') {
+        return Ok(());
+    }
+    Err(Exit::config(
+        format!("the run name `{name}` cannot be used"),
+        "use up to 64 of the letters a–z, digits, '.', '_' and '-', not starting with '.'",
+    ))
+}
+
+fn assemble(
+    run_dir: &RunDir,
+    mode: Mode,
+    config: Config,
+    install: &Install,
+    named: Named,
+    scenario_map: Option<MapInfo>,
+) -> Result<(RunFile, Claim), Exit> {
+    for part in ["logs", "parts"] {
+        let path = run_dir.path.join(part);
+        std::fs::create_dir(&path).map_err(|error| Exit::io("create", &path, &error))?;
+    }
+    let (source, map) = match (named, scenario_map) {
+        (Named::Scenario(sumocfg, _), Some(map)) => (Source::Scenario { sumocfg }, map),
+        _ => {
+            let source = town::build(install, &run_dir.path.join("map"))?;
+            let Source::Population { net_file, .. } = &source else {
+                return Err(Exit::run("the town has no net", ""));
+            };
+            let map = scenario::map_info(net_file, None)?;
+            (source, map)
+        }
+    };
+    let claim = Claim::new(&run_dir.path)?;
+    let config_hash = config::hash(&config);
+    let path = run_dir.path.join("config.toml");
+    std::fs::write(&path, format!("# BLAKE3 {config_hash}\n{}", config::to_toml(&config)))
+        .map_err(|error| Exit::io("write", &path, &error))?;
+    let run = RunFile {
+        schema_version: SCHEMA_VERSION,
+        run_id: claim.run_id,
+        name: run_dir.name.clone(),
+        run_dir: run_dir.path.clone(),
+        mode,
+        supervisor_pid: i32::try_from(std::process::id()).unwrap_or(0),
+        shared_memory: claim.memory.clone(),
+        source,
+        map,
+        sumo_home: install.sumo_home.clone(),
+        config,
+        config_hash,
+    };
+    check_shared_memory(&run)?;
+    Ok((run, claim))
+}
+
+/// Refuses a run whose worst case does not fit: a full `/dev/shm` would kill processes with SIGBUS in mid-run.
+fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
+    let needed: u64 = Channel::ALL
+        .into_iter()
+        .map(|channel| channel.worst_case_bytes(run) as u64)
+        .sum();
+    let free = free_bytes(Path::new(registry::SHARED_MEMORY))?;
+    if needed <= free {
+        return Ok(());
+    }
+    let mebi = |bytes: u64| bytes.div_ceil(1 << 20);
+    Err(Exit::missing(
+        format!(
+            "{} has {} MiB free, this run may need {} MiB",
+            registry::SHARED_MEMORY,
+            mebi(free),
+            mebi(needed)
+        ),
+        format!(
+            "lower `traffic.max_road_users` (now {}) or `run.window_ticks` (now {}), or enlarge {} (Docker: --shm-size)",
+            run.config.traffic.max_road_users,
+            run.config.run.window_ticks,
+            registry::SHARED_MEMORY
+        ),
+    ))
+}
+
+/// Free bytes of the file system that holds `path`.
+///
+/// # Errors
+/// It cannot be asked.
+pub fn free_bytes(path: &Path) -> Result<u64, Exit> {
+    let stat = rustix::fs::statvfs(path).map_err(|error| Exit::io("look at", path, &error.into()))?;
+    Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
+}

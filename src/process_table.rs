@@ -1,0 +1,189 @@
+//! The processes of a run as a table: adding a process is adding a row.
+
+use std::{
+    fs::OpenOptions,
+    os::unix::process::CommandExt as _,
+    path::Path,
+    process::{Child, Command, ExitStatus, Stdio},
+};
+
+use ipc_schema::{
+    failure::{Failure, FailureKind},
+    process::Process,
+    run::{Mode, RunFile},
+};
+use rustix::process::{Pid, Signal, kill_process_group};
+
+use crate::{failure::Exit, install::Install};
+
+/// What the end of a process means.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OnExit {
+    /// The run needs it: a failure ends the run.
+    Required,
+    /// It only watches: it is started again.
+    Restart,
+}
+
+/// One row.
+#[derive(Debug)]
+pub struct Row {
+    /// Which process.
+    pub process: Process,
+    /// Processes that must be ready before it is started.
+    pub needs: &'static [Process],
+    /// What its end means.
+    pub on_exit: OnExit,
+    /// Whether a run has it.
+    pub wanted: fn(&RunFile) -> bool,
+    /// How it is started.
+    pub command: fn(&Install, &RunFile) -> Result<Command, Exit>,
+}
+
+/// All rows, in the order of starting. SUMO comes first because it is the one that user's files can upset.
+pub const TABLE: [Row; 5] = [
+    Row {
+        process: Process::TrafficBridge,
+        needs: &[],
+        on_exit: OnExit::Required,
+        wanted: |_| true,
+        command: |install, _| install.binary(Process::TrafficBridge).map(Command::new),
+    },
+    Row {
+        process: Process::SimCore,
+        needs: &[Process::TrafficBridge],
+        on_exit: OnExit::Required,
+        wanted: |_| true,
+        command: |install, _| install.binary(Process::SimCore).map(Command::new),
+    },
+    Row {
+        process: Process::SensorDaemon,
+        needs: &[Process::TrafficBridge],
+        on_exit: OnExit::Required,
+        wanted: |_| true,
+        command: |install, _| install.binary(Process::SensorDaemon).map(Command::new),
+    },
+    Row {
+        process: Process::Trainer,
+        needs: &[Process::TrafficBridge],
+        on_exit: OnExit::Required,
+        wanted: |run| run.mode == Mode::Train,
+        command: trainer,
+    },
+    Row {
+        process: Process::Fanout,
+        needs: &[Process::TrafficBridge],
+        on_exit: OnExit::Restart,
+        wanted: |run| run.config.fanout.enabled,
+        command: |install, _| install.binary(Process::Fanout).map(Command::new),
+    },
+];
+
+fn trainer(install: &Install, run: &RunFile) -> Result<Command, Exit> {
+    let mut command = Command::new(&install.python);
+    command
+        .args(["-m", &run.config.trainer.module])
+        .env("PYTHONUNBUFFERED", "1");
+    Ok(command)
+}
+
+/// A started process; killed with its group when dropped.
+#[derive(Debug)]
+pub struct Running {
+    /// Its row.
+    pub row: &'static Row,
+    /// How often it has been started before.
+    pub incarnation: u32,
+    child: Child,
+    exit: Option<ExitStatus>,
+}
+
+impl Running {
+    /// Starts a row in a process group of its own, its output going to `logs/<process>.log`.
+    ///
+    /// # Errors
+    /// The program is missing or cannot be started.
+    pub fn start(
+        row: &'static Row,
+        install: &Install,
+        run: &RunFile,
+        run_file: &Path,
+        incarnation: u32,
+    ) -> Result<Self, Exit> {
+        let log_path = run.run_dir.join("logs").join(format!("{}.log", row.process));
+        let log = OpenOptions::new()
+            .create(true)
+            .append(true)
+            .open(&log_path)
+            .map_err(|error| Exit::io("open", &log_path, &error))?;
+        let errors = log.try_clone().map_err(|error| Exit::io("open", &log_path, &error))?;
+        let mut command = (row.command)(install, run)?;
+        command
+            .arg(run_file)
+            .env(ipc_schema::session::INCARNATION, incarnation.to_string())
+            .stdin(Stdio::null())
+            .stdout(log)
+            .stderr(errors)
+            .process_group(0);
+        let program = command.get_program().to_string_lossy().into_owned();
+        let child = command.spawn().map_err(|error| {
+            Exit::missing(
+                format!("cannot start {program}: {error}"),
+                "run `make build`, then `caraware doctor`",
+            )
+        })?;
+        Ok(Self {
+            row,
+            incarnation,
+            child,
+            exit: None,
+        })
+    }
+
+    /// How it ended, if it has.
+    pub fn poll(&mut self) -> Option<ExitStatus> {
+        if self.exit.is_none() {
+            self.exit = self.child.try_wait().ok().flatten();
+        }
+        self.exit
+    }
+
+    /// Sends `signal` to its process group, unless it has ended.
+    pub fn signal(&mut self, signal: Signal) {
+        if self.poll().is_some() {
+            return;
+        }
+        if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw)
+            && let Err(error) = kill_process_group(pid, signal)
+        {
+            tracing::debug!(%error, process = %self.row.process, "cannot signal");
+        }
+    }
+
+    /// What it said about its failure, or the end of its log.
+    #[must_use]
+    pub fn failure(&self, run: &RunFile, status: ExitStatus) -> Failure {
+        let name = self.row.process.name();
+        if let Some(mut failure) = Failure::read(&run.run_dir, name) {
+            failure.message = format!("{name}: {}", failure.message);
+            return failure;
+        }
+        let log = run.run_dir.join("logs").join(format!("{name}.log"));
+        let text = std::fs::read_to_string(&log).unwrap_or_default();
+        let tail: Vec<&str> = text.lines().rev().take(5).collect();
+        let tail = tail.into_iter().rev().collect::<Vec<_>>().join("\n  ");
+        Failure::new(FailureKind::Run, format!("{name} ended with {status}\n  {tail}"))
+            .with_help(format!("its log is {}", log.display()))
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        if self.poll().is_none() {
+            self.signal(Signal::KILL);
+            if let Err(error) = self.child.wait() {
+                tracing::debug!(%error, process = %self.row.process, "cannot wait");
+            }
+        }
+    }
+}

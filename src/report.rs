@@ -1,0 +1,118 @@
+//! `report.json`: what a run came to, put together from the parts that its processes wrote.
+
+use std::path::{Path, PathBuf};
+
+use ipc_schema::run::{Mode, RunFile};
+use serde::Deserialize;
+use serde_json::{Map, Value, json};
+
+use crate::{failure::Exit, supervisor::Outcome};
+
+/// What sensor-daemon writes at its end.
+#[derive(Debug, Deserialize, Default)]
+#[serde(default)]
+struct Sensing {
+    observation_hash: String,
+    observations: u64,
+    ticks: u64,
+    drops: u64,
+    cavs_max: u64,
+    raw_gnss_mean_error_m: Option<f64>,
+}
+
+/// Puts the report together, writes it, and returns it with its path.
+///
+/// # Errors
+/// Not writable.
+pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit> {
+    let parts = run.run_dir.join("parts");
+    let sensing: Sensing = read(&parts.join("sensor-daemon.json")).unwrap_or_default();
+    let training: Map<String, Value> = read(&parts.join("trainer.json")).unwrap_or_default();
+    let moving: Map<String, Value> = read(&parts.join("sim-core.json")).unwrap_or_default();
+    let traffic: Map<String, Value> = read(&parts.join("traffic-bridge.json")).unwrap_or_default();
+    let learned = |key: &str| training.get(key).cloned().unwrap_or(Value::Null);
+    let env_steps = match run.mode {
+        Mode::Train => learned("env_steps").as_u64().unwrap_or(0),
+        Mode::Simulate => sensing.observations,
+    };
+    let raw = match run.mode {
+        Mode::Train => learned("raw_gnss_mean_error_m"),
+        Mode::Simulate => json!(sensing.raw_gnss_mean_error_m),
+    };
+    #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+    let (rate, simulated_s) = (
+        env_steps as f64 / outcome.wall_s,
+        sensing.ticks as f64 * run.config.run.tick_s,
+    );
+    let report = json!({
+        "name": run.name,
+        "mode": run.mode,
+        "result": if outcome.interrupted { "interrupted" } else { "completed" },
+        "env_steps": env_steps,
+        "wall_s": outcome.wall_s,
+        "env_steps_per_s": rate,
+        "raw_gnss_mean_error_m": raw,
+        "ppo_mean_error_m": learned("ppo_mean_error_m"),
+        "policy_std": learned("policy_std"),
+        "vehicles": sensing.cavs_max,
+        "observation_hash": sensing.observation_hash,
+        "lost_ticks": training.get("lost_ticks").cloned().unwrap_or(json!(0)),
+        "duplicated_ticks": training.get("duplicated_ticks").cloned().unwrap_or(json!(0)),
+        "drops": sensing.drops,
+        "restarts": outcome.restarts,
+        "vehicle_steps": sensing.observations,
+        "ticks": sensing.ticks,
+        "simulated_s": simulated_s,
+        "real_time_factor": simulated_s / outcome.wall_s,
+        "seed": run.config.run.seed,
+        "config_hash": run.config_hash,
+        "trainer": training,
+        "dynamics": moving,
+        "traffic": traffic,
+    });
+    let path = run.run_dir.join("report.json");
+    let text = serde_json::to_string_pretty(&report).unwrap_or_default();
+    std::fs::write(&path, text + "\n").map_err(|error| Exit::io("write", &path, &error))?;
+    Ok((report, path))
+}
+
+fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Option<T> {
+    serde_json::from_str(&std::fs::read_to_string(path).ok()?).ok()
+}
+
+/// The report in a few lines for the terminal.
+#[must_use]
+pub fn summary(report: &Value, path: &Path) -> String {
+    let number = |key: &str, digits: usize| {
+        report[key]
+            .as_f64()
+            .map_or("–".into(), |value| format!("{value:.digits$}"))
+    };
+    let mut lines = vec![format!(
+        "{} {}: {} vehicle-steps in {} s ({} per second, {} × real time)",
+        report["name"].as_str().unwrap_or_default(),
+        report["result"].as_str().unwrap_or_default(),
+        report["vehicle_steps"],
+        number("wall_s", 1),
+        number("env_steps_per_s", 0),
+        number("real_time_factor", 1),
+    )];
+    if !report["ppo_mean_error_m"].is_null() {
+        lines.push(format!(
+            "mean error on unseen seeds: policy {} m, raw GNSS {} m   (policy σ {})",
+            number("ppo_mean_error_m", 2),
+            number("raw_gnss_mean_error_m", 2),
+            number("policy_std", 3)
+        ));
+    }
+    lines.push(format!(
+        "ticks lost {}, duplicated {}; messages dropped {}; restarts {}",
+        report["lost_ticks"], report["duplicated_ticks"], report["drops"], report["restarts"]
+    ));
+    lines.push(format!(
+        "observation hash {}",
+        report["observation_hash"].as_str().unwrap_or_default()
+    ));
+    lines.push(format!("report: {}", path.display()));
+    lines.join("\n")
+}

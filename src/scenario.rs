@@ -1,0 +1,333 @@
+//! What a `.sumocfg` and a net file say about themselves, read before anything is started.
+
+use std::{
+    fs::File,
+    io::{BufRead, BufReader},
+    path::{Path, PathBuf},
+};
+
+use flate2::read::MultiGzDecoder;
+use ipc_schema::run::MapInfo;
+use quick_xml::{
+    Reader,
+    events::{BytesStart, Event},
+};
+
+use crate::{config::ConfigError, failure::Exit};
+
+/// The options of a `.sumocfg` that the bridge needs.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Scenario {
+    /// The net.
+    pub net_file: PathBuf,
+    /// `step-length`, if set.
+    pub step_s: Option<f64>,
+    /// `seed`, if set.
+    pub seed: Option<u64>,
+}
+
+fn problem(path: &Path, message: impl Into<String>, help: impl Into<String>) -> Exit {
+    ConfigError::File {
+        path: path.display().to_string(),
+        message: message.into(),
+        help: help.into(),
+    }
+    .into()
+}
+
+/// The value of attribute `name`, unescaped.
+fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> {
+    let attribute = element.try_get_attribute(name).ok().flatten()?;
+    attribute
+        .normalized_value(quick_xml::XmlVersion::Implicit1_0)
+        .ok()
+        .map(|value| value.into_owned())
+}
+
+/// Reads a `.sumocfg` and checks that every file it names is there.
+///
+/// # Errors
+/// Unreadable, malformed, no net, or a named file is missing (with the line).
+pub fn read(path: &Path) -> Result<Scenario, Exit> {
+    let text = std::fs::read_to_string(path).map_err(|error| {
+        problem(
+            path,
+            format!("cannot be read: {error}"),
+            "give the path of an existing .sumocfg",
+        )
+    })?;
+    let directory = path.parent().unwrap_or(Path::new("."));
+    let mut scenario = Scenario::default();
+    let mut reader = Reader::from_str(&text);
+    loop {
+        let line = line_of(&text, reader.buffer_position());
+        match reader.read_event() {
+            Ok(Event::Start(element) | Event::Empty(element)) => {
+                option(&mut scenario, &element, path, directory, line)?
+            }
+            Ok(Event::Eof) => break,
+            Ok(_) => {}
+            Err(error) => {
+                return Err(problem(
+                    path,
+                    format!("line {line}: not valid XML: {error}"),
+                    "correct the file; SUMO's own check: `sumo -c FILE`",
+                ));
+            }
+        }
+    }
+    if scenario.net_file.as_os_str().is_empty() {
+        return Err(problem(
+            path,
+            "names no net-file",
+            "add <input><net-file value=\"…\"/></input>",
+        ));
+    }
+    Ok(scenario)
+}
+
+fn line_of(text: &str, position: u64) -> usize {
+    let end = usize::try_from(position).unwrap_or(usize::MAX).min(text.len());
+    let start = text.as_bytes()[end..]
+        .iter()
+        .take_while(|byte| byte.is_ascii_whitespace())
+        .count();
+    text.as_bytes()[..end + start]
+        .iter()
+        .filter(|byte| **byte == b'\n')
+        .count()
+        + 1
+}
+
+fn option(
+    scenario: &mut Scenario,
+    element: &BytesStart<'_>,
+    path: &Path,
+    directory: &Path,
+    line: usize,
+) -> Result<(), Exit> {
+    let name = element.local_name();
+    let name = name.as_ref().to_owned();
+    let Some(value) = attribute(element, "value").or_else(|| attribute(element, "v")) else {
+        return Ok(());
+    };
+    match name.as_str() {
+        "net-file" | "net" | "n" | "route-files" | "routes" | "r" | "additional-files" | "additional" | "a" => {
+            let files = files(&value, directory);
+            if let Some(missing) = files.iter().find(|file| !file.is_file()) {
+                let message = format!("line {line}: {name} names {}, which is not there", missing.display());
+                return Err(problem(
+                    path,
+                    message,
+                    "paths in a .sumocfg are relative to the .sumocfg itself",
+                ));
+            }
+            if name.starts_with('n') {
+                scenario.net_file = files.into_iter().next().unwrap_or_default();
+            }
+        }
+        "step-length" => scenario.step_s = Some(number(&value, &name, path, line)?),
+        "seed" => scenario.seed = Some(number(&value, &name, path, line)?),
+        _ => {}
+    }
+    Ok(())
+}
+
+fn files(value: &str, directory: &Path) -> Vec<PathBuf> {
+    value
+        .split(',')
+        .map(str::trim)
+        .filter(|name| !name.is_empty())
+        .map(|name| directory.join(name))
+        .collect()
+}
+
+fn number<T: std::str::FromStr>(value: &str, name: &str, path: &Path, line: usize) -> Result<T, Exit> {
+    value.trim().parse().map_err(|_| {
+        problem(
+            path,
+            format!("line {line}: {name} = \"{value}\" is not a number caraware understands"),
+            "give a plain number",
+        )
+    })
+}
+
+/// Reads the `<location>` of a net file (plain or gzip), the geodetic origin of the configuration standing in for a missing projection.
+///
+/// # Errors
+/// Unreadable, no `<location>`, or no projection and no origin.
+pub fn map_info(net: &Path, origin_deg: Option<(f64, f64)>) -> Result<MapInfo, Exit> {
+    let unreadable = |error: &dyn std::fmt::Display| {
+        problem(
+            net,
+            format!("cannot be read: {error}"),
+            "give a net built by netconvert",
+        )
+    };
+    let file = File::open(net).map_err(|error| unreadable(&error))?;
+    let mut raw = BufReader::new(file);
+    let gzip = raw
+        .fill_buf()
+        .map_err(|error| unreadable(&error))?
+        .starts_with(&[0x1f, 0x8b]);
+    let input: Box<dyn BufRead> = if gzip {
+        Box::new(BufReader::new(MultiGzDecoder::new(raw)))
+    } else {
+        Box::new(raw)
+    };
+    let mut reader = Reader::from_reader(input);
+    let mut buffer = Vec::new();
+    loop {
+        match reader.read_event_into(&mut buffer) {
+            Ok(Event::Start(element) | Event::Empty(element)) if element.local_name().as_ref() == "location" => {
+                return location(&element, net, origin_deg);
+            }
+            Ok(Event::Eof) => return Err(problem(net, "has no <location>", "give a net built by netconvert")),
+            Ok(_) => buffer.clear(),
+            Err(error) => return Err(unreadable(&error)),
+        }
+    }
+}
+
+/// Room around the net for what leaves it: GNSS errors, vehicles wider than their lane, metres.
+const MARGIN_M: f64 = 20.0;
+
+fn location(element: &BytesStart<'_>, net: &Path, origin_deg: Option<(f64, f64)>) -> Result<MapInfo, Exit> {
+    let numbers = |name: &str| -> Option<Vec<f64>> {
+        attribute(element, name)?
+            .split(',')
+            .map(|part| part.trim().parse().ok())
+            .collect()
+    };
+    let bad = |name: &str| {
+        problem(
+            net,
+            format!("<location> has no usable {name}"),
+            "give a net built by netconvert",
+        )
+    };
+    let bounds_m: [f64; 4] = numbers("convBoundary")
+        .and_then(|list| list.try_into().ok())
+        .ok_or_else(|| bad("convBoundary"))?;
+    let [x_min, y_min, x_max, y_max] = bounds_m;
+    let bounds_m = [x_min - MARGIN_M, y_min - MARGIN_M, x_max + MARGIN_M, y_max + MARGIN_M];
+    let offset_m: [f64; 2] = numbers("netOffset")
+        .and_then(|list| list.try_into().ok())
+        .ok_or_else(|| bad("netOffset"))?;
+    let projection = attribute(element, "projParameter").unwrap_or_default();
+    if projection.len() > 1 {
+        return Ok(MapInfo {
+            projection,
+            net_offset_m: offset_m,
+            bounds_m,
+        });
+    }
+    let (latitude, longitude) = origin_deg.ok_or_else(|| {
+        problem(
+            net,
+            "has no projection (projParameter is \"!\"), so GNSS has no latitude and longitude",
+            "give the place of the net's (0, 0): --set map.origin_latitude_deg=52.0 --set map.origin_longitude_deg=10.0",
+        )
+    })?;
+    let projection =
+        format!("+proj=tmerc +lat_0={latitude} +lon_0={longitude} +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs");
+    Ok(MapInfo {
+        projection,
+        net_offset_m: [0.0, 0.0],
+        bounds_m,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn write(directory: &Path, name: &str, text: &str) -> PathBuf {
+        let path = directory.join(name);
+        std::fs::write(&path, text).unwrap();
+        path
+    }
+
+    fn message(exit: Exit) -> (String, String) {
+        match exit {
+            Exit::Config(error) => (
+                error.to_string(),
+                miette::Diagnostic::help(&*error).unwrap().to_string(),
+            ),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    const NET: &str = r#"<net><location netOffset="1.0,-2.5" convBoundary="0,0,100,50" origBoundary="0,0,1,1" projParameter="P"/></net>"#;
+
+    #[test]
+    fn options_are_read_relative_to_the_file() {
+        let directory = tempfile::tempdir().unwrap();
+        write(directory.path(), "a.net.xml", NET);
+        let cfg = write(
+            directory.path(),
+            "a.sumocfg",
+            "<configuration>\n<input>\n<net-file value=\"a.net.xml\"/></input><time><step-length value=\"0.5\"/></time></configuration>",
+        );
+        let scenario = read(&cfg).unwrap();
+        assert_eq!(
+            scenario,
+            Scenario {
+                net_file: directory.path().join("a.net.xml"),
+                step_s: Some(0.5),
+                seed: None
+            }
+        );
+    }
+
+    #[test]
+    fn a_missing_route_file_is_named_with_its_line() {
+        let directory = tempfile::tempdir().unwrap();
+        write(directory.path(), "a.net.xml", NET);
+        let cfg = write(
+            directory.path(),
+            "a.sumocfg",
+            "<configuration>\n  <input>\n    <net-file value=\"a.net.xml\"/>\n    <route-files value=\"b.rou.xml\"/>\n  </input>\n</configuration>",
+        );
+        let (text, help) = message(read(&cfg).unwrap_err());
+        assert!(
+            text.contains("line 4: route-files names") && text.contains("b.rou.xml"),
+            "{text}"
+        );
+        assert!(help.contains("relative to the .sumocfg"), "{help}");
+    }
+
+    #[test]
+    fn the_location_is_read_from_plain_and_gzip_nets() {
+        use std::io::Write as _;
+        let directory = tempfile::tempdir().unwrap();
+        let net = NET.replace("\"P\"", "\"+proj=utm +zone=32\"");
+        let plain = write(directory.path(), "a.net.xml", &net);
+        let packed = directory.path().join("a.net.xml.gz");
+        let mut encoder = flate2::write::GzEncoder::new(File::create(&packed).unwrap(), flate2::Compression::fast());
+        encoder.write_all(net.as_bytes()).unwrap();
+        encoder.finish().unwrap();
+        let expected = MapInfo {
+            projection: "+proj=utm +zone=32".into(),
+            net_offset_m: [1.0, -2.5],
+            bounds_m: [-20.0, -20.0, 120.0, 70.0],
+        };
+        assert_eq!(map_info(&plain, None).unwrap(), expected);
+        assert_eq!(map_info(&packed, None).unwrap(), expected);
+    }
+
+    #[test]
+    fn a_net_without_projection_needs_an_origin() {
+        let directory = tempfile::tempdir().unwrap();
+        let net = write(directory.path(), "a.net.xml", &NET.replace("\"P\"", "\"!\""));
+        let (text, help) = message(map_info(&net, None).unwrap_err());
+        assert!(text.contains("has no projection"), "{text}");
+        assert!(help.contains("map.origin_latitude_deg"), "{help}");
+        assert!(
+            map_info(&net, Some((52.0, 10.0)))
+                .unwrap()
+                .projection
+                .starts_with("+proj=tmerc +lat_0=52 +lon_0=10")
+        );
+    }
+}

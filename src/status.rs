@@ -1,0 +1,164 @@
+//! `caraware ps` and `caraware stop`: runs seen from another terminal.
+
+use std::time::{Duration, Instant};
+
+use ipc_schema::{
+    board::{Health, Progress, State},
+    ports::BoardReader,
+    process::Process,
+    run::RunFile,
+    services,
+};
+use rustix::process::{Pid, Signal, kill_process};
+
+use crate::{
+    failure::Exit,
+    process_table::{Row, TABLE},
+    registry,
+};
+
+/// Time over which `ps` measures rates.
+const RATE_OVER: Duration = Duration::from_millis(500);
+/// Longest wait of `stop`.
+const STOP_WITHIN: Duration = Duration::from_secs(60);
+
+/// Prints the process table of every live run.
+///
+/// # Errors
+/// The run named is not alive, or its shared memory cannot be opened.
+pub fn ps(name: Option<&str>) -> Result<(), Exit> {
+    let runs: Vec<RunFile> = match name {
+        Some(name) => vec![registry::find(Some(name))?],
+        None => registry::entries()
+            .into_iter()
+            .filter(|entry| entry.alive)
+            .filter_map(|entry| entry.run)
+            .collect(),
+    };
+    if runs.is_empty() {
+        println!("no run is alive");
+        return Ok(());
+    }
+    println!(
+        "{:<16} {:<15} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>9}",
+        "RUN", "PROCESS", "STATE", "PID", "TICK", "TICKS/S", "LAG", "DROPS", "RESTARTS", "MEMORY"
+    );
+    for run in &runs {
+        print_run(run)?;
+    }
+    Ok(())
+}
+
+struct Look {
+    health: Health,
+    progress: Progress,
+}
+
+fn look(boards: &[(&'static Row, BoardReader)]) -> Vec<Look> {
+    boards
+        .iter()
+        .map(|(_, board)| Look {
+            health: board.health(),
+            progress: board.progress(),
+        })
+        .collect()
+}
+
+fn print_run(run: &RunFile) -> Result<(), Exit> {
+    let node = services::node(&run.shared_memory)?;
+    let wanted = TABLE.iter().filter(|row| (row.wanted)(run));
+    let boards = wanted
+        .map(|row| {
+            Ok((
+                row,
+                BoardReader::create(&services::open_board(&node, run, 0, row.process)?)?,
+            ))
+        })
+        .collect::<Result<Vec<_>, Exit>>()?;
+    let first = look(&boards);
+    wait(RATE_OVER);
+    let second = look(&boards);
+    let supervisor = memory_mib(run.supervisor_pid);
+    println!(
+        "{:<16} {:<15} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>5} MiB",
+        run.name, "supervisor", "running", run.supervisor_pid, "", "", "", "", "", supervisor
+    );
+    let source_ticks = second.first().map_or(0, |look| look.health.ticks);
+    for (((row, _), before), now) in boards.iter().zip(&first).zip(&second) {
+        #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+        let rate = now.health.ticks.saturating_sub(before.health.ticks) as f64 / RATE_OVER.as_secs_f64();
+        println!(
+            "{:<16} {:<15} {:<9} {:>8} {:>10} {:>9.0} {:>6} {:>7} {:>9} {:>5} MiB",
+            run.name,
+            row.process,
+            State::from_u32(now.health.state).name(),
+            now.health.pid,
+            now.health.ticks,
+            rate,
+            source_ticks.saturating_sub(now.health.ticks),
+            now.health.drops,
+            now.progress.incarnation,
+            memory_mib(now.health.pid)
+        );
+    }
+    Ok(())
+}
+
+/// Resident memory of a process, MiB.
+fn memory_mib(pid: i32) -> u64 {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    line.and_then(|rest| rest.split_whitespace().next())
+        .and_then(|kib| kib.parse::<u64>().ok())
+        .unwrap_or(0)
+        / 1024
+}
+
+fn wait(time: Duration) {
+    std::thread::park_timeout(time);
+}
+
+/// Asks the supervisor of a run to end it, and waits until nothing of it is left.
+///
+/// # Errors
+/// No such run, or it does not end in time.
+pub fn stop(name: Option<&str>) -> Result<(), Exit> {
+    let run = registry::find(name)?;
+    let pid = Pid::from_raw(run.supervisor_pid)
+        .ok_or_else(|| Exit::run("the run has no supervisor", "`caraware doctor --clean`"))?;
+    kill_process(pid, Signal::TERM)
+        .map_err(|error| Exit::run(format!("cannot signal process {}: {error}", run.supervisor_pid), ""))?;
+    println!("stopping {}: the trainer writes a checkpoint", run.name);
+    let deadline = Instant::now() + STOP_WITHIN;
+    while Instant::now() < deadline {
+        wait(Duration::from_millis(100));
+        if registry::find(Some(&run.name)).is_err() {
+            println!("{} has stopped; its results are in {}", run.name, run.run_dir.display());
+            return Ok(());
+        }
+    }
+    Err(Exit::run(
+        format!("{} has not stopped within {} s", run.name, STOP_WITHIN.as_secs()),
+        format!("kill process {}", run.supervisor_pid),
+    ))
+}
+
+/// Process ids of a live run by process, for tests and scripts.
+///
+/// # Errors
+/// As [`ps`].
+pub fn process_ids(run: &RunFile) -> Result<Vec<(Process, i32)>, Exit> {
+    let node = services::node(&run.shared_memory)?;
+    TABLE
+        .iter()
+        .filter(|row| (row.wanted)(run))
+        .map(|row| {
+            Ok((
+                row.process,
+                BoardReader::create(&services::open_board(&node, run, 0, row.process)?)?
+                    .health()
+                    .pid,
+            ))
+        })
+        .collect()
+}

@@ -1,0 +1,69 @@
+//! The project's own maps: plain XML carried in the binary, built by netconvert into the run directory.
+
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use ipc_schema::run::Source;
+
+use crate::{failure::Exit, install::Install};
+
+macro_rules! sources {
+    ($($name:literal),+ $(,)?) => { [$(($name, include_str!(concat!("../maps/town/", $name)))),+] };
+}
+
+/// The plain sources of the town.
+const SOURCES: [(&str, &str); 7] = sources![
+    "town.nod.xml",
+    "town.edg.xml",
+    "town.con.xml",
+    "town.typ.xml",
+    "town.netccfg",
+    "town.poly.xml",
+    "town.vtypes.add.xml",
+];
+
+/// Writes the sources of the town to `directory` and builds its net there.
+///
+/// # Errors
+/// Not writable, or netconvert refuses.
+pub fn build(install: &Install, directory: &Path) -> Result<Source, Exit> {
+    std::fs::create_dir_all(directory).map_err(|error| Exit::io("create", directory, &error))?;
+    for (name, text) in SOURCES {
+        let path = directory.join(name);
+        std::fs::write(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
+    }
+    let net_file = directory.join("town.net.xml");
+    netconvert(install, &directory.join("town.netccfg"), &net_file)?;
+    Ok(Source::Population {
+        net_file,
+        additional_files: vec![directory.join("town.vtypes.add.xml"), directory.join("town.poly.xml")],
+    })
+}
+
+fn netconvert(install: &Install, config: &Path, net_file: &PathBuf) -> Result<(), Exit> {
+    let program = install.sumo_program("netconvert");
+    let output = Command::new(&program)
+        .arg("-c")
+        .arg(config)
+        .arg("-o")
+        .arg(net_file)
+        .env("SUMO_HOME", &install.sumo_home)
+        .env("PROJ_DATA", install.sumo_home.join("data/proj"))
+        .output()
+        .map_err(|error| {
+            Exit::missing(
+                format!("cannot start {}: {error}", program.display()),
+                "run `make build`, then `caraware doctor`",
+            )
+        })?;
+    if output.status.success() {
+        return Ok(());
+    }
+    let text = String::from_utf8_lossy(&output.stderr);
+    Err(Exit::run(
+        format!("netconvert could not build {}: {}", net_file.display(), text.trim()),
+        "`caraware doctor` checks the SUMO installation",
+    ))
+}

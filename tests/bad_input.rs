@@ -1,0 +1,195 @@
+//! Bad input answers with file, key or line and what to do, the right exit code, and leaves nothing behind.
+
+mod common;
+
+use std::net::TcpListener;
+
+use common::{Workplace, shared_memory, sumo_program, text, tool};
+
+/// Runs a command that must be refused, and returns what it said in one line.
+fn refused(workplace: &Workplace, arguments: &[&str], exit_code: i32) -> String {
+    let before = shared_memory();
+    let output = workplace.run(arguments);
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(exit_code), "{arguments:?}: {said}");
+    workplace.assert_nothing_left();
+    assert_eq!(shared_memory(), before, "shared memory left behind");
+    // miette wraps lines with a margin.
+    said.replace(['│', '×', '╰', '─', '▶'], " ")
+        .split_whitespace()
+        .collect::<Vec<_>>()
+        .join(" ")
+}
+
+fn assert_says(said: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(said.contains(part), "`{part}` is not in: {said}");
+    }
+}
+
+#[test]
+fn unknown_configuration_key() {
+    let workplace = Workplace::new();
+    workplace.write("my.toml", "[run]\nseed = 1\n\n[traffic]\ncav = 3\n");
+    let said = refused(&workplace, &["train", "my.toml"], 2);
+    assert_says(
+        &said,
+        &["my.toml:5: unknown key `traffic.cav`", "did you mean `traffic.cavs`?"],
+    );
+    assert!(!workplace.path().join("runs").exists());
+}
+
+#[test]
+fn wrong_unit_and_wrong_range() {
+    let workplace = Workplace::new();
+    workplace.write("my.toml", "[gnss]\nnoise_std_m = 5.0\n");
+    assert_says(
+        &refused(&workplace, &["train", "my.toml"], 2),
+        &["my.toml:2: unknown key `gnss.noise_std_m`", "`gnss.noise_std_deg`"],
+    );
+    let said = refused(&workplace, &["train", "--set", "gnss.noise_std_deg=5.0"], 2);
+    assert_says(&said, &["`gnss.noise_std_deg` cannot be 5.0", "allowed: 0 … 1 in deg"]);
+    let said = refused(&workplace, &["train", "--set", "gnss.period_s=0.25"], 2);
+    assert_says(&said, &["`gnss.period_s` = 0.25 s", "`run.tick_s` = 0.1 s"]);
+}
+
+#[test]
+fn unknown_preset() {
+    let workplace = Workplace::new();
+    assert_says(
+        &refused(&workplace, &["train", "villlage"], 2),
+        &["villlage", "neither a preset, a .toml nor a .sumocfg", "presets: town"],
+    );
+}
+
+#[test]
+fn missing_sumocfg() {
+    let workplace = Workplace::new();
+    assert_says(
+        &refused(&workplace, &["simulate", "no/such.sumocfg"], 2),
+        &["no/such.sumocfg", "cannot be read", "existing .sumocfg"],
+    );
+}
+
+/// A small grid with the given routes; netgenerate gives it no projection.
+fn scenario(workplace: &Workplace, routes: &str) {
+    tool(
+        &sumo_program("netgenerate"),
+        &["--grid", "--grid.number", "3", "-o", "grid.net.xml"],
+        workplace.path(),
+    );
+    workplace.write("grid.rou.xml", routes);
+    workplace.write(
+        "grid.sumocfg",
+        "<configuration>\n  <input>\n    <net-file value=\"grid.net.xml\"/>\n    <route-files value=\"grid.rou.xml\"/>\n  </input>\n</configuration>\n",
+    );
+}
+
+#[test]
+fn net_without_projection() {
+    let workplace = Workplace::new();
+    scenario(&workplace, "<routes/>");
+    let said = refused(&workplace, &["simulate", "grid.sumocfg"], 2);
+    assert_says(
+        &said,
+        &["grid.net.xml", "no projection", "map.origin_latitude_deg=52.0"],
+    );
+}
+
+#[test]
+fn route_with_an_unknown_edge() {
+    let workplace = Workplace::new();
+    scenario(
+        &workplace,
+        "<routes>\n  <vehicle id=\"a\" depart=\"0\"><route edges=\"A0A1 nowhere\"/></vehicle>\n</routes>\n",
+    );
+    let origin = [
+        "--set",
+        "map.origin_latitude_deg=52",
+        "--set",
+        "map.origin_longitude_deg=10",
+        "--set",
+        "fanout.enabled=false",
+    ];
+    let said = refused(
+        &workplace,
+        &[&["simulate", "grid.sumocfg"], origin.as_slice()].concat(),
+        2,
+    );
+    assert_says(&said, &["traffic-bridge", "nowhere", "grid.sumocfg"]);
+}
+
+#[test]
+fn missing_route_file() {
+    let workplace = Workplace::new();
+    scenario(&workplace, "<routes/>");
+    std::fs::remove_file(workplace.path().join("grid.rou.xml")).unwrap();
+    let said = refused(&workplace, &["simulate", "grid.sumocfg"], 2);
+    assert_says(&said, &["grid.sumocfg", "line 4", "route-files", "grid.rou.xml"]);
+}
+
+#[test]
+fn port_in_use() {
+    let workplace = Workplace::new();
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let listen = format!("fanout.listen=tcp/{}", taken.local_addr().unwrap());
+    let said = refused(&workplace, &["train", "--set", &listen], 2);
+    assert_says(&said, &["`fanout.listen`", "cannot be listened on", "choose another"]);
+}
+
+#[test]
+fn run_name_in_use() {
+    let workplace = Workplace::new();
+    std::fs::create_dir_all(workplace.path().join("runs/mine")).unwrap();
+    let said = refused(
+        &workplace,
+        &["train", "--name", "mine", "--set", "fanout.enabled=false"],
+        2,
+    );
+    assert_says(&said, &["the run name `mine` is in use", "--name"]);
+    let said = refused(
+        &workplace,
+        &["train", "--name", "no good", "--set", "fanout.enabled=false"],
+        2,
+    );
+    assert_says(&said, &["the run name `no good` cannot be used"]);
+}
+
+#[test]
+fn shared_memory_too_small() {
+    let workplace = Workplace::new();
+    let said = refused(
+        &workplace,
+        &[
+            "train",
+            "--set",
+            "traffic.max_road_users=1000000",
+            "--set",
+            "run.window_ticks=256",
+            "--set",
+            "fanout.enabled=false",
+        ],
+        3,
+    );
+    assert_says(&said, &["/dev/shm has", "MiB free", "`traffic.max_road_users`"]);
+    assert!(
+        std::fs::read_dir(workplace.path().join("runs"))
+            .unwrap()
+            .next()
+            .is_none(),
+        "a run directory was left"
+    );
+}
+
+#[test]
+fn stopping_what_does_not_run() {
+    let workplace = Workplace::new();
+    assert_says(
+        &refused(&workplace, &["stop"], 2),
+        &["no run is alive", "caraware train"],
+    );
+    assert_says(
+        &refused(&workplace, &["ps", "ghost"], 2),
+        &["no run named `ghost` is alive"],
+    );
+}

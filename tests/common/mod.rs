@@ -1,0 +1,139 @@
+//! Starting the real command in a directory of its own, and looking at what it leaves behind.
+#![allow(dead_code, reason = "each test file uses its own part")]
+
+use std::{
+    net::TcpListener,
+    path::{Path, PathBuf},
+    process::{Command, Output},
+    sync::{Mutex, MutexGuard, PoisonError},
+};
+
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// Whole runs use all cores and look at shared memory: one at a time.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
+/// A directory in which runs are made.
+pub struct Workplace {
+    pub directory: TempDir,
+    _turn: MutexGuard<'static, ()>,
+}
+
+impl Workplace {
+    pub fn new() -> Self {
+        let turn = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+        Self {
+            directory: tempfile::tempdir().unwrap(),
+            _turn: turn,
+        }
+    }
+
+    pub fn path(&self) -> &Path {
+        self.directory.path()
+    }
+
+    /// The command with its runs in this directory and its own registry.
+    pub fn command(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_caraware"));
+        command
+            .args(arguments)
+            .current_dir(self.path())
+            .env("TMPDIR", self.path())
+            .env("NO_COLOR", "1");
+        command
+    }
+
+    pub fn run(&self, arguments: &[&str]) -> Output {
+        self.command(arguments).output().unwrap()
+    }
+
+    /// Runs that must succeed.
+    pub fn succeed(&self, arguments: &[&str]) -> Output {
+        let output = self.run(arguments);
+        assert!(
+            output.status.success(),
+            "{arguments:?}: {}\n{}",
+            output.status,
+            text(&output)
+        );
+        output
+    }
+
+    pub fn report(&self, name: &str) -> Value {
+        let text = std::fs::read_to_string(self.path().join("runs").join(name).join("report.json")).unwrap();
+        serde_json::from_str(&text).unwrap()
+    }
+
+    pub fn write(&self, name: &str, text: &str) -> PathBuf {
+        let path = self.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path
+    }
+
+    /// Nothing of any run of this workplace is left in shared memory, in the registry, or as a process.
+    pub fn assert_nothing_left(&self) {
+        let registry: Vec<_> = std::fs::read_dir(self.path())
+            .unwrap()
+            .flatten()
+            .filter(|entry| entry.file_name().to_string_lossy().starts_with("caraware-"))
+            .flat_map(|entry| std::fs::read_dir(entry.path()).unwrap().flatten())
+            .collect();
+        assert!(registry.is_empty(), "left in the registry: {registry:?}");
+        let here = self.path().to_string_lossy().into_owned();
+        let processes: Vec<String> = command_lines()
+            .into_iter()
+            .filter(|line| line.contains(&here))
+            .collect();
+        assert!(processes.is_empty(), "still running: {processes:?}");
+    }
+}
+
+/// Files of any run in shared memory.
+pub fn shared_memory() -> Vec<String> {
+    let names = std::fs::read_dir("/dev/shm")
+        .unwrap()
+        .flatten()
+        .map(|entry| entry.file_name().to_string_lossy().into_owned());
+    names.filter(|name| name.starts_with("caraware_")).collect()
+}
+
+/// Command lines of all processes.
+pub fn command_lines() -> Vec<String> {
+    let processes = std::fs::read_dir("/proc").unwrap().flatten();
+    processes
+        .filter_map(|entry| std::fs::read(entry.path().join("cmdline")).ok())
+        .map(|bytes| String::from_utf8_lossy(&bytes).replace('\0', " "))
+        .collect()
+}
+
+/// Everything the command printed.
+pub fn text(output: &Output) -> String {
+    format!(
+        "{}{}",
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr)
+    )
+}
+
+/// A free port on loopback.
+pub fn free_port() -> u16 {
+    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
+}
+
+/// A program of the SUMO wheel.
+pub fn sumo_program(name: &str) -> PathBuf {
+    caraware::install::Install::find()
+        .unwrap_or_else(|exit| panic!("{exit:?}"))
+        .sumo_program(name)
+}
+
+/// Runs a program that must succeed.
+pub fn tool(program: &Path, arguments: &[&str], directory: &Path) {
+    let output = Command::new(program)
+        .args(arguments)
+        .current_dir(directory)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{program:?}: {}", text(&output));
+}
