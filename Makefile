@@ -14,11 +14,16 @@ ARGS ?=
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
 
-test: build test-rust test-python ## all tests
+test: prerequisites $(VENV)/.installed ## all tests
+	cargo test $(CARGO_FLAGS) --workspace --no-run
+	$(EXTENSION)
+	$(MAKE) test-rust test-python
 
 build: prerequisites $(VENV)/.installed ## virtual environment, SUMO, all programs, the Python extension
 	cargo build $(CARGO_FLAGS) --workspace
-	VIRTUAL_ENV=$(CURDIR)/$(VENV) $(VENV)/bin/maturin develop --quiet $(CARGO_FLAGS) --manifest-path trainer/Cargo.toml --skip-install
+	$(EXTENSION)
+
+EXTENSION = VIRTUAL_ENV=$(CURDIR)/$(VENV) $(VENV)/bin/maturin develop --quiet $(CARGO_FLAGS) --manifest-path trainer/Cargo.toml --skip-install
 
 prerequisites:
 	@scripts/prerequisites.sh "$(PYTHON)"
@@ -34,8 +39,11 @@ $(VENV)/.installed: requirements.lock trainer/pyproject.toml viewer/pyproject.to
 test-rust:
 	cargo test $(CARGO_FLAGS) --workspace --no-fail-fast
 
+# One pytest each: test modules of different packages may share names.
 test-python:
-	$(VENV)/bin/python -m pytest -q trainer/tests viewer/tests
+	$(VENV)/bin/python -m pytest -q trainer/tests
+	cd viewer && ../$(VENV)/bin/python -m pytest -q tests
+	$(VENV)/bin/python -m pytest -q maps/town/tests
 
 lint: $(VENV)/.installed ## formatting and lints, as errors
 	cargo fmt --all --check

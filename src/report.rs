@@ -106,8 +106,8 @@ pub fn summary(report: &Value, path: &Path) -> String {
         ));
     }
     lines.push(format!(
-        "ticks lost {}, duplicated {}; messages dropped {}; restarts {}",
-        report["lost_ticks"], report["duplicated_ticks"], report["drops"], report["restarts"]
+        "ticks lost {}, duplicated {}; restarts {}; messages that watchers passed over {}",
+        report["lost_ticks"], report["duplicated_ticks"], report["restarts"], report["drops"]
     ));
     lines.push(format!(
         "observation hash {}",

@@ -116,7 +116,15 @@ fn route_with_an_unknown_edge() {
         &[&["simulate", "grid.sumocfg"], origin.as_slice()].concat(),
         2,
     );
-    assert_says(&said, &["traffic-bridge", "nowhere", "grid.sumocfg"]);
+    assert_says(
+        &said,
+        &[
+            "traffic-bridge",
+            "grid.rou.xml, line 2",
+            "The edge 'nowhere'",
+            "correct the file",
+        ],
+    );
 }
 
 #[test]

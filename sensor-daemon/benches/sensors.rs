@@ -1,6 +1,8 @@
 //! Cost of sensing: GNSS, IMU, speed and steering, observation, for 5 000 vehicles on one core.
 //! `cargo bench -p sensor-daemon`
 
+#![expect(clippy::panic, reason = "a benchmark that cannot run says why and ends")]
+
 use std::time::Instant;
 
 use ipc_schema::{

@@ -17,10 +17,7 @@ use ipc_schema::{
 };
 use serde::Serialize;
 
-use crate::{
-    digest::Digest,
-    sensing::{Sensing, SensingError},
-};
+use crate::{digest::Digest, sensing::Sensing};
 
 /// One process serves one environment.
 const ENV_INDEX: u32 = 0;
@@ -105,7 +102,7 @@ impl Daemon {
             }
             .into());
         }
-        let states = states(message).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
+        let states = states(message).map_err(broken)?;
         let n = self.sensing.assign(world, states);
         if let Some((board, _)) = &self.consumer
             && self.session.wait_for_credit(board, world.tick)? == Wait::Stopped
@@ -130,7 +127,7 @@ impl Daemon {
         let mut draft = self.observations.loan(header, ObservationLayout::new(n, d).len)?;
         self.sensing
             .observe(&header, states, draft.payload_mut())
-            .map_err(too_far)?;
+            .map_err(broken)?;
         self.digest.add(&header, draft.payload());
         draft.send()?;
         if let Some((_, waker)) = &self.consumer {
@@ -192,6 +189,6 @@ fn states(message: &Message) -> Result<&[VehicleState], BlockError> {
     block::view(message.payload(), layout.states)
 }
 
-fn too_far(error: SensingError) -> Failure {
+fn broken(error: BlockError) -> Failure {
     Failure::from_error(FailureKind::Run, &error)
 }

@@ -1,7 +1,10 @@
 //! GNSS receiver: latitude and longitude with white noise and bias, and the position they give in the world frame.
 
 use ipc_schema::config::Gnss as Params;
-use sim_core::geodesy::{GeodesyError, Geodetic, NetPosition, Projection};
+use sim_core::{
+    displacement::{Arc, DisplacementMap},
+    geodesy::NetPosition,
+};
 
 use crate::noise::{Sensor, Stream};
 
@@ -23,48 +26,37 @@ pub struct Fix {
 /// Noise and bias are angles of arc on the ground, the same for both axes (5e-5° ≙ 5.57 m): latitude gets the angle itself,
 /// longitude the angle divided by the cosine of the latitude. At the equator, where CARLA's towns lie, this is the paper's
 /// noise in degrees; elsewhere the error stays the same in metres instead of shrinking with the parallels.
-///
-/// # Errors
-/// The position is outside what the projection covers.
-pub fn sample(
-    params: &Params,
-    projection: &Projection,
-    x_m: f64,
-    y_m: f64,
-    stream: Stream,
-    index: u32,
-) -> Result<Fix, GeodesyError> {
+#[must_use]
+pub fn sample(params: &Params, map: &DisplacementMap, x_m: f64, y_m: f64, stream: Stream, index: u32) -> Fix {
     debug_assert_eq!(stream.sensor, Sensor::Gnss);
-    let truth = projection.geodetic_from_net(NetPosition { x_m, y_m })?;
-    let [north, east, ..] = stream.normals(index);
-    let latitude_deg = truth.latitude_deg + params.bias_deg + params.noise_std_deg * north;
-    let stretch = libm::cos(truth.latitude_deg.to_radians());
-    let longitude_deg = truth.longitude_deg + (params.bias_deg + params.noise_std_deg * east) / stretch;
-    let position = projection.net_from_geodetic(Geodetic {
-        latitude_deg,
-        longitude_deg,
-    })?;
-    Ok(Fix {
-        latitude_deg,
-        longitude_deg,
-        x_m: position.x_m,
-        y_m: position.y_m,
-    })
+    let [north, east] = stream.normal_pair(index);
+    let arc = Arc {
+        east_deg: params.bias_deg + params.noise_std_deg * east,
+        north_deg: params.bias_deg + params.noise_std_deg * north,
+    };
+    let displaced = map.displaced(NetPosition { x_m, y_m }, arc);
+    Fix {
+        latitude_deg: displaced.geodetic.latitude_deg,
+        longitude_deg: displaced.geodetic.longitude_deg,
+        x_m: displaced.net.x_m,
+        y_m: displaced.net.y_m,
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use ipc_schema::run::MapInfo;
+    use sim_core::geodesy::Projection;
 
-    fn projection() -> Projection {
-        Projection::new(&MapInfo {
+    fn map() -> DisplacementMap {
+        let map = MapInfo {
             projection: "+proj=tmerc +lat_0=52.26 +lon_0=10.52 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs"
                 .into(),
             net_offset_m: [129.0, 126.0],
             bounds_m: [0.0, 0.0, 260.0, 260.0],
-        })
-        .unwrap()
+        };
+        DisplacementMap::new(&Projection::new(&map).unwrap(), map.bounds_m).unwrap()
     }
 
     fn stream(id_hash: u64) -> Stream {
@@ -83,7 +75,7 @@ mod tests {
             bias_deg: 0.0,
         };
         for (x, y) in [(20.0, 17.9), (129.0, 126.0), (239.0, 236.0)] {
-            let fix = sample(&params, &projection(), x, y, stream(1), 0).unwrap();
+            let fix = sample(&params, &map(), x, y, stream(1), 0);
             assert!((fix.x_m - x).hypot(fix.y_m - y) < 1e-4, "{fix:?}");
         }
     }
@@ -97,9 +89,9 @@ mod tests {
             noise_std_deg: 5e-5,
             bias_deg: 0.0,
         };
-        let projection = projection();
+        let map = map();
         let errors: Vec<(f64, f64)> = (0..N)
-            .map(|index| sample(&params, &projection, 100.0, 50.0, stream(9), index).unwrap())
+            .map(|index| sample(&params, &map, 100.0, 50.0, stream(9), index))
             .map(|fix| (fix.x_m - 100.0, fix.y_m - 50.0))
             .collect();
         let mean = |of: &dyn Fn(&(f64, f64)) -> f64| errors.iter().map(of).sum::<f64>() / f64::from(N);
@@ -122,7 +114,7 @@ mod tests {
             noise_std_deg: 0.0,
             bias_deg: 1e-5,
         };
-        let fix = sample(&params, &projection(), 100.0, 50.0, stream(1), 0).unwrap();
+        let fix = sample(&params, &map(), 100.0, 50.0, stream(1), 0);
         assert!(
             (fix.x_m - 101.11).abs() < 0.02 && (fix.y_m - 51.11).abs() < 0.02,
             "{fix:?}"

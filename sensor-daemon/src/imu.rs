@@ -49,7 +49,7 @@ fn gravity_body(gravity_mps2: f64, state: &VehicleState) -> [f64; 3] {
     let (sin_roll, cos_roll) = libm::sincos(f64::from(state.roll_rad));
     [
         gravity_mps2 * sin_pitch,
-        -gravity_mps2 * cos_pitch * sin_roll,
+        gravity_mps2 * cos_pitch * sin_roll,
         gravity_mps2 * cos_pitch * cos_roll,
     ]
 }
@@ -106,7 +106,7 @@ mod tests {
                 0
             )
             .accel_mps2,
-            [0.0, -0.0, 9.81]
+            [0.0, 0.0, 9.81]
         );
         // Nose up by 30°: the accelerometer is pushed forward by half of gravity.
         let uphill = VehicleState {
@@ -125,6 +125,24 @@ mod tests {
         .accel_mps2;
         assert!(
             (felt[0] - 4.905).abs() < 1e-5 && (felt[2] - 8.4957).abs() < 1e-3,
+            "{felt:?}"
+        );
+    }
+
+    /// Rolled to the right by 30°, the left side is up: the seat pushes the sensor to its left by half of gravity.
+    #[test]
+    fn a_roll_to_the_right_is_felt_to_the_left() {
+        let rolled = VehicleState {
+            roll_rad: (PI / 6.0) as f32,
+            ..VehicleState::default()
+        };
+        let params = Params {
+            gravity_mps2: 9.81,
+            ..QUIET
+        };
+        let felt = sample(&params, &rolled, 1, 0).accel_mps2;
+        assert!(
+            (felt[1] - 4.905).abs() < 1e-5 && (felt[2] - 8.4957).abs() < 1e-3,
             "{felt:?}"
         );
     }

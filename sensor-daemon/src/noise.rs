@@ -30,17 +30,28 @@ impl Stream {
     /// the bits do not depend on the C library).
     #[must_use]
     pub fn normals(&self, sample: u32) -> [f64; 4] {
+        let [a, b, c, d] = self.uniform(sample);
+        let (n0, n1) = box_muller(a, b);
+        let (n2, n3) = box_muller(c, d);
+        [n0, n1, n2, n3]
+    }
+
+    /// The first two of [`Stream::normals`], at half the cost.
+    #[must_use]
+    pub fn normal_pair(&self, sample: u32) -> [f64; 2] {
+        let [a, b, ..] = self.uniform(sample);
+        let (n0, n1) = box_muller(a, b);
+        [n0, n1]
+    }
+
+    fn uniform(&self, sample: u32) -> [u32; 4] {
         let counter = [
             sample,
             self.sensor as u32,
             self.id_hash as u32,
             (self.id_hash >> 32) as u32,
         ];
-        let key = [self.episode_seed as u32, (self.episode_seed >> 32) as u32];
-        let [a, b, c, d] = philox4x32(counter, key);
-        let (n0, n1) = box_muller(a, b);
-        let (n2, n3) = box_muller(c, d);
-        [n0, n1, n2, n3]
+        philox4x32(counter, [self.episode_seed as u32, (self.episode_seed >> 32) as u32])
     }
 }
 
@@ -124,6 +135,12 @@ mod tests {
             assert!((variance - 1.0).abs() < 5.0 * (2.0 / n).sqrt(), "variance {variance}");
             assert!((kurtosis - 3.0).abs() < 5.0 * (24.0 / n).sqrt(), "kurtosis {kurtosis}");
         }
+    }
+
+    #[test]
+    fn a_pair_is_the_first_two() {
+        let stream = stream(7, Sensor::Gnss);
+        assert!((0..100).all(|sample| stream.normals(sample)[..2] == stream.normal_pair(sample)));
     }
 
     #[test]

@@ -9,7 +9,10 @@ use ipc_schema::{
     traffic::Kind,
     world::VehicleState,
 };
-use sim_core::geodesy::{GeodesyError, Projection};
+use sim_core::{
+    displacement::DisplacementMap,
+    geodesy::{GeodesyError, Projection},
+};
 
 use crate::{
     fields::{Normaliser, Readings},
@@ -18,25 +21,6 @@ use crate::{
     slots::Slots,
     speed_steering,
 };
-
-/// An observation cannot be made.
-#[derive(Debug, thiserror::Error)]
-pub enum SensingError {
-    /// A position is outside what the projection covers.
-    #[error("vehicle {vehicle} at tick {tick}: its position has no latitude and longitude")]
-    Position {
-        /// Dense index.
-        vehicle: u32,
-        /// Tick.
-        tick: u64,
-        /// Why.
-        #[source]
-        source: GeodesyError,
-    },
-    /// The payload is too short for its layout.
-    #[error(transparent)]
-    Block(#[from] BlockError),
-}
 
 /// Ticks between two samples of each sensor.
 #[derive(Debug, Clone, Copy)]
@@ -72,7 +56,7 @@ pub struct RawError {
 #[derive(Debug)]
 pub struct Sensing {
     config: Config,
-    projection: Projection,
+    map: DisplacementMap,
     normaliser: Normaliser,
     periods: Periods,
     slots: Slots,
@@ -87,10 +71,10 @@ impl Sensing {
     /// Sensors as configured, on a map.
     ///
     /// # Errors
-    /// The map's projection is not understood.
+    /// The map's projection is not understood, or the map is outside its domain.
     pub fn new(config: &Config, map: &MapInfo) -> Result<Self, GeodesyError> {
         Ok(Self {
-            projection: Projection::new(map)?,
+            map: DisplacementMap::new(&Projection::new(map)?, map.bounds_m)?,
             normaliser: Normaliser::new(&config.observation, map.bounds_m),
             periods: Periods::new(config),
             slots: Slots::default(),
@@ -134,13 +118,13 @@ impl Sensing {
     /// Samples what is due and writes the observation of the tick that [`Sensing::assign`] was called for.
     ///
     /// # Errors
-    /// A position has no latitude and longitude, or the payload is too short.
+    /// The payload is too short.
     pub fn observe(
         &mut self,
         header: &MessageHeader,
         states: &[VehicleState],
         payload: &mut [u8],
-    ) -> Result<(), SensingError> {
+    ) -> Result<(), BlockError> {
         let (n, d) = (self.slots.rows().len(), self.width());
         let layout = ObservationLayout::new(n, d);
         let sections = layout.named().map(|(_, section)| section);
@@ -160,7 +144,7 @@ impl Sensing {
             flags[slot] = lent.ended;
             let Some(row) = self.row_of_slot[slot] else { continue };
             let state = &states[row as usize];
-            self.sample(header, state, slot, lent.step)?;
+            self.sample(header, state, slot, lent.step);
             let readings = &self.readings[slot];
             let clipped = self
                 .normaliser
@@ -183,13 +167,7 @@ impl Sensing {
     }
 
     /// Takes the samples that are due at the vehicle's `step`; the first tick of a vehicle samples everything.
-    fn sample(
-        &mut self,
-        header: &MessageHeader,
-        state: &VehicleState,
-        slot: usize,
-        step: u32,
-    ) -> Result<(), SensingError> {
+    fn sample(&mut self, header: &MessageHeader, state: &VehicleState, slot: usize, step: u32) {
         let seed = header.episode_seed;
         let readings = &mut self.readings[slot];
         if step.is_multiple_of(self.periods.gnss) {
@@ -198,19 +176,8 @@ impl Sensing {
                 id_hash: state.id_hash,
                 sensor: Sensor::Gnss,
             };
-            readings.fix = gnss::sample(
-                &self.config.gnss,
-                &self.projection,
-                state.x_m,
-                state.y_m,
-                stream,
-                step / self.periods.gnss,
-            )
-            .map_err(|source| SensingError::Position {
-                vehicle: state.vehicle,
-                tick: header.tick,
-                source,
-            })?;
+            let index = step / self.periods.gnss;
+            readings.fix = gnss::sample(&self.config.gnss, &self.map, state.x_m, state.y_m, stream, index);
         }
         if step.is_multiple_of(self.periods.imu) {
             readings.imu = imu::sample(&self.config.imu, state, seed, step / self.periods.imu);
@@ -225,7 +192,6 @@ impl Sensing {
                 step / self.periods.speed_steering,
             );
         }
-        Ok(())
     }
 
     /// Ages of the newest samples at the vehicle's `step`, seconds.

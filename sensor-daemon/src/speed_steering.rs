@@ -16,12 +16,12 @@ pub struct Sample {
 /// The sensor's sample of a vehicle that moves as `state`.
 #[must_use]
 pub fn sample(params: &Params, steering_ratio: f64, state: &VehicleState, episode_seed: u64, index: u32) -> Sample {
-    let [speed, steering, ..] = Stream {
+    let [speed, steering] = Stream {
         episode_seed,
         id_hash: state.id_hash,
         sensor: Sensor::SpeedSteering,
     }
-    .normals(index);
+    .normal_pair(index);
     let true_speed = f64::from(state.velocity_body_mps[0]).abs();
     Sample {
         speed_mps: (true_speed + params.speed_noise_std_mps * speed).max(0.0),

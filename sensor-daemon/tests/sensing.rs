@@ -1,5 +1,7 @@
 //! Sensing as a whole: from world to observation block.
 
+#![expect(clippy::unwrap_used, reason = "tests assert by unwrapping, their helpers too")]
+
 use ipc_schema::{
     block,
     config::Config,

@@ -87,16 +87,14 @@ impl Core {
     /// One SUMO step: what happened, where everybody is, and the ticks that lead there.
     fn frame(&mut self, frame: &Message) -> Result<Wait, Failure> {
         let ticks_per_step = self.session.run.ticks_per_traffic_step();
+        let header = *frame.header();
         // The frame carries the number of the last of its ticks.
-        let header = MessageHeader {
-            tick: (frame.header().tick + 1).saturating_sub(ticks_per_step),
-            ..*frame.header()
-        };
-        if header.tick != self.ticks {
+        let first_tick = (header.tick + 1).saturating_sub(ticks_per_step);
+        if first_tick != self.ticks {
             return Err(PortError::Gap {
                 channel: "traffic",
                 expected: self.ticks,
-                received: header.tick,
+                received: first_tick,
             }
             .into());
         }
@@ -106,7 +104,7 @@ impl Core {
         for tick in 0..u32::try_from(ticks_per_step).unwrap_or(u32::MAX) {
             if self
                 .session
-                .wait_for_credit(&self.consumer, header.tick + u64::from(tick))?
+                .wait_for_credit(&self.consumer, first_tick + u64::from(tick))?
                 == Wait::Stopped
             {
                 return Ok(Wait::Stopped);

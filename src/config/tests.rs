@@ -138,7 +138,10 @@ fn the_reference_of_keys_is_true() {
     if std::env::var_os("CARAWARE_BLESS").is_some() {
         std::fs::write(path, &expected).unwrap();
     }
-    assert_eq!(std::fs::read_to_string(path).unwrap(), expected);
+    assert!(
+        std::fs::read_to_string(path).unwrap() == expected,
+        "{path} is not what CARAWARE_BLESS=1 would write"
+    );
 }
 
 mod reference {
@@ -190,5 +193,8 @@ fn the_resolved_default_preset_for_tests_is_true() {
     if std::env::var_os("CARAWARE_BLESS").is_some() {
         std::fs::write(path, &expected).unwrap();
     }
-    assert_eq!(std::fs::read_to_string(path).unwrap(), expected);
+    assert!(
+        std::fs::read_to_string(path).unwrap() == expected,
+        "{path} is not what CARAWARE_BLESS=1 would write"
+    );
 }
