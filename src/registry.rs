@@ -1,7 +1,7 @@
 //! Which runs are alive on this machine, and what dead ones left in shared memory.
 //!
-//! Every run has a directory of its own below `<temporary directory>/caraware-<user id>/`: a lock that its supervisor holds, the
-//! path of its run directory, and iceoryx2's files. Files in `/dev/shm` carry the directory's name in their prefix.
+//! Every run has a directory of its own below `/tmp/caraware-<user id>/` (or `CARAWARE_RUNTIME_DIR`): a lock that its supervisor
+//! holds, the path of its run directory, and iceoryx2's files. Files in `/dev/shm` carry the directory's name in their prefix.
 
 use std::{
     fs::{DirBuilder, File, OpenOptions},
@@ -20,10 +20,44 @@ pub const SHARED_MEMORY: &str = "/dev/shm";
 const LOCK: &str = "lock";
 const RUN_DIR: &str = "run_dir";
 
-/// The directory of all runs of this user.
+/// Environment variable that moves [`base`].
+const RUNTIME_DIR: &str = "CARAWARE_RUNTIME_DIR";
+/// Longest [`base`]: iceoryx2's sockets lie below it, and Unix allows their paths 107 bytes.
+const BASE_BYTES: usize = 40;
+
+/// The directory of all runs of this user. Not in `TMPDIR`, which may be long and differ between terminals.
 #[must_use]
 pub fn base() -> PathBuf {
-    std::env::temp_dir().join(format!("caraware-{}", rustix::process::getuid().as_raw()))
+    std::env::var_os(RUNTIME_DIR).map_or_else(
+        || format!("/tmp/caraware-{}", rustix::process::getuid().as_raw()).into(),
+        PathBuf::from,
+    )
+}
+
+/// Creates [`base`] for this user alone.
+fn create_base() -> Result<PathBuf, Exit> {
+    use std::os::unix::fs::MetadataExt as _;
+    let base = base();
+    let help = format!("set {RUNTIME_DIR} to a short path of your own, up to {BASE_BYTES} bytes");
+    if base.as_os_str().len() > BASE_BYTES || !base.is_absolute() {
+        return Err(Exit::config(
+            format!("{RUNTIME_DIR} = {} is too long or not absolute", base.display()),
+            help,
+        ));
+    }
+    DirBuilder::new()
+        .recursive(true)
+        .mode(0o700)
+        .create(&base)
+        .map_err(|error| Exit::io("create", &base, &error))?;
+    let owner = base
+        .metadata()
+        .map_err(|error| Exit::io("look at", &base, &error))?
+        .uid();
+    if owner != rustix::process::getuid().as_raw() {
+        return Err(Exit::run(format!("{} belongs to another user", base.display()), help));
+    }
+    Ok(base)
 }
 
 /// A claimed corner of shared memory; released and emptied when dropped.
@@ -46,7 +80,7 @@ impl Claim {
     pub fn new(run_dir: &Path) -> Result<Self, Exit> {
         let run_id = random_u64()?;
         let name = format!("{:08x}", run_id >> 32);
-        let directory = base().join(&name);
+        let directory = create_base()?.join(&name);
         DirBuilder::new()
             .recursive(true)
             .mode(0o700)

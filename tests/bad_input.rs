@@ -1,5 +1,11 @@
 //! Bad input answers with file, key or line and what to do, the right exit code, and leaves nothing behind.
 
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
 mod common;
 
 use std::net::TcpListener;

@@ -1,5 +1,11 @@
 //! The table of dependencies between crates (ARCHITECTURE.md): one direction, heavy dependencies each in one process only.
 
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
 use std::{collections::BTreeMap, process::Command};
 
 use serde_json::Value;

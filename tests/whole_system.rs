@@ -1,5 +1,11 @@
 //! Whole runs on real SUMO traffic, across real processes and real shared memory.
 
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
 mod common;
 
 use std::{
@@ -233,14 +239,13 @@ fn after_sigkill_of_the_supervisor_everything_ends_and_the_next_run_starts() {
             &[&QUIET[..], &["--set", "episode.training_episodes=100000"]].concat(),
         ),
     );
-    let registry = eventually("a running trainer", || {
+    eventually("a running trainer", || {
         let output = workplace.run(&["ps"]);
         String::from_utf8_lossy(&output.stdout)
             .lines()
             .any(|line| line.contains("trainer") && line.contains("running"))
             .then_some(())
     });
-    let () = registry;
     run.signal(Signal::KILL);
     let here = workplace.path().to_string_lossy().into_owned();
     eventually("the children end with the supervisor", || {

@@ -1,6 +1,10 @@
 //! What fanning out costs: `cargo bench -p fanout`.
 
-#![expect(clippy::unwrap_used, reason = "test code asserts by unwrapping")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    reason = "a measurement asserts by unwrapping"
+)]
 
 #[path = "../tests/harness/mod.rs"]
 #[allow(dead_code, reason = "shared with the tests proper, which use the rest")]

@@ -1,5 +1,11 @@
 //! Services, ports and boards over real shared memory.
 
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
 use std::{
     path::Path,
     sync::{Arc, atomic::AtomicBool},

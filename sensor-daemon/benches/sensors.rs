@@ -1,6 +1,11 @@
 //! Cost of sensing: GNSS, IMU, speed and steering, observation, for 5 000 vehicles on one core.
 //! `cargo bench -p sensor-daemon`
 
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
 #![expect(clippy::panic, reason = "a benchmark that cannot run says why and ends")]
 
 use std::time::Instant;

@@ -2,7 +2,8 @@
 //!
 //! A SUMO state that arrives is the *end* of a SUMO step. The mirror then moves through the `m` ticks of that step, the last
 //! of which ends at SUMO's own time: with `m = 1` a tick follows from each frame at once, with more the mirror knows both
-//! ends of the step it moves through. A road user is there from the tick at which SUMO first has it.
+//! ends of the step it moves through. Within it vehicles follow SUMO's positions smoothed, which puts them half a SUMO step
+//! behind (see [`crate::reference`]). A road user is there from the tick at which SUMO first has it.
 
 use ipc_schema::{
     block::{self, BlockError},

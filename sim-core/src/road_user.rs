@@ -90,7 +90,7 @@ impl RoadUser {
         } else {
             Mover::Vehicle {
                 state: State::new(0.0, 0.0, 0.0, 0.0),
-                path: Path::from_here(&TrafficState::default()),
+                path: Path::from_here(&TrafficState::default(), 0.0),
             }
         };
         Self {
@@ -118,11 +118,14 @@ impl RoadUser {
         };
         match (&mut self.mover, self.arrival) {
             (_, Arrival::Entering) => {}
-            (Mover::Person(person), _) => person.advance(&self.before, &self.now, settings.step_s()),
-            (Mover::Vehicle { path, .. }, Arrival::Jumping) => path.coast(&self.before),
+            (Mover::Person(person), Arrival::Jumping) => person.coast(&self.before, settings.step_s()),
+            (Mover::Person(person), Arrival::Continuing) => {
+                person.advance(&self.before, &self.now, settings.step_s());
+            }
+            (Mover::Vehicle { path, .. }, Arrival::Jumping) => path.coast(&self.before, settings.step_s()),
             (Mover::Vehicle { path, .. }, Arrival::Continuing) => {
                 if path.advance(&self.before, &self.now, self.dimensions.length_m, settings.step_s()) == Join::Broken {
-                    path.coast(&self.before);
+                    path.coast(&self.before, settings.step_s());
                     self.arrival = Arrival::Jumping;
                 }
             }
@@ -225,20 +228,20 @@ impl RoadUser {
         match &mut self.mover {
             Mover::Person(person) => {
                 if set {
-                    person.set(&self.now);
+                    person.set(&self.now, settings.step_s());
                 }
-                person.write(
-                    f64::from(tick) * settings.tick_s,
-                    settings,
-                    &self.before,
-                    &self.now,
-                    out,
-                    rows,
-                );
+                let start_s = f64::from(tick) * settings.tick_s;
+                let left = if set {
+                    0.0
+                } else {
+                    1.0 - (start_s + settings.tick_s) / settings.step_s()
+                };
+                let z_m = self.now.front_z_m - left * (self.now.front_z_m - self.before.front_z_m);
+                person.write(start_s, settings, z_m, out, rows);
             }
             Mover::Vehicle { state, path } => {
                 let front_m = self.dimensions.front_m();
-                *path = Path::from_here(&self.now);
+                *path = Path::from_here(&self.now, settings.step_s());
                 *state = set_onto(
                     &path.tick(0.0, settings.tick_s, 0.0),
                     front_m,

@@ -118,17 +118,20 @@ fn persons_pass_through_with_velocities_from_differences() {
         kind: Kind::Person as u32,
         ..TrafficState::default()
     };
-    frame(&mut mirror, &header(0, 0), &[at(1.0, 1.0)]);
+    // Half a step (0.1 s) behind SUMO: from 0.9 at 1 m/s to the middle between 1.0 and 1.3 at 1.5 m/s.
+    let set = frame(&mut mirror, &header(0, 0), &[at(1.0, 1.0)])[1].states[0];
+    assert!((set.y_m - 0.9).abs() < 1e-9);
     let ticks = frame(&mut mirror, &header(0, 2), &[at(1.3, 1.5)]);
     let (half, end) = (ticks[0].states[0], ticks[1].states[0]);
-    assert!((half.y_m - 1.15).abs() < 1e-12 && (end.y_m - 1.3).abs() < 1e-12);
-    assert!((end.velocity_body_mps[0] - 1.5).abs() < 1e-6 && end.velocity_body_mps[1].abs() < 1e-6);
-    assert!((ticks[1].rows[4].dy_m + 0.075).abs() < 1e-6, "{:?}", ticks[1].rows[4]);
-    let ticks = frame(&mut mirror, &header(0, 4), &[at(1.5, 1.0)]);
     assert!(
-        (ticks[0].states[0].accel_body_mps2[0] + 2.5).abs() < 1e-5,
-        "from 1.5 to 1 m/s in 0.2 s"
+        (half.y_m - 1.0125).abs() < 1e-9 && (end.y_m - 1.15).abs() < 1e-9,
+        "{} {}",
+        half.y_m,
+        end.y_m
     );
+    assert!((end.velocity_body_mps[0] - 1.5).abs() < 1e-6 && end.velocity_body_mps[1].abs() < 1e-6);
+    assert!((end.accel_body_mps2[0] - 2.5).abs() < 1e-5);
+    assert!((ticks[1].rows[4].dy_m - (1.0125 + 0.05 * 1.25 + 0.003_125 - 1.15)).abs() < 1e-6);
     assert_eq!(mirror.resynchronisations(), 0);
 }
 

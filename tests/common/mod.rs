@@ -39,7 +39,7 @@ impl Workplace {
         command
             .args(arguments)
             .current_dir(self.path())
-            .env("TMPDIR", self.path())
+            .env("CARAWARE_RUNTIME_DIR", self.path().join("run"))
             .env("NO_COLOR", "1");
         command
     }
@@ -73,11 +73,10 @@ impl Workplace {
 
     /// Nothing of any run of this workplace is left in shared memory, in the registry, or as a process.
     pub fn assert_nothing_left(&self) {
-        let registry: Vec<_> = std::fs::read_dir(self.path())
-            .unwrap()
+        let registry: Vec<_> = std::fs::read_dir(self.path().join("run"))
+            .into_iter()
             .flatten()
-            .filter(|entry| entry.file_name().to_string_lossy().starts_with("caraware-"))
-            .flat_map(|entry| std::fs::read_dir(entry.path()).unwrap().flatten())
+            .flatten()
             .collect();
         assert!(registry.is_empty(), "left in the registry: {registry:?}");
         let here = self.path().to_string_lossy().into_owned();

@@ -73,10 +73,11 @@ def main(run_file: str) -> None:
     config = RunConfig.from_run(channel.run)
     bounds = channel.run["map"]["bounds_m"]
     found = {
-        "in_shared_memory": True, "in_the_block": True, "distinct_vehicles": True, "writable": False,
-        "refused_writes": 0, "largest_position_error_m": 0.0, "largest_batch_error_m": 0.0, "largest_reward_error": 0.0, "samples": 0,
-        "foreign_samples": 0, "ticks": [], "env_steps": 0,
-    }  # fmt: skip
+        **dict.fromkeys(("in_shared_memory", "in_the_block", "distinct_vehicles"), True),
+        **dict.fromkeys(("largest_position_error_m", "largest_batch_error_m", "largest_reward_error"), 0.0),
+        **dict.fromkeys(("writable", "refused_writes", "samples", "foreign_samples", "env_steps"), 0),
+        "ticks": [],
+    }
     ppo = rollout = None
     seen: dict[tuple[int, int], torch.Tensor] = {}
     last = False

@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -28,9 +29,10 @@ NOISELESS = {
 def run_with(tmp_path: Path, module: str) -> subprocess.CompletedProcess:
     """A run whose trainer is a module of this directory."""
     settings = [f"--set={key}={value}" for key, value in (NOISELESS | {"trainer.module": module}).items()]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "TMPDIR": str(tmp_path)}
     command = [CARAWARE, "train", "town", "--name", "probe", *settings]
-    return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    with tempfile.TemporaryDirectory(prefix="caraware") as short:
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "CARAWARE_RUNTIME_DIR": short}
+        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
