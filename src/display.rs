@@ -71,7 +71,7 @@ impl Default for Display {
 }
 
 fn style() -> ProgressStyle {
-    ProgressStyle::with_template("{elapsed} [{bar:28}] {percent}%  {wide_msg}  eta {eta}")
+    ProgressStyle::with_template("{elapsed} [{bar:14}] {percent:>3}% {wide_msg} eta {eta}")
         .unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
@@ -133,9 +133,10 @@ impl View {
         );
         match self.mode {
             Mode::Simulate => traffic,
+            // The error first: a narrow terminal cuts the end.
             Mode::Train => format!(
-                "episode {:3}  {:.0} steps/s  σ {:.3}  reward {:.3}  error {:.2} m (raw GNSS {:.2} m)",
-                self.episode, self.steps_per_s, self.policy_std, self.reward, self.error_m, self.raw_gnss_error_m
+                "episode {:3}  error {:.2} m (raw GNSS {:.2} m)  σ {:.3}  reward {:.3}  {:.0} steps/s",
+                self.episode, self.error_m, self.raw_gnss_error_m, self.policy_std, self.reward, self.steps_per_s
             ),
         }
     }

@@ -64,7 +64,7 @@ impl Install {
 }
 
 fn python(bin: &Path) -> Result<PathBuf, Exit> {
-    if let Some(path) = std::env::var_os("CARAWARE_PYTHON") {
+    if let Some(path) = std::env::var_os("CARAWARE_PYTHON").filter(|path| !path.is_empty()) {
         return Ok(path.into());
     }
     bin.ancestors()
@@ -79,7 +79,7 @@ fn python(bin: &Path) -> Result<PathBuf, Exit> {
 }
 
 fn sumo_home(python: &Path) -> Result<PathBuf, Exit> {
-    if let Some(path) = std::env::var_os("CARAWARE_SUMO_HOME") {
+    if let Some(path) = std::env::var_os("CARAWARE_SUMO_HOME").filter(|path| !path.is_empty()) {
         return Ok(path.into());
     }
     let library = python

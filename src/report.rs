@@ -29,7 +29,6 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
     let sensing: Sensing = read(&parts.join("sensor-daemon.json")).unwrap_or_default();
     let training: Map<String, Value> = read(&parts.join("trainer.json")).unwrap_or_default();
     let moving: Map<String, Value> = read(&parts.join("sim-core.json")).unwrap_or_default();
-    let traffic: Map<String, Value> = read(&parts.join("traffic-bridge.json")).unwrap_or_default();
     let learned = |key: &str| training.get(key).cloned().unwrap_or(Value::Null);
     let env_steps = match run.mode {
         Mode::Train => learned("env_steps").as_u64().unwrap_or(0),
@@ -68,7 +67,6 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "config_hash": run.config_hash,
         "trainer": training,
         "dynamics": moving,
-        "traffic": traffic,
     });
     let path = run.run_dir.join("report.json");
     let text = serde_json::to_string_pretty(&report).unwrap_or_default();

@@ -118,13 +118,25 @@ fn the_same_seed_gives_the_same_bytes_whatever_runs_beside() {
     let workplace = Workplace::new();
     let hash = |name: &str| workplace.report(name)["observation_hash"].as_str().unwrap().to_owned();
     workplace.succeed(&small("train", "a", &QUIET));
-    workplace.succeed(&small(
-        "train",
-        "b",
-        &[&QUIET[..], &["--set", "run.window_ticks=2"]].concat(),
-    ));
+    // The other way round in everything that must not matter: a fan-out beside it, a narrow window, a shorter horizon.
+    let listen = format!("fanout.listen=tcp/127.0.0.1:{}", free_port());
+    let beside = [
+        "--set",
+        &listen,
+        "--set",
+        "run.window_ticks=2",
+        "--set",
+        "trainer.horizon=400",
+    ];
+    workplace.succeed(&small("train", "b", &beside));
+    workplace.succeed(&small("simulate", "d", &QUIET));
     workplace.succeed(&small("train", "c", &[&QUIET[..], &["--set", "run.seed=2"]].concat()));
-    assert_eq!(hash("a"), hash("b"), "same seed, another window");
+    assert_eq!(hash("a"), hash("b"), "same seed, another window, horizon and audience");
+    assert_ne!(
+        hash("a"),
+        hash("d"),
+        "without evaluations in between these are other episodes"
+    );
     assert_ne!(hash("a"), hash("c"), "another seed");
     assert_eq!(hash("a").len(), 64);
 }

@@ -41,7 +41,9 @@ fn link(sumo: &Path) {
 }
 
 fn sumo_home() -> Option<PathBuf> {
-    let named = env::var_os(SUMO_HOME_VARIABLE).map(PathBuf::from);
+    let named = env::var_os(SUMO_HOME_VARIABLE)
+        .filter(|path| !path.is_empty())
+        .map(PathBuf::from);
     named
         .or_else(virtual_environment)
         .filter(|sumo| sumo.join("include/libsumo/libsumo.h").is_file())

@@ -32,9 +32,9 @@ pub struct VehicleState {
     pub pitch_rad: f32,
     /// Velocity of the origin in the body frame, m/s.
     pub velocity_body_mps: [f32; 3],
-    /// Kinematic acceleration of the origin in the body frame (no gravity), m/s².
+    /// Kinematic acceleration of the origin in the body frame (no gravity), mean over the last sub-step, m/s².
     pub accel_body_mps2: [f32; 3],
-    /// Angular rate in the body frame, rad/s.
+    /// Angular rate in the body frame, mean over the last sub-step, rad/s.
     pub angular_rate_body_radps: [f32; 3],
     /// Road-wheel steering angle, positive to the left, radians.
     pub road_wheel_angle_rad: f32,
@@ -76,9 +76,9 @@ pub struct SubStep {
     pub dyaw_rad: f32,
     /// Speed of the rear axle along the body's x, m/s.
     pub speed_mps: f32,
-    /// Kinematic acceleration of the origin in the body frame, m/s².
+    /// Kinematic acceleration of the origin in the body frame, mean over the sub-step, m/s².
     pub accel_body_mps2: [f32; 3],
-    /// Angular rate in the body frame, rad/s.
+    /// Angular rate in the body frame, mean over the sub-step, rad/s.
     pub angular_rate_body_radps: [f32; 3],
     /// Road-wheel steering angle, radians.
     pub road_wheel_angle_rad: f32,

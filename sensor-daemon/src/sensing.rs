@@ -59,6 +59,8 @@ pub struct Sensing {
     map: DisplacementMap,
     normaliser: Normaliser,
     periods: Periods,
+    /// Length of a tick, nanoseconds.
+    tick_ns: u64,
     slots: Slots,
     /// Newest readings by slot.
     readings: Vec<Readings>,
@@ -77,6 +79,7 @@ impl Sensing {
             map: DisplacementMap::new(&Projection::new(map)?, map.bounds_m)?,
             normaliser: Normaliser::new(&config.observation, map.bounds_m),
             periods: Periods::new(config),
+            tick_ns: ((config.run.tick_s * 1e9).round() as u64).max(1),
             slots: Slots::default(),
             readings: Vec::new(),
             row_of_slot: Vec::new(),
@@ -169,6 +172,8 @@ impl Sensing {
     /// Takes the samples that are due at the vehicle's `step`; the first tick of a vehicle samples everything.
     fn sample(&mut self, header: &MessageHeader, state: &VehicleState, slot: usize, step: u32) {
         let seed = header.episode_seed;
+        // Counted from the start of the episode: a vehicle that leaves and returns does not meet its old noise again.
+        let index = (header.sim_time_ns / self.tick_ns) as u32;
         let readings = &mut self.readings[slot];
         if step.is_multiple_of(self.periods.gnss) {
             let stream = Stream {
@@ -176,21 +181,14 @@ impl Sensing {
                 id_hash: state.id_hash,
                 sensor: Sensor::Gnss,
             };
-            let index = step / self.periods.gnss;
             readings.fix = gnss::sample(&self.config.gnss, &self.map, state.x_m, state.y_m, stream, index);
         }
         if step.is_multiple_of(self.periods.imu) {
-            readings.imu = imu::sample(&self.config.imu, state, seed, step / self.periods.imu);
+            readings.imu = imu::sample(&self.config.imu, state, seed, index);
         }
         if step.is_multiple_of(self.periods.speed_steering) {
             let ratio = self.config.vehicle.steering_ratio;
-            readings.speed_steering = speed_steering::sample(
-                &self.config.speed_steering,
-                ratio,
-                state,
-                seed,
-                step / self.periods.speed_steering,
-            );
+            readings.speed_steering = speed_steering::sample(&self.config.speed_steering, ratio, state, seed, index);
         }
     }
 

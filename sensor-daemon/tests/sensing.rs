@@ -42,6 +42,7 @@ fn vehicle(number: u32, kind: Kind) -> VehicleState {
 fn tick(sensing: &mut Sensing, number: u64, flags: u32, states: &[VehicleState]) -> (usize, Vec<u64>) {
     let header = MessageHeader {
         tick: number,
+        sim_time_ns: (number + 1) * 100_000_000,
         flags,
         episode_seed: 5,
         ..MessageHeader::default()
