@@ -6,6 +6,7 @@ use std::{
     io,
     net::TcpListener,
     sync::{Arc, Mutex, PoisonError},
+    time::Duration,
 };
 
 use ipc_schema::failure::{Failure, FailureKind};
@@ -56,6 +57,9 @@ impl From<OutletError> for Failure {
         }
     }
 }
+
+/// Time for the last frames to leave: at most 1 MB for each viewer.
+const FAREWELL: Duration = Duration::from_millis(300);
 
 type Latest = Arc<Mutex<BTreeMap<Topic, ZBytes>>>;
 
@@ -118,8 +122,16 @@ impl Outlet {
         }
     }
 
-    /// Sends what is queued and takes leave of the viewers.
+    /// Lets viewers, if there are any, have what is queued, and takes leave of them. zenoh does not tell when its queues are
+    /// empty and drops them when it closes, so the last frames get [`FAREWELL`].
     pub fn close(self) {
+        let watched = self
+            .publishers
+            .values()
+            .any(|publisher| publisher.matching_status().wait().is_ok_and(|m| m.matching()));
+        if watched {
+            std::thread::park_timeout(FAREWELL);
+        }
         if let Err(error) = self.session.close().wait() {
             tracing::warn!(%error, "zenoh did not close in order");
         }

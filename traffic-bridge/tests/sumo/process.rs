@@ -293,6 +293,8 @@ fn config(ticks: u64, step_s: f64) -> serde_json::Value {
     config["run"]["window_ticks"] = WINDOW_TICKS.into();
     config["traffic"]["step_s"] = step_s.into();
     config["traffic"]["cavs"] = CAVS.into();
+    config["traffic"]["others"] = 0.into();
+    config["traffic"]["pedestrians"] = 0.into();
     config["episode"]["ticks"] = ticks.into();
     config["episode"]["training_episodes"] = 2.into();
     config
