@@ -9,10 +9,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pyproj
 import pytest
+import sumo
 from matplotlib.path import Path as Outline
-
-sumo = pytest.importorskip("sumo")
 
 TOWN = Path(__file__).parents[1]
 BIN = Path(sumo.SUMO_HOME) / "bin"
@@ -93,7 +93,6 @@ def test_no_street_is_a_dead_end(successors):
 
 
 def test_projection_puts_the_origin_at_the_centre_of_town(net):
-    pyproj = pytest.importorskip("pyproj")
     location = net.find("location")
     project = pyproj.Proj(location.get("projParameter"))
     offset_x, offset_y = map(float, location.get("netOffset").split(","))
