@@ -8,7 +8,7 @@ export PYO3_PYTHON = $(CURDIR)/$(VENV)/bin/python
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
 
-.PHONY: train test build prerequisites lint format test-rust test-python bench clean
+.PHONY: train test build prerequisites lint format test-rust test-python deny bench clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -54,6 +54,9 @@ format: $(VENV)/.installed
 	cargo fmt --all
 	$(VENV)/bin/ruff check --fix trainer viewer
 	$(VENV)/bin/ruff format trainer viewer
+
+deny: ## licences, sources and advisories of all dependencies (needs: cargo install cargo-deny --locked)
+	cargo deny check
 
 bench: build ## the benchmarks of docs/benchmarks.md
 	cargo bench --locked --workspace
