@@ -115,6 +115,10 @@ impl Claim {
 impl Drop for Claim {
     fn drop(&mut self) {
         remove(&self.directory);
+        // The last run leaves nothing; with another one alive the directory is not empty, and stays.
+        if let Err(error) = std::fs::remove_dir(base()) {
+            tracing::debug!(%error, "the registry stays");
+        }
     }
 }
 

@@ -5,7 +5,6 @@ use std::time::{Duration, Instant};
 use ipc_schema::{
     board::{Health, Progress, State},
     ports::BoardReader,
-    process::Process,
     run::RunFile,
     services,
 };
@@ -141,24 +140,4 @@ pub fn stop(name: Option<&str>) -> Result<(), Exit> {
         format!("{} has not stopped within {} s", run.name, STOP_WITHIN.as_secs()),
         format!("kill process {}", run.supervisor_pid),
     ))
-}
-
-/// Process ids of a live run by process, for tests and scripts.
-///
-/// # Errors
-/// As [`ps`].
-pub fn process_ids(run: &RunFile) -> Result<Vec<(Process, i32)>, Exit> {
-    let node = services::node(&run.shared_memory)?;
-    TABLE
-        .iter()
-        .filter(|row| (row.wanted)(run))
-        .map(|row| {
-            Ok((
-                row.process,
-                BoardReader::create(&services::open_board(&node, run, 0, row.process)?)?
-                    .health()
-                    .pid,
-            ))
-        })
-        .collect()
 }

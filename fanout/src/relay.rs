@@ -133,10 +133,9 @@ impl Relay {
         self.leave()
     }
 
-    /// Leaves shared memory alone for a while. A signal ends the wait with an error, which is none if it asks to stop.
+    /// Leaves shared memory alone for a while.
     fn rest(&mut self, came: usize) -> Result<(), SessionError> {
-        let waited = self.session.wait(self.patience.next(came));
-        if self.session.stopped() { Ok(()) } else { waited }
+        self.session.wait(self.patience.next(came))
     }
 
     /// Empties the queues; returns the most messages that one of them held.

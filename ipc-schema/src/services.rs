@@ -5,11 +5,8 @@ use iceoryx2::{
     config::Config as IpcConfig,
     node::{Node, NodeBuilder},
     port::listener::Listener,
-    prelude::{
-        Alignment, CallbackProgression, FileName, Path as IpcPath, SemanticString, ServiceName, SignalHandlingMode,
-    },
+    prelude::{Alignment, FileName, Path as IpcPath, SemanticString, ServiceName, SignalHandlingMode},
     service::{
-        Service as _,
         builder::publish_subscribe::Builder as DataBuilder,
         ipc_threadsafe,
         port_factory::{blackboard, event, publish_subscribe},
@@ -359,18 +356,4 @@ fn create_wake(node: &Node<Shm>, run: &RunFile, env_index: u32, process: Process
         .event_id_max_value(1)
         .create()
         .map_err(|e| refused("creation", format!("wake-up of {process}"))(&e))
-}
-
-/// Names of the services that exist under `memory`, for the process table of a run that somebody else supervises.
-///
-/// # Errors
-/// The shared memory cannot be read.
-pub fn count_services(memory: &SharedMemory) -> Result<usize, ServiceError> {
-    let mut count = 0;
-    Shm::list(&ipc_config(memory)?, |_| {
-        count += 1;
-        CallbackProgression::Continue
-    })
-    .map_err(|e| refused("listing", "services")(&e))?;
-    Ok(count)
 }

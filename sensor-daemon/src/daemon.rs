@@ -40,8 +40,9 @@ struct Part {
 pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut session = Session::join(run_file, Process::SensorDaemon, ENV_INDEX)?;
     let sensing = Sensing::new(&session.run.config, &session.run.map).map_err(|error| {
-        Failure::from_error(FailureKind::Config, &error)
-            .with_help("give a net whose <location> has a projection that PROJ knows")
+        Failure::from_error(FailureKind::Config, &error).with_help(
+            "give a net whose <location> has a projection that proj4rs knows, such as UTM or transverse Mercator",
+        )
     })?;
     let world = session.subscriber(Channel::World)?;
     let mut daemon = Daemon::open(session, sensing)?;
