@@ -63,6 +63,8 @@ pub struct Supervisor {
     signal_handle: Handle,
     restarts: u32,
     ready_at: Option<Instant>,
+    /// The look before the present one: whatever is found ready now got ready after it.
+    last_look: Instant,
 }
 
 impl Drop for Supervisor {
@@ -100,6 +102,7 @@ impl Supervisor {
             signal_handle,
             restarts: 0,
             ready_at: None,
+            last_look: Instant::now(),
         })
     }
 
@@ -115,6 +118,7 @@ impl Supervisor {
             self.reap()?;
             self.note_ready(started)?;
             display.update(&self.run, &self.boards, self.ready_at);
+            self.last_look = Instant::now();
             if self.finished() {
                 break;
             }
@@ -206,7 +210,7 @@ impl Supervisor {
             .filter(|row| row.on_exit == OnExit::Required)
             .find(|row| self.state_of(row.process) == State::Starting);
         match late {
-            None => self.ready_at = Some(Instant::now()),
+            None => self.ready_at = Some(self.last_look),
             Some(row) if started.elapsed() > READY_WITHIN => {
                 let log = self.run.run_dir.join("logs").join(format!("{}.log", row.process));
                 let message = format!("{} was not ready within {} s", row.process, READY_WITHIN.as_secs());
