@@ -8,7 +8,7 @@ use std::{
 use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
-    run::{MapInfo, Mode, RunFile, Source},
+    run::{MapInfo, Mode, RunFile, SceneFiles, Source},
     services::Channel,
 };
 use serde_json::Value;
@@ -194,15 +194,29 @@ fn assemble(
         let path = run_dir.path.join(part);
         std::fs::create_dir(&path).map_err(|error| Exit::io("create", &path, &error))?;
     }
-    let (source, map) = match (named, scenario_map) {
-        (Named::Scenario(sumocfg, _), Some(map)) => (Source::Scenario { sumocfg }, map),
+    let (source, map, scene_files) = match (named, scenario_map) {
+        (Named::Scenario(sumocfg, scenario), Some(map)) => {
+            let files = SceneFiles {
+                net_file: scenario.net_file,
+                additional_files: scenario.additional_files,
+            };
+            (Source::Scenario { sumocfg }, map, files)
+        }
         _ => {
             let source = town::build(install, &run_dir.path.join("map"))?;
-            let Source::Population { net_file, .. } = &source else {
+            let Source::Population {
+                net_file,
+                additional_files,
+            } = &source
+            else {
                 return Err(Exit::run("the town has no net", ""));
             };
             let map = scenario::map_info(net_file, None)?;
-            (source, map)
+            let files = SceneFiles {
+                net_file: net_file.clone(),
+                additional_files: additional_files.clone(),
+            };
+            (source, map, files)
         }
     };
     let claim = Claim::new(&run_dir.path)?;
@@ -220,6 +234,7 @@ fn assemble(
         shared_memory: claim.memory.clone(),
         source,
         map,
+        scene_files,
         sumo_home: install.sumo_home.clone(),
         config,
         config_hash,

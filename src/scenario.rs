@@ -20,6 +20,8 @@ use crate::{config::ConfigError, failure::Exit};
 pub struct Scenario {
     /// The net.
     pub net_file: PathBuf,
+    /// `additional-files`, in order.
+    pub additional_files: Vec<PathBuf>,
     /// `step-length`, if set.
     pub step_s: Option<f64>,
     /// `seed`, if set.
@@ -124,6 +126,8 @@ fn option(
             }
             if name.starts_with('n') {
                 scenario.net_file = files.into_iter().next().unwrap_or_default();
+            } else if name.starts_with('a') {
+                scenario.additional_files = files;
             }
         }
         "step-length" => scenario.step_s = Some(number(&value, &name, path, line)?),
@@ -274,6 +278,7 @@ mod tests {
             scenario,
             Scenario {
                 net_file: directory.path().join("a.net.xml"),
+                additional_files: Vec::new(),
                 step_s: Some(0.5),
                 seed: None
             }

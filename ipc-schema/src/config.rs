@@ -15,8 +15,16 @@ pub struct Config {
     pub map: Map,
     /// Length of episodes and when to evaluate.
     pub episode: Episode,
-    /// Limits of the kinematic vehicle model.
+    /// What the trainer's output means.
+    pub task: Task,
+    /// Vehicle models and their limits.
     pub vehicle: Vehicle,
+    /// The road.
+    pub road: Road,
+    /// What stands beside it.
+    pub scene: Scene,
+    /// Contacts.
+    pub collision: Collision,
     /// GNSS receiver.
     pub gnss: Gnss,
     /// Inertial measurement unit and compass.
@@ -59,6 +67,8 @@ pub struct Traffic {
     pub others: u32,
     /// Pedestrians kept alive (population control).
     pub pedestrians: u32,
+    /// Heroes kept alive (driving task).
+    pub heroes: u32,
     /// Share of a scenario's own vehicles that carry sensors (`.sumocfg`).
     pub cav_share: f64,
     /// Most road users alive at once; shared memory is laid out for them.
@@ -91,10 +101,95 @@ pub struct Episode {
     pub final_evaluations: u64,
 }
 
-/// Limits of the kinematic vehicle model.
+/// What the trainer's output means.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TaskKind {
+    /// A position for every connected vehicle; the world does not listen.
+    Localisation,
+    /// Steering and acceleration of every hero, each in −1 … 1.
+    Driving,
+}
+
+/// What the trainer's output means.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Task {
+    /// Which task.
+    pub kind: TaskKind,
+    /// Longest episode of a hero, seconds.
+    pub time_limit_s: f64,
+}
+
+/// A vehicle model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum VehicleModel {
+    /// Single track without slip.
+    Kinematic,
+    /// Single track with saturating tyres, load transfer, roll and pitch.
+    Dynamic,
+    /// Rigid body on four ray-cast wheels; heroes only.
+    RigidBody,
+}
+
+/// What the road is covered with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Surface {
+    /// Dry asphalt.
+    Dry,
+    /// Wet asphalt.
+    Wet,
+    /// Snow.
+    Snow,
+}
+
+/// The road.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Road {
+    /// What it is covered with: decides the friction.
+    pub surface: Surface,
+}
+
+/// What stands beside the road, or on it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Scene {
+    /// Obstacles, each "name x y heading": a prop by name, its centre in metres (world), its heading in degrees counter-clockwise
+    /// from east (0 if left out).
+    pub obstacles: Vec<String>,
+    /// Props placed at random beside the road, the same for the same `run.seed`.
+    pub random_props: u32,
+    /// Height of a building whose polygon and type name none, metres.
+    pub building_height_m: f64,
+}
+
+/// Contacts.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Collision {
+    /// Look for contacts of connected vehicles and heroes.
+    pub detect: bool,
+    /// A contact ends the trajectory of a connected vehicle, as it always ends a hero's.
+    pub ends_trajectory: bool,
+}
+
+/// Vehicle models and their limits.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Vehicle {
+    /// Model of connected vehicles.
+    pub cav_model: VehicleModel,
+    /// Model of vehicles without sensors.
+    pub other_model: VehicleModel,
+    /// Model of heroes.
+    pub hero_model: VehicleModel,
+    /// Models by SUMO class, each "class=model"; they win over the three above.
+    pub class_models: Vec<String>,
+    /// Time over which an instantaneous lane change is spread, seconds.
+    pub lane_change_s: f64,
     /// Largest road-wheel angle, radians.
     pub max_road_wheel_angle_rad: f64,
     /// Largest rate of the road-wheel angle, rad/s.

@@ -6,8 +6,10 @@ use serde::Serialize;
 
 use crate::{
     board::{Health, Progress, TrainingStatus},
+    ego::EgoPose,
+    event::Collision,
     header::MessageHeader,
-    traffic::{TrafficState, VehicleMeta},
+    traffic::{SignalMeta, TrafficState, VehicleMeta},
     world::{SubStep, VehicleState},
 };
 
@@ -79,6 +81,15 @@ pub fn table() -> Vec<TypeLayout> {
             id,
             vehicle_class
         }),
+        layout!(SignalMeta {
+            id_hash,
+            signal,
+            id_len,
+            id,
+            links,
+            reserved,
+            state
+        }),
         layout!(VehicleState {
             x_m,
             y_m,
@@ -102,17 +113,39 @@ pub fn table() -> Vec<TypeLayout> {
             kind,
             signals,
             flags,
-            reserved
+            reference_offset_m
         }),
         layout!(SubStep {
             dx_m,
             dy_m,
+            dz_m,
             dyaw_rad,
+            roll_rad,
+            pitch_rad,
             speed_mps,
+            lateral_speed_mps,
             accel_body_mps2,
             angular_rate_body_radps,
             road_wheel_angle_rad,
             reserved
+        }),
+        layout!(EgoPose {
+            front_x_m,
+            front_y_m,
+            yaw_rad,
+            speed_mps,
+            accel_mps2,
+            vehicle,
+            flags
+        }),
+        layout!(Collision {
+            position_m,
+            id_hash,
+            other_id_hash,
+            vehicle,
+            other,
+            other_class,
+            relative_speed_mps
         }),
         layout!(Progress {
             consumed_ticks,

@@ -3,10 +3,12 @@
 //! | service       | payload (64-byte aligned bytes, little endian)                    | producer       | required consumer |
 //! |---------------|-------------------------------------------------------------------|----------------|-------------------|
 //! | `traffic`     | `[TrafficState]`                                                  | traffic-bridge | sim-core          |
-//! | `traffic-meta`| `[VehicleMeta]`                                                   | traffic-bridge | sim-core          |
+//! | `traffic-meta`| [`traffic::TrafficMetaLayout`]: `[VehicleMeta]`, `[SignalMeta]`   | traffic-bridge | sim-core          |
 //! | `world`       | [`world::WorldLayout`]: `[VehicleState]`, `[SubStep]`             | sim-core       | sensor-daemon     |
 //! | `observation` | [`observation::ObservationLayout`]: obs, truth, GNSS, slots       | sensor-daemon  | trainer           |
-//! | `prediction`  | `[[f32; 2]]`, one row for each slot of the observation            | trainer        | none              |
+//! | `prediction`  | `[[f32; 2]]`, one row for each slot of the observation            | trainer        | none; sim-core when it drives |
+//! | `ego-pose`    | `[EgoPose]`                                                       | sim-core       | traffic-bridge    |
+//! | `event`       | `[Collision]`                                                     | sim-core       | none              |
 //! | `board`       | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`] | every process  | none (newest wins)|
 //! | `wake`        | an event without content                                          | every peer     | its process       |
 //!
@@ -16,6 +18,8 @@
 pub mod block;
 pub mod board;
 pub mod config;
+pub mod ego;
+pub mod event;
 pub mod failure;
 pub mod flow;
 pub mod header;
@@ -31,4 +35,4 @@ pub mod traffic;
 pub mod world;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 1;
+pub const SCHEMA_VERSION: u32 = 2;

@@ -45,6 +45,15 @@ pub struct MapInfo {
     pub bounds_m: [f64; 4],
 }
 
+/// The files that the static scene is built from.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct SceneFiles {
+    /// The net: road surface, crossings, traffic lights.
+    pub net_file: PathBuf,
+    /// Polygons (buildings) and whatever else SUMO is given beside the routes.
+    pub additional_files: Vec<PathBuf>,
+}
+
 /// Where the run's shared memory lives: nothing outside it is touched.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SharedMemory {
@@ -75,6 +84,8 @@ pub struct RunFile {
     pub source: Source,
     /// The map.
     pub map: MapInfo,
+    /// The files that the static scene is built from.
+    pub scene_files: SceneFiles,
     /// Installation of SUMO (the `sumo` directory of the `eclipse-sumo` wheel).
     pub sumo_home: PathBuf,
     /// The validated configuration.

@@ -16,11 +16,13 @@ use iceoryx2::{
 use crate::{
     block::ALIGNMENT,
     board::{Health, Progress, TrainingStatus},
+    ego::EgoPose,
+    event::Collision,
     header::MessageHeader,
     observation::ObservationLayout,
     process::Process,
     run::{RunFile, SharedMemory},
-    traffic::{TrafficState, VehicleMeta},
+    traffic::{SIGNALS_PER_MESSAGE, TrafficMetaLayout, TrafficState},
     world::WorldLayout,
 };
 
@@ -60,18 +62,24 @@ pub enum Channel {
     World,
     /// What connected vehicles sense.
     Observation,
-    /// What the policy makes of it.
+    /// What the policy makes of it: positions, or actions in the driving task.
     Prediction,
+    /// Where the heroes are, back to SUMO.
+    EgoPose,
+    /// Collisions.
+    Event,
 }
 
 impl Channel {
     /// All data services.
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 7] = [
         Self::Traffic,
         Self::TrafficMeta,
         Self::World,
         Self::Observation,
         Self::Prediction,
+        Self::EgoPose,
+        Self::Event,
     ];
 
     /// Name in service names and keys.
@@ -83,6 +91,8 @@ impl Channel {
             Self::World => "world",
             Self::Observation => "observation",
             Self::Prediction => "prediction",
+            Self::EgoPose => "ego-pose",
+            Self::Event => "event",
         }
     }
 
@@ -91,7 +101,7 @@ impl Channel {
     pub fn producer(self) -> Process {
         match self {
             Self::Traffic | Self::TrafficMeta => Process::TrafficBridge,
-            Self::World => Process::SimCore,
+            Self::World | Self::EgoPose | Self::Event => Process::SimCore,
             Self::Observation => Process::SensorDaemon,
             Self::Prediction => Process::Trainer,
         }
@@ -104,7 +114,9 @@ impl Channel {
             Self::Traffic | Self::TrafficMeta => Some(Process::SimCore),
             Self::World => Some(Process::SensorDaemon),
             Self::Observation => Some(Process::Trainer),
-            Self::Prediction => None,
+            Self::EgoPose => Some(Process::TrafficBridge),
+            // In the driving task sim-core waits for each of them, and the trainer is at most one ahead.
+            Self::Prediction | Self::Event => None,
         }
     }
 
@@ -121,10 +133,12 @@ impl Channel {
         match self {
             Self::Traffic => road_users * size_of::<TrafficState>(),
             // Everybody may leave and everybody may come within one step.
-            Self::TrafficMeta => 2 * road_users * size_of::<VehicleMeta>(),
+            Self::TrafficMeta => TrafficMetaLayout::new(2 * road_users, SIGNALS_PER_MESSAGE).len,
             Self::World => WorldLayout::new(road_users, run.config.run.sub_steps as usize).len,
             Self::Observation => ObservationLayout::new(road_users, fields).len,
             Self::Prediction => road_users * size_of::<[f32; 2]>(),
+            Self::EgoPose => road_users * size_of::<EgoPose>(),
+            Self::Event => road_users * size_of::<Collision>(),
         }
     }
 

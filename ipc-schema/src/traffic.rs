@@ -2,6 +2,8 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::block::{Section, sections};
+
 /// Kind of a road user, as carried in [`VehicleMeta::kind`] and [`TrafficState::kind`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
@@ -12,6 +14,8 @@ pub enum Kind {
     Other = 1,
     /// Pedestrian.
     Person = 2,
+    /// Vehicle that is driven by actions (`driving` task); it carries sensors as a [`Kind::Cav`] does.
+    Hero = 3,
 }
 
 /// SUMO moved this road user in a way no vehicle can (teleport, insertion, `moveToXY`): do not interpolate across it.
@@ -106,6 +110,53 @@ impl VehicleMeta {
         self.id[..len].copy_from_slice(&id.as_bytes()[..len]);
         self.id_len = u32::try_from(len).unwrap_or(0);
         self.id_hash = id_hash(id);
+    }
+}
+
+/// Most links of one traffic light that are carried.
+pub const SIGNAL_LINKS: usize = 128;
+
+/// Most traffic lights in one `traffic-meta` message; more changes in one step take more messages.
+pub const SIGNALS_PER_MESSAGE: usize = 256;
+
+/// State of one traffic light, sent when the episode begins and whenever it changes.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub struct SignalMeta {
+    /// Hash of SUMO's id ([`id_hash`]).
+    pub id_hash: u64,
+    /// Index of the traffic light, in the order of SUMO's sorted ids.
+    pub signal: u32,
+    /// Bytes of `id` in use.
+    pub id_len: u32,
+    /// SUMO's id, UTF-8, cut to [`ID_BYTES`].
+    pub id: [u8; ID_BYTES],
+    /// Links that it controls; those beyond [`SIGNAL_LINKS`] are not carried.
+    pub links: u32,
+    /// Zero.
+    pub reserved: u32,
+    /// SUMO's letter for each link (`r`, `y`, `g`, `G`, `u`, `o`, `O`, `s`), zero padded.
+    pub state: [u8; SIGNAL_LINKS],
+}
+
+/// Where the arrays of a `traffic-meta` message lie: `[VehicleMeta; count]`, then `[SignalMeta; columns]`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TrafficMetaLayout {
+    /// `VehicleMeta [count]`.
+    pub vehicles: Section,
+    /// `SignalMeta [columns]`.
+    pub signals: Section,
+    /// Length of the payload in bytes.
+    pub len: usize,
+}
+
+impl TrafficMetaLayout {
+    /// Layout for `vehicles` events of road users and `signals` changes of traffic lights.
+    #[must_use]
+    pub fn new(vehicles: usize, signals: usize) -> Self {
+        let ([vehicles, signals], len) =
+            sections([vehicles * size_of::<VehicleMeta>(), signals * size_of::<SignalMeta>()]);
+        Self { vehicles, signals, len }
     }
 }
 

@@ -8,6 +8,16 @@ use crate::block::{Section, sections};
 pub const RESYNCHRONISED: u32 = 1;
 /// First tick of this road user in the episode.
 pub const APPEARED: u32 = 1 << 1;
+/// It touches something it did not touch in the tick before.
+pub const COLLIDED: u32 = 1 << 2;
+/// A hero has left the road surface: its episode ends.
+pub const OFF_ROAD: u32 = 1 << 3;
+/// A hero has reached the end of its route: its episode ends.
+pub const ARRIVED: u32 = 1 << 4;
+/// A hero's time is up: its episode is cut.
+pub const TIME_LIMIT: u32 = 1 << 5;
+/// The action for this tick was refused; the last valid one was held.
+pub const ACTION_REFUSED: u32 = 1 << 6;
 
 /// One road user at the end of a tick.
 ///
@@ -58,10 +68,10 @@ pub struct VehicleState {
     pub kind: u32,
     /// SUMO's signal bits.
     pub signals: u32,
-    /// Bits [`RESYNCHRONISED`], [`APPEARED`].
+    /// Bits [`RESYNCHRONISED`], [`APPEARED`], [`COLLIDED`], [`OFF_ROAD`], [`ARRIVED`], [`TIME_LIMIT`], [`ACTION_REFUSED`].
     pub flags: u32,
-    /// Zero.
-    pub reserved: u32,
+    /// Distance between the reference and SUMO's own path (lane changes spread in time, kinks rounded), metres.
+    pub reference_offset_m: f32,
 }
 
 /// Motion at one nano sub-step; the last sub-step of a tick coincides with its [`VehicleState`].
@@ -72,10 +82,18 @@ pub struct SubStep {
     pub dx_m: f32,
     /// y minus the y of the tick's [`VehicleState`], metres.
     pub dy_m: f32,
+    /// z minus the z of the tick's [`VehicleState`], metres.
+    pub dz_m: f32,
     /// Heading minus the heading of the tick's [`VehicleState`], radians.
     pub dyaw_rad: f32,
+    /// Roll, positive to the right side down, radians.
+    pub roll_rad: f32,
+    /// Pitch, positive nose up, radians.
+    pub pitch_rad: f32,
     /// Speed of the rear axle along the body's x, m/s.
     pub speed_mps: f32,
+    /// Speed of the rear axle to the left, m/s.
+    pub lateral_speed_mps: f32,
     /// Kinematic acceleration of the origin in the body frame, mean over the sub-step, m/s².
     pub accel_body_mps2: [f32; 3],
     /// Angular rate in the body frame, mean over the sub-step, rad/s.

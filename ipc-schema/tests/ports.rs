@@ -18,7 +18,7 @@ use ipc_schema::{
     header::MessageHeader,
     ports::PortError,
     process::Process,
-    run::{MapInfo, Mode, RunFile, SharedMemory, Source},
+    run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
     services::{self, Channel, RunNode, ServiceHolder},
     session::{Session, SessionError},
 };
@@ -76,6 +76,7 @@ impl Corner {
                 net_offset_m: [0.0; 2],
                 bounds_m: [0.0; 4],
             },
+            scene_files: SceneFiles::default(),
             sumo_home: "none".into(),
             config: config(),
             config_hash: String::new(),

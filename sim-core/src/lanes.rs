@@ -212,6 +212,11 @@ mod tests {
 
     fn limits() -> config::Vehicle {
         config::Vehicle {
+            cav_model: config::VehicleModel::Kinematic,
+            other_model: config::VehicleModel::Kinematic,
+            hero_model: config::VehicleModel::Kinematic,
+            class_models: Vec::new(),
+            lane_change_s: 3.0,
             max_road_wheel_angle_rad: 0.6,
             max_road_wheel_rate_radps: 1.0,
             max_accel_mps2: 5.0,

@@ -294,7 +294,7 @@ fn write_rows(end: &State, lanes: &Lanes, lane: usize, rows: &mut [SubStep]) {
             accel_body_mps2: [moved.accel_x_mps2[lane] as f32, moved.accel_y_mps2[lane] as f32, 0.0],
             angular_rate_body_radps: [0.0, 0.0, moved.yaw_rate_radps[lane] as f32],
             road_wheel_angle_rad: moved.road_wheel_angle_rad[lane] as f32,
-            reserved: 0,
+            ..SubStep::default()
         };
     }
 }

@@ -25,6 +25,8 @@ pub enum Kind {
     Text,
     /// Observation fields: a preset by name or a list of field names.
     Fields,
+    /// A list of texts, which may be empty.
+    Texts,
     /// A list of whole numbers from `min` to `max`.
     Integers {
         /// Least value.
@@ -99,6 +101,7 @@ pub const KEYS: &[Key] = &[
     integer("traffic.cavs", "vehicles", 1, 100_000, "Connected vehicles kept alive on random routes (maps with population control)."),
     integer("traffic.others", "vehicles", 0, 100_000, "Vehicles without sensors kept alive (maps with population control)."),
     integer("traffic.pedestrians", "persons", 0, 100_000, "Pedestrians kept alive (maps with population control)."),
+    integer("traffic.heroes", "vehicles", 0, 1000, "Vehicles driven by actions and kept alive (maps with population control; the driving task only)."),
     float("traffic.cav_share", "", 0.0, 1.0, "Share of a `.sumocfg`'s vehicles that carry sensors."),
     integer("traffic.max_road_users", "", 1, 1_000_000, "Most road users alive at once; shared memory is laid out for them."),
     Key { path: "map.origin_latitude_deg", kind: Kind::Float { min: -89.9, max: 89.9 }, unit: "deg", meaning: "Latitude of the net's (0, 0); only for a net without projection.", optional: true },
@@ -108,12 +111,25 @@ pub const KEYS: &[Key] = &[
     integer("episode.evaluation_interval", "episodes", 0, 1_000_000_000, "Training episodes between two evaluations; 0 = only at the end."),
     integer("episode.evaluation_ticks", "ticks", 1, 1_000_000_000, "Length of an evaluation episode."),
     integer("episode.final_evaluations", "", 1, 1_000_000, "Evaluation episodes at the end, whose mean error is reported."),
+    other("task.kind", Kind::Choice(&["localisation", "driving"]), "What the trainer's output means: a position for every connected vehicle, or steering and acceleration of every hero."),
+    float("task.time_limit_s", "s", 0.1, 1e6, "Longest episode of a hero; then it is cut (truncated) and begins anew elsewhere."),
+    other("vehicle.cav_model", Kind::Choice(&["kinematic", "dynamic"]), "Model of connected vehicles: without slip, or with tyres, load transfer, roll and pitch."),
+    other("vehicle.other_model", Kind::Choice(&["kinematic", "dynamic"]), "Model of vehicles without sensors."),
+    other("vehicle.hero_model", Kind::Choice(&["kinematic", "dynamic", "rigid_body"]), "Model of heroes; \"rigid_body\" is a body on four ray-cast wheels."),
+    other("vehicle.class_models", Kind::Texts, "Models by SUMO vehicle class, such as [\"truck=kinematic\", \"bus=dynamic\"]; they win over the three above."),
+    float("vehicle.lane_change_s", "s", 0.1, 60.0, "Time over which SUMO's instantaneous lane change is spread."),
     float("vehicle.max_road_wheel_angle_rad", "rad", 0.05, 1.5, "Largest steering angle of the front wheels."),
     float("vehicle.max_road_wheel_rate_radps", "rad/s", 0.05, 20.0, "Largest rate of that angle."),
     float("vehicle.max_accel_mps2", "m/s²", 0.1, 50.0, "Largest acceleration of the mirrored vehicle."),
     float("vehicle.max_decel_mps2", "m/s²", 0.1, 50.0, "Largest deceleration of the mirrored vehicle."),
     float("vehicle.steering_ratio", "", 1.0, 100.0, "Steering-wheel angle per road-wheel angle."),
     float("vehicle.resynchronise_m", "m", 0.1, 1000.0, "Distance between the mirrored vehicle and SUMO's beyond which it is set onto SUMO's, and counted."),
+    other("road.surface", Kind::Choice(&["dry", "wet", "snow"]), "What the road is covered with: it scales the friction of the tyres."),
+    other("scene.obstacles", Kind::Texts, "Obstacles, each \"name x y heading\": a prop by name, its centre (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
+    integer("scene.random_props", "", 0, 1_000_000, "Props placed at random beside the road, the same for the same `run.seed`."),
+    float("scene.building_height_m", "m", 0.1, 1000.0, "Height of a building whose polygon and type name none."),
+    other("collision.detect", Kind::Flag, "Look for contacts of connected vehicles and heroes with everything."),
+    other("collision.ends_trajectory", Kind::Flag, "A contact ends the trajectory of a connected vehicle (terminated), as it always ends a hero's."),
     float("gnss.period_s", "s", 0.001, 100.0, "Time between fixes: a whole number of ticks."),
     float("gnss.noise_std_deg", "deg", 0.0, 1.0, "Standard deviation of latitude and longitude (5e-5: 5.57 m on each axis)."),
     float("gnss.bias_deg", "deg", -1.0, 1.0, "Bias of latitude and longitude."),
@@ -194,6 +210,7 @@ impl Key {
                 .collect::<Vec<_>>()
                 .join(", "),
             Kind::Text => "text".into(),
+            Kind::Texts => "list of texts".into(),
             Kind::Fields => format!("\"paper\", \"caraware\", or a list of {}", FIELD_NAMES.join(", ")),
             Kind::Integers { min, max } => format!("list of {min} … {max}"),
         }

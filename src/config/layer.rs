@@ -126,6 +126,7 @@ fn check(key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Value> {
         Kind::Choice(words) => value.as_str().filter(|word| words.contains(word)).map(Value::from),
         Kind::Text => value.as_str().map(Value::from),
         Kind::Fields => fields(value),
+        Kind::Texts => texts(value),
         Kind::Integers { min, max } => {
             let list: Option<Vec<Value>> = value
                 .as_array()?
@@ -153,6 +154,11 @@ fn integer(value: &DeValue<'_>, min: i64, max: i64) -> Option<i64> {
     let whole = value.as_integer()?;
     let number = i64::from_str_radix(whole.as_str(), whole.radix()).ok()?;
     (min..=max).contains(&number).then_some(number)
+}
+
+fn texts(value: &DeValue<'_>) -> Option<Value> {
+    let list: Option<Vec<&str>> = value.as_array()?.iter().map(|item| item.get_ref().as_str()).collect();
+    list.map(Value::from)
 }
 
 fn fields(value: &DeValue<'_>) -> Option<Value> {

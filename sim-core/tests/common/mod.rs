@@ -25,6 +25,11 @@ pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> Settings {
 
 pub fn limits() -> config::Vehicle {
     config::Vehicle {
+        cav_model: config::VehicleModel::Kinematic,
+        other_model: config::VehicleModel::Kinematic,
+        hero_model: config::VehicleModel::Kinematic,
+        class_models: Vec::new(),
+        lane_change_s: 3.0,
         max_road_wheel_angle_rad: 0.6,
         max_road_wheel_rate_radps: 1.0,
         max_accel_mps2: 5.0,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""
@@ -72,7 +72,7 @@ VEHICLE_STATE = np.dtype(
         ("kind", "<u4"),
         ("signals", "<u4"),
         ("flags", "<u4"),
-        ("reserved", "<u4"),
+        ("reference_offset_m", "<f4"),
     ]
 )
 """`VehicleState`: a road user at the end of a tick; origin at the centre of the rear axle (persons: their centre)."""

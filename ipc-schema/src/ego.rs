@@ -1,0 +1,23 @@
+//! `ego-pose`: where the heroes are, on their way back to SUMO.
+
+use bytemuck::{Pod, Zeroable};
+
+/// One hero at the end of a tick; it is moved there in SUMO before the next step.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct EgoPose {
+    /// Front-bumper centre, x, world, metres.
+    pub front_x_m: f64,
+    /// Front-bumper centre, y, world, metres.
+    pub front_y_m: f64,
+    /// Heading, counter-clockwise from east, radians.
+    pub yaw_rad: f64,
+    /// Speed along the heading, m/s.
+    pub speed_mps: f64,
+    /// Acceleration along the heading, m/s².
+    pub accel_mps2: f64,
+    /// Dense index within the episode.
+    pub vehicle: u32,
+    /// Bits of [`crate::world`] that end the hero's episode: `COLLIDED`, `OFF_ROAD`, `ARRIVED`, `TIME_LIMIT`; 0 while it lasts.
+    pub flags: u32,
+}
