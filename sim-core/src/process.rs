@@ -14,7 +14,10 @@ use ipc_schema::{
     traffic::{Kind, TrafficState, VehicleMeta},
 };
 
-use crate::mirror::{Mirror, MirrorError, Settings};
+use crate::{
+    mirror::{Mirror, MirrorError, Settings},
+    statistics::Summary,
+};
 
 /// One process serves one environment.
 const ENV_INDEX: u32 = 0;
@@ -22,6 +25,7 @@ const ENV_INDEX: u32 = 0;
 /// What this process adds to the run's report.
 #[derive(Debug, serde::Serialize)]
 struct Part {
+    tracking: Summary,
     resynchronisations: u64,
     vehicle_steps: u64,
     drops: u64,
@@ -70,7 +74,8 @@ impl Core {
         let consumer = session.board_of(Process::SensorDaemon)?;
         let consumer_wake = session.waker(Process::SensorDaemon)?;
         session.attach();
-        let mirror = Mirror::new(Settings::of_run(&session.run));
+        let mirror = Mirror::new(Settings::of_run(&session.run))
+            .map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
         Ok(Self {
             session,
             metas,
@@ -132,6 +137,12 @@ impl Core {
             }
             let metas: &[VehicleMeta] = rows(&message).map_err(unreadable)?;
             self.mirror.apply_meta(message.header(), metas).map_err(unmirrored)?;
+            for class in self.mirror.take_unknown_classes() {
+                tracing::warn!(
+                    class,
+                    "no parameter set lists this vehicle class: the default set is taken"
+                );
+            }
         }
         Ok(())
     }
@@ -186,6 +197,7 @@ impl Core {
 
     fn write_part(&self) -> Result<(), Failure> {
         self.session.write_part(&Part {
+            tracking: self.mirror.tracking().summary(),
             resynchronisations: self.mirror.resynchronisations(),
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
