@@ -119,6 +119,8 @@ pub struct DynamicParams {
     pub actuator_rate_per_s: [f64; 2],
     /// Largest jerk of the drive and brake actuators, m/s³.
     pub max_jerk_mps3: f64,
+    /// Largest curvature of the rear axle's way, 1/m.
+    pub max_curvature_per_m: f64,
 }
 
 /// Density of air, kg/m³ (ISO 2533, 15 °C at sea level).
@@ -130,6 +132,7 @@ impl DynamicParams {
     #[must_use]
     pub fn new(set: &Set, body: &Dimensions, limits: &config::Vehicle, surface: f64, dt_s: f64) -> Self {
         let mass_kg = set.mass_kg(body);
+        let max_road_wheel_angle_rad = set.max_road_wheel_angle_rad.min(limits.max_road_wheel_angle_rad);
         Self {
             wheelbase_m: body.wheelbase_m,
             cg_to_rear_m: set.front_load_share * body.wheelbase_m,
@@ -140,7 +143,8 @@ impl DynamicParams {
                 set.cornering_stiffness_rear_per_rad,
             ],
             friction: set.friction * surface,
-            max_road_wheel_angle_rad: set.max_road_wheel_angle_rad.min(limits.max_road_wheel_angle_rad),
+            max_road_wheel_angle_rad,
+            max_curvature_per_m: libm::tan(max_road_wheel_angle_rad) / body.wheelbase_m,
             max_road_wheel_rate_radps: set.max_road_wheel_rate_radps.min(limits.max_road_wheel_rate_radps),
             max_accel_mps2: set.max_accel_mps2.min(limits.max_accel_mps2),
             max_decel_mps2: set.max_decel_mps2.min(limits.max_decel_mps2),

@@ -13,6 +13,7 @@ pub mod displacement;
 pub mod dynamic;
 pub mod fleet;
 pub mod geodesy;
+pub mod governor;
 pub mod lanes;
 pub mod mirror;
 pub mod parameters;

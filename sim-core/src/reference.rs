@@ -14,6 +14,7 @@ use ipc_schema::traffic::TrafficState;
 
 use crate::{
     curve::{Curve, Rise},
+    governor::{Ability, Governor},
     trig::wrap_angle,
 };
 
@@ -80,6 +81,7 @@ pub struct Path {
     /// SUMO's path over the step: start, and the two half chords that the curve rounds.
     chords: [[f64; 2]; 3],
     lane_change: LaneChange,
+    governor: Governor,
 }
 
 impl Path {
@@ -99,6 +101,7 @@ impl Path {
             rising: [speed * libm::tan(f64::from(now.pitch_rad)), 0.0],
             chords: [start_m, start_m, start_m],
             lane_change: LaneChange::default(),
+            governor: Governor::default(),
         };
         path.climb(now, path.rising, step_s);
         path
@@ -161,14 +164,14 @@ impl Path {
         (self.height_m + self.rise.at(start_s)[0], self.rise.from_time(start_s))
     }
 
-    /// How far the reference is from SUMO's own path `t_s` after the start of the step: what is left of a lane change, and
-    /// what the curve cuts off the corner, metres.
+    /// How far the reference is from SUMO's own path `t_s` after the start of the step, at most: what is left of a lane change,
+    /// what the curve cuts off the corner, and what could not be driven, metres.
     #[must_use]
     pub fn offset_m(&self, t_s: f64) -> f64 {
         let point = self.curve.at(t_s).position_m;
         let [start, corner, end] = self.chords;
         let cut = distance_m(point, start, corner).min(distance_m(point, corner, end));
-        cut + self.lane_change.remaining()[0].abs()
+        cut + self.lane_change.remaining()[0].abs() + self.governor.distance_m()
     }
 
     /// From the middle of the last chord to the middle of this one.
@@ -186,8 +189,32 @@ impl Path {
     }
 
     /// The reference over one tick that starts `start_s` after the start of the step, for a vehicle at this speed, which
-    /// carries a lane change that takes `spread_s` on.
-    pub fn tick(&mut self, start_s: f64, tick_s: f64, speed_mps: f64, spread_s: f64) -> Curve {
+    /// carries a lane change that takes `spread_s` on, kept to what the vehicle is able to do.
+    pub fn tick(&mut self, start_s: f64, tick_s: f64, speed_mps: f64, spread_s: f64, ability: &Ability) -> Curve {
+        let path = self.with_lane_change(start_s, tick_s, speed_mps, spread_s);
+        self.governor.tick(&path, tick_s, ability)
+    }
+
+    /// The path itself at the start of the step.
+    #[must_use]
+    pub fn start(&self) -> Curve {
+        self.curve
+    }
+
+    /// Forgets lane change and offset, and gives SUMO's own path from `t_s` after the start of the step on.
+    pub fn resynchronise(&mut self, t_s: f64) -> Curve {
+        self.lane_change = LaneChange::default();
+        self.governor = Governor::default();
+        self.curve.from_time(t_s)
+    }
+
+    /// How far the reference is from where the path would be if everything could be driven, metres.
+    #[must_use]
+    pub fn undriven_m(&self) -> f64 {
+        self.governor.distance_m()
+    }
+
+    fn with_lane_change(&mut self, start_s: f64, tick_s: f64, speed_mps: f64, spread_s: f64) -> Curve {
         let curve = self.curve.from_time(start_s);
         if self.lane_change.offset_m == 0.0 {
             return curve;

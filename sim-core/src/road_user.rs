@@ -185,7 +185,7 @@ impl RoadUser {
             let spread_s = settings.vehicle.lane_change_s;
             let load = Load {
                 state,
-                curve: path.tick(start_s, settings.tick_s, state.speed_mps, spread_s),
+                curve: path.tick(start_s, settings.tick_s, state.speed_mps, spread_s, &params.ability()),
                 rise: path.road(start_s).1,
                 front_m: self.dimensions.front_m(),
             };
@@ -220,10 +220,10 @@ impl RoadUser {
         let error = tracking::error(state, front_m, &target);
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;
         let limit = settings.vehicle.resynchronise_m;
-        let lost = square > limit * limit;
+        let lost = square > limit * limit || path.undriven_m() > limit;
         if lost {
-            let curve = Curve::straight(target.position_m, target.velocity_mps);
-            *state = set_onto(&curve, front_m, path.heading_at(end_s));
+            *state = set_onto(&path.resynchronise(end_s), front_m, path.heading_at(end_s));
+            out.reference_offset_m = 0.0;
             write_set(state, path, end_s, front_m, out, rows);
         } else {
             out.tracking_lateral_m = error.lateral_m as f32;
@@ -260,8 +260,7 @@ impl RoadUser {
             Mover::Vehicle { state, path } => {
                 let front_m = self.dimensions.front_m();
                 *path = Path::from_here(&self.now, settings.step_s());
-                let curve = path.tick(0.0, settings.tick_s, 0.0, settings.vehicle.lane_change_s);
-                *state = set_onto(&curve, front_m, f64::from(self.now.yaw_rad));
+                *state = set_onto(&path.start(), front_m, f64::from(self.now.yaw_rad));
                 write_set(state, path, 0.0, front_m, out, rows);
             }
         }

@@ -132,15 +132,19 @@ pub struct KinematicParams {
     pub max_decel_mps2: f64,
     /// Largest lateral acceleration that a driver asks for, m/s².
     pub max_lateral_mps2: f64,
+    /// Largest curvature of the rear axle's way, 1/m.
+    pub max_curvature_per_m: f64,
 }
 
 impl KinematicParams {
     /// The limits of a parameter set, none above the configured ones, on a vehicle with this wheelbase.
     #[must_use]
     pub fn new(set: &Set, limits: &config::Vehicle, wheelbase_m: f64) -> Self {
+        let max_road_wheel_angle_rad = set.max_road_wheel_angle_rad.min(limits.max_road_wheel_angle_rad);
         Self {
             wheelbase_m,
-            max_road_wheel_angle_rad: set.max_road_wheel_angle_rad.min(limits.max_road_wheel_angle_rad),
+            max_curvature_per_m: libm::tan(max_road_wheel_angle_rad) / wheelbase_m,
+            max_road_wheel_angle_rad,
             max_road_wheel_rate_radps: set.max_road_wheel_rate_radps.min(limits.max_road_wheel_rate_radps),
             max_accel_mps2: set.max_accel_mps2.min(limits.max_accel_mps2),
             max_decel_mps2: set.max_decel_mps2.min(limits.max_decel_mps2),

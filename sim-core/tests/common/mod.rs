@@ -50,6 +50,7 @@ pub fn kinematic(limits: &config::Vehicle, wheelbase_m: f64) -> KinematicParams 
         max_accel_mps2: limits.max_accel_mps2,
         max_decel_mps2: limits.max_decel_mps2,
         max_lateral_mps2: 15.0,
+        max_curvature_per_m: limits.max_road_wheel_angle_rad.tan() / wheelbase_m,
     }
 }
 
