@@ -24,7 +24,18 @@ GRAVITY_MPS2 = 9.81
 # Speed, m/s -> amplitude of the road-wheel angle, rad: peaks of lateral acceleration of 2 m/s², at 5 m/s what the
 # package's bound on the rate of the road-wheel angle (0.4 rad/s) admits, 1.5 m/s².
 AMPLITUDE_RAD = {5.0: 0.12, 15.0: 0.0245, 30.0: 0.0071}
-COLUMNS = "speed_mps amplitude_rad t_s x_m y_m delta_rad v_mps psi_rad psi_dot_radps beta_rad".split()
+COLUMNS = [
+    "speed_mps",
+    "amplitude_rad",
+    "t_s",
+    "x_m",
+    "y_m",
+    "delta_rad",
+    "v_mps",
+    "psi_rad",
+    "psi_dot_radps",
+    "beta_rad",
+]
 
 
 def trajectory(speed_mps: float, amplitude_rad: float) -> np.ndarray:
