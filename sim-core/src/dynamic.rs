@@ -36,9 +36,9 @@ pub const SLIP_SPEED_MPS: f64 = 1.0;
 /// Share of the friction that brakes and drive may use (anti-lock, traction control); the rest is left for steering.
 const LONGITUDINAL_SHARE: f64 = 0.95;
 /// Least vertical load of an axle by mass, m/s²: none lifts off.
-const LEAST_LOAD_MPS2: f64 = 0.5;
+pub(crate) const LEAST_LOAD_MPS2: f64 = 0.5;
 /// A standing vehicle that slides and turns by less than this rests (m/s and rad/s).
-const RESTING: f64 = 0.02;
+pub(crate) const RESTING: f64 = 0.02;
 /// γ of ROS2: 1 − 1/√2.
 const GAMMA: f64 = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
 
@@ -187,7 +187,7 @@ impl DynamicParams {
 
     /// Acceleration after `dt_s`: lag, bounded jerk, bounded demand.
     #[inline(always)]
-    fn accel_after(&self, state: &State, demand_mps2: f64, dt_s: f64) -> f64 {
+    pub(crate) fn accel_after(&self, state: &State, demand_mps2: f64, dt_s: f64) -> f64 {
         let most = self.max_jerk_mps3 * dt_s;
         let lag = share(self.actuator_rate_per_s[0] * dt_s);
         let change = bound((demand_mps2 - state.accel_mps2) * lag, -most, most);
@@ -196,7 +196,7 @@ impl DynamicParams {
 
     /// Road-wheel angle after `dt_s`: lag, bounded rate, bounded angle.
     #[inline(always)]
-    fn road_wheel_angle_after(&self, state: &State, demand_rad: f64, dt_s: f64) -> f64 {
+    pub(crate) fn road_wheel_angle_after(&self, state: &State, demand_rad: f64, dt_s: f64) -> f64 {
         let most = self.max_road_wheel_rate_radps * dt_s;
         let lag = share(self.actuator_rate_per_s[1] * dt_s);
         let change = bound((demand_rad - state.road_wheel_angle_rad) * lag, -most, most);
@@ -210,7 +210,7 @@ impl DynamicParams {
     /// Longitudinal forces of the axles by mass for a total of `force_mps2`: shared as built. What one axle's friction cannot
     /// take goes to the other when braking; a driven axle spins no further than its friction.
     #[inline(always)]
-    fn axle_forces(&self, force_mps2: f64, loads_mps2: [f64; 2]) -> [f64; 2] {
+    pub(crate) fn axle_forces(&self, force_mps2: f64, loads_mps2: [f64; 2]) -> [f64; 2] {
         let driving = force_mps2 > 0.0;
         let share = pick(driving, self.share_front[0], self.share_front[1]);
         let [front_most, rear_most] = loads_mps2.map(|load| LONGITUDINAL_SHARE * self.friction * load);
@@ -382,7 +382,7 @@ struct Forces {
 
 /// Moves the origin with the mean of the two velocities and turns it with the mean of the two yaw rates.
 #[inline(always)]
-fn carry(state: &State, next: &mut State, dt_s: f64) -> Motion {
+pub(crate) fn carry(state: &State, next: &mut State, dt_s: f64) -> Motion {
     let turn = 0.5 * (state.yaw_rate_radps + next.yaw_rate_radps) * dt_s;
     let (sin, cos) = sin_cos_small(0.5 * turn);
     let half_way = rotate(state.heading, cos, sin);

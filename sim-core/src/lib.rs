@@ -20,6 +20,7 @@ pub mod parameters;
 pub mod person;
 pub mod process;
 pub mod reference;
+pub mod rigid_body;
 pub mod road_user;
 pub mod spherical;
 pub mod statistics;
