@@ -60,7 +60,8 @@ fn settings() -> Settings {
         max_accel_mps2: 5.0,
         max_decel_mps2: 9.0,
         steering_ratio: 15.0,
-        resynchronise_m: 5.0,
+        resynchronise_m: 2.0,
+        leave_path_m: 5.0,
     };
     Settings {
         vehicle,

@@ -31,12 +31,15 @@ pub struct Ability {
     pub power_by_mass: f64,
     /// Drag by mass and speed squared, 1/m.
     pub drag_by_mass_per_m: f64,
+    /// Rolling resistance by mass, m/s².
+    pub rolling_mps2: f64,
 }
 
 impl Ability {
     /// Largest acceleration, deceleration and lateral acceleration at a speed, m/s².
     fn at(&self, speed_mps: f64) -> [f64; 3] {
-        let power = self.power_by_mass / speed_mps - self.drag_by_mass_per_m * speed_mps * speed_mps;
+        let power =
+            self.power_by_mass / speed_mps - self.drag_by_mass_per_m * speed_mps * speed_mps - self.rolling_mps2;
         [
             self.accel_mps2.min(power).max(0.1),
             self.decel_mps2,
@@ -143,6 +146,7 @@ mod tests {
         decel_mps2: 9.0,
         power_by_mass: 60.0,
         drag_by_mass_per_m: 3e-4,
+        rolling_mps2: 0.1,
     };
 
     /// A path at 15 m/s that turns at once by `angle_rad` (spread over one tick, as the path does), then goes straight.

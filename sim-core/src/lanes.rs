@@ -19,8 +19,10 @@ use crate::{
 /// Vehicles side by side: two registers of AVX-512 or eight of SSE2 for each number.
 pub const LANES: usize = 16;
 
-/// Share of a vehicle's friction and of its steering that references use; the rest is for following them.
-const LATERAL_SHARE: f64 = 0.75;
+/// Share of a vehicle's friction, steering and power that references use; the rest is for following them.
+const LATERAL_SHARE: f64 = 0.6;
+const LONGITUDINAL_SHARE: f64 = 0.85;
+const POWER_SHARE: f64 = 0.8;
 const CURVATURE_SHARE: f64 = 0.9;
 
 type Lane = [f64; LANES];
@@ -65,6 +67,7 @@ impl Drive<KINEMATIC> for KinematicParams {
             decel_mps2: self.max_decel_mps2,
             power_by_mass: f64::INFINITY,
             drag_by_mass_per_m: 0.0,
+            rolling_mps2: 0.0,
         }
     }
 
@@ -89,10 +92,11 @@ impl Drive<DYNAMIC> for DynamicParams {
         Ability {
             lateral_mps2: LATERAL_SHARE * friction,
             curvature_per_m: CURVATURE_SHARE * self.max_curvature_per_m,
-            accel_mps2: self.max_accel_mps2.min(LATERAL_SHARE * friction),
-            decel_mps2: self.max_decel_mps2.min(LATERAL_SHARE * friction),
-            power_by_mass: self.max_power_by_mass,
+            accel_mps2: self.max_accel_mps2.min(LONGITUDINAL_SHARE * friction),
+            decel_mps2: self.max_decel_mps2.min(LONGITUDINAL_SHARE * friction),
+            power_by_mass: POWER_SHARE * self.max_power_by_mass,
             drag_by_mass_per_m: self.drag_by_mass_per_m,
+            rolling_mps2: self.rolling_mps2,
         }
     }
 
@@ -355,7 +359,8 @@ mod tests {
             max_accel_mps2: 5.0,
             max_decel_mps2: 9.0,
             steering_ratio: 15.0,
-            resynchronise_m: 5.0,
+            resynchronise_m: 2.0,
+            leave_path_m: 5.0,
         }
     }
 

@@ -220,7 +220,7 @@ impl RoadUser {
         let error = tracking::error(state, front_m, &target);
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;
         let limit = settings.vehicle.resynchronise_m;
-        let lost = square > limit * limit || path.undriven_m() > limit;
+        let lost = square > limit * limit || path.undriven_m() > settings.vehicle.leave_path_m;
         if lost {
             *state = set_onto(&path.resynchronise(end_s), front_m, path.heading_at(end_s));
             out.reference_offset_m = 0.0;

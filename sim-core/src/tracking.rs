@@ -33,6 +33,8 @@ const LOW_SPEED_MPS: f64 = 3.0;
 const MAX_TAN_BETA: f64 = 1.43;
 /// ω of the lateral error of a vehicle with tyres, 1/s.
 const LATERAL_FREQUENCY_PER_S: f64 = 4.0;
+/// Below this speed a vehicle with tyres is steered as if it rolled without slip, at twice this speed by its forces alone, m/s.
+const ROLLING_MPS: f64 = 2.0;
 /// Share of the friction that tracking asks for: the rest keeps the tyres' slip small.
 const FRICTION_SHARE: f64 = 0.9;
 /// Below this speed of vehicle or path the wheels are held, m/s.
@@ -172,14 +174,13 @@ pub fn demand_with_tyres(params: &DynamicParams, front_m: f64, state: &State, ta
     let frequency = LATERAL_FREQUENCY_PER_S * smaller(state.speed_mps * (1.0 / LOW_SPEED_MPS), 1.0);
     let wanted = bend + frequency * (2.0 * closing + frequency * error.lateral_m);
     let wanted = bound(wanted, -driven.max_lateral_mps2, driven.max_lateral_mps2);
-    let holds = (state.speed_mps < HOLD_MPS) | (along < HOLD_MPS);
+    let across = vy * cos - vx * sin;
+    let rolling = steering_demand(&driven, state, [along, across], error.lateral_m);
+    let slipping = angle_for(params, front_m, state, wanted);
+    let share = bound((state.speed_mps - ROLLING_MPS) * (1.0 / ROLLING_MPS), 0.0, 1.0);
     Input {
         accel_mps2: accel_demand(&driven, state, target.accel_mps2, along, error.longitudinal_m),
-        road_wheel_angle_rad: pick(
-            holds,
-            state.road_wheel_angle_rad,
-            angle_for(params, front_m, state, wanted),
-        ),
+        road_wheel_angle_rad: rolling + share * (slipping - rolling),
     }
 }
 
