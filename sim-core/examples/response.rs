@@ -34,7 +34,7 @@ const LIMITS: config::Vehicle = config::Vehicle {
     max_decel_mps2: 10.0,
     steering_ratio: 15.0,
     resynchronise_m: 2.0,
-        leave_path_m: 5.0,
+    leave_path_m: 5.0,
 };
 
 /// A vehicle under way.
