@@ -38,6 +38,7 @@ const LIMITS: config::Vehicle = config::Vehicle {
 };
 
 /// A vehicle under way.
+#[expect(clippy::large_enum_variant, reason = "two values in all")]
 enum Vehicle {
     Plain(Model, State),
     Rigid(Box<RigidBody>, RigidState),

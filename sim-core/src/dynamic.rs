@@ -249,12 +249,18 @@ impl DynamicParams {
             yaw_rate_radps: state.yaw_rate_radps,
         };
         let loads = self.loads_mps2(state.accel_mps2);
-        let level = self.axle_forces(self.force(state, wanted + resistance, resistance), loads);
-        let wheels = self.wheels(state, angle, loads, level, dt_s);
+        let level = self.axle_forces(
+            bound(wanted + resistance, -self.max_decel_mps2, self.max_accel_mps2),
+            loads,
+        );
+        let wheels = self.wheels(state, &before, angle, loads, level, dt_s);
         let start = self.forces(&wheels, &before);
         // What cornering costs, and the driver makes up for.
         let cornering = start.lateral_front_mps2 * wheels.sin - before.yaw_rate_radps * before.lateral_mps;
-        let [front, rear] = self.axle_forces(self.force(state, wanted + resistance + cornering, resistance), loads);
+        let [front, rear] = self.axle_forces(
+            self.force(wheels.inverse_mps[1], wanted + resistance + cornering, resistance),
+            loads,
+        );
         let accel = front * wheels.cos + rear - cornering - resistance;
         // What the driver gets is the actuator's state; the losses beyond it are not, or they would add up.
         let got = front + rear - cornering - resistance;
@@ -284,24 +290,36 @@ impl DynamicParams {
         (next, motion)
     }
 
-    /// The force by mass that drive and brakes give when `wanted_mps2` is asked for, against a `resistance`.
+    /// The force by mass that drive and brakes give when `wanted_mps2` is asked for, against a `resistance`, at 1 / `inverse_speed`.
     #[inline(always)]
-    fn force(&self, state: &State, wanted_mps2: f64, resistance: f64) -> f64 {
-        let power = self.max_power_by_mass / larger(state.speed_mps, 1.0);
+    fn force(&self, inverse_speed: f64, wanted_mps2: f64, resistance: f64) -> f64 {
+        let power = self.max_power_by_mass * inverse_speed;
         let most = smaller(power, self.max_accel_mps2 + larger(resistance, 0.0));
         bound(wanted_mps2, -self.max_decel_mps2, most)
     }
 
     /// The wheels of one sub-step, with angle and speed half-way.
     #[inline(always)]
-    fn wheels(&self, state: &State, angle: f64, loads: [f64; 2], used: [f64; 2], dt_s: f64) -> Wheels {
+    fn wheels(
+        &self,
+        state: &State,
+        before: &Slipping,
+        angle: f64,
+        loads: [f64; 2],
+        used: [f64; 2],
+        dt_s: f64,
+    ) -> Wheels {
         let (sin, cos) = sin_cos_small(0.5 * (state.road_wheel_angle_rad + angle));
         let speed_mps = larger(state.speed_mps + 0.5 * state.accel_mps2 * dt_s, 0.0);
+        let at_front = before.lateral_mps + self.cg_to_front_m() * before.yaw_rate_radps;
         Wheels {
             sin,
             cos,
             speed_mps,
-            rear_inverse: 1.0 / larger(speed_mps, SLIP_SPEED_MPS),
+            inverse_mps: inverses(
+                larger(speed_mps * cos + at_front * sin, SLIP_SPEED_MPS),
+                larger(speed_mps, SLIP_SPEED_MPS),
+            ),
             drive_front_mps2: used[0],
             stiffness: [0, 1].map(|axle: usize| self.stiffness_per_rad[axle] * loads[axle]),
             most_squared: [0, 1].map(|axle: usize| {
@@ -320,20 +338,22 @@ impl DynamicParams {
         let (lf, lr) = (self.cg_to_front_m(), self.cg_to_rear_m);
         let at_front = slipping.lateral_mps + lf * slipping.yaw_rate_radps;
         let at_rear = slipping.lateral_mps - lr * slipping.yaw_rate_radps;
-        let front_inverse = 1.0 / larger(speed_mps * cos + at_front * sin, SLIP_SPEED_MPS);
+        let [front_inverse, rear_inverse] = wheels.inverse_mps;
         let slips = [
             (speed_mps * sin - at_front * cos) * front_inverse,
-            -at_rear * wheels.rear_inverse,
+            -at_rear * rear_inverse,
         ];
+        let linear = [0, 1].map(|axle: usize| wheels.stiffness[axle] * slips[axle]);
+        let whole = [0, 1].map(|axle: usize| wheels.most_squared[axle] + linear[axle] * linear[axle]);
+        let inverse = inverses(whole[0], whole[1]);
         let [front, rear] = [0, 1].map(|axle: usize| {
-            let linear = wheels.stiffness[axle] * slips[axle];
             // cos² of the magic formula's angle: most² / (most² + linear²).
-            let square = wheels.most_squared[axle] / (wheels.most_squared[axle] + linear * linear);
+            let square = wheels.most_squared[axle] * inverse[axle];
             let factor = square.sqrt();
-            (linear * factor, wheels.stiffness[axle] * square * factor)
+            (linear[axle] * factor, wheels.stiffness[axle] * square * factor)
         });
         let across_front = front.0 * cos + wheels.drive_front_mps2 * sin;
-        let falls = [front.1 * cos * cos * front_inverse, rear.1 * wheels.rear_inverse];
+        let falls = [front.1 * cos * cos * front_inverse, rear.1 * rear_inverse];
         let turning = lr * falls[1] - lf * falls[0];
         Forces {
             lateral_front_mps2: front.0,
@@ -375,6 +395,13 @@ impl DynamicParams {
     }
 }
 
+/// 1 / a and 1 / b with one division.
+#[inline(always)]
+pub(crate) fn inverses(a: f64, b: f64) -> [f64; 2] {
+    let inverse = 1.0 / (a * b);
+    [b * inverse, a * inverse]
+}
+
 /// Motion of the centre of gravity across the heading.
 #[derive(Clone, Copy)]
 struct Slipping {
@@ -388,8 +415,8 @@ struct Wheels {
     sin: f64,
     cos: f64,
     speed_mps: f64,
-    /// 1 / speed of the rear wheels for their slip, s/m.
-    rear_inverse: f64,
+    /// 1 / speed of the front and of the rear wheels for their slip, s/m.
+    inverse_mps: [f64; 2],
     drive_front_mps2: f64,
     /// Lateral force by slip, front and rear, m/s².
     stiffness: [f64; 2],

@@ -14,7 +14,7 @@
 
 use crate::{
     curve::Target,
-    dynamic::{DynamicParams, GRAVITY_MPS2, SLIP_SPEED_MPS},
+    dynamic::{DynamicParams, GRAVITY_MPS2, SLIP_SPEED_MPS, inverses},
     trig::{atan_demand, bound, larger, pick, smaller},
     vehicle::{ACCEL_RATE_PER_S, Input, KinematicParams, MAX_JERK_MPS3, State},
 };
@@ -194,9 +194,10 @@ fn angle_for(params: &DynamicParams, state: &State, wanted_mps2: f64) -> f64 {
         -params.stiffness_per_rad[1] * loads[1] * state.lateral_mps * smaller(moving, 1.0 / SLIP_SPEED_MPS);
     let rear_most = params.friction * loads[1];
     let rear_square = rear_most * rear_most;
-    let rear = rear_linear * (rear_square / (rear_square + rear_linear * rear_linear)).sqrt();
+    let [front_inverse, rear_inverse] = inverses(params.friction * loads[0], rear_square + rear_linear * rear_linear);
+    let rear = rear_linear * (rear_square * rear_inverse).sqrt();
     let front = (wanted_mps2 - rear * params.bumper[1]) * params.bumper[0];
-    let share = bound(front / (params.friction * loads[0]), -FRICTION_SHARE, FRICTION_SHARE);
+    let share = bound(front * front_inverse, -FRICTION_SHARE, FRICTION_SHARE);
     let slip = share * params.friction / (params.stiffness_per_rad[0] * (1.0 - share * share).sqrt());
     let direction = atan_demand((state.lateral_mps + params.wheelbase_m * state.yaw_rate_radps) * moving);
     direction + slip * pace
