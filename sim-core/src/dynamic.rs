@@ -74,6 +74,12 @@ impl Spring {
         Self { gain, step }
     }
 
+    /// Where it rests under a held input.
+    #[must_use]
+    pub fn steady(&self, input: f64) -> f64 {
+        self.gain * input
+    }
+
     #[inline(always)]
     fn after(&self, [angle, rate]: [f64; 2], input: f64) -> [f64; 2] {
         let rest = self.gain * input;
@@ -257,10 +263,14 @@ impl DynamicParams {
         let start = self.forces(&wheels, &before);
         // What cornering costs, and the driver makes up for.
         let cornering = start.lateral_front_mps2 * wheels.sin - before.yaw_rate_radps * before.lateral_mps;
-        let [front, rear] = self.axle_forces(
-            self.force(wheels.inverse_mps[1], wanted + resistance + cornering, resistance),
-            loads,
+        let straight = wanted + resistance;
+        // Nobody accelerates through a slide while braking.
+        let asked = pick(
+            input.accel_mps2 < 0.0,
+            smaller(straight + cornering, larger(straight, 0.0)),
+            straight + cornering,
         );
+        let [front, rear] = self.axle_forces(self.force(wheels.inverse_mps[1], asked, resistance), loads);
         let accel = front * wheels.cos + rear - cornering - resistance;
         // What the driver gets is the actuator's state; the losses beyond it are not, or they would add up.
         let got = front + rear - cornering - resistance;
@@ -320,11 +330,13 @@ impl DynamicParams {
                 larger(speed_mps * cos + at_front * sin, SLIP_SPEED_MPS),
                 larger(speed_mps, SLIP_SPEED_MPS),
             ),
-            drive_front_mps2: used[0],
+            // A wheel that hardly rolls forward has no direction to brake in.
+            drive_front_mps2: used[0] * bound(speed_mps * cos + at_front * sin, 0.0, 1.0),
             stiffness: [0, 1].map(|axle: usize| self.stiffness_per_rad[axle] * loads[axle]),
             most_squared: [0, 1].map(|axle: usize| {
-                let most = [FRONT_GRIP, 1.0][axle] * self.friction * loads[axle];
-                larger(most * most - used[axle] * used[axle], LEAST_FORCE_SQUARED)
+                let most = self.friction * loads[axle];
+                let left = most * most - used[axle] * used[axle];
+                larger([FRONT_GRIP * FRONT_GRIP, 1.0][axle] * left, LEAST_FORCE_SQUARED)
             }),
         }
     }
