@@ -92,7 +92,7 @@ impl Body {
 /// Cosine and sine, error below 2e-9: a few nanometres at the corner of a lorry.
 #[inline]
 fn direction(yaw_rad: f64) -> Point {
-    if !(yaw_rad.abs() <= 4.0) {
+    if yaw_rad.abs() > 4.0 {
         let (sin, cos) = libm::sincos(yaw_rad);
         return [cos, sin];
     }

@@ -8,7 +8,7 @@ use super::body::Body;
 use crate::scene::shape::Point;
 
 /// Bodies that reach farther than this (trains) are compared with everybody instead of widening the cells, metres.
-const LARGE_M: f64 = 12.0;
+pub(super) const LARGE_M: f64 = 12.0;
 /// Fixed point of the rectangles: parts of a metre.
 const PER_METRE: f64 = 512.0;
 /// Row stride of the hash. Its last bits keep a row's stretch apart from the next one's for every table size.
@@ -52,10 +52,11 @@ pub(super) struct Broad {
 }
 
 impl Broad {
-    /// Pairs of rows whose rectangles meet, of which at least one is watched; the lower row first, some pairs twice.
-    pub(super) fn pairs(&mut self, bodies: &[Body], watched: &[bool]) -> &[(u32, u32)] {
+    /// Pairs of rows whose rectangles meet, of which at least one is watched; the lower row first, some pairs twice. No body but
+    /// the large reaches farther than `reach_m`.
+    pub(super) fn pairs(&mut self, bodies: &[Body], watched: &[bool], reach_m: f64) -> &[(u32, u32)] {
         self.pairs.clear();
-        self.fill(bodies, watched);
+        self.fill(bodies, watched, reach_m);
         self.sort();
         self.neighbours();
         for (place, large) in self.large.iter().enumerate() {
@@ -68,11 +69,10 @@ impl Broad {
     }
 
     /// Rectangles and buckets of everybody.
-    fn fill(&mut self, bodies: &[Body], watched: &[bool]) {
+    fn fill(&mut self, bodies: &[Body], watched: &[bool], reach_m: f64) {
         let origin = bodies.first().map_or([0.0; 2], |body| body.solid.centre_m);
-        let most_m = bodies.iter().map(Body::reach_m).filter(|reach_m| *reach_m <= LARGE_M);
-        let cells_per_m = 0.5 / most_m.fold(0.5, f64::max);
-        let size = (2 * bodies.len()).next_power_of_two().max(LEAST_BUCKETS);
+        let cells_per_m = 0.5 / reach_m.max(0.5);
+        let size = bodies.len().next_power_of_two().max(LEAST_BUCKETS);
         let mask = size as u32 - 1;
         self.entries.clear();
         self.buckets.clear();
@@ -94,24 +94,19 @@ impl Broad {
         }
     }
 
-    /// Counting sort by bucket.
+    /// Counting sort by bucket; entries of a bucket stay in order.
     fn sort(&mut self) {
+        // From counts to starts, one place late: placing moves each start to its end, which is the start of the next.
         let mut sum = 0;
-        for start in &mut self.starts {
-            sum += *start;
-            *start = sum;
+        for start in &mut self.starts[1..] {
+            sum += std::mem::replace(start, sum);
         }
         self.sorted.clear();
         self.sorted.resize(self.entries.len(), Entry::default());
-        // Backwards, so that entries of a bucket stay in order and `starts` ends as the starts.
-        for (entry, bucket) in self.entries.iter().zip(&self.buckets).rev() {
-            let end = &mut self.starts[*bucket as usize + 1];
-            *end -= 1;
-            self.sorted[*end as usize] = *entry;
-        }
-        self.starts.rotate_left(1);
-        if let Some(last) = self.starts.last_mut() {
-            *last = self.entries.len() as u32;
+        for (entry, bucket) in self.entries.iter().zip(&self.buckets) {
+            let next = &mut self.starts[*bucket as usize + 1];
+            self.sorted[*next as usize] = *entry;
+            *next += 1;
         }
     }
 
@@ -200,9 +195,10 @@ mod tests {
                 watched[1] = true;
             }
             let mut broad = Broad::default();
+            let reach_m = bodies.iter().map(Body::reach_m).filter(|reach_m| *reach_m <= LARGE_M).fold(0.0, f64::max);
             // Twice: buffers must not remember.
-            broad.pairs(&bodies[..bodies.len() / 2], &watched);
-            let found: BTreeSet<(u32, u32)> = broad.pairs(&bodies, &watched).iter().copied().collect();
+            broad.pairs(&bodies[..bodies.len() / 2], &watched, reach_m);
+            let found: BTreeSet<(u32, u32)> = broad.pairs(&bodies, &watched, reach_m).iter().copied().collect();
             for a in 0..bodies.len() {
                 for b in a + 1..bodies.len() {
                     let meets = bodies[a].solid.bounds().meets(&bodies[b].solid.bounds()) && (watched[a] || watched[b]);

@@ -12,18 +12,21 @@ use ipc_schema::{
     world::{COLLIDED, VehicleState},
 };
 
-use crate::scene::{Grid, Scene, Solid, shape::Bounds};
+use crate::scene::{
+    Grid, Scene, Solid,
+    shape::{Bounds, OrientedBox, smallest_rectangle},
+};
 
 pub mod body;
 mod broad;
 mod record;
 
 use body::{Body, box_touches_prism, boxes_touch, common_height, common_point};
-use broad::Broad;
+use broad::{Broad, LARGE_M};
 pub use record::{CollisionCounts, Contacts};
 
-/// Reach of a vehicle up to which one look at the cell of its centre finds every solid, metres.
-const REACH_M: f64 = 10.0;
+/// Reaches of vehicles (cars, lorries) up to which one look at the cell of the centre finds every solid: an index for each, metres.
+const REACHES_M: [f64; 2] = [3.2, 11.0];
 /// Size of a cell of the index over solids, metres.
 const CELL_M: f64 = 8.0;
 
@@ -49,9 +52,11 @@ impl Contact {
 #[derive(Debug)]
 pub struct Detector {
     scene: Arc<Scene>,
-    solid_bounds: Vec<Bounds>,
+    /// Rectangle of any heading about each solid.
+    rectangles: Vec<OrientedBox>,
     solid_hashes: Vec<u64>,
-    solids: Grid,
+    /// Over solids grown by [`REACHES_M`].
+    indices: [Grid; 2],
     bodies: Vec<Body>,
     watched: Vec<bool>,
     broad: Broad,
@@ -66,14 +71,19 @@ impl Detector {
     /// A detector over a scene.
     #[must_use]
     pub fn new(scene: Arc<Scene>) -> Self {
-        let solid_bounds: Vec<Bounds> = scene.bounds().collect();
-        let reachable: Vec<Bounds> = solid_bounds.iter().map(|bounds| bounds.grown(REACH_M)).collect();
+        let bounds: Vec<Bounds> = scene.bounds().collect();
+        let within = |reach_m: f64| -> Vec<Bounds> { bounds.iter().map(|bounds| bounds.grown(reach_m)).collect() };
+        let indices = REACHES_M.map(|reach_m| Grid::new(&within(reach_m), CELL_M));
+        let rectangles = (0..bounds.len() as u32).map(|number| match scene.solid(number) {
+            Solid::Building(building) => smallest_rectangle(&building.outline_m, building.z_m()),
+            Solid::Prop(prop) => prop.body,
+        });
         let buildings = scene.buildings().iter().map(|building| id_hash(&building.id));
         let props = scene.props().iter().map(|prop| id_hash(prop.kind.name));
         Self {
             solid_hashes: buildings.chain(props).collect(),
-            solids: Grid::new(&reachable, CELL_M),
-            solid_bounds,
+            rectangles: rectangles.collect(),
+            indices,
             scene,
             bodies: Vec::new(),
             watched: Vec::new(),
@@ -107,20 +117,34 @@ impl Detector {
         std::mem::swap(&mut self.contacts, &mut self.before);
         self.contacts.clear();
         self.begun.clear();
-        self.bodies.clear();
-        self.watched.clear();
-        self.bodies.extend(states.iter().map(Body::of));
-        let is_watched = |state: &VehicleState| state.kind == Kind::Cav as u32 || state.kind == Kind::Hero as u32;
-        self.watched.extend(states.iter().map(is_watched));
+        let reach_m = self.take(states);
         if self.watched.contains(&true) {
-            self.touch_road_users(states);
+            self.touch_road_users(states, reach_m);
             self.touch_solids(states);
         }
         self.begin(states);
     }
 
-    fn touch_road_users(&mut self, states: &[VehicleState]) {
-        for &(a, b) in self.broad.pairs(&self.bodies, &self.watched) {
+    /// Takes everybody's body and returns the farthest reach of those that are not large.
+    fn take(&mut self, states: &[VehicleState]) -> f64 {
+        self.bodies.clear();
+        self.watched.clear();
+        let mut most_m = 0.0;
+        for state in states {
+            let body = Body::of(state);
+            let reach_m = body.reach_m();
+            if reach_m <= LARGE_M && reach_m > most_m {
+                most_m = reach_m;
+            }
+            self.bodies.push(body);
+            self.watched
+                .push(state.kind == Kind::Cav as u32 || state.kind == Kind::Hero as u32);
+        }
+        most_m
+    }
+
+    fn touch_road_users(&mut self, states: &[VehicleState], reach_m: f64) {
+        for &(a, b) in self.broad.pairs(&self.bodies, &self.watched, reach_m) {
             let (one, two) = (a as usize, b as usize);
             if !self.bodies[one].touches(&self.bodies[two]) {
                 continue;
@@ -138,25 +162,23 @@ impl Detector {
     }
 
     fn touch_solids(&mut self, states: &[VehicleState]) {
-        if self.solid_bounds.is_empty() {
+        if self.rectangles.is_empty() {
             return;
         }
         for (row, body) in self.bodies.iter().enumerate() {
             if !self.watched[row] {
                 continue;
             }
-            let near = if body.reach_m() <= REACH_M {
-                self.solids.at(body.solid.centre_m)
-            } else {
-                self.solids.near(&body.solid.bounds(), &mut self.near);
-                &self.near
+            let reach_m = body.reach_m();
+            let near = match REACHES_M.iter().position(|most_m| reach_m <= *most_m) {
+                Some(index) => self.indices[index].at(body.solid.centre_m),
+                None => {
+                    self.scene.solids_near(&body.solid.bounds(), &mut self.near);
+                    &self.near
+                }
             };
-            if near.is_empty() {
-                continue;
-            }
-            let bounds = body.solid.bounds();
             for &number in near {
-                if !self.solid_bounds[number as usize].meets(&bounds) {
+                if !boxes_touch(&body.solid, &self.rectangles[number as usize]) {
                     continue;
                 }
                 if let Some(class) = struck(&self.scene, number, body) {
@@ -219,24 +241,20 @@ impl Detector {
 
     fn contact_with_solid(&self, number: u32, body: &Body) -> [f64; 3] {
         let (flat, z_m) = match self.scene.solid(number) {
-            Solid::Building(building) => (
-                common_point(&body.solid, &building.outline_m),
-                [building.base_z_m, building.base_z_m + building.height_m],
-            ),
+            Solid::Building(building) => (common_point(&body.solid, &building.outline_m), building.z_m()),
             Solid::Prop(prop) => (common_point(&body.solid, &prop.body.corners()), prop.body.z_m),
         };
         [flat[0], flat[1], common_height(body.solid.z_m, z_m)]
     }
 }
 
-/// What `body` touches there, if it does.
+/// What `body`, which touches the rectangle about it, touches there, if anything.
 fn struck(scene: &Scene, number: u32, body: &Body) -> Option<Struck> {
     match scene.solid(number) {
         Solid::Building(building) => {
-            let z_m = [building.base_z_m, building.base_z_m + building.height_m];
-            box_touches_prism(&body.solid, &building.outline_m, z_m).then_some(Struck::Building)
+            box_touches_prism(&body.solid, &building.outline_m, building.z_m()).then_some(Struck::Building)
         }
-        Solid::Prop(prop) => boxes_touch(&body.solid, &prop.body).then_some(Struck::Obstacle),
+        Solid::Prop(_) => Some(Struck::Obstacle),
     }
 }
 
