@@ -202,7 +202,7 @@ fn line<'a>(header: &MessageHeader, collision: &Collision, names: &'a [Box<str>]
         }
     };
     #[expect(clippy::cast_precision_loss, reason = "a time for people")]
-    let sim_time_s = header.sim_time_ns as f64 * 1e-9;
+    let sim_time_s = header.sim_time_ns as f64 / 1e9;
     Line {
         tick: header.tick,
         episode: header.episode,
