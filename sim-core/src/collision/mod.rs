@@ -1,8 +1,9 @@
 //! Contacts of connected vehicles and heroes with everything: vehicles, persons, buildings and props, from the states of a finished tick.
 //!
 //! Broad phase: a grid of everybody, built anew each tick, and a fixed grid of what stands still. Narrow phase: exact for upright
-//! boxes, capsules and prisms with their heights, so that what passes under a bridge touches nothing on it. The order of events
-//! depends on the road users' indices alone.
+//! boxes, capsules and prisms with their heights, so that what passes under a bridge touches nothing on it. A net without
+//! elevation says by its junctions where roads cross at different levels ([`crate::scene::Road::are_levels_apart`]). The order of
+//! events depends on the road users' indices alone.
 
 use std::sync::Arc;
 
@@ -146,7 +147,8 @@ impl Detector {
     fn touch_road_users(&mut self, states: &[VehicleState], reach_m: f64) {
         for &(a, b) in self.broad.pairs(&self.bodies, &self.watched, reach_m) {
             let (one, two) = (a as usize, b as usize);
-            if !self.bodies[one].touches(&self.bodies[two]) {
+            let bodies = [&self.bodies[one], &self.bodies[two]];
+            if !bodies[0].touches(bodies[1]) || self.scene.road().are_levels_apart(bodies.map(|body| &body.solid)) {
                 continue;
             }
             // Rows are in ascending order of the index.

@@ -14,6 +14,7 @@ use crate::geodesy::GeodesyError;
 
 mod building;
 mod grid;
+mod level;
 mod prop;
 mod road;
 pub mod shape;
@@ -22,7 +23,7 @@ mod xml;
 pub use building::{Prism, SolidClass};
 pub use grid::Grid;
 pub use prop::Prop;
-pub use road::{Piece, Road, Surface};
+pub use road::{NO_JUNCTION, Piece, Road, Surface};
 use shape::{Bounds, Point};
 
 /// Size of a cell of the index over buildings and props, metres.

@@ -7,7 +7,7 @@ use super::{
     xml::{Place, Tag, attribute, for_each_tag, points},
 };
 use quick_xml::events::BytesStart;
-use std::path::Path;
+use std::{collections::BTreeMap, path::Path};
 
 /// SUMO's width of a lane that states none, metres.
 const DEFAULT_WIDTH_M: f64 = 3.2;
@@ -92,7 +92,12 @@ pub struct Piece {
     pub shape_m: Vec<[f64; 3]>,
     /// Half the width of a strip; `None` for a polygon. Metres.
     pub half_width_m: Option<f64>,
+    /// Numbers of the junctions it begins and ends at, of the one it lies in twice; [`NO_JUNCTION`] if the net names none.
+    pub junctions: [u32; 2],
 }
+
+/// No junction, in [`Piece::junctions`].
+pub const NO_JUNCTION: u32 = u32::MAX;
 
 impl Piece {
     /// Its border as a closed polygon without the last point repeated, counter-clockwise for strips; corners are mitred.
@@ -255,16 +260,26 @@ impl Road {
     /// # Errors
     /// Unreadable, malformed, or a shape that is no list of points.
     pub(super) fn read(net_file: &Path) -> Result<Self, SceneError> {
-        let mut pieces = Vec::new();
+        let mut pieces: Vec<Piece> = Vec::new();
+        let mut junctions = Junctions::default();
         let mut function = String::new();
+        let mut ends = [NO_JUNCTION; 2];
         for_each_tag(net_file, |tag, place| {
             let Tag::Open(element) = tag else { return Ok(()) };
-            match element.local_name().as_ref() {
-                "edge" => function = attribute(element, "function").unwrap_or_default(),
-                "lane" => pieces.extend(lane(element, &function, place)?),
-                "junction" => pieces.extend(junction(element, place)?),
-                _ => {}
-            }
+            let found = match element.local_name().as_ref() {
+                "edge" => {
+                    function = attribute(element, "function").unwrap_or_default();
+                    ends = junctions.ends(element);
+                    None
+                }
+                "lane" => lane(element, &function, place)?.map(|piece| (piece, ends)),
+                "junction" => {
+                    let number = junctions.number(&attribute(element, "id").unwrap_or_default());
+                    junction(element, place)?.map(|piece| (piece, [number; 2]))
+                }
+                _ => None,
+            };
+            pieces.extend(found.map(|(piece, junctions)| Piece { junctions, ..piece }));
             Ok(())
         })?;
         Ok(Self::new(pieces))
@@ -284,10 +299,15 @@ impl Road {
 
     /// Pieces that `point` lies on, with the height there.
     pub fn under(&self, point: Point) -> impl Iterator<Item = (&Piece, f64)> {
+        self.parts_under(point).map(|(piece, _, height_m)| (piece, height_m))
+    }
+
+    /// As [`Road::under`], with the part of the piece.
+    pub(super) fn parts_under(&self, point: Point) -> impl Iterator<Item = (&Piece, usize, f64)> {
         self.index.at(point).iter().filter_map(move |&entry| {
             let (piece, part) = self.parts[entry as usize];
-            let piece = &self.pieces[piece as usize];
-            Some((piece, piece.height_at(part as usize, point)?))
+            let (piece, part) = (&self.pieces[piece as usize], part as usize);
+            Some((piece, part, piece.height_at(part, point)?))
         })
     }
 
@@ -310,6 +330,26 @@ impl Road {
             }
         }
         nearest
+    }
+}
+
+/// Numbers of junctions by id.
+#[derive(Debug, Default)]
+struct Junctions(BTreeMap<String, u32>);
+
+impl Junctions {
+    fn number(&mut self, id: &str) -> u32 {
+        let next = self.0.len() as u32;
+        *self.0.entry(id.to_owned()).or_insert(next)
+    }
+
+    /// Both ends of an edge; an edge within a junction is named ":JUNCTION_NUMBER".
+    fn ends(&mut self, edge: &BytesStart<'_>) -> [u32; 2] {
+        let id = attribute(edge, "id").unwrap_or_default();
+        if let Some((junction, _)) = id.strip_prefix(':').and_then(|id| id.rsplit_once('_')) {
+            return [self.number(junction); 2];
+        }
+        ["from", "to"].map(|end| attribute(edge, end).map_or(NO_JUNCTION, |id| self.number(&id)))
     }
 }
 
@@ -355,6 +395,7 @@ fn piece(
         surface,
         shape_m,
         half_width_m,
+        junctions: [NO_JUNCTION; 2],
     }))
 }
 
