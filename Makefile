@@ -43,6 +43,7 @@ test-python:
 	$(VENV)/bin/python -m pytest -q trainer/tests
 	cd viewer && ../$(VENV)/bin/python -m pytest -q tests
 	$(VENV)/bin/python -m pytest -q maps/town/tests
+	$(VENV)/bin/python -m pytest -q sim-core/tests
 
 lint: $(VENV)/.installed ## formatting and lints, as errors
 	cargo fmt --all --check

@@ -18,6 +18,7 @@ use crate::{
     collision::{CollisionCounts, Contacts},
     mirror::{Mirror, MirrorError, Settings},
     scene::Scene,
+    statistics::Summary,
 };
 
 /// One process serves one environment.
@@ -26,6 +27,7 @@ const ENV_INDEX: u32 = 0;
 /// What this process adds to the run's report.
 #[derive(Debug, serde::Serialize)]
 struct Part {
+    tracking: Summary,
     resynchronisations: u64,
     vehicle_steps: u64,
     drops: u64,
@@ -83,7 +85,8 @@ impl Core {
         let scene = Arc::new(Scene::of_run(&session.run)?);
         let contacts = Contacts::open(&session, Arc::clone(&scene))?;
         session.attach();
-        let mirror = Mirror::new(Settings::of_run(&session.run));
+        let mirror = Mirror::new(Settings::of_run(&session.run))
+            .map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
         Ok(Self {
             session,
             metas,
@@ -152,6 +155,12 @@ impl Core {
             if let Some(contacts) = &mut self.contacts {
                 contacts.learn(header, metas);
             }
+            for class in self.mirror.take_unknown_classes() {
+                tracing::warn!(
+                    class,
+                    "no parameter set lists this vehicle class: the default set is taken"
+                );
+            }
         }
         Ok(())
     }
@@ -211,6 +220,7 @@ impl Core {
     fn write_part(&mut self) -> Result<(), Failure> {
         let collisions = self.contacts.as_mut().map(Contacts::finish).transpose()?;
         self.session.write_part(&Part {
+            tracking: self.mirror.tracking().summary(),
             resynchronisations: self.mirror.resynchronisations(),
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
