@@ -35,6 +35,7 @@ fn main() {
         max_decel_mps2: 10.0,
         steering_ratio: 15.0,
         resynchronise_m: 5.0,
+        leave_path_m: 5.0,
     };
     let catalogue = Catalogue::new().unwrap();
     let set = &catalogue.sets()[catalogue.choose(b"passenger", 4.8).set];
