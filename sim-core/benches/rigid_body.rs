@@ -34,7 +34,7 @@ fn main() {
         max_accel_mps2: 6.0,
         max_decel_mps2: 10.0,
         steering_ratio: 15.0,
-        resynchronise_m: 5.0,
+        resynchronise_m: 2.0,
         leave_path_m: 5.0,
     };
     let catalogue = Catalogue::new().unwrap();

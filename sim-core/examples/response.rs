@@ -33,7 +33,7 @@ const LIMITS: config::Vehicle = config::Vehicle {
     max_accel_mps2: 6.0,
     max_decel_mps2: 10.0,
     steering_ratio: 15.0,
-    resynchronise_m: 5.0,
+    resynchronise_m: 2.0,
     leave_path_m: 5.0,
 };
 

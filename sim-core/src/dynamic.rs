@@ -35,10 +35,14 @@ pub const GRAVITY_MPS2: f64 = 9.81;
 pub const SLIP_SPEED_MPS: f64 = 1.0;
 /// Share of the friction that brakes and drive may use (anti-lock, traction control); the rest is left for steering.
 const LONGITUDINAL_SHARE: f64 = 0.95;
+/// Lateral grip of the front axle by that of the rear: cars are built to slide over their front wheels first.
+const FRONT_GRIP: f64 = 0.95;
 /// Least vertical load of an axle by mass, m/s²: none lifts off.
 pub(crate) const LEAST_LOAD_MPS2: f64 = 0.5;
 /// A standing vehicle that slides and turns by less than this rests (m/s and rad/s).
 pub(crate) const RESTING: f64 = 0.02;
+/// Square of the lateral force that is always left, m²/s⁴.
+const LEAST_FORCE_SQUARED: f64 = 1e-4;
 /// γ of ROS2: 1 − 1/√2.
 const GAMMA: f64 = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
 
@@ -121,6 +125,9 @@ pub struct DynamicParams {
     pub max_jerk_mps3: f64,
     /// Largest curvature of the rear axle's way, 1/m.
     pub max_curvature_per_m: f64,
+    /// How the front bumper answers to forces by mass: 1 / (1 + x m/I lf) of the front and (1 − x m/I lr) of the rear axle, with the
+    /// bumper x ahead of the centre of gravity.
+    pub bumper: [f64; 2],
 }
 
 /// Density of air, kg/m³ (ISO 2533, 15 °C at sea level).
@@ -132,11 +139,18 @@ impl DynamicParams {
     #[must_use]
     pub fn new(set: &Set, body: &Dimensions, limits: &config::Vehicle, surface: f64, dt_s: f64) -> Self {
         let mass_kg = set.mass_kg(body);
+        let cg_to_rear_m = set.front_load_share * body.wheelbase_m;
+        let mass_by_inertia_per_m2 = 1.0 / set.yaw_inertia_by_mass_m2(body);
+        let leverage = (body.front_m() - cg_to_rear_m) * mass_by_inertia_per_m2;
         let max_road_wheel_angle_rad = set.max_road_wheel_angle_rad.min(limits.max_road_wheel_angle_rad);
         Self {
             wheelbase_m: body.wheelbase_m,
-            cg_to_rear_m: set.front_load_share * body.wheelbase_m,
-            mass_by_inertia_per_m2: 1.0 / set.yaw_inertia_by_mass_m2(body),
+            cg_to_rear_m,
+            mass_by_inertia_per_m2,
+            bumper: [
+                1.0 / (1.0 + leverage * (body.wheelbase_m - cg_to_rear_m)),
+                1.0 - leverage * cg_to_rear_m,
+            ],
             height_by_wheelbase: set.cg_height_m(body) / body.wheelbase_m,
             stiffness_per_rad: [
                 set.cornering_stiffness_front_per_rad,
@@ -226,67 +240,75 @@ impl DynamicParams {
     #[inline(always)]
     pub fn step(&self, state: &State, input: &Input, slope_sin: f64, dt_s: f64) -> (State, Motion) {
         let angle = self.road_wheel_angle_after(state, input.road_wheel_angle_rad, dt_s);
-        let (sin, cos) = sin_cos_small(0.5 * (state.road_wheel_angle_rad + angle));
         let wanted = self.accel_after(state, input.accel_mps2, dt_s);
-        let loads = self.loads_mps2(state.accel_mps2);
-        let lateral = state.lateral_mps + self.cg_to_rear_m * state.yaw_rate_radps;
-        let before = Slipping {
-            lateral_mps: lateral,
-            yaw_rate_radps: state.yaw_rate_radps,
-        };
-        let mut wheels = Wheels {
-            sin,
-            cos,
-            speed_mps: state.speed_mps,
-            drive_front_mps2: 0.0,
-            stiffness: [
-                self.stiffness_per_rad[0] * loads[0],
-                self.stiffness_per_rad[1] * loads[1],
-            ],
-            most: loads.map(|load| self.friction * load),
-        };
         let resistance = self.drag_by_mass_per_m * state.speed_mps * state.speed_mps
             + pick(state.speed_mps > 0.0, self.rolling_mps2, 0.0)
             + GRAVITY_MPS2 * slope_sin;
-        // The driver makes up for what cornering costs.
-        let cornering = self.forces(&wheels, &before).lateral_mps2[0] * sin - before.yaw_rate_radps * lateral;
-        let most = smaller(
-            self.max_power_by_mass / larger(state.speed_mps, 1.0),
-            self.max_accel_mps2 + larger(resistance, 0.0),
-        );
-        let total = bound(wanted + resistance + cornering, -self.max_decel_mps2, most);
-        let [front, rear] = self.axle_forces(total, loads);
-        let left = |most: f64, used: f64| larger(most * most - used * used, 0.0).sqrt();
-        wheels.most = [left(wheels.most[0], front), left(wheels.most[1], rear)];
-        wheels.drive_front_mps2 = front;
-        let accel = front * cos + rear - self.forces(&wheels, &before).lateral_mps2[0] * sin
-            + before.yaw_rate_radps * lateral
-            - resistance;
-        let speed = state.speed_mps + 0.5 * (state.accel_mps2 + accel) * dt_s;
+        let before = Slipping {
+            lateral_mps: state.lateral_mps + self.cg_to_rear_m * state.yaw_rate_radps,
+            yaw_rate_radps: state.yaw_rate_radps,
+        };
+        let loads = self.loads_mps2(state.accel_mps2);
+        let level = self.axle_forces(self.force(state, wanted + resistance, resistance), loads);
+        let wheels = self.wheels(state, angle, loads, level, dt_s);
+        let start = self.forces(&wheels, &before);
+        // What cornering costs, and the driver makes up for.
+        let cornering = start.lateral_front_mps2 * wheels.sin - before.yaw_rate_radps * before.lateral_mps;
+        let [front, rear] = self.axle_forces(self.force(state, wanted + resistance + cornering, resistance), loads);
+        let accel = front * wheels.cos + rear - cornering - resistance;
+        // What the driver gets is the actuator's state; the losses beyond it are not, or they would add up.
+        let got = front + rear - cornering - resistance;
+        let speed = state.speed_mps + (accel - 0.5 * (got - state.accel_mps2)) * dt_s;
         let stands = (speed <= 0.0) | ((speed < STANDSTILL_MPS) & (input.accel_mps2 <= 0.0));
-        let (speed, accel) = (pick(stands, 0.0, speed), pick(stands, 0.0, accel));
-        wheels.speed_mps = 0.5 * (state.speed_mps + speed);
-        let after = self.slip_after(&wheels, &before, dt_s);
+        let after = self.slip_after(&wheels, &before, &start, dt_s);
         // A body that still slides sideways is stopped by its tyres alone.
         let rests = stands & (after.lateral_mps.abs() + after.yaw_rate_radps.abs() < RESTING);
         let after = Slipping {
             lateral_mps: pick(rests, 0.0, after.lateral_mps),
             yaw_rate_radps: pick(rests, 0.0, after.yaw_rate_radps),
         };
-        let felt = (after.lateral_mps - before.lateral_mps) / dt_s
+        let felt = (after.lateral_mps - before.lateral_mps) * (1.0 / dt_s)
             + 0.5 * (after.yaw_rate_radps + before.yaw_rate_radps) * wheels.speed_mps;
+        let got = pick(stands, 0.0, got);
         let mut next = State {
-            speed_mps: speed,
-            accel_mps2: accel,
+            speed_mps: pick(stands, 0.0, speed),
+            accel_mps2: got,
             road_wheel_angle_rad: angle,
             lateral_mps: after.lateral_mps - self.cg_to_rear_m * after.yaw_rate_radps,
             yaw_rate_radps: after.yaw_rate_radps,
             roll: self.roll.after(state.roll, pick(rests, 0.0, felt)),
-            pitch: self.pitch.after(state.pitch, accel),
+            pitch: self.pitch.after(state.pitch, got),
             ..*state
         };
         let motion = carry(state, &mut next, dt_s);
         (next, motion)
+    }
+
+    /// The force by mass that drive and brakes give when `wanted_mps2` is asked for, against a `resistance`.
+    #[inline(always)]
+    fn force(&self, state: &State, wanted_mps2: f64, resistance: f64) -> f64 {
+        let power = self.max_power_by_mass / larger(state.speed_mps, 1.0);
+        let most = smaller(power, self.max_accel_mps2 + larger(resistance, 0.0));
+        bound(wanted_mps2, -self.max_decel_mps2, most)
+    }
+
+    /// The wheels of one sub-step, with angle and speed half-way.
+    #[inline(always)]
+    fn wheels(&self, state: &State, angle: f64, loads: [f64; 2], used: [f64; 2], dt_s: f64) -> Wheels {
+        let (sin, cos) = sin_cos_small(0.5 * (state.road_wheel_angle_rad + angle));
+        let speed_mps = larger(state.speed_mps + 0.5 * state.accel_mps2 * dt_s, 0.0);
+        Wheels {
+            sin,
+            cos,
+            speed_mps,
+            rear_inverse: 1.0 / larger(speed_mps, SLIP_SPEED_MPS),
+            drive_front_mps2: used[0],
+            stiffness: [0, 1].map(|axle: usize| self.stiffness_per_rad[axle] * loads[axle]),
+            most_squared: [0, 1].map(|axle: usize| {
+                let most = [FRONT_GRIP, 1.0][axle] * self.friction * loads[axle];
+                larger(most * most - used[axle] * used[axle], LEAST_FORCE_SQUARED)
+            }),
+        }
     }
 
     /// What the tyres do at this slip, and how it changes.
@@ -299,29 +321,30 @@ impl DynamicParams {
         let at_front = slipping.lateral_mps + lf * slipping.yaw_rate_radps;
         let at_rear = slipping.lateral_mps - lr * slipping.yaw_rate_radps;
         let front_inverse = 1.0 / larger(speed_mps * cos + at_front * sin, SLIP_SPEED_MPS);
-        let rear_inverse = 1.0 / larger(speed_mps, SLIP_SPEED_MPS);
         let slips = [
             (speed_mps * sin - at_front * cos) * front_inverse,
-            -at_rear * rear_inverse,
+            -at_rear * wheels.rear_inverse,
         ];
         let [front, rear] = [0, 1].map(|axle: usize| {
             let linear = wheels.stiffness[axle] * slips[axle];
-            let saturation = linear / larger(wheels.most[axle], LEAST_LOAD_MPS2 * 0.01);
-            let factor = 1.0 / (1.0 + saturation * saturation).sqrt();
-            (linear * factor, wheels.stiffness[axle] * factor * factor * factor)
+            // cos² of the magic formula's angle: most² / (most² + linear²).
+            let square = wheels.most_squared[axle] / (wheels.most_squared[axle] + linear * linear);
+            let factor = square.sqrt();
+            (linear * factor, wheels.stiffness[axle] * square * factor)
         });
         let across_front = front.0 * cos + wheels.drive_front_mps2 * sin;
-        let falls = [front.1 * cos * cos * front_inverse, rear.1 * rear_inverse];
+        let falls = [front.1 * cos * cos * front_inverse, rear.1 * wheels.rear_inverse];
+        let turning = lr * falls[1] - lf * falls[0];
         Forces {
-            lateral_mps2: [front.0, rear.0],
+            lateral_front_mps2: front.0,
             rates: [
                 across_front + rear.0 - slipping.yaw_rate_radps * speed_mps,
                 self.mass_by_inertia_per_m2 * (lf * across_front - lr * rear.0),
             ],
             jacobian: [
-                [-(falls[0] + falls[1]), lr * falls[1] - lf * falls[0] - speed_mps],
+                [-(falls[0] + falls[1]), turning - speed_mps],
                 [
-                    self.mass_by_inertia_per_m2 * (lr * falls[1] - lf * falls[0]),
+                    self.mass_by_inertia_per_m2 * turning,
                     -self.mass_by_inertia_per_m2 * (lf * lf * falls[0] + lr * lr * falls[1]),
                 ],
             ],
@@ -330,8 +353,7 @@ impl DynamicParams {
 
     /// One step of ROS2.
     #[inline(always)]
-    fn slip_after(&self, wheels: &Wheels, before: &Slipping, dt_s: f64) -> Slipping {
-        let start = self.forces(wheels, before);
+    fn slip_after(&self, wheels: &Wheels, before: &Slipping, start: &Forces, dt_s: f64) -> Slipping {
         let scale = GAMMA * dt_s;
         let [[a, b], [c, d]] = start.jacobian;
         let (a, b, c, d) = (1.0 - scale * a, -scale * b, -scale * c, 1.0 - scale * d);
@@ -366,16 +388,18 @@ struct Wheels {
     sin: f64,
     cos: f64,
     speed_mps: f64,
+    /// 1 / speed of the rear wheels for their slip, s/m.
+    rear_inverse: f64,
     drive_front_mps2: f64,
     /// Lateral force by slip, front and rear, m/s².
     stiffness: [f64; 2],
-    /// Greatest lateral force, m/s².
-    most: [f64; 2],
+    /// Square of the greatest lateral force, m²/s⁴.
+    most_squared: [f64; 2],
 }
 
-/// Lateral forces by mass, and the rates of [`Slipping`] with their derivatives.
+/// Lateral force of the front axle by mass, and the rates of [`Slipping`] with their derivatives.
 struct Forces {
-    lateral_mps2: [f64; 2],
+    lateral_front_mps2: f64,
     rates: [f64; 2],
     jacobian: [[f64; 2]; 2],
 }

@@ -85,8 +85,8 @@ impl Governor {
             push = [0, 1].map(|axis: usize| push[axis] + (held[axis] - wanted[axis]) / mean);
         }
         let before = *self;
-        for axis in 0..2 {
-            self.rate_mps[axis] += push[axis] * tick_s;
+        for (axis, push) in push.into_iter().enumerate() {
+            self.rate_mps[axis] += push * tick_s;
             self.offset_m[axis] += 0.5 * tick_s * (first * before.rate_mps[axis] + last * self.rate_mps[axis]);
         }
         if norm(self.offset_m) < NONE && norm(self.rate_mps) < NONE {

@@ -6,6 +6,7 @@
 //! same bits as alone, on any machine.
 
 use bytemuck::Pod;
+use ipc_schema::world::SubStep;
 
 use crate::{
     attitude::{Lean, angular_rate, body_from_level, half_way},
@@ -30,6 +31,8 @@ type Lane = [f64; LANES];
 const STATE: usize = size_of::<State>() / 8;
 const CURVE: usize = size_of::<Curve>() / 8;
 const RISE: usize = size_of::<Rise>() / 8;
+/// Numbers in a [`SubStep`].
+const SUB_STEP: usize = size_of::<SubStep>() / 4;
 
 /// A model with `N` parameters that can run in lanes: free of branches.
 pub trait Drive<const N: usize>: Pod {
@@ -105,47 +108,8 @@ impl Drive<DYNAMIC> for DynamicParams {
     }
 }
 
-/// Motion of all lanes over one sub-step, with the state at its end.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Row {
-    /// Rear axle, metres.
-    pub x_m: Lane,
-    /// Rear axle, metres.
-    pub y_m: Lane,
-    /// Rear axle, above the front bumper's place at the start of the tick, metres.
-    pub z_m: Lane,
-    /// Radians, not wrapped.
-    pub yaw_rad: Lane,
-    /// Radians.
-    pub roll_rad: Lane,
-    /// Radians.
-    pub pitch_rad: Lane,
-    /// m/s.
-    pub speed_mps: Lane,
-    /// To the left, m/s.
-    pub lateral_mps: Lane,
-    /// Upwards, m/s.
-    pub climb_mps: Lane,
-    /// In the axes of the body, m/s².
-    pub accel_mps2: [Lane; 3],
-    /// In the axes of the body, rad/s.
-    pub rate_radps: [Lane; 3],
-    /// Radians.
-    pub road_wheel_angle_rad: Lane,
-}
-
-/// What a lane is loaded with.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Load<'a> {
-    /// The vehicle at the start of the tick.
-    pub state: &'a State,
-    /// Where its front bumper should be.
-    pub curve: Curve,
-    /// The road under it.
-    pub rise: Rise,
-    /// Rear axle to front bumper, metres.
-    pub front_m: f64,
-}
+/// Motion of all lanes over one sub-step in the order of [`SubStep`]; the first four fields count from the start of the tick.
+pub type Row = [[f32; LANES]; SUB_STEP];
 
 /// Vehicles of one model side by side.
 #[derive(Debug, Clone)]
@@ -158,6 +122,8 @@ pub struct Lanes<P, const N: usize> {
     /// Height of the rear axle above the front bumper's place at the start of the tick (metres), its rate (m/s), and the pitch
     /// of the road (radians).
     road: [Lane; 3],
+    /// x, y, z and yaw at the start of the tick.
+    origin: [Lane; 4],
     /// What moved, one for each sub-step.
     pub rows: Vec<Row>,
     model: std::marker::PhantomData<P>,
@@ -188,7 +154,8 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
             front_m: [1.0; LANES],
             params: P::empty().map(|value| [value; LANES]),
             road: [zero; 3],
-            rows: vec![Row::default(); sub_steps],
+            origin: [zero; 4],
+            rows: vec![[[0.0; LANES]; SUB_STEP]; sub_steps],
             model: std::marker::PhantomData,
         };
         let standing = State::new(0.0, 0.0, 0.0, 0.0);
@@ -196,13 +163,31 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
         lanes
     }
 
-    /// Puts a vehicle and its reference into a lane.
-    pub fn load(&mut self, lane: usize, params: &P, load: &Load<'_>) {
-        scatter(&mut self.state, lane, load.state);
-        scatter(&mut self.curve, lane, &load.curve);
-        scatter(&mut self.rise, lane, &load.rise);
+    /// Puts a vehicle into a lane, with its reference and the road under its front bumper, `front_m` ahead of the rear axle.
+    pub fn load(&mut self, lane: usize, params: &P, state: &State, reference: (&Curve, &Rise), front_m: f64) {
+        scatter(&mut self.state, lane, state);
+        scatter(&mut self.curve, lane, reference.0);
+        scatter(&mut self.rise, lane, reference.1);
         scatter(&mut self.params, lane, params);
-        self.front_m[lane] = load.front_m;
+        self.front_m[lane] = front_m;
+    }
+
+    /// Writes the sub-steps of the vehicle in a lane, relative to the last of them.
+    pub fn write(&self, lane: usize, rows: &mut [SubStep]) {
+        let Some(last) = self.rows.last() else { return };
+        let end: [f32; 4] = std::array::from_fn(|i| last[i][lane]);
+        for (row, moved) in rows.iter_mut().zip(&self.rows) {
+            let mut numbers: [f32; SUB_STEP] = std::array::from_fn(|i| moved[i][lane]);
+            numbers.iter_mut().zip(end).for_each(|(number, end)| *number -= end);
+            *row = bytemuck::must_cast(numbers);
+        }
+    }
+
+    /// Height of the rear axle above the front bumper's place at the start of the tick (metres), its rate (m/s), and the pitch of
+    /// the road (radians), at the end of the tick.
+    #[must_use]
+    pub fn road(&self, lane: usize) -> [f64; 3] {
+        gather(&self.road, lane)
     }
 
     /// The state of the vehicle in a lane.
@@ -267,7 +252,9 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
     fn start_road(&mut self) {
         for lane in 0..LANES {
             let road = road_at(&gather(&self.rise, lane), self.front_m[lane], 0.0);
-            (0..3).for_each(|i| self.road[i][lane] = road[i]);
+            scatter(&mut self.road, lane, &road);
+            let state: State = gather(&self.state, lane);
+            scatter(&mut self.origin, lane, &[state.x_m, state.y_m, road[0], state.yaw_rad]);
         }
     }
 
@@ -285,20 +272,28 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
             let felt = Felt::new([&state, &next], [road, road_next], &motion, dt_s);
             scatter(&mut self.state, lane, &next);
             scatter(&mut self.road, lane, &road_next);
-            row.x_m[lane] = next.x_m;
-            row.y_m[lane] = next.y_m;
-            row.z_m[lane] = road_next[0];
-            row.yaw_rad[lane] = next.yaw_rad;
-            row.roll_rad[lane] = felt.lean.roll_rad;
-            row.pitch_rad[lane] = felt.lean.pitch_rad;
-            row.speed_mps[lane] = next.speed_mps;
-            row.lateral_mps[lane] = next.lateral_mps;
-            row.climb_mps[lane] = road_next[1];
-            for axis in 0..3 {
-                row.accel_mps2[axis][lane] = felt.accel_mps2[axis];
-                row.rate_radps[axis][lane] = felt.rate_radps[axis];
+            let origin: [f64; 4] = gather(&self.origin, lane);
+            let numbers = [
+                next.x_m - origin[0],
+                next.y_m - origin[1],
+                road_next[0] - origin[2],
+                next.yaw_rad - origin[3],
+                felt.lean.roll_rad,
+                felt.lean.pitch_rad,
+                next.speed_mps,
+                next.lateral_mps,
+                felt.accel_mps2[0],
+                felt.accel_mps2[1],
+                felt.accel_mps2[2],
+                felt.rate_radps[0],
+                felt.rate_radps[1],
+                felt.rate_radps[2],
+                next.road_wheel_angle_rad,
+                0.0,
+            ];
+            for (field, number) in row.iter_mut().zip(numbers) {
+                field[lane] = number as f32;
             }
-            row.road_wheel_angle_rad[lane] = next.road_wheel_angle_rad;
         }
     }
 }
@@ -372,17 +367,6 @@ mod tests {
         body: Dimensions,
     }
 
-    impl Case {
-        fn load(&self) -> Load<'_> {
-            Load {
-                state: &self.state,
-                curve: self.curve,
-                rise: self.rise,
-                front_m: self.body.front_m(),
-            }
-        }
-    }
-
     fn case() -> impl Strategy<Value = Case> {
         let state = (
             -3.1_f64..3.1,
@@ -445,7 +429,13 @@ mod tests {
     fn compare<P: Drive<N>, const N: usize>(cases: &[Case], params: &[P]) -> Result<(), TestCaseError> {
         let mut lanes: Lanes<P, N> = Lanes::new(10);
         for (lane, (case, params)) in cases.iter().zip(params).enumerate() {
-            lanes.load(lane, params, &case.load());
+            lanes.load(
+                lane,
+                params,
+                &case.state,
+                (&case.curve, &case.rise),
+                case.body.front_m(),
+            );
         }
         let mut baseline = lanes.clone();
         lanes.advance(0.01);
@@ -453,11 +443,14 @@ mod tests {
         prop_assert_eq!(&lanes.rows, &baseline.rows, "whatever the processor's vectors");
         for (lane, (case, params)) in cases.iter().zip(params).enumerate() {
             let steps = alone(case, params, 10);
-            for ((state, _), row) in steps.iter().zip(&lanes.rows) {
-                prop_assert_eq!(state.x_m.to_bits(), row.x_m[lane].to_bits());
-                prop_assert_eq!(state.yaw_rad.to_bits(), row.yaw_rad[lane].to_bits());
-                prop_assert_eq!(state.lateral_mps.to_bits(), row.lateral_mps[lane].to_bits());
-                prop_assert_eq!(state.roll[0].to_bits(), row.roll_rad[lane].to_bits());
+            let mut rows = [SubStep::default(); 10];
+            lanes.write(lane, &mut rows);
+            for ((state, _), row) in steps.iter().zip(&rows) {
+                prop_assert!((f64::from(row.dx_m) - (state.x_m - steps[9].0.x_m)).abs() < 1e-5);
+                prop_assert!((f64::from(row.dyaw_rad) - (state.yaw_rad - steps[9].0.yaw_rad)).abs() < 1e-6);
+                prop_assert_eq!(row.lateral_speed_mps, state.lateral_mps as f32);
+                prop_assert_eq!(row.roll_rad, state.roll[0] as f32);
+                prop_assert_eq!(row.road_wheel_angle_rad, state.road_wheel_angle_rad as f32);
             }
             prop_assert_eq!(steps[9].0, lanes.state(lane));
         }

@@ -164,14 +164,19 @@ impl Path {
         (self.height_m + self.rise.at(start_s)[0], self.rise.from_time(start_s))
     }
 
-    /// How far the reference is from SUMO's own path `t_s` after the start of the step, at most: what is left of a lane change,
+    /// How far the reference is from SUMO's own path `t_s` after the start of the step of `step_s`, at most: what is left of a lane change,
     /// what the curve cuts off the corner, and what could not be driven, metres.
     #[must_use]
-    pub fn offset_m(&self, t_s: f64) -> f64 {
+    pub fn offset_m(&self, t_s: f64, step_s: f64) -> f64 {
+        let undriven = self.lane_change.remaining()[0].abs() + self.governor.distance_m();
+        if t_s >= step_s {
+            // The curve touches the path in the middle of each chord, where a step ends.
+            return undriven;
+        }
         let point = self.curve.at(t_s).position_m;
         let [start, corner, end] = self.chords;
         let cut = distance_m(point, start, corner).min(distance_m(point, corner, end));
-        cut + self.lane_change.remaining()[0].abs() + self.governor.distance_m()
+        cut + undriven
     }
 
     /// From the middle of the last chord to the middle of this one.

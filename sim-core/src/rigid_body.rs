@@ -14,6 +14,8 @@
 //! All state is in [`RigidState`], in the frame of the road: the slope tilts gravity, not the ground. rapier's world is only a
 //! workshop that is laid out anew in every sub-step, near its origin, so that nothing is lost to rounding far from it.
 
+use std::f64::consts::{FRAC_PI_4, TAU};
+
 use ipc_schema::config;
 use rapier3d_f64::{
     control::{DynamicRayCastVehicleController, WheelTuning},
@@ -76,6 +78,14 @@ impl From<State> for RigidState {
             heave: [0.0; 2],
             drive_mps2: level.accel_mps2,
         }
+    }
+}
+
+impl RigidState {
+    /// True if the body does not come back onto its wheels: it leans by more than 45°.
+    #[must_use]
+    pub fn is_overturned(&self) -> bool {
+        self.level.roll[0].abs() > FRAC_PI_4 || self.level.pitch[0].abs() > FRAC_PI_4
     }
 }
 
@@ -197,24 +207,27 @@ impl RigidBody {
             state.speed_mps * cos + at_front * sin,
             at_front * cos - state.speed_mps * sin,
         ];
-        let lateral = tyre(
-            params.stiffness_per_rad[0] * loads[0],
-            params.friction * loads[0],
-            front_mps,
-        );
         let at_cg = state.lateral_mps + params.cg_to_rear_m * state.yaw_rate_radps;
-        let cornering = lateral * sin - state.yaw_rate_radps * at_cg;
         let most = smaller(
             params.max_power_by_mass / larger(state.speed_mps, 1.0),
             params.max_accel_mps2 + larger(opposing, 0.0),
         );
-        let total = bound(wanted + opposing + cornering, -params.max_decel_mps2, most);
-        let [front_mps2, rear_mps2] = params.axle_forces(total, loads);
+        let grip = params.friction * loads[0];
+        let mut forces = [0.0; 2];
+        let mut cornering = 0.0;
+        // Twice: what cornering costs depends on the lateral force that driving leaves to the front tyres.
+        for _ in 0..2 {
+            let left = larger(grip * grip - forces[0] * forces[0], 0.0).sqrt();
+            let lateral = tyre(params.stiffness_per_rad[0] * loads[0], left, front_mps);
+            cornering = lateral * sin - state.yaw_rate_radps * at_cg;
+            let total = bound(wanted + opposing + cornering, -params.max_decel_mps2, most);
+            forces = params.axle_forces(total, loads);
+        }
         Drive {
-            front_mps2,
-            rear_mps2,
+            front_mps2: forces[0],
+            rear_mps2: forces[1],
             resistance_mps2,
-            got_mps2: front_mps2 + rear_mps2 - opposing - cornering,
+            got_mps2: forces[0] + forces[1] - opposing - cornering,
         }
     }
 
@@ -360,8 +373,8 @@ struct Suspension {
 impl Suspension {
     fn new(set: &Set, params: &DynamicParams, body: &Dimensions, height_m: f64, dt_s: f64) -> Self {
         let track = TRACK_BY_WIDTH * body.width_m;
-        let roll_natural = std::f64::consts::TAU * set.roll_frequency_hz;
-        let pitch_natural = std::f64::consts::TAU * set.pitch_frequency_hz;
+        let roll_natural = TAU * set.roll_frequency_hz;
+        let pitch_natural = TAU * set.pitch_frequency_hz;
         // What is left of the springs' moment after that of the weight.
         let roll_moment = height_m / set.roll_per_mps2_rad;
         let spring = (roll_moment + GRAVITY_MPS2 * height_m) / (track * track);

@@ -11,7 +11,7 @@ use crate::{
     curve::Curve,
     dimensions::Dimensions,
     fleet::{Fleet, FleetError},
-    lanes::{Drive, Lanes, Load},
+    lanes::{Drive, Lanes},
     person::Person,
     reference::{Join, Path},
     tracking,
@@ -68,6 +68,10 @@ enum Arrival {
 }
 
 /// What moves a road user.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "nearly all road users are vehicles, and a box would cost each a cache miss"
+)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Mover {
     /// A vehicle that tracks SUMO's front bumper.
@@ -183,13 +187,9 @@ impl RoadUser {
         if let Mover::Vehicle { state, path } = &mut self.mover {
             let start_s = f64::from(tick) * settings.tick_s;
             let spread_s = settings.vehicle.lane_change_s;
-            let load = Load {
-                state,
-                curve: path.tick(start_s, settings.tick_s, state.speed_mps, spread_s, &params.ability()),
-                rise: path.road(start_s).1,
-                front_m: self.dimensions.front_m(),
-            };
-            lanes.load(lane, params, &load);
+            let curve = path.tick(start_s, settings.tick_s, state.speed_mps, spread_s, &params.ability());
+            let rise = path.road(start_s).1;
+            lanes.load(lane, params, state, (&curve, &rise), self.dimensions.front_m());
         }
     }
 
@@ -212,10 +212,10 @@ impl RoadUser {
         *state = lanes.state(lane);
         let start_s = f64::from(tick) * settings.tick_s;
         let end_s = start_s + settings.tick_s;
-        write_rows(lanes, lane, path.road(start_s).0, out, rows);
         *state = state.settled();
-        out.yaw_rad = state.yaw_rad;
-        out.reference_offset_m = path.offset_m(end_s) as f32;
+        lanes.write(lane, rows);
+        write_moved(state, lanes.road(lane), path.road(start_s).0, rows, out);
+        out.reference_offset_m = path.offset_m(end_s, settings.step_s()) as f32;
         let target = lanes.curve(lane).at(settings.tick_s);
         let error = tracking::error(state, front_m, &target);
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;
@@ -296,46 +296,26 @@ impl RoadUser {
     }
 }
 
-/// Writes a lane: the sub-steps relative to the last of them, and the last of them as the state at the end of the tick.
-/// `height_m` is that of the road under the front bumper at the start of the tick.
-fn write_rows<P: Drive<N>, const N: usize>(
-    lanes: &Lanes<P, N>,
-    lane: usize,
-    height_m: f64,
-    out: &mut VehicleState,
-    rows: &mut [SubStep],
-) {
-    let Some(end) = lanes.rows.last() else { return };
-    for (row, moved) in rows.iter_mut().zip(&lanes.rows) {
-        *row = SubStep {
-            dx_m: (moved.x_m[lane] - end.x_m[lane]) as f32,
-            dy_m: (moved.y_m[lane] - end.y_m[lane]) as f32,
-            dz_m: (moved.z_m[lane] - end.z_m[lane]) as f32,
-            dyaw_rad: (moved.yaw_rad[lane] - end.yaw_rad[lane]) as f32,
-            roll_rad: moved.roll_rad[lane] as f32,
-            pitch_rad: moved.pitch_rad[lane] as f32,
-            speed_mps: moved.speed_mps[lane] as f32,
-            lateral_speed_mps: moved.lateral_mps[lane] as f32,
-            accel_body_mps2: moved.accel_mps2.map(|axis| axis[lane] as f32),
-            angular_rate_body_radps: moved.rate_radps.map(|axis| axis[lane] as f32),
-            road_wheel_angle_rad: moved.road_wheel_angle_rad[lane] as f32,
-            reserved: 0,
-        };
-    }
-    out.x_m = end.x_m[lane];
-    out.y_m = end.y_m[lane];
-    out.z_m = height_m + end.z_m[lane];
+/// Writes the state at the end of a tick: `road` is that of the lane (see [`Lanes::road`]), `height_m` that of the road under the
+/// front bumper at the start of the tick.
+fn write_moved(state: &State, road: [f64; 3], height_m: f64, rows: &[SubStep], out: &mut VehicleState) {
     let lean = Lean {
-        roll_rad: end.roll_rad[lane],
-        pitch_rad: end.pitch_rad[lane],
+        roll_rad: state.roll[0],
+        pitch_rad: state.pitch[0] + road[2],
     };
+    out.x_m = state.x_m;
+    out.y_m = state.y_m;
+    out.z_m = height_m + road[0];
+    out.yaw_rad = state.yaw_rad;
     out.roll_rad = lean.roll_rad as f32;
     out.pitch_rad = lean.pitch_rad as f32;
-    let velocity = [end.speed_mps[lane], end.lateral_mps[lane], end.climb_mps[lane]];
+    let velocity = [state.speed_mps, state.lateral_mps, road[1]];
     out.velocity_body_mps = body_from_level(&lean, velocity).map(|part| part as f32);
-    out.road_wheel_angle_rad = end.road_wheel_angle_rad[lane] as f32;
-    out.accel_body_mps2 = end.accel_mps2.map(|axis| axis[lane] as f32);
-    out.angular_rate_body_radps = end.rate_radps.map(|axis| axis[lane] as f32);
+    out.road_wheel_angle_rad = state.road_wheel_angle_rad as f32;
+    if let Some(last) = rows.last() {
+        out.accel_body_mps2 = last.accel_body_mps2;
+        out.angular_rate_body_radps = last.angular_rate_body_radps;
+    }
 }
 
 /// A state with the front bumper at the start of the curve, rolling straight ahead.

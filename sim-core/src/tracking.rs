@@ -176,7 +176,7 @@ pub fn demand_with_tyres(params: &DynamicParams, front_m: f64, state: &State, ta
     let wanted = bound(wanted, -driven.max_lateral_mps2, driven.max_lateral_mps2);
     let across = vy * cos - vx * sin;
     let rolling = steering_demand(&driven, state, [along, across], error.lateral_m);
-    let slipping = angle_for(params, front_m, state, wanted);
+    let slipping = angle_for(params, state, wanted);
     let share = bound((state.speed_mps - ROLLING_MPS) * (1.0 / ROLLING_MPS), 0.0, 1.0);
     Input {
         accel_mps2: accel_demand(&driven, state, target.accel_mps2, along, error.longitudinal_m),
@@ -186,18 +186,18 @@ pub fn demand_with_tyres(params: &DynamicParams, front_m: f64, state: &State, ta
 
 /// Road-wheel angle that accelerates the front bumper to the left by `wanted_mps2`.
 #[inline(always)]
-fn angle_for(params: &DynamicParams, front_m: f64, state: &State, wanted_mps2: f64) -> f64 {
-    let (lf, lr) = (params.cg_to_front_m(), params.cg_to_rear_m);
-    let ahead_of_cg = (front_m - lr) * params.mass_by_inertia_per_m2;
+fn angle_for(params: &DynamicParams, state: &State, wanted_mps2: f64) -> f64 {
     let loads = params.loads_mps2(state.accel_mps2);
-    let pace = larger(state.speed_mps, SLIP_SPEED_MPS);
-    let rear_linear = -params.stiffness_per_rad[1] * loads[1] * state.lateral_mps / pace;
-    let rear_share = rear_linear / (params.friction * loads[1]);
-    let rear = rear_linear / (1.0 + rear_share * rear_share).sqrt();
-    let front = (wanted_mps2 - rear * (1.0 - ahead_of_cg * lr)) / (1.0 + ahead_of_cg * lf);
+    let moving = 1.0 / larger(state.speed_mps, HOLD_MPS);
+    let pace = larger(state.speed_mps, SLIP_SPEED_MPS) * moving;
+    let rear_linear =
+        -params.stiffness_per_rad[1] * loads[1] * state.lateral_mps * smaller(moving, 1.0 / SLIP_SPEED_MPS);
+    let rear_most = params.friction * loads[1];
+    let rear_square = rear_most * rear_most;
+    let rear = rear_linear * (rear_square / (rear_square + rear_linear * rear_linear)).sqrt();
+    let front = (wanted_mps2 - rear * params.bumper[1]) * params.bumper[0];
     let share = bound(front / (params.friction * loads[0]), -FRICTION_SHARE, FRICTION_SHARE);
     let slip = share * params.friction / (params.stiffness_per_rad[0] * (1.0 - share * share).sqrt());
-    let moving = larger(state.speed_mps, HOLD_MPS);
-    let direction = atan_demand((state.lateral_mps + params.wheelbase_m * state.yaw_rate_radps) / moving);
-    direction + slip * pace / moving
+    let direction = atan_demand((state.lateral_mps + params.wheelbase_m * state.yaw_rate_radps) * moving);
+    direction + slip * pace
 }
