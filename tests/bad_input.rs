@@ -60,6 +60,24 @@ fn wrong_unit_and_wrong_range() {
 }
 
 #[test]
+fn obstacle_that_is_no_prop() {
+    let workplace = Workplace::new();
+    workplace.write("my.toml", "[scene]\nobstacles = [\"cone 10 20\", \"conne 30 40 90\"]\n");
+    let said = refused(&workplace, &["simulate", "my.toml"], 2);
+    assert_says(
+        &said,
+        &[
+            "my.toml:2",
+            "`scene.obstacles`: \"conne 30 40 90\" names no known prop",
+            "props: cone, bollard",
+        ],
+    );
+    let said = refused(&workplace, &["simulate", "--set", "scene.obstacles=[\"cone here\"]"], 2);
+    assert_says(&said, &["\"cone here\" is not", "x and y in metres"]);
+    assert!(!workplace.path().join("runs").exists());
+}
+
+#[test]
 fn unknown_preset() {
     let workplace = Workplace::new();
     assert_says(

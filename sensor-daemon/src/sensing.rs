@@ -7,7 +7,7 @@ use ipc_schema::{
     observation::{CLIPPED, GNSS_COLUMNS, ObservationLayout, TRUTH_COLUMNS, VALID},
     run::MapInfo,
     traffic::Kind,
-    world::VehicleState,
+    world::{COLLIDED, VehicleState},
 };
 use sim_core::{
     displacement::DisplacementMap,
@@ -101,11 +101,14 @@ impl Sensing {
     }
 
     /// Gives every connected vehicle in `states` its slot; returns the number of slots, which is the observation's n.
+    ///
+    /// With `collision.ends_trajectory` a vehicle has no slot at the tick in which it collides, as if it had left: the slot it held
+    /// says [`ipc_schema::observation::TERMINATED`], and from the next tick on it holds one anew, as a trajectory of its own.
     pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
         self.row_of_slot.fill(None);
         for (row, state) in (0_u32..).zip(states) {
-            if state.kind == Kind::Cav as u32 {
+            if self.is_sensed(state) {
                 let slot = self.slots.occupy(state.vehicle);
                 if slot >= self.row_of_slot.len() {
                     self.row_of_slot.resize(slot + 1, None);
@@ -116,6 +119,11 @@ impl Sensing {
         }
         self.slots.end();
         self.slots.rows().len()
+    }
+
+    fn is_sensed(&self, state: &VehicleState) -> bool {
+        let collides = self.config.collision.ends_trajectory && state.flags & COLLIDED != 0;
+        state.kind == Kind::Cav as u32 && !collides
     }
 
     /// Samples what is due and writes the observation of the tick that [`Sensing::assign`] was called for.

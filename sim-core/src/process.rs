@@ -1,6 +1,6 @@
 //! The process: `traffic` and `traffic-meta` in, one `world` for each tick out.
 
-use std::path::Path;
+use std::{path::Path, sync::Arc};
 
 use ipc_schema::{
     block::{self, BlockError, Section},
@@ -11,11 +11,13 @@ use ipc_schema::{
     process::Process,
     services::Channel,
     session::{Session, Wait},
-    traffic::{Kind, TrafficState, VehicleMeta},
+    traffic::{Kind, TrafficMetaLayout, TrafficState, VehicleMeta},
 };
 
 use crate::{
+    collision::{CollisionCounts, Contacts},
     mirror::{Mirror, MirrorError, Settings},
+    scene::Scene,
     statistics::Summary,
 };
 
@@ -29,12 +31,17 @@ struct Part {
     resynchronisations: u64,
     vehicle_steps: u64,
     drops: u64,
+    /// Buildings and props in the scene.
+    buildings: usize,
+    props: usize,
+    /// Contacts that began, if anybody looked.
+    collisions: Option<CollisionCounts>,
 }
 
 /// Mirrors until the last tick of the run, or until the process is asked to stop.
 ///
 /// # Errors
-/// A port fails, or what SUMO sent cannot be mirrored.
+/// The scene's files or obstacles are wrong, a port fails, or what SUMO sent cannot be mirrored.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut session = Session::join(run_file, Process::SimCore, ENV_INDEX)?;
     let metas = session.subscriber(Channel::TrafficMeta)?;
@@ -60,6 +67,8 @@ struct Core {
     /// `traffic-meta` messages applied.
     meta_messages: u64,
     mirror: Mirror,
+    scene: Arc<Scene>,
+    contacts: Option<Contacts>,
     world: Publisher,
     consumer: BoardReader,
     consumer_wake: Waker,
@@ -73,6 +82,8 @@ impl Core {
         let world = session.publisher(Channel::World)?;
         let consumer = session.board_of(Process::SensorDaemon)?;
         let consumer_wake = session.waker(Process::SensorDaemon)?;
+        let scene = Arc::new(Scene::of_run(&session.run)?);
+        let contacts = Contacts::open(&session, Arc::clone(&scene))?;
         session.attach();
         let mirror = Mirror::new(Settings::of_run(&session.run))
             .map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
@@ -81,6 +92,8 @@ impl Core {
             metas,
             meta_messages: 0,
             mirror,
+            scene,
+            contacts,
             world,
             consumer,
             consumer_wake,
@@ -135,8 +148,13 @@ impl Core {
                 }
                 .into());
             }
-            let metas: &[VehicleMeta] = rows(&message).map_err(unreadable)?;
-            self.mirror.apply_meta(message.header(), metas).map_err(unmirrored)?;
+            let header = message.header();
+            let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
+            let metas: &[VehicleMeta] = block::view(message.payload(), layout.vehicles).map_err(unreadable)?;
+            self.mirror.apply_meta(header, metas).map_err(unmirrored)?;
+            if let Some(contacts) = &mut self.contacts {
+                contacts.learn(header, metas);
+            }
             for class in self.mirror.take_unknown_classes() {
                 tracing::warn!(
                     class,
@@ -159,8 +177,12 @@ impl Core {
                 .settings()
                 .tick_header(frame, tick, u32::try_from(count).unwrap_or(u32::MAX))
         };
-        let mut draft = self.world.loan(header, self.mirror.layout(tick).len)?;
+        let layout = self.mirror.layout(tick);
+        let mut draft = self.world.loan(header, layout.len)?;
         self.mirror.write_tick(tick, draft.payload_mut()).map_err(unmirrored)?;
+        if let Some(contacts) = &mut self.contacts {
+            contacts.tick(&header, draft.payload_mut(), layout.states)?;
+        }
         draft.send()?;
         self.consumer_wake.wake();
         self.ticks += 1;
@@ -195,12 +217,16 @@ impl Core {
         Ok(())
     }
 
-    fn write_part(&self) -> Result<(), Failure> {
+    fn write_part(&mut self) -> Result<(), Failure> {
+        let collisions = self.contacts.as_mut().map(Contacts::finish).transpose()?;
         self.session.write_part(&Part {
             tracking: self.mirror.tracking().summary(),
             resynchronisations: self.mirror.resynchronisations(),
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
+            buildings: self.scene.buildings().len(),
+            props: self.scene.props().len(),
+            collisions,
         })
     }
 }

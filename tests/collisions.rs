@@ -1,0 +1,103 @@
+//! Whole runs with something in the way: contacts reach the report and the run's directory, and end trajectories if asked.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
+mod common;
+
+use std::collections::BTreeSet;
+
+use common::Workplace;
+use serde_json::Value;
+
+/// A run of 4 episodes of two minutes over the crossroads of Main Street and Market Street, where a crate lies.
+fn simulate(workplace: &Workplace, name: &str, more: &[&str]) -> Value {
+    let small = [
+        "simulate",
+        "town",
+        "--name",
+        name,
+        "--set",
+        "fanout.enabled=false",
+        "--set",
+        "traffic.cavs=16",
+        "--set",
+        "traffic.others=8",
+        "--set",
+        "traffic.pedestrians=4",
+        "--set",
+        "episode.ticks=1200",
+        "--set",
+        "episode.training_episodes=4",
+        "--set",
+        "scene.obstacles=[\"crate 129 126 45\"]",
+        "--set",
+        "scene.random_props=20",
+    ];
+    workplace.succeed(&[&small[..], more].concat());
+    workplace.report(name)
+}
+
+fn lines(workplace: &Workplace, name: &str) -> Vec<Value> {
+    let path = workplace.path().join("runs").join(name).join("events/collisions.jsonl");
+    let text = std::fs::read_to_string(path).unwrap();
+    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
+fn an_obstacle_on_the_road_is_struck_and_ends_trajectories_if_asked() {
+    let workplace = Workplace::new();
+    let report = simulate(&workplace, "watched", &[]);
+    let told = lines(&workplace, "watched");
+    let counts = &report["dynamics"]["collisions"];
+    assert_eq!(counts["total"], told.len());
+    assert_eq!(
+        (&report["dynamics"]["buildings"], &report["dynamics"]["props"]),
+        (&62.into(), &21.into())
+    );
+    let crates: Vec<&Value> = told.iter().filter(|line| line["other"] == "crate").collect();
+    assert!(crates.len() >= 10, "16 vehicles, 8 minutes: {} times", crates.len());
+    assert_eq!(
+        counts["obstacle"],
+        crates.len(),
+        "random props are never on the road: {told:#?}"
+    );
+    assert_eq!(counts["building"], 0);
+    for line in crates {
+        let at = |axis: usize| line["position_m"][axis].as_f64().unwrap();
+        // The diagonal of a crate is 1.44 m.
+        assert!((at(0) - 129.0).hypot(at(1) - 126.0) < 0.75 && at(2) > 0.0, "{line}");
+        assert!(line["vehicle"].as_str().unwrap().starts_with("cav."), "{line}");
+        assert!(
+            (0.0..14.5).contains(&line["relative_speed_mps"].as_f64().unwrap()),
+            "{line}"
+        );
+    }
+    assert!(told.is_sorted_by_key(|line| line["tick"].as_u64().unwrap()));
+
+    // Looking changes nothing but the report.
+    let blind = simulate(&workplace, "blind", &["--set", "collision.detect=false"]);
+    assert_eq!(blind["observation_hash"], report["observation_hash"]);
+    assert_eq!(blind["dynamics"]["collisions"], Value::Null);
+    assert!(!workplace.path().join("runs/blind/events").exists());
+
+    // A trajectory that ends leaves out the one observation at which its vehicle collides; traffic does not notice.
+    let ended = simulate(&workplace, "ended", &["--set", "collision.ends_trajectory=true"]);
+    assert_eq!(lines(&workplace, "ended"), told);
+    let mut left_out = BTreeSet::new();
+    for line in &told {
+        for who in ["vehicle", "other"] {
+            let name = line[who].as_str().unwrap();
+            if name.starts_with("cav.") {
+                left_out.insert((line["tick"].as_u64().unwrap(), name.to_owned()));
+            }
+        }
+    }
+    let steps = |report: &Value| report["vehicle_steps"].as_u64().unwrap();
+    assert_eq!(steps(&ended), steps(&report) - left_out.len() as u64);
+    assert_ne!(ended["observation_hash"], report["observation_hash"]);
+    workplace.assert_nothing_left();
+}
