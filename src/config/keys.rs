@@ -53,13 +53,36 @@ pub struct Key {
 
 /// Names of observation fields, in the order of the wire.
 pub const FIELD_NAMES: [&str; 25] = [
-    "gnss_x", "gnss_y", "accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z", "compass", "speed", "steering",
-    "route_x_5", "route_y_5", "route_x_10", "route_y_10", "route_x_20", "route_y_20", "route_x_40", "route_y_40",
-    "speed_limit", "route_offset", "route_left", "leader_gap", "leader_speed", "signal_gap",
+    "gnss_x",
+    "gnss_y",
+    "accel_x",
+    "accel_y",
+    "accel_z",
+    "gyro_x",
+    "gyro_y",
+    "gyro_z",
+    "compass",
+    "speed",
+    "steering",
+    "route_x_5",
+    "route_y_5",
+    "route_x_10",
+    "route_y_10",
+    "route_x_20",
+    "route_y_20",
+    "route_x_40",
+    "route_y_40",
+    "speed_limit",
+    "route_offset",
+    "route_left",
+    "leader_gap",
+    "leader_speed",
+    "signal_gap",
 ];
 
 /// Presets of `observation.fields`: name and the part of [`FIELD_NAMES`] that they take.
-pub const FIELD_PRESETS: [(&str, std::ops::Range<usize>); 3] = [("paper", 0..9), ("caraware", 0..11), ("driving", 9..25)];
+pub const FIELD_PRESETS: [(&str, std::ops::Range<usize>); 3] =
+    [("paper", 0..9), ("caraware", 0..11), ("driving", 9..25)];
 
 /// First of [`FIELD_NAMES`] that only a hero has.
 pub const FIRST_HERO_FIELD: usize = 11;
@@ -218,7 +241,10 @@ impl Key {
                 .join(", "),
             Kind::Text => "text".into(),
             Kind::Texts => "list of texts".into(),
-            Kind::Fields => format!("\"paper\", \"caraware\", \"driving\", or a list of {}", FIELD_NAMES.join(", ")),
+            Kind::Fields => format!(
+                "\"paper\", \"caraware\", \"driving\", or a list of {}",
+                FIELD_NAMES.join(", ")
+            ),
             Kind::Integers { min, max } => format!("list of {min} … {max}"),
         }
     }

@@ -7,7 +7,7 @@ use std::{
 };
 
 use tempfile::TempDir;
-use traffic_bridge::{frame::Frame, options::Options, session::Session};
+use traffic_bridge::{fleet::Fleet, frame::Frame, options::Options, session::Session};
 
 /// Tests run as threads of one process, SUMO runs once in a process: they take turns.
 static TURN: Mutex<()> = Mutex::new(());
@@ -85,7 +85,7 @@ impl Bench {
             &self.folder.path().join("sumo"),
             step_s,
             23423,
-            0.5,
+            Fleet::connected(0.5),
         )
         .unwrap()
     }
