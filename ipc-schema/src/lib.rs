@@ -27,6 +27,7 @@ pub mod layout;
 pub mod observation;
 pub mod ports;
 pub mod process;
+pub mod props;
 pub mod run;
 pub mod schedule;
 pub mod services;

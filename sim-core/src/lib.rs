@@ -16,6 +16,7 @@ pub mod person;
 pub mod process;
 pub mod reference;
 pub mod road_user;
+pub mod scene;
 pub mod spherical;
 pub mod tracking;
 pub mod trig;

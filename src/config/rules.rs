@@ -1,6 +1,6 @@
 //! Rules between keys: rates that must divide each other, sizes that must fit.
 
-use ipc_schema::config::Config;
+use ipc_schema::{config::Config, props::Obstacle};
 
 use super::{ConfigError, Settings};
 
@@ -58,6 +58,16 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
             "`map.origin_latitude_deg` and `map.origin_longitude_deg` go together".into(),
             "set both or neither".into(),
         ));
+    }
+    obstacles(settings, config)
+}
+
+/// Every entry of `scene.obstacles` must be a known prop and a place.
+fn obstacles(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+    for text in &config.scene.obstacles {
+        if let Err(error) = Obstacle::parse(text) {
+            return Err(conflict(settings, "scene.obstacles", error.to_string(), error.help()));
+        }
     }
     Ok(())
 }

@@ -198,3 +198,15 @@ fn the_resolved_default_preset_for_tests_is_true() {
         "{path} is not what CARAWARE_BLESS=1 would write"
     );
 }
+
+#[test]
+fn an_obstacle_that_cannot_be_placed_is_named_with_what_can() {
+    let (message, help) = error_of("[scene]\nobstacles = [\"cone 10 20\", \"cnoe 1 2\"]\n");
+    assert!(
+        message.contains("`scene.obstacles`: \"cnoe 1 2\" names no known prop"),
+        "{message}"
+    );
+    assert!(help.contains("props: cone, bollard"), "{help}");
+    let (message, _) = error_of("[scene]\nobstacles = [\"cone 10\"]\n");
+    assert!(message.contains("\"cone 10\" is not \"name x y\""), "{message}");
+}

@@ -1,0 +1,275 @@
+//! The static scene: buildings, props and the road surface, read once from the files SUMO runs on, the same for collisions and for rays.
+//!
+//! A pure function of net file, additional files, configuration and seed: processes that need it read it themselves.
+
+use std::path::PathBuf;
+
+use ipc_schema::{
+    failure::{Failure, FailureKind},
+    props::{Obstacle, ObstacleError},
+    run::RunFile,
+};
+
+use crate::geodesy::GeodesyError;
+
+mod building;
+mod grid;
+mod prop;
+mod road;
+pub mod shape;
+mod xml;
+
+pub use building::{Prism, SolidClass};
+pub use grid::Grid;
+pub use prop::Prop;
+pub use road::{Piece, Road, Surface};
+use shape::{Bounds, Point};
+
+/// Size of a cell of the index over buildings and props, metres.
+const CELL_M: f64 = 20.0;
+/// How far from a building the road is looked for that says how high the ground is, metres; doubled until there is some.
+const GROUND_REACH_M: f64 = 25.0;
+/// Beyond this distance from any road the ground has no height of its own, metres.
+const GROUND_LIMIT_M: f64 = 2_000.0;
+
+/// The scene cannot be built.
+#[derive(Debug, thiserror::Error)]
+pub enum SceneError {
+    /// A file cannot be read.
+    #[error("cannot read {path}")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: std::io::Error,
+    },
+    /// A file is not XML.
+    #[error("{path}, line {line}: not well-formed XML: {reason}")]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// Line in it.
+        line: usize,
+        /// Why.
+        reason: String,
+    },
+    /// A value makes no sense.
+    #[error("{path}, line {line}: \"{value}\" is no usable {what}")]
+    Value {
+        /// The file.
+        path: PathBuf,
+        /// Line in it.
+        line: usize,
+        /// Attribute.
+        what: &'static str,
+        /// What it says.
+        value: String,
+    },
+    /// A polygon in latitude and longitude cannot be brought onto the map.
+    #[error("{path}: polygon \"{id}\" is in longitude and latitude and cannot be brought onto the map")]
+    Geodetic {
+        /// The file.
+        path: PathBuf,
+        /// The polygon.
+        id: String,
+        /// Why.
+        #[source]
+        source: GeodesyError,
+    },
+    /// An entry of `scene.obstacles`.
+    #[error(transparent)]
+    Obstacle(#[from] ObstacleError),
+}
+
+impl From<SceneError> for Failure {
+    fn from(error: SceneError) -> Self {
+        let help = match &error {
+            SceneError::Unreadable { .. } => "check the path and its permissions".to_owned(),
+            SceneError::Malformed { .. } | SceneError::Value { .. } => {
+                "correct the file; `netedit` shows its shapes".into()
+            }
+            SceneError::Geodetic { .. } => {
+                "give polygons in net coordinates, or a net whose projection covers them".into()
+            }
+            SceneError::Obstacle(error) => error.help(),
+        };
+        Self::from_error(FailureKind::Config, &error).with_help(help)
+    }
+}
+
+/// Everything that stands still.
+#[derive(Debug, Clone, Default)]
+pub struct Scene {
+    road: Road,
+    buildings: Vec<Prism>,
+    props: Vec<Prop>,
+    /// Over buildings, then props.
+    index: Grid,
+}
+
+impl Scene {
+    /// Reads the scene of a run. A run without a net file has an empty one.
+    ///
+    /// # Errors
+    /// A file is unreadable or malformed, or an entry of `scene.obstacles` cannot be used.
+    pub fn of_run(run: &RunFile) -> Result<Self, SceneError> {
+        let (files, config) = (&run.scene_files, &run.config.scene);
+        let road = if files.net_file.as_os_str().is_empty() {
+            Road::default()
+        } else {
+            Road::read(&files.net_file)?
+        };
+        let mut buildings = Vec::new();
+        for file in &files.additional_files {
+            let ground_m = |point| ground_height_m(&road, point);
+            building::read(file, &run.map, config.building_height_m, &ground_m, &mut buildings)?;
+        }
+        let obstacles: Result<Vec<_>, _> = config.obstacles.iter().map(|text| Obstacle::parse(text)).collect();
+        let mut scene = Self::new(road, buildings, Vec::new());
+        let placed = obstacles?.iter().map(|obstacle| scene.prop(obstacle)).collect();
+        scene.set_props(placed);
+        let random = prop::beside_the_road(&scene, config.random_props, run.config.run.seed);
+        let mut all = std::mem::take(&mut scene.props);
+        all.extend(random);
+        scene.set_props(all);
+        Ok(scene)
+    }
+
+    /// A scene from its parts.
+    #[must_use]
+    pub fn new(road: Road, buildings: Vec<Prism>, props: Vec<Prop>) -> Self {
+        let mut scene = Self {
+            road,
+            buildings,
+            ..Self::default()
+        };
+        scene.set_props(props);
+        scene
+    }
+
+    fn set_props(&mut self, props: Vec<Prop>) {
+        self.props = props;
+        let bounds: Vec<Bounds> = self.bounds().collect();
+        self.index = Grid::new(&bounds, CELL_M);
+    }
+
+    /// Bounds of every building, then of every prop.
+    pub fn bounds(&self) -> impl Iterator<Item = Bounds> + '_ {
+        let buildings = self.buildings.iter().map(|building| building.bounds);
+        buildings.chain(self.props.iter().map(|prop| prop.body.bounds()))
+    }
+
+    /// A prop where an entry of the configuration wants it, on the ground.
+    #[must_use]
+    pub fn prop(&self, obstacle: &Obstacle) -> Prop {
+        let ground_m = ground_height_m(&self.road, [obstacle.x_m, obstacle.y_m]);
+        Prop::new(obstacle, ground_m)
+    }
+
+    /// The road surface.
+    #[must_use]
+    pub fn road(&self) -> &Road {
+        &self.road
+    }
+
+    /// Buildings and other solid polygons, in the order of the files.
+    #[must_use]
+    pub fn buildings(&self) -> &[Prism] {
+        &self.buildings
+    }
+
+    /// Obstacles of the configuration, then props placed at random.
+    #[must_use]
+    pub fn props(&self) -> &[Prop] {
+        &self.props
+    }
+
+    /// True if vehicles drive there: on a lane, in a junction or on a crossing; sidewalks and rails are no road.
+    #[must_use]
+    pub fn is_on_road(&self, x_m: f64, y_m: f64) -> bool {
+        self.road.under([x_m, y_m]).any(|(piece, _)| piece.surface.is_road())
+    }
+
+    /// Height of the road at a place, the lowest where several cross; `None` beside the road. Metres.
+    #[must_use]
+    pub fn road_height_m(&self, x_m: f64, y_m: f64) -> Option<f64> {
+        self.road_heights([x_m, y_m]).min_by(f64::total_cmp)
+    }
+
+    /// Height of the road at a place that is nearest to `z_m`: the right one of a bridge and what it crosses. Metres.
+    #[must_use]
+    pub fn road_height_near_m(&self, x_m: f64, y_m: f64, z_m: f64) -> Option<f64> {
+        self.road_heights([x_m, y_m])
+            .min_by(|a, b| (a - z_m).abs().total_cmp(&(b - z_m).abs()))
+    }
+
+    /// Heights by lanes where there are any, else by junctions.
+    fn road_heights(&self, point: Point) -> impl Iterator<Item = f64> {
+        let on_lane = self.road.under(point).any(|(piece, _)| piece.surface == Surface::Lane);
+        self.road.under(point).filter_map(move |(piece, height_m)| {
+            let wanted = piece.surface.is_road() && (piece.surface == Surface::Lane || !on_lane);
+            wanted.then_some(height_m)
+        })
+    }
+
+    /// Height of the ground: of the road, or of the nearest one. Metres.
+    #[must_use]
+    pub fn ground_height_m(&self, x_m: f64, y_m: f64) -> f64 {
+        ground_height_m(&self.road, [x_m, y_m])
+    }
+
+    /// True if a building or prop covers the place.
+    #[must_use]
+    pub fn is_in_solid(&self, x_m: f64, y_m: f64) -> bool {
+        let point = [x_m, y_m];
+        self.index.at(point).iter().any(|&number| match self.solid(number) {
+            Solid::Building(building) => building.contains(point),
+            Solid::Prop(prop) => {
+                let [ahead, left] = prop.body.local_from_world(point);
+                ahead.abs() <= prop.body.half_m[0] && left.abs() <= prop.body.half_m[1]
+            }
+        })
+    }
+
+    /// A building or prop by its number in [`Scene::bounds`] and [`Scene::solids_near`].
+    #[must_use]
+    pub fn solid(&self, number: u32) -> Solid<'_> {
+        let number = number as usize;
+        match self.buildings.get(number) {
+            Some(building) => Solid::Building(building),
+            None => Solid::Prop(&self.props[number - self.buildings.len()]),
+        }
+    }
+
+    /// Numbers of buildings and props whose bounds may meet `bounds`, ascending, into `found`.
+    pub fn solids_near(&self, bounds: &Bounds, found: &mut Vec<u32>) {
+        self.index.near(bounds, found);
+    }
+}
+
+/// A thing that stands still.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Solid<'a> {
+    /// A building.
+    Building(&'a Prism),
+    /// A prop.
+    Prop(&'a Prop),
+}
+
+fn ground_height_m(road: &Road, point: Point) -> f64 {
+    if let Some(height_m) = road.flat_height_m() {
+        return height_m;
+    }
+    if let Some(height_m) = road.under(point).map(|(_, height_m)| height_m).min_by(f64::total_cmp) {
+        return height_m;
+    }
+    let mut reach_m = GROUND_REACH_M;
+    while reach_m < GROUND_LIMIT_M {
+        if let Some((_, height_m)) = road.nearest(point, reach_m, |_| true) {
+            return height_m;
+        }
+        reach_m *= 2.0;
+    }
+    0.0
+}

@@ -1,0 +1,367 @@
+//! The road surface: lanes as strips, junctions and walking areas as polygons, each with its height.
+
+use super::{
+    SceneError,
+    grid::Grid,
+    shape::{Bounds, Point, between, contains, distance, dot, from_to, nearest_on_segment, share_along},
+    xml::{Place, Tag, attribute, for_each_tag, points},
+};
+use quick_xml::events::BytesStart;
+use std::path::Path;
+
+/// SUMO's width of a lane that states none, metres.
+const DEFAULT_WIDTH_M: f64 = 3.2;
+/// Shapes are written to centimetres: strips that touch may gape by this, metres.
+const SEAM_M: f64 = 0.05;
+/// Size of a cell of the index, metres.
+const CELL_M: f64 = 15.0;
+/// What does not drive on a road.
+const OFF_ROAD_CLASSES: [&str; 12] = [
+    "pedestrian",
+    "wheelchair",
+    "tram",
+    "rail",
+    "rail_urban",
+    "rail_electric",
+    "rail_fast",
+    "subway",
+    "cable_car",
+    "ship",
+    "aircraft",
+    "drone",
+];
+
+/// What a piece of the surface is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Surface {
+    /// A lane that road vehicles may use, also within a junction.
+    Lane,
+    /// The polygon of a junction.
+    Junction,
+    /// A pedestrian crossing; it lies on the road.
+    Crossing,
+    /// Where sidewalks and crossings meet.
+    WalkingArea,
+    /// A lane for pedestrians only.
+    Sidewalk,
+    /// Rails and waterways.
+    Track,
+    /// A lane that nobody may use: a verge.
+    Verge,
+}
+
+impl Surface {
+    /// True if vehicles drive on it.
+    #[must_use]
+    pub fn is_road(self) -> bool {
+        matches!(self, Self::Lane | Self::Junction | Self::Crossing)
+    }
+
+    fn of_lane(function: &str, element: &BytesStart<'_>) -> Self {
+        match function {
+            "crossing" => return Self::Crossing,
+            "walkingarea" => return Self::WalkingArea,
+            _ => {}
+        }
+        if attribute(element, "disallow").is_some_and(|list| list.trim() == "all") {
+            return Self::Verge;
+        }
+        let Some(allowed) = attribute(element, "allow") else {
+            return Self::Lane;
+        };
+        let mut classes = allowed.split_whitespace().peekable();
+        if classes.peek().is_none() || classes.clone().any(|class| !OFF_ROAD_CLASSES.contains(&class)) {
+            return Self::Lane;
+        }
+        if classes.all(|class| matches!(class, "pedestrian" | "wheelchair")) {
+            Self::Sidewalk
+        } else {
+            Self::Track
+        }
+    }
+}
+
+/// One lane, junction, crossing or walking area.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Piece {
+    /// SUMO's id.
+    pub id: String,
+    /// What it is for.
+    pub surface: Surface,
+    /// Centre line of a strip, outline of a polygon (not closed), metres.
+    pub shape_m: Vec<[f64; 3]>,
+    /// Half the width of a strip; `None` for a polygon. Metres.
+    pub half_width_m: Option<f64>,
+}
+
+impl Piece {
+    /// Its border as a closed polygon without the last point repeated, counter-clockwise for strips; corners are mitred.
+    #[must_use]
+    pub fn outline(&self) -> Vec<[f64; 3]> {
+        let Some(half_m) = self.half_width_m else {
+            return self.shape_m.clone();
+        };
+        let offset = |side_m: f64| {
+            move |place: usize| {
+                let [x, y, z] = self.shape_m[place];
+                let [nx, ny] = self.mitre(place);
+                [x + side_m * nx, y + side_m * ny, z]
+            }
+        };
+        let count = self.shape_m.len();
+        let right = (0..count).map(offset(-half_m));
+        right.chain((0..count).rev().map(offset(half_m))).collect()
+    }
+
+    /// Offset to the left at a point of the centre line that keeps both neighbours one metre away; at most 2 m long.
+    fn mitre(&self, place: usize) -> Point {
+        let count = self.shape_m.len();
+        let normal = |a: usize, b: usize| {
+            let d = from_to(flat(self.shape_m[a]), flat(self.shape_m[b]));
+            let length = dot(d, d).sqrt();
+            if length > 0.0 {
+                Some([-d[1] / length, d[0] / length])
+            } else {
+                None
+            }
+        };
+        let before = (place > 0).then(|| normal(place - 1, place)).flatten();
+        let after = (place + 1 < count).then(|| normal(place, place + 1)).flatten();
+        match (before, after) {
+            (Some(a), Some(b)) => {
+                let stretch = 1.0 / (1.0 + dot(a, b)).max(0.5);
+                [(a[0] + b[0]) * stretch, (a[1] + b[1]) * stretch]
+            }
+            (Some(n), None) | (None, Some(n)) => n,
+            (None, None) => [0.0; 2],
+        }
+    }
+
+    /// Height at `point` if it lies on this part of the piece.
+    fn height_at(&self, part: usize, point: Point) -> Option<f64> {
+        match self.half_width_m {
+            Some(half_m) => self.strip_height(part, half_m, point),
+            None => {
+                let outline = || self.shape_m.iter().copied().map(flat);
+                // Even–odd as in `contains`, without copying the outline.
+                let last = outline().next_back().into_iter();
+                let mut inside = false;
+                for (a, b) in last.chain(outline()).zip(outline()) {
+                    if (a[1] > point[1]) != (b[1] > point[1]) {
+                        inside ^= point[0] < a[0] + (point[1] - a[1]) / (b[1] - a[1]) * (b[0] - a[0]);
+                    }
+                }
+                inside.then(|| self.mean_height(point))
+            }
+        }
+    }
+
+    /// Between two points of the centre line: round at the joints, straight at both ends.
+    fn strip_height(&self, part: usize, half_m: f64, point: Point) -> Option<f64> {
+        let (from, to) = (self.shape_m[part], self.shape_m[part + 1]);
+        let (a, b) = (flat(from), flat(to));
+        let share = share_along(a, b, point);
+        let length_m = distance(a, b);
+        let beyond = (share < 0.0 && part == 0 && -share * length_m > SEAM_M)
+            || (share > 1.0 && part + 2 == self.shape_m.len() && (share - 1.0) * length_m > SEAM_M);
+        let share = share.clamp(0.0, 1.0);
+        let near = distance(between(a, b, share), point) <= half_m + SEAM_M;
+        (near && !beyond).then(|| from[2] + share * (to[2] - from[2]))
+    }
+
+    /// Mean height of the corners, weighted by one over the squared distance.
+    fn mean_height(&self, point: Point) -> f64 {
+        let (mut sum, mut weights) = (0.0, 0.0);
+        for corner in &self.shape_m {
+            let d = from_to(point, flat(*corner));
+            let weight = 1.0 / (dot(d, d) + 1e-9);
+            sum += weight * corner[2];
+            weights += weight;
+        }
+        sum / weights
+    }
+
+    fn parts(&self) -> usize {
+        self.half_width_m.map_or(1, |_| self.shape_m.len().saturating_sub(1))
+    }
+
+    fn part_bounds(&self, part: usize) -> Bounds {
+        match self.half_width_m {
+            Some(half_m) => Bounds::of(self.shape_m[part..=part + 1].iter().copied().map(flat)).grown(half_m + SEAM_M),
+            None => Bounds::of(self.shape_m.iter().copied().map(flat)),
+        }
+    }
+
+    /// Distance from `point` to this part, metres; 0 on it.
+    fn distance_to(&self, part: usize, point: Point) -> f64 {
+        match self.half_width_m {
+            Some(half_m) => {
+                let [a, b] = [self.shape_m[part], self.shape_m[part + 1]].map(flat);
+                (distance(nearest_on_segment(a, b, point), point) - half_m).max(0.0)
+            }
+            None => {
+                let outline: Vec<Point> = self.shape_m.iter().copied().map(flat).collect();
+                if contains(&outline, point) {
+                    return 0.0;
+                }
+                super::shape::edges(&outline)
+                    .map(|(a, b)| distance(nearest_on_segment(a, b, point), point))
+                    .fold(f64::INFINITY, f64::min)
+            }
+        }
+    }
+}
+
+fn flat([x, y, _]: [f64; 3]) -> Point {
+    [x, y]
+}
+
+/// The whole surface, with an index over the parts of its pieces.
+#[derive(Debug, Clone, Default)]
+pub struct Road {
+    pieces: Vec<Piece>,
+    /// Piece and part (segment of a strip) of each entry of the index.
+    parts: Vec<(u32, u32)>,
+    index: Grid,
+    is_flat: bool,
+}
+
+impl Road {
+    /// The surface of these pieces.
+    #[must_use]
+    pub fn new(pieces: Vec<Piece>) -> Self {
+        let mut parts = Vec::new();
+        for (number, piece) in (0_u32..).zip(&pieces) {
+            parts.extend((0..piece.parts() as u32).map(|part| (number, part)));
+        }
+        let bounds: Vec<Bounds> = parts
+            .iter()
+            .map(|&(piece, part)| pieces[piece as usize].part_bounds(part as usize))
+            .collect();
+        let is_flat = pieces
+            .iter()
+            .flat_map(|piece| &piece.shape_m)
+            .all(|point| point[2] == 0.0);
+        Self {
+            index: Grid::new(&bounds, CELL_M),
+            pieces,
+            parts,
+            is_flat,
+        }
+    }
+
+    /// Reads a net file.
+    ///
+    /// # Errors
+    /// Unreadable, malformed, or a shape that is no list of points.
+    pub(super) fn read(net_file: &Path) -> Result<Self, SceneError> {
+        let mut pieces = Vec::new();
+        let mut function = String::new();
+        for_each_tag(net_file, |tag, place| {
+            let Tag::Open(element) = tag else { return Ok(()) };
+            match element.local_name().as_ref() {
+                "edge" => function = attribute(element, "function").unwrap_or_default(),
+                "lane" => pieces.extend(lane(element, &function, place)?),
+                "junction" => pieces.extend(junction(element, place)?),
+                _ => {}
+            }
+            Ok(())
+        })?;
+        Ok(Self::new(pieces))
+    }
+
+    /// Its pieces, in the order of the net file.
+    #[must_use]
+    pub fn pieces(&self) -> &[Piece] {
+        &self.pieces
+    }
+
+    /// Height of everything if the net has no elevation, metres.
+    #[must_use]
+    pub fn flat_height_m(&self) -> Option<f64> {
+        self.is_flat.then_some(0.0)
+    }
+
+    /// Pieces that `point` lies on, with the height there.
+    pub fn under(&self, point: Point) -> impl Iterator<Item = (&Piece, f64)> {
+        self.index.at(point).iter().filter_map(move |&entry| {
+            let (piece, part) = self.parts[entry as usize];
+            let piece = &self.pieces[piece as usize];
+            Some((piece, piece.height_at(part as usize, point)?))
+        })
+    }
+
+    /// The piece nearest to `point` within `reach_m`: distance and height of its nearest corner, metres.
+    #[must_use]
+    pub fn nearest(&self, point: Point, reach_m: f64, wanted: impl Fn(Surface) -> bool) -> Option<(f64, f64)> {
+        let mut found = Vec::new();
+        self.index.near(&Bounds::about(point, reach_m), &mut found);
+        let mut nearest: Option<(f64, f64)> = None;
+        for entry in found {
+            let (piece, part) = self.parts[entry as usize];
+            let piece = &self.pieces[piece as usize];
+            if !wanted(piece.surface) {
+                continue;
+            }
+            let distance_m = piece.distance_to(part as usize, point);
+            if distance_m <= reach_m && nearest.is_none_or(|(least, _)| distance_m < least) {
+                let corner = piece.shape_m[part as usize];
+                nearest = Some((distance_m, corner[2]));
+            }
+        }
+        nearest
+    }
+}
+
+fn lane(element: &BytesStart<'_>, function: &str, place: &Place<'_>) -> Result<Option<Piece>, SceneError> {
+    let width_m = match attribute(element, "width") {
+        Some(text) => text
+            .parse()
+            .ok()
+            .filter(|width: &f64| *width > 0.0)
+            .ok_or_else(|| place.value("width", &text))?,
+        None => DEFAULT_WIDTH_M,
+    };
+    let surface = Surface::of_lane(function, element);
+    let half_width_m = (surface != Surface::WalkingArea).then_some(0.5 * width_m);
+    piece(element, surface, half_width_m, place)
+}
+
+fn junction(element: &BytesStart<'_>, place: &Place<'_>) -> Result<Option<Piece>, SceneError> {
+    match attribute(element, "type").as_deref() {
+        Some("internal" | "rail_signal" | "rail_crossing") => Ok(None),
+        _ => piece(element, Surface::Junction, None, place),
+    }
+}
+
+/// The piece of an element with a shape; `None` if it covers nothing.
+fn piece(
+    element: &BytesStart<'_>,
+    surface: Surface,
+    half_width_m: Option<f64>,
+    place: &Place<'_>,
+) -> Result<Option<Piece>, SceneError> {
+    let text = attribute(element, "shape").unwrap_or_default();
+    let mut shape_m = points(&text, place)?;
+    for point in &mut shape_m {
+        point[2] = if point[2].is_nan() { 0.0 } else { point[2] };
+    }
+    if half_width_m.is_none() && shape_m.len() > 1 && shape_m.first() == shape_m.last() {
+        shape_m.pop();
+    }
+    let least = if half_width_m.is_some() { 2 } else { 3 };
+    Ok((shape_m.len() >= least).then(|| Piece {
+        id: attribute(element, "id").unwrap_or_default(),
+        surface,
+        shape_m,
+        half_width_m,
+    }))
+}
+
+/// Unit vector to the left of the segment a → b.
+#[must_use]
+pub(super) fn left_of(a: Point, b: Point) -> Point {
+    let d = from_to(a, b);
+    let length = dot(d, d).sqrt().max(f64::MIN_POSITIVE);
+    [-d[1] / length, d[0] / length]
+}
