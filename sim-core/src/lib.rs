@@ -6,16 +6,20 @@
 // Values leave the core in single precision (positions excepted): the wire's precision, see `ipc_schema::world`.
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
+pub mod actions;
 pub mod curve;
 pub mod dimensions;
 pub mod displacement;
+pub mod driving;
 pub mod geodesy;
+pub mod hero;
 pub mod lanes;
 pub mod mirror;
 pub mod person;
 pub mod process;
 pub mod reference;
 pub mod road_user;
+pub mod route;
 pub mod scene;
 pub mod spherical;
 pub mod tracking;

@@ -17,6 +17,7 @@ pub use crate::road_user::Settings;
 use crate::{
     lanes::{LANES, Lanes},
     road_user::RoadUser,
+    vehicle::Input,
 };
 
 /// What SUMO sent cannot be mirrored.
@@ -246,6 +247,13 @@ impl Mirror {
                 tick,
             }),
             None => Ok(()),
+        }
+    }
+
+    /// What the hero `vehicle` is asked for from now on.
+    pub fn ask(&mut self, vehicle: u32, input: Input) {
+        if let Some(place) = self.place(vehicle) {
+            self.slab[place as usize].ask(input);
         }
     }
 

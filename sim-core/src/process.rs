@@ -11,10 +11,15 @@ use ipc_schema::{
     process::Process,
     services::Channel,
     session::{Session, Wait},
-    traffic::{Kind, TrafficState, VehicleMeta},
+    traffic::{Kind, ROUTES, TrafficMetaLayout, TrafficState},
+    world::WorldLayout,
 };
 
-use crate::mirror::{Mirror, MirrorError, Settings};
+use crate::{
+    actions::Actions,
+    driving::Account,
+    mirror::{Mirror, MirrorError, Settings},
+};
 
 /// One process serves one environment.
 const ENV_INDEX: u32 = 0;
@@ -25,6 +30,9 @@ struct Part {
     resynchronisations: u64,
     vehicle_steps: u64,
     drops: u64,
+    /// Heroes, in the driving task.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    heroes: Option<Account>,
 }
 
 /// Mirrors until the last tick of the run, or until the process is asked to stop.
@@ -56,6 +64,8 @@ struct Core {
     /// `traffic-meta` messages applied.
     meta_messages: u64,
     mirror: Mirror,
+    /// The heroes and their actions, in the driving task.
+    actions: Option<Actions>,
     world: Publisher,
     consumer: BoardReader,
     consumer_wake: Waker,
@@ -69,6 +79,10 @@ impl Core {
         let world = session.publisher(Channel::World)?;
         let consumer = session.board_of(Process::SensorDaemon)?;
         let consumer_wake = session.waker(Process::SensorDaemon)?;
+        let actions = match session.run.config.drives() {
+            true => Some(Actions::open(&mut session)?),
+            false => None,
+        };
         session.attach();
         let mirror = Mirror::new(Settings::of_run(&session.run));
         Ok(Self {
@@ -76,6 +90,7 @@ impl Core {
             metas,
             meta_messages: 0,
             mirror,
+            actions,
             world,
             consumer,
             consumer_wake,
@@ -109,6 +124,11 @@ impl Core {
             {
                 return Ok(Wait::Stopped);
             }
+            if let Some(actions) = &mut self.actions
+                && actions.take(&self.session, &header, &mut self.mirror)? == Wait::Stopped
+            {
+                return Ok(Wait::Stopped);
+            }
             self.publish(&header, tick, states)?;
         }
         Ok(Wait::Ready)
@@ -130,28 +150,60 @@ impl Core {
                 }
                 .into());
             }
-            let metas: &[VehicleMeta] = rows(&message).map_err(unreadable)?;
-            self.mirror.apply_meta(message.header(), metas).map_err(unmirrored)?;
+            self.apply_meta(&message)?;
+        }
+        Ok(())
+    }
+
+    fn apply_meta(&mut self, message: &Message) -> Result<(), Failure> {
+        let header = message.header();
+        if header.has(ROUTES) {
+            if let Some(actions) = &mut self.actions {
+                actions.add_route(header, rows(message).map_err(unreadable)?);
+            }
+            return Ok(());
+        }
+        let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
+        let vehicles = block::view(message.payload(), layout.vehicles).map_err(unreadable)?;
+        self.mirror.apply_meta(header, vehicles).map_err(unmirrored)?;
+        if let Some(actions) = &mut self.actions {
+            actions.add_metas(
+                header,
+                vehicles,
+                block::view(message.payload(), layout.signals).map_err(unreadable)?,
+            );
         }
         Ok(())
     }
 
     fn publish(&mut self, frame: &MessageHeader, tick: u32, states: &[TrafficState]) -> Result<(), Failure> {
         let count = self.mirror.count(tick);
+        let heroes = match &self.actions {
+            Some(_) => states.iter().filter(|state| state.kind == Kind::Hero as u32).count(),
+            None => 0,
+        };
         let ours = self.session.header();
         let header = MessageHeader {
             run_id: ours.run_id,
             incarnation: ours.incarnation,
-            sequence: 0,
+            sequence: heroes as u64,
             ..self
                 .mirror
                 .settings()
                 .tick_header(frame, tick, u32::try_from(count).unwrap_or(u32::MAX))
         };
-        let mut draft = self.world.loan(header, self.mirror.layout(tick).len)?;
+        let layout = WorldLayout::with_heroes(count, header.columns as usize, heroes);
+        let mut draft = self.world.loan(header, layout.len)?;
         self.mirror.write_tick(tick, draft.payload_mut()).map_err(unmirrored)?;
+        let poses = match &mut self.actions {
+            Some(actions) => actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?,
+            None => Vec::new(),
+        };
         draft.send()?;
         self.consumer_wake.wake();
+        if let Some(actions) = &self.actions {
+            actions.send_poses(&header, &poses)?;
+        }
         self.ticks += 1;
         self.vehicle_steps += count as u64;
         self.report(&header, states);
@@ -189,6 +241,7 @@ impl Core {
             resynchronisations: self.mirror.resynchronisations(),
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
+            heroes: self.actions.as_ref().map(Actions::account),
         })
     }
 }
