@@ -167,11 +167,11 @@ impl Core {
         let vehicles = block::view(message.payload(), layout.vehicles).map_err(unreadable)?;
         self.mirror.apply_meta(header, vehicles).map_err(unmirrored)?;
         if let Some(actions) = &mut self.actions {
-            actions.add_metas(
-                header,
-                vehicles,
-                block::view(message.payload(), layout.signals).map_err(unreadable)?,
-            );
+            let signals = match header.columns {
+                0 => &[],
+                _ => block::view(message.payload(), layout.signals).map_err(unreadable)?,
+            };
+            actions.add_metas(header, vehicles, signals);
         }
         Ok(())
     }
