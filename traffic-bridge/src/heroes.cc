@@ -20,6 +20,8 @@ namespace {
 constexpr int FREE_MOVEMENT = 2;
 // How far from a lane a hero may be and still be found on it, metres.
 constexpr double MATCH_THRESHOLD_M = 20.0;
+// Factor on speed limits and speed (m/s) that no hero reaches.
+constexpr double UNLIMITED = 100.0;
 // Ways through a junction have at most two internal lanes one behind the other; more would be a loop.
 constexpr int MAX_INTERNAL_LANES = 8;
 
@@ -99,6 +101,9 @@ void Simulation::take_over(std::uint32_t index) {
     const std::string& id = known_id(index);
     libsumo::Vehicle::setSpeedMode(id, 0);
     libsumo::Vehicle::setLaneChangeMode(id, 0);
+    // SUMO reckons a moved vehicle's speed from its way, but never above these.
+    libsumo::Vehicle::setSpeedFactor(id, UNLIMITED);
+    libsumo::Vehicle::setMaxSpeed(id, UNLIMITED);
 }
 
 void Simulation::move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration) {
