@@ -1,6 +1,6 @@
 //! The driving task's ports: `prediction` and `observation` in (who sits in which slot), `ego-pose` out.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, sync::Arc};
 
 use ipc_schema::{
     block::{self, BlockError, Section},
@@ -28,7 +28,7 @@ const ACTION_COLUMNS: u32 = 2;
 /// Heroes, and the ports that drive them.
 #[derive(Debug)]
 pub struct Actions {
-    driving: Driving<Scene>,
+    driving: Driving<Arc<Scene>>,
     /// SUMO's ids of the heroes of this episode, by dense index.
     ids: BTreeMap<u32, String>,
     predictions: Subscriber,
@@ -38,12 +38,11 @@ pub struct Actions {
 }
 
 impl Actions {
-    /// Opens the ports; the trainer's first answer cannot be missed.
+    /// Opens the ports, before the process is attached: the trainer's first answer cannot be missed.
     ///
     /// # Errors
-    /// A service or the scene's files cannot be opened.
-    pub fn open(session: &mut Session) -> Result<Self, Failure> {
-        let scene = Scene::of_run(&session.run).map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
+    /// A service cannot be opened.
+    pub fn open(session: &mut Session, scene: Arc<Scene>) -> Result<Self, Failure> {
         Ok(Self {
             ids: BTreeMap::new(),
             driving: Driving::new(&session.run.config, scene),

@@ -1,6 +1,6 @@
 //! The driving task: actions of heroes are checked, their ways along their routes followed, and their episodes ended.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, sync::Arc};
 
 use ipc_schema::{
     config,
@@ -15,6 +15,7 @@ use ipc_schema::{
 use crate::{
     hero::{self, Action},
     route::{Place, Route},
+    scene::Scene,
     vehicle::Input,
 };
 
@@ -35,9 +36,9 @@ pub trait Ground {
     fn is_on_road(&self, x_m: f64, y_m: f64) -> bool;
 }
 
-impl Ground for crate::scene::Scene {
+impl Ground for Arc<Scene> {
     fn is_on_road(&self, x_m: f64, y_m: f64) -> bool {
-        Self::is_on_road(self, x_m, y_m)
+        Scene::is_on_road(self, x_m, y_m)
     }
 }
 

@@ -1,12 +1,13 @@
 //! The nanoscopic core: geodesy, vehicle dynamics, and the mirror that tracks SUMO's traffic at the sub-step rate.
 //!
-//! Pure functions without clock, I/O or shared memory; only [`process`], the body of the `sim-core` binary, is a shell around
-//! [`mirror::Mirror`].
+//! Pure functions without clock, I/O or shared memory. Only [`process`], the body of the `sim-core` binary, is a shell around
+//! [`mirror::Mirror`] and [`collision`]; [`scene`] reads its files once.
 
 // Values leave the core in single precision (positions excepted): the wire's precision, see `ipc_schema::world`.
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
 pub mod actions;
+pub mod collision;
 pub mod curve;
 pub mod dimensions;
 pub mod displacement;

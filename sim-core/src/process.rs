@@ -1,6 +1,6 @@
 //! The process: `traffic` and `traffic-meta` in, one `world` for each tick out.
 
-use std::path::Path;
+use std::{path::Path, sync::Arc};
 
 use ipc_schema::{
     block::{self, BlockError, Section},
@@ -17,8 +17,10 @@ use ipc_schema::{
 
 use crate::{
     actions::Actions,
+    collision::{CollisionCounts, Contacts},
     driving::Account,
     mirror::{Mirror, MirrorError, Settings},
+    scene::Scene,
 };
 
 /// One process serves one environment.
@@ -33,12 +35,17 @@ struct Part {
     /// Heroes, in the driving task.
     #[serde(skip_serializing_if = "Option::is_none")]
     heroes: Option<Account>,
+    /// Buildings and props in the scene.
+    buildings: usize,
+    props: usize,
+    /// Contacts that began, if anybody looked.
+    collisions: Option<CollisionCounts>,
 }
 
 /// Mirrors until the last tick of the run, or until the process is asked to stop.
 ///
 /// # Errors
-/// A port fails, or what SUMO sent cannot be mirrored.
+/// The scene's files or obstacles are wrong, a port fails, or what SUMO sent cannot be mirrored.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut session = Session::join(run_file, Process::SimCore, ENV_INDEX)?;
     let metas = session.subscriber(Channel::TrafficMeta)?;
@@ -66,6 +73,8 @@ struct Core {
     mirror: Mirror,
     /// The heroes and their actions, in the driving task.
     actions: Option<Actions>,
+    scene: Arc<Scene>,
+    contacts: Option<Contacts>,
     world: Publisher,
     consumer: BoardReader,
     consumer_wake: Waker,
@@ -79,8 +88,10 @@ impl Core {
         let world = session.publisher(Channel::World)?;
         let consumer = session.board_of(Process::SensorDaemon)?;
         let consumer_wake = session.waker(Process::SensorDaemon)?;
+        let scene = Arc::new(Scene::of_run(&session.run)?);
+        let contacts = Contacts::open(&session, Arc::clone(&scene))?;
         let actions = match session.run.config.drives() {
-            true => Some(Actions::open(&mut session)?),
+            true => Some(Actions::open(&mut session, Arc::clone(&scene))?),
             false => None,
         };
         session.attach();
@@ -91,6 +102,8 @@ impl Core {
             meta_messages: 0,
             mirror,
             actions,
+            scene,
+            contacts,
             world,
             consumer,
             consumer_wake,
@@ -166,6 +179,9 @@ impl Core {
         let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
         let vehicles = block::view(message.payload(), layout.vehicles).map_err(unreadable)?;
         self.mirror.apply_meta(header, vehicles).map_err(unmirrored)?;
+        if let Some(contacts) = &mut self.contacts {
+            contacts.learn(header, vehicles);
+        }
         if let Some(actions) = &mut self.actions {
             let signals = match header.columns {
                 0 => &[],
@@ -195,6 +211,9 @@ impl Core {
         let layout = WorldLayout::with_heroes(count, header.columns as usize, heroes);
         let mut draft = self.world.loan(header, layout.len)?;
         self.mirror.write_tick(tick, draft.payload_mut()).map_err(unmirrored)?;
+        if let Some(contacts) = &mut self.contacts {
+            contacts.tick(&header, draft.payload_mut(), layout.states)?;
+        }
         let poses = match &mut self.actions {
             Some(actions) => actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?,
             None => Vec::new(),
@@ -236,12 +255,16 @@ impl Core {
         Ok(())
     }
 
-    fn write_part(&self) -> Result<(), Failure> {
+    fn write_part(&mut self) -> Result<(), Failure> {
+        let collisions = self.contacts.as_mut().map(Contacts::finish).transpose()?;
         self.session.write_part(&Part {
             resynchronisations: self.mirror.resynchronisations(),
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
             heroes: self.actions.as_ref().map(Actions::account),
+            buildings: self.scene.buildings().len(),
+            props: self.scene.props().len(),
+            collisions,
         })
     }
 }

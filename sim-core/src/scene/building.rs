@@ -113,6 +113,12 @@ impl Prism {
         })
     }
 
+    /// Heights of base and roof, metres.
+    #[must_use]
+    pub fn z_m(&self) -> [f64; 2] {
+        [self.base_z_m, self.base_z_m + self.height_m]
+    }
+
     /// True if `point` is inside the walls.
     #[must_use]
     pub fn contains(&self, point: Point) -> bool {

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use ipc_schema::{
     failure::{Failure, FailureKind},
     props::{Obstacle, ObstacleError},
-    run::RunFile,
+    run::{MapInfo, RunFile, SceneFiles},
 };
 
 use crate::geodesy::GeodesyError;
@@ -114,7 +114,23 @@ impl Scene {
     /// # Errors
     /// A file is unreadable or malformed, or an entry of `scene.obstacles` cannot be used.
     pub fn of_run(run: &RunFile) -> Result<Self, SceneError> {
-        let (files, config) = (&run.scene_files, &run.config.scene);
+        let config = &run.config.scene;
+        let mut scene = Self::read(&run.scene_files, &run.map, config.building_height_m)?;
+        let obstacles: Result<Vec<_>, _> = config.obstacles.iter().map(|text| Obstacle::parse(text)).collect();
+        let placed = obstacles?.iter().map(|obstacle| scene.prop(obstacle)).collect();
+        scene.set_props(placed);
+        let random = prop::beside_the_road(&scene, config.random_props, run.config.run.seed);
+        let mut all = std::mem::take(&mut scene.props);
+        all.extend(random);
+        scene.set_props(all);
+        Ok(scene)
+    }
+
+    /// Reads what stands in the files: roads and buildings, those without a height `building_height_m` high.
+    ///
+    /// # Errors
+    /// A file is unreadable or malformed.
+    pub fn read(files: &SceneFiles, map: &MapInfo, building_height_m: f64) -> Result<Self, SceneError> {
         let road = if files.net_file.as_os_str().is_empty() {
             Road::default()
         } else {
@@ -123,17 +139,9 @@ impl Scene {
         let mut buildings = Vec::new();
         for file in &files.additional_files {
             let ground_m = |point| ground_height_m(&road, point);
-            building::read(file, &run.map, config.building_height_m, &ground_m, &mut buildings)?;
+            building::read(file, map, building_height_m, &ground_m, &mut buildings)?;
         }
-        let obstacles: Result<Vec<_>, _> = config.obstacles.iter().map(|text| Obstacle::parse(text)).collect();
-        let mut scene = Self::new(road, buildings, Vec::new());
-        let placed = obstacles?.iter().map(|obstacle| scene.prop(obstacle)).collect();
-        scene.set_props(placed);
-        let random = prop::beside_the_road(&scene, config.random_props, run.config.run.seed);
-        let mut all = std::mem::take(&mut scene.props);
-        all.extend(random);
-        scene.set_props(all);
-        Ok(scene)
+        Ok(Self::new(road, buildings, Vec::new()))
     }
 
     /// A scene from its parts.

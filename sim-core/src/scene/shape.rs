@@ -260,6 +260,30 @@ impl OrientedBox {
     }
 }
 
+/// The smallest rectangle about a polygon, of any heading: one of its sides lies on a side of the convex hull (Freeman and
+/// Shapira, "Determining the minimum-area encasing rectangle for an arbitrary closed curve", 1975).
+#[must_use]
+pub fn smallest_rectangle(outline: &[Point], z_m: [f64; 2]) -> OrientedBox {
+    let hull = hull(outline);
+    let about = |along: Point| {
+        let local = Bounds::of(hull.iter().map(|point| [dot(along, *point), cross(along, *point)]));
+        let half_m = [0, 1].map(|axis: usize| 0.5 * (local.max_m[axis] - local.min_m[axis]));
+        let [ahead, left] = [0, 1].map(|axis: usize| 0.5 * (local.max_m[axis] + local.min_m[axis]));
+        OrientedBox {
+            centre_m: [ahead * along[0] - left * along[1], ahead * along[1] + left * along[0]],
+            along,
+            half_m,
+            z_m,
+        }
+    };
+    let area = |solid: &OrientedBox| solid.half_m[0] * solid.half_m[1];
+    edges(&hull)
+        .filter(|(a, b)| a != b)
+        .map(|(a, b)| about(from_to(a, b).map(|part| part / distance(a, b))))
+        .min_by(|a, b| area(a).total_cmp(&area(b)))
+        .unwrap_or_else(|| about([1.0, 0.0]))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -286,6 +310,20 @@ mod tests {
     }
 
     proptest! {
+        #[test]
+        fn the_smallest_rectangle_holds_every_corner_and_is_tight(
+            points in prop::collection::vec(prop::array::uniform2(-9.0_f64..9.0), 3..20), angle in -3.2_f64..3.2,
+        ) {
+            let rectangle = smallest_rectangle(&points, [0.0, 1.0]);
+            for point in &points {
+                let [ahead, left] = rectangle.local_from_world(*point);
+                prop_assert!(ahead.abs() < rectangle.half_m[0] + 1e-9 && left.abs() < rectangle.half_m[1] + 1e-9);
+            }
+            let turned = OrientedBox { centre_m: points[0], along: [angle.cos(), angle.sin()], half_m: [4.0, 1.5], z_m: [0.0; 2] };
+            let [l, w] = smallest_rectangle(&turned.corners(), [0.0; 2]).half_m;
+            prop_assert!((l * w - 6.0).abs() < 1e-9 && (l.max(w) - 4.0).abs() < 1e-9);
+        }
+
         #[test]
         fn a_box_holds_what_its_own_frame_says(
             angle in -3.2_f64..3.2, x in -9.0_f64..9.0, y in -9.0_f64..9.0, l in 0.1_f64..5.0, w in 0.1_f64..5.0,

@@ -1,0 +1,266 @@
+//! Contacts of connected vehicles and heroes with everything: vehicles, persons, buildings and props, from the states of a finished tick.
+//!
+//! Broad phase: a grid of everybody, built anew each tick, and a fixed grid of what stands still. Narrow phase: exact for upright
+//! boxes, capsules and prisms with their heights, so that what passes under a bridge touches nothing on it. The order of events
+//! depends on the road users' indices alone.
+
+use std::sync::Arc;
+
+use ipc_schema::{
+    event::{Collision, Struck},
+    traffic::{Kind, id_hash},
+    world::{COLLIDED, VehicleState},
+};
+
+use crate::scene::{
+    Grid, Scene, Solid,
+    shape::{Bounds, OrientedBox, smallest_rectangle},
+};
+
+pub mod body;
+mod broad;
+mod record;
+
+use body::{Body, box_touches_prism, boxes_touch, common_height, common_point};
+use broad::{Broad, LARGE_M};
+pub use record::{CollisionCounts, Contacts};
+
+/// Reaches of vehicles (cars, lorries) up to which one look at the cell of the centre finds every solid: an index for each, metres.
+const REACHES_M: [f64; 2] = [3.2, 11.0];
+/// Size of a cell of the index over solids, metres.
+const CELL_M: f64 = 8.0;
+
+/// A contact in a tick. Ordered by who touches what.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Contact {
+    /// Dense index of the vehicle: of two watched ones the lower.
+    vehicle: u32,
+    class: u32,
+    /// Dense index of the other road user, or number in the scene.
+    other: u32,
+    /// Rows in the world; of a solid its number in the scene.
+    rows: (u32, u32),
+}
+
+impl Contact {
+    fn who(&self) -> (u32, u32, u32) {
+        (self.vehicle, self.class, self.other)
+    }
+}
+
+/// Finds contacts, and tells those that begin from those that last.
+#[derive(Debug)]
+pub struct Detector {
+    scene: Arc<Scene>,
+    /// Rectangle of any heading about each solid.
+    rectangles: Vec<OrientedBox>,
+    solid_hashes: Vec<u64>,
+    /// Over solids grown by [`REACHES_M`].
+    indices: [Grid; 2],
+    bodies: Vec<Body>,
+    watched: Vec<bool>,
+    broad: Broad,
+    near: Vec<u32>,
+    episode: Option<u64>,
+    contacts: Vec<Contact>,
+    before: Vec<Contact>,
+    begun: Vec<Collision>,
+}
+
+impl Detector {
+    /// A detector over a scene.
+    #[must_use]
+    pub fn new(scene: Arc<Scene>) -> Self {
+        let bounds: Vec<Bounds> = scene.bounds().collect();
+        let within = |reach_m: f64| -> Vec<Bounds> { bounds.iter().map(|bounds| bounds.grown(reach_m)).collect() };
+        let indices = REACHES_M.map(|reach_m| Grid::new(&within(reach_m), CELL_M));
+        let rectangles = (0..bounds.len() as u32).map(|number| match scene.solid(number) {
+            Solid::Building(building) => smallest_rectangle(&building.outline_m, building.z_m()),
+            Solid::Prop(prop) => prop.body,
+        });
+        let buildings = scene.buildings().iter().map(|building| id_hash(&building.id));
+        let props = scene.props().iter().map(|prop| id_hash(prop.kind.name));
+        Self {
+            solid_hashes: buildings.chain(props).collect(),
+            rectangles: rectangles.collect(),
+            indices,
+            scene,
+            bodies: Vec::new(),
+            watched: Vec::new(),
+            broad: Broad::default(),
+            near: Vec::new(),
+            episode: None,
+            contacts: Vec::new(),
+            before: Vec::new(),
+            begun: Vec::new(),
+        }
+    }
+
+    /// The scene.
+    #[must_use]
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    /// Contacts that began in the last tick, in the order of the vehicles' indices.
+    #[must_use]
+    pub fn begun(&self) -> &[Collision] {
+        &self.begun
+    }
+
+    /// Looks for contacts at the end of a tick and sets [`COLLIDED`] where one begins; [`Detector::begun`] tells which.
+    pub fn detect(&mut self, episode: u64, states: &mut [VehicleState]) {
+        if self.episode != Some(episode) {
+            self.episode = Some(episode);
+            self.contacts.clear();
+        }
+        std::mem::swap(&mut self.contacts, &mut self.before);
+        self.contacts.clear();
+        self.begun.clear();
+        let reach_m = self.take(states);
+        if self.watched.contains(&true) {
+            self.touch_road_users(states, reach_m);
+            self.touch_solids(states);
+        }
+        self.begin(states);
+    }
+
+    /// Takes everybody's body and returns the farthest reach of those that are not large.
+    fn take(&mut self, states: &[VehicleState]) -> f64 {
+        self.bodies.clear();
+        self.watched.clear();
+        let mut most_m = 0.0;
+        for state in states {
+            let body = Body::of(state);
+            let reach_m = body.reach_m();
+            if reach_m <= LARGE_M && reach_m > most_m {
+                most_m = reach_m;
+            }
+            self.bodies.push(body);
+            self.watched
+                .push(state.kind == Kind::Cav as u32 || state.kind == Kind::Hero as u32);
+        }
+        most_m
+    }
+
+    fn touch_road_users(&mut self, states: &[VehicleState], reach_m: f64) {
+        for &(a, b) in self.broad.pairs(&self.bodies, &self.watched, reach_m) {
+            let (one, two) = (a as usize, b as usize);
+            if !self.bodies[one].touches(&self.bodies[two]) {
+                continue;
+            }
+            // Rows are in ascending order of the index.
+            let (vehicle, other) = if self.watched[one] { (one, two) } else { (two, one) };
+            let is_person = self.bodies[other].is_capsule;
+            self.contacts.push(Contact {
+                vehicle: states[vehicle].vehicle,
+                class: if is_person { Struck::Person } else { Struck::Vehicle } as u32,
+                other: states[other].vehicle,
+                rows: (vehicle as u32, other as u32),
+            });
+        }
+    }
+
+    fn touch_solids(&mut self, states: &[VehicleState]) {
+        if self.rectangles.is_empty() {
+            return;
+        }
+        for (row, body) in self.bodies.iter().enumerate() {
+            if !self.watched[row] {
+                continue;
+            }
+            let reach_m = body.reach_m();
+            let near = match REACHES_M.iter().position(|most_m| reach_m <= *most_m) {
+                Some(index) => self.indices[index].at(body.solid.centre_m),
+                None => {
+                    self.scene.solids_near(&body.solid.bounds(), &mut self.near);
+                    &self.near
+                }
+            };
+            for &number in near {
+                if !boxes_touch(&body.solid, &self.rectangles[number as usize]) {
+                    continue;
+                }
+                if let Some(class) = struck(&self.scene, number, body) {
+                    self.contacts.push(Contact {
+                        vehicle: states[row].vehicle,
+                        class: class as u32,
+                        other: number,
+                        rows: (row as u32, number),
+                    });
+                }
+            }
+        }
+    }
+
+    /// Flags and describes contacts that were not there in the tick before.
+    fn begin(&mut self, states: &mut [VehicleState]) {
+        self.contacts.sort_unstable();
+        self.contacts.dedup();
+        for contact in &self.contacts {
+            let known = self.before.binary_search_by_key(&contact.who(), Contact::who);
+            if known.is_ok() {
+                continue;
+            }
+            let collision = self.describe(contact, states);
+            self.begun.push(collision);
+            states[contact.rows.0 as usize].flags |= COLLIDED;
+            if contact.class == Struck::Vehicle as u32 || contact.class == Struck::Person as u32 {
+                states[contact.rows.1 as usize].flags |= COLLIDED;
+            }
+        }
+    }
+
+    fn describe(&self, contact: &Contact, states: &[VehicleState]) -> Collision {
+        let (row, other) = (contact.rows.0 as usize, contact.rows.1 as usize);
+        let (state, body) = (&states[row], &self.bodies[row]);
+        let velocity = world_velocity(state, body);
+        let is_solid = contact.class == Struck::Building as u32 || contact.class == Struck::Obstacle as u32;
+        let (position_m, other_id_hash, other_velocity) = if is_solid {
+            (
+                self.contact_with_solid(contact.other, body),
+                self.solid_hashes[other],
+                [0.0; 3],
+            )
+        } else {
+            let (other_state, other_body) = (&states[other], &self.bodies[other]);
+            let velocity = world_velocity(other_state, other_body);
+            (body.contact_m(other_body), other_state.id_hash, velocity)
+        };
+        let difference = [0, 1, 2].map(|axis: usize| velocity[axis] - other_velocity[axis]);
+        Collision {
+            position_m,
+            id_hash: state.id_hash,
+            other_id_hash,
+            vehicle: contact.vehicle,
+            other: contact.other,
+            other_class: contact.class,
+            relative_speed_mps: difference.iter().map(|v| v * v).sum::<f64>().sqrt() as f32,
+        }
+    }
+
+    fn contact_with_solid(&self, number: u32, body: &Body) -> [f64; 3] {
+        let (flat, z_m) = match self.scene.solid(number) {
+            Solid::Building(building) => (common_point(&body.solid, &building.outline_m), building.z_m()),
+            Solid::Prop(prop) => (common_point(&body.solid, &prop.body.corners()), prop.body.z_m),
+        };
+        [flat[0], flat[1], common_height(body.solid.z_m, z_m)]
+    }
+}
+
+/// What `body`, which touches the rectangle about it, touches there, if anything.
+fn struck(scene: &Scene, number: u32, body: &Body) -> Option<Struck> {
+    match scene.solid(number) {
+        Solid::Building(building) => {
+            box_touches_prism(&body.solid, &building.outline_m, building.z_m()).then_some(Struck::Building)
+        }
+        Solid::Prop(_) => Some(Struck::Obstacle),
+    }
+}
+
+/// Velocity of the origin in the world frame, m/s.
+fn world_velocity(state: &VehicleState, body: &Body) -> [f64; 3] {
+    let [ahead, left, up] = state.velocity_body_mps.map(f64::from);
+    let [cos, sin] = body.solid.along;
+    [ahead * cos - left * sin, ahead * sin + left * cos, up]
+}

@@ -1,0 +1,216 @@
+//! What becomes of contacts: a message, a line in the run's directory, a count in its report.
+
+use std::{
+    fs::File,
+    io::{BufWriter, Write as _},
+    path::PathBuf,
+    sync::Arc,
+};
+
+use ipc_schema::{
+    block::{self, Section},
+    event::{Collision, Struck},
+    failure::{Failure, FailureKind},
+    header::MessageHeader,
+    ports::Publisher,
+    services::Channel,
+    session::Session,
+    traffic::{MetaEvent, VehicleMeta},
+    world::VehicleState,
+};
+use serde::Serialize;
+
+use super::Detector;
+use crate::scene::{Scene, Solid};
+
+/// Contacts that began in the run, by what was struck.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct CollisionCounts {
+    /// All of them.
+    pub total: u64,
+    /// With vehicles.
+    pub vehicle: u64,
+    /// With persons.
+    pub person: u64,
+    /// With buildings.
+    pub building: u64,
+    /// With obstacles and props.
+    pub obstacle: u64,
+}
+
+impl CollisionCounts {
+    fn add(&mut self, class: u32) {
+        self.total += 1;
+        let count = match class {
+            class if class == Struck::Vehicle as u32 => &mut self.vehicle,
+            class if class == Struck::Person as u32 => &mut self.person,
+            class if class == Struck::Building as u32 => &mut self.building,
+            _ => &mut self.obstacle,
+        };
+        *count += 1;
+    }
+}
+
+/// A line of `events/collisions.jsonl`.
+#[derive(Debug, Serialize)]
+struct Line<'a> {
+    tick: u64,
+    episode: u64,
+    sim_time_s: f64,
+    vehicle: &'a str,
+    what: &'static str,
+    other: &'a str,
+    position_m: [f64; 3],
+    relative_speed_mps: f32,
+}
+
+/// The lines cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write {path}")]
+struct WriteError {
+    path: PathBuf,
+    #[source]
+    source: std::io::Error,
+}
+
+impl From<WriteError> for Failure {
+    fn from(error: WriteError) -> Self {
+        Self::from_error(FailureKind::Run, &error).with_help("check free space and permissions of the run directory")
+    }
+}
+
+/// Contacts of a run: found, told and counted.
+#[derive(Debug)]
+pub struct Contacts {
+    detector: Detector,
+    publisher: Publisher,
+    /// Most collisions in one message.
+    most: usize,
+    path: PathBuf,
+    lines: BufWriter<File>,
+    episode: Option<u64>,
+    /// SUMO's ids by dense index.
+    names: Vec<Box<str>>,
+    counts: CollisionCounts,
+}
+
+impl Contacts {
+    /// Contacts of the run of `session` in `scene`; `None` if nobody looks for them.
+    ///
+    /// # Errors
+    /// The service is not there, or the file cannot be made.
+    pub fn open(session: &Session, scene: Arc<Scene>) -> Result<Option<Self>, Failure> {
+        if !session.run.config.collision.detect {
+            return Ok(None);
+        }
+        let publisher = session.publisher(Channel::Event)?;
+        let directory = session.run.run_dir.join("events");
+        let path = directory.join("collisions.jsonl");
+        let created = std::fs::create_dir_all(&directory).and_then(|()| File::create(&path));
+        let file = created.map_err(|source| WriteError {
+            path: path.clone(),
+            source,
+        })?;
+        Ok(Some(Self {
+            detector: Detector::new(scene),
+            publisher,
+            most: (session.run.config.traffic.max_road_users as usize).max(1),
+            path,
+            lines: BufWriter::new(file),
+            episode: None,
+            names: Vec::new(),
+            counts: CollisionCounts::default(),
+        }))
+    }
+
+    /// Remembers who is who.
+    pub fn learn(&mut self, header: &MessageHeader, metas: &[VehicleMeta]) {
+        if self.episode != Some(header.episode) {
+            self.episode = Some(header.episode);
+            self.names.clear();
+        }
+        for meta in metas.iter().filter(|meta| meta.event == MetaEvent::Departed as u32) {
+            let index = meta.vehicle as usize;
+            if self.names.len() <= index {
+                self.names.resize(index + 1, Box::default());
+            }
+            self.names[index] = meta.id_text().into_boxed_str();
+        }
+    }
+
+    /// Looks for contacts in the states of a finished tick (section `states` of `payload`), flags them there, and tells them.
+    ///
+    /// # Errors
+    /// The payload is too short, or an event can be neither sent nor written.
+    pub fn tick(&mut self, header: &MessageHeader, payload: &mut [u8], states: Section) -> Result<(), Failure> {
+        let states: &mut [VehicleState] =
+            block::view_mut(payload, states).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
+        self.detector.detect(header.episode, states);
+        let begun = self.detector.begun();
+        if begun.is_empty() {
+            return Ok(());
+        }
+        for part in begun.chunks(self.most) {
+            let header = MessageHeader {
+                count: part.len() as u32,
+                columns: 0,
+                ..*header
+            };
+            let bytes: &[u8] = bytemuck::cast_slice(part);
+            let mut draft = self.publisher.loan(header, bytes.len())?;
+            draft.payload_mut().copy_from_slice(bytes);
+            draft.send()?;
+        }
+        for collision in begun {
+            self.counts.add(collision.other_class);
+            let line = line(header, collision, &self.names, self.detector.scene());
+            let written = serde_json::to_writer(&mut self.lines, &line).map_err(std::io::Error::from);
+            written
+                .and_then(|()| self.lines.write_all(b"\n"))
+                .map_err(|source| WriteError {
+                    path: self.path.clone(),
+                    source,
+                })?;
+        }
+        Ok(())
+    }
+
+    /// How many so far; everything told before is in the file.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn finish(&mut self) -> Result<CollisionCounts, Failure> {
+        self.lines.flush().map_err(|source| WriteError {
+            path: self.path.clone(),
+            source,
+        })?;
+        Ok(self.counts)
+    }
+}
+
+fn line<'a>(header: &MessageHeader, collision: &Collision, names: &'a [Box<str>], scene: &'a Scene) -> Line<'a> {
+    let name = |index: u32| names.get(index as usize).map_or("", |name| &**name);
+    let is = |class: Struck| collision.other_class == class as u32;
+    let (what, other) = if is(Struck::Vehicle) {
+        ("vehicle", name(collision.other))
+    } else if is(Struck::Person) {
+        ("person", name(collision.other))
+    } else {
+        match scene.solid(collision.other) {
+            Solid::Building(building) => ("building", building.id.as_str()),
+            Solid::Prop(prop) => ("obstacle", prop.kind.name),
+        }
+    };
+    #[expect(clippy::cast_precision_loss, reason = "a time for people")]
+    let sim_time_s = header.sim_time_ns as f64 * 1e-9;
+    Line {
+        tick: header.tick,
+        episode: header.episode,
+        sim_time_s,
+        vehicle: name(collision.vehicle),
+        what,
+        other,
+        position_m: collision.position_m,
+        relative_speed_mps: collision.relative_speed_mps,
+    }
+}
