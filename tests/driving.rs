@@ -94,6 +94,8 @@ fn drive(workplace: &Workplace, name: &str, script: &str) -> Value {
         "episode.training_episodes=1",
         "--set",
         "episode.final_evaluations=1",
+        "--set",
+        "episode.evaluation_ticks=1000",
     ];
     succeed(driven(workplace, script, &[&settings[..], &ORIGIN].concat()));
     workplace.assert_nothing_left();
@@ -217,14 +219,7 @@ fn without_heroes_traffic_is_that_of_bare_sumo() {
          <time><step-length value=\"0.5\"/><end value=\"400\"/></time>\
          <output><tripinfo-output value=\"trips.xml\"/></output></configuration>",
     );
-    workplace.succeed(
-        &[
-            &["simulate", "a.sumocfg", "--name", "ours", "--set", "run.tick_s=0.5"],
-            &ORIGIN[..],
-            &QUIET,
-        ]
-        .concat(),
-    );
+    workplace.succeed(&[&["simulate", "a.sumocfg", "--name", "ours"], &ORIGIN[..], &QUIET].concat());
     tool(
         &sumo_program("sumo"),
         &["-c", "a.sumocfg", "--no-step-log"],

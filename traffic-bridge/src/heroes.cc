@@ -20,7 +20,7 @@ namespace {
 constexpr int FREE_MOVEMENT = 2;
 // How far from a lane a hero may be and still be found on it, metres.
 constexpr double MATCH_THRESHOLD_M = 20.0;
-// Factor on speed limits and speed (m/s) that no hero reaches.
+// Factor on speed limits, speed (m/s) and deceleration (m/s²) that no hero reaches.
 constexpr double UNLIMITED = 100.0;
 // Ways through a junction have at most two internal lanes one behind the other; more would be a loop.
 constexpr int MAX_INTERNAL_LANES = 8;
@@ -104,6 +104,7 @@ void Simulation::take_over(std::uint32_t index) {
     // SUMO reckons a moved vehicle's speed from its way, but never above these.
     libsumo::Vehicle::setSpeedFactor(id, UNLIMITED);
     libsumo::Vehicle::setMaxSpeed(id, UNLIMITED);
+    libsumo::Vehicle::setEmergencyDecel(id, UNLIMITED);
 }
 
 void Simulation::move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration) {
