@@ -102,13 +102,7 @@ impl VehicleMeta {
 
     /// Stores `id`, cut at a character border, with the hash of the whole.
     pub fn set_id(&mut self, id: &str) {
-        let mut len = id.len().min(ID_BYTES);
-        while !id.is_char_boundary(len) {
-            len -= 1;
-        }
-        self.id = [0; ID_BYTES];
-        self.id[..len].copy_from_slice(&id.as_bytes()[..len]);
-        self.id_len = u32::try_from(len).unwrap_or(0);
+        (self.id, self.id_len) = id_text_bytes(id);
         self.id_hash = id_hash(id);
     }
 }
@@ -137,6 +131,34 @@ pub struct SignalMeta {
     pub reserved: u32,
     /// SUMO's letter for each link (`r`, `y`, `g`, `G`, `u`, `o`, `O`, `s`), zero padded.
     pub state: [u8; SIGNAL_LINKS],
+}
+
+impl SignalMeta {
+    /// SUMO's id as text (cut to [`ID_BYTES`]).
+    #[must_use]
+    pub fn id_text(&self) -> String {
+        let len = (self.id_len as usize).min(ID_BYTES);
+        String::from_utf8_lossy(&self.id[..len]).into_owned()
+    }
+
+    /// The letters of the links that are carried.
+    #[must_use]
+    pub fn state_text(&self) -> String {
+        let len = (self.links as usize).min(SIGNAL_LINKS);
+        String::from_utf8_lossy(&self.state[..len]).into_owned()
+    }
+}
+
+/// `id` cut at a character border to [`ID_BYTES`], zero padded, with the number of bytes in use.
+#[must_use]
+pub fn id_text_bytes(id: &str) -> ([u8; ID_BYTES], u32) {
+    let mut len = id.len().min(ID_BYTES);
+    while !id.is_char_boundary(len) {
+        len -= 1;
+    }
+    let mut bytes = [0; ID_BYTES];
+    bytes[..len].copy_from_slice(&id.as_bytes()[..len]);
+    (bytes, u32::try_from(len).unwrap_or(0))
 }
 
 /// Where the arrays of a `traffic-meta` message lie: `[VehicleMeta; count]`, then `[SignalMeta; columns]`.

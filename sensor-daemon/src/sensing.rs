@@ -104,11 +104,14 @@ impl Sensing {
     }
 
     /// Gives every connected vehicle in `states` its slot; returns the number of slots, which is the observation's n.
+    ///
+    /// With `collision.ends_trajectory` a vehicle has no slot at the tick in which it collides, as if it had left: the slot it held
+    /// says [`ipc_schema::observation::TERMINATED`], and from the next tick on it holds one anew, as a trajectory of its own.
     pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
         self.row_of_slot.fill(None);
         for (row, state) in (0_u32..).zip(states) {
-            if state.kind == self.agents as u32 {
+            if self.is_sensed(state) {
                 let slot = self.slots.occupy(state.vehicle);
                 if is_cut(state) {
                     self.slots.cut(slot);
@@ -122,6 +125,12 @@ impl Sensing {
         }
         self.slots.end();
         self.slots.rows().len()
+    }
+
+    fn is_sensed(&self, state: &VehicleState) -> bool {
+        // What a hero collides with ends its episode after the observation of that tick; SUMO lets it go.
+        let collides = self.config.collision.ends_trajectory && state.flags & COLLIDED != 0;
+        state.kind == self.agents as u32 && (self.agents == Kind::Hero || !collides)
     }
 
     /// Samples what is due and writes the observation of the tick that [`Sensing::assign`] was called for.

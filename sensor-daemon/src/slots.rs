@@ -11,7 +11,7 @@ pub struct Slot {
     pub vehicle: u32,
     /// Ticks since the vehicle took the slot.
     pub step: u32,
-    /// [`TERMINATED`], [`TRUNCATED`]: what became of the vehicle that had it at the previous tick.
+    /// [`TERMINATED`], [`TRUNCATED`]: the trajectory that held this slot at the previous tick ended there.
     pub ended: u32,
     seen: bool,
     /// Its vehicle's trajectory was cut at the last tick and did not end by itself.
@@ -165,6 +165,19 @@ mod tests {
         tick(&mut slots, false, &[2, 3]);
         tick(&mut slots, false, &[]);
         assert_eq!((slots.rows()[0].ended, slots.rows()[1].ended), (TERMINATED, TERMINATED));
+    }
+
+    #[test]
+    fn a_vehicle_that_is_left_out_for_a_tick_begins_anew() {
+        let mut slots = Slots::default();
+        tick(&mut slots, true, &[0, 1]);
+        tick(&mut slots, false, &[0, 1]);
+        assert_eq!(tick(&mut slots, false, &[1]), [1]);
+        assert_eq!(slots.rows()[0].ended, TERMINATED);
+        assert_eq!(tick(&mut slots, false, &[0, 1, 2]), [0, 1, 2]);
+        let row = slots.rows()[0];
+        assert_eq!((row.vehicle, row.step, row.ended), (0, 0, 0));
+        assert_eq!(slots.rows()[1].step, 3);
     }
 
     #[test]

@@ -9,7 +9,7 @@ use ipc_schema::{
     observation::{EMPTY_SLOT, ObservationLayout, TERMINATED, TRUNCATED, VALID},
     run::MapInfo,
     traffic::{Kind, id_hash},
-    world::VehicleState,
+    world::{COLLIDED, VehicleState},
 };
 use sensor_daemon::sensing::Sensing;
 
@@ -98,6 +98,48 @@ fn only_connected_vehicles_get_a_slot_and_a_left_one_is_terminated() {
     assert_eq!(section::<u32>(n, &payload, "episode_step"), [1, 0]);
     let (n, payload) = tick(&mut sensing, 2, FIRST_OF_EPISODE, &states[..2]);
     assert_eq!(section::<u32>(n, &payload, "flags"), [VALID | TRUNCATED, 0]);
+}
+
+#[test]
+fn a_collision_ends_the_trajectory_if_it_is_to() {
+    let mut config = config();
+    config.collision.ends_trajectory = true;
+    let mut sensing = Sensing::new(&config, &map()).unwrap();
+    let mut states = [vehicle(0, Kind::Cav), vehicle(1, Kind::Cav), vehicle(2, Kind::Other)];
+    tick(&mut sensing, 0, FIRST_OF_EPISODE, &states);
+    tick(&mut sensing, 1, 0, &states);
+    // The tick of the contact is no part of the trajectory; its last observation was the one before.
+    (states[0].flags, states[2].flags) = (COLLIDED, COLLIDED);
+    let (n, payload) = tick(&mut sensing, 2, 0, &states);
+    assert_eq!(section::<u32>(n, &payload, "vehicle"), [EMPTY_SLOT, 1]);
+    assert_eq!(section::<u32>(n, &payload, "flags"), [TERMINATED, VALID]);
+    // The contact lasts: a trajectory of its own, with fresh samples, that nothing has ended yet.
+    (states[0].flags, states[2].flags) = (0, 0);
+    let (n, payload) = tick(&mut sensing, 3, 0, &states);
+    assert_eq!(section::<u32>(n, &payload, "vehicle"), [0, 1]);
+    assert_eq!(section::<u32>(n, &payload, "flags"), [VALID, VALID]);
+    assert_eq!(section::<u32>(n, &payload, "episode_step"), [0, 3]);
+    // A vehicle that collides as it appears has had no trajectory to end.
+    states[1].vehicle = 3;
+    states[1].flags = COLLIDED;
+    let (n, payload) = tick(&mut sensing, 4, 0, &states);
+    assert_eq!(section::<u32>(n, &payload, "vehicle"), [0, EMPTY_SLOT]);
+    assert_eq!(
+        section::<u32>(n, &payload, "flags"),
+        [VALID, TERMINATED],
+        "of vehicle 1, which has left"
+    );
+}
+
+#[test]
+fn a_collision_ends_nothing_unless_asked() {
+    let mut sensing = Sensing::new(&config(), &map()).unwrap();
+    let mut states = [vehicle(0, Kind::Cav)];
+    tick(&mut sensing, 0, FIRST_OF_EPISODE, &states);
+    states[0].flags = COLLIDED;
+    let (n, payload) = tick(&mut sensing, 1, 0, &states);
+    assert_eq!(section::<u32>(n, &payload, "flags"), [VALID]);
+    assert_eq!(section::<u32>(n, &payload, "episode_step"), [1]);
 }
 
 /// A vehicle's stream depends on its id, not on who else is there or in which slot it sits.

@@ -22,8 +22,8 @@ const SIZE: Size = Size {
     pedestrians: 0,
 };
 
-/// A grid of 12 × 12 junctions, 150 m apart.
-fn grid(sumo: &Path, folder: &Path) -> std::io::Result<PathBuf> {
+/// A grid of 12 × 12 junctions, 150 m apart, of this type.
+fn grid(sumo: &Path, folder: &Path, junctions: &str) -> std::io::Result<PathBuf> {
     let net = folder.join("grid.net.xml");
     let size = [
         "--grid",
@@ -37,6 +37,7 @@ fn grid(sumo: &Path, folder: &Path) -> std::io::Result<PathBuf> {
     ];
     Command::new(sumo.join("bin/netgenerate"))
         .env("SUMO_HOME", sumo)
+        .args(["--default-junction-type", junctions])
         .args(size)
         .arg(&net)
         .output()?;
@@ -70,7 +71,16 @@ fn measure(net: &Path, sumo: &Path) -> Result<(), SumoError> {
     );
     println!("  SUMO's own step     {:.3}", micros(sumo_s));
     println!("  pass of getters     {:.3}   (budget 0.5)", micros(getters_s));
-    println!("  conversion to frame {:.3}", micros(step_s - sumo_s - getters_s));
+    let signals_s = cost.signals_s - before.signals_s;
+    println!(
+        "  traffic lights      {:.3}   ({:.2} % of SUMO's step)",
+        micros(signals_s),
+        100.0 * signals_s / sumo_s
+    );
+    println!(
+        "  conversion to frame {:.3}",
+        micros(step_s - sumo_s - getters_s - signals_s)
+    );
     println!("  population control  {:.3}", micros(control_s));
     Ok(())
 }
@@ -78,6 +88,9 @@ fn measure(net: &Path, sumo: &Path) -> Result<(), SumoError> {
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = tempfile::tempdir()?;
     let sumo = Path::new(env!("CARAWARE_BUILD_SUMO_HOME"));
-    measure(&grid(sumo, folder.path())?, sumo)?;
+    for junctions in ["priority", "traffic_light"] {
+        println!("12 × 12 junctions of type {junctions}:");
+        measure(&grid(sumo, folder.path(), junctions)?, sumo)?;
+    }
     Ok(())
 }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use ipc_schema::{
+    block::Section,
     board::State,
     failure::{Failure, FailureKind},
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
@@ -12,7 +13,7 @@ use ipc_schema::{
     schedule::Episode,
     services::Channel,
     session::{Session as Membership, Wait},
-    traffic::{ROUTES, RoutePoint},
+    traffic::{ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout, VehicleMeta},
 };
 
 use crate::{
@@ -272,19 +273,7 @@ impl Bridge {
 
     /// Sends one step: first what happened, then where everybody is.
     fn publish(&mut self, frame: &Frame, header: MessageHeader) -> Result<(), Failure> {
-        if !frame.events.is_empty() {
-            self.meta_messages += 1;
-            let header = MessageHeader {
-                sequence: self.meta_messages,
-                ..header
-            };
-            send(
-                &self.meta,
-                header,
-                frame.events.len(),
-                bytemuck::cast_slice(&frame.events),
-            )?;
-        }
+        self.publish_meta(frame, header)?;
         let header = MessageHeader {
             sequence: self.meta_messages,
             ..header
@@ -300,6 +289,33 @@ impl Bridge {
         self.vehicle_steps += frame.states.len() as u64;
         self.report(frame, &header);
         Ok(())
+    }
+
+    /// Sends events of road users and changes of traffic lights, in as many messages as the lights need; none if nothing happened.
+    fn publish_meta(&mut self, frame: &Frame, header: MessageHeader) -> Result<(), Failure> {
+        let mut events: &[VehicleMeta] = &frame.events;
+        let mut signals = frame.signals.chunks(SIGNALS_PER_MESSAGE);
+        loop {
+            let part = signals.next().unwrap_or_default();
+            if events.is_empty() && part.is_empty() {
+                return Ok(());
+            }
+            self.meta_messages += 1;
+            let layout = TrafficMetaLayout::new(events.len(), part.len());
+            let header = MessageHeader {
+                sequence: self.meta_messages,
+                count: rows(events.len()),
+                columns: rows(part.len()),
+                ..header
+            };
+            let mut draft = self.meta.loan(header, layout.len).map_err(too_many)?;
+            let payload = draft.payload_mut();
+            let at = |section: Section| section.offset..section.offset + section.len;
+            payload[at(layout.vehicles)].copy_from_slice(bytemuck::cast_slice(events));
+            payload[at(layout.signals)].copy_from_slice(bytemuck::cast_slice(part));
+            draft.send()?;
+            events = &[];
+        }
     }
 
     fn report(&mut self, frame: &Frame, header: &MessageHeader) {
@@ -325,8 +341,12 @@ impl Bridge {
     }
 }
 
-fn send(publisher: &Publisher, header: MessageHeader, rows: usize, bytes: &[u8]) -> Result<(), Failure> {
-    let count = u32::try_from(rows).unwrap_or(u32::MAX);
+fn rows(count: usize) -> u32 {
+    u32::try_from(count).unwrap_or(u32::MAX)
+}
+
+fn send(publisher: &Publisher, header: MessageHeader, count: usize, bytes: &[u8]) -> Result<(), Failure> {
+    let count = rows(count);
     let mut draft = publisher
         .loan(MessageHeader { count, ..header }, bytes.len())
         .map_err(too_many)?;

@@ -2,12 +2,14 @@
 
 use std::collections::BTreeMap;
 
-use ipc_schema::traffic::{Kind, MetaEvent, TrafficState, VehicleMeta};
+use ipc_schema::traffic::{
+    Kind, MetaEvent, SIGNAL_LINKS, SignalMeta, TrafficState, VehicleMeta, id_hash, id_text_bytes,
+};
 
 use crate::{
     convention,
     fleet::Fleet,
-    sumo::ffi::{RawEvent, RawEventKind, RawState},
+    sumo::ffi::{RawEvent, RawEventKind, RawSignal, RawState},
 };
 
 /// Everybody on the road after one SUMO step, and what happened in it. Reused from step to step.
@@ -17,6 +19,8 @@ pub struct Frame {
     pub states: Vec<TrafficState>,
     /// Arrivals, departures and teleports of this step.
     pub events: Vec<VehicleMeta>,
+    /// Traffic lights that changed in this step; in the first step of an episode all of them.
+    pub signals: Vec<SignalMeta>,
     /// Simulated time since the start of the episode, seconds.
     pub time_s: f64,
     /// SUMO steps since the start of the episode.
@@ -99,6 +103,23 @@ impl Register {
         let index = u32::try_from(self.types.len()).unwrap_or(u32::MAX);
         self.types.insert(vehicle_type.to_owned(), index);
         index
+    }
+}
+
+/// A traffic light as it goes over the wire; links beyond what is carried are counted but cut off.
+pub(crate) fn signal_meta(raw: &RawSignal) -> SignalMeta {
+    let (id, id_len) = id_text_bytes(&raw.id);
+    let mut state = [0; SIGNAL_LINKS];
+    let carried = raw.state.len().min(SIGNAL_LINKS);
+    state[..carried].copy_from_slice(&raw.state.as_bytes()[..carried]);
+    SignalMeta {
+        id_hash: id_hash(&raw.id),
+        signal: raw.index,
+        id_len,
+        id,
+        links: u32::try_from(raw.state.len()).unwrap_or(u32::MAX),
+        reserved: 0,
+        state,
     }
 }
 

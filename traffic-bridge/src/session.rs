@@ -11,7 +11,7 @@ use cxx::UniquePtr;
 
 use crate::{
     error::SumoError,
-    frame::{Frame, Register},
+    frame::{Frame, Register, signal_meta},
     inputs::InputFiles,
     options::Options,
     sumo::ffi,
@@ -50,6 +50,8 @@ pub struct Cost {
     pub step_s: f64,
     /// Finding out what happened and where everybody is.
     pub getters_s: f64,
+    /// Looking at traffic lights.
+    pub signals_s: f64,
 }
 
 /// A running simulation. Not `Send`: libsumo stays on the thread that started it.
@@ -146,6 +148,8 @@ impl Session {
         frame.time_s = self.time_s()?;
         self.register
             .fill(frame, self.sumo.states(), self.sumo.events(), self.step_s);
+        frame.signals.clear();
+        frame.signals.extend(self.sumo.signals().iter().map(signal_meta));
         Ok(())
     }
 
@@ -195,6 +199,7 @@ impl Session {
         Cost {
             step_s: self.sumo.seconds_in_step(),
             getters_s: self.sumo.seconds_in_getters(),
+            signals_s: self.sumo.seconds_in_signals(),
         }
     }
 

@@ -1,6 +1,7 @@
 // The life of the simulation, and the one pass of getters after each step.
 #include "traffic-bridge/src/shim.h"
 
+#include <algorithm>
 #include <cstdlib>
 #include <ctime>
 #include <utility>
@@ -15,6 +16,13 @@ namespace caraware {
 
 // Signals change slowly: each vehicle's are read once in this many steps.
 constexpr std::uint64_t SIGNAL_PERIOD_STEPS = 4;
+
+// A traffic light changes when SUMO has said it would switch. In case another program takes over in between (WAUT), each is also
+// looked at once in this many steps.
+constexpr std::uint64_t SIGNAL_LOOK_STEPS = 50;
+
+// SUMO counts milliseconds.
+constexpr double TIME_ROUNDING_S = 0.0005;
 
 namespace {
 
@@ -68,6 +76,13 @@ void Simulation::start(rust::Slice<const rust::String> arguments) {
     steps_ = 0;
     any_gone_ = false;
     has_elevation_ = net_has_elevation();
+    signals_.clear();
+    lights_.clear();
+    std::vector<std::string> ids = libsumo::TrafficLight::getIDList();
+    std::sort(ids.begin(), ids.end());
+    for (std::string& id : ids) {
+        lights_.push_back(Light{std::move(id), "", libsumo::INVALID_DOUBLE_VALUE});
+    }
 }
 
 void Simulation::close() {
@@ -86,9 +101,36 @@ void Simulation::step() {
     note_departures();
     note_teleports();
     read_all();
+    const double read = processor_seconds();
+    read_signals();
     ++steps_;
     seconds_in_step_ += stepped - start;
-    seconds_in_getters_ += processor_seconds() - stepped;
+    seconds_in_getters_ += read - stepped;
+    seconds_in_signals_ += processor_seconds() - read;
+}
+
+void Simulation::read_signals() {
+    signals_.clear();
+    if (lights_.empty()) {
+        return;
+    }
+    // The time of the step that was made; SUMO's clock stands at its end.
+    const double now = libsumo::Simulation::getTime() - libsumo::Simulation::getDeltaT();
+    for (std::size_t index = 0; index < lights_.size(); ++index) {
+        Light& light = lights_[index];
+        const bool may_have_switched = light.next_switch <= now + TIME_ROUNDING_S;
+        const bool is_its_turn = (steps_ + index) % SIGNAL_LOOK_STEPS == 0;
+        if (!may_have_switched && !is_its_turn) {
+            continue;
+        }
+        light.next_switch = libsumo::TrafficLight::getNextSwitch(light.id);
+        std::string state = libsumo::TrafficLight::getRedYellowGreenState(light.id);
+        if (state != light.told) {
+            light.told = std::move(state);
+            signals_.push_back(RawSignal{static_cast<std::uint32_t>(index), rust::String::lossy(light.id),
+                                         rust::String::lossy(light.told)});
+        }
+    }
 }
 
 void Simulation::note_arrivals() {
@@ -237,11 +279,15 @@ rust::Slice<const RawState> Simulation::states() const { return {states_.data(),
 
 rust::Slice<const RawEvent> Simulation::events() const { return {events_.data(), events_.size()}; }
 
+rust::Slice<const RawSignal> Simulation::signals() const { return {signals_.data(), signals_.size()}; }
+
 rust::String Simulation::take_messages() { return rust::String::lossy(errors_->take()); }
 
 double Simulation::seconds_in_step() const { return seconds_in_step_; }
 
 double Simulation::seconds_in_getters() const { return seconds_in_getters_; }
+
+double Simulation::seconds_in_signals() const { return seconds_in_signals_; }
 
 double Simulation::time() const { return libsumo::Simulation::getTime(); }
 

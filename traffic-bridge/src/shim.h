@@ -17,6 +17,7 @@ namespace caraware {
 
 struct RawState;
 struct RawEvent;
+struct RawSignal;
 struct RawEdge;
 struct RawLink;
 struct RawLane;
@@ -35,9 +36,11 @@ public:
     void step();
     rust::Slice<const RawState> states() const;
     rust::Slice<const RawEvent> events() const;
+    rust::Slice<const RawSignal> signals() const;
     rust::String take_messages();
     double seconds_in_step() const;
     double seconds_in_getters() const;
+    double seconds_in_signals() const;
 
     double time() const;
     double end_time() const;
@@ -83,12 +86,23 @@ private:
     void read_vehicle(const std::string& id, RawState& state) const;
     void read_person(const std::string& id, RawState& state) const;
     void read_all();
+    void read_signals();
     void forget_gone();
 
     std::unique_ptr<ErrorTee> errors_;
     std::vector<Live> live_;
     std::vector<RawState> states_;
     std::vector<RawEvent> events_;
+    // A traffic light, with the state last told ("" before the first) and the time at which SUMO looks at it again.
+    struct Light {
+        std::string id;
+        std::string told;
+        double next_switch;
+    };
+
+    // In the order of their sorted ids.
+    std::vector<Light> lights_;
+    std::vector<RawSignal> signals_;
     // Place in `live_` of an id; vehicles and persons have separate names. Never iterated.
     std::unordered_map<std::string, std::size_t> vehicle_places_;
     std::unordered_map<std::string, std::size_t> person_places_;
@@ -98,6 +112,7 @@ private:
     bool any_gone_ = false;
     double seconds_in_step_ = 0.0;
     double seconds_in_getters_ = 0.0;
+    double seconds_in_signals_ = 0.0;
 };
 
 // Processor time of this thread: what a step costs, whoever else is on the machine.

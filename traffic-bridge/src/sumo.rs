@@ -53,6 +53,16 @@ pub mod ffi {
         height: f64,
     }
 
+    /// A traffic light that has changed.
+    #[derive(Debug, Clone, PartialEq, Eq)]
+    struct RawSignal {
+        /// Place in the order of the sorted ids.
+        index: u32,
+        id: String,
+        /// A letter for each link.
+        state: String,
+    }
+
     /// A road that a class of road users may use.
     #[derive(Debug, Clone, PartialEq)]
     struct RawEdge {
@@ -119,13 +129,16 @@ pub mod ffi {
         fn states(self: &Simulation) -> &[RawState];
         /// What happened in the last step.
         fn events(self: &Simulation) -> &[RawEvent];
+        /// Traffic lights that changed in the last step; all of them after the first.
+        fn signals(self: &Simulation) -> &[RawSignal];
         /// What SUMO wrote to standard error since the last call (the last few kilobytes).
         fn take_messages(self: Pin<&mut Simulation>) -> String;
         /// Processor time of this thread, seconds.
         fn processor_seconds() -> f64;
-        /// Processor time spent in SUMO's own step and in the pass of getters since the start, seconds.
+        /// Processor time spent in SUMO's own step, in the pass of getters and in that over traffic lights since the start, seconds.
         fn seconds_in_step(self: &Simulation) -> f64;
         fn seconds_in_getters(self: &Simulation) -> f64;
+        fn seconds_in_signals(self: &Simulation) -> f64;
 
         fn time(self: &Simulation) -> Result<f64>;
         fn end_time(self: &Simulation) -> Result<f64>;

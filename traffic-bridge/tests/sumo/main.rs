@@ -5,4 +5,5 @@ mod population;
 mod process;
 mod scenario;
 mod session;
+mod signals;
 mod support;

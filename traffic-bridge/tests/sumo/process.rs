@@ -12,7 +12,7 @@ use std::{
 };
 
 use ipc_schema::{
-    SCHEMA_VERSION,
+    SCHEMA_VERSION, block,
     board::State,
     failure::{Failure, FailureKind},
     header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
@@ -21,7 +21,7 @@ use ipc_schema::{
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
     session::Session,
-    traffic::{Kind, TrafficState, VehicleMeta},
+    traffic::{Kind, SIGNALS_PER_MESSAGE, SignalMeta, TrafficMetaLayout, TrafficState, VehicleMeta},
 };
 
 use crate::support::{Bench, sumo_home};
@@ -134,8 +134,11 @@ fn next(subscriber: &Subscriber) -> Message {
     message.unwrap()
 }
 
-/// Everything a run sends, as sim-core takes it: the header of each step, its rows, and the departures told with it.
-fn consume(run: &Run) -> Vec<(MessageHeader, Vec<TrafficState>, Vec<VehicleMeta>)> {
+/// One step as sim-core takes it: its header and rows, what was told about road users, and about traffic lights.
+type Step = (MessageHeader, Vec<TrafficState>, Vec<VehicleMeta>, Vec<SignalMeta>);
+
+/// Everything a run sends.
+fn consume(run: &Run) -> Vec<Step> {
     let (mut session, traffic, meta) = run.sim_core();
     let (mut steps, mut meta_messages) = (Vec::new(), 0);
     loop {
@@ -143,7 +146,7 @@ fn consume(run: &Run) -> Vec<(MessageHeader, Vec<TrafficState>, Vec<VehicleMeta>
         let header = *message.header();
         let states = bytemuck::cast_slice(message.payload()).to_vec();
         drop(message);
-        let mut events = Vec::new();
+        let (mut events, mut signals) = (Vec::new(), Vec::new());
         while meta_messages < header.sequence {
             // What happened is told before where everybody is.
             let message = meta.receive().unwrap().unwrap();
@@ -152,10 +155,15 @@ fn consume(run: &Run) -> Vec<(MessageHeader, Vec<TrafficState>, Vec<VehicleMeta>
                 (message.header().tick, message.header().sequence),
                 (header.tick, meta_messages)
             );
-            events.extend_from_slice(bytemuck::cast_slice(message.payload()));
+            let header = message.header();
+            let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
+            assert_eq!(message.payload().len(), layout.len);
+            assert!(header.columns as usize <= SIGNALS_PER_MESSAGE && header.count + header.columns > 0);
+            events.extend_from_slice(block::view(message.payload(), layout.vehicles).unwrap());
+            signals.extend_from_slice(block::view(message.payload(), layout.signals).unwrap());
         }
         session.consumed(header.tick + 1);
-        steps.push((header, states, events));
+        steps.push((header, states, events, signals));
         if header.has(LAST_OF_RUN) {
             return steps;
         }
@@ -182,7 +190,7 @@ fn episodes_go_out_step_by_step_under_credit() {
     );
     let ticks: Vec<u64> = steps.iter().map(|(header, ..)| header.tick).collect();
     assert_eq!(ticks, (0..30).map(|step| 2 * step + 1).collect::<Vec<_>>());
-    for (place, (header, states, _)) in steps.iter().enumerate() {
+    for (place, (header, states, ..)) in steps.iter().enumerate() {
         let step = place as u64 % 15 + 1;
         assert_eq!(header.episode, place as u64 / 15);
         assert_eq!(header.sim_time_ns, step * 200_000_000);
@@ -196,13 +204,34 @@ fn episodes_go_out_step_by_step_under_credit() {
     for episode in steps.chunks(15) {
         let departed: Vec<_> = episode
             .iter()
-            .flat_map(|(_, _, events)| events)
+            .flat_map(|(_, _, events, _)| events)
             .map(|event| event.vehicle)
             .collect();
         assert_eq!(departed, (0..CAVS).collect::<Vec<_>>(), "indices begin anew");
         assert!(episode[14].1.iter().all(|state| state.kind == Kind::Cav as u32));
         assert_eq!(episode[14].1.len(), CAVS as usize);
     }
+}
+
+#[test]
+fn more_lights_than_a_message_holds_go_out_in_several() {
+    let bench = Bench::new();
+    let source = Source::Population {
+        net_file: bench.signalled_grid(20),
+        additional_files: Vec::new(),
+    };
+    let run = Run::new(&bench, source, 3, 0.1);
+    let mut process = run.start();
+    let steps = consume(&run);
+    assert_eq!(process.exit_code(), Some(0));
+    for first in steps.iter().filter(|(header, ..)| header.has(FIRST_OF_EPISODE)) {
+        let signals: Vec<u32> = first.3.iter().map(|signal| signal.signal).collect();
+        assert!(signals.len() > SIGNALS_PER_MESSAGE, "{}", signals.len());
+        assert_eq!(signals, (0..signals.len() as u32).collect::<Vec<_>>());
+    }
+    // One message for departures and 256 lights, one for the rest; two episodes.
+    let messages = steps.last().unwrap().0.sequence;
+    assert!((4..=8).contains(&messages), "{messages}");
 }
 
 #[test]
@@ -214,7 +243,7 @@ fn a_scenario_runs_to_its_own_end() {
     let mut process = run.start();
     let steps = consume(&run);
     assert_eq!(process.exit_code(), Some(0));
-    let (last, states, _) = steps.last().unwrap();
+    let (last, states, ..) = steps.last().unwrap();
     assert!(last.has(LAST_OF_EPISODE) && states.is_empty());
     assert_eq!(last.tick + 1, 10 * steps.len() as u64);
 }

@@ -7,7 +7,13 @@ use std::{
 };
 
 use tempfile::TempDir;
-use traffic_bridge::{fleet::Fleet, frame::Frame, options::Options, session::Session};
+use traffic_bridge::{
+    fleet::Fleet,
+    frame::Frame,
+    inputs::{attribute, for_each_element},
+    options::Options,
+    session::Session,
+};
 
 /// Tests run as threads of one process, SUMO runs once in a process: they take turns.
 static TURN: Mutex<()> = Mutex::new(());
@@ -58,6 +64,50 @@ impl Bench {
             .unwrap();
         assert!(status.status.success(), "{}", String::from_utf8_lossy(&status.stderr));
         net
+    }
+
+    /// The project's own town, built from its sources, and its additional files.
+    pub fn town(&self) -> (PathBuf, Vec<PathBuf>) {
+        let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("../maps/town");
+        let net = self.folder.path().join("town.net.xml");
+        let output = tool("netconvert")
+            .arg("-c")
+            .arg(sources.join("town.netccfg"))
+            .arg("-o")
+            .arg(&net)
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        (net, vec![sources.join("town.vtypes.add.xml")])
+    }
+
+    /// A grid of `number` × `number` junctions, each with signals.
+    pub fn signalled_grid(&self, number: u32) -> PathBuf {
+        let net = self.folder.path().join("signals.net.xml");
+        let number = number.to_string();
+        let options = ["--grid", "--grid.number", &number, "--grid.length", "60"];
+        let output = tool("netgenerate")
+            .args(options)
+            .args(["--default-junction-type", "traffic_light", "--output-file"])
+            .arg(&net)
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        net
+    }
+
+    /// Ids of a net's traffic lights, sorted.
+    pub fn lights_of(&self, net: &Path) -> Vec<String> {
+        let mut ids = Vec::new();
+        for_each_element(net, |element| {
+            if element.name().as_ref() == "tlLogic" {
+                ids.extend(attribute(element, "id"));
+            }
+        })
+        .unwrap();
+        ids.sort();
+        ids.dedup();
+        ids
     }
 
     /// Writes a file.

@@ -1,0 +1,104 @@
+//! Traffic lights as they are told, against what SUMO itself writes.
+
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
+
+use crate::support::{Bench, run, sumo_home};
+use ipc_schema::traffic::id_hash;
+use traffic_bridge::{
+    frame::Frame,
+    inputs::{attribute, for_each_element},
+    options::Options,
+    population::{Population, Size},
+    session::Session,
+};
+
+/// Junctions with signals in the town.
+const LIGHTS: usize = 4;
+
+/// Runs `net` with some traffic and compares every state of every light with what SUMO saves; returns the changes that were told.
+fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32) -> u32 {
+    let lights = bench.lights_of(net);
+    let events: String = lights
+        .iter()
+        .map(|id| format!("<timedEvent type=\"SaveTLSStates\" source=\"{id}\" dest=\"{id}.states.xml\"/>"))
+        .collect();
+    files.push(bench.file("a.add.xml", &format!("<additional>{events}</additional>")));
+    let options = Options::population(&sumo_home(), net, &files, 0.5, 1).unwrap();
+    let mut session = Session::start(options).unwrap();
+    let size = Size {
+        cavs: 20,
+        others: 0,
+        pedestrians,
+    };
+    let mut population = Population::start(&mut session, size, 1).unwrap();
+    let mut now: BTreeMap<String, String> = BTreeMap::new();
+    let (mut told, mut changes) = (Vec::new(), 0);
+    run(&mut session, 400, |session: &mut Session, frame: &Frame| {
+        if frame.step == 1 {
+            let all: Vec<String> = frame.signals.iter().map(|signal| signal.id_text()).collect();
+            assert_eq!(all, lights, "all of them, in the order of their ids");
+        }
+        for signal in &frame.signals {
+            assert_eq!(lights[signal.signal as usize], signal.id_text());
+            assert_eq!((signal.id_hash, signal.reserved), (id_hash(&signal.id_text()), 0));
+            let before = now.insert(signal.id_text(), signal.state_text());
+            assert_ne!(before.as_ref(), Some(&signal.state_text()), "told without a change");
+            changes += u32::from(before.is_some());
+        }
+        told.push(now.clone());
+        population.after_step(session, frame).unwrap();
+    });
+    session.close().unwrap();
+    let mut compared = 0;
+    for id in &lights {
+        for_each_element(&bench.folder.path().join(format!("{id}.states.xml")), |element| {
+            let (Some(time), Some(state)) = (attribute(element, "time"), attribute(element, "state")) else {
+                return;
+            };
+            // SUMO's time is that of the start of the step.
+            let step = (2.0 * time.parse::<f64>().unwrap()).round() as usize;
+            if let Some(told) = told.get(step) {
+                assert_eq!(told[id], state, "{id} at {time}");
+                compared += 1;
+            }
+        })
+        .unwrap();
+    }
+    assert_eq!(compared, lights.len() * 400);
+    changes
+}
+
+/// Its lights are actuated: when they switch depends on traffic.
+#[test]
+fn the_lights_of_the_town_are_told_as_sumo_writes_them() {
+    let bench = Bench::new();
+    let (net, files) = bench.town();
+    assert_eq!(bench.lights_of(&net).len(), LIGHTS);
+    let changes = compare(&bench, &net, files, 10);
+    assert!(changes > 20, "{changes} changes in 200 s");
+}
+
+#[test]
+fn lights_with_fixed_times_are_told_as_sumo_writes_them() {
+    let bench = Bench::new();
+    let net = bench.signalled_grid(3);
+    let changes = compare(&bench, &net, Vec::new(), 0);
+    assert!(changes > 30, "{changes} changes in 200 s");
+}
+
+#[test]
+fn a_new_episode_tells_every_light_again() {
+    let bench = Bench::new();
+    let (net, files) = bench.town();
+    let options = || Options::population(&sumo_home(), &net, &files, 1.0, 1).unwrap();
+    let mut session = Session::start(options()).unwrap();
+    let mut counts = Vec::new();
+    run(&mut session, 3, |_, frame| counts.push(frame.signals.len()));
+    let mut session = session.reload(options()).unwrap();
+    run(&mut session, 1, |_, frame| counts.push(frame.signals.len()));
+    assert_eq!((counts[0], counts[3]), (LIGHTS, LIGHTS), "{counts:?}");
+    assert!(counts[1] < LIGHTS && counts[2] < LIGHTS, "{counts:?}");
+}
