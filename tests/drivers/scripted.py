@@ -16,13 +16,18 @@ import numpy as np
 from caraware.channel import Channel
 
 SCRIPT = json.loads(os.environ["DRIVER_SCRIPT"])
-PHASES = sorted((float(key), value) for key, value in SCRIPT.items() if key[0].isdigit())
+PHASES = sorted(
+    (float(key), value) for key, value in SCRIPT.items() if key[0].isdigit()
+)
 
 
 def keep_lane(row: dict, speed: float, wanted: float) -> list[float]:
     """Pure pursuit towards the route 10 m ahead, and a proportional controller of the speed."""
     x, y = row["route_x_10"] * 10, row["route_y_10"] * 10
-    return [math.atan(2 * 2.7 * y / (x * x + y * y)) / 0.6, float(np.clip((wanted - speed) / 5, -1, 1))]
+    return [
+        math.atan(2 * 2.7 * y / (x * x + y * y)) / 0.6,
+        float(np.clip((wanted - speed) / 5, -1, 1)),
+    ]
 
 
 def act(row: dict, truth: list[float], age_s: float, first_speed: float) -> list[float]:
@@ -33,7 +38,10 @@ def act(row: dict, truth: list[float], age_s: float, first_speed: float) -> list
         return [float(part) for part in phase]
     if "stop_x_m" in SCRIPT:
         left = SCRIPT["stop_x_m"] - x
-        return [keep_lane(row, speed, 0)[0], float(np.clip((math.sqrt(max(2 * 3 * left, 0)) - speed) / 2, -1, 0.3))]
+        return [
+            keep_lane(row, speed, 0)[0],
+            float(np.clip((math.sqrt(max(2 * 3 * left, 0)) - speed) / 2, -1, 0.3)),
+        ]
     return keep_lane(row, speed, first_speed)
 
 
@@ -48,10 +56,20 @@ def main(run_file: str) -> None:
             for slot in range(len(obs.vehicle)):
                 key = (obs.episode, int(obs.vehicle[slot]))
                 truth, age_s = obs.truth[slot].tolist(), 0.1 * int(steps[slot])
-                ends = [bool(obs.valid[slot]), bool(obs.terminated[slot]), bool(obs.truncated[slot])]
+                ends = [
+                    bool(obs.valid[slot]),
+                    bool(obs.terminated[slot]),
+                    bool(obs.truncated[slot]),
+                ]
                 seen.append([obs.episode, obs.tick, slot, key[1], *ends, *truth])
                 if obs.valid[slot]:
-                    row = dict(zip(config["observation"]["fields"], obs.observation[slot].tolist(), strict=True))
+                    row = dict(
+                        zip(
+                            config["observation"]["fields"],
+                            obs.observation[slot].tolist(),
+                            strict=True,
+                        )
+                    )
                     first_speed.setdefault(key, truth[3])
                     actions[slot] = act(row, truth, age_s, first_speed[key])
                     if "mute_s" in SCRIPT and age_s >= SCRIPT["mute_s"]:

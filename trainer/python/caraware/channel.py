@@ -159,10 +159,11 @@ class Channel:
         self._attachment.publish_predictions(observation.block, rows.tobytes(), rows.shape[1], policy_version)
 
     def publish_actions(self, observation: Observation, actions: np.ndarray, policy_version: int = 0) -> None:
-        """Steering (left is positive) and acceleration for every slot, f32 [n, 2], each in -1 ... 1: the driving task.
+        """Actions of the driving task: steering (left is positive) and acceleration, each in -1 ... 1.
 
-        The simulation waits for the actions of every tick and makes the next one with them. Rows of empty slots are not read.
-        What is no number or out of range is refused: the last valid action of that vehicle is held.
+        f32 [n, 2], a row for every slot; rows of empty slots are not read. The simulation waits for the actions of
+        every tick and makes the next one with them. What is no number or out of range is refused: the last valid action
+        of that vehicle is held.
         """
         rows = np.ascontiguousarray(actions, dtype=np.float32)
         if rows.shape != (observation.block.slots, 2):
