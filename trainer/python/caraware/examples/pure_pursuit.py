@@ -9,8 +9,7 @@ import numpy as np
 
 from caraware.channel import Channel
 
-AHEAD_M = (5, 10, 20)
-WHEELBASE_M, BRAKING_MPS2, LATERAL_MPS2, STAND_OFF_M, KP, KI = 2.7, 2.0, 2.0, 5.0, 1.0, 0.1
+AHEAD_M, WHEELBASE_M, BRAKING_MPS2, LATERAL_MPS2, STAND_OFF_M, KP, KI = (5, 10, 20), 2.7, 2.0, 2.0, 5.0, 1.0, 0.1
 
 
 def si_units(row: np.ndarray, config: dict) -> dict[str, float]:
@@ -42,16 +41,14 @@ def drive(o: dict[str, float], integral_m: float, config: dict) -> tuple[float, 
 
 def main(run_file: str) -> None:
     channel, stop, integrals, ended, steps = Channel(run_file), [], {}, False, 0
+    config = channel.run["config"]
     signal.signal(signal.SIGTERM, lambda number, _: stop.append(number))
     while not ended and not stop:
         for obs in channel.receive(0.2):
             actions = np.zeros((len(obs.vehicle), 2), np.float32)
             for slot in np.flatnonzero(obs.valid):
-                seen, before = (
-                    si_units(obs.observation[slot], channel.run["config"]),
-                    integrals.get(obs.vehicle[slot], 0.0),
-                )
-                *actions[slot], integrals[obs.vehicle[slot]] = drive(seen, before, channel.run["config"])
+                seen, before = si_units(obs.observation[slot], config), integrals.get(obs.vehicle[slot], 0.0)
+                *actions[slot], integrals[obs.vehicle[slot]] = drive(seen, before, config)
             channel.publish_actions(obs, np.clip(actions, -1.0, 1.0))
             channel.consumed(obs.tick)
             ended, steps = obs.last, steps + int(obs.valid.sum())
