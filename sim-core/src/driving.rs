@@ -352,3 +352,6 @@ fn pose(state: &VehicleState) -> EgoPose {
         flags: state.flags & HERO_ENDS,
     }
 }
+
+#[cfg(test)]
+mod tests;
