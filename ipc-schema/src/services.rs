@@ -118,12 +118,13 @@ impl Channel {
             Self::World => Some(Process::SensorDaemon),
             Self::Observation => Some(Process::Trainer),
             Self::EgoPose => Some(Process::TrafficBridge),
-            // In the driving task sim-core waits for each of them, and the trainer is at most one ahead.
+            // In the driving task sim-core waits for each of them, so the trainer is at most one ahead and no queue overflows.
             Self::Prediction | Self::Event => None,
         }
     }
 
-    /// Subscribers at a time: the required one, its successor, the fan-out, one spare.
+    /// Subscribers at a time: the required one, its successor, the fan-out, and one spare, which `sim-core` takes of `observation`
+    /// in the driving task.
     const fn max_subscribers(self) -> usize {
         4
     }
