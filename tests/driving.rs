@@ -409,17 +409,32 @@ fn a_task_that_cannot_be_driven_is_refused_before_anything_starts() {
     let refused = |arguments: &[&str]| {
         let output = workplace.run(&[arguments, &QUIET].concat());
         assert_eq!(output.status.code(), Some(2), "{}", text(&output));
-        text(&output).replace(['│', '×'], " ").split_whitespace().collect::<Vec<_>>().join(" ")
+        text(&output)
+            .replace(['│', '×'], " ")
+            .split_whitespace()
+            .collect::<Vec<_>>()
+            .join(" ")
     };
     let said = refused(&["simulate", "driving"]);
-    assert!(said.contains("needs a trainer that drives") && said.contains("caraware train"), "{said}");
+    assert!(
+        said.contains("needs a trainer that drives") && said.contains("caraware train"),
+        "{said}"
+    );
     let said = refused(&["train", "driving", "--set", "traffic.hero_ids=[\"a\"]"]);
     assert!(said.contains("not by `traffic.hero_ids`"), "{said}");
     let said = refused(&["train", "town", "--set", "traffic.heroes=1"]);
     assert!(said.contains("without anybody who drives them"), "{said}");
     assert!(!workplace.path().join("runs").exists());
     // Only SUMO knows the edges.
-    let said = refused(&["train", "driving", "--set", "traffic.hero_route=[\"ring_west_1\", \"nowhere\"]"]);
-    assert!(said.contains("no hero can drive `traffic.hero_route`") && said.contains("nowhere"), "{said}");
+    let said = refused(&[
+        "train",
+        "driving",
+        "--set",
+        "traffic.hero_route=[\"ring_west_1\", \"nowhere\"]",
+    ]);
+    assert!(
+        said.contains("no hero can drive `traffic.hero_route`") && said.contains("nowhere"),
+        "{said}"
+    );
     workplace.assert_nothing_left();
 }

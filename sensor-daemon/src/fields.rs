@@ -153,6 +153,7 @@ mod tests {
                 speed_mps: 15.0,
                 steering_rad: 5.0,
             },
+            route: HeroView::default(),
         };
         let fields = vec![
             Field::Speed,
@@ -168,6 +169,38 @@ mod tests {
         assert_eq!(row, [0.5, 0.25, 1.0, 0.0, 0.75, 0.5, 0.75]);
         assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M).fill(&readings, &mut row));
         assert_eq!(row, [0.0, -0.5, 1.0, -1.0, 0.5, 0.0, 0.5]);
+    }
+
+    #[test]
+    fn a_heros_route_is_normalised_by_its_distances() {
+        let readings = Readings {
+            route: HeroView {
+                route_m: [[5.0, 0.0], [8.0, 5.0], [20.0, -20.0], [0.0, 40.0]],
+                speed_limit_mps: 15.0,
+                route_offset_m: -2.5,
+                route_left_m: 250.0,
+                leader_gap_m: 100.0,
+                leader_speed_mps: 0.0,
+                signal_gap_m: 25.0,
+                ..HeroView::default()
+            },
+            ..Readings::default()
+        };
+        let fields = vec![
+            Field::RouteX5,
+            Field::RouteY10,
+            Field::RouteY20,
+            Field::RouteX40,
+            Field::SpeedLimit,
+            Field::RouteOffset,
+            Field::RouteLeft,
+            Field::LeaderGap,
+            Field::LeaderSpeed,
+            Field::SignalGap,
+        ];
+        let mut row = [9.0; 10];
+        assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M).fill(&readings, &mut row));
+        assert_eq!(row, [1.0, 0.5, -1.0, 0.0, 0.0, -0.5, -0.5, 1.0, -1.0, -0.5]);
     }
 
     proptest! {
