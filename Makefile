@@ -43,17 +43,22 @@ test-python:
 	$(VENV)/bin/python -m pytest -q trainer/tests
 	cd viewer && ../$(VENV)/bin/python -m pytest -q tests
 	$(VENV)/bin/python -m pytest -q maps/town/tests
+	$(VENV)/bin/python -m pytest -q sim-core/tests
 
 lint: $(VENV)/.installed ## formatting and lints, as errors
 	cargo fmt --all --check
 	cargo clippy --locked --workspace --all-targets -- -D warnings
 	$(VENV)/bin/ruff check trainer viewer
+	$(VENV)/bin/ruff check --config trainer/pyproject.toml sim-core docs
 	$(VENV)/bin/ruff format --check trainer viewer
+	$(VENV)/bin/ruff format --config trainer/pyproject.toml --check sim-core docs
 
 format: $(VENV)/.installed
 	cargo fmt --all
 	$(VENV)/bin/ruff check --fix trainer viewer
+	$(VENV)/bin/ruff check --config trainer/pyproject.toml --fix sim-core docs
 	$(VENV)/bin/ruff format trainer viewer
+	$(VENV)/bin/ruff format --config trainer/pyproject.toml sim-core docs
 
 deny: ## licences, sources and advisories of all dependencies (needs: cargo install cargo-deny --locked)
 	cargo deny check

@@ -15,7 +15,7 @@ const TABLE: [(&str, &[&str], &[&str]); 7] = [
     ("ipc-schema", &[], &["iceoryx2"]),
     ("caraware", &["ipc-schema"], &["clap", "indicatif"]),
     ("traffic-bridge", &["ipc-schema"], &["cxx"]),
-    ("sim-core", &["ipc-schema"], &["rapier3d", "nalgebra"]),
+    ("sim-core", &["ipc-schema"], &["rapier3d-f64", "nalgebra"]),
     ("sensor-daemon", &["ipc-schema", "sim-core"], &["parry3d"]),
     ("fanout", &["ipc-schema"], &["zenoh"]),
     ("caraware-native", &["ipc-schema"], &["pyo3"]),

@@ -221,8 +221,10 @@ pub struct Vehicle {
     pub max_decel_mps2: f64,
     /// Steering-wheel angle per road-wheel angle.
     pub steering_ratio: f64,
-    /// Distance between mirror and SUMO beyond which the mirror is set onto SUMO, metres.
+    /// Tracking error beyond which the mirror is set onto SUMO, metres.
     pub resynchronise_m: f64,
+    /// Distance between the reference and SUMO's path, because that cannot be driven, beyond which the mirror is set onto SUMO, metres.
+    pub leave_path_m: f64,
 }
 
 /// GNSS receiver.

@@ -61,6 +61,44 @@ pub enum MetaEvent {
     Teleported = 2,
 }
 
+/// SUMO's vehicle classes.
+pub const VEHICLE_CLASSES: [&str; 34] = [
+    "passenger",
+    "private",
+    "emergency",
+    "authority",
+    "army",
+    "vip",
+    "hov",
+    "taxi",
+    "bus",
+    "coach",
+    "delivery",
+    "truck",
+    "trailer",
+    "motorcycle",
+    "moped",
+    "bicycle",
+    "evehicle",
+    "tram",
+    "rail_urban",
+    "rail",
+    "rail_electric",
+    "rail_fast",
+    "ship",
+    "container",
+    "cable_car",
+    "subway",
+    "aircraft",
+    "wheelchair",
+    "scooter",
+    "drone",
+    "custom1",
+    "custom2",
+    "pedestrian",
+    "ignoring",
+];
+
 /// Longest id carried as text; longer ids are cut, their hash is of the whole.
 pub const ID_BYTES: usize = 64;
 

@@ -37,9 +37,12 @@ fn state(vehicle: u32, time_s: f64) -> TrafficState {
     }
 }
 
-fn meta(vehicle: u32) -> VehicleMeta {
+/// `cavs` of ten vehicles are connected: with the default models these are dynamic, the others kinematic.
+fn meta(vehicle: u32, cavs: u32) -> VehicleMeta {
     let mut meta: VehicleMeta = bytemuck::Zeroable::zeroed();
-    (meta.vehicle, meta.kind, meta.event) = (vehicle, Kind::Cav as u32, MetaEvent::Departed as u32);
+    let kind = if vehicle % 10 < cavs { Kind::Cav } else { Kind::Other };
+    (meta.vehicle, meta.kind, meta.event) = (vehicle, kind as u32, MetaEvent::Departed as u32);
+    meta.vehicle_class[..9].copy_from_slice(b"passenger");
     (meta.length_m, meta.width_m, meta.height_m) = (LENGTH_M as f32, 1.8, 1.5);
     meta.set_id(&vehicle.to_string());
     meta
@@ -47,7 +50,7 @@ fn meta(vehicle: u32) -> VehicleMeta {
 
 fn settings() -> Settings {
     let vehicle = config::Vehicle {
-        cav_model: config::VehicleModel::Kinematic,
+        cav_model: config::VehicleModel::Dynamic,
         other_model: config::VehicleModel::Kinematic,
         hero_model: config::VehicleModel::Kinematic,
         class_models: Vec::new(),
@@ -57,20 +60,25 @@ fn settings() -> Settings {
         max_accel_mps2: 5.0,
         max_decel_mps2: 9.0,
         steering_ratio: 15.0,
-        resynchronise_m: 5.0,
+        resynchronise_m: 2.0,
+        leave_path_m: 5.0,
     };
     Settings {
         vehicle,
+        surface: config::Surface::Dry,
         tick_s: 0.1,
         sub_steps: 10,
         ticks_per_step: 1,
     }
 }
 
-fn measure(vehicles: u32) {
-    let mut mirror = Mirror::new(settings());
+fn measure(vehicles: u32, cavs: u32) {
+    let mut mirror = match Mirror::new(settings()) {
+        Ok(mirror) => mirror,
+        Err(error) => return eprintln!("{error}"),
+    };
     let header = MessageHeader::default();
-    let metas: Vec<VehicleMeta> = (0..vehicles).map(meta).collect();
+    let metas: Vec<VehicleMeta> = (0..vehicles).map(|vehicle| meta(vehicle, cavs)).collect();
     if let Err(error) = mirror.apply_meta(&header, &metas) {
         return eprintln!("{error}");
     }
@@ -93,7 +101,10 @@ fn measure(vehicles: u32) {
     }
     costs_us.sort_by(f64::total_cmp);
     let (median, least) = (costs_us[costs_us.len() / 2], costs_us[0]);
-    println!("mirror {vehicles:>6} vehicles: median {median:.3} µs, fastest {least:.3} µs per vehicle and tick");
+    println!(
+        "mirror {vehicles:>6} vehicles, {:>3} % dynamic: median {median:.3} µs, fastest {least:.3} µs per vehicle and tick",
+        10 * cavs
+    );
     println!("       re-synchronised {}", mirror.resynchronisations());
 }
 
@@ -104,5 +115,8 @@ fn main() {
     } else {
         wanted
     };
-    wanted.into_iter().for_each(measure);
+    for vehicles in wanted {
+        // The town's default mix is 32 connected vehicles of 40.
+        [0, 8, 10].into_iter().for_each(|cavs| measure(vehicles, cavs));
+    }
 }

@@ -1,5 +1,7 @@
 //! The reference of one tick: a cubic in time for where the front bumper should be.
 
+use bytemuck::{Pod, Zeroable};
+
 /// Where the front bumper should be.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Target {
@@ -9,10 +11,13 @@ pub struct Target {
     pub velocity_mps: [f64; 2],
     /// Acceleration along the path to be felt ahead of the error, m/s².
     pub accel_mps2: f64,
+    /// Derivative of the velocity, world frame, m/s².
+    pub bend_mps2: [f64; 2],
 }
 
 /// A cubic curve in the plane: `start + a t + b t² + c t³`.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct Curve {
     /// Metres.
     pub start_m: [f64; 2],
@@ -57,6 +62,7 @@ impl Curve {
             position_m: [position(0), position(1)],
             velocity_mps: [velocity(0), velocity(1)],
             accel_mps2: self.accel_mps2,
+            bend_mps2: [0, 1].map(|i: usize| 2.0 * b[i] + 6.0 * t_s * c[i]),
         }
     }
 
@@ -87,6 +93,43 @@ impl Curve {
             }
         }
         sum
+    }
+}
+
+/// The road under the front bumper over one tick: height and slope, each `start + a t + b t²`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct Rise {
+    /// Height above that at the start, metres per power of a second; the first is zero.
+    pub height_m: [f64; 3],
+    /// Slope, positive uphill, radians per power of a second.
+    pub slope_rad: [f64; 3],
+}
+
+impl Rise {
+    /// The same road with its time and its height counted from `t_s` on.
+    #[must_use]
+    pub fn from_time(&self, t_s: f64) -> Self {
+        let later = |[a, b, c]: [f64; 3]| [a + t_s * (b + t_s * c), b + 2.0 * t_s * c, c];
+        let [_, b, c] = later(self.height_m);
+        Self {
+            height_m: [0.0, b, c],
+            slope_rad: later(self.slope_rad),
+        }
+    }
+
+    /// Height above that at the start, its rate, slope and its rate after `t_s`.
+    #[must_use]
+    #[inline(always)]
+    pub fn at(&self, t_s: f64) -> [f64; 4] {
+        let [_, b, c] = self.height_m;
+        let [p, q, r] = self.slope_rad;
+        [
+            t_s * (b + t_s * c),
+            b + 2.0 * t_s * c,
+            p + t_s * (q + t_s * r),
+            q + 2.0 * t_s * r,
+        ]
     }
 }
 

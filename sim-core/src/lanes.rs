@@ -1,147 +1,211 @@
-//! Many vehicles at once: the tracker and the kinematic model on [`LANES`] vehicles side by side, for all sub-steps of a tick.
+//! Many vehicles at once: the tracker and one model on [`LANES`] vehicles side by side, for all sub-steps of a tick.
 //!
 //! One vehicle alone is a chain of some 300 dependent operations in each sub-step, which the processor waits for: 0.7 µs per
-//! tick of 10 sub-steps, measured. Side by side they fill its vector units: the whole mirror, reading and writing included,
-//! then takes 0.34 µs with SSE2 and 0.18 µs with AVX-512. The functions are those of [`crate::tracking`] and
-//! [`crate::vehicle`], no operation is fused or reordered, so every vehicle gets the same bits as alone, on any machine.
+//! tick of 10 sub-steps, measured. Side by side they fill its vector units. The functions are those of [`crate::tracking`],
+//! [`crate::vehicle`], [`crate::dynamic`] and [`crate::attitude`], no operation is fused or reordered, so every vehicle gets the
+//! same bits as alone, on any machine.
 
-use ipc_schema::config;
+use bytemuck::Pod;
+use ipc_schema::world::SubStep;
 
 use crate::{
-    curve::Curve,
+    attitude::{Lean, angular_rate, body_from_level, half_way},
+    curve::{Curve, Rise, Target},
+    dynamic::{DynamicParams, GRAVITY_MPS2},
+    governor::Ability,
     tracking::{self, Driven},
-    vehicle::{KinematicParams, State},
+    vehicle::{Input, KinematicParams, Motion, State},
 };
 
 /// Vehicles side by side: two registers of AVX-512 or eight of SSE2 for each number.
 pub const LANES: usize = 16;
 
+/// Share of a vehicle's friction, steering and power that references use; the rest is for following them.
+const LATERAL_SHARE: f64 = 0.6;
+const LONGITUDINAL_SHARE: f64 = 0.85;
+const POWER_SHARE: f64 = 0.8;
+const CURVATURE_SHARE: f64 = 0.9;
+
 type Lane = [f64; LANES];
+/// Numbers in a [`State`], a [`Curve`] and a [`Rise`].
+const STATE: usize = size_of::<State>() / 8;
+const CURVE: usize = size_of::<Curve>() / 8;
+const RISE: usize = size_of::<Rise>() / 8;
+/// Numbers in a [`SubStep`].
+const SUB_STEP: usize = size_of::<SubStep>() / 4;
 
-/// Motion of all lanes over one sub-step, with the state at its end.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Row {
-    /// Rear axle, metres.
-    pub x_m: Lane,
-    /// Rear axle, metres.
-    pub y_m: Lane,
-    /// Radians, not wrapped.
-    pub yaw_rad: Lane,
-    /// m/s.
-    pub speed_mps: Lane,
-    /// Forward, m/s².
-    pub accel_x_mps2: Lane,
-    /// To the left, m/s².
-    pub accel_y_mps2: Lane,
-    /// rad/s.
-    pub yaw_rate_radps: Lane,
-    /// Radians.
-    pub road_wheel_angle_rad: Lane,
+/// A model with `N` parameters that can run in lanes: free of branches.
+pub trait Drive<const N: usize>: Pod {
+    /// What the driver asks for to reach `target` with a front bumper `front_m` ahead of the rear axle.
+    fn demand(&self, front_m: f64, state: &State, target: &Target) -> Input;
+    /// The state after `dt_s`, and what moved on the way.
+    fn step(&self, state: &State, input: &Input, slope_sin: f64, dt_s: f64) -> (State, Motion);
+    /// What a reference may ask for.
+    fn ability(&self) -> Ability;
+    /// Parameters that keep the numbers of an empty lane finite.
+    fn empty() -> [f64; N];
 }
 
-/// Vehicles side by side.
-#[derive(Debug, Clone)]
-pub struct Lanes {
-    x_m: Lane,
-    y_m: Lane,
-    yaw_rad: Lane,
-    heading: [Lane; 2],
-    speed_mps: Lane,
-    accel_mps2: Lane,
-    road_wheel_angle_rad: Lane,
-    start_m: [Lane; 2],
-    cubic: [[Lane; 2]; 3],
-    path_accel_mps2: Lane,
-    front_m: Lane,
-    wheelbase_m: Lane,
-    /// What moved, one for each sub-step.
-    pub rows: Vec<Row>,
-}
+/// Parameters of the kinematic model.
+pub const KINEMATIC: usize = size_of::<KinematicParams>() / 8;
+/// Parameters of the dynamic model.
+pub const DYNAMIC: usize = size_of::<DynamicParams>() / 8;
 
-impl Lanes {
-    /// Empty lanes for `sub_steps` sub-steps.
-    #[must_use]
-    pub fn new(sub_steps: usize) -> Self {
-        // Empty lanes compute too: a body of one metre keeps their numbers finite.
-        let zero = [0.0; LANES];
-        Self {
-            x_m: zero,
-            y_m: zero,
-            yaw_rad: zero,
-            heading: [[1.0; LANES], zero],
-            speed_mps: zero,
-            accel_mps2: zero,
-            road_wheel_angle_rad: zero,
-            start_m: [zero; 2],
-            cubic: [[zero; 2]; 3],
-            path_accel_mps2: zero,
-            front_m: [1.0; LANES],
-            wheelbase_m: [1.0; LANES],
-            rows: vec![Row::default(); sub_steps],
+impl Drive<KINEMATIC> for KinematicParams {
+    #[inline(always)]
+    fn demand(&self, front_m: f64, state: &State, target: &Target) -> Input {
+        tracking::demand(&Driven::new(self, front_m), state, target)
+    }
+
+    #[inline(always)]
+    fn step(&self, state: &State, input: &Input, _: f64, dt_s: f64) -> (State, Motion) {
+        Self::step(self, state, input, dt_s)
+    }
+
+    fn ability(&self) -> Ability {
+        Ability {
+            lateral_mps2: self.max_lateral_mps2,
+            curvature_per_m: CURVATURE_SHARE * self.max_curvature_per_m,
+            accel_mps2: self.max_accel_mps2,
+            decel_mps2: self.max_decel_mps2,
+            power_by_mass: f64::INFINITY,
+            drag_by_mass_per_m: 0.0,
+            rolling_mps2: 0.0,
         }
     }
 
-    /// Puts a vehicle and its reference into a lane.
-    pub fn load(&mut self, lane: usize, state: &State, curve: &Curve, front_m: f64, wheelbase_m: f64) {
-        self.x_m[lane] = state.x_m;
-        self.y_m[lane] = state.y_m;
-        self.yaw_rad[lane] = state.yaw_rad;
-        self.speed_mps[lane] = state.speed_mps;
-        self.accel_mps2[lane] = state.accel_mps2;
-        self.road_wheel_angle_rad[lane] = state.road_wheel_angle_rad;
-        self.path_accel_mps2[lane] = curve.accel_mps2;
-        self.front_m[lane] = front_m;
-        self.wheelbase_m[lane] = wheelbase_m;
-        for axis in 0..2 {
-            self.heading[axis][lane] = state.heading[axis];
-            self.start_m[axis][lane] = curve.start_m[axis];
-            for power in 0..3 {
-                self.cubic[power][axis][lane] = curve.cubic[power][axis];
-            }
+    fn empty() -> [f64; KINEMATIC] {
+        [1.0; KINEMATIC]
+    }
+}
+
+impl Drive<DYNAMIC> for DynamicParams {
+    #[inline(always)]
+    fn demand(&self, front_m: f64, state: &State, target: &Target) -> Input {
+        tracking::demand_with_tyres(self, front_m, state, target)
+    }
+
+    #[inline(always)]
+    fn step(&self, state: &State, input: &Input, slope_sin: f64, dt_s: f64) -> (State, Motion) {
+        Self::step(self, state, input, slope_sin, dt_s)
+    }
+
+    fn ability(&self) -> Ability {
+        let friction = self.friction * GRAVITY_MPS2;
+        Ability {
+            lateral_mps2: LATERAL_SHARE * friction,
+            curvature_per_m: CURVATURE_SHARE * self.max_curvature_per_m,
+            accel_mps2: self.max_accel_mps2.min(LONGITUDINAL_SHARE * friction),
+            decel_mps2: self.max_decel_mps2.min(LONGITUDINAL_SHARE * friction),
+            power_by_mass: POWER_SHARE * self.max_power_by_mass,
+            drag_by_mass_per_m: self.drag_by_mass_per_m,
+            rolling_mps2: self.rolling_mps2,
         }
+    }
+
+    fn empty() -> [f64; DYNAMIC] {
+        [0.25; DYNAMIC]
+    }
+}
+
+/// Motion of all lanes over one sub-step in the order of [`SubStep`]; the first four fields count from the start of the tick.
+pub type Row = [[f32; LANES]; SUB_STEP];
+
+/// Vehicles of one model side by side.
+#[derive(Debug, Clone)]
+pub struct Lanes<P, const N: usize> {
+    state: [Lane; STATE],
+    curve: [Lane; CURVE],
+    rise: [Lane; RISE],
+    front_m: Lane,
+    params: [Lane; N],
+    /// Height of the rear axle above the front bumper's place at the start of the tick (metres), its rate (m/s), and the pitch
+    /// of the road (radians).
+    road: [Lane; 3],
+    /// x, y, z and yaw at the start of the tick.
+    origin: [Lane; 4],
+    /// What moved, one for each sub-step.
+    pub rows: Vec<Row>,
+    model: std::marker::PhantomData<P>,
+}
+
+#[inline(always)]
+fn scatter<T: Pod, const N: usize>(lanes: &mut [Lane; N], lane: usize, value: &T) {
+    let numbers: &[f64; N] = bytemuck::must_cast_ref(value);
+    for (place, number) in lanes.iter_mut().zip(numbers) {
+        place[lane] = *number;
+    }
+}
+
+#[inline(always)]
+fn gather<T: Pod, const N: usize>(lanes: &[Lane; N], lane: usize) -> T {
+    bytemuck::must_cast(std::array::from_fn::<f64, N, _>(|i| lanes[i][lane]))
+}
+
+impl<P: Drive<N>, const N: usize> Lanes<P, N> {
+    /// Empty lanes for `sub_steps` sub-steps.
+    #[must_use]
+    pub fn new(sub_steps: usize) -> Self {
+        let zero = [0.0; LANES];
+        let mut lanes = Self {
+            state: [zero; STATE],
+            curve: [zero; CURVE],
+            rise: [zero; RISE],
+            front_m: [1.0; LANES],
+            params: P::empty().map(|value| [value; LANES]),
+            road: [zero; 3],
+            origin: [zero; 4],
+            rows: vec![[[0.0; LANES]; SUB_STEP]; sub_steps],
+            model: std::marker::PhantomData,
+        };
+        let standing = State::new(0.0, 0.0, 0.0, 0.0);
+        (0..LANES).for_each(|lane| scatter(&mut lanes.state, lane, &standing));
+        lanes
+    }
+
+    /// Puts a vehicle into a lane, with its reference and the road under its front bumper, `front_m` ahead of the rear axle.
+    pub fn load(&mut self, lane: usize, params: &P, state: &State, reference: (&Curve, &Rise), front_m: f64) {
+        scatter(&mut self.state, lane, state);
+        scatter(&mut self.curve, lane, reference.0);
+        scatter(&mut self.rise, lane, reference.1);
+        scatter(&mut self.params, lane, params);
+        self.front_m[lane] = front_m;
+    }
+
+    /// Writes the sub-steps of the vehicle in a lane, relative to the last of them.
+    pub fn write(&self, lane: usize, rows: &mut [SubStep]) {
+        let Some(last) = self.rows.last() else { return };
+        let end: [f32; 4] = std::array::from_fn(|i| last[i][lane]);
+        for (row, moved) in rows.iter_mut().zip(&self.rows) {
+            let mut numbers: [f32; SUB_STEP] = std::array::from_fn(|i| moved[i][lane]);
+            numbers.iter_mut().zip(end).for_each(|(number, end)| *number -= end);
+            *row = bytemuck::must_cast(numbers);
+        }
+    }
+
+    /// Height of the rear axle above the front bumper's place at the start of the tick (metres), its rate (m/s), and the pitch of
+    /// the road (radians), at the end of the tick.
+    #[must_use]
+    pub fn road(&self, lane: usize) -> [f64; 3] {
+        gather(&self.road, lane)
     }
 
     /// The state of the vehicle in a lane.
     #[must_use]
     #[inline(always)]
     pub fn state(&self, lane: usize) -> State {
-        State {
-            x_m: self.x_m[lane],
-            y_m: self.y_m[lane],
-            yaw_rad: self.yaw_rad[lane],
-            heading: [self.heading[0][lane], self.heading[1][lane]],
-            speed_mps: self.speed_mps[lane],
-            accel_mps2: self.accel_mps2[lane],
-            road_wheel_angle_rad: self.road_wheel_angle_rad[lane],
-        }
-    }
-
-    #[inline(always)]
-    fn set_state(&mut self, lane: usize, state: &State) {
-        self.x_m[lane] = state.x_m;
-        self.y_m[lane] = state.y_m;
-        self.yaw_rad[lane] = state.yaw_rad;
-        self.heading[0][lane] = state.heading[0];
-        self.heading[1][lane] = state.heading[1];
-        self.speed_mps[lane] = state.speed_mps;
-        self.accel_mps2[lane] = state.accel_mps2;
-        self.road_wheel_angle_rad[lane] = state.road_wheel_angle_rad;
+        gather(&self.state, lane)
     }
 
     /// The reference of the vehicle in a lane.
     #[must_use]
     #[inline(always)]
     pub fn curve(&self, lane: usize) -> Curve {
-        let at = |pair: &[Lane; 2]| [pair[0][lane], pair[1][lane]];
-        Curve {
-            start_m: at(&self.start_m),
-            cubic: [at(&self.cubic[0]), at(&self.cubic[1]), at(&self.cubic[2])],
-            accel_mps2: self.path_accel_mps2[lane],
-        }
+        gather(&self.curve, lane)
     }
 
     /// Tracks all lanes through one tick of `rows.len()` sub-steps, with the widest vectors this machine has.
-    pub fn advance(&mut self, limits: &config::Vehicle, dt_s: f64) {
+    pub fn advance(&mut self, dt_s: f64) {
         #[cfg(target_arch = "x86_64")]
         #[expect(
             unsafe_code,
@@ -150,56 +214,123 @@ impl Lanes {
         {
             if std::arch::is_x86_feature_detected!("avx512f") {
                 // SAFETY: the processor has been asked in this very condition and has the feature.
-                return unsafe { self.advance_avx512(limits, dt_s) };
+                return unsafe { self.advance_avx512(dt_s) };
             }
             if std::arch::is_x86_feature_detected!("avx2") {
                 // SAFETY: as above.
-                return unsafe { self.advance_avx2(limits, dt_s) };
+                return unsafe { self.advance_avx2(dt_s) };
             }
         }
-        self.advance_here(limits, dt_s);
+        self.advance_here(dt_s);
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx512f")]
-    fn advance_avx512(&mut self, limits: &config::Vehicle, dt_s: f64) {
-        self.advance_here(limits, dt_s);
+    fn advance_avx512(&mut self, dt_s: f64) {
+        self.advance_here(dt_s);
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn advance_avx2(&mut self, limits: &config::Vehicle, dt_s: f64) {
-        self.advance_here(limits, dt_s);
+    fn advance_avx2(&mut self, dt_s: f64) {
+        self.advance_here(dt_s);
     }
 
     /// The same code for every processor: compiled anew into each caller.
     #[inline(always)]
-    fn advance_here(&mut self, limits: &config::Vehicle, dt_s: f64) {
+    fn advance_here(&mut self, dt_s: f64) {
         let mut rows = std::mem::take(&mut self.rows);
+        self.start_road();
         for (index, row) in rows.iter_mut().enumerate() {
-            self.sub_step(limits, index as f64 * dt_s, dt_s, row);
+            self.sub_step(index as f64 * dt_s, dt_s, row);
         }
         self.rows = rows;
     }
 
+    /// The road under the rear axle at the start of the tick.
+    #[inline(always)]
+    fn start_road(&mut self) {
+        for lane in 0..LANES {
+            let road = road_at(&gather(&self.rise, lane), self.front_m[lane], 0.0);
+            scatter(&mut self.road, lane, &road);
+            let state: State = gather(&self.state, lane);
+            scatter(&mut self.origin, lane, &[state.x_m, state.y_m, road[0], state.yaw_rad]);
+        }
+    }
+
     /// One sub-step of all lanes: the loop that the compiler turns into vector instructions.
     #[inline(always)]
-    fn sub_step(&mut self, limits: &config::Vehicle, time_s: f64, dt_s: f64, row: &mut Row) {
+    fn sub_step(&mut self, time_s: f64, dt_s: f64, row: &mut Row) {
         for lane in 0..LANES {
-            let state = self.state(lane);
-            let params = KinematicParams::new(limits, self.wheelbase_m[lane]);
-            let driven = Driven::new(&params, self.front_m[lane]);
-            let input = tracking::demand(&driven, &state, &self.curve(lane).at(time_s));
-            let (next, motion) = params.step(&state, &input, dt_s);
-            self.set_state(lane, &next);
-            row.x_m[lane] = next.x_m;
-            row.y_m[lane] = next.y_m;
-            row.yaw_rad[lane] = next.yaw_rad;
-            row.speed_mps[lane] = next.speed_mps;
-            row.accel_x_mps2[lane] = motion.accel_body_mps2[0];
-            row.accel_y_mps2[lane] = motion.accel_body_mps2[1];
-            row.yaw_rate_radps[lane] = motion.yaw_rate_radps;
-            row.road_wheel_angle_rad[lane] = next.road_wheel_angle_rad;
+            let state: State = gather(&self.state, lane);
+            let params: P = gather(&self.params, lane);
+            let front_m = self.front_m[lane];
+            let road: [f64; 3] = gather(&self.road, lane);
+            let input = params.demand(front_m, &state, &self.curve(lane).at(time_s));
+            let (next, motion) = params.step(&state, &input, road[2], dt_s);
+            let road_next = road_at(&gather(&self.rise, lane), front_m, time_s + dt_s);
+            let felt = Felt::new([&state, &next], [road, road_next], &motion, dt_s);
+            scatter(&mut self.state, lane, &next);
+            scatter(&mut self.road, lane, &road_next);
+            let origin: [f64; 4] = gather(&self.origin, lane);
+            let numbers = [
+                next.x_m - origin[0],
+                next.y_m - origin[1],
+                road_next[0] - origin[2],
+                next.yaw_rad - origin[3],
+                felt.lean.roll_rad,
+                felt.lean.pitch_rad,
+                next.speed_mps,
+                next.lateral_mps,
+                felt.accel_mps2[0],
+                felt.accel_mps2[1],
+                felt.accel_mps2[2],
+                felt.rate_radps[0],
+                felt.rate_radps[1],
+                felt.rate_radps[2],
+                next.road_wheel_angle_rad,
+                0.0,
+            ];
+            for (field, number) in row.iter_mut().zip(numbers) {
+                field[lane] = number as f32;
+            }
+        }
+    }
+}
+
+/// Height of the rear axle above the front bumper's place at the start of the tick, its rate, and the pitch of the road, `time_s`
+/// into the tick. The slope counts as its own sine and tangent: 0.3 % off at 10 %.
+#[inline(always)]
+fn road_at(rise: &Rise, front_m: f64, time_s: f64) -> [f64; 3] {
+    let [height_m, climb_mps, slope_rad, slope_rate] = rise.at(time_s);
+    [
+        height_m - front_m * slope_rad,
+        climb_mps - front_m * slope_rate,
+        slope_rad,
+    ]
+}
+
+/// What the body feels in one sub-step, and how it leans at its end.
+struct Felt {
+    lean: Lean,
+    accel_mps2: [f64; 3],
+    rate_radps: [f64; 3],
+}
+
+impl Felt {
+    #[inline(always)]
+    fn new(states: [&State; 2], roads: [[f64; 3]; 2], motion: &Motion, dt_s: f64) -> Self {
+        let [before, after] = [0, 1].map(|i: usize| Lean {
+            roll_rad: states[i].roll[0],
+            pitch_rad: states[i].pitch[0] + roads[i][2],
+        });
+        let rate = 1.0 / dt_s;
+        let [along, left] = motion.accel_level_mps2;
+        let up = (roads[1][1] - roads[0][1]) * rate;
+        Self {
+            lean: after,
+            accel_mps2: body_from_level(&half_way(&before, &after), [along, left, up]),
+            rate_radps: angular_rate(&before, &after, motion.yaw_rate_radps, rate),
         }
     }
 }
@@ -207,7 +338,8 @@ impl Lanes {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::vehicle::Motion;
+    use crate::{dimensions::Dimensions, parameters::Catalogue};
+    use ipc_schema::config;
     use proptest::prelude::*;
 
     fn limits() -> config::Vehicle {
@@ -222,76 +354,130 @@ mod tests {
             max_accel_mps2: 5.0,
             max_decel_mps2: 9.0,
             steering_ratio: 15.0,
-            resynchronise_m: 5.0,
+            resynchronise_m: 2.0,
+            leave_path_m: 5.0,
         }
     }
 
-    fn vehicle() -> impl Strategy<Value = (State, Curve, f64, f64)> {
+    #[derive(Debug, Clone)]
+    struct Case {
+        state: State,
+        curve: Curve,
+        rise: Rise,
+        body: Dimensions,
+    }
+
+    fn case() -> impl Strategy<Value = Case> {
         let state = (
             -3.1_f64..3.1,
             prop_oneof![Just(0.0), 0.0_f64..40.0],
             -9.0_f64..5.0,
             -0.6_f64..0.6,
+            prop::array::uniform2(-0.5_f64..0.5),
         );
-        let curve = prop::array::uniform4(-15.0_f64..15.0);
-        (state, curve, 1.0_f64..15.0, 0.5_f64..10.0).prop_map(|((yaw, speed, accel, angle), c, front, wheelbase)| {
-            let state = State {
-                accel_mps2: accel,
-                road_wheel_angle_rad: angle,
-                ..State::new(5.0, -7.0, yaw, speed)
-            };
-            let start = state.point_ahead(front);
-            let curve = Curve::hermite(
-                [start[0] + 0.1 * c[0], start[1]],
-                [c[1], c[2]],
-                [[c[2], c[3]], [c[0], c[1]]],
-                0.7,
-            );
-            (state, curve, front, wheelbase)
-        })
+        let slope = prop::array::uniform3(-0.05_f64..0.05);
+        (state, prop::array::uniform4(-15.0_f64..15.0), slope, 2.0_f64..18.0).prop_map(
+            |((yaw, speed, accel, angle, [lateral, rate]), c, slope_rad, length_m)| {
+                let body = Catalogue::new().unwrap().sets()[0].dimensions(length_m, 2.0, 1.5);
+                let state = State {
+                    accel_mps2: accel,
+                    road_wheel_angle_rad: angle,
+                    lateral_mps: lateral,
+                    yaw_rate_radps: rate,
+                    roll: [0.1 * lateral, rate],
+                    pitch: [0.1 * rate, lateral],
+                    ..State::new(5.0, -7.0, yaw, speed)
+                };
+                let start = state.point_ahead(body.front_m());
+                let curve = Curve::hermite(
+                    [start[0] + 0.1 * c[0], start[1]],
+                    [c[1], c[2]],
+                    [[c[2], c[3]], [c[0], c[1]]],
+                    0.7,
+                );
+                let rise = Rise {
+                    height_m: [0.0, slope_rad[1], slope_rad[2]],
+                    slope_rad,
+                };
+                Case {
+                    state,
+                    curve,
+                    rise,
+                    body,
+                }
+            },
+        )
     }
 
     /// The same vehicle alone: tracker and model one after the other.
-    fn alone(
-        mut state: State,
-        curve: &Curve,
-        front_m: f64,
-        wheelbase_m: f64,
-        sub_steps: usize,
-    ) -> Vec<(State, Motion)> {
-        let params = KinematicParams::new(&limits(), wheelbase_m);
-        let driven = Driven::new(&params, front_m);
+    fn alone<P: Drive<N>, const N: usize>(case: &Case, params: &P, sub_steps: usize) -> Vec<(State, Motion)> {
+        let front_m = case.body.front_m();
+        let mut state = case.state;
+        let mut slope = road_at(&case.rise, front_m, 0.0)[2];
         (0..sub_steps)
             .map(|index| {
-                let input = tracking::demand(&driven, &state, &curve.at(index as f64 * 0.01));
-                let (next, motion) = params.step(&state, &input, 0.01);
+                let time_s = index as f64 * 0.01;
+                let input = params.demand(front_m, &state, &case.curve.at(time_s));
+                let (next, motion) = params.step(&state, &input, slope, 0.01);
+                slope = road_at(&case.rise, front_m, time_s + 0.01)[2];
                 state = next;
                 (next, motion)
             })
             .collect()
     }
 
-    proptest! {
-        #[test]
-        fn side_by_side_gives_the_same_bits_as_alone(vehicles in prop::collection::vec(vehicle(), 1..=LANES)) {
-            let mut lanes = Lanes::new(10);
-            for (lane, (state, curve, front_m, wheelbase_m)) in vehicles.iter().enumerate() {
-                lanes.load(lane, state, curve, *front_m, *wheelbase_m);
+    fn compare<P: Drive<N>, const N: usize>(cases: &[Case], params: &[P]) -> Result<(), TestCaseError> {
+        let mut lanes: Lanes<P, N> = Lanes::new(10);
+        for (lane, (case, params)) in cases.iter().zip(params).enumerate() {
+            lanes.load(
+                lane,
+                params,
+                &case.state,
+                (&case.curve, &case.rise),
+                case.body.front_m(),
+            );
+        }
+        let mut baseline = lanes.clone();
+        lanes.advance(0.01);
+        baseline.advance_here(0.01);
+        prop_assert_eq!(&lanes.rows, &baseline.rows, "whatever the processor's vectors");
+        for (lane, (case, params)) in cases.iter().zip(params).enumerate() {
+            let steps = alone(case, params, 10);
+            let mut rows = [SubStep::default(); 10];
+            lanes.write(lane, &mut rows);
+            for ((state, _), row) in steps.iter().zip(&rows) {
+                prop_assert!((f64::from(row.dx_m) - (state.x_m - steps[9].0.x_m)).abs() < 1e-5);
+                prop_assert!((f64::from(row.dyaw_rad) - (state.yaw_rad - steps[9].0.yaw_rad)).abs() < 1e-6);
+                prop_assert_eq!(row.lateral_speed_mps, state.lateral_mps as f32);
+                prop_assert_eq!(row.roll_rad, state.roll[0] as f32);
+                prop_assert_eq!(row.road_wheel_angle_rad, state.road_wheel_angle_rad as f32);
             }
-            let mut baseline = lanes.clone();
-            lanes.advance(&limits(), 0.01);
-            baseline.advance_here(&limits(), 0.01);
-            prop_assert_eq!(&lanes.rows, &baseline.rows, "whatever the processor's vectors");
-            for (lane, (state, curve, front_m, wheelbase_m)) in vehicles.iter().enumerate() {
-                let steps = alone(*state, curve, *front_m, *wheelbase_m, 10);
-                for ((state, motion), row) in steps.iter().zip(&lanes.rows) {
-                    prop_assert_eq!(state.x_m.to_bits(), row.x_m[lane].to_bits());
-                    prop_assert_eq!(state.yaw_rad.to_bits(), row.yaw_rad[lane].to_bits());
-                    prop_assert_eq!(motion.accel_body_mps2[0].to_bits(), row.accel_x_mps2[lane].to_bits());
-                    prop_assert_eq!(motion.accel_body_mps2[1].to_bits(), row.accel_y_mps2[lane].to_bits());
+            prop_assert_eq!(steps[9].0, lanes.state(lane));
+        }
+        Ok(())
+    }
+
+    proptest! {
+            #[test]
+            fn side_by_side_gives_the_same_bits_as_alone(cases in prop::collection::vec(case(), 1..=LANES)) {
+                let catalogue = Catalogue::new().unwrap();
+                let set = &catalogue.sets()[0];
+                let kinematic: Vec<_> =
+                    cases.iter().map(|case| KinematicParams::new(set, &limits(), case.body.wheelbase_m)).collect();
+                compare(&cases, &kinematic)?;
+                let dynamic: Vec<_> =
+                    cases.iter().map(|case| DynamicParams::new(set, &case.body, &limits(), 0.7, 0.01)).collect();
+                compare(&cases, &dynamic)?;
+            }
+
+            #[test]
+            fn whatever_the_demand_the_numbers_stay_finite(case in case()) {
+                let catalogue = Catalogue::new().unwrap();
+                let params = DynamicParams::new(&catalogue.sets()[0], &case.body, &limits(), 0.3, 0.01);
+                for (state, motion) in alone(&case, &params, 200) {
+                    prop_assert!(bytemuck::cast::<State, [f64; STATE]>(state).iter().all(|number| number.is_finite()));
+    prop_assert!(motion.accel_level_mps2.iter().all(|accel| accel.is_finite()));
                 }
-                prop_assert_eq!(steps[9].0, lanes.state(lane));
             }
         }
-    }
 }

@@ -7,22 +7,29 @@
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
 pub mod actions;
+pub mod attitude;
 pub mod collision;
 pub mod curve;
 pub mod dimensions;
 pub mod displacement;
 pub mod driving;
+pub mod dynamic;
+pub mod fleet;
 pub mod geodesy;
+pub mod governor;
 pub mod hero;
 pub mod lanes;
 pub mod mirror;
+pub mod parameters;
 pub mod person;
 pub mod process;
 pub mod reference;
+pub mod rigid_body;
 pub mod road_user;
 pub mod route;
 pub mod scene;
 pub mod spherical;
+pub mod statistics;
 pub mod tracking;
 pub mod trig;
 pub mod vehicle;

@@ -15,9 +15,12 @@ use ipc_schema::{
 
 pub use crate::road_user::Settings;
 use crate::{
-    lanes::{LANES, Lanes},
+    dynamic::DynamicParams,
+    fleet::{Fleet, FleetError},
+    lanes::{DYNAMIC, Drive, KINEMATIC, LANES, Lanes},
     road_user::RoadUser,
-    vehicle::Input,
+    statistics::Tracking,
+    vehicle::{Input, KinematicParams, Model},
 };
 
 /// What SUMO sent cannot be mirrored.
@@ -64,6 +67,7 @@ impl Settings {
     pub fn of_run(run: &RunFile) -> Self {
         Self {
             vehicle: run.config.vehicle.clone(),
+            surface: run.config.road.surface,
             tick_s: run.config.run.tick_s,
             sub_steps: run.config.run.sub_steps,
             ticks_per_step: u32::try_from(run.ticks_per_traffic_step()).unwrap_or(u32::MAX),
@@ -113,18 +117,30 @@ pub struct Mirror {
     /// How many of them have a state in all ticks of the step.
     in_whole_step: usize,
     frame: u64,
-    lanes: Lanes,
+    fleet: Fleet,
+    kinematic: Bank<KinematicParams, KINEMATIC>,
+    dynamic: Bank<DynamicParams, DYNAMIC>,
+    tracking: Tracking,
+    resynchronisations: u64,
+}
+
+/// Vehicles of one model on their way through a tick.
+#[derive(Debug)]
+struct Bank<P, const N: usize> {
+    lanes: Lanes<P, N>,
     /// Place and row in the message of the vehicle in each lane.
     loaded: Vec<(u32, usize)>,
-    resynchronisations: u64,
 }
 
 impl Mirror {
     /// An empty mirror.
-    #[must_use]
-    pub fn new(settings: Settings) -> Self {
-        let lanes = Lanes::new(settings.sub_steps as usize);
-        Self {
+    ///
+    /// # Errors
+    /// A class is given a model that does not exist.
+    pub fn new(settings: Settings) -> Result<Self, FleetError> {
+        let sub_steps = settings.sub_steps as usize;
+        Ok(Self {
+            fleet: settings.fleet()?,
             settings,
             episode: None,
             places: Vec::new(),
@@ -133,10 +149,22 @@ impl Mirror {
             present: Vec::new(),
             in_whole_step: 0,
             frame: 0,
-            lanes,
-            loaded: Vec::with_capacity(LANES),
+            kinematic: Bank::new(sub_steps),
+            dynamic: Bank::new(sub_steps),
+            tracking: Tracking::default(),
             resynchronisations: 0,
-        }
+        })
+    }
+
+    /// How well vehicles have been tracked, over the run.
+    #[must_use]
+    pub fn tracking(&self) -> &Tracking {
+        &self.tracking
+    }
+
+    /// Vehicle classes met since the last call that no parameter set lists; each comes once in a run.
+    pub fn take_unknown_classes(&mut self) -> Vec<String> {
+        self.fleet.take_unknown()
     }
 
     /// Times and limits.
@@ -173,7 +201,7 @@ impl Mirror {
             return Err(MirrorError::TooMany { vehicle });
         }
         self.dismiss(vehicle);
-        let road_user = RoadUser::new(meta);
+        let road_user = RoadUser::new(meta, &mut self.fleet);
         let place = match self.free.pop() {
             Some(place) => {
                 self.slab[place as usize] = road_user;
@@ -299,35 +327,106 @@ impl Mirror {
             let row = place_in_message;
             place_in_message += 1;
             if road_user.moves(tick, &self.settings) {
-                road_user.load(tick, &self.settings, &mut self.lanes, self.loaded.len());
-                self.loaded.push((place, row));
-                if self.loaded.len() == LANES {
-                    self.move_loaded(tick, states, rows);
-                }
+                self.load(tick, place, row, states, rows);
             } else {
                 let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
                 let set = road_user.write_unmoved(tick, &self.settings, &mut states[row], sub_steps);
                 self.resynchronisations += u64::from(set);
             }
         }
-        self.move_loaded(tick, states, rows);
+        let mut follow = Follow::new(
+            &self.settings,
+            &mut self.slab,
+            &mut self.tracking,
+            &mut self.resynchronisations,
+        );
+        self.kinematic.advance(tick, &mut follow, states, rows);
+        self.dynamic.advance(tick, &mut follow, states, rows);
         Ok(())
     }
 
+    /// Puts a vehicle into the lanes of its model, and moves them if they are full.
+    fn load(&mut self, tick: u32, place: u32, row: usize, states: &mut [VehicleState], rows: &mut [SubStep]) {
+        let Self {
+            settings,
+            slab,
+            fleet,
+            kinematic,
+            dynamic,
+            tracking,
+            resynchronisations,
+            ..
+        } = self;
+        let built = fleet.at(slab[place as usize].model());
+        let mut follow = Follow::new(settings, slab, tracking, resynchronisations);
+        match &built.model {
+            Model::Kinematic(params) => {
+                if kinematic.load(tick, params, &mut follow, (place, row)) {
+                    kinematic.advance(tick, &mut follow, states, rows);
+                }
+            }
+            Model::Dynamic(params) => {
+                if dynamic.load(tick, params, &mut follow, (place, row)) {
+                    dynamic.advance(tick, &mut follow, states, rows);
+                }
+            }
+        }
+    }
+}
+
+/// What the lanes need of the mirror.
+struct Follow<'a> {
+    settings: &'a Settings,
+    slab: &'a mut [RoadUser],
+    tracking: &'a mut Tracking,
+    resynchronisations: &'a mut u64,
+}
+
+impl<'a> Follow<'a> {
+    fn new(
+        settings: &'a Settings,
+        slab: &'a mut [RoadUser],
+        tracking: &'a mut Tracking,
+        resynchronisations: &'a mut u64,
+    ) -> Self {
+        Self {
+            settings,
+            slab,
+            tracking,
+            resynchronisations,
+        }
+    }
+}
+
+impl<P: Drive<N>, const N: usize> Bank<P, N> {
+    fn new(sub_steps: usize) -> Self {
+        Self {
+            lanes: Lanes::new(sub_steps),
+            loaded: Vec::with_capacity(LANES),
+        }
+    }
+
+    /// Loads the road user at a place, whose tick goes to a row of the message. True if the lanes are full.
+    fn load(&mut self, tick: u32, params: &P, follow: &mut Follow<'_>, (place, row): (u32, usize)) -> bool {
+        let lane = self.loaded.len();
+        follow.slab[place as usize].load(tick, follow.settings, params, &mut self.lanes, lane);
+        self.loaded.push((place, row));
+        self.loaded.len() == LANES
+    }
+
     /// Moves the vehicles in the lanes through the tick and writes them.
-    fn move_loaded(&mut self, tick: u32, states: &mut [VehicleState], rows: &mut [SubStep]) {
+    fn advance(&mut self, tick: u32, follow: &mut Follow<'_>, states: &mut [VehicleState], rows: &mut [SubStep]) {
         if self.loaded.is_empty() {
             return;
         }
-        let Self {
-            settings, lanes, slab, ..
-        } = self;
-        lanes.advance(&settings.vehicle, settings.sub_step_s());
-        let per_tick = settings.sub_steps as usize;
+        self.lanes.advance(follow.settings.sub_step_s());
+        let per_tick = follow.settings.sub_steps as usize;
         for (lane, (place, row)) in self.loaded.drain(..).enumerate() {
             let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
-            let set = slab[place as usize].store(tick, settings, lanes, lane, &mut states[row], sub_steps);
-            self.resynchronisations += u64::from(set);
+            let (road_user, out) = (&mut follow.slab[place as usize], &mut states[row]);
+            let set = road_user.store(tick, follow.settings, &self.lanes, lane, out, sub_steps);
+            *follow.resynchronisations += u64::from(set);
+            follow.tracking.add(out);
         }
     }
 }

@@ -21,6 +21,7 @@ use crate::{
     driving::Account,
     mirror::{Mirror, MirrorError, Settings},
     scene::Scene,
+    statistics::Summary,
 };
 
 /// One process serves one environment.
@@ -29,6 +30,7 @@ const ENV_INDEX: u32 = 0;
 /// What this process adds to the run's report.
 #[derive(Debug, serde::Serialize)]
 struct Part {
+    tracking: Summary,
     resynchronisations: u64,
     vehicle_steps: u64,
     drops: u64,
@@ -95,7 +97,8 @@ impl Core {
             false => None,
         };
         session.attach();
-        let mirror = Mirror::new(Settings::of_run(&session.run));
+        let mirror = Mirror::new(Settings::of_run(&session.run))
+            .map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
         Ok(Self {
             session,
             metas,
@@ -179,6 +182,12 @@ impl Core {
         let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
         let vehicles = block::view(message.payload(), layout.vehicles).map_err(unreadable)?;
         self.mirror.apply_meta(header, vehicles).map_err(unmirrored)?;
+        for class in self.mirror.take_unknown_classes() {
+            tracing::warn!(
+                class,
+                "no parameter set lists this vehicle class: the default set is taken"
+            );
+        }
         if let Some(contacts) = &mut self.contacts {
             contacts.learn(header, vehicles);
         }
@@ -258,6 +267,7 @@ impl Core {
     fn write_part(&mut self) -> Result<(), Failure> {
         let collisions = self.contacts.as_mut().map(Contacts::finish).transpose()?;
         self.session.write_part(&Part {
+            tracking: self.mirror.tracking().summary(),
             resynchronisations: self.mirror.resynchronisations(),
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),

@@ -7,15 +7,17 @@
 //! to Splines*, chapter IX). It cannot overshoot, has no jump in velocity, and cuts a corner by an eighth of the change of
 //! chord. The price: the mirror runs half a SUMO step behind SUMO (0.05 s at steps of 0.1 s), all road users alike.
 //!
-//! SUMO changes lanes in one step. The sideways jump is taken out of the path and let back in over
-//! [`LANE_CHANGE_S`] with a minimum-jerk profile, as far as the vehicle moves at all.
+//! Height and slope of the road run the same way. SUMO changes lanes in one step. The sideways jump is taken out of the path and
+//! let back in over a configured time with a minimum-jerk profile, as far as the vehicle moves at all.
 
 use ipc_schema::traffic::TrafficState;
 
-use crate::{curve::Curve, trig::wrap_angle};
+use crate::{
+    curve::{Curve, Rise},
+    governor::{Ability, Governor},
+    trig::wrap_angle,
+};
 
-/// Time over which an instantaneous lane change is spread, seconds.
-pub const LANE_CHANGE_S: f64 = 3.0;
 /// Shortest distance over which it is spread, metres.
 const LANE_CHANGE_M: f64 = 12.0;
 /// Sideways jump within one SUMO step that counts as a lane change, metres.
@@ -47,9 +49,9 @@ impl LaneChange {
         [self.offset_m * (1.0 - profile), -self.offset_m * slope]
     }
 
-    /// Share of a lane change done per second at a speed.
-    fn rate_per_s(speed_mps: f64) -> f64 {
-        speed_mps / (speed_mps * LANE_CHANGE_S).max(LANE_CHANGE_M)
+    /// Share of a lane change that takes `spread_s` done per second at a speed.
+    fn rate_per_s(speed_mps: f64, spread_s: f64) -> f64 {
+        speed_mps / (speed_mps * spread_s).max(LANE_CHANGE_M)
     }
 }
 
@@ -71,7 +73,15 @@ pub struct Path {
     heading: [f64; 2],
     /// Velocity over the last chord, m/s.
     chord_mps: [f64; 2],
+    /// Road under the front bumper over the step, from `height_m` on.
+    rise: Rise,
+    height_m: f64,
+    /// Rates of height and slope over the last chord, m/s and rad/s.
+    rising: [f64; 2],
+    /// SUMO's path over the step: start, and the two half chords that the curve rounds.
+    chords: [[f64; 2]; 3],
     lane_change: LaneChange,
+    governor: Governor,
 }
 
 impl Path {
@@ -79,16 +89,22 @@ impl Path {
     #[must_use]
     pub fn from_here(now: &TrafficState, step_s: f64) -> Self {
         let (sin, cos) = libm::sincos(f64::from(now.yaw_rad));
-        let velocity = [f64::from(now.speed_mps) * cos, f64::from(now.speed_mps) * sin];
-        Self {
-            curve: Curve::straight(
-                half_a_step_before([now.front_x_m, now.front_y_m], velocity, step_s),
-                velocity,
-            ),
+        let speed = f64::from(now.speed_mps);
+        let velocity = [speed * cos, speed * sin];
+        let start_m = half_a_step_before([now.front_x_m, now.front_y_m], velocity, step_s);
+        let mut path = Self {
+            curve: Curve::straight(start_m, velocity),
             heading: [f64::from(now.yaw_rad), 0.0],
             chord_mps: velocity,
+            rise: Rise::default(),
+            height_m: 0.0,
+            rising: [speed * libm::tan(f64::from(now.pitch_rad)), 0.0],
+            chords: [start_m, start_m, start_m],
             lane_change: LaneChange::default(),
-        }
+            governor: Governor::default(),
+        };
+        path.climb(now, path.rising, step_s);
+        path
     }
 
     /// Takes the step from `before` to `now`, `step_s` later, of a body of `length_m`.
@@ -115,6 +131,9 @@ impl Path {
         }
         self.heading = [f64::from(before.yaw_rad), turn / step_s];
         self.bend(start_m, moved_m, step_s);
+        let slope_change = f64::from(now.pitch_rad) - f64::from(before.pitch_rad);
+        let rising = [now.front_z_m - before.front_z_m, slope_change].map(|change| change / step_s);
+        self.climb(before, rising, step_s);
         Join::Continued
     }
 
@@ -123,6 +142,41 @@ impl Path {
         let start_m = half_a_step_before([before.front_x_m, before.front_y_m], self.chord_mps, step_s);
         self.curve = Curve::straight(start_m, self.chord_mps);
         self.heading = [f64::from(before.yaw_rad), 0.0];
+        self.chords = [start_m; 3];
+        self.climb(before, self.rising, step_s);
+    }
+
+    /// Height and slope from the middle of the last chord to the middle of the next, whose rates are `rising`.
+    fn climb(&mut self, from: &TrafficState, rising: [f64; 2], step_s: f64) {
+        let [height, slope] = [0, 1].map(|i: usize| 0.5 * (rising[i] - self.rising[i]) / step_s);
+        self.height_m = from.front_z_m - 0.5 * step_s * self.rising[0];
+        let slope_rad = f64::from(from.pitch_rad) - 0.5 * step_s * self.rising[1];
+        self.rise = Rise {
+            height_m: [0.0, self.rising[0], height],
+            slope_rad: [slope_rad, self.rising[1], slope],
+        };
+        self.rising = rising;
+    }
+
+    /// Height of the road and the road itself from `start_s` after the start of the step on.
+    #[must_use]
+    pub fn road(&self, start_s: f64) -> (f64, Rise) {
+        (self.height_m + self.rise.at(start_s)[0], self.rise.from_time(start_s))
+    }
+
+    /// How far the reference is from SUMO's own path `t_s` after the start of the step of `step_s`, at most: what is left of a lane change,
+    /// what the curve cuts off the corner, and what could not be driven, metres.
+    #[must_use]
+    pub fn offset_m(&self, t_s: f64, step_s: f64) -> f64 {
+        let undriven = self.lane_change.remaining()[0].abs() + self.governor.distance_m();
+        if t_s >= step_s {
+            // The curve touches the path in the middle of each chord, where a step ends.
+            return undriven;
+        }
+        let point = self.curve.at(t_s).position_m;
+        let [start, corner, end] = self.chords;
+        let cut = distance_m(point, start, corner).min(distance_m(point, corner, end));
+        cut + undriven
     }
 
     /// From the middle of the last chord to the middle of this one.
@@ -131,17 +185,46 @@ impl Path {
         self.curve = Curve::straight(half_a_step_before(start_m, before, step_s), before);
         self.curve.cubic[1] = [0, 1].map(|axis: usize| 0.5 * (chord[axis] - before[axis]) / step_s);
         self.curve.accel_mps2 = (norm(chord) - norm(before)) / step_s;
+        self.chords = [
+            self.curve.start_m,
+            start_m,
+            half_a_step_before(start_m, chord.map(|speed| -speed), step_s),
+        ];
         self.chord_mps = chord;
     }
 
     /// The reference over one tick that starts `start_s` after the start of the step, for a vehicle at this speed, which
-    /// carries a lane change on.
-    pub fn tick(&mut self, start_s: f64, tick_s: f64, speed_mps: f64) -> Curve {
+    /// carries a lane change that takes `spread_s` on, kept to what the vehicle is able to do.
+    pub fn tick(&mut self, start_s: f64, tick_s: f64, speed_mps: f64, spread_s: f64, ability: &Ability) -> Curve {
+        let path = self.with_lane_change(start_s, tick_s, speed_mps, spread_s);
+        self.governor.tick(&path, tick_s, ability)
+    }
+
+    /// The path itself at the start of the step.
+    #[must_use]
+    pub fn start(&self) -> Curve {
+        self.curve
+    }
+
+    /// Forgets lane change and offset, and gives SUMO's own path from `t_s` after the start of the step on.
+    pub fn resynchronise(&mut self, t_s: f64) -> Curve {
+        self.lane_change = LaneChange::default();
+        self.governor = Governor::default();
+        self.curve.from_time(t_s)
+    }
+
+    /// How far the reference is from where the path would be if everything could be driven, metres.
+    #[must_use]
+    pub fn undriven_m(&self) -> f64 {
+        self.governor.distance_m()
+    }
+
+    fn with_lane_change(&mut self, start_s: f64, tick_s: f64, speed_mps: f64, spread_s: f64) -> Curve {
         let curve = self.curve.from_time(start_s);
         if self.lane_change.offset_m == 0.0 {
             return curve;
         }
-        let rate = LaneChange::rate_per_s(speed_mps);
+        let rate = LaneChange::rate_per_s(speed_mps, spread_s);
         let [from, u0] = self.shift(start_s, rate);
         self.lane_change.phase = (self.lane_change.phase + rate * tick_s).min(1.0);
         let [to, u1] = self.shift(start_s + tick_s, rate);
@@ -202,6 +285,22 @@ fn sideways_jump(chord_m: [f64; 2], heading_rad: f64, turn_rad: f64, length_m: f
 /// The middle of a chord that ends here.
 pub(crate) fn half_a_step_before(end_m: [f64; 2], chord_mps: [f64; 2], step_s: f64) -> [f64; 2] {
     [0, 1].map(|axis: usize| end_m[axis] - 0.5 * step_s * chord_mps[axis])
+}
+
+/// Distance of a point from the straight line between two others, metres.
+fn distance_m(point: [f64; 2], from: [f64; 2], to: [f64; 2]) -> f64 {
+    let (line, way) = (minus(to, from), minus(point, from));
+    let square = dot(line, line);
+    let share = if square > 0.0 {
+        (dot(way, line) / square).clamp(0.0, 1.0)
+    } else {
+        0.0
+    };
+    norm(minus(way, line.map(|part| part * share)))
+}
+
+fn minus(a: [f64; 2], b: [f64; 2]) -> [f64; 2] {
+    [a[0] - b[0], a[1] - b[1]]
 }
 
 fn dot(a: [f64; 2], b: [f64; 2]) -> f64 {

@@ -7,10 +7,12 @@ use ipc_schema::{
 };
 
 use crate::{
+    attitude::{Lean, body_from_level},
     curve::Curve,
     dimensions::Dimensions,
+    fleet::{Fleet, FleetError},
     hero::{self, Hero},
-    lanes::Lanes,
+    lanes::{Drive, Lanes},
     person::Person,
     reference::{Join, Path},
     tracking,
@@ -19,10 +21,12 @@ use crate::{
 };
 
 /// Times of a run and limits of its vehicles.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Settings {
-    /// Limits of the vehicle model.
+    /// Models of the vehicles and their limits.
     pub vehicle: config::Vehicle,
+    /// What the road is covered with.
+    pub surface: config::Surface,
     /// Length of a tick, seconds.
     pub tick_s: f64,
     /// Nano sub-steps in a tick.
@@ -32,6 +36,14 @@ pub struct Settings {
 }
 
 impl Settings {
+    /// The models of these settings.
+    ///
+    /// # Errors
+    /// A class is given a model that does not exist.
+    pub fn fleet(&self) -> Result<Fleet, FleetError> {
+        Fleet::new(&self.vehicle, self.surface, self.sub_step_s())
+    }
+
     /// Length of a sub-step, seconds.
     #[must_use]
     pub fn sub_step_s(&self) -> f64 {
@@ -57,6 +69,10 @@ enum Arrival {
 }
 
 /// What moves a road user.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "nearly all road users are vehicles, and a box would cost each a cache miss"
+)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Mover {
     /// A vehicle that tracks SUMO's front bumper.
@@ -71,6 +87,8 @@ enum Mover {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RoadUser {
     id_hash: u64,
+    /// Place of its model in the [`Fleet`].
+    model: u32,
     dimensions: Dimensions,
     mover: Mover,
     before: TrafficState,
@@ -85,13 +103,13 @@ pub struct RoadUser {
 impl RoadUser {
     /// A road user that SUMO has announced.
     #[must_use]
-    pub fn new(meta: &VehicleMeta) -> Self {
-        let [length, width, height] = [meta.length_m, meta.width_m, meta.height_m].map(f64::from);
-        let dimensions = Dimensions::new(&meta.vehicle_class, length, width, height);
+    pub fn new(meta: &VehicleMeta, fleet: &mut Fleet) -> Self {
+        let model = fleet.place(meta);
+        let dimensions = fleet.at(model).dimensions;
         let mover = if meta.kind == Kind::Person as u32 {
             Mover::Person(Person::default())
         } else if meta.kind == Kind::Hero as u32 {
-            Mover::Hero(Hero::default())
+            Mover::Hero(Hero::new(hero::model(fleet.at(model))))
         } else {
             Mover::Vehicle {
                 state: State::new(0.0, 0.0, 0.0, 0.0),
@@ -100,6 +118,7 @@ impl RoadUser {
         };
         Self {
             id_hash: meta.id_hash,
+            model,
             dimensions,
             mover,
             before: TrafficState::default(),
@@ -164,27 +183,37 @@ impl RoadUser {
         self.arrival != Arrival::Continuing && tick + 1 == settings.ticks_per_step
     }
 
+    /// Place of its model in the [`Fleet`].
+    #[must_use]
+    pub fn model(&self) -> u32 {
+        self.model
+    }
+
     /// Puts the vehicle into a lane for one tick.
-    pub fn load(&mut self, tick: u32, settings: &Settings, lanes: &mut Lanes, lane: usize) {
+    pub fn load<P: Drive<N>, const N: usize>(
+        &mut self,
+        tick: u32,
+        settings: &Settings,
+        params: &P,
+        lanes: &mut Lanes<P, N>,
+        lane: usize,
+    ) {
         if let Mover::Vehicle { state, path } = &mut self.mover {
-            let curve = path.tick(f64::from(tick) * settings.tick_s, settings.tick_s, state.speed_mps);
-            lanes.load(
-                lane,
-                state,
-                &curve,
-                self.dimensions.front_m(),
-                self.dimensions.wheelbase_m,
-            );
+            let start_s = f64::from(tick) * settings.tick_s;
+            let spread_s = settings.vehicle.lane_change_s;
+            let curve = path.tick(start_s, settings.tick_s, state.speed_mps, spread_s, &params.ability());
+            let rise = path.road(start_s).1;
+            lanes.load(lane, params, state, (&curve, &rise), self.dimensions.front_m());
         }
     }
 
     /// Takes the vehicle out of its lane and writes the tick. Returns true if it has been set onto its path because it was
     /// too far away.
-    pub fn store(
+    pub fn store<P: Drive<N>, const N: usize>(
         &mut self,
         tick: u32,
         settings: &Settings,
-        lanes: &Lanes,
+        lanes: &Lanes<P, N>,
         lane: usize,
         out: &mut VehicleState,
         rows: &mut [SubStep],
@@ -195,36 +224,25 @@ impl RoadUser {
             return false;
         };
         *state = lanes.state(lane);
-        write_rows(state, lanes, lane, rows);
+        let start_s = f64::from(tick) * settings.tick_s;
+        let end_s = start_s + settings.tick_s;
         *state = state.settled();
-        write_state(state, out);
-        if let Some(last) = rows.last() {
-            out.accel_body_mps2 = last.accel_body_mps2;
-            out.angular_rate_body_radps = last.angular_rate_body_radps;
-        }
-        let end_s = f64::from(tick + 1) * settings.tick_s;
+        lanes.write(lane, rows);
+        write_moved(state, lanes.road(lane), path.road(start_s).0, rows, out);
+        out.reference_offset_m = path.offset_m(end_s, settings.step_s()) as f32;
         let target = lanes.curve(lane).at(settings.tick_s);
         let error = tracking::error(state, front_m, &target);
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;
         let limit = settings.vehicle.resynchronise_m;
-        let lost = square > limit * limit;
+        let lost = square > limit * limit || path.undriven_m() > settings.vehicle.leave_path_m;
         if lost {
-            let curve = Curve::straight(target.position_m, target.velocity_mps);
-            *state = set_onto(&curve, front_m, path.heading_at(end_s));
-            write_set(state, out, rows);
+            *state = set_onto(&path.resynchronise(end_s), front_m, path.heading_at(end_s));
+            out.reference_offset_m = 0.0;
+            write_set(state, path, end_s, front_m, out, rows);
         } else {
             out.tracking_lateral_m = error.lateral_m as f32;
             out.tracking_longitudinal_m = error.longitudinal_m as f32;
         }
-        write_road(
-            &self.before,
-            &self.now,
-            end_s / settings.step_s(),
-            settings,
-            front_m,
-            out,
-            rows,
-        );
         self.flag(lost, out)
     }
 
@@ -257,23 +275,15 @@ impl RoadUser {
                 let front_m = self.dimensions.front_m();
                 if set {
                     hero.set(&self.now, front_m, out, rows);
-                    self.before = self.now;
                 } else {
-                    let model = hero::model(settings, &self.dimensions);
-                    hero.advance(&model, settings.sub_step_s(), out, rows);
+                    hero.advance([&self.before, &self.now], front_m, settings.sub_step_s(), out, rows);
                 }
-                write_road(&self.before, &self.now, 1.0, settings, front_m, out, rows);
             }
             Mover::Vehicle { state, path } => {
                 let front_m = self.dimensions.front_m();
                 *path = Path::from_here(&self.now, settings.step_s());
-                *state = set_onto(
-                    &path.tick(0.0, settings.tick_s, 0.0),
-                    front_m,
-                    f64::from(self.now.yaw_rad),
-                );
-                write_set(state, out, rows);
-                write_road(&self.now, &self.now, 1.0, settings, front_m, out, rows);
+                *state = set_onto(&path.start(), front_m, f64::from(self.now.yaw_rad));
+                write_set(state, path, 0.0, front_m, out, rows);
             }
         }
         self.flag(set, out)
@@ -308,28 +318,26 @@ impl RoadUser {
     }
 }
 
-/// Writes the sub-steps of a lane, relative to the state at the end of the tick.
-fn write_rows(end: &State, lanes: &Lanes, lane: usize, rows: &mut [SubStep]) {
-    for (row, moved) in rows.iter_mut().zip(&lanes.rows) {
-        *row = SubStep {
-            dx_m: (moved.x_m[lane] - end.x_m) as f32,
-            dy_m: (moved.y_m[lane] - end.y_m) as f32,
-            dyaw_rad: (moved.yaw_rad[lane] - end.yaw_rad) as f32,
-            speed_mps: moved.speed_mps[lane] as f32,
-            accel_body_mps2: [moved.accel_x_mps2[lane] as f32, moved.accel_y_mps2[lane] as f32, 0.0],
-            angular_rate_body_radps: [0.0, 0.0, moved.yaw_rate_radps[lane] as f32],
-            road_wheel_angle_rad: moved.road_wheel_angle_rad[lane] as f32,
-            ..SubStep::default()
-        };
-    }
-}
-
-fn write_state(state: &State, out: &mut VehicleState) {
+/// Writes the state at the end of a tick: `road` is that of the lane (see [`Lanes::road`]), `height_m` that of the road under the
+/// front bumper at the start of the tick.
+fn write_moved(state: &State, road: [f64; 3], height_m: f64, rows: &[SubStep], out: &mut VehicleState) {
+    let lean = Lean {
+        roll_rad: state.roll[0],
+        pitch_rad: state.pitch[0] + road[2],
+    };
     out.x_m = state.x_m;
     out.y_m = state.y_m;
+    out.z_m = height_m + road[0];
     out.yaw_rad = state.yaw_rad;
-    out.velocity_body_mps = [state.speed_mps as f32, 0.0, 0.0];
+    out.roll_rad = lean.roll_rad as f32;
+    out.pitch_rad = lean.pitch_rad as f32;
+    let velocity = [state.speed_mps, state.lateral_mps, road[1]];
+    out.velocity_body_mps = body_from_level(&lean, velocity).map(|part| part as f32);
     out.road_wheel_angle_rad = state.road_wheel_angle_rad as f32;
+    if let Some(last) = rows.last() {
+        out.accel_body_mps2 = last.accel_body_mps2;
+        out.angular_rate_body_radps = last.angular_rate_body_radps;
+    }
 }
 
 /// A state with the front bumper at the start of the curve, rolling straight ahead.
@@ -345,38 +353,29 @@ fn set_onto(curve: &Curve, front_m: f64, yaw_rad: f64) -> State {
     state
 }
 
-/// Writes a state that was set, not reached: all sub-steps show it, nothing accelerates or turns.
-fn write_set(state: &State, out: &mut VehicleState, rows: &mut [SubStep]) {
-    write_state(state, out);
+/// Writes a state that was set, not reached: all sub-steps show it, nothing accelerates or turns. It stands on the road of its
+/// path at `time_s`.
+fn write_set(state: &State, path: &Path, time_s: f64, front_m: f64, out: &mut VehicleState, rows: &mut [SubStep]) {
+    let (height_m, rise) = path.road(time_s);
+    let [_, climb_mps, slope_rad, slope_rate] = rise.at(0.0);
+    let lean = Lean {
+        roll_rad: 0.0,
+        pitch_rad: slope_rad,
+    };
+    let velocity = [state.speed_mps, 0.0, climb_mps - front_m * slope_rate];
+    out.x_m = state.x_m;
+    out.y_m = state.y_m;
+    out.z_m = height_m - front_m * slope_rad;
+    out.yaw_rad = state.yaw_rad;
+    out.roll_rad = 0.0;
+    out.pitch_rad = slope_rad as f32;
+    out.velocity_body_mps = body_from_level(&lean, velocity).map(|part| part as f32);
+    out.road_wheel_angle_rad = 0.0;
     out.accel_body_mps2 = [0.0; 3];
     out.angular_rate_body_radps = [0.0; 3];
     rows.fill(SubStep {
+        pitch_rad: out.pitch_rad,
         speed_mps: state.speed_mps as f32,
         ..SubStep::default()
     });
-}
-
-/// Height and slope follow the road, linearly over the SUMO step (`share` of it is done).
-fn write_road(
-    before: &TrafficState,
-    now: &TrafficState,
-    share: f64,
-    settings: &Settings,
-    front_m: f64,
-    out: &mut VehicleState,
-    rows: &mut [SubStep],
-) {
-    let slope_change = f64::from(now.pitch_rad) - f64::from(before.pitch_rad);
-    let pitch = f64::from(now.pitch_rad) - (1.0 - share) * slope_change;
-    let front_z = now.front_z_m - (1.0 - share) * (now.front_z_m - before.front_z_m);
-    out.pitch_rad = pitch as f32;
-    out.z_m = front_z;
-    if pitch == 0.0 && slope_change == 0.0 {
-        return;
-    }
-    out.z_m = front_z - front_m * libm::tan(pitch);
-    // Nose up is a rotation about the body's right, so its rate about the left is negative.
-    let rate = (-slope_change / settings.step_s()) as f32;
-    out.angular_rate_body_radps[1] = rate;
-    rows.iter_mut().for_each(|row| row.angular_rate_body_radps[1] = rate);
 }

@@ -5,9 +5,16 @@
 //! wanted P' fixes speed and yaw rate: `v = P'·t`, `ψ' = P'·n / d`. The wanted P' is the path's velocity plus a gain on the
 //! error. The curvature `ψ' / v = tan β / d` depends only on the direction β of P' in the body, which keeps its meaning
 //! down to walking pace; below [`HOLD_MPS`] the wheels are held.
+//!
+//! With tyres ([`DynamicParams`]) P is reached through forces. Its lateral acceleration is `Yf (1 + x m/I lf) + Yr (1 − x m/I lr)`
+//! with P `x` ahead of the centre of gravity: the front force that gives a wanted acceleration, and from the tyre's inverse the
+//! angle at which the front wheel must stand against its own velocity, follow at once. The error of P then obeys
+//! `e'' + 2 ω e' + ω² e = 0`; what is left, the yaw about P, is a damped oscillation (`ω₀² = m/I L C N / (1 + x m/I lf)`, damped by
+//! `ω₀² d / v`), because P lies ahead of the centre of percussion.
 
 use crate::{
     curve::Target,
+    dynamic::{DynamicParams, GRAVITY_MPS2, SLIP_SPEED_MPS},
     trig::{atan_demand, bound, larger, pick, smaller},
     vehicle::{ACCEL_RATE_PER_S, Input, KinematicParams, MAX_JERK_MPS3, State},
 };
@@ -24,9 +31,12 @@ const LATERAL_GAIN_PER_S: f64 = 2.5;
 const LOW_SPEED_MPS: f64 = 3.0;
 /// Most that tan β may be: 55°.
 const MAX_TAN_BETA: f64 = 1.43;
-/// Largest lateral acceleration a demand may ask for, m/s². The model has no tyres; SUMO takes bends within an edge at full
-/// speed (14 m/s² on a corner of 18 m radius at 16 m/s), and a mirror that refused would leave the road.
-const MAX_LATERAL_ACCEL_MPS2: f64 = 15.0;
+/// ω of the lateral error of a vehicle with tyres, 1/s.
+const LATERAL_FREQUENCY_PER_S: f64 = 4.0;
+/// Below this speed a vehicle with tyres is steered as if it rolled without slip, at twice this speed by its forces alone, m/s.
+const ROLLING_MPS: f64 = 2.0;
+/// Share of the friction that tracking asks for: the rest keeps the tyres' slip small.
+const FRICTION_SHARE: f64 = 0.9;
 /// Below this speed of vehicle or path the wheels are held, m/s.
 const HOLD_MPS: f64 = 0.05;
 /// A standing vehicle starts only when its path moves at [`HOLD_MPS`] or is this far ahead, metres.
@@ -47,6 +57,8 @@ pub struct Driven {
     pub max_accel_mps2: f64,
     /// Largest deceleration, m/s².
     pub max_decel_mps2: f64,
+    /// Largest lateral acceleration, m/s².
+    pub max_lateral_mps2: f64,
 }
 
 impl Driven {
@@ -59,6 +71,7 @@ impl Driven {
             wheelbase_m: params.wheelbase_m,
             max_accel_mps2: params.max_accel_mps2,
             max_decel_mps2: params.max_decel_mps2,
+            max_lateral_mps2: params.max_lateral_mps2,
         }
     }
 }
@@ -135,8 +148,56 @@ fn steering_demand(driven: &Driven, state: &State, [along, across]: [f64; 2], le
         -MAX_TAN_BETA,
         MAX_TAN_BETA,
     );
-    let most = MAX_LATERAL_ACCEL_MPS2 * pace * pace;
+    let most = driven.max_lateral_mps2 * pace * pace;
     let curvature_per_m = bound(tan_beta / driven.front_m, -most, most);
     let angle = atan_demand(driven.wheelbase_m * curvature_per_m);
     pick(holds, state.road_wheel_angle_rad, angle)
+}
+
+/// The demand that brings the front bumper, `front_m` ahead of the rear axle, of a vehicle with tyres onto its target.
+#[must_use]
+#[inline(always)]
+pub fn demand_with_tyres(params: &DynamicParams, front_m: f64, state: &State, target: &Target) -> Input {
+    let error = error(state, front_m, target);
+    let [cos, sin] = state.heading;
+    let [vx, vy] = target.velocity_mps;
+    let along = vx * cos + vy * sin;
+    let driven = Driven {
+        front_m,
+        wheelbase_m: params.wheelbase_m,
+        max_accel_mps2: params.max_accel_mps2,
+        max_decel_mps2: params.max_decel_mps2,
+        max_lateral_mps2: FRICTION_SHARE * params.friction * GRAVITY_MPS2,
+    };
+    let closing = vy * cos - vx * sin - (state.lateral_mps + front_m * state.yaw_rate_radps);
+    let bend = target.bend_mps2[1] * cos - target.bend_mps2[0] * sin;
+    let frequency = LATERAL_FREQUENCY_PER_S * smaller(state.speed_mps * (1.0 / LOW_SPEED_MPS), 1.0);
+    let wanted = bend + frequency * (2.0 * closing + frequency * error.lateral_m);
+    let wanted = bound(wanted, -driven.max_lateral_mps2, driven.max_lateral_mps2);
+    let across = vy * cos - vx * sin;
+    let rolling = steering_demand(&driven, state, [along, across], error.lateral_m);
+    let slipping = angle_for(params, state, wanted);
+    let share = bound((state.speed_mps - ROLLING_MPS) * (1.0 / ROLLING_MPS), 0.0, 1.0);
+    Input {
+        accel_mps2: accel_demand(&driven, state, target.accel_mps2, along, error.longitudinal_m),
+        road_wheel_angle_rad: rolling + share * (slipping - rolling),
+    }
+}
+
+/// Road-wheel angle that accelerates the front bumper to the left by `wanted_mps2`.
+#[inline(always)]
+fn angle_for(params: &DynamicParams, state: &State, wanted_mps2: f64) -> f64 {
+    let loads = params.loads_mps2(state.accel_mps2);
+    let moving = 1.0 / larger(state.speed_mps, HOLD_MPS);
+    let pace = larger(state.speed_mps, SLIP_SPEED_MPS) * moving;
+    let rear_linear =
+        -params.stiffness_per_rad[1] * loads[1] * state.lateral_mps * smaller(moving, 1.0 / SLIP_SPEED_MPS);
+    let rear_most = params.friction * loads[1];
+    let rear_square = rear_most * rear_most;
+    let rear = rear_linear * (rear_square / (rear_square + rear_linear * rear_linear)).sqrt();
+    let front = (wanted_mps2 - rear * params.bumper[1]) * params.bumper[0];
+    let share = bound(front / (params.friction * loads[0]), -FRICTION_SHARE, FRICTION_SHARE);
+    let slip = share * params.friction / (params.stiffness_per_rad[0] * (1.0 - share * share).sqrt());
+    let direction = atan_demand((state.lateral_mps + params.wheelbase_m * state.yaw_rate_radps) * moving);
+    direction + slip * pace
 }

@@ -5,12 +5,14 @@
 //! acceleration follows its demand with a lag and a bounded jerk, the road-wheel angle with a lag and a bounded rate.
 //! Speed, acceleration and road-wheel angle are therefore continuous, and so is what an inertial sensor feels.
 //!
-//! The functions here are free of branches and library calls so that [`crate::lanes`] can run them on many vehicles at
+//! [`crate::dynamic`] has the model with tyres. The functions here are free of branches and library calls so that [`crate::lanes`] can run them on many vehicles at
 //! once; one vehicle alone gives the same bits.
 
+use bytemuck::{Pod, Zeroable};
 use ipc_schema::config;
 
 use crate::trig::{bound, pick, sin_cos_small, smaller, tan_wheel, wrap_angle};
+use crate::{dynamic::DynamicParams, parameters::Set};
 
 /// Largest jerk of any vehicle, m/s³: a full brake application builds up 9 m/s² in about 0.3 s.
 pub const MAX_JERK_MPS3: f64 = 30.0;
@@ -18,11 +20,15 @@ pub const MAX_JERK_MPS3: f64 = 30.0;
 pub const ACCEL_RATE_PER_S: f64 = 12.0;
 /// Rate at which the road wheels follow their demand, 1/s.
 pub const STEERING_RATE_PER_S: f64 = 20.0;
+/// Largest lateral acceleration of the kinematic model, m/s². It has no tyres; SUMO takes bends within an edge at full speed
+/// (14 m/s² on a corner of 18 m radius at 16 m/s), and a mirror that refused would leave the road.
+const MAX_LATERAL_MPS2: f64 = 15.0;
 /// Below this speed a vehicle that does not want to move stands, m/s.
-const STANDSTILL_MPS: f64 = 0.002;
+pub(crate) const STANDSTILL_MPS: f64 = 0.002;
 
 /// State of a vehicle. World frame; origin of the body at the centre of the rear axle on the ground.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub struct State {
     /// Metres.
     pub x_m: f64,
@@ -38,6 +44,14 @@ pub struct State {
     pub accel_mps2: f64,
     /// Road-wheel angle, positive to the left, radians.
     pub road_wheel_angle_rad: f64,
+    /// Speed of the rear axle to the left, m/s: zero without slip.
+    pub lateral_mps: f64,
+    /// Yaw rate, rad/s.
+    pub yaw_rate_radps: f64,
+    /// Roll of the body on its springs, positive to the right side down, and its rate: rad and rad/s.
+    pub roll: [f64; 2],
+    /// Pitch of the body on its springs against the road, positive nose up, and its rate: rad and rad/s.
+    pub pitch: [f64; 2],
 }
 
 impl State {
@@ -54,6 +68,10 @@ impl State {
             speed_mps,
             accel_mps2: 0.0,
             road_wheel_angle_rad: 0.0,
+            lateral_mps: 0.0,
+            yaw_rate_radps: 0.0,
+            roll: [0.0; 2],
+            pitch: [0.0; 2],
         }
     }
 
@@ -92,14 +110,15 @@ pub struct Input {
 /// instant. `R(ψ) · accel · dt`, ψ half-way, is exactly the change of the velocity; `yaw_rate · dt` that of the heading.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Motion {
-    /// Kinematic acceleration forward and left, m/s².
-    pub accel_body_mps2: [f64; 2],
+    /// Kinematic acceleration along the heading and to the left, in the horizontal plane, m/s².
+    pub accel_level_mps2: [f64; 2],
     /// Yaw rate, rad/s.
     pub yaw_rate_radps: f64,
 }
 
 /// Parameters of the kinematic model.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub struct KinematicParams {
     /// Rear axle to front axle, metres.
     pub wheelbase_m: f64,
@@ -111,19 +130,25 @@ pub struct KinematicParams {
     pub max_accel_mps2: f64,
     /// Largest deceleration, m/s².
     pub max_decel_mps2: f64,
+    /// Largest lateral acceleration that a driver asks for, m/s².
+    pub max_lateral_mps2: f64,
+    /// Largest curvature of the rear axle's way, 1/m.
+    pub max_curvature_per_m: f64,
 }
 
 impl KinematicParams {
-    /// The configured limits on a vehicle with this wheelbase.
+    /// The limits of a parameter set, none above the configured ones, on a vehicle with this wheelbase.
     #[must_use]
-    #[inline]
-    pub fn new(limits: &config::Vehicle, wheelbase_m: f64) -> Self {
+    pub fn new(set: &Set, limits: &config::Vehicle, wheelbase_m: f64) -> Self {
+        let max_road_wheel_angle_rad = set.max_road_wheel_angle_rad.min(limits.max_road_wheel_angle_rad);
         Self {
             wheelbase_m,
-            max_road_wheel_angle_rad: limits.max_road_wheel_angle_rad,
-            max_road_wheel_rate_radps: limits.max_road_wheel_rate_radps,
-            max_accel_mps2: limits.max_accel_mps2,
-            max_decel_mps2: limits.max_decel_mps2,
+            max_curvature_per_m: libm::tan(max_road_wheel_angle_rad) / wheelbase_m,
+            max_road_wheel_angle_rad,
+            max_road_wheel_rate_radps: set.max_road_wheel_rate_radps.min(limits.max_road_wheel_rate_radps),
+            max_accel_mps2: set.max_accel_mps2.min(limits.max_accel_mps2),
+            max_decel_mps2: set.max_decel_mps2.min(limits.max_decel_mps2),
+            max_lateral_mps2: MAX_LATERAL_MPS2,
         }
     }
 
@@ -170,6 +195,7 @@ impl KinematicParams {
         let half_way = rotate(state.heading, cos_half, sin_half);
         // Chord of an arc: its length times sin(turn/2) / (turn/2).
         let chord = 0.5 * (state.speed_mps + speed) * dt_s * (1.0 - turn * turn * (1.0 / 24.0));
+        let rate = 1.0 / dt_s;
         let next = State {
             x_m: state.x_m + chord * half_way[0],
             y_m: state.y_m + chord * half_way[1],
@@ -178,10 +204,13 @@ impl KinematicParams {
             speed_mps: speed,
             accel_mps2: accel,
             road_wheel_angle_rad: angle,
+            lateral_mps: 0.0,
+            yaw_rate_radps: turn * rate,
+            roll: [0.0; 2],
+            pitch: [0.0; 2],
         };
-        let rate = 1.0 / dt_s;
         let motion = Motion {
-            accel_body_mps2: [
+            accel_level_mps2: [
                 (speed - state.speed_mps) * cos_half * rate,
                 (speed + state.speed_mps) * sin_half * rate,
             ],
@@ -193,12 +222,12 @@ impl KinematicParams {
 
 /// Share of a lag that passes in one sub-step.
 #[inline(always)]
-fn share(rate: f64) -> f64 {
+pub(crate) fn share(rate: f64) -> f64 {
     smaller(rate, 1.0)
 }
 
 #[inline(always)]
-fn rotate(direction: [f64; 2], cos: f64, sin: f64) -> [f64; 2] {
+pub(crate) fn rotate(direction: [f64; 2], cos: f64, sin: f64) -> [f64; 2] {
     [
         direction[0] * cos - direction[1] * sin,
         direction[0] * sin + direction[1] * cos,
@@ -211,6 +240,8 @@ fn rotate(direction: [f64; 2], cos: f64, sin: f64) -> [f64; 2] {
 pub enum Model {
     /// Kinematic single-track model.
     Kinematic(KinematicParams),
+    /// Single-track model with tyres, load transfer, roll and pitch.
+    Dynamic(DynamicParams),
 }
 
 impl Model {
@@ -219,6 +250,7 @@ impl Model {
     pub fn step(&self, state: &State, input: &Input, dt_s: f64) -> (State, Motion) {
         match self {
             Self::Kinematic(params) => params.step(state, input, dt_s),
+            Self::Dynamic(params) => params.step(state, input, 0.0, dt_s),
         }
     }
 }

@@ -4,9 +4,9 @@ mod common;
 
 use std::f64::consts::FRAC_PI_2;
 
-use common::{Road, drive, limits, mirror_one, settings};
+use common::{Road, drive, kinematic, limits, mirror_one, settings};
 use ipc_schema::world::{SubStep, VehicleState};
-use sim_core::vehicle::{Input, KinematicParams, Model, State};
+use sim_core::vehicle::{Input, Model, State};
 
 /// Dead reckoning as a user would do it: heading from the angular rate, velocity from the body's acceleration turned by
 /// the heading half-way, position from the mean velocity.
@@ -84,7 +84,7 @@ fn sub_steps_lie_on_the_path_between_two_ticks() {
 fn slalom(steps: u32) -> State {
     let mut limits = limits();
     (limits.max_road_wheel_rate_radps, limits.max_accel_mps2) = (10.0, 50.0);
-    let model = Model::Kinematic(KinematicParams::new(&limits, 2.6));
+    let model = Model::Kinematic(kinematic(&limits, 2.6));
     let dt_s = 4.0 / f64::from(steps);
     let mut state = State::new(0.0, 0.0, 0.3, 10.0);
     for i in 0..steps {
@@ -114,7 +114,7 @@ fn halving_the_sub_step_at_least_halves_the_error() {
 /// With held actuators only the arc remains: an exact circle whatever the sub-step.
 #[test]
 fn a_circle_closes_whatever_the_sub_step() {
-    let model = Model::Kinematic(KinematicParams::new(&limits(), 2.6));
+    let model = Model::Kinematic(kinematic(&limits(), 2.6));
     let angle = 0.2;
     let radius = 2.6 / f64::tan(angle);
     for steps in [50_u32, 100, 1000] {
@@ -131,7 +131,7 @@ fn a_circle_closes_whatever_the_sub_step() {
             let (next, motion) = model.step(&state, &input, time_s / f64::from(steps));
             assert!((motion.yaw_rate_radps - 8.0 / radius).abs() < 1e-9);
             let coarse = (8.0 / radius * time_s / f64::from(steps)).powi(2) / 24.0;
-            assert!((motion.accel_body_mps2[1] / (64.0 / radius) - 1.0).abs() < coarse + 1e-9);
+            assert!((motion.accel_level_mps2[1] / (64.0 / radius) - 1.0).abs() < coarse + 1e-9);
             state = next;
         }
         assert!((state.x_m - 3.0).hypot(state.y_m - 4.0) < 1e-6, "{state:?}");
@@ -142,7 +142,7 @@ fn a_circle_closes_whatever_the_sub_step() {
 /// Constant deceleration from 20 m/s: the actuator's lag aside, v² / 2a.
 #[test]
 fn straight_braking_distance() {
-    let model = Model::Kinematic(KinematicParams::new(&limits(), 2.6));
+    let model = Model::Kinematic(kinematic(&limits(), 2.6));
     let mut state = State {
         accel_mps2: -5.0,
         ..State::new(0.0, 0.0, 0.0, 20.0)

@@ -43,7 +43,7 @@ fn every_tick_gets_its_own_header() {
 
 #[test]
 fn a_new_episode_forgets_everything_even_if_announcements_come_first() {
-    let mut mirror = Mirror::new(settings(0.1, 10, 1));
+    let mut mirror = Mirror::new(settings(0.1, 10, 1)).unwrap();
     mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
     frame(&mut mirror, &header(0, 0), &[road().state(0, 50.0, 5.0)]);
     mirror.apply_meta(&header(1, 1), &[meta(0, Kind::Cav)]).unwrap();
@@ -56,7 +56,7 @@ fn a_new_episode_forgets_everything_even_if_announcements_come_first() {
 
 #[test]
 fn arrivals_make_room_and_strangers_are_refused() {
-    let mut mirror = Mirror::new(settings(0.1, 10, 1));
+    let mut mirror = Mirror::new(settings(0.1, 10, 1)).unwrap();
     mirror
         .apply_meta(&header(0, 0), &[meta(0, Kind::Cav), meta(7, Kind::Other)])
         .unwrap();
@@ -76,7 +76,7 @@ fn arrivals_make_room_and_strangers_are_refused() {
 
 #[test]
 fn faulty_frames_are_refused_by_name() {
-    let mut mirror = Mirror::new(settings(0.1, 10, 1));
+    let mut mirror = Mirror::new(settings(0.1, 10, 1)).unwrap();
     mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
     let mut broken = road().state(0, 50.0, 5.0);
     broken.front_y_m = f64::NAN;
@@ -96,7 +96,7 @@ fn faulty_frames_are_refused_by_name() {
 
 #[test]
 fn a_vehicle_that_was_away_is_set_and_counted() {
-    let mut mirror = Mirror::new(settings(0.1, 10, 10));
+    let mut mirror = Mirror::new(settings(0.1, 10, 10)).unwrap();
     mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
     frame(&mut mirror, &header(0, 0), &[road().state(0, 50.0, 5.0)]);
     frame(&mut mirror, &header(0, 10), &[]);
@@ -109,7 +109,7 @@ fn a_vehicle_that_was_away_is_set_and_counted() {
 
 #[test]
 fn persons_pass_through_with_velocities_from_differences() {
-    let mut mirror = Mirror::new(settings(0.1, 10, 2));
+    let mut mirror = Mirror::new(settings(0.1, 10, 2)).unwrap();
     mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Person)]).unwrap();
     let at = |y: f64, speed: f32| TrafficState {
         front_y_m: y,
@@ -152,13 +152,13 @@ proptest! {
                 states
             })
             .collect();
-        let mut together = Mirror::new(settings(0.1, 10, 1));
+        let mut together = Mirror::new(settings(0.1, 10, 1)).unwrap();
         let metas: Vec<_> = (0..count).map(|v| meta(v, Kind::Cav)).collect();
         together.apply_meta(&header(0, 0), &metas).unwrap();
         let mut alone: Vec<Mirror> = metas
             .iter()
             .map(|m| {
-                let mut mirror = Mirror::new(settings(0.1, 10, 1));
+                let mut mirror = Mirror::new(settings(0.1, 10, 1)).unwrap();
                 mirror.apply_meta(&header(0, 0), &[*m]).unwrap();
                 mirror
             })

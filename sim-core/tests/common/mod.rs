@@ -10,6 +10,7 @@ use ipc_schema::{
     world::{SubStep, VehicleState},
 };
 use sim_core::mirror::{Mirror, Settings};
+use sim_core::vehicle::KinematicParams;
 
 /// Body of the vehicles in these tests, metres.
 pub const LENGTH_M: f64 = 4.3;
@@ -17,6 +18,7 @@ pub const LENGTH_M: f64 = 4.3;
 pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> Settings {
     Settings {
         vehicle: limits(),
+        surface: config::Surface::Dry,
         tick_s,
         sub_steps,
         ticks_per_step,
@@ -35,7 +37,21 @@ pub fn limits() -> config::Vehicle {
         max_accel_mps2: 5.0,
         max_decel_mps2: 9.0,
         steering_ratio: 15.0,
-        resynchronise_m: 5.0,
+        resynchronise_m: 2.0,
+        leave_path_m: 5.0,
+    }
+}
+
+/// The kinematic model with these limits.
+pub fn kinematic(limits: &config::Vehicle, wheelbase_m: f64) -> KinematicParams {
+    KinematicParams {
+        wheelbase_m,
+        max_road_wheel_angle_rad: limits.max_road_wheel_angle_rad,
+        max_road_wheel_rate_radps: limits.max_road_wheel_rate_radps,
+        max_accel_mps2: limits.max_accel_mps2,
+        max_decel_mps2: limits.max_decel_mps2,
+        max_lateral_mps2: 15.0,
+        max_curvature_per_m: limits.max_road_wheel_angle_rad.tan() / wheelbase_m,
     }
 }
 
@@ -144,7 +160,7 @@ impl Aligned {
 
 /// The ticks of one vehicle that SUMO moves through `states`.
 pub fn mirror_one(settings: Settings, states: &[TrafficState]) -> (Vec<VehicleState>, Vec<SubStep>) {
-    let mut mirror = Mirror::new(settings);
+    let mut mirror = Mirror::new(settings).unwrap();
     mirror
         .apply_meta(&MessageHeader::default(), &[meta(0, Kind::Cav)])
         .unwrap();

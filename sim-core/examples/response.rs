@@ -1,0 +1,169 @@
+//! Prints how the vehicle models answer, as CSV: the figures of `docs/vehicle-model.md` are drawn from it.
+//!
+//! `cargo run --release -p sim-core --example response > response.csv`. Vehicle: the set `sedan` at its own size, sub-steps of 5 ms.
+//! `circle`: end states after 12 s at a held road-wheel angle and 20 m/s. `step`: 0.03 rad from t = 0.5 s on, at 20 m/s. `brake`: full
+//! braking from 30 m/s.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "an example asserts by unwrapping and prints"
+)]
+
+use ipc_schema::config::{self, Surface};
+use sim_core::{
+    dimensions::Dimensions,
+    dynamic::DynamicParams,
+    fleet::friction_share,
+    parameters::{Catalogue, Set},
+    rigid_body::{RigidBody, RigidState},
+    vehicle::{Input, KinematicParams, Model, Motion, State},
+};
+
+const DT_S: f64 = 0.005;
+const SPEED_MPS: f64 = 20.0;
+const LIMITS: config::Vehicle = config::Vehicle {
+    cav_model: config::VehicleModel::Dynamic,
+    other_model: config::VehicleModel::Kinematic,
+    hero_model: config::VehicleModel::RigidBody,
+    class_models: Vec::new(),
+    lane_change_s: 3.0,
+    max_road_wheel_angle_rad: 0.6,
+    max_road_wheel_rate_radps: 1.0,
+    max_accel_mps2: 6.0,
+    max_decel_mps2: 10.0,
+    steering_ratio: 15.0,
+    resynchronise_m: 2.0,
+    leave_path_m: 5.0,
+};
+
+/// A vehicle under way.
+enum Vehicle {
+    Plain(Model, State),
+    Rigid(Box<RigidBody>, RigidState),
+}
+
+impl Vehicle {
+    fn new(model: &str, set: &Set, body: &Dimensions, surface: Surface, speed_mps: f64) -> Self {
+        let (share, start) = (friction_share(surface), State::new(0.0, 0.0, 0.0, speed_mps));
+        match model {
+            "kinematic" => Self::Plain(
+                Model::Kinematic(KinematicParams::new(set, &LIMITS, body.wheelbase_m)),
+                start,
+            ),
+            "dynamic" => Self::Plain(
+                Model::Dynamic(DynamicParams::new(set, body, &LIMITS, share, DT_S)),
+                start,
+            ),
+            _ => Self::Rigid(
+                Box::new(RigidBody::new(set, body, &LIMITS, share, DT_S).unwrap()),
+                start.into(),
+            ),
+        }
+    }
+
+    fn state(&self) -> State {
+        match self {
+            Self::Plain(_, state) => *state,
+            Self::Rigid(_, state) => state.level,
+        }
+    }
+
+    fn step(&mut self, accel_mps2: f64, road_wheel_angle_rad: f64) -> Motion {
+        let input = Input {
+            accel_mps2,
+            road_wheel_angle_rad,
+        };
+        match self {
+            Self::Plain(model, state) => {
+                let (next, motion) = model.step(state, &input, DT_S);
+                *state = next;
+                motion
+            }
+            Self::Rigid(body, state) => {
+                let (next, motion) = body.step(state, &input, 0.0);
+                *state = next;
+                motion
+            }
+        }
+    }
+}
+
+/// Who answers what.
+struct Case<'a> {
+    figure: &'a str,
+    model: &'a str,
+    surface: Surface,
+}
+
+fn print(case: &Case<'_>, time_s: f64, vehicle: &Vehicle, motion: &Motion, cg_to_rear_m: f64) {
+    let state = vehicle.state();
+    let slip = libm::atan2(
+        state.lateral_mps + cg_to_rear_m * state.yaw_rate_radps,
+        state.speed_mps.max(0.01),
+    );
+    println!(
+        "{},{},{},{time_s:.3},{:.5},{:.4},{:.4},{:.4},{:.5},{slip:.5},{:.5},{:.5}",
+        case.figure,
+        case.model,
+        format!("{:?}", case.surface).to_lowercase(),
+        state.road_wheel_angle_rad,
+        state.speed_mps,
+        state.x_m,
+        motion.accel_level_mps2[1],
+        state.yaw_rate_radps,
+        state.roll[0],
+        state.pitch[0],
+    );
+}
+
+fn main() {
+    let catalogue = Catalogue::new().unwrap();
+    let set = catalogue.sets().iter().find(|set| set.name == "sedan").unwrap();
+    let body = set.dimensions(set.length_m, set.width_m, set.height_m);
+    let cg = set.front_load_share * body.wheelbase_m;
+    println!(
+        "figure,model,surface,t_s,road_wheel_angle_rad,speed_mps,x_m,lateral_mps2,yaw_rate_radps,slip_rad,roll_rad,pitch_rad"
+    );
+    let models = ["kinematic", "dynamic", "rigid_body"];
+    let run = |case: &Case<'_>, speed: f64, duration_s: f64, each: u32, input: &dyn Fn(f64, &State) -> (f64, f64)| {
+        let mut vehicle = Vehicle::new(case.model, set, &body, case.surface, speed);
+        let steps = (duration_s / DT_S).round() as u32;
+        for step in 1..=steps {
+            let (accel, angle) = input(f64::from(step - 1) * DT_S, &vehicle.state());
+            let motion = vehicle.step(accel, angle);
+            if step.is_multiple_of(each) || (each == 0 && step == steps) {
+                print(case, f64::from(step) * DT_S, &vehicle, &motion, cg);
+            }
+        }
+    };
+    let hold = |state: &State| 2.0 * (SPEED_MPS - state.speed_mps);
+    for model in models {
+        for surface in [Surface::Dry, Surface::Snow] {
+            let case = Case {
+                figure: "circle",
+                model,
+                surface,
+            };
+            for angle in (1..=40).map(|i| 0.0025 * f64::from(i)) {
+                run(&case, SPEED_MPS, 12.0, 0, &|_, state| (hold(state), angle));
+            }
+        }
+        let case = Case {
+            figure: "step",
+            model,
+            surface: Surface::Dry,
+        };
+        run(&case, SPEED_MPS, 3.0, 2, &|t, state| {
+            (hold(state), if t < 0.5 { 0.0 } else { 0.03 })
+        });
+        for surface in [Surface::Dry, Surface::Wet, Surface::Snow] {
+            let case = Case {
+                figure: "brake",
+                model,
+                surface,
+            };
+            run(&case, 30.0, 14.0, 4, &|_, _| (-9.5, 0.0));
+        }
+    }
+}

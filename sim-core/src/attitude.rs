@@ -1,0 +1,56 @@
+//! What an inertial sensor in the body feels, from what the body's origin does and how the body leans.
+//!
+//! `world_from_body = Rz(ψ) Ry(−θ) Rx(φ)` with yaw ψ, pitch θ (positive nose up) and roll φ (positive right side down). Values
+//! are means over a sub-step, turned with the angles half-way: integrating them gives the motion again.
+
+use crate::trig::sin_cos_small;
+
+/// Roll and pitch, radians.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Lean {
+    /// Positive right side down.
+    pub roll_rad: f64,
+    /// Positive nose up, road's slope included.
+    pub pitch_rad: f64,
+}
+
+/// `vector` (along the heading, to the left, up) in the axes of a body that leans.
+#[must_use]
+#[inline(always)]
+pub fn body_from_level(lean: &Lean, vector: [f64; 3]) -> [f64; 3] {
+    let (sin_pitch, cos_pitch) = sin_cos_small(lean.pitch_rad);
+    let (sin_roll, cos_roll) = sin_cos_small(lean.roll_rad);
+    let [along, left, up] = vector;
+    let normal = cos_pitch * up - sin_pitch * along;
+    [
+        cos_pitch * along + sin_pitch * up,
+        cos_roll * left + sin_roll * normal,
+        cos_roll * normal - sin_roll * left,
+    ]
+}
+
+/// Angular rate in the axes of the body, rad/s, from the rate of yaw and the change from one lean to the other in `1 / rate_per_s`.
+#[must_use]
+#[inline(always)]
+pub fn angular_rate(before: &Lean, after: &Lean, yaw_rate_radps: f64, rate_per_s: f64) -> [f64; 3] {
+    let roll_rate = (after.roll_rad - before.roll_rad) * rate_per_s;
+    let pitch_rate = (after.pitch_rad - before.pitch_rad) * rate_per_s;
+    let between = half_way(before, after);
+    let (sin_pitch, cos_pitch) = sin_cos_small(between.pitch_rad);
+    let (sin_roll, cos_roll) = sin_cos_small(between.roll_rad);
+    [
+        roll_rate + yaw_rate_radps * sin_pitch,
+        yaw_rate_radps * cos_pitch * sin_roll - pitch_rate * cos_roll,
+        yaw_rate_radps * cos_pitch * cos_roll + pitch_rate * sin_roll,
+    ]
+}
+
+/// The mean of two leans.
+#[must_use]
+#[inline(always)]
+pub fn half_way(before: &Lean, after: &Lean) -> Lean {
+    Lean {
+        roll_rad: 0.5 * (before.roll_rad + after.roll_rad),
+        pitch_rad: 0.5 * (before.pitch_rad + after.pitch_rad),
+    }
+}

@@ -1,0 +1,182 @@
+//! Which model with which parameters moves which vehicle.
+
+use std::collections::BTreeMap;
+
+use ipc_schema::{
+    config::{self, Surface, VehicleModel},
+    traffic::{Kind, VehicleMeta},
+};
+
+use crate::{
+    dimensions::Dimensions,
+    dynamic::DynamicParams,
+    parameters::{Catalogue, ParameterError},
+    vehicle::{KinematicParams, Model},
+};
+
+/// Share of the friction on dry asphalt that a surface leaves (J. Wong, *Theory of Ground Vehicles*, table 1.5: 0.85 dry, 0.6
+/// wet, 0.2 to 0.3 on packed snow).
+#[must_use]
+pub fn friction_share(surface: Surface) -> f64 {
+    match surface {
+        Surface::Dry => 1.0,
+        Surface::Wet => 0.7,
+        Surface::Snow => 0.3,
+    }
+}
+
+/// The vehicle models cannot be set up.
+#[derive(Debug, thiserror::Error)]
+pub enum FleetError {
+    /// The parameter sets are damaged.
+    #[error(transparent)]
+    Parameters(#[from] ParameterError),
+    /// An entry of `vehicle.class_models` is not understood.
+    #[error(
+        "`vehicle.class_models` has \"{entry}\": give \"class=kinematic\" or \"class=dynamic\" with a vehicle class of SUMO"
+    )]
+    ClassModel {
+        /// The entry.
+        entry: String,
+    },
+}
+
+/// A model for one kind and size of vehicle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Built {
+    /// What moves it.
+    pub model: Model,
+    /// Its size.
+    pub dimensions: Dimensions,
+}
+
+/// The same for all vehicles that share it: parameter set, model and size (bits of length, width and height).
+type Key = (usize, bool, [u32; 3]);
+
+/// All models of a run, one for each kind and size of vehicle.
+#[derive(Debug, Clone)]
+pub struct Fleet {
+    catalogue: Catalogue,
+    limits: config::Vehicle,
+    by_class: BTreeMap<String, VehicleModel>,
+    surface: f64,
+    sub_step_s: f64,
+    built: Vec<Built>,
+    places: BTreeMap<Key, u32>,
+    /// Classes that no set lists, and whether that has been told.
+    unknown: BTreeMap<String, bool>,
+}
+
+impl Fleet {
+    /// The models of a run with sub-steps of `sub_step_s`.
+    ///
+    /// # Errors
+    /// A class is given a model that does not exist.
+    pub fn new(limits: &config::Vehicle, surface: Surface, sub_step_s: f64) -> Result<Self, FleetError> {
+        let by_class = limits.class_models.iter().map(|entry| class_model(entry));
+        Ok(Self {
+            catalogue: Catalogue::new()?,
+            limits: limits.clone(),
+            by_class: by_class.collect::<Result<_, _>>()?,
+            surface: friction_share(surface),
+            sub_step_s,
+            built: Vec::new(),
+            places: BTreeMap::new(),
+            unknown: BTreeMap::new(),
+        })
+    }
+
+    /// Index of the model for an announced road user.
+    pub fn place(&mut self, meta: &VehicleMeta) -> u32 {
+        let choice = self.catalogue.choose(&meta.vehicle_class, f64::from(meta.length_m));
+        let class = class_text(meta);
+        if !choice.known && meta.kind != Kind::Person as u32 {
+            self.unknown.entry(class.clone()).or_insert(false);
+        }
+        let dynamic = self.model_of(&class, meta.kind) != VehicleModel::Kinematic;
+        let size = [meta.length_m, meta.width_m, meta.height_m];
+        let key = (choice.set, dynamic, size.map(f32::to_bits));
+        if let Some(place) = self.places.get(&key) {
+            return *place;
+        }
+        let place = self.built.len() as u32;
+        let [length, width, height] = size.map(f64::from);
+        self.built
+            .push(self.build(choice.set, dynamic, [length, width, height]));
+        self.places.insert(key, place);
+        place
+    }
+
+    fn build(&self, set: usize, dynamic: bool, [length, width, height]: [f64; 3]) -> Built {
+        let set = &self.catalogue.sets()[set];
+        let dimensions = set.dimensions(length, width, height);
+        let model = if dynamic {
+            Model::Dynamic(DynamicParams::new(
+                set,
+                &dimensions,
+                &self.limits,
+                self.surface,
+                self.sub_step_s,
+            ))
+        } else {
+            Model::Kinematic(KinematicParams::new(set, &self.limits, dimensions.wheelbase_m))
+        };
+        Built { model, dimensions }
+    }
+
+    fn model_of(&self, class: &str, kind: u32) -> VehicleModel {
+        self.by_class.get(class).copied().unwrap_or({
+            if kind == Kind::Cav as u32 {
+                self.limits.cav_model
+            } else if kind == Kind::Hero as u32 {
+                self.limits.hero_model
+            } else {
+                self.limits.other_model
+            }
+        })
+    }
+
+    /// The model at a place given by [`Fleet::place`].
+    #[must_use]
+    #[inline]
+    pub fn at(&self, place: u32) -> &Built {
+        &self.built[place as usize]
+    }
+
+    /// Vehicle classes met since the last call that no parameter set lists; each comes once in a run.
+    pub fn take_unknown(&mut self) -> Vec<String> {
+        let untold = self.unknown.iter_mut().filter(|(_, told)| !**told);
+        untold
+            .map(|(class, told)| {
+                *told = true;
+                class.clone()
+            })
+            .collect()
+    }
+}
+
+fn class_text(meta: &VehicleMeta) -> String {
+    let end = meta
+        .vehicle_class
+        .iter()
+        .position(|&byte| byte == 0)
+        .unwrap_or(meta.vehicle_class.len());
+    String::from_utf8_lossy(&meta.vehicle_class[..end]).into_owned()
+}
+
+fn class_model(entry: &str) -> Result<(String, VehicleModel), FleetError> {
+    let refused = || FleetError::ClassModel {
+        entry: entry.to_owned(),
+    };
+    let (class, model) = entry.split_once('=').ok_or_else(refused)?;
+    let (class, model) = (class.trim(), model.trim());
+    let model = match model {
+        "kinematic" => VehicleModel::Kinematic,
+        "dynamic" => VehicleModel::Dynamic,
+        _ => return Err(refused()),
+    };
+    if !ipc_schema::traffic::VEHICLE_CLASSES.contains(&class) {
+        return Err(refused());
+    }
+    Ok((class.to_owned(), model))
+}

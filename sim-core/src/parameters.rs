@@ -1,0 +1,196 @@
+//! Parameter sets of vehicles, read from `data/vehicles.toml`: which set a vehicle of SUMO gets, and how it scales.
+
+use serde::Deserialize;
+
+use crate::dimensions::Dimensions;
+
+/// The committed sets.
+const SETS: &str = include_str!("../data/vehicles.toml");
+
+/// The parameter sets cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ParameterError {
+    /// Not TOML, or a key is missing or unknown.
+    #[error("the parameter sets of vehicles cannot be read")]
+    Format(#[from] toml::de::Error),
+    /// Not exactly one default.
+    #[error("{count} parameter sets of vehicles are marked `default`, one must be")]
+    Default {
+        /// How many are.
+        count: usize,
+    },
+}
+
+/// One parameter set. SI units and radians.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Set {
+    /// Name.
+    pub name: String,
+    /// Taken for a class that no set lists.
+    pub default: bool,
+    /// SUMO vehicle classes.
+    pub classes: Vec<String>,
+    /// Longest vehicle that gets this set, metres.
+    pub longest_m: f64,
+    /// Bumper to bumper, metres.
+    pub length_m: f64,
+    /// Metres.
+    pub width_m: f64,
+    /// Metres.
+    pub height_m: f64,
+    /// Rear axle to front axle, metres.
+    pub wheelbase_m: f64,
+    /// Rear axle to rear bumper, metres.
+    pub rear_overhang_m: f64,
+    /// Mass, kg.
+    pub mass_kg: f64,
+    /// Moment of inertia about the vertical axis through the centre of gravity, kg m².
+    pub yaw_inertia_kgm2: f64,
+    /// Share of the weight on the front axle.
+    pub front_load_share: f64,
+    /// Height of the centre of gravity, metres.
+    pub cg_height_m: f64,
+    /// Lateral force by vertical load and slip angle, front axle, 1/rad.
+    pub cornering_stiffness_front_per_rad: f64,
+    /// Lateral force by vertical load and slip angle, rear axle, 1/rad.
+    pub cornering_stiffness_rear_per_rad: f64,
+    /// Greatest force by vertical load on dry asphalt.
+    pub friction: f64,
+    /// Steady roll by lateral acceleration, rad per m/s²; positive leans out of the bend.
+    pub roll_per_mps2_rad: f64,
+    /// Natural frequency of roll, Hz.
+    pub roll_frequency_hz: f64,
+    /// Damping ratio of roll.
+    pub roll_damping_ratio: f64,
+    /// Steady pitch by longitudinal acceleration, rad per m/s²; positive lifts the nose when accelerating.
+    pub pitch_per_mps2_rad: f64,
+    /// Natural frequency of pitch, Hz.
+    pub pitch_frequency_hz: f64,
+    /// Damping ratio of pitch.
+    pub pitch_damping_ratio: f64,
+    /// Share of the driving force on the front axle.
+    pub drive_share_front: f64,
+    /// Greatest driving power, W.
+    pub max_power_w: f64,
+    /// Greatest acceleration, m/s².
+    pub max_accel_mps2: f64,
+    /// Share of the braking force on the front axle.
+    pub brake_share_front: f64,
+    /// Greatest deceleration of the brakes, m/s².
+    pub max_decel_mps2: f64,
+    /// Drag coefficient times frontal area, m².
+    pub drag_area_m2: f64,
+    /// Rolling resistance by weight.
+    pub rolling_resistance: f64,
+    /// Greatest road-wheel angle, radians.
+    pub max_road_wheel_angle_rad: f64,
+    /// Greatest rate of the road-wheel angle, rad/s.
+    pub max_road_wheel_rate_radps: f64,
+    /// Steering-wheel angle by road-wheel angle.
+    pub steering_ratio: f64,
+    /// Where the numbers come from.
+    pub source: String,
+}
+
+impl Set {
+    /// Size and axles of a vehicle of SUMO with this set: lengths along the body scale with its length.
+    #[must_use]
+    pub fn dimensions(&self, length_m: f64, width_m: f64, height_m: f64) -> Dimensions {
+        let length_m = length_m.max(SHORTEST_M);
+        let scale = length_m / self.length_m;
+        Dimensions {
+            length_m,
+            width_m,
+            height_m,
+            wheelbase_m: self.wheelbase_m * scale,
+            rear_overhang_m: self.rear_overhang_m * scale,
+        }
+    }
+
+    /// Mass of a vehicle of this size: it scales with length × width, kg.
+    #[must_use]
+    pub fn mass_kg(&self, body: &Dimensions) -> f64 {
+        self.mass_kg * (body.length_m / self.length_m) * (body.width_m.max(NARROWEST_M) / self.width_m)
+    }
+
+    /// Moment of inertia by mass, m²: it scales with the length squared.
+    #[must_use]
+    pub fn yaw_inertia_by_mass_m2(&self, body: &Dimensions) -> f64 {
+        let scale = body.length_m / self.length_m;
+        self.yaw_inertia_kgm2 / self.mass_kg * scale * scale
+    }
+
+    /// Height of the centre of gravity: it scales with the height, metres.
+    #[must_use]
+    pub fn cg_height_m(&self, body: &Dimensions) -> f64 {
+        self.cg_height_m * body.height_m.max(LOWEST_M) / self.height_m
+    }
+}
+
+/// Shortest, narrowest and lowest body that is taken seriously, metres: SUMO lets a user write anything.
+const SHORTEST_M: f64 = 0.5;
+const NARROWEST_M: f64 = 0.3;
+const LOWEST_M: f64 = 0.5;
+
+/// All parameter sets.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Catalogue {
+    sets: Vec<Set>,
+    default: usize,
+}
+
+/// Which set a vehicle gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Choice {
+    /// Index of the set.
+    pub set: usize,
+    /// True if a set lists the class.
+    pub known: bool,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    set: Vec<Set>,
+}
+
+impl Catalogue {
+    /// The committed sets.
+    ///
+    /// # Errors
+    /// The committed file is damaged (a test reads it).
+    pub fn new() -> Result<Self, ParameterError> {
+        let File { set: sets } = toml::from_str(SETS)?;
+        let mut defaults = sets.iter().enumerate().filter(|(_, set)| set.default);
+        let default = defaults.next().map(|(index, _)| index);
+        let count = usize::from(default.is_some()) + defaults.count();
+        match default {
+            Some(default) if count == 1 => Ok(Self { sets, default }),
+            _ => Err(ParameterError::Default { count }),
+        }
+    }
+
+    /// The sets in the order of the file.
+    #[must_use]
+    pub fn sets(&self) -> &[Set] {
+        &self.sets
+    }
+
+    /// The first set that lists SUMO class `class` (UTF-8, zero padded) and admits the length; the last that lists it if none
+    /// does; the default if none lists it.
+    #[must_use]
+    pub fn choose(&self, class: &[u8], length_m: f64) -> Choice {
+        let end = class.iter().position(|&b| b == 0).unwrap_or(class.len());
+        let lists = |set: &Set| set.classes.iter().any(|known| known.as_bytes() == &class[..end]);
+        let mut listing = self.sets.iter().enumerate().filter(|(_, set)| lists(set));
+        let fitting = listing.clone().find(|(_, set)| length_m <= set.longest_m);
+        match fitting.or_else(|| listing.next_back()) {
+            Some((set, _)) => Choice { set, known: true },
+            None => Choice {
+                set: self.default,
+                known: false,
+            },
+        }
+    }
+}
