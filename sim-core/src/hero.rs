@@ -47,25 +47,23 @@ pub fn fault(action: Action) -> Option<(&'static str, f32)> {
         .find(|(_, value)| !(-1.0..=1.0).contains(value))
 }
 
-/// A hero's model, its state, and what it is asked for.
+/// State of a hero and what it is asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hero {
-    model: Model,
     state: State,
     input: Input,
 }
 
-impl Hero {
-    /// A hero that SUMO has not inserted yet.
-    #[must_use]
-    pub fn new(model: Model) -> Self {
+impl Default for Hero {
+    fn default() -> Self {
         Self {
-            model,
             state: State::new(0.0, 0.0, 0.0, 0.0),
             input: Input::default(),
         }
     }
+}
 
+impl Hero {
     /// What it is asked for from now on.
     pub fn ask(&mut self, input: Input) {
         self.input = input;
@@ -88,6 +86,7 @@ impl Hero {
     /// Moves through one tick. Height and slope are those of the road under SUMO's copy of it, `[before, now]`.
     pub fn advance(
         &mut self,
+        model: &Model,
         [before, now]: [&TrafficState; 2],
         front_m: f64,
         sub_step_s: f64,
@@ -100,7 +99,7 @@ impl Hero {
         let mut states = Vec::with_capacity(rows.len());
         for (number, row) in rows.iter_mut().enumerate() {
             let from = lean(&self.state, slope(number as f64));
-            let (next, motion) = self.model.step(&self.state, &self.input, sub_step_s);
+            let (next, motion) = model.step(&self.state, &self.input, sub_step_s);
             let to = lean(&next, slope(number as f64 + 1.0));
             *row = sub_step(&next, &motion, [from, to], 1.0 / sub_step_s);
             row.dz_m = (between(before.front_z_m, now.front_z_m, number as f64 + 1.0) - now.front_z_m) as f32;

@@ -330,7 +330,8 @@ impl Mirror {
                 self.load(tick, place, row, states, rows);
             } else {
                 let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
-                let set = road_user.write_unmoved(tick, &self.settings, &mut states[row], sub_steps);
+                let built = self.fleet.at(road_user.model());
+                let set = road_user.write_unmoved(tick, &self.settings, built, &mut states[row], sub_steps);
                 self.resynchronisations += u64::from(set);
             }
         }

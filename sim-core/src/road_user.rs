@@ -10,7 +10,7 @@ use crate::{
     attitude::{Lean, body_from_level},
     curve::Curve,
     dimensions::Dimensions,
-    fleet::{Fleet, FleetError},
+    fleet::{Built, Fleet, FleetError},
     hero::{self, Hero},
     lanes::{Drive, Lanes},
     person::Person,
@@ -109,7 +109,7 @@ impl RoadUser {
         let mover = if meta.kind == Kind::Person as u32 {
             Mover::Person(Person::default())
         } else if meta.kind == Kind::Hero as u32 {
-            Mover::Hero(Hero::new(hero::model(fleet.at(model))))
+            Mover::Hero(Hero::default())
         } else {
             Mover::Vehicle {
                 state: State::new(0.0, 0.0, 0.0, 0.0),
@@ -252,6 +252,7 @@ impl RoadUser {
         &mut self,
         tick: u32,
         settings: &Settings,
+        built: &Built,
         out: &mut VehicleState,
         rows: &mut [SubStep],
     ) -> bool {
@@ -276,7 +277,8 @@ impl RoadUser {
                 if set {
                     hero.set(&self.now, front_m, out, rows);
                 } else {
-                    hero.advance([&self.before, &self.now], front_m, settings.sub_step_s(), out, rows);
+                    let road = [&self.before, &self.now];
+                    hero.advance(&hero::model(built), road, front_m, settings.sub_step_s(), out, rows);
                 }
             }
             Mover::Vehicle { state, path } => {
