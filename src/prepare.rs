@@ -54,6 +54,7 @@ enum Named {
 pub fn prepare(args: &RunArgs, mode: Mode) -> Result<Prepared, Exit> {
     let (settings, named, label) = resolve(args)?;
     let config = settings.validate()?;
+    check_task(&config, mode, &named)?;
     let install = Install::find()?;
     let origin = config.map.origin_latitude_deg.zip(config.map.origin_longitude_deg);
     let scenario_map = match &named {
@@ -114,6 +115,31 @@ fn suggest_scenario(settings: &mut Settings, scenario: &Scenario, source: &str) 
     );
     settings.suggest("run.seed", Value::from(scenario.seed.unwrap_or(SUMO_SEED)), source);
     settings.suggest("traffic.max_road_users", Value::from(SCENARIO_ROAD_USERS), source);
+}
+
+/// Actions need somebody who gives them, and heroes that the source of traffic has.
+fn check_task(config: &Config, mode: Mode, named: &Named) -> Result<(), Exit> {
+    if !config.drives() {
+        return Ok(());
+    }
+    let traffic = &config.traffic;
+    match (mode, named) {
+        (Mode::Simulate, _) => Err(Exit::config(
+            "the driving task needs a trainer that drives, and `caraware simulate` has none",
+            "use `caraware train`; trainer.module names the driver",
+        )),
+        (Mode::Train, Named::Map) if traffic.heroes == 0 || !traffic.hero_ids.is_empty() => Err(Exit::config(
+            "on a map with population control heroes come by `traffic.heroes`, not by `traffic.hero_ids`",
+            "set traffic.heroes = 1 and traffic.hero_ids = []",
+        )),
+        (Mode::Train, Named::Scenario(..)) if traffic.heroes > 0 || !traffic.hero_route.is_empty() => {
+            Err(Exit::config(
+                "heroes of a .sumocfg are vehicles of its own: `traffic.heroes` and `traffic.hero_route` are for maps with population control",
+                "set traffic.hero_ids to the ids of the vehicles that are to be driven, and traffic.heroes = 0",
+            ))
+        }
+        (Mode::Train, _) => Ok(()),
+    }
 }
 
 fn check_port(config: &Config) -> Result<(), Exit> {

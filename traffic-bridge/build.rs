@@ -10,7 +10,16 @@ use std::{
 const SUMO_HOME_VARIABLE: &str = "CARAWARE_SUMO_HOME";
 
 fn main() {
-    for file in ["sumo.rs", "shim.h", "shim.cc", "control.cc", "error_tee.h", "text.h"] {
+    for file in [
+        "sumo.rs",
+        "shim.h",
+        "shim.cc",
+        "control.cc",
+        "heroes.cc",
+        "lanes.h",
+        "error_tee.h",
+        "text.h",
+    ] {
         println!("cargo:rerun-if-changed=src/{file}");
     }
     println!("cargo:rerun-if-env-changed={SUMO_HOME_VARIABLE}");
@@ -22,7 +31,7 @@ fn main() {
         exit(1);
     };
     cxx_build::bridge("src/sumo.rs")
-        .files(["src/shim.cc", "src/control.cc"])
+        .files(["src/shim.cc", "src/control.cc", "src/heroes.cc"])
         .std("c++17")
         .include(sumo.join("include"))
         .flag_if_supported("-Wno-unused-parameter")

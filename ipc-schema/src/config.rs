@@ -39,6 +39,23 @@ pub struct Config {
     pub fanout: Fanout,
 }
 
+impl Config {
+    /// Heroes alive at a time, at most; 0 if the task is not driving.
+    #[must_use]
+    pub fn heroes(&self) -> usize {
+        match self.task.kind {
+            TaskKind::Localisation => 0,
+            TaskKind::Driving => self.traffic.heroes as usize + self.traffic.hero_ids.len(),
+        }
+    }
+
+    /// True if actions move vehicles, so that every process waits for the one before it.
+    #[must_use]
+    pub fn drives(&self) -> bool {
+        self.task.kind == TaskKind::Driving
+    }
+}
+
 /// Time, seed and flow control.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -69,6 +86,10 @@ pub struct Traffic {
     pub pedestrians: u32,
     /// Heroes kept alive (driving task).
     pub heroes: u32,
+    /// Edges of every hero's route; empty = at random.
+    pub hero_route: Vec<String>,
+    /// SUMO ids of the heroes of a scenario (`.sumocfg`).
+    pub hero_ids: Vec<String>,
     /// Share of a scenario's own vehicles that carry sensors (`.sumocfg`).
     pub cav_share: f64,
     /// Most road users alive at once; shared memory is laid out for them.
@@ -284,6 +305,42 @@ pub enum Field {
     Speed,
     /// Steering-wheel angle; range ± `steering_range_rad`.
     Steering,
+    /// Hero: its route 5 m ahead, forward of the rear axle; range ± 5 m.
+    #[serde(rename = "route_x_5")]
+    RouteX5,
+    /// Hero: its route 5 m ahead, to the left of the rear axle; range ± 5 m.
+    #[serde(rename = "route_y_5")]
+    RouteY5,
+    /// Hero: its route 10 m ahead, forward of the rear axle; range ± 10 m.
+    #[serde(rename = "route_x_10")]
+    RouteX10,
+    /// Hero: its route 10 m ahead, to the left of the rear axle; range ± 10 m.
+    #[serde(rename = "route_y_10")]
+    RouteY10,
+    /// Hero: its route 20 m ahead, forward of the rear axle; range ± 20 m.
+    #[serde(rename = "route_x_20")]
+    RouteX20,
+    /// Hero: its route 20 m ahead, to the left of the rear axle; range ± 20 m.
+    #[serde(rename = "route_y_20")]
+    RouteY20,
+    /// Hero: its route 40 m ahead, forward of the rear axle; range ± 40 m.
+    #[serde(rename = "route_x_40")]
+    RouteX40,
+    /// Hero: its route 40 m ahead, to the left of the rear axle; range ± 40 m.
+    #[serde(rename = "route_y_40")]
+    RouteY40,
+    /// Hero: speed limit; range 0 … `speed_range_mps`.
+    SpeedLimit,
+    /// Hero: centre line of its route as seen from the rear axle, positive to the left; range ± 5 m.
+    RouteOffset,
+    /// Hero: way to the end of its route; range 0 … 1000 m.
+    RouteLeft,
+    /// Hero: gap to the next road user on its route; range 0 … 100 m, 100 = none.
+    LeaderGap,
+    /// Hero: speed of that road user along the route; range 0 … `speed_range_mps`.
+    LeaderSpeed,
+    /// Hero: way to the next stop line whose signal is not green; range 0 … 100 m, 100 = none.
+    SignalGap,
 }
 
 /// Fields and normalisation of the observation.

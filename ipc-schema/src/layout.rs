@@ -9,8 +9,8 @@ use crate::{
     ego::EgoPose,
     event::Collision,
     header::MessageHeader,
-    traffic::{SignalMeta, TrafficState, VehicleMeta},
-    world::{SubStep, VehicleState},
+    traffic::{RoutePoint, SignalMeta, TrafficState, VehicleMeta},
+    world::{HeroView, SubStep, VehicleState},
 };
 
 /// Layout of one payload type.
@@ -127,6 +127,27 @@ pub fn table() -> Vec<TypeLayout> {
             accel_body_mps2,
             angular_rate_body_radps,
             road_wheel_angle_rad,
+            reserved
+        }),
+        layout!(RoutePoint {
+            x_m,
+            y_m,
+            speed_limit_mps,
+            vehicle,
+            index,
+            edge,
+            signal,
+            link
+        }),
+        layout!(HeroView {
+            route_m,
+            speed_limit_mps,
+            route_offset_m,
+            route_left_m,
+            leader_gap_m,
+            leader_speed_mps,
+            signal_gap_m,
+            vehicle,
             reserved
         }),
         layout!(EgoPose {

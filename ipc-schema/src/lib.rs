@@ -3,8 +3,8 @@
 //! | service       | payload (64-byte aligned bytes, little endian)                    | producer       | required consumer |
 //! |---------------|-------------------------------------------------------------------|----------------|-------------------|
 //! | `traffic`     | `[TrafficState]`                                                  | traffic-bridge | sim-core          |
-//! | `traffic-meta`| [`traffic::TrafficMetaLayout`]: `[VehicleMeta]`, `[SignalMeta]`   | traffic-bridge | sim-core          |
-//! | `world`       | [`world::WorldLayout`]: `[VehicleState]`, `[SubStep]`             | sim-core       | sensor-daemon     |
+//! | `traffic-meta`| [`traffic::TrafficMetaLayout`]: `[VehicleMeta]`, `[SignalMeta]`; or `[RoutePoint]` | traffic-bridge | sim-core          |
+//! | `world`       | [`world::WorldLayout`]: `[VehicleState]`, `[SubStep]`, `[HeroView]` | sim-core       | sensor-daemon     |
 //! | `observation` | [`observation::ObservationLayout`]: obs, truth, GNSS, slots       | sensor-daemon  | trainer           |
 //! | `prediction`  | `[[f32; 2]]`, one row for each slot of the observation            | trainer        | none; sim-core when it drives |
 //! | `ego-pose`    | `[EgoPose]`                                                       | sim-core       | traffic-bridge    |

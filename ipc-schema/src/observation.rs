@@ -12,9 +12,9 @@ pub const GNSS_COLUMNS: usize = 2;
 
 /// The slot holds a vehicle whose sensors have all delivered at least once.
 pub const VALID: u32 = 1;
-/// The trajectory that held this slot at the previous tick ended there: arrival or removal. Never bootstrap across it.
+/// The trajectory that held this slot at the previous tick ended there: arrival, removal, collision, off-road. Never bootstrap across it.
 pub const TERMINATED: u32 = 1 << 1;
-/// The trajectory that held this slot at the previous tick was cut there: end of episode. Bootstrap, then cut.
+/// The trajectory that held this slot at the previous tick was cut there: end of episode, or a hero's time limit. Bootstrap, then cut.
 pub const TRUNCATED: u32 = 1 << 2;
 /// At least one field was outside its range and has been clipped.
 pub const CLIPPED: u32 = 1 << 3;

@@ -22,7 +22,7 @@ use crate::{
     observation::ObservationLayout,
     process::Process,
     run::{RunFile, SharedMemory},
-    traffic::{SIGNALS_PER_MESSAGE, TrafficMetaLayout, TrafficState},
+    traffic::{ROUTE_POINTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout, TrafficState},
     world::WorldLayout,
 };
 
@@ -50,6 +50,9 @@ const MAX_NODES: usize = 24;
 const MAX_READERS: usize = 32;
 /// Messages a process may hold besides those in its queue.
 const SPARE_MESSAGES: usize = 2;
+
+/// Messages that the route of one hero may take: 4096 points.
+const ROUTE_MESSAGES_PER_HERO: usize = 2;
 
 /// A data service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -115,12 +118,13 @@ impl Channel {
             Self::World => Some(Process::SensorDaemon),
             Self::Observation => Some(Process::Trainer),
             Self::EgoPose => Some(Process::TrafficBridge),
-            // In the driving task sim-core waits for each of them, and the trainer is at most one ahead.
+            // In the driving task sim-core waits for each of them, so the trainer is at most one ahead and no queue overflows.
             Self::Prediction | Self::Event => None,
         }
     }
 
-    /// Subscribers at a time: the required one, its successor, the fan-out, one spare.
+    /// Subscribers at a time: the required one, its successor, the fan-out, and one spare, which `sim-core` takes of `observation`
+    /// in the driving task.
     const fn max_subscribers(self) -> usize {
         4
     }
@@ -133,8 +137,12 @@ impl Channel {
         match self {
             Self::Traffic => road_users * size_of::<TrafficState>(),
             // Everybody may leave and everybody may come within one step.
-            Self::TrafficMeta => TrafficMetaLayout::new(2 * road_users, SIGNALS_PER_MESSAGE).len,
-            Self::World => WorldLayout::new(road_users, run.config.run.sub_steps as usize).len,
+            Self::TrafficMeta => TrafficMetaLayout::new(2 * road_users, SIGNALS_PER_MESSAGE)
+                .len
+                .max(ROUTE_POINTS_PER_MESSAGE * size_of::<RoutePoint>()),
+            Self::World => {
+                WorldLayout::with_heroes(road_users, run.config.run.sub_steps as usize, run.config.heroes()).len
+            }
             Self::Observation => ObservationLayout::new(road_users, fields).len,
             Self::Prediction => road_users * size_of::<[f32; 2]>(),
             Self::EgoPose => road_users * size_of::<EgoPose>(),
@@ -145,7 +153,13 @@ impl Channel {
     /// Messages a subscriber's queue holds.
     #[must_use]
     pub fn queue_length(self, run: &RunFile) -> usize {
-        usize::try_from(run.window_ticks()).unwrap_or(usize::MAX) + SPARE_MESSAGES
+        let window = usize::try_from(run.window_ticks()).unwrap_or(usize::MAX);
+        // All heroes may come within one step, each with its route.
+        let routes = match self {
+            Self::TrafficMeta => run.config.heroes() * ROUTE_MESSAGES_PER_HERO,
+            _ => 0,
+        };
+        window + routes + SPARE_MESSAGES
     }
 
     /// Most shared memory this service can touch, bytes: every queue full, every message of the longest size.

@@ -220,6 +220,35 @@ impl TrafficMetaLayout {
     }
 }
 
+/// Header flag of a `traffic-meta` message that carries `[RoutePoint; count]` and nothing else.
+pub const ROUTES: u32 = 1 << 8;
+/// Most points in one such message; longer routes take more messages.
+pub const ROUTE_POINTS_PER_MESSAGE: usize = 2048;
+/// [`RoutePoint::signal`] where there is none.
+pub const NO_SIGNAL: u32 = u32::MAX;
+
+/// One point of the line that a hero is to follow: centre of its lanes and of its ways across junctions.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct RoutePoint {
+    /// World, metres.
+    pub x_m: f64,
+    /// World, metres.
+    pub y_m: f64,
+    /// Speed limit from here on, m/s.
+    pub speed_limit_mps: f32,
+    /// Dense index of the hero.
+    pub vehicle: u32,
+    /// Number of the point in the hero's route, from 0.
+    pub index: u32,
+    /// Number of the edge in the hero's route, from 0; a way across a junction belongs to the edge before it.
+    pub edge: u32,
+    /// [`SignalMeta::signal`] of the traffic light whose stop line this is, or [`NO_SIGNAL`].
+    pub signal: u32,
+    /// Its link for the hero's way.
+    pub link: u32,
+}
+
 /// First eight bytes of the BLAKE3 hash of a SUMO id, little endian.
 #[must_use]
 pub fn id_hash(id: &str) -> u64 {

@@ -104,25 +104,72 @@ pub struct SubStep {
     pub reserved: u32,
 }
 
-/// Where the two arrays of a `world` message lie: `[VehicleState; count]`, then `[SubStep; count * sub_steps]` vehicle by vehicle.
+/// Bits that end a hero's episode; [`TIME_LIMIT`] alone cuts it, the others terminate it.
+pub const HERO_ENDS: u32 = COLLIDED | OFF_ROAD | ARRIVED | TIME_LIMIT;
+
+/// Distances along its route at which a hero sees where it leads, metres.
+pub const ROUTE_AHEAD_M: [f64; 4] = [5.0, 10.0, 20.0, 40.0];
+/// How far ahead a hero sees road users and signals on its route, metres.
+pub const SIGHT_M: f64 = 100.0;
+
+/// What a hero sees of its route and of the traffic on it, at the end of a tick.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct HeroView {
+    /// Points of its route [`ROUTE_AHEAD_M`] ahead, forward and left of the rear axle, body frame, metres.
+    pub route_m: [[f32; 2]; 4],
+    /// Speed limit where it is, m/s.
+    pub speed_limit_mps: f32,
+    /// Nearest point of its route as seen from the rear axle, positive to the left, metres.
+    pub route_offset_m: f32,
+    /// From the front bumper to the end of the route, along it, metres.
+    pub route_left_m: f32,
+    /// From bumper to bumper of the next road user on its route, metres, at most [`SIGHT_M`].
+    pub leader_gap_m: f32,
+    /// Speed of that road user along the route, m/s; 0 if there is none.
+    pub leader_speed_mps: f32,
+    /// From the front bumper to the next stop line whose signal is not green, metres, at most [`SIGHT_M`].
+    pub signal_gap_m: f32,
+    /// Dense index of the hero within the episode.
+    pub vehicle: u32,
+    /// Zero.
+    pub reserved: u32,
+}
+
+/// Where the arrays of a `world` message lie: `[VehicleState; count]`, `[SubStep; count * sub_steps]` vehicle by vehicle, and
+/// `[HeroView; heroes]` by ascending index, `heroes` being the header's `sequence`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WorldLayout {
     /// `VehicleState [count]`.
     pub states: Section,
     /// `SubStep [count, sub_steps]`.
     pub sub_steps: Section,
+    /// `HeroView [heroes]`.
+    pub heroes: Section,
     /// Length of the payload in bytes.
     pub len: usize,
 }
 
 impl WorldLayout {
-    /// Layout for `count` road users with `sub_steps` samples each.
+    /// Layout for `count` road users with `sub_steps` samples each, none of them a hero.
     #[must_use]
     pub fn new(count: usize, sub_steps: usize) -> Self {
-        let ([states, sub_steps], len) = sections([
+        Self::with_heroes(count, sub_steps, 0)
+    }
+
+    /// Layout for `count` road users with `sub_steps` samples each, `heroes` of them heroes.
+    #[must_use]
+    pub fn with_heroes(count: usize, sub_steps: usize, heroes: usize) -> Self {
+        let ([states, sub_steps, heroes], len) = sections([
             count * size_of::<VehicleState>(),
             count * sub_steps * size_of::<SubStep>(),
+            heroes * size_of::<HeroView>(),
         ]);
-        Self { states, sub_steps, len }
+        Self {
+            states,
+            sub_steps,
+            heroes,
+            len,
+        }
     }
 }

@@ -63,7 +63,7 @@ fn round(config: &Config, map: &MapInfo, states: &[VehicleState]) -> f64 {
         header.tick = tick;
         sensing.assign(&header, states);
         sensing
-            .observe(&header, states, bytemuck::cast_slice_mut(&mut payload))
+            .observe(&header, states, &[], bytemuck::cast_slice_mut(&mut payload))
             .unwrap_or_else(|error| panic!("{error}"));
         header.flags = 0;
     }

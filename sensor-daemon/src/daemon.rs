@@ -13,7 +13,7 @@ use ipc_schema::{
     run::Mode,
     services::Channel,
     session::{Session, Wait},
-    world::{VehicleState, WorldLayout},
+    world::{HeroView, VehicleState, WorldLayout},
 };
 use serde::Serialize;
 
@@ -103,18 +103,26 @@ impl Daemon {
             }
             .into());
         }
-        let states = states(message).map_err(broken)?;
+        let layout = layout(world);
+        let states: &[VehicleState] = block::view(message.payload(), layout.states).map_err(broken)?;
+        let views: &[HeroView] = block::view(message.payload(), layout.heroes).map_err(broken)?;
         let n = self.sensing.assign(world, states);
         if let Some((board, _)) = &self.consumer
             && self.session.wait_for_credit(board, world.tick)? == Wait::Stopped
         {
             return Ok(Wait::Stopped);
         }
-        self.publish(world, states, n)?;
+        self.publish(world, states, views, n)?;
         Ok(Wait::Ready)
     }
 
-    fn publish(&mut self, world: &MessageHeader, states: &[VehicleState], n: usize) -> Result<(), Failure> {
+    fn publish(
+        &mut self,
+        world: &MessageHeader,
+        states: &[VehicleState],
+        views: &[HeroView],
+        n: usize,
+    ) -> Result<(), Failure> {
         let d = self.sensing.width();
         let ours = self.session.header();
         let header = MessageHeader {
@@ -127,7 +135,7 @@ impl Daemon {
         };
         let mut draft = self.observations.loan(header, ObservationLayout::new(n, d).len)?;
         self.sensing
-            .observe(&header, states, draft.payload_mut())
+            .observe(&header, states, views, draft.payload_mut())
             .map_err(broken)?;
         self.digest.add(&header, draft.payload());
         draft.send()?;
@@ -184,10 +192,10 @@ impl Daemon {
     }
 }
 
-fn states(message: &Message) -> Result<&[VehicleState], BlockError> {
-    let header = message.header();
-    let layout = WorldLayout::new(header.count as usize, header.columns as usize);
-    block::view(message.payload(), layout.states)
+fn layout(header: &MessageHeader) -> WorldLayout {
+    let count = header.count as usize;
+    let heroes = usize::try_from(header.sequence).unwrap_or(usize::MAX).min(count);
+    WorldLayout::with_heroes(count, header.columns as usize, heroes)
 }
 
 fn broken(error: BlockError) -> Failure {

@@ -1,6 +1,9 @@
 //! From sensor values to a normalised row.
 
-use ipc_schema::config::{Field, Observation as Params, Scale};
+use ipc_schema::{
+    config::{Field, Observation as Params, Scale},
+    world::{HeroView, ROUTE_AHEAD_M, SIGHT_M},
+};
 
 use crate::{gnss::Fix, imu, speed_steering};
 
@@ -13,7 +16,14 @@ pub struct Readings {
     pub imu: imu::Sample,
     /// Speed and steering.
     pub speed_steering: speed_steering::Sample,
+    /// What a hero sees of its route.
+    pub route: HeroView,
 }
+
+/// Range of the distance to the route, metres.
+const ROUTE_OFFSET_M: f64 = 5.0;
+/// Range of the way left, metres.
+const ROUTE_LEFT_M: f64 = 1000.0;
 
 impl Readings {
     fn value(&self, field: Field) -> f64 {
@@ -29,6 +39,20 @@ impl Readings {
             Field::Compass => self.imu.compass_rad,
             Field::Speed => self.speed_steering.speed_mps,
             Field::Steering => self.speed_steering.steering_rad,
+            Field::RouteX5 => f64::from(self.route.route_m[0][0]),
+            Field::RouteY5 => f64::from(self.route.route_m[0][1]),
+            Field::RouteX10 => f64::from(self.route.route_m[1][0]),
+            Field::RouteY10 => f64::from(self.route.route_m[1][1]),
+            Field::RouteX20 => f64::from(self.route.route_m[2][0]),
+            Field::RouteY20 => f64::from(self.route.route_m[2][1]),
+            Field::RouteX40 => f64::from(self.route.route_m[3][0]),
+            Field::RouteY40 => f64::from(self.route.route_m[3][1]),
+            Field::SpeedLimit => f64::from(self.route.speed_limit_mps),
+            Field::RouteOffset => f64::from(self.route.route_offset_m),
+            Field::RouteLeft => f64::from(self.route.route_left_m),
+            Field::LeaderGap => f64::from(self.route.leader_gap_m),
+            Field::LeaderSpeed => f64::from(self.route.leader_speed_mps),
+            Field::SignalGap => f64::from(self.route.signal_gap_m),
         }
     }
 }
@@ -51,7 +75,14 @@ impl Normaliser {
             Field::AccelX | Field::AccelY | Field::AccelZ => (-params.accel_range_mps2, params.accel_range_mps2),
             Field::GyroX | Field::GyroY | Field::GyroZ => (-params.gyro_range_radps, params.gyro_range_radps),
             Field::Compass => (0.0, std::f64::consts::TAU),
-            Field::Speed => (0.0, params.speed_range_mps),
+            Field::RouteX5 | Field::RouteY5 => (-ROUTE_AHEAD_M[0], ROUTE_AHEAD_M[0]),
+            Field::RouteX10 | Field::RouteY10 => (-ROUTE_AHEAD_M[1], ROUTE_AHEAD_M[1]),
+            Field::RouteX20 | Field::RouteY20 => (-ROUTE_AHEAD_M[2], ROUTE_AHEAD_M[2]),
+            Field::RouteX40 | Field::RouteY40 => (-ROUTE_AHEAD_M[3], ROUTE_AHEAD_M[3]),
+            Field::RouteOffset => (-ROUTE_OFFSET_M, ROUTE_OFFSET_M),
+            Field::RouteLeft => (0.0, ROUTE_LEFT_M),
+            Field::LeaderGap | Field::SignalGap => (0.0, SIGHT_M),
+            Field::Speed | Field::SpeedLimit | Field::LeaderSpeed => (0.0, params.speed_range_mps),
             Field::Steering => (-params.steering_range_rad, params.steering_range_rad),
         };
         let fields = params
@@ -122,6 +153,7 @@ mod tests {
                 speed_mps: 15.0,
                 steering_rad: 5.0,
             },
+            route: HeroView::default(),
         };
         let fields = vec![
             Field::Speed,
@@ -137,6 +169,38 @@ mod tests {
         assert_eq!(row, [0.5, 0.25, 1.0, 0.0, 0.75, 0.5, 0.75]);
         assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M).fill(&readings, &mut row));
         assert_eq!(row, [0.0, -0.5, 1.0, -1.0, 0.5, 0.0, 0.5]);
+    }
+
+    #[test]
+    fn a_heros_route_is_normalised_by_its_distances() {
+        let readings = Readings {
+            route: HeroView {
+                route_m: [[5.0, 0.0], [8.0, 5.0], [20.0, -20.0], [0.0, 40.0]],
+                speed_limit_mps: 15.0,
+                route_offset_m: -2.5,
+                route_left_m: 250.0,
+                leader_gap_m: 100.0,
+                leader_speed_mps: 0.0,
+                signal_gap_m: 25.0,
+                ..HeroView::default()
+            },
+            ..Readings::default()
+        };
+        let fields = vec![
+            Field::RouteX5,
+            Field::RouteY10,
+            Field::RouteY20,
+            Field::RouteX40,
+            Field::SpeedLimit,
+            Field::RouteOffset,
+            Field::RouteLeft,
+            Field::LeaderGap,
+            Field::LeaderSpeed,
+            Field::SignalGap,
+        ];
+        let mut row = [9.0; 10];
+        assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M).fill(&readings, &mut row));
+        assert_eq!(row, [1.0, 0.5, -1.0, 0.0, 0.0, -0.5, -0.5, 1.0, -1.0, -0.5]);
     }
 
     proptest! {

@@ -7,7 +7,7 @@ use ipc_schema::{
     observation::{CLIPPED, GNSS_COLUMNS, ObservationLayout, TRUTH_COLUMNS, VALID},
     run::MapInfo,
     traffic::Kind,
-    world::{COLLIDED, VehicleState},
+    world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, TIME_LIMIT, VehicleState},
 };
 use sim_core::{
     displacement::DisplacementMap,
@@ -62,6 +62,8 @@ pub struct Sensing {
     /// Length of a tick, nanoseconds.
     tick_ns: u64,
     slots: Slots,
+    /// Who gets a slot: heroes if they drive, else connected vehicles.
+    agents: Kind,
     /// Newest readings by slot.
     readings: Vec<Readings>,
     /// Row in the world, by slot, for the tick at work.
@@ -81,6 +83,7 @@ impl Sensing {
             periods: Periods::new(config),
             tick_ns: ((config.run.tick_s * 1e9).round() as u64).max(1),
             slots: Slots::default(),
+            agents: if config.drives() { Kind::Hero } else { Kind::Cav },
             readings: Vec::new(),
             row_of_slot: Vec::new(),
             raw_error: RawError::default(),
@@ -110,6 +113,9 @@ impl Sensing {
         for (row, state) in (0_u32..).zip(states) {
             if self.is_sensed(state) {
                 let slot = self.slots.occupy(state.vehicle);
+                if is_cut(state) {
+                    self.slots.cut(slot);
+                }
                 if slot >= self.row_of_slot.len() {
                     self.row_of_slot.resize(slot + 1, None);
                     self.readings.resize(slot + 1, Readings::default());
@@ -122,8 +128,9 @@ impl Sensing {
     }
 
     fn is_sensed(&self, state: &VehicleState) -> bool {
+        // What a hero collides with ends its episode after the observation of that tick; SUMO lets it go.
         let collides = self.config.collision.ends_trajectory && state.flags & COLLIDED != 0;
-        state.kind == Kind::Cav as u32 && !collides
+        state.kind == self.agents as u32 && (self.agents == Kind::Hero || !collides)
     }
 
     /// Samples what is due and writes the observation of the tick that [`Sensing::assign`] was called for.
@@ -134,6 +141,7 @@ impl Sensing {
         &mut self,
         header: &MessageHeader,
         states: &[VehicleState],
+        views: &[HeroView],
         payload: &mut [u8],
     ) -> Result<(), BlockError> {
         let (n, d) = (self.slots.rows().len(), self.width());
@@ -156,6 +164,10 @@ impl Sensing {
             let Some(row) = self.row_of_slot[slot] else { continue };
             let state = &states[row as usize];
             self.sample(header, state, slot, lent.step);
+            // Both are in ascending order of the vehicle.
+            if let Ok(place) = views.binary_search_by_key(&state.vehicle, |view| view.vehicle) {
+                self.readings[slot].route = views[place];
+            }
             let readings = &self.readings[slot];
             let clipped = self
                 .normaliser
@@ -205,4 +217,9 @@ impl Sensing {
         [self.periods.gnss, self.periods.imu, self.periods.speed_steering]
             .map(|period| (f64::from(step % period) * self.config.run.tick_s) as f32)
     }
+}
+
+/// True if the trajectory of a hero is cut at this tick, and does not end by itself.
+fn is_cut(state: &VehicleState) -> bool {
+    state.flags & TIME_LIMIT != 0 && state.flags & (COLLIDED | OFF_ROAD | ARRIVED) == 0
 }

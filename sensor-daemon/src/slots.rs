@@ -14,6 +14,8 @@ pub struct Slot {
     /// [`TERMINATED`], [`TRUNCATED`]: the trajectory that held this slot at the previous tick ended there.
     pub ended: u32,
     seen: bool,
+    /// Its vehicle's trajectory was cut at the last tick and did not end by itself.
+    cut: bool,
 }
 
 const EMPTY: Slot = Slot {
@@ -21,6 +23,7 @@ const EMPTY: Slot = Slot {
     step: 0,
     ended: 0,
     seen: false,
+    cut: false,
 };
 
 /// All slots of a run. The number of slots never shrinks.
@@ -71,6 +74,11 @@ impl Slots {
         number
     }
 
+    /// The trajectory in slot `number` is cut at this tick: once its vehicle is gone, the slot says so.
+    pub fn cut(&mut self, number: usize) {
+        self.slots[number].cut = true;
+    }
+
     fn take_free(&mut self, vehicle: u32) -> u32 {
         let number = self.free.pop_first().unwrap_or_else(|| {
             self.slots.push(EMPTY);
@@ -80,6 +88,7 @@ impl Slots {
         *slot = Slot {
             vehicle,
             step: 0,
+            cut: false,
             ..*slot
         };
         number
@@ -91,7 +100,7 @@ impl Slots {
             if slot.vehicle != EMPTY_SLOT && !slot.seen {
                 self.of_vehicle[slot.vehicle as usize] = EMPTY_SLOT;
                 *slot = Slot {
-                    ended: slot.ended | TERMINATED,
+                    ended: slot.ended | if slot.cut { TRUNCATED } else { TERMINATED },
                     ..EMPTY
                 };
                 self.leaving.push(number);
@@ -137,6 +146,25 @@ mod tests {
             (slots.rows()[1].ended, slots.rows()[1].step, slots.rows()[0].step),
             (0, 0, 2)
         );
+    }
+
+    #[test]
+    fn a_trajectory_that_is_cut_is_truncated_and_the_next_in_its_slot_is_not() {
+        let mut slots = Slots::default();
+        tick(&mut slots, true, &[0, 1]);
+        slots.begin(false);
+        [0, 1].into_iter().for_each(|vehicle| {
+            let number = slots.occupy(vehicle);
+            if vehicle == 1 {
+                slots.cut(number);
+            }
+        });
+        slots.end();
+        tick(&mut slots, false, &[]);
+        assert_eq!((slots.rows()[0].ended, slots.rows()[1].ended), (TERMINATED, TRUNCATED));
+        tick(&mut slots, false, &[2, 3]);
+        tick(&mut slots, false, &[]);
+        assert_eq!((slots.rows()[0].ended, slots.rows()[1].ended), (TERMINATED, TERMINATED));
     }
 
     #[test]

@@ -50,7 +50,7 @@ fn tick(sensing: &mut Sensing, number: u64, flags: u32, states: &[VehicleState])
     let n = sensing.assign(&header, states);
     let mut payload = vec![0_u64; ObservationLayout::new(n, sensing.width()).len / 8];
     sensing
-        .observe(&header, states, bytemuck::cast_slice_mut(&mut payload))
+        .observe(&header, states, &[], bytemuck::cast_slice_mut(&mut payload))
         .unwrap();
     (n, payload)
 }

@@ -6,15 +6,18 @@
 // Values leave the core in single precision (positions excepted): the wire's precision, see `ipc_schema::world`.
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
+pub mod actions;
 pub mod attitude;
 pub mod collision;
 pub mod curve;
 pub mod dimensions;
 pub mod displacement;
+pub mod driving;
 pub mod dynamic;
 pub mod fleet;
 pub mod geodesy;
 pub mod governor;
+pub mod hero;
 pub mod lanes;
 pub mod mirror;
 pub mod parameters;
@@ -23,6 +26,7 @@ pub mod process;
 pub mod reference;
 pub mod rigid_body;
 pub mod road_user;
+pub mod route;
 pub mod scene;
 pub mod spherical;
 pub mod statistics;

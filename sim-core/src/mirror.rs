@@ -20,7 +20,7 @@ use crate::{
     lanes::{DYNAMIC, Drive, KINEMATIC, LANES, Lanes},
     road_user::RoadUser,
     statistics::Tracking,
-    vehicle::{KinematicParams, Model},
+    vehicle::{Input, KinematicParams, Model},
 };
 
 /// What SUMO sent cannot be mirrored.
@@ -278,6 +278,13 @@ impl Mirror {
         }
     }
 
+    /// What the hero `vehicle` is asked for from now on.
+    pub fn ask(&mut self, vehicle: u32, input: Input) {
+        if let Some(place) = self.place(vehicle) {
+            self.slab[place as usize].ask(input);
+        }
+    }
+
     /// Number of road users in tick `tick` (0-based within the SUMO step).
     #[must_use]
     pub fn count(&self, tick: u32) -> usize {
@@ -323,7 +330,8 @@ impl Mirror {
                 self.load(tick, place, row, states, rows);
             } else {
                 let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
-                let set = road_user.write_unmoved(tick, &self.settings, &mut states[row], sub_steps);
+                let built = self.fleet.at(road_user.model());
+                let set = road_user.write_unmoved(tick, &self.settings, built, &mut states[row], sub_steps);
                 self.resynchronisations += u64::from(set);
             }
         }

@@ -11,11 +11,14 @@ use ipc_schema::{
     process::Process,
     services::Channel,
     session::{Session, Wait},
-    traffic::{Kind, TrafficMetaLayout, TrafficState, VehicleMeta},
+    traffic::{Kind, ROUTES, TrafficMetaLayout, TrafficState},
+    world::WorldLayout,
 };
 
 use crate::{
+    actions::Actions,
     collision::{CollisionCounts, Contacts},
+    driving::Account,
     mirror::{Mirror, MirrorError, Settings},
     scene::Scene,
     statistics::Summary,
@@ -31,6 +34,9 @@ struct Part {
     resynchronisations: u64,
     vehicle_steps: u64,
     drops: u64,
+    /// Heroes, in the driving task.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    heroes: Option<Account>,
     /// Buildings and props in the scene.
     buildings: usize,
     props: usize,
@@ -67,6 +73,8 @@ struct Core {
     /// `traffic-meta` messages applied.
     meta_messages: u64,
     mirror: Mirror,
+    /// The heroes and their actions, in the driving task.
+    actions: Option<Actions>,
     scene: Arc<Scene>,
     contacts: Option<Contacts>,
     world: Publisher,
@@ -84,6 +92,10 @@ impl Core {
         let consumer_wake = session.waker(Process::SensorDaemon)?;
         let scene = Arc::new(Scene::of_run(&session.run)?);
         let contacts = Contacts::open(&session, Arc::clone(&scene))?;
+        let actions = match session.run.config.drives() {
+            true => Some(Actions::open(&mut session, Arc::clone(&scene))?),
+            false => None,
+        };
         session.attach();
         let mirror = Mirror::new(Settings::of_run(&session.run))
             .map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
@@ -92,6 +104,7 @@ impl Core {
             metas,
             meta_messages: 0,
             mirror,
+            actions,
             scene,
             contacts,
             world,
@@ -127,6 +140,11 @@ impl Core {
             {
                 return Ok(Wait::Stopped);
             }
+            if let Some(actions) = &mut self.actions
+                && actions.take(&self.session, &header, &mut self.mirror)? == Wait::Stopped
+            {
+                return Ok(Wait::Stopped);
+            }
             self.publish(&header, tick, states)?;
         }
         Ok(Wait::Ready)
@@ -148,43 +166,72 @@ impl Core {
                 }
                 .into());
             }
-            let header = message.header();
-            let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
-            let metas: &[VehicleMeta] = block::view(message.payload(), layout.vehicles).map_err(unreadable)?;
-            self.mirror.apply_meta(header, metas).map_err(unmirrored)?;
-            if let Some(contacts) = &mut self.contacts {
-                contacts.learn(header, metas);
+            self.apply_meta(&message)?;
+        }
+        Ok(())
+    }
+
+    fn apply_meta(&mut self, message: &Message) -> Result<(), Failure> {
+        let header = message.header();
+        if header.has(ROUTES) {
+            if let Some(actions) = &mut self.actions {
+                actions.add_route(header, rows(message).map_err(unreadable)?);
             }
-            for class in self.mirror.take_unknown_classes() {
-                tracing::warn!(
-                    class,
-                    "no parameter set lists this vehicle class: the default set is taken"
-                );
-            }
+            return Ok(());
+        }
+        let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
+        let vehicles = block::view(message.payload(), layout.vehicles).map_err(unreadable)?;
+        self.mirror.apply_meta(header, vehicles).map_err(unmirrored)?;
+        for class in self.mirror.take_unknown_classes() {
+            tracing::warn!(
+                class,
+                "no parameter set lists this vehicle class: the default set is taken"
+            );
+        }
+        if let Some(contacts) = &mut self.contacts {
+            contacts.learn(header, vehicles);
+        }
+        if let Some(actions) = &mut self.actions {
+            let signals = match header.columns {
+                0 => &[],
+                _ => block::view(message.payload(), layout.signals).map_err(unreadable)?,
+            };
+            actions.add_metas(header, vehicles, signals);
         }
         Ok(())
     }
 
     fn publish(&mut self, frame: &MessageHeader, tick: u32, states: &[TrafficState]) -> Result<(), Failure> {
         let count = self.mirror.count(tick);
+        let heroes = match &self.actions {
+            Some(_) => states.iter().filter(|state| state.kind == Kind::Hero as u32).count(),
+            None => 0,
+        };
         let ours = self.session.header();
         let header = MessageHeader {
             run_id: ours.run_id,
             incarnation: ours.incarnation,
-            sequence: 0,
+            sequence: heroes as u64,
             ..self
                 .mirror
                 .settings()
                 .tick_header(frame, tick, u32::try_from(count).unwrap_or(u32::MAX))
         };
-        let layout = self.mirror.layout(tick);
+        let layout = WorldLayout::with_heroes(count, header.columns as usize, heroes);
         let mut draft = self.world.loan(header, layout.len)?;
         self.mirror.write_tick(tick, draft.payload_mut()).map_err(unmirrored)?;
         if let Some(contacts) = &mut self.contacts {
             contacts.tick(&header, draft.payload_mut(), layout.states)?;
         }
+        let poses = match &mut self.actions {
+            Some(actions) => actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?,
+            None => Vec::new(),
+        };
         draft.send()?;
         self.consumer_wake.wake();
+        if let Some(actions) = &self.actions {
+            actions.send_poses(&header, &poses)?;
+        }
         self.ticks += 1;
         self.vehicle_steps += count as u64;
         self.report(&header, states);
@@ -224,6 +271,7 @@ impl Core {
             resynchronisations: self.mirror.resynchronisations(),
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
+            heroes: self.actions.as_ref().map(Actions::account),
             buildings: self.scene.buildings().len(),
             props: self.scene.props().len(),
             collisions,

@@ -10,13 +10,14 @@ use crate::{
     attitude::{Lean, body_from_level},
     curve::Curve,
     dimensions::Dimensions,
-    fleet::{Fleet, FleetError},
+    fleet::{Built, Fleet, FleetError},
+    hero::{self, Hero},
     lanes::{Drive, Lanes},
     person::Person,
     reference::{Join, Path},
     tracking,
     trig::wrap_angle,
-    vehicle::State,
+    vehicle::{Input, State},
 };
 
 /// Times of a run and limits of its vehicles.
@@ -78,6 +79,8 @@ enum Mover {
     Vehicle { state: State, path: Path },
     /// A person, moved by SUMO alone.
     Person(Person),
+    /// A vehicle that actions move; SUMO follows it.
+    Hero(Hero),
 }
 
 /// One road user.
@@ -105,6 +108,8 @@ impl RoadUser {
         let dimensions = fleet.at(model).dimensions;
         let mover = if meta.kind == Kind::Person as u32 {
             Mover::Person(Person::default())
+        } else if meta.kind == Kind::Hero as u32 {
+            Mover::Hero(Hero::default())
         } else {
             Mover::Vehicle {
                 state: State::new(0.0, 0.0, 0.0, 0.0),
@@ -137,6 +142,8 @@ impl RoadUser {
         };
         match (&mut self.mover, self.arrival) {
             (_, Arrival::Entering) => {}
+            // Wherever SUMO has put a hero: it is where its model has brought it.
+            (Mover::Hero(_), _) => self.arrival = Arrival::Continuing,
             (Mover::Person(person), Arrival::Jumping) => person.coast(&self.before, settings.step_s()),
             (Mover::Person(person), Arrival::Continuing) => {
                 person.advance(&self.before, &self.now, settings.step_s());
@@ -148,6 +155,13 @@ impl RoadUser {
                     self.arrival = Arrival::Jumping;
                 }
             }
+        }
+    }
+
+    /// What a hero is asked for from now on; others do not listen.
+    pub fn ask(&mut self, input: Input) {
+        if let Mover::Hero(hero) = &mut self.mover {
+            hero.ask(input);
         }
     }
 
@@ -238,6 +252,7 @@ impl RoadUser {
         &mut self,
         tick: u32,
         settings: &Settings,
+        built: &Built,
         out: &mut VehicleState,
         rows: &mut [SubStep],
     ) -> bool {
@@ -256,6 +271,15 @@ impl RoadUser {
                 };
                 let z_m = self.now.front_z_m - left * (self.now.front_z_m - self.before.front_z_m);
                 person.write(start_s, settings, z_m, out, rows);
+            }
+            Mover::Hero(hero) => {
+                let front_m = self.dimensions.front_m();
+                if set {
+                    hero.set(&self.now, front_m, out, rows);
+                } else {
+                    let road = [&self.before, &self.now];
+                    hero.advance(&hero::model(built), road, front_m, settings.sub_step_s(), out, rows);
+                }
             }
             Mover::Vehicle { state, path } => {
                 let front_m = self.dimensions.front_m();
@@ -289,7 +313,7 @@ impl RoadUser {
         out.length_m = length_m as f32;
         out.width_m = width_m as f32;
         out.height_m = height_m as f32;
-        if matches!(self.mover, Mover::Vehicle { .. }) {
+        if !matches!(self.mover, Mover::Person(_)) {
             out.wheelbase_m = wheelbase_m as f32;
             out.rear_overhang_m = rear_overhang_m as f32;
         }

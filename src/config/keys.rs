@@ -52,12 +52,40 @@ pub struct Key {
 }
 
 /// Names of observation fields, in the order of the wire.
-pub const FIELD_NAMES: [&str; 11] = [
-    "gnss_x", "gnss_y", "accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z", "compass", "speed", "steering",
+pub const FIELD_NAMES: [&str; 25] = [
+    "gnss_x",
+    "gnss_y",
+    "accel_x",
+    "accel_y",
+    "accel_z",
+    "gyro_x",
+    "gyro_y",
+    "gyro_z",
+    "compass",
+    "speed",
+    "steering",
+    "route_x_5",
+    "route_y_5",
+    "route_x_10",
+    "route_y_10",
+    "route_x_20",
+    "route_y_20",
+    "route_x_40",
+    "route_y_40",
+    "speed_limit",
+    "route_offset",
+    "route_left",
+    "leader_gap",
+    "leader_speed",
+    "signal_gap",
 ];
 
-/// Presets of `observation.fields`: name and how many of [`FIELD_NAMES`] they take.
-pub const FIELD_PRESETS: [(&str, usize); 2] = [("paper", 9), ("caraware", 11)];
+/// Presets of `observation.fields`: name and the part of [`FIELD_NAMES`] that they take.
+pub const FIELD_PRESETS: [(&str, std::ops::Range<usize>); 3] =
+    [("paper", 0..9), ("caraware", 0..11), ("driving", 9..25)];
+
+/// First of [`FIELD_NAMES`] that only a hero has.
+pub const FIRST_HERO_FIELD: usize = 11;
 
 const fn float(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> Key {
     Key {
@@ -98,10 +126,12 @@ pub const KEYS: &[Key] = &[
     integer("run.window_ticks", "ticks", 1, 256, "Ticks that traffic, dynamics and sensors may each be ahead of the next process."),
     float("run.real_time_factor", "s/s", 0.0, 1000.0, "Simulated seconds per wall second; 0 = as fast as possible."),
     float("traffic.step_s", "s", 0.001, 10.0, "Length of a SUMO step: a whole number of ticks. A `.sumocfg` that sets `step-length` decides it."),
-    integer("traffic.cavs", "vehicles", 1, 100_000, "Connected vehicles kept alive on random routes (maps with population control)."),
+    integer("traffic.cavs", "vehicles", 0, 100_000, "Connected vehicles kept alive on random routes (maps with population control); at least 1 but in the driving task."),
     integer("traffic.others", "vehicles", 0, 100_000, "Vehicles without sensors kept alive (maps with population control)."),
     integer("traffic.pedestrians", "persons", 0, 100_000, "Pedestrians kept alive (maps with population control)."),
     integer("traffic.heroes", "vehicles", 0, 1000, "Vehicles driven by actions and kept alive (maps with population control; the driving task only)."),
+    other("traffic.hero_route", Kind::Texts, "Edges of the route of every hero, from its first to its last (maps with population control); [] = at random."),
+    other("traffic.hero_ids", Kind::Texts, "Vehicles of a `.sumocfg` that are driven by actions, by their ids (the driving task only)."),
     float("traffic.cav_share", "", 0.0, 1.0, "Share of a `.sumocfg`'s vehicles that carry sensors."),
     integer("traffic.max_road_users", "", 1, 1_000_000, "Most road users alive at once; shared memory is laid out for them."),
     Key { path: "map.origin_latitude_deg", kind: Kind::Float { min: -89.9, max: 89.9 }, unit: "deg", meaning: "Latitude of the net's (0, 0); only for a net without projection.", optional: true },
@@ -143,7 +173,7 @@ pub const KEYS: &[Key] = &[
     float("speed_steering.period_s", "s", 0.001, 100.0, "Time between samples: a whole number of ticks."),
     float("speed_steering.speed_noise_std_mps", "m/s", 0.0, 100.0, "Standard deviation of the wheel speed."),
     float("speed_steering.steering_noise_std_rad", "rad", 0.0, 10.0, "Standard deviation of the steering-wheel angle."),
-    other("observation.fields", Kind::Fields, "Fields of the observation in order: \"paper\" (nine: GNSS and IMU), \"caraware\" (eleven: with speed and steering), or a list of names."),
+    other("observation.fields", Kind::Fields, "Fields of the observation in order: \"paper\" (nine: GNSS and IMU), \"caraware\" (eleven: with speed and steering), \"driving\" (sixteen: speed, steering, the route ahead), or a list of names; those from \"route_x_5\" on are a hero's."),
     other("observation.scale", Kind::Choice(&["zero_to_one", "minus_one_to_one"]), "Range that every field is normalised to: the paper's text says 0 … 1, CarAware's code −1 … 1."),
     float("observation.accel_range_mps2", "m/s²", 0.1, 1000.0, "Full scale of the accelerometer fields."),
     float("observation.gyro_range_radps", "rad/s", 0.01, 1000.0, "Full scale of the gyroscope fields."),
@@ -212,7 +242,10 @@ impl Key {
                 .join(", "),
             Kind::Text => "text".into(),
             Kind::Texts => "list of texts".into(),
-            Kind::Fields => format!("\"paper\", \"caraware\", or a list of {}", FIELD_NAMES.join(", ")),
+            Kind::Fields => format!(
+                "\"paper\", \"caraware\", \"driving\", or a list of {}",
+                FIELD_NAMES.join(", ")
+            ),
             Kind::Integers { min, max } => format!("list of {min} … {max}"),
         }
     }

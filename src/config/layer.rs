@@ -163,8 +163,8 @@ fn texts(value: &DeValue<'_>) -> Option<Value> {
 
 fn fields(value: &DeValue<'_>) -> Option<Value> {
     if let Some(preset) = value.as_str() {
-        let (_, count) = FIELD_PRESETS.iter().find(|(name, _)| *name == preset)?;
-        return Some(Value::from(&FIELD_NAMES[..*count]));
+        let (_, part) = FIELD_PRESETS.iter().find(|(name, _)| *name == preset)?;
+        return Some(Value::from(&FIELD_NAMES[part.clone()]));
     }
     let names: Option<Vec<&str>> = value.as_array()?.iter().map(|item| item.get_ref().as_str()).collect();
     let names = names?;

@@ -14,7 +14,10 @@ pub use error::ConfigError;
 use layer::{Layer, Setting};
 
 /// Embedded presets by name; the first is the default and holds every key that must have a value.
-pub const PRESETS: [(&str, &str); 1] = [("town", include_str!("../../configs/town.toml"))];
+pub const PRESETS: [(&str, &str); 2] = [
+    ("town", include_str!("../../configs/town.toml")),
+    ("driving", include_str!("../../configs/driving.toml")),
+];
 
 /// Merged settings, each remembering where it was set.
 #[derive(Debug, Clone)]

@@ -2,7 +2,10 @@
 
 use ipc_schema::{config::Config, props::Obstacle};
 
-use super::{ConfigError, Settings};
+use super::{
+    ConfigError, Settings,
+    keys::{FIELD_NAMES, FIRST_HERO_FIELD},
+};
 
 /// Checks every rule.
 pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
@@ -34,7 +37,9 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
             "a batch is a part of the horizon: lower the one or raise the other".into(),
         ));
     }
-    let road_users = config.traffic.cavs + config.traffic.others + config.traffic.pedestrians;
+    task(settings, config)?;
+    let traffic = &config.traffic;
+    let road_users = traffic.cavs + traffic.others + traffic.pedestrians + traffic.heroes;
     if road_users > config.traffic.max_road_users {
         return Err(conflict(
             settings,
@@ -60,6 +65,82 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
         ));
     }
     obstacles(settings, config)
+}
+
+/// The learner that comes with caraware: it predicts positions.
+const LOCALISING_TRAINER: &str = "caraware.train";
+
+/// Heroes and the driving task go together, and actions must reach SUMO at every tick.
+fn task(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+    let refuse = |path: &str, message: String, help: &str| Err(conflict(settings, path, message, help.into()));
+    let traffic = &config.traffic;
+    if !config.drives() {
+        if traffic.heroes > 0 {
+            let message = format!("`traffic.heroes` = {} without anybody who drives them", traffic.heroes);
+            return refuse(
+                "traffic.heroes",
+                message,
+                "set task.kind = \"driving\", or traffic.heroes = 0",
+            );
+        }
+        if !traffic.hero_ids.is_empty() {
+            let message = "`traffic.hero_ids` names heroes without anybody who drives them".into();
+            return refuse(
+                "traffic.hero_ids",
+                message,
+                "set task.kind = \"driving\", or traffic.hero_ids = []",
+            );
+        }
+        if let Some(name) = hero_field(config) {
+            let message = format!("`observation.fields` has \"{name}\", which only a hero has");
+            return refuse(
+                "observation.fields",
+                message,
+                "set task.kind = \"driving\", or leave the field out",
+            );
+        }
+        if traffic.cavs == 0 {
+            let message = "`traffic.cavs` = 0: nobody is to be localised".into();
+            return refuse("traffic.cavs", message, "ask for one connected vehicle or more");
+        }
+        return Ok(());
+    }
+    if config.heroes() == 0 {
+        let message = "`task.kind` = \"driving\" without a hero".into();
+        return refuse(
+            "task.kind",
+            message,
+            "set traffic.heroes = 1 (with a .sumocfg: traffic.hero_ids = [\"…\"])",
+        );
+    }
+    #[expect(clippy::float_cmp, reason = "both are what the user wrote")]
+    if traffic.step_s != config.run.tick_s {
+        let message = format!(
+            "`traffic.step_s` = {} s is not `run.tick_s` = {} s, as the driving task needs",
+            traffic.step_s, config.run.tick_s
+        );
+        return refuse(
+            "traffic.step_s",
+            message,
+            "set both to the same time, such as 0.1: an action reaches SUMO within a tick",
+        );
+    }
+    if config.trainer.module == LOCALISING_TRAINER {
+        let message = format!("`trainer.module` = \"{LOCALISING_TRAINER}\" learns to localise and cannot drive");
+        let help = "name a module that publishes actions, such as \"caraware.examples.pure_pursuit\"";
+        return refuse("trainer.module", message, help);
+    }
+    Ok(())
+}
+
+/// The first field of the observation that only a hero has.
+fn hero_field(config: &Config) -> Option<String> {
+    let heroes = &FIELD_NAMES[FIRST_HERO_FIELD..];
+    let names = config.observation.fields.iter().filter_map(|field| {
+        let name = serde_json::to_value(field).ok()?;
+        name.as_str().map(str::to_owned)
+    });
+    names.into_iter().find(|name| heroes.contains(&name.as_str()))
 }
 
 /// Every entry of `scene.obstacles` must be a known prop and a place.

@@ -210,3 +210,58 @@ fn an_obstacle_that_cannot_be_placed_is_named_with_what_can() {
     let (message, _) = error_of("[scene]\nobstacles = [\"cone 10\"]\n");
     assert!(message.contains("\"cone 10\" is not \"name x y\""), "{message}");
 }
+
+#[test]
+fn heroes_and_the_driving_task_go_together() {
+    let cases = [
+        (
+            "traffic.heroes = 1",
+            "`traffic.heroes` = 1 without anybody who drives them",
+            "task.kind = \"driving\"",
+        ),
+        (
+            "traffic.hero_ids = [\"a\"]",
+            "`traffic.hero_ids` names heroes without anybody",
+            "task.kind = \"driving\"",
+        ),
+        (
+            "traffic.cavs = 0",
+            "`traffic.cavs` = 0: nobody is to be localised",
+            "one connected vehicle",
+        ),
+        (
+            "observation.fields = \"driving\"",
+            "\"route_x_5\", which only a hero has",
+            "leave the field out",
+        ),
+        (
+            "task.kind = \"driving\"",
+            "`task.kind` = \"driving\" without a hero",
+            "traffic.heroes = 1",
+        ),
+        (
+            "task.kind = \"driving\"\ntraffic.heroes = 1\ntraffic.step_s = 0.5",
+            "`traffic.step_s` = 0.5 s is not `run.tick_s` = 0.1 s",
+            "set both to the same time",
+        ),
+        (
+            "task.kind = \"driving\"\ntraffic.heroes = 1",
+            "`trainer.module` = \"caraware.train\" learns to localise",
+            "caraware.examples.pure_pursuit",
+        ),
+    ];
+    for (text, expected, cure) in cases {
+        let (message, help) = error_of(text);
+        assert!(
+            message.contains(expected) && help.contains(cure),
+            "{text}: {message}; {help}"
+        );
+    }
+}
+
+#[test]
+fn heroes_count_as_road_users() {
+    let (message, _) =
+        error_of("task.kind = \"driving\"\ntraffic.heroes = 1\ntrainer.module = \"mine\"\ntraffic.max_road_users = 52");
+    assert!(message.contains("less than the 53 road users"), "{message}");
+}

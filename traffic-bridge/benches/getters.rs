@@ -18,6 +18,7 @@ const WARM_UP_STEPS: usize = 100;
 const SIZE: Size = Size {
     cavs: 250,
     others: 250,
+    heroes: 0,
     pedestrians: 0,
 };
 
@@ -45,7 +46,7 @@ fn grid(sumo: &Path, folder: &Path, junctions: &str) -> std::io::Result<PathBuf>
 
 fn measure(net: &Path, sumo: &Path) -> Result<(), SumoError> {
     let mut session = Session::start(Options::population(sumo, net, &[], 0.1, 1)?)?;
-    let mut population = Population::start(&mut session, SIZE, 1)?;
+    let mut population = Population::start(&mut session, SIZE, &[], 1)?;
     let (mut frame, mut control_s, mut step_s, mut rows) = (Frame::default(), 0.0, 0.0, 0);
     let mut before = session.cost();
     for step in 0..WARM_UP_STEPS + STEPS {

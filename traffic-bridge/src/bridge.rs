@@ -7,18 +7,20 @@ use ipc_schema::{
     board::State,
     failure::{Failure, FailureKind},
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
-    ports::{BoardReader, PortError, Publisher, Waker},
+    ports::{BoardReader, PortError, Publisher, Subscriber, Waker},
     process::Process,
     run::{RunFile, Source},
     schedule::Episode,
     services::Channel,
     session::{Session as Membership, Wait},
-    traffic::{SIGNALS_PER_MESSAGE, TrafficMetaLayout, VehicleMeta},
+    traffic::{ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout, VehicleMeta},
 };
 
 use crate::{
     error::SumoError,
+    fleet::Fleet,
     frame::Frame,
+    heroes,
     options::Options,
     pacing::Pacing,
     population::{Population, Size},
@@ -33,9 +35,13 @@ const ENV_INDEX: u32 = 0;
 /// # Errors
 /// The user's files are wrong, the shared memory is gone, or SUMO fails.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
-    let membership = Membership::join(run_file, Process::TrafficBridge, ENV_INDEX)?;
+    let mut membership = Membership::join(run_file, Process::TrafficBridge, ENV_INDEX)?;
     let episodes = membership.run.episodes();
-    let mut bridge = Bridge::open(membership)?;
+    let poses = match membership.run.config.drives() {
+        true => Some(membership.subscriber(Channel::EgoPose)?),
+        false => None,
+    };
+    let mut bridge = Bridge::open(membership, poses)?;
     let mut sumo = None;
     for (place, episode) in episodes.iter().enumerate() {
         let options = options(&bridge.membership.run, episode)?;
@@ -63,13 +69,17 @@ fn options(run: &RunFile, episode: &Episode) -> Result<Options, SumoError> {
         } => Options::population(&run.sumo_home, net_file, additional_files, traffic.step_s, episode.seed),
         Source::Scenario { sumocfg } => {
             let output_dir = run.run_dir.join("sumo");
+            let fleet = Fleet::Scenario {
+                heroes: traffic.hero_ids.iter().cloned().collect(),
+                cav_share: traffic.cav_share,
+            };
             Options::scenario(
                 &run.sumo_home,
                 sumocfg,
                 &output_dir,
                 traffic.step_s,
                 episode.seed,
-                traffic.cav_share,
+                fleet,
             )
         }
     }
@@ -78,7 +88,10 @@ fn options(run: &RunFile, episode: &Episode) -> Result<Options, SumoError> {
 /// The road users that we put into an empty net; a scenario brings its own.
 fn population(run: &RunFile, session: &mut Session, seed: u64) -> Result<Option<Population>, SumoError> {
     match run.source {
-        Source::Population { .. } => Population::start(session, Size::from(&run.config.traffic), seed).map(Some),
+        Source::Population { .. } => {
+            let traffic = &run.config.traffic;
+            Population::start(session, Size::from(traffic), &traffic.hero_route, seed).map(Some)
+        }
         Source::Scenario { .. } => Ok(None),
     }
 }
@@ -90,6 +103,8 @@ struct Bridge {
     meta: Publisher,
     consumer: BoardReader,
     consumer_wake: Waker,
+    /// Where the heroes are, in the driving task.
+    poses: Option<Subscriber>,
     pacing: Pacing,
     ticks_per_step: u64,
     /// `traffic-meta` messages sent.
@@ -100,7 +115,7 @@ struct Bridge {
 }
 
 impl Bridge {
-    fn open(membership: Membership) -> Result<Self, Failure> {
+    fn open(membership: Membership, poses: Option<Subscriber>) -> Result<Self, Failure> {
         let traffic = membership.publisher(Channel::Traffic)?;
         let meta = membership.publisher(Channel::TrafficMeta)?;
         let consumer = membership.board_of(Process::SimCore)?;
@@ -113,6 +128,7 @@ impl Bridge {
             meta,
             consumer,
             consumer_wake,
+            poses,
             pacing,
             ticks_per_step,
             meta_messages: 0,
@@ -154,12 +170,16 @@ impl Bridge {
             if self.may_send(tick, session.step_s())? == Wait::Stopped {
                 return Ok(Wait::Stopped);
             }
+            if self.move_heroes(session, episode, &frame)? == Wait::Stopped {
+                return Ok(Wait::Stopped);
+            }
             session.step(&mut frame)?;
             let ends = self.ends(session, episode, &frame)?;
-            self.publish(
-                &frame,
-                self.header(episode, &frame, tick, session.step_s(), ends, is_last),
-            )?;
+            let header = self.header(episode, &frame, tick, session.step_s(), ends, is_last);
+            if self.poses.is_some() {
+                self.publish_routes(&heroes::take_over(session, &frame)?, header)?;
+            }
+            self.publish(&frame, header)?;
             if ends {
                 return Ok(Wait::Ready);
             }
@@ -175,6 +195,47 @@ impl Bridge {
             Wait::Ready => Ok(self.pacing.wait(&self.membership, step_s)?),
             Wait::Stopped => Ok(Wait::Stopped),
         }
+    }
+
+    /// In the driving task: waits for the poses of the tick sent last and sets the heroes of `frame`, its step, to them.
+    fn move_heroes(&mut self, session: &mut Session, episode: &Episode, frame: &Frame) -> Result<Wait, Failure> {
+        let Some(poses) = &self.poses else {
+            return Ok(Wait::Ready);
+        };
+        let Some(before) = self.ticks.checked_sub(1) else {
+            return Ok(Wait::Ready);
+        };
+        let Some(message) = self.membership.next(poses)? else {
+            return Ok(Wait::Stopped);
+        };
+        let header = message.header();
+        if header.tick != before {
+            return Err(PortError::Gap {
+                channel: Channel::EgoPose.name(),
+                expected: before,
+                received: header.tick,
+            }
+            .into());
+        }
+        // The heroes of the episode before went with it.
+        if header.episode == episode.index {
+            let poses = heroes::poses(&message).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
+            heroes::apply(session, frame, poses)?;
+        }
+        Ok(Wait::Ready)
+    }
+
+    fn publish_routes(&mut self, points: &[RoutePoint], header: MessageHeader) -> Result<(), Failure> {
+        for part in heroes::parts(points) {
+            self.meta_messages += 1;
+            let header = MessageHeader {
+                flags: header.flags | ROUTES,
+                sequence: self.meta_messages,
+                ..header
+            };
+            send(&self.meta, header, part.len(), bytemuck::cast_slice(part))?;
+        }
+        Ok(())
     }
 
     fn ends(&self, session: &Session, episode: &Episode, frame: &Frame) -> Result<bool, SumoError> {

@@ -1,38 +1,15 @@
 // What population control asks of SUMO between two steps: roads, routes, new road users.
 #include <algorithm>
-#include <utility>
 
 #include <libsumo/libsumo.h>
 
 #include "traffic-bridge/src/error_tee.h"
+#include "traffic-bridge/src/lanes.h"
 #include "traffic-bridge/src/shim.h"
 #include "traffic-bridge/src/sumo.rs.h"
 #include "traffic-bridge/src/text.h"
 
 namespace caraware {
-
-namespace {
-
-bool is_internal(const std::string& edge) { return edge.empty() || edge.front() == ':'; }
-
-bool allows(const std::string& lane, const std::string& vehicle_class) {
-    const std::vector<std::string> refused = libsumo::Lane::getDisallowed(lane);
-    return std::find(refused.begin(), refused.end(), vehicle_class) == refused.end();
-}
-
-// Lanes of `edge` that `vehicle_class` may use.
-std::vector<std::string> lanes_for(const std::string& edge, const std::string& vehicle_class) {
-    std::vector<std::string> result;
-    for (int i = 0; i < libsumo::Edge::getLaneNumber(edge); ++i) {
-        std::string lane = edge + "_" + std::to_string(i);
-        if (allows(lane, vehicle_class)) {
-            result.push_back(std::move(lane));
-        }
-    }
-    return result;
-}
-
-}  // namespace
 
 rust::String Simulation::vehicle_class(rust::Str vehicle_type) const {
     return rust::String::lossy(libsumo::VehicleType::getVehicleClass(text(vehicle_type)));

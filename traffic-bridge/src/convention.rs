@@ -32,6 +32,12 @@ pub fn yaw_rad_from_heading_deg(heading_deg: f64) -> f32 {
     }
 }
 
+/// Heading in degrees clockwise from north, in [0, 360), of a yaw in radians counter-clockwise from east.
+#[must_use]
+pub fn heading_deg_from_yaw_rad(yaw_rad: f64) -> f64 {
+    (90.0 - yaw_rad.to_degrees()).rem_euclid(360.0)
+}
+
 /// SUMO's `--seed` for an episode seed: its low 31 bits.
 #[must_use]
 pub fn sumo_seed(episode_seed: u64) -> u64 {
@@ -149,6 +155,13 @@ mod tests {
             let (east, north) = heading_deg.to_radians().sin_cos();
             prop_assert!((f64::from(yaw_rad).cos() - east).abs() < 1e-6);
             prop_assert!((f64::from(yaw_rad).sin() - north).abs() < 1e-6);
+        }
+
+        #[test]
+        fn headings_go_there_and_back(yaw_rad in -3.1_f64..3.1) {
+            let heading_deg = heading_deg_from_yaw_rad(yaw_rad);
+            prop_assert!((0.0..360.0).contains(&heading_deg));
+            prop_assert!((f64::from(yaw_rad_from_heading_deg(heading_deg)) - yaw_rad).abs() < 1e-6);
         }
 
         #[test]

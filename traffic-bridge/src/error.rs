@@ -73,6 +73,12 @@ pub enum SumoError {
         /// Edges found.
         found: usize,
     },
+    /// `traffic.hero_route` is no route.
+    #[error("no hero can drive `traffic.hero_route`: {reason}")]
+    HeroRoute {
+        /// SUMO's own words.
+        reason: String,
+    },
     /// The output directory cannot be made.
     #[error("cannot create {path}")]
     Output {
@@ -97,7 +103,8 @@ impl SumoError {
             | Self::Malformed { .. }
             | Self::Refused { .. }
             | Self::Step { .. }
-            | Self::NoRoads { .. } => FailureKind::Config,
+            | Self::NoRoads { .. }
+            | Self::HeroRoute { .. } => FailureKind::Config,
         }
     }
 
@@ -112,6 +119,7 @@ impl SumoError {
             Self::NoRoads { .. } => {
                 "use a net whose roads lead everywhere and back (sidewalks and crossings for pedestrians), or ask for none of them"
             }
+            Self::HeroRoute { .. } => "name edges that cars may use, each leading to the next (`netedit` shows them)",
             Self::Output { .. } => "check free space and permissions of the run directory",
             Self::AlreadyRunning | Self::Call { .. } => {
                 "this is a defect of traffic-bridge: please report it with its log"

@@ -25,7 +25,7 @@ pub struct Frame {
     pub time_s: f64,
     /// SUMO steps since the start of the episode.
     pub step: u64,
-    /// Connected vehicles among `states`.
+    /// Connected vehicles and heroes among `states`.
     pub cavs: u32,
 }
 
@@ -55,7 +55,7 @@ impl Register {
         for raw in states {
             let kind = self.kind(raw.index);
             if let Some(state) = convention::traffic_state(raw, kind, step_s) {
-                frame.cavs += u32::from(kind == Kind::Cav);
+                frame.cavs += u32::from(matches!(kind, Kind::Cav | Kind::Hero));
                 frame.states.push(state);
             }
         }

@@ -10,6 +10,8 @@ pub mod error;
 pub mod fleet;
 pub mod frame;
 mod graph;
+pub mod hero_route;
+pub mod heroes;
 pub mod inputs;
 pub mod options;
 mod pacing;

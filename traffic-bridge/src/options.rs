@@ -63,8 +63,8 @@ impl Options {
     }
 
     /// A user's scenario exactly as SUMO runs it, but for its outputs, which go to `output_dir`. `step_s` is the step
-    /// that the run wants, `seed` its seed; they replace the scenario's own only if they differ. A share of `cav_share` of the vehicles
-    /// are connected.
+    /// that the run wants, `seed` its seed; they replace the scenario's own only if they differ. `fleet` tells which
+    /// of its vehicles are connected or heroes.
     ///
     /// # Errors
     /// A file is missing or malformed, or `output_dir` cannot be made.
@@ -74,7 +74,7 @@ impl Options {
         output_dir: &Path,
         step_s: f64,
         seed: u64,
-        cav_share: f64,
+        fleet: Fleet,
     ) -> Result<Self, SumoError> {
         let scenario = Scenario::read(sumocfg)?;
         scenario.files.check()?;
@@ -90,7 +90,10 @@ impl Options {
         if scenario.seed != seed {
             arguments.extend(["--seed".to_owned(), sumo_seed(seed).to_string()]);
         }
-        let fleet = Fleet::Share(cav_share);
+        if matches!(&fleet, Fleet::Scenario { heroes, .. } if !heroes.is_empty()) {
+            // What a hero runs into is ours to tell and to end; SUMO would lift it out of the way.
+            arguments.extend(["--collision.action".to_owned(), "warn".to_owned()]);
+        }
         Ok(Self {
             arguments,
             files: scenario.files,

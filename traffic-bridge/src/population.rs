@@ -13,9 +13,9 @@ use ipc_schema::{
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 
 use crate::{
-    catalogue::{Catalogue, draw},
+    catalogue::{Catalogue, Entry, draw},
     error::SumoError,
-    fleet::CAV_PREFIX,
+    fleet::{CAV_PREFIX, HERO_PREFIX},
     frame::Frame,
     pedestrians::Pedestrians,
     roads::Roads,
@@ -28,6 +28,8 @@ const OTHER_PREFIX: &str = "other.";
 const CARE_S: f64 = 1.0;
 /// A vehicle that found no room for this long tries elsewhere, seconds.
 const PATIENCE_S: f64 = 1.5;
+/// Heroes are of this class where the catalogue has it.
+const HERO_CLASS: &str = "passenger";
 /// Routes are prolonged when fewer edges than this are left: enough for early lane changes, and for a second on short edges.
 const EDGES_AHEAD: usize = 4;
 /// How many road users to keep alive.
@@ -37,6 +39,8 @@ pub struct Size {
     pub cavs: u32,
     /// Other vehicles.
     pub others: u32,
+    /// Heroes.
+    pub heroes: u32,
     /// Pedestrians.
     pub pedestrians: u32,
 }
@@ -46,9 +50,21 @@ impl From<&Traffic> for Size {
         Self {
             cavs: traffic.cavs,
             others: traffic.others,
+            heroes: traffic.heroes,
             pedestrians: traffic.pedestrians,
         }
     }
+}
+
+/// Where a driver goes.
+#[derive(Debug, Clone)]
+enum Way {
+    /// From one random place to the next, for ever.
+    Forever,
+    /// To one random place.
+    Once,
+    /// Along these edges.
+    Given(Rc<[String]>),
 }
 
 /// A place in the population, and who fills it now.
@@ -58,6 +74,7 @@ struct Driver {
     id: String,
     vehicle_type: String,
     roads: Rc<Roads>,
+    way: Way,
     rng: ChaCha8Rng,
     /// Last edge of the route.
     goal: usize,
@@ -114,13 +131,19 @@ impl Population {
     /// Puts everybody at a random place of the freshly started `session`; they depart within the first two seconds.
     ///
     /// # Errors
-    /// The net has no connected roads for a vehicle class in use, or no sidewalks for pedestrians.
-    pub fn start(session: &mut Session, size: Size, episode_seed: u64) -> Result<Self, SumoError> {
+    /// The net has no connected roads for a vehicle class in use, or no sidewalks for pedestrians, or no way along
+    /// `hero_route` (the edges of every hero's route; none = at random).
+    pub fn start(
+        session: &mut Session,
+        size: Size,
+        hero_route: &[String],
+        episode_seed: u64,
+    ) -> Result<Self, SumoError> {
         let catalogue = Catalogue::read(session)?;
         let pedestrians = Pedestrians::start(session, size.pedestrians, &catalogue.pedestrians, episode_seed)?;
         let pace = Pace::new(session.step_s());
         let (place_of, next_number) = (BTreeMap::new(), BTreeMap::new());
-        let drivers = drivers(session, size, &catalogue, episode_seed)?;
+        let drivers = drivers(session, size, hero_route, &catalogue, episode_seed)?;
         let mut population = Self {
             drivers,
             place_of,
@@ -190,6 +213,15 @@ impl Population {
 
 impl Driver {
     fn add(&mut self, session: &mut Session, step: u64) -> Result<(), SumoError> {
+        if let Way::Given(route) = &self.way {
+            (self.route_edges, self.added_step, self.departed) = (route.len(), step, false);
+            let added = session
+                .sumo_mut()
+                .add_vehicle_at_start(&self.id, &self.vehicle_type, route);
+            return added.map_err(|error| SumoError::HeroRoute {
+                reason: error.what().trim().to_owned(),
+            });
+        }
         let start = self.roads.draw_start(&mut self.rng);
         self.goal = self.roads.draw_other(start, &mut self.rng);
         let route = self.roads.route(start, self.goal);
@@ -203,6 +235,9 @@ impl Driver {
     /// Leads the vehicle on to another random edge when its route gets short. A refusal does no harm: it is tried
     /// again, and whoever arrives in the meantime is replaced.
     fn prolong(&mut self, session: &mut Session) {
+        if !matches!(self.way, Way::Forever) {
+            return;
+        }
         let passed = session
             .sumo()
             .route_index(&self.id)
@@ -219,31 +254,56 @@ impl Driver {
     }
 }
 
-/// The places of the population, still empty.
-fn drivers(session: &Session, size: Size, catalogue: &Catalogue, episode_seed: u64) -> Result<Vec<Driver>, SumoError> {
-    let cavs = std::iter::repeat_n(CAV_PREFIX, size.cavs as usize);
-    let others = std::iter::repeat_n(OTHER_PREFIX, size.others as usize);
-    let mut roads: BTreeMap<&str, Rc<Roads>> = BTreeMap::new();
+/// The places of the population, still empty: heroes last, so that they do not change what the others draw.
+fn drivers(
+    session: &Session,
+    size: Size,
+    hero_route: &[String],
+    catalogue: &Catalogue,
+    episode_seed: u64,
+) -> Result<Vec<Driver>, SumoError> {
+    let hero_way = match hero_route {
+        [] => Way::Once,
+        edges => Way::Given(edges.into()),
+    };
+    let hero_types: Vec<Entry> = catalogue
+        .vehicles
+        .iter()
+        .filter(|entry| entry.class == HERO_CLASS)
+        .cloned()
+        .collect();
+    let hero_types = if hero_types.is_empty() {
+        &catalogue.vehicles
+    } else {
+        &hero_types
+    };
+    let all = [
+        (CAV_PREFIX, size.cavs, Way::Forever, &catalogue.vehicles),
+        (OTHER_PREFIX, size.others, Way::Forever, &catalogue.vehicles),
+        (HERO_PREFIX, size.heroes, hero_way, hero_types),
+    ];
+    let places = all
+        .into_iter()
+        .flat_map(|(prefix, count, way, types)| std::iter::repeat_n((prefix, way, types), count as usize));
+    let mut roads: BTreeMap<String, Rc<Roads>> = BTreeMap::new();
     let mut drivers = Vec::new();
-    for (place, prefix) in cavs.chain(others).enumerate() {
+    for (place, (prefix, way, types)) in places.enumerate() {
         let mut rng = stream(episode_seed, place as u64);
-        let entry = draw(&catalogue.vehicles, &mut rng);
-        if !roads.contains_key(entry.class.as_str()) {
-            roads.insert(&entry.class, Rc::new(Roads::connected(session, &entry.class)?));
+        let entry = draw(types, &mut rng);
+        if !roads.contains_key(&entry.class) {
+            roads.insert(entry.class.clone(), Rc::new(Roads::connected(session, &entry.class)?));
         }
-        let roads = Rc::clone(&roads[entry.class.as_str()]);
-        let (id, vehicle_type) = (String::new(), entry.id.clone());
-        let (goal, route_edges, added_step, departed) = (0, 0, 0, false);
         drivers.push(Driver {
             prefix,
-            id,
-            vehicle_type,
-            roads,
+            id: String::new(),
+            vehicle_type: entry.id.clone(),
+            roads: Rc::clone(&roads[&entry.class]),
+            way,
             rng,
-            goal,
-            route_edges,
-            added_step,
-            departed,
+            goal: 0,
+            route_edges: 0,
+            added_step: 0,
+            departed: false,
         });
     }
     Ok(drivers)

@@ -20,6 +20,8 @@ struct RawEvent;
 struct RawSignal;
 struct RawEdge;
 struct RawLink;
+struct RawLane;
+struct RawWay;
 class ErrorTee;
 
 class Simulation {
@@ -51,6 +53,13 @@ public:
 
     void add_vehicle(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route);
     void remove_vehicle(rust::Str id);
+    void add_vehicle_at_start(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route);
+    void take_over(std::uint32_t index);
+    void move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration);
+    void remove_by_index(std::uint32_t index);
+    std::int32_t lane_index(std::uint32_t index) const;
+    rust::Vec<RawLane> route_lanes(std::uint32_t index) const;
+    rust::Vec<RawWay> route_ways(std::uint32_t index) const;
     std::int32_t route_index(rust::Str id) const;
     void extend_route(rust::Str id, rust::Slice<const rust::String> more);
 
@@ -67,6 +76,8 @@ private:
         bool gone;
     };
 
+    const std::string* id_of(std::uint32_t index) const;
+    const std::string& known_id(std::uint32_t index) const;
     void note_departures();
     void note_arrivals();
     void note_teleports();

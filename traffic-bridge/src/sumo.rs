@@ -80,6 +80,36 @@ pub mod ffi {
         to: String,
     }
 
+    /// A lane on a vehicle's route.
+    #[derive(Debug, Clone, PartialEq)]
+    struct RawLane {
+        /// Place of its edge in the route.
+        edge: u32,
+        /// Number of the lane on its edge, from the right.
+        lane: u32,
+        /// m/s.
+        speed_limit: f64,
+        /// x, y, x, y, … of the centre line.
+        shape: Vec<f64>,
+    }
+
+    /// A way across a junction from a lane of the route to a lane of its next edge.
+    #[derive(Debug, Clone, PartialEq)]
+    struct RawWay {
+        /// Place of the edge it leaves in the route.
+        edge: u32,
+        from_lane: u32,
+        to_lane: u32,
+        /// m/s.
+        speed_limit: f64,
+        /// x, y, x, y, … of the centre line.
+        shape: Vec<f64>,
+        /// Place of the traffic light among SUMO's sorted ids, negative where there is none.
+        signal: i32,
+        /// Number of the way at that traffic light.
+        link: u32,
+    }
+
     unsafe extern "C++" {
         include!("traffic-bridge/src/shim.h");
 
@@ -122,6 +152,34 @@ pub mod ffi {
         /// Adds a vehicle on a free place of the first edge of `route`, at the speed of traffic there.
         fn add_vehicle(self: Pin<&mut Simulation>, id: &str, vehicle_type: &str, route: &[String]) -> Result<()>;
         fn remove_vehicle(self: Pin<&mut Simulation>, id: &str) -> Result<()>;
+        /// Adds a vehicle at the beginning of the first edge of `route`, as soon as there is room.
+        fn add_vehicle_at_start(
+            self: Pin<&mut Simulation>,
+            id: &str,
+            vehicle_type: &str,
+            route: &[String],
+        ) -> Result<()>;
+        /// SUMO leaves speed and lane of the vehicle of this dense index to others from now on.
+        fn take_over(self: Pin<&mut Simulation>, index: u32) -> Result<()>;
+        /// Puts the vehicle's front bumper there at the end of the next step (`angle` in degrees clockwise from north);
+        /// until then everybody reckons with this speed and acceleration.
+        fn move_vehicle(
+            self: Pin<&mut Simulation>,
+            index: u32,
+            x: f64,
+            y: f64,
+            angle: f64,
+            speed: f64,
+            acceleration: f64,
+        ) -> Result<()>;
+        /// Takes the vehicle of this dense index out of the simulation; nothing if it is not there.
+        fn remove_by_index(self: Pin<&mut Simulation>, index: u32) -> Result<()>;
+        /// Number of the lane on which the vehicle is, from the right.
+        fn lane_index(self: &Simulation, index: u32) -> Result<i32>;
+        /// Lanes on the vehicle's route that it may use, edge by edge.
+        fn route_lanes(self: &Simulation, index: u32) -> Result<Vec<RawLane>>;
+        /// Ways between those lanes.
+        fn route_ways(self: &Simulation, index: u32) -> Result<Vec<RawWay>>;
         /// Index of the edge of its route where the vehicle is; negative before it departs.
         fn route_index(self: &Simulation, id: &str) -> Result<i32>;
         /// Continues the vehicle's route by `more`, which begins with its last edge.

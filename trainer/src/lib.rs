@@ -11,7 +11,7 @@ use ipc_schema::{
     board::{State, TrainingStatus},
     header::{self, MessageHeader},
     observation::ObservationLayout,
-    ports::{Message, Publisher, Subscriber},
+    ports::{Message, Publisher, Subscriber, Waker},
     process::Process,
     run::RunFile,
     services::Channel as Service,
@@ -42,6 +42,8 @@ struct Attached {
     session: Session,
     observations: Subscriber,
     predictions: Publisher,
+    /// Whoever waits for the predictions: sim-core in the driving task.
+    driven: Option<Waker>,
     training: TrainingStatus,
     ended: bool,
 }
@@ -65,11 +67,16 @@ impl Attachment {
         let mut session = Session::join_with(run, Process::Trainer, 0, stop).map_err(session_failed)?;
         let observations = session.subscriber(Service::Observation).map_err(session_failed)?;
         let predictions = session.publisher(Service::Prediction).map_err(session_failed)?;
+        let driven = match session.run.config.drives() {
+            true => Some(session.waker(Process::SimCore).map_err(session_failed)?),
+            false => None,
+        };
         session.attach();
         let attached = Attached {
             session,
             observations,
             predictions,
+            driven,
             training: TrainingStatus::default(),
             ended: false,
         };
@@ -126,7 +133,8 @@ impl Attachment {
         Ok(())
     }
 
-    /// Publishes the predictions for `block`: `rows` is f32 `[n, columns]` in C order.
+    /// Publishes the predictions for `block`: `rows` is f32 `[n, columns]` in C order. In the driving task these are actions,
+    /// and the simulation waits for them.
     fn publish_predictions(
         &self,
         block: &ObservationBlock,
@@ -152,7 +160,11 @@ impl Attachment {
             .loan(header, rows.len())
             .map_err(|error| failed(&error))?;
         draft.payload_mut().copy_from_slice(rows);
-        draft.send().map(drop).map_err(|error| failed(&error))
+        draft.send().map_err(|error| failed(&error))?;
+        if let Some(waker) = &inner.driven {
+            waker.wake();
+        }
+        Ok(())
     }
 
     /// Shows how learning goes; what is left out keeps its last value.

@@ -14,6 +14,7 @@ use traffic_bridge::{
 const SIZE: Size = Size {
     cavs: 24,
     others: 12,
+    heroes: 0,
     pedestrians: 10,
 };
 const STEP_S: f64 = 0.1;
@@ -24,7 +25,7 @@ fn options(bench: &Bench, seed: u64) -> Options {
 
 /// All bytes of all frames of an episode, and where connected vehicles begin.
 fn episode(session: &mut Session, seed: u64, steps: usize) -> (Vec<u8>, Vec<(i64, i64)>) {
-    let mut population = Population::start(session, SIZE, seed).unwrap();
+    let mut population = Population::start(session, SIZE, &[], seed).unwrap();
     let (mut bytes, mut places) = (Vec::new(), Vec::new());
     run(session, steps, |session, frame| {
         bytes.extend_from_slice(bytemuck::cast_slice(&frame.states));
@@ -65,7 +66,7 @@ fn the_same_seed_gives_the_same_bytes_and_another_does_not() {
 fn everybody_stays_alive_for_ever() {
     let bench = Bench::new();
     let mut session = Session::start(options(&bench, 3)).unwrap();
-    let mut population = Population::start(&mut session, SIZE, 3).unwrap();
+    let mut population = Population::start(&mut session, SIZE, &[], 3).unwrap();
     let (mut arrived, mut edges_of_time) = (0, BTreeSet::new());
     run(&mut session, 6000, |session, frame| {
         let alive = |kind: Kind| frame.states.iter().filter(|state| state.kind == kind as u32).count();
@@ -109,7 +110,7 @@ fn whoever_leaves_is_replaced() {
     let additional = bench.file("end.add.xml", text);
     let options = Options::population(&sumo_home(), &net, &[additional], STEP_S, 3).unwrap();
     let mut session = Session::start(options).unwrap();
-    let mut population = Population::start(&mut session, SIZE, 3).unwrap();
+    let mut population = Population::start(&mut session, SIZE, &[], 3).unwrap();
     let (mut arrived, mut names) = (0, BTreeSet::new());
     run(&mut session, 3000, |session, frame| {
         arrived += frame
@@ -138,9 +139,10 @@ fn a_crowd_finds_room() {
     let crowd = Size {
         cavs: 400,
         others: 0,
+        heroes: 0,
         pedestrians: 0,
     };
-    let mut population = Population::start(&mut session, crowd, 3).unwrap();
+    let mut population = Population::start(&mut session, crowd, &[], 3).unwrap();
     let mut cavs = 0;
     // One vehicle to 20 m of lane: whoever finds none where it wants to start is moved.
     run(&mut session, 100, |session, frame| {
@@ -157,13 +159,14 @@ fn a_net_without_sidewalks_refuses_pedestrians() {
     let start = |size| {
         let options = Options::population(&sumo_home(), &net, &[], STEP_S, 1).unwrap();
         let mut session = Session::start(options).unwrap();
-        Population::start(&mut session, size, 1).unwrap_err()
+        Population::start(&mut session, size, &[], 1).unwrap_err()
     };
     for (size, who) in [
         (
             Size {
                 cavs: 1,
                 others: 0,
+                heroes: 0,
                 pedestrians: 0,
             },
             "passenger",
@@ -172,6 +175,7 @@ fn a_net_without_sidewalks_refuses_pedestrians() {
             Size {
                 cavs: 0,
                 others: 0,
+                heroes: 0,
                 pedestrians: 1,
             },
             "pedestrian",

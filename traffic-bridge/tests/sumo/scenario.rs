@@ -3,7 +3,7 @@
 use std::{collections::BTreeSet, path::Path, time::SystemTime};
 
 use crate::support::{Bench, run, sumo_home};
-use traffic_bridge::{options::Options, session::Session};
+use traffic_bridge::{fleet::Fleet, options::Options, session::Session};
 
 /// Files below `folder` with their times of change.
 fn listing(folder: &Path) -> BTreeSet<(std::path::PathBuf, SystemTime)> {
@@ -24,7 +24,15 @@ fn a10kw_runs_and_writes_into_the_run_directory_alone() {
     let games = sumo_home().join("tools/game");
     let before = listing(&games);
     let output = bench.folder.path().join("sumo");
-    let options = Options::scenario(&sumo_home(), &games.join("A10KW.sumocfg"), &output, 0.5, 23423, 1.0).unwrap();
+    let options = Options::scenario(
+        &sumo_home(),
+        &games.join("A10KW.sumocfg"),
+        &output,
+        0.5,
+        23423,
+        Fleet::connected(1.0),
+    )
+    .unwrap();
     let mut session = Session::start(options).unwrap();
     assert_eq!((session.step_s(), session.duration_s()), (0.5, Some(1800.0)));
     let (mut most, mut vehicle_steps) = (0, 0);

@@ -5,7 +5,7 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     traffic::{DISCONTINUOUS, Kind, MetaEvent},
 };
-use traffic_bridge::{error::SumoError, frame::Frame, options::Options, session::Session};
+use traffic_bridge::{error::SumoError, fleet::Fleet, frame::Frame, options::Options, session::Session};
 
 const TWO_CARS: &str = "<routes>\
     <vehicle id=\"first\" depart=\"0\" departSpeed=\"0\"><route edges=\"A0B0 B0C0\"/></vehicle>\
@@ -166,7 +166,16 @@ fn files_that_are_missing_or_broken_are_named() {
     let bench = Bench::new();
     let home = sumo_home();
     let folder = bench.folder.path();
-    let scenario = |name: &str| Options::scenario(&home, &folder.join(name), &folder.join("sumo"), 1.0, 23423, 0.5);
+    let scenario = |name: &str| {
+        Options::scenario(
+            &home,
+            &folder.join(name),
+            &folder.join("sumo"),
+            1.0,
+            23423,
+            Fleet::connected(0.5),
+        )
+    };
     assert_config(
         &refusal(scenario("none.sumocfg"), 0),
         &["none.sumocfg", "does not exist"],

@@ -31,9 +31,10 @@ fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32)
     let size = Size {
         cavs: 20,
         others: 0,
+        heroes: 0,
         pedestrians,
     };
-    let mut population = Population::start(&mut session, size, 1).unwrap();
+    let mut population = Population::start(&mut session, size, &[], 1).unwrap();
     let mut now: BTreeMap<String, String> = BTreeMap::new();
     let (mut told, mut changes) = (Vec::new(), 0);
     run(&mut session, 400, |session: &mut Session, frame: &Frame| {

@@ -8,6 +8,7 @@ use std::{
 
 use tempfile::TempDir;
 use traffic_bridge::{
+    fleet::Fleet,
     frame::Frame,
     inputs::{attribute, for_each_element},
     options::Options,
@@ -134,7 +135,7 @@ impl Bench {
             &self.folder.path().join("sumo"),
             step_s,
             23423,
-            0.5,
+            Fleet::connected(0.5),
         )
         .unwrap()
     }

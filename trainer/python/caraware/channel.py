@@ -158,6 +158,18 @@ class Channel:
         rows = predictions.detach().to(torch.float32).contiguous().numpy()
         self._attachment.publish_predictions(observation.block, rows.tobytes(), rows.shape[1], policy_version)
 
+    def publish_actions(self, observation: Observation, actions: np.ndarray, policy_version: int = 0) -> None:
+        """Actions of the driving task: steering (left is positive) and acceleration, each in -1 ... 1.
+
+        f32 [n, 2], a row for every slot; rows of empty slots are not read. The simulation waits for the actions of
+        every tick and makes the next one with them. What is no number or out of range is refused: the last valid action
+        of that vehicle is held.
+        """
+        rows = np.ascontiguousarray(actions, dtype=np.float32)
+        if rows.shape != (observation.block.slots, 2):
+            raise ValueError(f"actions of shape {rows.shape}, the task takes ({observation.block.slots}, 2)")
+        self._attachment.publish_predictions(observation.block, rows.tobytes(), 2, policy_version)
+
     def report(self, **status: float) -> None:
         """Shows episode, env_steps, updates, env_steps_per_s, policy_std, reward, error_m, raw_gnss_error_m."""
         self._attachment.report(**status)

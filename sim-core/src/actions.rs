@@ -1,0 +1,199 @@
+//! The driving task's ports: `prediction` and `observation` in (who sits in which slot), `ego-pose` out.
+
+use std::{collections::BTreeMap, sync::Arc};
+
+use ipc_schema::{
+    block::{self, BlockError, Section},
+    ego::EgoPose,
+    failure::{Failure, FailureKind},
+    header::MessageHeader,
+    observation::{EMPTY_SLOT, ObservationLayout},
+    ports::{Message, PortError, Publisher, Subscriber, Waker},
+    process::Process,
+    services::Channel,
+    session::{Session, Wait},
+    traffic::{Kind, RoutePoint, SignalMeta, VehicleMeta},
+    world::{HeroView, VehicleState, WorldLayout},
+};
+
+use crate::{
+    driving::{Account, Driving, Refusal},
+    mirror::Mirror,
+    scene::Scene,
+};
+
+/// Numbers of an action: steering and acceleration.
+const ACTION_COLUMNS: u32 = 2;
+
+/// Heroes, and the ports that drive them.
+#[derive(Debug)]
+pub struct Actions {
+    driving: Driving<Arc<Scene>>,
+    /// SUMO's ids of the heroes of this episode, by dense index.
+    ids: BTreeMap<u32, String>,
+    predictions: Subscriber,
+    observations: Subscriber,
+    poses: Publisher,
+    bridge_wake: Waker,
+}
+
+impl Actions {
+    /// Opens the ports, before the process is attached: the trainer's first answer cannot be missed.
+    ///
+    /// # Errors
+    /// A service cannot be opened.
+    pub fn open(session: &mut Session, scene: Arc<Scene>) -> Result<Self, Failure> {
+        Ok(Self {
+            ids: BTreeMap::new(),
+            driving: Driving::new(&session.run.config, scene),
+            predictions: session.subscriber(Channel::Prediction)?,
+            observations: session.subscriber(Channel::Observation)?,
+            poses: session.publisher(Channel::EgoPose)?,
+            bridge_wake: session.waker(Process::TrafficBridge)?,
+        })
+    }
+
+    /// What became of the heroes so far.
+    #[must_use]
+    pub fn account(&self) -> Account {
+        self.driving.account()
+    }
+
+    /// Takes points of routes.
+    pub fn add_route(&mut self, header: &MessageHeader, points: &[RoutePoint]) {
+        self.driving.enter_episode(header.episode);
+        self.driving.add_route(points);
+    }
+
+    /// Takes who came, and states of traffic lights.
+    pub fn add_metas(&mut self, header: &MessageHeader, metas: &[VehicleMeta], signals: &[SignalMeta]) {
+        self.driving.enter_episode(header.episode);
+        for meta in metas.iter().filter(|meta| meta.kind == Kind::Hero as u32) {
+            self.ids.insert(meta.vehicle, meta.id_text());
+        }
+        self.driving.add_signals(signals);
+    }
+
+    /// Waits for the answer to the observation before the tick of `frame`, and asks the heroes for what it says.
+    ///
+    /// # Errors
+    /// A port fails, or the answer is not one of actions.
+    pub fn take(&mut self, session: &Session, frame: &MessageHeader, mirror: &mut Mirror) -> Result<Wait, Failure> {
+        self.driving.enter_episode(frame.episode);
+        let Some(before) = frame.tick.checked_sub(1) else {
+            return Ok(Wait::Ready);
+        };
+        let Some(answer) = next(session, &self.predictions, Channel::Prediction, before)? else {
+            return Ok(Wait::Stopped);
+        };
+        let Some(question) = next(session, &self.observations, Channel::Observation, before)? else {
+            return Ok(Wait::Stopped);
+        };
+        // The heroes of the episode before went with it.
+        if question.header().episode == frame.episode {
+            let actions = actions(&answer, question.header().count)?;
+            let vehicles = vehicles(&question).map_err(unreadable)?;
+            for (vehicle, action) in vehicles
+                .iter()
+                .zip(actions)
+                .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT)
+            {
+                let (input, refusal) = self.driving.act(*vehicle, *action);
+                mirror.ask(*vehicle, input);
+                if let Some(Refusal { part, value, held }) = refusal {
+                    let (id, tick) = (self.ids.get(vehicle).map_or("", String::as_str), frame.tick);
+                    tracing::warn!(
+                        "hero {id}, tick {tick}: {part} {value} is not a number in -1 … 1; {held:?} is held; further refusals of this hero are counted only"
+                    );
+                }
+            }
+        }
+        Ok(Wait::Ready)
+    }
+
+    /// Ends the heroes' tick in the `world` message; where they are for SUMO.
+    ///
+    /// # Errors
+    /// The payload is too short.
+    pub fn end_tick(&mut self, layout: &WorldLayout, payload: &mut [u8]) -> Result<Vec<EgoPose>, BlockError> {
+        let [states, views] = block::split_mut(payload, &[layout.states, layout.heroes])?;
+        let whole = |section: Section, element: usize| BlockError {
+            actual: section.len,
+            offset: section.offset,
+            len: section.len,
+            element,
+        };
+        let states: &mut [VehicleState] =
+            bytemuck::try_cast_slice_mut(states).map_err(|_| whole(layout.states, size_of::<VehicleState>()))?;
+        let views: &mut [HeroView] =
+            bytemuck::try_cast_slice_mut(views).map_err(|_| whole(layout.heroes, size_of::<HeroView>()))?;
+        Ok(self.driving.end_tick(states, views))
+    }
+
+    /// Tells traffic-bridge where the heroes are; it waits for this after every tick.
+    ///
+    /// # Errors
+    /// The port fails.
+    pub fn send_poses(&self, world: &MessageHeader, poses: &[EgoPose]) -> Result<(), Failure> {
+        let header = MessageHeader {
+            count: u32::try_from(poses.len()).unwrap_or(u32::MAX),
+            columns: 0,
+            sequence: 0,
+            ..*world
+        };
+        let bytes = bytemuck::cast_slice(poses);
+        let mut draft = self.poses.loan(header, bytes.len())?;
+        draft.payload_mut().copy_from_slice(bytes);
+        draft.send()?;
+        self.bridge_wake.wake();
+        Ok(())
+    }
+}
+
+/// The message of `tick`; older ones are passed over. `None` once the process is asked to stop.
+fn next(session: &Session, port: &Subscriber, channel: Channel, tick: u64) -> Result<Option<Message>, Failure> {
+    loop {
+        let Some(message) = session.next(port)? else {
+            return Ok(None);
+        };
+        let received = message.header().tick;
+        if received > tick {
+            return Err(PortError::Gap {
+                channel: channel.name(),
+                expected: tick,
+                received,
+            }
+            .into());
+        }
+        if received == tick {
+            return Ok(Some(message));
+        }
+    }
+}
+
+/// The actions in an answer, one for each slot.
+fn actions(answer: &Message, slots: u32) -> Result<&[[f32; 2]], Failure> {
+    let header = answer.header();
+    if header.columns != ACTION_COLUMNS || header.count != slots {
+        return Err(Failure::new(
+            FailureKind::Run,
+            format!(
+                "tick {}: the trainer sent actions of shape [{}, {}], the task takes [{slots}, {ACTION_COLUMNS}]",
+                header.tick, header.count, header.columns
+            ),
+        )
+        .with_help("answer every observation with steering and acceleration for each of its slots"));
+    }
+    let len = slots as usize * size_of::<[f32; 2]>();
+    block::view(answer.payload(), Section { offset: 0, len }).map_err(unreadable)
+}
+
+fn vehicles(question: &Message) -> Result<&[u32], BlockError> {
+    let header = question.header();
+    let layout = ObservationLayout::new(header.count as usize, header.columns as usize);
+    block::view(question.payload(), layout.vehicle)
+}
+
+fn unreadable(error: BlockError) -> Failure {
+    Failure::from_error(FailureKind::Run, &error)
+}

@@ -1,0 +1,357 @@
+//! The driving task: actions of heroes are checked, their ways along their routes followed, and their episodes ended.
+
+use std::{collections::BTreeMap, sync::Arc};
+
+use ipc_schema::{
+    config,
+    ego::EgoPose,
+    traffic::{Kind, RoutePoint, SIGNAL_LINKS, SignalMeta},
+    world::{
+        ACTION_REFUSED, APPEARED, ARRIVED, COLLIDED, HERO_ENDS, HeroView, OFF_ROAD, ROUTE_AHEAD_M, SIGHT_M, TIME_LIMIT,
+        VehicleState,
+    },
+};
+
+use crate::{
+    hero::{self, Action},
+    route::{Place, Route},
+    scene::Scene,
+    vehicle::Input,
+};
+
+/// A hero is off the road after this long beside it, seconds.
+const OFF_ROAD_AFTER_S: f64 = 0.5;
+/// Its front bumper this near to the end of its route, a hero has arrived, metres.
+const ARRIVED_WITHIN_M: f64 = 5.0;
+/// Part of the route before and behind its last place where a hero is looked for, metres.
+const SEARCH_M: [f64; 2] = [5.0, 20.0];
+/// Room beside a hero and what it meets that still counts as in its way, metres.
+const SIDE_ROOM_M: f64 = 0.2;
+/// Room beside a person.
+const PERSON_ROOM_M: f64 = 0.8;
+
+/// Says whether a place (x, y, world, metres) is on the road.
+pub trait Ground {
+    /// True if vehicles drive there.
+    fn is_on_road(&self, x_m: f64, y_m: f64) -> bool;
+}
+
+impl Ground for Arc<Scene> {
+    fn is_on_road(&self, x_m: f64, y_m: f64) -> bool {
+        Scene::is_on_road(self, x_m, y_m)
+    }
+}
+
+/// What became of heroes and their actions, for the run's report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+pub struct Account {
+    /// Episodes of heroes that began.
+    pub episodes: u64,
+    /// Ended by a collision.
+    pub collided: u64,
+    /// Ended beside the road.
+    pub off_road: u64,
+    /// Ended at the end of the route.
+    pub arrived: u64,
+    /// Cut by the time limit.
+    pub time_limit: u64,
+    /// Actions that were refused: no numbers, or out of range.
+    pub refused_actions: u64,
+}
+
+/// An action that was refused.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Refusal {
+    /// "steering" or "acceleration".
+    pub part: &'static str,
+    /// What was asked.
+    pub value: f32,
+    /// The action that is held instead.
+    pub held: Action,
+}
+
+/// One hero's episode.
+#[derive(Debug, Default)]
+struct Trip {
+    route: Route,
+    /// Station of the rear axle, metres; `None` before the first tick.
+    station_m: Option<f64>,
+    action: Action,
+    refused: bool,
+    told: bool,
+    off_road_ticks: u32,
+    ticks: u64,
+    over: bool,
+}
+
+/// All heroes of the current episode.
+#[derive(Debug)]
+pub struct Driving<G> {
+    ground: G,
+    limits: config::Vehicle,
+    off_road_ticks: u32,
+    time_limit_ticks: u64,
+    episode: Option<u64>,
+    trips: BTreeMap<u32, Trip>,
+    /// Letters of each traffic light's links.
+    signals: BTreeMap<u32, [u8; SIGNAL_LINKS]>,
+    account: Account,
+}
+
+impl<G: Ground> Driving<G> {
+    /// No heroes yet.
+    #[must_use]
+    pub fn new(config: &config::Config, ground: G) -> Self {
+        let ticks = |seconds: f64| libm::round(seconds / config.run.tick_s).max(1.0);
+        Self {
+            ground,
+            limits: config.vehicle.clone(),
+            off_road_ticks: ticks(OFF_ROAD_AFTER_S) as u32,
+            time_limit_ticks: ticks(config.task.time_limit_s) as u64,
+            episode: None,
+            trips: BTreeMap::new(),
+            signals: BTreeMap::new(),
+            account: Account::default(),
+        }
+    }
+
+    /// What became of the heroes so far.
+    #[must_use]
+    pub fn account(&self) -> Account {
+        self.account
+    }
+
+    /// Forgets everything when a new episode begins.
+    pub fn enter_episode(&mut self, episode: u64) {
+        if self.episode != Some(episode) {
+            self.episode = Some(episode);
+            self.trips.clear();
+            self.signals.clear();
+        }
+    }
+
+    /// Takes points of routes; a point with number 0 begins one.
+    pub fn add_route(&mut self, points: &[RoutePoint]) {
+        for point in points {
+            let trip = self.trips.entry(point.vehicle).or_default();
+            if point.index == 0 {
+                trip.route = Route::default();
+            }
+            trip.route.push(point);
+        }
+    }
+
+    /// Takes states of traffic lights.
+    pub fn add_signals(&mut self, signals: &[SignalMeta]) {
+        for signal in signals {
+            self.signals.insert(signal.signal, signal.state);
+        }
+    }
+
+    /// Takes the action for the hero `vehicle` and returns what it asks for. What cannot be used is refused and counted: the
+    /// last valid action is held. The first refusal in a hero's episode is returned, to be told.
+    pub fn act(&mut self, vehicle: u32, action: Action) -> (Input, Option<Refusal>) {
+        let trip = self.trips.entry(vehicle).or_default();
+        let mut refusal = None;
+        match hero::fault(action) {
+            None => trip.action = action,
+            Some((part, value)) => {
+                trip.refused = true;
+                self.account.refused_actions += 1;
+                if !std::mem::replace(&mut trip.told, true) {
+                    refusal = Some(Refusal {
+                        part,
+                        value,
+                        held: trip.action,
+                    });
+                }
+            }
+        }
+        (hero::input(trip.action, &self.limits), refusal)
+    }
+
+    /// Ends a tick, after everybody has moved and contacts are known: sets the flags of heroes in `states`, fills `views` (one
+    /// for each hero, in their order) and returns where they are for SUMO.
+    pub fn end_tick(&mut self, states: &mut [VehicleState], views: &mut [HeroView]) -> Vec<EgoPose> {
+        let mut poses = Vec::new();
+        let heroes: Vec<usize> = (0..states.len())
+            .filter(|&row| states[row].kind == Kind::Hero as u32)
+            .collect();
+        for (&row, view) in heroes.iter().zip(views) {
+            let (mut trip, vehicle) = (
+                self.trips.remove(&states[row].vehicle).unwrap_or_default(),
+                states[row].vehicle,
+            );
+            let station_m = trip.follow(&states[row]);
+            *view = self.view(&trip.route, station_m, row, states);
+            let flags = self.judge(&mut trip, &states[row], view);
+            states[row].flags |= flags;
+            poses.push(pose(&states[row]));
+            self.trips.insert(vehicle, trip);
+        }
+        poses
+    }
+
+    /// Flags of a hero at the end of a tick: why its episode ends, and whether its action was refused.
+    fn judge(&mut self, trip: &mut Trip, state: &VehicleState, view: &HeroView) -> u32 {
+        let account = &mut self.account;
+        account.episodes += u64::from(state.flags & APPEARED != 0);
+        let on_road = [0.0, front_m(state)].iter().all(|ahead_m| {
+            let [x_m, y_m] = ahead(state, *ahead_m);
+            self.ground.is_on_road(x_m, y_m)
+        });
+        trip.off_road_ticks = if on_road { 0 } else { trip.off_road_ticks + 1 };
+        trip.ticks += 1;
+        let has_route = trip.route.length_m() > 0.0;
+        let mut flags = if std::mem::take(&mut trip.refused) {
+            ACTION_REFUSED
+        } else {
+            0
+        };
+        for (bit, holds) in [
+            (OFF_ROAD, trip.off_road_ticks >= self.off_road_ticks),
+            (ARRIVED, has_route && f64::from(view.route_left_m) <= ARRIVED_WITHIN_M),
+        ] {
+            flags |= if holds { bit } else { 0 };
+        }
+        // What has ended by itself is not cut.
+        if (flags | state.flags) & HERO_ENDS == 0 && trip.ticks >= self.time_limit_ticks {
+            flags |= TIME_LIMIT;
+        }
+        let ends = (flags | state.flags) & HERO_ENDS;
+        if ends != 0 && !std::mem::replace(&mut trip.over, true) {
+            account.collided += u64::from(ends & COLLIDED != 0);
+            account.off_road += u64::from(ends & OFF_ROAD != 0);
+            account.arrived += u64::from(ends & ARRIVED != 0);
+            account.time_limit += u64::from(ends & TIME_LIMIT != 0);
+        }
+        flags
+    }
+
+    /// What the hero in `row` sees at `station_m` of its route.
+    fn view(&self, route: &Route, station_m: f64, row: usize, states: &[VehicleState]) -> HeroView {
+        let hero = &states[row];
+        let (sin, cos) = libm::sincos(hero.yaw_rad);
+        let seen = |[x, y]: [f64; 2]| {
+            let (dx, dy) = (x - hero.x_m, y - hero.y_m);
+            [(cos * dx + sin * dy) as f32, (cos * dy - sin * dx) as f32]
+        };
+        let straight = |ahead_m: f64| [hero.x_m + ahead_m * cos, hero.y_m + ahead_m * sin];
+        let front_station_m = station_m + front_m(hero);
+        let here = route
+            .project([hero.x_m, hero.y_m], station_m, station_m)
+            .unwrap_or_default();
+        let (leader_gap_m, leader_speed_mps) = leader(route, station_m, row, states);
+        HeroView {
+            route_m: ROUTE_AHEAD_M.map(|ahead_m| seen(route.at(station_m + ahead_m).unwrap_or(straight(ahead_m)))),
+            speed_limit_mps: route.speed_limit_mps(station_m),
+            route_offset_m: -here.left_m as f32,
+            route_left_m: (route.length_m() - front_station_m).max(0.0) as f32,
+            leader_gap_m: leader_gap_m as f32,
+            leader_speed_mps: leader_speed_mps as f32,
+            signal_gap_m: self.signal_gap_m(route, front_station_m) as f32,
+            vehicle: hero.vehicle,
+            reserved: 0,
+        }
+    }
+
+    /// Way to the next stop line that is not green, metres.
+    fn signal_gap_m(&self, route: &Route, front_station_m: f64) -> f64 {
+        let is_closed = |signal: u32, link: u32| {
+            let letter = self.signals.get(&signal).and_then(|links| links.get(link as usize));
+            letter.is_some_and(|letter| matches!(letter, b'r' | b'R' | b'y' | b'Y' | b'u'))
+        };
+        route
+            .stop_lines()
+            .iter()
+            .filter(|stop| stop.station_m >= front_station_m && is_closed(stop.signal, stop.link))
+            .map(|stop| stop.station_m - front_station_m)
+            .fold(SIGHT_M, f64::min)
+    }
+}
+
+impl Trip {
+    /// Follows the hero along its route; the station of its rear axle, metres.
+    fn follow(&mut self, state: &VehicleState) -> f64 {
+        let point = [state.x_m, state.y_m];
+        let (from_m, to_m) = match self.station_m {
+            Some(station_m) => (station_m - SEARCH_M[0], station_m + SEARCH_M[1]),
+            None => (0.0, self.route.first_edge_m()),
+        };
+        if let Some(place) = self.route.project(point, from_m, to_m) {
+            self.station_m = Some(place.station_m);
+        }
+        self.station_m.unwrap_or(0.0)
+    }
+}
+
+/// Gap to and speed of the next road user in the way of the hero in `row`: metres, m/s.
+fn leader(route: &Route, station_m: f64, row: usize, states: &[VehicleState]) -> (f64, f64) {
+    let hero = &states[row];
+    let front_station_m = station_m + front_m(hero);
+    let mut found = (SIGHT_M, 0.0);
+    for (number, other) in states.iter().enumerate() {
+        let reach_m = SIGHT_M + f64::from(hero.length_m + other.length_m);
+        if number == row || libm::hypot(other.x_m - hero.x_m, other.y_m - hero.y_m) > reach_m {
+            continue;
+        }
+        let is_person = other.kind == Kind::Person as u32;
+        let room_m = if is_person { PERSON_ROOM_M } else { SIDE_ROOM_M };
+        let corridor_m = 0.5 * f64::from(hero.width_m + other.width_m) + room_m;
+        let in_the_way = spine(other).into_iter().filter_map(|point| {
+            let place = route.project(point, station_m, front_station_m + SIGHT_M)?;
+            (place.left_m.abs() < corridor_m && place.station_m > station_m + 0.5 * front_m(hero)).then_some(place)
+        });
+        for place in in_the_way {
+            let gap_m = (place.station_m - front_station_m).max(0.0);
+            if gap_m < found.0 {
+                found = (gap_m, speed_along(other, &place));
+            }
+        }
+    }
+    found
+}
+
+/// Rear, middle and front of a road user on its centre line.
+fn spine(state: &VehicleState) -> [[f64; 2]; 3] {
+    let rear_m = if state.kind == Kind::Person as u32 {
+        -0.5 * f64::from(state.length_m)
+    } else {
+        -f64::from(state.rear_overhang_m)
+    };
+    [0.0, 0.5, 1.0].map(|share| ahead(state, rear_m + share * f64::from(state.length_m)))
+}
+
+fn speed_along(state: &VehicleState, place: &Place) -> f64 {
+    let (sin, cos) = libm::sincos(state.yaw_rad);
+    let [forward, left, _] = state.velocity_body_mps.map(f64::from);
+    let (vx, vy) = (cos * forward - sin * left, sin * forward + cos * left);
+    vx * place.direction[0] + vy * place.direction[1]
+}
+
+/// From the rear axle to the front bumper, metres.
+fn front_m(state: &VehicleState) -> f64 {
+    f64::from(state.length_m - state.rear_overhang_m)
+}
+
+/// The point `ahead_m` in front of the origin.
+fn ahead(state: &VehicleState, ahead_m: f64) -> [f64; 2] {
+    let (sin, cos) = libm::sincos(state.yaw_rad);
+    [state.x_m + ahead_m * cos, state.y_m + ahead_m * sin]
+}
+
+fn pose(state: &VehicleState) -> EgoPose {
+    let [front_x_m, front_y_m] = ahead(state, front_m(state));
+    EgoPose {
+        front_x_m,
+        front_y_m,
+        yaw_rad: state.yaw_rad,
+        speed_mps: f64::from(state.velocity_body_mps[0]),
+        accel_mps2: f64::from(state.accel_body_mps2[0]),
+        vehicle: state.vehicle,
+        flags: state.flags & HERO_ENDS,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,190 @@
+use ipc_schema::traffic::{NO_SIGNAL, RoutePoint};
+
+use super::*;
+
+/// A road along x, 4 m wide.
+#[derive(Debug)]
+struct Strip;
+
+impl Ground for Strip {
+    fn is_on_road(&self, _: f64, y_m: f64) -> bool {
+        y_m.abs() < 2.0
+    }
+}
+
+fn config() -> config::Config {
+    let text = include_str!("../../../ipc-schema/tests/town.json");
+    let mut config: config::Config = serde_json::from_str(text).unwrap();
+    config.task.kind = config::TaskKind::Driving;
+    config.task.time_limit_s = 2.0;
+    config
+}
+
+/// One hero (index 3) on a straight route of 200 m with a stop line at 100 m.
+fn driving() -> Driving<Strip> {
+    let mut driving = Driving::new(&config(), Strip);
+    driving.enter_episode(0);
+    let points: Vec<RoutePoint> = [0.0, 100.0, 200.0]
+        .into_iter()
+        .zip(0_u32..)
+        .map(|(x_m, index)| RoutePoint {
+            x_m,
+            speed_limit_mps: 10.0,
+            vehicle: 3,
+            index,
+            signal: if index == 1 { 5 } else { NO_SIGNAL },
+            link: 2,
+            ..RoutePoint::default()
+        })
+        .collect();
+    driving.add_route(&points);
+    driving
+}
+
+fn car(vehicle: u32, kind: Kind, x_m: f64, y_m: f64) -> VehicleState {
+    VehicleState {
+        x_m,
+        y_m,
+        vehicle,
+        kind: kind as u32,
+        length_m: 5.0,
+        width_m: 1.8,
+        rear_overhang_m: 1.0,
+        velocity_body_mps: [7.0, 0.0, 0.0],
+        ..VehicleState::default()
+    }
+}
+
+fn tick(driving: &mut Driving<Strip>, states: &mut [VehicleState]) -> (HeroView, EgoPose) {
+    let mut views = [HeroView::default()];
+    let poses = driving.end_tick(states, &mut views);
+    (views[0], poses[0])
+}
+
+#[test]
+fn a_hero_sees_its_route_what_is_on_it_and_the_signal() {
+    let mut driving = driving();
+    let mut letters = [0; SIGNAL_LINKS];
+    letters[2] = b'r';
+    let signal = |state| SignalMeta {
+        signal: 5,
+        links: 3,
+        state,
+        ..bytemuck::Zeroable::zeroed()
+    };
+    driving.add_signals(&[signal(letters)]);
+    // Another on its route 30 m ahead, one beside it, one behind it.
+    let mut states = [
+        car(1, Kind::Other, 41.0, 0.5),
+        car(2, Kind::Cav, 25.0, 3.2),
+        car(3, Kind::Hero, 10.0, -1.0),
+        car(4, Kind::Other, 0.0, 0.0),
+    ];
+    let (view, pose) = tick(&mut driving, &mut states);
+    assert_eq!(view.vehicle, 3);
+    assert_eq!(view.route_m, [[5.0, 1.0], [10.0, 1.0], [20.0, 1.0], [40.0, 1.0]]);
+    assert_eq!(
+        (view.speed_limit_mps, view.route_offset_m, view.route_left_m),
+        (10.0, 1.0, 186.0)
+    );
+    // Rear bumper of the leader at 40 m, front bumper of the hero at 14 m.
+    assert_eq!((view.leader_gap_m, view.leader_speed_mps), (26.0, 7.0));
+    assert_eq!(view.signal_gap_m, 86.0);
+    assert_eq!(
+        (pose.front_x_m, pose.front_y_m, pose.vehicle, pose.flags),
+        (14.0, -1.0, 3, 0)
+    );
+    letters[2] = b'G';
+    driving.add_signals(&[signal(letters)]);
+    let (view, _) = tick(&mut driving, &mut states[2..3]);
+    assert_eq!(
+        (view.signal_gap_m, view.leader_gap_m, view.leader_speed_mps),
+        (100.0, 100.0, 0.0)
+    );
+}
+
+#[test]
+fn off_the_road_for_half_a_second_arrival_and_time_end_the_episode_each_with_its_flag() {
+    let mut off = driving();
+    let flags: Vec<u32> = (0..5)
+        .map(|_| tick(&mut off, &mut [car(3, Kind::Hero, 10.0, 2.5)]).1.flags)
+        .collect();
+    assert_eq!(flags, [0, 0, 0, 0, OFF_ROAD]);
+    // Back on the road in between: the time begins anew.
+    let mut back = driving();
+    for y_m in [2.5, 2.5, 2.5, 0.0, 2.5, 2.5] {
+        assert_eq!(tick(&mut back, &mut [car(3, Kind::Hero, 10.0, y_m)]).1.flags, 0);
+    }
+    let mut arriving = driving();
+    for x_m in [
+        50.0_f64, 65.0, 80.0, 95.0, 110.0, 125.0, 140.0, 155.0, 170.0, 185.0, 190.0,
+    ] {
+        assert_eq!(
+            tick(&mut arriving, &mut [car(3, Kind::Hero, x_m, 0.0)]).1.flags,
+            0,
+            "{x_m}"
+        );
+    }
+    assert_eq!(
+        tick(&mut arriving, &mut [car(3, Kind::Hero, 191.5, 0.0)]).1.flags,
+        ARRIVED
+    );
+    let mut waiting = driving();
+    let flags: Vec<u32> = (0..20)
+        .map(|_| tick(&mut waiting, &mut [car(3, Kind::Hero, 10.0, 0.0)]).1.flags)
+        .collect();
+    assert_eq!((flags[18], flags[19]), (0, TIME_LIMIT));
+    let account = |driving: &Driving<Strip>| {
+        let Account {
+            off_road,
+            arrived,
+            time_limit,
+            collided,
+            ..
+        } = driving.account();
+        [off_road, arrived, time_limit, collided]
+    };
+    assert_eq!(
+        (account(&off), account(&arriving), account(&waiting)),
+        ([1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0])
+    );
+}
+
+#[test]
+fn a_collision_ends_the_episode_and_what_has_ended_is_not_cut() {
+    let mut driving = driving();
+    for _ in 0..19 {
+        tick(&mut driving, &mut [car(3, Kind::Hero, 10.0, 0.0)]);
+    }
+    let mut states = [VehicleState {
+        flags: COLLIDED,
+        ..car(3, Kind::Hero, 10.0, 0.0)
+    }];
+    assert_eq!(tick(&mut driving, &mut states).1.flags, COLLIDED);
+    assert_eq!(driving.account().collided, 1);
+}
+
+#[test]
+fn a_refused_action_is_flagged_counted_told_once_and_the_last_valid_one_is_held() {
+    let mut driving = driving();
+    let (good, refusal) = driving.act(3, [0.5, -0.5]);
+    assert_eq!(refusal, None);
+    assert_eq!((good.road_wheel_angle_rad, good.accel_mps2), (0.5 * 0.6, -0.5 * 9.0));
+    assert_eq!(tick(&mut driving, &mut [car(3, Kind::Hero, 10.0, 0.0)]).0.vehicle, 3);
+    for (action, told) in [
+        ([0.0, f32::NAN], true),
+        ([2.0, 0.0], false),
+        ([f32::INFINITY, 0.0], false),
+    ] {
+        let (held, refusal) = driving.act(3, action);
+        assert_eq!(held, good);
+        assert_eq!(refusal.is_some(), told, "{refusal:?}");
+        let mut states = [car(3, Kind::Hero, 10.0, 0.0)];
+        tick(&mut driving, &mut states);
+        assert_eq!(states[0].flags, ACTION_REFUSED);
+    }
+    let mut states = [car(3, Kind::Hero, 10.0, 0.0)];
+    driving.act(3, [0.0, 1.0]);
+    tick(&mut driving, &mut states);
+    assert_eq!((states[0].flags, driving.account().refused_actions), (0, 3));
+}
