@@ -193,7 +193,12 @@ pub struct Subscriber {
 }
 
 impl Subscriber {
-    pub(crate) fn create(service: &DataService, channel: Channel, run: &RunFile) -> Result<Self, PortError> {
+    /// The receiving end of an opened service: for whoever watches a run without taking part in it. It may miss messages, and
+    /// holds nobody up.
+    ///
+    /// # Errors
+    /// iceoryx2 refuses.
+    pub fn create(service: &DataService, channel: Channel, run: &RunFile) -> Result<Self, PortError> {
         let port = service
             .subscriber_builder()
             .create()
@@ -374,12 +379,15 @@ impl Waker {
     }
 }
 
+/// The socket below counts in microseconds and takes zero of them for ever.
+const SHORTEST_WAIT: Duration = Duration::from_micros(10);
+
 /// Waits until somebody wakes this process or `timeout` has passed. Look for work before waiting, and again after.
 ///
 /// # Errors
 /// The listener is broken.
 pub fn wait(listener: &WakeListener, timeout: Duration) -> Result<(), PortError> {
-    match listener.timed_wait(|_| (), timeout) {
+    match listener.timed_wait(|_| (), timeout.max(SHORTEST_WAIT)) {
         // A signal ends the wait early, like a wake-up: the caller looks at its stop flag.
         Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
         Err(error) => Err(refused("wake", "waiting")(&error)),

@@ -220,6 +220,18 @@ fn a_board_outlives_its_writer_and_a_wake_up_is_not_lost() {
     corner.join(Process::Trainer);
 }
 
+/// The socket below takes zero microseconds for ever.
+#[test]
+fn a_wait_of_less_than_a_microsecond_ends() {
+    let run = Corner::new(11);
+    let session = run.join(Process::Trainer);
+    let begin = std::time::Instant::now();
+    for nanoseconds in [0, 1, 999, 1_001] {
+        session.wait(Duration::from_nanos(nanoseconds)).unwrap();
+    }
+    assert!(begin.elapsed() < Duration::from_secs(5));
+}
+
 #[test]
 fn a_process_without_its_supervisor_does_not_start() {
     let corner = Corner::new(6);

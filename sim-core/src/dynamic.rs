@@ -43,6 +43,8 @@ pub(crate) const LEAST_LOAD_MPS2: f64 = 0.5;
 pub(crate) const RESTING: f64 = 0.02;
 /// Square of the lateral force that is always left, m²/s⁴.
 const LEAST_FORCE_SQUARED: f64 = 1e-4;
+/// Share of the cornering resistance that the driver makes up for: all up to a sideslip of 0.1 at the rear axle, none from 0.25.
+const SLIDE: [f64; 2] = [5.0 / 3.0, 20.0 / 3.0];
 /// γ of ROS2: 1 − 1/√2.
 const GAMMA: f64 = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
 
@@ -261,19 +263,15 @@ impl DynamicParams {
         );
         let wheels = self.wheels(state, &before, angle, loads, level, dt_s);
         let start = self.forces(&wheels, &before);
-        // What cornering costs, and the driver makes up for.
+        // What cornering costs. The driver makes up for it, but not for what a slide costs.
         let cornering = start.lateral_front_mps2 * wheels.sin - before.yaw_rate_radps * before.lateral_mps;
-        let straight = wanted + resistance;
-        // Nobody accelerates through a slide while braking.
-        let asked = pick(
-            input.accel_mps2 < 0.0,
-            smaller(straight + cornering, larger(straight, 0.0)),
-            straight + cornering,
-        );
-        let [front, rear] = self.axle_forces(self.force(wheels.inverse_mps[1], asked, resistance), loads);
+        let slide = state.lateral_mps.abs() * smaller(wheels.inverse_mps[1], 0.5);
+        let made_up = cornering * bound(SLIDE[0] - SLIDE[1] * slide, 0.0, 1.0);
+        let asked = self.force(wheels.inverse_mps[1], wanted + resistance + made_up, resistance);
+        let [front, rear] = self.axle_forces(asked, loads);
         let accel = front * wheels.cos + rear - cornering - resistance;
         // What the driver gets is the actuator's state; the losses beyond it are not, or they would add up.
-        let got = front + rear - cornering - resistance;
+        let got = front + rear - made_up - resistance;
         let speed = state.speed_mps + (accel - 0.5 * (got - state.accel_mps2)) * dt_s;
         let stands = (speed <= 0.0) | ((speed < STANDSTILL_MPS) & (input.accel_mps2 <= 0.0));
         let after = self.slip_after(&wheels, &before, &start, dt_s);

@@ -42,7 +42,7 @@ const HOLD_MPS: f64 = 0.05;
 /// A standing vehicle starts only when its path moves at [`HOLD_MPS`] or is this far ahead, metres.
 const START_M: f64 = 0.5;
 /// Jerk with which a stop ends, m/s³.
-const STOP_JERK_MPS3: f64 = 0.4 * MAX_JERK_MPS3;
+const STOP_JERK_MPS3: f64 = 0.25 * MAX_JERK_MPS3;
 /// Deceleration in the last moment before standstill, m/s².
 const LEAST_STOPPING_MPS2: f64 = 0.1;
 
