@@ -348,14 +348,18 @@ fn the_scripted_driver_drives_laps_of_the_town_the_same_for_the_same_seed() {
         succeed(command);
         workplace.report(name)
     };
-    let report = lap("lap", &["--set", "episode.ticks=1600"]);
-    let heroes = &report["dynamics"]["heroes"];
-    assert!(heroes["arrived"].as_u64().unwrap() >= 1, "{heroes}");
-    assert_eq!(
-        (&heroes["off_road"], &heroes["collided"], &heroes["time_limit"]),
-        (&0.into(), &0.into(), &0.into())
-    );
-    assert_eq!(heroes["refused_actions"], 0);
+    for model in ["kinematic", "dynamic", "rigid_body"] {
+        let chosen = format!("vehicle.hero_model=\"{model}\"");
+        let report = lap(model, &["--set", "episode.ticks=1600", "--set", &chosen]);
+        let heroes = &report["dynamics"]["heroes"];
+        assert!(heroes["arrived"].as_u64().unwrap() >= 1, "{model}: {heroes}");
+        assert_eq!(
+            (&heroes["off_road"], &heroes["collided"], &heroes["time_limit"]),
+            (&0.into(), &0.into(), &0.into()),
+            "{model}"
+        );
+        assert_eq!(heroes["refused_actions"], 0, "{model}");
+    }
     let again = |name: &str, more: &[&str]| {
         lap(name, &[&["--set", "episode.ticks=300"], more].concat())["observation_hash"].clone()
     };

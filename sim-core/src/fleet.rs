@@ -11,6 +11,7 @@ use crate::{
     dimensions::Dimensions,
     dynamic::DynamicParams,
     parameters::{Catalogue, ParameterError},
+    rigid_body::RigidBody,
     vehicle::{KinematicParams, Model},
 };
 
@@ -50,11 +51,11 @@ pub struct Built {
     pub dimensions: Dimensions,
 }
 
-/// The same for all vehicles that share it: parameter set, model and size (bits of length, width and height).
-type Key = (usize, bool, [u32; 3]);
+/// The same for all vehicles that share it: parameter set, model, and size (bits of length, width and height).
+type Key = (usize, u8, [u32; 3]);
 
 /// All models of a run, one for each kind and size of vehicle.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Fleet {
     catalogue: Catalogue,
     limits: config::Vehicle,
@@ -63,6 +64,8 @@ pub struct Fleet {
     sub_step_s: f64,
     built: Vec<Built>,
     places: BTreeMap<Key, u32>,
+    /// rapier's worlds, for the places whose model they are.
+    bodies: BTreeMap<u32, RigidBody>,
     /// Classes that no set lists, and whether that has been told.
     unknown: BTreeMap<String, bool>,
 }
@@ -82,6 +85,7 @@ impl Fleet {
             sub_step_s,
             built: Vec::new(),
             places: BTreeMap::new(),
+            bodies: BTreeMap::new(),
             unknown: BTreeMap::new(),
         })
     }
@@ -93,24 +97,40 @@ impl Fleet {
         if !choice.known && meta.kind != Kind::Person as u32 {
             self.unknown.entry(class.clone()).or_insert(false);
         }
-        let dynamic = self.model_of(&class, meta.kind) != VehicleModel::Kinematic;
+        let model = self.model_of(&class, meta.kind);
         let size = [meta.length_m, meta.width_m, meta.height_m];
-        let key = (choice.set, dynamic, size.map(f32::to_bits));
+        let key = (choice.set, model as u8, size.map(f32::to_bits));
         if let Some(place) = self.places.get(&key) {
             return *place;
         }
         let place = self.built.len() as u32;
         let [length, width, height] = size.map(f64::from);
-        self.built
-            .push(self.build(choice.set, dynamic, [length, width, height]));
+        let built = self.build(choice.set, model, [length, width, height]);
+        if model == VehicleModel::RigidBody {
+            self.add_body(place, choice.set, &built.dimensions);
+        }
+        self.built.push(built);
         self.places.insert(key, place);
         place
     }
 
-    fn build(&self, set: usize, dynamic: bool, [length, width, height]: [f64; 3]) -> Built {
+    /// Two-wheelers stay with the dynamic model: four wheels do not lean into a bend.
+    fn add_body(&mut self, place: u32, set: usize, size: &Dimensions) {
+        let set = &self.catalogue.sets()[set];
+        if let Ok(body) = RigidBody::new(set, size, &self.limits, self.surface, self.sub_step_s) {
+            self.bodies.insert(place, body);
+        }
+    }
+
+    /// The model at a place and, if it is that of a rigid body, rapier's world for it.
+    pub fn with_body(&mut self, place: u32) -> (&Built, Option<&mut RigidBody>) {
+        (&self.built[place as usize], self.bodies.get_mut(&place))
+    }
+
+    fn build(&self, set: usize, model: VehicleModel, [length, width, height]: [f64; 3]) -> Built {
         let set = &self.catalogue.sets()[set];
         let dimensions = set.dimensions(length, width, height);
-        let model = if dynamic {
+        let model = if model != VehicleModel::Kinematic {
             Model::Dynamic(DynamicParams::new(
                 set,
                 &dimensions,

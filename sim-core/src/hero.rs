@@ -11,6 +11,7 @@ use ipc_schema::{
 use crate::{
     attitude::{Lean, angular_rate, body_from_level, half_way},
     fleet::Built,
+    rigid_body::{RigidBody, RigidState},
     vehicle::{Input, Model, Motion, State},
 };
 
@@ -51,6 +52,8 @@ pub fn fault(action: Action) -> Option<(&'static str, f32)> {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hero {
     state: State,
+    /// What a rigid body has beside it: heave and its rate (m, m/s), and the actuator's acceleration (m/s²).
+    beside: [f64; 3],
     input: Input,
 }
 
@@ -58,6 +61,7 @@ impl Default for Hero {
     fn default() -> Self {
         Self {
             state: State::new(0.0, 0.0, 0.0, 0.0),
+            beside: [0.0; 3],
             input: Input::default(),
         }
     }
@@ -74,7 +78,7 @@ impl Hero {
         let (yaw_rad, speed_mps) = (f64::from(now.yaw_rad), f64::from(now.speed_mps));
         let mut state = State::new(now.front_x_m, now.front_y_m, yaw_rad, speed_mps);
         [state.x_m, state.y_m] = state.point_ahead(-front_m);
-        self.state = state;
+        (self.state, self.beside) = (state, [0.0; 3]);
         rows.fill(SubStep {
             speed_mps: now.speed_mps,
             pitch_rad: now.pitch_rad,
@@ -86,7 +90,7 @@ impl Hero {
     /// Moves through one tick. Height and slope are those of the road under SUMO's copy of it, `[before, now]`.
     pub fn advance(
         &mut self,
-        model: &Model,
+        (model, mut body): (&Model, Option<&mut RigidBody>),
         [before, now]: [&TrafficState; 2],
         front_m: f64,
         sub_step_s: f64,
@@ -99,7 +103,10 @@ impl Hero {
         let mut states = Vec::with_capacity(rows.len());
         for (number, row) in rows.iter_mut().enumerate() {
             let from = lean(&self.state, slope(number as f64));
-            let (next, motion) = model.step(&self.state, &self.input, sub_step_s);
+            let (next, motion) = match &mut body {
+                Some(body) => self.step_body(body, libm::sin(slope(number as f64))),
+                None => model.step(&self.state, &self.input, sub_step_s),
+            };
             let to = lean(&next, slope(number as f64 + 1.0));
             *row = sub_step(&next, &motion, [from, to], 1.0 / sub_step_s);
             row.dz_m = (between(before.front_z_m, now.front_z_m, number as f64 + 1.0) - now.front_z_m) as f32;
@@ -113,6 +120,18 @@ impl Hero {
         }
         self.state = self.state.settled();
         self.write(now, front_m, rows, out);
+    }
+
+    fn step_body(&mut self, body: &mut RigidBody, slope_sin: f64) -> (State, Motion) {
+        let [heave_m, heave_mps, drive_mps2] = self.beside;
+        let before = RigidState {
+            level: self.state,
+            heave: [heave_m, heave_mps],
+            drive_mps2,
+        };
+        let (after, motion) = body.step(&before, &self.input, slope_sin);
+        self.beside = [after.heave[0], after.heave[1], after.drive_mps2];
+        (after.level, motion)
     }
 
     fn write(&self, now: &TrafficState, front_m: f64, rows: &[SubStep], out: &mut VehicleState) {

@@ -330,8 +330,8 @@ impl Mirror {
                 self.load(tick, place, row, states, rows);
             } else {
                 let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
-                let built = self.fleet.at(road_user.model());
-                let set = road_user.write_unmoved(tick, &self.settings, built, &mut states[row], sub_steps);
+                let models = self.fleet.with_body(road_user.model());
+                let set = road_user.write_unmoved(tick, &self.settings, models, &mut states[row], sub_steps);
                 self.resynchronisations += u64::from(set);
             }
         }

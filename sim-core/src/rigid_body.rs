@@ -121,6 +121,15 @@ pub struct RigidBody {
     wheels: DynamicRayCastVehicleController,
 }
 
+impl std::fmt::Debug for RigidBody {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("RigidBody")
+            .field("params", &self.params)
+            .field("mass_kg", &self.mass_kg)
+            .finish_non_exhaustive()
+    }
+}
+
 impl RigidBody {
     /// A vehicle of this size with a parameter set, none of its limits above the configured ones, on a road that leaves
     /// `surface` of the friction on dry asphalt, for sub-steps of `dt_s`.

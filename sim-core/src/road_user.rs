@@ -15,6 +15,7 @@ use crate::{
     lanes::{Drive, Lanes},
     person::Person,
     reference::{Join, Path},
+    rigid_body::RigidBody,
     tracking,
     trig::wrap_angle,
     vehicle::{Input, State},
@@ -252,7 +253,7 @@ impl RoadUser {
         &mut self,
         tick: u32,
         settings: &Settings,
-        built: &Built,
+        (built, body): (&Built, Option<&mut RigidBody>),
         out: &mut VehicleState,
         rows: &mut [SubStep],
     ) -> bool {
@@ -278,7 +279,8 @@ impl RoadUser {
                     hero.set(&self.now, front_m, out, rows);
                 } else {
                     let road = [&self.before, &self.now];
-                    hero.advance(&hero::model(built), road, front_m, settings.sub_step_s(), out, rows);
+                    let models = (&hero::model(built), body);
+                    hero.advance(models, road, front_m, settings.sub_step_s(), out, rows);
                 }
             }
             Mover::Vehicle { state, path } => {
