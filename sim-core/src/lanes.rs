@@ -26,6 +26,9 @@ const LONGITUDINAL_SHARE: f64 = 0.85;
 const POWER_SHARE: f64 = 0.8;
 const CURVATURE_SHARE: f64 = 0.9;
 
+/// Time between two demands of a driver, seconds.
+const DEMAND_S: f64 = 0.02;
+
 type Lane = [f64; LANES];
 /// Numbers in a [`State`], a [`Curve`] and a [`Rise`].
 const STATE: usize = size_of::<State>() / 8;
@@ -124,6 +127,8 @@ pub struct Lanes<P, const N: usize> {
     road: [Lane; 3],
     /// x, y, z and yaw at the start of the tick.
     origin: [Lane; 4],
+    /// What the driver asks for: acceleration and road-wheel angle.
+    input: [Lane; 2],
     /// What moved, one for each sub-step.
     pub rows: Vec<Row>,
     model: std::marker::PhantomData<P>,
@@ -155,6 +160,7 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
             params: P::empty().map(|value| [value; LANES]),
             road: [zero; 3],
             origin: [zero; 4],
+            input: [zero; 2],
             rows: vec![[[0.0; LANES]; SUB_STEP]; sub_steps],
             model: std::marker::PhantomData,
         };
@@ -241,8 +247,13 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
     fn advance_here(&mut self, dt_s: f64) {
         let mut rows = std::mem::take(&mut self.rows);
         self.start_road();
+        let between = between_demands(dt_s);
         for (index, row) in rows.iter_mut().enumerate() {
-            self.sub_step(index as f64 * dt_s, dt_s, row);
+            let time_s = index as f64 * dt_s;
+            if index.is_multiple_of(between) {
+                self.ask(time_s);
+            }
+            self.sub_step(time_s, dt_s, row);
         }
         self.rows = rows;
     }
@@ -258,6 +269,16 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
         }
     }
 
+    /// What the drivers of all lanes ask for.
+    #[inline(always)]
+    fn ask(&mut self, time_s: f64) {
+        for lane in 0..LANES {
+            let (state, params): (State, P) = (gather(&self.state, lane), gather(&self.params, lane));
+            let input = params.demand(self.front_m[lane], &state, &self.curve(lane).at(time_s));
+            scatter(&mut self.input, lane, &[input.accel_mps2, input.road_wheel_angle_rad]);
+        }
+    }
+
     /// One sub-step of all lanes: the loop that the compiler turns into vector instructions.
     #[inline(always)]
     fn sub_step(&mut self, time_s: f64, dt_s: f64, row: &mut Row) {
@@ -266,7 +287,11 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
             let params: P = gather(&self.params, lane);
             let front_m = self.front_m[lane];
             let road: [f64; 3] = gather(&self.road, lane);
-            let input = params.demand(front_m, &state, &self.curve(lane).at(time_s));
+            let [accel_mps2, road_wheel_angle_rad] = gather(&self.input, lane);
+            let input = Input {
+                accel_mps2,
+                road_wheel_angle_rad,
+            };
             let (next, motion) = params.step(&state, &input, road[2], dt_s);
             let road_next = road_at(&gather(&self.rise, lane), front_m, time_s + dt_s);
             let felt = Felt::new([&state, &next], [road, road_next], &motion, dt_s);
@@ -296,6 +321,12 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
             }
         }
     }
+}
+
+/// Sub-steps of `dt_s` from one demand of the drivers to the next: they look 50 times a second, as often as a steering actuator
+/// that follows at 20/s needs.
+fn between_demands(dt_s: f64) -> usize {
+    libm::round(DEMAND_S / dt_s).max(1.0) as usize
 }
 
 /// Height of the rear axle above the front bumper's place at the start of the tick, its rate, and the pitch of the road, `time_s`
@@ -414,10 +445,13 @@ mod tests {
         let front_m = case.body.front_m();
         let mut state = case.state;
         let mut slope = road_at(&case.rise, front_m, 0.0)[2];
+        let mut input = Input::default();
         (0..sub_steps)
             .map(|index| {
                 let time_s = index as f64 * 0.01;
-                let input = params.demand(front_m, &state, &case.curve.at(time_s));
+                if index % 2 == 0 {
+                    input = params.demand(front_m, &state, &case.curve.at(time_s));
+                }
                 let (next, motion) = params.step(&state, &input, slope, 0.01);
                 slope = road_at(&case.rise, front_m, time_s + 0.01)[2];
                 state = next;
