@@ -78,6 +78,22 @@ fn obstacle_that_is_no_prop() {
 }
 
 #[test]
+fn vehicle_model_for_no_class() {
+    let workplace = Workplace::new();
+    workplace.write("my.toml", "[vehicle]\nclass_models = [\"truk=dynamic\"]\n");
+    let said = refused(&workplace, &["simulate", "my.toml"], 2);
+    assert_says(
+        &said,
+        &[
+            "my.toml:2",
+            "\"truk=dynamic\"",
+            "no vehicle class",
+            "passenger, private",
+        ],
+    );
+}
+
+#[test]
 fn unknown_preset() {
     let workplace = Workplace::new();
     assert_says(

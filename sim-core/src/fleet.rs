@@ -163,6 +163,12 @@ impl Fleet {
         &self.built[place as usize]
     }
 
+    /// Name of the parameter set that unknown classes get.
+    #[must_use]
+    pub fn default_set(&self) -> &str {
+        &self.catalogue.default_set().name
+    }
+
     /// Vehicle classes met since the last call that no parameter set lists; each comes once in a run.
     pub fn take_unknown(&mut self) -> Vec<String> {
         let untold = self.unknown.iter_mut().filter(|(_, told)| !**told);
@@ -199,4 +205,86 @@ fn class_model(entry: &str) -> Result<(String, VehicleModel), FleetError> {
         return Err(refused());
     }
     Ok((class.to_owned(), model))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn limits() -> config::Vehicle {
+        config::Vehicle {
+            cav_model: VehicleModel::Dynamic,
+            other_model: VehicleModel::Kinematic,
+            hero_model: VehicleModel::RigidBody,
+            class_models: vec!["bus=kinematic".into(), "truck=dynamic".into()],
+            lane_change_s: 3.0,
+            max_road_wheel_angle_rad: 0.6,
+            max_road_wheel_rate_radps: 1.0,
+            max_accel_mps2: 5.0,
+            max_decel_mps2: 9.0,
+            steering_ratio: 15.0,
+            resynchronise_m: 2.0,
+            leave_path_m: 5.0,
+        }
+    }
+
+    fn meta(kind: Kind, class: &str) -> VehicleMeta {
+        let mut meta: VehicleMeta = bytemuck::Zeroable::zeroed();
+        meta.kind = kind as u32;
+        (meta.length_m, meta.width_m, meta.height_m) = (4.5, 1.8, 1.5);
+        meta.vehicle_class[..class.len()].copy_from_slice(class.as_bytes());
+        meta
+    }
+
+    fn dynamic(fleet: &mut Fleet, kind: Kind, class: &str) -> bool {
+        let place = fleet.place(&meta(kind, class));
+        matches!(fleet.at(place).model, Model::Dynamic(_))
+    }
+
+    #[test]
+    fn models_follow_the_role_unless_the_class_says_otherwise() {
+        let mut fleet = Fleet::new(&limits(), Surface::Dry, 0.01).unwrap();
+        assert!(dynamic(&mut fleet, Kind::Cav, "passenger"));
+        assert!(!dynamic(&mut fleet, Kind::Other, "passenger"));
+        assert!(!dynamic(&mut fleet, Kind::Cav, "bus"));
+        assert!(dynamic(&mut fleet, Kind::Other, "truck"));
+        let (hero, motorcycle) = (
+            fleet.place(&meta(Kind::Hero, "passenger")),
+            fleet.place(&meta(Kind::Hero, "moped")),
+        );
+        assert!(fleet.with_body(hero).1.is_some());
+        assert!(fleet.with_body(motorcycle).1.is_none(), "two wheels lean into a bend");
+        assert_eq!(
+            fleet.place(&meta(Kind::Hero, "passenger")),
+            hero,
+            "one world for all of a kind"
+        );
+    }
+
+    #[test]
+    fn an_unknown_class_gets_the_named_default_and_is_told_once() {
+        let mut fleet = Fleet::new(&limits(), Surface::Dry, 0.01).unwrap();
+        let (unknown, sedan) = (
+            fleet.place(&meta(Kind::Cav, "hovercraft")),
+            fleet.place(&meta(Kind::Cav, "passenger")),
+        );
+        assert_eq!(fleet.default_set(), "sedan");
+        assert_eq!(fleet.at(unknown), fleet.at(sedan));
+        fleet.place(&meta(Kind::Other, "hovercraft"));
+        assert_eq!(fleet.take_unknown(), ["hovercraft"]);
+        fleet.place(&meta(Kind::Cav, "hovercraft"));
+        assert!(fleet.take_unknown().is_empty());
+    }
+
+    #[test]
+    fn a_model_for_no_class_is_refused() {
+        for entry in ["bus", "bus=flying", "hovercraft=dynamic"] {
+            let limits = config::Vehicle {
+                class_models: vec![entry.into()],
+                ..limits()
+            };
+            let error = Fleet::new(&limits, Surface::Dry, 0.01).unwrap_err();
+            assert!(error.to_string().contains(entry), "{error}");
+        }
+    }
 }

@@ -162,6 +162,12 @@ impl Mirror {
         &self.tracking
     }
 
+    /// Name of the parameter set that unknown classes get.
+    #[must_use]
+    pub fn default_set(&self) -> &str {
+        self.fleet.default_set()
+    }
+
     /// Vehicle classes met since the last call that no parameter set lists; each comes once in a run.
     pub fn take_unknown_classes(&mut self) -> Vec<String> {
         self.fleet.take_unknown()

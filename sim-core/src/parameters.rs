@@ -177,6 +177,12 @@ impl Catalogue {
         &self.sets
     }
 
+    /// The set for classes that none lists.
+    #[must_use]
+    pub fn default_set(&self) -> &Set {
+        &self.sets[self.default]
+    }
+
     /// The first set that lists SUMO class `class` (UTF-8, zero padded) and admits the length; the last that lists it if none
     /// does; the default if none lists it.
     #[must_use]

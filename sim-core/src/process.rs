@@ -185,7 +185,8 @@ impl Core {
         for class in self.mirror.take_unknown_classes() {
             tracing::warn!(
                 class,
-                "no parameter set lists this vehicle class: the default set is taken"
+                "no parameter set lists this vehicle class: the set `{}` is taken",
+                self.mirror.default_set()
             );
         }
         if let Some(contacts) = &mut self.contacts {

@@ -1,6 +1,6 @@
 //! Rules between keys: rates that must divide each other, sizes that must fit.
 
-use ipc_schema::{config::Config, props::Obstacle};
+use ipc_schema::{config::Config, props::Obstacle, traffic::VEHICLE_CLASSES};
 
 use super::{
     ConfigError, Settings,
@@ -25,6 +25,7 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
             ));
         }
     }
+    check_class_models(settings, config)?;
     let trainer = &config.trainer;
     if trainer.batch_size > trainer.horizon {
         return Err(conflict(
@@ -151,6 +152,27 @@ fn obstacles(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
         }
     }
     Ok(())
+}
+
+/// Entries of `vehicle.class_models` are "class=model" with a vehicle class of SUMO.
+fn check_class_models(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+    let understood = |entry: &str| {
+        entry.split_once('=').is_some_and(|(class, model)| {
+            VEHICLE_CLASSES.contains(&class.trim()) && ["kinematic", "dynamic"].contains(&model.trim())
+        })
+    };
+    match config.vehicle.class_models.iter().find(|entry| !understood(entry)) {
+        None => Ok(()),
+        Some(entry) => Err(conflict(
+            settings,
+            "vehicle.class_models",
+            format!("`vehicle.class_models` has \"{entry}\", which is no vehicle class of SUMO with a model"),
+            format!(
+                "give \"class=kinematic\" or \"class=dynamic\"; the classes are {}",
+                VEHICLE_CLASSES.join(", ")
+            ),
+        )),
+    }
 }
 
 fn is_multiple(value_s: f64, tick_s: f64) -> bool {
