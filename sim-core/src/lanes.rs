@@ -210,8 +210,9 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
         gather(&self.curve, lane)
     }
 
-    /// Tracks all lanes through one tick of `rows.len()` sub-steps, with the widest vectors this machine has.
-    pub fn advance(&mut self, dt_s: f64) {
+    /// Tracks all lanes through one tick of `rows.len()` sub-steps, with the widest vectors this machine has. `meanwhile` is called
+    /// with the number of each sub-step: a place to ask for the memory of the next vehicles.
+    pub fn advance(&mut self, dt_s: f64, meanwhile: &impl Fn(usize)) {
         #[cfg(target_arch = "x86_64")]
         #[expect(
             unsafe_code,
@@ -220,31 +221,31 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
         {
             if std::arch::is_x86_feature_detected!("avx512f") {
                 // SAFETY: the processor has been asked in this very condition and has the feature.
-                return unsafe { self.advance_avx512(dt_s) };
+                return unsafe { self.advance_avx512(dt_s, meanwhile) };
             }
             if std::arch::is_x86_feature_detected!("avx2") {
                 // SAFETY: as above.
-                return unsafe { self.advance_avx2(dt_s) };
+                return unsafe { self.advance_avx2(dt_s, meanwhile) };
             }
         }
-        self.advance_here(dt_s);
+        self.advance_here(dt_s, meanwhile);
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx512f")]
-    fn advance_avx512(&mut self, dt_s: f64) {
-        self.advance_here(dt_s);
+    fn advance_avx512(&mut self, dt_s: f64, meanwhile: &impl Fn(usize)) {
+        self.advance_here(dt_s, meanwhile);
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn advance_avx2(&mut self, dt_s: f64) {
-        self.advance_here(dt_s);
+    fn advance_avx2(&mut self, dt_s: f64, meanwhile: &impl Fn(usize)) {
+        self.advance_here(dt_s, meanwhile);
     }
 
     /// The same code for every processor: compiled anew into each caller.
     #[inline(always)]
-    fn advance_here(&mut self, dt_s: f64) {
+    fn advance_here(&mut self, dt_s: f64, meanwhile: &impl Fn(usize)) {
         let mut rows = std::mem::take(&mut self.rows);
         self.start_road();
         let between = between_demands(dt_s);
@@ -254,6 +255,7 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
                 self.ask(time_s);
             }
             self.sub_step(time_s, dt_s, row);
+            meanwhile(index);
         }
         self.rows = rows;
     }
@@ -472,8 +474,8 @@ mod tests {
             );
         }
         let mut baseline = lanes.clone();
-        lanes.advance(0.01);
-        baseline.advance_here(0.01);
+        lanes.advance(0.01, &|_| ());
+        baseline.advance_here(0.01, &|_| ());
         prop_assert_eq!(&lanes.rows, &baseline.rows, "whatever the processor's vectors");
         for (lane, (case, params)) in cases.iter().zip(params).enumerate() {
             let steps = alone(case, params, 10);

@@ -22,6 +22,7 @@ pub mod lanes;
 pub mod mirror;
 pub mod parameters;
 pub mod person;
+pub mod prefetch;
 pub mod process;
 pub mod reference;
 pub mod rigid_body;

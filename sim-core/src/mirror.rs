@@ -18,6 +18,7 @@ use crate::{
     dynamic::DynamicParams,
     fleet::{Fleet, FleetError},
     lanes::{DYNAMIC, Drive, KINEMATIC, LANES, Lanes},
+    prefetch::Ahead,
     road_user::RoadUser,
     statistics::Tracking,
     vehicle::{Input, KinematicParams, Model},
@@ -426,8 +427,18 @@ impl<P: Drive<N>, const N: usize> Bank<P, N> {
         if self.loaded.is_empty() {
             return;
         }
-        self.lanes.advance(follow.settings.sub_step_s());
         let per_tick = follow.settings.sub_steps as usize;
+        let (place, row) = self.loaded.last().copied().unwrap_or_default();
+        let next = (
+            Ahead::new(follow.slab, place as usize + 1, LANES),
+            Ahead::new(rows, (row + 1) * per_tick, LANES * per_tick),
+            Ahead::new(states, row + 1, LANES),
+        );
+        self.lanes.advance(follow.settings.sub_step_s(), &|sub_step| {
+            next.0.fetch(sub_step, per_tick);
+            next.1.fetch(sub_step, per_tick);
+            next.2.fetch(sub_step, per_tick);
+        });
         for (lane, (place, row)) in self.loaded.drain(..).enumerate() {
             let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
             let (road_user, out) = (&mut follow.slab[place as usize], &mut states[row]);
