@@ -6,11 +6,7 @@ use std::{
 };
 
 use indicatif::{ProgressBar, ProgressStyle};
-use ipc_schema::{
-    ports::BoardReader,
-    process::Process,
-    run::{Mode, RunFile},
-};
+use ipc_schema::{ports::BoardReader, process::Process, run::RunFile};
 
 /// Time between two lines when there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -77,7 +73,8 @@ fn style() -> ProgressStyle {
 
 /// What is shown.
 struct View {
-    mode: Mode,
+    /// Updates of a policy so far.
+    updates: u64,
     ticks: u64,
     total_ticks: Option<u64>,
     episode: u64,
@@ -110,7 +107,7 @@ impl View {
         let (steps, sim_time_s) = (sensing.vehicle_steps as f64, sensing.sim_time_ns as f64 * 1e-9);
         let total: Option<u64> = run.episodes().iter().map(|episode| episode.ticks).sum();
         Self {
-            mode: run.mode,
+            updates: training.updates,
             ticks: sensing.ticks,
             total_ticks: total,
             episode: sensing.episode,
@@ -131,10 +128,11 @@ impl View {
             "episode {:3}  {:7.1} s  {} of {} road users sensing  {:.0} steps/s",
             self.episode, self.sim_time_s, self.cavs, self.road_users, self.steps_per_s
         );
-        match self.mode {
-            Mode::Simulate => traffic,
+        // Before the first update, and where nothing learns to localise, there is no error to show.
+        match self.updates {
+            0 => traffic,
             // The error first: a narrow terminal cuts the end.
-            Mode::Train => format!(
+            _ => format!(
                 "episode {:3}  error {:.2} m (raw GNSS {:.2} m)  σ {:.3}  reward {:.3}  {:.0} steps/s",
                 self.episode, self.error_m, self.raw_gnss_error_m, self.policy_std, self.reward, self.steps_per_s
             ),

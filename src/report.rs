@@ -103,6 +103,18 @@ pub fn summary(report: &Value, path: &Path) -> String {
             number("policy_std", 3)
         ));
     }
+    let heroes = &report["dynamics"]["heroes"];
+    if !heroes.is_null() {
+        lines.push(format!(
+            "heroes: {} episodes, of which {} arrived, {} collided, {} left the road, {} ran out of time; {} actions refused",
+            heroes["episodes"],
+            heroes["arrived"],
+            heroes["collided"],
+            heroes["off_road"],
+            heroes["time_limit"],
+            heroes["refused_actions"]
+        ));
+    }
     lines.push(format!(
         "ticks lost {}, duplicated {}; restarts {}; messages that watchers passed over {}",
         report["lost_ticks"], report["duplicated_ticks"], report["restarts"], report["drops"]

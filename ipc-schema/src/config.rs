@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::traffic::VEHICLE_CLASSES;
+
 /// One whole configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -152,6 +154,19 @@ pub enum VehicleModel {
     Dynamic,
     /// Rigid body on four ray-cast wheels; heroes only.
     RigidBody,
+}
+
+/// Reads an entry of `vehicle.class_models`, "class=kinematic" or "class=dynamic" with a vehicle class of SUMO.
+#[must_use]
+pub fn class_model(entry: &str) -> Option<(&str, VehicleModel)> {
+    let (class, model) = entry.split_once('=')?;
+    let model = match model.trim() {
+        "kinematic" => VehicleModel::Kinematic,
+        "dynamic" => VehicleModel::Dynamic,
+        _ => return None,
+    };
+    let class = class.trim();
+    VEHICLE_CLASSES.contains(&class).then_some((class, model))
 }
 
 /// What the road is covered with.

@@ -90,9 +90,9 @@ pub struct SubStep {
     pub roll_rad: f32,
     /// Pitch, positive nose up, radians.
     pub pitch_rad: f32,
-    /// Speed of the rear axle along the body's x, m/s.
+    /// Speed of the rear axle along the heading, in the horizontal plane, m/s.
     pub speed_mps: f32,
-    /// Speed of the rear axle to the left, m/s.
+    /// Speed of the rear axle to the left of the heading, in the horizontal plane, m/s.
     pub lateral_speed_mps: f32,
     /// Kinematic acceleration of the origin in the body frame, mean over the sub-step, m/s².
     pub accel_body_mps2: [f32; 3],

@@ -3,6 +3,9 @@
 //! `cargo bench -p sim-core --bench mirror [VEHICLES]…` prints microseconds per vehicle and tick on one core: the median
 //! over the measured ticks, and the fastest.
 
+#[path = "../tests/common/preset.rs"]
+mod preset;
+
 use std::{hint::black_box, time::Instant};
 
 use ipc_schema::{
@@ -49,20 +52,7 @@ fn meta(vehicle: u32, cavs: u32) -> VehicleMeta {
 }
 
 fn settings() -> Settings {
-    let vehicle = config::Vehicle {
-        cav_model: config::VehicleModel::Dynamic,
-        other_model: config::VehicleModel::Kinematic,
-        hero_model: config::VehicleModel::Kinematic,
-        class_models: Vec::new(),
-        lane_change_s: 3.0,
-        max_road_wheel_angle_rad: 0.6,
-        max_road_wheel_rate_radps: 1.0,
-        max_accel_mps2: 5.0,
-        max_decel_mps2: 9.0,
-        steering_ratio: 15.0,
-        resynchronise_m: 2.0,
-        leave_path_m: 5.0,
-    };
+    let vehicle = preset::town().vehicle;
     Settings {
         vehicle,
         surface: config::Surface::Dry,

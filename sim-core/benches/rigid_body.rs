@@ -9,6 +9,9 @@
     reason = "a measurement asserts by unwrapping"
 )]
 
+#[path = "../tests/common/preset.rs"]
+mod preset;
+
 use std::{hint::black_box, time::Instant};
 
 use ipc_schema::config;
@@ -24,18 +27,9 @@ const DT_S: f64 = 0.005;
 
 fn main() {
     let limits = config::Vehicle {
-        cav_model: config::VehicleModel::Dynamic,
-        other_model: config::VehicleModel::Kinematic,
-        hero_model: config::VehicleModel::RigidBody,
-        class_models: Vec::new(),
-        lane_change_s: 3.0,
-        max_road_wheel_angle_rad: 0.6,
-        max_road_wheel_rate_radps: 1.0,
         max_accel_mps2: 6.0,
         max_decel_mps2: 10.0,
-        steering_ratio: 15.0,
-        resynchronise_m: 2.0,
-        leave_path_m: 5.0,
+        ..preset::town().vehicle
     };
     let catalogue = Catalogue::new().unwrap();
     let set = &catalogue.sets()[catalogue.choose(b"passenger", 4.8).set];

@@ -10,6 +10,9 @@
     reason = "an example asserts by unwrapping and prints"
 )]
 
+#[path = "../tests/common/preset.rs"]
+mod preset;
+
 use ipc_schema::config::{self, Surface};
 use sim_core::{
     dimensions::Dimensions,
@@ -22,20 +25,13 @@ use sim_core::{
 
 const DT_S: f64 = 0.005;
 const SPEED_MPS: f64 = 20.0;
-const LIMITS: config::Vehicle = config::Vehicle {
-    cav_model: config::VehicleModel::Dynamic,
-    other_model: config::VehicleModel::Kinematic,
-    hero_model: config::VehicleModel::RigidBody,
-    class_models: Vec::new(),
-    lane_change_s: 3.0,
-    max_road_wheel_angle_rad: 0.6,
-    max_road_wheel_rate_radps: 1.0,
-    max_accel_mps2: 6.0,
-    max_decel_mps2: 10.0,
-    steering_ratio: 15.0,
-    resynchronise_m: 2.0,
-    leave_path_m: 5.0,
-};
+fn limits() -> config::Vehicle {
+    config::Vehicle {
+        max_accel_mps2: 6.0,
+        max_decel_mps2: 10.0,
+        ..preset::town().vehicle
+    }
+}
 
 /// A vehicle under way.
 #[expect(clippy::large_enum_variant, reason = "two values in all")]
@@ -49,15 +45,15 @@ impl Vehicle {
         let (share, start) = (friction_share(surface), State::new(0.0, 0.0, 0.0, speed_mps));
         match model {
             "kinematic" => Self::Plain(
-                Model::Kinematic(KinematicParams::new(set, &LIMITS, body.wheelbase_m)),
+                Model::Kinematic(KinematicParams::new(set, &limits(), body.wheelbase_m)),
                 start,
             ),
             "dynamic" => Self::Plain(
-                Model::Dynamic(DynamicParams::new(set, body, &LIMITS, share, DT_S)),
+                Model::Dynamic(DynamicParams::new(set, body, &limits(), share, DT_S)),
                 start,
             ),
             _ => Self::Rigid(
-                Box::new(RigidBody::new(set, body, &LIMITS, share, DT_S).unwrap()),
+                Box::new(RigidBody::new(set, body, &limits(), share, DT_S).unwrap()),
                 start.into(),
             ),
         }

@@ -76,7 +76,13 @@ impl Fleet {
     /// # Errors
     /// A class is given a model that does not exist.
     pub fn new(limits: &config::Vehicle, surface: Surface, sub_step_s: f64) -> Result<Self, FleetError> {
-        let by_class = limits.class_models.iter().map(|entry| class_model(entry));
+        let by_class = limits
+            .class_models
+            .iter()
+            .map(|entry| match config::class_model(entry) {
+                Some((class, model)) => Ok((class.to_owned(), model)),
+                None => Err(FleetError::ClassModel { entry: entry.clone() }),
+            });
         Ok(Self {
             catalogue: Catalogue::new()?,
             limits: limits.clone(),
@@ -190,41 +196,16 @@ fn class_text(meta: &VehicleMeta) -> String {
     String::from_utf8_lossy(&meta.vehicle_class[..end]).into_owned()
 }
 
-fn class_model(entry: &str) -> Result<(String, VehicleModel), FleetError> {
-    let refused = || FleetError::ClassModel {
-        entry: entry.to_owned(),
-    };
-    let (class, model) = entry.split_once('=').ok_or_else(refused)?;
-    let (class, model) = (class.trim(), model.trim());
-    let model = match model {
-        "kinematic" => VehicleModel::Kinematic,
-        "dynamic" => VehicleModel::Dynamic,
-        _ => return Err(refused()),
-    };
-    if !ipc_schema::traffic::VEHICLE_CLASSES.contains(&class) {
-        return Err(refused());
-    }
-    Ok((class.to_owned(), model))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::preset;
 
     fn limits() -> config::Vehicle {
         config::Vehicle {
-            cav_model: VehicleModel::Dynamic,
-            other_model: VehicleModel::Kinematic,
             hero_model: VehicleModel::RigidBody,
             class_models: vec!["bus=kinematic".into(), "truck=dynamic".into()],
-            lane_change_s: 3.0,
-            max_road_wheel_angle_rad: 0.6,
-            max_road_wheel_rate_radps: 1.0,
-            max_accel_mps2: 5.0,
-            max_decel_mps2: 9.0,
-            steering_ratio: 15.0,
-            resynchronise_m: 2.0,
-            leave_path_m: 5.0,
+            ..preset::town().vehicle
         }
     }
 

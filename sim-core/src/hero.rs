@@ -9,7 +9,7 @@ use ipc_schema::{
 };
 
 use crate::{
-    attitude::{Lean, angular_rate, body_from_level, half_way},
+    attitude::{Felt, Lean, body_from_level},
     fleet::Built,
     rigid_body::{RigidBody, RigidState},
     vehicle::{Input, Model, Motion, State},
@@ -102,12 +102,12 @@ impl Hero {
         let slope = |done: f64| between(before.pitch_rad.into(), now.pitch_rad.into(), done);
         let mut states = Vec::with_capacity(rows.len());
         for (number, row) in rows.iter_mut().enumerate() {
-            let from = lean(&self.state, slope(number as f64));
+            let from = Lean::of(&self.state, slope(number as f64));
             let (next, motion) = match &mut body {
                 Some(body) => self.step_body(body, libm::sin(slope(number as f64))),
                 None => model.step(&self.state, &self.input, sub_step_s),
             };
-            let to = lean(&next, slope(number as f64 + 1.0));
+            let to = Lean::of(&next, slope(number as f64 + 1.0));
             *row = sub_step(&next, &motion, [from, to], 1.0 / sub_step_s);
             row.dz_m = (between(before.front_z_m, now.front_z_m, number as f64 + 1.0) - now.front_z_m) as f32;
             self.state = next;
@@ -136,7 +136,7 @@ impl Hero {
 
     fn write(&self, now: &TrafficState, front_m: f64, rows: &[SubStep], out: &mut VehicleState) {
         let (state, slope_rad) = (&self.state, f64::from(now.pitch_rad));
-        let lean = lean(state, slope_rad);
+        let lean = Lean::of(state, slope_rad);
         out.x_m = state.x_m;
         out.y_m = state.y_m;
         out.z_m = now.front_z_m - front_m * libm::tan(slope_rad);
@@ -153,24 +153,16 @@ impl Hero {
     }
 }
 
-fn lean(state: &State, slope_rad: f64) -> Lean {
-    Lean {
-        roll_rad: state.roll[0],
-        pitch_rad: state.pitch[0] + slope_rad,
-    }
-}
-
-fn sub_step(state: &State, motion: &Motion, [from, to]: [Lean; 2], rate_per_s: f64) -> SubStep {
-    let [along, left] = motion.accel_level_mps2;
-    let [forward, to_the_left, _] = body_from_level(&to, [state.speed_mps, state.lateral_mps, 0.0]);
-    let accel = body_from_level(&half_way(&from, &to), [along, left, 0.0]);
+fn sub_step(state: &State, motion: &Motion, leans: [Lean; 2], rate_per_s: f64) -> SubStep {
+    // Its height is SUMO's, linear over a step: no upward acceleration is known.
+    let felt = Felt::new(leans, motion, 0.0, rate_per_s);
     SubStep {
-        roll_rad: to.roll_rad as f32,
-        pitch_rad: to.pitch_rad as f32,
-        speed_mps: forward as f32,
-        lateral_speed_mps: to_the_left as f32,
-        accel_body_mps2: accel.map(|part| part as f32),
-        angular_rate_body_radps: angular_rate(&from, &to, motion.yaw_rate_radps, rate_per_s).map(|part| part as f32),
+        roll_rad: leans[1].roll_rad as f32,
+        pitch_rad: leans[1].pitch_rad as f32,
+        speed_mps: state.speed_mps as f32,
+        lateral_speed_mps: state.lateral_mps as f32,
+        accel_body_mps2: felt.accel_mps2.map(|part| part as f32),
+        angular_rate_body_radps: felt.rate_radps.map(|part| part as f32),
         road_wheel_angle_rad: state.road_wheel_angle_rad as f32,
         ..SubStep::default()
     }

@@ -9,7 +9,7 @@ use bytemuck::Pod;
 use ipc_schema::world::SubStep;
 
 use crate::{
-    attitude::{Lean, angular_rate, body_from_level, half_way},
+    attitude::{Felt, Lean},
     curve::{Curve, Rise, Target},
     dynamic::{DynamicParams, GRAVITY_MPS2},
     governor::Ability,
@@ -296,7 +296,9 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
             };
             let (next, motion) = params.step(&state, &input, road[2], dt_s);
             let road_next = road_at(&gather(&self.rise, lane), front_m, time_s + dt_s);
-            let felt = Felt::new([&state, &next], [road, road_next], &motion, dt_s);
+            let leans = [Lean::of(&state, road[2]), Lean::of(&next, road_next[2])];
+            let rate = 1.0 / dt_s;
+            let felt = Felt::new(leans, &motion, (road_next[1] - road[1]) * rate, rate);
             scatter(&mut self.state, lane, &next);
             scatter(&mut self.road, lane, &road_next);
             let origin: [f64; 4] = gather(&self.origin, lane);
@@ -305,8 +307,8 @@ impl<P: Drive<N>, const N: usize> Lanes<P, N> {
                 next.y_m - origin[1],
                 road_next[0] - origin[2],
                 next.yaw_rad - origin[3],
-                felt.lean.roll_rad,
-                felt.lean.pitch_rad,
+                leans[1].roll_rad,
+                leans[1].pitch_rad,
                 next.speed_mps,
                 next.lateral_mps,
                 felt.accel_mps2[0],
@@ -343,177 +345,5 @@ fn road_at(rise: &Rise, front_m: f64, time_s: f64) -> [f64; 3] {
     ]
 }
 
-/// What the body feels in one sub-step, and how it leans at its end.
-struct Felt {
-    lean: Lean,
-    accel_mps2: [f64; 3],
-    rate_radps: [f64; 3],
-}
-
-impl Felt {
-    #[inline(always)]
-    fn new(states: [&State; 2], roads: [[f64; 3]; 2], motion: &Motion, dt_s: f64) -> Self {
-        let [before, after] = [0, 1].map(|i: usize| Lean {
-            roll_rad: states[i].roll[0],
-            pitch_rad: states[i].pitch[0] + roads[i][2],
-        });
-        let rate = 1.0 / dt_s;
-        let [along, left] = motion.accel_level_mps2;
-        let up = (roads[1][1] - roads[0][1]) * rate;
-        Self {
-            lean: after,
-            accel_mps2: body_from_level(&half_way(&before, &after), [along, left, up]),
-            rate_radps: angular_rate(&before, &after, motion.yaw_rate_radps, rate),
-        }
-    }
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::{dimensions::Dimensions, parameters::Catalogue};
-    use ipc_schema::config;
-    use proptest::prelude::*;
-
-    fn limits() -> config::Vehicle {
-        config::Vehicle {
-            cav_model: config::VehicleModel::Kinematic,
-            other_model: config::VehicleModel::Kinematic,
-            hero_model: config::VehicleModel::Kinematic,
-            class_models: Vec::new(),
-            lane_change_s: 3.0,
-            max_road_wheel_angle_rad: 0.6,
-            max_road_wheel_rate_radps: 1.0,
-            max_accel_mps2: 5.0,
-            max_decel_mps2: 9.0,
-            steering_ratio: 15.0,
-            resynchronise_m: 2.0,
-            leave_path_m: 5.0,
-        }
-    }
-
-    #[derive(Debug, Clone)]
-    struct Case {
-        state: State,
-        curve: Curve,
-        rise: Rise,
-        body: Dimensions,
-    }
-
-    fn case() -> impl Strategy<Value = Case> {
-        let state = (
-            -3.1_f64..3.1,
-            prop_oneof![Just(0.0), 0.0_f64..40.0],
-            -9.0_f64..5.0,
-            -0.6_f64..0.6,
-            prop::array::uniform2(-0.5_f64..0.5),
-        );
-        let slope = prop::array::uniform3(-0.05_f64..0.05);
-        (state, prop::array::uniform4(-15.0_f64..15.0), slope, 2.0_f64..18.0).prop_map(
-            |((yaw, speed, accel, angle, [lateral, rate]), c, slope_rad, length_m)| {
-                let body = Catalogue::new().unwrap().sets()[0].dimensions(length_m, 2.0, 1.5);
-                let state = State {
-                    accel_mps2: accel,
-                    road_wheel_angle_rad: angle,
-                    lateral_mps: lateral,
-                    yaw_rate_radps: rate,
-                    roll: [0.1 * lateral, rate],
-                    pitch: [0.1 * rate, lateral],
-                    ..State::new(5.0, -7.0, yaw, speed)
-                };
-                let start = state.point_ahead(body.front_m());
-                let curve = Curve::hermite(
-                    [start[0] + 0.1 * c[0], start[1]],
-                    [c[1], c[2]],
-                    [[c[2], c[3]], [c[0], c[1]]],
-                    0.7,
-                );
-                let rise = Rise {
-                    height_m: [0.0, slope_rad[1], slope_rad[2]],
-                    slope_rad,
-                };
-                Case {
-                    state,
-                    curve,
-                    rise,
-                    body,
-                }
-            },
-        )
-    }
-
-    /// The same vehicle alone: tracker and model one after the other.
-    fn alone<P: Drive<N>, const N: usize>(case: &Case, params: &P, sub_steps: usize) -> Vec<(State, Motion)> {
-        let front_m = case.body.front_m();
-        let mut state = case.state;
-        let mut slope = road_at(&case.rise, front_m, 0.0)[2];
-        let mut input = Input::default();
-        (0..sub_steps)
-            .map(|index| {
-                let time_s = index as f64 * 0.01;
-                if index % 2 == 0 {
-                    input = params.demand(front_m, &state, &case.curve.at(time_s));
-                }
-                let (next, motion) = params.step(&state, &input, slope, 0.01);
-                slope = road_at(&case.rise, front_m, time_s + 0.01)[2];
-                state = next;
-                (next, motion)
-            })
-            .collect()
-    }
-
-    fn compare<P: Drive<N>, const N: usize>(cases: &[Case], params: &[P]) -> Result<(), TestCaseError> {
-        let mut lanes: Lanes<P, N> = Lanes::new(10);
-        for (lane, (case, params)) in cases.iter().zip(params).enumerate() {
-            lanes.load(
-                lane,
-                params,
-                &case.state,
-                (&case.curve, &case.rise),
-                case.body.front_m(),
-            );
-        }
-        let mut baseline = lanes.clone();
-        lanes.advance(0.01, &|_| ());
-        baseline.advance_here(0.01, &|_| ());
-        prop_assert_eq!(&lanes.rows, &baseline.rows, "whatever the processor's vectors");
-        for (lane, (case, params)) in cases.iter().zip(params).enumerate() {
-            let steps = alone(case, params, 10);
-            let mut rows = [SubStep::default(); 10];
-            lanes.write(lane, &mut rows);
-            for ((state, _), row) in steps.iter().zip(&rows) {
-                prop_assert!((f64::from(row.dx_m) - (state.x_m - steps[9].0.x_m)).abs() < 1e-5);
-                prop_assert!((f64::from(row.dyaw_rad) - (state.yaw_rad - steps[9].0.yaw_rad)).abs() < 1e-6);
-                prop_assert_eq!(row.lateral_speed_mps, state.lateral_mps as f32);
-                prop_assert_eq!(row.roll_rad, state.roll[0] as f32);
-                prop_assert_eq!(row.road_wheel_angle_rad, state.road_wheel_angle_rad as f32);
-            }
-            prop_assert_eq!(steps[9].0, lanes.state(lane));
-        }
-        Ok(())
-    }
-
-    proptest! {
-            #[test]
-            fn side_by_side_gives_the_same_bits_as_alone(cases in prop::collection::vec(case(), 1..=LANES)) {
-                let catalogue = Catalogue::new().unwrap();
-                let set = &catalogue.sets()[0];
-                let kinematic: Vec<_> =
-                    cases.iter().map(|case| KinematicParams::new(set, &limits(), case.body.wheelbase_m)).collect();
-                compare(&cases, &kinematic)?;
-                let dynamic: Vec<_> =
-                    cases.iter().map(|case| DynamicParams::new(set, &case.body, &limits(), 0.7, 0.01)).collect();
-                compare(&cases, &dynamic)?;
-            }
-
-            #[test]
-            fn whatever_the_demand_the_numbers_stay_finite(case in case()) {
-                let catalogue = Catalogue::new().unwrap();
-                let params = DynamicParams::new(&catalogue.sets()[0], &case.body, &limits(), 0.3, 0.01);
-                for (state, motion) in alone(&case, &params, 200) {
-                    prop_assert!(bytemuck::cast::<State, [f64; STATE]>(state).iter().all(|number| number.is_finite()));
-    prop_assert!(motion.accel_level_mps2.iter().all(|accel| accel.is_finite()));
-                }
-            }
-        }
-}
+mod tests;

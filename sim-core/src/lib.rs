@@ -6,6 +6,10 @@
 // Values leave the core in single precision (positions excepted): the wire's precision, see `ipc_schema::world`.
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
+#[cfg(test)]
+#[path = "../tests/common/preset.rs"]
+mod preset;
+
 pub mod actions;
 pub mod attitude;
 pub mod collision;

@@ -325,10 +325,7 @@ impl RoadUser {
 /// Writes the state at the end of a tick: `road` is that of the lane (see [`Lanes::road`]), `height_m` that of the road under the
 /// front bumper at the start of the tick.
 fn write_moved(state: &State, road: [f64; 3], height_m: f64, rows: &[SubStep], out: &mut VehicleState) {
-    let lean = Lean {
-        roll_rad: state.roll[0],
-        pitch_rad: state.pitch[0] + road[2],
-    };
+    let lean = Lean::of(state, road[2]);
     out.x_m = state.x_m;
     out.y_m = state.y_m;
     out.z_m = height_m + road[0];

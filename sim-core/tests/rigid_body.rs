@@ -2,6 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 
+#[path = "common/preset.rs"]
+mod preset;
+
 use ipc_schema::config;
 use sim_core::{
     dimensions::Dimensions,
@@ -15,18 +18,9 @@ const DT_S: f64 = 0.005;
 
 fn limits() -> config::Vehicle {
     config::Vehicle {
-        cav_model: config::VehicleModel::Dynamic,
-        other_model: config::VehicleModel::Kinematic,
-        hero_model: config::VehicleModel::RigidBody,
-        class_models: Vec::new(),
-        lane_change_s: 3.0,
-        max_road_wheel_angle_rad: 0.6,
-        max_road_wheel_rate_radps: 1.0,
         max_accel_mps2: 6.0,
         max_decel_mps2: 10.0,
-        steering_ratio: 15.0,
-        resynchronise_m: 2.0,
-        leave_path_m: 5.0,
+        ..preset::town().vehicle
     }
 }
 

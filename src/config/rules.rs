@@ -1,6 +1,10 @@
 //! Rules between keys: rates that must divide each other, sizes that must fit.
 
-use ipc_schema::{config::Config, props::Obstacle, traffic::VEHICLE_CLASSES};
+use ipc_schema::{
+    config::{Config, class_model},
+    props::Obstacle,
+    traffic::VEHICLE_CLASSES,
+};
 
 use super::{
     ConfigError, Settings,
@@ -71,67 +75,79 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
 /// The learner that comes with caraware: it predicts positions.
 const LOCALISING_TRAINER: &str = "caraware.train";
 
-/// Heroes and the driving task go together, and actions must reach SUMO at every tick.
+/// Heroes and the driving task go together.
 fn task(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
-    let refuse = |path: &str, message: String, help: &str| Err(conflict(settings, path, message, help.into()));
+    let refused = if config.drives() {
+        undrivable(config)
+    } else {
+        heroes_without_a_driver(config)
+    };
+    match refused {
+        None => Ok(()),
+        Some((path, message, help)) => Err(conflict(settings, path, message, help.into())),
+    }
+}
+
+/// Key, message and help of what is wrong.
+type Refusal = (&'static str, String, &'static str);
+
+fn heroes_without_a_driver(config: &Config) -> Option<Refusal> {
     let traffic = &config.traffic;
-    if !config.drives() {
-        if traffic.heroes > 0 {
-            let message = format!("`traffic.heroes` = {} without anybody who drives them", traffic.heroes);
-            return refuse(
-                "traffic.heroes",
-                message,
-                "set task.kind = \"driving\", or traffic.heroes = 0",
-            );
-        }
-        if !traffic.hero_ids.is_empty() {
-            let message = "`traffic.hero_ids` names heroes without anybody who drives them".into();
-            return refuse(
-                "traffic.hero_ids",
-                message,
-                "set task.kind = \"driving\", or traffic.hero_ids = []",
-            );
-        }
-        if let Some(name) = hero_field(config) {
-            let message = format!("`observation.fields` has \"{name}\", which only a hero has");
-            return refuse(
-                "observation.fields",
-                message,
-                "set task.kind = \"driving\", or leave the field out",
-            );
-        }
-        if traffic.cavs == 0 {
-            let message = "`traffic.cavs` = 0: nobody is to be localised".into();
-            return refuse("traffic.cavs", message, "ask for one connected vehicle or more");
-        }
-        return Ok(());
+    if traffic.heroes > 0 {
+        return Some((
+            "traffic.heroes",
+            format!("`traffic.heroes` = {} without anybody who drives them", traffic.heroes),
+            "set task.kind = \"driving\", or traffic.heroes = 0",
+        ));
     }
+    if !traffic.hero_ids.is_empty() {
+        return Some((
+            "traffic.hero_ids",
+            "`traffic.hero_ids` names heroes without anybody who drives them".into(),
+            "set task.kind = \"driving\", or traffic.hero_ids = []",
+        ));
+    }
+    if let Some(name) = hero_field(config) {
+        return Some((
+            "observation.fields",
+            format!("`observation.fields` has \"{name}\", which only a hero has"),
+            "set task.kind = \"driving\", or leave the field out",
+        ));
+    }
+    (traffic.cavs == 0).then(|| {
+        (
+            "traffic.cavs",
+            "`traffic.cavs` = 0: nobody is to be localised".into(),
+            "ask for one connected vehicle or more",
+        )
+    })
+}
+
+/// Actions must come, and reach SUMO at every tick.
+fn undrivable(config: &Config) -> Option<Refusal> {
     if config.heroes() == 0 {
-        let message = "`task.kind` = \"driving\" without a hero".into();
-        return refuse(
+        return Some((
             "task.kind",
-            message,
+            "`task.kind` = \"driving\" without a hero".into(),
             "set traffic.heroes = 1 (with a .sumocfg: traffic.hero_ids = [\"…\"])",
-        );
+        ));
     }
+    let (step_s, tick_s) = (config.traffic.step_s, config.run.tick_s);
     #[expect(clippy::float_cmp, reason = "both are what the user wrote")]
-    if traffic.step_s != config.run.tick_s {
-        let message = format!(
-            "`traffic.step_s` = {} s is not `run.tick_s` = {} s, as the driving task needs",
-            traffic.step_s, config.run.tick_s
-        );
-        return refuse(
+    if step_s != tick_s {
+        return Some((
             "traffic.step_s",
-            message,
+            format!("`traffic.step_s` = {step_s} s is not `run.tick_s` = {tick_s} s, as the driving task needs"),
             "set both to the same time, such as 0.1: an action reaches SUMO within a tick",
-        );
+        ));
     }
-    if config.trainer.module == LOCALISING_TRAINER {
-        let message = format!("`trainer.module` = \"{LOCALISING_TRAINER}\" learns to localise and cannot drive");
-        let help = "name a module that publishes actions, such as \"caraware.examples.pure_pursuit\"";
-        return refuse("trainer.module", message, help);
-    }
-    Ok(())
+    (config.trainer.module == LOCALISING_TRAINER).then(|| {
+        (
+            "trainer.module",
+            format!("`trainer.module` = \"{LOCALISING_TRAINER}\" learns to localise and cannot drive"),
+            "name a module that publishes actions, such as \"caraware.examples.pure_pursuit\"",
+        )
+    })
 }
 
 /// The first field of the observation that only a hero has.
@@ -156,12 +172,12 @@ fn obstacles(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
 
 /// Entries of `vehicle.class_models` are "class=model" with a vehicle class of SUMO.
 fn check_class_models(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
-    let understood = |entry: &str| {
-        entry.split_once('=').is_some_and(|(class, model)| {
-            VEHICLE_CLASSES.contains(&class.trim()) && ["kinematic", "dynamic"].contains(&model.trim())
-        })
-    };
-    match config.vehicle.class_models.iter().find(|entry| !understood(entry)) {
+    match config
+        .vehicle
+        .class_models
+        .iter()
+        .find(|entry| class_model(entry).is_none())
+    {
         None => Ok(()),
         Some(entry) => Err(conflict(
             settings,

@@ -2,6 +2,8 @@
 #![allow(dead_code, reason = "each test uses a part")]
 #![allow(clippy::unwrap_used, reason = "test code may assert by unwrapping")]
 
+pub mod preset;
+
 use ipc_schema::{
     block::view,
     config,
@@ -28,17 +30,7 @@ pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> Settings {
 pub fn limits() -> config::Vehicle {
     config::Vehicle {
         cav_model: config::VehicleModel::Kinematic,
-        other_model: config::VehicleModel::Kinematic,
-        hero_model: config::VehicleModel::Kinematic,
-        class_models: Vec::new(),
-        lane_change_s: 3.0,
-        max_road_wheel_angle_rad: 0.6,
-        max_road_wheel_rate_radps: 1.0,
-        max_accel_mps2: 5.0,
-        max_decel_mps2: 9.0,
-        steering_ratio: 15.0,
-        resynchronise_m: 2.0,
-        leave_path_m: 5.0,
+        ..preset::town().vehicle
     }
 }
 
