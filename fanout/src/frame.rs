@@ -48,7 +48,7 @@ pub fn encode(channel: Channel, header: &MessageHeader, payload: &[u8]) -> Resul
         Channel::World => world(header, payload),
         Channel::Observation => {
             plausible(header, payload)?;
-            let layout = ObservationLayout::new(header.count as usize, header.columns as usize);
+            let layout = ObservationLayout::of(header);
             whole(header, payload, layout.len)
         }
         _ => {
@@ -176,7 +176,7 @@ mod tests {
 
     #[test]
     fn observations_are_never_cut() {
-        let layout = ObservationLayout::new(20_000, 9);
+        let layout = ObservationLayout::new(20_000, 9, 0);
         let words = payload(layout.len);
         let error = encode(Channel::Observation, &header(20_000, 9), cast_slice(&words)).unwrap_err();
         assert_eq!(error, FrameError::TooLong(layout.len + HEADER_BYTES));
@@ -195,7 +195,7 @@ mod tests {
     proptest! {
         #[test]
         fn frames_come_back_as_they_were(n in 0_usize..200, d in 1_u32..12) {
-            let layout = ObservationLayout::new(n, d as usize);
+            let layout = ObservationLayout::new(n, d as usize, 0);
             for (channel, len) in [(Channel::Observation, layout.len), (Channel::Prediction, n * d as usize * 4)] {
                 let words = payload(len);
                 let bytes = &cast_slice::<_, u8>(&words)[..len];

@@ -5,6 +5,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::traffic::VEHICLE_CLASSES;
 
+mod sensors;
+pub use sensors::*;
+
 /// One whole configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -27,12 +30,18 @@ pub struct Config {
     pub scene: Scene,
     /// Contacts.
     pub collision: Collision,
+    /// Rain, fog and sun.
+    pub weather: Weather,
     /// GNSS receiver.
     pub gnss: Gnss,
     /// Inertial measurement unit and compass.
     pub imu: Imu,
     /// Wheel speed and steering angle.
     pub speed_steering: SpeedSteering,
+    /// Spinning LIDAR.
+    pub lidar: Lidar,
+    /// What happens while a sensor is dark.
+    pub blackout: Blackout,
     /// Fields and normalisation of the observation.
     pub observation: Observation,
     /// The learner.
@@ -49,6 +58,32 @@ impl Config {
             TaskKind::Localisation => 0,
             TaskKind::Driving => self.traffic.heroes as usize + self.traffic.hero_ids.len(),
         }
+    }
+
+    /// What the road is covered with in this weather: rain makes a dry road wet.
+    #[must_use]
+    pub fn surface(&self) -> Surface {
+        match self.road.surface {
+            Surface::Dry if self.weather.rain_mmph > 0.0 => Surface::Wet,
+            surface => surface,
+        }
+    }
+
+    /// Numbers in a row of the observation: fields times ticks.
+    #[must_use]
+    pub fn observation_width(&self) -> usize {
+        self.observation.fields.len() * self.observation.history as usize
+    }
+
+    /// IMU samples in a tick: those of a slow IMU count as one.
+    #[must_use]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "validated: at most `run.sub_steps`"
+    )]
+    pub fn imu_samples(&self) -> usize {
+        (self.run.tick_s / self.imu.period_s).round().max(1.0) as usize
     }
 
     /// True if actions move vehicles, so that every process waits for the one before it.
@@ -200,6 +235,9 @@ pub struct Scene {
     pub random_props: u32,
     /// Height of a building whose polygon and type name none, metres.
     pub building_height_m: f64,
+    /// Triangle meshes, each "file x y heading": a Wavefront OBJ, its origin on the ground in metres (world), its heading in degrees
+    /// counter-clockwise from east (0 if left out). LIDARs see them; traffic and collisions do not.
+    pub meshes: Vec<String>,
 }
 
 /// Contacts.
@@ -242,48 +280,6 @@ pub struct Vehicle {
     pub leave_path_m: f64,
 }
 
-/// GNSS receiver.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Gnss {
-    /// Time between fixes, seconds.
-    pub period_s: f64,
-    /// Standard deviation of latitude and of longitude, degrees (5e-5 ≙ 5.57 m of latitude).
-    pub noise_std_deg: f64,
-    /// Bias of latitude and of longitude, degrees.
-    pub bias_deg: f64,
-}
-
-/// Inertial measurement unit and compass.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Imu {
-    /// Time between samples, seconds.
-    pub period_s: f64,
-    /// Standard deviation of each accelerometer axis, m/s².
-    pub accel_noise_std_mps2: f64,
-    /// Standard deviation of each gyroscope axis, rad/s.
-    pub gyro_noise_std_radps: f64,
-    /// Bias of each gyroscope axis, rad/s.
-    pub gyro_bias_radps: f64,
-    /// Standard deviation of the compass, radians.
-    pub compass_noise_std_rad: f64,
-    /// Gravity in the accelerometer, m/s²: 9.81 gives specific force, 0 kinematic acceleration.
-    pub gravity_mps2: f64,
-}
-
-/// Wheel speed and steering angle.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct SpeedSteering {
-    /// Time between samples, seconds.
-    pub period_s: f64,
-    /// Standard deviation of the speed, m/s.
-    pub speed_noise_std_mps: f64,
-    /// Standard deviation of the steering-wheel angle, radians.
-    pub steering_noise_std_rad: f64,
-}
-
 /// Scale of the normalised observation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -295,7 +291,7 @@ pub enum Scale {
 }
 
 /// One field of the observation.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Field {
     /// GNSS fix, x in the world frame; range: the map's bounds.
@@ -320,6 +316,46 @@ pub enum Field {
     Speed,
     /// Steering-wheel angle; range ± `steering_range_rad`.
     Steering,
+    /// GNSS fix, height in the world frame; range ± 100 m about the height of the map's ground.
+    GnssZ,
+    /// GNSS receiver's own estimate of its horizontal error (1σ of the distance); range 0 … 50 m.
+    GnssAccuracy,
+    /// Age of the newest GNSS fix; range 0 … `age_range_s`.
+    GnssAge,
+    /// 1 while the GNSS receiver delivers, 0 in a blackout.
+    GnssValid,
+    /// Age of the newest IMU sample; range 0 … `age_range_s`.
+    ImuAge,
+    /// 1 while the IMU delivers, 0 in a blackout.
+    ImuValid,
+    /// Age of the newest speed and steering sample; range 0 … `age_range_s`.
+    SpeedSteeringAge,
+    /// 1 while the speed and steering sensor delivers, 0 in a blackout.
+    SpeedSteeringValid,
+    /// Nearest object that the LIDAR sees: its nearest point, forward of the rear axle; range ± `lidar.range_m`, which stands for none.
+    #[serde(rename = "object_1_x")]
+    Object1X,
+    /// Nearest object: its nearest point, to the left of the rear axle; range ± `lidar.range_m`.
+    #[serde(rename = "object_1_y")]
+    Object1Y,
+    /// Second nearest object, forward.
+    #[serde(rename = "object_2_x")]
+    Object2X,
+    /// Second nearest object, left.
+    #[serde(rename = "object_2_y")]
+    Object2Y,
+    /// Third nearest object, forward.
+    #[serde(rename = "object_3_x")]
+    Object3X,
+    /// Third nearest object, left.
+    #[serde(rename = "object_3_y")]
+    Object3Y,
+    /// Fourth nearest object, forward.
+    #[serde(rename = "object_4_x")]
+    Object4X,
+    /// Fourth nearest object, left.
+    #[serde(rename = "object_4_y")]
+    Object4Y,
     /// Hero: its route 5 m ahead, forward of the rear axle; range ± 5 m.
     #[serde(rename = "route_x_5")]
     RouteX5,
@@ -364,6 +400,8 @@ pub enum Field {
 pub struct Observation {
     /// Fields in order.
     pub fields: Vec<Field>,
+    /// Ticks in a row: the newest and those before it, oldest first.
+    pub history: u32,
     /// Scale of every field.
     pub scale: Scale,
     /// Full scale of the accelerometer, m/s².
@@ -374,6 +412,8 @@ pub struct Observation {
     pub speed_range_mps: f64,
     /// Full scale of the steering-wheel angle, radians.
     pub steering_range_rad: f64,
+    /// Full scale of the ages of samples, seconds.
+    pub age_range_s: f64,
 }
 
 /// Reward of a prediction, a function of its Euclidean distance d from the truth.

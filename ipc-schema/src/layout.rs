@@ -9,6 +9,7 @@ use crate::{
     ego::EgoPose,
     event::Collision,
     header::MessageHeader,
+    pointcloud::{LidarPoint, Scan},
     traffic::{RoutePoint, SignalMeta, TrafficState, VehicleMeta},
     world::{HeroView, SubStep, VehicleState},
 };
@@ -167,6 +168,25 @@ pub fn table() -> Vec<TypeLayout> {
             other,
             other_class,
             relative_speed_mps
+        }),
+        layout!(LidarPoint {
+            position_m,
+            intensity,
+            object,
+            incidence_cos,
+            tag,
+            channel,
+            age_us
+        }),
+        layout!(Scan {
+            position_m,
+            attitude_rad,
+            id_hash,
+            azimuth_rad,
+            range_m,
+            rays,
+            axes,
+            reserved
         }),
         layout!(Progress {
             consumed_ticks,

@@ -25,6 +25,7 @@ pub mod flow;
 pub mod header;
 pub mod layout;
 pub mod observation;
+pub mod pointcloud;
 pub mod ports;
 pub mod process;
 pub mod props;
@@ -36,4 +37,4 @@ pub mod traffic;
 pub mod world;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 2;
+pub const SCHEMA_VERSION: u32 = 3;

@@ -133,7 +133,6 @@ impl Channel {
     #[must_use]
     pub fn max_payload(self, run: &RunFile) -> usize {
         let road_users = run.config.traffic.max_road_users as usize;
-        let fields = run.config.observation.fields.len();
         match self {
             Self::Traffic => road_users * size_of::<TrafficState>(),
             // Everybody may leave and everybody may come within one step.
@@ -143,7 +142,9 @@ impl Channel {
             Self::World => {
                 WorldLayout::with_heroes(road_users, run.config.run.sub_steps as usize, run.config.heroes()).len
             }
-            Self::Observation => ObservationLayout::new(road_users, fields).len,
+            Self::Observation => {
+                ObservationLayout::new(road_users, run.config.observation_width(), run.config.imu_samples()).len
+            }
             Self::Prediction => road_users * size_of::<[f32; 2]>(),
             Self::EgoPose => road_users * size_of::<EgoPose>(),
             Self::Event => road_users * size_of::<Collision>(),

@@ -57,7 +57,12 @@ fn round(config: &Config, map: &MapInfo, states: &[VehicleState]) -> f64 {
         ..MessageHeader::default()
     };
     let n = sensing.assign(&header, states);
-    let mut payload = vec![0_u64; ObservationLayout::new(n, sensing.width()).len.div_ceil(8)];
+    let mut payload = vec![
+        0_u64;
+        ObservationLayout::new(n, sensing.width(), sensing.imu_samples())
+            .len
+            .div_ceil(8)
+    ];
     let start = Instant::now();
     for tick in 0..TICKS {
         header.tick = tick;

@@ -130,10 +130,10 @@ impl Daemon {
             columns: d as u32,
             run_id: ours.run_id,
             incarnation: ours.incarnation,
-            sequence: 0,
+            sequence: self.sensing.imu_samples() as u64,
             ..*world
         };
-        let mut draft = self.observations.loan(header, ObservationLayout::new(n, d).len)?;
+        let mut draft = self.observations.loan(header, ObservationLayout::of(&header).len)?;
         self.sensing
             .observe(&header, states, views, draft.payload_mut())
             .map_err(broken)?;

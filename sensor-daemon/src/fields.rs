@@ -53,6 +53,7 @@ impl Readings {
             Field::LeaderGap => f64::from(self.route.leader_gap_m),
             Field::LeaderSpeed => f64::from(self.route.leader_speed_mps),
             Field::SignalGap => f64::from(self.route.signal_gap_m),
+            _ => 0.0,
         }
     }
 }
@@ -84,6 +85,7 @@ impl Normaliser {
             Field::LeaderGap | Field::SignalGap => (0.0, SIGHT_M),
             Field::Speed | Field::SpeedLimit | Field::LeaderSpeed => (0.0, params.speed_range_mps),
             Field::Steering => (-params.steering_range_rad, params.steering_range_rad),
+            _ => (0.0, 1.0),
         };
         let fields = params
             .fields
@@ -121,16 +123,14 @@ impl Normaliser {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::preset::town;
     use proptest::prelude::*;
 
     fn params(fields: Vec<Field>, scale: Scale) -> Params {
         Params {
             fields,
             scale,
-            accel_range_mps2: 20.0,
-            gyro_range_radps: 2.0,
-            speed_range_mps: 30.0,
-            steering_range_rad: 10.0,
+            ..town().observation
         }
     }
 

@@ -31,8 +31,8 @@ pub fn sample(params: &Params, map: &DisplacementMap, x_m: f64, y_m: f64, stream
     debug_assert_eq!(stream.sensor, Sensor::Gnss);
     let [north, east] = stream.normal_pair(index);
     let arc = Arc {
-        east_deg: params.bias_deg + params.noise_std_deg * east,
-        north_deg: params.bias_deg + params.noise_std_deg * north,
+        east_deg: params.bias_deg[1] + params.noise_std_deg[1] * east,
+        north_deg: params.bias_deg[0] + params.noise_std_deg[0] * north,
     };
     let displaced = map.displaced(NetPosition { x_m, y_m }, arc);
     Fix {
@@ -46,6 +46,7 @@ pub fn sample(params: &Params, map: &DisplacementMap, x_m: f64, y_m: f64, stream
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::preset::town;
     use ipc_schema::run::MapInfo;
     use sim_core::geodesy::Projection;
 
@@ -70,9 +71,9 @@ mod tests {
     #[test]
     fn without_noise_the_fix_is_the_truth_to_a_tenth_of_a_millimetre() {
         let params = Params {
-            period_s: 0.1,
-            noise_std_deg: 0.0,
-            bias_deg: 0.0,
+            noise_std_deg: [0.0; 2],
+            bias_deg: [0.0; 2],
+            ..town().gnss
         };
         for (x, y) in [(20.0, 17.9), (129.0, 126.0), (239.0, 236.0)] {
             let fix = sample(&params, &map(), x, y, stream(1), 0);
@@ -85,9 +86,9 @@ mod tests {
     fn the_papers_noise_is_seven_metres_on_average_and_equal_on_both_axes() {
         const N: u32 = 40_000;
         let params = Params {
-            period_s: 0.1,
-            noise_std_deg: 5e-5,
-            bias_deg: 0.0,
+            noise_std_deg: [5e-5; 2],
+            bias_deg: [0.0; 2],
+            ..town().gnss
         };
         let map = map();
         let errors: Vec<(f64, f64)> = (0..N)
@@ -110,9 +111,9 @@ mod tests {
     #[test]
     fn a_bias_moves_the_mean_north_east() {
         let params = Params {
-            period_s: 0.1,
-            noise_std_deg: 0.0,
-            bias_deg: 1e-5,
+            noise_std_deg: [0.0; 2],
+            bias_deg: [1e-5; 2],
+            ..town().gnss
         };
         let fix = sample(&params, &map(), 100.0, 50.0, stream(1), 0);
         assert!(

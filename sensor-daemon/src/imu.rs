@@ -1,6 +1,12 @@
 //! Inertial measurement unit: accelerometer, gyroscope and compass in the vehicle's body frame (x forward, y left, z up).
 
-use ipc_schema::{config::Imu as Params, world::VehicleState};
+use ipc_schema::{
+    config::{Imu as Params, ImuConvention},
+    world::VehicleState,
+};
+
+/// Standard gravity, m/s².
+pub const GRAVITY_MPS2: f64 = 9.806_65;
 
 use crate::noise::{Sensor, Stream};
 
@@ -25,13 +31,18 @@ pub fn sample(params: &Params, state: &VehicleState, episode_seed: u64, index: u
     };
     let accel_noise = stream(Sensor::Accelerometer).normals(index);
     let gyro_noise = stream(Sensor::Gyroscope).normals(index);
-    let gravity = gravity_body(params.gravity_mps2, state);
+    let gravity_mps2 = if params.convention == ImuConvention::Kinematic {
+        0.0
+    } else {
+        GRAVITY_MPS2
+    };
+    let gravity = gravity_body(gravity_mps2, state);
     let axis =
-        |i: usize| f64::from(state.accel_body_mps2[i]) + gravity[i] + params.accel_noise_std_mps2 * accel_noise[i];
+        |i: usize| f64::from(state.accel_body_mps2[i]) + gravity[i] + params.accel_noise_std_mps2[i] * accel_noise[i];
     let rate = |i: usize| {
         f64::from(state.angular_rate_body_radps[i])
-            + params.gyro_bias_radps
-            + params.gyro_noise_std_radps * gyro_noise[i]
+            + params.gyro_bias_radps[i]
+            + params.gyro_noise_std_radps[i] * gyro_noise[i]
     };
     Sample {
         accel_mps2: [axis(0), axis(1), axis(2)],
@@ -65,17 +76,18 @@ pub fn compass_rad(yaw_rad: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::preset::town;
     use proptest::prelude::*;
     use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-    const QUIET: Params = Params {
-        period_s: 0.1,
-        accel_noise_std_mps2: 0.0,
-        gyro_noise_std_radps: 0.0,
-        gyro_bias_radps: 0.0,
-        compass_noise_std_rad: 0.0,
-        gravity_mps2: 0.0,
-    };
+    fn quiet() -> Params {
+        Params {
+            accel_noise_std_mps2: [0.0; 3],
+            gyro_noise_std_radps: [0.0; 3],
+            compass_noise_std_rad: 0.0,
+            ..town().imu
+        }
+    }
 
     #[test]
     fn the_compass_knows_the_four_winds() {
@@ -94,19 +106,19 @@ mod tests {
     #[test]
     fn a_quiet_imu_at_rest_feels_gravity_as_configured() {
         let state = VehicleState::default();
-        assert_eq!(sample(&QUIET, &state, 1, 0).accel_mps2, [0.0; 3]);
+        assert_eq!(sample(&quiet(), &state, 1, 0).accel_mps2, [0.0; 3]);
         assert_eq!(
             sample(
                 &Params {
-                    gravity_mps2: 9.81,
-                    ..QUIET
+                    convention: ImuConvention::SpecificForce,
+                    ..quiet()
                 },
                 &state,
                 1,
                 0
             )
             .accel_mps2,
-            [0.0, 0.0, 9.81]
+            [0.0, 0.0, GRAVITY_MPS2]
         );
         // Nose up by 30°: the accelerometer is pushed forward by half of gravity.
         let uphill = VehicleState {
@@ -115,8 +127,8 @@ mod tests {
         };
         let felt = sample(
             &Params {
-                gravity_mps2: 9.81,
-                ..QUIET
+                convention: ImuConvention::SpecificForce,
+                ..quiet()
             },
             &uphill,
             1,
@@ -124,7 +136,7 @@ mod tests {
         )
         .accel_mps2;
         assert!(
-            (felt[0] - 4.905).abs() < 1e-5 && (felt[2] - 8.4957).abs() < 1e-3,
+            (felt[0] - 4.903_325).abs() < 1e-5 && (felt[2] - 8.4928).abs() < 1e-3,
             "{felt:?}"
         );
     }
@@ -137,12 +149,12 @@ mod tests {
             ..VehicleState::default()
         };
         let params = Params {
-            gravity_mps2: 9.81,
-            ..QUIET
+            convention: ImuConvention::SpecificForce,
+            ..quiet()
         };
         let felt = sample(&params, &rolled, 1, 0).accel_mps2;
         assert!(
-            (felt[1] - 4.905).abs() < 1e-5 && (felt[2] - 8.4957).abs() < 1e-3,
+            (felt[1] - 4.903_325).abs() < 1e-5 && (felt[2] - 8.4928).abs() < 1e-3,
             "{felt:?}"
         );
     }
@@ -151,10 +163,10 @@ mod tests {
     fn noise_has_the_configured_level_and_bias_stays() {
         const N: u32 = 20_000;
         let params = Params {
-            accel_noise_std_mps2: 0.5,
-            gyro_noise_std_radps: 0.1,
-            gyro_bias_radps: 0.02,
-            ..QUIET
+            accel_noise_std_mps2: [0.5; 3],
+            gyro_noise_std_radps: [0.1; 3],
+            gyro_bias_radps: [0.02; 3],
+            ..quiet()
         };
         let samples: Vec<Sample> = (0..N)
             .map(|index| sample(&params, &VehicleState::default(), 3, index))

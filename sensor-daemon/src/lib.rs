@@ -12,6 +12,9 @@ pub mod fields;
 pub mod gnss;
 pub mod imu;
 pub mod noise;
+#[cfg(test)]
+#[path = "../../sim-core/tests/common/preset.rs"]
+mod preset;
 pub mod sensing;
 pub mod slots;
 pub mod speed_steering;

@@ -4,7 +4,7 @@ use ipc_schema::{
     block::{self, BlockError},
     config::Config,
     header::{FIRST_OF_EPISODE, MessageHeader},
-    observation::{CLIPPED, GNSS_COLUMNS, ObservationLayout, TRUTH_COLUMNS, VALID},
+    observation::{CLIPPED, GNSS_COLUMNS, ObservationLayout, SENSORS, TRUTH_COLUMNS, VALID},
     run::MapInfo,
     traffic::Kind,
     world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, TIME_LIMIT, VehicleState},
@@ -97,6 +97,12 @@ impl Sensing {
         self.normaliser.width()
     }
 
+    /// IMU samples in a tick.
+    #[must_use]
+    pub fn imu_samples(&self) -> usize {
+        self.config.imu_samples()
+    }
+
     /// Error of the raw GNSS so far.
     #[must_use]
     pub fn raw_error(&self) -> RawError {
@@ -145,10 +151,23 @@ impl Sensing {
         payload: &mut [u8],
     ) -> Result<(), BlockError> {
         let (n, d) = (self.slots.rows().len(), self.width());
-        let layout = ObservationLayout::new(n, d);
+        let layout = ObservationLayout::new(n, d, self.imu_samples());
         let sections = layout.named().map(|(_, section)| section);
-        let [observation, truth, gnss_m, id_hash, vehicle, flags, episode_step, age_s] =
-            block::split_mut(payload, &sections)?;
+        let [
+            observation,
+            truth,
+            gnss_m,
+            _gnss_geodetic,
+            _gnss_quality,
+            _imu,
+            _speed_steering,
+            id_hash,
+            vehicle,
+            flags,
+            _sensors,
+            episode_step,
+            age_s,
+        ] = block::split_mut(payload, &sections)?;
         let observation: &mut [f32] = bytemuck::cast_slice_mut(observation);
         let truth: &mut [[f32; TRUTH_COLUMNS]] = bytemuck::cast_slice_mut(truth);
         let gnss_m: &mut [[f32; GNSS_COLUMNS]] = bytemuck::cast_slice_mut(gnss_m);
@@ -156,7 +175,7 @@ impl Sensing {
         let vehicle: &mut [u32] = bytemuck::cast_slice_mut(vehicle);
         let flags: &mut [u32] = bytemuck::cast_slice_mut(flags);
         let episode_step: &mut [u32] = bytemuck::cast_slice_mut(episode_step);
-        let age_s: &mut [[f32; 3]] = bytemuck::cast_slice_mut(age_s);
+        let age_s: &mut [[f32; SENSORS]] = bytemuck::cast_slice_mut(age_s);
         for slot in 0..n {
             let lent = self.slots.rows()[slot];
             vehicle[slot] = lent.vehicle;
@@ -179,7 +198,7 @@ impl Sensing {
                 state.yaw_rad as f32,
                 state.velocity_body_mps[0],
             ];
-            gnss_m[slot] = [readings.fix.x_m as f32, readings.fix.y_m as f32];
+            gnss_m[slot] = [readings.fix.x_m as f32, readings.fix.y_m as f32, 0.0];
             id_hash[slot] = state.id_hash;
             episode_step[slot] = lent.step;
             age_s[slot] = self.ages_s(lent.step);
@@ -213,8 +232,8 @@ impl Sensing {
     }
 
     /// Ages of the newest samples at the vehicle's `step`, seconds.
-    fn ages_s(&self, step: u32) -> [f32; 3] {
-        [self.periods.gnss, self.periods.imu, self.periods.speed_steering]
+    fn ages_s(&self, step: u32) -> [f32; SENSORS] {
+        [self.periods.gnss, self.periods.imu, self.periods.speed_steering, 1]
             .map(|period| (f64::from(step % period) * self.config.run.tick_s) as f32)
     }
 }

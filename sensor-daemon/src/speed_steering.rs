@@ -32,13 +32,14 @@ pub fn sample(params: &Params, steering_ratio: f64, state: &VehicleState, episod
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::preset::town;
 
     #[test]
     fn without_noise_it_tells_wheel_speed_and_steering_wheel_angle() {
         let params = Params {
-            period_s: 0.1,
             speed_noise_std_mps: 0.0,
             steering_noise_std_rad: 0.0,
+            ..town().speed_steering
         };
         let state = VehicleState {
             velocity_body_mps: [12.5, 0.0, 0.0],
@@ -58,9 +59,9 @@ mod tests {
     fn speed_noise_has_the_configured_level_and_never_makes_speed_negative() {
         const N: u32 = 20_000;
         let params = Params {
-            period_s: 0.1,
             speed_noise_std_mps: 0.3,
             steering_noise_std_rad: 0.0,
+            ..town().speed_steering
         };
         let moving = VehicleState {
             velocity_body_mps: [20.0, 0.0, 0.0],

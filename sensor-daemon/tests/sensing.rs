@@ -48,7 +48,7 @@ fn tick(sensing: &mut Sensing, number: u64, flags: u32, states: &[VehicleState])
         ..MessageHeader::default()
     };
     let n = sensing.assign(&header, states);
-    let mut payload = vec![0_u64; ObservationLayout::new(n, sensing.width()).len / 8];
+    let mut payload = vec![0_u64; ObservationLayout::new(n, sensing.width(), sensing.imu_samples()).len / 8];
     sensing
         .observe(&header, states, &[], bytemuck::cast_slice_mut(&mut payload))
         .unwrap();
@@ -56,7 +56,7 @@ fn tick(sensing: &mut Sensing, number: u64, flags: u32, states: &[VehicleState])
 }
 
 fn section<T: bytemuck::Pod>(n: usize, payload: &[u64], name: &str) -> Vec<T> {
-    let layout = ObservationLayout::new(n, 9);
+    let layout = ObservationLayout::new(n, 9, 1);
     let (_, place) = layout.named().into_iter().find(|(known, _)| *known == name).unwrap();
     block::view::<T>(bytemuck::cast_slice(payload), place).unwrap().to_vec()
 }
@@ -64,7 +64,7 @@ fn section<T: bytemuck::Pod>(n: usize, payload: &[u64], name: &str) -> Vec<T> {
 #[test]
 fn without_noise_the_observation_is_the_truth_of_the_same_row() {
     let mut config = config();
-    config.gnss.noise_std_deg = 0.0;
+    config.gnss.noise_std_deg = [0.0; 2];
     let mut sensing = Sensing::new(&config, &map()).unwrap();
     let states: Vec<_> = (0..5).map(|number| vehicle(number, Kind::Cav)).collect();
     let (n, payload) = tick(&mut sensing, 0, FIRST_OF_EPISODE, &states);
@@ -148,11 +148,11 @@ fn a_vehicles_noise_does_not_depend_on_the_others() {
     let alone = vehicle(7, Kind::Cav);
     let mut one = Sensing::new(&config(), &map()).unwrap();
     let (n, payload) = tick(&mut one, 0, FIRST_OF_EPISODE, &[alone]);
-    let reference = section::<[f32; 2]>(n, &payload, "gnss_m")[0];
+    let reference = section::<[f32; 3]>(n, &payload, "gnss_m")[0];
     let mut many = Sensing::new(&config(), &map()).unwrap();
     let crowd: Vec<_> = (0..8).map(|number| vehicle(number, Kind::Cav)).collect();
     let (n, payload) = tick(&mut many, 0, FIRST_OF_EPISODE, &crowd);
-    assert_eq!(section::<[f32; 2]>(n, &payload, "gnss_m")[7], reference);
+    assert_eq!(section::<[f32; 3]>(n, &payload, "gnss_m")[7], reference);
 }
 
 #[test]
@@ -170,8 +170,8 @@ fn a_slow_sensor_holds_its_sample_and_tells_its_age() {
             if number == 0 { FIRST_OF_EPISODE } else { 0 },
             &states,
         );
-        fixes.push(section::<[f32; 2]>(n, &payload, "gnss_m")[0]);
-        ages.push(section::<[f32; 3]>(n, &payload, "age_s")[0]);
+        fixes.push(section::<[f32; 3]>(n, &payload, "gnss_m")[0]);
+        ages.push(section::<[f32; 4]>(n, &payload, "age_s")[0]);
     }
     assert!(fixes[0] == fixes[1] && fixes[1] == fixes[2] && fixes[2] != fixes[3] && fixes[3] == fixes[5]);
     let gnss_ages: Vec<i32> = ages.iter().map(|age| (age[0] * 10.0).round() as i32).collect();

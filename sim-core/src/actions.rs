@@ -190,7 +190,7 @@ fn actions(answer: &Message, slots: u32) -> Result<&[[f32; 2]], Failure> {
 
 fn vehicles(question: &Message) -> Result<&[u32], BlockError> {
     let header = question.header();
-    let layout = ObservationLayout::new(header.count as usize, header.columns as usize);
+    let layout = ObservationLayout::of(header);
     block::view(question.payload(), layout.vehicle)
 }
 

@@ -68,7 +68,7 @@ impl Settings {
     pub fn of_run(run: &RunFile) -> Self {
         Self {
             vehicle: run.config.vehicle.clone(),
-            surface: run.config.road.surface,
+            surface: run.config.surface(),
             tick_s: run.config.run.tick_s,
             sub_steps: run.config.run.sub_steps,
             ticks_per_step: u32::try_from(run.ticks_per_traffic_step()).unwrap_or(u32::MAX),

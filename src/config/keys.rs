@@ -27,6 +27,22 @@ pub enum Kind {
     Fields,
     /// A list of texts, which may be empty.
     Texts,
+    /// `count` numbers from `min` to `max`; one number stands for all of them.
+    Floats {
+        /// How many.
+        count: usize,
+        /// Least value.
+        min: f64,
+        /// Greatest value.
+        max: f64,
+    },
+    /// A shortest and a longest duration or the like, from `min` to `max`; one number stands for both.
+    Span {
+        /// Least value.
+        min: f64,
+        /// Greatest value.
+        max: f64,
+    },
     /// A list of whole numbers from `min` to `max`.
     Integers {
         /// Least value.
@@ -52,7 +68,7 @@ pub struct Key {
 }
 
 /// Names of observation fields, in the order of the wire.
-pub const FIELD_NAMES: [&str; 25] = [
+pub const FIELD_NAMES: [&str; 41] = [
     "gnss_x",
     "gnss_y",
     "accel_x",
@@ -64,6 +80,22 @@ pub const FIELD_NAMES: [&str; 25] = [
     "compass",
     "speed",
     "steering",
+    "gnss_z",
+    "gnss_accuracy",
+    "gnss_age",
+    "gnss_valid",
+    "imu_age",
+    "imu_valid",
+    "speed_steering_age",
+    "speed_steering_valid",
+    "object_1_x",
+    "object_1_y",
+    "object_2_x",
+    "object_2_y",
+    "object_3_x",
+    "object_3_y",
+    "object_4_x",
+    "object_4_y",
     "route_x_5",
     "route_y_5",
     "route_x_10",
@@ -80,12 +112,15 @@ pub const FIELD_NAMES: [&str; 25] = [
     "signal_gap",
 ];
 
-/// Presets of `observation.fields`: name and the part of [`FIELD_NAMES`] that they take.
-pub const FIELD_PRESETS: [(&str, std::ops::Range<usize>); 3] =
-    [("paper", 0..9), ("caraware", 0..11), ("driving", 9..25)];
+/// Presets of `observation.fields`: name and the parts of [`FIELD_NAMES`] that they take.
+pub const FIELD_PRESETS: [(&str, &[std::ops::Range<usize>]); 3] = [
+    ("paper", &[0..9]),
+    ("caraware", &[0..11]),
+    ("driving", &[9..11, 27..41]),
+];
 
 /// First of [`FIELD_NAMES`] that only a hero has.
-pub const FIRST_HERO_FIELD: usize = 11;
+pub const FIRST_HERO_FIELD: usize = 27;
 
 const fn float(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> Key {
     Key {
@@ -102,6 +137,33 @@ const fn integer(path: &'static str, unit: &'static str, min: i64, max: i64, mea
         path,
         kind: Kind::Integer { min, max },
         unit,
+        meaning,
+        optional: false,
+    }
+}
+
+const fn floats(
+    path: &'static str,
+    unit: &'static str,
+    count: usize,
+    min: f64,
+    max: f64,
+    meaning: &'static str,
+) -> Key {
+    Key {
+        path,
+        kind: Kind::Floats { count, min, max },
+        unit,
+        meaning,
+        optional: false,
+    }
+}
+
+const fn span(path: &'static str, max: f64, meaning: &'static str) -> Key {
+    Key {
+        path,
+        kind: Kind::Span { min: 0.0, max },
+        unit: "s",
         meaning,
         optional: false,
     }
@@ -159,26 +221,85 @@ pub const KEYS: &[Key] = &[
     other("scene.obstacles", Kind::Texts, "Obstacles, each \"name x y heading\": a prop by name, its centre (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
     integer("scene.random_props", "", 0, 1_000_000, "Props placed at random beside the road, the same for the same `run.seed`."),
     float("scene.building_height_m", "m", 0.1, 1000.0, "Height of a building whose polygon and type name none."),
+    other("scene.meshes", Kind::Texts, "Triangle meshes that LIDARs see, each \"file.obj x y heading\": its origin on the ground (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
     other("collision.detect", Kind::Flag, "Look for contacts of connected vehicles and heroes with everything."),
     other("collision.ends_trajectory", Kind::Flag, "A contact ends the trajectory of a connected vehicle (terminated), as it always ends a hero's."),
+    float("weather.rain_mmph", "mm/h", 0.0, 200.0, "Rain: a dry road becomes wet; LIDAR returns grow weaker and get lost (2.5 light, 10 moderate, 50 violent)."),
+    float("weather.visibility_m", "m", 10.0, 1e6, "Meteorological optical range; below 1000 m it is fog, which attenuates LIDAR returns."),
+    float("weather.sun_elevation_deg", "deg", -90.0, 90.0, "Height of the sun above the horizon; below 0 it is night."),
+    float("weather.sun_azimuth_deg", "deg", 0.0, 360.0, "Direction of the sun, clockwise from north."),
+    float("weather.sunlight", "", 0.0, 1.0, "Direct sunlight: 1 = clear sky, 0 = overcast. It adds noise to LIDAR ranges, most towards the sun."),
     float("gnss.period_s", "s", 0.001, 100.0, "Time between fixes: a whole number of ticks."),
-    float("gnss.noise_std_deg", "deg", 0.0, 1.0, "Standard deviation of latitude and longitude (5e-5: 5.57 m on each axis)."),
-    float("gnss.bias_deg", "deg", -1.0, 1.0, "Bias of latitude and longitude."),
-    float("imu.period_s", "s", 0.001, 100.0, "Time between samples: a whole number of ticks."),
-    float("imu.accel_noise_std_mps2", "m/s²", 0.0, 100.0, "Standard deviation of each accelerometer axis."),
-    float("imu.gyro_noise_std_radps", "rad/s", 0.0, 100.0, "Standard deviation of each gyroscope axis."),
-    float("imu.gyro_bias_radps", "rad/s", -10.0, 10.0, "Bias of each gyroscope axis."),
+    floats("gnss.noise_std_deg", "deg", 2, 0.0, 1.0, "Standard deviation of latitude and longitude (5e-5: 5.57 m), degrees of arc on the ground."),
+    floats("gnss.bias_deg", "deg", 2, -1.0, 1.0, "Bias of latitude and longitude, degrees of arc on the ground."),
+    floats("gnss.noise_std_m", "m", 3, 0.0, 10_000.0, "Standard deviation east, north and up, beside `gnss.noise_std_deg`."),
+    floats("gnss.bias_m", "m", 3, -10_000.0, 10_000.0, "Bias east, north and up, beside `gnss.bias_deg`."),
+    floats("gnss.correlated_std_m", "m", 3, 0.0, 10_000.0, "Standard deviation of the slow error (first-order Gauss–Markov) east, north and up."),
+    float("gnss.correlation_time_s", "s", 0.001, 1e6, "Time in which the correlation of the slow error falls to 1/e."),
+    other("gnss.sky_view", Kind::Flag, "Buildings block satellites: fewer of them, a worse fix, reflections off walls."),
+    other("gnss.pedestrians", Kind::Flag, "Pedestrians carry a smartphone: a slot in the observation with GNSS and IMU (the localisation task only)."),
+    float("gnss.pedestrian_noise_factor", "", 0.0, 1000.0, "Errors of a smartphone's fix as a multiple of a vehicle's."),
+    span("gnss.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn anew each time; [0, 0] = none."),
+    span("gnss.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
+    float("imu.period_s", "s", 0.00001, 100.0, "Time between samples: a whole number of sub-steps; all samples of a tick are delivered."),
+    other("imu.convention", Kind::Choice(&["kinematic", "specific_force", "carla"]), "\"kinematic\": no gravity; \"specific_force\": at rest 9.80665 m/s² upwards; \"carla\": the same in CARLA's left-handed frame (y right)."),
+    floats("imu.accel_noise_std_mps2", "m/s²", 3, 0.0, 100.0, "White noise of an accelerometer sample, standard deviation by axis; beside the density."),
+    floats("imu.accel_noise_density", "m/s²/√Hz", 3, 0.0, 100.0, "White noise of the accelerometer by axis as a density (velocity random walk)."),
+    floats("imu.accel_bias_mps2", "m/s²", 3, -100.0, 100.0, "Constant bias of the accelerometer by axis."),
+    floats("imu.accel_bias_walk", "m/s³/√Hz", 3, 0.0, 100.0, "Random walk of that bias by axis."),
+    floats("imu.accel_range_mps2", "m/s²", 3, 0.1, 1e6, "Full scale of the accelerometer by axis: beyond, samples are clamped."),
+    floats("imu.accel_resolution_mps2", "m/s²", 3, 0.0, 100.0, "Smallest step of the accelerometer by axis; 0 = continuous."),
+    floats("imu.gyro_noise_std_radps", "rad/s", 3, 0.0, 100.0, "White noise of a gyroscope sample, standard deviation by axis; beside the density."),
+    floats("imu.gyro_noise_density", "rad/s/√Hz", 3, 0.0, 100.0, "White noise of the gyroscope by axis as a density (angle random walk)."),
+    floats("imu.gyro_bias_radps", "rad/s", 3, -10.0, 10.0, "Constant bias of the gyroscope by axis."),
+    floats("imu.gyro_bias_walk", "rad/s²/√Hz", 3, 0.0, 100.0, "Random walk of that bias by axis."),
+    floats("imu.gyro_range_radps", "rad/s", 3, 0.01, 1e6, "Full scale of the gyroscope by axis: beyond, samples are clamped."),
+    floats("imu.gyro_resolution_radps", "rad/s", 3, 0.0, 100.0, "Smallest step of the gyroscope by axis; 0 = continuous."),
     float("imu.compass_noise_std_rad", "rad", 0.0, 10.0, "Standard deviation of the compass."),
-    float("imu.gravity_mps2", "m/s²", 0.0, 20.0, "Gravity in the accelerometer: 9.81 = specific force, 0 = kinematic acceleration."),
+    float("imu.compass_bias_rad", "rad", -10.0, 10.0, "Constant error of the compass, clockwise."),
+    span("imu.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn anew each time; [0, 0] = none."),
+    span("imu.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
     float("speed_steering.period_s", "s", 0.001, 100.0, "Time between samples: a whole number of ticks."),
     float("speed_steering.speed_noise_std_mps", "m/s", 0.0, 100.0, "Standard deviation of the wheel speed."),
+    float("speed_steering.speed_scale_std", "", 0.0, 0.5, "Scale error of the wheel speed (tyre radius): standard deviation over vehicles, constant for each."),
     float("speed_steering.steering_noise_std_rad", "rad", 0.0, 10.0, "Standard deviation of the steering-wheel angle."),
-    other("observation.fields", Kind::Fields, "Fields of the observation in order: \"paper\" (nine: GNSS and IMU), \"caraware\" (eleven: with speed and steering), \"driving\" (sixteen: speed, steering, the route ahead), or a list of names; those from \"route_x_5\" on are a hero's."),
+    float("speed_steering.steering_scale_std", "", 0.0, 0.5, "Scale error of the steering-wheel angle: standard deviation over vehicles, constant for each."),
+    float("speed_steering.steering_bias_rad", "rad", -10.0, 10.0, "Constant error of the steering-wheel angle."),
+    span("speed_steering.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn anew each time; [0, 0] = none."),
+    span("speed_steering.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
+    integer("lidar.vehicles", "vehicles", 0, 100_000, "Vehicles that carry a LIDAR: those in the first so many slots of the observation; 0 = none."),
+    other("lidar.pattern", Kind::Text, "Rays: \"uniform\" (`lidar.channels` between the two elevations), a unit by name (\"vlp16\", \"hdl32e\", \"hdl64e\", \"pandar40p\", \"os1_32\", \"os1_64\", \"os1_128\", \"vls128\"), or \"table\"."),
+    other("lidar.ray_table", Kind::Text, "CSV file of pattern \"table\": a line for each ray with azimuth_deg (counter-clockwise from ahead), elevation_deg; \"\" = none."),
+    integer("lidar.channels", "", 1, 1024, "Lasers one above the other (pattern \"uniform\")."),
+    integer("lidar.points_per_second", "1/s", 1, 20_000_000, "Rays per second of all channels together."),
+    float("lidar.rotation_hz", "1/s", 0.1, 1000.0, "Rotations per second; a whole number of them in a tick, or of ticks in one."),
+    float("lidar.min_range_m", "m", 0.0, 100.0, "Nearest return."),
+    float("lidar.range_m", "m", 0.1, 1000.0, "Farthest return."),
+    float("lidar.upper_fov_deg", "deg", -90.0, 90.0, "Elevation of the highest channel (pattern \"uniform\")."),
+    float("lidar.lower_fov_deg", "deg", -90.0, 90.0, "Elevation of the lowest channel (pattern \"uniform\")."),
+    float("lidar.horizontal_fov_deg", "deg", 0.1, 360.0, "Field of view about straight ahead; 360 = all around."),
+    floats("lidar.mount", "m, rad", 6, -100.0, 100.0, "Where it is mounted: x, y, z from the centre of the rear axle on the ground (m), then roll, pitch (nose up), yaw (rad)."),
+    float("lidar.range_noise_std_m", "m", 0.0, 100.0, "Standard deviation of the range."),
+    float("lidar.attenuation_per_m", "1/m", 0.0, 10.0, "Attenuation of the intensity by clear air: exp(−attenuation × range)."),
+    float("lidar.dropoff", "", 0.0, 1.0, "Share of returns that get lost whatever they are."),
+    float("lidar.dropoff_intensity", "", 0.0, 1.0, "Intensity from which on no return gets lost for being weak."),
+    float("lidar.dropoff_zero_intensity", "", 0.0, 1.0, "Share of returns lost at intensity 0, falling linearly to none at `lidar.dropoff_intensity`."),
+    other("lidar.rolling_shutter", Kind::Flag, "Each azimuth at its own time, everybody moving; else the whole tick at its end."),
+    other("lidar.mode", Kind::Choice(&["all", "interest"]), "\"all\" returns, or those of \"interest\": vehicles, persons and `lidar.interest_props`."),
+    other("lidar.interest_props", Kind::Texts, "Props that are of interest, by name (docs/scene.md)."),
+    other("lidar.axes", Kind::Choice(&["forward", "paper"]), "Axes of the points: x forward, y left, z up; or the paper's: y backward, x left, z down."),
+    span("lidar.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn anew each time; [0, 0] = none."),
+    span("lidar.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
+    other("blackout.enabled", Kind::Flag, "Switch for the blackouts of all sensors."),
+    other("blackout.policy", Kind::Choice(&["hold", "nan", "drop"]), "Meanwhile the observation holds the last sample, or not-a-number, or the row is marked invalid."),
+    other("observation.fields", Kind::Fields, "Fields of the observation in order: \"paper\" (nine: GNSS and IMU), \"caraware\" (eleven: with speed and steering), \"driving\" (sixteen: speed, steering, the route ahead), or a list of names; those from \"route_x_5\" on are a hero's, those that begin with \"object_\" need a LIDAR."),
+    integer("observation.history", "ticks", 1, 64, "Ticks in a row: the newest last, those before it in front (frame stack)."),
     other("observation.scale", Kind::Choice(&["zero_to_one", "minus_one_to_one"]), "Range that every field is normalised to: the paper's text says 0 … 1, CarAware's code −1 … 1."),
     float("observation.accel_range_mps2", "m/s²", 0.1, 1000.0, "Full scale of the accelerometer fields."),
     float("observation.gyro_range_radps", "rad/s", 0.01, 1000.0, "Full scale of the gyroscope fields."),
     float("observation.speed_range_mps", "m/s", 0.1, 1000.0, "Full scale of the speed field."),
     float("observation.steering_range_rad", "rad", 0.1, 1000.0, "Full scale of the steering field."),
+    float("observation.age_range_s", "s", 0.001, 1e6, "Full scale of the fields of ages."),
     other("trainer.module", Kind::Text, "Python module that is run as the trainer; your own takes its part through `caraware.channel`."),
     float("trainer.learning_rate", "", 1e-9, 1.0, "Learning rate of Adam at the start."),
     float("trainer.learning_rate_decay", "", 0.01, 1.0, "Factor on the learning rate after each update."),
@@ -246,6 +367,8 @@ impl Key {
                 "\"paper\", \"caraware\", \"driving\", or a list of {}",
                 FIELD_NAMES.join(", ")
             ),
+            Kind::Floats { count, min, max } => format!("{count} × {min} … {max}, or one for all"),
+            Kind::Span { min, max } => format!("[shortest, longest] in {min} … {max}"),
             Kind::Integers { min, max } => format!("list of {min} … {max}"),
         }
     }

@@ -127,6 +127,10 @@ fn check(key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Value> {
         Kind::Text => value.as_str().map(Value::from),
         Kind::Fields => fields(value),
         Kind::Texts => texts(value),
+        Kind::Floats { count, min, max } => floats(value, count, min, max).map(Value::from),
+        Kind::Span { min, max } => floats(value, 2, min, max)
+            .filter(|span| span[0] <= span[1])
+            .map(Value::from),
         Kind::Integers { min, max } => {
             let list: Option<Vec<Value>> = value
                 .as_array()?
@@ -150,6 +154,15 @@ fn float(value: &DeValue<'_>) -> Option<f64> {
     }
 }
 
+/// `count` numbers, or one that stands for all.
+fn floats(value: &DeValue<'_>, count: usize, min: f64, max: f64) -> Option<Vec<f64>> {
+    let list: Vec<f64> = match value.as_array() {
+        Some(list) => list.iter().map(|item| float(item.get_ref())).collect::<Option<_>>()?,
+        None => vec![float(value)?; count],
+    };
+    (list.len() == count && list.iter().all(|number| (min..=max).contains(number))).then_some(list)
+}
+
 fn integer(value: &DeValue<'_>, min: i64, max: i64) -> Option<i64> {
     let whole = value.as_integer()?;
     let number = i64::from_str_radix(whole.as_str(), whole.radix()).ok()?;
@@ -163,8 +176,12 @@ fn texts(value: &DeValue<'_>) -> Option<Value> {
 
 fn fields(value: &DeValue<'_>) -> Option<Value> {
     if let Some(preset) = value.as_str() {
-        let (_, part) = FIELD_PRESETS.iter().find(|(name, _)| *name == preset)?;
-        return Some(Value::from(&FIELD_NAMES[part.clone()]));
+        let (_, parts) = FIELD_PRESETS.iter().find(|(name, _)| *name == preset)?;
+        let names: Vec<&str> = parts
+            .iter()
+            .flat_map(|part| FIELD_NAMES[part.clone()].to_vec())
+            .collect();
+        return Some(Value::from(names));
     }
     let names: Option<Vec<&str>> = value.as_array()?.iter().map(|item| item.get_ref().as_str()).collect();
     let names = names?;

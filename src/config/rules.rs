@@ -6,6 +6,8 @@ use ipc_schema::{
     traffic::VEHICLE_CLASSES,
 };
 
+mod sensors;
+
 use super::{
     ConfigError, Settings,
     keys::{FIELD_NAMES, FIRST_HERO_FIELD},
@@ -17,7 +19,6 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
     for (path, value_s) in [
         ("traffic.step_s", config.traffic.step_s),
         ("gnss.period_s", config.gnss.period_s),
-        ("imu.period_s", config.imu.period_s),
         ("speed_steering.period_s", config.speed_steering.period_s),
     ] {
         if !is_multiple(value_s, tick_s) {
@@ -29,6 +30,7 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
             ));
         }
     }
+    sensors::check(settings, config)?;
     check_class_models(settings, config)?;
     let trainer = &config.trainer;
     if trainer.batch_size > trainer.horizon {

@@ -54,15 +54,15 @@ fn an_unknown_key_names_file_line_and_what_was_meant() {
 
 #[test]
 fn an_unknown_table_is_an_unknown_key() {
-    let (message, _) = error_of("[lidar]\nchannels = 3\n");
-    assert_eq!(message, "my.toml:1: unknown key `lidar`");
+    let (message, _) = error_of("[radar]\nchannels = 3\n");
+    assert_eq!(message, "my.toml:1: unknown key `radar`");
 }
 
 #[test]
 fn a_value_out_of_range_names_range_and_unit() {
     let (message, help) = error_of("[gnss]\nnoise_std_deg = -1\n");
     assert_eq!(message, "my.toml:2: `gnss.noise_std_deg` cannot be -1");
-    assert!(help.starts_with("allowed: 0 … 1 in deg."), "{help}");
+    assert!(help.starts_with("allowed: 2 × 0 … 1, or one for all in deg."), "{help}");
 }
 
 #[test]

@@ -247,7 +247,7 @@ impl ObservationBlock {
     fn new(message: Message) -> PyResult<Self> {
         let header = *message.header();
         let payload_address = message.payload().as_ptr().expose_provenance();
-        let layout = ObservationLayout::new(header.count as usize, header.columns as usize);
+        let layout = ObservationLayout::of(&header);
         if layout.len > message.payload().len() {
             return Err(PyValueError::new_err(format!(
                 "tick {}: {} slots of {} fields need {} bytes, the message has {}",

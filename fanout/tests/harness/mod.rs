@@ -209,7 +209,7 @@ pub fn send_world(session: &Session, publisher: &Publisher, tick: u64, flags: u3
 
 /// Payload of an observation whose truth is (tick, slot, 0, 0).
 pub fn observation(tick: u64, count: usize) -> Vec<u8> {
-    let layout = ObservationLayout::new(count, FIELDS as usize);
+    let layout = ObservationLayout::new(count, FIELDS as usize, 0);
     let mut words = vec![0_u64; layout.len / 8];
     let truth: &mut [[f32; 4]] = view_mut(cast_slice_mut(&mut words), layout.truth).unwrap();
     for (slot, row) in truth.iter_mut().enumerate() {

@@ -1,0 +1,109 @@
+//! `pointcloud`: what one LIDAR has seen during a tick.
+//!
+//! One message for each vehicle that carries a LIDAR and each tick. Its header's `count` is the number of points, `columns` the
+//! number of azimuths fired, `sequence` the dense index of the vehicle; the payload is one [`Scan`], then the points.
+
+use bytemuck::{Pod, Zeroable};
+
+use crate::block::{Section, sections};
+
+/// What a point lies on. Values are stable; new ones come at the end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u16)]
+pub enum Tag {
+    /// The ground.
+    Ground = 0,
+    /// A building, or a part of one.
+    Building = 1,
+    /// A wall or fence.
+    Wall = 2,
+    /// Towers, silos, tanks.
+    Structure = 3,
+    /// A vehicle of the traffic, connected or not, and heroes.
+    Vehicle = 4,
+    /// A vehicle with two wheels.
+    TwoWheeler = 5,
+    /// A pedestrian.
+    Person = 6,
+    /// Cones, bollards, barriers.
+    Barrier = 7,
+    /// Benches, bins, boxes, shelters.
+    Furniture = 8,
+    /// Lamp posts and signs.
+    Pole = 9,
+    /// Trees.
+    Vegetation = 10,
+    /// A vehicle that never moves.
+    ParkedVehicle = 11,
+    /// What fell off a lorry.
+    Load = 12,
+    /// A triangle mesh of `scene.meshes`, or ground that is not flat.
+    Mesh = 13,
+}
+
+/// `object` of a point that belongs to no road user: its top bit is set, the rest is the number of the building, prop or mesh.
+pub const STATIC_OBJECT: u32 = 1 << 31;
+/// `object` of a point on the ground.
+pub const GROUND: u32 = u32::MAX;
+
+/// One return.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct LidarPoint {
+    /// In the sensor's axes at the time the point was fired (`lidar.axes`), metres, range noise included.
+    pub position_m: [f32; 3],
+    /// 0 … 1, after attenuation.
+    pub intensity: f32,
+    /// Dense index of the road user, or [`STATIC_OBJECT`] and a number, or [`GROUND`].
+    pub object: u32,
+    /// Cosine of the angle between the ray and the surface's normal, 0 … 1.
+    pub incidence_cos: f32,
+    /// A [`Tag`].
+    pub tag: u16,
+    /// Which laser: 0 is the lowest.
+    pub channel: u16,
+    /// Before the end of the tick, microseconds.
+    pub age_us: u32,
+}
+
+/// Where the sensor was, for whoever brings points into the world.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+pub struct Scan {
+    /// Sensor at the end of the tick, world, metres.
+    pub position_m: [f64; 3],
+    /// Roll, pitch (nose up) and heading (counter-clockwise from east) of the sensor at the end of the tick, radians.
+    pub attitude_rad: [f64; 3],
+    /// Hash of the vehicle's SUMO id.
+    pub id_hash: u64,
+    /// First azimuth of the tick, radians counter-clockwise from the sensor's x axis, in [0, 2π).
+    pub azimuth_rad: f32,
+    /// Farthest return, metres.
+    pub range_m: f32,
+    /// Rays fired.
+    pub rays: u32,
+    /// 1 in the paper's axes, 0 with x forward.
+    pub axes: u32,
+    /// Zero.
+    pub reserved: [u32; 4],
+}
+
+/// Where the arrays of a `pointcloud` message lie.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PointcloudLayout {
+    /// `Scan [1]`.
+    pub scan: Section,
+    /// `LidarPoint [count]`.
+    pub points: Section,
+    /// Length of the payload in bytes.
+    pub len: usize,
+}
+
+impl PointcloudLayout {
+    /// Layout for `count` points.
+    #[must_use]
+    pub fn new(count: usize) -> Self {
+        let ([scan, points], len) = sections([size_of::<Scan>(), count * size_of::<LidarPoint>()]);
+        Self { scan, points, len }
+    }
+}

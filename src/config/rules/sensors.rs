@@ -1,0 +1,148 @@
+//! Rules of the sensors: rates that divide each other, fields of view that hold something, fields that have a source.
+
+use ipc_schema::config::{Config, Field, Lidar};
+
+use super::{ConfigError, Settings, conflict, is_multiple};
+
+/// Checks the sensors.
+pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+    let refused = imu(config).or_else(|| lidar(config)).or_else(|| observation(config));
+    match refused {
+        None => Ok(()),
+        Some((path, message, help)) => Err(conflict(settings, path, message, help)),
+    }
+}
+
+/// Key, message and help of what is wrong.
+type Refusal = (&'static str, String, String);
+
+/// A fast IMU divides the tick and is divided by the sub-step; a slow one is a whole number of ticks.
+fn imu(config: &Config) -> Option<Refusal> {
+    let (period_s, tick_s) = (config.imu.period_s, config.run.tick_s);
+    let sub_step_s = tick_s / f64::from(config.run.sub_steps);
+    let fits = if period_s < tick_s {
+        is_multiple(period_s, sub_step_s) && is_multiple(tick_s, period_s)
+    } else {
+        is_multiple(period_s, tick_s)
+    };
+    (!fits).then(|| {
+        (
+            "imu.period_s",
+            format!(
+                "`imu.period_s` = {period_s} s is neither a whole number of ticks of `run.tick_s` = {tick_s} s nor a whole part of one \
+                 that is a whole number of sub-steps of {sub_step_s} s"
+            ),
+            format!("choose {tick_s} s, a multiple of it, or a part such as {sub_step_s} s; or another `run.sub_steps`"),
+        )
+    })
+}
+
+fn lidar(config: &Config) -> Option<Refusal> {
+    let lidar = &config.lidar;
+    if lidar.vehicles == 0 {
+        return None;
+    }
+    pattern(lidar)
+        .or_else(|| field_of_view(lidar))
+        .or_else(|| rates(config))
+}
+
+fn pattern(lidar: &Lidar) -> Option<Refusal> {
+    if !Lidar::PATTERNS.contains(&lidar.pattern.as_str()) {
+        return Some((
+            "lidar.pattern",
+            format!("`lidar.pattern` = \"{}\" is no known pattern", lidar.pattern),
+            format!("the patterns are {}", Lidar::PATTERNS.join(", ")),
+        ));
+    }
+    (lidar.pattern == "table" && lidar.ray_table.is_empty()).then(|| {
+        (
+            "lidar.pattern",
+            "`lidar.pattern` = \"table\" without a table".into(),
+            "name a CSV file in lidar.ray_table, or another pattern".into(),
+        )
+    })
+}
+
+fn field_of_view(lidar: &Lidar) -> Option<Refusal> {
+    let (lower, upper) = (lidar.lower_fov_deg, lidar.upper_fov_deg);
+    if lidar.pattern == "uniform" && (lower > upper || (lidar.channels > 1 && upper - lower <= 0.0)) {
+        return Some((
+            "lidar.upper_fov_deg",
+            format!(
+                "`lidar.upper_fov_deg` = {upper} is not above `lidar.lower_fov_deg` = {lower}: the field of view is empty"
+            ),
+            "give the highest channel's elevation in upper_fov_deg, the lowest one's in lower_fov_deg".into(),
+        ));
+    }
+    (lidar.min_range_m >= lidar.range_m).then(|| {
+        (
+            "lidar.min_range_m",
+            format!(
+                "`lidar.min_range_m` = {} leaves nothing below `lidar.range_m` = {}",
+                lidar.min_range_m, lidar.range_m
+            ),
+            "lower the one or raise the other".into(),
+        )
+    })
+}
+
+/// Rotations and ticks divide each other, and every tick fires as many columns.
+fn rates(config: &Config) -> Option<Refusal> {
+    let (lidar, tick_s) = (&config.lidar, config.run.tick_s);
+    let rotation_s = 1.0 / lidar.rotation_hz;
+    if !is_multiple(rotation_s, tick_s) && !is_multiple(tick_s, rotation_s) {
+        return Some((
+            "lidar.rotation_hz",
+            format!(
+                "`lidar.rotation_hz` = {}: neither is a rotation a whole number of ticks of `run.tick_s` = {tick_s} s nor a tick one of \
+                 rotations",
+                lidar.rotation_hz
+            ),
+            format!("choose a multiple or a whole part of {} Hz", 1.0 / tick_s),
+        ));
+    }
+    if lidar.pattern == "table" {
+        return None;
+    }
+    let columns = lidar.points_per_second as f64 * tick_s / lidar.lasers() as f64;
+    let whole = columns.round();
+    (whole < 1.0 || (columns - whole).abs() > 1e-6 * columns).then(|| {
+        (
+            "lidar.points_per_second",
+            format!(
+                "`lidar.points_per_second` = {} makes {columns:.3} firings of {} channels in a tick of {tick_s} s: not a whole number",
+                lidar.points_per_second,
+                lidar.lasers()
+            ),
+            format!(
+                "choose a multiple of {} such as {}",
+                (lidar.lasers() as f64 / tick_s).round(),
+                (whole.max(1.0) * lidar.lasers() as f64 / tick_s).round()
+            ),
+        )
+    })
+}
+
+/// What a field shows must be there.
+fn observation(config: &Config) -> Option<Refusal> {
+    let fields = &config.observation.fields;
+    let needs_lidar = fields
+        .iter()
+        .any(|field| *field >= Field::Object1X && *field <= Field::Object4Y);
+    if needs_lidar && config.lidar.vehicles == 0 {
+        return Some((
+            "observation.fields",
+            "`observation.fields` has nearest objects, which only a LIDAR sees".into(),
+            "set lidar.vehicles to the number of vehicles that carry one, or leave the fields out".into(),
+        ));
+    }
+    if config.gnss.pedestrians && config.drives() {
+        return Some((
+            "gnss.pedestrians",
+            "`gnss.pedestrians` is for the localisation task: pedestrians take no actions".into(),
+            "set gnss.pedestrians = false".into(),
+        ));
+    }
+    None
+}
