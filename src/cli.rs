@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 
 /// Co-simulation of SUMO traffic with sensing vehicles, feeding a learner in another process.
 #[derive(Debug, Parser)]
@@ -22,6 +22,7 @@ const AFTER: &str = "Examples:
   caraware train --set traffic.cavs=8 --set run.seed=7
   caraware simulate my.sumocfg                    your own scenario, every vehicle sensing
   caraware ps                                     what runs, from another terminal
+  caraware bench lidar                            rays per second, beside Open3D's
   caraware stop                                   end it; the trainer writes a checkpoint first
 
 Exit codes: 0 done, 1 the run failed, 2 usage or configuration, 3 something is missing on this machine, 130 interrupted.
@@ -44,12 +45,34 @@ pub enum Command {
         /// Name of the run; may be left out if only one is alive
         run: Option<String>,
     },
+    /// Measure a part on this machine, side by side with its peers
+    Bench(BenchArgs),
     /// Say what is missing on this machine and what dead runs left
     Doctor {
         /// Remove what dead runs left in shared memory
         #[arg(long)]
         clean: bool,
     },
+}
+
+/// What can be measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Part {
+    /// LIDAR: rays per second on one core beside Open3D's ray caster (Embree), same scene and rays
+    Lidar,
+}
+
+/// What `bench` takes.
+#[derive(Debug, Args, Clone)]
+pub struct BenchArgs {
+    /// What to measure
+    pub part: Part,
+    /// Write the figures to this file as well
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Python that has the peers installed [default: the project's]
+    #[arg(long, value_name = "PATH")]
+    pub python: Option<PathBuf>,
 }
 
 /// What `train` and `simulate` take.

@@ -23,19 +23,7 @@ impl Install {
     /// # Errors
     /// A part is missing: which one and how to get it.
     pub fn find() -> Result<Self, Exit> {
-        let executable = std::env::current_exe().map_err(|error| {
-            Exit::missing(
-                format!("cannot find the running program: {error}"),
-                "start caraware by its path",
-            )
-        })?;
-        let bin = executable.parent().map(Path::to_path_buf).unwrap_or_default();
-        // Test binaries lie one level below the programs.
-        let bin = if bin.ends_with("deps") {
-            bin.parent().map(Path::to_path_buf).unwrap_or_default()
-        } else {
-            bin
-        };
+        let bin = programs()?;
         let python = python(&bin)?;
         let sumo_home = sumo_home(&python)?;
         Ok(Self { bin, python, sumo_home })
@@ -63,7 +51,31 @@ impl Install {
     }
 }
 
-fn python(bin: &Path) -> Result<PathBuf, Exit> {
+/// Directory of the programs: beside the running one.
+///
+/// # Errors
+/// The system does not tell which program is running.
+pub fn programs() -> Result<PathBuf, Exit> {
+    let executable = std::env::current_exe().map_err(|error| {
+        Exit::missing(
+            format!("cannot find the running program: {error}"),
+            "start caraware by its path",
+        )
+    })?;
+    let bin = executable.parent().map(Path::to_path_buf).unwrap_or_default();
+    // Test binaries lie one level below the programs.
+    Ok(if bin.ends_with("deps") {
+        bin.parent().map(Path::to_path_buf).unwrap_or_default()
+    } else {
+        bin
+    })
+}
+
+/// Python of the project's virtual environment, or the one that `CARAWARE_PYTHON` names.
+///
+/// # Errors
+/// There is none.
+pub fn python(bin: &Path) -> Result<PathBuf, Exit> {
     if let Some(path) = std::env::var_os("CARAWARE_PYTHON").filter(|path| !path.is_empty()) {
         return Ok(path.into());
     }

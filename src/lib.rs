@@ -1,5 +1,6 @@
 //! The `caraware` command: configuration, process table, supervisor, status, doctor.
 
+pub mod bench;
 pub mod cli;
 pub mod config;
 pub mod display;

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use caraware::{
+    bench,
     cli::{Cli, Command, RunArgs},
     display::Display,
     doctor,
@@ -21,6 +22,7 @@ fn main() -> ExitCode {
         Command::Simulate(args) => run(&args, Mode::Simulate),
         Command::Ps { run } => status::ps(run.as_deref()),
         Command::Stop { run } => status::stop(run.as_deref()),
+        Command::Bench(args) => bench::bench(&args),
         Command::Doctor { clean } => doctor::doctor(clean),
     };
     match result {

@@ -279,6 +279,10 @@ fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
     if needed <= free {
         return Ok(());
     }
+    let lidars = match run.config.lidar.vehicles {
+        0 => String::new(),
+        vehicles => format!(" or `lidar.vehicles` (now {vehicles})"),
+    };
     let mebi = |bytes: u64| bytes.div_ceil(1 << 20);
     Err(Exit::missing(
         format!(
@@ -288,7 +292,7 @@ fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
             mebi(needed)
         ),
         format!(
-            "lower `traffic.max_road_users` (now {}) or `run.window_ticks` (now {}), or enlarge {} (Docker: --shm-size)",
+            "lower `traffic.max_road_users` (now {}) or `run.window_ticks` (now {}){lidars}, or enlarge {} (Docker: --shm-size)",
             run.config.traffic.max_road_users,
             run.config.run.window_ticks,
             registry::SHARED_MEMORY

@@ -122,14 +122,7 @@ impl Publisher {
     /// # Errors
     /// Longer than laid out, or all messages are in use.
     pub fn loan(&self, header: MessageHeader, len: usize) -> Result<Draft, PortError> {
-        if len > self.limit {
-            return Err(PortError::TooLong {
-                channel: self.channel.name(),
-                needed: len,
-                limit: self.limit,
-                max_road_users: self.max_road_users,
-            });
-        }
+        self.check_length(len)?;
         let mut sample = self
             .port
             .loan_slice(len)
@@ -138,6 +131,40 @@ impl Publisher {
         Ok(Draft {
             sample,
             channel: self.channel,
+        })
+    }
+
+    /// A message of `len` payload bytes in shared memory whose bytes are those of whatever lay there before: for whoever writes all
+    /// that is to be read. Zeroing a long message takes longer than filling it.
+    ///
+    /// # Errors
+    /// As [`Publisher::loan`].
+    pub fn loan_unwritten(&self, header: MessageHeader, len: usize) -> Result<Draft, PortError> {
+        self.check_length(len)?;
+        let sample = self
+            .port
+            .loan_slice_uninit(len)
+            .map_err(|e| refused(self.channel.name(), "loan")(&e))?;
+        #[expect(unsafe_code, reason = "the bytes are initialised, only not by this program")]
+        // SAFETY: the payload lies in a shared-memory file that the kernel has filled with zeros and that processes of this run have
+        // written since; every byte has a value, and every value is a valid `u8`.
+        let mut sample = unsafe { sample.assume_init() };
+        *sample.user_header_mut() = header;
+        Ok(Draft {
+            sample,
+            channel: self.channel,
+        })
+    }
+
+    fn check_length(&self, len: usize) -> Result<(), PortError> {
+        if len <= self.limit {
+            return Ok(());
+        }
+        Err(PortError::TooLong {
+            channel: self.channel.name(),
+            needed: len,
+            limit: self.limit,
+            max_road_users: self.max_road_users,
         })
     }
 

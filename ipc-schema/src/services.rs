@@ -20,6 +20,7 @@ use crate::{
     event::Collision,
     header::MessageHeader,
     observation::ObservationLayout,
+    pointcloud::PointcloudLayout,
     process::Process,
     run::{RunFile, SharedMemory},
     traffic::{ROUTE_POINTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout, TrafficState},
@@ -71,11 +72,13 @@ pub enum Channel {
     EgoPose,
     /// Collisions.
     Event,
+    /// What LIDARs see: one message for each of them and each tick.
+    Pointcloud,
 }
 
 impl Channel {
     /// All data services.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::Traffic,
         Self::TrafficMeta,
         Self::World,
@@ -83,6 +86,7 @@ impl Channel {
         Self::Prediction,
         Self::EgoPose,
         Self::Event,
+        Self::Pointcloud,
     ];
 
     /// Name in service names and keys.
@@ -96,6 +100,7 @@ impl Channel {
             Self::Prediction => "prediction",
             Self::EgoPose => "ego-pose",
             Self::Event => "event",
+            Self::Pointcloud => "pointcloud",
         }
     }
 
@@ -105,7 +110,7 @@ impl Channel {
         match self {
             Self::Traffic | Self::TrafficMeta => Process::TrafficBridge,
             Self::World | Self::EgoPose | Self::Event => Process::SimCore,
-            Self::Observation => Process::SensorDaemon,
+            Self::Observation | Self::Pointcloud => Process::SensorDaemon,
             Self::Prediction => Process::Trainer,
         }
     }
@@ -119,7 +124,8 @@ impl Channel {
             Self::Observation => Some(Process::Trainer),
             Self::EgoPose => Some(Process::TrafficBridge),
             // In the driving task sim-core waits for each of them, so the trainer is at most one ahead and no queue overflows.
-            Self::Prediction | Self::Event => None,
+            // Whoever looks at point clouds may miss some: the newest win.
+            Self::Prediction | Self::Event | Self::Pointcloud => None,
         }
     }
 
@@ -148,6 +154,7 @@ impl Channel {
             Self::Prediction => road_users * size_of::<[f32; 2]>(),
             Self::EgoPose => road_users * size_of::<EgoPose>(),
             Self::Event => road_users * size_of::<Collision>(),
+            Self::Pointcloud => PointcloudLayout::new(run.config.lidar.rays_per_tick(run.config.run.tick_s)).len,
         }
     }
 
@@ -155,19 +162,36 @@ impl Channel {
     #[must_use]
     pub fn queue_length(self, run: &RunFile) -> usize {
         let window = usize::try_from(run.window_ticks()).unwrap_or(usize::MAX);
-        // All heroes may come within one step, each with its route.
-        let routes = match self {
-            Self::TrafficMeta => run.config.heroes() * ROUTE_MESSAGES_PER_HERO,
-            _ => 0,
-        };
-        window + routes + SPARE_MESSAGES
+        match self {
+            // All heroes may come within one step, each with its route.
+            Self::TrafficMeta => window + run.config.heroes() * ROUTE_MESSAGES_PER_HERO + SPARE_MESSAGES,
+            // The scans of one tick.
+            Self::Pointcloud => run.config.lidar.vehicles as usize + SPARE_MESSAGES,
+            _ => window + SPARE_MESSAGES,
+        }
+    }
+
+    /// True where the newest message pushes the oldest out of a full queue; else it is the newest that is dropped, and counted.
+    const fn newest_wins(self) -> bool {
+        matches!(self, Self::Pointcloud)
+    }
+
+    /// Messages that one subscriber may hold while it works on them.
+    fn in_hand(self, run: &RunFile) -> usize {
+        match self {
+            Self::Pointcloud => SPARE_MESSAGES,
+            // A batch at work while the next one is taken.
+            _ => 2 * self.queue_length(run),
+        }
     }
 
     /// Most shared memory this service can touch, bytes: every queue full, every message of the longest size.
     #[must_use]
     pub fn worst_case_bytes(self, run: &RunFile) -> usize {
-        // Its queue, and twice as many in hand: a batch at work while the next one is taken.
-        let per_subscriber = 3 * self.queue_length(run);
+        if self == Self::Pointcloud && run.config.lidar.vehicles == 0 {
+            return 0;
+        }
+        let per_subscriber = self.queue_length(run) + self.in_hand(run);
         let messages = 2 * per_subscriber + SPARE_MESSAGES;
         messages * (self.max_payload(run) + size_of::<MessageHeader>() + 4 * ALIGNMENT)
     }
@@ -257,13 +281,13 @@ fn data_builder(
         .publish_subscribe::<[u8]>()
         .user_header::<MessageHeader>()
         .payload_alignment(alignment)
-        .enable_safe_overflow(false)
+        .enable_safe_overflow(channel.newest_wins())
         .history_size(0)
         .max_publishers(2)
         .max_subscribers(channel.max_subscribers())
         .max_nodes(MAX_NODES)
         .subscriber_max_buffer_size(channel.queue_length(run))
-        .subscriber_max_borrowed_samples(2 * channel.queue_length(run)))
+        .subscriber_max_borrowed_samples(channel.in_hand(run)))
 }
 
 /// Opens a data service.

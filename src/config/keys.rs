@@ -112,11 +112,11 @@ pub const FIELD_NAMES: [&str; 41] = [
     "signal_gap",
 ];
 
-/// Presets of `observation.fields`: name and the parts of [`FIELD_NAMES`] that they take.
-pub const FIELD_PRESETS: [(&str, &[std::ops::Range<usize>]); 3] = [
-    ("paper", &[0..9]),
-    ("caraware", &[0..11]),
-    ("driving", &[9..11, 27..41]),
+/// Presets of `observation.fields`: name and the parts of [`FIELD_NAMES`] that they take, first and past the last.
+pub const FIELD_PRESETS: [(&str, &[[usize; 2]]); 3] = [
+    ("paper", &[[0, 9]]),
+    ("caraware", &[[0, 11]]),
+    ("driving", &[[9, 11], [27, 41]]),
 ];
 
 /// First of [`FIELD_NAMES`] that only a hero has.
@@ -332,9 +332,15 @@ pub fn find(path: &str) -> Option<&'static Key> {
     KEYS.iter().find(|key| key.path == path)
 }
 
-/// The existing path most like `path`, if any is near.
+/// Keys of earlier versions, and what took their place.
+const RENAMED: [(&str, &str); 1] = [("imu.gravity_mps2", "imu.convention")];
+
+/// The existing path that took the place of `path`, or the one most like it, if any is near.
 #[must_use]
 pub fn nearest(path: &str) -> Option<&'static str> {
+    if let Some((_, now)) = RENAMED.iter().find(|(then, _)| *then == path) {
+        return Some(now);
+    }
     let last = |p: &str| p.rsplit('.').next().unwrap_or_default().to_owned();
     KEYS.iter()
         .map(|key| {

@@ -179,7 +179,8 @@ fn fields(value: &DeValue<'_>) -> Option<Value> {
         let (_, parts) = FIELD_PRESETS.iter().find(|(name, _)| *name == preset)?;
         let names: Vec<&str> = parts
             .iter()
-            .flat_map(|part| FIELD_NAMES[part.clone()].to_vec())
+            .flat_map(|[first, end]| &FIELD_NAMES[*first..*end])
+            .copied()
             .collect();
         return Some(Value::from(names));
     }

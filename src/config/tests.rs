@@ -1,13 +1,15 @@
 use super::*;
 
+fn config_of(text: &str) -> Result<Config, ConfigError> {
+    layer::parse("my.toml", text).and_then(|layer| {
+        let mut settings = Settings::defaults()?;
+        settings.0.extend(layer);
+        settings.validate()
+    })
+}
+
 fn error_of(text: &str) -> (String, String) {
-    let error = layer::parse("my.toml", text)
-        .and_then(|layer| {
-            let mut settings = Settings::defaults()?;
-            settings.0.extend(layer);
-            settings.validate()
-        })
-        .unwrap_err();
+    let error = config_of(text).unwrap_err();
     let help = miette::Diagnostic::help(&error)
         .map(|help| help.to_string())
         .unwrap_or_default();
@@ -53,6 +55,12 @@ fn an_unknown_key_names_file_line_and_what_was_meant() {
 }
 
 #[test]
+fn a_renamed_key_leads_to_the_new_one() {
+    let (_, help) = error_of("imu.gravity_mps2 = 9.81\n");
+    assert_eq!(help, "did you mean `imu.convention`? All keys: configs/README.md");
+}
+
+#[test]
 fn an_unknown_table_is_an_unknown_key() {
     let (message, _) = error_of("[radar]\nchannels = 3\n");
     assert_eq!(message, "my.toml:1: unknown key `radar`");
@@ -83,12 +91,115 @@ fn text_where_a_number_belongs_and_not_a_number_are_refused() {
 
 #[test]
 fn rates_that_do_not_divide_name_both_numbers() {
-    let (message, help) = error_of("[imu]\nperiod_s = 0.25\n");
+    let (message, help) = error_of("[gnss]\nperiod_s = 0.25\n");
     assert_eq!(
         message,
-        "my.toml:2: `imu.period_s` = 0.25 s is not a whole number of ticks of `run.tick_s` = 0.1 s"
+        "my.toml:2: `gnss.period_s` = 0.25 s is not a whole number of ticks of `run.tick_s` = 0.1 s"
     );
     assert_eq!(help, "choose a multiple of 0.1 s, or another `run.tick_s`");
+}
+
+#[test]
+fn a_fast_imu_divides_the_tick_and_takes_whole_sub_steps() {
+    for period_s in ["0.25", "0.03", "0.04", "0.005"] {
+        let (message, help) = error_of(&format!("imu.period_s = {period_s}\n"));
+        assert!(
+            message.starts_with(&format!("my.toml:1: `imu.period_s` = {period_s} s is neither")),
+            "{message}"
+        );
+        assert!(help.starts_with("choose 0.1 s"), "{help}");
+    }
+    for period_s in ["0.01", "0.02", "0.05", "0.1", "0.3"] {
+        assert!(config_of(&format!("imu.period_s = {period_s}\n")).is_ok(), "{period_s}");
+    }
+}
+
+#[test]
+fn one_number_stands_for_all_axes_and_a_list_must_be_whole() {
+    let axes = |text: &str| config_of(text).unwrap().gnss.noise_std_m;
+    assert_eq!(axes("gnss.noise_std_m = 2\n"), [2.0; 3]);
+    assert_eq!(axes("gnss.noise_std_m = [1, 2.5, 3]\n"), [1.0, 2.5, 3.0]);
+    for text in [
+        "gnss.noise_std_m = [1, 2]",
+        "gnss.noise_std_m = [1, 2, -3]",
+        "gnss.noise_std_m = []",
+    ] {
+        assert_eq!(
+            error_of(text).1,
+            "allowed: 3 × 0 … 10000, or one for all in m. Standard deviation east, north and up, beside `gnss.noise_std_deg`."
+        );
+    }
+    for text in [
+        "gnss.blackout_gap_s = [10, 5]",
+        "gnss.blackout_gap_s = [-1, 5]",
+        "imu.blackout_length_s = [1]",
+    ] {
+        assert!(
+            error_of(text)
+                .1
+                .starts_with("allowed: [shortest, longest] in 0 … 1000000 in s.")
+        );
+    }
+}
+
+#[test]
+fn a_lidar_that_makes_no_sense_is_refused_with_key_value_and_what_is_allowed() {
+    for (text, message, help) in [
+        (
+            "lidar.points_per_second = 1000000000",
+            "`lidar.points_per_second` cannot be 1000000000",
+            "allowed: 1 … 20000000 in 1/s",
+        ),
+        (
+            "lidar.range_noise_std_m = -0.1",
+            "`lidar.range_noise_std_m` cannot be -0.1",
+            "allowed: 0 … 100 in m",
+        ),
+        (
+            "lidar.horizontal_fov_deg = 0",
+            "`lidar.horizontal_fov_deg` cannot be 0",
+            "allowed: 0.1 … 360 in deg",
+        ),
+        (
+            "lidar.upper_fov_deg = -40",
+            "`lidar.upper_fov_deg` = -40 is not above `lidar.lower_fov_deg` = -30",
+            "give the highest",
+        ),
+        (
+            "lidar.rotation_hz = 7",
+            "`lidar.rotation_hz` = 7: neither",
+            "choose a multiple or a whole part of 10 Hz",
+        ),
+        (
+            "lidar.points_per_second = 100000",
+            "makes 312.500 firings of 32 channels in a tick of 0.1 s",
+            "choose a multiple of 320 such as 100160",
+        ),
+        (
+            "lidar.pattern = \"vlp17\"",
+            "`lidar.pattern` = \"vlp17\" is no known pattern",
+            "the patterns are uniform, vlp16",
+        ),
+        (
+            "lidar.pattern = \"table\"",
+            "\"table\" without a table",
+            "name a CSV file",
+        ),
+        (
+            "lidar.min_range_m = 100",
+            "leaves nothing below `lidar.range_m` = 100",
+            "lower the one",
+        ),
+    ] {
+        let (said, helped) = error_of(&format!("lidar.vehicles = 1\n{text}\n"));
+        assert!(said.starts_with("my.toml:2: ") && said.contains(message), "{said}");
+        assert!(helped.starts_with(help), "{helped}");
+    }
+    assert!(
+        error_of("observation.fields = [\"object_1_x\"]\n")
+            .0
+            .contains("only a LIDAR sees")
+    );
 }
 
 #[test]

@@ -299,6 +299,12 @@ impl ObservationBlock {
         self.header.columns
     }
 
+    /// Number of IMU samples k.
+    #[getter]
+    fn imu_samples(&self) -> usize {
+        self.header.sequence as usize
+    }
+
     /// True in an evaluation episode.
     #[getter]
     fn evaluation(&self) -> bool {
@@ -323,7 +329,7 @@ impl ObservationBlock {
         self.payload_address
     }
 
-    /// The bytes of one array ("observation", "truth", "gnss_m", "id_hash", "vehicle", "flags", "episode_step", "age_s")
+    /// The bytes of one array ("observation", "truth", "gnss_m", …: `ipc_schema::observation::ObservationLayout`)
     /// as a read-only buffer over shared memory.
     fn section(slf: Bound<'_, Self>, name: &str) -> PyResult<SectionView> {
         let table = slf.get().layout.named();
@@ -348,5 +354,15 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("TRUNCATED", ipc_schema::observation::TRUNCATED)?;
     module.add("CLIPPED", ipc_schema::observation::CLIPPED)?;
     module.add("EMPTY_SLOT", ipc_schema::observation::EMPTY_SLOT)?;
+    for (name, bit) in [
+        ("GNSS", ipc_schema::observation::GNSS),
+        ("IMU", ipc_schema::observation::IMU),
+        ("SPEED_STEERING", ipc_schema::observation::SPEED_STEERING),
+        ("LIDAR", ipc_schema::observation::LIDAR),
+    ] {
+        module.add(name, bit)?;
+    }
+    module.add("GNSS_COLUMNS", ipc_schema::observation::GNSS_COLUMNS)?;
+    module.add("IMU_COLUMNS", ipc_schema::observation::IMU_COLUMNS)?;
     module.add("TRUTH_COLUMNS", ipc_schema::observation::TRUTH_COLUMNS)
 }

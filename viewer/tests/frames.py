@@ -37,9 +37,9 @@ def observation(tick: int, truth_xy: np.ndarray, gnss_m: np.ndarray, valid: np.n
     truth = np.zeros((n, 4), np.float32)
     truth[:, :2] = truth_xy
     flags = np.ones(n, np.uint32) if valid is None else valid.astype(np.uint32)
-    arrays = {"truth": truth, "gnss_m": gnss_m, "vehicle": np.arange(n), "flags": flags}
+    arrays = {"truth": truth, "gnss_m": np.pad(gnss_m, ((0, 0), (0, 1))), "vehicle": np.arange(n), "flags": flags}
     payload = b""
-    for name, element, shape in wire.observation_sections(n, d):
+    for name, element, shape in wire.observation_sections(n, d, 0):
         payload += np.asarray(arrays.get(name, np.zeros(shape)), element).reshape(shape).tobytes()
         payload += bytes(-len(payload) % wire.ALIGNMENT)
     return header(tick, n, d) + payload

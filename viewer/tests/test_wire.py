@@ -32,17 +32,17 @@ def test_observation_sections_are_aligned_and_in_order() -> None:
     truth = np.arange(14, dtype=np.float32).reshape(7, 2)
     observation = wire.decode_observation(frames.observation(1, truth, truth + 100, np.arange(7) % 2))
     np.testing.assert_array_equal(observation.truth[:, :2], truth)
-    np.testing.assert_array_equal(observation.gnss_m, truth + 100)
+    np.testing.assert_array_equal(observation.gnss_m[:, :2], truth + 100)
     np.testing.assert_array_equal(observation.vehicle, np.arange(7))
     np.testing.assert_array_equal(observation.valid, np.arange(7) % 2 == 1)
-    assert observation.age_s.shape == (7, 3)
+    assert observation.age_s.shape == (7, 4)
 
 
 def test_an_empty_slot_is_not_valid() -> None:
     frame = bytearray(frames.observation(0, np.zeros((1, 2)), np.zeros((1, 2))))
     observation = wire.decode_observation(bytes(frame))
     assert observation.valid.tolist() == [True]
-    at = len(frame) - 4 * wire.ALIGNMENT  # vehicle, flags, episode_step, age_s: one aligned section each
+    at = len(frame) - 5 * wire.ALIGNMENT  # vehicle, flags, sensors, episode_step, age_s: one aligned section each
     frame[at : at + 4] = b"\xff" * 4
     assert wire.decode_observation(bytes(frame)).valid.tolist() == [False]
 

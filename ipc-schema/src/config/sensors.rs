@@ -195,6 +195,18 @@ impl Lidar {
         "table",
     ];
 
+    /// Rays fired in a tick of `tick_s` seconds.
+    #[must_use]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        clippy::cast_precision_loss,
+        reason = "validated: at most 2e7 rays per second"
+    )]
+    pub fn rays_per_tick(&self, tick_s: f64) -> usize {
+        (self.points_per_second as f64 * tick_s).ceil() as usize
+    }
+
     /// Lasers that fire together: a column of the scan. A table fires as it says.
     #[must_use]
     pub fn lasers(&self) -> u32 {

@@ -91,8 +91,37 @@ class Observation:
 
     @cached_property
     def gnss_m(self) -> Tensor:
-        """f32 [n, 2]: newest raw GNSS fix (m, world), the baseline."""
-        return read_only_tensor(self._array("gnss_m", np.float32, 2))
+        """f32 [n, 3]: newest raw GNSS fix, east, north and up (m, world); its x and y are the baseline."""
+        return read_only_tensor(self._array("gnss_m", np.float32, _native.GNSS_COLUMNS))
+
+    @cached_property
+    def gnss_geodetic(self) -> np.ndarray:
+        """f64 [n, 3]: the same fix as latitude, longitude (degrees) and altitude (m)."""
+        return self._array("gnss_geodetic", np.float64, 3)
+
+    @cached_property
+    def gnss_quality(self) -> np.ndarray:
+        """f32 [n, 2]: the receiver's estimate of its horizontal error (m, 1σ of the distance), satellites in use."""
+        return self._array("gnss_quality", np.float32, 2)
+
+    @cached_property
+    def imu(self) -> Tensor:
+        """f32 [n, k, 7]: IMU samples since the last tick, oldest first.
+
+        Columns: acceleration x, y, z (m/s²), angular rate x, y, z (rad/s), compass (rad). Frame and gravity are what `imu.convention` says; k is 1 for an IMU that samples once a tick or less often.
+        """
+        array = self._array("imu", np.float32)
+        return read_only_tensor(array.reshape(self.block.slots, self.block.imu_samples, _native.IMU_COLUMNS))
+
+    @cached_property
+    def speed_steering(self) -> Tensor:
+        """f32 [n, 2]: newest wheel speed (m/s) and steering-wheel angle (rad, positive to the left)."""
+        return read_only_tensor(self._array("speed_steering", np.float32, 2))
+
+    @cached_property
+    def sensors(self) -> np.ndarray:
+        """u32 [n]: bits `GNSS`, `IMU`, `SPEED_STEERING`, `LIDAR` of `caraware._native`: which sensors deliver."""
+        return self._array("sensors", np.uint32)
 
     @cached_property
     def vehicle(self) -> np.ndarray:
@@ -106,8 +135,8 @@ class Observation:
 
     @cached_property
     def age_s(self) -> np.ndarray:
-        """f32 [n, 3]: age of the newest GNSS, IMU and speed-steering sample (s)."""
-        return self._array("age_s", np.float32, 3)
+        """f32 [n, 4]: age of the newest GNSS, IMU, speed-steering and LIDAR sample (s)."""
+        return self._array("age_s", np.float32, 4)
 
     @cached_property
     def _flags(self) -> np.ndarray:

@@ -141,6 +141,8 @@ class RunConfig:
     bounds: MapBounds
     config_sha256: str
     """Of the resolved configuration, as canonical JSON: a checkpoint remembers what it was trained with."""
+    dark_is_nan: bool = False
+    """Fields of a sensor in a blackout are not numbers (`blackout.policy`); the networks see 0, mid-range, instead."""
     resume_from: Path | None = field(default=None)
     """A checkpoint directory to continue from."""
 
@@ -156,6 +158,7 @@ class RunConfig:
             trainer=TrainerConfig.from_run(run),
             bounds=MapBounds.from_run(run),
             config_sha256=hashlib.sha256(canonical).hexdigest(),
+            dark_is_nan=run.get("config", {}).get("blackout", {}).get("policy") == "nan",
             resume_from=Path(resume) if resume else None,
         )
 

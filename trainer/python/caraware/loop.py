@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from caraware.checkpoint import Counters, load_checkpoint, save_checkpoint
@@ -87,7 +88,9 @@ class TrainingLoop:
             self._env_steps, self._episode = counters.env_steps, counters.episode
             self._committed_tick, self._saved_updates = counters.committed_tick, counters.updates
         self._ledger = TickLedger(self._committed_tick if self._committed_tick >= 0 else None)
-        self._rollout = Rollout(trainer.horizon, size, bootstrap=trainer.discount > 0)
+        self._rollout = Rollout(
+            trainer.horizon, size, bootstrap=trainer.discount > 0, dark_is_nan=self._config.dark_is_nan
+        )
         self._sample_clock = (time.monotonic(), self._env_steps)
         log.info("observations of %d fields, %s", size, self._config.trainer)
 
@@ -98,12 +101,16 @@ class TrainingLoop:
         if not fresh:
             self._channel.consumed(ticks[-1].tick)
         while fresh:
-            predictions_m = self._ppo.predict_m([obs.observation for obs in fresh])
+            predictions_m = self._ppo.predict_m([self._visible(obs) for obs in fresh])
             version, used = self._updates(), 0
             while used < len(fresh) and self._updates() == version:
                 self._take(fresh[used], predictions_m[used])
                 used += 1
             fresh = fresh[used:]
+
+    def _visible(self, obs: Observation) -> Tensor:
+        """The observation as the networks take it: in place, unless fields of dark sensors must become numbers."""
+        return torch.nan_to_num(obs.observation) if self._config.dark_is_nan else obs.observation
 
     def _take(self, obs: Observation, predicted_m: Tensor) -> None:
         """Everything that one tick causes."""

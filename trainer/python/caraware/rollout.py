@@ -50,8 +50,9 @@ class Rollout:
     they were still worth. That tick then opens the next horizon.
     """
 
-    def __init__(self, horizon: int, observation_size: int, *, bootstrap: bool) -> None:
+    def __init__(self, horizon: int, observation_size: int, *, bootstrap: bool, dark_is_nan: bool = False) -> None:
         self._horizon, self._size, self._bootstrap = horizon, observation_size, bootstrap
+        self._dark_is_nan = dark_is_nan
         self._ticks = 0
         self._samples = self._newest_samples = 0
         self._last_tick = -1
@@ -71,6 +72,8 @@ class Rollout:
             self._grow(2 * self._capacity, self._slots)
         t = self._ticks
         self._observation[t, :rows].copy_(obs.observation)
+        if self._dark_is_nan:
+            self._observation[t, :rows].nan_to_num_()
         self._truth[t, :rows].copy_(obs.truth)
         self._set_row(self._vehicle[t], obs.vehicle, EMPTY_SLOT)
         self._set_row(self._valid[t], obs.valid, False)

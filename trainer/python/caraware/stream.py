@@ -50,7 +50,7 @@ class Observation(Protocol):
 
     @property
     def gnss_m(self) -> Tensor:
-        """f32 `[n, 2]`: newest raw GNSS fix in world metres. Only for the baseline."""
+        """f32 `[n, 2]` or `[n, 3]`: newest raw GNSS fix in world metres. Only for the baseline."""
 
     @property
     def vehicle(self) -> np.ndarray:

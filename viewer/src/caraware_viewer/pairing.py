@@ -71,7 +71,7 @@ def policy_errors(observation: Observation, prediction: Prediction) -> Errors:
 def gnss_error_m(observation: Observation) -> float:
     """Mean distance of the raw GNSS fixes from the truth over the valid slots, metres; NaN if there are none."""
     valid = observation.valid
-    return mean_distance_m(observation.truth[valid, :2], observation.gnss_m[valid])
+    return mean_distance_m(observation.truth[valid, :2], observation.gnss_m[valid, :2])
 
 
 def mean_distance_m(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:

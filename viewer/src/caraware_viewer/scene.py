@@ -92,7 +92,7 @@ class Scene:
 
     def _draw_observation(self, observation: wire.Observation) -> None:
         self._at(observation.header)
-        fixes_m = on_screen(observation.gnss_m[observation.valid])
+        fixes_m = on_screen(observation.gnss_m[observation.valid, :2])
         self._log(GNSS, rr.Points2D(fixes_m, colors=GNSS_COLOR, radii=rr.Radius.ui_points(2.0)))
         self._log_scalar(GNSS_ERROR, gnss_error_m(observation))
         self._draw_pair(self._pairing.observation(observation))

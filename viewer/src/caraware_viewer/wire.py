@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""
@@ -115,13 +115,23 @@ class Observation:
     truth: NDArray[np.float32]
     """`[n, 4]`: x, y of the rear axle (metres, world frame), yaw (radians), speed (m/s)."""
     gnss_m: NDArray[np.float32]
-    """`[n, 2]`: newest raw fix, metres, world frame."""
+    """`[n, 3]`: newest raw fix, metres, world frame (east, north, up)."""
+    gnss_geodetic: NDArray[np.float64]
+    """`[n, 3]`: the same fix, latitude and longitude (degrees), altitude (metres)."""
+    gnss_quality: NDArray[np.float32]
+    """`[n, 2]`: the receiver's estimate of its horizontal error (metres), satellites in use."""
+    imu: NDArray[np.float32]
+    """`[n, k, 7]`: samples since the last tick: acceleration (m/s²), angular rate (rad/s), compass (rad)."""
+    speed_steering: NDArray[np.float32]
+    """`[n, 2]`: wheel speed (m/s), steering-wheel angle (rad)."""
     id_hash: NDArray[np.uint64]
     vehicle: NDArray[np.uint32]
     flags: NDArray[np.uint32]
+    sensors: NDArray[np.uint32]
+    """Bits 1 GNSS, 2 IMU, 4 speed and steering, 8 LIDAR: which sensors deliver."""
     episode_step: NDArray[np.uint32]
     age_s: NDArray[np.float32]
-    """`[n, 3]`: age of the newest GNSS, IMU and speed-steering sample, seconds."""
+    """`[n, 4]`: age of the newest GNSS, IMU, speed-steering and LIDAR sample, seconds."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -138,17 +148,22 @@ class Prediction:
     """`[n, 2]`: predicted x, y, metres, world frame, one row for each slot of the observation."""
 
 
-def observation_sections(n: int, d: int) -> list[tuple[str, str, tuple[int, ...]]]:
+def observation_sections(n: int, d: int, k: int) -> list[tuple[str, str, tuple[int, ...]]]:
     """Name, element type and shape of the sections of an observation, in order; each is aligned to `ALIGNMENT`."""
     return [
         ("observation", "<f4", (n, d)),
         ("truth", "<f4", (n, 4)),
-        ("gnss_m", "<f4", (n, 2)),
+        ("gnss_m", "<f4", (n, 3)),
+        ("gnss_geodetic", "<f8", (n, 3)),
+        ("gnss_quality", "<f4", (n, 2)),
+        ("imu", "<f4", (n, k, 7)),
+        ("speed_steering", "<f4", (n, 2)),
         ("id_hash", "<u8", (n,)),
         ("vehicle", "<u4", (n,)),
         ("flags", "<u4", (n,)),
+        ("sensors", "<u4", (n,)),
         ("episode_step", "<u4", (n,)),
-        ("age_s", "<f4", (n, 3)),
+        ("age_s", "<f4", (n, 4)),
     ]
 
 
@@ -176,7 +191,7 @@ def decode_observation(frame: bytes) -> Observation:
     header = decode_header(frame)
     arrays = {}
     offset = 0
-    for name, element, shape in observation_sections(header.count, header.columns):
+    for name, element, shape in observation_sections(header.count, header.columns, header.sequence):
         array = _array(frame, HEADER.itemsize + offset, np.dtype(element), shape)
         arrays[name] = array
         offset = -(-(offset + array.nbytes) // ALIGNMENT) * ALIGNMENT
