@@ -258,3 +258,18 @@ pub struct Weather {
     /// Sunlight: 0 = overcast or night, 1 = clear sky.
     pub sunlight: f64,
 }
+
+#[cfg(test)]
+mod tests {
+    use crate::config::{Config, Surface};
+
+    #[test]
+    fn rain_wets_a_dry_road_and_no_other() {
+        let mut config: Config = serde_json::from_str(include_str!("../../tests/town.json")).unwrap();
+        assert_eq!(config.surface(), Surface::Dry);
+        config.weather.rain_mmph = 2.5;
+        assert_eq!(config.surface(), Surface::Wet);
+        config.road.surface = Surface::Snow;
+        assert_eq!(config.surface(), Surface::Snow);
+    }
+}

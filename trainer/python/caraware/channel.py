@@ -108,7 +108,8 @@ class Observation:
     def imu(self) -> Tensor:
         """f32 [n, k, 7]: IMU samples since the last tick, oldest first.
 
-        Columns: acceleration x, y, z (m/s²), angular rate x, y, z (rad/s), compass (rad). Frame and gravity are what `imu.convention` says; k is 1 for an IMU that samples once a tick or less often.
+        Columns: acceleration x, y, z (m/s²), angular rate x, y, z (rad/s), compass (rad). Frame and gravity are
+        what `imu.convention` says; k is 1 for an IMU that samples once a tick or less often.
         """
         array = self._array("imu", np.float32)
         return read_only_tensor(array.reshape(self.block.slots, self.block.imu_samples, _native.IMU_COLUMNS))
