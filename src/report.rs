@@ -18,6 +18,7 @@ struct Sensing {
     drops: u64,
     cavs_max: u64,
     raw_gnss_mean_error_m: Option<f64>,
+    lidar: Option<Value>,
 }
 
 /// Puts the report together, writes it, and returns it with its path.
@@ -67,6 +68,7 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "config_hash": run.config_hash,
         "trainer": training,
         "dynamics": moving,
+        "lidar": sensing.lidar,
     });
     let path = run.run_dir.join("report.json");
     let text = serde_json::to_string_pretty(&report).unwrap_or_default();
@@ -113,6 +115,13 @@ pub fn summary(report: &Value, path: &Path) -> String {
             heroes["off_road"],
             heroes["time_limit"],
             heroes["refused_actions"]
+        ));
+    }
+    let lidar = &report["lidar"];
+    if !lidar.is_null() {
+        lines.push(format!(
+            "LIDAR: {} scans, {} points of {} rays",
+            lidar["scans"], lidar["points"], lidar["rays"]
         ));
     }
     lines.push(format!(

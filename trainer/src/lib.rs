@@ -22,7 +22,9 @@ use pyo3::{
     prelude::*,
 };
 
+mod scans;
 mod view;
+use scans::PointCloud;
 use view::SectionView;
 
 /// Longest wait between two looks at Python's signals.
@@ -41,6 +43,8 @@ fn session_failed(error: SessionError) -> PyErr {
 struct Attached {
     session: Session,
     observations: Subscriber,
+    /// Opened when first asked for.
+    scans: Option<Subscriber>,
     predictions: Publisher,
     /// Whoever waits for the predictions: sim-core in the driving task.
     driven: Option<Waker>,
@@ -75,6 +79,7 @@ impl Attachment {
         let attached = Attached {
             session,
             observations,
+            scans: None,
             predictions,
             driven,
             training: TrainingStatus::default(),
@@ -102,6 +107,21 @@ impl Attachment {
             py.detach(|| self.lock()?.session.wait(left.min(LOOK)).map_err(session_failed))?;
             py.check_signals()?;
         }
+    }
+
+    /// LIDAR scans that have come since the last call, the newest of them if there were more than fit; none before the first call.
+    fn scans(&self, py: Python<'_>) -> PyResult<Vec<PointCloud>> {
+        let mut inner = self.lock()?;
+        if inner.scans.is_none() {
+            inner.scans = Some(inner.session.subscriber(Service::Pointcloud).map_err(session_failed)?);
+        }
+        let mut scans = Vec::new();
+        while let Some(subscriber) = &inner.scans
+            && let Some(message) = subscriber.receive().map_err(|error| failed(&error))?
+        {
+            scans.push(PointCloud::new(py, &message)?);
+        }
+        Ok(scans)
     }
 
     /// True once the last block of the run has been received.
@@ -348,6 +368,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Attachment>()?;
     module.add_class::<ObservationBlock>()?;
     module.add_class::<SectionView>()?;
+    module.add_class::<PointCloud>()?;
     module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
     module.add("VALID", ipc_schema::observation::VALID)?;
     module.add("TERMINATED", ipc_schema::observation::TERMINATED)?;

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from caraware import _native
+from caraware.pointcloud import PointCloud
 
 
 class StreamEndedError(Exception):
@@ -174,6 +175,14 @@ class Channel:
         if self._attachment.ended:
             raise StreamEndedError
         return [Observation(block) for block in self._attachment.receive(timeout_s)]
+
+    def scans(self) -> list[PointCloud]:
+        """LIDAR scans since the last call, oldest first; the newest of them if more came than shared memory holds.
+
+        One for each vehicle that carries a LIDAR (`lidar.vehicles`) and each tick. The first call subscribes and
+        gives none.
+        """
+        return [PointCloud.of(scan) for scan in self._attachment.scans()]
 
     def consumed(self, tick: int) -> None:
         """Gives the simulation credit for all ticks up to and including `tick`."""

@@ -1,0 +1,110 @@
+"""LIDAR scans: points in the sensor's axes, the pose of the sensor, and the way from one to the other."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+
+from caraware import _native
+
+POINT = np.dtype(
+    [
+        ("position_m", "<f4", 3),
+        ("intensity", "<f4"),
+        ("object", "<u4"),
+        ("incidence_cos", "<f4"),
+        ("tag", "<u2"),
+        ("channel", "<u2"),
+        ("age_us", "<u4"),
+    ]
+)
+"""`LidarPoint`: position in the sensor's axes at the time the point was fired (m), intensity 0 ... 1, object, cosine of
+the incidence angle, tag, channel (0 is the lowest), age at the end of the tick (µs)."""
+
+SCAN = np.dtype(
+    [
+        ("position_m", "<f8", 3),
+        ("attitude_rad", "<f8", 3),
+        ("id_hash", "<u8"),
+        ("azimuth_rad", "<f4"),
+        ("range_m", "<f4"),
+        ("rays", "<u4"),
+        ("axes", "<u4"),
+        ("reserved", "<u4", 4),
+    ]
+)
+"""`Scan`: the sensor at the end of the tick in the world (m; roll, pitch, heading in rad), and how it was set up."""
+
+STATIC_OBJECT = 1 << 31
+"""Bit of `object`: a building, prop or mesh; the rest is its number."""
+GROUND = 0xFFFF_FFFF
+"""`object` of a point on the ground."""
+
+
+class Tag(IntEnum):
+    """What a point lies on."""
+
+    GROUND = 0
+    BUILDING = 1
+    WALL = 2
+    STRUCTURE = 3
+    VEHICLE = 4
+    TWO_WHEELER = 5
+    PERSON = 6
+    BARRIER = 7
+    FURNITURE = 8
+    POLE = 9
+    VEGETATION = 10
+    PARKED_VEHICLE = 11
+    LOAD = 12
+    MESH = 13
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """What one LIDAR has seen during a tick; a copy, valid for ever."""
+
+    tick: int
+    sim_time_ns: int
+    vehicle: int
+    """Dense index of the vehicle within its episode, as in `Observation.vehicle`."""
+    scan: np.void
+    """`SCAN`."""
+    points: np.ndarray
+    """`POINT [count]`, read-only."""
+
+    @classmethod
+    def of(cls, native: _native.PointCloud) -> "PointCloud":
+        """From a message."""
+        return cls(
+            tick=native.tick,
+            sim_time_ns=native.sim_time_ns,
+            vehicle=native.vehicle,
+            scan=np.frombuffer(native.scan, SCAN)[0],
+            points=np.frombuffer(native.points, POINT),
+        )
+
+    @cached_property
+    def world_m(self) -> np.ndarray:
+        """f64 [count, 3]: the points in the world frame, with the pose of the sensor at the end of the tick.
+
+        With a rolling shutter a point was fired up to a tick earlier, when the sensor was up to `speed * age` behind:
+        so far what stands still is drawn out of place, as a LIDAR without motion compensation has it.
+        """
+        points = self.points["position_m"].astype(np.float64)
+        if self.scan["axes"] == 1:  # the paper's: y backward, x left, z down
+            points = np.stack((-points[:, 1], points[:, 0], -points[:, 2]), 1)
+        return points @ rotation(*self.scan["attitude_rad"]).T + self.scan["position_m"]
+
+
+def rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """World from sensor, f64 [3, 3]: heading counter-clockwise, then pitch with the nose up, then roll to the right."""
+    (sr, cr), (sp, cp), (sy, cy) = ((np.sin(angle), np.cos(angle)) for angle in (roll, -pitch, yaw))
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )

@@ -1,0 +1,62 @@
+//! LIDAR scans for Python: copied out of shared memory, so that nobody holds up the next one.
+
+use ipc_schema::{block, header::MessageHeader, pointcloud::PointcloudLayout, ports::Message};
+use pyo3::{exceptions::PyValueError, prelude::*, types::PyBytes};
+
+/// What one LIDAR has seen during a tick.
+#[pyclass(frozen, module = "caraware._native")]
+pub(crate) struct PointCloud {
+    header: MessageHeader,
+    scan: Py<PyBytes>,
+    points: Py<PyBytes>,
+}
+
+impl PointCloud {
+    pub(crate) fn new(py: Python<'_>, message: &Message) -> PyResult<Self> {
+        let header = *message.header();
+        let layout = PointcloudLayout::new(header.count as usize);
+        let bytes = |section| {
+            block::view::<u8>(message.payload(), section)
+                .map(|bytes| PyBytes::new(py, bytes).unbind())
+                .map_err(|error| PyValueError::new_err(error.to_string()))
+        };
+        Ok(Self {
+            header,
+            scan: bytes(layout.scan)?,
+            points: bytes(layout.points)?,
+        })
+    }
+}
+
+#[pymethods]
+impl PointCloud {
+    /// Tick number, 0-based over the run.
+    #[getter]
+    fn tick(&self) -> u64 {
+        self.header.tick
+    }
+
+    /// Simulated time at the end of the tick, nanoseconds since the start of the episode.
+    #[getter]
+    fn sim_time_ns(&self) -> u64 {
+        self.header.sim_time_ns
+    }
+
+    /// Dense index of the vehicle within the episode.
+    #[getter]
+    fn vehicle(&self) -> u64 {
+        self.header.sequence
+    }
+
+    /// The bytes of one `Scan`.
+    #[getter]
+    fn scan(&self, py: Python<'_>) -> Py<PyBytes> {
+        self.scan.clone_ref(py)
+    }
+
+    /// The bytes of the points, `LidarPoint [count]`.
+    #[getter]
+    fn points(&self, py: Python<'_>) -> Py<PyBytes> {
+        self.points.clone_ref(py)
+    }
+}
