@@ -102,7 +102,7 @@ class Mlp:
         The rows may come in several blocks `[_, inputs]`: only the first layer reads them, each where it lies.
         """
         rows = sum(len(block) for block in blocks)
-        self._reserve(rows)
+        self.reserve(rows)
         start = 0
         for block in blocks:
             self._layer(0, block, self._activated[0][start : start + len(block)])
@@ -140,7 +140,8 @@ class Mlp:
             start += rows
         return output
 
-    def _reserve(self, rows: int) -> None:
+    def reserve(self, rows: int) -> None:
+        """Room for so many rows. It stays where it is until more are asked for."""
         if rows > self._rows:
             self._activated = [torch.empty(rows, layer.outputs, device=self._device) for layer in self.layers]
             self._gradients = [torch.empty(rows, layer.outputs, device=self._device) for layer in self.layers]

@@ -22,6 +22,7 @@ from caraware import rewards
 from caraware.adam import Adam
 from caraware.config import MapBounds, TrainerConfig
 from caraware.gae import generalised_advantage
+from caraware.graphed import GraphedUpdate, StepTable
 from caraware.networks import FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
 from caraware.rollout import Horizon
 
@@ -122,6 +123,7 @@ class Ppo:
         self.value_optimiser = Adam(self.value.mlp.parameters)
         self._reward = rewards.by_name(config.reward)
         self._second_core = _worker(config, self.device)
+        self._graphed = GraphedUpdate(self) if self.device.type == "cuda" else None
 
     @torch.no_grad()
     def predict_m(self, observations: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -166,7 +168,9 @@ class Ppo:
         learning_rate = self.config.learning_rate * self.config.learning_rate_decay**self.updates
         orders = [torch.randperm(len(batch.reward), generator=self.shuffling) for _ in range(self.config.epochs)]
         orders = [order.to(self.device) for order in orders]
-        if self._second_core is None:
+        if self._graphed is not None:
+            policy, value = self._means_of(self._graphed.run(batch, orders, learning_rate))
+        elif self._second_core is None:
             policy = self._improve_policy(batch, orders, learning_rate)
             value = self._improve_value(batch, orders, learning_rate)
         else:
@@ -216,6 +220,17 @@ class Ppo:
                 log.append((loss, norm))
         loss, norm = _means(log)
         return _ValueMeans(loss, norm)
+
+    def _means_of(self, table: StepTable) -> tuple[_PolicyMeans, _ValueMeans]:
+        """The means of an update on a GPU, which tells its numbers at its end."""
+        if not table.finite():
+            raise NonFiniteLoss("a loss or gradient", self.updates + 1)
+        loss, kl, clipped, ratio_mean, _, norm = table.policy.mean(0).tolist()
+        ratio_max = table.policy[:, 4].max().item()
+        spread = entropy(self.policy.log_std).item()
+        value_loss, value_norm = table.value.mean(0).tolist()
+        policy = _PolicyMeans(loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
+        return policy, _ValueMeans(value_loss, value_norm)
 
     def _advantages(self, horizon: Horizon, rows: Tensor, reward: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
         """Advantages and value targets `[s]` of the samples, by way of the `[T, N]` grid that GAE needs."""
@@ -362,9 +377,12 @@ def _configure_torch(config: TrainerConfig) -> torch.device:
     """Settings that torch keeps per process: threads within an operation, and the precision of matrix products."""
     torch.set_num_threads(_threads_per_network(config))
     amx = hasattr(torch.cpu, "get_capabilities") and torch.cpu.get_capabilities().get("amx_bf16", False)
-    reduced = config.matmul_precision == "bfloat16" or (config.matmul_precision == "auto" and amx)
-    torch.set_float32_matmul_precision("medium" if reduced else "highest")
-    return torch.device("cuda" if config.device == "auto" and torch.cuda.is_available() else "cpu")
+    gpu = config.device == "auto" and torch.cuda.is_available()
+    reduced = config.matmul_precision == "bfloat16" or (config.matmul_precision == "auto" and amx and not gpu)
+    # On a GPU "auto" is TensorFloat-32: 10 bits of mantissa, float32's range.
+    full = "high" if gpu and config.matmul_precision == "auto" else "highest"
+    torch.set_float32_matmul_precision("medium" if reduced else full)
+    return torch.device("cuda" if gpu else "cpu")
 
 
 def _threads_per_network(config: TrainerConfig) -> int:

@@ -1,0 +1,231 @@
+"""PPO's gradient steps on a GPU: one CUDA graph, a minibatch of both networks, replayed without asking the GPU anything.
+
+The steps of `caraware.ppo` read losses and norms back after every minibatch, which costs nothing on a CPU and most of
+the time on a GPU, whose kernels here last microseconds. So on a GPU an update runs as replays of one captured step:
+it finds its own rows (a counter on the device), takes its own Adam step, and writes its numbers into a table that is
+read once, when the update is over. Policy and value network run side by side on two streams of the graph.
+
+A graph has fixed shapes, but horizons differ by some samples: minibatches are filled up with rows of weight 0.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from caraware.adam import BETA_MEAN, BETA_SQUARE, EPSILON, Adam
+from caraware.networks import CHUNK_ROWS, FlatParameters, entropy, log_probability
+
+if TYPE_CHECKING:
+    from caraware.ppo import Batch, Ppo
+
+WARM_UP_STEPS = 3
+"""Steps before the capture: libraries choose their kernels and workspaces in the first calls."""
+SMALLEST_DEVIATION = 1e-8
+POLICY_COLUMNS, VALUE_COLUMNS = 6, 2
+
+
+@dataclass(frozen=True)
+class StepTable:
+    """What the gradient steps of one update wrote, in order, on the CPU."""
+
+    policy: Tensor
+    """f64 `[steps, 6]`: loss, KL, clip fraction, mean ratio, largest ratio, gradient norm."""
+    value: Tensor
+    """f64 `[steps, 2]`: loss, gradient norm."""
+
+    def finite(self) -> bool:
+        """Whether every number is one."""
+        return bool(self.policy.isfinite().all() and self.value.isfinite().all())
+
+
+class GraphedUpdate:
+    """The gradient steps of an update in fixed memory. With a CPU device they run one by one, for the tests."""
+
+    def __init__(self, ppo: "Ppo") -> None:
+        self._ppo, self._device = ppo, ppo.device
+        self._samples = self._rows = self._steps = 0
+        self._replay: Callable[[], None] = self._both_steps
+        self._learning_rate = torch.zeros((), device=self._device)
+        self._policy_adam = _DeviceAdam(ppo.policy_optimiser, ppo.policy.mlp.parameters, self._learning_rate)
+        self._value_adam = _DeviceAdam(ppo.value_optimiser, ppo.value.mlp.parameters, self._learning_rate)
+
+    def run(self, batch: "Batch", orders: list[Tensor], learning_rate: float) -> StepTable:
+        """Take all steps. If a number is not finite, the parameters and moments are as before the update."""
+        parts = max(1, round(len(batch.reward) / self._ppo.config.batch_size))
+        rows = -(-len(batch.reward) // parts)
+        if (rows, parts * len(orders)) != (self._rows, self._steps) or len(batch.reward) > self._samples:
+            self._allocate(len(batch.reward), rows, parts * len(orders))
+            self._load(batch, orders, parts)
+            self._capture()
+        self._load(batch, orders, parts)
+        self._learning_rate.fill_(learning_rate)
+        before = self._snapshot()
+        for _ in range(self._steps):
+            self._replay()
+        table = StepTable(self._policy_log.double().cpu(), self._value_log.double().cpu())
+        if not table.finite():
+            self._restore(before)
+            return table
+        for adam in (self._policy_adam, self._value_adam):
+            adam.optimiser.steps += self._steps
+        return table
+
+    def _allocate(self, samples: int, rows: int, steps: int) -> None:
+        """Room for `samples` and one row of weight 0, and for the numbers of `steps` steps."""
+        self._samples, self._rows, self._steps = samples + samples // 8, rows, steps
+        full, device = self._samples + 1, self._device
+        # The graph remembers addresses: no later pass without gradient may make the networks ask for more.
+        for network in (self._ppo.policy.mlp, self._ppo.value.mlp):
+            network.reserve(max(rows, CHUNK_ROWS))
+        self._observation = torch.zeros(full, self._ppo.observation_size, device=device)
+        self._action = torch.zeros(full, 2, device=device)
+        self._old_log_probability = torch.zeros(full, device=device)
+        self._advantage = torch.zeros(full, device=device)
+        self._target = torch.zeros(full, device=device)
+        self._weight = torch.zeros(full, device=device)
+        self._order = torch.zeros(steps, rows, dtype=torch.int64, device=device)
+        self._step = torch.zeros((), dtype=torch.int64, device=device)
+        self._policy_log = torch.zeros(steps, POLICY_COLUMNS, device=device)
+        self._value_log = torch.zeros(steps, VALUE_COLUMNS, device=device)
+
+    def _load(self, batch: "Batch", orders: list[Tensor], parts: int) -> None:
+        """Put a batch into the fixed memory, and its minibatches, filled up, into the table of orders."""
+        count = len(batch.reward)
+        columns = (batch.observation, batch.action, batch.log_probability, batch.advantage, batch.value_target)
+        rooms = (self._observation, self._action, self._old_log_probability, self._advantage, self._target)
+        for room, column in zip(rooms, columns, strict=True):
+            room[:count].copy_(column)
+        self._weight.zero_()[:count].fill_(1)
+        nobody = self._samples
+        pieces = [piece for order in orders for piece in order.tensor_split(parts)]
+        self._order.fill_(nobody)
+        for row, piece in zip(self._order, pieces, strict=True):
+            row[: len(piece)].copy_(piece)
+        self._step.zero_()
+        self._policy_adam.load()
+        self._value_adam.load()
+
+    def _capture(self) -> None:
+        """Record one step of both networks. What the warm-up moved is put back."""
+        if self._device.type != "cuda":
+            return
+        before = self._snapshot()
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UP_STEPS):
+                self._step.zero_()
+                self._both_steps()
+        torch.cuda.current_stream().wait_stream(stream)
+        self._step.zero_()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self._side_by_side()
+        self._replay = graph.replay
+        self._restore(before)
+
+    def _both_steps(self) -> None:
+        self._policy_step()
+        self._value_step()
+        self._step += 1
+
+    def _side_by_side(self) -> None:
+        """The same, the value network on a stream of its own."""
+        main, side = torch.cuda.current_stream(), torch.cuda.Stream()
+        side.wait_stream(main)
+        with torch.cuda.stream(side):
+            self._value_step()
+        self._policy_step()
+        main.wait_stream(side)
+        self._step += 1
+
+    def _minibatch(self, *columns: Tensor) -> tuple[Tensor, ...]:
+        rows = self._order.index_select(0, self._step.view(1)).view(-1)
+        return tuple(column.index_select(0, rows) for column in columns)
+
+    def _policy_step(self) -> None:
+        """As `Ppo._improve_policy`, with weights: equation 7's gradient, clipped, and Adam."""
+        config, policy = self._ppo.config, self._ppo.policy
+        observation, action, old, advantage, weight = self._minibatch(
+            self._observation, self._action, self._old_log_probability, self._advantage, self._weight
+        )
+        share = weight / weight.sum()
+        centred = advantage - (advantage * share).sum()
+        advantage = centred / ((centred.square() * share).sum().sqrt() + SMALLEST_DEVIATION)
+        mean = policy.mlp.forward(observation)
+        inverse_std = torch.exp(-policy.log_std)
+        deviation = (action - mean) * inverse_std
+        log_ratio = (log_probability(action, mean, policy.log_std) - old) * weight
+        ratio = log_ratio.exp()
+        unclipped = ratio * advantage
+        clipped = ratio.clamp(1 - config.clip_epsilon, 1 + config.clip_epsilon) * advantage
+        pull = (torch.where(unclipped <= clipped, unclipped, 0.0) * -share).unsqueeze(1)
+        policy.mlp.backward(observation, pull * deviation * inverse_std)
+        policy.log_std_gradient.copy_((pull * (deviation.square() - 1)).sum(0) - config.entropy_scale)
+        norm = self._policy_adam.step(config.max_grad_norm)
+        loss = -(torch.minimum(unclipped, clipped) * share).sum() - config.entropy_scale * entropy(policy.log_std)
+        numbers = (
+            loss,
+            ((ratio - 1 - log_ratio) * share).sum(),
+            (((ratio - 1).abs() > config.clip_epsilon) * share).sum(),
+            (ratio * share).sum(),
+            (ratio * weight).max(),
+            norm,
+        )
+        self._policy_log.index_copy_(0, self._step.view(1), torch.stack(numbers).unsqueeze(0))
+
+    def _value_step(self) -> None:
+        """As `Ppo._improve_value`, with weights."""
+        config, network = self._ppo.config, self._ppo.value.mlp
+        observation, target, weight = self._minibatch(self._observation, self._target, self._weight)
+        share = weight / weight.sum()
+        error = network.forward(observation).squeeze(1) - target
+        network.backward(observation, (2 * config.value_scale * error * share).unsqueeze(1))
+        norm = self._value_adam.step(config.max_grad_norm)
+        numbers = torch.stack(((error.square() * share).sum(), norm))
+        self._value_log.index_copy_(0, self._step.view(1), numbers.unsqueeze(0))
+
+    def _state(self) -> list[Tensor]:
+        return [
+            tensor
+            for adam in (self._policy_adam, self._value_adam)
+            for tensor in (adam.parameters.values, adam.optimiser.mean, adam.optimiser.square, adam.steps)
+        ]
+
+    def _snapshot(self) -> list[Tensor]:
+        return [tensor.clone() for tensor in self._state()]
+
+    def _restore(self, before: list[Tensor]) -> None:
+        for tensor, kept in zip(self._state(), before, strict=True):
+            tensor.copy_(kept)
+
+
+class _DeviceAdam:
+    """`caraware.adam.Adam` with the step count and the learning rate on the device, after clipping the gradient."""
+
+    def __init__(self, optimiser: Adam, parameters: FlatParameters, learning_rate: Tensor) -> None:
+        self.optimiser, self.parameters = optimiser, parameters
+        self.steps = torch.zeros((), dtype=torch.float64, device=parameters.values.device)
+        self._learning_rate = learning_rate
+
+    def load(self) -> None:
+        """Take over the optimiser's count."""
+        self.steps.fill_(float(self.optimiser.steps))
+
+    def step(self, max_grad_norm: float) -> Tensor:
+        """One step; returns the norm before clipping."""
+        gradient, adam = self.parameters.gradient, self.optimiser
+        norm = torch.linalg.vector_norm(gradient)
+        gradient.mul_((max_grad_norm / norm).clamp(max=1.0))
+        self.steps += 1
+        adam.mean.lerp_(gradient, 1 - BETA_MEAN)
+        adam.square.mul_(BETA_SQUARE).addcmul_(gradient, gradient, value=1 - BETA_SQUARE)
+        seen_mean = (1 - torch.exp(self.steps * math.log(BETA_MEAN))).float()
+        seen_square = (1 - torch.exp(self.steps * math.log(BETA_SQUARE))).float()
+        scale = adam.square.sqrt().div_(seen_square.sqrt()).add_(EPSILON)
+        self.parameters.values.sub_(adam.mean * (self._learning_rate / seen_mean) / scale)
+        return norm
