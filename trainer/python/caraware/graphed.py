@@ -1,4 +1,4 @@
-"""PPO's gradient steps on a GPU: one CUDA graph, a minibatch of both networks, replayed without asking the GPU anything.
+"""PPO's gradient steps on a GPU: one CUDA graph, a minibatch of both networks, replayed without asking anything back.
 
 The steps of `caraware.ppo` read losses and norms back after every minibatch, which costs nothing on a CPU and most of
 the time on a GPU, whose kernels here last microseconds. So on a GPU an update runs as replays of one captured step:
