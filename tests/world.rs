@@ -12,16 +12,13 @@ use std::{
     collections::BTreeMap,
     path::Path,
     process::{Child, Stdio},
-    time::{Duration, Instant},
 };
 
-use common::Workplace;
+use common::{Spectator, Workplace, until};
 use ipc_schema::{
     block,
     header::LAST_OF_RUN,
-    ports::Subscriber,
-    run::RunFile,
-    services::{self, Channel},
+    services::Channel,
     traffic::Kind,
     world::{APPEARED, RESYNCHRONISED, SubStep, VehicleState, WorldLayout},
 };
@@ -50,16 +47,8 @@ fn watch(workplace: &Workplace, settings: &[&str]) -> Vec<Vec<Moved>> {
 }
 
 fn receive(run_file: &Path, run: &mut Child) -> Vec<Vec<Moved>> {
-    let started = run_file.with_file_name("logs").join("traffic-bridge.log");
-    let (node, service, file) = until(run, || {
-        // Processes start when all services are there: looking earlier would meet them half made.
-        started.exists().then_some(())?;
-        let file = RunFile::read(run_file).ok()?;
-        let node = services::node(&file.shared_memory).ok()?;
-        let service = services::open_data(&node, &file, 0, Channel::World).ok()?;
-        Some((node, service, file))
-    });
-    let world = Subscriber::create(&service, Channel::World, &file).unwrap();
+    let spectator = Spectator::join(run_file, run);
+    let world = spectator.subscribe(Channel::World);
     let mut ticks: Vec<Vec<Moved>> = Vec::new();
     loop {
         let message = until(run, || world.receive().unwrap());
@@ -73,25 +62,9 @@ fn receive(run_file: &Path, run: &mut Child) -> Vec<Vec<Moved>> {
         if header.has(LAST_OF_RUN) {
             drop(message);
             drop(world);
-            drop(node);
+            drop(spectator);
             return ticks;
         }
-    }
-}
-
-/// What `ask` answers, asked again and again while the run lives.
-fn until<T>(run: &mut Child, mut ask: impl FnMut() -> Option<T>) -> T {
-    let begin = Instant::now();
-    loop {
-        if let Some(answer) = ask() {
-            return answer;
-        }
-        if begin.elapsed() > Duration::from_mins(1) {
-            run.kill().unwrap();
-            panic!("nothing came for a minute");
-        }
-        assert!(run.try_wait().unwrap().is_none(), "the run ended early");
-        std::thread::yield_now();
     }
 }
 

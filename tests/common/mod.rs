@@ -4,10 +4,16 @@
 use std::{
     net::TcpListener,
     path::{Path, PathBuf},
-    process::{Command, Output},
+    process::{Child, Command, Output},
     sync::{Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
 };
 
+use ipc_schema::{
+    ports::Subscriber,
+    run::RunFile,
+    services::{self, Channel, RunNode},
+};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -135,4 +141,45 @@ pub fn tool(program: &Path, arguments: &[&str], directory: &Path) {
         .output()
         .unwrap();
     assert!(output.status.success(), "{program:?}: {}", text(&output));
+}
+
+/// A place in a live run from which to look at its shared memory.
+pub struct Spectator {
+    node: RunNode,
+    file: RunFile,
+}
+
+impl Spectator {
+    /// Joins the run as soon as it is there.
+    pub fn join(run_file: &Path, run: &mut Child) -> Self {
+        let started = run_file.with_file_name("logs").join("traffic-bridge.log");
+        until(run, || {
+            // Processes start when all services are there: looking earlier would meet them half made.
+            started.exists().then_some(())?;
+            let file = RunFile::read(run_file).ok()?;
+            let node = services::node(&file.shared_memory).ok()?;
+            Some(Self { node, file })
+        })
+    }
+
+    pub fn subscribe(&self, channel: Channel) -> Subscriber {
+        let service = services::open_data(&self.node, &self.file, 0, channel).unwrap();
+        Subscriber::create(&service, channel, &self.file).unwrap()
+    }
+}
+
+/// What `ask` answers, asked again and again while the run lives.
+pub fn until<T>(run: &mut Child, mut ask: impl FnMut() -> Option<T>) -> T {
+    let begin = Instant::now();
+    loop {
+        if let Some(answer) = ask() {
+            return answer;
+        }
+        if begin.elapsed() > Duration::from_mins(1) {
+            run.kill().unwrap();
+            panic!("nothing came for a minute");
+        }
+        assert!(run.try_wait().unwrap().is_none(), "the run ended early");
+        std::thread::yield_now();
+    }
 }
