@@ -34,15 +34,22 @@ struct Wall {
     top_m: f32,
 }
 
+/// Where the sky begins in a sector.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Edge {
+    /// Tangent of the elevation below which buildings hide it.
+    tangent: f32,
+    /// Distance of the wall that does, metres.
+    distance_m: f32,
+}
+
 /// The sky of a place.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Horizon {
     /// The place: antenna, world, metres.
     pub place_m: [f64; 3],
-    /// Tangent of the elevation below which buildings hide the sky, along the middle of each sector.
-    tangent: [f32; SECTORS],
-    /// Distance of the wall that does, metres.
-    distance_m: [f32; SECTORS],
+    /// Along the middle of each sector.
+    edges: [Edge; SECTORS],
     walls: Vec<Wall>,
 }
 
@@ -84,56 +91,101 @@ impl From<Satellite> for Placed {
 impl Horizon {
     /// Tangent of the elevation below which the sky is hidden, along the middle of each sector; sector 0 begins in the east, the next
     /// are counter-clockwise from it.
-    #[must_use]
-    pub fn tangents(&self) -> &[f32; SECTORS] {
-        &self.tangent
+    pub fn tangents(&self) -> impl Iterator<Item = f64> + '_ {
+        self.edges.iter().map(|edge| f64::from(edge.tangent))
     }
 
     /// True if the satellite is in sight of an antenna at `antenna_m`, near the place.
     #[must_use]
     pub fn is_in_sight(&self, placed: &Placed, antenna_m: [f64; 3]) -> bool {
-        let tangent = f64::from(self.tangent[placed.sector]);
-        if tangent <= 0.0 {
-            return true;
-        }
+        let edge = self.edges[placed.sector];
         // The same wall from a little higher or lower.
         let higher_m = antenna_m[2] - self.place_m[2];
-        tangent - higher_m / f64::from(self.distance_m[placed.sector]) < placed.satellite.tan_elevation
+        let (tangent, distance_m) = (f64::from(edge.tangent), f64::from(edge.distance_m));
+        tangent <= 0.0 || tangent * distance_m - higher_m < placed.satellite.tan_elevation * distance_m
     }
 
+    /// Walls as they stand about an antenna at `antenna_m`, near the place.
+    #[must_use]
+    pub fn mirrors(&self, antenna_m: [f64; 3]) -> Mirrors<'_> {
+        let moved = [antenna_m[0] - self.place_m[0], antenna_m[1] - self.place_m[1]];
+        let higher_m = antenna_m[2] - self.place_m[2];
+        let mut mirrors = Mirrors {
+            edges: &self.edges,
+            higher_m,
+            walls: [Mirror::default(); WALLS],
+        };
+        for (mirror, wall) in mirrors.walls.iter_mut().zip(&self.walls) {
+            *mirror = Mirror {
+                left: from_to(moved, wall.left_m.map(f64::from)),
+                right: from_to(moved, wall.right_m.map(f64::from)),
+                outward: wall.outward.map(f64::from),
+                distance_m: 0.0,
+                top_m: f64::from(wall.top_m) - higher_m,
+            };
+            mirror.distance_m = -dot(mirror.outward, mirror.left);
+        }
+        mirrors
+    }
+}
+
+/// A wall relative to an antenna; one without a distance mirrors nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Mirror {
+    left: Point,
+    right: Point,
+    outward: Point,
+    distance_m: f64,
+    top_m: f64,
+}
+
+/// Walls about an antenna.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Mirrors<'a> {
+    edges: &'a [Edge; SECTORS],
+    higher_m: f64,
+    walls: [Mirror; WALLS],
+}
+
+impl Mirrors<'_> {
     /// Extra path of a hidden satellite's signal by the nearest wall that mirrors it to the antenna, metres.
     ///
     /// A vertical wall at distance `d` with the outward normal `n` makes the path longer by `2 d n·s = 2 d cos e cos Δ`, `e` being
     /// the elevation and Δ the azimuth of the satellite against the normal (image of the antenna behind the wall; Groves, section
-    /// 9.3.4.1). It does if the mirrored ray meets the wall between its ends and below its roof, and if the wall is lit there: it
+    /// 9.3.4). It does if the mirrored ray meets the wall between its ends and below its roof, and if the wall is lit there: it
     /// is higher up and farther away from what hides the satellite than the antenna is.
     #[must_use]
-    pub fn extra_path_m(&self, placed: &Placed, antenna_m: [f64; 3]) -> Option<f64> {
+    pub fn extra_path_m(&self, placed: &Placed) -> Option<f64> {
         let satellite = &placed.satellite;
         let (s, tan_e) = (satellite.heading, satellite.tan_elevation);
-        let moved = [antenna_m[0] - self.place_m[0], antenna_m[1] - self.place_m[1]];
-        let higher_m = antenna_m[2] - self.place_m[2];
-        let blocker_m = f64::from(self.distance_m[placed.sector]);
-        let blocker_top_m = f64::from(self.tangent[placed.sector]) * blocker_m - higher_m;
+        let edge = self.edges[placed.sector];
+        let hider_m = f64::from(edge.distance_m);
+        let hider_top_m = f64::from(edge.tangent) * hider_m - self.higher_m;
+        let nearest_m = self
+            .walls
+            .iter()
+            .filter_map(|wall| {
+                let facing = dot(wall.outward, s);
+                // The ray meets the wall at distance `d / facing`; everything below is multiplied by `facing`.
+                let rises_m = wall.distance_m * tan_e;
+                let is_reached = facing > 0.0 && wall.distance_m > 0.0 && rises_m <= wall.top_m * facing;
+                let is_lit = hider_m * facing * tan_e + 2.0 * rises_m >= hider_top_m * facing;
+                (is_reached && is_lit && wall.is_met(s, facing)).then_some(wall.distance_m * facing)
+            })
+            .min_by(f64::total_cmp)?;
         let cos_e = dot(s, [satellite.line_of_sight[0], satellite.line_of_sight[1]]);
-        let reflection = |wall: &Wall| {
-            let n = wall.outward.map(f64::from);
-            let facing = dot(n, s);
-            let left = from_to(moved, wall.left_m.map(f64::from));
-            let wall_m = -dot(n, left);
-            if facing <= 0.0 || wall_m <= 0.0 {
-                return None;
-            }
-            let mirrored = [s[0] - 2.0 * facing * n[0], s[1] - 2.0 * facing * n[1]];
-            let right = from_to(moved, wall.right_m.map(f64::from));
-            let reach_m = wall_m / facing;
-            let meets = cross(mirrored, left) >= 0.0
-                && cross(right, mirrored) >= 0.0
-                && reach_m * tan_e <= f64::from(wall.top_m) - higher_m;
-            let lit = (blocker_m + 2.0 * reach_m) * tan_e >= blocker_top_m;
-            (meets && lit).then_some(2.0 * wall_m * facing * cos_e)
-        };
-        self.walls.iter().filter_map(reflection).min_by(f64::total_cmp)
+        Some(2.0 * nearest_m * cos_e)
+    }
+}
+
+impl Mirror {
+    /// True if the ray towards `s`, mirrored, meets the wall between its ends.
+    fn is_met(&self, s: Point, facing: f64) -> bool {
+        let mirrored = [
+            s[0] - 2.0 * facing * self.outward[0],
+            s[1] - 2.0 * facing * self.outward[1],
+        ];
+        cross(mirrored, self.left) >= 0.0 && cross(self.right, mirrored) >= 0.0
     }
 }
 
@@ -147,7 +199,6 @@ pub struct Skyline {
 
 /// Walls over the sectors while they are looked for.
 struct Search {
-    place: Point,
     tangent: [f64; SECTORS],
     distance_m: [f64; SECTORS],
     /// Number of the wall in `seen`.
@@ -187,7 +238,6 @@ impl Skyline {
     pub fn sky(&self, scene: &Scene, place_m: [f64; 3]) -> Sky {
         let place = [place_m[0], place_m[1]];
         let mut search = Search {
-            place,
             tangent: [0.0; SECTORS],
             distance_m: [1.0; SECTORS],
             wall: [usize::MAX; SECTORS],
@@ -250,8 +300,10 @@ impl Search {
         }
         Sky::Walled(Box::new(Horizon {
             place_m,
-            tangent: self.tangent.map(|value| value as f32),
-            distance_m: self.distance_m.map(|value| value as f32),
+            edges: std::array::from_fn(|sector| Edge {
+                tangent: self.tangent[sector] as f32,
+                distance_m: self.distance_m[sector] as f32,
+            }),
             walls: self.largest_walls(),
         }))
     }

@@ -232,28 +232,41 @@ impl SkyMap {
 
 fn view(sky: &horizon::Sky, epoch: &Epoch, antenna_m: [f64; 3]) -> SkyView {
     match sky {
-        horizon::Sky::Open => SkyView {
-            satellites: epoch.satellites.len() as u32,
-            noise_factor: 1.0,
-            offset_m: [0.0; 3],
-            has_fix: true,
-        },
+        horizon::Sky::Open => open_view(epoch),
         horizon::Sky::Inside => SkyView::without_fix(0),
         horizon::Sky::Walled(horizon) => {
+            // The usual case along wide roads.
+            if epoch
+                .satellites
+                .iter()
+                .all(|placed| horizon.is_in_sight(placed, antenna_m))
+            {
+                return open_view(epoch);
+            }
             let (satellites, solution) = received(horizon, epoch, antenna_m);
             fix(satellites, solution, epoch.hdop)
         }
     }
 }
 
+fn open_view(epoch: &Epoch) -> SkyView {
+    SkyView {
+        satellites: epoch.satellites.len() as u32,
+        noise_factor: 1.0,
+        offset_m: [0.0; 3],
+        has_fix: epoch.hdop <= MOST_HDOP,
+    }
+}
+
 /// Satellites in use, and what they make of it.
 fn received(horizon: &horizon::Horizon, epoch: &Epoch, antenna_m: [f64; 3]) -> (u32, Option<Solution>) {
     let (mut equations, mut satellites) = (NormalEquations::default(), 0);
+    let mirrors = horizon.mirrors(antenna_m);
     for placed in &epoch.satellites {
         let (weight, extra_m) = if horizon.is_in_sight(placed, antenna_m) {
             (1.0, 0.0)
         } else {
-            match horizon.extra_path_m(placed, antenna_m) {
+            match mirrors.extra_path_m(placed) {
                 Some(extra_m) if extra_m <= MOST_EXTRA_PATH_M => (REFLECTED_WEIGHT, extra_m),
                 _ => continue,
             }
