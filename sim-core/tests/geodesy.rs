@@ -1,6 +1,6 @@
 //! The projection against PROJ, and there and back over 50 km × 50 km.
 
-#![allow(clippy::unwrap_used, reason = "test code may assert by unwrapping")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "test code may assert by unwrapping")]
 
 use ipc_schema::run::MapInfo;
 use sim_core::{
