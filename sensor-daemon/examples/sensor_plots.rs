@@ -2,6 +2,7 @@
 //!
 //! `cargo run --release -p sensor-daemon --example sensor_plots -- DIR`. `imu.csv`: two hours at rest, x axes of accelerometer and
 //! gyroscope, with the parameters in `imu_model.csv`. `gnss.csv`: a drive past houses (`houses.csv`) with three kinds of error.
+//! `street.csv`: the sky over a day in an east–west street 20 m wide between houses of several heights, 3 m off its middle.
 //! `scan.csv`, with the columns x_m,y_m,z_m,tag,intensity, is the LIDAR's.
 
 #![allow(
@@ -21,7 +22,7 @@ use ipc_schema::{config::Config, run::MapInfo, world::VehicleState};
 use sensor_daemon::{
     gnss, imu,
     noise::{Sensor, Stream},
-    sky::SkyMap,
+    sky::{SkyMap, SkyView},
 };
 use sim_core::{
     displacement::DisplacementMap,
@@ -80,7 +81,8 @@ fn main() -> io::Result<()> {
     write_imu(&mut create("imu.csv")?)?;
     write_imu_model(&mut create("imu_model.csv")?)?;
     write_houses(&mut create("houses.csv")?)?;
-    write_gnss(&mut create("gnss.csv")?)
+    write_gnss(&mut create("gnss.csv")?)?;
+    write_street(&mut create("street.csv")?)
 }
 
 /// The IMU at rest: the one place that says how its errors come about.
@@ -198,6 +200,42 @@ fn write_gnss(out: &mut impl Write) -> io::Result<()> {
                 )?;
             }
         }
+    }
+    Ok(())
+}
+
+fn write_street(out: &mut impl Write) -> io::Result<()> {
+    writeln!(
+        out,
+        "houses_m,satellites,no_fix_share,noise_factor,along_rms_m,across_rms_m"
+    )?;
+    for height_m in [0.1, 10.0, 20.0, 30.0, 45.0] {
+        let house = |from_y: f64, to_y: f64| {
+            let outline = vec![[-150.0, from_y], [150.0, from_y], [150.0, to_y], [-150.0, to_y]];
+            Prism::new(String::new(), SolidClass::Building, outline, 0.0, height_m).expect("a house has an area")
+        };
+        let houses = vec![house(10.0, 25.0), house(-25.0, -10.0)];
+        let scene = Arc::new(Scene::new(Road::default(), houses, Vec::new()));
+        let middle = sim_core::geodesy::Geodetic {
+            latitude_deg: 52.0,
+            longitude_deg: 10.5,
+        };
+        let sky = SkyMap::new(scene, middle, [-200.0, -200.0, 200.0, 200.0], SEED);
+        let views: Vec<SkyView> = (0..1436)
+            .map(|minute| sky.at(0.0, -3.0, 0.0, 60.0 * f64::from(minute)))
+            .collect();
+        let fixes: Vec<&SkyView> = views.iter().filter(|view| view.has_fix).collect();
+        let mean = |of: &dyn Fn(&SkyView) -> f64| fixes.iter().map(|view| of(view)).sum::<f64>() / fixes.len() as f64;
+        let rms = |axis: usize| mean(&|view| view.offset_m[axis] * view.offset_m[axis]).sqrt();
+        writeln!(
+            out,
+            "{height_m},{:.1},{:.3},{:.2},{:.1},{:.1}",
+            views.iter().map(|view| f64::from(view.satellites)).sum::<f64>() / views.len() as f64,
+            1.0 - fixes.len() as f64 / views.len() as f64,
+            mean(&|view| view.noise_factor),
+            rms(0),
+            rms(1),
+        )?;
     }
     Ok(())
 }

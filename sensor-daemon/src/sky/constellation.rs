@@ -2,7 +2,7 @@
 //!
 //! Thirty satellites in a Walker pattern 30/6/1 (J. Walker, "Satellite constellations", Journal of the British Interplanetary
 //! Society 37, 1984): six planes inclined by 55°, five satellites in each, on circular orbits that take half a sidereal day, as
-//! GPS's do (E. Kaplan and C. Hegarty, *Understanding GPS*, 2nd edition, section 3.1). Where the orbit is and how the earth turns
+//! GPS's do (E. Kaplan and C. Hegarty, *Understanding GPS*, 2nd edition, section 3.2). Where the orbit is and how the earth turns
 //! below it follows IS-GPS-200, table 20-IV, without eccentricity and perturbations. It is no almanac of a date: the pattern
 //! repeats each sidereal day, and an episode begins somewhere in it.
 
@@ -86,7 +86,7 @@ pub struct Observer {
 }
 
 impl Observer {
-    /// The place itself, at height zero (Kaplan and Hegarty, section 2.2.3.1; axes: section 2.2.3).
+    /// The place itself, at height zero (Kaplan and Hegarty, section 2.2.3).
     #[must_use]
     pub fn at(place: Geodetic) -> Self {
         const RADIUS_M: f64 = 6_378_137.0;
