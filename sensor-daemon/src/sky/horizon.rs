@@ -23,7 +23,7 @@ const FARTHEST_M: f64 = 1_000.0;
 const INDEX_CELL_M: f64 = 50.0;
 
 /// A wall as seen from the place: everything relative to it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Wall {
     /// Ends, the left one first for who looks at it, metres.
     left_m: [f32; 2],
@@ -50,7 +50,8 @@ pub struct Horizon {
     pub place_m: [f64; 3],
     /// Along the middle of each sector.
     edges: [Edge; SECTORS],
-    walls: Vec<Wall>,
+    /// The rest is empty.
+    walls: [Wall; WALLS],
 }
 
 /// A place with a free sky above the mask, a place under some walls, or one inside a building.
@@ -309,15 +310,18 @@ impl Search {
     }
 
     /// Walls that fill most sectors; of equals those that were found first.
-    fn largest_walls(&self) -> Vec<Wall> {
+    fn largest_walls(&self) -> [Wall; WALLS] {
         let fills = |number: usize| self.wall.iter().filter(|wall| **wall == number).count();
         let mut large: Vec<(usize, usize)> = (0..self.seen.len())
             .map(|number| (fills(number), number))
             .filter(|(sectors, _)| *sectors >= LEAST_SECTORS)
             .collect();
         large.sort_by_key(|(sectors, number)| (std::cmp::Reverse(*sectors), *number));
-        large.truncate(WALLS);
-        large.iter().map(|(_, number)| self.wall(*number)).collect()
+        let mut walls = [Wall::default(); WALLS];
+        for (wall, (_, number)) in walls.iter_mut().zip(large) {
+            *wall = self.wall(number);
+        }
+        walls
     }
 
     fn wall(&self, number: usize) -> Wall {
