@@ -34,13 +34,33 @@ struct Wall {
     top_m: f32,
 }
 
-/// Where the sky begins in a sector.
+/// The wall behind which the sky begins in a sector, in whole parts of a metre: all sectors fit four cache lines.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Edge {
-    /// Tangent of the elevation below which buildings hide it.
-    tangent: f32,
-    /// Distance of the wall that does, metres.
-    distance_m: f32,
+    /// Its roof above the antenna, 1/64 m; 0 if there is none.
+    top: u16,
+    /// Its distance, 1/32 m.
+    distance: u16,
+}
+
+impl Edge {
+    const TOP: f64 = 64.0;
+    const DISTANCE: f64 = 32.0;
+
+    fn new(top_m: f64, distance_m: f64) -> Self {
+        Self {
+            top: (top_m * Self::TOP).round() as u16,
+            distance: ((distance_m * Self::DISTANCE).round() as u16).max(1),
+        }
+    }
+
+    fn top_m(self) -> f64 {
+        f64::from(self.top) * (1.0 / Self::TOP)
+    }
+
+    fn distance_m(self) -> f64 {
+        f64::from(self.distance) * (1.0 / Self::DISTANCE)
+    }
 }
 
 /// The sky of a place.
@@ -93,17 +113,15 @@ impl Horizon {
     /// Tangent of the elevation below which the sky is hidden, along the middle of each sector; sector 0 begins in the east, the next
     /// are counter-clockwise from it.
     pub fn tangents(&self) -> impl Iterator<Item = f64> + '_ {
-        self.edges.iter().map(|edge| f64::from(edge.tangent))
+        self.edges.iter().map(|edge| edge.top_m() / edge.distance_m())
     }
 
     /// True if the satellite is in sight of an antenna at `antenna_m`, near the place.
     #[must_use]
     pub fn is_in_sight(&self, placed: &Placed, antenna_m: [f64; 3]) -> bool {
         let edge = self.edges[placed.sector];
-        // The same wall from a little higher or lower.
         let higher_m = antenna_m[2] - self.place_m[2];
-        let (tangent, distance_m) = (f64::from(edge.tangent), f64::from(edge.distance_m));
-        tangent <= 0.0 || tangent * distance_m - higher_m < placed.satellite.tan_elevation * distance_m
+        edge.top == 0 || edge.top_m() - higher_m < placed.satellite.tan_elevation * edge.distance_m()
     }
 
     /// Walls as they stand about an antenna at `antenna_m`, near the place.
@@ -160,8 +178,7 @@ impl Mirrors<'_> {
         let satellite = &placed.satellite;
         let (s, tan_e) = (satellite.heading, satellite.tan_elevation);
         let edge = self.edges[placed.sector];
-        let hider_m = f64::from(edge.distance_m);
-        let hider_top_m = f64::from(edge.tangent) * hider_m - self.higher_m;
+        let (hider_m, hider_top_m) = (edge.distance_m(), edge.top_m() - self.higher_m);
         let nearest_m = self
             .walls
             .iter()
@@ -301,9 +318,9 @@ impl Search {
         }
         Sky::Walled(Box::new(Horizon {
             place_m,
-            edges: std::array::from_fn(|sector| Edge {
-                tangent: self.tangent[sector] as f32,
-                distance_m: self.distance_m[sector] as f32,
+            edges: std::array::from_fn(|sector| {
+                let distance_m = self.distance_m[sector];
+                Edge::new(self.tangent[sector] * distance_m, distance_m)
             }),
             walls: self.largest_walls(),
         }))

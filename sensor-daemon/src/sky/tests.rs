@@ -215,15 +215,19 @@ fn seeds_begin_at_different_times_and_a_day_later_all_is_the_same() {
     assert_eq!(first, views(&map, 0.0));
 }
 
-/// The highest tangent of a roof along a heading by intersecting with every edge.
-fn highest_tangent(buildings: &[Prism], place: Point, antenna_z_m: f64, angle_rad: f64) -> f64 {
+/// Height above the antenna and distance of the roof that is seen highest along a heading, by intersecting with every edge; nothing
+/// is [0, 1].
+fn highest_roof(buildings: &[Prism], place: Point, antenna_z_m: f64, angle_rad: f64) -> [f64; 2] {
     let far = [place[0] + 5e3 * angle_rad.cos(), place[1] + 5e3 * angle_rad.sin()];
-    let mut highest = 0.0_f64;
+    let mut highest = [0.0, 1.0];
     for building in buildings {
         let outline = &building.outline_m;
         for (i, &a) in outline.iter().enumerate() {
             if let Some(hit) = crossing(place, far, a, outline[(i + 1) % outline.len()]) {
-                highest = highest.max((building.z_m()[1] - antenna_z_m) / distance(place, hit));
+                let seen = [building.z_m()[1] - antenna_z_m, distance(place, hit)];
+                if seen[0] / seen[1] > highest[0] / highest[1] {
+                    highest = seen;
+                }
             }
         }
     }
@@ -252,18 +256,21 @@ proptest! {
         let scene = Scene::new(Road::default(), buildings.clone(), Vec::new());
         let inside = buildings.iter().any(|building| building.contains([x, y]) && building.height_m > z);
         let tan_mask = constellation::MASK_DEG.to_radians().tan();
-        let expected: Vec<f64> = (0..horizon::SECTORS)
-            .map(|sector| highest_tangent(&buildings, [x, y], z, TAU * (sector as f64 + 0.5) / horizon::SECTORS as f64))
+        let expected: Vec<[f64; 2]> = (0..horizon::SECTORS)
+            .map(|sector| highest_roof(&buildings, [x, y], z, TAU * (sector as f64 + 0.5) / horizon::SECTORS as f64))
             .collect();
+        let is_low = |[top, distance]: [f64; 2]| top / distance <= tan_mask * (1.0 + 1e-6);
         match Skyline::new(&buildings).sky(&scene, [x, y, z]) {
             horizon::Sky::Inside => prop_assert!(inside),
-            horizon::Sky::Open => prop_assert!(!inside && expected.iter().all(|tangent| *tangent <= tan_mask * (1.0 + 1e-6))),
+            horizon::Sky::Open => prop_assert!(!inside && expected.iter().all(|roof| is_low(*roof))),
             horizon::Sky::Walled(horizon) => {
                 prop_assert!(!inside);
-                for (sector, (found, expected)) in horizon.tangents().zip(&expected).enumerate() {
-                    // Lower than the mask it does not matter.
-                    let both_low = found <= tan_mask && *expected <= tan_mask * (1.0 + 1e-6);
-                    prop_assert!(both_low || (found - expected).abs() < 1e-5 * (1.0 + expected), "{sector}: {found} is not {expected}");
+                for (sector, (found, roof)) in horizon.tangents().zip(&expected).enumerate() {
+                    // Rounded to 1/64 m up and 1/32 m away. Lower than the mask it does not matter.
+                    let error_rad = (found.atan() - (roof[0] / roof[1]).atan()).abs();
+                    let rounding_rad = (0.5 / 64.0 + 0.5 / 32.0) / roof[0].hypot(roof[1]);
+                    let are_low = found <= tan_mask && is_low(*roof);
+                    prop_assert!(are_low || error_rad < 1.1 * rounding_rad, "{sector}: {found} is not {roof:?}");
                 }
             }
         }
