@@ -26,9 +26,9 @@ use position::{NormalEquations, Solution};
 
 /// Smallest cell of the map of horizons, metres; a cell has one horizon.
 const CELL_M: f64 = 4.0;
-/// Most cells: larger maps get larger cells. 16 bytes each.
+/// Most cells: larger maps get larger cells. 24 bytes each.
 const MOST_CELLS: f64 = 1e6;
-/// Most horizons that are kept, about 0.8 kB each; those of further places are computed each time.
+/// Most horizons that are kept, 0.5 kB each; those of further places are computed each time.
 const MOST_HORIZONS: usize = 150_000;
 /// Places tried along each side of a cell whose middle is inside a building.
 const TRIES: i32 = 5;

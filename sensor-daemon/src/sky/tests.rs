@@ -215,6 +215,17 @@ fn seeds_begin_at_different_times_and_a_day_later_all_is_the_same() {
     assert_eq!(first, views(&map, 0.0));
 }
 
+/// What the bounds on cells and horizons mean: at most 24 MB and 77 MB.
+#[test]
+fn memory_is_bounded() {
+    assert!(size_of::<OnceLock<horizon::Sky>>() <= 24 && size_of::<horizon::Horizon>() <= 512);
+    let scene = Arc::new(Scene::default());
+    let large = SkyMap::new(Arc::clone(&scene), MIDDLE, [0.0, 0.0, 200_000.0, 100_000.0], 1);
+    assert!(large.skies.len() < 1_010_000 && large.at(1e5, 5e4, 0.0, 0.0).has_fix);
+    let long = SkyMap::new(scene, MIDDLE, [0.0, 0.0, 1e6, 0.0], 1);
+    assert!(long.skies.len() <= 1_000_001);
+}
+
 /// Height above the antenna and distance of the roof that is seen highest along a heading, by intersecting with every edge; nothing
 /// is [0, 1].
 fn highest_roof(buildings: &[Prism], place: Point, antenna_z_m: f64, angle_rad: f64) -> [f64; 2] {
