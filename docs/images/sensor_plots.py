@@ -107,6 +107,43 @@ def gnss(directory: Path) -> None:
     figure.savefig(HERE / "sensor_gnss.png", dpi=110)
 
 
+def sky(directory: Path) -> None:
+    """The sky at two places: what houses hide, and by which way each satellite is received. North is up."""
+    with open(directory / "horizons.csv", newline="", encoding="utf-8") as file:
+        horizons = list(csv.DictReader(file))
+    with open(directory / "satellites.csv", newline="", encoding="utf-8") as file:
+        satellites = list(csv.DictReader(file))
+    places = list(dict.fromkeys(row["place"] for row in horizons))
+    figure, axes = plt.subplots(1, len(places), figsize=(10, 4.6), layout="constrained", subplot_kw={"polar": True})
+    marks = {"direct": ("o", "tab:green"), "reflected": ("D", "tab:orange"), "hidden": ("x", "tab:red")}
+    for axis, place in zip(axes, places, strict=True):
+        edge = sorted(
+            (float(row["azimuth_deg"]) % 360.0, float(row["elevation_deg"]))
+            for row in horizons
+            if row["place"] == place
+        )
+        azimuth, elevation = np.array([*edge, (edge[0][0] + 360.0, edge[0][1])]).T
+        axis.fill_between(np.radians(azimuth), 90.0 - elevation, 90.0, color="0.85", linewidth=0, zorder=0)
+        for signal, (marker, colour) in marks.items():
+            mine = [row for row in satellites if row["place"] == place and row["signal"] == signal]
+            where = [np.radians(float(row["azimuth_deg"])) for row in mine]
+            axis.scatter(
+                where,
+                [90.0 - float(row["elevation_deg"]) for row in mine],
+                marker=marker,
+                color=colour,
+                label=signal,
+                zorder=3,
+            )
+        axis.set_theta_zero_location("N")
+        axis.set_theta_direction(-1)
+        axis.set(rlim=(0, 90), yticks=[0, 30, 60, 80], yticklabels=["90°", "60°", "30°", "10°"], title=place)
+        axis.set_xticks(np.radians([0, 90, 180, 270]), ["N", "E", "S", "W"])
+        axis.grid(alpha=0.3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
+    figure.savefig(HERE / "sensor_sky.png", dpi=110)
+
+
 def scan(directory: Path) -> None:
     """One rotation of a LIDAR from above: what each point lies on, and how strong it is."""
     points = np.genfromtxt(directory / "scan.csv", delimiter=",", names=True)
@@ -133,7 +170,7 @@ def scan(directory: Path) -> None:
     figure.savefig(HERE / "sensor_scan.png", dpi=110)
 
 
-FIGURES = {allan: "imu.csv", gnss: "gnss.csv", scan: "scan.csv"}
+FIGURES = {allan: "imu.csv", gnss: "gnss.csv", sky: "satellites.csv", scan: "scan.csv"}
 
 
 def main() -> None:

@@ -33,12 +33,12 @@ fn town() -> Vec<Prism> {
         .collect()
 }
 
-/// Nanoseconds for one look, vehicles everywhere on the streets.
-fn look_ns(map: &SkyMap, time_s: f64) -> f64 {
+/// Nanoseconds for one look, vehicles everywhere on the first `streets` streets of `length_m`.
+fn look_ns(map: &SkyMap, streets: u32, length_m: u32, time_s: f64) -> f64 {
     let start = Instant::now();
     for i in 0..LOOKS {
-        let along_m = f64::from(i.wrapping_mul(2_654_435_761) % 200_000) / 100.0;
-        let street_m = f64::from(i % 25) * RASTER_M + 10.0 + f64::from(i % 5) - 2.0;
+        let along_m = f64::from(i.wrapping_mul(2_654_435_761) % (100 * length_m)) / 100.0;
+        let street_m = f64::from(i % streets) * RASTER_M + 10.0 + f64::from(i % 5) - 2.0;
         black_box(map.at(along_m, street_m, 0.0, time_s));
     }
     start.elapsed().as_secs_f64() * 1e9 / f64::from(LOOKS)
@@ -49,11 +49,17 @@ fn main() {
         latitude_deg: 52.0,
         longitude_deg: 10.5,
     };
-    for (name, buildings) in [("open", Vec::new()), ("streets", town())] {
+    for (name, buildings, streets, length_m) in [
+        ("open", Vec::new(), 25, 2000),
+        ("two short streets", town(), 2, 50),
+        ("twenty-five streets", town(), 25, 2000),
+    ] {
         let scene = Arc::new(Scene::new(Road::default(), buildings, Vec::new()));
         let map = SkyMap::new(scene, middle, [0.0, 0.0, SIDE_M, SIDE_M], 1);
-        let first = look_ns(&map, 0.0);
-        let mut rounds: Vec<f64> = (1..=ROUNDS).map(|round| look_ns(&map, 600.0 * round as f64)).collect();
+        let first = look_ns(&map, streets, length_m, 0.0);
+        let mut rounds: Vec<f64> = (1..=ROUNDS)
+            .map(|round| look_ns(&map, streets, length_m, 600.0 * round as f64))
+            .collect();
         rounds.sort_by(f64::total_cmp);
         println!(
             "sky, {name}: {:.0} ns a look (median of {ROUNDS}; {first:.0} ns with horizons still to compute)",

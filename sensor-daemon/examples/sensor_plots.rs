@@ -3,7 +3,7 @@
 //! `cargo run --release -p sensor-daemon --example sensor_plots -- DIR`. `imu.csv`: two hours at rest, x axes of accelerometer and
 //! gyroscope, with the parameters in `imu_model.csv`. `gnss.csv`: a drive past houses (`houses.csv`) with three kinds of error.
 //! `street.csv`: the sky over a day in an east–west street 20 m wide between houses of several heights, 3 m off its middle.
-//! `scan.csv`, with the columns x_m,y_m,z_m,tag,intensity, is the LIDAR's.
+//! `horizons.csv`, `satellites.csv`: the sky at two places of the drive. `scan.csv`, with the columns x_m,y_m,z_m,tag,intensity, is the LIDAR's.
 
 #![allow(
     clippy::unwrap_used,
@@ -22,11 +22,15 @@ use ipc_schema::{config::Config, run::MapInfo, world::VehicleState};
 use sensor_daemon::{
     gnss, imu,
     noise::{Sensor, Stream},
-    sky::{SkyMap, SkyView},
+    sky::{
+        ANTENNA_M, MOST_EXTRA_PATH_M, SkyMap, SkyView,
+        constellation::Observer,
+        horizon::{Placed, SECTORS, Sky, Skyline},
+    },
 };
 use sim_core::{
     displacement::DisplacementMap,
-    geodesy::{NetPosition, Projection},
+    geodesy::{Geodetic, NetPosition, Projection},
     scene::{Prism, Road, Scene, SolidClass},
 };
 
@@ -82,7 +86,8 @@ fn main() -> io::Result<()> {
     write_imu_model(&mut create("imu_model.csv")?)?;
     write_houses(&mut create("houses.csv")?)?;
     write_gnss(&mut create("gnss.csv")?)?;
-    write_street(&mut create("street.csv")?)
+    write_street(&mut create("street.csv")?)?;
+    write_sky(&mut create("horizons.csv")?, &mut create("satellites.csv")?)
 }
 
 /// The IMU at rest: the one place that says how its errors come about.
@@ -216,7 +221,7 @@ fn write_street(out: &mut impl Write) -> io::Result<()> {
         };
         let houses = vec![house(10.0, 25.0), house(-25.0, -10.0)];
         let scene = Arc::new(Scene::new(Road::default(), houses, Vec::new()));
-        let middle = sim_core::geodesy::Geodetic {
+        let middle = Geodetic {
             latitude_deg: 52.0,
             longitude_deg: 10.5,
         };
@@ -236,6 +241,51 @@ fn write_street(out: &mut impl Write) -> io::Result<()> {
             rms(0),
             rms(1),
         )?;
+    }
+    Ok(())
+}
+
+/// Horizons and satellites at two places of the drive.
+fn write_sky(horizons: &mut impl Write, satellites: &mut impl Write) -> io::Result<()> {
+    writeln!(horizons, "place,azimuth_deg,elevation_deg")?;
+    writeln!(satellites, "place,azimuth_deg,elevation_deg,signal")?;
+    let scene = scene();
+    let skyline = Skyline::new(scene.buildings());
+    let observer = Observer::at(Geodetic {
+        latitude_deg: 52.0,
+        longitude_deg: 10.5,
+    });
+    for (place, [x, y]) in [("along the street", [75.0, -2.0]), ("at the corner", [148.0, 0.0])] {
+        let antenna_m = [x, y, ANTENNA_M];
+        let Sky::Walled(horizon) = skyline.sky(&scene, antenna_m) else {
+            continue;
+        };
+        for (sector, tangent) in horizon.tangents().enumerate() {
+            let azimuth_deg = 90.0 - 360.0 * (sector as f64 + 0.5) / SECTORS as f64;
+            writeln!(
+                horizons,
+                "{place},{azimuth_deg:.3},{:.3}",
+                libm::atan(tangent).to_degrees()
+            )?;
+        }
+        let mirrors = horizon.mirrors(antenna_m);
+        for satellite in observer.satellites(3000.0) {
+            let placed = Placed::from(satellite);
+            let signal = if horizon.is_in_sight(&placed, antenna_m) {
+                "direct"
+            } else if mirrors
+                .extra_path_m(&placed)
+                .is_some_and(|extra_m| extra_m <= MOST_EXTRA_PATH_M)
+            {
+                "reflected"
+            } else {
+                "hidden"
+            };
+            let [east, north] = satellite.heading;
+            let azimuth_deg = libm::atan2(east, north).to_degrees();
+            let elevation_deg = libm::atan(satellite.tan_elevation).to_degrees();
+            writeln!(satellites, "{place},{azimuth_deg:.3},{elevation_deg:.3},{signal}")?;
+        }
     }
     Ok(())
 }
