@@ -245,25 +245,43 @@ fn highest_roof(buildings: &[Prism], place: Point, antenna_z_m: f64, angle_rad: 
     highest
 }
 
+/// Random houses: middle, distances of their corners from it, height, metres.
+type Houses = Vec<(Point, Vec<f64>, f64)>;
+
+fn houses() -> impl Strategy<Value = Houses> {
+    let corners = prop::collection::vec(2.0_f64..25.0, 3..8);
+    prop::collection::vec((prop::array::uniform2(-80.0_f64..80.0), corners, 2.0_f64..60.0), 1..12)
+}
+
+fn prisms(houses: &Houses) -> Vec<Prism> {
+    let prism = |(turn, ([cx, cy], radii, height)): (usize, &(Point, Vec<f64>, f64))| {
+        let corner = |(i, r): (usize, &f64)| {
+            let angle = TAU * (i as f64 + 0.37 * turn as f64) / radii.len() as f64;
+            [cx + r * angle.cos(), cy + r * angle.sin()]
+        };
+        let outline = radii.iter().enumerate().map(corner).collect();
+        Prism::new(String::new(), SolidClass::Building, outline, 0.0, *height)
+    };
+    houses.iter().enumerate().filter_map(prism).collect()
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
     #[test]
-    fn horizons_are_what_rays_say(
-        houses in prop::collection::vec((prop::array::uniform2(-80.0_f64..80.0), prop::collection::vec(2.0_f64..25.0, 3..8), 2.0_f64..60.0), 1..12),
-        x in -60.0_f64..60.0, y in -60.0_f64..60.0, z in 0.0_f64..20.0,
-    ) {
-        let buildings: Vec<Prism> = houses
-            .iter()
-            .enumerate()
-            .filter_map(|(turn, ([cx, cy], radii, height))| {
-                let corner = |(i, r): (usize, &f64)| {
-                    let angle = TAU * (i as f64 + 0.37 * turn as f64) / radii.len() as f64;
-                    [cx + r * angle.cos(), cy + r * angle.sin()]
-                };
-                let outline = radii.iter().enumerate().map(corner).collect();
-                Prism::new(String::new(), SolidClass::Building, outline, 0.0, *height)
-            })
-            .collect();
+    fn a_view_keeps_its_promises(houses in houses(), x in -90.0_f64..90.0, y in -90.0_f64..90.0, z in 0.0_f64..10.0, time_s in 0.0_f64..1e5) {
+        let map = over(prisms(&houses));
+        let (view, open) = (map.at(x, y, z, time_s), over(Vec::new()).at(x, y, z, time_s));
+        prop_assert!(view.satellites <= open.satellites && view.noise_factor >= 1.0, "{view:?}");
+        let [e, n, u] = view.offset_m;
+        prop_assert!(libm::hypot(libm::hypot(e, n), u) < MOST_OFFSET_M * (1.0 + 1e-12), "{view:?}");
+        prop_assert!(view.noise_factor * map.epoch(time_s).hdop < MOST_HDOP * (1.0 + 1e-12));
+        prop_assert!(view.has_fix || view == SkyView::without_fix(view.satellites));
+        prop_assert!(!view.has_fix || view.satellites >= LEAST_SATELLITES);
+    }
+
+    #[test]
+    fn horizons_are_what_rays_say(houses in houses(), x in -60.0_f64..60.0, y in -60.0_f64..60.0, z in 0.0_f64..20.0) {
+        let buildings = prisms(&houses);
         let scene = Scene::new(Road::default(), buildings.clone(), Vec::new());
         let inside = buildings.iter().any(|building| building.contains([x, y]) && building.height_m > z);
         let tan_mask = constellation::MASK_DEG.to_radians().tan();
@@ -277,9 +295,9 @@ proptest! {
             horizon::Sky::Walled(horizon) => {
                 prop_assert!(!inside);
                 for (sector, (found, roof)) in horizon.tangents().zip(&expected).enumerate() {
-                    // Rounded to 1/64 m up and 1/32 m away. Lower than the mask it does not matter.
+                    // Rounded to 1/64 m up and 1/32 m away, never 0. Lower than the mask it does not matter.
                     let error_rad = (found.atan() - (roof[0] / roof[1]).atan()).abs();
-                    let rounding_rad = (0.5 / 64.0 + 0.5 / 32.0) / roof[0].hypot(roof[1]);
+                    let rounding_rad = (0.5 / 64.0 + 1.0 / 32.0) / roof[0].hypot(roof[1]);
                     let are_low = found <= tan_mask && is_low(*roof);
                     prop_assert!(are_low || error_rad < 1.1 * rounding_rad, "{sector}: {found} is not {roof:?}");
                 }
