@@ -215,6 +215,23 @@ fn seeds_begin_at_different_times_and_a_day_later_all_is_the_same() {
     assert_eq!(first, views(&map, 0.0));
 }
 
+/// A regular pattern may have moments in which all satellites stand alike: none is bad enough to lose a fix, anywhere on earth.
+#[test]
+fn an_open_sky_gives_a_fix_everywhere() {
+    let scene = Arc::new(Scene::default());
+    for latitude_deg in [-90.0, -60.0, -33.0, 0.0, 10.0, 25.0, 45.0, 52.0, 60.0, 70.0, 80.0, 90.0] {
+        for longitude_deg in [0.0, 17.0, 31.0] {
+            let middle = Geodetic {
+                latitude_deg,
+                longitude_deg,
+            };
+            let map = SkyMap::new(Arc::clone(&scene), middle, BOUNDS_M, 1);
+            let worst = times().map(|time_s| map.epoch(time_s).hdop).fold(0.0, f64::max);
+            assert!(worst < 3.0, "{worst} at {middle:?}");
+        }
+    }
+}
+
 /// What the bounds on cells and horizons mean: at most 24 MB and 77 MB.
 #[test]
 fn memory_is_bounded() {
