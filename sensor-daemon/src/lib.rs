@@ -16,5 +16,6 @@ pub mod noise;
 #[path = "../../sim-core/tests/common/preset.rs"]
 mod preset;
 pub mod sensing;
+pub mod sky;
 pub mod slots;
 pub mod speed_steering;
