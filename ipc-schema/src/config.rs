@@ -438,18 +438,28 @@ pub struct Trainer {
     pub learning_rate: f64,
     /// Factor on the learning rate after each update.
     pub learning_rate_decay: f64,
+    /// Learning rate at the end of training; `None`: `learning_rate_decay` alone.
+    pub learning_rate_final: Option<f64>,
     /// Discount γ.
     pub discount: f64,
     /// GAE λ.
     pub gae_lambda: f64,
     /// Clip ε of the probability ratio.
     pub clip_epsilon: f64,
+    /// ε at the end of training; `None`: constant.
+    pub clip_epsilon_final: Option<f64>,
     /// Standard deviation of the policy at the start, in the action's −1 … 1.
     pub initial_std: f64,
     /// Weight of the entropy bonus.
     pub entropy_scale: f64,
+    /// Weight of the entropy bonus at the end of training; `None`: constant.
+    pub entropy_scale_final: Option<f64>,
     /// Weight of the value loss.
     pub value_scale: f64,
+    /// How far a value may move in one update; `None`: any way.
+    pub value_clip: Option<f64>,
+    /// KL divergence at which an update of the policy ends; `None`: after all epochs.
+    pub target_kl: Option<f64>,
     /// Largest norm of the gradient.
     pub max_grad_norm: f64,
     /// Samples per update.

@@ -169,6 +169,16 @@ const fn span(path: &'static str, max: f64, meaning: &'static str) -> Key {
     }
 }
 
+const fn optional(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> Key {
+    Key {
+        path,
+        kind: Kind::Float { min, max },
+        unit,
+        meaning,
+        optional: true,
+    }
+}
+
 const fn other(path: &'static str, kind: Kind, meaning: &'static str) -> Key {
     Key {
         path,
@@ -196,8 +206,8 @@ pub const KEYS: &[Key] = &[
     other("traffic.hero_ids", Kind::Texts, "Vehicles of a `.sumocfg` that are driven by actions, by their ids (the driving task only)."),
     float("traffic.cav_share", "", 0.0, 1.0, "Share of a `.sumocfg`'s vehicles that carry sensors."),
     integer("traffic.max_road_users", "", 1, 1_000_000, "Most road users alive at once; shared memory is laid out for them."),
-    Key { path: "map.origin_latitude_deg", kind: Kind::Float { min: -89.9, max: 89.9 }, unit: "deg", meaning: "Latitude of the net's (0, 0); only for a net without projection.", optional: true },
-    Key { path: "map.origin_longitude_deg", kind: Kind::Float { min: -180.0, max: 180.0 }, unit: "deg", meaning: "Longitude of the net's (0, 0); only for a net without projection.", optional: true },
+    optional("map.origin_latitude_deg", "deg", -89.9, 89.9, "Latitude of the net's (0, 0); only for a net without projection."),
+    optional("map.origin_longitude_deg", "deg", -180.0, 180.0, "Longitude of the net's (0, 0); only for a net without projection."),
     integer("episode.ticks", "ticks", 1, 1_000_000_000, "Length of a training episode; its end respawns everybody at random places."),
     integer("episode.training_episodes", "", 1, 1_000_000_000, "Training episodes of the run."),
     integer("episode.evaluation_interval", "episodes", 0, 1_000_000_000, "Training episodes between two evaluations; 0 = only at the end."),
@@ -303,12 +313,17 @@ pub const KEYS: &[Key] = &[
     other("trainer.module", Kind::Text, "Python module that is run as the trainer; your own takes its part through `caraware.channel`."),
     float("trainer.learning_rate", "", 1e-9, 1.0, "Learning rate of Adam at the start."),
     float("trainer.learning_rate_decay", "", 0.01, 1.0, "Factor on the learning rate after each update."),
+    optional("trainer.learning_rate_final", "", 0.0, 1.0, "Learning rate at the end of training: then it falls linearly with the training episodes instead of by `trainer.learning_rate_decay`."),
     float("trainer.discount", "", 0.0, 1.0, "Discount γ. A prediction does not change what comes next, so 0 is exact and has the least variance."),
     float("trainer.gae_lambda", "", 0.0, 1.0, "λ of generalised advantage estimation."),
     float("trainer.clip_epsilon", "", 0.01, 1.0, "ε: the probability ratio is clipped to 1 ± ε."),
+    optional("trainer.clip_epsilon_final", "", 0.01, 1.0, "ε at the end of training, reached linearly with the training episodes."),
     float("trainer.initial_std", "", 0.001, 10.0, "Standard deviation of the policy at the start, in units of half the map."),
     float("trainer.entropy_scale", "", 0.0, 10.0, "Weight of the entropy bonus."),
+    optional("trainer.entropy_scale_final", "", 0.0, 10.0, "Weight of the entropy bonus at the end of training, reached linearly with the training episodes."),
     float("trainer.value_scale", "", 0.0, 100.0, "Weight of the value loss."),
+    optional("trainer.value_clip", "", 0.0, 1e6, "A value moves at most this far from the value before the update in one update; unset = unbounded."),
+    optional("trainer.target_kl", "", 1e-9, 1e6, "An update of the policy ends with the epoch whose mean KL divergence from the policy before is larger; unset = all epochs."),
     float("trainer.max_grad_norm", "", 0.0001, 1e6, "Largest norm of the gradient."),
     integer("trainer.horizon", "samples", 1, 100_000_000, "Samples in one update."),
     integer("trainer.batch_size", "samples", 1, 100_000_000, "Samples in one gradient step; at most the horizon."),

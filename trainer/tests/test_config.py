@@ -12,6 +12,17 @@ def test_defaults_and_given_values() -> None:
     assert config.epochs == TrainerConfig().epochs
 
 
+def test_progress_counts_training_episodes_alone() -> None:
+    run = run_file("x")
+    run["run_dir"] = "x"
+    run["config"]["episode"] = {"training_episodes": 6, "evaluation_interval": 2}
+    config = RunConfig.from_run(run)
+    # Two of training, one of evaluation, and so on: t t e t t e t t e.
+    trained = [0, 1, 2, 2, 3, 4, 4, 5, 6]
+    assert [config.progress(episode) for episode in range(9)] == [count / 6 for count in trained]
+    assert config.progress(20) == 1.0
+
+
 def test_the_seed_of_the_run_is_the_trainer_s() -> None:
     run = run_file("x")
     run["config"]["run"] = {"seed": 7}

@@ -12,8 +12,8 @@ SAMPLES_OVER = 40
 """The horizon is overshot by some samples, so minibatches differ in length and are filled up."""
 
 
-def learner(*, graphed: bool) -> Ppo:
-    ppo = fresh(**TOY, matmul_precision="float32", threads=1)
+def learner(*, graphed: bool, **extra: object) -> Ppo:
+    ppo = fresh(**TOY, matmul_precision="float32", threads=1, **extra)
     ppo._graphed = GraphedUpdate(ppo) if graphed else None
     return ppo
 
@@ -38,6 +38,26 @@ def test_both_ways_move_the_parameters_alike() -> None:
     assert (parameters(plain) - parameters(graphed)).norm() < 1e-3 * moved
     assert int(plain.policy_optimiser.steps) == int(graphed.policy_optimiser.steps) == 3 * 4 * 8
     torch.testing.assert_close(plain.value_optimiser.mean, graphed.value_optimiser.mean, rtol=1e-2, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {"value_clip": 0.05},
+        {"target_kl": 1e-3},
+        {"learning_rate_final": 0.0, "clip_epsilon_final": 0.05, "entropy_scale_final": 0.5},
+    ],
+)
+def test_both_ways_take_the_extras_alike(extra: dict) -> None:
+    learners = [learner(graphed=way, **extra) for way in (False, True)]
+    for ppo in learners:
+        ppo.progress = 0.4
+    plain, graphed = (learn(ppo, 3) for ppo in learners)
+    for a, b in zip(plain, graphed, strict=True):
+        assert (a.policy_epochs, a.learning_rate, a.clip_epsilon) == (b.policy_epochs, b.learning_rate, b.clip_epsilon)
+        assert b.value_loss == pytest.approx(a.value_loss, rel=2e-3)
+        assert b.approximate_kl == pytest.approx(a.approximate_kl, rel=2e-2, abs=1e-6)
+    assert int(learners[0].policy_optimiser.steps) == int(learners[1].policy_optimiser.steps)
 
 
 def test_an_update_with_a_loss_that_is_no_number_changes_nothing() -> None:

@@ -2,7 +2,7 @@
 
 import torch
 from caraware.networks import GaussianPolicy, Mlp, ValueNetwork, entropy, log_probability
-from caraware.ppo import clipped_surrogate
+from caraware.objective import clipped_surrogate
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 

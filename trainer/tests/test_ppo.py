@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 from caraware.config import MapBounds, TrainerConfig
-from caraware.ppo import NonFiniteLoss, Ppo, UpdateStats, save_batch
+from caraware.objective import clipped_error
+from caraware.ppo import NonFiniteLoss, Ppo, Settings, UpdateStats, save_batch
 from caraware.rewards import distance_m
 from caraware.rollout import Rollout
 from safetensors.torch import load_file
@@ -55,6 +56,45 @@ def errors_m(ppo: Ppo) -> tuple[float, float]:
     predicted_m = torch.cat(ppo.predict_m([obs.observation for obs in ticks]))
     raw_m = torch.cat([obs.gnss_m for obs in ticks])
     return distance_m(predicted_m, truth).mean().item(), distance_m(raw_m, truth).mean().item()
+
+
+def test_schedules_run_from_the_first_value_to_the_last() -> None:
+    config = TrainerConfig.from_run(
+        run_file(
+            "x",
+            learning_rate=1e-3,
+            learning_rate_decay=0.5,
+            learning_rate_final=1e-4,
+            clip_epsilon=0.2,
+            clip_epsilon_final=0.1,
+            entropy_scale=0.01,
+        )
+    )
+    half = Settings.at(config, updates=3, progress=0.5)
+    assert half.learning_rate == pytest.approx(5.5e-4)
+    assert half.clip_epsilon == pytest.approx(0.15)
+    assert half.entropy_scale == 0.01
+    assert Settings.at(config, 0, 7.0).learning_rate == pytest.approx(1e-4)
+    decayed = TrainerConfig.from_run(run_file("x", learning_rate=1e-3, learning_rate_decay=0.5))
+    assert Settings.at(decayed, updates=3, progress=0.5).learning_rate == pytest.approx(1.25e-4)
+
+
+def test_an_update_of_the_policy_ends_where_it_has_gone_too_far() -> None:
+    free, held = fresh(**TOY), fresh(**TOY, target_kl=1e-9)
+    assert [train(ppo, 1)[0].policy_epochs for ppo in (free, held)] == [4, 1]
+    assert [int(ppo.policy_optimiser.steps) for ppo in (free, held)] == [32, 8]
+    assert [int(ppo.value_optimiser.steps) for ppo in (free, held)] == [32, 32]
+
+
+def test_clipped_values_by_hand() -> None:
+    value, target = torch.tensor([1.0, 3.0, -1.0, 1.4]), torch.tensor([2.0, 2.0, 2.0, 2.0])
+    before = torch.tensor([1.0, 1.0, 1.0, 1.0])
+    error = clipped_error(value, target, target - before, 0.5)
+    # Held at 1 ± 0.5: (1, 1.5, 0.5, 1.4). The larger error counts; it pulls where the value itself has it or is free.
+    assert error.loss.tolist() == pytest.approx([1.0, 1.0, 9.0, 0.36])
+    assert error.pull.tolist() == pytest.approx([-1.0, 1.0, -3.0, -0.6])
+    past = clipped_error(torch.tensor([1.9]), torch.tensor([2.0]), torch.tensor([1.0]), 0.5)
+    assert past.loss.tolist() == pytest.approx([0.25]) and past.pull.tolist() == [0.0]
 
 
 def test_the_toy_task_is_learnt() -> None:

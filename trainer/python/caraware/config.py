@@ -37,15 +37,25 @@ class TrainerConfig:
     """Adam's step size at the first update, for the policy and the value network."""
     learning_rate_decay: float = 0.995
     """Factor on the learning rate after every update."""
+    learning_rate_final: float | None = None
+    """Learning rate at the end of training, reached linearly with the training episodes; None: the decay alone."""
     discount: float = 0.0
     """γ. Predictions do not influence the world, so 0 (a bandit) loses nothing and has the least variance."""
     gae_lambda: float = 0.95
     clip_epsilon: float = 0.2
     """ε: probability ratios beyond 1 ± ε earn nothing more."""
+    clip_epsilon_final: float | None = None
+    """ε at the end of training; None: constant."""
     initial_std: float = 1.0
     """Standard deviation of the policy at the start, in actions: 1 is half the map's width."""
     entropy_scale: float = 0.001
+    entropy_scale_final: float | None = None
+    """Entropy scale at the end of training; None: constant."""
     value_scale: float = 1.0
+    value_clip: float | None = None
+    """How far a value may move from the value before the update; None: any way."""
+    target_kl: float | None = None
+    """The policy's update ends with the epoch whose mean KL divergence is larger; None: after all epochs."""
     max_grad_norm: float = 0.5
     """Largest gradient norm, of the policy and of the value network each."""
     horizon: int = 8192
@@ -98,6 +108,9 @@ class TrainerConfig:
         for name in ("entropy_scale", "value_scale", "threads", "seed"):
             _range(name, getattr(self, name), 0, math.inf)
         _range("clip_epsilon", self.clip_epsilon, SMALLEST, 1.0)
+        for name in ("learning_rate_final", "clip_epsilon_final", "entropy_scale_final", "value_clip", "target_kl"):
+            if (value := getattr(self, name)) is not None:
+                _range(name, value, 0.0, math.inf)
         for name in ("horizon", "batch_size", "epochs", "checkpoint_interval_updates", "checkpoints_kept"):
             _range(name, getattr(self, name), 1, math.inf)
         _range("batch_size", self.batch_size, 1, self.horizon)
@@ -143,6 +156,9 @@ class RunConfig:
     """Of the resolved configuration, as canonical JSON: a checkpoint remembers what it was trained with."""
     dark_is_nan: bool = False
     """Fields of a sensor in a blackout are not numbers (`blackout.policy`); the networks see 0, mid-range, instead."""
+    training_episodes: int = 1
+    evaluation_interval: int = 0
+    """Training episodes between two evaluation episodes; 0: none between."""
     resume_from: Path | None = field(default=None)
     """A checkpoint directory to continue from."""
 
@@ -153,14 +169,23 @@ class RunConfig:
             raise ConfigError("the run file has no `run_dir`", "start the trainer through `caraware train`")
         canonical = json.dumps(run.get("config", {}), sort_keys=True, separators=(",", ":")).encode()
         resume = run.get("resume_from")
+        episodes = run.get("config", {}).get("episode", {})
         return cls(
             run_dir=Path(run["run_dir"]),
             trainer=TrainerConfig.from_run(run),
             bounds=MapBounds.from_run(run),
             config_sha256=hashlib.sha256(canonical).hexdigest(),
             dark_is_nan=run.get("config", {}).get("blackout", {}).get("policy") == "nan",
+            training_episodes=max(1, episodes.get("training_episodes", 1)),
+            evaluation_interval=episodes.get("evaluation_interval", 0),
             resume_from=Path(resume) if resume else None,
         )
+
+    def progress(self, episode: int) -> float:
+        """Share of the training episodes that lie before the run's `episode`-th; evaluations stand between them."""
+        interval = self.evaluation_interval
+        trained = episode - episode // (interval + 1) if interval > 0 else episode
+        return min(1.0, trained / self.training_episodes)
 
 
 def _key(field_name: str) -> str:
@@ -179,7 +204,9 @@ def _typed(name: str, kind: object, section: dict) -> Any:
     value = section[_key(name)]
     if kind == tuple[int, ...] and isinstance(value, list) and all(type(v) is int for v in value):
         return tuple(value)
-    if kind is float and type(value) in (int, float):
+    if kind == float | None and value is None:
+        return None
+    if kind in (float, float | None) and type(value) in (int, float):
         return float(value)
     if kind in (int, str) and type(value) is kind:
         return value

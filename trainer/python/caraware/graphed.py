@@ -1,15 +1,16 @@
-"""PPO's gradient steps on a GPU: one CUDA graph, a minibatch of both networks, replayed without asking anything back.
+"""PPO's gradient steps on a GPU: a CUDA graph for a minibatch of each network, replayed without asking anything back.
 
 The steps of `caraware.ppo` read losses and norms back after every minibatch, which costs nothing on a CPU and most of
-the time on a GPU, whose kernels here last microseconds. So on a GPU an update runs as replays of one captured step:
-it finds its own rows (a counter on the device), takes its own Adam step, and writes its numbers into a table that is
-read once, when the update is over. Policy and value network run side by side on two streams of the graph.
+the time on a GPU, whose kernels here last microseconds. So on a GPU an update runs as replays of captured steps:
+a step finds its own rows (a counter on the device), takes its own Adam step, and writes its numbers into a table that
+is read when the update is over (with `target_kl`, after every epoch). Policy and value network have a stream each.
 
 A graph has fixed shapes, but horizons differ by some samples: minibatches are filled up with rows of weight 0.
 """
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,9 +19,10 @@ from torch import Tensor
 
 from caraware.adam import BETA_MEAN, BETA_SQUARE, EPSILON, Adam
 from caraware.networks import CHUNK_ROWS, FlatParameters, entropy, log_probability
+from caraware.objective import clipped_error
 
 if TYPE_CHECKING:
-    from caraware.ppo import Batch, Ppo
+    from caraware.ppo import Batch, Ppo, Settings
 
 WARM_UP_STEPS = 3
 """Steps before the capture: libraries choose their kernels and workspaces in the first calls."""
@@ -36,6 +38,8 @@ class StepTable:
     """f64 `[steps, 6]`: loss, KL, clip fraction, mean ratio, largest ratio, gradient norm."""
     value: Tensor
     """f64 `[steps, 2]`: loss, gradient norm."""
+    policy_epochs: int
+    """Epochs that the policy went through; rows of `policy` beyond them are left out."""
 
     def finite(self) -> bool:
         """Whether every number is one."""
@@ -48,12 +52,15 @@ class GraphedUpdate:
     def __init__(self, ppo: "Ppo") -> None:
         self._ppo, self._device = ppo, ppo.device
         self._samples = self._rows = self._steps = 0
-        self._replay: Callable[[], None] = self._both_steps
-        self._learning_rate = torch.zeros((), device=self._device)
+        self._policy_lane = _Lane(self._device, self._policy_step)
+        self._value_lane = _Lane(self._device, self._value_step)
+        self._learning_rate, self._clip_epsilon, self._entropy_scale = (
+            torch.zeros((), device=self._device) for _ in range(3)
+        )
         self._policy_adam = _DeviceAdam(ppo.policy_optimiser, ppo.policy.mlp.parameters, self._learning_rate)
         self._value_adam = _DeviceAdam(ppo.value_optimiser, ppo.value.mlp.parameters, self._learning_rate)
 
-    def run(self, batch: "Batch", orders: list[Tensor], learning_rate: float) -> StepTable:
+    def run(self, batch: "Batch", orders: list[Tensor], now: "Settings") -> StepTable:
         """Take all steps. If a number is not finite, the parameters and moments are as before the update."""
         parts = max(1, round(len(batch.reward) / self._ppo.config.batch_size))
         rows = -(-len(batch.reward) // parts)
@@ -62,17 +69,44 @@ class GraphedUpdate:
             self._load(batch, orders, parts)
             self._capture()
         self._load(batch, orders, parts)
-        self._learning_rate.fill_(learning_rate)
+        for scalar, value in (
+            (self._learning_rate, now.learning_rate),
+            (self._clip_epsilon, now.clip_epsilon),
+            (self._entropy_scale, now.entropy_scale),
+        ):
+            scalar.fill_(value)
         before = self._snapshot()
-        for _ in range(self._steps):
-            self._replay()
-        table = StepTable(self._policy_log.double().cpu(), self._value_log.double().cpu())
+        epochs = self._replay(parts, len(orders))
+        policy_log = self._policy_log[: epochs * parts]
+        table = StepTable(policy_log.double().cpu(), self._value_log.double().cpu(), epochs)
         if not table.finite():
             self._restore(before)
             return table
-        for adam in (self._policy_adam, self._value_adam):
-            adam.optimiser.steps += self._steps
+        self._policy_adam.optimiser.steps += epochs * parts
+        self._value_adam.optimiser.steps += self._steps
         return table
+
+    def _replay(self, parts: int, epochs: int) -> int:
+        """All steps of both networks side by side; returns the epochs that the policy went through."""
+        policy_epochs = 0
+        for lane in (self._policy_lane, self._value_lane):
+            lane.begin()
+        for epoch in range(epochs):
+            self._value_lane.run(parts)
+            if policy_epochs == epoch and not self._went_far(policy_epochs, parts):
+                self._policy_lane.run(parts)
+                policy_epochs += 1
+        for lane in (self._policy_lane, self._value_lane):
+            lane.end()
+        return policy_epochs
+
+    def _went_far(self, epochs: int, parts: int) -> bool:
+        """Whether the last of `epochs` epochs took the policy farther than `target_kl`: then the GPU is asked."""
+        target = self._ppo.config.target_kl
+        if target is None or epochs == 0:
+            return False
+        self._policy_lane.end()
+        return self._policy_log[(epochs - 1) * parts : epochs * parts, 1].mean().item() > target
 
     def _allocate(self, samples: int, rows: int, steps: int) -> None:
         """Room for `samples` and one row of weight 0, and for the numbers of `steps` steps."""
@@ -88,7 +122,6 @@ class GraphedUpdate:
         self._target = torch.zeros(full, device=device)
         self._weight = torch.zeros(full, device=device)
         self._order = torch.zeros(steps, rows, dtype=torch.int64, device=device)
-        self._step = torch.zeros((), dtype=torch.int64, device=device)
         self._policy_log = torch.zeros(steps, POLICY_COLUMNS, device=device)
         self._value_log = torch.zeros(steps, VALUE_COLUMNS, device=device)
 
@@ -105,53 +138,27 @@ class GraphedUpdate:
         self._order.fill_(nobody)
         for row, piece in zip(self._order, pieces, strict=True):
             row[: len(piece)].copy_(piece)
-        self._step.zero_()
+        for lane in (self._policy_lane, self._value_lane):
+            lane.step.zero_()
         self._policy_adam.load()
         self._value_adam.load()
 
     def _capture(self) -> None:
-        """Record one step of both networks. What the warm-up moved is put back."""
-        if self._device.type != "cuda":
-            return
+        """Record a step of each network. What the warm-up moved is put back."""
         before = self._snapshot()
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            for _ in range(WARM_UP_STEPS):
-                self._step.zero_()
-                self._both_steps()
-        torch.cuda.current_stream().wait_stream(stream)
-        self._step.zero_()
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            self._side_by_side()
-        self._replay = graph.replay
+        for lane in (self._policy_lane, self._value_lane):
+            lane.capture()
         self._restore(before)
 
-    def _both_steps(self) -> None:
-        self._policy_step()
-        self._value_step()
-        self._step += 1
-
-    def _side_by_side(self) -> None:
-        """The same, the value network on a stream of its own."""
-        main, side = torch.cuda.current_stream(), torch.cuda.Stream()
-        side.wait_stream(main)
-        with torch.cuda.stream(side):
-            self._value_step()
-        self._policy_step()
-        main.wait_stream(side)
-        self._step += 1
-
-    def _minibatch(self, *columns: Tensor) -> tuple[Tensor, ...]:
-        rows = self._order.index_select(0, self._step.view(1)).view(-1)
+    def _minibatch(self, step: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
+        rows = self._order.index_select(0, step.view(1)).view(-1)
         return tuple(column.index_select(0, rows) for column in columns)
 
-    def _policy_step(self) -> None:
+    def _policy_step(self, step: Tensor) -> None:
         """As `Ppo._improve_policy`, with weights: equation 7's gradient, clipped, and Adam."""
         config, policy = self._ppo.config, self._ppo.policy
         observation, action, old, advantage, weight = self._minibatch(
-            self._observation, self._action, self._old_log_probability, self._advantage, self._weight
+            step, self._observation, self._action, self._old_log_probability, self._advantage, self._weight
         )
         share = weight / weight.sum()
         centred = advantage - (advantage * share).sum()
@@ -162,32 +169,33 @@ class GraphedUpdate:
         log_ratio = (log_probability(action, mean, policy.log_std) - old) * weight
         ratio = log_ratio.exp()
         unclipped = ratio * advantage
-        clipped = ratio.clamp(1 - config.clip_epsilon, 1 + config.clip_epsilon) * advantage
+        clipped = torch.minimum(torch.maximum(ratio, 1 - self._clip_epsilon), 1 + self._clip_epsilon) * advantage
         pull = (torch.where(unclipped <= clipped, unclipped, 0.0) * -share).unsqueeze(1)
         policy.mlp.backward(observation, pull * deviation * inverse_std)
-        policy.log_std_gradient.copy_((pull * (deviation.square() - 1)).sum(0) - config.entropy_scale)
+        policy.log_std_gradient.copy_((pull * (deviation.square() - 1)).sum(0) - self._entropy_scale)
         norm = self._policy_adam.step(config.max_grad_norm)
-        loss = -(torch.minimum(unclipped, clipped) * share).sum() - config.entropy_scale * entropy(policy.log_std)
+        loss = -(torch.minimum(unclipped, clipped) * share).sum() - self._entropy_scale * entropy(policy.log_std)
         numbers = (
             loss,
             ((ratio - 1 - log_ratio) * share).sum(),
-            (((ratio - 1).abs() > config.clip_epsilon) * share).sum(),
+            (((ratio - 1).abs() > self._clip_epsilon) * share).sum(),
             (ratio * share).sum(),
             (ratio * weight).max(),
             norm,
         )
-        self._policy_log.index_copy_(0, self._step.view(1), torch.stack(numbers).unsqueeze(0))
+        self._policy_log.index_copy_(0, step.view(1), torch.stack(numbers).unsqueeze(0))
 
-    def _value_step(self) -> None:
+    def _value_step(self, step: Tensor) -> None:
         """As `Ppo._improve_value`, with weights."""
         config, network = self._ppo.config, self._ppo.value.mlp
-        observation, target, weight = self._minibatch(self._observation, self._target, self._weight)
+        columns = (self._observation, self._target, self._advantage, self._weight)
+        observation, target, advantage, weight = self._minibatch(step, *columns)
         share = weight / weight.sum()
-        error = network.forward(observation).squeeze(1) - target
-        network.backward(observation, (2 * config.value_scale * error * share).unsqueeze(1))
+        error = clipped_error(network.forward(observation).squeeze(1), target, advantage, config.value_clip)
+        network.backward(observation, (2 * config.value_scale * error.pull * share).unsqueeze(1))
         norm = self._value_adam.step(config.max_grad_norm)
-        numbers = torch.stack(((error.square() * share).sum(), norm))
-        self._value_log.index_copy_(0, self._step.view(1), numbers.unsqueeze(0))
+        numbers = torch.stack(((error.loss * share).sum(), norm))
+        self._value_log.index_copy_(0, step.view(1), numbers.unsqueeze(0))
 
     def _state(self) -> list[Tensor]:
         return [
@@ -202,6 +210,52 @@ class GraphedUpdate:
     def _restore(self, before: list[Tensor]) -> None:
         for tensor, kept in zip(self._state(), before, strict=True):
             tensor.copy_(kept)
+
+
+class _Lane:
+    """The steps of one network, with a counter of their own; on a GPU a stream and the graph of one step."""
+
+    def __init__(self, device: torch.device, take: Callable[[Tensor], None]) -> None:
+        self.step = torch.zeros((), dtype=torch.int64, device=device)
+        self._take = take
+        self._stream = torch.cuda.Stream() if device.type == "cuda" else None
+        self._replay: Callable[[], None] = self._one
+
+    def capture(self) -> None:
+        """Record one step, after some that let libraries choose their kernels."""
+        if self._stream is None:
+            return
+        self.begin()
+        with torch.cuda.stream(self._stream):
+            for _ in range(WARM_UP_STEPS):
+                self.step.zero_()
+                self._one()
+        self.end()
+        self.step.zero_()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self._one()
+        self._replay = graph.replay
+
+    def begin(self) -> None:
+        """What was asked of the device before comes before the steps."""
+        if self._stream is not None:
+            self._stream.wait_stream(torch.cuda.current_stream())
+
+    def run(self, steps: int) -> None:
+        """Take so many steps."""
+        with torch.cuda.stream(self._stream) if self._stream is not None else nullcontext():
+            for _ in range(steps):
+                self._replay()
+
+    def end(self) -> None:
+        """What will be asked of the device comes after the steps."""
+        if self._stream is not None:
+            torch.cuda.current_stream().wait_stream(self._stream)
+
+    def _one(self) -> None:
+        self._take(self.step)
+        self.step += 1
 
 
 class _DeviceAdam:

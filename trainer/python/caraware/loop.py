@@ -137,6 +137,7 @@ class TrainingLoop:
         assert self._ppo is not None
         horizon = self._rollout.take()
         batch = self._ppo.score(horizon)
+        self._ppo.progress = self._config.progress(self._episode)
         try:
             stats = self._ppo.update(batch)
         except NonFiniteLoss as error:

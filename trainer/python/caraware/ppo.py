@@ -24,6 +24,7 @@ from caraware.config import MapBounds, TrainerConfig
 from caraware.gae import generalised_advantage
 from caraware.graphed import GraphedUpdate, StepTable
 from caraware.networks import FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
+from caraware.objective import clipped_error, clipped_surrogate
 from caraware.rollout import Horizon
 
 ACTIONS = 2
@@ -85,11 +86,40 @@ class UpdateStats:
     policy_gradient_norm: float
     value_gradient_norm: float
     learning_rate: float
+    clip_epsilon: float
+    entropy_scale: float
+    policy_epochs: int
+    """Fewer than configured where `target_kl` ended the policy's update early."""
     samples: int
 
 
 @dataclass(frozen=True)
+class Settings:
+    """What schedules say of one update."""
+
+    learning_rate: float
+    clip_epsilon: float
+    entropy_scale: float
+
+    @classmethod
+    def at(cls, config: TrainerConfig, updates: int, progress: float) -> "Settings":
+        """After `updates` updates, with the share `progress` of all training episodes behind."""
+
+        def scheduled(start: float, end: float | None) -> float:
+            return start if end is None else start + (end - start) * min(max(progress, 0.0), 1.0)
+
+        decayed = config.learning_rate * config.learning_rate_decay**updates
+        linear = config.learning_rate_final is not None
+        return cls(
+            learning_rate=scheduled(config.learning_rate, config.learning_rate_final) if linear else decayed,
+            clip_epsilon=scheduled(config.clip_epsilon, config.clip_epsilon_final),
+            entropy_scale=scheduled(config.entropy_scale, config.entropy_scale_final),
+        )
+
+
+@dataclass(frozen=True)
 class _PolicyMeans:
+    epochs: int
     loss: float
     entropy: float
     approximate_kl: float
@@ -112,6 +142,8 @@ class Ppo:
         self.config, self.bounds = config, bounds
         self.observation_size = observation_size
         self.updates = 0
+        self.progress = 0.0
+        """Share of all training episodes that is behind; schedules follow it."""
         self.device = _configure_torch(config)
         self.sampling = torch.Generator().manual_seed(config.seed)
         self.shuffling = torch.Generator().manual_seed(config.seed + 1)
@@ -165,71 +197,83 @@ class Ppo:
     @torch.no_grad()
     def update(self, batch: Batch) -> UpdateStats:
         """All epochs of minibatches over one batch. Policy and value share nothing, so each has its own core."""
-        learning_rate = self.config.learning_rate * self.config.learning_rate_decay**self.updates
+        now = Settings.at(self.config, self.updates, self.progress)
         orders = [torch.randperm(len(batch.reward), generator=self.shuffling) for _ in range(self.config.epochs)]
         orders = [order.to(self.device) for order in orders]
         if self._graphed is not None:
-            policy, value = self._means_of(self._graphed.run(batch, orders, learning_rate))
+            policy, value = self._means_of(self._graphed.run(batch, orders, now), len(orders))
         elif self._second_core is None:
-            policy = self._improve_policy(batch, orders, learning_rate)
-            value = self._improve_value(batch, orders, learning_rate)
+            policy = self._improve_policy(batch, orders, now)
+            value = self._improve_value(batch, orders, now)
         else:
-            value_job = self._second_core.submit(self._improve_value, batch, orders, learning_rate)
+            value_job = self._second_core.submit(self._improve_value, batch, orders, now)
             try:
-                policy = self._improve_policy(batch, orders, learning_rate)
+                policy = self._improve_policy(batch, orders, now)
             finally:
                 value_job.exception()
             value = value_job.result()
         self.updates += 1
-        return self._stats(batch, policy, value, learning_rate)
+        return self._stats(batch, policy, value, now)
 
     @torch.no_grad()
-    def _improve_policy(self, batch: Batch, orders: list[Tensor], learning_rate: float) -> _PolicyMeans:
+    def _improve_policy(self, batch: Batch, orders: list[Tensor], now: Settings) -> _PolicyMeans:
         """Climb the clipped surrogate objective plus the entropy bonus."""
-        policy, log, ratio_max = self.policy, [], 0.0
+        policy, log, ratio_max, epochs = self.policy, [], 0.0, 0
         for order in orders:
+            before = len(log)
             columns = (batch.observation, batch.action, batch.log_probability, batch.advantage)
             for observation, action, old_log_probability, advantage in self._minibatches(columns, order):
                 mean = policy.mlp.forward(observation)
                 surrogate = clipped_surrogate(
-                    mean, policy.log_std, action, old_log_probability, _normalised(advantage), self.config.clip_epsilon
+                    mean, policy.log_std, action, old_log_probability, _normalised(advantage), now.clip_epsilon
                 )
-                bonus = self.config.entropy_scale * entropy(policy.log_std)
+                bonus = now.entropy_scale * entropy(policy.log_std)
                 loss = self._finite("the policy's loss", surrogate.loss - bonus)
                 policy.mlp.backward(observation, surrogate.mean_gradient)
-                policy.log_std_gradient.copy_(surrogate.log_std_gradient - self.config.entropy_scale)
-                norm = self._step("the policy's gradient", policy.mlp.parameters, self.policy_optimiser, learning_rate)
+                policy.log_std_gradient.copy_(surrogate.log_std_gradient - now.entropy_scale)
+                norm = self._step(
+                    "the policy's gradient", policy.mlp.parameters, self.policy_optimiser, now.learning_rate
+                )
                 ratio = surrogate.ratio
                 log.append((loss, surrogate.approximate_kl(), surrogate.clip_fraction(), ratio.mean().item(), norm))
                 ratio_max = max(ratio_max, ratio.max().item())
+            epochs += 1
+            if self._went_far([row[1] for row in log[before:]]):
+                break
         loss, kl, clipped, ratio_mean, norm = _means(log)
         spread = entropy(policy.log_std).item()
-        return _PolicyMeans(loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
+        return _PolicyMeans(epochs, loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
 
     @torch.no_grad()
-    def _improve_value(self, batch: Batch, orders: list[Tensor], learning_rate: float) -> _ValueMeans:
-        """Regress on the value targets with the mean squared error."""
+    def _went_far(self, kl_of_steps: Sequence[float]) -> bool:
+        """Whether the policy has left the one that sampled by more than `target_kl` in an epoch."""
+        return self.config.target_kl is not None and sum(kl_of_steps) / len(kl_of_steps) > self.config.target_kl
+
+    def _improve_value(self, batch: Batch, orders: list[Tensor], now: Settings) -> _ValueMeans:
+        """Regress on the value targets with the mean squared error, clipped where `value_clip` says so."""
         network, log = self.value.mlp, []
         for order in orders:
-            for observation, target in self._minibatches((batch.observation, batch.value_target), order):
-                error = network.forward(observation).squeeze(1) - target
-                loss = self._finite("the value network's loss", error.square().mean())
-                gradient = error.unsqueeze(1).mul_(2 * self.config.value_scale / len(target))
-                network.backward(observation, gradient)
-                norm = self._step("the value gradient", network.parameters, self.value_optimiser, learning_rate)
+            columns = (batch.observation, batch.value_target, batch.advantage)
+            for observation, target, advantage in self._minibatches(columns, order):
+                value = network.forward(observation).squeeze(1)
+                error = clipped_error(value, target, advantage, self.config.value_clip)
+                loss = self._finite("the value network's loss", error.loss.mean())
+                network.backward(observation, error.pull.unsqueeze(1) * (2 * self.config.value_scale / len(target)))
+                norm = self._step("the value gradient", network.parameters, self.value_optimiser, now.learning_rate)
                 log.append((loss, norm))
         loss, norm = _means(log)
         return _ValueMeans(loss, norm)
 
-    def _means_of(self, table: StepTable) -> tuple[_PolicyMeans, _ValueMeans]:
+    def _means_of(self, table: StepTable, epochs: int) -> tuple[_PolicyMeans, _ValueMeans]:
         """The means of an update on a GPU, which tells its numbers at its end."""
         if not table.finite():
             raise NonFiniteLoss("a loss or gradient", self.updates + 1)
+        epochs = min(epochs, table.policy_epochs)
         loss, kl, clipped, ratio_mean, _, norm = table.policy.mean(0).tolist()
         ratio_max = table.policy[:, 4].max().item()
         spread = entropy(self.policy.log_std).item()
         value_loss, value_norm = table.value.mean(0).tolist()
-        policy = _PolicyMeans(loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
+        policy = _PolicyMeans(epochs, loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
         return policy, _ValueMeans(value_loss, value_norm)
 
     def _advantages(self, horizon: Horizon, rows: Tensor, reward: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
@@ -277,7 +321,7 @@ class Ppo:
             raise NonFiniteLoss(what, self.updates + 1)
         return number
 
-    def _stats(self, batch: Batch, policy: _PolicyMeans, value: _ValueMeans, learning_rate: float) -> UpdateStats:
+    def _stats(self, batch: Batch, policy: _PolicyMeans, value: _ValueMeans, now: Settings) -> UpdateStats:
         return UpdateStats(
             policy_loss=policy.loss,
             value_loss=value.loss,
@@ -293,63 +337,16 @@ class Ppo:
             explained_variance=_explained_variance(batch),
             policy_gradient_norm=policy.gradient_norm,
             value_gradient_norm=value.gradient_norm,
-            learning_rate=learning_rate,
+            learning_rate=now.learning_rate,
+            clip_epsilon=now.clip_epsilon,
+            entropy_scale=now.entropy_scale,
+            policy_epochs=policy.epochs,
             samples=len(batch.reward),
         )
 
     def sigma(self) -> float:
         """Standard deviation of the policy, mean over the actions; 1 is half the map."""
         return self.policy.log_std.exp().mean().item()
-
-
-@dataclass(frozen=True)
-class Surrogate:
-    """PPO's clipped objective of a minibatch (equation 7, as a loss) and its gradient."""
-
-    loss: Tensor
-    """Scalar."""
-    mean_gradient: Tensor
-    """`[b, 2]`: dLoss/dMean."""
-    log_std_gradient: Tensor
-    """`[2]`: dLoss/dLogStd."""
-    ratio: Tensor
-    """`[b]`: new over old probability of the action."""
-    log_ratio: Tensor
-    """`[b]`."""
-    clip_epsilon: float
-
-    def approximate_kl(self) -> float:
-        """See `UpdateStats.approximate_kl`."""
-        return (self.ratio - 1 - self.log_ratio).mean().item()
-
-    def clip_fraction(self) -> float:
-        """Share of samples whose ratio left 1 ± ε."""
-        return ((self.ratio - 1).abs() > self.clip_epsilon).float().mean().item()
-
-
-def clipped_surrogate(
-    mean: Tensor, log_std: Tensor, action: Tensor, old_log_probability: Tensor, advantage: Tensor, clip_epsilon: float
-) -> Surrogate:
-    """-E[min(ratio A, clip(ratio, 1 - ε, 1 + ε) A)] and its gradient, for `[b, 2]` means and actions.
-
-    The gradient flows only through samples where the unclipped term is the smaller: d(ratio)/dθ = ratio dlogπ/dθ,
-    with dlogπ/dμ = (a - μ)/σ² and dlogπ/dlogσ = ((a - μ)/σ)² - 1.
-    """
-    inverse_std = torch.exp(-log_std)
-    deviation = (action - mean) * inverse_std
-    log_ratio = log_probability(action, mean, log_std) - old_log_probability
-    ratio = log_ratio.exp()
-    unclipped = ratio * advantage
-    clipped = ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon) * advantage
-    weight = torch.where(unclipped <= clipped, unclipped, 0.0).div_(-len(advantage)).unsqueeze(1)
-    return Surrogate(
-        loss=-torch.minimum(unclipped, clipped).mean(),
-        mean_gradient=weight * deviation * inverse_std,
-        log_std_gradient=(weight * (deviation.square() - 1)).sum(0),
-        ratio=ratio,
-        log_ratio=log_ratio,
-        clip_epsilon=clip_epsilon,
-    )
 
 
 def save_batch(batch: Batch, policy: FlatParameters, file: Path) -> None:
