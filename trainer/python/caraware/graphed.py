@@ -233,7 +233,8 @@ class _Lane:
         self.end()
         self.step.zero_()
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        # On its own stream: graphs captured on one stream share cuBLAS's workspace, and wait for ever side by side.
+        with torch.cuda.graph(graph, stream=self._stream):
             self._one()
         self._replay = graph.replay
 
