@@ -49,7 +49,7 @@ impl Meshes {
 
     pub(super) fn new(entries: &[String], scene: &Scene) -> Result<Self, LidarError> {
         let mut meshes = Vec::new();
-        if scene.road().flat_height_m().is_none() {
+        if flat_ground_m(scene).is_none() {
             meshes.extend(ground(scene));
         }
         let first = (scene.buildings().len() + scene.props().len()) as u32;
@@ -84,6 +84,12 @@ impl Meshes {
         }
         nearest
     }
+}
+
+/// Height of the ground if it is flat: in a net without elevation, and without a net.
+pub(super) fn flat_ground_m(scene: &Scene) -> Option<f64> {
+    let road = scene.road();
+    road.flat_height_m().or(road.pieces().is_empty().then_some(0.0))
 }
 
 /// The ground between and about the roads, as tall as the nearest road at the corners of a grid.

@@ -112,7 +112,7 @@ impl Lidar {
             solids: solids::Solids::new(lidar, scene)?,
             receiver: returns::Receiver::new(config),
             path: Path::best(),
-            ground_m: scene.road().flat_height_m(),
+            ground_m: mesh::flat_ground_m(scene),
             is_rolling: lidar.rolling_shutter,
             is_paper: lidar.axes == LidarAxes::Paper,
             range_m: lidar.range_m,
