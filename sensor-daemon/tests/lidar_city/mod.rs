@@ -13,7 +13,7 @@ use sim_core::scene::{Prism, Scene, SolidClass};
 pub mod oracle;
 
 /// Distance of two streets, metres.
-const PITCH_M: f64 = 46.0;
+const PITCH_M: f64 = 50.0;
 /// Blocks in a row.
 const BLOCKS: usize = 16;
 /// Sub-steps of a tick.
@@ -69,7 +69,7 @@ pub fn scene(buildings: usize, seed: u64) -> Scene {
     let mut random = Random(seed);
     let prisms = (0..buildings).map(|number| {
         let (block, half) = (number / 2, number % 2);
-        let corner = [block % BLOCKS, block / BLOCKS].map(|i| PITCH_M * (i as f64 - BLOCKS as f64 / 2.0) + 8.0);
+        let corner = [block % BLOCKS, block / BLOCKS].map(|i| PITCH_M * (i as f64 - BLOCKS as f64 / 2.0) + 10.0);
         let x = corner[0] + 15.5 * half as f64;
         let (w, d) = (random.between(12.0, 14.5), random.between(24.0, 30.0));
         let local: Vec<[f64; 2]> = match number % 4 {
