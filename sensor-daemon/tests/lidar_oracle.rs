@@ -29,7 +29,12 @@ fn tally(moves: Moves, is_rolling: bool, lean: [f64; 2], carriers: std::ops::Ran
     for row in carriers {
         let count = lidar.scan(&targets, row, 0, 1, &mut scratch, &mut scan, &mut points);
         let of_row = &steps[row * SUB_STEPS..(row + 1) * SUB_STEPS];
-        tally.add(&compare(&world, &rays(&config, &states[row], of_row), row, &points[..count]));
+        tally.add(&compare(
+            &world,
+            &rays(&config, &states[row], of_row),
+            row,
+            &points[..count],
+        ));
     }
     tally
 }

@@ -5,7 +5,11 @@
 //! Without `--python` the peers are left out; it names an interpreter that can `import open3d` (`pip install open3d-cpu`; it needs
 //! libusb-1.0, libGL and libgomp) and, if you like, `embreex`. `--oracle` holds ten million rays against parry3d instead.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a measurement that cannot run says why and ends")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "a measurement that cannot run says why and ends"
+)]
 
 use std::{
     io::{BufRead as _, BufReader, Write as _},
@@ -83,7 +87,10 @@ fn main() {
         ("tilted", Moves::Wildly, false, true),
         ("tilted, rolling shutter", Moves::Wildly, true, true),
     ];
-    println!("{BUILDINGS} buildings, {VEHICLES} moving vehicles, {CARRIERS} LIDARs of 32 x 1800 rays, one core, {:?}", options.path);
+    println!(
+        "{BUILDINGS} buildings, {VEHICLES} moving vehicles, {CARRIERS} LIDARs of 32 x 1800 rays, one core, {:?}",
+        options.path
+    );
     for (name, moves, is_rolling, is_tilted) in cases {
         let mut bench = Bench::new(options.path, moves, is_rolling, is_tilted, CARRIERS);
         bench.round();
@@ -104,7 +111,10 @@ fn main() {
         bench.round();
         let mut rates: Vec<f64> = (0..PAIRS).map(|_| bench.round().rate()).collect();
         rates.sort_by(f64::total_cmp);
-        println!("{lidars:4} LIDARs, tilted, rolling    {:7.1} M rays/s", rates[PAIRS / 2] / 1e6);
+        println!(
+            "{lidars:4} LIDARs, tilted, rolling    {:7.1} M rays/s",
+            rates[PAIRS / 2] / 1e6
+        );
         report[format!("{lidars} LIDARs")] = rates[PAIRS / 2].into();
     }
     if let Some(python) = &options.python {
@@ -151,7 +161,9 @@ impl Bench {
             config.lidar.mount[3..5].copy_from_slice(&[0.02, -0.03]);
         }
         let scene = lidar_city::scene(BUILDINGS, 1);
-        let lidar = Lidar::new(&config, &scene).unwrap_or_else(|error| panic!("{error}")).with_path(path);
+        let lidar = Lidar::new(&config, &scene)
+            .unwrap_or_else(|error| panic!("{error}"))
+            .with_path(path);
         let ticks = (0..TICKS).map(|tick| {
             let (mut states, steps) = lidar_city::traffic(VEHICLES, 0, moves, tick, 2);
             // Carriers do not see themselves; nor do the peers see them.
@@ -184,13 +196,22 @@ impl Bench {
             self.targets.update(states, steps, SUB_STEPS);
             for row in 0..self.lidars {
                 let points = self.points.get();
-                last = self.lidar.scan(&self.targets, row, tick, 1, &mut self.scratch, &mut scan, points);
+                last = self
+                    .lidar
+                    .scan(&self.targets, row, tick, 1, &mut self.scratch, &mut scan, points);
                 round.rays += scan.rays as usize;
                 round.points += last;
             }
         }
         round.seconds = begin.elapsed().as_secs_f64();
-        let range = |point: &LidarPoint| point.position_m.iter().map(|part| f64::from(part * part)).sum::<f64>().sqrt();
+        let range = |point: &LidarPoint| {
+            point
+                .position_m
+                .iter()
+                .map(|part| f64::from(part * part))
+                .sum::<f64>()
+                .sqrt()
+        };
         round.mean_range_m = self.points.get()[..last].iter().map(range).sum::<f64>() / last.max(1) as f64;
         round
     }
@@ -330,7 +351,12 @@ fn peers(python: &FilePath, path: Path) -> serde_json::Value {
             rates.sort_by(f64::total_cmp);
             println!(
                 "{name:10} {:7.2} M rays/s (hits {:.3}, mean range {:.1} m); we are {:.1} x as fast ({:.1} ... {:.1} in {PAIRS} pairs)",
-                rates[PAIRS / 2] / 1e6, warm[1], warm[2], ratios[PAIRS / 2], ratios[0], ratios[PAIRS - 1],
+                rates[PAIRS / 2] / 1e6,
+                warm[1],
+                warm[2],
+                ratios[PAIRS / 2],
+                ratios[0],
+                ratios[PAIRS - 1],
             );
             report[name] = serde_json::json!({ "rays_per_s": rates[PAIRS / 2], "ratio": ratios[PAIRS / 2], "spread": [ratios[0], ratios[PAIRS - 1]] });
         }
@@ -369,7 +395,10 @@ fn hold_against_parry(path: Path) {
             let rays = oracle::rays(&config, &states[row], &steps[row * SUB_STEPS..(row + 1) * SUB_STEPS]);
             all.add(&oracle::compare(&world, &rays, row, &points[..count]));
         }
-        println!("{moves_name}, rolling shutter {is_rolling}: {all:?}", moves_name = if lean[0] == 0.0 { "upright" } else { "tilted" });
+        println!(
+            "{moves_name}, rolling shutter {is_rolling}: {all:?}",
+            moves_name = if lean[0] == 0.0 { "upright" } else { "tilted" }
+        );
     }
     let off = all.rays - all.same;
     println!(

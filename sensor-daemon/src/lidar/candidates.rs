@@ -97,7 +97,11 @@ fn tilt_rad(up: f64, steepest: f64) -> f64 {
     }
     let aside = steepest * sin2.sqrt();
     let ahead = up - aside;
-    if ahead < 0.1 { TAU } else { libm::atan(aside / ahead) + sin2 }
+    if ahead < 0.1 {
+        TAU
+    } else {
+        libm::atan(aside / ahead) + sin2
+    }
 }
 
 /// −π … π.
@@ -113,7 +117,8 @@ pub(super) fn angle_rad(x: f64, y: f64) -> f64 {
     let (small, large) = if ax < ay { (ax, ay) } else { (ay, ax) };
     let ratio = small / large.max(1e-30);
     let square = ratio * ratio;
-    let angle = ratio * (0.999_866 + square * (-0.330_299_5 + square * (0.180_141 + square * (-0.085_133 + square * 0.020_835_1))));
+    let angle = ratio
+        * (0.999_866 + square * (-0.330_299_5 + square * (0.180_141 + square * (-0.085_133 + square * 0.020_835_1))));
     let angle = if ax < ay { 0.5 * PI - angle } else { angle };
     let angle = if x < 0.0 { PI - angle } else { angle };
     if y < 0.0 { -angle } else { angle }
@@ -135,7 +140,10 @@ impl Candidates {
                 return whole;
             }
             let begin = begin - TAU * (begin * (1.0 / TAU)).floor();
-            [(begin * per_rad) as f32 - 1.0, ((begin + length) * per_rad) as f32 + 1.0]
+            [
+                (begin * per_rad) as f32 - 1.0,
+                ((begin + length) * per_rad) as f32 + 1.0,
+            ]
         };
         // A circle that may come closer by `motion_m`.
         let circle = |dx: f64, dy: f64, distance_m: f64, radius_m: f64| {
@@ -176,13 +184,21 @@ impl Candidates {
                 }
                 let (left, right) = (angle_rad(p[0], p[1]), angle_rad(q[0], q[1]));
                 let width = wrapped(left - right);
-                let more = if watch.motion_m > 0.0 { 1.6 * watch.motion_m / distance_m } else { 0.0 };
+                let more = if watch.motion_m > 0.0 {
+                    1.6 * watch.motion_m / distance_m
+                } else {
+                    0.0
+                };
                 let is_wide = distance_m < 2.0 * watch.motion_m || width.abs() > 3.0 || distance_m < 0.01;
                 let low = if width < 0.0 { left } else { right };
                 all.push(Candidate {
                     kind: Kind::Wall(index, number as u32),
                     near_m: (distance_m - watch.motion_m).max(0.0) as f32,
-                    columns: if is_wide { whole } else { columns(low, low + width.abs(), more) },
+                    columns: if is_wide {
+                        whole
+                    } else {
+                        columns(low, low + width.abs(), more)
+                    },
                 });
             }
         });

@@ -64,7 +64,11 @@ impl Firing {
         let half = 0.5 * lidar.horizontal_fov_deg.to_radians() + 1e-9;
         let off_centre = |column: usize| angle(column).min(TAU - angle(column));
         let azimuth = |column| {
-            if pattern.is_table { [0.0, 1.0] } else { <[f64; 2]>::from(libm::sincos(angle(column))) }
+            if pattern.is_table {
+                [0.0, 1.0]
+            } else {
+                <[f64; 2]>::from(libm::sincos(angle(column)))
+            }
         };
         Ok(Self {
             per_rotation,
@@ -89,7 +93,9 @@ impl Firing {
     pub(super) fn most_columns(&self) -> usize {
         let fired = |phase: usize| {
             let (begin, count) = self.tick(phase as u64);
-            (begin..begin + count).filter(|column| self.is_seen[column % self.per_rotation]).count()
+            (begin..begin + count)
+                .filter(|column| self.is_seen[column % self.per_rotation])
+                .count()
         };
         (0..self.phases).map(fired).max().unwrap_or(0)
     }
@@ -112,7 +118,13 @@ impl Firing {
                 next += 1;
                 continue;
             }
-            let at = |column: usize| if sub_steps == 0 { 1.0 } else { (column + 1) as f64 / count as f64 };
+            let at = |column: usize| {
+                if sub_steps == 0 {
+                    1.0
+                } else {
+                    (column + 1) as f64 / count as f64
+                }
+            };
             spans.push(Span {
                 first: next,
                 count: seen,

@@ -27,7 +27,10 @@ struct Mesh {
 
 impl std::fmt::Debug for Mesh {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.debug_struct("Mesh").field("object", &self.object).finish_non_exhaustive()
+        formatter
+            .debug_struct("Mesh")
+            .field("object", &self.object)
+            .finish_non_exhaustive()
     }
 }
 
@@ -178,4 +181,3 @@ impl<'a> Entry<'a> {
         TriMesh::new(vertices, triangles).map_err(|error| wrong(format!("{error:?}")))
     }
 }
-

@@ -183,7 +183,10 @@ impl Lidar {
 impl scan::Order<'_> {
     fn run_on(&self, path: Path, scratch: &mut Scratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
         #[cfg(target_arch = "x86_64")]
-        #[expect(unsafe_code, reason = "calls of functions compiled for more than the baseline processor")]
+        #[expect(
+            unsafe_code,
+            reason = "calls of functions compiled for more than the baseline processor"
+        )]
         match path {
             // SAFETY: `Lidar::path` is a path that `Path::is_here` has found on this processor.
             Path::Avx512 => return unsafe { self.run_avx512(scratch, scan, points) },

@@ -42,7 +42,14 @@ pub fn nearest_objects(points: &[LidarPoint], lidar: &Lidar) -> [[f32; 2]; OBJEC
         let place_m = lidar.body_from_point(point);
         let square = place_m[0] * place_m[0] + place_m[1] * place_m[1];
         if square < nearest[OBJECTS - 1].square {
-            enter(&mut nearest, Nearest { object: point.object, square, place_m });
+            enter(
+                &mut nearest,
+                Nearest {
+                    object: point.object,
+                    square,
+                    place_m,
+                },
+            );
         }
     }
     nearest.map(|one| one.place_m)

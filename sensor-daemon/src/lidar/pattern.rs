@@ -142,7 +142,11 @@ pub(super) fn elevations_deg(lidar: &config::Lidar) -> Option<Vec<f64>> {
 fn pandar40p() -> Vec<f64> {
     let below = [-25.0, -19.0, -14.0, -13.0, -12.0, -11.0, -10.0, -9.0, -8.0, -7.0];
     let fine = (0..25).map(|i| -6.0 + f64::from(i) / 3.0);
-    below.into_iter().chain(fine).chain([3.0, 5.0, 8.0, 11.0, 15.0]).collect()
+    below
+        .into_iter()
+        .chain(fine)
+        .chain([3.0, 5.0, 8.0, 11.0, 15.0])
+        .collect()
 }
 
 /// Velodyne VLS-128 (Alpha Prime) user manual (63-9483): 0.11° apart about the horizon, from −25° to 15°. The angles below the
@@ -152,7 +156,9 @@ fn vls128() -> Vec<f64> {
         -25.0, -19.582, -16.042, -13.565, -11.742, -10.346, -9.244, -8.352, -7.65, -7.15, -6.85, -6.65, -6.5,
     ];
     let fine = (0..104).map(|i| -6.39 + 0.11 * f64::from(i));
-    let above = [5.09, 5.29, 5.59, 6.09, 6.792, 7.684, 8.786, 10.182, 11.582, 13.182, 15.0];
+    let above = [
+        5.09, 5.29, 5.59, 6.09, 6.792, 7.684, 8.786, 10.182, 11.582, 13.182, 15.0,
+    ];
     below.into_iter().chain(fine).chain(above).collect()
 }
 

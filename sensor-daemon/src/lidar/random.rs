@@ -77,7 +77,10 @@ pub(super) fn ln<S: Simd>(x: S::F) -> S::F {
     // √½ as the begin of an interval of the mantissa.
     let shifted = S::minus(bits, S::splat_words(0x3F35_04F3));
     let exponent = S::from_signed(sign_shift::<S>(shifted));
-    let mantissa = S::plus(S::and(shifted, S::splat_words(0x007F_FFFF)), S::splat_words(0x3F35_04F3));
+    let mantissa = S::plus(
+        S::and(shifted, S::splat_words(0x007F_FFFF)),
+        S::splat_words(0x3F35_04F3),
+    );
     let f = S::floats(mantissa) - S::splat(1.0);
     let square = f * f;
     let tail = horner::<S, 9>(
@@ -138,7 +141,14 @@ pub(super) fn exp_minus<S: Simd>(x: S::F) -> S::F {
     let rest = S::splat(0.0) - x - whole * S::splat(0.693_359_4) + whole * S::splat(2.121_944_4e-4);
     let tail = horner::<S, 6>(
         rest,
-        [1.987_569_1e-4, 1.398_199_9e-3, 8.333_452e-3, 4.166_579_6e-2, 1.666_666_5e-1, 0.5],
+        [
+            1.987_569_1e-4,
+            1.398_199_9e-3,
+            8.333_452e-3,
+            4.166_579_6e-2,
+            1.666_666_5e-1,
+            0.5,
+        ],
     );
     let mantissa = tail * rest * rest + rest + S::splat(1.0);
     S::floats(S::plus(S::words(mantissa), S::left::<23>(S::words(raised))))
@@ -198,7 +208,15 @@ mod tests {
             let [words, ..] = Plain::philox(0, key.rest, key.key);
             words[0]
         };
-        let all = [(1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2), (1 << 32, 1, 1), (1, 1 << 32, 1), (1, 1, 1 << 32)];
+        let all = [
+            (1, 1, 1),
+            (2, 1, 1),
+            (1, 2, 1),
+            (1, 1, 2),
+            (1 << 32, 1, 1),
+            (1, 1 << 32, 1),
+            (1, 1, 1 << 32),
+        ];
         let mut drawn = all.map(|(seed, id, tick)| first(Key::new(seed, id, tick)));
         drawn.sort_unstable();
         assert!(drawn.windows(2).all(|two| two[0] != two[1]));
@@ -230,7 +248,10 @@ mod tests {
         let _ = Words::ZERO;
         for number in 0..1000 {
             let expected = stored::<Plain>(&key, number);
-            #[expect(unsafe_code, reason = "calls of functions compiled for more than the baseline processor")]
+            #[expect(
+                unsafe_code,
+                reason = "calls of functions compiled for more than the baseline processor"
+            )]
             if is_x86_feature_detected!("avx2") {
                 // SAFETY: the processor has been asked.
                 assert_eq!(unsafe { avx2(&key, number) }, expected);

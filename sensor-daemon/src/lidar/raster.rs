@@ -162,7 +162,9 @@ impl Canvas {
             self.incidence.resize(places, Floats::ZERO);
             self.object.resize(places, Words::ZERO);
             self.word.resize(places, Words::ZERO);
-            self.direction.iter_mut().for_each(|axis| axis.resize(places, Floats::ZERO));
+            self.direction
+                .iter_mut()
+                .for_each(|axis| axis.resize(places, Floats::ZERO));
         }
     }
 
@@ -187,9 +189,7 @@ impl Canvas {
     pub(super) fn see<S: Simd>(&mut self, column: usize) {
         let begin = column * self.groups;
         let places = &self.t[begin..begin + self.groups];
-        let farthest = places
-            .iter()
-            .fold(S::splat(0.0), |far, t| S::max(far, S::load(t)));
+        let farthest = places.iter().fold(S::splat(0.0), |far, t| S::max(far, S::load(t)));
         self.columns[column / LANES].far.0[column % LANES] = S::largest(farthest);
     }
 
@@ -209,7 +209,11 @@ impl Canvas {
             // The left corner is not right of all rays, the right one not left of all.
             let left = S::le(zero, cross::<S>(load2::<S>(&columns.right), p));
             let right = cross::<S>(load2::<S>(&columns.left), q);
-            let right = if UPRIGHT { S::lt(right, zero) } else { S::le(right, zero) };
+            let right = if UPRIGHT {
+                S::lt(right, zero)
+            } else {
+                S::le(right, zero)
+            };
             let offset = wall.offset.at::<S>(share);
             let mut seen = S::both(S::both(left, right), S::both(near, S::lt(offset, zero)));
             let live = self.live(chunk);
@@ -320,10 +324,7 @@ impl Canvas {
         let mut any = 0;
         for wall in walls {
             let [p, q] = [&wall.p, &wall.q].map(|point| point.map(|line| line.at::<S>(share)));
-            let crossed = S::differ(
-                S::le(zero, cross::<S>(ahead, p)),
-                S::le(zero, cross::<S>(ahead, q)),
-            );
+            let crossed = S::differ(S::le(zero, cross::<S>(ahead, p)), S::le(zero, cross::<S>(ahead, q)));
             let facing = dot::<S>(wall.normal.map(|line| line.at::<S>(share)), ahead);
             let t = wall.offset.at::<S>(share) / facing;
             any |= S::bits(crossed);
@@ -371,10 +372,7 @@ impl Canvas {
             let mut inside = S::mask(0);
             for wall in walls {
                 let [p, q] = [&wall.p, &wall.q].map(|point| point.map(|line| line.at::<S>(share)));
-                let crossed = S::differ(
-                    S::le(zero, cross::<S>([x, y], p)),
-                    S::le(zero, cross::<S>([x, y], q)),
-                );
+                let crossed = S::differ(S::le(zero, cross::<S>([x, y], p)), S::le(zero, cross::<S>([x, y], q)));
                 let facing = dot::<S>(wall.normal.map(|line| line.at::<S>(share)), [x, y]);
                 // offset / facing < t, without the division.
                 let behind = S::lt(wall.offset.at::<S>(share), facing * t);
@@ -407,7 +405,10 @@ impl Canvas {
             let right = S::le(reach, cross::<S>(at, load2::<S>(&columns.left)));
             let seen = S::bits(S::both(left, right)) & near;
             let at = stored2::<S>(at);
-            let z = [stored::<S>(body.z[0].at::<S>(share)), stored::<S>(body.z[1].at::<S>(share))];
+            let z = [
+                stored::<S>(body.z[0].at::<S>(share)),
+                stored::<S>(body.z[1].at::<S>(share)),
+            ];
             for lane in set(seen) {
                 let centre = [at[0].0[lane], at[1].0[lane]];
                 let ahead = [columns.ahead[0].0[lane], columns.ahead[1].0[lane]];
@@ -454,7 +455,10 @@ impl Canvas {
             let t = high / up;
             let within = S::both(S::lt(along - root, t * square), S::lt(t * square, along + root));
             let below = S::both(S::lt(high, zero), S::lt(zero, t));
-            let top = S::both(S::both(meets, within), S::both(below, S::lt(t, S::load(&self.t[place]))));
+            let top = S::both(
+                S::both(meets, within),
+                S::both(below, S::lt(t, S::load(&self.t[place]))),
+            );
             self.put::<S>(place, top, t, up, body);
             hit |= S::bits(mantle) | S::bits(top);
         }

@@ -55,7 +55,11 @@ impl Receiver {
             noise_std_m: lidar.range_noise_std_m as f32,
             attenuation_per_m: (lidar.attenuation_per_m + 2.0 * air.extinction_per_m) as f32,
             dropoff: lidar.dropoff as f32,
-            inv_weak: if weak { (1.0 / lidar.dropoff_intensity) as f32 } else { 0.0 },
+            inv_weak: if weak {
+                (1.0 / lidar.dropoff_intensity) as f32
+            } else {
+                0.0
+            },
             dropoff_zero: lidar.dropoff_zero_intensity as f32,
             is_random: noisy || weak || lidar.dropoff > 0.0,
             wanted: if lidar.mode == LidarMode::Interest { INTEREST } else { 0 },
@@ -148,10 +152,18 @@ impl Receiver {
         let (x, y, z) = if UPRIGHT {
             (ahead * cosine, ahead * sine, range * gamma)
         } else {
-            (ahead * cosine - beside * sine, ahead * sine + beside * cosine, range * gamma)
+            (
+                ahead * cosine - beside * sine,
+                ahead * sine + beside * cosine,
+                range * gamma,
+            )
         };
         let zero = S::splat(0.0);
-        let [x, y, z] = if self.is_paper { [y, zero - x, zero - z] } else { [x, y, z] };
+        let [x, y, z] = if self.is_paper {
+            [y, zero - x, zero - z]
+        } else {
+            [x, y, z]
+        };
         let tag = S::or(S::and(word, S::splat_words(0xFF)), S::load_words(&rays.channel));
         let words = [
             S::words(x),

@@ -51,7 +51,11 @@ struct Work<'a> {
 impl Order<'_> {
     /// Sub-steps that count: none if everything is seen as it is at the end of the tick.
     fn sub_steps(&self) -> usize {
-        if self.lidar.is_rolling { self.targets.sub_steps } else { 0 }
+        if self.lidar.is_rolling {
+            self.targets.sub_steps
+        } else {
+            0
+        }
     }
 
     fn dt_s(&self) -> f64 {
@@ -90,7 +94,9 @@ impl Order<'_> {
         };
         scratch.candidates.gather(lidar, self.targets, self.row, &watch);
         let rotation = lidar.firing.per_rotation;
-        scratch.candidates.sort(&scratch.spans, (begin % rotation, count), rotation);
+        scratch
+            .candidates
+            .sort(&scratch.spans, (begin % rotation, count), rotation);
         let is_upright = lidar.is_flat_fan && self.targets.is_upright(self.row);
         if is_upright {
             self.spans::<S, true>(begin, scratch, points)
@@ -107,8 +113,14 @@ impl Order<'_> {
         let first = spans.first().map_or(0, |span| (begin + span.first) % rotation);
         let [sine, cosine] = lidar.firing.azimuths.get(first).copied().unwrap_or([0.0, 1.0]);
         let azimuth = libm::atan2(sine, cosine);
-        let azimuth = if azimuth < 0.0 { azimuth + std::f64::consts::TAU } else { azimuth };
-        let columns = spans.iter().flat_map(|span| (0..span.count).map(|column| begin + span.first + column));
+        let azimuth = if azimuth < 0.0 {
+            azimuth + std::f64::consts::TAU
+        } else {
+            azimuth
+        };
+        let columns = spans
+            .iter()
+            .flat_map(|span| (0..span.count).map(|column| begin + span.first + column));
         let rays = |column: usize| -> u32 {
             let groups = lidar.pattern.column(column % rotation);
             groups.iter().map(|group| group.live.count_ones()).sum()
@@ -294,7 +306,11 @@ impl<'a> Work<'a> {
             let place = column * canvas.groups + group;
             let (limit, t, incidence) = if UPRIGHT {
                 let rays = &lidar.pattern.groups[group];
-                (range * S::load(&rays.alpha), below * S::load(&rays.cot), S::load(&rays.tan))
+                (
+                    range * S::load(&rays.alpha),
+                    below * S::load(&rays.cot),
+                    S::load(&rays.tan),
+                )
             } else {
                 let z = S::load(&canvas.direction[2][place]);
                 (range, below / z, z)
@@ -363,7 +379,10 @@ impl<'a> Work<'a> {
             [first[0] - from[0], first[1] - from[1]],
             [last[0] - to[0], last[1] - to[1]],
         ];
-        (ends, [0, 1].map(|axis: usize| Line::between(ends[0][axis], ends[1][axis])))
+        (
+            ends,
+            [0, 1].map(|axis: usize| Line::between(ends[0][axis], ends[1][axis])),
+        )
     }
 
     #[inline(always)]

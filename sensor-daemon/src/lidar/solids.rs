@@ -146,7 +146,10 @@ impl Solids {
         };
         self.walls.extend(edges(&outline).filter_map(|(p, q)| wall(p, q)));
         let centre_m = centre(bounds);
-        let reach_m = outline.iter().map(|corner| distance(*corner, centre_m)).fold(0.0, f64::max);
+        let reach_m = outline
+            .iter()
+            .map(|corner| distance(*corner, centre_m))
+            .fold(0.0, f64::max);
         self.most_reach_m = self.most_reach_m.max(reach_m);
         self.near.push([centre_m[0], centre_m[1], reach_m]);
         self.stills.push(Still {

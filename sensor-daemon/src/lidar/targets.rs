@@ -63,7 +63,14 @@ impl Targets {
         self.sub_steps = k;
         self.knots.clear();
         self.knots.extend(sub_steps[..states.len() * k].iter().map(|step| {
-            [step.dx_m, step.dy_m, step.dz_m, step.dyaw_rad, step.roll_rad, step.pitch_rad]
+            [
+                step.dx_m,
+                step.dy_m,
+                step.dz_m,
+                step.dyaw_rad,
+                step.roll_rad,
+                step.pitch_rad,
+            ]
         }));
         self.movers.clear();
         self.near.clear();

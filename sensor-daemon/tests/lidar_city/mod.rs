@@ -1,7 +1,11 @@
 //! A dense city to look at: blocks of buildings, half of them not convex, between streets full of moving vehicles and persons; and
 //! the rays of a LIDAR in it in double precision, worked out without the library under test. Shared by tests and `lidar-bench`.
 
-#![allow(dead_code, clippy::unwrap_used, reason = "every user takes what it needs; tests assert by unwrapping")]
+#![allow(
+    dead_code,
+    clippy::unwrap_used,
+    reason = "every user takes what it needs; tests assert by unwrapping"
+)]
 
 use ipc_schema::{
     config::Config,
@@ -74,17 +78,38 @@ pub fn scene(buildings: usize, seed: u64) -> Scene {
         let (w, d) = (random.between(12.0, 14.5), random.between(24.0, 30.0));
         let local: Vec<[f64; 2]> = match number % 4 {
             0 | 1 => vec![[0.0, 0.0], [w, 0.0], [w, d], [0.0, d]],
-            2 => vec![[0.0, 0.0], [w, 0.0], [w, 0.4 * d], [0.5 * w, 0.4 * d], [0.5 * w, d], [0.0, d]],
+            2 => vec![
+                [0.0, 0.0],
+                [w, 0.0],
+                [w, 0.4 * d],
+                [0.5 * w, 0.4 * d],
+                [0.5 * w, d],
+                [0.0, d],
+            ],
             _ => vec![
-                [0.0, 0.0], [w, 0.0], [w, d], [0.7 * w, d], [0.7 * w, 0.3 * d], [0.3 * w, 0.35 * d], [0.3 * w, d], [0.0, d],
+                [0.0, 0.0],
+                [w, 0.0],
+                [w, d],
+                [0.7 * w, d],
+                [0.7 * w, 0.3 * d],
+                [0.3 * w, 0.35 * d],
+                [0.3 * w, d],
+                [0.0, d],
             ],
         };
         let turn = random.between(-0.03, 0.03);
         let outline = local.iter().map(|[a, b]| {
-            [x + a * turn.cos() - b * turn.sin(), corner[1] + a * turn.sin() + b * turn.cos()]
+            [
+                x + a * turn.cos() - b * turn.sin(),
+                corner[1] + a * turn.sin() + b * turn.cos(),
+            ]
         });
         // One in eight is low enough to be looked down on by a sensor on a roof.
-        let height = if number % 8 == 5 { random.between(1.0, 1.9) } else { random.between(7.0, 25.0) };
+        let height = if number % 8 == 5 {
+            random.between(1.0, 1.9)
+        } else {
+            random.between(7.0, 25.0)
+        };
         let id = format!("building {number}");
         Prism::new(id, SolidClass::Building, outline.collect(), 0.0, height).unwrap()
     });
@@ -92,7 +117,13 @@ pub fn scene(buildings: usize, seed: u64) -> Scene {
 }
 
 /// Vehicles and persons in the streets at the end of tick `tick`, with their sub-steps.
-pub fn traffic(vehicles: usize, persons: usize, moves: Moves, tick: u64, seed: u64) -> (Vec<VehicleState>, Vec<SubStep>) {
+pub fn traffic(
+    vehicles: usize,
+    persons: usize,
+    moves: Moves,
+    tick: u64,
+    seed: u64,
+) -> (Vec<VehicleState>, Vec<SubStep>) {
     let mut random = Random(seed);
     let (mut states, mut steps) = (Vec::new(), Vec::new());
     for number in 0..vehicles + persons {
@@ -103,15 +134,36 @@ pub fn traffic(vehicles: usize, persons: usize, moves: Moves, tick: u64, seed: u
         let side = if random.next() < 0.5 { 1.0 } else { -1.0 };
         let speed = if is_person { 1.4 } else { random.between(0.0, 14.0) };
         let across = side * if is_person { 6.0 } else { 2.0 };
-        let heading = f64::from(is_north) * std::f64::consts::FRAC_PI_2 + if side > 0.0 { std::f64::consts::PI } else { 0.0 };
+        let heading =
+            f64::from(is_north) * std::f64::consts::FRAC_PI_2 + if side > 0.0 { std::f64::consts::PI } else { 0.0 };
         let yaw = heading + random.between(-0.05, 0.05);
         let along = along - side * speed * TICK_S * tick as f64;
-        let place = if is_north { [street - across, along] } else { [along, street + across] };
+        let place = if is_north {
+            [street - across, along]
+        } else {
+            [along, street + across]
+        };
         let wild = moves == Moves::Wildly && !is_person;
         let turning = if wild { random.between(-0.6, 0.6) } else { 0.0 };
-        let lean: [f64; 2] = if wild { [random.between(-0.04, 0.04), random.between(-0.04, 0.04)] } else { [0.0; 2] };
-        let length = if is_person { 0.5 } else if number % 9 == 4 { 12.0 } else { random.between(3.8, 5.0) };
-        let height = if is_person { 1.75 } else if number % 9 == 4 { 3.1 } else { random.between(1.4, 1.95) };
+        let lean: [f64; 2] = if wild {
+            [random.between(-0.04, 0.04), random.between(-0.04, 0.04)]
+        } else {
+            [0.0; 2]
+        };
+        let length = if is_person {
+            0.5
+        } else if number % 9 == 4 {
+            12.0
+        } else {
+            random.between(3.8, 5.0)
+        };
+        let height = if is_person {
+            1.75
+        } else if number % 9 == 4 {
+            3.1
+        } else {
+            random.between(1.4, 1.95)
+        };
         states.push(VehicleState {
             x_m: place[0],
             y_m: place[1],

@@ -47,7 +47,14 @@ pub fn pose(state: &VehicleState, steps: &[SubStep], at: f64) -> [f64; 6] {
     let knot = |i: usize| {
         let s = &steps[i];
         let d = [s.dx_m, s.dy_m, s.dz_m, s.dyaw_rad].map(f64::from);
-        [end[0] + d[0], end[1] + d[1], end[2] + d[2], end[3] + d[3], f64::from(s.roll_rad), f64::from(s.pitch_rad)]
+        [
+            end[0] + d[0],
+            end[1] + d[1],
+            end[2] + d[2],
+            end[3] + d[3],
+            f64::from(s.roll_rad),
+            f64::from(s.pitch_rad),
+        ]
     };
     let place = (at * k as f64).max(1e-12);
     let i = (place - 1e-9).floor().max(0.0) as usize;
@@ -100,17 +107,29 @@ pub fn rays(config: &Config, state: &VehicleState, steps: &[SubStep]) -> Vec<One
     let [mx, my, mz, mroll, mpitch, myaw] = lidar.mount;
     let mut rays = Vec::new();
     for column in 0..columns {
-        let at = if lidar.rolling_shutter { (column + 1) as f64 / columns as f64 } else { 1.0 };
-        let [x, y, z, yaw, roll, pitch] = if lidar.rolling_shutter { pose(state, steps, at) } else { pose(state, &[], 1.0) };
+        let at = if lidar.rolling_shutter {
+            (column + 1) as f64 / columns as f64
+        } else {
+            1.0
+        };
+        let [x, y, z, yaw, roll, pitch] = if lidar.rolling_shutter {
+            pose(state, steps, at)
+        } else {
+            pose(state, &[], 1.0)
+        };
         let body = rotation(roll, pitch, yaw);
         let arm = turned(&body, [mx, my, mz]);
         let sensor = times(&body, &rotation(mroll, mpitch, myaw));
         let azimuth = std::f64::consts::TAU * column as f64 / columns as f64;
         for channel in 0..lidar.channels {
             let span = lidar.upper_fov_deg - lidar.lower_fov_deg;
-            let elevation = (lidar.lower_fov_deg + span * f64::from(channel) / f64::from(lidar.channels - 1)).to_radians();
-            let in_sensor =
-                [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()];
+            let elevation =
+                (lidar.lower_fov_deg + span * f64::from(channel) / f64::from(lidar.channels - 1)).to_radians();
+            let in_sensor = [
+                elevation.cos() * azimuth.cos(),
+                elevation.cos() * azimuth.sin(),
+                elevation.sin(),
+            ];
             rays.push(OneRay {
                 origin_m: [x + arm[0], y + arm[1], z + arm[2]],
                 direction: turned(&sensor, in_sensor),
@@ -223,7 +242,11 @@ impl<'a> World<'a> {
             if number == row || dx.hypot(dy) > self.range_m + 20.0 || ahead < -20.0 || aside.abs() > 20.0 * flat {
                 continue;
             }
-            let steps = if self.is_rolling { &self.steps[number * k..(number + 1) * k] } else { &[] };
+            let steps = if self.is_rolling {
+                &self.steps[number * k..(number + 1) * k]
+            } else {
+                &[]
+            };
             if let Some(range_m) = self.road_user(state, pose(state, steps, ray.at), &cast) {
                 offer(range_m, state.vehicle);
             }
@@ -300,7 +323,8 @@ pub fn compare(world: &World<'_>, rays: &[OneRay], row: usize, points: &[LidarPo
             tally.grazing += 1;
         } else {
             eprintln!(
-                "ours {object:x} at {range_m}, parry {:x} at {}: {ray:?}", hit.object, hit.range_m
+                "ours {object:x} at {range_m}, parry {:x} at {}: {ray:?}",
+                hit.object, hit.range_m
             );
         }
     }
@@ -310,16 +334,35 @@ pub fn compare(world: &World<'_>, rays: &[OneRay], row: usize, points: &[LidarPo
 
 /// True if a ray that runs 3 mm beside this one at the place of the hit meets what we say, within what such a shift can do.
 fn is_grazing(world: &World<'_>, ray: &OneRay, row: usize, range_m: f64, object: u32) -> bool {
-    let reach_m = if object == NOTHING { world.range_m } else { range_m.max(1.0) };
+    let reach_m = if object == NOTHING {
+        world.range_m
+    } else {
+        range_m.max(1.0)
+    };
     let [x, y, z] = ray.direction;
     let flat = x.hypot(y).max(1e-9);
     let (side, up) = ([-y / flat, x / flat, 0.0], [-x * z / flat, -y * z / flat, flat]);
-    [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (-0.7, 0.7), (0.7, 0.7), (-0.7, -0.7), (0.7, -0.7)]
-        .into_iter()
-        .any(|(a, b)| {
-            let off = 3e-3 / reach_m;
-            let moved = std::array::from_fn(|i| ray.direction[i] + off * (a * side[i] + b * up[i]));
-            let hit = world.cast(&OneRay { direction: moved, ..*ray }, row);
-            hit.object == object
-        })
+    [
+        (-1.0, 0.0),
+        (1.0, 0.0),
+        (0.0, -1.0),
+        (0.0, 1.0),
+        (-0.7, 0.7),
+        (0.7, 0.7),
+        (-0.7, -0.7),
+        (0.7, -0.7),
+    ]
+    .into_iter()
+    .any(|(a, b)| {
+        let off = 3e-3 / reach_m;
+        let moved = std::array::from_fn(|i| ray.direction[i] + off * (a * side[i] + b * up[i]));
+        let hit = world.cast(
+            &OneRay {
+                direction: moved,
+                ..*ray
+            },
+            row,
+        );
+        hit.object == object
+    })
 }

@@ -36,7 +36,12 @@ macro_rules! operator {
             type Output = Self;
             #[inline(always)]
             fn $function(self, other: Self) -> Self {
-                Self(unsafe { [$intrinsic(self.0[0], other.0[0]), $intrinsic(self.0[1], other.0[1])] })
+                Self(unsafe {
+                    [
+                        $intrinsic(self.0[0], other.0[0]),
+                        $intrinsic(self.0[1], other.0[1]),
+                    ]
+                })
             }
         }
     };
@@ -193,15 +198,21 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn left<const N: u32>(a: U) -> U {
-        U(two(a.0, |a| unsafe { _mm256_sll_epi32(a, _mm_cvtsi32_si128(N as i32)) }))
+        U(two(a.0, |a| unsafe {
+            _mm256_sll_epi32(a, _mm_cvtsi32_si128(N as i32))
+        }))
     }
     #[inline(always)]
     fn right<const N: u32>(a: U) -> U {
-        U(two(a.0, |a| unsafe { _mm256_srl_epi32(a, _mm_cvtsi32_si128(N as i32)) }))
+        U(two(a.0, |a| unsafe {
+            _mm256_srl_epi32(a, _mm_cvtsi32_si128(N as i32))
+        }))
     }
     #[inline(always)]
     fn equal(a: U, b: U) -> [__m256; 2] {
-        pair(a.0, b.0, |a, b| unsafe { _mm256_castsi256_ps(_mm256_cmpeq_epi32(a, b)) })
+        pair(a.0, b.0, |a, b| unsafe {
+            _mm256_castsi256_ps(_mm256_cmpeq_epi32(a, b))
+        })
     }
     #[inline(always)]
     fn words(value: F) -> U {

@@ -39,7 +39,12 @@ operator!(Div, div, _mm512_div_ps);
 /// Words 0 … 7 of both halves of a Philox word.
 #[inline(always)]
 fn joined(even: __m512i, odd: __m512i) -> U {
-    U(unsafe { _mm512_inserti64x4::<1>(_mm512_castsi256_si512(_mm512_cvtepi64_epi32(even)), _mm512_cvtepi64_epi32(odd)) })
+    U(unsafe {
+        _mm512_inserti64x4::<1>(
+            _mm512_castsi256_si512(_mm512_cvtepi64_epi32(even)),
+            _mm512_cvtepi64_epi32(odd),
+        )
+    })
 }
 
 impl Simd for Avx512 {
@@ -176,7 +181,12 @@ impl Simd for Avx512 {
             let step = _mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0);
             let multipliers = MULTIPLIERS.map(splat);
             // Lower halves add and wrap on their own: a carry into the upper half is not looked at.
-            let mut low = [_mm512_add_epi64(splat(first), step), splat(rest[0]), splat(rest[1]), splat(rest[2])];
+            let mut low = [
+                _mm512_add_epi64(splat(first), step),
+                splat(rest[0]),
+                splat(rest[1]),
+                splat(rest[2]),
+            ];
             let mut high = low;
             high[0] = _mm512_add_epi64(splat(first.wrapping_add(8)), step);
             let mut keys = key;
@@ -210,7 +220,10 @@ impl Simd for Avx512 {
         }
         unsafe {
             // Sixteen rows fit behind the cursor, which moves on by at most one after each of them.
-            let [first, second] = [transposed([words[0], words[1], words[2], words[3]]), transposed([words[4], words[5], words[6], words[7]])];
+            let [first, second] = [
+                transposed([words[0], words[1], words[2], words[3]]),
+                transposed([words[4], words[5], words[6], words[7]]),
+            ];
             let low = _mm512_set_epi64(11, 10, 3, 2, 9, 8, 1, 0);
             let high = _mm512_set_epi64(15, 14, 7, 6, 13, 12, 5, 4);
             // Rows 0 … 3 with 4 … 7, then 8 … 11 with 12 … 15.

@@ -94,7 +94,12 @@ pub(super) trait Simd: Copy {
 }
 
 /// Rows of the lanes in `keep` from memory: the way every processor can go, and the end of the buffer.
-pub(super) fn compact_rows(words: &[[u32; LANES]; 8], keep: u32, points: &mut [LidarPoint], mut cursor: usize) -> usize {
+pub(super) fn compact_rows(
+    words: &[[u32; LANES]; 8],
+    keep: u32,
+    points: &mut [LidarPoint],
+    mut cursor: usize,
+) -> usize {
     for lane in (0..LANES).filter(|lane| keep >> lane & 1 == 1) {
         let Some(point) = points.get_mut(cursor) else {
             return cursor;

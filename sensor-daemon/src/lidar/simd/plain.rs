@@ -99,13 +99,14 @@ impl Simd for Plain {
     }
     #[inline(always)]
     fn store_words_where(mask: u32, value: u32, to: &mut Words) {
-        (0..LANES)
-            .filter(|i| mask >> i & 1 == 1)
-            .for_each(|i| to.0[i] = value);
+        (0..LANES).filter(|i| mask >> i & 1 == 1).for_each(|i| to.0[i] = value);
     }
     #[inline(always)]
     fn largest(value: F) -> f32 {
-        value.0.iter().fold(f32::NEG_INFINITY, |a, &b| if a > b { a } else { b })
+        value
+            .0
+            .iter()
+            .fold(f32::NEG_INFINITY, |a, &b| if a > b { a } else { b })
     }
     #[inline(always)]
     fn splat_words(value: u32) -> [u32; LANES] {
