@@ -11,6 +11,7 @@ pub mod digest;
 pub mod fields;
 pub mod gnss;
 pub mod imu;
+pub mod lidar;
 pub mod noise;
 #[cfg(test)]
 #[path = "../../sim-core/tests/common/preset.rs"]

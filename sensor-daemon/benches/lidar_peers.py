@@ -1,0 +1,62 @@
+"""General ray tracers on the rays and triangles that `lidar-bench` has written: one thread, one line of answer for a line of name."""
+
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+
+
+def open3d_peer(vertices, faces, rays):
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
+    tensor = o3d.core.Tensor(rays)
+
+    def cast():
+        return scene.cast_rays(tensor, nthreads=1)["t_hit"].numpy()
+
+    return cast
+
+
+def embreex_peer(vertices, faces, rays):
+    from embreex import rtcore_scene
+    from embreex.mesh_construction import TriangleMesh
+
+    scene = rtcore_scene.EmbreeScene()
+    TriangleMesh(scene, vertices[faces])
+    origins, directions = rays[:, :3].copy(), rays[:, 3:].copy()
+
+    def cast():
+        distances = scene.run(origins, directions, query="DISTANCE")
+        return np.where(distances > 1e30, np.inf, distances)
+
+    return cast
+
+
+def main():
+    directory = Path(sys.argv[1])
+    vertices = np.fromfile(directory / "vertices.f32", np.float32).reshape(-1, 3)
+    faces = np.fromfile(directory / "faces.u32", np.uint32).reshape(-1, 3)
+    rays = np.fromfile(directory / "rays.f32", np.float32).reshape(-1, 6)
+    peers = {}
+    for name, make in (("open3d", open3d_peer), ("embreex", embreex_peer)):
+        try:
+            peers[name] = make(vertices, faces, rays)
+        except (ImportError, OSError) as error:
+            print(f"{name} is left out: {error} (pip install open3d-cpu embreex; Debian: libgl1 libusb-1.0-0 libgomp1)", file=sys.stderr)
+    print(*peers, flush=True)
+    for line in sys.stdin:
+        cast = peers[line.strip()]
+        begin = time.perf_counter()
+        distances = cast()
+        seconds = time.perf_counter() - begin
+        seen = distances < 100.0
+        print(len(rays) / seconds, seen.mean(), distances[seen].mean(), flush=True)
+
+
+main()

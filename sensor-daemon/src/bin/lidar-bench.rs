@@ -1,0 +1,412 @@
+//! Rays per second of the LIDAR on one core, beside general ray tracers in the same run, and its agreement with parry3d.
+//!
+//! `cargo run --release -p sensor-daemon --bin lidar-bench -- [--python PATH] [--path auto|avx512|avx2|plain] [--json FILE] [--oracle]`
+//!
+//! Without `--python` the peers are left out; it names an interpreter that can `import open3d` (`pip install open3d-cpu`; it needs
+//! libusb-1.0, libGL and libgomp) and, if you like, `embreex`. `--oracle` holds ten million rays against parry3d instead.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "a measurement that cannot run says why and ends"
+)]
+
+use std::{
+    io::{BufRead as _, BufReader, Write as _},
+    path::{Path as FilePath, PathBuf},
+    process::{Child, Command, Stdio},
+    time::Instant,
+};
+
+use ipc_schema::{
+    config::Config,
+    pointcloud::{LidarPoint, Scan},
+    world::{SubStep, VehicleState},
+};
+use sensor_daemon::lidar::{Lidar, Path, Scratch, Targets};
+use sim_core::scene::Scene;
+
+#[path = "../../tests/lidar_city/mod.rs"]
+mod lidar_city;
+use lidar_city::{Moves, SUB_STEPS, oracle};
+
+const CARRIERS: usize = 16;
+const BUILDINGS: usize = 500;
+const VEHICLES: usize = 200;
+const PAIRS: usize = 5;
+/// Ticks of one round.
+const TICKS: u64 = 10;
+
+/// What to do.
+struct Options {
+    python: Option<PathBuf>,
+    path: Path,
+    json: Option<PathBuf>,
+    is_oracle: bool,
+}
+
+fn options() -> Options {
+    let mut options = Options {
+        python: None,
+        path: Path::best(),
+        json: None,
+        is_oracle: false,
+    };
+    let mut arguments = std::env::args().skip(1);
+    while let Some(argument) = arguments.next() {
+        let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
+        match argument.as_str() {
+            "--python" => options.python = Some(value().into()),
+            "--json" => options.json = Some(value().into()),
+            "--path" => {
+                options.path = match value().as_str() {
+                    "auto" => Path::best(),
+                    "avx512" => Path::Avx512,
+                    "avx2" => Path::Avx2,
+                    "plain" => Path::Plain,
+                    other => panic!("--path {other}: auto, avx512, avx2 or plain"),
+                }
+            }
+            "--oracle" => options.is_oracle = true,
+            other => panic!("unknown option {other}"),
+        }
+    }
+    assert!(options.path.is_here(), "this processor has no {:?}", options.path);
+    options
+}
+
+fn main() {
+    let options = options();
+    if options.is_oracle {
+        return hold_against_parry(options.path);
+    }
+    let mut report = serde_json::json!({ "path": format!("{:?}", options.path) });
+    let cases = [
+        ("upright", Moves::Straight, false, false),
+        ("upright, rolling shutter", Moves::Straight, true, false),
+        ("tilted", Moves::Wildly, false, true),
+        ("tilted, rolling shutter", Moves::Wildly, true, true),
+    ];
+    println!(
+        "{BUILDINGS} buildings, {VEHICLES} moving vehicles, {CARRIERS} LIDARs of 32 x 1800 rays, one core, {:?}",
+        options.path
+    );
+    for (name, moves, is_rolling, is_tilted) in cases {
+        let mut bench = Bench::new(options.path, moves, is_rolling, is_tilted, CARRIERS);
+        bench.round();
+        let mut rates: Vec<f64> = (0..PAIRS).map(|_| bench.round().rate()).collect();
+        rates.sort_by(f64::total_cmp);
+        let round = bench.round();
+        println!(
+            "{name:28} {:7.1} M rays/s  {:.4} ms per scan   mean range {:.1} m, returns {:.3}",
+            rates[PAIRS / 2] / 1e6,
+            1e3 * 57_600.0 / rates[PAIRS / 2],
+            round.mean_range_m,
+            round.points as f64 / round.rays as f64,
+        );
+        report[name] = serde_json::json!({ "rays_per_s": rates[PAIRS / 2], "spread": [rates[0], rates[PAIRS - 1]] });
+    }
+    for lidars in [1, 10, 100] {
+        let mut bench = Bench::new(options.path, Moves::Wildly, true, true, lidars);
+        bench.round();
+        let mut rates: Vec<f64> = (0..PAIRS).map(|_| bench.round().rate()).collect();
+        rates.sort_by(f64::total_cmp);
+        println!(
+            "{lidars:4} LIDARs, tilted, rolling    {:7.1} M rays/s",
+            rates[PAIRS / 2] / 1e6
+        );
+        report[format!("{lidars} LIDARs")] = rates[PAIRS / 2].into();
+    }
+    if let Some(python) = &options.python {
+        report["peers"] = peers(python, options.path);
+    } else {
+        println!("peers left out: --python PATH names an interpreter with open3d (pip install open3d-cpu)");
+    }
+    if let Some(file) = &options.json {
+        std::fs::write(file, format!("{report:#}\n")).unwrap_or_else(|error| panic!("{}: {error}", file.display()));
+    }
+}
+
+/// One round.
+struct Round {
+    rays: usize,
+    points: usize,
+    seconds: f64,
+    mean_range_m: f64,
+}
+
+impl Round {
+    fn rate(&self) -> f64 {
+        self.rays as f64 / self.seconds
+    }
+}
+
+/// A city, its traffic tick by tick, and LIDARs in it that write into shared memory.
+struct Bench {
+    config: Config,
+    scene: Scene,
+    lidar: Lidar,
+    lidars: usize,
+    ticks: Vec<(Vec<VehicleState>, Vec<SubStep>)>,
+    targets: Targets,
+    scratch: Scratch,
+    points: SharedMemory,
+}
+
+impl Bench {
+    fn new(path: Path, moves: Moves, is_rolling: bool, is_tilted: bool, lidars: usize) -> Self {
+        let mut config = lidar_city::config();
+        config.lidar.rolling_shutter = is_rolling;
+        if is_tilted {
+            config.lidar.mount[3..5].copy_from_slice(&[0.02, -0.03]);
+        }
+        let scene = lidar_city::scene(BUILDINGS, 1);
+        let lidar = Lidar::new(&config, &scene)
+            .unwrap_or_else(|error| panic!("{error}"))
+            .with_path(path);
+        let ticks = (0..TICKS).map(|tick| {
+            let (mut states, steps) = lidar_city::traffic(VEHICLES, 0, moves, tick, 2);
+            // Carriers do not see themselves; nor do the peers see them.
+            states[..CARRIERS].iter_mut().for_each(|state| state.height_m = 0.0);
+            (states, steps)
+        });
+        Self {
+            ticks: ticks.collect(),
+            points: SharedMemory::new(lidar.max_points()),
+            config,
+            scene,
+            lidar,
+            lidars,
+            targets: Targets::default(),
+            scratch: Scratch::default(),
+        }
+    }
+
+    fn round(&mut self) -> Round {
+        let mut round = Round {
+            rays: 0,
+            points: 0,
+            seconds: 0.0,
+            mean_range_m: 0.0,
+        };
+        let mut scan = Scan::default();
+        let begin = Instant::now();
+        let mut last = 0;
+        for (tick, (states, steps)) in (0..).zip(&self.ticks) {
+            self.targets.update(states, steps, SUB_STEPS);
+            for row in 0..self.lidars {
+                let points = self.points.get();
+                last = self
+                    .lidar
+                    .scan(&self.targets, row, tick, 1, &mut self.scratch, &mut scan, points);
+                round.rays += scan.rays as usize;
+                round.points += last;
+            }
+        }
+        round.seconds = begin.elapsed().as_secs_f64();
+        let range = |point: &LidarPoint| {
+            point
+                .position_m
+                .iter()
+                .map(|part| f64::from(part * part))
+                .sum::<f64>()
+                .sqrt()
+        };
+        round.mean_range_m = self.points.get()[..last].iter().map(range).sum::<f64>() / last.max(1) as f64;
+        round
+    }
+}
+
+/// A mapping that another process could read, as the one of a real run.
+struct SharedMemory {
+    at: *mut LidarPoint,
+    count: usize,
+}
+
+impl SharedMemory {
+    #[expect(unsafe_code, reason = "mapping memory")]
+    fn new(count: usize) -> Self {
+        use rustix::{
+            fs::{MemfdFlags, ftruncate, memfd_create},
+            mm::{MapFlags, ProtFlags, mmap},
+        };
+        let bytes = count * size_of::<LidarPoint>();
+        let file = memfd_create("lidar-bench", MemfdFlags::CLOEXEC).unwrap();
+        ftruncate(&file, bytes as u64).unwrap();
+        let access = ProtFlags::READ | ProtFlags::WRITE;
+        // SAFETY: a fresh mapping at an address of the kernel's choice aliases nothing; it lives until the process ends.
+        let at = unsafe { mmap(std::ptr::null_mut(), bytes, access, MapFlags::SHARED, &file, 0) }.unwrap();
+        Self { at: at.cast(), count }
+    }
+
+    #[expect(unsafe_code, reason = "mapped memory as a slice")]
+    fn get(&mut self) -> &mut [LidarPoint] {
+        // SAFETY: the mapping is page-aligned, `count` points long, zeroed (a valid point), and borrowed through `self` alone.
+        unsafe { std::slice::from_raw_parts_mut(self.at, self.count) }
+    }
+}
+
+/// Triangles and rays of one frame into raw files of single precision.
+fn write_frame(directory: &FilePath, bench: &Bench) {
+    let (states, _) = bench.ticks.last().unwrap();
+    let (mut vertices, mut faces, _) = oracle::triangles(&bench.scene);
+    for state in &states[CARRIERS..] {
+        box_of(state, &mut vertices, &mut faces);
+    }
+    let far = 2000.0;
+    let first = vertices.len() as u32;
+    vertices.extend([[-far, -far, 0.0], [far, -far, 0.0], [far, far, 0.0], [-far, far, 0.0]]);
+    faces.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
+    let vertices: Vec<f32> = vertices.iter().flatten().map(|part| *part as f32).collect();
+    let mut rays = Vec::new();
+    for state in &states[..CARRIERS] {
+        for ray in oracle::rays(&bench.config, state, &[]) {
+            rays.extend(ray.origin_m.iter().chain(&ray.direction).map(|part| *part as f32));
+        }
+    }
+    let write = |name: &str, bytes: &[u8]| std::fs::write(directory.join(name), bytes).unwrap();
+    write("vertices.f32", bytemuck::cast_slice(&vertices));
+    write("faces.u32", bytemuck::cast_slice(&faces));
+    write("rays.f32", bytemuck::cast_slice(&rays));
+}
+
+fn box_of(state: &VehicleState, vertices: &mut Vec<[f64; 3]>, faces: &mut Vec<[u32; 3]>) {
+    let first = vertices.len() as u32;
+    let (sin, cos) = state.yaw_rad.sin_cos();
+    let [length, width, height, rear] =
+        [state.length_m, state.width_m, state.height_m, state.rear_overhang_m].map(f64::from);
+    for z in [0.0, height] {
+        for [a, b] in [[length - rear, 0.5], [-rear, 0.5], [-rear, -0.5], [length - rear, -0.5]] {
+            let left = b * width;
+            vertices.push([state.x_m + a * cos - left * sin, state.y_m + a * sin + left * cos, z]);
+        }
+    }
+    for i in 0..4 {
+        let (a, b) = (first + i, first + (i + 1) % 4);
+        faces.extend([[a, b, b + 4], [a, b + 4, a + 4]]);
+    }
+    faces.extend([[4, 5, 6], [4, 6, 7], [0, 2, 1], [0, 3, 2]].map(|face| face.map(|corner| first + corner)));
+}
+
+/// The peers' process: answers a line with their name by a line with seconds, rays and hits.
+struct Peers {
+    process: Child,
+    answers: BufReader<std::process::ChildStdout>,
+    names: Vec<String>,
+}
+
+impl Peers {
+    fn start(python: &FilePath, directory: &FilePath) -> Option<Self> {
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/lidar_peers.py");
+        let mut process = Command::new(python)
+            .arg(script)
+            .arg(directory)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap_or_else(|error| panic!("{}: {error}", python.display()));
+        let answers = BufReader::new(process.stdout.take()?);
+        let mut peers = Self {
+            process,
+            answers,
+            names: Vec::new(),
+        };
+        peers.names = peers.answer().split_whitespace().map(str::to_owned).collect();
+        Some(peers)
+    }
+
+    fn answer(&mut self) -> String {
+        let mut line = String::new();
+        self.answers.read_line(&mut line).unwrap();
+        line
+    }
+
+    /// Rays per second, share of hits and mean range of one round.
+    fn round(&mut self, name: &str) -> [f64; 3] {
+        writeln!(self.process.stdin.as_mut().unwrap(), "{name}").unwrap();
+        let answer = self.answer();
+        let numbers: Vec<f64> = answer.split_whitespace().map(|word| word.parse().unwrap()).collect();
+        [numbers[0], numbers[1], numbers[2]]
+    }
+}
+
+fn peers(python: &FilePath, path: Path) -> serde_json::Value {
+    let directory = std::env::temp_dir().join(format!("lidar-bench-{}", std::process::id()));
+    std::fs::create_dir_all(&directory).unwrap();
+    let mut bench = Bench::new(path, Moves::Straight, false, false, CARRIERS);
+    write_frame(&directory, &bench);
+    let mut report = serde_json::json!({});
+    if let Some(mut peers) = Peers::start(python, &directory) {
+        for name in peers.names.clone() {
+            let (_, warm) = (bench.round(), peers.round(&name));
+            let mut ratios = Vec::new();
+            let mut rates = Vec::new();
+            for _ in 0..PAIRS {
+                let ours = bench.round().rate();
+                let [theirs, ..] = peers.round(&name);
+                ratios.push(ours / theirs);
+                rates.push(theirs);
+            }
+            ratios.sort_by(f64::total_cmp);
+            rates.sort_by(f64::total_cmp);
+            println!(
+                "{name:10} {:7.2} M rays/s (hits {:.3}, mean range {:.1} m); we are {:.1} x as fast ({:.1} ... {:.1} in {PAIRS} pairs)",
+                rates[PAIRS / 2] / 1e6,
+                warm[1],
+                warm[2],
+                ratios[PAIRS / 2],
+                ratios[0],
+                ratios[PAIRS - 1],
+            );
+            report[name] = serde_json::json!({ "rays_per_s": rates[PAIRS / 2], "ratio": ratios[PAIRS / 2], "spread": [ratios[0], ratios[PAIRS - 1]] });
+        }
+        drop(peers.process.stdin.take());
+        let _ = peers.process.wait();
+    }
+    let _ = std::fs::remove_dir_all(&directory);
+    report
+}
+
+/// Ten million rays, upright and tilted, at once and one after the other, against parry3d.
+fn hold_against_parry(path: Path) {
+    let mut all = oracle::Tally::default();
+    for (number, (moves, is_rolling, lean)) in [
+        (Moves::Straight, false, [0.0, 0.0]),
+        (Moves::Straight, true, [0.0, 0.0]),
+        (Moves::Wildly, false, [0.05, -0.08]),
+        (Moves::Wildly, true, [-0.03, 0.06]),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let mut config = lidar_city::exact_config();
+        config.lidar.rolling_shutter = is_rolling;
+        config.lidar.mount = [1.0, 0.1, 2.0, lean[0], lean[1], 0.2];
+        let scene = lidar_city::scene(BUILDINGS, 1 + number as u64);
+        let (states, steps) = lidar_city::traffic(VEHICLES, 60, moves, number as u64, 2);
+        let lidar = Lidar::new(&config, &scene).unwrap().with_path(path);
+        let world = oracle::World::new(&config, &scene, &states, &steps);
+        let mut targets = Targets::default();
+        targets.update(&states, &steps, SUB_STEPS);
+        let (mut scratch, mut scan) = (Scratch::default(), Scan::default());
+        let mut points = vec![LidarPoint::default(); lidar.max_points()];
+        for row in 0..44 {
+            let count = lidar.scan(&targets, row, 0, 1, &mut scratch, &mut scan, &mut points);
+            let rays = oracle::rays(&config, &states[row], &steps[row * SUB_STEPS..(row + 1) * SUB_STEPS]);
+            all.add(&oracle::compare(&world, &rays, row, &points[..count]));
+        }
+        println!(
+            "{moves_name}, rolling shutter {is_rolling}: {all:?}",
+            moves_name = if lean[0] == 0.0 { "upright" } else { "tilted" }
+        );
+    }
+    let off = all.rays - all.same;
+    println!(
+        "{} rays, {} with a hit: {} the same ({:.5} %), {off} not, of which {} graze an edge",
+        all.rays,
+        all.hits,
+        all.same,
+        100.0 * all.same as f64 / all.rays as f64,
+        all.grazing
+    );
+}

@@ -1,0 +1,295 @@
+//! Which surfaces a scan may see, and in which columns: everything within range, nearest first, sorted into spans.
+
+use std::f64::consts::{PI, TAU};
+
+use super::{Lidar, Targets, firing::Span, sensor::Sensor, simd::LANES};
+
+/// Added to every angle: the error of [`angle_rad`] and of the directions, radians.
+const MARGIN_RAD: f64 = 1.5e-3;
+
+/// What a candidate is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// A wall of a building or prop: number of the wall, number of the solid.
+    Wall(u32, u32),
+    /// Its roof and underside.
+    Cap(u32),
+    /// A road user, by row.
+    Mover(u32),
+}
+
+/// A surface, or a road user.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Candidate {
+    pub(super) kind: Kind,
+    /// No part comes nearer horizontally during the tick, metres.
+    pub(super) near_m: f32,
+    /// First and last column of a rotation that may see it, the last beyond a rotation where it lies across its begin.
+    columns: [f32; 2],
+}
+
+/// A candidate in a span, with the first and last chunk that may see it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Entry {
+    pub(super) candidate: u32,
+    pub(super) chunks: [u8; 2],
+}
+
+/// Candidates of a scan.
+#[derive(Debug, Default)]
+pub(super) struct Candidates {
+    pub(super) all: Vec<Candidate>,
+    order: Vec<u64>,
+    /// Span and entry, nearest candidate first.
+    found: Vec<(u32, Entry)>,
+    /// Entries by span; where each span's begin.
+    pub(super) entries: Vec<Entry>,
+    starts: Vec<u32>,
+    /// By column of the tick: the first span that ends behind it, the last that begins before it (one more).
+    first_span: Vec<u16>,
+    last_span: Vec<u16>,
+}
+
+/// The sensor during a tick, as far as candidates need to know.
+pub(super) struct Watch {
+    pub(super) place_m: [f64; 3],
+    heading_rad: f64,
+    /// How far it is from `place_m`, at most, metres; in height alone.
+    motion_m: f64,
+    rise_m: f64,
+    /// By how much columns look elsewhere than their azimuth says, radians.
+    spread_rad: f64,
+}
+
+impl Watch {
+    /// From the sensor at the begin and end of each span; `steepest` is the largest tangent of an elevation, infinite for a table.
+    pub(super) fn new(sensors: &[[Sensor; 2]], steepest: f64) -> Option<Self> {
+        let middle = &sensors.get(sensors.len() / 2)?[0];
+        let heading = |sensor: &Sensor| angle_rad(sensor.world_from_sensor[0][0], sensor.world_from_sensor[1][0]);
+        let heading_rad = heading(middle);
+        let mut watch = Self {
+            place_m: middle.position_m,
+            heading_rad,
+            motion_m: 0.0,
+            rise_m: 0.0,
+            spread_rad: 0.0,
+        };
+        let mut turned = 0.0_f64;
+        let mut least_up = 1.0_f64;
+        for sensor in sensors.iter().flatten() {
+            let off: [f64; 3] = std::array::from_fn(|axis| sensor.position_m[axis] - middle.position_m[axis]);
+            watch.motion_m = watch.motion_m.max((off[0] * off[0] + off[1] * off[1]).sqrt());
+            watch.rise_m = watch.rise_m.max(off[2].abs());
+            turned = turned.max(wrapped(heading(sensor) - heading_rad).abs());
+            least_up = least_up.min(sensor.world_from_sensor[2][2]);
+        }
+        watch.spread_rad = turned + MARGIN_RAD + tilt_rad(least_up, steepest);
+        Some(watch)
+    }
+}
+
+/// By how much a ray's azimuth differs from its column's when the sensor's axis leans by the angle whose cosine is `up`: it moves
+/// sideways by at most `tan e sin θ`, over at least `cos θ − tan e sin θ` ahead; and the column itself by θ²/2.
+fn tilt_rad(up: f64, steepest: f64) -> f64 {
+    let sin2 = 1.0 - up * up;
+    if sin2 <= 0.0 {
+        return 0.0;
+    }
+    let aside = steepest * sin2.sqrt();
+    let ahead = up - aside;
+    if ahead < 0.1 {
+        TAU
+    } else {
+        libm::atan(aside / ahead) + sin2
+    }
+}
+
+/// −π … π.
+#[inline(always)]
+fn wrapped(angle: f64) -> f64 {
+    angle - TAU * (angle * (1.0 / TAU)).round_ties_even()
+}
+
+/// Angle of a vector to 2e-4 rad: a polynomial in the smaller over the larger part.
+#[inline(always)]
+pub(super) fn angle_rad(x: f64, y: f64) -> f64 {
+    let (ax, ay) = (x.abs(), y.abs());
+    let (small, large) = if ax < ay { (ax, ay) } else { (ay, ax) };
+    let ratio = small / large.max(1e-30);
+    let square = ratio * ratio;
+    let angle = ratio
+        * (0.999_866 + square * (-0.330_299_5 + square * (0.180_141 + square * (-0.085_133 + square * 0.020_835_1))));
+    let angle = if ax < ay { 0.5 * PI - angle } else { angle };
+    let angle = if x < 0.0 { PI - angle } else { angle };
+    if y < 0.0 { -angle } else { angle }
+}
+
+impl Candidates {
+    /// Everything that the carrier in `row` may see.
+    #[inline(always)]
+    pub(super) fn gather(&mut self, lidar: &Lidar, targets: &Targets, row: usize, watch: &Watch) {
+        self.all.clear();
+        let per_rad = lidar.firing.per_rotation as f64 / TAU;
+        let [x, y, z] = watch.place_m;
+        let range_m = lidar.range_m + watch.motion_m;
+        let whole = [0.0, lidar.firing.per_rotation as f32];
+        let columns = |low: f64, high: f64, more: f64| {
+            let begin = low - watch.heading_rad - watch.spread_rad - more;
+            let length = high - low + 2.0 * (watch.spread_rad + more);
+            if length >= TAU || lidar.pattern.is_table {
+                return whole;
+            }
+            let begin = begin - TAU * (begin * (1.0 / TAU)).floor();
+            [
+                (begin * per_rad) as f32 - 1.0,
+                ((begin + length) * per_rad) as f32 + 1.0,
+            ]
+        };
+        // A circle that may come closer by `motion_m`.
+        let circle = |dx: f64, dy: f64, distance_m: f64, radius_m: f64| {
+            if distance_m < 1.05 * radius_m {
+                return whole;
+            }
+            let half = libm::asin(radius_m / distance_m);
+            let centre = angle_rad(dx, dy);
+            columns(centre - half, centre + half, 0.0)
+        };
+        let all = &mut self.all;
+        let solids = &lidar.solids;
+        solids.within([x, y], range_m, |number, distance_m| {
+            let still = &solids.stills[number];
+            let above = z + watch.rise_m > still.z_m[1] || z - watch.rise_m < still.z_m[0];
+            let (dx, dy) = (still.centre_m[0] - x, still.centre_m[1] - y);
+            if above {
+                all.push(Candidate {
+                    kind: Kind::Cap(number as u32),
+                    near_m: (distance_m - still.reach_m - watch.motion_m).max(0.0) as f32,
+                    columns: circle(dx, dy, distance_m, still.reach_m + watch.motion_m),
+                });
+            }
+            for index in still.walls.clone() {
+                let wall = &solids.walls[index as usize];
+                let [p, q] = [wall.p_m, wall.q_m].map(|corner| [corner[0] - x, corner[1] - y]);
+                let offset = wall.normal[0] * p[0] + wall.normal[1] * p[1];
+                if offset > watch.motion_m {
+                    continue;
+                }
+                let along = [q[0] - p[0], q[1] - p[1]];
+                let square = along[0] * along[0] + along[1] * along[1];
+                let share = (-(p[0] * along[0] + p[1] * along[1]) / square).clamp(0.0, 1.0);
+                let nearest = [p[0] + share * along[0], p[1] + share * along[1]];
+                let distance_m = (nearest[0] * nearest[0] + nearest[1] * nearest[1]).sqrt();
+                if distance_m > range_m {
+                    continue;
+                }
+                let (left, right) = (angle_rad(p[0], p[1]), angle_rad(q[0], q[1]));
+                let width = wrapped(left - right);
+                let more = if watch.motion_m > 0.0 {
+                    1.6 * watch.motion_m / distance_m
+                } else {
+                    0.0
+                };
+                let is_wide = distance_m < 2.0 * watch.motion_m || width.abs() > 3.0 || distance_m < 0.01;
+                let low = if width < 0.0 { left } else { right };
+                all.push(Candidate {
+                    kind: Kind::Wall(index, number as u32),
+                    near_m: (distance_m - watch.motion_m).max(0.0) as f32,
+                    columns: if is_wide {
+                        whole
+                    } else {
+                        columns(low, low + width.abs(), more)
+                    },
+                });
+            }
+        });
+        for (number, [at_x, at_y, reach_m]) in targets.near.iter().enumerate() {
+            let (dx, dy) = (at_x - x, at_y - y);
+            let square = dx * dx + dy * dy;
+            let most_m = range_m + reach_m;
+            if square < most_m * most_m && number != row {
+                let (distance_m, reach_m) = (square.sqrt(), reach_m + watch.motion_m);
+                all.push(Candidate {
+                    kind: Kind::Mover(number as u32),
+                    near_m: (distance_m - reach_m).max(0.0) as f32,
+                    columns: circle(dx, dy, distance_m, reach_m),
+                });
+            }
+        }
+    }
+
+    /// Sorts the candidates into the spans of a tick that begins at column `begin` of a rotation and has `count` columns.
+    #[inline(always)]
+    pub(super) fn sort(&mut self, spans: &[Span], (begin, count): (usize, usize), per_rotation: usize) {
+        self.order.clear();
+        let keys = self.all.iter().enumerate();
+        self.order
+            .extend(keys.map(|(number, one)| u64::from(one.near_m.to_bits()) << 32 | number as u64));
+        self.order.sort_unstable();
+        self.columns_to_spans(spans, count);
+        self.found.clear();
+        self.starts.clear();
+        self.starts.resize(spans.len() + 1, 0);
+        let (begin, round) = (begin as f32, per_rotation as f32);
+        for place in 0..self.order.len() {
+            let key = self.order[place];
+            let number = key as u32;
+            let [low, high] = self.all[number as usize].columns;
+            let length = (high - low).min(round + 1.0);
+            let mut low = low - begin;
+            // The first turn of the head whose view of it reaches into the tick.
+            low -= round * ((low + length) / round).floor();
+            while low < count as f32 {
+                let high = low + length;
+                if high >= 0.0 {
+                    self.enter(number, [low.max(0.0) as usize, (high as usize).min(count - 1)], spans);
+                }
+                low += round;
+            }
+        }
+        self.gather_by_span(spans.len());
+    }
+
+    /// Enters a candidate into the spans of some columns.
+    #[inline(always)]
+    fn enter(&mut self, candidate: u32, [low, high]: [usize; 2], spans: &[Span]) {
+        for number in self.first_span[low]..self.last_span[high] {
+            let span = &spans[number as usize];
+            let chunk = |column: usize| (column.saturating_sub(span.first).min(span.count - 1) / LANES) as u8;
+            self.starts[number as usize + 1] += 1;
+            let chunks = [chunk(low), chunk(high)];
+            self.found.push((u32::from(number), Entry { candidate, chunks }));
+        }
+    }
+
+    fn columns_to_spans(&mut self, spans: &[Span], count: usize) {
+        self.first_span.clear();
+        self.last_span.clear();
+        for (number, span) in (0_u16..).zip(spans) {
+            self.first_span.resize(span.first + span.count, number);
+            self.last_span.resize(span.first, number);
+        }
+        self.first_span.resize(count, spans.len() as u16);
+        self.last_span.resize(count, spans.len() as u16);
+    }
+
+    fn gather_by_span(&mut self, spans: usize) {
+        for span in 0..spans {
+            self.starts[span + 1] += self.starts[span];
+        }
+        self.entries.resize(self.found.len(), Entry::default());
+        // `order` serves as the place of the next entry of each span.
+        self.order.clear();
+        self.order.extend(self.starts.iter().map(|&start| u64::from(start)));
+        for (span, entry) in &self.found {
+            let next = &mut self.order[*span as usize];
+            self.entries[*next as usize] = *entry;
+            *next += 1;
+        }
+    }
+
+    /// Entries of a span.
+    #[inline(always)]
+    pub(super) fn of_span(&self, span: usize) -> &[Entry] {
+        &self.entries[self.starts[span] as usize..self.starts[span + 1] as usize]
+    }
+}

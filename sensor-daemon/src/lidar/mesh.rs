@@ -1,0 +1,183 @@
+//! Ground that is not flat, and triangle meshes: rays one by one through a hierarchy of boxes.
+
+use std::path::Path;
+
+use ipc_schema::pointcloud::{GROUND, STATIC_OBJECT, Tag};
+use parry3d_f64::{
+    math::Vector,
+    query::{Ray, RayCast},
+    shape::TriMesh,
+};
+use sim_core::scene::{Scene, shape::Bounds};
+
+use super::error::LidarError;
+
+/// Least size of a cell of the ground, metres.
+const GROUND_CELL_M: f64 = 5.0;
+/// Most cells of the ground: larger nets get larger cells.
+const GROUND_CELLS: f64 = 250_000.0;
+/// The ground goes on beyond the outermost road, metres.
+const MARGIN_M: f64 = 100.0;
+
+/// One mesh in the world.
+struct Mesh {
+    triangles: TriMesh,
+    object: u32,
+}
+
+impl std::fmt::Debug for Mesh {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter
+            .debug_struct("Mesh")
+            .field("object", &self.object)
+            .finish_non_exhaustive()
+    }
+}
+
+/// All meshes of a scene.
+#[derive(Debug, Default)]
+pub(super) struct Meshes(Vec<Mesh>);
+
+/// What a ray meets.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct MeshHit {
+    pub(super) range_m: f64,
+    pub(super) incidence_cos: f64,
+    pub(super) object: u32,
+}
+
+impl Meshes {
+    /// Tag of all of them.
+    pub(super) const WORD: u32 = Tag::Mesh as u32;
+
+    pub(super) fn new(entries: &[String], scene: &Scene) -> Result<Self, LidarError> {
+        let mut meshes = Vec::new();
+        if flat_ground_m(scene).is_none() {
+            meshes.extend(ground(scene));
+        }
+        let first = (scene.buildings().len() + scene.props().len()) as u32;
+        for (number, text) in (first..).zip(entries) {
+            let entry = Entry::parse(text).ok_or_else(|| LidarError::MeshEntry { text: text.clone() })?;
+            meshes.push(Mesh {
+                triangles: entry.read(scene)?,
+                object: STATIC_OBJECT | number,
+            });
+        }
+        Ok(Self(meshes))
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// What a ray meets first within `range_m`; `direction` has length 1.
+    pub(super) fn cast(&self, origin_m: [f64; 3], direction: [f64; 3], range_m: f64) -> Option<MeshHit> {
+        let vector = |[x, y, z]: [f64; 3]| Vector::new(x, y, z);
+        let ray = Ray::new(vector(origin_m), vector(direction));
+        let mut nearest: Option<MeshHit> = None;
+        for mesh in &self.0 {
+            let most_m = nearest.map_or(range_m, |hit| hit.range_m);
+            if let Some(hit) = mesh.triangles.cast_local_ray_and_get_normal(&ray, most_m, false) {
+                nearest = Some(MeshHit {
+                    range_m: hit.time_of_impact,
+                    incidence_cos: hit.normal.dot(ray.dir).abs(),
+                    object: mesh.object,
+                });
+            }
+        }
+        nearest
+    }
+}
+
+/// Height of the ground if it is flat: in a net without elevation, and without a net.
+pub(super) fn flat_ground_m(scene: &Scene) -> Option<f64> {
+    let road = scene.road();
+    road.flat_height_m().or(road.pieces().is_empty().then_some(0.0))
+}
+
+/// The ground between and about the roads, as tall as the nearest road at the corners of a grid.
+fn ground(scene: &Scene) -> Option<Mesh> {
+    let corners = scene.road().pieces().iter().flat_map(|piece| &piece.shape_m);
+    let bounds = Bounds::of(corners.map(|[x, y, _]| [*x, *y])).grown(MARGIN_M);
+    let size = [0, 1].map(|axis: usize| bounds.max_m[axis] - bounds.min_m[axis]);
+    let cell_m = GROUND_CELL_M.max((size[0] * size[1] / GROUND_CELLS).sqrt());
+    let [columns, rows] = size.map(|length_m| (length_m / cell_m).ceil() as u32 + 1);
+    let mut vertices = Vec::new();
+    for row in 0..rows {
+        for column in 0..columns {
+            let x = bounds.min_m[0] + f64::from(column) * cell_m;
+            let y = bounds.min_m[1] + f64::from(row) * cell_m;
+            vertices.push(Vector::new(x, y, scene.ground_height_m(x, y)));
+        }
+    }
+    let mut triangles = Vec::new();
+    for row in 0..rows - 1 {
+        for column in 0..columns - 1 {
+            let at = row * columns + column;
+            triangles.extend([[at, at + 1, at + columns], [at + 1, at + columns + 1, at + columns]]);
+        }
+    }
+    let triangles = TriMesh::new(vertices, triangles).ok()?;
+    Some(Mesh {
+        triangles,
+        object: GROUND,
+    })
+}
+
+/// An entry of `scene.meshes`.
+struct Entry<'a> {
+    path: &'a Path,
+    place_m: [f64; 2],
+    heading_deg: f64,
+}
+
+impl<'a> Entry<'a> {
+    fn parse(text: &'a str) -> Option<Self> {
+        let words: Vec<&str> = text.split_whitespace().collect();
+        let number = |word: &str| word.parse().ok().filter(|value: &f64| value.is_finite());
+        let (path, x, y, heading) = match words[..] {
+            [path, x, y] => (path, x, y, "0"),
+            [path, x, y, heading] => (path, x, y, heading),
+            _ => return None,
+        };
+        Some(Self {
+            path: Path::new(path),
+            place_m: [number(x)?, number(y)?],
+            heading_deg: number(heading)?,
+        })
+    }
+
+    fn read(&self, scene: &Scene) -> Result<TriMesh, LidarError> {
+        let wrong = |reason: String| LidarError::Mesh {
+            path: self.path.into(),
+            reason,
+        };
+        std::fs::File::open(self.path).map_err(|source| LidarError::Unreadable {
+            path: self.path.into(),
+            source,
+        })?;
+        let options = tobj::LoadOptions {
+            triangulate: true,
+            ..tobj::LoadOptions::default()
+        };
+        // Materials do not matter: a library that is missing is no error.
+        let (models, _) = tobj::load_obj(self.path, &options).map_err(|error| wrong(error.to_string()))?;
+        let [x, y] = self.place_m;
+        let ground_m = scene.ground_height_m(x, y);
+        let (sin, cos) = libm::sincos(self.heading_deg.to_radians());
+        let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
+        for model in &models {
+            let first = vertices.len() as u32;
+            vertices.extend(model.mesh.positions.chunks_exact(3).map(|p| {
+                let [a, b, c] = [p[0], p[1], p[2]].map(f64::from);
+                Vector::new(x + a * cos - b * sin, y + a * sin + b * cos, ground_m + c)
+            }));
+            let of_model = model.mesh.indices.chunks_exact(3);
+            triangles.extend(of_model.map(|corners| [first + corners[0], first + corners[1], first + corners[2]]));
+        }
+        if triangles.is_empty() {
+            return Err(wrong("it has no faces".into()));
+        }
+        TriMesh::new(vertices, triangles).map_err(|error| wrong(format!("{error:?}")))
+    }
+}

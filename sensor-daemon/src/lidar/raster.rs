@@ -1,0 +1,469 @@
+//! The kernel: which surface each ray of a span meets first.
+//!
+//! A spinning LIDAR is drawn like a picture, not traced like a scene: surface after surface, nearest first, into a buffer of
+//! distances. A surface is held against sixteen columns at a time (does it lie in their azimuth, nearer than what they have?), and in
+//! the columns that remain against sixteen rays at a time. Positions are relative to the sensor: differences are taken in double
+//! precision, the rest is single. Within a span every quantity of a surface is linear in time.
+//!
+//! Two ways: an upright sensor with its lasers in one plane meets a wall at one horizontal distance in the whole column, and `t` is that
+//! distance; any other sensor has directions of its own for each ray, and `t` is the range. A corner is tested by the same
+//! expression for both walls that share it: no ray slips through between them.
+
+use super::simd::{Floats, LANES, Simd, Words};
+
+/// Sixteen columns, four times.
+pub(super) const CHUNKS: usize = super::firing::SPAN / LANES;
+
+/// A value at the first column of the span, and how much more it is at the last.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Line(pub(super) f32, pub(super) f32);
+
+impl Line {
+    /// From the values at both ends.
+    #[inline(always)]
+    pub(super) fn between(first: f64, last: f64) -> Self {
+        Self(first as f32, (last - first) as f32)
+    }
+
+    #[inline(always)]
+    fn at<S: Simd>(self, share: S::F) -> S::F {
+        S::splat(self.0) + share * S::splat(self.1)
+    }
+}
+
+/// A wall as the sensor sees it during a span.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Wall {
+    /// Corners, counter-clockwise about the solid, relative to the sensor.
+    pub(super) p: [Line; 2],
+    pub(super) q: [Line; 2],
+    /// Outwards.
+    pub(super) normal: [Line; 2],
+    /// `normal · p`: negative if the sensor is before it.
+    pub(super) offset: Line,
+}
+
+/// What a surface belongs to, and bounds of it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Body {
+    pub(super) object: u32,
+    pub(super) word: u32,
+    /// Lowest and highest point relative to the sensor.
+    pub(super) z: [Line; 2],
+    /// No part is nearer horizontally.
+    pub(super) near: f32,
+    /// First and last chunk of the span that may see it.
+    pub(super) chunks: [usize; 2],
+}
+
+/// A wall in sixteen columns.
+struct Columns {
+    p: [Floats; 2],
+    q: [Floats; 2],
+    normal: [Floats; 2],
+    offset: Floats,
+    z: [Floats; 2],
+}
+
+/// Results of a span, and its columns.
+#[derive(Debug, Default)]
+pub(super) struct Canvas {
+    /// Groups in a column.
+    pub(super) groups: usize,
+    /// Columns.
+    pub(super) count: usize,
+    pub(super) columns: [Chunk; CHUNKS],
+    /// By column, then group: horizontal distance or range, cosine of incidence (in the upright way over the cosine of the
+    /// elevation), object and word.
+    pub(super) t: Vec<Floats>,
+    pub(super) incidence: Vec<Floats>,
+    pub(super) object: Vec<Words>,
+    pub(super) word: Vec<Words>,
+    /// Directions in the world's axes, of sensors that need one for each ray.
+    pub(super) direction: [Vec<Floats>; 3],
+    /// Tangents and cotangents of the elevations, by group, of those that do not.
+    pub(super) tan: Vec<Floats>,
+    pub(super) cot: Vec<Floats>,
+    crossings: Vec<(Floats, u32)>,
+}
+
+/// Sixteen columns.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Chunk {
+    /// Share of the span's time.
+    pub(super) share: Floats,
+    /// Horizontal directions: of the column, and such that all its rays lie between the rightmost and the leftmost.
+    pub(super) ahead: [Floats; 2],
+    pub(super) right: [Floats; 2],
+    pub(super) left: [Floats; 2],
+    /// Farthest of what the rays have met so far.
+    pub(super) far: Floats,
+}
+
+impl Default for Chunk {
+    fn default() -> Self {
+        let none = [Floats::ZERO; 2];
+        Self {
+            share: Floats::ZERO,
+            ahead: none,
+            right: none,
+            left: none,
+            far: Floats::ZERO,
+        }
+    }
+}
+
+/// z of the cross product.
+#[inline(always)]
+fn cross<S: Simd>(a: [S::F; 2], b: [S::F; 2]) -> S::F {
+    a[0] * b[1] - a[1] * b[0]
+}
+
+#[inline(always)]
+fn dot<S: Simd>(a: [S::F; 2], b: [S::F; 2]) -> S::F {
+    a[0] * b[0] + a[1] * b[1]
+}
+
+#[inline(always)]
+fn load2<S: Simd>(from: &[Floats; 2]) -> [S::F; 2] {
+    [S::load(&from[0]), S::load(&from[1])]
+}
+
+#[inline(always)]
+fn stored<S: Simd>(value: S::F) -> Floats {
+    let mut to = Floats::ZERO;
+    S::store(value, &mut to);
+    to
+}
+
+#[inline(always)]
+fn stored2<S: Simd>(value: [S::F; 2]) -> [Floats; 2] {
+    [stored::<S>(value[0]), stored::<S>(value[1])]
+}
+
+/// Numbers of the bits that are set.
+#[inline(always)]
+fn set(mut bits: u32) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let lane = bits.trailing_zeros() as usize;
+        let is_any = bits != 0;
+        bits &= bits.wrapping_sub(1);
+        is_any.then_some(lane)
+    })
+}
+
+impl Canvas {
+    /// Room for the groups of `columns` columns.
+    pub(super) fn make_room(&mut self, groups: usize) {
+        let places = super::firing::SPAN * groups;
+        self.groups = groups;
+        if self.t.len() < places {
+            self.t.resize(places, Floats::ZERO);
+            self.incidence.resize(places, Floats::ZERO);
+            self.object.resize(places, Words::ZERO);
+            self.word.resize(places, Words::ZERO);
+            self.direction
+                .iter_mut()
+                .for_each(|axis| axis.resize(places, Floats::ZERO));
+        }
+    }
+
+    /// Columns of a chunk that exist.
+    #[inline(always)]
+    fn live(&self, chunk: usize) -> u32 {
+        let count = self.count.saturating_sub(chunk * LANES).min(LANES);
+        ((1_u64 << count) - 1) as u32
+    }
+
+    /// Lanes of `mask` in a place now show `body`.
+    #[inline(always)]
+    fn put<S: Simd>(&mut self, place: usize, mask: S::M, t: S::F, incidence: S::F, body: &Body) {
+        S::store_where(mask, t, &mut self.t[place]);
+        S::store_where(mask, incidence, &mut self.incidence[place]);
+        S::store_words_where(mask, body.object, &mut self.object[place]);
+        S::store_words_where(mask, body.word, &mut self.word[place]);
+    }
+
+    /// Farthest of what the rays of a column have met, anew.
+    #[inline(always)]
+    pub(super) fn see<S: Simd>(&mut self, column: usize) {
+        let begin = column * self.groups;
+        let places = &self.t[begin..begin + self.groups];
+        let farthest = places.iter().fold(S::splat(0.0), |far, t| S::max(far, S::load(t)));
+        self.columns[column / LANES].far.0[column % LANES] = S::largest(farthest);
+    }
+
+    /// One wall.
+    #[inline(always)]
+    pub(super) fn wall<S: Simd, const UPRIGHT: bool>(&mut self, wall: &Wall, body: &Body) {
+        for chunk in body.chunks[0]..=body.chunks[1] {
+            let columns = &self.columns[chunk];
+            let share = S::load(&columns.share);
+            let far = S::load(&columns.far);
+            let near = S::lt(S::splat(body.near), far);
+            if S::bits(near) == 0 {
+                continue;
+            }
+            let [p, q] = [&wall.p, &wall.q].map(|point| point.map(|line| line.at::<S>(share)));
+            let zero = S::splat(0.0);
+            // The left corner is not right of all rays, the right one not left of all.
+            let left = S::le(zero, cross::<S>(load2::<S>(&columns.right), p));
+            let right = cross::<S>(load2::<S>(&columns.left), q);
+            let right = if UPRIGHT {
+                S::lt(right, zero)
+            } else {
+                S::le(right, zero)
+            };
+            let offset = wall.offset.at::<S>(share);
+            let mut seen = S::both(S::both(left, right), S::both(near, S::lt(offset, zero)));
+            let live = self.live(chunk);
+            if S::bits(seen) & live == 0 {
+                continue;
+            }
+            let normal = wall.normal.map(|line| line.at::<S>(share));
+            let z = body.z.map(|line| line.at::<S>(share));
+            if UPRIGHT {
+                let facing = dot::<S>(normal, load2::<S>(&columns.ahead));
+                let t = offset / facing;
+                seen = S::both(seen, S::lt(t, far));
+                let (t, incidence) = (stored::<S>(t), stored::<S>(facing));
+                let z = [stored::<S>(z[0]), stored::<S>(z[1])];
+                for lane in set(S::bits(seen) & live) {
+                    let z = [z[0].0[lane], z[1].0[lane]];
+                    self.wall_upright::<S>(chunk * LANES + lane, t.0[lane], incidence.0[lane], z, body);
+                }
+            } else {
+                let columns = Columns {
+                    p: stored2::<S>(p),
+                    q: stored2::<S>(q),
+                    normal: stored2::<S>(normal),
+                    offset: stored::<S>(offset),
+                    z: stored2::<S>(z),
+                };
+                for lane in set(S::bits(seen) & live) {
+                    self.wall_tilted::<S>(chunk * LANES + lane, lane, &columns, body);
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn wall_upright<S: Simd>(&mut self, column: usize, t: f32, incidence: f32, z: [f32; 2], body: &Body) {
+        let t = S::splat(t);
+        let [low, high] = z.map(S::splat);
+        let mut hit = 0;
+        for group in 0..self.groups {
+            let place = column * self.groups + group;
+            let height = t * S::load(&self.tan[group]);
+            let inside = S::both(S::le(low, height), S::le(height, high));
+            let mask = S::both(inside, S::lt(t, S::load(&self.t[place])));
+            hit |= S::bits(mask);
+            self.put::<S>(place, mask, t, S::splat(incidence), body);
+        }
+        if hit != 0 {
+            self.see::<S>(column);
+        }
+    }
+
+    #[inline(always)]
+    fn wall_tilted<S: Simd>(&mut self, column: usize, lane: usize, at: &Columns, body: &Body) {
+        let splat2 = |of: &[Floats; 2]| [S::splat(of[0].0[lane]), S::splat(of[1].0[lane])];
+        let (p, q, normal) = (splat2(&at.p), splat2(&at.q), splat2(&at.normal));
+        let [low, high] = splat2(&at.z);
+        let offset = S::splat(at.offset.0[lane]);
+        let zero = S::splat(0.0);
+        let mut hit = 0;
+        for group in 0..self.groups {
+            let place = column * self.groups + group;
+            let [x, y, z] = [0, 1, 2].map(|axis: usize| S::load(&self.direction[axis][place]));
+            let between = S::both(S::le(zero, cross::<S>([x, y], p)), S::lt(cross::<S>([x, y], q), zero));
+            let facing = dot::<S>(normal, [x, y]);
+            let t = offset / facing;
+            let height = t * z;
+            let inside = S::both(S::le(low, height), S::le(height, high));
+            let nearer = S::both(S::lt(t, S::load(&self.t[place])), S::lt(facing, zero));
+            let mask = S::both(S::both(between, inside), nearer);
+            hit |= S::bits(mask);
+            self.put::<S>(place, mask, t, facing, body);
+        }
+        if hit != 0 {
+            self.see::<S>(column);
+        }
+    }
+
+    /// A roof or an underside at height `z`, over the outline that `walls` make: a point is inside if the ray's line has crossed an odd
+    /// number of walls before it.
+    #[inline(always)]
+    pub(super) fn cap<S: Simd, const UPRIGHT: bool>(&mut self, walls: &[Wall], z: Line, body: &Body) {
+        for chunk in body.chunks[0]..=body.chunks[1] {
+            let columns = self.columns[chunk];
+            let near = S::bits(S::lt(S::splat(body.near), S::load(&columns.far))) & self.live(chunk);
+            if near == 0 {
+                continue;
+            }
+            let heights = stored::<S>(z.at::<S>(S::load(&columns.share)));
+            if UPRIGHT {
+                let crossed = self.cross::<S>(walls, &columns);
+                for lane in set(near & crossed) {
+                    self.cap_upright::<S>(chunk * LANES + lane, lane, heights.0[lane], body);
+                }
+            } else {
+                for lane in set(near) {
+                    let share = columns.share.0[lane];
+                    self.cap_tilted::<S>(chunk * LANES + lane, share, heights.0[lane], walls, body);
+                }
+            }
+        }
+    }
+
+    /// Where the columns of a chunk cross each wall; columns that cross any.
+    #[inline(always)]
+    fn cross<S: Simd>(&mut self, walls: &[Wall], columns: &Chunk) -> u32 {
+        let (share, ahead, zero) = (S::load(&columns.share), load2::<S>(&columns.ahead), S::splat(0.0));
+        self.crossings.clear();
+        let mut any = 0;
+        for wall in walls {
+            let [p, q] = [&wall.p, &wall.q].map(|point| point.map(|line| line.at::<S>(share)));
+            let crossed = S::differ(S::le(zero, cross::<S>(ahead, p)), S::le(zero, cross::<S>(ahead, q)));
+            let facing = dot::<S>(wall.normal.map(|line| line.at::<S>(share)), ahead);
+            let t = wall.offset.at::<S>(share) / facing;
+            any |= S::bits(crossed);
+            self.crossings.push((stored::<S>(t), S::bits(crossed)));
+        }
+        any
+    }
+
+    #[inline(always)]
+    fn cap_upright<S: Simd>(&mut self, column: usize, lane: usize, height: f32, body: &Body) {
+        let (height, zero) = (S::splat(height), S::splat(0.0));
+        let mut hit = 0;
+        for group in 0..self.groups {
+            let place = column * self.groups + group;
+            let t = height * S::load(&self.cot[group]);
+            let nearer = S::both(S::lt(zero, t), S::lt(t, S::load(&self.t[place])));
+            let mut inside = S::mask(0);
+            for (crossing, crossed) in &self.crossings {
+                if crossed >> lane & 1 == 1 {
+                    inside = S::differ(inside, S::lt(S::splat(crossing.0[lane]), t));
+                }
+            }
+            let mask = S::both(nearer, inside);
+            hit |= S::bits(mask);
+            let tan = S::load(&self.tan[group]);
+            self.put::<S>(place, mask, t, tan, body);
+        }
+        if hit != 0 {
+            self.see::<S>(column);
+        }
+    }
+
+    #[inline(always)]
+    fn cap_tilted<S: Simd>(&mut self, column: usize, share: f32, height: f32, walls: &[Wall], body: &Body) {
+        let (height, zero, share) = (S::splat(height), S::splat(0.0), S::splat(share));
+        let mut hit = 0;
+        for group in 0..self.groups {
+            let place = column * self.groups + group;
+            let [x, y, z] = [0, 1, 2].map(|axis: usize| S::load(&self.direction[axis][place]));
+            let t = height / z;
+            let nearer = S::both(S::lt(zero, t), S::lt(t, S::load(&self.t[place])));
+            if S::bits(nearer) == 0 {
+                continue;
+            }
+            let mut inside = S::mask(0);
+            for wall in walls {
+                let [p, q] = [&wall.p, &wall.q].map(|point| point.map(|line| line.at::<S>(share)));
+                let crossed = S::differ(S::le(zero, cross::<S>([x, y], p)), S::le(zero, cross::<S>([x, y], q)));
+                let facing = dot::<S>(wall.normal.map(|line| line.at::<S>(share)), [x, y]);
+                // offset / facing < t, without the division.
+                let behind = S::lt(wall.offset.at::<S>(share), facing * t);
+                let before = S::differ(behind, S::lt(facing, zero));
+                inside = S::differ(inside, S::both(crossed, before));
+            }
+            let mask = S::both(nearer, inside);
+            hit |= S::bits(mask);
+            self.put::<S>(place, mask, t, z, body);
+        }
+        if hit != 0 {
+            self.see::<S>(column);
+        }
+    }
+
+    /// An upright cylinder: mantle and top.
+    #[inline(always)]
+    pub(super) fn cylinder<S: Simd, const UPRIGHT: bool>(&mut self, centre: [Line; 2], radius: f32, body: &Body) {
+        for chunk in body.chunks[0]..=body.chunks[1] {
+            let columns = self.columns[chunk];
+            let share = S::load(&columns.share);
+            let near = S::bits(S::lt(S::splat(body.near), S::load(&columns.far))) & self.live(chunk);
+            if near == 0 {
+                continue;
+            }
+            let at = centre.map(|line| line.at::<S>(share));
+            // Within a radius of the wedge.
+            let reach = S::splat(-1.001 * radius);
+            let left = S::le(reach, cross::<S>(load2::<S>(&columns.right), at));
+            let right = S::le(reach, cross::<S>(at, load2::<S>(&columns.left)));
+            let seen = S::bits(S::both(left, right)) & near;
+            let at = stored2::<S>(at);
+            let z = [
+                stored::<S>(body.z[0].at::<S>(share)),
+                stored::<S>(body.z[1].at::<S>(share)),
+            ];
+            for lane in set(seen) {
+                let centre = [at[0].0[lane], at[1].0[lane]];
+                let ahead = [columns.ahead[0].0[lane], columns.ahead[1].0[lane]];
+                let z = [z[0].0[lane], z[1].0[lane]];
+                self.cylinder_column::<S, UPRIGHT>(chunk * LANES + lane, centre, radius, ahead, z, body);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn cylinder_column<S: Simd, const UPRIGHT: bool>(
+        &mut self,
+        column: usize,
+        centre: [f32; 2],
+        radius: f32,
+        ahead: [f32; 2],
+        z: [f32; 2],
+        body: &Body,
+    ) {
+        let (at, radius, zero) = (centre.map(S::splat), S::splat(radius), S::splat(0.0));
+        let [low, high] = z.map(S::splat);
+        let mut hit = 0;
+        for group in 0..self.groups {
+            let place = column * self.groups + group;
+            // Direction with the scale of `t`, and its horizontal part squared.
+            let (flat, up, square) = if UPRIGHT {
+                (ahead.map(S::splat), S::load(&self.tan[group]), S::splat(1.0))
+            } else {
+                let [x, y, z] = [0, 1, 2].map(|axis: usize| S::load(&self.direction[axis][place]));
+                ([x, y], z, x * x + y * y)
+            };
+            let along = dot::<S>(flat, at);
+            let off = cross::<S>(flat, at);
+            let root2 = square * radius * radius - off * off;
+            let root = S::sqrt(S::max(root2, zero));
+            let best = S::load(&self.t[place]);
+            let meets = S::lt(zero, root2);
+            let t = (along - root) / square;
+            let height = t * up;
+            let inside = S::both(S::le(low, height), S::le(height, high));
+            let mantle = S::both(S::both(meets, inside), S::both(S::lt(zero, t), S::lt(t, best)));
+            self.put::<S>(place, mantle, t, root / radius, body);
+            // The top, of a sensor that looks down on it.
+            let t = high / up;
+            let within = S::both(S::lt(along - root, t * square), S::lt(t * square, along + root));
+            let below = S::both(S::lt(high, zero), S::lt(zero, t));
+            let top = S::both(
+                S::both(meets, within),
+                S::both(below, S::lt(t, S::load(&self.t[place]))),
+            );
+            self.put::<S>(place, top, t, up, body);
+            hit |= S::bits(mantle) | S::bits(top);
+        }
+        if hit != 0 {
+            self.see::<S>(column);
+        }
+    }
+}

@@ -1,0 +1,201 @@
+//! From what a ray has met to a return: range error, intensity, loss, and the point itself.
+
+use ipc_schema::{
+    config::{Config, LidarAxes, LidarMode},
+    pointcloud::LidarPoint,
+};
+
+use super::{
+    pattern::Group,
+    random::{Key, draw, exp_minus},
+    raster::Canvas,
+    simd::Simd,
+    solids::{INTEREST, NOTHING},
+    weather::Air,
+};
+
+/// What happens to returns.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Receiver {
+    min_range_m: f32,
+    range_m: f32,
+    noise_std_m: f32,
+    attenuation_per_m: f32,
+    dropoff: f32,
+    /// 1 / `lidar.dropoff_intensity`; 0 = none is lost for being weak.
+    inv_weak: f32,
+    dropoff_zero: f32,
+    is_random: bool,
+    /// Bit that a word must have.
+    wanted: u32,
+    is_paper: bool,
+    pub(super) air: Air,
+    is_clear: bool,
+}
+
+/// One column's contribution that all its rays share.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Shot {
+    /// Sine and cosine of the azimuth in the sensor's frame.
+    pub(super) azimuth: [f32; 2],
+    pub(super) age_us: u32,
+    /// The sun in the axes of the column: ahead, left, up.
+    pub(super) sun: [f32; 3],
+}
+
+impl Receiver {
+    pub(super) fn new(config: &Config) -> Self {
+        let lidar = &config.lidar;
+        let air = Air::new(&config.weather);
+        let weak = lidar.dropoff_intensity > 0.0 && lidar.dropoff_zero_intensity > 0.0;
+        let noisy = lidar.range_noise_std_m > 0.0 || air.range_share > 0.0 || air.sun_std_m > 0.0;
+        Self {
+            min_range_m: lidar.min_range_m as f32,
+            range_m: lidar.range_m as f32,
+            noise_std_m: lidar.range_noise_std_m as f32,
+            attenuation_per_m: (lidar.attenuation_per_m + 2.0 * air.extinction_per_m) as f32,
+            dropoff: lidar.dropoff as f32,
+            inv_weak: if weak {
+                (1.0 / lidar.dropoff_intensity) as f32
+            } else {
+                0.0
+            },
+            dropoff_zero: lidar.dropoff_zero_intensity as f32,
+            is_random: noisy || weak || lidar.dropoff > 0.0,
+            wanted: if lidar.mode == LidarMode::Interest { INTEREST } else { 0 },
+            is_paper: lidar.axes == LidarAxes::Paper,
+            is_clear: air.is_clear(),
+            air,
+        }
+    }
+
+    /// Writes the returns of a span from `cursor` on; the new cursor. `groups(column)` are the rays of a column, `shots` one for each.
+    #[inline(always)]
+    pub(super) fn write<'a, S: Simd, const UPRIGHT: bool>(
+        &self,
+        canvas: &Canvas,
+        groups: impl Fn(usize) -> &'a [Group],
+        shots: &[Shot],
+        (key, first): (&Key, u32),
+        points: &mut [LidarPoint],
+        mut cursor: usize,
+    ) -> usize {
+        let all = canvas.count * canvas.groups;
+        let (mut column, mut group) = (0, 0);
+        for pair in 0..all.div_ceil(2) {
+            let zero = S::splat(0.0);
+            let (mut normal, mut uniform) = ([zero; 2], [zero; 2]);
+            if self.is_random {
+                let drawn = draw::<S>(key, first + pair as u32);
+                (normal, uniform) = (drawn.normal, drawn.uniform);
+            }
+            for half in 0..2.min(all - 2 * pair) {
+                let rays = &groups(column)[group];
+                let random = (normal[half], uniform[half]);
+                let place = 2 * pair + half;
+                cursor = self.group::<S, UPRIGHT>(canvas, place, rays, &shots[column], random, points, cursor);
+                group += 1;
+                if group == canvas.groups {
+                    (column, group) = (column + 1, 0);
+                }
+            }
+        }
+        cursor
+    }
+
+    #[inline(always)]
+    #[expect(clippy::too_many_arguments, reason = "one call from one place, inlined")]
+    fn group<S: Simd, const UPRIGHT: bool>(
+        &self,
+        canvas: &Canvas,
+        place: usize,
+        rays: &Group,
+        shot: &Shot,
+        (normal, uniform): (S::F, S::F),
+        points: &mut [LidarPoint],
+        cursor: usize,
+    ) -> usize {
+        let word = S::load_words(&canvas.word[place]);
+        let (mut range, mut incidence) = (S::load(&canvas.t[place]), S::load(&canvas.incidence[place]));
+        let (alpha, gamma) = (S::load(&rays.alpha), S::load(&rays.gamma));
+        if UPRIGHT {
+            range = range * S::load(&rays.inv_cos);
+            incidence = incidence * alpha;
+        }
+        let incidence = S::max(incidence, S::splat(0.0) - incidence);
+        let met = !S::bits(S::equal(word, S::splat_words(NOTHING)));
+        let wanted = S::splat_words(self.wanted);
+        let of_interest = S::bits(S::equal(S::and(word, wanted), wanted));
+        let far_enough = S::bits(S::le(S::splat(self.min_range_m), range));
+        let mut keep = rays.live & met & of_interest & far_enough;
+        let mut intensity = exp_minus::<S>(range * S::splat(self.attenuation_per_m));
+        let mut sigma = S::splat(self.noise_std_m);
+        if !self.is_clear {
+            let (seen, weather_sigma) = self.weather::<S>(range, rays, shot);
+            keep &= seen;
+            sigma = weather_sigma;
+        }
+        if self.is_random {
+            let one = S::splat(1.0);
+            let weak = S::splat(self.dropoff_zero) * S::max(one - intensity * S::splat(self.inv_weak), S::splat(0.0));
+            let weak = if self.inv_weak > 0.0 { weak } else { S::splat(0.0) };
+            let lost = S::splat(self.dropoff) + S::splat(1.0 - self.dropoff) * weak;
+            keep &= S::bits(S::le(lost, uniform));
+            range = S::max(range + normal * sigma, S::splat(0.0));
+        }
+        if keep == 0 {
+            return cursor;
+        }
+        intensity = S::min(intensity, S::splat(1.0));
+        let [sine, cosine] = shot.azimuth.map(S::splat);
+        let (ahead, beside) = (range * alpha, range * S::load(&rays.beta));
+        let (x, y, z) = if UPRIGHT {
+            (ahead * cosine, ahead * sine, range * gamma)
+        } else {
+            (
+                ahead * cosine - beside * sine,
+                ahead * sine + beside * cosine,
+                range * gamma,
+            )
+        };
+        let zero = S::splat(0.0);
+        let [x, y, z] = if self.is_paper {
+            [y, zero - x, zero - z]
+        } else {
+            [x, y, z]
+        };
+        let tag = S::or(S::and(word, S::splat_words(0xFF)), S::load_words(&rays.channel));
+        let words = [
+            S::words(x),
+            S::words(y),
+            S::words(z),
+            S::words(intensity),
+            S::load_words(&canvas.object[place]),
+            S::words(S::min(incidence, S::splat(1.0))),
+            tag,
+            S::splat_words(shot.age_us),
+        ];
+        S::compact(words, keep, points, cursor)
+    }
+
+    /// Which returns come through, and the standard deviation of the range.
+    #[inline(always)]
+    fn weather<S: Simd>(&self, range: S::F, rays: &Group, shot: &Shot) -> (u32, S::F) {
+        let air = &self.air;
+        let (one, zero) = (S::splat(1.0), S::splat(0.0));
+        let loss = exp_minus::<S>(range * S::splat((2.0 * air.extinction_per_m) as f32));
+        let farther = S::splat(self.range_m);
+        let seen = if air.extinction_per_m > 0.0 {
+            S::bits(S::le(range * range, loss * (farther * farther)))
+        } else {
+            u32::MAX
+        };
+        let rain = range * S::splat(air.range_share as f32);
+        let [ahead, left, up] = shot.sun.map(S::splat);
+        let towards = S::load(&rays.alpha) * ahead + S::load(&rays.beta) * left + S::load(&rays.gamma) * up;
+        let towards = S::min(S::max(towards, zero), one);
+        let sun = towards * towards * S::splat(air.sun_std_m as f32);
+        let own = S::splat(self.noise_std_m);
+        (seen, S::sqrt(own * own + rain * rain + sun * sun))
+    }
+}

@@ -1,0 +1,519 @@
+//! One scan: spans, candidates, surfaces, returns.
+
+use ipc_schema::pointcloud::{GROUND, LidarPoint, Scan, Tag};
+
+use super::{
+    Lidar, Targets,
+    candidates::{Candidates, Entry, Kind, Watch},
+    firing::{SPAN, Span},
+    mesh::Meshes,
+    pattern::Group,
+    random::Key,
+    raster::{Body, Canvas, Line, Wall},
+    returns::Shot,
+    sensor::{Sensor, turned},
+    simd::{LANES, Simd},
+    solids::NOTHING,
+};
+
+/// Working memory of one thread: empty at first, then kept.
+#[derive(Debug, Default)]
+pub struct Scratch {
+    canvas: Canvas,
+    candidates: Candidates,
+    spans: Vec<Span>,
+    sensors: Vec<[Sensor; 2]>,
+    walls: Vec<Wall>,
+    shots: Vec<Shot>,
+}
+
+/// What a scan is of.
+#[derive(Clone, Copy)]
+pub(super) struct Order<'a> {
+    pub(super) lidar: &'a Lidar,
+    pub(super) targets: &'a Targets,
+    pub(super) row: usize,
+    pub(super) tick: u64,
+    pub(super) episode_seed: u64,
+}
+
+/// A span being worked on.
+struct Work<'a> {
+    order: &'a Order<'a>,
+    span: Span,
+    sensors: [Sensor; 2],
+    /// First column of the tick in the cycle.
+    begin: usize,
+    /// Length of a sub-step, seconds.
+    dt_s: f64,
+}
+
+impl Order<'_> {
+    /// Sub-steps that count: none if everything is seen as it is at the end of the tick.
+    fn sub_steps(&self) -> usize {
+        if self.lidar.is_rolling {
+            self.targets.sub_steps
+        } else {
+            0
+        }
+    }
+
+    fn dt_s(&self) -> f64 {
+        self.lidar.tick_s / self.targets.sub_steps.max(1) as f64
+    }
+
+    fn sensor(&self, span: &Span, end: usize) -> Sensor {
+        let pose = match self.sub_steps() {
+            0 => self.targets.movers[self.row].end,
+            count => {
+                let share = span.at[end] * count as f64 - span.sub_step as f64;
+                self.targets.pose(self.row, span.sub_step, share, self.dt_s())
+            }
+        };
+        self.lidar.mount.sensor(&pose)
+    }
+
+    /// The whole scan; points written.
+    #[inline(always)]
+    pub(super) fn run<S: Simd>(&self, scratch: &mut Scratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
+        let lidar = self.lidar;
+        let (begin, count) = lidar.firing.tick(self.tick);
+        lidar.firing.spans(self.tick, self.sub_steps(), &mut scratch.spans);
+        let stands = self.sub_steps() == 0 || self.targets.is_still(self.row);
+        scratch.sensors.clear();
+        for span in &scratch.spans {
+            let both = match scratch.sensors.last() {
+                Some(before) if stands => *before,
+                _ => [self.sensor(span, 0), self.sensor(span, 1)],
+            };
+            scratch.sensors.push(both);
+        }
+        *scan = self.header(begin, &scratch.spans);
+        let Some(watch) = Watch::new(&scratch.sensors, lidar.steepest) else {
+            return 0;
+        };
+        scratch.candidates.gather(lidar, self.targets, self.row, &watch);
+        let rotation = lidar.firing.per_rotation;
+        scratch
+            .candidates
+            .sort(&scratch.spans, (begin % rotation, count), rotation);
+        let is_upright = lidar.is_flat_fan && self.targets.is_upright(self.row);
+        if is_upright {
+            self.spans::<S, true>(begin, scratch, points)
+        } else {
+            self.spans::<S, false>(begin, scratch, points)
+        }
+    }
+
+    fn header(&self, begin: usize, spans: &[Span]) -> Scan {
+        let lidar = self.lidar;
+        let mover = &self.targets.movers[self.row];
+        let sensor = lidar.mount.sensor(&mover.end);
+        let rotation = lidar.firing.per_rotation;
+        let first = spans.first().map_or(0, |span| (begin + span.first) % rotation);
+        let [sine, cosine] = lidar.firing.azimuths.get(first).copied().unwrap_or([0.0, 1.0]);
+        let azimuth = libm::atan2(sine, cosine);
+        let azimuth = if azimuth < 0.0 {
+            azimuth + std::f64::consts::TAU
+        } else {
+            azimuth
+        };
+        let columns = spans
+            .iter()
+            .flat_map(|span| (0..span.count).map(|column| begin + span.first + column));
+        let rays = |column: usize| -> u32 {
+            let groups = lidar.pattern.column(column % rotation);
+            groups.iter().map(|group| group.live.count_ones()).sum()
+        };
+        let rays = if lidar.pattern.is_table {
+            columns.map(rays).sum()
+        } else {
+            (columns.count() * lidar.pattern.lasers) as u32
+        };
+        Scan {
+            position_m: sensor.position_m,
+            attitude_rad: sensor.attitude_rad(),
+            id_hash: mover.id_hash,
+            azimuth_rad: azimuth as f32,
+            range_m: lidar.range_m as f32,
+            rays,
+            axes: u32::from(lidar.is_paper),
+            reserved: [0; 4],
+        }
+    }
+
+    #[inline(always)]
+    fn spans<S: Simd, const UPRIGHT: bool>(
+        &self,
+        begin: usize,
+        scratch: &mut Scratch,
+        points: &mut [LidarPoint],
+    ) -> usize {
+        let lidar = self.lidar;
+        let mover = &self.targets.movers[self.row];
+        let key = Key::new(self.episode_seed, mover.id_hash, self.tick);
+        let Scratch {
+            canvas,
+            candidates,
+            spans,
+            sensors,
+            walls,
+            shots,
+        } = scratch;
+        canvas.make_room(lidar.pattern.per_column);
+        canvas.tan.clear();
+        canvas.cot.clear();
+        if UPRIGHT {
+            canvas.tan.extend(lidar.pattern.groups.iter().map(|group| group.tan));
+            canvas.cot.extend(lidar.pattern.groups.iter().map(|group| group.cot));
+        }
+        let mut cursor = 0;
+        for (number, span) in spans.iter().enumerate() {
+            let work = Work {
+                order: self,
+                span: *span,
+                sensors: sensors[number],
+                begin,
+                dt_s: self.dt_s(),
+            };
+            work.start::<S, UPRIGHT>(canvas, shots);
+            work.surfaces::<S, UPRIGHT>(canvas, candidates, candidates.of_span(number), walls);
+            if !UPRIGHT && !lidar.meshes.is_empty() {
+                work.meshes(canvas);
+            }
+            let first = (span.fired_before * lidar.pattern.per_column) as u32;
+            let groups = |column: usize| work.groups(column);
+            cursor = lidar
+                .receiver
+                .write::<S, UPRIGHT>(canvas, groups, shots, (&key, first), points, cursor);
+        }
+        cursor
+    }
+}
+
+/// Length 1, from nearly that.
+#[inline(always)]
+fn unit(v: [f64; 3]) -> [f64; 3] {
+    let square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
+    v.map(|part| part * (1.5 - 0.5 * square))
+}
+
+impl<'a> Work<'a> {
+    /// A column of the span in the rotation.
+    #[inline(always)]
+    fn column(&self, column: usize) -> usize {
+        (self.begin + self.span.first + column) % self.order.lidar.firing.per_rotation
+    }
+
+    #[inline(always)]
+    fn groups(&self, column: usize) -> &'a [Group] {
+        self.order.lidar.pattern.column(self.column(column))
+    }
+
+    /// Directions of the columns, ages, and the ground.
+    #[inline(always)]
+    fn start<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut Canvas, shots: &mut Vec<Shot>) {
+        let lidar = self.order.lidar;
+        canvas.count = self.span.count;
+        shots.clear();
+        let [first, last] = self.sensors.map(|sensor| sensor.world_from_sensor);
+        let last_column = (self.span.count - 1).max(1) as f64;
+        for column in 0..self.span.count {
+            let share = column as f64 / last_column;
+            let [sine, cosine] = lidar.firing.azimuths[self.column(column)];
+            let axis = |of: [f64; 3], row: usize| {
+                let at = |i: usize| first[row][i] + share * (last[row][i] - first[row][i]);
+                at(0) * of[0] + at(1) * of[1] + at(2) * of[2]
+            };
+            let turn = |of: [f64; 3]| unit([axis(of, 0), axis(of, 1), axis(of, 2)]);
+            let ahead = turn([cosine, sine, 0.0]);
+            let (chunk, lane) = (column / LANES, column % LANES);
+            let of_chunk = &mut canvas.columns[chunk];
+            of_chunk.share.0[lane] = share as f32;
+            of_chunk.ahead[0].0[lane] = ahead[0] as f32;
+            of_chunk.ahead[1].0[lane] = ahead[1] as f32;
+            if UPRIGHT {
+                (of_chunk.right, of_chunk.left) = (of_chunk.ahead, of_chunk.ahead);
+            } else {
+                let frame = [ahead, turn([-sine, cosine, 0.0]), turn([0.0, 0.0, 1.0])];
+                self.aim::<S>(canvas, column, &frame);
+            }
+            shots.push(self.shot(column, [sine, cosine]));
+            self.ground::<S, UPRIGHT>(canvas, column, share as f32);
+            canvas.see::<S>(column);
+        }
+    }
+
+    #[inline(always)]
+    fn shot(&self, column: usize, azimuth: [f64; 2]) -> Shot {
+        let lidar = self.order.lidar;
+        let [from, to] = self.span.at;
+        let at = from + (to - from) * column as f64 / (self.span.count - 1).max(1) as f64;
+        let [sine, cosine] = azimuth;
+        let sun = if lidar.receiver.air.sun_std_m > 0.0 {
+            let r = &self.sensors[0].world_from_sensor;
+            let back: [[f64; 3]; 3] = std::array::from_fn(|row| std::array::from_fn(|i| r[i][row]));
+            let [x, y, z] = turned(&back, lidar.receiver.air.sun);
+            [x * cosine + y * sine, y * cosine - x * sine, z].map(|part| part as f32)
+        } else {
+            [0.0; 3]
+        };
+        Shot {
+            azimuth: azimuth.map(|part| part as f32),
+            age_us: ((1.0 - at) * lidar.tick_s * 1e6 + 0.5) as u32,
+            sun,
+        }
+    }
+
+    /// Directions of the rays of a column whose axes are `frame` in the world.
+    #[inline(always)]
+    fn aim<S: Simd>(&self, canvas: &mut Canvas, column: usize, frame: &[[f64; 3]; 3]) {
+        let [ahead, left, up] = frame.map(|axis| axis.map(|part| S::splat(part as f32)));
+        let groups = self.groups(column);
+        for (group, rays) in groups.iter().enumerate() {
+            let place = column * canvas.groups + group;
+            let (alpha, beta, gamma) = (S::load(&rays.alpha), S::load(&rays.beta), S::load(&rays.gamma));
+            for axis in 0..3 {
+                let direction = alpha * ahead[axis] + beta * left[axis] + gamma * up[axis];
+                S::store(direction, &mut canvas.direction[axis][place]);
+            }
+        }
+        let edges = match groups {
+            [only] if self.order.lidar.pattern.is_table => wedge(canvas, column, 0..only.live.count_ones() as usize),
+            _ => {
+                let last = (canvas.groups - 1) * LANES + groups[canvas.groups - 1].live.count_ones() as usize - 1;
+                wedge(canvas, column, [0, last].into_iter())
+            }
+        };
+        let of_chunk = &mut canvas.columns[column / LANES];
+        for axis in 0..2 {
+            of_chunk.right[axis].0[column % LANES] = edges[0][axis];
+            of_chunk.left[axis].0[column % LANES] = edges[1][axis];
+        }
+    }
+
+    /// The ground, or nothing.
+    #[inline(always)]
+    fn ground<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut Canvas, column: usize, share: f32) {
+        let lidar = self.order.lidar;
+        let range = S::splat(lidar.range_m as f32);
+        let height = lidar.ground_m.map_or(0.0, |ground_m| {
+            let [first, last] = self.sensors.map(|sensor| (sensor.position_m[2] - ground_m) as f32);
+            first + share * (last - first)
+        });
+        let (below, zero) = (S::splat(-height), S::splat(0.0));
+        for group in 0..canvas.groups {
+            let place = column * canvas.groups + group;
+            let (limit, t, incidence) = if UPRIGHT {
+                let rays = &lidar.pattern.groups[group];
+                (
+                    range * S::load(&rays.alpha),
+                    below * S::load(&rays.cot),
+                    S::load(&rays.tan),
+                )
+            } else {
+                let z = S::load(&canvas.direction[2][place]);
+                (range, below / z, z)
+            };
+            let is_hit = S::both(S::lt(zero, t), S::lt(t, limit));
+            let is_hit = if height > 0.0 { is_hit } else { S::mask(0) };
+            S::store(S::select(is_hit, t, limit), &mut canvas.t[place]);
+            S::store(incidence, &mut canvas.incidence[place]);
+            let whole = S::mask(0xFFFF);
+            S::store_words_where(whole, GROUND, &mut canvas.object[place]);
+            S::store_words_where(whole, NOTHING, &mut canvas.word[place]);
+            S::store_words_where(is_hit, Tag::Ground as u32, &mut canvas.word[place]);
+        }
+    }
+
+    #[inline(always)]
+    fn surfaces<S: Simd, const UPRIGHT: bool>(
+        &self,
+        canvas: &mut Canvas,
+        candidates: &Candidates,
+        entries: &[Entry],
+        walls: &mut Vec<Wall>,
+    ) {
+        let solids = &self.order.lidar.solids;
+        for entry in entries {
+            let candidate = &candidates.all[entry.candidate as usize];
+            if candidate.near_m >= farthest::<S>(canvas) {
+                break;
+            }
+            let body = |object: u32, word: u32, z: [Line; 2]| Body {
+                object,
+                word,
+                z,
+                near: candidate.near_m,
+                chunks: entry.chunks.map(usize::from),
+            };
+            match candidate.kind {
+                Kind::Wall(index, number) => {
+                    let still = &solids.stills[number as usize];
+                    let body = body(still.object, still.word, self.heights(still.z_m, still.z_m));
+                    canvas.wall::<S, UPRIGHT>(&self.still_wall(index), &body);
+                }
+                Kind::Cap(number) => {
+                    let still = &solids.stills[number as usize];
+                    walls.clear();
+                    walls.extend(still.walls.clone().map(|index| self.still_wall(index)));
+                    let body = body(still.object, still.word, self.heights(still.z_m, still.z_m));
+                    self.caps::<S, UPRIGHT>(canvas, walls, &body);
+                }
+                Kind::Mover(row) => self.mover::<S, UPRIGHT>(canvas, row as usize, &body, walls),
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn heights(&self, first: [f64; 2], last: [f64; 2]) -> [Line; 2] {
+        let [z0, z1] = self.sensors.map(|sensor| sensor.position_m[2]);
+        [0, 1].map(|i: usize| Line::between(first[i] - z0, last[i] - z1))
+    }
+
+    /// Corners at both ends of the span, relative to the sensor.
+    #[inline(always)]
+    fn seen(&self, first: [f64; 2], last: [f64; 2]) -> ([[f64; 2]; 2], [Line; 2]) {
+        let [from, to] = self.sensors.map(|sensor| sensor.position_m);
+        let ends = [
+            [first[0] - from[0], first[1] - from[1]],
+            [last[0] - to[0], last[1] - to[1]],
+        ];
+        (
+            ends,
+            [0, 1].map(|axis: usize| Line::between(ends[0][axis], ends[1][axis])),
+        )
+    }
+
+    #[inline(always)]
+    fn still_wall(&self, index: u32) -> Wall {
+        let wall = &self.order.lidar.solids.walls[index as usize];
+        let (ends, p) = self.seen(wall.p_m, wall.p_m);
+        let (_, q) = self.seen(wall.q_m, wall.q_m);
+        let offset = ends.map(|end| wall.normal[0] * end[0] + wall.normal[1] * end[1]);
+        Wall {
+            p,
+            q,
+            normal: wall.normal.map(|part| Line(part as f32, 0.0)),
+            offset: Line::between(offset[0], offset[1]),
+        }
+    }
+
+    #[inline(always)]
+    fn caps<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut Canvas, walls: &[Wall], body: &Body) {
+        let [low, high] = body.z;
+        if high.0 < 0.0 || high.0 + high.1 < 0.0 {
+            canvas.cap::<S, UPRIGHT>(walls, high, body);
+        }
+        if low.0 > 0.0 || low.0 + low.1 > 0.0 {
+            canvas.cap::<S, UPRIGHT>(walls, low, body);
+        }
+    }
+
+    #[inline(always)]
+    fn mover<S: Simd, const UPRIGHT: bool>(
+        &self,
+        canvas: &mut Canvas,
+        row: usize,
+        body: &impl Fn(u32, u32, [Line; 2]) -> Body,
+        walls: &mut Vec<Wall>,
+    ) {
+        let (targets, span) = (self.order.targets, &self.span);
+        let mover = &targets.movers[row];
+        let sub_steps = self.order.sub_steps();
+        let poses = [0, 1].map(|end: usize| {
+            if sub_steps == 0 {
+                return mover.end;
+            }
+            let share = span.at[end] * sub_steps as f64 - span.sub_step as f64;
+            targets.pose(row, span.sub_step, share, self.dt_s)
+        });
+        let z = poses.map(|pose| [pose.position_m[2], pose.position_m[2] + mover.height_m]);
+        let body = body(mover.object, mover.word, self.heights(z[0], z[1]));
+        if mover.is_person {
+            let [first, last] = poses.map(|pose| [pose.position_m[0], pose.position_m[1]]);
+            let (_, centre) = self.seen(first, last);
+            canvas.cylinder::<S, UPRIGHT>(centre, mover.half_width_m as f32, &body);
+            return;
+        }
+        let corners = poses.map(|pose| mover.corners_m(&pose));
+        let turns = poses.map(|pose| libm::sincos(pose.attitude_rad[2]));
+        walls.clear();
+        let seen: [_; 4] = std::array::from_fn(|corner| self.seen(corners[0][corner], corners[1][corner]));
+        for side in 0..4 {
+            // Left, rear, right, front: from a corner to the next one.
+            let normals = turns.map(|(sin, cos)| [[-sin, cos], [-cos, -sin], [sin, -cos], [cos, sin]][side]);
+            let ((ends, p), (_, q)) = (seen[side], seen[(side + 1) % 4]);
+            let offset = [0, 1].map(|end: usize| normals[end][0] * ends[end][0] + normals[end][1] * ends[end][1]);
+            let wall = Wall {
+                p,
+                q,
+                normal: [0, 1].map(|axis: usize| Line::between(normals[0][axis], normals[1][axis])),
+                offset: Line::between(offset[0], offset[1]),
+            };
+            if offset[0] < 0.0 || offset[1] < 0.0 {
+                canvas.wall::<S, UPRIGHT>(&wall, &body);
+            }
+            walls.push(wall);
+        }
+        self.caps::<S, UPRIGHT>(canvas, walls, &body);
+    }
+
+    /// Rays one by one against meshes.
+    #[inline(never)]
+    fn meshes(&self, canvas: &mut Canvas) {
+        let lidar = self.order.lidar;
+        let [from, to] = self.sensors.map(|sensor| sensor.position_m);
+        for column in 0..canvas.count {
+            let share = column as f64 / (canvas.count - 1).max(1) as f64;
+            let origin_m = std::array::from_fn(|axis| from[axis] + share * (to[axis] - from[axis]));
+            for group in 0..canvas.groups {
+                let (place, live) = (column * canvas.groups + group, self.groups(column)[group].live);
+                for lane in (0..LANES).filter(|lane| live >> lane & 1 == 1) {
+                    let direction = [0, 1, 2].map(|axis: usize| f64::from(canvas.direction[axis][place].0[lane]));
+                    let range_m = f64::from(canvas.t[place].0[lane]);
+                    if let Some(hit) = lidar.meshes.cast(origin_m, direction, range_m) {
+                        canvas.t[place].0[lane] = hit.range_m as f32;
+                        canvas.incidence[place].0[lane] = hit.incidence_cos as f32;
+                        canvas.object[place].0[lane] = hit.object;
+                        canvas.word[place].0[lane] = Meshes::WORD;
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Horizontal directions right and left of all of these rays of a column; none where they spread too far.
+#[inline(always)]
+fn wedge(canvas: &Canvas, column: usize, rays: impl Iterator<Item = usize>) -> [[f32; 2]; 2] {
+    let begin = column * canvas.groups;
+    let direction = |ray: usize| [0, 1].map(|axis: usize| canvas.direction[axis][begin + ray / LANES].0[ray % LANES]);
+    let mut ahead: Option<[f32; 2]> = None;
+    let (mut least, mut most) = (0.0_f32, 0.0_f32);
+    for ray in rays {
+        let [x, y] = direction(ray);
+        let [a, b] = *ahead.get_or_insert([x, y]);
+        let (along, aside) = (a * x + b * y, a * y - b * x);
+        if along < 1e-3 {
+            return [[0.0; 2]; 2];
+        }
+        let slope = aside / along;
+        (least, most) = (least.min(slope), most.max(slope));
+    }
+    let [a, b] = ahead.unwrap_or([1.0, 0.0]);
+    let turned = |slope: f32| [a - slope * b, b + slope * a];
+    [turned(least - 1e-6), turned(most + 1e-6)]
+}
+
+/// Farthest of what any ray of the span has met so far.
+#[inline(always)]
+fn farthest<S: Simd>(canvas: &Canvas) -> f32 {
+    let chunks = canvas.count.div_ceil(LANES);
+    let far = canvas.columns[..chunks]
+        .iter()
+        .fold(S::splat(0.0), |far, chunk| S::max(far, S::load(&chunk.far)));
+    S::largest(far)
+}
+
+const _: () = assert!(SPAN.is_multiple_of(LANES));

@@ -1,0 +1,85 @@
+//! Where the sensor is: the carrier's pose and the mounting.
+
+use super::targets::Pose;
+
+/// A rotation; rows are world axes, columns the turned ones.
+pub(super) type Rotation = [[f64; 3]; 3];
+
+/// Sensor at one time.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Sensor {
+    pub(super) position_m: [f64; 3],
+    pub(super) world_from_sensor: Rotation,
+}
+
+/// How it is mounted.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Mount {
+    position_m: [f64; 3],
+    body_from_sensor: Rotation,
+    pub(super) is_upright: bool,
+}
+
+/// `Rz(yaw) Ry(−pitch) Rx(roll)`: pitch is positive nose up, roll right side down (as in `sim_core::attitude`).
+pub(super) fn rotation([roll, pitch, yaw]: [f64; 3]) -> Rotation {
+    let ((sr, cr), (sp, cp), (sy, cy)) = (sincos(roll), sincos(pitch), libm::sincos(yaw));
+    [
+        [cy * cp, -sy * cr - cy * sp * sr, sy * sr - cy * sp * cr],
+        [sy * cp, cy * cr - sy * sp * sr, -cy * sr - sy * sp * cr],
+        [sp, cp * sr, cp * cr],
+    ]
+}
+
+/// Sine and cosine; most sensors stand upright.
+#[inline(always)]
+fn sincos(angle: f64) -> (f64, f64) {
+    if angle == 0.0 { (0.0, 1.0) } else { libm::sincos(angle) }
+}
+
+fn product(a: &Rotation, b: &Rotation) -> Rotation {
+    std::array::from_fn(|row| std::array::from_fn(|column| (0..3).map(|i| a[row][i] * b[i][column]).sum()))
+}
+
+/// `rotation · vector`
+pub(super) fn turned(rotation: &Rotation, vector: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|row| (0..3).map(|i| rotation[row][i] * vector[i]).sum())
+}
+
+impl Mount {
+    pub(super) fn new([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Self {
+        Self {
+            position_m: [x, y, z],
+            body_from_sensor: rotation([roll, pitch, yaw]),
+            is_upright: roll == 0.0 && pitch == 0.0,
+        }
+    }
+
+    /// The sensor on a carrier in this pose.
+    #[inline(always)]
+    pub(super) fn sensor(&self, carrier: &Pose) -> Sensor {
+        let world_from_body = rotation(carrier.attitude_rad);
+        let arm = turned(&world_from_body, self.position_m);
+        Sensor {
+            position_m: std::array::from_fn(|axis| carrier.position_m[axis] + arm[axis]),
+            world_from_sensor: product(&world_from_body, &self.body_from_sensor),
+        }
+    }
+
+    /// A point of the sensor's frame in the carrier's.
+    pub(super) fn body_from_point(&self, point: [f64; 3]) -> [f64; 3] {
+        let turned = turned(&self.body_from_sensor, point);
+        std::array::from_fn(|axis| self.position_m[axis] + turned[axis])
+    }
+}
+
+impl Sensor {
+    /// Roll, pitch and heading.
+    pub(super) fn attitude_rad(&self) -> [f64; 3] {
+        let r = &self.world_from_sensor;
+        [
+            libm::atan2(r[2][1], r[2][2]),
+            libm::asin(r[2][0].clamp(-1.0, 1.0)),
+            libm::atan2(r[1][0], r[0][0]),
+        ]
+    }
+}

@@ -1,0 +1,266 @@
+//! AVX-512 (F, DQ, BW, VL): sixteen numbers in one register.
+
+#![expect(unsafe_code, reason = "vector instructions: see the module above for why")]
+// SAFETY (every block of this file): these functions are inlined into code that is compiled for AVX-512F, DQ, BW and VL, and that
+// code is entered only after the processor has said that it has them (`super::super::Path`). Pointers come from references.
+#![allow(clippy::undocumented_unsafe_blocks, reason = "one sentence above covers all")]
+
+use super::{Floats, LANES, LidarPoint, MULTIPLIERS, Simd, WEYL, Words, compact_rows};
+use std::arch::x86_64::*;
+use std::ops::{Add, Div, Mul, Sub};
+
+/// The AVX-512 make.
+#[derive(Clone, Copy)]
+pub(in super::super) struct Avx512;
+
+/// Sixteen floats.
+#[derive(Clone, Copy)]
+pub(in super::super) struct F(__m512);
+/// Sixteen words.
+#[derive(Clone, Copy)]
+pub(in super::super) struct U(__m512i);
+
+macro_rules! operator {
+    ($name:ident, $function:ident, $intrinsic:ident) => {
+        impl $name for F {
+            type Output = Self;
+            #[inline(always)]
+            fn $function(self, other: Self) -> Self {
+                Self(unsafe { $intrinsic(self.0, other.0) })
+            }
+        }
+    };
+}
+operator!(Add, add, _mm512_add_ps);
+operator!(Sub, sub, _mm512_sub_ps);
+operator!(Mul, mul, _mm512_mul_ps);
+operator!(Div, div, _mm512_div_ps);
+
+/// Words 0 … 7 of both halves of a Philox word.
+#[inline(always)]
+fn joined(even: __m512i, odd: __m512i) -> U {
+    U(unsafe {
+        _mm512_inserti64x4::<1>(
+            _mm512_castsi256_si512(_mm512_cvtepi64_epi32(even)),
+            _mm512_cvtepi64_epi32(odd),
+        )
+    })
+}
+
+impl Simd for Avx512 {
+    type F = F;
+    type U = U;
+    type M = u16;
+
+    #[inline(always)]
+    fn splat(value: f32) -> F {
+        F(unsafe { _mm512_set1_ps(value) })
+    }
+    #[inline(always)]
+    fn load(from: &Floats) -> F {
+        F(unsafe { _mm512_load_ps(from.0.as_ptr()) })
+    }
+    #[inline(always)]
+    fn store(value: F, to: &mut Floats) {
+        unsafe { _mm512_store_ps(to.0.as_mut_ptr(), value.0) }
+    }
+    #[inline(always)]
+    fn sqrt(value: F) -> F {
+        F(unsafe { _mm512_sqrt_ps(value.0) })
+    }
+    #[inline(always)]
+    fn max(a: F, b: F) -> F {
+        F(unsafe { _mm512_max_ps(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn min(a: F, b: F) -> F {
+        F(unsafe { _mm512_min_ps(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn lt(a: F, b: F) -> u16 {
+        unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a.0, b.0) }
+    }
+    #[inline(always)]
+    fn le(a: F, b: F) -> u16 {
+        unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(a.0, b.0) }
+    }
+    #[inline(always)]
+    fn both(a: u16, b: u16) -> u16 {
+        a & b
+    }
+    #[inline(always)]
+    fn differ(a: u16, b: u16) -> u16 {
+        a ^ b
+    }
+    #[inline(always)]
+    fn bits(mask: u16) -> u32 {
+        u32::from(mask)
+    }
+    #[inline(always)]
+    fn mask(bits: u32) -> u16 {
+        bits as u16
+    }
+    #[inline(always)]
+    fn select(mask: u16, yes: F, no: F) -> F {
+        F(unsafe { _mm512_mask_blend_ps(mask, no.0, yes.0) })
+    }
+    #[inline(always)]
+    fn store_where(mask: u16, value: F, to: &mut Floats) {
+        unsafe { _mm512_mask_store_ps(to.0.as_mut_ptr(), mask, value.0) }
+    }
+    #[inline(always)]
+    fn store_words_where(mask: u16, value: u32, to: &mut Words) {
+        unsafe { _mm512_mask_store_epi32(to.0.as_mut_ptr().cast(), mask, _mm512_set1_epi32(value as i32)) }
+    }
+    #[inline(always)]
+    fn largest(value: F) -> f32 {
+        unsafe {
+            let half = _mm256_max_ps(_mm512_castps512_ps256(value.0), _mm512_extractf32x8_ps::<1>(value.0));
+            super::avx2::largest_of_8(half)
+        }
+    }
+    #[inline(always)]
+    fn splat_words(value: u32) -> U {
+        U(unsafe { _mm512_set1_epi32(value as i32) })
+    }
+    #[inline(always)]
+    fn load_words(from: &Words) -> U {
+        U(unsafe { _mm512_load_si512(from.0.as_ptr().cast()) })
+    }
+    #[inline(always)]
+    fn and(a: U, b: U) -> U {
+        U(unsafe { _mm512_and_si512(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn or(a: U, b: U) -> U {
+        U(unsafe { _mm512_or_si512(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn xor(a: U, b: U) -> U {
+        U(unsafe { _mm512_xor_si512(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn plus(a: U, b: U) -> U {
+        U(unsafe { _mm512_add_epi32(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn minus(a: U, b: U) -> U {
+        U(unsafe { _mm512_sub_epi32(a.0, b.0) })
+    }
+    #[inline(always)]
+    fn left<const N: u32>(a: U) -> U {
+        U(unsafe { _mm512_slli_epi32::<N>(a.0) })
+    }
+    #[inline(always)]
+    fn right<const N: u32>(a: U) -> U {
+        U(unsafe { _mm512_srli_epi32::<N>(a.0) })
+    }
+    #[inline(always)]
+    fn equal(a: U, b: U) -> u16 {
+        unsafe { _mm512_cmpeq_epi32_mask(a.0, b.0) }
+    }
+    #[inline(always)]
+    fn words(value: F) -> U {
+        U(unsafe { _mm512_castps_si512(value.0) })
+    }
+    #[inline(always)]
+    fn floats(value: U) -> F {
+        F(unsafe { _mm512_castsi512_ps(value.0) })
+    }
+    #[inline(always)]
+    fn from_signed(value: U) -> F {
+        F(unsafe { _mm512_cvtepi32_ps(value.0) })
+    }
+
+    /// Eight counters in each register, a word in the lower half of 64 bits: products need no shuffling, and what stands in the upper
+    /// halves never matters.
+    #[inline(always)]
+    fn philox(first: u32, rest: [u32; 3], key: [u32; 2]) -> [U; 4] {
+        unsafe {
+            let splat = |word: u32| _mm512_set1_epi64(i64::from(word));
+            let step = _mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0);
+            let multipliers = MULTIPLIERS.map(splat);
+            // Lower halves add and wrap on their own: a carry into the upper half is not looked at.
+            let mut low = [
+                _mm512_add_epi64(splat(first), step),
+                splat(rest[0]),
+                splat(rest[1]),
+                splat(rest[2]),
+            ];
+            let mut high = low;
+            high[0] = _mm512_add_epi64(splat(first.wrapping_add(8)), step);
+            let mut keys = key;
+            for _ in 0..10 {
+                let [k0, k1] = keys.map(splat);
+                for state in [&mut low, &mut high] {
+                    let [c0, c1, c2, c3] = *state;
+                    let p0 = _mm512_mul_epu32(c0, multipliers[0]);
+                    let p1 = _mm512_mul_epu32(c2, multipliers[1]);
+                    *state = [
+                        _mm512_xor_si512(_mm512_xor_si512(_mm512_srli_epi64::<32>(p1), c1), k0),
+                        p1,
+                        _mm512_xor_si512(_mm512_xor_si512(_mm512_srli_epi64::<32>(p0), c3), k1),
+                        p0,
+                    ];
+                }
+                keys = [keys[0].wrapping_add(WEYL[0]), keys[1].wrapping_add(WEYL[1])];
+            }
+            std::array::from_fn(|word| joined(low[word], high[word]))
+        }
+    }
+
+    #[inline(always)]
+    fn compact(words: [U; 8], keep: u32, points: &mut [LidarPoint], cursor: usize) -> usize {
+        if cursor + LANES > points.len() {
+            let mut rows = [[0_u32; LANES]; 8];
+            for (row, word) in rows.iter_mut().zip(words) {
+                unsafe { _mm512_storeu_si512(row.as_mut_ptr().cast(), word.0) };
+            }
+            return compact_rows(&rows, keep, points, cursor);
+        }
+        unsafe {
+            // Sixteen rows fit behind the cursor, which moves on by at most one after each of them.
+            let [first, second] = [
+                transposed([words[0], words[1], words[2], words[3]]),
+                transposed([words[4], words[5], words[6], words[7]]),
+            ];
+            let low = _mm512_set_epi64(11, 10, 3, 2, 9, 8, 1, 0);
+            let high = _mm512_set_epi64(15, 14, 7, 6, 13, 12, 5, 4);
+            // Rows 0 … 3 with 4 … 7, then 8 … 11 with 12 … 15.
+            let pair = |order, k: usize| _mm512_permutex2var_epi64(first[k], order, second[k]);
+            let mut at: *mut __m256i = points.as_mut_ptr().add(cursor).cast();
+            let begin = at;
+            let mut kept = keep as usize;
+            for order in [low, high] {
+                let rows: [__m512i; 4] = std::array::from_fn(|k| pair(order, k));
+                for row in rows {
+                    _mm256_storeu_si256(at, _mm512_castsi512_si256(row));
+                    at = at.add(kept & 1);
+                    kept >>= 1;
+                }
+                for row in rows {
+                    _mm256_storeu_si256(at, _mm512_extracti64x4_epi64::<1>(row));
+                    at = at.add(kept & 1);
+                    kept >>= 1;
+                }
+            }
+            cursor + at.offset_from_unsigned(begin)
+        }
+    }
+}
+
+/// Four words of sixteen lanes as rows of four: part `p` of result `k` is lane `4 p + k`.
+#[inline(always)]
+unsafe fn transposed(words: [U; 4]) -> [__m512i; 4] {
+    unsafe {
+        let [a, b, c, d] = words.map(|word| word.0);
+        let (ab_low, ab_high) = (_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
+        let (cd_low, cd_high) = (_mm512_unpacklo_epi32(c, d), _mm512_unpackhi_epi32(c, d));
+        [
+            _mm512_unpacklo_epi64(ab_low, cd_low),
+            _mm512_unpackhi_epi64(ab_low, cd_low),
+            _mm512_unpacklo_epi64(ab_high, cd_high),
+            _mm512_unpackhi_epi64(ab_high, cd_high),
+        ]
+    }
+}

@@ -1,0 +1,112 @@
+//! Sixteen numbers at a time, in three makes: AVX-512, AVX2, and arrays that every processor can do.
+//!
+//! Every operation is an IEEE operation rounded once (no fused multiply-add, no approximate reciprocals), so all three give the same
+//! bits; the tests of [`super`] compare whole scans. Intrinsics and not plain loops, because the loops of these kernels mix
+//! comparisons, masks and 64-bit products, which the compiler turns into scalar code.
+
+use std::ops::{Add, Div, Mul, Sub};
+
+use ipc_schema::pointcloud::LidarPoint;
+
+#[cfg(target_arch = "x86_64")]
+pub(super) mod avx2;
+#[cfg(target_arch = "x86_64")]
+pub(super) mod avx512;
+pub(super) mod plain;
+
+/// Numbers side by side.
+pub(super) const LANES: usize = 16;
+
+/// Sixteen numbers in memory, on a cache line of their own.
+#[repr(C, align(64))]
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Floats(pub(super) [f32; LANES]);
+
+/// Sixteen whole numbers in memory.
+#[repr(C, align(64))]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Words(pub(super) [u32; LANES]);
+
+impl Floats {
+    pub(super) const ZERO: Self = Self([0.0; LANES]);
+}
+
+impl Words {
+    pub(super) const ZERO: Self = Self([0; LANES]);
+}
+
+/// Multipliers and key steps of Philox4x32 (Salmon et al., SC 2011).
+pub(super) const MULTIPLIERS: [u32; 2] = [0xD251_1F53, 0xCD9E_8D57];
+pub(super) const WEYL: [u32; 2] = [0x9E37_79B9, 0xBB67_AE85];
+
+/// What the kernels are written in.
+pub(super) trait Simd: Copy {
+    /// Sixteen `f32`.
+    type F: Copy + Add<Output = Self::F> + Sub<Output = Self::F> + Mul<Output = Self::F> + Div<Output = Self::F>;
+    /// Sixteen `u32`.
+    type U: Copy;
+    /// Sixteen yes or no.
+    type M: Copy;
+
+    fn splat(value: f32) -> Self::F;
+    fn load(from: &Floats) -> Self::F;
+    fn store(value: Self::F, to: &mut Floats);
+    fn sqrt(value: Self::F) -> Self::F;
+    /// `a > b ? a : b`
+    fn max(a: Self::F, b: Self::F) -> Self::F;
+    /// `a < b ? a : b`
+    fn min(a: Self::F, b: Self::F) -> Self::F;
+    fn lt(a: Self::F, b: Self::F) -> Self::M;
+    fn le(a: Self::F, b: Self::F) -> Self::M;
+    fn both(a: Self::M, b: Self::M) -> Self::M;
+    fn differ(a: Self::M, b: Self::M) -> Self::M;
+    fn bits(mask: Self::M) -> u32;
+    fn mask(bits: u32) -> Self::M;
+    /// `mask ? yes : no`
+    fn select(mask: Self::M, yes: Self::F, no: Self::F) -> Self::F;
+    /// Stores the lanes of the mask.
+    fn store_where(mask: Self::M, value: Self::F, to: &mut Floats);
+    /// Stores `value` in the lanes of the mask.
+    fn store_words_where(mask: Self::M, value: u32, to: &mut Words);
+    /// Largest of all lanes.
+    fn largest(value: Self::F) -> f32;
+
+    fn splat_words(value: u32) -> Self::U;
+    fn load_words(from: &Words) -> Self::U;
+    fn and(a: Self::U, b: Self::U) -> Self::U;
+    fn or(a: Self::U, b: Self::U) -> Self::U;
+    fn xor(a: Self::U, b: Self::U) -> Self::U;
+    fn plus(a: Self::U, b: Self::U) -> Self::U;
+    fn minus(a: Self::U, b: Self::U) -> Self::U;
+    fn left<const N: u32>(a: Self::U) -> Self::U;
+    fn right<const N: u32>(a: Self::U) -> Self::U;
+    fn equal(a: Self::U, b: Self::U) -> Self::M;
+    /// The bits of a float.
+    fn words(value: Self::F) -> Self::U;
+    /// The float of these bits.
+    fn floats(value: Self::U) -> Self::F;
+    /// Signed whole numbers as floats.
+    fn from_signed(value: Self::U) -> Self::F;
+    /// Philox4x32-10 of counters `[first + lane, rest…]`.
+    fn philox(first: u32, rest: [u32; 3], key: [u32; 2]) -> [Self::U; 4];
+    /// Writes the points of the lanes in `keep`, in order, from `cursor` on; the new cursor.
+    fn compact(words: [Self::U; 8], keep: u32, points: &mut [LidarPoint], cursor: usize) -> usize;
+}
+
+/// Rows of the lanes in `keep` from memory: the way every processor can go, and the end of the buffer.
+pub(super) fn compact_rows(
+    words: &[[u32; LANES]; 8],
+    keep: u32,
+    points: &mut [LidarPoint],
+    mut cursor: usize,
+) -> usize {
+    for lane in (0..LANES).filter(|lane| keep >> lane & 1 == 1) {
+        let Some(point) = points.get_mut(cursor) else {
+            return cursor;
+        };
+        let row: [u32; 8] = std::array::from_fn(|word| words[word][lane]);
+        *point = bytemuck::must_cast(row);
+        cursor += 1;
+    }
+    cursor
+}

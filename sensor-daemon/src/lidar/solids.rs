@@ -1,0 +1,221 @@
+//! What stands still: buildings and props as prisms, by cell of a grid.
+
+use std::ops::Range;
+
+use ipc_schema::{
+    config,
+    pointcloud::{STATIC_OBJECT, Tag},
+    props::{PROPS, PropClass},
+};
+use sim_core::scene::{
+    Scene, Solid, SolidClass,
+    shape::{Bounds, Point, distance, edges, from_to},
+};
+
+use super::error::LidarError;
+
+/// Size of a cell, metres.
+const CELL_M: f64 = 64.0;
+/// Most cells in a row or column.
+const MOST_CELLS: f64 = 2048.0;
+/// Set in the word of what an interested LIDAR keeps.
+pub(super) const INTEREST: u32 = 1 << 15;
+/// Word of a ray that has met nothing.
+pub(super) const NOTHING: u32 = 0xFFFF;
+/// Shorter walls are left out, metres.
+const SHORTEST_M: f64 = 1e-6;
+
+/// A prism: walls over an outline, a roof, an underside.
+#[derive(Debug, Clone)]
+pub(super) struct Still {
+    pub(super) object: u32,
+    /// Tag, with [`INTEREST`] where it is of interest.
+    pub(super) word: u32,
+    /// Lowest and highest point, metres.
+    pub(super) z_m: [f64; 2],
+    pub(super) walls: Range<u32>,
+    pub(super) centre_m: Point,
+    /// Radius of the circle about its outline, metres.
+    pub(super) reach_m: f64,
+}
+
+/// A wall, from corner to corner counter-clockwise about its prism.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct StillWall {
+    pub(super) p_m: Point,
+    pub(super) q_m: Point,
+    /// Outwards, length 1.
+    pub(super) normal: Point,
+}
+
+/// All of it.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Solids {
+    pub(super) stills: Vec<Still>,
+    pub(super) walls: Vec<StillWall>,
+    /// Centres and reaches of `stills`, for the test of distance.
+    near: Vec<[f64; 3]>,
+    min_m: Point,
+    cell_m: f64,
+    columns: usize,
+    rows: usize,
+    /// First of `stills` of each cell, and one past the last.
+    starts: Vec<u32>,
+    most_reach_m: f64,
+}
+
+/// The wall between two corners; none where they coincide.
+pub(super) fn wall(p_m: Point, q_m: Point) -> Option<StillWall> {
+    let length_m = distance(p_m, q_m);
+    let [x, y] = from_to(p_m, q_m);
+    (length_m > SHORTEST_M).then(|| StillWall {
+        p_m,
+        q_m,
+        normal: [y / length_m, -x / length_m],
+    })
+}
+
+impl Solids {
+    pub(super) fn new(lidar: &config::Lidar, scene: &Scene) -> Result<Self, LidarError> {
+        let interest = interest(lidar)?;
+        let all: Vec<(u32, Solid<'_>, Bounds)> = (0_u32..)
+            .zip(scene.bounds())
+            .map(|(number, bounds)| (number, scene.solid(number), bounds))
+            .collect();
+        let mut solids = Self::empty(&all);
+        let cell = |bounds: &Bounds| solids.cell(centre(bounds));
+        let mut order: Vec<(usize, usize)> = (0..all.len()).map(|i| (cell(&all[i].2), i)).collect();
+        order.sort_unstable();
+        let mut starts = vec![0_u32; solids.columns * solids.rows + 1];
+        for (cell, i) in order {
+            starts[cell + 1] += 1;
+            let (number, solid, bounds) = &all[i];
+            solids.add(*number, solid, bounds, &interest);
+        }
+        for cell in 1..starts.len() {
+            starts[cell] += starts[cell - 1];
+        }
+        solids.starts = starts;
+        Ok(solids)
+    }
+
+    fn empty(all: &[(u32, Solid<'_>, Bounds)]) -> Self {
+        let whole = all
+            .iter()
+            .fold(Bounds::EMPTY, |whole, (.., one)| whole.with(one.min_m).with(one.max_m));
+        if all.is_empty() {
+            return Self {
+                cell_m: CELL_M,
+                ..Self::default()
+            };
+        }
+        let size = from_to(whole.min_m, whole.max_m);
+        let cell_m = CELL_M.max(size[0].max(size[1]) / MOST_CELLS);
+        let count = |length_m: f64| (length_m / cell_m) as usize + 1;
+        Self {
+            min_m: whole.min_m,
+            cell_m,
+            columns: count(size[0]),
+            rows: count(size[1]),
+            ..Self::default()
+        }
+    }
+
+    fn place(&self, point: Point) -> [usize; 2] {
+        let at = |axis: usize, count: usize| {
+            (((point[axis] - self.min_m[axis]) / self.cell_m).max(0.0) as usize).min(count.saturating_sub(1))
+        };
+        [at(0, self.columns), at(1, self.rows)]
+    }
+
+    fn cell(&self, point: Point) -> usize {
+        let [column, row] = self.place(point);
+        row * self.columns + column
+    }
+
+    fn add(&mut self, number: u32, solid: &Solid<'_>, bounds: &Bounds, interest: &[bool]) {
+        let begin = self.walls.len() as u32;
+        let (outline, z_m, word) = match solid {
+            Solid::Building(building) => (building.outline_m.clone(), building.z_m(), tag(building.class) as u32),
+            Solid::Prop(prop) => {
+                let kind = PROPS.iter().position(|kind| kind == prop.kind);
+                let is_wanted = kind.is_some_and(|kind| interest[kind]);
+                let word = prop_tag(prop.kind.class) as u32 | if is_wanted { INTEREST } else { 0 };
+                (prop.body.corners().to_vec(), prop.body.z_m, word)
+            }
+        };
+        self.walls.extend(edges(&outline).filter_map(|(p, q)| wall(p, q)));
+        let centre_m = centre(bounds);
+        let reach_m = outline
+            .iter()
+            .map(|corner| distance(*corner, centre_m))
+            .fold(0.0, f64::max);
+        self.most_reach_m = self.most_reach_m.max(reach_m);
+        self.near.push([centre_m[0], centre_m[1], reach_m]);
+        self.stills.push(Still {
+            object: STATIC_OBJECT | number,
+            word,
+            z_m,
+            walls: begin..self.walls.len() as u32,
+            centre_m,
+            reach_m,
+        });
+    }
+
+    /// Calls `found` with the number and the distance of the centre of everything that may be within `range_m` of `place`.
+    #[inline(always)]
+    pub(super) fn within(&self, place: Point, range_m: f64, mut found: impl FnMut(usize, f64)) {
+        if self.stills.is_empty() {
+            return;
+        }
+        let reach_m = range_m + self.most_reach_m;
+        let [from, to] = [-reach_m, reach_m].map(|off_m| self.place([place[0] + off_m, place[1] + off_m]));
+        for row in from[1]..=to[1] {
+            let cells = row * self.columns + from[0]..row * self.columns + to[0] + 1;
+            for number in self.starts[cells.start] as usize..self.starts[cells.end] as usize {
+                let [x, y, reach_m] = self.near[number];
+                let (x, y, far) = (x - place[0], y - place[1], range_m + reach_m);
+                let square = x * x + y * y;
+                if square < far * far {
+                    found(number, square.sqrt());
+                }
+            }
+        }
+    }
+}
+
+fn centre(bounds: &Bounds) -> Point {
+    [0, 1].map(|axis: usize| 0.5 * (bounds.min_m[axis] + bounds.max_m[axis]))
+}
+
+/// Whether each prop of the catalogue is of interest.
+fn interest(lidar: &config::Lidar) -> Result<Vec<bool>, LidarError> {
+    if let Some(name) = lidar
+        .interest_props
+        .iter()
+        .find(|name| PROPS.iter().all(|prop| prop.name != name.as_str()))
+    {
+        return Err(LidarError::Prop { name: name.clone() });
+    }
+    let is_wanted = |name: &str| lidar.interest_props.iter().any(|wanted| wanted == name);
+    Ok(PROPS.iter().map(|prop| is_wanted(prop.name)).collect())
+}
+
+fn tag(class: SolidClass) -> Tag {
+    match class {
+        SolidClass::Building => Tag::Building,
+        SolidClass::Wall => Tag::Wall,
+        SolidClass::Structure => Tag::Structure,
+    }
+}
+
+fn prop_tag(class: PropClass) -> Tag {
+    match class {
+        PropClass::Barrier => Tag::Barrier,
+        PropClass::Furniture => Tag::Furniture,
+        PropClass::Pole => Tag::Pole,
+        PropClass::Vegetation => Tag::Vegetation,
+        PropClass::Vehicle => Tag::ParkedVehicle,
+        PropClass::Load => Tag::Load,
+    }
+}

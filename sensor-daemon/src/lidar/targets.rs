@@ -1,0 +1,214 @@
+//! What moves: road users and the way each took during the tick.
+
+use ipc_schema::{
+    pointcloud::Tag,
+    traffic::Kind,
+    world::{APPEARED, RESYNCHRONISED, SubStep, VehicleState},
+};
+
+use super::solids::INTEREST;
+
+/// A vehicle that is narrower has two wheels, metres: motorcycles are up to 0.95 m wide, the smallest cars 1.4 m.
+const TWO_WHEELER_M: f32 = 1.1;
+
+/// Where a body's origin is and how it is turned.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Pose {
+    pub(super) position_m: [f64; 3],
+    /// Roll (right side down), pitch (nose up), heading (counter-clockwise from east).
+    pub(super) attitude_rad: [f64; 3],
+}
+
+/// Relative to the end of the tick: x, y, z, heading; and roll and pitch themselves.
+type Knot = [f32; 6];
+
+/// A road user.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Mover {
+    pub(super) end: Pose,
+    /// From the origin: rear, front, half the width, height.
+    pub(super) rear_m: f64,
+    pub(super) front_m: f64,
+    pub(super) half_width_m: f64,
+    pub(super) height_m: f64,
+    pub(super) object: u32,
+    pub(super) word: u32,
+    pub(super) is_person: bool,
+    pub(super) id_hash: u64,
+    /// Stands where it is for the whole tick, as far as anybody knows.
+    is_still: bool,
+    /// Rates of a knot at the begin of the first sub-step, per second.
+    rates: Knot,
+    /// How far its origin was from where it ends, at most, metres.
+    pub(super) travel_m: f64,
+    /// Radius of the circle about its footprint, from the centre, metres.
+    pub(super) radius_m: f64,
+}
+
+/// Everything that moves in a tick, for all LIDARs.
+#[derive(Debug, Clone, Default)]
+pub struct Targets {
+    pub(super) movers: Vec<Mover>,
+    /// Ends of sub-steps, road user by road user.
+    knots: Vec<Knot>,
+    pub(super) sub_steps: usize,
+    /// Centre and reach of each, for the test of distance.
+    pub(super) near: Vec<[f64; 3]>,
+}
+
+impl Targets {
+    /// Takes in a tick: `states` and `sub_steps[row * k + i]`, as in a `world` message. With `k` = 0 nothing moves.
+    pub fn update(&mut self, states: &[VehicleState], sub_steps: &[SubStep], k: usize) {
+        let k = if sub_steps.len() < states.len() * k { 0 } else { k };
+        self.sub_steps = k;
+        self.knots.clear();
+        self.knots.extend(sub_steps[..states.len() * k].iter().map(|step| {
+            [
+                step.dx_m,
+                step.dy_m,
+                step.dz_m,
+                step.dyaw_rad,
+                step.roll_rad,
+                step.pitch_rad,
+            ]
+        }));
+        self.movers.clear();
+        self.near.clear();
+        for (row, state) in states.iter().enumerate() {
+            let mover = Mover::new(state, &sub_steps[row * k..(row + 1) * k]);
+            let [x, y] = mover.centre_m(&mover.end);
+            self.near.push([x, y, mover.radius_m + mover.travel_m]);
+            self.movers.push(mover);
+        }
+    }
+
+    /// Pose of a road user at share `at` (0 … 1) of a sub-step that takes `dt_s`.
+    #[inline(always)]
+    pub(super) fn pose(&self, row: usize, sub_step: usize, at: f64, dt_s: f64) -> Pose {
+        let mover = &self.movers[row];
+        if mover.is_still {
+            return mover.end;
+        }
+        let knots = &self.knots[row * self.sub_steps..(row + 1) * self.sub_steps];
+        let after = knots[sub_step].map(f64::from);
+        let left = 1.0 - at;
+        let mut knot = after;
+        if sub_step == 0 {
+            for (value, rate) in knot.iter_mut().zip(mover.rates) {
+                *value -= f64::from(rate) * dt_s * left;
+            }
+        } else {
+            for (value, before) in knot.iter_mut().zip(knots[sub_step - 1]) {
+                *value += (f64::from(before) - *value) * left;
+            }
+        }
+        let end = &mover.end;
+        Pose {
+            position_m: std::array::from_fn(|axis| end.position_m[axis] + knot[axis]),
+            attitude_rad: [knot[4], knot[5], end.attitude_rad[2] + knot[3]],
+        }
+    }
+
+    /// True if the road user keeps its pose for the whole tick.
+    pub(super) fn is_still(&self, row: usize) -> bool {
+        self.movers[row].is_still
+    }
+
+    /// True if a road user is upright all the tick.
+    pub(super) fn is_upright(&self, row: usize) -> bool {
+        let mover = &self.movers[row];
+        let [roll, pitch, _] = mover.end.attitude_rad;
+        let knots = &self.knots[row * self.sub_steps..(row + 1) * self.sub_steps];
+        let level = |knot: &Knot| knot[4] == 0.0 && knot[5] == 0.0;
+        roll == 0.0
+            && pitch == 0.0
+            && (mover.is_still || (knots.iter().all(level) && mover.rates[4] == 0.0 && mover.rates[5] == 0.0))
+    }
+}
+
+impl Mover {
+    fn new(state: &VehicleState, steps: &[SubStep]) -> Self {
+        let is_person = state.kind == Kind::Person as u32;
+        let tag = match is_person {
+            true => Tag::Person,
+            false if state.width_m < TWO_WHEELER_M => Tag::TwoWheeler,
+            false => Tag::Vehicle,
+        };
+        let [length_m, width_m, rear_m] = [state.length_m, state.width_m, state.rear_overhang_m].map(f64::from);
+        let mut mover = Self {
+            end: Pose {
+                position_m: [state.x_m, state.y_m, state.z_m],
+                attitude_rad: [f64::from(state.roll_rad), f64::from(state.pitch_rad), state.yaw_rad],
+            },
+            rear_m: -rear_m,
+            front_m: length_m - rear_m,
+            half_width_m: 0.5 * width_m,
+            height_m: f64::from(state.height_m),
+            object: state.vehicle,
+            word: tag as u32 | INTEREST,
+            is_person,
+            id_hash: state.id_hash,
+            is_still: steps.is_empty() || state.flags & (RESYNCHRONISED | APPEARED) != 0,
+            rates: [0.0; 6],
+            travel_m: 0.0,
+            radius_m: 0.5 * libm::hypot(length_m, width_m),
+        };
+        if is_person {
+            let radius_m = 0.5 * length_m.max(width_m);
+            (mover.rear_m, mover.front_m) = (-radius_m, radius_m);
+            (mover.half_width_m, mover.radius_m) = (radius_m, radius_m);
+        }
+        if !mover.is_still {
+            mover.start(state.yaw_rad, steps);
+        }
+        mover
+    }
+
+    /// Rates before the first sub-step ends, from its velocities, and how far it came.
+    fn start(&mut self, yaw_rad: f64, steps: &[SubStep]) {
+        let first = &steps[0];
+        let yaw_rad = yaw_rad + f64::from(first.dyaw_rad);
+        let (sin, cos) = libm::sincos(yaw_rad);
+        let [along, left] = [first.speed_mps, first.lateral_speed_mps].map(f64::from);
+        let [roll_rate, pitch_rate, yaw_rate] = first.angular_rate_body_radps;
+        let climb = along * libm::tan(f64::from(first.pitch_rad));
+        let climb = if first.dz_m == 0.0 { 0.0 } else { climb as f32 };
+        self.rates = [
+            (along * cos - left * sin) as f32,
+            (along * sin + left * cos) as f32,
+            climb,
+            yaw_rate,
+            roll_rate,
+            -pitch_rate,
+        ];
+        let far = |step: &SubStep| f64::from(step.dx_m).abs().max(f64::from(step.dy_m).abs());
+        let travelled = steps.iter().map(far).fold(0.0, f64::max) * std::f64::consts::SQRT_2;
+        // The first sub-step starts one sub-step further back: of ten as much again and a half, of one by speed and a second.
+        let more = match steps.len() {
+            1 => libm::hypot(along, left),
+            count => 1.5 * travelled / (count - 1) as f64,
+        };
+        self.travel_m = travelled + more;
+    }
+
+    /// Centre of its footprint in a pose.
+    #[inline(always)]
+    pub(super) fn centre_m(&self, pose: &Pose) -> [f64; 2] {
+        if self.is_person {
+            return [pose.position_m[0], pose.position_m[1]];
+        }
+        let (sin, cos) = libm::sincos(pose.attitude_rad[2]);
+        let ahead_m = 0.5 * (self.rear_m + self.front_m);
+        [pose.position_m[0] + ahead_m * cos, pose.position_m[1] + ahead_m * sin]
+    }
+
+    /// Corners, counter-clockwise from the front left.
+    #[inline(always)]
+    pub(super) fn corners_m(&self, pose: &Pose) -> [[f64; 2]; 4] {
+        let (sin, cos) = libm::sincos(pose.attitude_rad[2]);
+        let [x, y, _] = pose.position_m;
+        let (front, rear, half) = (self.front_m, self.rear_m, self.half_width_m);
+        [[front, half], [rear, half], [rear, -half], [front, -half]]
+            .map(|[ahead, left]| [x + ahead * cos - left * sin, y + ahead * sin + left * cos])
+    }
+}
