@@ -17,7 +17,7 @@ use ipc_schema::{
     run::MapInfo,
     world::VehicleState,
 };
-use sensor_daemon::sensing::Sensing;
+use sensor_daemon::sensing::{Sensing, World};
 
 const VEHICLES: u32 = 5000;
 const TICKS: u64 = 100;
@@ -68,7 +68,14 @@ fn round(config: &Config, map: &MapInfo, states: &[VehicleState]) -> f64 {
         header.tick = tick;
         sensing.assign(&header, states);
         sensing
-            .observe(&header, states, &[], bytemuck::cast_slice_mut(&mut payload))
+            .observe(
+                &header,
+                &World {
+                    states,
+                    ..World::default()
+                },
+                bytemuck::cast_slice_mut(&mut payload),
+            )
             .unwrap_or_else(|error| panic!("{error}"));
         header.flags = 0;
     }

@@ -1,63 +1,232 @@
-//! Inertial measurement unit: accelerometer, gyroscope and compass in the vehicle's body frame (x forward, y left, z up).
+//! Inertial measurement unit: accelerometer, gyroscope and compass in the vehicle's body.
+//!
+//! Error model of IEEE Std 952-2020 (annex C): white noise, constant bias and a random walk of the bias on each axis; then full
+//! scale and resolution. A density N (per √Hz) is a standard deviation of N √f for samples at f Hz; a walk K moves the bias by
+//! K √Δt from sample to sample. Both are exact for samples that are means over their period. Errors belong to the sensor's
+//! own axes: those of the convention.
+
+use std::f64::consts::{FRAC_PI_2, TAU};
 
 use ipc_schema::{
     config::{Imu as Params, ImuConvention},
-    world::VehicleState,
+    observation::IMU_COLUMNS,
+    world::SubStep,
+};
+
+use crate::{
+    noise::{Draws, Sensor},
+    normals::{Block, cos_sin},
 };
 
 /// Standard gravity, m/s².
 pub const GRAVITY_MPS2: f64 = 9.806_65;
 
-use crate::noise::{Sensor, Stream};
+/// One number for each axis: accelerometer x, y, z, gyroscope x, y, z, compass, nothing.
+pub type Axes = [f32; 8];
+/// One sample: accelerometer x, y, z (m/s²), gyroscope x, y, z (rad/s), compass (clockwise from grid north, radians in [0, 2π)).
+pub type Sample = [f32; IMU_COLUMNS];
 
-/// One sample.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Sample {
-    /// Acceleration of the body's origin, m/s²; specific force where the configuration gives it gravity.
-    pub accel_mps2: [f64; 3],
-    /// Angular rate, rad/s.
-    pub gyro_radps: [f64; 3],
-    /// Heading clockwise from grid north, radians in [0, 2π).
-    pub compass_rad: f64,
+const COMPASS: usize = 6;
+/// Place of [`SubStep::accel_body_mps2`] among a sub-step's numbers; the angular rate follows it.
+const FELT: usize = 8;
+
+/// An IMU as configured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Unit {
+    samples: usize,
+    /// Sign of each axis; 0 where a sub-step holds something else.
+    signs: Axes,
+    gravity_mps2: f32,
+    bias: Axes,
+    white: Axes,
+    walk: Axes,
+    range: Axes,
+    resolution: Axes,
+    /// True for halves of the axes, first white then walk, that have noise.
+    noisy: [bool; 4],
 }
 
-/// The IMU's sample of a vehicle that moves as `state`.
-#[must_use]
-pub fn sample(params: &Params, state: &VehicleState, episode_seed: u64, index: u32) -> Sample {
-    let stream = |sensor| Stream {
-        episode_seed,
-        id_hash: state.id_hash,
-        sensor,
-    };
-    let accel_noise = stream(Sensor::Accelerometer).normals(index);
-    let gyro_noise = stream(Sensor::Gyroscope).normals(index);
-    let gravity_mps2 = if params.convention == ImuConvention::Kinematic {
-        0.0
+/// Streams of the halves of the axes.
+const STREAMS: [Sensor; 4] = [Sensor::ImuFront, Sensor::ImuBack, Sensor::WalkFront, Sensor::WalkBack];
+
+/// Where a body is at the end of a tick, and how it got there.
+#[derive(Debug, Clone, Copy)]
+pub struct Body<'a> {
+    /// Heading, counter-clockwise from east, radians.
+    pub yaw_rad: f64,
+    /// Sub-steps of the tick, at least one.
+    pub rows: &'a [SubStep],
+}
+
+fn axes(accel: [f64; 3], gyro: [f64; 3], compass: f64) -> Axes {
+    let [ax, ay, az] = accel.map(|value| value as f32);
+    let [gx, gy, gz] = gyro.map(|value| value as f32);
+    [ax, ay, az, gx, gy, gz, compass as f32, 0.0]
+}
+
+/// The largest multiple of `resolution` within `range`: where a sensor saturates.
+fn full_scale(range: f64, resolution: f64) -> f64 {
+    if resolution > 0.0 {
+        libm::floor(range / resolution * (1.0 + 1e-9)) * resolution
     } else {
-        GRAVITY_MPS2
-    };
-    let gravity = gravity_body(gravity_mps2, state);
-    let axis =
-        |i: usize| f64::from(state.accel_body_mps2[i]) + gravity[i] + params.accel_noise_std_mps2[i] * accel_noise[i];
-    let rate = |i: usize| {
-        f64::from(state.angular_rate_body_radps[i])
-            + params.gyro_bias_radps[i]
-            + params.gyro_noise_std_radps[i] * gyro_noise[i]
-    };
-    Sample {
-        accel_mps2: [axis(0), axis(1), axis(2)],
-        gyro_radps: [rate(0), rate(1), rate(2)],
-        compass_rad: compass_rad(state.yaw_rad + params.compass_noise_std_rad * gyro_noise[3]),
+        range
+    }
+}
+
+impl Unit {
+    /// A unit that takes `samples` samples in a tick (1 for a slow one).
+    #[must_use]
+    pub fn new(params: &Params, samples: usize) -> Self {
+        let white = |std: [f64; 3], density: [f64; 3]| {
+            [0, 1, 2].map(|i: usize| (std[i] * std[i] + density[i] * density[i] / params.period_s).sqrt())
+        };
+        let limits =
+            |range: [f64; 3], resolution: [f64; 3]| [0, 1, 2].map(|i: usize| full_scale(range[i], resolution[i]));
+        let white = axes(
+            white(params.accel_noise_std_mps2, params.accel_noise_density),
+            white(params.gyro_noise_std_radps, params.gyro_noise_density),
+            params.compass_noise_std_rad,
+        );
+        let root_s = params.period_s.sqrt();
+        let walk = axes(
+            params.accel_bias_walk.map(|k| k * root_s),
+            params.gyro_bias_walk.map(|k| k * root_s),
+            0.0,
+        );
+        let any = |axes: &[f32]| axes.iter().any(|std| *std > 0.0);
+        Self {
+            samples: samples.max(1),
+            signs: signs(params.convention),
+            gravity_mps2: match params.convention {
+                ImuConvention::Kinematic => 0.0,
+                ImuConvention::SpecificForce | ImuConvention::Carla => GRAVITY_MPS2 as f32,
+            },
+            bias: axes(params.accel_bias_mps2, params.gyro_bias_radps, params.compass_bias_rad),
+            white,
+            walk,
+            range: axes(
+                limits(params.accel_range_mps2, params.accel_resolution_mps2),
+                limits(params.gyro_range_radps, params.gyro_resolution_radps),
+                f64::from(f32::MAX),
+            ),
+            resolution: axes(params.accel_resolution_mps2, params.gyro_resolution_radps, 0.0),
+            noisy: [any(&white[..4]), any(&white[4..]), any(&walk[..4]), any(&walk[4..])],
+        }
+    }
+
+    /// Asks for the numbers of the samples from `first` on.
+    pub fn ask(&self, draws: &mut Draws, id_hash: u64, first: u32) {
+        for (stream, noisy) in STREAMS.into_iter().zip(self.noisy) {
+            if noisy {
+                draws.ask(id_hash, stream, first, self.samples);
+            }
+        }
+    }
+
+    /// How many blocks [`Unit::ask`] asks for.
+    #[must_use]
+    pub fn blocks(&self) -> usize {
+        self.noisy.iter().filter(|noisy| **noisy).count() * self.samples
+    }
+
+    /// The samples of a tick, oldest first, into `out` (one place for each); `walk` is what the biases have walked so far.
+    ///
+    /// A sample over several sub-steps is the mean of their accelerations and rates; gravity and heading are those at its end.
+    #[inline(always)]
+    pub fn sample(&self, body: &Body, blocks: &[Block], walk: &mut Axes, out: &mut [Sample]) {
+        const SILENT: &[Block] = &[];
+        let mut rest = blocks;
+        let halves = self.noisy.map(|noisy| {
+            if noisy {
+                let (half, tail) = rest.split_at(self.samples);
+                rest = tail;
+                half
+            } else {
+                SILENT
+            }
+        });
+        let rows = body.rows;
+        let steps = (rows.len() / self.samples).max(1);
+        for (number, out) in out.iter_mut().enumerate() {
+            let normals = |half: usize| halves[half].get(number).copied().unwrap_or_default();
+            let (white, drift) = (join(normals(0), normals(1)), join(normals(2), normals(3)));
+            let end = ((number + 1) * steps).min(rows.len());
+            let rows = &rows[end - steps..end];
+            for axis in 0..8 {
+                walk[axis] += self.walk[axis] * drift[axis];
+            }
+            let felt = self.felt(rows);
+            let read: Axes = std::array::from_fn(|axis| {
+                let value = felt[axis] + self.bias[axis] + walk[axis] + self.white[axis] * white[axis];
+                self.delivered(axis, value)
+            });
+            out.copy_from_slice(&read[..IMU_COLUMNS]);
+            let yaw_rad = body.yaw_rad + f64::from(rows[steps - 1].dyaw_rad);
+            out[COMPASS] = compass_rad(yaw_rad, f64::from(read[COMPASS]));
+        }
+    }
+
+    /// A value as it leaves the sensor: a multiple of the resolution within the range.
+    #[inline(always)]
+    fn delivered(&self, axis: usize, value: f32) -> f32 {
+        let resolution = self.resolution[axis];
+        let value = if resolution > 0.0 {
+            (value / resolution).round_ties_even() * resolution
+        } else {
+            value
+        };
+        value.clamp(-self.range[axis], self.range[axis])
+    }
+
+    /// What the sensor feels over these sub-steps without errors, in its own axes.
+    #[inline(always)]
+    fn felt(&self, rows: &[SubStep]) -> Axes {
+        let mut sum = [0.0; 8];
+        for row in rows {
+            let numbers: &[f32; 16] = bytemuck::must_cast_ref(row);
+            for axis in 0..8 {
+                sum[axis] += numbers[FELT + axis];
+            }
+        }
+        let share = 1.0 / rows.len() as f32;
+        let mut felt = sum.map(|value| value * share);
+        if self.gravity_mps2 != 0.0
+            && let Some(last) = rows.last()
+        {
+            let gravity = gravity_body(self.gravity_mps2, last);
+            for axis in 0..3 {
+                felt[axis] += gravity[axis];
+            }
+        }
+        std::array::from_fn(|axis| felt[axis] * self.signs[axis])
+    }
+}
+
+#[inline(always)]
+fn join(front: Block, back: Block) -> Axes {
+    bytemuck::must_cast([front, back])
+}
+
+/// Signs of the axes of a convention against x forward, y left, z up.
+///
+/// CARLA's sensors live in Unreal's left-handed frame, x forward, y right, z up (CARLA's documentation, "Sensors reference", IMU;
+/// `AInertialMeasurementUnit`): acceleration along y changes its sign, and of the angular rate, an axial vector, the two components
+/// that the mirror leaves in place: rolling to the left and turning to the right are positive there, and nose down still is. Its
+/// compass is 0 at (0, −1, 0), which is north there, and grows clockwise as ours. Its gravity is 9.81 m/s², ours 9.806 65.
+fn signs(convention: ImuConvention) -> Axes {
+    match convention {
+        ImuConvention::Kinematic | ImuConvention::SpecificForce => [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0],
+        ImuConvention::Carla => [1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 0.0, 0.0],
     }
 }
 
 /// What an accelerometer feels of gravity: the upward reaction, turned into the body (roll and pitch small or large).
-fn gravity_body(gravity_mps2: f64, state: &VehicleState) -> [f64; 3] {
-    if gravity_mps2 == 0.0 {
-        return [0.0; 3];
-    }
-    let (sin_pitch, cos_pitch) = libm::sincos(f64::from(state.pitch_rad));
-    let (sin_roll, cos_roll) = libm::sincos(f64::from(state.roll_rad));
+#[inline(always)]
+fn gravity_body(gravity_mps2: f32, row: &SubStep) -> [f32; 3] {
+    const TURNS: f64 = 4_294_967_296.0 / TAU;
+    let turns = |angle_rad: f32| (f64::from(angle_rad) * TURNS) as i64 as u32;
+    let (cos_pitch, sin_pitch) = cos_sin(turns(row.pitch_rad));
+    let (cos_roll, sin_roll) = cos_sin(turns(row.roll_rad));
     [
         gravity_mps2 * sin_pitch,
         gravity_mps2 * cos_pitch * sin_roll,
@@ -65,118 +234,15 @@ fn gravity_body(gravity_mps2: f64, state: &VehicleState) -> [f64; 3] {
     ]
 }
 
-/// Heading clockwise from north in [0, 2π), from yaw counter-clockwise from east.
+/// Heading clockwise from north in [0, 2π), from yaw counter-clockwise from east, with an error clockwise.
 #[must_use]
-pub fn compass_rad(yaw_rad: f64) -> f64 {
-    let heading = (std::f64::consts::FRAC_PI_2 - yaw_rad).rem_euclid(std::f64::consts::TAU);
+#[inline(always)]
+pub fn compass_rad(yaw_rad: f64, error_rad: f64) -> f32 {
+    let heading = FRAC_PI_2 - yaw_rad + error_rad;
+    let heading = (heading - TAU * (heading * (1.0 / TAU)).floor()) as f32;
     // The remainder of a tiny negative number rounds up to the whole circle.
-    if heading >= std::f64::consts::TAU { 0.0 } else { heading }
+    if heading >= TAU as f32 { 0.0 } else { heading.max(0.0) }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::preset::town;
-    use proptest::prelude::*;
-    use std::f64::consts::{FRAC_PI_2, PI, TAU};
-
-    fn quiet() -> Params {
-        Params {
-            accel_noise_std_mps2: [0.0; 3],
-            gyro_noise_std_radps: [0.0; 3],
-            compass_noise_std_rad: 0.0,
-            ..town().imu
-        }
-    }
-
-    #[test]
-    fn the_compass_knows_the_four_winds() {
-        for (yaw, heading) in [(FRAC_PI_2, 0.0), (0.0, FRAC_PI_2), (-FRAC_PI_2, PI), (PI, 1.5 * PI)] {
-            assert!((compass_rad(yaw) - heading).abs() < 1e-12);
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn the_compass_stays_in_the_circle(yaw in -100.0_f64..100.0) {
-            prop_assert!((0.0..TAU).contains(&compass_rad(yaw)));
-        }
-    }
-
-    #[test]
-    fn a_quiet_imu_at_rest_feels_gravity_as_configured() {
-        let state = VehicleState::default();
-        assert_eq!(sample(&quiet(), &state, 1, 0).accel_mps2, [0.0; 3]);
-        assert_eq!(
-            sample(
-                &Params {
-                    convention: ImuConvention::SpecificForce,
-                    ..quiet()
-                },
-                &state,
-                1,
-                0
-            )
-            .accel_mps2,
-            [0.0, 0.0, GRAVITY_MPS2]
-        );
-        // Nose up by 30°: the accelerometer is pushed forward by half of gravity.
-        let uphill = VehicleState {
-            pitch_rad: (PI / 6.0) as f32,
-            ..state
-        };
-        let felt = sample(
-            &Params {
-                convention: ImuConvention::SpecificForce,
-                ..quiet()
-            },
-            &uphill,
-            1,
-            0,
-        )
-        .accel_mps2;
-        assert!(
-            (felt[0] - 4.903_325).abs() < 1e-5 && (felt[2] - 8.4928).abs() < 1e-3,
-            "{felt:?}"
-        );
-    }
-
-    /// Rolled to the right by 30°, the left side is up: the seat pushes the sensor to its left by half of gravity.
-    #[test]
-    fn a_roll_to_the_right_is_felt_to_the_left() {
-        let rolled = VehicleState {
-            roll_rad: (PI / 6.0) as f32,
-            ..VehicleState::default()
-        };
-        let params = Params {
-            convention: ImuConvention::SpecificForce,
-            ..quiet()
-        };
-        let felt = sample(&params, &rolled, 1, 0).accel_mps2;
-        assert!(
-            (felt[1] - 4.903_325).abs() < 1e-5 && (felt[2] - 8.4928).abs() < 1e-3,
-            "{felt:?}"
-        );
-    }
-
-    #[test]
-    fn noise_has_the_configured_level_and_bias_stays() {
-        const N: u32 = 20_000;
-        let params = Params {
-            accel_noise_std_mps2: [0.5; 3],
-            gyro_noise_std_radps: [0.1; 3],
-            gyro_bias_radps: [0.02; 3],
-            ..quiet()
-        };
-        let samples: Vec<Sample> = (0..N)
-            .map(|index| sample(&params, &VehicleState::default(), 3, index))
-            .collect();
-        let n = f64::from(N);
-        for axis in 0..3 {
-            let std = (samples.iter().map(|s| s.accel_mps2[axis].powi(2)).sum::<f64>() / n).sqrt();
-            assert!((std - 0.5).abs() < 5.0 * 0.5 / (2.0 * n).sqrt(), "accelerometer {std}");
-            let mean = samples.iter().map(|s| s.gyro_radps[axis]).sum::<f64>() / n;
-            assert!((mean - 0.02).abs() < 5.0 * 0.1 / n.sqrt(), "gyroscope {mean}");
-        }
-    }
-}
+mod tests;

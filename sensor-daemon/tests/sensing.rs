@@ -11,7 +11,7 @@ use ipc_schema::{
     traffic::{Kind, id_hash},
     world::{COLLIDED, VehicleState},
 };
-use sensor_daemon::sensing::Sensing;
+use sensor_daemon::sensing::{Sensing, World};
 
 fn config() -> Config {
     serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).unwrap()
@@ -50,7 +50,14 @@ fn tick(sensing: &mut Sensing, number: u64, flags: u32, states: &[VehicleState])
     let n = sensing.assign(&header, states);
     let mut payload = vec![0_u64; ObservationLayout::new(n, sensing.width(), sensing.imu_samples()).len / 8];
     sensing
-        .observe(&header, states, &[], bytemuck::cast_slice_mut(&mut payload))
+        .observe(
+            &header,
+            &World {
+                states,
+                ..World::default()
+            },
+            bytemuck::cast_slice_mut(&mut payload),
+        )
         .unwrap();
     (n, payload)
 }
