@@ -21,6 +21,7 @@ use sensor_daemon::{
     imu::{Body, Unit},
     noise::Draws,
     sensing::{Sensing, World},
+    wide::Path,
 };
 
 const VEHICLES: u32 = 5000;
@@ -151,7 +152,7 @@ fn imu_alone(config: &Config) -> f64 {
     for run in 0..RUNS {
         draws.clear();
         unit.ask(&mut draws, u64::from(run), 0);
-        unit.sample(&body, draws.draw(1), &mut walk, &mut out);
+        unit.sample(Path::widest(), &body, draws.draw(1), &mut walk, &mut out);
         std::hint::black_box(&out);
     }
     start.elapsed().as_secs_f64() * 1e6 / (f64::from(RUNS) * SAMPLES as f64)

@@ -58,21 +58,21 @@ impl Carrier {
 
     /// Sensors that are not in a blackout, of those that it has.
     #[must_use]
-    #[inline]
+    #[inline(always)]
     pub fn awake(&self) -> u32 {
         let awake = (0..SENSORS).filter(|i| !self.phases[*i].is_dark());
         awake.fold(0, |bits, i| bits | BITS[i]) & self.present
     }
 
     /// Takes note of a sample of the sensor with this index at `step`.
-    #[inline]
+    #[inline(always)]
     pub fn note(&mut self, sensor: usize, step: u32) {
         self.sampled[sensor] = step;
         self.known |= BITS[sensor];
     }
 
     /// Sets the ages and says who delivers at `step`, with ticks of `tick_s`. Sensors that it does not have are 0 s old.
-    #[inline]
+    #[inline(always)]
     pub fn age(&mut self, step: u32, tick_s: f64) {
         let fix = if self.has_fix { u32::MAX } else { !GNSS };
         self.readings.delivering = self.awake() & fix & self.known;

@@ -37,7 +37,7 @@ const HEIGHT_M: f64 = 100.0;
 const ACCURACY_M: f64 = 50.0;
 
 impl Readings {
-    #[inline]
+    #[inline(always)]
     fn value(&self, field: Field) -> f64 {
         let deliver = |bit: u32| f64::from(u8::from(self.delivering & bit != 0));
         match field {
@@ -153,7 +153,7 @@ impl Normaliser {
 
     /// Fills `row` (one number for each field), with not-a-number where the field's sensor is among the bits `blank`; true if a value
     /// was outside its range and has been clipped. What is not a number is not clipped.
-    #[inline]
+    #[inline(always)]
     pub fn fill(&self, readings: &Readings, blank: u32, row: &mut [f32]) -> bool {
         let mut clipped = false;
         let [factor, shift] = self.scale;

@@ -197,7 +197,7 @@ impl Receiver {
     /// "Introduction to Random Signals and Applied Kalman Filtering", 4th ed., section 3.6). It starts as `w` itself, in its
     /// stationary distribution.
     #[must_use]
-    #[inline]
+    #[inline(always)]
     pub fn correlated(&self, state: [f32; 3], normals: &Block) -> [f32; 3] {
         [0, 1, 2].map(|axis: usize| self.decay[0] * state[axis] + self.decay[1] * normals[axis])
     }
@@ -210,7 +210,7 @@ impl Receiver {
     /// north. The receiver estimates its error from all of them: 1σ of the distance is √(σ_east² + σ_north²), with the bias added
     /// in square.
     #[must_use]
-    #[inline]
+    #[inline(always)]
     pub fn fix(&self, [x_m, y_m, z_m]: [f64; 3], errors: &Errors) -> Fix {
         let (view, factor) = (errors.view, errors.factor);
         let noisy = factor * view.noise_factor;

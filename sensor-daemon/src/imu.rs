@@ -15,7 +15,8 @@ use ipc_schema::{
 
 use crate::{
     noise::{Draws, Sensor},
-    normals::{Block, cos_sin},
+    normals::{Block, LANES, cos_sin},
+    wide::{Path, Work},
 };
 
 /// Standard gravity, m/s².
@@ -42,6 +43,10 @@ pub struct Unit {
     walk: Axes,
     range: Axes,
     resolution: Axes,
+    /// The same, 1 where there is none.
+    divisor: Axes,
+    /// True if any axis has a resolution.
+    is_stepped: bool,
     /// True for halves of the axes, first white then walk, that have noise.
     noisy: [bool; 4],
 }
@@ -93,6 +98,7 @@ impl Unit {
             params.gyro_bias_walk.map(|k| k * root_s),
             0.0,
         );
+        let resolution = axes(params.accel_resolution_mps2, params.gyro_resolution_radps, 0.0);
         let any = |axes: &[f32]| axes.iter().any(|std| *std > 0.0);
         Self {
             samples: samples.max(1),
@@ -109,7 +115,9 @@ impl Unit {
                 limits(params.gyro_range_radps, params.gyro_resolution_radps),
                 f64::from(f32::MAX),
             ),
-            resolution: axes(params.accel_resolution_mps2, params.gyro_resolution_radps, 0.0),
+            resolution,
+            divisor: resolution.map(|step| if step > 0.0 { step } else { 1.0 }),
+            is_stepped: any(&resolution),
             noisy: [any(&white[..4]), any(&white[4..]), any(&walk[..4]), any(&walk[4..])],
         }
     }
@@ -132,74 +140,109 @@ impl Unit {
     /// The samples of a tick, oldest first, into `out` (one place for each); `walk` is what the biases have walked so far.
     ///
     /// A sample over several sub-steps is the mean of their accelerations and rates; gravity and heading are those at its end.
-    #[inline(always)]
-    pub fn sample(&self, body: &Body, blocks: &[Block], walk: &mut Axes, out: &mut [Sample]) {
-        const SILENT: &[Block] = &[];
-        let mut rest = blocks;
-        let halves = self.noisy.map(|noisy| {
-            if noisy {
-                let (half, tail) = rest.split_at(self.samples);
-                rest = tail;
-                half
-            } else {
-                SILENT
-            }
+    #[inline]
+    pub fn sample(&self, path: Path, body: &Body, blocks: &[Block], walk: &mut Axes, out: &mut [Sample]) {
+        path.run(Samples {
+            unit: self,
+            body,
+            blocks,
+            walk,
+            out,
         });
-        let rows = body.rows;
-        let steps = (rows.len() / self.samples).max(1);
-        for (number, out) in out.iter_mut().enumerate() {
-            let normals = |half: usize| halves[half].get(number).copied().unwrap_or_default();
-            let (white, drift) = (join(normals(0), normals(1)), join(normals(2), normals(3)));
-            let end = ((number + 1) * steps).min(rows.len());
-            let rows = &rows[end - steps..end];
+    }
+
+    /// The halves of the axes' numbers, first white then walk; none where there is no noise.
+    #[inline(always)]
+    fn halves<'b>(&self, blocks: &'b [Block]) -> [&'b [Block]; 4] {
+        let mut halves = [blocks; 4];
+        let mut rest = blocks;
+        for (half, noisy) in halves.iter_mut().zip(self.noisy) {
+            let (ours, tail) = rest.split_at(if noisy { self.samples.min(rest.len()) } else { 0 });
+            (*half, rest) = (ours, tail);
+        }
+        halves
+    }
+
+    /// What the axes read if they feel `felt`; the compass, its error.
+    #[inline(always)]
+    fn read(&self, felt: &Axes, [white, drift]: [Axes; 2], walk: &mut Axes) -> Axes {
+        let mut value = [0.0; 8];
+        for axis in 0..8 {
+            walk[axis] += self.walk[axis] * drift[axis];
+            value[axis] = felt[axis] * self.signs[axis] + self.bias[axis] + walk[axis] + self.white[axis] * white[axis];
+        }
+        if self.is_stepped {
             for axis in 0..8 {
-                walk[axis] += self.walk[axis] * drift[axis];
+                let stepped = (value[axis] / self.divisor[axis]).round_ties_even() * self.divisor[axis];
+                value[axis] = if self.resolution[axis] > 0.0 {
+                    stepped
+                } else {
+                    value[axis]
+                };
             }
-            let felt = self.felt(rows);
-            let read: Axes = std::array::from_fn(|axis| {
-                let value = felt[axis] + self.bias[axis] + walk[axis] + self.white[axis] * white[axis];
-                self.delivered(axis, value)
-            });
+        }
+        for axis in 0..8 {
+            let most = self.range[axis];
+            value[axis] = if value[axis] > most { most } else { value[axis] };
+            value[axis] = if value[axis] < -most { -most } else { value[axis] };
+        }
+        value
+    }
+}
+
+/// The samples of one tick, with the widest vectors.
+struct Samples<'a> {
+    unit: &'a Unit,
+    body: &'a Body<'a>,
+    blocks: &'a [Block],
+    walk: &'a mut Axes,
+    out: &'a mut [Sample],
+}
+
+impl Work for Samples<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let (unit, rows) = (self.unit, self.body.rows);
+        let halves = unit.halves(self.blocks);
+        let steps = (rows.len() / unit.samples).max(1);
+        let share = 1.0 / steps as f32;
+        let mut walk = *self.walk;
+        let mut gravity = [[0.0; LANES]; 3];
+        let mut end = 0;
+        for (number, out) in self.out.iter_mut().enumerate() {
+            let lane = number % LANES;
+            if lane == 0 && unit.gravity_mps2 != 0.0 {
+                gravity = gravity_body(unit.gravity_mps2, rows, end, steps);
+            }
+            end = (end + steps).min(rows.len());
+            let mut felt = mean(&rows[end - steps..end], share);
+            for (felt, gravity) in felt.iter_mut().zip(&gravity) {
+                *felt += gravity[lane];
+            }
+            let normals = |half: usize| halves[half].get(number).copied().unwrap_or_default();
+            let noise = [join(normals(0), normals(1)), join(normals(2), normals(3))];
+            let read = unit.read(&felt, noise, &mut walk);
             out.copy_from_slice(&read[..IMU_COLUMNS]);
-            let yaw_rad = body.yaw_rad + f64::from(rows[steps - 1].dyaw_rad);
+            let yaw_rad = self.body.yaw_rad + f64::from(rows[end - 1].dyaw_rad);
             out[COMPASS] = compass_rad(yaw_rad, f64::from(read[COMPASS]));
         }
+        *self.walk = walk;
     }
+}
 
-    /// A value as it leaves the sensor: a multiple of the resolution within the range.
-    #[inline(always)]
-    fn delivered(&self, axis: usize, value: f32) -> f32 {
-        let resolution = self.resolution[axis];
-        let value = if resolution > 0.0 {
-            (value / resolution).round_ties_even() * resolution
-        } else {
-            value
-        };
-        value.clamp(-self.range[axis], self.range[axis])
-    }
-
-    /// What the sensor feels over these sub-steps without errors, in its own axes.
-    #[inline(always)]
-    fn felt(&self, rows: &[SubStep]) -> Axes {
-        let mut sum = [0.0; 8];
-        for row in rows {
-            let numbers: &[f32; 16] = bytemuck::must_cast_ref(row);
-            for axis in 0..8 {
-                sum[axis] += numbers[FELT + axis];
-            }
+/// Mean acceleration and angular rate over sub-steps.
+#[inline(always)]
+fn mean(rows: &[SubStep], share: f32) -> Axes {
+    let mut sum = [0.0; 8];
+    for row in rows {
+        let numbers: &[f32; 16] = bytemuck::must_cast_ref(row);
+        for axis in 0..8 {
+            sum[axis] += numbers[FELT + axis];
         }
-        let share = 1.0 / rows.len() as f32;
-        let mut felt = sum.map(|value| value * share);
-        if self.gravity_mps2 != 0.0
-            && let Some(last) = rows.last()
-        {
-            let gravity = gravity_body(self.gravity_mps2, last);
-            for axis in 0..3 {
-                felt[axis] += gravity[axis];
-            }
-        }
-        std::array::from_fn(|axis| felt[axis] * self.signs[axis])
     }
+    sum.map(|value| value * share)
 }
 
 #[inline(always)]
@@ -220,28 +263,41 @@ fn signs(convention: ImuConvention) -> Axes {
     }
 }
 
-/// What an accelerometer feels of gravity: the upward reaction, turned into the body (roll and pitch small or large).
+/// What an accelerometer feels of gravity at the ends of the next samples: the upward reaction, turned into the body (roll and pitch
+/// small or large).
 #[inline(always)]
-fn gravity_body(gravity_mps2: f32, row: &SubStep) -> [f32; 3] {
-    const TURNS: f64 = 4_294_967_296.0 / TAU;
-    let turns = |angle_rad: f32| (f64::from(angle_rad) * TURNS) as i64 as u32;
-    let (cos_pitch, sin_pitch) = cos_sin(turns(row.pitch_rad));
-    let (cos_roll, sin_roll) = cos_sin(turns(row.roll_rad));
-    [
-        gravity_mps2 * sin_pitch,
-        gravity_mps2 * cos_pitch * sin_roll,
-        gravity_mps2 * cos_pitch * cos_roll,
-    ]
+fn gravity_body(gravity_mps2: f32, rows: &[SubStep], from: usize, steps: usize) -> [[f32; LANES]; 3] {
+    let (mut roll, mut pitch) = ([0; LANES], [0; LANES]);
+    let ends = (from + steps - 1..rows.len()).step_by(steps);
+    for (lane, end) in (0..LANES).zip(ends) {
+        (roll[lane], pitch[lane]) = (turns(rows[end].roll_rad), turns(rows[end].pitch_rad));
+    }
+    let mut gravity = [[0.0; LANES]; 3];
+    for lane in 0..LANES {
+        let (cos_pitch, sin_pitch) = cos_sin(pitch[lane]);
+        let (cos_roll, sin_roll) = cos_sin(roll[lane]);
+        gravity[0][lane] = gravity_mps2 * sin_pitch;
+        gravity[1][lane] = gravity_mps2 * cos_pitch * sin_roll;
+        gravity[2][lane] = gravity_mps2 * cos_pitch * cos_roll;
+    }
+    gravity
 }
 
-/// Heading clockwise from north in [0, 2π), from yaw counter-clockwise from east, with an error clockwise.
+/// An angle in parts of 2⁻³² of a turn, whole turns left out. The last bit of a number between 2²⁰ and 2²¹ is one such part: the
+/// addition rounds to it, without a conversion that depends on the sign and size.
+#[inline(always)]
+fn turns(angle_rad: impl Into<f64>) -> u32 {
+    const ROUNDS: f64 = 1_572_864.0;
+    (angle_rad.into() * (1.0 / TAU) + ROUNDS).to_bits() as u32
+}
+
+/// Heading clockwise from north in [0, 2π) to 2⁻²⁴ of a turn, from yaw counter-clockwise from east, with an error clockwise.
 #[must_use]
 #[inline(always)]
 pub fn compass_rad(yaw_rad: f64, error_rad: f64) -> f32 {
-    let heading = FRAC_PI_2 - yaw_rad + error_rad;
-    let heading = (heading - TAU * (heading * (1.0 / TAU)).floor()) as f32;
-    // The remainder of a tiny negative number rounds up to the whole circle.
-    if heading >= TAU as f32 { 0.0 } else { heading.max(0.0) }
+    const RAD: f32 = (TAU / 16_777_216.0) as f32;
+    let heading = turns(FRAC_PI_2 - yaw_rad + error_rad);
+    (heading.wrapping_add(1 << 7) >> 8) as i32 as f32 * RAD
 }
 
 #[cfg(test)]

@@ -116,13 +116,19 @@ impl Draws {
         if end > self.counters.len() * LANES {
             self.counters.resize(end.div_ceil(LANES), [[0; LANES]; 4]);
         }
-        let (low, high) = (id_hash as u32, (id_hash >> 32) as u32);
-        for (place, sample) in (self.len..end).zip(0_u32..) {
+        let words = [sensor as u32, id_hash as u32, (id_hash >> 32) as u32];
+        let (mut place, mut sample) = (self.len, first);
+        while place < end {
             let (group, lane) = (&mut self.counters[place / LANES], place % LANES);
-            group[0][lane] = first.wrapping_add(sample);
-            group[1][lane] = sensor as u32;
-            group[2][lane] = low;
-            group[3][lane] = high;
+            let lanes = lane..(lane + end - place).min(LANES);
+            place += lanes.len();
+            for counter in &mut group[0][lanes.clone()] {
+                *counter = sample;
+                sample = sample.wrapping_add(1);
+            }
+            for (row, word) in group[1..].iter_mut().zip(words) {
+                row[lanes.clone()].fill(word);
+            }
         }
         self.len = end;
     }

@@ -43,12 +43,9 @@ fn minus_two_ln(u: f32) -> f32 {
     let e = (bits as i32 >> 23) as f32;
     let f = f32::from_bits((bits & 0x007F_FFFF).wrapping_add(HALF_ROOT_BITS)) - 1.0;
     let square = f * f;
-    let tail = 0.333_333
-        + f * (-0.250_000_1
-            + f * (0.200_028_63
-                + f * (-0.166_685_37
-                    + f * (0.142_069_46
-                        + f * (-0.123_894_85 + f * (0.119_558_56 + f * (-0.117_912_91 + f * 0.067_450_63)))))));
+    let tail = 0.333_341_66
+        + f * (-0.250_017
+            + f * (0.199_548_74 + f * (-0.165_644_26 + f * (0.149_780_12 + f * (-0.143_790_04 + f * 0.086_721_19)))));
     -2.0 * (e * std::f32::consts::LN_2 + (f + square * (f * tail - 0.5)))
 }
 
@@ -61,9 +58,8 @@ pub fn cos_sin(turns: u32) -> (f32, f32) {
     let quarter = turns.wrapping_add(1 << 29) >> 30;
     let x = turns.wrapping_sub(quarter << 30) as i32 as f32 * RAD;
     let q = x * x;
-    let sin = x + x * q * (-0.166_666_67 + q * (0.008_333_328 + q * (-0.000_198_390_44 + q * 2.716_01e-6)));
-    let cos =
-        1.0 - 0.5 * q + q * q * (0.041_666_668 + q * (-0.001_388_888_3 + q * (2.479_952e-5 + q * -2.721_020_3e-7)));
+    let sin = x + x * q * (-0.166_666_51 + q * (0.008_331_979 + q * -0.000_194_956_01));
+    let cos = 1.0 - 0.5 * q + q * q * (0.041_666_646 + q * (-0.001_388_736_8 + q * 2.443_841_4e-5));
     let odd = quarter & 1 != 0;
     let (c, s) = (if odd { sin } else { cos }, if odd { cos } else { sin });
     // The cosine is negative in quarters 1 and 2, the sine in 2 and 3.

@@ -245,6 +245,7 @@ impl Sensing {
     }
 
     /// Samples and writes one slot with numbers from the front of `blocks`; the rest is for the slots behind it.
+    #[inline]
     fn sense<'b>(
         &mut self,
         slot: usize,
@@ -286,6 +287,7 @@ impl Sensing {
     }
 
     /// Writes what a slot's sensors have delivered.
+    #[inline]
     fn write(&mut self, slot: usize, state: &VehicleState, step: u32, out: &mut Sections) {
         let carrier = &mut self.carriers[slot];
         let readings = &carrier.readings;
@@ -318,13 +320,15 @@ impl Sensing {
         }
         if readings.delivering & GNSS != 0 {
             let fix = &readings.fix;
-            self.raw_error.sum_m += libm::hypot(fix.x_m - state.x_m, fix.y_m - state.y_m);
+            let (x_m, y_m) = (fix.x_m - state.x_m, fix.y_m - state.y_m);
+            self.raw_error.sum_m += (x_m * x_m + y_m * y_m).sqrt();
             self.raw_error.count += 1;
         }
     }
 }
 
 /// Writes the newest raw samples of a slot; while a sensor is dark and the policy says so, not-a-number.
+#[inline]
 fn write_raw(slot: usize, carrier: &Carrier, policy: BlackoutPolicy, out: &mut Sections) {
     let readings = &carrier.readings;
     let fix = &readings.fix;

@@ -41,7 +41,7 @@ pub fn has_noise(params: &Params) -> bool {
 
 /// The sensor's sample of a vehicle that moves as `state`, with standard normal numbers for speed and steering.
 #[must_use]
-#[inline]
+#[inline(always)]
 pub fn sample(params: &Params, steering_ratio: f64, scales: &Scales, state: &VehicleState, normals: &Block) -> Sample {
     let true_speed = f64::from(state.velocity_body_mps[0]).abs();
     let true_steering = f64::from(state.road_wheel_angle_rad) * steering_ratio;

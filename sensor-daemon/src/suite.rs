@@ -16,6 +16,7 @@ use crate::{
     noise::{Draws, Sensor, Stream},
     normals::Block,
     speed_steering::{self, Scales},
+    wide::Path,
 };
 
 /// The time of a tick, as far as noise and blackouts know it.
@@ -56,6 +57,7 @@ pub struct Suite {
     lidar_range_m: f32,
     pedestrian_factor: f64,
     tick_s: f64,
+    path: Path,
 }
 
 impl Suite {
@@ -92,6 +94,7 @@ impl Suite {
             lidar_range_m: config.lidar.range_m as f32,
             pedestrian_factor: config.gnss.pedestrian_noise_factor,
             tick_s: config.run.tick_s,
+            path: Path::widest(),
         })
     }
 
@@ -163,7 +166,7 @@ impl Suite {
 
     /// Samples what is due, from the front of `blocks`; the IMU's samples of the tick go to `out`. Processes with a memory go on in a
     /// blackout, whose end does not show how long it was.
-    #[inline]
+    #[inline(always)]
     pub fn sample<'b>(
         &self,
         carrier: &mut Carrier,
@@ -194,7 +197,7 @@ impl Suite {
         blocks
     }
 
-    #[inline]
+    #[inline(always)]
     fn sample_gnss<'b>(
         &self,
         carrier: &mut Carrier,
@@ -234,7 +237,7 @@ impl Suite {
         blocks
     }
 
-    #[inline]
+    #[inline(always)]
     fn sample_imu<'b>(
         &self,
         carrier: &mut Carrier,
@@ -251,7 +254,7 @@ impl Suite {
                 yaw_rad: motion.state.yaw_rad,
                 rows: motion.rows,
             };
-            self.unit.sample(&body, ours, &mut carrier.walk, out);
+            self.unit.sample(self.path, &body, ours, &mut carrier.walk, out);
             if is_awake && let Some(newest) = out.last() {
                 carrier.readings.imu = *newest;
                 carrier.note(1, motion.step);

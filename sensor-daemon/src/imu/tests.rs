@@ -31,7 +31,7 @@ fn samples(params: &Params, rows: &[SubStep], count: usize) -> Vec<Sample> {
         rows,
     };
     assert_eq!(unit.blocks(), 0);
-    unit.sample(&body, &[], &mut [0.0; 8], &mut out);
+    unit.sample(Path::widest(), &body, &[], &mut [0.0; 8], &mut out);
     out
 }
 
@@ -190,7 +190,7 @@ fn white_noise_has_the_configured_level_on_every_axis() {
     };
     let normals = blocks(&unit, 3, 0);
     assert_eq!((unit.blocks(), normals.len()), (2 * N, 2 * N));
-    unit.sample(&body, &normals, &mut [0.0; 8], &mut out);
+    unit.sample(Path::widest(), &body, &normals, &mut [0.0; 8], &mut out);
     let stds = [0.5, 0.2, 0.1, 0.1, 0.2, 0.3, 0.05];
     let means = [1.0, -2.0, 0.0, 0.0, 0.0, 0.5, 1.0];
     let n = N as f64;
@@ -238,9 +238,15 @@ fn biases_walk_and_remember() {
         let (mut walk, mut whole) = ([0.0; 8], [0.0; 8]);
         let (mut few, mut many) = ([[0.0; 7]; 10], vec![[0.0; 7]; 100]);
         for tick in 0..10_u32 {
-            short.sample(&body, &blocks(&short, id, tick * 10), &mut walk, &mut few);
+            short.sample(
+                Path::widest(),
+                &body,
+                &blocks(&short, id, tick * 10),
+                &mut walk,
+                &mut few,
+            );
         }
-        long.sample(&body, &blocks(&long, id, 0), &mut whole, &mut many);
+        long.sample(Path::widest(), &body, &blocks(&long, id, 0), &mut whole, &mut many);
         assert_eq!(walk, whole);
         assert_eq!(few[9], many[99]);
         assert_eq!(few[9][0], walk[0]);
