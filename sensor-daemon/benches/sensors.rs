@@ -19,7 +19,8 @@ use ipc_schema::{
 };
 use sensor_daemon::{
     imu::{Body, Unit},
-    noise::Draws,
+    noise::{Drawn, Draws},
+    normals::LANES,
     sensing::{Sensing, World},
     wide::Path,
 };
@@ -136,24 +137,27 @@ fn round(config: &Config) -> f64 {
     start.elapsed().as_secs_f64() * 1e6 / (TICKS as f64 * f64::from(VEHICLES))
 }
 
-/// Microseconds per sample of the IMU, its numbers included.
+/// Microseconds per sample of the IMU, its numbers included: 16 vehicles, ten samples a tick.
 fn imu_alone(config: &Config) -> f64 {
-    const SAMPLES: usize = 100;
     const RUNS: u32 = 5000;
-    let unit = Unit::new(&config.imu, SAMPLES);
+    let unit = Unit::new(&config.imu, SUB_STEPS);
     let mut draws = Draws::default();
-    let rows = [SubStep::default(); SAMPLES];
+    let rows = [SubStep::default(); SUB_STEPS];
     let body = Body {
         yaw_rad: 1.0,
         rows: &rows,
     };
-    let (mut walk, mut out) = ([0.0; 8], [[0.0; 7]; SAMPLES]);
+    let ids: [u64; LANES] = std::array::from_fn(|lane| lane as u64);
+    let (mut walks, mut out) = ([[0.0; 8]; LANES], [[0.0; 7]; SUB_STEPS]);
     let start = Instant::now();
     for run in 0..RUNS {
         draws.clear();
-        unit.ask(&mut draws, u64::from(run), 0);
-        unit.sample(Path::widest(), &body, draws.draw(1), &mut walk, &mut out);
-        std::hint::black_box(&out);
+        unit.plan(&mut draws, run * SUB_STEPS as u32);
+        let blocks = draws.draw(1, &ids);
+        for (lane, walk) in walks.iter_mut().enumerate() {
+            unit.sample(Path::widest(), &body, Drawn::new(blocks, lane), walk, &mut out);
+            std::hint::black_box(&out);
+        }
     }
-    start.elapsed().as_secs_f64() * 1e6 / (f64::from(RUNS) * SAMPLES as f64)
+    start.elapsed().as_secs_f64() * 1e6 / (f64::from(RUNS) * (SUB_STEPS * LANES) as f64)
 }

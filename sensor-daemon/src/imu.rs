@@ -14,7 +14,7 @@ use ipc_schema::{
 };
 
 use crate::{
-    noise::{Draws, Sensor},
+    noise::{Drawn, Draws, Sensor},
     normals::{Block, LANES, cos_sin},
     wide::{Path, Work},
 };
@@ -122,16 +122,16 @@ impl Unit {
         }
     }
 
-    /// Asks for the numbers of the samples from `first` on.
-    pub fn ask(&self, draws: &mut Draws, id_hash: u64, first: u32) {
+    /// Plans the numbers of the samples from `first` on.
+    pub fn plan(&self, draws: &mut Draws, first: u32) {
         for (stream, noisy) in STREAMS.into_iter().zip(self.noisy) {
             if noisy {
-                draws.ask(id_hash, stream, first, self.samples);
+                draws.plan(stream, first, self.samples);
             }
         }
     }
 
-    /// How many blocks [`Unit::ask`] asks for.
+    /// How many blocks [`Unit::plan`] plans.
     #[must_use]
     pub fn blocks(&self) -> usize {
         self.noisy.iter().filter(|noisy| **noisy).count() * self.samples
@@ -141,60 +141,22 @@ impl Unit {
     ///
     /// A sample over several sub-steps is the mean of their accelerations and rates; gravity and heading are those at its end.
     #[inline]
-    pub fn sample(&self, path: Path, body: &Body, blocks: &[Block], walk: &mut Axes, out: &mut [Sample]) {
+    pub fn sample(&self, path: Path, body: &Body, drawn: Drawn, walk: &mut Axes, out: &mut [Sample]) {
         path.run(Samples {
             unit: self,
             body,
-            blocks,
+            drawn,
             walk,
             out,
         });
     }
-
-    /// The halves of the axes' numbers, first white then walk; none where there is no noise.
-    #[inline(always)]
-    fn halves<'b>(&self, blocks: &'b [Block]) -> [&'b [Block]; 4] {
-        let mut halves = [blocks; 4];
-        let mut rest = blocks;
-        for (half, noisy) in halves.iter_mut().zip(self.noisy) {
-            let (ours, tail) = rest.split_at(if noisy { self.samples.min(rest.len()) } else { 0 });
-            (*half, rest) = (ours, tail);
-        }
-        halves
-    }
-
-    /// What the axes read if they feel `felt`; the compass, its error.
-    #[inline(always)]
-    fn read(&self, felt: &Axes, [white, drift]: [Axes; 2], walk: &mut Axes) -> Axes {
-        let mut value = [0.0; 8];
-        for axis in 0..8 {
-            walk[axis] += self.walk[axis] * drift[axis];
-            value[axis] = felt[axis] * self.signs[axis] + self.bias[axis] + walk[axis] + self.white[axis] * white[axis];
-        }
-        if self.is_stepped {
-            for axis in 0..8 {
-                let stepped = (value[axis] / self.divisor[axis]).round_ties_even() * self.divisor[axis];
-                value[axis] = if self.resolution[axis] > 0.0 {
-                    stepped
-                } else {
-                    value[axis]
-                };
-            }
-        }
-        for axis in 0..8 {
-            let most = self.range[axis];
-            value[axis] = if value[axis] > most { most } else { value[axis] };
-            value[axis] = if value[axis] < -most { -most } else { value[axis] };
-        }
-        value
-    }
 }
 
-/// The samples of one tick, with the widest vectors.
+/// The samples of one tick, with the widest vectors: [`LANES`] of them in one pass after the other, each a loop over plain arrays.
 struct Samples<'a> {
     unit: &'a Unit,
     body: &'a Body<'a>,
-    blocks: &'a [Block],
+    drawn: Drawn<'a>,
     walk: &'a mut Axes,
     out: &'a mut [Sample],
 }
@@ -205,36 +167,93 @@ impl Work for Samples<'_> {
     #[inline(always)]
     fn run(self) {
         let (unit, rows) = (self.unit, self.body.rows);
-        let halves = unit.halves(self.blocks);
+        let mut drawn = self.drawn;
+        let [front, back, walk_front, walk_back] = unit
+            .noisy
+            .map(|noisy| drawn.split(if noisy { unit.samples } else { 0 }));
         let steps = (rows.len() / unit.samples).max(1);
-        let share = 1.0 / steps as f32;
-        let mut walk = *self.walk;
-        let mut gravity = [[0.0; LANES]; 3];
-        let mut end = 0;
-        for (number, out) in self.out.iter_mut().enumerate() {
-            let lane = number % LANES;
-            if lane == 0 && unit.gravity_mps2 != 0.0 {
-                gravity = gravity_body(unit.gravity_mps2, rows, end, steps);
+        let mut values = [[0.0; 8]; LANES];
+        let mut first = 0;
+        for some in self.out.chunks_mut(LANES) {
+            let count = some.len();
+            let values = &mut values[..count];
+            // With fewer sub-steps than samples, the last ones see the newest that there is.
+            let place = |i: usize| (first + i) * steps;
+            let rows_of = |i: usize| &rows[place(i).min(rows.len() - steps)..][..steps];
+            for (i, value) in values.iter_mut().enumerate() {
+                *value = mean(rows_of(i));
             }
-            end = (end + steps).min(rows.len());
-            let mut felt = mean(&rows[end - steps..end], share);
-            for (felt, gravity) in felt.iter_mut().zip(&gravity) {
-                *felt += gravity[lane];
+            if unit.gravity_mps2 != 0.0 {
+                add_gravity(unit.gravity_mps2, &rows_of, values);
             }
-            let normals = |half: usize| halves[half].get(number).copied().unwrap_or_default();
-            let noise = [join(normals(0), normals(1)), join(normals(2), normals(3))];
-            let read = unit.read(&felt, noise, &mut walk);
-            out.copy_from_slice(&read[..IMU_COLUMNS]);
-            let yaw_rad = self.body.yaw_rad + f64::from(rows[end - 1].dyaw_rad);
-            out[COMPASS] = compass_rad(yaw_rad, f64::from(read[COMPASS]));
+            unit.err(values);
+            if unit.noisy[2] || unit.noisy[3] {
+                for (i, value) in values.iter_mut().enumerate() {
+                    let drift = join(walk_front.at(first + i), walk_back.at(first + i));
+                    for axis in 0..8 {
+                        self.walk[axis] += unit.walk[axis] * drift[axis];
+                        value[axis] += self.walk[axis];
+                    }
+                }
+            }
+            if !(front.is_empty() && back.is_empty()) {
+                for (i, value) in values.iter_mut().enumerate() {
+                    let white = join(front.at(first + i), back.at(first + i));
+                    for axis in 0..8 {
+                        value[axis] += unit.white[axis] * white[axis];
+                    }
+                }
+            }
+            unit.deliver(values);
+            for (i, (out, value)) in some.iter_mut().zip(&*values).enumerate() {
+                out.copy_from_slice(&value[..IMU_COLUMNS]);
+                let yaw_rad = self.body.yaw_rad + f64::from(rows_of(i)[steps - 1].dyaw_rad);
+                out[COMPASS] = compass_rad(yaw_rad, f64::from(value[COMPASS]));
+            }
+            first += count;
         }
-        *self.walk = walk;
+    }
+}
+
+impl Unit {
+    /// From what the body feels to the sensor's axes, with constant biases.
+    #[inline(always)]
+    fn err(&self, values: &mut [Axes]) {
+        for value in values {
+            for axis in 0..8 {
+                value[axis] = value[axis] * self.signs[axis] + self.bias[axis];
+            }
+        }
+    }
+
+    /// From values to what leaves the sensor: multiples of the resolution within the range.
+    #[inline(always)]
+    fn deliver(&self, values: &mut [Axes]) {
+        if self.is_stepped {
+            for value in &mut *values {
+                for axis in 0..8 {
+                    let stepped = (value[axis] / self.divisor[axis]).round_ties_even() * self.divisor[axis];
+                    value[axis] = if self.resolution[axis] > 0.0 {
+                        stepped
+                    } else {
+                        value[axis]
+                    };
+                }
+            }
+        }
+        for value in values {
+            for axis in 0..8 {
+                let most = self.range[axis];
+                let below = if value[axis] > most { most } else { value[axis] };
+                value[axis] = if below < -most { -most } else { below };
+            }
+        }
     }
 }
 
 /// Mean acceleration and angular rate over sub-steps.
 #[inline(always)]
-fn mean(rows: &[SubStep], share: f32) -> Axes {
+fn mean(rows: &[SubStep]) -> Axes {
     let mut sum = [0.0; 8];
     for row in rows {
         let numbers: &[f32; 16] = bytemuck::must_cast_ref(row);
@@ -242,7 +261,11 @@ fn mean(rows: &[SubStep], share: f32) -> Axes {
             sum[axis] += numbers[FELT + axis];
         }
     }
-    sum.map(|value| value * share)
+    let share = 1.0 / rows.len() as f32;
+    for value in &mut sum {
+        *value *= share;
+    }
+    sum
 }
 
 #[inline(always)]
@@ -263,14 +286,15 @@ fn signs(convention: ImuConvention) -> Axes {
     }
 }
 
-/// What an accelerometer feels of gravity at the ends of the next samples: the upward reaction, turned into the body (roll and pitch
+/// Adds what an accelerometer feels of gravity at the end of each sample: the upward reaction, turned into the body (roll and pitch
 /// small or large).
 #[inline(always)]
-fn gravity_body(gravity_mps2: f32, rows: &[SubStep], from: usize, steps: usize) -> [[f32; LANES]; 3] {
-    let (mut roll, mut pitch) = ([0; LANES], [0; LANES]);
-    let ends = (from + steps - 1..rows.len()).step_by(steps);
-    for (lane, end) in (0..LANES).zip(ends) {
-        (roll[lane], pitch[lane]) = (turns(rows[end].roll_rad), turns(rows[end].pitch_rad));
+fn add_gravity<'r>(gravity_mps2: f32, rows_of: &impl Fn(usize) -> &'r [SubStep], values: &mut [Axes]) {
+    let (mut roll, mut pitch): ([u32; LANES], [u32; LANES]) = ([0; LANES], [0; LANES]);
+    for (i, (roll, pitch)) in roll.iter_mut().zip(&mut pitch).take(values.len()).enumerate() {
+        if let Some(end) = rows_of(i).last() {
+            (*roll, *pitch) = (turns(end.roll_rad), turns(end.pitch_rad));
+        }
     }
     let mut gravity = [[0.0; LANES]; 3];
     for lane in 0..LANES {
@@ -280,7 +304,11 @@ fn gravity_body(gravity_mps2: f32, rows: &[SubStep], from: usize, steps: usize) 
         gravity[1][lane] = gravity_mps2 * cos_pitch * sin_roll;
         gravity[2][lane] = gravity_mps2 * cos_pitch * cos_roll;
     }
-    gravity
+    for (i, value) in values.iter_mut().enumerate() {
+        for axis in 0..3 {
+            value[axis] += gravity[axis][i];
+        }
+    }
 }
 
 /// An angle in parts of 2⁻³² of a turn, whole turns left out. The last bit of a number between 2²⁰ and 2²¹ is one such part: the

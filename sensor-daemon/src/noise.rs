@@ -1,7 +1,7 @@
 //! Counter-based random numbers: a value depends on what it is for, never on when or in which order it is drawn.
 
 use crate::{
-    normals::{self, Block, Counters, LANES},
+    normals::{self, Block, LANES, Lanes, Purpose},
     wide::Path,
 };
 
@@ -78,13 +78,12 @@ impl Stream {
     }
 }
 
-/// Numbers of many vehicles and sensors, asked for one after the other and then drawn together, [`LANES`] blocks at a time.
+/// Numbers of [`LANES`] vehicles at a time. All need the same at a tick: it is planned once, and drawn for one group after the other.
 #[derive(Debug)]
 pub struct Draws {
     path: Path,
-    counters: Vec<Counters>,
-    blocks: Vec<[Block; LANES]>,
-    len: usize,
+    plan: Vec<Purpose>,
+    blocks: Vec<Lanes>,
 }
 
 impl Default for Draws {
@@ -99,53 +98,78 @@ impl Draws {
     pub fn on(path: Path) -> Self {
         Self {
             path,
-            counters: Vec::new(),
+            plan: Vec::new(),
             blocks: Vec::new(),
-            len: 0,
         }
     }
 
-    /// Forgets everything that was asked for.
+    /// Forgets everything that was planned.
     pub fn clear(&mut self) {
-        self.len = 0;
+        self.plan.clear();
     }
 
-    /// Asks for the blocks of `count` samples from `first` on.
-    pub fn ask(&mut self, id_hash: u64, sensor: Sensor, first: u32, count: usize) {
-        let end = self.len + count;
-        if end > self.counters.len() * LANES {
-            self.counters.resize(end.div_ceil(LANES), [[0; LANES]; 4]);
-        }
-        let words = [sensor as u32, id_hash as u32, (id_hash >> 32) as u32];
-        let (mut place, mut sample) = (self.len, first);
-        while place < end {
-            let (group, lane) = (&mut self.counters[place / LANES], place % LANES);
-            let lanes = lane..(lane + end - place).min(LANES);
-            place += lanes.len();
-            for counter in &mut group[0][lanes.clone()] {
-                *counter = sample;
-                sample = sample.wrapping_add(1);
-            }
-            for (row, word) in group[1..].iter_mut().zip(words) {
-                row[lanes.clone()].fill(word);
-            }
-        }
-        self.len = end;
+    /// Plans `count` samples of a sensor from `first` on.
+    pub fn plan(&mut self, sensor: Sensor, first: u32, count: usize) {
+        let samples = (0_u32..).take(count);
+        self.plan
+            .extend(samples.map(|sample| [first.wrapping_add(sample), sensor as u32]));
     }
 
-    /// Draws everything that was asked for, in that order.
-    pub fn draw(&mut self, episode_seed: u64) -> &[Block] {
-        let groups = self.len.div_ceil(LANES);
-        if self.blocks.len() < groups {
-            self.blocks.resize(groups, [[0.0; 4]; LANES]);
+    /// Draws everything that is planned, in that order, for the vehicles with these ids.
+    pub fn draw(&mut self, episode_seed: u64, ids: &[u64; LANES]) -> &[Lanes] {
+        self.blocks.resize(self.plan.len(), [[0.0; 4]; LANES]);
+        normals::fill(self.path, key(episode_seed), ids, &self.plan, &mut self.blocks);
+        &self.blocks
+    }
+}
+
+/// One vehicle's share of what has been drawn for a group, taken from the front.
+#[derive(Debug, Clone, Copy)]
+pub struct Drawn<'a> {
+    blocks: &'a [Lanes],
+    lane: usize,
+}
+
+impl<'a> Drawn<'a> {
+    /// The share of the vehicle in `lane`.
+    #[must_use]
+    #[inline]
+    pub fn new(blocks: &'a [Lanes], lane: usize) -> Self {
+        Self {
+            blocks,
+            lane: lane % LANES,
         }
-        normals::fill(
-            self.path,
-            key(episode_seed),
-            &self.counters[..groups],
-            &mut self.blocks[..groups],
-        );
-        &self.blocks.as_flattened()[..self.len]
+    }
+
+    /// The next block if one was planned, else zeros.
+    #[inline]
+    pub fn take(&mut self, is_planned: bool) -> Block {
+        if is_planned { self.split(1).at(0) } else { [0.0; 4] }
+    }
+
+    /// The next `count` blocks, or as many as there are.
+    #[must_use]
+    #[inline(always)]
+    pub fn split(&mut self, count: usize) -> Self {
+        let (blocks, rest) = self.blocks.split_at(count.min(self.blocks.len()));
+        self.blocks = rest;
+        Self { blocks, ..*self }
+    }
+
+    /// The block at an index; zeros behind the last.
+    #[must_use]
+    #[inline(always)]
+    pub fn at(&self, index: usize) -> Block {
+        self.blocks
+            .get(index)
+            .map_or([0.0; 4], |lanes| lanes[self.lane % LANES])
+    }
+
+    /// True if there are no blocks.
+    #[must_use]
+    #[inline(always)]
+    pub fn is_empty(&self) -> bool {
+        self.blocks.is_empty()
     }
 }
 
@@ -205,14 +229,23 @@ mod tests {
     #[test]
     fn draws_are_the_streams_own_numbers() {
         let mut draws = Draws::default();
+        let mut ids = [9; LANES];
+        (ids[3], ids[15]) = (7, u64::MAX - 5);
         for round in 0..3_u32 {
             draws.clear();
-            draws.ask(7, Sensor::Gnss, round, 1);
-            draws.ask(u64::MAX - 5, Sensor::ImuBack, u32::MAX, 20);
-            let blocks = draws.draw(42);
+            draws.plan(Sensor::Gnss, round, 1);
+            draws.plan(Sensor::ImuBack, u32::MAX, 20);
+            let blocks = draws.draw(42, &ids);
             assert_eq!(blocks.len(), 21);
-            assert_eq!(blocks[0], stream(7, Sensor::Gnss).normals(round));
-            assert_eq!(blocks[3], stream(u64::MAX - 5, Sensor::ImuBack).normals(1));
+            let mut mine = Drawn::new(blocks, 3);
+            assert_eq!(mine.take(false), [0.0; 4]);
+            assert_eq!(mine.take(true), stream(7, Sensor::Gnss).normals(round));
+            let mut other = Drawn::new(blocks, 15);
+            let _ = other.take(true);
+            let imu = other.split(20);
+            assert_eq!(imu.at(2), stream(u64::MAX - 5, Sensor::ImuBack).normals(1));
+            assert_eq!((imu.at(20), other.take(true)), ([0.0; 4], [0.0; 4]));
+            assert!(other.is_empty() && !imu.is_empty());
         }
     }
 

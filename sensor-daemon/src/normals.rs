@@ -12,8 +12,11 @@ pub const LANES: usize = 16;
 /// Four independent standard normal numbers.
 pub type Block = [f32; 4];
 
-/// Counters of [`LANES`] blocks, word by word.
-pub type Counters = [[u32; LANES]; 4];
+/// Blocks of all lanes for one counter of theirs.
+pub type Lanes = [Block; LANES];
+
+/// What the numbers of all lanes are for: the first two words of their counters.
+pub type Purpose = [u32; 2];
 
 const MULTIPLIERS: [u64; 2] = [0xD251_1F53, 0xCD9E_8D57];
 const WEYL: [u32; 2] = [0x9E37_79B9, 0xBB67_AE85];
@@ -90,12 +93,14 @@ pub fn block(counter: [u32; 4], key: [u32; 2]) -> Block {
     [n0, n1, n2, n3]
 }
 
-/// Blocks of normal numbers for many counters.
+/// Blocks of normal numbers for many purposes, of [`LANES`] vehicles side by side.
 #[derive(Debug)]
 struct Normals<'a> {
     key: [u32; 2],
-    counters: &'a [Counters],
-    blocks: &'a mut [[Block; LANES]],
+    /// The last two words of each lane's counters.
+    ids: [[u32; LANES]; 2],
+    purposes: &'a [Purpose],
+    blocks: &'a mut [Lanes],
 }
 
 impl Work for Normals<'_> {
@@ -103,10 +108,11 @@ impl Work for Normals<'_> {
 
     #[inline(always)]
     fn run(self) {
-        for (counters, blocks) in self.counters.iter().zip(self.blocks) {
+        let [low, high] = self.ids;
+        for ([sample, sensor], blocks) in self.purposes.iter().zip(self.blocks) {
             let mut words = [[0_u32; LANES]; 4];
             for lane in 0..LANES {
-                let word = philox4x32(std::array::from_fn(|i| counters[i][lane]), self.key);
+                let word = philox4x32([*sample, *sensor, low[lane], high[lane]], self.key);
                 for i in 0..4 {
                     words[i][lane] = word[i];
                 }
@@ -123,9 +129,14 @@ impl Work for Normals<'_> {
     }
 }
 
-/// Fills `blocks`, one for each lane of `counters`, on the given path.
-pub fn fill(path: Path, key: [u32; 2], counters: &[Counters], blocks: &mut [[Block; LANES]]) {
-    path.run(Normals { key, counters, blocks });
+/// Fills `blocks`, one for each purpose, for the vehicles with these ids, on the given path.
+pub fn fill(path: Path, key: [u32; 2], ids: &[u64; LANES], purposes: &[Purpose], blocks: &mut [Lanes]) {
+    path.run(Normals {
+        key,
+        ids: [ids.map(|id| id as u32), ids.map(|id| (id >> 32) as u32)],
+        purposes,
+        blocks,
+    });
 }
 
 #[cfg(test)]
@@ -188,21 +199,18 @@ mod tests {
 
     #[test]
     fn every_path_gives_the_bits_of_a_block_alone() {
-        const GROUPS: usize = 500;
-        let counters: Vec<Counters> = (0..GROUPS)
-            .map(|group| {
-                std::array::from_fn(|word| {
-                    std::array::from_fn(|lane| ((group * 16 + lane) as u32).wrapping_mul(0x9E37_79B9 + 2 * word as u32))
-                })
-            })
+        const PURPOSES: usize = 500;
+        let purposes: Vec<Purpose> = (0..PURPOSES as u32)
+            .map(|i| [i.wrapping_mul(0x9E37_79B9), i % 7])
             .collect();
+        let ids: [u64; LANES] = std::array::from_fn(|lane| (lane as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let key = [7, 0xDEAD_BEEF];
         for path in Path::available() {
-            let mut blocks = vec![[[0.0; 4]; LANES]; GROUPS];
-            fill(path, key, &counters, &mut blocks);
-            for (group, lanes) in counters.iter().zip(&blocks) {
-                for (lane, numbers) in lanes.iter().enumerate() {
-                    let alone = block(std::array::from_fn(|word| group[word][lane]), key);
+            let mut blocks = vec![[[0.0; 4]; LANES]; PURPOSES];
+            fill(path, key, &ids, &purposes, &mut blocks);
+            for ([sample, sensor], lanes) in purposes.iter().zip(&blocks) {
+                for (id, numbers) in ids.iter().zip(lanes) {
+                    let alone = block([*sample, *sensor, *id as u32, (id >> 32) as u32], key);
                     assert_eq!(numbers.map(f32::to_bits), alone.map(f32::to_bits), "{path:?}");
                 }
             }

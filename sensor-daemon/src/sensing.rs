@@ -1,7 +1,5 @@
 //! All sensors of all connected road users: one tick of the world in, one observation block out.
 
-use std::ops::Range;
-
 use ipc_schema::{
     block::BlockError,
     config::{BlackoutPolicy, Config},
@@ -18,15 +16,12 @@ use crate::{
     fields::Normaliser,
     gnss::Sky,
     history::{First, History},
-    noise::Draws,
-    normals::Block,
+    noise::{Drawn, Draws},
+    normals::LANES,
     sections::Sections,
     slots::Slots,
     suite::{Motion, Now, Suite},
 };
-
-/// Slots whose numbers are drawn together: enough to fill the lanes, few enough for the first-level cache.
-const TOGETHER: usize = 16;
 
 /// Sums of the raw GNSS error over all fixes.
 #[derive(Debug, Clone, Copy, Default)]
@@ -220,45 +215,34 @@ impl Sensing {
         let mut sections = Sections::split(payload, &layout)?;
         let now = self.now(header);
         let mut draws = std::mem::take(&mut self.draws);
-        for first in (0..n).step_by(TOGETHER) {
-            let slots = first..n.min(first + TOGETHER);
-            self.ask(slots.clone(), world, &now, &mut draws);
-            let mut blocks = draws.draw(now.episode_seed);
-            for slot in slots {
-                blocks = self.sense(slot, world, &now, blocks, &mut sections);
+        draws.clear();
+        self.suite.plan(&mut draws, &now);
+        for first in (0..n).step_by(LANES) {
+            let ids = std::array::from_fn(|lane| self.id_hash(first + lane, world));
+            let blocks = draws.draw(now.episode_seed, &ids);
+            for slot in first..n.min(first + LANES) {
+                self.sense(slot, world, &now, Drawn::new(blocks, slot - first), &mut sections);
             }
         }
         self.draws = draws;
         Ok(())
     }
 
-    /// Asks for the numbers of these slots.
-    fn ask(&self, slots: Range<usize>, world: &World, now: &Now, draws: &mut Draws) {
-        draws.clear();
-        for slot in slots {
-            if let Some(row) = self.row_of_slot[slot] {
-                let id_hash = world.states[row as usize].id_hash;
-                let step = self.slots.rows()[slot].step;
-                self.suite.ask(draws, &self.carriers[slot], id_hash, step, now);
-            }
+    /// Hash of the id of the road user in a slot; anything for an empty one.
+    fn id_hash(&self, slot: usize, world: &World) -> u64 {
+        match self.row_of_slot.get(slot) {
+            Some(Some(row)) => world.states[*row as usize].id_hash,
+            _ => 0,
         }
     }
 
-    /// Samples and writes one slot with numbers from the front of `blocks`; the rest is for the slots behind it.
-    #[inline]
-    fn sense<'b>(
-        &mut self,
-        slot: usize,
-        world: &World,
-        now: &Now,
-        blocks: &'b [Block],
-        out: &mut Sections,
-    ) -> &'b [Block] {
+    /// Samples and writes one slot with the numbers drawn for it.
+    fn sense(&mut self, slot: usize, world: &World, now: &Now, drawn: Drawn, out: &mut Sections) {
         let lent = self.slots.rows()[slot];
         out.vehicle[slot] = lent.vehicle;
         out.flags[slot] = lent.ended;
         let Some(row) = self.row_of_slot[slot] else {
-            return blocks;
+            return;
         };
         let row = row as usize;
         let state = &world.states[row];
@@ -277,13 +261,12 @@ impl Sensing {
         };
         let carrier = &mut self.carriers[slot];
         let samples = &mut out.imu[slot * self.imu_samples..(slot + 1) * self.imu_samples];
-        let rest = self.suite.sample(carrier, &motion, now, blocks, samples);
+        self.suite.sample(carrier, &motion, now, drawn, samples);
         // Both are in ascending order of the vehicle.
         if let Ok(place) = world.views.binary_search_by_key(&state.vehicle, |view| view.vehicle) {
             carrier.readings.route = world.views[place];
         }
         self.write(slot, state, lent.step, out);
-        rest
     }
 
     /// Writes what a slot's sensors have delivered.

@@ -13,7 +13,7 @@ use crate::{
     carrier::Carrier,
     gnss::{self, Receiver, Sky, SkyView},
     imu::{self, Unit},
-    noise::{Draws, Sensor, Stream},
+    noise::{Drawn, Draws, Sensor, Stream},
     normals::Block,
     speed_steering::{self, Scales},
     wide::Path,
@@ -138,6 +138,20 @@ impl Suite {
         }
     }
 
+    /// Plans the numbers that [`Suite::sample`] takes at this tick if everything is due, with those first that are always needed.
+    pub fn plan(&self, draws: &mut Draws, now: &Now) {
+        if self.receiver.has_white_noise() {
+            draws.plan(Sensor::Gnss, now.tick, 1);
+        }
+        if self.receiver.has_correlated_noise() {
+            draws.plan(Sensor::GnssCorrelated, now.tick, 1);
+        }
+        if self.speed_steering_noise {
+            draws.plan(Sensor::SpeedSteering, now.tick, 1);
+        }
+        self.unit.plan(draws, now.tick.wrapping_mul(self.imu_samples));
+    }
+
     /// True if the sensor with this index samples at this step of its carrier; the first step samples everything.
     #[inline]
     fn is_due(&self, sensor: usize, step: u32) -> bool {
@@ -145,134 +159,93 @@ impl Suite {
         period == 1 || step.is_multiple_of(period)
     }
 
-    /// Asks for the numbers that [`Suite::sample`] will need.
+    /// Samples what is due with the numbers drawn for its carrier; the IMU's samples of the tick go to `out`. Processes with a memory go
+    /// on in a blackout, whose end does not show how long it was.
     #[inline]
-    pub fn ask(&self, draws: &mut Draws, carrier: &Carrier, id_hash: u64, step: u32, now: &Now) {
-        if self.is_due(0, step) {
-            if self.receiver.has_white_noise() {
-                draws.ask(id_hash, Sensor::Gnss, now.tick, 1);
-            }
-            if self.receiver.has_correlated_noise() {
-                draws.ask(id_hash, Sensor::GnssCorrelated, now.tick, 1);
-            }
-        }
-        if self.is_due(1, step) {
-            self.unit.ask(draws, id_hash, now.tick.wrapping_mul(self.imu_samples));
-        }
-        if self.is_due(2, step) && self.speed_steering_noise && carrier.present & SPEED_STEERING != 0 {
-            draws.ask(id_hash, Sensor::SpeedSteering, now.tick, 1);
-        }
-    }
-
-    /// Samples what is due, from the front of `blocks`; the IMU's samples of the tick go to `out`. Processes with a memory go on in a
-    /// blackout, whose end does not show how long it was.
-    #[inline(always)]
-    pub fn sample<'b>(
-        &self,
-        carrier: &mut Carrier,
-        motion: &Motion,
-        now: &Now,
-        mut blocks: &'b [Block],
-        out: &mut [imu::Sample],
-    ) -> &'b [Block] {
+    pub fn sample(&self, carrier: &mut Carrier, motion: &Motion, now: &Now, mut drawn: Drawn, out: &mut [imu::Sample]) {
         let (step, awake) = (motion.step, carrier.awake());
+        let normals = [
+            self.receiver.has_white_noise(),
+            self.receiver.has_correlated_noise(),
+            self.speed_steering_noise,
+        ]
+        .map(|is_planned| drawn.take(is_planned));
         if self.is_due(0, step) {
-            blocks = self.sample_gnss(carrier, motion, now, awake & GNSS != 0, blocks);
+            self.sample_gnss(carrier, motion, now, awake & GNSS != 0, [&normals[0], &normals[1]]);
         }
-        blocks = self.sample_imu(carrier, motion, awake & IMU != 0, blocks, out);
-        if self.is_due(2, step) && carrier.present & SPEED_STEERING != 0 {
-            let normals;
-            (normals, blocks) = take(blocks, self.speed_steering_noise);
-            if awake & SPEED_STEERING != 0 {
-                let (params, ratio) = (&self.speed_steering, self.steering_ratio);
-                carrier.readings.speed_steering =
-                    speed_steering::sample(params, ratio, &carrier.scales, motion.state, normals);
-                carrier.note(2, step);
-            }
+        if self.is_due(2, step) && awake & SPEED_STEERING != 0 {
+            let (params, ratio) = (&self.speed_steering, self.steering_ratio);
+            carrier.readings.speed_steering =
+                speed_steering::sample(params, ratio, &carrier.scales, motion.state, &normals[2]);
+            carrier.note(2, step);
         }
+        self.sample_imu(carrier, motion, awake & IMU != 0, drawn, out);
         if awake & LIDAR != 0 {
             carrier.note(3, step);
         }
         carrier.age(step, self.tick_s);
-        blocks
     }
 
-    #[inline(always)]
-    fn sample_gnss<'b>(
+    #[inline]
+    fn sample_gnss(
         &self,
         carrier: &mut Carrier,
         motion: &Motion,
         now: &Now,
         is_awake: bool,
-        blocks: &'b [Block],
-    ) -> &'b [Block] {
-        let (white, blocks) = take(blocks, self.receiver.has_white_noise());
-        let (fresh, blocks) = take(blocks, self.receiver.has_correlated_noise());
+        [white, fresh]: [&Block; 2],
+    ) {
         carrier.correlated = if motion.step == 0 {
             [fresh[0], fresh[1], fresh[2]]
         } else {
             self.receiver.correlated(carrier.correlated, fresh)
         };
-        if is_awake {
-            let state = motion.state;
-            let place_m = [state.x_m, state.y_m, state.z_m];
-            let time_s = now.time_ns as f64 * 1e-9;
-            let view = self.sky.as_ref().map_or_else(SkyView::default, |sky| {
-                sky.at(place_m[0], place_m[1], place_m[2], time_s)
-            });
-            carrier.has_fix = view.has_fix;
-            if view.has_fix {
-                carrier.readings.fix = self.receiver.fix(
-                    place_m,
-                    &gnss::Errors {
-                        white,
-                        correlated: &carrier.correlated,
-                        view: &view,
-                        factor: carrier.gnss_factor,
-                    },
-                );
-                carrier.note(0, motion.step);
-            }
+        if !is_awake {
+            return;
         }
-        blocks
+        let state = motion.state;
+        let place_m = [state.x_m, state.y_m, state.z_m];
+        let time_s = now.time_ns as f64 * 1e-9;
+        let view = self.sky.as_ref().map_or_else(SkyView::default, |sky| {
+            sky.at(place_m[0], place_m[1], place_m[2], time_s)
+        });
+        carrier.has_fix = view.has_fix;
+        if view.has_fix {
+            carrier.readings.fix = self.receiver.fix(
+                place_m,
+                &gnss::Errors {
+                    white,
+                    correlated: &carrier.correlated,
+                    view: &view,
+                    factor: carrier.gnss_factor,
+                },
+            );
+            carrier.note(0, motion.step);
+        }
     }
 
-    #[inline(always)]
-    fn sample_imu<'b>(
+    #[inline]
+    fn sample_imu(
         &self,
         carrier: &mut Carrier,
         motion: &Motion,
         is_awake: bool,
-        blocks: &'b [Block],
+        drawn: Drawn,
         out: &mut [imu::Sample],
-    ) -> &'b [Block] {
-        let mut rest = blocks;
+    ) {
         if self.is_due(1, motion.step) {
-            let (ours, tail) = blocks.split_at(self.unit.blocks());
-            rest = tail;
             let body = imu::Body {
                 yaw_rad: motion.state.yaw_rad,
                 rows: motion.rows,
             };
-            self.unit.sample(self.path, &body, ours, &mut carrier.walk, out);
+            self.unit.sample(self.path, &body, drawn, &mut carrier.walk, out);
             if is_awake && let Some(newest) = out.last() {
                 carrier.readings.imu = *newest;
                 carrier.note(1, motion.step);
-                return rest;
+                return;
             }
         }
         out.fill(carrier.readings.imu);
-        rest
-    }
-}
-
-/// The first block if one was asked for, else zeros; and the rest.
-#[inline]
-fn take(blocks: &[Block], is_asked: bool) -> (&Block, &[Block]) {
-    const SILENT: &Block = &[0.0; 4];
-    match blocks.split_first() {
-        Some(split) if is_asked => split,
-        _ => (SILENT, blocks),
     }
 }
 

@@ -1,7 +1,7 @@
 //! Conventions by hand, and errors against their numbers.
 
 use super::*;
-use crate::{noise::Stream, preset::town};
+use crate::{noise::Stream, normals::Lanes, preset::town};
 use proptest::prelude::*;
 use std::f64::consts::PI;
 
@@ -31,7 +31,7 @@ fn samples(params: &Params, rows: &[SubStep], count: usize) -> Vec<Sample> {
         rows,
     };
     assert_eq!(unit.blocks(), 0);
-    unit.sample(Path::widest(), &body, &[], &mut [0.0; 8], &mut out);
+    unit.sample(Path::widest(), &body, Drawn::new(&[], 0), &mut [0.0; 8], &mut out);
     out
 }
 
@@ -160,10 +160,10 @@ fn values_are_multiples_of_the_resolution_within_the_range() {
     assert_eq!(read[..6], [10.0, -9.75, 50.0, 1.0, -1.0, 0.0]);
 }
 
-fn blocks(unit: &Unit, id_hash: u64, first: u32) -> Vec<Block> {
+fn blocks(unit: &Unit, id_hash: u64, first: u32) -> Vec<Lanes> {
     let mut draws = Draws::default();
-    unit.ask(&mut draws, id_hash, first);
-    draws.draw(1).to_vec()
+    unit.plan(&mut draws, first);
+    draws.draw(1, &[id_hash; LANES]).to_vec()
 }
 
 /// Standard deviation and density add as variances; constant biases stay; every axis has its own noise.
@@ -190,7 +190,7 @@ fn white_noise_has_the_configured_level_on_every_axis() {
     };
     let normals = blocks(&unit, 3, 0);
     assert_eq!((unit.blocks(), normals.len()), (2 * N, 2 * N));
-    unit.sample(Path::widest(), &body, &normals, &mut [0.0; 8], &mut out);
+    unit.sample(Path::widest(), &body, Drawn::new(&normals, 5), &mut [0.0; 8], &mut out);
     let stds = [0.5, 0.2, 0.1, 0.1, 0.2, 0.3, 0.05];
     let means = [1.0, -2.0, 0.0, 0.0, 0.0, 0.5, 1.0];
     let n = N as f64;
@@ -241,12 +241,18 @@ fn biases_walk_and_remember() {
             short.sample(
                 Path::widest(),
                 &body,
-                &blocks(&short, id, tick * 10),
+                Drawn::new(&blocks(&short, id, tick * 10), 0),
                 &mut walk,
                 &mut few,
             );
         }
-        long.sample(Path::widest(), &body, &blocks(&long, id, 0), &mut whole, &mut many);
+        long.sample(
+            Path::widest(),
+            &body,
+            Drawn::new(&blocks(&long, id, 0), 0),
+            &mut whole,
+            &mut many,
+        );
         assert_eq!(walk, whole);
         assert_eq!(few[9], many[99]);
         assert_eq!(few[9][0], walk[0]);
@@ -269,5 +275,49 @@ fn streams_are_independent_of_how_many_are_asked_for() {
         id_hash: 3,
         sensor: Sensor::ImuFront,
     };
-    assert_eq!(alone[0], stream.normals(77));
+    assert_eq!(alone[0][0], stream.normals(77));
+}
+
+/// Everything on, over ticks of several sub-steps: the vectors' bits are the plain ones.
+#[test]
+fn every_path_gives_the_same_samples() {
+    let params = Params {
+        period_s: 0.01,
+        convention: ImuConvention::Carla,
+        accel_bias_walk: [0.2; 3],
+        accel_resolution_mps2: [0.01, 0.0, 0.02],
+        accel_range_mps2: [10.0; 3],
+        gyro_noise_density: [0.01; 3],
+        gyro_bias_walk: [0.1; 3],
+        compass_noise_std_rad: 0.3,
+        ..town().imu
+    };
+    let rows: Vec<SubStep> = (0..40_u8)
+        .map(|i| SubStep {
+            accel_body_mps2: [f32::from(i) * 0.37, -f32::from(i), 0.1],
+            angular_rate_body_radps: [0.1, -0.2, f32::from(i) * 0.01],
+            roll_rad: f32::from(i) * 0.01,
+            pitch_rad: f32::from(i) * -0.02,
+            dyaw_rad: f32::from(i) * 0.3,
+            ..SubStep::default()
+        })
+        .collect();
+    for samples in [1, 10, 20, 40] {
+        let unit = Unit::new(&params, samples);
+        let normals = blocks(&unit, 3, 100);
+        let on = |path| {
+            let (mut walk, mut out) = ([0.5; 8], vec![[0.0; 7]; samples]);
+            let body = Body {
+                yaw_rad: 2.0,
+                rows: &rows,
+            };
+            unit.sample(path, &body, Drawn::new(&normals, 9), &mut walk, &mut out);
+            let bits: Vec<u32> = walk.iter().chain(out.as_flattened()).map(|v| v.to_bits()).collect();
+            bits
+        };
+        let plain = on(Path::Plain);
+        for path in Path::available() {
+            assert!(on(path) == plain, "{path:?} of {samples}");
+        }
+    }
 }
