@@ -14,7 +14,7 @@ use ipc_schema::{
 };
 
 use crate::{
-    noise::{Drawn, Draws, Sensor},
+    noise::{Draws, Sensor},
     normals::{Block, LANES, cos_sin},
     wide::{Path, Work},
 };
@@ -36,23 +36,22 @@ const FELT: usize = 8;
 pub struct Unit {
     samples: usize,
     /// Sign of each axis; 0 where a sub-step holds something else.
-    signs: Axes,
+    signs: Pair,
     gravity_mps2: f32,
-    bias: Axes,
-    white: Axes,
-    walk: Axes,
-    range: Axes,
-    resolution: Axes,
+    bias: Pair,
+    white: Pair,
+    walk: Pair,
+    range: Pair,
+    resolution: Pair,
     /// The same, 1 where there is none.
-    divisor: Axes,
+    divisor: Pair,
     /// True if any axis has a resolution.
     is_stepped: bool,
-    /// True for halves of the axes, first white then walk, that have noise.
-    noisy: [bool; 4],
+    /// True if any axis has white noise.
+    is_noisy: bool,
+    /// True if any bias walks.
+    is_walking: bool,
 }
-
-/// Streams of the halves of the axes.
-const STREAMS: [Sensor; 4] = [Sensor::ImuFront, Sensor::ImuBack, Sensor::WalkFront, Sensor::WalkBack];
 
 /// Where a body is at the end of a tick, and how it got there.
 #[derive(Debug, Clone, Copy)]
@@ -63,10 +62,14 @@ pub struct Body<'a> {
     pub rows: &'a [SubStep],
 }
 
-fn axes(accel: [f64; 3], gyro: [f64; 3], compass: f64) -> Axes {
+fn axes(accel: [f64; 3], gyro: [f64; 3], compass: f64) -> Pair {
     let [ax, ay, az] = accel.map(|value| value as f32);
     let [gx, gy, gz] = gyro.map(|value| value as f32);
-    [ax, ay, az, gx, gy, gz, compass as f32, 0.0]
+    twice([ax, ay, az, gx, gy, gz, compass as f32, 0.0])
+}
+
+fn twice(axes: Axes) -> Pair {
+    bytemuck::must_cast([axes, axes])
 }
 
 /// The largest multiple of `resolution` within `range`: where a sensor saturates.
@@ -99,10 +102,10 @@ impl Unit {
             0.0,
         );
         let resolution = axes(params.accel_resolution_mps2, params.gyro_resolution_radps, 0.0);
-        let any = |axes: &[f32]| axes.iter().any(|std| *std > 0.0);
+        let any = |axes: &Pair| axes.iter().any(|std| *std > 0.0);
         Self {
             samples: samples.max(1),
-            signs: signs(params.convention),
+            signs: twice(signs(params.convention)),
             gravity_mps2: match params.convention {
                 ImuConvention::Kinematic => 0.0,
                 ImuConvention::SpecificForce | ImuConvention::Carla => GRAVITY_MPS2 as f32,
@@ -118,48 +121,55 @@ impl Unit {
             resolution,
             divisor: resolution.map(|step| if step > 0.0 { step } else { 1.0 }),
             is_stepped: any(&resolution),
-            noisy: [any(&white[..4]), any(&white[4..]), any(&walk[..4]), any(&walk[4..])],
+            is_noisy: any(&white),
+            is_walking: any(&walk),
         }
     }
 
-    /// Plans the numbers of the samples from `first` on.
+    /// Plans the numbers of the samples from `first` on: white noise sample by sample, then the walk, two blocks each.
     pub fn plan(&self, draws: &mut Draws, first: u32) {
-        for (stream, noisy) in STREAMS.into_iter().zip(self.noisy) {
-            if noisy {
-                draws.plan(stream, first, self.samples);
+        let streams = [
+            (self.is_noisy, [Sensor::ImuFront, Sensor::ImuBack]),
+            (self.is_walking, [Sensor::WalkFront, Sensor::WalkBack]),
+        ];
+        for (is_on, halves) in streams {
+            for sample in (0_u32..).take(if is_on { self.samples } else { 0 }) {
+                for half in halves {
+                    draws.plan(half, first.wrapping_add(sample));
+                }
             }
         }
     }
 
-    /// How many blocks [`Unit::plan`] plans.
-    #[must_use]
-    pub fn blocks(&self) -> usize {
-        self.noisy.iter().filter(|noisy| **noisy).count() * self.samples
-    }
-
-    /// The samples of a tick, oldest first, into `out` (one place for each); `walk` is what the biases have walked so far.
+    /// The samples of a tick, oldest first, into `out` (one place for each), with the numbers that were planned; `walk` is what the
+    /// biases have walked so far.
     ///
     /// A sample over several sub-steps is the mean of their accelerations and rates; gravity and heading are those at its end.
     #[inline]
-    pub fn sample(&self, path: Path, body: &Body, drawn: Drawn, walk: &mut Axes, out: &mut [Sample]) {
+    pub fn sample(&self, path: Path, body: &Body, normals: &[Block], walk: &mut Axes, out: &mut [Sample]) {
         path.run(Samples {
             unit: self,
             body,
-            drawn,
+            normals: normals.as_flattened(),
             walk,
             out,
         });
     }
 }
 
-/// The samples of one tick, with the widest vectors: [`LANES`] of them in one pass after the other, each a loop over plain arrays.
+/// The samples of one tick, with the widest vectors: [`LANES`] of them, in one pass after the other over plain arrays.
 struct Samples<'a> {
     unit: &'a Unit,
     body: &'a Body<'a>,
-    drawn: Drawn<'a>,
+    normals: &'a [f32],
     walk: &'a mut Axes,
     out: &'a mut [Sample],
 }
+
+/// Numbers of two samples: one register of AVX-512.
+type Pair = [f32; 16];
+/// Numbers of [`LANES`] samples.
+type Values = [Pair; LANES / 2];
 
 impl Work for Samples<'_> {
     type Output = ();
@@ -167,85 +177,108 @@ impl Work for Samples<'_> {
     #[inline(always)]
     fn run(self) {
         let (unit, rows) = (self.unit, self.body.rows);
-        let mut drawn = self.drawn;
-        let [front, back, walk_front, walk_back] = unit
-            .noisy
-            .map(|noisy| drawn.split(if noisy { unit.samples } else { 0 }));
         let steps = (rows.len() / unit.samples).max(1);
-        let mut values = [[0.0; 8]; LANES];
+        let of_all = |is_on: bool| if is_on { 8 * unit.samples } else { 0 };
+        let (mut white, rest) = self.normals.split_at(of_all(unit.is_noisy).min(self.normals.len()));
+        let mut drift = &rest[..of_all(unit.is_walking).min(rest.len())];
+        let mut values: Values = [[0.0; 16]; LANES / 2];
         let mut first = 0;
         for some in self.out.chunks_mut(LANES) {
-            let count = some.len();
-            let values = &mut values[..count];
+            let values = &mut values[..some.len().div_ceil(2)];
             // With fewer sub-steps than samples, the last ones see the newest that there is.
-            let place = |i: usize| (first + i) * steps;
-            let rows_of = |i: usize| &rows[place(i).min(rows.len() - steps)..][..steps];
-            for (i, value) in values.iter_mut().enumerate() {
-                *value = mean(rows_of(i));
+            let rows_of = |i: usize| &rows[((first + i) * steps).min(rows.len() - steps)..][..steps];
+            for i in 0..some.len() {
+                values[i / 2][8 * (i % 2)..][..8].copy_from_slice(&mean(rows_of(i)));
             }
             if unit.gravity_mps2 != 0.0 {
-                add_gravity(unit.gravity_mps2, &rows_of, values);
+                add_gravity(unit.gravity_mps2, some.len(), &rows_of, values);
             }
-            unit.err(values);
-            if unit.noisy[2] || unit.noisy[3] {
-                for (i, value) in values.iter_mut().enumerate() {
-                    let drift = join(walk_front.at(first + i), walk_back.at(first + i));
-                    for axis in 0..8 {
-                        self.walk[axis] += unit.walk[axis] * drift[axis];
-                        value[axis] += self.walk[axis];
-                    }
-                }
-            }
-            if !(front.is_empty() && back.is_empty()) {
-                for (i, value) in values.iter_mut().enumerate() {
-                    let white = join(front.at(first + i), back.at(first + i));
-                    for axis in 0..8 {
-                        value[axis] += unit.white[axis] * white[axis];
-                    }
-                }
+            unit.err(take(&mut white, values.len()), values);
+            if unit.is_walking {
+                unit.walk(take(&mut drift, values.len()), self.walk, values);
             }
             unit.deliver(values);
-            for (i, (out, value)) in some.iter_mut().zip(&*values).enumerate() {
+            for (i, out) in some.iter_mut().enumerate() {
+                let value = &values[i / 2][8 * (i % 2)..];
                 out.copy_from_slice(&value[..IMU_COLUMNS]);
                 let yaw_rad = self.body.yaw_rad + f64::from(rows_of(i)[steps - 1].dyaw_rad);
                 out[COMPASS] = compass_rad(yaw_rad, f64::from(value[COMPASS]));
             }
-            first += count;
+            first += some.len();
+        }
+    }
+}
+
+/// The front of `numbers` for so many pairs, or what there is.
+#[inline(always)]
+fn take<'n>(numbers: &mut &'n [f32], pairs: usize) -> &'n [f32] {
+    let (front, rest) = numbers.split_at((16 * pairs).min(numbers.len()));
+    *numbers = rest;
+    front
+}
+
+/// The numbers of a pair of samples; zeros where there are none.
+#[inline(always)]
+fn pair(numbers: &[f32], index: usize) -> Pair {
+    let numbers = &numbers[(16 * index).min(numbers.len())..];
+    match numbers.first_chunk() {
+        Some(pair) => *pair,
+        None => {
+            let mut pair = [0.0; 16];
+            pair[..numbers.len()].copy_from_slice(numbers);
+            pair
         }
     }
 }
 
 impl Unit {
-    /// From what the body feels to the sensor's axes, with constant biases.
+    /// From what the body feels to the sensor's axes, with constant biases and white noise.
     #[inline(always)]
-    fn err(&self, values: &mut [Axes]) {
-        for value in values {
-            for axis in 0..8 {
-                value[axis] = value[axis] * self.signs[axis] + self.bias[axis];
+    fn err(&self, normals: &[f32], values: &mut [Pair]) {
+        for (index, value) in values.iter_mut().enumerate() {
+            let normals = pair(normals, index);
+            for i in 0..16 {
+                value[i] = value[i] * self.signs[i] + (self.bias[i] + self.white[i] * normals[i]);
             }
         }
     }
 
-    /// From values to what leaves the sensor: multiples of the resolution within the range.
+    /// Lets the biases walk from sample to sample.
     #[inline(always)]
-    fn deliver(&self, values: &mut [Axes]) {
-        if self.is_stepped {
-            for value in &mut *values {
+    fn walk(&self, normals: &[f32], walk: &mut Axes, values: &mut [Pair]) {
+        let mut walked = *walk;
+        for (index, value) in values.iter_mut().enumerate() {
+            let normals = pair(normals, index);
+            let mut step = [0.0; 16];
+            for i in 0..16 {
+                step[i] = self.walk[i] * normals[i];
+            }
+            for half in [0, 8] {
                 for axis in 0..8 {
-                    let stepped = (value[axis] / self.divisor[axis]).round_ties_even() * self.divisor[axis];
-                    value[axis] = if self.resolution[axis] > 0.0 {
-                        stepped
-                    } else {
-                        value[axis]
-                    };
+                    walked[axis] += step[half + axis];
+                }
+                for axis in 0..8 {
+                    value[half + axis] += walked[axis];
                 }
             }
         }
+        *walk = walked;
+    }
+
+    /// From values to what leaves the sensor: multiples of the resolution within the range.
+    #[inline(always)]
+    fn deliver(&self, values: &mut [Pair]) {
         for value in values {
-            for axis in 0..8 {
-                let most = self.range[axis];
-                let below = if value[axis] > most { most } else { value[axis] };
-                value[axis] = if below < -most { -most } else { below };
+            if self.is_stepped {
+                for i in 0..16 {
+                    let stepped = (value[i] / self.divisor[i]).round_ties_even() * self.divisor[i];
+                    value[i] = if self.resolution[i] > 0.0 { stepped } else { value[i] };
+                }
+            }
+            for i in 0..16 {
+                let most = self.range[i];
+                let below = if value[i] > most { most } else { value[i] };
+                value[i] = if below < -most { -most } else { below };
             }
         }
     }
@@ -268,11 +301,6 @@ fn mean(rows: &[SubStep]) -> Axes {
     sum
 }
 
-#[inline(always)]
-fn join(front: Block, back: Block) -> Axes {
-    bytemuck::must_cast([front, back])
-}
-
 /// Signs of the axes of a convention against x forward, y left, z up.
 ///
 /// CARLA's sensors live in Unreal's left-handed frame, x forward, y right, z up (CARLA's documentation, "Sensors reference", IMU;
@@ -289,9 +317,9 @@ fn signs(convention: ImuConvention) -> Axes {
 /// Adds what an accelerometer feels of gravity at the end of each sample: the upward reaction, turned into the body (roll and pitch
 /// small or large).
 #[inline(always)]
-fn add_gravity<'r>(gravity_mps2: f32, rows_of: &impl Fn(usize) -> &'r [SubStep], values: &mut [Axes]) {
+fn add_gravity<'r>(gravity_mps2: f32, samples: usize, rows_of: &impl Fn(usize) -> &'r [SubStep], values: &mut [Pair]) {
     let (mut roll, mut pitch): ([u32; LANES], [u32; LANES]) = ([0; LANES], [0; LANES]);
-    for (i, (roll, pitch)) in roll.iter_mut().zip(&mut pitch).take(values.len()).enumerate() {
+    for (i, (roll, pitch)) in roll.iter_mut().zip(&mut pitch).take(samples).enumerate() {
         if let Some(end) = rows_of(i).last() {
             (*roll, *pitch) = (turns(end.roll_rad), turns(end.pitch_rad));
         }
@@ -304,9 +332,9 @@ fn add_gravity<'r>(gravity_mps2: f32, rows_of: &impl Fn(usize) -> &'r [SubStep],
         gravity[1][lane] = gravity_mps2 * cos_pitch * sin_roll;
         gravity[2][lane] = gravity_mps2 * cos_pitch * cos_roll;
     }
-    for (i, value) in values.iter_mut().enumerate() {
+    for i in 0..samples {
         for axis in 0..3 {
-            value[axis] += gravity[axis][i];
+            values[i / 2][8 * (i % 2) + axis] += gravity[axis][i];
         }
     }
 }

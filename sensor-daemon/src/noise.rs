@@ -1,7 +1,7 @@
 //! Counter-based random numbers: a value depends on what it is for, never on when or in which order it is drawn.
 
 use crate::{
-    normals::{self, Block, LANES, Lanes, Purpose},
+    normals::{self, Block, LANES, Purpose},
     wide::Path,
 };
 
@@ -83,7 +83,7 @@ impl Stream {
 pub struct Draws {
     path: Path,
     plan: Vec<Purpose>,
-    blocks: Vec<Lanes>,
+    blocks: Vec<Block>,
 }
 
 impl Default for Draws {
@@ -108,68 +108,25 @@ impl Draws {
         self.plan.clear();
     }
 
-    /// Plans `count` samples of a sensor from `first` on.
-    pub fn plan(&mut self, sensor: Sensor, first: u32, count: usize) {
-        let samples = (0_u32..).take(count);
-        self.plan
-            .extend(samples.map(|sample| [first.wrapping_add(sample), sensor as u32]));
+    /// Plans a sample of a sensor.
+    pub fn plan(&mut self, sensor: Sensor, sample: u32) {
+        self.plan.push([sample, sensor as u32]);
     }
 
-    /// Draws everything that is planned, in that order, for the vehicles with these ids.
-    pub fn draw(&mut self, episode_seed: u64, ids: &[u64; LANES]) -> &[Lanes] {
-        self.blocks.resize(self.plan.len(), [[0.0; 4]; LANES]);
+    /// Draws everything that is planned for the vehicles with these ids.
+    pub fn draw(&mut self, episode_seed: u64, ids: &[u64; LANES]) {
+        self.blocks.resize(LANES * self.plan.len(), [0.0; 4]);
         normals::fill(self.path, key(episode_seed), ids, &self.plan, &mut self.blocks);
-        &self.blocks
     }
-}
 
-/// One vehicle's share of what has been drawn for a group, taken from the front.
-#[derive(Debug, Clone, Copy)]
-pub struct Drawn<'a> {
-    blocks: &'a [Lanes],
-    lane: usize,
-}
-
-impl<'a> Drawn<'a> {
-    /// The share of the vehicle in `lane`.
+    /// What has been drawn for the vehicle in `lane`, in the order of the plan.
     #[must_use]
     #[inline]
-    pub fn new(blocks: &'a [Lanes], lane: usize) -> Self {
-        Self {
-            blocks,
-            lane: lane % LANES,
-        }
-    }
-
-    /// The next block if one was planned, else zeros.
-    #[inline]
-    pub fn take(&mut self, is_planned: bool) -> Block {
-        if is_planned { self.split(1).at(0) } else { [0.0; 4] }
-    }
-
-    /// The next `count` blocks, or as many as there are.
-    #[must_use]
-    #[inline(always)]
-    pub fn split(&mut self, count: usize) -> Self {
-        let (blocks, rest) = self.blocks.split_at(count.min(self.blocks.len()));
-        self.blocks = rest;
-        Self { blocks, ..*self }
-    }
-
-    /// The block at an index; zeros behind the last.
-    #[must_use]
-    #[inline(always)]
-    pub fn at(&self, index: usize) -> Block {
+    pub fn of(&self, lane: usize) -> &[Block] {
+        let planned = self.plan.len();
         self.blocks
-            .get(index)
-            .map_or([0.0; 4], |lanes| lanes[self.lane % LANES])
-    }
-
-    /// True if there are no blocks.
-    #[must_use]
-    #[inline(always)]
-    pub fn is_empty(&self) -> bool {
-        self.blocks.is_empty()
+            .get(lane * planned..(lane + 1) * planned)
+            .unwrap_or_default()
     }
 }
 
@@ -229,23 +186,17 @@ mod tests {
     #[test]
     fn draws_are_the_streams_own_numbers() {
         let mut draws = Draws::default();
+        assert!(draws.of(3).is_empty());
         let mut ids = [9; LANES];
         (ids[3], ids[15]) = (7, u64::MAX - 5);
         for round in 0..3_u32 {
             draws.clear();
-            draws.plan(Sensor::Gnss, round, 1);
-            draws.plan(Sensor::ImuBack, u32::MAX, 20);
-            let blocks = draws.draw(42, &ids);
-            assert_eq!(blocks.len(), 21);
-            let mut mine = Drawn::new(blocks, 3);
-            assert_eq!(mine.take(false), [0.0; 4]);
-            assert_eq!(mine.take(true), stream(7, Sensor::Gnss).normals(round));
-            let mut other = Drawn::new(blocks, 15);
-            let _ = other.take(true);
-            let imu = other.split(20);
-            assert_eq!(imu.at(2), stream(u64::MAX - 5, Sensor::ImuBack).normals(1));
-            assert_eq!((imu.at(20), other.take(true)), ([0.0; 4], [0.0; 4]));
-            assert!(other.is_empty() && !imu.is_empty());
+            draws.plan(Sensor::Gnss, round);
+            draws.plan(Sensor::ImuBack, u32::MAX);
+            draws.draw(42, &ids);
+            assert_eq!(draws.of(3)[0], stream(7, Sensor::Gnss).normals(round));
+            let back = stream(u64::MAX - 5, Sensor::ImuBack).normals(u32::MAX);
+            assert_eq!(draws.of(15)[1..], [back]);
         }
     }
 

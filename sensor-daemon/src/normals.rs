@@ -12,9 +12,6 @@ pub const LANES: usize = 16;
 /// Four independent standard normal numbers.
 pub type Block = [f32; 4];
 
-/// Blocks of all lanes for one counter of theirs.
-pub type Lanes = [Block; LANES];
-
 /// What the numbers of all lanes are for: the first two words of their counters.
 pub type Purpose = [u32; 2];
 
@@ -100,7 +97,8 @@ struct Normals<'a> {
     /// The last two words of each lane's counters.
     ids: [[u32; LANES]; 2],
     purposes: &'a [Purpose],
-    blocks: &'a mut [Lanes],
+    /// As many for each lane as there are purposes, lane by lane.
+    blocks: &'a mut [Block],
 }
 
 impl Work for Normals<'_> {
@@ -109,7 +107,8 @@ impl Work for Normals<'_> {
     #[inline(always)]
     fn run(self) {
         let [low, high] = self.ids;
-        for ([sample, sensor], blocks) in self.purposes.iter().zip(self.blocks) {
+        let stride = self.purposes.len();
+        for (purpose, [sample, sensor]) in self.purposes.iter().enumerate() {
             let mut words = [[0_u32; LANES]; 4];
             for lane in 0..LANES {
                 let word = philox4x32([*sample, *sensor, low[lane], high[lane]], self.key);
@@ -122,15 +121,19 @@ impl Work for Normals<'_> {
                 (numbers[0][lane], numbers[1][lane]) = box_muller(words[0][lane], words[1][lane]);
                 (numbers[2][lane], numbers[3][lane]) = box_muller(words[2][lane], words[3][lane]);
             }
+            let mut together = [[0.0; 4]; LANES];
             for lane in 0..LANES {
-                blocks[lane] = [numbers[0][lane], numbers[1][lane], numbers[2][lane], numbers[3][lane]];
+                together[lane] = [numbers[0][lane], numbers[1][lane], numbers[2][lane], numbers[3][lane]];
+            }
+            for (place, block) in self.blocks[purpose..].iter_mut().step_by(stride).zip(together) {
+                *place = block;
             }
         }
     }
 }
 
-/// Fills `blocks`, one for each purpose, for the vehicles with these ids, on the given path.
-pub fn fill(path: Path, key: [u32; 2], ids: &[u64; LANES], purposes: &[Purpose], blocks: &mut [Lanes]) {
+/// Fills `blocks` for the vehicles with these ids, on the given path: for each of them, one behind the other, one for each purpose.
+pub fn fill(path: Path, key: [u32; 2], ids: &[u64; LANES], purposes: &[Purpose], blocks: &mut [Block]) {
     path.run(Normals {
         key,
         ids: [ids.map(|id| id as u32), ids.map(|id| (id >> 32) as u32)],
@@ -206,10 +209,10 @@ mod tests {
         let ids: [u64; LANES] = std::array::from_fn(|lane| (lane as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let key = [7, 0xDEAD_BEEF];
         for path in Path::available() {
-            let mut blocks = vec![[[0.0; 4]; LANES]; PURPOSES];
+            let mut blocks = vec![[0.0; 4]; LANES * PURPOSES];
             fill(path, key, &ids, &purposes, &mut blocks);
-            for ([sample, sensor], lanes) in purposes.iter().zip(&blocks) {
-                for (id, numbers) in ids.iter().zip(lanes) {
+            for (id, own) in ids.iter().zip(blocks.chunks_exact(PURPOSES)) {
+                for ([sample, sensor], numbers) in purposes.iter().zip(own) {
                     let alone = block([*sample, *sensor, *id as u32, (id >> 32) as u32], key);
                     assert_eq!(numbers.map(f32::to_bits), alone.map(f32::to_bits), "{path:?}");
                 }

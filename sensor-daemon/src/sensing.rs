@@ -16,8 +16,8 @@ use crate::{
     fields::Normaliser,
     gnss::Sky,
     history::{First, History},
-    noise::{Drawn, Draws},
-    normals::LANES,
+    noise::Draws,
+    normals::{Block, LANES},
     sections::Sections,
     slots::Slots,
     suite::{Motion, Now, Suite},
@@ -219,9 +219,9 @@ impl Sensing {
         self.suite.plan(&mut draws, &now);
         for first in (0..n).step_by(LANES) {
             let ids = std::array::from_fn(|lane| self.id_hash(first + lane, world));
-            let blocks = draws.draw(now.episode_seed, &ids);
+            draws.draw(now.episode_seed, &ids);
             for slot in first..n.min(first + LANES) {
-                self.sense(slot, world, &now, Drawn::new(blocks, slot - first), &mut sections);
+                self.sense(slot, world, &now, draws.of(slot - first), &mut sections);
             }
         }
         self.draws = draws;
@@ -237,7 +237,7 @@ impl Sensing {
     }
 
     /// Samples and writes one slot with the numbers drawn for it.
-    fn sense(&mut self, slot: usize, world: &World, now: &Now, drawn: Drawn, out: &mut Sections) {
+    fn sense(&mut self, slot: usize, world: &World, now: &Now, drawn: &[Block], out: &mut Sections) {
         let lent = self.slots.rows()[slot];
         out.vehicle[slot] = lent.vehicle;
         out.flags[slot] = lent.ended;

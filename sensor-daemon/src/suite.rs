@@ -13,7 +13,7 @@ use crate::{
     carrier::Carrier,
     gnss::{self, Receiver, Sky, SkyView},
     imu::{self, Unit},
-    noise::{Drawn, Draws, Sensor, Stream},
+    noise::{Draws, Sensor, Stream},
     normals::Block,
     speed_steering::{self, Scales},
     wide::Path,
@@ -141,13 +141,13 @@ impl Suite {
     /// Plans the numbers that [`Suite::sample`] takes at this tick if everything is due, with those first that are always needed.
     pub fn plan(&self, draws: &mut Draws, now: &Now) {
         if self.receiver.has_white_noise() {
-            draws.plan(Sensor::Gnss, now.tick, 1);
+            draws.plan(Sensor::Gnss, now.tick);
         }
         if self.receiver.has_correlated_noise() {
-            draws.plan(Sensor::GnssCorrelated, now.tick, 1);
+            draws.plan(Sensor::GnssCorrelated, now.tick);
         }
         if self.speed_steering_noise {
-            draws.plan(Sensor::SpeedSteering, now.tick, 1);
+            draws.plan(Sensor::SpeedSteering, now.tick);
         }
         self.unit.plan(draws, now.tick.wrapping_mul(self.imu_samples));
     }
@@ -162,21 +162,28 @@ impl Suite {
     /// Samples what is due with the numbers drawn for its carrier; the IMU's samples of the tick go to `out`. Processes with a memory go
     /// on in a blackout, whose end does not show how long it was.
     #[inline]
-    pub fn sample(&self, carrier: &mut Carrier, motion: &Motion, now: &Now, mut drawn: Drawn, out: &mut [imu::Sample]) {
+    pub fn sample(
+        &self,
+        carrier: &mut Carrier,
+        motion: &Motion,
+        now: &Now,
+        mut drawn: &[Block],
+        out: &mut [imu::Sample],
+    ) {
         let (step, awake) = (motion.step, carrier.awake());
         let normals = [
             self.receiver.has_white_noise(),
             self.receiver.has_correlated_noise(),
             self.speed_steering_noise,
         ]
-        .map(|is_planned| drawn.take(is_planned));
+        .map(|is_planned| take(&mut drawn, is_planned));
         if self.is_due(0, step) {
-            self.sample_gnss(carrier, motion, now, awake & GNSS != 0, [&normals[0], &normals[1]]);
+            self.sample_gnss(carrier, motion, now, awake & GNSS != 0, [normals[0], normals[1]]);
         }
         if self.is_due(2, step) && awake & SPEED_STEERING != 0 {
             let (params, ratio) = (&self.speed_steering, self.steering_ratio);
             carrier.readings.speed_steering =
-                speed_steering::sample(params, ratio, &carrier.scales, motion.state, &normals[2]);
+                speed_steering::sample(params, ratio, &carrier.scales, motion.state, normals[2]);
             carrier.note(2, step);
         }
         self.sample_imu(carrier, motion, awake & IMU != 0, drawn, out);
@@ -230,7 +237,7 @@ impl Suite {
         carrier: &mut Carrier,
         motion: &Motion,
         is_awake: bool,
-        drawn: Drawn,
+        drawn: &[Block],
         out: &mut [imu::Sample],
     ) {
         if self.is_due(1, motion.step) {
@@ -246,6 +253,18 @@ impl Suite {
             }
         }
         out.fill(carrier.readings.imu);
+    }
+}
+
+/// The next block if one was planned, else zeros.
+#[inline]
+fn take<'b>(drawn: &mut &'b [Block], is_planned: bool) -> &'b Block {
+    match drawn.split_first() {
+        Some((block, rest)) if is_planned => {
+            *drawn = rest;
+            block
+        }
+        _ => &[0.0; 4],
     }
 }
 
