@@ -14,8 +14,8 @@ use ipc_schema::{
 };
 
 use crate::{
-    noise::{Draws, Sensor},
-    normals::{Block, LANES, cos_sin},
+    noise::{Drawn, Draws, Sensor},
+    normals::{LANES, cos_sin},
     wide::{Path, Work},
 };
 
@@ -28,8 +28,6 @@ pub type Axes = [f32; 8];
 pub type Sample = [f32; IMU_COLUMNS];
 
 const COMPASS: usize = 6;
-/// Place of [`SubStep::accel_body_mps2`] among a sub-step's numbers; the angular rate follows it.
-const FELT: usize = 8;
 
 /// An IMU as configured.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,9 +40,10 @@ pub struct Unit {
     white: Pair,
     walk: Pair,
     range: Pair,
-    resolution: Pair,
-    /// The same, 1 where there is none.
+    /// Resolution, 1 where there is none.
     divisor: Pair,
+    /// All bits where there is a resolution.
+    stepped: [u32; 16],
     /// True if any axis has a resolution.
     is_stepped: bool,
     /// True if any axis has white noise.
@@ -118,8 +117,8 @@ impl Unit {
                 limits(params.gyro_range_radps, params.gyro_resolution_radps),
                 f64::from(f32::MAX),
             ),
-            resolution,
             divisor: resolution.map(|step| if step > 0.0 { step } else { 1.0 }),
+            stepped: resolution.map(|step| if step > 0.0 { u32::MAX } else { 0 }),
             is_stepped: any(&resolution),
             is_noisy: any(&white),
             is_walking: any(&walk),
@@ -146,11 +145,11 @@ impl Unit {
     ///
     /// A sample over several sub-steps is the mean of their accelerations and rates; gravity and heading are those at its end.
     #[inline]
-    pub fn sample(&self, path: Path, body: &Body, normals: &[Block], walk: &mut Axes, out: &mut [Sample]) {
+    pub fn sample(&self, path: Path, body: &Body, drawn: Drawn, walk: &mut Axes, out: &mut [Sample]) {
         path.run(Samples {
             unit: self,
             body,
-            normals: normals.as_flattened(),
+            drawn,
             walk,
             out,
         });
@@ -161,7 +160,7 @@ impl Unit {
 struct Samples<'a> {
     unit: &'a Unit,
     body: &'a Body<'a>,
-    normals: &'a [f32],
+    drawn: Drawn<'a>,
     walk: &'a mut Axes,
     out: &'a mut [Sample],
 }
@@ -178,24 +177,36 @@ impl Work for Samples<'_> {
     fn run(self) {
         let (unit, rows) = (self.unit, self.body.rows);
         let steps = (rows.len() / unit.samples).max(1);
-        let of_all = |is_on: bool| if is_on { 8 * unit.samples } else { 0 };
-        let (mut white, rest) = self.normals.split_at(of_all(unit.is_noisy).min(self.normals.len()));
-        let mut drift = &rest[..of_all(unit.is_walking).min(rest.len())];
+        let of_all = |is_on: bool| if is_on { 2 * unit.samples } else { 0 };
+        let mut drawn = self.drawn;
+        let white = drawn.split(of_all(unit.is_noisy));
+        let drift = drawn.split(of_all(unit.is_walking));
         let mut values: Values = [[0.0; 16]; LANES / 2];
         let mut first = 0;
         for some in self.out.chunks_mut(LANES) {
             let values = &mut values[..some.len().div_ceil(2)];
             // With fewer sub-steps than samples, the last ones see the newest that there is.
             let rows_of = |i: usize| &rows[((first + i) * steps).min(rows.len() - steps)..][..steps];
+            let gravity = if unit.gravity_mps2 == 0.0 {
+                [[0.0; LANES]; 3]
+            } else {
+                gravity_body(unit.gravity_mps2, some.len(), &rows_of)
+            };
             for i in 0..some.len() {
-                values[i / 2][8 * (i % 2)..][..8].copy_from_slice(&mean(rows_of(i)));
+                let felt = if steps == 1 {
+                    felt(&rows_of(i)[0])
+                } else {
+                    mean(rows_of(i))
+                };
+                let gravity = [gravity[0][i], gravity[1][i], gravity[2][i], 0.0, 0.0, 0.0, 0.0, 0.0];
+                let value = &mut values[i / 2][8 * (i % 2)..][..8];
+                for axis in 0..8 {
+                    value[axis] = felt[axis] + gravity[axis];
+                }
             }
-            if unit.gravity_mps2 != 0.0 {
-                add_gravity(unit.gravity_mps2, some.len(), &rows_of, values);
-            }
-            unit.err(take(&mut white, values.len()), values);
+            unit.err(white, 2 * first, values);
             if unit.is_walking {
-                unit.walk(take(&mut drift, values.len()), self.walk, values);
+                unit.walk(drift, 2 * first, self.walk, values);
             }
             unit.deliver(values);
             for (i, out) in some.iter_mut().enumerate() {
@@ -209,34 +220,12 @@ impl Work for Samples<'_> {
     }
 }
 
-/// The front of `numbers` for so many pairs, or what there is.
-#[inline(always)]
-fn take<'n>(numbers: &mut &'n [f32], pairs: usize) -> &'n [f32] {
-    let (front, rest) = numbers.split_at((16 * pairs).min(numbers.len()));
-    *numbers = rest;
-    front
-}
-
-/// The numbers of a pair of samples; zeros where there are none.
-#[inline(always)]
-fn pair(numbers: &[f32], index: usize) -> Pair {
-    let numbers = &numbers[(16 * index).min(numbers.len())..];
-    match numbers.first_chunk() {
-        Some(pair) => *pair,
-        None => {
-            let mut pair = [0.0; 16];
-            pair[..numbers.len()].copy_from_slice(numbers);
-            pair
-        }
-    }
-}
-
 impl Unit {
-    /// From what the body feels to the sensor's axes, with constant biases and white noise.
+    /// From what the body feels to the sensor's axes, with constant biases and white noise, whose blocks begin at `from`.
     #[inline(always)]
-    fn err(&self, normals: &[f32], values: &mut [Pair]) {
+    fn err(&self, white: Drawn, from: usize, values: &mut [Pair]) {
         for (index, value) in values.iter_mut().enumerate() {
-            let normals = pair(normals, index);
+            let normals = white.four(from + 4 * index);
             for i in 0..16 {
                 value[i] = value[i] * self.signs[i] + (self.bias[i] + self.white[i] * normals[i]);
             }
@@ -245,10 +234,10 @@ impl Unit {
 
     /// Lets the biases walk from sample to sample.
     #[inline(always)]
-    fn walk(&self, normals: &[f32], walk: &mut Axes, values: &mut [Pair]) {
+    fn walk(&self, drift: Drawn, from: usize, walk: &mut Axes, values: &mut [Pair]) {
         let mut walked = *walk;
         for (index, value) in values.iter_mut().enumerate() {
-            let normals = pair(normals, index);
+            let normals = drift.four(from + 4 * index);
             let mut step = [0.0; 16];
             for i in 0..16 {
                 step[i] = self.walk[i] * normals[i];
@@ -271,8 +260,10 @@ impl Unit {
         for value in values {
             if self.is_stepped {
                 for i in 0..16 {
+                    // Bits instead of a condition, which would become a branch for each axis.
                     let stepped = (value[i] / self.divisor[i]).round_ties_even() * self.divisor[i];
-                    value[i] = if self.resolution[i] > 0.0 { stepped } else { value[i] };
+                    let bits = (stepped.to_bits() & self.stepped[i]) | (value[i].to_bits() & !self.stepped[i]);
+                    value[i] = f32::from_bits(bits);
                 }
             }
             for i in 0..16 {
@@ -284,14 +275,21 @@ impl Unit {
     }
 }
 
+/// Acceleration and angular rate of a sub-step; what follows them has the sign 0.
+#[inline(always)]
+fn felt(row: &SubStep) -> Axes {
+    let [_, felt]: [Axes; 2] = bytemuck::must_cast(*row);
+    felt
+}
+
 /// Mean acceleration and angular rate over sub-steps.
 #[inline(always)]
 fn mean(rows: &[SubStep]) -> Axes {
     let mut sum = [0.0; 8];
     for row in rows {
-        let numbers: &[f32; 16] = bytemuck::must_cast_ref(row);
+        let felt = felt(row);
         for axis in 0..8 {
-            sum[axis] += numbers[FELT + axis];
+            sum[axis] += felt[axis];
         }
     }
     let share = 1.0 / rows.len() as f32;
@@ -314,10 +312,10 @@ fn signs(convention: ImuConvention) -> Axes {
     }
 }
 
-/// Adds what an accelerometer feels of gravity at the end of each sample: the upward reaction, turned into the body (roll and pitch
-/// small or large).
+/// What an accelerometer feels of gravity at the end of each sample: the upward reaction, turned into the body (roll and pitch small
+/// or large).
 #[inline(always)]
-fn add_gravity<'r>(gravity_mps2: f32, samples: usize, rows_of: &impl Fn(usize) -> &'r [SubStep], values: &mut [Pair]) {
+fn gravity_body<'r>(gravity_mps2: f32, samples: usize, rows_of: &impl Fn(usize) -> &'r [SubStep]) -> [[f32; LANES]; 3] {
     let (mut roll, mut pitch): ([u32; LANES], [u32; LANES]) = ([0; LANES], [0; LANES]);
     for (i, (roll, pitch)) in roll.iter_mut().zip(&mut pitch).take(samples).enumerate() {
         if let Some(end) = rows_of(i).last() {
@@ -332,11 +330,7 @@ fn add_gravity<'r>(gravity_mps2: f32, samples: usize, rows_of: &impl Fn(usize) -
         gravity[1][lane] = gravity_mps2 * cos_pitch * sin_roll;
         gravity[2][lane] = gravity_mps2 * cos_pitch * cos_roll;
     }
-    for i in 0..samples {
-        for axis in 0..3 {
-            values[i / 2][8 * (i % 2) + axis] += gravity[axis][i];
-        }
-    }
+    gravity
 }
 
 /// An angle in parts of 2⁻³² of a turn, whole turns left out. The last bit of a number between 2²⁰ and 2²¹ is one such part: the

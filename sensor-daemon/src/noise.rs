@@ -1,7 +1,7 @@
 //! Counter-based random numbers: a value depends on what it is for, never on when or in which order it is drawn.
 
 use crate::{
-    normals::{self, Block, LANES, Purpose},
+    normals::{self, Block, LANES, Lanes, Purpose},
     wide::Path,
 };
 
@@ -83,7 +83,7 @@ impl Stream {
 pub struct Draws {
     path: Path,
     plan: Vec<Purpose>,
-    blocks: Vec<Block>,
+    blocks: Vec<Lanes>,
 }
 
 impl Default for Draws {
@@ -115,18 +115,76 @@ impl Draws {
 
     /// Draws everything that is planned for the vehicles with these ids.
     pub fn draw(&mut self, episode_seed: u64, ids: &[u64; LANES]) {
-        self.blocks.resize(LANES * self.plan.len(), [0.0; 4]);
+        self.blocks.resize(self.plan.len(), [[0.0; 4]; LANES]);
         normals::fill(self.path, key(episode_seed), ids, &self.plan, &mut self.blocks);
     }
 
     /// What has been drawn for the vehicle in `lane`, in the order of the plan.
     #[must_use]
     #[inline]
-    pub fn of(&self, lane: usize) -> &[Block] {
-        let planned = self.plan.len();
-        self.blocks
-            .get(lane * planned..(lane + 1) * planned)
-            .unwrap_or_default()
+    pub fn of(&self, lane: usize) -> Drawn<'_> {
+        Drawn {
+            blocks: &self.blocks,
+            lane: lane % LANES,
+        }
+    }
+}
+
+/// One vehicle's share of what has been drawn for a group.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Drawn<'a> {
+    blocks: &'a [Lanes],
+    lane: usize,
+}
+
+impl Drawn<'_> {
+    /// Takes the next block if one was planned, else zeros.
+    #[inline]
+    pub fn take(&mut self, is_planned: bool) -> Block {
+        if is_planned { self.split(1).at(0) } else { [0.0; 4] }
+    }
+
+    /// Takes the next `count` blocks, or as many as there are.
+    #[must_use]
+    #[inline(always)]
+    pub fn split(&mut self, count: usize) -> Self {
+        let (blocks, rest) = self.blocks.split_at(count.min(self.blocks.len()));
+        self.blocks = rest;
+        Self { blocks, ..*self }
+    }
+
+    /// The block at an index; zeros behind the last.
+    #[must_use]
+    #[inline(always)]
+    pub fn at(&self, index: usize) -> Block {
+        match self.blocks.get(index) {
+            Some(lanes) => lanes[self.lane % LANES],
+            None => [0.0; 4],
+        }
+    }
+
+    /// Four blocks from an index on; zeros behind the last.
+    #[must_use]
+    #[inline(always)]
+    pub fn four(&self, index: usize) -> [f32; 16] {
+        let lane = self.lane % LANES;
+        let four = match self.blocks.get(index..index + 4) {
+            Some([a, b, c, d]) => [a[lane], b[lane], c[lane], d[lane]],
+            _ => [0, 1, 2, 3].map(|i| self.at(index + i)),
+        };
+        bytemuck::must_cast(four)
+    }
+
+    /// Number of blocks.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.blocks.len()
+    }
+
+    /// True if there are no blocks.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.blocks.is_empty()
     }
 }
 
@@ -194,9 +252,14 @@ mod tests {
             draws.plan(Sensor::Gnss, round);
             draws.plan(Sensor::ImuBack, u32::MAX);
             draws.draw(42, &ids);
-            assert_eq!(draws.of(3)[0], stream(7, Sensor::Gnss).normals(round));
+            assert_eq!(draws.of(3).at(0), stream(7, Sensor::Gnss).normals(round));
             let back = stream(u64::MAX - 5, Sensor::ImuBack).normals(u32::MAX);
-            assert_eq!(draws.of(15)[1..], [back]);
+            let mut drawn = draws.of(15);
+            let flat: [[f32; 4]; 4] = bytemuck::must_cast(drawn.four(1));
+            assert_eq!(flat, [back, [0.0; 4], [0.0; 4], [0.0; 4]]);
+            assert_eq!((drawn.len(), drawn.take(false)), (2, [0.0; 4]));
+            let _ = drawn.take(true);
+            assert_eq!((drawn.take(true), drawn.take(true)), (back, [0.0; 4]));
         }
     }
 

@@ -12,6 +12,9 @@ pub const LANES: usize = 16;
 /// Four independent standard normal numbers.
 pub type Block = [f32; 4];
 
+/// Blocks of all lanes for one purpose.
+pub type Lanes = [Block; LANES];
+
 /// What the numbers of all lanes are for: the first two words of their counters.
 pub type Purpose = [u32; 2];
 
@@ -97,8 +100,7 @@ struct Normals<'a> {
     /// The last two words of each lane's counters.
     ids: [[u32; LANES]; 2],
     purposes: &'a [Purpose],
-    /// As many for each lane as there are purposes, lane by lane.
-    blocks: &'a mut [Block],
+    blocks: &'a mut [Lanes],
 }
 
 impl Work for Normals<'_> {
@@ -107,8 +109,7 @@ impl Work for Normals<'_> {
     #[inline(always)]
     fn run(self) {
         let [low, high] = self.ids;
-        let stride = self.purposes.len();
-        for (purpose, [sample, sensor]) in self.purposes.iter().enumerate() {
+        for ([sample, sensor], blocks) in self.purposes.iter().zip(self.blocks) {
             let mut words = [[0_u32; LANES]; 4];
             for lane in 0..LANES {
                 let word = philox4x32([*sample, *sensor, low[lane], high[lane]], self.key);
@@ -121,19 +122,15 @@ impl Work for Normals<'_> {
                 (numbers[0][lane], numbers[1][lane]) = box_muller(words[0][lane], words[1][lane]);
                 (numbers[2][lane], numbers[3][lane]) = box_muller(words[2][lane], words[3][lane]);
             }
-            let mut together = [[0.0; 4]; LANES];
             for lane in 0..LANES {
-                together[lane] = [numbers[0][lane], numbers[1][lane], numbers[2][lane], numbers[3][lane]];
-            }
-            for (place, block) in self.blocks[purpose..].iter_mut().step_by(stride).zip(together) {
-                *place = block;
+                blocks[lane] = [numbers[0][lane], numbers[1][lane], numbers[2][lane], numbers[3][lane]];
             }
         }
     }
 }
 
-/// Fills `blocks` for the vehicles with these ids, on the given path: for each of them, one behind the other, one for each purpose.
-pub fn fill(path: Path, key: [u32; 2], ids: &[u64; LANES], purposes: &[Purpose], blocks: &mut [Block]) {
+/// Fills `blocks`, one for each purpose, for the vehicles with these ids, on the given path.
+pub fn fill(path: Path, key: [u32; 2], ids: &[u64; LANES], purposes: &[Purpose], blocks: &mut [Lanes]) {
     path.run(Normals {
         key,
         ids: [ids.map(|id| id as u32), ids.map(|id| (id >> 32) as u32)],
@@ -209,10 +206,10 @@ mod tests {
         let ids: [u64; LANES] = std::array::from_fn(|lane| (lane as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let key = [7, 0xDEAD_BEEF];
         for path in Path::available() {
-            let mut blocks = vec![[0.0; 4]; LANES * PURPOSES];
+            let mut blocks = vec![[[0.0; 4]; LANES]; PURPOSES];
             fill(path, key, &ids, &purposes, &mut blocks);
-            for (id, own) in ids.iter().zip(blocks.chunks_exact(PURPOSES)) {
-                for ([sample, sensor], numbers) in purposes.iter().zip(own) {
+            for ([sample, sensor], lanes) in purposes.iter().zip(&blocks) {
+                for (id, numbers) in ids.iter().zip(lanes) {
                     let alone = block([*sample, *sensor, *id as u32, (id >> 32) as u32], key);
                     assert_eq!(numbers.map(f32::to_bits), alone.map(f32::to_bits), "{path:?}");
                 }

@@ -16,8 +16,8 @@ use crate::{
     fields::Normaliser,
     gnss::Sky,
     history::{First, History},
-    noise::Draws,
-    normals::{Block, LANES},
+    noise::{Drawn, Draws},
+    normals::LANES,
     sections::Sections,
     slots::Slots,
     suite::{Motion, Now, Suite},
@@ -237,7 +237,7 @@ impl Sensing {
     }
 
     /// Samples and writes one slot with the numbers drawn for it.
-    fn sense(&mut self, slot: usize, world: &World, now: &Now, drawn: &[Block], out: &mut Sections) {
+    fn sense(&mut self, slot: usize, world: &World, now: &Now, drawn: Drawn, out: &mut Sections) {
         let lent = self.slots.rows()[slot];
         out.vehicle[slot] = lent.vehicle;
         out.flags[slot] = lent.ended;

@@ -13,7 +13,7 @@ use crate::{
     carrier::Carrier,
     gnss::{self, Receiver, Sky, SkyView},
     imu::{self, Unit},
-    noise::{Draws, Sensor, Stream},
+    noise::{Drawn, Draws, Sensor, Stream},
     normals::Block,
     speed_steering::{self, Scales},
     wide::Path,
@@ -162,28 +162,21 @@ impl Suite {
     /// Samples what is due with the numbers drawn for its carrier; the IMU's samples of the tick go to `out`. Processes with a memory go
     /// on in a blackout, whose end does not show how long it was.
     #[inline]
-    pub fn sample(
-        &self,
-        carrier: &mut Carrier,
-        motion: &Motion,
-        now: &Now,
-        mut drawn: &[Block],
-        out: &mut [imu::Sample],
-    ) {
+    pub fn sample(&self, carrier: &mut Carrier, motion: &Motion, now: &Now, mut drawn: Drawn, out: &mut [imu::Sample]) {
         let (step, awake) = (motion.step, carrier.awake());
         let normals = [
             self.receiver.has_white_noise(),
             self.receiver.has_correlated_noise(),
             self.speed_steering_noise,
         ]
-        .map(|is_planned| take(&mut drawn, is_planned));
+        .map(|is_planned| drawn.take(is_planned));
         if self.is_due(0, step) {
-            self.sample_gnss(carrier, motion, now, awake & GNSS != 0, [normals[0], normals[1]]);
+            self.sample_gnss(carrier, motion, now, awake & GNSS != 0, [&normals[0], &normals[1]]);
         }
         if self.is_due(2, step) && awake & SPEED_STEERING != 0 {
             let (params, ratio) = (&self.speed_steering, self.steering_ratio);
             carrier.readings.speed_steering =
-                speed_steering::sample(params, ratio, &carrier.scales, motion.state, normals[2]);
+                speed_steering::sample(params, ratio, &carrier.scales, motion.state, &normals[2]);
             carrier.note(2, step);
         }
         self.sample_imu(carrier, motion, awake & IMU != 0, drawn, out);
@@ -237,7 +230,7 @@ impl Suite {
         carrier: &mut Carrier,
         motion: &Motion,
         is_awake: bool,
-        drawn: &[Block],
+        drawn: Drawn,
         out: &mut [imu::Sample],
     ) {
         if self.is_due(1, motion.step) {
@@ -253,18 +246,6 @@ impl Suite {
             }
         }
         out.fill(carrier.readings.imu);
-    }
-}
-
-/// The next block if one was planned, else zeros.
-#[inline]
-fn take<'b>(drawn: &mut &'b [Block], is_planned: bool) -> &'b Block {
-    match drawn.split_first() {
-        Some((block, rest)) if is_planned => {
-            *drawn = rest;
-            block
-        }
-        _ => &[0.0; 4],
     }
 }
 

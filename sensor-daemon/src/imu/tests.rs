@@ -30,8 +30,8 @@ fn samples(params: &Params, rows: &[SubStep], count: usize) -> Vec<Sample> {
         yaw_rad: FRAC_PI_2,
         rows,
     };
-    assert!(blocks(&unit, 1, 0).is_empty());
-    unit.sample(Path::widest(), &body, &[], &mut [0.0; 8], &mut out);
+    assert!(blocks(&unit, 1, 0).of(0).is_empty());
+    unit.sample(Path::widest(), &body, Drawn::default(), &mut [0.0; 8], &mut out);
     out
 }
 
@@ -160,11 +160,11 @@ fn values_are_multiples_of_the_resolution_within_the_range() {
     assert_eq!(read[..6], [10.0, -9.75, 50.0, 1.0, -1.0, 0.0]);
 }
 
-fn blocks(unit: &Unit, id_hash: u64, first: u32) -> Vec<Block> {
+fn blocks(unit: &Unit, id_hash: u64, first: u32) -> Draws {
     let mut draws = Draws::default();
     unit.plan(&mut draws, first);
     draws.draw(1, &[id_hash; LANES]);
-    draws.of(5).to_vec()
+    draws
 }
 
 /// Standard deviation and density add as variances; constant biases stay; every axis has its own noise.
@@ -190,8 +190,8 @@ fn white_noise_has_the_configured_level_on_every_axis() {
         rows: &[SubStep::default()],
     };
     let normals = blocks(&unit, 3, 0);
-    assert_eq!(normals.len(), 2 * N);
-    unit.sample(Path::widest(), &body, &normals, &mut [0.0; 8], &mut out);
+    assert_eq!(normals.of(5).len(), 2 * N);
+    unit.sample(Path::widest(), &body, normals.of(5), &mut [0.0; 8], &mut out);
     let stds = [0.5, 0.2, 0.1, 0.1, 0.2, 0.3, 0.05];
     let means = [1.0, -2.0, 0.0, 0.0, 0.0, 0.5, 1.0];
     let n = N as f64;
@@ -242,12 +242,12 @@ fn biases_walk_and_remember() {
             short.sample(
                 Path::widest(),
                 &body,
-                &blocks(&short, id, tick * 10),
+                blocks(&short, id, tick * 10).of(1),
                 &mut walk,
                 &mut few,
             );
         }
-        long.sample(Path::widest(), &body, &blocks(&long, id, 0), &mut whole, &mut many);
+        long.sample(Path::widest(), &body, blocks(&long, id, 0).of(9), &mut whole, &mut many);
         assert_eq!(walk, whole);
         assert_eq!(few[9], many[99]);
         assert_eq!(few[9][0], walk[0]);
@@ -270,7 +270,7 @@ fn streams_are_independent_of_how_many_are_asked_for() {
         id_hash: 3,
         sensor: Sensor::ImuFront,
     };
-    assert_eq!(alone[0], stream.normals(77));
+    assert_eq!(alone.of(2).at(0), stream.normals(77));
 }
 
 /// Everything on, over ticks of several sub-steps: the vectors' bits are the plain ones.
@@ -306,7 +306,7 @@ fn every_path_gives_the_same_samples() {
                 yaw_rad: 2.0,
                 rows: &rows,
             };
-            unit.sample(path, &body, &normals, &mut walk, &mut out);
+            unit.sample(path, &body, normals.of(5), &mut walk, &mut out);
             let bits: Vec<u32> = walk.iter().chain(out.as_flattened()).map(|v| v.to_bits()).collect();
             bits
         };
