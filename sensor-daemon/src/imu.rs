@@ -256,16 +256,33 @@ impl Unit {
 
     /// From values to what leaves the sensor: multiples of the resolution within the range.
     #[inline(always)]
+    #[expect(
+        clippy::needless_range_loop,
+        reason = "plain indices are what the compiler turns into vectors here"
+    )]
     fn deliver(&self, values: &mut [Pair]) {
-        for value in values {
-            if self.is_stepped {
+        if self.is_stepped {
+            for value in &mut *values {
+                let mut steps: Pair = [0.0; 16];
                 for i in 0..16 {
-                    // Bits instead of a condition, which would become a branch for each axis.
-                    let stepped = (value[i] / self.divisor[i]).round_ties_even() * self.divisor[i];
-                    let bits = (stepped.to_bits() & self.stepped[i]) | (value[i].to_bits() & !self.stepped[i]);
-                    value[i] = f32::from_bits(bits);
+                    steps[i] = value[i] / self.divisor[i];
                 }
+                for step in &mut steps {
+                    *step = step.round_ties_even();
+                }
+                for i in 0..16 {
+                    steps[i] *= self.divisor[i];
+                }
+                // Bits instead of a condition, which would become a branch for each axis.
+                let (stepped, mut kept): ([u32; 16], [u32; 16]) =
+                    (bytemuck::must_cast(steps), bytemuck::must_cast(*value));
+                for i in 0..16 {
+                    kept[i] ^= (kept[i] ^ stepped[i]) & self.stepped[i];
+                }
+                *value = bytemuck::must_cast(kept);
             }
+        }
+        for value in values {
             for i in 0..16 {
                 let most = self.range[i];
                 let below = if value[i] > most { most } else { value[i] };
