@@ -316,7 +316,7 @@ pub enum Field {
     Speed,
     /// Steering-wheel angle; range ± `steering_range_rad`.
     Steering,
-    /// GNSS fix, height in the world frame; range ± 100 m about the height of the map's ground.
+    /// GNSS fix, height in the world frame; range ± 100 m about its origin.
     GnssZ,
     /// GNSS receiver's own estimate of its horizontal error (1σ of the distance); range 0 … 50 m.
     GnssAccuracy,

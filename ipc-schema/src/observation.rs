@@ -29,7 +29,7 @@ pub const VALID: u32 = 1;
 pub const TERMINATED: u32 = 1 << 1;
 /// The trajectory that held this slot at the previous tick was cut there: end of episode, or a hero's time limit. Bootstrap, then cut.
 pub const TRUNCATED: u32 = 1 << 2;
-/// Bit of `sensors`: the GNSS receiver delivers (no blackout).
+/// Bit of `sensors`: the GNSS receiver delivers (no blackout, satellites enough for a fix).
 pub const GNSS: u32 = 1;
 /// Bit of `sensors`: the IMU delivers.
 pub const IMU: u32 = 1 << 1;
@@ -71,7 +71,7 @@ pub struct ObservationLayout {
     pub sensors: Section,
     /// `u32 [n]`: ticks since this vehicle took the slot.
     pub episode_step: Section,
-    /// `f32 [n, 4]`: age of the newest GNSS, IMU, speed-steering and LIDAR sample, seconds.
+    /// `f32 [n, 4]`: age of the newest GNSS, IMU, speed-steering and LIDAR sample, seconds; 0 for a sensor that it does not have.
     pub age_s: Section,
     /// Length of the payload in bytes.
     pub len: usize,

@@ -13,11 +13,14 @@ use ipc_schema::{
     run::Mode,
     services::Channel,
     session::{Session, Wait},
-    world::{HeroView, VehicleState, WorldLayout},
+    world::WorldLayout,
 };
 use serde::Serialize;
 
-use crate::{digest::Digest, sensing::Sensing};
+use crate::{
+    digest::Digest,
+    sensing::{Sensing, World},
+};
 
 /// One process serves one environment.
 const ENV_INDEX: u32 = 0;
@@ -103,26 +106,18 @@ impl Daemon {
             }
             .into());
         }
-        let layout = layout(world);
-        let states: &[VehicleState] = block::view(message.payload(), layout.states).map_err(broken)?;
-        let views: &[HeroView] = block::view(message.payload(), layout.heroes).map_err(broken)?;
-        let n = self.sensing.assign(world, states);
+        let everybody = view(message, world)?;
+        let n = self.sensing.assign(world, everybody.states);
         if let Some((board, _)) = &self.consumer
             && self.session.wait_for_credit(board, world.tick)? == Wait::Stopped
         {
             return Ok(Wait::Stopped);
         }
-        self.publish(world, states, views, n)?;
+        self.publish(world, &everybody, n)?;
         Ok(Wait::Ready)
     }
 
-    fn publish(
-        &mut self,
-        world: &MessageHeader,
-        states: &[VehicleState],
-        views: &[HeroView],
-        n: usize,
-    ) -> Result<(), Failure> {
+    fn publish(&mut self, world: &MessageHeader, everybody: &World, n: usize) -> Result<(), Failure> {
         let d = self.sensing.width();
         let ours = self.session.header();
         let header = MessageHeader {
@@ -135,20 +130,20 @@ impl Daemon {
         };
         let mut draft = self.observations.loan(header, ObservationLayout::of(&header).len)?;
         self.sensing
-            .observe(&header, states, views, draft.payload_mut())
+            .observe(&header, everybody, draft.payload_mut())
             .map_err(broken)?;
         self.digest.add(&header, draft.payload());
         draft.send()?;
         if let Some((_, waker)) = &self.consumer {
             waker.wake();
         }
-        self.account(&header, states.len());
+        self.account(&header, everybody.states.len());
         Ok(())
     }
 
     fn account(&mut self, header: &MessageHeader, road_users: usize) {
         let before = self.vehicle_steps;
-        self.vehicle_steps = self.sensing.raw_error().count;
+        self.vehicle_steps = self.sensing.observations();
         let cavs = (self.vehicle_steps - before) as u32;
         self.cavs_max = self.cavs_max.max(cavs);
         self.ticks += 1;
@@ -196,6 +191,16 @@ fn layout(header: &MessageHeader) -> WorldLayout {
     let count = header.count as usize;
     let heroes = usize::try_from(header.sequence).unwrap_or(usize::MAX).min(count);
     WorldLayout::with_heroes(count, header.columns as usize, heroes)
+}
+
+/// The world that a message carries.
+fn view<'a>(message: &'a Message, header: &MessageHeader) -> Result<World<'a>, Failure> {
+    let (payload, layout) = (message.payload(), layout(header));
+    Ok(World {
+        states: block::view(payload, layout.states).map_err(broken)?,
+        sub_steps: block::view(payload, layout.sub_steps).map_err(broken)?,
+        views: block::view(payload, layout.heroes).map_err(broken)?,
+    })
 }
 
 fn broken(error: BlockError) -> Failure {

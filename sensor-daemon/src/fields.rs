@@ -2,6 +2,7 @@
 
 use ipc_schema::{
     config::{Field, Observation as Params, Scale},
+    observation::{GNSS, IMU, LIDAR, SENSORS, SPEED_STEERING},
     world::{HeroView, ROUTE_AHEAD_M, SIGHT_M},
 };
 
@@ -16,6 +17,12 @@ pub struct Readings {
     pub imu: imu::Sample,
     /// Speed and steering.
     pub speed_steering: speed_steering::Sample,
+    /// Nearest points of the nearest objects that the LIDAR sees, forward and left of the rear axle, metres.
+    pub objects_m: [[f32; 2]; 4],
+    /// Ages of the newest samples by sensor, seconds.
+    pub ages_s: [f32; SENSORS],
+    /// Bits of the sensors that deliver.
+    pub delivering: u32,
     /// What a hero sees of its route.
     pub route: HeroView,
 }
@@ -24,21 +31,43 @@ pub struct Readings {
 const ROUTE_OFFSET_M: f64 = 5.0;
 /// Range of the way left, metres.
 const ROUTE_LEFT_M: f64 = 1000.0;
+/// Range of heights above and below the ground, metres.
+const HEIGHT_M: f64 = 100.0;
+/// Range of the receiver's estimate of its error, metres.
+const ACCURACY_M: f64 = 50.0;
 
 impl Readings {
+    #[inline(always)]
     fn value(&self, field: Field) -> f64 {
+        let deliver = |bit: u32| f64::from(u8::from(self.delivering & bit != 0));
         match field {
             Field::GnssX => self.fix.x_m,
             Field::GnssY => self.fix.y_m,
-            Field::AccelX => self.imu.accel_mps2[0],
-            Field::AccelY => self.imu.accel_mps2[1],
-            Field::AccelZ => self.imu.accel_mps2[2],
-            Field::GyroX => self.imu.gyro_radps[0],
-            Field::GyroY => self.imu.gyro_radps[1],
-            Field::GyroZ => self.imu.gyro_radps[2],
-            Field::Compass => self.imu.compass_rad,
+            Field::GnssZ => self.fix.z_m,
+            Field::GnssAccuracy => self.fix.accuracy_m,
+            Field::AccelX => f64::from(self.imu[0]),
+            Field::AccelY => f64::from(self.imu[1]),
+            Field::AccelZ => f64::from(self.imu[2]),
+            Field::GyroX => f64::from(self.imu[3]),
+            Field::GyroY => f64::from(self.imu[4]),
+            Field::GyroZ => f64::from(self.imu[5]),
+            Field::Compass => f64::from(self.imu[6]),
             Field::Speed => self.speed_steering.speed_mps,
             Field::Steering => self.speed_steering.steering_rad,
+            Field::GnssAge => f64::from(self.ages_s[0]),
+            Field::ImuAge => f64::from(self.ages_s[1]),
+            Field::SpeedSteeringAge => f64::from(self.ages_s[2]),
+            Field::GnssValid => deliver(GNSS),
+            Field::ImuValid => deliver(IMU),
+            Field::SpeedSteeringValid => deliver(SPEED_STEERING),
+            Field::Object1X => f64::from(self.objects_m[0][0]),
+            Field::Object1Y => f64::from(self.objects_m[0][1]),
+            Field::Object2X => f64::from(self.objects_m[1][0]),
+            Field::Object2Y => f64::from(self.objects_m[1][1]),
+            Field::Object3X => f64::from(self.objects_m[2][0]),
+            Field::Object3Y => f64::from(self.objects_m[2][1]),
+            Field::Object4X => f64::from(self.objects_m[3][0]),
+            Field::Object4Y => f64::from(self.objects_m[3][1]),
             Field::RouteX5 => f64::from(self.route.route_m[0][0]),
             Field::RouteY5 => f64::from(self.route.route_m[0][1]),
             Field::RouteX10 => f64::from(self.route.route_m[1][0]),
@@ -53,70 +82,123 @@ impl Readings {
             Field::LeaderGap => f64::from(self.route.leader_gap_m),
             Field::LeaderSpeed => f64::from(self.route.leader_speed_mps),
             Field::SignalGap => f64::from(self.route.signal_gap_m),
-            _ => 0.0,
         }
     }
+}
+
+/// Bit of the sensor that a field shows; 0 for what is known in a blackout too.
+fn sensor(field: Field) -> u32 {
+    match field {
+        Field::GnssX | Field::GnssY | Field::GnssZ | Field::GnssAccuracy => GNSS,
+        Field::AccelX | Field::AccelY | Field::AccelZ | Field::GyroX | Field::GyroY | Field::GyroZ | Field::Compass => {
+            IMU
+        }
+        Field::Speed | Field::Steering => SPEED_STEERING,
+        object if object >= Field::Object1X && object <= Field::Object4Y => LIDAR,
+        _ => 0,
+    }
+}
+
+/// One field with its range.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Column {
+    field: Field,
+    low: f64,
+    span: f64,
+    /// Bit of its sensor.
+    sensor: u32,
 }
 
 /// The configured fields with their ranges as affine maps.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Normaliser {
-    /// Field, lower end, upper end.
-    fields: Vec<(Field, f64, f64)>,
-    scale: Scale,
+    columns: Vec<Column>,
+    /// Of a field in 0 … 1: factor and what is added.
+    scale: [f64; 2],
 }
 
 impl Normaliser {
-    /// Ranges from the map's bounds `[x_min, y_min, x_max, y_max]` (metres) and the configuration.
+    /// Ranges from the map's bounds `[x_min, y_min, x_max, y_max]` (metres), the LIDAR's range (metres) and the configuration.
     #[must_use]
-    pub fn new(params: &Params, bounds_m: [f64; 4]) -> Self {
-        let range = |field: &Field| match field {
-            Field::GnssX => (bounds_m[0], bounds_m[2]),
-            Field::GnssY => (bounds_m[1], bounds_m[3]),
-            Field::AccelX | Field::AccelY | Field::AccelZ => (-params.accel_range_mps2, params.accel_range_mps2),
-            Field::GyroX | Field::GyroY | Field::GyroZ => (-params.gyro_range_radps, params.gyro_range_radps),
-            Field::Compass => (0.0, std::f64::consts::TAU),
-            Field::RouteX5 | Field::RouteY5 => (-ROUTE_AHEAD_M[0], ROUTE_AHEAD_M[0]),
-            Field::RouteX10 | Field::RouteY10 => (-ROUTE_AHEAD_M[1], ROUTE_AHEAD_M[1]),
-            Field::RouteX20 | Field::RouteY20 => (-ROUTE_AHEAD_M[2], ROUTE_AHEAD_M[2]),
-            Field::RouteX40 | Field::RouteY40 => (-ROUTE_AHEAD_M[3], ROUTE_AHEAD_M[3]),
-            Field::RouteOffset => (-ROUTE_OFFSET_M, ROUTE_OFFSET_M),
-            Field::RouteLeft => (0.0, ROUTE_LEFT_M),
-            Field::LeaderGap | Field::SignalGap => (0.0, SIGHT_M),
-            Field::Speed | Field::SpeedLimit | Field::LeaderSpeed => (0.0, params.speed_range_mps),
-            Field::Steering => (-params.steering_range_rad, params.steering_range_rad),
-            _ => (0.0, 1.0),
-        };
-        let fields = params
-            .fields
-            .iter()
-            .map(|field| (*field, range(field).0, range(field).1))
-            .collect();
+    pub fn new(params: &Params, bounds_m: [f64; 4], lidar_range_m: f64) -> Self {
+        let columns = params.fields.iter().map(|field| {
+            let (low, high) = range(*field, params, bounds_m, lidar_range_m);
+            Column {
+                field: *field,
+                low,
+                span: high - low,
+                sensor: sensor(*field),
+            }
+        });
         Self {
-            fields,
-            scale: params.scale,
+            columns: columns.collect(),
+            scale: match params.scale {
+                Scale::ZeroToOne => [1.0, 0.0],
+                Scale::MinusOneToOne => [2.0, -1.0],
+            },
         }
     }
 
     /// Number of fields.
     #[must_use]
     pub fn width(&self) -> usize {
-        self.fields.len()
+        self.columns.len()
     }
 
-    /// Fills `row` (one number for each field); true if a value was outside its range and has been clipped.
-    pub fn fill(&self, readings: &Readings, row: &mut [f32]) -> bool {
+    /// Bits of the sensors that the fields show.
+    #[must_use]
+    pub fn needs(&self) -> u32 {
+        self.columns.iter().fold(0, |bits, column| bits | column.sensor)
+    }
+
+    /// Fills `row` (one number for each field), with not-a-number where the field's sensor is among the bits `blank`; true if a value
+    /// was outside its range and has been clipped. What is not a number is not clipped.
+    #[inline(always)]
+    pub fn fill(&self, readings: &Readings, blank: u32, row: &mut [f32]) -> bool {
         let mut clipped = false;
-        for (place, (field, low, high)) in row.iter_mut().zip(&self.fields) {
-            let unit = (readings.value(*field) - low) / (high - low);
-            clipped |= !(0.0..=1.0).contains(&unit);
-            let unit = unit.clamp(0.0, 1.0);
-            *place = match self.scale {
-                Scale::ZeroToOne => unit,
-                Scale::MinusOneToOne => 2.0 * unit - 1.0,
-            } as f32;
+        let [factor, shift] = self.scale;
+        for (place, column) in row.iter_mut().zip(&self.columns) {
+            if column.sensor & blank != 0 {
+                *place = f32::NAN;
+                continue;
+            }
+            let unit = (readings.value(column.field) - column.low) / column.span;
+            clipped |= !(0.0..=1.0).contains(&unit) && !unit.is_nan();
+            *place = (factor * unit.clamp(0.0, 1.0) + shift) as f32;
         }
         clipped
+    }
+}
+
+/// Lower and upper end of a field.
+fn range(field: Field, params: &Params, bounds_m: [f64; 4], lidar_range_m: f64) -> (f64, f64) {
+    match field {
+        Field::GnssX => (bounds_m[0], bounds_m[2]),
+        Field::GnssY => (bounds_m[1], bounds_m[3]),
+        Field::GnssZ => (-HEIGHT_M, HEIGHT_M),
+        Field::GnssAccuracy => (0.0, ACCURACY_M),
+        Field::AccelX | Field::AccelY | Field::AccelZ => (-params.accel_range_mps2, params.accel_range_mps2),
+        Field::GyroX | Field::GyroY | Field::GyroZ => (-params.gyro_range_radps, params.gyro_range_radps),
+        Field::Compass => (0.0, std::f64::consts::TAU),
+        Field::GnssAge | Field::ImuAge | Field::SpeedSteeringAge => (0.0, params.age_range_s),
+        Field::GnssValid | Field::ImuValid | Field::SpeedSteeringValid => (0.0, 1.0),
+        Field::RouteX5 | Field::RouteY5 => (-ROUTE_AHEAD_M[0], ROUTE_AHEAD_M[0]),
+        Field::RouteX10 | Field::RouteY10 => (-ROUTE_AHEAD_M[1], ROUTE_AHEAD_M[1]),
+        Field::RouteX20 | Field::RouteY20 => (-ROUTE_AHEAD_M[2], ROUTE_AHEAD_M[2]),
+        Field::RouteX40 | Field::RouteY40 => (-ROUTE_AHEAD_M[3], ROUTE_AHEAD_M[3]),
+        Field::RouteOffset => (-ROUTE_OFFSET_M, ROUTE_OFFSET_M),
+        Field::RouteLeft => (0.0, ROUTE_LEFT_M),
+        Field::LeaderGap | Field::SignalGap => (0.0, SIGHT_M),
+        Field::Speed | Field::SpeedLimit | Field::LeaderSpeed => (0.0, params.speed_range_mps),
+        Field::Steering => (-params.steering_range_rad, params.steering_range_rad),
+        Field::Object1X
+        | Field::Object1Y
+        | Field::Object2X
+        | Field::Object2Y
+        | Field::Object3X
+        | Field::Object3Y
+        | Field::Object4X
+        | Field::Object4Y => (-lidar_range_m, lidar_range_m),
     }
 }
 
@@ -144,16 +226,12 @@ mod tests {
                 y_m: 300.0,
                 ..Fix::default()
             },
-            imu: imu::Sample {
-                accel_mps2: [-20.0, 0.0, 10.0],
-                gyro_radps: [0.0; 3],
-                compass_rad: std::f64::consts::PI,
-            },
+            imu: [-20.0, 0.0, 10.0, 0.0, 0.0, 0.0, std::f32::consts::PI],
             speed_steering: speed_steering::Sample {
                 speed_mps: 15.0,
                 steering_rad: 5.0,
             },
-            route: HeroView::default(),
+            ..Readings::default()
         };
         let fields = vec![
             Field::Speed,
@@ -165,10 +243,13 @@ mod tests {
             Field::Steering,
         ];
         let mut row = [9.0; 7];
-        assert!(!Normaliser::new(&params(fields.clone(), Scale::ZeroToOne), BOUNDS_M).fill(&readings, &mut row));
-        assert_eq!(row, [0.5, 0.25, 1.0, 0.0, 0.75, 0.5, 0.75]);
-        assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M).fill(&readings, &mut row));
-        assert_eq!(row, [0.0, -0.5, 1.0, -1.0, 0.5, 0.0, 0.5]);
+        assert!(
+            !Normaliser::new(&params(fields.clone(), Scale::ZeroToOne), BOUNDS_M, 100.0).fill(&readings, 0, &mut row)
+        );
+        let near = |row: [f32; 7], expected: [f32; 7]| (0..7).all(|i| (row[i] - expected[i]).abs() < 1e-7);
+        assert!(near(row, [0.5, 0.25, 1.0, 0.0, 0.75, 0.5, 0.75]), "{row:?}");
+        assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M, 100.0).fill(&readings, 0, &mut row));
+        assert!(near(row, [0.0, -0.5, 1.0, -1.0, 0.5, 0.0, 0.5]), "{row:?}");
     }
 
     #[test]
@@ -199,8 +280,61 @@ mod tests {
             Field::SignalGap,
         ];
         let mut row = [9.0; 10];
-        assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M).fill(&readings, &mut row));
+        assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M, 100.0).fill(&readings, 0, &mut row));
         assert_eq!(row, [1.0, 0.5, -1.0, 0.0, 0.0, -0.5, -0.5, 1.0, -1.0, -0.5]);
+    }
+
+    #[test]
+    fn height_accuracy_ages_validity_and_objects_have_their_ranges() {
+        let readings = Readings {
+            fix: Fix {
+                z_m: 50.0,
+                accuracy_m: 12.5,
+                ..Fix::default()
+            },
+            ages_s: [2.5, 0.0, 10.0, 0.0],
+            delivering: IMU,
+            objects_m: [[80.0, -40.0], [0.0, 0.0], [0.0, 0.0], [20.0, 80.0]],
+            ..Readings::default()
+        };
+        let fields = vec![
+            Field::GnssZ,
+            Field::GnssAccuracy,
+            Field::GnssAge,
+            Field::GnssValid,
+            Field::ImuAge,
+            Field::ImuValid,
+            Field::SpeedSteeringAge,
+            Field::SpeedSteeringValid,
+            Field::Object1X,
+            Field::Object1Y,
+            Field::Object4X,
+            Field::Object4Y,
+        ];
+        let normaliser = Normaliser::new(&params(fields, Scale::ZeroToOne), BOUNDS_M, 80.0);
+        assert_eq!(normaliser.needs(), GNSS | LIDAR);
+        let mut row = [9.0; 12];
+        assert!(!normaliser.fill(&readings, 0, &mut row));
+        assert_eq!(row, [0.75, 0.25, 0.25, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 0.25, 0.625, 1.0]);
+    }
+
+    #[test]
+    fn a_blank_sensor_is_not_a_number_and_that_is_not_clipped() {
+        let readings = Readings {
+            fix: Fix {
+                x_m: -5000.0,
+                ..Fix::default()
+            },
+            ..Readings::default()
+        };
+        let fields = vec![Field::GnssX, Field::Speed, Field::GnssAge, Field::AccelX];
+        let normaliser = Normaliser::new(&params(fields, Scale::ZeroToOne), BOUNDS_M, 100.0);
+        let mut row = [9.0; 4];
+        assert!(!normaliser.fill(&readings, GNSS | IMU, &mut row));
+        assert!(row[0].is_nan() && row[3].is_nan());
+        assert_eq!(row[1..3], [0.0, 0.0]);
+        assert!(normaliser.fill(&readings, IMU, &mut row));
+        assert_eq!(row[0], 0.0);
     }
 
     proptest! {
@@ -209,7 +343,7 @@ mod tests {
             let readings = Readings { fix: Fix { x_m: x, ..Fix::default() }, ..Readings::default() };
             for (scale, low) in [(Scale::ZeroToOne, 0.0), (Scale::MinusOneToOne, -1.0)] {
                 let mut row = [9.0];
-                let clipped = Normaliser::new(&params(vec![Field::GnssX], scale), BOUNDS_M).fill(&readings, &mut row);
+                let clipped = Normaliser::new(&params(vec![Field::GnssX], scale), BOUNDS_M, 100.0).fill(&readings, 0, &mut row);
                 prop_assert!((low..=1.0).contains(&row[0]));
                 prop_assert_eq!(clipped, !(0.0..=200.0).contains(&x));
             }

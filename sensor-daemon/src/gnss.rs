@@ -1,12 +1,12 @@
-//! GNSS receiver: latitude and longitude with white noise and bias, and the position they give in the world frame.
+//! GNSS receiver: white and correlated noise and bias east, north and up, as angles or metres, and the position they give.
 
 use ipc_schema::config::Gnss as Params;
 use sim_core::{
     displacement::{Arc, DisplacementMap},
-    geodesy::NetPosition,
+    geodesy::{GeodesyError, NetPosition, Projection},
 };
 
-use crate::noise::{Sensor, Stream};
+use crate::normals::Block;
 
 /// One fix.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -15,110 +15,231 @@ pub struct Fix {
     pub latitude_deg: f64,
     /// Degrees, east positive.
     pub longitude_deg: f64,
-    /// World frame, metres.
+    /// Height in the world frame, metres.
+    pub altitude_m: f64,
+    /// World frame, east, metres.
     pub x_m: f64,
-    /// World frame, metres.
+    /// World frame, north, metres.
     pub y_m: f64,
+    /// World frame, up, metres.
+    pub z_m: f64,
+    /// The receiver's own estimate of its horizontal error, 1σ of the distance, metres.
+    pub accuracy_m: f64,
+    /// Satellites in use.
+    pub satellites: u32,
 }
 
-/// The fix of an antenna at `(x_m, y_m)` in the world frame.
+/// What a receiver gets from the sky at a place and time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SkyView {
+    /// Satellites in use.
+    pub satellites: u32,
+    /// Factor on the white and the correlated error, at least 1.
+    pub noise_factor: f64,
+    /// Error from reflections east, north and up, metres.
+    pub offset_m: [f64; 3],
+    /// Enough satellites for a fix.
+    pub has_fix: bool,
+}
+
+impl Default for SkyView {
+    /// The open sky.
+    fn default() -> Self {
+        Self {
+            satellites: 12,
+            noise_factor: 1.0,
+            offset_m: [0.0; 3],
+            has_fix: true,
+        }
+    }
+}
+
+/// Where satellites stand, and what blocks and reflects them.
+pub trait Sky {
+    /// What an antenna at this place (world frame, metres) gets at this time of the episode (seconds).
+    fn at(&self, x_m: f64, y_m: f64, z_m: f64, time_s: f64) -> SkyView;
+}
+
+/// Degrees of [`Arc`] for a metre on the ground, by place.
 ///
-/// Noise and bias are angles of arc on the ground, the same for both axes (5e-5° ≙ 5.57 m): latitude gets the angle itself,
-/// longitude the angle divided by the cosine of the latitude. At the equator, where CARLA's towns lie, this is the paper's
-/// noise in degrees; elsewhere the error stays the same in metres instead of shrinking with the parallels.
-#[must_use]
-pub fn sample(params: &Params, map: &DisplacementMap, x_m: f64, y_m: f64, stream: Stream, index: u32) -> Fix {
-    debug_assert_eq!(stream.sensor, Sensor::Gnss);
-    let [north, east] = stream.normal_pair(index);
-    let arc = Arc {
-        east_deg: params.bias_deg[1] + params.noise_std_deg[1] * east,
-        north_deg: params.bias_deg[0] + params.noise_std_deg[0] * north,
-    };
-    let displaced = map.displaced(NetPosition { x_m, y_m }, arc);
-    Fix {
-        latitude_deg: displaced.geodetic.latitude_deg,
-        longitude_deg: displaced.geodetic.longitude_deg,
-        x_m: displaced.net.x_m,
-        y_m: displaced.net.y_m,
+/// A metre north is 1/M radians, a metre east 1/N radians of the arc that [`Arc`] divides by the cosine of the latitude; M and N are
+/// the radii of curvature of the ellipsoid of WGS 84 in the meridian and in the prime vertical (NIMA TR8350.2, 1997, section 4).
+/// Between the southern and the northern border of the map both change linearly with y: to 1e-7 of themselves over 50 km.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Ground {
+    y_m: f64,
+    /// Degrees per metre at `y_m`, and their change for a metre of y: east, north.
+    arc_deg: [[f64; 2]; 2],
+}
+
+impl Ground {
+    fn new(projection: &Projection, bounds_m: [f64; 4]) -> Result<Self, GeodesyError> {
+        let [x_min, y_min, x_max, y_max] = bounds_m;
+        let x_m = 0.5 * (x_min + x_max);
+        let at = |y_m: f64| -> Result<[f64; 2], GeodesyError> {
+            let place = projection.geodetic_from_net(NetPosition { x_m, y_m })?;
+            Ok(arc_deg_per_m(place.latitude_deg))
+        };
+        let height_m = (y_max - y_min).max(1.0);
+        let (south, north) = (at(y_min)?, at(y_min + height_m)?);
+        let change = [0, 1].map(|axis: usize| (north[axis] - south[axis]) / height_m);
+        Ok(Self {
+            y_m: y_min,
+            arc_deg: [south, change],
+        })
+    }
+
+    fn arc(&self, y_m: f64, [east_m, north_m]: [f64; 2]) -> Arc {
+        let at = |axis: usize| self.arc_deg[0][axis] + self.arc_deg[1][axis] * (y_m - self.y_m);
+        Arc {
+            east_deg: east_m * at(0),
+            north_deg: north_m * at(1),
+        }
+    }
+}
+
+/// Degrees of arc for a metre to the east and to the north at a latitude.
+fn arc_deg_per_m(latitude_deg: f64) -> [f64; 2] {
+    const SEMI_MAJOR_M: f64 = 6_378_137.0;
+    const FLATTENING: f64 = 1.0 / 298.257_223_563;
+    const SQUARE: f64 = FLATTENING * (2.0 - FLATTENING);
+    let sin = libm::sin(latitude_deg.to_radians());
+    let w = 1.0 - SQUARE * sin * sin;
+    let prime_vertical_m = SEMI_MAJOR_M / w.sqrt();
+    let meridian_m = prime_vertical_m * (1.0 - SQUARE) / w;
+    [(1.0 / prime_vertical_m).to_degrees(), (1.0 / meridian_m).to_degrees()]
+}
+
+/// A receiver as configured, on a map.
+#[derive(Debug, Clone)]
+pub struct Receiver {
+    map: DisplacementMap,
+    ground: Ground,
+    /// Standard deviation of the white noise east, north and up, metres: angles and metres together.
+    white_m: [f64; 3],
+    correlated_m: [f64; 3],
+    bias: Arc,
+    bias_m: [f64; 3],
+    /// What is left of the correlated error after a period, and the standard deviation of what joins it, as shares.
+    decay: [f32; 2],
+    /// Variance of the horizontal distance from white and correlated noise, and square of the horizontal bias, m².
+    horizontal_m2: [f64; 2],
+}
+
+/// What the errors of one fix are made of.
+#[derive(Debug, Clone, Copy)]
+pub struct Errors<'a> {
+    /// Standard normal numbers: east, north, up.
+    pub white: &'a Block,
+    /// State of the correlated error, unit variance: east, north, up.
+    pub correlated: &'a [f32; 3],
+    /// What the sky gives.
+    pub view: &'a SkyView,
+    /// Factor on all errors but reflections.
+    pub factor: f64,
+}
+
+impl Receiver {
+    /// A receiver on a map with these bounds (x_min, y_min, x_max, y_max, metres).
+    ///
+    /// # Errors
+    /// The map is not inside the domain of its projection.
+    pub fn new(params: &Params, projection: &Projection, bounds_m: [f64; 4]) -> Result<Self, GeodesyError> {
+        let ground = Ground::new(projection, bounds_m)?;
+        let middle_m = 0.5 * (bounds_m[1] + bounds_m[3]);
+        let metre = ground.arc(middle_m, [1.0, 1.0]);
+        let [north_deg, east_deg] = params.noise_std_deg;
+        let [east_m, north_m, up_m] = params.noise_std_m;
+        let white_m = [
+            libm::hypot(east_deg / metre.east_deg, east_m),
+            libm::hypot(north_deg / metre.north_deg, north_m),
+            up_m,
+        ];
+        let correlated_m = params.correlated_std_m;
+        let bias = Arc {
+            east_deg: params.bias_deg[1],
+            north_deg: params.bias_deg[0],
+        };
+        let bias_east_m = bias.east_deg / metre.east_deg + params.bias_m[0];
+        let bias_north_m = bias.north_deg / metre.north_deg + params.bias_m[1];
+        let phi = libm::exp(-params.period_s / params.correlation_time_s);
+        let horizontal = |m: &[f64; 3]| m[0] * m[0] + m[1] * m[1];
+        Ok(Self {
+            map: DisplacementMap::new(projection, bounds_m)?,
+            ground,
+            white_m,
+            correlated_m,
+            bias,
+            bias_m: params.bias_m,
+            decay: [phi as f32, (1.0 - phi * phi).sqrt() as f32],
+            horizontal_m2: [
+                horizontal(&white_m) + horizontal(&correlated_m),
+                bias_east_m * bias_east_m + bias_north_m * bias_north_m,
+            ],
+        })
+    }
+
+    /// True if fixes have white noise.
+    #[must_use]
+    pub fn has_white_noise(&self) -> bool {
+        self.white_m != [0.0; 3]
+    }
+
+    /// True if fixes have a correlated error.
+    #[must_use]
+    pub fn has_correlated_noise(&self) -> bool {
+        self.correlated_m != [0.0; 3]
+    }
+
+    /// The correlated error one period later, from its state (unit variance) and standard normal numbers.
+    ///
+    /// First-order Gauss–Markov process, x′ = φ x + √(1 − φ²) w with φ = exp(−Δt/τ): exact for any Δt (Brown and Hwang,
+    /// "Introduction to Random Signals and Applied Kalman Filtering", 4th ed., section 3.6). It starts as `w` itself, in its
+    /// stationary distribution.
+    #[must_use]
+    #[inline(always)]
+    pub fn correlated(&self, state: [f32; 3], normals: &Block) -> [f32; 3] {
+        [0, 1, 2].map(|axis: usize| self.decay[0] * state[axis] + self.decay[1] * normals[axis])
+    }
+
+    /// The fix of an antenna at `place_m` in the world frame.
+    ///
+    /// Angles of arc on the ground are the same for both axes (5e-5° ≙ 5.57 m): latitude gets the angle itself, longitude the angle
+    /// divided by the cosine of the latitude. At the equator, where CARLA's towns lie, this is the paper's noise in degrees; elsewhere
+    /// the error stays the same in metres instead of shrinking with the parallels. Metres are metres on the ellipsoid, true east and
+    /// north. The receiver estimates its error from all of them: 1σ of the distance is √(σ_east² + σ_north²), with the bias added
+    /// in square.
+    #[must_use]
+    #[inline(always)]
+    pub fn fix(&self, [x_m, y_m, z_m]: [f64; 3], errors: &Errors) -> Fix {
+        let (view, factor) = (errors.view, errors.factor);
+        let noisy = factor * view.noise_factor;
+        let error_m = [0, 1, 2].map(|axis: usize| {
+            let white = self.white_m[axis] * f64::from(errors.white[axis]);
+            let correlated = self.correlated_m[axis] * f64::from(errors.correlated[axis]);
+            noisy * (white + correlated) + factor * self.bias_m[axis] + view.offset_m[axis]
+        });
+        let arc = self.ground.arc(y_m, [error_m[0], error_m[1]]);
+        let displaced = self.map.displaced(
+            NetPosition { x_m, y_m },
+            Arc {
+                east_deg: arc.east_deg + factor * self.bias.east_deg,
+                north_deg: arc.north_deg + factor * self.bias.north_deg,
+            },
+        );
+        let [noise_m2, bias_m2] = self.horizontal_m2;
+        Fix {
+            latitude_deg: displaced.geodetic.latitude_deg,
+            longitude_deg: displaced.geodetic.longitude_deg,
+            altitude_m: z_m + error_m[2],
+            x_m: displaced.net.x_m,
+            y_m: displaced.net.y_m,
+            z_m: z_m + error_m[2],
+            accuracy_m: (noisy * noisy * noise_m2 + factor * factor * bias_m2).sqrt(),
+            satellites: view.satellites,
+        }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::preset::town;
-    use ipc_schema::run::MapInfo;
-    use sim_core::geodesy::Projection;
-
-    fn map() -> DisplacementMap {
-        let map = MapInfo {
-            projection: "+proj=tmerc +lat_0=52.26 +lon_0=10.52 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs"
-                .into(),
-            net_offset_m: [129.0, 126.0],
-            bounds_m: [0.0, 0.0, 260.0, 260.0],
-        };
-        DisplacementMap::new(&Projection::new(&map).unwrap(), map.bounds_m).unwrap()
-    }
-
-    fn stream(id_hash: u64) -> Stream {
-        Stream {
-            episode_seed: 1,
-            id_hash,
-            sensor: Sensor::Gnss,
-        }
-    }
-
-    #[test]
-    fn without_noise_the_fix_is_the_truth_to_a_tenth_of_a_millimetre() {
-        let params = Params {
-            noise_std_deg: [0.0; 2],
-            bias_deg: [0.0; 2],
-            ..town().gnss
-        };
-        for (x, y) in [(20.0, 17.9), (129.0, 126.0), (239.0, 236.0)] {
-            let fix = sample(&params, &map(), x, y, stream(1), 0);
-            assert!((fix.x_m - x).hypot(fix.y_m - y) < 1e-4, "{fix:?}");
-        }
-    }
-
-    /// σ = 5e-5° is 5.57 m on each axis, so the mean distance is σ √(π/2) = 6.98 m.
-    #[test]
-    fn the_papers_noise_is_seven_metres_on_average_and_equal_on_both_axes() {
-        const N: u32 = 40_000;
-        let params = Params {
-            noise_std_deg: [5e-5; 2],
-            bias_deg: [0.0; 2],
-            ..town().gnss
-        };
-        let map = map();
-        let errors: Vec<(f64, f64)> = (0..N)
-            .map(|index| sample(&params, &map, 100.0, 50.0, stream(9), index))
-            .map(|fix| (fix.x_m - 100.0, fix.y_m - 50.0))
-            .collect();
-        let mean = |of: &dyn Fn(&(f64, f64)) -> f64| errors.iter().map(of).sum::<f64>() / f64::from(N);
-        let (std_x, std_y) = (mean(&|e| e.0 * e.0).sqrt(), mean(&|e| e.1 * e.1).sqrt());
-        let sigma_m = 5e-5_f64.to_radians() * 6_371_000.0;
-        // Five standard errors of a standard deviation, σ/√(2N), and the ellipsoid's 0.5 % against the sphere.
-        let tolerance = 5.0 * sigma_m / (2.0 * f64::from(N)).sqrt() + 0.005 * sigma_m;
-        assert!(
-            (std_x - sigma_m).abs() < tolerance && (std_y - sigma_m).abs() < tolerance,
-            "{std_x} {std_y}"
-        );
-        let distance = mean(&|e| e.0.hypot(e.1));
-        assert!((distance - 6.98).abs() < 0.1, "{distance}");
-    }
-
-    #[test]
-    fn a_bias_moves_the_mean_north_east() {
-        let params = Params {
-            noise_std_deg: [0.0; 2],
-            bias_deg: [1e-5; 2],
-            ..town().gnss
-        };
-        let fix = sample(&params, &map(), 100.0, 50.0, stream(1), 0);
-        assert!(
-            (fix.x_m - 101.11).abs() < 0.02 && (fix.y_m - 51.11).abs() < 0.02,
-            "{fix:?}"
-        );
-    }
-}
+mod tests;

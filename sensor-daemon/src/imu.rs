@@ -1,182 +1,371 @@
-//! Inertial measurement unit: accelerometer, gyroscope and compass in the vehicle's body frame (x forward, y left, z up).
+//! Inertial measurement unit: accelerometer, gyroscope and compass in the vehicle's body.
+//!
+//! Error model of IEEE Std 952-2020 (annex C): white noise, constant bias and a random walk of the bias on each axis; then full
+//! scale and resolution. A density N (per √Hz) is a standard deviation of N √f for samples at f Hz; a walk K moves the bias by
+//! K √Δt from sample to sample. Both are exact for samples that are means over their period. Errors belong to the sensor's
+//! own axes: those of the convention.
+
+use std::f64::consts::{FRAC_PI_2, TAU};
 
 use ipc_schema::{
     config::{Imu as Params, ImuConvention},
-    world::VehicleState,
+    observation::IMU_COLUMNS,
+    world::SubStep,
+};
+
+use crate::{
+    noise::{Drawn, Draws, Sensor},
+    normals::{LANES, cos_sin},
+    wide::{Path, Work},
 };
 
 /// Standard gravity, m/s².
 pub const GRAVITY_MPS2: f64 = 9.806_65;
 
-use crate::noise::{Sensor, Stream};
+/// One number for each axis: accelerometer x, y, z, gyroscope x, y, z, compass, nothing.
+pub type Axes = [f32; 8];
+/// One sample: accelerometer x, y, z (m/s²), gyroscope x, y, z (rad/s), compass (clockwise from grid north, radians in [0, 2π)).
+pub type Sample = [f32; IMU_COLUMNS];
 
-/// One sample.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Sample {
-    /// Acceleration of the body's origin, m/s²; specific force where the configuration gives it gravity.
-    pub accel_mps2: [f64; 3],
-    /// Angular rate, rad/s.
-    pub gyro_radps: [f64; 3],
-    /// Heading clockwise from grid north, radians in [0, 2π).
-    pub compass_rad: f64,
+const COMPASS: usize = 6;
+
+/// An IMU as configured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Unit {
+    samples: usize,
+    /// Sign of each axis; 0 where a sub-step holds something else.
+    signs: Pair,
+    gravity_mps2: f32,
+    bias: Pair,
+    white: Pair,
+    walk: Pair,
+    range: Pair,
+    /// Resolution, 1 where there is none.
+    divisor: Pair,
+    /// All bits where there is a resolution.
+    stepped: [u32; 16],
+    /// True if any axis has a resolution.
+    is_stepped: bool,
+    /// True if any axis has white noise.
+    is_noisy: bool,
+    /// True if any bias walks.
+    is_walking: bool,
 }
 
-/// The IMU's sample of a vehicle that moves as `state`.
-#[must_use]
-pub fn sample(params: &Params, state: &VehicleState, episode_seed: u64, index: u32) -> Sample {
-    let stream = |sensor| Stream {
-        episode_seed,
-        id_hash: state.id_hash,
-        sensor,
-    };
-    let accel_noise = stream(Sensor::Accelerometer).normals(index);
-    let gyro_noise = stream(Sensor::Gyroscope).normals(index);
-    let gravity_mps2 = if params.convention == ImuConvention::Kinematic {
-        0.0
+/// Where a body is at the end of a tick, and how it got there.
+#[derive(Debug, Clone, Copy)]
+pub struct Body<'a> {
+    /// Heading, counter-clockwise from east, radians.
+    pub yaw_rad: f64,
+    /// Sub-steps of the tick, at least one.
+    pub rows: &'a [SubStep],
+}
+
+fn axes(accel: [f64; 3], gyro: [f64; 3], compass: f64) -> Pair {
+    let [ax, ay, az] = accel.map(|value| value as f32);
+    let [gx, gy, gz] = gyro.map(|value| value as f32);
+    twice([ax, ay, az, gx, gy, gz, compass as f32, 0.0])
+}
+
+fn twice(axes: Axes) -> Pair {
+    bytemuck::must_cast([axes, axes])
+}
+
+/// The largest multiple of `resolution` within `range`: where a sensor saturates.
+fn full_scale(range: f64, resolution: f64) -> f64 {
+    if resolution > 0.0 {
+        libm::floor(range / resolution * (1.0 + 1e-9)) * resolution
     } else {
-        GRAVITY_MPS2
-    };
-    let gravity = gravity_body(gravity_mps2, state);
-    let axis =
-        |i: usize| f64::from(state.accel_body_mps2[i]) + gravity[i] + params.accel_noise_std_mps2[i] * accel_noise[i];
-    let rate = |i: usize| {
-        f64::from(state.angular_rate_body_radps[i])
-            + params.gyro_bias_radps[i]
-            + params.gyro_noise_std_radps[i] * gyro_noise[i]
-    };
-    Sample {
-        accel_mps2: [axis(0), axis(1), axis(2)],
-        gyro_radps: [rate(0), rate(1), rate(2)],
-        compass_rad: compass_rad(state.yaw_rad + params.compass_noise_std_rad * gyro_noise[3]),
+        range
     }
 }
 
-/// What an accelerometer feels of gravity: the upward reaction, turned into the body (roll and pitch small or large).
-fn gravity_body(gravity_mps2: f64, state: &VehicleState) -> [f64; 3] {
-    if gravity_mps2 == 0.0 {
-        return [0.0; 3];
+impl Unit {
+    /// A unit that takes `samples` samples in a tick (1 for a slow one).
+    #[must_use]
+    pub fn new(params: &Params, samples: usize) -> Self {
+        let white = |std: [f64; 3], density: [f64; 3]| {
+            [0, 1, 2].map(|i: usize| (std[i] * std[i] + density[i] * density[i] / params.period_s).sqrt())
+        };
+        let limits =
+            |range: [f64; 3], resolution: [f64; 3]| [0, 1, 2].map(|i: usize| full_scale(range[i], resolution[i]));
+        let white = axes(
+            white(params.accel_noise_std_mps2, params.accel_noise_density),
+            white(params.gyro_noise_std_radps, params.gyro_noise_density),
+            params.compass_noise_std_rad,
+        );
+        let root_s = params.period_s.sqrt();
+        let walk = axes(
+            params.accel_bias_walk.map(|k| k * root_s),
+            params.gyro_bias_walk.map(|k| k * root_s),
+            0.0,
+        );
+        let resolution = axes(params.accel_resolution_mps2, params.gyro_resolution_radps, 0.0);
+        let any = |axes: &Pair| axes.iter().any(|std| *std > 0.0);
+        Self {
+            samples: samples.max(1),
+            signs: twice(signs(params.convention)),
+            gravity_mps2: match params.convention {
+                ImuConvention::Kinematic => 0.0,
+                ImuConvention::SpecificForce | ImuConvention::Carla => GRAVITY_MPS2 as f32,
+            },
+            bias: axes(params.accel_bias_mps2, params.gyro_bias_radps, params.compass_bias_rad),
+            white,
+            walk,
+            range: axes(
+                limits(params.accel_range_mps2, params.accel_resolution_mps2),
+                limits(params.gyro_range_radps, params.gyro_resolution_radps),
+                f64::from(f32::MAX),
+            ),
+            divisor: resolution.map(|step| if step > 0.0 { step } else { 1.0 }),
+            stepped: resolution.map(|step| if step > 0.0 { u32::MAX } else { 0 }),
+            is_stepped: any(&resolution),
+            is_noisy: any(&white),
+            is_walking: any(&walk),
+        }
     }
-    let (sin_pitch, cos_pitch) = libm::sincos(f64::from(state.pitch_rad));
-    let (sin_roll, cos_roll) = libm::sincos(f64::from(state.roll_rad));
-    [
-        gravity_mps2 * sin_pitch,
-        gravity_mps2 * cos_pitch * sin_roll,
-        gravity_mps2 * cos_pitch * cos_roll,
-    ]
+
+    /// Plans the numbers of the samples from `first` on: white noise sample by sample, then the walk, two blocks each.
+    pub fn plan(&self, draws: &mut Draws, first: u32) {
+        let streams = [
+            (self.is_noisy, [Sensor::ImuFront, Sensor::ImuBack]),
+            (self.is_walking, [Sensor::WalkFront, Sensor::WalkBack]),
+        ];
+        for (is_on, halves) in streams {
+            for sample in (0_u32..).take(if is_on { self.samples } else { 0 }) {
+                for half in halves {
+                    draws.plan(half, first.wrapping_add(sample));
+                }
+            }
+        }
+    }
+
+    /// The samples of a tick, oldest first, into `out` (one place for each), with the numbers that were planned; `walk` is what the
+    /// biases have walked so far.
+    ///
+    /// A sample over several sub-steps is the mean of their accelerations and rates; gravity and heading are those at its end.
+    #[inline]
+    pub fn sample(&self, path: Path, body: &Body, drawn: Drawn, walk: &mut Axes, out: &mut [Sample]) {
+        path.run(Samples {
+            unit: self,
+            body,
+            drawn,
+            walk,
+            out,
+        });
+    }
 }
 
-/// Heading clockwise from north in [0, 2π), from yaw counter-clockwise from east.
+/// The samples of one tick, with the widest vectors: [`LANES`] of them, in one pass after the other over plain arrays.
+struct Samples<'a> {
+    unit: &'a Unit,
+    body: &'a Body<'a>,
+    drawn: Drawn<'a>,
+    walk: &'a mut Axes,
+    out: &'a mut [Sample],
+}
+
+/// Numbers of two samples: one register of AVX-512.
+type Pair = [f32; 16];
+/// Numbers of [`LANES`] samples.
+type Values = [Pair; LANES / 2];
+
+impl Work for Samples<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let (unit, rows) = (self.unit, self.body.rows);
+        let steps = (rows.len() / unit.samples).max(1);
+        let of_all = |is_on: bool| if is_on { 2 * unit.samples } else { 0 };
+        let mut drawn = self.drawn;
+        let white = drawn.split(of_all(unit.is_noisy));
+        let drift = drawn.split(of_all(unit.is_walking));
+        let mut values: Values = [[0.0; 16]; LANES / 2];
+        let mut first = 0;
+        for some in self.out.chunks_mut(LANES) {
+            let values = &mut values[..some.len().div_ceil(2)];
+            // With fewer sub-steps than samples, the last ones see the newest that there is.
+            let rows_of = |i: usize| &rows[((first + i) * steps).min(rows.len() - steps)..][..steps];
+            let gravity = if unit.gravity_mps2 == 0.0 {
+                [[0.0; LANES]; 3]
+            } else {
+                gravity_body(unit.gravity_mps2, some.len(), &rows_of)
+            };
+            for i in 0..some.len() {
+                let felt = if steps == 1 {
+                    felt(&rows_of(i)[0])
+                } else {
+                    mean(rows_of(i))
+                };
+                let gravity = [gravity[0][i], gravity[1][i], gravity[2][i], 0.0, 0.0, 0.0, 0.0, 0.0];
+                let value = &mut values[i / 2][8 * (i % 2)..][..8];
+                for axis in 0..8 {
+                    value[axis] = felt[axis] + gravity[axis];
+                }
+            }
+            unit.err(white, 2 * first, values);
+            if unit.is_walking {
+                unit.walk(drift, 2 * first, self.walk, values);
+            }
+            unit.deliver(values);
+            for (i, out) in some.iter_mut().enumerate() {
+                let value = &values[i / 2][8 * (i % 2)..];
+                out.copy_from_slice(&value[..IMU_COLUMNS]);
+                let yaw_rad = self.body.yaw_rad + f64::from(rows_of(i)[steps - 1].dyaw_rad);
+                out[COMPASS] = compass_rad(yaw_rad, f64::from(value[COMPASS]));
+            }
+            first += some.len();
+        }
+    }
+}
+
+impl Unit {
+    /// From what the body feels to the sensor's axes, with constant biases and white noise, whose blocks begin at `from`.
+    #[inline(always)]
+    fn err(&self, white: Drawn, from: usize, values: &mut [Pair]) {
+        for (index, value) in values.iter_mut().enumerate() {
+            let normals = white.four(from + 4 * index);
+            for i in 0..16 {
+                value[i] = value[i] * self.signs[i] + (self.bias[i] + self.white[i] * normals[i]);
+            }
+        }
+    }
+
+    /// Lets the biases walk from sample to sample.
+    #[inline(always)]
+    fn walk(&self, drift: Drawn, from: usize, walk: &mut Axes, values: &mut [Pair]) {
+        let mut walked = *walk;
+        for (index, value) in values.iter_mut().enumerate() {
+            let normals = drift.four(from + 4 * index);
+            let mut step = [0.0; 16];
+            for i in 0..16 {
+                step[i] = self.walk[i] * normals[i];
+            }
+            for half in [0, 8] {
+                for axis in 0..8 {
+                    walked[axis] += step[half + axis];
+                }
+                for axis in 0..8 {
+                    value[half + axis] += walked[axis];
+                }
+            }
+        }
+        *walk = walked;
+    }
+
+    /// From values to what leaves the sensor: multiples of the resolution within the range.
+    #[inline(always)]
+    #[expect(
+        clippy::needless_range_loop,
+        reason = "plain indices are what the compiler turns into vectors here"
+    )]
+    fn deliver(&self, values: &mut [Pair]) {
+        if self.is_stepped {
+            for value in &mut *values {
+                let mut steps: Pair = [0.0; 16];
+                for i in 0..16 {
+                    steps[i] = value[i] / self.divisor[i];
+                }
+                for step in &mut steps {
+                    *step = step.round_ties_even();
+                }
+                for i in 0..16 {
+                    steps[i] *= self.divisor[i];
+                }
+                // Bits instead of a condition, which would become a branch for each axis.
+                let (stepped, mut kept): ([u32; 16], [u32; 16]) =
+                    (bytemuck::must_cast(steps), bytemuck::must_cast(*value));
+                for i in 0..16 {
+                    kept[i] ^= (kept[i] ^ stepped[i]) & self.stepped[i];
+                }
+                *value = bytemuck::must_cast(kept);
+            }
+        }
+        for value in values {
+            for i in 0..16 {
+                let most = self.range[i];
+                let below = if value[i] > most { most } else { value[i] };
+                value[i] = if below < -most { -most } else { below };
+            }
+        }
+    }
+}
+
+/// Acceleration and angular rate of a sub-step; what follows them has the sign 0.
+#[inline(always)]
+fn felt(row: &SubStep) -> Axes {
+    let [_, felt]: [Axes; 2] = bytemuck::must_cast(*row);
+    felt
+}
+
+/// Mean acceleration and angular rate over sub-steps.
+#[inline(always)]
+fn mean(rows: &[SubStep]) -> Axes {
+    let mut sum = [0.0; 8];
+    for row in rows {
+        let felt = felt(row);
+        for axis in 0..8 {
+            sum[axis] += felt[axis];
+        }
+    }
+    let share = 1.0 / rows.len() as f32;
+    for value in &mut sum {
+        *value *= share;
+    }
+    sum
+}
+
+/// Signs of the axes of a convention against x forward, y left, z up.
+///
+/// CARLA's sensors live in Unreal's left-handed frame, x forward, y right, z up (CARLA's documentation, "Sensors reference", IMU;
+/// `AInertialMeasurementUnit`): acceleration along y changes its sign, and of the angular rate, an axial vector, the two components
+/// that the mirror leaves in place: rolling to the left and turning to the right are positive there, and nose down still is. Its
+/// compass is 0 at (0, −1, 0), which is north there, and grows clockwise as ours. Its gravity is 9.81 m/s², ours 9.806 65.
+fn signs(convention: ImuConvention) -> Axes {
+    match convention {
+        ImuConvention::Kinematic | ImuConvention::SpecificForce => [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0],
+        ImuConvention::Carla => [1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 0.0, 0.0],
+    }
+}
+
+/// What an accelerometer feels of gravity at the end of each sample: the upward reaction, turned into the body (roll and pitch small
+/// or large).
+#[inline(always)]
+fn gravity_body<'r>(gravity_mps2: f32, samples: usize, rows_of: &impl Fn(usize) -> &'r [SubStep]) -> [[f32; LANES]; 3] {
+    let (mut roll, mut pitch): ([u32; LANES], [u32; LANES]) = ([0; LANES], [0; LANES]);
+    for (i, (roll, pitch)) in roll.iter_mut().zip(&mut pitch).take(samples).enumerate() {
+        if let Some(end) = rows_of(i).last() {
+            (*roll, *pitch) = (turns(end.roll_rad), turns(end.pitch_rad));
+        }
+    }
+    let mut gravity = [[0.0; LANES]; 3];
+    for lane in 0..LANES {
+        let (cos_pitch, sin_pitch) = cos_sin(pitch[lane]);
+        let (cos_roll, sin_roll) = cos_sin(roll[lane]);
+        gravity[0][lane] = gravity_mps2 * sin_pitch;
+        gravity[1][lane] = gravity_mps2 * cos_pitch * sin_roll;
+        gravity[2][lane] = gravity_mps2 * cos_pitch * cos_roll;
+    }
+    gravity
+}
+
+/// An angle in parts of 2⁻³² of a turn, whole turns left out. The last bit of a number between 2²⁰ and 2²¹ is one such part: the
+/// addition rounds to it, without a conversion that depends on the sign and size.
+#[inline(always)]
+fn turns(angle_rad: impl Into<f64>) -> u32 {
+    const ROUNDS: f64 = 1_572_864.0;
+    (angle_rad.into() * (1.0 / TAU) + ROUNDS).to_bits() as u32
+}
+
+/// Heading clockwise from north in [0, 2π) to 2⁻²⁴ of a turn, from yaw counter-clockwise from east, with an error clockwise.
 #[must_use]
-pub fn compass_rad(yaw_rad: f64) -> f64 {
-    let heading = (std::f64::consts::FRAC_PI_2 - yaw_rad).rem_euclid(std::f64::consts::TAU);
-    // The remainder of a tiny negative number rounds up to the whole circle.
-    if heading >= std::f64::consts::TAU { 0.0 } else { heading }
+#[inline(always)]
+pub fn compass_rad(yaw_rad: f64, error_rad: f64) -> f32 {
+    const RAD: f32 = (TAU / 16_777_216.0) as f32;
+    let heading = turns(FRAC_PI_2 - yaw_rad + error_rad);
+    (heading.wrapping_add(1 << 7) >> 8) as i32 as f32 * RAD
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::preset::town;
-    use proptest::prelude::*;
-    use std::f64::consts::{FRAC_PI_2, PI, TAU};
-
-    fn quiet() -> Params {
-        Params {
-            accel_noise_std_mps2: [0.0; 3],
-            gyro_noise_std_radps: [0.0; 3],
-            compass_noise_std_rad: 0.0,
-            ..town().imu
-        }
-    }
-
-    #[test]
-    fn the_compass_knows_the_four_winds() {
-        for (yaw, heading) in [(FRAC_PI_2, 0.0), (0.0, FRAC_PI_2), (-FRAC_PI_2, PI), (PI, 1.5 * PI)] {
-            assert!((compass_rad(yaw) - heading).abs() < 1e-12);
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn the_compass_stays_in_the_circle(yaw in -100.0_f64..100.0) {
-            prop_assert!((0.0..TAU).contains(&compass_rad(yaw)));
-        }
-    }
-
-    #[test]
-    fn a_quiet_imu_at_rest_feels_gravity_as_configured() {
-        let state = VehicleState::default();
-        assert_eq!(sample(&quiet(), &state, 1, 0).accel_mps2, [0.0; 3]);
-        assert_eq!(
-            sample(
-                &Params {
-                    convention: ImuConvention::SpecificForce,
-                    ..quiet()
-                },
-                &state,
-                1,
-                0
-            )
-            .accel_mps2,
-            [0.0, 0.0, GRAVITY_MPS2]
-        );
-        // Nose up by 30°: the accelerometer is pushed forward by half of gravity.
-        let uphill = VehicleState {
-            pitch_rad: (PI / 6.0) as f32,
-            ..state
-        };
-        let felt = sample(
-            &Params {
-                convention: ImuConvention::SpecificForce,
-                ..quiet()
-            },
-            &uphill,
-            1,
-            0,
-        )
-        .accel_mps2;
-        assert!(
-            (felt[0] - 4.903_325).abs() < 1e-5 && (felt[2] - 8.4928).abs() < 1e-3,
-            "{felt:?}"
-        );
-    }
-
-    /// Rolled to the right by 30°, the left side is up: the seat pushes the sensor to its left by half of gravity.
-    #[test]
-    fn a_roll_to_the_right_is_felt_to_the_left() {
-        let rolled = VehicleState {
-            roll_rad: (PI / 6.0) as f32,
-            ..VehicleState::default()
-        };
-        let params = Params {
-            convention: ImuConvention::SpecificForce,
-            ..quiet()
-        };
-        let felt = sample(&params, &rolled, 1, 0).accel_mps2;
-        assert!(
-            (felt[1] - 4.903_325).abs() < 1e-5 && (felt[2] - 8.4928).abs() < 1e-3,
-            "{felt:?}"
-        );
-    }
-
-    #[test]
-    fn noise_has_the_configured_level_and_bias_stays() {
-        const N: u32 = 20_000;
-        let params = Params {
-            accel_noise_std_mps2: [0.5; 3],
-            gyro_noise_std_radps: [0.1; 3],
-            gyro_bias_radps: [0.02; 3],
-            ..quiet()
-        };
-        let samples: Vec<Sample> = (0..N)
-            .map(|index| sample(&params, &VehicleState::default(), 3, index))
-            .collect();
-        let n = f64::from(N);
-        for axis in 0..3 {
-            let std = (samples.iter().map(|s| s.accel_mps2[axis].powi(2)).sum::<f64>() / n).sqrt();
-            assert!((std - 0.5).abs() < 5.0 * 0.5 / (2.0 * n).sqrt(), "accelerometer {std}");
-            let mean = samples.iter().map(|s| s.gyro_radps[axis]).sum::<f64>() / n;
-            assert!((mean - 0.02).abs() < 5.0 * 0.1 / n.sqrt(), "gyroscope {mean}");
-        }
-    }
-}
+mod tests;

@@ -6,17 +6,24 @@
 // Sensor values leave in single precision: the wire's precision, see `ipc_schema::observation`.
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
+pub mod blackout;
+pub mod carrier;
 pub mod daemon;
 pub mod digest;
 pub mod fields;
 pub mod gnss;
+pub mod history;
 pub mod imu;
 pub mod lidar;
 pub mod noise;
+pub mod normals;
 #[cfg(test)]
 #[path = "../../sim-core/tests/common/preset.rs"]
 mod preset;
+pub mod sections;
 pub mod sensing;
 pub mod sky;
 pub mod slots;
 pub mod speed_steering;
+pub mod suite;
+pub mod wide;

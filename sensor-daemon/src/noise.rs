@@ -1,5 +1,12 @@
 //! Counter-based random numbers: a value depends on what it is for, never on when or in which order it is drawn.
 
+use crate::{
+    normals::{self, Block, LANES, Lanes, Purpose},
+    wide::Path,
+};
+
+pub use crate::normals::philox4x32;
+
 /// Random stream of one sensor of one vehicle in one episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stream {
@@ -11,101 +18,179 @@ pub struct Stream {
     pub sensor: Sensor,
 }
 
-/// Sensors with random streams of their own.
+/// Sensors, and parts of sensors, with random streams of their own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Sensor {
-    /// GNSS receiver.
+    /// GNSS receiver, white noise: east, north, up.
     Gnss = 1,
-    /// Accelerometer.
-    Accelerometer = 2,
-    /// Gyroscope and compass.
-    Gyroscope = 3,
+    /// IMU, white noise: accelerometer, and x of the gyroscope.
+    ImuFront = 2,
+    /// IMU, white noise: y and z of the gyroscope, compass.
+    ImuBack = 3,
     /// Wheel speed and steering angle.
     SpeedSteering = 4,
+    /// GNSS receiver, correlated noise: east, north, up.
+    GnssCorrelated = 32,
+    /// IMU, walk of the biases of the accelerometer and of x of the gyroscope.
+    WalkFront = 33,
+    /// IMU, walk of the biases of y and z of the gyroscope.
+    WalkBack = 34,
+    /// Scale errors of wheel speed and steering angle.
+    Scale = 35,
+    /// Blackouts of the GNSS receiver.
+    GnssBlackout = 40,
+    /// Blackouts of the IMU.
+    ImuBlackout = 41,
+    /// Blackouts of the speed and steering sensor.
+    SpeedSteeringBlackout = 42,
+    /// Blackouts of the LIDAR.
+    LidarBlackout = 43,
+}
+
+/// The key of an episode's numbers.
+fn key(episode_seed: u64) -> [u32; 2] {
+    [episode_seed as u32, (episode_seed >> 32) as u32]
 }
 
 impl Stream {
-    /// Four independent standard normal numbers for the sensor's `sample`-th sample (Box–Muller transform; libm is used so that
-    /// the bits do not depend on the C library).
+    /// Four independent standard normal numbers for the sensor's `sample`-th sample.
     #[must_use]
-    pub fn normals(&self, sample: u32) -> [f64; 4] {
-        let [a, b, c, d] = self.uniform(sample);
-        let (n0, n1) = box_muller(a, b);
-        let (n2, n3) = box_muller(c, d);
-        [n0, n1, n2, n3]
+    pub fn normals(&self, sample: u32) -> Block {
+        normals::block(self.counter(sample, 0), key(self.episode_seed))
     }
 
-    /// The first two of [`Stream::normals`], at half the cost.
+    /// Two numbers uniform in [0, 1) for the `part`-th part of the sensor's `sample`-th sample; 24 bits of parts count.
     #[must_use]
-    pub fn normal_pair(&self, sample: u32) -> [f64; 2] {
-        let [a, b, ..] = self.uniform(sample);
-        let (n0, n1) = box_muller(a, b);
-        [n0, n1]
+    pub fn uniform_pair(&self, sample: u32, part: u32) -> [f64; 2] {
+        let [a, b, c, d] = philox4x32(self.counter(sample, part), key(self.episode_seed));
+        [[a, b], [c, d]]
+            .map(|[high, low]| (f64::from(high >> 5) * 67_108_864.0 + f64::from(low >> 6)) / 9_007_199_254_740_992.0)
     }
 
-    fn uniform(&self, sample: u32) -> [u32; 4] {
-        let counter = [
+    fn counter(&self, sample: u32, part: u32) -> [u32; 4] {
+        [
             sample,
-            self.sensor as u32,
+            self.sensor as u32 | (part << 8),
             self.id_hash as u32,
             (self.id_hash >> 32) as u32,
-        ];
-        philox4x32(counter, [self.episode_seed as u32, (self.episode_seed >> 32) as u32])
+        ]
     }
 }
 
-/// Philox4x32-10, the counter-based generator of Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
-#[must_use]
-pub fn philox4x32(counter: [u32; 4], key: [u32; 2]) -> [u32; 4] {
-    const MULTIPLIERS: [u64; 2] = [0xD251_1F53, 0xCD9E_8D57];
-    const WEYL: [u32; 2] = [0x9E37_79B9, 0xBB67_AE85];
-    let ([mut c0, mut c1, mut c2, mut c3], [mut k0, mut k1]) = (counter, key);
-    for _ in 0..10 {
-        let (p0, p1) = (MULTIPLIERS[0] * u64::from(c0), MULTIPLIERS[1] * u64::from(c2));
-        (c0, c1, c2, c3) = (
-            (p1 >> 32) as u32 ^ c1 ^ k0,
-            p1 as u32,
-            (p0 >> 32) as u32 ^ c3 ^ k1,
-            p0 as u32,
-        );
-        (k0, k1) = (k0.wrapping_add(WEYL[0]), k1.wrapping_add(WEYL[1]));
-    }
-    [c0, c1, c2, c3]
+/// Numbers of [`LANES`] vehicles at a time. All need the same at a tick: it is planned once, and drawn for one group after the other.
+#[derive(Debug)]
+pub struct Draws {
+    path: Path,
+    plan: Vec<Purpose>,
+    blocks: Vec<Lanes>,
 }
 
-/// Two independent standard normal numbers from two uniform 32-bit ones.
-fn box_muller(a: u32, b: u32) -> (f64, f64) {
-    const SCALE: f64 = 1.0 / 4_294_967_296.0;
-    // In (0, 1]: the logarithm is finite.
-    let radius = libm::sqrt(-2.0 * libm::log((f64::from(a) + 1.0) * SCALE));
-    let (sine, cosine) = libm::sincos(std::f64::consts::TAU * (f64::from(b) * SCALE));
-    (radius * cosine, radius * sine)
+impl Default for Draws {
+    fn default() -> Self {
+        Self::on(Path::widest())
+    }
+}
+
+impl Draws {
+    /// Draws with the instructions of `path`.
+    #[must_use]
+    pub fn on(path: Path) -> Self {
+        Self {
+            path,
+            plan: Vec::new(),
+            blocks: Vec::new(),
+        }
+    }
+
+    /// Forgets everything that was planned.
+    pub fn clear(&mut self) {
+        self.plan.clear();
+    }
+
+    /// Plans a sample of a sensor.
+    pub fn plan(&mut self, sensor: Sensor, sample: u32) {
+        self.plan.push([sample, sensor as u32]);
+    }
+
+    /// Draws everything that is planned for the vehicles with these ids.
+    pub fn draw(&mut self, episode_seed: u64, ids: &[u64; LANES]) {
+        self.blocks.resize(self.plan.len(), [[0.0; 4]; LANES]);
+        normals::fill(self.path, key(episode_seed), ids, &self.plan, &mut self.blocks);
+    }
+
+    /// What has been drawn for the vehicle in `lane`, in the order of the plan.
+    #[must_use]
+    #[inline]
+    pub fn of(&self, lane: usize) -> Drawn<'_> {
+        Drawn {
+            blocks: &self.blocks,
+            lane: lane % LANES,
+        }
+    }
+}
+
+/// One vehicle's share of what has been drawn for a group.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Drawn<'a> {
+    blocks: &'a [Lanes],
+    lane: usize,
+}
+
+impl Drawn<'_> {
+    /// Takes the next block if one was planned, else zeros.
+    #[inline]
+    pub fn take(&mut self, is_planned: bool) -> Block {
+        if is_planned { self.split(1).at(0) } else { [0.0; 4] }
+    }
+
+    /// Takes the next `count` blocks, or as many as there are.
+    #[must_use]
+    #[inline(always)]
+    pub fn split(&mut self, count: usize) -> Self {
+        let (blocks, rest) = self.blocks.split_at(count.min(self.blocks.len()));
+        self.blocks = rest;
+        Self { blocks, ..*self }
+    }
+
+    /// The block at an index; zeros behind the last.
+    #[must_use]
+    #[inline(always)]
+    pub fn at(&self, index: usize) -> Block {
+        match self.blocks.get(index) {
+            Some(lanes) => lanes[self.lane % LANES],
+            None => [0.0; 4],
+        }
+    }
+
+    /// Four blocks from an index on; zeros behind the last.
+    #[must_use]
+    #[inline(always)]
+    pub fn four(&self, index: usize) -> [f32; 16] {
+        let lane = self.lane % LANES;
+        let four = match self.blocks.get(index..index + 4) {
+            Some([a, b, c, d]) => [a[lane], b[lane], c[lane], d[lane]],
+            _ => [0, 1, 2, 3].map(|i| self.at(index + i)),
+        };
+        bytemuck::must_cast(four)
+    }
+
+    /// Number of blocks.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.blocks.len()
+    }
+
+    /// True if there are no blocks.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.blocks.is_empty()
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// Known answers published with Random123 (kat_vectors, philox 4x32, 10 rounds).
-    #[test]
-    fn philox_gives_the_published_answers() {
-        assert_eq!(
-            philox4x32([0; 4], [0; 2]),
-            [0x6627_e8d5, 0xe169_c58d, 0xbc57_ac4c, 0x9b00_dbd8]
-        );
-        assert_eq!(
-            philox4x32([u32::MAX; 4], [u32::MAX; 2]),
-            [0x408f_276d, 0x41c8_3b0e, 0xa20b_c7c6, 0x6d54_51fd]
-        );
-        assert_eq!(
-            philox4x32(
-                [0x243f_6a88, 0x85a3_08d3, 0x1319_8a2e, 0x0370_7344],
-                [0xa409_3822, 0x299f_31d0]
-            ),
-            [0xd16c_fe09, 0x94fd_cceb, 0x5001_e420, 0x2412_6ea1]
-        );
-    }
 
     fn stream(id_hash: u64, sensor: Sensor) -> Stream {
         Stream {
@@ -115,52 +200,102 @@ mod tests {
         }
     }
 
-    fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64, f64) {
-        let n = values.clone().count() as f64;
-        let mean = values.clone().sum::<f64>() / n;
-        let variance = values.clone().map(|v| (v - mean).powi(2)).sum::<f64>() / n;
-        let kurtosis = values.map(|v| (v - mean).powi(4)).sum::<f64>() / n / variance.powi(2);
-        (mean, variance, kurtosis)
+    /// Mean, variance, skewness, kurtosis.
+    fn moments(values: &[f64]) -> [f64; 4] {
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let central = |power| values.iter().map(|v| (v - mean).powi(power)).sum::<f64>() / n;
+        let variance = central(2);
+        [
+            mean,
+            variance,
+            central(3) / variance.powf(1.5),
+            central(4) / variance.powi(2),
+        ]
     }
 
     #[test]
     fn normals_are_standard_normal() {
-        const N: u32 = 100_000;
+        const N: u32 = 1_000_000;
         let stream = stream(7, Sensor::Gnss);
+        let blocks: Vec<Block> = (0..N).map(|sample| stream.normals(sample)).collect();
         for axis in 0..4 {
-            let (mean, variance, kurtosis) = moments((0..N).map(|sample| stream.normals(sample)[axis]));
-            // Five standard errors: 1/√N, √(2/N), √(24/N).
+            let values: Vec<f64> = blocks.iter().map(|block| f64::from(block[axis])).collect();
+            let [mean, variance, skewness, kurtosis] = moments(&values);
+            // Five standard errors: 1/√N, √(2/N), √(6/N), √(24/N).
             let n = f64::from(N);
             assert!(mean.abs() < 5.0 / n.sqrt(), "mean {mean}");
             assert!((variance - 1.0).abs() < 5.0 * (2.0 / n).sqrt(), "variance {variance}");
+            assert!(skewness.abs() < 5.0 * (6.0 / n).sqrt(), "skewness {skewness}");
             assert!((kurtosis - 3.0).abs() < 5.0 * (24.0 / n).sqrt(), "kurtosis {kurtosis}");
+            // Shares beyond 1 to 4.5 σ: erfc(x/√2), five standard errors of a count.
+            for beyond in [1.0, 2.0, 3.0, 4.0, 4.5] {
+                let share = libm::erfc(beyond / std::f64::consts::SQRT_2);
+                let count = values.iter().filter(|value| value.abs() > beyond).count() as f64;
+                assert!(
+                    (count - n * share).abs() < 5.0 * (n * share).sqrt(),
+                    "{count} beyond {beyond} σ, {} expected",
+                    n * share
+                );
+            }
         }
     }
 
     #[test]
-    fn a_pair_is_the_first_two() {
-        let stream = stream(7, Sensor::Gnss);
-        assert!((0..100).all(|sample| stream.normals(sample)[..2] == stream.normal_pair(sample)));
+    fn draws_are_the_streams_own_numbers() {
+        let mut draws = Draws::default();
+        assert!(draws.of(3).is_empty());
+        let mut ids = [9; LANES];
+        (ids[3], ids[15]) = (7, u64::MAX - 5);
+        for round in 0..3_u32 {
+            draws.clear();
+            draws.plan(Sensor::Gnss, round);
+            draws.plan(Sensor::ImuBack, u32::MAX);
+            draws.draw(42, &ids);
+            assert_eq!(draws.of(3).at(0), stream(7, Sensor::Gnss).normals(round));
+            let back = stream(u64::MAX - 5, Sensor::ImuBack).normals(u32::MAX);
+            let mut drawn = draws.of(15);
+            let flat: [[f32; 4]; 4] = bytemuck::must_cast(drawn.four(1));
+            assert_eq!(flat, [back, [0.0; 4], [0.0; 4], [0.0; 4]]);
+            assert_eq!((drawn.len(), drawn.take(false)), (2, [0.0; 4]));
+            let _ = drawn.take(true);
+            assert_eq!((drawn.take(true), drawn.take(true)), (back, [0.0; 4]));
+        }
     }
 
     #[test]
-    fn streams_of_vehicles_sensors_and_axes_are_independent() {
+    fn uniform_pairs_are_uniform_and_parts_differ() {
         const N: u32 = 100_000;
-        let correlation =
-            |a: &dyn Fn(u32) -> f64, b: &dyn Fn(u32) -> f64| (0..N).map(|s| a(s) * b(s)).sum::<f64>() / f64::from(N);
-        let draw = |id_hash, sensor, axis: usize| move |sample: u32| stream(id_hash, sensor).normals(sample)[axis];
+        let stream = stream(7, Sensor::GnssBlackout);
+        let pairs: Vec<[f64; 2]> = (0..N).map(|part| stream.uniform_pair(3, part)).collect();
+        for axis in 0..2 {
+            let mean = pairs.iter().map(|pair| pair[axis]).sum::<f64>() / f64::from(N);
+            assert!((mean - 0.5).abs() < 5.0 / (12.0 * f64::from(N)).sqrt(), "{mean}");
+            assert!(pairs.iter().all(|pair| (0.0..1.0).contains(&pair[axis])));
+        }
+    }
+
+    #[test]
+    fn streams_of_vehicles_sensors_axes_and_samples_are_independent() {
+        const N: u32 = 100_000;
+        let draw =
+            |id_hash, sensor, axis: usize| move |sample: u32| f64::from(stream(id_hash, sensor).normals(sample)[axis]);
         let reference = draw(1, Sensor::Gnss, 0);
-        let others: [&dyn Fn(u32) -> f64; 4] = [
+        let others: [&dyn Fn(u32) -> f64; 8] = [
             &draw(2, Sensor::Gnss, 0),
-            &draw(1, Sensor::Gyroscope, 0),
+            &draw(1, Sensor::ImuFront, 0),
+            &draw(1, Sensor::GnssCorrelated, 0),
             &draw(1, Sensor::Gnss, 1),
+            &draw(1, Sensor::Gnss, 2),
             &draw(1 << 32, Sensor::Gnss, 0),
+            &|sample| reference(sample + 1),
+            &|sample| reference(sample + 16),
         ];
-        for other in others {
-            let correlation = correlation(&reference, other);
+        for (number, other) in others.iter().enumerate() {
+            let correlation = (0..N).map(|s| reference(s) * other(s)).sum::<f64>() / f64::from(N);
             assert!(
                 correlation.abs() < 5.0 / f64::from(N).sqrt(),
-                "correlation {correlation}"
+                "correlation {correlation} with {number}"
             );
         }
     }

@@ -1,74 +1,71 @@
-//! All sensors of all connected vehicles: one tick of the world in, one observation block out.
+//! All sensors of all connected road users: one tick of the world in, one observation block out.
 
 use ipc_schema::{
-    block::{self, BlockError},
-    config::Config,
+    block::BlockError,
+    config::{BlackoutPolicy, Config},
     header::{FIRST_OF_EPISODE, MessageHeader},
-    observation::{CLIPPED, GNSS_COLUMNS, ObservationLayout, SENSORS, TRUTH_COLUMNS, VALID},
+    observation::{CLIPPED, GNSS, IMU, LIDAR, ObservationLayout, SPEED_STEERING, VALID},
     run::MapInfo,
     traffic::Kind,
-    world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, TIME_LIMIT, VehicleState},
+    world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, SubStep, TIME_LIMIT, VehicleState},
 };
-use sim_core::{
-    displacement::DisplacementMap,
-    geodesy::{GeodesyError, Projection},
-};
+use sim_core::geodesy::{GeodesyError, Projection};
 
 use crate::{
-    fields::{Normaliser, Readings},
-    gnss, imu,
-    noise::{Sensor, Stream},
+    carrier::Carrier,
+    fields::Normaliser,
+    gnss::Sky,
+    history::{First, History},
+    noise::{Drawn, Draws},
+    normals::LANES,
+    sections::Sections,
     slots::Slots,
-    speed_steering,
+    suite::{Motion, Now, Suite},
 };
-
-/// Ticks between two samples of each sensor.
-#[derive(Debug, Clone, Copy)]
-struct Periods {
-    gnss: u32,
-    imu: u32,
-    speed_steering: u32,
-}
-
-impl Periods {
-    fn new(config: &Config) -> Self {
-        // Validated to be whole numbers of ticks.
-        let ticks =
-            |period_s: f64| ((period_s / config.run.tick_s).round() as i64).clamp(1, i64::from(u32::MAX)) as u32;
-        Self {
-            gnss: ticks(config.gnss.period_s),
-            imu: ticks(config.imu.period_s),
-            speed_steering: ticks(config.speed_steering.period_s),
-        }
-    }
-}
 
 /// Sums of the raw GNSS error over all fixes.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RawError {
     /// Sum of distances, metres.
     pub sum_m: f64,
-    /// Number of vehicle-ticks.
+    /// Number of vehicle-ticks with a receiver that delivers.
     pub count: u64,
 }
 
+/// One tick of the world, as `world` carries it.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct World<'a> {
+    /// Everybody at the end of the tick.
+    pub states: &'a [VehicleState],
+    /// As many sub-steps for each of them, one behind the other; none = what the states say.
+    pub sub_steps: &'a [SubStep],
+    /// What heroes see.
+    pub views: &'a [HeroView],
+}
+
 /// Sensors of a run, with what they remember from tick to tick.
-#[derive(Debug)]
 pub struct Sensing {
-    config: Config,
-    map: DisplacementMap,
+    suite: Suite,
     normaliser: Normaliser,
-    periods: Periods,
+    history: History,
+    policy: BlackoutPolicy,
+    lidar_range_m: f32,
+    imu_samples: usize,
     /// Length of a tick, nanoseconds.
     tick_ns: u64,
     slots: Slots,
     /// Who gets a slot: heroes if they drive, else connected vehicles.
     agents: Kind,
-    /// Newest readings by slot.
-    readings: Vec<Readings>,
+    /// Persons get one too.
+    pedestrians: bool,
+    collision_ends: bool,
+    /// What each slot's sensors remember.
+    carriers: Vec<Carrier>,
     /// Row in the world, by slot, for the tick at work.
     row_of_slot: Vec<Option<u32>>,
+    draws: Draws,
     raw_error: RawError,
+    observations: u64,
 }
 
 impl Sensing {
@@ -77,30 +74,43 @@ impl Sensing {
     /// # Errors
     /// The map's projection is not understood, or the map is outside its domain.
     pub fn new(config: &Config, map: &MapInfo) -> Result<Self, GeodesyError> {
+        let tick_ns = ((config.run.tick_s * 1e9).round() as u64).max(1);
+        let normaliser = Normaliser::new(&config.observation, map.bounds_m, config.lidar.range_m);
         Ok(Self {
-            map: DisplacementMap::new(&Projection::new(map)?, map.bounds_m)?,
-            normaliser: Normaliser::new(&config.observation, map.bounds_m),
-            periods: Periods::new(config),
-            tick_ns: ((config.run.tick_s * 1e9).round() as u64).max(1),
+            suite: Suite::new(config, &Projection::new(map)?, map.bounds_m, tick_ns)?,
+            history: History::new(normaliser.width(), config.observation.history as usize),
+            normaliser,
+            policy: config.blackout.policy,
+            lidar_range_m: config.lidar.range_m as f32,
+            imu_samples: config.imu_samples(),
+            tick_ns,
             slots: Slots::default(),
             agents: if config.drives() { Kind::Hero } else { Kind::Cav },
-            readings: Vec::new(),
+            pedestrians: config.gnss.pedestrians && !config.drives(),
+            collision_ends: config.collision.ends_trajectory,
+            carriers: Vec::new(),
             row_of_slot: Vec::new(),
+            draws: Draws::default(),
             raw_error: RawError::default(),
-            config: config.clone(),
+            observations: 0,
         })
     }
 
-    /// Fields in a row.
+    /// Puts satellites, and what hides them, into the sky; without, it is open.
+    pub fn set_sky(&mut self, sky: Box<dyn Sky>) {
+        self.suite.set_sky(sky);
+    }
+
+    /// Numbers in a row: fields times ticks.
     #[must_use]
     pub fn width(&self) -> usize {
-        self.normaliser.width()
+        self.history.width()
     }
 
     /// IMU samples in a tick.
     #[must_use]
     pub fn imu_samples(&self) -> usize {
-        self.config.imu_samples()
+        self.imu_samples
     }
 
     /// Error of the raw GNSS so far.
@@ -109,13 +119,20 @@ impl Sensing {
         self.raw_error
     }
 
-    /// Gives every connected vehicle in `states` its slot; returns the number of slots, which is the observation's n.
+    /// Valid rows so far.
+    #[must_use]
+    pub fn observations(&self) -> u64 {
+        self.observations
+    }
+
+    /// Gives every connected road user in `states` its slot; returns the number of slots, which is the observation's n.
     ///
     /// With `collision.ends_trajectory` a vehicle has no slot at the tick in which it collides, as if it had left: the slot it held
     /// says [`ipc_schema::observation::TERMINATED`], and from the next tick on it holds one anew, as a trajectory of its own.
     pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
         self.row_of_slot.fill(None);
+        let now = self.now(header);
         for (row, state) in (0_u32..).zip(states) {
             if self.is_sensed(state) {
                 let slot = self.slots.occupy(state.vehicle);
@@ -124,117 +141,214 @@ impl Sensing {
                 }
                 if slot >= self.row_of_slot.len() {
                     self.row_of_slot.resize(slot + 1, None);
-                    self.readings.resize(slot + 1, Readings::default());
                 }
                 self.row_of_slot[slot] = Some(row);
+                self.carry(slot, state, &now);
             }
         }
         self.slots.end();
         self.slots.rows().len()
     }
 
-    fn is_sensed(&self, state: &VehicleState) -> bool {
-        // What a hero collides with ends its episode after the observation of that tick; SUMO lets it go.
-        let collides = self.config.collision.ends_trajectory && state.flags & COLLIDED != 0;
-        state.kind == self.agents as u32 && (self.agents == Kind::Hero || !collides)
+    /// Takes the carrier in `slot` to this tick, a new one for a new trajectory.
+    fn carry(&mut self, slot: usize, state: &VehicleState, now: &Now) {
+        if self.slots.rows()[slot].step == 0 {
+            let carrier = self.suite.begin(state, slot, now);
+            match self.carriers.get_mut(slot) {
+                Some(place) => *place = carrier,
+                // Slots are lent in ascending order: this is the next one.
+                None => self.carriers.push(carrier),
+            }
+        } else {
+            self.suite.advance(&mut self.carriers[slot], state.id_hash, now);
+        }
     }
 
-    /// Samples what is due and writes the observation of the tick that [`Sensing::assign`] was called for.
+    fn is_sensed(&self, state: &VehicleState) -> bool {
+        // What a hero collides with ends its episode after the observation of that tick; SUMO lets it go.
+        let collides = self.collision_ends && state.flags & COLLIDED != 0;
+        let is_agent = state.kind == self.agents as u32 || (self.pedestrians && state.kind == Kind::Person as u32);
+        is_agent && (self.agents == Kind::Hero || !collides)
+    }
+
+    fn now(&self, header: &MessageHeader) -> Now {
+        Now {
+            episode_seed: header.episode_seed,
+            tick: (header.sim_time_ns / self.tick_ns) as u32,
+            time_ns: header.sim_time_ns,
+        }
+    }
+
+    /// Slot and row in the world of everybody whose LIDAR scans at the tick that [`Sensing::assign`] was called for.
+    pub fn lidars(&self) -> impl Iterator<Item = (usize, usize)> {
+        let slots = self.row_of_slot.iter().zip(&self.carriers).enumerate();
+        slots.filter_map(|(slot, (row, carrier))| match row {
+            Some(row) if carrier.awake() & LIDAR != 0 => Some((slot, *row as usize)),
+            _ => None,
+        })
+    }
+
+    /// What the LIDAR in `slot` sees nearest: points of four objects, forward and left of the rear axle (metres). What is not finite
+    /// stands for no object. To be called between [`Sensing::assign`] and [`Sensing::observe`]; held until it is called again.
+    pub fn set_objects(&mut self, slot: usize, objects_m: [[f32; 2]; 4]) {
+        if let Some(carrier) = self.carriers.get_mut(slot) {
+            carrier.readings.objects_m = objects_m.map(|[forward_m, left_m]| {
+                if forward_m.is_finite() && left_m.is_finite() {
+                    [forward_m, left_m]
+                } else {
+                    [self.lidar_range_m; 2]
+                }
+            });
+        }
+    }
+
+    /// Samples what is due and writes the observation of the tick that [`Sensing::assign`] was called for, into a payload of zeros.
+    ///
+    /// A row is [`VALID`] once every sensor of its road user has delivered; until then its observation and raw samples stay 0. A
+    /// pedestrian has no speed and steering sensor: its bit is never set, speed and steering are the value 0, aged 0 s.
     ///
     /// # Errors
     /// The payload is too short.
-    pub fn observe(
-        &mut self,
-        header: &MessageHeader,
-        states: &[VehicleState],
-        views: &[HeroView],
-        payload: &mut [u8],
-    ) -> Result<(), BlockError> {
-        let (n, d) = (self.slots.rows().len(), self.width());
-        let layout = ObservationLayout::new(n, d, self.imu_samples());
-        let sections = layout.named().map(|(_, section)| section);
-        let [
-            observation,
-            truth,
-            gnss_m,
-            _gnss_geodetic,
-            _gnss_quality,
-            _imu,
-            _speed_steering,
-            id_hash,
-            vehicle,
-            flags,
-            _sensors,
-            episode_step,
-            age_s,
-        ] = block::split_mut(payload, &sections)?;
-        let observation: &mut [f32] = bytemuck::cast_slice_mut(observation);
-        let truth: &mut [[f32; TRUTH_COLUMNS]] = bytemuck::cast_slice_mut(truth);
-        let gnss_m: &mut [[f32; GNSS_COLUMNS]] = bytemuck::cast_slice_mut(gnss_m);
-        let id_hash: &mut [u64] = bytemuck::cast_slice_mut(id_hash);
-        let vehicle: &mut [u32] = bytemuck::cast_slice_mut(vehicle);
-        let flags: &mut [u32] = bytemuck::cast_slice_mut(flags);
-        let episode_step: &mut [u32] = bytemuck::cast_slice_mut(episode_step);
-        let age_s: &mut [[f32; SENSORS]] = bytemuck::cast_slice_mut(age_s);
-        for slot in 0..n {
-            let lent = self.slots.rows()[slot];
-            vehicle[slot] = lent.vehicle;
-            flags[slot] = lent.ended;
-            let Some(row) = self.row_of_slot[slot] else { continue };
-            let state = &states[row as usize];
-            self.sample(header, state, slot, lent.step);
-            // Both are in ascending order of the vehicle.
-            if let Ok(place) = views.binary_search_by_key(&state.vehicle, |view| view.vehicle) {
-                self.readings[slot].route = views[place];
+    pub fn observe(&mut self, header: &MessageHeader, world: &World, payload: &mut [u8]) -> Result<(), BlockError> {
+        let n = self.slots.rows().len();
+        let layout = ObservationLayout::new(n, self.width(), self.imu_samples);
+        let mut sections = Sections::split(payload, &layout)?;
+        let now = self.now(header);
+        let mut draws = std::mem::take(&mut self.draws);
+        draws.clear();
+        self.suite.plan(&mut draws, &now);
+        for first in (0..n).step_by(LANES) {
+            let ids = std::array::from_fn(|lane| self.id_hash(first + lane, world));
+            draws.draw(now.episode_seed, &ids);
+            for slot in first..n.min(first + LANES) {
+                self.sense(slot, world, &now, draws.of(slot - first), &mut sections);
             }
-            let readings = &self.readings[slot];
-            let clipped = self
-                .normaliser
-                .fill(readings, &mut observation[slot * d..(slot + 1) * d]);
-            flags[slot] |= VALID | if clipped { CLIPPED } else { 0 };
-            truth[slot] = [
-                state.x_m as f32,
-                state.y_m as f32,
-                state.yaw_rad as f32,
-                state.velocity_body_mps[0],
-            ];
-            gnss_m[slot] = [readings.fix.x_m as f32, readings.fix.y_m as f32, 0.0];
-            id_hash[slot] = state.id_hash;
-            episode_step[slot] = lent.step;
-            age_s[slot] = self.ages_s(lent.step);
-            self.raw_error.sum_m += libm::hypot(readings.fix.x_m - state.x_m, readings.fix.y_m - state.y_m);
-            self.raw_error.count += 1;
         }
+        self.draws = draws;
         Ok(())
     }
 
-    /// Takes the samples that are due at the vehicle's `step`; the first tick of a vehicle samples everything.
-    fn sample(&mut self, header: &MessageHeader, state: &VehicleState, slot: usize, step: u32) {
-        let seed = header.episode_seed;
-        // Counted from the start of the episode: a vehicle that leaves and returns does not meet its old noise again.
-        let index = (header.sim_time_ns / self.tick_ns) as u32;
-        let readings = &mut self.readings[slot];
-        if step.is_multiple_of(self.periods.gnss) {
-            let stream = Stream {
-                episode_seed: seed,
-                id_hash: state.id_hash,
-                sensor: Sensor::Gnss,
-            };
-            readings.fix = gnss::sample(&self.config.gnss, &self.map, state.x_m, state.y_m, stream, index);
-        }
-        if step.is_multiple_of(self.periods.imu) {
-            readings.imu = imu::sample(&self.config.imu, state, seed, index);
-        }
-        if step.is_multiple_of(self.periods.speed_steering) {
-            let ratio = self.config.vehicle.steering_ratio;
-            readings.speed_steering = speed_steering::sample(&self.config.speed_steering, ratio, state, seed, index);
+    /// Hash of the id of the road user in a slot; anything for an empty one.
+    fn id_hash(&self, slot: usize, world: &World) -> u64 {
+        match self.row_of_slot.get(slot) {
+            Some(Some(row)) => world.states[*row as usize].id_hash,
+            _ => 0,
         }
     }
 
-    /// Ages of the newest samples at the vehicle's `step`, seconds.
-    fn ages_s(&self, step: u32) -> [f32; SENSORS] {
-        [self.periods.gnss, self.periods.imu, self.periods.speed_steering, 1]
-            .map(|period| (f64::from(step % period) * self.config.run.tick_s) as f32)
+    /// Samples and writes one slot with the numbers drawn for it.
+    fn sense(&mut self, slot: usize, world: &World, now: &Now, drawn: Drawn, out: &mut Sections) {
+        let lent = self.slots.rows()[slot];
+        out.vehicle[slot] = lent.vehicle;
+        out.flags[slot] = lent.ended;
+        let Some(row) = self.row_of_slot[slot] else {
+            return;
+        };
+        let row = row as usize;
+        let state = &world.states[row];
+        let alone;
+        let per = world.sub_steps.len() / world.states.len();
+        let rows = if per == 0 {
+            alone = [sub_step(state)];
+            &alone
+        } else {
+            &world.sub_steps[row * per..(row + 1) * per]
+        };
+        let motion = Motion {
+            state,
+            rows,
+            step: lent.step,
+        };
+        let carrier = &mut self.carriers[slot];
+        let samples = &mut out.imu[slot * self.imu_samples..(slot + 1) * self.imu_samples];
+        self.suite.sample(carrier, &motion, now, drawn, samples);
+        // Both are in ascending order of the vehicle.
+        if let Ok(place) = world.views.binary_search_by_key(&state.vehicle, |view| view.vehicle) {
+            carrier.readings.route = world.views[place];
+        }
+        self.write(slot, state, lent.step, out);
+    }
+
+    /// Writes what a slot's sensors have delivered.
+    #[inline]
+    fn write(&mut self, slot: usize, state: &VehicleState, step: u32, out: &mut Sections) {
+        let carrier = &mut self.carriers[slot];
+        let readings = &carrier.readings;
+        out.truth[slot] = [
+            state.x_m as f32,
+            state.y_m as f32,
+            state.yaw_rad as f32,
+            state.velocity_body_mps[0],
+        ];
+        out.id_hash[slot] = state.id_hash;
+        out.episode_step[slot] = step;
+        out.sensors[slot] = readings.delivering;
+        out.age_s[slot] = readings.ages_s;
+        write_raw(slot, carrier, self.policy, out);
+        if carrier.present & !carrier.known != 0 {
+            return;
+        }
+        let dark = carrier.dark();
+        let blank = if self.policy == BlackoutPolicy::Nan { dark } else { 0 };
+        let (d, width) = (self.normaliser.width(), self.history.width());
+        let row = &mut out.observation[slot * width..(slot + 1) * width];
+        let clipped = self.normaliser.fill(readings, blank, &mut row[width - d..]);
+        let first = if carrier.is_seen { First::No } else { First::Yes };
+        carrier.is_seen = true;
+        self.history.stack(slot, first, row);
+        out.flags[slot] |= if clipped { CLIPPED } else { 0 };
+        if self.policy != BlackoutPolicy::Drop || dark & self.normaliser.needs() == 0 {
+            out.flags[slot] |= VALID;
+            self.observations += 1;
+        }
+        if readings.delivering & GNSS != 0 {
+            let fix = &readings.fix;
+            let (x_m, y_m) = (fix.x_m - state.x_m, fix.y_m - state.y_m);
+            self.raw_error.sum_m += (x_m * x_m + y_m * y_m).sqrt();
+            self.raw_error.count += 1;
+        }
+    }
+}
+
+/// Writes the newest raw samples of a slot; while a sensor is dark and the policy says so, not-a-number.
+#[inline]
+fn write_raw(slot: usize, carrier: &Carrier, policy: BlackoutPolicy, out: &mut Sections) {
+    let readings = &carrier.readings;
+    let fix = &readings.fix;
+    out.gnss_m[slot] = [fix.x_m as f32, fix.y_m as f32, fix.z_m as f32];
+    out.gnss_geodetic[slot] = [fix.latitude_deg, fix.longitude_deg, fix.altitude_m];
+    out.gnss_quality[slot] = [fix.accuracy_m as f32, fix.satellites as f32];
+    let sample = &readings.speed_steering;
+    out.speed_steering[slot] = [sample.speed_mps as f32, sample.steering_rad as f32];
+    let blank = carrier.dark() & carrier.known;
+    if policy != BlackoutPolicy::Nan || blank == 0 {
+        return;
+    }
+    if blank & GNSS != 0 {
+        out.gnss_m[slot].fill(f32::NAN);
+        out.gnss_geodetic[slot].fill(f64::NAN);
+        out.gnss_quality[slot].fill(f32::NAN);
+    }
+    if blank & IMU != 0 {
+        let k = out.imu.len() / out.vehicle.len();
+        out.imu[slot * k..(slot + 1) * k].fill([f32::NAN; 7]);
+    }
+    if blank & SPEED_STEERING != 0 {
+        out.speed_steering[slot].fill(f32::NAN);
+    }
+}
+
+/// The sub-step that a state alone tells of.
+fn sub_step(state: &VehicleState) -> SubStep {
+    SubStep {
+        roll_rad: state.roll_rad,
+        pitch_rad: state.pitch_rad,
+        speed_mps: state.velocity_body_mps[0],
+        lateral_speed_mps: state.velocity_body_mps[1],
+        accel_body_mps2: state.accel_body_mps2,
+        angular_rate_body_radps: state.angular_rate_body_radps,
+        road_wheel_angle_rad: state.road_wheel_angle_rad,
+        ..SubStep::default()
     }
 }
 

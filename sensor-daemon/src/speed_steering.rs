@@ -2,7 +2,7 @@
 
 use ipc_schema::{config::SpeedSteering as Params, world::VehicleState};
 
-use crate::noise::{Sensor, Stream};
+use crate::normals::Block;
 
 /// One sample.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -13,26 +13,66 @@ pub struct Sample {
     pub steering_rad: f64,
 }
 
-/// The sensor's sample of a vehicle that moves as `state`.
-#[must_use]
-pub fn sample(params: &Params, steering_ratio: f64, state: &VehicleState, episode_seed: u64, index: u32) -> Sample {
-    let [speed, steering] = Stream {
-        episode_seed,
-        id_hash: state.id_hash,
-        sensor: Sensor::SpeedSteering,
+/// Constant factors of one vehicle's speed and steering angle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Scales {
+    /// Of the speed: tyres worn, or not the size that the counter was set to.
+    pub speed: f64,
+    /// Of the steering angle.
+    pub steering: f64,
+}
+
+impl Scales {
+    /// The factors of a vehicle from its own standard normal numbers.
+    #[must_use]
+    pub fn new(params: &Params, normals: &Block) -> Self {
+        Self {
+            speed: 1.0 + params.speed_scale_std * f64::from(normals[0]),
+            steering: 1.0 + params.steering_scale_std * f64::from(normals[1]),
+        }
     }
-    .normal_pair(index);
+}
+
+/// True if samples have noise.
+#[must_use]
+pub fn has_noise(params: &Params) -> bool {
+    params.speed_noise_std_mps > 0.0 || params.steering_noise_std_rad > 0.0
+}
+
+/// The sensor's sample of a vehicle that moves as `state`, with standard normal numbers for speed and steering.
+#[must_use]
+#[inline(always)]
+pub fn sample(params: &Params, steering_ratio: f64, scales: &Scales, state: &VehicleState, normals: &Block) -> Sample {
     let true_speed = f64::from(state.velocity_body_mps[0]).abs();
+    let true_steering = f64::from(state.road_wheel_angle_rad) * steering_ratio;
     Sample {
-        speed_mps: (true_speed + params.speed_noise_std_mps * speed).max(0.0),
-        steering_rad: f64::from(state.road_wheel_angle_rad) * steering_ratio + params.steering_noise_std_rad * steering,
+        speed_mps: (true_speed * scales.speed + params.speed_noise_std_mps * f64::from(normals[0])).max(0.0),
+        steering_rad: true_steering * scales.steering
+            + params.steering_bias_rad
+            + params.steering_noise_std_rad * f64::from(normals[1]),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::preset::town;
+    use crate::{
+        noise::{Sensor, Stream},
+        preset::town,
+    };
+
+    const EXACT: Scales = Scales {
+        speed: 1.0,
+        steering: 1.0,
+    };
+
+    fn stream(id_hash: u64, sensor: Sensor) -> Stream {
+        Stream {
+            episode_seed: 1,
+            id_hash,
+            sensor,
+        }
+    }
 
     #[test]
     fn without_noise_it_tells_wheel_speed_and_steering_wheel_angle() {
@@ -41,35 +81,76 @@ mod tests {
             steering_noise_std_rad: 0.0,
             ..town().speed_steering
         };
+        assert!(!has_noise(&params) && has_noise(&town().speed_steering));
         let state = VehicleState {
-            velocity_body_mps: [12.5, 0.0, 0.0],
+            velocity_body_mps: [-12.5, 3.0, 0.0],
             road_wheel_angle_rad: -0.25,
             ..VehicleState::default()
         };
         assert_eq!(
-            sample(&params, 16.0, &state, 1, 0),
+            sample(&params, 16.0, &EXACT, &state, &[1.0; 4]),
             Sample {
                 speed_mps: 12.5,
                 steering_rad: -4.0
             }
         );
+        let biased = Params {
+            steering_bias_rad: 0.5,
+            ..params
+        };
+        let scales = Scales {
+            speed: 1.02,
+            steering: 0.5,
+        };
+        assert_eq!(
+            sample(&biased, 16.0, &scales, &state, &[1.0; 4]),
+            Sample {
+                speed_mps: 12.75,
+                steering_rad: -1.5
+            }
+        );
     }
 
     #[test]
-    fn speed_noise_has_the_configured_level_and_never_makes_speed_negative() {
+    fn noise_has_the_configured_level_and_never_makes_speed_negative() {
         const N: u32 = 20_000;
         let params = Params {
             speed_noise_std_mps: 0.3,
-            steering_noise_std_rad: 0.0,
+            steering_noise_std_rad: 0.1,
             ..town().speed_steering
         };
         let moving = VehicleState {
             velocity_body_mps: [20.0, 0.0, 0.0],
             ..VehicleState::default()
         };
-        let errors = (0..N).map(|index| sample(&params, 16.0, &moving, 1, index).speed_mps - 20.0);
-        let std = (errors.map(|e| e * e).sum::<f64>() / f64::from(N)).sqrt();
-        assert!((std - 0.3).abs() < 5.0 * 0.3 / (2.0 * f64::from(N)).sqrt(), "{std}");
-        assert!((0..N).all(|index| sample(&params, 16.0, &VehicleState::default(), 1, index).speed_mps >= 0.0));
+        let at = |state: &VehicleState, index| {
+            let normals = stream(1, Sensor::SpeedSteering).normals(index);
+            sample(&params, 16.0, &EXACT, state, &normals)
+        };
+        let std = |of: &dyn Fn(u32) -> f64| ((0..N).map(|i| of(i).powi(2)).sum::<f64>() / f64::from(N)).sqrt();
+        let share = 5.0 / (2.0 * f64::from(N)).sqrt();
+        let speed = std(&|i| at(&moving, i).speed_mps - 20.0);
+        assert!((speed / 0.3 - 1.0).abs() < share, "{speed}");
+        let steering = std(&|i| at(&moving, i).steering_rad);
+        assert!((steering / 0.1 - 1.0).abs() < share, "{steering}");
+        assert!((0..N).all(|index| at(&VehicleState::default(), index).speed_mps >= 0.0));
+    }
+
+    #[test]
+    fn scale_errors_vary_over_vehicles_as_configured() {
+        const N: u64 = 20_000;
+        let params = Params {
+            speed_scale_std: 0.02,
+            steering_scale_std: 0.005,
+            ..town().speed_steering
+        };
+        let scales: Vec<Scales> = (0..N)
+            .map(|id| Scales::new(&params, &stream(id, Sensor::Scale).normals(0)))
+            .collect();
+        let std =
+            |of: &dyn Fn(&Scales) -> f64| (scales.iter().map(|s| (of(s) - 1.0).powi(2)).sum::<f64>() / N as f64).sqrt();
+        let share = 5.0 / (2.0 * N as f64).sqrt();
+        assert!((std(&|s| s.speed) / 0.02 - 1.0).abs() < share);
+        assert!((std(&|s| s.steering) / 0.005 - 1.0).abs() < share);
     }
 }

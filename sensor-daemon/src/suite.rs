@@ -1,0 +1,268 @@
+//! The suite of point sensors that every connected road user carries: when each samples, and what it then delivers.
+
+use ipc_schema::{
+    config::Config,
+    observation::{GNSS, IMU, LIDAR, SENSORS, SPEED_STEERING},
+    traffic::Kind,
+    world::{SubStep, VehicleState},
+};
+use sim_core::geodesy::{GeodesyError, Projection};
+
+use crate::{
+    blackout::Schedule,
+    carrier::Carrier,
+    gnss::{self, Receiver, Sky, SkyView},
+    imu::{self, Unit},
+    noise::{Drawn, Draws, Sensor, Stream},
+    normals::Block,
+    speed_steering::{self, Scales},
+    wide::Path,
+};
+
+/// The time of a tick, as far as noise and blackouts know it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Now {
+    /// Seed of the episode.
+    pub episode_seed: u64,
+    /// Ticks since the start of the episode: a vehicle that leaves and returns does not meet its old noise again.
+    pub tick: u32,
+    /// Time of the episode, nanoseconds.
+    pub time_ns: u64,
+}
+
+/// One road user's motion over a tick.
+#[derive(Debug, Clone, Copy)]
+pub struct Motion<'a> {
+    /// At the end of the tick.
+    pub state: &'a VehicleState,
+    /// Sub-steps, at least one.
+    pub rows: &'a [SubStep],
+    /// Ticks since it took its slot.
+    pub step: u32,
+}
+
+/// Sensors as configured.
+pub struct Suite {
+    receiver: Receiver,
+    sky: Option<Box<dyn Sky>>,
+    unit: Unit,
+    speed_steering: ipc_schema::config::SpeedSteering,
+    speed_steering_noise: bool,
+    steering_ratio: f64,
+    schedules: [Option<Schedule>; SENSORS],
+    /// Ticks between two samples of each sensor.
+    periods: [u32; SENSORS],
+    imu_samples: u32,
+    lidars: usize,
+    lidar_range_m: f32,
+    pedestrian_factor: f64,
+    tick_s: f64,
+    path: Path,
+}
+
+impl Suite {
+    /// Sensors on a map with these bounds (x_min, y_min, x_max, y_max, metres).
+    ///
+    /// # Errors
+    /// The map is outside the domain of its projection.
+    pub fn new(
+        config: &Config,
+        projection: &Projection,
+        bounds_m: [f64; 4],
+        tick_ns: u64,
+    ) -> Result<Self, GeodesyError> {
+        // Validated to be whole numbers of ticks.
+        let ticks =
+            |period_s: f64| ((period_s / config.run.tick_s).round() as i64).clamp(1, i64::from(u32::MAX)) as u32;
+        let samples = config.imu_samples();
+        Ok(Self {
+            receiver: Receiver::new(&config.gnss, projection, bounds_m)?,
+            sky: None,
+            unit: Unit::new(&config.imu, samples),
+            speed_steering_noise: speed_steering::has_noise(&config.speed_steering),
+            speed_steering: config.speed_steering.clone(),
+            steering_ratio: config.vehicle.steering_ratio,
+            schedules: schedules(config, tick_ns),
+            periods: [
+                ticks(config.gnss.period_s),
+                ticks(config.imu.period_s),
+                ticks(config.speed_steering.period_s),
+                1,
+            ],
+            imu_samples: u32::try_from(samples).unwrap_or(u32::MAX),
+            lidars: config.lidar.vehicles as usize,
+            lidar_range_m: config.lidar.range_m as f32,
+            pedestrian_factor: config.gnss.pedestrian_noise_factor,
+            tick_s: config.run.tick_s,
+            path: Path::widest(),
+        })
+    }
+
+    /// Puts something into the sky.
+    pub fn set_sky(&mut self, sky: Box<dyn Sky>) {
+        self.sky = Some(sky);
+    }
+
+    /// The carrier in `slot` of a road user that is sensed for the first time.
+    #[must_use]
+    pub fn begin(&self, state: &VehicleState, slot: usize, now: &Now) -> Carrier {
+        let is_person = state.kind == Kind::Person as u32;
+        let (odometer, factor) = if is_person {
+            (0, self.pedestrian_factor)
+        } else {
+            (SPEED_STEERING, 1.0)
+        };
+        let lidar = if slot < self.lidars && !is_person { LIDAR } else { 0 };
+        let stream = Stream {
+            episode_seed: now.episode_seed,
+            id_hash: state.id_hash,
+            sensor: Sensor::Scale,
+        };
+        let scales = Scales::new(&self.speed_steering, &stream.normals(0));
+        let mut carrier = Carrier::new(GNSS | IMU | odometer | lidar, scales, factor, self.lidar_range_m);
+        for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
+            if let Some(schedule) = schedule {
+                *phase = schedule.begin(now.episode_seed, state.id_hash, now.tick, now.time_ns);
+            }
+        }
+        carrier
+    }
+
+    /// Takes the sensors' blackouts on to this tick.
+    #[inline]
+    pub fn advance(&self, carrier: &mut Carrier, id_hash: u64, now: &Now) {
+        for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
+            if let Some(schedule) = schedule {
+                schedule.advance(phase, now.episode_seed, id_hash, now.time_ns);
+            }
+        }
+    }
+
+    /// Plans the numbers that [`Suite::sample`] takes at this tick if everything is due, with those first that are always needed.
+    pub fn plan(&self, draws: &mut Draws, now: &Now) {
+        if self.receiver.has_white_noise() {
+            draws.plan(Sensor::Gnss, now.tick);
+        }
+        if self.receiver.has_correlated_noise() {
+            draws.plan(Sensor::GnssCorrelated, now.tick);
+        }
+        if self.speed_steering_noise {
+            draws.plan(Sensor::SpeedSteering, now.tick);
+        }
+        self.unit.plan(draws, now.tick.wrapping_mul(self.imu_samples));
+    }
+
+    /// True if the sensor with this index samples at this step of its carrier; the first step samples everything.
+    #[inline]
+    fn is_due(&self, sensor: usize, step: u32) -> bool {
+        let period = self.periods[sensor];
+        period == 1 || step.is_multiple_of(period)
+    }
+
+    /// Samples what is due with the numbers drawn for its carrier; the IMU's samples of the tick go to `out`. Processes with a memory go
+    /// on in a blackout, whose end does not show how long it was.
+    #[inline]
+    pub fn sample(&self, carrier: &mut Carrier, motion: &Motion, now: &Now, mut drawn: Drawn, out: &mut [imu::Sample]) {
+        let (step, awake) = (motion.step, carrier.awake());
+        let normals = [
+            self.receiver.has_white_noise(),
+            self.receiver.has_correlated_noise(),
+            self.speed_steering_noise,
+        ]
+        .map(|is_planned| drawn.take(is_planned));
+        if self.is_due(0, step) {
+            self.sample_gnss(carrier, motion, now, awake & GNSS != 0, [&normals[0], &normals[1]]);
+        }
+        if self.is_due(2, step) && awake & SPEED_STEERING != 0 {
+            let (params, ratio) = (&self.speed_steering, self.steering_ratio);
+            carrier.readings.speed_steering =
+                speed_steering::sample(params, ratio, &carrier.scales, motion.state, &normals[2]);
+            carrier.note(2, step);
+        }
+        self.sample_imu(carrier, motion, awake & IMU != 0, drawn, out);
+        if awake & LIDAR != 0 {
+            carrier.note(3, step);
+        }
+        carrier.age(step, self.tick_s);
+    }
+
+    #[inline]
+    fn sample_gnss(
+        &self,
+        carrier: &mut Carrier,
+        motion: &Motion,
+        now: &Now,
+        is_awake: bool,
+        [white, fresh]: [&Block; 2],
+    ) {
+        carrier.correlated = if motion.step == 0 {
+            [fresh[0], fresh[1], fresh[2]]
+        } else {
+            self.receiver.correlated(carrier.correlated, fresh)
+        };
+        if !is_awake {
+            return;
+        }
+        let state = motion.state;
+        let place_m = [state.x_m, state.y_m, state.z_m];
+        let time_s = now.time_ns as f64 * 1e-9;
+        let view = self.sky.as_ref().map_or_else(SkyView::default, |sky| {
+            sky.at(place_m[0], place_m[1], place_m[2], time_s)
+        });
+        carrier.has_fix = view.has_fix;
+        if view.has_fix {
+            carrier.readings.fix = self.receiver.fix(
+                place_m,
+                &gnss::Errors {
+                    white,
+                    correlated: &carrier.correlated,
+                    view: &view,
+                    factor: carrier.gnss_factor,
+                },
+            );
+            carrier.note(0, motion.step);
+        }
+    }
+
+    #[inline]
+    fn sample_imu(
+        &self,
+        carrier: &mut Carrier,
+        motion: &Motion,
+        is_awake: bool,
+        drawn: Drawn,
+        out: &mut [imu::Sample],
+    ) {
+        if self.is_due(1, motion.step) {
+            let body = imu::Body {
+                yaw_rad: motion.state.yaw_rad,
+                rows: motion.rows,
+            };
+            self.unit.sample(self.path, &body, drawn, &mut carrier.walk, out);
+            if is_awake && let Some(newest) = out.last() {
+                carrier.readings.imu = *newest;
+                carrier.note(1, motion.step);
+                return;
+            }
+        }
+        out.fill(carrier.readings.imu);
+    }
+}
+
+fn schedules(config: &Config, tick_ns: u64) -> [Option<Schedule>; SENSORS] {
+    if !config.blackout.enabled {
+        return [None; SENSORS];
+    }
+    let (gnss, imu, odometer, lidar) = (&config.gnss, &config.imu, &config.speed_steering, &config.lidar);
+    [
+        (Sensor::GnssBlackout, gnss.blackout_length_s, gnss.blackout_gap_s),
+        (Sensor::ImuBlackout, imu.blackout_length_s, imu.blackout_gap_s),
+        (
+            Sensor::SpeedSteeringBlackout,
+            odometer.blackout_length_s,
+            odometer.blackout_gap_s,
+        ),
+        (Sensor::LidarBlackout, lidar.blackout_length_s, lidar.blackout_gap_s),
+    ]
+    .map(|(sensor, length_s, gap_s)| Schedule::new(sensor, length_s, gap_s, tick_ns))
+}

@@ -1,0 +1,143 @@
+//! What the tests of sensing share: a map, road users, and a run of ticks whose sections can be looked at.
+
+#![allow(
+    dead_code,
+    clippy::unwrap_used,
+    reason = "each test uses a part; tests assert by unwrapping"
+)]
+
+use ipc_schema::{
+    block,
+    config::Config,
+    header::{FIRST_OF_EPISODE, MessageHeader},
+    observation::ObservationLayout,
+    run::MapInfo,
+    traffic::{Kind, id_hash},
+    world::{SubStep, VehicleState},
+};
+use sensor_daemon::sensing::{Sensing, World};
+
+pub fn config() -> Config {
+    serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap()
+}
+
+/// The preset without any noise.
+pub fn quiet() -> Config {
+    let mut config = config();
+    config.gnss.noise_std_deg = [0.0; 2];
+    config.imu.accel_noise_std_mps2 = [0.0; 3];
+    config.imu.gyro_noise_std_radps = [0.0; 3];
+    config.imu.compass_noise_std_rad = 0.0;
+    config.speed_steering.speed_noise_std_mps = 0.0;
+    config.speed_steering.steering_noise_std_rad = 0.0;
+    config
+}
+
+pub fn map() -> MapInfo {
+    MapInfo {
+        projection: "+proj=tmerc +lat_0=52.26 +lon_0=10.52 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs".into(),
+        net_offset_m: [129.0, 126.0],
+        bounds_m: [0.0, 0.0, 260.0, 260.0],
+    }
+}
+
+pub fn road_user(number: u32, kind: Kind) -> VehicleState {
+    VehicleState {
+        x_m: 50.0 + f64::from(number % 100),
+        y_m: 80.0,
+        yaw_rad: 1.0,
+        velocity_body_mps: [7.0, 0.0, 0.0],
+        id_hash: id_hash(&format!("cav.{number}")),
+        vehicle: number,
+        kind: kind as u32,
+        ..VehicleState::default()
+    }
+}
+
+pub fn cavs(count: u32) -> Vec<VehicleState> {
+    (0..count).map(|number| road_user(number, Kind::Cav)).collect()
+}
+
+/// The payload of one tick, as 8-byte words, which are aligned enough for every section.
+pub struct Tick {
+    pub n: usize,
+    layout: ObservationLayout,
+    payload: Vec<u64>,
+}
+
+impl Tick {
+    pub fn section<T: bytemuck::Pod>(&self, name: &str) -> Vec<T> {
+        let (_, place) = self
+            .layout
+            .named()
+            .into_iter()
+            .find(|(known, _)| *known == name)
+            .unwrap();
+        block::view::<T>(bytemuck::cast_slice(&self.payload), place)
+            .unwrap()
+            .to_vec()
+    }
+
+    pub fn bytes(&self) -> &[u64] {
+        &self.payload
+    }
+}
+
+/// A run that goes on tick by tick.
+pub struct Run {
+    pub sensing: Sensing,
+    tick: u64,
+    seed: u64,
+    tick_ns: u64,
+    flags: u32,
+}
+
+impl Run {
+    pub fn new(config: &Config) -> Self {
+        Self {
+            sensing: Sensing::new(config, &map()).unwrap(),
+            tick: 0,
+            seed: 5,
+            tick_ns: (config.run.tick_s * 1e9) as u64,
+            flags: FIRST_OF_EPISODE,
+        }
+    }
+
+    /// A new episode begins, from time 0 on.
+    pub fn restart(&mut self, seed: u64) {
+        (self.tick, self.seed, self.flags) = (0, seed, FIRST_OF_EPISODE);
+    }
+
+    pub fn tick(&mut self, states: &[VehicleState]) -> Tick {
+        self.tick_with(states, &[], |_| ())
+    }
+
+    pub fn tick_with(
+        &mut self,
+        states: &[VehicleState],
+        sub_steps: &[SubStep],
+        between: impl FnOnce(&mut Sensing),
+    ) -> Tick {
+        let header = MessageHeader {
+            tick: self.tick,
+            sim_time_ns: (self.tick + 1) * self.tick_ns,
+            flags: self.flags,
+            episode_seed: self.seed,
+            ..MessageHeader::default()
+        };
+        (self.tick, self.flags) = (self.tick + 1, 0);
+        let n = self.sensing.assign(&header, states);
+        between(&mut self.sensing);
+        let layout = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples());
+        let mut payload = vec![0_u64; layout.len / 8];
+        let world = World {
+            states,
+            sub_steps,
+            views: &[],
+        };
+        self.sensing
+            .observe(&header, &world, bytemuck::cast_slice_mut(&mut payload))
+            .unwrap();
+        Tick { n, layout, payload }
+    }
+}
