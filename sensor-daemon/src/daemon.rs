@@ -1,6 +1,6 @@
 //! The process: `world` in, `observation` out, one for one.
 
-use std::path::Path;
+use std::{path::Path, sync::Arc};
 
 use ipc_schema::{
     block::{self, BlockError},
@@ -17,9 +17,16 @@ use ipc_schema::{
 };
 use serde::Serialize;
 
+use sim_core::{
+    geodesy::{GeodesyError, NetPosition, Projection},
+    scene::Scene,
+};
+
 use crate::{
     digest::Digest,
+    scanning::{Scanning, Tally},
     sensing::{Sensing, World},
+    sky::SkyMap,
 };
 
 /// One process serves one environment.
@@ -34,21 +41,19 @@ struct Part {
     cavs_max: u32,
     raw_gnss_mean_error_m: Option<f64>,
     drops: u64,
+    lidar: Option<Tally>,
 }
 
 /// Senses until the last tick of the run, or until the process is asked to stop.
 ///
 /// # Errors
-/// The map's projection is not understood, or a port fails.
+/// The map's projection is not understood, the scene or a LIDAR's ray table cannot be read, or a port fails.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut session = Session::join(run_file, Process::SensorDaemon, ENV_INDEX)?;
-    let sensing = Sensing::new(&session.run.config, &session.run.map).map_err(|error| {
-        Failure::from_error(FailureKind::Config, &error).with_help(
-            "give a net whose <location> has a projection that proj4rs knows, such as UTM or transverse Mercator",
-        )
-    })?;
+    let mut sensing = Sensing::new(&session.run.config, &session.run.map).map_err(unprojected)?;
+    let scanning = look_around(&mut session, &mut sensing)?;
     let world = session.subscriber(Channel::World)?;
-    let mut daemon = Daemon::open(session, sensing)?;
+    let mut daemon = Daemon::open(session, sensing, scanning)?;
     while let Some(message) = daemon.session.next(&world)? {
         let header = *message.header();
         if daemon.tick(&message)? == Wait::Stopped {
@@ -63,9 +68,43 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     daemon.write_part()
 }
 
+/// Gives GNSS receivers their sky and vehicles their LIDARs, if the configuration asks for either: only they need the scene.
+fn look_around(session: &mut Session, sensing: &mut Sensing) -> Result<Option<Scanning>, Failure> {
+    let (sky_view, has_lidars) = (session.run.config.gnss.sky_view, session.run.config.lidar.vehicles > 0);
+    if !sky_view && !has_lidars {
+        return Ok(None);
+    }
+    let scene = Arc::new(Scene::of_run(&session.run)?);
+    if sky_view {
+        let map = &session.run.map;
+        let [x_min, y_min, x_max, y_max] = map.bounds_m;
+        let middle = NetPosition {
+            x_m: 0.5 * (x_min + x_max),
+            y_m: 0.5 * (y_min + y_max),
+        };
+        let middle = Projection::new(map)
+            .and_then(|projection| projection.geodetic_from_net(middle))
+            .map_err(unprojected)?;
+        let sky = SkyMap::new(Arc::clone(&scene), middle, map.bounds_m, session.run.config.run.seed);
+        sensing.set_sky(Box::new(sky));
+    }
+    if !has_lidars {
+        return Ok(None);
+    }
+    let publisher = session.publisher(Channel::Pointcloud)?;
+    Scanning::new(&session.run.config, &scene, publisher).map(Some)
+}
+
+fn unprojected(error: GeodesyError) -> Failure {
+    Failure::from_error(FailureKind::Config, &error).with_help(
+        "give a net whose <location> has a projection that proj4rs knows, such as UTM or transverse Mercator",
+    )
+}
+
 struct Daemon {
     session: Session,
     sensing: Sensing,
+    scanning: Option<Scanning>,
     observations: Publisher,
     /// Who must not miss an observation: nobody if nobody learns.
     consumer: Option<(BoardReader, Waker)>,
@@ -76,7 +115,7 @@ struct Daemon {
 }
 
 impl Daemon {
-    fn open(mut session: Session, sensing: Sensing) -> Result<Self, Failure> {
+    fn open(mut session: Session, sensing: Sensing, scanning: Option<Scanning>) -> Result<Self, Failure> {
         let observations = session.publisher(Channel::Observation)?;
         let consumer = match session.run.mode {
             Mode::Train => Some((session.board_of(Process::Trainer)?, session.waker(Process::Trainer)?)),
@@ -86,6 +125,7 @@ impl Daemon {
         Ok(Self {
             session,
             sensing,
+            scanning,
             observations,
             consumer,
             digest: Digest::default(),
@@ -108,6 +148,7 @@ impl Daemon {
         }
         let everybody = view(message, world)?;
         let n = self.sensing.assign(world, everybody.states);
+        self.scan(world, &everybody)?;
         if let Some((board, _)) = &self.consumer
             && self.session.wait_for_credit(board, world.tick)? == Wait::Stopped
         {
@@ -115,6 +156,20 @@ impl Daemon {
         }
         self.publish(world, &everybody, n)?;
         Ok(Wait::Ready)
+    }
+
+    /// Scans with all LIDARs; what the observation shows of it is there before the observation is made.
+    fn scan(&mut self, world: &MessageHeader, everybody: &World) -> Result<(), Failure> {
+        let Some(scanning) = &mut self.scanning else {
+            return Ok(());
+        };
+        let ours = self.session.header();
+        let header = MessageHeader {
+            run_id: ours.run_id,
+            incarnation: ours.incarnation,
+            ..*world
+        };
+        scanning.scan(&header, everybody.states, everybody.sub_steps, &mut self.sensing)
     }
 
     fn publish(&mut self, world: &MessageHeader, everybody: &World, n: usize) -> Result<(), Failure> {
@@ -182,6 +237,7 @@ impl Daemon {
             cavs_max: self.cavs_max,
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
             drops: self.observations.drops(),
+            lidar: self.scanning.as_ref().map(Scanning::tally),
         };
         self.session.write_part(&part)
     }

@@ -56,8 +56,13 @@ impl Default for SkyView {
 
 /// Where satellites stand, and what blocks and reflects them.
 pub trait Sky {
-    /// What an antenna at this place (world frame, metres) gets at this time of the episode (seconds).
+    /// What the antenna of a road user on the ground at this place (world frame, metres) gets at this time of the episode (seconds).
     fn at(&self, x_m: f64, y_m: f64, z_m: f64, time_s: f64) -> SkyView;
+
+    /// A new episode, with this seed.
+    fn begin_episode(&mut self, episode_seed: u64) {
+        let _ = episode_seed;
+    }
 }
 
 /// Degrees of [`Arc`] for a metre on the ground, by place.

@@ -20,6 +20,7 @@ pub mod normals;
 #[cfg(test)]
 #[path = "../../sim-core/tests/common/preset.rs"]
 mod preset;
+pub mod scanning;
 pub mod sections;
 pub mod sensing;
 pub mod sky;

@@ -131,6 +131,9 @@ impl Sensing {
     /// says [`ipc_schema::observation::TERMINATED`], and from the next tick on it holds one anew, as a trajectory of its own.
     pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
+        if header.has(FIRST_OF_EPISODE) {
+            self.suite.begin_episode(header.episode_seed);
+        }
         self.row_of_slot.fill(None);
         let now = self.now(header);
         for (row, state) in (0_u32..).zip(states) {

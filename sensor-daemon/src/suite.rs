@@ -103,6 +103,13 @@ impl Suite {
         self.sky = Some(sky);
     }
 
+    /// A new episode, with this seed.
+    pub fn begin_episode(&mut self, episode_seed: u64) {
+        if let Some(sky) = &mut self.sky {
+            sky.begin_episode(episode_seed);
+        }
+    }
+
     /// The carrier in `slot` of a road user that is sensed for the first time.
     #[must_use]
     pub fn begin(&self, state: &VehicleState, slot: usize, now: &Now) -> Carrier {

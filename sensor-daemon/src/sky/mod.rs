@@ -14,7 +14,10 @@ use std::{
 
 use sim_core::{geodesy::Geodetic, scene::Scene};
 
-use crate::noise::philox4x32;
+use crate::{
+    gnss::{Sky, SkyView},
+    noise::philox4x32,
+};
 
 pub mod constellation;
 pub mod horizon;
@@ -47,27 +50,12 @@ pub const MOST_HDOP: f64 = 20.0;
 /// Reflections move a fix by no more, metres.
 pub const MOST_OFFSET_M: f64 = 50.0;
 
-/// What a receiver has of the sky.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SkyView {
-    /// Satellites in use, reflected ones included.
-    pub satellites: u32,
-    /// Standard deviation of the horizontal error as a multiple of that under an open sky at the same time, at least 1.
-    pub noise_factor: f64,
-    /// Displacement by reflections, east, north and up, metres: the same at the same place and time, at most [`MOST_OFFSET_M`] long.
-    pub offset_m: [f64; 3],
-    /// False if the satellites do not suffice; then the factor is 1 and the displacement 0.
-    pub has_fix: bool,
-}
-
-impl SkyView {
-    fn without_fix(satellites: u32) -> Self {
-        Self {
-            satellites,
-            noise_factor: 1.0,
-            offset_m: [0.0; 3],
-            has_fix: false,
-        }
+fn without_fix(satellites: u32) -> SkyView {
+    SkyView {
+        satellites,
+        noise_factor: 1.0,
+        offset_m: [0.0; 3],
+        has_fix: false,
     }
 }
 
@@ -132,29 +120,16 @@ impl SkyMap {
             kept: AtomicUsize::new(0),
             epochs: (0..STEPS).map(|_| OnceLock::new()).collect(),
         };
-        map.begin_episode(episode_seed);
+        map.start(episode_seed);
         map
     }
 
-    /// A new episode: its seed says at what time of the sidereal day it begins. Horizons stay.
-    pub fn begin_episode(&mut self, episode_seed: u64) {
+    /// The constellation at the start of an episode: its seed says at what time of the sidereal day it begins. Horizons stay.
+    fn start(&mut self, episode_seed: u64) {
         let key = [episode_seed as u32, (episode_seed >> 32) as u32];
         // A counter of its own: sensors count their samples in the first word and have a number in the second.
         let [random, ..] = philox4x32([0, u32::MAX, 0, 0], key);
         self.start_s = SIDEREAL_DAY_S * f64::from(random) / 4_294_967_296.0;
-    }
-
-    /// The sky of a road user on the ground at `(x_m, y_m, z_m)` (world, metres), its antenna [`ANTENNA_M`] above, at `time_s` of the
-    /// episode.
-    #[must_use]
-    pub fn at(&self, x_m: f64, y_m: f64, z_m: f64, time_s: f64) -> SkyView {
-        let epoch = self.epoch(time_s);
-        let cell = [(x_m - self.min_m[0]) / self.cell_m, (y_m - self.min_m[1]) / self.cell_m].map(f64::floor);
-        let antenna_m = [x_m, y_m, z_m + ANTENNA_M];
-        match self.kept_sky(cell) {
-            Some(sky) => view(sky, epoch, antenna_m),
-            None => view(&self.sky_of(cell), epoch, antenna_m),
-        }
     }
 
     /// The satellites at a time, kept.
@@ -230,10 +205,28 @@ impl SkyMap {
     }
 }
 
+impl Sky for SkyMap {
+    /// The sky of a road user on the ground at `(x_m, y_m, z_m)` (world, metres), its antenna [`ANTENNA_M`] above, at `time_s` of the
+    /// episode.
+    fn at(&self, x_m: f64, y_m: f64, z_m: f64, time_s: f64) -> SkyView {
+        let epoch = self.epoch(time_s);
+        let cell = [(x_m - self.min_m[0]) / self.cell_m, (y_m - self.min_m[1]) / self.cell_m].map(f64::floor);
+        let antenna_m = [x_m, y_m, z_m + ANTENNA_M];
+        match self.kept_sky(cell) {
+            Some(sky) => view(sky, epoch, antenna_m),
+            None => view(&self.sky_of(cell), epoch, antenna_m),
+        }
+    }
+
+    fn begin_episode(&mut self, episode_seed: u64) {
+        self.start(episode_seed);
+    }
+}
+
 fn view(sky: &horizon::Sky, epoch: &Epoch, antenna_m: [f64; 3]) -> SkyView {
     match sky {
         horizon::Sky::Open => open_view(epoch),
-        horizon::Sky::Inside => SkyView::without_fix(0),
+        horizon::Sky::Inside => without_fix(0),
         horizon::Sky::Walled(horizon) => {
             // The usual case along wide roads.
             if epoch
@@ -280,7 +273,7 @@ fn received(horizon: &horizon::Horizon, epoch: &Epoch, antenna_m: [f64; 3]) -> (
 
 fn fix(satellites: u32, solution: Option<Solution>, open_hdop: f64) -> SkyView {
     let Some(solution) = solution.filter(|solution| solution.hdop() <= MOST_HDOP) else {
-        return SkyView::without_fix(satellites);
+        return without_fix(satellites);
     };
     let [e, n, u] = solution.offset_m;
     let length_m = (e * e + n * n + u * u).sqrt();

@@ -1,0 +1,128 @@
+//! LIDARs in a run: scans of every vehicle that carries one, into shared memory, and what they say about the nearest objects.
+
+use ipc_schema::{
+    block,
+    config::{Config, Field},
+    failure::{Failure, FailureKind},
+    header::MessageHeader,
+    pointcloud::{LidarPoint, PointcloudLayout, Scan},
+    ports::Publisher,
+    world::{SubStep, VehicleState},
+};
+use serde::Serialize;
+use sim_core::scene::Scene;
+
+use crate::{
+    lidar::{Lidar, Scratch, Targets, nearest_objects},
+    sensing::Sensing,
+};
+
+/// What LIDARs add to the run's report.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Tally {
+    /// Scans: one for each LIDAR and tick.
+    pub scans: u64,
+    /// Rays cast.
+    pub rays: u64,
+    /// Points written.
+    pub points: u64,
+}
+
+/// The LIDARs of a run.
+pub struct Scanning {
+    lidar: Lidar,
+    targets: Targets,
+    scratch: Scratch,
+    publisher: Publisher,
+    sub_steps: usize,
+    /// The observation shows nearest objects.
+    shows_objects: bool,
+    tally: Tally,
+}
+
+impl Scanning {
+    /// LIDARs as configured, in a scene.
+    ///
+    /// # Errors
+    /// A ray table or mesh cannot be used.
+    pub fn new(config: &Config, scene: &Scene, publisher: Publisher) -> Result<Self, Failure> {
+        let objects = Field::Object1X..=Field::Object4Y;
+        Ok(Self {
+            lidar: Lidar::new(config, scene)?,
+            targets: Targets::default(),
+            scratch: Scratch::default(),
+            publisher,
+            sub_steps: config.run.sub_steps as usize,
+            shows_objects: config.observation.fields.iter().any(|field| objects.contains(field)),
+            tally: Tally::default(),
+        })
+    }
+
+    /// So far.
+    #[must_use]
+    pub fn tally(&self) -> Tally {
+        self.tally
+    }
+
+    /// One tick: scans all around every vehicle that carries a LIDAR, publishes the points and tells `sensing` what is near.
+    ///
+    /// # Errors
+    /// Shared memory fails.
+    pub fn scan(
+        &mut self,
+        header: &MessageHeader,
+        states: &[VehicleState],
+        sub_steps: &[SubStep],
+        sensing: &mut Sensing,
+    ) -> Result<(), Failure> {
+        self.targets.update(states, sub_steps, self.sub_steps);
+        let carriers: Vec<(usize, usize)> = sensing.lidars().collect();
+        for (slot, row) in carriers {
+            if let Some(objects) = self.scan_one(header, &states[row], row)? {
+                sensing.set_objects(slot, objects);
+            }
+        }
+        Ok(())
+    }
+
+    fn scan_one(
+        &mut self,
+        header: &MessageHeader,
+        carrier: &VehicleState,
+        row: usize,
+    ) -> Result<Option<[[f32; 2]; 4]>, Failure> {
+        let layout = PointcloudLayout::new(self.lidar.max_points());
+        let mut draft = self.publisher.loan_unwritten(*header, layout.len)?;
+        let [head, body] = block::split_mut(draft.payload_mut(), &[layout.scan, layout.points]).map_err(broken)?;
+        let points: &mut [LidarPoint] = bytemuck::cast_slice_mut(body);
+        let mut scan = Scan::default();
+        let count = self.lidar.scan(
+            &self.targets,
+            row,
+            header.tick,
+            header.episode_seed,
+            &mut self.scratch,
+            &mut scan,
+            points,
+        );
+        let objects = self
+            .shows_objects
+            .then(|| nearest_objects(&points[..count], &self.lidar));
+        self.tally.scans += 1;
+        self.tally.rays += u64::from(scan.rays);
+        self.tally.points += count as u64;
+        head.copy_from_slice(bytemuck::bytes_of(&scan));
+        *draft.header_mut() = MessageHeader {
+            count: count as u32,
+            columns: self.lidar.columns() as u32,
+            sequence: u64::from(carrier.vehicle),
+            ..*header
+        };
+        draft.send()?;
+        Ok(objects)
+    }
+}
+
+fn broken(error: block::BlockError) -> Failure {
+    Failure::from_error(FailureKind::Run, &error)
+}
