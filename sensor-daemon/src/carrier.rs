@@ -77,9 +77,13 @@ impl Carrier {
         let fix = if self.has_fix { u32::MAX } else { !GNSS };
         self.readings.delivering = self.awake() & fix & self.known;
         for (sensor, bit) in BITS.into_iter().enumerate() {
-            let is_present = self.present & bit != 0;
-            let ticks = if is_present { step - self.sampled[sensor] } else { 0 };
-            self.readings.ages_s[sensor] = (f64::from(ticks) * tick_s) as f32;
+            // Most are fresh.
+            let is_old = self.present & bit != 0 && self.sampled[sensor] != step;
+            self.readings.ages_s[sensor] = if is_old {
+                (f64::from(step - self.sampled[sensor]) * tick_s) as f32
+            } else {
+                0.0
+            };
         }
     }
 

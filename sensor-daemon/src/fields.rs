@@ -155,18 +155,23 @@ impl Normaliser {
     /// was outside its range and has been clipped. What is not a number is not clipped.
     #[inline(always)]
     pub fn fill(&self, readings: &Readings, blank: u32, row: &mut [f32]) -> bool {
-        let mut clipped = false;
+        let (mut below, mut above) = (0.0_f64, 1.0_f64);
         let [factor, shift] = self.scale;
         for (place, column) in row.iter_mut().zip(&self.columns) {
-            if column.sensor & blank != 0 {
-                *place = f32::NAN;
-                continue;
-            }
-            let unit = (readings.value(column.field) - column.low) / column.span;
-            clipped |= !(0.0..=1.0).contains(&unit) && !unit.is_nan();
-            *place = (factor * unit.clamp(0.0, 1.0) + shift) as f32;
+            let value = if column.sensor & blank == 0 {
+                readings.value(column.field)
+            } else {
+                f64::NAN
+            };
+            let unit = (value - column.low) / column.span;
+            // Comparisons that are false for what is not a number: it passes through.
+            below = if unit < below { unit } else { below };
+            above = if unit > above { unit } else { above };
+            let unit = if unit < 0.0 { 0.0 } else { unit };
+            let unit = if unit > 1.0 { 1.0 } else { unit };
+            *place = (factor * unit + shift) as f32;
         }
-        clipped
+        below < 0.0 || above > 1.0
     }
 }
 

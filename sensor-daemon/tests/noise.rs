@@ -300,8 +300,8 @@ fn vehicles_sensors_axes_and_samples_are_independent() {
             "variance {variance} of {i}"
         );
         for j in 0..16 {
-            let beside = (v_next(VEHICLES), &now);
-            let next_vehicle = correlation(&|v| now[v][i], &|v| beside.1[(v + 1) % beside.0][j]);
+            let beside = |v: usize| &now[(v + 1) % VEHICLES as usize];
+            let next_vehicle = correlation(&|v| now[v][i], &|v| beside(v)[j]);
             let next_tick = correlation(&|v| now[v][i], &|v| next[v][j]);
             let others = if i == j {
                 0.0
@@ -314,10 +314,6 @@ fn vehicles_sensors_axes_and_samples_are_independent() {
             }
         }
     }
-}
-
-fn v_next(vehicles: u32) -> usize {
-    vehicles as usize
 }
 
 #[test]
