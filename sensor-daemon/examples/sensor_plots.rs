@@ -3,7 +3,7 @@
 //! `cargo run --release -p sensor-daemon --example sensor_plots -- DIR`. `imu.csv`: two hours at rest, x axes of accelerometer and
 //! gyroscope, with the parameters in `imu_model.csv`. `gnss.csv`: a drive past houses (`houses.csv`) with three kinds of error.
 //! `street.csv`: the sky over a day in an east–west street 20 m wide between houses of several heights, 3 m off its middle.
-//! `horizons.csv`, `satellites.csv`: the sky at two places of the drive. `scan.csv`, with the columns x_m,y_m,z_m,tag,intensity, is the LIDAR's.
+//! `horizons.csv`, `satellites.csv`: the sky at two places of the drive. `scan.csv`: a LIDAR's points.
 
 #![allow(
     clippy::unwrap_used,
@@ -18,18 +18,27 @@ use std::{
     sync::Arc,
 };
 
-use ipc_schema::{config::Config, run::MapInfo, world::VehicleState};
+use ipc_schema::{
+    block::{self, Section},
+    config::Config,
+    header::{FIRST_OF_EPISODE, MessageHeader},
+    observation::{GNSS, IMU_COLUMNS, ObservationLayout},
+    pointcloud::{LidarPoint, Scan},
+    run::MapInfo,
+    traffic::Kind,
+    world::{SubStep, VehicleState},
+};
 use sensor_daemon::{
-    gnss, imu,
-    noise::{Sensor, Stream},
+    gnss::{Sky as _, SkyView},
+    lidar::{Lidar, Scratch, Targets},
+    sensing::{Sensing, World},
     sky::{
-        ANTENNA_M, MOST_EXTRA_PATH_M, SkyMap, SkyView,
+        ANTENNA_M, MOST_EXTRA_PATH_M, SkyMap,
         constellation::Observer,
         horizon::{Placed, SECTORS, Sky, Skyline},
     },
 };
 use sim_core::{
-    displacement::DisplacementMap,
     geodesy::{Geodetic, NetPosition, Projection},
     scene::{Prism, Road, Scene, SolidClass},
 };
@@ -87,35 +96,79 @@ fn main() -> io::Result<()> {
     write_houses(&mut create("houses.csv")?)?;
     write_gnss(&mut create("gnss.csv")?)?;
     write_street(&mut create("street.csv")?)?;
+    write_scan(&mut create("scan.csv")?)?;
     write_sky(&mut create("horizons.csv")?, &mut create("satellites.csv")?)
 }
 
-/// The IMU at rest: the one place that says how its errors come about.
+/// One tick of 0.1 s after the other of one vehicle: the bytes of each observation go to `each`.
+fn sense(
+    sensing: &mut Sensing,
+    ticks: u32,
+    state: &dyn Fn(u32) -> Option<VehicleState>,
+    each: &mut dyn FnMut(u32, &Block),
+) {
+    let mut header = MessageHeader {
+        flags: FIRST_OF_EPISODE,
+        episode_seed: SEED,
+        ..MessageHeader::default()
+    };
+    for tick in 0..ticks {
+        let Some(state) = state(tick) else { return };
+        (header.tick, header.sim_time_ns) = (u64::from(tick), (u64::from(tick) + 1) * 100_000_000);
+        let states = [state];
+        let n = sensing.assign(&header, &states);
+        let layout = ObservationLayout::new(n, sensing.width(), sensing.imu_samples());
+        let mut payload = vec![0_u64; layout.len.div_ceil(8)];
+        let world = World {
+            states: &states,
+            ..World::default()
+        };
+        sensing
+            .observe(&header, &world, bytemuck::cast_slice_mut(&mut payload))
+            .unwrap();
+        each(tick, &Block { layout, payload });
+        header.flags = 0;
+    }
+}
+
+/// An observation.
+struct Block {
+    layout: ObservationLayout,
+    payload: Vec<u64>,
+}
+
+impl Block {
+    fn section<T: bytemuck::Pod>(&self, section: Section) -> &[T] {
+        block::view(bytemuck::cast_slice(&self.payload), section).unwrap()
+    }
+}
+
+/// The IMU at rest.
 fn write_imu(out: &mut impl Write) -> io::Result<()> {
-    let params = ipc_schema::config::Imu {
-        accel_noise_std_mps2: [ACCEL[0] / IMU_S.sqrt(); 3],
-        gyro_noise_std_radps: [GYRO[0] / IMU_S.sqrt(); 3],
-        gyro_bias_radps: [0.0; 3],
-        ..town().imu
+    let mut config = town();
+    config.imu = ipc_schema::config::Imu {
+        period_s: IMU_S,
+        accel_noise_std_mps2: [0.0; 3],
+        accel_noise_density: [ACCEL[0]; 3],
+        accel_bias_walk: [ACCEL[1]; 3],
+        gyro_noise_std_radps: [0.0; 3],
+        gyro_noise_density: [GYRO[0]; 3],
+        gyro_bias_walk: [GYRO[1]; 3],
+        ..config.imu
     };
     let state = VehicleState {
         id_hash: ID,
         ..VehicleState::default()
     };
-    let walk = Stream {
-        episode_seed: SEED,
-        id_hash: ID + 1,
-        sensor: Sensor::Accelerometer,
-    };
-    let (mut accel_bias, mut gyro_bias) = (0.0, 0.0);
+    let mut samples = Vec::new();
+    let mut sensing = Sensing::new(&config, &map()).unwrap();
+    let ticks = IMU_SAMPLES / 10;
+    sense(&mut sensing, ticks, &|_| Some(state), &mut |_, block| {
+        samples.extend_from_slice(block.section::<[f32; IMU_COLUMNS]>(block.layout.imu));
+    });
     writeln!(out, "accel_mps2,gyro_radps")?;
-    for index in 0..IMU_SAMPLES {
-        let sample = imu::sample(&params, &state, SEED, index);
-        let [a, g] = [0, 1].map(|i: usize| f64::from(walk.normals(index)[i] as f32));
-        accel_bias += ACCEL[1] * IMU_S.sqrt() * a;
-        gyro_bias += GYRO[1] * IMU_S.sqrt() * g;
-        let (accel, gyro) = (sample.accel_mps2[0] + accel_bias, sample.gyro_radps[0] + gyro_bias);
-        writeln!(out, "{accel:.6e},{gyro:.6e}")?;
+    for sample in samples {
+        writeln!(out, "{:.6e},{:.6e}", sample[0], sample[3])?;
     }
     Ok(())
 }
@@ -156,55 +209,108 @@ fn place(mut way_m: f64) -> Option<[f64; 2]> {
     None
 }
 
-/// The drive with each kind of error: the one place that says how they come about.
+/// Where the drive is at a tick.
+fn driven(tick: u32) -> Option<VehicleState> {
+    let [x_m, y_m] = place(SPEED_MPS * GNSS_S * f64::from(tick))?;
+    Some(VehicleState {
+        x_m,
+        y_m,
+        id_hash: ID,
+        ..VehicleState::default()
+    })
+}
+
+/// The drive with each kind of error alone; the sky's with a little white noise to scale.
 fn write_gnss(out: &mut impl Write) -> io::Result<()> {
     let info = map();
-    let projection = Projection::new(&info).unwrap();
-    let displacements = DisplacementMap::new(&projection, info.bounds_m).unwrap();
-    let middle = projection
+    let middle = Projection::new(&info)
+        .unwrap()
         .geodetic_from_net(NetPosition { x_m: 60.0, y_m: 70.0 })
         .unwrap();
-    let sky = SkyMap::new(scene(), middle, info.bounds_m, SEED);
-    let white_deg = (WHITE_M / 6_371_000.0_f64).to_degrees();
-    let params = ipc_schema::config::Gnss {
-        noise_std_deg: [white_deg; 2],
-        bias_deg: [0.0; 2],
-        ..town().gnss
-    };
-    let stream = |id_hash| Stream {
-        episode_seed: SEED,
-        id_hash,
-        sensor: Sensor::Gnss,
-    };
-    let decay = libm::exp(-GNSS_S / CORRELATION_TIME_S);
-    let mut slow = stream(ID + 1).normal_pair(u32::MAX);
     writeln!(out, "error,t_s,x_m,y_m,fix_x_m,fix_y_m,satellites")?;
-    for index in 0_u32.. {
-        let t_s = f64::from(index) * GNSS_S;
-        let Some([x, y]) = place(SPEED_MPS * t_s) else { break };
-        let step = stream(ID + 1).normal_pair(index);
-        slow = [0, 1].map(|i: usize| decay * slow[i] + libm::sqrt(1.0 - decay * decay) * step[i]);
-        let fix = gnss::sample(&params, &displacements, x, y, stream(ID), index);
-        let white = [fix.x_m - x, fix.y_m - y];
-        let view = sky.at(x, y, 0.0, t_s);
-        // Each error alone; the sky's with a little white noise to scale.
-        let seen = [0, 1].map(|i: usize| view.offset_m[i] + 0.25 * view.noise_factor * white[i]);
-        let correlated = slow.map(|error| CORRELATED_M * error);
-        let open = sky.at(1e6, 1e6, 0.0, t_s).satellites;
-        for (name, error, satellites, has_fix) in [
-            ("white", white, open, true),
-            ("correlated", correlated, open, true),
-            ("sky view", seen, view.satellites, view.has_fix),
-        ] {
+    let [white, correlated, sky] = [[WHITE_M, 0.0], [0.0, CORRELATED_M], [0.25 * WHITE_M, 0.0]];
+    for (name, [white_m, correlated_m], is_hidden) in [
+        ("white", white, false),
+        ("correlated", correlated, false),
+        ("sky view", sky, true),
+    ] {
+        let mut config = town();
+        config.gnss.noise_std_deg = [0.0; 2];
+        config.gnss.noise_std_m = [white_m; 3];
+        config.gnss.correlated_std_m = [correlated_m; 3];
+        config.gnss.correlation_time_s = CORRELATION_TIME_S;
+        let mut sensing = Sensing::new(&config, &info).unwrap();
+        let scene = if is_hidden { scene() } else { Arc::new(Scene::default()) };
+        sensing.set_sky(Box::new(SkyMap::new(scene, middle, info.bounds_m, SEED)));
+        let mut lines = Vec::new();
+        sense(&mut sensing, u32::MAX, &driven, &mut |tick, block| {
+            let state = driven(tick).unwrap();
+            let has_fix = block.section::<u32>(block.layout.sensors)[0] & GNSS != 0;
+            let [x, y, _] = block.section::<[f32; 3]>(block.layout.gnss_m)[0];
+            let [_, satellites] = block.section::<[f32; 2]>(block.layout.gnss_quality)[0];
             if has_fix {
-                writeln!(
-                    out,
-                    "{name},{t_s:.1},{x:.3},{y:.3},{:.3},{:.3},{satellites}",
-                    x + error[0],
-                    y + error[1]
-                )?;
+                let t_s = GNSS_S * f64::from(tick);
+                lines.push(format!(
+                    "{name},{t_s:.1},{:.3},{:.3},{x:.3},{y:.3},{satellites}",
+                    state.x_m, state.y_m
+                ));
             }
+        });
+        for line in lines {
+            writeln!(out, "{line}")?;
         }
+    }
+    Ok(())
+}
+
+/// Length, width and height of the vehicles on the street, metres.
+const CAR_M: [f32; 3] = [4.5, 1.8, 1.5];
+
+/// A scan amid the houses, other vehicles and persons around.
+fn write_scan(out: &mut impl Write) -> io::Result<()> {
+    let mut config = town();
+    config.lidar.vehicles = 1;
+    config.lidar.range_m = 80.0;
+    let lidar = Lidar::new(&config, &scene()).unwrap();
+    let road_user = |vehicle: u32, [x_m, y_m]: [f64; 2], yaw_rad: f64, kind: Kind| {
+        let person = kind == Kind::Person;
+        VehicleState {
+            x_m,
+            y_m,
+            yaw_rad,
+            vehicle,
+            kind: kind as u32,
+            id_hash: u64::from(vehicle),
+            length_m: if person { 0.5 } else { CAR_M[0] },
+            width_m: if person { 0.5 } else { CAR_M[1] },
+            height_m: if person { 1.7 } else { CAR_M[2] },
+            rear_overhang_m: if person { 0.0 } else { 0.9 },
+            ..VehicleState::default()
+        }
+    };
+    let around = [
+        ([75.0, -2.0], 0.0, Kind::Cav),
+        ([90.0, -2.2], 0.0, Kind::Other),
+        ([58.0, -1.8], 0.0, Kind::Other),
+        ([84.0, 2.0], std::f64::consts::PI, Kind::Other),
+        ([62.0, 2.2], std::f64::consts::PI, Kind::Other),
+        ([110.0, 2.1], std::f64::consts::PI, Kind::Other),
+        ([82.0, 6.5], 0.0, Kind::Person),
+        ([70.0, -6.5], 0.0, Kind::Person),
+        ([66.0, 6.2], 0.0, Kind::Person),
+    ];
+    let states: Vec<VehicleState> = (0..)
+        .zip(around)
+        .map(|(vehicle, (place, yaw_rad, kind))| road_user(vehicle, place, yaw_rad, kind))
+        .collect();
+    let mut targets = Targets::default();
+    targets.update(&states, &vec![SubStep::default(); states.len()], 1);
+    let (mut scan, mut points) = (Scan::default(), vec![LidarPoint::default(); lidar.max_points()]);
+    let count = lidar.scan(&targets, 0, 0, SEED, &mut Scratch::default(), &mut scan, &mut points);
+    writeln!(out, "x_m,y_m,z_m,tag,intensity")?;
+    for point in &points[..count] {
+        let [x, y, z] = point.position_m;
+        writeln!(out, "{x:.3},{y:.3},{z:.3},{},{:.3}", point.tag, point.intensity)?;
     }
     Ok(())
 }

@@ -4,7 +4,7 @@ use ipc_schema::{
     block::BlockError,
     config::{BlackoutPolicy, Config},
     header::{FIRST_OF_EPISODE, MessageHeader},
-    observation::{CLIPPED, GNSS, IMU, LIDAR, ObservationLayout, SPEED_STEERING, VALID},
+    observation::{CLIPPED, GNSS, LIDAR, ObservationLayout, VALID},
     run::MapInfo,
     traffic::Kind,
     world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, SubStep, TIME_LIMIT, VehicleState},
@@ -287,7 +287,7 @@ impl Sensing {
         out.episode_step[slot] = step;
         out.sensors[slot] = readings.delivering;
         out.age_s[slot] = readings.ages_s;
-        write_raw(slot, carrier, self.policy, out);
+        write_raw(slot, carrier, out);
         if carrier.present & !carrier.known != 0 {
             return;
         }
@@ -313,9 +313,9 @@ impl Sensing {
     }
 }
 
-/// Writes the newest raw samples of a slot; while a sensor is dark and the policy says so, not-a-number.
+/// Writes the newest raw samples of a slot. While a sensor is dark they are its last: estimators that read them look at age and bit.
 #[inline]
-fn write_raw(slot: usize, carrier: &Carrier, policy: BlackoutPolicy, out: &mut Sections) {
+fn write_raw(slot: usize, carrier: &Carrier, out: &mut Sections) {
     let readings = &carrier.readings;
     let fix = &readings.fix;
     out.gnss_m[slot] = [fix.x_m as f32, fix.y_m as f32, fix.z_m as f32];
@@ -323,22 +323,6 @@ fn write_raw(slot: usize, carrier: &Carrier, policy: BlackoutPolicy, out: &mut S
     out.gnss_quality[slot] = [fix.accuracy_m as f32, fix.satellites as f32];
     let sample = &readings.speed_steering;
     out.speed_steering[slot] = [sample.speed_mps as f32, sample.steering_rad as f32];
-    let blank = carrier.dark() & carrier.known;
-    if policy != BlackoutPolicy::Nan || blank == 0 {
-        return;
-    }
-    if blank & GNSS != 0 {
-        out.gnss_m[slot].fill(f32::NAN);
-        out.gnss_geodetic[slot].fill(f64::NAN);
-        out.gnss_quality[slot].fill(f32::NAN);
-    }
-    if blank & IMU != 0 {
-        let k = out.imu.len() / out.vehicle.len();
-        out.imu[slot * k..(slot + 1) * k].fill([f32::NAN; 7]);
-    }
-    if blank & SPEED_STEERING != 0 {
-        out.speed_steering[slot].fill(f32::NAN);
-    }
 }
 
 /// The sub-step that a state alone tells of.

@@ -57,8 +57,16 @@ fn a_held_fix_grows_older_and_its_bit_is_cleared() {
     assert!((180..=220).contains(&dark_ticks), "{dark_ticks}");
 }
 
+/// What a vehicle's sensors have delivered.
+#[derive(Default)]
+struct Raw {
+    fix: Vec<[f32; 3]>,
+    imu: Option<[f32; 7]>,
+    speed: Vec<f32>,
+}
+
 #[test]
-fn not_a_number_in_fields_and_raw_samples_while_dark() {
+fn fields_are_not_a_number_while_dark_and_raw_samples_the_last() {
     let mut config = dark(BlackoutPolicy::Nan);
     for (length, gap) in [
         (&mut config.imu.blackout_length_s, &mut config.imu.blackout_gap_s),
@@ -73,6 +81,7 @@ fn not_a_number_in_fields_and_raw_samples_while_dark() {
     config.observation.fields.push(Field::Speed);
     let mut run = Run::new(&config);
     let mut seen = 0;
+    let mut last = Raw::default();
     for _ in 0..300 {
         let tick = run.tick(&cavs(1));
         let sensors = tick.section::<u32>("sensors")[0];
@@ -87,16 +96,22 @@ fn not_a_number_in_fields_and_raw_samples_while_dark() {
                 sensors & SPEED_STEERING == 0
             ]
         );
-        let all = |values: Vec<f32>, dark: bool| values.iter().all(|value| value.is_nan() == dark);
-        assert!(all(tick.section("gnss_m"), sensors & GNSS == 0));
-        assert!(all(tick.section("gnss_quality"), sensors & GNSS == 0));
-        assert!(
-            tick.section::<f64>("gnss_geodetic")
-                .iter()
-                .all(|v| v.is_nan() == (sensors & GNSS == 0))
-        );
-        assert!(all(tick.section("imu"), sensors & IMU == 0));
-        assert!(all(tick.section("speed_steering"), sensors & SPEED_STEERING == 0));
+        let raw = Raw {
+            fix: tick.section("gnss_m"),
+            imu: tick.section::<[f32; 7]>("imu").last().copied(),
+            speed: tick.section("speed_steering"),
+        };
+        for (bit, held, moved) in [
+            (GNSS, raw.fix == last.fix, raw.fix != last.fix),
+            (IMU, raw.imu == last.imu, raw.imu != last.imu),
+            (SPEED_STEERING, raw.speed == last.speed, raw.speed != last.speed),
+        ] {
+            assert!(
+                if sensors & bit == 0 { held } else { moved },
+                "the raw sample is the last"
+            );
+        }
+        last = raw;
         assert_eq!(tick.section::<u32>("flags")[0] & CLIPPED, 0);
         seen |= 1 << sensors;
     }

@@ -125,7 +125,7 @@ fn there_is_no_fix_in_a_deep_courtyard_nor_inside_a_house() {
     for time_s in times() {
         let view = courtyard.at(0.0, 0.0, 0.0, time_s);
         assert!(!view.has_fix && view.satellites < 4, "{view:?}");
-        assert_eq!(courtyard.at(20.0, 0.0, 0.0, time_s), SkyView::without_fix(0));
+        assert_eq!(courtyard.at(20.0, 0.0, 0.0, time_s), without_fix(0));
         assert!(courtyard.at(0.0, 0.0, 100.0, time_s).has_fix, "on the roof");
     }
 }
@@ -292,7 +292,7 @@ proptest! {
         let [e, n, u] = view.offset_m;
         prop_assert!(libm::hypot(libm::hypot(e, n), u) < MOST_OFFSET_M * (1.0 + 1e-12), "{view:?}");
         prop_assert!(view.noise_factor * map.epoch(time_s).hdop < MOST_HDOP * (1.0 + 1e-12));
-        prop_assert!(view.has_fix || view == SkyView::without_fix(view.satellites));
+        prop_assert!(view.has_fix || view == without_fix(view.satellites));
         prop_assert!(!view.has_fix || view.satellites >= LEAST_SATELLITES);
     }
 
