@@ -302,7 +302,7 @@ struct Peers {
 }
 
 impl Peers {
-    fn start(python: &FilePath, directory: &FilePath) -> Option<Self> {
+    fn start(python: &FilePath, directory: &FilePath) -> Self {
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/lidar_peers.py");
         let mut process = Command::new(python)
             .arg(script)
@@ -311,14 +311,14 @@ impl Peers {
             .stdout(Stdio::piped())
             .spawn()
             .unwrap_or_else(|error| panic!("{}: {error}", python.display()));
-        let answers = BufReader::new(process.stdout.take()?);
+        let answers = BufReader::new(process.stdout.take().unwrap());
         let mut peers = Self {
             process,
             answers,
             names: Vec::new(),
         };
         peers.names = peers.answer().split_whitespace().map(str::to_owned).collect();
-        Some(peers)
+        peers
     }
 
     fn answer(&mut self) -> String {
@@ -342,33 +342,32 @@ fn peers(python: &FilePath, path: Path) -> serde_json::Value {
     let mut bench = Bench::new(path, Moves::Straight, false, false, CARRIERS);
     write_frame(&directory, &bench);
     let mut report = serde_json::json!({});
-    if let Some(mut peers) = Peers::start(python, &directory) {
-        for name in peers.names.clone() {
-            let (_, warm) = (bench.round(), peers.round(&name));
-            let mut ratios = Vec::new();
-            let mut rates = Vec::new();
-            for _ in 0..PAIRS {
-                let ours = bench.round().rate();
-                let [theirs, ..] = peers.round(&name);
-                ratios.push(ours / theirs);
-                rates.push(theirs);
-            }
-            ratios.sort_by(f64::total_cmp);
-            rates.sort_by(f64::total_cmp);
-            println!(
-                "{name:10} {:7.2} M rays/s (hits {:.3}, mean range {:.1} m); we are {:.1} x as fast ({:.1} ... {:.1} in {PAIRS} pairs)",
-                rates[PAIRS / 2] / 1e6,
-                warm[1],
-                warm[2],
-                ratios[PAIRS / 2],
-                ratios[0],
-                ratios[PAIRS - 1],
-            );
-            report[name] = serde_json::json!({ "rays_per_s": rates[PAIRS / 2], "ratio": ratios[PAIRS / 2], "spread": [ratios[0], ratios[PAIRS - 1]] });
+    let mut peers = Peers::start(python, &directory);
+    for name in peers.names.clone() {
+        let (_, warm) = (bench.round(), peers.round(&name));
+        let mut ratios = Vec::new();
+        let mut rates = Vec::new();
+        for _ in 0..PAIRS {
+            let ours = bench.round().rate();
+            let [theirs, ..] = peers.round(&name);
+            ratios.push(ours / theirs);
+            rates.push(theirs);
         }
-        drop(peers.process.stdin.take());
-        let _ = peers.process.wait();
+        ratios.sort_by(f64::total_cmp);
+        rates.sort_by(f64::total_cmp);
+        println!(
+            "{name:10} {:7.2} M rays/s (hits {:.3}, mean range {:.1} m); we are {:.1} x as fast ({:.1} ... {:.1} in {PAIRS} pairs)",
+            rates[PAIRS / 2] / 1e6,
+            warm[1],
+            warm[2],
+            ratios[PAIRS / 2],
+            ratios[0],
+            ratios[PAIRS - 1],
+        );
+        report[name] = serde_json::json!({ "rays_per_s": rates[PAIRS / 2], "ratio": ratios[PAIRS / 2], "spread": [ratios[0], ratios[PAIRS - 1]] });
     }
+    drop(peers.process.stdin.take());
+    let _ = peers.process.wait();
     let _ = std::fs::remove_dir_all(&directory);
     report
 }

@@ -164,10 +164,7 @@ pub(super) fn exp_minus<S: Simd>(x: S::F) -> S::F {
 
 #[cfg(test)]
 mod tests {
-    use super::{
-        super::simd::{Floats, Words, plain::Plain},
-        *,
-    };
+    use super::{super::simd::plain::Plain, *};
 
     fn lane(value: <Plain as Simd>::F) -> f64 {
         f64::from(value.0[0])

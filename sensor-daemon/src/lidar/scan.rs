@@ -190,12 +190,10 @@ impl Order<'_> {
 /// Vectors of length 1 from vectors of nearly that, by a step of Newton's.
 #[inline(always)]
 fn unit(of: &[[f64; LANES]; 3], to: &mut [Floats; 3]) {
-    for i in 0..LANES {
-        let square = of[0][i] * of[0][i] + of[1][i] * of[1][i] + of[2][i] * of[2][i];
-        let scale = 1.5 - 0.5 * square;
-        to[0].0[i] = (of[0][i] * scale) as f32;
-        to[1].0[i] = (of[1][i] * scale) as f32;
-        to[2].0[i] = (of[2][i] * scale) as f32;
+    let [x, y, z] = of;
+    let scale: [f64; LANES] = std::array::from_fn(|i| 1.5 - 0.5 * (x[i] * x[i] + y[i] * y[i] + z[i] * z[i]));
+    for (from, to) in of.iter().zip(to) {
+        to.0 = std::array::from_fn(|i| (from[i] * scale[i]) as f32);
     }
 }
 
