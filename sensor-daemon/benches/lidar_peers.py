@@ -1,4 +1,7 @@
-"""General ray tracers on the rays and triangles that `lidar-bench` has written: one thread, one line of answer for a line of name."""
+"""General ray tracers on the rays and triangles that `lidar-bench` has written: one thread, one line of answer for a line of name.
+
+Seconds are those that the process had a core, as in `lidar-bench`: others may be at work on the machine.
+"""
 
 import os
 import sys
@@ -52,9 +55,9 @@ def main():
     print(*peers, flush=True)
     for line in sys.stdin:
         cast = peers[line.strip()]
-        begin = time.perf_counter()
+        begin = time.process_time()
         distances = cast()
-        seconds = time.perf_counter() - begin
+        seconds = time.process_time() - begin
         seen = distances < 100.0
         print(len(rays) / seconds, seen.mean(), distances[seen].mean(), flush=True)
 

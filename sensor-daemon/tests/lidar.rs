@@ -624,7 +624,7 @@ fn a_table_fires_as_it_says() {
     assert_eq!(scanned.points.len(), 3);
     for (point, (azimuth_deg, elevation_deg, channel)) in scanned.points.iter().zip(expected) {
         let off = (azimuth(point).to_degrees() - azimuth_deg).rem_euclid(360.0);
-        assert!(off < 1e-4 || off > 359.999);
+        assert!(!(1e-4..359.999).contains(&off));
         assert!(((f64::from(point.position_m[2]) / range(point)).asin().to_degrees() - elevation_deg).abs() < 1e-4);
         assert_eq!(point.channel, channel);
     }

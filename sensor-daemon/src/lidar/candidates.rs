@@ -2,7 +2,13 @@
 
 use std::f64::consts::{PI, TAU};
 
-use super::{Lidar, Targets, firing::Span, sensor::Sensor, simd::LANES};
+use super::{
+    Lidar, Targets,
+    firing::Span,
+    sensor::Sensor,
+    simd::LANES,
+    solids::{Solids, StillWall},
+};
 
 /// Added to every angle: the error of [`angle_rad`] and of the directions, radians.
 const MARGIN_RAD: f64 = 1.5e-3;
@@ -124,94 +130,133 @@ pub(super) fn angle_rad(x: f64, y: f64) -> f64 {
     if y < 0.0 { -angle } else { angle }
 }
 
+/// How the head of a LIDAR turns, for the columns that may see a thing.
+struct Eye<'a> {
+    watch: &'a Watch,
+    per_rotation: f64,
+    is_table: bool,
+    range_m: f64,
+}
+
+impl Eye<'_> {
+    fn whole(&self) -> [f32; 2] {
+        [0.0, self.per_rotation as f32]
+    }
+
+    /// Columns that may look between two angles, `more` further out on both sides.
+    #[inline(always)]
+    fn columns(&self, low: f64, high: f64, more: f64) -> [f32; 2] {
+        let more = more + self.watch.spread_rad;
+        let length = high - low + 2.0 * more;
+        if length >= TAU || self.is_table {
+            return self.whole();
+        }
+        let begin = low - self.watch.heading_rad - more;
+        let begin = begin - TAU * (begin * (1.0 / TAU)).floor();
+        let per_rad = self.per_rotation * (1.0 / TAU);
+        [
+            (begin * per_rad) as f32 - 1.0,
+            ((begin + length) * per_rad) as f32 + 1.0,
+        ]
+    }
+
+    /// Columns that may see a circle.
+    #[inline(always)]
+    fn circle(&self, [dx, dy]: [f64; 2], distance_m: f64, radius_m: f64) -> [f32; 2] {
+        if distance_m < 1.05 * radius_m {
+            return self.whole();
+        }
+        let half = libm::asin(radius_m / distance_m);
+        let centre = angle_rad(dx, dy);
+        self.columns(centre - half, centre + half, 0.0)
+    }
+
+    /// Least distance of a wall that shows its outside and is within range, and the columns that may see it.
+    #[inline(always)]
+    fn wall(&self, wall: &StillWall) -> Option<(f32, [f32; 2])> {
+        let [x, y, _] = self.watch.place_m;
+        let motion_m = self.watch.motion_m;
+        let (p, q) = ([wall.p_m[0] - x, wall.p_m[1] - y], [wall.q_m[0] - x, wall.q_m[1] - y]);
+        let offset = wall.normal[0] * p[0] + wall.normal[1] * p[1];
+        if offset > motion_m {
+            return None;
+        }
+        let along = [q[0] - p[0], q[1] - p[1]];
+        let square = along[0] * along[0] + along[1] * along[1];
+        let share = (-(p[0] * along[0] + p[1] * along[1]) / square).clamp(0.0, 1.0);
+        let nearest = [p[0] + share * along[0], p[1] + share * along[1]];
+        let distance_m = (nearest[0] * nearest[0] + nearest[1] * nearest[1]).sqrt();
+        if distance_m > self.range_m {
+            return None;
+        }
+        let (left, right) = (angle_rad(p[0], p[1]), angle_rad(q[0], q[1]));
+        let width = wrapped(left - right);
+        let is_wide = distance_m < 2.0 * motion_m || width.abs() > 3.0 || distance_m < 0.01;
+        let low = if width < 0.0 { left } else { right };
+        // asin x < 1.6 x
+        let more = if motion_m > 0.0 {
+            1.6 * motion_m / distance_m
+        } else {
+            0.0
+        };
+        let columns = if is_wide {
+            self.whole()
+        } else {
+            self.columns(low, low + width.abs(), more)
+        };
+        Some(((distance_m - motion_m).max(0.0) as f32, columns))
+    }
+}
+
 impl Candidates {
     /// Everything that the carrier in `row` may see.
     #[inline(always)]
     pub(super) fn gather(&mut self, lidar: &Lidar, targets: &Targets, row: usize, watch: &Watch) {
         self.all.clear();
-        let per_rad = lidar.firing.per_rotation as f64 / TAU;
-        let [x, y, z] = watch.place_m;
-        let range_m = lidar.range_m + watch.motion_m;
-        let whole = [0.0, lidar.firing.per_rotation as f32];
-        let columns = |low: f64, high: f64, more: f64| {
-            let begin = low - watch.heading_rad - watch.spread_rad - more;
-            let length = high - low + 2.0 * (watch.spread_rad + more);
-            if length >= TAU || lidar.pattern.is_table {
-                return whole;
-            }
-            let begin = begin - TAU * (begin * (1.0 / TAU)).floor();
-            [
-                (begin * per_rad) as f32 - 1.0,
-                ((begin + length) * per_rad) as f32 + 1.0,
-            ]
+        let eye = Eye {
+            watch,
+            per_rotation: lidar.firing.per_rotation as f64,
+            is_table: lidar.pattern.is_table,
+            range_m: lidar.range_m + watch.motion_m,
         };
-        // A circle that may come closer by `motion_m`.
-        let circle = |dx: f64, dy: f64, distance_m: f64, radius_m: f64| {
-            if distance_m < 1.05 * radius_m {
-                return whole;
-            }
-            let half = libm::asin(radius_m / distance_m);
-            let centre = angle_rad(dx, dy);
-            columns(centre - half, centre + half, 0.0)
-        };
-        let all = &mut self.all;
-        let solids = &lidar.solids;
-        solids.within([x, y], range_m, |number, distance_m| {
-            let still = &solids.stills[number];
-            let above = z + watch.rise_m > still.z_m[1] || z - watch.rise_m < still.z_m[0];
-            let (dx, dy) = (still.centre_m[0] - x, still.centre_m[1] - y);
-            if above {
-                all.push(Candidate {
-                    kind: Kind::Cap(number as u32),
-                    near_m: (distance_m - still.reach_m - watch.motion_m).max(0.0) as f32,
-                    columns: circle(dx, dy, distance_m, still.reach_m + watch.motion_m),
-                });
-            }
-            for index in still.walls.clone() {
-                let wall = &solids.walls[index as usize];
-                let [p, q] = [wall.p_m, wall.q_m].map(|corner| [corner[0] - x, corner[1] - y]);
-                let offset = wall.normal[0] * p[0] + wall.normal[1] * p[1];
-                if offset > watch.motion_m {
-                    continue;
-                }
-                let along = [q[0] - p[0], q[1] - p[1]];
-                let square = along[0] * along[0] + along[1] * along[1];
-                let share = (-(p[0] * along[0] + p[1] * along[1]) / square).clamp(0.0, 1.0);
-                let nearest = [p[0] + share * along[0], p[1] + share * along[1]];
-                let distance_m = (nearest[0] * nearest[0] + nearest[1] * nearest[1]).sqrt();
-                if distance_m > range_m {
-                    continue;
-                }
-                let (left, right) = (angle_rad(p[0], p[1]), angle_rad(q[0], q[1]));
-                let width = wrapped(left - right);
-                let more = if watch.motion_m > 0.0 {
-                    1.6 * watch.motion_m / distance_m
-                } else {
-                    0.0
-                };
-                let is_wide = distance_m < 2.0 * watch.motion_m || width.abs() > 3.0 || distance_m < 0.01;
-                let low = if width < 0.0 { left } else { right };
-                all.push(Candidate {
-                    kind: Kind::Wall(index, number as u32),
-                    near_m: (distance_m - watch.motion_m).max(0.0) as f32,
-                    columns: if is_wide {
-                        whole
-                    } else {
-                        columns(low, low + width.abs(), more)
-                    },
-                });
-            }
+        let [x, y, _] = watch.place_m;
+        lidar.solids.within([x, y], eye.range_m, |number, distance_m| {
+            self.still(&lidar.solids, number, distance_m, &eye);
         });
         for (number, [at_x, at_y, reach_m]) in targets.near.iter().enumerate() {
             let (dx, dy) = (at_x - x, at_y - y);
             let square = dx * dx + dy * dy;
-            let most_m = range_m + reach_m;
+            let most_m = eye.range_m + reach_m;
             if square < most_m * most_m && number != row {
                 let (distance_m, reach_m) = (square.sqrt(), reach_m + watch.motion_m);
-                all.push(Candidate {
+                self.all.push(Candidate {
                     kind: Kind::Mover(number as u32),
                     near_m: (distance_m - reach_m).max(0.0) as f32,
-                    columns: circle(dx, dy, distance_m, reach_m),
+                    columns: eye.circle([dx, dy], distance_m, reach_m),
+                });
+            }
+        }
+    }
+
+    /// Roof and walls of what stands still.
+    #[inline(always)]
+    fn still(&mut self, solids: &Solids, number: usize, distance_m: f64, eye: &Eye<'_>) {
+        let (watch, still) = (eye.watch, &solids.stills[number]);
+        let [x, y, z] = watch.place_m;
+        if z + watch.rise_m > still.z_m[1] || z - watch.rise_m < still.z_m[0] {
+            let centre = [still.centre_m[0] - x, still.centre_m[1] - y];
+            self.all.push(Candidate {
+                kind: Kind::Cap(number as u32),
+                near_m: (distance_m - still.reach_m - watch.motion_m).max(0.0) as f32,
+                columns: eye.circle(centre, distance_m, still.reach_m + watch.motion_m),
+            });
+        }
+        for index in still.walls.clone() {
+            if let Some((near_m, columns)) = eye.wall(&solids.walls[index as usize]) {
+                self.all.push(Candidate {
+                    kind: Kind::Wall(index, number as u32),
+                    near_m,
+                    columns,
                 });
             }
         }

@@ -39,8 +39,10 @@ pub(super) struct Firing {
     cycle: usize,
     /// Ticks in that.
     phases: usize,
-    /// Sine and cosine of the azimuth of each column of a rotation.
-    pub(super) azimuths: Vec<[f64; 2]>,
+    /// Sines and cosines of the azimuths of the columns of a rotation, and of the first of the next: a span and a chunk may reach
+    /// beyond the end.
+    pub(super) sines: Vec<f64>,
+    pub(super) cosines: Vec<f64>,
     /// Whether a column is within the field of view.
     is_seen: Vec<bool>,
     tick_s: f64,
@@ -63,18 +65,16 @@ impl Firing {
         let angle = |column: usize| TAU * column as f64 / per_rotation as f64;
         let half = 0.5 * lidar.horizontal_fov_deg.to_radians() + 1e-9;
         let off_centre = |column: usize| angle(column).min(TAU - angle(column));
-        let azimuth = |column| {
-            if pattern.is_table {
-                [0.0, 1.0]
-            } else {
-                <[f64; 2]>::from(libm::sincos(angle(column)))
-            }
+        let azimuth = |column: usize| match pattern.is_table {
+            true => (0.0, 1.0),
+            false => libm::sincos(angle(column % per_rotation)),
         };
         Ok(Self {
             per_rotation,
             cycle: per_rotation * rotations,
             phases,
-            azimuths: (0..per_rotation).map(azimuth).collect(),
+            sines: (0..per_rotation + SPAN).map(|column| azimuth(column).0).collect(),
+            cosines: (0..per_rotation + SPAN).map(|column| azimuth(column).1).collect(),
             is_seen: (0..per_rotation)
                 .map(|column| pattern.is_table || off_centre(column) <= half)
                 .collect(),

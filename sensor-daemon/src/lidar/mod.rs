@@ -10,6 +10,7 @@ use ipc_schema::{
 };
 use sim_core::scene::Scene;
 
+mod aim;
 mod candidates;
 mod error;
 mod firing;

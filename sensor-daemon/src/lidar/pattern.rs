@@ -39,6 +39,8 @@ pub(super) struct Pattern {
     pub(super) per_column: usize,
     /// Rays in a full column.
     pub(super) lasers: usize,
+    /// `alpha` and `gamma` of the lowest and the highest laser.
+    pub(super) ends: [[f32; 2]; 2],
     /// Rays of a rotation one by one; their azimuth is in `alpha` and `beta`.
     pub(super) is_table: bool,
 }
@@ -65,6 +67,10 @@ impl Pattern {
         let groups: Vec<Group> = rays.chunks(LANES).map(Group::new).collect();
         Ok(Self {
             per_column: groups.len(),
+            ends: [&rays[0], &rays[rays.len() - 1]].map(|ray| {
+                let (sine, cosine) = libm::sincos(ray.elevation_deg.to_radians());
+                [cosine as f32, sine as f32]
+            }),
             groups,
             lasers: rays.len(),
             is_table: false,
@@ -188,6 +194,7 @@ fn table(path: &Path, rotation_hz: f64) -> Result<Pattern, LidarError> {
         groups: rays.chunks(together).map(Group::new).collect(),
         per_column: 1,
         lasers: together,
+        ends: [[0.0; 2]; 2],
         is_table: true,
     })
 }

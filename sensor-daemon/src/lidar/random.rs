@@ -3,7 +3,7 @@
 //! Numbers depend on (seed of the episode, vehicle, tick, ray) alone. A scan has a key of its own, drawn from Philox with the first
 //! three; then one draw of Philox serves two rays.
 
-use super::simd::Simd;
+use super::simd::{Floats, Simd};
 use crate::noise::philox4x32;
 
 /// The LIDAR's number among the sensors with random streams.
@@ -48,7 +48,23 @@ fn uniform<S: Simd>(word: S::U) -> S::F {
     (S::from_signed(S::right::<8>(word)) + centre) * S::splat(1.0 / 16_777_216.0)
 }
 
-/// Random numbers of groups `2 number` and `2 number + 1` of a scan.
+/// Random numbers of consecutive groups, two to a draw, from draw `first` on. A loop of its own: draws are long chains of operations,
+/// and two of them have room side by side in the processor where one and the work on its returns have not.
+#[inline(always)]
+pub(super) fn fill<S: Simd>(key: &Key, first: u32, groups: usize, normal: &mut [Floats], uniform: &mut [Floats]) {
+    let (normals, uniforms) = (normal[..groups].chunks_mut(2), uniform[..groups].chunks_mut(2));
+    for (number, (normal, uniform)) in (first..).zip(normals.zip(uniforms)) {
+        let drawn = draw::<S>(key, number);
+        S::store(drawn.normal[0], &mut normal[0]);
+        S::store(drawn.uniform[0], &mut uniform[0]);
+        if let ([_, normal], [_, uniform]) = (normal, uniform) {
+            S::store(drawn.normal[1], normal);
+            S::store(drawn.uniform[1], uniform);
+        }
+    }
+}
+
+/// Random numbers of two groups of a scan.
 #[inline(always)]
 pub(super) fn draw<S: Simd>(key: &Key, number: u32) -> Drawn<S> {
     let [a, b, c, d] = S::philox(number.wrapping_mul(16), key.rest, key.key);
@@ -63,11 +79,11 @@ pub(super) fn draw<S: Simd>(key: &Key, number: u32) -> Drawn<S> {
 
 #[inline(always)]
 fn horner<S: Simd, const N: usize>(x: S::F, coefficients: [f32; N]) -> S::F {
-    let [first, rest @ ..] = &coefficients[..] else {
-        return S::splat(0.0);
-    };
-    rest.iter()
-        .fold(S::splat(*first), |sum, coefficient| sum * x + S::splat(*coefficient))
+    let mut sum = S::splat(coefficients[0]);
+    for coefficient in &coefficients[1..] {
+        sum = sum * x + S::splat(*coefficient);
+    }
+    sum
 }
 
 /// Natural logarithm of normal numbers: exponent and a polynomial over √½ … √2 (Cephes, `logf`).
@@ -83,20 +99,12 @@ pub(super) fn ln<S: Simd>(x: S::F) -> S::F {
     );
     let f = S::floats(mantissa) - S::splat(1.0);
     let square = f * f;
-    let tail = horner::<S, 9>(
-        f,
-        [
-            7.037_683_6e-2,
-            -1.151_461e-1,
-            1.167_699_9e-1,
-            -1.242_014_1e-1,
-            1.424_932_3e-1,
-            -1.666_805_8e-1,
-            2.000_071_5e-1,
-            -2.499_999_4e-1,
-            3.333_333_1e-1,
-        ],
-    );
+    // Cephes' nine coefficients, summed in pairs: half as long a chain of dependent operations.
+    let pair = |high: f32, low: f32| S::splat(high) * f + S::splat(low);
+    let fourth = square * square;
+    let low = pair(-0.249_999_94, 0.333_333_3) + square * pair(-1.666_805_8e-1, 2.000_071_5e-1);
+    let high = pair(-1.242_014_1e-1, 1.424_932_3e-1) + square * pair(-1.151_461e-1, 1.167_699_9e-1);
+    let tail = low + fourth * (high + fourth * S::splat(7.037_683_6e-2));
     let small = f * square * tail - square * S::splat(0.5) + f;
     small + exponent * S::splat(std::f32::consts::LN_2)
 }
@@ -156,10 +164,7 @@ pub(super) fn exp_minus<S: Simd>(x: S::F) -> S::F {
 
 #[cfg(test)]
 mod tests {
-    use super::{
-        super::simd::{Floats, Words, plain::Plain},
-        *,
-    };
+    use super::{super::simd::plain::Plain, *};
 
     fn lane(value: <Plain as Simd>::F) -> f64 {
         f64::from(value.0[0])
@@ -245,7 +250,6 @@ mod tests {
             out
         }
         let key = Key::new(1, 2, 3);
-        let _ = Words::ZERO;
         for number in 0..1000 {
             let expected = stored::<Plain>(&key, number);
             #[expect(

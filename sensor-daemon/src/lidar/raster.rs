@@ -31,6 +31,17 @@ impl Line {
     }
 }
 
+/// Two values at a share of the span. Written out: closures over vectors are not always inlined, and then they go through memory.
+#[inline(always)]
+fn at2<S: Simd>(lines: &[Line; 2], share: S::F) -> [S::F; 2] {
+    [lines[0].at::<S>(share), lines[1].at::<S>(share)]
+}
+
+#[inline(always)]
+fn splat2<S: Simd>(values: [f32; 2]) -> [S::F; 2] {
+    [S::splat(values[0]), S::splat(values[1])]
+}
+
 /// A wall as the sensor sees it during a span.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Wall {
@@ -85,6 +96,9 @@ pub(super) struct Canvas {
     pub(super) tan: Vec<Floats>,
     pub(super) cot: Vec<Floats>,
     crossings: Vec<(Floats, u32)>,
+    /// Random numbers: standard normal, and in (0, 1).
+    pub(super) normal: Vec<Floats>,
+    pub(super) uniform: Vec<Floats>,
 }
 
 /// Sixteen columns.
@@ -96,8 +110,14 @@ pub(super) struct Chunk {
     pub(super) ahead: [Floats; 2],
     pub(super) right: [Floats; 2],
     pub(super) left: [Floats; 2],
-    /// Farthest of what the rays have met so far.
+    /// The rays come no farther than this.
     pub(super) far: Floats,
+    /// Sine and cosine of the azimuth in the sensor's frame.
+    pub(super) azimuth: [Floats; 2],
+    /// Before the end of the tick, microseconds.
+    pub(super) age_us: Words,
+    /// Axes in the world, of sensors that lean: ahead, left, up.
+    pub(super) axes: [[Floats; 3]; 3],
 }
 
 impl Default for Chunk {
@@ -109,6 +129,9 @@ impl Default for Chunk {
             right: none,
             left: none,
             far: Floats::ZERO,
+            azimuth: none,
+            age_us: Words::ZERO,
+            axes: [[Floats::ZERO; 3]; 3],
         }
     }
 }
@@ -159,6 +182,8 @@ impl Canvas {
         self.groups = groups;
         if self.t.len() < places {
             self.t.resize(places, Floats::ZERO);
+            self.normal.resize(places, Floats::ZERO);
+            self.uniform.resize(places, Floats::ZERO);
             self.incidence.resize(places, Floats::ZERO);
             self.object.resize(places, Words::ZERO);
             self.word.resize(places, Words::ZERO);
@@ -168,6 +193,13 @@ impl Canvas {
         }
     }
 
+    /// Directions of the rays of a place.
+    #[inline(always)]
+    fn ray<S: Simd>(&self, place: usize) -> [S::F; 3] {
+        let [x, y, z] = &self.direction;
+        [S::load(&x[place]), S::load(&y[place]), S::load(&z[place])]
+    }
+
     /// Columns of a chunk that exist.
     #[inline(always)]
     fn live(&self, chunk: usize) -> u32 {
@@ -175,22 +207,29 @@ impl Canvas {
         ((1_u64 << count) - 1) as u32
     }
 
-    /// Lanes of `mask` in a place now show `body`.
+    /// Lanes of `mask` in a place, where rays have come `best` far, now show `body`; how far they come. The distance is stored whole:
+    /// the next surface loads it, and a processor does not hand a masked store on to a load.
     #[inline(always)]
-    fn put<S: Simd>(&mut self, place: usize, mask: S::M, t: S::F, incidence: S::F, body: &Body) {
-        S::store_where(mask, t, &mut self.t[place]);
+    fn put<S: Simd>(
+        &mut self,
+        place: usize,
+        mask: S::M,
+        (t, best): (S::F, S::F),
+        incidence: S::F,
+        body: &Body,
+    ) -> S::F {
+        let now = S::select(mask, t, best);
+        S::store(now, &mut self.t[place]);
         S::store_where(mask, incidence, &mut self.incidence[place]);
         S::store_words_where(mask, body.object, &mut self.object[place]);
         S::store_words_where(mask, body.word, &mut self.word[place]);
+        now
     }
 
-    /// Farthest of what the rays of a column have met, anew.
+    /// The rays of a column come as far as this.
     #[inline(always)]
-    pub(super) fn see<S: Simd>(&mut self, column: usize) {
-        let begin = column * self.groups;
-        let places = &self.t[begin..begin + self.groups];
-        let farthest = places.iter().fold(S::splat(0.0), |far, t| S::max(far, S::load(t)));
-        self.columns[column / LANES].far.0[column % LANES] = S::largest(farthest);
+    fn limit<S: Simd>(&mut self, column: usize, far: S::F) {
+        self.columns[column / LANES].far.0[column % LANES] = S::largest(far);
     }
 
     /// One wall.
@@ -204,7 +243,7 @@ impl Canvas {
             if S::bits(near) == 0 {
                 continue;
             }
-            let [p, q] = [&wall.p, &wall.q].map(|point| point.map(|line| line.at::<S>(share)));
+            let (p, q) = (at2::<S>(&wall.p, share), at2::<S>(&wall.q, share));
             let zero = S::splat(0.0);
             // The left corner is not right of all rays, the right one not left of all.
             let left = S::le(zero, cross::<S>(load2::<S>(&columns.right), p));
@@ -220,8 +259,8 @@ impl Canvas {
             if S::bits(seen) & live == 0 {
                 continue;
             }
-            let normal = wall.normal.map(|line| line.at::<S>(share));
-            let z = body.z.map(|line| line.at::<S>(share));
+            let normal = at2::<S>(&wall.normal, share);
+            let z = at2::<S>(&body.z, share);
             if UPRIGHT {
                 let facing = dot::<S>(normal, load2::<S>(&columns.ahead));
                 let t = offset / facing;
@@ -250,19 +289,17 @@ impl Canvas {
     #[inline(always)]
     fn wall_upright<S: Simd>(&mut self, column: usize, t: f32, incidence: f32, z: [f32; 2], body: &Body) {
         let t = S::splat(t);
-        let [low, high] = z.map(S::splat);
-        let mut hit = 0;
+        let [low, high] = splat2::<S>(z);
+        let mut far = S::splat(0.0);
         for group in 0..self.groups {
             let place = column * self.groups + group;
             let height = t * S::load(&self.tan[group]);
+            let best = S::load(&self.t[place]);
             let inside = S::both(S::le(low, height), S::le(height, high));
-            let mask = S::both(inside, S::lt(t, S::load(&self.t[place])));
-            hit |= S::bits(mask);
-            self.put::<S>(place, mask, t, S::splat(incidence), body);
+            let mask = S::both(inside, S::lt(t, best));
+            far = S::max(far, self.put::<S>(place, mask, (t, best), S::splat(incidence), body));
         }
-        if hit != 0 {
-            self.see::<S>(column);
-        }
+        self.limit::<S>(column, far);
     }
 
     #[inline(always)]
@@ -272,23 +309,21 @@ impl Canvas {
         let [low, high] = splat2(&at.z);
         let offset = S::splat(at.offset.0[lane]);
         let zero = S::splat(0.0);
-        let mut hit = 0;
+        let mut far = S::splat(0.0);
         for group in 0..self.groups {
             let place = column * self.groups + group;
-            let [x, y, z] = [0, 1, 2].map(|axis: usize| S::load(&self.direction[axis][place]));
+            let [x, y, z] = self.ray::<S>(place);
             let between = S::both(S::le(zero, cross::<S>([x, y], p)), S::lt(cross::<S>([x, y], q), zero));
             let facing = dot::<S>(normal, [x, y]);
             let t = offset / facing;
             let height = t * z;
             let inside = S::both(S::le(low, height), S::le(height, high));
-            let nearer = S::both(S::lt(t, S::load(&self.t[place])), S::lt(facing, zero));
+            let best = S::load(&self.t[place]);
+            let nearer = S::both(S::lt(t, best), S::lt(facing, zero));
             let mask = S::both(S::both(between, inside), nearer);
-            hit |= S::bits(mask);
-            self.put::<S>(place, mask, t, facing, body);
+            far = S::max(far, self.put::<S>(place, mask, (t, best), facing, body));
         }
-        if hit != 0 {
-            self.see::<S>(column);
-        }
+        self.limit::<S>(column, far);
     }
 
     /// A roof or an underside at height `z`, over the outline that `walls` make: a point is inside if the ray's line has crossed an odd
@@ -323,9 +358,9 @@ impl Canvas {
         self.crossings.clear();
         let mut any = 0;
         for wall in walls {
-            let [p, q] = [&wall.p, &wall.q].map(|point| point.map(|line| line.at::<S>(share)));
+            let (p, q) = (at2::<S>(&wall.p, share), at2::<S>(&wall.q, share));
             let crossed = S::differ(S::le(zero, cross::<S>(ahead, p)), S::le(zero, cross::<S>(ahead, q)));
-            let facing = dot::<S>(wall.normal.map(|line| line.at::<S>(share)), ahead);
+            let facing = dot::<S>(at2::<S>(&wall.normal, share), ahead);
             let t = wall.offset.at::<S>(share) / facing;
             any |= S::bits(crossed);
             self.crossings.push((stored::<S>(t), S::bits(crossed)));
@@ -336,11 +371,12 @@ impl Canvas {
     #[inline(always)]
     fn cap_upright<S: Simd>(&mut self, column: usize, lane: usize, height: f32, body: &Body) {
         let (height, zero) = (S::splat(height), S::splat(0.0));
-        let mut hit = 0;
+        let mut far = S::splat(0.0);
         for group in 0..self.groups {
             let place = column * self.groups + group;
             let t = height * S::load(&self.cot[group]);
-            let nearer = S::both(S::lt(zero, t), S::lt(t, S::load(&self.t[place])));
+            let best = S::load(&self.t[place]);
+            let nearer = S::both(S::lt(zero, t), S::lt(t, best));
             let mut inside = S::mask(0);
             for (crossing, crossed) in &self.crossings {
                 if crossed >> lane & 1 == 1 {
@@ -348,44 +384,40 @@ impl Canvas {
                 }
             }
             let mask = S::both(nearer, inside);
-            hit |= S::bits(mask);
             let tan = S::load(&self.tan[group]);
-            self.put::<S>(place, mask, t, tan, body);
+            far = S::max(far, self.put::<S>(place, mask, (t, best), tan, body));
         }
-        if hit != 0 {
-            self.see::<S>(column);
-        }
+        self.limit::<S>(column, far);
     }
 
     #[inline(always)]
     fn cap_tilted<S: Simd>(&mut self, column: usize, share: f32, height: f32, walls: &[Wall], body: &Body) {
         let (height, zero, share) = (S::splat(height), S::splat(0.0), S::splat(share));
-        let mut hit = 0;
+        let mut far = S::splat(0.0);
         for group in 0..self.groups {
             let place = column * self.groups + group;
-            let [x, y, z] = [0, 1, 2].map(|axis: usize| S::load(&self.direction[axis][place]));
+            let [x, y, z] = self.ray::<S>(place);
             let t = height / z;
-            let nearer = S::both(S::lt(zero, t), S::lt(t, S::load(&self.t[place])));
+            let best = S::load(&self.t[place]);
+            let nearer = S::both(S::lt(zero, t), S::lt(t, best));
             if S::bits(nearer) == 0 {
+                far = S::max(far, best);
                 continue;
             }
             let mut inside = S::mask(0);
             for wall in walls {
-                let [p, q] = [&wall.p, &wall.q].map(|point| point.map(|line| line.at::<S>(share)));
+                let (p, q) = (at2::<S>(&wall.p, share), at2::<S>(&wall.q, share));
                 let crossed = S::differ(S::le(zero, cross::<S>([x, y], p)), S::le(zero, cross::<S>([x, y], q)));
-                let facing = dot::<S>(wall.normal.map(|line| line.at::<S>(share)), [x, y]);
+                let facing = dot::<S>(at2::<S>(&wall.normal, share), [x, y]);
                 // offset / facing < t, without the division.
                 let behind = S::lt(wall.offset.at::<S>(share), facing * t);
                 let before = S::differ(behind, S::lt(facing, zero));
                 inside = S::differ(inside, S::both(crossed, before));
             }
             let mask = S::both(nearer, inside);
-            hit |= S::bits(mask);
-            self.put::<S>(place, mask, t, z, body);
+            far = S::max(far, self.put::<S>(place, mask, (t, best), z, body));
         }
-        if hit != 0 {
-            self.see::<S>(column);
-        }
+        self.limit::<S>(column, far);
     }
 
     /// An upright cylinder: mantle and top.
@@ -398,7 +430,7 @@ impl Canvas {
             if near == 0 {
                 continue;
             }
-            let at = centre.map(|line| line.at::<S>(share));
+            let at = at2::<S>(&centre, share);
             // Within a radius of the wedge.
             let reach = S::splat(-1.001 * radius);
             let left = S::le(reach, cross::<S>(load2::<S>(&columns.right), at));
@@ -428,16 +460,16 @@ impl Canvas {
         z: [f32; 2],
         body: &Body,
     ) {
-        let (at, radius, zero) = (centre.map(S::splat), S::splat(radius), S::splat(0.0));
-        let [low, high] = z.map(S::splat);
-        let mut hit = 0;
+        let (at, radius, zero) = (splat2::<S>(centre), S::splat(radius), S::splat(0.0));
+        let [low, high] = splat2::<S>(z);
+        let mut far = S::splat(0.0);
         for group in 0..self.groups {
             let place = column * self.groups + group;
             // Direction with the scale of `t`, and its horizontal part squared.
             let (flat, up, square) = if UPRIGHT {
-                (ahead.map(S::splat), S::load(&self.tan[group]), S::splat(1.0))
+                (splat2::<S>(ahead), S::load(&self.tan[group]), S::splat(1.0))
             } else {
-                let [x, y, z] = [0, 1, 2].map(|axis: usize| S::load(&self.direction[axis][place]));
+                let [x, y, z] = self.ray::<S>(place);
                 ([x, y], z, x * x + y * y)
             };
             let along = dot::<S>(flat, at);
@@ -450,20 +482,15 @@ impl Canvas {
             let height = t * up;
             let inside = S::both(S::le(low, height), S::le(height, high));
             let mantle = S::both(S::both(meets, inside), S::both(S::lt(zero, t), S::lt(t, best)));
-            self.put::<S>(place, mantle, t, root / radius, body);
+            let best = self.put::<S>(place, mantle, (t, best), root / radius, body);
             // The top, of a sensor that looks down on it.
             let t = high / up;
             let within = S::both(S::lt(along - root, t * square), S::lt(t * square, along + root));
             let below = S::both(S::lt(high, zero), S::lt(zero, t));
-            let top = S::both(
-                S::both(meets, within),
-                S::both(below, S::lt(t, S::load(&self.t[place]))),
-            );
-            self.put::<S>(place, top, t, up, body);
-            hit |= S::bits(mantle) | S::bits(top);
+            let nearer = S::both(below, S::lt(t, best));
+            let top = S::both(S::both(meets, within), nearer);
+            far = S::max(far, self.put::<S>(place, top, (t, best), up, body));
         }
-        if hit != 0 {
-            self.see::<S>(column);
-        }
+        self.limit::<S>(column, far);
     }
 }

@@ -7,9 +7,9 @@ use ipc_schema::{
 
 use super::{
     pattern::Group,
-    random::{Key, draw, exp_minus},
+    random::{Key, exp_minus, fill},
     raster::Canvas,
-    simd::Simd,
+    simd::{LANES, Simd},
     solids::{INTEREST, NOTHING},
     weather::Air,
 };
@@ -33,21 +33,21 @@ pub(super) struct Receiver {
     is_clear: bool,
 }
 
-/// One column's contribution that all its rays share.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Shot {
+/// What the rays of a column share.
+struct Shot {
     /// Sine and cosine of the azimuth in the sensor's frame.
-    pub(super) azimuth: [f32; 2],
-    pub(super) age_us: u32,
-    /// The sun in the axes of the column: ahead, left, up.
-    pub(super) sun: [f32; 3],
+    azimuth: [f32; 2],
+    age_us: u32,
+    sun: [f32; 3],
 }
 
 impl Receiver {
     pub(super) fn new(config: &Config) -> Self {
         let lidar = &config.lidar;
         let air = Air::new(&config.weather);
-        let weak = lidar.dropoff_intensity > 0.0 && lidar.dropoff_zero_intensity > 0.0;
+        // Of a return from the end of the range: no other is weaker.
+        let weakest = libm::exp(-(lidar.attenuation_per_m + 2.0 * air.extinction_per_m) * lidar.range_m);
+        let weak = lidar.dropoff_zero_intensity > 0.0 && weakest < lidar.dropoff_intensity;
         let noisy = lidar.range_noise_std_m > 0.0 || air.range_share > 0.0 || air.sun_std_m > 0.0;
         Self {
             min_range_m: lidar.min_range_m as f32,
@@ -69,49 +69,44 @@ impl Receiver {
         }
     }
 
-    /// Writes the returns of a span from `cursor` on; the new cursor. `groups(column)` are the rays of a column, `shots` one for each.
+    /// Writes the returns of a span from `cursor` on; the new cursor. `groups(column)` are the rays of a column, `sun` is the
+    /// direction to the sun in the sensor's frame.
     #[inline(always)]
     pub(super) fn write<'a, S: Simd, const UPRIGHT: bool>(
         &self,
-        canvas: &Canvas,
+        canvas: &mut Canvas,
         groups: impl Fn(usize) -> &'a [Group],
-        shots: &[Shot],
+        sun: [f32; 3],
         (key, first): (&Key, u32),
         points: &mut [LidarPoint],
         mut cursor: usize,
     ) -> usize {
-        let all = canvas.count * canvas.groups;
-        let (mut column, mut group) = (0, 0);
-        for pair in 0..all.div_ceil(2) {
-            let zero = S::splat(0.0);
-            let (mut normal, mut uniform) = ([zero; 2], [zero; 2]);
-            if self.is_random {
-                let drawn = draw::<S>(key, first + pair as u32);
-                (normal, uniform) = (drawn.normal, drawn.uniform);
-            }
-            for half in 0..2.min(all - 2 * pair) {
-                let rays = &groups(column)[group];
-                let random = (normal[half], uniform[half]);
-                let place = 2 * pair + half;
-                cursor = self.group::<S, UPRIGHT>(canvas, place, rays, &shots[column], random, points, cursor);
-                group += 1;
-                if group == canvas.groups {
-                    (column, group) = (column + 1, 0);
-                }
+        if self.is_random {
+            let count = canvas.count * canvas.groups;
+            fill::<S>(key, first, count, &mut canvas.normal, &mut canvas.uniform);
+        }
+        for column in 0..canvas.count {
+            let (chunk, lane) = (&canvas.columns[column / LANES], column % LANES);
+            let shot = Shot {
+                azimuth: [chunk.azimuth[0].0[lane], chunk.azimuth[1].0[lane]],
+                age_us: chunk.age_us.0[lane],
+                sun,
+            };
+            for (group, rays) in groups(column).iter().enumerate() {
+                let place = column * canvas.groups + group;
+                cursor = self.group::<S, UPRIGHT>(canvas, place, rays, &shot, points, cursor);
             }
         }
         cursor
     }
 
     #[inline(always)]
-    #[expect(clippy::too_many_arguments, reason = "one call from one place, inlined")]
     fn group<S: Simd, const UPRIGHT: bool>(
         &self,
         canvas: &Canvas,
         place: usize,
         rays: &Group,
         shot: &Shot,
-        (normal, uniform): (S::F, S::F),
         points: &mut [LidarPoint],
         cursor: usize,
     ) -> usize {
@@ -140,14 +135,14 @@ impl Receiver {
             let weak = S::splat(self.dropoff_zero) * S::max(one - intensity * S::splat(self.inv_weak), S::splat(0.0));
             let weak = if self.inv_weak > 0.0 { weak } else { S::splat(0.0) };
             let lost = S::splat(self.dropoff) + S::splat(1.0 - self.dropoff) * weak;
-            keep &= S::bits(S::le(lost, uniform));
-            range = S::max(range + normal * sigma, S::splat(0.0));
+            keep &= S::bits(S::le(lost, S::load(&canvas.uniform[place])));
+            range = S::max(range + S::load(&canvas.normal[place]) * sigma, S::splat(0.0));
         }
         if keep == 0 {
             return cursor;
         }
         intensity = S::min(intensity, S::splat(1.0));
-        let [sine, cosine] = shot.azimuth.map(S::splat);
+        let (sine, cosine) = (S::splat(shot.azimuth[0]), S::splat(shot.azimuth[1]));
         let (ahead, beside) = (range * alpha, range * S::load(&rays.beta));
         let (x, y, z) = if UPRIGHT {
             (ahead * cosine, ahead * sine, range * gamma)
@@ -191,7 +186,10 @@ impl Receiver {
             u32::MAX
         };
         let rain = range * S::splat(air.range_share as f32);
-        let [ahead, left, up] = shot.sun.map(S::splat);
+        // The sun in the axes of the column.
+        let ([x, y, up], [sine, cosine]) = (shot.sun, shot.azimuth);
+        let (ahead, left) = (S::splat(x * cosine + y * sine), S::splat(y * cosine - x * sine));
+        let up = S::splat(up);
         let towards = S::load(&rays.alpha) * ahead + S::load(&rays.beta) * left + S::load(&rays.gamma) * up;
         let towards = S::min(S::max(towards, zero), one);
         let sun = towards * towards * S::splat(air.sun_std_m as f32);

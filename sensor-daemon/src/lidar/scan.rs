@@ -1,6 +1,6 @@
 //! One scan: spans, candidates, surfaces, returns.
 
-use ipc_schema::pointcloud::{GROUND, LidarPoint, Scan, Tag};
+use ipc_schema::pointcloud::{LidarPoint, Scan};
 
 use super::{
     Lidar, Targets,
@@ -10,10 +10,8 @@ use super::{
     pattern::Group,
     random::Key,
     raster::{Body, Canvas, Line, Wall},
-    returns::Shot,
-    sensor::{Sensor, turned},
+    sensor::Sensor,
     simd::{LANES, Simd},
-    solids::NOTHING,
 };
 
 /// Working memory of one thread: empty at first, then kept.
@@ -24,7 +22,6 @@ pub struct Scratch {
     spans: Vec<Span>,
     sensors: Vec<[Sensor; 2]>,
     walls: Vec<Wall>,
-    shots: Vec<Shot>,
 }
 
 /// What a scan is of.
@@ -38,10 +35,10 @@ pub(super) struct Order<'a> {
 }
 
 /// A span being worked on.
-struct Work<'a> {
-    order: &'a Order<'a>,
-    span: Span,
-    sensors: [Sensor; 2],
+pub(super) struct Work<'a> {
+    pub(super) order: &'a Order<'a>,
+    pub(super) span: Span,
+    pub(super) sensors: [Sensor; 2],
     /// First column of the tick in the cycle.
     begin: usize,
     /// Length of a sub-step, seconds.
@@ -111,8 +108,7 @@ impl Order<'_> {
         let sensor = lidar.mount.sensor(&mover.end);
         let rotation = lidar.firing.per_rotation;
         let first = spans.first().map_or(0, |span| (begin + span.first) % rotation);
-        let [sine, cosine] = lidar.firing.azimuths.get(first).copied().unwrap_or([0.0, 1.0]);
-        let azimuth = libm::atan2(sine, cosine);
+        let azimuth = libm::atan2(lidar.firing.sines[first], lidar.firing.cosines[first]);
         let azimuth = if azimuth < 0.0 {
             azimuth + std::f64::consts::TAU
         } else {
@@ -158,7 +154,6 @@ impl Order<'_> {
             spans,
             sensors,
             walls,
-            shots,
         } = scratch;
         canvas.make_room(lidar.pattern.per_column);
         canvas.tan.clear();
@@ -176,7 +171,7 @@ impl Order<'_> {
                 begin,
                 dt_s: self.dt_s(),
             };
-            work.start::<S, UPRIGHT>(canvas, shots);
+            work.start::<S, UPRIGHT>(canvas);
             work.surfaces::<S, UPRIGHT>(canvas, candidates, candidates.of_span(number), walls);
             if !UPRIGHT && !lidar.meshes.is_empty() {
                 work.meshes(canvas);
@@ -185,144 +180,26 @@ impl Order<'_> {
             let groups = |column: usize| work.groups(column);
             cursor = lidar
                 .receiver
-                .write::<S, UPRIGHT>(canvas, groups, shots, (&key, first), points, cursor);
+                .write::<S, UPRIGHT>(canvas, groups, work.sun(), (&key, first), points, cursor);
         }
         cursor
     }
 }
 
-/// Length 1, from nearly that.
-#[inline(always)]
-fn unit(v: [f64; 3]) -> [f64; 3] {
-    let square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
-    v.map(|part| part * (1.5 - 0.5 * square))
-}
-
 impl<'a> Work<'a> {
     /// A column of the span in the rotation.
     #[inline(always)]
-    fn column(&self, column: usize) -> usize {
+    pub(super) fn column(&self, column: usize) -> usize {
         (self.begin + self.span.first + column) % self.order.lidar.firing.per_rotation
     }
 
     #[inline(always)]
-    fn groups(&self, column: usize) -> &'a [Group] {
-        self.order.lidar.pattern.column(self.column(column))
-    }
-
-    /// Directions of the columns, ages, and the ground.
-    #[inline(always)]
-    fn start<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut Canvas, shots: &mut Vec<Shot>) {
-        let lidar = self.order.lidar;
-        canvas.count = self.span.count;
-        shots.clear();
-        let [first, last] = self.sensors.map(|sensor| sensor.world_from_sensor);
-        let last_column = (self.span.count - 1).max(1) as f64;
-        for column in 0..self.span.count {
-            let share = column as f64 / last_column;
-            let [sine, cosine] = lidar.firing.azimuths[self.column(column)];
-            let axis = |of: [f64; 3], row: usize| {
-                let at = |i: usize| first[row][i] + share * (last[row][i] - first[row][i]);
-                at(0) * of[0] + at(1) * of[1] + at(2) * of[2]
-            };
-            let turn = |of: [f64; 3]| unit([axis(of, 0), axis(of, 1), axis(of, 2)]);
-            let ahead = turn([cosine, sine, 0.0]);
-            let (chunk, lane) = (column / LANES, column % LANES);
-            let of_chunk = &mut canvas.columns[chunk];
-            of_chunk.share.0[lane] = share as f32;
-            of_chunk.ahead[0].0[lane] = ahead[0] as f32;
-            of_chunk.ahead[1].0[lane] = ahead[1] as f32;
-            if UPRIGHT {
-                (of_chunk.right, of_chunk.left) = (of_chunk.ahead, of_chunk.ahead);
-            } else {
-                let frame = [ahead, turn([-sine, cosine, 0.0]), turn([0.0, 0.0, 1.0])];
-                self.aim::<S>(canvas, column, &frame);
-            }
-            shots.push(self.shot(column, [sine, cosine]));
-            self.ground::<S, UPRIGHT>(canvas, column, share as f32);
-            canvas.see::<S>(column);
-        }
-    }
-
-    #[inline(always)]
-    fn shot(&self, column: usize, azimuth: [f64; 2]) -> Shot {
-        let lidar = self.order.lidar;
-        let [from, to] = self.span.at;
-        let at = from + (to - from) * column as f64 / (self.span.count - 1).max(1) as f64;
-        let [sine, cosine] = azimuth;
-        let sun = if lidar.receiver.air.sun_std_m > 0.0 {
-            let r = &self.sensors[0].world_from_sensor;
-            let back: [[f64; 3]; 3] = std::array::from_fn(|row| std::array::from_fn(|i| r[i][row]));
-            let [x, y, z] = turned(&back, lidar.receiver.air.sun);
-            [x * cosine + y * sine, y * cosine - x * sine, z].map(|part| part as f32)
+    pub(super) fn groups(&self, column: usize) -> &'a [Group] {
+        let pattern = &self.order.lidar.pattern;
+        if pattern.is_table {
+            pattern.column(self.column(column))
         } else {
-            [0.0; 3]
-        };
-        Shot {
-            azimuth: azimuth.map(|part| part as f32),
-            age_us: ((1.0 - at) * lidar.tick_s * 1e6 + 0.5) as u32,
-            sun,
-        }
-    }
-
-    /// Directions of the rays of a column whose axes are `frame` in the world.
-    #[inline(always)]
-    fn aim<S: Simd>(&self, canvas: &mut Canvas, column: usize, frame: &[[f64; 3]; 3]) {
-        let [ahead, left, up] = frame.map(|axis| axis.map(|part| S::splat(part as f32)));
-        let groups = self.groups(column);
-        for (group, rays) in groups.iter().enumerate() {
-            let place = column * canvas.groups + group;
-            let (alpha, beta, gamma) = (S::load(&rays.alpha), S::load(&rays.beta), S::load(&rays.gamma));
-            for axis in 0..3 {
-                let direction = alpha * ahead[axis] + beta * left[axis] + gamma * up[axis];
-                S::store(direction, &mut canvas.direction[axis][place]);
-            }
-        }
-        let edges = match groups {
-            [only] if self.order.lidar.pattern.is_table => wedge(canvas, column, 0..only.live.count_ones() as usize),
-            _ => {
-                let last = (canvas.groups - 1) * LANES + groups[canvas.groups - 1].live.count_ones() as usize - 1;
-                wedge(canvas, column, [0, last].into_iter())
-            }
-        };
-        let of_chunk = &mut canvas.columns[column / LANES];
-        for axis in 0..2 {
-            of_chunk.right[axis].0[column % LANES] = edges[0][axis];
-            of_chunk.left[axis].0[column % LANES] = edges[1][axis];
-        }
-    }
-
-    /// The ground, or nothing.
-    #[inline(always)]
-    fn ground<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut Canvas, column: usize, share: f32) {
-        let lidar = self.order.lidar;
-        let range = S::splat(lidar.range_m as f32);
-        let height = lidar.ground_m.map_or(0.0, |ground_m| {
-            let [first, last] = self.sensors.map(|sensor| (sensor.position_m[2] - ground_m) as f32);
-            first + share * (last - first)
-        });
-        let (below, zero) = (S::splat(-height), S::splat(0.0));
-        for group in 0..canvas.groups {
-            let place = column * canvas.groups + group;
-            let (limit, t, incidence) = if UPRIGHT {
-                let rays = &lidar.pattern.groups[group];
-                (
-                    range * S::load(&rays.alpha),
-                    below * S::load(&rays.cot),
-                    S::load(&rays.tan),
-                )
-            } else {
-                let z = S::load(&canvas.direction[2][place]);
-                (range, below / z, z)
-            };
-            let is_hit = S::both(S::lt(zero, t), S::lt(t, limit));
-            let is_hit = if height > 0.0 { is_hit } else { S::mask(0) };
-            S::store(S::select(is_hit, t, limit), &mut canvas.t[place]);
-            S::store(incidence, &mut canvas.incidence[place]);
-            let whole = S::mask(0xFFFF);
-            S::store_words_where(whole, GROUND, &mut canvas.object[place]);
-            S::store_words_where(whole, NOTHING, &mut canvas.word[place]);
-            S::store_words_where(is_hit, Tag::Ground as u32, &mut canvas.word[place]);
+            &pattern.groups
         }
     }
 
@@ -482,28 +359,6 @@ impl<'a> Work<'a> {
             }
         }
     }
-}
-
-/// Horizontal directions right and left of all of these rays of a column; none where they spread too far.
-#[inline(always)]
-fn wedge(canvas: &Canvas, column: usize, rays: impl Iterator<Item = usize>) -> [[f32; 2]; 2] {
-    let begin = column * canvas.groups;
-    let direction = |ray: usize| [0, 1].map(|axis: usize| canvas.direction[axis][begin + ray / LANES].0[ray % LANES]);
-    let mut ahead: Option<[f32; 2]> = None;
-    let (mut least, mut most) = (0.0_f32, 0.0_f32);
-    for ray in rays {
-        let [x, y] = direction(ray);
-        let [a, b] = *ahead.get_or_insert([x, y]);
-        let (along, aside) = (a * x + b * y, a * y - b * x);
-        if along < 1e-3 {
-            return [[0.0; 2]; 2];
-        }
-        let slope = aside / along;
-        (least, most) = (least.min(slope), most.max(slope));
-    }
-    let [a, b] = ahead.unwrap_or([1.0, 0.0]);
-    let turned = |slope: f32| [a - slope * b, b + slope * a];
-    [turned(least - 1e-6), turned(most + 1e-6)]
 }
 
 /// Farthest of what any ray of the span has met so far.

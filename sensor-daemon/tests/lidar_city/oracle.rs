@@ -264,6 +264,12 @@ impl<'a> World<'a> {
             return Cylinder::new(0.5 * height, 0.5 * width.max(length)).cast_ray(&pose, ray, self.range_m, false);
         }
         let ahead = 0.5 * length - rear;
+        // Walls are seen from outside: two vehicles of random traffic may overlap, and a sensor be within another's box.
+        let (dx, dy) = (ray.origin.x - x, ray.origin.y - y);
+        let (along, left) = (dx * yaw.cos() + dy * yaw.sin() - ahead, dy * yaw.cos() - dx * yaw.sin());
+        if along.abs() < 0.5 * length && left.abs() < 0.5 * width && (z..z + height).contains(&ray.origin.z) {
+            return None;
+        }
         let centre = Vector::new(x + ahead * yaw.cos(), y + ahead * yaw.sin(), z + 0.5 * height);
         let pose = Pose::from_parts(centre, Rotation::from_rotation_z(yaw));
         Cuboid::new(Vector::new(0.5 * length, 0.5 * width, 0.5 * height)).cast_ray(&pose, ray, self.range_m, false)
@@ -280,6 +286,7 @@ pub struct Tally {
     /// Of the others, those that the oracle itself sees differently when the ray is moved by a few millimetres.
     pub grazing: usize,
     pub range_sum_m: f64,
+    printed: usize,
 }
 
 impl Tally {
@@ -321,7 +328,8 @@ pub fn compare(world: &World<'_>, rays: &[OneRay], row: usize, points: &[LidarPo
             tally.same += 1;
         } else if is_grazing(world, ray, row, range_m, object) {
             tally.grazing += 1;
-        } else {
+        } else if tally.printed < 5 {
+            tally.printed += 1;
             eprintln!(
                 "ours {object:x} at {range_m}, parry {:x} at {}: {ray:?}",
                 hit.object, hit.range_m

@@ -177,6 +177,14 @@ impl Simd for Avx2 {
         U(unsafe { [_mm256_load_si256(at), _mm256_load_si256(at.add(1))] })
     }
     #[inline(always)]
+    fn store_words(value: U, to: &mut Words) {
+        let at: *mut __m256i = to.0.as_mut_ptr().cast();
+        unsafe {
+            _mm256_store_si256(at, value.0[0]);
+            _mm256_store_si256(at.add(1), value.0[1]);
+        }
+    }
+    #[inline(always)]
     fn and(a: U, b: U) -> U {
         U(pair(a.0, b.0, |a, b| unsafe { _mm256_and_si256(a, b) }))
     }
@@ -238,7 +246,7 @@ impl Simd for Avx2 {
             });
             let mut keys = key;
             for _ in 0..10 {
-                let [k0, k1] = keys.map(splat);
+                let (k0, k1) = (splat(keys[0]), splat(keys[1]));
                 for state in &mut halves {
                     let [c0, c1, c2, c3] = *state;
                     let (high0, low0) = wide(c0, MULTIPLIERS[0]);

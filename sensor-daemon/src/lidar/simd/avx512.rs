@@ -128,6 +128,10 @@ impl Simd for Avx512 {
         U(unsafe { _mm512_load_si512(from.0.as_ptr().cast()) })
     }
     #[inline(always)]
+    fn store_words(value: U, to: &mut Words) {
+        unsafe { _mm512_store_si512(to.0.as_mut_ptr().cast(), value.0) }
+    }
+    #[inline(always)]
     fn and(a: U, b: U) -> U {
         U(unsafe { _mm512_and_si512(a.0, b.0) })
     }
@@ -179,7 +183,7 @@ impl Simd for Avx512 {
         unsafe {
             let splat = |word: u32| _mm512_set1_epi64(i64::from(word));
             let step = _mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0);
-            let multipliers = MULTIPLIERS.map(splat);
+            let multipliers = [splat(MULTIPLIERS[0]), splat(MULTIPLIERS[1])];
             // Lower halves add and wrap on their own: a carry into the upper half is not looked at.
             let mut low = [
                 _mm512_add_epi64(splat(first), step),
@@ -191,7 +195,7 @@ impl Simd for Avx512 {
             high[0] = _mm512_add_epi64(splat(first.wrapping_add(8)), step);
             let mut keys = key;
             for _ in 0..10 {
-                let [k0, k1] = keys.map(splat);
+                let (k0, k1) = (splat(keys[0]), splat(keys[1]));
                 for state in [&mut low, &mut high] {
                     let [c0, c1, c2, c3] = *state;
                     let p0 = _mm512_mul_epu32(c0, multipliers[0]);
@@ -205,7 +209,12 @@ impl Simd for Avx512 {
                 }
                 keys = [keys[0].wrapping_add(WEYL[0]), keys[1].wrapping_add(WEYL[1])];
             }
-            std::array::from_fn(|word| joined(low[word], high[word]))
+            [
+                joined(low[0], high[0]),
+                joined(low[1], high[1]),
+                joined(low[2], high[2]),
+                joined(low[3], high[3]),
+            ]
         }
     }
 
@@ -232,7 +241,7 @@ impl Simd for Avx512 {
             let begin = at;
             let mut kept = keep as usize;
             for order in [low, high] {
-                let rows: [__m512i; 4] = std::array::from_fn(|k| pair(order, k));
+                let rows: [__m512i; 4] = [pair(order, 0), pair(order, 1), pair(order, 2), pair(order, 3)];
                 for row in rows {
                     _mm256_storeu_si256(at, _mm512_castsi512_si256(row));
                     at = at.add(kept & 1);
@@ -253,7 +262,7 @@ impl Simd for Avx512 {
 #[inline(always)]
 unsafe fn transposed(words: [U; 4]) -> [__m512i; 4] {
     unsafe {
-        let [a, b, c, d] = words.map(|word| word.0);
+        let [U(a), U(b), U(c), U(d)] = words;
         let (ab_low, ab_high) = (_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
         let (cd_low, cd_high) = (_mm512_unpacklo_epi32(c, d), _mm512_unpackhi_epi32(c, d));
         [

@@ -73,6 +73,7 @@ pub(super) trait Simd: Copy {
 
     fn splat_words(value: u32) -> Self::U;
     fn load_words(from: &Words) -> Self::U;
+    fn store_words(value: Self::U, to: &mut Words);
     fn and(a: Self::U, b: Self::U) -> Self::U;
     fn or(a: Self::U, b: Self::U) -> Self::U;
     fn xor(a: Self::U, b: Self::U) -> Self::U;

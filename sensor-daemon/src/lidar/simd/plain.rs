@@ -117,6 +117,10 @@ impl Simd for Plain {
         from.0
     }
     #[inline(always)]
+    fn store_words(value: [u32; LANES], to: &mut Words) {
+        to.0 = value;
+    }
+    #[inline(always)]
     fn and(a: [u32; LANES], b: [u32; LANES]) -> [u32; LANES] {
         from_fn(|i| a[i] & b[i])
     }

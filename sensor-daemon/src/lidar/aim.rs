@@ -1,0 +1,229 @@
+//! The rays of a span: which way its columns look, and the ground below.
+
+use ipc_schema::pointcloud::{GROUND, Tag};
+
+use super::{
+    raster::{Canvas, Chunk},
+    scan::Work,
+    sensor::{Rotation, turned},
+    simd::{Floats, LANES, Simd},
+    solids::NOTHING,
+};
+
+/// Vectors of length 1 from vectors of nearly that, by a step of Newton's.
+#[inline(always)]
+fn unit(of: &[[f64; LANES]; 3], to: &mut [Floats; 3]) {
+    let [x, y, z] = of;
+    let scale: [f64; LANES] = std::array::from_fn(|i| 1.5 - 0.5 * (x[i] * x[i] + y[i] * y[i] + z[i] * z[i]));
+    for (from, to) in of.iter().zip(to) {
+        to.0 = std::array::from_fn(|i| (from[i] * scale[i]) as f32);
+    }
+}
+
+impl Work<'_> {
+    /// The sun in the sensor's frame.
+    pub(super) fn sun(&self) -> [f32; 3] {
+        let r = &self.sensors[0].world_from_sensor;
+        let back: Rotation = std::array::from_fn(|row| std::array::from_fn(|i| r[i][row]));
+        turned(&back, self.order.lidar.receiver.air.sun).map(|part| part as f32)
+    }
+
+    /// Directions of the columns and their rays, ages, and the ground.
+    #[inline(always)]
+    pub(super) fn start<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut Canvas) {
+        canvas.count = self.span.count;
+        for chunk in 0..self.span.count.div_ceil(LANES) {
+            self.aim_columns::<UPRIGHT>(&mut canvas.columns[chunk], chunk * LANES);
+            canvas.columns[chunk].far = Floats([self.order.lidar.range_m as f32; LANES]);
+            if !UPRIGHT && !self.order.lidar.pattern.is_table {
+                self.fan::<S>(&mut canvas.columns[chunk]);
+            }
+        }
+        if UPRIGHT {
+            return self.ground_upright::<S>(canvas);
+        }
+        for column in 0..self.span.count {
+            self.aim::<S>(canvas, column);
+            self.ground_tilted::<S>(canvas, column);
+        }
+    }
+
+    /// Axes, azimuths and ages of sixteen columns; those beyond the end of the span come out as they may.
+    #[inline(always)]
+    fn aim_columns<const UPRIGHT: bool>(&self, chunk: &mut Chunk, first: usize) {
+        let lidar = self.order.lidar;
+        let [from, to] = self.sensors.map(|sensor| sensor.world_from_sensor);
+        let inv = 1.0 / (self.span.count - 1).max(1) as f64;
+        let at = self.column(0) + first;
+        let sines: &[f64; LANES] = row(&lidar.firing.sines, at);
+        let cosines: &[f64; LANES] = row(&lidar.firing.cosines, at);
+        let shares: [f64; LANES] = std::array::from_fn(|i| (first + i) as f64 * inv);
+        let age_s = (1.0 - self.span.at[0]) * lidar.tick_s;
+        let shorter_s = (self.span.at[1] - self.span.at[0]) * lidar.tick_s;
+        for i in 0..LANES {
+            chunk.share.0[i] = shares[i] as f32;
+            chunk.azimuth[0].0[i] = sines[i] as f32;
+            chunk.azimuth[1].0[i] = cosines[i] as f32;
+            chunk.age_us.0[i] = ((age_s - shorter_s * shares[i]) * 1e6 + 0.5).max(0.0) as i32 as u32;
+        }
+        let mut axes = [[[0.0_f64; LANES]; 3]; 3];
+        let [ahead, left, up] = &mut axes;
+        for part in 0..3 {
+            let change = [0, 1, 2].map(|i: usize| to[part][i] - from[part][i]);
+            for i in 0..LANES {
+                let x = from[part][0] + shares[i] * change[0];
+                let y = from[part][1] + shares[i] * change[1];
+                ahead[part][i] = x * cosines[i] + y * sines[i];
+                left[part][i] = y * cosines[i] - x * sines[i];
+                up[part][i] = from[part][2] + shares[i] * change[2];
+            }
+        }
+        let wanted = if UPRIGHT { 1 } else { 3 };
+        for (axis, to) in axes.iter_mut().zip(&mut chunk.axes).take(wanted) {
+            unit(axis, to);
+        }
+        let [x, y, _] = chunk.axes[0];
+        chunk.ahead = [x, y];
+        if UPRIGHT {
+            (chunk.right, chunk.left) = (chunk.ahead, chunk.ahead);
+        }
+    }
+
+    /// Between which directions the rays of sixteen columns lie, each column in a plane: between those of its lowest and its highest
+    /// ray. Seen from above they may not spread too far.
+    #[inline(always)]
+    fn fan<S: Simd>(&self, chunk: &mut Chunk) {
+        let [lowest, highest] = self.order.lidar.pattern.ends;
+        let axis = |of: usize, part: usize| S::load(&chunk.axes[of][part]);
+        let ray =
+            |[alpha, gamma]: [f32; 2], part: usize| axis(0, part) * S::splat(alpha) + axis(2, part) * S::splat(gamma);
+        let (ax, ay) = (ray(lowest, 0), ray(lowest, 1));
+        let (bx, by) = (ray(highest, 0), ray(highest, 1));
+        let (aside, along) = (ax * by - ay * bx, ax * bx + ay * by);
+        let zero = S::splat(0.0);
+        let is_left = S::le(zero, aside);
+        let near = S::lt(S::splat(1e-3), along);
+        let (more, flat) = (S::splat(1e-6), |x: S::F| S::select(near, x, zero));
+        let (rx, ry) = (S::select(is_left, ax, bx), S::select(is_left, ay, by));
+        let (lx, ly) = (S::select(is_left, bx, ax), S::select(is_left, by, ay));
+        S::store(flat(rx + more * ry), &mut chunk.right[0]);
+        S::store(flat(ry - more * rx), &mut chunk.right[1]);
+        S::store(flat(lx - more * ly), &mut chunk.left[0]);
+        S::store(flat(ly + more * lx), &mut chunk.left[1]);
+    }
+
+    /// Directions of the rays of a column.
+    #[inline(always)]
+    fn aim<S: Simd>(&self, canvas: &mut Canvas, column: usize) {
+        let is_table = self.order.lidar.pattern.is_table;
+        let (chunk, lane) = (column / LANES, column % LANES);
+        let part = |canvas: &Canvas, axis: usize, part: usize| S::splat(canvas.columns[chunk].axes[axis][part].0[lane]);
+        for (group, rays) in self.groups(column).iter().enumerate() {
+            let place = column * canvas.groups + group;
+            let (alpha, beta, gamma) = (S::load(&rays.alpha), S::load(&rays.beta), S::load(&rays.gamma));
+            for axis in 0..3 {
+                let mut direction = alpha * part(canvas, 0, axis) + gamma * part(canvas, 2, axis);
+                if is_table {
+                    direction = direction + beta * part(canvas, 1, axis);
+                }
+                S::store(direction, &mut canvas.direction[axis][place]);
+            }
+        }
+        if is_table {
+            let edges = wedge(canvas, column, self.groups(column)[0].live.count_ones() as usize);
+            let of_chunk = &mut canvas.columns[chunk];
+            let [right, left] = edges;
+            for (axis, (right, left)) in right.into_iter().zip(left).enumerate() {
+                of_chunk.right[axis].0[lane] = right;
+                of_chunk.left[axis].0[lane] = left;
+            }
+        }
+    }
+
+    /// Height of the sensor above flat ground at both ends of the span; 0 without.
+    #[inline(always)]
+    fn heights_above_ground(&self) -> [f32; 2] {
+        let ground_m = self.order.lidar.ground_m;
+        ground_m.map_or([0.0; 2], |ground_m| {
+            self.sensors.map(|sensor| (sensor.position_m[2] - ground_m) as f32)
+        })
+    }
+
+    /// The ground, or nothing, as far as the range goes: the same in every column at the same height.
+    #[inline(always)]
+    fn ground_upright<S: Simd>(&self, canvas: &mut Canvas) {
+        let range = S::splat(self.order.lidar.range_m as f32);
+        let [first, last] = self.heights_above_ground();
+        for group in 0..canvas.groups {
+            let rays = &self.order.lidar.pattern.groups[group];
+            let (limit, cot, tan) = (range * S::load(&rays.alpha), S::load(&rays.cot), S::load(&rays.tan));
+            for column in 0..canvas.count {
+                let height = if first == last {
+                    first
+                } else {
+                    at_share(canvas, column, first, last)
+                };
+                let t = S::splat(-height) * cot;
+                self.lay::<S>(canvas, column * canvas.groups + group, height, (t, limit), tan);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn ground_tilted<S: Simd>(&self, canvas: &mut Canvas, column: usize) {
+        let limit = S::splat(self.order.lidar.range_m as f32);
+        let [first, last] = self.heights_above_ground();
+        let height = at_share(canvas, column, first, last);
+        for group in 0..canvas.groups {
+            let place = column * canvas.groups + group;
+            let z = S::load(&canvas.direction[2][place]);
+            self.lay::<S>(canvas, place, height, (S::splat(-height) / z, limit), z);
+        }
+    }
+
+    #[inline(always)]
+    fn lay<S: Simd>(&self, canvas: &mut Canvas, place: usize, height: f32, (t, limit): (S::F, S::F), incidence: S::F) {
+        let is_hit = S::both(S::lt(S::splat(0.0), t), S::lt(t, limit));
+        let is_hit = if height > 0.0 { is_hit } else { S::mask(0) };
+        S::store(S::select(is_hit, t, limit), &mut canvas.t[place]);
+        S::store(incidence, &mut canvas.incidence[place]);
+        S::store_words(S::splat_words(GROUND), &mut canvas.object[place]);
+        let word = S::select(
+            is_hit,
+            S::floats(S::splat_words(Tag::Ground as u32)),
+            S::floats(S::splat_words(NOTHING)),
+        );
+        S::store_words(S::words(word), &mut canvas.word[place]);
+    }
+}
+
+/// Sixteen numbers from `at` on.
+#[inline(always)]
+fn row(of: &[f64], at: usize) -> &[f64; LANES] {
+    // A span and its last chunk reach no further than `SPAN` beyond a rotation: the table is that much longer.
+    of[at..].first_chunk().unwrap_or(&[0.0; LANES])
+}
+
+/// A value between those at both ends of the span.
+#[inline(always)]
+fn at_share(canvas: &Canvas, column: usize, first: f32, last: f32) -> f32 {
+    first + canvas.columns[column / LANES].share.0[column % LANES] * (last - first)
+}
+
+/// Horizontal directions right and left of the first `count` rays of a column of one group; none where they spread too far.
+fn wedge(canvas: &Canvas, column: usize, count: usize) -> [[f32; 2]; 2] {
+    let direction = |ray: usize| [0, 1].map(|axis: usize| canvas.direction[axis][column].0[ray]);
+    let [a, b] = direction(0);
+    let (mut least, mut most) = (0.0_f32, 0.0_f32);
+    for ray in 0..count {
+        let [x, y] = direction(ray);
+        let (along, aside) = (a * x + b * y, a * y - b * x);
+        if along < 1e-3 {
+            return [[0.0; 2]; 2];
+        }
+        let slope = aside / along;
+        (least, most) = (least.min(slope), most.max(slope));
+    }
+    let turned = |slope: f32| [a - slope * b, b + slope * a];
+    [turned(least - 1e-6), turned(most + 1e-6)]
+}
