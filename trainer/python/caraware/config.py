@@ -11,6 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from caraware import rewards
+from caraware.baselines.noise import SensorNoise
 
 _KEY_OF_FIELD = {"checkpoint_interval_updates": "checkpoint_interval"}
 """Fields whose name in the configuration file differs (there, the unit stands in the table of keys)."""
@@ -143,6 +144,8 @@ class RunConfig:
     """Of the resolved configuration, as canonical JSON: a checkpoint remembers what it was trained with."""
     dark_is_nan: bool = False
     """Fields of a sensor in a blackout are not numbers (`blackout.policy`); the networks see 0, mid-range, instead."""
+    sensors: SensorNoise | None = None
+    """Errors of the sensors, which the classical baselines are tuned with; None for a run file without sensors."""
     resume_from: Path | None = field(default=None)
     """A checkpoint directory to continue from."""
 
@@ -159,6 +162,7 @@ class RunConfig:
             bounds=MapBounds.from_run(run),
             config_sha256=hashlib.sha256(canonical).hexdigest(),
             dark_is_nan=run.get("config", {}).get("blackout", {}).get("policy") == "nan",
+            sensors=SensorNoise.from_run(run),
             resume_from=Path(resume) if resume else None,
         )
 

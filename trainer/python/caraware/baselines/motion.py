@@ -1,0 +1,169 @@
+"""How a vehicle moves between two IMU samples: the state, its transition with Jacobian, and the process noise.
+
+Arrays have slots last: a mean is `[d, n]`, a covariance `[d, d, n]`, and everything is done for all slots at once.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from caraware.baselines.noise import GRAVITY_MPS2, SensorNoise
+
+X, Y, YAW, SPEED, GYRO_BIAS, ACCEL_BIAS = range(6)
+"""Rows that every state has: m, m, rad, m/s, rad/s, m/s²; the position is the centre of the rear axle."""
+
+Entry = tuple[int, int, np.ndarray | float]
+"""Row, column and value `[n]` of what a matrix has beside the identity."""
+
+
+@dataclass(frozen=True)
+class MotionModel:
+    """What is known of vehicles beyond their sensors. Reasons: docs/baselines.md."""
+
+    accel_std_mps2: float = 1.5
+    """Acceleration along the heading, as a first-order Gauss–Markov process (R. Singer, 1970)."""
+    accel_time_s: float = 2.0
+    yaw_rate_std_radps: float = 0.2
+    yaw_rate_time_s: float = 2.0
+    slip_rad_per_g: float = 0.05
+    """Angle between heading and motion of the rear axle by lateral acceleration: 1/23 for `sedan`, to 1/8 for buses."""
+    slip_time_s: float = 2.0
+    """How long a bend lasts."""
+    position_walk_m: float = 0.01
+    """Per √s, on each axis: what the arcs between samples leave out."""
+    first_speed_std_mps: float = 10.0
+    """Of somebody whose wheel speed is not known."""
+
+
+@dataclass(frozen=True)
+class StateLayout:
+    """The rows of the state: six that are always there, and errors of sensors that the configuration speaks of."""
+
+    slow: tuple[int, int] | None = None
+    """Slow error of the fix, east and north (m)."""
+    bias: tuple[int, int] | None = None
+    """Constant error of the fix, east and north (m)."""
+    scale: int | None = None
+    """Scale error of the wheel speed (-)."""
+    compass: int | None = None
+    """Constant error of the compass, counter-clockwise (rad)."""
+    size: int = 6
+
+    @classmethod
+    def of(cls, noise: SensorNoise) -> "StateLayout":
+        """Only what has an error gets a row."""
+        rows: dict = {}
+        size = 6
+        for name, stds in (("slow", noise.fix_slow_std_m), ("bias", noise.fix_bias_std_m)):
+            if max(stds) > 0:
+                rows[name], size = (size, size + 1), size + 2
+        for name, std in (("scale", noise.wheel_scale_std), ("compass", noise.compass_bias_std_rad)):
+            if std > 0:
+                rows[name], size = size, size + 1
+        return cls(**rows, size=size)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What an IMU says about an interval: means over it `[n]`, and how much they still count."""
+
+    dt_s: float
+    yaw_rate_radps: np.ndarray
+    accel_mps2: np.ndarray
+    yaw_rate_trust: np.ndarray | float = 1.0
+    """1 for a fresh sample; `exp(−age/τ)` for one that is held, the expectation of a Gauss–Markov process."""
+    accel_trust: np.ndarray | float = 1.0
+    yaw_variance: np.ndarray | float = field(default=0.0)
+    """rad²: what the yaw does in the interval that the IMU does not say, sensor noise included."""
+    speed_variance: np.ndarray | float = field(default=0.0)
+    """(m/s)²: the same of the speed."""
+
+
+def transition(mean: np.ndarray, motion: Motion, layout: StateLayout, slow_kept: float) -> tuple[np.ndarray, list]:
+    """The mean after an interval, and the Jacobian F as entries beside the identity.
+
+    An arc is driven along the heading half-way (second order in dt):
+    `ω = g_ω (ω_imu − b_ω)`, `a = g_a (a_imu − b_a)`, `ψ_m = ψ + ω dt/2`, `s = v dt + a dt²/2`,
+    `x += s cos ψ_m`, `y += s sin ψ_m`, `ψ += ω dt`, `v += a dt`; slow errors decay, the rest stays.
+
+    Entries stand in an order in which no row is read after it has been changed: `propagate` works in place.
+    """
+    dt = motion.dt_s
+    rate = motion.yaw_rate_trust * (motion.yaw_rate_radps - mean[GYRO_BIAS])
+    accel = motion.accel_trust * (motion.accel_mps2 - mean[ACCEL_BIAS])
+    heading = mean[YAW] + 0.5 * dt * rate
+    path = dt * mean[SPEED] + 0.5 * dt**2 * accel
+    east, north = np.cos(heading), np.sin(heading)
+    moved = mean.copy()
+    moved[X] += path * east
+    moved[Y] += path * north
+    moved[YAW] += dt * rate
+    moved[SPEED] += dt * accel
+    half_turn = 0.5 * dt * motion.yaw_rate_trust * path
+    half_push = 0.5 * dt**2 * motion.accel_trust
+    entries: list[Entry] = [
+        (X, YAW, -path * north),
+        (X, SPEED, dt * east),
+        (X, GYRO_BIAS, half_turn * north),
+        (X, ACCEL_BIAS, -half_push * east),
+        (Y, YAW, path * east),
+        (Y, SPEED, dt * north),
+        (Y, GYRO_BIAS, -half_turn * east),
+        (Y, ACCEL_BIAS, -half_push * north),
+        (YAW, GYRO_BIAS, -dt * motion.yaw_rate_trust),
+        (SPEED, ACCEL_BIAS, -dt * motion.accel_trust),
+    ]
+    for row in layout.slow or ():
+        moved[row] *= slow_kept
+        entries.append((row, row, slow_kept - 1.0))
+    return moved, entries
+
+
+def propagate_rows(matrix: np.ndarray, entries: list[Entry]) -> None:
+    """`F M`, in place."""
+    for row, column, value in entries:
+        matrix[row] += value * matrix[column]
+
+
+def propagate_columns(matrix: np.ndarray, entries: list[Entry]) -> None:
+    """`M Fᵀ`, in place."""
+    for row, column, value in entries:
+        matrix[:, row] += value * matrix[:, column]
+
+
+def process_noise(
+    before: np.ndarray, motion: Motion, noise: SensorNoise, model: MotionModel, layout: StateLayout, slow_kept: float
+) -> list[Entry]:
+    """Q of an interval, entries of its upper triangle and diagonal; `before` is the mean at its start `[d, n]`.
+
+    The rear axle of a bend slips outwards by an angle that nobody measures: noise across the heading.
+    """
+    dt = motion.dt_s
+    rate = motion.yaw_rate_trust * (motion.yaw_rate_radps - before[GYRO_BIAS])
+    slip_mps = model.slip_rad_per_g / GRAVITY_MPS2 * before[SPEED] ** 2 * rate
+    across = 2.0 * model.slip_time_s * dt * slip_mps**2
+    east, north = np.cos(before[YAW]), np.sin(before[YAW])
+    walk = model.position_walk_m**2 * dt
+    entries: list[Entry] = [
+        (X, X, across * north**2 + walk),
+        (X, Y, -across * north * east),
+        (Y, Y, across * east**2 + walk),
+        (YAW, YAW, motion.yaw_variance),
+        (SPEED, SPEED, motion.speed_variance),
+        (GYRO_BIAS, GYRO_BIAS, noise.gyro_bias_walk**2 * dt),
+        (ACCEL_BIAS, ACCEL_BIAS, noise.accel_bias_walk**2 * dt),
+    ]
+    for row, std in zip(layout.slow or (), noise.fix_slow_std_m, strict=False):
+        entries.append((row, row, std**2 * (1.0 - slow_kept**2)))
+    return entries
+
+
+def forgotten(age_s: np.ndarray | float, std: float, time_s: float) -> np.ndarray | float:
+    """Variance of the integral of a Gauss–Markov process over `age_s` after it was known exactly.
+
+    `σ² τ² (2 a/τ − 3 + 4 e^(−a/τ) − e^(−2a/τ))`: `2 σ² a³/(3 τ)` at first, `2 σ² τ a` in the end (Brown and Hwang,
+    Introduction to Random Signals, section 5.3; the series below 0.01 τ, where the terms cancel).
+    """
+    u = age_s / time_s
+    exact = 2.0 * u - 3.0 + 4.0 * np.exp(-u) - np.exp(-2.0 * u)
+    return std**2 * time_s**2 * np.where(u < 0.01, 2.0 / 3.0 * u**3 * (1.0 - 0.75 * u), exact)
