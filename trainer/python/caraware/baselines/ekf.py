@@ -28,6 +28,7 @@ from caraware.baselines.motion import (
 )
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import Samples
+from caraware.stream import EMPTY_SLOT
 
 NO_HEADING_VARIANCE = math.pi**2 / 3.0
 """Variance of a heading of which nothing is known: uniform on the circle. Beyond, the next fix starts a filter anew."""
@@ -36,7 +37,7 @@ GATE_PROBABILITY = 0.9999
 """Share of good fixes that pass the gate, where fixes may be reflections."""
 
 GATE_PATIENCE = 20
-"""So many fixes refused in a row show that the filter is wrong, not the fixes."""
+"""So many fixes refused in a row show that the filter is wrong, not the fixes: it starts anew from the next."""
 
 FORGOTTEN_TIMES = 40.0
 """Correlation times after which a held sample says nothing."""
@@ -102,8 +103,10 @@ class Ekf:
         self.cross = self.belief.covariance
         """Covariance of the state at the tick before with the predicted one, `P Fᵀ` `[d, d, n]`."""
         self.keep_prediction = False
+        self._motion = Motion(0.0, *np.zeros((2, 0)))
         self._gated = noise.fix_outliers if gated is None else gated
         self._time_s: float | None = None
+        self._vehicle = np.zeros(0, np.uint32)
         self._lost = np.zeros(0, bool)
         self._refused = np.zeros(0, int)
         self._fix_time_s = self._imu_time_s = self._wheel_time_s = np.zeros(0)
@@ -117,8 +120,9 @@ class Ekf:
 
     def step(self, samples: Samples) -> None:
         """One tick for all slots: predict to it, correct with what is new, start filters that have none."""
-        self._grow(len(samples.present))
-        self.running &= samples.present & ~samples.begins
+        self._grow(len(samples.vehicle))
+        self.running &= (samples.vehicle == self._vehicle) & (samples.vehicle != EMPTY_SLOT) & ~samples.begins
+        self._vehicle = samples.vehicle
         if self._time_s is not None and samples.time_s < self._time_s:
             self.running[:] = False
         fix_new = self._is_new(self._fix_time_s, samples.fix_on, samples.fix_age_s, samples.time_s)
@@ -126,6 +130,7 @@ class Ekf:
         imu_new = self._is_new(self._imu_time_s, samples.imu_on, samples.imu_age_s, samples.time_s)
         self._predict(samples, imu_new)
         self._lost |= self.belief.covariance[YAW, YAW] > NO_HEADING_VARIANCE
+        self._lost |= self._refused >= GATE_PATIENCE
         can_start = samples.valid & np.isfinite(samples.fix_m).all(0)
         self.started = can_start & (~self.running | (self._lost & fix_new))
         steady = self.running & ~self.started
@@ -142,11 +147,12 @@ class Ekf:
         steps = len(samples.accel_mps2)
         dt_s = (samples.time_s - self._time_s) / steps if self._time_s is not None else 0.0
         self._yaw_at_sample = np.zeros((steps, len(imu_new)))
+        self._motion = Motion(0.0, *np.zeros((2, len(imu_new))))
         if self.keep_prediction:
             self.cross = self.belief.covariance.copy()
         for i in range(steps if dt_s > 0 else 0):
             end_s = samples.time_s - (steps - 1 - i) * dt_s
-            motion = self._motion(samples, i, imu_new, end_s, dt_s)
+            self._motion = motion = self._motion_between(samples, i, imu_new, end_s, dt_s)
             kept = math.exp(-dt_s / self.noise.fix_slow_time_s)
             moved, jacobian = transition(self.belief.mean, motion, self.layout, kept)
             noise = process_noise(self.belief.mean, motion, self.noise, self.model, self.layout, kept)
@@ -157,7 +163,7 @@ class Ekf:
         if self.keep_prediction:
             self.predicted = Belief(self.belief.mean.copy(), self.belief.covariance.copy())
 
-    def _motion(self, samples: Samples, i: int, imu_new: np.ndarray, end_s: float, dt_s: float) -> Motion:
+    def _motion_between(self, samples: Samples, i: int, imu_new: np.ndarray, end_s: float, dt_s: float) -> Motion:
         """What is known about the `i`-th interval of a tick.
 
         Between two samples the rate goes in a line from one to the other; what it does beside that has a quarter of
@@ -206,7 +212,8 @@ class Ekf:
         if not use.any():
             return
         mean = self.belief.mean
-        speed = mean[SPEED] - samples.wheel_age_s * (self._held[1] - mean[ACCEL_BIAS])
+        _, accel = self._rates()
+        speed = mean[SPEED] - samples.wheel_age_s * accel
         row: list = [(SPEED, 1.0)]
         scale = 0.0
         if self.layout.scale is not None:
@@ -216,7 +223,10 @@ class Ekf:
         self.belief.correct(row, innovation, self.noise.wheel_std_mps**2, use)
 
     def _correct_position(self, samples: Samples, use: np.ndarray) -> None:
-        """`z = p − a v (cos ψ, sin ψ) + e + b + n`: the place `a` seconds ago, when the fix was taken."""
+        """`z = p − s (cos ψ_m, sin ψ_m) + e + b + n`: the place `a` seconds ago, when the fix was taken.
+
+        `s = a v − a² α/2` and `ψ_m = ψ − a ω/2` lead back there, with the newest acceleration and yaw rate.
+        """
         if not use.any():
             return
         variance = self._fix_variance(samples)
@@ -228,16 +238,23 @@ class Ekf:
     def _fix_row(self, axis: int, age_s: np.ndarray) -> tuple[list, np.ndarray]:
         """Jacobian and expectation of a fix's `axis` (0 east, 1 north)."""
         mean = self.belief.mean
-        along, across = (np.cos, np.sin) if axis == 0 else (np.sin, np.cos)
-        turned = across(mean[YAW]) * (1.0 if axis == 0 else -1.0)
-        back_m = age_s * mean[SPEED]
-        row = [(X + axis, 1.0), (SPEED, -age_s * along(mean[YAW])), (YAW, back_m * turned)]
-        expected = mean[X + axis] - back_m * along(mean[YAW])
+        rate, accel = self._rates()
+        heading = mean[YAW] - 0.5 * age_s * rate
+        along, turned = (np.cos(heading), -np.sin(heading)) if axis == 0 else (np.sin(heading), np.cos(heading))
+        back_m = age_s * mean[SPEED] - 0.5 * age_s**2 * accel
+        row = [(X + axis, 1.0), (SPEED, -age_s * along), (YAW, -back_m * turned)]
+        expected = mean[X + axis] - back_m * along
         for rows in (self.layout.slow, self.layout.bias):
             if rows is not None:
                 row.append((rows[axis], 1.0))
                 expected = expected + mean[rows[axis]]
         return row, expected
+
+    def _rates(self) -> tuple[np.ndarray, np.ndarray]:
+        """Yaw rate and acceleration now `[n]`. H leaves their biases out: they lead back no further than an age."""
+        motion, mean = self._motion, self.belief.mean
+        rate = motion.yaw_rate_trust * (motion.yaw_rate_radps - mean[GYRO_BIAS])
+        return rate, motion.accel_trust * (motion.accel_mps2 - mean[ACCEL_BIAS])
 
     def _fix_variance(self, samples: Samples) -> np.ndarray:
         """R of both axes `[2, n]`: the configuration's, or more where the receiver says that the fix is worse."""
@@ -255,8 +272,7 @@ class Ekf:
         ee, en, nn = (self._spread(a[0], b[0]) for a, b in ((east, east), (east, north), (north, north)))
         ee, nn = ee + variance[0], nn + variance[1]
         distance = nn * innovation[0] ** 2 - 2.0 * en * innovation[0] * innovation[1] + ee * innovation[1] ** 2
-        near = distance <= -2.0 * math.log(1.0 - GATE_PROBABILITY) * (ee * nn - en**2)
-        passes = near | (self._refused >= GATE_PATIENCE)
+        passes = distance <= -2.0 * math.log(1.0 - GATE_PROBABILITY) * (ee * nn - en**2)
         self._refused = np.where(use, np.where(passes, 0, self._refused + 1), self._refused)
         return passes
 
@@ -339,6 +355,7 @@ class Ekf:
         self.running, self.started, self._lost = (
             np.concatenate((a, np.zeros(more, bool))) for a in (self.running, self.started, self._lost)
         )
+        self._vehicle = np.concatenate((self._vehicle, np.full(more, EMPTY_SLOT, np.uint32)))
         self._refused = np.concatenate((self._refused, np.zeros(more, int)))
         self._fix_time_s, self._imu_time_s, self._wheel_time_s = (
             np.concatenate((a, np.full(more, -np.inf)))

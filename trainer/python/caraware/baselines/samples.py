@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caraware.stream import EMPTY_SLOT, Observation
+from caraware.stream import Observation
 
 GNSS, IMU, SPEED_STEERING = 1, 2, 4
 """Bits of `sensors` (ipc-schema/src/observation.rs): the sensor delivers."""
@@ -21,8 +21,8 @@ class Samples:
     """One tick of `n` slots, `k` IMU samples each, oldest first. Ages are those of the newest sample."""
 
     time_s: float
-    present: np.ndarray
-    """bool `[n]`: somebody holds the slot."""
+    vehicle: np.ndarray
+    """u32 `[n]`: who holds the slot, `EMPTY_SLOT` if nobody does."""
     valid: np.ndarray
     """bool `[n]`: all sensors have delivered, so that there is a fix."""
     begins: np.ndarray
@@ -57,7 +57,7 @@ def read_samples(obs: Observation, convention: str) -> Samples:
     finite_imu = np.isfinite(accel_mps2 + yaw_rate_radps + compass_rad).all(0)
     return Samples(
         time_s=obs.sim_time_ns * 1e-9,
-        present=np.asarray(obs.vehicle) != EMPTY_SLOT,
+        vehicle=np.array(obs.vehicle),
         valid=np.array(obs.valid),
         begins=obs.terminated | obs.truncated | (np.asarray(obs.episode_step) == 0),
         fix_m=fix_m,
