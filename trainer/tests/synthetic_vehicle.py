@@ -118,21 +118,26 @@ def standing_track(ticks: int, vehicles: int, seed: int) -> Track:
 def _driven(
     rng: np.random.Generator, accel: np.ndarray, rate: np.ndarray, speed: np.ndarray, drawn_to_mps: float | None = None
 ) -> Track:
-    """Integrate; row i of accelerations and rates is the mean over the sub-step that ends there."""
+    """Integrate; row i of accelerations and rates is the mean over the sub-step that ends there.
+
+    Rear axles slip outwards in proportion to the lateral acceleration, each vehicle's by its own.
+    """
     steps, vehicles = accel.shape
     dt_s = TICK_S / SUB_STEPS
     track = Track(*(np.zeros((steps, vehicles)) for _ in range(4)), accel.copy(), rate)
     track.x_m[0], track.y_m[0] = rng.uniform(0, 200, vehicles), rng.uniform(0, 200, vehicles)
     track.yaw_rad[0], track.speed_mps[0] = rng.uniform(-np.pi, np.pi, vehicles), speed
+    slip_s2pm = rng.normal(0.05, 0.04, vehicles) / GRAVITY_MPS2
     for i in range(1, steps):
         before = track.speed_mps[i - 1]
         push = track.accel_mps2[i] - (0.2 * (before - drawn_to_mps) if drawn_to_mps else 0.0)
         track.accel_mps2[i] = np.maximum(push, -before / dt_s)
         track.speed_mps[i] = before + dt_s * track.accel_mps2[i]
         track.yaw_rad[i] = track.yaw_rad[i - 1] + dt_s * rate[i]
-        heading, path = track.yaw_rad[i - 1] + 0.5 * dt_s * rate[i], 0.5 * dt_s * (before + track.speed_mps[i])
-        track.x_m[i] = track.x_m[i - 1] + path * np.cos(heading)
-        track.y_m[i] = track.y_m[i - 1] + path * np.sin(heading)
+        course = track.yaw_rad[i - 1] + (0.5 * dt_s - slip_s2pm * before) * rate[i]
+        path = 0.5 * dt_s * (before + track.speed_mps[i])
+        track.x_m[i] = track.x_m[i - 1] + path * np.cos(course)
+        track.y_m[i] = track.y_m[i - 1] + path * np.sin(course)
     return track
 
 

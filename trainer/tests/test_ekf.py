@@ -86,23 +86,23 @@ class Reference:
 
     def __init__(self, noise: SensorNoise, model: MotionModel, start: np.ndarray, covariance: np.ndarray) -> None:
         self.noise, self.model = noise, model
-        self.kf = ExtendedKalmanFilter(dim_x=12, dim_z=1)
+        self.kf = ExtendedKalmanFilter(dim_x=13, dim_z=1)
         self.kf.x, self.kf.P = start.copy(), covariance.copy()
         self.imu: np.ndarray | None = None
         self.imu_age_s = 0.0
-        x = sympy.symbols("x y yaw v bw ba ce cn be bn s bc")
+        x = sympy.symbols("x y yaw v bw ba slip ce cn be bn s bc")
         rate, accel, trust_rate, trust_accel, dt, kept = inputs = sympy.symbols("rate accel gr ga dt kept")
         turn, push = trust_rate * (rate - x[4]), trust_accel * (accel - x[5])
-        middle, path = x[2] + turn * dt / 2, x[3] * dt + push * dt**2 / 2
+        middle, path = x[2] + turn * dt / 2 - x[6] / 9.80665 * x[3] * turn, x[3] * dt + push * dt**2 / 2
         moved = [
             x[0] + path * sympy.cos(middle),
             x[1] + path * sympy.sin(middle),
             x[2] + turn * dt,
             x[3] + push * dt,
-            *x[4:6],
-            kept * x[6],
+            *x[4:7],
             kept * x[7],
-            *x[8:],
+            kept * x[8],
+            *x[9:],
         ]
         self.f = sympy.lambdify((x, inputs), moved)
         self.jacobian = sympy.lambdify((x, inputs), sympy.Matrix(moved).jacobian(x))
@@ -127,14 +127,14 @@ class Reference:
         kept = math.exp(-dt / noise.fix_slow_time_s)
         u = (*mean, *trusts, dt, kept)
         yaw, v = kf.x[2], kf.x[3]
-        slip = model.slip_rad_per_g / 9.80665 * v**2 * trusts[0] * (mean[0] - kf.x[4])
-        q = np.zeros((12, 12))
+        slip = model.slip_noise_rad_per_g / 9.80665 * v**2 * trusts[0] * (mean[0] - kf.x[4])
+        q = np.zeros((13, 13))
         left = np.array([-math.sin(yaw), math.cos(yaw)])
         q[:2, :2] = 2 * model.slip_time_s * dt * slip**2 * np.outer(left, left)
         q[:2, :2] += np.eye(2) * model.position_walk_m**2 * dt
         q[2, 2], q[3, 3] = variances
         q[4, 4], q[5, 5] = noise.gyro_bias_walk**2 * dt, noise.accel_bias_walk**2 * dt
-        q[6, 6], q[7, 7] = np.square(noise.fix_slow_std_m) * (1 - kept**2)
+        q[7, 7], q[8, 8] = np.square(noise.fix_slow_std_m) * (1 - kept**2)
         kf.F, kf.Q = np.array(self.jacobian(kf.x, u), float), q
         before = kf.x
         kf.predict_x = lambda u_=0: setattr(kf, "x", np.array(self.f(before, u), float))
@@ -148,7 +148,7 @@ class Reference:
         return float(weights @ (time_s * (1 - np.exp(-s / time_s))) ** 2) * age / 2 * 2 * std**2 / time_s
 
     def update(self, z: float, h: dict[int, float], expected: float, variance: float, angle: bool = False) -> None:
-        row = np.zeros((1, 12))
+        row = np.zeros((1, 13))
         for index, coefficient in h.items():
             row[0, index] = coefficient
         residual = (lambda a, b: wrapped(a - b)) if angle else np.subtract
@@ -177,13 +177,13 @@ def test_state_and_covariance_are_filterpy_s_to_1e_9() -> None:
         reference.predict(imu if lit[IMU] else None)
         x = reference.kf
         if lit[IMU]:
-            reference.update(samples.yaw_rad[0, 1], {2: 1, 11: 1}, x.x[2] + x.x[11], noise.compass_std_rad**2, True)
+            reference.update(samples.yaw_rad[0, 1], {2: 1, 12: 1}, x.x[2] + x.x[12], noise.compass_std_rad**2, True)
         if lit[SPEED_STEERING]:
-            v, s = x.x[3], x.x[10]
-            reference.update(samples.wheel_mps[1], {3: 1 + s, 10: v}, (1 + s) * v, noise.wheel_std_mps**2)
+            v, s = x.x[3], x.x[11]
+            reference.update(samples.wheel_mps[1], {3: 1 + s, 11: v}, (1 + s) * v, noise.wheel_std_mps**2)
         if lit[GNSS] and obs.tick % 3 == 0:
             for axis in (0, 1):
-                h = {axis: 1, 6 + axis: 1, 8 + axis: 1}
+                h = {axis: 1, 7 + axis: 1, 9 + axis: 1}
                 reference.update(samples.fix_m[axis, 1], h, x.x[list(h)].sum(), noise.fix_std_m[axis] ** 2)
         x.x[2] = wrapped(x.x[2])
         np.testing.assert_allclose(ekf.belief.mean[:, 1], x.x, rtol=1e-9, atol=1e-9)
@@ -198,7 +198,7 @@ def squared_errors(obs: VehicleObservation, ekf: Ekf, states: int) -> np.ndarray
     return np.einsum("in,ni->n", error, np.linalg.solve(covariance, error.T[:, :, None])[:, :, 0])
 
 
-EXACT = MotionModel(1e-4, 2.0, 1e-5, 2.0, slip_rad_per_g=0.0, position_walk_m=1e-3)
+EXACT = MotionModel(1e-4, 2.0, 1e-5, 2.0, slip_noise_rad_per_g=0.0, position_walk_m=1e-3)
 """Vehicles that do what their IMU says, which those of `steady_track` do."""
 
 
@@ -286,7 +286,7 @@ def test_a_held_sample_counts_once() -> None:
 
 
 def test_an_old_fix_corrects_the_place_where_it_was_taken() -> None:
-    """Perfect fixes that arrive half a second late leave no lag."""
+    """Perfect fixes that arrive half a second, 5 m, late leave no lag but some of the slip over that time."""
     tables = tables_of(gnss__noise_std_deg=[1e-8, 1e-8])
     track = steady_track(100, 20, 5)
     noise = noise_of(tables)
@@ -297,7 +297,7 @@ def test_an_old_fix_corrects_the_place_where_it_was_taken() -> None:
         age = np.array(obs.age_s)
         age[:, 0] = 0.1 * min(tick, 5)
         ekf.step(read_samples(replace(obs, gnss_m=late.gnss_m, age_s=age), "kinematic"))
-    assert errors_m(shown[-1], ekf).max() < 0.05
+    assert errors_m(shown[-1], ekf).max() < 0.1
     assert raw_errors_m(shown[-6]).max() < 0.1
 
 
@@ -440,7 +440,7 @@ def test_the_first_covariance_knows_what_rows_owe_to_one_measurement() -> None:
     """Draw truths and sensors many times: errors of first estimates have the covariance that filters begin with."""
     tables, vehicles = tables_of(**MANY_ERRORS), 4000
     ((obs, ekf),) = filtered(observations(steady_track(1, vehicles, 1), tables, 2), tables)
-    assert StateLayout.of(ekf.noise).size == 12
+    assert StateLayout.of(ekf.noise).size == 13
     nees = squared_errors(obs, ekf, 4).mean()
     low, high = chi2.ppf([0.0005, 0.9995], 4 * vehicles) / vehicles
     assert low < nees < high

@@ -119,10 +119,10 @@ def test_who_sees_the_future_knows_more() -> None:
 
 
 def test_memory_is_bounded_and_little_is_lost_by_it() -> None:
-    """Room for 40 ticks of 20 vehicles with 12 states: every tick waits for 20 others at least."""
+    """Room for 40 ticks of 20 vehicles with 13 states: every tick waits for 20 others at least."""
     tables = tables_of(**MANY_ERRORS)
     whole = smoothed_errors(tables)[1]
-    _, bounded, waited = smoothed_errors(tables, memory_bytes=40 * 8 * 20 * (144 + 24))
+    _, bounded, waited = smoothed_errors(tables, memory_bytes=40 * 8 * 20 * (169 + 26))
     assert (min(waited), max(waited)) == (21, 40)
     assert bounded.mean() < 1.1 * whole.mean()
     assert not np.array_equal(bounded, whole)

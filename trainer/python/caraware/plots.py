@@ -30,7 +30,7 @@ def plot_error(file: Path, training: list[TrainingPoint], evaluations: list[Eval
     axes.yaxis.set_minor_formatter(ScalarFormatter())
     axes.tick_params(axis="y", which="minor", labelsize=8)
     axes.set_ylabel("mean position error [m]")
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, fontsize=9)
     _save(figure, file)
 
 

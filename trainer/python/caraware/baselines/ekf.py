@@ -13,6 +13,7 @@ import numpy as np
 from caraware.baselines.motion import (
     ACCEL_BIAS,
     GYRO_BIAS,
+    SLIP,
     SPEED,
     YAW,
     Motion,
@@ -294,6 +295,7 @@ class Ekf:
         mean[YAW], covariance[YAW, YAW] = yaw, yaw_variance
         covariance[GYRO_BIAS, GYRO_BIAS] = noise.gyro_bias_std_radps**2
         covariance[ACCEL_BIAS, ACCEL_BIAS] = noise.accel_bias_std_mps2**2
+        mean[SLIP], covariance[SLIP, SLIP] = self.model.slip_rad_per_g, self.model.slip_std_rad_per_g**2
         moved_m = samples.fix_age_s * speed
         mean[X] = samples.fix_m[0] + moved_m * np.cos(yaw)
         mean[Y] = samples.fix_m[1] + moved_m * np.sin(yaw)

@@ -9,8 +9,8 @@ import numpy as np
 
 from caraware.baselines.noise import GRAVITY_MPS2, SensorNoise
 
-X, Y, YAW, SPEED, GYRO_BIAS, ACCEL_BIAS = range(6)
-"""Rows that every state has: m, m, rad, m/s, rad/s, m/s²; the position is the centre of the rear axle."""
+X, Y, YAW, SPEED, GYRO_BIAS, ACCEL_BIAS, SLIP = range(7)
+"""Rows that every state has: m, m, rad, m/s, rad/s, m/s², rad per g; the position is the centre of the rear axle."""
 
 Entry = tuple[int, int, np.ndarray | float]
 """Row, column and value `[n]` of what a matrix has beside the identity."""
@@ -26,7 +26,11 @@ class MotionModel:
     yaw_rate_std_radps: float = 0.2
     yaw_rate_time_s: float = 2.0
     slip_rad_per_g: float = 0.05
-    """Angle between heading and motion of the rear axle by lateral acceleration: 1/23 for `sedan`, to 1/8 for buses."""
+    """Angle between heading and motion of the rear axle by lateral acceleration: its compliance, 1/23 for `sedan`."""
+    slip_std_rad_per_g: float = 0.04
+    """Over vehicles: from 0 for the kinematic model and rails to 1/8 for trucks."""
+    slip_noise_rad_per_g: float = 0.01
+    """What is not proportional, as tyres near their limit and in transients."""
     slip_time_s: float = 2.0
     """How long a bend lasts."""
     position_walk_m: float = 0.01
@@ -37,7 +41,7 @@ class MotionModel:
 
 @dataclass(frozen=True)
 class StateLayout:
-    """The rows of the state: six that are always there, and errors of sensors that the configuration speaks of."""
+    """The rows of the state: seven that are always there, and errors of sensors that the configuration speaks of."""
 
     slow: tuple[int, int] | None = None
     """Slow error of the fix, east and north (m)."""
@@ -47,13 +51,13 @@ class StateLayout:
     """Scale error of the wheel speed (-)."""
     compass: int | None = None
     """Constant error of the compass, counter-clockwise (rad)."""
-    size: int = 6
+    size: int = 7
 
     @classmethod
     def of(cls, noise: SensorNoise) -> "StateLayout":
         """Only what has an error gets a row."""
         rows: dict = {}
-        size = 6
+        size = 7
         for name, stds in (("slow", noise.fix_slow_std_m), ("bias", noise.fix_bias_std_m)):
             if max(stds) > 0:
                 rows[name], size = (size, size + 1), size + 2
@@ -82,34 +86,34 @@ class Motion:
 def transition(mean: np.ndarray, motion: Motion, layout: StateLayout, slow_kept: float) -> tuple[np.ndarray, list]:
     """The mean after an interval, and the Jacobian F as entries beside the identity.
 
-    An arc is driven along the heading half-way (second order in dt):
-    `ω = g_ω (ω_imu − b_ω)`, `a = g_a (a_imu − b_a)`, `ψ_m = ψ + ω dt/2`, `s = v dt + a dt²/2`,
-    `x += s cos ψ_m`, `y += s sin ψ_m`, `ψ += ω dt`, `v += a dt`; slow errors decay, the rest stays.
+    An arc is driven along the heading half-way (second order in dt), less the slip of the rear axle:
+    `ω = g_ω (ω_imu − b_ω)`, `a = g_a (a_imu − b_a)`, `χ = ψ + ω dt/2 − κ v ω/g`, `s = v dt + a dt²/2`,
+    `x += s cos χ`, `y += s sin χ`, `ψ += ω dt`, `v += a dt`; slow errors decay, the rest stays.
 
     Entries stand in an order in which no row is read after it has been changed: `propagate` works in place.
     """
     dt = motion.dt_s
     rate = motion.yaw_rate_trust * (motion.yaw_rate_radps - mean[GYRO_BIAS])
     accel = motion.accel_trust * (motion.accel_mps2 - mean[ACCEL_BIAS])
-    heading = mean[YAW] + 0.5 * dt * rate
+    lead_s = 0.5 * dt - mean[SLIP] / GRAVITY_MPS2 * mean[SPEED]
+    course = mean[YAW] + lead_s * rate
     path = dt * mean[SPEED] + 0.5 * dt**2 * accel
-    east, north = np.cos(heading), np.sin(heading)
+    east, north = np.cos(course), np.sin(course)
     moved = mean.copy()
     moved[X] += path * east
     moved[Y] += path * north
     moved[YAW] += dt * rate
     moved[SPEED] += dt * accel
-    half_turn = 0.5 * dt * motion.yaw_rate_trust * path
-    half_push = 0.5 * dt**2 * motion.accel_trust
-    entries: list[Entry] = [
-        (X, YAW, -path * north),
-        (X, SPEED, dt * east),
-        (X, GYRO_BIAS, half_turn * north),
-        (X, ACCEL_BIAS, -half_push * east),
-        (Y, YAW, path * east),
-        (Y, SPEED, dt * north),
-        (Y, GYRO_BIAS, -half_turn * east),
-        (Y, ACCEL_BIAS, -half_push * north),
+    entries: list[Entry] = []
+    for row, along, across in ((X, east, -path * north), (Y, north, path * east)):
+        entries += [
+            (row, YAW, across),
+            (row, SPEED, dt * along - across * rate * mean[SLIP] / GRAVITY_MPS2),
+            (row, GYRO_BIAS, -across * lead_s * motion.yaw_rate_trust),
+            (row, ACCEL_BIAS, -0.5 * dt**2 * motion.accel_trust * along),
+            (row, SLIP, -across * rate * mean[SPEED] / GRAVITY_MPS2),
+        ]
+    entries += [
         (YAW, GYRO_BIAS, -dt * motion.yaw_rate_trust),
         (SPEED, ACCEL_BIAS, -dt * motion.accel_trust),
     ]
@@ -136,11 +140,11 @@ def process_noise(
 ) -> list[Entry]:
     """Q of an interval, entries of its upper triangle and diagonal; `before` is the mean at its start `[d, n]`.
 
-    The rear axle of a bend slips outwards by an angle that nobody measures: noise across the heading.
+    What slips beside the proportion that the state knows is noise across the heading.
     """
     dt = motion.dt_s
     rate = motion.yaw_rate_trust * (motion.yaw_rate_radps - before[GYRO_BIAS])
-    slip_mps = model.slip_rad_per_g / GRAVITY_MPS2 * before[SPEED] ** 2 * rate
+    slip_mps = model.slip_noise_rad_per_g / GRAVITY_MPS2 * before[SPEED] ** 2 * rate
     across = 2.0 * model.slip_time_s * dt * slip_mps**2
     east, north = np.cos(before[YAW]), np.sin(before[YAW])
     walk = model.position_walk_m**2 * dt
