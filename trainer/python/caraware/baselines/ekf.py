@@ -91,8 +91,7 @@ class Belief:
 class Ekf:
     """The filters of all slots. Feed `step` with every tick; `position_m` is the estimate at that tick."""
 
-    def __init__(self, noise: SensorNoise, model: MotionModel | None = None, gated: bool | None = None) -> None:
-        """`gated` refuses fixes that are too far off; without, where the configuration speaks of reflections."""
+    def __init__(self, noise: SensorNoise, model: MotionModel | None = None) -> None:
         self.noise, self.model, self.layout = noise, model or MotionModel(), StateLayout.of(noise)
         self.belief = Belief.of_nobody(self.layout.size, 0)
         self.running = np.zeros(0, bool)
@@ -105,7 +104,6 @@ class Ekf:
         """Covariance of the state at the tick before with the predicted one, `P Fᵀ` `[d, d, n]`."""
         self.keep_prediction = False
         self._motion = Motion(0.0, *np.zeros((2, 0)))
-        self._gated = noise.fix_outliers if gated is None else gated
         self._time_s: float | None = None
         self._vehicle = np.zeros(0, np.uint32)
         self._lost = np.zeros(0, bool)
@@ -266,7 +264,7 @@ class Ekf:
 
     def _passes(self, samples: Samples, variance: np.ndarray, use: np.ndarray) -> np.ndarray:
         """Chi-square test of the innovation, two degrees of freedom (Bar-Shalom, section 5.4): bool `[n]`."""
-        if not self._gated:
+        if not self.noise.fix_outliers:
             return use
         east, north = (self._fix_row(axis, samples.fix_age_s) for axis in (0, 1))
         innovation = samples.fix_m - np.stack((east[1], north[1]))
