@@ -131,6 +131,10 @@ class Reference:
         q = np.zeros((13, 13))
         left = np.array([-math.sin(yaw), math.cos(yaw)])
         q[:2, :2] = 2 * model.slip_time_s * dt * slip**2 * np.outer(left, left)
+        ahead = np.array([math.cos(yaw), math.sin(yaw)])
+        lasting, turned = 2 * model.heading_time_s * dt, min(kf.P[2, 2], 1)
+        q[:2, :2] += lasting * (v**2 + kf.P[3, 3]) * turned**2 / 2 * np.outer(ahead, ahead)
+        q[:2, :2] += lasting * kf.P[3, 3] * turned * np.outer(left, left)
         q[:2, :2] += np.eye(2) * model.position_walk_m**2 * dt
         q[2, 2], q[3, 3] = variances
         q[4, 4], q[5, 5] = noise.gyro_bias_walk**2 * dt, noise.accel_bias_walk**2 * dt
@@ -193,12 +197,12 @@ def test_state_and_covariance_are_filterpy_s_to_1e_9() -> None:
 def squared_errors(obs: VehicleObservation, ekf: Ekf, states: int) -> np.ndarray:
     """Normalised estimation error squared `[n]` of the first `states` states (Bar-Shalom, section 5.4)."""
     error = ekf.belief.mean[:states] - obs.truth[:, :states].numpy().T
-    error[YAW] = wrapped(error[YAW])
+    error[YAW:3] = wrapped(error[YAW:3])
     covariance = ekf.belief.covariance[:states, :states].transpose(2, 0, 1)
     return np.einsum("in,ni->n", error, np.linalg.solve(covariance, error.T[:, :, None])[:, :, 0])
 
 
-EXACT = MotionModel(1e-4, 1e4, 1e-5, 1e4, slip_noise_rad_per_g=0.0, position_walk_m=1e-3)
+EXACT = MotionModel(1e-4, 1e4, 1e-5, 1e4, slip_noise_rad_per_g=0.0, heading_time_s=0.5, position_walk_m=1e-3)
 """Vehicles that do what their IMU says, which those of `steady_track` do."""
 
 
@@ -261,6 +265,16 @@ def test_an_outage_makes_the_covariance_grow_and_it_recovers() -> None:
     assert np.mean(error[299]) < 2 * np.mean(error[99])
     # Errors within five standard deviations, all the time.
     assert (np.array(error) < 5 * np.array(std)).all()
+
+
+@pytest.mark.parametrize("bits", [IMU, GNSS | IMU, IMU | SPEED_STEERING, EVERYTHING])
+def test_covariances_stay_honest_without_a_heading(bits: int) -> None:
+    """Ten seconds without IMU, and five after it: a linear filter alone is wrong by hundreds of its variances then."""
+    dark = np.zeros((251, 100), np.uint32)
+    dark[100:200] = bits
+    for obs, ekf in filtered(observations(town_track(251, 100, 1), seed=2, dark=dark), sensor_tables()):
+        if obs.tick in (150, 199, 205, 250):
+            assert 0.3 < squared_errors(obs, ekf, 2).mean() < 3.0, obs.tick
 
 
 def test_in_the_dark_nothing_diverges_and_light_brings_it_back() -> None:

@@ -85,7 +85,7 @@ def test_propagating_by_entries_is_multiplying_by_the_jacobian() -> None:
     root = rng.normal(size=(layout.size, layout.size, slots))
     covariance = np.einsum("ijn,kjn->ikn", root, root)
     moved, entries = transition(mean, motion, layout, 0.9)
-    added = process_noise(mean, motion, noise, MotionModel(), layout, 0.9)
+    added = process_noise(mean, covariance, motion, noise, MotionModel(), layout, 0.9)
     jacobian = dense(entries, layout.size, slots)
     extra = np.zeros_like(covariance)
     for row, column, value in added:
@@ -185,15 +185,21 @@ def test_the_series_meets_the_formula() -> None:
     assert forgotten(at * (1 - 1e-9), 1.0, 2.0) == pytest.approx(float(forgotten(at * (1 + 1e-9), 1.0, 2.0)), rel=1e-3)
 
 
-def test_noise_across_the_heading_grows_with_the_bend() -> None:
+def test_noise_along_and_across_the_heading() -> None:
     noise, _ = everything()
     mean = np.zeros((13, 2))
     mean[SPEED] = 10.0
+    covariance = np.zeros((13, 13, 2))
+    covariance[YAW, YAW], covariance[SPEED, SPEED] = [0.0, 0.2], [0.0, 4.0]
     motion = Motion(0.1, np.array([0.0, 0.4]), np.zeros(2))
-    entries = {(i, j): v for i, j, v in process_noise(mean, motion, noise, MotionModel(), StateLayout(), 1.0)}
+    entries = {
+        (i, j): v for i, j, v in process_noise(mean, covariance, motion, noise, MotionModel(), StateLayout(), 1.0)
+    }
     across = np.broadcast_to(entries[Y, Y], 2)
     assert across[0] == pytest.approx(1e-5)
     slip_mps = 0.01 * (10.0 * 0.4 / 9.80665) * 10.0
-    assert across[1] - across[0] == pytest.approx(2 * 2.0 * 0.1 * slip_mps**2)
-    assert np.broadcast_to(entries[X, X], 2) == pytest.approx([1e-5, 1e-5])
+    assert across[1] - across[0] == pytest.approx(2 * 2.0 * 0.1 * slip_mps**2 + 2 * 5.0 * 0.1 * 4.0 * 0.2)
+    # Along it: variance of 1 − cos δ, V²/2, for as long as an error of the heading lasts.
+    along = np.broadcast_to(entries[X, X], 2)
+    assert along == pytest.approx([1e-5, 1e-5 + 2 * 5.0 * 0.1 * (10.0**2 + 4.0) * 0.2**2 / 2])
     assert entries[GYRO_BIAS, GYRO_BIAS] > 0

@@ -153,9 +153,10 @@ class Ekf:
             end_s = samples.time_s - (steps - 1 - i) * dt_s
             self._motion = motion = self._motion_between(samples, i, imu_new, end_s, dt_s)
             kept = math.exp(-dt_s / self.noise.fix_slow_time_s)
-            moved, jacobian = transition(self.belief.mean, motion, self.layout, kept)
-            noise = process_noise(self.belief.mean, motion, self.noise, self.model, self.layout, kept)
-            self.belief.predict(moved, jacobian, noise)
+            belief, layout = self.belief, self.layout
+            moved, jacobian = transition(belief.mean, motion, layout, kept)
+            noise = process_noise(belief.mean, belief.covariance, motion, self.noise, self.model, layout, kept)
+            belief.predict(moved, jacobian, noise)
             self._yaw_at_sample[i] = moved[YAW]
             if self.keep_prediction:
                 propagate_columns(self.cross, jacobian)

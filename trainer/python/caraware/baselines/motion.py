@@ -33,6 +33,8 @@ class MotionModel:
     """What is not proportional, as tyres near their limit and in transients."""
     slip_time_s: float = 2.0
     """How long a bend lasts."""
+    heading_time_s: float = 5.0
+    """How long an error of the heading lasts, where the linear model of it is too coarse."""
     position_walk_m: float = 0.01
     """Per √s, on each axis: what the arcs between samples leave out."""
     first_speed_std_mps: float = 10.0
@@ -136,22 +138,34 @@ def propagate_columns(matrix: np.ndarray, entries: list[Entry]) -> None:
 
 
 def process_noise(
-    before: np.ndarray, motion: Motion, noise: SensorNoise, model: MotionModel, layout: StateLayout, slow_kept: float
+    before: np.ndarray,
+    covariance: np.ndarray,
+    motion: Motion,
+    noise: SensorNoise,
+    model: MotionModel,
+    layout: StateLayout,
+    slow_kept: float,
 ) -> list[Entry]:
-    """Q of an interval, entries of its upper triangle and diagonal; `before` is the mean at its start `[d, n]`.
+    """Q of an interval, entries of its upper triangle and diagonal; mean and covariance are those at its start.
 
-    What slips beside the proportion that the state knows is noise across the heading.
+    What slips beside the proportion that the state knows is noise across the heading. So are the terms of second order
+    that no Jacobian shows (Bar-Shalom, section 10.3.2): a heading in error by `δ` costs `v (1 − cos δ)`, of variance
+    `v² V_ψ²/2`, along it; and with an error of the speed it leads aside, by a velocity of variance `V_v V_ψ`.
     """
     dt = motion.dt_s
     rate = motion.yaw_rate_trust * (motion.yaw_rate_radps - before[GYRO_BIAS])
     slip_mps = model.slip_noise_rad_per_g / GRAVITY_MPS2 * before[SPEED] ** 2 * rate
     across = 2.0 * model.slip_time_s * dt * slip_mps**2
+    yaw_variance, speed_variance = np.minimum(covariance[YAW, YAW], 1.0), covariance[SPEED, SPEED]
+    lasting_s2 = 2.0 * model.heading_time_s * dt
+    along = lasting_s2 * (before[SPEED] ** 2 + speed_variance) * yaw_variance**2 / 2.0
+    across = across + lasting_s2 * speed_variance * yaw_variance
     east, north = np.cos(before[YAW]), np.sin(before[YAW])
     walk = model.position_walk_m**2 * dt
     entries: list[Entry] = [
-        (X, X, across * north**2 + walk),
-        (X, Y, -across * north * east),
-        (Y, Y, across * east**2 + walk),
+        (X, X, along * east**2 + across * north**2 + walk),
+        (X, Y, (along - across) * north * east),
+        (Y, Y, along * north**2 + across * east**2 + walk),
         (YAW, YAW, motion.yaw_variance),
         (SPEED, SPEED, motion.speed_variance),
         (GYRO_BIAS, GYRO_BIAS, noise.gyro_bias_walk**2 * dt),
