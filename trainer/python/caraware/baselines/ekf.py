@@ -85,7 +85,8 @@ class Belief:
         root = use / np.sqrt(spread)
         gain = toward * root
         self.mean += gain * (np.where(use, innovation, 0.0) * root)
-        self.covariance -= gain[:, None] * gain[None, :]
+        for i in range(len(gain)):  # row by row, which stays in the cache
+            self.covariance[i] -= gain[i] * gain
 
 
 class Ekf:
@@ -238,17 +239,16 @@ class Ekf:
     def _fix_row(self, axis: int, age_s: np.ndarray) -> tuple[list, np.ndarray]:
         """Jacobian and expectation of a fix's `axis` (0 east, 1 north)."""
         mean = self.belief.mean
+        rows = [rows[axis] for rows in (self.layout.slow, self.layout.bias) if rows is not None]
+        row: list = [(X + axis, 1.0)] + [(error, 1.0) for error in rows]
+        expected = sum(mean[error] for error in [X + axis, *rows])
+        if not age_s.any():
+            return row, expected
         rate, accel = self._rates()
         heading = mean[YAW] - 0.5 * age_s * rate
         along, turned = (np.cos(heading), -np.sin(heading)) if axis == 0 else (np.sin(heading), np.cos(heading))
         back_m = age_s * mean[SPEED] - 0.5 * age_s**2 * accel
-        row = [(X + axis, 1.0), (SPEED, -age_s * along), (YAW, -back_m * turned)]
-        expected = mean[X + axis] - back_m * along
-        for rows in (self.layout.slow, self.layout.bias):
-            if rows is not None:
-                row.append((rows[axis], 1.0))
-                expected = expected + mean[rows[axis]]
-        return row, expected
+        return [*row, (SPEED, -age_s * along), (YAW, -back_m * turned)], expected - back_m * along
 
     def _rates(self) -> tuple[np.ndarray, np.ndarray]:
         """Yaw rate and acceleration now `[n]`. H leaves their biases out: they lead back no further than an age."""

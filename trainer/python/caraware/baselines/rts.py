@@ -13,7 +13,7 @@ from caraware.baselines.ekf import Belief, Ekf, wrapped
 from caraware.baselines.motion import YAW
 
 MEMORY_BYTES = 512 * 2**20
-"""Largest memory of a smoother. An episode that fits is smoothed as a whole: 300 ticks of 4 400 vehicles."""
+"""Largest memory of a smoother. An episode that fits is smoothed as a whole: 300 ticks of 3 500 vehicles."""
 
 
 @dataclass(frozen=True)
