@@ -75,6 +75,8 @@ class Track:
     speed_mps: np.ndarray
     accel_mps2: np.ndarray
     yaw_rate_radps: np.ndarray
+    felt_mps2: np.ndarray
+    """Acceleration of the rear axle along the body, which slides sideways in bends."""
 
     def ticks(self) -> int:
         """Ticks in it."""
@@ -120,14 +122,16 @@ def _driven(
 ) -> Track:
     """Integrate; row i of accelerations and rates is the mean over the sub-step that ends there.
 
-    Rear axles slip outwards in proportion to the lateral acceleration, each vehicle's by its own.
+    Rear axles slip outwards in proportion to the lateral acceleration, each vehicle's by its own: at `−κ v² ω/g` to the
+    left, which is felt along the body, `v̇ − ω (−κ v² ω/g)`.
     """
     steps, vehicles = accel.shape
     dt_s = TICK_S / SUB_STEPS
-    track = Track(*(np.zeros((steps, vehicles)) for _ in range(4)), accel.copy(), rate)
+    track = Track(*(np.zeros((steps, vehicles)) for _ in range(4)), accel.copy(), rate, accel.copy())
     track.x_m[0], track.y_m[0] = rng.uniform(0, 200, vehicles), rng.uniform(0, 200, vehicles)
     track.yaw_rad[0], track.speed_mps[0] = rng.uniform(-np.pi, np.pi, vehicles), speed
     slip_s2pm = rng.normal(0.05, 0.04, vehicles) / GRAVITY_MPS2
+    track.felt_mps2[0] += slip_s2pm * (speed * rate[0]) ** 2
     for i in range(1, steps):
         before = track.speed_mps[i - 1]
         push = track.accel_mps2[i] - (0.2 * (before - drawn_to_mps) if drawn_to_mps else 0.0)
@@ -136,6 +140,7 @@ def _driven(
         track.yaw_rad[i] = track.yaw_rad[i - 1] + dt_s * rate[i]
         course = track.yaw_rad[i - 1] + (0.5 * dt_s - slip_s2pm * before) * rate[i]
         path = 0.5 * dt_s * (before + track.speed_mps[i])
+        track.felt_mps2[i] = track.accel_mps2[i] + slip_s2pm * (before * rate[i]) ** 2
         track.x_m[i] = track.x_m[i - 1] + path * np.cos(course)
         track.y_m[i] = track.y_m[i - 1] + path * np.sin(course)
     return track
@@ -227,7 +232,7 @@ class Sensors:
         for j in range(count):
             i = max(0, tick * SUB_STEPS - (count - 1 - j) * SUB_STEPS // count)
             sample = np.zeros((self._n, 7))
-            sample[:, 0] = track.accel_mps2[i] + self._accel_bias + std["accel"] * rng.normal(size=self._n)
+            sample[:, 0] = track.felt_mps2[i] + self._accel_bias + std["accel"] * rng.normal(size=self._n)
             sample[:, 2] = 0.0 if imu["convention"] == "kinematic" else GRAVITY_MPS2
             sample[:, 5] = sign * (track.yaw_rate_radps[i] + self._gyro_bias + std["gyro"] * rng.normal(size=self._n))
             yaw = track.yaw_rad[i] + imu["compass_noise_std_rad"] * rng.normal(size=self._n) - self._compass_bias

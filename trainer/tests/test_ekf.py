@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sympy
-from caraware.baselines.ekf import GATE_PATIENCE, NO_HEADING_VARIANCE, Ekf, wrapped
+from caraware.baselines.ekf import GATE_PATIENCE, NO_HEADING_VARIANCE, Ekf, never_negative, wrapped
 from caraware.baselines.motion import SPEED, YAW, MotionModel, StateLayout
 from caraware.baselines.noise import METRES_PER_DEGREE, SensorNoise
 from caraware.baselines.samples import read_samples
@@ -28,6 +28,11 @@ from synthetic_vehicle import (
 )
 
 EVERYTHING = GNSS | IMU | SPEED_STEERING
+FEW_ERRORS = {
+    "imu__gyro_noise_std_radps": 0.02,
+    "imu__compass_noise_std_rad": 0.05,
+    "speed_steering__speed_noise_std_mps": 0.05,
+}
 MANY_ERRORS = {
     "gnss__correlated_std_m": [2.0, 3.0, 0.0],
     "gnss__correlation_time_s": 20.0,
@@ -98,7 +103,7 @@ class Reference:
             x[0] + path * sympy.cos(middle),
             x[1] + path * sympy.sin(middle),
             x[2] + turn * dt,
-            x[3] + push * dt,
+            x[3] + (push - x[6] / 9.80665 * x[3] ** 2 * turn**2) * dt,
             *x[4:7],
             kept * x[7],
             kept * x[8],
@@ -136,7 +141,9 @@ class Reference:
         q[:2, :2] += lasting * (v**2 + kf.P[3, 3]) * turned**2 / 2 * np.outer(ahead, ahead)
         q[:2, :2] += lasting * kf.P[3, 3] * turned * np.outer(left, left)
         q[:2, :2] += np.eye(2) * model.position_walk_m**2 * dt
-        q[2, 2], q[3, 3] = variances
+        rate = trusts[0] * (mean[0] - kf.x[4])
+        by_rate = np.array([1, -2 * kf.x[6] / 9.80665 * v**2 * rate])
+        q[2:4, 2:4] = variances[0] * np.outer(by_rate, by_rate) + np.diag([0, variances[1]])
         q[4, 4], q[5, 5] = noise.gyro_bias_walk**2 * dt, noise.accel_bias_walk**2 * dt
         q[7, 7], q[8, 8] = np.square(noise.fix_slow_std_m) * (1 - kept**2)
         kf.F, kf.Q = np.array(self.jacobian(kf.x, u), float), q
@@ -158,6 +165,32 @@ class Reference:
         residual = (lambda a, b: wrapped(a - b)) if angle else np.subtract
         z_, at = np.array([z]), np.array([expected])
         self.kf.update(z_, lambda x: row, lambda x: at, R=np.array([[variance]]), residual=residual)
+
+
+def censored(value: float, std: float) -> tuple[float, float, float]:
+    """Mean, derivative and variance of max(0, value + n), by integration."""
+
+    def mean(power: int, at: float) -> float:
+        nodes, weights = np.polynomial.legendre.leggauss(200)
+        low = max(-12 * std, -at)
+        n = low + (12 * std - low) * (nodes + 1) / 2
+        density = np.exp(-0.5 * (n / std) ** 2) / (std * math.sqrt(2 * math.pi))
+        return float(weights @ ((at + n) ** power * density) * (12 * std - low) / 2)
+
+    value = max(value, -std)
+    return mean(1, value), mean(0, value), mean(2, value) - mean(1, value) ** 2
+
+
+def test_a_wheel_that_cannot_count_backwards_does_not_creep() -> None:
+    """Standing for 30 s with 0.1 m/s of noise, which cut at 0 reads 0.04 m/s: 1.2 m if it were believed."""
+    tables = tables_of(speed_steering__speed_noise_std_mps=0.1, gnss__noise_std_deg=[1e-3, 1e-3])
+    shown = observations(standing_track(301, 200, 1), tables, 2)
+    *_, (_, ekf) = filtered(shown, tables)
+    # The mean of 200, each of 0.04 m/s: 0.003.
+    assert abs(ekf.belief.mean[SPEED].mean()) < 0.01
+    for share in (-0.9, 0.0, 0.5, 3.0, 40.0):
+        ours = never_negative(np.array([share * 0.1]), 0.1)
+        np.testing.assert_allclose(np.concatenate(ours), censored(share * 0.1, 0.1), rtol=1e-9)
 
 
 def test_state_and_covariance_are_filterpy_s_to_1e_9() -> None:
@@ -184,7 +217,8 @@ def test_state_and_covariance_are_filterpy_s_to_1e_9() -> None:
             reference.update(samples.yaw_rad[0, 1], {2: 1, 12: 1}, x.x[2] + x.x[12], noise.compass_std_rad**2, True)
         if lit[SPEED_STEERING]:
             v, s = x.x[3], x.x[11]
-            reference.update(samples.wheel_mps[1], {3: 1 + s, 11: v}, (1 + s) * v, noise.wheel_std_mps**2)
+            expected, passed, variance = censored((1 + s) * v, noise.wheel_std_mps)
+            reference.update(samples.wheel_mps[1], {3: passed * (1 + s), 11: passed * v}, expected, variance)
         if lit[GNSS] and obs.tick % 3 == 0:
             for axis in (0, 1):
                 h = {axis: 1, 7 + axis: 1, 9 + axis: 1}
@@ -209,10 +243,10 @@ EXACT = MotionModel(1e-4, 1e4, 1e-5, 1e4, slip_noise_rad_per_g=0.0, heading_time
 @pytest.mark.parametrize(
     "changes",
     [
-        {"imu__gyro_noise_std_radps": 0.02, "imu__compass_noise_std_rad": 0.05},
+        FEW_ERRORS,
         MANY_ERRORS,
         MANY_ERRORS | {"imu__period_s": 0.02, "gnss__period_s": 1.0, "speed_steering__period_s": 0.2},
-        {"imu__period_s": 0.5, "imu__gyro_noise_std_radps": 0.1, "imu__compass_noise_std_rad": 0.1},
+        {"imu__period_s": 0.5, "imu__gyro_noise_std_radps": 0.03, "imu__compass_noise_std_rad": 0.1},
     ],
     ids=["few errors", "every error", "other rates", "slow IMU"],
 )
@@ -282,7 +316,8 @@ def test_in_the_dark_nothing_diverges_and_light_brings_it_back() -> None:
     ticks, lit = 1350, 1250
     track = steady_track(2, 8, 3)
     long = Track(*(np.repeat(column[:1], (ticks - 1) * 10 + 1, 0) for column in vars(track).values()))
-    still = replace(long, speed_mps=0 * long.speed_mps, yaw_rate_radps=0 * long.yaw_rate_radps)
+    nothing = 0 * long.speed_mps
+    still = replace(long, speed_mps=nothing, yaw_rate_radps=nothing, felt_mps2=nothing)
     dark = np.zeros((ticks, 8), np.uint32)
     dark[50:lit] = EVERYTHING
     for obs, ekf in filtered(observations(still, seed=2, dark=dark), sensor_tables()):

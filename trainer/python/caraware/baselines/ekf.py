@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from caraware.baselines.motion import (
     ACCEL_BIAS,
@@ -40,6 +41,9 @@ GATE_PROBABILITY = 0.9999
 GATE_PATIENCE = 20
 """So many fixes refused in a row show that the filter is wrong, not the fixes: it starts anew from the next."""
 
+CERTAIN = 10.0
+"""Standard deviations from which on a wheel turns for certain: what is cut off is below the last bit."""
+
 FORGOTTEN_TIMES = 40.0
 """Correlation times after which a held sample says nothing."""
 
@@ -47,6 +51,21 @@ FORGOTTEN_TIMES = 40.0
 def wrapped(angle_rad: np.ndarray) -> np.ndarray:
     """Angles in [−π, π)."""
     return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def never_negative(value: np.ndarray, std: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean, derivative by `value` and variance of `max(0, value + n)`, `n` of standard deviation `std`.
+
+    A wheel at rest that cannot count backwards reads 0.4 σ on average; taken at its word it creeps away (B. Allik et
+    al., The Tobit Kalman filter, IEEE Transactions on Control Systems Technology 24(1), 2016). Below −σ, as at −σ.
+    """
+    value = np.maximum(value, -std)
+    share = np.minimum(value / std, CERTAIN)
+    passed = torch.special.ndtr(torch.from_numpy(share)).numpy()
+    density = np.exp(-0.5 * share**2) / math.sqrt(2.0 * math.pi)
+    mean = value * passed + std * density
+    variance = (value**2 + std**2) * passed + value * std * density - mean**2
+    return mean, passed, np.where(share < CERTAIN, variance, std**2)
 
 
 @dataclass
@@ -209,7 +228,7 @@ class Ekf:
         self.belief.correct(row, innovation, self.noise.compass_std_rad**2 / len(samples.yaw_rad), use)
 
     def _correct_wheel_speed(self, samples: Samples, use: np.ndarray) -> None:
-        """`z = (1 + s) v + n`, of the speed that the vehicle had when the sample was taken. Nobody drives backwards."""
+        """`z = max(0, (1 + s) v + n)`, of the speed when the sample was taken. Nobody drives backwards."""
         if not use.any():
             return
         mean = self.belief.mean
@@ -220,8 +239,9 @@ class Ekf:
         if self.layout.scale is not None:
             scale = mean[self.layout.scale]
             row = [(SPEED, 1.0 + scale), (self.layout.scale, speed)]
-        innovation = samples.wheel_mps - (1.0 + scale) * speed
-        self.belief.correct(row, innovation, self.noise.wheel_std_mps**2, use)
+        expected, passed, variance = never_negative((1.0 + scale) * speed, self.noise.wheel_std_mps)
+        row = [(index, coefficient * passed) for index, coefficient in row]
+        self.belief.correct(row, samples.wheel_mps - expected, variance, use)
 
     def _correct_position(self, samples: Samples, use: np.ndarray) -> None:
         """`z = p − s (cos ψ_m, sin ψ_m) + e + b + n`: the place `a` seconds ago, when the fix was taken.
@@ -259,7 +279,7 @@ class Ekf:
     def _fix_variance(self, samples: Samples) -> np.ndarray:
         """R of both axes `[2, n]`: the configuration's, or more where the receiver says that the fix is worse."""
         noise = self.noise
-        nominal_m = math.hypot(*noise.fix_std_m, *noise.fix_slow_std_m)
+        nominal_m = math.hypot(*noise.fix_std_m, *noise.fix_slow_std_m, *noise.fix_bias_std_m)
         factor = np.maximum(samples.fix_error_m / nominal_m, 1.0)
         return np.square(np.array(noise.fix_std_m)[:, None] * np.where(np.isfinite(factor), factor, 1.0))
 

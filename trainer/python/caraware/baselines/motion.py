@@ -90,7 +90,8 @@ def transition(mean: np.ndarray, motion: Motion, layout: StateLayout, slow_kept:
 
     An arc is driven along the heading half-way (second order in dt), less the slip of the rear axle:
     `ω = g_ω (ω_imu − b_ω)`, `a = g_a (a_imu − b_a)`, `χ = ψ + ω dt/2 − κ v ω/g`, `s = v dt + a dt²/2`,
-    `x += s cos χ`, `y += s sin χ`, `ψ += ω dt`, `v += a dt`; slow errors decay, the rest stays.
+    `x += s cos χ`, `y += s sin χ`, `ψ += ω dt`, `v += (a − κ v² ω²/g) dt`; slow errors decay, the rest stays. What an
+    accelerometer feels along the body is `v̇` less yaw rate times lateral speed, which slip makes `−κ v² ω/g`.
 
     Entries stand in an order in which no row is read after it has been changed: `propagate` works in place.
     """
@@ -105,7 +106,8 @@ def transition(mean: np.ndarray, motion: Motion, layout: StateLayout, slow_kept:
     moved[X] += path * east
     moved[Y] += path * north
     moved[YAW] += dt * rate
-    moved[SPEED] += dt * accel
+    bent = dt * mean[SPEED] * rate / GRAVITY_MPS2
+    moved[SPEED] += dt * accel - bent * rate * mean[SPEED] * mean[SLIP]
     entries: list[Entry] = []
     for row, along, across in ((X, east, -path * north), (Y, north, path * east)):
         entries += [
@@ -117,6 +119,9 @@ def transition(mean: np.ndarray, motion: Motion, layout: StateLayout, slow_kept:
         ]
     entries += [
         (YAW, GYRO_BIAS, -dt * motion.yaw_rate_trust),
+        (SPEED, SPEED, -2.0 * bent * rate * mean[SLIP]),
+        (SPEED, GYRO_BIAS, 2.0 * bent * mean[SPEED] * mean[SLIP] * motion.yaw_rate_trust),
+        (SPEED, SLIP, -bent * rate * mean[SPEED]),
         (SPEED, ACCEL_BIAS, -dt * motion.accel_trust),
     ]
     for row in layout.slow or ():
@@ -156,6 +161,8 @@ def process_noise(
     rate = motion.yaw_rate_trust * (motion.yaw_rate_radps - before[GYRO_BIAS])
     slip_mps = model.slip_noise_rad_per_g / GRAVITY_MPS2 * before[SPEED] ** 2 * rate
     across = 2.0 * model.slip_time_s * dt * slip_mps**2
+    # By `κ v² ω²/g` an error of the yaw rate is one of the acceleration too.
+    felt = 2.0 * before[SLIP] / GRAVITY_MPS2 * before[SPEED] ** 2 * rate
     yaw_variance, speed_variance = np.minimum(covariance[YAW, YAW], 1.0), covariance[SPEED, SPEED]
     lasting_s2 = 2.0 * model.heading_time_s * dt
     along = lasting_s2 * (before[SPEED] ** 2 + speed_variance) * yaw_variance**2 / 2.0
@@ -167,7 +174,8 @@ def process_noise(
         (X, Y, (along - across) * north * east),
         (Y, Y, along * north**2 + across * east**2 + walk),
         (YAW, YAW, motion.yaw_variance),
-        (SPEED, SPEED, motion.speed_variance),
+        (YAW, SPEED, -felt * motion.yaw_variance),
+        (SPEED, SPEED, motion.speed_variance + felt**2 * motion.yaw_variance),
         (GYRO_BIAS, GYRO_BIAS, noise.gyro_bias_walk**2 * dt),
         (ACCEL_BIAS, ACCEL_BIAS, noise.accel_bias_walk**2 * dt),
     ]
