@@ -228,7 +228,11 @@ class Ekf:
         self.belief.correct(row, innovation, self.noise.compass_std_rad**2 / len(samples.yaw_rad), use)
 
     def _correct_wheel_speed(self, samples: Samples, use: np.ndarray) -> None:
-        """`z = max(0, (1 + s) v + n)`, of the speed when the sample was taken. Nobody drives backwards."""
+        """`z = max(0, (1 + s) v + n)`, of the speed when the sample was taken. Nobody drives backwards.
+
+        The cut is linearised at the prediction, which only a prediction sharper than the sensor allows; else
+        `(1 + s) v + n`.
+        """
         if not use.any():
             return
         mean = self.belief.mean
@@ -239,7 +243,12 @@ class Ekf:
         if self.layout.scale is not None:
             scale = mean[self.layout.scale]
             row = [(SPEED, 1.0 + scale), (self.layout.scale, speed)]
-        expected, passed, variance = never_negative((1.0 + scale) * speed, self.noise.wheel_std_mps)
+        turned, std = (1.0 + scale) * speed, self.noise.wheel_std_mps
+        sharp = self.belief.covariance[SPEED, SPEED] < std**2
+        expected, passed, variance = (
+            np.where(sharp, cut, plain)
+            for cut, plain in zip(never_negative(turned, std), (turned, 1.0, std**2), strict=True)
+        )
         row = [(index, coefficient * passed) for index, coefficient in row]
         self.belief.correct(row, samples.wheel_mps - expected, variance, use)
 
