@@ -53,6 +53,8 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "env_steps_per_s": rate,
         "raw_gnss_mean_error_m": raw,
         "ppo_mean_error_m": learned("ppo_mean_error_m"),
+        "ekf_mean_error_m": learned("ekf_mean_error_m"),
+        "rts_mean_error_m": learned("rts_mean_error_m"),
         "policy_std": learned("policy_std"),
         "vehicles": sensing.cavs_max,
         "observation_hash": sensing.observation_hash,
@@ -103,6 +105,13 @@ pub fn summary(report: &Value, path: &Path) -> String {
             number("ppo_mean_error_m", 2),
             number("raw_gnss_mean_error_m", 2),
             number("policy_std", 3)
+        ));
+    }
+    if !report["ekf_mean_error_m"].is_null() {
+        lines.push(format!(
+            "from the same samples: EKF {} m, RTS smoother {} m (sees the future: a bound, not an estimator)",
+            number("ekf_mean_error_m", 2),
+            number("rts_mean_error_m", 2)
         ));
     }
     let heroes = &report["dynamics"]["heroes"];

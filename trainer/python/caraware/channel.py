@@ -141,6 +141,11 @@ class Observation:
         return self._array("age_s", np.float32, 4)
 
     @cached_property
+    def episode_step(self) -> np.ndarray:
+        """u32 [n]: ticks since the vehicle took the slot."""
+        return self._array("episode_step", np.uint32)
+
+    @cached_property
     def _flags(self) -> np.ndarray:
         return self._array("flags", np.uint32)
 

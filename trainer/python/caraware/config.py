@@ -11,6 +11,7 @@ from typing import Any
 from torch import Tensor
 
 from caraware import rewards
+from caraware.baselines.noise import SensorNoise
 
 _KEY_OF_FIELD = {"checkpoint_interval_updates": "checkpoint_interval"}
 """Fields whose name in the configuration file differs (there, the unit stands in the table of keys)."""
@@ -159,6 +160,8 @@ class RunConfig:
     training_episodes: int = 1
     evaluation_interval: int = 0
     """Training episodes between two evaluation episodes; 0: none between."""
+    sensors: SensorNoise | None = None
+    """Errors of the sensors, which the classical baselines are tuned with; None for a run file without sensors."""
     resume_from: Path | None = field(default=None)
     """A checkpoint directory to continue from."""
 
@@ -178,6 +181,7 @@ class RunConfig:
             dark_is_nan=run.get("config", {}).get("blackout", {}).get("policy") == "nan",
             training_episodes=max(1, episodes.get("training_episodes", 1)),
             evaluation_interval=episodes.get("evaluation_interval", 0),
+            sensors=SensorNoise.from_run(run),
             resume_from=Path(resume) if resume else None,
         )
 

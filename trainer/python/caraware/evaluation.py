@@ -1,18 +1,28 @@
-"""Errors of the deterministic policy and of raw GNSS, over exactly the same rows."""
+"""Errors of the deterministic policy, of raw GNSS and of the classical baselines, over exactly the same rows."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from torch import Tensor
 
+from caraware.baselines import BaselineErrors, Baselines, SensorNoise
 from caraware.rewards import distance_m
 from caraware.stream import Observation
+
+CI95_STANDARD_ERRORS = 1.96
+"""Half the width of a 95 % confidence interval of a mean."""
 
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """One evaluation phase: every valid row of consecutive evaluation episodes, the policy unchanged."""
+    """One evaluation phase: every valid row of consecutive evaluation episodes, the policy unchanged.
+
+    Standard errors are those of the mean, with the vehicles of an episode as clusters: one vehicle's samples are not
+    independent. Half a 95 % confidence interval is 1.96 of them.
+    """
 
     env_steps: int
     """Training samples seen before it."""
@@ -21,9 +31,43 @@ class EvaluationResult:
     samples: int
     ppo_mean_error_m: float
     ppo_standard_error_m: float
-    """Of the mean, with the vehicles of an episode as clusters: one vehicle's samples are not independent."""
     raw_gnss_mean_error_m: float
     raw_gnss_standard_error_m: float
+    ekf_mean_error_m: float | None = None
+    """Of the extended Kalman filter; None for a run without sensor tables."""
+    ekf_standard_error_m: float | None = None
+    rts_mean_error_m: float | None = None
+    """Of the smoother, which sees the future: a bound, not an estimator."""
+    rts_standard_error_m: float | None = None
+    ppo_ci95_m: float = field(init=False)
+    """Half the width of the confidence interval of the mean, 95 %."""
+    raw_gnss_ci95_m: float = field(init=False)
+    ekf_ci95_m: float | None = field(init=False)
+    rts_ci95_m: float | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        for name in ESTIMATORS:
+            error_m = getattr(self, f"{name}_standard_error_m")
+            object.__setattr__(self, f"{name}_ci95_m", None if error_m is None else CI95_STANDARD_ERRORS * error_m)
+
+    def headline(self) -> dict[str, float | None]:
+        """Mean errors and half their confidence intervals, for the run's report."""
+        return {key: value for key, value in asdict(self).items() if key.endswith(("_mean_error_m", "_ci95_m"))}
+
+    def __str__(self) -> str:
+        told = ", ".join(
+            f"{label} {getattr(self, f'{name}_mean_error_m'):.3f} ± {getattr(self, f'{name}_ci95_m'):.3f} m"
+            for name, label in ESTIMATORS.items()
+            if getattr(self, f"{name}_mean_error_m") is not None
+        )
+        return f"{told} (95 %), {self.samples} samples"
+
+
+ESTIMATORS = {"ppo": "policy", "raw_gnss": "raw GNSS", "ekf": "EKF", "rts": "RTS smoother (sees the future: a bound)"}
+"""Key of each, as in the run's report, and its name for people; the order of the columns of an evaluation's sums."""
+
+NO_HEADLINE = dict.fromkeys(f"{name}_{what}_m" for name in ESTIMATORS for what in ("mean_error", "ci95"))
+"""The headline of a run that has not been evaluated: every key, without a value."""
 
 
 class ErrorMeter:
@@ -48,45 +92,68 @@ class ErrorMeter:
 
 
 class Evaluation:
-    """Collects one evaluation phase. Vehicles are told apart within an episode."""
+    """Collects one evaluation phase. Vehicles are told apart within an episode.
 
-    def __init__(self) -> None:
+    With the errors of sensors, filter and smoother run beside the policy, over the same rows; without, they have no
+    results.
+    """
+
+    def __init__(self, noise: SensorNoise | None = None) -> None:
+        self._baselines = Baselines(noise) if noise else None
         self._finished: list[np.ndarray] = []
         self._episode: int | None = None
-        self._sums = np.zeros((0, 3))
-        """f64 `[vehicle, 3]` of the current episode: samples, sum of the policy's errors, sum of raw GNSS's."""
+        self._sums = np.zeros((0, 1 + len(ESTIMATORS)))
+        """f64 `[vehicle, 5]` of the current episode: samples, and the sum of the errors of each estimator."""
 
     def add(self, obs: Observation, policy_m: np.ndarray, raw_m: np.ndarray) -> None:
         """Add the errors `[v]` of the valid rows of one evaluation tick."""
         if obs.episode != self._episode:
-            self._finished.append(self._sums)
-            self._episode, self._sums = obs.episode, np.zeros((0, 3))
+            self._finish_episode()
+            self._episode = obs.episode
         vehicle = obs.vehicle[obs.valid].astype(np.int64)
-        if len(vehicle) == 0:
-            return
-        if (missing := int(vehicle.max()) + 1 - len(self._sums)) > 0:
+        self._make_room(vehicle)
+        self._sums[vehicle, :3] += np.column_stack((np.ones(len(vehicle)), policy_m, raw_m))
+        if self._baselines:
+            filtered, smoothed = self._baselines.add(obs)
+            self._sums[filtered.vehicle, 3] += filtered.error_m
+            self._add_smoothed(smoothed)
+
+    def _add_smoothed(self, ticks: Iterable[BaselineErrors]) -> None:
+        for tick in ticks:
+            self._sums[tick.vehicle, 4] += tick.error_m
+
+    def _make_room(self, vehicle: np.ndarray) -> None:
+        missing = int(vehicle.max(initial=-1)) + 1 - len(self._sums)
+        if missing > 0:
             self._sums = np.pad(self._sums, ((0, missing), (0, 0)))
-        self._sums[vehicle] += np.column_stack((np.ones(len(vehicle)), policy_m, raw_m))
+
+    def _finish_episode(self) -> None:
+        """The smoother has waited for the end; from here on vehicles are others."""
+        if self._baselines:
+            self._add_smoothed(self._baselines.finish_episode())
+        self._finished.append(self._sums[self._sums[:, 0] > 0])
+        self._sums = np.zeros((0, self._sums.shape[1]))
 
     def result(self, env_steps: int, policy_version: int) -> EvaluationResult | None:
-        """The phase so far; None without a sample."""
-        episodes = [sums[sums[:, 0] > 0] for sums in (*self._finished, self._sums)]
-        sums = np.concatenate(episodes)
+        """The phase, which ends here; None without a sample."""
+        self._finish_episode()
+        sums = np.concatenate(self._finished)
         if len(sums) == 0:
             return None
         count = sums[:, 0]
         means = sums[:, 1:].sum(0) / count.sum()
         # Ratio estimator over clusters (Cochran, Sampling Techniques, section 6.3).
         errors = np.sqrt(np.square(sums[:, 1:] - count[:, None] * means).sum(0)) / count.sum()
+        known = list(ESTIMATORS)[: None if self._baselines else 2]
+        results: dict[str, Any] = {}
+        for name, mean_m, error_m in zip(known, means, errors, strict=False):
+            results |= {f"{name}_mean_error_m": float(mean_m), f"{name}_standard_error_m": float(error_m)}
         return EvaluationResult(
             env_steps=env_steps,
             policy_version=policy_version,
-            episodes=sum(len(episode) > 0 for episode in episodes),
+            episodes=sum(len(episode) > 0 for episode in self._finished),
             samples=int(count.sum()),
-            ppo_mean_error_m=float(means[0]),
-            ppo_standard_error_m=float(errors[0]),
-            raw_gnss_mean_error_m=float(means[1]),
-            raw_gnss_standard_error_m=float(errors[1]),
+            **results,
         )
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from caraware.checkpoint import Counters, load_checkpoint, save_checkpoint
 from caraware.config import RunConfig
-from caraware.evaluation import ErrorMeter, Evaluation, EvaluationResult, errors_m
+from caraware.evaluation import NO_HEADLINE, ErrorMeter, Evaluation, EvaluationResult, errors_m
 from caraware.metrics import Metrics, TrainingPoint
 from caraware.plots import plot_error, plot_sigma
 from caraware.ppo import NonFiniteLoss, Ppo, UpdateStats, save_batch
@@ -120,7 +120,7 @@ class TrainingLoop:
         self._vehicles = max(self._vehicles, int(np.count_nonzero(obs.valid)))
         if obs.evaluation:
             self._rollout.ended(obs)
-            self._evaluation = self._evaluation or Evaluation()
+            self._evaluation = self._evaluation or Evaluation(self._config.sensors)
             self._evaluation.add(obs, policy_m, raw_m)
             self._channel.consumed(obs.tick)
             return
@@ -174,13 +174,7 @@ class TrainingLoop:
         self._evaluation = None
         if result is not None:
             self._metrics.evaluated(result)
-            log.info(
-                "evaluation at %d env steps: policy %.3f m, raw GNSS %.3f m, %d samples",
-                result.env_steps,
-                result.ppo_mean_error_m,
-                result.raw_gnss_mean_error_m,
-                result.samples,
-            )
+            log.info("evaluation at %d env steps: %s", result.env_steps, result)
 
     def _commit(self) -> None:
         """Write a checkpoint of everything learnt so far."""
@@ -203,8 +197,8 @@ class TrainingLoop:
         final: EvaluationResult | None = self._metrics.evaluations[-1] if self._metrics.evaluations else None
         part = {
             "env_steps": self._env_steps,
-            "ppo_mean_error_m": final.ppo_mean_error_m if final else None,
-            "raw_gnss_mean_error_m": final.raw_gnss_mean_error_m if final else None,
+            **(final.headline() if final else NO_HEADLINE),
+            "rts_note": "the smoother sees the future: a bound, not an estimator",
             "policy_std": self._ppo.sigma() if self._ppo else None,
             "updates": self._updates(),
             "vehicles": self._vehicles,

@@ -42,8 +42,14 @@ class Metrics:
     def evaluated(self, result: EvaluationResult) -> None:
         """Record one evaluation phase."""
         self.evaluations.append(result)
-        self._writer.add_scalar("error/evaluation_m", result.ppo_mean_error_m, result.env_steps)
-        self._writer.add_scalar("error/evaluation_raw_gnss_m", result.raw_gnss_mean_error_m, result.env_steps)
+        for tag, error_m in (
+            ("error/evaluation_m", result.ppo_mean_error_m),
+            ("error/evaluation_raw_gnss_m", result.raw_gnss_mean_error_m),
+            ("error/evaluation_ekf_m", result.ekf_mean_error_m),
+            ("error/evaluation_rts_sees_the_future_m", result.rts_mean_error_m),
+        ):
+            if error_m is not None:
+                self._writer.add_scalar(tag, error_m, result.env_steps)
 
     def close(self) -> None:
         """Flush everything to disk."""

@@ -11,35 +11,50 @@ from caraware.evaluation import EvaluationResult
 from caraware.metrics import TrainingPoint
 
 POLICY, EVALUATION, RAW, REWARD = "#7fb3d5", "#1a5276", "#b03a2e", "#ca6f1e"
+EKF, RTS = "#e69f00", "#555555"
+"""Told apart by the colour-blind too: they differ in lightness, and each line has its own dashes and marks."""
 
 
 def plot_error(file: Path, training: list[TrainingPoint], evaluations: list[EvaluationResult]) -> None:
-    """Mean position error of the policy in training and in evaluations, against raw GNSS, over env steps."""
-    figure, axes = _figure("Position error of the policy against raw GNSS")
+    """Mean position error of the policy in training and in evaluations, against the baselines, over env steps."""
+    figure, axes = _figure("Position error of the policy against raw GNSS and filters")
     axes.plot([p.env_steps for p in training], [p.error_m for p in training], color=POLICY, label="policy, training")
     raw_m = _last_raw_m(training, evaluations)
     if raw_m is not None:
         axes.axhline(raw_m, color=RAW, linestyle="--", label=f"raw GNSS ({raw_m:.2f} m)")
-    if evaluations:
-        final = evaluations[-1]
-        axes.errorbar(
-            [e.env_steps for e in evaluations],
-            [e.ppo_mean_error_m for e in evaluations],
-            yerr=[1.96 * e.ppo_standard_error_m for e in evaluations],
-            color=EVALUATION,
-            marker="o",
-            markersize=4,
-            linewidth=1.5,
-            capsize=2,
-            label=f"policy, evaluation on unseen seeds (last {final.ppo_mean_error_m:.2f} m, bars 95 %)",
-        )
+    _plot_evaluated(axes, evaluations, "ekf", "EKF, same samples", EKF, "-.", "s")
+    _plot_evaluated(axes, evaluations, "rts", "RTS smoother, sees the future: a bound", RTS, ":", "^")
+    _plot_evaluated(axes, evaluations, "ppo", "policy, evaluation on unseen seeds", EVALUATION, "-", "o")
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(ScalarFormatter())
     axes.yaxis.set_minor_formatter(ScalarFormatter())
     axes.tick_params(axis="y", which="minor", labelsize=8)
     axes.set_ylabel("mean position error [m]")
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, fontsize=9)
     _save(figure, file)
+
+
+def _plot_evaluated(
+    axes: Axes, evaluations: list[EvaluationResult], name: str, label: str, colour: str, dashes: str, marker: str
+) -> None:
+    """One estimator's mean errors with their confidence intervals, if it has any."""
+    points = [(e.env_steps, getattr(e, f"{name}_mean_error_m"), getattr(e, f"{name}_ci95_m")) for e in evaluations]
+    points = [point for point in points if point[1] is not None]
+    if not points:
+        return
+    steps, means_m, halves_m = zip(*points, strict=True)
+    axes.errorbar(
+        steps,
+        means_m,
+        yerr=halves_m,
+        color=colour,
+        linestyle=dashes,
+        marker=marker,
+        markersize=4,
+        linewidth=1.5,
+        capsize=2,
+        label=f"{label} (last {means_m[-1]:.2f} m, bars 95 %)",
+    )
 
 
 def plot_sigma(file: Path, training: list[TrainingPoint]) -> None:

@@ -50,7 +50,34 @@ class Observation(Protocol):
 
     @property
     def gnss_m(self) -> Tensor:
-        """f32 `[n, 2]` or `[n, 3]`: newest raw GNSS fix in world metres. Only for the baseline."""
+        """f32 `[n, 2]` or `[n, 3]`: newest raw GNSS fix in world metres. Only for the baselines."""
+
+    @property
+    def gnss_quality(self) -> np.ndarray:
+        """f32 `[n, 2]`: the receiver's estimate of its horizontal error (m, 1σ of the distance, 0 = none), satellites.
+
+        This and the other raw sections are only for the baselines, which read them in evaluation episodes.
+        """
+
+    @property
+    def imu(self) -> Tensor:
+        """f32 `[n, k, 7]`: samples since the last tick, oldest first: accelerations, angular rates, compass."""
+
+    @property
+    def speed_steering(self) -> Tensor:
+        """f32 `[n, 2]`: newest wheel speed (m/s) and steering-wheel angle (rad)."""
+
+    @property
+    def sensors(self) -> np.ndarray:
+        """u32 `[n]`: bits of the sensors that deliver: 1 GNSS, 2 IMU, 4 speed and steering, 8 LIDAR."""
+
+    @property
+    def age_s(self) -> np.ndarray:
+        """f32 `[n, 4]`: age of the newest sample of each sensor, in the order of the bits."""
+
+    @property
+    def episode_step(self) -> np.ndarray:
+        """u32 `[n]`: ticks since the vehicle took the slot."""
 
     @property
     def vehicle(self) -> np.ndarray:

@@ -1,0 +1,62 @@
+"""Classical estimators beside the learner, from the same samples: a tuned EKF, and an RTS smoother as a bound.
+
+The smoother sees the future: a bound, not an estimator. Model, equations and tuning: docs/baselines.md.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from caraware.baselines.ekf import Ekf
+from caraware.baselines.motion import MotionModel
+from caraware.baselines.noise import SensorNoise
+from caraware.baselines.rts import SmoothedTick, Smoother
+from caraware.baselines.samples import read_samples
+from caraware.stream import Observation
+
+__all__ = ["BaselineErrors", "Baselines", "Ekf", "MotionModel", "SensorNoise", "Smoother"]
+
+
+@dataclass(frozen=True)
+class BaselineErrors:
+    """Errors of the valid rows of one tick of an episode; `[v]` each."""
+
+    vehicle: np.ndarray
+    """i64: dense index within the episode."""
+    error_m: np.ndarray
+
+
+class Baselines:
+    """EKF and smoother over the evaluation episodes of one phase. It copies what it needs of an observation."""
+
+    def __init__(self, noise: SensorNoise) -> None:
+        self._noise = noise
+        self._begin()
+
+    def add(self, obs: Observation) -> tuple[BaselineErrors, list[BaselineErrors]]:
+        """Errors of the EKF at this tick, and of the smoother at ticks that are done, if any."""
+        self._ekf.step(read_samples(obs, self._noise.convention))
+        rows = np.flatnonzero(obs.valid)
+        vehicle = obs.vehicle[rows].astype(np.int64)
+        truth_m = np.asarray(obs.truth)[rows, :2].astype(np.float64)
+        filtered = BaselineErrors(vehicle, _distance_m(self._ekf.position_m[rows], truth_m))
+        return filtered, [_errors(tick) for tick in self._smoother.push((rows, vehicle, truth_m))]
+
+    def finish_episode(self) -> list[BaselineErrors]:
+        """Errors of the smoother at the ticks that waited for the end of the episode; the next one starts anew."""
+        left = [_errors(tick) for tick in self._smoother.finish()]
+        self._begin()
+        return left
+
+    def _begin(self) -> None:
+        self._ekf = Ekf(self._noise)
+        self._smoother = Smoother(self._ekf)
+
+
+def _errors(tick: SmoothedTick) -> BaselineErrors:
+    rows, vehicle, truth_m = tick.label
+    return BaselineErrors(vehicle, _distance_m(tick.mean[:2, rows].T, truth_m))
+
+
+def _distance_m(estimate_m: np.ndarray, truth_m: np.ndarray) -> np.ndarray:
+    return np.hypot(*(estimate_m - truth_m).T)
