@@ -16,7 +16,7 @@ const TABLE: [(&str, &[&str], &[&str]); 7] = [
     ("caraware", &["ipc-schema"], &["clap", "indicatif"]),
     ("traffic-bridge", &["ipc-schema"], &["cxx"]),
     ("sim-core", &["ipc-schema"], &["rapier3d-f64", "nalgebra"]),
-    ("sensor-daemon", &["ipc-schema", "sim-core"], &["parry3d"]),
+    ("sensor-daemon", &["ipc-schema", "sim-core"], &["parry3d-f64"]),
     ("fanout", &["ipc-schema"], &["zenoh"]),
     ("caraware-native", &["ipc-schema"], &["pyo3"]),
 ];

@@ -5,6 +5,7 @@
 
 use std::{hint::black_box, sync::Arc, time::Instant};
 
+use sensor_daemon::gnss::Sky as _;
 use sensor_daemon::sky::SkyMap;
 use sim_core::{
     geodesy::Geodetic,

@@ -136,7 +136,7 @@ pub struct Lidar {
     pub vehicles: u32,
     /// "uniform", a unit by name, or "table".
     pub pattern: String,
-    /// Ray table of pattern "table": a CSV file with columns azimuth_deg, elevation_deg, column.
+    /// Ray table of pattern "table": a CSV file with columns azimuth_deg and elevation_deg, a line for each ray.
     pub ray_table: String,
     /// Lasers one above the other (pattern "uniform").
     pub channels: u32,
