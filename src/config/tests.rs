@@ -212,6 +212,14 @@ fn a_batch_larger_than_the_horizon_is_refused() {
 }
 
 #[test]
+fn a_word_on_the_command_line_is_a_word() {
+    for assignment in ["blackout.policy=nan", "blackout.policy=\"nan\"", "trainer.module=nan"] {
+        assert!(layer::parse_assignment(assignment).is_ok(), "{assignment}");
+    }
+    assert!(layer::parse_assignment("gnss.period_s=nan").is_err());
+}
+
+#[test]
 fn assignments_take_numbers_words_and_lists() {
     let settings = Settings::defaults()
         .unwrap()
