@@ -1,0 +1,387 @@
+"""The one loop behind all faces: answers a tick, takes the next, and tells how trajectories went on.
+
+A slot at tick k + 1 tells how the trajectory that held it at k ended; by then a new one may hold it. So a step from k to
+k + 1 gives, for each slot, the reward of k's action, whether k was the last tick of its trajectory, and the row of k + 1,
+which is that of another vehicle where a trajectory ended.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from caraware.channel import StreamEndedError
+from caraware.envs import rewards
+from caraware.envs.task import Task
+from caraware.envs.transition import Rows, Transition
+from caraware.stream import EMPTY_SLOT, Channel, Observation
+
+log = logging.getLogger(__name__)
+
+RUN_ON_TICKS = 2000
+"""A reset in the middle of an episode with more ticks left than this starts a new run instead of running on to its end."""
+REPORT_S = 1.0
+"""Time between two reports of the status."""
+
+Policy = Callable[[np.ndarray], np.ndarray]
+"""`observation f32 [N, d] -> action [N, 2]`."""
+
+
+class RunEndedError(Exception):
+    """The last tick of a run that `caraware` started has been taken: there is nothing to step any more."""
+
+
+class Source(Protocol):
+    """Where ticks come from."""
+
+    channel: Any
+    """The trainer's place in the present run."""
+    seed: int
+    """Seed of the present run."""
+    can_restart: bool
+
+    def receive(self) -> Observation | None:
+        """The next tick, or None after the last of the run."""
+
+    def restart(self, seed: int | None = None) -> None:
+        """Begin another run, where that is possible."""
+
+    def close(self, part: dict | None = None) -> None:
+        """Leave the run; `part` goes into its report."""
+
+
+class GivenChannel:
+    """A channel that somebody opened, in a process that the supervisor started by `trainer.module`."""
+
+    can_restart = False
+
+    def __init__(self, channel: Channel) -> None:
+        self.channel, self.seed = channel, int(channel.run["config"]["run"].get("seed", 0))
+        self._queue: list[Observation] = []
+        self._last = False
+
+    def receive(self) -> Observation | None:
+        """The next tick, or None after the last of the run."""
+        while not self._queue and not self._last:
+            try:
+                self._queue = list(self.channel.receive(0.2))[::-1]
+            except StreamEndedError:
+                self._last = True
+        if not self._queue:
+            return None
+        obs = self._queue.pop()
+        self._last = obs.last
+        return obs
+
+    def restart(self, seed: int | None = None) -> None:
+        """Never called: the run is its supervisor's."""
+        raise RunEndedError
+
+    def close(self, part: dict | None = None) -> None:
+        """Write the trainer's part of the report; say that all is done, if it is."""
+        if part is not None:
+            file = Path(self.channel.run["run_dir"], "parts", "trainer.json")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(part, indent=2) + "\n")
+        if self._last:
+            self.channel.done()
+
+
+@dataclass(frozen=True)
+class Tick:
+    """One tick of all N slots, copied out of shared memory; rows without a vehicle are zero."""
+
+    source: Observation | None
+    """What is to be answered; None beyond the end of the run."""
+    episode: tuple[int, int]
+    """Number of the run and of the episode in it."""
+    rows: Rows
+    mask: np.ndarray
+    vehicle: np.ndarray
+    id_hash: np.ndarray
+    terminated: np.ndarray
+    """Of the trajectory that held the slot a tick before."""
+    truncated: np.ndarray
+
+
+class Slots:
+    """All slots of a source of ticks, stepped together."""
+
+    def __init__(
+        self,
+        source: Source | Channel,
+        num_envs: int | None = None,
+        reward: rewards.Reward | None = None,
+        evaluation_policy: Policy | None = None,
+    ) -> None:
+        self.source: Source = source if hasattr(source, "can_restart") else GivenChannel(source)  # type: ignore[assignment]
+        self.task = Task.from_run(self.source.channel.run)
+        wanted = num_envs or self.task.slots
+        if not wanted:
+            raise ValueError("a scenario does not say how many vehicles sense at a time: give num_envs")
+        self.count = int(wanted)
+        self._reward = reward or rewards.default(self.task)
+        self._evaluation_policy, self._evaluation = evaluation_policy, _Errors()
+        self._raw_evaluation = _Errors()
+        self._idle = np.zeros((self.count, 2), np.float32)
+        self._runs = 0
+        self._untouched, self._stepped, self._told_narrow = True, True, False
+        self._now: Tick | None = None
+        self._env_steps, self._reported = 0, (time.monotonic(), 0)
+
+    @property
+    def now(self) -> Tick:
+        """The tick to be answered next."""
+        if self._now is None:
+            raise RuntimeError("call reset() before step()")
+        return self._now
+
+    @property
+    def over(self) -> bool:
+        """True beyond the end of a run that cannot be started anew."""
+        return self._now is not None and self._now.source is None
+
+    def reset(self, seed: int | None) -> Tick:
+        """The first tick of a run with `seed`; without, of the next episode."""
+        if seed is not None and not (self._untouched and seed == self.source.seed):
+            self._reseed(int(seed))
+        if self._now is None:
+            self._now = self._settle(self._take())
+        elif self._stepped and not self._untouched:
+            self._now = self._next_episode(self._now)
+        self._stepped = False
+        self._refuse_end()
+        return self.now
+
+    def seek(self, slot: int) -> Tick:
+        """Runs on to the first tick at which `slot` holds a vehicle."""
+        while not self.now.mask[slot]:
+            self._refuse_end()
+            self._answer(self.now, self._idle)
+            self._now = self._settle(self._take())
+        return self.now
+
+    def step(self, action: np.ndarray) -> tuple[Transition, np.ndarray]:
+        """Answers the present tick with actions `[N, 2]` and goes on to the next.
+
+        Returns what happened and its rewards, f64 `[N]`.
+        """
+        now = self.now
+        self._refuse_end()
+        action = self._checked(action)
+        self._answer(now, action)
+        following = self._take()
+        self._untouched, self._stepped = False, True
+        transition = self._transition(now, following)
+        self._env_steps += int(np.count_nonzero(now.mask))
+        with np.errstate(all="ignore"):
+            rewards_ = np.asarray(self._reward(transition, action), np.float64)
+        if rewards_.shape != (self.count,):
+            raise ValueError(f"the reward function gave shape {rewards_.shape}, one number a slot is ({self.count},)")
+        self._now = self._settle(following)
+        self._show()
+        return transition, np.where(now.mask, rewards_, 0.0)
+
+    def close(self) -> None:
+        """Leaves the run."""
+        self.source.close(self._part())
+
+    def _reseed(self, seed: int) -> None:
+        if not self.source.can_restart:
+            warnings.warn(f"seed {seed} is not used: the run was started with `run.seed` {self.source.seed}", stacklevel=4)
+            return
+        self._now, self._untouched = None, True
+        self.source.restart(seed)
+        self._runs += 1
+
+    def _checked(self, action: np.ndarray) -> np.ndarray:
+        action = np.asarray(action, np.float32)
+        if action.shape != (self.count, 2):
+            raise ValueError(f"actions of shape {action.shape}, {self.count} slots take ({self.count}, 2)")
+        return action
+
+    def _refuse_end(self) -> None:
+        if self.over:
+            raise RunEndedError("the run has ended: its last tick has been answered")
+
+    def _next_episode(self, tick: Tick) -> Tick:
+        if self.source.can_restart and self._ticks_left(tick) > RUN_ON_TICKS:
+            self._restart()
+            return self._settle(self._take())
+        episode = tick.episode
+        while tick.episode == episode and tick.source is not None:
+            self._answer(tick, self._idle)
+            tick = self._settle(self._take())
+        return tick
+
+    def _ticks_left(self, tick: Tick) -> float:
+        if self.task.episode_ticks is None or tick.source is None:
+            return float("inf")
+        return self.task.episode_ticks - tick.source.sim_time_ns / (self.task.tick_s * 1e9)
+
+    def _restart(self) -> None:
+        self.source.restart()
+        self._runs += 1
+
+    def _take(self) -> Tick | None:
+        """The next tick of the run, or None after its last."""
+        obs = self.source.receive()
+        return None if obs is None else self._copied(obs)
+
+    def _settle(self, tick: Tick | None) -> Tick:
+        """Runs on from `tick` to the first that asks for a decision: not an evaluation's, with a vehicle in some slot."""
+        while True:
+            if tick is None:
+                if not self.source.can_restart:
+                    return self._nobody()
+                self._restart()
+            elif tick.source.evaluation:
+                self._evaluate(tick)
+            elif tick.mask.any():
+                return tick
+            else:
+                self._answer(tick, self._idle)
+            tick = self._take()
+
+    def _evaluate(self, tick: Tick) -> None:
+        """Answers a tick of an evaluation, which nobody learns from."""
+        if self._evaluation_policy is None:
+            self._answer(tick, self._idle, publish=self.task.drives)
+            return
+        if self._evaluation.episode is None or tick.episode[1] > self._evaluation.episode + 1:
+            self._evaluation, self._raw_evaluation = _Errors(), _Errors()
+        action = self._checked(self._evaluation_policy(tick.rows.observation))
+        self._answer(tick, action)
+        if not self.task.drives:
+            self._evaluation.add(tick, self.task.to_world_m(action))
+            self._raw_evaluation.add(tick, tick.rows.gnss_m)
+
+    def _answer(self, tick: Tick, action: np.ndarray, *, publish: bool = True) -> None:
+        obs, channel = tick.source, self.source.channel
+        assert obs is not None
+        if publish:
+            rows = self.task.answer(action, len(obs.vehicle))
+            if self.task.drives:
+                channel.publish_actions(obs, rows)
+            else:
+                channel.publish_predictions(obs, torch.from_numpy(rows), 0)
+        channel.consumed(obs.tick)
+        if self.source.can_restart:
+            # Nobody asks for old ticks again: the run does not outlive this process.
+            channel.committed(obs.tick)
+
+    def _copied(self, obs: Observation) -> Tick:
+        n = self.count
+        vehicle = _padded(obs.vehicle, n, EMPTY_SLOT)
+        mask = _padded(obs.valid, n) & (vehicle != EMPTY_SLOT)
+        observation = _padded(obs.observation.numpy(), n)
+        if self.task.dark_is_nan:
+            np.nan_to_num(observation, copy=False)
+        if observation.shape[1] != self.task.fields.width:
+            raise ValueError(f"rows of {observation.shape[1]} numbers, the run file tells {self.task.fields.width}")
+        truth, gnss_m = _padded(obs.truth.numpy(), n), _padded(obs.gnss_m.numpy()[:, :2], n)
+        if not mask.all():
+            for rows in (observation, truth, gnss_m):
+                rows[~mask] = 0
+        if len(obs.vehicle) > n and not self._told_narrow and np.any(obs.vehicle[n:] != EMPTY_SLOT):
+            log.warning("%d slots, of which this environment has the first %d", len(obs.vehicle), n)
+            self._told_narrow = True
+        return Tick(
+            source=obs,
+            episode=(self._runs, obs.episode),
+            rows=Rows(self.task, observation, truth, gnss_m),
+            mask=mask,
+            vehicle=vehicle,
+            id_hash=_padded(getattr(obs, "id_hash", obs.vehicle).astype(np.uint64), n),
+            terminated=_padded(obs.terminated, n),
+            truncated=_padded(obs.truncated, n),
+        )
+
+    def _nobody(self) -> Tick:
+        """Beyond the last tick of a run."""
+        n, nobody = self.count, np.zeros(self.count, bool)
+        zeros = [np.zeros((n, width), np.float32) for width in (self.task.fields.width, 4, 2)]
+        vehicle = np.full(n, EMPTY_SLOT, np.uint32)
+        ids = np.zeros(n, np.uint64)
+        return Tick(None, (self._runs + 1, 0), Rows(self.task, *zeros), nobody, vehicle, ids, nobody, nobody)
+
+    def _transition(self, now: Tick, following: Tick | None) -> Transition:
+        if following is None:
+            terminated, truncated, after = np.zeros(self.count, bool), now.mask.copy(), now.rows
+        else:
+            terminated = now.mask & following.terminated
+            same = following.mask & (following.vehicle == now.vehicle) & (following.episode == now.episode)
+            # A slot that changed hands or has a gap without a flag: its trajectory went on unseen.
+            truncated = now.mask & ~terminated & (following.truncated | ~same)
+            after = _where(terminated | truncated, now.rows, following.rows)
+        return Transition(
+            task=self.task,
+            observation=now.rows.observation,
+            truth=now.rows.truth,
+            gnss_m=now.rows.gnss_m,
+            mask=now.mask,
+            vehicle=now.vehicle,
+            id_hash=now.id_hash,
+            terminated=terminated,
+            truncated=truncated,
+            next=after,
+        )
+
+    def _show(self) -> None:
+        clock, (since, steps) = time.monotonic(), self._reported
+        if clock - since < REPORT_S:
+            return
+        rate = (self._env_steps - steps) / (clock - since)
+        self._reported = (clock, self._env_steps)
+        self.source.channel.report(episode=self.now.episode[1], env_steps=self._env_steps, env_steps_per_s=rate)
+
+    def _part(self) -> dict:
+        """The trainer's part of the run's report."""
+        part: dict[str, Any] = {"env_steps": self._env_steps}
+        if self._evaluation.count:
+            part["ppo_mean_error_m"] = self._evaluation.mean_m()
+            part["raw_gnss_mean_error_m"] = self._raw_evaluation.mean_m()
+        return part
+
+
+class _Errors:
+    """Mean distance to the truth over one phase of evaluation episodes."""
+
+    def __init__(self) -> None:
+        self.episode: int | None = None
+        self.count, self._sum_m = 0, 0.0
+
+    def add(self, tick: Tick, place_m: np.ndarray) -> None:
+        away = np.asarray(place_m, np.float64) - tick.rows.truth[:, :2]
+        self._sum_m += float(np.hypot(away[:, 0], away[:, 1])[tick.mask].sum())
+        self.count += int(np.count_nonzero(tick.mask))
+        self.episode = tick.episode[1]
+
+    def mean_m(self) -> float:
+        return self._sum_m / self.count
+
+
+def _padded(values: np.ndarray, n: int, empty: int = 0) -> np.ndarray:
+    """A copy of the first `n` rows, filled up to `n` where there are fewer."""
+    if len(values) >= n:
+        return values[:n].copy()
+    rows = np.full((n, *values.shape[1:]), empty, values.dtype)
+    rows[: len(values)] = values
+    return rows
+
+
+def _where(ended: np.ndarray, now: Rows, following: Rows) -> Rows:
+    """The following rows, those of `now` where `ended`."""
+    if not ended.any():
+        return following
+    pairs = ((now.observation, following.observation), (now.truth, following.truth), (now.gnss_m, following.gnss_m))
+    return Rows(now.task, *(np.where(ended[:, None], old, new) for old, new in pairs))
