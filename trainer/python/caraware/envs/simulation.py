@@ -64,6 +64,7 @@ class Simulation:
         self._config, self._settings, self._runs = str(config), dict(settings or {}), runs
         self._program = Path(program) if program else _find_program()
         self._restarts = 0
+        self.current: Observation | None = None
         self._temporary: Path | None = None
         self._run: _Run | None = None
         _open_simulations.add(self)
@@ -103,7 +104,9 @@ class Simulation:
 
     def receive(self) -> Observation | None:
         """The next tick, or None after the last of the run. Raises `SimulationError` when the simulation ends before."""
-        return self._alive().receive()
+        self.current = None
+        self.current = self._alive().receive()
+        return self.current
 
     def close(self, part: Mapping[str, Any] | None = None) -> None:
         """Ends the simulation in order. Closing twice does no harm."""
@@ -118,6 +121,10 @@ class Simulation:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    def __del__(self) -> None:
+        with contextlib.suppress(AttributeError):  # where __init__ did not get far
+            self.close()
 
     def _alive(self) -> _Run:
         if self._run is None:
@@ -141,6 +148,7 @@ class Simulation:
         return self._temporary
 
     def _end(self, part: Mapping[str, Any] | None = None) -> None:
+        self.current = None
         run, self._run = self._run, None
         if run is not None:
             run.end(part)

@@ -48,6 +48,8 @@ class Source(Protocol):
     seed: int
     """Seed of the present run."""
     can_restart: bool
+    current: Observation | None
+    """The tick received last. Nobody else may keep it: memory of a run must be let go before the run is left."""
 
     def receive(self) -> Observation | None:
         """The next tick, or None after the last of the run."""
@@ -66,11 +68,13 @@ class GivenChannel:
 
     def __init__(self, channel: Channel) -> None:
         self.channel, self.seed = channel, int(channel.run["config"]["run"].get("seed", 0))
+        self.current: Observation | None = None
         self._queue: list[Observation] = []
         self._last = False
 
     def receive(self) -> Observation | None:
         """The next tick, or None after the last of the run."""
+        self.current = None
         while not self._queue and not self._last:
             try:
                 self._queue = list(self.channel.receive(0.2))[::-1]
@@ -78,9 +82,9 @@ class GivenChannel:
                 self._last = True
         if not self._queue:
             return None
-        obs = self._queue.pop()
-        self._last = obs.last
-        return obs
+        self.current = self._queue.pop()
+        self._last = self.current.last
+        return self.current
 
     def restart(self, seed: int | None = None) -> None:
         """Never called: the run is its supervisor's."""
@@ -100,8 +104,10 @@ class GivenChannel:
 class Tick:
     """One tick of all N slots, copied out of shared memory; rows without a vehicle are zero."""
 
-    source: Observation | None
-    """What is to be answered; None beyond the end of the run."""
+    over: bool
+    """True beyond the end of the run: there is nothing to answer."""
+    evaluation: bool
+    sim_time_ns: int
     episode: tuple[int, int]
     """Number of the run and of the episode in it."""
     rows: Rows
@@ -148,7 +154,7 @@ class Slots:
     @property
     def over(self) -> bool:
         """True beyond the end of a run that cannot be started anew."""
-        return self._now is not None and self._now.source is None
+        return self._now is not None and self._now.over
 
     def reset(self, seed: int | None) -> Tick:
         """The first tick of a run with `seed`; without, of the next episode."""
@@ -166,7 +172,7 @@ class Slots:
         """Runs on to the first tick at which `slot` holds a vehicle."""
         while not self.now.mask[slot]:
             self._refuse_end()
-            self._answer(self.now, self._idle)
+            self._answer(self._idle)
             self._now = self._settle(self._take())
         return self.now
 
@@ -178,7 +184,7 @@ class Slots:
         now = self.now
         self._refuse_end()
         action = self._checked(action)
-        self._answer(now, action)
+        self._answer(action)
         following = self._take()
         self._untouched, self._stepped = False, True
         transition = self._transition(now, following)
@@ -218,15 +224,15 @@ class Slots:
             self._restart()
             return self._settle(self._take())
         episode = tick.episode
-        while tick.episode == episode and tick.source is not None:
-            self._answer(tick, self._idle)
+        while tick.episode == episode:
+            self._answer(self._idle)
             tick = self._settle(self._take())
         return tick
 
     def _ticks_left(self, tick: Tick) -> float:
-        if self.task.episode_ticks is None or tick.source is None:
+        if self.task.episode_ticks is None:
             return float("inf")
-        return self.task.episode_ticks - tick.source.sim_time_ns / (self.task.tick_s * 1e9)
+        return self.task.episode_ticks - tick.sim_time_ns / (self.task.tick_s * 1e9)
 
     def _restart(self) -> None:
         self.source.restart()
@@ -244,30 +250,33 @@ class Slots:
                 if not self.source.can_restart:
                     return self._nobody()
                 self._restart()
-            elif tick.source.evaluation:
+            elif tick.evaluation:
                 self._evaluate(tick)
             elif tick.mask.any():
                 return tick
             else:
-                self._answer(tick, self._idle)
+                self._answer(self._idle)
             tick = self._take()
 
     def _evaluate(self, tick: Tick) -> None:
         """Answers a tick of an evaluation, which nobody learns from."""
         if self._evaluation_policy is None:
-            self._answer(tick, self._idle, publish=self.task.drives)
+            self._answer(self._idle, publish=self.task.drives)
             return
         if self._evaluation.episode is None or tick.episode[1] > self._evaluation.episode + 1:
             self._evaluation, self._raw_evaluation = _Errors(), _Errors()
         action = self._checked(self._evaluation_policy(tick.rows.observation))
-        self._answer(tick, action)
+        self._answer(action)
         if not self.task.drives:
             self._evaluation.add(tick, self.task.to_world_m(action))
             self._raw_evaluation.add(tick, tick.rows.gnss_m)
 
-    def _answer(self, tick: Tick, action: np.ndarray, *, publish: bool = True) -> None:
-        obs, channel = tick.source, self.source.channel
-        assert obs is not None
+    def _answer(self, action: np.ndarray, *, publish: bool = True) -> None:
+        """Answers the tick received last, once: an interrupted step may be taken again."""
+        obs, channel = self.source.current, self.source.channel
+        if obs is None:
+            return
+        self.source.current = None
         if publish:
             rows = self.task.answer(action, len(obs.vehicle))
             if self.task.drives:
@@ -296,7 +305,9 @@ class Slots:
             log.warning("%d slots, of which this environment has the first %d", len(obs.vehicle), n)
             self._told_narrow = True
         return Tick(
-            source=obs,
+            over=False,
+            evaluation=obs.evaluation,
+            sim_time_ns=obs.sim_time_ns,
             episode=(self._runs, obs.episode),
             rows=Rows(self.task, observation, truth, gnss_m),
             mask=mask,
@@ -312,7 +323,8 @@ class Slots:
         zeros = [np.zeros((n, width), np.float32) for width in (self.task.fields.width, 4, 2)]
         vehicle = np.full(n, EMPTY_SLOT, np.uint32)
         ids = np.zeros(n, np.uint64)
-        return Tick(None, (self._runs + 1, 0), Rows(self.task, *zeros), nobody, vehicle, ids, nobody, nobody)
+        episode, rows = (self._runs + 1, 0), Rows(self.task, *zeros)
+        return Tick(True, False, 0, episode, rows, nobody, vehicle, ids, nobody, nobody)
 
     def _transition(self, now: Tick, following: Tick | None) -> Transition:
         if following is None:
