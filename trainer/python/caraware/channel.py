@@ -220,3 +220,7 @@ class Channel:
     def done(self) -> None:
         """All work is done: the process may end."""
         self._attachment.done()
+
+    def close(self) -> None:
+        """Lets go of the run's shared memory, whoever still holds this object, which is of no use afterwards."""
+        del self._attachment

@@ -98,6 +98,7 @@ class Simulation:
             seed, first = int(drawn[0]), self._first_seed
         else:
             self._restarts, first = 0, seed
+        self._alive()
         self._end()
         self._start(seed)
         self._first_seed = first
@@ -230,7 +231,7 @@ class _Run:
             file.write_text(json.dumps(part) + "\n")
         if self._ended:
             self.channel.done()
-        del self.channel
+        self.channel.close()
         self._stop()
         self._close_files()
 

@@ -160,6 +160,7 @@ class Slots:
         """The first tick of a run with `seed`; without, of the next episode."""
         if seed is not None and not (self._untouched and seed == self.source.seed):
             self._reseed(int(seed))
+        self._refuse_end()
         if self._now is None:
             self._now = self._settle(self._take())
         elif self._stepped and not self._untouched:
@@ -203,7 +204,8 @@ class Slots:
 
     def _reseed(self, seed: int) -> None:
         if not self.source.can_restart:
-            warnings.warn(f"seed {seed} is not used: the run was started with `run.seed` {self.source.seed}", stacklevel=4)
+            message = f"seed {seed} cannot begin this run anew: caraware started it, with `run.seed` {self.source.seed}"
+            warnings.warn(message, stacklevel=4)
             return
         self._now, self._untouched = None, True
         self.source.restart(seed)
