@@ -101,7 +101,9 @@ def main(seconds: float) -> None:
                 with make(config, settings, seed=repeat + 1) as simulation:
                     rates.append(face(simulation, seconds))
             spread = ", ".join(f"{rate:,.0f}" for rate in sorted(rates))
-            print(f"{name:20} {face.__name__:10} {statistics.median(rates):10,.0f} env-steps/s   ({spread})", flush=True)
+            print(
+                f"{name:20} {face.__name__:10} {statistics.median(rates):10,.0f} env-steps/s   ({spread})", flush=True
+            )
 
 
 if __name__ == "__main__":

@@ -201,7 +201,9 @@ USER = """
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_a_user_that_is_killed_or_interrupted_takes_its_simulation_along(number: signal.Signals) -> None:
     script = textwrap.dedent(USER.format(settings=DRIVING))
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as user:
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as user:
         pid, prefix = user.stdout.readline().split()
         processes = processes_of(int(pid))
         user.send_signal(number)
@@ -274,7 +276,9 @@ def test_the_example_with_stable_baselines_as_the_trainer_of_a_run(tmp_path: Pat
     settings |= {"trainer.module": "caraware.examples.sb3_ppo", "fanout.enabled": "false"}
     command = [CARAWARE, "train", "town", "--name", "sb3", *(f"--set={key}={value}" for key, value in settings.items())]
     package = str(Path(envs.__file__).parents[2])
-    finished = subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": package}, capture_output=True, text=True)
+    finished = subprocess.run(
+        command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": package}, capture_output=True, text=True
+    )
     assert finished.returncode == 0, finished.stdout + finished.stderr
     report = json.loads((tmp_path / "runs" / "sb3" / "report.json").read_text())
     # 4 episodes of 40 ticks with 4 vehicles, some of which enter late; the evaluations are nobody's experience.

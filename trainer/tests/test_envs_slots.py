@@ -29,7 +29,12 @@ def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: i
         "gnss": {},
         "trainer": {},
     }
-    return {"run_dir": run_dir, "config": config, "map": {"bounds_m": [0.0, 0.0, 200.0, 100.0]}, "source": {"population": {}}}
+    return {
+        "run_dir": run_dir,
+        "config": config,
+        "map": {"bounds_m": [0.0, 0.0, 200.0, 100.0]},
+        "source": {"population": {}},
+    }
 
 
 def tick(number: int, vehicles: list[int], terminated: tuple = (), truncated: tuple = (), **more: object):

@@ -15,7 +15,7 @@ from caraware.stream import Channel
 
 
 class CarAwareParallelEnv(ParallelEnv):
-    """Agents are vehicles, such as `cav.12`. They come and go; within an episode, which is the simulation's, no id is used twice.
+    """Agents are vehicles, such as `cav.12`, that come and go. In an episode, the simulation's, no id is used twice.
 
     Nobody knows beforehand who will come: `possible_agents` holds the ids seen so far and grows. Observation and action
     spaces are the same for all. An agent's last step has its last observation; whoever comes in a step is in its

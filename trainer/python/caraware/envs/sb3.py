@@ -17,9 +17,9 @@ from caraware.stream import Channel
 class CarAwareVecEnv(VecEnv):
     """Slots as sub-environments that reset themselves.
 
-    `infos[i]["mask"]` is False where slot i holds no vehicle: its observation is zero, its action not used, its reward 0.
-    Stable-Baselines3 has no way to leave such rows out; they make up the beginning of a trajectory. At the end of a
-    trajectory `infos[i]` has `terminal_observation`, `TimeLimit.truncated`, and the `episode` that `Monitor` would give.
+    `infos[i]["mask"]` is False where slot i holds no vehicle: its observation is zero, its action not used, its reward
+    0. Stable-Baselines3 has no way to leave such rows out; they make up the beginning of a trajectory. At the end of
+    one `infos[i]` has `terminal_observation`, `TimeLimit.truncated`, and the `episode` that `Monitor` would give.
 
     `evaluation_policy` answers the evaluation episodes of a run that `caraware` started.
     """

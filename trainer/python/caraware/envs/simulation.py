@@ -104,7 +104,7 @@ class Simulation:
         self._first_seed = first
 
     def receive(self) -> Observation | None:
-        """The next tick, or None after the last of the run. Raises `SimulationError` when the simulation ends before."""
+        """The next tick, or None after the last of the run. Raises `SimulationError` if the simulation ends before."""
         self.current = None
         self.current = self._alive().receive()
         return self.current
@@ -139,7 +139,7 @@ class Simulation:
         self._run = _Run(self._program, self._config, settings, runs)
 
     def _temporary_runs(self) -> Path:
-        """Where nobody asked to keep results: a directory that goes with the environment, or with the next one's start."""
+        """Where nobody asked to keep results: a directory that goes with the simulation, or when the next starts."""
         if self._temporary is None:
             base = Path(tempfile.gettempdir())
             for old in base.glob("caraware-env-*"):
@@ -165,9 +165,10 @@ def make(
 ) -> Simulation:
     """Starts a simulation for a face: `CarAwareVectorEnv(make("town", {"traffic.cavs": 8}))`.
 
-    `config` is what `caraware train` takes: a preset, a `.toml` or a `.sumocfg`; `set` changes single settings of it by
-    their keys (configs/README.md). `runs` is the directory for run directories, one for each start; without, results are
-    thrown away. `program` is the `caraware` command if it is neither in `CARAWARE`, nor beside this package, nor in `PATH`.
+    `config` is what `caraware train` takes: a preset, a `.toml` or a `.sumocfg`; `set` changes single settings of it
+    by their keys (configs/README.md). `runs` is the directory for run directories, one for each start; without,
+    results are thrown away. `program` is the `caraware` command; without, it is that of the environment variable
+    `CARAWARE`, the build beside this package or this Python, or the one in `PATH`.
 
     Raises `SimulationError` with the message of `caraware` where the configuration is wrong or something is missing.
     """

@@ -51,7 +51,9 @@ class CarAwareVectorEnv(VectorEnv):
         All slots share a world, so there is one seed: of a list the first counts.
         """
         if options and "reset_mask" in options:
-            raise ValueError("slots share a world and cannot be reset one by one; SAME_STEP autoreset needs no reset_mask")
+            raise ValueError(
+                "slots share a world and cannot be reset one by one; SAME_STEP autoreset needs no reset_mask"
+            )
         if isinstance(seed, list | tuple):
             seed = seed[0]
         super().reset(seed=seed)
@@ -64,7 +66,10 @@ class CarAwareVectorEnv(VectorEnv):
         tick = self.slots.now
         infos = self._info(tick)
         if not self.slots.task.drives:
-            infos |= {"error_m": np.where(transition.mask, error_m(transition, actions), 0.0), "_error_m": transition.mask}
+            infos |= {
+                "error_m": np.where(transition.mask, error_m(transition, actions), 0.0),
+                "_error_m": transition.mask,
+            }
         ended = transition.terminated | transition.truncated
         if ended.any():
             infos |= _final(transition, ended)

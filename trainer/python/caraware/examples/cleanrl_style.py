@@ -35,7 +35,9 @@ class Agent(nn.Module):
 
     def __init__(self, fields: int, actions: int) -> None:
         super().__init__()
-        self.mean = nn.Sequential(nn.Linear(fields, 256), nn.Tanh(), nn.Linear(256, 128), nn.Tanh(), nn.Linear(128, actions))
+        self.mean = nn.Sequential(
+            nn.Linear(fields, 256), nn.Tanh(), nn.Linear(256, 128), nn.Tanh(), nn.Linear(128, actions)
+        )
         self.log_std = nn.Parameter(torch.zeros(actions))
         self.critic = nn.Sequential(nn.Linear(fields, 128), nn.Tanh(), nn.Linear(128, 1))
 
@@ -100,7 +102,12 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, batch: Collected, set
     held = batch.mask
     advantage = batch.advantage(settings.discount, settings.gae_lambda)
     target = (advantage + batch.value)[held]
-    observation, action, log_prob, gain = batch.observation[held], batch.action[held], batch.log_prob[held], advantage[held]
+    observation, action, log_prob, gain = (
+        batch.observation[held],
+        batch.action[held],
+        batch.log_prob[held],
+        advantage[held],
+    )
     gain = (gain - gain.mean()) / (gain.std() + 1e-8)
     for _ in range(settings.epochs):
         for rows in torch.randperm(len(gain)).split(settings.batch_size):

@@ -1,7 +1,7 @@
 """Stable-Baselines3's PPO, alone or in the trainer's place of a run.
 
-python -m caraware.examples.sb3_ppo [STEPS]                            starts its own simulation
-caraware train --set trainer.module=caraware.examples.sb3_ppo          learns, and predicts in the evaluations, until the run ends
+`python -m caraware.examples.sb3_ppo [STEPS]` starts its own simulation.
+`caraware train --set trainer.module=caraware.examples.sb3_ppo` learns until the run ends, and answers its evaluations.
 """
 
 import signal
