@@ -1,14 +1,17 @@
 """Env-steps per second with random actions through each face, beside the raw channel.
 
-`python trainer/benches/faces.py [SECONDS]`: town and driving, each face in turn, three times; the median is told.
+`python trainer/benches/faces.py [SECONDS]`: town and driving, the faces in turn, three times; medians, and the least CPU
+time of this process for a step of all vehicles.
 """
 
 import statistics
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+import torch
 from caraware.envs import CarAwareEnv, CarAwareParallelEnv, CarAwareVecEnv, CarAwareVectorEnv, Simulation, make
 
 REPEATS = 3
@@ -20,39 +23,46 @@ CONFIGS = {
 }
 
 
-def until(seconds: float, step: Callable[[], int]) -> float:
-    """Env-steps per second of `step`, which gives how many it made."""
+def until(seconds: float, step: Callable[[], int]) -> tuple[float, float]:
+    """Env-steps per second of `step`, which gives how many it made, and this process's CPU time for a call (µs)."""
     step()
-    began, steps = time.perf_counter(), 0
+    began, cpu_began, steps, calls = time.perf_counter(), time.process_time(), 0, 0
     while (passed := time.perf_counter() - began) < seconds:
-        steps += step()
-    return steps / passed
+        steps, calls = steps + step(), calls + 1
+    return steps / passed, (time.process_time() - cpu_began) / calls * 1e6
 
 
-def raw(simulation: Simulation, seconds: float) -> float:
+def raw(simulation: Simulation, seconds: float) -> tuple[float, float]:
     """Take a tick, answer it, give credit: what no face can beat."""
-    channel, rng = simulation.channel, np.random.default_rng(0)
+    channel, rng, waiting = simulation.channel, np.random.default_rng(0), deque()
     drives = channel.run["config"]["task"]["kind"] == "driving"
 
     def step() -> int:
-        ticks = channel.receive(10.0)
-        for obs in ticks:
-            if drives:
-                channel.publish_actions(obs, rng.uniform(-1, 1, (len(obs.vehicle), 2)))
-            channel.consumed(obs.tick)
-        return sum(int(obs.valid.sum()) for obs in ticks)
+        if not waiting:
+            waiting.extend(channel.receive(10.0))
+        obs = waiting.popleft()
+        actions = rng.uniform(-1, 1, (len(obs.vehicle), 2))
+        if drives:
+            channel.publish_actions(obs, actions)
+        else:
+            channel.publish_predictions(obs, torch.from_numpy(actions), 0)
+        channel.consumed(obs.tick)
+        return int(obs.valid.sum())
 
-    return until(seconds, step)
+    try:
+        return until(seconds, step)
+    finally:
+        waiting.clear()
 
 
-def vector(simulation: Simulation, seconds: float) -> float:
+def vector(simulation: Simulation, seconds: float) -> tuple[float, float]:
     """Gymnasium's VectorEnv."""
     env, rng = CarAwareVectorEnv(simulation), np.random.default_rng(0)
     env.reset()
     return until(seconds, lambda: int(env.step(rng.uniform(-1, 1, (env.num_envs, 2)))[4]["mask"].sum()))
 
 
-def sb3(simulation: Simulation, seconds: float) -> float:
+def sb3(simulation: Simulation, seconds: float) -> tuple[float, float]:
     """Stable-Baselines3's VecEnv."""
     env, rng = CarAwareVecEnv(simulation), np.random.default_rng(0)
     env.reset()
@@ -64,7 +74,7 @@ def sb3(simulation: Simulation, seconds: float) -> float:
     return until(seconds, step)
 
 
-def parallel(simulation: Simulation, seconds: float) -> float:
+def parallel(simulation: Simulation, seconds: float) -> tuple[float, float]:
     """PettingZoo's ParallelEnv."""
     env, rng = CarAwareParallelEnv(simulation), np.random.default_rng(0)
     env.reset()
@@ -78,7 +88,7 @@ def parallel(simulation: Simulation, seconds: float) -> float:
     return until(seconds, step)
 
 
-def single(simulation: Simulation, seconds: float) -> float:
+def single(simulation: Simulation, seconds: float) -> tuple[float, float]:
     """Gymnasium's Env; of several vehicles it sees one."""
     env, rng = CarAwareEnv(simulation), np.random.default_rng(0)
     env.reset()
@@ -92,18 +102,24 @@ def single(simulation: Simulation, seconds: float) -> float:
     return until(seconds, step)
 
 
+FACES = (raw, vector, sb3, parallel, single)
+
+
 def main(seconds: float) -> None:
-    """All faces on all configurations."""
+    """All faces on all configurations, in turn, so that what else the machine does meets all alike."""
     for name, (config, settings) in CONFIGS.items():
-        for face in (raw, vector, sb3, parallel, single):
-            rates = []
-            for repeat in range(REPEATS):
+        measured: dict[str, list[tuple[float, float]]] = {face.__name__: [] for face in FACES}
+        for repeat in range(REPEATS):
+            for face in FACES:
                 with make(config, settings, seed=repeat + 1) as simulation:
-                    rates.append(face(simulation, seconds))
-            spread = ", ".join(f"{rate:,.0f}" for rate in sorted(rates))
-            print(
-                f"{name:20} {face.__name__:10} {statistics.median(rates):10,.0f} env-steps/s   ({spread})", flush=True
+                    measured[face.__name__].append(face(simulation, seconds))
+        for face, results in measured.items():
+            rates, cpu_us = zip(*results, strict=True)
+            share = statistics.median(rate / raw for rate, (raw, _) in zip(rates, measured["raw"], strict=True))
+            told = (
+                f"{statistics.median(rates):9,.0f} env-steps/s {share:6.0%} of raw {min(cpu_us):6.0f} µs of CPU a step"
             )
+            print(f"{name:18} {face:9} {told}   ({', '.join(f'{rate:,.0f}' for rate in rates)})", flush=True)
 
 
 if __name__ == "__main__":
