@@ -1,7 +1,7 @@
 """Env-steps per second with random actions through each face, beside the raw channel.
 
-`python trainer/benches/faces.py [SECONDS]`: town and driving, the faces in turn, three times; medians, and the least CPU
-time of this process for a step of all vehicles.
+`python trainer/benches/faces.py [SECONDS]`: town and driving, the faces in turn, three times; medians, and the least
+CPU time of this process for a step of all vehicles.
 """
 
 import statistics

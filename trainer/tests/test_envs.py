@@ -166,6 +166,27 @@ def test_kept_runs_have_a_report(tmp_path: Path) -> None:
     assert report["result"] == "interrupted" and 60 <= report["trainer"]["env_steps"] <= 80
 
 
+def test_what_a_killed_user_left_is_removed_and_what_a_living_one_has_is_not() -> None:
+    dead = Path(tempfile.mkdtemp(prefix=f"caraware-env-{os.getpid()}-"))
+    (dead / "lock").touch()
+    with make("town", TOWN) as one:
+        assert not dead.exists()
+        with make("town", TOWN):
+            assert Path(one.run["run_dir"]).is_dir()
+        child = os.fork()
+        if child == 0:
+            one.close()  # not the child's to close
+            os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
+        CarAwareVectorEnv(one).reset()
+
+
+def test_seed_and_trainer_are_no_settings() -> None:
+    for key in ("run.seed", "trainer.module"):
+        with pytest.raises(ValueError, match=key):
+            make("town", {key: "1"})
+
+
 def test_a_wrong_setting_is_told_with_the_message_of_caraware() -> None:
     with pytest.raises(SimulationError, match=r"traffic\.cavz"):
         make("town", {"traffic.cavz": 4})

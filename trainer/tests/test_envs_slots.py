@@ -213,6 +213,8 @@ def test_the_end_of_the_run_truncates_and_then_nothing_can_be_stepped(tmp_path) 
         with pytest.raises(RunEndedError):
             call()
     assert channel.consumed_up_to == 1 and not channel.is_done
+    env.slots.commit()
+    assert channel.committed_up_to == 1
     env.close()
     assert channel.is_done
 

@@ -6,7 +6,7 @@ from caraware import _native
 
 PREFIXES = ("cav.", "hero.", "person.")
 """Population control numbers whom it adds within an episode: `cav.0`, `cav.1`, …; nobody gets an old number."""
-FIRST_NUMBERS, MOST_NUMBERS = 256, 1 << 18
+FIRST_NUMBERS, MOST_NUMBERS = 256, 1 << 16
 """Numbers looked through at first and at most."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import fcntl
 import json
 import os
 import select
@@ -29,6 +30,8 @@ RECEIVE_TIMEOUT_S = 0.2
 """Time between two looks at whether the simulation still runs, while it sends nothing."""
 STOP_WITHIN_S = 40.0
 """Longest time from the request to stop to the supervisor's end; it gives its own processes 30 s."""
+
+_TEMPORARY = "caraware-env-"
 
 ENDLESS = {
     "episode.training_episodes": 10_000,
@@ -62,10 +65,14 @@ class Simulation:
         program: str | Path | None = None,
     ) -> None:
         self._config, self._settings, self._runs = str(config), dict(settings or {}), runs
+        for key, instead in (("run.seed", "give seed="), ("trainer.module", "this process is the trainer")):
+            if key in self._settings:
+                raise ValueError(f"`{key}` cannot be set here: {instead}")
+        self._owner = os.getpid()
         self._program = Path(program) if program else _find_program()
         self._restarts = 0
         self.current: Observation | None = None
-        self._temporary: Path | None = None
+        self._temporary: _TemporaryRuns | None = None
         self._run: _Run | None = None
         _open_simulations.add(self)
         self._start(seed)
@@ -110,11 +117,13 @@ class Simulation:
         return self.current
 
     def close(self, part: Mapping[str, Any] | None = None) -> None:
-        """Ends the simulation in order. Closing twice does no harm."""
+        """Ends the simulation in order. Closing twice does no harm, nor does closing in a forked child."""
+        if os.getpid() != self._owner:
+            return
         self._end(part)
         _open_simulations.discard(self)
         if self._temporary is not None:
-            shutil.rmtree(self._temporary, ignore_errors=True)
+            self._temporary.remove()
             self._temporary = None
 
     def __enter__(self) -> Simulation:
@@ -134,19 +143,11 @@ class Simulation:
 
     def _start(self, seed: int) -> None:
         self._seed = self._first_seed = int(seed)
-        runs = Path(self._runs) if self._runs is not None else self._temporary_runs()
+        if self._runs is None and self._temporary is None:
+            self._temporary = _TemporaryRuns()
+        runs = self._temporary.path if self._temporary is not None else Path(str(self._runs))
         settings = ENDLESS | self._settings | {"run.seed": self._seed, "trainer.module": outside.__name__}
         self._run = _Run(self._program, self._config, settings, runs)
-
-    def _temporary_runs(self) -> Path:
-        """Where nobody asked to keep results: a directory that goes with the simulation, or when the next starts."""
-        if self._temporary is None:
-            base = Path(tempfile.gettempdir())
-            for old in base.glob("caraware-env-*"):
-                if not Path("/proc", old.name.split("-")[2]).exists():
-                    shutil.rmtree(old, ignore_errors=True)
-            self._temporary = Path(tempfile.mkdtemp(prefix=f"caraware-env-{os.getpid()}-"))
-        return self._temporary
 
     def _end(self, part: Mapping[str, Any] | None = None) -> None:
         self.current = None
@@ -175,6 +176,32 @@ def make(
     return Simulation(config, set, seed, runs=runs, program=program)
 
 
+class _TemporaryRuns:
+    """A directory for the runs of a simulation whose results nobody asked to keep.
+
+    It is removed with the simulation, or, if its process was killed, when the next one starts: whoever lives holds a
+    lock on a file in it.
+    """
+
+    def __init__(self) -> None:
+        for old in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*"):
+            self._remove_if_dead(old)
+        self.path = Path(tempfile.mkdtemp(prefix=f"{_TEMPORARY}{os.getpid()}-"))
+        self._lock = open(self.path / "lock", "w")  # noqa: SIM115, it is held as long as this object
+        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def remove(self) -> None:
+        """Removes everything."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        self._lock.close()
+
+    @staticmethod
+    def _remove_if_dead(directory: Path) -> None:
+        with contextlib.suppress(OSError), open(directory / "lock") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(directory, ignore_errors=True)
+
+
 class _Run:
     """One run of `caraware train`, from its start to its end."""
 
@@ -196,7 +223,6 @@ class _Run:
                 env=os.environ | {outside.LINE: name, outside.USER: str(os.getpid()), "PYTHONPATH": _python_path()},
                 start_new_session=True,  # Ctrl-C in a terminal is this process's affair
             )
-            self._owner = os.getpid()
             try:
                 run_file = self._wait_for_run_file(listener)
                 self.channel = Channel(run_file, outside=True)
@@ -223,10 +249,8 @@ class _Run:
         return self._queue.popleft()
 
     def end(self, part: Mapping[str, Any] | None) -> None:
-        """Stops the run, unless it has ended; in a forked child only the handles are let go."""
+        """Stops the run, unless it has ended."""
         self._queue.clear()
-        if self._owner != os.getpid():
-            return
         if part is not None and self.process.poll() is None:
             file = Path(self.channel.run["run_dir"], "parts", "trainer.json")
             file.write_text(json.dumps(part) + "\n")

@@ -140,7 +140,7 @@ class Slots:
         self._evaluation_policy, self._evaluation = evaluation_policy, _Errors()
         self._raw_evaluation = _Errors()
         self._idle = np.zeros((self.count, 2), np.float32)
-        self._runs = 0
+        self._runs, self._answered = 0, -1
         self._untouched, self._stepped, self._told_narrow = True, True, False
         self._now: Tick | None = None
         self._env_steps, self._reported = 0, (time.monotonic(), 0)
@@ -199,6 +199,11 @@ class Slots:
         self._show()
         return transition, np.where(now.mask, rewards_, 0.0)
 
+    def commit(self) -> None:
+        """Says that a checkpoint of yours has what was learnt so far: nobody needs the ticks before the present one."""
+        if self._answered >= 0:
+            self.source.channel.committed(self._answered)
+
     def close(self) -> None:
         """Leaves the run."""
         self.source.close(self._part())
@@ -210,7 +215,7 @@ class Slots:
             return
         self._now, self._untouched = None, True
         self.source.restart(seed)
-        self._runs += 1
+        self._runs, self._answered = self._runs + 1, -1
 
     def _checked(self, action: np.ndarray) -> np.ndarray:
         action = np.asarray(action, np.float32)
@@ -237,7 +242,7 @@ class Slots:
 
     def _restart(self) -> None:
         self.source.restart()
-        self._runs += 1
+        self._runs, self._answered = self._runs + 1, -1
 
     def _take(self) -> Tick | None:
         """The next tick of the run, or None after its last."""
@@ -277,7 +282,7 @@ class Slots:
         obs, channel = self.source.current, self.source.channel
         if obs is None:
             return
-        self.source.current = None
+        self.source.current, self._answered = None, obs.tick
         if publish:
             rows = self.task.answer(action, len(obs.vehicle))
             if self.task.drives:
