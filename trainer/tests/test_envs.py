@@ -208,6 +208,16 @@ def test_a_simulation_that_dies_is_an_exception_with_the_reason(victim: str) -> 
         assert not left_in_shared_memory(prefix)
 
 
+def test_a_simulation_that_somebody_stops_is_an_exception_that_says_so() -> None:
+    with make("town", TOWN) as simulation:
+        env = CarAwareVectorEnv(simulation)
+        env.reset()
+        assert subprocess.run([CARAWARE, "stop", simulation.run["name"]], capture_output=True).returncode == 0
+        with pytest.raises(SimulationError, match="caraware stop"):
+            for _ in range(100_000):
+                env.step(np.zeros((4, 2), np.float32))
+
+
 USER = """
     import sys, numpy as np
     from caraware.envs import CarAwareVectorEnv, make

@@ -364,3 +364,37 @@ def test_names_of_the_population_and_of_named_heroes_are_found_and_others_shown_
     run["config"]["traffic"]["hero_ids"] = ["veh7"]
     names = Names(run)
     assert names.of(id_hash("veh7")) == "veh7" and names.of(id_hash("cav.0")) == f"0x{id_hash('cav.0'):016x}"
+
+
+def test_the_driving_reward_tells_arrival_from_other_ends_and_a_time_limit_from_both() -> None:
+    from caraware.envs import rewards
+    from caraware.envs.task import Task
+    from caraware.envs.transition import Rows
+
+    run = run_file("", 5, drives=True)
+    run["config"]["observation"]["fields"] = ["route_left", "route_offset"]
+    task = Task.from_run(run)
+
+    def rows(left_m: list[float], offset_m: list[float]) -> Rows:
+        observation = np.stack((np.array(left_m) / 500 - 1, np.array(offset_m) / 5), 1).astype(np.float32)
+        truth = np.tile(np.array([0, 0, 0, 8.0], np.float32), (5, 1))
+        return Rows(task, observation, truth, truth[:, :2])
+
+    # On its way, arrived, crashed, out of time, and too far from its end for the range of `route_left`.
+    before, after = rows([100, 4, 50, 50, 1000], [0] * 5), rows([99, 4, 50, 50, 1000], [2.5, 0, 0, 0, 0])
+    terminated, truncated = np.array([0, 1, 1, 0, 0], bool), np.array([0, 0, 0, 1, 0], bool)
+    ids = np.zeros(5, np.uint64)
+    fields = (before.observation, before.truth, before.gnss_m, np.ones(5, bool), ids, ids, terminated, truncated)
+    reward = rewards.driving(Transition(task, *fields, after), np.zeros((5, 2)))
+    # 1 m of way and 2.5 m beside the line; 8 m/s for 0.1 s. Steps of 1000 m / 2²⁴ are 0.06 mm.
+    assert reward.tolist() == pytest.approx([0.1 - 0.05, 10, -10, 0, 0.08], abs=1e-4)
+
+
+def test_the_localisation_reward_is_that_of_the_configuration_at_the_tick_answered(tmp_path) -> None:
+    env = CarAwareVectorEnv(channel_of([tick(0, [30, 0]), tick(1, [90, 0]), tick(2, [1, 1])], tmp_path, 2))
+    env.reset()
+    # Predicted (100, 50) and (0, 50), true (30, 0) and (0, 0).
+    _, reward, *_, infos = env.step(np.array([[0, 0], [-1, 0]], np.float32))
+    errors_m = [np.hypot(70, 50), 50.0]
+    assert infos["error_m"].tolist() == pytest.approx(errors_m, rel=1e-5)
+    assert reward.tolist() == pytest.approx([1 / (1 + error / 5) for error in errors_m], rel=1e-5)

@@ -56,6 +56,9 @@ def driving(obs: Transition, action: np.ndarray) -> np.ndarray:
     before, after = obs.si("route_left"), obs.next.si("route_left")
     far = (before > FAR_M) | (after > FAR_M)
     progress_m = np.where(far, obs.next.truth[:, 3] * obs.tick_s, before - after)
-    beside = 0.02 * np.abs(obs.next.si("route_offset"))
+    on_the_way = progress_m / 10 - 0.02 * np.abs(obs.next.si("route_offset"))
+    ended = obs.terminated | obs.truncated
+    if not ended.any():
+        return on_the_way
     end = np.where(arrived(obs), 10.0, np.where(obs.terminated, -10.0, 0.0))
-    return np.where(obs.terminated | obs.truncated, end, progress_m / 10 - beside)
+    return np.where(ended, end, on_the_way)

@@ -31,6 +31,9 @@ RECEIVE_TIMEOUT_S = 0.2
 STOP_WITHIN_S = 40.0
 """Longest time from the request to stop to the supervisor's end; it gives its own processes 30 s."""
 
+INTERRUPTED = 130
+"""Exit code of `caraware` when somebody stopped it."""
+
 _TEMPORARY = "caraware-env-"
 
 ENDLESS = {
@@ -307,12 +310,12 @@ class _Run:
             raise SimulationError(self._message())
 
     def _message(self) -> str:
-        """What `caraware` said last: of its lines those from the error on."""
+        """What `caraware` said last: its error, or its last lines."""
         status = self.process.poll()
         file = self._messages.fileno()
         text = os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace").strip()
         _, found, error = text.rpartition("\n  × ")
-        told = f"× {error}" if found else text
+        told = f"× {error}" if found else "\n".join(text.splitlines()[-3:])
         return f"the simulation ended (caraware: {_exit_text(status)})\n{told}"
 
 
@@ -333,6 +336,8 @@ def _text(value: Any) -> str:
 def _exit_text(status: int | None) -> str:
     if status is None:
         return "still alive"
+    if status == INTERRUPTED:
+        return "stopped by a signal or `caraware stop`"
     return f"signal {-status}" if status < 0 else f"exit code {status}"
 
 
