@@ -131,6 +131,8 @@ impl Session {
                 pid: run.supervisor_pid,
             });
         }
+        // A supervisor that ends removes the files of the run, from under this process too; iceoryx2 would warn of each.
+        iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Error);
         Self::open(run, process, env_index, stop)
     }
 

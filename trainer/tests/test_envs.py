@@ -190,6 +190,9 @@ def test_seed_and_trainer_are_no_settings() -> None:
 def test_a_wrong_setting_is_told_with_the_message_of_caraware() -> None:
     with pytest.raises(SimulationError, match=r"traffic\.cavz"):
         make("town", {"traffic.cavz": 4})
+    with pytest.raises(SimulationError, match="cannot start /no/caraware"):
+        make("town", program="/no/caraware")
+    assert not list(Path(tempfile.gettempdir()).glob(f"caraware-env-{os.getpid()}-*"))
 
 
 @pytest.mark.parametrize("victim", ["sim-core", "caraware"])

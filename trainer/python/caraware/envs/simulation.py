@@ -78,7 +78,11 @@ class Simulation:
         self._temporary: _TemporaryRuns | None = None
         self._run: _Run | None = None
         _open_simulations.add(self)
-        self._start(seed)
+        try:
+            self._start(seed)
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def run(self) -> dict[str, Any]:
@@ -218,14 +222,7 @@ class _Run:
             listener.bind("\0" + name)
             listener.listen(1)
             assignments = [f"--set={key}={_text(value)}" for key, value in settings.items()]
-            self.process = subprocess.Popen(
-                [program, "train", config, "--runs", runs, *assignments],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=self._messages,
-                env=os.environ | {outside.LINE: name, outside.USER: str(os.getpid()), "PYTHONPATH": _python_path()},
-                start_new_session=True,  # Ctrl-C in a terminal is this process's affair
-            )
+            self.process = self._started([program, "train", config, "--runs", runs, *assignments], name)
             try:
                 run_file = self._wait_for_run_file(listener)
                 self.channel = Channel(run_file, outside=True)
@@ -234,6 +231,20 @@ class _Run:
                 if isinstance(error, RuntimeError) and not isinstance(error, SimulationError):
                     raise SimulationError(f"cannot join the run: {error}\n{self._message()}") from error
                 raise
+
+    def _started(self, command: list[str | Path], line: str) -> subprocess.Popen:
+        told = {outside.LINE: line, outside.USER: str(os.getpid()), "PYTHONPATH": _python_path()}
+        try:
+            return subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=self._messages,
+                env=os.environ | told,
+                start_new_session=True,  # Ctrl-C in a terminal is this process's affair
+            )
+        except OSError as error:
+            raise SimulationError(f"cannot start {command[0]}: {error.strerror}") from error
 
     def receive(self) -> Observation | None:
         while not self._queue:
@@ -313,10 +324,10 @@ class _Run:
         """What `caraware` said last: its error, or its last lines."""
         status = self.process.poll()
         file = self._messages.fileno()
-        text = os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace").strip()
-        _, found, error = text.rpartition("\n  × ")
-        told = f"× {error}" if found else "\n".join(text.splitlines()[-3:])
-        return f"the simulation ended (caraware: {_exit_text(status)})\n{told}"
+        lines = os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace").rstrip().splitlines()
+        errors = [number for number, line in enumerate(lines) if line.lstrip().startswith("×")]
+        told = lines[errors[-1] :] if errors else lines[-3:]
+        return "\n".join([f"the simulation ended (caraware: {_exit_text(status)})", *told])
 
 
 _open_simulations: weakref.WeakSet[Simulation] = weakref.WeakSet()
