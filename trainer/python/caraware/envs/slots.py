@@ -71,7 +71,7 @@ class GivenChannel:
         self.channel, self.seed = channel, int(channel.run["config"]["run"].get("seed", 0))
         self.current: Observation | None = None
         self._queue: list[Observation] = []
-        self._last = False
+        self._last, self._newest = False, -1
 
     def receive(self) -> Observation | None:
         """The next tick, or None after the last of the run."""
@@ -84,7 +84,7 @@ class GivenChannel:
         if not self._queue:
             return None
         self.current = self._queue.pop()
-        self._last = self.current.last
+        self._last, self._newest = self.current.last, self.current.tick
         return self.current
 
     def restart(self, seed: int | None = None) -> None:
@@ -98,6 +98,8 @@ class GivenChannel:
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(json.dumps(part, indent=2) + "\n")
         if self._last:
+            # There will be no successor that could want old ticks.
+            self.channel.committed(self._newest)
             self.channel.done()
 
 
