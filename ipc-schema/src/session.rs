@@ -112,6 +112,37 @@ impl Session {
         stop: Arc<AtomicBool>,
     ) -> Result<Self, SessionError> {
         end_with_supervisor(run.supervisor_pid)?;
+        Self::open(run, process, env_index, stop)
+    }
+
+    /// Joins like [`Session::join_with`] from a process that the supervisor did not start, and that outlives the run: it does not end
+    /// with the supervisor, and has to ask [`Session::supervisor_lives`] while it waits.
+    ///
+    /// # Errors
+    /// As [`Session::join`].
+    pub fn join_from_outside(
+        run: RunFile,
+        process: Process,
+        env_index: u32,
+        stop: Arc<AtomicBool>,
+    ) -> Result<Self, SessionError> {
+        if !lives(run.supervisor_pid) {
+            return Err(SessionError::Orphaned {
+                pid: run.supervisor_pid,
+            });
+        }
+        // A supervisor that ends removes the files of the run, from under this process too; iceoryx2 would warn of each.
+        iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Error);
+        Self::open(run, process, env_index, stop)
+    }
+
+    /// False once the supervisor is gone, and its parent, if that lives, has taken note of its end.
+    #[must_use]
+    pub fn supervisor_lives(&self) -> bool {
+        lives(self.run.supervisor_pid)
+    }
+
+    fn open(run: RunFile, process: Process, env_index: u32, stop: Arc<AtomicBool>) -> Result<Self, SessionError> {
         let node = services::node(&run.shared_memory)?;
         let board = BoardWriter::create(&services::open_board(&node, &run, env_index, process)?)?;
         let wake = services::open_wake(&node, &run, env_index, process)?
@@ -348,6 +379,10 @@ fn end_with_supervisor(pid: i32) -> Result<(), SessionError> {
     } else {
         Err(SessionError::Orphaned { pid })
     }
+}
+
+fn lives(pid: i32) -> bool {
+    rustix::process::Pid::from_raw(pid).is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok())
 }
 
 /// The `main` of a process binary: reads the run file named by the first argument, logs to standard error, runs `body`,

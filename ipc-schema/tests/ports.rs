@@ -244,6 +244,26 @@ fn a_process_without_its_supervisor_does_not_start() {
 }
 
 #[test]
+fn a_process_from_outside_needs_a_living_supervisor_that_is_not_its_parent() {
+    let corner = Corner::new(61);
+    let joined = |supervisor_pid: i32| {
+        let run = RunFile {
+            supervisor_pid,
+            ..corner.run.clone()
+        };
+        Session::join_from_outside(run, Process::Trainer, 0, Arc::new(AtomicBool::new(false)))
+    };
+    assert!(matches!(joined(1_000_000_000), Err(SessionError::Orphaned { .. })));
+    let mut supervisor = std::process::Command::new("sleep").arg("60").spawn().unwrap();
+    let mut session = joined(supervisor.id().try_into().unwrap()).unwrap();
+    session.attach();
+    assert!(session.supervisor_lives());
+    supervisor.kill().unwrap();
+    supervisor.wait().unwrap();
+    assert!(!session.supervisor_lives());
+}
+
+#[test]
 fn a_run_file_of_another_version_is_refused() {
     let corner = Corner::new(7);
     RunFile {

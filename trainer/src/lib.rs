@@ -50,9 +50,11 @@ struct Attached {
     driven: Option<Waker>,
     training: TrainingStatus,
     ended: bool,
+    /// The supervisor did not start this process, which does not end with it.
+    outside: bool,
 }
 
-/// A trainer's place in a run: one for each process.
+/// A trainer's place in a run: one for each process that the supervisor started, any number for one from outside.
 #[pyclass(frozen, module = "caraware._native")]
 struct Attachment {
     inner: Mutex<Attached>,
@@ -63,12 +65,20 @@ struct Attachment {
 #[pymethods]
 impl Attachment {
     /// Joins the run that `run_file` describes and opens its ports; producers may send from now on.
+    ///
+    /// With `outside` this process is none that the supervisor started. It does not end with the supervisor; `receive` raises instead.
     #[new]
-    fn new(run_file: &str) -> PyResult<Self> {
+    #[pyo3(signature = (run_file, *, outside=false))]
+    fn new(run_file: &str, outside: bool) -> PyResult<Self> {
         let run = RunFile::read(Path::new(run_file)).map_err(|error| failed(&error))?;
         let run_json = std::fs::read_to_string(run_file).map_err(|error| failed(&error))?;
         let stop = Arc::new(AtomicBool::new(false));
-        let mut session = Session::join_with(run, Process::Trainer, 0, stop).map_err(session_failed)?;
+        let join = if outside {
+            Session::join_from_outside
+        } else {
+            Session::join_with
+        };
+        let mut session = join(run, Process::Trainer, 0, stop).map_err(session_failed)?;
         let observations = session.subscriber(Service::Observation).map_err(session_failed)?;
         let predictions = session.publisher(Service::Prediction).map_err(session_failed)?;
         let driven = match session.run.config.drives() {
@@ -84,6 +94,7 @@ impl Attachment {
             driven,
             training: TrainingStatus::default(),
             ended: false,
+            outside,
         };
         Ok(Self {
             inner: Mutex::new(attached),
@@ -104,7 +115,7 @@ impl Attachment {
             if left.is_zero() {
                 return Ok(blocks);
             }
-            py.detach(|| self.lock()?.session.wait(left.min(LOOK)).map_err(session_failed))?;
+            py.detach(|| self.wait(left.min(LOOK)))?;
             py.check_signals()?;
         }
     }
@@ -226,6 +237,15 @@ impl Attachment {
         self.inner
             .lock()
             .map_err(|_| PyRuntimeError::new_err("an earlier call failed in the middle: attach anew"))
+    }
+
+    fn wait(&self, timeout: Duration) -> PyResult<()> {
+        let inner = self.lock()?;
+        if inner.outside && !inner.session.supervisor_lives() {
+            let pid = inner.session.run.supervisor_pid;
+            return Err(session_failed(SessionError::Orphaned { pid }));
+        }
+        inner.session.wait(timeout).map_err(session_failed)
     }
 
     fn take_waiting(&self) -> PyResult<Vec<ObservationBlock>> {
@@ -362,6 +382,12 @@ impl ObservationBlock {
     }
 }
 
+/// Hash of a SUMO id, as it stands in `id_hash` of an observation.
+#[pyfunction]
+fn id_hash(id: &str) -> u64 {
+    ipc_schema::traffic::id_hash(id)
+}
+
 /// The module.
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -369,6 +395,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<ObservationBlock>()?;
     module.add_class::<SectionView>()?;
     module.add_class::<PointCloud>()?;
+    module.add_function(wrap_pyfunction!(id_hash, module)?)?;
     module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
     module.add("VALID", ipc_schema::observation::VALID)?;
     module.add("TERMINATED", ipc_schema::observation::TERMINATED)?;

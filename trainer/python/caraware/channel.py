@@ -166,10 +166,14 @@ class Observation:
 
 
 class Channel:
-    """A trainer's place in a run. One for each process; opening it lets the simulation start."""
+    """A trainer's place in a run. One for each process; opening it lets the simulation start.
 
-    def __init__(self, run_file: str) -> None:
-        self._attachment = _native.Attachment(run_file)
+    `outside` is for a process that the supervisor did not start (`caraware.envs.make`): it does not end with the run,
+    and may have places in several.
+    """
+
+    def __init__(self, run_file: str, *, outside: bool = False) -> None:
+        self._attachment = _native.Attachment(run_file, outside=outside)
         self.run: dict[str, Any] = json.loads(self._attachment.run_json)
 
     def receive(self, timeout_s: float) -> list[Observation]:
@@ -221,3 +225,7 @@ class Channel:
     def done(self) -> None:
         """All work is done: the process may end."""
         self._attachment.done()
+
+    def close(self) -> None:
+        """Lets go of the run's shared memory, whoever still holds this object, which is of no use afterwards."""
+        del self._attachment

@@ -1,0 +1,66 @@
+"""Fields of an observation by name: their places in a row and their ranges (docs/driving.md, configs/README.md)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+class UnknownFieldError(KeyError):
+    """The observation has no such field, or its range is not known here."""
+
+
+@dataclass(frozen=True)
+class Fields:
+    """The columns of an observation row of one run."""
+
+    names: tuple[str, ...]
+    """In the order of the columns of one tick; with a history, the newest tick comes last."""
+    history: int
+    low: float
+    """Lower end of the normalised range; the upper one is 1."""
+    _ranges: dict[str, tuple[float, float]]
+
+    @classmethod
+    def from_run(cls, run: dict) -> Fields:
+        """The fields that the run file names."""
+        settings = run["config"]["observation"]
+        low = 0.0 if settings.get("scale") == "zero_to_one" else -1.0
+        return cls(tuple(settings["fields"]), int(settings.get("history", 1)), low, _ranges(run))
+
+    @property
+    def width(self) -> int:
+        """Numbers in a row."""
+        return len(self.names) * self.history
+
+    def si(self, observation: np.ndarray, name: str) -> np.ndarray:
+        """Field `name` of rows `[..., d]` in SI units, `[...]`; of the newest tick. Clipped at the field's range."""
+        if name not in self.names or name not in self._ranges:
+            known = ", ".join(field for field in self.names if field in self._ranges)
+            raise UnknownFieldError(f"no field {name!r} with a known range in the observation; there are: {known}")
+        low, high = self._ranges[name]
+        place = (self.history - 1) * len(self.names) + self.names.index(name)
+        unit = (observation[..., place].astype(np.float64) - self.low) / (1.0 - self.low)
+        return low + unit * (high - low)
+
+
+def _ranges(run: dict) -> dict[str, tuple[float, float]]:
+    settings, lidar = run["config"]["observation"], run["config"].get("lidar", {})
+    x_min, y_min, x_max, y_max = run["map"]["bounds_m"]
+    ranges = {"gnss_x": (x_min, x_max), "gnss_y": (y_min, y_max), "compass": (0.0, math.tau)}
+    ranges |= {f"accel_{axis}": _both(settings["accel_range_mps2"]) for axis in "xyz"}
+    ranges |= {f"gyro_{axis}": _both(settings["gyro_range_radps"]) for axis in "xyz"}
+    ranges |= dict.fromkeys(("speed", "speed_limit", "leader_speed"), (0.0, settings["speed_range_mps"]))
+    ranges |= {f"route_{axis}_{ahead}": _both(ahead) for axis in "xy" for ahead in (5, 10, 20, 40)}
+    ranges |= {"steering": _both(settings["steering_range_rad"]), "route_offset": _both(5), "route_left": (0.0, 1e3)}
+    ranges |= dict.fromkeys(("leader_gap", "signal_gap"), (0.0, 100.0)) | {"gnss_accuracy": (0.0, 50.0)}
+    for sensor in ("gnss", "imu", "speed_steering"):
+        ranges |= {f"{sensor}_age": (0.0, settings.get("age_range_s", 10.0)), f"{sensor}_valid": (0.0, 1.0)}
+    reach_m = lidar.get("range_m", 100.0)
+    return ranges | {f"object_{i}_{axis}": _both(reach_m) for i in range(1, 5) for axis in "xy"}
+
+
+def _both(limit: float) -> tuple[float, float]:
+    return (-float(limit), float(limit))

@@ -1,0 +1,91 @@
+"""Stable-Baselines3's `VecEnv`: every slot is a sub-environment, without a wrapper between."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
+
+from caraware.envs.rewards import Reward
+from caraware.envs.slots import Policy, Slots, Source
+from caraware.envs.transition import Transition
+from caraware.stream import Channel
+
+
+class CarAwareVecEnv(VecEnv):
+    """Slots as sub-environments that reset themselves.
+
+    `infos[i]["mask"]` is False where slot i holds no vehicle: its observation is zero, its action not used, its reward
+    0. Stable-Baselines3 has no way to leave such rows out; they make up the beginning of a trajectory. At the end of
+    one `infos[i]` has `terminal_observation`, `TimeLimit.truncated`, and the `episode` that `Monitor` would give.
+
+    `evaluation_policy` answers the evaluation episodes of a run that `caraware` started.
+    """
+
+    def __init__(
+        self,
+        source: Source | Channel,
+        num_envs: int | None = None,
+        reward: Reward | None = None,
+        evaluation_policy: Policy | None = None,
+    ) -> None:
+        self.slots = Slots(source, num_envs, reward, evaluation_policy)
+        task = self.slots.task
+        self.render_mode = None
+        self._returns = np.zeros(self.slots.count)
+        self._lengths = np.zeros(self.slots.count, np.int64)
+        super().__init__(self.slots.count, task.observation_space(), task.action_space())
+
+    def reset(self) -> np.ndarray:
+        """First observation `[N, d]`; the seed is the first of those that `seed()` set."""
+        tick = self.slots.reset(self._seeds[0])
+        self._reset_seeds()
+        self._reset_options()
+        self._returns[:], self._lengths[:] = 0.0, 0
+        self.reset_infos = [{"mask": bool(held)} for held in tick.mask]
+        return tick.rows.observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Remembers the actions; in the driving task the world waits for them in `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """One tick: observations `[N, d]`, rewards and done `[N]`, infos."""
+        transition, reward = self.slots.step(self._actions)
+        self._returns += reward
+        self._lengths += transition.mask
+        infos: list[dict[str, Any]] = [{"mask": held} for held in self.slots.now.mask.tolist()]
+        done = transition.terminated | transition.truncated
+        for slot in np.flatnonzero(done):
+            infos[slot] |= self._last_words(transition, int(slot))
+        self._returns[done], self._lengths[done] = 0.0, 0
+        return self.slots.now.rows.observation, reward.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        """Ends the simulation, or the part in it."""
+        self.slots.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """The attribute of this environment, once for each index: sub-environments have none of their own."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Sets the attribute of this environment."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """Refused: sub-environments have no methods of their own."""
+        raise NotImplementedError(f"{method_name}: slots share one simulation and have no methods of their own")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> Sequence[bool]:
+        """Nothing is wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _last_words(self, transition: Transition, slot: int) -> dict[str, Any]:
+        return {
+            "terminal_observation": transition.observation[slot].copy(),
+            "TimeLimit.truncated": bool(transition.truncated[slot]),
+            "episode": {"r": float(self._returns[slot]), "l": int(self._lengths[slot]), "t": 0.0},
+        }

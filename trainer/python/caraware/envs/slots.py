@@ -1,0 +1,417 @@
+"""The one loop behind all faces: answers a tick, takes the next, and tells how trajectories went on.
+
+A slot at tick k + 1 tells how the trajectory that held it at k ended; by then a new one may hold it. So a step from k
+to k + 1 gives, for each slot, the reward of k's action, whether k was the last tick of its trajectory, and the row of
+k + 1, which is that of another vehicle where a trajectory ended.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from caraware import _native
+from caraware.channel import StreamEndedError
+from caraware.envs import rewards
+from caraware.envs.task import Task
+from caraware.envs.transition import Rows, Transition
+from caraware.stream import EMPTY_SLOT, Channel, Observation
+
+log = logging.getLogger(__name__)
+
+RUN_ON_TICKS = 2000
+"""A reset in an episode with more ticks left than this starts a new run instead of running on to the end."""
+REPORT_S = 1.0
+"""Time between two reports of the status."""
+
+Policy = Callable[[np.ndarray], np.ndarray]
+"""`observation f32 [N, d] -> action [N, 2]`."""
+
+
+class RunEndedError(Exception):
+    """The last tick of a run that `caraware` started has been taken: there is nothing to step any more."""
+
+
+class Source(Protocol):
+    """Where ticks come from."""
+
+    channel: Any
+    """The trainer's place in the present run."""
+    seed: int
+    """Seed of the present run."""
+    can_restart: bool
+    current: Observation | None
+    """The tick received last. Nobody else may keep it: memory of a run must be let go before the run is left."""
+
+    def receive(self) -> Observation | None:
+        """The next tick, or None after the last of the run."""
+
+    def restart(self, seed: int | None = None) -> None:
+        """Begin another run, where that is possible."""
+
+    def close(self, part: dict | None = None) -> None:
+        """Leave the run; `part` goes into its report."""
+
+
+class GivenChannel:
+    """A channel that somebody opened, in a process that the supervisor started by `trainer.module`."""
+
+    can_restart = False
+
+    def __init__(self, channel: Channel) -> None:
+        self.channel, self.seed = channel, int(channel.run["config"]["run"].get("seed", 0))
+        self.current: Observation | None = None
+        self._queue: list[Observation] = []
+        self._last, self._newest = False, -1
+
+    def receive(self) -> Observation | None:
+        """The next tick, or None after the last of the run."""
+        self.current = None
+        while not self._queue and not self._last:
+            try:
+                self._queue = list(self.channel.receive(0.2))[::-1]
+            except StreamEndedError:
+                self._last = True
+        if not self._queue:
+            return None
+        self.current = self._queue.pop()
+        self._last, self._newest = self.current.last, self.current.tick
+        return self.current
+
+    def restart(self, seed: int | None = None) -> None:
+        """Never called: the run is its supervisor's."""
+        raise RunEndedError
+
+    def close(self, part: dict | None = None) -> None:
+        """Write the trainer's part of the report; say that all is done, if it is."""
+        if part is not None:
+            file = Path(self.channel.run["run_dir"], "parts", "trainer.json")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(part, indent=2) + "\n")
+        if self._last:
+            # There will be no successor that could want old ticks.
+            self.channel.committed(self._newest)
+            self.channel.done()
+
+
+@dataclass(frozen=True)
+class Tick:
+    """One tick of all N slots, copied out of shared memory; rows without a vehicle are zero."""
+
+    over: bool
+    """True beyond the end of the run: there is nothing to answer."""
+    evaluation: bool
+    sim_time_ns: int
+    episode: tuple[int, int]
+    """Number of the run and of the episode in it."""
+    rows: Rows
+    mask: np.ndarray
+    vehicle: np.ndarray
+    id_hash: np.ndarray
+    terminated: np.ndarray
+    """Of the trajectory that held the slot a tick before."""
+    truncated: np.ndarray
+
+
+class Slots:
+    """All slots of a source of ticks, stepped together."""
+
+    def __init__(
+        self,
+        source: Source | Channel,
+        num_envs: int | None = None,
+        reward: rewards.Reward | None = None,
+        evaluation_policy: Policy | None = None,
+    ) -> None:
+        self.source: Source = source if hasattr(source, "can_restart") else GivenChannel(source)  # type: ignore[assignment]
+        self.task = Task.from_run(self.source.channel.run)
+        wanted = num_envs or self.task.slots
+        if not wanted:
+            raise ValueError("a scenario does not say how many vehicles sense at a time: give num_envs")
+        self.count = int(wanted)
+        self._reward = reward or rewards.default(self.task)
+        self._evaluation_policy, self._evaluation = evaluation_policy, _Errors()
+        self._raw_evaluation = _Errors()
+        self._idle = np.zeros((self.count, 2), np.float32)
+        self._runs, self._answered = 0, -1
+        self._untouched, self._stepped, self._told_narrow = True, True, False
+        self._now: Tick | None = None
+        self._env_steps, self._reported = 0, (time.monotonic(), 0)
+
+    @property
+    def now(self) -> Tick:
+        """The tick to be answered next."""
+        if self._now is None:
+            raise RuntimeError("call reset() before step()")
+        return self._now
+
+    @property
+    def over(self) -> bool:
+        """True beyond the end of a run that cannot be started anew."""
+        return self._now is not None and self._now.over
+
+    def reset(self, seed: int | None) -> Tick:
+        """The first tick of a run with `seed`; without, of the next episode."""
+        if seed is not None and not (self._untouched and seed == self.source.seed):
+            self._reseed(int(seed))
+        self._refuse_end()
+        if self._now is None:
+            self._now = self._settle(self._take())
+        elif self._stepped and not self._untouched:
+            self._now = self._next_episode(self._now)
+        self._stepped = False
+        self._refuse_end()
+        return self.now
+
+    def seek(self, slot: int) -> Tick:
+        """Runs on to the first tick at which `slot` holds a vehicle."""
+        while not self.now.mask[slot]:
+            self._refuse_end()
+            self._answer(self._idle)
+            self._now = self._settle(self._take())
+        return self.now
+
+    def step(self, action: np.ndarray) -> tuple[Transition, np.ndarray]:
+        """Answers the present tick with actions `[N, 2]` and goes on to the next.
+
+        Returns what happened and its rewards, f64 `[N]`.
+        """
+        now = self.now
+        self._refuse_end()
+        action = self._checked(action)
+        self._answer(action)
+        following = self._take()
+        self._untouched, self._stepped = False, True
+        transition = self._transition(now, following)
+        self._env_steps += int(np.count_nonzero(now.mask))
+        with np.errstate(all="ignore"):
+            rewards_ = np.asarray(self._reward(transition, action), np.float64)
+        if rewards_.shape != (self.count,):
+            raise ValueError(f"the reward function gave shape {rewards_.shape}, one number a slot is ({self.count},)")
+        self._now = self._settle(following)
+        self._show()
+        return transition, np.where(now.mask, rewards_, 0.0)
+
+    def commit(self) -> None:
+        """Says that a checkpoint of yours has what was learnt so far: nobody needs the ticks before the present one."""
+        if self._answered >= 0:
+            self.source.channel.committed(self._answered)
+
+    def close(self) -> None:
+        """Leaves the run."""
+        self.source.close(self._part())
+
+    def _reseed(self, seed: int) -> None:
+        if not self.source.can_restart:
+            message = f"seed {seed} cannot begin this run anew: caraware started it, with `run.seed` {self.source.seed}"
+            warnings.warn(message, stacklevel=4)
+            return
+        self._now, self._untouched = None, True
+        self.source.restart(seed)
+        self._runs, self._answered = self._runs + 1, -1
+
+    def _checked(self, action: np.ndarray) -> np.ndarray:
+        action = np.asarray(action, np.float32)
+        if action.shape != (self.count, 2):
+            raise ValueError(f"actions of shape {action.shape}, {self.count} slots take ({self.count}, 2)")
+        return action
+
+    def _refuse_end(self) -> None:
+        if self.over:
+            raise RunEndedError("the run has ended: its last tick has been answered")
+
+    def _next_episode(self, tick: Tick) -> Tick:
+        if self.source.can_restart and self._ticks_left(tick) > RUN_ON_TICKS:
+            self._restart()
+            return self._settle(self._take())
+        episode = tick.episode
+        while tick.episode == episode:
+            self._answer(self._idle)
+            tick = self._settle(self._take())
+        return tick
+
+    def _ticks_left(self, tick: Tick) -> float:
+        return self.task.episode_ticks - tick.sim_time_ns / (self.task.tick_s * 1e9)
+
+    def _restart(self) -> None:
+        self.source.restart()
+        self._runs, self._answered = self._runs + 1, -1
+
+    def _take(self) -> Tick | None:
+        """The next tick of the run, or None after its last."""
+        obs = self.source.receive()
+        return None if obs is None else self._copied(obs)
+
+    def _settle(self, tick: Tick | None) -> Tick:
+        """Runs on to the first tick that asks for a decision: not an evaluation's, with a vehicle in some slot."""
+        while True:
+            if tick is None:
+                if not self.source.can_restart:
+                    return self._nobody()
+                self._restart()
+            elif tick.evaluation:
+                self._evaluate(tick)
+            elif tick.mask.any():
+                return tick
+            else:
+                self._answer(self._idle)
+            tick = self._take()
+
+    def _evaluate(self, tick: Tick) -> None:
+        """Answers a tick of an evaluation, which nobody learns from."""
+        if self._evaluation_policy is None:
+            self._answer(self._idle, publish=self.task.drives)
+            return
+        if self._evaluation.episode is None or tick.episode[1] > self._evaluation.episode + 1:
+            self._evaluation, self._raw_evaluation = _Errors(), _Errors()
+        action = self._checked(self._evaluation_policy(tick.rows.observation))
+        self._answer(action)
+        if not self.task.drives:
+            self._evaluation.add(tick, self.task.to_world_m(action))
+            self._raw_evaluation.add(tick, tick.rows.gnss_m)
+
+    def _answer(self, action: np.ndarray, *, publish: bool = True) -> None:
+        """Answers the tick received last, once: an interrupted step may be taken again."""
+        obs, channel = self.source.current, self.source.channel
+        if obs is None:
+            return
+        self.source.current, self._answered = None, obs.tick
+        if publish:
+            rows = self.task.answer(action, len(obs.vehicle))
+            if self.task.drives:
+                channel.publish_actions(obs, rows)
+            else:
+                channel.publish_predictions(obs, torch.from_numpy(rows), 0)
+        if obs.last or (obs.tick + 1) % self.task.credit_ticks == 0:
+            channel.consumed(obs.tick)
+            if self.source.can_restart:
+                # Nobody asks for old ticks again: the run does not outlive this process.
+                channel.committed(obs.tick)
+
+    def _copied(self, obs: Observation) -> Tick:
+        n = self.count
+        vehicle = _padded(obs.vehicle, n, EMPTY_SLOT)
+        mask = _padded(obs.valid, n) & (vehicle != EMPTY_SLOT)
+        observation = _padded(_array(obs, "observation"), n)
+        if self.task.dark_is_nan:
+            np.nan_to_num(observation, copy=False)
+        if observation.shape[1] != self.task.fields.width:
+            raise ValueError(f"rows of {observation.shape[1]} numbers, the run file tells {self.task.fields.width}")
+        truth, gnss_m = _padded(_array(obs, "truth"), n), _padded(_array(obs, "gnss_m")[:, :2], n)
+        if not mask.all():
+            for rows in (observation, truth, gnss_m):
+                rows[~mask] = 0
+        if len(obs.vehicle) > n and not self._told_narrow and np.any(obs.vehicle[n:] != EMPTY_SLOT):
+            log.warning("%d slots, of which this environment has the first %d", len(obs.vehicle), n)
+            self._told_narrow = True
+        return Tick(
+            over=False,
+            evaluation=obs.evaluation,
+            sim_time_ns=obs.sim_time_ns,
+            episode=(self._runs, obs.episode),
+            rows=Rows(self.task, observation, truth, gnss_m),
+            mask=mask,
+            vehicle=vehicle,
+            id_hash=_padded(getattr(obs, "id_hash", obs.vehicle).astype(np.uint64), n),
+            terminated=_padded(obs.terminated, n),
+            truncated=_padded(obs.truncated, n),
+        )
+
+    def _nobody(self) -> Tick:
+        """Beyond the last tick of a run."""
+        n, nobody = self.count, np.zeros(self.count, bool)
+        zeros = [np.zeros((n, width), np.float32) for width in (self.task.fields.width, 4, 2)]
+        vehicle = np.full(n, EMPTY_SLOT, np.uint32)
+        ids = np.zeros(n, np.uint64)
+        episode, rows = (self._runs + 1, 0), Rows(self.task, *zeros)
+        return Tick(True, False, 0, episode, rows, nobody, vehicle, ids, nobody, nobody)
+
+    def _transition(self, now: Tick, following: Tick | None) -> Transition:
+        if following is None:
+            terminated, truncated, after = np.zeros(self.count, bool), now.mask.copy(), now.rows
+        else:
+            terminated = now.mask & following.terminated
+            same = following.mask & (following.vehicle == now.vehicle) & (following.episode == now.episode)
+            # A slot that changed hands or has a gap without a flag: its trajectory went on unseen.
+            truncated = now.mask & ~terminated & (following.truncated | ~same)
+            after = _where(terminated | truncated, now.rows, following.rows)
+        return Transition(
+            task=self.task,
+            observation=now.rows.observation,
+            truth=now.rows.truth,
+            gnss_m=now.rows.gnss_m,
+            mask=now.mask,
+            vehicle=now.vehicle,
+            id_hash=now.id_hash,
+            terminated=terminated,
+            truncated=truncated,
+            next=after,
+        )
+
+    def _show(self) -> None:
+        clock, (since, steps) = time.monotonic(), self._reported
+        if clock - since < REPORT_S:
+            return
+        rate = (self._env_steps - steps) / (clock - since)
+        self._reported = (clock, self._env_steps)
+        self.source.channel.report(episode=self.now.episode[1], env_steps=self._env_steps, env_steps_per_s=rate)
+
+    def _part(self) -> dict:
+        """The trainer's part of the run's report."""
+        part: dict[str, Any] = {"env_steps": self._env_steps}
+        if self._evaluation.count:
+            part["ppo_mean_error_m"] = self._evaluation.mean_m()
+            part["raw_gnss_mean_error_m"] = self._raw_evaluation.mean_m()
+        return part
+
+
+class _Errors:
+    """Mean distance to the truth over one phase of evaluation episodes."""
+
+    def __init__(self) -> None:
+        self.episode: int | None = None
+        self.count, self._sum_m = 0, 0.0
+
+    def add(self, tick: Tick, place_m: np.ndarray) -> None:
+        away = np.asarray(place_m, np.float64) - tick.rows.truth[:, :2]
+        self._sum_m += float(np.hypot(away[:, 0], away[:, 1])[tick.mask].sum())
+        self.count += int(np.count_nonzero(tick.mask))
+        self.episode = tick.episode[1]
+
+    def mean_m(self) -> float:
+        return self._sum_m / self.count
+
+
+def _array(obs: Observation, name: str) -> np.ndarray:
+    """f32 `[n, …]` of a tick. Straight from shared memory where it lies there: a tensor on the way takes 20 µs."""
+    block = getattr(obs, "block", None)
+    if block is None:
+        return getattr(obs, name).numpy()
+    columns = {"observation": block.fields, "truth": _native.TRUTH_COLUMNS, "gnss_m": _native.GNSS_COLUMNS}[name]
+    return np.frombuffer(block.section(name), np.float32).reshape(block.slots, columns)
+
+
+def _padded(values: np.ndarray, n: int, empty: int = 0) -> np.ndarray:
+    """A copy of the first `n` rows, filled up to `n` where there are fewer."""
+    if len(values) >= n:
+        return values[:n].copy()
+    rows = np.full((n, *values.shape[1:]), empty, values.dtype)
+    rows[: len(values)] = values
+    return rows
+
+
+def _where(ended: np.ndarray, now: Rows, following: Rows) -> Rows:
+    """The following rows, those of `now` where `ended`."""
+    if not ended.any():
+        return following
+    pairs = ((now.observation, following.observation), (now.truth, following.truth), (now.gnss_m, following.gnss_m))
+    return Rows(now.task, *(np.where(ended[:, None], old, new) for old, new in pairs))

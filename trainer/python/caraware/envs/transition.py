@@ -1,0 +1,53 @@
+"""What one step of all slots was: the material of rewards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from caraware.envs.task import Task
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What all slots are at one tick. Row `i` is slot `i`; rows without a vehicle are zero."""
+
+    task: Task
+    observation: np.ndarray
+    """f32 `[N, d]`, normalised."""
+    truth: np.ndarray
+    """f32 `[N, 4]`: x and y of the rear axle (m, world), yaw (rad), speed (m/s). No policy may see it."""
+    gnss_m: np.ndarray
+    """f32 `[N, 2]`: newest raw GNSS fix (m, world)."""
+
+    def si(self, field: str) -> np.ndarray:
+        """f64 `[N]`: a field of the observation in SI units, such as `si("leader_gap")`; clipped at its range."""
+        return self.task.fields.si(self.observation, field)
+
+
+@dataclass(frozen=True)
+class Transition(Rows):
+    """One tick that has been answered, and what came of it."""
+
+    mask: np.ndarray
+    """bool `[N]`: the slot holds a vehicle. Other rows earn nothing, whatever a reward says of them."""
+    vehicle: np.ndarray
+    """u32 `[N]`: dense index within the simulation's episode."""
+    id_hash: np.ndarray
+    """u64 `[N]`: hash of the vehicle's SUMO id."""
+    terminated: np.ndarray
+    """bool `[N]`: the trajectory ended with this tick."""
+    truncated: np.ndarray
+    """bool `[N]`: it was cut after this tick."""
+    next: Rows
+    """A tick later; for trajectories that ended, this tick again: they have no other."""
+
+    @property
+    def tick_s(self) -> float:
+        """Time between the two, seconds."""
+        return self.task.tick_s
+
+    def to_world_m(self, action: np.ndarray) -> np.ndarray:
+        """Actions `[N, 2]` of the localisation task as positions in world metres."""
+        return self.task.to_world_m(action)

@@ -1,0 +1,98 @@
+"""`gymnasium.vector.VectorEnv`: every slot is a sub-environment, all of them in one world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from caraware.envs.rewards import Reward, error_m
+from caraware.envs.slots import Policy, Slots, Source, Tick
+from caraware.envs.transition import Transition
+from caraware.stream import Channel
+
+
+class CarAwareVectorEnv(VectorEnv):
+    """Slots as sub-environments with SAME_STEP autoreset.
+
+    `infos["mask"]` (bool `[N]`) tells which slots hold a vehicle. A row without one is zero, earns 0 and its action is
+    not used; it is the time before the next trajectory of that slot. Where a trajectory ended, `infos["final_obs"]` has
+    its last observation and `infos["final_info"]` what else is known of it. Further keys: `vehicle`, `id_hash`, `truth`
+    of the rows returned, and in the localisation task `error_m` of the actions taken.
+
+    A `num_envs` other than `traffic.cavs` or the number of heroes takes the first slots only. `evaluation_policy`
+    answers the evaluation episodes of a run that `caraware` started; nobody steps or learns from those.
+    """
+
+    def __init__(
+        self,
+        source: Source | Channel,
+        num_envs: int | None = None,
+        reward: Reward | None = None,
+        evaluation_policy: Policy | None = None,
+    ) -> None:
+        self.slots = Slots(source, num_envs, reward, evaluation_policy)
+        self.num_envs = self.slots.count
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.render_mode, self.spec = None, None
+        self.single_observation_space = self.slots.task.observation_space()
+        self.single_action_space = self.slots.task.action_space()
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._all = np.ones(self.num_envs, bool)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """First observation `[N, d]` of a run with `seed`; without, of the simulation's next episode.
+
+        All slots share a world, so there is one seed: of a list the first counts.
+        """
+        if options and "reset_mask" in options:
+            raise ValueError(
+                "slots share a world and cannot be reset one by one; SAME_STEP autoreset needs no reset_mask"
+            )
+        if isinstance(seed, list | tuple):
+            seed = seed[0]
+        super().reset(seed=seed)
+        tick = self.slots.reset(seed)
+        return tick.rows.observation, self._info(tick)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Observations `[N, d]`, rewards, terminated, truncated `[N]`, infos."""
+        transition, reward = self.slots.step(actions)
+        tick = self.slots.now
+        infos = self._info(tick)
+        if not self.slots.task.drives:
+            infos |= {
+                "error_m": np.where(transition.mask, error_m(transition, actions), 0.0),
+                "_error_m": transition.mask,
+            }
+        ended = transition.terminated | transition.truncated
+        if ended.any():
+            infos |= _final(transition, ended)
+        return tick.rows.observation, reward, transition.terminated, transition.truncated, infos
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Ends the simulation, or the part in it."""
+        self.slots.close()
+
+    def _info(self, tick: Tick) -> dict[str, Any]:
+        known = {"vehicle": tick.vehicle, "id_hash": tick.id_hash, "truth": tick.rows.truth}
+        infos: dict[str, Any] = {"mask": tick.mask, "_mask": self._all}
+        for key, value in known.items():
+            infos[key], infos[f"_{key}"] = value, tick.mask
+        return infos
+
+
+def _final(transition: Transition, ended: np.ndarray) -> dict[str, Any]:
+    """Gymnasium's keys for trajectories that ended in this step."""
+    final_obs = np.full(len(ended), None, dtype=object)
+    for slot in np.flatnonzero(ended):
+        final_obs[slot] = transition.observation[slot].copy()
+    info: dict[str, Any] = {}
+    for key in ("vehicle", "id_hash", "truth"):
+        info[key], info[f"_{key}"] = getattr(transition, key), ended
+    return {"final_obs": final_obs, "_final_obs": ended, "final_info": info, "_final_info": ended}

@@ -1,0 +1,400 @@
+"""How trajectories in slots become episodes of standard faces: hand-made ticks, no simulation."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from caraware.envs import CarAwareEnv, CarAwareParallelEnv, CarAwareVecEnv, CarAwareVectorEnv, RunEndedError, Transition
+from caraware.envs.fields import Fields, UnknownFieldError
+from caraware.envs.names import Names
+from caraware.envs.slots import RUN_ON_TICKS
+from caraware.stream import EMPTY_SLOT
+from synthetic import SyntheticChannel, SyntheticObservation
+
+E = EMPTY_SLOT
+FIELDS = ["gnss_x", "gnss_y", "speed"]
+
+
+def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: int = 1000) -> dict:
+    """A run file of population control."""
+    observation = {"fields": FIELDS, "accel_range_mps2": 20.0, "gyro_range_radps": 2.0, "speed_range_mps": 30.0}
+    config = {
+        "run": {"seed": 5, "tick_s": 0.1},
+        "task": {"kind": "driving" if drives else "localisation"},
+        "traffic": {"cavs": slots, "heroes": slots, "pedestrians": 0},
+        "episode": {"ticks": episode_ticks},
+        "observation": observation | {"steering_range_rad": 10.0},
+        "gnss": {},
+        "trainer": {},
+    }
+    return {
+        "run_dir": run_dir,
+        "config": config,
+        "map": {"bounds_m": [0.0, 0.0, 200.0, 100.0]},
+        "source": {"population": {}},
+    }
+
+
+def tick(number: int, vehicles: list[int], terminated: tuple = (), truncated: tuple = (), **more: object):
+    """A tick whose rows say which vehicle and tick they are of: observation = truth = [vehicle, tick, …] / 1000."""
+    vehicle = np.array(vehicles, np.uint32)
+    valid = vehicle != E
+    # Rows without a vehicle hold rubbish: whoever uses them is found out.
+    who = np.where(valid, vehicle.astype(float), 777.0)
+    rows = np.stack((who / 1000, np.full(len(who), number / 1000), np.zeros(len(who))), 1).astype(np.float32)
+    truth = np.concatenate((rows[:, :2] * 1000, np.zeros((len(who), 2), np.float32)), 1)
+    flags = [np.isin(np.arange(len(who)), np.array(slots, int)) for slots in (terminated, truncated)]
+    tensors = [torch.from_numpy(values) for values in (rows, truth, truth[:, :2].copy())]
+    return SyntheticObservation(number, *tensors, vehicle, valid, *flags, **more)
+
+
+@dataclass
+class DrivingChannel(SyntheticChannel):
+    """Remembers actions too, and gives one tick at a time: the world waits."""
+
+    group: int = 1
+
+    def __post_init__(self) -> None:
+        self.actions: dict[int, np.ndarray] = {}
+
+    def publish_actions(self, observation: SyntheticObservation, actions: np.ndarray, policy_version: int = 0) -> None:
+        """Remember the actions; each tick is answered once."""
+        assert observation.tick not in self.actions
+        assert actions.shape == (len(observation.vehicle), 2)
+        self.actions[observation.tick] = actions.copy()
+
+
+def channel_of(ticks: list[SyntheticObservation], tmp_path, slots: int, **options: object) -> DrivingChannel:
+    """A channel over these ticks, the last of which ends the run."""
+    ticks = [*ticks[:-1], replace(ticks[-1], last=True)]
+    return DrivingChannel(run_file(str(tmp_path), slots, **options), iter(ticks))
+
+
+def who(observation: np.ndarray) -> list[int]:
+    """Vehicles that rows are of."""
+    return np.rint(observation[..., 0] * 1000).astype(int).tolist()
+
+
+def when(observation: np.ndarray) -> list[int]:
+    """Ticks that rows are of."""
+    return np.rint(observation[..., 1] * 1000).astype(int).tolist()
+
+
+def which(obs: Transition, action: np.ndarray) -> np.ndarray:
+    """A reward that tells whom it was given: vehicle, and a thousandth of the tick answered."""
+    return obs.truth[:, 0].astype(np.float64) + obs.truth[:, 1] / 1000
+
+
+NOTHING = np.zeros((2, 2), np.float32)
+
+
+def test_a_terminated_trajectory_keeps_its_last_observation_and_the_slot_is_empty_until_the_next(tmp_path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [1, E], terminated=(1,)), tick(2, [1, 3]), tick(3, [1, 3])]
+    env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2), reward=which)
+    observation, infos = env.reset()
+    assert who(observation) == [1, 2] and infos["mask"].tolist() == [True, True]
+
+    observation, reward, terminated, truncated, infos = env.step(NOTHING)
+    assert terminated.tolist() == [False, True] and truncated.tolist() == [False, False]
+    assert reward.tolist() == pytest.approx([1.0, 2.0])  # of tick 0, whose action it was
+    assert infos["mask"].tolist() == [True, False] and observation[1].tolist() == [0, 0, 0]
+    assert infos["final_obs"][0] is None and who(infos["final_obs"][1]) == 2 and when(infos["final_obs"][1]) == 0
+    assert infos["_final_obs"].tolist() == [False, True] and infos["final_info"]["vehicle"][1] == 2
+
+    observation, reward, terminated, truncated, infos = env.step(NOTHING)
+    assert not terminated.any() and not truncated.any() and "final_obs" not in infos
+    assert who(observation) == [1, 3] and reward.tolist() == pytest.approx([1.001, 0.0])
+
+
+def test_the_end_of_an_episode_truncates_and_gives_the_next_episodes_first_row(tmp_path) -> None:
+    # The same dense index means another vehicle in the next episode.
+    ticks = [tick(0, [1, 2]), tick(1, [1, 2], truncated=(0, 1), episode=1), tick(2, [1, 2], episode=1)]
+    env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2), reward=which)
+    env.reset()
+    observation, _, terminated, truncated, infos = env.step(NOTHING)
+    assert truncated.all() and not terminated.any()
+    assert when(observation) == [1, 1] and [when(row) for row in infos["final_obs"]] == [0, 0]
+    *_, truncated, _ = env.step(NOTHING)
+    assert not truncated.any()
+
+
+def test_terminated_wins_over_truncated(tmp_path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [1, 2], terminated=(0,), truncated=(0, 1), episode=1), tick(2, [1, 2], episode=1)]
+    env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2))
+    env.reset()
+    _, _, terminated, truncated, _ = env.step(NOTHING)
+    assert terminated.tolist() == [True, False] and truncated.tolist() == [False, True]
+
+
+def test_a_gap_without_a_flag_truncates(tmp_path) -> None:
+    dark = tick(1, [1, 2])
+    dark.valid[1] = False
+    ticks = [tick(0, [1, 2]), dark, tick(2, [1, 2]), tick(3, [7, 2])]
+    env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2))
+    env.reset()
+    *_, truncated, infos = env.step(NOTHING)
+    assert truncated.tolist() == [False, True] and infos["mask"].tolist() == [True, False]
+    *_, truncated, _ = env.step(NOTHING)
+    assert not truncated.any()
+    *_, truncated, _ = env.step(NOTHING)
+    assert truncated.tolist() == [True, False]  # another vehicle
+
+
+def test_slots_that_are_not_there_yet_are_empty_and_those_beyond_are_left_out(tmp_path) -> None:
+    ticks = [tick(0, [1]), tick(1, [1, 2, 3]), tick(2, [1, 2, 3])]
+    channel = channel_of(ticks, tmp_path, 2)
+    env = CarAwareVectorEnv(channel)
+    _, infos = env.reset()
+    assert infos["mask"].tolist() == [True, False]
+    observation, *_ = env.step(NOTHING)
+    assert who(observation) == [1, 2]
+    env.step(NOTHING)
+    assert channel.predictions[1].shape == (3, 2)
+
+
+def test_ticks_without_any_vehicle_ask_for_no_decision(tmp_path) -> None:
+    ticks = [tick(0, [E, E]), tick(1, [1, E]), tick(2, [E, E], terminated=(0,)), tick(3, [E, E]), tick(4, [E, 2])]
+    ticks.append(tick(5, [E, 2]))
+    channel = channel_of(ticks, tmp_path, 2, drives=True)
+    env = CarAwareVectorEnv(channel, reward=which)
+    observation, _ = env.reset()
+    assert who(observation)[0] == 1
+    observation, _, terminated, _, infos = env.step(np.ones((2, 2), np.float32))
+    assert terminated.tolist() == [True, False] and infos["mask"].tolist() == [False, True]
+    assert who(observation)[1] == 2 and who(infos["final_obs"][0]) == 1
+    assert sorted(channel.actions) == [0, 1, 2, 3]  # every tick is answered, by whomever
+    assert channel.actions[1].tolist() == [[1, 1], [1, 1]] and not channel.actions[2].any()
+
+
+def test_actions_beyond_the_range_are_clipped_where_they_drive_and_not_where_they_predict(tmp_path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, 2])]
+    wild = np.array([[2.0, -3.0], [0.0, np.nan]], np.float32)
+    channel = channel_of(ticks, tmp_path, 2, drives=True)
+    env = CarAwareVectorEnv(channel, reward=which)
+    env.reset()
+    env.step(wild)
+    assert channel.actions[0][0].tolist() == [1.0, -1.0] and np.isnan(channel.actions[0][1, 1])
+    channel = channel_of(ticks, tmp_path, 2)
+    env = CarAwareVectorEnv(channel)
+    env.reset()
+    env.step(np.array([[-1.0, 1.0], [2.0, 0.0]], np.float32))
+    assert channel.predictions[0].tolist() == [[0.0, 100.0], [300.0, 50.0]]
+
+
+def test_evaluation_episodes_are_answered_by_their_policy_and_stepped_by_nobody(tmp_path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [1, 2], truncated=(0, 1), episode=1, evaluation=True)]
+    ticks += [tick(2, [1, 2], episode=1, evaluation=True), tick(3, [4, 5], truncated=(0, 1), episode=2)]
+    ticks += [tick(4, [4, 5], episode=2)]
+    channel = channel_of(ticks, tmp_path, 2)
+    env = CarAwareVectorEnv(channel, evaluation_policy=lambda observation: np.full((2, 2), -1.0))
+    env.reset()
+    observation, _, _, truncated, infos = env.step(NOTHING)
+    assert truncated.all() and who(infos["final_obs"][0]) == 1 and who(observation) == [4, 5]
+    assert channel.predictions[1].tolist() == [[0.0, 0.0], [0.0, 0.0]]
+    *_, truncated, _ = env.step(NOTHING)
+    assert not truncated.any()  # the flags of tick 3 were those of the evaluation
+    env.close()
+    text = (tmp_path / "parts" / "trainer.json").read_text()
+    # Places are (vehicle, tick): the mean distance of (1, 1), (2, 1), (1, 2), (2, 2) to (0, 0).
+    expected = np.mean([np.hypot(a, b) for a in (1, 2) for b in (1, 2)])
+    assert f'"ppo_mean_error_m": {expected}'[:30] in text and '"env_steps": 4' in text
+
+
+def test_the_end_of_the_run_truncates_and_then_nothing_can_be_stepped(tmp_path) -> None:
+    channel = channel_of([tick(0, [1, 2]), tick(1, [1, 2])], tmp_path, 2)
+    env = CarAwareVectorEnv(channel)
+    env.reset()
+    env.step(NOTHING)
+    *_, truncated, infos = env.step(NOTHING)
+    assert truncated.all() and not infos["mask"].any() and when(infos["final_obs"][0]) == 1
+    for call in (env.reset, lambda: env.step(NOTHING)):
+        with pytest.raises(RunEndedError):
+            call()
+    assert channel.consumed_up_to == 1 and not channel.is_done
+    env.slots.commit()
+    assert channel.committed_up_to == 1
+    env.close()
+    assert channel.is_done
+
+
+def test_reset_runs_on_to_the_next_episode_but_not_twice_without_a_step(tmp_path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, 2]), tick(3, [4, 5], truncated=(0, 1), episode=1)]
+    ticks += [tick(4, [4, 5], episode=1)]
+    env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2))
+    assert who(env.reset()[0]) == [1, 2]
+    env.step(NOTHING)
+    assert who(env.reset()[0]) == [4, 5]
+    assert when(env.reset()[0]) == [3, 3]
+    for seed in (99, 5):  # even its own: it is past its beginning
+        with pytest.warns(UserWarning, match="cannot begin this run anew"):
+            env.reset(seed=seed)
+
+
+class Restartable:
+    """A source of hand-made runs that can be started anew."""
+
+    can_restart = True
+
+    def __init__(self, channel: DrivingChannel, make_ticks) -> None:
+        self.channel, self._make, self.seed, self.current, self.seeds = channel, make_ticks, 5, None, [5]
+        self._ticks: Iterator[SyntheticObservation] = make_ticks(5)
+
+    def receive(self):
+        """The next tick."""
+        self.current = next(self._ticks, None)
+        return self.current
+
+    def restart(self, seed=None) -> None:
+        """Begin anew."""
+        self.seed = self.seed + 1000 if seed is None else seed
+        self.seeds.append(self.seed)
+        self.channel.consumed_up_to = self.channel.committed_up_to = -1
+        self._ticks = self._make(self.seed)
+
+    def close(self, part=None) -> None:
+        """Nothing to close."""
+
+
+def restartable(tmp_path, episode_ticks: int) -> Restartable:
+    """Runs of three ticks whose vehicle is the seed."""
+    channel = DrivingChannel(run_file(str(tmp_path), 1, episode_ticks=episode_ticks), iter(()))
+    return Restartable(channel, lambda seed: iter([tick(number, [seed]) for number in range(3)]))
+
+
+def test_a_run_is_started_anew_for_another_seed_or_where_it_ended_and_only_then(tmp_path) -> None:
+    source = restartable(tmp_path, episode_ticks=3)
+    env = CarAwareVectorEnv(source)
+    action = np.zeros((1, 2), np.float32)
+    env.reset(seed=5)
+    env.reset(seed=5)
+    assert source.seeds == [5]
+    env.step(action)
+    assert when(env.reset(seed=5)[0]) == [0] and source.seeds == [5, 5]
+    assert who(env.reset(seed=6)[0]) == [6] and source.seeds == [5, 5, 6]
+    ends = [bool(env.step(action)[3][0]) for _ in range(7)]
+    assert ends == [False, False, True, False, False, True, False] and source.seeds[3:] == [1006, 2006]
+
+
+def test_a_reset_far_from_the_end_of_an_episode_starts_a_new_run(tmp_path) -> None:
+    source = restartable(tmp_path, episode_ticks=RUN_ON_TICKS + 100)
+    env = CarAwareVectorEnv(source)
+    env.reset()
+    env.step(np.zeros((1, 2), np.float32))
+    assert who(env.reset()[0]) == [1005]
+
+
+def test_the_single_face_ends_with_its_vehicle_and_goes_on_with_the_next_in_the_slot(tmp_path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [E, 2], terminated=(0,)), tick(2, [E, 2]), tick(3, [3, 2]), tick(4, [3, 2])]
+    env = CarAwareEnv(channel_of(ticks, tmp_path, 2), reward=which)
+    observation, info = env.reset()
+    assert who(observation) == 1 and info["vehicle"] == 1
+    observation, reward, terminated, truncated, info = env.step(np.zeros(2, np.float32))
+    assert (terminated, truncated) == (True, False) and who(observation) == 1 and info["vehicle"] == 1
+    assert reward == pytest.approx(1.0)
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(np.zeros(2, np.float32))
+    observation, info = env.reset()
+    assert (who(observation), when(observation)) == (3, 3)
+
+
+def test_agents_come_and_go_under_their_ids_and_an_episode_ends_with_the_simulations(tmp_path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [1, E], terminated=(1,)), tick(2, [1, 3]), tick(3, [1, 3])]
+    ticks += [tick(4, [1, 9], truncated=(0, 1), episode=1), tick(5, [1, 9], episode=1)]
+    env = CarAwareParallelEnv(channel_of(ticks, tmp_path, 2), reward=which)
+    observations, _ = env.reset()
+    one, two, three = (f"0x{number:016x}" for number in (1, 2, 3))
+    assert env.agents == [one, two] and who(observations[two]) == 2
+    observations, rewards, terminated, _, _ = env.step({one: [0, 0], two: [0, 0]})
+    assert terminated == {one: False, two: True} and env.agents == [one]
+    assert when(observations[two]) == 0 and rewards[two] == pytest.approx(2.0)
+    observations, rewards, terminated, _, _ = env.step({one: [0, 0]})
+    assert env.agents == [one, three] and rewards[three] == 0.0 and who(observations[three]) == 3
+    env.step({})
+    *_, truncated, _ = env.step({})
+    assert truncated == {one: True, three: True} and env.agents == []
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    observations, _ = env.reset()
+    assert {when(row) for row in observations.values()} == {4}
+    assert env.possible_agents == [one, two, three, f"0x{9:016x}"]
+
+
+def test_stable_baselines_gets_the_last_observation_and_the_sums_of_an_episode(tmp_path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, E], terminated=(1,)), tick(3, [1, E], truncated=(0,))]
+    ticks[3] = replace(tick(3, [1, E], truncated=(0,), episode=1))
+    ticks.append(tick(4, [1, E], episode=1))
+    env = CarAwareVecEnv(channel_of(ticks, tmp_path, 2), reward=lambda obs, action: np.ones(2))
+    env.reset()
+    env.step(NOTHING)
+    _, _, done, infos = env.step(NOTHING)
+    assert done.tolist() == [False, True] and infos[1]["TimeLimit.truncated"] is False
+    assert infos[1]["episode"] == {"r": 2.0, "l": 2, "t": 0.0} and when(infos[1]["terminal_observation"]) == 1
+    _, reward, done, infos = env.step(NOTHING)
+    assert reward.tolist() == [1.0, 0.0] and done.tolist() == [True, False]
+    assert infos[0]["TimeLimit.truncated"] is True and infos[0]["episode"]["l"] == 3
+
+
+def test_a_reward_of_the_wrong_shape_is_refused(tmp_path) -> None:
+    env = CarAwareVectorEnv(channel_of([tick(0, [1, 2]), tick(1, [1, 2])], tmp_path, 2), reward=lambda obs, action: 1.0)
+    env.reset()
+    with pytest.raises(ValueError, match="reward"):
+        env.step(NOTHING)
+
+
+def test_fields_by_name_are_in_si_units_of_the_newest_tick() -> None:
+    run = run_file("", 1)
+    fields = Fields.from_run(run)
+    row = np.array([[-1.0, 1.0, 0.0]], np.float32)
+    assert [float(fields.si(row, name)[0]) for name in FIELDS] == [0.0, 100.0, 15.0]
+    run["config"]["observation"] |= {"history": 2, "scale": "zero_to_one"}
+    fields = Fields.from_run(run)
+    assert fields.width == 6 and float(fields.si(np.array([[9, 9, 9, 0.5, 0, 0]], np.float32), "gnss_x")[0]) == 100.0
+    with pytest.raises(UnknownFieldError, match="gnss_x, gnss_y, speed"):
+        fields.si(row, "leader_gap")
+
+
+def test_names_of_the_population_and_of_named_heroes_are_found_and_others_shown_as_hashes() -> None:
+    from caraware._native import id_hash
+
+    names = Names(run_file("", 1))
+    assert [names.of(id_hash(name)) for name in ("cav.0", "hero.300", "cav.5000")] == ["cav.0", "hero.300", "cav.5000"]
+    run = run_file("", 1)
+    run["source"] = {"scenario": {}}
+    run["config"]["traffic"]["hero_ids"] = ["veh7"]
+    names = Names(run)
+    assert names.of(id_hash("veh7")) == "veh7" and names.of(id_hash("cav.0")) == f"0x{id_hash('cav.0'):016x}"
+
+
+def test_the_driving_reward_tells_arrival_from_other_ends_and_a_time_limit_from_both() -> None:
+    from caraware.envs import rewards
+    from caraware.envs.task import Task
+    from caraware.envs.transition import Rows
+
+    run = run_file("", 5, drives=True)
+    run["config"]["observation"]["fields"] = ["route_left", "route_offset"]
+    task = Task.from_run(run)
+
+    def rows(left_m: list[float], offset_m: list[float]) -> Rows:
+        observation = np.stack((np.array(left_m) / 500 - 1, np.array(offset_m) / 5), 1).astype(np.float32)
+        truth = np.tile(np.array([0, 0, 0, 8.0], np.float32), (5, 1))
+        return Rows(task, observation, truth, truth[:, :2])
+
+    # On its way, arrived, crashed, out of time, and too far from its end for the range of `route_left`.
+    before, after = rows([100, 4, 50, 50, 1000], [0] * 5), rows([99, 4, 50, 50, 1000], [2.5, 0, 0, 0, 0])
+    terminated, truncated = np.array([0, 1, 1, 0, 0], bool), np.array([0, 0, 0, 1, 0], bool)
+    ids = np.zeros(5, np.uint64)
+    fields = (before.observation, before.truth, before.gnss_m, np.ones(5, bool), ids, ids, terminated, truncated)
+    reward = rewards.driving(Transition(task, *fields, after), np.zeros((5, 2)))
+    # 1 m of way and 2.5 m beside the line; 8 m/s for 0.1 s. Steps of 1000 m / 2²⁴ are 0.06 mm.
+    assert reward.tolist() == pytest.approx([0.1 - 0.05, 10, -10, 0, 0.08], abs=1e-4)
+
+
+def test_the_localisation_reward_is_that_of_the_configuration_at_the_tick_answered(tmp_path) -> None:
+    env = CarAwareVectorEnv(channel_of([tick(0, [30, 0]), tick(1, [90, 0]), tick(2, [1, 1])], tmp_path, 2))
+    env.reset()
+    # Predicted (100, 50) and (0, 50), true (30, 0) and (0, 0).
+    _, reward, *_, infos = env.step(np.array([[0, 0], [-1, 0]], np.float32))
+    errors_m = [np.hypot(70, 50), 50.0]
+    assert infos["error_m"].tolist() == pytest.approx(errors_m, rel=1e-5)
+    assert reward.tolist() == pytest.approx([1 / (1 + error / 5) for error in errors_m], rel=1e-5)
