@@ -19,8 +19,10 @@ use crate::{failure::Exit, install::Install};
 /// What the end of a process means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OnExit {
-    /// The run needs it: a failure ends the run.
+    /// The run needs it: its end before its work is done ends the run.
     Required,
+    /// The run needs it, and nothing is lost when it dies: it is replaced, unless it told of a failure.
+    Replace,
     /// It only watches: it is started again.
     Restart,
 }
@@ -38,6 +40,14 @@ pub struct Row {
     pub wanted: fn(&RunFile) -> bool,
     /// How it is started.
     pub command: fn(&Install, &RunFile) -> Result<Command, Exit>,
+}
+
+impl Row {
+    /// True if the run is not over before this process is done.
+    #[must_use]
+    pub fn is_required(&self) -> bool {
+        self.on_exit != OnExit::Restart
+    }
 }
 
 /// All rows, in the order of starting. SUMO comes first because it is the one that user's files can upset.
@@ -66,7 +76,7 @@ pub const TABLE: [Row; 5] = [
     Row {
         process: Process::Trainer,
         needs: &[Process::TrafficBridge],
-        on_exit: OnExit::Required,
+        on_exit: OnExit::Replace,
         wanted: |run| run.mode == Mode::Train,
         command: trainer,
     },

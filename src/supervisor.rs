@@ -1,7 +1,9 @@
 //! The supervisor: owns a run, creates every channel, starts and watches the processes, and ends them all.
 
 use std::{
+    os::unix::process::ExitStatusExt as _,
     path::PathBuf,
+    process::ExitStatus,
     sync::mpsc::{Receiver, RecvTimeoutError, channel},
     time::{Duration, Instant},
 };
@@ -9,7 +11,7 @@ use std::{
 use ipc_schema::{
     board::State,
     failure::{Failure, FailureKind},
-    ports::BoardReader,
+    ports::{BoardReader, RosterWriter},
     process::Process,
     run::RunFile,
     services::{self, RunNode, ServiceHolder},
@@ -36,6 +38,8 @@ const READY_WITHIN: Duration = Duration::from_secs(120);
 const STOP_WITHIN: Duration = Duration::from_secs(30);
 /// Most restarts of a process that only watches.
 const MAX_RESTARTS: u32 = 20;
+/// Most replacements of a trainer in a row without a new commit.
+const MAX_VAIN_REPLACEMENTS: u32 = 5;
 
 /// How a run ended, and what the supervisor saw.
 #[derive(Debug)]
@@ -53,6 +57,7 @@ pub struct Supervisor {
     // Dropped in this order: processes, services, node, shared memory.
     running: Vec<Running>,
     boards: Vec<(Process, BoardReader)>,
+    roster: RosterWriter,
     _services: ServiceHolder,
     node: RunNode,
     _claim: Claim,
@@ -62,6 +67,9 @@ pub struct Supervisor {
     signals: Receiver<i32>,
     signal_handle: Handle,
     restarts: u32,
+    /// Replacements of the trainer since its last commit, and the ticks committed then.
+    vain_replacements: u32,
+    committed_ticks: u64,
     ready_at: Option<Instant>,
     /// The look before the present one: whatever is found ready now got ready after it.
     last_look: Instant,
@@ -71,7 +79,7 @@ impl Drop for Supervisor {
     fn drop(&mut self) {
         self.signal_handle.close();
         self.running.clear();
-        self.node.try_cleanup_dead_nodes();
+        services::forget_dead(&self.node);
     }
 }
 
@@ -85,13 +93,15 @@ impl Supervisor {
         let (signals, signal_handle) = watch_signals()?;
         let node = services::node(&run.shared_memory)?;
         let holder = ServiceHolder::create(&node, &run, 0)?;
-        let boards = holder
-            .boards()
-            .map(|(process, board)| Ok((process, BoardReader::create(board)?)))
+        let roster = RosterWriter::create(&holder)?;
+        let boards = Process::ALL
+            .into_iter()
+            .map(|process| Ok((process, BoardReader::open(&node, &run, 0, process)?)))
             .collect::<Result<_, Exit>>()?;
         Ok(Self {
             running: Vec::new(),
             boards,
+            roster,
             _services: holder,
             node,
             _claim: claim,
@@ -101,6 +111,8 @@ impl Supervisor {
             signals,
             signal_handle,
             restarts: 0,
+            vain_replacements: 0,
+            committed_ticks: 0,
             ready_at: None,
             last_look: Instant::now(),
         })
@@ -142,9 +154,16 @@ impl Supervisor {
         TABLE.iter().filter(|row| (row.wanted)(&self.run))
     }
 
+    fn board(&self, process: Process) -> Option<&BoardReader> {
+        self.boards
+            .iter()
+            .find(|(known, _)| *known == process)
+            .map(|(_, board)| board)
+    }
+
     fn state_of(&self, process: Process) -> State {
-        let board = self.boards.iter().find(|(known, _)| *known == process);
-        board.map_or(State::Starting, |(_, board)| State::from_u32(board.health().state))
+        self.board(process)
+            .map_or(State::Starting, |board| State::from_u32(board.health().state))
     }
 
     fn is_started(&self, process: Process) -> bool {
@@ -164,7 +183,7 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Looks for ended processes: a failure of a required one ends the run, watchers are started again.
+    /// Looks for ended processes: a failure of a required one ends the run; watchers, and a trainer that died, are started again.
     fn reap(&mut self) -> Result<(), Exit> {
         for index in 0..self.running.len() {
             let Some(status) = self.running[index].poll() else {
@@ -175,19 +194,53 @@ impl Supervisor {
             if status.success() && done {
                 continue;
             }
-            self.node.try_cleanup_dead_nodes();
+            services::forget_dead(&self.node);
             match row.on_exit {
-                OnExit::Required => return Err(self.running[index].failure(&self.run, status).into()),
-                OnExit::Restart => self.restart(index)?,
+                OnExit::Restart if self.running[index].incarnation < MAX_RESTARTS => self.restart(index)?,
+                OnExit::Restart => {}
+                // All that it had to do is on disk.
+                OnExit::Replace if done => {}
+                OnExit::Replace if status.signal().is_some() => self.replace(index, status)?,
+                OnExit::Required | OnExit::Replace => {
+                    return Err(self.running[index].failure(&self.run, status).into());
+                }
             }
         }
         Ok(())
     }
 
+    /// Replaces a trainer that died, unless that has been in vain for too long.
+    fn replace(&mut self, index: usize, status: ExitStatus) -> Result<(), Exit> {
+        let process = self.running[index].row.process;
+        let committed = self.board(process).map_or(0, |board| board.progress().committed_ticks);
+        if committed > self.committed_ticks {
+            self.committed_ticks = committed;
+            self.vain_replacements = 0;
+        }
+        self.vain_replacements += 1;
+        if self.vain_replacements > MAX_VAIN_REPLACEMENTS {
+            let mut failure = self.running[index].failure(&self.run, status);
+            failure.message = format!(
+                "{}\n  replaced {MAX_VAIN_REPLACEMENTS} times in a row, and it never got to a new checkpoint",
+                failure.message
+            );
+            return Err(failure.into());
+        }
+        eprintln!("{process} ended with {status}; a successor continues from the newest checkpoint");
+        self.restart(index)
+    }
+
     fn restart(&mut self, index: usize) -> Result<(), Exit> {
         let incarnation = self.running[index].incarnation + 1;
-        if incarnation > MAX_RESTARTS {
-            return Ok(());
+        let process = self.running[index].row.process;
+        if !self.roster.set(process, incarnation) {
+            return Err(Exit::run(
+                format!(
+                    "{process} has been replaced {} times: a run holds no more",
+                    incarnation - 1
+                ),
+                "find out from its log why it dies",
+            ));
         }
         self.restarts += 1;
         self.running[index] = Running::start(
@@ -207,7 +260,7 @@ impl Supervisor {
         }
         let late = self
             .wanted()
-            .filter(|row| row.on_exit == OnExit::Required)
+            .filter(|row| row.is_required())
             .find(|row| self.state_of(row.process) == State::Starting);
         match late {
             None => self.ready_at = Some(self.last_look),
@@ -224,11 +277,8 @@ impl Supervisor {
     }
 
     fn finished(&mut self) -> bool {
-        let wanted = self.wanted().filter(|row| row.on_exit == OnExit::Required).count();
-        let required = self
-            .running
-            .iter_mut()
-            .filter(|running| running.row.on_exit == OnExit::Required);
+        let wanted = self.wanted().filter(|row| row.is_required()).count();
+        let required = self.running.iter_mut().filter(|running| running.row.is_required());
         required
             .map(|running| usize::from(running.poll().is_some()))
             .sum::<usize>()

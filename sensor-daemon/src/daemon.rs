@@ -8,7 +8,7 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     header::{LAST_OF_RUN, MessageHeader},
     observation::ObservationLayout,
-    ports::{BoardReader, Message, PortError, Publisher, Waker},
+    ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
     run::Mode,
     services::Channel,
@@ -17,7 +17,7 @@ use ipc_schema::{
 };
 use serde::Serialize;
 
-use crate::{digest::Digest, sensing::Sensing};
+use crate::{delivery::Delivery, digest::Digest, sensing::Sensing};
 
 /// One process serves one environment.
 const ENV_INDEX: u32 = 0;
@@ -31,6 +31,10 @@ struct Part {
     cavs_max: u32,
     raw_gnss_mean_error_m: Option<f64>,
     drops: u64,
+    /// Observations that successors of the trainer were given again.
+    redelivered_ticks: u64,
+    /// Most of the journal in use at a time.
+    journal_mib: usize,
 }
 
 /// Senses until the last tick of the run, or until the process is asked to stop.
@@ -46,7 +50,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     })?;
     let world = session.subscriber(Channel::World)?;
     let mut daemon = Daemon::open(session, sensing)?;
-    while let Some(message) = daemon.session.next(&world)? {
+    while let Some(message) = daemon.next(&world)? {
         let header = *message.header();
         if daemon.tick(&message)? == Wait::Stopped {
             break;
@@ -65,7 +69,7 @@ struct Daemon {
     sensing: Sensing,
     observations: Publisher,
     /// Who must not miss an observation: nobody if nobody learns.
-    consumer: Option<(BoardReader, Waker)>,
+    consumer: Option<Delivery>,
     digest: Digest,
     ticks: u64,
     vehicle_steps: u64,
@@ -76,7 +80,7 @@ impl Daemon {
     fn open(mut session: Session, sensing: Sensing) -> Result<Self, Failure> {
         let observations = session.publisher(Channel::Observation)?;
         let consumer = match session.run.mode {
-            Mode::Train => Some((session.board_of(Process::Trainer)?, session.waker(Process::Trainer)?)),
+            Mode::Train => Some(Delivery::open(&session)?),
             Mode::Simulate => None,
         };
         session.attach();
@@ -90,6 +94,47 @@ impl Daemon {
             vehicle_steps: 0,
             cavs_max: 0,
         })
+    }
+
+    /// The next `world` message; meanwhile a successor of the trainer is given what it lacks.
+    fn next(&mut self, world: &Subscriber) -> Result<Option<Message>, Failure> {
+        let mut received = Ok(None);
+        loop {
+            let waited = self.session.wait_until(|| {
+                received = world.receive();
+                !matches!(received, Ok(None)) || self.consumer.as_ref().is_some_and(Delivery::is_behind)
+            })?;
+            if let Some(message) = std::mem::replace(&mut received, Ok(None))? {
+                return Ok(Some(message));
+            }
+            if waited == Wait::Stopped {
+                return Ok(None);
+            }
+            self.catch_up()?;
+        }
+    }
+
+    fn catch_up(&mut self) -> Result<(), Failure> {
+        match &mut self.consumer {
+            Some(consumer) => consumer.catch_up(&self.observations),
+            None => Ok(()),
+        }
+    }
+
+    /// Waits until `condition` holds for the trainer, and gives its successors what they lack; without a trainer there is no wait.
+    fn wait_for_trainer(&mut self, condition: impl Fn(&Delivery, &Session) -> bool) -> Result<Wait, Failure> {
+        loop {
+            self.catch_up()?;
+            let Some(consumer) = &self.consumer else {
+                return Ok(Wait::Ready);
+            };
+            let waited = self
+                .session
+                .wait_until(|| consumer.is_behind() || condition(consumer, &self.session))?;
+            if waited == Wait::Stopped || condition(consumer, &self.session) {
+                return Ok(waited);
+            }
+        }
     }
 
     /// One tick: waits for credit, senses, publishes.
@@ -107,9 +152,7 @@ impl Daemon {
         let states: &[VehicleState] = block::view(message.payload(), layout.states).map_err(broken)?;
         let views: &[HeroView] = block::view(message.payload(), layout.heroes).map_err(broken)?;
         let n = self.sensing.assign(world, states);
-        if let Some((board, _)) = &self.consumer
-            && self.session.wait_for_credit(board, world.tick)? == Wait::Stopped
-        {
+        if self.wait_for_trainer(Delivery::may_send)? == Wait::Stopped {
             return Ok(Wait::Stopped);
         }
         self.publish(world, states, views, n)?;
@@ -129,18 +172,24 @@ impl Daemon {
             count: n as u32,
             columns: d as u32,
             run_id: ours.run_id,
-            incarnation: ours.incarnation,
             sequence: self.sensing.imu_samples() as u64,
             ..*world
+        };
+        let header = match &self.consumer {
+            Some(consumer) => consumer.addressed(header),
+            None => header,
         };
         let mut draft = self.observations.loan(header, ObservationLayout::of(&header).len)?;
         self.sensing
             .observe(&header, states, views, draft.payload_mut())
             .map_err(broken)?;
         self.digest.add(&header, draft.payload());
+        if let Some(consumer) = &mut self.consumer {
+            consumer.keep(header, draft.payload())?;
+        }
         draft.send()?;
-        if let Some((_, waker)) = &self.consumer {
-            waker.wake();
+        if let Some(consumer) = &self.consumer {
+            consumer.wake();
         }
         self.account(&header, states.len());
         Ok(())
@@ -165,12 +214,11 @@ impl Daemon {
         });
     }
 
-    /// Leaves once everything sent has been consumed.
+    /// Leaves once the trainer is done: until then it may die and need everything since its last commit.
     fn leave(mut self) -> Result<(), Failure> {
+        let waited = self.wait_for_trainer(|consumer, _| consumer.is_done())?;
         self.write_part()?;
-        if let Some((board, _)) = &self.consumer
-            && self.session.wait_until_consumed(board, self.ticks)? == Wait::Stopped
-        {
+        if waited == Wait::Stopped {
             return Ok(());
         }
         self.session.report(|health| health.state = State::Done as u32);
@@ -187,6 +235,8 @@ impl Daemon {
             cavs_max: self.cavs_max,
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
             drops: self.observations.drops(),
+            redelivered_ticks: self.consumer.as_ref().map_or(0, Delivery::redelivered),
+            journal_mib: self.consumer.as_ref().map_or(0, Delivery::journal_mib),
         };
         self.session.write_part(&part)
     }

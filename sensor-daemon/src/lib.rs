@@ -7,10 +7,12 @@
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
 pub mod daemon;
+pub mod delivery;
 pub mod digest;
 pub mod fields;
 pub mod gnss;
 pub mod imu;
+pub mod journal;
 pub mod noise;
 #[cfg(test)]
 #[path = "../../sim-core/tests/common/preset.rs"]

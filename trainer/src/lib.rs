@@ -15,7 +15,7 @@ use ipc_schema::{
     process::Process,
     run::RunFile,
     services::Channel as Service,
-    session::{Session, SessionError},
+    session::{self, Session, SessionError},
 };
 use pyo3::{
     exceptions::{PyKeyError, PyRuntimeError, PyValueError},
@@ -62,9 +62,11 @@ struct Attachment {
 
 #[pymethods]
 impl Attachment {
-    /// Joins the run that `run_file` describes and opens its ports; producers may send from now on.
+    /// Joins the run that `run_file` describes and opens its ports; producers may send from now on, beginning with `first_tick`:
+    /// all ticks before it are in the checkpoint that this trainer continues from.
     #[new]
-    fn new(run_file: &str) -> PyResult<Self> {
+    #[pyo3(signature = (run_file, first_tick=0))]
+    fn new(run_file: &str, first_tick: u64) -> PyResult<Self> {
         let run = RunFile::read(Path::new(run_file)).map_err(|error| failed(&error))?;
         let run_json = std::fs::read_to_string(run_file).map_err(|error| failed(&error))?;
         let stop = Arc::new(AtomicBool::new(false));
@@ -75,7 +77,7 @@ impl Attachment {
             true => Some(session.waker(Process::SimCore).map_err(session_failed)?),
             false => None,
         };
-        session.attach();
+        session.attach_from(first_tick);
         let attached = Attached {
             session,
             observations,
@@ -124,6 +126,18 @@ impl Attachment {
         Ok(scans)
     }
 
+    /// How often this trainer has been replaced before.
+    #[getter]
+    fn incarnation(&self) -> u32 {
+        session::incarnation()
+    }
+
+    /// Messages of other runs and of replaced incarnations that were refused.
+    #[getter]
+    fn refused(&self) -> PyResult<u64> {
+        Ok(self.lock()?.observations.refused())
+    }
+
     /// True once the last block of the run has been received.
     #[getter]
     fn ended(&self) -> PyResult<bool> {
@@ -149,7 +163,7 @@ impl Attachment {
 
     /// Says that all work is done.
     fn done(&self) -> PyResult<()> {
-        self.lock()?.session.report(|health| health.state = State::Done as u32);
+        self.lock()?.session.done();
         Ok(())
     }
 
@@ -362,6 +376,13 @@ impl ObservationBlock {
     }
 }
 
+/// Numbers in a row of the observation of the run that `run_file` describes.
+#[pyfunction]
+fn observation_size(run_file: &str) -> PyResult<usize> {
+    let run = RunFile::read(Path::new(run_file)).map_err(|error| failed(&error))?;
+    Ok(run.config.observation_width())
+}
+
 /// The module.
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -369,6 +390,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<ObservationBlock>()?;
     module.add_class::<SectionView>()?;
     module.add_class::<PointCloud>()?;
+    module.add_function(wrap_pyfunction!(observation_size, module)?)?;
     module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
     module.add("VALID", ipc_schema::observation::VALID)?;
     module.add("TERMINATED", ipc_schema::observation::TERMINATED)?;
