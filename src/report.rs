@@ -62,6 +62,7 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "duplicated_ticks": training.get("duplicated_ticks").cloned().unwrap_or(json!(0)),
         "drops": sensing.drops,
         "restarts": outcome.restarts,
+        "swaps": outcome.swaps,
         "redelivered_ticks": sensing.redelivered_ticks,
         "journal_mib": sensing.journal_mib,
         "vehicle_steps": sensing.observations,
