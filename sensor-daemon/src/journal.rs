@@ -379,13 +379,13 @@ mod tests {
         assert!(journal.file.is_some(), "90 MiB are more than the memory part");
         (0..90).for_each(|tick| check(&journal, tick));
         assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0);
-        // What is freed is used again: the file does not grow.
+        // What is freed is used again: never more than 130 MiB are held, 64 of them in memory, in chunks of 4.
         for _ in 0..5 {
             journal.commit(journal.ticks());
             fill(&mut journal, 40, 1 << 20);
         }
         let len = journal.file.as_ref().unwrap().metadata().unwrap().len();
-        assert!(len <= 40 << 20, "{len} bytes in the file");
+        assert!(len <= 72 << 20, "{len} bytes in the file");
         (journal.first()..journal.ticks()).for_each(|tick| check(&journal, tick));
     }
 

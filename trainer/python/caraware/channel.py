@@ -164,7 +164,7 @@ class Channel:
     """A trainer's place in a run. One for each process; opening it lets the simulation start."""
 
     def __init__(self, run_file: str, first_tick: int = 0) -> None:
-        """Joins the run; ticks come from `first_tick` on, however far the simulation is: all before it are committed."""
+        """Join the run; ticks come from `first_tick` on, however far the simulation is: all before are committed."""
         self._attachment = _native.Attachment(run_file, first_tick)
         self.run: dict[str, Any] = json.loads(self._attachment.run_json)
 

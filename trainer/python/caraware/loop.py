@@ -90,7 +90,7 @@ class TrainingLoop:
         leave_requested: Callable[[], bool] = lambda: False,
         learner: Learner | None = None,
     ) -> None:
-        """Without a `learner`, one begins at the first tick. A request to leave is met where a successor can take over."""
+        """Without a `learner`, one begins at the first tick. A request to leave is met where a successor can go on."""
         self._channel, self._config, self._stop_requested = channel, config, stop_requested
         self._leave_requested, self._left = leave_requested, False
         self._metrics = Metrics(config.run_dir / "tensorboard")
@@ -104,8 +104,11 @@ class TrainingLoop:
         if learner is not None:
             self._start(learner)
 
-    def run(self) -> None:
-        """Train until the last tick or a request to stop; then commit, plot and write `parts/trainer.json`."""
+    def run(self) -> bool:
+        """Train until the last tick or a request to stop; then commit, plot and write `parts/trainer.json`.
+
+        False if it left to a successor instead, after a commit.
+        """
         ended = False
         while not ended and not self._left and not self._stop_requested():
             ticks = self._channel.receive(RECEIVE_TIMEOUT_S)
@@ -115,7 +118,7 @@ class TrainingLoop:
                 ended = ticks[-1].last and not self._left
         if self._left:
             self._leave()
-            return
+            return False
         self._finish_evaluation()
         if self._ppo is not None and self._ppo.updates != self._saved_updates:
             self.commit()
@@ -125,6 +128,7 @@ class TrainingLoop:
         if ended:
             self._channel.done()
         log.info("%s after %d updates", "run complete" if ended else "stopped", self._updates())
+        return True
 
     def _ensure_started(self, first: Observation) -> None:
         """The first tick tells the size of the observation, which the networks need."""

@@ -80,9 +80,10 @@ class Succession:
         """Say that this shadow is ready, and wait; False if it is not wanted any more."""
         os.write(1, b"ready\n")
         os.dup2(2, 1)
-        told = os.read(0, 16)
+        if os.read(0, 16) != b"go\n":
+            return False
         self.is_shadow = False
-        return told == b"go\n"
+        return True
 
 
 def main(arguments: list[str]) -> int:
@@ -120,20 +121,19 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
 
     from caraware.channel import Channel
 
-    if not succession.replaces:
-        channel = Channel(str(run_file))
-        TrainingLoop(channel, config, lambda: stop.requested, leave_requested=lambda: stop.leave_requested).run()
+    learner = _successor(run_file, config, succession) if succession.replaces else None
+    if succession.is_shadow:
         return
-    learner = _successor(run_file, config, succession)
-    if learner is None:
-        return
-    channel = Channel(str(run_file), learner.first_tick())
+    channel = Channel(str(run_file), learner.first_tick() if learner else 0)
     loop = TrainingLoop(
         channel, config, lambda: stop.requested, leave_requested=lambda: stop.leave_requested, learner=learner
     )
     if succession.checkpoint is not None:
         loop.commit()
-    loop.run()
+    if not loop.run():
+        # A successor waits for this process to end, and the simulation for it: torch would take seconds to tidy up.
+        logging.shutdown()
+        os._exit(0)
 
 
 def _successor(run_file: Path, config: "RunConfig", succession: Succession) -> "Learner | None":
