@@ -1,9 +1,9 @@
-"""Disturbs one run on purpose: planned swaps and kills of the trainer at random moments, then compares with an undisturbed run.
+"""Disturbs one run on purpose, by planned swaps and kills of its trainer at random moments; compares with a quiet one.
 
     PYTHONPATH=trainer/python .venv/bin/python docs/endurance.py --swaps 20 --kills 50 --seed 1
 
-Both runs go to a temporary directory. Prints one line of JSON; the exit code is 0 if nothing was lost or learnt twice, observation
-hash and final tensors are equal, and nothing is left in shared memory.
+Both runs go to a temporary directory. Prints one line of JSON; the exit code is 0 if nothing was lost or learnt twice,
+observation hash and final tensors are equal, and nothing is left in shared memory.
 """
 
 import argparse
@@ -58,30 +58,33 @@ def trainer_pid(run: Path) -> int | None:
     return max(pids, default=None)
 
 
+def newest(run: Path) -> str:
+    """Name of the newest checkpoint; empty before the first."""
+    latest = run / "checkpoints" / "latest"
+    return latest.read_text() if latest.exists() else ""
+
+
 def disturb(run: Path, process: subprocess.Popen, deeds: list[str], rng: random.Random) -> dict:
-    """Swap and kill until all is done or the run is over. A kill comes at any moment, also of a successor that gets ready."""
-    done = {"swaps": 0, "refused": 0, "kills": 0, "pauses_s": []}
+    """Swap and kill at random moments until all is done or the run is over.
+
+    Between two deeds there is a new checkpoint: five deaths in a row without one would end the run, as they should.
+    """
+    done = {"swaps": 0, "refused": 0, "kills": 0, "hand_overs_s": []}
+    before = ""
     for deed in deeds:
-        time.sleep(rng.uniform(0.0, 3.0 if deed == "kill" else 1.0))
-        # Five deaths in a row without a commit would end the run, as they should.
-        commits = len(list(run.glob("checkpoints/update-*")))
-        while process.poll() is None and commits == 0:
-            time.sleep(0.05)
-            commits = len(list(run.glob("checkpoints/update-*")))
+        while process.poll() is None and newest(run) == before:
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0.0, 1.0))
         if process.poll() is not None:
             break
+        before = newest(run)
         if deed == "swap":
             answer = subprocess.run([CARAWARE, "swap", run.name], cwd=run.parents[1], capture_output=True, text=True)
             done["swaps" if answer.returncode == 0 else "refused"] += 1
-            done["pauses_s"] += [float(answer.stdout.split()[-2])] if answer.returncode == 0 else []
+            done["hand_overs_s"] += [float(answer.stdout.split()[-2])] if answer.returncode == 0 else []
         elif (pid := trainer_pid(run)) is not None:
-            before = (run / "checkpoints" / "latest").read_text()
             os.kill(pid, signal.SIGKILL)
             done["kills"] += 1
-            while (
-                process.poll() is None and rng.random() < 0.999 and (run / "checkpoints/latest").read_text() == before
-            ):
-                time.sleep(0.02)
     return done
 
 
