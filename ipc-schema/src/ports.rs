@@ -240,7 +240,7 @@ impl Subscriber {
 
     /// Refuses messages of incarnations before `incarnation`, also before a newer one has come.
     #[must_use]
-    pub(crate) fn from_incarnation(self, incarnation: u32) -> Self {
+    pub(crate) fn since_incarnation(self, incarnation: u32) -> Self {
         self.incarnation.store(incarnation, Ordering::Relaxed);
         self
     }

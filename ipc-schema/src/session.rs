@@ -179,7 +179,7 @@ impl Session {
         let subscriber = Subscriber::create(&service, channel, &self.run)?;
         Ok(match (channel, self.process) {
             // What was sent to the one before this is not for this one.
-            (Channel::Observation, Process::Trainer) => subscriber.from_incarnation(self.incarnation),
+            (Channel::Observation, Process::Trainer) => subscriber.since_incarnation(self.incarnation),
             _ => subscriber,
         })
     }
