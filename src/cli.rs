@@ -23,6 +23,7 @@ const AFTER: &str = "Examples:
   caraware simulate my.sumocfg                    your own scenario, every vehicle sensing
   caraware ps                                     what runs, from another terminal
   caraware bench lidar                            rays per second, beside Open3D's
+  caraware swap --set trainer.learning_rate=0.001 another trainer for a live run, which loses nothing
   caraware stop                                   end it; the trainer writes a checkpoint first
 
 Exit codes: 0 done, 1 the run failed, 2 usage or configuration, 3 something is missing on this machine, 130 interrupted.
@@ -40,6 +41,9 @@ pub enum Command {
         /// Name of a run; all live runs if not given
         run: Option<String>,
     },
+    /// Replace the trainer of a live run; the simulation goes on, and no observation is lost
+    #[command(after_help = SWAP)]
+    Swap(SwapArgs),
     /// End a run in order
     Stop {
         /// Name of the run; may be left out if only one is alive
@@ -53,6 +57,27 @@ pub enum Command {
         #[arg(long)]
         clean: bool,
     },
+}
+
+const SWAP: &str = "Examples:
+  caraware swap                                          the same trainer anew: after an upgrade of its code
+  caraware swap town-1 --set trainer.learning_rate=0.001
+  caraware swap --checkpoint runs/town-0/checkpoints/update-000400
+
+The successor starts beside the trainer at work and gets ready. Only then does the old one write a checkpoint and leave. A successor
+that fails is refused, and the old trainer goes on.";
+
+/// What `swap` takes.
+#[derive(Debug, Args, Clone)]
+pub struct SwapArgs {
+    /// Name of the run; may be left out if only one is alive
+    pub run: Option<String>,
+    /// Change one setting of the trainer, e.g. --set trainer.learning_rate=0.001 (repeatable)
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Take the parameters of this checkpoint (a directory) instead of the run's newest
+    #[arg(long, value_name = "DIRECTORY")]
+    pub checkpoint: Option<PathBuf>,
 }
 
 /// What can be measured.

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use ipc_schema::{
     failure::{Failure, FailureKind},
-    ports::PortError,
+    ports::{BoardError, PortError},
     run::RunFileError,
     services::ServiceError,
 };
@@ -100,6 +100,15 @@ impl From<ServiceError> for Exit {
 impl From<PortError> for Exit {
     fn from(error: PortError) -> Self {
         Self::Failure(Failure::from_error(FailureKind::Run, &error))
+    }
+}
+
+impl From<BoardError> for Exit {
+    fn from(error: BoardError) -> Self {
+        match error {
+            BoardError::Service(error) => error.into(),
+            BoardError::Port(error) => error.into(),
+        }
     }
 }
 

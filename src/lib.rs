@@ -13,5 +13,7 @@ pub mod registry;
 pub mod report;
 pub mod scenario;
 pub mod status;
+pub mod succession;
 pub mod supervisor;
+pub mod swap;
 pub mod town;

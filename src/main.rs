@@ -11,6 +11,7 @@ use caraware::{
     prepare::prepare,
     report, status,
     supervisor::Supervisor,
+    swap,
 };
 use clap::Parser as _;
 use ipc_schema::run::Mode;
@@ -21,6 +22,7 @@ fn main() -> ExitCode {
         Command::Train(args) => run(&args, Mode::Train),
         Command::Simulate(args) => run(&args, Mode::Simulate),
         Command::Ps { run } => status::ps(run.as_deref()),
+        Command::Swap(args) => swap::swap(&args),
         Command::Stop { run } => status::stop(run.as_deref()),
         Command::Bench(args) => bench::bench(&args),
         Command::Doctor { clean } => doctor::doctor(clean),

@@ -2,9 +2,10 @@
 
 use std::{
     fs::OpenOptions,
+    io::Write as _,
     os::unix::process::CommandExt as _,
-    path::Path,
-    process::{Child, Command, ExitStatus, Stdio},
+    path::{Path, PathBuf},
+    process::{Child, ChildStdout, Command, ExitStatus, Stdio},
 };
 
 use ipc_schema::{
@@ -12,15 +13,17 @@ use ipc_schema::{
     process::Process,
     run::{Mode, RunFile},
 };
-use rustix::process::{Pid, Signal, kill_process_group};
+use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 
 use crate::{failure::Exit, install::Install};
 
 /// What the end of a process means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OnExit {
-    /// The run needs it: a failure ends the run.
+    /// The run needs it: its end before its work is done ends the run.
     Required,
+    /// The run needs it, and nothing is lost when it dies: it is replaced, unless it told of a failure.
+    Replace,
     /// It only watches: it is started again.
     Restart,
 }
@@ -38,6 +41,14 @@ pub struct Row {
     pub wanted: fn(&RunFile) -> bool,
     /// How it is started.
     pub command: fn(&Install, &RunFile) -> Result<Command, Exit>,
+}
+
+impl Row {
+    /// True if the run is not over before this process is done.
+    #[must_use]
+    pub fn is_required(&self) -> bool {
+        self.on_exit != OnExit::Restart
+    }
 }
 
 /// All rows, in the order of starting. SUMO comes first because it is the one that user's files can upset.
@@ -66,7 +77,7 @@ pub const TABLE: [Row; 5] = [
     Row {
         process: Process::Trainer,
         needs: &[Process::TrafficBridge],
-        on_exit: OnExit::Required,
+        on_exit: OnExit::Replace,
         wanted: |run| run.mode == Mode::Train,
         command: trainer,
     },
@@ -110,6 +121,50 @@ impl Running {
         run_file: &Path,
         incarnation: u32,
     ) -> Result<Self, Exit> {
+        Self::spawn(row, install, run, run_file, incarnation, |_| {})
+    }
+
+    /// Starts a successor beside the process of `row` that is at work: it says on the standard output that comes with it when it is
+    /// ready, and waits for [`Running::go`]. With `checkpoint`, it takes the parameters from there.
+    ///
+    /// # Errors
+    /// As [`Running::start`].
+    pub fn start_shadow(
+        row: &'static Row,
+        install: &Install,
+        run: &RunFile,
+        run_file: &Path,
+        incarnation: u32,
+        checkpoint: Option<&PathBuf>,
+    ) -> Result<(Self, Option<ChildStdout>), Exit> {
+        let mut shadow = Self::spawn(row, install, run, run_file, incarnation, |command| {
+            command
+                .env("CARAWARE_SHADOW", "1")
+                .envs(checkpoint.map(|path| ("CARAWARE_CHECKPOINT", path)))
+                .stdin(Stdio::piped())
+                .stdout(Stdio::piped());
+        })?;
+        let output = shadow.child.stdout.take();
+        Ok((shadow, output))
+    }
+
+    /// Tells a shadow that the place is free.
+    pub fn go(&mut self) {
+        if let Some(mut input) = self.child.stdin.take()
+            && let Err(error) = input.write_all(b"go\n")
+        {
+            tracing::warn!(%error, process = %self.row.process, "a successor that ended before its turn");
+        }
+    }
+
+    fn spawn(
+        row: &'static Row,
+        install: &Install,
+        run: &RunFile,
+        run_file: &Path,
+        incarnation: u32,
+        change: impl FnOnce(&mut Command),
+    ) -> Result<Self, Exit> {
         let log_path = run.run_dir.join("logs").join(format!("{}.log", row.process));
         let log = OpenOptions::new()
             .create(true)
@@ -125,6 +180,7 @@ impl Running {
             .stdout(log)
             .stderr(errors)
             .process_group(0);
+        change(&mut command);
         let program = command.get_program().to_string_lossy().into_owned();
         let child = command.spawn().map_err(|error| {
             Exit::missing(
@@ -155,6 +211,16 @@ impl Running {
         }
         if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw)
             && let Err(error) = kill_process_group(pid, signal)
+        {
+            tracing::debug!(%error, process = %self.row.process, "cannot signal");
+        }
+    }
+
+    /// Asks it to make room for a successor; unlike [`Running::signal`], nobody in its group but itself.
+    pub fn ask_to_leave(&mut self) {
+        if self.poll().is_none()
+            && let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw)
+            && let Err(error) = kill_process(pid, Signal::USR1)
         {
             tracing::debug!(%error, process = %self.row.process, "cannot signal");
         }

@@ -67,12 +67,7 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
     let node = services::node(&run.shared_memory)?;
     let wanted = TABLE.iter().filter(|row| (row.wanted)(run));
     let boards = wanted
-        .map(|row| {
-            Ok((
-                row,
-                BoardReader::create(&services::open_board(&node, run, 0, row.process)?)?,
-            ))
-        })
+        .map(|row| Ok((row, BoardReader::open(&node, run, 0, row.process)?)))
         .collect::<Result<Vec<_>, Exit>>()?;
     let first = look(&boards);
     wait(RATE_OVER);

@@ -17,6 +17,18 @@ pub struct Progress {
     pub attached: u32,
 }
 
+/// Most incarnations of a process in one run. Each writes entries of its own: iceoryx2 leaves those of a killed writer locked.
+pub const INCARNATIONS: u32 = 256;
+
+/// Which incarnation of each process counts, in the order of [`crate::process::Process::ALL`]; written by the supervisor alone.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
+#[type_name("caraware::Roster")]
+pub struct Roster {
+    /// Incarnation of each process.
+    pub incarnations: [u32; 5],
+}
+
 /// State of a process, [`Health::state`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]

@@ -105,6 +105,8 @@ pub struct Run {
     pub sub_steps: u32,
     /// Ticks a producer may be ahead of its required consumer.
     pub window_ticks: u32,
+    /// Most memory and disk for observations that no checkpoint contains yet, MiB.
+    pub journal_mib: u32,
     /// Simulated seconds per wall second; 0 = as fast as possible.
     pub real_time_factor: f64,
 }

@@ -23,7 +23,7 @@ pub struct MessageHeader {
     pub env_index: u32,
     /// Random identity of the run; a message of another run is refused.
     pub run_id: u64,
-    /// Counts the replacements of the sending process.
+    /// Counts the replacements of the sending process. `observation`: of the trainer that it is meant for.
     pub incarnation: u32,
     /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`].
     pub flags: u32,

@@ -5,7 +5,7 @@ use std::mem::{align_of, offset_of, size_of};
 use serde::Serialize;
 
 use crate::{
-    board::{Health, Progress, TrainingStatus},
+    board::{Health, Progress, Roster, TrainingStatus},
     ego::EgoPose,
     event::Collision,
     header::MessageHeader,
@@ -207,6 +207,7 @@ pub fn table() -> Vec<TypeLayout> {
             resynchronisations,
             total_ticks
         }),
+        layout!(Roster { incarnations }),
         layout!(TrainingStatus {
             episode,
             env_steps,

@@ -10,6 +10,7 @@
 //! | `ego-pose`    | `[EgoPose]`                                                       | sim-core       | traffic-bridge    |
 //! | `event`       | `[Collision]`                                                     | sim-core       | none              |
 //! | `board`       | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`] | every process  | none (newest wins)|
+//! | `roster`      | [`board::Roster`]: the incarnation of each process that counts    | supervisor     | none (newest wins)|
 //! | `wake`        | an event without content                                          | every peer     | its process       |
 //!
 //! Every message carries a [`header::MessageHeader`]. Services are created in [`services`] by the supervisor alone;
@@ -17,6 +18,7 @@
 
 pub mod block;
 pub mod board;
+mod board_port;
 pub mod config;
 pub mod ego;
 pub mod event;
@@ -37,4 +39,4 @@ pub mod traffic;
 pub mod world;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 3;
+pub const SCHEMA_VERSION: u32 = 4;

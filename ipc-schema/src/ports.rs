@@ -3,28 +3,25 @@
 use std::{
     sync::{
         Arc,
-        atomic::{AtomicU64, Ordering},
+        atomic::{AtomicU32, AtomicU64, Ordering},
     },
     time::Duration,
 };
 
 use iceoryx2::{
-    port::{
-        BackpressureAction, listener::ListenerWaitError, notifier::Notifier, publisher, reader, subscriber, writer,
-    },
+    port::{BackpressureAction, listener::ListenerWaitError, notifier::Notifier, publisher, subscriber},
     prelude::{AllocationStrategy, BackpressureStrategy},
     sample, sample_mut,
 };
 
 use crate::{
     SCHEMA_VERSION,
-    board::{Health, Progress, TrainingStatus},
     header::MessageHeader,
     run::RunFile,
-    services::{
-        BoardService, Channel, DataService, HEALTH_KEY, PROGRESS_KEY, Shm, TRAINING_KEY, WakeListener, WakeService,
-    },
+    services::{Channel, DataService, Shm, WakeListener, WakeService},
 };
+
+pub use crate::board_port::{BoardError, BoardReader, BoardWriter, RosterWriter};
 
 /// A message could not be sent or received.
 #[derive(Debug, thiserror::Error)]
@@ -73,7 +70,7 @@ pub enum PortError {
     },
 }
 
-fn refused(channel: &'static str, action: &'static str) -> impl FnOnce(&dyn std::fmt::Debug) -> PortError {
+pub(crate) fn refused(channel: &'static str, action: &'static str) -> impl FnOnce(&dyn std::fmt::Debug) -> PortError {
     move |reason| PortError::Refused {
         channel,
         action,
@@ -216,6 +213,8 @@ pub struct Subscriber {
     port: subscriber::Subscriber<Shm, [u8], MessageHeader>,
     channel: Channel,
     run_id: u64,
+    /// The newest incarnation of the sender (`observation`: of the trainer it is meant for); what is older is stale.
+    incarnation: AtomicU32,
     refused: AtomicU64,
 }
 
@@ -234,11 +233,20 @@ impl Subscriber {
             port,
             channel,
             run_id: run.run_id,
+            incarnation: AtomicU32::new(0),
             refused: AtomicU64::new(0),
         })
     }
 
-    /// The next message, if one is waiting; it stays readable until dropped. Messages of another run are refused and counted.
+    /// Refuses messages of incarnations before `incarnation`, also before a newer one has come.
+    #[must_use]
+    pub(crate) fn since_incarnation(self, incarnation: u32) -> Self {
+        self.incarnation.store(incarnation, Ordering::Relaxed);
+        self
+    }
+
+    /// The next message, if one is waiting; it stays readable until dropped. Messages of another run and of an incarnation that has been
+    /// replaced are refused and counted.
     ///
     /// # Errors
     /// The connection is broken, or the sender speaks another schema version.
@@ -258,14 +266,16 @@ impl Subscriber {
                     found: header.schema_version,
                 });
             }
-            if header.run_id == self.run_id {
+            if header.run_id == self.run_id
+                && header.incarnation >= self.incarnation.fetch_max(header.incarnation, Ordering::Relaxed)
+            {
                 return Ok(Some(Message { header, sample }));
             }
             self.refused.fetch_add(1, Ordering::Relaxed);
         }
     }
 
-    /// Messages of other runs that were refused.
+    /// Messages of other runs and of replaced incarnations that were refused.
     #[must_use]
     pub fn refused(&self) -> u64 {
         self.refused.load(Ordering::Relaxed)
@@ -290,97 +300,6 @@ impl Message {
     #[must_use]
     pub fn payload(&self) -> &[u8] {
         self.sample.payload()
-    }
-}
-
-/// The writing end of a process's own board.
-pub struct BoardWriter {
-    progress: writer::EntryHandleMut<Shm, u32, Progress>,
-    health: writer::EntryHandleMut<Shm, u32, Health>,
-    training: writer::EntryHandleMut<Shm, u32, TrainingStatus>,
-}
-
-impl BoardWriter {
-    pub(crate) fn create(service: &BoardService) -> Result<Self, PortError> {
-        let writer = service
-            .writer_builder()
-            .create()
-            .map_err(|e| refused("board", "creation of the writer")(&e))?;
-        Ok(Self {
-            progress: writer
-                .entry(&PROGRESS_KEY)
-                .map_err(|e| refused("board", "opening of progress")(&e))?,
-            health: writer
-                .entry(&HEALTH_KEY)
-                .map_err(|e| refused("board", "opening of health")(&e))?,
-            training: writer
-                .entry(&TRAINING_KEY)
-                .map_err(|e| refused("board", "opening of the training status")(&e))?,
-        })
-    }
-
-    /// Replaces the progress.
-    pub fn set_progress(&self, value: Progress) {
-        self.progress.update_with_copy(value);
-    }
-
-    /// Replaces the health.
-    pub fn set_health(&self, value: Health) {
-        self.health.update_with_copy(value);
-    }
-
-    /// Replaces the training status.
-    pub fn set_training(&self, value: TrainingStatus) {
-        self.training.update_with_copy(value);
-    }
-}
-
-/// The board of another process.
-pub struct BoardReader {
-    progress: reader::EntryHandle<Shm, u32, Progress>,
-    health: reader::EntryHandle<Shm, u32, Health>,
-    training: reader::EntryHandle<Shm, u32, TrainingStatus>,
-}
-
-impl BoardReader {
-    /// Reads `service`, the board of any process.
-    ///
-    /// # Errors
-    /// All readers are taken.
-    pub fn create(service: &BoardService) -> Result<Self, PortError> {
-        let reader = service
-            .reader_builder()
-            .create()
-            .map_err(|e| refused("board", "creation of the reader")(&e))?;
-        Ok(Self {
-            progress: reader
-                .entry(&PROGRESS_KEY)
-                .map_err(|e| refused("board", "opening of progress")(&e))?,
-            health: reader
-                .entry(&HEALTH_KEY)
-                .map_err(|e| refused("board", "opening of health")(&e))?,
-            training: reader
-                .entry(&TRAINING_KEY)
-                .map_err(|e| refused("board", "opening of the training status")(&e))?,
-        })
-    }
-
-    /// Newest progress.
-    #[must_use]
-    pub fn progress(&self) -> Progress {
-        *self.progress.get()
-    }
-
-    /// Newest health.
-    #[must_use]
-    pub fn health(&self) -> Health {
-        *self.health.get()
-    }
-
-    /// Newest training status.
-    #[must_use]
-    pub fn training(&self) -> TrainingStatus {
-        *self.training.get()
     }
 }
 

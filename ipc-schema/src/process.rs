@@ -28,6 +28,12 @@ impl Process {
         Self::Fanout,
     ];
 
+    /// Place in [`Process::ALL`].
+    #[must_use]
+    pub fn index(self) -> usize {
+        self as usize
+    }
+
     /// Name as it stands in logs, services and the process table.
     #[must_use]
     pub fn name(self) -> &'static str {

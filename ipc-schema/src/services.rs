@@ -15,7 +15,7 @@ use iceoryx2::{
 
 use crate::{
     block::ALIGNMENT,
-    board::{Health, Progress, TrainingStatus},
+    board::{Health, INCARNATIONS, Progress, Roster, TrainingStatus},
     ego::EgoPose,
     event::Collision,
     header::MessageHeader,
@@ -38,17 +38,35 @@ pub type BoardService = blackboard::PortFactory<Shm, u32>;
 /// An opened wake-up service.
 pub type WakeService = event::PortFactory<Shm>;
 
-/// Board entry of [`Progress`].
-pub const PROGRESS_KEY: u32 = 0;
-/// Board entry of [`Health`].
-pub const HEALTH_KEY: u32 = 1;
-/// Board entry of [`TrainingStatus`].
-pub const TRAINING_KEY: u32 = 2;
+/// Entries of one incarnation on a board.
+const ENTRIES: u32 = 3;
+/// The one entry of the roster.
+pub const ROSTER_KEY: u32 = 0;
+
+/// Board entry of an incarnation's [`Progress`].
+#[must_use]
+pub const fn progress_key(incarnation: u32) -> u32 {
+    ENTRIES * incarnation
+}
+
+/// Board entry of an incarnation's [`Health`].
+#[must_use]
+pub const fn health_key(incarnation: u32) -> u32 {
+    ENTRIES * incarnation + 1
+}
+
+/// Board entry of an incarnation's [`TrainingStatus`].
+#[must_use]
+pub const fn training_key(incarnation: u32) -> u32 {
+    ENTRIES * incarnation + 2
+}
 
 /// Most processes that open one service at a time: all of a run, a successor for each, and spectators (`caraware ps`).
 const MAX_NODES: usize = 24;
 /// Readers of one board.
 const MAX_READERS: usize = 32;
+/// Readers of the roster: every reader of a board reads it.
+const MAX_ROSTER_READERS: usize = 5 * MAX_READERS;
 /// Messages a process may hold besides those in its queue.
 const SPARE_MESSAGES: usize = 2;
 
@@ -249,6 +267,14 @@ pub fn node(memory: &SharedMemory) -> Result<Node<Shm>, ServiceError> {
         .map_err(|e| refused("creation", "node")(&e))
 }
 
+/// Takes what dead processes left in the services that others hold open: their places there are free again.
+pub fn forget_dead(node: &RunNode) {
+    let state = node.try_cleanup_dead_nodes();
+    if state.failed_cleanups > 0 {
+        tracing::warn!(?state, "a dead process is still in the way");
+    }
+}
+
 fn ipc_config(memory: &SharedMemory) -> Result<IpcConfig, ServiceError> {
     let root = memory.root.to_string_lossy();
     let mut config = IpcConfig::default();
@@ -322,6 +348,17 @@ pub fn open_board(
         .map_err(|e| refused("opening", format!("board of {process}"))(&e))
 }
 
+/// Opens the roster: which incarnation of each process counts.
+///
+/// # Errors
+/// It does not exist.
+pub fn open_roster(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<BoardService, ServiceError> {
+    node.service_builder(&service_name(run, env_index, "roster")?)
+        .blackboard_opener::<u32>()
+        .open()
+        .map_err(|e| refused("opening", "roster")(&e))
+}
+
 /// Opens the wake-up service of a process.
 ///
 /// # Errors
@@ -347,7 +384,8 @@ pub type WakeListener = Listener<Shm>;
 pub struct ServiceHolder {
     /// Data services, in the order of [`Channel::ALL`].
     _data: Vec<DataService>,
-    boards: Vec<(Process, BoardService)>,
+    _boards: Vec<BoardService>,
+    roster: BoardService,
     _wakes: Vec<WakeService>,
 }
 
@@ -364,20 +402,22 @@ impl ServiceHolder {
         });
         let boards = Process::ALL
             .into_iter()
-            .map(|process| Ok((process, create_board(node, run, env_index, process)?)));
+            .map(|process| create_board(node, run, env_index, process));
         let wakes = Process::ALL
             .into_iter()
             .map(|process| create_wake(node, run, env_index, process));
         Ok(Self {
             _data: data.collect::<Result<_, _>>()?,
-            boards: boards.collect::<Result<_, ServiceError>>()?,
+            _boards: boards.collect::<Result<_, _>>()?,
+            roster: create_roster(node, run, env_index)?,
             _wakes: wakes.collect::<Result<_, _>>()?,
         })
     }
 
-    /// The boards of all processes.
-    pub fn boards(&self) -> impl Iterator<Item = (Process, &BoardService)> {
-        self.boards.iter().map(|(process, board)| (*process, board))
+    /// The roster.
+    #[must_use]
+    pub fn roster(&self) -> &BoardService {
+        &self.roster
     }
 }
 
@@ -388,15 +428,30 @@ fn create_board(
     process: Process,
 ) -> Result<BoardService, ServiceError> {
     let name = service_name(run, env_index, &format!("board/{process}"))?;
-    node.service_builder(&name)
+    let board = node
+        .service_builder(&name)
         .blackboard_creator::<u32>()
         .max_readers(MAX_READERS)
-        .max_nodes(MAX_NODES)
-        .add(PROGRESS_KEY, Progress::default())
-        .add(HEALTH_KEY, Health::default())
-        .add(TRAINING_KEY, TrainingStatus::default())
+        .max_nodes(MAX_NODES);
+    (0..INCARNATIONS)
+        .fold(board, |board, incarnation| {
+            board
+                .add(progress_key(incarnation), Progress::default())
+                .add(health_key(incarnation), Health::default())
+                .add(training_key(incarnation), TrainingStatus::default())
+        })
         .create()
         .map_err(|e| refused("creation", format!("board of {process}"))(&e))
+}
+
+fn create_roster(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<BoardService, ServiceError> {
+    node.service_builder(&service_name(run, env_index, "roster")?)
+        .blackboard_creator::<u32>()
+        .max_readers(MAX_ROSTER_READERS)
+        .max_nodes(MAX_NODES)
+        .add(ROSTER_KEY, Roster::default())
+        .create()
+        .map_err(|e| refused("creation", "roster")(&e))
 }
 
 fn create_wake(node: &Node<Shm>, run: &RunFile, env_index: u32, process: Process) -> Result<WakeService, ServiceError> {

@@ -18,7 +18,7 @@ use crate::{
     failure::{Failure, FailureKind},
     flow,
     header::MessageHeader,
-    ports::{BoardReader, BoardWriter, PortError, Publisher, Subscriber, Waker, wait},
+    ports::{BoardError, BoardReader, BoardWriter, PortError, Publisher, Subscriber, Waker, wait},
     process::Process,
     run::{RunFile, RunFileError},
     services::{self, Channel, ServiceError, Shm, WakeListener},
@@ -26,6 +26,15 @@ use crate::{
 
 /// Environment variable with the number of times a process has been started before.
 pub const INCARNATION: &str = "CARAWARE_INCARNATION";
+
+/// How often this process has been started before, as the supervisor says.
+#[must_use]
+pub fn incarnation() -> u32 {
+    std::env::var(INCARNATION)
+        .ok()
+        .and_then(|text| text.parse().ok())
+        .unwrap_or(0)
+}
 
 /// Longest wait between two looks at credit, data and the stop flag.
 const LOOK: Duration = Duration::from_millis(50);
@@ -144,7 +153,6 @@ impl Session {
 
     fn open(run: RunFile, process: Process, env_index: u32, stop: Arc<AtomicBool>) -> Result<Self, SessionError> {
         let node = services::node(&run.shared_memory)?;
-        let board = BoardWriter::create(&services::open_board(&node, &run, env_index, process)?)?;
         let wake = services::open_wake(&node, &run, env_index, process)?
             .listener_builder()
             .create()
@@ -153,10 +161,8 @@ impl Session {
                 action: "creation of the listener",
                 reason: format!("{e:?}"),
             })?;
-        let incarnation = std::env::var(INCARNATION)
-            .ok()
-            .and_then(|text| text.parse().ok())
-            .unwrap_or(0);
+        let incarnation = incarnation();
+        let board = BoardWriter::create(&services::open_board(&node, &run, env_index, process)?, incarnation)?;
         let progress = Progress {
             incarnation,
             ..Progress::default()
@@ -201,7 +207,12 @@ impl Session {
         if channel.required_consumer() == Some(self.process) {
             self.upstream.push(self.waker(channel.producer())?);
         }
-        Ok(Subscriber::create(&service, channel, &self.run)?)
+        let subscriber = Subscriber::create(&service, channel, &self.run)?;
+        Ok(match (channel, self.process) {
+            // What was sent to the one before this is not for this one.
+            (Channel::Observation, Process::Trainer) => subscriber.since_incarnation(self.incarnation),
+            _ => subscriber,
+        })
     }
 
     /// Wakes `process`.
@@ -222,12 +233,7 @@ impl Session {
     /// # Errors
     /// The service cannot be opened.
     pub fn board_of(&self, process: Process) -> Result<BoardReader, SessionError> {
-        Ok(BoardReader::create(&services::open_board(
-            &self.node,
-            &self.run,
-            self.env_index,
-            process,
-        )?)?)
+        Ok(BoardReader::open(&self.node, &self.run, self.env_index, process)?)
     }
 
     /// Header for a message of this process; the caller adds episode, tick, time and sizes.
@@ -244,7 +250,17 @@ impl Session {
 
     /// All ports are open: producers may send.
     pub fn attach(&mut self) {
-        self.progress.attached = 1;
+        self.attach_from(0);
+    }
+
+    /// All ports are open, and all ticks below `tick` are committed: its producer may send from there on.
+    pub fn attach_from(&mut self, tick: u64) {
+        self.progress = Progress {
+            consumed_ticks: tick,
+            committed_ticks: tick,
+            attached: 1,
+            ..self.progress
+        };
         self.board.set_progress(self.progress);
         self.report(|health| health.state = State::Ready as u32);
         self.wake_upstream();
@@ -261,6 +277,12 @@ impl Session {
     pub fn committed(&mut self, ticks: u64) {
         self.progress.committed_ticks = ticks;
         self.board.set_progress(self.progress);
+    }
+
+    /// All work is done: whoever stayed for this process may leave.
+    pub fn done(&mut self) {
+        self.report(|health| health.state = State::Done as u32);
+        self.wake_upstream();
     }
 
     fn wake_upstream(&self) {
@@ -408,6 +430,15 @@ pub fn main(process: Process, body: impl FnOnce(&Path) -> Result<(), Failure>) -
                 failure.write(run_dir, process.name());
             }
             ExitCode::from(failure.kind.exit_code())
+        }
+    }
+}
+
+impl From<BoardError> for SessionError {
+    fn from(error: BoardError) -> Self {
+        match error {
+            BoardError::Service(error) => Self::Service(error),
+            BoardError::Port(error) => Self::Port(error),
         }
     }
 }

@@ -8,7 +8,7 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     header::{LAST_OF_RUN, MessageHeader},
     observation::ObservationLayout,
-    ports::{BoardReader, Message, PortError, Publisher, Waker},
+    ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
     run::Mode,
     services::Channel,
@@ -23,6 +23,7 @@ use sim_core::{
 };
 
 use crate::{
+    delivery::Delivery,
     digest::Digest,
     scanning::{Scanning, Tally},
     sensing::{Sensing, World},
@@ -42,6 +43,10 @@ struct Part {
     raw_gnss_mean_error_m: Option<f64>,
     drops: u64,
     lidar: Option<Tally>,
+    /// Observations that successors of the trainer were given again.
+    redelivered_ticks: u64,
+    /// Most of the journal in use at a time.
+    journal_mib: usize,
 }
 
 /// Senses until the last tick of the run, or until the process is asked to stop.
@@ -54,7 +59,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     let scanning = look_around(&mut session, &mut sensing)?;
     let world = session.subscriber(Channel::World)?;
     let mut daemon = Daemon::open(session, sensing, scanning)?;
-    while let Some(message) = daemon.session.next(&world)? {
+    while let Some(message) = daemon.next(&world)? {
         let header = *message.header();
         if daemon.tick(&message)? == Wait::Stopped {
             break;
@@ -107,7 +112,7 @@ struct Daemon {
     scanning: Option<Scanning>,
     observations: Publisher,
     /// Who must not miss an observation: nobody if nobody learns.
-    consumer: Option<(BoardReader, Waker)>,
+    consumer: Option<Delivery>,
     digest: Digest,
     ticks: u64,
     vehicle_steps: u64,
@@ -118,7 +123,7 @@ impl Daemon {
     fn open(mut session: Session, sensing: Sensing, scanning: Option<Scanning>) -> Result<Self, Failure> {
         let observations = session.publisher(Channel::Observation)?;
         let consumer = match session.run.mode {
-            Mode::Train => Some((session.board_of(Process::Trainer)?, session.waker(Process::Trainer)?)),
+            Mode::Train => Some(Delivery::open(&session)?),
             Mode::Simulate => None,
         };
         session.attach();
@@ -135,6 +140,47 @@ impl Daemon {
         })
     }
 
+    /// The next `world` message; meanwhile a successor of the trainer is given what it lacks.
+    fn next(&mut self, world: &Subscriber) -> Result<Option<Message>, Failure> {
+        let mut received = Ok(None);
+        loop {
+            let waited = self.session.wait_until(|| {
+                received = world.receive();
+                !matches!(received, Ok(None)) || self.consumer.as_ref().is_some_and(Delivery::is_behind)
+            })?;
+            if let Some(message) = std::mem::replace(&mut received, Ok(None))? {
+                return Ok(Some(message));
+            }
+            if waited == Wait::Stopped {
+                return Ok(None);
+            }
+            self.catch_up()?;
+        }
+    }
+
+    fn catch_up(&mut self) -> Result<(), Failure> {
+        match &mut self.consumer {
+            Some(consumer) => consumer.catch_up(&self.observations),
+            None => Ok(()),
+        }
+    }
+
+    /// Waits until `condition` holds for the trainer, and gives its successors what they lack; without a trainer there is no wait.
+    fn wait_for_trainer(&mut self, condition: impl Fn(&Delivery, &Session) -> bool) -> Result<Wait, Failure> {
+        loop {
+            self.catch_up()?;
+            let Some(consumer) = &self.consumer else {
+                return Ok(Wait::Ready);
+            };
+            let waited = self
+                .session
+                .wait_until(|| consumer.is_behind() || condition(consumer, &self.session))?;
+            if waited == Wait::Stopped || condition(consumer, &self.session) {
+                return Ok(waited);
+            }
+        }
+    }
+
     /// One tick: waits for credit, senses, publishes.
     fn tick(&mut self, message: &Message) -> Result<Wait, Failure> {
         let world = message.header();
@@ -149,9 +195,7 @@ impl Daemon {
         let everybody = view(message, world)?;
         let n = self.sensing.assign(world, everybody.states);
         self.scan(world, &everybody)?;
-        if let Some((board, _)) = &self.consumer
-            && self.session.wait_for_credit(board, world.tick)? == Wait::Stopped
-        {
+        if self.wait_for_trainer(Delivery::may_send)? == Wait::Stopped {
             return Ok(Wait::Stopped);
         }
         self.publish(world, &everybody, n)?;
@@ -179,18 +223,24 @@ impl Daemon {
             count: n as u32,
             columns: d as u32,
             run_id: ours.run_id,
-            incarnation: ours.incarnation,
             sequence: self.sensing.imu_samples() as u64,
             ..*world
+        };
+        let header = match &self.consumer {
+            Some(consumer) => consumer.addressed(header),
+            None => header,
         };
         let mut draft = self.observations.loan(header, ObservationLayout::of(&header).len)?;
         self.sensing
             .observe(&header, everybody, draft.payload_mut())
             .map_err(broken)?;
         self.digest.add(&header, draft.payload());
+        if let Some(consumer) = &mut self.consumer {
+            consumer.keep(header, draft.payload())?;
+        }
         draft.send()?;
-        if let Some((_, waker)) = &self.consumer {
-            waker.wake();
+        if let Some(consumer) = &self.consumer {
+            consumer.wake();
         }
         self.account(&header, everybody.states.len());
         Ok(())
@@ -215,12 +265,11 @@ impl Daemon {
         });
     }
 
-    /// Leaves once everything sent has been consumed.
+    /// Leaves once the trainer is done: until then it may die and need everything since its last commit.
     fn leave(mut self) -> Result<(), Failure> {
+        let waited = self.wait_for_trainer(|consumer, _| consumer.is_done())?;
         self.write_part()?;
-        if let Some((board, _)) = &self.consumer
-            && self.session.wait_until_consumed(board, self.ticks)? == Wait::Stopped
-        {
+        if waited == Wait::Stopped {
             return Ok(());
         }
         self.session.report(|health| health.state = State::Done as u32);
@@ -238,6 +287,8 @@ impl Daemon {
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
             drops: self.observations.drops(),
             lidar: self.scanning.as_ref().map(Scanning::tally),
+            redelivered_ticks: self.consumer.as_ref().map_or(0, Delivery::redelivered),
+            journal_mib: self.consumer.as_ref().map_or(0, Delivery::journal_mib),
         };
         self.session.write_part(&part)
     }

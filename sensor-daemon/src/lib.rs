@@ -1,7 +1,7 @@
 //! Sensors of connected vehicles, and the assembly of what they deliver into observations.
 //!
 //! A library of pure functions without clock, I/O or shared memory; the `sensor-daemon` binary is a thin shell around
-//! [`sensing::Sensing`].
+//! [`sensing::Sensing`]: [`daemon`], with the [`delivery`] to the trainer and its [`journal`].
 
 // Sensor values leave in single precision: the wire's precision, see `ipc_schema::observation`.
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
@@ -9,11 +9,13 @@
 pub mod blackout;
 pub mod carrier;
 pub mod daemon;
+pub mod delivery;
 pub mod digest;
 pub mod fields;
 pub mod gnss;
 pub mod history;
 pub mod imu;
+pub mod journal;
 pub mod lidar;
 pub mod noise;
 pub mod normals;

@@ -196,6 +196,7 @@ pub const KEYS: &[Key] = &[
     float("run.tick_s", "s", 0.001, 10.0, "Length of a tick: one observation of every connected vehicle."),
     integer("run.sub_steps", "", 1, 1000, "Nanoscopic sub-steps in a tick (10 in 0.1 s: dynamics at 100 Hz)."),
     integer("run.window_ticks", "ticks", 1, 256, "Ticks that traffic, dynamics and sensors may each be ahead of the next process."),
+    integer("run.journal_mib", "MiB", 1, 1_048_576, "Most memory (the first 64) and disk for observations that a replaced trainer is given again; without enough the oldest go."),
     float("run.real_time_factor", "s/s", 0.0, 1000.0, "Simulated seconds per wall second; 0 = as fast as possible."),
     float("traffic.step_s", "s", 0.001, 10.0, "Length of a SUMO step: a whole number of ticks. A `.sumocfg` that sets `step-length` decides it."),
     integer("traffic.cavs", "vehicles", 0, 100_000, "Connected vehicles kept alive on random routes (maps with population control); at least 1 but in the driving task."),

@@ -33,6 +33,14 @@ impl Settings {
         layer::parse(&format!("preset {name}"), text).map(Self)
     }
 
+    /// Settings that come to `config`.
+    ///
+    /// # Errors
+    /// Never with a validated configuration.
+    pub fn of(config: &Config) -> Result<Self, ConfigError> {
+        layer::parse("the run's configuration", &to_toml(config)).map(Self)
+    }
+
     /// Adds a preset by name; `None` if there is no such preset.
     pub fn with_preset(mut self, name: &str) -> Option<Result<Self, ConfigError>> {
         let (name, text) = PRESETS.iter().find(|(known, _)| *known == name)?;

@@ -15,7 +15,7 @@ use ipc_schema::{
     process::Process,
     run::RunFile,
     services::Channel as Service,
-    session::{Session, SessionError},
+    session::{self, Session, SessionError},
 };
 use pyo3::{
     exceptions::{PyKeyError, PyRuntimeError, PyValueError},
@@ -64,12 +64,13 @@ struct Attachment {
 
 #[pymethods]
 impl Attachment {
-    /// Joins the run that `run_file` describes and opens its ports; producers may send from now on.
+    /// Joins the run that `run_file` describes and opens its ports; producers may send from now on, beginning with `first_tick`:
+    /// all ticks before it are in the checkpoint that this trainer continues from.
     ///
     /// With `outside` this process is none that the supervisor started. It does not end with the supervisor; `receive` raises instead.
     #[new]
-    #[pyo3(signature = (run_file, *, outside=false))]
-    fn new(run_file: &str, outside: bool) -> PyResult<Self> {
+    #[pyo3(signature = (run_file, first_tick=0, *, outside=false))]
+    fn new(run_file: &str, first_tick: u64, outside: bool) -> PyResult<Self> {
         let run = RunFile::read(Path::new(run_file)).map_err(|error| failed(&error))?;
         let run_json = std::fs::read_to_string(run_file).map_err(|error| failed(&error))?;
         let stop = Arc::new(AtomicBool::new(false));
@@ -85,7 +86,7 @@ impl Attachment {
             true => Some(session.waker(Process::SimCore).map_err(session_failed)?),
             false => None,
         };
-        session.attach();
+        session.attach_from(first_tick);
         let attached = Attached {
             session,
             observations,
@@ -135,6 +136,18 @@ impl Attachment {
         Ok(scans)
     }
 
+    /// How often this trainer has been replaced before.
+    #[getter]
+    fn incarnation(&self) -> u32 {
+        session::incarnation()
+    }
+
+    /// Messages of other runs and of replaced incarnations that were refused.
+    #[getter]
+    fn refused(&self) -> PyResult<u64> {
+        Ok(self.lock()?.observations.refused())
+    }
+
     /// True once the last block of the run has been received.
     #[getter]
     fn ended(&self) -> PyResult<bool> {
@@ -160,7 +173,7 @@ impl Attachment {
 
     /// Says that all work is done.
     fn done(&self) -> PyResult<()> {
-        self.lock()?.session.report(|health| health.state = State::Done as u32);
+        self.lock()?.session.done();
         Ok(())
     }
 
@@ -388,6 +401,13 @@ fn id_hash(id: &str) -> u64 {
     ipc_schema::traffic::id_hash(id)
 }
 
+/// Numbers in a row of the observation of the run that `run_file` describes.
+#[pyfunction]
+fn observation_size(run_file: &str) -> PyResult<usize> {
+    let run = RunFile::read(Path::new(run_file)).map_err(|error| failed(&error))?;
+    Ok(run.config.observation_width())
+}
+
 /// The module.
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -396,6 +416,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<SectionView>()?;
     module.add_class::<PointCloud>()?;
     module.add_function(wrap_pyfunction!(id_hash, module)?)?;
+    module.add_function(wrap_pyfunction!(observation_size, module)?)?;
     module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
     module.add("VALID", ipc_schema::observation::VALID)?;
     module.add("TERMINATED", ipc_schema::observation::TERMINATED)?;

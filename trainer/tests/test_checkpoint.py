@@ -1,6 +1,7 @@
 """Checkpoints: a round trip, bit-exact resumption, and damage that is refused."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -8,12 +9,18 @@ import torch
 from caraware.checkpoint import (
     CheckpointError,
     Counters,
+    Course,
     latest_checkpoint,
     load_checkpoint,
+    load_course,
+    newest_sound_checkpoint,
     read_manifest,
+    remove_partial,
     save_checkpoint,
 )
 from caraware.config import MapBounds, TrainerConfig
+from caraware.evaluation import EvaluationResult
+from caraware.metrics import TrainingPoint
 from caraware.ppo import Ppo
 from caraware.rollout import Rollout
 from synthetic import FIELDS, SIZE_M, run_file, street_ticks
@@ -149,3 +156,34 @@ def test_the_manifest_is_plain_json(tmp_path: Path) -> None:
     manifest = json.loads((save(tmp_path, fresh()) / "manifest.json").read_text())
     assert manifest["schema_version"] == 1
     assert all(len(digest) == 64 for digest in manifest["files"].values())
+
+
+def test_the_newest_sound_checkpoint_is_found_past_damaged_ones(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    ppo = fresh()
+    assert newest_sound_checkpoint(tmp_path) is None
+    for update in range(1, 4):
+        train(ppo, update, update + 1)
+        save(tmp_path, ppo)
+    (tmp_path / "update-000003" / "manifest.json").unlink()
+    file = tmp_path / "update-000002" / "random.safetensors"
+    file.write_bytes(file.read_bytes()[:-1])
+    (tmp_path / ".update-000004.partial").mkdir()
+    remove_partial(tmp_path)
+    assert newest_sound_checkpoint(tmp_path) == tmp_path / "update-000001"
+    assert "update-000003" in caplog.text and "random.safetensors: is damaged" in caplog.text
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_course_of_training_comes_back_exactly(tmp_path: Path) -> None:
+    evaluation = EvaluationResult(7, 1, 2, 300, 4.5, 0.1, 7.0, 0.2)
+    points = [TrainingPoint(7, 0.3, 0.1, 5.25, math.pi, 1e4), TrainingPoint(2**40, 0.1, 0.2, math.nan, 6.0, 0.0)]
+    course = Course(11, 1, 2, 6, 40, [evaluation], points)
+    ppo = fresh()
+    written = save_checkpoint(tmp_path, ppo, Counters(1, 7, 0, 9), "0", 3, course)
+    found = load_course(written)
+    assert (found.evaluations, found.training[0]) == (course.evaluations, points[0])
+    assert repr(found) == repr(course)
+    assert load_checkpoint(written, fresh()) == Counters(1, 7, 0, 9)
+    assert load_course(save(tmp_path / "bare", ppo)) == Course()

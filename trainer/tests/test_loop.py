@@ -1,5 +1,6 @@
 """The loop and the process around it, over a channel of prepared ticks."""
 
+import contextlib
 import json
 import math
 import os
@@ -14,9 +15,9 @@ import numpy as np
 import pytest
 import torch
 from caraware import train
-from caraware.checkpoint import latest_checkpoint
+from caraware.checkpoint import latest_checkpoint, newest_sound_checkpoint
 from caraware.config import RunConfig
-from caraware.loop import TickLedger, TrainingLoop
+from caraware.loop import Learner, TickLedger, TrainingLoop
 from caraware.ppo import NonFiniteLoss
 from safetensors.torch import load_file
 from synthetic import SyntheticChannel, SyntheticObservation, run_file, street_ticks, with_evaluation
@@ -172,7 +173,7 @@ def test_a_loss_that_is_no_number_saves_its_batch(tmp_path: Path) -> None:
 class ProcessChannel(SyntheticChannel):
     """What `caraware.channel.Channel` would be in the process under test."""
 
-    def __init__(self, run_file_path: str) -> None:
+    def __init__(self, run_file_path: str, first_tick: int = 0) -> None:
         run = json.loads(Path(run_file_path).read_text())
         super().__init__(run, with_evaluation(32, 4, 16, 5.0, 1))
 
@@ -180,7 +181,7 @@ class ProcessChannel(SyntheticChannel):
 class TerminatedChannel(SyntheticChannel):
     """... whose supervisor asks the process to stop at tick 25."""
 
-    def __init__(self, run_file_path: str) -> None:
+    def __init__(self, run_file_path: str, first_tick: int = 0) -> None:
         super().__init__(json.loads(Path(run_file_path).read_text()), self._ticks())
 
     @staticmethod
@@ -262,3 +263,47 @@ def test_no_run_file_ends_with_2(tmp_path: Path) -> None:
     assert train.main([]) == 2
     (tmp_path / "run.json").write_text("{")
     assert train.main([str(tmp_path / "run.json")]) == 2
+
+
+class KilledError(Exception):
+    """The trainer is gone in the middle of a tick."""
+
+
+def stream(first: int, death: int | None = None) -> Iterator[SyntheticObservation]:
+    """Evaluations at the ticks 0 to 19, 60 to 79 and 120 to 139; training in between."""
+    for obs in street_ticks(140, 16, 5.0, seed=4):
+        if obs.tick == death:
+            raise KilledError
+        if obs.tick >= first:
+            episode, evaluation = obs.tick // 20, obs.tick // 20 in (0, 3, 6)
+            truncated = np.full(16, obs.tick % 20 == 0)
+            yield replace(obs, episode=episode, evaluation=evaluation, truncated=truncated, last=obs.tick == 139)
+
+
+@pytest.mark.parametrize("discount", [0.0, 0.9])
+@pytest.mark.parametrize("tick", [2, 11, 30, 36, 60, 99, 110, 125])
+@pytest.mark.parametrize("end", ["left", "killed"])
+def test_a_successor_ends_where_the_undisturbed_run_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, tick: int, discount: float
+) -> None:
+    """An update every 16 training ticks, a checkpoint with every second."""
+    monkeypatch.setattr(TrainingLoop, "_draw", lambda loop: None)
+
+    def settings(folder: str) -> dict:
+        return run_file(str(tmp_path / folder), discount=discount, checkpoint_interval=2)
+
+    loop_over(tmp_path / "whole", stream(0), group=1, run=settings("whole"))
+    config = RunConfig.from_run(settings("cut"))
+    first = SyntheticChannel(settings("cut"), stream(0, tick if end == "killed" else None), 1)
+    loop = TrainingLoop(
+        first, config, lambda: False, leave_requested=lambda: end == "left" and first.consumed_up_to >= tick
+    )
+    with contextlib.suppress(KilledError):
+        assert not loop.run()
+    newest = newest_sound_checkpoint(tmp_path / "cut" / "checkpoints")
+    learner = Learner.begin(replace(config, resume_from=newest), 4)
+    second = SyntheticChannel(settings("cut"), stream(learner.first_tick()), 1)
+    assert TrainingLoop(second, config, lambda: False, learner=learner).run()
+    one, two = final_parameters(tmp_path / "whole"), final_parameters(tmp_path / "cut")
+    assert all(torch.equal(tensor, two[name]) for name, tensor in one.items())
+    assert part(tmp_path / "cut") == part(tmp_path / "whole")

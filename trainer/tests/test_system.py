@@ -31,7 +31,8 @@ def run_with(tmp_path: Path, module: str) -> subprocess.CompletedProcess:
     settings = [f"--set={key}={value}" for key, value in (NOISELESS | {"trainer.module": module}).items()]
     command = [CARAWARE, "train", "town", "--name", "probe", *settings]
     with tempfile.TemporaryDirectory(prefix="caraware") as short:
-        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "CARAWARE_RUNTIME_DIR": short}
+        path = os.pathsep.join(filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
+        environment = os.environ | {"PYTHONPATH": path, "CARAWARE_RUNTIME_DIR": short}
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
 
 

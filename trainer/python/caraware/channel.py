@@ -172,8 +172,9 @@ class Channel:
     and may have places in several.
     """
 
-    def __init__(self, run_file: str, *, outside: bool = False) -> None:
-        self._attachment = _native.Attachment(run_file, outside=outside)
+    def __init__(self, run_file: str, first_tick: int = 0, *, outside: bool = False) -> None:
+        """Join the run; ticks come from `first_tick` on, however far the simulation is: all before are committed."""
+        self._attachment = _native.Attachment(run_file, first_tick, outside=outside)
         self.run: dict[str, Any] = json.loads(self._attachment.run_json)
 
     def receive(self, timeout_s: float) -> list[Observation]:

@@ -2,9 +2,10 @@
 
 import hashlib
 import json
+import logging
 import os
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
 
 import torch
@@ -12,10 +13,16 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from caraware.evaluation import EvaluationResult
+from caraware.metrics import TrainingPoint
 from caraware.ppo import Ppo
+
+log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
+COURSE = "course.json"
+POINTS = "points.safetensors"
 LATEST = "latest"
 """File beside the checkpoints that names the newest."""
 
@@ -40,6 +47,21 @@ class Counters:
 
 
 @dataclass(frozen=True)
+class Course:
+    """What a successor cannot compute again: how training went up to the checkpoint."""
+
+    received_ticks: int = 0
+    lost_ticks: int = 0
+    duplicated_ticks: int = 0
+    vehicles: int = 0
+    """Most at a time."""
+    evaluated_tick: int = -1
+    """Newest tick of `evaluations`; -1 before the first."""
+    evaluations: list[EvaluationResult] = field(default_factory=list)
+    training: list[TrainingPoint] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
 class Manifest:
     """What `manifest.json` says."""
 
@@ -53,7 +75,9 @@ class Manifest:
     """Name to SHA-256."""
 
 
-def save_checkpoint(folder: Path, ppo: Ppo, counters: Counters, config_sha256: str, keep: int) -> Path:
+def save_checkpoint(
+    folder: Path, ppo: Ppo, counters: Counters, config_sha256: str, keep: int, course: Course | None = None
+) -> Path:
     """Write `folder/update-NNNNNN`, then point `folder/latest` at it; older ones beyond `keep` are removed.
 
     Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there.
@@ -63,6 +87,11 @@ def save_checkpoint(folder: Path, ppo: Ppo, counters: Counters, config_sha256: s
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     files = {name: _write(temporary / name, save(tensors)) for name, tensors in _tensors(ppo).items()}
+    if course is not None:
+        rows = torch.tensor([astuple(point) for point in course.training], dtype=torch.float64)
+        files[POINTS] = _write(temporary / POINTS, save({"training": rows}))
+        rest = asdict(course) | {"training": None}
+        files[COURSE] = _write(temporary / COURSE, json.dumps(rest).encode())
     manifest = Manifest(
         schema_version=SCHEMA_VERSION,
         torch_version=torch.__version__,
@@ -90,8 +119,10 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
     for name, expected in (("observation_size", ppo.observation_size), ("hidden", ppo.config.hidden)):
         if (found := getattr(manifest, name)) != expected:
             raise CheckpointError(checkpoint / MANIFEST, f"its {name} is {found}, this run's is {expected}")
-    stored = {name: _read_tensors(checkpoint / name, digest) for name, digest in manifest.files.items()}
     current = _tensors(ppo)
+    stored = {
+        name: _read_tensors(checkpoint / name, digest) for name, digest in manifest.files.items() if name in current
+    }
     for name, tensors in current.items():
         if set(stored.get(name, {})) != set(tensors):
             raise CheckpointError(checkpoint / name, "does not hold the tensors of this trainer")
@@ -101,6 +132,39 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
     ppo.shuffling.set_state(stored["random.safetensors"]["shuffling"])
     ppo.updates = manifest.counters.updates
     return manifest.counters
+
+
+def load_course(checkpoint: Path) -> Course:
+    """How training went up to a checkpoint; nothing if it was saved without. Raises `CheckpointError`."""
+    files = read_manifest(checkpoint).files
+    if COURSE not in files:
+        return Course()
+    rest = json.loads(_verified(checkpoint / COURSE, files[COURSE]))
+    rows = _read_tensors(checkpoint / POINTS, files[POINTS])["training"].tolist()
+    evaluations = [EvaluationResult.restored(result) for result in rest.pop("evaluations")]
+    training = [TrainingPoint(int(steps), *values) for steps, *values in rows]
+    return Course(**rest | {"evaluations": evaluations, "training": training})
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove what a killed trainer left half-written. Nobody may be writing."""
+    for partial in folder.glob(".*.partial"):
+        if partial.is_dir():
+            shutil.rmtree(partial)
+        else:
+            partial.unlink()
+
+
+def newest_sound_checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint that verifies, None if there is none."""
+    for checkpoint in sorted(folder.glob("update-*"), reverse=True):
+        try:
+            for name, digest in read_manifest(checkpoint).files.items():
+                _verified(checkpoint / name, digest)
+            return checkpoint
+        except CheckpointError as error:
+            log.warning("checkpoint refused, the one before it is used: %s", error)
+    return None
 
 
 def latest_checkpoint(folder: Path) -> Path:
@@ -141,13 +205,20 @@ def _tensors(ppo: Ppo) -> dict[str, dict[str, Tensor]]:
     return {"parameters.safetensors": parameters, "optimiser.safetensors": moments, "random.safetensors": random}
 
 
-def _read_tensors(file: Path, sha256: str) -> dict[str, Tensor]:
+def _verified(file: Path, sha256: str) -> bytes:
+    """The content of a file of a checkpoint."""
     try:
-        found = hashlib.sha256(file.read_bytes()).hexdigest()
+        content = file.read_bytes()
     except OSError as error:
         raise CheckpointError(file, f"cannot be read ({error.strerror})") from error
+    found = hashlib.sha256(content).hexdigest()
     if found != sha256:
         raise CheckpointError(file, f"is damaged: SHA-256 {found[:12]}…, the manifest says {sha256[:12]}…")
+    return content
+
+
+def _read_tensors(file: Path, sha256: str) -> dict[str, Tensor]:
+    _verified(file, sha256)
     try:
         return load_file(file)
     except SafetensorError as error:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,11 @@ class EvaluationResult:
         for name in ESTIMATORS:
             error_m = getattr(self, f"{name}_standard_error_m")
             object.__setattr__(self, f"{name}_ci95_m", None if error_m is None else CI95_STANDARD_ERRORS * error_m)
+
+    @classmethod
+    def restored(cls, values: dict) -> "EvaluationResult":
+        """From what `dataclasses.asdict` made of one."""
+        return cls(**{known.name: values[known.name] for known in fields(cls) if known.init})
 
     def headline(self) -> dict[str, float | None]:
         """Mean errors and half their confidence intervals, for the run's report."""

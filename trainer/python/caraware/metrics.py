@@ -1,6 +1,7 @@
 """The course of training: TensorBoard events, and a history for the plots."""
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
@@ -28,7 +29,17 @@ class Metrics:
     def __init__(self, folder: Path) -> None:
         self.training: list[TrainingPoint] = []
         self.evaluations: list[EvaluationResult] = []
-        self._writer = SummaryWriter(str(folder))
+        self._folder = folder
+        self._purge_step: int | None = None
+
+    def resume(self, training: list[TrainingPoint], evaluations: list[EvaluationResult], env_steps: int) -> None:
+        """Go on after `env_steps`: events that a predecessor recorded beyond are void."""
+        self.training, self.evaluations = list(training), list(evaluations)
+        self._purge_step = env_steps + 1
+
+    @cached_property
+    def _writer(self) -> SummaryWriter:
+        return SummaryWriter(str(self._folder), purge_step=self._purge_step)
 
     def updated(self, point: TrainingPoint, stats: UpdateStats) -> None:
         """Record one update."""

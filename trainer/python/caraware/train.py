@@ -1,16 +1,25 @@
 """`python -m caraware.train RUN_FILE`: the trainer process of one run.
 
+A trainer that replaces another continues from the newest checkpoint that verifies. As a shadow (`CARAWARE_SHADOW`) it
+gets ready first, says so on standard output, and takes over when standard input tells it to.
+
 Exit codes: 0 done, or stopped by SIGTERM or SIGINT after a checkpoint; 1 the run failed; 2 configuration;
 3 something is missing on this machine. A failure is told once, in `<run>/logs/trainer.error.json`.
 """
 
 import json
 import logging
+import os
 import signal
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from caraware.config import RunConfig
+    from caraware.loop import Learner
 
 log = logging.getLogger("caraware.train")
 
@@ -25,23 +34,56 @@ class Failure:
     message: str
     help: str
 
-    def write(self, run_dir: Path) -> None:
+    def write(self, run_dir: Path, process: str) -> None:
         """Leave it where the supervisor looks."""
-        file = run_dir / "logs" / "trainer.error.json"
+        file = run_dir / "logs" / f"{process}.error.json"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps({"kind": self.kind, "message": self.message, "help": self.help}) + "\n")
 
 
 class StopSignal:
-    """Remembers SIGTERM and SIGINT, so that the loop ends between two batches."""
+    """Remembers SIGTERM and SIGINT, so that the loop ends between two batches, and SIGUSR1: leave to a successor."""
 
     def __init__(self) -> None:
-        self.requested = False
-        for number in (signal.SIGTERM, signal.SIGINT):
+        self.requested = self.leave_requested = False
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
             signal.signal(number, self._remember)
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
-        self.requested = True
+        if number == signal.SIGUSR1:
+            self.leave_requested = True
+        else:
+            self.requested = True
+
+
+@dataclass
+class Succession:
+    """Whether this process replaces a trainer, and how; what the supervisor says in the environment."""
+
+    replaces: bool
+    is_shadow: bool
+    """Another trainer is still at work: get ready, then wait."""
+    checkpoint: Path | None
+    """Parameters to take instead of the newest of the run."""
+
+    @classmethod
+    def from_environment(cls) -> "Succession":
+        """First trainer of a run unless told otherwise."""
+        checkpoint = os.environ.get("CARAWARE_CHECKPOINT")
+        return cls(
+            replaces=int(os.environ.get("CARAWARE_INCARNATION", "0")) > 0,
+            is_shadow=bool(os.environ.get("CARAWARE_SHADOW")),
+            checkpoint=Path(checkpoint) if checkpoint else None,
+        )
+
+    def wait_for_turn(self) -> bool:
+        """Say that this shadow is ready, and wait; False if it is not wanted any more."""
+        os.write(1, b"ready\n")
+        os.dup2(2, 1)
+        if os.read(0, 16) != b"go\n":
+            return False
+        self.is_shadow = False
+        return True
 
 
 def main(arguments: list[str]) -> int:
@@ -51,13 +93,13 @@ def main(arguments: list[str]) -> int:
         print("usage: python -m caraware.train RUN_FILE", file=sys.stderr)
         return EXIT_CODES["config"]
     run_file = Path(arguments[0])
-    stop = StopSignal()
+    stop, succession = StopSignal(), Succession.from_environment()
     try:
-        _train(run_file, stop)
+        _train(run_file, stop, succession)
     except Exception as error:  # the edge of the process: everything ends up in one place
         failure = _explain(error)
         log.exception("%s", failure.message)
-        failure.write(_run_dir(run_file))
+        failure.write(_run_dir(run_file), "successor" if succession.is_shadow else "trainer")
         return EXIT_CODES[failure.kind]
     return 0
 
@@ -70,7 +112,7 @@ def _run_dir(run_file: Path) -> Path:
         return run_file.parent
 
 
-def _train(run_file: Path, stop: StopSignal) -> None:
+def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
     """Imports stand here so that a missing package is reported like any other failure."""
     from caraware.config import RunConfig
     from caraware.loop import TrainingLoop
@@ -79,8 +121,40 @@ def _train(run_file: Path, stop: StopSignal) -> None:
 
     from caraware.channel import Channel
 
-    channel = Channel(str(run_file))
-    TrainingLoop(channel, config, lambda: stop.requested).run()
+    learner = _successor(run_file, config, succession) if succession.replaces else None
+    if succession.is_shadow:
+        return
+    channel = Channel(str(run_file), learner.first_tick() if learner else 0)
+    loop = TrainingLoop(
+        channel, config, lambda: stop.requested, leave_requested=lambda: stop.leave_requested, learner=learner
+    )
+    if succession.checkpoint is not None:
+        loop.commit()
+    if not loop.run():
+        # A successor waits for this process to end, and the simulation for it: torch would take seconds to tidy up.
+        logging.shutdown()
+        os._exit(0)
+
+
+def _successor(run_file: Path, config: "RunConfig", succession: Succession) -> "Learner | None":
+    """A learner that stands where the run's newest sound checkpoint does; None if it is not wanted any more."""
+    from caraware import _native
+    from caraware.checkpoint import newest_sound_checkpoint, remove_partial
+    from caraware.loop import Learner
+
+    size, folder = _native.observation_size(str(run_file)), config.run_dir / "checkpoints"
+    if succession.is_shadow:
+        # Whatever could be wrong with the settings or the checkpoint shows here, while the predecessor is at work.
+        Learner.begin(replace(config, resume_from=succession.checkpoint or newest_sound_checkpoint(folder)), size)
+        if not succession.wait_for_turn():
+            return None
+    remove_partial(folder)
+    newest = newest_sound_checkpoint(folder)
+    learner = Learner.begin(replace(config, resume_from=newest or config.resume_from), size)
+    log.info("continues from %s at tick %d", newest.name if newest else "the beginning", learner.first_tick())
+    if succession.checkpoint is not None:
+        learner.take_parameters(succession.checkpoint)
+    return learner
 
 
 def _read_run(run_file: Path) -> dict:

@@ -1,0 +1,146 @@
+//! A process that is killed leaves nothing that stands in the way of its successor.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests assert by unwrapping")]
+
+use std::{
+    path::Path,
+    process::{Child, Command},
+    sync::{Arc, atomic::AtomicBool},
+    time::{Duration, Instant},
+};
+
+use ipc_schema::{
+    board::State,
+    config::Config,
+    header::MessageHeader,
+    ports::{BoardReader, RosterWriter},
+    process::Process,
+    run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
+    services::{self, Channel, ServiceHolder},
+    session::{INCARNATION, Session},
+};
+
+/// Set for the process that is to be killed: the run file.
+const VICTIM: &str = "CARAWARE_TEST_VICTIM";
+
+fn run_in(directory: &Path) -> RunFile {
+    let mut config: Config = serde_json::from_str(include_str!("town.json")).unwrap();
+    config.traffic.max_road_users = 8;
+    RunFile {
+        schema_version: ipc_schema::SCHEMA_VERSION,
+        run_id: 1,
+        name: "killed".into(),
+        run_dir: directory.into(),
+        mode: Mode::Train,
+        supervisor_pid: std::process::id().try_into().unwrap(),
+        shared_memory: SharedMemory {
+            root: directory.into(),
+            prefix: format!("caraware_killed{}_", std::process::id()),
+        },
+        source: Source::Scenario { sumocfg: "none".into() },
+        map: MapInfo {
+            projection: String::new(),
+            net_offset_m: [0.0; 2],
+            bounds_m: [0.0; 4],
+        },
+        scene_files: SceneFiles::default(),
+        sumo_home: "none".into(),
+        config,
+        config_hash: String::new(),
+    }
+}
+
+/// Not a test of its own: the process that the test below kills.
+#[test]
+fn the_victim() {
+    let Some(run_file) = std::env::var_os(VICTIM) else {
+        return;
+    };
+    let run = RunFile::read(Path::new(&run_file)).unwrap();
+    let mut session = Session::join_with(run, Process::Trainer, 0, Arc::new(AtomicBool::new(false))).unwrap();
+    let observations = session.subscriber(Channel::Observation).unwrap();
+    let predictions = session.publisher(Channel::Prediction).unwrap();
+    session.attach_from(7);
+    let message = session.next(&observations).unwrap().unwrap();
+    let header = MessageHeader {
+        tick: message.header().tick,
+        ..session.header()
+    };
+    predictions.loan(header, 8).unwrap().send().unwrap();
+    session.consumed(header.tick + 1);
+    loop {
+        session.wait(Duration::from_secs(1)).unwrap();
+    }
+}
+
+fn start_victim(run_file: &Path, incarnation: u32) -> Child {
+    Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "the_victim", "--nocapture"])
+        .env(VICTIM, run_file)
+        .env(INCARNATION, incarnation.to_string())
+        .spawn()
+        .unwrap()
+}
+
+fn eventually(what: &str, condition: impl Fn() -> bool) {
+    let deadline = Instant::now() + Duration::from_secs(30);
+    while !condition() {
+        assert!(Instant::now() < deadline, "{what}: not within half a minute");
+        std::thread::park_timeout(Duration::from_millis(1));
+    }
+}
+
+#[test]
+fn a_killed_trainer_is_replaced_again_and_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let run = run_in(directory.path());
+    let run_file = run.write().unwrap();
+    let node = services::node(&run.shared_memory).unwrap();
+    let holder = ServiceHolder::create(&node, &run, 0).unwrap();
+    let mut roster = RosterWriter::create(&holder).unwrap();
+    let board = BoardReader::open(&node, &run, 0, Process::Trainer).unwrap();
+    let mut in_process = run.clone();
+    in_process.supervisor_pid = rustix::process::getppid().unwrap().as_raw_nonzero().get();
+    let mut sensing =
+        Session::join_with(in_process, Process::SensorDaemon, 0, Arc::new(AtomicBool::new(false))).unwrap();
+    let observations = sensing.publisher(Channel::Observation).unwrap();
+    let predictions = sensing.subscriber(Channel::Prediction).unwrap();
+    let waker = sensing.waker(Process::Trainer).unwrap();
+    for incarnation in 0..12 {
+        assert!(roster.set(Process::Trainer, incarnation));
+        assert_eq!(
+            (board.progress().attached, board.health().state),
+            (0, State::Starting as u32)
+        );
+        let mut victim = start_victim(&run_file, incarnation);
+        eventually("attached", || board.progress().attached == 1);
+        assert_eq!(
+            (board.progress().incarnation, board.progress().committed_ticks),
+            (incarnation, 7)
+        );
+        let header = MessageHeader {
+            tick: 7,
+            incarnation,
+            ..sensing.header()
+        };
+        observations.loan(header, 8).unwrap().send().unwrap();
+        waker.wake();
+        eventually("consumed", || board.progress().consumed_ticks == 8);
+        let answer = predictions.receive().unwrap().unwrap();
+        assert_eq!((answer.header().incarnation, answer.header().tick), (incarnation, 7));
+        victim.kill().unwrap();
+        victim.wait().unwrap();
+        assert_eq!(board.progress().consumed_ticks, 8, "a board outlives its writer");
+        services::forget_dead(&node);
+    }
+    drop((observations, predictions, waker, sensing, board, roster, holder, node));
+    let left = std::fs::read_dir("/dev/shm").unwrap().flatten();
+    for entry in left.filter(|entry| {
+        entry
+            .file_name()
+            .to_string_lossy()
+            .starts_with(&run.shared_memory.prefix)
+    }) {
+        std::fs::remove_file(entry.path()).unwrap();
+    }
+}

@@ -1,0 +1,456 @@
+//! A learner that is killed or replaced in mid-run: nothing lost, nothing learnt twice, the same policy in the end.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
+mod common;
+
+use std::{
+    path::{Path, PathBuf},
+    process::{Child, Stdio},
+    sync::OnceLock,
+    time::{Duration, Instant},
+};
+
+use common::{Workplace, shared_memory, text};
+use ipc_schema::{
+    board::{Health, Progress},
+    ports::BoardReader,
+    process::Process,
+    run::RunFile,
+    services::{self, RunNode},
+};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+/// Six vehicles, six episodes of which two evaluations between: 3 000 ticks, 24 updates, a checkpoint for every second.
+const SMALL: [&str; 12] = [
+    "traffic.cavs=6",
+    "traffic.others=3",
+    "traffic.pedestrians=3",
+    "episode.ticks=400",
+    "episode.training_episodes=6",
+    "episode.evaluation_interval=2",
+    "episode.evaluation_ticks=100",
+    "trainer.horizon=600",
+    "trainer.batch_size=300",
+    "trainer.checkpoint_interval=2",
+    "trainer.matmul_precision=float32",
+    "fanout.enabled=false",
+];
+
+fn arguments(name: &str, more: &[&str]) -> Vec<String> {
+    let settings = SMALL.iter().chain(more).flat_map(|setting| ["--set", setting]);
+    ["train", "town", "--name", name]
+        .into_iter()
+        .chain(settings)
+        .map(str::to_owned)
+        .collect()
+}
+
+/// A run in the background and its boards.
+struct Run {
+    child: Child,
+    directory: PathBuf,
+    trainer: BoardReader,
+    sensing: BoardReader,
+    _node: RunNode,
+}
+
+impl Run {
+    fn start(workplace: &Workplace, name: &str, more: &[&str]) -> Self {
+        let arguments = arguments(name, more);
+        let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+        let mut child = workplace
+            .command(&arguments)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let directory = workplace.path().join("runs").join(name);
+        let (node, trainer, sensing) = eventually(&mut child, "boards", || {
+            let run = RunFile::read(&directory.join("run.json")).ok()?;
+            let node = services::node(&run.shared_memory).ok()?;
+            let trainer = BoardReader::open(&node, &run, 0, Process::Trainer).ok()?;
+            let sensing = BoardReader::open(&node, &run, 0, Process::SensorDaemon).ok()?;
+            Some((node, trainer, sensing))
+        });
+        Self {
+            child,
+            directory,
+            trainer,
+            sensing,
+            _node: node,
+        }
+    }
+
+    /// Waits until `condition` holds of the trainer that is at work.
+    fn until(&mut self, what: &str, condition: impl Fn(Progress, Health) -> bool) {
+        let trainer = &self.trainer;
+        eventually(&mut self.child, what, || {
+            condition(trainer.progress(), trainer.health()).then_some(())
+        });
+    }
+
+    /// Kills the trainer once it has consumed `tick` ticks as incarnation `incarnation`.
+    fn kill_trainer_at(&mut self, incarnation: u32, tick: u64) {
+        self.until("a trainer at work", |progress, _| {
+            progress.incarnation == incarnation && progress.attached == 1 && progress.consumed_ticks >= tick
+        });
+        let pid = Pid::from_raw(self.trainer.health().pid).unwrap();
+        kill_process(pid, Signal::KILL).unwrap();
+    }
+
+    /// Exit code and everything the command said.
+    fn end(self) -> (Option<i32>, String) {
+        let Self {
+            child,
+            trainer,
+            sensing,
+            _node,
+            ..
+        } = self;
+        // Spectators go before what they look at.
+        drop((trainer, sensing, _node));
+        let output = child.wait_with_output().unwrap();
+        (output.status.code(), text(&output))
+    }
+
+    fn log(&self) -> String {
+        std::fs::read_to_string(self.directory.join("logs/trainer.log")).unwrap_or_default()
+    }
+}
+
+/// Asks until there is an answer, or the run is over.
+fn eventually<T>(child: &mut Child, what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
+    let deadline = Instant::now() + Duration::from_secs(120);
+    while Instant::now() < deadline {
+        if let Some(answer) = ask() {
+            return answer;
+        }
+        let over = child.try_wait().unwrap();
+        assert!(over.is_none(), "{what}: the run is over: {over:?}");
+        std::thread::park_timeout(Duration::from_millis(1));
+    }
+    child.kill().unwrap();
+    panic!("{what}: not within two minutes");
+}
+
+/// Nothing of the run is left in shared memory, in the registry or as a process, and nothing half-written in its directory.
+fn assert_nothing_left(workplace: &Workplace, name: &str) {
+    workplace.assert_nothing_left();
+    let directory = workplace.path().join("runs").join(name);
+    let prefix = RunFile::read(&directory.join("run.json")).unwrap().shared_memory.prefix;
+    let left: Vec<String> = shared_memory()
+        .into_iter()
+        .filter(|file| file.starts_with(&prefix))
+        .collect();
+    assert!(left.is_empty(), "{left:?}");
+    let partial = |entry: &std::fs::DirEntry| entry.file_name().to_string_lossy().contains("partial");
+    for place in [directory.clone(), directory.join("checkpoints")] {
+        let files = std::fs::read_dir(place).into_iter().flatten().flatten();
+        assert_eq!(files.filter(partial).count(), 0);
+    }
+    assert!(!directory.join("run.next.json").exists());
+}
+
+/// Hash of every tensor of the newest checkpoint: parameters, optimiser, generators.
+fn learnt(run: &Path) -> String {
+    let checkpoints = run.join("checkpoints");
+    let newest = std::fs::read_to_string(checkpoints.join("latest")).unwrap();
+    let mut hasher = blake3::Hasher::new();
+    for name in ["parameters", "optimiser", "random"] {
+        let file = checkpoints.join(newest.trim()).join(format!("{name}.safetensors"));
+        hasher.update(&std::fs::read(file).unwrap());
+    }
+    format!("{} {}", newest.trim(), hasher.finalize().to_hex())
+}
+
+/// What a run of these settings and seed comes to, disturbed or not.
+#[derive(Debug, Clone, PartialEq)]
+struct Result {
+    observation_hash: String,
+    learnt: String,
+    /// Policy's mean error of each evaluation.
+    evaluations: Vec<(u64, f64)>,
+    env_steps: u64,
+    ticks: u64,
+}
+
+impl Result {
+    fn of(workplace: &Workplace, name: &str) -> Self {
+        let report = workplace.report(name);
+        assert_eq!(
+            (&report["lost_ticks"], &report["duplicated_ticks"]),
+            (&0.into(), &0.into()),
+            "{report:#}"
+        );
+        assert_eq!(report["result"], "completed");
+        let evaluations = report["trainer"]["evaluations"].as_array().unwrap();
+        let evaluation = |value: &Value| {
+            (
+                value["policy_version"].as_u64().unwrap(),
+                value["ppo_mean_error_m"].as_f64().unwrap(),
+            )
+        };
+        Self {
+            observation_hash: report["observation_hash"].as_str().unwrap().into(),
+            learnt: learnt(&workplace.path().join("runs").join(name)),
+            evaluations: evaluations.iter().map(evaluation).collect(),
+            env_steps: report["env_steps"].as_u64().unwrap(),
+            ticks: report["trainer"]["received_ticks"].as_u64().unwrap(),
+        }
+    }
+}
+
+/// The undisturbed run, made once.
+fn undisturbed(workplace: &Workplace) -> &'static Result {
+    static RESULT: OnceLock<Result> = OnceLock::new();
+    RESULT.get_or_init(|| {
+        let arguments = arguments("undisturbed", &[]);
+        workplace.succeed(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+        let report = workplace.report("undisturbed");
+        assert_eq!(
+            (&report["restarts"], &report["redelivered_ticks"]),
+            (&0.into(), &0.into())
+        );
+        let result = Result::of(workplace, "undisturbed");
+        assert_eq!(result.evaluations.len(), 3);
+        assert_eq!(result.ticks, report["ticks"]);
+        result
+    })
+}
+
+fn assert_undisturbed(workplace: &Workplace, name: &str, restarts: u64) {
+    let expected = undisturbed(workplace);
+    let report = workplace.report(name);
+    assert_eq!(report["restarts"], restarts);
+    let result = Result::of(workplace, name);
+    // The forward pass sees as many ticks at once as wait: an error of some 60 m depends on that by the rounding of its sum.
+    assert_eq!(result.evaluations.len(), expected.evaluations.len());
+    for (found, wanted) in result.evaluations.iter().zip(&expected.evaluations) {
+        assert_eq!(found.0, wanted.0, "updates before an evaluation");
+        assert!((found.1 - wanted.1).abs() < 1e-4, "{found:?}, undisturbed {wanted:?}");
+    }
+    assert_eq!(
+        Result {
+            evaluations: expected.evaluations.clone(),
+            ..result
+        },
+        *expected
+    );
+}
+
+#[test]
+fn a_trainer_killed_again_and_again_learns_what_the_undisturbed_one_does() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "killed", &[]);
+    // Before the first checkpoint (tick 200), in the middle, in the first evaluation (ticks 800 to 899), after it, in the last.
+    for (incarnation, tick) in [(0, 30), (1, 150), (2, 470), (3, 850), (4, 1234), (5, 2950)] {
+        run.kill_trainer_at(incarnation, tick);
+    }
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    assert_undisturbed(&workplace, "killed", 6);
+    let redelivered = workplace.report("killed")["redelivered_ticks"].as_u64().unwrap();
+    assert!(redelivered > 0 && redelivered < 3000, "{redelivered} ticks sent again");
+    assert_nothing_left(&workplace, "killed");
+}
+
+#[test]
+fn a_damaged_newest_checkpoint_is_passed_over() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "damaged", &[]);
+    let pid = {
+        run.until("the fourth checkpoint", |progress, _| progress.committed_ticks >= 800);
+        Pid::from_raw(run.trainer.health().pid).unwrap()
+    };
+    // A stopped process cannot write another checkpoint while this one is damaged.
+    kill_process(pid, Signal::STOP).unwrap();
+    let checkpoints = run.directory.join("checkpoints");
+    let newest = std::fs::read_to_string(checkpoints.join("latest")).unwrap();
+    let file = checkpoints.join(newest.trim()).join("parameters.safetensors");
+    let mut bytes = std::fs::read(&file).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    std::fs::write(&file, bytes).unwrap();
+    kill_process(pid, Signal::KILL).unwrap();
+    run.until("a successor", |progress, _| {
+        progress.incarnation == 1 && progress.attached == 1
+    });
+    let log = run.log();
+    assert!(
+        log.contains("checkpoint refused") && log.contains("is damaged"),
+        "{log}"
+    );
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    assert_undisturbed(&workplace, "damaged", 1);
+}
+
+#[test]
+fn a_trainer_that_dies_at_once_each_time_ends_the_run_with_its_last_words() {
+    let workplace = Workplace::new();
+    workplace.write(
+        "suicide.py",
+        "import os, signal, sys\nprint('no room for me', file=sys.stderr, flush=True)\nos.kill(os.getpid(), signal.SIGKILL)\n",
+    );
+    let python = std::env::var("PYTHONPATH").unwrap_or_default();
+    let arguments = arguments("vain", &["trainer.module=suicide"]);
+    let output = workplace
+        .command(&arguments.iter().map(String::as_str).collect::<Vec<_>>())
+        .env("PYTHONPATH", format!("{}:{python}", workplace.path().display()))
+        .output()
+        .unwrap();
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    for words in [
+        "signal: 9",
+        "no room for me",
+        "replaced 5 times in a row",
+        "trainer.log",
+    ] {
+        assert!(said.contains(words), "\"{words}\" is missing:\n{said}");
+    }
+    assert_nothing_left(&workplace, "vain");
+}
+
+#[test]
+fn a_journal_that_is_too_small_names_its_key() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(
+        &workplace,
+        "small",
+        &[
+            "run.journal_mib=1",
+            "trainer.checkpoint_interval=1000",
+            "episode.ticks=4000",
+        ],
+    );
+    // A tick is about 1.3 kB: a mebibyte holds some 800 of them.
+    run.kill_trainer_at(0, 2500);
+    let (code, said) = run.end();
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("`run.journal_mib` (now 1)"), "{said}");
+    assert_nothing_left(&workplace, "small");
+}
+
+/// The longest time without a new tick, until `over`.
+fn longest_pause(sensing: &BoardReader, mut over: impl FnMut() -> bool) -> Duration {
+    let (mut ticks, mut since, mut longest) = (sensing.health().ticks, Instant::now(), Duration::ZERO);
+    while !over() {
+        std::thread::park_timeout(Duration::from_millis(1));
+        let now = sensing.health().ticks;
+        longest = longest.max(since.elapsed());
+        if now != ticks {
+            (ticks, since) = (now, Instant::now());
+        }
+    }
+    longest
+}
+
+/// Slow enough for a successor to get ready in mid-run: 20 times real time, 15 s.
+const PACED: &str = "run.real_time_factor=20";
+
+#[test]
+fn a_planned_swap_changes_nothing_but_the_process() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "swapped", &[PACED]);
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    let old = run.trainer.health().pid;
+    let mut swap = workplace
+        .command(&["swap", "swapped"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let pause = longest_pause(&run.sensing, || swap.try_wait().unwrap().is_some());
+    let output = swap.wait_with_output().unwrap();
+    let said = text(&output);
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains("trainer 1 has taken over at tick"), "{said}");
+    run.until("another process at work", |progress, health| {
+        progress.incarnation == 1 && health.pid != old && health.ticks > progress.committed_ticks
+    });
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    assert_undisturbed(&workplace, "swapped", 0);
+    let swaps = workplace.report("swapped")["swaps"].clone();
+    assert_eq!(swaps[0]["incarnation"], 1);
+    println!(
+        "hand-over {} s; the simulation paused for {pause:?} at most",
+        swaps[0]["pause_s"]
+    );
+    assert_nothing_left(&workplace, "swapped");
+}
+
+#[test]
+fn a_swap_with_other_settings_learns_on_with_them() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "changed", &[PACED]);
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    let output = workplace.run(&["swap", "--set", "trainer.learning_rate=0.0001"]);
+    assert!(output.status.success(), "{}", text(&output));
+    // What is killed after the swap comes back with the new settings.
+    run.kill_trainer_at(1, run.trainer.progress().committed_ticks + 1);
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    let (expected, result) = (undisturbed(&workplace), Result::of(&workplace, "changed"));
+    assert_eq!(result.observation_hash, expected.observation_hash);
+    assert_eq!((result.env_steps, result.ticks), (expected.env_steps, expected.ticks));
+    assert_ne!(result.learnt, expected.learnt);
+    let config = RunFile::read(&workplace.path().join("runs/changed/run.json"))
+        .unwrap()
+        .config;
+    assert!(format!("{:?}", config.trainer).contains("learning_rate: 0.0001"));
+    let log = std::fs::read_to_string(workplace.path().join("runs/changed/logs/trainer.log")).unwrap();
+    assert_eq!(log.matches("learning_rate=0.0001,").count(), 2, "{log}");
+}
+
+#[test]
+fn a_swap_that_cannot_be_is_refused_and_the_trainer_goes_on() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "refused", &[PACED]);
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    let refused = |arguments: &[&str], code: i32, words: &[&str]| {
+        let output = workplace.run(&[&["swap", "refused"], arguments].concat());
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(code), "{said}");
+        // Messages are wrapped for the terminal.
+        let said = said.replace('│', " ").split_whitespace().collect::<Vec<_>>().join(" ");
+        for word in words {
+            assert!(said.contains(word), "\"{word}\" is missing:\n{said}");
+        }
+    };
+    refused(
+        &["--set", "trainer.lerning_rate=1"],
+        2,
+        &["trainer.lerning_rate", "trainer.learning_rate"],
+    );
+    refused(
+        &["--set", "traffic.cavs=9"],
+        2,
+        &["`traffic.cavs` cannot change in a live run"],
+    );
+    refused(&["--checkpoint", "nowhere"], 2, &["nowhere is not a checkpoint"]);
+    let checkpoints = run.directory.join("checkpoints");
+    let newest = std::fs::read_to_string(checkpoints.join("latest")).unwrap();
+    let manifest = std::fs::read_to_string(checkpoints.join(newest.trim()).join("manifest.json")).unwrap();
+    let other = workplace.path().join("other");
+    std::fs::create_dir(&other).unwrap();
+    let wider = manifest.replace("\"observation_size\": 9", "\"observation_size\": 11");
+    assert_ne!(wider, manifest);
+    std::fs::write(other.join("manifest.json"), wider).unwrap();
+    refused(
+        &["--checkpoint", "other"],
+        1,
+        &["the trainer goes on", "observation_size is 11, this run's is 9"],
+    );
+    assert_eq!(run.trainer.progress().incarnation, 0);
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    assert_undisturbed(&workplace, "refused", 0);
+    assert_nothing_left(&workplace, "refused");
+}
