@@ -48,13 +48,13 @@ fn unknown_configuration_key() {
 #[test]
 fn wrong_unit_and_wrong_range() {
     let workplace = Workplace::new();
-    workplace.write("my.toml", "[gnss]\nnoise_std_m = 5.0\n");
+    workplace.write("my.toml", "[gnss]\nnoise_deg = 5.0\n");
     assert_says(
         &refused(&workplace, &["train", "my.toml"], 2),
-        &["my.toml:2: unknown key `gnss.noise_std_m`", "`gnss.noise_std_deg`"],
+        &["my.toml:2: unknown key `gnss.noise_deg`", "`gnss.noise_std_deg`"],
     );
     let said = refused(&workplace, &["train", "--set", "gnss.noise_std_deg=5.0"], 2);
-    assert_says(&said, &["`gnss.noise_std_deg` cannot be 5.0", "allowed: 0 … 1 in deg"]);
+    assert_says(&said, &["`gnss.noise_std_deg` cannot be 5.0", "allowed: 2 × 0 … 1, or one for all in deg"]);
     let said = refused(&workplace, &["train", "--set", "gnss.period_s=0.25"], 2);
     assert_says(&said, &["`gnss.period_s` = 0.25 s", "`run.tick_s` = 0.1 s"]);
 }
