@@ -49,16 +49,16 @@ lint: $(VENV)/.installed ## formatting and lints, as errors
 	cargo fmt --all --check
 	cargo clippy --locked --workspace --all-targets -- -D warnings
 	$(VENV)/bin/ruff check trainer viewer
-	$(VENV)/bin/ruff check --config trainer/pyproject.toml sim-core docs
+	$(VENV)/bin/ruff check --config trainer/pyproject.toml sim-core sensor-daemon docs
 	$(VENV)/bin/ruff format --check trainer viewer
-	$(VENV)/bin/ruff format --config trainer/pyproject.toml --check sim-core docs
+	$(VENV)/bin/ruff format --config trainer/pyproject.toml --check sim-core sensor-daemon docs
 
 format: $(VENV)/.installed
 	cargo fmt --all
 	$(VENV)/bin/ruff check --fix trainer viewer
-	$(VENV)/bin/ruff check --config trainer/pyproject.toml --fix sim-core docs
+	$(VENV)/bin/ruff check --config trainer/pyproject.toml --fix sim-core sensor-daemon docs
 	$(VENV)/bin/ruff format trainer viewer
-	$(VENV)/bin/ruff format --config trainer/pyproject.toml sim-core docs
+	$(VENV)/bin/ruff format --config trainer/pyproject.toml sim-core sensor-daemon docs
 
 deny: ## licences, sources and advisories of all dependencies (needs: cargo install cargo-deny --locked)
 	cargo deny check

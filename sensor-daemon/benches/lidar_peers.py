@@ -1,4 +1,4 @@
-"""General ray tracers on the rays and triangles that `lidar-bench` has written: one thread, one line of answer for a line of name.
+"""General ray tracers on the rays and triangles that `lidar-bench` has written: one thread, a line for each name.
 
 Seconds are those that the process had a core, as in `lidar-bench`: others may be at work on the machine.
 """
@@ -51,7 +51,8 @@ def main():
         try:
             peers[name] = make(vertices, faces, rays)
         except (ImportError, OSError) as error:
-            print(f"{name} is left out: {error} (pip install open3d-cpu embreex; Debian: libgl1 libusb-1.0-0 libgomp1)", file=sys.stderr)
+            cure = "pip install open3d-cpu embreex; Debian: libgl1 libusb-1.0-0 libgomp1"
+            print(f"{name} is left out: {error} ({cure})", file=sys.stderr)
     print(*peers, flush=True)
     for line in sys.stdin:
         cast = peers[line.strip()]
