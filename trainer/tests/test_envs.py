@@ -222,8 +222,9 @@ def test_a_simulation_that_somebody_stops_is_an_exception_that_says_so() -> None
 
 
 USER = """
-    import sys, numpy as np
+    import signal, numpy as np
     from caraware.envs import CarAwareVectorEnv, make
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell in the background starts programs without it
     simulation = make("driving", {settings!r})
     env = CarAwareVectorEnv(simulation)
     env.reset()
@@ -242,7 +243,7 @@ def test_a_user_that_is_killed_or_interrupted_takes_its_simulation_along(number:
         pid, prefix = user.stdout.readline().split()
         processes = processes_of(int(pid))
         user.send_signal(number)
-        errors = user.communicate()[1]
+        errors = user.communicate(timeout=60)[1]
         assert user.returncode == -number and (number == signal.SIGKILL) == (errors == "")
         assert number == signal.SIGKILL or errors.rstrip().endswith("KeyboardInterrupt")
     wait_until(lambda: all(gone(process) for process in processes))
