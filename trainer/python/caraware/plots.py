@@ -5,7 +5,7 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, ScalarFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
 from caraware.evaluation import EvaluationResult
 from caraware.metrics import TrainingPoint
@@ -26,9 +26,9 @@ def plot_error(file: Path, training: list[TrainingPoint], evaluations: list[Eval
     _plot_evaluated(axes, evaluations, "rts", "RTS smoother, sees the future: a bound", RTS, ":", "^")
     _plot_evaluated(axes, evaluations, "ppo", "policy, evaluation on unseen seeds", EVALUATION, "-", "o")
     axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(ScalarFormatter())
-    axes.yaxis.set_minor_formatter(ScalarFormatter())
-    axes.tick_params(axis="y", which="minor", labelsize=8)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel("mean position error [m]")
     axes.legend(frameon=False, fontsize=9)
     _save(figure, file)
