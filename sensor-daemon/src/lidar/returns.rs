@@ -100,6 +100,25 @@ impl Receiver {
         cursor
     }
 
+    /// Points at `range` along the rays, in the sensor's axes.
+    #[inline(always)]
+    fn position<S: Simd, const UPRIGHT: bool>(&self, range: S::F, rays: &Group, shot: &Shot) -> [S::F; 3] {
+        let (sine, cosine) = (S::splat(shot.azimuth[0]), S::splat(shot.azimuth[1]));
+        let (ahead, up) = (range * S::load(&rays.alpha), range * S::load(&rays.gamma));
+        let (x, y) = if UPRIGHT {
+            (ahead * cosine, ahead * sine)
+        } else {
+            let beside = range * S::load(&rays.beta);
+            (ahead * cosine - beside * sine, ahead * sine + beside * cosine)
+        };
+        let zero = S::splat(0.0);
+        if self.is_paper {
+            [y, zero - x, zero - up]
+        } else {
+            [x, y, up]
+        }
+    }
+
     #[inline(always)]
     fn group<S: Simd, const UPRIGHT: bool>(
         &self,
@@ -112,7 +131,7 @@ impl Receiver {
     ) -> usize {
         let word = S::load_words(&canvas.word[place]);
         let (mut range, mut incidence) = (S::load(&canvas.t[place]), S::load(&canvas.incidence[place]));
-        let (alpha, gamma) = (S::load(&rays.alpha), S::load(&rays.gamma));
+        let alpha = S::load(&rays.alpha);
         if UPRIGHT {
             range = range * S::load(&rays.inv_cos);
             incidence = incidence * alpha;
@@ -142,23 +161,7 @@ impl Receiver {
             return cursor;
         }
         intensity = S::min(intensity, S::splat(1.0));
-        let (sine, cosine) = (S::splat(shot.azimuth[0]), S::splat(shot.azimuth[1]));
-        let (ahead, beside) = (range * alpha, range * S::load(&rays.beta));
-        let (x, y, z) = if UPRIGHT {
-            (ahead * cosine, ahead * sine, range * gamma)
-        } else {
-            (
-                ahead * cosine - beside * sine,
-                ahead * sine + beside * cosine,
-                range * gamma,
-            )
-        };
-        let zero = S::splat(0.0);
-        let [x, y, z] = if self.is_paper {
-            [y, zero - x, zero - z]
-        } else {
-            [x, y, z]
-        };
+        let [x, y, z] = self.position::<S, UPRIGHT>(range, rays, shot);
         let tag = S::or(S::and(word, S::splat_words(0xFF)), S::load_words(&rays.channel));
         let words = [
             S::words(x),

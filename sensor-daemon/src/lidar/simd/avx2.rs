@@ -1,9 +1,8 @@
 //! AVX2: sixteen numbers in two registers.
 
 #![expect(unsafe_code, reason = "vector instructions: see the module above for why")]
-// SAFETY (every block of this file): these functions are inlined into code that is compiled for AVX2, and that code is entered only
-// after the processor has said that it has it (`super::super::Path`). Pointers come from references.
-#![allow(clippy::undocumented_unsafe_blocks, reason = "one sentence above covers all")]
+// That it is sound to use them here: these functions are inlined into code that is compiled for AVX2, and that code is entered only
+// after the processor has said that it has it (`super::super::Path`).
 
 use super::{Floats, LANES, LidarPoint, MULTIPLIERS, Simd, WEYL, Words, compact_rows};
 use std::arch::x86_64::*;
@@ -36,6 +35,7 @@ macro_rules! operator {
             type Output = Self;
             #[inline(always)]
             fn $function(self, other: Self) -> Self {
+                // SAFETY: AVX2 is here (above).
                 Self(unsafe {
                     [
                         $intrinsic(self.0[0], other.0[0]),
@@ -54,6 +54,7 @@ operator!(Div, div, _mm256_div_ps);
 /// Largest of eight.
 #[inline(always)]
 pub(super) unsafe fn largest_of_8(value: __m256) -> f32 {
+    // SAFETY: AVX2 is here (above).
     unsafe {
         let four = _mm_max_ps(_mm256_castps256_ps128(value), _mm256_extractf128_ps::<1>(value));
         let two = _mm_max_ps(four, _mm_movehl_ps(four, four));
@@ -64,6 +65,7 @@ pub(super) unsafe fn largest_of_8(value: __m256) -> f32 {
 /// High and low halves of the products of eight words with one.
 #[inline(always)]
 unsafe fn wide(a: __m256i, multiplier: u32) -> (__m256i, __m256i) {
+    // SAFETY: AVX2 is here (above).
     unsafe {
         let m = _mm256_set1_epi64x(i64::from(multiplier));
         let even = _mm256_mul_epu32(a, m);
@@ -82,16 +84,19 @@ impl Simd for Avx2 {
 
     #[inline(always)]
     fn splat(value: f32) -> F {
+        // SAFETY: AVX2 is here (above); the pointer is that of a reference to as many aligned numbers.
         F(unsafe { [_mm256_set1_ps(value); 2] })
     }
     #[inline(always)]
     fn load(from: &Floats) -> F {
         let at = from.0.as_ptr();
+        // SAFETY: AVX2 is here (above); the pointer is that of a reference to as many aligned numbers.
         F(unsafe { [_mm256_load_ps(at), _mm256_load_ps(at.add(8))] })
     }
     #[inline(always)]
     fn store(value: F, to: &mut Floats) {
         let at = to.0.as_mut_ptr();
+        // SAFETY: AVX2 is here (above); the pointer is that of a reference to as many aligned numbers.
         unsafe {
             _mm256_store_ps(at, value.0[0]);
             _mm256_store_ps(at.add(8), value.0[1]);
@@ -99,39 +104,48 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn sqrt(value: F) -> F {
+        // SAFETY: AVX2 is here (above).
         F(two(value.0, |a| unsafe { _mm256_sqrt_ps(a) }))
     }
     #[inline(always)]
     fn max(a: F, b: F) -> F {
+        // SAFETY: AVX2 is here (above).
         F(pair(a.0, b.0, |a, b| unsafe { _mm256_max_ps(a, b) }))
     }
     #[inline(always)]
     fn min(a: F, b: F) -> F {
+        // SAFETY: AVX2 is here (above).
         F(pair(a.0, b.0, |a, b| unsafe { _mm256_min_ps(a, b) }))
     }
     #[inline(always)]
     fn lt(a: F, b: F) -> [__m256; 2] {
+        // SAFETY: AVX2 is here (above).
         pair(a.0, b.0, |a, b| unsafe { _mm256_cmp_ps::<_CMP_LT_OQ>(a, b) })
     }
     #[inline(always)]
     fn le(a: F, b: F) -> [__m256; 2] {
+        // SAFETY: AVX2 is here (above).
         pair(a.0, b.0, |a, b| unsafe { _mm256_cmp_ps::<_CMP_LE_OQ>(a, b) })
     }
     #[inline(always)]
     fn both(a: [__m256; 2], b: [__m256; 2]) -> [__m256; 2] {
+        // SAFETY: AVX2 is here (above).
         pair(a, b, |a, b| unsafe { _mm256_and_ps(a, b) })
     }
     #[inline(always)]
     fn differ(a: [__m256; 2], b: [__m256; 2]) -> [__m256; 2] {
+        // SAFETY: AVX2 is here (above).
         pair(a, b, |a, b| unsafe { _mm256_xor_ps(a, b) })
     }
     #[inline(always)]
     fn bits(mask: [__m256; 2]) -> u32 {
+        // SAFETY: AVX2 is here (above).
         let [low, high] = two(mask, |a| unsafe { _mm256_movemask_ps(a) as u32 });
         low | high << 8
     }
     #[inline(always)]
     fn mask(bits: u32) -> [__m256; 2] {
+        // SAFETY: AVX2 is here (above).
         unsafe {
             let places = _mm256_set_epi32(128, 64, 32, 16, 8, 4, 2, 1);
             two([bits, bits >> 8], |bits| {
@@ -142,6 +156,7 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn select(mask: [__m256; 2], yes: F, no: F) -> F {
+        // SAFETY: AVX2 is here (above).
         F(unsafe {
             [
                 _mm256_blendv_ps(no.0[0], yes.0[0], mask[0]),
@@ -156,6 +171,7 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn store_words_where(mask: [__m256; 2], value: u32, to: &mut Words) {
         let at: *mut f32 = to.0.as_mut_ptr().cast();
+        // SAFETY: AVX2 is here (above); the pointer is that of a reference to as many aligned numbers.
         unsafe {
             let value = _mm256_castsi256_ps(_mm256_set1_epi32(value as i32));
             _mm256_store_ps(at, _mm256_blendv_ps(_mm256_load_ps(at), value, mask[0]));
@@ -165,20 +181,24 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn largest(value: F) -> f32 {
+        // SAFETY: AVX2 is here (above).
         unsafe { largest_of_8(_mm256_max_ps(value.0[0], value.0[1])) }
     }
     #[inline(always)]
     fn splat_words(value: u32) -> U {
+        // SAFETY: AVX2 is here (above); the pointer is that of a reference to as many aligned numbers.
         U(unsafe { [_mm256_set1_epi32(value as i32); 2] })
     }
     #[inline(always)]
     fn load_words(from: &Words) -> U {
         let at: *const __m256i = from.0.as_ptr().cast();
+        // SAFETY: AVX2 is here (above); the pointer is that of a reference to as many aligned numbers.
         U(unsafe { [_mm256_load_si256(at), _mm256_load_si256(at.add(1))] })
     }
     #[inline(always)]
     fn store_words(value: U, to: &mut Words) {
         let at: *mut __m256i = to.0.as_mut_ptr().cast();
+        // SAFETY: AVX2 is here (above); the pointer is that of a reference to as many aligned numbers.
         unsafe {
             _mm256_store_si256(at, value.0[0]);
             _mm256_store_si256(at.add(1), value.0[1]);
@@ -186,57 +206,69 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn and(a: U, b: U) -> U {
+        // SAFETY: AVX2 is here (above).
         U(pair(a.0, b.0, |a, b| unsafe { _mm256_and_si256(a, b) }))
     }
     #[inline(always)]
     fn or(a: U, b: U) -> U {
+        // SAFETY: AVX2 is here (above).
         U(pair(a.0, b.0, |a, b| unsafe { _mm256_or_si256(a, b) }))
     }
     #[inline(always)]
     fn xor(a: U, b: U) -> U {
+        // SAFETY: AVX2 is here (above).
         U(pair(a.0, b.0, |a, b| unsafe { _mm256_xor_si256(a, b) }))
     }
     #[inline(always)]
     fn plus(a: U, b: U) -> U {
+        // SAFETY: AVX2 is here (above).
         U(pair(a.0, b.0, |a, b| unsafe { _mm256_add_epi32(a, b) }))
     }
     #[inline(always)]
     fn minus(a: U, b: U) -> U {
+        // SAFETY: AVX2 is here (above).
         U(pair(a.0, b.0, |a, b| unsafe { _mm256_sub_epi32(a, b) }))
     }
     #[inline(always)]
     fn left<const N: u32>(a: U) -> U {
+        // SAFETY: AVX2 is here (above).
         U(two(a.0, |a| unsafe {
             _mm256_sll_epi32(a, _mm_cvtsi32_si128(N as i32))
         }))
     }
     #[inline(always)]
     fn right<const N: u32>(a: U) -> U {
+        // SAFETY: AVX2 is here (above).
         U(two(a.0, |a| unsafe {
             _mm256_srl_epi32(a, _mm_cvtsi32_si128(N as i32))
         }))
     }
     #[inline(always)]
     fn equal(a: U, b: U) -> [__m256; 2] {
+        // SAFETY: AVX2 is here (above).
         pair(a.0, b.0, |a, b| unsafe {
             _mm256_castsi256_ps(_mm256_cmpeq_epi32(a, b))
         })
     }
     #[inline(always)]
     fn words(value: F) -> U {
+        // SAFETY: AVX2 is here (above).
         U(two(value.0, |a| unsafe { _mm256_castps_si256(a) }))
     }
     #[inline(always)]
     fn floats(value: U) -> F {
+        // SAFETY: AVX2 is here (above).
         F(two(value.0, |a| unsafe { _mm256_castsi256_ps(a) }))
     }
     #[inline(always)]
     fn from_signed(value: U) -> F {
+        // SAFETY: AVX2 is here (above).
         F(two(value.0, |a| unsafe { _mm256_cvtepi32_ps(a) }))
     }
 
     #[inline(always)]
     fn philox(first: u32, rest: [u32; 3], key: [u32; 2]) -> [U; 4] {
+        // SAFETY: AVX2 is here (above).
         unsafe {
             let splat = |word: u32| _mm256_set1_epi32(word as i32);
             let step = _mm256_set_epi32(7, 6, 5, 4, 3, 2, 1, 0);
@@ -270,6 +302,7 @@ impl Simd for Avx2 {
             let mut rows = [[0_u32; LANES]; 8];
             for (row, word) in rows.iter_mut().zip(words) {
                 let at: *mut __m256i = row.as_mut_ptr().cast();
+                // SAFETY: AVX2 is here (above); a row has room for sixteen words.
                 unsafe {
                     _mm256_storeu_si256(at, word.0[0]);
                     _mm256_storeu_si256(at.add(1), word.0[1]);
@@ -277,6 +310,7 @@ impl Simd for Avx2 {
             }
             return compact_rows(&rows, keep, points, cursor);
         }
+        // SAFETY: AVX2 is here (above); rows are written within `points`, whose end has been compared with `cursor`.
         unsafe {
             // Sixteen rows fit behind the cursor, which moves on by at most one after each of them.
             let mut at: *mut __m256i = points.as_mut_ptr().add(cursor).cast();
@@ -297,6 +331,7 @@ impl Simd for Avx2 {
 /// Eight words of eight lanes as eight rows of eight words.
 #[inline(always)]
 unsafe fn transposed(w: [__m256i; 8]) -> [__m256i; 8] {
+    // SAFETY: AVX2 is here (above).
     unsafe {
         let quads = |a, b, c, d| {
             let (ab_low, ab_high) = (_mm256_unpacklo_epi32(a, b), _mm256_unpackhi_epi32(a, b));
