@@ -122,24 +122,22 @@ pub const FIELD_PRESETS: [(&str, &[[usize; 2]]); 3] = [
 /// First of [`FIELD_NAMES`] that only a hero has.
 pub const FIRST_HERO_FIELD: usize = 27;
 
-const fn float(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> Key {
+const fn key(path: &'static str, kind: Kind, unit: &'static str, meaning: &'static str) -> Key {
     Key {
         path,
-        kind: Kind::Float { min, max },
+        kind,
         unit,
         meaning,
         optional: false,
     }
 }
 
+const fn float(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> Key {
+    key(path, Kind::Float { min, max }, unit, meaning)
+}
+
 const fn integer(path: &'static str, unit: &'static str, min: i64, max: i64, meaning: &'static str) -> Key {
-    Key {
-        path,
-        kind: Kind::Integer { min, max },
-        unit,
-        meaning,
-        optional: false,
-    }
+    key(path, Kind::Integer { min, max }, unit, meaning)
 }
 
 const fn floats(
@@ -150,43 +148,22 @@ const fn floats(
     max: f64,
     meaning: &'static str,
 ) -> Key {
-    Key {
-        path,
-        kind: Kind::Floats { count, min, max },
-        unit,
-        meaning,
-        optional: false,
-    }
+    key(path, Kind::Floats { count, min, max }, unit, meaning)
 }
 
 const fn span(path: &'static str, max: f64, meaning: &'static str) -> Key {
-    Key {
-        path,
-        kind: Kind::Span { min: 0.0, max },
-        unit: "s",
-        meaning,
-        optional: false,
-    }
+    key(path, Kind::Span { min: 0.0, max }, "s", meaning)
 }
 
 const fn optional(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> Key {
     Key {
-        path,
-        kind: Kind::Float { min, max },
-        unit,
-        meaning,
         optional: true,
+        ..float(path, unit, min, max, meaning)
     }
 }
 
 const fn other(path: &'static str, kind: Kind, meaning: &'static str) -> Key {
-    Key {
-        path,
-        kind,
-        unit: "",
-        meaning,
-        optional: false,
-    }
+    key(path, kind, "", meaning)
 }
 
 /// Every key there is.
