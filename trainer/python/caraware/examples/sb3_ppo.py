@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.logger import HumanOutputFormat, Logger
 
 from caraware.channel import Channel
 from caraware.envs import CarAwareVecEnv, RunEndedError, make
@@ -19,7 +20,7 @@ def ppo(env: CarAwareVecEnv, horizon: int = 8192, batch_size: int = 1024) -> PPO
     """PPO with the settings of the paper; predictions do not change the world, so only driving looks ahead."""
     task = env.slots.task
     torch.set_num_threads(1)  # of two cores the simulation needs one; torch's idle threads would spin on it
-    return PPO(
+    model = PPO(
         "MlpPolicy",
         env,
         learning_rate=1e-3,
@@ -30,8 +31,10 @@ def ppo(env: CarAwareVecEnv, horizon: int = 8192, batch_size: int = 1024) -> PPO
         ent_coef=0.001,
         policy_kwargs={"net_arch": [256, 128]},
         device="cpu",
-        verbose=1,
     )
+    # Its own logger makes a directory for every start, and leaves it.
+    model.set_logger(Logger(folder=None, output_formats=[HumanOutputFormat(sys.stdout)]))
+    return model
 
 
 def alone(steps: int, horizon: int = 8192, batch_size: int = 1024, **settings: object) -> PPO:
