@@ -419,23 +419,6 @@ mod tests {
         journal.restart(journal.first()).unwrap();
     }
 
-    /// `cargo test --release -p sensor-daemon journal -- --ignored --nocapture`
-    #[test]
-    #[ignore = "a measurement"]
-    fn what_a_tick_of_the_town_costs() {
-        let directory = tempfile::tempdir().unwrap();
-        let mut journal = Journal::new(directory.path(), 1 << 30, 12_000);
-        let message = payload(1, 12_000);
-        let begin = std::time::Instant::now();
-        for tick in 0..100_000 {
-            journal.push(header(tick), &message).unwrap();
-            if tick % 2560 == 0 {
-                journal.commit(tick);
-            }
-        }
-        println!("{:?} a tick", begin.elapsed() / 100_000);
-    }
-
     #[derive(Debug, Clone)]
     enum Step {
         Push(usize),
