@@ -85,6 +85,20 @@ pub struct SwapArgs {
 pub enum Part {
     /// LIDAR: rays per second on one core beside Open3D's ray caster (Embree), same scene and rays
     Lidar,
+    /// Everything above, one after the other
+    All,
+}
+
+impl Part {
+    /// The parts that are measured, in the order of the documentation.
+    pub const MEASURED: [Self; 1] = [Self::Lidar];
+
+    /// Its name on the command line.
+    #[must_use]
+    pub fn name(self) -> String {
+        self.to_possible_value()
+            .map_or_else(String::new, |value| value.get_name().to_owned())
+    }
 }
 
 /// What `bench` takes.
@@ -95,6 +109,12 @@ pub struct BenchArgs {
     /// Write the figures to this file as well
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
+    /// Draw the curves as pictures into this directory
+    #[arg(long, value_name = "DIRECTORY")]
+    pub plots: Option<PathBuf>,
+    /// Keep the figures in docs/benchmarks/ and write docs/benchmarks.md anew
+    #[arg(long)]
+    pub keep: bool,
     /// Python that has the peers installed [default: the project's]
     #[arg(long, value_name = "PATH")]
     pub python: Option<PathBuf>,

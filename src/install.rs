@@ -34,14 +34,7 @@ impl Install {
     /// # Errors
     /// It has not been built.
     pub fn binary(&self, process: Process) -> Result<PathBuf, Exit> {
-        let path = self.bin.join(process.name());
-        if path.is_file() {
-            return Ok(path);
-        }
-        Err(Exit::missing(
-            format!("the program {} is not there", path.display()),
-            "run `make build`",
-        ))
+        program(&self.bin, process.name())
     }
 
     /// A program of the SUMO wheel ("sumo", "netconvert").
@@ -69,6 +62,21 @@ pub fn programs() -> Result<PathBuf, Exit> {
     } else {
         bin
     })
+}
+
+/// Path of a program of ours in `bin`.
+///
+/// # Errors
+/// It has not been built.
+pub fn program(bin: &Path, name: &str) -> Result<PathBuf, Exit> {
+    let path = bin.join(name);
+    if path.is_file() {
+        return Ok(path);
+    }
+    Err(Exit::missing(
+        format!("the program {} is not there", path.display()),
+        "run `make build`",
+    ))
 }
 
 /// Python of the project's virtual environment, or the one that `CARAWARE_PYTHON` names.

@@ -79,7 +79,7 @@ fn main() {
     if options.is_oracle {
         return hold_against_parry(options.path);
     }
-    let mut report = serde_json::json!({ "path": format!("{:?}", options.path) });
+    let mut report = serde_json::json!({ "path": format!("{:?}", options.path), "cases": {}, "lidars": {} });
     let cases = [
         ("upright", Moves::Straight, false, false),
         ("upright, rolling shutter", Moves::Straight, true, false),
@@ -104,7 +104,8 @@ fn main() {
             round.mean_range_m,
             round.points as f64 / round.rays as f64,
         );
-        report[name] = serde_json::json!({ "rays_per_s": rates[PAIRS / 2], "spread": [rates[0], rates[PAIRS - 1]] });
+        report["cases"][name] =
+            serde_json::json!({ "rays_per_s": rates[PAIRS / 2], "spread": [rates[0], rates[PAIRS - 1]] });
     }
     for lidars in [1, 10, 100] {
         let mut bench = Bench::new(options.path, Moves::Wildly, true, true, lidars);
@@ -115,7 +116,7 @@ fn main() {
             "{lidars:4} LIDARs, tilted, rolling    {:7.1} M rays/s",
             rates[PAIRS / 2] / 1e6
         );
-        report[format!("{lidars} LIDARs")] = rates[PAIRS / 2].into();
+        report["lidars"][lidars.to_string()] = rates[PAIRS / 2].into();
     }
     if let Some(python) = &options.python {
         report["peers"] = peers(python, options.path);

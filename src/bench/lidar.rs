@@ -1,0 +1,85 @@
+//! Rays per second of the LIDAR, beside general ray tracers on the same scene.
+
+use std::{collections::BTreeMap, process::Command};
+
+use serde::Deserialize;
+
+use super::{Options, Report, Table};
+use crate::{failure::Exit, install};
+
+/// What `lidar-bench` writes.
+#[derive(Debug, Deserialize)]
+struct Measured {
+    path: String,
+    cases: BTreeMap<String, Rate>,
+    lidars: BTreeMap<u32, f64>,
+    #[serde(default)]
+    peers: BTreeMap<String, Peer>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Rate {
+    rays_per_s: f64,
+    spread: [f64; 2],
+}
+
+#[derive(Debug, Deserialize)]
+struct Peer {
+    rays_per_s: f64,
+    ratio: f64,
+    spread: [f64; 2],
+}
+
+/// Runs `lidar-bench`.
+///
+/// # Errors
+/// It is not built, or fails.
+pub fn measure(options: &Options) -> Result<Report, Exit> {
+    let mut command = Command::new(install::program(&options.bin, "lidar-bench")?);
+    if let Some(python) = &options.python {
+        command.arg("--python").arg(python);
+    }
+    let measured: Measured = super::report::from_program(command)?;
+    let mut report = Report::new(
+        "lidar",
+        "LIDAR",
+        format!(
+            "500 buildings, 200 moving vehicles, 16 LIDARs of 32 × 1800 rays, 100 m, with noise and tags, points written to shared memory; one \
+             core, processor time, {}. The peers cast the same rays at the same triangles in the same run, and return distances only.",
+            measured.path
+        ),
+    );
+    let mega = |rate: f64| format!("{:.1}", rate / 1e6);
+    let mut ours = Table::new("", &["scan", "million rays/s", "smallest–largest"]);
+    for (name, rate) in &measured.cases {
+        let [smallest, largest] = rate.spread.map(mega);
+        ours.row([name.clone(), mega(rate.rays_per_s), format!("{smallest}–{largest}")]);
+        report.figure(format!("{name}, rays/s"), rate.rays_per_s);
+    }
+    for (lidars, rate) in &measured.lidars {
+        ours.row([
+            format!("{lidars} LIDARs, tilted, rolling shutter"),
+            mega(*rate),
+            String::new(),
+        ]);
+    }
+    report.tables.push(ours);
+    let mut peers = Table::new("", &["peer", "million rays/s", "ours is faster by", "smallest–largest"]);
+    for (name, peer) in &measured.peers {
+        let [smallest, largest] = peer.spread;
+        let ratio = format!("{:.1} ×", peer.ratio);
+        peers.row([
+            name.clone(),
+            mega(peer.rays_per_s),
+            ratio,
+            format!("{smallest:.1}–{largest:.1}"),
+        ]);
+        report.figure(format!("ratio to {name}"), peer.ratio);
+    }
+    if peers.rows.is_empty() {
+        report.text += " No peer is installed here: `pip install open3d-cpu embreex`.";
+    } else {
+        report.tables.push(peers);
+    }
+    Ok(report)
+}

@@ -1,0 +1,73 @@
+//! `caraware bench`: measures a part of caraware on this machine, side by side with what others use for the same work.
+//!
+//! One file for each part; all end in a [`Report`]. Decision 9.
+
+mod lidar;
+mod page;
+mod plots;
+pub mod report;
+
+use std::{io::Write as _, path::PathBuf};
+
+pub use report::{Curve, Line, Machine, Report, Spread, Table};
+
+use crate::{
+    cli::{BenchArgs, Part},
+    failure::Exit,
+    install,
+};
+
+/// What every measurement may need.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// Directory of our programs.
+    pub bin: PathBuf,
+    /// Python that has the peers installed, if there is one.
+    pub python: Option<PathBuf>,
+}
+
+/// Measures, prints, and writes what is asked for.
+///
+/// # Errors
+/// Something the measurement needs is missing, or it fails.
+pub fn bench(args: &BenchArgs) -> Result<(), Exit> {
+    let bin = install::programs()?;
+    // The peers are Python packages that nothing else needs: without a Python, ours is measured alone.
+    let python = args.python.clone().or_else(|| install::python(&bin).ok());
+    let options = Options { bin, python };
+    let parts = match args.part {
+        Part::All => Part::MEASURED.to_vec(),
+        part => vec![part],
+    };
+    let mut reports = Vec::new();
+    for part in parts {
+        let report = measure(part, &options)?;
+        // A reader that went away (`| head`) does not undo a measurement.
+        let _ = writeln!(std::io::stdout(), "{report}");
+        if args.keep {
+            page::keep(&report)?;
+        }
+        reports.push(report);
+    }
+    if args.keep {
+        page::write()?;
+    }
+    if let Some(path) = &args.json {
+        let text = match reports.as_slice() {
+            [report] => serde_json::to_string_pretty(report),
+            reports => serde_json::to_string_pretty(reports),
+        };
+        std::fs::write(path, text.unwrap_or_default() + "\n").map_err(|error| Exit::io("write", path, &error))?;
+    }
+    if let Some(directory) = &args.plots {
+        plots::draw(&install::python(&options.bin)?, &reports, directory)?;
+    }
+    Ok(())
+}
+
+fn measure(part: Part, options: &Options) -> Result<Report, Exit> {
+    match part {
+        Part::Lidar => lidar::measure(options),
+        Part::All => Err(Exit::config("`all` is not a part", "")),
+    }
+}

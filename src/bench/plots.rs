@@ -1,0 +1,37 @@
+//! Pictures of a report's curves, drawn by the project's Python as the trainer's plots are.
+
+use std::{
+    io::Write as _,
+    path::Path,
+    process::{Command, Stdio},
+};
+
+use super::Report;
+use crate::failure::Exit;
+
+/// Draws every curve of `reports` into `directory`.
+///
+/// # Errors
+/// Not writable, or Python fails.
+pub fn draw(python: &Path, reports: &[Report], directory: &Path) -> Result<(), Exit> {
+    std::fs::create_dir_all(directory).map_err(|error| Exit::io("create", directory, &error))?;
+    let failed = |error: &std::io::Error| Exit::io("start", python, error);
+    let mut process = Command::new(python)
+        .args(["-m", "caraware.benchmark_plots"])
+        .arg(directory)
+        .stdin(Stdio::piped())
+        .spawn()
+        .map_err(|error| failed(&error))?;
+    if let Some(mut input) = process.stdin.take() {
+        let text = serde_json::to_string(reports).unwrap_or_default();
+        input.write_all(text.as_bytes()).map_err(|error| failed(&error))?;
+    }
+    let status = process.wait().map_err(|error| failed(&error))?;
+    if status.success() {
+        return Ok(());
+    }
+    Err(Exit::run(
+        format!("drawing the plots ended with {status}"),
+        "its message above says why",
+    ))
+}

@@ -1,0 +1,313 @@
+//! What a measurement found, in one form for the terminal, for files and for the documentation.
+
+use std::{collections::BTreeMap, fmt, process::Command};
+
+use serde::{Deserialize, Serialize};
+
+use crate::failure::Exit;
+
+/// What one part's measurement found.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// The part, as `caraware bench` names it.
+    pub part: String,
+    /// One line: what was measured.
+    pub title: String,
+    /// What is compared with what, and how.
+    pub text: String,
+    /// The command that prints it again.
+    pub command: String,
+    /// Where it was measured.
+    pub machine: Machine,
+    /// The figures for people.
+    pub tables: Vec<Table>,
+    /// The figures for programs: name with unit → value.
+    pub figures: BTreeMap<String, f64>,
+    /// What is worth a picture.
+    #[serde(default)]
+    pub curves: Vec<Curve>,
+}
+
+impl Report {
+    /// A report without figures.
+    #[must_use]
+    pub fn new(part: &str, title: impl Into<String>, text: impl Into<String>) -> Self {
+        Self {
+            part: part.into(),
+            title: title.into(),
+            text: text.into(),
+            command: format!("caraware bench {part}"),
+            machine: Machine::here(),
+            tables: Vec::new(),
+            figures: BTreeMap::new(),
+            curves: Vec::new(),
+        }
+    }
+
+    /// Adds a figure for programs.
+    pub fn figure(&mut self, name: impl Into<String>, value: f64) {
+        self.figures.insert(name.into(), value);
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}\n{}\n", self.title, self.text)?;
+        self.tables.iter().try_for_each(|table| writeln!(f, "{table}"))?;
+        write!(f, "{}", self.machine)
+    }
+}
+
+/// The machine, the build and the day.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Machine {
+    /// The processor's name.
+    pub processor: String,
+    /// Cores that this process may use.
+    pub cores: usize,
+    /// Memory, GiB.
+    pub memory_gib: u64,
+    /// The revision measured; "+" if files differ from it.
+    pub revision: String,
+    /// Day of the measurement, UTC.
+    pub date: String,
+}
+
+impl Machine {
+    /// This machine, now.
+    #[must_use]
+    pub fn here() -> Self {
+        let read = |path| std::fs::read_to_string(path).unwrap_or_default();
+        let value = |text: &str, key: &str| {
+            text.lines()
+                .find_map(|line| line.strip_prefix(key)?.split_once(':'))
+                .map(|(_, value)| value.trim().to_owned())
+        };
+        let memory_kib = value(&read("/proc/meminfo"), "MemTotal")
+            .and_then(|text| text.split_whitespace().next()?.parse::<u64>().ok())
+            .unwrap_or_default();
+        Self {
+            processor: value(&read("/proc/cpuinfo"), "model name").unwrap_or_else(|| "unknown".into()),
+            cores: std::thread::available_parallelism().map_or(1, Into::into),
+            memory_gib: memory_kib.div_ceil(1 << 20),
+            revision: revision(),
+            date: jiff::Timestamp::now().strftime("%Y-%m-%d").to_string(),
+        }
+    }
+}
+
+impl fmt::Display for Machine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            processor,
+            cores,
+            memory_gib,
+            revision,
+            date,
+        } = self;
+        writeln!(
+            f,
+            "{processor}, {cores} cores, {memory_gib} GiB; revision {revision}; {date}"
+        )
+    }
+}
+
+fn revision() -> String {
+    let git = |arguments: &[&str]| {
+        let output = Command::new("git")
+            .args(["-C", env!("CARGO_MANIFEST_DIR")])
+            .args(arguments)
+            .output()
+            .ok()?;
+        (output.status.success()).then(|| String::from_utf8_lossy(&output.stdout).trim().to_owned())
+    };
+    let changed = git(&["status", "--porcelain", "--untracked-files=no"]).is_some_and(|text| !text.is_empty());
+    git(&["rev-parse", "--short=7", "HEAD"]).map_or_else(
+        || env!("CARGO_PKG_VERSION").into(),
+        |revision| if changed { revision + "+" } else { revision },
+    )
+}
+
+/// Rows of text under column names.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Table {
+    /// What the rows have in common; may be empty.
+    pub title: String,
+    /// Names of the columns, with units.
+    pub columns: Vec<String>,
+    /// The rows; each as long as `columns`.
+    pub rows: Vec<Vec<String>>,
+}
+
+impl Table {
+    /// A table without rows.
+    #[must_use]
+    pub fn new(title: impl Into<String>, columns: &[&str]) -> Self {
+        Self {
+            title: title.into(),
+            columns: columns.iter().map(|name| (*name).to_owned()).collect(),
+            rows: Vec::new(),
+        }
+    }
+
+    /// Adds a row.
+    pub fn row<const N: usize>(&mut self, cells: [String; N]) {
+        self.rows.push(cells.into());
+    }
+
+    /// The table in Markdown.
+    #[must_use]
+    pub fn markdown(&self) -> String {
+        let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
+        let mut text = line(&self.columns);
+        text += &line(&vec!["---".to_owned(); self.columns.len()]);
+        text += &self.rows.iter().map(|row| line(row)).collect::<String>();
+        text
+    }
+}
+
+impl fmt::Display for Table {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if !self.title.is_empty() {
+            writeln!(f, "{}", self.title)?;
+        }
+        let lines = || std::iter::once(&self.columns).chain(&self.rows);
+        let width = |column: usize| {
+            let cells = lines().filter_map(|cells| cells.get(column));
+            cells.map(|cell| cell.chars().count()).max().unwrap_or_default()
+        };
+        let widths: Vec<usize> = (0..self.columns.len()).map(width).collect();
+        for cells in lines() {
+            let padded: Vec<String> = cells
+                .iter()
+                .zip(&widths)
+                .enumerate()
+                .map(|(column, (cell, &width))| match column {
+                    0 => format!("{cell:<width$}"),
+                    _ => format!("{cell:>width$}"),
+                })
+                .collect();
+            writeln!(f, "  {}", padded.join("  ").trim_end())?;
+        }
+        Ok(())
+    }
+}
+
+/// A picture: lines over one quantity.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Curve {
+    /// Name of the picture's file, without extension.
+    pub name: String,
+    /// Title over it.
+    pub title: String,
+    /// The horizontal axis, with unit.
+    pub x: String,
+    /// The vertical axis, with unit.
+    pub y: String,
+    /// Whether the axes are logarithmic: horizontal, vertical.
+    pub logarithmic: [bool; 2],
+    /// The lines.
+    pub lines: Vec<Line>,
+}
+
+/// One line of a [`Curve`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Line {
+    /// What it shows.
+    pub name: String,
+    /// Its points.
+    pub points: Vec<[f64; 2]>,
+}
+
+/// Median, smallest and largest of repeated measurements.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Spread {
+    /// The middle one; of an even number, the mean of the middle two.
+    pub median: f64,
+    /// The smallest.
+    pub smallest: f64,
+    /// The largest.
+    pub largest: f64,
+}
+
+impl Spread {
+    /// Of at least one value.
+    ///
+    /// # Errors
+    /// There is none.
+    pub fn of(values: impl IntoIterator<Item = f64>) -> Result<Self, Exit> {
+        let mut values: Vec<f64> = values.into_iter().collect();
+        values.sort_by(f64::total_cmp);
+        let (Some(&smallest), Some(&largest)) = (values.first(), values.last()) else {
+            return Err(Exit::run("a measurement without a value", ""));
+        };
+        let middle = values.len() / 2;
+        let median = match values.len() % 2 {
+            0 => f64::midpoint(values[middle - 1], values[middle]),
+            _ => values[middle],
+        };
+        Ok(Self {
+            median,
+            smallest,
+            largest,
+        })
+    }
+}
+
+impl fmt::Display for Spread {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let digits = f.precision().unwrap_or(2);
+        write!(
+            f,
+            "{:.digits$} ({:.digits$}–{:.digits$})",
+            self.median, self.smallest, self.largest
+        )
+    }
+}
+
+/// Runs a program of ours that measures and takes `--json FILE`; its own words go to standard error.
+///
+/// # Errors
+/// It cannot be started, fails, or writes something else.
+pub fn from_program<T: serde::de::DeserializeOwned>(mut command: Command) -> Result<T, Exit> {
+    let program = command.get_program().to_string_lossy().into_owned();
+    let file = std::env::temp_dir().join(format!("caraware-bench-{}.json", std::process::id()));
+    let status = command
+        .arg("--json")
+        .arg(&file)
+        .stdout(std::io::stderr())
+        .status()
+        .map_err(|error| Exit::io("start", program.as_ref(), &error))?;
+    let text = std::fs::read_to_string(&file).unwrap_or_default();
+    // Absent if the program failed before writing it.
+    let _ = std::fs::remove_file(&file);
+    if !status.success() {
+        return Err(Exit::run(
+            format!("{program} ended with {status}"),
+            "its message above says why",
+        ));
+    }
+    serde_json::from_str(&text).map_err(|error| Exit::run(format!("{program} wrote no report: {error}"), ""))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::float_cmp, reason = "tests assert by unwrapping")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_median_of_an_even_number_is_between_the_middle_two() {
+        let spread = Spread::of([4.0, 1.0, 3.0, 2.0]).unwrap();
+        assert_eq!([spread.median, spread.smallest, spread.largest], [2.5, 1.0, 4.0]);
+        assert_eq!(Spread::of([5.0]).unwrap().median, 5.0);
+        assert!(Spread::of([]).is_err());
+    }
+
+    #[test]
+    fn columns_are_as_wide_as_their_widest_cell() {
+        let mut table = Table::new("rates", &["what", "µs"]);
+        table.row(["a long name".into(), "1".into()]);
+        assert_eq!(table.to_string(), "rates\n  what         µs\n  a long name   1\n");
+        assert_eq!(table.markdown(), "| what | µs |\n| --- | --- |\n| a long name | 1 |\n");
+    }
+}
