@@ -128,10 +128,23 @@ pub struct RunArgs {
     /// Change one setting, e.g. --set traffic.cavs=8 (repeatable; see configs/README.md)
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
+    /// Environments side by side, each with its own seed, feeding one trainer; short for --set run.envs=N
+    #[arg(long, value_name = "N")]
+    pub envs: Option<u32>,
     /// Name of the run [default: CONFIG and the first free number]
     #[arg(long)]
     pub name: Option<String>,
     /// Directory that holds run directories
     #[arg(long, default_value = "runs")]
     pub runs: PathBuf,
+}
+
+impl RunArgs {
+    /// The same with every option that is short for a setting written as one.
+    #[must_use]
+    pub fn with_shorthands(&self) -> Self {
+        let mut args = self.clone();
+        args.set.extend(args.envs.take().map(|envs| format!("run.envs={envs}")));
+        args
+    }
 }

@@ -6,7 +6,12 @@ use std::{
 };
 
 use indicatif::{ProgressBar, ProgressStyle};
-use ipc_schema::{ports::BoardReader, process::Process, run::RunFile};
+use ipc_schema::{
+    board::{Health, TrainingStatus},
+    process::Process,
+};
+
+use crate::environment::Environment;
 
 /// Time between two lines when there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -35,8 +40,8 @@ impl Display {
     }
 
     /// Shows the newest state of the boards.
-    pub fn update(&mut self, run: &RunFile, boards: &[(Process, BoardReader)], ready_at: Option<Instant>) {
-        let view = View::read(run, boards, ready_at);
+    pub fn update(&mut self, environments: &[Environment], ready_at: Option<Instant>) {
+        let view = View::read(environments, ready_at);
         if let Some(bar) = &self.bar {
             if bar.length() != view.total_ticks && view.total_ticks.is_some() {
                 bar.set_style(style());
@@ -90,22 +95,26 @@ struct View {
 }
 
 impl View {
-    fn read(run: &RunFile, boards: &[(Process, BoardReader)], ready_at: Option<Instant>) -> Self {
-        let board = |process: Process| {
-            boards
-                .iter()
-                .find(|(known, _)| *known == process)
-                .map(|(_, board)| board)
+    /// All environments together; where they stand is where the slowest does.
+    fn read(environments: &[Environment], ready_at: Option<Instant>) -> Self {
+        let all = |process: Process| {
+            let healths = environments.iter().map(|environment| environment.board(process).health());
+            healths.collect::<Vec<_>>()
         };
-        let sensing = board(Process::SensorDaemon)
-            .map(BoardReader::health)
-            .unwrap_or_default();
-        let moving = board(Process::SimCore).map(BoardReader::health).unwrap_or_default();
-        let training = board(Process::Trainer).map(BoardReader::training).unwrap_or_default();
+        let (sensings, movings) = (all(Process::SensorDaemon), all(Process::SimCore));
+        let slowest = sensings.iter().min_by_key(|health| health.ticks).copied();
+        let sensing = Health {
+            cavs: sensings.iter().map(|health| health.cavs).sum(),
+            vehicle_steps: sensings.iter().map(|health| health.vehicle_steps).sum(),
+            ..slowest.unwrap_or_default()
+        };
+        let first = environments.first();
+        let training = first.map_or_else(TrainingStatus::default, |first| first.board(Process::Trainer).training());
         let wall_s = ready_at.map_or(0.0, |ready| ready.elapsed().as_secs_f64());
         #[expect(clippy::cast_precision_loss, reason = "for display")]
         let (steps, sim_time_s) = (sensing.vehicle_steps as f64, sensing.sim_time_ns as f64 * 1e-9);
-        let total: Option<u64> = run.episodes().iter().map(|episode| episode.ticks).sum();
+        let episodes = first.map(|first| first.run.episodes()).unwrap_or_default();
+        let total: Option<u64> = episodes.iter().map(|episode| episode.ticks).sum();
         Self {
             updates: training.updates,
             ticks: sensing.ticks,
@@ -113,7 +122,7 @@ impl View {
             episode: sensing.episode,
             sim_time_s,
             cavs: sensing.cavs,
-            road_users: moving.road_users,
+            road_users: movings.iter().map(|health| health.road_users).sum(),
             steps: sensing.vehicle_steps,
             steps_per_s: if wall_s > 0.0 { steps / wall_s } else { 0.0 },
             policy_std: training.policy_std,

@@ -3,8 +3,10 @@
 pub mod bench;
 pub mod cli;
 pub mod config;
+pub mod cores;
 pub mod display;
 pub mod doctor;
+pub mod environment;
 pub mod failure;
 pub mod install;
 pub mod prepare;

@@ -52,7 +52,7 @@ enum Named {
 /// # Errors
 /// Anything wrong with the configuration, the user's files or this machine.
 pub fn prepare(args: &RunArgs, mode: Mode) -> Result<Prepared, Exit> {
-    let (settings, named, label) = resolve(args)?;
+    let (settings, named, label) = resolve(&args.with_shorthands())?;
     let config = settings.validate()?;
     check_task(&config, mode, &named)?;
     let install = Install::find()?;
@@ -252,6 +252,7 @@ fn assemble(
         .map_err(|error| Exit::io("write", &path, &error))?;
     let run = RunFile {
         schema_version: SCHEMA_VERSION,
+        env_index: 0,
         run_id: claim.run_id,
         name: run_dir.name.clone(),
         run_dir: run_dir.path.clone(),
@@ -274,7 +275,8 @@ fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
     let needed: u64 = Channel::ALL
         .into_iter()
         .map(|channel| channel.worst_case_bytes(run) as u64)
-        .sum();
+        .sum::<u64>()
+        * u64::from(run.config.run.envs);
     let free = free_bytes(Path::new(registry::SHARED_MEMORY))?;
     if needed <= free {
         return Ok(());
@@ -282,6 +284,10 @@ fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
     let lidars = match run.config.lidar.vehicles {
         0 => String::new(),
         vehicles => format!(" or `lidar.vehicles` (now {vehicles})"),
+    };
+    let environments = match run.config.run.envs {
+        1 => String::new(),
+        envs => format!(" or `run.envs` (now {envs})"),
     };
     let mebi = |bytes: u64| bytes.div_ceil(1 << 20);
     Err(Exit::missing(
@@ -292,7 +298,7 @@ fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
             mebi(needed)
         ),
         format!(
-            "lower `traffic.max_road_users` (now {}) or `run.window_ticks` (now {}){lidars}, or enlarge {} (Docker: --shm-size)",
+            "lower `traffic.max_road_users` (now {}) or `run.window_ticks` (now {}){environments}{lidars}, or enlarge {} (Docker: --shm-size)",
             run.config.traffic.max_road_users,
             run.config.run.window_ticks,
             registry::SHARED_MEMORY

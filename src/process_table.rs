@@ -28,11 +28,22 @@ pub enum OnExit {
     Restart,
 }
 
+/// What a process belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scope {
+    /// Every environment has its own.
+    Environment,
+    /// There is one for the whole run; it belongs to environment 0.
+    Run,
+}
+
 /// One row.
 #[derive(Debug)]
 pub struct Row {
     /// Which process.
     pub process: Process,
+    /// What it belongs to.
+    pub scope: Scope,
     /// Processes that must be ready before it is started.
     pub needs: &'static [Process],
     /// What its end means.
@@ -49,12 +60,37 @@ impl Row {
     pub fn is_required(&self) -> bool {
         self.on_exit != OnExit::Restart
     }
+
+    /// What its end means in `run`: of trainers that learn together, none can be replaced in the middle of a step that all take.
+    #[must_use]
+    pub fn on_exit(&self, run: &RunFile) -> OnExit {
+        match self.on_exit {
+            OnExit::Replace if run.config.trainer.ranks > 1 => OnExit::Required,
+            on_exit => on_exit,
+        }
+    }
+
+    /// True if environment `env_index` of `run` has it.
+    #[must_use]
+    pub fn is_in(&self, run: &RunFile, env_index: u32) -> bool {
+        (env_index == 0 || self.scope == Scope::Environment) && (self.wanted)(run)
+    }
+
+    /// Its name among those of a run: with the environment, where there are several.
+    #[must_use]
+    pub fn label(&self, run: &RunFile) -> String {
+        match self.scope {
+            Scope::Environment if run.config.run.envs > 1 => format!("{}/{}", self.process, run.env_index),
+            _ => self.process.to_string(),
+        }
+    }
 }
 
 /// All rows, in the order of starting. SUMO comes first because it is the one that user's files can upset.
 pub const TABLE: [Row; 5] = [
     Row {
         process: Process::TrafficBridge,
+        scope: Scope::Environment,
         needs: &[],
         on_exit: OnExit::Required,
         wanted: |_| true,
@@ -62,6 +98,7 @@ pub const TABLE: [Row; 5] = [
     },
     Row {
         process: Process::SimCore,
+        scope: Scope::Environment,
         needs: &[Process::TrafficBridge],
         on_exit: OnExit::Required,
         wanted: |_| true,
@@ -69,6 +106,7 @@ pub const TABLE: [Row; 5] = [
     },
     Row {
         process: Process::SensorDaemon,
+        scope: Scope::Environment,
         needs: &[Process::TrafficBridge],
         on_exit: OnExit::Required,
         wanted: |_| true,
@@ -76,6 +114,7 @@ pub const TABLE: [Row; 5] = [
     },
     Row {
         process: Process::Trainer,
+        scope: Scope::Run,
         needs: &[Process::TrafficBridge],
         on_exit: OnExit::Replace,
         wanted: |run| run.mode == Mode::Train,
@@ -83,6 +122,7 @@ pub const TABLE: [Row; 5] = [
     },
     Row {
         process: Process::Fanout,
+        scope: Scope::Run,
         needs: &[Process::TrafficBridge],
         on_exit: OnExit::Restart,
         wanted: |run| run.config.fanout.enabled,
@@ -103,6 +143,8 @@ fn trainer(install: &Install, run: &RunFile) -> Result<Command, Exit> {
 pub struct Running {
     /// Its row.
     pub row: &'static Row,
+    /// Its environment.
+    pub env_index: u32,
     /// How often it has been started before.
     pub incarnation: u32,
     child: Child,
@@ -190,6 +232,7 @@ impl Running {
         })?;
         Ok(Self {
             row,
+            env_index: run.env_index,
             incarnation,
             child,
             exit: None,
@@ -231,14 +274,14 @@ impl Running {
     pub fn failure(&self, run: &RunFile, status: ExitStatus) -> Failure {
         let name = self.row.process.name();
         if let Some(mut failure) = Failure::read(&run.run_dir, name) {
-            failure.message = format!("{name}: {}", failure.message);
+            failure.message = format!("{}: {}", self.row.label(run), failure.message);
             return failure;
         }
         let log = run.run_dir.join("logs").join(format!("{name}.log"));
         let text = std::fs::read_to_string(&log).unwrap_or_default();
         let tail: Vec<&str> = text.lines().rev().take(5).collect();
         let tail = tail.into_iter().rev().collect::<Vec<_>>().join("\n  ");
-        Failure::new(FailureKind::Run, format!("{name} ended with {status}\n  {tail}"))
+        Failure::new(FailureKind::Run, format!("{} ended with {status}\n  {tail}", self.row.label(run)))
             .with_help(format!("its log is {}", log.display()))
     }
 }

@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 use crate::{failure::Exit, supervisor::Outcome};
 
 /// What sensor-daemon writes at its end.
-#[derive(Debug, Deserialize, Default)]
+#[derive(Debug, Clone, Deserialize, Default)]
 #[serde(default)]
 struct Sensing {
     observation_hash: String,
@@ -23,15 +23,70 @@ struct Sensing {
     lidar: Option<Value>,
 }
 
+impl Sensing {
+    /// Sums over all environments; the hash is the first one's, and the error the mean over all samples.
+    fn total(environments: &[Self]) -> Self {
+        let sum = |part: fn(&Self) -> u64| environments.iter().map(part).sum();
+        #[expect(clippy::cast_precision_loss, reason = "weights of a mean")]
+        let errors_m = environments.iter().filter_map(|one| {
+            let mean_m = one.raw_gnss_mean_error_m?;
+            Some((one.observations as f64, one.observations as f64 * mean_m))
+        });
+        let (samples, error_m) = errors_m.fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
+        let first = environments.first().cloned().unwrap_or_default();
+        Self {
+            observations: sum(|one| one.observations),
+            ticks: sum(|one| one.ticks),
+            drops: sum(|one| one.drops),
+            redelivered_ticks: sum(|one| one.redelivered_ticks),
+            journal_mib: sum(|one| one.journal_mib),
+            cavs_max: sum(|one| one.cavs_max),
+            raw_gnss_mean_error_m: (samples > 0.0).then(|| error_m / samples),
+            ..first
+        }
+    }
+}
+
+/// What one environment came to.
+fn of_environment(run: &RunFile, sensing: &Sensing) -> Value {
+    json!({
+        "environment": run.env_index,
+        "seed": run.seed(),
+        "observation_hash": sensing.observation_hash,
+        "vehicle_steps": sensing.observations,
+        "ticks": sensing.ticks,
+        "vehicles": sensing.cavs_max,
+        "raw_gnss_mean_error_m": sensing.raw_gnss_mean_error_m,
+        "drops": sensing.drops,
+        "redelivered_ticks": sensing.redelivered_ticks,
+        "dynamics": part(run, "sim-core").unwrap_or(Value::Null),
+        "lidar": sensing.lidar,
+    })
+}
+
+/// What a process of an environment wrote at its end.
+fn part<T: serde::de::DeserializeOwned>(run: &RunFile, process: &str) -> Option<T> {
+    read(&run.run_dir.join("parts").join(format!("{process}.json")))
+}
+
 /// Puts the report together, writes it, and returns it with its path.
 ///
 /// # Errors
 /// Not writable.
 pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit> {
-    let parts = run.run_dir.join("parts");
-    let sensing: Sensing = read(&parts.join("sensor-daemon.json")).unwrap_or_default();
-    let training: Map<String, Value> = read(&parts.join("trainer.json")).unwrap_or_default();
-    let moving: Map<String, Value> = read(&parts.join("sim-core.json")).unwrap_or_default();
+    let runs: Vec<RunFile> = (0..run.config.run.envs).map(|index| run.environment(index)).collect();
+    let sensings: Vec<Sensing> = runs
+        .iter()
+        .map(|run| part(run, "sensor-daemon").unwrap_or_default())
+        .collect();
+    let environments: Vec<Value> = runs
+        .iter()
+        .zip(&sensings)
+        .map(|(run, sensing)| of_environment(run, sensing))
+        .collect();
+    let sensing = Sensing::total(&sensings);
+    let training: Map<String, Value> = part(run, "trainer").unwrap_or_default();
+    let moving: Map<String, Value> = part(run, "sim-core").unwrap_or_default();
     let learned = |key: &str| training.get(key).cloned().unwrap_or(Value::Null);
     let env_steps = match run.mode {
         Mode::Train => learned("env_steps").as_u64().unwrap_or(0),
@@ -71,11 +126,12 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "ticks": sensing.ticks,
         "simulated_s": simulated_s,
         "real_time_factor": simulated_s / outcome.wall_s,
-        "seed": run.config.run.seed,
+        "seed": run.seed(),
         "config_hash": run.config_hash,
         "trainer": training,
         "dynamics": moving,
         "lidar": sensing.lidar,
+        "environments": environments,
     });
     let path = run.run_dir.join("report.json");
     let text = serde_json::to_string_pretty(&report).unwrap_or_default();
@@ -85,6 +141,25 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
 
 fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Option<T> {
     serde_json::from_str(&std::fs::read_to_string(path).ok()?).ok()
+}
+
+/// The observation hash; with several environments that of each, and what it is of.
+fn hashes(report: &Value) -> Vec<String> {
+    let hash = |of: &Value| of["observation_hash"].as_str().unwrap_or_default().to_owned();
+    let environments = report["environments"].as_array().map_or(&[][..], Vec::as_slice);
+    if environments.len() < 2 {
+        return vec![format!("observation hash {}", hash(report))];
+    }
+    let line = |one: &Value| {
+        format!(
+            "environment {}: {} vehicle-steps, seed {}, observation hash {}",
+            one["environment"],
+            one["vehicle_steps"],
+            one["seed"],
+            hash(one)
+        )
+    };
+    environments.iter().map(line).collect()
 }
 
 /// The report in a few lines for the terminal.
@@ -142,10 +217,7 @@ pub fn summary(report: &Value, path: &Path) -> String {
         "ticks lost {}, duplicated {}; restarts {}; messages that watchers passed over {}",
         report["lost_ticks"], report["duplicated_ticks"], report["restarts"], report["drops"]
     ));
-    lines.push(format!(
-        "observation hash {}",
-        report["observation_hash"].as_str().unwrap_or_default()
-    ));
+    lines.extend(hashes(report));
     lines.push(format!("report: {}", path.display()));
     lines.join("\n")
 }

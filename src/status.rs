@@ -12,7 +12,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use crate::{
     failure::Exit,
-    process_table::{Row, TABLE},
+    process_table::{Scope, TABLE},
     registry,
 };
 
@@ -39,7 +39,7 @@ pub fn ps(name: Option<&str>) -> Result<(), Exit> {
         return Ok(());
     }
     println!(
-        "{:<16} {:<15} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>9}",
+        "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>9}",
         "RUN", "PROCESS", "STATE", "PID", "TICK", "TICKS/S", "LAG", "DROPS", "RESTARTS", "MEMORY"
     );
     for run in &runs {
@@ -48,43 +48,58 @@ pub fn ps(name: Option<&str>) -> Result<(), Exit> {
     Ok(())
 }
 
+/// A process of a run.
+struct Seat {
+    label: String,
+    env_index: u32,
+    scope: Scope,
+    board: BoardReader,
+}
+
 struct Look {
     health: Health,
     progress: Progress,
 }
 
-fn look(boards: &[(&'static Row, BoardReader)]) -> Vec<Look> {
+fn look(boards: &[Seat]) -> Vec<Look> {
     boards
         .iter()
-        .map(|(_, board)| Look {
-            health: board.health(),
-            progress: board.progress(),
+        .map(|seat| Look {
+            health: seat.board.health(),
+            progress: seat.board.progress(),
         })
         .collect()
 }
 
 fn print_run(run: &RunFile) -> Result<(), Exit> {
     let node = services::node(&run.shared_memory)?;
-    let wanted = TABLE.iter().filter(|row| (row.wanted)(run));
-    let boards = wanted
-        .map(|row| Ok((row, BoardReader::open(&node, run, 0, row.process)?)))
-        .collect::<Result<Vec<_>, Exit>>()?;
+    let mut boards = Vec::new();
+    for environment in (0..run.config.run.envs).map(|index| run.environment(index)) {
+        for row in TABLE.iter().filter(|row| row.is_in(&environment, environment.env_index)) {
+            let board = BoardReader::open(&node, run, environment.env_index, row.process)?;
+            let label = row.label(&environment);
+            boards.push(Seat { label, env_index: environment.env_index, scope: row.scope, board });
+        }
+    }
+    boards.sort_by_key(|seat| seat.scope == Scope::Run);
     let first = look(&boards);
     wait(RATE_OVER);
     let second = look(&boards);
     let supervisor = memory_mib(run.supervisor_pid);
     println!(
-        "{:<16} {:<15} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>5} MiB",
+        "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>5} MiB",
         run.name, "supervisor", "running", run.supervisor_pid, "", "", "", "", "", supervisor
     );
-    let source_ticks = second.first().map_or(0, |look| look.health.ticks);
-    for (((row, _), before), now) in boards.iter().zip(&first).zip(&second) {
+    for ((seat, before), now) in boards.iter().zip(&first).zip(&second) {
+        // The first process of an environment is its SUMO.
+        let source = boards.iter().position(|other| other.env_index == seat.env_index);
+        let source_ticks = source.map_or(0, |source| second[source].health.ticks);
         #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
         let rate = now.health.ticks.saturating_sub(before.health.ticks) as f64 / RATE_OVER.as_secs_f64();
         println!(
-            "{:<16} {:<15} {:<9} {:>8} {:>10} {:>9.0} {:>6} {:>7} {:>9} {:>5} MiB",
+            "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9.0} {:>6} {:>7} {:>9} {:>5} MiB",
             run.name,
-            row.process,
+            seat.label,
             State::from_u32(now.health.state).name(),
             now.health.pid,
             now.health.ticks,

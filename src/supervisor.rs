@@ -12,10 +12,10 @@ use std::{
 use ipc_schema::{
     board::State,
     failure::{Failure, FailureKind},
-    ports::{BoardReader, RosterWriter},
+    ports::BoardReader,
     process::Process,
-    run::RunFile,
-    services::{self, RunNode, ServiceHolder},
+    run::{Mode, RunFile},
+    services::{self, RunNode},
 };
 use rustix::process::Signal;
 use signal_hook::{
@@ -24,11 +24,12 @@ use signal_hook::{
 };
 
 use crate::{
-    config,
+    config, cores,
     display::Display,
+    environment::Environment,
     failure::Exit,
     install::Install,
-    process_table::{OnExit, Row, Running, TABLE},
+    process_table::{OnExit, Row, Running, Scope, TABLE},
     registry::Claim,
     succession::{self, Succession},
     swap::{self, Asked, Handover},
@@ -78,13 +79,11 @@ pub struct Supervisor {
     asked_to_leave: bool,
     // Dropped in this order: processes, services, node, shared memory.
     running: Vec<Running>,
-    boards: Vec<(Process, BoardReader)>,
-    roster: RosterWriter,
-    _services: ServiceHolder,
+    /// Environment 0 is the home of what belongs to the whole run.
+    environments: Vec<Environment>,
     node: RunNode,
     _claim: Claim,
-    run: RunFile,
-    run_file: PathBuf,
+    cores: Option<cores::Plan>,
     install: Install,
     events: Receiver<Event>,
     event_sender: Sender<Event>,
@@ -114,29 +113,24 @@ impl Supervisor {
     /// # Errors
     /// The run directory is not writable, or iceoryx2 refuses.
     pub fn new(run: RunFile, install: Install, claim: Claim) -> Result<Self, Exit> {
-        let run_file = run.write()?;
         let (event_sender, events) = channel();
         let signal_handle = watch_signals(event_sender.clone())?;
         let sender = event_sender.clone();
         swap::listen(&run, move |asked| sender.send(Event::Swap(asked)).is_ok())?;
         let node = services::node(&run.shared_memory)?;
-        let holder = ServiceHolder::create(&node, &run, 0)?;
-        let roster = RosterWriter::create(&holder)?;
-        let boards = Process::ALL
-            .into_iter()
-            .map(|process| Ok((process, BoardReader::open(&node, &run, 0, process)?)))
+        let envs = run.config.run.envs;
+        let environments = (0..envs)
+            .map(|index| Environment::create(&node, &run, index))
             .collect::<Result<_, Exit>>()?;
+        let cores = cores::plan(&cores::available(), envs as usize, run.mode == Mode::Train);
         Ok(Self {
             succession: None,
             asked_to_leave: false,
             running: Vec::new(),
-            boards,
-            roster,
-            _services: holder,
+            environments,
             node,
             _claim: claim,
-            run,
-            run_file,
+            cores,
             install,
             events,
             event_sender,
@@ -162,7 +156,7 @@ impl Supervisor {
             self.reap()?;
             self.advance_swap();
             self.note_ready(started)?;
-            display.update(&self.run, &self.boards, self.ready_at);
+            display.update(&self.environments, self.ready_at);
             self.last_look = Instant::now();
             if self.finished() {
                 break;
@@ -174,7 +168,7 @@ impl Supervisor {
         }
         self.refuse_swap("the run is over", "");
         let wall_s = self.ready_at.unwrap_or(started).elapsed().as_secs_f64();
-        display.update(&self.run, &self.boards, self.ready_at);
+        display.update(&self.environments, self.ready_at);
         display.finish();
         self.stop_all(interrupted);
         Ok(Outcome {
@@ -185,37 +179,70 @@ impl Supervisor {
         })
     }
 
-    fn wanted(&self) -> impl Iterator<Item = &'static Row> + use<'_> {
-        TABLE.iter().filter(|row| (row.wanted)(&self.run))
+    /// The run, as environment 0 and whatever belongs to the whole run see it.
+    fn run(&self) -> &RunFile {
+        &self.environments[0].run
     }
 
-    fn board(&self, process: Process) -> Option<&BoardReader> {
-        self.boards
+    /// Every process that the run has: its row and its environment.
+    fn wanted(&self) -> impl Iterator<Item = (&'static Row, &Environment)> {
+        self.environments.iter().flat_map(|environment| {
+            let run = &environment.run;
+            let rows = TABLE.iter().filter(|row| row.is_in(run, run.env_index));
+            rows.map(move |row| (row, environment))
+        })
+    }
+
+    fn trainer(&self) -> &BoardReader {
+        self.environments[0].board(Process::Trainer)
+    }
+
+    fn is_started(&self, row: &Row, env_index: u32) -> bool {
+        self.running
             .iter()
-            .find(|(known, _)| *known == process)
-            .map(|(_, board)| board)
+            .any(|running| running.row.process == row.process && running.env_index == env_index)
     }
 
-    fn state_of(&self, process: Process) -> State {
-        self.board(process)
-            .map_or(State::Starting, |board| State::from_u32(board.health().state))
-    }
-
-    fn is_started(&self, process: Process) -> bool {
-        self.running.iter().any(|running| running.row.process == process)
+    /// What belongs to the whole run needs the processes of every environment, another only those of its own.
+    fn may_start(&self, row: &Row, environment: &Environment) -> bool {
+        let is_up = |environment: &Environment| {
+            let mut needs = row.needs.iter();
+            needs.all(|need| environment.state_of(*need) != State::Starting)
+        };
+        match row.scope {
+            Scope::Run => self.environments.iter().all(is_up),
+            Scope::Environment => is_up(environment),
+        }
     }
 
     fn start_what_can(&mut self) -> Result<(), Exit> {
-        let due: Vec<&'static Row> = self
+        let due: Vec<(&'static Row, u32)> = self
             .wanted()
-            .filter(|row| !self.is_started(row.process))
-            .filter(|row| row.needs.iter().all(|need| self.state_of(*need) != State::Starting))
+            .filter(|(row, environment)| !self.is_started(row, environment.run.env_index))
+            .filter(|(row, environment)| self.may_start(row, environment))
+            .map(|(row, environment)| (row, environment.run.env_index))
             .collect();
-        for row in due {
-            self.running
-                .push(Running::start(row, &self.install, &self.run, &self.run_file, 0)?);
+        for (row, env_index) in due {
+            let started = self.start(row, env_index, 0)?;
+            self.running.push(started);
         }
         Ok(())
+    }
+
+    /// Starts the process of `row` in its environment, on the cores that are meant for it.
+    fn start(&self, row: &'static Row, env_index: u32, incarnation: u32) -> Result<Running, Exit> {
+        let environment = &self.environments[env_index as usize];
+        cores::within(self.cores_of(row, env_index), || {
+            Running::start(row, &self.install, &environment.run, &environment.run_file, incarnation)
+        })
+    }
+
+    fn cores_of(&self, row: &Row, env_index: u32) -> Option<&[usize]> {
+        let plan = self.cores.as_ref()?;
+        match row.scope {
+            Scope::Environment => plan.environments.get(env_index as usize).map(Vec::as_slice),
+            Scope::Run => Some(&plan.rest),
+        }
     }
 
     /// Looks for ended processes: a failure of a required one ends the run; watchers, and a trainer that died, are started again.
@@ -225,15 +252,17 @@ impl Supervisor {
                 continue;
             };
             let row = self.running[index].row;
-            let done = self.state_of(row.process) == State::Done;
+            let environment = &self.environments[self.running[index].env_index as usize];
+            let done = environment.state_of(row.process) == State::Done;
             if status.success() && done {
                 continue;
             }
             services::forget_dead(&self.node);
-            if row.on_exit == OnExit::Replace && self.take_over(index, done)? {
+            let on_exit = row.on_exit(self.run());
+            if on_exit == OnExit::Replace && self.take_over(index, done)? {
                 continue;
             }
-            match row.on_exit {
+            match on_exit {
                 OnExit::Restart if self.running[index].incarnation < MAX_RESTARTS => self.restart(index)?,
                 OnExit::Restart => {}
                 // All that it had to do is on disk.
@@ -241,24 +270,30 @@ impl Supervisor {
                 OnExit::Replace if status.signal().is_some() => self.replace(index, status)?,
                 OnExit::Replace if self.asked_to_leave && status.success() => self.restart(index)?,
                 OnExit::Required | OnExit::Replace => {
-                    return Err(self.running[index].failure(&self.run, status).into());
+                    return Err(self.failure(index, status).into());
                 }
             }
         }
         Ok(())
     }
 
+    fn failure(&self, index: usize, status: ExitStatus) -> Failure {
+        let running = &self.running[index];
+        running.failure(&self.environments[running.env_index as usize].run, status)
+    }
+
     /// Replaces a trainer that died, unless that has been in vain for too long.
     fn replace(&mut self, index: usize, status: ExitStatus) -> Result<(), Exit> {
         let process = self.running[index].row.process;
-        let committed = self.board(process).map_or(0, |board| board.progress().committed_ticks);
+        let boards = self.environments.iter().map(|environment| environment.board(process));
+        let committed = boards.map(|board| board.progress().committed_ticks).sum();
         if committed > self.committed_ticks {
             self.committed_ticks = committed;
             self.vain_replacements = 0;
         }
         self.vain_replacements += 1;
         if self.vain_replacements > MAX_VAIN_REPLACEMENTS {
-            let mut failure = self.running[index].failure(&self.run, status);
+            let mut failure = self.failure(index, status);
             failure.message = format!(
                 "{}\n  replaced {MAX_VAIN_REPLACEMENTS} times in a row, and it never got to a new checkpoint",
                 failure.message
@@ -270,27 +305,33 @@ impl Supervisor {
     }
 
     fn restart(&mut self, index: usize) -> Result<(), Exit> {
+        let (row, env_index) = (self.running[index].row, self.running[index].env_index);
         let incarnation = self.running[index].incarnation + 1;
-        let process = self.running[index].row.process;
-        if !self.roster.set(process, incarnation) {
+        if !self.counts(row, env_index, incarnation) {
             return Err(Exit::run(
                 format!(
-                    "{process} has been replaced {} times: a run holds no more",
+                    "{} has been replaced {} times: a run holds no more",
+                    row.process,
                     incarnation - 1
                 ),
                 "find out from its log why it dies",
             ));
         }
         self.restarts += 1;
-        self.asked_to_leave &= process != Process::Trainer;
-        self.running[index] = Running::start(
-            self.running[index].row,
-            &self.install,
-            &self.run,
-            &self.run_file,
-            incarnation,
-        )?;
+        self.asked_to_leave &= row.process != Process::Trainer;
+        self.running[index] = self.start(row, env_index, incarnation)?;
         Ok(())
+    }
+
+    /// From now on this incarnation counts, wherever the process has a place. False if there are no more.
+    #[must_use]
+    fn counts(&mut self, row: &Row, env_index: u32, incarnation: u32) -> bool {
+        let places = self.environments.iter_mut().filter(|environment| match row.scope {
+            Scope::Run => true,
+            Scope::Environment => environment.run.env_index == env_index,
+        });
+        let mut set = places.map(|environment| environment.roster.set(row.process, incarnation));
+        set.all(|is_set| is_set)
     }
 
     /// Remembers when the last required process got ready; gives up if one does not.
@@ -300,13 +341,14 @@ impl Supervisor {
         }
         let late = self
             .wanted()
-            .filter(|row| row.is_required())
-            .find(|row| self.state_of(row.process) == State::Starting);
+            .filter(|(row, _)| row.is_required())
+            .find(|(row, environment)| self.is_starting(row, environment));
         match late {
             None => self.ready_at = Some(self.last_look),
-            Some(row) if started.elapsed() > READY_WITHIN => {
-                let log = self.run.run_dir.join("logs").join(format!("{}.log", row.process));
-                let message = format!("{} was not ready within {} s", row.process, READY_WITHIN.as_secs());
+            Some((row, environment)) if started.elapsed() > READY_WITHIN => {
+                let log = environment.run.run_dir.join("logs").join(format!("{}.log", row.process));
+                let name = row.label(&environment.run);
+                let message = format!("{name} was not ready within {} s", READY_WITHIN.as_secs());
                 return Err(Failure::new(FailureKind::Run, message)
                     .with_help(format!("its log is {}", log.display()))
                     .into());
@@ -316,8 +358,17 @@ impl Supervisor {
         Ok(())
     }
 
+    /// What belongs to the whole run, and is needed, is ready when it is in every environment.
+    fn is_starting(&self, row: &Row, environment: &Environment) -> bool {
+        let starts = |environment: &Environment| environment.state_of(row.process) == State::Starting;
+        match row.scope {
+            Scope::Run => self.environments.iter().any(starts),
+            Scope::Environment => starts(environment),
+        }
+    }
+
     fn finished(&mut self) -> bool {
-        let wanted = self.wanted().filter(|row| row.is_required()).count();
+        let wanted = self.wanted().filter(|(row, _)| row.is_required()).count();
         let required = self.running.iter_mut().filter(|running| running.row.is_required());
         required
             .map(|running| usize::from(running.poll().is_some()))
@@ -339,13 +390,15 @@ impl Supervisor {
 
     /// Starts a successor beside the trainer at work, or refuses.
     fn begin_swap(&mut self, asked: Asked) {
-        let state = self.state_of(Process::Trainer);
+        let state = self.environments[0].state_of(Process::Trainer);
         let index = self
             .running
             .iter()
             .position(|running| running.row.on_exit == OnExit::Replace);
+        let learns_alone = self.run().config.trainer.ranks == 1;
         let refusal = match (&self.succession, index, state) {
             (Some(_), ..) => "another swap is under way",
+            _ if !learns_alone => "its trainer learns together with others: none of them can be replaced alone",
             (None, None, _) => "the run has no trainer",
             (None, Some(_), State::Starting) => "the trainer is only starting",
             (None, Some(_), State::Done) => "the trainer is done",
@@ -364,16 +417,18 @@ impl Supervisor {
     }
 
     fn start_successor(&self, index: usize, asked: &Asked) -> Result<(RunFile, PathBuf, Running), Exit> {
-        let config = swap::changed(&self.run, &asked.request.set)?;
+        let config = swap::changed(self.run(), &asked.request.set)?;
         let run = RunFile {
             config_hash: config::hash(&config),
             config,
-            ..self.run.clone()
+            ..self.run().clone()
         };
         let run_file = succession::write_run(&run, "run.next.json")?;
         let (row, incarnation) = (self.running[index].row, self.running[index].incarnation + 1);
         let checkpoint = asked.request.checkpoint.as_ref();
-        let (shadow, output) = Running::start_shadow(row, &self.install, &run, &run_file, incarnation, checkpoint)?;
+        let (shadow, output) = cores::within(self.cores_of(row, 0), || {
+            Running::start_shadow(row, &self.install, &run, &run_file, incarnation, checkpoint)
+        })?;
         let sender = self.event_sender.clone();
         let wait = move || {
             let mut line = String::new();
@@ -421,11 +476,11 @@ impl Supervisor {
         let Some((mut successor, run)) = taken else {
             return Ok(false);
         };
-        if !self.roster.set(Process::Trainer, successor.incarnation) {
+        if !self.counts(successor.row, 0, successor.incarnation) {
             return Err(Exit::run("a run holds no more successors", "start another run"));
         }
         succession::write_run(&run, "run.json")?;
-        self.run = run;
+        self.environments[0].run = run;
         self.asked_to_leave = false;
         successor.go();
         self.running[index] = successor;
@@ -441,10 +496,7 @@ impl Supervisor {
             succession.refuse(failure);
             return;
         }
-        let progress = self
-            .board(Process::Trainer)
-            .map(BoardReader::progress)
-            .unwrap_or_default();
+        let progress = self.trainer().progress();
         if succession.is_taking() && progress.attached == 1 {
             self.swaps.extend(succession.done(progress.committed_ticks));
         } else {

@@ -26,14 +26,12 @@ use std::path::Path;
 
 use ipc_schema::{failure::Failure, process::Process, session::Session};
 
-/// The environment a fan-out serves.
-const ENV_INDEX: u32 = 0;
-
 /// Fans out the run of `run_file` until the run ends or the process is asked to stop.
 ///
 /// # Errors
 /// The run cannot be joined, the endpoint cannot be listened on, or a port broke.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
-    let session = Session::join(run_file, Process::Fanout, ENV_INDEX)?;
-    Ok(relay::Relay::open(session, ENV_INDEX)?.run()?)
+    let session = Session::join(run_file, Process::Fanout)?;
+    let env_index = session.run.env_index;
+    Ok(relay::Relay::open(session, env_index)?.run()?)
 }

@@ -101,6 +101,10 @@ impl Config {
 pub struct Run {
     /// Seed of everything random.
     pub seed: u64,
+    /// Environments (SUMO, dynamics, sensors) side by side, feeding one trainer.
+    pub envs: u32,
+    /// Index of the first of them among those of all runs that learn together: their seeds follow from it.
+    pub first_env: u32,
     /// Length of a tick (one observation), seconds.
     pub tick_s: f64,
     /// Nanoscopic sub-steps in a tick.
@@ -342,6 +346,8 @@ pub struct Trainer {
     pub reward: Reward,
     /// Scale of `bounded_inverse` and `exponential`, metres.
     pub reward_scale_m: f64,
+    /// Trainers that learn together by `torch.distributed`, each with a run of its own.
+    pub ranks: u32,
     /// Threads of torch; 0 = one for each core.
     pub threads: u64,
     /// "cpu" or "auto" (a GPU if there is one).

@@ -72,7 +72,10 @@ pub struct RunFile {
     pub run_id: u64,
     /// Name of the run.
     pub name: String,
-    /// Directory with everything the run leaves behind.
+    /// Index of the environment that this file speaks to, 0-based; what belongs to the whole run belongs to environment 0.
+    #[serde(default)]
+    pub env_index: u32,
+    /// Directory with everything that this environment leaves behind; that of environment 0 holds the others'.
     pub run_dir: PathBuf,
     /// What the run is for.
     pub mode: Mode,
@@ -165,6 +168,27 @@ impl RunFile {
         Ok(path)
     }
 
+    /// The same run as environment `env_index` sees it. `self` is environment 0's.
+    #[must_use]
+    pub fn environment(&self, env_index: u32) -> Self {
+        let run_dir = match env_index {
+            0 => self.run_dir.clone(),
+            index => self.run_dir.join(format!("env-{index}")),
+        };
+        Self {
+            env_index,
+            run_dir,
+            ..self.clone()
+        }
+    }
+
+    /// Seed of everything random in this environment; that of the run in the first one of all.
+    #[must_use]
+    pub fn seed(&self) -> u64 {
+        let run = &self.config.run;
+        schedule::environment_seed(run.seed, run.first_env + self.env_index)
+    }
+
     /// SUMO steps per tick are 1 / this: ticks in one SUMO step.
     #[must_use]
     pub fn ticks_per_traffic_step(&self) -> u64 {
@@ -186,7 +210,7 @@ impl RunFile {
     /// The episodes of this run.
     #[must_use]
     pub fn episodes(&self) -> Vec<schedule::Episode> {
-        let (lengths, seed) = (&self.config.episode, self.config.run.seed);
+        let (lengths, seed) = (&self.config.episode, self.seed());
         match (&self.source, self.mode) {
             (_, Mode::Train) => schedule::training(lengths, seed),
             (Source::Scenario { .. }, Mode::Simulate) => schedule::scenario(seed),

@@ -66,6 +66,24 @@ pub fn scenario(seed: u64) -> Vec<Episode> {
     }]
 }
 
+/// Seed of the `environment`-th environment: the run's own for the first, then the first eight bytes of a BLAKE3 hash.
+#[must_use]
+pub fn environment_seed(run_seed: u64, environment: u32) -> u64 {
+    if environment == 0 {
+        return run_seed;
+    }
+    let mut hasher = blake3::Hasher::new_derive_key("caraware environment");
+    hasher.update(&run_seed.to_le_bytes());
+    hasher.update(&environment.to_le_bytes());
+    first_eight(&hasher)
+}
+
+fn first_eight(hasher: &blake3::Hasher) -> u64 {
+    let mut first = [0_u8; 8];
+    first.copy_from_slice(&hasher.finalize().as_bytes()[..8]);
+    u64::from_le_bytes(first)
+}
+
 /// Seed of the `count`-th training or evaluation episode: first eight bytes of a BLAKE3 hash, so the two never meet.
 #[must_use]
 pub fn episode_seed(run_seed: u64, evaluation: bool, count: u64) -> u64 {
@@ -76,9 +94,7 @@ pub fn episode_seed(run_seed: u64, evaluation: bool, count: u64) -> u64 {
     });
     hasher.update(&run_seed.to_le_bytes());
     hasher.update(&count.to_le_bytes());
-    let mut first = [0_u8; 8];
-    first.copy_from_slice(&hasher.finalize().as_bytes()[..8]);
-    u64::from_le_bytes(first)
+    first_eight(&hasher)
 }
 
 #[cfg(test)]
@@ -103,7 +119,19 @@ mod tests {
         assert_eq!(kinds, [false, false, true, false, false, true, true]);
     }
 
+    #[test]
+    fn the_first_environment_has_the_seed_of_the_run() {
+        assert_eq!(environment_seed(42, 0), 42);
+    }
+
     proptest! {
+        #[test]
+        fn no_two_environments_share_an_episode(seed: u64, n in 1_u64..8, environments in 2_u32..9) {
+            let episodes = (0..environments).flat_map(|env| training(&lengths(n, 2, 2), environment_seed(seed, env)));
+            let seeds: Vec<u64> = episodes.map(|episode| episode.seed).collect();
+            prop_assert_eq!(seeds.iter().collect::<BTreeSet<_>>().len(), seeds.len());
+        }
+
         #[test]
         fn no_seed_is_used_twice(seed: u64, n in 0_u64..50, interval in 0_u64..5, last in 0_u64..5) {
             let episodes = training(&lengths(n, interval, last), seed);

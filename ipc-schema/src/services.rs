@@ -369,11 +369,16 @@ pub fn open_wake(
     env_index: u32,
     process: Process,
 ) -> Result<WakeService, ServiceError> {
-    let name = service_name(run, env_index, &format!("wake/{process}"))?;
-    node.service_builder(&name)
+    node.service_builder(&wake_name(run, env_index, process)?)
         .event()
         .open()
         .map_err(|e| refused("opening", format!("wake-up of {process}"))(&e))
+}
+
+/// The trainer is one for all environments, and waits for all of them at once: its wake-up is environment 0's.
+fn wake_name(run: &RunFile, env_index: u32, process: Process) -> Result<ServiceName, ServiceError> {
+    let home = if process == Process::Trainer { 0 } else { env_index };
+    service_name(run, home, &format!("wake/{process}"))
 }
 
 /// A listener that empties itself when it wakes.
@@ -405,6 +410,7 @@ impl ServiceHolder {
             .map(|process| create_board(node, run, env_index, process));
         let wakes = Process::ALL
             .into_iter()
+            .filter(|process| env_index == 0 || *process != Process::Trainer)
             .map(|process| create_wake(node, run, env_index, process));
         Ok(Self {
             _data: data.collect::<Result<_, _>>()?,
@@ -455,11 +461,11 @@ fn create_roster(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<Boar
 }
 
 fn create_wake(node: &Node<Shm>, run: &RunFile, env_index: u32, process: Process) -> Result<WakeService, ServiceError> {
-    let name = service_name(run, env_index, &format!("wake/{process}"))?;
-    node.service_builder(&name)
+    let envs = run.config.run.envs as usize;
+    node.service_builder(&wake_name(run, env_index, process)?)
         .event()
-        .max_nodes(MAX_NODES)
-        .max_notifiers(2 * Process::ALL.len())
+        .max_nodes(MAX_NODES + Process::ALL.len() * envs)
+        .max_notifiers(2 * Process::ALL.len() * envs)
         .max_listeners(2)
         .event_id_max_value(1)
         .create()

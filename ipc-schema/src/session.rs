@@ -85,9 +85,9 @@ pub struct Session {
     process: Process,
     env_index: u32,
     incarnation: u32,
-    node: Node<Shm>,
+    node: Arc<Node<Shm>>,
     board: BoardWriter,
-    wake: WakeListener,
+    wake: Arc<WakeListener>,
     stop: Arc<AtomicBool>,
     progress: Progress,
     health: Health,
@@ -95,11 +95,12 @@ pub struct Session {
 }
 
 impl Session {
-    /// Joins the run as `process`: opens its board and wake-up, ends with the supervisor, stops at SIGTERM and SIGINT.
+    /// Joins the run as `process` of the environment that the run file speaks to: opens its board and wake-up, ends with the
+    /// supervisor, stops at SIGTERM and SIGINT.
     ///
     /// # Errors
     /// The run file, the shared memory or the supervisor is not there.
-    pub fn join(run_file: &Path, process: Process, env_index: u32) -> Result<Self, SessionError> {
+    pub fn join(run_file: &Path, process: Process) -> Result<Self, SessionError> {
         let stop = Arc::new(AtomicBool::new(false));
         for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
             signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|source| SessionError::System {
@@ -107,7 +108,9 @@ impl Session {
                 source,
             })?;
         }
-        Self::join_with(RunFile::read(run_file)?, process, env_index, stop)
+        let run = RunFile::read(run_file)?;
+        let env_index = run.env_index;
+        Self::join_with(run, process, env_index, stop)
     }
 
     /// Joins like [`Session::join`] but leaves signals to the caller, who sets `stop`.
@@ -152,7 +155,7 @@ impl Session {
     }
 
     fn open(run: RunFile, process: Process, env_index: u32, stop: Arc<AtomicBool>) -> Result<Self, SessionError> {
-        let node = services::node(&run.shared_memory)?;
+        let node = Arc::new(services::node(&run.shared_memory)?);
         let wake = services::open_wake(&node, &run, env_index, process)?
             .listener_builder()
             .create()
@@ -161,6 +164,33 @@ impl Session {
                 action: "creation of the listener",
                 reason: format!("{e:?}"),
             })?;
+        Self::take_place(run, process, env_index, stop, node, Arc::new(wake))
+    }
+
+    /// The place of this process, which is the trainer and has joined environment 0, in another environment of its run. Both are woken
+    /// and wait together.
+    ///
+    /// # Errors
+    /// There is no such environment.
+    pub fn in_environment(&self, env_index: u32) -> Result<Self, SessionError> {
+        Self::take_place(
+            self.run.environment(env_index),
+            self.process,
+            env_index,
+            Arc::clone(&self.stop),
+            Arc::clone(&self.node),
+            Arc::clone(&self.wake),
+        )
+    }
+
+    fn take_place(
+        run: RunFile,
+        process: Process,
+        env_index: u32,
+        stop: Arc<AtomicBool>,
+        node: Arc<Node<Shm>>,
+        wake: Arc<WakeListener>,
+    ) -> Result<Self, SessionError> {
         let incarnation = incarnation();
         let board = BoardWriter::create(&services::open_board(&node, &run, env_index, process)?, incarnation)?;
         let progress = Progress {

@@ -28,6 +28,7 @@ fn run_in(directory: &Path) -> RunFile {
     config.traffic.max_road_users = 8;
     RunFile {
         schema_version: ipc_schema::SCHEMA_VERSION,
+        env_index: 0,
         run_id: 1,
         name: "killed".into(),
         run_dir: directory.into(),

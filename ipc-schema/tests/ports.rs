@@ -61,6 +61,7 @@ impl Corner {
         let prefix = format!("caraware_test{}_{run_id}_", std::process::id());
         let run = RunFile {
             schema_version: ipc_schema::SCHEMA_VERSION,
+            env_index: 0,
             run_id,
             name: "test".into(),
             run_dir: directory.path().into(),
@@ -268,6 +269,7 @@ fn a_run_file_of_another_version_is_refused() {
     let corner = Corner::new(7);
     RunFile {
         schema_version: 99,
+        env_index: 0,
         ..corner.run.clone()
     }
     .write()

@@ -30,9 +30,6 @@ use crate::{
     sky::SkyMap,
 };
 
-/// One process serves one environment.
-const ENV_INDEX: u32 = 0;
-
 /// What this process adds to the run's report.
 #[derive(Debug, Serialize)]
 struct Part {
@@ -54,7 +51,7 @@ struct Part {
 /// # Errors
 /// The map's projection is not understood, the scene or a LIDAR's ray table cannot be read, or a port fails.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
-    let mut session = Session::join(run_file, Process::SensorDaemon, ENV_INDEX)?;
+    let mut session = Session::join(run_file, Process::SensorDaemon)?;
     let mut sensing = Sensing::new(&session.run.config, &session.run.map).map_err(unprojected)?;
     let scanning = look_around(&mut session, &mut sensing)?;
     let world = session.subscriber(Channel::World)?;
@@ -90,7 +87,7 @@ fn look_around(session: &mut Session, sensing: &mut Sensing) -> Result<Option<Sc
         let middle = Projection::new(map)
             .and_then(|projection| projection.geodetic_from_net(middle))
             .map_err(unprojected)?;
-        let sky = SkyMap::new(Arc::clone(&scene), middle, map.bounds_m, session.run.config.run.seed);
+        let sky = SkyMap::new(Arc::clone(&scene), middle, map.bounds_m, session.run.seed());
         sensing.set_sky(Box::new(sky));
     }
     if !has_lidars {

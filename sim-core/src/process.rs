@@ -24,9 +24,6 @@ use crate::{
     statistics::Summary,
 };
 
-/// One process serves one environment.
-const ENV_INDEX: u32 = 0;
-
 /// What this process adds to the run's report.
 #[derive(Debug, serde::Serialize)]
 struct Part {
@@ -49,7 +46,7 @@ struct Part {
 /// # Errors
 /// The scene's files or obstacles are wrong, a port fails, or what SUMO sent cannot be mirrored.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
-    let mut session = Session::join(run_file, Process::SimCore, ENV_INDEX)?;
+    let mut session = Session::join(run_file, Process::SimCore)?;
     let metas = session.subscriber(Channel::TrafficMeta)?;
     let traffic = session.subscriber(Channel::Traffic)?;
     let mut core = Core::open(session, metas)?;

@@ -54,6 +54,7 @@ impl Run {
         change(&mut config);
         let file = RunFile {
             schema_version: SCHEMA_VERSION,
+            env_index: 0,
             run_id: 5,
             name: name.into(),
             mode: Mode::Simulate,

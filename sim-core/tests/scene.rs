@@ -42,6 +42,7 @@ fn run(net_file: &Path, additional_files: &[PathBuf]) -> RunFile {
     let config: Config = serde_json::from_str(town).unwrap();
     RunFile {
         schema_version: ipc_schema::SCHEMA_VERSION,
+        env_index: 0,
         run_id: 0,
         name: "scene".into(),
         run_dir: PathBuf::new(),

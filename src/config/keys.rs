@@ -170,6 +170,8 @@ const fn other(path: &'static str, kind: Kind, meaning: &'static str) -> Key {
 #[rustfmt::skip]
 pub const KEYS: &[Key] = &[
     integer("run.seed", "", 0, i64::MAX, "Seed of everything random: traffic, noise, the learner. The same seed gives the same bytes."),
+    integer("run.envs", "", 1, 64, "Environments side by side, each with SUMO, dynamics and sensors of its own and a seed that follows from `run.seed`; they feed one trainer (docs/parallel.md)."),
+    integer("run.first_env", "", 0, 1_000_000, "Place of this run's first environment among those of all runs that learn together; `caraware.parallel` sets it."),
     float("run.tick_s", "s", 0.001, 10.0, "Length of a tick: one observation of every connected vehicle."),
     integer("run.sub_steps", "", 1, 1000, "Nanoscopic sub-steps in a tick (10 in 0.1 s: dynamics at 100 Hz)."),
     integer("run.window_ticks", "ticks", 1, 256, "Ticks that traffic, dynamics and sensors may each be ahead of the next process."),
@@ -309,6 +311,7 @@ pub const KEYS: &[Key] = &[
     other("trainer.hidden", Kind::Integers { min: 1, max: 65536 }, "Widths of the hidden layers of the policy and of the value network."),
     other("trainer.reward", Kind::Choice(&["inverse", "bounded_inverse", "exponential"]), "Reward of a prediction at distance d from the truth: 1/d, 1/(1+d/scale), exp(−d/scale)."),
     float("trainer.reward_scale_m", "m", 0.001, 1e6, "The scale in those."),
+    integer("trainer.ranks", "", 1, 1024, "Trainers that learn together by torch.distributed, each with a run of its own; `caraware.parallel` sets it (docs/parallel.md)."),
     integer("trainer.threads", "", 0, 1024, "Threads of torch; 0 = one for each core."),
     other("trainer.device", Kind::Choice(&["cpu", "auto"]), "\"auto\" uses a GPU if there is one."),
     other("trainer.matmul_precision", Kind::Choice(&["auto", "float32", "bfloat16"]), "Precision of the inputs of matrix products; \"auto\" takes bfloat16 where the processor multiplies it in hardware (AMX)."),

@@ -27,15 +27,12 @@ use crate::{
     session::Session,
 };
 
-/// One process serves one environment.
-const ENV_INDEX: u32 = 0;
-
 /// Runs all episodes of the run named by `run_file`, or until the process is asked to stop.
 ///
 /// # Errors
 /// The user's files are wrong, the shared memory is gone, or SUMO fails.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
-    let mut membership = Membership::join(run_file, Process::TrafficBridge, ENV_INDEX)?;
+    let mut membership = Membership::join(run_file, Process::TrafficBridge)?;
     let episodes = membership.run.episodes();
     let poses = match membership.run.config.drives() {
         true => Some(membership.subscriber(Channel::EgoPose)?),

@@ -79,28 +79,23 @@ impl Attachment {
         } else {
             Session::join_with
         };
-        let mut session = join(run, Process::Trainer, 0, stop).map_err(session_failed)?;
-        let observations = session.subscriber(Service::Observation).map_err(session_failed)?;
-        let predictions = session.publisher(Service::Prediction).map_err(session_failed)?;
-        let driven = match session.run.config.drives() {
-            true => Some(session.waker(Process::SimCore).map_err(session_failed)?),
-            false => None,
-        };
-        session.attach_from(first_tick);
-        let attached = Attached {
-            session,
-            observations,
-            scans: None,
-            predictions,
-            driven,
-            training: TrainingStatus::default(),
-            ended: false,
-            outside,
-        };
-        Ok(Self {
-            inner: Mutex::new(attached),
-            run_json,
-        })
+        let session = join(run, Process::Trainer, 0, stop).map_err(session_failed)?;
+        Self::attach(session, run_json, first_tick, outside)
+    }
+
+    /// The place of this trainer in another environment of the run; producers there may send from now on, beginning with `first_tick`.
+    fn in_environment(&self, env_index: u32, first_tick: u64) -> PyResult<Self> {
+        let inner = self.lock()?;
+        let session = inner.session.in_environment(env_index).map_err(session_failed)?;
+        Self::attach(session, self.run_json.clone(), first_tick, inner.outside)
+    }
+
+    /// Waits until something happens in any environment, at most `timeout_s` seconds. Look for blocks before, and again after.
+    fn wait_for_any(&self, py: Python<'_>, timeout_s: f64) -> PyResult<()> {
+        let timeout =
+            Duration::try_from_secs_f64(timeout_s).map_err(|error| PyValueError::new_err(error.to_string()))?;
+        py.detach(|| self.wait(timeout.min(LOOK)))?;
+        py.check_signals()
     }
 
     /// All blocks that are waiting, at least one; an empty list after `timeout_s` seconds. Releases the GIL while it waits.
@@ -246,6 +241,31 @@ impl Attachment {
 }
 
 impl Attachment {
+    /// Opens the ports of a place in a run.
+    fn attach(mut session: Session, run_json: String, first_tick: u64, outside: bool) -> PyResult<Self> {
+        let observations = session.subscriber(Service::Observation).map_err(session_failed)?;
+        let predictions = session.publisher(Service::Prediction).map_err(session_failed)?;
+        let driven = match session.run.config.drives() {
+            true => Some(session.waker(Process::SimCore).map_err(session_failed)?),
+            false => None,
+        };
+        session.attach_from(first_tick);
+        let attached = Attached {
+            session,
+            observations,
+            scans: None,
+            predictions,
+            driven,
+            training: TrainingStatus::default(),
+            ended: false,
+            outside,
+        };
+        Ok(Self {
+            inner: Mutex::new(attached),
+            run_json,
+        })
+    }
+
     fn lock(&self) -> PyResult<MutexGuard<'_, Attached>> {
         self.inner
             .lock()

@@ -17,7 +17,8 @@ import torch
 from caraware import train
 from caraware.checkpoint import latest_checkpoint, newest_sound_checkpoint
 from caraware.config import RunConfig
-from caraware.loop import Learner, TickLedger, TrainingLoop
+from caraware.environment import TickLedger
+from caraware.loop import Learner, TrainingLoop
 from caraware.ppo import NonFiniteLoss
 from safetensors.torch import load_file
 from synthetic import SyntheticChannel, SyntheticObservation, run_file, street_ticks, with_evaluation

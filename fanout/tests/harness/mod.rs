@@ -247,6 +247,7 @@ pub fn publisher(run: &Run, channel: Channel) -> (Session, Publisher) {
 fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
     RunFile {
         schema_version: SCHEMA_VERSION,
+        env_index: 0,
         run_id: u64::from(port) << 32 | u64::from(std::process::id()),
         name: name.to_owned(),
         mode,

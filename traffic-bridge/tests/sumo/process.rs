@@ -294,6 +294,7 @@ fn run_file(run_dir: PathBuf, source: Source, ticks: u64, step_s: f64) -> RunFil
     let pid = std::process::id();
     RunFile {
         schema_version: SCHEMA_VERSION,
+        env_index: 0,
         run_id: u64::from(pid) << 32 | u64::from(number),
         name: "test".to_owned(),
         mode: Mode::Simulate,

@@ -174,8 +174,24 @@ class Channel:
 
     def __init__(self, run_file: str, first_tick: int = 0, *, outside: bool = False) -> None:
         """Join the run; ticks come from `first_tick` on, however far the simulation is: all before are committed."""
-        self._attachment = _native.Attachment(run_file, first_tick, outside=outside)
-        self.run: dict[str, Any] = json.loads(self._attachment.run_json)
+        self._hold(_native.Attachment(run_file, first_tick, outside=outside))
+
+    def _hold(self, attachment: _native.Attachment) -> None:
+        self._attachment = attachment
+        self.run: dict[str, Any] = json.loads(attachment.run_json)
+
+    def in_environment(self, index: int, first_tick: int = 0) -> Channel:
+        """This trainer's place in another environment of the run (`run.envs`); this one is environment 0's.
+
+        Each has its own ticks, credits and commits. A trainer has to take a place in every environment.
+        """
+        channel = object.__new__(Channel)
+        channel._hold(self._attachment.in_environment(index, first_tick))
+        return channel
+
+    def wait_for_any(self, timeout_s: float) -> None:
+        """Wait until something comes from any environment, at most `timeout_s`. Look with `receive(0)` first."""
+        self._attachment.wait_for_any(timeout_s)
 
     def receive(self, timeout_s: float) -> list[Observation]:
         """All ticks that are waiting, in order, at least one; an empty list after `timeout_s`.

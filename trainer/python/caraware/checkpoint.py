@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from caraware.environment import Place
 from caraware.evaluation import EvaluationResult
 from caraware.metrics import TrainingPoint
 from caraware.ppo import Ppo
@@ -59,6 +60,8 @@ class Course:
     """Newest tick of `evaluations`; -1 before the first."""
     evaluations: list[EvaluationResult] = field(default_factory=list)
     training: list[TrainingPoint] = field(default_factory=list)
+    others: list[Place] = field(default_factory=list)
+    """The environments after the first, of which `Counters` and the fields above tell."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,8 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
             raise CheckpointError(checkpoint / name, "does not hold the tensors of this trainer")
         for key, tensor in tensors.items():
             tensor.copy_(stored[name][key])
-    ppo.sampling.set_state(stored["random.safetensors"]["sampling"])
+    for name, generator in ppo.sampling_generators().items():
+        generator.set_state(stored["random.safetensors"][name])
     ppo.shuffling.set_state(stored["random.safetensors"]["shuffling"])
     ppo.updates = manifest.counters.updates
     return manifest.counters
@@ -142,8 +146,9 @@ def load_course(checkpoint: Path) -> Course:
     rest = json.loads(_verified(checkpoint / COURSE, files[COURSE]))
     rows = _read_tensors(checkpoint / POINTS, files[POINTS])["training"].tolist()
     evaluations = [EvaluationResult.restored(result) for result in rest.pop("evaluations")]
+    others = [Place(**place) for place in rest.pop("others", [])]
     training = [TrainingPoint(int(steps), *values) for steps, *values in rows]
-    return Course(**rest | {"evaluations": evaluations, "training": training})
+    return Course(**rest | {"evaluations": evaluations, "training": training, "others": others})
 
 
 def remove_partial(folder: Path) -> None:
@@ -201,7 +206,8 @@ def _tensors(ppo: Ppo) -> dict[str, dict[str, Tensor]]:
         moments[f"{network}.mean"] = optimiser.mean
         moments[f"{network}.square"] = optimiser.square
         moments[f"{network}.steps"] = optimiser.steps
-    random = {"sampling": ppo.sampling.get_state(), "shuffling": ppo.shuffling.get_state()}
+    random = {name: generator.get_state() for name, generator in ppo.sampling_generators().items()}
+    random["shuffling"] = ppo.shuffling.get_state()
     return {"parameters.safetensors": parameters, "optimiser.safetensors": moments, "random.safetensors": random}
 
 

@@ -69,6 +69,8 @@ class TrainerConfig:
     reward_scale_m: float = 5.0
     matmul_precision: str = "auto"
     """`float32`, `bfloat16` (inputs of matrix products only), or `auto`: bfloat16 where the CPU has AMX tiles."""
+    ranks: int = 1
+    """Trainers that learn together by torch.distributed, each with a run of its own; horizon and batch are of each."""
     threads: int = 0
     """CPU threads; 0 is one per core this process may use."""
     device: str = "cpu"
@@ -112,7 +114,7 @@ class TrainerConfig:
         for name in ("learning_rate_final", "clip_epsilon_final", "entropy_scale_final", "value_clip", "target_kl"):
             if (value := getattr(self, name)) is not None:
                 _range(name, value, 0.0, math.inf)
-        for name in ("horizon", "batch_size", "epochs", "checkpoint_interval_updates", "checkpoints_kept"):
+        for name in ("horizon", "batch_size", "epochs", "ranks", "checkpoint_interval_updates", "checkpoints_kept"):
             _range(name, getattr(self, name), 1, math.inf)
         _range("batch_size", self.batch_size, 1, self.horizon)
         if not self.hidden or min(self.hidden) < 1:
@@ -162,6 +164,8 @@ class RunConfig:
     """Training episodes between two evaluation episodes; 0: none between."""
     sensors: SensorNoise | None = None
     """Errors of the sensors, which the classical baselines are tuned with; None for a run file without sensors."""
+    environments: tuple[int, ...] = (0,)
+    """Indices of this run's environments among those of all runs that learn together."""
     resume_from: Path | None = field(default=None)
     """A checkpoint directory to continue from."""
 
@@ -173,6 +177,8 @@ class RunConfig:
         canonical = json.dumps(run.get("config", {}), sort_keys=True, separators=(",", ":")).encode()
         resume = run.get("resume_from")
         episodes = run.get("config", {}).get("episode", {})
+        place = run.get("config", {}).get("run", {})
+        first_env = place.get("first_env", 0)
         return cls(
             run_dir=Path(run["run_dir"]),
             trainer=TrainerConfig.from_run(run),
@@ -182,6 +188,7 @@ class RunConfig:
             training_episodes=max(1, episodes.get("training_episodes", 1)),
             evaluation_interval=episodes.get("evaluation_interval", 0),
             sensors=SensorNoise.from_run(run),
+            environments=tuple(range(first_env, first_env + place.get("envs", 1))),
             resume_from=Path(resume) if resume else None,
         )
 

@@ -1,8 +1,8 @@
 """Errors of the deterministic policy, of raw GNSS and of the classical baselines, over exactly the same rows."""
 
 import math
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,8 @@ class EvaluationResult:
     rts_mean_error_m: float | None = None
     """Of the smoother, which sees the future: a bound, not an estimator."""
     rts_standard_error_m: float | None = None
+    environment: int = 0
+    """Whose episodes; the first one's index if those of all are pooled."""
     ppo_ci95_m: float = field(init=False)
     """Half the width of the confidence interval of the mean, 95 %."""
     raw_gnss_ci95_m: float = field(init=False)
@@ -53,7 +55,7 @@ class EvaluationResult:
     @classmethod
     def restored(cls, values: dict) -> "EvaluationResult":
         """From what `dataclasses.asdict` made of one."""
-        return cls(**{known.name: values[known.name] for known in fields(cls) if known.init})
+        return cls(**{known.name: values[known.name] for known in fields(cls) if known.init and known.name in values})
 
     def headline(self) -> dict[str, float | None]:
         """Mean errors and half their confidence intervals, for the run's report."""
@@ -139,7 +141,7 @@ class Evaluation:
         self._finished.append(self._sums[self._sums[:, 0] > 0])
         self._sums = np.zeros((0, self._sums.shape[1]))
 
-    def result(self, env_steps: int, policy_version: int) -> EvaluationResult | None:
+    def result(self, env_steps: int, policy_version: int, environment: int = 0) -> EvaluationResult | None:
         """The phase, which ends here; None without a sample."""
         self._finish_episode()
         sums = np.concatenate(self._finished)
@@ -158,8 +160,36 @@ class Evaluation:
             policy_version=policy_version,
             episodes=sum(len(episode) > 0 for episode in self._finished),
             samples=int(count.sum()),
+            environment=environment,
             **results,
         )
+
+
+def pooled(results: Sequence[EvaluationResult]) -> list[EvaluationResult]:
+    """Phase by phase the evaluations of all environments as one; phases that not every environment has finished wait.
+
+    Environments share no vehicle, so the mean is that over all samples and its variance the sum of theirs.
+    """
+    by_environment: dict[int, list[EvaluationResult]] = {}
+    for result in results:
+        by_environment.setdefault(result.environment, []).append(result)
+    return [_pool(phase) for phase in zip(*by_environment.values(), strict=False)]
+
+
+def _pool(phase: Sequence[EvaluationResult]) -> EvaluationResult:
+    if len(phase) == 1:
+        return phase[0]
+    samples = sum(result.samples for result in phase)
+    shares = [result.samples / samples for result in phase]
+    values: dict[str, Any] = {}
+    for name in ESTIMATORS:
+        means_m = [getattr(result, f"{name}_mean_error_m") for result in phase]
+        if None in means_m:
+            continue
+        errors_m = [getattr(result, f"{name}_standard_error_m") for result in phase]
+        values[f"{name}_mean_error_m"] = sum(share * mean for share, mean in zip(shares, means_m, strict=True))
+        values[f"{name}_standard_error_m"] = math.hypot(*(s * e for s, e in zip(shares, errors_m, strict=True)))
+    return replace(phase[0], samples=samples, episodes=sum(result.episodes for result in phase), **values)
 
 
 def errors_m(obs: Observation, predictions_m: Tensor) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ samples depend on the seed and on the data alone, never on how many ticks happen
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
@@ -29,6 +29,8 @@ from caraware.rollout import Horizon
 
 ACTIONS = 2
 SMALLEST_DEVIATION = 1e-8
+SEED_STRIDE = 0x9E3779B97F4A7C15
+"""Between the seeds of neighbouring environments: 2^64 over the golden ratio, so that they look nothing alike."""
 
 
 class NonFiniteLoss(Exception):
@@ -62,6 +64,14 @@ class Batch:
     """i64 `[s]`."""
     tick: Tensor
     """i64 `[s]`."""
+
+    @classmethod
+    def joined(cls, batches: Sequence["Batch"]) -> "Batch":
+        """The rows of all, one batch after the other."""
+        if len(batches) == 1:
+            return batches[0]
+        columns = (f.name for f in fields(cls))
+        return cls(**{name: torch.cat([getattr(batch, name) for batch in batches]) for name in columns})
 
 
 @dataclass(frozen=True)
@@ -138,7 +148,10 @@ class _ValueMeans:
 class Ppo:
     """Policy, value network, their optimisers and random numbers; everything that a checkpoint must hold."""
 
-    def __init__(self, config: TrainerConfig, observation_size: int, bounds: MapBounds) -> None:
+    def __init__(
+        self, config: TrainerConfig, observation_size: int, bounds: MapBounds, environments: Sequence[int] = (0,)
+    ) -> None:
+        """`environments` are the indices, among all that learn together, of those whose horizons it scores."""
         self.config, self.bounds = config, bounds
         self.observation_size = observation_size
         self.updates = 0
@@ -151,11 +164,22 @@ class Ppo:
         self.value = ValueNetwork(observation_size, config.hidden, self.device)
         self.policy.initialise(self.sampling, config.initial_std)
         self.value.initialise(self.sampling)
+        self._samplings = [self._sampling_of(index) for index in environments]
         self.policy_optimiser = Adam(self.policy.mlp.parameters)
         self.value_optimiser = Adam(self.value.mlp.parameters)
         self._reward = rewards.by_name(config.reward)
         self._second_core = _worker(config, self.device)
         self._graphed = GraphedUpdate(self) if self.device.type == "cuda" else None
+
+    def _sampling_of(self, environment: int) -> torch.Generator:
+        """Every environment has its own random actions, whoever learns from it; the first goes on after the weights."""
+        if environment == 0:
+            return self.sampling
+        return torch.Generator().manual_seed((self.config.seed + environment * SEED_STRIDE) % 2**63)
+
+    def sampling_generators(self) -> dict[str, torch.Generator]:
+        """The random numbers of the actions, by the name that a checkpoint gives them."""
+        return {f"sampling{index or ''}": generator for index, generator in enumerate(self._samplings)}
 
     @torch.no_grad()
     def predict_m(self, observations: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -171,13 +195,13 @@ class Ppo:
         return self.update(self.score(horizon))
 
     @torch.no_grad()
-    def score(self, horizon: Horizon) -> Batch:
-        """Give every sample of the horizon its action, reward and advantage."""
+    def score(self, horizon: Horizon, environment: int = 0) -> Batch:
+        """Give every sample of one environment's horizon its action, reward and advantage."""
         rows = horizon.valid.flatten().nonzero().squeeze(1)
         observation = horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device)
         truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
         mean = self.policy.mlp.infer(observation)
-        noise = torch.randn(mean.shape, generator=self.sampling).to(self.device)
+        noise = torch.randn(mean.shape, generator=self._samplings[environment]).to(self.device)
         action = mean + self.policy.log_std.exp() * noise
         reward = self._reward(rewards.distance_m(self.bounds.to_world_m(action), truth), self.config.reward_scale_m)
         value = self.value.mlp.infer(observation).squeeze(1)

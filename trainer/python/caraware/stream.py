@@ -106,6 +106,9 @@ class Channel(Protocol):
     def receive(self, timeout_s: float) -> Sequence[Observation]:
         """Wait for ticks and return all that are there, oldest first; empty after `timeout_s` without any."""
 
+    def wait_for_any(self, timeout_s: float) -> None:
+        """Wait until something comes from any environment of the run, at most `timeout_s`."""
+
     def consumed(self, tick: int) -> None:
         """Give the producer credit up to and including `tick`."""
 

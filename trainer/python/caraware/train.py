@@ -124,9 +124,15 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
     learner = _successor(run_file, config, succession) if succession.replaces else None
     if succession.is_shadow:
         return
-    channel = Channel(str(run_file), learner.first_tick() if learner else 0)
+    first_ticks = [learner.first_tick(index) if learner else 0 for index in range(len(config.environments))]
+    channel = Channel(str(run_file), first_ticks[0])
     loop = TrainingLoop(
-        channel, config, lambda: stop.requested, leave_requested=lambda: stop.leave_requested, learner=learner
+        channel,
+        config,
+        lambda: stop.requested,
+        others=[channel.in_environment(index, tick) for index, tick in enumerate(first_ticks) if index > 0],
+        leave_requested=lambda: stop.leave_requested,
+        learner=learner,
     )
     if succession.checkpoint is not None:
         loop.commit()

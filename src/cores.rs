@@ -1,0 +1,101 @@
+//! Which cores the processes of a run may use.
+//!
+//! Three processes of one environment talk a thousand times a second: kept together they stay in one cache, and
+//! environments do not push each other around. With one environment, or too few cores, the kernel decides.
+
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+
+/// Processes of an environment, each of which can keep a core busy.
+const ENVIRONMENT_CORES: usize = 3;
+/// Cores that a learner needs beside the environments: one for each of its networks.
+const TRAINER_CORES: usize = 2;
+
+/// Who may use which core.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Plan {
+    /// Cores of each environment.
+    pub environments: Vec<Vec<usize>>,
+    /// Cores of the processes that belong to the whole run.
+    pub rest: Vec<usize>,
+}
+
+/// Shares `cores` out to `envs` environments and, with `trainer_cores` for it, a trainer. `None`: everybody may use all of them.
+#[must_use]
+pub fn plan(cores: &[usize], envs: usize, trains: bool) -> Option<Plan> {
+    let spare = if trains { TRAINER_CORES } else { 0 };
+    let each = (cores.len().saturating_sub(spare) / envs.max(1)).min(ENVIRONMENT_CORES);
+    if envs < 2 || each == 0 || trains && each < ENVIRONMENT_CORES {
+        return None;
+    }
+    let (shared, rest) = cores.split_at(each * envs);
+    Some(Plan {
+        environments: shared.chunks(each).map(<[usize]>::to_vec).collect(),
+        rest: if rest.is_empty() { cores } else { rest }.to_vec(),
+    })
+}
+
+/// The cores that this process may use.
+#[must_use]
+pub fn available() -> Vec<usize> {
+    sched_getaffinity(None)
+        .map(|set| (0..CpuSet::MAX_CPU).filter(|core| set.is_set(*core)).collect())
+        .unwrap_or_default()
+}
+
+/// Runs `start` on `cores`, so that a process which it starts is bound to them from its first instruction.
+pub fn within<T>(cores: Option<&[usize]>, start: impl FnOnce() -> T) -> T {
+    let Some(cores) = cores else { return start() };
+    let before = available();
+    bind(cores);
+    let result = start();
+    bind(&before);
+    result
+}
+
+fn bind(cores: &[usize]) {
+    let mut set = CpuSet::new();
+    cores.iter().for_each(|core| set.set(*core));
+    if let Err(error) = sched_setaffinity(None, &set) {
+        tracing::debug!(%error, "cannot choose cores");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cores(count: usize) -> Vec<usize> {
+        (0..count).collect()
+    }
+
+    #[test]
+    fn one_environment_is_left_to_the_kernel() {
+        assert_eq!(plan(&cores(16), 1, true), None);
+    }
+
+    #[test]
+    fn sixteen_cores_hold_four_environments_and_a_trainer() {
+        let plan = plan(&cores(16), 4, true).unwrap();
+        assert_eq!(plan.environments.len(), 4);
+        assert_eq!(plan.environments[1], [3, 4, 5]);
+        assert_eq!(plan.rest, [12, 13, 14, 15]);
+    }
+
+    #[test]
+    fn a_trainer_shares_two_cores_with_everybody() {
+        assert_eq!(plan(&cores(2), 2, true), None);
+        assert_eq!(plan(&cores(16), 8, true), None);
+    }
+
+    #[test]
+    fn without_a_trainer_two_cores_have_an_environment_each() {
+        let plan = plan(&cores(2), 2, false).unwrap();
+        assert_eq!(plan.environments, [[0], [1]]);
+        assert_eq!(plan.rest, [0, 1]);
+    }
+
+    #[test]
+    fn more_environments_than_cores_are_left_to_the_kernel() {
+        assert_eq!(plan(&cores(2), 3, false), None);
+    }
+}
