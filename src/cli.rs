@@ -85,13 +85,15 @@ pub struct SwapArgs {
 pub enum Part {
     /// LIDAR: rays per second on one core beside Open3D's ray caster (Embree), same scene and rays
     Lidar,
+    /// Environments: vehicle-steps per second of 1, 2 and 4 side by side, beside one that has one core to itself
+    Envs,
     /// Everything above, one after the other
     All,
 }
 
 impl Part {
     /// The parts that are measured, in the order of the documentation.
-    pub const MEASURED: [Self; 1] = [Self::Lidar];
+    pub const MEASURED: [Self; 2] = [Self::Lidar, Self::Envs];
 
     /// Its name on the command line.
     #[must_use]
@@ -131,6 +133,9 @@ pub struct RunArgs {
     /// Environments side by side, each with its own seed, feeding one trainer; short for --set run.envs=N
     #[arg(long, value_name = "N")]
     pub envs: Option<u32>,
+    /// Show no progress and no summary, only what goes wrong
+    #[arg(long)]
+    pub quiet: bool,
     /// Name of the run [default: CONFIG and the first free number]
     #[arg(long)]
     pub name: Option<String>,

@@ -20,6 +20,7 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 #[derive(Debug)]
 pub struct Display {
     bar: Option<ProgressBar>,
+    is_silent: bool,
     last_line: Instant,
     last_text: String,
 }
@@ -34,6 +35,18 @@ impl Display {
         }
         Self {
             bar,
+            is_silent: false,
+            last_line: Instant::now(),
+            last_text: String::new(),
+        }
+    }
+
+    /// Shows nothing.
+    #[must_use]
+    pub fn silent() -> Self {
+        Self {
+            bar: None,
+            is_silent: true,
             last_line: Instant::now(),
             last_text: String::new(),
         }
@@ -41,6 +54,9 @@ impl Display {
 
     /// Shows the newest state of the boards.
     pub fn update(&mut self, environments: &[Environment], ready_at: Option<Instant>) {
+        if self.is_silent {
+            return;
+        }
         let view = View::read(environments, ready_at);
         if let Some(bar) = &self.bar {
             if bar.length() != view.total_ticks && view.total_ticks.is_some() {
@@ -60,6 +76,7 @@ impl Display {
     pub fn finish(&mut self) {
         match &self.bar {
             Some(bar) => bar.abandon(),
+            None if self.is_silent => {}
             None => eprintln!("{}", self.last_text),
         }
     }

@@ -36,11 +36,15 @@ fn main() -> ExitCode {
 fn run(args: &RunArgs, mode: Mode) -> Result<(), Exit> {
     let prepared = prepare(args, mode)?;
     let run = prepared.run.clone();
-    eprintln!("run {}: results go to {}", run.name, run.run_dir.display());
+    if !args.quiet {
+        eprintln!("run {}: results go to {}", run.name, run.run_dir.display());
+    }
     let supervisor = Supervisor::new(prepared.run, prepared.install, prepared.claim)?;
-    let outcome = supervisor.supervise(&mut Display::new())?;
+    let outcome = supervisor.supervise(&mut if args.quiet { Display::silent() } else { Display::new() })?;
     let (report, path) = report::write(&run, &outcome)?;
-    println!("{}", report::summary(&report, &path));
+    if !args.quiet {
+        println!("{}", report::summary(&report, &path));
+    }
     if outcome.interrupted {
         Err(Exit::Interrupted)
     } else {

@@ -2,6 +2,7 @@
 //!
 //! One file for each part; all end in a [`Report`]. Decision 9.
 
+mod envs;
 mod lidar;
 mod page;
 mod plots;
@@ -67,6 +68,7 @@ pub fn bench(args: &BenchArgs) -> Result<(), Exit> {
 
 fn measure(part: Part, options: &Options) -> Result<Report, Exit> {
     match part {
+        Part::Envs => envs::measure(options),
         Part::Lidar => lidar::measure(options),
         Part::All => Err(Exit::config("`all` is not a part", "")),
     }

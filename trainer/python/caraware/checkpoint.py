@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 COURSE = "course.json"
+RANDOM = "random.safetensors"
 POINTS = "points.safetensors"
 LATEST = "latest"
 """File beside the checkpoints that names the newest."""
@@ -79,17 +80,26 @@ class Manifest:
 
 
 def save_checkpoint(
-    folder: Path, ppo: Ppo, counters: Counters, config_sha256: str, keep: int, course: Course | None = None
+    folder: Path,
+    ppo: Ppo,
+    counters: Counters,
+    config_sha256: str,
+    keep: int,
+    course: Course | None = None,
+    random: dict[str, Tensor] | None = None,
 ) -> Path:
     """Write `folder/update-NNNNNN`, then point `folder/latest` at it; older ones beyond `keep` are removed.
 
-    Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there.
+    Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there. `random`
+    adds the generators of other ranks.
     """
     target = folder / f"update-{counters.updates:06d}"
     temporary = folder / f".{target.name}.partial"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
-    files = {name: _write(temporary / name, save(tensors)) for name, tensors in _tensors(ppo).items()}
+    tensors_of = _tensors(ppo)
+    tensors_of[RANDOM] |= random or {}
+    files = {name: _write(temporary / name, save(tensors)) for name, tensors in tensors_of.items()}
     if course is not None:
         rows = torch.tensor([astuple(point) for point in course.training], dtype=torch.float64)
         files[POINTS] = _write(temporary / POINTS, save({"training": rows}))
@@ -127,13 +137,15 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
         name: _read_tensors(checkpoint / name, digest) for name, digest in manifest.files.items() if name in current
     }
     for name, tensors in current.items():
-        if set(stored.get(name, {})) != set(tensors):
+        found = set(stored.get(name, {}))
+        # A checkpoint of several ranks holds the generators of all.
+        if not found.issuperset(tensors) or (name != RANDOM and found != set(tensors)):
             raise CheckpointError(checkpoint / name, "does not hold the tensors of this trainer")
         for key, tensor in tensors.items():
             tensor.copy_(stored[name][key])
     for name, generator in ppo.sampling_generators().items():
-        generator.set_state(stored["random.safetensors"][name])
-    ppo.shuffling.set_state(stored["random.safetensors"]["shuffling"])
+        generator.set_state(stored[RANDOM][name])
+    ppo.shuffling.set_state(stored[RANDOM]["shuffling"])
     ppo.updates = manifest.counters.updates
     return manifest.counters
 
@@ -208,7 +220,7 @@ def _tensors(ppo: Ppo) -> dict[str, dict[str, Tensor]]:
         moments[f"{network}.steps"] = optimiser.steps
     random = {name: generator.get_state() for name, generator in ppo.sampling_generators().items()}
     random["shuffling"] = ppo.shuffling.get_state()
-    return {"parameters.safetensors": parameters, "optimiser.safetensors": moments, "random.safetensors": random}
+    return {"parameters.safetensors": parameters, "optimiser.safetensors": moments, RANDOM: random}
 
 
 def _verified(file: Path, sha256: str) -> bytes:

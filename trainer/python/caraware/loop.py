@@ -4,7 +4,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from caraware.evaluation import NO_HEADLINE, ErrorMeter, Evaluation, errors_m, p
 from caraware.metrics import Metrics, TrainingPoint
 from caraware.plots import plot_error, plot_sigma
 from caraware.ppo import Batch, NonFiniteLoss, Ppo, UpdateStats, save_batch
+from caraware.ranks import RankError, Ranks, Verdict
 from caraware.stream import Channel, Observation
 
 log = logging.getLogger(__name__)
@@ -35,9 +36,9 @@ class Learner:
     course: Course
 
     @classmethod
-    def begin(cls, config: RunConfig, observation_size: int) -> "Learner":
+    def begin(cls, config: RunConfig, observation_size: int, ranks: Ranks | None = None) -> "Learner":
         """A learner for observations of this size, continued from `config.resume_from`. Raises `CheckpointError`."""
-        ppo = Ppo(config.trainer, observation_size, config.bounds, config.environments)
+        ppo = Ppo(config.trainer, observation_size, config.bounds, config.environments, ranks)
         learner = cls(ppo, Counters(0, 0, 0, -1), Course())
         if config.resume_from is not None:
             learner.load(config.resume_from)
@@ -83,12 +84,14 @@ class TrainingLoop:
         others: Sequence[Channel] = (),
         leave_requested: Callable[[], bool] = lambda: False,
         learner: Learner | None = None,
+        ranks: Ranks | None = None,
     ) -> None:
-        """`channel` is environment 0's, `others` those of the further ones.
+        """`channel` is environment 0's, `others` those of the further ones; `ranks` are those who learn together.
 
         Without a `learner`, one begins at the first tick. A request to leave is met where a successor can go on.
         """
         self._channel, self._config, self._stop_requested = channel, config, stop_requested
+        self._ranks = ranks or Ranks()
         self._environments = [Environment(i, each, config) for i, each in enumerate((channel, *others))]
         self._leave_requested, self._left = leave_requested, False
         self._metrics = Metrics(config.run_dir / "tensorboard")
@@ -96,6 +99,8 @@ class TrainingLoop:
         self._env_steps = self._passed_steps = self._vehicles = 0
         """Samples seen, and those among them that came when no horizon could be filled any more."""
         self._saved_updates = -1
+        self._others_stopped = False
+        self._agreed_episode = 0
         self._learns = True
         """Until an environment ends before its share of the horizon is full."""
         self._meter = ErrorMeter()
@@ -107,9 +112,11 @@ class TrainingLoop:
 
         False if it left to a successor instead, after a commit.
         """
-        while not (self._left or self._ended() or self._stop_requested()):
+        while not (self._left or self._ended() or self._stopped()):
             self._receive()
             self._consume()
+        if self._learns and not self._left:
+            self._agree(Verdict.STOP if self._stopped() else Verdict.ENDED)
         if self._left:
             self._leave()
             return False
@@ -124,7 +131,21 @@ class TrainingLoop:
             for environment in self._environments:
                 environment.channel.done()
         log.info("%s after %d updates", "run complete" if self._ended() else "stopped", self._updates())
+        if self._others_stopped and not self._stop_requested():
+            raise RankError(f"another rank was asked to stop, after update {self._updates()}")
         return True
+
+    def _stopped(self) -> bool:
+        """Whether this trainer, or one that it learns together with, has been asked to stop."""
+        return self._others_stopped or self._stop_requested()
+
+    def _agree(self, verdict: Verdict) -> bool:
+        """Whether all who learn together can learn. If not they never will again, and each ends by itself."""
+        assert not self._others_stopped
+        agreed, self._agreed_episode = self._ranks.agree(verdict, self._episode())
+        self._learns = agreed is Verdict.FULL
+        self._others_stopped = agreed is Verdict.STOP
+        return self._learns
 
     def _ended(self) -> bool:
         return all(environment.ended for environment in self._environments)
@@ -132,7 +153,7 @@ class TrainingLoop:
     def _ensure_started(self, first: Observation) -> None:
         """The first tick tells the size of the observation, which the networks need."""
         if self._ppo is None:
-            self._start(Learner.begin(self._config, first.observation.shape[1]))
+            self._start(Learner.begin(self._config, first.observation.shape[1], self._ranks))
 
     def _start(self, learner: Learner) -> None:
         """Go on where `learner` stands."""
@@ -197,10 +218,11 @@ class TrainingLoop:
     def _learn_or_give_up(self) -> None:
         full = [environment.rollout.full() for environment in self._environments]
         if all(full):
-            self._learn()
-            self._left = self._leave_requested()
+            if self._agree(Verdict.FULL):
+                self._learn()
+                self._left = self._leave_requested()
         elif any(environment.ended and not full[environment.index] for environment in self._environments):
-            self._learns = False
+            self._agree(Verdict.ENDED)
 
     def _visible(self, obs: Observation) -> Tensor:
         """The observation as the networks take it: in place, unless fields of dark sensors must become numbers."""
@@ -236,7 +258,7 @@ class TrainingLoop:
         assert self._ppo is not None
         horizons = [environment.rollout.take() for environment in self._environments]
         batch = Batch.joined([self._ppo.score(horizon, index) for index, horizon in enumerate(horizons)])
-        self._ppo.progress = self._config.progress(self._episode())
+        self._ppo.progress = self._config.progress(self._agreed_episode)
         try:
             stats = self._ppo.update(batch)
         except NonFiniteLoss as error:
@@ -272,10 +294,15 @@ class TrainingLoop:
             updates=self._updates(),
         )
 
+    def _number(self, environment: Environment) -> int:
+        """Its index among the environments of all ranks."""
+        numbers = self._config.environments
+        return numbers[environment.index] if environment.index < len(numbers) else environment.index
+
     def _finish_evaluation(self, environment: Environment) -> None:
         """Close the evaluation phase of an environment, if one is open."""
         evaluation, environment.evaluation = environment.evaluation, None
-        result = evaluation.result(self._env_steps, self._updates(), environment.index) if evaluation else None
+        result = evaluation.result(self._env_steps, self._updates(), self._number(environment)) if evaluation else None
         if result is not None:
             environment.evaluated_tick = environment.evaluation_tick
             self._metrics.evaluated(result)
@@ -288,12 +315,31 @@ class TrainingLoop:
         committed_tick = self._environments[0].committed_tick
         counters = Counters(self._updates(), self._trained_steps(), self._episode(), committed_tick)
         kept = self._config.trainer.checkpoints_kept
-        written = save_checkpoint(folder, self._ppo, counters, self._config.config_sha256, kept, self._course())
+        course, random = self._of_all_ranks()
+        if self._ranks.rank == 0:
+            saved = save_checkpoint(folder, self._ppo, counters, self._config.config_sha256, kept, course, random)
+            log.info("checkpoint %s, learnt up to tick %d", saved.name, committed_tick)
+        # The checkpoint of rank 0 is that of all.
+        self._ranks.gather(None)
         self._saved_updates = counters.updates
         for environment in self._environments:
             if environment.committed_tick >= 0:
                 environment.channel.committed(environment.committed_tick)
-        log.info("checkpoint %s, learnt up to tick %d", written.name, committed_tick)
+
+    def _of_all_ranks(self) -> tuple[Course, dict[str, Tensor]]:
+        """What the checkpoint of all ranks says of their environments: those of one trainer that has them all."""
+        assert self._ppo is not None
+        own = self._course()
+        self._ranks.check_equal(
+            "the parameters", [self._ppo.policy.mlp.parameters.values, self._ppo.value.mlp.parameters.values]
+        )
+        states = {name: generator.get_state() for name, generator in self._ppo.sampling_generators().items()}
+        first, *others = self._ranks.gather((own, [environment.place() for environment in self._environments], states))
+        places = [*own.others, *(place for _, theirs, _ in others for place in theirs)]
+        if self._ranks.rank > 0:
+            return own, {}
+        random = {name: state for _, _, theirs in (first, *others) for name, state in theirs.items()}
+        return replace(own, others=places), random
 
     def _course(self) -> Course:
         """How training went, of what the checkpoint contains."""
@@ -323,10 +369,13 @@ class TrainingLoop:
 
     def _write_part(self) -> None:
         """The trainer's part of the run's report. The headline errors are the last evaluation's."""
-        phases = pooled(self._metrics.evaluations)
+        everybody = self._ranks.gather((self._metrics.evaluations, self._env_steps))
+        phases = pooled([result for results, _ in everybody for result in results])
         ledgers = [environment.ledger for environment in self._environments] if self._ppo else []
         part = {
             "env_steps": self._env_steps,
+            "ranks": self._ranks.size,
+            "env_steps_of_all_ranks": sum(steps for _, steps in everybody),
             **(phases[-1].headline() if phases else NO_HEADLINE),
             "rts_note": "the smoother sees the future: a bound, not an estimator",
             "policy_std": self._ppo.sigma() if self._ppo else None,

@@ -25,6 +25,7 @@ from caraware.gae import generalised_advantage
 from caraware.graphed import GraphedUpdate, StepTable
 from caraware.networks import FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
 from caraware.objective import clipped_error, clipped_surrogate
+from caraware.ranks import Minibatch, Ranks, Union
 from caraware.rollout import Horizon
 
 ACTIONS = 2
@@ -149,9 +150,15 @@ class Ppo:
     """Policy, value network, their optimisers and random numbers; everything that a checkpoint must hold."""
 
     def __init__(
-        self, config: TrainerConfig, observation_size: int, bounds: MapBounds, environments: Sequence[int] = (0,)
+        self,
+        config: TrainerConfig,
+        observation_size: int,
+        bounds: MapBounds,
+        environments: Sequence[int] = (0,),
+        ranks: Ranks | None = None,
     ) -> None:
-        """`environments` are the indices, among all that learn together, of those whose horizons it scores."""
+        """`environments` are the indices, among those of all `ranks`, of those whose horizons it scores."""
+        self.ranks = ranks or Ranks()
         self.config, self.bounds = config, bounds
         self.observation_size = observation_size
         self.updates = 0
@@ -164,12 +171,14 @@ class Ppo:
         self.value = ValueNetwork(observation_size, config.hidden, self.device)
         self.policy.initialise(self.sampling, config.initial_std)
         self.value.initialise(self.sampling)
+        self._environments = tuple(environments)
         self._samplings = [self._sampling_of(index) for index in environments]
         self.policy_optimiser = Adam(self.policy.mlp.parameters)
         self.value_optimiser = Adam(self.value.mlp.parameters)
         self._reward = rewards.by_name(config.reward)
         self._second_core = _worker(config, self.device)
-        self._graphed = GraphedUpdate(self) if self.device.type == "cuda" else None
+        # The steps of several ranks meet on the way, which a graph of one rank's step does not know of.
+        self._graphed = GraphedUpdate(self) if self.device.type == "cuda" and self.ranks.size == 1 else None
 
     def _sampling_of(self, environment: int) -> torch.Generator:
         """Every environment has its own random actions, whoever learns from it; the first goes on after the weights."""
@@ -179,7 +188,8 @@ class Ppo:
 
     def sampling_generators(self) -> dict[str, torch.Generator]:
         """The random numbers of the actions, by the name that a checkpoint gives them."""
-        return {f"sampling{index or ''}": generator for index, generator in enumerate(self._samplings)}
+        names = (f"sampling{index or ''}" for index in self._environments)
+        return dict(zip(names, self._samplings, strict=True))
 
     @torch.no_grad()
     def predict_m(self, observations: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -222,71 +232,97 @@ class Ppo:
     def update(self, batch: Batch) -> UpdateStats:
         """All epochs of minibatches over one batch. Policy and value share nothing, so each has its own core."""
         now = Settings.at(self.config, self.updates, self.progress)
-        orders = [torch.randperm(len(batch.reward), generator=self.shuffling) for _ in range(self.config.epochs)]
+        union = self.ranks.union(batch.advantage, batch.reward, batch.value_target)
+        orders = [torch.randperm(len(union), generator=self.shuffling) for _ in range(self.config.epochs)]
         orders = [order.to(self.device) for order in orders]
         if self._graphed is not None:
             policy, value = self._means_of(self._graphed.run(batch, orders, now), len(orders))
         elif self._second_core is None:
-            policy = self._improve_policy(batch, orders, now)
-            value = self._improve_value(batch, orders, now)
+            policy = self._improve_policy(batch, union, orders, now)
+            value = self._improve_value(batch, union, orders, now)
         else:
-            value_job = self._second_core.submit(self._improve_value, batch, orders, now)
+            value_job = self._second_core.submit(self._improve_value, batch, union, orders, now)
             try:
-                policy = self._improve_policy(batch, orders, now)
+                policy = self._improve_policy(batch, union, orders, now)
             finally:
                 value_job.exception()
             value = value_job.result()
         self.updates += 1
-        return self._stats(batch, policy, value, now)
+        return self._stats(union, policy, value, now)
 
     @torch.no_grad()
-    def _improve_policy(self, batch: Batch, orders: list[Tensor], now: Settings) -> _PolicyMeans:
+    def _improve_policy(self, batch: Batch, union: Union, orders: list[Tensor], now: Settings) -> _PolicyMeans:
         """Climb the clipped surrogate objective plus the entropy bonus."""
-        policy, log, ratio_max, epochs = self.policy, [], 0.0, 0
+        policy, epochs = self.policy, 0
+        log: list[list[float]] = []
+        largest: list[float] = []
+        columns = (batch.observation, batch.action, batch.log_probability)
         for order in orders:
-            before = len(log)
-            columns = (batch.observation, batch.action, batch.log_probability, batch.advantage)
-            for observation, action, old_log_probability, advantage in self._minibatches(columns, order):
-                mean = policy.mlp.forward(observation)
-                surrogate = clipped_surrogate(
-                    mean, policy.log_std, action, old_log_probability, _normalised(advantage), now.clip_epsilon
-                )
-                bonus = now.entropy_scale * entropy(policy.log_std)
-                loss = self._finite("the policy's loss", surrogate.loss - bonus)
-                policy.mlp.backward(observation, surrogate.mean_gradient)
-                policy.log_std_gradient.copy_(surrogate.log_std_gradient - now.entropy_scale)
-                norm = self._step(
-                    "the policy's gradient", policy.mlp.parameters, self.policy_optimiser, now.learning_rate
-                )
-                ratio = surrogate.ratio
-                log.append((loss, surrogate.approximate_kl(), surrogate.clip_fraction(), ratio.mean().item(), norm))
-                ratio_max = max(ratio_max, ratio.max().item())
+            steps: list[tuple[float, ...]] = []
+            for part in union.minibatches(columns, order, self._parts(union)):
+                *told, ratio_max = self._policy_gradient(part, now)
+                norm = self._step("policy", policy.mlp.parameters, self.policy_optimiser, now.learning_rate)
+                steps.append(tuple(number * part.share for number in (*told, norm)))
+                largest.append(ratio_max)
+            log += self._of_all("policy", steps)
             epochs += 1
-            if self._went_far([row[1] for row in log[before:]]):
+            if self._went_far([row[1] for row in log[-len(steps) :]]):
                 break
         loss, kl, clipped, ratio_mean, norm = _means(log)
-        spread = entropy(policy.log_std).item()
+        spread, ratio_max = entropy(policy.log_std).item(), self.ranks.largest(max(largest))
         return _PolicyMeans(epochs, loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
+
+    def _policy_gradient(self, part: Minibatch, now: Settings) -> tuple[float, float, float, float, float]:
+        """This rank's part of the gradient; its loss, KL, clip fraction, mean and largest ratio."""
+        policy = self.policy
+        if part.share == 0.0:
+            policy.mlp.parameters.gradient.zero_()
+            return 0.0, 0.0, 0.0, 0.0, 0.0
+        observation, action, old_log_probability = part.own
+        mean = policy.mlp.forward(observation)
+        advantage = part.mine(_normalised(part.advantage))
+        surrogate = clipped_surrogate(mean, policy.log_std, action, old_log_probability, advantage, now.clip_epsilon)
+        loss = self._finite("the policy's loss", surrogate.loss - now.entropy_scale * entropy(policy.log_std))
+        policy.mlp.backward(observation, surrogate.mean_gradient * part.share)
+        policy.log_std_gradient.copy_((surrogate.log_std_gradient - now.entropy_scale) * part.share)
+        ratio, kl = surrogate.ratio, surrogate.approximate_kl()
+        return loss, kl, surrogate.clip_fraction(), ratio.mean().item(), ratio.max().item()
+
+    def _of_all(self, lane: str, steps: Sequence[tuple[float, ...]]) -> list[list[float]]:
+        """The numbers of every step, weighted with the shares of the ranks, of all ranks."""
+        table = torch.tensor(steps, dtype=torch.float64)
+        self.ranks.add_up(lane, table)
+        return table.tolist()
 
     @torch.no_grad()
     def _went_far(self, kl_of_steps: Sequence[float]) -> bool:
         """Whether the policy has left the one that sampled by more than `target_kl` in an epoch."""
         return self.config.target_kl is not None and sum(kl_of_steps) / len(kl_of_steps) > self.config.target_kl
 
-    def _improve_value(self, batch: Batch, orders: list[Tensor], now: Settings) -> _ValueMeans:
+    def _improve_value(self, batch: Batch, union: Union, orders: list[Tensor], now: Settings) -> _ValueMeans:
         """Regress on the value targets with the mean squared error, clipped where `value_clip` says so."""
-        network, log = self.value.mlp, []
+        steps = []
+        columns = (batch.observation, batch.value_target, batch.advantage)
         for order in orders:
-            columns = (batch.observation, batch.value_target, batch.advantage)
-            for observation, target, advantage in self._minibatches(columns, order):
-                value = network.forward(observation).squeeze(1)
-                error = clipped_error(value, target, advantage, self.config.value_clip)
-                loss = self._finite("the value network's loss", error.loss.mean())
-                network.backward(observation, error.pull.unsqueeze(1) * (2 * self.config.value_scale / len(target)))
-                norm = self._step("the value gradient", network.parameters, self.value_optimiser, now.learning_rate)
-                log.append((loss, norm))
-        loss, norm = _means(log)
+            for part in union.minibatches(columns, order, self._parts(union)):
+                loss = self._value_gradient(part)
+                norm = self._step("value", self.value.mlp.parameters, self.value_optimiser, now.learning_rate)
+                steps.append((loss * part.share, norm * part.share))
+        loss, norm = _means(self._of_all("value", steps))
         return _ValueMeans(loss, norm)
+
+    def _value_gradient(self, part: Minibatch) -> float:
+        """This rank's part of the gradient; its loss."""
+        network = self.value.mlp
+        if part.share == 0.0:
+            network.parameters.gradient.zero_()
+            return 0.0
+        observation, target, advantage = part.own
+        error = clipped_error(network.forward(observation).squeeze(1), target, advantage, self.config.value_clip)
+        loss = self._finite("the value network's loss", error.loss.mean())
+        weight = 2 * self.config.value_scale / len(target) * part.share
+        network.backward(observation, error.pull.unsqueeze(1) * weight)
+        return loss
 
     def _means_of(self, table: StepTable, epochs: int) -> tuple[_PolicyMeans, _ValueMeans]:
         """The means of an update on a GPU, which tells its numbers at its end."""
@@ -326,14 +362,14 @@ class Ppo:
         advantage, value_target = (result.flatten()[rows].to(self.device) for result in results)
         return advantage, value_target
 
-    def _minibatches(self, columns: tuple[Tensor, ...], order: Tensor) -> list[tuple[Tensor, ...]]:
-        """Rows of `columns` in `order`, gathered at once, cut into near-equal parts of about `batch_size`."""
-        parts = max(1, round(len(order) / self.config.batch_size))
-        return list(zip(*(column.index_select(0, order).tensor_split(parts) for column in columns), strict=True))
+    def _parts(self, union: Union) -> int:
+        """Minibatches of about `batch_size` samples of each rank."""
+        return max(1, round(len(union) / (self.config.batch_size * self.ranks.size)))
 
-    def _step(self, what: str, parameters: FlatParameters, optimiser: Adam, learning_rate: float) -> float:
-        """Clip the gradient to `max_grad_norm`, take one Adam step, and return the norm before clipping."""
-        norm = self._finite(what, torch.linalg.vector_norm(parameters.gradient))
+    def _step(self, lane: str, parameters: FlatParameters, optimiser: Adam, learning_rate: float) -> float:
+        """Add up the gradient of all ranks, clip it to `max_grad_norm`, take an Adam step; the norm before clipping."""
+        self.ranks.add_up(lane, parameters.gradient)
+        norm = self._finite(f"the {lane} gradient", torch.linalg.vector_norm(parameters.gradient))
         if norm > self.config.max_grad_norm:
             parameters.gradient.mul_(self.config.max_grad_norm / norm)
         optimiser.step(learning_rate)
@@ -345,7 +381,7 @@ class Ppo:
             raise NonFiniteLoss(what, self.updates + 1)
         return number
 
-    def _stats(self, batch: Batch, policy: _PolicyMeans, value: _ValueMeans, now: Settings) -> UpdateStats:
+    def _stats(self, union: Union, policy: _PolicyMeans, value: _ValueMeans, now: Settings) -> UpdateStats:
         return UpdateStats(
             policy_loss=policy.loss,
             value_loss=value.loss,
@@ -355,17 +391,17 @@ class Ppo:
             ratio_mean=policy.ratio_mean,
             ratio_max=policy.ratio_max,
             sigma=self.sigma(),
-            advantage_mean=batch.advantage.mean().item(),
-            advantage_std=batch.advantage.std(correction=0).item(),
-            reward_mean=batch.reward.mean().item(),
-            explained_variance=_explained_variance(batch),
+            advantage_mean=union.advantage.mean().item(),
+            advantage_std=union.advantage.std(correction=0).item(),
+            reward_mean=union.reward.mean().item(),
+            explained_variance=_explained_variance(union),
             policy_gradient_norm=policy.gradient_norm,
             value_gradient_norm=value.gradient_norm,
             learning_rate=now.learning_rate,
             clip_epsilon=now.clip_epsilon,
             entropy_scale=now.entropy_scale,
             policy_epochs=policy.epochs,
-            samples=len(batch.reward),
+            samples=len(union),
         )
 
     def sigma(self) -> float:
@@ -385,13 +421,13 @@ def _normalised(advantage: Tensor) -> Tensor:
     return (advantage - advantage.mean()) / deviation
 
 
-def _means(rows: Sequence[tuple[float, ...]]) -> list[float]:
+def _means(rows: Sequence[Sequence[float]]) -> list[float]:
     return [sum(column) / len(rows) for column in zip(*rows, strict=True)]
 
 
-def _explained_variance(batch: Batch) -> float:
-    spread = batch.value_target.var(correction=0).item()
-    return 1 - batch.advantage.var(correction=0).item() / spread if spread > 0 else 0.0
+def _explained_variance(union: Union) -> float:
+    spread = union.value_target.var(correction=0).item()
+    return 1 - union.advantage.var(correction=0).item() / spread if spread > 0 else 0.0
 
 
 def _configure_torch(config: TrainerConfig) -> torch.device:

@@ -119,8 +119,10 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
 
     config = RunConfig.from_run(_read_run(run_file))
 
+    from caraware import ranks
     from caraware.channel import Channel
 
+    together = ranks.of_run(config.trainer.ranks)
     learner = _successor(run_file, config, succession) if succession.replaces else None
     if succession.is_shadow:
         return
@@ -133,6 +135,7 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
         others=[channel.in_environment(index, tick) for index, tick in enumerate(first_ticks) if index > 0],
         leave_requested=lambda: stop.leave_requested,
         learner=learner,
+        ranks=together,
     )
     if succession.checkpoint is not None:
         loop.commit()
@@ -181,6 +184,7 @@ def _explain(error: Exception) -> Failure:
     from caraware.checkpoint import CheckpointError
     from caraware.config import ConfigError
     from caraware.ppo import NonFiniteLoss
+    from caraware.ranks import RankError
 
     if isinstance(error, ConfigError):
         return Failure("config", str(error), error.help)
@@ -189,6 +193,8 @@ def _explain(error: Exception) -> Failure:
     if isinstance(error, NonFiniteLoss):
         saved = f"the batch is in {error.batch_file}; " if error.batch_file else ""
         return Failure("run", str(error), f"{saved}a smaller `trainer.learning_rate` is the usual cure")
+    if isinstance(error, RankError):
+        return Failure("run", str(error), "all ranks end together; the first to fail says why")
     return Failure("run", f"{type(error).__name__}: {error}", "the traceback is in the trainer's log")
 
 

@@ -13,7 +13,6 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import tempfile
 import weakref
 from collections import deque
@@ -25,6 +24,7 @@ import numpy as np
 
 from caraware.channel import Channel, Observation
 from caraware.envs import outside
+from caraware.program import ProgramError, caraware_program
 
 RECEIVE_TIMEOUT_S = 0.2
 """Time between two looks at whether the simulation still runs, while it sends nothing."""
@@ -365,14 +365,7 @@ def _python_path() -> str:
 
 
 def _find_program() -> Path:
-    """The `caraware` command: `CARAWARE`, the build beside this package or this Python, or the one in `PATH`."""
-    if named := os.environ.get("CARAWARE"):
-        return Path(named)
-    roots = [*Path(__file__).parents, *Path(sys.executable).parents]
-    for root in roots:
-        program = root / "target" / "release" / "caraware"
-        if program.is_file():
-            return program
-    if found := shutil.which("caraware"):
-        return Path(found)
-    raise SimulationError("the program caraware is not there: run `make build`, or set CARAWARE to its path")
+    try:
+        return caraware_program()
+    except ProgramError as error:
+        raise SimulationError(str(error)) from error

@@ -1,0 +1,24 @@
+"""Where the `caraware` command is, for what starts it from Python. It imports nothing but the standard library."""
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+
+class ProgramError(Exception):
+    """The command is not there."""
+
+
+def caraware_program() -> Path:
+    """`CARAWARE`, the build beside this package or this Python, or the one in `PATH`. Raises `ProgramError`."""
+    if named := os.environ.get("CARAWARE"):
+        return Path(named)
+    roots = [*Path(__file__).parents, *Path(sys.executable).parents]
+    for root in roots:
+        program = root / "target" / "release" / "caraware"
+        if program.is_file():
+            return program
+    if found := shutil.which("caraware"):
+        return Path(found)
+    raise ProgramError("the program caraware is not there: run `make build`, or set CARAWARE to its path")

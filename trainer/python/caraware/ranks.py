@@ -1,0 +1,198 @@
+"""Trainers that learn together: every gradient step is one of all, over the union of what each has collected.
+
+Each rank is the trainer of a run of its own and sees only its own environments. Before an update the ranks tell each
+other how many samples they have, and their advantages, rewards and value targets: three numbers for each sample. All
+shuffle the union alike and cut it into the same minibatches; a rank works on the rows that are its own, its gradient is
+weighted by its share of the minibatch, and the sum over the ranks is the gradient of the whole minibatch. So all take
+the step that one trainer with all the samples would take, and keep equal parameters.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from enum import IntEnum
+from typing import Any
+
+import torch
+from torch import Tensor
+
+WAIT_AT_MOST = timedelta(hours=1)
+"""For ranks whose simulation is slower. One that has ended is noticed at once: its connections are closed."""
+
+
+class RankError(Exception):
+    """The ranks cannot go on together."""
+
+
+class Verdict(IntEnum):
+    """Where a trainer stands when it could learn; the least of all ranks counts."""
+
+    STOP = 0
+    """It was asked to stop."""
+    ENDED = 1
+    """It will not fill a horizon any more."""
+    FULL = 2
+    """Its horizon is full."""
+
+
+@dataclass(frozen=True)
+class Union:
+    """The samples of all ranks in the order of the ranks, and which of them are this one's."""
+
+    advantage: Tensor
+    """f32 `[S]`."""
+    reward: Tensor
+    """f32 `[S]`."""
+    value_target: Tensor
+    """f32 `[S]`."""
+    offset: int
+    """First row that is this rank's."""
+    own: int
+    """Number of rows that are."""
+
+    def __len__(self) -> int:
+        return len(self.advantage)
+
+    def minibatches(self, columns: Sequence[Tensor], order: Tensor, parts: int) -> Iterator["Minibatch"]:
+        """The union in `order`, cut into near-equal parts: the own rows of each, gathered at once from `columns`."""
+        advantages = self.advantage.index_select(0, order).tensor_split(parts)
+        if self.own == len(self):
+            gathered = [column.index_select(0, order).tensor_split(parts) for column in columns]
+            yield from (
+                Minibatch(*part, None, 1.0) for part in zip(zip(*gathered, strict=True), advantages, strict=True)
+            )
+            return
+        is_own = (order >= self.offset) & (order < self.offset + self.own)
+        masks = is_own.tensor_split(parts)
+        sizes = [int(mask.sum()) for mask in masks]
+        rows = order[is_own] - self.offset
+        gathered = [column.index_select(0, rows).split(sizes) for column in columns]
+        for own, advantage, mask, size in zip(zip(*gathered, strict=True), advantages, masks, sizes, strict=True):
+            yield Minibatch(own, advantage, mask, size / len(mask))
+
+
+@dataclass(frozen=True)
+class Minibatch:
+    """One rank's part of a minibatch of the union."""
+
+    own: tuple[Tensor, ...]
+    """Its rows of the columns asked for."""
+    advantage: Tensor
+    """f32 `[b]`: of the whole minibatch, before normalisation."""
+    is_own: Tensor | None
+    """bool `[b]`; None if all are."""
+    share: float
+    """Of the minibatch; the shares of all ranks add up to 1."""
+
+    def mine(self, values: Tensor) -> Tensor:
+        """This rank's rows of `values` `[b]`, those of the whole minibatch."""
+        return values if self.is_own is None else values[self.is_own]
+
+
+class Ranks:
+    """A trainer that learns alone."""
+
+    rank, size = 0, 1
+
+    def agree(self, verdict: Verdict, episode: int) -> tuple[Verdict, int]:
+        """The least verdict and episode of all ranks. Waits for all of them."""
+        return verdict, episode
+
+    def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> Union:
+        """The samples of all, `[s]` of this rank given."""
+        return Union(advantage, reward, value_target, 0, len(advantage))
+
+    def add_up(self, lane: str, values: Tensor) -> None:
+        """Replace `values` by their sum over the ranks. The lanes `policy` and `value` may be in use side by side."""
+
+    def largest(self, value: float) -> float:
+        """The largest of all ranks."""
+        return value
+
+    def gather(self, value: Any) -> list[Any]:
+        """The values of all ranks, in their order."""
+        return [value]
+
+    def check_equal(self, what: str, tensors: Sequence[Tensor]) -> None:
+        """Raises `RankError` where they are not the same on all ranks, bit for bit."""
+
+
+class TorchRanks(Ranks):
+    """A trainer among others that `torchrun` started (`caraware.parallel`)."""
+
+    def __init__(self, ranks: int) -> None:
+        """Meet the others. Raises `RankError` if they do not come, or are not `ranks`."""
+        import torch.distributed as dist
+
+        self._dist = dist
+        if (started := int(os.environ.get("WORLD_SIZE", "0"))) != ranks:
+            raise RankError(f"`trainer.ranks` is {ranks}, and torchrun started {started} processes")
+        if torch.cuda.is_available():
+            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+        with self._together("meeting"):
+            backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
+            dist.init_process_group(backend, timeout=WAIT_AT_MOST)
+            self._groups = {lane: dist.new_group() for lane in ("policy", "value")}
+        self.rank, self.size = dist.get_rank(), dist.get_world_size()
+
+    @contextmanager
+    def _together(self, doing: str) -> Iterator[None]:
+        """What torch says of a lost connection names addresses, not what happened."""
+        try:
+            yield
+        except (RuntimeError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise RankError(f"another rank has ended or cannot be reached ({doing}: {reason})") from error
+
+    def agree(self, verdict: Verdict, episode: int) -> tuple[Verdict, int]:
+        """See `Ranks.agree`."""
+        values = torch.tensor([int(verdict), episode])
+        with self._together("waiting for all horizons"):
+            self._dist.all_reduce(values, op=self._dist.ReduceOp.MIN)
+        return Verdict(int(values[0])), int(values[1])
+
+    def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> Union:
+        """See `Ranks.union`."""
+        own = torch.stack((advantage, reward, value_target)).cpu()
+        sizes = self.gather(own.shape[1])
+        padded = torch.zeros(3, max(sizes))
+        padded[:, : own.shape[1]] = own
+        everybody = [torch.empty_like(padded) for _ in sizes]
+        with self._together("telling each other the advantages"):
+            self._dist.all_gather(everybody, padded)
+        columns = torch.cat([each[:, :size] for each, size in zip(everybody, sizes, strict=True)], 1)
+        columns = columns.to(advantage.device)
+        return Union(columns[0], columns[1], columns[2], sum(sizes[: self.rank]), own.shape[1])
+
+    def add_up(self, lane: str, values: Tensor) -> None:
+        """See `Ranks.add_up`."""
+        with self._together("adding up gradients"):
+            self._dist.all_reduce(values, group=self._groups[lane])
+
+    def largest(self, value: float) -> float:
+        """See `Ranks.largest`."""
+        return max(self.gather(value))
+
+    def gather(self, value: Any) -> list[Any]:
+        """See `Ranks.gather`."""
+        values: list[Any] = [None] * self._dist.get_world_size()
+        with self._together("telling each other"):
+            self._dist.all_gather_object(values, value)
+        return values
+
+    def check_equal(self, what: str, tensors: Sequence[Tensor]) -> None:
+        """See `Ranks.check_equal`."""
+        digest = hashlib.blake2b(digest_size=16)
+        for tensor in tensors:
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        digests = self.gather(digest.hexdigest())
+        if len(set(digests)) > 1:
+            raise RankError(f"{what} differ between the ranks: {', '.join(digests)}")
+
+
+def of_run(ranks: int) -> Ranks:
+    """Alone, or among the others that `torchrun` started. Raises `RankError`."""
+    return TorchRanks(ranks) if ranks > 1 else Ranks()

@@ -1,0 +1,51 @@
+"""One rank of a small data-parallel training over prepared ticks; `torchrun` starts it for test_ranks.py."""
+
+import os
+import sys
+from pathlib import Path
+
+from caraware import ranks
+from caraware.config import RunConfig
+from caraware.loop import TrainingLoop
+from synthetic import SyntheticChannel, run_file, with_evaluation
+
+HORIZON, BATCH, VEHICLES, TRAINING_TICKS = 256, 64, 16, 64
+
+
+def settings(folder: Path, envs: int, first_env: int, world: int) -> dict:
+    """The run file of one trainer with `envs` environments among `world` ranks; sizes are of each environment."""
+    run = run_file(str(folder), ranks=world, horizon=envs * HORIZON, batch_size=envs * BATCH, checkpoint_interval=1)
+    run["config"]["run"] = {"envs": envs, "first_env": first_env, "seed": 1}
+    return run
+
+
+def channels(run: dict) -> list[SyntheticChannel]:
+    """The ticks of its environments: each the same, whoever has it."""
+    place = run["config"]["run"]
+    numbers = range(place["first_env"], place["first_env"] + place["envs"])
+    return [SyntheticChannel(run, with_evaluation(TRAINING_TICKS, 6, VEHICLES, 5.0, 1 + env)) for env in numbers]
+
+
+def main(folder: Path, fault: str) -> None:
+    """Train as rank `RANK`, in a directory of its own; with a fault, one of the ranks does what it should not."""
+    rank, world = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+    run = settings(folder / f"rank{rank}", 1, rank, world)
+    together = ranks.of_run(world)
+    first, *others = channels(run)
+    loop = TrainingLoop(first, RunConfig.from_run(run), lambda: False, others=others, ranks=together)
+    if rank == 1 and fault == "dies":
+        learn = loop._learn
+        loop._learn = lambda: os._exit(9) if loop._updates() == 2 else learn()  # type: ignore[method-assign]
+    if rank == 1 and fault == "differs":
+        loop._ensure_started(next(with_evaluation(1, 0, VEHICLES, 5.0, 1)))
+        assert loop._ppo is not None
+        loop._ppo.policy.mlp.parameters.values[0] += 1e-3
+    loop.run()
+
+
+if __name__ == "__main__":
+    try:
+        main(Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else "")
+    except ranks.RankError as error:
+        print(f"RankError: {error}", file=sys.stderr, flush=True)
+        sys.exit(1)

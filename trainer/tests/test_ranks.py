@@ -1,0 +1,134 @@
+"""Ranks that learn together by `torch.distributed` learn what one trainer with all their environments learns."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from caraware.checkpoint import latest_checkpoint, load_course
+from caraware.config import RunConfig
+from caraware.loop import TrainingLoop
+from caraware.parallel import Place, command
+from caraware.ranks import Ranks, Union
+from rank_probe import TRAINING_TICKS, VEHICLES, channels, settings
+from safetensors.torch import load_file
+
+HERE = Path(__file__).parent
+UPDATES = 4
+"""Of 256 samples of each of two environments."""
+LARGEST_DIFFERENCE = 1e-5
+"""Of a parameter after four updates of 64 gradient steps, which move it by up to 0.1: float32 sums in another order."""
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def launch(folder: Path, *options: str, fault: str = "") -> subprocess.Popen:
+    """`torchrun` over the probe, started and not waited for."""
+    path = os.pathsep.join(filter(None, (str(HERE), os.environ.get("PYTHONPATH"))))
+    torchrun = [sys.executable, "-m", "torch.distributed.run", *options]
+    return subprocess.Popen(
+        [*torchrun, str(HERE / "rank_probe.py"), str(folder), fault],
+        env=os.environ | {"PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def finish(process: subprocess.Popen) -> str:
+    said, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, said
+    return said
+
+
+def parameters(folder: Path) -> dict[str, torch.Tensor]:
+    return load_file(latest_checkpoint(folder / "checkpoints") / "parameters.safetensors")
+
+
+def part(folder: Path) -> dict:
+    return json.loads((folder / "parts" / "trainer.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One trainer with both environments, and a horizon and batch of twice the size."""
+    folder = tmp_path_factory.mktemp("alone")
+    run = settings(folder, 2, 0, 1)
+    first, *others = channels(run)
+    TrainingLoop(first, RunConfig.from_run(run), lambda: False, others=others).run()
+    return folder
+
+
+def assert_the_same(alone: Path, rank0: Path) -> None:
+    one, two = parameters(alone), parameters(rank0)
+    assert {name: tensor.shape for name, tensor in one.items()} == {name: tensor.shape for name, tensor in two.items()}
+    differences = {name: (tensor - two[name]).abs().max().item() for name, tensor in one.items()}
+    assert max(differences.values()) < LARGEST_DIFFERENCE, differences
+    of_one, of_two = part(alone), part(rank0)
+    assert (of_two["updates"], of_two["ranks"]) == (UPDATES, 2)
+    assert of_two["env_steps_of_all_ranks"] == of_one["env_steps"] == 2 * TRAINING_TICKS * VEHICLES
+    assert of_two["ppo_mean_error_m"] == pytest.approx(of_one["ppo_mean_error_m"], rel=1e-4)
+    assert [e["samples"] for e in of_two["evaluations"]] == [e["samples"] for e in of_one["evaluations"]]
+
+
+def test_two_ranks_learn_what_one_does_with_twice_the_batch(tmp_path: Path, alone: Path) -> None:
+    finish(launch(tmp_path, "--standalone", "--nproc-per-node=2"))
+    assert_the_same(alone, tmp_path / "rank0")
+    # The checkpoint is that of one trainer with both environments; only rank 0 writes it.
+    mine, theirs = (latest_checkpoint(folder / "checkpoints") for folder in (alone, tmp_path / "rank0"))
+    assert load_course(theirs).others == load_course(mine).others
+    for name, state in load_file(mine / "random.safetensors").items():
+        assert torch.equal(state, load_file(theirs / "random.safetensors")[name])
+    assert not (tmp_path / "rank1" / "checkpoints").exists()
+
+
+def test_two_nodes_meet_at_a_rendezvous_address(tmp_path: Path, alone: Path) -> None:
+    meeting = ("--nnodes=2", "--nproc-per-node=1", "--rdzv-backend=c10d", f"--rdzv-endpoint=127.0.0.1:{free_port()}")
+    nodes = [launch(tmp_path, *meeting, "--local-addr=127.0.0.1") for _ in range(2)]
+    for node in nodes:
+        finish(node)
+    assert_the_same(alone, tmp_path / "rank0")
+
+
+@pytest.mark.parametrize(("fault", "says"), [("dies", "exitcode  : 9"), ("differs", "parameters differ")])
+def test_all_ranks_end_when_one_cannot_go_on(tmp_path: Path, fault: str, says: str) -> None:
+    process = launch(tmp_path, "--standalone", "--nproc-per-node=2", fault=fault)
+    said, _ = process.communicate(timeout=240)
+    assert process.returncode != 0
+    assert says in said, said
+
+
+def test_a_minibatch_of_the_union_is_what_the_ranks_have_of_it_together() -> None:
+    columns = torch.arange(10.0)
+    whole = Ranks().union(columns, columns, columns)
+    order = torch.randperm(10, generator=torch.Generator().manual_seed(3))
+    parts = [Union(columns, columns, columns, offset, own) for offset, own in ((0, 3), (3, 7))]
+    cut = [list(part.minibatches([columns[part.offset :][: part.own]], order, 4)) for part in parts]
+    for together, first, second in zip(whole.minibatches([columns], order, 4), *cut, strict=True):
+        assert first.share + second.share == together.share == 1.0
+        assert torch.equal(first.advantage, together.advantage)
+        rows = torch.cat((first.own[0], second.own[0]))
+        assert torch.equal(rows.sort().values, together.own[0].sort().values)
+        assert torch.equal(first.own[0], first.mine(together.advantage))
+
+
+def test_each_rank_gets_its_own_environments_and_cores() -> None:
+    place = Place(rank=1, ranks=2, local_rank=1, local_ranks=2)
+    words = command(["town", "--set", "traffic.cavs=8", "--envs", "3", "--name", "x"], place, 7)
+    assert words[:4] == ["train", "town", "--set", "traffic.cavs=8"]
+    assert words[words.index("--name") + 1] == "x-rank1"
+    for setting in ("run.envs=3", "run.first_env=3", "trainer.ranks=2", "fanout.enabled=false"):
+        assert f"--set={setting}" in words
+    first = command([], Place(0, 2, 0, 2), 7)
+    assert first[first.index("--name") + 1] == "town-p7"
+    assert not any("fanout" in word for word in first)
+    assert place.cores([0, 1, 2, 3, 8]) == [2, 3]
+    assert place.cores([4]) == [4]
