@@ -115,7 +115,9 @@ impl View {
     /// All environments together; where they stand is where the slowest does.
     fn read(environments: &[Environment], ready_at: Option<Instant>) -> Self {
         let all = |process: Process| {
-            let healths = environments.iter().map(|environment| environment.board(process).health());
+            let healths = environments
+                .iter()
+                .map(|environment| environment.board(process).health());
             healths.collect::<Vec<_>>()
         };
         let (sensings, movings) = (all(Process::SensorDaemon), all(Process::SimCore));
@@ -126,7 +128,9 @@ impl View {
             ..slowest.unwrap_or_default()
         };
         let first = environments.first();
-        let training = first.map_or_else(TrainingStatus::default, |first| first.board(Process::Trainer).training());
+        let training = first.map_or_else(TrainingStatus::default, |first| {
+            first.board(Process::Trainer).training()
+        });
         let wall_s = ready_at.map_or(0.0, |ready| ready.elapsed().as_secs_f64());
         #[expect(clippy::cast_precision_loss, reason = "for display")]
         let (steps, sim_time_s) = (sensing.vehicle_steps as f64, sensing.sim_time_ns as f64 * 1e-9);

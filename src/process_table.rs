@@ -281,8 +281,11 @@ impl Running {
         let text = std::fs::read_to_string(&log).unwrap_or_default();
         let tail: Vec<&str> = text.lines().rev().take(5).collect();
         let tail = tail.into_iter().rev().collect::<Vec<_>>().join("\n  ");
-        Failure::new(FailureKind::Run, format!("{} ended with {status}\n  {tail}", self.row.label(run)))
-            .with_help(format!("its log is {}", log.display()))
+        Failure::new(
+            FailureKind::Run,
+            format!("{} ended with {status}\n  {tail}", self.row.label(run)),
+        )
+        .with_help(format!("its log is {}", log.display()))
     }
 }
 

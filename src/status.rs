@@ -75,10 +75,18 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
     let node = services::node(&run.shared_memory)?;
     let mut boards = Vec::new();
     for environment in (0..run.config.run.envs).map(|index| run.environment(index)) {
-        for row in TABLE.iter().filter(|row| row.is_in(&environment, environment.env_index)) {
+        for row in TABLE
+            .iter()
+            .filter(|row| row.is_in(&environment, environment.env_index))
+        {
             let board = BoardReader::open(&node, run, environment.env_index, row.process)?;
             let label = row.label(&environment);
-            boards.push(Seat { label, env_index: environment.env_index, scope: row.scope, board });
+            boards.push(Seat {
+                label,
+                env_index: environment.env_index,
+                scope: row.scope,
+                board,
+            });
         }
     }
     boards.sort_by_key(|seat| seat.scope == Scope::Run);

@@ -346,7 +346,11 @@ impl Supervisor {
         match late {
             None => self.ready_at = Some(self.last_look),
             Some((row, environment)) if started.elapsed() > READY_WITHIN => {
-                let log = environment.run.run_dir.join("logs").join(format!("{}.log", row.process));
+                let log = environment
+                    .run
+                    .run_dir
+                    .join("logs")
+                    .join(format!("{}.log", row.process));
                 let name = row.label(&environment.run);
                 let message = format!("{name} was not ready within {} s", READY_WITHIN.as_secs());
                 return Err(Failure::new(FailureKind::Run, message)

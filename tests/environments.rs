@@ -167,7 +167,10 @@ fn a_killed_trainer_is_given_what_it_lacks_of_every_environment() {
     assert_eq!(found["restarts"], 1);
     for (found, expected) in [(&found, 1), (&expected, 0)].map(|(report, restarts)| (report, restarts)) {
         assert_eq!(found["restarts"], expected);
-        assert_eq!((&found["lost_ticks"], &found["duplicated_ticks"]), (&0.into(), &0.into()));
+        assert_eq!(
+            (&found["lost_ticks"], &found["duplicated_ticks"]),
+            (&0.into(), &0.into())
+        );
         assert_eq!(found["trainer"]["received_ticks"], found["ticks"]);
         assert_eq!(found["trainer"]["updates"], 9, "{found:#}");
     }

@@ -95,13 +95,7 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
     Ok(report)
 }
 
-fn compare(
-    load: &Load,
-    caraware: &Path,
-    runs: &Path,
-    cores: &[usize],
-    report: &mut Report,
-) -> Result<Line, Exit> {
+fn compare(load: &Load, caraware: &Path, runs: &Path, cores: &[usize], report: &mut Report) -> Result<Line, Exit> {
     let mut base = Vec::new();
     let mut rates = vec![Vec::new(); ENVIRONMENTS.len()];
     for _ in 0..ROUNDS {
@@ -112,7 +106,8 @@ fn compare(
     }
     let columns = ["environments", "vehicle-steps/s", "of the base", "of the ideal"];
     let mut table = Table::new(load.name, &columns);
-    let thousand = |rates: &[f64]| Spread::of(rates.iter().map(|rate| rate / 1e3)).map(|spread| format!("{spread:.0} k"));
+    let thousand =
+        |rates: &[f64]| Spread::of(rates.iter().map(|rate| rate / 1e3)).map(|spread| format!("{spread:.0} k"));
     table.row(["1, on one core (base)".into(), thousand(&base)?, "1".into(), "1".into()]);
     let mut points = Vec::new();
     for (envs, rates) in ENVIRONMENTS.into_iter().zip(&rates) {
@@ -121,7 +116,10 @@ fn compare(
         let (x, ideal) = (envs as f64, envs.min(cores.len()) as f64);
         let of_ideal = format!("{:.0} %", 100.0 * ratio.median / ideal);
         table.row([envs.to_string(), thousand(rates)?, format!("{ratio:.2} ×"), of_ideal]);
-        report.figure(format!("{}, {envs} environments, of one on one core", load.short), ratio.median);
+        report.figure(
+            format!("{}, {envs} environments, of one on one core", load.short),
+            ratio.median,
+        );
         points.push([x, ratio.median]);
     }
     report.tables.push(table);
@@ -132,13 +130,7 @@ fn compare(
 }
 
 /// Vehicle-steps per second of one run.
-fn rate(
-    load: &Load,
-    envs: usize,
-    cores: Option<&[usize]>,
-    caraware: &Path,
-    runs: &Path,
-) -> Result<f64, Exit> {
+fn rate(load: &Load, envs: usize, cores: Option<&[usize]>, caraware: &Path, runs: &Path) -> Result<f64, Exit> {
     let settings = [
         format!("run.envs={envs}"),
         format!("traffic.cavs={}", load.cavs),

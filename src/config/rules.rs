@@ -143,6 +143,13 @@ fn undrivable(config: &Config) -> Option<Refusal> {
             "set both to the same time, such as 0.1: an action reaches SUMO within a tick",
         ));
     }
+    if config.run.envs > 1 {
+        return Some((
+            "run.envs",
+            format!("`run.envs` = {}: a driver drives in one environment", config.run.envs),
+            "start several runs, each with run.envs = 1",
+        ));
+    }
     (config.trainer.module == LOCALISING_TRAINER).then(|| {
         (
             "trainer.module",

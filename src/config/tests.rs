@@ -364,6 +364,11 @@ fn heroes_and_the_driving_task_go_together() {
             "set both to the same time",
         ),
         (
+            "task.kind = \"driving\"\ntraffic.heroes = 1\nrun.envs = 2",
+            "`run.envs` = 2: a driver drives in one environment",
+            "start several runs",
+        ),
+        (
             "task.kind = \"driving\"\ntraffic.heroes = 1",
             "`trainer.module` = \"caraware.train\" learns to localise",
             "caraware.examples.pure_pursuit",

@@ -182,7 +182,7 @@ def test_what_a_killed_user_left_is_removed_and_what_a_living_one_has_is_not() -
 
 
 def test_seed_and_trainer_are_no_settings() -> None:
-    for key in ("run.seed", "trainer.module"):
+    for key in ("run.seed", "run.envs", "trainer.module"):
         with pytest.raises(ValueError, match=key):
             make("town", {key: "1"})
 

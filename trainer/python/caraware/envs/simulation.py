@@ -68,7 +68,11 @@ class Simulation:
         program: str | Path | None = None,
     ) -> None:
         self._config, self._settings, self._runs = str(config), dict(settings or {}), runs
-        for key, instead in (("run.seed", "give seed="), ("trainer.module", "this process is the trainer")):
+        for key, instead in (
+            ("run.seed", "give seed="),
+            ("run.envs", "make several simulations"),
+            ("trainer.module", "this process is the trainer"),
+        ):
             if key in self._settings:
                 raise ValueError(f"`{key}` cannot be set here: {instead}")
         self._owner = os.getpid()
