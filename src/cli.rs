@@ -87,13 +87,15 @@ pub enum Part {
     Lidar,
     /// Environments: vehicle-steps per second of 1, 2 and 4 side by side, beside one that has one core to itself
     Envs,
+    /// Fan-out: lateness and rate of a run with eight viewers, one stopped and one slow, beside the same run alone; kills of the fan-out
+    Fanout,
     /// Everything above, one after the other
     All,
 }
 
 impl Part {
     /// The parts that are measured, in the order of the documentation.
-    pub const MEASURED: [Self; 2] = [Self::Lidar, Self::Envs];
+    pub const MEASURED: [Self; 3] = [Self::Lidar, Self::Envs, Self::Fanout];
 
     /// Its name on the command line.
     #[must_use]

@@ -13,6 +13,7 @@ pub mod prepare;
 pub mod process_table;
 pub mod registry;
 pub mod report;
+pub mod revival;
 pub mod scenario;
 pub mod status;
 pub mod succession;

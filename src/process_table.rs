@@ -123,7 +123,8 @@ pub const TABLE: [Row; 5] = [
     Row {
         process: Process::Fanout,
         scope: Scope::Run,
-        needs: &[Process::TrafficBridge],
+        // It shows the scene that sim-core has read.
+        needs: &[Process::SimCore],
         on_exit: OnExit::Restart,
         wanted: |run| run.config.fanout.enabled,
         command: |install, _| install.binary(Process::Fanout).map(Command::new),

@@ -1,6 +1,7 @@
 //! The supervisor: owns a run, creates every channel, starts and watches the processes, and ends them all.
 
 use std::{
+    collections::BTreeMap,
     io::{BufRead as _, BufReader},
     os::unix::process::ExitStatusExt as _,
     path::PathBuf,
@@ -10,7 +11,7 @@ use std::{
 };
 
 use ipc_schema::{
-    board::State,
+    board::{INCARNATIONS, State},
     failure::{Failure, FailureKind},
     ports::BoardReader,
     process::Process,
@@ -31,6 +32,7 @@ use crate::{
     install::Install,
     process_table::{OnExit, Row, Running, Scope, TABLE},
     registry::Claim,
+    revival::{Revival, Verdict},
     succession::{self, Succession},
     swap::{self, Asked, Handover},
 };
@@ -54,8 +56,6 @@ const HAND_OVER_LOOK: Duration = Duration::from_millis(5);
 const READY_WITHIN: Duration = Duration::from_secs(120);
 /// Longest time from SIGTERM to the end of a process, before SIGKILL.
 const STOP_WITHIN: Duration = Duration::from_secs(30);
-/// Most restarts of a process that only watches.
-const MAX_RESTARTS: u32 = 20;
 /// Most replacements of a trainer in a row without a new commit.
 const MAX_VAIN_REPLACEMENTS: u32 = 5;
 
@@ -89,6 +89,8 @@ pub struct Supervisor {
     event_sender: Sender<Event>,
     signal_handle: Handle,
     restarts: u32,
+    /// Deaths of processes that only watch.
+    revivals: BTreeMap<Process, Revival>,
     swaps: Vec<Handover>,
     /// Replacements of the trainer since its last commit, and the ticks committed then.
     vain_replacements: u32,
@@ -136,6 +138,7 @@ impl Supervisor {
             event_sender,
             signal_handle,
             restarts: 0,
+            revivals: BTreeMap::new(),
             swaps: Vec::new(),
             vain_replacements: 0,
             committed_ticks: 0,
@@ -263,8 +266,7 @@ impl Supervisor {
                 continue;
             }
             match on_exit {
-                OnExit::Restart if self.running[index].incarnation < MAX_RESTARTS => self.restart(index)?,
-                OnExit::Restart => {}
+                OnExit::Restart => self.revive(index)?,
                 // All that it had to do is on disk.
                 OnExit::Replace if done => {}
                 OnExit::Replace if status.signal().is_some() => self.replace(index, status)?,
@@ -280,6 +282,23 @@ impl Supervisor {
     fn failure(&self, index: usize, status: ExitStatus) -> Failure {
         let running = &self.running[index];
         running.failure(&self.environments[running.env_index as usize].run, status)
+    }
+
+    /// Starts a process that only watches again, if that has a point. The run goes on without it.
+    fn revive(&mut self, index: usize) -> Result<(), Exit> {
+        let running = &self.running[index];
+        let (process, next) = (running.row.process, running.incarnation + 1);
+        let board = self.environments[running.env_index as usize].board(process);
+        let worked = board.progress().attached == 1;
+        let verdict = self
+            .revivals
+            .entry(process)
+            .or_default()
+            .verdict(worked, Instant::now());
+        if verdict == Verdict::Start && next < INCARNATIONS {
+            return self.restart(index);
+        }
+        Ok(())
     }
 
     /// Replaces a trainer that died, unless that has been in vain for too long.

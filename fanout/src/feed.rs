@@ -32,11 +32,50 @@ impl Tally {
     }
 }
 
-/// One channel as a spectator sees it.
+/// A channel as a spectator sees it: what is of another run or another version is refused and counted, and nobody dies of it.
+#[derive(Debug)]
+pub struct Watch {
+    subscriber: Subscriber,
+    wrong_versions: u64,
+}
+
+impl Watch {
+    /// Attends `channel`, as a consumer nobody waits for.
+    ///
+    /// # Errors
+    /// The service cannot be opened.
+    pub fn open(session: &mut Session, channel: Channel) -> Result<Self, SessionError> {
+        Ok(Self {
+            subscriber: session.subscriber(channel)?,
+            wrong_versions: 0,
+        })
+    }
+
+    /// The next message, if one waits.
+    ///
+    /// # Errors
+    /// The port is broken.
+    pub fn receive(&mut self) -> Result<Option<Message>, PortError> {
+        loop {
+            match self.subscriber.receive() {
+                Err(PortError::Version { .. }) => self.wrong_versions += 1,
+                received => return received,
+            }
+        }
+    }
+
+    /// Messages that were refused.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.subscriber.refused() + self.wrong_versions
+    }
+}
+
+/// One channel with a message for each tick.
 #[derive(Debug)]
 pub struct Feed {
     channel: Channel,
-    subscriber: Subscriber,
+    watch: Watch,
     held: VecDeque<Message>,
     most: usize,
     tally: Tally,
@@ -51,7 +90,7 @@ impl Feed {
     pub fn open(session: &mut Session, channel: Channel) -> Result<Self, SessionError> {
         Ok(Self {
             channel,
-            subscriber: session.subscriber(channel)?,
+            watch: Watch::open(session, channel)?,
             held: VecDeque::new(),
             most: most_held(&session.run, channel),
             tally: Tally::default(),
@@ -62,10 +101,10 @@ impl Feed {
     /// Takes everything that waits, keeps the newest, and returns how many messages came.
     ///
     /// # Errors
-    /// The port is broken or speaks another schema version.
+    /// The port is broken.
     pub fn drain(&mut self) -> Result<usize, PortError> {
         let mut came = 0;
-        while let Some(message) = self.subscriber.receive()? {
+        while let Some(message) = self.watch.receive()? {
             self.tally.count(message.header());
             self.held.push_back(message);
             if self.held.len() > self.most {
@@ -91,10 +130,10 @@ impl Feed {
         &self.tally
     }
 
-    /// Messages of other runs that were refused.
+    /// Messages that were refused.
     #[must_use]
     pub fn refused(&self) -> u64 {
-        self.subscriber.refused()
+        self.watch.refused()
     }
 
     /// Ticks that are held and have not been published, newest first.

@@ -4,8 +4,11 @@
 use bytemuck::{bytes_of, pod_read_unaligned};
 use ipc_schema::{
     block::{BlockError, Section, view},
+    event::Collision,
     header::MessageHeader,
-    observation::ObservationLayout,
+    observation::{IMU_COLUMNS, ObservationLayout},
+    pointcloud::{LidarPoint, PointcloudLayout, Scan},
+    prediction::PredictionLayout,
     services::Channel,
     world::{VehicleState, WorldLayout},
 };
@@ -16,6 +19,8 @@ pub const HEADER_BYTES: usize = size_of::<MessageHeader>();
 /// Longest frame, bytes. zenoh queues 16 batches of 64 KiB for each priority and drops a message that does not fit: of
 /// frames of 1.05 MB a third to a half were lost on loopback, of 0.52 MB none.
 pub const MAX_FRAME_BYTES: usize = 900_000;
+/// Longest frame of one scan, bytes: two fit the queue.
+pub const MAX_SCAN_BYTES: usize = 480_000;
 
 /// A message cannot be framed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -33,40 +38,45 @@ pub enum FrameError {
 pub struct Frame {
     /// Header and payload.
     pub bytes: Vec<u8>,
-    /// Rows left out to stay below [`MAX_FRAME_BYTES`].
-    pub thinned_rows: usize,
+    /// Rows left out so that a viewer's queue holds it.
+    pub left_out: usize,
 }
 
 /// Frames a message of `channel`.
 ///
-/// `world` loses its sub-steps (`columns` = 0) and, above [`MAX_FRAME_BYTES`], all road users but every second (third, …).
+/// Of `world` the sub-steps stay behind (`columns` = 0) and, of more road users or points than fit, all but every second (third, …).
+/// Observations and predictions are cut to their first slots.
 ///
 /// # Errors
 /// The payload is too short for its header, or the frame too long.
 pub fn encode(channel: Channel, header: &MessageHeader, payload: &[u8]) -> Result<Frame, FrameError> {
+    let columns = header.columns as usize;
     match channel {
         Channel::World => world(header, payload),
         Channel::Observation => {
-            plausible(header, payload)?;
-            let layout = ObservationLayout::of(header);
-            whole(header, payload, layout.len)
+            let samples = usize::try_from(header.sequence).unwrap_or(usize::MAX);
+            plausible(header, columns.max(samples.saturating_mul(IMU_COLUMNS)), payload)?;
+            slots(header, payload, |header| {
+                let layout = ObservationLayout::of(header);
+                (layout.named().map(|(_, section)| section).to_vec(), layout.len)
+            })
         }
-        _ => {
-            plausible(header, payload)?;
-            whole(header, payload, values(header) * size_of::<f32>())
+        Channel::Prediction => {
+            plausible(header, columns, payload)?;
+            slots(header, payload, |header| {
+                let layout = PredictionLayout::of(header);
+                (vec![layout.prediction, layout.estimate_m], layout.len)
+            })
         }
+        Channel::Pointcloud => scan(header, payload),
+        _ => collisions(header, payload),
     }
 }
 
-/// Values in the first section of a payload with rows and columns.
-fn values(header: &MessageHeader) -> usize {
-    (header.count as usize).saturating_mul(header.columns as usize)
-}
-
 /// Refuses sizes that no payload of this length holds, before anything is computed from them.
-fn plausible(header: &MessageHeader, payload: &[u8]) -> Result<(), BlockError> {
-    let len = values(header)
-        .max(header.count as usize)
+fn plausible(header: &MessageHeader, columns: usize, payload: &[u8]) -> Result<(), BlockError> {
+    let len = (header.count as usize)
+        .saturating_mul(columns.max(1))
         .saturating_mul(size_of::<f32>());
     if len <= payload.len() {
         return Ok(());
@@ -79,36 +89,109 @@ fn plausible(header: &MessageHeader, payload: &[u8]) -> Result<(), BlockError> {
     })
 }
 
-fn whole(header: &MessageHeader, payload: &[u8], len: usize) -> Result<Frame, FrameError> {
-    let total = HEADER_BYTES + len;
-    if total > MAX_FRAME_BYTES {
-        return Err(FrameError::TooLong(total));
+fn with_count(header: &MessageHeader, count: usize) -> MessageHeader {
+    MessageHeader {
+        count: u32::try_from(count).unwrap_or(u32::MAX),
+        ..*header
     }
+}
+
+/// A block whose sections have a row for each slot, cut to the slots that fit.
+fn slots(
+    header: &MessageHeader,
+    payload: &[u8],
+    parts: impl Fn(&MessageHeader) -> (Vec<Section>, usize),
+) -> Result<Frame, FrameError> {
+    let rows = header.count as usize;
+    let (sections, len) = parts(header);
+    if HEADER_BYTES + len <= MAX_FRAME_BYTES {
+        let bytes: &[u8] = view(payload, Section { offset: 0, len })?;
+        return Ok(Frame {
+            bytes: [bytes_of(header), bytes].concat(),
+            left_out: 0,
+        });
+    }
+    // Sections are padded to a border each: room for that is left.
+    let room = MAX_FRAME_BYTES.saturating_sub(HEADER_BYTES + 64 * sections.len());
+    let kept = rows * room / len;
+    let header = with_count(header, kept);
+    let (shorter, len) = parts(&header);
+    let mut bytes = bytes_of(&header).to_vec();
+    bytes.resize(HEADER_BYTES + len, 0);
+    for (from, to) in sections.into_iter().zip(shorter) {
+        let part = Section { len: to.len, ..from };
+        let start = HEADER_BYTES + to.offset;
+        bytes[start..start + to.len].copy_from_slice(view(payload, part)?);
+    }
+    if bytes.len() > MAX_FRAME_BYTES {
+        return Err(FrameError::TooLong(bytes.len()));
+    }
+    Ok(Frame {
+        bytes,
+        left_out: rows - kept,
+    })
+}
+
+fn collisions(header: &MessageHeader, payload: &[u8]) -> Result<Frame, FrameError> {
+    let len = (header.count as usize).saturating_mul(size_of::<Collision>());
     let bytes: &[u8] = view(payload, Section { offset: 0, len })?;
+    if HEADER_BYTES + len > MAX_FRAME_BYTES {
+        return Err(FrameError::TooLong(HEADER_BYTES + len));
+    }
     Ok(Frame {
         bytes: [bytes_of(header), bytes].concat(),
-        thinned_rows: 0,
+        left_out: 0,
     })
 }
 
 fn world(header: &MessageHeader, payload: &[u8]) -> Result<Frame, FrameError> {
-    let rows = header.count as usize;
-    let states: &[VehicleState] = view(payload, WorldLayout::new(rows, 0).states)?;
-    let most = (MAX_FRAME_BYTES - HEADER_BYTES) / size_of::<VehicleState>();
-    let kept = states.iter().step_by(rows.div_ceil(most).max(1));
+    let states: &[VehicleState] = view(payload, WorldLayout::new(header.count as usize, 0).states)?;
+    let header = MessageHeader { columns: 0, ..*header };
+    Ok(thinned(&header, &[], states, MAX_FRAME_BYTES))
+}
+
+fn scan(header: &MessageHeader, payload: &[u8]) -> Result<Frame, FrameError> {
+    let layout = PointcloudLayout::new(header.count as usize);
+    let scan: &[Scan] = view(payload, layout.scan)?;
+    let points: &[LidarPoint] = view(payload, layout.points)?;
+    let mut head = bytemuck::cast_slice(scan).to_vec();
+    head.resize(layout.points.offset, 0);
+    Ok(thinned(header, &head, points, MAX_SCAN_BYTES))
+}
+
+/// Header, `head`, and as many of `rows` as `most_bytes` hold, evenly.
+fn thinned<T: bytemuck::Pod>(header: &MessageHeader, head: &[u8], rows: &[T], most_bytes: usize) -> Frame {
+    let most = (most_bytes - HEADER_BYTES - head.len()) / size_of::<T>();
+    let kept = rows.iter().step_by(rows.len().div_ceil(most).max(1));
     let count = kept.len();
-    let header = MessageHeader {
-        count: u32::try_from(count).unwrap_or(u32::MAX),
-        columns: 0,
-        ..*header
-    };
-    let mut bytes = Vec::with_capacity(HEADER_BYTES + count * size_of::<VehicleState>());
-    bytes.extend_from_slice(bytes_of(&header));
-    kept.for_each(|state| bytes.extend_from_slice(bytes_of(state)));
-    Ok(Frame {
+    let mut bytes = Vec::with_capacity(HEADER_BYTES + head.len() + count * size_of::<T>());
+    bytes.extend_from_slice(bytes_of(&with_count(header, count)));
+    bytes.extend_from_slice(head);
+    kept.for_each(|row| bytes.extend_from_slice(bytes_of(row)));
+    Frame {
         bytes,
-        thinned_rows: rows - count,
-    })
+        left_out: rows.len() - count,
+    }
+}
+
+/// A whole table as one frame, for those who ask; and its next part for those who listen, from row `place` on, which it moves.
+/// `rows` are bytes, `row_bytes` each.
+#[must_use]
+pub fn table(header: &MessageHeader, rows: &[u8], row_bytes: usize, place: &mut usize) -> (Vec<u8>, Vec<u8>) {
+    let count = rows.len() / row_bytes;
+    let frame = |rows: &[u8]| {
+        let header = MessageHeader {
+            columns: 0,
+            sequence: 0,
+            ..with_count(header, rows.len() / row_bytes)
+        };
+        [bytes_of(&header), rows].concat()
+    };
+    let most = (MAX_FRAME_BYTES - HEADER_BYTES) / row_bytes;
+    let from = if *place < count { *place } else { 0 };
+    let to = count.min(from + most);
+    *place = to;
+    (frame(&rows[from * row_bytes..to * row_bytes]), frame(rows))
 }
 
 /// Takes a frame apart; `None` if it is shorter than a header.
@@ -119,89 +202,4 @@ pub fn decode(frame: &[u8]) -> Option<(MessageHeader, &[u8])> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use bytemuck::cast_slice;
-    use proptest::prelude::*;
-
-    fn header(count: usize, columns: u32) -> MessageHeader {
-        MessageHeader {
-            schema_version: ipc_schema::SCHEMA_VERSION,
-            run_id: 7,
-            tick: 11,
-            count: u32::try_from(count).unwrap(),
-            columns,
-            ..MessageHeader::default()
-        }
-    }
-
-    fn states(count: usize) -> Vec<VehicleState> {
-        (0..count)
-            .map(|i| VehicleState {
-                x_m: i as f64,
-                vehicle: u32::try_from(i).unwrap(),
-                ..VehicleState::default()
-            })
-            .collect()
-    }
-
-    /// Words, so that sections are aligned as in shared memory.
-    fn payload(len: usize) -> Vec<u64> {
-        (0..len.div_ceil(8) as u64).collect()
-    }
-
-    #[test]
-    fn world_keeps_every_state_and_no_sub_step() {
-        let layout = WorldLayout::new(3, 10);
-        let mut words = payload(layout.len);
-        let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
-        bytes[..layout.states.len].copy_from_slice(cast_slice(&states(3)));
-        let frame = encode(Channel::World, &header(3, 10), bytes).unwrap();
-        let (head, body) = decode(&frame.bytes).unwrap();
-        assert_eq!(head, header(3, 0));
-        assert_eq!(body, cast_slice::<_, u8>(&states(3)));
-        assert_eq!(frame.thinned_rows, 0);
-    }
-
-    #[test]
-    fn a_crowd_is_thinned_evenly_and_counted() {
-        let crowd = states(20_000);
-        let frame = encode(Channel::World, &header(20_000, 0), cast_slice(&crowd)).unwrap();
-        let (head, body) = decode(&frame.bytes).unwrap();
-        assert!(frame.bytes.len() <= MAX_FRAME_BYTES);
-        assert_eq!((head.count, frame.thinned_rows), (5_000, 15_000));
-        let second: VehicleState = pod_read_unaligned(&body[136..272]);
-        assert_eq!(second.vehicle, 4);
-    }
-
-    #[test]
-    fn observations_are_never_cut() {
-        let layout = ObservationLayout::new(20_000, 9, 0);
-        let words = payload(layout.len);
-        let error = encode(Channel::Observation, &header(20_000, 9), cast_slice(&words)).unwrap_err();
-        assert_eq!(error, FrameError::TooLong(layout.len + HEADER_BYTES));
-    }
-
-    #[test]
-    fn a_header_that_promises_too_much_is_refused() {
-        for channel in [Channel::World, Channel::Observation, Channel::Prediction] {
-            let error = encode(channel, &header(100, 9), &[0; 64]).unwrap_err();
-            assert!(matches!(error, FrameError::Block(_)), "{error}");
-            assert!(encode(channel, &header(u32::MAX as usize, u32::MAX), &[0; 64]).is_err());
-        }
-        assert!(decode(&[0; HEADER_BYTES - 1]).is_none());
-    }
-
-    proptest! {
-        #[test]
-        fn frames_come_back_as_they_were(n in 0_usize..200, d in 1_u32..12) {
-            let layout = ObservationLayout::new(n, d as usize, 0);
-            for (channel, len) in [(Channel::Observation, layout.len), (Channel::Prediction, n * d as usize * 4)] {
-                let words = payload(len);
-                let bytes = &cast_slice::<_, u8>(&words)[..len];
-                let frame = encode(channel, &header(n, d), bytes).unwrap();
-                prop_assert_eq!(decode(&frame.bytes).unwrap(), (header(n, d), bytes));
-            }
-        }
-    }
-}
+mod tests;

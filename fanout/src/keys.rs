@@ -5,40 +5,52 @@ use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 /// Characters that stand for themselves: RFC 3986's unreserved ones.
 const ENCODED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b'_').remove(b'~');
 
-/// What is published under a run's prefix.
+/// What is published under a run's prefix; scans have keys of their own ([`Keys::scan`]).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Topic {
+    /// The scene and the tick, as JSON; answers queries only.
+    Map,
+    /// How the run fares, as JSON.
+    Status,
+    /// Who is who, as a frame.
+    Vehicles,
+    /// Traffic lights, as a frame.
+    Signals,
     /// Road users, as a frame.
     World,
     /// What connected vehicles sense, with the truth, as a frame.
     Observation,
-    /// What the policy makes of it, as a frame.
+    /// What policy and filter make of it, as a frame.
     Prediction,
-    /// How the run fares, as JSON.
-    Status,
-    /// The map and the tick, as JSON; answers queries only.
-    Map,
+    /// Contacts that begin, as a frame.
+    Event,
 }
 
 impl Topic {
     /// All topics.
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 8] = [
+        Self::Map,
+        Self::Status,
+        Self::Vehicles,
+        Self::Signals,
         Self::World,
         Self::Observation,
         Self::Prediction,
-        Self::Status,
-        Self::Map,
+        Self::Event,
     ];
 
     /// Last part of the key.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
+            Self::Map => "map",
+            Self::Status => "status",
+            Self::Vehicles => "vehicles",
+            Self::Signals => "signals",
             Self::World => "world",
             Self::Observation => "observation",
             Self::Prediction => "prediction",
-            Self::Status => "status",
-            Self::Map => "map",
+            Self::Event => "event",
         }
     }
 }
@@ -79,10 +91,16 @@ impl Keys {
         format!("{}/alive", self.prefix)
     }
 
-    /// Key expression over all topics.
+    /// Key of the scans of the vehicle with this SUMO id.
+    #[must_use]
+    pub fn scan(&self, id: &str) -> String {
+        format!("{}/pointcloud/{}", self.prefix, encode(id))
+    }
+
+    /// Key expression over all of them.
     #[must_use]
     pub fn all(&self) -> String {
-        format!("{}/*", self.prefix)
+        format!("{}/**", self.prefix)
     }
 }
 
@@ -117,6 +135,10 @@ mod tests {
                 prop_assert!(KeyExpr::new(keys.all()).is_ok_and(|all| all.includes(&KeyExpr::new(key.as_str()).unwrap())));
                 prop_assert_eq!(key.split('/').count(), 4);
             }
+            let scan = keys.scan(&name);
+            prop_assert!(KeyExpr::new(scan.as_str()).is_ok_and(|k| k.as_str() == scan && !k.is_wild()), "{}", scan);
+            prop_assert!(KeyExpr::new(keys.all()).is_ok_and(|all| all.includes(&KeyExpr::new(scan.as_str()).unwrap())));
+            prop_assert_eq!(scan.split('/').count(), 5);
             if !name.is_empty() {
                 let part = encode(&name);
                 prop_assert_eq!(percent_decode_str(&part).decode_utf8().unwrap(), name);

@@ -1,27 +1,34 @@
-//! The zenoh side: a closed session that listens where it was told, publishers that drop rather than wait, and the
-//! newest value of every key for those who ask.
+//! What zenoh shows: publishers that drop rather than wait, and the newest value of every key for those who ask.
 
 use std::{
     collections::BTreeMap,
-    io,
-    net::TcpListener,
-    sync::{Arc, Mutex, PoisonError},
-    time::Duration,
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+        mpsc::{Receiver, SyncSender, sync_channel},
+    },
+    time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
-use ipc_schema::failure::{Failure, FailureKind};
+use ipc_schema::{
+    config::Fanout,
+    failure::{Failure, FailureKind},
+};
 use zenoh::{
     Wait,
     bytes::{Encoding, ZBytes},
-    config::Config,
     key_expr::KeyExpr,
     liveliness::LivelinessToken,
-    pubsub::Publisher,
+    pubsub::{Publisher, Subscriber},
     qos::{CongestionControl, Priority},
     query::{Query, Queryable},
+    sample::Locality,
 };
 
-use crate::keys::{Keys, Topic};
+use crate::{
+    endpoint,
+    keys::{Keys, Topic},
+};
 
 /// The zenoh side failed.
 #[derive(Debug, thiserror::Error)]
@@ -44,6 +51,9 @@ pub enum OutletError {
         /// zenoh's reason.
         reason: String,
     },
+    /// No thread for those who ask.
+    #[error("cannot start the thread that answers queries: {0}")]
+    Thread(std::io::Error),
 }
 
 impl From<OutletError> for Failure {
@@ -53,85 +63,219 @@ impl From<OutletError> for Failure {
                 "another run may be using the port: give this one a free port with `--set fanout.listen=tcp/127.0.0.1:PORT`, \
                  or do without viewers with `--set fanout.enabled=false`",
             ),
-            OutletError::Refused { .. } => Self::from_error(FailureKind::Run, &error),
+            OutletError::Refused { .. } | OutletError::Thread(_) => Self::from_error(FailureKind::Run, &error),
         }
     }
 }
 
 /// Time for the last frames to leave: at most 1 MB for each viewer.
 const FAREWELL: Duration = Duration::from_millis(300);
+/// Questions that wait for an answer; whoever asks more is not answered. A viewer that stalls while it is answered holds up the
+/// others' answers, by at most zenoh's 5 s, and nobody's frames.
+const QUESTIONS: usize = 256;
 
-type Latest = Arc<Mutex<BTreeMap<Topic, ZBytes>>>;
+/// A key with the newest value that it had.
+#[derive(Clone)]
+struct Value {
+    key: KeyExpr<'static>,
+    encoding: Encoding,
+    payload: ZBytes,
+    attachment: [u8; 16],
+}
+
+type Latest = Arc<Mutex<BTreeMap<String, Value>>>;
+
+/// A key being published.
+pub struct Line {
+    publisher: Publisher<'static>,
+    key: String,
+    encoding: Encoding,
+    sequence: u64,
+}
+
+impl Line {
+    /// True while somebody subscribes.
+    #[must_use]
+    pub fn is_watched(&self) -> bool {
+        self.publisher
+            .matching_status()
+            .wait()
+            .is_ok_and(|status| status.matching())
+    }
+}
 
 /// Everything a run shows to viewers.
 pub struct Outlet {
     session: zenoh::Session,
-    publishers: BTreeMap<Topic, Publisher<'static>>,
+    keys: Keys,
+    lines: BTreeMap<Topic, Line>,
     latest: Latest,
+    foreign: Arc<AtomicU64>,
     // Held: dropping them withdraws them.
     _queryable: Queryable<()>,
-    _token: LivelinessToken,
+    _guard: Subscriber<()>,
+    token: Option<LivelinessToken>,
 }
 
 impl Outlet {
-    /// Listens on `endpoint` and declares all keys; `map` is the JSON that answers for [`Topic::Map`].
+    /// Listens and declares all keys; `map` is the JSON that answers for [`Topic::Map`].
     ///
     /// # Errors
     /// The endpoint is malformed, taken, or not of this machine.
-    pub fn open(endpoint: &str, keys: &Keys, map: &str) -> Result<Self, OutletError> {
-        let session = listen(endpoint)?;
+    pub fn open(settings: &Fanout, keys: &Keys, map: &str) -> Result<Self, OutletError> {
+        let session = endpoint::listen(settings)?;
         let latest: Latest = Arc::default();
-        store(&latest, Topic::Map, ZBytes::from(map));
-        let publishers = Topic::ALL
-            .into_iter()
-            .filter(|topic| *topic != Topic::Map)
-            .map(|topic| Ok((topic, publisher(&session, topic, keys)?)))
-            .collect::<Result<_, OutletError>>()?;
+        let (sender, questions) = sync_channel(QUESTIONS);
+        answer_on_a_thread(&latest, questions)?;
         let queryable = session
             .declare_queryable(keys.all())
-            .callback(answers(&latest, keys)?)
+            .callback(take_question(sender))
             .wait()
             .map_err(refused("declaration", keys.all()))?;
-        let token = session
-            .liveliness()
-            .declare_token(keys.alive())
-            .wait()
-            .map_err(refused("declaration", keys.alive()))?;
-        Ok(Self {
-            session,
-            publishers,
-            latest,
+        let foreign = Arc::new(AtomicU64::new(0));
+        let outlet = Self {
+            _guard: guard(&session, keys, &foreign)?,
             _queryable: queryable,
-            _token: token,
+            keys: keys.clone(),
+            lines: BTreeMap::new(),
+            latest,
+            foreign,
+            session,
+            token: None,
+        };
+        let value = outlet.value(&keys.topic(Topic::Map), &Encoding::APPLICATION_JSON, map, 0)?;
+        outlet.store(value);
+        outlet.declare_lines()
+    }
+
+    fn declare_lines(mut self) -> Result<Self, OutletError> {
+        for topic in Topic::ALL.into_iter().filter(|topic| *topic != Topic::Map) {
+            let line = self.line(&self.keys.topic(topic), encoding(topic), priority(topic))?;
+            self.lines.insert(topic, line);
+        }
+        Ok(self)
+    }
+
+    /// A key of its own for one vehicle's scans.
+    ///
+    /// # Errors
+    /// zenoh refuses.
+    pub fn scan_line(&self, id: &str) -> Result<Line, OutletError> {
+        self.line(
+            &self.keys.scan(id),
+            Encoding::APPLICATION_OCTET_STREAM,
+            Priority::Background,
+        )
+    }
+
+    fn line(&self, key: &str, encoding: Encoding, priority: Priority) -> Result<Line, OutletError> {
+        let publisher = self
+            .session
+            .declare_publisher(key.to_owned())
+            .encoding(encoding.clone())
+            .congestion_control(CongestionControl::Drop)
+            .priority(priority)
+            .allowed_destination(Locality::Remote)
+            .wait()
+            .map_err(refused("declaration", key.to_owned()))?;
+        Ok(Line {
+            publisher,
+            key: key.to_owned(),
+            encoding,
+            sequence: 0,
         })
     }
 
-    /// Publishes; never waits for a viewer.
+    /// Says that the run is here.
+    ///
+    /// # Errors
+    /// zenoh refuses.
+    pub fn announce(&mut self) -> Result<(), OutletError> {
+        let token = self.session.liveliness().declare_token(self.keys.alive()).wait();
+        self.token = Some(token.map_err(refused("declaration", self.keys.alive()))?);
+        Ok(())
+    }
+
+    /// Publishes, and answers with it from now on; never waits for a viewer.
     ///
     /// # Errors
     /// The session is closed.
-    pub fn publish(&self, topic: Topic, bytes: Vec<u8>) -> Result<(), OutletError> {
-        let value = ZBytes::from(bytes);
-        store(&self.latest, topic, value.clone());
-        match self.publishers.get(&topic) {
-            Some(publisher) => publisher
-                .put(value)
-                .wait()
-                .map_err(refused("publication", topic.name().to_owned())),
-            None => Ok(()),
+    pub fn publish(&mut self, topic: Topic, bytes: Vec<u8>) -> Result<(), OutletError> {
+        self.publish_part(topic, bytes.clone(), Some(bytes))
+    }
+
+    /// Publishes `part`, and answers with `whole` from now on, if that is given.
+    ///
+    /// # Errors
+    /// As [`Outlet::publish`].
+    pub fn publish_part(&mut self, topic: Topic, part: Vec<u8>, whole: Option<Vec<u8>>) -> Result<(), OutletError> {
+        let Some(mut line) = self.lines.remove(&topic) else {
+            return Ok(());
+        };
+        let result = self.publish_on(&mut line, part, whole);
+        self.lines.insert(topic, line);
+        result
+    }
+
+    /// The same on any line.
+    ///
+    /// # Errors
+    /// As [`Outlet::publish`].
+    pub fn publish_on(&self, line: &mut Line, part: Vec<u8>, whole: Option<Vec<u8>>) -> Result<(), OutletError> {
+        let attachment = attachment(line.sequence);
+        line.sequence += 1;
+        if let Some(whole) = whole {
+            let value = self.value(&line.key, &line.encoding, whole, line.sequence - 1)?;
+            self.store(value);
         }
+        line.publisher
+            .put(part)
+            .attachment(attachment.as_slice())
+            .wait()
+            .map_err(refused("publication", line.key.clone()))
+    }
+
+    /// Nobody is to be answered for this line any more.
+    pub fn forget(&self, line: &Line) {
+        self.locked().remove(&line.key);
+    }
+
+    /// Samples that others have put on this run's keys.
+    #[must_use]
+    pub fn foreign_samples(&self) -> u64 {
+        self.foreign.load(Ordering::Relaxed)
+    }
+
+    fn value(
+        &self,
+        key: &str,
+        encoding: &Encoding,
+        payload: impl Into<ZBytes>,
+        sequence: u64,
+    ) -> Result<Value, OutletError> {
+        Ok(Value {
+            key: KeyExpr::new(key.to_owned()).map_err(refused("declaration", key.to_owned()))?,
+            encoding: encoding.clone(),
+            payload: payload.into(),
+            attachment: attachment(sequence),
+        })
+    }
+
+    fn store(&self, value: Value) {
+        self.locked().insert(value.key.to_string(), value);
+    }
+
+    fn locked(&self) -> std::sync::MutexGuard<'_, BTreeMap<String, Value>> {
+        self.latest.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Lets viewers, if there are any, have what is queued, and takes leave of them. zenoh does not tell when its queues are
     /// empty and drops them when it closes, so the last frames get [`FAREWELL`].
-    pub fn close(self) {
-        let watched = self
-            .publishers
-            .values()
-            .any(|publisher| publisher.matching_status().wait().is_ok_and(|m| m.matching()));
-        if watched {
+    pub fn close(mut self) {
+        if self.lines.values().any(Line::is_watched) {
             std::thread::park_timeout(FAREWELL);
         }
+        drop(self.token.take());
         if let Err(error) = self.session.close().wait() {
             tracing::warn!(%error, "zenoh did not close in order");
         }
@@ -146,28 +290,38 @@ fn refused(action: &'static str, key: String) -> impl FnOnce(zenoh::Error) -> Ou
     }
 }
 
-fn store(latest: &Latest, topic: Topic, value: ZBytes) {
-    latest
-        .lock()
-        .unwrap_or_else(PoisonError::into_inner)
-        .insert(topic, value);
+/// Sequence number and time of taking, little endian.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "a label for viewers on other machines; nothing follows from it"
+)]
+fn attachment(sequence: u64) -> [u8; 16] {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let now_ns = u64::try_from(now.as_nanos()).unwrap_or(u64::MAX);
+    let mut bytes = [0; 16];
+    bytes[..8].copy_from_slice(&sequence.to_le_bytes());
+    bytes[8..].copy_from_slice(&now_ns.to_le_bytes());
+    bytes
 }
 
-/// Frames have priorities of their own, so each has a queue of its own; the short ones overtake the long ones.
-fn publisher(session: &zenoh::Session, topic: Topic, keys: &Keys) -> Result<Publisher<'static>, OutletError> {
-    let priority = match topic {
-        Topic::Status | Topic::Map => Priority::DataHigh,
+/// Sequence number and UNIX time in nanoseconds of an attachment; `None` if it is none of ours.
+#[must_use]
+pub fn read_attachment(bytes: &[u8]) -> Option<(u64, u64)> {
+    let (sequence, time) = bytes.split_at_checked(8)?;
+    Some((
+        u64::from_le_bytes(sequence.try_into().ok()?),
+        u64::from_le_bytes(time.try_into().ok()?),
+    ))
+}
+
+/// Each priority has queues of its own: the short and urgent overtake the long.
+fn priority(topic: Topic) -> Priority {
+    match topic {
+        Topic::Map | Topic::Status | Topic::Signals | Topic::Event => Priority::InteractiveLow,
+        Topic::Prediction => Priority::DataHigh,
         Topic::World => Priority::Data,
-        Topic::Prediction => Priority::DataLow,
-        Topic::Observation => Priority::Background,
-    };
-    session
-        .declare_publisher(keys.topic(topic))
-        .encoding(encoding(topic))
-        .congestion_control(CongestionControl::Drop)
-        .priority(priority)
-        .wait()
-        .map_err(refused("declaration", keys.topic(topic)))
+        Topic::Observation | Topic::Vehicles => Priority::DataLow,
+    }
 }
 
 fn encoding(topic: Topic) -> Encoding {
@@ -177,92 +331,70 @@ fn encoding(topic: Topic) -> Encoding {
     }
 }
 
-fn answers(latest: &Latest, keys: &Keys) -> Result<impl Fn(Query) + Send + Sync + 'static, OutletError> {
-    let latest = Arc::clone(latest);
-    let topics = Topic::ALL
-        .into_iter()
-        .map(|topic| Ok((topic, key_expr(keys.topic(topic))?)))
-        .collect::<Result<Vec<_>, OutletError>>()?;
-    Ok(move |query: Query| {
-        for (topic, key) in topics.iter().filter(|(_, key)| query.key_expr().intersects(key)) {
-            let value = latest
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner)
-                .get(topic)
-                .cloned();
-            let Some(value) = value else { continue };
-            if let Err(error) = query.reply(key, value).encoding(encoding(*topic)).wait() {
-                tracing::debug!(%error, %key, "a query was not answered");
-            }
+/// Counts what others put on this run's keys. Nothing of it is looked at.
+fn guard(session: &zenoh::Session, keys: &Keys, foreign: &Arc<AtomicU64>) -> Result<Subscriber<()>, OutletError> {
+    let counter = Arc::clone(foreign);
+    session
+        .declare_subscriber(keys.all())
+        .allowed_origin(Locality::Remote)
+        .callback(move |_| {
+            counter.fetch_add(1, Ordering::Relaxed);
+        })
+        .wait()
+        .map_err(refused("declaration", keys.all()))
+}
+
+fn take_question(sender: SyncSender<Query>) -> impl Fn(Query) + Send + Sync + 'static {
+    move |query| {
+        if sender.try_send(query).is_err() {
+            tracing::debug!("too many questions at once");
         }
-    })
+    }
 }
 
-fn key_expr(key: String) -> Result<KeyExpr<'static>, OutletError> {
-    KeyExpr::new(key.clone()).map_err(refused("declaration", key))
+/// zenoh's own threads must not wait for a viewer that is slow to take its answer.
+fn answer_on_a_thread(latest: &Latest, questions: Receiver<Query>) -> Result<(), OutletError> {
+    let latest = Arc::clone(latest);
+    std::thread::Builder::new()
+        .name("answers".into())
+        .spawn(move || questions.iter().for_each(|query| answer(&latest, &query)))
+        .map(drop)
+        .map_err(OutletError::Thread)
 }
 
-fn listen(endpoint: &str) -> Result<zenoh::Session, OutletError> {
-    let failed = |error: zenoh::Error| OutletError::Listen {
-        endpoint: endpoint.to_owned(),
-        reason: plain_reason(endpoint).unwrap_or_else(|| error.to_string()),
-    };
-    let config = config(endpoint).map_err(failed)?;
-    zenoh::open(config).wait().map_err(failed)
-}
-
-/// Closed by default: one endpoint, no discovery, no shared memory, no administration. A viewer that stalls or is slow
-/// costs `put` nothing: measured with these waits, queues and buffer, at most 0.6 ms.
-fn config(endpoint: &str) -> zenoh::Result<Config> {
-    let endpoint = serde_json::to_string(endpoint)?;
-    Config::from_json5(&format!(
-        r#"{{
-            mode: "router",
-            listen: {{ endpoints: [{endpoint}], timeout_ms: 0, exit_on_failure: true }},
-            connect: {{ endpoints: [] }},
-            scouting: {{ delay: 0, multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }},
-            adminspace: {{ enabled: false }},
-            transport: {{
-                shared_memory: {{ enabled: false }},
-                link: {{
-                    tcp: {{ so_sndbuf: 65536 }},
-                    tx: {{ queue: {{
-                        size: {{ data_high: 16, data: 16, data_low: 16, background: 16 }},
-                        congestion_control: {{ drop: {{ wait_before_drop: 0, max_wait_before_drop_fragments: 0 }} }},
-                    }} }},
-                }},
-            }},
-        }}"#
-    ))
-}
-
-/// Why the operating system does not give out the endpoint's port, if that is the trouble.
-fn plain_reason(endpoint: &str) -> Option<String> {
-    let address = endpoint
-        .strip_prefix("tcp/")
-        .map(|a| a.split(['?', '#']).next().unwrap_or(a));
-    let Some(address) = address else {
-        return Some("this program speaks tcp only: `tcp/HOST:PORT`".to_owned());
-    };
-    TcpListener::bind(address).err().map(|error| reason(&error, address))
-}
-
-fn reason(error: &io::Error, address: &str) -> String {
-    let port = address.rsplit(':').next().unwrap_or(address);
-    match error.kind() {
-        io::ErrorKind::AddrInUse => format!("port {port} is in use"),
-        io::ErrorKind::AddrNotAvailable => format!("{address} is not an address of this machine"),
-        io::ErrorKind::PermissionDenied => format!("no permission for port {port}"),
-        _ => error.to_string(),
+fn answer(latest: &Latest, query: &Query) {
+    let values: Vec<Value> = latest
+        .lock()
+        .unwrap_or_else(PoisonError::into_inner)
+        .values()
+        .filter(|value| query.key_expr().intersects(&value.key))
+        .cloned()
+        .collect();
+    for value in values {
+        let reply = query
+            .reply(value.key.clone(), value.payload)
+            .encoding(value.encoding)
+            .attachment(value.attachment.as_slice());
+        if let Err(error) = reply.wait() {
+            tracing::debug!(%error, key = %value.key, "a query was not answered");
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::net::TcpListener;
+
     use super::*;
 
     fn failure(endpoint: &str) -> Failure {
-        match Outlet::open(endpoint, &Keys::new("t", 0), "{}") {
+        let config: ipc_schema::config::Config =
+            serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).unwrap();
+        let settings = Fanout {
+            listen: endpoint.to_owned(),
+            ..config.fanout
+        };
+        match Outlet::open(&settings, &Keys::new("t", 0), "{}") {
             Ok(_) => panic!("{endpoint} was accepted"),
             Err(error) => error.into(),
         }
@@ -299,5 +431,13 @@ mod tests {
                 failure.message
             );
         }
+    }
+
+    #[test]
+    fn attachments_come_back() {
+        let bytes = attachment(7);
+        assert!(read_attachment(&bytes).is_some_and(|(sequence, at_ns)| sequence == 7 && at_ns > 1 << 60));
+        assert_eq!(read_attachment(&bytes[..15]), None);
+        assert_eq!(read_attachment(&[]), None);
     }
 }

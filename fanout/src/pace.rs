@@ -17,12 +17,12 @@ pub struct Budget {
 }
 
 impl Budget {
-    /// A full budget of `rate_hz` sets per second.
+    /// A full budget of `rate_hz` sets per second; with 0 there is never one.
     #[must_use]
     pub fn new(rate_hz: f64) -> Self {
         Self {
             rate_hz,
-            tokens: BURST_FRAMES,
+            tokens: if rate_hz > 0.0 { BURST_FRAMES } else { 0.0 },
             at: Duration::ZERO,
         }
     }
@@ -33,6 +33,11 @@ impl Budget {
         self.at = self.at.max(now);
         self.tokens = (self.tokens + elapsed_s * self.rate_hz).min(BURST_FRAMES);
         self.tokens >= 1.0
+    }
+
+    /// One more set may be published at once, whatever was before; none with a rate of 0.
+    pub fn refill(&mut self) {
+        self.tokens = Self::new(self.rate_hz).tokens;
     }
 
     /// Pays for a set whose longest frame has `longest_bytes`: above [`FULL_RATE_FRAME_BYTES`] the rate falls.

@@ -14,16 +14,17 @@ use ipc_schema::{
 };
 
 use crate::{
+    facts::Facts,
     feed::{Feed, newest_common},
     frame,
     keys::{Keys, Topic},
+    meter::{Delivering, Errors, Observed, Rate, RoadUsers},
     outlet::{Outlet, OutletError},
     pace::{Budget, Patience},
-    status::{Counters, Map, ProcessStatus, Status},
+    scans::Scans,
+    status::{self, Counters, ProcessStatus, Status},
 };
 
-/// Time between two states of the run.
-const STATUS_INTERVAL: Duration = Duration::from_millis(500);
 /// How long messages of different ticks wait for one another before they go out as they are.
 const MEETING_LIMIT: Duration = Duration::from_millis(500);
 /// How long the last tick may take to come through all channels.
@@ -65,17 +66,32 @@ impl From<RelayError> for Failure {
 /// A fan-out at work.
 pub struct Relay {
     session: Session,
-    feeds: Vec<(Topic, Feed)>,
+    env_index: u32,
+    feeds: Vec<Stream>,
+    facts: Facts,
+    scans: Option<Scans>,
     boards: Vec<(Process, BoardReader)>,
     outlet: Outlet,
-    budget: Budget,
     patience: Patience,
     started: Instant,
+    run_age_s: f64,
     counters: Counters,
     newest: MessageHeader,
+    is_announced: bool,
+    rate: Rate,
+    road_users: RoadUsers,
+    sensors: Delivering,
+    errors_m: Errors,
     apart_since: Option<Duration>,
     ended_at: Option<Duration>,
-    next_status: Duration,
+    status_budget: Budget,
+}
+
+/// A channel with a message for each tick, and how often it goes out.
+struct Stream {
+    topic: Topic,
+    feed: Feed,
+    budget: Budget,
 }
 
 impl Relay {
@@ -85,31 +101,44 @@ impl Relay {
     /// A service of the run is not there, or the endpoint cannot be listened on.
     pub fn open(mut session: Session, env_index: u32) -> Result<Self, RelayError> {
         let run = &session.run;
-        let map = serde_json::to_string(&Map::of(run)).unwrap_or_default();
-        let outlet = Outlet::open(&run.config.fanout.listen, &Keys::new(&run.name, env_index), &map)?;
+        let settings = run.config.fanout.clone();
+        let keys = Keys::new(&run.name, env_index);
+        let outlet = Outlet::open(&settings, &keys, &status::map(run, env_index))?;
         let queue_length = Channel::World.queue_length(run);
-        let budget = Budget::new(run.config.fanout.rate_hz);
+        let rates_hz = [settings.world_hz, settings.observation_hz, settings.prediction_hz];
         let feeds = CHANNELS
             .into_iter()
-            .map(|(channel, topic)| Ok((topic, Feed::open(&mut session, channel)?)))
+            .zip(rates_hz)
+            .map(|((channel, topic), rate_hz)| {
+                let (feed, budget) = (Feed::open(&mut session, channel)?, Budget::new(rate_hz));
+                Ok(Stream { topic, feed, budget })
+            })
             .collect::<Result<_, SessionError>>()?;
         let boards = Process::ALL
             .into_iter()
             .map(|process| Ok((process, session.board_of(process)?)))
             .collect::<Result<_, SessionError>>()?;
         Ok(Self {
+            facts: Facts::open(&mut session)?,
+            scans: Scans::open(&mut session)?,
+            run_age_s: status::age_s(session.run.supervisor_pid),
             session,
+            env_index,
             feeds,
             boards,
             outlet,
-            budget,
             patience: Patience::new(queue_length),
             started: Instant::now(),
             counters: Counters::default(),
             newest: MessageHeader::default(),
+            is_announced: false,
+            rate: Rate::default(),
+            road_users: RoadUsers::default(),
+            sensors: Delivering::default(),
+            errors_m: Errors::default(),
             apart_since: None,
             ended_at: None,
-            next_status: Duration::ZERO,
+            status_budget: Budget::new(settings.status_hz),
         })
     }
 
@@ -124,29 +153,36 @@ impl Relay {
             let came = self.look()?;
             let now = self.started.elapsed();
             self.publish_if_due(now)?;
-            self.tell_if_due(now)?;
+            self.facts.relay(now, &mut self.outlet, &mut self.counters)?;
+            if let Some(scans) = &mut self.scans {
+                scans.relay(now, self.facts.directory(), &self.outlet, &mut self.counters)?;
+            }
+            if self.status_budget.allows(now) {
+                self.status_budget.spend(0);
+                self.tell(State::Running, now)?;
+            }
             if self.finished(now) {
                 break;
             }
-            self.rest(came)?;
+            self.session.wait(self.patience.next(came))?;
         }
         self.leave()
     }
 
-    /// Leaves shared memory alone for a while.
-    fn rest(&mut self, came: usize) -> Result<(), SessionError> {
-        self.session.wait(self.patience.next(came))
-    }
-
     /// Empties the queues; returns the most messages that one of them held.
     fn look(&mut self) -> Result<usize, PortError> {
+        let changes = self.facts.look(&mut self.counters)?;
         self.feeds
             .iter_mut()
-            .try_fold(0, |most, (_, feed)| Ok(feed.drain()?.max(most)))
+            .try_fold(changes, |most, stream| Ok(stream.feed.drain()?.max(most)))
     }
 
     fn publish_if_due(&mut self, now: Duration) -> Result<(), RelayError> {
-        if !self.budget.allows(now) {
+        let mut due = false;
+        for stream in &mut self.feeds {
+            due |= stream.budget.allows(now);
+        }
+        if !due {
             return Ok(());
         }
         let ticks = match self.common_tick() {
@@ -155,18 +191,18 @@ impl Relay {
             None => return Ok(()),
         };
         self.apart_since = None;
-        self.publish_set(&ticks)
+        self.publish_set(now, &ticks)
     }
 
     /// The newest tick that every channel in use holds.
     fn common_tick(&self) -> Option<u64> {
-        let in_use = self.feeds.iter().filter(|(_, feed)| feed.tally().ticks > 0);
-        let ticks: Vec<Vec<u64>> = in_use.map(|(_, feed)| feed.fresh_ticks().collect()).collect();
+        let in_use = self.feeds().filter(|feed| feed.tally().ticks > 0);
+        let ticks: Vec<Vec<u64>> = in_use.map(|feed| feed.fresh_ticks().collect()).collect();
         newest_common(&ticks)
     }
 
     fn newest_ticks(&self) -> Vec<Option<u64>> {
-        self.feeds.iter().map(|(_, feed)| feed.fresh_ticks().next()).collect()
+        self.feeds().map(|feed| feed.fresh_ticks().next()).collect()
     }
 
     /// True if there is something to publish that has waited too long for its counterparts.
@@ -178,47 +214,79 @@ impl Relay {
         now.saturating_sub(*self.apart_since.get_or_insert(now)) > MEETING_LIMIT
     }
 
-    /// Publishes a tick of each channel, if there is one.
-    fn publish_set(&mut self, ticks: &[Option<u64>]) -> Result<(), RelayError> {
+    fn feeds(&self) -> impl Iterator<Item = &Feed> {
+        self.feeds.iter().map(|stream| &stream.feed)
+    }
+
+    /// Publishes a tick of each channel that is due, if there is one.
+    fn publish_set(&mut self, now: Duration, ticks: &[Option<u64>]) -> Result<(), RelayError> {
+        self.measure(ticks);
         let mut longest = 0;
-        for ((topic, feed), tick) in self.feeds.iter_mut().zip(ticks) {
+        let mut out = Vec::new();
+        for (stream, tick) in self.feeds.iter_mut().zip(ticks) {
             let Some(tick) = *tick else { continue };
-            let Some(message) = feed.fresh(tick) else { continue };
+            let Some(message) = stream.feed.fresh(tick) else {
+                continue;
+            };
             let header = *message.header();
-            let framed = frame::encode(feed.channel(), &header, message.payload());
-            feed.release(tick);
+            let is_due = stream.budget.allows(now);
+            let framed = is_due.then(|| frame::encode(stream.feed.channel(), &header, message.payload()));
+            stream.feed.release(tick);
             if header.tick >= self.newest.tick {
                 self.newest = header;
             }
             match framed {
-                Ok(frame) => {
+                Some(Ok(frame)) => {
                     longest = longest.max(frame.bytes.len());
-                    self.counters.frames += 1;
-                    self.counters.thinned_rows += frame.thinned_rows as u64;
-                    self.outlet.publish(*topic, frame.bytes)?;
+                    out.push((stream.topic, frame));
                 }
-                Err(error) => count_refusal(&mut self.counters, *topic, &error),
+                Some(Err(error)) => self.counters.refuse(stream.topic.name(), &error),
+                None => {}
             }
         }
-        if self.budget.spend(longest) {
-            self.counters.slowed_sets += 1;
+        let mut slowed = false;
+        for stream in &mut self.feeds {
+            if out.iter().any(|(topic, _)| *topic == stream.topic) {
+                slowed |= stream.budget.spend(longest);
+            }
+        }
+        self.counters.slowed_sets += u64::from(slowed);
+        for (topic, frame) in out {
+            self.counters.frames += 1;
+            *self.counters.left_out(topic) += frame.left_out as u64;
+            self.outlet.publish(topic, frame.bytes)?;
+        }
+        if !self.is_announced {
+            self.is_announced = true;
+            self.outlet.announce()?;
         }
         Ok(())
     }
 
-    fn tell_if_due(&mut self, now: Duration) -> Result<(), RelayError> {
-        if now < self.next_status {
-            return Ok(());
+    /// Reads off the ticks that are about to go out what the status tells of them.
+    fn measure(&mut self, ticks: &[Option<u64>]) {
+        let message = |place: usize| {
+            let message = self.feeds.get(place)?.feed.fresh((*ticks.get(place)?)?)?;
+            Some((message.header(), message.payload()))
+        };
+        if let Some(road_users) = message(0).and_then(|(header, payload)| RoadUsers::of(header, payload)) {
+            self.road_users = road_users;
         }
-        self.next_status = now + STATUS_INTERVAL;
-        self.tell(State::Running)
+        if let Some(observed) = message(1).and_then(|(header, payload)| Observed::of(header, payload)) {
+            let positions = !self.session.run.config.drives();
+            let prediction = message(2).filter(|_| positions);
+            self.sensors = observed.delivering();
+            self.errors_m = observed.errors(prediction);
+        }
     }
 
     /// Publishes the state of the run and puts this process's own on its board.
-    fn tell(&mut self, state: State) -> Result<(), RelayError> {
-        let ticks = self.feeds.iter().map(|(_, feed)| feed.tally().ticks).max().unwrap_or(0);
-        let missed = self.feeds.iter().map(|(_, feed)| feed.tally().missed).sum();
+    fn tell(&mut self, state: State, now: Duration) -> Result<(), RelayError> {
+        let ticks = self.feeds().map(|feed| feed.tally().ticks).max().unwrap_or(0);
+        let missed = self.feeds().map(|feed| feed.tally().missed).sum();
+        self.rate.note(now, ticks);
         self.counters.missed_ticks = missed;
+        self.counters.refused_samples = self.outlet.foreign_samples();
         let newest = self.newest;
         self.session.report(|health| {
             health.state = if ticks > 0 { state as u32 } else { health.state };
@@ -227,25 +295,51 @@ impl Relay {
             health.sim_time_ns = newest.sim_time_ns;
             health.drops = missed;
         });
-        let json = serde_json::to_vec(&self.status()).unwrap_or_default();
+        let json = serde_json::to_vec(&self.status(now)).unwrap_or_default();
         Ok(self.outlet.publish(Topic::Status, json)?)
     }
 
-    fn status(&self) -> Status {
-        let refused: u64 = self.feeds.iter().map(|(_, feed)| feed.refused()).sum();
+    fn status(&self, now: Duration) -> Status {
+        let scans = self.scans.as_ref().map_or(0, Scans::refused);
+        let refused: u64 = self.feeds().map(Feed::refused).sum::<u64>() + scans + self.facts.refused();
+        let health: Vec<_> = self
+            .boards
+            .iter()
+            .map(|(process, board)| (*process, board.health()))
+            .collect();
+        let sumo = health.first().map_or(0, |(_, health)| health.ticks);
         let trainer = self.boards.iter().find(|(process, _)| *process == Process::Trainer);
+        let run = &self.session.run;
+        let tick_s = run.config.run.tick_s;
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a tick is longer than a nanosecond"
+        )]
+        let tick_ns = (tick_s * 1e9).round().max(1.0) as u64;
         Status {
+            schema_version: run.schema_version,
+            run: run.name.clone(),
+            run_id: status::run_id(run),
+            env: self.env_index,
+            mode: run.mode,
             tick: self.newest.tick,
             episode: self.newest.episode,
+            step: (self.newest.sim_time_ns / tick_ns).saturating_sub(1),
             sim_time_ns: self.newest.sim_time_ns,
             evaluation: self.newest.has(EVALUATION),
-            processes: self
-                .boards
+            run_age_s: self.run_age_s + now.as_secs_f64(),
+            ticks_per_s: self.rate.per_s(),
+            real_time_factor: self.rate.per_s() * tick_s,
+            road_users: self.road_users,
+            sensors: self.sensors,
+            errors_m: self.errors_m,
+            processes: health
                 .iter()
-                .map(|(process, board)| ProcessStatus::of(*process, &board.health()))
+                .map(|(process, health)| ProcessStatus::of(*process, health, sumo))
                 .collect(),
             training: trainer
-                .filter(|_| self.session.run.mode == Mode::Train)
+                .filter(|_| run.mode != Mode::Simulate)
                 .map(|(_, board)| board.training().into()),
             fanout: Counters {
                 refused_messages: self.counters.refused_messages + refused,
@@ -269,7 +363,7 @@ impl Relay {
             Mode::Train => Channel::Observation,
             Mode::Simulate => Channel::World,
         };
-        let came = self.feeds.iter().any(|(_, f)| f.channel() == last && f.tally().ended);
+        let came = self.feeds().any(|feed| feed.channel() == last && feed.tally().ended);
         let done = |(process, board): &(Process, BoardReader)| {
             *process == last.producer() && board.health().state == State::Done as u32
         };
@@ -277,34 +371,25 @@ impl Relay {
     }
 
     fn all_published(&self) -> bool {
-        let mut in_use = self.feeds.iter().map(|(_, feed)| feed).filter(|f| f.tally().ticks > 0);
-        let newest = self.feeds.iter().map(|(_, feed)| feed.tally().ticks).max();
+        let mut in_use = self.feeds().filter(|feed| feed.tally().ticks > 0);
+        let newest = self.feeds().map(|feed| feed.tally().ticks).max();
         in_use.all(|feed| Some(feed.tally().ticks) == newest && feed.fresh_ticks().next().is_none())
     }
 
     /// Publishes what is left, whatever the rate, and closes.
     fn leave(mut self) -> Result<(), RelayError> {
         self.look()?;
+        let now = self.started.elapsed();
         let ticks = match self.common_tick() {
             Some(tick) => vec![Some(tick); self.feeds.len()],
             None => self.newest_ticks(),
         };
-        self.publish_set(&ticks)?;
-        self.tell(State::Done)?;
+        self.feeds.iter_mut().for_each(|stream| stream.budget.refill());
+        self.publish_set(now, &ticks)?;
+        self.tell(State::Done, now)?;
         self.session.report(|health| health.state = State::Done as u32);
         tracing::info!(counters = ?self.counters, "done");
         self.outlet.close();
         Ok(())
-    }
-}
-
-fn count_refusal(counters: &mut Counters, topic: Topic, error: &frame::FrameError) {
-    let counter = match error {
-        frame::FrameError::Block(_) => &mut counters.refused_messages,
-        frame::FrameError::TooLong(_) => &mut counters.oversize_frames,
-    };
-    *counter += 1;
-    if *counter == 1 {
-        tracing::warn!(topic = topic.name(), %error, "not published; later ones are only counted");
     }
 }

@@ -1,5 +1,7 @@
 //! What is told in JSON: the map once, the state of the run twice a second.
 
+use std::collections::BTreeMap;
+
 use ipc_schema::{
     board::{Health, State, TrainingStatus},
     config::Field,
@@ -7,44 +9,78 @@ use ipc_schema::{
     run::{MapInfo, Mode, RunFile},
 };
 use serde::Serialize;
+use serde_json::{Value, json};
+
+use crate::{
+    frame::FrameError,
+    keys::Topic,
+    meter::{Delivering, Errors, RoadUsers},
+};
 
 /// What a viewer needs to know once.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Map<'a> {
-    /// Of every frame of this run.
-    pub schema_version: u32,
-    /// Name of the run.
-    pub run: &'a str,
-    /// What the run is for.
-    pub mode: Mode,
-    /// Projection, offset and bounds of the net.
-    pub map: &'a MapInfo,
-    /// Length of a tick, seconds.
-    pub tick_s: f64,
-    /// Sub-steps in a tick.
-    pub sub_steps: u32,
-    /// Simulated seconds per wall second; 0 = as fast as possible.
-    pub real_time_factor: f64,
-    /// Columns of the observation.
-    pub observation_fields: &'a [Field],
-    /// Most frames per wall second and topic.
-    pub rate_hz: f64,
+struct Map<'a> {
+    schema_version: u32,
+    run: &'a str,
+    run_id: String,
+    env: u32,
+    mode: Mode,
+    map: &'a MapInfo,
+    tick_s: f64,
+    sub_steps: u32,
+    real_time_factor: f64,
+    observation_fields: &'a [Field],
+    rates_hz: BTreeMap<&'static str, f64>,
+    lidar: Value,
 }
 
-impl<'a> Map<'a> {
-    /// What the run file says.
-    #[must_use]
-    pub fn of(run: &'a RunFile) -> Self {
-        Self {
-            schema_version: run.schema_version,
-            run: &run.name,
-            mode: run.mode,
-            map: &run.map,
-            tick_s: run.config.run.tick_s,
-            sub_steps: run.config.run.sub_steps,
-            real_time_factor: run.config.run.real_time_factor,
-            observation_fields: &run.config.observation.fields,
-            rate_hz: run.config.fanout.rate_hz,
+/// The run's identity as text: JSON has no integers of 64 bits.
+#[must_use]
+pub fn run_id(run: &RunFile) -> String {
+    format!("{:#018x}", run.run_id)
+}
+
+/// What the run file says, and the scene that `sim-core` has written down, as JSON.
+#[must_use]
+pub fn map(run: &RunFile, env: u32) -> String {
+    let (fanout, lidar) = (&run.config.fanout, &run.config.lidar);
+    let map = Map {
+        schema_version: run.schema_version,
+        run: &run.name,
+        run_id: run_id(run),
+        env,
+        mode: run.mode,
+        map: &run.map,
+        tick_s: run.config.run.tick_s,
+        sub_steps: run.config.run.sub_steps,
+        real_time_factor: run.config.run.real_time_factor,
+        observation_fields: &run.config.observation.fields,
+        rates_hz: BTreeMap::from([
+            ("world", fanout.world_hz),
+            ("observation", fanout.observation_hz),
+            ("prediction", fanout.prediction_hz),
+            ("pointcloud", fanout.pointcloud_hz),
+            ("event", fanout.event_hz),
+            ("signals", fanout.signals_hz),
+            ("vehicles", fanout.vehicles_hz),
+            ("status", fanout.status_hz),
+        ]),
+        lidar: json!({ "vehicles": lidar.vehicles, "range_m": lidar.range_m, "mode": lidar.mode }),
+    };
+    let text = serde_json::to_string(&map).unwrap_or_default();
+    // A large net's scene has many megabytes: it is passed on as it stands.
+    let scene = scene(run).unwrap_or_else(|| "null".into());
+    format!("{},\"scene\":{scene}}}", text.strip_suffix('}').unwrap_or(&text))
+}
+
+fn scene(run: &RunFile) -> Option<String> {
+    let path = run.chart_path();
+    let text = std::fs::read_to_string(&path).ok()?;
+    match serde_json::from_str::<serde::de::IgnoredAny>(&text) {
+        Ok(_) => Some(text),
+        Err(error) => {
+            tracing::warn!(%error, path = %path.display(), "viewers see no scene");
+            None
         }
     }
 }
@@ -58,6 +94,8 @@ pub struct ProcessStatus {
     pub state: &'static str,
     /// Ticks produced or consumed.
     pub ticks: u64,
+    /// Ticks behind SUMO.
+    pub lag: u64,
     /// Episode at work.
     pub episode: u64,
     /// Road users in its newest tick.
@@ -73,13 +111,14 @@ pub struct ProcessStatus {
 }
 
 impl ProcessStatus {
-    /// What `process` wrote on its board.
+    /// What `process` wrote on its board, when SUMO stands at `newest` ticks.
     #[must_use]
-    pub fn of(process: Process, health: &Health) -> Self {
+    pub fn of(process: Process, health: &Health, newest: u64) -> Self {
         Self {
             name: process.name(),
             state: State::from_u32(health.state).name(),
             ticks: health.ticks,
+            lag: newest.saturating_sub(health.ticks),
             episode: health.episode,
             road_users: health.road_users,
             cavs: health.cavs,
@@ -105,6 +144,8 @@ pub struct Training {
     pub policy_std: f64,
     /// Mean reward, lately.
     pub reward: f64,
+    /// Largest of those so far.
+    pub best_reward: f64,
     /// Mean error of the policy, metres.
     pub error_m: f64,
     /// Mean error of the raw GNSS fix, metres.
@@ -120,6 +161,7 @@ impl From<TrainingStatus> for Training {
             env_steps_per_s: status.env_steps_per_s,
             policy_std: status.policy_std,
             reward: status.reward,
+            best_reward: status.best_reward,
             error_m: status.error_m,
             raw_gnss_error_m: status.raw_gnss_error_m,
         }
@@ -135,29 +177,112 @@ pub struct Counters {
     pub missed_ticks: u64,
     /// Messages refused: of another run, or not what their header promises.
     pub refused_messages: u64,
-    /// Road users left out of frames that were too long.
+    /// Samples that others have put on this run's keys.
+    pub refused_samples: u64,
+    /// Road users and points left out of frames that were too long.
     pub thinned_rows: u64,
+    /// Slots left out of frames that were too long.
+    pub cut_rows: u64,
     /// Frames that were too long and could not be thinned.
     pub oversize_frames: u64,
     /// Sets that lowered the rate because a frame was long.
     pub slowed_sets: u64,
+    /// Scans of vehicles whose name was not known yet.
+    pub unnamed_scans: u64,
+}
+
+impl Counters {
+    /// The count of rows that frames of `topic` leave out.
+    pub fn left_out(&mut self, topic: Topic) -> &mut u64 {
+        match topic {
+            Topic::Observation | Topic::Prediction => &mut self.cut_rows,
+            _ => &mut self.thinned_rows,
+        }
+    }
+
+    /// Counts a message that is not published; tells of the first.
+    pub fn refuse(&mut self, topic: &'static str, error: &FrameError) {
+        let counter = match error {
+            FrameError::Block(_) => &mut self.refused_messages,
+            FrameError::TooLong(_) => &mut self.oversize_frames,
+        };
+        *counter += 1;
+        if *counter == 1 {
+            tracing::warn!(topic, %error, "not published; later ones are only counted");
+        }
+    }
 }
 
 /// The state of the run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Status {
+    /// Of every frame of this run.
+    pub schema_version: u32,
+    /// Name of the run.
+    pub run: String,
+    /// Its identity.
+    pub run_id: String,
+    /// Number of the environment.
+    pub env: u32,
+    /// What the run is for.
+    pub mode: Mode,
     /// Newest tick published.
     pub tick: u64,
     /// Episode of that tick.
     pub episode: u64,
+    /// Ticks of that episode before it.
+    pub step: u64,
     /// Simulated time within that episode, nanoseconds.
     pub sim_time_ns: u64,
     /// True in an evaluation episode.
     pub evaluation: bool,
+    /// Wall seconds since the run was started.
+    pub run_age_s: f64,
+    /// Ticks per wall second, lately.
+    pub ticks_per_s: f64,
+    /// Simulated seconds per wall second, lately.
+    pub real_time_factor: f64,
+    /// Who is on the road.
+    pub road_users: RoadUsers,
+    /// Whose sensors deliver.
+    pub sensors: Delivering,
+    /// Errors of the newest set.
+    pub errors_m: Errors,
     /// Every process of the run.
     pub processes: Vec<ProcessStatus>,
     /// How learning goes; `None` in a run without.
     pub training: Option<Training>,
     /// What the fan-out itself did.
     pub fanout: Counters,
+}
+
+/// Seconds since process `pid` was started; 0 if it is gone.
+#[must_use]
+pub fn age_s(pid: i32) -> f64 {
+    let read = |path: &str| std::fs::read_to_string(path).unwrap_or_default();
+    let uptime_s = read("/proc/uptime")
+        .split_whitespace()
+        .next()
+        .and_then(|text| text.parse::<f64>().ok());
+    let stat = read(&format!("/proc/{pid}/stat"));
+    // After the name in parentheses; the 22nd field of all, in hundredths of a second (proc(5)).
+    let started = stat.rsplit(')').next().and_then(|rest| rest.split_whitespace().nth(19));
+    let started_s = started
+        .and_then(|text| text.parse::<f64>().ok())
+        .map(|ticks| ticks / 100.0);
+    uptime_s
+        .zip(started_s)
+        .map_or(0.0, |(uptime, started)| uptime - started)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_has_an_age() {
+        let own = i32::try_from(std::process::id()).unwrap();
+        assert!((0.0..100_000.0).contains(&age_s(own)));
+        assert_eq!(age_s(-1), 0.0);
+    }
 }

@@ -3,13 +3,25 @@
 #[cfg(test)]
 mod harness;
 
-use bytemuck::cast_slice;
+use std::{io::Write as _, mem::offset_of, net::TcpStream};
+
+use bytemuck::{cast_slice, pod_read_unaligned};
 use fanout::keys::Topic;
 use harness::{
-    PATIENCE, Run, ask, next, observation, publisher, send_observation, send_prediction, send_world, states, until,
-    watch,
+    PATIENCE, Run, ask, header, next, observation, publisher, send, send_census, send_observation, send_prediction,
+    send_scan, send_world, states, until, watch,
 };
-use ipc_schema::{board::State, failure::Failure, header::LAST_OF_RUN, process::Process, run::Mode, services::Channel};
+use ipc_schema::{
+    SCHEMA_VERSION,
+    board::State,
+    failure::Failure,
+    header::{LAST_OF_RUN, MessageHeader},
+    pointcloud::Scan,
+    process::Process,
+    run::Mode,
+    services::Channel,
+    traffic::{SignalMeta, VehicleMeta, id_hash},
+};
 use zenoh::{Wait, sample::SampleKind};
 
 /// The whole of a train run: frames are the bytes of shared memory, of one tick, newest wins, and the end is an end.
@@ -49,8 +61,8 @@ fn frames_are_the_bytes_of_shared_memory() {
         );
         let (header, payload) = next(&predicted);
         assert_eq!(
-            (header.tick, payload),
-            (tick, cast_slice(&[[tick as f32, 0.5]; 4]).to_vec())
+            (header.tick, &payload[..32]),
+            (tick, cast_slice(&[[tick as f32, 0.5]; 4]))
         );
     }
 
@@ -87,7 +99,7 @@ fn a_late_joiner_has_the_whole_picture() {
     until("a status with the tick", || {
         let status = ask(&viewer, &run.key(Topic::Status)).unwrap();
         let status: serde_json::Value = serde_json::from_slice(&status).unwrap();
-        status["processes"].as_array().is_some_and(|p| p.len() == 5) && status["fanout"]["frames"] == 1
+        status["processes"].as_array().is_some_and(|p| p.len() == 5) && status["fanout"]["frames"] != 0
     });
 
     let alive = viewer
@@ -176,4 +188,158 @@ fn it_stops_when_asked() {
     let _viewer = run.attach();
     fanout.terminate().unwrap();
     assert_eq!(fanout.exit_code(), Some(0));
+}
+
+/// What changes slowly comes whole with a question, whatever characters ids have; scans only to those who want them.
+#[test]
+fn ids_lights_and_scans_of_any_name_reach_who_asks() {
+    const IDS: [&str; 3] = ["plain", "a/b #?$*", "ünï%41"];
+    let run = Run::new("names", Mode::Simulate);
+    let _fanout = run.start_fanout();
+    let viewer = run.attach();
+    let (bridge, censuses) = publisher(&run, Channel::Census);
+    let (sim, worlds) = publisher(&run, Channel::World);
+    let (sensors, scans) = publisher(&run, Channel::Pointcloud);
+    let lights = watch(&viewer, run.key(Topic::Signals));
+    until("attendance", || {
+        sim.board_of(Process::Fanout).unwrap().progress().attached == 1
+    });
+    send_world(&sim, &worlds, 0, 0, 3);
+    send_census(&bridge, &censuses, 0, &IDS, "rG");
+    let (header, payload) = next(&lights);
+    let state = |payload: &[u8], row: usize| payload[row * size_of::<SignalMeta>() + offset_of!(SignalMeta, state)];
+    assert_eq!((header.count, state(&payload, 0), state(&payload, 1)), (2, b'r', b'G'));
+
+    let late = run.attach();
+    until("the table of road users", || {
+        let Some(frame) = ask(&late, &run.key(Topic::Vehicles)) else {
+            return false;
+        };
+        let (header, payload) = fanout::frame::decode(&frame).unwrap();
+        let rows = payload.chunks_exact(size_of::<VehicleMeta>());
+        let ids: Vec<String> = rows
+            .map(|row| pod_read_unaligned::<VehicleMeta>(row).id_text())
+            .collect();
+        header.count == 3 && ids == IDS
+    });
+    assert!(ask(&late, &run.key(Topic::Signals)).is_some_and(|frame| state(&frame[72..], 1) == b'G'));
+
+    // Nobody watches: nothing goes out. Then somebody does.
+    send_scan(&sensors, &scans, 1, (IDS[1], 1), 50);
+    let wanted = watch(&late, run.scan_key(IDS[1]));
+    let mut tick = 1;
+    until("a scan", || {
+        tick += 1;
+        send_scan(&sensors, &scans, tick, (IDS[2], 2), 50);
+        send_scan(&sensors, &scans, tick, (IDS[1], 1), 50);
+        ask(&late, &run.scan_key(IDS[1])).is_some()
+    });
+    let (header, payload) = next(&wanted);
+    assert_eq!((header.count, header.sequence), (50, 1));
+    assert_eq!(
+        pod_read_unaligned::<Scan>(&payload[..size_of::<Scan>()]).id_hash,
+        id_hash(IDS[1])
+    );
+    assert!(ask(&late, &run.scan_key(IDS[2])).is_none());
+}
+
+/// Random bytes on the port, nonsense on every key, another version in shared memory: counted, and nobody dies of it.
+#[test]
+fn garbage_is_counted_and_hurts_nobody() {
+    let run = Run::new("garbage", Mode::Simulate);
+    let mut fanout = run.start_fanout();
+    let viewer = run.attach();
+    let world = watch(&viewer, run.key(Topic::World));
+    let (sim, worlds) = publisher(&run, Channel::World);
+    let (sensors, observations) = publisher(&run, Channel::Observation);
+    until("attendance", || {
+        sim.board_of(Process::Fanout).unwrap().progress().attached == 1
+    });
+    for seed in 0..20_u64 {
+        let mut port = TcpStream::connect(("127.0.0.1", run.port)).unwrap();
+        let bytes: Vec<u8> = (0..200 * seed)
+            .map(|i| (i.wrapping_mul(6_364_136_223_846_793_005 ^ seed) >> 33) as u8)
+            .collect();
+        // It may be cut off in the middle: that is a refusal.
+        let _ = port.write_all(&bytes);
+        // A length that promises more than comes, and a torn connection.
+        let _ = port.write_all(&[0xff, 0xff, 1, 2, 3]);
+    }
+    let vandal = run.attach();
+    let keys = Topic::ALL.map(|topic| run.key(topic)).into_iter();
+    let keys: Vec<String> = keys
+        .chain([
+            run.alive_key(),
+            run.scan_key("x"),
+            format!("{}/x/y", run.key(Topic::World)),
+        ])
+        .collect();
+    for key in &keys {
+        for bytes in [vec![], vec![0xff; 71], vec![7; 300]] {
+            vandal.put(key, bytes).wait().unwrap();
+        }
+        vandal.delete(key).wait().unwrap();
+        let _ = vandal.get(format!("{key}?_anyke;x=%")).payload(vec![1; 99]).wait();
+    }
+    // A sender of another version, and one that promises more than it holds.
+    let old = MessageHeader {
+        schema_version: SCHEMA_VERSION - 1,
+        ..header(&sim, 0, 0, 1, 0)
+    };
+    send(&worlds, old, &[0; 136]);
+    send(&observations, header(&sensors, 0, 0, 4000, 9), &[0; 64]);
+    send_world(&sim, &worlds, 1, 0, 3);
+    let mine = |payload: &[u8]| payload == cast_slice::<_, u8>(&states(1, 3));
+    until("a frame of the run among the nonsense", || {
+        let sample = world.recv_timeout(PATIENCE).unwrap().unwrap();
+        let bytes = sample.payload().to_bytes();
+        fanout::reader::check("world", &bytes, Some(run.file.run_id)).is_ok() && mine(&bytes[72..])
+    });
+    until("the counts", || {
+        let status = ask(&viewer, &run.key(Topic::Status)).unwrap();
+        let Ok(status) = serde_json::from_slice::<serde_json::Value>(&status) else {
+            return false;
+        };
+        let count = |name: &str| status["fanout"][name].as_u64().unwrap();
+        count("refused_samples") >= 4 * keys.len() as u64 && count("refused_messages") == 2
+    });
+    send_world(&sim, &worlds, 2, LAST_OF_RUN, 3);
+    assert_eq!(fanout.exit_code(), Some(0));
+}
+
+/// A killed fan-out that is started again shows the run to the viewer that watched the one before.
+#[test]
+fn viewers_come_back_to_the_next_fan_out() {
+    let run = Run::new("again", Mode::Simulate);
+    let (sim, worlds) = publisher(&run, Channel::World);
+    let (bridge, censuses) = publisher(&run, Channel::Census);
+    let mut fanout = run.start_fanout();
+    let viewer = run.attach();
+    let world = watch(&viewer, run.key(Topic::World));
+    let mut tick = 0;
+    let mut shown = || {
+        tick += 1;
+        send_world(&sim, &worlds, tick, 0, 3);
+        send_census(&bridge, &censuses, tick, &["a"], "r");
+        world
+            .recv_timeout(std::time::Duration::from_millis(100))
+            .unwrap()
+            .is_some()
+    };
+    for incarnation in 1..4 {
+        until("a frame", &mut shown);
+        fanout.0.kill().unwrap();
+        fanout.0.wait().unwrap();
+        run.forget_dead();
+        while world.try_recv().unwrap().is_some() {}
+        fanout = run.start_incarnation(incarnation);
+    }
+    until("a frame", &mut shown);
+    let late = run.attach();
+    until("the whole picture", || {
+        shown();
+        [Topic::Map, Topic::Vehicles, Topic::Signals, Topic::World, Topic::Status]
+            .into_iter()
+            .all(|topic| ask(&late, &run.key(topic)).is_some())
+    });
 }

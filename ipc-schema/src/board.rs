@@ -113,6 +113,8 @@ pub struct TrainingStatus {
     pub policy_std: f64,
     /// Mean reward, lately.
     pub reward: f64,
+    /// Largest of those so far.
+    pub best_reward: f64,
     /// Mean error of the policy, metres: the last evaluation, or of the samples before the first.
     pub error_m: f64,
     /// Mean error of the raw GNSS fix on the same samples, metres.

@@ -358,6 +358,8 @@ pub struct Trainer {
     pub checkpoint_interval: u64,
     /// Newest checkpoints that are kept.
     pub checkpoints_kept: u64,
+    /// When the Kalman filter's estimates travel beside the predictions.
+    pub estimates: Estimates,
 }
 
 /// Shared memory → zenoh.
@@ -368,6 +370,32 @@ pub struct Fanout {
     pub enabled: bool,
     /// zenoh endpoint to listen on.
     pub listen: String,
-    /// Most frames per wall second and topic.
-    pub rate_hz: f64,
+    /// Most frames of `world` per wall second.
+    pub world_hz: f64,
+    /// The same of `observation`.
+    pub observation_hz: f64,
+    /// The same of `prediction`.
+    pub prediction_hz: f64,
+    /// The same of each LIDAR's `pointcloud`.
+    pub pointcloud_hz: f64,
+    /// The same of `event`.
+    pub event_hz: f64,
+    /// The same of `signals`.
+    pub signals_hz: f64,
+    /// The same of `vehicles`.
+    pub vehicles_hz: f64,
+    /// The same of `status`.
+    pub status_hz: f64,
+}
+
+/// When the trainer runs the Kalman filter beside the policy, for whoever watches.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Estimates {
+    /// In a run paced by the wall clock: at full speed the filter costs more than the policy.
+    Paced,
+    /// Always.
+    Always,
+    /// Never.
+    Never,
 }

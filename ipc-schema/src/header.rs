@@ -25,7 +25,7 @@ pub struct MessageHeader {
     pub run_id: u64,
     /// Counts the replacements of the sending process. `observation`: of the trainer that it is meant for.
     pub incarnation: u32,
-    /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`].
+    /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`]; from bit 8 on what the payload says.
     pub flags: u32,
     /// Episode number, 0-based over the run.
     pub episode: u64,

@@ -80,7 +80,8 @@ pub fn table() -> Vec<TypeLayout> {
             height_m,
             id_len,
             id,
-            vehicle_class
+            vehicle_class,
+            type_id
         }),
         layout!(SignalMeta {
             id_hash,
@@ -215,6 +216,7 @@ pub fn table() -> Vec<TypeLayout> {
             env_steps_per_s,
             policy_std,
             reward,
+            best_reward,
             error_m,
             raw_gnss_error_m
         }),

@@ -6,9 +6,10 @@
 //! | `traffic-meta`| [`traffic::TrafficMetaLayout`]: `[VehicleMeta]`, `[SignalMeta]`; or `[RoutePoint]` | traffic-bridge | sim-core          |
 //! | `world`       | [`world::WorldLayout`]: `[VehicleState]`, `[SubStep]`, `[HeroView]` | sim-core       | sensor-daemon     |
 //! | `observation` | [`observation::ObservationLayout`]: obs, truth, GNSS, slots       | sensor-daemon  | trainer           |
-//! | `prediction`  | `[[f32; 2]]`, one row for each slot of the observation            | trainer        | none; sim-core when it drives |
+//! | `prediction`  | [`prediction::PredictionLayout`]: one row for each slot of the observation | trainer | none; sim-core when it drives |
 //! | `ego-pose`    | `[EgoPose]`                                                       | sim-core       | traffic-bridge    |
 //! | `event`       | `[Collision]`                                                     | sim-core       | none              |
+//! | `census`      | as `traffic-meta`: everybody and every light, each simulated second | traffic-bridge | none              |
 //! | `board`       | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`] | every process  | none (newest wins)|
 //! | `roster`      | [`board::Roster`]: the incarnation of each process that counts    | supervisor     | none (newest wins)|
 //! | `wake`        | an event without content                                          | every peer     | its process       |
@@ -29,6 +30,7 @@ pub mod layout;
 pub mod observation;
 pub mod pointcloud;
 pub mod ports;
+pub mod prediction;
 pub mod process;
 pub mod props;
 pub mod run;
@@ -39,4 +41,4 @@ pub mod traffic;
 pub mod world;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 5;
+pub const SCHEMA_VERSION: u32 = 6;

@@ -189,6 +189,12 @@ impl RunFile {
         schedule::environment_seed(run.seed, run.first_env + self.env_index)
     }
 
+    /// Where `sim-core` writes what viewers are told of the scene, as JSON (docs/fanout.md, `map`), before it attaches.
+    #[must_use]
+    pub fn chart_path(&self) -> PathBuf {
+        self.run_dir.join("map").join("chart.json")
+    }
+
     /// SUMO steps per tick are 1 / this: ticks in one SUMO step.
     #[must_use]
     pub fn ticks_per_traffic_step(&self) -> u64 {

@@ -21,9 +21,12 @@ use crate::{
     header::MessageHeader,
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
+    prediction::{ESTIMATE_COLUMNS, PredictionLayout},
     process::Process,
     run::{RunFile, SharedMemory},
-    traffic::{ROUTE_POINTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout, TrafficState},
+    traffic::{
+        MOST_SIGNALS, ROUTE_POINTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout, TrafficState,
+    },
     world::WorldLayout,
 };
 
@@ -80,6 +83,8 @@ pub enum Channel {
     Traffic,
     /// Arrivals, departures and what a road user is.
     TrafficMeta,
+    /// Everybody on the road and every traffic light, once per simulated second.
+    Census,
     /// Road users as the nanoscopic core moves them.
     World,
     /// What connected vehicles sense.
@@ -96,9 +101,10 @@ pub enum Channel {
 
 impl Channel {
     /// All data services.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Traffic,
         Self::TrafficMeta,
+        Self::Census,
         Self::World,
         Self::Observation,
         Self::Prediction,
@@ -113,6 +119,7 @@ impl Channel {
         match self {
             Self::Traffic => "traffic",
             Self::TrafficMeta => "traffic-meta",
+            Self::Census => "census",
             Self::World => "world",
             Self::Observation => "observation",
             Self::Prediction => "prediction",
@@ -126,7 +133,7 @@ impl Channel {
     #[must_use]
     pub fn producer(self) -> Process {
         match self {
-            Self::Traffic | Self::TrafficMeta => Process::TrafficBridge,
+            Self::Traffic | Self::TrafficMeta | Self::Census => Process::TrafficBridge,
             Self::World | Self::EgoPose | Self::Event => Process::SimCore,
             Self::Observation | Self::Pointcloud => Process::SensorDaemon,
             Self::Prediction => Process::Trainer,
@@ -142,8 +149,8 @@ impl Channel {
             Self::Observation => Some(Process::Trainer),
             Self::EgoPose => Some(Process::TrafficBridge),
             // In the driving task sim-core waits for each of them, so the trainer is at most one ahead and no queue overflows.
-            // Whoever looks at point clouds may miss some: the newest win.
-            Self::Prediction | Self::Event | Self::Pointcloud => None,
+            // Whoever looks at point clouds or a census may miss some: the newest win.
+            Self::Prediction | Self::Event | Self::Pointcloud | Self::Census => None,
         }
     }
 
@@ -163,13 +170,14 @@ impl Channel {
             Self::TrafficMeta => TrafficMetaLayout::new(2 * road_users, SIGNALS_PER_MESSAGE)
                 .len
                 .max(ROUTE_POINTS_PER_MESSAGE * size_of::<RoutePoint>()),
+            Self::Census => TrafficMetaLayout::new(road_users, MOST_SIGNALS).len,
             Self::World => {
                 WorldLayout::with_heroes(road_users, run.config.run.sub_steps as usize, run.config.heroes()).len
             }
             Self::Observation => {
                 ObservationLayout::new(road_users, run.config.observation_width(), run.config.imu_samples()).len
             }
-            Self::Prediction => road_users * size_of::<[f32; 2]>(),
+            Self::Prediction => PredictionLayout::new(road_users, ESTIMATE_COLUMNS, true).len,
             Self::EgoPose => road_users * size_of::<EgoPose>(),
             Self::Event => road_users * size_of::<Collision>(),
             Self::Pointcloud => PointcloudLayout::new(run.config.lidar.rays_per_tick(run.config.run.tick_s)).len,
@@ -183,6 +191,8 @@ impl Channel {
         match self {
             // All heroes may come within one step, each with its route.
             Self::TrafficMeta => window + run.config.heroes() * ROUTE_MESSAGES_PER_HERO + SPARE_MESSAGES,
+            // The newest replaces the one before.
+            Self::Census => SPARE_MESSAGES,
             // The scans of one tick.
             Self::Pointcloud => run.config.lidar.vehicles as usize + SPARE_MESSAGES,
             _ => window + SPARE_MESSAGES,
@@ -191,13 +201,13 @@ impl Channel {
 
     /// True where the newest message pushes the oldest out of a full queue; else it is the newest that is dropped, and counted.
     const fn newest_wins(self) -> bool {
-        matches!(self, Self::Pointcloud)
+        matches!(self, Self::Pointcloud | Self::Census)
     }
 
     /// Messages that one subscriber may hold while it works on them.
     fn in_hand(self, run: &RunFile) -> usize {
         match self {
-            Self::Pointcloud => SPARE_MESSAGES,
+            Self::Pointcloud | Self::Census => SPARE_MESSAGES,
             // A batch at work while the next one is taken.
             _ => 2 * self.queue_length(run),
         }
@@ -206,7 +216,12 @@ impl Channel {
     /// Most shared memory this service can touch, bytes: every queue full, every message of the longest size.
     #[must_use]
     pub fn worst_case_bytes(self, run: &RunFile) -> usize {
-        if self == Self::Pointcloud && run.config.lidar.vehicles == 0 {
+        let unused = match self {
+            Self::Pointcloud => run.config.lidar.vehicles == 0,
+            Self::Census => !run.config.fanout.enabled,
+            _ => false,
+        };
+        if unused {
             return 0;
         }
         let per_subscriber = self.queue_length(run) + self.in_hand(run);

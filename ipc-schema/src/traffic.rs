@@ -101,6 +101,8 @@ pub const VEHICLE_CLASSES: [&str; 34] = [
 
 /// Longest id carried as text; longer ids are cut, their hash is of the whole.
 pub const ID_BYTES: usize = 64;
+/// Longest name of a vehicle type that is carried.
+pub const TYPE_ID_BYTES: usize = 32;
 
 /// Slowly changing facts about a road user.
 #[repr(C)]
@@ -128,6 +130,8 @@ pub struct VehicleMeta {
     pub id: [u8; ID_BYTES],
     /// SUMO's vehicle class ("passenger", "truck", …), UTF-8, zero padded.
     pub vehicle_class: [u8; 16],
+    /// SUMO's vehicle type, UTF-8, zero padded; cut.
+    pub type_id: [u8; TYPE_ID_BYTES],
 }
 
 impl VehicleMeta {
@@ -150,6 +154,9 @@ pub const SIGNAL_LINKS: usize = 128;
 
 /// Most traffic lights in one `traffic-meta` message; more changes in one step take more messages.
 pub const SIGNALS_PER_MESSAGE: usize = 256;
+
+/// Most traffic lights in a census; of those beyond only the changes are told.
+pub const MOST_SIGNALS: usize = 4096;
 
 /// State of one traffic light, sent when the episode begins and whenever it changes.
 #[repr(C)]

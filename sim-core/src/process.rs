@@ -20,7 +20,7 @@ use crate::{
     collision::{CollisionCounts, Contacts},
     driving::Account,
     mirror::{Mirror, MirrorError, Settings},
-    scene::Scene,
+    scene::{Scene, chart::Chart},
     statistics::Summary,
 };
 
@@ -89,6 +89,7 @@ impl Core {
         let consumer_wake = session.waker(Process::SensorDaemon)?;
         let scene = Arc::new(Scene::of_run(&session.run)?);
         let contacts = Contacts::open(&session, Arc::clone(&scene))?;
+        draw_chart(&session, &scene)?;
         let actions = match session.run.config.drives() {
             true => Some(Actions::open(&mut session, Arc::clone(&scene))?),
             false => None,
@@ -275,6 +276,18 @@ impl Core {
             collisions,
         })
     }
+}
+
+/// Tells viewers what the scene looks like, if there may be any.
+fn draw_chart(session: &Session, scene: &Scene) -> Result<(), Failure> {
+    if !session.run.config.fanout.enabled {
+        return Ok(());
+    }
+    let path = session.run.chart_path();
+    Chart::of_run(&session.run, scene)?.write(&path).map_err(|error| {
+        Failure::new(FailureKind::Run, format!("cannot write {}: {error}", path.display()))
+            .with_help("check free space and permissions of the run directory")
+    })
 }
 
 /// The payload as `count` rows.

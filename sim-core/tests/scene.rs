@@ -17,7 +17,7 @@ use ipc_schema::{
     props::ObstacleError,
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
 };
-use sim_core::scene::{Scene, SceneError, Surface, shape};
+use sim_core::scene::{Scene, SceneError, Surface, chart::Chart, shape};
 
 /// The SUMO that `make build` installed, or the one that is named instead.
 fn sumo_home() -> PathBuf {
@@ -353,4 +353,44 @@ fn the_motorway_of_the_wheel_has_road_and_a_shopping_centre() {
             assert!(scene.is_on_road(*x, *y), "{} at {x}, {y}", piece.id);
         }
     }
+}
+
+#[test]
+fn viewers_are_told_of_lanes_lights_and_houses() {
+    let directory = tempfile::tempdir().unwrap();
+    let run = town(directory.path());
+    let scene = Scene::of_run(&run).unwrap();
+    let chart = Chart::of_run(&run, &scene).unwrap();
+    let count = |kind, inside| {
+        let lanes = chart.lanes.iter();
+        lanes.filter(|lane| lane.kind == kind && lane.inside == inside).count()
+    };
+    assert_eq!(
+        (count("car", false), count("sidewalk", false), count("crossing", true)),
+        (52, 52, 52)
+    );
+    assert!(
+        chart
+            .lanes
+            .iter()
+            .all(|lane| (lane.left == "none") == lane.inside && lane.points_m.len() > 1)
+    );
+    assert_eq!((chart.buildings.len(), chart.signals.len()), (62, 4));
+    for signal in &chart.signals {
+        assert!(signal.links.len() > 3, "{signal:?}");
+        for (number, link) in signal.links.iter().enumerate() {
+            assert_eq!(link.link as usize, number);
+            let lane = chart.lanes.iter().find(|lane| lane.id == link.lane).unwrap();
+            let end = if lane.kind == "crossing" {
+                lane.points_m.first()
+            } else {
+                lane.points_m.last()
+            };
+            assert_eq!(Some(&link.position_m), end);
+        }
+    }
+    let path = directory.path().join("map/chart.json");
+    chart.write(&path).unwrap();
+    let told: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    assert_eq!(told["lanes"].as_array().unwrap().len(), chart.lanes.len());
 }

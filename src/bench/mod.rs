@@ -3,6 +3,7 @@
 //! One file for each part; all end in a [`Report`]. Decision 9.
 
 mod envs;
+mod fanout;
 mod lidar;
 mod page;
 mod plots;
@@ -70,6 +71,7 @@ fn measure(part: Part, options: &Options) -> Result<Report, Exit> {
     match part {
         Part::Envs => envs::measure(options),
         Part::Lidar => lidar::measure(options),
+        Part::Fanout => fanout::measure(options),
         Part::All => Err(Exit::config("`all` is not a part", "")),
     }
 }

@@ -317,9 +317,17 @@ pub const KEYS: &[Key] = &[
     other("trainer.matmul_precision", Kind::Choice(&["auto", "float32", "bfloat16"]), "Precision of the inputs of matrix products; \"auto\" takes bfloat16 where the processor multiplies it in hardware (AMX)."),
     integer("trainer.checkpoint_interval", "updates", 1, 1_000_000, "Updates between two checkpoints; the last is always written."),
     integer("trainer.checkpoints_kept", "", 1, 1_000_000, "Newest checkpoints that are kept."),
+    other("trainer.estimates", Kind::Choice(&["paced", "always", "never"]), "When the Kalman filter runs beside the policy for whoever watches: in runs paced by `run.real_time_factor`, always, or never. At full speed it costs more than the policy."),
     other("fanout.enabled", Kind::Flag, "Start the fan-out process, which lets viewers attach."),
     other("fanout.listen", Kind::Text, "zenoh endpoint that viewers connect to."),
-    float("fanout.rate_hz", "1/s", 0.1, 1000.0, "Most frames per wall second and topic."),
+    float("fanout.world_hz", "1/s", 0.0, 1000.0, "Most frames of `world` per wall second; 0 = none."),
+    float("fanout.observation_hz", "1/s", 0.0, 1000.0, "Most frames of `observation` per wall second; 0 = none."),
+    float("fanout.prediction_hz", "1/s", 0.0, 1000.0, "Most frames of `prediction` per wall second; 0 = none."),
+    float("fanout.pointcloud_hz", "1/s", 0.0, 1000.0, "Most frames of each LIDAR per wall second, while somebody watches it; 0 = none."),
+    float("fanout.event_hz", "1/s", 0.0, 1000.0, "Most messages of contacts per wall second; 0 = none."),
+    float("fanout.signals_hz", "1/s", 0.0, 1000.0, "Most frames of traffic lights per wall second, after changes; 0 = none."),
+    float("fanout.vehicles_hz", "1/s", 0.0, 1000.0, "Most tables of road users per wall second; 0 = none."),
+    float("fanout.status_hz", "1/s", 0.0, 1000.0, "Most reports of how the run fares per wall second; 0 = none."),
 ];
 
 /// The key of this dotted path.
@@ -329,7 +337,10 @@ pub fn find(path: &str) -> Option<&'static Key> {
 }
 
 /// Keys of earlier versions, and what took their place.
-const RENAMED: [(&str, &str); 1] = [("imu.gravity_mps2", "imu.convention")];
+const RENAMED: [(&str, &str); 2] = [
+    ("imu.gravity_mps2", "imu.convention"),
+    ("fanout.rate_hz", "fanout.world_hz"),
+];
 
 /// The existing path that took the place of `path`, or the one most like it, if any is near.
 #[must_use]

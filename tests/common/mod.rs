@@ -10,7 +10,8 @@ use std::{
 };
 
 use ipc_schema::{
-    ports::Subscriber,
+    ports::{BoardReader, Subscriber},
+    process::Process,
     run::RunFile,
     services::{self, Channel, RunNode},
 };
@@ -160,6 +161,10 @@ impl Spectator {
             let node = services::node(&file.shared_memory).ok()?;
             Some(Self { node, file })
         })
+    }
+
+    pub fn board(&self, process: Process) -> BoardReader {
+        BoardReader::open(&self.node, &self.file, 0, process).unwrap()
     }
 
     pub fn subscribe(&self, channel: Channel) -> Subscriber {

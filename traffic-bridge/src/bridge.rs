@@ -17,6 +17,7 @@ use ipc_schema::{
 };
 
 use crate::{
+    census::Census,
     error::SumoError,
     fleet::Fleet,
     frame::Frame,
@@ -98,6 +99,8 @@ struct Bridge {
     membership: Membership,
     traffic: Publisher,
     meta: Publisher,
+    /// For whoever watches, if anybody may.
+    census: Option<(Publisher, Census)>,
     consumer: BoardReader,
     consumer_wake: Waker,
     /// Where the heroes are, in the driving task.
@@ -115,6 +118,10 @@ impl Bridge {
     fn open(membership: Membership, poses: Option<Subscriber>) -> Result<Self, Failure> {
         let traffic = membership.publisher(Channel::Traffic)?;
         let meta = membership.publisher(Channel::TrafficMeta)?;
+        let census = match membership.run.config.fanout.enabled {
+            true => Some((membership.publisher(Channel::Census)?, Census::default())),
+            false => None,
+        };
         let consumer = membership.board_of(Process::SimCore)?;
         let consumer_wake = membership.waker(Process::SimCore)?;
         let pacing = Pacing::new(membership.run.config.run.real_time_factor);
@@ -123,6 +130,7 @@ impl Bridge {
             membership,
             traffic,
             meta,
+            census,
             consumer,
             consumer_wake,
             poses,
@@ -282,6 +290,10 @@ impl Bridge {
             bytemuck::cast_slice(&frame.states),
         )?;
         self.consumer_wake.wake();
+        if let Some((publisher, census)) = &mut self.census {
+            census.enter(frame);
+            census.publish_if_due(publisher, header)?;
+        }
         self.ticks += self.ticks_per_step;
         self.vehicle_steps += frame.states.len() as u64;
         self.report(frame, &header);

@@ -90,7 +90,8 @@ impl Register {
             height_m: convention::single(event.height),
             id_len: 0,
             id: [0; ipc_schema::traffic::ID_BYTES],
-            vehicle_class: class_bytes(&event.vehicle_class),
+            vehicle_class: padded(&event.vehicle_class),
+            type_id: padded(&event.vehicle_type),
         };
         meta.set_id(&event.id);
         meta
@@ -131,9 +132,10 @@ fn meta_event(kind: RawEventKind) -> MetaEvent {
     }
 }
 
-fn class_bytes(class: &str) -> [u8; 16] {
-    let mut bytes = [0; 16];
-    let len = class.len().min(bytes.len());
-    bytes[..len].copy_from_slice(&class.as_bytes()[..len]);
+/// `text` cut at a character border, zero padded.
+fn padded<const N: usize>(text: &str) -> [u8; N] {
+    let mut bytes = [0; N];
+    let len = text.floor_char_boundary(N);
+    bytes[..len].copy_from_slice(&text.as_bytes()[..len]);
     bytes
 }

@@ -5,6 +5,7 @@
 
 pub mod bridge;
 pub mod catalogue;
+pub mod census;
 pub mod convention;
 pub mod error;
 pub mod fleet;

@@ -12,6 +12,7 @@ use ipc_schema::{
     header::{self, MessageHeader},
     observation::ObservationLayout,
     ports::{Message, Publisher, Subscriber, Waker},
+    prediction::{ESTIMATES, PredictionLayout},
     process::Process,
     run::RunFile,
     services::Channel as Service,
@@ -173,13 +174,15 @@ impl Attachment {
     }
 
     /// Publishes the predictions for `block`: `rows` is f32 `[n, columns]` in C order. In the driving task these are actions,
-    /// and the simulation waits for them.
+    /// and the simulation waits for them. `estimates` is f32 `[n, 2]`: what the filter says, beside them.
+    #[pyo3(signature = (block, rows, columns, policy_version, estimates=None))]
     fn publish_predictions(
         &self,
         block: &ObservationBlock,
         rows: &[u8],
         columns: u32,
         policy_version: u64,
+        estimates: Option<&[u8]>,
     ) -> PyResult<()> {
         let expected = block.header.count as usize * columns as usize * size_of::<f32>();
         if rows.len() != expected {
@@ -189,16 +192,34 @@ impl Attachment {
             )));
         }
         let inner = self.lock()?;
+        let answered = answer(inner.session.header(), &block.header);
         let header = MessageHeader {
             columns,
             sequence: policy_version,
-            ..answer(inner.session.header(), &block.header)
+            flags: answered.flags | if estimates.is_some() { ESTIMATES } else { 0 },
+            ..answered
         };
+        let layout = PredictionLayout::of(&header);
+        if let Some(estimates) = estimates
+            && estimates.len() != layout.estimate_m.len
+        {
+            return Err(PyValueError::new_err(format!(
+                "estimates have {} bytes, [n, 2] of f32 has {}",
+                estimates.len(),
+                layout.estimate_m.len
+            )));
+        }
         let mut draft = inner
             .predictions
-            .loan(header, rows.len())
+            .loan(header, layout.len)
             .map_err(|error| failed(&error))?;
-        draft.payload_mut().copy_from_slice(rows);
+        let payload = draft.payload_mut();
+        for (section, rows) in [
+            (layout.prediction, rows),
+            (layout.estimate_m, estimates.unwrap_or_default()),
+        ] {
+            payload[section.offset..section.offset + section.len].copy_from_slice(rows);
+        }
         draft.send().map_err(|error| failed(&error))?;
         if let Some(waker) = &inner.driven {
             waker.wake();
@@ -232,6 +253,10 @@ impl Attachment {
             env_steps_per_s: env_steps_per_s.unwrap_or(old.env_steps_per_s),
             policy_std: policy_std.unwrap_or(old.policy_std),
             reward: reward.unwrap_or(old.reward),
+            best_reward: match reward {
+                Some(reward) if old.best_reward == 0.0 || reward > old.best_reward => reward,
+                _ => old.best_reward,
+            },
             error_m: error_m.unwrap_or(old.error_m),
             raw_gnss_error_m: raw_gnss_error_m.unwrap_or(old.raw_gnss_error_m),
         };

@@ -16,11 +16,14 @@ use ipc_schema::{
     block::view_mut,
     header::MessageHeader,
     observation::ObservationLayout,
+    pointcloud::{PointcloudLayout, Scan},
     ports::Publisher,
+    prediction::PredictionLayout,
     process::Process,
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
     session::Session,
+    traffic::{SignalMeta, TrafficMetaLayout, VehicleMeta, id_hash},
     world::{VehicleState, WorldLayout},
 };
 use tempfile::TempDir;
@@ -38,6 +41,7 @@ pub struct Run {
     pub port: u16,
     path: PathBuf,
     _holder: ServiceHolder,
+    node: services::RunNode,
     _dir: TempDir,
     _sweep: Sweep,
 }
@@ -65,7 +69,10 @@ impl Run {
         std::fs::create_dir(dir.path().join("logs")).unwrap();
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let mut file = run_file(name, mode, dir.path().into(), port);
-        file.config.fanout.rate_hz = rate_hz;
+        let settings = &mut file.config.fanout;
+        settings.world_hz = rate_hz;
+        settings.observation_hz = rate_hz;
+        settings.prediction_hz = rate_hz;
         let path = file.write().unwrap();
         let node = services::node(&file.shared_memory).unwrap();
         let holder = ServiceHolder::create(&node, &file, 0).unwrap();
@@ -75,13 +82,20 @@ impl Run {
             port,
             path,
             _holder: holder,
+            node,
             _dir: dir,
         }
     }
 
     pub fn start_fanout(&self) -> Fanout {
+        self.start_incarnation(0)
+    }
+
+    /// The fan-out, started for the `incarnation`-th time again.
+    pub fn start_incarnation(&self, incarnation: u32) -> Fanout {
         let child = Command::new(env!("CARGO_BIN_EXE_fanout"))
             .arg(&self.path)
+            .env(ipc_schema::session::INCARNATION, incarnation.to_string())
             .stderr(Stdio::inherit())
             .spawn()
             .unwrap();
@@ -100,6 +114,15 @@ impl Run {
 
     pub fn key(&self, topic: Topic) -> String {
         Keys::new(&self.file.name, 0).topic(topic)
+    }
+
+    pub fn scan_key(&self, id: &str) -> String {
+        Keys::new(&self.file.name, 0).scan(id)
+    }
+
+    /// What `caraware` does when a process has died.
+    pub fn forget_dead(&self) {
+        services::forget_dead(&self.node);
     }
 
     pub fn alive_key(&self) -> String {
@@ -233,8 +256,45 @@ pub fn send_observation(session: &Session, publisher: &Publisher, tick: u64, fla
 }
 
 pub fn send_prediction(session: &Session, publisher: &Publisher, tick: u64, count: usize) {
+    let header = header(session, tick, 0, count, 2);
+    let layout = PredictionLayout::of(&header);
+    let mut payload = vec![0; layout.len];
     let rows = vec![[tick as f32, 0.5]; count];
-    send(publisher, header(session, tick, 0, count, 2), cast_slice(&rows));
+    payload[..layout.prediction.len].copy_from_slice(cast_slice(&rows));
+    send(publisher, header, &payload);
+}
+
+/// One of each of `ids`, by dense index, and a traffic light in the state of each letter.
+pub fn send_census(session: &Session, publisher: &Publisher, tick: u64, ids: &[&str], letters: &str) {
+    let layout = TrafficMetaLayout::new(ids.len(), letters.len());
+    let header = header(session, tick, 0, ids.len(), u32::try_from(letters.len()).unwrap());
+    let mut draft = publisher.loan(header, layout.len).unwrap();
+    let vehicles: &mut [VehicleMeta] = view_mut(draft.payload_mut(), layout.vehicles).unwrap();
+    for (index, (meta, id)) in vehicles.iter_mut().zip(ids).enumerate() {
+        meta.set_id(id);
+        meta.vehicle = u32::try_from(index).unwrap();
+    }
+    let signals: &mut [SignalMeta] = view_mut(draft.payload_mut(), layout.signals).unwrap();
+    for (index, (meta, letter)) in signals.iter_mut().zip(letters.bytes()).enumerate() {
+        (meta.signal, meta.links, meta.state[0]) = (u32::try_from(index).unwrap(), 1, letter);
+    }
+    draft.send().unwrap();
+}
+
+/// A scan of `points` points by the vehicle with this id and dense index.
+pub fn send_scan(session: &Session, publisher: &Publisher, tick: u64, (id, index): (&str, u32), points: usize) {
+    let layout = PointcloudLayout::new(points);
+    let header = MessageHeader {
+        sequence: index.into(),
+        ..header(session, tick, 0, points, 1)
+    };
+    let mut draft = publisher.loan(header, layout.len).unwrap();
+    let scan = Scan {
+        id_hash: id_hash(id),
+        ..Scan::default()
+    };
+    draft.payload_mut()[..size_of::<Scan>()].copy_from_slice(bytemuck::bytes_of(&scan));
+    draft.send().unwrap();
 }
 
 /// The publishers of a run, in the order of the data.
@@ -278,7 +338,7 @@ fn config(port: u16) -> serde_json::Value {
         serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
     config["run"]["sub_steps"] = SUB_STEPS.into();
     config["traffic"]["max_road_users"] = 2100.into();
-    config["fanout"] =
-        serde_json::json!({ "enabled": true, "listen": format!("tcp/127.0.0.1:{port}"), "rate_hz": 50.0 });
+    config["lidar"]["vehicles"] = 2.into();
+    config["fanout"]["listen"] = format!("tcp/127.0.0.1:{port}").into();
     config
 }

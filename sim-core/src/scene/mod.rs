@@ -13,6 +13,7 @@ use ipc_schema::{
 use crate::geodesy::GeodesyError;
 
 mod building;
+pub mod chart;
 mod grid;
 mod level;
 mod prop;

@@ -218,10 +218,20 @@ class Channel:
         """All ticks up to and including `tick` are in a checkpoint that has been renamed into place."""
         self._attachment.committed(tick)
 
-    def publish_predictions(self, observation: Observation, predictions: Tensor, policy_version: int) -> None:
-        """Predicted positions, f32 [n, 2] in world metres, for everybody who watches."""
+    def publish_predictions(
+        self,
+        observation: Observation,
+        predictions: Tensor,
+        policy_version: int,
+        estimates: np.ndarray | None = None,
+    ) -> None:
+        """Predicted positions, f32 [n, 2] in world metres, for everybody who watches.
+
+        `estimates`, f32 [n, 2], are those of a filter beside the policy, not-a-number where it has none.
+        """
         rows = predictions.detach().to(torch.float32).contiguous().numpy()
-        self._attachment.publish_predictions(observation.block, rows.tobytes(), rows.shape[1], policy_version)
+        beside = None if estimates is None else np.ascontiguousarray(estimates, dtype=np.float32).tobytes()
+        self._attachment.publish_predictions(observation.block, rows.tobytes(), rows.shape[1], policy_version, beside)
 
     def publish_actions(self, observation: Observation, actions: np.ndarray, policy_version: int = 0) -> None:
         """Actions of the driving task: steering (left is positive) and acceleration, each in -1 ... 1.

@@ -78,6 +78,8 @@ class TrainerConfig:
     seed: int = 1
     checkpoint_interval_updates: int = 10
     checkpoints_kept: int = 5
+    estimates: str = "paced"
+    """When the Kalman filter runs beside the policy for whoever watches: `paced`, `always`, `never`."""
 
     @classmethod
     def from_run(cls, run: dict) -> "TrainerConfig":
@@ -102,6 +104,7 @@ class TrainerConfig:
     def _check(self) -> None:
         _choice("algorithm", self.algorithm, ("ppo",))
         _choice("device", self.device, ("cpu", "auto"))
+        _choice("estimates", self.estimates, ("paced", "always", "never"))
         _choice("reward", self.reward, tuple(rewards.REWARDS))
         _choice("matmul_precision", self.matmul_precision, ("auto", "float32", "bfloat16"))
         for name in ("learning_rate", "learning_rate_decay", "initial_std", "max_grad_norm", "reward_scale_m"):
@@ -166,6 +169,8 @@ class RunConfig:
     """Errors of the sensors, which the classical baselines are tuned with; None for a run file without sensors."""
     environments: tuple[int, ...] = (0,)
     """Indices of this run's environments among those of all runs that learn together."""
+    is_paced: bool = False
+    """The simulation keeps to the wall clock: there is time for what only a watcher sees."""
     resume_from: Path | None = field(default=None)
     """A checkpoint directory to continue from."""
 
@@ -189,8 +194,14 @@ class RunConfig:
             evaluation_interval=episodes.get("evaluation_interval", 0),
             sensors=SensorNoise.from_run(run),
             environments=tuple(range(first_env, first_env + place.get("envs", 1))),
+            is_paced=run.get("config", {}).get("run", {}).get("real_time_factor", 0.0) > 0.0,
             resume_from=Path(resume) if resume else None,
         )
+
+    def shows_estimates(self) -> bool:
+        """The Kalman filter runs beside the policy. At full speed it would cost more than the policy."""
+        wanted = {"paced": self.is_paced, "always": True, "never": False}[self.trainer.estimates]
+        return wanted and self.sensors is not None
 
     def progress(self, episode: int) -> float:
         """Share of the training episodes that lie before the run's `episode`-th; evaluations stand between them."""

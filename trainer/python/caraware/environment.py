@@ -8,7 +8,10 @@ environments' own ticks alone, never on how they happen to arrive together.
 from collections import deque
 from dataclasses import dataclass
 
+import numpy as np
+
 from caraware.config import RunConfig
+from caraware.estimates import Estimates
 from caraware.evaluation import Evaluation
 from caraware.rollout import Rollout
 from caraware.stream import Channel, Observation
@@ -60,7 +63,13 @@ class Environment:
         self.evaluation: Evaluation | None = None
         self.evaluation_tick = self.evaluated_tick = -1
         """Newest tick of the open evaluation phase, and of those that are finished."""
+        shown = config.sensors if config.shows_estimates() else None
+        self._estimates = Estimates(shown) if shown else None
         self._received_last = False
+
+    def estimates_m(self, obs: Observation) -> np.ndarray | None:
+        """f32 `[n, 2]`: the Kalman filter's positions (m, world), for whoever watches; None if it is not to run."""
+        return self._estimates.position_m(obs) if self._estimates else None
 
     def start(self, place: Place, horizon: int, observation_size: int) -> None:
         """Go on from `place`, collecting `horizon` samples for every update."""

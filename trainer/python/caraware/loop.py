@@ -231,7 +231,11 @@ class TrainingLoop:
     def _take(self, environment: Environment, obs: Observation, predicted_m: Tensor) -> None:
         """Everything that one tick causes."""
         channel = environment.channel
-        channel.publish_predictions(obs, predicted_m, self._updates())
+        estimates_m = environment.estimates_m(obs)
+        if estimates_m is None:
+            channel.publish_predictions(obs, predicted_m, self._updates())
+        else:
+            channel.publish_predictions(obs, predicted_m, self._updates(), estimates_m)
         policy_m, raw_m = errors_m(obs, predicted_m)
         environment.episode = obs.episode
         self._vehicles = max(self._vehicles, int(np.count_nonzero(obs.valid)))

@@ -115,8 +115,14 @@ class Channel(Protocol):
     def committed(self, tick: int) -> None:
         """Say that all ticks up to and including `tick` are in a checkpoint: nobody needs to deliver them again."""
 
-    def publish_predictions(self, observation: Any, predictions: Tensor, policy_version: int) -> None:
-        """Send f32 `[n, 2]` predicted positions in world metres for the tick of `observation`."""
+    def publish_predictions(
+        self,
+        observation: Any,
+        predictions: Tensor,
+        policy_version: int,
+        estimates: np.ndarray | None = None,
+    ) -> None:
+        """Send f32 `[n, 2]` predicted positions in world metres for the tick of `observation`, and a filter's."""
 
     def done(self) -> None:
         """Say that all work is done, so that the run may end."""

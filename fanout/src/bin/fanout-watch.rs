@@ -1,0 +1,219 @@
+//! `fanout-watch ENDPOINT RUN [--viewers N] [--seconds S] [--bytes-per-s B] [--log FILE]`: viewers that draw nothing. They count
+//! what comes, what is lost on the way and what is to be refused, and print it as JSON. For tests and `caraware bench fanout`.
+
+use std::{
+    collections::BTreeMap,
+    fs::File,
+    io::{self, BufWriter, Read, Write},
+    net::{TcpListener, TcpStream},
+    process::ExitCode,
+    sync::{Arc, Mutex, PoisonError},
+    thread,
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+};
+
+use fanout::{keys::Keys, outlet::read_attachment, reader};
+use zenoh::{Wait, sample::Sample};
+
+type Failure = Box<dyn std::error::Error + Send + Sync>;
+
+/// What the command line says.
+struct Options {
+    endpoint: String,
+    run: String,
+    viewers: usize,
+    seconds: f64,
+    /// Speed of the link, 0 = as it is.
+    bytes_per_s: u64,
+    /// Where to note each `world` frame: tick and UNIX time in nanoseconds.
+    log: Option<File>,
+}
+
+impl Options {
+    fn read() -> Result<Self, Failure> {
+        let mut arguments = std::env::args().skip(1);
+        let mut next = |what: &str| arguments.next().ok_or_else(|| format!("{what} is missing"));
+        let mut options = Self {
+            endpoint: next("ENDPOINT")?,
+            run: next("RUN")?,
+            viewers: 1,
+            seconds: 10.0,
+            bytes_per_s: 0,
+            log: None,
+        };
+        while let Ok(name) = next("") {
+            let value = next(&name)?;
+            match name.as_str() {
+                "--viewers" => options.viewers = value.parse()?,
+                "--seconds" => options.seconds = value.parse()?,
+                "--bytes-per-s" => options.bytes_per_s = value.parse()?,
+                "--log" => options.log = Some(File::create(value)?),
+                _ => return Err(format!("unknown option {name}").into()),
+            }
+        }
+        Ok(options)
+    }
+}
+
+/// What came of one topic, of all viewers together.
+#[derive(Default, serde::Serialize)]
+struct Count {
+    received: u64,
+    bytes: u64,
+    /// Gaps in the sequence numbers: lost on the way.
+    lost: u64,
+    /// Sequences that began anew: another fan-out.
+    begun_anew: u64,
+    refused: u64,
+    /// From shared memory to here, median, milliseconds.
+    median_age_ms: f64,
+    #[serde(skip)]
+    ages_ms: Vec<f64>,
+    #[serde(skip)]
+    sequences: BTreeMap<(usize, String), u64>,
+}
+
+impl Count {
+    fn add(&mut self, viewer: usize, sample: &Sample, topic: &str, now_ns: u64) {
+        let bytes = sample.payload().to_bytes();
+        self.received += 1;
+        self.bytes += bytes.len() as u64;
+        let told = sample
+            .attachment()
+            .and_then(|attachment| read_attachment(&attachment.to_bytes()));
+        let (Ok(_), Some((sequence, taken_ns))) = (reader::check(topic, &bytes, None), told) else {
+            self.refused += 1;
+            return;
+        };
+        self.ages_ms.push(now_ns.saturating_sub(taken_ns) as f64 / 1e6);
+        let key = (viewer, sample.key_expr().to_string());
+        match self.sequences.insert(key, sequence) {
+            Some(before) if sequence > before => self.lost += sequence - before - 1,
+            Some(_) => self.begun_anew += 1,
+            None => {}
+        }
+    }
+}
+
+#[derive(Default)]
+struct Counts {
+    topics: BTreeMap<String, Count>,
+    log: Option<BufWriter<File>>,
+}
+
+impl Counts {
+    fn add(&mut self, viewer: usize, sample: &Sample, prefix: usize) {
+        #[expect(clippy::disallowed_methods, reason = "compared with the time on what comes")]
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let now_ns = u64::try_from(now.as_nanos()).unwrap_or(u64::MAX);
+        let topic = sample.key_expr().as_str().get(prefix..).unwrap_or_default();
+        let name = topic.split('/').next().unwrap_or_default();
+        self.topics
+            .entry(name.to_owned())
+            .or_default()
+            .add(viewer, sample, topic, now_ns);
+        if let (Some(log), "world") = (&mut self.log, name)
+            && let Some((header, _)) = fanout::frame::decode(&sample.payload().to_bytes())
+            && writeln!(log, "{},{now_ns}", header.tick).is_err()
+        {
+            self.log = None;
+        }
+    }
+}
+
+/// A viewer's zenoh, once the fan-out listens.
+fn attach(endpoint: &str) -> Result<zenoh::Session, Failure> {
+    let endpoint = serde_json::to_string(endpoint)?;
+    let config = zenoh::Config::from_json5(&format!(
+        r#"{{ mode: "client", connect: {{ endpoints: [{endpoint}], timeout_ms: 20000 }},
+             scouting: {{ multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }},
+             transport: {{ shared_memory: {{ enabled: false }} }} }}"#
+    ))?;
+    zenoh::open(config).wait()
+}
+
+/// A link of `bytes_per_s` to `endpoint`: its address. Little is in flight, as in a real one.
+fn slow_link(endpoint: &str, bytes_per_s: u64) -> Result<String, Failure> {
+    let address = endpoint.strip_prefix("tcp/").ok_or("only tcp/HOST:PORT")?.to_owned();
+    let listener = TcpListener::bind("127.0.0.1:0")?;
+    let local = format!("tcp/{}", listener.local_addr()?);
+    thread::spawn(move || {
+        for client in listener.incoming().flatten() {
+            let Ok(server) = TcpStream::connect(&address) else {
+                continue;
+            };
+            let (Ok(up), Ok(up_to)) = (client.try_clone(), server.try_clone()) else {
+                continue;
+            };
+            thread::spawn(move || pass(up, up_to, u64::MAX));
+            thread::spawn(move || pass(server, client, bytes_per_s));
+        }
+    });
+    Ok(local)
+}
+
+fn pass(mut from: TcpStream, mut to: TcpStream, bytes_per_s: u64) -> io::Result<()> {
+    let mut buffer = [0; 2048];
+    let (begun, mut passed) = (Instant::now(), 0_u64);
+    loop {
+        let length = from.read(&mut buffer)?;
+        if length == 0 {
+            return Ok(());
+        }
+        to.write_all(&buffer[..length])?;
+        passed += length as u64;
+        let due = Duration::from_secs_f64(passed as f64 / bytes_per_s as f64);
+        thread::park_timeout(due.saturating_sub(begun.elapsed()));
+    }
+}
+
+fn watch(mut options: Options) -> Result<(), Failure> {
+    if options.bytes_per_s > 0 {
+        options.endpoint = slow_link(&options.endpoint, options.bytes_per_s)?;
+    }
+    let all = Keys::new(&options.run, 0).all();
+    let prefix = all.len() - "**".len();
+    let counts = Arc::new(Mutex::new(Counts {
+        log: options.log.take().map(BufWriter::new),
+        ..Counts::default()
+    }));
+    let mut held = Vec::new();
+    for viewer in 0..options.viewers {
+        let session = attach(&options.endpoint)?;
+        let counts = Arc::clone(&counts);
+        let count = move |sample: Sample| {
+            counts
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .add(viewer, &sample, prefix);
+        };
+        let subscriber = session.declare_subscriber(all.clone()).callback(count).wait()?;
+        held.push((subscriber, session));
+    }
+    let _ = writeln!(io::stdout(), "watching");
+    let until = Instant::now() + Duration::from_secs_f64(options.seconds);
+    while Instant::now() < until {
+        thread::park_timeout(until.saturating_duration_since(Instant::now()));
+    }
+    drop(held);
+    let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
+    for count in counts.topics.values_mut() {
+        count.ages_ms.sort_by(f64::total_cmp);
+        count.median_age_ms = count.ages_ms.get(count.ages_ms.len() / 2).copied().unwrap_or_default();
+    }
+    if let Some(log) = &mut counts.log {
+        log.flush()?;
+    }
+    writeln!(io::stdout(), "{}", serde_json::to_string(&counts.topics)?)?;
+    Ok(())
+}
+
+fn main() -> ExitCode {
+    match Options::read().and_then(watch) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            let _ = writeln!(io::stderr(), "fanout-watch: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}

@@ -1,0 +1,251 @@
+//! Who is who: road users and traffic lights, from a census now and then and the changes between.
+
+use std::collections::BTreeMap;
+
+use bytemuck::bytes_of;
+use ipc_schema::{
+    block::{BlockError, view},
+    header::MessageHeader,
+    traffic::{MetaEvent, ROUTES, SignalMeta, TrafficMetaLayout, VehicleMeta},
+};
+
+/// A fact and the tick that it is of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Dated<T> {
+    tick: u64,
+    fact: T,
+}
+
+/// Road users and traffic lights of the episode at hand.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Directory {
+    header: MessageHeader,
+    vehicles: BTreeMap<u32, Dated<VehicleMeta>>,
+    signals: BTreeMap<u32, Dated<SignalMeta>>,
+    /// Who left after the census: the tick of it.
+    gone: BTreeMap<u32, u64>,
+    signals_changed: bool,
+}
+
+impl Directory {
+    /// Enters a `traffic-meta` message: what changed in its tick.
+    ///
+    /// # Errors
+    /// The payload does not hold what its header promises.
+    pub fn apply_changes(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<(), BlockError> {
+        if header.has(ROUTES) || !self.turn_to(header) {
+            return Ok(());
+        }
+        let (vehicles, signals) = rows(header, payload)?;
+        for fact in vehicles {
+            if fact.event == MetaEvent::Departed as u32 {
+                let dated = Dated {
+                    tick: header.tick,
+                    fact: *fact,
+                };
+                self.vehicles.insert(fact.vehicle, dated);
+            } else if fact.event == MetaEvent::Arrived as u32 {
+                self.vehicles.remove(&fact.vehicle);
+                self.gone.insert(fact.vehicle, header.tick);
+            }
+        }
+        self.enter_signals(header, signals);
+        Ok(())
+    }
+
+    /// Enters a `census` message: everybody there is. What is known of a later tick stays.
+    ///
+    /// # Errors
+    /// As [`Directory::apply_changes`].
+    pub fn apply_census(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<(), BlockError> {
+        if !self.turn_to(header) {
+            return Ok(());
+        }
+        let (vehicles, signals) = rows(header, payload)?;
+        self.gone.retain(|_, tick| *tick > header.tick);
+        self.vehicles.retain(|_, dated| dated.tick > header.tick);
+        for fact in vehicles {
+            if !self.gone.contains_key(&fact.vehicle) {
+                self.vehicles.entry(fact.vehicle).or_insert(Dated {
+                    tick: header.tick,
+                    fact: *fact,
+                });
+            }
+        }
+        self.enter_signals(header, signals);
+        Ok(())
+    }
+
+    /// Begins anew with a new episode; false for what is of an old one.
+    fn turn_to(&mut self, header: &MessageHeader) -> bool {
+        if header.episode < self.header.episode {
+            return false;
+        }
+        if header.episode > self.header.episode {
+            *self = Self::default();
+        }
+        if header.tick >= self.header.tick {
+            self.header = *header;
+        }
+        true
+    }
+
+    fn enter_signals(&mut self, header: &MessageHeader, signals: &[SignalMeta]) {
+        for fact in signals {
+            let dated = Dated {
+                tick: header.tick,
+                fact: *fact,
+            };
+            let known = self.signals.entry(fact.signal).or_insert(dated);
+            if known.tick <= header.tick {
+                self.signals_changed |= known.fact != *fact || known.tick == header.tick;
+                *known = dated;
+            }
+        }
+    }
+
+    /// Header of the newest tick entered.
+    #[must_use]
+    pub fn header(&self) -> &MessageHeader {
+        &self.header
+    }
+
+    /// The road user with this dense index, if it is known.
+    #[must_use]
+    pub fn vehicle(&self, index: u32) -> Option<&VehicleMeta> {
+        self.vehicles.get(&index).map(|dated| &dated.fact)
+    }
+
+    /// Road users that are known.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.vehicles.len()
+    }
+
+    /// True if nobody is known.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.vehicles.is_empty()
+    }
+
+    /// All road users as bytes, row after row by ascending index.
+    #[must_use]
+    pub fn vehicle_rows(&self) -> Vec<u8> {
+        self.vehicles
+            .values()
+            .flat_map(|dated| bytes_of(&dated.fact))
+            .copied()
+            .collect()
+    }
+
+    /// All traffic lights as bytes, if one has changed since the last call.
+    pub fn take_signal_rows(&mut self) -> Option<Vec<u8>> {
+        std::mem::take(&mut self.signals_changed).then(|| {
+            self.signals
+                .values()
+                .flat_map(|dated| bytes_of(&dated.fact))
+                .copied()
+                .collect()
+        })
+    }
+}
+
+fn rows<'a>(header: &MessageHeader, payload: &'a [u8]) -> Result<(&'a [VehicleMeta], &'a [SignalMeta]), BlockError> {
+    let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
+    let signals: &[SignalMeta] = match header.columns {
+        0 => &[],
+        _ => view(payload, layout.signals)?,
+    };
+    Ok((view(payload, layout.vehicles)?, signals))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bytemuck::{Zeroable as _, cast_slice_mut};
+    use ipc_schema::block::view_mut;
+
+    fn vehicle(vehicle: u32, event: MetaEvent) -> VehicleMeta {
+        VehicleMeta {
+            vehicle,
+            event: event as u32,
+            ..VehicleMeta::zeroed()
+        }
+    }
+
+    fn signal(signal: u32, letter: u8) -> SignalMeta {
+        let mut meta = SignalMeta {
+            signal,
+            links: 1,
+            ..SignalMeta::zeroed()
+        };
+        meta.state[0] = letter;
+        meta
+    }
+
+    fn message(episode: u64, tick: u64, vehicles: &[VehicleMeta], signals: &[SignalMeta]) -> (MessageHeader, Vec<u64>) {
+        let layout = TrafficMetaLayout::new(vehicles.len(), signals.len());
+        let mut words = vec![0_u64; layout.len / 8];
+        let bytes: &mut [u8] = cast_slice_mut(&mut words);
+        view_mut(bytes, layout.vehicles).unwrap().copy_from_slice(vehicles);
+        if !signals.is_empty() {
+            view_mut(bytes, layout.signals).unwrap().copy_from_slice(signals);
+        }
+        let header = MessageHeader {
+            episode,
+            tick,
+            count: u32::try_from(vehicles.len()).unwrap(),
+            columns: u32::try_from(signals.len()).unwrap(),
+            ..MessageHeader::default()
+        };
+        (header, words)
+    }
+
+    fn known(directory: &Directory) -> Vec<u32> {
+        directory.vehicles.keys().copied().collect()
+    }
+
+    #[test]
+    fn a_census_mends_what_was_missed_and_undoes_nothing_newer() {
+        use MetaEvent::{Arrived, Departed};
+        let mut directory = Directory::default();
+        let change = |tick, vehicles: &[VehicleMeta], signals: &[SignalMeta], directory: &mut Directory| {
+            let (header, words) = message(0, tick, vehicles, signals);
+            directory.apply_changes(&header, bytemuck::cast_slice(&words)).unwrap();
+        };
+        change(
+            5,
+            &[vehicle(0, Departed), vehicle(1, Departed)],
+            &[signal(0, b'r')],
+            &mut directory,
+        );
+        change(
+            8,
+            &[vehicle(1, Arrived), vehicle(3, Departed)],
+            &[signal(0, b'G')],
+            &mut directory,
+        );
+        // Of tick 7: vehicle 0 has left unseen, 2 has come unseen, 1 had not left, 3 had not come.
+        let (header, words) = message(0, 7, &[vehicle(1, Departed), vehicle(2, Departed)], &[signal(0, b'y')]);
+        directory.apply_census(&header, bytemuck::cast_slice(&words)).unwrap();
+        assert_eq!(known(&directory), [2, 3]);
+        assert_eq!(directory.signals[&0].fact.state[0], b'G');
+        assert!(directory.take_signal_rows().is_some());
+        assert!(directory.take_signal_rows().is_none());
+        // The next episode begins anew, and what is late of the old one does not count.
+        let (header, words) = message(1, 9, &[vehicle(0, Departed)], &[]);
+        directory.apply_census(&header, bytemuck::cast_slice(&words)).unwrap();
+        change(8, &[vehicle(7, Departed)], &[], &mut directory);
+        assert_eq!(known(&directory), [0]);
+        assert_eq!(directory.vehicle_rows().len(), size_of::<VehicleMeta>());
+    }
+
+    #[test]
+    fn a_message_that_promises_too_much_is_refused() {
+        let header = MessageHeader {
+            count: 1000,
+            ..MessageHeader::default()
+        };
+        assert!(Directory::default().apply_census(&header, &[0; 64]).is_err());
+    }
+}

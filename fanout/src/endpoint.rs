@@ -1,0 +1,67 @@
+//! The zenoh side as configured: the one place where its configuration is made. Closed unless told otherwise.
+
+use std::{io, net::TcpListener};
+
+use ipc_schema::config::Fanout;
+use zenoh::{Wait, config::Config};
+
+use crate::outlet::OutletError;
+
+/// Opens a zenoh peer that listens where it was told, and nowhere else.
+///
+/// # Errors
+/// The endpoint is malformed, taken, or not of this machine.
+pub fn listen(settings: &Fanout) -> Result<zenoh::Session, OutletError> {
+    let endpoint = &settings.listen;
+    let failed = |error: zenoh::Error| OutletError::Listen {
+        endpoint: endpoint.clone(),
+        reason: plain_reason(endpoint).unwrap_or_else(|| error.to_string()),
+    };
+    zenoh::open(config(settings).map_err(failed)?).wait().map_err(failed)
+}
+
+/// Closed by default: one endpoint, no discovery, no shared memory, no administration. A viewer that stalls or is slow
+/// costs `put` nothing: measured with these waits, queues and buffer, at most 0.6 ms.
+fn config(settings: &Fanout) -> zenoh::Result<Config> {
+    let endpoint = serde_json::to_string(&settings.listen)?;
+    Config::from_json5(&format!(
+        r#"{{
+            mode: "router",
+            listen: {{ endpoints: [{endpoint}], timeout_ms: 0, exit_on_failure: true }},
+            connect: {{ endpoints: [] }},
+            scouting: {{ delay: 0, multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }},
+            adminspace: {{ enabled: false }},
+            transport: {{
+                shared_memory: {{ enabled: false }},
+                link: {{
+                    tcp: {{ so_sndbuf: 65536 }},
+                    tx: {{ queue: {{
+                        size: {{ interactive_low: 16, data_high: 16, data: 16, data_low: 16, background: 16 }},
+                        congestion_control: {{ drop: {{ wait_before_drop: 0, max_wait_before_drop_fragments: 0 }} }},
+                    }} }},
+                }},
+            }},
+        }}"#
+    ))
+}
+
+/// Why the operating system does not give out the endpoint's port, if that is the trouble.
+fn plain_reason(endpoint: &str) -> Option<String> {
+    let address = endpoint
+        .strip_prefix("tcp/")
+        .map(|a| a.split(['?', '#']).next().unwrap_or(a));
+    let Some(address) = address else {
+        return Some("this program speaks tcp only: `tcp/HOST:PORT`".to_owned());
+    };
+    TcpListener::bind(address).err().map(|error| reason(&error, address))
+}
+
+fn reason(error: &io::Error, address: &str) -> String {
+    let port = address.rsplit(':').next().unwrap_or(address);
+    match error.kind() {
+        io::ErrorKind::AddrInUse => format!("port {port} is in use"),
+        io::ErrorKind::AddrNotAvailable => format!("{address} is not an address of this machine"),
+        io::ErrorKind::PermissionDenied => format!("no permission for port {port}"),
+        _ => error.to_string(),
+    }
+}

@@ -1,0 +1,167 @@
+use bytemuck::cast_slice;
+use ipc_schema::prediction::ESTIMATES;
+use proptest::prelude::*;
+
+use super::*;
+
+fn header(count: usize, columns: u32) -> MessageHeader {
+    MessageHeader {
+        schema_version: ipc_schema::SCHEMA_VERSION,
+        run_id: 7,
+        tick: 11,
+        count: u32::try_from(count).unwrap(),
+        columns,
+        ..MessageHeader::default()
+    }
+}
+
+fn states(count: usize) -> Vec<VehicleState> {
+    (0..count)
+        .map(|i| VehicleState {
+            x_m: i as f64,
+            vehicle: u32::try_from(i).unwrap(),
+            ..VehicleState::default()
+        })
+        .collect()
+}
+
+/// Words, so that sections are aligned as in shared memory.
+fn payload(len: usize) -> Vec<u64> {
+    (0..len.div_ceil(8) as u64).collect()
+}
+
+#[test]
+fn world_keeps_every_state_and_no_sub_step() {
+    let layout = WorldLayout::new(3, 10);
+    let mut words = payload(layout.len);
+    let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+    bytes[..layout.states.len].copy_from_slice(cast_slice(&states(3)));
+    let frame = encode(Channel::World, &header(3, 10), bytes).unwrap();
+    let (head, body) = decode(&frame.bytes).unwrap();
+    assert_eq!(head, header(3, 0));
+    assert_eq!(body, cast_slice::<_, u8>(&states(3)));
+    assert_eq!(frame.left_out, 0);
+}
+
+#[test]
+fn a_crowd_is_thinned_evenly_and_counted() {
+    let crowd = states(20_000);
+    let frame = encode(Channel::World, &header(20_000, 0), cast_slice(&crowd)).unwrap();
+    let (head, body) = decode(&frame.bytes).unwrap();
+    assert!(frame.bytes.len() <= MAX_FRAME_BYTES);
+    assert_eq!((head.count, frame.left_out), (5_000, 15_000));
+    let second: VehicleState = pod_read_unaligned(&body[136..272]);
+    assert_eq!(second.vehicle, 4);
+}
+
+#[test]
+fn a_dense_scan_is_thinned_and_keeps_where_the_sensor_was() {
+    let layout = PointcloudLayout::new(40_000);
+    let mut words = payload(layout.len);
+    let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+    let scan = Scan {
+        id_hash: 9,
+        ..Scan::default()
+    };
+    bytes[..layout.scan.len].copy_from_slice(bytes_of(&scan));
+    let frame = encode(Channel::Pointcloud, &header(40_000, 1800), bytes).unwrap();
+    let (head, body) = decode(&frame.bytes).unwrap();
+    let kept = head.count as usize;
+    assert!(frame.bytes.len() <= MAX_SCAN_BYTES && kept + frame.left_out == 40_000 && kept > 13_000);
+    assert_eq!(pod_read_unaligned::<Scan>(&body[..size_of::<Scan>()]), scan);
+    assert_eq!(body.len(), layout.points.offset + kept * size_of::<LidarPoint>());
+}
+
+/// Slot by slot what stood there, of as many slots as fit.
+#[test]
+fn long_observations_are_cut_to_their_first_slots() {
+    let layout = ObservationLayout::new(20_000, 9, 1);
+    let words = payload(layout.len);
+    let long = MessageHeader {
+        sequence: 1,
+        ..header(20_000, 9)
+    };
+    let frame = encode(Channel::Observation, &long, cast_slice(&words)).unwrap();
+    let (head, body) = decode(&frame.bytes).unwrap();
+    let short = ObservationLayout::of(&head);
+    assert_eq!(head.count as usize + frame.left_out, 20_000);
+    assert!(
+        (850_000..=MAX_FRAME_BYTES).contains(&frame.bytes.len()),
+        "{}",
+        frame.bytes.len()
+    );
+    for ((_, from), (name, to)) in layout.named().into_iter().zip(short.named()) {
+        let whole = &cast_slice::<_, u8>(&words)[from.offset..from.offset + to.len];
+        assert_eq!(&body[to.offset..to.offset + to.len], whole, "{name}");
+    }
+}
+
+#[test]
+fn a_header_that_promises_too_much_is_refused() {
+    for channel in [
+        Channel::World,
+        Channel::Observation,
+        Channel::Prediction,
+        Channel::Event,
+        Channel::Pointcloud,
+    ] {
+        for columns in [0, 9, u32::MAX] {
+            let error = encode(channel, &header(100, columns), &[0; 64]).unwrap_err();
+            assert!(matches!(error, FrameError::Block(_)), "{error}");
+            let huge = MessageHeader {
+                sequence: u64::MAX,
+                ..header(u32::MAX as usize, columns)
+            };
+            assert!(encode(channel, &huge, &[0; 64]).is_err());
+        }
+    }
+    assert!(decode(&[0; HEADER_BYTES - 1]).is_none());
+}
+
+#[test]
+fn a_long_table_goes_out_in_parts_that_make_the_whole() {
+    let rows: Vec<u8> = (0..10_000_u64)
+        .flat_map(|i| [i; 19])
+        .flat_map(u64::to_le_bytes)
+        .collect();
+    let (mut place, mut parts) = (0, Vec::new());
+    for _ in 0..2 {
+        let (part, whole) = table(&header(0, 3), &rows, 152, &mut place);
+        assert!(part.len() <= MAX_FRAME_BYTES);
+        assert_eq!(decode(&whole).unwrap(), (header(10_000, 0), rows.as_slice()));
+        let (head, body) = decode(&part).unwrap();
+        assert_eq!(head.count as usize * 152, body.len());
+        parts.extend_from_slice(body);
+    }
+    assert_eq!(parts, rows);
+    assert_eq!(place, 10_000);
+    assert_eq!(
+        decode(&table(&header(0, 0), &[], 152, &mut place).0).unwrap().0.count,
+        0
+    );
+}
+
+proptest! {
+    #[test]
+    fn frames_come_back_as_they_were(n in 0_usize..200, d in 1_u32..12, estimates in any::<bool>()) {
+        let observed = header(n, d);
+        let predicted = MessageHeader { flags: if estimates { ESTIMATES } else { 0 }, sequence: 1 << 40, ..observed };
+        let lengths = [ObservationLayout::of(&observed).len, PredictionLayout::of(&predicted).len];
+        for (channel, header, len) in [(Channel::Observation, observed, lengths[0]), (Channel::Prediction, predicted, lengths[1])] {
+            let words = payload(len);
+            let bytes = &cast_slice::<_, u8>(&words)[..len];
+            let frame = encode(channel, &header, bytes).unwrap();
+            prop_assert_eq!(decode(&frame.bytes).unwrap(), (header, bytes));
+        }
+    }
+
+    /// Nothing that stands in shared memory, however wrong, ends the fan-out.
+    #[test]
+    fn nonsense_is_an_error_and_no_panic(header in prop::array::uniform18(any::<u32>()), len in 0_usize..40) {
+        let header: MessageHeader = bytemuck::cast(header);
+        let words = vec![u64::MAX; 8 * len];
+        for channel in Channel::ALL {
+            let _ = encode(channel, &header, cast_slice(&words));
+        }
+    }
+}

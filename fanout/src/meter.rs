@@ -1,0 +1,235 @@
+//! What a viewer reads off a run: how fast it goes, who is there, whose sensors deliver, and how far estimates are from the truth.
+
+use std::time::Duration;
+
+use ipc_schema::{
+    block::view,
+    header::MessageHeader,
+    observation::{
+        EMPTY_SLOT, GNSS, GNSS_COLUMNS, IMU, LIDAR, ObservationLayout, SPEED_STEERING, TRUTH_COLUMNS, VALID,
+    },
+    prediction::PredictionLayout,
+    traffic::Kind,
+    world::{VehicleState, WorldLayout},
+};
+use serde::Serialize;
+
+/// Time over which the rate is taken.
+const RATE_OVER: Duration = Duration::from_secs(2);
+
+/// Ticks per wall second, lately.
+#[derive(Debug, Clone, Default)]
+pub struct Rate {
+    begun: Option<(Duration, u64)>,
+    per_s: f64,
+}
+
+impl Rate {
+    /// `ticks` have come by `now`.
+    pub fn note(&mut self, now: Duration, ticks: u64) {
+        let (since, then) = *self.begun.get_or_insert((now, ticks));
+        let elapsed = now.saturating_sub(since);
+        if elapsed >= RATE_OVER || (self.per_s == 0.0 && elapsed >= RATE_OVER / 4) {
+            self.per_s = ticks.saturating_sub(then) as f64 / elapsed.as_secs_f64();
+            self.begun = Some((now, ticks));
+        }
+    }
+
+    /// Ticks per wall second.
+    #[must_use]
+    pub fn per_s(&self) -> f64 {
+        self.per_s
+    }
+}
+
+/// Road users by kind.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct RoadUsers {
+    /// Connected vehicles.
+    pub cav: u32,
+    /// Vehicles without sensors.
+    pub other: u32,
+    /// Pedestrians.
+    pub person: u32,
+    /// Vehicles driven by actions.
+    pub hero: u32,
+}
+
+impl RoadUsers {
+    /// Of a `world` message; `None` if it does not hold what its header promises.
+    #[must_use]
+    pub fn of(header: &MessageHeader, payload: &[u8]) -> Option<Self> {
+        let states: &[VehicleState] = view(payload, WorldLayout::new(header.count as usize, 0).states).ok()?;
+        let mut count = Self::default();
+        for state in states {
+            match state.kind {
+                kind if kind == Kind::Cav as u32 => count.cav += 1,
+                kind if kind == Kind::Person as u32 => count.person += 1,
+                kind if kind == Kind::Hero as u32 => count.hero += 1,
+                _ => count.other += 1,
+            }
+        }
+        Some(count)
+    }
+}
+
+/// Vehicles whose sensor delivers.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Delivering {
+    /// GNSS.
+    pub gnss: u32,
+    /// IMU.
+    pub imu: u32,
+    /// Speed and steering.
+    pub speed_steering: u32,
+    /// LIDAR.
+    pub lidar: u32,
+}
+
+/// Mean distances from the truth over the valid rows of one tick, metres.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Errors {
+    /// Of the policy.
+    pub policy: Option<f64>,
+    /// Of the newest fixes.
+    pub raw_gnss: Option<f64>,
+    /// Of the filter.
+    pub ekf: Option<f64>,
+}
+
+/// Sensors and truth of an `observation` message.
+#[derive(Debug, Clone, Copy)]
+pub struct Observed<'a> {
+    truth: &'a [[f32; TRUTH_COLUMNS]],
+    gnss_m: &'a [[f32; GNSS_COLUMNS]],
+    vehicle: &'a [u32],
+    flags: &'a [u32],
+    sensors: &'a [u32],
+}
+
+impl<'a> Observed<'a> {
+    /// `None` if the message does not hold what its header promises.
+    #[must_use]
+    pub fn of(header: &MessageHeader, payload: &'a [u8]) -> Option<Self> {
+        let layout = ObservationLayout::of(header);
+        Some(Self {
+            truth: view(payload, layout.truth).ok()?,
+            gnss_m: view(payload, layout.gnss_m).ok()?,
+            vehicle: view(payload, layout.vehicle).ok()?,
+            flags: view(payload, layout.flags).ok()?,
+            sensors: view(payload, layout.sensors).ok()?,
+        })
+    }
+
+    /// Whose sensors deliver.
+    #[must_use]
+    pub fn delivering(&self) -> Delivering {
+        let held = self
+            .vehicle
+            .iter()
+            .zip(self.sensors)
+            .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT);
+        held.fold(Delivering::default(), |count, (_, sensors)| Delivering {
+            gnss: count.gnss + u32::from(sensors & GNSS != 0),
+            imu: count.imu + u32::from(sensors & IMU != 0),
+            speed_steering: count.speed_steering + u32::from(sensors & SPEED_STEERING != 0),
+            lidar: count.lidar + u32::from(sensors & LIDAR != 0),
+        })
+    }
+
+    /// How far fixes, and what `prediction` holds if it holds positions, are from the truth.
+    #[must_use]
+    pub fn errors(&self, prediction: Option<(&MessageHeader, &[u8])>) -> Errors {
+        let xy = |rows: &'a [[f32; GNSS_COLUMNS]]| rows.iter().map(|[x, y, _]| [*x, *y]);
+        let (policy, ekf) =
+            prediction
+                .filter(|(header, _)| header.columns == 2)
+                .map_or((None, None), |(header, payload)| {
+                    let layout = PredictionLayout::of(header);
+                    let rows = |section| view::<[f32; 2]>(payload, section).ok().filter(|rows| !rows.is_empty());
+                    (rows(layout.prediction), rows(layout.estimate_m))
+                });
+        Errors {
+            policy: policy.and_then(|rows| self.mean_m(rows.iter().copied())),
+            raw_gnss: self.mean_m(xy(self.gnss_m)),
+            ekf: ekf.and_then(|rows| self.mean_m(rows.iter().copied())),
+        }
+    }
+
+    fn mean_m(&self, rows: impl Iterator<Item = [f32; 2]>) -> Option<f64> {
+        let held = self.vehicle.iter().zip(self.flags);
+        let (mut sum, mut count) = (0.0, 0_u32);
+        for (([x, y], truth), (vehicle, flags)) in rows.zip(self.truth).zip(held) {
+            let distance_m = f64::from(x - truth[0]).hypot(f64::from(y - truth[1]));
+            if *vehicle != EMPTY_SLOT && flags & VALID != 0 && distance_m.is_finite() {
+                sum += distance_m;
+                count += 1;
+            }
+        }
+        (count > 0).then(|| sum / f64::from(count))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use bytemuck::cast_slice_mut;
+    use ipc_schema::{block::view_mut, prediction::ESTIMATES};
+
+    #[test]
+    fn errors_are_means_over_valid_rows() {
+        let header = MessageHeader {
+            count: 3,
+            columns: 1,
+            ..MessageHeader::default()
+        };
+        let layout = ObservationLayout::of(&header);
+        let mut words = vec![0_u64; layout.len / 8];
+        let bytes: &mut [u8] = cast_slice_mut(&mut words);
+        view_mut::<[f32; 3]>(bytes, layout.gnss_m).unwrap().copy_from_slice(&[
+            [3.0, 4.0, 9.0],
+            [0.0, 1.0, 0.0],
+            [99.0; 3],
+        ]);
+        view_mut::<u32>(bytes, layout.vehicle)
+            .unwrap()
+            .copy_from_slice(&[0, 1, EMPTY_SLOT]);
+        view_mut::<u32>(bytes, layout.flags).unwrap().fill(VALID);
+        view_mut::<u32>(bytes, layout.sensors).unwrap().fill(GNSS | LIDAR);
+        let observed = Observed::of(&header, bytemuck::cast_slice(&words)).unwrap();
+        let told = MessageHeader {
+            columns: 2,
+            flags: ESTIMATES,
+            ..header
+        };
+        let layout = PredictionLayout::of(&told);
+        let mut words = vec![0_u64; layout.len / 8];
+        let bytes: &mut [u8] = cast_slice_mut(&mut words);
+        view_mut::<[f32; 2]>(bytes, layout.prediction).unwrap().fill([2.0, 0.0]);
+        view_mut::<[f32; 2]>(bytes, layout.estimate_m)
+            .unwrap()
+            .copy_from_slice(&[[f32::NAN; 2], [0.0, 0.5], [0.0; 2]]);
+        let errors = observed.errors(Some((&told, bytemuck::cast_slice(&words))));
+        assert_eq!(
+            (errors.policy, errors.raw_gnss, errors.ekf),
+            (Some(2.0), Some(3.0), Some(0.5))
+        );
+        assert_eq!(observed.errors(None).policy, None);
+        assert_eq!(
+            observed.delivering(),
+            Delivering {
+                gnss: 2,
+                lidar: 2,
+                ..Delivering::default()
+            }
+        );
+        assert!(Observed::of(&header, &[0; 64]).is_none());
+    }
+
+    #[test]
+    fn the_rate_follows_what_comes() {
+        let mut rate = Rate::default();
+        (0..=100_u64).for_each(|i| rate.note(Duration::from_millis(100 * i), 5 * i));
+        assert!((rate.per_s() - 50.0).abs() < 1e-9);
+    }
+}

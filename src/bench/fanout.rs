@@ -1,0 +1,554 @@
+//! What watching costs a run: nothing that can be measured while it keeps to the clock, little while it takes all cores.
+
+use std::{
+    io::{BufRead as _, BufReader},
+    path::{Path, PathBuf},
+    process::{Child, ChildStdout, Command, Stdio},
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+};
+
+use ipc_schema::{
+    board::State,
+    ports::BoardReader,
+    process::Process,
+    run::RunFile,
+    services::{self, RunNode},
+};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+use super::{Options, Report, Spread, Table};
+use crate::{failure::Exit, install};
+
+/// Wall time of a paced run, seconds.
+const PACED_S: u64 = 20;
+/// Pairs of paced runs, and of free ones.
+const PACED_PAIRS: usize = 2;
+const FREE_PAIRS: usize = 3;
+/// Ticks of a free run.
+const FREE_TICKS: u64 = 12_000;
+/// Kills of the fan-out.
+const KILLS: u32 = 50;
+/// Between two looks at a board: a thousandth of a tick in real time.
+const LOOK: Duration = Duration::from_micros(200);
+/// A link of 1 Mbit/s.
+const SLOW_BYTES_PER_S: u64 = 125_000;
+/// Longest wait for anything.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// Measures all of it.
+///
+/// # Errors
+/// A program is missing, or a run fails.
+pub fn measure(options: &Options) -> Result<Report, Exit> {
+    let mut report = Report::new(
+        "fanout",
+        "Fan-out",
+        format!(
+            "The town, 52 road users. Watched means six viewers that count frames, one more that is stopped (SIGSTOP) and one behind a proxy that \
+             reads its socket at {SLOW_BYTES_PER_S} bytes/s (1 Mbit/s), on this very machine. Lateness is that of the observation of each tick \
+             behind its time, as seen on the sensors' board every {} µs.",
+            LOOK.as_micros()
+        ),
+    );
+    let bench = Bench::new(options)?;
+    bench.paced(&mut report)?;
+    bench.free(&mut report)?;
+    bench.kills(&mut report)?;
+    Ok(report)
+}
+
+struct Bench {
+    caraware: PathBuf,
+    watch: PathBuf,
+    directory: PathBuf,
+}
+
+impl Drop for Bench {
+    fn drop(&mut self) {
+        if let Err(error) = std::fs::remove_dir_all(&self.directory) {
+            tracing::debug!(%error, "cannot remove the measurement's runs");
+        }
+    }
+}
+
+impl Bench {
+    fn new(options: &Options) -> Result<Self, Exit> {
+        let directory = std::env::temp_dir().join(format!("caraware-bench-{}", std::process::id()));
+        std::fs::create_dir_all(&directory).map_err(|error| Exit::io("create", &directory, &error))?;
+        Ok(Self {
+            caraware: install::program(&options.bin, "caraware")?,
+            watch: install::program(&options.bin, "fanout-watch")?,
+            directory,
+        })
+    }
+
+    fn start(&self, name: &str, port: Option<u16>, settings: &[String]) -> Result<Running, Exit> {
+        let fanout = match port {
+            Some(port) => format!("fanout.listen=tcp/127.0.0.1:{port}"),
+            None => "fanout.enabled=false".into(),
+        };
+        let settings = settings.iter().chain([&fanout]).flat_map(|setting| ["--set", setting]);
+        let mut command = Command::new(&self.caraware);
+        command
+            .args(["simulate", "town", "--name", name, "--runs"])
+            .arg(&self.directory)
+            .args(settings)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null());
+        let child = command
+            .spawn()
+            .map_err(|error| Exit::io("start", &self.caraware, &error))?;
+        Running::join(child, self.directory.join(name))
+    }
+
+    /// Viewers: those that count, one that is stopped, one on a slow link.
+    fn audience(&self, run: &str, port: u16, seconds: u64) -> Result<Vec<Viewer>, Exit> {
+        let viewer = |arguments: &[String]| Viewer::start(&self.watch, run, port, seconds, arguments);
+        let log = self.directory.join("world.csv");
+        let healthy = viewer(&[
+            "--viewers".into(),
+            "6".into(),
+            "--log".into(),
+            log.display().to_string(),
+        ])?;
+        let stopped = viewer(&[])?;
+        signal(&stopped.child, Signal::STOP);
+        let slow = viewer(&["--bytes-per-s".into(), SLOW_BYTES_PER_S.to_string()])?;
+        Ok(vec![healthy, slow, stopped])
+    }
+
+    /// Paced at real time: lateness of ticks without and with an audience, and the age of what the healthy see.
+    fn paced(&self, report: &mut Report) -> Result<(), Exit> {
+        let mut table = Table::new(
+            "in real time",
+            &[
+                "run",
+                "lateness p50 (ms)",
+                "p95 (ms)",
+                "p99 (ms)",
+                "largest (ms)",
+                "hash",
+            ],
+        );
+        let mut hashes = Vec::new();
+        for pair in 0..PACED_PAIRS {
+            for watched in [false, true] {
+                let name = format!("paced-{pair}-{watched}");
+                let settings = [
+                    "run.real_time_factor=1".to_owned(),
+                    format!("episode.ticks={}", (PACED_S + 5) * 10),
+                    "episode.training_episodes=1".into(),
+                    "episode.final_evaluations=0".into(),
+                ];
+                let port = free_port()?;
+                let mut run = self.start(&name, Some(port), &settings)?;
+                run.wait_for_ticks(10)?;
+                let audience = match watched {
+                    true => self.audience(&name, port, PACED_S)?,
+                    false => Vec::new(),
+                };
+                let ticks = run.observe(Duration::from_secs(PACED_S - 1));
+                let seen = audience.into_iter().map(Viewer::finish).collect::<Vec<_>>();
+                let late = lateness_ms(&ticks);
+                let found = run.finish()?;
+                hashes.push(found["observation_hash"].clone());
+                let who = if watched { "watched" } else { "alone" };
+                let at = |share| percentile(&late, share);
+                table.row([
+                    format!("{who}, {}", pair + 1),
+                    format!("{:.2}", at(0.5)),
+                    format!("{:.2}", at(0.95)),
+                    format!("{:.2}", at(0.99)),
+                    format!("{:.2}", at(1.0)),
+                    found["observation_hash"]
+                        .as_str()
+                        .unwrap_or_default()
+                        .chars()
+                        .take(8)
+                        .collect(),
+                ]);
+                report.figure(format!("paced, {who}, lateness p99, ms"), at(0.99));
+                if watched {
+                    self.age(report, &ticks, &seen)?;
+                }
+            }
+        }
+        report.tables.push(table);
+        report.figure(
+            "observation hashes of paced runs are one, 1 = yes",
+            f64::from(u8::from(all_equal(&hashes))),
+        );
+        Ok(())
+    }
+
+    /// How old what a healthy viewer has just got is: since the tick stood on the sensors' board.
+    fn age(&self, report: &mut Report, ticks: &[(u64, u64)], seen: &[Value]) -> Result<(), Exit> {
+        let log = self.directory.join("world.csv");
+        let text = std::fs::read_to_string(&log).map_err(|error| Exit::io("read", &log, &error))?;
+        let made: std::collections::BTreeMap<u64, u64> = ticks.iter().copied().collect();
+        let mut ages_ms: Vec<f64> = text
+            .lines()
+            .filter_map(|line| {
+                let (tick, at_ns) = line.split_once(',')?;
+                let made_ns = made.get(&(tick.parse::<u64>().ok()? + 1))?;
+                Some((at_ns.parse::<f64>().ok()? - *made_ns as f64) / 1e6)
+            })
+            .collect();
+        ages_ms.sort_by(f64::total_cmp);
+        report.figure("median age of world frames, ms", percentile(&ages_ms, 0.5));
+        report.figure("p99 age of world frames, ms", percentile(&ages_ms, 0.99));
+        if let Some(world) = seen.first().map(|counts| &counts["world"]) {
+            for what in ["received", "lost", "refused"] {
+                report.figure(
+                    format!("world frames {what} by six healthy viewers"),
+                    world[what].as_f64().unwrap_or(f64::NAN),
+                );
+            }
+        }
+        Ok(())
+    }
+
+    /// As fast as it goes: watched against without a fan-out, in alternating pairs.
+    fn free(&self, report: &mut Report) -> Result<(), Exit> {
+        let settings = [
+            format!("episode.ticks={FREE_TICKS}"),
+            "episode.training_episodes=1".into(),
+            "episode.final_evaluations=0".into(),
+        ];
+        let (mut ratios, mut hashes) = (Vec::new(), Vec::new());
+        let mut table = Table::new(
+            "as fast as it goes",
+            &["pair", "off (ticks/s)", "watched (ticks/s)", "ratio"],
+        );
+        for pair in 0..FREE_PAIRS {
+            let mut rates = [0.0; 2];
+            for (place, watched) in [(0, false), (1, true)] {
+                let port = if watched { Some(free_port()?) } else { None };
+                let name = format!("free-{pair}-{watched}");
+                let mut run = self.start(&name, port, &settings)?;
+                run.wait_for_ticks(1)?;
+                let audience = match port {
+                    Some(port) => self.audience(&name, port, 600)?,
+                    None => Vec::new(),
+                };
+                // Viewers take their time to start: only what comes after counts.
+                rates[place] = run.rate();
+                drop(audience);
+                hashes.push(run.finish()?["observation_hash"].clone());
+            }
+            let ratio = rates[1] / rates[0];
+            ratios.push(ratio);
+            table.row([
+                (pair + 1).to_string(),
+                format!("{:.0}", rates[0]),
+                format!("{:.0}", rates[1]),
+                format!("{ratio:.3}"),
+            ]);
+        }
+        let spread = Spread::of(ratios.iter().copied())?;
+        report.figure("rate watched / off, median", spread.median);
+        report.figure("rate watched / off, smallest", spread.smallest);
+        report.figure(
+            "observation hashes of free runs are one, 1 = yes",
+            f64::from(u8::from(all_equal(&hashes))),
+        );
+        report.tables.push(table);
+        Ok(())
+    }
+
+    /// Kills the fan-out again and again; a viewer watches throughout.
+    fn kills(&self, report: &mut Report) -> Result<(), Exit> {
+        let settings = [
+            "run.real_time_factor=10".to_owned(),
+            "episode.ticks=1000000".into(),
+            "episode.training_episodes=1".into(),
+        ];
+        let port = free_port()?;
+        let mut run = self.start("kills", Some(port), &settings)?;
+        run.wait_for_ticks(10)?;
+        let viewer = Viewer::start(&self.watch, "kills", port, 600, &[])?;
+        let undisturbed = longest_gap_ms(&run.observe(Duration::from_secs(10)));
+        let (mut ticks, mut memory_mib) = (Vec::new(), Vec::new());
+        for kill in 0..KILLS {
+            let board = run.fanout()?;
+            let begun = Instant::now();
+            while board.progress().attached != 1 || board.health().state != State::Running as u32 {
+                if begun.elapsed() > PATIENCE {
+                    return Err(Exit::run("the fan-out did not come back", ""));
+                }
+                ticks.extend(run.observe(Duration::from_millis(5)));
+            }
+            let pid = board.health().pid;
+            memory_mib.push(resident_mib(pid));
+            // Between 0 and 0.4 s, scattered without a generator of random numbers.
+            let wait = Duration::from_millis(u64::from(kill * 7919 % 400));
+            ticks.extend(run.observe(wait));
+            if let Some(pid) = Pid::from_raw(pid) {
+                let _ = kill_process(pid, Signal::KILL);
+            }
+            ticks.extend(run.observe(Duration::from_millis(100)));
+        }
+        let disturbed = longest_gap_ms(&ticks);
+        let board = run.fanout()?;
+        ticks = run.observe(Duration::from_secs(20));
+        report.figure("fan-out killed, times", f64::from(KILLS));
+        report.figure(
+            "longest pause of the run undisturbed, ms (a tick is due every 10)",
+            undisturbed,
+        );
+        report.figure("longest pause of the run while the fan-out is killed, ms", disturbed);
+        report.figure("longest pause after, ms", longest_gap_ms(&ticks));
+        report.figure(
+            "fan-out restarted, 1 = yes",
+            f64::from(u8::from(board.progress().attached == 1)),
+        );
+        report.figure(
+            "resident memory of the last fan-out after 20 s, MiB",
+            resident_mib(board.health().pid),
+        );
+        report.figure("resident memory of fresh fan-outs, MiB", Spread::of(memory_mib)?.median);
+        drop(viewer);
+        let mut table = Table::new(
+            "fan-out killed 50 times, a tick every 10 ms",
+            &["", "longest pause of the run (ms)"],
+        );
+        table.row(["undisturbed, 10 s".into(), format!("{undisturbed:.1}")]);
+        table.row(["while it is killed".into(), format!("{disturbed:.1}")]);
+        report.tables.push(table);
+        run.stop()
+    }
+}
+
+/// A run in the background, with its boards; stopped when dropped.
+struct Running {
+    child: Child,
+    directory: PathBuf,
+    run: RunFile,
+    node: RunNode,
+    sensors: BoardReader,
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        if matches!(self.child.try_wait(), Ok(None)) {
+            signal(&self.child, Signal::INT);
+            let _ = self.child.wait();
+        }
+    }
+}
+
+impl Running {
+    fn join(mut child: Child, directory: PathBuf) -> Result<Self, Exit> {
+        let begun = Instant::now();
+        let started = directory.join("logs").join("traffic-bridge.log");
+        while begun.elapsed() < PATIENCE && matches!(child.try_wait(), Ok(None)) {
+            // Processes start when all services are there: looking earlier would meet them half made.
+            if started.exists()
+                && let Ok(run) = RunFile::read(&directory.join("run.json"))
+                && let Ok(node) = services::node(&run.shared_memory)
+                && let Ok(sensors) = BoardReader::open(&node, &run, 0, Process::SensorDaemon)
+            {
+                return Ok(Self {
+                    child,
+                    directory,
+                    run,
+                    node,
+                    sensors,
+                });
+            }
+            pause();
+        }
+        Err(Exit::run(
+            format!("the run in {} did not start", directory.display()),
+            "",
+        ))
+    }
+
+    fn ticks(&self) -> u64 {
+        self.sensors.health().ticks
+    }
+
+    fn lives(&mut self) -> bool {
+        matches!(self.child.try_wait(), Ok(None))
+    }
+
+    fn wait_for_ticks(&mut self, ticks: u64) -> Result<(), Exit> {
+        let begun = Instant::now();
+        while self.ticks() < ticks {
+            if begun.elapsed() > PATIENCE || !self.lives() {
+                return Err(Exit::run(
+                    format!("the run in {} did not start", self.directory.display()),
+                    "",
+                ));
+            }
+            pause();
+        }
+        Ok(())
+    }
+
+    /// Number of ticks and UNIX time (ns) whenever it changes.
+    fn observe(&mut self, time: Duration) -> Vec<(u64, u64)> {
+        let begun = Instant::now();
+        let mut seen = Vec::new();
+        let mut last = u64::MAX;
+        while begun.elapsed() < time {
+            let ticks = self.ticks();
+            if ticks != last {
+                seen.push((ticks, unix_ns()));
+                last = ticks;
+            }
+            pause();
+        }
+        seen
+    }
+
+    /// Ticks per second from here on to shortly before the end.
+    fn rate(&mut self) -> f64 {
+        let (from, begun) = (self.ticks(), Instant::now());
+        let to = FREE_TICKS * 9 / 10;
+        while self.ticks() < to && self.lives() {
+            std::thread::park_timeout(Duration::from_millis(5));
+        }
+        (self.ticks() - from) as f64 / begun.elapsed().as_secs_f64()
+    }
+
+    fn fanout(&self) -> Result<BoardReader, Exit> {
+        BoardReader::open(&self.node, &self.run, 0, Process::Fanout)
+            .map_err(|error| Exit::run(format!("the board of the fan-out cannot be read: {error}"), ""))
+    }
+
+    /// Waits for the end: the report.
+    fn finish(mut self) -> Result<Value, Exit> {
+        let status = self.child.wait();
+        let path = self.directory.join("report.json");
+        let text = std::fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
+        match status {
+            Ok(status) if status.success() => Ok(serde_json::from_str(&text).unwrap_or_default()),
+            status => Err(Exit::run(format!("a run ended with {status:?}"), "")),
+        }
+    }
+
+    fn stop(mut self) -> Result<(), Exit> {
+        signal(&self.child, Signal::INT);
+        self.child
+            .wait()
+            .map(drop)
+            .map_err(|error| Exit::io("wait for", &self.directory, &error))
+    }
+}
+
+/// A viewer that counts; killed when dropped.
+struct Viewer {
+    child: Child,
+    output: BufReader<ChildStdout>,
+}
+
+impl Drop for Viewer {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Viewer {
+    /// Starts one and waits until it watches.
+    fn start(program: &Path, run: &str, port: u16, seconds: u64, arguments: &[String]) -> Result<Self, Exit> {
+        let mut child = Command::new(program)
+            .args([&format!("tcp/127.0.0.1:{port}"), run, "--seconds", &seconds.to_string()])
+            .args(arguments)
+            .stdout(Stdio::piped())
+            .spawn()
+            .map_err(|error| Exit::io("start", program, &error))?;
+        let output = child.stdout.take().map(BufReader::new);
+        let mut output = output.ok_or_else(|| Exit::run("a viewer has no output", ""))?;
+        let mut line = String::new();
+        match output.read_line(&mut line) {
+            Ok(_) if line.trim() == "watching" => Ok(Self { child, output }),
+            _ => Err(Exit::run("a viewer cannot attach", "its message above says why")),
+        }
+    }
+
+    /// What it counted; null of one that is stopped.
+    fn finish(mut self) -> Value {
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap_or_default();
+        if stat
+            .rsplit(')')
+            .next()
+            .is_some_and(|rest| rest.trim_start().starts_with('T'))
+        {
+            return Value::Null;
+        }
+        let mut line = String::new();
+        match self.output.read_line(&mut line) {
+            Ok(_) => serde_json::from_str(&line).unwrap_or_default(),
+            Err(_) => Value::Null,
+        }
+    }
+}
+
+fn signal(child: &Child, signal: Signal) {
+    if let Some(pid) = i32::try_from(child.id()).ok().and_then(Pid::from_raw)
+        && let Err(error) = kill_process(pid, signal)
+    {
+        tracing::debug!(%error, "cannot signal");
+    }
+}
+
+fn pause() {
+    std::thread::park_timeout(LOOK);
+}
+
+#[expect(
+    clippy::disallowed_methods,
+    reason = "compared with what viewers, other processes, note"
+)]
+fn unix_ns() -> u64 {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
+}
+
+fn free_port() -> Result<u16, Exit> {
+    std::net::TcpListener::bind("127.0.0.1:0")
+        .and_then(|listener| listener.local_addr())
+        .map(|address| address.port())
+        .map_err(|error| Exit::run(format!("no free port: {error}"), ""))
+}
+
+/// Lateness of each tick behind a clock of ten ticks a second that none of them is ahead of, sorted, milliseconds.
+fn lateness_ms(ticks: &[(u64, u64)]) -> Vec<f64> {
+    let behind = |(tick, at_ns): &(u64, u64)| *at_ns as f64 / 1e6 - *tick as f64 * 100.0;
+    let earliest = ticks.iter().map(behind).fold(f64::INFINITY, f64::min);
+    let mut late: Vec<f64> = ticks.iter().map(|tick| behind(tick) - earliest).collect();
+    late.sort_by(f64::total_cmp);
+    late
+}
+
+/// Longest time between two changes, milliseconds.
+fn longest_gap_ms(ticks: &[(u64, u64)]) -> f64 {
+    let gaps = ticks.windows(2).map(|pair| (pair[1].1 - pair[0].1) as f64 / 1e6);
+    gaps.fold(0.0, f64::max)
+}
+
+fn percentile(sorted: &[f64], share: f64) -> f64 {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a place in the list"
+    )]
+    let place = (share * sorted.len().saturating_sub(1) as f64).round() as usize;
+    sorted.get(place).copied().unwrap_or(f64::NAN)
+}
+
+fn resident_mib(pid: i32) -> f64 {
+    let text = std::fs::read_to_string(format!("/proc/{pid}/statm")).unwrap_or_default();
+    let pages = text
+        .split_whitespace()
+        .nth(1)
+        .and_then(|pages| pages.parse::<f64>().ok());
+    pages.map_or(f64::NAN, |pages| pages * 4.0 / 1024.0)
+}
+
+fn all_equal(values: &[Value]) -> bool {
+    values.windows(2).all(|pair| pair[0] == pair[1])
+}

@@ -1,0 +1,119 @@
+//! A run while its fan-out is killed and its viewers come and go.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
+mod common;
+
+use std::{
+    io::{BufRead as _, BufReader},
+    process::{Child, Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use common::{Spectator, Workplace, free_port, until};
+use ipc_schema::{board::State, process::Process};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+const KILLS: u64 = 6;
+
+fn settings(fanout: &str) -> Vec<String> {
+    let settings = [
+        "traffic.cavs=6",
+        "traffic.others=3",
+        "traffic.pedestrians=3",
+        "episode.ticks=600",
+        "episode.training_episodes=1",
+        "episode.final_evaluations=0",
+        fanout,
+    ];
+    settings
+        .iter()
+        .flat_map(|setting| ["--set".to_owned(), (*setting).to_owned()])
+        .collect()
+}
+
+fn simulate(name: &str, settings: &[String]) -> Vec<String> {
+    let head = ["simulate", "town", "--name", name].map(str::to_owned);
+    [head.as_slice(), settings].concat()
+}
+
+/// A viewer that counts.
+fn watch(run: &str, port: u16, seconds: u64) -> Child {
+    let program = caraware::install::programs().unwrap().join("fanout-watch");
+    Command::new(program)
+        .args([&format!("tcp/127.0.0.1:{port}"), run, "--seconds", &seconds.to_string()])
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap()
+}
+
+/// A viewer that is killed.
+struct Victim(Child);
+
+impl Victim {
+    fn kill(&mut self) {
+        self.0.kill().unwrap();
+        self.0.wait().unwrap();
+    }
+}
+
+impl Drop for Victim {
+    fn drop(&mut self) {
+        self.kill();
+    }
+}
+
+fn count(mut viewer: Child) -> Value {
+    let lines = BufReader::new(viewer.stdout.take().unwrap()).lines();
+    let last = lines.map_while(Result::ok).last().unwrap();
+    assert!(viewer.wait().unwrap().success());
+    serde_json::from_str(&last).unwrap()
+}
+
+/// The fan-out comes back every time, its viewers with it, and the run's bytes are those of a run that nobody watches.
+#[test]
+fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
+    let workplace = Workplace::new();
+    let alone = simulate("alone", &settings("fanout.enabled=false"));
+    workplace.succeed(&alone.iter().map(String::as_str).collect::<Vec<_>>());
+    let port = free_port();
+    let mut arguments = simulate("watched", &settings(&format!("fanout.listen=tcp/127.0.0.1:{port}")));
+    arguments.extend(["--set".into(), "run.real_time_factor=3".into()]);
+    let mut command = workplace.command(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+    let mut run = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let spectator = Spectator::join(&workplace.path().join("runs/watched/run.json"), &mut run);
+    let board = spectator.board(Process::Fanout);
+    let works = |incarnation: u64| {
+        let there = board.progress().attached == 1 && u64::from(board.progress().incarnation) == incarnation;
+        (there && board.health().state == State::Running as u32).then_some(board.health().pid)
+    };
+    until(&mut run, || works(0));
+    let viewer = watch("watched", port, 15);
+    let mut victim = Victim(watch("watched", port, 60));
+    for kill in 0..KILLS {
+        let pid = until(&mut run, || works(kill));
+        let moment = Instant::now();
+        while moment.elapsed() < Duration::from_millis(kill * 137 % 400) {
+            std::thread::park_timeout(Duration::from_millis(5));
+        }
+        kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL).unwrap();
+        if kill == KILLS / 2 {
+            victim.kill();
+        }
+    }
+    until(&mut run, || works(KILLS));
+    let seen = count(viewer);
+    assert!(run.wait().unwrap().success());
+    assert!(seen["world"]["begun_anew"].as_u64().unwrap() >= 1, "{seen:#}");
+    assert_eq!(seen["world"]["refused"], 0, "{seen:#}");
+    let (alone, watched) = (workplace.report("alone"), workplace.report("watched"));
+    assert_eq!(watched["observation_hash"], alone["observation_hash"]);
+    assert_eq!(watched["ticks"], alone["ticks"]);
+    assert_eq!(watched["restarts"], KILLS);
+    workplace.assert_nothing_left();
+}
