@@ -8,7 +8,7 @@ export PYO3_PYTHON = $(CURDIR)/$(VENV)/bin/python
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
 
-.PHONY: train test build prerequisites lint format test-rust test-python deny bench clean
+.PHONY: train test build prerequisites lint format test-rust test-python deny bench peers clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -66,6 +66,12 @@ deny: ## licences, sources and advisories of all dependencies (needs: cargo inst
 bench: build ## the benchmarks of docs/benchmarks.md
 	cargo bench --locked --workspace
 
+peers: build ## what `caraware bench` compares with, in an environment of its own that sees the project's packages
+	$(VENV)/bin/python -m venv .venv-peers
+	$(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))' \
+		> $$(.venv-peers/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/project.pth
+	.venv-peers/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements-peers.txt
+
 clean:
 	cargo clean
-	rm -rf $(VENV)
+	rm -rf $(VENV) .venv-peers

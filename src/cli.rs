@@ -89,13 +89,17 @@ pub enum Part {
     Envs,
     /// Fan-out: lateness and rate of a run with eight viewers, one stopped and one slow, beside the same run alone; kills of the fan-out
     Fanout,
+    /// Observation hop: from publish to a visible tensor, 1 KiB to 16 MiB, beside pyzmq, pipe and TCP
+    Ipc,
     /// Everything above, one after the other
     All,
 }
 
 impl Part {
     /// The parts that are measured, in the order of the documentation.
-    pub const MEASURED: [Self; 3] = [Self::Lidar, Self::Envs, Self::Fanout];
+    pub fn measured() -> impl Iterator<Item = Self> {
+        Self::value_variants().iter().copied().filter(|part| *part != Self::All)
+    }
 
     /// Its name on the command line.
     #[must_use]
@@ -119,13 +123,13 @@ pub struct BenchArgs {
     /// Keep the figures in docs/benchmarks/ and write docs/benchmarks.md anew
     #[arg(long)]
     pub keep: bool,
-    /// Python that has the peers installed [default: the project's]
+    /// Python that has the peers installed [default: what `make peers` installed, or the project's]
     #[arg(long, value_name = "PATH")]
     pub python: Option<PathBuf>,
 }
 
 /// What `train` and `simulate` take.
-#[derive(Debug, Args, Clone)]
+#[derive(Debug, Args, Clone, Default)]
 pub struct RunArgs {
     /// Preset name, .toml file, or .sumocfg file [default: town]
     pub config: Option<String>,

@@ -79,6 +79,14 @@ pub fn program(bin: &Path, name: &str) -> Result<PathBuf, Exit> {
     ))
 }
 
+/// Python of `make peers`, which has what the benchmarks compare with, if it is there.
+#[must_use]
+pub fn peers_python(bin: &Path) -> Option<PathBuf> {
+    bin.ancestors()
+        .map(|directory| directory.join(".venv-peers/bin/python"))
+        .find(|path| path.exists())
+}
+
 /// Python of the project's virtual environment, or the one that `CARAWARE_PYTHON` names.
 ///
 /// # Errors

@@ -4,6 +4,7 @@
 
 mod envs;
 mod fanout;
+mod ipc;
 mod lidar;
 mod page;
 mod plots;
@@ -34,11 +35,12 @@ pub struct Options {
 /// Something the measurement needs is missing, or it fails.
 pub fn bench(args: &BenchArgs) -> Result<(), Exit> {
     let bin = install::programs()?;
-    // The peers are Python packages that nothing else needs: without a Python, ours is measured alone.
-    let python = args.python.clone().or_else(|| install::python(&bin).ok());
+    // The peers are Python packages that nothing else needs: without them, ours is measured alone.
+    let python = args.python.clone().or_else(|| install::peers_python(&bin));
+    let python = python.or_else(|| install::python(&bin).ok());
     let options = Options { bin, python };
     let parts = match args.part {
-        Part::All => Part::MEASURED.to_vec(),
+        Part::All => Part::measured().collect(),
         part => vec![part],
     };
     let mut reports = Vec::new();
@@ -70,6 +72,7 @@ pub fn bench(args: &BenchArgs) -> Result<(), Exit> {
 fn measure(part: Part, options: &Options) -> Result<Report, Exit> {
     match part {
         Part::Envs => envs::measure(options),
+        Part::Ipc => ipc::measure(options),
         Part::Lidar => lidar::measure(options),
         Part::Fanout => fanout::measure(options),
         Part::All => Err(Exit::config("`all` is not a part", "")),

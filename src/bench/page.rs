@@ -38,7 +38,7 @@ pub fn write() -> Result<(), Exit> {
 fn page() -> Result<String, Exit> {
     let directory = documentation().join("benchmarks");
     let mut text = HEAD.to_owned();
-    for part in Part::MEASURED {
+    for part in Part::measured() {
         let path = directory.join(format!("{}.json", part.name()));
         let Ok(kept) = std::fs::read_to_string(&path) else {
             continue;

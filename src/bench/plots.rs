@@ -17,7 +17,7 @@ pub fn draw(python: &Path, reports: &[Report], directory: &Path) -> Result<(), E
     std::fs::create_dir_all(directory).map_err(|error| Exit::io("create", directory, &error))?;
     let failed = |error: &std::io::Error| Exit::io("start", python, error);
     let mut process = Command::new(python)
-        .args(["-m", "caraware.benchmark_plots"])
+        .args(["-m", "caraware.benchmarks.plots"])
         .arg(directory)
         .stdin(Stdio::piped())
         .spawn()

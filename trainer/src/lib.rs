@@ -23,6 +23,8 @@ use pyo3::{
     prelude::*,
 };
 
+use rustix::time::{ClockId, clock_gettime};
+
 mod scans;
 mod view;
 use scans::PointCloud;
@@ -30,6 +32,8 @@ use view::SectionView;
 
 /// Longest wait between two looks at Python's signals.
 const LOOK: Duration = Duration::from_millis(50);
+/// Looks for a message between two looks at the clock.
+const POLLS: usize = 100;
 
 fn failed(error: &dyn std::error::Error) -> PyErr {
     PyRuntimeError::new_err(
@@ -100,11 +104,14 @@ impl Attachment {
     }
 
     /// All blocks that are waiting, at least one; an empty list after `timeout_s` seconds. Releases the GIL while it waits.
-    fn receive(&self, py: Python<'_>, timeout_s: f64) -> PyResult<Vec<ObservationBlock>> {
+    ///
+    /// With `busy` it keeps its core and looks again and again instead of sleeping: a microsecond instead of a wake-up.
+    #[pyo3(signature = (timeout_s, *, busy=false))]
+    fn receive(&self, py: Python<'_>, timeout_s: f64, busy: bool) -> PyResult<Vec<ObservationBlock>> {
         let deadline = Instant::now()
             + Duration::try_from_secs_f64(timeout_s).map_err(|error| PyValueError::new_err(error.to_string()))?;
         loop {
-            let blocks = py.detach(|| self.take_waiting())?;
+            let blocks = py.detach(|| if busy { self.poll(deadline) } else { self.take_waiting() })?;
             if !blocks.is_empty() {
                 return Ok(blocks);
             }
@@ -112,7 +119,9 @@ impl Attachment {
             if left.is_zero() {
                 return Ok(blocks);
             }
-            py.detach(|| self.wait(left.min(LOOK)))?;
+            if !busy {
+                py.detach(|| self.wait(left.min(LOOK)))?;
+            }
             py.check_signals()?;
         }
     }
@@ -306,6 +315,23 @@ impl Attachment {
         inner.session.wait(timeout).map_err(session_failed)
     }
 
+    /// Looks until something is there, the deadline has passed, or it is time to look at Python's signals.
+    fn poll(&self, deadline: Instant) -> PyResult<Vec<ObservationBlock>> {
+        let until = deadline.min(Instant::now() + LOOK);
+        loop {
+            for _ in 0..POLLS {
+                let blocks = self.take_waiting()?;
+                if !blocks.is_empty() {
+                    return Ok(blocks);
+                }
+                std::hint::spin_loop();
+            }
+            if Instant::now() >= until {
+                return self.wait(Duration::ZERO).map(|()| Vec::new());
+            }
+        }
+    }
+
     fn take_waiting(&self) -> PyResult<Vec<ObservationBlock>> {
         let mut inner = self.lock()?;
         let mut blocks = Vec::new();
@@ -315,6 +341,13 @@ impl Attachment {
         }
         Ok(blocks)
     }
+}
+
+/// The system's monotonic clock, the same in all processes and in Python's `time.monotonic_ns`.
+fn now_ns() -> u64 {
+    let time = clock_gettime(ClockId::Monotonic);
+    let seconds = u64::try_from(time.tv_sec).unwrap_or_default();
+    seconds * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap_or_default()
 }
 
 /// The header of an answer to `question`: our identity, its episode, tick, time and count.
@@ -333,6 +366,9 @@ fn answer(ours: MessageHeader, question: &MessageHeader) -> MessageHeader {
 /// One tick's observations in shared memory; the memory stays valid while this object or a view of it lives.
 #[pyclass(frozen, module = "caraware._native")]
 struct ObservationBlock {
+    /// When it was taken, on the system's monotonic clock, nanoseconds.
+    #[pyo3(get)]
+    received_ns: u64,
     header: MessageHeader,
     layout: ObservationLayout,
     /// Address of the payload; valid as long as `_message` lives.
@@ -343,6 +379,7 @@ struct ObservationBlock {
 
 impl ObservationBlock {
     fn new(message: Message) -> PyResult<Self> {
+        let received_ns = now_ns();
         let header = *message.header();
         let payload_address = message.payload().as_ptr().expose_provenance();
         let layout = ObservationLayout::of(&header);
@@ -357,6 +394,7 @@ impl ObservationBlock {
             )));
         }
         Ok(Self {
+            received_ns,
             header,
             layout,
             payload_address,

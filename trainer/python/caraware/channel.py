@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import warnings
-from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -50,31 +49,53 @@ def _shares_memory(a: Tensor, b: Tensor) -> bool:
 
 def read_only_tensor(array: np.ndarray) -> Tensor:
     """A tensor over a read-only numpy array, without a copy."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
-        return torch.from_numpy(array).as_subclass(ReadOnlyTensor)
+    return torch.from_numpy(array).as_subclass(ReadOnlyTensor)
 
 
-@dataclass(frozen=True)
+# torch warns once per process of an array that is not writable: here, where nobody sees it.
+with warnings.catch_warnings():
+    warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+    read_only_tensor(np.frombuffer(bytes(4), np.float32))
+
+
 class Observation:
     """One tick of one environment. n slots, d fields; a slot keeps its vehicle until that vehicle is gone.
 
     All arrays are read-only views over shared memory, valid while this object or any of them lives.
     """
 
-    block: _native.ObservationBlock
-    tick: int = field(init=False)
-    episode: int = field(init=False)
-    sim_time_ns: int = field(init=False)
-    evaluation: bool = field(init=False)
-    """True in an evaluation episode, whose seed training never sees."""
-    last: bool = field(init=False)
-    """True for the last tick of the run."""
-    episode_last: bool = field(init=False)
+    def __init__(self, block: _native.ObservationBlock) -> None:
+        self.block = block
 
-    def __post_init__(self) -> None:
-        for name in ("tick", "episode", "sim_time_ns", "evaluation", "last", "episode_last"):
-            object.__setattr__(self, name, getattr(self.block, name))
+    @property
+    def tick(self) -> int:
+        """Tick number, 0-based over the run."""
+        return self.block.tick
+
+    @property
+    def episode(self) -> int:
+        """Episode number, 0-based over the run."""
+        return self.block.episode
+
+    @property
+    def sim_time_ns(self) -> int:
+        """Simulated time since the start of the episode."""
+        return self.block.sim_time_ns
+
+    @property
+    def evaluation(self) -> bool:
+        """True in an evaluation episode, whose seed training never sees."""
+        return self.block.evaluation
+
+    @property
+    def last(self) -> bool:
+        """True for the last tick of the run."""
+        return self.block.last
+
+    @property
+    def episode_last(self) -> bool:
+        """True for the last tick of its episode."""
+        return self.block.episode_last
 
     def _array(self, name: str, dtype: type, columns: int | None = None) -> np.ndarray:
         array = np.frombuffer(self.block.section(name), dtype=dtype)
@@ -193,14 +214,16 @@ class Channel:
         """Wait until something comes from any environment, at most `timeout_s`. Look with `receive(0)` first."""
         self._attachment.wait_for_any(timeout_s)
 
-    def receive(self, timeout_s: float) -> list[Observation]:
+    def receive(self, timeout_s: float, *, busy: bool = False) -> list[Observation]:
         """All ticks that are waiting, in order, at least one; an empty list after `timeout_s`.
+
+        `busy` polls instead of sleeping: it takes a whole core and saves the wake-up, some 30 µs.
 
         Raises StreamEndedError once the last tick has been received before.
         """
         if self._attachment.ended:
             raise StreamEndedError
-        return [Observation(block) for block in self._attachment.receive(timeout_s)]
+        return [Observation(block) for block in self._attachment.receive(timeout_s, busy=busy)]
 
     def scans(self) -> list[PointCloud]:
         """LIDAR scans since the last call, oldest first; the newest of them if more came than shared memory holds.

@@ -1,4 +1,4 @@
-"""Pictures of `caraware bench`: `python -m caraware.benchmark_plots DIRECTORY < reports.json`.
+"""Pictures of `caraware bench`: `python -m caraware.benchmarks.plots DIRECTORY < reports.json`.
 
 The input is a list of reports (`src/bench/report.rs`); every curve becomes `DIRECTORY/<name>.png`.
 """

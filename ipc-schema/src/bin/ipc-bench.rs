@@ -1,0 +1,125 @@
+//! The time a bare iceoryx2 message takes from one process to another, both busy-polling: the yardstick of `caraware bench ipc`.
+//!
+//! `ipc-bench [--messages N] --json FILE`; the other process is this program again.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "a measurement that cannot run says why and ends"
+)]
+
+use std::{
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+};
+
+use iceoryx2::{
+    config::Config,
+    prelude::{FileName, NodeBuilder, Path as IpcPath, SemanticString as _, ServiceName, ipc},
+    service::port_factory::publish_subscribe::PortFactory,
+};
+use rustix::time::{ClockId, clock_gettime};
+
+/// Messages before the measurement, while pages and caches warm up.
+const WARM_UP: u64 = 2_000;
+/// Pause between two messages: the receiver has read the last one and polls again.
+const PAUSE_NS: u64 = 20_000;
+
+/// The services: there, and back once a message has been taken.
+const STAMPS: &str = "stamps";
+const TAKEN: &str = "taken";
+
+/// The system's monotonic clock, nanoseconds, the same in all processes.
+fn now_ns() -> u64 {
+    let time = clock_gettime(ClockId::Monotonic);
+    u64::try_from(time.tv_sec).unwrap() * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap()
+}
+
+/// The service `name` below `root`.
+fn service(root: &Path, name: &str) -> PortFactory<ipc::Service, u64, ()> {
+    let mut config = Config::default();
+    config
+        .global
+        .set_root_path(&IpcPath::new(root.as_os_str().as_encoded_bytes()).unwrap());
+    config.global.prefix = FileName::new(b"caraware_bench_").unwrap();
+    let node = NodeBuilder::new().config(&config).create::<ipc::Service>().unwrap();
+    node.service_builder(&ServiceName::new(name).unwrap())
+        .publish_subscribe::<u64>()
+        .open_or_create()
+        .unwrap()
+}
+
+fn receive(root: &Path, messages: u64, json: &Path) {
+    let subscriber = service(root, STAMPS).subscriber_builder().create().unwrap();
+    let taken = service(root, TAKEN).publisher_builder().create().unwrap();
+    println!("ready");
+    let mut latencies = Vec::new();
+    for _ in 0..messages + WARM_UP {
+        let sample = loop {
+            if let Some(sample) = subscriber.receive().unwrap() {
+                break sample;
+            }
+            std::hint::spin_loop();
+        };
+        latencies.push(now_ns() - *sample);
+        drop(sample);
+        taken.send_copy(0).unwrap();
+    }
+    let report = serde_json::json!({ "latencies_ns": latencies[usize::try_from(WARM_UP).unwrap()..] });
+    std::fs::write(json, report.to_string()).unwrap();
+}
+
+fn send(root: &Path, messages: u64) {
+    let publisher = service(root, STAMPS).publisher_builder().create().unwrap();
+    let taken = service(root, TAKEN).subscriber_builder().create().unwrap();
+    for _ in 0..messages + WARM_UP {
+        let begin = now_ns();
+        while now_ns() - begin < PAUSE_NS {
+            std::hint::spin_loop();
+        }
+        let sample = publisher.loan_uninit().unwrap();
+        sample.write_payload(now_ns()).send().unwrap();
+        while taken.receive().unwrap().is_none() {
+            std::hint::spin_loop();
+        }
+    }
+}
+
+fn main() {
+    let mut messages = 50_000;
+    let mut json = None;
+    let mut receiver_root: Option<PathBuf> = None;
+    let mut arguments = std::env::args().skip(1);
+    while let Some(argument) = arguments.next() {
+        let mut value = || arguments.next().unwrap_or_else(|| panic!("{argument} needs a value"));
+        match argument.as_str() {
+            "--messages" => messages = value().parse().unwrap(),
+            "--json" => json = Some(PathBuf::from(value())),
+            "--receive" => receiver_root = Some(value().into()),
+            other => panic!("unknown option {other}"),
+        }
+    }
+    let json = json.unwrap_or_else(|| panic!("--json FILE is needed"));
+    if let Some(root) = receiver_root {
+        return receive(&root, messages, &json);
+    }
+    let root = std::env::temp_dir().join(format!("ipc-bench-{}", std::process::id()));
+    std::fs::create_dir_all(&root).unwrap();
+    // Held here, so that the service outlives whoever leaves first.
+    let held = [STAMPS, TAKEN].map(|name| service(&root, name));
+    let mut receiver = Command::new(std::env::current_exe().unwrap())
+        .arg("--receive")
+        .arg(&root)
+        .args(["--messages", &messages.to_string(), "--json"])
+        .arg(&json)
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    std::io::BufRead::read_line(&mut std::io::BufReader::new(receiver.stdout.take().unwrap()), &mut line).unwrap();
+    send(&root, messages);
+    let status = receiver.wait().unwrap();
+    drop(held);
+    std::fs::remove_dir_all(&root).unwrap();
+    assert!(status.success(), "the receiver ended with {status}");
+}

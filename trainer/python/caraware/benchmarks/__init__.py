@@ -1,0 +1,1 @@
+"""Programs that `caraware bench` starts: the Python side of what it measures."""

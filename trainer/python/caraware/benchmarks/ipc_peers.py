@@ -1,0 +1,143 @@
+"""The peers of `caraware bench ipc`: one-way latency of what Python programs usually send arrays with.
+
+`python -m caraware.benchmarks.ipc_peers SIZES FILE` sends messages of each size (bytes, comma-separated) from one
+process to another through a pipe of `multiprocessing`, a TCP connection over loopback and, if pyzmq is installed,
+ZeroMQ's `ipc://`, and writes `{peer: {size: [latency_ns, …]}}`. The sender stamps the monotonic clock right before it
+sends; the receiver once the message is a tensor. One message is under way at a time.
+"""
+
+import importlib.util
+import json
+import multiprocessing
+import socket
+import struct
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+import torch
+
+STAMP = struct.Struct("<Q")
+WARM_UP = 20
+PAUSE_S = 200e-6
+
+Receive = Callable[[int], "bytes | bytearray | memoryview"]
+Send = Callable[[bytearray], None]
+
+
+def tensor_of(message: bytes | bytearray | memoryview) -> torch.Tensor:
+    """The floats of a message, without a copy."""
+    return torch.from_numpy(np.frombuffer(message, dtype=np.float32))
+
+
+def messages_of(size: int) -> int:
+    """How many messages are measured: fewer of the large ones."""
+    return max(50, min(1000, (64 << 20) // size))
+
+
+def pipe_receiver(connection: Connection) -> Receive:
+    """A `multiprocessing.Pipe`, as `Connection.send_bytes` and `recv_bytes` use it."""
+    return lambda _: connection.recv_bytes()
+
+
+def tcp_receiver(port_pipe: Connection) -> Receive:
+    """A TCP connection over loopback without Nagle's delay, read into one buffer."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    port_pipe.send(listener.getsockname()[1])
+    stream, _ = listener.accept()
+    buffers: dict[int, bytearray] = {}
+
+    def receive(size: int) -> memoryview:
+        view = memoryview(buffers.setdefault(size, bytearray(size)))
+        got = 0
+        while got < size:
+            got += stream.recv_into(view[got:])
+        return view
+
+    return receive
+
+
+def zmq_receiver(address: str) -> Receive:
+    """A ZeroMQ PULL socket; the message is not copied out of its frame."""
+    import zmq
+
+    receiver = zmq.Context().socket(zmq.PULL)
+    receiver.connect(address)
+    return lambda _: receiver.recv(copy=False).buffer
+
+
+def receiving(kind: str, address: str, sizes: list[int], connection: Connection, answer: Connection) -> None:
+    """The other process: receives everything, then answers with all latencies."""
+    receive = {
+        "multiprocessing pipe": lambda: pipe_receiver(connection),
+        "TCP over loopback": lambda: tcp_receiver(answer),
+        "pyzmq ipc://": lambda: zmq_receiver(address),
+    }[kind]()
+    answer.send("ready")
+    latencies: dict[int, list[int]] = {}
+    for size in sizes:
+        latencies[size] = []
+        for _ in range(WARM_UP + messages_of(size)):
+            message = receive(size)
+            tensor = tensor_of(message)
+            now_ns = time.monotonic_ns()
+            assert tensor.numel() * 4 == size
+            latencies[size].append(now_ns - STAMP.unpack_from(message)[0])
+            answer.send_bytes(b"taken")
+        del latencies[size][:WARM_UP]
+    answer.send(latencies)
+
+
+def measure(kind: str, sizes: list[int]) -> dict[int, list[int]]:
+    """All latencies of one peer."""
+    context = multiprocessing.get_context("spawn")
+    theirs, ours = context.Pipe(duplex=False)
+    answer, their_answer = context.Pipe(duplex=False)
+    with tempfile.TemporaryDirectory() as directory:
+        address = f"ipc://{directory}/socket"
+        if kind == "pyzmq ipc://":
+            import zmq
+
+            socket_ = zmq.Context().socket(zmq.PUSH)
+            socket_.bind(address)
+        arguments = (kind, address, sizes, theirs, their_answer)
+        process = context.Process(target=receiving, args=arguments, daemon=True)
+        process.start()
+        send: Send
+        if kind == "multiprocessing pipe":
+            send = ours.send_bytes
+        elif kind == "TCP over loopback":
+            stream = socket.create_connection(("127.0.0.1", answer.recv()))
+            stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            send = stream.sendall
+        else:
+            # pyzmq hands the buffer over without a copy; it is not written before the receiver has taken the message.
+            send = lambda message: socket_.send(message, copy=False)  # noqa: E731
+        assert answer.recv() == "ready"
+        for size in sizes:
+            message = bytearray(size)
+            for _ in range(WARM_UP + messages_of(size)):
+                time.sleep(PAUSE_S)
+                STAMP.pack_into(message, 0, time.monotonic_ns())
+                send(message)
+                answer.recv_bytes()
+        latencies = answer.recv()
+        process.join()
+    return latencies
+
+
+def main() -> None:
+    """Measures every peer that is installed."""
+    sizes = [int(size) for size in sys.argv[1].split(",")]
+    kinds = ["multiprocessing pipe", "TCP over loopback"]
+    if importlib.util.find_spec("zmq"):
+        kinds.append("pyzmq ipc://")
+    Path(sys.argv[2]).write_text(json.dumps({kind: measure(kind, sizes) for kind in kinds}))
+
+
+if __name__ == "__main__":
+    main()
