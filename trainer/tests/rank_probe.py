@@ -9,12 +9,15 @@ from caraware.config import RunConfig
 from caraware.loop import TrainingLoop
 from synthetic import SyntheticChannel, run_file, with_evaluation
 
+DEVICE = os.environ.get("RANK_PROBE_DEVICE", "cpu")
 HORIZON, BATCH, VEHICLES, TRAINING_TICKS = 256, 64, 16, 64
 
 
 def settings(folder: Path, envs: int, first_env: int, world: int) -> dict:
     """The run file of one trainer with `envs` environments among `world` ranks; sizes are of each environment."""
-    run = run_file(str(folder), ranks=world, horizon=envs * HORIZON, batch_size=envs * BATCH, checkpoint_interval=1)
+    run = run_file(
+        str(folder), ranks=world, horizon=envs * HORIZON, batch_size=envs * BATCH, checkpoint_interval=1, device=DEVICE
+    )
     run["config"]["run"] = {"envs": envs, "first_env": first_env, "seed": 1}
     return run
 
@@ -41,6 +44,7 @@ def main(folder: Path, fault: str) -> None:
         assert loop._ppo is not None
         loop._ppo.policy.mlp.parameters.values[0] += 1e-3
     loop.run()
+    together.close()
 
 
 if __name__ == "__main__":

@@ -119,6 +119,9 @@ class Ranks:
     def check_equal(self, what: str, tensors: Sequence[Tensor]) -> None:
         """Raises `RankError` where they are not the same on all ranks, bit for bit."""
 
+    def close(self) -> None:
+        """Part from the others, when all are done."""
+
 
 class TorchRanks(Ranks):
     """A trainer among others that `torchrun` started (`caraware.parallel`)."""
@@ -191,6 +194,10 @@ class TorchRanks(Ranks):
         digests = self.gather(digest.hexdigest())
         if len(set(digests)) > 1:
             raise RankError(f"{what} differ between the ranks: {', '.join(digests)}")
+
+    def close(self) -> None:
+        """See `Ranks.close`."""
+        self._dist.destroy_process_group()
 
 
 def of_run(ranks: int) -> Ranks:

@@ -143,6 +143,7 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
         # A successor waits for this process to end, and the simulation for it: torch would take seconds to tidy up.
         logging.shutdown()
         os._exit(0)
+    together.close()
 
 
 def _successor(run_file: Path, config: "RunConfig", succession: Succession) -> "Learner | None":
