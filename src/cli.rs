@@ -21,6 +21,7 @@ const AFTER: &str = "Examples:
   caraware train                                  learn on the town with the default preset
   caraware train --set traffic.cavs=8 --set run.seed=7
   caraware simulate my.sumocfg                    your own scenario, every vehicle sensing
+  caraware play town-1                            watch what it has learnt, beside a Kalman filter
   caraware ps                                     what runs, from another terminal
   caraware bench lidar                            rays per second, beside Open3D's
   caraware swap --set trainer.learning_rate=0.001 another trainer for a live run, which loses nothing
@@ -33,7 +34,11 @@ All configuration keys: configs/README.md";
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Simulate and learn
-    Train(RunArgs),
+    #[command(after_help = RESUME)]
+    Train(TrainArgs),
+    /// Let the policy of a checkpoint predict, without end; nothing learns
+    #[command(after_help = PLAY)]
+    Play(PlayArgs),
     /// Simulate without learning; a `.sumocfg` runs to its end
     Simulate(RunArgs),
     /// Show the processes of every live run
@@ -66,6 +71,47 @@ const SWAP: &str = "Examples:
 
 The successor starts beside the trainer at work and gets ready. Only then does the old one write a checkpoint and leave. A successor
 that fails is refused, and the old trainer goes on.";
+
+const RESUME: &str = "Examples:
+  caraware train                                             the default preset, from the beginning
+  caraware train --resume town-1                             goes on from its newest sound checkpoint, in runs/town-1
+  caraware train --resume runs/town-1/checkpoints/update-000300    another run, which begins there
+
+A resumed run ends with the parameters, bit for bit, of the run that was never stopped (on a CPU).";
+
+const PLAY: &str = "Examples:
+  caraware play town-1                                       the best checkpoint of the run, on its own map, on unseen seeds
+  caraware play runs/town-1/checkpoints/update-000300
+  caraware play town-1 my/scenario.sumocfg                   on other roads; the observation must have the same size
+  caraware play town-1 --set run.real_time_factor=1          as fast as time goes by, for a viewer
+
+Shows each vehicle's position error by the policy and by an extended Kalman filter over the same samples, until Ctrl-C or `caraware
+stop`; then a report. On a terminal the table is live, otherwise there is a line every few seconds. Predictions go to viewers.";
+
+/// What `train` takes.
+#[derive(Debug, Args, Clone)]
+pub struct TrainArgs {
+    /// The run.
+    #[command(flatten)]
+    pub run: RunArgs,
+    /// Go on with a run (its name or directory), or from one of its checkpoints (a directory) in another run
+    #[arg(long, value_name = "RUN", conflicts_with = "config")]
+    pub resume: Option<String>,
+}
+
+/// What `play` takes.
+#[derive(Debug, Args, Clone)]
+pub struct PlayArgs {
+    /// Name or directory of a run, whose best checkpoint is taken, or a checkpoint directory
+    #[arg(value_name = "RUN|CHECKPOINT")]
+    pub checkpoint: String,
+    /// The run; without CONFIG it is like the one that learnt.
+    #[command(flatten)]
+    pub run: RunArgs,
+    /// End after so many episodes of `episode.ticks` each [default: never]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub episodes: Option<u64>,
+}
 
 /// What `swap` takes.
 #[derive(Debug, Args, Clone)]

@@ -9,12 +9,16 @@ use indicatif::{ProgressBar, ProgressStyle};
 use ipc_schema::{
     board::{Health, TrainingStatus},
     process::Process,
+    run::Mode,
 };
 
-use crate::environment::Environment;
+use crate::{environment::Environment, live_table::LiveTable};
 
 /// Time between two lines when there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
+
+/// Rows of a table, so that it fits on most terminals.
+const TABLE_ROWS: usize = 24;
 
 /// Shows how a run fares.
 #[derive(Debug)]
@@ -57,6 +61,13 @@ impl Display {
         if self.is_silent {
             return;
         }
+        if let Some(run) = environments.first().map(|environment| &environment.run)
+            && run.mode == Mode::Play
+            && let Some(table) = LiveTable::read(&run.run_dir)
+        {
+            self.show(&table);
+            return;
+        }
         let view = View::read(environments, ready_at);
         if let Some(bar) = &self.bar {
             if bar.length() != view.total_ticks && view.total_ticks.is_some() {
@@ -70,6 +81,17 @@ impl Display {
             eprintln!("{}", view.line());
         }
         self.last_text = view.line();
+    }
+
+    /// The errors of each vehicle: a table where there is a terminal, else a line.
+    fn show(&mut self, table: &LiveTable) {
+        if let Some(bar) = &self.bar {
+            bar.set_message(table.lines(TABLE_ROWS).join("\n"));
+        } else if self.last_line.elapsed() >= LINE_EVERY {
+            self.last_line = Instant::now();
+            eprintln!("{}", table.line());
+        }
+        self.last_text = table.line();
     }
 
     /// Leaves the last state on the screen.

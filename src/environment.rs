@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use ipc_schema::{
     board::State,
-    ports::{BoardReader, RosterWriter},
+    ports::{BoardReader, RosterWriter, Waker},
     process::Process,
     run::RunFile,
     services::{RunNode, ServiceHolder},
@@ -21,6 +21,8 @@ pub struct Environment {
     /// Which incarnation of each process counts.
     pub roster: RosterWriter,
     boards: Vec<BoardReader>,
+    /// Who makes observations looks at a hand-over at once.
+    sensing: Waker,
     _services: ServiceHolder,
 }
 
@@ -41,10 +43,12 @@ impl Environment {
             .into_iter()
             .map(|process| Ok(BoardReader::open(node, &run, env_index, process)?))
             .collect::<Result<_, Exit>>()?;
+        let sensing = Waker::open(node, &run, env_index, Process::SensorDaemon)?;
         Ok(Self {
             run,
             run_file,
             roster: RosterWriter::create(&services)?,
+            sensing,
             boards,
             _services: services,
         })
@@ -54,6 +58,17 @@ impl Environment {
     #[must_use]
     pub fn board(&self, process: Process) -> &BoardReader {
         &self.boards[process.index()]
+    }
+
+    /// Says whether a hand-over from one trainer to the next is under way.
+    pub fn set_handing_over(&mut self, under_way: bool) {
+        self.roster.set_handing_over(Process::Trainer, under_way);
+        self.wake_sensing();
+    }
+
+    /// Lets sensor-daemon look at once who counts.
+    pub fn wake_sensing(&self) {
+        self.sensing.wake();
     }
 
     /// State of a process.

@@ -1,6 +1,7 @@
 //! The `caraware` command: configuration, process table, supervisor, status, doctor.
 
 pub mod bench;
+pub mod checkpoint;
 pub mod cli;
 pub mod config;
 pub mod cores;
@@ -9,10 +10,12 @@ pub mod doctor;
 pub mod environment;
 pub mod failure;
 pub mod install;
+pub mod live_table;
 pub mod prepare;
 pub mod process_table;
 pub mod registry;
 pub mod report;
+pub mod resume;
 pub mod revival;
 pub mod scenario;
 pub mod status;

@@ -4,11 +4,11 @@ use std::process::ExitCode;
 
 use caraware::{
     bench,
-    cli::{Cli, Command, RunArgs},
+    cli::{Cli, Command},
     display::Display,
     doctor,
     failure::Exit,
-    prepare::prepare,
+    prepare::{Prepared, prepare, prepare_play, prepare_resume},
     report, status,
     supervisor::Supervisor,
     swap,
@@ -19,8 +19,12 @@ use ipc_schema::run::Mode;
 fn main() -> ExitCode {
     let cli = Cli::parse();
     let result = match cli.command {
-        Command::Train(args) => run(&args, Mode::Train),
-        Command::Simulate(args) => run(&args, Mode::Simulate),
+        Command::Train(args) => match &args.resume {
+            Some(resumed) => prepare_resume(&args.run, resumed).and_then(run),
+            None => prepare(&args.run, Mode::Train).and_then(run),
+        },
+        Command::Play(args) => prepare_play(&args).and_then(run),
+        Command::Simulate(args) => prepare(&args, Mode::Simulate).and_then(run),
         Command::Ps { run } => status::ps(run.as_deref()),
         Command::Swap(args) => swap::swap(&args),
         Command::Stop { run } => status::stop(run.as_deref()),
@@ -33,8 +37,7 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(args: &RunArgs, mode: Mode) -> Result<(), Exit> {
-    let prepared = prepare(args, mode)?;
+fn run(prepared: Prepared) -> Result<(), Exit> {
     let run = prepared.run.clone();
     if !args.quiet {
         eprintln!("run {}: results go to {}", run.name, run.run_dir.display());

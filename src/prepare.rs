@@ -8,17 +8,19 @@ use std::{
 use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
-    run::{MapInfo, Mode, RunFile, SceneFiles, Source},
+    run::{Beginning, MapInfo, Mode, RunFile, SceneFiles, Source},
     services::Channel,
 };
 use serde_json::Value;
 
 use crate::{
-    cli::RunArgs,
+    checkpoint::Found,
+    cli::{PlayArgs, RunArgs},
     config::{self, ConfigError, Settings},
     failure::Exit,
     install::Install,
     registry::{self, Claim},
+    resume,
     scenario::{self, Scenario},
     town,
 };
@@ -53,9 +55,82 @@ enum Named {
 /// Anything wrong with the configuration, the user's files or this machine.
 pub fn prepare(args: &RunArgs, mode: Mode) -> Result<Prepared, Exit> {
     let (settings, named, label) = resolve(&args.with_shorthands())?;
-    let config = settings.validate()?;
-    check_task(&config, mode, &named)?;
+    make(args, mode, settings.validate()?, named, &label, Install::find()?)
+}
+
+/// Checks a run in which the policy of a checkpoint predicts, and claims its directory and shared memory.
+///
+/// # Errors
+/// As [`prepare`], or there is no such checkpoint, or it does not fit the configuration.
+pub fn prepare_play(args: &PlayArgs) -> Result<Prepared, Exit> {
     let install = Install::find()?;
+    let found = Found::best(&install, &args.checkpoint, &args.run.runs)?;
+    let (settings, named) = match &args.run.config {
+        Some(_) => resolve(&args.run.with_shorthands()).map(|(settings, named, _)| (settings, named))?,
+        None => of_run(&found.run()?, &args.run.with_shorthands().set)?,
+    };
+    let config = settings.validate()?;
+    if config.drives() {
+        return Err(Exit::config(
+            "play is for policies that tell where a vehicle is, not for the driving task",
+            "`caraware train` with a driver as trainer.module drives",
+        ));
+    }
+    found.check_fit(&config)?;
+    let label = format!("{}-play", found.label());
+    let mut prepared = make(&args.run, Mode::Play, config, named, &label, install)?;
+    prepared.run.beginning = Some(Beginning {
+        checkpoint: found.checkpoint,
+        committed_ticks: 0,
+        episode: 0,
+        episode_tick: 0,
+        episodes: args.episodes,
+    });
+    Ok(prepared)
+}
+
+/// Checks a run that goes on from a checkpoint: in its own directory if a run is named, in a new one if a checkpoint is.
+///
+/// # Errors
+/// As [`prepare`], or there is no such checkpoint or run, or a setting differs that observations depend on.
+pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<Prepared, Exit> {
+    let install = Install::find()?;
+    let found = Found::newest(&install, resumed, &args.runs)?;
+    let old = found.run()?;
+    let config = resume::changed(&old, &args.with_shorthands().set)?;
+    found.check_fit(&config)?;
+    if found.is_run && args.name.is_none() {
+        check_port(&config)?;
+        registry::sweep();
+        let (run, claim) = resume::go_on(&found, old, config, &install)?;
+        check_shared_memory(&run)?;
+        return Ok(Prepared { run, install, claim });
+    }
+    let (_, named) = of_run(&old, &[])?;
+    let mut prepared = make(args, Mode::Train, config, named, &found.label(), install)?;
+    prepared.run.beginning = Some(found.copy_into(&prepared.run.run_dir)?);
+    Ok(prepared)
+}
+
+/// The settings and the source of traffic of another run, and what changes.
+fn of_run(run: &RunFile, set: &[String]) -> Result<(Settings, Named), Exit> {
+    let settings = Settings::of(&run.config)?.with_assignments(set)?;
+    let named = match &run.source {
+        Source::Scenario { sumocfg } => Named::Scenario(sumocfg.clone(), scenario::read(sumocfg)?),
+        Source::Population { .. } => Named::Map,
+    };
+    Ok((settings, named))
+}
+
+fn make(
+    args: &RunArgs,
+    mode: Mode,
+    config: Config,
+    named: Named,
+    label: &str,
+    install: Install,
+) -> Result<Prepared, Exit> {
+    check_task(&config, mode, &named)?;
     let origin = config.map.origin_latitude_deg.zip(config.map.origin_longitude_deg);
     let scenario_map = match &named {
         Named::Scenario(_, scenario) => Some(scenario::map_info(&scenario.net_file, origin)?),
@@ -63,7 +138,7 @@ pub fn prepare(args: &RunArgs, mode: Mode) -> Result<Prepared, Exit> {
     };
     check_port(&config)?;
     registry::sweep();
-    let run_dir = create_run_dir(args, &label)?;
+    let run_dir = create_run_dir(args, label)?;
     let result = assemble(&run_dir, mode, config, &install, named, scenario_map);
     if result.is_err() {
         // Nothing has been started: leave nothing behind.
@@ -138,7 +213,7 @@ fn check_task(config: &Config, mode: Mode, named: &Named) -> Result<(), Exit> {
                 "set traffic.hero_ids to the ids of the vehicles that are to be driven, and traffic.heroes = 0",
             ))
         }
-        (Mode::Train, _) => Ok(()),
+        (Mode::Train | Mode::Play, _) => Ok(()),
     }
 }
 
@@ -265,6 +340,7 @@ fn assemble(
         sumo_home: install.sumo_home.clone(),
         config,
         config_hash,
+        beginning: None,
     };
     check_shared_memory(&run)?;
     Ok((run, claim))

@@ -117,7 +117,7 @@ pub const TABLE: [Row; 5] = [
         scope: Scope::Run,
         needs: &[Process::TrafficBridge],
         on_exit: OnExit::Replace,
-        wanted: |run| run.mode == Mode::Train,
+        wanted: |run| run.mode.has_trainer(),
         command: trainer,
     },
     Row {
@@ -131,11 +131,16 @@ pub const TABLE: [Row; 5] = [
     },
 ];
 
+/// What takes the trainer's place where nothing learns.
+const PLAYER: &str = "caraware.play";
+
 fn trainer(install: &Install, run: &RunFile) -> Result<Command, Exit> {
     let mut command = Command::new(&install.python);
-    command
-        .args(["-m", &run.config.trainer.module])
-        .env("PYTHONUNBUFFERED", "1");
+    let module = match run.mode {
+        Mode::Play => PLAYER,
+        Mode::Train | Mode::Simulate => &run.config.trainer.module,
+    };
+    command.args(["-m", module]).env("PYTHONUNBUFFERED", "1");
     Ok(command)
 }
 

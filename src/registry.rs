@@ -228,6 +228,13 @@ pub fn sweep() -> usize {
     dead.len()
 }
 
+/// True if the supervisor of the run in `run_dir` lives.
+#[must_use]
+pub fn is_alive(run_dir: &Path) -> bool {
+    let is_there = |entry: &Entry| entry.alive && entry.run.as_ref().is_some_and(|run| run.run_dir == run_dir);
+    entries().iter().any(is_there)
+}
+
 /// The live run called `name`, or the only one if `name` is `None`.
 ///
 /// # Errors

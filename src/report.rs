@@ -6,7 +6,7 @@ use ipc_schema::run::{Mode, RunFile};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-use crate::{failure::Exit, supervisor::Outcome};
+use crate::{failure::Exit, supervisor::Outcome, swap::Handover};
 
 /// What sensor-daemon writes at its end.
 #[derive(Debug, Clone, Deserialize, Default)]
@@ -18,6 +18,7 @@ struct Sensing {
     drops: u64,
     redelivered_ticks: u64,
     journal_mib: u64,
+    hand_overs: Vec<HandOver>,
     cavs_max: u64,
     raw_gnss_mean_error_m: Option<f64>,
     lidar: Option<Value>,
@@ -69,6 +70,34 @@ fn part<T: serde::de::DeserializeOwned>(run: &RunFile, process: &str) -> Option<
     read(&run.run_dir.join("parts").join(format!("{process}.json")))
 }
 
+/// A planned hand-over as sensor-daemon saw it.
+#[derive(Debug, Clone, Deserialize)]
+struct HandOver {
+    incarnation: u32,
+    stall_s: f64,
+    ticks_without_trainer: u64,
+    most_ahead_ticks: u64,
+}
+
+/// The swaps of a run, each with what the simulation noticed of it. A tick takes `tick_s` wall seconds on average.
+fn swaps(outcome: &Outcome, sensing: &Sensing, tick_s: f64) -> Vec<Value> {
+    let told = |swap: &Handover| {
+        let mut value = json!(swap);
+        if let Some(seen) = sensing
+            .hand_overs
+            .iter()
+            .find(|seen| seen.incarnation == swap.incarnation)
+        {
+            value["stall_s"] = json!(seen.stall_s);
+            value["stall_ticks"] = json!(seen.stall_s / tick_s);
+            value["ticks_without_trainer"] = json!(seen.ticks_without_trainer);
+            value["most_ahead_ticks"] = json!(seen.most_ahead_ticks);
+        }
+        value
+    };
+    outcome.swaps.iter().map(told).collect()
+}
+
 /// Puts the report together, writes it, and returns it with its path.
 ///
 /// # Errors
@@ -90,10 +119,10 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
     let learned = |key: &str| training.get(key).cloned().unwrap_or(Value::Null);
     let env_steps = match run.mode {
         Mode::Train => learned("env_steps").as_u64().unwrap_or(0),
-        Mode::Simulate => sensing.observations,
+        Mode::Simulate | Mode::Play => sensing.observations,
     };
     let raw = match run.mode {
-        Mode::Train => learned("raw_gnss_mean_error_m"),
+        Mode::Train | Mode::Play => learned("raw_gnss_mean_error_m"),
         Mode::Simulate => json!(sensing.raw_gnss_mean_error_m),
     };
     #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
@@ -112,6 +141,11 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "ppo_mean_error_m": learned("ppo_mean_error_m"),
         "ekf_mean_error_m": learned("ekf_mean_error_m"),
         "rts_mean_error_m": learned("rts_mean_error_m"),
+        "ppo_ci95_m": learned("ppo_ci95_m"),
+        "raw_gnss_ci95_m": learned("raw_gnss_ci95_m"),
+        "ekf_ci95_m": learned("ekf_ci95_m"),
+        "rts_ci95_m": learned("rts_ci95_m"),
+        "evaluation_seeds": learned("evaluation_seeds"),
         "policy_std": learned("policy_std"),
         "vehicles": sensing.cavs_max,
         "observation_hash": sensing.observation_hash,
@@ -119,13 +153,14 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "duplicated_ticks": training.get("duplicated_ticks").cloned().unwrap_or(json!(0)),
         "drops": sensing.drops,
         "restarts": outcome.restarts,
-        "swaps": outcome.swaps,
+        "swaps": swaps(outcome, &sensing, outcome.wall_s / sensing.ticks.max(1) as f64),
         "redelivered_ticks": sensing.redelivered_ticks,
         "journal_mib": sensing.journal_mib,
         "vehicle_steps": sensing.observations,
         "ticks": sensing.ticks,
         "simulated_s": simulated_s,
         "real_time_factor": simulated_s / outcome.wall_s,
+        "beginning": run.beginning,
         "seed": run.seed(),
         "config_hash": run.config_hash,
         "trainer": training,
@@ -148,7 +183,11 @@ fn hashes(report: &Value) -> Vec<String> {
     let hash = |of: &Value| of["observation_hash"].as_str().unwrap_or_default().to_owned();
     let environments = report["environments"].as_array().map_or(&[][..], Vec::as_slice);
     if environments.len() < 2 {
-        return vec![format!("observation hash {}", hash(report))];
+        let since = match report["beginning"]["episode"].as_u64() {
+            Some(episode) if report["mode"] == "train" => format!(" (since episode {episode}, where this part began)"),
+            _ => String::new(),
+        };
+        return vec![format!("observation hash {}{since}", hash(report))];
     }
     let line = |one: &Value| {
         format!(
@@ -170,6 +209,10 @@ pub fn summary(report: &Value, path: &Path) -> String {
             .as_f64()
             .map_or("–".into(), |value| format!("{value:.digits$}"))
     };
+    let error = |name: &str| match report[format!("{name}_ci95_m")].as_f64() {
+        Some(half_m) => format!("{} ± {half_m:.2} m", number(&format!("{name}_mean_error_m"), 2)),
+        None => format!("{} m", number(&format!("{name}_mean_error_m"), 2)),
+    };
     let mut lines = vec![format!(
         "{} {}: {} vehicle-steps in {} s ({} per second, {} × real time)",
         report["name"].as_str().unwrap_or_default(),
@@ -180,18 +223,28 @@ pub fn summary(report: &Value, path: &Path) -> String {
         number("real_time_factor", 1),
     )];
     if !report["ppo_mean_error_m"].is_null() {
+        let seeds = match report["evaluation_seeds"].as_u64() {
+            Some(seeds) if seeds > 1 => format!("{seeds} unseen seeds (± 95 %)"),
+            _ => "unseen seeds".to_owned(),
+        };
         lines.push(format!(
-            "mean error on unseen seeds: policy {} m, raw GNSS {} m   (policy σ {})",
-            number("ppo_mean_error_m", 2),
-            number("raw_gnss_mean_error_m", 2),
+            "mean error on {seeds}: policy {}, raw GNSS {}   (policy σ {})",
+            error("ppo"),
+            error("raw_gnss"),
             number("policy_std", 3)
         ));
     }
     if !report["ekf_mean_error_m"].is_null() {
         lines.push(format!(
-            "from the same samples: EKF {} m, RTS smoother {} m (sees the future: a bound, not an estimator)",
-            number("ekf_mean_error_m", 2),
-            number("rts_mean_error_m", 2)
+            "from the same samples: EKF {}{}",
+            error("ekf"),
+            match report["rts_mean_error_m"].is_null() {
+                true => String::new(),
+                false => format!(
+                    ", RTS smoother {} (sees the future: a bound, not an estimator)",
+                    error("rts")
+                ),
+            }
         ));
     }
     let heroes = &report["dynamics"]["heroes"];

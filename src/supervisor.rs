@@ -15,7 +15,7 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     ports::BoardReader,
     process::Process,
-    run::{Mode, RunFile},
+    run::RunFile,
     services::{self, RunNode},
 };
 use rustix::process::Signal;
@@ -124,7 +124,7 @@ impl Supervisor {
         let environments = (0..envs)
             .map(|index| Environment::create(&node, &run, index))
             .collect::<Result<_, Exit>>()?;
-        let cores = cores::plan(&cores::available(), envs as usize, run.mode == Mode::Train);
+        let cores = cores::plan(&cores::available(), envs as usize, run.mode.has_trainer());
         Ok(Self {
             succession: None,
             asked_to_leave: false,
@@ -479,8 +479,18 @@ impl Supervisor {
                 .iter_mut()
                 .find(|running| running.row.on_exit == OnExit::Replace)
         {
+            for environment in &mut self.environments {
+                environment.set_handing_over(true);
+            }
             trainer.ask_to_leave();
             self.asked_to_leave = true;
+        }
+    }
+
+    /// The successor is at work, or nothing comes of it.
+    fn end_hand_over(&mut self) {
+        for environment in &mut self.environments {
+            environment.set_handing_over(false);
         }
     }
 
@@ -502,6 +512,7 @@ impl Supervisor {
         if !self.counts(successor.row, 0, successor.incarnation) {
             return Err(Exit::run("a run holds no more successors", "start another run"));
         }
+        self.environments.iter().for_each(Environment::wake_sensing);
         succession::write_run(&run, "run.json")?;
         self.environments[0].run = run;
         self.asked_to_leave = false;
@@ -517,10 +528,12 @@ impl Supervisor {
         };
         if let Some(failure) = succession.failure() {
             succession.refuse(failure);
+            self.end_hand_over();
             return;
         }
         let progress = self.trainer().progress();
         if succession.is_taking() && progress.attached == 1 {
+            self.end_hand_over();
             self.swaps.extend(succession.done(progress.committed_ticks));
         } else {
             self.succession = Some(succession);
@@ -530,6 +543,7 @@ impl Supervisor {
     fn refuse_swap(&mut self, message: &str, help: &str) {
         if let Some(succession) = self.succession.take() {
             succession.refuse(Failure::new(FailureKind::Run, message).with_help(help));
+            self.end_hand_over();
         }
     }
 

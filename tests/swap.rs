@@ -228,20 +228,7 @@ fn assert_undisturbed(workplace: &Workplace, name: &str, restarts: u64) {
     let expected = undisturbed(workplace);
     let report = workplace.report(name);
     assert_eq!(report["restarts"], restarts);
-    let result = Result::of(workplace, name);
-    // The forward pass sees as many ticks at once as wait: an error of some 60 m depends on that by the rounding of its sum.
-    assert_eq!(result.evaluations.len(), expected.evaluations.len());
-    for (found, wanted) in result.evaluations.iter().zip(&expected.evaluations) {
-        assert_eq!(found.0, wanted.0, "updates before an evaluation");
-        assert!((found.1 - wanted.1).abs() < 1e-4, "{found:?}, undisturbed {wanted:?}");
-    }
-    assert_eq!(
-        Result {
-            evaluations: expected.evaluations.clone(),
-            ..result
-        },
-        *expected
-    );
+    assert_eq!(Result::of(workplace, name), *expected);
 }
 
 #[test]
@@ -353,6 +340,7 @@ fn longest_pause(sensing: &BoardReader, mut over: impl FnMut() -> bool) -> Durat
 
 /// Slow enough for a successor to get ready in mid-run: 20 times real time, 15 s.
 const PACED: &str = "run.real_time_factor=20";
+const PACED_TICKS_PER_S: f64 = 200.0;
 
 #[test]
 fn a_planned_swap_changes_nothing_but_the_process() {
@@ -379,10 +367,14 @@ fn a_planned_swap_changes_nothing_but_the_process() {
     assert_undisturbed(&workplace, "swapped", 0);
     let swaps = workplace.report("swapped")["swaps"].clone();
     assert_eq!(swaps[0]["incarnation"], 1);
-    println!(
-        "hand-over {} s; the simulation paused for {pause:?} at most",
-        swaps[0]["pause_s"]
+    // The simulation goes on while nobody is attached: it waits for less than a window, and makes ticks meanwhile if there is time for any.
+    let figure = |key: &str| swaps[0][key].as_f64().unwrap();
+    assert!(figure("stall_ticks") <= 8.0, "{swaps:#}");
+    assert!(
+        figure("ticks_without_trainer") > 0.0 || figure("pause_s") * PACED_TICKS_PER_S < 8.0,
+        "{swaps:#}"
     );
+    println!("{swaps:#}\nno tick for {pause:?} at most");
     assert_nothing_left(&workplace, "swapped");
 }
 
@@ -412,6 +404,13 @@ fn a_swap_with_other_settings_learns_on_with_them() {
 #[test]
 fn a_swap_that_cannot_be_is_refused_and_the_trainer_goes_on() {
     let workplace = Workplace::new();
+    let short = [
+        "observation.fields=caraware",
+        "episode.ticks=120",
+        "episode.training_episodes=1",
+    ];
+    let wider = arguments("wider", &[&short[..], &["episode.final_evaluations=1"]].concat());
+    workplace.succeed(&wider.iter().map(String::as_str).collect::<Vec<_>>());
     let mut run = Run::start(&workplace, "refused", &[PACED]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
     let refused = |arguments: &[&str], code: i32, words: &[&str]| {
@@ -435,16 +434,8 @@ fn a_swap_that_cannot_be_is_refused_and_the_trainer_goes_on() {
         &["`traffic.cavs` cannot change in a live run"],
     );
     refused(&["--checkpoint", "nowhere"], 2, &["nowhere is not a checkpoint"]);
-    let checkpoints = run.directory.join("checkpoints");
-    let newest = std::fs::read_to_string(checkpoints.join("latest")).unwrap();
-    let manifest = std::fs::read_to_string(checkpoints.join(newest.trim()).join("manifest.json")).unwrap();
-    let other = workplace.path().join("other");
-    std::fs::create_dir(&other).unwrap();
-    let wider = manifest.replace("\"observation_size\": 9", "\"observation_size\": 11");
-    assert_ne!(wider, manifest);
-    std::fs::write(other.join("manifest.json"), wider).unwrap();
     refused(
-        &["--checkpoint", "other"],
+        &["--checkpoint", "runs/wider/checkpoints/update-000001"],
         1,
         &["the trainer goes on", "observation_size is 11, this run's is 9"],
     );

@@ -105,7 +105,7 @@ fn a_run_trains_reports_and_leaves_nothing_behind() {
         .count();
     assert!(events > 0, "no TensorBoard events");
     assert!(
-        text(&output).contains("mean error on unseen seeds"),
+        text(&output).contains("mean error on 4 unseen seeds (± 95 %): policy"),
         "{}",
         text(&output)
     );

@@ -8,7 +8,6 @@ use ipc_schema::{
     header::{EVALUATION, MessageHeader},
     ports::{BoardReader, PortError},
     process::Process,
-    run::Mode,
     services::Channel,
     session::{Session, SessionError},
 };
@@ -339,7 +338,7 @@ impl Relay {
                 .map(|(process, health)| ProcessStatus::of(*process, health, sumo))
                 .collect(),
             training: trainer
-                .filter(|_| run.mode != Mode::Simulate)
+                .filter(|_| run.mode.has_trainer())
                 .map(|(_, board)| board.training().into()),
             fanout: Counters {
                 refused_messages: self.counters.refused_messages + refused,
@@ -359,9 +358,9 @@ impl Relay {
 
     /// True if the last channel of the run has had its last tick; its producer says so too, should that tick be missed.
     fn run_ended(&self) -> bool {
-        let last = match self.session.run.mode {
-            Mode::Train => Channel::Observation,
-            Mode::Simulate => Channel::World,
+        let last = match self.session.run.mode.has_trainer() {
+            true => Channel::Observation,
+            false => Channel::World,
         };
         let came = self.feeds().any(|feed| feed.channel() == last && feed.tally().ended);
         let done = |(process, board): &(Process, BoardReader)| {

@@ -27,6 +27,8 @@ pub const INCARNATIONS: u32 = 256;
 pub struct Roster {
     /// Incarnation of each process.
     pub incarnations: [u32; 5],
+    /// 1 while a successor that is ready waits for that incarnation to leave, or opens its ports, else 0.
+    pub handing_over: [u32; 5],
 }
 
 /// State of a process, [`Health::state`].

@@ -145,6 +145,12 @@ impl BoardReader {
         *self.entries.borrow().training.get()
     }
 
+    /// True while a successor that is ready waits for the incarnation that counts to leave, or opens its ports.
+    #[must_use]
+    pub fn is_handing_over(&self) -> bool {
+        self.roster.get().handing_over[self.process] != 0
+    }
+
     /// Turns to the entries of the incarnation that counts.
     fn follow_roster(&self) {
         let counts = self.roster.get().incarnations[self.process];
@@ -210,5 +216,11 @@ impl RosterWriter {
         self.roster.incarnations[process.index()] = incarnation;
         self.entry.update_with_copy(self.roster);
         true
+    }
+
+    /// Says whether a hand-over of `process` is under way.
+    pub fn set_handing_over(&mut self, process: Process, under_way: bool) {
+        self.roster.handing_over[process.index()] = u32::from(under_way);
+        self.entry.update_with_copy(self.roster);
     }
 }

@@ -358,6 +358,8 @@ pub struct Trainer {
     pub checkpoint_interval: u64,
     /// Newest checkpoints that are kept.
     pub checkpoints_kept: u64,
+    /// Updates between two checkpoints that are kept for good; 0 = none.
+    pub checkpoint_keep_every: u64,
     /// When the Kalman filter's estimates travel beside the predictions.
     pub estimates: Estimates,
 }

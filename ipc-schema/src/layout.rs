@@ -208,7 +208,10 @@ pub fn table() -> Vec<TypeLayout> {
             resynchronisations,
             total_ticks
         }),
-        layout!(Roster { incarnations }),
+        layout!(Roster {
+            incarnations,
+            handing_over
+        }),
         layout!(TrainingStatus {
             episode,
             env_steps,

@@ -18,7 +18,7 @@ use crate::{
     SCHEMA_VERSION,
     header::MessageHeader,
     run::RunFile,
-    services::{Channel, DataService, Shm, WakeListener, WakeService},
+    services::{self, Channel, DataService, RunNode, Shm, WakeListener, WakeService},
 };
 
 pub use crate::board_port::{BoardError, BoardReader, BoardWriter, RosterWriter};
@@ -315,6 +315,19 @@ impl Waker {
                 .create()
                 .map_err(|e| refused("wake", "creation of the notifier")(&e))?,
         ))
+    }
+
+    /// Wakes `process` of environment `env_index`, for whoever is no process of the run itself.
+    ///
+    /// # Errors
+    /// The service is not there, or all who may wake it are.
+    pub fn open(
+        node: &RunNode,
+        run: &RunFile,
+        env_index: u32,
+        process: crate::process::Process,
+    ) -> Result<Self, BoardError> {
+        Ok(Self::create(&services::open_wake(node, run, env_index, process)?)?)
     }
 
     /// Wakes the process if it waits; harmless if it does not or is gone.

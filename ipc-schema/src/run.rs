@@ -14,6 +14,31 @@ pub enum Mode {
     Train,
     /// No learner.
     Simulate,
+    /// A policy of a checkpoint predicts, and nothing learns.
+    Play,
+}
+
+impl Mode {
+    /// True if there is a process in the trainer's place, which must not miss an observation.
+    #[must_use]
+    pub fn has_trainer(self) -> bool {
+        self != Self::Simulate
+    }
+}
+
+/// The checkpoint that a run begins with.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Beginning {
+    /// Its directory.
+    pub checkpoint: PathBuf,
+    /// Ticks of the run that it has learnt from: none of them is delivered again.
+    pub committed_ticks: u64,
+    /// The episode that the first of the others belongs to: the simulation begins with it.
+    pub episode: u64,
+    /// The first tick of that episode.
+    pub episode_tick: u64,
+    /// Play: most episodes; `None`: without end.
+    pub episodes: Option<u64>,
 }
 
 /// What traffic runs on.
@@ -95,6 +120,9 @@ pub struct RunFile {
     pub config: Config,
     /// BLAKE3 of the configuration's canonical JSON.
     pub config_hash: String,
+    /// The checkpoint to begin with, where there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub beginning: Option<Beginning>,
 }
 
 /// The run file cannot be used.
@@ -213,11 +241,45 @@ impl RunFile {
         u64::from(self.config.run.window_ticks).max(self.ticks_per_traffic_step())
     }
 
-    /// The episodes of this run.
+    /// Number of the first tick that is made.
+    #[must_use]
+    pub fn first_tick(&self) -> u64 {
+        self.beginning.as_ref().map_or(0, |beginning| beginning.episode_tick)
+    }
+
+    /// Ticks that the checkpoint which the run begins with has learnt from.
+    #[must_use]
+    pub fn committed_ticks(&self) -> u64 {
+        self.beginning.as_ref().map_or(0, |beginning| beginning.committed_ticks)
+    }
+
+    /// The episodes that are made, in order; in play they may have no end.
+    pub fn schedule(&self) -> Box<dyn Iterator<Item = schedule::Episode>> {
+        let (first, episodes) = match &self.beginning {
+            Some(beginning) => (beginning.episode, beginning.episodes),
+            None => (0, None),
+        };
+        if self.mode == Mode::Play {
+            let ticks = match self.source {
+                Source::Population { .. } => Some(self.config.episode.ticks),
+                Source::Scenario { .. } => None,
+            };
+            let seed = self.seed();
+            return Box::new((0..episodes.unwrap_or(u64::MAX)).map(move |index| schedule::play(seed, index, ticks)));
+        }
+        Box::new(
+            self.episodes()
+                .into_iter()
+                .filter(move |episode| episode.index >= first),
+        )
+    }
+
+    /// The episodes of this run, where they have an end that the configuration knows; none in play.
     #[must_use]
     pub fn episodes(&self) -> Vec<schedule::Episode> {
         let (lengths, seed) = (&self.config.episode, self.seed());
         match (&self.source, self.mode) {
+            (_, Mode::Play) => Vec::new(),
             (_, Mode::Train) => schedule::training(lengths, seed),
             (Source::Scenario { .. }, Mode::Simulate) => schedule::scenario(seed),
             (Source::Population { .. }, Mode::Simulate) => schedule::simulation(lengths, seed),

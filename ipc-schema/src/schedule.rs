@@ -84,6 +84,17 @@ fn first_eight(hasher: &blake3::Hasher) -> u64 {
     u64::from_le_bytes(first)
 }
 
+/// The `index`-th episode of play: its seed is one that no training sees.
+#[must_use]
+pub fn play(seed: u64, index: u64, ticks: Option<u64>) -> Episode {
+    Episode {
+        index,
+        evaluation: true,
+        seed: episode_seed(seed, true, index),
+        ticks,
+    }
+}
+
 /// Seed of the `count`-th training or evaluation episode: first eight bytes of a BLAKE3 hash, so the two never meet.
 #[must_use]
 pub fn episode_seed(run_seed: u64, evaluation: bool, count: u64) -> u64 {

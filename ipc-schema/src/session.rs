@@ -278,9 +278,9 @@ impl Session {
         }
     }
 
-    /// All ports are open: producers may send.
+    /// All ports are open: producers may send what the run begins with.
     pub fn attach(&mut self) {
-        self.attach_from(0);
+        self.attach_from(self.run.first_tick());
     }
 
     /// All ports are open, and all ticks below `tick` are committed: its producer may send from there on.

@@ -48,6 +48,7 @@ fn run_in(directory: &Path) -> RunFile {
         sumo_home: "none".into(),
         config,
         config_hash: String::new(),
+        beginning: None,
     }
 }
 

@@ -81,6 +81,7 @@ impl Corner {
             sumo_home: "none".into(),
             config: config(),
             config_hash: String::new(),
+            beginning: None,
         };
         let node = services::node(&run.shared_memory).unwrap();
         let services = ServiceHolder::create(&node, &run, 0).unwrap();

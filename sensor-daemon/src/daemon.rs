@@ -1,6 +1,6 @@
 //! The process: `world` in, `observation` out, one for one.
 
-use std::{path::Path, sync::Arc};
+use std::{path::Path, sync::Arc, time::Instant};
 
 use ipc_schema::{
     block::{self, BlockError},
@@ -10,7 +10,6 @@ use ipc_schema::{
     observation::ObservationLayout,
     ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
-    run::Mode,
     services::Channel,
     session::{Session, Wait},
     world::WorldLayout,
@@ -25,6 +24,7 @@ use sim_core::{
 use crate::{
     delivery::Delivery,
     digest::Digest,
+    hand_over::Account,
     scanning::{Scanning, Tally},
     sensing::{Sensing, World},
     sky::SkyMap,
@@ -44,6 +44,8 @@ struct Part {
     redelivered_ticks: u64,
     /// Most of the journal in use at a time.
     journal_mib: usize,
+    /// Planned hand-overs from one trainer to the next.
+    hand_overs: Vec<Account>,
 }
 
 /// Senses until the last tick of the run, or until the process is asked to stop.
@@ -111,7 +113,10 @@ struct Daemon {
     /// Who must not miss an observation: nobody if nobody learns.
     consumer: Option<Delivery>,
     digest: Digest,
+    /// One more than the newest tick made.
     ticks: u64,
+    /// Ticks that are learnt already: those of them that are made, because their episode is, are not sent.
+    committed_ticks: u64,
     vehicle_steps: u64,
     cavs_max: u32,
 }
@@ -119,11 +124,12 @@ struct Daemon {
 impl Daemon {
     fn open(mut session: Session, sensing: Sensing, scanning: Option<Scanning>) -> Result<Self, Failure> {
         let observations = session.publisher(Channel::Observation)?;
-        let consumer = match session.run.mode {
-            Mode::Train => Some(Delivery::open(&session)?),
-            Mode::Simulate => None,
+        let consumer = match session.run.mode.has_trainer() {
+            true => Some(Delivery::open(&session)?),
+            false => None,
         };
         session.attach();
+        let (ticks, committed_ticks) = (session.run.first_tick(), session.run.committed_ticks());
         Ok(Self {
             session,
             sensing,
@@ -131,7 +137,8 @@ impl Daemon {
             observations,
             consumer,
             digest: Digest::default(),
-            ticks: 0,
+            ticks,
+            committed_ticks,
             vehicle_steps: 0,
             cavs_max: 0,
         })
@@ -192,11 +199,23 @@ impl Daemon {
         let everybody = view(message, world)?;
         let n = self.sensing.assign(world, everybody.states);
         self.scan(world, &everybody)?;
-        if self.wait_for_trainer(Delivery::may_send)? == Wait::Stopped {
+        let is_learnt = world.tick < self.committed_ticks;
+        if !is_learnt && self.wait_for_credit(n)? == Wait::Stopped {
             return Ok(Wait::Stopped);
         }
         self.publish(world, &everybody, n)?;
         Ok(Wait::Ready)
+    }
+
+    /// Waits until the tick of `n` slots may be sent, or kept while one trainer hands over to the next.
+    fn wait_for_credit(&mut self, n: usize) -> Result<Wait, Failure> {
+        let len = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples()).len;
+        let since = Instant::now();
+        let waited = self.wait_for_trainer(|consumer, session| consumer.may_send(session) || consumer.may_keep(len))?;
+        if let Some(consumer) = &mut self.consumer {
+            consumer.attend_hand_over(since);
+        }
+        Ok(waited)
     }
 
     /// Scans with all LIDARs; what the observation shows of it is there before the observation is made.
@@ -232,15 +251,30 @@ impl Daemon {
             .observe(&header, everybody, draft.payload_mut())
             .map_err(broken)?;
         self.digest.add(&header, draft.payload());
-        if let Some(consumer) = &mut self.consumer {
-            consumer.keep(header, draft.payload())?;
+        if self.is_due(&header, draft.payload())? {
+            draft.send()?;
         }
-        draft.send()?;
         if let Some(consumer) = &self.consumer {
             consumer.wake();
         }
         self.account(&header, everybody.states.len());
         Ok(())
+    }
+
+    /// Keeps the tick for trainers to come. False if the present one has no credit for it: it is sent from the journal later.
+    fn is_due(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<bool, Failure> {
+        if header.tick < self.committed_ticks {
+            return Ok(false);
+        }
+        let Some(consumer) = &mut self.consumer else {
+            return Ok(true);
+        };
+        let is_due = consumer.may_send(&self.session);
+        consumer.keep(*header, payload)?;
+        if is_due {
+            consumer.sends_live();
+        }
+        Ok(is_due)
     }
 
     fn account(&mut self, header: &MessageHeader, road_users: usize) {
@@ -279,13 +313,14 @@ impl Daemon {
         let part = Part {
             observation_hash: self.digest.hex(),
             observations: self.vehicle_steps,
-            ticks: self.ticks,
+            ticks: self.ticks - self.session.run.first_tick(),
             cavs_max: self.cavs_max,
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
             drops: self.observations.drops(),
             lidar: self.scanning.as_ref().map(Scanning::tally),
             redelivered_ticks: self.consumer.as_ref().map_or(0, Delivery::redelivered),
             journal_mib: self.consumer.as_ref().map_or(0, Delivery::journal_mib),
+            hand_overs: self.consumer.as_ref().map_or(&[][..], Delivery::hand_overs).to_vec(),
         };
         self.session.write_part(&part)
     }

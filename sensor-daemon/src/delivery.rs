@@ -1,4 +1,7 @@
 //! Observations to the trainer, each tick in order under its credits: live ones, and those of the journal again for a successor.
+//! During a planned hand-over live ones may be kept for later, so that the simulation goes on.
+
+use std::time::Instant;
 
 use ipc_schema::{
     board::{Progress, State},
@@ -11,7 +14,10 @@ use ipc_schema::{
     session::{Session, SessionError},
 };
 
-use crate::journal::{Journal, JournalError};
+use crate::{
+    hand_over::{Account, HandOver},
+    journal::{Journal, JournalError},
+};
 
 const MIB: usize = 1 << 20;
 
@@ -25,7 +31,14 @@ pub struct Delivery {
     incarnation: Option<u32>,
     /// The next tick that it has not been sent.
     next: u64,
+    /// One more than the newest tick that anybody has been sent.
+    sent: u64,
     redelivered: u64,
+    /// A planned hand-over under way, during which the simulation goes on without credit.
+    hand_over: Option<HandOver>,
+    hand_overs: Vec<Account>,
+    /// In the driving task the world waits for every action: nothing can be made in advance.
+    goes_on: bool,
 }
 
 impl Delivery {
@@ -36,7 +49,8 @@ impl Delivery {
     pub fn open(session: &Session) -> Result<Self, SessionError> {
         let run = &session.run;
         let limit = run.config.run.journal_mib as usize * MIB;
-        let journal = Journal::new(&run.run_dir, limit, Channel::Observation.max_payload(run));
+        let (longest, committed) = (Channel::Observation.max_payload(run), run.committed_ticks());
+        let journal = Journal::new(&run.run_dir, limit, longest).beginning_at(committed);
         Ok(Self {
             board: session.board_of(Process::Trainer)?,
             waker: session.waker(Process::Trainer)?,
@@ -44,8 +58,12 @@ impl Delivery {
             // Strict lock-step has one tick on the way at a time, and so have its ticks when they are sent again.
             window: if run.config.drives() { 1 } else { run.window_ticks() },
             incarnation: None,
-            next: 0,
+            next: committed,
+            sent: committed,
             redelivered: 0,
+            hand_over: None,
+            hand_overs: Vec::new(),
+            goes_on: !run.config.drives(),
         })
     }
 
@@ -65,6 +83,43 @@ impl Delivery {
         self.incarnation == Some(progress.incarnation)
             && self.next == self.journal.ticks()
             && flow::has_credit(self.next, &progress, session.run.window_ticks())
+    }
+
+    /// True if the live tick that follows all others may be made and kept, to be sent when there is credit: a planned hand-over is
+    /// under way, and the journal has room for `len` bytes beside everything that is not committed.
+    #[must_use]
+    pub fn may_keep(&self, len: usize) -> bool {
+        self.goes_on
+            && self.journal.has_room(len)
+            && match &self.hand_over {
+                Some(hand_over) => hand_over.allows(&self.board.progress(), self.journal.ticks()),
+                None => self.board.is_handing_over(),
+            }
+    }
+
+    /// Looks how a planned hand-over goes; the simulation has waited for a trainer since `since`.
+    pub fn attend_hand_over(&mut self, since: Instant) {
+        let under_way = self.goes_on && self.board.is_handing_over();
+        if self.hand_over.is_none() && !under_way {
+            return;
+        }
+        let (now, made, progress) = (Instant::now(), self.journal.ticks(), self.board.progress());
+        let hand_over = self
+            .hand_over
+            .get_or_insert_with(|| HandOver::begin(now, progress.incarnation));
+        hand_over.waited(since, now);
+        hand_over.note(&progress, under_way, made);
+        let is_level = self.incarnation == Some(progress.incarnation) && self.next == made;
+        if hand_over.is_over(is_level) {
+            self.hand_overs.push(hand_over.account(progress.incarnation));
+            self.hand_over = None;
+        }
+    }
+
+    /// Planned hand-overs so far.
+    #[must_use]
+    pub fn hand_overs(&self) -> &[Account] {
+        &self.hand_overs
     }
 
     /// True once the trainer has done all its work.
@@ -117,9 +172,10 @@ impl Delivery {
                 .map_err(|error| lost(&error))?;
             draft.send()?;
             self.waker.wake();
-            self.redelivered += 1;
+            self.redelivered += u64::from(self.next < self.sent);
         }
         self.next += 1;
+        self.sent = self.sent.max(self.next);
         Ok(())
     }
 
@@ -132,14 +188,22 @@ impl Delivery {
         }
     }
 
-    /// Keeps a live tick, which is about to be sent.
+    /// Keeps a live tick.
     ///
     /// # Errors
     /// The journal's file cannot be written.
     pub fn keep(&mut self, header: MessageHeader, payload: &[u8]) -> Result<(), Failure> {
         self.journal.push(header, payload).map_err(|error| lost(&error))?;
-        self.next += 1;
+        if let Some(hand_over) = &mut self.hand_over {
+            hand_over.made_one(&self.board.progress());
+        }
         Ok(())
+    }
+
+    /// The live tick that was kept last is being sent.
+    pub fn sends_live(&mut self) {
+        self.next += 1;
+        self.sent = self.sent.max(self.next);
     }
 
     /// Wakes the trainer: a tick has been sent.

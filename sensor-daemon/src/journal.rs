@@ -128,6 +128,16 @@ impl Journal {
         }
     }
 
+    /// The same where all ticks below `tick` are committed already: it begins with that one.
+    #[must_use]
+    pub fn beginning_at(self, tick: u64) -> Self {
+        Self {
+            commits: [tick; 2],
+            ticks: tick,
+            ..self
+        }
+    }
+
     /// The oldest tick held; with nothing held, the next one.
     #[must_use]
     pub fn first(&self) -> u64 {
@@ -150,6 +160,17 @@ impl Journal {
     #[must_use]
     pub fn bytes(&self) -> usize {
         self.chunks.iter().map(|chunk| chunk.used).sum()
+    }
+
+    /// True if a tick of `len` bytes can be added without any older one being given up.
+    #[must_use]
+    pub fn has_room(&self, len: usize) -> bool {
+        let fits = |chunk: &Chunk| chunk.used + len <= self.chunk_bytes;
+        self.chunks.back().is_some_and(fits) || self.chunks.len() < self.most_chunks()
+    }
+
+    fn most_chunks(&self) -> usize {
+        (self.limit_bytes / self.chunk_bytes).max(2)
     }
 
     /// Adds the next tick.
@@ -260,8 +281,7 @@ impl Journal {
             let source = std::io::Error::from(std::io::ErrorKind::InvalidInput);
             return Err(failed("write", &self.directory)(source));
         }
-        let most = (self.limit_bytes / self.chunk_bytes).max(2);
-        while self.chunks.len() >= most {
+        while self.chunks.len() >= self.most_chunks() {
             self.warn();
             self.free_first();
         }
@@ -447,8 +467,10 @@ mod tests {
                 let at = |part: f64| (part * (lens.len() as f64 + 0.99)) as u64;
                 match step {
                     Step::Push(len) => {
+                        let (first, has_room) = (journal.first(), lens.is_empty() || journal.has_room(len));
                         journal.push(header(journal.ticks()), &payload(journal.ticks(), len)).unwrap();
                         lens.push(len);
+                        prop_assert_eq!(has_room, lens.len() == 1 || journal.first() == first);
                     }
                     Step::Commit(part) => {
                         journal.commit(at(part));

@@ -1,7 +1,7 @@
 //! Sensors of connected vehicles, and the assembly of what they deliver into observations.
 //!
 //! A library of pure functions without clock, I/O or shared memory; the `sensor-daemon` binary is a thin shell around
-//! [`sensing::Sensing`]: [`daemon`], with the [`delivery`] to the trainer and its [`journal`].
+//! [`sensing::Sensing`]: [`daemon`], with the [`delivery`] to the trainer, its [`journal`], and the [`hand_over`] to the next.
 
 // Sensor values leave in single precision: the wire's precision, see `ipc_schema::observation`.
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
@@ -13,6 +13,7 @@ pub mod delivery;
 pub mod digest;
 pub mod fields;
 pub mod gnss;
+pub mod hand_over;
 pub mod history;
 pub mod imu;
 pub mod journal;

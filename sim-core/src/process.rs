@@ -97,6 +97,7 @@ impl Core {
         session.attach();
         let mirror = Mirror::new(Settings::of_run(&session.run))
             .map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
+        let ticks = session.run.first_tick();
         Ok(Self {
             session,
             metas,
@@ -108,7 +109,7 @@ impl Core {
             world,
             consumer,
             consumer_wake,
-            ticks: 0,
+            ticks,
             vehicle_steps: 0,
         })
     }

@@ -78,6 +78,7 @@ impl Run {
             sumo_home: PathBuf::new(),
             config,
             config_hash: String::new(),
+            beginning: None,
             run_dir,
         };
         file.write().unwrap();

@@ -67,6 +67,7 @@ fn run(net_file: &Path, additional_files: &[PathBuf]) -> RunFile {
         sumo_home: PathBuf::new(),
         config,
         config_hash: String::new(),
+        beginning: None,
     }
 }
 

@@ -2,11 +2,12 @@
 #![allow(dead_code, reason = "each test file uses its own part")]
 
 use std::{
+    collections::BTreeMap,
     net::TcpListener,
     path::{Path, PathBuf},
     process::{Child, Command, Output},
     sync::{Mutex, MutexGuard, PoisonError},
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use ipc_schema::{
@@ -102,6 +103,18 @@ pub fn shared_memory() -> Vec<String> {
         .flatten()
         .map(|entry| entry.file_name().to_string_lossy().into_owned());
     names.filter(|name| name.starts_with("caraware_")).collect()
+}
+
+/// Every file below a directory and when it was last written.
+pub fn tree(directory: &Path) -> BTreeMap<PathBuf, SystemTime> {
+    let mut files = BTreeMap::new();
+    for entry in std::fs::read_dir(directory).unwrap().flatten() {
+        match entry.metadata().unwrap() {
+            data if data.is_dir() => files.extend(tree(&entry.path())),
+            data => drop(files.insert(entry.path(), data.modified().unwrap())),
+        }
+    }
+    files
 }
 
 /// Command lines of all processes.

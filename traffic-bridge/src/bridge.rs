@@ -34,22 +34,22 @@ use crate::{
 /// The user's files are wrong, the shared memory is gone, or SUMO fails.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut membership = Membership::join(run_file, Process::TrafficBridge)?;
-    let episodes = membership.run.episodes();
+    let mut episodes = membership.run.schedule().peekable();
     let poses = match membership.run.config.drives() {
         true => Some(membership.subscriber(Channel::EgoPose)?),
         false => None,
     };
     let mut bridge = Bridge::open(membership, poses)?;
     let mut sumo = None;
-    for (place, episode) in episodes.iter().enumerate() {
-        let options = options(&bridge.membership.run, episode)?;
+    while let Some(episode) = episodes.next() {
+        let options = options(&bridge.membership.run, &episode)?;
         let mut session = match sumo.take() {
             None => Session::start(options)?,
             Some(previous) => Session::reload(previous, options)?,
         };
-        bridge.announce(&session, &episodes);
-        let is_last = place + 1 == episodes.len();
-        if bridge.episode(&mut session, episode, is_last)? == Wait::Stopped {
+        bridge.announce(&session);
+        let is_last = episodes.peek().is_none();
+        if bridge.episode(&mut session, &episode, is_last)? == Wait::Stopped {
             return Ok(());
         }
         sumo = Some(session);
@@ -126,6 +126,7 @@ impl Bridge {
         let consumer_wake = membership.waker(Process::SimCore)?;
         let pacing = Pacing::new(membership.run.config.run.real_time_factor);
         let ticks_per_step = membership.run.ticks_per_traffic_step();
+        let ticks = membership.run.first_tick();
         Ok(Self {
             membership,
             traffic,
@@ -137,13 +138,13 @@ impl Bridge {
             pacing,
             ticks_per_step,
             meta_messages: 0,
-            ticks: 0,
+            ticks,
             vehicle_steps: 0,
         })
     }
 
     /// Tells the length of the run.
-    fn announce(&mut self, session: &Session, episodes: &[Episode]) {
+    fn announce(&mut self, session: &Session) {
         let per_step = self.ticks_per_step;
         let scenario = session.duration_s().map_or(0, |duration_s| {
             #[expect(
@@ -159,7 +160,7 @@ impl Bridge {
                 .ticks
                 .map_or(scenario, |ticks| ticks.div_ceil(per_step) * per_step)
         };
-        let total_ticks = episodes.iter().map(ticks).sum();
+        let total_ticks = self.membership.run.episodes().iter().map(ticks).sum();
         self.membership.report(|health| {
             health.state = State::Running as u32;
             health.total_ticks = total_ticks;

@@ -11,7 +11,7 @@ use ipc_schema::{
     board::{State, TrainingStatus},
     header::{self, MessageHeader},
     observation::ObservationLayout,
-    ports::{Message, Publisher, Subscriber, Waker},
+    ports::{BoardReader, Message, Publisher, Subscriber, Waker},
     prediction::{ESTIMATES, PredictionLayout},
     process::Process,
     run::RunFile,
@@ -54,6 +54,9 @@ struct Attached {
     /// Whoever waits for the predictions: sim-core in the driving task.
     driven: Option<Waker>,
     training: TrainingStatus,
+    /// Board of where ticks begin; opened when first asked for.
+    traffic: Option<BoardReader>,
+    consumed_ticks: u64,
     ended: bool,
     /// The supervisor did not start this process, which does not end with it.
     outside: bool,
@@ -141,6 +144,17 @@ impl Attachment {
         Ok(scans)
     }
 
+    /// Ticks that the traffic is ahead of the newest one consumed here.
+    fn lag_ticks(&self) -> PyResult<u64> {
+        let mut inner = self.lock()?;
+        if inner.traffic.is_none() {
+            let board = inner.session.board_of(Process::TrafficBridge);
+            inner.traffic = Some(board.map_err(session_failed)?);
+        }
+        let ahead = inner.traffic.as_ref().map_or(0, |board| board.health().ticks);
+        Ok(ahead.saturating_sub(inner.consumed_ticks))
+    }
+
     /// How often this trainer has been replaced before.
     #[getter]
     fn incarnation(&self) -> u32 {
@@ -162,6 +176,7 @@ impl Attachment {
     /// Gives the producer credit for all ticks up to and including `tick`.
     fn consumed(&self, tick: u64) -> PyResult<()> {
         let mut inner = self.lock()?;
+        inner.consumed_ticks = tick + 1;
         inner.session.consumed(tick + 1);
         inner.session.report(|health| {
             health.ticks = tick + 1;
@@ -291,6 +306,8 @@ impl Attachment {
             predictions,
             driven,
             training: TrainingStatus::default(),
+            traffic: None,
+            consumed_ticks: first_tick,
             ended: false,
             outside,
         };

@@ -64,11 +64,21 @@ class SyntheticChannel:
         assert tick >= self.committed_up_to
         self.committed_up_to = tick
 
+    def lag_ticks(self) -> int:
+        """Whatever has been handed out has been consumed."""
+        return 0
+
     def done(self) -> None:
         """Remember the end."""
         self.is_done = True
 
-    def publish_predictions(self, observation: SyntheticObservation, predictions: Tensor, policy_version: int) -> None:
+    def publish_predictions(
+        self,
+        observation: SyntheticObservation,
+        predictions: Tensor,
+        policy_version: int,
+        estimates_m: np.ndarray | None = None,
+    ) -> None:
         """Remember the predictions."""
         assert predictions.shape == (len(observation.vehicle), 2)
         self.predictions[observation.tick] = predictions.clone()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from caraware import _native
 from caraware.baselines.noise import GRAVITY_MPS2, METRES_PER_DEGREE
 from caraware.stream import EMPTY_SLOT
 from synthetic import SyntheticObservation, run_file
@@ -55,7 +56,12 @@ def vehicle_run(run_dir: str, tables: dict | None = None, **trainer: object) -> 
 
 @dataclass
 class VehicleObservation(SyntheticObservation):
-    """A tick with its raw sections."""
+    """A tick with its raw sections. Vehicles are called as population control would."""
+
+    @property
+    def id_hash(self) -> np.ndarray:
+        """u64 `[n]`."""
+        return np.array([_native.id_hash(f"cav.{vehicle}") for vehicle in self.vehicle], np.uint64)
 
     gnss_quality: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     imu: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 1, 7))

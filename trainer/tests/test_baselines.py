@@ -75,19 +75,35 @@ def test_all_are_measured_on_the_same_valid_rows(tmp_path: Path) -> None:
 
 def test_the_report_has_every_mean_with_its_interval(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    run_over(tmp_path, episodes(True, False, True), vehicle_run(str(tmp_path)))
+    run_over(tmp_path, episodes(True, False, True, True, True), vehicle_run(str(tmp_path)))
     report = part(tmp_path)
-    assert len(report["evaluations"]) == 2
+    first, final = report["evaluations"]
+    assert (report["evaluation_seeds"], first["episodes"]) == (3, 1)
     for name in ESTIMATORS:
-        final = report["evaluations"][-1]
         assert report[f"{name}_mean_error_m"] == final[f"{name}_mean_error_m"] > 0
-        assert report[f"{name}_ci95_m"] == pytest.approx(1.96 * final[f"{name}_standard_error_m"])
-        assert 0 < report[f"{name}_ci95_m"] < report[f"{name}_mean_error_m"]
+        assert 0 < report[f"{name}_ci95_m"] < 4 * report[f"{name}_mean_error_m"]
+        # A single seed tells nothing about how seeds differ.
+        assert first[f"{name}_ci95_m"] is None
+        assert first[f"{name}_standard_error_m"] > 0
     assert "sees the future" in report["rts_note"]
     (line, _) = (r.message for r in caplog.records if r.message.startswith("evaluation at"))
     told = [f"{label} {report['evaluations'][0][f'{name}_mean_error_m']:.3f} ± " for name, label in ESTIMATORS.items()]
     assert all(words in line for words in told)
     assert "sees the future" in line
+
+
+def test_intervals_are_over_seeds() -> None:
+    """Three episodes whose mean errors are known by hand: t(0.95, 2) s/√3."""
+    phase = Evaluation()
+    for obs in street_ticks(6, 4, 1.0, seed=1):
+        error_m = np.full(4, [2.0, 3.0, 7.0][obs.tick // 2])
+        phase.add(replace(obs, episode=obs.tick // 2), error_m, 2 * error_m)
+    result = phase.result(0, 1)
+    assert (result.ppo_mean_error_m, result.episodes) == (4.0, 3)
+    assert result.ppo_ci95_m == pytest.approx(4.302653 * math.sqrt(7 / 3), rel=1e-6)
+    assert result.raw_gnss_ci95_m == pytest.approx(2 * result.ppo_ci95_m)
+    assert result.half_width_m("ppo") == result.ppo_ci95_m
+    assert "95 % over 3 seeds" in str(result)
 
 
 def test_tensorboard_has_a_curve_for_each(tmp_path: Path) -> None:
@@ -135,7 +151,7 @@ def test_the_interval_covers_the_true_mean() -> None:
             errors_m = level + rng.normal(0, 0.3, 40)
             phase.add(obs, errors_m, errors_m)
         result = phase.result(0, 0)
-        covered += abs(result.ppo_mean_error_m - 2.0) < result.ppo_ci95_m
+        covered += abs(result.ppo_mean_error_m - 2.0) < result.half_width_m("ppo")
     assert abs(covered / 400 - 0.95) < 4 * math.sqrt(0.95 * 0.05 / 400)
 
 

@@ -2,24 +2,30 @@
 
 import json
 import math
+import os
 from pathlib import Path
 
 import pytest
 import torch
 from caraware.checkpoint import (
-    CheckpointError,
-    Counters,
     Course,
-    latest_checkpoint,
+    Keeping,
     load_checkpoint,
     load_course,
-    newest_sound_checkpoint,
-    read_manifest,
+    mark_best,
     remove_partial,
     save_checkpoint,
 )
 from caraware.config import MapBounds, TrainerConfig
 from caraware.evaluation import EvaluationResult
+from caraware.manifest import (
+    CheckpointError,
+    Counters,
+    best_checkpoint,
+    latest_checkpoint,
+    newest_sound_checkpoint,
+    read_manifest,
+)
 from caraware.metrics import TrainingPoint
 from caraware.ppo import Ppo
 from caraware.rollout import Rollout
@@ -59,7 +65,7 @@ def counters(ppo: Ppo) -> Counters:
 
 
 def save(folder: Path, ppo: Ppo, keep: int = 5) -> Path:
-    return save_checkpoint(folder, ppo, counters(ppo), "abc", keep)
+    return save_checkpoint(folder, ppo, counters(ppo), "abc", Keeping(keep))
 
 
 def test_resuming_is_bit_exact(tmp_path: Path) -> None:
@@ -154,8 +160,95 @@ def test_a_refused_checkpoint_changes_nothing(tmp_path: Path) -> None:
 
 def test_the_manifest_is_plain_json(tmp_path: Path) -> None:
     manifest = json.loads((save(tmp_path, fresh()) / "manifest.json").read_text())
-    assert manifest["schema_version"] == 1
+    assert manifest["schema_version"] == 2
     assert all(len(digest) == 64 for digest in manifest["files"].values())
+    assert {"counters", "schedules", "config_sha256", "torch_version", "manifest_sha256"} < set(manifest)
+    assert set(manifest["schedules"]) == {"progress", "learning_rate", "clip_epsilon", "entropy_scale"}
+
+
+def test_schedules_stand_where_the_newest_update_had_them(tmp_path: Path) -> None:
+    ppo = fresh(learning_rate=0.01, learning_rate_decay=0.5, clip_epsilon=0.2, clip_epsilon_final=0.1)
+    ppo.progress = 0.25
+    train(ppo, 0, 3)
+    schedules = read_manifest(save(tmp_path, ppo)).schedules
+    assert schedules.progress == 0.25
+    assert (schedules.learning_rate, schedules.clip_epsilon) == (pytest.approx(0.0025), pytest.approx(0.175))
+
+
+def test_the_best_and_every_nth_outlive_the_newest(tmp_path: Path) -> None:
+    ppo = fresh()
+    for update in range(1, 8):
+        train(ppo, update, update + 1)
+        written = save_checkpoint(tmp_path, ppo, counters(ppo), "abc", Keeping(newest=1, every=3))
+        if update == 2:
+            mark_best(written)
+    names = sorted(path.name for path in tmp_path.glob("update-*"))
+    assert names == ["update-000002", "update-000003", "update-000006", "update-000007"]
+    assert best_checkpoint(tmp_path) == tmp_path / "update-000002"
+    mark_best(written)
+    save_checkpoint(tmp_path, ppo, counters(ppo), "abc", Keeping(newest=1))
+    assert [path.name for path in tmp_path.glob("update-*")] == ["update-000007"]
+
+
+def flip_a_bit(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 4
+    file.write_bytes(content)
+
+
+def replace_in(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+
+
+def replace_hash(checkpoint: Path) -> None:
+    replace_in(checkpoint / "manifest.json", read_manifest(checkpoint).files["parameters.safetensors"], 64 * "0")
+
+
+DAMAGES = {
+    "a flipped bit": (lambda c: flip_a_bit(c / "parameters.safetensors"), "parameters.safetensors: is damaged"),
+    "a flipped bit of moments": (
+        lambda c: flip_a_bit(c / "optimiser.safetensors"),
+        "optimiser.safetensors: is damaged",
+    ),
+    "a truncated file": (lambda c: os.truncate(c / "random.safetensors", 100), "random.safetensors: is damaged"),
+    "an empty file": (lambda c: os.truncate(c / "parameters.safetensors", 0), "parameters.safetensors: is damaged"),
+    "a missing file": (lambda c: (c / "random.safetensors").unlink(), "random.safetensors: cannot be read"),
+    "a missing manifest": (lambda c: (c / "manifest.json").unlink(), "manifest.json: cannot be read"),
+    "a truncated manifest": (lambda c: os.truncate(c / "manifest.json", 80), "manifest.json: is not a manifest"),
+    "another tick": (
+        lambda c: replace_in(c / "manifest.json", '_tick": 11', '_tick": 12'),
+        "manifest.json: is damaged",
+    ),
+    "another hash": (replace_hash, "manifest.json: is damaged"),
+    "another schema": (
+        lambda c: replace_in(c / "manifest.json", '_version": 2', '_version": 1'),
+        "this trainer reads 2",
+    ),
+    "half-written": (lambda c: c.rename(c.with_name(f".{c.name}.partial")), None),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_what_is_damaged_is_refused_with_the_reason_and_the_one_before_is_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
+) -> None:
+    ppo = fresh()
+    train(ppo, 0, 2)
+    before = save(tmp_path, ppo)
+    train(ppo, 2, 3)
+    newest = save(tmp_path, ppo)
+    assert newest_sound_checkpoint(tmp_path) == newest
+    harm, reason = DAMAGES[damage]
+    harm(newest)
+    assert newest_sound_checkpoint(tmp_path) == before
+    assert reason is None or (reason in caplog.text and "the one before it is used" in caplog.text)
+    if reason is not None:
+        loaded = fresh(seed=5)
+        with pytest.raises(CheckpointError):
+            load_checkpoint(newest, loaded)
+        load_checkpoint(before, loaded)
 
 
 def test_the_newest_sound_checkpoint_is_found_past_damaged_ones(
@@ -181,7 +274,7 @@ def test_the_course_of_training_comes_back_exactly(tmp_path: Path) -> None:
     points = [TrainingPoint(7, 0.3, 0.1, 5.25, math.pi, 1e4), TrainingPoint(2**40, 0.1, 0.2, math.nan, 6.0, 0.0)]
     course = Course(11, 1, 2, 6, 40, [evaluation], points)
     ppo = fresh()
-    written = save_checkpoint(tmp_path, ppo, Counters(1, 7, 0, 9), "0", 3, course)
+    written = save_checkpoint(tmp_path, ppo, Counters(1, 7, 0, 9), "0", Keeping(3), course)
     found = load_course(written)
     assert (found.evaluations, found.training[0]) == (course.evaluations, points[0])
     assert repr(found) == repr(course)

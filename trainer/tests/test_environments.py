@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.checkpoint import latest_checkpoint, load_course, read_manifest
+from caraware.checkpoint import load_course
 from caraware.config import RunConfig
 from caraware.environment import share
 from caraware.evaluation import EvaluationResult, pooled
 from caraware.loop import Learner, TrainingLoop
+from caraware.manifest import latest_checkpoint, read_manifest
 from safetensors.torch import load_file
 from synthetic import FIELDS, SyntheticChannel, SyntheticObservation, run_file, with_evaluation
 

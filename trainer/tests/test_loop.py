@@ -8,20 +8,21 @@ import signal
 import sys
 import types
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from caraware import train
-from caraware.checkpoint import latest_checkpoint, newest_sound_checkpoint
 from caraware.config import RunConfig
 from caraware.environment import TickLedger
 from caraware.loop import Learner, TrainingLoop
-from caraware.ppo import NonFiniteLoss
+from caraware.manifest import best_checkpoint, latest_checkpoint, newest_sound_checkpoint, read_manifest
+from caraware.ppo import NonFiniteLoss, UpdateStats
 from safetensors.torch import load_file
 from synthetic import SyntheticChannel, SyntheticObservation, run_file, street_ticks, with_evaluation
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 PNG = b"\x89PNG"
 
@@ -95,7 +96,44 @@ def test_how_ticks_arrive_together_changes_nothing(tmp_path: Path) -> None:
         assert torch.equal(tensor, three[name])
         assert torch.equal(tensor, eight[name])
     errors = [part(tmp_path / str(group))["ppo_mean_error_m"] for group in (1, 3, 8)]
-    assert errors == pytest.approx([errors[0]] * 3, rel=1e-6)
+    assert errors == [errors[0]] * 3
+
+
+def test_the_checkpoint_with_the_best_evaluation_is_kept(tmp_path: Path) -> None:
+    """The first evaluation of a policy that has learnt is its best: the truth of the second one is 500 m away."""
+
+    def ticks() -> Iterator[SyntheticObservation]:
+        for obs in street_ticks(160, 16, 5.0, seed=3):
+            phase = obs.tick // 40
+            if phase == 3:
+                obs.truth[:, :2] += 500.0
+            yield replace(obs, episode=phase, evaluation=phase % 2 == 1, last=obs.tick == 159)
+
+    loop_over(tmp_path, ticks(), run=run_file(str(tmp_path), checkpoint_interval=1, checkpoints_kept=1))
+    first, second = part(tmp_path)["evaluations"]
+    assert first["ppo_mean_error_m"] < second["ppo_mean_error_m"]
+    best = best_checkpoint(tmp_path / "checkpoints")
+    assert best == tmp_path / "checkpoints" / f"update-{first['policy_version']:06d}"
+    assert read_manifest(best).counters.updates == first["policy_version"] == 2
+    assert latest_checkpoint(tmp_path / "checkpoints").name == "update-000005"
+    assert len(list((tmp_path / "checkpoints").glob("update-*"))) == 2
+
+
+def test_tensorboard_has_every_tag_with_finite_values(tmp_path: Path) -> None:
+    loop_over(tmp_path, with_evaluation(100, 20, 16, 5.0, seed=1))
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    tags = set(events.Tags()["scalars"])
+    wanted = {f"update/{field.name}" for field in fields(UpdateStats)}
+    assert {"update/policy_loss", "update/value_loss", "update/return_mean", "update/advantage_std"} < wanted
+    assert {"update/ratio_max", "update/approximate_kl", "update/entropy", "update/sigma"} < wanted
+    assert {"update/action_mean_x", "update/action_std_y", "update/action_outside"} < wanted
+    wanted |= {"error/training_m", "error/training_raw_gnss_m", "error/evaluation_m", "error/evaluation_raw_gnss_m"}
+    assert tags >= wanted | {"speed/env_steps_per_s", "speed/lag_ticks"}
+    for tag in tags:
+        points = events.Scalars(tag)
+        assert len(points) == (2 if "evaluation" in tag else 6)
+        assert all(math.isfinite(point.value) for point in points), tag
 
 
 def test_a_prediction_comes_from_the_newest_policy(tmp_path: Path) -> None:
@@ -140,7 +178,7 @@ def test_stopping_and_resuming_ends_where_the_uninterrupted_run_does(tmp_path: P
     TrainingLoop(channel, RunConfig.from_run(channel.run), lambda: channel.consumed_up_to >= 40).run()
     first = part(cut)
     assert (first["updates"], first["untrained_env_steps"]) == (2, 8 * 16)
-    resumed = run_file(str(cut)) | {"resume_from": str(latest_checkpoint(cut / "checkpoints"))}
+    resumed = run_file(str(cut)) | {"beginning": {"checkpoint": str(latest_checkpoint(cut / "checkpoints"))}}
     after = (obs for obs in with_evaluation(64, 4, 16, 5.0, 3) if obs.tick > 35)
     loop_over(cut, after, run=resumed)
     one, two = final_parameters(whole), final_parameters(cut)
@@ -249,7 +287,7 @@ def test_a_bad_configuration_ends_with_2_and_the_cure(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("channel_module")
 def test_a_damaged_checkpoint_ends_with_1(tmp_path: Path) -> None:
-    run = run_file(str(tmp_path)) | {"resume_from": str(tmp_path / "nothing")}
+    run = run_file(str(tmp_path)) | {"beginning": {"checkpoint": str(tmp_path / "nothing")}}
     assert train.main([write_run(tmp_path, run)]) == 1
     assert "manifest.json" in failure(tmp_path)["message"]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.checkpoint import latest_checkpoint
+from caraware.manifest import latest_checkpoint
 from caraware.program import caraware_program
 from safetensors.torch import load_file
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.checkpoint import latest_checkpoint, load_course
+from caraware.checkpoint import load_course
 from caraware.config import RunConfig
 from caraware.loop import TrainingLoop
+from caraware.manifest import latest_checkpoint
 from caraware.parallel import Place, command
 from caraware.ranks import Ranks, Union
 from rank_probe import TRAINING_TICKS, VEHICLES, channels, settings

@@ -328,6 +328,7 @@ fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
         sumo_home: "none".into(),
         config: serde_json::from_value(config(port)).unwrap(),
         config_hash: String::new(),
+        beginning: None,
         run_dir,
     }
 }

@@ -272,6 +272,10 @@ class Channel:
         """Shows episode, env_steps, updates, env_steps_per_s, policy_std, reward, error_m, raw_gnss_error_m."""
         self._attachment.report(**status)
 
+    def lag_ticks(self) -> int:
+        """Ticks that the traffic is ahead of the newest one consumed."""
+        return self._attachment.lag_ticks()
+
     def done(self) -> None:
         """All work is done: the process may end."""
         self._attachment.done()

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import logging
 import os
 import shutil
 from dataclasses import asdict, astuple, dataclass, field
@@ -13,39 +12,30 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from caraware.config import TrainerConfig
 from caraware.environment import Place
 from caraware.evaluation import EvaluationResult
+from caraware.manifest import (
+    BEST,
+    LATEST,
+    MANIFEST,
+    OWN_HASH,
+    SCHEMA_VERSION,
+    CheckpointError,
+    Counters,
+    Manifest,
+    Schedules,
+    best_checkpoint,
+    own_hash,
+    read_manifest,
+    verified,
+)
 from caraware.metrics import TrainingPoint
-from caraware.ppo import Ppo
+from caraware.ppo import Ppo, Settings
 
-log = logging.getLogger(__name__)
-
-SCHEMA_VERSION = 1
-MANIFEST = "manifest.json"
 COURSE = "course.json"
 RANDOM = "random.safetensors"
 POINTS = "points.safetensors"
-LATEST = "latest"
-"""File beside the checkpoints that names the newest."""
-
-
-class CheckpointError(Exception):
-    """A checkpoint that cannot be used: which file, and why."""
-
-    def __init__(self, file: Path, reason: str) -> None:
-        super().__init__(f"{file}: {reason}")
-        self.file, self.reason = file, reason
-
-
-@dataclass(frozen=True)
-class Counters:
-    """How far training has come."""
-
-    updates: int
-    env_steps: int
-    episode: int
-    committed_tick: int
-    """Newest tick that the parameters have learnt from; -1 before the first."""
 
 
 @dataclass(frozen=True)
@@ -66,17 +56,17 @@ class Course:
 
 
 @dataclass(frozen=True)
-class Manifest:
-    """What `manifest.json` says."""
+class Keeping:
+    """Which checkpoints outlive the next one; the one that `best` names always does."""
 
-    schema_version: int
-    torch_version: str
-    config_sha256: str
-    observation_size: int
-    hidden: tuple[int, ...]
-    counters: Counters
-    files: dict[str, str]
-    """Name to SHA-256."""
+    newest: int
+    every: int = 0
+    """Updates between two that stay for good; 0: none but those above."""
+
+    @classmethod
+    def of(cls, config: TrainerConfig) -> "Keeping":
+        """As configured."""
+        return cls(config.checkpoints_kept, config.checkpoint_keep_every)
 
 
 def save_checkpoint(
@@ -84,16 +74,16 @@ def save_checkpoint(
     ppo: Ppo,
     counters: Counters,
     config_sha256: str,
-    keep: int,
+    keep: Keeping,
     course: Course | None = None,
     random: dict[str, Tensor] | None = None,
 ) -> Path:
-    """Write `folder/update-NNNNNN`, then point `folder/latest` at it; older ones beyond `keep` are removed.
+    """Write `folder/update-NNNNNN`, then point `folder/latest` at it; older ones that `keep` does not name are removed.
 
     Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there. `random`
     adds the generators of other ranks.
     """
-    target = folder / f"update-{counters.updates:06d}"
+    target = folder / checkpoint_name(counters.updates)
     temporary = folder / f".{target.name}.partial"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
@@ -112,18 +102,33 @@ def save_checkpoint(
         observation_size=ppo.observation_size,
         hidden=ppo.config.hidden,
         counters=counters,
+        schedules=_schedules(ppo),
         files=files,
     )
-    _write(temporary / MANIFEST, json.dumps(asdict(manifest), indent=2).encode())
+    entries = asdict(manifest)
+    _write(temporary / MANIFEST, json.dumps(entries | {OWN_HASH: own_hash(entries)}, indent=2).encode())
     _sync_directory(temporary)
     if target.exists():
         shutil.rmtree(target)
     temporary.rename(target)
-    _write(folder / f".{LATEST}.partial", target.name.encode())
-    (folder / f".{LATEST}.partial").rename(folder / LATEST)
-    _sync_directory(folder)
+    _point(folder, LATEST, target)
     _remove_old(folder, keep)
     return target
+
+
+def checkpoint_name(updates: int) -> str:
+    """Of the directory of the checkpoint after so many updates."""
+    return f"update-{updates:06d}"
+
+
+def mark_best(checkpoint: Path) -> None:
+    """Let `best` name this checkpoint; it stays until another is better."""
+    _point(checkpoint.parent, BEST, checkpoint)
+
+
+def _schedules(ppo: Ppo) -> Schedules:
+    """Of the newest update; before the first, of that one."""
+    return Schedules(ppo.progress, **asdict(Settings.at(ppo.config, max(ppo.updates - 1, 0), ppo.progress)))
 
 
 def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
@@ -155,7 +160,7 @@ def load_course(checkpoint: Path) -> Course:
     files = read_manifest(checkpoint).files
     if COURSE not in files:
         return Course()
-    rest = json.loads(_verified(checkpoint / COURSE, files[COURSE]))
+    rest = json.loads(verified(checkpoint / COURSE, files[COURSE]))
     rows = _read_tensors(checkpoint / POINTS, files[POINTS])["training"].tolist()
     evaluations = [EvaluationResult.restored(result) for result in rest.pop("evaluations")]
     others = [Place(**place) for place in rest.pop("others", [])]
@@ -170,40 +175,6 @@ def remove_partial(folder: Path) -> None:
             shutil.rmtree(partial)
         else:
             partial.unlink()
-
-
-def newest_sound_checkpoint(folder: Path) -> Path | None:
-    """The newest checkpoint that verifies, None if there is none."""
-    for checkpoint in sorted(folder.glob("update-*"), reverse=True):
-        try:
-            for name, digest in read_manifest(checkpoint).files.items():
-                _verified(checkpoint / name, digest)
-            return checkpoint
-        except CheckpointError as error:
-            log.warning("checkpoint refused, the one before it is used: %s", error)
-    return None
-
-
-def latest_checkpoint(folder: Path) -> Path:
-    """The checkpoint that `folder/latest` names. Raises `CheckpointError` if there is none."""
-    try:
-        return folder / (folder / LATEST).read_text().strip()
-    except OSError as error:
-        raise CheckpointError(folder / LATEST, f"cannot be read ({error.strerror})") from error
-
-
-def read_manifest(checkpoint: Path) -> Manifest:
-    """The manifest of a checkpoint directory. Raises `CheckpointError`."""
-    file = checkpoint / MANIFEST
-    try:
-        raw = json.loads(file.read_bytes())
-        if raw["schema_version"] != SCHEMA_VERSION:
-            raise CheckpointError(file, f"schema version {raw['schema_version']}, this trainer reads {SCHEMA_VERSION}")
-        return Manifest(**{**raw, "counters": Counters(**raw["counters"]), "hidden": tuple(raw["hidden"])})
-    except OSError as error:
-        raise CheckpointError(file, f"cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise CheckpointError(file, f"is not a manifest ({error})") from error
 
 
 def _tensors(ppo: Ppo) -> dict[str, dict[str, Tensor]]:
@@ -223,24 +194,19 @@ def _tensors(ppo: Ppo) -> dict[str, dict[str, Tensor]]:
     return {"parameters.safetensors": parameters, "optimiser.safetensors": moments, RANDOM: random}
 
 
-def _verified(file: Path, sha256: str) -> bytes:
-    """The content of a file of a checkpoint."""
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise CheckpointError(file, f"cannot be read ({error.strerror})") from error
-    found = hashlib.sha256(content).hexdigest()
-    if found != sha256:
-        raise CheckpointError(file, f"is damaged: SHA-256 {found[:12]}…, the manifest says {sha256[:12]}…")
-    return content
-
-
 def _read_tensors(file: Path, sha256: str) -> dict[str, Tensor]:
-    _verified(file, sha256)
+    verified(file, sha256)
     try:
         return load_file(file)
     except SafetensorError as error:
         raise CheckpointError(file, f"is not a safetensors file ({error})") from error
+
+
+def _point(folder: Path, name: str, checkpoint: Path) -> None:
+    """Let the file `name` name a checkpoint, from one moment to the next."""
+    _write(folder / f".{name}.partial", checkpoint.name.encode())
+    (folder / f".{name}.partial").rename(folder / name)
+    _sync_directory(folder)
 
 
 def _write(file: Path, content: bytes) -> str:
@@ -260,6 +226,9 @@ def _sync_directory(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _remove_old(folder: Path, keep: int) -> None:
-    for old in sorted(folder.glob("update-*"))[:-keep]:
-        shutil.rmtree(old)
+def _remove_old(folder: Path, keep: Keeping) -> None:
+    best = best_checkpoint(folder)
+    for old in sorted(folder.glob("update-*"))[: -keep.newest]:
+        stays = keep.every > 0 and int(old.name.removeprefix("update-")) % keep.every == 0
+        if old != best and not stays:
+            shutil.rmtree(old)

@@ -78,6 +78,8 @@ class TrainerConfig:
     seed: int = 1
     checkpoint_interval_updates: int = 10
     checkpoints_kept: int = 5
+    checkpoint_keep_every: int = 0
+    """Checkpoints after a multiple of so many updates stay for good; 0: only the newest and the best."""
     estimates: str = "paced"
     """When the Kalman filter runs beside the policy for whoever watches: `paced`, `always`, `never`."""
 
@@ -111,7 +113,7 @@ class TrainerConfig:
             _range(name, getattr(self, name), SMALLEST, math.inf)
         for name in ("discount", "gae_lambda"):
             _range(name, getattr(self, name), 0.0, 1.0)
-        for name in ("entropy_scale", "value_scale", "threads", "seed"):
+        for name in ("entropy_scale", "value_scale", "threads", "seed", "checkpoint_keep_every"):
             _range(name, getattr(self, name), 0, math.inf)
         _range("clip_epsilon", self.clip_epsilon, SMALLEST, 1.0)
         for name in ("learning_rate_final", "clip_epsilon_final", "entropy_scale_final", "value_clip", "target_kl"):
@@ -180,7 +182,7 @@ class RunConfig:
         if "run_dir" not in run:
             raise ConfigError("the run file has no `run_dir`", "start the trainer through `caraware train`")
         canonical = json.dumps(run.get("config", {}), sort_keys=True, separators=(",", ":")).encode()
-        resume = run.get("resume_from")
+        resume = (run.get("beginning") or {}).get("checkpoint")
         episodes = run.get("config", {}).get("episode", {})
         place = run.get("config", {}).get("run", {})
         first_env = place.get("first_env", 0)

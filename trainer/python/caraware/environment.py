@@ -37,6 +37,27 @@ class TickLedger:
         return True
 
 
+class EpisodeStarts:
+    """At which tick episodes began: a simulation that goes on behind a tick begins with the episode of the next."""
+
+    def __init__(self, episode: int = 0, tick: int = 0) -> None:
+        self._starts = [(tick, episode)]
+
+    def note(self, obs: Observation) -> None:
+        """Note a tick of the run, in order."""
+        if obs.episode != self._starts[-1][1]:
+            self._starts.append((obs.tick, obs.episode))
+        if obs.episode_last:
+            self._starts.append((obs.tick + 1, obs.episode + 1))
+
+    def behind(self, committed_tick: int) -> tuple[int, int]:
+        """Episode of the tick behind `committed_tick`, and its first tick; what lies before is forgotten."""
+        while len(self._starts) > 1 and self._starts[1][0] <= committed_tick + 1:
+            del self._starts[0]
+        tick, episode = self._starts[0]
+        return episode, tick
+
+
 @dataclass(frozen=True)
 class Place:
     """How far one environment has come, up to a checkpoint."""
@@ -60,6 +81,7 @@ class Environment:
         self.committed_tick = -1
         self.episode = 0
         self.ledger = TickLedger(None)
+        self.starts = EpisodeStarts()
         self.evaluation: Evaluation | None = None
         self.evaluation_tick = self.evaluated_tick = -1
         """Newest tick of the open evaluation phase, and of those that are finished."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -10,18 +10,20 @@ from torch import Tensor
 
 from caraware.baselines import BaselineErrors, Baselines, SensorNoise
 from caraware.rewards import distance_m
+from caraware.statistics import mean_interval
 from caraware.stream import Observation
 
 CI95_STANDARD_ERRORS = 1.96
-"""Half the width of a 95 % confidence interval of a mean."""
+"""Half the width of a 95 % confidence interval of a mean of many, in standard errors."""
 
 
 @dataclass(frozen=True)
 class EvaluationResult:
     """One evaluation phase: every valid row of consecutive evaluation episodes, the policy unchanged.
 
-    Standard errors are those of the mean, with the vehicles of an episode as clusters: one vehicle's samples are not
-    independent. Half a 95 % confidence interval is 1.96 of them.
+    Confidence intervals are over seeds: Student's t over the means of the episodes, each of which has a seed of its
+    own. Standard errors are those of the mean with the vehicles of an episode as clusters, since one vehicle's samples
+    are not independent: all that a phase of a single episode can tell.
     """
 
     env_steps: int
@@ -41,39 +43,44 @@ class EvaluationResult:
     rts_standard_error_m: float | None = None
     environment: int = 0
     """Whose episodes; the first one's index if those of all are pooled."""
-    ppo_ci95_m: float = field(init=False)
-    """Half the width of the confidence interval of the mean, 95 %."""
-    raw_gnss_ci95_m: float = field(init=False)
-    ekf_ci95_m: float | None = field(init=False)
-    rts_ci95_m: float | None = field(init=False)
-
-    def __post_init__(self) -> None:
-        for name in ESTIMATORS:
-            error_m = getattr(self, f"{name}_standard_error_m")
-            object.__setattr__(self, f"{name}_ci95_m", None if error_m is None else CI95_STANDARD_ERRORS * error_m)
+    ppo_ci95_m: float | None = None
+    """Half the width of the 95 % confidence interval of the mean over seeds; None for a single seed."""
+    raw_gnss_ci95_m: float | None = None
+    ekf_ci95_m: float | None = None
+    rts_ci95_m: float | None = None
 
     @classmethod
     def restored(cls, values: dict) -> "EvaluationResult":
         """From what `dataclasses.asdict` made of one."""
-        return cls(**{known.name: values[known.name] for known in fields(cls) if known.init and known.name in values})
+        return cls(**{known.name: values[known.name] for known in fields(cls) if known.name in values})
+
+    def half_width_m(self, name: str) -> float:
+        """Half a 95 % interval of an estimator's mean: over seeds, or over vehicles where there is one seed only."""
+        over_seeds = getattr(self, f"{name}_ci95_m")
+        return CI95_STANDARD_ERRORS * getattr(self, f"{name}_standard_error_m") if over_seeds is None else over_seeds
 
     def headline(self) -> dict[str, float | None]:
-        """Mean errors and half their confidence intervals, for the run's report."""
-        return {key: value for key, value in asdict(self).items() if key.endswith(("_mean_error_m", "_ci95_m"))}
+        """Mean errors, half their confidence intervals and the number of seeds, for the run's report."""
+        told = {key: value for key, value in asdict(self).items() if key.endswith(("_mean_error_m", "_ci95_m"))}
+        return told | {"evaluation_seeds": self.episodes}
 
     def __str__(self) -> str:
         told = ", ".join(
-            f"{label} {getattr(self, f'{name}_mean_error_m'):.3f} ± {getattr(self, f'{name}_ci95_m'):.3f} m"
+            f"{label} {getattr(self, f'{name}_mean_error_m'):.3f} ± {self.half_width_m(name):.3f} m"
             for name, label in ESTIMATORS.items()
             if getattr(self, f"{name}_mean_error_m") is not None
         )
-        return f"{told} (95 %), {self.samples} samples"
+        over = f"{self.episodes} seeds" if self.episodes > 1 else "the vehicles of one seed"
+        return f"{told} (95 % over {over}), {self.samples} samples"
 
 
 ESTIMATORS = {"ppo": "policy", "raw_gnss": "raw GNSS", "ekf": "EKF", "rts": "RTS smoother (sees the future: a bound)"}
 """Key of each, as in the run's report, and its name for people; the order of the columns of an evaluation's sums."""
 
-NO_HEADLINE = dict.fromkeys(f"{name}_{what}_m" for name in ESTIMATORS for what in ("mean_error", "ci95"))
+NO_HEADLINE: dict[str, float | None] = {
+    **dict.fromkeys(f"{name}_{what}_m" for name in ESTIMATORS for what in ("mean_error", "ci95")),
+    "evaluation_seeds": 0,
+}
 """The headline of a run that has not been evaluated: every key, without a value."""
 
 
@@ -153,12 +160,18 @@ class Evaluation:
         errors = np.sqrt(np.square(sums[:, 1:] - count[:, None] * means).sum(0)) / count.sum()
         known = list(ESTIMATORS)[: None if self._baselines else 2]
         results: dict[str, Any] = {}
-        for name, mean_m, error_m in zip(known, means, errors, strict=False):
-            results |= {f"{name}_mean_error_m": float(mean_m), f"{name}_standard_error_m": float(error_m)}
+        seeds = [episode[:, 1:].sum(0) / episode[:, 0].sum() for episode in self._finished if len(episode)]
+        for column, name in enumerate(known):
+            over_seeds = mean_interval([float(seed[column]) for seed in seeds])
+            results |= {
+                f"{name}_mean_error_m": float(means[column]),
+                f"{name}_standard_error_m": float(errors[column]),
+                f"{name}_ci95_m": over_seeds.half_width if over_seeds.count > 1 else None,
+            }
         return EvaluationResult(
             env_steps=env_steps,
             policy_version=policy_version,
-            episodes=sum(len(episode) > 0 for episode in self._finished),
+            episodes=len(seeds),
             samples=int(count.sum()),
             environment=environment,
             **results,
@@ -189,6 +202,12 @@ def _pool(phase: Sequence[EvaluationResult]) -> EvaluationResult:
         errors_m = [getattr(result, f"{name}_standard_error_m") for result in phase]
         values[f"{name}_mean_error_m"] = sum(share * mean for share, mean in zip(shares, means_m, strict=True))
         values[f"{name}_standard_error_m"] = math.hypot(*(s * e for s, e in zip(shares, errors_m, strict=True)))
+        halves_m = [getattr(result, f"{name}_ci95_m") for result in phase]
+        if None in halves_m:
+            # One episode each: what differs between seeds is what differs between environments.
+            values[f"{name}_ci95_m"] = mean_interval(means_m).half_width
+        else:
+            values[f"{name}_ci95_m"] = math.hypot(*(s * h for s, h in zip(shares, halves_m, strict=True)))
     return replace(phase[0], samples=samples, episodes=sum(result.episodes for result in phase), **values)
 
 

@@ -11,10 +11,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caraware.checkpoint import Counters, Course, load_checkpoint, load_course, save_checkpoint
+from caraware.checkpoint import (
+    Course,
+    Keeping,
+    checkpoint_name,
+    load_checkpoint,
+    load_course,
+    mark_best,
+    save_checkpoint,
+)
 from caraware.config import RunConfig
-from caraware.environment import Environment, Place, share
-from caraware.evaluation import NO_HEADLINE, ErrorMeter, Evaluation, errors_m, pooled
+from caraware.environment import Environment, EpisodeStarts, Place, share
+from caraware.evaluation import NO_HEADLINE, ErrorMeter, Evaluation, EvaluationResult, errors_m, pooled
+from caraware.manifest import Counters
 from caraware.metrics import Metrics, TrainingPoint
 from caraware.plots import plot_error, plot_sigma
 from caraware.ppo import Batch, NonFiniteLoss, Ppo, UpdateStats, save_batch
@@ -43,6 +52,10 @@ class Learner:
         if config.resume_from is not None:
             learner.load(config.resume_from)
         return learner
+
+    def warm_up(self) -> None:
+        """Let everything that the first prediction needs be there before it is waited for."""
+        self.ppo.predict_m([torch.zeros(1, self.ppo.observation_size)])
 
     def load(self, checkpoint: Path) -> None:
         """Continue from a checkpoint. Raises `CheckpointError`."""
@@ -165,6 +178,8 @@ class TrainingLoop:
             place = places[environment.index] if environment.index < len(places) else Place()
             environment.start(place, share(trainer.horizon, count, environment.index), size)
             environment.episode = counters.episode
+        # Only a run of one environment can be resumed.
+        self._environments[0].starts = EpisodeStarts(counters.next_episode, counters.next_episode_tick)
         if counters.updates > 0:
             self._saved_updates = counters.updates
             self._metrics.resume(course.training, course.evaluations, counters.env_steps)
@@ -193,8 +208,7 @@ class TrainingLoop:
         going_on = [each for each in self._environments if each.pending and self._may_go_on(each)]
         if going_on:
             assert self._ppo is not None
-            blocks = [self._visible(obs) for environment in going_on for obs in environment.pending]
-            predictions_m = iter(self._ppo.predict_m(blocks))
+            predictions_m = iter(self._predict_m([obs for environment in going_on for obs in environment.pending]))
             for environment in going_on:
                 predicted_m = [next(predictions_m) for _ in environment.pending]
                 if not self._take_all(environment, predicted_m):
@@ -224,6 +238,23 @@ class TrainingLoop:
         elif any(environment.ended and not full[environment.index] for environment in self._environments):
             self._agree(Verdict.ENDED)
 
+    def _predict_m(self, ticks: Sequence[Observation]) -> list[Tensor]:
+        """Predicted positions `[n, 2]` for each tick. Training ticks go through the network together.
+
+        An evaluation tick goes alone and without empty slots: a matrix product rounds as its shape demands, and what an
+        evaluation says must not depend on how many ticks happened to wait.
+        """
+        assert self._ppo is not None
+        training = iter(self._ppo.predict_m([self._visible(obs) for obs in ticks if not obs.evaluation]))
+        return [self._predict_alone_m(obs) if obs.evaluation else next(training) for obs in ticks]
+
+    def _predict_alone_m(self, obs: Observation) -> Tensor:
+        assert self._ppo is not None
+        rows = torch.from_numpy(np.flatnonzero(obs.valid))
+        predicted_m = torch.zeros(len(obs.valid), 2)
+        predicted_m[rows] = self._ppo.predict_m([self._visible(obs).index_select(0, rows)])[0]
+        return predicted_m
+
     def _visible(self, obs: Observation) -> Tensor:
         """The observation as the networks take it: in place, unless fields of dark sensors must become numbers."""
         return torch.nan_to_num(obs.observation) if self._config.dark_is_nan else obs.observation
@@ -238,6 +269,7 @@ class TrainingLoop:
             channel.publish_predictions(obs, predicted_m, self._updates(), estimates_m)
         policy_m, raw_m = errors_m(obs, predicted_m)
         environment.episode = obs.episode
+        environment.starts.note(obs)
         self._vehicles = max(self._vehicles, int(np.count_nonzero(obs.valid)))
         if obs.evaluation:
             environment.rollout.ended(obs)
@@ -286,7 +318,7 @@ class TrainingLoop:
         self._sample_clock = (now, self._env_steps)
         rate = (self._env_steps - steps) / max(now - since, 1e-9)
         point = TrainingPoint(self._env_steps, stats.sigma, stats.reward_mean, error_m, raw_gnss_error_m, rate)
-        self._metrics.updated(point, stats)
+        self._metrics.updated(point, stats, self._channel.lag_ticks())
         self._channel.report(
             episode=self._episode(),
             env_steps=self._env_steps,
@@ -311,17 +343,37 @@ class TrainingLoop:
             environment.evaluated_tick = environment.evaluation_tick
             self._metrics.evaluated(result)
             log.info("evaluation at %d env steps: %s", result.env_steps, result)
+            self._keep_best(result)
+
+    def _keep_best(self, result: EvaluationResult) -> None:
+        """Let `best` name a checkpoint of the policy that was evaluated, if none before had less error.
+
+        Ranks would have to agree on it, and environments to have finished the same phase: only one of one does it.
+        """
+        if self._ranks.size > 1 or len(self._environments) > 1:
+            return
+        errors_m = [other.ppo_mean_error_m for other in self._metrics.evaluations if other.policy_version > 0]
+        if result.policy_version > 0 and result.ppo_mean_error_m <= min(errors_m):
+            if self._saved_updates != result.policy_version:
+                self.commit()
+            mark_best(self._config.run_dir / "checkpoints" / checkpoint_name(result.policy_version))
 
     def commit(self) -> None:
         """Write a checkpoint of everything learnt so far."""
         assert self._ppo is not None
         folder = self._config.run_dir / "checkpoints"
         committed_tick = self._environments[0].committed_tick
-        counters = Counters(self._updates(), self._trained_steps(), self._episode(), committed_tick)
-        kept = self._config.trainer.checkpoints_kept
+        counters = Counters(
+            self._updates(),
+            self._trained_steps(),
+            self._episode(),
+            committed_tick,
+            *self._environments[0].starts.behind(committed_tick),
+        )
+        keep = Keeping.of(self._config.trainer)
         course, random = self._of_all_ranks()
         if self._ranks.rank == 0:
-            saved = save_checkpoint(folder, self._ppo, counters, self._config.config_sha256, kept, course, random)
+            saved = save_checkpoint(folder, self._ppo, counters, self._config.config_sha256, keep, course, random)
             log.info("checkpoint %s, learnt up to tick %d", saved.name, committed_tick)
         # The checkpoint of rank 0 is that of all.
         self._ranks.gather(None)

@@ -41,14 +41,15 @@ class Metrics:
     def _writer(self) -> SummaryWriter:
         return SummaryWriter(str(self._folder), purge_step=self._purge_step)
 
-    def updated(self, point: TrainingPoint, stats: UpdateStats) -> None:
-        """Record one update."""
+    def updated(self, point: TrainingPoint, stats: UpdateStats, lag_ticks: int = 0) -> None:
+        """Record one update, after which the simulation was `lag_ticks` ahead."""
         self.training.append(point)
         for name, value in asdict(stats).items():
             self._writer.add_scalar(f"update/{name}", value, point.env_steps)
         self._writer.add_scalar("error/training_m", point.error_m, point.env_steps)
         self._writer.add_scalar("error/training_raw_gnss_m", point.raw_gnss_error_m, point.env_steps)
         self._writer.add_scalar("speed/env_steps_per_s", point.env_steps_per_s, point.env_steps)
+        self._writer.add_scalar("speed/lag_ticks", lag_ticks, point.env_steps)
 
     def evaluated(self, result: EvaluationResult) -> None:
         """Record one evaluation phase."""

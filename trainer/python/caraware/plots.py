@@ -37,12 +37,14 @@ def plot_error(file: Path, training: list[TrainingPoint], evaluations: list[Eval
 def _plot_evaluated(
     axes: Axes, evaluations: list[EvaluationResult], name: str, label: str, colour: str, dashes: str, marker: str
 ) -> None:
-    """One estimator's mean errors with their confidence intervals, if it has any."""
-    points = [(e.env_steps, getattr(e, f"{name}_mean_error_m"), getattr(e, f"{name}_ci95_m")) for e in evaluations]
-    points = [point for point in points if point[1] is not None]
-    if not points:
+    """One estimator's mean errors, if it has any, with 95 % intervals: over seeds, of one seed over its vehicles."""
+    key = f"{name}_mean_error_m"
+    known = [e for e in evaluations if getattr(e, key) is not None]
+    if not known:
         return
-    steps, means_m, halves_m = zip(*points, strict=True)
+    steps, means_m = [e.env_steps for e in known], [getattr(e, key) for e in known]
+    halves_m, seeds = [e.half_width_m(name) for e in known], known[-1].episodes
+    told = f"last {means_m[-1]:.2f} ± {halves_m[-1]:.2f} m" + (f", {seeds} seeds" if seeds > 1 else "")
     axes.errorbar(
         steps,
         means_m,
@@ -53,7 +55,7 @@ def _plot_evaluated(
         markersize=4,
         linewidth=1.5,
         capsize=2,
-        label=f"{label} (last {means_m[-1]:.2f} m, bars 95 %)",
+        label=f"{label} ({told})",
     )
 
 

@@ -91,7 +91,17 @@ class UpdateStats:
     """Standard deviation of the policy after the update, mean over the actions, in actions."""
     advantage_mean: float
     advantage_std: float
+    return_mean: float
+    """Of the value targets."""
+    return_std: float
     reward_mean: float
+    action_mean_x: float
+    """Of the actions that this trainer sampled: 0 is the middle of the map, ±1 its edge."""
+    action_mean_y: float
+    action_std_x: float
+    action_std_y: float
+    action_outside: float
+    """Share of the sampled positions that lie outside the map."""
     explained_variance: float
     """1 - Var(target - value) / Var(target), of the values before the update."""
     policy_gradient_norm: float
@@ -248,7 +258,7 @@ class Ppo:
                 value_job.exception()
             value = value_job.result()
         self.updates += 1
-        return self._stats(union, policy, value, now)
+        return self._stats(batch, union, policy, value, now)
 
     @torch.no_grad()
     def _improve_policy(self, batch: Batch, union: Union, orders: list[Tensor], now: Settings) -> _PolicyMeans:
@@ -381,7 +391,11 @@ class Ppo:
             raise NonFiniteLoss(what, self.updates + 1)
         return number
 
-    def _stats(self, union: Union, policy: _PolicyMeans, value: _ValueMeans, now: Settings) -> UpdateStats:
+    def _stats(
+        self, batch: Batch, union: Union, policy: _PolicyMeans, value: _ValueMeans, now: Settings
+    ) -> UpdateStats:
+        action_mean_x, action_mean_y = batch.action.mean(0).tolist()
+        action_std_x, action_std_y = batch.action.std(0, correction=0).tolist()
         return UpdateStats(
             policy_loss=policy.loss,
             value_loss=value.loss,
@@ -393,7 +407,14 @@ class Ppo:
             sigma=self.sigma(),
             advantage_mean=union.advantage.mean().item(),
             advantage_std=union.advantage.std(correction=0).item(),
+            return_mean=union.value_target.mean().item(),
+            return_std=union.value_target.std(correction=0).item(),
             reward_mean=union.reward.mean().item(),
+            action_mean_x=action_mean_x,
+            action_mean_y=action_mean_y,
+            action_std_x=action_std_x,
+            action_std_y=action_std_y,
+            action_outside=(batch.action.abs() > 1).any(1).float().mean().item(),
             explained_variance=_explained_variance(union),
             policy_gradient_norm=policy.gradient_norm,
             value_gradient_norm=value.gradient_norm,

@@ -84,6 +84,10 @@ class Observation(Protocol):
         """u32 `[n]`: dense vehicle index within the episode, `EMPTY_SLOT` where there is none."""
 
     @property
+    def id_hash(self) -> np.ndarray:
+        """u64 `[n]`: hash of the vehicle's SUMO id. Only for its name."""
+
+    @property
     def valid(self) -> np.ndarray:
         """bool `[n]`: the row holds a vehicle with valid sensors."""
 
@@ -123,6 +127,9 @@ class Channel(Protocol):
         estimates: np.ndarray | None = None,
     ) -> None:
         """Send f32 `[n, 2]` predicted positions in world metres for the tick of `observation`, and a filter's."""
+
+    def lag_ticks(self) -> int:
+        """Ticks that the traffic is ahead of the newest one consumed."""
 
     def done(self) -> None:
         """Say that all work is done, so that the run may end."""

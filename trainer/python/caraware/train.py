@@ -18,6 +18,8 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from caraware.config import RunConfig
     from caraware.loop import Learner
 
@@ -86,8 +88,8 @@ class Succession:
         return True
 
 
-def main(arguments: list[str]) -> int:
-    """Run the trainer of one run file; the process's exit code."""
+def main(arguments: list[str], work: "Callable[[Path, StopSignal, Succession], None] | None" = None) -> int:
+    """Run the trainer of one run file, or whatever `work` does in its place; the process's exit code."""
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
     if len(arguments) != 1:
         print("usage: python -m caraware.train RUN_FILE", file=sys.stderr)
@@ -95,7 +97,7 @@ def main(arguments: list[str]) -> int:
     run_file = Path(arguments[0])
     stop, succession = StopSignal(), Succession.from_environment()
     try:
-        _train(run_file, stop, succession)
+        (work or _train)(run_file, stop, succession)
     except Exception as error:  # the edge of the process: everything ends up in one place
         failure = _explain(error)
         log.exception("%s", failure.message)
@@ -117,15 +119,18 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
     from caraware.config import RunConfig
     from caraware.loop import TrainingLoop
 
-    config = RunConfig.from_run(_read_run(run_file))
+    config = RunConfig.from_run(read_run(run_file))
 
     from caraware import ranks
     from caraware.channel import Channel
 
     together = ranks.of_run(config.trainer.ranks)
-    learner = _successor(run_file, config, succession) if succession.replaces else None
-    if succession.is_shadow:
-        return
+    if succession.replaces:
+        learner = _successor(run_file, config, succession)
+        if succession.is_shadow:
+            return
+    else:
+        learner = _resumed(run_file, config)
     first_ticks = [learner.first_tick(index) if learner else 0 for index in range(len(config.environments))]
     channel = Channel(str(run_file), first_ticks[0])
     loop = TrainingLoop(
@@ -146,16 +151,32 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
     together.close()
 
 
+def _resumed(run_file: Path, config: "RunConfig") -> "Learner | None":
+    """A learner that stands where the checkpoint does that the run begins with; None if it begins anew."""
+    from caraware import _native
+    from caraware.checkpoint import remove_partial
+    from caraware.loop import Learner
+
+    if config.resume_from is None:
+        return None
+    remove_partial(config.run_dir / "checkpoints")
+    learner = Learner.begin(config, _native.observation_size(str(run_file)))
+    log.info("resumed from %s at tick %d", config.resume_from, learner.first_tick())
+    return learner
+
+
 def _successor(run_file: Path, config: "RunConfig", succession: Succession) -> "Learner | None":
     """A learner that stands where the run's newest sound checkpoint does; None if it is not wanted any more."""
     from caraware import _native
-    from caraware.checkpoint import newest_sound_checkpoint, remove_partial
+    from caraware.checkpoint import remove_partial
     from caraware.loop import Learner
+    from caraware.manifest import newest_sound_checkpoint
 
     size, folder = _native.observation_size(str(run_file)), config.run_dir / "checkpoints"
     if succession.is_shadow:
         # Whatever could be wrong with the settings or the checkpoint shows here, while the predecessor is at work.
-        Learner.begin(replace(config, resume_from=succession.checkpoint or newest_sound_checkpoint(folder)), size)
+        trial = replace(config, resume_from=succession.checkpoint or newest_sound_checkpoint(folder))
+        Learner.begin(trial, size).warm_up()
         if not succession.wait_for_turn():
             return None
     remove_partial(folder)
@@ -167,7 +188,8 @@ def _successor(run_file: Path, config: "RunConfig", succession: Succession) -> "
     return learner
 
 
-def _read_run(run_file: Path) -> dict:
+def read_run(run_file: Path) -> dict:
+    """The run file, parsed. Raises `ConfigError`."""
     from caraware.config import ConfigError
 
     try:
@@ -182,8 +204,8 @@ def _explain(error: Exception) -> Failure:
         return Failure(
             "missing", f"cannot import {error.name}: {error}", "`make train` installs what the trainer needs"
         )
-    from caraware.checkpoint import CheckpointError
     from caraware.config import ConfigError
+    from caraware.manifest import CheckpointError
     from caraware.ppo import NonFiniteLoss
     from caraware.ranks import RankError
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""

@@ -1,0 +1,209 @@
+//! Checkpoints on disk, as `caraware.manifest` (Python, which writes them) verifies them.
+
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use ipc_schema::{
+    config::Config,
+    run::{Beginning, RunFile},
+};
+use serde::Deserialize;
+
+use crate::{failure::Exit, install::Install};
+
+/// What the manifest says that matters here.
+#[derive(Debug, Clone, Deserialize)]
+struct Manifest {
+    observation_size: u64,
+    hidden: Vec<u64>,
+    counters: Counters,
+}
+
+#[derive(Debug, Clone, Deserialize)]
+struct Counters {
+    /// -1 before the first.
+    committed_tick: i64,
+    next_episode: u64,
+    next_episode_tick: u64,
+}
+
+/// What the Python side answers.
+#[derive(Debug, Deserialize)]
+struct Answer {
+    checkpoint: Option<PathBuf>,
+    manifest: Option<Manifest>,
+    refused: Option<String>,
+}
+
+/// A checkpoint of which every byte is as it was written.
+#[derive(Debug)]
+pub struct Found {
+    /// Its directory.
+    pub checkpoint: PathBuf,
+    /// True if a run was named, and not this checkpoint of it.
+    pub is_run: bool,
+    run_dir: PathBuf,
+    manifest: Manifest,
+}
+
+impl Found {
+    /// Looks for a checkpoint by its directory, or for the best of a run by the run's directory or its name in `runs`.
+    ///
+    /// # Errors
+    /// There is none, or it is damaged.
+    pub fn best(install: &Install, named: &str, runs: &Path) -> Result<Self, Exit> {
+        Self::ask(install, named, runs, "best")
+    }
+
+    /// The same, but of a run the newest.
+    ///
+    /// # Errors
+    /// There is none, or it is damaged.
+    pub fn newest(install: &Install, named: &str, runs: &Path) -> Result<Self, Exit> {
+        Self::ask(install, named, runs, "newest")
+    }
+
+    fn ask(install: &Install, named: &str, runs: &Path, which: &str) -> Result<Self, Exit> {
+        let (place, is_run) = place(named, runs)?;
+        let output = Command::new(&install.python)
+            .args(["-m", "caraware.manifest"])
+            .arg(&place)
+            .arg(which)
+            .output()
+            .map_err(|error| Exit::io("start", &install.python, &error))?;
+        let said = String::from_utf8_lossy(&output.stderr);
+        let answer: Answer = serde_json::from_slice(&output.stdout).map_err(|_| {
+            Exit::missing(
+                format!("cannot look into {}: {}", place.display(), said.trim()),
+                "`make build` installs what the trainer needs; `caraware doctor` checks it",
+            )
+        })?;
+        // What was passed over on the way is a warning.
+        eprint!("{said}");
+        let (Some(checkpoint), Some(manifest)) = (answer.checkpoint, answer.manifest) else {
+            return Err(Exit::run(
+                format!("checkpoint refused: {}", answer.refused.unwrap_or_default()),
+                "give another checkpoint of the run, e.g. runs/NAME/checkpoints/update-000100",
+            ));
+        };
+        let run_dir = checkpoint.ancestors().nth(2).unwrap_or(&checkpoint).to_owned();
+        Ok(Self {
+            checkpoint,
+            is_run,
+            run_dir,
+            manifest,
+        })
+    }
+
+    /// The run that it belongs to.
+    ///
+    /// # Errors
+    /// Its run file is not there, or of another version.
+    pub fn run(&self) -> Result<RunFile, Exit> {
+        RunFile::read(&self.run_dir.join("run.json")).map_err(|error| {
+            let mut failure =
+                ipc_schema::failure::Failure::from_error(ipc_schema::failure::FailureKind::Config, &error);
+            failure.help = Some(format!(
+                "the run of {} tells what it was made with; `caraware play` takes a CONFIG instead",
+                self.checkpoint.display()
+            ));
+            failure.into()
+        })
+    }
+
+    /// Name of the run that it belongs to.
+    #[must_use]
+    pub fn label(&self) -> String {
+        self.run_dir
+            .file_name()
+            .map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
+    }
+
+    /// Refuses a configuration whose observation or network has another size.
+    ///
+    /// # Errors
+    /// They differ: both are named.
+    pub fn check_fit(&self, config: &Config) -> Result<(), Exit> {
+        let refuse = |what: &str, has: String, wants: String, help: &str| {
+            let message = format!(
+                "{} does not fit the configuration: its {what} {has}, the configuration's {wants}",
+                self.checkpoint.display()
+            );
+            Err(Exit::config(message, help))
+        };
+        let (size, width) = (self.manifest.observation_size, config.observation_width() as u64);
+        if size != width {
+            let help = "set observation.fields and observation.history as in the run that learnt it";
+            return refuse("observation has", format!("{size} numbers"), width.to_string(), help);
+        }
+        if self.manifest.hidden != config.trainer.hidden {
+            let (has, wants) = (&self.manifest.hidden, &config.trainer.hidden);
+            let help = "set trainer.hidden as in the run that learnt it";
+            return refuse(
+                "network has hidden layers",
+                format!("{has:?}"),
+                format!("{wants:?}"),
+                help,
+            );
+        }
+        Ok(())
+    }
+
+    /// Where a run that goes on from it begins.
+    #[must_use]
+    pub fn beginning(&self) -> Beginning {
+        let counters = &self.manifest.counters;
+        Beginning {
+            checkpoint: self.checkpoint.clone(),
+            committed_ticks: u64::try_from(counters.committed_tick + 1).unwrap_or(0),
+            episode: counters.next_episode,
+            episode_tick: counters.next_episode_tick,
+            episodes: None,
+        }
+    }
+
+    /// Copies it to the checkpoints of another run, which goes on from the copy.
+    ///
+    /// # Errors
+    /// Not readable, or not writable.
+    pub fn copy_into(&self, run_dir: &Path) -> Result<Beginning, Exit> {
+        let name = self.checkpoint.file_name().unwrap_or_default();
+        let folder = run_dir.join("checkpoints");
+        let copy = folder.join(name);
+        let failed = |error: std::io::Error| Exit::io("write", &copy, &error);
+        std::fs::create_dir_all(&copy).map_err(failed)?;
+        for entry in std::fs::read_dir(&self.checkpoint).map_err(failed)?.flatten() {
+            std::fs::copy(entry.path(), copy.join(entry.file_name())).map_err(failed)?;
+        }
+        std::fs::write(folder.join("latest"), name.as_encoded_bytes()).map_err(failed)?;
+        Ok(Beginning {
+            checkpoint: copy.clone(),
+            ..self.beginning()
+        })
+    }
+}
+
+/// The directory of a checkpoint, or of a run; true if it is a run.
+fn place(named: &str, runs: &Path) -> Result<(PathBuf, bool), Exit> {
+    let absolute = |path: &Path| std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error));
+    let path = Path::new(named);
+    if path.join("manifest.json").exists() || path.parent().is_some_and(|folder| folder.ends_with("checkpoints")) {
+        return Ok((absolute(path)?, false));
+    }
+    let places = [runs.join(named), path.to_owned()];
+    if let Some(run) = places.iter().find(|place| place.join("checkpoints").is_dir()) {
+        return Ok((absolute(run)?, true));
+    }
+    if let Some(run) = places.iter().find(|place| place.join("run.json").is_file()) {
+        return Err(Exit::run(
+            format!("the run {} has no checkpoint", run.display()),
+            "it ended before its first one: start it anew with `caraware train`",
+        ));
+    }
+    Err(Exit::config(
+        format!("`{named}` is neither a run in {} nor a checkpoint", runs.display()),
+        "give a run's name or directory, or a directory like runs/NAME/checkpoints/update-000100",
+    ))
+}

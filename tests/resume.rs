@@ -1,0 +1,161 @@
+//! A run that was stopped goes on from a checkpoint, and ends where the run does that was never stopped.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
+mod common;
+
+use std::{
+    path::{Path, PathBuf},
+    process::{Output, Stdio},
+};
+
+use common::{Workplace, text, until};
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+/// Six vehicles, four episodes of which one evaluation between: 1 500 ticks of which 400 are evaluations, a checkpoint for every update.
+const SMALL: [&str; 13] = [
+    "traffic.cavs=6",
+    "traffic.others=3",
+    "traffic.pedestrians=3",
+    "episode.ticks=275",
+    "episode.training_episodes=4",
+    "episode.evaluation_interval=2",
+    "episode.evaluation_ticks=80",
+    "trainer.horizon=600",
+    "trainer.batch_size=300",
+    "trainer.checkpoint_interval=1",
+    "trainer.checkpoint_keep_every=1",
+    "trainer.matmul_precision=float32",
+    "fanout.enabled=false",
+];
+
+fn arguments<'a>(name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let settings = SMALL.iter().chain(more).flat_map(|setting| ["--set", setting]);
+    ["train", "town", "--name", name].into_iter().chain(settings).collect()
+}
+
+fn run_dir(workplace: &Workplace, name: &str) -> PathBuf {
+    workplace.path().join("runs").join(name)
+}
+
+/// What a run came to: hash of every tensor of the newest checkpoint, every evaluation, and how many samples it learnt from.
+fn outcome(workplace: &Workplace, name: &str) -> (String, Vec<(u64, f64, f64)>, Value) {
+    let report = workplace.report(name);
+    assert_eq!(report["result"], "completed");
+    assert_eq!(
+        (&report["lost_ticks"], &report["duplicated_ticks"]),
+        (&0.into(), &0.into()),
+        "{report:#}"
+    );
+    let evaluation = |value: &Value| {
+        (
+            value["policy_version"].as_u64().unwrap(),
+            value["ppo_mean_error_m"].as_f64().unwrap(),
+            value["ekf_mean_error_m"].as_f64().unwrap(),
+        )
+    };
+    let evaluations = report["trainer"]["evaluations"].as_array().unwrap();
+    let learnt = (report["trainer"]["received_ticks"].clone(), report["env_steps"].clone());
+    (
+        tensors(&run_dir(workplace, name)),
+        evaluations.iter().map(evaluation).collect(),
+        serde_json::json!(learnt),
+    )
+}
+
+fn tensors(run: &Path) -> String {
+    let checkpoints = run.join("checkpoints");
+    let newest = std::fs::read_to_string(checkpoints.join("latest")).unwrap();
+    let mut hasher = blake3::Hasher::new();
+    for name in ["parameters", "optimiser", "random"] {
+        let file = checkpoints.join(newest.trim()).join(format!("{name}.safetensors"));
+        hasher.update(&std::fs::read(file).unwrap());
+    }
+    format!("{} {}", newest.trim(), hasher.finalize().to_hex())
+}
+
+fn refused(output: &Output, code: i32, words: &[&str]) {
+    let said = text(output);
+    assert_eq!(output.status.code(), Some(code), "{said}");
+    // Messages are wrapped for the terminal.
+    let said = said.replace('│', " ").split_whitespace().collect::<Vec<_>>().join(" ");
+    for word in words {
+        assert!(said.contains(word), "\"{word}\" is missing:\n{said}");
+    }
+}
+
+#[test]
+fn a_run_that_goes_on_ends_where_the_one_does_that_was_never_stopped() {
+    let workplace = Workplace::new();
+    workplace.succeed(&arguments("whole", &[]));
+    let expected = outcome(&workplace, "whole");
+    assert_eq!(expected.1.len(), 2, "an evaluation between and one at the end");
+
+    // Stopped in the second half; its newest checkpoint is damaged, so that it goes on from the one before.
+    let mut run = workplace
+        .command(&arguments("cut", &["run.real_time_factor=40"]))
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let checkpoints = run_dir(&workplace, "cut").join("checkpoints");
+    until(&mut run, || checkpoints.join("update-000006").exists().then_some(()));
+    refused(
+        &workplace.run(&["train", "--resume", "cut"]),
+        2,
+        &["the run cut is alive", "caraware stop cut"],
+    );
+    kill_process(Pid::from_child(&run), Signal::INT).unwrap();
+    assert_eq!(run.wait().unwrap().code(), Some(130));
+    assert_eq!(workplace.report("cut")["result"], "interrupted");
+    let newest = std::fs::read_to_string(checkpoints.join("latest")).unwrap();
+    let file = checkpoints.join(newest.trim()).join("optimiser.safetensors");
+    let mut bytes = std::fs::read(&file).unwrap();
+    bytes[1000] ^= 8;
+    std::fs::write(&file, bytes).unwrap();
+    let output = workplace.succeed(&["train", "--resume", "cut", "--set", "run.real_time_factor=0"]);
+    assert!(
+        text(&output).contains("optimiser.safetensors: is damaged"),
+        "{}",
+        text(&output)
+    );
+    let beginning = workplace.report("cut")["beginning"].clone();
+    assert!(beginning["episode"].as_u64().unwrap() > 0, "{beginning}");
+    assert!(beginning["committed_ticks"].as_u64().unwrap() > beginning["episode_tick"].as_u64().unwrap());
+    assert_eq!(outcome(&workplace, "cut"), expected);
+
+    // From any checkpoint in a new run, which leaves the old one as it is.
+    let before = common::tree(&run_dir(&workplace, "whole"));
+    for (kept, name) in [("update-000002", "from-2"), ("update-000005", "from-5")] {
+        let checkpoint = format!("runs/whole/checkpoints/{kept}");
+        workplace.succeed(&["train", "--resume", &checkpoint, "--name", name]);
+        assert_eq!(outcome(&workplace, name), expected, "{kept}");
+    }
+    assert_eq!(common::tree(&run_dir(&workplace, "whole")), before);
+    // The first began with the first episode: its hash is over all that the whole run has made.
+    let hash = |name: &str| workplace.report(name)["observation_hash"].clone();
+    assert_eq!(workplace.report("from-2")["beginning"]["episode_tick"], 0);
+    assert_eq!(hash("from-2"), hash("whole"));
+    assert_ne!(hash("from-5"), hash("whole"));
+    workplace.assert_nothing_left();
+
+    let cavs = ["train", "--resume", "whole", "--set", "traffic.cavs=7"];
+    refused(&workplace.run(&cavs), 2, &["`traffic.cavs` cannot change", "trainer."]);
+    let wide = ["train", "--resume", "whole", "--set", "trainer.hidden=[64]"];
+    refused(&workplace.run(&wide), 2, &["hidden layers [500, 300]", "[64]"]);
+    refused(
+        &workplace.run(&["train", "--resume", "nobody"]),
+        2,
+        &["`nobody` is neither a run"],
+    );
+    refused(
+        &workplace.run(&["train", "town", "--resume", "whole"]),
+        2,
+        &["cannot be used with"],
+    );
+}

@@ -1,0 +1,171 @@
+"""What a checkpoint says of itself, and whether that is true: manifests, hashes, which one is the newest or the best.
+
+Imports nothing heavy: `python -m caraware.manifest RUN|CHECKPOINT newest|best` answers the command line in a moment.
+"""
+
+import hashlib
+import json
+import logging
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+SCHEMA_VERSION = 2
+MANIFEST = "manifest.json"
+LATEST, BEST = "latest", "best"
+"""Files beside the checkpoints that name the newest, and the one whose evaluation had the least mean error."""
+OWN_HASH = "manifest_sha256"
+"""Entry of the manifest: SHA-256 of all its other entries, as canonical JSON."""
+
+
+class CheckpointError(Exception):
+    """A checkpoint that cannot be used: which file, and why."""
+
+    def __init__(self, file: Path, reason: str) -> None:
+        super().__init__(f"{file}: {reason}")
+        self.file, self.reason = file, reason
+
+
+@dataclass(frozen=True)
+class Counters:
+    """How far training has come."""
+
+    updates: int
+    env_steps: int
+    episode: int
+    committed_tick: int
+    """Newest tick that the parameters have learnt from; -1 before the first."""
+    next_episode: int = 0
+    """The episode that the tick after it belongs to: a resumed simulation begins there."""
+    next_episode_tick: int = 0
+    """The first tick of that episode."""
+
+
+@dataclass(frozen=True)
+class Schedules:
+    """Where what changes over training stood in the update that the checkpoint follows."""
+
+    progress: float
+    learning_rate: float
+    clip_epsilon: float
+    entropy_scale: float
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What `manifest.json` says."""
+
+    schema_version: int
+    torch_version: str
+    config_sha256: str
+    observation_size: int
+    hidden: tuple[int, ...]
+    counters: Counters
+    schedules: Schedules
+    files: dict[str, str]
+    """Name to SHA-256. `random.safetensors` holds the states of the random numbers."""
+
+
+def best_checkpoint(folder: Path) -> Path | None:
+    """The checkpoint that `best` names, if there is one."""
+    try:
+        return folder / (folder / BEST).read_text().strip()
+    except OSError:
+        return None
+
+
+def newest_sound_checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint that verifies, None if there is none."""
+    for checkpoint in sorted(folder.glob("update-*"), reverse=True):
+        try:
+            verify_checkpoint(checkpoint)
+            return checkpoint
+        except CheckpointError as error:
+            log.warning("checkpoint refused, the one before it is used: %s", error)
+    return None
+
+
+def verify_checkpoint(checkpoint: Path) -> Manifest:
+    """The manifest of a checkpoint of which every byte is as it was written. Raises `CheckpointError`."""
+    manifest = read_manifest(checkpoint)
+    for name, digest in manifest.files.items():
+        verified(checkpoint / name, digest)
+    return manifest
+
+
+def latest_checkpoint(folder: Path) -> Path:
+    """The checkpoint that `folder/latest` names. Raises `CheckpointError` if there is none."""
+    try:
+        return folder / (folder / LATEST).read_text().strip()
+    except OSError as error:
+        raise CheckpointError(folder / LATEST, f"cannot be read ({error.strerror})") from error
+
+
+def read_manifest(checkpoint: Path) -> Manifest:
+    """The manifest of a checkpoint directory. Raises `CheckpointError`."""
+    file = checkpoint / MANIFEST
+    try:
+        raw = json.loads(file.read_bytes())
+        if raw["schema_version"] != SCHEMA_VERSION:
+            raise CheckpointError(file, f"schema version {raw['schema_version']}, this trainer reads {SCHEMA_VERSION}")
+        stated, found = raw.pop(OWN_HASH), own_hash(raw)
+        if stated != found:
+            raise CheckpointError(file, f"is damaged: SHA-256 {found[:12]}…, it says {stated[:12]}…")
+        parts = {"counters": Counters(**raw["counters"]), "schedules": Schedules(**raw["schedules"])}
+        return Manifest(**raw | parts | {"hidden": tuple(raw["hidden"])})
+    except OSError as error:
+        raise CheckpointError(file, f"cannot be read ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(file, f"is not a manifest ({error})") from error
+
+
+def verified(file: Path, sha256: str) -> bytes:
+    """The content of a file of a checkpoint."""
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise CheckpointError(file, f"cannot be read ({error.strerror})") from error
+    found = hashlib.sha256(content).hexdigest()
+    if found != sha256:
+        raise CheckpointError(file, f"is damaged: SHA-256 {found[:12]}…, the manifest says {sha256[:12]}…")
+    return content
+
+
+def own_hash(entries: dict) -> str:
+    """Of a manifest without this hash."""
+    return hashlib.sha256(json.dumps(entries, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def main(arguments: list[str]) -> int:
+    """Print the checkpoint that is asked for and its manifest, or why it is refused; one JSON object."""
+    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
+    place, which = Path(arguments[0]), arguments[1]
+    try:
+        checkpoint = _choose(place / "checkpoints", which) if (place / "checkpoints").is_dir() else place
+        manifest = verify_checkpoint(checkpoint)
+    except CheckpointError as error:
+        print(json.dumps({"refused": str(error)}))
+        return 1
+    print(json.dumps({"checkpoint": str(checkpoint), "manifest": asdict(manifest)}))
+    return 0
+
+
+def _choose(folder: Path, which: str) -> Path:
+    """The best or the newest of a run; the newest sound one where that is damaged. Raises `CheckpointError`."""
+    best = best_checkpoint(folder) if which == "best" else None
+    if best is not None:
+        try:
+            verify_checkpoint(best)
+            return best
+        except CheckpointError as error:
+            log.warning("checkpoint refused, the newest is used: %s", error)
+    newest = newest_sound_checkpoint(folder)
+    if newest is None:
+        raise CheckpointError(folder, "holds no checkpoint that can be used")
+    return newest
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

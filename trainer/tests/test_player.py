@@ -1,0 +1,111 @@
+"""Playing a checkpoint over a channel of prepared ticks."""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from caraware.baselines import Ekf, SensorNoise
+from caraware.baselines.samples import read_samples
+from caraware.config import RunConfig
+from caraware.loop import Learner
+from caraware.player import LIVE, PlayLoop, Tally
+from synthetic import SyntheticChannel
+from synthetic_vehicle import VehicleObservation, observations, sensor_tables, town_track, vehicle_run
+
+TICKS, VEHICLES = 40, 5
+
+
+def ticks(first: int = 0, episodes: int = 2) -> Iterator[VehicleObservation]:
+    """Episodes with seeds of their own."""
+    for episode in range(episodes):
+        for obs in observations(town_track(TICKS, VEHICLES, episode), seed=episode):
+            tick = episode * TICKS + obs.tick
+            if tick >= first:
+                ends = obs.tick == TICKS - 1
+                yield replace(
+                    obs,
+                    tick=tick,
+                    episode=episode,
+                    evaluation=True,
+                    episode_last=ends,
+                    last=ends and episode == episodes - 1,
+                    truncated=np.full(VEHICLES, obs.tick == 0 and episode > 0),
+                )
+
+
+def run(folder: Path) -> dict:
+    played = vehicle_run(str(folder))
+    played["config"]["traffic"] = {}
+    return played
+
+
+def loop_over(folder: Path, stream: Iterator[VehicleObservation], stop_at: int | None = None) -> SyntheticChannel:
+    played = run(folder)
+    folder.mkdir(exist_ok=True)
+    channel = SyntheticChannel(played, stream)
+    config = RunConfig.from_run(played)
+    size = next(ticks()).observation.shape[1]
+    stop = lambda: stop_at is not None and channel.consumed_up_to >= stop_at  # noqa: E731
+    PlayLoop(channel, config, Learner.begin(config, size), stop).run()
+    return channel
+
+
+def part(folder: Path) -> dict:
+    return json.loads((folder / "parts" / "trainer.json").read_text())
+
+
+def test_errors_are_those_of_predictions_filter_and_fix(tmp_path: Path) -> None:
+    channel = loop_over(tmp_path, ticks())
+    noise = SensorNoise.from_run({"config": sensor_tables()})
+    error_m: dict[str, list[float]] = {"ppo": [], "ekf": [], "raw_gnss": []}
+    for obs in ticks():
+        if obs.tick % TICKS == 0:
+            ekf = Ekf(noise)
+        ekf.step(read_samples(obs, noise.convention))
+        truth = np.asarray(obs.truth)[:, :2]
+        for name, estimate in (
+            ("ppo", np.asarray(channel.predictions[obs.tick])),
+            ("ekf", ekf.position_m),
+            ("raw_gnss", np.asarray(obs.gnss_m)[:, :2]),
+        ):
+            error_m[name] += list(np.hypot(*(estimate - truth)[obs.valid].T))
+    report = part(tmp_path)
+    for name, values in error_m.items():
+        assert report[f"{name}_mean_error_m"] == pytest.approx(np.mean(values), rel=1e-5)
+        assert report[f"{name}_ci95_m"] > 0
+    assert (report["evaluation_seeds"], report["vehicles"], report["env_steps"]) == (2, VEHICLES, len(values))
+    assert channel.is_done
+    assert channel.committed_up_to == channel.consumed_up_to == 2 * TICKS - 1
+    assert not (tmp_path / "checkpoints").exists()
+
+
+def test_the_table_has_a_row_for_every_vehicle(tmp_path: Path) -> None:
+    loop_over(tmp_path, ticks())
+    table = json.loads((tmp_path / LIVE).read_text())["table"]
+    assert (table["episode"], len(table["vehicles"])) == (1, VEHICLES)
+    for row in table["vehicles"]:
+        assert set(row["now_m"]) == set(row["mean_m"]) == {"ppo", "ekf", "raw_gnss"}
+        assert all(math.isfinite(value) for value in [*row["now_m"].values(), *row["mean_m"].values()])
+
+
+def test_a_successor_counts_on_from_the_file(tmp_path: Path) -> None:
+    """The filter begins anew in it, policy and fix do not know the difference."""
+    loop_over(tmp_path / "whole", ticks())
+    loop_over(tmp_path / "cut", ticks(), stop_at=50)
+    tally = Tally.read(tmp_path / "cut" / LIVE)
+    assert 50 <= tally.tick < 2 * TICKS - 1
+    loop_over(tmp_path / "cut", ticks(first=tally.tick + 1))
+    one, two = part(tmp_path / "whole"), part(tmp_path / "cut")
+    for key in ("env_steps", "vehicles", "evaluation_seeds"):
+        assert one[key] == two[key]
+    for key in ("ppo_mean_error_m", "raw_gnss_mean_error_m", "ppo_ci95_m"):
+        assert two[key] == pytest.approx(one[key], rel=1e-6)
+
+
+def test_a_file_that_is_no_table_is_no_predecessor(tmp_path: Path) -> None:
+    (tmp_path / LIVE).write_text("{")
+    assert Tally.read(tmp_path / LIVE) == Tally()
