@@ -130,7 +130,7 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
         if succession.is_shadow:
             return
     else:
-        learner = _resumed(run_file, config)
+        learner = _resumed(config)
     first_ticks = [learner.first_tick(index) if learner else 0 for index in range(len(config.environments))]
     channel = Channel(str(run_file), first_ticks[0])
     loop = TrainingLoop(
@@ -151,16 +151,16 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
     together.close()
 
 
-def _resumed(run_file: Path, config: "RunConfig") -> "Learner | None":
+def _resumed(config: "RunConfig") -> "Learner | None":
     """A learner that stands where the checkpoint does that the run begins with; None if it begins anew."""
-    from caraware import _native
     from caraware.checkpoint import remove_partial
     from caraware.loop import Learner
+    from caraware.manifest import read_manifest
 
     if config.resume_from is None:
         return None
     remove_partial(config.run_dir / "checkpoints")
-    learner = Learner.begin(config, _native.observation_size(str(run_file)))
+    learner = Learner.begin(config, read_manifest(config.resume_from).observation_size)
     log.info("resumed from %s at tick %d", config.resume_from, learner.first_tick())
     return learner
 
