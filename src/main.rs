@@ -38,14 +38,14 @@ fn main() -> ExitCode {
 }
 
 fn run(prepared: Prepared) -> Result<(), Exit> {
-    let run = prepared.run.clone();
-    if !args.quiet {
+    let (run, quiet) = (prepared.run.clone(), prepared.quiet);
+    if !quiet {
         eprintln!("run {}: results go to {}", run.name, run.run_dir.display());
     }
     let supervisor = Supervisor::new(prepared.run, prepared.install, prepared.claim)?;
-    let outcome = supervisor.supervise(&mut if args.quiet { Display::silent() } else { Display::new() })?;
+    let outcome = supervisor.supervise(&mut if quiet { Display::silent() } else { Display::new() })?;
     let (report, path) = report::write(&run, &outcome)?;
-    if !args.quiet {
+    if !quiet {
         println!("{}", report::summary(&report, &path));
     }
     if outcome.interrupted {

@@ -41,6 +41,8 @@ pub struct Prepared {
     pub install: Install,
     /// Its corner of shared memory.
     pub claim: Claim,
+    /// Show no progress and no summary.
+    pub quiet: bool,
 }
 
 /// What CONFIG names.
@@ -104,7 +106,12 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<Prepared, Exit> {
         registry::sweep();
         let (run, claim) = resume::go_on(&found, old, config, &install)?;
         check_shared_memory(&run)?;
-        return Ok(Prepared { run, install, claim });
+        return Ok(Prepared {
+            run,
+            install,
+            claim,
+            quiet: args.quiet,
+        });
     }
     let (_, named) = of_run(&old, &[])?;
     let mut prepared = make(args, Mode::Train, config, named, &found.label(), install)?;
@@ -147,7 +154,12 @@ fn make(
         }
     }
     let (run, claim) = result?;
-    Ok(Prepared { run, install, claim })
+    Ok(Prepared {
+        run,
+        install,
+        claim,
+        quiet: args.quiet,
+    })
 }
 
 fn resolve(args: &RunArgs) -> Result<(Settings, Named, String), Exit> {
