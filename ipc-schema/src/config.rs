@@ -48,6 +48,8 @@ pub struct Config {
     pub observation: Observation,
     /// The learner.
     pub trainer: Trainer,
+    /// The learned estimator of the preset `fusion`.
+    pub fusion: Fusion,
     /// Shared memory → zenoh.
     pub fanout: Fanout,
 }
@@ -137,6 +139,8 @@ pub struct Traffic {
     pub hero_ids: Vec<String>,
     /// Share of a scenario's own vehicles that carry sensors (`.sumocfg`).
     pub cav_share: f64,
+    /// Share of all trips, from road to road, that only evaluation episodes make, which make no others; 0 = none.
+    pub held_out_trips: f64,
     /// Most road users alive at once; shared memory is laid out for them.
     pub max_road_users: u32,
 }
@@ -298,6 +302,18 @@ pub enum Reward {
     BoundedInverse,
     /// exp(−d / scale).
     Exponential,
+}
+
+/// The learned estimator of the preset `fusion` (`caraware.fusion.train`).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Fusion {
+    /// Whether the estimator has the lanes of the net.
+    pub map: bool,
+    /// Ticks in a piece of an episode that is learnt from.
+    pub segment_ticks: u64,
+    /// Ticks that a gradient reaches back.
+    pub truncation_ticks: u64,
 }
 
 /// The learner: PPO with the paper's hyper-parameters.

@@ -14,9 +14,10 @@ pub use error::ConfigError;
 use layer::{Layer, Setting};
 
 /// Embedded presets by name; the first is the default and holds every key that must have a value.
-pub const PRESETS: [(&str, &str); 2] = [
+pub const PRESETS: [(&str, &str); 3] = [
     ("town", include_str!("../../configs/town.toml")),
     ("driving", include_str!("../../configs/driving.toml")),
+    ("fusion", include_str!("../../configs/fusion.toml")),
 ];
 
 /// Merged settings, each remembering where it was set.

@@ -26,6 +26,7 @@ use crate::{
     pacing::Pacing,
     population::{Population, Size},
     session::Session,
+    trips::Trips,
 };
 
 /// Runs all episodes of the run named by `run_file`, or until the process is asked to stop.
@@ -84,11 +85,13 @@ fn options(run: &RunFile, episode: &Episode) -> Result<Options, SumoError> {
 }
 
 /// The road users that we put into an empty net; a scenario brings its own.
-fn population(run: &RunFile, session: &mut Session, seed: u64) -> Result<Option<Population>, SumoError> {
+fn population(run: &RunFile, session: &mut Session, episode: &Episode) -> Result<Option<Population>, SumoError> {
     match run.source {
         Source::Population { .. } => {
             let traffic = &run.config.traffic;
-            Population::start(session, Size::from(traffic), &traffic.hero_route, seed).map(Some)
+            let trips = Trips::of_episode(traffic.held_out_trips, episode.evaluation);
+            let size = Size::from(traffic);
+            Population::start_on(session, size, &traffic.hero_route, trips, episode.seed).map(Some)
         }
         Source::Scenario { .. } => Ok(None),
     }
@@ -169,7 +172,7 @@ impl Bridge {
 
     /// Runs one episode to its end.
     fn episode(&mut self, session: &mut Session, episode: &Episode, is_last: bool) -> Result<Wait, Failure> {
-        let mut population = population(&self.membership.run, session, episode.seed)?;
+        let mut population = population(&self.membership.run, session, episode)?;
         let mut frame = Frame::default();
         loop {
             let tick = self.ticks + self.ticks_per_step - 1;

@@ -49,7 +49,7 @@ impl Fleet {
 }
 
 /// `hash` / 2⁶⁴, below 1.
-fn unit(hash: u64) -> f64 {
+pub(crate) fn unit(hash: u64) -> f64 {
     #[expect(clippy::cast_precision_loss, reason = "the 53 high bits are exact")]
     let high = (hash >> 11) as f64;
     high / (1_u64 << 53) as f64

@@ -21,3 +21,4 @@ pub mod population;
 pub mod roads;
 pub mod session;
 pub mod sumo;
+pub mod trips;

@@ -20,6 +20,7 @@ use crate::{
     pedestrians::Pedestrians,
     roads::Roads,
     session::{Session, called},
+    trips::Trips,
 };
 
 /// Ids of vehicles without sensors start with this.
@@ -32,6 +33,8 @@ const PATIENCE_S: f64 = 1.5;
 const HERO_CLASS: &str = "passenger";
 /// Routes are prolonged when fewer edges than this are left: enough for early lane changes, and for a second on short edges.
 const EDGES_AHEAD: usize = 4;
+/// Draws of a goal before one that is not allowed will do: with a tenth of all trips allowed, one in 10¹¹ is wrong.
+const DRAWS_OF_A_TRIP: usize = 256;
 /// How many road users to keep alive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Size {
@@ -75,6 +78,7 @@ struct Driver {
     vehicle_type: String,
     roads: Rc<Roads>,
     way: Way,
+    trips: Trips,
     rng: ChaCha8Rng,
     /// Last edge of the route.
     goal: usize,
@@ -139,11 +143,25 @@ impl Population {
         hero_route: &[String],
         episode_seed: u64,
     ) -> Result<Self, SumoError> {
+        Self::start_on(session, size, hero_route, Trips::ANY, episode_seed)
+    }
+
+    /// [`Self::start`] where vehicles make these trips only, as far as chance finds them.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn start_on(
+        session: &mut Session,
+        size: Size,
+        hero_route: &[String],
+        trips: Trips,
+        episode_seed: u64,
+    ) -> Result<Self, SumoError> {
         let catalogue = Catalogue::read(session)?;
         let pedestrians = Pedestrians::start(session, size.pedestrians, &catalogue.pedestrians, episode_seed)?;
         let pace = Pace::new(session.step_s());
         let (place_of, next_number) = (BTreeMap::new(), BTreeMap::new());
-        let drivers = drivers(session, size, hero_route, &catalogue, episode_seed)?;
+        let drivers = drivers(session, size, hero_route, trips, &catalogue, episode_seed)?;
         let mut population = Self {
             drivers,
             place_of,
@@ -223,13 +241,25 @@ impl Driver {
             });
         }
         let start = self.roads.draw_start(&mut self.rng);
-        self.goal = self.roads.draw_other(start, &mut self.rng);
+        self.goal = self.draw_goal(start);
         let route = self.roads.route(start, self.goal);
         (self.route_edges, self.added_step, self.departed) = (route.len(), step, false);
         called(
             "add a vehicle",
             session.sumo_mut().add_vehicle(&self.id, &self.vehicle_type, &route),
         )
+    }
+
+    /// A random road to go to, on an allowed trip; any if none comes up.
+    fn draw_goal(&mut self, from: usize) -> usize {
+        let mut goal = from;
+        for _ in 0..DRAWS_OF_A_TRIP {
+            goal = self.roads.draw_other(from, &mut self.rng);
+            if self.trips.allow(&self.roads.edge(from).id, &self.roads.edge(goal).id) {
+                break;
+            }
+        }
+        goal
     }
 
     /// Leads the vehicle on to another random edge when its route gets short. A refusal does no harm: it is tried
@@ -245,7 +275,7 @@ impl Driver {
         if self.route_edges > passed + EDGES_AHEAD {
             return;
         }
-        let goal = self.roads.draw_other(self.goal, &mut self.rng);
+        let goal = self.draw_goal(self.goal);
         let more = self.roads.route(self.goal, goal);
         match session.sumo_mut().extend_route(&self.id, &more) {
             Ok(()) => (self.route_edges, self.goal) = (self.route_edges + more.len() - 1, goal),
@@ -259,6 +289,7 @@ fn drivers(
     session: &Session,
     size: Size,
     hero_route: &[String],
+    trips: Trips,
     catalogue: &Catalogue,
     episode_seed: u64,
 ) -> Result<Vec<Driver>, SumoError> {
@@ -299,6 +330,7 @@ fn drivers(
             vehicle_type: entry.id.clone(),
             roads: Rc::clone(&roads[&entry.class]),
             way,
+            trips,
             rng,
             goal: 0,
             route_edges: 0,

@@ -148,6 +148,12 @@ class Evaluation:
         self._finished.append(self._sums[self._sums[:, 0] > 0])
         self._sums = np.zeros((0, self._sums.shape[1]))
 
+    def seeds_m(self) -> list[dict[str, float]]:
+        """Mean errors by estimator of every episode that is finished, each of which has a seed of its own."""
+        known = list(ESTIMATORS)[: None if self._baselines else 2]
+        means = [episode[:, 1:].sum(0) / episode[:, 0].sum() for episode in self._finished if len(episode)]
+        return [dict(zip(known, map(float, mean), strict=False)) for mean in means]
+
     def result(self, env_steps: int, policy_version: int, environment: int = 0) -> EvaluationResult | None:
         """The phase, which ends here; None without a sample."""
         self._finish_episode()

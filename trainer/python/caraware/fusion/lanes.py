@@ -1,0 +1,183 @@
+"""The map that the learned estimator carries: the lanes of the net, and from anywhere the way to the next of them.
+
+A map is what navigation systems have; it says nothing of where a vehicle is. Lanes are cut into straight pieces, and a
+raster over place and heading remembers which piece is nearest, so that a look-up costs the same in any town.
+"""
+
+import gzip
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+from torch import Tensor
+
+HEADING_BINS = 24
+"""Of 15 degrees each."""
+CELL_M = 1.0
+REACH_M = 15.0
+"""Lanes further away are not found."""
+MOST_CELLS = 4_000_000
+"""Of one heading; larger maps get larger cells."""
+OTHER_HEADING_RAD = math.radians(75.0)
+"""A lane that leads this far away from a vehicle's heading is not the one it drives on."""
+NOWHERE = -1
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Straight pieces of lanes; f32 `[s]` each, headings in rad counter-clockwise from east."""
+
+    x_m: Tensor
+    """Start, in world metres."""
+    y_m: Tensor
+    heading_rad: Tensor
+    length_m: Tensor
+    left_m: Tensor
+    """From the piece's start to the end of its lane; a junction's lanes end where the junction does."""
+    speed_limit_mps: Tensor
+
+    def __len__(self) -> int:
+        return len(self.x_m)
+
+
+def read_pieces(net_file: Path) -> Pieces:
+    """All lanes that cars may use. Raises `OSError` or `xml.etree.ElementTree.ParseError` for a file that is no net."""
+    rows: list[tuple[float, ...]] = []
+    with gzip.open(net_file) if net_file.suffix == ".gz" else net_file.open("rb") as stream:
+        for _, element in ElementTree.iterparse(stream):
+            if element.tag != "lane":
+                if element.tag == "edge":
+                    element.clear()
+                continue
+            if _for_cars(element):
+                rows += _cut(element)
+    columns = torch.tensor(rows, dtype=torch.float64).reshape(-1, 6).T.to(torch.float32)
+    return Pieces(*columns.contiguous())
+
+
+def _for_cars(lane: ElementTree.Element) -> bool:
+    allowed, denied = lane.get("allow"), (lane.get("disallow") or "").split()
+    return "passenger" in allowed.split() if allowed else "passenger" not in denied and "all" not in denied
+
+
+def _cut(lane: ElementTree.Element) -> list[tuple[float, ...]]:
+    points = np.array([[float(v) for v in point.split(",")[:2]] for point in lane.get("shape", "").split()])
+    ways = np.diff(points, axis=0) if len(points) > 1 else np.zeros((0, 2))
+    lengths = np.hypot(*ways.T)
+    lefts = np.cumsum(lengths[::-1])[::-1]
+    limit = float(lane.get("speed", "13.9"))
+    return [
+        (*start, math.atan2(way[1], way[0]), length, left, limit)
+        for start, way, length, left in zip(points[:-1].tolist(), ways.tolist(), lengths, lefts, strict=True)
+        if length > 0
+    ]
+
+
+@dataclass(frozen=True)
+class Match:
+    """The nearest place on a lane, seen from some places with headings; f32 `[questions, n]` each."""
+
+    ahead_m: Tensor
+    """The way there, along the heading asked for."""
+    left_m: Tensor
+    """The way there, across it."""
+    turned_rad: Tensor
+    """The lane's heading less the one asked for."""
+    to_end_m: Tensor
+    """Left of the lane."""
+    speed_limit_mps: Tensor
+    found: Tensor
+    """1, or 0 where no lane is near; then all others are 0."""
+
+
+class LaneMap:
+    """Finds the lane piece for places with headings, by distance and some metres for a difference in heading.
+
+    `metres_per_rad` has one such weight for each question (first dimension of what `match` is asked).
+    """
+
+    def __init__(self, pieces: Pieces, metres_per_rad: Sequence[float]) -> None:
+        self._pieces = pieces if len(pieces) else Pieces(*torch.zeros(6, 1))
+        low, high = _corners(self._pieces)
+        width, height = (high - low).tolist()
+        self._cell_m = max(CELL_M, math.sqrt(width * height / MOST_CELLS))
+        self._origin = (float(low[0]), float(low[1]))
+        self._shape = (math.ceil(height / self._cell_m) + 1, math.ceil(width / self._cell_m) + 1)
+        rasters = {weight: self._raster(weight, len(pieces)) for weight in metres_per_rad}
+        self._nearest = torch.cat(list(rasters.values()))
+        starts = [list(rasters).index(weight) * HEADING_BINS for weight in metres_per_rad]
+        self._first_row = torch.tensor(starts)[:, None]
+
+    def _raster(self, metres_per_rad: float, count: int) -> Tensor:
+        """i64 `[headings * rows * columns]`: the piece with the least cost at the middle of each cell."""
+        cost = np.full((HEADING_BINS, *self._shape), np.inf, np.float32)
+        nearest = np.full(cost.shape, NOWHERE, np.int32)
+        headings = (np.arange(HEADING_BINS) + 0.5) * (2 * math.pi / HEADING_BINS)
+        p = self._pieces
+        table = torch.stack((p.x_m, p.y_m, p.heading_rad, p.length_m)).T.double().numpy()
+        for piece, (x, y, heading, length) in enumerate(table[:count]):
+            window, square = self._squares(x, y, heading, length)
+            turned = np.abs((heading - headings + math.pi) % (2 * math.pi) - math.pi)
+            for i in np.flatnonzero(turned < OTHER_HEADING_RAD):
+                here = square + np.float32((metres_per_rad * turned[i]) ** 2)
+                better = (square < REACH_M**2) & (here < cost[i][window])
+                np.copyto(cost[i][window], here, where=better)
+                np.copyto(nearest[i][window], piece, where=better)
+        return torch.from_numpy(nearest.reshape(-1)).long()
+
+    def _squares(self, x: float, y: float, heading: float, length: float) -> tuple[tuple[slice, slice], np.ndarray]:
+        """Rows and columns within reach of a piece, and their squared distances to it (m²)."""
+        cos, sin = math.cos(heading), math.sin(heading)
+
+        def span(ends: tuple[float, float], origin: float, size: int) -> slice:
+            first = int((min(ends) - REACH_M - origin) // self._cell_m)
+            return slice(max(first, 0), min(int((max(ends) + REACH_M - origin) // self._cell_m) + 1, size))
+
+        rows = span((y, y + length * sin), self._origin[1], self._shape[0])
+        columns = span((x, x + length * cos), self._origin[0], self._shape[1])
+        across = self._origin[0] + (np.arange(columns.start, columns.stop) + 0.5) * self._cell_m - x
+        up = (self._origin[1] + (np.arange(rows.start, rows.stop) + 0.5) * self._cell_m - y)[:, None]
+        along = np.clip(across * cos + up * sin, 0.0, length)
+        square = (across - along * cos) ** 2 + (up - along * sin) ** 2
+        return (rows, columns), square.astype(np.float32)
+
+    def match(self, x_m: Tensor, y_m: Tensor, heading_rad: Tensor) -> Match:
+        """The nearest lane from each place; f32 `[questions, n]` each, in world metres and rad."""
+        rows, columns = self._shape
+        row = ((y_m - self._origin[1]) / self._cell_m).floor().long()
+        column = ((x_m - self._origin[0]) / self._cell_m).floor().long()
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        heading_bin = (heading_rad.remainder(2 * math.pi) * (HEADING_BINS / (2 * math.pi))).long()
+        heading_bin = heading_bin.clamp_(0, HEADING_BINS - 1) + self._first_row
+        cell = (heading_bin * rows + row.clamp_(0, rows - 1)) * columns + column.clamp_(0, columns - 1)
+        piece = torch.where(inside, self._nearest[cell], NOWHERE)
+        found = (piece >= 0).to(x_m.dtype)
+        piece.clamp_min_(0)
+        p = self._pieces
+        lane_rad = p.heading_rad[piece]
+        cos, sin = lane_rad.cos(), lane_rad.sin()
+        dx, dy = x_m - p.x_m[piece], y_m - p.y_m[piece]
+        along = torch.minimum((dx * cos + dy * sin).clamp_min_(0), p.length_m[piece])
+        dx, dy = along * cos - dx, along * sin - dy
+        cos, sin = heading_rad.cos(), heading_rad.sin()
+        turned = (lane_rad - heading_rad + math.pi).remainder(2 * math.pi) - math.pi
+        return Match(
+            found * (dx * cos + dy * sin),
+            found * (dy * cos - dx * sin),
+            found * turned,
+            found * (p.left_m[piece] - along),
+            found * p.speed_limit_mps[piece],
+            found,
+        )
+
+
+def _corners(p: Pieces) -> tuple[Tensor, Tensor]:
+    """The box of all lanes and what is within reach of them: low and high x, y."""
+    starts = torch.stack((p.x_m, p.y_m))
+    ends = starts + p.length_m * torch.stack((p.heading_rad.cos(), p.heading_rad.sin()))
+    both = torch.cat((starts, ends), 1)
+    return both.amin(1) - REACH_M, both.amax(1) + REACH_M

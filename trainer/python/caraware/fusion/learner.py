@@ -1,0 +1,173 @@
+"""How the estimator learns: from whole episodes, along the gradient of its mean error through time.
+
+PPO must guess the gradient of a reward from random actions, since it does not know how actions lead to rewards. Here
+that is known: an estimate is a sum of corrections, and the error a function of it. So the gradient is taken through
+the sum and the network's memory (truncated backpropagation through time; R. Williams and J. Peng, 1990). The truth
+appears in the loss alone.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from caraware.adam import Adam
+from caraware.config import ConfigError, MapBounds, TrainerConfig
+from caraware.fusion.carrier import COLUMNS, Carried
+from caraware.fusion.estimator import FusionEstimator, FusionNetwork, distance_loss
+from caraware.fusion.lanes import Pieces, read_pieces
+from caraware.networks import FlatParameters
+from caraware.ppo import NonFiniteLoss
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """Table `fusion` of the configuration."""
+
+    map: bool = True
+    """Whether the estimator has the lanes of the net."""
+    segment_ticks: int = 256
+    """An episode is learnt from in pieces of so many ticks, side by side."""
+    truncation_ticks: int = 64
+    """Ticks between two gradient steps; the gradient reaches no further back."""
+
+    @classmethod
+    def from_run(cls, run: dict) -> "FusionConfig":
+        """Read `run["config"]["fusion"]`. Raises `ConfigError`."""
+        section = run.get("config", {}).get("fusion", {})
+        config = cls(**{key: section[key] for key in ("map", "segment_ticks", "truncation_ticks") if key in section})
+        if config.segment_ticks % config.truncation_ticks != 0:
+            raise ConfigError(
+                f"`fusion.segment_ticks` = {config.segment_ticks} is no multiple of"
+                f" `fusion.truncation_ticks` = {config.truncation_ticks}",
+                "every gradient step takes as many ticks: give a multiple",
+            )
+        return config
+
+    def pieces(self, run: dict) -> Pieces:
+        """The lanes of the run's net; none without a map. Raises `OSError`."""
+        if not self.map:
+            return Pieces(*torch.zeros(6, 0))
+        return read_pieces(Path(run["scene_files"]["net_file"]))
+
+
+@dataclass(frozen=True)
+class FusionStats:
+    """What one episode taught."""
+
+    loss_m: float
+    """Mean error in the first pass over the episode, pieces starting from the filter's estimate."""
+    last_loss_m: float
+    """In the last pass."""
+    gradient_norm: float
+    learning_rate: float
+    steps: int
+    """Gradient steps."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What one episode was: `T` ticks of `n` slots."""
+
+    table: Tensor
+    """f32 `[T, n, COLUMNS]`."""
+    truth_m: Tensor
+    """f32 `[T, n, 2]`: east and north from the map's centre."""
+    valid: Tensor
+    """f32 `[T, n]`: 1 for rows that count."""
+
+    def pieces(self, ticks: int) -> "Episode":
+        """The same cut into pieces of so many ticks, side by side; the end is filled with rows that do not count."""
+
+        def cut(column: Tensor) -> Tensor:
+            missing = -len(column) % ticks
+            padded = torch.cat((column, column.new_zeros(missing, *column.shape[1:])))
+            return torch.cat(padded.split(ticks), 1)
+
+        return Episode(cut(self.table), cut(self.truth_m), cut(self.valid))
+
+
+class FusionLearner:
+    """Estimator, optimiser and random numbers: everything that a checkpoint must hold."""
+
+    def __init__(self, trainer: TrainerConfig, fusion: FusionConfig, pieces: Pieces, bounds: MapBounds) -> None:
+        self.config, self.fusion = trainer, fusion
+        self.updates = 0
+        torch.set_num_threads(1)  # matrices this small are not worth a second thread
+        self.random = torch.Generator().manual_seed(trainer.seed)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(trainer.seed)
+            network = FusionNetwork(trainer.hidden[0])
+        self.parameters = _flattened(network)
+        self.optimiser = Adam(self.parameters)
+        centre_m = ((bounds.x_min_m + bounds.x_max_m) / 2, (bounds.y_min_m + bounds.y_max_m) / 2)
+        self.estimator = FusionEstimator(network, pieces, centre_m)
+
+    def learn(self, episode: Episode, progress: float) -> FusionStats:
+        """Some passes over an episode; `progress` is the share of training that is behind. Raises `NonFiniteLoss`."""
+        final = (
+            self.config.learning_rate if self.config.learning_rate_final is None else self.config.learning_rate_final
+        )
+        learning_rate = self.config.learning_rate + (final - self.config.learning_rate) * progress
+        pieces = episode.pieces(self.fusion.segment_ticks)
+        log = [self._pass(pieces, learning_rate) for _ in range(self.config.epochs)]
+        self.updates += 1
+        steps = sum(len(losses) for losses, _ in log)
+        return FusionStats(
+            loss_m=sum(log[0][0]) / len(log[0][0]),
+            last_loss_m=sum(log[-1][0]) / len(log[-1][0]),
+            gradient_norm=sum(sum(norms) for _, norms in log) / steps,
+            learning_rate=learning_rate,
+            steps=steps,
+        )
+
+    def _pass(self, pieces: Episode, learning_rate: float) -> tuple[list[float], list[float]]:
+        """Once through all pieces, side by side and in a random share of them: losses and gradient norms."""
+        slots = torch.randperm(pieces.table.shape[1], generator=self.random)
+        slots = slots[pieces.valid.sum(0)[slots] > 0]
+        state, losses, norms = self.estimator.begin(len(slots)), [], []
+        for start in range(0, len(pieces.table), self.fusion.truncation_ticks):
+            ticks = slice(start, start + self.fusion.truncation_ticks)
+            table = pieces.table[ticks].index_select(1, slots)
+            offset_m, state = self.estimator.unroll(table, state.detached())
+            error_m = Carried.of(table).filter_m + offset_m - pieces.truth_m[ticks].index_select(1, slots)
+            loss = distance_loss(error_m, pieces.valid[ticks].index_select(1, slots))
+            self.parameters.gradient.zero_()
+            loss.backward()
+            losses.append(self._finite("the loss", loss.detach()))
+            norms.append(self._finite("the gradient", torch.linalg.vector_norm(self.parameters.gradient)))
+            if norms[-1] > self.config.max_grad_norm:
+                self.parameters.gradient.mul_(self.config.max_grad_norm / norms[-1])
+            with torch.no_grad():
+                self.optimiser.step(learning_rate)
+        return losses, norms
+
+    def _finite(self, what: str, value: Tensor) -> float:
+        if not torch.isfinite(value):
+            raise NonFiniteLoss(what, self.updates + 1)
+        return value.item()
+
+    def tensors(self) -> dict[str, dict[str, Tensor]]:
+        """Every tensor of a checkpoint by file and name. Parameters and moments are views: filling them loads them."""
+        moments = {"mean": self.optimiser.mean, "square": self.optimiser.square, "steps": self.optimiser.steps}
+        return {
+            "parameters.safetensors": dict(self.parameters.value),
+            "optimiser.safetensors": moments,
+            "random.safetensors": {"shuffling": self.random.get_state()},
+        }
+
+    def shape(self) -> dict[str, int]:
+        """What a checkpoint must agree with."""
+        return {"columns": COLUMNS, "hidden": self.config.hidden[0]}
+
+
+def _flattened(network: FusionNetwork) -> FlatParameters:
+    """Let the network's parameters and gradients be views of one vector each."""
+    shapes = {name: tuple(parameter.shape) for name, parameter in network.named_parameters()}
+    flat = FlatParameters(shapes, torch.device("cpu"))
+    for name, parameter in network.named_parameters():
+        flat.value[name].copy_(parameter.data)
+        parameter.data = flat.value[name]
+        parameter.grad = flat.grad[name]
+    return flat

@@ -1,0 +1,257 @@
+"""The learned estimator: where it starts, what it sees, that it learns, and that it goes on where it was stopped."""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from caraware.baselines.ekf import Ekf
+from caraware.baselines.noise import SensorNoise
+from caraware.baselines.samples import read_samples
+from caraware.checkpoint import CheckpointError
+from caraware.config import ConfigError
+from caraware.fusion.carrier import COLUMNS, Carried, Carrier
+from caraware.fusion.lanes import LaneMap, Pieces, read_pieces
+from caraware.fusion.learner import Episode, FusionConfig, FusionLearner
+from caraware.fusion.store import Progress, load_fusion, newest_sound, save_fusion
+from caraware.fusion.train import Estimating, FusionLoop, Recording, begin
+from synthetic import SyntheticChannel
+from synthetic_vehicle import Track, VehicleObservation, observations, sensor_tables, town_track, vehicle_run
+
+NET = """<net><edge id="a"><lane id="a_0" speed="13.9" length="200" shape="0,{y} 100,{y} 200,{y}"/>
+<lane id="a_1" allow="pedestrian" speed="1" length="200" shape="0,0 200,0"/></edge>
+<edge id="b"><lane id="b_0" disallow="pedestrian" speed="8.3" length="200" shape="{x},0 {x},200"/></edge></net>"""
+STREET_M = 80.0
+
+
+def net_file(folder: Path) -> Path:
+    """A street to the east at y = 80 m, one to the north at x = 80 m, a sidewalk at y = 0."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "net.net.xml"
+    file.write_text(NET.format(x=STREET_M, y=STREET_M))
+    return file
+
+
+def street_run(folder: Path, slow_m: float = 0.0, **trainer: object) -> dict:
+    tables = sensor_tables(gnss__correlated_std_m=[slow_m, slow_m, 0.0])
+    run = vehicle_run(str(folder), tables, hidden=[16], epochs=4, learning_rate=2e-3, **trainer)
+    run["config"]["fusion"] = {"segment_ticks": 32, "truncation_ticks": 16}
+    run["scene_files"] = {"net_file": str(net_file(folder))}
+    return run
+
+
+def street_track(ticks: int, vehicles: int, seed: int) -> Track:
+    """Half of the vehicles drive to the east on one street, half to the north on the other, straight on."""
+    track = town_track(ticks, vehicles, seed)
+    rng = np.random.default_rng(seed)
+    east = np.arange(vehicles) % 2 == 0
+    along = rng.uniform(0, 30, vehicles) + np.cumsum(track.speed_mps, 0) * 0.01
+    still = np.zeros_like(along)
+    return Track(
+        np.where(east, along, STREET_M),
+        np.where(east, STREET_M, along),
+        np.where(east, still, math.pi / 2),
+        track.speed_mps,
+        track.accel_mps2,
+        still,
+        track.accel_mps2,
+    )
+
+
+def street_ticks(run: dict, episodes: int, vehicles: int = 6, ticks: int = 40) -> Iterator[VehicleObservation]:
+    """Training episodes, then one for evaluation."""
+    for episode in range(episodes + 1):
+        for obs in observations(street_track(ticks, vehicles, episode), run["config"], seed=episode):
+            yield replace(
+                obs,
+                tick=episode * ticks + obs.tick,
+                episode=episode,
+                evaluation=episode == episodes,
+                episode_last=obs.tick == ticks - 1,
+                last=episode == episodes and obs.tick == ticks - 1,
+            )
+
+
+def learner_of(run: dict) -> FusionLearner:
+    return begin(run, None)[1]
+
+
+def estimates(run: dict, learner: FusionLearner, ticks: list[VehicleObservation]) -> torch.Tensor:
+    noise = SensorNoise.from_run(run)
+    assert noise is not None
+    x_m, y_m = learner.estimator.centre_m.tolist()
+    estimating = Estimating(learner, Carrier(noise, (x_m, y_m)))
+    return torch.stack([estimating.step(obs)[0] for obs in ticks])
+
+
+def shaken(learner: FusionLearner) -> FusionLearner:
+    """The same with random parameters: a network that has its own opinion."""
+    generator = torch.Generator().manual_seed(1)
+    learner.parameters.values.add_(0.1 * torch.randn(learner.parameters.values.shape, generator=generator))
+    return learner
+
+
+def test_before_it_learns_it_is_the_filter(tmp_path: Path) -> None:
+    run = street_run(tmp_path, slow_m=2.0)
+    noise = SensorNoise.from_run(run)
+    assert noise is not None
+    dark = np.zeros((80, 6), np.uint32)
+    dark[30:60, ::2] = 1
+    ticks = list(observations(town_track(80, 6, 1), run["config"], dark=dark))
+    ekf, expected = Ekf(noise), []
+    for obs in ticks:
+        ekf.step(read_samples(obs, noise.convention))
+        expected.append(ekf.position_m.copy())
+    assert np.abs(estimates(run, learner_of(run), ticks).numpy() - np.array(expected)).max() < 1e-3
+
+
+def test_it_sees_neither_truth_nor_future(tmp_path: Path) -> None:
+    run = street_run(tmp_path)
+    ticks = list(observations(town_track(60, 5, 2), run["config"]))
+    learner = shaken(learner_of(run))
+    told = estimates(run, learner, ticks)
+    lied = [replace(obs, truth=obs.truth + 100.0) for obs in ticks]
+    assert torch.equal(estimates(run, learner, lied), told)
+    later = [obs if obs.tick < 40 else replace(obs, gnss_m=obs.gnss_m + 50.0) for obs in ticks]
+    changed = estimates(run, learner, later)
+    assert torch.equal(changed[:40], told[:40])
+    assert not torch.equal(changed[40:], told[40:])
+
+
+def test_carrier_says_how_far_vehicles_went_and_fixes_pulled(tmp_path: Path) -> None:
+    run = street_run(tmp_path)
+    noise = SensorNoise.from_run(run)
+    assert noise is not None
+    carrier, before = Carrier(noise, (110.0, 110.0)), torch.zeros(4, 2)
+    for obs in observations(town_track(30, 4, 3), run["config"]):
+        c = Carried.of(carrier.step(obs))
+        assert c.running.all()
+        assert bool(c.begins.all()) == (obs.tick == 0)
+        if obs.tick:
+            assert torch.allclose(before + c.step_m + c.pull_m, c.filter_m, atol=1e-4)
+            assert torch.allclose(c.innovation_m, obs.gnss_m[:, :2] - 110.0 - before - c.step_m, atol=1e-4)
+        before = c.filter_m
+    assert float(c.gain.max()) < 0.2
+
+
+def test_the_raster_finds_what_a_search_of_all_pieces_finds(tmp_path: Path) -> None:
+    pieces = read_pieces(net_file(tmp_path))
+    assert (len(pieces), sorted(set(pieces.speed_limit_mps.tolist()))) == (3, pytest.approx([8.3, 13.9]))
+    weights = (4.0, 25.0)
+    rng = np.random.default_rng(1)
+    x, y = torch.tensor(rng.uniform(60, 100, (2, 400)), dtype=torch.float32)
+    yaw = torch.tensor(rng.uniform(-math.pi, math.pi, 400), dtype=torch.float32)
+    match = LaneMap(pieces, weights).match(x.expand(2, -1), y.expand(2, -1), yaw.expand(2, -1))
+    p = {name: column.numpy()[:, None] for name, column in vars(pieces).items()}
+    along = (x.numpy() - p["x_m"]) * np.cos(p["heading_rad"]) + (y.numpy() - p["y_m"]) * np.sin(p["heading_rad"])
+    along = np.clip(along, 0, p["length_m"])
+    dx = p["x_m"] + along * np.cos(p["heading_rad"]) - x.numpy()
+    dy = p["y_m"] + along * np.sin(p["heading_rad"]) - y.numpy()
+    turned = (p["heading_rad"] - yaw.numpy() + math.pi) % (2 * math.pi) - math.pi
+    allowed = (np.abs(turned) < math.radians(75)) & (np.hypot(dx, dy) < 15)
+    for question, weight in enumerate(weights):
+        cost = np.where(allowed, dx**2 + dy**2 + (weight * turned) ** 2, np.inf)
+        best = cost.argmin(0)
+        rows = np.arange(400)
+        ahead = dx[best, rows] * np.cos(yaw.numpy()) + dy[best, rows] * np.sin(yaw.numpy())
+        same = np.abs(match.ahead_m[question].numpy() - np.where(allowed.any(0), ahead, 0)) < 1e-2
+        # Cells and headings are rounded to their middles, which decides near ties otherwise.
+        assert same.mean() > 0.85
+        assert (match.found[question].numpy() == allowed.any(0)).mean() > 0.85
+
+
+def test_without_a_map_no_lane_is_found() -> None:
+    match = LaneMap(Pieces(*torch.zeros(6, 0)), (4.0,)).match(*torch.zeros(3, 1, 5))
+    assert all((column == 0).all() for column in vars(match).values())
+
+
+def test_it_learns_streets_and_beats_the_filter_on_vehicles_it_has_not_seen(tmp_path: Path) -> None:
+    run = street_run(tmp_path, slow_m=3.0)
+    run["config"]["fusion"] = {"segment_ticks": 100, "truncation_ticks": 50}
+    learner = learner_of(run)
+    for seed in range(3):
+        learner.learn(recorded(run, learner, seed), progress=0.0)
+    unseen = recorded(run, learner, seed=3)
+    with torch.no_grad():
+        offset_m, _ = learner.estimator.unroll(unseen.table, learner.estimator.begin(24))
+    filter_m = Carried.of(unseen.table).filter_m - unseen.truth_m
+    assert float((filter_m + offset_m).norm(dim=-1).mean()) < 0.8 * float(filter_m.norm(dim=-1).mean())
+
+
+def recorded(run: dict, learner: FusionLearner, seed: int) -> Episode:
+    noise, centre_m, recording = SensorNoise.from_run(run), learner.estimator.centre_m, Recording()
+    assert noise is not None
+    carrier = Carrier(noise, (float(centre_m[0]), float(centre_m[1])))
+    for obs in observations(street_track(100, 24, seed), run["config"], seed=seed):
+        recording.add(carrier.step(obs), obs.truth[:, :2] - centre_m, torch.ones(24))
+    return recording.episode()
+
+
+def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
+    run = street_run(tmp_path)
+    channel = SyntheticChannel(run, street_ticks(run, episodes=2))
+    config, learner, progress = begin(run, None)
+    assert FusionLoop(channel, config, learner, progress, lambda: False).run()
+    part = json.loads((tmp_path / "parts" / "trainer.json").read_text())
+    assert (part["updates"], part["env_steps"], part["untrained_env_steps"]) == (2, 2 * 40 * 6, 0)
+    assert (part["lost_ticks"], part["duplicated_ticks"]) == (0, 0)
+    assert part["seeds_m"][0]["ekf"] == pytest.approx(part["ekf_mean_error_m"])
+    assert part["seeds_m"][0]["ppo"] == pytest.approx(part["ppo_mean_error_m"])
+    assert channel.is_done
+    assert set(channel.predictions) == set(range(3 * 40))
+    assert channel.committed_up_to == 2 * 40 - 1
+
+
+def test_stopped_and_continued_it_ends_with_the_same_bytes(tmp_path: Path) -> None:
+    def parameters(folder: Path, *limits: int) -> torch.Tensor:
+        run = street_run(folder, checkpoint_interval=1)
+        for limit in limits:
+            config, learner, progress = begin(run, newest_sound(folder / "checkpoints"))
+            ticks = (obs for obs in street_ticks(run, episodes=3) if obs.tick > progress.committed_tick)
+            channel = SyntheticChannel(run, ticks)
+            FusionLoop(
+                channel, config, learner, progress, lambda c=channel, limit=limit: c.consumed_up_to >= limit
+            ).run()
+        assert learner.updates == 3
+        return learner.parameters.values
+
+    whole, cut = parameters(tmp_path / "whole", 10**6), parameters(tmp_path / "cut", 55, 110, 10**6)
+    assert torch.equal(whole, cut)
+
+
+def test_a_damaged_checkpoint_is_refused_and_the_one_before_it_used(tmp_path: Path) -> None:
+    run = street_run(tmp_path)
+    learner = shaken(learner_of(run))
+    for updates in (1, 2):
+        save_fusion(tmp_path / "c", learner, Progress(updates=updates), keep=5)
+    file = tmp_path / "c" / "update-000002" / "parameters.safetensors"
+    file.write_bytes(file.read_bytes()[:-1] + b"\x01")
+    with pytest.raises(CheckpointError, match="damaged"):
+        load_fusion(file.parent, learner)
+    newest = newest_sound(tmp_path / "c")
+    assert newest is not None
+    fresh = learner_of(run)
+    assert load_fusion(newest, fresh).updates == 1
+    assert torch.equal(fresh.parameters.values, learner.parameters.values)
+    wider = street_run(tmp_path)
+    wider["config"]["trainer"]["hidden"] = [8]
+    with pytest.raises(CheckpointError, match=r"16.*8"):
+        load_fusion(newest, learner_of(wider))
+
+
+def test_pieces_of_an_episode_hold_every_row_once() -> None:
+    ticks, slots = 10, 3
+    table = torch.arange(ticks * slots * COLUMNS, dtype=torch.float32).view(ticks, slots, COLUMNS)
+    pieces = Episode(table, table[..., :2], torch.ones(ticks, slots)).pieces(4)
+    assert pieces.table.shape == (4, 3 * slots, COLUMNS)
+    assert torch.equal(pieces.table[:, slots : 2 * slots], table[4:8])
+    assert pieces.valid.sum() == ticks * slots
+
+
+def test_ticks_that_do_not_divide_are_refused() -> None:
+    with pytest.raises(ConfigError, match="segment_ticks"):
+        FusionConfig.from_run({"config": {"fusion": {"segment_ticks": 100, "truncation_ticks": 64}}})
