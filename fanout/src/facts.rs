@@ -133,7 +133,7 @@ impl Facts {
             let rows = self.directory.vehicle_rows();
             let (part, whole) = frame::table(&header, &rows, size_of::<VehicleMeta>(), &mut self.vehicles.place);
             counters.frames += 1;
-            outlet.publish_part(Topic::Vehicles, part, Some(whole))?;
+            outlet.publish_part(Topic::Vehicles, part.into(), Some(whole.into()))?;
         }
         self.signal_rows = self.directory.take_signal_rows().or(self.signal_rows.take());
         if self.signals.budget.allows(now)
@@ -146,7 +146,7 @@ impl Facts {
             if part.len() < whole.len() {
                 self.signal_rows = Some(rows);
             }
-            outlet.publish_part(Topic::Signals, part, Some(whole))?;
+            outlet.publish_part(Topic::Signals, part.into(), Some(whole.into()))?;
         }
         if self.event_budget.allows(now)
             && let Some(frame) = self.contact_frames.pop_front()

@@ -201,14 +201,15 @@ impl Outlet {
     /// # Errors
     /// The session is closed.
     pub fn publish(&mut self, topic: Topic, bytes: Vec<u8>) -> Result<(), OutletError> {
-        self.publish_part(topic, bytes.clone(), Some(bytes))
+        let value = ZBytes::from(bytes);
+        self.publish_part(topic, value.clone(), Some(value))
     }
 
     /// Publishes `part`, and answers with `whole` from now on, if that is given.
     ///
     /// # Errors
     /// As [`Outlet::publish`].
-    pub fn publish_part(&mut self, topic: Topic, part: Vec<u8>, whole: Option<Vec<u8>>) -> Result<(), OutletError> {
+    pub fn publish_part(&mut self, topic: Topic, part: ZBytes, whole: Option<ZBytes>) -> Result<(), OutletError> {
         let Some(mut line) = self.lines.remove(&topic) else {
             return Ok(());
         };
@@ -221,7 +222,7 @@ impl Outlet {
     ///
     /// # Errors
     /// As [`Outlet::publish`].
-    pub fn publish_on(&self, line: &mut Line, part: Vec<u8>, whole: Option<Vec<u8>>) -> Result<(), OutletError> {
+    pub fn publish_on(&self, line: &mut Line, part: ZBytes, whole: Option<ZBytes>) -> Result<(), OutletError> {
         let attachment = attachment(line.sequence);
         line.sequence += 1;
         if let Some(whole) = whole {

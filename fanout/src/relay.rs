@@ -76,7 +76,6 @@ pub struct Relay {
     run_age_s: f64,
     counters: Counters,
     newest: MessageHeader,
-    is_announced: bool,
     rate: Rate,
     road_users: RoadUsers,
     sensors: Delivering,
@@ -130,7 +129,6 @@ impl Relay {
             started: Instant::now(),
             counters: Counters::default(),
             newest: MessageHeader::default(),
-            is_announced: false,
             rate: Rate::default(),
             road_users: RoadUsers::default(),
             sensors: Delivering::default(),
@@ -148,6 +146,7 @@ impl Relay {
     pub fn run(mut self) -> Result<(), RelayError> {
         tracing::info!(endpoint = %self.session.run.config.fanout.listen, "viewers may attach");
         self.session.attach();
+        self.outlet.announce()?;
         while !self.session.stopped() {
             let came = self.look()?;
             let now = self.started.elapsed();
@@ -254,10 +253,6 @@ impl Relay {
             self.counters.frames += 1;
             *self.counters.left_out(topic) += frame.left_out as u64;
             self.outlet.publish(topic, frame.bytes)?;
-        }
-        if !self.is_announced {
-            self.is_announced = true;
-            self.outlet.announce()?;
         }
         Ok(())
     }

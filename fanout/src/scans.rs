@@ -4,6 +4,7 @@ use std::{collections::BTreeMap, time::Duration};
 
 use bytemuck::pod_read_unaligned;
 use ipc_schema::{pointcloud::Scan, ports::Message, services::Channel, session::Session};
+use zenoh::bytes::ZBytes;
 
 use crate::{
     directory::Directory,
@@ -133,7 +134,8 @@ impl Scans {
                 carrier.budget.spend(bytes);
                 counters.frames += 1;
                 counters.thinned_rows += frame.left_out as u64;
-                outlet.publish_on(&mut carrier.line, frame.bytes.clone(), Some(frame.bytes))?;
+                let value = ZBytes::from(frame.bytes);
+                outlet.publish_on(&mut carrier.line, value.clone(), Some(value))?;
                 Ok(bytes)
             }
             Err(error) => {
