@@ -28,7 +28,6 @@ fn settings(fanout: &str) -> Vec<String> {
         "traffic.pedestrians=3",
         "episode.ticks=600",
         "episode.training_episodes=1",
-        "episode.final_evaluations=0",
         fanout,
     ];
     settings

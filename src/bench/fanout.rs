@@ -139,7 +139,6 @@ impl Bench {
                     "run.real_time_factor=1".to_owned(),
                     format!("episode.ticks={}", (PACED_S + 5) * 10),
                     "episode.training_episodes=1".into(),
-                    "episode.final_evaluations=0".into(),
                 ];
                 let port = free_port()?;
                 let mut run = self.start(&name, Some(port), &settings)?;
@@ -214,7 +213,6 @@ impl Bench {
         let settings = [
             format!("episode.ticks={FREE_TICKS}"),
             "episode.training_episodes=1".into(),
-            "episode.final_evaluations=0".into(),
         ];
         let (mut ratios, mut hashes) = (Vec::new(), Vec::new());
         let mut table = Table::new(
