@@ -124,6 +124,18 @@ fn option(
                     "paths in a .sumocfg are relative to the .sumocfg itself",
                 ));
             }
+            for file in files
+                .iter()
+                .filter(|file| file.extension().is_some_and(|kind| kind == "gz"))
+            {
+                unpack(file).map_err(|error| {
+                    let message = format!(
+                        "line {line}: {name} names {}, which cannot be unpacked: {error}",
+                        file.display()
+                    );
+                    problem(path, message, "copy or pack the file again; `gzip -t FILE` checks it")
+                })?;
+            }
             if name.starts_with('n') {
                 scenario.net_file = files.into_iter().next().unwrap_or_default();
             } else if name.starts_with('a') {
@@ -144,6 +156,11 @@ fn files(value: &str, directory: &Path) -> Vec<PathBuf> {
         .filter(|name| !name.is_empty())
         .map(|name| directory.join(name))
         .collect()
+}
+
+/// Reads a gzip file to its end: SUMO would stop in the middle without saying which file is damaged.
+fn unpack(file: &Path) -> std::io::Result<u64> {
+    std::io::copy(&mut MultiGzDecoder::new(File::open(file)?), &mut std::io::sink())
 }
 
 fn number<T: std::str::FromStr>(value: &str, name: &str, path: &Path, line: usize) -> Result<T, Exit> {

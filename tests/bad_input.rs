@@ -170,6 +170,99 @@ fn route_with_an_unknown_edge() {
     );
 }
 
+/// `grid.sumocfg` with another route file.
+fn simulate(workplace: &Workplace, routes: &str, settings: &[&str]) -> String {
+    workplace.write(
+        "grid.sumocfg",
+        &format!(
+            "<configuration>\n  <input>\n    <net-file value=\"grid.net.xml\"/>\n    <route-files value=\"{routes}\"/>\n  </input>\n</configuration>\n"
+        ),
+    );
+    let mut arguments = vec![
+        "simulate",
+        "grid.sumocfg",
+        "--set",
+        "map.origin_latitude_deg=52",
+        "--set",
+        "map.origin_longitude_deg=10",
+        "--set",
+        "fanout.enabled=false",
+    ];
+    arguments.extend(settings);
+    refused(workplace, &arguments, 2)
+}
+
+#[test]
+fn damaged_gzip() {
+    let workplace = Workplace::new();
+    scenario(&workplace, "<routes/>");
+    let whole = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\x03\xb3\x29\xca\x2f\x2d\x49\x2d\xd6\xb7\x03\x00";
+    for (name, bytes) in [("cut.rou.xml.gz", &whole[..14]), ("plain.rou.xml.gz", b"<routes/>")] {
+        std::fs::write(workplace.path().join(name), bytes).unwrap();
+        let said = simulate(&workplace, name, &[]);
+        assert_says(
+            &said,
+            &[
+                "grid.sumocfg",
+                "line 4",
+                "route-files",
+                name,
+                "cannot be unpacked",
+                "gzip -t",
+            ],
+        );
+    }
+}
+
+#[test]
+fn no_vehicles() {
+    let workplace = Workplace::new();
+    scenario(&workplace, "<routes/>");
+    let said = simulate(&workplace, "grid.rou.xml", &[]);
+    assert_says(
+        &said,
+        &["traffic-bridge", "grid.sumocfg", "no road user came", "route-files"],
+    );
+}
+
+#[test]
+fn more_vehicles_than_shared_memory_is_laid_out_for() {
+    let workplace = Workplace::new();
+    let vehicles: String = (0..200)
+        .map(|number| {
+            format!(
+                "  <vehicle id=\"{number}\" depart=\"{}\" departPos=\"random_free\"><route edges=\"A0A1 A1A2\"/></vehicle>\n",
+                number / 20
+            )
+        })
+        .collect();
+    scenario(&workplace, &format!("<routes>\n{vehicles}</routes>\n"));
+    let said = simulate(&workplace, "grid.rou.xml", &["--set", "traffic.max_road_users=52"]);
+    assert_says(
+        &said,
+        &["traffic", "`traffic.max_road_users` (now 52)", "fewer road users"],
+    );
+}
+
+#[test]
+fn a_region_that_is_none() {
+    let workplace = Workplace::new();
+    for (text, says) in [
+        (
+            "polygon_m = [\"0 0\", \"10 zero\", \"10 10\"]",
+            "\"10 zero\" is no corner",
+        ),
+        ("polygon_m = [\"0 0\", \"10 0\"]", "has 2 corners"),
+        (
+            "polygon_m = [\"0 0\", \"10 0\", \"0 10\"]\nradius_m = 5.0",
+            "are two regions",
+        ),
+    ] {
+        workplace.write("my.toml", &format!("[region]\n{text}\n"));
+        assert_says(&refused(&workplace, &["train", "my.toml"], 2), &["my.toml:2", says]);
+    }
+}
+
 #[test]
 fn missing_route_file() {
     let workplace = Workplace::new();

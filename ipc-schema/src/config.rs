@@ -6,8 +6,10 @@ use serde::{Deserialize, Serialize};
 use crate::traffic::VEHICLE_CLASSES;
 
 mod observation;
+mod region;
 mod sensors;
 pub use observation::*;
+pub use region::*;
 pub use sensors::*;
 
 /// One whole configuration.
@@ -34,6 +36,8 @@ pub struct Config {
     pub collision: Collision,
     /// Rain, fog and sun.
     pub weather: Weather,
+    /// Where vehicles are sensed.
+    pub region: Region,
     /// GNSS receiver.
     pub gnss: Gnss,
     /// Inertial measurement unit and compass.

@@ -23,6 +23,7 @@ pub mod normals;
 #[cfg(test)]
 #[path = "../../sim-core/tests/common/preset.rs"]
 mod preset;
+pub mod region;
 pub mod scanning;
 pub mod sections;
 pub mod sensing;

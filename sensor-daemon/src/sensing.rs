@@ -18,6 +18,7 @@ use crate::{
     history::{First, History},
     noise::{Drawn, Draws},
     normals::LANES,
+    region::Region,
     sections::Sections,
     slots::Slots,
     suite::{Motion, Now, Suite},
@@ -59,6 +60,8 @@ pub struct Sensing {
     /// Persons get one too.
     pedestrians: bool,
     collision_ends: bool,
+    /// Where they are sensed.
+    region: Region,
     /// What each slot's sensors remember.
     carriers: Vec<Carrier>,
     /// Row in the world, by slot, for the tick at work.
@@ -88,6 +91,7 @@ impl Sensing {
             agents: if config.drives() { Kind::Hero } else { Kind::Cav },
             pedestrians: config.gnss.pedestrians && !config.drives(),
             collision_ends: config.collision.ends_trajectory,
+            region: Region::new(&config.region),
             carriers: Vec::new(),
             row_of_slot: Vec::new(),
             draws: Draws::default(),
@@ -125,7 +129,7 @@ impl Sensing {
         self.observations
     }
 
-    /// Gives every connected road user in `states` its slot; returns the number of slots, which is the observation's n.
+    /// Gives every connected road user in `states` and in the region its slot; returns the number of slots, which is the observation's n.
     ///
     /// With `collision.ends_trajectory` a vehicle has no slot at the tick in which it collides, as if it had left: the slot it held
     /// says [`ipc_schema::observation::TERMINATED`], and from the next tick on it holds one anew, as a trajectory of its own.
@@ -137,7 +141,10 @@ impl Sensing {
         self.row_of_slot.fill(None);
         let now = self.now(header);
         for (row, state) in (0_u32..).zip(states) {
-            if self.is_sensed(state) {
+            if self.is_sensed(state) && !self.region.contains(state.x_m, state.y_m) {
+                // It drives on where nobody looks: its trajectory is cut here, and another begins if it comes back.
+                self.slots.cut_vehicle(state.vehicle);
+            } else if self.is_sensed(state) {
                 let slot = self.slots.occupy(state.vehicle);
                 if is_cut(state) {
                     self.slots.cut(slot);

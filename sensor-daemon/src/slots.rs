@@ -79,6 +79,15 @@ impl Slots {
         self.slots[number].cut = true;
     }
 
+    /// As [`Slots::cut`] for the slot that `vehicle` held until now, if it held one.
+    pub fn cut_vehicle(&mut self, vehicle: u32) {
+        if let Some(&number) = self.of_vehicle.get(vehicle as usize)
+            && number != EMPTY_SLOT
+        {
+            self.cut(number as usize);
+        }
+    }
+
     fn take_free(&mut self, vehicle: u32) -> u32 {
         let number = self.free.pop_first().unwrap_or_else(|| {
             self.slots.push(EMPTY);
@@ -178,6 +187,20 @@ mod tests {
         let row = slots.rows()[0];
         assert_eq!((row.vehicle, row.step, row.ended), (0, 0, 0));
         assert_eq!(slots.rows()[1].step, 3);
+    }
+
+    #[test]
+    fn a_vehicle_that_leaves_the_region_is_truncated_and_begins_anew() {
+        let mut slots = Slots::default();
+        tick(&mut slots, true, &[0, 1]);
+        slots.begin(false);
+        slots.occupy(0);
+        slots.cut_vehicle(1);
+        slots.cut_vehicle(7);
+        slots.end();
+        assert_eq!((slots.rows()[1].ended, slots.rows()[0].ended), (TRUNCATED, 0));
+        assert_eq!(tick(&mut slots, false, &[0, 1]), [0, 1]);
+        assert_eq!((slots.rows()[1].step, slots.rows()[1].ended), (0, 0));
     }
 
     #[test]

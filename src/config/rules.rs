@@ -71,6 +71,7 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
             "set both or neither".into(),
         ));
     }
+    region(settings, config)?;
     obstacles(settings, config)
 }
 
@@ -167,6 +168,29 @@ fn hero_field(config: &Config) -> Option<String> {
         name.as_str().map(str::to_owned)
     });
     names.into_iter().find(|name| heroes.contains(&name.as_str()))
+}
+
+/// A polygon has corners, and excludes a circle.
+fn region(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+    let refused = |message: String, help: &str| Err(conflict(settings, "region.polygon_m", message, help.into()));
+    match config.region.corners_m() {
+        Err(entry) => refused(
+            format!("`region.polygon_m`: \"{entry}\" is no corner"),
+            "give x and y in metres, such as \"120 45.5\"",
+        ),
+        Ok(corners) if (1..3).contains(&corners.len()) => refused(
+            format!("`region.polygon_m` has {} corners", corners.len()),
+            "give three corners or more, or [] for none",
+        ),
+        Ok(corners) if !corners.is_empty() && config.region.radius_m > 0.0 => refused(
+            format!(
+                "`region.polygon_m` and `region.radius_m` = {} are two regions",
+                config.region.radius_m
+            ),
+            "set region.polygon_m = [] or region.radius_m = 0",
+        ),
+        Ok(_) => Ok(()),
+    }
 }
 
 /// Every entry of `scene.obstacles` must be a known prop and a place.

@@ -190,11 +190,24 @@ impl Bridge {
             }
             self.publish(&frame, header)?;
             if ends {
+                self.check_that_somebody_came()?;
                 return Ok(Wait::Ready);
             }
             if let Some(population) = &mut population {
                 population.after_step(session, &frame)?;
             }
+        }
+    }
+
+    /// A scenario in which nobody ever drives is a mistake: an end before the first departure, or no routes.
+    fn check_that_somebody_came(&self) -> Result<(), Failure> {
+        match &self.membership.run.source {
+            Source::Scenario { sumocfg } if self.vehicle_steps == 0 => Err(Failure::new(
+                FailureKind::Config,
+                format!("{}: no road user came before its end", sumocfg.display()),
+            )
+            .with_help("name routes or flows in its route-files, and look at its begin, end and their depart times")),
+            _ => Ok(()),
         }
     }
 

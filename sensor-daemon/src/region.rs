@@ -1,0 +1,109 @@
+//! The part of the map in which vehicles are sensed.
+
+use ipc_schema::config;
+
+/// A place is inside it or not; metres, world frame.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Region {
+    /// Everywhere.
+    All,
+    /// Within a distance of a point.
+    Circle {
+        /// x and y of the centre.
+        centre_m: [f64; 2],
+        /// Its radius.
+        radius_m: f64,
+    },
+    /// Inside a polygon, which need not be convex; by the even-odd rule where it crosses itself.
+    Polygon(Vec<[f64; 2]>),
+}
+
+impl Region {
+    /// The region of a validated configuration.
+    #[must_use]
+    pub fn new(config: &config::Region) -> Self {
+        match config.corners_m() {
+            Ok(corners) if !corners.is_empty() => Self::Polygon(corners),
+            _ if config.radius_m > 0.0 => Self::Circle {
+                centre_m: config.centre_m,
+                radius_m: config.radius_m,
+            },
+            _ => Self::All,
+        }
+    }
+
+    /// True if (`x_m`, `y_m`) is inside.
+    #[must_use]
+    pub fn contains(&self, x_m: f64, y_m: f64) -> bool {
+        match self {
+            Self::All => true,
+            Self::Circle { centre_m, radius_m } => (x_m - centre_m[0]).hypot(y_m - centre_m[1]) <= *radius_m,
+            Self::Polygon(corners) => {
+                let ends = corners.iter().zip(corners.iter().cycle().skip(1));
+                // How often a ray to the east crosses an edge.
+                let crossed = ends.filter(|([ax, ay], [bx, by])| {
+                    (*ay > y_m) != (*by > y_m) && x_m < ax + (y_m - ay) / (by - ay) * (bx - ax)
+                });
+                crossed.count() % 2 == 1
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn polygon(corners: &[&str]) -> Region {
+        Region::new(&config::Region {
+            polygon_m: corners.iter().map(|corner| (*corner).to_owned()).collect(),
+            ..config::Region::default()
+        })
+    }
+
+    #[test]
+    fn without_a_region_everything_is_inside() {
+        assert_eq!(Region::new(&config::Region::default()), Region::All);
+        assert!(Region::All.contains(1e9, -1e9));
+    }
+
+    #[test]
+    fn a_bay_of_a_polygon_is_outside() {
+        // An L: the upper right quarter is missing.
+        let region = polygon(&["0 0", "10 0", "10 5", "5 5", "5 10", "0 10"]);
+        for (x, y, inside) in [
+            (2.0, 2.0, true),
+            (8.0, 2.0, true),
+            (2.0, 8.0, true),
+            (8.0, 8.0, false),
+            (-1.0, 5.0, false),
+            (11.0, 2.0, false),
+        ] {
+            assert_eq!(region.contains(x, y), inside, "{x} {y}");
+        }
+    }
+
+    proptest! {
+        /// A rectangle contains what lies between its sides, whichever way round and wherever its corners begin.
+        #[test]
+        fn a_rectangle_is_its_sides(
+            x in -50.0..50.0_f64, y in -50.0..50.0_f64, turn in 0..4_usize, reverse: bool,
+        ) {
+            let mut corners = vec!["-20 -10", "30 -10", "30 25", "-20 25"];
+            corners.rotate_left(turn);
+            if reverse {
+                corners.reverse();
+            }
+            let inside = (-20.0..30.0).contains(&x) && (-10.0..25.0).contains(&y);
+            prop_assert_eq!(polygon(&corners).contains(x, y), inside);
+        }
+
+        /// A circle contains what is nearer to its centre than its radius.
+        #[test]
+        fn a_circle_is_its_radius(x in -50.0..50.0_f64, y in -50.0..50.0_f64) {
+            let region = Region::new(&config::Region { centre_m: [3.0, -4.0], radius_m: 20.0, ..config::Region::default() });
+            prop_assert_eq!(region.contains(x, y), (x - 3.0).powi(2) + (y + 4.0).powi(2) <= 400.0);
+        }
+    }
+}
