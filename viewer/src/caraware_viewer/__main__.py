@@ -11,16 +11,25 @@ from collections.abc import Sequence
 # rerun reads this when it is loaded and started: a viewer of one's own simulation does not report on its user.
 os.environ.setdefault("CI", "1")
 
-import rerun as rr
-
-from caraware_viewer.layout import blueprint
-from caraware_viewer.link import Link, LinkError, choose, connect
-from caraware_viewer.scene import Scene
-from caraware_viewer.wire import FrameError
+from caraware_viewer.display import DisplayError
+from caraware_viewer.link import LinkError
+from caraware_viewer.watch import watch
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
-_LOOK_S = 0.5
+_EXAMPLES = """Examples:
+  caraware-viewer                                  the run on this machine, in a window
+  caraware-viewer --web                            in a browser: prints the address to open
+  caraware-viewer --save run.rrd                   record; look later with `rerun run.rrd`
+  caraware-viewer --web --save run.rrd             both
+  caraware-viewer --vehicle cav.3 --lidar all      the 3-D view and the figures follow cav.3, with its whole point cloud
+  caraware-viewer tcp/127.0.0.1:7448 --run town-2  another endpoint, one of several runs there
+
+A run on another machine listens on its own loopback. From your laptop:
+  ssh -N -L 7447:127.0.0.1:7447 HOST &
+  caraware-viewer
+
+Exit codes: 0 the run ended or the window was closed, 1 nothing to watch, 2 usage, 130 interrupted."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,63 +37,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         return watch(options)
-    except LinkError as error:
+    except (LinkError, DisplayError) as error:
         print(f"caraware-viewer: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130
 
 
-def watch(options: argparse.Namespace) -> int:
-    """Connects, opens the recording, and draws what comes."""
-    session = connect(options.endpoint, options.timeout)
-    try:
-        run = choose(session, options.endpoint, options.run, options.timeout)
-    except BaseException:
-        session.close()
-        raise
-    with Link(session, run) as link:
-        run_map = link.map(options.timeout)
-        recording = rr.RecordingStream("caraware", recording_id=f"{run.run}/{run.env}")
-        _open_sink(recording, options, blueprint(run_map["map"]["bounds_m"]))
-        print(f"watching run {run.run} at {options.endpoint}", file=sys.stderr)
-        try:
-            _draw(link, Scene(recording, run_map))
-        finally:
-            recording.flush()
-            recording.disconnect()
-    print(f"run {run.run} has ended", file=sys.stderr)
-    return 0
-
-
-def _draw(link: Link, scene: Scene) -> None:
-    refused = 0
-    while True:
-        # Looked at before taking: what was stored before the end is drawn.
-        ended = link.frames.closed
-        for topic, frame in link.frames.take(_LOOK_S).items():
-            try:
-                scene.draw(topic, frame)
-            except FrameError as error:
-                refused += 1
-                if refused == 1:
-                    print(f"caraware-viewer: {topic}: {error} (later ones are left out in silence)", file=sys.stderr)
-        if ended:
-            return
-
-
-def _open_sink(recording: rr.RecordingStream, options: argparse.Namespace, views: rr.blueprint.Blueprint) -> None:
-    if options.save:
-        recording.save(options.save, default_blueprint=views)
-    elif options.connect:
-        recording.connect_grpc(options.connect, default_blueprint=views)
-    else:
-        recording.spawn(default_blueprint=views)
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="caraware-viewer", description="Watch a run of the CarAware co-simulation bridge: zenoh to rerun."
+        prog="caraware-viewer",
+        description="Watch a run of the CarAware co-simulation bridge: zenoh to rerun.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "endpoint",
@@ -94,20 +59,51 @@ def _parser() -> argparse.ArgumentParser:
         help="the run's `fanout.listen` (default %(default)s)",
     )
     parser.add_argument("--run", metavar="NAME", help="name of the run, if several are fanned out there")
+    parser.add_argument("--env", metavar="N", type=int, help="environment of the run (default: its first)")
     parser.add_argument(
         "--timeout", type=_seconds, default=5.0, metavar="S", help="longest wait for an answer (default %(default)s s)"
     )
-    sink = parser.add_mutually_exclusive_group()
-    sink.add_argument("--save", metavar="F.rrd", help="record to a file instead of showing")
-    sink.add_argument("--connect", metavar="URL", help="show in a rerun viewer that is already open (rerun+http://…)")
-    sink.add_argument("--spawn", action="store_true", help="open a rerun viewer (the default)")
+    _add_sinks(parser.add_argument_group("where it is shown (a window, if nothing is said and there is a screen)"))
+    _add_scene(parser.add_argument_group("what is shown"))
     return parser
+
+
+def _add_sinks(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--web", action="store_true", help="serve browsers on this machine and print the address")
+    group.add_argument(
+        "--web-port", type=_port, metavar="PORT", help="port of that address (default 9090 if it is free)"
+    )
+    group.add_argument("--save", metavar="F.rrd", help="record to a file")
+    group.add_argument("--connect", metavar="URL", help="a rerun viewer that is already open (rerun+http://…/proxy)")
+
+
+def _add_scene(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--vehicle",
+        metavar="ID",
+        action="append",
+        help="a vehicle to look at (repeatable): figures and point cloud; the first is in the 3-D view (default: a hero, "
+        "else one with a LIDAR, else the first that senses)",
+    )
+    group.add_argument(
+        "--lidar",
+        choices=("interest", "all", "off"),
+        default="interest",
+        help="points on road users only, with the range ring; all points; none (default %(default)s)",
+    )
 
 
 def _endpoint(text: str) -> str:
     if not re.fullmatch(r"[a-z][a-z-]*/\S+:\d{1,5}", text):
         raise argparse.ArgumentTypeError(f"{text!r} is no endpoint: write tcp/HOST:PORT, as in {DEFAULT_ENDPOINT}")
     return text
+
+
+def _port(text: str) -> int:
+    value = int(text)
+    if not 0 < value < 65536:
+        raise argparse.ArgumentTypeError(f"{text} is no port")
+    return value
 
 
 def _seconds(text: str) -> float:

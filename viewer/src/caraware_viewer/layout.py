@@ -6,16 +6,26 @@ from collections.abc import Sequence
 
 import rerun.blueprint as rrb
 
-from caraware_viewer.scene import TIMELINE
+from caraware_viewer import plots
+from caraware_viewer.canvas import TIMELINE
 
-_MARGIN = 0.05
+_MARGIN = 0.02
 _WINDOW_S = 60.0
+_BACKGROUND = [20, 23, 29]
 
 
-def blueprint(bounds_m: Sequence[float]) -> rrb.Blueprint:
-    """Top view of the map (`bounds_m`: x_min, y_min, x_max, y_max) beside the plots of the last minute."""
+def blueprint(bounds_m: Sequence[float], real_time_factor: float = 0.0) -> rrb.Blueprint:
+    """Top view of the map (`bounds_m`: x_min, y_min, x_max, y_max), HUD, 3-D view, and plots.
+
+    The plots show the last minute, or the last so many seconds as pass in a minute of a run that is not paced.
+    """
     return rrb.Blueprint(
-        rrb.Horizontal(_top_view(bounds_m), rrb.Vertical(*_plots()), column_shares=[2, 1]),
+        rrb.Horizontal(
+            _top_view(bounds_m),
+            rrb.Vertical(_hud(), _space(), row_shares=[3, 2]),
+            rrb.Vertical(*_plots(real_time_factor)),
+            column_shares=[5, 3, 3],
+        ),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
@@ -31,16 +41,35 @@ def _top_view(bounds_m: Sequence[float]) -> rrb.Spatial2DView:
         x_range=[x_min - x_margin, x_max + x_margin],
         y_range=[-y_max - y_margin, -y_min + y_margin],
     )
-    return rrb.Spatial2DView(name="Top view", origin="/top", background=[16, 18, 24], visual_bounds=visible)
+    return rrb.Spatial2DView(name="Top view", origin="/top", background=_BACKGROUND, visual_bounds=visible)
 
 
-def _plots() -> list[rrb.TimeSeriesView]:
-    window = rrb.VisibleTimeRanges(
-        timeline=TIMELINE,
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_WINDOW_S),
-        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0),
+def _hud() -> rrb.TextDocumentView:
+    return rrb.TextDocumentView(name="Run and vehicle", origin="/hud")
+
+
+def _space() -> rrb.Spatial3DView:
+    eye = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital, position=(-18.0, -9.0, 12.0), look_target=(6.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
     )
-    return [
-        rrb.TimeSeriesView(name="Mean error (m): policy and raw GNSS", origin="/plots/error_m", time_ranges=window),
-        rrb.TimeSeriesView(name="Policy: standard deviation, reward", origin="/plots/policy"),
-    ]
+    return rrb.Spatial3DView(
+        name="Vehicle and its LIDAR", origin="/space", background=_BACKGROUND, line_grid=False, eye_controls=eye
+    )
+
+
+def _plots(real_time_factor: float) -> list[rrb.TimeSeriesView]:
+    ranges = None
+    if real_time_factor > 0:
+        ranges = rrb.VisibleTimeRanges(
+            timeline=TIMELINE,
+            start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_WINDOW_S * real_time_factor),
+            end=rrb.TimeRangeBoundary.cursor_relative(seconds=0),
+        )
+    views = {
+        "Mean error (m)": plots.ERRORS,
+        "Policy: σ": plots.STD,
+        "Reward": plots.REWARD,
+        "Vehicle-steps per second": plots.STEPS,
+        "Real-time factor": plots.REAL_TIME,
+    }
+    return [rrb.TimeSeriesView(name=name, origin=f"/{path}", time_ranges=ranges) for name, path in views.items()]

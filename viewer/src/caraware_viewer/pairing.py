@@ -48,32 +48,34 @@ def _keep(frames: dict[tuple[int, int], Observation] | dict[tuple[int, int], Pre
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Euclidean distances from the truth at one tick, for the slots that predict and are valid."""
+class Distances:
+    """Euclidean distances from the truth at one tick, one for each slot, metres; NaN where nothing can be compared."""
 
-    truth_m: NDArray[np.float32]
-    """`[k, 2]`."""
-    predicted_m: NDArray[np.float32]
-    """`[k, 2]`."""
-    policy_m: float
-    """Mean over the slots, metres; NaN if there are none."""
+    raw_gnss: NDArray[np.float32]
+    policy: NDArray[np.float32] | None = None
+    ekf: NDArray[np.float32] | None = None
 
 
-def policy_errors(observation: Observation, prediction: Prediction) -> Errors:
-    """Predictions beside their truths, without the slots that are not valid or hold no finite prediction."""
-    n = min(observation.header.count, prediction.header.count)
-    predicted = prediction.position_m[:n]
-    chosen = observation.valid[:n] & np.isfinite(predicted).all(axis=1)
-    truth, predicted = observation.truth[:n, :2][chosen], predicted[chosen]
-    return Errors(truth, predicted, mean_distance_m(truth, predicted))
+def distances(observation: Observation, prediction: Prediction | None, *, driving: bool = False) -> Distances:
+    """Of an observation and what was made of it; a driving policy's actions are no positions."""
+    raw_gnss = distance_m(observation, observation.gnss_m[:, :2])
+    policy = None if prediction is None or driving else distance_m(observation, prediction.position_m)
+    estimate_m = None if prediction is None else prediction.estimate_m
+    return Distances(raw_gnss, policy, None if estimate_m is None else distance_m(observation, estimate_m))
 
 
-def gnss_error_m(observation: Observation) -> float:
-    """Mean distance of the raw GNSS fixes from the truth over the valid slots, metres; NaN if there are none."""
-    valid = observation.valid
-    return mean_distance_m(observation.truth[valid, :2], observation.gnss_m[valid, :2])
+def distance_m(observation: Observation, points_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Distance `[n]` of `points_m` `[≤ n, 2]` from the truth; NaN where a slot is not valid or holds no finite point."""
+    result = np.full(observation.header.count, np.nan, np.float32)
+    n = min(observation.header.count, len(points_m))
+    result[:n] = np.linalg.norm(points_m[:n] - observation.truth[:n, :2], axis=1)
+    result[~observation.valid] = np.nan
+    result[~np.isfinite(result)] = np.nan
+    return result
 
 
-def mean_distance_m(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """Mean Euclidean distance between the rows of `a` and `b`; NaN without rows."""
-    return float(np.linalg.norm(a - b, axis=1).mean()) if len(a) else float("nan")
+def mean_m(distance: NDArray[np.float32] | None) -> float:
+    """Mean of what is there; NaN if nothing is."""
+    if distance is None or np.isnan(distance).all():
+        return float("nan")
+    return float(np.nanmean(distance))

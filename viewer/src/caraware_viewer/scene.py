@@ -1,135 +1,235 @@
-"""What is drawn: a few batched entities, whatever the number of vehicles. World metres, x east, y up on the screen.
-
-rerun's 2-D views count y downwards and its 2-D boxes cannot turn: outlines are line strips with y negated.
-"""
+"""Draws the frames of one run: a few batched entities, whatever the number of vehicles."""
 
 from __future__ import annotations
 
 import json
+import time
+from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
-from caraware_viewer import wire
-from caraware_viewer.pairing import Pairing, gnss_error_m, policy_errors
+from caraware_viewer import cloud, geometry, plots, space, top, wire
+from caraware_viewer.canvas import Canvas
+from caraware_viewer.hud import Shown, hud
+from caraware_viewer.link import CLOUDS, Sample
+from caraware_viewer.pairing import Pairing, distances
+from caraware_viewer.picture import Picture
+from caraware_viewer.static_map import draw_map
+from caraware_viewer.wire import FrameError
 
-VEHICLES = "top/vehicles"
-GNSS = "top/gnss"
-PREDICTIONS = "top/predictions"
-LINKS = "top/prediction_errors"
-BOUNDS = "top/map/bounds"
-POLICY_ERROR = "plots/error_m/policy"
-GNSS_ERROR = "plots/error_m/raw_gnss"
-POLICY_STD = "plots/policy/std"
-REWARD = "plots/policy/reward"
+HUD = "hud"
 
-TIMELINE = "sim_time"
-"""Simulated time since the start of the run; episodes follow one another."""
-
-KIND_COLORS = np.array([0x3FA7FFFF, 0xB8BDC7FF, 0xF2C14EFF], dtype=np.uint32)
-"""RGBA by `VehicleState.kind`: connected vehicle, other vehicle, pedestrian."""
-GNSS_COLOR = [235, 94, 85]
-PREDICTION_COLOR = [94, 214, 125]
-LINK_COLOR = [94, 214, 125, 110]
-BOUNDS_COLOR = [70, 74, 84]
-
-_CORNERS = np.array([[0, 1], [1, 1], [1, -1], [0, -1], [0, 1]], dtype=np.float64)
-"""Closed outline of a box: 0 … 1 from rear to front, ±1 from right to left."""
+_CONTACT_S = 5.0
+"""Simulated time for which a contact stays on the map."""
+_RATE_OVER = 20
+"""Frames over which the rate of drawing is measured."""
 
 
-def outlines_m(states: NDArray[np.void]) -> NDArray[np.float32]:
-    """Closed outlines `[n, 5, 2]` of road users seen from above, world metres."""
-    rear_m = np.where(states["kind"] == wire.PERSON, states["length_m"] / 2, states["rear_overhang_m"])
-    along_m = _CORNERS[:, 0] * states["length_m"][:, None] - rear_m[:, None]
-    across_m = _CORNERS[:, 1] * states["width_m"][:, None] / 2
-    cos, sin = np.cos(states["yaw_rad"])[:, None], np.sin(states["yaw_rad"])[:, None]
-    x_m = states["x_m"][:, None] + cos * along_m - sin * across_m
-    y_m = states["y_m"][:, None] + sin * along_m + cos * across_m
-    return np.stack([x_m, y_m], axis=-1).astype(np.float32)
-
-
-def on_screen(points_m: NDArray[np.floating]) -> NDArray[np.float32]:
-    """World x, y `[…, 2]` in rerun's 2-D view, where y counts downwards."""
-    return (np.asarray(points_m) * np.array([1.0, -1.0])).astype(np.float32)
+class AnotherRun(FrameError):
+    """A frame of a new run of the same name: its map has to be asked for."""
 
 
 class Scene:
     """Draws the frames of one run into a rerun recording."""
 
-    def __init__(self, recording: rr.RecordingStream, run_map: dict[str, Any]) -> None:
-        self._recording = recording
-        self._tick_s = float(run_map["tick_s"])
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        run_map: dict[str, Any],
+        wanted: list[str] | None = None,
+        lidar: str = "interest",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        try:
+            self._canvas = Canvas(recording, float(run_map["tick_s"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise FrameError(f"the map is not what this viewer knows: {error!r}") from error
+        self._map = run_map
+        self._lidar = lidar
+        self._clock = clock
+        self._picture = Picture(wanted or [])
         self._pairing = Pairing()
-        self._draw_static(run_map["map"]["bounds_m"])
+        self._clouds: dict[int, wire.Cloud] = {}
+        self._contacts: list[tuple[int, np.ndarray]] = []
+        self._drawn_at: deque[float] = deque(maxlen=_RATE_OVER)
+        self._age_ms = float("nan")
+        self.lost = 0
+        """Samples that did not arrive, as the link counts them."""
+        self.refused = 0
+        """Samples refused."""
+        self._stop_lines = _stop_lines(run_map)
+        draw_map(self._canvas, run_map)
+        plots.name_series(self._canvas)
 
-    def draw(self, topic: str, frame: bytes) -> None:
-        """Draws a frame; raises `wire.FrameError` if it is not what it says it is."""
+    def clouds_wanted(self) -> list[str]:
+        """Names of the vehicles whose point clouds are shown."""
+        if self._lidar == "off":
+            return []
+        return [self._picture.names[h] for h in self._picture.looked_at() if h in self._picture.names]
+
+    def draw(self, topic: str, sample: Sample) -> None:
+        """Draws a sample; raises `wire.FrameError` if it is not what it says it is."""
+        if topic == "status":
+            self._draw_status(sample.payload)
+            return
+        self._check_run(wire.decode_header(sample.payload))
         match topic:
             case "world":
-                self._draw_world(wire.decode_world(frame))
+                self._draw_world(wire.decode_world(sample.payload), sample)
             case "observation":
-                self._draw_observation(wire.decode_observation(frame))
+                self._draw_observation(wire.decode_observation(sample.payload))
             case "prediction":
-                self._draw_pair(self._pairing.prediction(wire.decode_prediction(frame)))
-            case "status":
-                self._draw_status(frame)
+                self._draw_pair(self._pairing.prediction(wire.decode_prediction(sample.payload)))
+            case "vehicles":
+                self._picture.enter_names(wire.decode_rows(sample.payload, wire.VEHICLE_META))
+            case "signals":
+                self._draw_signals(wire.decode_rows(sample.payload, wire.SIGNAL_META))
+            case "event":
+                self._draw_event(wire.decode_rows(sample.payload, wire.COLLISION))
+            case _ if topic.startswith(CLOUDS):
+                self._draw_cloud(wire.decode_cloud(sample.payload))
 
-    def _draw_static(self, bounds_m: list[float]) -> None:
-        x_min, y_min, x_max, y_max = bounds_m
-        corners = np.array([[x_min, y_min], [x_max, y_min], [x_max, y_max], [x_min, y_max], [x_min, y_min]])
-        self._log(BOUNDS, rr.LineStrips2D([on_screen(corners)], colors=BOUNDS_COLOR), static=True)
-        series = {POLICY_ERROR: ("policy", PREDICTION_COLOR), GNSS_ERROR: ("raw GNSS", GNSS_COLOR)}
-        for path, (name, color) in series.items():
-            self._log(path, rr.SeriesLines(names=name, colors=color), static=True)
+    def _check_run(self, header: wire.Header) -> None:
+        told = self._map.get("run_id")
+        if told is not None and header.run_id != int(told, 16):
+            raise AnotherRun(f"a frame of run {header.run_id:#018x}, the map is of {told}")
 
-    def _draw_world(self, world: wire.World) -> None:
+    def _draw_world(self, world: wire.World, sample: Sample) -> None:
+        before, self._picture.world = self._picture.world, world
+        if before is not None and before.header.episode != world.header.episode:
+            self._contacts.clear()
+            self._clouds.clear()
         self._at(world.header)
-        kinds = np.minimum(world.states["kind"], wire.PERSON)
-        strips = on_screen(outlines_m(world.states))
-        self._log(VEHICLES, rr.LineStrips2D(strips, colors=KIND_COLORS[kinds], radii=rr.Radius.ui_points(1.0)))
+        self._drawn_at.append(self._clock())
+        self._age_ms = sample.age_ms()
+        looked_at = self._picture.looked_at()
+        rows = [row for row in map(self._picture.row, looked_at) if row is not None]
+        top.draw_road_users(self._canvas, world.states, self._picture.names)
+        top.draw_looked_at(self._canvas, rows)
+        space.draw_space(self._canvas, world.states, rows[0] if rows else None)
+        self._draw_contacts(world.header)
+        text = hud(self._picture, self._map, looked_at, self._shown())
+        self._canvas.log(HUD, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+    def _shown(self) -> Shown:
+        times = self._drawn_at
+        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else float("nan")
+        return Shown(rate, self._age_ms, self.lost, self.refused)
 
     def _draw_observation(self, observation: wire.Observation) -> None:
+        self._picture.observation = observation
         self._at(observation.header)
-        fixes_m = on_screen(observation.gnss_m[observation.valid, :2])
-        self._log(GNSS, rr.Points2D(fixes_m, colors=GNSS_COLOR, radii=rr.Radius.ui_points(2.0)))
-        self._log_scalar(GNSS_ERROR, gnss_error_m(observation))
-        self._draw_pair(self._pairing.observation(observation))
+        top.draw_observation(self._canvas, observation)
+        pair = self._pairing.observation(observation)
+        if pair is None:
+            # Alone until its prediction comes, if there is a policy at all.
+            alone = distances(observation, None)
+            if self._picture.distances is None or self._picture.distances.policy is None:
+                self._picture.distances = alone
+            self._canvas.scalar(plots.GNSS_ERROR, plots.mean_m(alone.raw_gnss))
+        else:
+            self._draw_pair(pair)
 
     def _draw_pair(self, pair: tuple[wire.Observation, wire.Prediction] | None) -> None:
         if pair is None:
             return
-        errors = policy_errors(*pair)
-        self._at(pair[0].header)
-        predicted, truth = on_screen(errors.predicted_m), on_screen(errors.truth_m)
-        self._log(PREDICTIONS, rr.Points2D(predicted, colors=PREDICTION_COLOR, radii=rr.Radius.ui_points(2.5)))
-        self._log(LINKS, rr.LineStrips2D(np.stack([predicted, truth], axis=1), colors=LINK_COLOR))
-        self._log_scalar(POLICY_ERROR, errors.policy_m)
+        observation, prediction = pair
+        self._at(observation.header)
+        driving = self._picture.driving
+        if not driving:
+            top.draw_estimates(self._canvas, top.PREDICTIONS, observation, prediction.position_m)
+        if prediction.estimate_m is not None:
+            top.draw_estimates(self._canvas, top.ESTIMATES, observation, prediction.estimate_m)
+        self._picture.distances = distances(observation, prediction, driving=driving)
+        plots.plot_errors(self._canvas, self._picture.distances)
 
-    def _draw_status(self, frame: bytes) -> None:
+    def _draw_signals(self, frame: wire.Rows) -> None:
+        for row in frame.rows:
+            self._picture.signals[int(row["id_hash"])] = wire.text(row["state"], min(int(row["links"]), 128))
+        self._at(frame.header)
+        lights = [
+            (position_m, letters[link])
+            for id_hash, letters in self._picture.signals.items()
+            for link, position_m in self._stop_lines.get(id_hash, [])
+            if link < len(letters)
+        ]
+        top.draw_signals(self._canvas, lights)
+
+    def _draw_event(self, frame: wire.Rows) -> None:
+        self._picture.collisions += len(frame.rows)
+        self._contacts += [(frame.header.tick, position_m) for position_m in frame.rows["position_m"]]
+
+    def _draw_contacts(self, header: wire.Header) -> None:
+        oldest = header.tick - _CONTACT_S / float(self._map["tick_s"])
+        if self._contacts:
+            self._contacts = [(tick, at) for tick, at in self._contacts if tick >= oldest]
+            top.draw_contacts(self._canvas, np.array([at[:2] for _, at in self._contacts]).reshape(-1, 2))
+
+    def _draw_cloud(self, seen: wire.Cloud) -> None:
+        id_hash = int(seen.scan["id_hash"])
+        looked_at = self._picture.looked_at()
+        if id_hash not in looked_at:
+            return
+        self._clouds = {h: c for h, c in self._clouds.items() if h in looked_at} | {id_hash: seen}
+        self._at(seen.header)
+        placed = {h: self._placed(c) for h, c in self._clouds.items()}
+        rings = [
+            geometry.ring_m(c.scan["position_m"], float(c.scan["range_m"]))
+            for h, c in self._clouds.items()
+            if self._lidar == "all" or len(placed[h][0])
+        ]
+        points_m = np.concatenate([points for points, _ in placed.values()])
+        top.draw_clouds(self._canvas, points_m, np.concatenate([colors for _, colors in placed.values()]), rings)
+        if looked_at[0] in placed:
+            space.draw_cloud(self._canvas, *placed[looked_at[0]])
+
+    def _placed(self, seen: wire.Cloud) -> tuple[np.ndarray, np.ndarray]:
+        """World positions and colours of the points to show."""
+        points = seen.points if self._lidar == "all" else cloud.of_interest(seen.points)
+        row = self._picture.row(int(seen.scan["id_hash"]))
+        velocity_mps, yaw_rate_radps = (np.zeros(3), 0.0) if row is None else _motion(row)
+        return cloud.in_world_m(seen.scan, points, velocity_mps, yaw_rate_radps), cloud.colors(points)
+
+    def _draw_status(self, payload: bytes) -> None:
         try:
-            status = json.loads(frame)
-            training = status["training"]
+            status = json.loads(payload)
             tick = int(status["tick"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise wire.FrameError(f"a status of {len(frame)} bytes is not what this viewer knows: {error!r}") from error
-        if training and training["updates"]:
-            self._at_tick(tick)
-            self._log_scalar(POLICY_STD, training["policy_std"])
-            self._log_scalar(REWARD, training["reward"])
+            self._picture.status = status
+            self._canvas.at(tick)
+            plots.plot_status(self._canvas, status, _steps_per_s(status))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise FrameError(f"a status of {len(payload)} bytes is not what this viewer knows: {error!r}") from error
 
     def _at(self, header: wire.Header) -> None:
-        self._at_tick(header.tick)
-        self._recording.set_time("episode", sequence=header.episode)
+        self._canvas.at(header.tick, header.episode)
 
-    def _at_tick(self, tick: int) -> None:
-        self._recording.set_time("tick", sequence=tick)
-        self._recording.set_time(TIMELINE, duration=(tick + 1) * self._tick_s)
 
-    def _log_scalar(self, path: str, value: float | None) -> None:
-        if value is not None and np.isfinite(value):
-            self._log(path, rr.Scalars(value))
+def _steps_per_s(status: dict[str, Any]) -> float | None:
+    """Vehicle-steps per second: sensing vehicles times ticks."""
+    if status.get("ticks_per_s") is None:
+        return None
+    users = status.get("road_users") or {}
+    return float(status["ticks_per_s"]) * (users.get("cav", 0) + users.get("hero", 0))
 
-    def _log(self, path: str, archetype: rr.AsComponents, *, static: bool = False) -> None:
-        rr.log(path, archetype, static=static, recording=self._recording)
+
+def _stop_lines(run_map: dict[str, Any]) -> dict[int, list[tuple[int, list[float]]]]:
+    """Links of each traffic light and where they stop, by the hash of its id."""
+    try:
+        lights = (run_map.get("scene") or {}).get("signals", [])
+        return {
+            int(light["id_hash"], 16): [(int(link["link"]), link["position_m"]) for link in light["links"]]
+            for light in lights
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise FrameError(f"the map's traffic lights are not what this viewer knows: {error!r}") from error
+
+
+def _motion(row: np.void) -> tuple[np.ndarray, float]:
+    """Velocity in the world, m/s, and yaw rate, rad/s."""
+    forward, left, up = (float(value) for value in row["velocity_body_mps"])
+    cos, sin = np.cos(row["yaw_rad"]), np.sin(row["yaw_rad"])
+    velocity_mps = np.array([cos * forward - sin * left, sin * forward + cos * left, up])
+    return velocity_mps, float(row["angular_rate_body_radps"][2])

@@ -1,4 +1,4 @@
-"""The wire layout: what a frame's bytes mean.
+"""The wire layout: what a frame's bytes mean (`docs/fanout.md`).
 
 A frame is a message as it stands in the simulator's shared memory: 72 bytes of header, then the payload, little endian.
 `ipc-schema/layout.json` is the committed table that the types below repeat; a test compares the two.
@@ -6,6 +6,7 @@ A frame is a message as it stands in the simulator's shared memory: 72 bytes of 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +20,14 @@ FIRST_OF_EPISODE = 1 << 1
 LAST_OF_EPISODE = 1 << 2
 LAST_OF_RUN = 1 << 3
 
-CAV, OTHER, PERSON = 0, 1, 2
+ESTIMATES = 1 << 8
+"""Of a prediction: a section with the filter's estimates follows."""
+
+CAV, OTHER, PERSON, HERO = 0, 1, 2, 3
 """Values of `VehicleState.kind`."""
+
+GNSS, IMU, SPEED_STEERING, LIDAR = 1, 2, 4, 8
+"""Bits of an observation's `sensors`: which deliver."""
 
 EMPTY_SLOT = 0xFFFF_FFFF
 """`vehicle` of a slot that nobody holds."""
@@ -76,6 +83,76 @@ VEHICLE_STATE = np.dtype(
     ]
 )
 """`VehicleState`: a road user at the end of a tick; origin at the centre of the rear axle (persons: their centre)."""
+
+VEHICLE_META = np.dtype(
+    [
+        ("id_hash", "<u8"),
+        ("vehicle", "<u4"),
+        ("event", "<u4"),
+        ("kind", "<u4"),
+        ("type_index", "<u4"),
+        ("length_m", "<f4"),
+        ("width_m", "<f4"),
+        ("height_m", "<f4"),
+        ("id_len", "<u4"),
+        ("id", "V64"),
+        ("vehicle_class", "V16"),
+    ]
+)
+"""`VehicleMeta`: who a road user is."""
+
+SIGNAL_META = np.dtype(
+    [
+        ("id_hash", "<u8"),
+        ("signal", "<u4"),
+        ("id_len", "<u4"),
+        ("id", "V64"),
+        ("links", "<u4"),
+        ("reserved", "<u4"),
+        ("state", "V128"),
+    ]
+)
+"""`SignalMeta`: the letters of a traffic light's links."""
+
+COLLISION = np.dtype(
+    [
+        ("position_m", "<f8", 3),
+        ("id_hash", "<u8"),
+        ("other_id_hash", "<u8"),
+        ("vehicle", "<u4"),
+        ("other", "<u4"),
+        ("other_class", "<u4"),
+        ("relative_speed_mps", "<f4"),
+    ]
+)
+"""`Collision`: a contact that begins."""
+
+SCAN = np.dtype(
+    [
+        ("position_m", "<f8", 3),
+        ("attitude_rad", "<f8", 3),
+        ("id_hash", "<u8"),
+        ("azimuth_rad", "<f4"),
+        ("range_m", "<f4"),
+        ("rays", "<u4"),
+        ("axes", "<u4"),
+        ("reserved", "<u4", 4),
+    ]
+)
+"""`Scan`: where a LIDAR was at the end of the tick; `axes` 0: x forward, y left, z up; 1: y back, x left, z down."""
+
+LIDAR_POINT = np.dtype(
+    [
+        ("position_m", "<f4", 3),
+        ("intensity", "<f4"),
+        ("object", "<u4"),
+        ("incidence_cos", "<f4"),
+        ("tag", "<u2"),
+        ("channel", "<u2"),
+        ("age_us", "<u4"),
+    ]
+)
+"""`LidarPoint`: one return, in the axes that the sensor had when it fired."""
 
 
 class FrameError(ValueError):
@@ -146,6 +223,27 @@ class Prediction:
     header: Header
     position_m: NDArray[np.float32]
     """`[n, 2]`: predicted x, y, metres, world frame, one row for each slot of the observation."""
+    estimate_m: NDArray[np.float32] | None
+    """`[n, 2]`: where the Kalman filter thinks the vehicle is, metres; NaN where it does not say. `None`: it is not run."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A frame of equal rows: `VEHICLE_META`, `SIGNAL_META`, or `COLLISION`."""
+
+    header: Header
+    rows: NDArray[np.void]
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """What one LIDAR has seen during a tick."""
+
+    header: Header
+    scan: np.void
+    """`SCAN`."""
+    points: NDArray[np.void]
+    """`LIDAR_POINT [count]`."""
 
 
 def observation_sections(n: int, d: int, k: int) -> list[tuple[str, str, tuple[int, ...]]]:
@@ -183,7 +281,13 @@ def decode_header(frame: bytes) -> Header:
 def decode_world(frame: bytes) -> World:
     """A `world` frame."""
     header = decode_header(frame)
-    return World(header, _array(frame, HEADER.itemsize, VEHICLE_STATE, (header.count,)))
+    return World(header, _array(frame, 0, VEHICLE_STATE, (header.count,)))
+
+
+def decode_rows(frame: bytes, row: np.dtype) -> Rows:
+    """A frame of `vehicles`, `signals` or `event`."""
+    header = decode_header(frame)
+    return Rows(header, _array(frame, 0, row, (header.count,)))
 
 
 def decode_observation(frame: bytes) -> Observation:
@@ -192,9 +296,9 @@ def decode_observation(frame: bytes) -> Observation:
     arrays = {}
     offset = 0
     for name, element, shape in observation_sections(header.count, header.columns, header.sequence):
-        array = _array(frame, HEADER.itemsize + offset, np.dtype(element), shape)
+        array = _array(frame, offset, np.dtype(element), shape)
         arrays[name] = array
-        offset = -(-(offset + array.nbytes) // ALIGNMENT) * ALIGNMENT
+        offset = _aligned(offset + array.nbytes)
     return Observation(header, **arrays)
 
 
@@ -203,13 +307,34 @@ def decode_prediction(frame: bytes) -> Prediction:
     header = decode_header(frame)
     if header.columns != 2:
         raise FrameError(f"a prediction has x and y, this one {header.columns} columns")
-    return Prediction(header, _array(frame, HEADER.itemsize, np.dtype("<f4"), (header.count, 2)))
+    shape = (header.count, 2)
+    position_m = _array(frame, 0, np.dtype("<f4"), shape)
+    if not header.flags & ESTIMATES:
+        return Prediction(header, position_m, None)
+    return Prediction(header, position_m, _array(frame, _aligned(position_m.nbytes), np.dtype("<f4"), shape))
+
+
+def decode_cloud(frame: bytes) -> Cloud:
+    """A `pointcloud/<id>` frame."""
+    header = decode_header(frame)
+    scan = _array(frame, 0, SCAN, (1,))[0]
+    return Cloud(header, scan, _array(frame, _aligned(SCAN.itemsize), LIDAR_POINT, (header.count,)))
+
+
+def text(field: np.void, length: int) -> str:
+    """UTF-8 in a field of fixed size."""
+    return bytes(field)[:length].decode(errors="replace")
+
+
+def _aligned(offset: int) -> int:
+    return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
 def _array(frame: bytes, offset: int, element: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    count = 1
-    for length in shape:
-        count *= length
-    if offset + count * element.itemsize > len(frame):
-        raise FrameError(f"a frame of {len(frame)} bytes does not hold {shape} elements at byte {offset}")
-    return np.frombuffer(frame, element, count=count, offset=offset).reshape(shape)
+    """Elements `offset` bytes into the payload."""
+    count = math.prod(shape)
+    if HEADER.itemsize + offset + count * element.itemsize > len(frame):
+        raise FrameError(
+            f"a frame of {len(frame)} bytes does not hold {shape} elements at byte {offset} of its payload"
+        )
+    return np.frombuffer(frame, element, count=count, offset=HEADER.itemsize + offset).reshape(shape)

@@ -1,0 +1,75 @@
+"""Points of a LIDAR in the world: each was fired a little before the end of its tick, from where the sensor was."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+PAPER_AXES = 1
+"""Value of `Scan.axes`: y backward, x left, z down."""
+
+INTEREST = (4, 5, 6, 12)
+"""Tags of points on vehicles, two-wheelers, pedestrians and lost loads: what `interest` shows."""
+
+TAG_COLORS = np.array(
+    [
+        0x5A5F6BFF,  # ground
+        0x9A8C7AFF,  # building
+        0x8A8578FF,  # wall
+        0x8A8578FF,  # structure
+        0x4FC3FFFF,  # vehicle
+        0x7FE3D0FF,  # two-wheeler
+        0xFFC04EFF,  # person
+        0xFF7F50FF,  # barrier
+        0xB58AFFFF,  # furniture
+        0xC8C8C8FF,  # pole
+        0x5FBF6AFF,  # vegetation
+        0x7F9FBFFF,  # parked vehicle
+        0xFF5A5AFF,  # load
+        0x9A8C7AFF,  # mesh
+        0xFFFFFFFF,  # a tag of a later version
+    ],
+    dtype=np.uint32,
+)
+"""RGBA by `LidarPoint.tag`."""
+
+
+def of_interest(points: NDArray[np.void]) -> NDArray[np.void]:
+    """Points on what moves."""
+    return points[np.isin(points["tag"], INTEREST)]
+
+
+def colors(points: NDArray[np.void]) -> NDArray[np.uint32]:
+    """RGBA `[n]`."""
+    return TAG_COLORS[np.minimum(points["tag"], len(TAG_COLORS) - 1)]
+
+
+def in_world_m(
+    scan: np.void, points: NDArray[np.void], velocity_mps: NDArray[np.floating], yaw_rate_radps: float
+) -> NDArray[np.float32]:
+    """World positions `[n, 3]` of points, the sensor having moved with `velocity_mps` (world) and turned meanwhile."""
+    age_s = points["age_us"].astype(np.float64) * 1e-6
+    forward = points["position_m"].astype(np.float64)
+    if scan["axes"] == PAPER_AXES:
+        forward = np.column_stack([-forward[:, 1], forward[:, 0], -forward[:, 2]])
+    roll, pitch, yaw = (float(angle) for angle in scan["attitude_rad"])
+    level = forward @ (_pitched(pitch) @ _rolled(roll)).T
+    heading = yaw - yaw_rate_radps * age_s
+    cos, sin = np.cos(heading), np.sin(heading)
+    turned = np.column_stack(
+        [cos * level[:, 0] - sin * level[:, 1], sin * level[:, 0] + cos * level[:, 1], level[:, 2]]
+    )
+    moved = scan["position_m"] - age_s[:, None] * np.asarray(velocity_mps, np.float64)
+    return (turned + moved).astype(np.float32)
+
+
+def _rolled(roll_rad: float) -> NDArray[np.float64]:
+    """Vehicle from rolled axes: positive to the right side down."""
+    cos, sin = np.cos(roll_rad), np.sin(roll_rad)
+    return np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+
+
+def _pitched(pitch_rad: float) -> NDArray[np.float64]:
+    """Vehicle from pitched axes: positive nose up."""
+    cos, sin = np.cos(pitch_rad), np.sin(pitch_rad)
+    return np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]])

@@ -1,0 +1,201 @@
+"""The HUD: a text with the figures of the run and of the vehicles looked at. Pure functions of what is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from caraware_viewer import wire
+from caraware_viewer.pairing import mean_m
+from caraware_viewer.picture import Picture
+
+KMH = 3.6
+MOST_VEHICLES = 40
+"""Rows of the table of errors, at most; those looked at come first."""
+
+_SENSORS = ((wire.GNSS, "GNSS"), (wire.IMU, "IMU"), (wire.SPEED_STEERING, "speed+steering"), (wire.LIDAR, "LIDAR"))
+_COMPASS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
+_NOTHING = "–"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the viewer itself does."""
+
+    frames_per_s: float = math.nan
+    """Ticks drawn per wall second."""
+    age_ms: float = math.nan
+    """Age of the newest tick when it was drawn, if both clocks agree."""
+    lost: int = 0
+    """Samples that did not arrive."""
+    refused: int = 0
+    """Samples that are not what they say they are."""
+
+
+def hud(picture: Picture, run_map: dict[str, Any], looked_at: Sequence[int], shown: Shown) -> str:
+    """The whole text, as markdown."""
+    blocks = [_run(picture, run_map, shown)]
+    blocks += [_vehicle(picture, id_hash) for id_hash in looked_at[:4]]
+    blocks.append(_errors(picture, looked_at))
+    return "\n\n".join(block for block in blocks if block)
+
+
+def _run(picture: Picture, run_map: dict[str, Any], shown: Shown) -> str:
+    status = picture.status
+    training = status.get("training") or {}
+    title = f"### {run_map.get('run', 'run')} · {run_map.get('mode', '')}"
+    title += " · evaluation" if status.get("evaluation") else ""
+    rows = [
+        ("episode", _text(status.get("episode")) + f" · step {_text(status.get('step'))}"),
+        ("time", f"{_clock(_sim_time_s(picture, run_map))} in all · {_episode_s(picture):.1f} s in this episode"),
+        ("simulation", _speed(status, training)),
+        ("road users", _counts(picture, run_map)),
+        ("sensors on", _sensors(picture)),
+    ]
+    if training.get("updates"):
+        best = training.get("best_reward")
+        rows.append(("reward", f"{_number(training.get('reward'), 3)} now · {_number(best, 3)} best"))
+        rows.append(("policy", f"σ {_number(training.get('policy_std'), 3)} · {training['updates']} updates"))
+    if picture.distances is not None:
+        d = picture.distances
+        means = (
+            f"policy {_metres(mean_m(d.policy))} · EKF {_metres(mean_m(d.ekf))} · GNSS {_metres(mean_m(d.raw_gnss))}"
+        )
+        rows.append(("mean error", means))
+    if picture.collisions:
+        rows.append(("contacts", f"{picture.collisions} since this viewer joined"))
+    rows.append(("viewer", _viewer(shown)))
+    return title + "\n" + _table(("", ""), rows)
+
+
+def _speed(status: dict[str, Any], training: dict[str, Any]) -> str:
+    parts = []
+    if training.get("env_steps_per_s"):
+        parts.append(f"{training['env_steps_per_s']:,.0f} samples/s".replace(",", " "))
+    if status.get("ticks_per_s") is not None:
+        parts.append(f"{status['ticks_per_s']:.0f} ticks/s")
+    if status.get("real_time_factor") is not None:
+        parts.append(f"{status['real_time_factor']:.1f} × real time")
+    return " · ".join(parts) or _NOTHING
+
+
+def _counts(picture: Picture, run_map: dict[str, Any]) -> str:
+    if picture.world is None:
+        return _NOTHING
+    of_kind = np.bincount(picture.world.states["kind"], minlength=4)
+    counts = [(wire.HERO, "heroes"), (wire.CAV, "CAV"), (wire.OTHER, "others"), (wire.PERSON, "pedestrians")]
+    parts = [f"{of_kind[kind]} {name}" for kind, name in counts if of_kind[kind] or kind != wire.HERO]
+    obstacles = len((run_map.get("scene") or {}).get("obstacles", []))
+    return " · ".join([*parts, f"{obstacles} obstacles"])
+
+
+def _sensors(picture: Picture) -> str:
+    if picture.observation is None:
+        return _NOTHING
+    held = picture.observation.vehicle != wire.EMPTY_SLOT
+    sensors = picture.observation.sensors[held]
+    return " · ".join(f"{name} {int((sensors & bit != 0).sum())}" for bit, name in _SENSORS)
+
+
+def _viewer(shown: Shown) -> str:
+    parts = [f"{_number(shown.frames_per_s, 1)} frames/s", f"{_number(shown.age_ms, 0)} ms old"]
+    parts += [f"{shown.lost} lost"] if shown.lost else []
+    parts += [f"{shown.refused} refused"] if shown.refused else []
+    return " · ".join(parts)
+
+
+def _vehicle(picture: Picture, id_hash: int) -> str:
+    """Speed, steering, heading, accelerations and rates as the sensors tell them; without sensors, as they are."""
+    row, slot = picture.row(id_hash), picture.slot(id_hash)
+    if row is None:
+        return ""
+    if picture.observation is not None and slot is not None and picture.observation.imu.shape[1]:
+        speed_mps, steering_rad = (float(value) for value in picture.observation.speed_steering[slot])
+        newest = picture.observation.imu[slot, -1]
+        accel, rate, compass_rad = newest[:3], newest[3:6], float(newest[6])
+        source, steering = "sensed", "steering wheel"
+    else:
+        speed_mps, steering_rad = float(np.hypot(*row["velocity_body_mps"][:2])), float(row["road_wheel_angle_rad"])
+        accel, rate = row["accel_body_mps2"], row["angular_rate_body_radps"]
+        compass_rad = (math.pi / 2 - float(row["yaw_rad"])) % (2 * math.pi)
+        source, steering = "true", "road wheels"
+    rows = [
+        ("speed", f"{speed_mps * KMH:.1f} km/h"),
+        (steering, f"{math.degrees(steering_rad):+.1f}°"),
+        ("heading", f"{math.degrees(compass_rad):.1f}° {compass_letters(compass_rad)}"),
+        ("acceleration", _vector(accel, "m/s²")),
+        ("rates", _vector(np.degrees(rate), "°/s")),
+    ]
+    return f"### {picture.name(id_hash)} ({source})\n" + _table(("", ""), rows)
+
+
+def compass_letters(compass_rad: float) -> str:
+    """N, NE, E, … of a compass angle, clockwise from north."""
+    return _COMPASS[round(math.degrees(compass_rad) / 45) % 8]
+
+
+def _errors(picture: Picture, looked_at: Sequence[int]) -> str:
+    """Error of each vehicle; those looked at first, then by slot."""
+    observation, distances = picture.observation, picture.distances
+    if observation is None or distances is None:
+        return ""
+    slots = np.flatnonzero(observation.valid)
+    if not len(slots):
+        return ""
+    ordered = sorted(slots.tolist(), key=lambda slot: int(observation.id_hash[slot]) not in looked_at)
+    rows = [
+        (
+            picture.name(int(observation.id_hash[slot])),
+            *(_NOTHING if d is None else _number(float(d[slot]), 2) for d in (distances.policy, distances.ekf)),
+            _number(float(distances.raw_gnss[slot]), 2),
+        )
+        for slot in ordered[:MOST_VEHICLES]
+    ]
+    rest = f"\n\n… and {len(slots) - MOST_VEHICLES} more" if len(slots) > MOST_VEHICLES else ""
+    return "### error (m)\n" + _table(("vehicle", "policy", "EKF", "GNSS"), rows) + rest
+
+
+def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "\n".join("| " + " | ".join(_escaped(cell) for cell in line) + " |" for line in lines)
+
+
+def _escaped(cell: str) -> str:
+    """Ids may hold any characters."""
+    return cell.replace("\\", "\\\\").replace("|", "\\|").replace("\n", " ").replace("<", "\\<").replace("`", "\\`")
+
+
+def _sim_time_s(picture: Picture, run_map: dict[str, Any]) -> float:
+    if picture.world is None:
+        return 0.0
+    return (picture.world.header.tick + 1) * float(run_map["tick_s"])
+
+
+def _episode_s(picture: Picture) -> float:
+    return 0.0 if picture.world is None else picture.world.header.sim_time_ns * 1e-9
+
+
+def _clock(seconds: float) -> str:
+    minutes, second = divmod(int(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours:02d}:{minute:02d}:{second:02d}"
+
+
+def _text(value: object) -> str:
+    return _NOTHING if value is None else str(value)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return _NOTHING if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def _metres(value: float) -> str:
+    return f"{value:.2f} m" if math.isfinite(value) else _NOTHING
+
+
+def _vector(values: Iterable[float], unit: str) -> str:
+    return " ".join(f"{float(value):+.2f}" for value in values) + f" {unit}"

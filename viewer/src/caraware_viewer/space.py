@@ -1,0 +1,50 @@
+"""The 3-D view: the world below a transform that puts the vehicle looked at into the origin; the camera stays with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from caraware_viewer import geometry, wire
+from caraware_viewer.canvas import Canvas
+from caraware_viewer.top import KIND_COLORS
+
+WORLD = "space/world"
+VEHICLES = "space/world/vehicles"
+CLOUD = "space/world/lidar"
+
+SIGHT_M = 120.0
+"""Road users farther from the vehicle than this are left out."""
+
+
+def draw_space(canvas: Canvas, states: NDArray[np.void], centre: np.void | None) -> None:
+    """Boxes of the road users near `centre`, which is at the origin with its nose along x."""
+    if centre is None:
+        canvas.log(VEHICLES, rr.Boxes3D(centers=[], half_sizes=[]))
+        return
+    origin_m = np.array([centre["x_m"], centre["y_m"], centre["z_m"]])
+    yaw_rad = float(centre["yaw_rad"])
+    canvas.log(WORLD, vehicle_from_world(origin_m, yaw_rad))
+    near = np.hypot(states["x_m"] - origin_m[0], states["y_m"] - origin_m[1]) < SIGHT_M
+    shown = states[near]
+    boxes = rr.Boxes3D(
+        centers=geometry.centres_m(shown),
+        half_sizes=np.column_stack([shown["length_m"], shown["width_m"], shown["height_m"]]) / 2,
+        quaternions=geometry.quaternions(shown["yaw_rad"]),
+        colors=KIND_COLORS[np.minimum(shown["kind"], wire.HERO)],
+        fill_mode="solid",
+    )
+    canvas.log(VEHICLES, boxes)
+
+
+def vehicle_from_world(origin_m: NDArray[np.float64], yaw_rad: float) -> rr.Transform3D:
+    """Turns and moves the world so that `origin_m` lies at zero, heading along x."""
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    return rr.Transform3D(translation=-turn @ origin_m, mat3x3=turn)
+
+
+def draw_cloud(canvas: Canvas, points_m: NDArray[np.floating], colors: NDArray[np.uint32]) -> None:
+    """Points of the vehicle's LIDAR."""
+    canvas.log(CLOUD, rr.Points3D(points_m, colors=colors, radii=rr.Radius.ui_points(1.2)))

@@ -1,0 +1,195 @@
+"""What stands still: roads with their markings, sidewalks, crossings, buildings, obstacles. Drawn once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from caraware_viewer.canvas import Canvas, on_screen
+from caraware_viewer.geometry import hatching_m, quaternions, walls_m
+from caraware_viewer.wire import FrameError
+
+BOUNDS = "top/map/bounds"
+ROADS = "top/map/roads"
+JUNCTIONS = "top/map/junctions"
+WALKS = "top/map/walks"
+CROSSINGS = "top/map/crossings"
+MARKINGS = "top/map/markings"
+BUILDINGS = "top/map/buildings"
+OBSTACLES = "top/map/obstacles"
+SPACE_ROADS = "space/world/roads"
+SPACE_BUILDINGS = "space/world/buildings"
+SPACE_OBSTACLES = "space/world/obstacles"
+
+ROAD_COLOR, WALK_COLOR, CROSSING_COLOR = [52, 56, 64], [84, 82, 78], [150, 150, 146]
+MARKING_COLOR, BUILDING_COLOR, WALL_COLOR = [196, 198, 200], [104, 88, 74], [150, 128, 108]
+OBSTACLE_COLOR, BOUNDS_COLOR = [255, 127, 80], [70, 74, 84]
+
+_ROAD_KINDS = ("car", "bus", "bicycle", "rail")
+_MARKING_M = 0.12
+_DASH_M, _GAP_M = 3.0, 6.0
+_STRIPE_M = 0.5
+_MOST_HATCHES = 60_000
+"""Segments that fill polygons, at most: beyond, the rows lie farther apart."""
+_FINEST_M = 0.5
+
+
+def draw_map(canvas: Canvas, run_map: dict[str, Any]) -> None:
+    """Draws the static map; a map without a scene has its bounds alone."""
+    try:
+        _draw_bounds(canvas, run_map["map"]["bounds_m"])
+        scene = run_map.get("scene") or {}
+        lanes, areas = scene.get("lanes", []), scene.get("areas", [])
+        _draw_lanes(canvas, lanes)
+        _draw_polygons(canvas, JUNCTIONS, [a for a in areas if a["kind"] == "junction"], ROAD_COLOR, 2.0)
+        _draw_polygons(canvas, WALKS + "/areas", [a for a in areas if a["kind"] == "walking_area"], WALK_COLOR, 2.5)
+        _draw_buildings(canvas, scene.get("buildings", []))
+        _draw_obstacles(canvas, scene.get("obstacles", []))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise FrameError(f"the map is not what this viewer knows: {error!r}") from error
+
+
+def _draw_bounds(canvas: Canvas, bounds_m: list[float]) -> None:
+    x_min, y_min, x_max, y_max = bounds_m
+    corners = np.array([[x_min, y_min], [x_max, y_min], [x_max, y_max], [x_min, y_max], [x_min, y_min]])
+    canvas.log(BOUNDS, rr.LineStrips2D([on_screen(corners)], colors=BOUNDS_COLOR, draw_order=0.0), static=True)
+
+
+def _draw_lanes(canvas: Canvas, lanes: list[dict[str, Any]]) -> None:
+    """Lanes are strips as wide as they are; where they cross a junction they have no markings."""
+    roads = [lane for lane in lanes if lane["kind"] in _ROAD_KINDS]
+    _strips(canvas, ROADS, roads, ROAD_COLOR, 1.0)
+    _strips(canvas, WALKS, [lane for lane in lanes if lane["kind"] == "sidewalk"], WALK_COLOR, 1.5)
+    stripes = [stripe for lane in lanes if lane["kind"] == "crossing" for stripe in stripes_m(lane)]
+    _segments(canvas, CROSSINGS, stripes, CROSSING_COLOR, _STRIPE_M / 2, 4.0)
+    markings = [piece for lane in roads if not lane["inside"] for piece in markings_m(lane)]
+    _segments(canvas, MARKINGS, markings, MARKING_COLOR, _MARKING_M / 2, 5.0)
+    if roads:
+        edges = [edge_m(lane, side) for lane in roads for side in (-1, 1) if not lane["inside"]]
+        strips = [_lifted(edge, lane) for edge, lane in zip(edges, _twice(roads), strict=True)]
+        canvas.log(SPACE_ROADS, rr.LineStrips3D(strips, colors=MARKING_COLOR, radii=_MARKING_M / 2), static=True)
+
+
+def _twice(lanes: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:
+    return (lane for lane in lanes if not lane["inside"] for _ in range(2))
+
+
+def _lifted(edge_points_m: NDArray[np.float64], lane: dict[str, Any]) -> NDArray[np.float32]:
+    height_m = np.asarray(lane["points_m"], np.float64)[:, 2]
+    return np.column_stack([edge_points_m, height_m]).astype(np.float32)
+
+
+def edge_m(lane: dict[str, Any], side: int) -> NDArray[np.float64]:
+    """Edge `[n, 2]` of a lane: to the left of its direction for `side` 1, to the right for -1."""
+    line = np.asarray(lane["points_m"], np.float64)[:, :2]
+    along = np.gradient(line, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    return line + side * lane["width_m"] / 2 * np.column_stack([-along[:, 1], along[:, 0]])
+
+
+def markings_m(lane: dict[str, Any]) -> list[NDArray[np.float64]]:
+    """Painted lines of a lane's edges; a dashed one is a piece each."""
+    pieces = []
+    for side, name in ((1, "left"), (-1, "right")):
+        if lane[name] == "solid":
+            pieces.append(edge_m(lane, side))
+        elif lane[name] == "dashed":
+            pieces += pieces_m(edge_m(lane, side), _DASH_M, _GAP_M)
+    return pieces
+
+
+def stripes_m(lane: dict[str, Any]) -> list[NDArray[np.float64]]:
+    """Stripes of a crossing, along the direction of the traffic it crosses."""
+    line = np.asarray(lane["points_m"], np.float64)[:, :2]
+    stripes = []
+    for piece in pieces_m(line, _STRIPE_M, _STRIPE_M):
+        along = piece[-1] - piece[0]
+        across = (
+            np.array([-along[1], along[0]]) / max(np.linalg.norm(along), 1e-9) * (lane["width_m"] / 2 - _STRIPE_M / 2)
+        )
+        stripes.append(piece.mean(axis=0) + np.array([across, -across]))
+    return stripes
+
+
+def pieces_m(line_m: NDArray[np.float64], piece_m: float, gap_m: float) -> list[NDArray[np.float64]]:
+    """Pieces `[2, 2]` of a line, with gaps between; the last may be cut."""
+    steps_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1)
+    at_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    begins = np.arange(0.0, at_m[-1], piece_m + gap_m)
+    ends = np.minimum(begins + piece_m, at_m[-1])
+    both = np.stack([begins, ends], axis=1)
+    return list(np.stack([np.interp(both, at_m, line_m[:, axis]) for axis in range(2)], axis=-1))
+
+
+def _strips(canvas: Canvas, path: str, lanes: list[dict[str, Any]], color: list[int], order: float) -> None:
+    if not lanes:
+        return
+    strips = [on_screen(np.asarray(lane["points_m"], np.float64)[:, :2]) for lane in lanes]
+    radii = [lane["width_m"] / 2 for lane in lanes]
+    canvas.log(path, rr.LineStrips2D(strips, colors=color, radii=radii, draw_order=order), static=True)
+
+
+def _segments(canvas: Canvas, path: str, lines: list, color: list[int], radius_m: float, order: float) -> None:
+    if lines:
+        strips = [on_screen(line) for line in lines]
+        canvas.log(path, rr.LineStrips2D(strips, colors=color, radii=radius_m, draw_order=order), static=True)
+
+
+def _draw_polygons(canvas: Canvas, path: str, polygons: list[dict[str, Any]], color: list[int], order: float) -> None:
+    outlines = [np.asarray(polygon["points_m"], np.float64)[:, :2] for polygon in polygons]
+    outlines = [outline for outline in outlines if len(outline) > 2]
+    if not outlines:
+        return
+    rows_m = sum(float(np.ptp(outline[:, 1])) for outline in outlines)
+    spacing_m = max(_FINEST_M, rows_m / _MOST_HATCHES)
+    filling = [segment for outline in outlines for segment in hatching_m(outline, spacing_m)]
+    _segments(canvas, path, filling, color, 0.55 * spacing_m, order)
+
+
+def _draw_buildings(canvas: Canvas, buildings: list[dict[str, Any]]) -> None:
+    _draw_polygons(canvas, BUILDINGS, buildings, BUILDING_COLOR, 6.0)
+    outlines = [np.asarray(building["points_m"], np.float64)[:, :2] for building in buildings]
+    _segments(canvas, BUILDINGS + "/walls", [np.vstack([o, o[:1]]) for o in outlines], WALL_COLOR, 0.25, 6.5)
+    if not buildings:
+        return
+    vertices, triangles, count = [], [], 0
+    for building, outline in zip(buildings, outlines, strict=True):
+        points, faces = walls_m(outline, building["base_m"], building["height_m"])
+        vertices.append(points)
+        triangles.append(faces + count)
+        count += len(points)
+    mesh = rr.Mesh3D(
+        vertex_positions=np.concatenate(vertices),
+        triangle_indices=np.concatenate(triangles),
+        albedo_factor=BUILDING_COLOR,
+        face_rendering="DoubleSided",
+    )
+    canvas.log(SPACE_BUILDINGS, mesh, static=True)
+
+
+def _draw_obstacles(canvas: Canvas, obstacles: list[dict[str, Any]]) -> None:
+    if not obstacles:
+        return
+    centres_m = np.array([obstacle["center_m"] for obstacle in obstacles], np.float64)
+    sizes_m = np.array([obstacle["size_m"] for obstacle in obstacles], np.float64)
+    yaw_rad = np.array([obstacle["yaw_rad"] for obstacle in obstacles], np.float64)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) / 2 * sizes_m[:, None, :2]
+    cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
+    turned = np.stack(
+        [cos * corners[..., 0] - sin * corners[..., 1], sin * corners[..., 0] + cos * corners[..., 1]], axis=-1
+    )
+    outlines = on_screen(turned + centres_m[:, None, :2])
+    strips = rr.LineStrips2D(outlines, colors=OBSTACLE_COLOR, radii=rr.Radius.ui_points(1.5), draw_order=7.0)
+    canvas.log(OBSTACLES, strips, static=True)
+    boxes = rr.Boxes3D(
+        centers=centres_m + [0, 0, 0.5] * sizes_m[:, 2:],
+        half_sizes=sizes_m / 2,
+        quaternions=quaternions(yaw_rad),
+        colors=OBSTACLE_COLOR,
+        fill_mode="solid",
+    )
+    canvas.log(SPACE_OBSTACLES, boxes, static=True)

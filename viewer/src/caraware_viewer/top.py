@@ -1,0 +1,122 @@
+"""The top view: everybody who moves, and where sensors and estimators think they are. World metres, north up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from caraware_viewer import geometry, wire
+from caraware_viewer.canvas import Canvas, on_screen
+
+OUTLINES = "top/vehicles"
+BODIES = "top/vehicles/bodies"
+BLINKERS = "top/vehicles/blinkers"
+BRAKES = "top/vehicles/brakes"
+NAMES = "top/vehicles/names"
+LOOKED_AT = "top/looked_at"
+GNSS = "top/gnss"
+PREDICTIONS = "top/predictions"
+ESTIMATES = "top/ekf"
+SIGNALS = "top/signals"
+CONTACTS = "top/contacts"
+CLOUD = "top/lidar"
+RING = "top/lidar/range"
+
+KIND_COLORS = np.array([0x3FA7FFFF, 0xB8BDC7FF, 0xF2C14EFF, 0xFF4FD8FF], dtype=np.uint32)
+"""RGBA by `VehicleState.kind`: connected vehicle, other vehicle, pedestrian, hero."""
+BODY_ALPHA = 0x80
+GNSS_COLOR, PREDICTION_COLOR, ESTIMATE_COLOR = [235, 94, 85], [94, 214, 125], [196, 132, 255]
+LINK_ALPHA = 120
+BLINKER_COLOR, BRAKE_COLOR, RING_COLOR, CONTACT_COLOR = [255, 170, 0], [255, 30, 30], [120, 200, 255], [255, 0, 90]
+SIGNAL_COLORS = {"r": 0xF03C32FF, "u": 0xF0783CFF, "y": 0xF5D23CFF, "g": 0x32C85AFF, "G": 0x32C85AFF, "o": 0xF5A03CFF}
+"""RGBA by SUMO's letter; all others are off."""
+SIGNAL_OFF = 0x707070FF
+
+NAMED_AT_MOST = 48
+"""Connected vehicles with their names beside them; more would hide the map."""
+
+
+def draw_road_users(canvas: Canvas, states: NDArray[np.void], names: dict[int, str]) -> None:
+    """Boxes with an arrow ahead, blinkers, brake lights, and the names of a few."""
+    colors = KIND_COLORS[np.minimum(states["kind"], wire.HERO)]
+    outlines = on_screen(geometry.outlines_m(states))
+    canvas.log(OUTLINES, rr.LineStrips2D(outlines, colors=colors, radii=rr.Radius.ui_points(0.8), draw_order=21.0))
+    bodies, filled = on_screen(geometry.bodies_m(states)), colors & 0xFFFFFF00 | BODY_ALPHA
+    radii = geometry.body_radii_m(states)
+    canvas.log(BODIES, rr.LineStrips2D(bodies, colors=filled, radii=radii, draw_order=20.0))
+    canvas.points(BLINKERS, geometry.blinkers_m(states), BLINKER_COLOR, 2.0, 23.0)
+    canvas.points(BRAKES, geometry.brake_lights_m(states), BRAKE_COLOR, 1.6, 22.0)
+    _draw_names(canvas, states[(states["kind"] == wire.CAV) | (states["kind"] == wire.HERO)], names)
+
+
+def _draw_names(canvas: Canvas, states: NDArray[np.void], names: dict[int, str]) -> None:
+    known = [names.get(int(id_hash)) for id_hash in states["id_hash"]]
+    if len(states) > NAMED_AT_MOST or None in known:
+        states, known = states[:0], []
+    positions = on_screen(geometry.centres_m(states)[:, :2])
+    radii = rr.Radius.ui_points(0.0)
+    labels = rr.Points2D(
+        positions, labels=known, show_labels=True, radii=radii, colors=[210, 214, 220], draw_order=24.0
+    )
+    canvas.log(NAMES, labels)
+
+
+def draw_looked_at(canvas: Canvas, states: Sequence[np.void]) -> None:
+    """A ring around each vehicle that the other views follow."""
+    rings = [on_screen(geometry.ring_m([row["x_m"], row["y_m"]], 0.9 * float(row["length_m"]))) for row in states]
+    color = [255, 255, 255]
+    canvas.log(LOOKED_AT, rr.LineStrips2D(rings, colors=color, radii=rr.Radius.ui_points(1.0), draw_order=24.0))
+
+
+def draw_guesses(
+    canvas: Canvas,
+    path: str,
+    points_m: NDArray[np.floating],
+    truth_m: NDArray[np.floating],
+    color: list[int],
+    order: float,
+) -> None:
+    """Points with a line each to the vehicle they stand for."""
+    canvas.points(path, points_m, color, 2.5, order)
+    links = on_screen(geometry.links_m(points_m, truth_m))
+    line = rr.LineStrips2D(links, colors=[*color, LINK_ALPHA], radii=rr.Radius.ui_points(0.6), draw_order=order - 0.5)
+    canvas.log(path + "/links", line)
+
+
+def draw_observation(canvas: Canvas, observation: wire.Observation) -> None:
+    """Raw GNSS fixes."""
+    valid = observation.valid
+    draw_guesses(canvas, GNSS, observation.gnss_m[valid, :2], observation.truth[valid, :2], GNSS_COLOR, 26.0)
+
+
+def draw_estimates(canvas: Canvas, path: str, observation: wire.Observation, points_m: NDArray[np.float32]) -> None:
+    """What a policy or filter thinks, where it says something."""
+    n = min(len(points_m), observation.header.count)
+    chosen = observation.valid[:n] & np.isfinite(points_m[:n]).all(axis=1)
+    color, order = {PREDICTIONS: (PREDICTION_COLOR, 28.0), ESTIMATES: (ESTIMATE_COLOR, 30.0)}[path]
+    draw_guesses(canvas, path, points_m[:n][chosen], observation.truth[:n, :2][chosen], color, order)
+
+
+def draw_signals(canvas: Canvas, lights: list[tuple[Sequence[float], str]]) -> None:
+    """A dot at the stop line of each link, in the colour of its letter."""
+    points = on_screen(np.array([position[:2] for position, _ in lights], np.float64).reshape(-1, 2))
+    colors = np.array([SIGNAL_COLORS.get(letter, SIGNAL_OFF) for _, letter in lights], np.uint32)
+    canvas.log(SIGNALS, rr.Points2D(points, colors=colors, radii=rr.Radius.ui_points(3.0), draw_order=15.0))
+
+
+def draw_contacts(canvas: Canvas, positions_m: NDArray[np.floating]) -> None:
+    """Where somebody ran into something lately."""
+    canvas.points(CONTACTS, positions_m, CONTACT_COLOR, 6.0, 31.0)
+
+
+def draw_clouds(
+    canvas: Canvas, points_m: NDArray[np.floating], colors: NDArray[np.uint32], rings_m: list[NDArray[np.float32]]
+) -> None:
+    """LIDAR points from above, and how far the LIDARs see."""
+    cloud = rr.Points2D(on_screen(points_m[:, :2]), colors=colors, radii=rr.Radius.ui_points(0.8), draw_order=18.0)
+    canvas.log(CLOUD, cloud)
+    rings = [on_screen(ring) for ring in rings_m]
+    canvas.log(RING, rr.LineStrips2D(rings, colors=RING_COLOR, radii=rr.Radius.ui_points(0.7), draw_order=17.0))

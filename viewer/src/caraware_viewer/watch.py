@@ -1,0 +1,98 @@
+"""A run being watched: one thread draws, this one waits for the end of the run, of the display, or for Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import threading
+from collections.abc import Iterator
+
+import rerun as rr
+
+from caraware_viewer.display import Display, has_screen
+from caraware_viewer.layout import blueprint
+from caraware_viewer.link import Link, choose, connect
+from caraware_viewer.scene import Scene
+from caraware_viewer.wire import FrameError
+
+_LOOK_S = 0.25
+_FLUSH_S = 5.0
+
+
+def watch(options: argparse.Namespace) -> int:
+    """Connects, opens the recording, and draws what comes until the run ends; returns the exit code."""
+    session = connect(options.endpoint, options.timeout)
+    try:
+        run = choose(session, options.endpoint, options.run, options.timeout, options.env)
+    except BaseException:
+        session.close()
+        raise
+    with Link(session, run) as link, _display(options) as display:
+        run_map = link.map(options.timeout)
+        recording = rr.RecordingStream("caraware", recording_id=f"{run.run}/{run.env}")
+        views = blueprint(run_map["map"]["bounds_m"], run_map.get("real_time_factor", 0.0))
+        recording.set_sinks(*_sinks(options, display), default_blueprint=views)
+        print(f"watching run {run.run} at {options.endpoint}", file=sys.stderr)
+        if display is not None and display.page is not None:
+            print(f"open {display.page.url} in a browser", file=sys.stderr)
+        ended = _draw_until_over(link, Scene(recording, run_map, options.vehicle, options.lidar), display)
+        # A stalled display is not waited for.
+        with contextlib.suppress(RuntimeError):
+            recording.flush(timeout_sec=_FLUSH_S)
+        if ended:
+            recording.disconnect()
+    print(f"run {run.run} has ended" if link.frames.ended else "the display was closed", file=sys.stderr)
+    return 0
+
+
+def _draw_until_over(link: Link, scene: Scene, display: Display | None) -> bool:
+    """Draws until the run or the display ends; false if drawing hangs in a display that takes nothing."""
+    drawing = threading.Thread(target=_draw, args=(link, scene), name="draw", daemon=True)
+    drawing.start()
+    while drawing.is_alive():
+        drawing.join(_LOOK_S)
+        if display is not None and display.closed:
+            link.frames.close()
+            break
+    drawing.join(_FLUSH_S)
+    return not drawing.is_alive()
+
+
+def _draw(link: Link, scene: Scene) -> None:
+    told: set[str] = set()
+    while True:
+        # Looked at before taking: what was stored before the end is drawn.
+        closed = link.frames.closed
+        scene.lost = link.frames.lost
+        for topic, sample in link.frames.take(_LOOK_S).items():
+            try:
+                scene.draw(topic, sample)
+            except FrameError as error:
+                scene.refused += 1
+                if topic not in told:
+                    print(f"caraware-viewer: {topic}: {error} (later ones are left out in silence)", file=sys.stderr)
+                told.add(topic)
+        if closed:
+            return
+        link.follow_clouds(scene.clouds_wanted())
+
+
+def _sinks(options: argparse.Namespace, display: Display | None) -> Iterator[rr.GrpcSink | rr.FileSink]:
+    if options.save:
+        yield rr.FileSink(options.save)
+    if options.connect:
+        yield rr.GrpcSink(options.connect)
+    if display is not None:
+        yield rr.GrpcSink(display.url)
+
+
+def _display(options: argparse.Namespace) -> contextlib.AbstractContextManager[Display | None]:
+    if options.web or options.web_port:
+        return Display.web(options.web_port)
+    if options.save or options.connect:
+        return contextlib.nullcontext()
+    if not has_screen():
+        print("there is no screen here (DISPLAY is not set): serving a browser instead, as --web does", file=sys.stderr)
+        return Display.web()
+    return Display.window()
