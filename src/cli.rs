@@ -22,7 +22,9 @@ const AFTER: &str = "Examples:
   caraware train --set traffic.cavs=8 --set run.seed=7
   caraware simulate my.sumocfg                    your own scenario, every vehicle sensing
   caraware play town-1                            watch what it has learnt, beside a Kalman filter
+  caraware train --viewer                         the same, and watch it
   caraware ps                                     what runs, from another terminal
+  caraware view --web                             watch it in a browser
   caraware bench lidar                            rays per second, beside Open3D's
   caraware swap --set trainer.learning_rate=0.001 another trainer for a live run, which loses nothing
   caraware stop                                   end it; the trainer writes a checkpoint first
@@ -54,6 +56,9 @@ pub enum Command {
         /// Name of the run; may be left out if only one is alive
         run: Option<String>,
     },
+    /// Watch a live run: map, vehicles, estimates, point clouds and figures, in a window or a browser
+    #[command(after_help = VIEW)]
+    View(ViewArgs),
     /// Measure a part on this machine, side by side with its peers
     Bench(BenchArgs),
     /// Say what is missing on this machine and what dead runs left
@@ -126,6 +131,56 @@ pub struct SwapArgs {
     pub checkpoint: Option<PathBuf>,
 }
 
+const VIEW: &str = "Examples:
+  caraware view                          the run on this machine, in a window (a browser where there is no screen)
+  caraware view --web                    prints an address to open; any number of browsers may
+  caraware view --save run.rrd           record; look later with `.venv/bin/rerun run.rrd`
+  caraware view town-2                   one of several runs
+  caraware view --vehicle cav.3 --lidar all
+  caraware view tcp/127.0.0.1:7448       an endpoint (`fanout.listen` of a run)
+
+Come and go as you like, several at once: no viewer can hold up the run. Ctrl-C ends the viewer alone.
+From another machine, which needs neither Rust nor this command (pip install ./viewer):
+  ssh -N -L 7447:127.0.0.1:7447 HOST &
+  caraware-viewer";
+
+/// What `view` takes.
+#[derive(Debug, Args, Clone)]
+pub struct ViewArgs {
+    /// Name of a run on this machine, or an endpoint as tcp/HOST:PORT [default: the only run alive]
+    pub endpoint: Option<String>,
+    /// Serve browsers on this machine, and print the address
+    #[arg(long)]
+    pub web: bool,
+    /// Port of that address [default: 9090 if it is free]
+    #[arg(long, value_name = "PORT", value_parser = clap::value_parser!(u16).range(1..))]
+    pub web_port: Option<u16>,
+    /// Record to a file; with --web, both
+    #[arg(long, value_name = "F.rrd")]
+    pub save: Option<PathBuf>,
+    /// A vehicle to look at (repeatable): figures and point cloud; the first is in the 3-D view
+    #[arg(long, value_name = "ID")]
+    pub vehicle: Vec<String>,
+    /// Points of the LIDARs: on road users only, with the range ring; all; none [default: interest]
+    #[arg(long, value_parser = ["interest", "all", "off"])]
+    pub lidar: Option<String>,
+    /// Environment of the run [default: its first]
+    #[arg(long, value_name = "N")]
+    pub env: Option<u32>,
+    /// Name of the run, if several are behind an endpoint
+    #[arg(long, value_name = "NAME")]
+    pub run: Option<String>,
+}
+
+/// Where a viewer beside a run shows it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ViewerKind {
+    /// In a window; where there is no screen, in a browser
+    Window,
+    /// In a browser: prints the address
+    Web,
+}
+
 /// What can be measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Part {
@@ -194,6 +249,9 @@ pub struct RunArgs {
     /// Directory that holds run directories
     #[arg(long, default_value = "runs")]
     pub runs: PathBuf,
+    /// Watch it, as `caraware view` does: in a window, or with --viewer=web in a browser
+    #[arg(long, value_name = "WHERE", num_args = 0..=1, require_equals = true, default_missing_value = "window")]
+    pub viewer: Option<ViewerKind>,
 }
 
 impl RunArgs {

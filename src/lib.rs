@@ -23,3 +23,4 @@ pub mod succession;
 pub mod supervisor;
 pub mod swap;
 pub mod town;
+pub mod view;

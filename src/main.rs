@@ -12,6 +12,7 @@ use caraware::{
     report, status,
     supervisor::Supervisor,
     swap,
+    view::{self, Beside},
 };
 use clap::Parser as _;
 use ipc_schema::run::Mode;
@@ -28,6 +29,7 @@ fn main() -> ExitCode {
         Command::Ps { run } => status::ps(run.as_deref()),
         Command::Swap(args) => swap::swap(&args),
         Command::Stop { run } => status::stop(run.as_deref()),
+        Command::View(args) => view::view(&args),
         Command::Bench(args) => bench::bench(&args),
         Command::Doctor { clean } => doctor::doctor(clean),
     };
@@ -42,6 +44,8 @@ fn run(prepared: Prepared) -> Result<(), Exit> {
     if !quiet {
         eprintln!("run {}: results go to {}", run.name, run.run_dir.display());
     }
+    // Dropped, and so ended, after the run.
+    let _viewer = args.viewer.map(|kind| Beside::start(&run, kind)).transpose()?;
     let supervisor = Supervisor::new(prepared.run, prepared.install, prepared.claim)?;
     let outcome = supervisor.supervise(&mut if quiet { Display::silent() } else { Display::new() })?;
     let (report, path) = report::write(&run, &outcome)?;

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from caraware_viewer import wire
+
+RUN_ID = 7
 
 
 def header(tick: int, count: int, columns: int, **fields: int) -> bytes:
     row = np.zeros(1, wire.HEADER)
     values = {
         "schema_version": wire.SCHEMA_VERSION,
-        "run_id": 7,
+        "run_id": RUN_ID,
         "tick": tick,
         "sim_time_ns": (tick + 1) * 100_000_000,
         "count": count,
@@ -22,28 +26,75 @@ def header(tick: int, count: int, columns: int, **fields: int) -> bytes:
     return row.tobytes()
 
 
-def world(tick: int, count: int = 3) -> bytes:
-    states = np.zeros(count, wire.VEHICLE_STATE)
-    states["x_m"] = 10.0 * np.arange(count) + tick
-    states["y_m"] = 50.0
-    states["length_m"], states["width_m"], states["rear_overhang_m"] = 4.5, 1.8, 1.0
-    states["kind"] = np.arange(count) % 3
-    states["vehicle"] = np.arange(count)
-    return header(tick, count, 0) + states.tobytes()
+def states(count: int = 3, tick: int = 0, **fields: Any) -> np.ndarray:
+    """A row of vehicles heading east, 10 m apart; the third of every three is a pedestrian."""
+    rows = np.zeros(count, wire.VEHICLE_STATE)
+    rows["x_m"] = 10.0 * np.arange(count) + tick
+    rows["y_m"] = 50.0
+    rows["length_m"], rows["width_m"], rows["height_m"], rows["rear_overhang_m"] = 4.5, 1.8, 1.5, 1.0
+    rows["kind"] = np.arange(count) % 3
+    rows["vehicle"] = np.arange(count)
+    rows["id_hash"] = 100 + np.arange(count)
+    for name, value in fields.items():
+        rows[name] = value
+    return rows
 
 
-def observation(tick: int, truth_xy: np.ndarray, gnss_m: np.ndarray, valid: np.ndarray | None = None) -> bytes:
-    n, d = len(truth_xy), 2
+def world(tick: int, count: int = 3, **fields: Any) -> bytes:
+    return header(tick, count, 0) + states(count, tick, **fields).tobytes()
+
+
+def observation(
+    tick: int, truth_xy: np.ndarray, gnss_m: np.ndarray, valid: np.ndarray | None = None, **fields: np.ndarray
+) -> bytes:
+    n, d, k = len(truth_xy), 2, 1
     truth = np.zeros((n, 4), np.float32)
     truth[:, :2] = truth_xy
     flags = np.ones(n, np.uint32) if valid is None else valid.astype(np.uint32)
     arrays = {"truth": truth, "gnss_m": np.pad(gnss_m, ((0, 0), (0, 1))), "vehicle": np.arange(n), "flags": flags}
+    arrays |= {"id_hash": 100 + np.arange(n), "sensors": np.full(n, 7)} | fields
     payload = b""
-    for name, element, shape in wire.observation_sections(n, d, 0):
+    for name, element, shape in wire.observation_sections(n, d, k):
         payload += np.asarray(arrays.get(name, np.zeros(shape)), element).reshape(shape).tobytes()
         payload += bytes(-len(payload) % wire.ALIGNMENT)
-    return header(tick, n, d) + payload
+    return header(tick, n, d, sequence=k) + payload
 
 
-def prediction(tick: int, position_m: np.ndarray) -> bytes:
-    return header(tick, len(position_m), 2) + np.asarray(position_m, "<f4").tobytes()
+def prediction(tick: int, position_m: np.ndarray, estimate_m: np.ndarray | None = None) -> bytes:
+    first = np.asarray(position_m, "<f4").tobytes()
+    if estimate_m is None:
+        return header(tick, len(position_m), 2) + first
+    second = bytes(-len(first) % wire.ALIGNMENT) + np.asarray(estimate_m, "<f4").tobytes()
+    return header(tick, len(position_m), 2, flags=wire.ESTIMATES) + first + second
+
+
+def vehicles(tick: int, names: dict[int, str], **fields: int) -> bytes:
+    rows = np.zeros(len(names), wire.VEHICLE_META)
+    for row, (id_hash, name) in zip(rows, names.items(), strict=True):
+        text = name.encode()
+        row["id_hash"], row["id_len"], row["id"] = id_hash, len(text), np.void(text.ljust(64, b"\0"))
+    return header(tick, len(names), 0, **fields) + rows.tobytes()
+
+
+def signals(tick: int, letters: dict[int, str]) -> bytes:
+    rows = np.zeros(len(letters), wire.SIGNAL_META)
+    for row, (id_hash, state) in zip(rows, letters.items(), strict=True):
+        row["id_hash"], row["links"], row["state"] = id_hash, len(state), np.void(state.encode().ljust(128, b"\0"))
+    return header(tick, len(letters), 0) + rows.tobytes()
+
+
+def event(tick: int, positions_m: np.ndarray) -> bytes:
+    rows = np.zeros(len(positions_m), wire.COLLISION)
+    rows["position_m"] = positions_m
+    return header(tick, len(rows), 0) + rows.tobytes()
+
+
+def pointcloud(tick: int, points: dict[str, Any], **scan: Any) -> bytes:
+    head = np.zeros(1, wire.SCAN)
+    for name, value in ({"range_m": 50.0} | scan).items():
+        head[name] = value
+    rows = np.zeros(len(points["position_m"]), wire.LIDAR_POINT)
+    for name, value in points.items():
+        rows[name] = value
+    payload = head.tobytes() + bytes(-wire.SCAN.itemsize % wire.ALIGNMENT) + rows.tobytes()
+    return header(tick, len(rows), 0) + payload

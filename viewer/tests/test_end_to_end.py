@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -17,13 +18,14 @@ import numpy as np
 import pytest
 import zenoh
 
-from caraware_viewer import scene
-from caraware_viewer.link import LatestFrames, RunKey
+from caraware_viewer import canvas, plots, scene, static_map, top
+from caraware_viewer.link import LatestFrames, RunKey, Sample, encoded
 
 RUN = RunKey("a run/with #odd? $name*", 0)
 MAP = {"run": RUN.run, "tick_s": 0.1, "map": {"bounds_m": [0.0, 0.0, 220.0, 200.0]}}
 STATUS = {"tick": 2, "training": {"updates": 3, "policy_std": 0.5, "reward": 0.25}, "processes": []}
 TRUTH = np.array([[10.0, 20.0], [30.0, 40.0]], np.float32)
+VEHICLE = "flow#1/car *?$ ü"
 GNSS_OFFSET_M = np.array([3.0, 4.0], np.float32)
 
 
@@ -42,18 +44,23 @@ class StandIn:
             config.insert_json5(key, json.dumps(value))
         self.session = zenoh.open(config)
         self.endpoint = f"tcp/127.0.0.1:{port}"
+        self.sent = 0
         key = f"{RUN.prefix}/map"
         self._map = self.session.declare_queryable(key, lambda query: query.reply(key, json.dumps(MAP)))
         self.token = self.session.liveliness().declare_token(f"{RUN.prefix}/alive")
 
     def put(self, topic: str, payload: bytes) -> None:
-        self.session.put(f"{RUN.prefix}/{topic}", payload)
+        self.session.put(f"{RUN.prefix}/{topic}", payload, attachment=struct.pack("<QQ", self.sent, time.time_ns()))
+        self.sent += 1
 
     def publish(self, tick: int) -> None:
+        self.put("vehicles", frames.vehicles(tick, {100: VEHICLE}))
         self.put("world", frames.world(tick))
         self.put("observation", frames.observation(tick, TRUTH, TRUTH + GNSS_OFFSET_M))
         self.put("prediction", frames.prediction(tick, TRUTH + 1))
         self.put("status", json.dumps(STATUS).encode())
+        points = {"position_m": [[1, 2, 3]], "tag": [4]}
+        self.put(f"pointcloud/{encoded(VEHICLE)}", frames.pointcloud(tick, points, id_hash=100))
 
 
 @pytest.fixture
@@ -97,10 +104,10 @@ def test_a_run_becomes_a_recording(fanout: StandIn, tmp_path: Path) -> None:
 
     rerun("verify", str(file))
     listing = rerun("print", "-vv", str(file))
-    drawn = [scene.VEHICLES, scene.GNSS, scene.PREDICTIONS, scene.LINKS, scene.POLICY_ERROR, scene.GNSS_ERROR]
-    for path in [*drawn, scene.BOUNDS, scene.POLICY_STD, scene.REWARD]:
+    drawn = [top.OUTLINES, top.GNSS, top.PREDICTIONS, top.CLOUD, plots.POLICY_ERROR, plots.GNSS_ERROR, scene.HUD]
+    for path in [*drawn, static_map.BOUNDS, plots.STD, plots.REWARD]:
         assert f"/{path}" in listing, path
-    assert scene.TIMELINE in listing
+    assert canvas.TIMELINE in listing
 
 
 def stand_in_process(port: int) -> subprocess.Popen[str]:
@@ -148,21 +155,49 @@ def test_what_is_no_endpoint_is_a_usage_error() -> None:
     assert "tcp/HOST:PORT" in output
 
 
-@pytest.mark.parametrize("name", ["town-1", "a/b", "#?$*", "ü €", "", "%", "100%"])
-def test_any_name_makes_a_key_and_comes_back(name: str) -> None:
-    key = RunKey(name, 3)
-    assert str(zenoh.KeyExpr(f"{key.prefix}/alive")) == f"{key.prefix}/alive"
-    assert RunKey.of_alive_key(f"{key.prefix}/alive") == key
+def odd_names() -> list[str]:
+    """Those that have been trouble, and random ones over all of Unicode."""
+    random = np.random.default_rng(5)
+    codes = [random.integers(0, 0x10FFFF, size=int(random.integers(1, 12))) for _ in range(200)]
+    drawn = ["".join(chr(int(code)) for code in row if not 0xD800 <= code < 0xE000) for row in codes]
+    ascii_names = ["".join(chr(int(code)) for code in random.integers(0, 128, size=6)) for _ in range(200)]
+    return ["town-1", "a/b", "#?$*", "ü €", "", "%", "100%", "~.-_", *drawn, *ascii_names]
 
 
-def test_only_the_newest_frame_of_a_topic_is_kept() -> None:
+def test_any_name_makes_a_key_and_comes_back() -> None:
+    parts = {}
+    for name in odd_names():
+        key = RunKey(name, 3)
+        assert str(zenoh.KeyExpr(f"{key.prefix}/alive")) == f"{key.prefix}/alive"
+        assert RunKey.of_alive_key(f"{key.prefix}/alive") == key
+        assert parts.setdefault(encoded(name), name) == name
+
+
+def test_only_the_newest_sample_of_a_topic_is_kept() -> None:
     latest = LatestFrames()
     for payload in (b"1", b"2", b"3"):
-        latest.store("world", payload)
-    latest.store("status", b"s")
-    assert latest.take(0) == {"world": b"3", "status": b"s"}
+        latest.store("world", Sample(payload))
+    latest.add("world", Sample(b"older"))
+    latest.add("status", Sample(b"s"))
+    assert latest.take(0) == {"world": Sample(b"3"), "status": Sample(b"s")}
     assert latest.take(0) == {}
     assert latest.skipped["world"] == 2
+
+
+def test_gaps_in_the_numbers_are_losses_and_a_jump_back_is_a_new_fan_out() -> None:
+    latest = LatestFrames()
+    for sequence in (5, 6, 9, 0, 1, 3):
+        latest.store("world", Sample(b"", sequence))
+    latest.store("status", Sample(b"", 100))
+    latest.store("event", Sample(b""))
+    assert latest.lost == 2 + 1
+
+
+def test_an_age_that_cannot_be_is_not_told() -> None:
+    now_ns = time.time_ns()
+    assert 100 <= Sample(b"", 0, now_ns - 100_000_000).age_ms() < 50_000
+    for sample in (Sample(b""), Sample(b"", 0, 0), Sample(b"", 0, now_ns + 3_600_000_000_000)):
+        assert np.isnan(sample.age_ms())
 
 
 def test_a_close_ends_the_wait() -> None:

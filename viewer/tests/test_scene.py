@@ -1,36 +1,275 @@
-"""Geometry of what is drawn."""
+"""Frames become entities: what is logged is read back from a recording."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import frames
 import numpy as np
+import pytest
+import recordings
+import rerun as rr
 
-from caraware_viewer import wire
-from caraware_viewer.scene import on_screen, outlines_m
+from caraware_viewer import plots, scene, space, static_map, top, wire
+from caraware_viewer.layout import blueprint
+from caraware_viewer.link import Sample
+from caraware_viewer.scene import Scene
+
+TRUTH = np.array([[10.0, 20.0], [30.0, 40.0]], np.float32)
+SCENE = {
+    "lanes": [
+        {"id": "a_0", "kind": "sidewalk", "inside": False, "width_m": 2.0, "right": "none", "left": "none"},
+        {"id": "a_1", "kind": "car", "inside": False, "width_m": 3.2, "right": "solid", "left": "dashed"},
+        {"id": ":j_0", "kind": "car", "inside": True, "width_m": 3.2, "right": "solid", "left": "solid"},
+        {"id": ":j_c0", "kind": "crossing", "inside": True, "width_m": 4.0, "right": "none", "left": "none"},
+    ],
+    "areas": [
+        {"id": "j", "kind": "junction", "points_m": [[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]]},
+        {"id": "w", "kind": "walking_area", "points_m": [[0, 0, 0], [2, 0, 0], [2, 2, 0]]},
+    ],
+    "buildings": [
+        {"id": "b", "kind": "building", "points_m": [[50, 50], [60, 50], [60, 60]], "base_m": 1, "height_m": 8},
+    ],
+    "obstacles": [{"kind": "cone", "center_m": [1, 2, 0], "yaw_rad": 0.5, "size_m": [0.4, 0.4, 0.7]}],
+    "signals": [
+        {
+            "id": "j",
+            "id_hash": "0x0000000000000009",
+            "links": [
+                {"link": 0, "lane": "a_1", "position_m": [48.0, 3.0, 0.0], "yaw_rad": 0.0},
+                {"link": 2, "lane": "a_1", "position_m": [48.0, 6.0, 0.0], "yaw_rad": 0.0},
+            ],
+        }
+    ],
+}
+for lane in SCENE["lanes"]:
+    lane["points_m"] = [[0.0, 1.0, 0.5], [20.0, 1.0, 0.5]]
+MAP: dict[str, Any] = {
+    "run": "a run",
+    "run_id": f"{frames.RUN_ID:#018x}",
+    "mode": "train",
+    "tick_s": 0.1,
+    "map": {"bounds_m": [0.0, 0.0, 220.0, 200.0]},
+    "scene": SCENE,
+}
+STATUS = {
+    "tick": 2,
+    "episode": 1,
+    "step": 3,
+    "ticks_per_s": 50.0,
+    "real_time_factor": 5.0,
+    "road_users": {"cav": 4, "other": 1, "person": 0, "hero": 1},
+    "training": {"updates": 3, "policy_std": 0.5, "reward": 0.25, "best_reward": 0.75, "env_steps_per_s": 1234.0},
+}
+
+Drawn = Callable[..., tuple[Scene, dict[str, recordings.Entity]]]
 
 
-def states(**fields: float) -> np.ndarray:
-    row = np.zeros(1, wire.VEHICLE_STATE)
-    values = {"x_m": 10, "y_m": 20, "length_m": 5, "width_m": 2, "rear_overhang_m": 1}
-    for name, value in (values | fields).items():
-        row[name] = value
-    return row
+@pytest.fixture
+def drawn(tmp_path: Path) -> Drawn:
+    """Draws samples into a recording and reads it back."""
+
+    def draw(*samples: tuple[str, bytes], run_map: dict[str, Any] = MAP, **options: Any) -> tuple[Scene, dict]:
+        recording = rr.RecordingStream("test", recording_id="test")
+        path = tmp_path / "run.rrd"
+        recording.save(path, default_blueprint=blueprint(run_map["map"]["bounds_m"]))
+        drawing = Scene(recording, run_map, **options)
+        for topic, payload in samples:
+            drawing.draw(topic, Sample(payload))
+        recording.flush()
+        recording.disconnect()
+        return drawing, recordings.read(path)
+
+    return draw
 
 
-def test_a_vehicle_reaches_from_its_rear_overhang_to_its_front() -> None:
-    outline = outlines_m(states())[0]
-    np.testing.assert_allclose(outline, [[9, 21], [14, 21], [14, 19], [9, 19], [9, 21]], atol=1e-5)
+def near(entity: recordings.Entity, component: str, expected: Any) -> None:
+    np.testing.assert_allclose(np.array(entity.newest(component)), np.array(expected), atol=1e-4)
 
 
-def test_heading_turns_it_counter_clockwise() -> None:
-    outline = outlines_m(states(yaw_rad=np.pi / 2))[0]
-    np.testing.assert_allclose(outline, [[9, 19], [9, 24], [11, 24], [11, 19], [9, 19]], atol=1e-5)
+def test_the_static_map_is_drawn_once(drawn: Drawn) -> None:
+    _, found = drawn()
+    near(found[static_map.ROADS], "LineStrips2D:radii", [1.6, 1.6])
+    near(found[static_map.ROADS], "LineStrips2D:strips", [[[0, -1], [20, -1]]] * 2)
+    near(found[static_map.WALKS], "LineStrips2D:radii", [1.0])
+    assert len(found[static_map.MARKINGS].newest("LineStrips2D:strips")) == 1 + 3  # solid, and three dashes in 20 m
+    assert len(found[static_map.CROSSINGS].newest("LineStrips2D:strips")) == 20
+    for path in (static_map.JUNCTIONS, static_map.WALKS + "/areas", static_map.BUILDINGS, static_map.BOUNDS):
+        assert found[path].newest("LineStrips2D:strips")
+    heights = {point[2] for point in found[static_map.SPACE_BUILDINGS].newest("Mesh3D:vertex_positions")}
+    assert heights == {1.0, 9.0}
+    near(found[static_map.SPACE_OBSTACLES], "Boxes3D:centers", [[1, 2, 0.35]])
+    assert all(at == recordings.ALWAYS for at, _ in found[static_map.ROADS].rows)
 
 
-def test_a_pedestrian_stands_in_its_centre() -> None:
-    outline = outlines_m(states(kind=wire.PERSON, length_m=0.5, width_m=0.5, rear_overhang_m=0))[0]
-    np.testing.assert_allclose(outline.mean(axis=0)[0], 10, atol=0.1)
-    np.testing.assert_allclose([outline.min(axis=0), outline.max(axis=0)], [[9.75, 19.75], [10.25, 20.25]], atol=1e-5)
+def test_a_map_without_a_scene_has_its_bounds(drawn: Drawn) -> None:
+    _, found = drawn(run_map={"tick_s": 0.1, "map": MAP["map"]})
+    assert static_map.BOUNDS in found
+    assert static_map.ROADS not in found
 
 
-def test_up_on_the_screen_is_north() -> None:
-    np.testing.assert_array_equal(on_screen(np.array([[1.0, 2.0]])), [[1, -2]])
+@pytest.mark.parametrize("scene_part", [{"lanes": [{}]}, {"signals": [{"id": "j"}]}, {"buildings": [{"points_m": 3}]}])
+def test_a_map_that_lacks_what_is_needed_is_refused(drawn: Drawn, scene_part: dict) -> None:
+    with pytest.raises(wire.FrameError, match="map"):
+        drawn(run_map=MAP | {"scene": scene_part})
+
+
+def test_vehicles_are_a_few_entities_whatever_their_number(drawn: Drawn) -> None:
+    _, few = drawn(("world", frames.world(0, 3)))
+    _, many = drawn(("world", frames.world(0, 2000)))
+    assert few.keys() == many.keys()
+    assert len(many[top.OUTLINES].newest("LineStrips2D:strips")) == 2000
+    assert len(many[top.OUTLINES].newest("LineStrips2D:colors")) == 2000
+
+
+def test_kinds_have_colours_of_their_own(drawn: Drawn) -> None:
+    kinds = [wire.CAV, wire.OTHER, wire.PERSON, wire.HERO, 77]
+    _, found = drawn(("world", frames.world(0, 5, kind=kinds)))
+    assert found[top.OUTLINES].newest("LineStrips2D:colors") == top.KIND_COLORS[[0, 1, 2, 3, 3]].tolist()
+
+
+def test_signals_of_vehicles_and_lights_are_drawn(drawn: Drawn) -> None:
+    _, found = drawn(
+        ("world", frames.world(0, 1, signals=1 | 8)),
+        ("signals", frames.signals(0, {9: "rGy", 10: "rrr"})),
+        ("signals", frames.signals(1, {9: "Gru"})),
+    )
+    assert len(found[top.BLINKERS].newest("Points2D:positions")) == 2
+    assert len(found[top.BRAKES].newest("Points2D:positions")) == 2
+    near(found[top.SIGNALS], "Points2D:positions", [[48, -3], [48, -6]])
+    assert [row["Points2D:colors"] for _, row in found[top.SIGNALS].rows] == [
+        [top.SIGNAL_COLORS["r"], top.SIGNAL_COLORS["y"]],
+        [top.SIGNAL_COLORS["G"], top.SIGNAL_COLORS["u"]],
+    ]
+
+
+def test_guesses_are_linked_to_their_vehicles(drawn: Drawn) -> None:
+    _, found = drawn(
+        ("observation", frames.observation(2, TRUTH, TRUTH + np.array([3, 4]))),
+        ("prediction", frames.prediction(2, TRUTH + np.array([0, 2]), TRUTH + np.array([1, 0]))),
+    )
+    for path, offset in ((top.GNSS, [3, 4]), (top.PREDICTIONS, [0, 2]), (top.ESTIMATES, [1, 0])):
+        near(found[path], "Points2D:positions", (TRUTH + offset) * [1, -1])
+        near(found[path + "/links"], "LineStrips2D:strips", np.stack([TRUTH + offset, TRUTH], axis=1) * [1, -1])
+    for path, error in ((plots.GNSS_ERROR, 5), (plots.POLICY_ERROR, 2), (plots.EKF_ERROR, 1)):
+        near(found[path], "Scalars:scalars", [error])
+        assert found[path].rows[-1][0] == pytest.approx(0.3)
+
+
+def test_an_estimate_that_is_not_a_number_is_left_out(drawn: Drawn) -> None:
+    estimates = np.array([[np.nan, np.nan], [31.0, 40.0]])
+    _, found = drawn(
+        ("prediction", frames.prediction(2, TRUTH, estimates)),
+        ("observation", frames.observation(2, TRUTH, TRUTH)),
+    )
+    near(found[top.ESTIMATES], "Points2D:positions", [[31, -40]])
+
+
+def test_a_drivers_actions_are_not_drawn_as_positions(drawn: Drawn) -> None:
+    _, found = drawn(
+        ("world", frames.world(1, 2, kind=wire.HERO)),
+        ("observation", frames.observation(2, TRUTH, TRUTH)),
+        ("prediction", frames.prediction(2, TRUTH)),
+    )
+    assert top.PREDICTIONS not in found
+    assert not [row for _, row in found[plots.POLICY_ERROR].rows if "Scalars:scalars" in row]
+
+
+def test_the_vehicle_looked_at_is_the_origin_of_the_3d_view(drawn: Drawn) -> None:
+    _, found = drawn(
+        ("vehicles", frames.vehicles(0, {101: "cav 1", 100: "cav 0"})),
+        ("world", frames.world(0, 3, yaw_rad=np.pi / 2)),
+        wanted=["cav 1"],
+    )
+    turn = np.array(found[space.WORLD].newest("Transform3D:mat3x3")[0]).reshape(3, 3).T
+    move = np.array(found[space.WORLD].newest("Transform3D:translation")[0])
+    np.testing.assert_allclose(turn @ [10, 50, 0] + move, [0, 0, 0], atol=1e-4)
+    np.testing.assert_allclose(turn @ [10, 55, 0] + move, [5, 0, 0], atol=1e-4)
+    assert len(found[space.VEHICLES].newest("Boxes3D:centers")) == 3
+    ring = np.array(found[top.LOOKED_AT].newest("LineStrips2D:strips"))
+    np.testing.assert_allclose(ring[0].mean(axis=0), [10, -50], atol=0.2)
+
+
+def test_a_cloud_is_drawn_in_the_world_with_its_range(drawn: Drawn) -> None:
+    points = {"position_m": [[5, 0, 0], [0, 5, 0]], "tag": [4, 0]}
+    seen = frames.pointcloud(1, points, position_m=[10.0, 50.0, 2.0], id_hash=101)
+    samples = [
+        ("vehicles", frames.vehicles(0, {101: "x/y", 100: "other"})),
+        ("world", frames.world(0, 3, x_m=10.0)),
+        ("pointcloud/x%2Fy", seen),
+        ("pointcloud/other", frames.pointcloud(1, points, id_hash=100)),
+    ]
+    drawing, found = drawn(*samples, wanted=["x/y"])
+    assert drawing.clouds_wanted() == ["x/y"]
+    near(found[top.CLOUD], "Points2D:positions", [[15, -50]])
+    near(found[space.CLOUD], "Points3D:positions", [[15, 50, 2]])
+    ring = np.array(found[top.RING].newest("LineStrips2D:strips")[0])
+    np.testing.assert_allclose(np.hypot(*(ring - [10, -50]).T), 50, atol=1e-3)
+    _, whole = drawn(*samples, wanted=["x/y"], lidar="all")
+    assert len(whole[top.CLOUD].newest("Points2D:positions")) == 2
+    drawing, _ = drawn(*samples[:2], wanted=["x/y"], lidar="off")
+    assert drawing.clouds_wanted() == []
+
+
+def test_contacts_stay_for_a_while(drawn: Drawn) -> None:
+    _, found = drawn(
+        ("event", frames.event(5, np.array([[1.0, 2.0, 0.0]]))),
+        ("world", frames.world(5)),
+        ("world", frames.world(54)),
+        ("world", frames.world(56)),
+    )
+    assert [len(row["Points2D:positions"]) for _, row in found[top.CONTACTS].rows] == [1, 1, 0]
+
+
+def test_the_status_is_plotted_and_told(drawn: Drawn) -> None:
+    _, found = drawn(("status", json.dumps(STATUS).encode()), ("world", frames.world(2)))
+    for path, value in ((plots.STD, 0.5), (plots.REWARD, 0.25), (plots.STEPS, 250.0), (plots.REAL_TIME, 5.0)):
+        near(found[path], "Scalars:scalars", [value])
+    text = found[scene.HUD].newest("TextDocument:text")[0]
+    for part in ("a run", "train", "0.750 best", "1 234 samples/s", "5.0 × real time", "1 obstacles"):
+        assert part in text
+
+
+def test_a_run_without_a_learner_has_no_policy_plots(drawn: Drawn) -> None:
+    _, found = drawn(("status", json.dumps(STATUS | {"training": None}).encode()))
+    assert not [row for _, row in found[plots.STD].rows if "Scalars:scalars" in row]
+
+
+def test_every_topic_may_be_missing(drawn: Drawn) -> None:
+    _, found = drawn(("world", frames.world(0, 0)))
+    assert found[scene.HUD].newest("TextDocument:text")
+
+
+def test_seeking_is_in_simulated_time_over_episodes(drawn: Drawn) -> None:
+    _, found = drawn(*(("world", frames.world(tick)) for tick in (0, 9, 99)))
+    assert [at for at, _ in found[top.OUTLINES].rows] == pytest.approx([0.1, 1.0, 10.0])
+
+
+def test_frames_of_another_run_are_refused(drawn: Drawn) -> None:
+    other = frames.header(0, 0, 0, run_id=8)
+    for topic in ("world", "vehicles", "signals", "event", "pointcloud/x"):
+        with pytest.raises(scene.AnotherRun):
+            drawn((topic, other))
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"{", b"[]", b"null", b'{"tick": null}', b'{"tick": 1, "training": 3}', b"\xff"]
+)
+def test_a_status_that_is_none_is_refused(drawn: Drawn, payload: bytes) -> None:
+    with pytest.raises(wire.FrameError):
+        drawn(("status", payload))
+
+
+def test_random_bytes_are_refused_on_every_topic(drawn: Drawn) -> None:
+    random = np.random.default_rng(3)
+    recording = rr.RecordingStream("test", recording_id="garbage")
+    drawing = Scene(recording, MAP)
+    for topic in ("world", "observation", "prediction", "status", "vehicles", "signals", "event", "pointcloud/a"):
+        for size in (0, 1, 71, 72, 500, 4000):
+            with pytest.raises(wire.FrameError):
+                drawing.draw(topic, Sample(random.bytes(size)))
+            with pytest.raises(wire.FrameError):
+                drawing.draw(topic, Sample(frames.header(0, 2**32 - 1, 2**32 - 1) + random.bytes(size)))

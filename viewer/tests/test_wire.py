@@ -14,7 +14,18 @@ from caraware_viewer import wire
 LAYOUT = Path(__file__).parents[2] / "ipc-schema" / "layout.json"
 
 
-@pytest.mark.parametrize(("name", "dtype"), [("MessageHeader", wire.HEADER), ("VehicleState", wire.VEHICLE_STATE)])
+TYPES = {
+    "MessageHeader": wire.HEADER,
+    "VehicleState": wire.VEHICLE_STATE,
+    "VehicleMeta": wire.VEHICLE_META,
+    "SignalMeta": wire.SIGNAL_META,
+    "Collision": wire.COLLISION,
+    "Scan": wire.SCAN,
+    "LidarPoint": wire.LIDAR_POINT,
+}
+
+
+@pytest.mark.parametrize(("name", "dtype"), TYPES.items())
 def test_types_repeat_the_committed_table(name: str, dtype: np.dtype) -> None:
     table = {row["name"]: row for row in json.loads(LAYOUT.read_text())}
     assert dtype.itemsize == table[name]["size"]
@@ -47,7 +58,49 @@ def test_an_empty_slot_is_not_valid() -> None:
     assert wire.decode_observation(bytes(frame)).valid.tolist() == [False]
 
 
-@pytest.mark.parametrize("decode", [wire.decode_world, wire.decode_observation, wire.decode_prediction])
+def test_estimates_follow_predictions_where_the_header_says_so() -> None:
+    position_m = np.arange(10, dtype=np.float32).reshape(5, 2)
+    alone = wire.decode_prediction(frames.prediction(0, position_m))
+    np.testing.assert_array_equal(alone.position_m, position_m)
+    assert alone.estimate_m is None
+    both = wire.decode_prediction(frames.prediction(0, position_m, position_m + 50))
+    np.testing.assert_array_equal(both.position_m, position_m)
+    np.testing.assert_array_equal(both.estimate_m, position_m + 50)
+
+
+def test_rows_come_back() -> None:
+    names = {5: "flow#1/a b", 6: "ü €", 7: ""}
+    rows = wire.decode_rows(frames.vehicles(3, names), wire.VEHICLE_META).rows
+    assert {int(row["id_hash"]): wire.text(row["id"], int(row["id_len"])) for row in rows} == names
+    lights = wire.decode_rows(frames.signals(3, {9: "rGy"}), wire.SIGNAL_META).rows
+    assert [wire.text(row["state"], int(row["links"])) for row in lights] == ["rGy"]
+    contacts = wire.decode_rows(frames.event(3, np.array([[1, 2, 3], [4, 5, 6]])), wire.COLLISION).rows
+    np.testing.assert_array_equal(contacts["position_m"], [[1, 2, 3], [4, 5, 6]])
+
+
+def test_a_cloud_comes_back() -> None:
+    points = {"position_m": np.arange(9).reshape(3, 3), "tag": [0, 4, 6]}
+    seen = wire.decode_cloud(frames.pointcloud(3, points, range_m=80.0, id_hash=11))
+    assert (float(seen.scan["range_m"]), int(seen.scan["id_hash"])) == (80.0, 11)
+    np.testing.assert_array_equal(seen.points["position_m"], points["position_m"])
+    assert seen.points["tag"].tolist() == [0, 4, 6]
+
+
+def test_a_name_that_is_cut_within_a_character_is_still_text() -> None:
+    assert wire.text(np.void("aü".encode()[:2]), 2) == "a\ufffd"
+
+
+@pytest.mark.parametrize(
+    "decode",
+    [
+        wire.decode_world,
+        wire.decode_observation,
+        wire.decode_prediction,
+        wire.decode_cloud,
+        lambda frame: wire.decode_rows(frame, wire.VEHICLE_META),
+        lambda frame: wire.decode_rows(frame, wire.SIGNAL_META),
+    ],
+)
 def test_garbage_is_refused(decode) -> None:
     whole = frames.header(0, 4, 2)
     for frame in (b"", whole[:71], whole, whole + bytes(8), frames.header(0, 2**32 - 1, 2) + bytes(1000)):

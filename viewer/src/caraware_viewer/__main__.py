@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -35,6 +36,8 @@ Exit codes: 0 the run ended or the window was closed, 1 nothing to watch, 2 usag
 def main(arguments: Sequence[str] | None = None) -> int:
     """Watches a run until it ends. Exit code 0: it ended, 1: nothing to watch, 2: usage, 130: interrupted."""
     options = _parser().parse_args(arguments)
+    # Asked to end, it writes what is left, as at Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return watch(options)
     except (LinkError, DisplayError) as error:
@@ -82,8 +85,8 @@ def _add_scene(group: argparse._ArgumentGroup) -> None:
         "--vehicle",
         metavar="ID",
         action="append",
-        help="a vehicle to look at (repeatable): figures and point cloud; the first is in the 3-D view (default: a hero, "
-        "else one with a LIDAR, else the first that senses)",
+        help="a vehicle to look at (repeatable): figures and point cloud; the first is in the 3-D view (default: a "
+        "hero, else one with a LIDAR, else the first that senses)",
     )
     group.add_argument(
         "--lidar",

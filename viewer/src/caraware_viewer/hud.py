@@ -47,7 +47,7 @@ def hud(picture: Picture, run_map: dict[str, Any], looked_at: Sequence[int], sho
 def _run(picture: Picture, run_map: dict[str, Any], shown: Shown) -> str:
     status = picture.status
     training = status.get("training") or {}
-    title = f"### {run_map.get('run', 'run')} · {run_map.get('mode', '')}"
+    title = f"#### {_escaped(str(run_map.get('run', 'run')))} · {run_map.get('mode', '')}"
     title += " · evaluation" if status.get("evaluation") else ""
     rows = [
         ("episode", _text(status.get("episode")) + f" · step {_text(status.get('step'))}"),
@@ -69,7 +69,7 @@ def _run(picture: Picture, run_map: dict[str, Any], shown: Shown) -> str:
     if picture.collisions:
         rows.append(("contacts", f"{picture.collisions} since this viewer joined"))
     rows.append(("viewer", _viewer(shown)))
-    return title + "\n" + _table(("", ""), rows)
+    return title + "\n" + _table(rows[0], rows[1:])
 
 
 def _speed(status: dict[str, Any], training: dict[str, Any]) -> str:
@@ -130,7 +130,7 @@ def _vehicle(picture: Picture, id_hash: int) -> str:
         ("acceleration", _vector(accel, "m/s²")),
         ("rates", _vector(np.degrees(rate), "°/s")),
     ]
-    return f"### {picture.name(id_hash)} ({source})\n" + _table(("", ""), rows)
+    return f"#### {_escaped(picture.name(id_hash))} ({source})\n" + _table(rows[0], rows[1:])
 
 
 def compass_letters(compass_rad: float) -> str:
@@ -156,7 +156,7 @@ def _errors(picture: Picture, looked_at: Sequence[int]) -> str:
         for slot in ordered[:MOST_VEHICLES]
     ]
     rest = f"\n\n… and {len(slots) - MOST_VEHICLES} more" if len(slots) > MOST_VEHICLES else ""
-    return "### error (m)\n" + _table(("vehicle", "policy", "EKF", "GNSS"), rows) + rest
+    return "#### error (m)\n" + _table(("vehicle", "policy", "EKF", "GNSS"), rows) + rest
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:

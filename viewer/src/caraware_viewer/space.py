@@ -1,4 +1,4 @@
-"""The 3-D view: the world below a transform that puts the vehicle looked at into the origin; the camera stays with it."""
+"""The 3-D view: the world below a transform that puts a vehicle into the origin, so the camera stays with it."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -36,27 +37,38 @@ def watch(options: argparse.Namespace) -> int:
         print(f"watching run {run.run} at {options.endpoint}", file=sys.stderr)
         if display is not None and display.page is not None:
             print(f"open {display.page.url} in a browser", file=sys.stderr)
-        ended = _draw_until_over(link, Scene(recording, run_map, options.vehicle, options.lidar), display)
-        # A stalled display is not waited for.
-        with contextlib.suppress(RuntimeError):
-            recording.flush(timeout_sec=_FLUSH_S)
-        if ended:
-            recording.disconnect()
+        drawing = threading.Thread(
+            target=_draw,
+            args=(link, Scene(recording, run_map, options.vehicle, options.lidar)),
+            name="draw",
+            daemon=True,
+        )
+        drawing.start()
+        try:
+            _wait_for_end(drawing, link, display)
+        finally:
+            link.frames.close()
+            drawing.join(_FLUSH_S)
+            _finish(recording, stalled=drawing.is_alive())
     print(f"run {run.run} has ended" if link.frames.ended else "the display was closed", file=sys.stderr)
     return 0
 
 
-def _draw_until_over(link: Link, scene: Scene, display: Display | None) -> bool:
-    """Draws until the run or the display ends; false if drawing hangs in a display that takes nothing."""
-    drawing = threading.Thread(target=_draw, args=(link, scene), name="draw", daemon=True)
-    drawing.start()
-    while drawing.is_alive():
+def _wait_for_end(drawing: threading.Thread, link: Link, display: Display | None) -> None:
+    """Waits until the run has ended and is drawn, or the display was closed."""
+    while drawing.is_alive() and not (display is not None and display.closed):
         drawing.join(_LOOK_S)
-        if display is not None and display.closed:
-            link.frames.close()
-            break
-    drawing.join(_FLUSH_S)
-    return not drawing.is_alive()
+
+
+def _finish(recording: rr.RecordingStream, *, stalled: bool) -> None:
+    """Writes what is left; a display that takes nothing is not waited for."""
+    with contextlib.suppress(RuntimeError):
+        recording.flush(timeout_sec=_FLUSH_S)
+    if stalled:
+        print("caraware-viewer: the display takes nothing any more: left it", file=sys.stderr)
+        sys.stderr.flush()
+        os._exit(1)
+    recording.disconnect()
 
 
 def _draw(link: Link, scene: Scene) -> None:

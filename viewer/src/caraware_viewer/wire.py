@@ -224,7 +224,7 @@ class Prediction:
     position_m: NDArray[np.float32]
     """`[n, 2]`: predicted x, y, metres, world frame, one row for each slot of the observation."""
     estimate_m: NDArray[np.float32] | None
-    """`[n, 2]`: where the Kalman filter thinks the vehicle is, metres; NaN where it does not say. `None`: it is not run."""
+    """`[n, 2]`: where the Kalman filter thinks it is, metres; NaN where it does not say. `None`: it is not run."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,225 @@
+//! `caraware view`: finds the run and starts the Python viewer; `--viewer` starts one beside a run.
+
+use std::{
+    os::unix::process::CommandExt as _,
+    path::Path,
+    process::{Child, Command, Stdio},
+    time::{Duration, Instant},
+};
+
+use ipc_schema::run::RunFile;
+use rustix::process::{Pid, Signal, kill_process_group};
+
+use crate::{
+    cli::{ViewArgs, ViewerKind},
+    failure::Exit,
+    install, registry,
+};
+
+/// The Python package that shows a run.
+const MODULE: &str = "caraware_viewer";
+/// What a viewer beside a run waits for its first tick, seconds.
+const FIRST_TICK_WITHIN_S: &str = "120";
+/// Longest time from the end of a run to the end of its viewer.
+const LEAVE_WITHIN: Duration = Duration::from_secs(8);
+/// Time between two looks at a leaving viewer.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Shows a run until it ends: this process becomes the viewer.
+///
+/// # Errors
+/// No such run, one that is not fanned out, or no viewer on this machine.
+pub fn view(args: &ViewArgs) -> Result<(), Exit> {
+    let target = Target::find(args.endpoint.as_deref())?;
+    let mut command = viewer(&target)?;
+    command.args(args.env.map(|env| format!("--env={env}")));
+    command.args(args.web.then_some("--web"));
+    command.args(args.web_port.map(|port| format!("--web-port={port}")));
+    command.args(args.save.as_ref().map(|path| format!("--save={}", path.display())));
+    command.args(args.vehicle.iter().map(|id| format!("--vehicle={id}")));
+    command.args(args.lidar.as_ref().map(|points| format!("--lidar={points}")));
+    if let Some(name) = &args.run {
+        command.arg(format!("--run={name}"));
+    }
+    let error = command.exec();
+    Err(Exit::missing(
+        format!("cannot start {}: {error}", command.get_program().to_string_lossy()),
+        "run `make build`, then `caraware doctor`",
+    ))
+}
+
+/// Where a run is fanned out.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Target {
+    endpoint: String,
+    /// Its name, where it is known; else the viewer takes the only one there.
+    run: Option<String>,
+}
+
+impl Target {
+    /// An endpoint as it stands; else a run of this machine, by name or the only one.
+    fn find(text: Option<&str>) -> Result<Self, Exit> {
+        if let Some(endpoint) = text.filter(|text| is_endpoint(text)) {
+            return Ok(Self {
+                endpoint: endpoint.to_owned(),
+                run: None,
+            });
+        }
+        if let Some(address) = text.filter(|text| looks_like_address(text)) {
+            return Err(Exit::config(
+                format!("`{address}` is no endpoint"),
+                format!("write the protocol too: caraware view tcp/{address}"),
+            ));
+        }
+        registry::find(text).and_then(|run| Self::of(&run))
+    }
+
+    fn of(run: &RunFile) -> Result<Self, Exit> {
+        if !run.config.fanout.enabled {
+            return Err(Exit::config(
+                format!("{} shows nothing: its `fanout.enabled` is false", run.name),
+                "start it without `--set fanout.enabled=false`",
+            ));
+        }
+        Ok(Self {
+            endpoint: run.config.fanout.listen.clone(),
+            run: Some(run.name.clone()),
+        })
+    }
+}
+
+/// `tcp/host:port` and its like.
+fn is_endpoint(text: &str) -> bool {
+    text.split_once('/').is_some_and(|(protocol, address)| {
+        !protocol.is_empty()
+            && protocol.chars().all(|c| c.is_ascii_lowercase() || c == '-')
+            && looks_like_address(address)
+    })
+}
+
+/// `host:port`.
+fn looks_like_address(text: &str) -> bool {
+    text.rsplit_once(':')
+        .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok())
+}
+
+/// The command of a viewer of `target`, checked to be installed.
+fn viewer(target: &Target) -> Result<Command, Exit> {
+    let python = install::python(&install::programs()?)?;
+    check_installed(&python)?;
+    let mut command = Command::new(python);
+    command.args(["-m", MODULE, &target.endpoint]);
+    command.args(target.run.as_ref().map(|name| format!("--run={name}")));
+    Ok(command)
+}
+
+fn check_installed(python: &Path) -> Result<(), Exit> {
+    let script = format!(
+        "import importlib.util as u, sys; sys.exit(' '.join(p for p in ('{MODULE}', 'rerun', 'zenoh') if u.find_spec(p) is None))"
+    );
+    let help = "run `make build`; elsewhere, with Python alone: pip install ./viewer";
+    let output = Command::new(python)
+        .args(["-c", &script])
+        .stdin(Stdio::null())
+        .output()
+        .map_err(|error| Exit::missing(format!("cannot start {}: {error}", python.display()), help))?;
+    match String::from_utf8_lossy(&output.stderr).trim() {
+        "" => Ok(()),
+        absent => Err(Exit::missing(
+            format!("the viewer is not installed for {}: {absent}", python.display()),
+            help,
+        )),
+    }
+}
+
+/// A viewer beside a run: it ends with the run, and its own end disturbs nobody.
+#[derive(Debug)]
+pub struct Beside {
+    child: Child,
+}
+
+impl Beside {
+    /// Starts a viewer that waits for the first tick of `run`, in a process group of its own: Ctrl-C ends the run, and the run's end
+    /// the viewer.
+    ///
+    /// # Errors
+    /// The run is not fanned out, or no viewer is installed.
+    pub fn start(run: &RunFile, kind: ViewerKind) -> Result<Self, Exit> {
+        let mut command = viewer(&Target::of(run)?)?;
+        command.args(["--timeout", FIRST_TICK_WITHIN_S]);
+        command.args((kind == ViewerKind::Web).then_some("--web"));
+        command.stdin(Stdio::null()).process_group(0);
+        let child = command.spawn().map_err(|error| {
+            Exit::missing(
+                format!("cannot start the viewer: {error}"),
+                "run `make build`, then `caraware doctor`",
+            )
+        })?;
+        Ok(Self { child })
+    }
+
+    fn has_left(&mut self) -> bool {
+        !matches!(self.child.try_wait(), Ok(None))
+    }
+
+    fn signal(&self, signal: Signal) {
+        if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw)
+            && let Err(error) = kill_process_group(pid, signal)
+        {
+            tracing::debug!(%error, "cannot signal the viewer");
+        }
+    }
+}
+
+impl Drop for Beside {
+    /// Lets it draw what is left, then ends it.
+    fn drop(&mut self) {
+        for signal in [Signal::TERM, Signal::KILL] {
+            if self.has_left() {
+                return;
+            }
+            self.signal(signal);
+            let deadline = Instant::now() + LEAVE_WITHIN;
+            while Instant::now() < deadline && !self.has_left() {
+                std::thread::park_timeout(LOOK);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn endpoints_and_names_are_told_apart() {
+        for endpoint in [
+            "tcp/127.0.0.1:7447",
+            "tls/host.example:7448",
+            "tcp/[::1]:7447",
+            "unixsock-stream/x:1",
+        ] {
+            assert!(is_endpoint(endpoint), "{endpoint}");
+        }
+        for other in [
+            "town-1",
+            "host:7447",
+            "tcp/host",
+            "tcp/host:port",
+            "tcp/:7447",
+            "/host:1",
+            "TCP/host:1",
+            "a/b",
+        ] {
+            assert!(!is_endpoint(other), "{other}");
+        }
+    }
+
+    #[test]
+    fn an_address_without_protocol_is_told_how_to_be_written() {
+        let Err(Exit::Failure(failure)) = Target::find(Some("laptop:7447")) else {
+            unreachable!("an address is no run");
+        };
+        assert!(failure.help.is_some_and(|help| help.contains("tcp/laptop:7447")));
+    }
+}

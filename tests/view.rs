@@ -1,0 +1,90 @@
+//! `caraware view` says what is wrong, and a viewer beside a run ends with it without disturbing it.
+
+#![allow(clippy::unwrap_used, reason = "tests and measurements assert by unwrapping")]
+
+mod common;
+
+use std::net::TcpListener;
+
+use common::{Workplace, text};
+
+fn free_endpoint() -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    format!("tcp/{}", listener.local_addr().unwrap())
+}
+
+#[test]
+fn nothing_to_watch_is_said_with_what_to_do() {
+    let workplace = Workplace::new();
+    let endpoint = free_endpoint();
+    for (arguments, exit_code, parts) in [
+        (vec!["view"], 2, ["no run is alive", "caraware train"]),
+        (vec!["view", "town-7"], 2, ["no run named `town-7`", "alive: none"]),
+        (
+            vec!["view", "host:7447"],
+            2,
+            ["`host:7447` is no endpoint", "tcp/host:7447"],
+        ),
+        (
+            vec!["view", &endpoint, "--save", "unused.rrd"],
+            1,
+            ["nothing answers", "fanout.listen"],
+        ),
+    ] {
+        let output = workplace.run(&arguments);
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(exit_code), "{arguments:?}: {said}");
+        for part in parts {
+            assert!(said.contains(part), "`{part}` is not in: {said}");
+        }
+        assert!(!said.contains("Traceback"), "{said}");
+    }
+}
+
+#[test]
+fn a_python_without_the_viewer_is_said() {
+    let workplace = Workplace::new();
+    let bare = workplace.write("python", "#!/bin/sh\necho caraware_viewer rerun >&2\nexit 1\n");
+    std::fs::set_permissions(&bare, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
+    let output = workplace
+        .command(&["view", "tcp/127.0.0.1:1"])
+        .env("CARAWARE_PYTHON", &bare)
+        .output()
+        .unwrap();
+    let said = text(&output);
+    assert_eq!(output.status.code(), Some(3), "{said}");
+    assert!(said.contains("pip install ./viewer"), "{said}");
+}
+
+/// The viewer draws into a page that nobody opens, and leaves with the run; the run is as it is without.
+#[test]
+fn a_viewer_beside_a_run_changes_nothing() {
+    let workplace = Workplace::new();
+    let endpoint = format!("fanout.listen={}", free_endpoint());
+    let run = |name: &'static str, more: &[&str]| {
+        let mut arguments = vec![
+            "simulate",
+            "--name",
+            name,
+            "--set",
+            "episode.ticks=60",
+            "--set",
+            &endpoint,
+        ];
+        arguments.extend([
+            "--set",
+            "run.real_time_factor=1.0",
+            "--set",
+            "episode.training_episodes=1",
+        ]);
+        arguments.extend(more);
+        let output = workplace.succeed(&arguments);
+        (workplace.report(name)["observation_hash"].clone(), text(&output))
+    };
+    let (alone, _) = run("alone", &[]);
+    let (watched, said) = run("watched", &["--viewer=web"]);
+    assert_eq!(alone, watched);
+    assert!(said.contains("watching run watched"), "{said}");
+    assert!(said.contains("open http://127.0.0.1:"), "{said}");
+    workplace.assert_nothing_left();
+}

@@ -1,0 +1,144 @@
+"""Headless Chromium, driven by the DevTools protocol over a pipe: no package beside the browser is needed."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import select
+import shutil
+import subprocess
+import tempfile
+import time
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+ARGUMENTS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+    "--no-first-run",
+    "--force-device-scale-factor=1",
+    "--remote-debugging-pipe",
+)
+# rerun's page writes tens of thousands of debug messages, each of which would travel through the pipe.
+QUIET = "console.debug = () => {};"
+
+
+def find() -> str:
+    """Path of the browser; fails with what to do if there is none: a test left out would be a test passed."""
+    for name in NAMES:
+        path = shutil.which(name)
+        if path is not None:
+            return path
+    raise RuntimeError("no Chromium: run scripts/browser.sh (Debian and Ubuntu: apt-get install chromium)")
+
+
+class Browser:
+    """One page in a browser with a fresh profile. Use as a context manager."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self._profile = tempfile.TemporaryDirectory(prefix="caraware-browser-", ignore_cleanup_errors=True)
+        to_read, self._write = os.pipe()
+        self._read, to_write = os.pipe()
+        arguments = [find(), *ARGUMENTS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}"]
+        # Chromium reads commands from descriptor 3 and writes answers to 4.
+        shell = ["sh", "-c", f'exec "$@" 3<&{to_read} 4>&{to_write} 2>/dev/null', "sh", *arguments, "about:blank"]
+        self._process = subprocess.Popen(shell, pass_fds=(to_read, to_write), start_new_session=True)
+        os.close(to_read)
+        os.close(to_write)
+        self._buffer = b""
+        self._id = 0
+        self.requests: list[str] = []
+        """Addresses that the page asked for."""
+        self.refused: list[str] = []
+        """What the page wrote to its console about its content security policy."""
+        self._session: str | None = None
+        targets = self.call("Target.getTargets")["targetInfos"]
+        page = next(target for target in targets if target["type"] == "page")
+        self._session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
+        for domain in ("Page", "Network", "Log"):
+            self.call(f"{domain}.enable")
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.call("Emulation.setDeviceMetricsOverride", **metrics)
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=QUIET)
+
+    def open(self, url: str) -> None:
+        """Goes to an address."""
+        self.call("Page.navigate", url=url)
+
+    def evaluate(self, expression: str) -> Any:
+        """Value of a JavaScript expression."""
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def wait_for(self, expression: str, timeout_s: float) -> None:
+        """Waits until an expression is true."""
+        deadline = time.monotonic() + timeout_s
+        while not self.evaluate(expression):
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"{expression} is not true after {timeout_s:g} s")
+            time.sleep(0.1)
+
+    def screenshot(self) -> NDArray[np.uint8]:
+        """What is to be seen, `[height, width, 3]`."""
+        data = self.call("Page.captureScreenshot", format="png", timeout_s=60.0)["data"]
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+
+    def call(self, method: str, timeout_s: float = 30.0, **parameters: Any) -> dict[str, Any]:
+        """Sends a command and waits for its answer."""
+        self._id += 1
+        message: dict[str, Any] = {"id": self._id, "method": method, "params": parameters}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        deadline = time.monotonic() + timeout_s
+        while True:
+            answer = self._receive(deadline, method)
+            if answer.get("id") == self._id:
+                if "error" in answer:
+                    raise RuntimeError(f"{method}: {answer['error']['message']}")
+                return answer["result"]
+            self._note(answer)
+
+    def _note(self, event: dict[str, Any]) -> None:
+        if event.get("method") == "Network.requestWillBeSent":
+            self.requests.append(event["params"]["request"]["url"])
+        elif event.get("method") == "Log.entryAdded" and "Content Security Policy" in event["params"]["entry"]["text"]:
+            self.refused.append(event["params"]["entry"]["text"])
+
+    def _receive(self, deadline: float, method: str) -> dict[str, Any]:
+        while b"\0" not in self._buffer:
+            ready, _, _ = select.select([self._read], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                raise TimeoutError(f"the browser does not answer {method}")
+            chunk = os.read(self._read, 1 << 16)
+            if not chunk:
+                raise RuntimeError(f"the browser ended with exit code {self._process.wait()}")
+            self._buffer += chunk
+        line, _, self._buffer = self._buffer.partition(b"\0")
+        return json.loads(line)
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        os.close(self._write)
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        os.close(self._read)
+        self._profile.cleanup()

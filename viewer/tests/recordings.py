@@ -1,0 +1,42 @@
+"""Recordings read back: what was logged, when, on which entity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rerun.chunk import RrdReader
+
+from caraware_viewer.canvas import TIMELINE
+
+ALWAYS = float("-inf")
+"""Time of what is static."""
+
+
+@dataclass
+class Entity:
+    """Everything logged on one path."""
+
+    rows: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
+    """Simulated time in seconds, values by component ("Points2D:positions")."""
+
+    def newest(self, component: str) -> Any:
+        """Its last value."""
+        return [row[component] for _, row in self.rows if row.get(component) is not None][-1]
+
+
+def read(path: Path) -> dict[str, Entity]:
+    """All entities of a recording, rows in the order of simulated time."""
+    entities: dict[str, Entity] = {}
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        entity = entities.setdefault(chunk.entity_path.removeprefix("/"), Entity())
+        columns = {name: batch.column(name) for name in batch.schema.names if ":" in name}
+        times = batch.column(TIMELINE).cast("int64").to_pylist() if TIMELINE in batch.schema.names else None
+        for index in range(batch.num_rows):
+            at_s = ALWAYS if times is None else times[index] * 1e-9
+            entity.rows.append((at_s, {name: column[index].as_py() for name, column in columns.items()}))
+    for entity in entities.values():
+        entity.rows.sort(key=lambda row: row[0])
+    return entities

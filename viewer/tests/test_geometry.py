@@ -1,0 +1,146 @@
+"""Geometry of what is drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from caraware_viewer import cloud, geometry, static_map, wire
+from caraware_viewer.canvas import on_screen
+
+
+def states(**fields: float) -> np.ndarray:
+    row = np.zeros(1, wire.VEHICLE_STATE)
+    values = {"x_m": 10, "y_m": 20, "length_m": 5, "width_m": 2, "height_m": 1.5, "rear_overhang_m": 1}
+    for name, value in (values | fields).items():
+        row[name] = value
+    return row
+
+
+def test_a_vehicle_reaches_from_its_rear_overhang_to_its_front() -> None:
+    outline = geometry.outlines_m(states())[0]
+    corners, apex = outline[[0, 1, 2, 4]], outline[3]
+    np.testing.assert_allclose(corners, [[9, 21], [9, 19], [14, 19], [14, 21]], atol=1e-5)
+    np.testing.assert_allclose(outline[0], outline[-1])
+    np.testing.assert_allclose(apex, [12, 20], atol=1e-5)
+
+
+def test_heading_turns_it_counter_clockwise() -> None:
+    outline = geometry.outlines_m(states(yaw_rad=np.pi / 2))[0]
+    np.testing.assert_allclose(outline[[0, 1, 2, 4]], [[9, 19], [11, 19], [11, 24], [9, 24]], atol=1e-5)
+
+
+def test_a_pedestrian_stands_in_its_centre() -> None:
+    person = states(kind=wire.PERSON, length_m=0.5, width_m=0.5, rear_overhang_m=0)
+    outline = geometry.outlines_m(person)[0]
+    np.testing.assert_allclose([outline.min(axis=0), outline.max(axis=0)], [[9.75, 19.75], [10.25, 20.25]], atol=1e-5)
+    np.testing.assert_allclose(geometry.centres_m(person)[0], [10, 20, 0.75], atol=1e-5)
+
+
+def test_a_body_stays_inside_its_outline() -> None:
+    car = states(yaw_rad=0.7)
+    body, radius = geometry.bodies_m(car)[0], float(geometry.body_radii_m(car)[0])
+    assert np.linalg.norm(body[1] - body[0]) + 2 * radius == pytest.approx(5.0, abs=1e-5)
+    assert radius < 1.0
+
+
+@pytest.mark.parametrize(
+    ("signals", "expected"),
+    [
+        (0, []),
+        (geometry.BLINKER_LEFT, [[9, 21], [14, 21]]),
+        (geometry.BLINKER_RIGHT, [[9, 19], [14, 19]]),
+        (geometry.BLINKER_BOTH, [[9, 21], [14, 21], [9, 19], [14, 19]]),
+    ],
+)
+def test_blinkers_are_at_the_corners_of_their_side(signals: int, expected: list) -> None:
+    found = geometry.blinkers_m(states(signals=signals))
+    np.testing.assert_allclose(found, np.array(expected).reshape(-1, 2), atol=1e-5)
+
+
+def test_brake_lights_are_at_the_rear() -> None:
+    found = geometry.brake_lights_m(states(signals=geometry.BRAKE | geometry.BLINKER_LEFT))
+    np.testing.assert_allclose(found, [[9, 20.7], [9, 19.3]], atol=1e-5)
+    assert geometry.brake_lights_m(states(signals=geometry.BRAKE, kind=wire.PERSON)).shape == (0, 2)
+
+
+def test_hatching_fills_a_polygon_with_a_notch() -> None:
+    outline = np.array([[0, 0], [10, 0], [10, 10], [6, 10], [6, 4], [4, 4], [4, 10], [0, 10]])
+    segments = geometry.hatching_m(outline, 0.1)
+    area = sum(0.1 * float(segment[1, 0] - segment[0, 0]) for segment in segments)
+    assert area == pytest.approx(10 * 10 - 2 * 6, rel=0.01)
+    assert not any(y > 4 and left < 5 < right for (left, y), (right, _) in segments)
+
+
+def test_walls_stand_on_every_edge() -> None:
+    vertices, triangles = geometry.walls_m(np.array([[0, 0], [2, 0], [2, 1]]), 3.0, 4.0)
+    corners = vertices[triangles]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    assert areas.sum() == pytest.approx(4.0 * (2 + 1 + np.sqrt(5)))
+    assert (vertices[:, 2].min(), vertices[:, 2].max()) == (3.0, 7.0)
+
+
+def test_a_dashed_line_is_in_pieces_along_its_bends() -> None:
+    pieces = static_map.pieces_m(np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]]), 3.0, 6.0)
+    np.testing.assert_allclose(pieces, [[[0, 0], [3, 0]], [[9, 0], [10, 2]], [[10, 8], [10, 10]]])
+
+
+def test_the_left_edge_lies_to_the_left() -> None:
+    lane = {"points_m": [[0, 0, 1], [10, 0, 1]], "width_m": 4.0}
+    np.testing.assert_allclose(static_map.edge_m(lane, 1), [[0, 2], [10, 2]])
+    np.testing.assert_allclose(static_map.edge_m(lane, -1), [[0, -2], [10, -2]])
+
+
+def test_stripes_of_a_crossing_lie_across_the_way_of_who_walks() -> None:
+    lane = {"points_m": [[0, 0, 0], [3, 0, 0]], "width_m": 4.0}
+    stripes = np.array(static_map.stripes_m(lane))
+    assert len(stripes) == 3
+    np.testing.assert_allclose(stripes[0], [[0.25, 1.75], [0.25, -1.75]])
+
+
+def scan(**fields: object) -> np.void:
+    head = np.zeros(1, wire.SCAN)
+    for name, value in fields.items():
+        head[name] = value
+    return head[0]
+
+
+def point(position_m: list[float], age_us: int = 0) -> np.ndarray:
+    row = np.zeros(1, wire.LIDAR_POINT)
+    row["position_m"], row["age_us"] = position_m, age_us
+    return row
+
+
+STILL = np.zeros(3)
+
+
+def test_points_are_placed_by_the_pose_of_their_sensor() -> None:
+    placed = cloud.in_world_m(scan(position_m=[10, 20, 2], attitude_rad=[0, 0, np.pi / 2]), point([5, 1, 0]), STILL, 0)
+    np.testing.assert_allclose(placed, [[9, 25, 2]], atol=1e-5)
+    nose_up = cloud.in_world_m(scan(attitude_rad=[0, 0.1, 0]), point([10, 0, 0]), STILL, 0)
+    np.testing.assert_allclose(nose_up, [[10 * np.cos(0.1), 0, 10 * np.sin(0.1)]], atol=1e-5)
+    right_down = cloud.in_world_m(scan(attitude_rad=[0.1, 0, 0]), point([0, 10, 0]), STILL, 0)
+    np.testing.assert_allclose(right_down, [[0, 10 * np.cos(0.1), 10 * np.sin(0.1)]], atol=1e-5)
+
+
+def test_the_papers_axes_are_turned() -> None:
+    placed = cloud.in_world_m(scan(axes=cloud.PAPER_AXES), point([1, -5, 2]), STILL, 0)
+    np.testing.assert_allclose(placed, [[5, 1, -2]], atol=1e-6)
+
+
+def test_points_fired_earlier_were_fired_from_farther_back() -> None:
+    placed = cloud.in_world_m(scan(), point([5, 0, 0], 100_000), np.array([10.0, 0, 0]), np.pi)
+    angle = -0.1 * np.pi
+    np.testing.assert_allclose(placed, [[5 * np.cos(angle) - 1, 5 * np.sin(angle), 0]], atol=1e-5)
+
+
+def test_interest_is_what_moves() -> None:
+    points = np.zeros(14, wire.LIDAR_POINT)
+    points["tag"] = np.arange(14)
+    assert cloud.of_interest(points)["tag"].tolist() == [4, 5, 6, 12]
+    points["tag"] += 1000
+    assert (cloud.colors(points) == cloud.TAG_COLORS[-1]).all()
+
+
+def test_up_on_the_screen_is_north() -> None:
+    np.testing.assert_array_equal(on_screen(np.array([[1.0, 2.0]])), [[1, -2]])
