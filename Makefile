@@ -8,12 +8,12 @@ export PYO3_PYTHON = $(CURDIR)/$(VENV)/bin/python
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
 
-.PHONY: train test build prerequisites lint format test-rust test-python deny bench peers clean
+.PHONY: train test build prerequisites browser lint format test-rust test-python deny bench peers clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
 
-test: prerequisites $(VENV)/.installed ## all tests
+test: prerequisites browser $(VENV)/.installed ## all tests
 	cargo test $(CARGO_FLAGS) --workspace --no-run
 	$(EXTENSION)
 	$(MAKE) test-rust test-python
@@ -26,6 +26,9 @@ EXTENSION = VIRTUAL_ENV=$(CURDIR)/$(VENV) $(VENV)/bin/maturin develop --quiet $(
 
 prerequisites:
 	@scripts/prerequisites.sh "$(PYTHON)"
+
+browser: ## a Chromium for the viewer's test
+	@scripts/browser.sh
 
 # The pins are in requirements.lock; the two packages of this project are installed in place.
 $(VENV)/.installed: requirements.lock trainer/pyproject.toml viewer/pyproject.toml

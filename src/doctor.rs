@@ -13,8 +13,8 @@ const LIBRARIES: [(&str, &str); 4] = [
     ("libXrender.so.1", "libxrender1"),
     ("libGL.so.1", "libgl1"),
 ];
-/// Python packages that training needs.
-const PACKAGES: [&str; 7] = [
+/// Python packages that training and watching need.
+const PACKAGES: [&str; 10] = [
     "torch",
     "numpy",
     "matplotlib",
@@ -22,7 +22,12 @@ const PACKAGES: [&str; 7] = [
     "safetensors",
     "caraware",
     "sumo",
+    "caraware_viewer",
+    "rerun",
+    "zenoh",
 ];
+/// Programs any of which the viewer's test can use.
+const BROWSERS: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
 /// Least free space worth starting with, MiB.
 const SHARED_MEMORY_MIB: u64 = 64;
 const DISK_MIB: u64 = 512;
@@ -65,6 +70,7 @@ pub fn doctor(clean: bool) -> Result<(), Exit> {
     );
     space(&mut checks, "disk", ".", DISK_MIB, "free some disk space");
     port(&mut checks);
+    browser();
     runs(clean);
     match checks.missing {
         0 => Ok(()),
@@ -150,6 +156,20 @@ fn port(checks: &mut Checks) {
         ),
     };
     checks.say(result, "port for viewers");
+}
+
+/// Watching needs any browser, of this machine or another; the viewer's test a certain one here.
+fn browser() {
+    let directories = std::env::var_os("PATH").unwrap_or_default();
+    let found = std::env::split_paths(&directories)
+        .flat_map(|directory| BROWSERS.map(|name| directory.join(name)))
+        .find(|path| path.is_file());
+    match found {
+        Some(path) => println!("ok       browser for the viewer's test: {}", path.display()),
+        None => println!(
+            "note     browser for the viewer's test: none; `make test` needs one\n         → apt-get install chromium"
+        ),
+    }
 }
 
 fn runs(clean: bool) {

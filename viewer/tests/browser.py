@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+CHOSEN = "CARAWARE_BROWSER"
+"""Environment variable that names another program."""
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGUMENTS = (
     "--headless=new",
@@ -39,7 +41,7 @@ QUIET = "console.debug = () => {};"
 
 def find() -> str:
     """Path of the browser; fails with what to do if there is none: a test left out would be a test passed."""
-    for name in NAMES:
+    for name in filter(None, (os.environ.get(CHOSEN), *NAMES)):
         path = shutil.which(name)
         if path is not None:
             return path

@@ -97,6 +97,7 @@ VEHICLE_META = np.dtype(
         ("id_len", "<u4"),
         ("id", "V64"),
         ("vehicle_class", "V16"),
+        ("type_id", "V32"),
     ]
 )
 """`VehicleMeta`: who a road user is."""
