@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import fcntl
 import io
 import json
 import os
@@ -55,12 +56,25 @@ class Browser:
         self._profile = tempfile.TemporaryDirectory(prefix="caraware-browser-", ignore_cleanup_errors=True)
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
-        arguments = [find(), *ARGUMENTS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}"]
-        # Chromium reads commands from descriptor 3 and writes answers to 4.
-        shell = ["sh", "-c", f'exec "$@" 3<&{to_read} 4>&{to_write} 2>/dev/null', "sh", *arguments, "about:blank"]
-        self._process = subprocess.Popen(shell, pass_fds=(to_read, to_write), start_new_session=True)
+        # Chromium reads commands from descriptor 3 and writes answers to 4: out of their way first.
+        ours = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, 10) for descriptor in (to_read, to_write)]
         os.close(to_read)
         os.close(to_write)
+
+        def hand_over() -> None:
+            for descriptor, place in zip(ours, (3, 4), strict=True):
+                os.dup2(descriptor, place)
+
+        arguments = [find(), *ARGUMENTS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}"]
+        self._process = subprocess.Popen(
+            [*arguments, "about:blank"],
+            stderr=subprocess.DEVNULL,
+            close_fds=False,
+            preexec_fn=hand_over,
+            start_new_session=True,
+        )
+        for descriptor in ours:
+            os.close(descriptor)
         self._buffer = b""
         self._id = 0
         self.requests: list[str] = []

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[2]
 COMMAND = ROOT / "target" / "release" / "caraware"
 PICTURE = os.environ.get("CARAWARE_SCREENSHOT")
 SIZE = (1600, 900) if PICTURE else (1280, 720)
-# Paced, so that the browser's software renderer keeps up and the filter runs; a learner with its first update after seconds.
+# Paced, so that the browser's software renderer keeps up and the filter runs; a learner that updates after seconds.
 SETTINGS = ("run.real_time_factor=1.0", "lidar.vehicles=4", "trainer.horizon=1024", "trainer.batch_size=256")
 SEEN_WITHIN_S = 90.0
 

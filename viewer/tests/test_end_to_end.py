@@ -53,6 +53,16 @@ class StandIn:
         self.session.put(f"{RUN.prefix}/{topic}", payload, attachment=struct.pack("<QQ", self.sent, time.time_ns()))
         self.sent += 1
 
+    def publish_until_clouds_are_wanted(self) -> None:
+        """A viewer asks for point clouds once it knows who is there."""
+        clouds = self.session.declare_publisher(f"{RUN.prefix}/pointcloud/{encoded(VEHICLE)}")
+        for tick in range(200):
+            self.publish(tick)
+            if clouds.matching_status.matching:
+                return
+            time.sleep(0.1)
+        raise TimeoutError("nobody asked for a point cloud")
+
     def publish(self, tick: int) -> None:
         self.put("vehicles", frames.vehicles(tick, {100: VEHICLE}))
         self.put("world", frames.world(tick))
@@ -91,11 +101,12 @@ def test_a_run_becomes_a_recording(fanout: StandIn, tmp_path: Path) -> None:
     process = viewer(fanout.endpoint, "--run", RUN.run, "--save", str(file))
     assert process.stderr is not None
     assert "watching run" in process.stderr.readline()
-    for tick in range(5):
-        fanout.publish(tick)
+    fanout.publish_until_clouds_are_wanted()
+    for tick in range(1000, 1003):
         fanout.put("world", b"garbage")
-        time.sleep(0.1)
-    fanout.publish(5)
+        time.sleep(0.2)
+        fanout.publish(tick)
+        time.sleep(0.2)
     fanout.token.undeclare()
     assert process.wait(timeout=20) == 0
     output = process.stderr.read()

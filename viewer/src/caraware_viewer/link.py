@@ -17,6 +17,8 @@ from urllib.parse import quote, unquote
 
 import zenoh
 
+from caraware_viewer.wire import SCHEMA_VERSION
+
 TOPICS = ("world", "observation", "prediction", "status", "vehicles", "signals", "event")
 CLOUDS = "pointcloud/"
 """Topics of point clouds begin with this; a vehicle's id follows."""
@@ -218,7 +220,7 @@ class Link:
         """The run's map and tick settings."""
         for reply in self._session.get(f"{self.run.prefix}/map", timeout=timeout_s):
             if reply.ok:
-                return json.loads(bytes(reply.ok.payload))
+                return _known(bytes(reply.ok.payload), self.run.run)
         raise LinkError(
             f"run {self.run.run!r} did not tell its map within {timeout_s:g} s: is its fan-out being killed?"
         )
@@ -252,3 +254,18 @@ class Link:
             self._farewell = threading.Timer(RETURN_S, self.frames.end)
             self._farewell.daemon = True
             self._farewell.start()
+
+
+def _known(payload: bytes, run: str) -> dict[str, Any]:
+    """The map, if it is one of this viewer's version."""
+    try:
+        run_map = json.loads(payload)
+        version = run_map.get("schema_version", SCHEMA_VERSION)
+    except (ValueError, AttributeError) as error:
+        raise LinkError(f"the map of run {run!r} is not what this viewer knows: {error}") from error
+    if version != SCHEMA_VERSION:
+        raise LinkError(
+            f"run {run!r} speaks schema version {version}, this viewer {SCHEMA_VERSION}: "
+            "install the viewer of the run's version"
+        )
+    return run_map
