@@ -109,7 +109,7 @@ class Browser:
 
     def screenshot(self) -> NDArray[np.uint8]:
         """What is to be seen, `[height, width, 3]`."""
-        data = self.call("Page.captureScreenshot", format="png", timeout_s=60.0)["data"]
+        data = self.call("Page.captureScreenshot", format="png", timeout_s=120.0)["data"]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
     def call(self, method: str, timeout_s: float = 30.0, **parameters: Any) -> dict[str, Any]:

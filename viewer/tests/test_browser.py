@@ -29,10 +29,16 @@ from caraware_viewer import plots, scene, space, static_map, top
 ROOT = Path(__file__).parents[2]
 COMMAND = ROOT / "target" / "release" / "caraware"
 PICTURE = os.environ.get("CARAWARE_SCREENSHOT")
-SIZE = (1600, 900) if PICTURE else (1280, 720)
+SIZE = (1600, 900) if PICTURE else (1000, 600)
 # Paced, so that the browser's software renderer keeps up and the filter runs; a learner that updates after seconds.
-SETTINGS = ("run.real_time_factor=1.0", "lidar.vehicles=4", "trainer.horizon=1024", "trainer.batch_size=256")
-SEEN_WITHIN_S = 90.0
+SETTINGS = (
+    "run.real_time_factor=1.0",
+    "lidar.vehicles=4",
+    "trainer.horizon=1024",
+    "trainer.batch_size=256",
+    *(f"fanout.{topic}_hz=2" for topic in ("world", "observation", "prediction", "pointcloud", "status")),
+)
+SEEN_WITHIN_S = 150.0
 
 Picture = NDArray[np.uint8]
 

@@ -72,12 +72,11 @@ def test_hatching_fills_a_polygon_with_a_notch() -> None:
     assert not any(y > 4 and left < 5 < right for (left, y), (right, _) in segments)
 
 
-def test_walls_stand_on_every_edge() -> None:
-    vertices, triangles = geometry.walls_m(np.array([[0, 0], [2, 0], [2, 1]]), 3.0, 4.0)
-    corners = vertices[triangles]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    assert areas.sum() == pytest.approx(4.0 * (2 + 1 + np.sqrt(5)))
-    assert (vertices[:, 2].min(), vertices[:, 2].max()) == (3.0, 7.0)
+def test_a_prism_has_a_foot_a_top_and_corners() -> None:
+    strips = geometry.frame_m(np.array([[0, 0], [2, 0], [2, 1]]), 3.0, 4.0)
+    assert [len(strip) for strip in strips] == [4, 4, 2, 2, 2]
+    assert [set(strip[:, 2]) for strip in strips] == [{3.0}, {7.0}, *[{3.0, 7.0}] * 3]
+    np.testing.assert_array_equal(strips[3], [[2, 0, 3], [2, 0, 7]])
 
 
 def test_a_dashed_line_is_in_pieces_along_its_bends() -> None:

@@ -99,7 +99,8 @@ def test_the_static_map_is_drawn_once(drawn: Drawn) -> None:
     assert len(found[static_map.CROSSINGS].newest("LineStrips2D:strips")) == 20
     for path in (static_map.JUNCTIONS, static_map.WALKS + "/areas", static_map.BUILDINGS, static_map.BOUNDS):
         assert found[path].newest("LineStrips2D:strips")
-    heights = {point[2] for point in found[static_map.SPACE_BUILDINGS].newest("Mesh3D:vertex_positions")}
+    strips = found[static_map.SPACE_BUILDINGS].newest("LineStrips3D:strips")
+    heights = {point[2] for strip in strips for point in strip}
     assert heights == {1.0, 9.0}
     near(found[static_map.SPACE_OBSTACLES], "Boxes3D:centers", [[1, 2, 0.35]])
     assert all(at == recordings.ALWAYS for at, _ in found[static_map.ROADS].rows)
@@ -129,6 +130,15 @@ def test_kinds_have_colours_of_their_own(drawn: Drawn) -> None:
     kinds = [wire.CAV, wire.OTHER, wire.PERSON, wire.HERO, 77]
     _, found = drawn(("world", frames.world(0, 5, kind=kinds)))
     assert found[top.OUTLINES].newest("LineStrips2D:colors") == top.KIND_COLORS[[0, 1, 2, 3, 3]].tolist()
+
+
+def test_few_vehicles_have_their_names_of_many_those_looked_at(drawn: Drawn) -> None:
+    names = {100 + i: f"cav {i}" for i in range(100)}
+    for count, expected in ((3, ["cav 0", "cav 1", "cav 2"]), (100, ["cav 7"])):
+        _, found = drawn(
+            ("vehicles", frames.vehicles(0, names)), ("world", frames.world(0, count, kind=0)), wanted=["cav 7"]
+        )
+        assert found[top.NAMES].newest("Points2D:labels") == expected
 
 
 def test_signals_of_vehicles_and_lights_are_drawn(drawn: Drawn) -> None:

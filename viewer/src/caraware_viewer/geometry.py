@@ -95,14 +95,12 @@ def hatching_m(outline_m: Points, spacing_m: float) -> list[NDArray[np.float32]]
     return segments
 
 
-def walls_m(outline_m: Points, base_m: float, height_m: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Vertices `[2n, 3]` and triangles `[2n, 3]` of the walls of a prism over a polygon `[n, 2]`."""
-    n = len(outline_m)
-    low = np.column_stack([outline_m, np.full(n, base_m)])
-    high = np.column_stack([outline_m, np.full(n, base_m + height_m)])
-    i, j = np.arange(n), (np.arange(n) + 1) % n
-    triangles = np.concatenate([np.column_stack([i, j, j + n]), np.column_stack([i, j + n, i + n])])
-    return np.concatenate([low, high]).astype(np.float32), triangles.astype(np.uint32)
+def frame_m(outline_m: Points, base_m: float, height_m: float) -> list[NDArray[np.float32]]:
+    """Edges of a prism over a polygon `[n, 2]`: its foot, its top, and its corners, as strips `[·, 3]`."""
+    closed = np.vstack([outline_m, outline_m[:1]])
+    levels = [np.column_stack([closed, np.full(len(closed), z)]) for z in (base_m, base_m + height_m)]
+    corners = np.stack([level[:-1] for level in levels], axis=1)
+    return [strip.astype(np.float32) for strip in (*levels, *corners)]
 
 
 def _rear_m(states: NDArray[np.void]) -> NDArray[np.float32]:

@@ -107,7 +107,7 @@ class Scene:
         self._age_ms = sample.age_ms()
         looked_at = self._picture.looked_at()
         rows = [row for row in map(self._picture.row, looked_at) if row is not None]
-        top.draw_road_users(self._canvas, world.states, self._picture.names)
+        top.draw_road_users(self._canvas, world.states, self._picture.names, looked_at)
         top.draw_looked_at(self._canvas, rows)
         space.draw_space(self._canvas, world.states, rows[0] if rows else None)
         self._draw_contacts(world.header)

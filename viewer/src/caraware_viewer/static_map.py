@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from caraware_viewer.canvas import Canvas, on_screen
-from caraware_viewer.geometry import hatching_m, quaternions, walls_m
+from caraware_viewer.geometry import frame_m, hatching_m, quaternions
 from caraware_viewer.wire import FrameError
 
 BOUNDS = "top/map/bounds"
@@ -156,19 +156,14 @@ def _draw_buildings(canvas: Canvas, buildings: list[dict[str, Any]]) -> None:
     _segments(canvas, BUILDINGS + "/walls", [np.vstack([o, o[:1]]) for o in outlines], WALL_COLOR, 0.25, 6.5)
     if not buildings:
         return
-    vertices, triangles, count = [], [], 0
-    for building, outline in zip(buildings, outlines, strict=True):
-        points, faces = walls_m(outline, building["base_m"], building["height_m"])
-        vertices.append(points)
-        triangles.append(faces + count)
-        count += len(points)
-    mesh = rr.Mesh3D(
-        vertex_positions=np.concatenate(vertices),
-        triangle_indices=np.concatenate(triangles),
-        albedo_factor=BUILDING_COLOR,
-        face_rendering="DoubleSided",
-    )
-    canvas.log(SPACE_BUILDINGS, mesh, static=True)
+    # Filled walls would hide the vehicle from the camera behind it.
+    strips = [
+        strip
+        for building, outline in zip(buildings, outlines, strict=True)
+        for strip in frame_m(outline, building["base_m"], building["height_m"])
+    ]
+    frames = rr.LineStrips3D(strips, colors=WALL_COLOR, radii=rr.Radius.ui_points(0.7))
+    canvas.log(SPACE_BUILDINGS, frames, static=True)
 
 
 def _draw_obstacles(canvas: Canvas, obstacles: list[dict[str, Any]]) -> None:

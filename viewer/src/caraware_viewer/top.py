@@ -35,11 +35,13 @@ SIGNAL_COLORS = {"r": 0xF03C32FF, "u": 0xF0783CFF, "y": 0xF5D23CFF, "g": 0x32C85
 """RGBA by SUMO's letter; all others are off."""
 SIGNAL_OFF = 0x707070FF
 
-NAMED_AT_MOST = 48
-"""Connected vehicles with their names beside them; more would hide the map."""
+NAMED_AT_MOST = 12
+"""Connected vehicles with their names beside them; of more, those looked at alone: the others would hide the map."""
 
 
-def draw_road_users(canvas: Canvas, states: NDArray[np.void], names: dict[int, str]) -> None:
+def draw_road_users(
+    canvas: Canvas, states: NDArray[np.void], names: dict[int, str], looked_at: Sequence[int] = ()
+) -> None:
     """Boxes with an arrow ahead, blinkers, brake lights, and the names of a few."""
     colors = KIND_COLORS[np.minimum(states["kind"], wire.HERO)]
     outlines = on_screen(geometry.outlines_m(states))
@@ -49,13 +51,15 @@ def draw_road_users(canvas: Canvas, states: NDArray[np.void], names: dict[int, s
     canvas.log(BODIES, rr.LineStrips2D(bodies, colors=filled, radii=radii, draw_order=20.0))
     canvas.points(BLINKERS, geometry.blinkers_m(states), BLINKER_COLOR, 2.0, 23.0)
     canvas.points(BRAKES, geometry.brake_lights_m(states), BRAKE_COLOR, 1.6, 22.0)
-    _draw_names(canvas, states[(states["kind"] == wire.CAV) | (states["kind"] == wire.HERO)], names)
+    connected = states[(states["kind"] == wire.CAV) | (states["kind"] == wire.HERO)]
+    if len(connected) > NAMED_AT_MOST:
+        connected = states[np.isin(states["id_hash"], np.array(looked_at, np.uint64))]
+    _draw_names(canvas, connected, names)
 
 
 def _draw_names(canvas: Canvas, states: NDArray[np.void], names: dict[int, str]) -> None:
-    known = [names.get(int(id_hash)) for id_hash in states["id_hash"]]
-    if len(states) > NAMED_AT_MOST or None in known:
-        states, known = states[:0], []
+    states = states[[int(id_hash) in names for id_hash in states["id_hash"]]]
+    known = [names[int(id_hash)] for id_hash in states["id_hash"]]
     positions = on_screen(geometry.centres_m(states)[:, :2])
     radii = rr.Radius.ui_points(0.0)
     labels = rr.Points2D(
