@@ -1,6 +1,10 @@
 //! `caraware view` says what is wrong, and a viewer beside a run ends with it without disturbing it.
 
-#![allow(clippy::unwrap_used, reason = "tests and measurements assert by unwrapping")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
 
 mod common;
 

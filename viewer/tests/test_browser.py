@@ -29,7 +29,7 @@ from caraware_viewer import plots, scene, space, static_map, top
 ROOT = Path(__file__).parents[2]
 COMMAND = ROOT / "target" / "release" / "caraware"
 PICTURE = os.environ.get("CARAWARE_SCREENSHOT")
-SIZE = (1600, 900) if PICTURE else (1000, 600)
+SIZE = (1000, 600)
 # Paced, so that the browser's software renderer keeps up and the filter runs; a learner that updates after seconds.
 SETTINGS = (
     "run.real_time_factor=1.0",
