@@ -15,7 +15,7 @@ use serde_json::Value;
 
 use crate::{
     checkpoint::Found,
-    cli::{PlayArgs, RunArgs},
+    cli::{PlayArgs, RunArgs, ViewerKind},
     config::{self, ConfigError, Settings},
     failure::Exit,
     install::Install,
@@ -43,6 +43,8 @@ pub struct Prepared {
     pub claim: Claim,
     /// Show no progress and no summary.
     pub quiet: bool,
+    /// Where to show it meanwhile, if at all.
+    pub viewer: Option<ViewerKind>,
 }
 
 /// What CONFIG names.
@@ -111,6 +113,7 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<Prepared, Exit> {
             install,
             claim,
             quiet: args.quiet,
+            viewer: args.viewer,
         });
     }
     let (_, named) = of_run(&old, &[])?;
@@ -159,6 +162,7 @@ fn make(
         install,
         claim,
         quiet: args.quiet,
+        viewer: args.viewer,
     })
 }
 
