@@ -47,6 +47,12 @@ pub fn changed(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
             "only a run of one environment and one trainer goes on from a checkpoint",
         ));
     }
+    if !run.config.curriculum.steps.is_empty() {
+        return Err(Exit::config(
+            format!("{} follows a curriculum, and cannot be resumed", run.name),
+            "where its lessons begin is known while it runs; start another run",
+        ));
+    }
     for assignment in set {
         let key = assignment.split('=').next().unwrap_or_default().trim();
         let is_known = config::keys::KEYS.iter().any(|known| known.path == key);

@@ -379,6 +379,43 @@ fn a_planned_swap_changes_nothing_but_the_process() {
 }
 
 #[test]
+fn another_framework_takes_over_and_no_observation_is_lost() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "framework", &[PACED]);
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    let module = "trainer.module=caraware.examples.sb3_takeover";
+    let output = workplace.run(&["swap", "framework", "--set", module]);
+    assert!(output.status.success(), "{}", text(&output));
+    // It learns, saves and commits by itself; killed, it goes on from there.
+    let taken_over = run.trainer.progress().committed_ticks;
+    run.until("an update of its own", |progress, _| {
+        progress.incarnation == 1 && progress.committed_ticks > taken_over
+    });
+    run.kill_trainer_at(1, run.trainer.progress().committed_ticks + 1);
+    let log = run.directory.join("logs/trainer.log");
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    let report = workplace.report("framework");
+    assert_eq!(report["observation_hash"], undisturbed(&workplace).observation_hash);
+    assert_eq!(
+        (&report["lost_ticks"], &report["duplicated_ticks"]),
+        (&0.into(), &0.into())
+    );
+    assert_eq!(
+        (&report["restarts"], &report["swaps"][0]["incarnation"]),
+        (&1.into(), &1.into())
+    );
+    let log = std::fs::read_to_string(log).unwrap();
+    let begun = format!("takes over at tick {}", report["swaps"][0]["first_tick"]);
+    assert!(
+        log.contains(&begun) && log.matches("takes over at tick").count() == 2,
+        "{log}"
+    );
+    assert!(workplace.path().join("runs/framework/sb3_takeover.zip").exists());
+    assert_nothing_left(&workplace, "framework");
+}
+
+#[test]
 fn a_swap_with_other_settings_learns_on_with_them() {
     let workplace = Workplace::new();
     let mut run = Run::start(&workplace, "changed", &[PACED]);

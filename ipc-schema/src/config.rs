@@ -5,9 +5,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::traffic::VEHICLE_CLASSES;
 
+mod curriculum;
 mod observation;
 mod region;
 mod sensors;
+pub use curriculum::*;
 pub use observation::*;
 pub use region::*;
 pub use sensors::*;
@@ -24,6 +26,8 @@ pub struct Config {
     pub map: Map,
     /// Length of episodes and when to evaluate.
     pub episode: Episode,
+    /// Steps of training, each with a gate to the next.
+    pub curriculum: Curriculum,
     /// What the trainer's output means.
     pub task: Task,
     /// Vehicle models and their limits.
@@ -354,6 +358,8 @@ pub struct Trainer {
     pub target_kl: Option<f64>,
     /// Largest norm of the gradient.
     pub max_grad_norm: f64,
+    /// Actions tried on every observation.
+    pub actions_per_observation: u64,
     /// Samples per update.
     pub horizon: u64,
     /// Samples per gradient step.

@@ -11,6 +11,16 @@ pub const FIRST_OF_EPISODE: u32 = 1 << 1;
 pub const LAST_OF_EPISODE: u32 = 1 << 2;
 /// Last tick of the run: the producer sends nothing after it.
 pub const LAST_OF_RUN: u32 = 1 << 3;
+/// Last tick of a lesson: before the next one the producer waits for the trainer to say which step of the curriculum it belongs to.
+pub const LAST_OF_LESSON: u32 = 1 << 4;
+/// First bit of the step of the curriculum, counted from 1; 0 is the base configuration.
+const STEP_SHIFT: u32 = 16;
+
+/// The flags of a tick in step `step` of the curriculum, counted from 1; 0 is the base configuration.
+#[must_use]
+pub const fn step_flags(step: u8) -> u32 {
+    (step as u32) << STEP_SHIFT
+}
 
 /// Identity and time of a message. 72 bytes, no implicit padding.
 #[repr(C)]
@@ -25,7 +35,8 @@ pub struct MessageHeader {
     pub run_id: u64,
     /// Counts the replacements of the sending process. `observation`: of the trainer that it is meant for.
     pub incarnation: u32,
-    /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`]; from bit 8 on what the payload says.
+    /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`], [`LAST_OF_LESSON`]; from bit 8 on what the
+    /// payload says; from bit 16 on [`step_flags`].
     pub flags: u32,
     /// Episode number, 0-based over the run.
     pub episode: u64,
@@ -49,5 +60,11 @@ impl MessageHeader {
     #[must_use]
     pub fn has(&self, flag: u32) -> bool {
         self.flags & flag == flag
+    }
+
+    /// Step of the curriculum, counted from 1; 0 is the base configuration.
+    #[must_use]
+    pub const fn step(&self) -> usize {
+        (self.flags >> STEP_SHIFT & 0xff) as usize
     }
 }

@@ -193,7 +193,11 @@ pub fn table() -> Vec<TypeLayout> {
             consumed_ticks,
             committed_ticks,
             incarnation,
-            attached
+            attached,
+            decided_lessons,
+            since_lesson,
+            step,
+            padding
         }),
         layout!(Health {
             state,

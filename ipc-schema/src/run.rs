@@ -274,7 +274,22 @@ impl RunFile {
         )
     }
 
-    /// The episodes of this run, where they have an end that the configuration knows; none in play.
+    /// The way through this run if it has a curriculum.
+    #[must_use]
+    pub fn course(&self) -> Option<schedule::Course> {
+        let Config {
+            curriculum, episode, ..
+        } = &self.config;
+        match (&self.source, curriculum.steps.is_empty()) {
+            (Source::Population { .. }, false) if self.mode != Mode::Play => {
+                Some(schedule::Course::new(episode, curriculum, self.config.run.seed))
+            }
+            _ => None,
+        }
+    }
+
+    /// The episodes of this run, where they have an end that the configuration knows; none in play. Of one with a curriculum the
+    /// longest that it may get.
     #[must_use]
     pub fn episodes(&self) -> Vec<schedule::Episode> {
         let (lengths, seed) = (&self.config.episode, self.seed());

@@ -1,6 +1,6 @@
 //! Which episodes a run consists of: a pure function of configuration and seed, so that every process knows it.
 
-use crate::config::Episode as Lengths;
+use crate::config::{Curriculum, Episode as Lengths};
 
 /// One episode of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -95,6 +95,115 @@ pub fn play(seed: u64, index: u64, ticks: Option<u64>) -> Episode {
     }
 }
 
+/// What a run with a curriculum does next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Due {
+    /// An evaluation, in the base configuration.
+    Evaluation {
+        /// The episode.
+        episode: Episode,
+        /// True if nothing follows it.
+        is_last: bool,
+    },
+    /// A lesson, whose step is to be asked for ([`Course::enter`]).
+    Lesson(u64),
+    /// Nothing.
+    Nothing,
+}
+
+/// A lesson of a run with a curriculum.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Lesson {
+    /// Its step, counted from 0.
+    pub step: usize,
+    /// The episode that begins with it; `None`: the one that is running goes on.
+    pub begins: Option<Episode>,
+}
+
+/// The way through a run with a curriculum: lessons, evaluations at the interval, and the final evaluations. A function of
+/// configuration, seed and the steps that lessons are given.
+#[derive(Debug)]
+pub struct Course {
+    lengths: Lengths,
+    restarts: Vec<bool>,
+    seed: u64,
+    lessons: u64,
+    episodes: u64,
+    evaluations: u64,
+    final_evaluations: u64,
+    evaluated_lessons: u64,
+    is_over: bool,
+    /// Step of the episode that is running.
+    running: Option<usize>,
+}
+
+impl Course {
+    /// At its beginning.
+    #[must_use]
+    pub fn new(lengths: &Lengths, curriculum: &Curriculum, seed: u64) -> Self {
+        Self {
+            lengths: lengths.clone(),
+            restarts: curriculum.steps.iter().map(|step| step.restart).collect(),
+            seed,
+            lessons: 0,
+            episodes: 0,
+            evaluations: 0,
+            final_evaluations: 0,
+            evaluated_lessons: 0,
+            is_over: false,
+            running: None,
+        }
+    }
+
+    /// What follows. An evaluation is begun by asking for it.
+    pub fn due(&mut self) -> Due {
+        self.is_over |= self.lessons >= self.lengths.training_episodes;
+        let interval = self.lengths.evaluation_interval;
+        if self.is_over {
+            self.final_evaluations += 1;
+            return match self.final_evaluations > self.lengths.final_evaluations {
+                true => Due::Nothing,
+                false => self.evaluation(self.final_evaluations == self.lengths.final_evaluations),
+            };
+        }
+        if interval > 0 && self.lessons > self.evaluated_lessons && self.lessons.is_multiple_of(interval) {
+            self.evaluated_lessons = self.lessons;
+            return self.evaluation(false);
+        }
+        Due::Lesson(self.lessons)
+    }
+
+    fn evaluation(&mut self, is_last: bool) -> Due {
+        self.running = None;
+        let episode = self.begin(true, self.evaluations, self.lengths.evaluation_ticks);
+        self.evaluations += 1;
+        Due::Evaluation { episode, is_last }
+    }
+
+    fn begin(&mut self, evaluation: bool, count: u64, ticks: u64) -> Episode {
+        self.episodes += 1;
+        Episode {
+            index: self.episodes - 1,
+            evaluation,
+            seed: episode_seed(self.seed, evaluation, count),
+            ticks: Some(ticks),
+        }
+    }
+
+    /// Begins the lesson that is due, in `step`, counted from 0; `None` if that is behind the last: no lesson follows.
+    pub fn enter(&mut self, step: usize) -> Option<Lesson> {
+        let Some(restart) = self.restarts.get(step) else {
+            self.is_over = true;
+            return None;
+        };
+        let goes_on = !restart && self.running == Some(step);
+        let begins = (!goes_on).then(|| self.begin(false, self.lessons, self.lengths.ticks));
+        self.running = Some(step);
+        self.lessons += 1;
+        Some(Lesson { step, begins })
+    }
+}
+
 /// Seed of the `count`-th training or evaluation episode: first eight bytes of a BLAKE3 hash, so the two never meet.
 #[must_use]
 pub fn episode_seed(run_seed: u64, evaluation: bool, count: u64) -> u64 {
@@ -133,6 +242,45 @@ mod tests {
     #[test]
     fn the_first_environment_has_the_seed_of_the_run() {
         assert_eq!(environment_seed(42, 0), 42);
+    }
+
+    /// A course through steps of which the second does not restart, as it is given `steps`: L and E begin an episode, l goes on.
+    fn course(lengths: &Lengths, steps: &[usize]) -> String {
+        let curriculum = Curriculum {
+            steps: [true, false]
+                .map(|restart| serde_json::from_value(serde_json::json!({"cavs": 1, "restart": restart})).unwrap())
+                .to_vec(),
+            log: String::new(),
+        };
+        let mut course = Course::new(lengths, &curriculum, 7);
+        let mut told = String::new();
+        let mut seeds = BTreeSet::new();
+        loop {
+            let episode = match course.due() {
+                Due::Evaluation { episode, is_last } => {
+                    told.push(if is_last { '!' } else { 'E' });
+                    Some(episode)
+                }
+                Due::Lesson(number) => course.enter(steps[number as usize]).and_then(|lesson| {
+                    told.push(if lesson.begins.is_some() { 'L' } else { 'l' });
+                    lesson.begins
+                }),
+                Due::Nothing => return told,
+            };
+            if let Some(episode) = episode {
+                assert_eq!(episode.index, seeds.len() as u64);
+                assert!(seeds.insert(episode.seed));
+            }
+        }
+    }
+
+    #[test]
+    fn a_course_restarts_where_its_step_says_so_and_ends_behind_the_last_step() {
+        assert_eq!(course(&lengths(9, 0, 2), &[0, 0, 1, 1, 1, 2]), "LLLllE!");
+        // An evaluation has the roads to itself; the step it interrupts begins anew.
+        assert_eq!(course(&lengths(9, 2, 1), &[0, 1, 1, 1, 2]), "LLELlE!");
+        // A gate that is never passed.
+        assert_eq!(course(&lengths(4, 0, 1), &[0, 0, 0, 0, 0]), "LLLL!");
     }
 
     proptest! {

@@ -315,6 +315,14 @@ impl Session {
         self.wake_upstream();
     }
 
+    /// All lessons below `lessons` have a step of the curriculum, the newest from lesson `since` on `step`, counted from 0.
+    pub fn decided(&mut self, lessons: u64, since: u64, step: u32) {
+        self.progress.decided_lessons = lessons;
+        self.progress.since_lesson = since;
+        self.progress.step = step;
+        self.board.set_progress(self.progress);
+    }
+
     fn wake_upstream(&self) {
         self.upstream.iter().for_each(Waker::wake);
     }

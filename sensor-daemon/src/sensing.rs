@@ -46,7 +46,10 @@ pub struct World<'a> {
 
 /// Sensors of a run, with what they remember from tick to tick.
 pub struct Sensing {
-    suite: Suite,
+    /// The base configuration's, then one for each step of the curriculum.
+    suites: Vec<Suite>,
+    /// Which of them is at work.
+    step: usize,
     normaliser: Normaliser,
     history: History,
     policy: BlackoutPolicy,
@@ -79,8 +82,12 @@ impl Sensing {
     pub fn new(config: &Config, map: &MapInfo) -> Result<Self, GeodesyError> {
         let tick_ns = ((config.run.tick_s * 1e9).round() as u64).max(1);
         let normaliser = Normaliser::new(&config.observation, map.bounds_m, config.lidar.range_m);
+        let projection = Projection::new(map)?;
+        let suites = (0..=config.curriculum.steps.len())
+            .map(|step| Suite::new(&config.in_step(step), &projection, map.bounds_m, tick_ns));
         Ok(Self {
-            suite: Suite::new(config, &Projection::new(map)?, map.bounds_m, tick_ns)?,
+            suites: suites.collect::<Result<_, _>>()?,
+            step: 0,
             history: History::new(normaliser.width(), config.observation.history as usize),
             normaliser,
             policy: config.blackout.policy,
@@ -102,7 +109,17 @@ impl Sensing {
 
     /// Puts satellites, and what hides them, into the sky; without, it is open.
     pub fn set_sky(&mut self, sky: Box<dyn Sky>) {
-        self.suite.set_sky(sky);
+        self.suites[self.step].set_sky(sky);
+    }
+
+    /// The sensors of a step of the curriculum are at work from now on, under the same sky.
+    fn enter(&mut self, step: usize) {
+        let step = step.min(self.suites.len() - 1);
+        let sky = self.suites[self.step].take_sky();
+        self.step = step;
+        if let Some(sky) = sky {
+            self.suites[step].set_sky(sky);
+        }
     }
 
     /// Numbers in a row: fields times ticks.
@@ -136,7 +153,8 @@ impl Sensing {
     pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
         if header.has(FIRST_OF_EPISODE) {
-            self.suite.begin_episode(header.episode_seed);
+            self.enter(header.step());
+            self.suites[self.step].begin_episode(header.episode_seed);
         }
         self.row_of_slot.fill(None);
         let now = self.now(header);
@@ -163,14 +181,14 @@ impl Sensing {
     /// Takes the carrier in `slot` to this tick, a new one for a new trajectory.
     fn carry(&mut self, slot: usize, state: &VehicleState, now: &Now) {
         if self.slots.rows()[slot].step == 0 {
-            let carrier = self.suite.begin(state, slot, now);
+            let carrier = self.suites[self.step].begin(state, slot, now);
             match self.carriers.get_mut(slot) {
                 Some(place) => *place = carrier,
                 // Slots are lent in ascending order: this is the next one.
                 None => self.carriers.push(carrier),
             }
         } else {
-            self.suite.advance(&mut self.carriers[slot], state.id_hash, now);
+            self.suites[self.step].advance(&mut self.carriers[slot], state.id_hash, now);
         }
     }
 
@@ -226,7 +244,7 @@ impl Sensing {
         let now = self.now(header);
         let mut draws = std::mem::take(&mut self.draws);
         draws.clear();
-        self.suite.plan(&mut draws, &now);
+        self.suites[self.step].plan(&mut draws, &now);
         for first in (0..n).step_by(LANES) {
             let ids = std::array::from_fn(|lane| self.id_hash(first + lane, world));
             draws.draw(now.episode_seed, &ids);
@@ -271,7 +289,7 @@ impl Sensing {
         };
         let carrier = &mut self.carriers[slot];
         let samples = &mut out.imu[slot * self.imu_samples..(slot + 1) * self.imu_samples];
-        self.suite.sample(carrier, &motion, now, drawn, samples);
+        self.suites[self.step].sample(carrier, &motion, now, drawn, samples);
         // Both are in ascending order of the vehicle.
         if let Ok(place) = world.views.binary_search_by_key(&state.vehicle, |view| view.vehicle) {
             carrier.readings.route = world.views[place];

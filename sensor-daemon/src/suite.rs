@@ -103,6 +103,11 @@ impl Suite {
         self.sky = Some(sky);
     }
 
+    /// Takes it out again.
+    pub fn take_sky(&mut self) -> Option<Box<dyn Sky>> {
+        self.sky.take()
+    }
+
     /// A new episode, with this seed.
     pub fn begin_episode(&mut self, episode_seed: u64) {
         if let Some(sky) = &mut self.sky {

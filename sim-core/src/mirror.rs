@@ -7,7 +7,7 @@
 
 use ipc_schema::{
     block::{self, BlockError},
-    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader},
     run::RunFile,
     traffic::{MetaEvent, TrafficState, VehicleMeta},
     world::{SubStep, VehicleState, WorldLayout},
@@ -78,7 +78,7 @@ impl Settings {
     /// Header of tick `tick` (0-based within the SUMO step) from the header of the frame.
     ///
     /// The frame carries number and time of the last of its ticks. The first tick of the step keeps [`FIRST_OF_EPISODE`], the
-    /// last [`LAST_OF_EPISODE`] and [`LAST_OF_RUN`].
+    /// last [`LAST_OF_EPISODE`], [`LAST_OF_LESSON`] and [`LAST_OF_RUN`].
     #[must_use]
     pub fn tick_header(&self, frame: &MessageHeader, tick: u32, count: u32) -> MessageHeader {
         let left = self.ticks_per_step.saturating_sub(tick + 1);
@@ -93,7 +93,7 @@ impl Settings {
             header.flags &= !FIRST_OF_EPISODE;
         }
         if left > 0 {
-            header.flags &= !(LAST_OF_EPISODE | LAST_OF_RUN);
+            header.flags &= !(LAST_OF_EPISODE | LAST_OF_LESSON | LAST_OF_RUN);
         }
         header
     }

@@ -9,6 +9,7 @@ mod lidar;
 mod page;
 mod plots;
 pub mod report;
+mod trainer;
 
 use std::{io::Write as _, path::PathBuf};
 
@@ -75,6 +76,7 @@ fn measure(part: Part, options: &Options) -> Result<Report, Exit> {
         Part::Ipc => ipc::measure(options),
         Part::Lidar => lidar::measure(options),
         Part::Fanout => fanout::measure(options),
+        Part::Trainer => trainer::measure(options),
         Part::All => Err(Exit::config("`all` is not a part", "")),
     }
 }

@@ -50,6 +50,8 @@ pub enum Kind {
         /// Greatest value.
         max: i64,
     },
+    /// A list of tables with these keys.
+    Tables(&'static [Key]),
 }
 
 /// One key.
@@ -166,6 +168,19 @@ const fn other(path: &'static str, kind: Kind, meaning: &'static str) -> Key {
     key(path, kind, "", meaning)
 }
 
+/// Keys of a step of the curriculum.
+#[rustfmt::skip]
+pub const STEP_KEYS: &[Key] = &[
+    integer("curriculum.steps.cavs", "vehicles", 1, 100_000, "Connected vehicles kept alive in this step."),
+    Key { optional: true, ..integer("curriculum.steps.ticks", "ticks", 1, 1_000_000_000, "Length of a lesson. Unset = `episode.ticks`.") },
+    Key { optional: true, ..other("curriculum.steps.restart", Kind::Flag, "Every lesson begins with all vehicles at new random places; false: it goes on where the one before ended. Unset = true.") },
+    optional("curriculum.steps.noise", "", 0.0, 1000.0, "Factor on random errors and biases of all sensors. Unset = 1."),
+    optional("curriculum.steps.blackout", "", 0.0, 1000.0, "Factor on the lengths of blackouts (`blackout.enabled`); 0 = none. Unset = 1."),
+    optional("curriculum.steps.until_std", "", 0.0, 10.0, "Passed once the policy's standard deviation is at most this, in units of half the map."),
+    optional("curriculum.steps.until_error_m", "m", 0.0, 1e9, "Passed once the mean error of the policy in the samples of an update is at most this."),
+    Key { optional: true, ..integer("curriculum.steps.until_lessons", "lessons", 1, 1_000_000_000, "Passed after so many lessons, if not before. Without any of these three the step lasts to the end of training.") },
+];
+
 /// Every key there is.
 #[rustfmt::skip]
 pub const KEYS: &[Key] = &[
@@ -194,6 +209,8 @@ pub const KEYS: &[Key] = &[
     integer("episode.evaluation_interval", "episodes", 0, 1_000_000_000, "Training episodes between two evaluations; 0 = only at the end."),
     integer("episode.evaluation_ticks", "ticks", 1, 1_000_000_000, "Length of an evaluation episode."),
     integer("episode.final_evaluations", "", 1, 1_000_000, "Evaluation episodes at the end, whose mean error is reported."),
+    other("curriculum.steps", Kind::Tables(STEP_KEYS), "Steps of training in order, each a `[[curriculum.steps]]`; [] = none. Then training is counted in lessons of `episode.ticks` ticks (or the step's `ticks`), at most `episode.training_episodes` of them, and evaluations are in the base configuration."),
+    other("curriculum.log", Kind::Text, "`actions.jsonl` of a run, whose steps `caraware simulate` repeats without a learner; \"\" = none."),
     other("task.kind", Kind::Choice(&["localisation", "driving"]), "What the trainer's output means: a position for every connected vehicle, or steering and acceleration of every hero."),
     float("task.time_limit_s", "s", 0.1, 1e6, "Longest episode of a hero; then it is cut (truncated) and begins anew elsewhere."),
     other("vehicle.cav_model", Kind::Choice(&["kinematic", "dynamic"]), "Model of connected vehicles: without slip, or with tyres, load transfer, roll and pitch."),
@@ -309,6 +326,7 @@ pub const KEYS: &[Key] = &[
     optional("trainer.value_clip", "", 0.0, 1e6, "A value moves at most this far from the value before the update in one update; unset = unbounded."),
     optional("trainer.target_kl", "", 1e-9, 1e6, "An update of the policy ends with the epoch whose mean KL divergence from the policy before is larger; unset = all epochs."),
     float("trainer.max_grad_norm", "", 0.0001, 1e6, "Largest norm of the gradient."),
+    integer("trainer.actions_per_observation", "", 1, 1024, "Actions tried on every observation (`trainer.discount` = 0 only): predictions do not influence the world, so the reward of each is known, and more of them make the gradient less noisy for nearly nothing."),
     integer("trainer.horizon", "samples", 1, 100_000_000, "Samples in one update."),
     integer("trainer.batch_size", "samples", 1, 100_000_000, "Samples in one gradient step; at most the horizon."),
     integer("trainer.epochs", "", 1, 1000, "Passes over a horizon."),
@@ -341,7 +359,7 @@ pub const KEYS: &[Key] = &[
 /// The key of this dotted path.
 #[must_use]
 pub fn find(path: &str) -> Option<&'static Key> {
-    KEYS.iter().find(|key| key.path == path)
+    KEYS.iter().chain(STEP_KEYS).find(|key| key.path == path)
 }
 
 /// Keys of earlier versions, and what took their place.
@@ -358,6 +376,7 @@ pub fn nearest(path: &str) -> Option<&'static str> {
     }
     let last = |p: &str| p.rsplit('.').next().unwrap_or_default().to_owned();
     KEYS.iter()
+        .chain(STEP_KEYS)
         .map(|key| {
             let whole = strsim::jaro_winkler(path, key.path);
             let leaf = strsim::jaro_winkler(&last(path), &last(key.path));
@@ -369,6 +388,12 @@ pub fn nearest(path: &str) -> Option<&'static str> {
 }
 
 impl Key {
+    /// The last part of the path.
+    #[must_use]
+    pub fn leaf(&self) -> &'static str {
+        self.path.rsplit('.').next().unwrap_or(self.path)
+    }
+
     /// The allowed values, for people.
     #[must_use]
     pub fn range(&self) -> String {
@@ -391,6 +416,10 @@ impl Key {
             Kind::Floats { count, min, max } => format!("{count} × {min} … {max}, or one for all"),
             Kind::Span { min, max } => format!("[shortest, longest] in {min} … {max}"),
             Kind::Integers { min, max } => format!("list of {min} … {max}"),
+            Kind::Tables(keys) => format!(
+                "list of tables with {}",
+                keys.iter().map(|key| key.leaf()).collect::<Vec<_>>().join(", ")
+            ),
         }
     }
 }

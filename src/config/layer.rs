@@ -107,13 +107,48 @@ fn walk(prefix: &str, table: &DeTable<'_>, source: &Source, layer: &mut Layer) -
             source: source.clone(),
             span: value.span(),
         };
-        let value = check(key, value).ok_or_else(|| ConfigError::Value {
+        let value = match key.kind {
+            Kind::Tables(_) => tables(key, value, source)?,
+            _ => check(key, value),
+        };
+        let value = value.ok_or_else(|| ConfigError::Value {
             key,
             place: place.clone(),
         })?;
         layer.insert(key.path, Setting { value, place });
     }
     Ok(())
+}
+
+/// A list of tables, each value checked by its own key; `None` if it is none.
+fn tables(key: &'static Key, value: &Spanned<DeValue<'_>>, source: &Source) -> Result<Option<Value>, ConfigError> {
+    let Some(items) = value.get_ref().as_array() else {
+        return Ok(None);
+    };
+    let mut list = Vec::new();
+    for item in items {
+        let DeValue::Table(table) = item.get_ref() else {
+            return Ok(None);
+        };
+        let mut layer = Layer::new();
+        walk(key.path, table, source, &mut layer)?;
+        if let Kind::Tables(keys) = key.kind
+            && let Some(missing) = keys.iter().find(|key| !key.optional && !layer.contains_key(key.path))
+        {
+            return Err(ConfigError::Conflict {
+                message: format!("entry {} of `{}` has no `{}`", list.len() + 1, key.path, missing.leaf()),
+                help: format!("give `{}`. {}", missing.leaf(), missing.meaning),
+                place: Place {
+                    source: source.clone(),
+                    span: item.span(),
+                },
+            });
+        }
+        let entries = layer.values().zip(layer.keys());
+        let entries = entries.map(|(setting, path)| (path[key.path.len() + 1..].to_owned(), setting.value.clone()));
+        list.push(Value::Object(entries.collect()));
+    }
+    Ok(Some(Value::from(list)))
 }
 
 /// The value if `key` allows it.
@@ -142,6 +177,8 @@ fn check(key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Value> {
                 .collect();
             list.filter(|list| !list.is_empty()).map(Value::from)
         }
+        // Its values have places of their own (`tables`).
+        Kind::Tables(_) => None,
     }
 }
 

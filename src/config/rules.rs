@@ -6,6 +6,7 @@ use ipc_schema::{
     traffic::VEHICLE_CLASSES,
 };
 
+mod curriculum;
 mod sensors;
 
 use super::{
@@ -45,6 +46,7 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
         ));
     }
     task(settings, config)?;
+    curriculum::check(settings, config)?;
     let traffic = &config.traffic;
     let road_users = traffic.cavs + traffic.others + traffic.pedestrians + traffic.heroes;
     if road_users > config.traffic.max_road_users {

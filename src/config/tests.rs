@@ -288,6 +288,18 @@ mod reference {
                 key.unit,
                 key.meaning
             ));
+            if let keys::Kind::Tables(entries) = key.kind {
+                for entry in entries {
+                    let optional = if entry.optional { "none" } else { "" };
+                    text.push_str(&format!(
+                        "| `{leaf}.{}` | `{optional}` | {} | {} | {} |\n",
+                        entry.leaf(),
+                        entry.range(),
+                        entry.unit,
+                        entry.meaning
+                    ));
+                }
+            }
         }
         text
     }
@@ -316,6 +328,54 @@ fn the_resolved_default_preset_for_tests_is_true() {
         std::fs::read_to_string(path).unwrap() == expected,
         "{path} is not what CARAWARE_BLESS=1 would write"
     );
+}
+
+#[test]
+fn a_step_of_a_curriculum_is_checked_value_by_value() {
+    let config =
+        config_of("[[curriculum.steps]]\ncavs = 1\nrestart = false\nuntil_std = 0.5\n[[curriculum.steps]]\ncavs = 8\n")
+            .unwrap();
+    let steps = config.curriculum.steps;
+    assert_eq!(
+        (steps.len(), steps[0].restart, steps[1].restart, steps[1].cavs),
+        (2, false, true, 8)
+    );
+    assert_eq!((steps[0].until_std, steps[1].noise), (Some(0.5), 1.0));
+    let (message, help) = error_of("[[curriculum.steps]]\ncavs = 1\nuntil_sigma = 0.5\n");
+    assert_eq!(message, "my.toml:3: unknown key `curriculum.steps.until_sigma`");
+    assert!(help.contains("`curriculum.steps.until_std`"), "{help}");
+    let (message, _) = error_of("[curriculum]\nsteps = [{ cavs = 0 }]\n");
+    assert_eq!(message, "my.toml:2: `curriculum.steps.cavs` cannot be 0");
+    let (message, _) = error_of("[[curriculum.steps]]\nrestart = true\n");
+    assert!(
+        message.contains("entry 1 of `curriculum.steps` has no `cavs`"),
+        "{message}"
+    );
+    let (message, help) = error_of("traffic.max_road_users = 60\n[[curriculum.steps]]\ncavs = 100\n");
+    assert!(
+        message.contains("step 1 of `curriculum.steps` asks for 120 road users"),
+        "{message}"
+    );
+    assert_eq!(help, "set traffic.max_road_users to 120 or more");
+}
+
+#[test]
+fn a_step_changes_population_noise_and_blackouts_and_nothing_else() {
+    let text = "[blackout]\nenabled = true\n[[curriculum.steps]]\ncavs = 3\nnoise = 2.0\nblackout = 0.0\n[[curriculum.steps]]\ncavs = 5\n";
+    let config = config_of(text).unwrap();
+    let (base, first, second) = (config.in_step(0), config.in_step(1), config.in_step(2));
+    assert_eq!(base, config);
+    assert_eq!((first.traffic.cavs, second.traffic.cavs), (3, 5));
+    assert_eq!(
+        (first.gnss.noise_std_deg, second.gnss.noise_std_deg),
+        ([1e-4; 2], [5e-5; 2])
+    );
+    assert_eq!(
+        (first.imu.accel_noise_std_mps2, first.gnss.blackout_length_s),
+        ([0.002; 3], [0.0; 2])
+    );
+    assert_eq!(second.gnss.blackout_length_s, [5.0, 10.0]);
+    assert_eq!((first.trainer, first.run), (config.trainer, config.run));
 }
 
 #[test]

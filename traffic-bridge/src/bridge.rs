@@ -6,11 +6,11 @@ use ipc_schema::{
     block::Section,
     board::State,
     failure::{Failure, FailureKind},
-    header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader, step_flags},
     ports::{BoardReader, PortError, Publisher, Subscriber, Waker},
     process::Process,
     run::{RunFile, Source},
-    schedule::Episode,
+    schedule::{Course, Due, Episode},
     services::Channel,
     session::{Session as Membership, Wait},
     traffic::{ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout, VehicleMeta},
@@ -18,6 +18,7 @@ use ipc_schema::{
 
 use crate::{
     census::Census,
+    decisions::Decisions,
     error::SumoError,
     fleet::Fleet,
     frame::Frame,
@@ -35,27 +36,51 @@ use crate::{
 /// The user's files are wrong, the shared memory is gone, or SUMO fails.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut membership = Membership::join(run_file, Process::TrafficBridge)?;
-    let mut episodes = membership.run.schedule().peekable();
+    let episodes = membership.run.schedule();
     let poses = match membership.run.config.drives() {
         true => Some(membership.subscriber(Channel::EgoPose)?),
         false => None,
     };
     let mut bridge = Bridge::open(membership, poses)?;
-    let mut sumo = None;
-    while let Some(episode) = episodes.next() {
-        let options = options(&bridge.membership.run, &episode)?;
-        let mut session = match sumo.take() {
-            None => Session::start(options)?,
-            Some(previous) => Session::reload(previous, options)?,
-        };
-        bridge.announce(&session);
-        let is_last = episodes.peek().is_none();
-        if bridge.episode(&mut session, &episode, is_last)? == Wait::Stopped {
-            return Ok(());
-        }
-        sumo = Some(session);
+    let waited = match bridge.membership.run.course() {
+        Some(course) => bridge.follow(course)?,
+        None => bridge.all(episodes)?,
+    };
+    match waited {
+        Wait::Ready => bridge.leave(),
+        Wait::Stopped => Ok(()),
     }
-    bridge.leave()
+}
+
+/// SUMO with the road users of one episode.
+struct Underway {
+    session: Session,
+    population: Option<Population>,
+    frame: Frame,
+    episode: Episode,
+}
+
+impl Underway {
+    /// After a pause: what the last step was not yet followed by.
+    fn go_on(mut self) -> Result<Self, SumoError> {
+        if let Some(population) = &mut self.population {
+            population.after_step(&mut self.session, &self.frame)?;
+        }
+        Ok(self)
+    }
+}
+
+/// What a stretch of an episode means.
+#[derive(Debug, Clone, Copy, Default)]
+struct Stretch {
+    /// Ticks of the episode until it is over; `None`: until the episode is.
+    ticks: Option<u64>,
+    /// Flags of all its ticks, beside those of the episode.
+    flags: u32,
+    /// Flags of its last tick.
+    last_flags: u32,
+    /// The run ends with the episode.
+    is_last: bool,
 }
 
 /// What SUMO is to be told for `episode`.
@@ -85,10 +110,15 @@ fn options(run: &RunFile, episode: &Episode) -> Result<Options, SumoError> {
 }
 
 /// The road users that we put into an empty net; a scenario brings its own.
-fn population(run: &RunFile, session: &mut Session, episode: &Episode) -> Result<Option<Population>, SumoError> {
+fn population(
+    run: &RunFile,
+    session: &mut Session,
+    episode: &Episode,
+    step: usize,
+) -> Result<Option<Population>, SumoError> {
     match run.source {
         Source::Population { .. } => {
-            let traffic = &run.config.traffic;
+            let traffic = &run.config.in_step(step).traffic;
             let trips = Trips::of_episode(traffic.held_out_trips, episode.evaluation);
             let size = Size::from(traffic);
             Population::start_on(session, size, &traffic.hero_route, trips, episode.seed).map(Some)
@@ -170,31 +200,136 @@ impl Bridge {
         });
     }
 
-    /// Runs one episode to its end.
-    fn episode(&mut self, session: &mut Session, episode: &Episode, is_last: bool) -> Result<Wait, Failure> {
-        let mut population = population(&self.membership.run, session, episode)?;
-        let mut frame = Frame::default();
+    /// Runs all episodes of a run without a curriculum.
+    fn all(&mut self, episodes: impl Iterator<Item = Episode>) -> Result<Wait, Failure> {
+        let (mut before, mut episodes) = (None, episodes.peekable());
+        while let Some(episode) = episodes.next() {
+            let mut underway = self.begin(before.take(), &episode, 0)?;
+            self.announce(&underway.session);
+            let stretch = Stretch {
+                is_last: episodes.peek().is_none(),
+                ..Stretch::default()
+            };
+            if self.run(&mut underway, stretch)? == Wait::Stopped {
+                return Ok(Wait::Stopped);
+            }
+            before = Some(underway);
+        }
+        Ok(Wait::Ready)
+    }
+
+    /// Runs lessons and evaluations as `course` has them, in the steps that are decided on the way.
+    fn follow(&mut self, mut course: Course) -> Result<Wait, Failure> {
+        let mut decisions = Decisions::open(&self.membership)?;
+        let mut underway: Option<Underway> = None;
+        loop {
+            let (begins, step, stretch) = match course.due() {
+                Due::Nothing => return Ok(Wait::Ready),
+                Due::Evaluation { episode, is_last } => {
+                    let stretch = Stretch {
+                        is_last,
+                        ..Stretch::default()
+                    };
+                    (Some(episode), 0, stretch)
+                }
+                Due::Lesson(number) => {
+                    let Some(step) = decisions.step_of(&self.membership, number, self.ticks)? else {
+                        return Ok(Wait::Stopped);
+                    };
+                    let Some(lesson) = course.enter(step) else {
+                        continue;
+                    };
+                    let past = match lesson.begins {
+                        Some(_) => 0,
+                        None => underway
+                            .as_ref()
+                            .map_or(0, |underway| underway.frame.step * self.ticks_per_step),
+                    };
+                    let config = &self.membership.run.config;
+                    let kind = &config.curriculum.steps[step];
+                    let ticks = kind.ticks.unwrap_or(config.episode.ticks);
+                    #[expect(clippy::cast_possible_truncation, reason = "validated: at most 255 steps")]
+                    let stretch = Stretch {
+                        ticks: Some(past + ticks.next_multiple_of(self.ticks_per_step)),
+                        flags: step_flags(step as u8 + 1),
+                        last_flags: match kind.restart {
+                            true => LAST_OF_LESSON | LAST_OF_EPISODE,
+                            false => LAST_OF_LESSON,
+                        },
+                        is_last: false,
+                    };
+                    (lesson.begins, step + 1, stretch)
+                }
+            };
+            let mut now = match (begins, underway.take()) {
+                (Some(episode), before) => self.begin(before, &episode, step)?,
+                (None, Some(now)) => now.go_on()?,
+                (None, None) => return Ok(Wait::Ready),
+            };
+            self.announce(&now.session);
+            if self.run(&mut now, stretch)? == Wait::Stopped {
+                return Ok(Wait::Stopped);
+            }
+            underway = Some(now);
+        }
+    }
+
+    /// SUMO at the beginning of `episode`, in `step` of the curriculum (counted from 1; 0: none).
+    fn begin(&mut self, before: Option<Underway>, episode: &Episode, step: usize) -> Result<Underway, Failure> {
+        let run = &self.membership.run;
+        let options = options(run, episode)?;
+        let mut session = match before {
+            None => Session::start(options)?,
+            Some(before) => Session::reload(before.session, options)?,
+        };
+        let population = population(run, &mut session, episode, step)?;
+        Ok(Underway {
+            session,
+            population,
+            frame: Frame::default(),
+            episode: *episode,
+        })
+    }
+
+    /// Runs an episode to the end of the stretch, or to its own.
+    fn run(&mut self, underway: &mut Underway, stretch: Stretch) -> Result<Wait, Failure> {
+        let Underway {
+            session,
+            population,
+            frame,
+            episode,
+        } = underway;
         loop {
             let tick = self.ticks + self.ticks_per_step - 1;
             if self.may_send(tick, session.step_s())? == Wait::Stopped {
                 return Ok(Wait::Stopped);
             }
-            if self.move_heroes(session, episode, &frame)? == Wait::Stopped {
+            if self.move_heroes(session, episode, frame)? == Wait::Stopped {
                 return Ok(Wait::Stopped);
             }
-            session.step(&mut frame)?;
-            let ends = self.ends(session, episode, &frame)?;
-            let header = self.header(episode, &frame, tick, session.step_s(), ends, is_last);
+            session.step(frame)?;
+            let pauses = stretch
+                .ticks
+                .is_some_and(|ticks| frame.step * self.ticks_per_step >= ticks);
+            let ends = stretch.ticks.is_none() && self.ends(session, episode, frame)?;
+            let flags = stretch.flags | if pauses { stretch.last_flags } else { 0 };
+            let header = self.header(episode, frame, tick, session.step_s(), ends, ends && stretch.is_last);
+            let header = MessageHeader {
+                flags: header.flags | flags,
+                ..header
+            };
             if self.poses.is_some() {
-                self.publish_routes(&heroes::take_over(session, &frame)?, header)?;
+                self.publish_routes(&heroes::take_over(session, frame)?, header)?;
             }
-            self.publish(&frame, header)?;
+            self.publish(frame, header)?;
             if ends {
                 self.check_that_somebody_came()?;
+            }
+            if ends || pauses {
                 return Ok(Wait::Ready);
             }
-            if let Some(population) = &mut population {
-                population.after_step(session, &frame)?;
+            if let Some(population) = population {
+                population.after_step(session, frame)?;
             }
         }
     }
@@ -277,14 +412,14 @@ impl Bridge {
         tick: u64,
         step_s: f64,
         ends: bool,
-        is_last: bool,
+        ends_run: bool,
     ) -> MessageHeader {
         let flag = |bit: u32, is_set: bool| if is_set { bit } else { 0 };
         MessageHeader {
             flags: flag(EVALUATION, episode.evaluation)
                 | flag(FIRST_OF_EPISODE, frame.step == 1)
                 | flag(LAST_OF_EPISODE, ends)
-                | flag(LAST_OF_RUN, ends && is_last),
+                | flag(LAST_OF_RUN, ends_run),
             episode: episode.index,
             episode_seed: episode.seed,
             tick,

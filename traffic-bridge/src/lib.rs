@@ -7,6 +7,7 @@ pub mod bridge;
 pub mod catalogue;
 pub mod census;
 pub mod convention;
+mod decisions;
 pub mod error;
 pub mod fleet;
 pub mod frame;

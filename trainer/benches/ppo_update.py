@@ -10,72 +10,9 @@ import time
 from collections.abc import Callable
 
 import torch
+from caraware.benchmark_trainer import BATCH, EPOCHS, HORIZON, OBSERVATIONS, PlainAgent, plain_update, random_batch
 from caraware.config import MapBounds, TrainerConfig
 from caraware.ppo import Batch, Ppo
-from torch import Tensor, nn
-from torch.distributions import Normal
-
-OBSERVATIONS, HORIZON, BATCH, EPOCHS = 9, 32_768, 2_048, 4
-
-
-class PlainAgent(nn.Module):
-    """The paper's networks as anybody would write them."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.value = nn.Sequential(
-            nn.Linear(OBSERVATIONS, 500), nn.ReLU(), nn.Linear(500, 300), nn.ReLU(), nn.Linear(300, 1)
-        )
-        self.mean = nn.Sequential(
-            nn.Linear(OBSERVATIONS, 500), nn.ReLU(), nn.Linear(500, 300), nn.Tanh(), nn.Linear(300, 2), nn.Tanh()
-        )
-        self.log_std = nn.Parameter(torch.zeros(1, 2))
-
-    def evaluate(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Log-probability, entropy and value, `[b]` each."""
-        mean = self.mean(observation)
-        normal = Normal(mean, self.log_std.expand_as(mean).exp())
-        value = self.value(observation).squeeze(1)
-        return normal.log_prob(action).sum(1), normal.entropy().sum(1), value
-
-
-def plain_update(agent: PlainAgent, adam: torch.optim.Adam, batch: Batch) -> None:
-    """Epochs of minibatches through autograd and a joint optimiser."""
-    for _ in range(EPOCHS):
-        order = torch.randperm(HORIZON).to(batch.reward.device)
-        for start in range(0, HORIZON, BATCH):
-            rows = order[start : start + BATCH]
-            new_log_probability, entropy, value = agent.evaluate(batch.observation[rows], batch.action[rows])
-            ratio = (new_log_probability - batch.log_probability[rows]).exp()
-            advantage = batch.advantage[rows]
-            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-            policy_loss = torch.max(-advantage * ratio, -advantage * ratio.clamp(0.8, 1.2)).mean()
-            value_loss = (value - batch.value_target[rows]).square().mean()
-            adam.zero_grad()
-            (policy_loss - 0.01 * entropy.mean() + value_loss).backward()
-            nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
-            adam.step()
-
-
-def random_batch(ppo: Ppo) -> Batch:
-    """Actions of the given policy with made-up advantages."""
-    observation = torch.rand(HORIZON, OBSERVATIONS) * 2 - 1
-    with torch.no_grad():
-        action = ppo.policy.mlp.infer(observation.to(ppo.device)).cpu() + torch.randn(HORIZON, 2)
-    nothing = torch.zeros(HORIZON)
-    log_probability = -0.5 * torch.randn(HORIZON, 2).square().sum(1) - 1.8379
-    target = torch.rand(HORIZON)
-    return Batch(
-        observation=observation,
-        action=action,
-        log_probability=log_probability,
-        reward=target,
-        advantage=torch.randn(HORIZON),
-        value_target=target,
-        truth=torch.zeros(HORIZON, 4),
-        vehicle=nothing.long(),
-        tick=nothing.long(),
-    )
 
 
 def on(device: torch.device, batch: Batch) -> Batch:

@@ -53,6 +53,8 @@ struct Attached {
     predictions: Publisher,
     /// Whoever waits for the predictions: sim-core in the driving task.
     driven: Option<Waker>,
+    /// Whoever waits for the step of the next lesson.
+    taught: Waker,
     training: TrainingStatus,
     /// Board of where ticks begin; opened when first asked for.
     traffic: Option<BoardReader>,
@@ -191,6 +193,15 @@ impl Attachment {
         Ok(())
     }
 
+    /// Says that all lessons below `lessons` have a step of the curriculum: those from `since` on `step`, counted from 0. The
+    /// simulation waits for that before each lesson.
+    fn decided(&self, lessons: u64, since: u64, step: u32) -> PyResult<()> {
+        let mut inner = self.lock()?;
+        inner.session.decided(lessons, since, step);
+        inner.taught.wake();
+        Ok(())
+    }
+
     /// Says that all work is done.
     fn done(&self) -> PyResult<()> {
         self.lock()?.session.done();
@@ -298,6 +309,7 @@ impl Attachment {
             true => Some(session.waker(Process::SimCore).map_err(session_failed)?),
             false => None,
         };
+        let taught = session.waker(Process::TrafficBridge).map_err(session_failed)?;
         session.attach_from(first_tick);
         let attached = Attached {
             session,
@@ -305,6 +317,7 @@ impl Attachment {
             scans: None,
             predictions,
             driven,
+            taught,
             training: TrainingStatus::default(),
             traffic: None,
             consumed_ticks: first_tick,
@@ -468,6 +481,18 @@ impl ObservationBlock {
     #[getter]
     fn episode_last(&self) -> bool {
         self.header.has(header::LAST_OF_EPISODE)
+    }
+
+    /// True for the last tick of a lesson, before the next of which the simulation waits for `Attachment.decided`.
+    #[getter]
+    fn lesson_last(&self) -> bool {
+        self.header.has(header::LAST_OF_LESSON)
+    }
+
+    /// Step of the curriculum, counted from 1; 0 without one, and in evaluations.
+    #[getter]
+    fn step(&self) -> usize {
+        self.header.step()
     }
 
     /// True for the last tick of the run.

@@ -30,6 +30,8 @@ class SyntheticObservation:
     evaluation: bool = False
     last: bool = False
     episode_last: bool = False
+    lesson_last: bool = False
+    step: int = 0
     sim_time_ns: int = 0
 
 
@@ -46,6 +48,7 @@ class SyntheticChannel:
     predictions: dict[int, Tensor] = field(default_factory=dict)
     versions: dict[int, int] = field(default_factory=dict)
     reports: list[dict] = field(default_factory=list)
+    decisions: list[tuple[int, int, int]] = field(default_factory=list)
 
     def receive(self, timeout_s: float) -> list[SyntheticObservation]:
         """The next ticks."""
@@ -58,6 +61,10 @@ class SyntheticChannel:
         """Remember the credit."""
         assert tick >= self.consumed_up_to
         self.consumed_up_to = tick
+
+    def decided(self, lessons: int, since: int, step: int) -> None:
+        """Remember the newest decision."""
+        self.decisions.append((lessons, since, step))
 
     def committed(self, tick: int) -> None:
         """Remember the commit."""

@@ -45,6 +45,7 @@ def test_both_ways_move_the_parameters_alike() -> None:
     [
         {"value_clip": 0.05},
         {"target_kl": 1e-3},
+        {"actions_per_observation": 4, "value_clip": 0.05},
         {"learning_rate_final": 0.0, "clip_epsilon_final": 0.05, "entropy_scale_final": 0.5},
     ],
 )

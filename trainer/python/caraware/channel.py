@@ -97,6 +97,16 @@ class Observation:
         """True for the last tick of its episode."""
         return self.block.episode_last
 
+    @property
+    def lesson_last(self) -> bool:
+        """True for the last tick of a lesson of the curriculum."""
+        return self.block.lesson_last
+
+    @property
+    def step(self) -> int:
+        """Step of the curriculum, counted from 1; 0 without one, and in evaluations."""
+        return self.block.step
+
     def _array(self, name: str, dtype: type, columns: int | None = None) -> np.ndarray:
         array = np.frombuffer(self.block.section(name), dtype=dtype)
         return array if columns is None else array.reshape(self.block.slots, columns)
@@ -195,6 +205,7 @@ class Channel:
 
     def __init__(self, run_file: str, first_tick: int = 0, *, outside: bool = False) -> None:
         """Join the run; ticks come from `first_tick` on, however far the simulation is: all before are committed."""
+        self.first_tick = first_tick
         self._hold(_native.Attachment(run_file, first_tick, outside=outside))
 
     def _hold(self, attachment: _native.Attachment) -> None:
@@ -207,6 +218,7 @@ class Channel:
         Each has its own ticks, credits and commits. A trainer has to take a place in every environment.
         """
         channel = object.__new__(Channel)
+        channel.first_tick = first_tick
         channel._hold(self._attachment.in_environment(index, first_tick))
         return channel
 
@@ -240,6 +252,13 @@ class Channel:
     def committed(self, tick: int) -> None:
         """All ticks up to and including `tick` are in a checkpoint that has been renamed into place."""
         self._attachment.committed(tick)
+
+    def decided(self, lessons: int, since: int, step: int) -> None:
+        """All lessons of a curriculum below `lessons` have a step; those from `since` on `step`, counted from 0.
+
+        The simulation waits for that before every lesson, the first included. `caraware.curriculum` says it.
+        """
+        self._attachment.decided(lessons, since, step)
 
     def publish_predictions(
         self,

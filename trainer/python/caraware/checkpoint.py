@@ -53,6 +53,8 @@ class Course:
     training: list[TrainingPoint] = field(default_factory=list)
     others: list[Place] = field(default_factory=list)
     """The environments after the first, of which `Counters` and the fields above tell."""
+    curriculum: dict = field(default_factory=dict)
+    """`caraware.curriculum.Standing`; empty without a curriculum."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from caraware import rewards
 from caraware.baselines.noise import SensorNoise
+from caraware.curriculum import Step
 
 _KEY_OF_FIELD = {"checkpoint_interval_updates": "checkpoint_interval"}
 """Fields whose name in the configuration file differs (there, the unit stands in the table of keys)."""
@@ -59,6 +60,9 @@ class TrainerConfig:
     """The policy's update ends with the epoch whose mean KL divergence is larger; None: after all epochs."""
     max_grad_norm: float = 0.5
     """Largest gradient norm, of the policy and of the value network each."""
+    actions_per_observation: int = 1
+    """Actions tried on every observation: a prediction does not influence the world, so each one's reward is known.
+    More of them make the gradient's noise smaller for the same samples."""
     horizon: int = 8192
     """Samples (one vehicle at one tick) collected before every update."""
     batch_size: int = 1024
@@ -119,7 +123,20 @@ class TrainerConfig:
         for name in ("learning_rate_final", "clip_epsilon_final", "entropy_scale_final", "value_clip", "target_kl"):
             if (value := getattr(self, name)) is not None:
                 _range(name, value, 0.0, math.inf)
-        for name in ("horizon", "batch_size", "epochs", "ranks", "checkpoint_interval_updates", "checkpoints_kept"):
+        if self.actions_per_observation > 1 and self.ranks > 1:
+            raise ConfigError(
+                f"`trainer.actions_per_observation` = {self.actions_per_observation} with several ranks",
+                "ranks already share more samples: set trainer.actions_per_observation = 1",
+            )
+        if self.actions_per_observation > 1 and self.discount > 0.0:
+            raise ConfigError(
+                f"`trainer.actions_per_observation` = {self.actions_per_observation} with `trainer.discount`"
+                f" = {self.discount}",
+                "several actions on one observation have one future: set trainer.discount = 0",
+            )
+        for name in ("actions_per_observation", "horizon", "batch_size", "epochs", "ranks"):
+            _range(name, getattr(self, name), 1, math.inf)
+        for name in ("checkpoint_interval_updates", "checkpoints_kept"):
             _range(name, getattr(self, name), 1, math.inf)
         _range("batch_size", self.batch_size, 1, self.horizon)
         if not self.hidden or min(self.hidden) < 1:
@@ -165,6 +182,8 @@ class RunConfig:
     dark_is_nan: bool = False
     """Fields of a sensor in a blackout are not numbers (`blackout.policy`); the networks see 0, mid-range, instead."""
     training_episodes: int = 1
+    """With a curriculum: most lessons."""
+    curriculum: tuple[Step, ...] = ()
     evaluation_interval: int = 0
     """Training episodes between two evaluation episodes; 0: none between."""
     sensors: SensorNoise | None = None
@@ -193,6 +212,7 @@ class RunConfig:
             config_sha256=hashlib.sha256(canonical).hexdigest(),
             dark_is_nan=run.get("config", {}).get("blackout", {}).get("policy") == "nan",
             training_episodes=max(1, episodes.get("training_episodes", 1)),
+            curriculum=Step.from_run(run),
             evaluation_interval=episodes.get("evaluation_interval", 0),
             sensors=SensorNoise.from_run(run),
             environments=tuple(range(first_env, first_env + place.get("envs", 1))),

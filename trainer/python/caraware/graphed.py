@@ -116,9 +116,10 @@ class GraphedUpdate:
         for network in (self._ppo.policy.mlp, self._ppo.value.mlp):
             network.reserve(max(rows, CHUNK_ROWS))
         self._observation = torch.zeros(full, self._ppo.observation_size, device=device)
-        self._action = torch.zeros(full, 2, device=device)
-        self._old_log_probability = torch.zeros(full, device=device)
-        self._advantage = torch.zeros(full, device=device)
+        tries = self._ppo.config.actions_per_observation
+        self._action = torch.zeros(full, tries, 2, device=device)
+        self._old_log_probability = torch.zeros(full, tries, device=device)
+        self._advantage = torch.zeros(full, tries, device=device)
         self._target = torch.zeros(full, device=device)
         self._weight = torch.zeros(full, device=device)
         self._order = torch.zeros(steps, rows, dtype=torch.int64, device=device)
@@ -131,7 +132,7 @@ class GraphedUpdate:
         columns = (batch.observation, batch.action, batch.log_probability, batch.advantage, batch.value_target)
         rooms = (self._observation, self._action, self._old_log_probability, self._advantage, self._target)
         for room, column in zip(rooms, columns, strict=True):
-            room[:count].copy_(column)
+            room[:count].copy_(column.view(count, *room.shape[1:]))
         self._weight.zero_()[:count].fill_(1)
         nobody = self._samples
         pieces = [piece for order in orders for piece in order.tensor_split(parts)]
@@ -160,19 +161,20 @@ class GraphedUpdate:
         observation, action, old, advantage, weight = self._minibatch(
             step, self._observation, self._action, self._old_log_probability, self._advantage, self._weight
         )
-        share = weight / weight.sum()
+        weight = weight.unsqueeze(1)
+        share = weight / (weight.sum() * advantage.shape[1])
         centred = advantage - (advantage * share).sum()
         advantage = centred / ((centred.square() * share).sum().sqrt() + SMALLEST_DEVIATION)
-        mean = policy.mlp.forward(observation)
+        mean = policy.mlp.forward(observation).unsqueeze(1)
         inverse_std = torch.exp(-policy.log_std)
         deviation = (action - mean) * inverse_std
         log_ratio = (log_probability(action, mean, policy.log_std) - old) * weight
         ratio = log_ratio.exp()
         unclipped = ratio * advantage
         clipped = torch.minimum(torch.maximum(ratio, 1 - self._clip_epsilon), 1 + self._clip_epsilon) * advantage
-        pull = (torch.where(unclipped <= clipped, unclipped, 0.0) * -share).unsqueeze(1)
-        policy.mlp.backward(observation, pull * deviation * inverse_std)
-        policy.log_std_gradient.copy_((pull * (deviation.square() - 1)).sum(0) - self._entropy_scale)
+        pull = (torch.where(unclipped <= clipped, unclipped, 0.0) * -share).unsqueeze(2)
+        policy.mlp.backward(observation, (pull * deviation * inverse_std).sum(1))
+        policy.log_std_gradient.copy_((pull * (deviation.square() - 1)).sum((0, 1)) - self._entropy_scale)
         norm = self._policy_adam.step(config.max_grad_norm)
         loss = -(torch.minimum(unclipped, clipped) * share).sum() - self._entropy_scale * entropy(policy.log_std)
         numbers = (
@@ -191,7 +193,7 @@ class GraphedUpdate:
         columns = (self._observation, self._target, self._advantage, self._weight)
         observation, target, advantage, weight = self._minibatch(step, *columns)
         share = weight / weight.sum()
-        error = clipped_error(network.forward(observation).squeeze(1), target, advantage, config.value_clip)
+        error = clipped_error(network.forward(observation).squeeze(1), target, advantage.mean(1), config.value_clip)
         network.backward(observation, (2 * config.value_scale * error.pull * share).unsqueeze(1))
         norm = self._value_adam.step(config.max_grad_norm)
         numbers = torch.stack(((error.loss * share).sum(), norm))

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,6 +22,7 @@ from caraware.checkpoint import (
     save_checkpoint,
 )
 from caraware.config import RunConfig
+from caraware.curriculum import Curriculum
 from caraware.environment import Environment, EpisodeStarts, Place, share
 from caraware.evaluation import NO_HEADLINE, ErrorMeter, Evaluation, EvaluationResult, errors_m, pooled
 from caraware.manifest import Counters
@@ -117,6 +119,11 @@ class TrainingLoop:
         self._learns = True
         """Until an environment ends before its share of the horizon is full."""
         self._meter = ErrorMeter()
+        self._curriculum = Curriculum(config.curriculum, channel)
+        self._curriculum.begin(learner.course.curriculum if learner else None)
+        self._lesson_end: Observation | None = None
+        """Last tick of a lesson that is not decided about yet."""
+        self._commit_due = False
         if learner is not None:
             self._start(learner)
 
@@ -215,6 +222,10 @@ class TrainingLoop:
                     return
         if self._ppo is not None and self._learns:
             self._learn_or_give_up()
+        self._end_lesson()
+        # A lesson that ended with the horizon is part of the checkpoint: its last tick will not come again.
+        if self._commit_due:
+            self.commit()
 
     def _take_all(self, environment: Environment, predicted_m: list[Tensor]) -> bool:
         """Take waiting ticks while the environment may go on; False if a successor takes over."""
@@ -223,6 +234,9 @@ class TrainingLoop:
                 break
             obs = environment.pending.popleft()
             self._take(environment, obs, prediction_m)
+            if obs.lesson_last:
+                self._lesson_end = obs
+                break
             # What comes in an evaluation, or after an update, a successor can take up as well.
             if obs.evaluation and self._leave_requested():
                 self._left = True
@@ -289,12 +303,19 @@ class TrainingLoop:
             self._passed_steps += len(policy_m)
         channel.consumed(obs.tick)
 
+    def _end_lesson(self) -> None:
+        """Before the next lesson the simulation waits for its step of the curriculum."""
+        if self._lesson_end is not None and self._ppo is not None:
+            error_m = self._metrics.training[-1].error_m if self._metrics.training else math.nan
+            self._curriculum.lesson_ended(self._lesson_end, self._env_steps, self._ppo.sigma(), error_m)
+        self._lesson_end = None
+
     def _learn(self) -> None:
         """One update, while the simulation already makes the next ticks."""
         assert self._ppo is not None
         horizons = [environment.rollout.take() for environment in self._environments]
         batch = Batch.joined([self._ppo.score(horizon, index) for index, horizon in enumerate(horizons)])
-        self._ppo.progress = self._config.progress(self._agreed_episode)
+        self._ppo.progress = self._progress()
         try:
             stats = self._ppo.update(batch)
         except NonFiniteLoss as error:
@@ -304,8 +325,13 @@ class TrainingLoop:
         for environment, horizon in zip(self._environments, horizons, strict=True):
             environment.committed_tick = horizon.last_tick()
         self._record(stats)
-        if self._ppo.updates % self._config.trainer.checkpoint_interval_updates == 0:
-            self.commit()
+        self._commit_due = self._ppo.updates % self._config.trainer.checkpoint_interval_updates == 0
+
+    def _progress(self) -> float:
+        """Share of training that is behind."""
+        if self._curriculum:
+            return self._curriculum.share(self._config.training_episodes)
+        return self._config.progress(self._agreed_episode)
 
     def _episode(self) -> int:
         """The episode of the environment that is farthest behind."""
@@ -377,7 +403,7 @@ class TrainingLoop:
             log.info("checkpoint %s, learnt up to tick %d", saved.name, committed_tick)
         # The checkpoint of rank 0 is that of all.
         self._ranks.gather(None)
-        self._saved_updates = counters.updates
+        self._saved_updates, self._commit_due = counters.updates, False
         for environment in self._environments:
             if environment.committed_tick >= 0:
                 environment.channel.committed(environment.committed_tick)
@@ -406,6 +432,7 @@ class TrainingLoop:
             duplicated_ticks=first.duplicated_ticks,
             vehicles=self._vehicles,
             evaluated_tick=first.evaluated_tick,
+            curriculum=self._curriculum.saved(),
             evaluations=self._metrics.evaluations,
             training=self._metrics.training,
             others=others,
@@ -437,6 +464,7 @@ class TrainingLoop:
             "policy_std": self._ppo.sigma() if self._ppo else None,
             "updates": self._updates(),
             "vehicles": self._vehicles,
+            "curriculum": self._curriculum.report(),
             "received_ticks": sum(ledger.received for ledger in ledgers),
             "lost_ticks": sum(ledger.lost for ledger in ledgers),
             "duplicated_ticks": sum(ledger.duplicated for ledger in ledgers),

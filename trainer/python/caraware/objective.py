@@ -1,6 +1,6 @@
 """PPO's two objectives with their gradients: the clipped surrogate of the policy, the error of the values."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -38,9 +38,16 @@ def clipped_surrogate(
 ) -> Surrogate:
     """-E[min(ratio A, clip(ratio, 1 - ε, 1 + ε) A)] and its gradient, for `[b, 2]` means and actions.
 
+    With k actions per observation, actions are `[b, k, 2]`, old log-probabilities and advantages `[b, k]`.
+
     The gradient flows only through samples where the unclipped term is the smaller: d(ratio)/dθ = ratio dlogπ/dθ,
     with dlogπ/dμ = (a - μ)/σ² and dlogπ/dlogσ = ((a - μ)/σ)² - 1.
     """
+    if advantage.ndim == 2:
+        tries = advantage.shape[1]
+        columns = (action.flatten(0, 1), old_log_probability.flatten(), advantage.flatten(), clip_epsilon)
+        each = clipped_surrogate(mean.repeat_interleave(tries, 0), log_std, *columns)
+        return replace(each, mean_gradient=each.mean_gradient.view(-1, tries, mean.shape[1]).sum(1))
     inverse_std = torch.exp(-log_std)
     deviation = (action - mean) * inverse_std
     log_ratio = log_probability(action, mean, log_std) - old_log_probability

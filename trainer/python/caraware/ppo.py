@@ -50,13 +50,13 @@ class Batch:
     observation: Tensor
     """f32 `[s, d]`."""
     action: Tensor
-    """f32 `[s, 2]`, as sampled, not clipped."""
+    """f32 `[s, 2]`, as sampled, not clipped; `[s, k, 2]` with k > 1 actions per observation."""
     log_probability: Tensor
-    """f32 `[s]` of the action under the policy that sampled it."""
+    """f32 `[s]` or `[s, k]` of the action under the policy that sampled it."""
     reward: Tensor
-    """f32 `[s]`."""
+    """f32 `[s]`, mean over the actions of an observation."""
     advantage: Tensor
-    """f32 `[s]`, before normalisation."""
+    """f32 `[s]` or `[s, k]`, before normalisation."""
     value_target: Tensor
     """f32 `[s]`."""
     truth: Tensor
@@ -73,6 +73,10 @@ class Batch:
             return batches[0]
         columns = (f.name for f in fields(cls))
         return cls(**{name: torch.cat([getattr(batch, name) for batch in batches]) for name in columns})
+
+    def value_advantage(self) -> Tensor:
+        """f32 `[s]`: the value target minus the value before the update."""
+        return self.advantage if self.advantage.ndim == 1 else self.advantage.mean(1)
 
 
 @dataclass(frozen=True)
@@ -221,15 +225,21 @@ class Ppo:
         observation = horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device)
         truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
         mean = self.policy.mlp.infer(observation)
-        noise = torch.randn(mean.shape, generator=self._samplings[environment]).to(self.device)
-        action = mean + self.policy.log_std.exp() * noise
-        reward = self._reward(rewards.distance_m(self.bounds.to_world_m(action), truth), self.config.reward_scale_m)
         value = self.value.mlp.infer(observation).squeeze(1)
-        advantage, value_target = self._advantages(horizon, rows, reward, value)
+        tries = self.config.actions_per_observation
+        centre, place = (mean, truth) if tries == 1 else (mean.unsqueeze(1), truth.unsqueeze(1))
+        noise = torch.randn(len(mean), tries, ACTIONS, generator=self._samplings[environment]).to(self.device)
+        action = centre + self.policy.log_std.exp() * (noise.squeeze(1) if tries == 1 else noise)
+        reward = self._reward(rewards.distance_m(self.bounds.to_world_m(action), place), self.config.reward_scale_m)
+        if tries == 1:
+            advantage, value_target = self._advantages(horizon, rows, reward, value)
+        else:
+            advantage = reward - value.unsqueeze(1)
+            reward = value_target = reward.mean(1)
         return Batch(
             observation=observation,
             action=action,
-            log_probability=log_probability(action, mean, self.policy.log_std),
+            log_probability=log_probability(action, centre, self.policy.log_std),
             reward=reward,
             advantage=advantage,
             value_target=value_target,
@@ -312,7 +322,7 @@ class Ppo:
     def _improve_value(self, batch: Batch, union: Union, orders: list[Tensor], now: Settings) -> _ValueMeans:
         """Regress on the value targets with the mean squared error, clipped where `value_clip` says so."""
         steps = []
-        columns = (batch.observation, batch.value_target, batch.advantage)
+        columns = (batch.observation, batch.value_target, batch.value_advantage())
         for order in orders:
             for part in union.minibatches(columns, order, self._parts(union)):
                 loss = self._value_gradient(part)
@@ -448,7 +458,8 @@ def _means(rows: Sequence[Sequence[float]]) -> list[float]:
 
 def _explained_variance(union: Union) -> float:
     spread = union.value_target.var(correction=0).item()
-    return 1 - union.advantage.var(correction=0).item() / spread if spread > 0 else 0.0
+    advantage = union.advantage if union.advantage.ndim == 1 else union.advantage.mean(1)
+    return 1 - advantage.var(correction=0).item() / spread if spread > 0 else 0.0
 
 
 def _configure_torch(config: TrainerConfig) -> torch.device:

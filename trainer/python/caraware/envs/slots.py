@@ -71,7 +71,9 @@ class GivenChannel:
         self.channel, self.seed = channel, int(channel.run["config"]["run"].get("seed", 0))
         self.current: Observation | None = None
         self._queue: list[Observation] = []
-        self._last, self._newest = False, -1
+        # Where a run is taken over, what comes before the first tick is the predecessor's.
+        self._last, self._newest = False, getattr(channel, "first_tick", 0) - 1
+        self.lost_ticks = self.duplicated_ticks = 0
 
     def receive(self) -> Observation | None:
         """The next tick, or None after the last of the run."""
@@ -84,6 +86,8 @@ class GivenChannel:
         if not self._queue:
             return None
         self.current = self._queue.pop()
+        self.lost_ticks += max(self.current.tick - self._newest - 1, 0)
+        self.duplicated_ticks += self.current.tick <= self._newest
         self._last, self._newest = self.current.last, self.current.tick
         return self.current
 
@@ -94,6 +98,7 @@ class GivenChannel:
     def close(self, part: dict | None = None) -> None:
         """Write the trainer's part of the report; say that all is done, if it is."""
         if part is not None:
+            part = part | {"lost_ticks": self.lost_ticks, "duplicated_ticks": self.duplicated_ticks}
             file = Path(self.channel.run["run_dir"], "parts", "trainer.json")
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_text(json.dumps(part, indent=2) + "\n")
@@ -200,6 +205,11 @@ class Slots:
         self._now = self._settle(following)
         self._show()
         return transition, np.where(now.mask, rewards_, 0.0)
+
+    @property
+    def answered(self) -> int:
+        """Newest tick that has been answered; -1 before the first."""
+        return self._answered
 
     def commit(self) -> None:
         """Says that a checkpoint of yours has what was learnt so far: nobody needs the ticks before the present one."""

@@ -1,0 +1,156 @@
+//! The learner beside Stable-Baselines3 and a plain loop, and what a tick costs before the update.
+
+use std::process::Command;
+
+use serde::Deserialize;
+
+use super::{Options, Report, Spread, Table};
+use crate::{failure::Exit, install};
+
+/// Samples in a horizon, and visits of a sample in an update, as `caraware.benchmark_trainer` has them.
+const HORIZON: f64 = 32_768.0;
+const EPOCHS: f64 = 4.0;
+
+/// What `caraware.benchmark_trainer` prints: seconds, by round.
+#[derive(Debug, Deserialize)]
+struct Measured {
+    threads: u32,
+    precision: String,
+    update_s: Update,
+    horizon_s: Horizon,
+    ticks: Vec<Tick>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Update {
+    ours: Vec<f64>,
+    plain: Vec<f64>,
+    sb3: Vec<f64>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Horizon {
+    ours: Vec<f64>,
+    sb3: Vec<f64>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Tick {
+    vehicles: u64,
+    us_per_tick: f64,
+    forward_us_per_tick: f64,
+    calls_per_tick: f64,
+}
+
+/// Runs `python -m caraware.benchmark_trainer`.
+///
+/// # Errors
+/// There is no Python with the trainer, or it fails.
+pub fn measure(options: &Options) -> Result<Report, Exit> {
+    let python = match &options.python {
+        Some(python) => python.clone(),
+        None => install::python(&options.bin)?,
+    };
+    let mut command = Command::new(python);
+    command.args(["-m", "caraware.benchmark_trainer"]);
+    let measured: Measured = super::report::from_program(command)?;
+    let mut report = Report::new(
+        "trainer",
+        "The learner",
+        format!(
+            "The paper's networks (9 → 500 → 300, policy and value apart), horizon 32 768, batch 2 048, four epochs, {} threads, {} matrix \
+             products; all learners alternate in one process, median of {} rounds.",
+            measured.threads,
+            measured.precision,
+            measured.update_s.ours.len()
+        ),
+    );
+    let (update, horizon) = (&measured.update_s, &measured.horizon_s);
+    let mut updates = Table::new(
+        "",
+        &["one update", "sample-visits/s", "ours is faster by", "smallest–largest"],
+    );
+    updates.row([
+        "ours".into(),
+        rate(&update.ours, HORIZON * EPOCHS)?,
+        String::new(),
+        String::new(),
+    ]);
+    for (name, theirs) in [
+        ("plain loop (CleanRL's manner)", &update.plain),
+        ("Stable-Baselines3's PPO", &update.sb3),
+    ] {
+        let [ratio, range] = compare(&mut report, &format!("update, ratio to {name}"), &update.ours, theirs)?;
+        updates.row([name.into(), rate(theirs, HORIZON * EPOCHS)?, ratio, range]);
+    }
+    let mut rollouts = Table::new(
+        "",
+        &[
+            "rollout and update, environment for nothing",
+            "env-steps/s",
+            "ours is faster by",
+            "smallest–largest",
+        ],
+    );
+    rollouts.row([
+        "ours, 8 vehicles".into(),
+        rate(&horizon.ours, HORIZON)?,
+        String::new(),
+        String::new(),
+    ]);
+    let [ratio, range] = compare(
+        &mut report,
+        "rollout and update, ratio to Stable-Baselines3's PPO",
+        &horizon.ours,
+        &horizon.sb3,
+    )?;
+    rollouts.row([
+        "Stable-Baselines3's PPO, 8 environments".into(),
+        rate(&horizon.sb3, HORIZON)?,
+        ratio,
+        range,
+    ]);
+    let mut ticks = Table::new(
+        "",
+        &[
+            "vehicles in a tick",
+            "µs/tick",
+            "of these the policy's forward pass",
+            "µs/vehicle",
+            "calls from Python/tick",
+        ],
+    );
+    for tick in &measured.ticks {
+        #[expect(clippy::cast_precision_loss, reason = "some thousands")]
+        let each = tick.us_per_tick / tick.vehicles as f64;
+        ticks.row([
+            tick.vehicles.to_string(),
+            format!("{:.0}", tick.us_per_tick),
+            format!("{:.0}", tick.forward_us_per_tick),
+            format!("{each:.2}"),
+            format!("{:.1}", tick.calls_per_tick),
+        ]);
+        report.figure(
+            format!("calls per tick of {} vehicles", tick.vehicles),
+            tick.calls_per_tick,
+        );
+    }
+    report.tables = vec![updates, rollouts, ticks];
+    Ok(report)
+}
+
+/// Median rate of rounds of `amount` each.
+fn rate(seconds: &[f64], amount: f64) -> Result<String, Exit> {
+    let spread = Spread::of(seconds.iter().map(|seconds| amount / seconds))?;
+    Ok(format!("{:.0}", spread.median))
+}
+
+/// How much faster ours is, round by round: median, and smallest and largest.
+fn compare(report: &mut Report, name: &str, ours: &[f64], theirs: &[f64]) -> Result<[String; 2], Exit> {
+    let spread = Spread::of(ours.iter().zip(theirs).map(|(ours, theirs)| theirs / ours))?;
+    report.figure(name, spread.median);
+    Ok([
+        format!("{:.2} ×", spread.median),
+        format!("{:.2}–{:.2}", spread.smallest, spread.largest),
+    ])
+}

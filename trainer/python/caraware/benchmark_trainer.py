@@ -1,0 +1,290 @@
+"""`python -m caraware.benchmark_trainer [--pairs N] [--threads N]`: the learner beside SB3 and a plain loop.
+
+Same networks, horizon, batch, epochs, and threads; ours and theirs alternate in one process. Prints JSON, which
+`caraware bench trainer` turns into a report. A sample visit is one sample in one epoch.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.distributions import Normal
+
+from caraware.config import MapBounds, TrainerConfig
+from caraware.evaluation import ErrorMeter, errors_m
+from caraware.ppo import Batch, Ppo
+from caraware.rollout import Rollout
+
+OBSERVATIONS, HORIZON, BATCH, EPOCHS = 9, 32_768, 2_048, 4
+VEHICLES = 8
+WINDOW_TICKS = 64
+SIZES = (50, 500, 5_000)
+"""Vehicles at a time, for what a tick costs."""
+BOUNDS = MapBounds(0.0, 0.0, 220.0, 220.0)
+
+
+class PlainAgent(nn.Module):
+    """The paper's networks as anybody would write them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.value = nn.Sequential(
+            nn.Linear(OBSERVATIONS, 500), nn.ReLU(), nn.Linear(500, 300), nn.ReLU(), nn.Linear(300, 1)
+        )
+        self.mean = nn.Sequential(
+            nn.Linear(OBSERVATIONS, 500), nn.ReLU(), nn.Linear(500, 300), nn.Tanh(), nn.Linear(300, 2), nn.Tanh()
+        )
+        self.log_std = nn.Parameter(torch.zeros(1, 2))
+
+    def evaluate(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-probability, entropy and value, `[b]` each."""
+        mean = self.mean(observation)
+        normal = Normal(mean, self.log_std.expand_as(mean).exp())
+        value = self.value(observation).squeeze(1)
+        return normal.log_prob(action).sum(1), normal.entropy().sum(1), value
+
+
+def plain_update(agent: PlainAgent, adam: torch.optim.Adam, batch: Batch) -> None:
+    """Epochs of minibatches through autograd and a joint optimiser, in CleanRL's manner."""
+    for _ in range(EPOCHS):
+        order = torch.randperm(HORIZON).to(batch.reward.device)
+        for start in range(0, HORIZON, BATCH):
+            rows = order[start : start + BATCH]
+            new_log_probability, entropy, value = agent.evaluate(batch.observation[rows], batch.action[rows])
+            ratio = (new_log_probability - batch.log_probability[rows]).exp()
+            advantage = batch.advantage[rows]
+            advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+            policy_loss = torch.max(-advantage * ratio, -advantage * ratio.clamp(0.8, 1.2)).mean()
+            value_loss = (value - batch.value_target[rows]).square().mean()
+            adam.zero_grad()
+            (policy_loss - 0.01 * entropy.mean() + value_loss).backward()
+            nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
+            adam.step()
+
+
+def random_batch(ppo: Ppo) -> Batch:
+    """Actions of the given policy with made-up advantages."""
+    observation = torch.rand(HORIZON, OBSERVATIONS) * 2 - 1
+    with torch.no_grad():
+        action = ppo.policy.mlp.infer(observation.to(ppo.device)).cpu() + torch.randn(HORIZON, 2)
+    nothing = torch.zeros(HORIZON)
+    log_probability = -0.5 * torch.randn(HORIZON, 2).square().sum(1) - 1.8379
+    target = torch.rand(HORIZON)
+    return Batch(
+        observation=observation,
+        action=action,
+        log_probability=log_probability,
+        reward=target,
+        advantage=torch.randn(HORIZON),
+        value_target=target,
+        truth=torch.zeros(HORIZON, 4),
+        vehicle=nothing.long(),
+        tick=nothing.long(),
+    )
+
+
+@dataclass
+class FreeTick:
+    """A tick that cost nothing: the arrays that the rollout and the error meter read."""
+
+    tick: int
+    observation: Tensor
+    truth: Tensor
+    gnss_m: Tensor
+    vehicle: np.ndarray
+    valid: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+
+
+@dataclass
+class FreeTicks:
+    """Ticks of `vehicles`, over and over."""
+
+    vehicles: int
+    _tick: FreeTick = field(init=False)
+
+    def __post_init__(self) -> None:
+        n, nobody = self.vehicles, np.zeros(self.vehicles, bool)
+        truth = torch.rand(n, 4) * 220
+        self._tick = FreeTick(
+            0, torch.rand(n, OBSERVATIONS) * 2 - 1, truth, truth[:, :2] + 5, np.arange(n), ~nobody, nobody, nobody
+        )
+
+    def __iter__(self) -> Iterator[list[FreeTick]]:
+        tick = 0
+        while True:
+            window = [FreeTick(**vars(self._tick) | {"tick": tick + i}) for i in range(WINDOW_TICKS)]
+            tick += WINDOW_TICKS
+            yield window
+
+
+def take(ppo: Ppo, rollout: Rollout, meter: ErrorMeter, window: list[FreeTick]) -> None:
+    """What the training loop does with the ticks that wait: one forward pass, then error and copy for each."""
+    for obs, predicted_m in zip(window, ppo.predict_m([obs.observation for obs in window]), strict=True):
+        meter.add(*errors_m(obs, predicted_m))
+        rollout.add(obs)
+
+
+def our_horizon(ppo: Ppo, rollout: Rollout, ticks: Iterator[list[FreeTick]]) -> None:
+    """A horizon of ticks and its update."""
+    meter = ErrorMeter()
+    while not rollout.full():
+        take(ppo, rollout, meter, next(ticks))
+    ppo.learn(rollout.take())
+
+
+def sb3_model() -> object:
+    """Stable-Baselines3's PPO with the same sizes on an environment that costs nothing."""
+    from gymnasium import spaces
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.logger import Logger
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+    class FreeEnv(VecEnv):
+        def __init__(self) -> None:
+            box = spaces.Box(-1, 1, (OBSERVATIONS,), np.float32)
+            self.render_mode = None
+            super().__init__(VEHICLES, box, spaces.Box(-1, 1, (2,), np.float32))
+            self._observation = np.random.default_rng(1).uniform(-1, 1, (VEHICLES, OBSERVATIONS)).astype(np.float32)
+            self._infos: list[dict] = [{} for _ in range(VEHICLES)]
+
+        def reset(self) -> np.ndarray:
+            return self._observation
+
+        def step_async(self, actions: np.ndarray) -> None:
+            self._actions = actions
+
+        def step_wait(self) -> tuple:
+            reward = -np.square(self._actions - self._observation[:, :2]).sum(1)
+            return self._observation, reward, np.zeros(VEHICLES, bool), self._infos
+
+        def close(self) -> None:
+            pass
+
+        def get_attr(self, attr_name: str, indices: object = None) -> list:
+            return [getattr(self, attr_name)] * VEHICLES
+
+        def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
+            setattr(self, attr_name, value)
+
+        def env_method(self, method_name: str, *args: object, indices: object = None, **kwargs: object) -> list:
+            raise NotImplementedError(method_name)
+
+        def env_is_wrapped(self, wrapper_class: type, indices: object = None) -> list[bool]:
+            return [False] * VEHICLES
+
+    model = PPO(
+        "MlpPolicy",
+        FreeEnv(),
+        n_steps=HORIZON // VEHICLES,
+        batch_size=BATCH,
+        n_epochs=EPOCHS,
+        learning_rate=1e-4,
+        policy_kwargs={"net_arch": [500, 300], "activation_fn": nn.ReLU},
+        device="cpu",
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    return model
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Wall time of one call."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def python_calls(work: Callable[[], object]) -> int:
+    """Function calls of Python and of C that one call makes."""
+    count = 0
+
+    def note(frame: object, event: str, argument: object) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    sys.setprofile(note)
+    try:
+        work()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
+def measure_tick(ppo: Ppo, vehicles: int) -> dict[str, float]:
+    """What a tick of so many vehicles costs before the update: time, and calls from Python, which must not grow."""
+    rollout, meter, ticks = Rollout(10**9, OBSERVATIONS, bootstrap=False), ErrorMeter(), iter(FreeTicks(vehicles))
+    for _ in range(2):
+        take(ppo, rollout, meter, next(ticks))
+    window = next(ticks)
+    forward = seconds(lambda: ppo.predict_m([obs.observation for obs in window]))
+    calls = python_calls(lambda: take(ppo, rollout, meter, window))
+    whole = seconds(lambda: take(ppo, rollout, meter, next(ticks)))
+    per_tick = 1e6 / WINDOW_TICKS
+    return {
+        "vehicles": vehicles,
+        "us_per_tick": whole * per_tick,
+        "forward_us_per_tick": forward * per_tick,
+        "calls_per_tick": calls / WINDOW_TICKS,
+    }
+
+
+def main() -> None:
+    """Alternate all learners and print what came of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--pairs", type=int, default=5)
+    options = parser.parse_args()
+    config = TrainerConfig(
+        horizon=HORIZON,
+        batch_size=BATCH,
+        epochs=EPOCHS,
+        learning_rate=1e-4,
+        threads=options.threads,
+        matmul_precision="float32",
+    )
+    ppo = Ppo(config, OBSERVATIONS, BOUNDS)
+    own_threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    batch, agent, model = random_batch(ppo), PlainAgent(), sb3_model()
+    adam = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5)
+    rollout, ticks = Rollout(HORIZON, OBSERVATIONS, bootstrap=False), iter(FreeTicks(VEHICLES))
+    model.learn(HORIZON)
+
+    def theirs(work: Callable[[], object]) -> float:
+        torch.set_num_threads(options.threads)
+        try:
+            return seconds(work)
+        finally:
+            torch.set_num_threads(own_threads)
+
+    pairs: dict[str, list[float]] = {name: [] for name in ("ours", "plain", "sb3", "our_horizon", "sb3_horizon")}
+    for number in range(options.pairs + 1):
+        told = {
+            "plain": theirs(lambda: plain_update(agent, adam, batch)),
+            "ours": seconds(lambda: ppo.update(batch)),
+            "sb3": theirs(model.train),
+            "our_horizon": seconds(lambda: our_horizon(ppo, rollout, ticks)),
+            "sb3_horizon": theirs(lambda: model.learn(HORIZON, reset_num_timesteps=False)),
+        }
+        for name, value in told.items():
+            # The first round warms up.
+            pairs[name] += [value] if number > 0 else []
+    result = {
+        "threads": options.threads,
+        "precision": precision,
+        "update_s": {name: pairs[name] for name in ("ours", "plain", "sb3")},
+        "horizon_s": {"ours": pairs["our_horizon"], "sb3": pairs["sb3_horizon"]},
+        "ticks": [measure_tick(ppo, vehicles) for vehicles in SIZES],
+    }
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
