@@ -228,12 +228,17 @@ fn no_vehicles() {
 #[test]
 fn more_vehicles_than_shared_memory_is_laid_out_for() {
     let workplace = Workplace::new();
-    let vehicles: String = (0..200)
+    // The two directions of all twelve roads of the grid, six vehicles on each.
+    let roads: Vec<String> = [
+        "A0A1", "A1A2", "B0B1", "B1B2", "C0C1", "C1C2", "A0B0", "B0C0", "A1B1", "B1C1", "A2B2", "B2C2",
+    ]
+    .iter()
+    .flat_map(|road| [(*road).to_owned(), format!("{}{}", &road[2..], &road[..2])])
+    .collect();
+    let vehicles: String = (0..6 * roads.len())
         .map(|number| {
-            format!(
-                "  <vehicle id=\"{number}\" depart=\"{}\" departPos=\"random_free\"><route edges=\"A0A1 A1A2\"/></vehicle>\n",
-                number / 20
-            )
+            let road = &roads[number % roads.len()];
+            format!("  <vehicle id=\"{number}\" depart=\"0\" departPos=\"random_free\"><route edges=\"{road}\"/></vehicle>\n")
         })
         .collect();
     scenario(&workplace, &format!("<routes>\n{vehicles}</routes>\n"));

@@ -6,10 +6,10 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from caraware.baselines import BaselineErrors, Baselines, SensorNoise
-from caraware.rewards import distance_m
 from caraware.statistics import mean_interval
 from caraware.stream import Observation
 
@@ -219,6 +219,22 @@ def _pool(phase: Sequence[EvaluationResult]) -> EvaluationResult:
 
 def errors_m(obs: Observation, predictions_m: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Distances to the truth `[v]` of predictions `[n, 2]` and of raw GNSS, on the valid rows of a tick."""
-    valid = obs.valid
-    policy = distance_m(predictions_m, obs.truth).numpy()[valid]
-    return policy, distance_m(obs.gnss_m, obs.truth).numpy()[valid]
+    return errors_of_ticks_m([obs], [predictions_m])[0]
+
+
+def errors_of_ticks_m(
+    ticks: Sequence[Observation], predictions_m: Sequence[Tensor]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """As `errors_m`, for each of some ticks: the same numbers, bit for bit, whichever ticks come together."""
+    truth = torch.cat([obs.truth for obs in ticks]).numpy()
+    policy = _distance_m(torch.cat(list(predictions_m)).numpy(), truth)
+    raw = _distance_m(torch.cat([obs.gnss_m for obs in ticks]).numpy(), truth)
+    ends = np.cumsum([len(obs.valid) for obs in ticks])[:-1]
+    parts = zip(ticks, np.split(policy, ends), np.split(raw, ends), strict=True)
+    return [(policy[obs.valid], raw[obs.valid]) for obs, policy, raw in parts]
+
+
+def _distance_m(position: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Horizontal distance `[n]`. Elementwise, so that a row's result does not depend on the rows beside it."""
+    east, north = position[:, 0] - truth[:, 0], position[:, 1] - truth[:, 1]
+    return np.sqrt(east * east + north * north)

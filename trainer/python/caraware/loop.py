@@ -24,7 +24,7 @@ from caraware.checkpoint import (
 from caraware.config import RunConfig
 from caraware.curriculum import Curriculum
 from caraware.environment import Environment, EpisodeStarts, Place, share
-from caraware.evaluation import NO_HEADLINE, ErrorMeter, Evaluation, EvaluationResult, errors_m, pooled
+from caraware.evaluation import NO_HEADLINE, ErrorMeter, Evaluation, EvaluationResult, errors_of_ticks_m, pooled
 from caraware.manifest import Counters
 from caraware.metrics import Metrics, TrainingPoint
 from caraware.plots import plot_error, plot_sigma
@@ -34,6 +34,8 @@ from caraware.stream import Channel, Observation
 
 log = logging.getLogger(__name__)
 
+CREDIT_TICKS = 8
+"""The simulation gets its credit back after so many ticks, or when no more wait: each time it is woken."""
 RECEIVE_TIMEOUT_S = 0.2
 """How long a request to stop may wait for the next tick."""
 
@@ -217,8 +219,9 @@ class TrainingLoop:
             assert self._ppo is not None
             predictions_m = iter(self._predict_m([obs for environment in going_on for obs in environment.pending]))
             for environment in going_on:
-                predicted_m = [next(predictions_m) for _ in environment.pending]
-                if not self._take_all(environment, predicted_m):
+                ticks = list(environment.pending)
+                predicted_m = [next(predictions_m) for _ in ticks]
+                if not self._take_all(environment, predicted_m, errors_of_ticks_m(ticks, predicted_m)):
                     return
         if self._ppo is not None and self._learns:
             self._learn_or_give_up()
@@ -227,21 +230,29 @@ class TrainingLoop:
         if self._commit_due:
             self.commit()
 
-    def _take_all(self, environment: Environment, predicted_m: list[Tensor]) -> bool:
+    def _take_all(
+        self, environment: Environment, predicted_m: list[Tensor], errors_m: list[tuple[np.ndarray, np.ndarray]]
+    ) -> bool:
         """Take waiting ticks while the environment may go on; False if a successor takes over."""
-        for prediction_m in predicted_m:
+        taken = 0
+        for prediction_m, (policy_m, raw_m) in zip(predicted_m, errors_m, strict=True):
             if not self._may_go_on(environment):
                 break
             obs = environment.pending.popleft()
-            self._take(environment, obs, prediction_m)
+            self._take(environment, obs, prediction_m, policy_m, raw_m)
+            taken += 1
+            if taken % CREDIT_TICKS == 0:
+                environment.channel.consumed(obs.tick)
             if obs.lesson_last:
                 self._lesson_end = obs
                 break
             # What comes in an evaluation, or after an update, a successor can take up as well.
             if obs.evaluation and self._leave_requested():
                 self._left = True
-                return False
-        return True
+                break
+        if taken % CREDIT_TICKS:
+            environment.channel.consumed(obs.tick)
+        return not self._left
 
     def _learn_or_give_up(self) -> None:
         full = [environment.rollout.full() for environment in self._environments]
@@ -273,15 +284,21 @@ class TrainingLoop:
         """The observation as the networks take it: in place, unless fields of dark sensors must become numbers."""
         return torch.nan_to_num(obs.observation) if self._config.dark_is_nan else obs.observation
 
-    def _take(self, environment: Environment, obs: Observation, predicted_m: Tensor) -> None:
-        """Everything that one tick causes."""
+    def _take(
+        self,
+        environment: Environment,
+        obs: Observation,
+        predicted_m: Tensor,
+        policy_m: np.ndarray,
+        raw_m: np.ndarray,
+    ) -> None:
+        """Everything that one tick causes; its rows' errors are those of the policy and of raw GNSS."""
         channel = environment.channel
         estimates_m = environment.estimates_m(obs)
         if estimates_m is None:
             channel.publish_predictions(obs, predicted_m, self._updates())
         else:
             channel.publish_predictions(obs, predicted_m, self._updates(), estimates_m)
-        policy_m, raw_m = errors_m(obs, predicted_m)
         environment.episode = obs.episode
         environment.starts.note(obs)
         self._vehicles = max(self._vehicles, int(np.count_nonzero(obs.valid)))
@@ -292,7 +309,6 @@ class TrainingLoop:
                 environment.evaluation = environment.evaluation or Evaluation(self._config.sensors)
                 environment.evaluation.add(obs, policy_m, raw_m)
                 environment.evaluation_tick = obs.tick
-            channel.consumed(obs.tick)
             return
         self._finish_evaluation(environment)
         self._meter.add(policy_m, raw_m)
@@ -301,7 +317,6 @@ class TrainingLoop:
             environment.rollout.add(obs)
         else:
             self._passed_steps += len(policy_m)
-        channel.consumed(obs.tick)
 
     def _end_lesson(self) -> None:
         """Before the next lesson the simulation waits for its step of the curriculum."""

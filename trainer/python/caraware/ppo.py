@@ -29,6 +29,8 @@ from caraware.ranks import Minibatch, Ranks, Union
 from caraware.rollout import Horizon
 
 ACTIONS = 2
+SMALL_ROWS = 256
+"""Rows of a block below which blocks are put together before the network sees them."""
 SMALLEST_DEVIATION = 1e-8
 SEED_STRIDE = 0x9E3779B97F4A7C15
 """Between the seeds of neighbouring environments: 2^64 over the golden ratio, so that they look nothing alike."""
@@ -209,9 +211,14 @@ class Ppo:
     def predict_m(self, observations: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Predicted positions `[n, 2]` in world metres for each of some `[n, d]` blocks: the policy's mean.
 
-        One forward pass over all rows; the blocks are read where they lie, which is shared memory.
+        One forward pass over all rows. Large blocks are read where they lie, which is shared memory; small ones are
+        put together first, which costs less than to call for each.
         """
-        mean = self.policy.mlp.infer(*(block.to(self.device) for block in observations))
+        rows = sum(len(block) for block in observations)
+        if len(observations) > 1 and rows < SMALL_ROWS * len(observations):
+            mean = self.policy.mlp.infer(torch.cat(list(observations)).to(self.device))
+        else:
+            mean = self.policy.mlp.infer(*(block.to(self.device) for block in observations))
         return self.bounds.to_world_m(mean).cpu().split([len(block) for block in observations])
 
     def learn(self, horizon: Horizon) -> UpdateStats:
@@ -404,8 +411,10 @@ class Ppo:
     def _stats(
         self, batch: Batch, union: Union, policy: _PolicyMeans, value: _ValueMeans, now: Settings
     ) -> UpdateStats:
-        action_mean_x, action_mean_y = batch.action.mean(0).tolist()
-        action_std_x, action_std_y = batch.action.std(0, correction=0).tolist()
+        # With several actions for an observation they lie side by side.
+        actions = batch.action.reshape(-1, ACTIONS)
+        action_mean_x, action_mean_y = actions.mean(0).tolist()
+        action_std_x, action_std_y = actions.std(0, correction=0).tolist()
         return UpdateStats(
             policy_loss=policy.loss,
             value_loss=value.loss,
@@ -424,7 +433,7 @@ class Ppo:
             action_mean_y=action_mean_y,
             action_std_x=action_std_x,
             action_std_y=action_std_y,
-            action_outside=(batch.action.abs() > 1).any(1).float().mean().item(),
+            action_outside=(actions.abs() > 1).any(1).float().mean().item(),
             explained_variance=_explained_variance(union),
             policy_gradient_norm=policy.gradient_norm,
             value_gradient_norm=value.gradient_norm,
