@@ -10,6 +10,7 @@ mod common;
 
 use std::{
     io::{BufRead as _, BufReader},
+    path::Path,
     process::{Child, Command, Stdio},
     time::{Duration, Instant},
 };
@@ -42,10 +43,12 @@ fn simulate(name: &str, settings: &[String]) -> Vec<String> {
 }
 
 /// A viewer that counts.
-fn watch(run: &str, port: u16, seconds: u64) -> Child {
+fn watch(run: &str, port: u16, seconds: u64, log: &Path) -> Child {
     let program = caraware::install::programs().unwrap().join("fanout-watch");
     Command::new(program)
         .args([&format!("tcp/127.0.0.1:{port}"), run, "--seconds", &seconds.to_string()])
+        .arg("--log")
+        .arg(log)
         .stdout(Stdio::piped())
         .spawn()
         .unwrap()
@@ -92,8 +95,15 @@ fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
         (there && board.health().state == State::Running as u32).then_some(board.health().pid)
     };
     until(&mut run, || works(0));
-    let viewer = watch("watched", port, 15);
-    let mut victim = Victim(watch("watched", port, 60));
+    let logs = ["viewer", "victim"].map(|name| workplace.path().join(name));
+    let viewer = watch("watched", port, 15, &logs[0]);
+    let mut victim = Victim(watch("watched", port, 60, &logs[1]));
+    // Both have seen a frame: what comes after a kill comes to a viewer that was there before.
+    until(&mut run, || {
+        logs.iter()
+            .all(|log| log.metadata().is_ok_and(|log| log.len() > 0))
+            .then_some(())
+    });
     for kill in 0..KILLS {
         let pid = until(&mut run, || works(kill));
         let moment = Instant::now();

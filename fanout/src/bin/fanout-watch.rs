@@ -4,7 +4,7 @@
 use std::{
     collections::BTreeMap,
     fs::File,
-    io::{self, BufWriter, Read, Write},
+    io::{self, LineWriter, Read, Write},
     net::{TcpListener, TcpStream},
     process::ExitCode,
     sync::{Arc, Mutex, PoisonError},
@@ -98,7 +98,7 @@ impl Count {
 #[derive(Default)]
 struct Counts {
     topics: BTreeMap<String, Count>,
-    log: Option<BufWriter<File>>,
+    log: Option<LineWriter<File>>,
 }
 
 impl Counts {
@@ -174,7 +174,7 @@ fn watch(mut options: Options) -> Result<(), Failure> {
     let all = Keys::new(&options.run, 0).all();
     let prefix = all.len() - "**".len();
     let counts = Arc::new(Mutex::new(Counts {
-        log: options.log.take().map(BufWriter::new),
+        log: options.log.take().map(LineWriter::new),
         ..Counts::default()
     }));
     let mut held = Vec::new();
