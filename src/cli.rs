@@ -51,6 +51,9 @@ pub enum Command {
     /// Replace the trainer of a live run; the simulation goes on, and no observation is lost
     #[command(after_help = SWAP)]
     Swap(SwapArgs),
+    /// Pause, step or reset a live simulation, switch sensors, place vehicles
+    #[command(after_help = CONTROL)]
+    Control(ControlArgs),
     /// End a run in order
     Stop {
         /// Name of the run; may be left out if only one is alive
@@ -100,7 +103,7 @@ pub struct TrainArgs {
     #[command(flatten)]
     pub run: RunArgs,
     /// Go on with a run (its name or directory), or from one of its checkpoints (a directory) in another run
-    #[arg(long, value_name = "RUN", conflicts_with = "config")]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "commands"])]
     pub resume: Option<String>,
 }
 
@@ -116,6 +119,101 @@ pub struct PlayArgs {
     /// End after so many episodes of `episode.ticks` each [default: never]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub episodes: Option<u64>,
+}
+
+const CONTROL: &str = "Examples:
+  caraware control pause
+  caraware control step 10                       ten ticks, then pause again
+  caraware control sensor cav.3 gnss off         until the episode ends
+  caraware control sensor all lidar on
+  caraware control start cav.3 A1B1              a successor of cav.3 starts from edge A1B1
+  caraware control destination cav.3 C2D2
+  caraware control reset                         the same episode from its beginning
+
+Every command takes effect at a tick, which the answer names. Those that change the simulation are written to the run's commands.jsonl:
+`caraware train --commands FILE` with the same configuration makes the same run again. From another host: `caraware-viewer command`.";
+
+/// What `control` takes.
+#[derive(Debug, Args, Clone)]
+pub struct ControlArgs {
+    /// Name of the run; may be left out if only one is alive
+    #[arg(long, global = true, value_name = "NAME")]
+    pub run: Option<String>,
+    /// Environment of the run [default: all of them]
+    #[arg(long, global = true, value_name = "N")]
+    pub env: Option<u32>,
+    /// What to do
+    #[command(subcommand)]
+    pub action: ControlAction,
+}
+
+/// What may be asked of a live simulation.
+#[derive(Debug, Clone, Subcommand)]
+pub enum ControlAction {
+    /// Make no more ticks
+    Pause,
+    /// Make ticks again
+    Resume,
+    /// Make some ticks, whole SUMO steps, and pause
+    Step {
+        /// How many
+        #[arg(default_value_t = 1)]
+        ticks: u64,
+    },
+    /// Begin the episode anew, with its own seed
+    Reset,
+    /// Switch a sensor until the episode ends
+    Sensor {
+        /// SUMO's id of the vehicle, or `all`
+        vehicle: String,
+        /// Which sensor
+        sensor: SensorName,
+        /// Where to
+        state: SwitchState,
+    },
+    /// Let a vehicle start anew from an edge
+    Start {
+        /// SUMO's id of the vehicle
+        #[arg(allow_hyphen_values = true)]
+        vehicle: String,
+        /// SUMO's id of the edge
+        #[arg(allow_hyphen_values = true)]
+        edge: String,
+    },
+    /// Lead a vehicle to an edge
+    Destination {
+        /// SUMO's id of the vehicle
+        #[arg(allow_hyphen_values = true)]
+        vehicle: String,
+        /// SUMO's id of the edge
+        #[arg(allow_hyphen_values = true)]
+        edge: String,
+    },
+}
+
+/// Sensors by name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+#[value(rename_all = "snake_case")]
+pub enum SensorName {
+    /// GNSS receiver
+    Gnss,
+    /// Inertial unit with compass
+    Imu,
+    /// Speed and steering angle
+    SpeedSteering,
+    /// LIDAR
+    Lidar,
+    /// Every sensor
+    All,
+}
+
+/// Where a sensor is switched to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum SwitchState {
+    /// It delivers
+    On,
+    /// It delivers nothing
+    Off,
 }
 
 /// What `swap` takes.
@@ -170,6 +268,30 @@ pub struct ViewArgs {
     /// Name of the run, if several are behind an endpoint
     #[arg(long, value_name = "NAME")]
     pub run: Option<String>,
+    /// Who you are.
+    #[command(flatten)]
+    pub credentials: Credentials,
+}
+
+/// Who a viewer is, if the run asks (docs/remote.md).
+#[derive(Debug, Args, Clone)]
+#[command(next_help_heading = "Who you are, if the run asks")]
+pub struct Credentials {
+    /// User
+    #[arg(long, value_name = "NAME", requires = "password_file")]
+    pub user: Option<String>,
+    /// File with the user's password, readable by you alone
+    #[arg(long, value_name = "FILE", requires = "user")]
+    pub password_file: Option<PathBuf>,
+    /// Certificate of the authority behind a tls/ endpoint (PEM)
+    #[arg(long, value_name = "FILE")]
+    pub ca: Option<PathBuf>,
+    /// Your own certificate, if the run asks for one (PEM)
+    #[arg(long, value_name = "FILE", requires = "key")]
+    pub certificate: Option<PathBuf>,
+    /// Its private key (PEM)
+    #[arg(long, value_name = "FILE", requires = "certificate")]
+    pub key: Option<PathBuf>,
 }
 
 /// Where a viewer beside a run shows it.
@@ -248,6 +370,9 @@ pub struct RunArgs {
     /// Name of the run [default: CONFIG and the first free number]
     #[arg(long)]
     pub name: Option<String>,
+    /// Carry out the commands of another run's commands.jsonl, each at its tick
+    #[arg(long, value_name = "FILE")]
+    pub commands: Option<PathBuf>,
     /// Directory that holds run directories
     #[arg(long, default_value = "runs")]
     pub runs: PathBuf,

@@ -7,7 +7,7 @@ use ipc_schema::{
     ports::{BoardReader, RosterWriter, Waker},
     process::Process,
     run::RunFile,
-    services::{RunNode, ServiceHolder},
+    services::{ControlService, RunNode, ServiceHolder},
 };
 
 use crate::failure::Exit;
@@ -23,7 +23,7 @@ pub struct Environment {
     boards: Vec<BoardReader>,
     /// Who makes observations looks at a hand-over at once.
     sensing: Waker,
-    _services: ServiceHolder,
+    services: ServiceHolder,
 }
 
 impl Environment {
@@ -50,8 +50,14 @@ impl Environment {
             roster: RosterWriter::create(&services)?,
             sensing,
             boards,
-            _services: services,
+            services,
         })
+    }
+
+    /// The service that takes commands.
+    #[must_use]
+    pub fn control(&self) -> &ControlService {
+        self.services.control()
     }
 
     /// The board of a process; for the trainer, what it says of this environment.

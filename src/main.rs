@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use caraware::{
     bench,
     cli::{Cli, Command},
+    control,
     display::Display,
     doctor,
     failure::Exit,
@@ -28,6 +29,7 @@ fn main() -> ExitCode {
         Command::Simulate(args) => prepare(&args, Mode::Simulate).and_then(run),
         Command::Ps { run } => status::ps(run.as_deref()),
         Command::Swap(args) => swap::swap(&args),
+        Command::Control(args) => control::control(&args),
         Command::Stop { run } => status::stop(run.as_deref()),
         Command::View(args) => view::view(&args),
         Command::Bench(args) => bench::bench(&args),

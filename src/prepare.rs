@@ -1,13 +1,11 @@
 //! From the command line to a run file: everything that can be wrong is found here, before anything is started.
 
-use std::{
-    net::TcpListener,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
 use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
+    control,
     run::{Beginning, MapInfo, Mode, RunFile, SceneFiles, Source},
     services::Channel,
 };
@@ -20,7 +18,7 @@ use crate::{
     failure::Exit,
     install::Install,
     registry::{self, Claim},
-    resume,
+    remote, resume,
     scenario::{self, Scenario},
     town,
 };
@@ -101,10 +99,10 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<Prepared, Exit> {
     let install = Install::find()?;
     let found = Found::newest(&install, resumed, &args.runs)?;
     let old = found.run()?;
-    let config = resume::changed(&old, &args.with_shorthands().set)?;
+    let mut config = resume::changed(&old, &args.with_shorthands().set)?;
     found.check_fit(&config)?;
     if found.is_run && args.name.is_none() {
-        check_port(&config)?;
+        remote::check(&mut config.fanout)?;
         registry::sweep();
         let (run, claim) = resume::go_on(&found, old, config, &install)?;
         check_shared_memory(&run)?;
@@ -135,7 +133,7 @@ fn of_run(run: &RunFile, set: &[String]) -> Result<(Settings, Named), Exit> {
 fn make(
     args: &RunArgs,
     mode: Mode,
-    config: Config,
+    mut config: Config,
     named: Named,
     label: &str,
     install: Install,
@@ -146,10 +144,12 @@ fn make(
         Named::Scenario(_, scenario) => Some(scenario::map_info(&scenario.net_file, origin)?),
         Named::Map => None,
     };
-    check_port(&config)?;
+    remote::check(&mut config.fanout)?;
+    let actions = actions(args.commands.as_deref(), config.run.envs)?;
     registry::sweep();
     let run_dir = create_run_dir(args, label)?;
-    let result = assemble(&run_dir, mode, config, &install, named, scenario_map);
+    let result = assemble(&run_dir, mode, config, &install, named, scenario_map)
+        .and_then(|assembled| write_actions(&run_dir.path, &actions).map(|()| assembled));
     if result.is_err() {
         // Nothing has been started: leave nothing behind.
         if let Err(error) = std::fs::remove_dir_all(&run_dir.path) {
@@ -233,23 +233,47 @@ fn check_task(config: &Config, mode: Mode, named: &Named) -> Result<(), Exit> {
     }
 }
 
-fn check_port(config: &Config) -> Result<(), Exit> {
-    if !config.fanout.enabled {
-        return Ok(());
+/// The texts of the action logs of all environments that have one: that of environment 0 is `path`, the others lie beside it as in a run
+/// directory.
+fn actions(path: Option<&Path>, envs: u32) -> Result<Vec<(u32, String)>, Exit> {
+    let Some(path) = path else { return Ok(Vec::new()) };
+    let mut logs = vec![(0, log(path)?)];
+    for index in 1..envs {
+        let path = path.with_file_name(format!("env-{index}")).join(control::COMMAND_LOG);
+        if path.exists() {
+            logs.push((index, log(&path)?));
+        }
     }
-    let listen = &config.fanout.listen;
-    let address = listen.strip_prefix("tcp/").ok_or_else(|| {
+    Ok(logs)
+}
+
+fn log(path: &Path) -> Result<String, Exit> {
+    let wrong = |reason: String| {
         Exit::config(
-            format!("`fanout.listen` = \"{listen}\" is not an endpoint caraware knows"),
-            "give tcp/HOST:PORT, for example tcp/127.0.0.1:7447",
+            format!("--commands {}: {reason}", path.display()),
+            "give the commands.jsonl of a run of the same configuration",
         )
-    })?;
-    TcpListener::bind(address).map(drop).map_err(|error| {
-        Exit::config(
-            format!("`fanout.listen` = \"{listen}\" cannot be listened on: {error}"),
-            "another run or program has the port: choose another, e.g. --set fanout.listen=tcp/127.0.0.1:7448, or --set fanout.enabled=false",
-        )
-    })
+    };
+    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    match control::actions(&text) {
+        Ok(_) => Ok(text),
+        Err((line, reason)) => Err(wrong(format!("line {line}: {reason}"))),
+    }
+}
+
+/// Puts the logs that the run is to follow where each `traffic-bridge` looks for its own.
+fn write_actions(run_dir: &Path, logs: &[(u32, String)]) -> Result<(), Exit> {
+    for (index, text) in logs {
+        let directory = match index {
+            0 => run_dir.to_owned(),
+            index => run_dir.join(format!("env-{index}")),
+        };
+        let path = directory.join(control::COMMAND_REPLAY);
+        std::fs::create_dir_all(&directory)
+            .and_then(|()| std::fs::write(&path, text))
+            .map_err(|error| Exit::io("write", &path, &error))?;
+    }
+    Ok(())
 }
 
 struct RunDir {

@@ -5,6 +5,7 @@ use std::path::Path;
 use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
+    control,
     run::{Mode, RunFile},
 };
 
@@ -51,6 +52,16 @@ pub fn changed(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
         return Err(Exit::config(
             format!("{} follows a curriculum, and cannot be resumed", run.name),
             "where its lessons begin is known while it runs; start another run",
+        ));
+    }
+    if run.run_dir.join(control::COMMAND_LOG).exists() {
+        return Err(Exit::config(
+            format!(
+                "{} was given commands ({}), and cannot be resumed",
+                run.name,
+                control::COMMAND_LOG
+            ),
+            "its episodes are not those of its configuration any more; make it again with --commands, or start another run",
         ));
     }
     for assignment in set {

@@ -13,7 +13,7 @@ use std::{
 use ipc_schema::{
     board::{INCARNATIONS, State},
     failure::{Failure, FailureKind},
-    ports::BoardReader,
+    ports::{BoardReader, ControlClient},
     process::Process,
     run::RunFile,
     services::{self, RunNode},
@@ -25,11 +25,14 @@ use signal_hook::{
 };
 
 use crate::{
-    config, cores,
+    config,
+    control::Controls,
+    cores,
     display::Display,
     environment::Environment,
     failure::Exit,
     install::Install,
+    line,
     process_table::{OnExit, Row, Running, Scope, TABLE},
     registry::Claim,
     revival::{Revival, Verdict},
@@ -42,16 +45,16 @@ use crate::{
 enum Event {
     /// A signal came.
     Signal(i32),
-    /// `caraware swap` asks for another trainer.
-    Swap(Asked),
+    /// `caraware swap` or `caraware control` asks for something.
+    Asked(line::Asked),
     /// The successor of this incarnation is ready.
     Ready(u32),
 }
 
 /// Time between two looks at the processes when nothing happens.
 const LOOK: Duration = Duration::from_millis(100);
-/// The same while a successor opens its ports: how long that takes is told.
-const HAND_OVER_LOOK: Duration = Duration::from_millis(5);
+/// The same while a successor opens its ports, which is timed, or somebody waits for an answer.
+const SHORT_LOOK: Duration = Duration::from_millis(5);
 /// Longest time from start to ready.
 const READY_WITHIN: Duration = Duration::from_secs(120);
 /// Longest time from SIGTERM to the end of a process, before SIGKILL.
@@ -81,6 +84,7 @@ pub struct Supervisor {
     running: Vec<Running>,
     /// Environment 0 is the home of what belongs to the whole run.
     environments: Vec<Environment>,
+    controls: Controls,
     node: RunNode,
     _claim: Claim,
     cores: Option<cores::Plan>,
@@ -118,18 +122,23 @@ impl Supervisor {
         let (event_sender, events) = channel();
         let signal_handle = watch_signals(event_sender.clone())?;
         let sender = event_sender.clone();
-        swap::listen(&run, move |asked| sender.send(Event::Swap(asked)).is_ok())?;
+        line::listen(&run, move |asked| sender.send(Event::Asked(asked)).is_ok())?;
         let node = services::node(&run.shared_memory)?;
         let envs = run.config.run.envs;
-        let environments = (0..envs)
+        let environments: Vec<_> = (0..envs)
             .map(|index| Environment::create(&node, &run, index))
             .collect::<Result<_, Exit>>()?;
+        let clients = environments
+            .iter()
+            .map(|environment: &Environment| ControlClient::create(environment.control()));
+        let controls = Controls::new(clients.collect::<Result<_, _>>()?);
         let cores = cores::plan(&cores::available(), envs as usize, run.mode.has_trainer());
         Ok(Self {
             succession: None,
             asked_to_leave: false,
             running: Vec::new(),
             environments,
+            controls,
             node,
             _claim: claim,
             cores,
@@ -158,6 +167,7 @@ impl Supervisor {
             self.start_what_can()?;
             self.reap()?;
             self.advance_swap();
+            self.controls.advance()?;
             self.note_ready(started)?;
             display.update(&self.environments, self.ready_at);
             self.last_look = Instant::now();
@@ -170,6 +180,7 @@ impl Supervisor {
             }
         }
         self.refuse_swap("the run is over", "");
+        self.controls.end();
         let wall_s = self.ready_at.unwrap_or(started).elapsed().as_secs_f64();
         display.update(&self.environments, self.ready_at);
         display.finish();
@@ -402,9 +413,11 @@ impl Supervisor {
     /// Waits for something to happen, at most [`LOOK`]; true if it asks the run to end.
     fn wait_for_event(&mut self) -> bool {
         let taking = self.succession.as_ref().is_some_and(Succession::is_taking);
-        match self.events.recv_timeout(if taking { HAND_OVER_LOOK } else { LOOK }) {
+        let is_short = taking || self.controls.is_waiting();
+        match self.events.recv_timeout(if is_short { SHORT_LOOK } else { LOOK }) {
             Ok(Event::Signal(signal)) => return signal != SIGCHLD,
-            Ok(Event::Swap(asked)) => self.begin_swap(asked),
+            Ok(Event::Asked(line::Asked::Swap(asked))) => self.begin_swap(asked),
+            Ok(Event::Asked(line::Asked::Control(command, env, line))) => self.controls.pass_on(&command, env, line),
             Ok(Event::Ready(incarnation)) => self.successor_ready(incarnation),
             Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {}
         }

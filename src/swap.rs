@@ -1,15 +1,10 @@
-//! `caraware swap`: replaces the trainer of a live run. The request goes to the supervisor through a socket in the run's own
-//! directory, which only its user can enter.
+//! `caraware swap`: replaces the trainer of a live run.
 
-use std::{
-    io::{BufRead as _, BufReader, Write as _},
-    os::unix::net::{UnixListener, UnixStream},
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
 use ipc_schema::{
     config::Config,
-    failure::{Failure, FailureKind},
+    failure::Failure,
     run::{Mode, RunFile},
 };
 use serde::{Deserialize, Serialize};
@@ -18,11 +13,10 @@ use crate::{
     cli::SwapArgs,
     config::{self, Settings},
     failure::Exit,
+    line::{self, Asking, Line},
     registry,
 };
 
-/// The socket, beside the run's lock.
-const SOCKET: &str = "control";
 /// The only settings that may change in a live run.
 const CHANGEABLE: &str = "trainer.";
 
@@ -63,56 +57,25 @@ pub struct Handover {
 pub struct Asked {
     /// What is asked.
     pub request: Request,
-    stream: UnixStream,
+    line: Line,
 }
 
 impl Asked {
+    /// A request that came over `line`.
+    #[must_use]
+    pub fn new(request: Request, line: Line) -> Self {
+        Self { request, line }
+    }
+
     /// Answers; a command that has gone meanwhile is not missed.
-    pub fn answer(mut self, answer: &Answer) {
-        let line = serde_json::to_string(answer).unwrap_or_default();
-        if let Err(error) = writeln!(self.stream, "{line}") {
-            tracing::warn!(%error, "nobody waits for the answer to a swap");
-        }
+    pub fn answer(self, answer: &Answer) {
+        self.line.answer(answer);
     }
 
     /// Answers that nothing has changed.
     pub fn refuse(self, failure: Failure) {
         self.answer(&Answer::Refused(failure));
     }
-}
-
-/// Path of the control socket of a run.
-fn socket(run: &RunFile) -> PathBuf {
-    run.shared_memory.root.join(SOCKET)
-}
-
-/// Listens for requests until the run's directory goes; each is handed to `take`.
-///
-/// # Errors
-/// The socket cannot be created.
-pub fn listen(run: &RunFile, take: impl Fn(Asked) -> bool + Send + 'static) -> Result<(), Exit> {
-    let path = socket(run);
-    let listener = UnixListener::bind(&path).map_err(|error| Exit::io("listen on", &path, &error))?;
-    let serve = move || {
-        for stream in listener.incoming().flatten() {
-            let mut line = String::new();
-            let mut reader = BufReader::new(stream);
-            let request = reader
-                .read_line(&mut line)
-                .ok()
-                .and_then(|_| serde_json::from_str(&line).ok());
-            let Some(request) = request else { continue };
-            let stream = reader.into_inner();
-            if !take(Asked { request, stream }) {
-                return;
-            }
-        }
-    };
-    std::thread::Builder::new()
-        .name("control".into())
-        .spawn(serve)
-        .map(drop)
-        .map_err(|error| Exit::run(format!("cannot listen for requests: {error}"), ""))
 }
 
 /// The configuration of `run` with other settings of the trainer.
@@ -161,7 +124,7 @@ pub fn swap(args: &SwapArgs) -> Result<(), Exit> {
         set: args.set.clone(),
         checkpoint: args.checkpoint.as_deref().map(checkpoint).transpose()?,
     };
-    match ask(&socket(&run), &request)? {
+    match line::ask(&run, &Asking::Swap(request))? {
         Answer::Done(handover) => {
             println!(
                 "{}: trainer {} has taken over at tick {}; the hand-over took {:.2} s",
@@ -171,20 +134,4 @@ pub fn swap(args: &SwapArgs) -> Result<(), Exit> {
         }
         Answer::Refused(failure) => Err(failure.into()),
     }
-}
-
-fn ask(socket: &Path, request: &Request) -> Result<Answer, Exit> {
-    let failed = |error: &std::io::Error| Exit::io("ask the supervisor through", socket, error);
-    let mut stream = UnixStream::connect(socket).map_err(|error| failed(&error))?;
-    writeln!(stream, "{}", serde_json::to_string(request).unwrap_or_default()).map_err(|error| failed(&error))?;
-    let mut line = String::new();
-    BufReader::new(stream)
-        .read_line(&mut line)
-        .map_err(|error| failed(&error))?;
-    serde_json::from_str(&line).map_err(|_| {
-        Exit::Failure(
-            Failure::new(FailureKind::Run, "the run ended before the trainer was replaced")
-                .with_help("its report says how"),
-        )
-    })
 }

@@ -41,6 +41,16 @@ pub fn view(args: &ViewArgs) -> Result<(), Exit> {
     if let Some(name) = &args.run {
         command.arg(format!("--run={name}"));
     }
+    let who = &args.credentials;
+    command.args(who.user.as_ref().map(|user| format!("--user={user}")));
+    for (option, path) in [
+        ("password-file", &who.password_file),
+        ("ca", &who.ca),
+        ("certificate", &who.certificate),
+        ("key", &who.key),
+    ] {
+        command.args(path.as_ref().map(|path| format!("--{option}={}", path.display())));
+    }
     let error = command.exec();
     Err(Exit::missing(
         format!("cannot start {}: {error}", command.get_program().to_string_lossy()),

@@ -5,19 +5,23 @@ use std::{io, net::TcpListener};
 use ipc_schema::config::Fanout;
 use zenoh::{Wait, config::Config};
 
-use crate::outlet::OutletError;
+use crate::{access, outlet::OutletError};
 
 /// Opens a zenoh peer that listens where it was told, and nowhere else.
 ///
 /// # Errors
-/// The endpoint is malformed, taken, or not of this machine.
+/// The endpoint is malformed, taken, or not of this machine, or a certificate or the file of users cannot be used.
 pub fn listen(settings: &Fanout) -> Result<zenoh::Session, OutletError> {
     let endpoint = &settings.listen;
     let failed = |error: zenoh::Error| OutletError::Listen {
         endpoint: endpoint.clone(),
         reason: plain_reason(endpoint).unwrap_or_else(|| error.to_string()),
     };
-    zenoh::open(config(settings).map_err(failed)?).wait().map_err(failed)
+    let mut config = config(settings).map_err(failed)?;
+    for (key, value) in access::settings(settings) {
+        config.insert_json5(key, &value).map_err(failed)?;
+    }
+    zenoh::open(config).wait().map_err(failed)
 }
 
 /// Closed by default: one endpoint, no discovery, no shared memory, no administration. A viewer that stalls or is slow
@@ -49,9 +53,10 @@ fn config(settings: &Fanout) -> zenoh::Result<Config> {
 fn plain_reason(endpoint: &str) -> Option<String> {
     let address = endpoint
         .strip_prefix("tcp/")
+        .or_else(|| endpoint.strip_prefix("tls/"))
         .map(|a| a.split(['?', '#']).next().unwrap_or(a));
     let Some(address) = address else {
-        return Some("this program speaks tcp only: `tcp/HOST:PORT`".to_owned());
+        return Some("this program speaks tcp and tls only: `tcp/HOST:PORT`, `tls/HOST:PORT`".to_owned());
     };
     TcpListener::bind(address).err().map(|error| reason(&error, address))
 }

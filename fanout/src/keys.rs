@@ -91,6 +91,12 @@ impl Keys {
         format!("{}/alive", self.prefix)
     }
 
+    /// Key that takes commands: under a prefix of its own, so that a right to read is none to command.
+    #[must_use]
+    pub fn control(&self) -> String {
+        format!("caraware-control{}", &self.prefix["caraware".len()..])
+    }
+
     /// Key of the scans of the vehicle with this SUMO id.
     #[must_use]
     pub fn scan(&self, id: &str) -> String {

@@ -4,6 +4,8 @@
 //! Keys, payloads and rates: `docs/fanout.md`. Every published key also answers queries with its newest value: a late joiner
 //! has the whole picture at once.
 
+pub mod access;
+pub mod commands;
 pub mod directory;
 pub mod endpoint;
 pub mod facts;

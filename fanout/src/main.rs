@@ -2,8 +2,9 @@
 
 use std::process::ExitCode;
 
+use fanout::access::{HEARD, RefusalLayer};
 use ipc_schema::{process::Process, session};
 
 fn main() -> ExitCode {
-    session::main(Process::Fanout, fanout::run)
+    session::main_heard(Process::Fanout, RefusalLayer, HEARD, fanout::run)
 }

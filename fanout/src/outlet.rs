@@ -186,6 +186,12 @@ impl Outlet {
         })
     }
 
+    /// The session, for others who declare keys.
+    #[must_use]
+    pub fn session(&self) -> &zenoh::Session {
+        &self.session
+    }
+
     /// Says that the run is here.
     ///
     /// # Errors

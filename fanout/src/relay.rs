@@ -13,6 +13,8 @@ use ipc_schema::{
 };
 
 use crate::{
+    access,
+    commands::Commands,
     facts::Facts,
     feed::{Feed, newest_common},
     frame,
@@ -71,6 +73,7 @@ pub struct Relay {
     scans: Option<Scans>,
     boards: Vec<(Process, BoardReader)>,
     outlet: Outlet,
+    commands: Commands,
     patience: Patience,
     started: Instant,
     run_age_s: f64,
@@ -102,6 +105,7 @@ impl Relay {
         let settings = run.config.fanout.clone();
         let keys = Keys::new(&run.name, env_index);
         let outlet = Outlet::open(&settings, &keys, &status::map(run, env_index))?;
+        let commands = Commands::open(outlet.session(), keys.control(), env_index, run.control_socket())?;
         let queue_length = Channel::World.queue_length(run);
         let rates_hz = [settings.world_hz, settings.observation_hz, settings.prediction_hz];
         let feeds = CHANNELS
@@ -125,6 +129,7 @@ impl Relay {
             feeds,
             boards,
             outlet,
+            commands,
             patience: Patience::new(queue_length),
             started: Instant::now(),
             counters: Counters::default(),
@@ -280,7 +285,9 @@ impl Relay {
         let missed = self.feeds().map(|feed| feed.tally().missed).sum();
         self.rate.note(now, ticks);
         self.counters.missed_ticks = missed;
-        self.counters.refused_samples = self.outlet.foreign_samples();
+        self.counters.refused_samples = self.outlet.foreign_samples() + access::forged_samples();
+        self.counters.refused_commands = self.commands.refused();
+        self.counters.refused_connections += access::tell_refusals();
         let newest = self.newest;
         self.session.report(|health| {
             health.state = if ticks > 0 { state as u32 } else { health.state };

@@ -189,6 +189,10 @@ pub struct Counters {
     pub slowed_sets: u64,
     /// Scans of vehicles whose name was not known yet.
     pub unnamed_scans: u64,
+    /// Commands from the network that were refused.
+    pub refused_commands: u64,
+    /// Peers that were not let in.
+    pub refused_connections: u64,
 }
 
 impl Counters {

@@ -398,6 +398,16 @@ pub struct Fanout {
     pub enabled: bool,
     /// zenoh endpoint to listen on.
     pub listen: String,
+    /// File of those who may connect, a line `user:password` each; "" = nobody is asked.
+    pub users: String,
+    /// Certificate of this machine, PEM, for an endpoint `tls/…`.
+    pub tls_certificate: String,
+    /// Its private key, PEM.
+    pub tls_private_key: String,
+    /// Certificate of the authority, PEM, that must have signed the certificates of those who connect; "" = they need none.
+    pub tls_client_ca: String,
+    /// Users, or common names of certificates, that may send commands; "*" = all who may connect.
+    pub commanders: Vec<String>,
     /// Most frames of `world` per wall second.
     pub world_hz: f64,
     /// The same of `observation`.

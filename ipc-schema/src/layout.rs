@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use crate::{
     board::{Health, Progress, Roster, TrainingStatus},
+    control::{ControlReply, ControlRequest, SensorSwitch},
     ego::EgoPose,
     event::Collision,
     header::MessageHeader,
@@ -215,6 +216,31 @@ pub fn table() -> Vec<TypeLayout> {
         layout!(Roster {
             incarnations,
             handing_over
+        }),
+        layout!(ControlRequest {
+            schema_version,
+            command,
+            sensors,
+            is_on,
+            ticks,
+            vehicle_len,
+            edge_len,
+            vehicle,
+            edge
+        }),
+        layout!(ControlReply {
+            schema_version,
+            outcome,
+            tick,
+            episode,
+            text_len,
+            reserved,
+            text
+        }),
+        layout!(SensorSwitch {
+            id_hash,
+            sensors,
+            flags
         }),
         layout!(TrainingStatus {
             episode,

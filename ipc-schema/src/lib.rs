@@ -10,6 +10,8 @@
 //! | `ego-pose`    | `[EgoPose]`                                                       | sim-core       | traffic-bridge    |
 //! | `event`       | `[Collision]`                                                     | sim-core       | none              |
 //! | `census`      | as `traffic-meta`: everybody and every light, each simulated second | traffic-bridge | none              |
+//! | `switch`      | `[SensorSwitch]`, from the tick in the header on                  | traffic-bridge | sensor-daemon     |
+//! | `control`     | [`control::ControlRequest`] → [`control::ControlReply`]           | supervisor     | traffic-bridge    |
 //! | `board`       | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`] | every process  | none (newest wins)|
 //! | `roster`      | [`board::Roster`]: the incarnation of each process that counts    | supervisor     | none (newest wins)|
 //! | `wake`        | an event without content                                          | every peer     | its process       |
@@ -21,6 +23,8 @@ pub mod block;
 pub mod board;
 mod board_port;
 pub mod config;
+pub mod control;
+mod control_port;
 pub mod ego;
 pub mod event;
 pub mod failure;
@@ -41,4 +45,4 @@ pub mod traffic;
 pub mod world;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 8;
+pub const SCHEMA_VERSION: u32 = 9;

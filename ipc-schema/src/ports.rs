@@ -21,7 +21,10 @@ use crate::{
     services::{self, Channel, DataService, RunNode, Shm, WakeListener, WakeService},
 };
 
-pub use crate::board_port::{BoardError, BoardReader, BoardWriter, RosterWriter};
+pub use crate::{
+    board_port::{BoardError, BoardReader, BoardWriter, RosterWriter},
+    control_port::{ControlClient, ControlServer, Pending},
+};
 
 /// A message could not be sent or received.
 #[derive(Debug, thiserror::Error)]

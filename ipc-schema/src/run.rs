@@ -223,6 +223,12 @@ impl RunFile {
         self.run_dir.join("map").join("chart.json")
     }
 
+    /// Socket through which the supervisor takes requests, in a directory that only its user can enter.
+    #[must_use]
+    pub fn control_socket(&self) -> PathBuf {
+        self.shared_memory.root.join("control")
+    }
+
     /// SUMO steps per tick are 1 / this: ticks in one SUMO step.
     #[must_use]
     pub fn ticks_per_traffic_step(&self) -> u64 {

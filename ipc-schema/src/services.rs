@@ -7,15 +7,16 @@ use iceoryx2::{
     port::listener::Listener,
     prelude::{Alignment, FileName, Path as IpcPath, SemanticString, ServiceName, SignalHandlingMode},
     service::{
-        builder::publish_subscribe::Builder as DataBuilder,
+        builder::{publish_subscribe::Builder as DataBuilder, request_response::Builder as ControlBuilder},
         ipc_threadsafe,
-        port_factory::{blackboard, event, publish_subscribe},
+        port_factory::{blackboard, event, publish_subscribe, request_response},
     },
 };
 
 use crate::{
     block::ALIGNMENT,
     board::{Health, INCARNATIONS, Progress, Roster, TrainingStatus},
+    control::{ControlReply, ControlRequest, MAX_SWITCHES, SensorSwitch},
     ego::EgoPose,
     event::Collision,
     header::MessageHeader,
@@ -38,6 +39,8 @@ pub type RunNode = Node<Shm>;
 pub type DataService = publish_subscribe::PortFactory<Shm, [u8], MessageHeader>;
 /// An opened board.
 pub type BoardService = blackboard::PortFactory<Shm, u32>;
+/// The opened service for commands.
+pub type ControlService = request_response::PortFactory<Shm, ControlRequest, (), ControlReply, ()>;
 /// An opened wake-up service.
 pub type WakeService = event::PortFactory<Shm>;
 
@@ -70,6 +73,8 @@ const MAX_NODES: usize = 24;
 const MAX_READERS: usize = 32;
 /// Readers of the roster: every reader of a board reads it.
 const MAX_ROSTER_READERS: usize = 5 * MAX_READERS;
+/// Commands that wait for an answer at a time.
+const MAX_PENDING_COMMANDS: usize = 16;
 /// Messages a process may hold besides those in its queue.
 const SPARE_MESSAGES: usize = 2;
 
@@ -97,11 +102,13 @@ pub enum Channel {
     Event,
     /// What LIDARs see: one message for each of them and each tick.
     Pointcloud,
+    /// Sensors that commands switch on and off.
+    Switch,
 }
 
 impl Channel {
     /// All data services.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Traffic,
         Self::TrafficMeta,
         Self::Census,
@@ -111,6 +118,7 @@ impl Channel {
         Self::EgoPose,
         Self::Event,
         Self::Pointcloud,
+        Self::Switch,
     ];
 
     /// Name in service names and keys.
@@ -126,6 +134,7 @@ impl Channel {
             Self::EgoPose => "ego-pose",
             Self::Event => "event",
             Self::Pointcloud => "pointcloud",
+            Self::Switch => "switch",
         }
     }
 
@@ -133,7 +142,7 @@ impl Channel {
     #[must_use]
     pub fn producer(self) -> Process {
         match self {
-            Self::Traffic | Self::TrafficMeta | Self::Census => Process::TrafficBridge,
+            Self::Traffic | Self::TrafficMeta | Self::Census | Self::Switch => Process::TrafficBridge,
             Self::World | Self::EgoPose | Self::Event => Process::SimCore,
             Self::Observation | Self::Pointcloud => Process::SensorDaemon,
             Self::Prediction => Process::Trainer,
@@ -150,7 +159,8 @@ impl Channel {
             Self::EgoPose => Some(Process::TrafficBridge),
             // In the driving task sim-core waits for each of them, so the trainer is at most one ahead and no queue overflows.
             // Whoever looks at point clouds or a census may miss some: the newest win.
-            Self::Prediction | Self::Event | Self::Pointcloud | Self::Census => None,
+            // A switch goes with a tick, whose own credit bounds both.
+            Self::Prediction | Self::Event | Self::Pointcloud | Self::Census | Self::Switch => None,
         }
     }
 
@@ -181,6 +191,7 @@ impl Channel {
             Self::EgoPose => road_users * size_of::<EgoPose>(),
             Self::Event => road_users * size_of::<Collision>(),
             Self::Pointcloud => PointcloudLayout::new(run.config.lidar.rays_per_tick(run.config.run.tick_s)).len,
+            Self::Switch => MAX_SWITCHES * size_of::<SensorSwitch>(),
         }
     }
 
@@ -193,6 +204,8 @@ impl Channel {
             Self::TrafficMeta => window + run.config.heroes() * ROUTE_MESSAGES_PER_HERO + SPARE_MESSAGES,
             // The newest replaces the one before.
             Self::Census => SPARE_MESSAGES,
+            // One for each step that is on its way through `sim-core`.
+            Self::Switch => 2 * window + SPARE_MESSAGES,
             // The scans of one tick.
             Self::Pointcloud => run.config.lidar.vehicles as usize + SPARE_MESSAGES,
             _ => window + SPARE_MESSAGES,
@@ -346,6 +359,36 @@ pub fn open_data(
         .map_err(|e| refused("opening", channel.name())(&e))
 }
 
+/// Opens the service for commands.
+///
+/// # Errors
+/// It does not exist.
+pub fn open_control(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<ControlService, ServiceError> {
+    control_builder(node, run, env_index)?
+        .open()
+        .map_err(|e| refused("opening", "control")(&e))
+}
+
+fn control_builder(
+    node: &Node<Shm>,
+    run: &RunFile,
+    env_index: u32,
+) -> Result<ControlBuilder<ControlRequest, (), ControlReply, (), Shm>, ServiceError> {
+    Ok(node
+        .service_builder(&service_name(run, env_index, "control")?)
+        .request_response::<ControlRequest, ControlReply>()
+        .enable_safe_overflow_for_requests(false)
+        .enable_safe_overflow_for_responses(false)
+        .enable_fire_and_forget_requests(false)
+        .max_active_requests_per_client(MAX_PENDING_COMMANDS)
+        .max_loaned_requests(1)
+        .max_response_buffer_size(1)
+        .max_borrowed_responses_per_pending_response(1)
+        .max_servers(1)
+        .max_clients(2)
+        .max_nodes(MAX_NODES))
+}
+
 /// Opens the board of a process.
 ///
 /// # Errors
@@ -406,6 +449,7 @@ pub struct ServiceHolder {
     _data: Vec<DataService>,
     _boards: Vec<BoardService>,
     roster: BoardService,
+    control: ControlService,
     _wakes: Vec<WakeService>,
 }
 
@@ -431,8 +475,17 @@ impl ServiceHolder {
             _data: data.collect::<Result<_, _>>()?,
             _boards: boards.collect::<Result<_, _>>()?,
             roster: create_roster(node, run, env_index)?,
+            control: control_builder(node, run, env_index)?
+                .create()
+                .map_err(|e| refused("creation", "control")(&e))?,
             _wakes: wakes.collect::<Result<_, _>>()?,
         })
+    }
+
+    /// The service for commands.
+    #[must_use]
+    pub fn control(&self) -> &ControlService {
+        &self.control
     }
 
     /// The roster.

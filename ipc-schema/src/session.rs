@@ -11,6 +11,7 @@ use std::{
 };
 
 use iceoryx2::node::Node;
+use tracing_subscriber::{EnvFilter, Layer, Registry, layer::SubscriberExt as _, util::SubscriberInitExt as _};
 
 use crate::{
     SCHEMA_VERSION,
@@ -18,7 +19,7 @@ use crate::{
     failure::{Failure, FailureKind},
     flow,
     header::MessageHeader,
-    ports::{BoardError, BoardReader, BoardWriter, PortError, Publisher, Subscriber, Waker, wait},
+    ports::{BoardError, BoardReader, BoardWriter, ControlServer, PortError, Publisher, Subscriber, Waker, wait},
     process::Process,
     run::{RunFile, RunFileError},
     services::{self, Channel, ServiceError, Shm, WakeListener},
@@ -245,6 +246,15 @@ impl Session {
         })
     }
 
+    /// The end that answers commands.
+    ///
+    /// # Errors
+    /// The service cannot be opened.
+    pub fn control_server(&self) -> Result<ControlServer, SessionError> {
+        let service = services::open_control(&self.node, &self.run, self.env_index)?;
+        Ok(ControlServer::create(&service)?)
+    }
+
     /// Wakes `process`.
     ///
     /// # Errors
@@ -448,13 +458,22 @@ fn lives(pid: i32) -> bool {
 /// The `main` of a process binary: reads the run file named by the first argument, logs to standard error, runs `body`,
 /// and turns its failure into a failure file and an exit code.
 pub fn main(process: Process, body: impl FnOnce(&Path) -> Result<(), Failure>) -> ExitCode {
-    tracing_subscriber::fmt()
+    main_heard(process, tracing_subscriber::layer::Identity::new(), "off", body)
+}
+
+/// As [`main`], with somebody who hears what the libraries log, as far as the filter `heard` lets it through.
+pub fn main_heard(
+    process: Process,
+    hearer: impl Layer<Registry> + Send + Sync + 'static,
+    heard: &str,
+    body: impl FnOnce(&Path) -> Result<(), Failure>,
+) -> ExitCode {
+    let log = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(false)
-        .with_env_filter(
-            tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "info,zenoh=error".into()),
-        )
-        .init();
+        .with_filter(EnvFilter::try_from_default_env().unwrap_or_else(|_| "info,zenoh=error".into()));
+    let hearer = hearer.with_filter(EnvFilter::new(heard));
+    tracing_subscriber::registry().with(hearer).with(log).init();
     let Some(run_file) = std::env::args_os().nth(1) else {
         tracing::error!("usage: {process} RUN_FILE   (started by `caraware`, not by hand)");
         return ExitCode::from(FailureKind::Config.exit_code());

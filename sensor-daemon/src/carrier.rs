@@ -26,6 +26,8 @@ pub struct Carrier {
     pub sampled: [u32; SENSORS],
     /// Sensors that it has.
     pub present: u32,
+    /// Sensors that a command has switched off.
+    pub off: u32,
     /// Sensors that have delivered at least once.
     pub known: u32,
     /// The receiver had satellites enough when it last looked.
@@ -50,18 +52,19 @@ impl Carrier {
             phases: [Phase::default(); SENSORS],
             sampled: [0; SENSORS],
             present,
+            off: 0,
             known: 0,
             has_fix: true,
             is_seen: false,
         }
     }
 
-    /// Sensors that are not in a blackout, of those that it has.
+    /// Sensors that are neither in a blackout nor switched off, of those that it has.
     #[must_use]
     #[inline(always)]
     pub fn awake(&self) -> u32 {
         let awake = (0..SENSORS).filter(|i| !self.phases[*i].is_dark());
-        awake.fold(0, |bits, i| bits | BITS[i]) & self.present
+        awake.fold(0, |bits, i| bits | BITS[i]) & self.present & !self.off
     }
 
     /// Takes note of a sample of the sensor with this index at `step`.

@@ -109,6 +109,8 @@ struct Daemon {
     session: Session,
     sensing: Sensing,
     scanning: Option<Scanning>,
+    /// Sensors that commands switch.
+    switches: Subscriber,
     observations: Publisher,
     /// Who must not miss an observation: nobody if nobody learns.
     consumer: Option<Delivery>,
@@ -124,6 +126,7 @@ struct Daemon {
 impl Daemon {
     fn open(mut session: Session, sensing: Sensing, scanning: Option<Scanning>) -> Result<Self, Failure> {
         let observations = session.publisher(Channel::Observation)?;
+        let switches = session.subscriber(Channel::Switch)?;
         let consumer = match session.run.mode.has_trainer() {
             true => Some(Delivery::open(&session)?),
             false => None,
@@ -134,6 +137,7 @@ impl Daemon {
             session,
             sensing,
             scanning,
+            switches,
             observations,
             consumer,
             digest: Digest::default(),
@@ -197,6 +201,7 @@ impl Daemon {
             .into());
         }
         let everybody = view(message, world)?;
+        self.sensing.switches_mut().receive(&self.switches)?.map_err(broken)?;
         let n = self.sensing.assign(world, everybody.states);
         self.scan(world, &everybody)?;
         let is_learnt = world.tick < self.committed_ticks;

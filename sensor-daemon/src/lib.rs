@@ -31,4 +31,5 @@ pub mod sky;
 pub mod slots;
 pub mod speed_steering;
 pub mod suite;
+pub mod switches;
 pub mod wide;

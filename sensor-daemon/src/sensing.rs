@@ -22,6 +22,7 @@ use crate::{
     sections::Sections,
     slots::Slots,
     suite::{Motion, Now, Suite},
+    switches::Switches,
 };
 
 /// Sums of the raw GNSS error over all fixes.
@@ -58,6 +59,8 @@ pub struct Sensing {
     /// Length of a tick, nanoseconds.
     tick_ns: u64,
     slots: Slots,
+    /// What commands have switched off.
+    switches: Switches,
     /// Who gets a slot: heroes if they drive, else connected vehicles.
     agents: Kind,
     /// Persons get one too.
@@ -95,6 +98,7 @@ impl Sensing {
             imu_samples: config.imu_samples(),
             tick_ns,
             slots: Slots::default(),
+            switches: Switches::default(),
             agents: if config.drives() { Kind::Hero } else { Kind::Cav },
             pedestrians: config.gnss.pedestrians && !config.drives(),
             collision_ends: config.collision.ends_trajectory,
@@ -120,6 +124,11 @@ impl Sensing {
         if let Some(sky) = sky {
             self.suites[step].set_sky(sky);
         }
+    }
+
+    /// Sensors that commands switch, to be filled before the tick at which they hold is assigned.
+    pub fn switches_mut(&mut self) -> &mut Switches {
+        &mut self.switches
     }
 
     /// Numbers in a row: fields times ticks.
@@ -155,7 +164,9 @@ impl Sensing {
         if header.has(FIRST_OF_EPISODE) {
             self.enter(header.step());
             self.suites[self.step].begin_episode(header.episode_seed);
+            self.switches.begin_episode();
         }
+        self.switches.advance(header.tick);
         self.row_of_slot.fill(None);
         let now = self.now(header);
         for (row, state) in (0_u32..).zip(states) {
@@ -189,6 +200,9 @@ impl Sensing {
             }
         } else {
             self.suites[self.step].advance(&mut self.carriers[slot], state.id_hash, now);
+        }
+        if self.switches.in_use() {
+            self.carriers[slot].off = self.switches.off(state.id_hash);
         }
     }
 

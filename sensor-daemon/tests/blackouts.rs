@@ -5,6 +5,7 @@ mod common;
 use common::{Run, cavs, config, quiet, road_user};
 use ipc_schema::{
     config::{BlackoutPolicy, Config, Field},
+    control::{EVERY_VEHICLE, SWITCHED_ON, SensorSwitch},
     observation::{CLIPPED, GNSS, IMU, LIDAR, SPEED_STEERING, VALID},
     traffic::Kind,
 };
@@ -267,4 +268,41 @@ fn lidars_scan_in_the_first_slots_unless_dark_and_their_objects_are_observed() {
         dark += u32::from(!scanning);
     }
     assert!((15..=25).contains(&dark), "{dark}");
+}
+
+/// A sensor that a command switches off is dark from its tick to the end of the episode, for one vehicle or for all; the others' numbers
+/// are those of the run without commands.
+#[test]
+fn a_switched_sensor_is_dark_until_it_is_switched_on_or_the_episode_ends() {
+    let switch = |id: Option<u32>, sensors: u32, on: u32| SensorSwitch {
+        id_hash: id.map_or(0, |number| road_user(number, Kind::Cav).id_hash),
+        sensors,
+        flags: on | if id.is_none() { EVERY_VEHICLE } else { 0 },
+    };
+    let (mut run, mut plain) = (Run::new(&config()), Run::new(&config()));
+    let switches = run.sensing.switches_mut();
+    switches.push(3, switch(Some(1), GNSS, 0));
+    switches.push(5, switch(None, IMU, 0));
+    switches.push(8, switch(Some(1), ALL, SWITCHED_ON));
+    for tick in 0..12 {
+        let (seen, untouched) = (run.tick(&cavs(3)), plain.tick(&cavs(3)));
+        let expected = match tick {
+            0..3 => [ALL, ALL, ALL],
+            3..5 => [ALL, ALL & !GNSS, ALL],
+            5..8 => [ALL & !IMU, ALL & !GNSS & !IMU, ALL & !IMU],
+            _ => [ALL & !IMU, ALL, ALL & !IMU],
+        };
+        assert_eq!(seen.section::<u32>("sensors"), expected, "tick {tick}");
+        let fixes = [&seen, &untouched].map(|tick| tick.section::<[f32; 3]>("gnss_m"));
+        for vehicle in 0..3 {
+            let is_dark = expected[vehicle] & GNSS == 0;
+            assert_eq!(
+                fixes[0][vehicle] != fixes[1][vehicle],
+                is_dark,
+                "tick {tick}, vehicle {vehicle}"
+            );
+        }
+    }
+    run.restart(6);
+    assert_eq!(run.tick(&cavs(3)).section::<u32>("sensors"), [ALL; 3]);
 }

@@ -6,8 +6,9 @@ use ipc_schema::{
     block::Section,
     board::State,
     failure::{Failure, FailureKind},
+    flow,
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader, step_flags},
-    ports::{BoardReader, PortError, Publisher, Subscriber, Waker},
+    ports::{BoardReader, ControlServer, PortError, Publisher, Subscriber, Waker},
     process::Process,
     run::{RunFile, Source},
     schedule::{Course, Due, Episode},
@@ -18,6 +19,7 @@ use ipc_schema::{
 
 use crate::{
     census::Census,
+    control::{Control, Place},
     decisions::Decisions,
     error::SumoError,
     fleet::Fleet,
@@ -127,6 +129,17 @@ fn population(
     }
 }
 
+/// How an episode ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum End {
+    /// At its end.
+    Over,
+    /// By a reset: it begins anew.
+    Again,
+    /// The process was asked to stop.
+    Stopped,
+}
+
 /// This process's ports, and how far the run has come.
 struct Bridge {
     membership: Membership,
@@ -139,6 +152,14 @@ struct Bridge {
     /// Where the heroes are, in the driving task.
     poses: Option<Subscriber>,
     pacing: Pacing,
+    commands: ControlServer,
+    control: Control,
+    /// Sensors that commands switch, and the board of the process that must not miss it.
+    switches: Publisher,
+    sensing: BoardReader,
+    /// Episodes that were reset, and the ticks that were made of them.
+    resets: u64,
+    repeated_ticks: u64,
     ticks_per_step: u64,
     /// `traffic-meta` messages sent.
     meta_messages: u64,
@@ -160,7 +181,17 @@ impl Bridge {
         let pacing = Pacing::new(membership.run.config.run.real_time_factor);
         let ticks_per_step = membership.run.ticks_per_traffic_step();
         let ticks = membership.run.first_tick();
+        let commands = membership.control_server()?;
+        let control = Control::of_run(&membership.run.run_dir)?;
+        let switches = membership.publisher(Channel::Switch)?;
+        let sensing = membership.board_of(Process::SensorDaemon)?;
         Ok(Self {
+            commands,
+            control,
+            switches,
+            sensing,
+            resets: 0,
+            repeated_ticks: 0,
             membership,
             traffic,
             meta,
@@ -174,6 +205,11 @@ impl Bridge {
             ticks,
             vehicle_steps: 0,
         })
+    }
+
+    /// Number of the episode in the run: by its schedule, and one more for each that was reset.
+    fn number(&self, episode: &Episode) -> u64 {
+        episode.index + self.resets
     }
 
     /// Tells the length of the run.
@@ -193,7 +229,11 @@ impl Bridge {
                 .ticks
                 .map_or(scenario, |ticks| ticks.div_ceil(per_step) * per_step)
         };
-        let total_ticks = self.membership.run.episodes().iter().map(ticks).sum();
+        let total_ticks: u64 = self.membership.run.episodes().iter().map(ticks).sum();
+        let total_ticks = match total_ticks {
+            0 => 0,
+            ticks => ticks + self.repeated_ticks,
+        };
         self.membership.report(|health| {
             health.state = State::Running as u32;
             health.total_ticks = total_ticks;
@@ -204,16 +244,21 @@ impl Bridge {
     fn all(&mut self, episodes: impl Iterator<Item = Episode>) -> Result<Wait, Failure> {
         let (mut before, mut episodes) = (None, episodes.peekable());
         while let Some(episode) = episodes.next() {
-            let mut underway = self.begin(before.take(), &episode, 0)?;
-            self.announce(&underway.session);
             let stretch = Stretch {
                 is_last: episodes.peek().is_none(),
                 ..Stretch::default()
             };
-            if self.run(&mut underway, stretch)? == Wait::Stopped {
-                return Ok(Wait::Stopped);
+            loop {
+                let mut underway = self.begin(before.take(), &episode, 0)?;
+                self.announce(&underway.session);
+                let end = self.run(&mut underway, stretch)?;
+                before = Some(underway);
+                match end {
+                    End::Over => break,
+                    End::Again => {}
+                    End::Stopped => return Ok(Wait::Stopped),
+                }
             }
-            before = Some(underway);
         }
         Ok(Wait::Ready)
     }
@@ -267,7 +312,7 @@ impl Bridge {
                 (None, None) => return Ok(Wait::Ready),
             };
             self.announce(&now.session);
-            if self.run(&mut now, stretch)? == Wait::Stopped {
+            if self.run(&mut now, stretch)? == End::Stopped {
                 return Ok(Wait::Stopped);
             }
             underway = Some(now);
@@ -283,6 +328,7 @@ impl Bridge {
             Some(before) => Session::reload(before.session, options)?,
         };
         let population = population(run, &mut session, episode, step)?;
+        self.control.begin_episode();
         Ok(Underway {
             session,
             population,
@@ -292,7 +338,7 @@ impl Bridge {
     }
 
     /// Runs an episode to the end of the stretch, or to its own.
-    fn run(&mut self, underway: &mut Underway, stretch: Stretch) -> Result<Wait, Failure> {
+    fn run(&mut self, underway: &mut Underway, stretch: Stretch) -> Result<End, Failure> {
         let Underway {
             session,
             population,
@@ -301,23 +347,29 @@ impl Bridge {
         } = underway;
         loop {
             let tick = self.ticks + self.ticks_per_step - 1;
-            if self.may_send(tick, session.step_s())? == Wait::Stopped {
-                return Ok(Wait::Stopped);
+            if self.may_send(tick, session, population.as_mut(), episode, frame)? == Wait::Stopped {
+                return Ok(End::Stopped);
             }
             if self.move_heroes(session, episode, frame)? == Wait::Stopped {
-                return Ok(Wait::Stopped);
+                return Ok(End::Stopped);
             }
             session.step(frame)?;
+            self.control.note(&frame.events);
+            let is_reset = self.control.take_reset();
             let pauses = stretch
                 .ticks
                 .is_some_and(|ticks| frame.step * self.ticks_per_step >= ticks);
-            let ends = stretch.ticks.is_none() && self.ends(session, episode, frame)?;
+            let ends = is_reset || stretch.ticks.is_none() && self.ends(session, episode, frame)?;
             let flags = stretch.flags | if pauses { stretch.last_flags } else { 0 };
-            let header = self.header(episode, frame, tick, session.step_s(), ends, ends && stretch.is_last);
+            let ends_run = ends && stretch.is_last && !is_reset;
+            let header = self.header(episode, frame, tick, session.step_s(), ends, ends_run);
             let header = MessageHeader {
                 flags: header.flags | flags,
                 ..header
             };
+            if self.publish_switches(episode)? == Wait::Stopped {
+                return Ok(End::Stopped);
+            }
             if self.poses.is_some() {
                 self.publish_routes(&heroes::take_over(session, frame)?, header)?;
             }
@@ -325,8 +377,13 @@ impl Bridge {
             if ends {
                 self.check_that_somebody_came()?;
             }
+            if is_reset {
+                self.resets += 1;
+                self.repeated_ticks += frame.step * self.ticks_per_step;
+                return Ok(End::Again);
+            }
             if ends || pauses {
-                return Ok(Wait::Ready);
+                return Ok(End::Over);
             }
             if let Some(population) = population {
                 population.after_step(session, frame)?;
@@ -346,12 +403,68 @@ impl Bridge {
         }
     }
 
-    /// Waits for credit up to `tick`, and for its time if the run is paced.
-    fn may_send(&mut self, tick: u64, step_s: f64) -> Result<Wait, Failure> {
-        match self.membership.wait_for_credit(&self.consumer, tick)? {
-            Wait::Ready => Ok(self.pacing.wait(&self.membership, step_s)?),
-            Wait::Stopped => Ok(Wait::Stopped),
+    /// Carries out commands while it waits for credit up to `tick`, for the end of a pause, and for its time if the run is paced.
+    fn may_send(
+        &mut self,
+        tick: u64,
+        session: &mut Session,
+        population: Option<&mut Population>,
+        episode: &Episode,
+        frame: &Frame,
+    ) -> Result<Wait, Failure> {
+        let step_s = session.step_s();
+        let number = self.number(episode);
+        let run = &self.membership.run;
+        let mut place = Place {
+            session,
+            population,
+            tick: self.ticks,
+            episode: number,
+            step: frame.step,
+            ticks_per_step: self.ticks_per_step,
+            has_lidars: run.config.lidar.vehicles > 0,
+            has_lessons: !run.config.curriculum.steps.is_empty(),
+            senses_persons: run.config.gnss.pedestrians,
+        };
+        self.control.replay(&mut place)?;
+        let window = run.window_ticks();
+        let (control, commands, consumer) = (&mut self.control, &self.commands, &self.consumer);
+        let mut failure = None;
+        let waited = self.membership.wait_until(|| {
+            while failure.is_none() {
+                match commands.serve(|command| control.answer(command, &mut place)) {
+                    Ok(true) => {}
+                    Ok(false) => break,
+                    Err(error) => failure = Some(error),
+                }
+            }
+            failure.is_some() || !control.holds(place.tick) && flow::has_credit(tick, &consumer.progress(), window)
+        })?;
+        match (failure, waited) {
+            (Some(failure), _) => Err(failure),
+            (None, Wait::Ready) => Ok(self.pacing.wait(&self.membership, step_s)?),
+            (None, Wait::Stopped) => Ok(Wait::Stopped),
         }
+    }
+
+    /// Sends what commands switch at the next tick: before the tick itself, so that it is there when its world is sensed.
+    fn publish_switches(&mut self, episode: &Episode) -> Result<Wait, Failure> {
+        let switches = self.control.take_switches();
+        if switches.is_empty() {
+            return Ok(Wait::Ready);
+        }
+        // Who is not there yet misses what is sent; ticks would wait for it in `sim-core`.
+        let sensing = &self.sensing;
+        let waited = self.membership.wait_until(|| sensing.progress().attached == 1)?;
+        if waited == Wait::Ready {
+            let header = MessageHeader {
+                tick: self.ticks,
+                episode: self.number(episode),
+                ..self.membership.header()
+            };
+            send(&self.switches, header, switches.len(), bytemuck::cast_slice(&switches))?;
+        }
+        Ok(waited)
     }
 
     /// In the driving task: waits for the poses of the tick sent last and sets the heroes of `frame`, its step, to them.
@@ -375,7 +488,7 @@ impl Bridge {
             .into());
         }
         // The heroes of the episode before went with it.
-        if header.episode == episode.index {
+        if header.episode == self.number(episode) {
             let poses = heroes::poses(&message).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
             heroes::apply(session, frame, poses)?;
         }
@@ -420,7 +533,7 @@ impl Bridge {
                 | flag(FIRST_OF_EPISODE, frame.step == 1)
                 | flag(LAST_OF_EPISODE, ends)
                 | flag(LAST_OF_RUN, ends_run),
-            episode: episode.index,
+            episode: self.number(episode),
             episode_seed: episode.seed,
             tick,
             sim_time_ns: frame.step * nanoseconds(step_s),

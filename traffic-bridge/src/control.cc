@@ -71,6 +71,12 @@ void Simulation::extend_route(rust::Str id, rust::Slice<const rust::String> more
     libsumo::Vehicle::setRoute(name, ahead);
 }
 
+std::uint32_t Simulation::set_destination(rust::Str id, rust::Str edge) {
+    const std::string name = text(id);
+    libsumo::Vehicle::changeTarget(name, text(edge));
+    return static_cast<std::uint32_t>(libsumo::Vehicle::getRoute(name).size());
+}
+
 rust::Vec<rust::String> Simulation::walk(rust::Str from, double from_position, rust::Str to,
                                          double to_position) const {
     std::vector<std::string> edges;

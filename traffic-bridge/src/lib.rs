@@ -6,6 +6,7 @@
 pub mod bridge;
 pub mod catalogue;
 pub mod census;
+mod control;
 pub mod convention;
 mod decisions;
 pub mod error;
@@ -18,6 +19,7 @@ pub mod inputs;
 pub mod options;
 mod pacing;
 mod pedestrians;
+mod placing;
 pub mod population;
 pub mod roads;
 pub mod session;

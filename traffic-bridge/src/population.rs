@@ -70,19 +70,27 @@ enum Way {
     Given(Rc<[String]>),
 }
 
+/// Roads that a command has given to whoever fills the place next.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Placed {
+    pub(crate) start: Option<usize>,
+    pub(crate) goal: Option<usize>,
+}
+
 /// A place in the population, and who fills it now.
 #[derive(Debug)]
-struct Driver {
+pub(crate) struct Driver {
     prefix: &'static str,
-    id: String,
+    pub(crate) id: String,
     vehicle_type: String,
-    roads: Rc<Roads>,
+    pub(crate) roads: Rc<Roads>,
     way: Way,
     trips: Trips,
     rng: ChaCha8Rng,
     /// Last edge of the route.
-    goal: usize,
-    route_edges: usize,
+    pub(crate) goal: usize,
+    pub(crate) route_edges: usize,
+    pub(crate) placed: Placed,
     added_step: u64,
     departed: bool,
 }
@@ -90,8 +98,8 @@ struct Driver {
 /// The road users of one episode.
 #[derive(Debug)]
 pub struct Population {
-    drivers: Vec<Driver>,
-    place_of: BTreeMap<String, usize>,
+    pub(crate) drivers: Vec<Driver>,
+    pub(crate) place_of: BTreeMap<String, usize>,
     next_number: BTreeMap<&'static str, u32>,
     pedestrians: Pedestrians,
     pace: Pace,
@@ -218,7 +226,7 @@ impl Population {
     }
 
     /// Adds a new vehicle for `place`, of the type that belongs to the place, with a random route.
-    fn fill(&mut self, session: &mut Session, place: usize, step: u64) -> Result<(), SumoError> {
+    pub(crate) fn fill(&mut self, session: &mut Session, place: usize, step: u64) -> Result<(), SumoError> {
         let driver = &mut self.drivers[place];
         self.place_of.remove(&driver.id);
         let number = self.next_number.entry(driver.prefix).or_insert(0);
@@ -230,6 +238,10 @@ impl Population {
 }
 
 impl Driver {
+    pub(crate) fn is_on_a_given_way(&self) -> bool {
+        matches!(self.way, Way::Given(_))
+    }
+
     fn add(&mut self, session: &mut Session, step: u64) -> Result<(), SumoError> {
         if let Way::Given(route) = &self.way {
             (self.route_edges, self.added_step, self.departed) = (route.len(), step, false);
@@ -240,8 +252,12 @@ impl Driver {
                 reason: error.what().trim().to_owned(),
             });
         }
-        let start = self.roads.draw_start(&mut self.rng);
-        self.goal = self.draw_goal(start);
+        let placed = std::mem::take(&mut self.placed);
+        let start = placed.start.unwrap_or_else(|| self.roads.draw_start(&mut self.rng));
+        self.goal = match placed.goal {
+            Some(goal) if goal != start => goal,
+            _ => self.draw_goal(start),
+        };
         let route = self.roads.route(start, self.goal);
         (self.route_edges, self.added_step, self.departed) = (route.len(), step, false);
         called(
@@ -334,6 +350,7 @@ fn drivers(
             rng,
             goal: 0,
             route_edges: 0,
+            placed: Placed::default(),
             added_step: 0,
             departed: false,
         });

@@ -84,6 +84,12 @@ impl Roads {
         &self.edges[index]
     }
 
+    /// Index of the road with SUMO's id `id`, if it is one of these.
+    #[must_use]
+    pub fn find(&self, id: &str) -> Option<usize> {
+        self.edges.binary_search_by(|edge| edge.id.as_str().cmp(id)).ok()
+    }
+
     /// SUMO's ids of the fastest route, both ends included.
     #[must_use]
     pub fn route(&self, from: usize, to: usize) -> Vec<String> {

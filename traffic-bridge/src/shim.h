@@ -62,6 +62,7 @@ public:
     rust::Vec<RawWay> route_ways(std::uint32_t index) const;
     std::int32_t route_index(rust::Str id) const;
     void extend_route(rust::Str id, rust::Slice<const rust::String> more);
+    std::uint32_t set_destination(rust::Str id, rust::Str edge);
 
     rust::Vec<rust::String> walk(rust::Str from, double from_position, rust::Str to, double to_position) const;
     void add_person(rust::Str id, rust::Str person_type, rust::Str edge, double position);

@@ -184,6 +184,8 @@ pub mod ffi {
         fn route_index(self: &Simulation, id: &str) -> Result<i32>;
         /// Continues the vehicle's route by `more`, which begins with its last edge.
         fn extend_route(self: Pin<&mut Simulation>, id: &str, more: &[String]) -> Result<()>;
+        /// Leads the vehicle from where it is to `edge` by SUMO's own choice of route; the number of edges of its route.
+        fn set_destination(self: Pin<&mut Simulation>, id: &str, edge: &str) -> Result<u32>;
 
         /// Walk along sidewalks and crossings, both ends included; empty if there is none.
         fn walk(self: &Simulation, from: &str, from_position: f64, to: &str, to_position: f64) -> Result<Vec<String>>;

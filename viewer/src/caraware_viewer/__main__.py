@@ -12,6 +12,7 @@ from collections.abc import Sequence
 # rerun reads this when it is loaded and started: a viewer of one's own simulation does not report on its user.
 os.environ.setdefault("CI", "1")
 
+from caraware_viewer import access, command
 from caraware_viewer.display import DisplayError
 from caraware_viewer.link import LinkError
 from caraware_viewer.watch import watch
@@ -35,12 +36,15 @@ Exit codes: 0 the run ended or the window was closed, 1 nothing to watch, 2 usag
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Watches a run until it ends. Exit code 0: it ended, 1: nothing to watch, 2: usage, 130: interrupted."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments[:1] == ["command"]:
+        return command.main(arguments[1:])
     options = _parser().parse_args(arguments)
     # Asked to end, it writes what is left, as at Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return watch(options)
-    except (LinkError, DisplayError) as error:
+    except (LinkError, access.AccessError, DisplayError) as error:
         print(f"caraware-viewer: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -66,6 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--timeout", type=_seconds, default=5.0, metavar="S", help="longest wait for an answer (default %(default)s s)"
     )
+    access.add_arguments(parser.add_argument_group("who you are, if the run asks"))
     _add_sinks(parser.add_argument_group("where it is shown (a window, if nothing is said and there is a screen)"))
     _add_scene(parser.add_argument_group("what is shown"))
     return parser

@@ -17,6 +17,7 @@ from urllib.parse import quote, unquote
 
 import zenoh
 
+from caraware_viewer import access
 from caraware_viewer.wire import SCHEMA_VERSION
 
 TOPICS = ("world", "observation", "prediction", "status", "vehicles", "signals", "event")
@@ -139,33 +140,12 @@ class LatestFrames:
         return self._closed
 
 
-def config(endpoint: str, timeout_s: float) -> zenoh.Config:
-    """A client of `endpoint` that neither scouts nor is found."""
-    settings = {
-        "mode": "client",
-        "connect/endpoints": [endpoint],
-        "connect/timeout_ms": int(timeout_s * 1000),
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/shared_memory/enabled": False,
-    }
-    result = zenoh.Config()
-    for key, value in settings.items():
-        result.insert_json5(key, json.dumps(value))
-    return result
-
-
-def connect(endpoint: str, timeout_s: float) -> zenoh.Session:
-    """Opens a session to the fan-out at `endpoint`."""
+def connect(endpoint: str, timeout_s: float, credentials: access.Credentials = access.ANONYMOUS) -> zenoh.Session:
+    """Opens a session to the fan-out at `endpoint`. Raises `LinkError`."""
     try:
-        return zenoh.open(config(endpoint, timeout_s))
-    except zenoh.ZError as error:
-        raise LinkError(
-            f"nothing answers at {endpoint} within {timeout_s:g} s.\n"
-            "  Is a run going, with `fanout.enabled = true`? Its endpoint is `fanout.listen` in its configuration.\n"
-            "  A run on another machine listens on its own loopback: open a tunnel first, "
-            "`ssh -L 7447:127.0.0.1:7447 HOST`."
-        ) from error
+        return access.connect(endpoint, timeout_s, credentials)
+    except access.AccessError as error:
+        raise LinkError(str(error)) from error
 
 
 def alive(session: zenoh.Session, timeout_s: float) -> list[RunKey]:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 import rerun as rr
 
+from caraware_viewer import access
 from caraware_viewer.display import Display, has_screen
 from caraware_viewer.layout import blueprint
 from caraware_viewer.link import Link, choose, connect
@@ -23,7 +24,7 @@ _FLUSH_S = 5.0
 
 def watch(options: argparse.Namespace) -> int:
     """Connects, opens the recording, and draws what comes until the run ends; returns the exit code."""
-    session = connect(options.endpoint, options.timeout)
+    session = connect(options.endpoint, options.timeout, access.of_options(options))
     try:
         run = choose(session, options.endpoint, options.run, options.timeout, options.env)
     except BaseException:

@@ -1,0 +1,102 @@
+//! Asking and answering over the service `control`. Neither end ever waits for the other.
+
+use iceoryx2::{
+    pending_response::PendingResponse,
+    port::{client::Client, server::Server},
+    prelude::BackpressureStrategy,
+};
+
+use crate::{
+    control::{Command, ControlReply, ControlRequest, Refusal, RefusalKind, Reply},
+    ports::{PortError, refused},
+    services::{ControlService, Shm},
+};
+
+const NAME: &str = "control";
+
+/// The asking end, of the supervisor.
+pub struct ControlClient(Client<Shm, ControlRequest, (), ControlReply, ()>);
+
+/// A command that has been sent and not been answered yet.
+pub struct Pending(PendingResponse<Shm, ControlRequest, (), ControlReply, ()>);
+
+impl ControlClient {
+    /// The asking end of `service`.
+    ///
+    /// # Errors
+    /// iceoryx2 refuses.
+    pub fn create(service: &ControlService) -> Result<Self, PortError> {
+        let client = service
+            .client_builder()
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .create()
+            .map_err(|e| refused(NAME, "creation of the client")(&e))?;
+        Ok(Self(client))
+    }
+
+    /// Sends a command.
+    ///
+    /// # Errors
+    /// Too many are on the way, or nobody is there to take it.
+    pub fn send(&self, command: &Command) -> Result<Pending, Refusal> {
+        let pending = self.0.send_copy(ControlRequest::from(command));
+        match pending {
+            Ok(pending) if pending.number_of_server_connections() > 0 => Ok(Pending(pending)),
+            Ok(_) => Err(Refusal::new(
+                RefusalKind::Unanswered,
+                "the simulation does not take commands now: it is starting, or over",
+            )),
+            Err(error) => Err(Refusal::new(
+                RefusalKind::Busy,
+                format!("too many commands at a time ({error:?}): ask again"),
+            )),
+        }
+    }
+}
+
+impl Pending {
+    /// The answer, if it is there.
+    ///
+    /// # Errors
+    /// The port is broken.
+    pub fn reply(&self) -> Result<Option<Reply>, PortError> {
+        let response = self.0.receive().map_err(|e| refused(NAME, "receiving")(&e))?;
+        Ok(response.map(|response| Reply::from(response.payload())))
+    }
+}
+
+/// The answering end, of `traffic-bridge`.
+pub struct ControlServer(Server<Shm, ControlRequest, (), ControlReply, ()>);
+
+impl ControlServer {
+    /// The answering end of `service`.
+    ///
+    /// # Errors
+    /// iceoryx2 refuses.
+    pub fn create(service: &ControlService) -> Result<Self, PortError> {
+        let server = service
+            .server_builder()
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .create()
+            .map_err(|e| refused(NAME, "creation of the server")(&e))?;
+        Ok(Self(server))
+    }
+
+    /// Answers the next command, if there is one; false if there is none. An asker who has gone meanwhile is not missed.
+    ///
+    /// # Errors
+    /// The port is broken, or `answer` fails.
+    pub fn serve<E: From<PortError>>(
+        &self,
+        answer: impl FnOnce(Result<Command, Refusal>) -> Result<Reply, E>,
+    ) -> Result<bool, E> {
+        let Some(request) = self.0.receive().map_err(|e| refused(NAME, "receiving")(&e))? else {
+            return Ok(false);
+        };
+        let reply = answer(Command::try_from(request.payload()))?;
+        if let Err(error) = request.send_copy(ControlReply::from(&reply)) {
+            tracing::debug!(?error, "nobody waits for the answer to a command");
+        }
+        Ok(true)
+    }
+}

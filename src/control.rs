@@ -1,0 +1,189 @@
+//! `caraware control`: commands to a live simulation, and the supervisor's part in them: it passes them on and hands answers back.
+
+use std::time::{Duration, Instant};
+
+use ipc_schema::{
+    control::{Command, Refusal, RefusalKind, Reply, Sensor, Switch},
+    failure::{Failure, FailureKind},
+    ports::{ControlClient, Pending, PortError},
+};
+
+use crate::{
+    cli::{ControlAction, ControlArgs, SensorName, SwitchState},
+    failure::Exit,
+    line::{self, Asking, Line},
+    registry,
+};
+
+/// Longest wait for the simulation to answer; it takes commands while it waits for the learner, but not within a step of SUMO.
+const ANSWER_WITHIN: Duration = Duration::from_secs(10);
+
+/// The supervisor's side: commands that have been passed on.
+pub struct Controls {
+    /// One for each environment.
+    clients: Vec<ControlClient>,
+    waiting: Vec<Waiting>,
+}
+
+/// A command that has not been answered by everybody whom it went to.
+struct Waiting {
+    asked: Vec<Pending>,
+    replies: Vec<Reply>,
+    line: Line,
+    since: Instant,
+}
+
+impl Waiting {
+    /// Takes the answers that are there; true if these are all.
+    fn look(&mut self) -> Result<bool, PortError> {
+        for pending in std::mem::take(&mut self.asked) {
+            match pending.reply()? {
+                Some(reply) => self.replies.push(reply),
+                None => self.asked.push(pending),
+            }
+        }
+        Ok(self.asked.is_empty())
+    }
+
+    /// Answers: a refusal, if anybody refused.
+    fn answer(mut self) {
+        let refused = self.replies.iter().position(|reply| matches!(reply, Reply::Refused(_)));
+        if !self.replies.is_empty() {
+            self.line.answer(&self.replies.swap_remove(refused.unwrap_or(0)));
+        }
+    }
+}
+
+impl Controls {
+    /// Passes commands on to the peers of `clients`, one for each environment.
+    #[must_use]
+    pub fn new(clients: Vec<ControlClient>) -> Self {
+        Self {
+            clients,
+            waiting: Vec::new(),
+        }
+    }
+
+    /// Passes a command on to an environment, or to all of them; the answer will go back over `line`.
+    pub fn pass_on(&mut self, command: &Command, env_index: Option<u32>, line: Line) {
+        let index = env_index.map(|index| index as usize);
+        let clients = match index {
+            None => self.clients.as_slice(),
+            Some(index) => self.clients.get(index..=index).unwrap_or_default(),
+        };
+        if clients.is_empty() {
+            let message = format!("the run has {} environments, numbered from 0", self.clients.len());
+            return line.refuse(Refusal::new(RefusalKind::Unsupported, message));
+        }
+        let mut waiting = Waiting {
+            asked: Vec::new(),
+            replies: Vec::new(),
+            line,
+            since: Instant::now(),
+        };
+        for client in clients {
+            match client.send(command) {
+                Ok(pending) => waiting.asked.push(pending),
+                Err(refusal) => waiting.replies.push(Reply::Refused(refusal)),
+            }
+        }
+        self.waiting.push(waiting);
+    }
+
+    /// Hands answers back.
+    ///
+    /// # Errors
+    /// The port is broken.
+    pub fn advance(&mut self) -> Result<(), PortError> {
+        for mut waiting in std::mem::take(&mut self.waiting) {
+            if waiting.look()? {
+                waiting.answer();
+            } else if waiting.since.elapsed() > ANSWER_WITHIN {
+                waiting.line.refuse(Refusal::new(
+                    RefusalKind::Unanswered,
+                    format!("the simulation has not answered within {} s", ANSWER_WITHIN.as_secs()),
+                ));
+            } else {
+                self.waiting.push(waiting);
+            }
+        }
+        Ok(())
+    }
+
+    /// True while an answer is expected.
+    #[must_use]
+    pub fn is_waiting(&self) -> bool {
+        !self.waiting.is_empty()
+    }
+
+    /// Refuses what is left: the run is over.
+    pub fn end(&mut self) {
+        for waiting in self.waiting.drain(..) {
+            let refusal = Refusal::new(RefusalKind::Unanswered, "the run is over");
+            waiting.line.refuse(refusal);
+        }
+    }
+}
+
+/// Sends a command to a live run and prints the answer.
+///
+/// # Errors
+/// No such run is alive, or the command is refused.
+pub fn control(args: &ControlArgs) -> Result<(), Exit> {
+    let command = command(&args.action);
+    let refused = |refusal: Refusal| {
+        let kind = match refusal.kind {
+            RefusalKind::Busy | RefusalKind::Sumo | RefusalKind::Unanswered => FailureKind::Run,
+            _ => FailureKind::Config,
+        };
+        let help = match refusal.kind {
+            RefusalKind::UnknownVehicle => "the viewer, and runs/NAME/events, show who is there",
+            RefusalKind::UnknownEdge => "`netedit` shows the edges of the net and their ids",
+            RefusalKind::Busy => "ask again",
+            RefusalKind::Unanswered => "`caraware ps` shows how far the run is",
+            _ => "`caraware control --help` says what may be asked",
+        };
+        Exit::Failure(Failure::new(kind, format!("refused: {refusal}")).with_help(help))
+    };
+    command.check().map_err(refused)?;
+    let run = registry::find(args.run.as_deref())?;
+    let asking = Asking::Control {
+        env: args.env,
+        request: command.to_json(),
+    };
+    match line::ask(&run, &asking)? {
+        Reply::Done(done) => {
+            println!("{}: tick {}: {}", run.name, done.tick, done.message);
+            Ok(())
+        }
+        Reply::Refused(refusal) => Err(refused(refusal)),
+    }
+}
+
+fn command(action: &ControlAction) -> Command {
+    match action.clone() {
+        ControlAction::Pause => Command::Pause {},
+        ControlAction::Resume => Command::Resume {},
+        ControlAction::Step { ticks } => Command::Step { ticks },
+        ControlAction::Reset => Command::Reset {},
+        ControlAction::Sensor { vehicle, sensor, state } => Command::Sensor {
+            vehicle: (vehicle != EVERYBODY).then_some(vehicle),
+            sensor: match sensor {
+                SensorName::Gnss => Sensor::Gnss,
+                SensorName::Imu => Sensor::Imu,
+                SensorName::SpeedSteering => Sensor::SpeedSteering,
+                SensorName::Lidar => Sensor::Lidar,
+                SensorName::All => Sensor::All,
+            },
+            state: match state {
+                SwitchState::On => Switch::On,
+                SwitchState::Off => Switch::Off,
+            },
+        },
+        ControlAction::Start { vehicle, edge } => Command::Start { vehicle, edge },
+        ControlAction::Destination { vehicle, edge } => Command::Destination { vehicle, edge },
+    }
+}
+
+/// Stands for all vehicles.
+const EVERYBODY: &str = "all";

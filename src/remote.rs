@@ -1,0 +1,227 @@
+//! Who may watch from where: `fanout.*` is checked before anything listens. Beyond loopback nobody is let in who does not say who he is.
+
+use std::{
+    net::{TcpListener, ToSocketAddrs as _},
+    os::unix::fs::PermissionsExt as _,
+    path::Path,
+};
+
+use ipc_schema::config::Fanout;
+
+use crate::failure::Exit;
+
+/// Checks endpoint, files and rights, and makes paths absolute.
+///
+/// # Errors
+/// The endpoint cannot be listened on, is open to anybody beyond this machine, or a file is missing or readable by others.
+pub fn check(fanout: &mut Fanout) -> Result<(), Exit> {
+    if !fanout.enabled {
+        return Ok(());
+    }
+    check_endpoint(fanout)?;
+    for (key, path) in [
+        ("users", &mut fanout.users),
+        ("tls_certificate", &mut fanout.tls_certificate),
+        ("tls_private_key", &mut fanout.tls_private_key),
+        ("tls_client_ca", &mut fanout.tls_client_ca),
+    ] {
+        readable(key, path)?;
+    }
+    check_secrets(fanout)?;
+    check_users(fanout)
+}
+
+fn check_endpoint(fanout: &Fanout) -> Result<(), Exit> {
+    let listen = &fanout.listen;
+    let encrypted = listen.strip_prefix("tls/");
+    let address = encrypted.or_else(|| listen.strip_prefix("tcp/")).ok_or_else(|| {
+        Exit::config(
+            format!("`fanout.listen` = \"{listen}\" is not an endpoint caraware knows"),
+            "give tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or tls/HOST:PORT",
+        )
+    })?;
+    let has_certificate = [&fanout.tls_certificate, &fanout.tls_private_key].map(|path| !path.is_empty());
+    match (encrypted, has_certificate) {
+        (Some(_), [true, true]) | (None, _) => {}
+        (Some(_), _) => {
+            return Err(Exit::config(
+                format!("`fanout.listen` = \"{listen}\" needs a certificate"),
+                "set fanout.tls_certificate and fanout.tls_private_key; docs/remote.md has the lines of openssl that make them",
+            ));
+        }
+    }
+    if encrypted.is_none() && !fanout.tls_client_ca.is_empty() {
+        return Err(Exit::config(
+            "`fanout.tls_client_ca` asks for certificates, which tcp does not carry",
+            "listen on tls/HOST:PORT, or set fanout.tls_client_ca = \"\"",
+        ));
+    }
+    if is_beyond_loopback(address) && fanout.users.is_empty() && fanout.tls_client_ca.is_empty() {
+        return Err(Exit::config(
+            format!("`fanout.listen` = \"{listen}\" would let anybody in who reaches it"),
+            "name those who may connect in fanout.users, or ask for certificates with fanout.tls_client_ca (docs/remote.md); or stay on \
+             127.0.0.1 and let viewers come through a tunnel: ssh -N -L 7447:127.0.0.1:7447 HOST",
+        ));
+    }
+    TcpListener::bind(address).map(drop).map_err(|error| {
+        Exit::config(
+            format!("`fanout.listen` = \"{listen}\" cannot be listened on: {error}"),
+            "another run or program has the port: choose another, e.g. --set fanout.listen=tcp/127.0.0.1:7448, or --set fanout.enabled=false",
+        )
+    })
+}
+
+/// True unless every address that the name stands for is of the loopback.
+fn is_beyond_loopback(address: &str) -> bool {
+    address.to_socket_addrs().map_or(true, |mut addresses| {
+        addresses.any(|address| !address.ip().is_loopback())
+    })
+}
+
+/// Makes the path absolute and opens the file once.
+fn readable(key: &str, path: &mut String) -> Result<(), Exit> {
+    if path.is_empty() {
+        return Ok(());
+    }
+    let given = Path::new(&*path);
+    let absolute = std::path::absolute(given).map_err(|error| Exit::io("resolve", given, &error))?;
+    std::fs::File::open(&absolute).map_err(|error| {
+        Exit::config(
+            format!("`fanout.{key}` = \"{path}\" cannot be read: {error}"),
+            "give a file; docs/remote.md says how it is made",
+        )
+    })?;
+    *path = absolute.to_string_lossy().into_owned();
+    Ok(())
+}
+
+/// Passwords and private keys are for their owner alone.
+fn check_secrets(fanout: &Fanout) -> Result<(), Exit> {
+    for (key, path) in [("users", &fanout.users), ("tls_private_key", &fanout.tls_private_key)] {
+        if path.is_empty() {
+            continue;
+        }
+        let mode = std::fs::metadata(path).map_or(0, |data| data.permissions().mode());
+        if mode & 0o077 != 0 {
+            return Err(Exit::config(
+                format!("`fanout.{key}` = \"{path}\" can be read by other users of this machine"),
+                format!("chmod 600 {path}"),
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// The file of users says who is who, and commanders are among them.
+fn check_users(fanout: &Fanout) -> Result<(), Exit> {
+    let mut known = Vec::new();
+    if !fanout.users.is_empty() {
+        let path = Path::new(&fanout.users);
+        let text = std::fs::read_to_string(path).map_err(|error| Exit::io("read", path, &error))?;
+        for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.is_empty()) {
+            match line.split_once(':') {
+                Some((user, password)) if !user.is_empty() && !password.is_empty() => known.push(user.to_owned()),
+                _ => {
+                    return Err(Exit::config(
+                        format!("{}, line {number}: not user:password", fanout.users),
+                        "write a line alice:her-password for each who may connect",
+                    ));
+                }
+            }
+        }
+        if known.is_empty() {
+            return Err(Exit::config(
+                format!("`fanout.users` = \"{}\" names nobody", fanout.users),
+                "write a line alice:her-password for each who may connect",
+            ));
+        }
+    }
+    let unknown = fanout
+        .commanders
+        .iter()
+        .find(|name| *name != "*" && !known.contains(name));
+    match unknown {
+        // Common names of certificates are not known before somebody comes with one.
+        Some(name) if fanout.tls_client_ca.is_empty() => Err(Exit::config(
+            format!("`fanout.commanders` has \"{name}\", who is not in the file `fanout.users`"),
+            "add a line for this user there, or leave the name out; \"*\" = all who may connect",
+        )),
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn message(change: impl FnOnce(&mut Fanout)) -> Option<String> {
+        let settings = crate::config::Settings::defaults().unwrap();
+        let mut fanout = settings.validate().unwrap().fanout;
+        fanout.listen = "tcp/127.0.0.1:0".into();
+        change(&mut fanout);
+        match check(&mut fanout) {
+            Ok(()) => None,
+            Err(Exit::Failure(failure)) => Some(failure.message),
+            Err(exit) => panic!("{exit:?}"),
+        }
+    }
+
+    fn file(directory: &tempfile::TempDir, name: &str, text: &str, mode: u32) -> String {
+        let path = directory.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
+        path.to_string_lossy().into_owned()
+    }
+
+    #[test]
+    fn beyond_loopback_nobody_is_let_in_without_a_name() {
+        let directory = tempfile::tempdir().unwrap();
+        let users = file(&directory, "users", "alice:secret\n", 0o600);
+        let pem = file(&directory, "pem", "", 0o600);
+        for listen in ["tcp/0.0.0.0:0", "tcp/[::]:0", "tls/0.0.0.0:0"] {
+            let open = message(|fanout| {
+                fanout.listen = listen.into();
+                (fanout.tls_certificate, fanout.tls_private_key) = (pem.clone(), pem.clone());
+            });
+            assert!(open.unwrap().contains("would let anybody in"), "{listen}");
+            let closed = message(|fanout| {
+                fanout.listen = listen.into();
+                fanout.users = users.clone();
+                (fanout.tls_certificate, fanout.tls_private_key) = (pem.clone(), pem.clone());
+            });
+            assert_eq!(closed, None, "{listen}");
+        }
+        assert_eq!(message(|_| {}), None);
+        assert_eq!(message(|fanout| fanout.listen = "tcp/localhost:0".into()), None);
+    }
+
+    #[test]
+    fn every_mistake_is_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let users = file(&directory, "users", "alice:secret\n", 0o600);
+        let open = file(&directory, "open", "alice:secret\n", 0o644);
+        let bare = file(&directory, "bare", "alice\n", 0o600);
+        let empty = file(&directory, "empty", "\n", 0o600);
+        let says = |part: &str, change: &dyn Fn(&mut Fanout)| {
+            let message = message(change).unwrap_or_default();
+            assert!(message.contains(part), "{part}: {message}");
+        };
+        says("needs a certificate", &|fanout| {
+            fanout.listen = "tls/127.0.0.1:0".into()
+        });
+        says("is not an endpoint", &|fanout| {
+            fanout.listen = "quic/127.0.0.1:0".into()
+        });
+        says("cannot be read", &|fanout| fanout.users = "/nowhere/users".into());
+        says("by other users", &|fanout| fanout.users = open.clone());
+        says("line 1: not user:password", &|fanout| fanout.users = bare.clone());
+        says("names nobody", &|fanout| fanout.users = empty.clone());
+        says("who is not in the file", &|fanout| {
+            fanout.users = users.clone();
+            fanout.commanders = vec!["bob".into()];
+        });
+        says("which tcp does not carry", &|fanout| {
+            fanout.tls_client_ca = users.clone()
+        });
+    }
+}
