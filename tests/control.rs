@@ -25,14 +25,15 @@ use ipc_schema::{
 };
 
 /// Two episodes of 300 ticks, six seconds of wall clock at this pace: time for a few commands.
-const SMALL: [&str; 10] = [
+const SMALL: [&str; 11] = [
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=2",
     "episode.ticks=300",
     "episode.training_episodes=2",
     "episode.evaluation_interval=0",
-    "episode.final_evaluations=0",
+    "episode.final_evaluations=1",
+    "episode.evaluation_ticks=100",
     "fanout.enabled=false",
     "run.window_ticks=3",
     "blackout.policy=nan",

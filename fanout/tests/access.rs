@@ -1,6 +1,9 @@
 //! Who is let in, who may read and who may command: the real fan-out, the real viewer's side of zenoh.
 
+#![allow(clippy::unwrap_used, reason = "a failed step fails the test")]
+
 #[cfg(test)]
+#[allow(dead_code, reason = "each test file uses its own part")]
 mod harness;
 
 use std::{
