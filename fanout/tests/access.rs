@@ -84,6 +84,15 @@ fn command(
     Some(serde_json::from_slice(&bytes).unwrap())
 }
 
+/// Waits until the run says that it is there: commands are taken then, but not yet when the port opens.
+fn until_alive(run: &Run, session: &zenoh::Session) {
+    let key = Keys::new(&run.file.name, 0).alive();
+    until("a run that is there", || {
+        let tokens = session.liveliness().get(&key).wait().unwrap();
+        tokens.recv().is_ok_and(|token| token.result().is_ok())
+    });
+}
+
 fn listening(run: &Run) -> harness::Fanout {
     let fanout = run.start_fanout();
     until("an open port", || {
@@ -176,6 +185,7 @@ fn garbage_commands_are_refused_and_counted() {
     let asked = supervisor(&run);
     let _fanout = listening(&run);
     let viewer = connect(&run, "").unwrap();
+    until_alive(&run, &viewer);
     let kind = |bytes: Vec<u8>| match command(&run, &viewer, bytes, PAUSE) {
         Some(Reply::Refused(Refusal { kind, .. })) => kind,
         reply => panic!("{reply:?}"),
