@@ -141,10 +141,12 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "ppo_mean_error_m": learned("ppo_mean_error_m"),
         "ekf_mean_error_m": learned("ekf_mean_error_m"),
         "rts_mean_error_m": learned("rts_mean_error_m"),
+        "supervised_mean_error_m": learned("supervised_mean_error_m"),
         "ppo_ci95_m": learned("ppo_ci95_m"),
         "raw_gnss_ci95_m": learned("raw_gnss_ci95_m"),
         "ekf_ci95_m": learned("ekf_ci95_m"),
         "rts_ci95_m": learned("rts_ci95_m"),
+        "supervised_ci95_m": learned("supervised_ci95_m"),
         "evaluation_seeds": learned("evaluation_seeds"),
         "policy_std": learned("policy_std"),
         "vehicles": sensing.cavs_max,
@@ -232,6 +234,12 @@ pub fn summary(report: &Value, path: &Path) -> String {
             error("ppo"),
             error("raw_gnss"),
             number("policy_std", 3)
+        ));
+    }
+    if !report["supervised_mean_error_m"].is_null() {
+        lines.push(format!(
+            "from the same samples: the policy's network taught by regression to the truth {}",
+            error("supervised")
         ));
     }
     if !report["ekf_mean_error_m"].is_null() {

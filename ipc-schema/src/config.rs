@@ -368,6 +368,8 @@ pub struct Trainer {
     pub epochs: u64,
     /// Width of the hidden layers of policy and value network.
     pub hidden: Vec<u64>,
+    /// Train a network of the policy's size by regression beside it.
+    pub supervised: bool,
     /// Reward by name.
     pub reward: Reward,
     /// Scale of `bounded_inverse` and `exponential`, metres.

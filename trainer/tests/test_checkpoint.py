@@ -90,6 +90,7 @@ def test_what_is_in_the_directory(tmp_path: Path) -> None:
         "parameters.safetensors",
         "optimiser.safetensors",
         "random.safetensors",
+        "supervised.safetensors",
     }
     manifest = read_manifest(written)
     assert manifest.counters.committed_tick == 7

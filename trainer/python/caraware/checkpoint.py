@@ -36,6 +36,8 @@ from caraware.ppo import Ppo, Settings
 COURSE = "course.json"
 RANDOM = "random.safetensors"
 POINTS = "points.safetensors"
+SUPERVISED = "supervised.safetensors"
+"""Of the baseline beside PPO; a checkpoint of a run without it has none, and the baseline then begins anew."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
     for name, expected in (("observation_size", ppo.observation_size), ("hidden", ppo.config.hidden)):
         if (found := getattr(manifest, name)) != expected:
             raise CheckpointError(checkpoint / MANIFEST, f"its {name} is {found}, this run's is {expected}")
-    current = _tensors(ppo)
+    current = {name: tensors for name, tensors in _tensors(ppo).items() if name != SUPERVISED or name in manifest.files}
     stored = {
         name: _read_tensors(checkpoint / name, digest) for name, digest in manifest.files.items() if name in current
     }
@@ -193,7 +195,12 @@ def _tensors(ppo: Ppo) -> dict[str, dict[str, Tensor]]:
         moments[f"{network}.steps"] = optimiser.steps
     random = {name: generator.get_state() for name, generator in ppo.sampling_generators().items()}
     random["shuffling"] = ppo.shuffling.get_state()
-    return {"parameters.safetensors": parameters, "optimiser.safetensors": moments, RANDOM: random}
+    tensors = {"parameters.safetensors": parameters, "optimiser.safetensors": moments, RANDOM: random}
+    if ppo.supervised is not None:
+        mlp, optimiser = ppo.supervised.mlp, ppo.supervised.optimiser
+        own = {"mean": optimiser.mean, "square": optimiser.square, "steps": optimiser.steps}
+        tensors[SUPERVISED] = dict(mlp.parameters.value) | own
+    return tensors
 
 
 def _read_tensors(file: Path, sha256: str) -> dict[str, Tensor]:

@@ -69,6 +69,8 @@ class TrainerConfig:
     """Samples in a gradient step."""
     epochs: int = 4
     hidden: tuple[int, ...] = (500, 300)
+    supervised: bool = True
+    """Teach a network of the policy's size by regression to the truth beside it (`caraware.supervised`)."""
     reward: str = "bounded_inverse"
     reward_scale_m: float = 5.0
     matmul_precision: str = "auto"
@@ -252,7 +254,7 @@ def _typed(name: str, kind: object, section: dict) -> Any:
         return None
     if kind in (float, float | None) and type(value) in (int, float):
         return float(value)
-    if kind in (int, str) and type(value) is kind:
+    if kind in (int, str, bool) and type(value) is kind:
         return value
     wanted = "list of integers" if kind == tuple[int, ...] else getattr(kind, "__name__", str(kind))
     raise ConfigError(f"`trainer.{_key(name)}` is {value!r}", f"give a value of type {wanted}")

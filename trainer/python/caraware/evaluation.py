@@ -48,6 +48,10 @@ class EvaluationResult:
     raw_gnss_ci95_m: float | None = None
     ekf_ci95_m: float | None = None
     rts_ci95_m: float | None = None
+    supervised_mean_error_m: float | None = None
+    """Of the policy's network taught by regression to the truth; None for a run without it."""
+    supervised_standard_error_m: float | None = None
+    supervised_ci95_m: float | None = None
 
     @classmethod
     def restored(cls, values: dict) -> "EvaluationResult":
@@ -74,7 +78,13 @@ class EvaluationResult:
         return f"{told} (95 % over {over}), {self.samples} samples"
 
 
-ESTIMATORS = {"ppo": "policy", "raw_gnss": "raw GNSS", "ekf": "EKF", "rts": "RTS smoother (sees the future: a bound)"}
+ESTIMATORS = {
+    "ppo": "policy",
+    "raw_gnss": "raw GNSS",
+    "supervised": "regression",
+    "ekf": "EKF",
+    "rts": "RTS smoother (sees the future: a bound)",
+}
 """Key of each, as in the run's report, and its name for people; the order of the columns of an evaluation's sums."""
 
 NO_HEADLINE: dict[str, float | None] = {
@@ -112,14 +122,19 @@ class Evaluation:
     results.
     """
 
-    def __init__(self, noise: SensorNoise | None = None) -> None:
+    def __init__(self, noise: SensorNoise | None = None, *, supervised: bool = False) -> None:
+        """`supervised`: the errors of that baseline will be added too."""
         self._baselines = Baselines(noise) if noise else None
+        missing = ("ekf", "rts")[: 0 if noise else 2] + ("supervised",)[: 0 if supervised else 1]
+        self._known = [name for name in ESTIMATORS if name not in missing]
         self._finished: list[np.ndarray] = []
         self._episode: int | None = None
         self._sums = np.zeros((0, 1 + len(ESTIMATORS)))
-        """f64 `[vehicle, 5]` of the current episode: samples, and the sum of the errors of each estimator."""
+        """f64 `[vehicle, 6]` of the current episode: samples, and the sum of the errors of each estimator."""
 
-    def add(self, obs: Observation, policy_m: np.ndarray, raw_m: np.ndarray) -> None:
+    def add(
+        self, obs: Observation, policy_m: np.ndarray, raw_m: np.ndarray, supervised_m: np.ndarray | None = None
+    ) -> None:
         """Add the errors `[v]` of the valid rows of one evaluation tick."""
         if obs.episode != self._episode:
             self._finish_episode()
@@ -127,14 +142,16 @@ class Evaluation:
         vehicle = obs.vehicle[obs.valid].astype(np.int64)
         self._make_room(vehicle)
         self._sums[vehicle, :3] += np.column_stack((np.ones(len(vehicle)), policy_m, raw_m))
+        if supervised_m is not None:
+            self._sums[vehicle, 3] += supervised_m
         if self._baselines:
             filtered, smoothed = self._baselines.add(obs)
-            self._sums[filtered.vehicle, 3] += filtered.error_m
+            self._sums[filtered.vehicle, 4] += filtered.error_m
             self._add_smoothed(smoothed)
 
     def _add_smoothed(self, ticks: Iterable[BaselineErrors]) -> None:
         for tick in ticks:
-            self._sums[tick.vehicle, 4] += tick.error_m
+            self._sums[tick.vehicle, 5] += tick.error_m
 
     def _make_room(self, vehicle: np.ndarray) -> None:
         missing = int(vehicle.max(initial=-1)) + 1 - len(self._sums)
@@ -150,9 +167,9 @@ class Evaluation:
 
     def seeds_m(self) -> list[dict[str, float]]:
         """Mean errors by estimator of every episode that is finished, each of which has a seed of its own."""
-        known = list(ESTIMATORS)[: None if self._baselines else 2]
         means = [episode[:, 1:].sum(0) / episode[:, 0].sum() for episode in self._finished if len(episode)]
-        return [dict(zip(known, map(float, mean), strict=False)) for mean in means]
+        every = [dict(zip(ESTIMATORS, map(float, mean), strict=True)) for mean in means]
+        return [{name: mean[name] for name in self._known} for mean in every]
 
     def result(self, env_steps: int, policy_version: int, environment: int = 0) -> EvaluationResult | None:
         """The phase, which ends here; None without a sample."""
@@ -164,10 +181,11 @@ class Evaluation:
         means = sums[:, 1:].sum(0) / count.sum()
         # Ratio estimator over clusters (Cochran, Sampling Techniques, section 6.3).
         errors = np.sqrt(np.square(sums[:, 1:] - count[:, None] * means).sum(0)) / count.sum()
-        known = list(ESTIMATORS)[: None if self._baselines else 2]
         results: dict[str, Any] = {}
         seeds = [episode[:, 1:].sum(0) / episode[:, 0].sum() for episode in self._finished if len(episode)]
-        for column, name in enumerate(known):
+        for column, name in enumerate(ESTIMATORS):
+            if name not in self._known:
+                continue
             over_seeds = mean_interval([float(seed[column]) for seed in seeds])
             results |= {
                 f"{name}_mean_error_m": float(means[column]),

@@ -30,6 +30,7 @@ from caraware.metrics import Metrics, TrainingPoint
 from caraware.plots import plot_error, plot_sigma
 from caraware.ppo import Batch, NonFiniteLoss, Ppo, UpdateStats, save_batch
 from caraware.ranks import RankError, Ranks, Verdict
+from caraware.rewards import distance_m
 from caraware.stream import Channel, Observation
 
 log = logging.getLogger(__name__)
@@ -284,6 +285,15 @@ class TrainingLoop:
         """The observation as the networks take it: in place, unless fields of dark sensors must become numbers."""
         return torch.nan_to_num(obs.observation) if self._config.dark_is_nan else obs.observation
 
+    def _supervised_errors_m(self, obs: Observation) -> np.ndarray | None:
+        """Of the baseline that is taught beside the policy, on the valid rows; None without it."""
+        assert self._ppo is not None
+        if self._ppo.supervised is None:
+            return None
+        rows = torch.from_numpy(np.flatnonzero(obs.valid))
+        predicted_m = self._ppo.supervised.predict_m(self._visible(obs).index_select(0, rows))
+        return distance_m(predicted_m, obs.truth.index_select(0, rows)).numpy()
+
     def _take(
         self,
         environment: Environment,
@@ -293,6 +303,7 @@ class TrainingLoop:
         raw_m: np.ndarray,
     ) -> None:
         """Everything that one tick causes; its rows' errors are those of the policy and of raw GNSS."""
+        assert self._ppo is not None
         channel = environment.channel
         estimates_m = environment.estimates_m(obs)
         if estimates_m is None:
@@ -306,8 +317,10 @@ class TrainingLoop:
             environment.rollout.ended(obs)
             # A predecessor may have evaluated ticks that it had not learnt up to.
             if obs.tick > environment.evaluated_tick:
-                environment.evaluation = environment.evaluation or Evaluation(self._config.sensors)
-                environment.evaluation.add(obs, policy_m, raw_m)
+                environment.evaluation = environment.evaluation or Evaluation(
+                    self._config.sensors, supervised=self._ppo.supervised is not None
+                )
+                environment.evaluation.add(obs, policy_m, raw_m, self._supervised_errors_m(obs))
                 environment.evaluation_tick = obs.tick
             return
         self._finish_evaluation(environment)

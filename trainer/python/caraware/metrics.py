@@ -57,6 +57,7 @@ class Metrics:
         for tag, error_m in (
             ("error/evaluation_m", result.ppo_mean_error_m),
             ("error/evaluation_raw_gnss_m", result.raw_gnss_mean_error_m),
+            ("error/evaluation_supervised_m", result.supervised_mean_error_m),
             ("error/evaluation_ekf_m", result.ekf_mean_error_m),
             ("error/evaluation_rts_sees_the_future_m", result.rts_mean_error_m),
         ):

@@ -11,7 +11,7 @@ from caraware.evaluation import EvaluationResult
 from caraware.metrics import TrainingPoint
 
 POLICY, EVALUATION, RAW, REWARD = "#7fb3d5", "#1a5276", "#b03a2e", "#ca6f1e"
-EKF, RTS = "#e69f00", "#555555"
+EKF, RTS, SUPERVISED = "#e69f00", "#555555", "#009e73"
 """Told apart by the colour-blind too: they differ in lightness, and each line has its own dashes and marks."""
 
 
@@ -22,6 +22,7 @@ def plot_error(file: Path, training: list[TrainingPoint], evaluations: list[Eval
     raw_m = _last_raw_m(training, evaluations)
     if raw_m is not None:
         axes.axhline(raw_m, color=RAW, linestyle="--", label=f"raw GNSS ({raw_m:.2f} m)")
+    _plot_evaluated(axes, evaluations, "supervised", "the same network, taught the truth", SUPERVISED, "--", "D")
     _plot_evaluated(axes, evaluations, "ekf", "EKF, same samples", EKF, "-.", "s")
     _plot_evaluated(axes, evaluations, "rts", "RTS smoother, sees the future: a bound", RTS, ":", "^")
     _plot_evaluated(axes, evaluations, "ppo", "policy, evaluation on unseen seeds", EVALUATION, "-", "o")

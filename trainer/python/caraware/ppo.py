@@ -27,6 +27,7 @@ from caraware.networks import FlatParameters, GaussianPolicy, ValueNetwork, entr
 from caraware.objective import clipped_error, clipped_surrogate
 from caraware.ranks import Minibatch, Ranks, Union
 from caraware.rollout import Horizon
+from caraware.supervised import Supervised
 
 ACTIONS = 2
 SMALL_ROWS = 256
@@ -193,6 +194,9 @@ class Ppo:
         self.value_optimiser = Adam(self.value.mlp.parameters)
         self._reward = rewards.by_name(config.reward)
         self._second_core = _worker(config, self.device)
+        self.supervised = (
+            Supervised(config, observation_size, bounds, self.device, self.ranks) if config.supervised else None
+        )
         # The steps of several ranks meet on the way, which a graph of one rank's step does not know of.
         self._graphed = GraphedUpdate(self) if self.device.type == "cuda" and self.ranks.size == 1 else None
 
@@ -274,6 +278,8 @@ class Ppo:
             finally:
                 value_job.exception()
             value = value_job.result()
+        if self.supervised is not None:
+            self.supervised.learn(batch, union, self._parts(union), now.learning_rate)
         self.updates += 1
         return self._stats(batch, union, policy, value, now)
 

@@ -1,0 +1,111 @@
+"""The baseline that is taught the truth: its gradient, what it learns, and that PPO does not notice it."""
+
+import contextlib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from caraware import supervised
+from caraware.checkpoint import Keeping, load_checkpoint, save_checkpoint
+from caraware.config import RunConfig
+from caraware.loop import Learner, TrainingLoop
+from caraware.manifest import Counters, newest_sound_checkpoint
+from caraware.ppo import Ppo
+from caraware.rewards import distance_m
+from caraware.rollout import Rollout
+from caraware.supervised import Supervised
+from safetensors.torch import load_file
+from synthetic import FIELDS, SyntheticChannel, run_file, street_ticks
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_loop import KilledError, final_parameters, loop_over, part, stream
+from test_networks import modules
+from test_ppo import NOISE_M, TOY, errors_m, fresh, parameters, train
+
+
+def beside(ppo: Ppo) -> Supervised:
+    assert ppo.supervised is not None
+    return ppo.supervised
+
+
+def test_ppo_does_not_notice_it(tmp_path: Path) -> None:
+    for name, is_there in (("with", True), ("without", False)):
+        loop_over(tmp_path / name, stream(0), run=run_file(str(tmp_path / name), supervised=is_there))
+    one, two = (final_parameters(tmp_path / name) for name in ("with", "without"))
+    assert all(torch.equal(tensor, two[name]) for name, tensor in one.items())
+    with_it, without = part(tmp_path / "with"), part(tmp_path / "without")
+    assert with_it["ppo_mean_error_m"] == without["ppo_mean_error_m"]
+    assert with_it["supervised_mean_error_m"] > 0.0 and without["supervised_mean_error_m"] is None
+
+
+def test_it_learns_the_toy_task_from_an_eighth_of_the_steps() -> None:
+    ppo = fresh(**TOY)
+    train(ppo, 80)
+    _, raw_m = errors_m(ppo)
+    ticks = list(street_ticks(200, 64, NOISE_M, seed=99))
+    predicted_m = beside(ppo).predict_m(torch.cat([obs.observation for obs in ticks]))
+    taught_m = distance_m(predicted_m, torch.cat([obs.truth for obs in ticks])).mean().item()
+    assert taught_m < 0.95 * raw_m
+
+
+def test_its_gradient_is_that_of_the_mean_distance(monkeypatch: pytest.MonkeyPatch) -> None:
+    ppo = fresh(matmul_precision="float32", batch_size=256)
+    monkeypatch.setattr(supervised, "LEARNT_EVERY", 1)
+    rollout = Rollout(256, FIELDS, bootstrap=False)
+    for obs in street_ticks(4, 64, NOISE_M, seed=5):
+        rollout.add(obs)
+    batch, baseline = ppo.score(rollout.take()), beside(ppo)
+    reference = modules(baseline.mlp)
+    expected_m = distance_m(ppo.bounds.to_world_m(reference(batch.observation)), batch.truth).mean()
+    expected_m.backward()
+    union = ppo.ranks.union(batch.advantage, batch.reward, batch.value_target)
+    assert baseline.learn(batch, union, 1, 0.0) == pytest.approx(expected_m.item(), rel=1e-5)
+    gradient = torch.cat([value.grad.flatten() for value in reference.parameters()])
+    torch.testing.assert_close(baseline.mlp.parameters.gradient[: len(gradient)], gradient, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("tick", [36, 60, 99, 125])
+def test_a_successor_of_a_killed_trainer_has_the_same_baseline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tick: int
+) -> None:
+    monkeypatch.setattr(TrainingLoop, "_draw", lambda loop: None)
+    settings = {name: run_file(str(tmp_path / name), checkpoint_interval=2) for name in ("whole", "cut")}
+    loop_over(tmp_path / "whole", stream(0), group=1, run=settings["whole"])
+    with contextlib.suppress(KilledError):
+        loop_over(tmp_path / "cut", stream(0, tick), group=1, run=settings["cut"])
+    config = RunConfig.from_run(settings["cut"])
+    newest = newest_sound_checkpoint(tmp_path / "cut" / "checkpoints")
+    learner = Learner.begin(replace(config, resume_from=newest), FIELDS)
+    second = SyntheticChannel(settings["cut"], stream(learner.first_tick()), 1)
+    assert TrainingLoop(second, config, lambda: False, learner=learner).run()
+    one, two = (load_file(next(tmp_path.glob(f"{name}/checkpoints/*5/supervised.safetensors"))) for name in settings)
+    assert all(torch.equal(tensor, two[name]) for name, tensor in one.items())
+    assert part(tmp_path / "cut") == part(tmp_path / "whole")
+
+
+def test_it_begins_anew_where_a_checkpoint_has_none(tmp_path: Path) -> None:
+    without, with_it = fresh(supervised=False), fresh()
+    train(without, 2)
+    written = save_checkpoint(tmp_path, without, Counters(2, 512, 0, 7), "0", Keeping(1))
+    load_checkpoint(written, with_it)
+    assert torch.equal(parameters(with_it), parameters(without))
+    assert torch.equal(beside(with_it).mlp.parameters.values, beside(fresh()).mlp.parameters.values)
+    (tmp_path / "other").mkdir()
+    trained = fresh()
+    train(trained, 2)
+    written = save_checkpoint(tmp_path / "other", trained, Counters(2, 512, 0, 7), "0", Keeping(1))
+    load_checkpoint(written, without)
+    load_checkpoint(written, with_it)
+    assert torch.equal(beside(with_it).mlp.parameters.values, beside(trained).mlp.parameters.values)
+
+
+def test_it_stands_in_report_and_tensorboard_with_an_interval(tmp_path: Path) -> None:
+    loop_over(tmp_path, stream(0))
+    report = part(tmp_path)
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    points = events.Scalars("error/evaluation_supervised_m")
+    assert len(points) == 3
+    assert points[-1].value == pytest.approx(report["supervised_mean_error_m"], rel=1e-5)
+    assert report["evaluations"][-1]["supervised_standard_error_m"] > 0.0
+    assert "supervised_ci95_m" in report
