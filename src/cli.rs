@@ -25,6 +25,7 @@ const AFTER: &str = "Examples:
   caraware train --viewer                         the same, and watch it
   caraware ps                                     what runs, from another terminal
   caraware view --web                             watch it in a browser
+  caraware generate city --vehicles 20000         a city of any size: city/city.sumocfg
   caraware bench lidar                            rays per second, beside Open3D's
   caraware swap --set trainer.learning_rate=0.001 another trainer for a live run, which loses nothing
   caraware stop                                   end it; the trainer writes a checkpoint first
@@ -62,6 +63,8 @@ pub enum Command {
     /// Watch a live run: map, vehicles, estimates, point clouds and figures, in a window or a browser
     #[command(after_help = VIEW)]
     View(ViewArgs),
+    /// Write a city and its traffic, of any size, as a scenario of SUMO
+    Generate(GenerateArgs),
     /// Measure a part on this machine, side by side with its peers
     Bench(BenchArgs),
     /// Say what is missing on this machine and what dead runs left
@@ -351,6 +354,34 @@ pub struct BenchArgs {
     /// Python that has the peers installed [default: what `make peers` installed, or the project's]
     #[arg(long, value_name = "PATH")]
     pub python: Option<PathBuf>,
+}
+
+/// What `generate` takes.
+#[derive(Debug, Args, Clone)]
+pub struct GenerateArgs {
+    /// Where to write city.sumocfg, city.net.xml and city.rou.xml
+    pub directory: PathBuf,
+    /// Vehicles, all on the road from the first step to the last
+    #[arg(long, default_value_t = 5000)]
+    pub vehicles: u32,
+    /// Simulated time, seconds
+    #[arg(long, default_value_t = 60.0)]
+    pub duration_s: f64,
+    /// SUMO's step, seconds
+    #[arg(long, default_value_t = 0.1)]
+    pub step_s: f64,
+    /// Seed of the routes and of SUMO: the same gives the same files
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Junctions along each side of the grid [default: so many that ten vehicles share a kilometre of lane]
+    #[arg(long)]
+    pub junctions: Option<u32>,
+    /// From junction to junction, metres
+    #[arg(long, default_value_t = 200.0)]
+    pub block_m: f64,
+    /// Lanes in each direction
+    #[arg(long, default_value_t = 1)]
+    pub lanes: u32,
 }
 
 /// What `train` and `simulate` take.

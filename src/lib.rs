@@ -10,6 +10,7 @@ pub mod display;
 pub mod doctor;
 pub mod environment;
 pub mod failure;
+pub mod generate;
 pub mod install;
 pub mod line;
 pub mod live_table;

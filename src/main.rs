@@ -9,6 +9,7 @@ use caraware::{
     display::Display,
     doctor,
     failure::Exit,
+    generate,
     prepare::{Prepared, prepare, prepare_play, prepare_resume},
     report, status,
     supervisor::Supervisor,
@@ -32,6 +33,7 @@ fn main() -> ExitCode {
         Command::Control(args) => control::control(&args),
         Command::Stop { run } => status::stop(run.as_deref()),
         Command::View(args) => view::view(&args),
+        Command::Generate(args) => generate::generate(&args),
         Command::Bench(args) => bench::bench(&args),
         Command::Doctor { clean } => doctor::doctor(clean),
     };

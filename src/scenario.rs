@@ -38,7 +38,7 @@ fn problem(path: &Path, message: impl Into<String>, help: impl Into<String>) -> 
 }
 
 /// The value of attribute `name`, unescaped.
-fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> {
+pub(crate) fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> {
     let attribute = element.try_get_attribute(name).ok().flatten()?;
     attribute
         .normalized_value(quick_xml::XmlVersion::Implicit1_0)

@@ -1,0 +1,286 @@
+//! `caraware generate`: a city of any size with demand that keeps its vehicles on the road, as a scenario that plain SUMO runs too.
+//!
+//! The net is netgenerate's grid with signals at every junction, put onto the globe. The same arguments give the same bytes.
+
+mod demand;
+mod streets;
+
+use std::{
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use crate::{cli::GenerateArgs, failure::Exit, install::Install};
+use demand::Demand;
+use streets::Streets;
+
+/// Vehicles for each street (one direction of a block) of a city whose size is not given: ten on a kilometre of lane.
+const VEHICLES_PER_STREET: f64 = 2.0;
+/// Where the middle of the city lies: latitude and longitude, degrees.
+const ORIGIN_DEG: [f64; 2] = [52.26, 10.52];
+/// WGS 84: semi-major axis (metres), squared eccentricity.
+const WGS84: [f64; 2] = [6_378_137.0, 0.006_694_379_990_14];
+
+/// What is to be generated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct City {
+    /// Vehicles on the road from the first step to the last.
+    pub vehicles: u32,
+    /// Simulated time, seconds.
+    pub duration_s: f64,
+    /// SUMO's step, seconds.
+    pub step_s: f64,
+    /// Seed of routes and of SUMO.
+    pub seed: u64,
+    /// Junctions along each side of the grid.
+    pub junctions: u32,
+    /// From junction to junction, metres.
+    pub block_m: f64,
+    /// Lanes in each direction.
+    pub lanes: u32,
+}
+
+impl City {
+    /// A city that has room for its vehicles: ten on a kilometre of lane, blocks of 200 m, one lane in each direction.
+    #[must_use]
+    pub fn of(vehicles: u32, duration_s: f64, step_s: f64, seed: u64) -> Self {
+        Self {
+            vehicles,
+            duration_s,
+            step_s,
+            seed,
+            junctions: junctions_for(vehicles),
+            block_m: 200.0,
+            lanes: 1,
+        }
+    }
+
+    /// Writes `city.net.xml`, `city.rou.xml` and `city.sumocfg` to `directory`; returns the path of the last.
+    ///
+    /// # Errors
+    /// The vehicles do not fit, the directory is not writable, or netgenerate fails.
+    pub fn write(&self, install: &Install, directory: &Path) -> Result<PathBuf, Exit> {
+        self.check()?;
+        std::fs::create_dir_all(directory).map_err(|error| Exit::io("create", directory, &error))?;
+        let write = |name: &str, text: &str| {
+            let path = directory.join(name);
+            std::fs::write(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
+            Ok::<_, Exit>(path)
+        };
+        let net = self.net(install, directory)?;
+        let streets = Streets::of(&net).map_err(|reason| Exit::run(format!("netgenerate's net: {reason}"), ""))?;
+        let routes = Demand::new(self, &streets)?.text();
+        write("city.net.xml", &net)?;
+        write("city.rou.xml", &routes)?;
+        write("city.sumocfg", &self.configuration())
+    }
+
+    fn check(&self) -> Result<(), Exit> {
+        let positive = |name: &str, value: f64| {
+            if value > 0.0 && value.is_finite() {
+                return Ok(());
+            }
+            Err(Exit::config(format!("--{name} is {value}"), "give a number above 0"))
+        };
+        positive("duration-s", self.duration_s)?;
+        positive("step-s", self.step_s)?;
+        positive("vehicles", self.vehicles.into())?;
+        positive("lanes", self.lanes.into())?;
+        // Shorter blocks have no room left between their junctions.
+        if self.junctions < 2 || self.block_m < 50.0 {
+            return Err(Exit::config(
+                format!("a grid of {} junctions a side, {} m apart", self.junctions, self.block_m),
+                "give --junctions 2 or more and --block-m 50 or more",
+            ));
+        }
+        Ok(())
+    }
+
+    /// netgenerate's grid, without the head that tells the time, and on the globe.
+    fn net(&self, install: &Install, directory: &Path) -> Result<String, Exit> {
+        let file = directory.join("city.net.xml");
+        let program = install.sumo_program("netgenerate");
+        let output = Command::new(&program)
+            .args(["--grid", "--default-junction-type", "traffic_light", "--no-turnarounds"])
+            .args(["--grid.number", &self.junctions.to_string()])
+            .args(["--grid.length", &self.block_m.to_string()])
+            .args(["--default.lanenumber", &self.lanes.to_string()])
+            .arg("--output-file")
+            .arg(&file)
+            .env("SUMO_HOME", &install.sumo_home)
+            .output()
+            .map_err(|error| Exit::io("start", &program, &error))?;
+        if !output.status.success() {
+            let reason = String::from_utf8_lossy(&output.stderr);
+            return Err(Exit::run(
+                format!("netgenerate could not build the grid: {}", reason.trim()),
+                "`caraware doctor` checks the SUMO installation",
+            ));
+        }
+        let text = std::fs::read_to_string(&file).map_err(|error| Exit::io("read", &file, &error))?;
+        self.placed(&text)
+            .ok_or_else(|| Exit::run("netgenerate's net has no <location>", ""))
+    }
+
+    /// A net without comment, its `<location>` replaced by that of the city.
+    fn placed(&self, net: &str) -> Option<String> {
+        let (head, rest) = net.split_once("<!--")?;
+        let (_, rest) = rest.split_once("-->")?;
+        let (before, rest) = rest.split_once("<location ")?;
+        let (_, after) = rest.split_once("/>")?;
+        Some(format!(
+            "{}\n{}{}{after}",
+            head.trim_end(),
+            before.trim_start(),
+            self.location()
+        ))
+    }
+
+    /// Transverse Mercator about the middle of the city.
+    fn location(&self) -> String {
+        let side_m = f64::from(self.junctions - 1) * self.block_m;
+        let half_m = 0.5 * side_m;
+        let [latitude, longitude] = ORIGIN_DEG;
+        let [axis_m, eccentricity] = WGS84;
+        let curved = 1.0 - eccentricity * latitude.to_radians().sin().powi(2);
+        let meridian_m = axis_m * (1.0 - eccentricity) / curved.powf(1.5);
+        let parallel_m = axis_m / curved.sqrt() * latitude.to_radians().cos();
+        let (up, right) = ((half_m / meridian_m).to_degrees(), (half_m / parallel_m).to_degrees());
+        format!(
+            "<location netOffset=\"{half_m:.2},{half_m:.2}\" convBoundary=\"0.00,0.00,{side_m:.2},{side_m:.2}\" \
+             origBoundary=\"{:.6},{:.6},{:.6},{:.6}\" projParameter=\"+proj=tmerc +lat_0={latitude} +lon_0={longitude} +k=1 +x_0=0 +y_0=0 \
+             +ellps=WGS84 +units=m +no_defs\"/>",
+            longitude - right,
+            latitude - up,
+            longitude + right,
+            latitude + up,
+        )
+    }
+
+    fn configuration(&self) -> String {
+        let Self {
+            duration_s,
+            step_s,
+            seed,
+            ..
+        } = self;
+        // SUMO's seed is a positive `int`.
+        let seed = seed & 0x7fff_ffff;
+        format!(
+            "<configuration>\n\
+             \x20   <input>\n\
+             \x20       <net-file value=\"city.net.xml\"/>\n\
+             \x20       <route-files value=\"city.rou.xml\"/>\n\
+             \x20   </input>\n\
+             \x20   <output>\n\
+             \x20       <summary-output value=\"summary.xml\"/>\n\
+             \x20       <tripinfo-output value=\"tripinfo.xml\"/>\n\
+             \x20       <tripinfo-output.write-unfinished value=\"true\"/>\n\
+             \x20   </output>\n\
+             \x20   <time>\n\
+             \x20       <begin value=\"0\"/>\n\
+             \x20       <end value=\"{duration_s}\"/>\n\
+             \x20       <step-length value=\"{step_s}\"/>\n\
+             \x20   </time>\n\
+             \x20   <random_number>\n\
+             \x20       <seed value=\"{seed}\"/>\n\
+             \x20   </random_number>\n\
+             \x20   <report>\n\
+             \x20       <no-step-log value=\"true\"/>\n\
+             \x20   </report>\n\
+             </configuration>\n"
+        )
+    }
+}
+
+/// Junctions a side whose 4·n·(n − 1) streets have [`VEHICLES_PER_STREET`].
+fn junctions_for(vehicles: u32) -> u32 {
+    let enough = |n: &u32| f64::from(4 * n) * f64::from(n - 1) * VEHICLES_PER_STREET >= f64::from(vehicles);
+    (2..1 << 14).find(enough).unwrap_or(1 << 14)
+}
+
+/// Generates what the command line asks for and says how to run it.
+///
+/// # Errors
+/// As [`City::write`].
+pub fn generate(args: &GenerateArgs) -> Result<(), Exit> {
+    let city = City {
+        junctions: args.junctions.unwrap_or_else(|| junctions_for(args.vehicles)),
+        block_m: args.block_m,
+        lanes: args.lanes,
+        ..City::of(args.vehicles, args.duration_s, args.step_s, args.seed)
+    };
+    let sumocfg = city.write(&Install::find()?, &args.directory)?;
+    println!(
+        "{}: {} vehicles for {} s on {} junctions with signals",
+        sumocfg.display(),
+        city.vehicles,
+        city.duration_s,
+        city.junctions * city.junctions,
+    );
+    println!(
+        "caraware simulate {} --set traffic.max_road_users={}",
+        sumocfg.display(),
+        city.vehicles
+    );
+    Ok(())
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
+mod tests {
+    use super::*;
+    use crate::scenario;
+
+    fn small(seed: u64) -> City {
+        City {
+            junctions: 3,
+            ..City::of(40, 30.0, 0.5, seed)
+        }
+    }
+
+    fn files(city: &City) -> (tempfile::TempDir, [String; 3]) {
+        let directory = tempfile::tempdir().unwrap();
+        city.write(&Install::find().unwrap(), directory.path()).unwrap();
+        let read = |name| std::fs::read_to_string(directory.path().join(name)).unwrap();
+        let texts = ["city.net.xml", "city.rou.xml", "city.sumocfg"].map(read);
+        (directory, texts)
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_bytes_and_another_other_routes() {
+        let (one, again, other) = (files(&small(1)).1, files(&small(1)).1, files(&small(2)).1);
+        assert_eq!(one, again);
+        assert_eq!(one[0], other[0]);
+        assert_ne!(one[1], other[1]);
+    }
+
+    #[test]
+    fn the_city_lies_on_the_globe() {
+        let (directory, _) = files(&small(1));
+        let map = scenario::map_info(&directory.path().join("city.net.xml"), None).unwrap();
+        assert!(map.projection.starts_with("+proj=tmerc +lat_0=52.26"), "{map:?}");
+        assert_eq!(map.net_offset_m, [200.0, 200.0]);
+        assert_eq!(map.bounds_m, [-20.0, -20.0, 420.0, 420.0]);
+    }
+
+    #[test]
+    fn room_grows_with_the_vehicles() {
+        assert_eq!([1, 16, 17, 5000, 50_000].map(junctions_for), [2, 2, 3, 26, 80]);
+    }
+
+    #[test]
+    fn more_vehicles_than_fit_are_refused() {
+        let city = City {
+            vehicles: 4000,
+            ..small(1)
+        };
+        let directory = tempfile::tempdir().unwrap();
+        let refused = city.write(&Install::find().unwrap(), directory.path()).unwrap_err();
+        let Exit::Failure(failure) = refused else {
+            unreachable!("{refused:?}")
+        };
+        assert!(failure.message.contains("4000 vehicles"), "{failure:?}");
+        assert!(failure.help.unwrap().contains("--junctions"));
+    }
+}
