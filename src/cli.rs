@@ -319,6 +319,10 @@ pub enum Part {
     Ipc,
     /// The learner: updates per second beside Stable-Baselines3 and a plain loop, and what a tick costs it
     Trainer,
+    /// What co-simulation of 5 000 vehicles costs beside bare SUMO
+    Overhead,
+    /// 1 000 to 50 000 vehicles: cost and memory of each; a motorway, and long steps of SUMO
+    Scale,
     /// Everything above, one after the other
     All,
 }
@@ -351,6 +355,9 @@ pub struct BenchArgs {
     /// Keep the figures in docs/benchmarks/ and write docs/benchmarks.md anew
     #[arg(long)]
     pub keep: bool,
+    /// Small and short: whether it works, not how fast it is
+    #[arg(long, conflicts_with = "keep")]
+    pub quick: bool,
     /// Python that has the peers installed [default: what `make peers` installed, or the project's]
     #[arg(long, value_name = "PATH")]
     pub python: Option<PathBuf>,

@@ -6,6 +6,7 @@ mod demand;
 mod streets;
 
 use std::{
+    io::Write as _,
     path::{Path, PathBuf},
     process::Command,
 };
@@ -89,7 +90,10 @@ impl City {
         // Shorter blocks have no room left between their junctions.
         if self.junctions < 2 || self.block_m < 50.0 {
             return Err(Exit::config(
-                format!("a grid of {} junctions a side, {} m apart", self.junctions, self.block_m),
+                format!(
+                    "a grid of {} junctions a side, {} m apart",
+                    self.junctions, self.block_m
+                ),
                 "give --junctions 2 or more and --block-m 50 or more",
             ));
         }
@@ -211,17 +215,15 @@ pub fn generate(args: &GenerateArgs) -> Result<(), Exit> {
         ..City::of(args.vehicles, args.duration_s, args.step_s, args.seed)
     };
     let sumocfg = city.write(&Install::find()?, &args.directory)?;
-    println!(
-        "{}: {} vehicles for {} s on {} junctions with signals",
-        sumocfg.display(),
-        city.vehicles,
-        city.duration_s,
-        city.junctions * city.junctions,
-    );
-    println!(
-        "caraware simulate {} --set traffic.max_road_users={}",
-        sumocfg.display(),
-        city.vehicles
+    let (path, junctions) = (sumocfg.display(), city.junctions * city.junctions);
+    let City {
+        vehicles, duration_s, ..
+    } = city;
+    // A reader that went away (`| head`) does not undo what is written.
+    let _ = writeln!(
+        std::io::stdout(),
+        "{path}: {vehicles} vehicles for {duration_s} s on {junctions} junctions with signals\n\
+         caraware simulate {path} --set traffic.max_road_users={vehicles}",
     );
     Ok(())
 }

@@ -210,6 +210,12 @@ fn suggest_scenario(settings: &mut Settings, scenario: &Scenario, source: &str) 
 
 /// Actions need somebody who gives them, and heroes that the source of traffic has.
 fn check_task(config: &Config, mode: Mode, named: &Named) -> Result<(), Exit> {
+    if matches!(named, Named::Map) && (config.episode.whole_scenario || config.traffic.scale.is_some()) {
+        return Err(Exit::config(
+            "`episode.whole_scenario` and `traffic.scale` are for a .sumocfg, and there is none",
+            "name one in place of the preset, or leave them out",
+        ));
+    }
     if !config.drives() {
         return Ok(());
     }

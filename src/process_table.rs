@@ -115,7 +115,8 @@ pub const TABLE: [Row; 5] = [
     Row {
         process: Process::Trainer,
         scope: Scope::Run,
-        needs: &[Process::TrafficBridge],
+        // Python takes as long to import torch as SUMO to read a large net.
+        needs: &[],
         on_exit: OnExit::Replace,
         wanted: |run| run.mode.has_trainer(),
         command: trainer,

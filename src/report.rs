@@ -2,7 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use ipc_schema::run::{Mode, RunFile};
+use ipc_schema::{
+    process::Process,
+    run::{Mode, RunFile},
+};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
@@ -130,6 +133,13 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         env_steps as f64 / outcome.wall_s,
         sensing.ticks as f64 * run.config.run.tick_s,
     );
+    let used: Map<String, Value> = Process::ALL
+        .into_iter()
+        .filter_map(|process| {
+            let part: Value = part(run, process.name())?;
+            Some((process.name().to_owned(), part.get("process")?.clone()))
+        })
+        .collect();
     let report = json!({
         "name": run.name,
         "mode": run.mode,
@@ -169,6 +179,8 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "dynamics": moving,
         "lidar": sensing.lidar,
         "environments": environments,
+        "traffic": part::<Value>(run, "traffic-bridge"),
+        "processes": used,
     });
     let path = run.run_dir.join("report.json");
     let text = serde_json::to_string_pretty(&report).unwrap_or_default();

@@ -173,7 +173,7 @@ fn number<T: std::str::FromStr>(value: &str, name: &str, path: &Path, line: usiz
     })
 }
 
-/// Reads the `<location>` of a net file (plain or gzip), the geodetic origin of the configuration standing in for a missing projection.
+/// Reads a net file (plain or gzip): its `<location>`, and how many traffic lights it has; the geodetic origin of the configuration standing in for a missing projection.
 ///
 /// # Errors
 /// Unreadable, no `<location>`, or no projection and no origin.
@@ -198,16 +198,28 @@ pub fn map_info(net: &Path, origin_deg: Option<(f64, f64)>) -> Result<MapInfo, E
     };
     let mut reader = Reader::from_reader(input);
     let mut buffer = Vec::new();
-    loop {
+    let mut map = loop {
         match reader.read_event_into(&mut buffer) {
             Ok(Event::Start(element) | Event::Empty(element)) if element.local_name().as_ref() == "location" => {
-                return location(&element, net, origin_deg);
+                break location(&element, net, origin_deg)?;
             }
             Ok(Event::Eof) => return Err(problem(net, "has no <location>", "give a net built by netconvert")),
             Ok(_) => buffer.clear(),
             Err(error) => return Err(unreadable(&error)),
         }
+    };
+    map.traffic_lights = traffic_lights(&mut reader.into_inner()).map_err(|error| unreadable(&error))?;
+    Ok(map)
+}
+
+/// Counts the programs of traffic lights in the rest of a net. Large nets have a million elements: each is only looked at.
+fn traffic_lights(net: &mut impl BufRead) -> std::io::Result<u32> {
+    let (mut element, mut count) = (Vec::new(), 0);
+    while net.read_until(b'>', &mut element)? > 0 {
+        count += u32::from(element.trim_ascii_start().starts_with(b"<tlLogic "));
+        element.clear();
     }
+    Ok(count)
 }
 
 /// Room around the net for what leaves it: GNSS errors, vehicles wider than their lane, metres.
@@ -241,6 +253,7 @@ fn location(element: &BytesStart<'_>, net: &Path, origin_deg: Option<(f64, f64)>
             projection,
             net_offset_m: offset_m,
             bounds_m,
+            traffic_lights: 0,
         });
     }
     let (latitude, longitude) = origin_deg.ok_or_else(|| {
@@ -256,6 +269,7 @@ fn location(element: &BytesStart<'_>, net: &Path, origin_deg: Option<(f64, f64)>
         projection,
         net_offset_m: [0.0, 0.0],
         bounds_m,
+        traffic_lights: 0,
     })
 }
 
@@ -320,10 +334,11 @@ mod tests {
     }
 
     #[test]
-    fn the_location_is_read_from_plain_and_gzip_nets() {
+    fn location_and_traffic_lights_are_read_from_plain_and_gzip_nets() {
         use std::io::Write as _;
         let directory = tempfile::tempdir().unwrap();
-        let net = NET.replace("\"P\"", "\"+proj=utm +zone=32\"");
+        let lights = "\n  <tlLogic id=\"a\">\n  <phase/></tlLogic>\n<tlLogic id=\"b\"/></net>";
+        let net = NET.replace("\"P\"", "\"+proj=utm +zone=32\"").replace("</net>", lights);
         let plain = write(directory.path(), "a.net.xml", &net);
         let packed = directory.path().join("a.net.xml.gz");
         let mut encoder = flate2::write::GzEncoder::new(File::create(&packed).unwrap(), flate2::Compression::fast());
@@ -333,6 +348,7 @@ mod tests {
             projection: "+proj=utm +zone=32".into(),
             net_offset_m: [1.0, -2.5],
             bounds_m: [-20.0, -20.0, 120.0, 70.0],
+            traffic_lights: 2,
         };
         assert_eq!(map_info(&plain, None).unwrap(), expected);
         assert_eq!(map_info(&packed, None).unwrap(), expected);

@@ -149,6 +149,8 @@ pub struct Traffic {
     pub cav_share: f64,
     /// Share of all trips, from road to road, that only evaluation episodes make, which make no others; 0 = none.
     pub held_out_trips: f64,
+    /// Factor on a scenario's demand, SUMO's `--scale` (`.sumocfg`); `None` = as the scenario says.
+    pub scale: Option<f64>,
     /// Most road users alive at once; shared memory is laid out for them.
     pub max_road_users: u32,
 }
@@ -177,6 +179,8 @@ pub struct Episode {
     pub evaluation_ticks: u64,
     /// Evaluation episodes at the end.
     pub final_evaluations: u64,
+    /// The scenario as it is (`.sumocfg`): one episode with its own seed, to its own end.
+    pub whole_scenario: bool,
 }
 
 /// What the trainer's output means.

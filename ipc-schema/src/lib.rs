@@ -42,7 +42,8 @@ pub mod schedule;
 pub mod services;
 pub mod session;
 pub mod traffic;
+pub mod usage;
 pub mod world;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 9;
+pub const SCHEMA_VERSION: u32 = 10;

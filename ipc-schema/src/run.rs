@@ -68,6 +68,8 @@ pub struct MapInfo {
     pub net_offset_m: [f64; 2],
     /// x_min, y_min, x_max, y_max of the net with a margin of 20 m, metres: the range of positions and predictions.
     pub bounds_m: [f64; 4],
+    /// Programs of traffic lights in the net: at least as many as there are lights.
+    pub traffic_lights: u32,
 }
 
 /// The files that the static scene is built from.
@@ -87,6 +89,9 @@ pub struct SharedMemory {
     /// Prefix of the files in `/dev/shm`.
     pub prefix: String,
 }
+
+/// SUMO steps under way at least: the one that moves now, the one that waits for it, and the one that SUMO makes meanwhile.
+const STEPS_AHEAD: u64 = 3;
 
 /// The run file, `run.json` in the run directory.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -241,10 +246,21 @@ impl RunFile {
         ratio.max(1)
     }
 
-    /// Ticks a producer may be ahead: the configured window, at least one SUMO step.
+    /// Ticks that dynamics and sensors may be ahead of the next process.
     #[must_use]
     pub fn window_ticks(&self) -> u64 {
-        u64::from(self.config.run.window_ticks).max(self.ticks_per_traffic_step())
+        u64::from(self.config.run.window_ticks)
+    }
+
+    /// Ticks that traffic may be ahead of the dynamics: the window, and at least [`STEPS_AHEAD`] SUMO steps where a step has several
+    /// ticks. With less SUMO and the dynamics wait for each other instead of working side by side.
+    #[must_use]
+    pub fn traffic_window_ticks(&self) -> u64 {
+        let window = self.window_ticks();
+        match self.ticks_per_traffic_step() {
+            1 => window,
+            per_step => window.max(STEPS_AHEAD * per_step),
+        }
     }
 
     /// Number of the first tick that is made.
@@ -301,8 +317,9 @@ impl RunFile {
         let (lengths, seed) = (&self.config.episode, self.seed());
         match (&self.source, self.mode) {
             (_, Mode::Play) => Vec::new(),
-            (_, Mode::Train) => schedule::training(lengths, seed),
             (Source::Scenario { .. }, Mode::Simulate) => schedule::scenario(seed),
+            (Source::Scenario { .. }, Mode::Train) if lengths.whole_scenario => schedule::scenario(seed),
+            (_, Mode::Train) => schedule::training(lengths, seed),
             (Source::Population { .. }, Mode::Simulate) => schedule::simulation(lengths, seed),
         }
     }

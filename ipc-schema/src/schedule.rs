@@ -230,6 +230,7 @@ mod tests {
             evaluation_interval,
             evaluation_ticks: 5,
             final_evaluations,
+            whole_scenario: false,
         }
     }
 

@@ -26,7 +26,8 @@ use crate::{
     process::Process,
     run::{RunFile, SharedMemory},
     traffic::{
-        MOST_SIGNALS, ROUTE_POINTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout, TrafficState,
+        EVENTS_PER_MESSAGE, MOST_SIGNALS, ROUTE_POINTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout,
+        TrafficState,
     },
     world::WorldLayout,
 };
@@ -80,6 +81,17 @@ const SPARE_MESSAGES: usize = 2;
 
 /// Messages that the route of one hero may take: 4096 points.
 const ROUTE_MESSAGES_PER_HERO: usize = 2;
+
+/// Most `traffic-meta` messages without routes that one SUMO step takes: everybody may leave and everybody may come in it, and every
+/// traffic light may change.
+fn meta_messages(run: &RunFile) -> usize {
+    let (road_users, lights) = (
+        run.config.traffic.max_road_users as usize,
+        run.map.traffic_lights as usize,
+    );
+    let events = (2 * road_users).div_ceil(EVENTS_PER_MESSAGE);
+    events.max(lights.div_ceil(SIGNALS_PER_MESSAGE)).max(1)
+}
 
 /// A data service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -176,8 +188,7 @@ impl Channel {
         let road_users = run.config.traffic.max_road_users as usize;
         match self {
             Self::Traffic => road_users * size_of::<TrafficState>(),
-            // Everybody may leave and everybody may come within one step.
-            Self::TrafficMeta => TrafficMetaLayout::new(2 * road_users, SIGNALS_PER_MESSAGE)
+            Self::TrafficMeta => TrafficMetaLayout::new(EVENTS_PER_MESSAGE, SIGNALS_PER_MESSAGE)
                 .len
                 .max(ROUTE_POINTS_PER_MESSAGE * size_of::<RoutePoint>()),
             Self::Census => TrafficMetaLayout::new(road_users, MOST_SIGNALS).len,
@@ -199,13 +210,19 @@ impl Channel {
     #[must_use]
     pub fn queue_length(self, run: &RunFile) -> usize {
         let window = usize::try_from(run.window_ticks()).unwrap_or(usize::MAX);
+        let per_step = usize::try_from(run.ticks_per_traffic_step()).unwrap_or(usize::MAX);
+        let traffic_window = usize::try_from(run.traffic_window_ticks()).unwrap_or(usize::MAX);
+        let steps = traffic_window.div_ceil(per_step);
         match self {
+            Self::Traffic => steps + SPARE_MESSAGES,
             // All heroes may come within one step, each with its route.
-            Self::TrafficMeta => window + run.config.heroes() * ROUTE_MESSAGES_PER_HERO + SPARE_MESSAGES,
+            Self::TrafficMeta => {
+                steps * meta_messages(run) + run.config.heroes() * ROUTE_MESSAGES_PER_HERO + SPARE_MESSAGES
+            }
             // The newest replaces the one before.
             Self::Census => SPARE_MESSAGES,
             // One for each step that is on its way through `sim-core`.
-            Self::Switch => 2 * window + SPARE_MESSAGES,
+            Self::Switch => steps + window + SPARE_MESSAGES,
             // The scans of one tick.
             Self::Pointcloud => run.config.lidar.vehicles as usize + SPARE_MESSAGES,
             _ => window + SPARE_MESSAGES,

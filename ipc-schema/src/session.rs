@@ -23,6 +23,7 @@ use crate::{
     process::Process,
     run::{RunFile, RunFileError},
     services::{self, Channel, ServiceError, Shm, WakeListener},
+    usage::{self, Usage},
 };
 
 /// Environment variable with the number of times a process has been started before.
@@ -93,6 +94,8 @@ pub struct Session {
     progress: Progress,
     health: Health,
     upstream: Vec<Waker>,
+    /// Processor time used before the work began, seconds.
+    start_cpu_s: f64,
 }
 
 impl Session {
@@ -217,6 +220,7 @@ impl Session {
             progress,
             health,
             upstream: Vec::new(),
+            start_cpu_s: 0.0,
         })
     }
 
@@ -302,8 +306,14 @@ impl Session {
             ..self.progress
         };
         self.board.set_progress(self.progress);
+        self.begin_work();
         self.report(|health| health.state = State::Ready as u32);
         self.wake_upstream();
+    }
+
+    /// From here on processor time counts as that of the work itself: everything has been loaded.
+    pub fn begin_work(&mut self) {
+        self.start_cpu_s = usage::processor_time_s();
     }
 
     /// All ticks below `ticks` have been consumed: their producer gets the credit.
@@ -343,7 +353,7 @@ impl Session {
         self.board.set_health(self.health);
     }
 
-    /// Writes what this process adds to the run's report, `parts/<process>.json`.
+    /// Writes what this process adds to the run's report, `parts/<process>.json`, with what it has used of the machine as `process`.
     ///
     /// # Errors
     /// Not writable.
@@ -353,7 +363,12 @@ impl Session {
             Failure::new(FailureKind::Run, format!("cannot write {}: {reason}", path.display()))
                 .with_help("check permissions and free space (`caraware doctor`)")
         };
-        let text = serde_json::to_string_pretty(part).map_err(|error| failed(&error))?;
+        let mut part = serde_json::to_value(part).map_err(|error| failed(&error))?;
+        let used = serde_json::to_value(Usage::so_far(self.start_cpu_s)).map_err(|error| failed(&error))?;
+        if let Some(part) = part.as_object_mut() {
+            part.insert("process".into(), used);
+        }
+        let text = serde_json::to_string_pretty(&part).map_err(|error| failed(&error))?;
         std::fs::write(&path, text).map_err(|error| failed(&error))
     }
 

@@ -152,6 +152,9 @@ impl VehicleMeta {
 /// Most links of one traffic light that are carried.
 pub const SIGNAL_LINKS: usize = 128;
 
+/// Most events of road users in one `traffic-meta` message; more in one step take more messages.
+pub const EVENTS_PER_MESSAGE: usize = 1024;
+
 /// Most traffic lights in one `traffic-meta` message; more changes in one step take more messages.
 pub const SIGNALS_PER_MESSAGE: usize = 256;
 

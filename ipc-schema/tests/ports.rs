@@ -76,6 +76,7 @@ impl Corner {
                 projection: String::new(),
                 net_offset_m: [0.0; 2],
                 bounds_m: [0.0; 4],
+                traffic_lights: 0,
             },
             scene_files: SceneFiles::default(),
             sumo_home: "none".into(),

@@ -115,6 +115,7 @@ fn round(config: &Config) -> f64 {
         projection: "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs".into(),
         net_offset_m: [-385_000.0, -5_815_000.0],
         bounds_m: [0.0, 0.0, 10_000.0, 10_000.0],
+        traffic_lights: 0,
     };
     let mut sensing = Sensing::new(config, &map).unwrap_or_else(|error| panic!("{error}"));
     let states = states();

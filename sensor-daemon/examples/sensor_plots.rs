@@ -71,6 +71,7 @@ fn map() -> MapInfo {
         projection: "+proj=tmerc +lat_0=52.26 +lon_0=10.52 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs".into(),
         net_offset_m: [0.0, 0.0],
         bounds_m: [-100.0, -60.0, 220.0, 200.0],
+        traffic_lights: 0,
     }
 }
 

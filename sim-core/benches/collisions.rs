@@ -123,6 +123,7 @@ fn load(files: &str) {
         projection: "!".into(),
         net_offset_m: [0.0; 2],
         bounds_m: [0.0; 4],
+        traffic_lights: 0,
     };
     let mut costs_ms = Vec::new();
     for _ in 0..9 {

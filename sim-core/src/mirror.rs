@@ -313,7 +313,7 @@ impl Mirror {
     }
 
     /// Moves all road users through tick `tick` and writes them into `payload`, laid out by [`Mirror::layout`], in ascending
-    /// order of their index. Call once for each tick of the step, in order; `payload` must be zeroed.
+    /// order of their index. Call once for each tick of the step, in order. Every byte of both arrays is written.
     ///
     /// # Errors
     /// The payload is too short or misaligned.

@@ -218,7 +218,11 @@ impl Core {
                 .tick_header(frame, tick, u32::try_from(count).unwrap_or(u32::MAX))
         };
         let layout = WorldLayout::with_heroes(count, header.columns as usize, heroes);
-        let mut draft = self.world.loan(header, layout.len)?;
+        let mut draft = match &self.actions {
+            // What heroes see is only written where there is something to see.
+            Some(_) => self.world.loan(header, layout.len)?,
+            None => self.world.loan_unwritten(header, layout.len)?,
+        };
         self.mirror.write_tick(tick, draft.payload_mut()).map_err(unmirrored)?;
         if let Some(contacts) = &mut self.contacts {
             contacts.tick(&header, draft.payload_mut(), layout.states)?;

@@ -308,6 +308,8 @@ impl RoadUser {
             wheelbase_m,
             rear_overhang_m,
         } = self.dimensions;
+        // Whatever lay there before.
+        *out = VehicleState::default();
         out.id_hash = self.id_hash;
         out.vehicle = self.now.vehicle;
         out.kind = self.now.kind;

@@ -27,6 +27,7 @@ fn map(definition: &str, net_offset_m: [f64; 2]) -> MapInfo {
         projection: definition.into(),
         net_offset_m,
         bounds_m: [0.0, 0.0, 1.0, 1.0],
+        traffic_lights: 0,
     }
 }
 

@@ -70,6 +70,7 @@ impl Run {
                 projection: "!".into(),
                 net_offset_m: [0.0; 2],
                 bounds_m: [0.0, 0.0, 100.0, 100.0],
+                traffic_lights: 0,
             },
             scene_files: SceneFiles {
                 net_file,

@@ -59,6 +59,7 @@ fn run(net_file: &Path, additional_files: &[PathBuf]) -> RunFile {
             projection: "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs".into(),
             net_offset_m: [-402_990.32, -5_794_389.48],
             bounds_m: [0.0, 0.0, 5_000.0, 5_000.0],
+            traffic_lights: 0,
         },
         scene_files: SceneFiles {
             net_file: net_file.into(),

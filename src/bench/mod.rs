@@ -6,9 +6,13 @@ mod envs;
 mod fanout;
 mod ipc;
 mod lidar;
+mod overhead;
 mod page;
 mod plots;
 pub mod report;
+mod scale;
+mod sides;
+mod stages;
 mod trainer;
 
 use std::{io::Write as _, path::PathBuf};
@@ -28,6 +32,8 @@ pub struct Options {
     pub bin: PathBuf,
     /// Python that has the peers installed, if there is one.
     pub python: Option<PathBuf>,
+    /// Whether only the way is tried: small, short, no figures to keep.
+    pub quick: bool,
 }
 
 /// Measures, prints, and writes what is asked for.
@@ -39,7 +45,11 @@ pub fn bench(args: &BenchArgs) -> Result<(), Exit> {
     // The peers are Python packages that nothing else needs: without them, ours is measured alone.
     let python = args.python.clone().or_else(|| install::peers_python(&bin));
     let python = python.or_else(|| install::python(&bin).ok());
-    let options = Options { bin, python };
+    let options = Options {
+        bin,
+        python,
+        quick: args.quick,
+    };
     let parts = match args.part {
         Part::All => Part::measured().collect(),
         part => vec![part],
@@ -77,6 +87,8 @@ fn measure(part: Part, options: &Options) -> Result<Report, Exit> {
         Part::Lidar => lidar::measure(options),
         Part::Fanout => fanout::measure(options),
         Part::Trainer => trainer::measure(options),
+        Part::Overhead => overhead::measure(options),
+        Part::Scale => scale::measure(options),
         Part::All => Err(Exit::config("`all` is not a part", "")),
     }
 }

@@ -44,7 +44,10 @@ impl<'a> Demand<'a> {
         let room: f64 = lanes.iter().map(|(_, _, length_m)| (length_m / ROOM_M).floor()).sum();
         if f64::from(city.vehicles) > room {
             return Err(Exit::config(
-                format!("{} vehicles do not fit onto streets with room for {room}", city.vehicles),
+                format!(
+                    "{} vehicles do not fit onto streets with room for {room}",
+                    city.vehicles
+                ),
                 "give more --junctions, longer blocks or more --lanes",
             ));
         }

@@ -14,7 +14,7 @@ use ipc_schema::{
     schedule::{Course, Due, Episode},
     services::Channel,
     session::{Session as Membership, Wait},
-    traffic::{ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout, VehicleMeta},
+    traffic::{EVENTS_PER_MESSAGE, ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout},
 };
 
 use crate::{
@@ -28,7 +28,7 @@ use crate::{
     options::Options,
     pacing::Pacing,
     population::{Population, Size},
-    session::Session,
+    session::{Cost, Session},
     trips::Trips,
 };
 
@@ -99,14 +99,15 @@ fn options(run: &RunFile, episode: &Episode) -> Result<Options, SumoError> {
                 heroes: traffic.hero_ids.iter().cloned().collect(),
                 cav_share: traffic.cav_share,
             };
-            Options::scenario(
+            let options = Options::scenario(
                 &run.sumo_home,
                 sumocfg,
                 &output_dir,
                 traffic.step_s,
                 episode.seed,
                 fleet,
-            )
+            )?;
+            Ok(options.with_scale(traffic.scale))
         }
     }
 }
@@ -166,6 +167,21 @@ struct Bridge {
     /// Ticks sent.
     ticks: u64,
     vehicle_steps: u64,
+    /// Where processor time went, over the episodes so far.
+    cost: Option<Cost>,
+}
+
+/// What this process adds to the run's report: processor time, seconds.
+#[derive(Debug, serde::Serialize)]
+struct Part {
+    /// SUMO's own steps.
+    sumo_step_s: f64,
+    /// Finding out what happened and where everybody is.
+    getters_s: f64,
+    /// Looking at traffic lights.
+    signals_s: f64,
+    /// Road users, over SUMO's steps.
+    vehicle_steps: u64,
 }
 
 impl Bridge {
@@ -204,6 +220,7 @@ impl Bridge {
             meta_messages: 0,
             ticks,
             vehicle_steps: 0,
+            cost: None,
         })
     }
 
@@ -234,6 +251,9 @@ impl Bridge {
             0 => 0,
             ticks => ticks + self.repeated_ticks,
         };
+        if self.ticks == 0 {
+            self.membership.begin_work();
+        }
         self.membership.report(|health| {
             health.state = State::Running as u32;
             health.total_ticks = total_ticks;
@@ -376,6 +396,7 @@ impl Bridge {
             self.publish(frame, header)?;
             if ends {
                 self.check_that_somebody_came()?;
+                self.cost = Some(session.cost());
             }
             if is_reset {
                 self.resets += 1;
@@ -427,7 +448,7 @@ impl Bridge {
             senses_persons: run.config.gnss.pedestrians,
         };
         self.control.replay(&mut place)?;
-        let window = run.window_ticks();
+        let window = run.traffic_window_ticks();
         let (control, commands, consumer) = (&mut self.control, &self.commands, &self.consumer);
         let mut failure = None;
         let waited = self.membership.wait_until(|| {
@@ -565,30 +586,29 @@ impl Bridge {
         Ok(())
     }
 
-    /// Sends events of road users and changes of traffic lights, in as many messages as the lights need; none if nothing happened.
+    /// Sends events of road users and changes of traffic lights, in as many messages as they need; none if nothing happened.
     fn publish_meta(&mut self, frame: &Frame, header: MessageHeader) -> Result<(), Failure> {
-        let mut events: &[VehicleMeta] = &frame.events;
+        let mut events = frame.events.chunks(EVENTS_PER_MESSAGE);
         let mut signals = frame.signals.chunks(SIGNALS_PER_MESSAGE);
         loop {
-            let part = signals.next().unwrap_or_default();
-            if events.is_empty() && part.is_empty() {
-                return Ok(());
-            }
+            let (vehicles, lights) = match (events.next(), signals.next()) {
+                (None, None) => return Ok(()),
+                (vehicles, lights) => (vehicles.unwrap_or_default(), lights.unwrap_or_default()),
+            };
             self.meta_messages += 1;
-            let layout = TrafficMetaLayout::new(events.len(), part.len());
+            let layout = TrafficMetaLayout::new(vehicles.len(), lights.len());
             let header = MessageHeader {
                 sequence: self.meta_messages,
-                count: rows(events.len()),
-                columns: rows(part.len()),
+                count: rows(vehicles.len()),
+                columns: rows(lights.len()),
                 ..header
             };
             let mut draft = self.meta.loan(header, layout.len).map_err(too_many)?;
             let payload = draft.payload_mut();
             let at = |section: Section| section.offset..section.offset + section.len;
-            payload[at(layout.vehicles)].copy_from_slice(bytemuck::cast_slice(events));
-            payload[at(layout.signals)].copy_from_slice(bytemuck::cast_slice(part));
+            payload[at(layout.vehicles)].copy_from_slice(bytemuck::cast_slice(vehicles));
+            payload[at(layout.signals)].copy_from_slice(bytemuck::cast_slice(lights));
             draft.send()?;
-            events = &[];
         }
     }
 
@@ -608,10 +628,25 @@ impl Bridge {
 
     /// Leaves once everything sent has been consumed.
     fn leave(mut self) -> Result<(), Failure> {
+        self.write_part()?;
         if self.membership.wait_until_consumed(&self.consumer, self.ticks)? == Wait::Ready {
             self.membership.report(|health| health.state = State::Done as u32);
         }
         Ok(())
+    }
+}
+
+impl Bridge {
+    fn write_part(&self) -> Result<(), Failure> {
+        let Some(cost) = self.cost else {
+            return Ok(());
+        };
+        self.membership.write_part(&Part {
+            sumo_step_s: cost.step_s,
+            getters_s: cost.getters_s,
+            signals_s: cost.signals_s,
+            vehicle_steps: self.vehicle_steps,
+        })
     }
 }
 

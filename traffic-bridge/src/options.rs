@@ -66,6 +66,8 @@ impl Options {
     /// that the run wants, `seed` its seed; they replace the scenario's own only if they differ. `fleet` tells which
     /// of its vehicles are connected or heroes.
     ///
+    /// The demand is the scenario's own unless [`Options::with_scale`] says otherwise.
+    ///
     /// # Errors
     /// A file is missing or malformed, or `output_dir` cannot be made.
     pub fn scenario(
@@ -100,6 +102,17 @@ impl Options {
             fleet,
             sumo_home: sumo_home.into(),
         })
+    }
+}
+
+impl Options {
+    /// The same with `scale` times the demand, if it is given: SUMO's `--scale`.
+    #[must_use]
+    pub fn with_scale(mut self, scale: Option<f64>) -> Self {
+        if let Some(scale) = scale {
+            self.arguments.extend(["--scale".to_owned(), scale.to_string()]);
+        }
+        self
     }
 }
 

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstdlib>
 #include <ctime>
+#include <limits>
 #include <utility>
 
 #include <libsumo/libsumo.h>
@@ -20,6 +21,12 @@ constexpr std::uint64_t SIGNAL_PERIOD_STEPS = 4;
 // A traffic light changes when SUMO has said it would switch. In case another program takes over in between (WAUT), each is also
 // looked at once in this many steps.
 constexpr std::uint64_t SIGNAL_LOOK_STEPS = 50;
+
+// Road users are put in order when more than one in this many has come since.
+constexpr std::size_t LATE_SHARE = 16;
+
+// In place of the place of somebody who is gone.
+constexpr std::size_t GONE = std::numeric_limits<std::size_t>::max();
 
 // SUMO counts milliseconds.
 constexpr double TIME_ROUNDING_S = 0.0005;
@@ -72,6 +79,8 @@ void Simulation::start(rust::Slice<const rust::String> arguments) {
     events_.clear();
     vehicle_places_.clear();
     person_places_.clear();
+    reading_order_.clear();
+    late_ = 0;
     next_index_ = 0;
     steps_ = 0;
     any_gone_ = false;
@@ -183,6 +192,8 @@ void Simulation::depart(const std::string& id, bool is_person) {
     }
     const double invalid = libsumo::INVALID_DOUBLE_VALUE;
     places.emplace(id, live_.size());
+    reading_order_.push_back(live_.size());
+    ++late_;
     live_.push_back(Live{id, is_person, false});
     states_.push_back(RawState{invalid, invalid, 0.0, 0.0, 0.0, invalid, invalid, 0, next_index_});
     events_.push_back(std::move(departure));
@@ -236,8 +247,20 @@ void Simulation::read_person(const std::string& id, RawState& state) const {
     }
 }
 
+void Simulation::put_in_order() {
+    // Sorting takes longer than it saves if few have come.
+    if (late_ * LATE_SHARE <= reading_order_.size()) {
+        return;
+    }
+    std::sort(reading_order_.begin(), reading_order_.end(), [this](std::size_t a, std::size_t b) {
+        return live_[a].is_person != live_[b].is_person ? live_[b].is_person : live_[a].id < live_[b].id;
+    });
+    late_ = 0;
+}
+
 void Simulation::read_all() {
-    for (std::size_t place = 0; place < live_.size(); ++place) {
+    put_in_order();
+    for (const std::size_t place : reading_order_) {
         const Live& road_user = live_[place];
         try {
             if (road_user.is_person) {
@@ -257,12 +280,14 @@ void Simulation::forget_gone() {
         return;
     }
     std::size_t kept = 0;
+    moved_.assign(live_.size(), GONE);
     for (std::size_t place = 0; place < live_.size(); ++place) {
         auto& places = live_[place].is_person ? person_places_ : vehicle_places_;
         if (live_[place].gone) {
             places.erase(live_[place].id);
             continue;
         }
+        moved_[place] = kept;
         if (kept != place) {
             places[live_[place].id] = kept;
             live_[kept] = std::move(live_[place]);
@@ -272,6 +297,10 @@ void Simulation::forget_gone() {
     }
     live_.erase(live_.begin() + static_cast<std::ptrdiff_t>(kept), live_.end());
     states_.erase(states_.begin() + static_cast<std::ptrdiff_t>(kept), states_.end());
+    for (std::size_t& place : reading_order_) {
+        place = moved_[place];
+    }
+    reading_order_.erase(std::remove(reading_order_.begin(), reading_order_.end(), GONE), reading_order_.end());
     any_gone_ = false;
 }
 

@@ -87,12 +87,19 @@ private:
     void read_vehicle(const std::string& id, RawState& state) const;
     void read_person(const std::string& id, RawState& state) const;
     void read_all();
+    void put_in_order();
     void read_signals();
     void forget_gone();
 
     std::unique_ptr<ErrorTee> errors_;
     std::vector<Live> live_;
     std::vector<RawState> states_;
+    // Places in `live_` in the order of their ids, but for the newest `late_`: SUMO finds a vehicle by its id in a tree, and
+    // neighbours in the tree share their way and their cache lines.
+    std::vector<std::size_t> reading_order_;
+    std::size_t late_ = 0;
+    // Where a road user goes when others are forgotten. Reused.
+    std::vector<std::size_t> moved_;
     std::vector<RawEvent> events_;
     // A traffic light, with the state last told ("" before the first) and the time at which SUMO looks at it again.
     struct Light {

@@ -323,6 +323,7 @@ fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
             projection: "+proj=utm +zone=32 +ellps=WGS84".into(),
             net_offset_m: [0.0, 0.0],
             bounds_m: [0.0, 0.0, 220.0, 200.0],
+            traffic_lights: 0,
         },
         scene_files: SceneFiles::default(),
         sumo_home: "none".into(),

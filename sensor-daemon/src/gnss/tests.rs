@@ -15,6 +15,7 @@ fn projection(definition: &str, net_offset_m: [f64; 2]) -> Projection {
         projection: definition.into(),
         net_offset_m,
         bounds_m: SMALL_M,
+        traffic_lights: 0,
     })
     .unwrap()
 }

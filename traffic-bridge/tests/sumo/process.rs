@@ -43,7 +43,9 @@ struct Run {
 impl Run {
     fn new(bench: &Bench, source: Source, ticks: u64, step_s: f64) -> Self {
         let run_dir = bench.folder.path().join("run");
-        std::fs::create_dir_all(run_dir.join("logs")).unwrap();
+        for part in ["logs", "parts"] {
+            std::fs::create_dir_all(run_dir.join(part)).unwrap();
+        }
         let file = run_file(run_dir, source, ticks, step_s);
         let path = file.write().unwrap();
         let node = services::node(&file.shared_memory).unwrap();
@@ -308,6 +310,7 @@ fn run_file(run_dir: PathBuf, source: Source, ticks: u64, step_s: f64) -> RunFil
             projection: "!".into(),
             net_offset_m: [0.0; 2],
             bounds_m: [0.0, 0.0, 400.0, 400.0],
+            traffic_lights: 0,
         },
         scene_files: SceneFiles::default(),
         sumo_home: sumo_home(),

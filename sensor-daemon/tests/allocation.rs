@@ -1,0 +1,84 @@
+//! Once everybody is there, a tick of the sensors allocates nothing, however many they are.
+
+#![allow(
+    unsafe_code,
+    clippy::unwrap_used,
+    reason = "counting allocations takes an allocator; tests assert by unwrapping"
+)]
+
+mod common;
+
+use std::{
+    alloc::{GlobalAlloc, Layout, System},
+    cell::Cell,
+};
+
+use ipc_schema::{
+    header::{FIRST_OF_EPISODE, MessageHeader},
+    observation::ObservationLayout,
+    world::SubStep,
+};
+use sensor_daemon::sensing::{Sensing, World};
+
+thread_local! {
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+/// The system's allocator, counting what this thread asks for.
+struct Counting;
+
+// SAFETY: all calls go to the system's allocator as they are; the counter neither allocates nor unwinds.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
+        // SAFETY: the caller keeps the contract of `alloc`.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller keeps the contract of `dealloc`.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+const SUB_STEPS: usize = 10;
+
+#[test]
+fn a_tick_allocates_nothing() {
+    let mut config = common::config();
+    config.observation.history = 2;
+    config.gnss.correlated_std_m = [1.0; 3];
+    config.imu.period_s = 0.01;
+    let mut sensing = Sensing::new(&config, &common::map()).unwrap();
+    let states = common::cavs(300);
+    let sub_steps = vec![SubStep::default(); states.len() * SUB_STEPS];
+    let world = World {
+        states: &states,
+        sub_steps: &sub_steps,
+        views: &[],
+    };
+    let mut payload = Vec::new();
+    for tick in 0..20_u64 {
+        let header = MessageHeader {
+            flags: if tick == 0 { FIRST_OF_EPISODE } else { 0 },
+            tick,
+            sim_time_ns: (tick + 1) * 100_000_000,
+            ..MessageHeader::default()
+        };
+        let layout = ObservationLayout::new(states.len(), sensing.width(), sensing.imu_samples());
+        payload.clear();
+        payload.resize(layout.len.div_ceil(8), 0_u64);
+        let before = ALLOCATIONS.get();
+        sensing.assign(&header, &states);
+        sensing
+            .observe(&header, &world, bytemuck::cast_slice_mut(&mut payload))
+            .unwrap();
+        let allocated = ALLOCATIONS.get() - before;
+        // The first ticks make room.
+        assert!(tick < 2 || allocated == 0, "tick {tick}: {allocated}");
+    }
+    assert!(ALLOCATIONS.get() > 0, "nothing was counted");
+}

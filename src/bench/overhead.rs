@@ -1,0 +1,97 @@
+//! What co-simulation costs beside bare SUMO on the same scenario.
+
+use super::{
+    Options, Report, Spread, Table,
+    sides::{Ours, Place, Scenario, same_results},
+    stages::Stages,
+};
+use crate::{failure::Exit, generate::City, install::Install};
+
+/// Vehicles, simulated seconds, pairs.
+const SIZE: (u32, f64, usize) = (5000, 60.0, 5);
+/// The same when only the way is tried.
+const QUICK: (u32, f64, usize) = (60, 6.0, 1);
+
+/// Runs bare SUMO and ours in turn on a generated city.
+///
+/// # Errors
+/// Either fails, or SUMO's results differ.
+pub fn measure(options: &Options) -> Result<Report, Exit> {
+    let (vehicles, duration_s, pairs) = if options.quick { QUICK } else { SIZE };
+    let place = Place::new("overhead")?;
+    let install = Install::find()?;
+    let sumocfg = City::of(vehicles, duration_s, 0.1, 1).write(&install, &place.path().join("city"))?;
+    let mut scenario = Scenario::new(options, &place, install, sumocfg, 1.0, vehicles)?;
+    let mut table = Table::new(
+        "Alternating pairs",
+        &["pair", "sumo, s", "ours, s", "ratio", "sumo, CPU s", "ours, CPU s"],
+    );
+    let (mut ratios, mut last, mut files) = (Vec::new(), None, 0);
+    for pair in 1..=pairs {
+        let (bare, results) = scenario.bare()?;
+        let ours = scenario.ours()?;
+        files = same_results(&results, &ours.results)?;
+        let ratio = ours.taken.wall_s / bare.wall_s;
+        table.row([
+            pair.to_string(),
+            format!("{:.2}", bare.wall_s),
+            format!("{:.2}", ours.taken.wall_s),
+            format!("{ratio:.3}"),
+            format!("{:.2}", bare.cpu_s),
+            format!("{:.2}", ours.taken.cpu_s),
+        ]);
+        ratios.push(ratio);
+        last = Some(ours);
+    }
+    let ratio = Spread::of(ratios)?;
+    let mut report = Report::new(
+        "overhead",
+        "Co-simulation beside bare SUMO",
+        format!(
+            "{vehicles} vehicles on a generated city (`caraware generate`), {duration_s} s at steps of 0.1 s: bare `sumo`, then ours, in turn. \
+             Ours moves every vehicle at 100 Hz, samples GNSS, IMU, speed and steering of all of them every 0.1 s, and delivers them to a \
+             consumer's torch tensor in a process of its own. Wall time from start to end of the program, loading included: ratio {ratio:.3}. \
+             The {files} result files of SUMO are identical in both, but for the comment at their head and the milliseconds that a step took."
+        ),
+    );
+    report.figure("ratio of wall times", ratio.median);
+    report.figure("result files compared", files as f64);
+    report.tables.push(table);
+    if let Some(ours) = last {
+        let table = stages(&ours, &mut report);
+        report.tables.push(table);
+    }
+    Ok(report)
+}
+
+/// Where processor time goes in one run.
+fn stages(ours: &Ours, report: &mut Report) -> Table {
+    let stages = Stages::of(ours);
+    let mut table = Table::new(
+        "Where processor time goes (the last pair)",
+        &["stage", "CPU s", "µs per vehicle-step", "share"],
+    );
+    for (name, seconds) in stages.named() {
+        let each = stages.per_step_us(seconds);
+        table.row([
+            name.to_owned(),
+            format!("{seconds:.2}"),
+            format!("{each:.3}"),
+            format!("{:.1} %", 100.0 * seconds / ours.taken.cpu_s),
+        ]);
+        report.figure(format!("{name}, µs per vehicle-step"), each);
+    }
+    let (start, rest) = (stages.start_s, (ours.taken.cpu_s - stages.sum_s()).max(0.0));
+    for (name, seconds) in [
+        ("loading, all processes", start),
+        ("supervisor and the rest", rest - start),
+    ] {
+        table.row([
+            name.to_owned(),
+            format!("{seconds:.2}"),
+            String::new(),
+            format!("{:.1} %", 100.0 * seconds / ours.taken.cpu_s),
+        ]);
+    }
+    table
+}

@@ -1,0 +1,226 @@
+//! Cost and memory for each vehicle, from a thousand to fifty thousand; and what a real motorway and long steps of SUMO do.
+
+use super::{
+    Curve, Line, Options, Report, Table,
+    sides::{Ours, Place, Scenario, Taken, same_results},
+    stages::Stages,
+};
+use crate::{failure::Exit, generate::City, install::Install};
+
+/// Vehicles and simulated seconds of each city.
+const CITIES: [(u32, f64); 5] = [
+    (1000, 60.0),
+    (5000, 60.0),
+    (10_000, 40.0),
+    (20_000, 20.0),
+    (50_000, 12.0),
+];
+/// The same when only the way is tried.
+const QUICK: [(u32, f64); 2] = [(50, 5.0), (100, 5.0)];
+/// Vehicles and simulated seconds of the city at steps of 1 s.
+const LONG_STEPS: (u32, f64) = (20_000, 60.0);
+const LONG_STEPS_QUICK: (u32, f64) = (100, 10.0);
+/// Factors on the motorway's demand.
+const MOTORWAY_SCALES: [f64; 2] = [1.0, 3.0];
+/// Room for the road users of the motorway at the largest factor.
+const MOTORWAY_ROAD_USERS: u32 = 8192;
+
+/// One case on both sides.
+struct Case {
+    vehicles: u32,
+    bare: Taken,
+    ours: Ours,
+    stages: Stages,
+}
+
+impl Case {
+    fn measure(scenario: &mut Scenario, vehicles: u32) -> Result<Self, Exit> {
+        let (bare, results) = scenario.bare()?;
+        let ours = scenario.ours()?;
+        same_results(&results, &ours.results)?;
+        let stages = Stages::of(&ours);
+        Ok(Self {
+            vehicles,
+            bare,
+            ours,
+            stages,
+        })
+    }
+
+    /// Cost of a vehicle-step outside SUMO, µs.
+    fn outside_us(&self) -> f64 {
+        self.stages.per_step_us(self.stages.outside_s())
+    }
+
+    /// Most memory of the three processes that hold vehicles, KiB for each vehicle; shared memory counts in each that touches it.
+    fn memory_kib(&self) -> f64 {
+        let processes = ["traffic-bridge", "sim-core", "sensor-daemon"];
+        let mib = processes.map(|name| self.ours.number(&format!("/processes/{name}/peak_memory_mib")));
+        1024.0 * mib.iter().sum::<f64>() / f64::from(self.vehicles)
+    }
+}
+
+/// Runs all cases, each once on both sides.
+///
+/// # Errors
+/// A run fails, or SUMO's results differ.
+pub fn measure(options: &Options) -> Result<Report, Exit> {
+    let place = Place::new("scale")?;
+    let mut report = Report::new(
+        "scale",
+        "From a thousand to fifty thousand vehicles",
+        "Generated cities with ten vehicles on a kilometre of lane (`caraware generate`), every vehicle dynamic at 100 Hz and sensing every 0.1 s, \
+         delivered to a consumer's tensor. Processor time in the loop for each sensed vehicle-step, loading left out; memory is the most that \
+         the bridge with SUMO, dynamics and sensors held, for each vehicle, shared memory counted in each of them.",
+    );
+    let cities = if options.quick { &QUICK[..] } else { &CITIES[..] };
+    let mut cases = Vec::new();
+    for &(vehicles, duration_s) in cities {
+        cases.push(city(options, &place, vehicles, duration_s, 0.1)?);
+    }
+    report.tables.push(costs(&cases));
+    report.curves.push(curve(&cases));
+    for case in &cases {
+        report.figure(
+            format!("{} vehicles, µs per vehicle-step outside SUMO", case.vehicles),
+            case.outside_us(),
+        );
+        report.figure(
+            format!("{} vehicles, KiB per vehicle", case.vehicles),
+            case.memory_kib(),
+        );
+    }
+    let at = |vehicles| {
+        cases
+            .iter()
+            .find(|case| case.vehicles == vehicles)
+            .map(Case::outside_us)
+    };
+    if let (Some(few), Some(many)) = (at(5000), at(50_000)) {
+        report.figure("cost outside SUMO at 50 000 vehicles over that at 5 000", many / few);
+        report.text += &format!(
+            " Outside SUMO a vehicle-step at 50 000 vehicles costs {:.2} × one at 5 000.",
+            many / few
+        );
+    }
+    large(options, &place, &mut report)?;
+    Ok(report)
+}
+
+fn city(options: &Options, place: &Place, vehicles: u32, duration_s: f64, step_s: f64) -> Result<Case, Exit> {
+    let install = Install::find()?;
+    let directory = place.path().join(format!("city-{vehicles}-{step_s}"));
+    let sumocfg = City::of(vehicles, duration_s, step_s, 1).write(&install, &directory)?;
+    let mut scenario = Scenario::new(options, place, install, sumocfg, 1.0, vehicles)?;
+    Case::measure(&mut scenario, vehicles)
+}
+
+fn costs(cases: &[Case]) -> Table {
+    let mut table = Table::new(
+        "µs per vehicle-step",
+        &[
+            "vehicles",
+            "SUMO's own step",
+            "getters",
+            "conversion",
+            "dynamics",
+            "sensors",
+            "consumer",
+            "all outside SUMO",
+            "KiB per vehicle",
+            "wall, × sumo",
+        ],
+    );
+    for case in cases {
+        let each = |seconds| format!("{:.3}", case.stages.per_step_us(seconds));
+        table.row([
+            case.vehicles.to_string(),
+            each(case.stages.sumo_s),
+            each(case.stages.getters_s),
+            each(case.stages.bridge_s),
+            each(case.stages.dynamics_s),
+            each(case.stages.sensors_s),
+            each(case.stages.consumer_s),
+            each(case.stages.outside_s()),
+            format!("{:.1}", case.memory_kib()),
+            format!("{:.2}", case.ours.taken.wall_s / case.bare.wall_s),
+        ]);
+    }
+    table
+}
+
+fn curve(cases: &[Case]) -> Curve {
+    let line = |name: &str, of: fn(&Stages) -> f64| Line {
+        name: name.to_owned(),
+        points: cases
+            .iter()
+            .map(|case| [f64::from(case.vehicles), case.stages.per_step_us(of(&case.stages))])
+            .collect(),
+    };
+    Curve {
+        name: "scale".into(),
+        title: "Cost of a vehicle-step".into(),
+        x: "vehicles".into(),
+        y: "processor time, µs".into(),
+        logarithmic: [true, true],
+        lines: vec![
+            line("SUMO's own step", |stages| stages.sumo_s),
+            line("everything else", Stages::outside_s),
+            line("dynamics", |stages| stages.dynamics_s),
+            line("sensors", |stages| stages.sensors_s),
+            line("getters", |stages| stages.getters_s),
+        ],
+    }
+}
+
+/// Steps of SUMO that are longer than a tick, and SUMO's own motorway at increased demand.
+fn large(options: &Options, place: &Place, report: &mut Report) -> Result<(), Exit> {
+    let mut table = Table::new(
+        "SUMO steps longer than the tick of 0.1 s",
+        &[
+            "scenario",
+            "at once",
+            "sensed vehicle-steps",
+            "of them a second",
+            "× real time",
+            "sumo, s",
+            "ours, s",
+            "ratio",
+        ],
+    );
+    let (vehicles, duration_s) = if options.quick { LONG_STEPS_QUICK } else { LONG_STEPS };
+    let case = city(options, place, vehicles, duration_s, 1.0)?;
+    report.figure(
+        format!("{vehicles} vehicles at steps of 1 s, sensed vehicle-steps/s"),
+        case.ours.number("/env_steps_per_s"),
+    );
+    table.row(row(&format!("city of {vehicles}, steps of 1 s"), &case));
+    let scales = if options.quick { &[][..] } else { &MOTORWAY_SCALES[..] };
+    for &scale in scales {
+        let install = Install::find()?;
+        let sumocfg = install.sumo_home.join("tools/game/A10KW.sumocfg");
+        let mut scenario = Scenario::new(options, place, install, sumocfg, scale, MOTORWAY_ROAD_USERS)?;
+        let case = Case::measure(&mut scenario, 1)?;
+        report.figure(
+            format!("A10KW at {scale} × its demand, × real time"),
+            case.ours.number("/real_time_factor"),
+        );
+        table.row(row(&format!("A10KW, demand × {scale}, steps of 0.5 s"), &case));
+    }
+    report.tables.push(table);
+    Ok(())
+}
+
+fn row(name: &str, case: &Case) -> [String; 8] {
+    let ours = &case.ours;
+    [
+        name.to_owned(),
+        format!("{:.0}", ours.number("/vehicles")),
+        format!("{:.0}", ours.number("/vehicle_steps")),
+        format!("{:.0}", ours.number("/env_steps_per_s")),
+        format!("{:.1}", ours.number("/real_time_factor")),
+        format!("{:.2}", case.bare.wall_s),
+        format!("{:.2}", ours.taken.wall_s),
+        format!("{:.2}", ours.taken.wall_s / case.bare.wall_s),
+    ]
+}

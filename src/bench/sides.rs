@@ -1,0 +1,303 @@
+//! The two sides of a comparison with SUMO alone: the bare program, and ours with a consumer of every observation, on one scenario.
+
+use std::{
+    path::{Path, PathBuf},
+    process::{Command, Stdio},
+    time::Instant,
+};
+
+use ipc_schema::usage;
+use rustix::{
+    io::Errno,
+    process::{Pid, WaitId, WaitIdOptions, waitid},
+};
+use serde_json::Value;
+
+use super::Options;
+use crate::{failure::Exit, install, install::Install};
+
+/// Vehicle-ticks that ours may run ahead: with 5 000 vehicles as long as the consumer takes to import torch.
+const WINDOW_VEHICLE_TICKS: u32 = 64 * 5000;
+/// Steps up to the root directory from anywhere: SUMO puts the prefix behind the folder of the scenario.
+const TO_THE_ROOT: usize = 128;
+
+/// What a program took.
+#[derive(Debug, Clone, Copy)]
+pub struct Taken {
+    /// From its start to its end, seconds.
+    pub wall_s: f64,
+    /// Processor time of it and of all it started, seconds.
+    pub cpu_s: f64,
+}
+
+/// Ours: what it took and what it reports.
+#[derive(Debug, Clone)]
+pub struct Ours {
+    /// What it took.
+    pub taken: Taken,
+    /// Its `report.json`.
+    pub report: Value,
+    /// Where SUMO wrote its results.
+    pub results: PathBuf,
+}
+
+impl Ours {
+    /// A number of the report, by its path.
+    #[must_use]
+    pub fn number(&self, path: &str) -> f64 {
+        self.report.pointer(path).and_then(Value::as_f64).unwrap_or(0.0)
+    }
+}
+
+/// A directory for a measurement, removed at its end.
+#[derive(Debug)]
+pub struct Place(PathBuf);
+
+impl Place {
+    /// A new one below the system's directory for temporary files.
+    ///
+    /// # Errors
+    /// Not writable.
+    pub fn new(part: &str) -> Result<Self, Exit> {
+        let path = std::env::temp_dir().join(format!("caraware-bench-{part}-{}", std::process::id()));
+        std::fs::create_dir_all(&path).map_err(|error| Exit::io("create", &path, &error))?;
+        Ok(Self(path))
+    }
+
+    /// Where it is.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        if let Err(error) = std::fs::remove_dir_all(&self.0) {
+            tracing::warn!(%error, path = %self.0.display(), "cannot remove what a measurement leaves");
+        }
+    }
+}
+
+/// One scenario for both sides.
+#[derive(Debug)]
+pub struct Scenario<'a> {
+    place: &'a Place,
+    install: Install,
+    program: PathBuf,
+    sumocfg: PathBuf,
+    /// Factor on its demand.
+    scale: f64,
+    max_road_users: u32,
+    /// Runs so far.
+    runs: u32,
+}
+
+impl<'a> Scenario<'a> {
+    /// `sumocfg` with `scale` times its demand, with at most `max_road_users` at once.
+    ///
+    /// # Errors
+    /// Our program is not built.
+    pub fn new(
+        options: &Options,
+        place: &'a Place,
+        install: Install,
+        sumocfg: PathBuf,
+        scale: f64,
+        max_road_users: u32,
+    ) -> Result<Self, Exit> {
+        Ok(Self {
+            place,
+            program: install::program(&options.bin, "caraware")?,
+            install,
+            sumocfg,
+            scale,
+            max_road_users,
+            runs: 0,
+        })
+    }
+
+    /// Runs bare SUMO; its results are in the directory returned.
+    ///
+    /// # Errors
+    /// SUMO fails.
+    pub fn bare(&mut self) -> Result<(Taken, PathBuf), Exit> {
+        self.runs += 1;
+        let results = self.place.path().join(format!("bare-{}", self.runs));
+        std::fs::create_dir_all(&results).map_err(|error| Exit::io("create", &results, &error))?;
+        let from_root = results.to_string_lossy().trim_start_matches('/').to_owned();
+        let data = self.install.sumo_home.join("data/proj");
+        let mut command = Command::new(self.install.sumo_program("sumo"));
+        command
+            .arg("-c")
+            .arg(&self.sumocfg)
+            .arg("--output-prefix")
+            .arg(format!("{}{from_root}/", "../".repeat(TO_THE_ROOT)))
+            .args(["--scale", &self.scale.to_string(), "--no-step-log", "true"])
+            .env("SUMO_HOME", &self.install.sumo_home)
+            .env("PROJ_DATA", &data)
+            .env("PROJ_LIB", &data);
+        Ok((self.take(&mut command)?, results))
+    }
+
+    /// Runs ours, every vehicle sensing, every observation delivered to the consumer.
+    ///
+    /// # Errors
+    /// The run fails.
+    pub fn ours(&mut self) -> Result<Ours, Exit> {
+        self.runs += 1;
+        let name = format!("ours-{}", self.runs);
+        let runs = self.place.path().join("runs");
+        let mut command = Command::new(&self.program);
+        command
+            .arg("train")
+            .arg(&self.sumocfg)
+            .args(["--name", &name])
+            .arg("--runs")
+            .arg(&runs);
+        let settings = [
+            "trainer.module=caraware.consumer".to_owned(),
+            "episode.whole_scenario=true".to_owned(),
+            "fanout.enabled=false".to_owned(),
+            "traffic.cav_share=1.0".to_owned(),
+            format!(
+                "run.window_ticks={}",
+                (WINDOW_VEHICLE_TICKS / self.max_road_users).clamp(8, 64)
+            ),
+            format!("traffic.scale={}", self.scale),
+            format!("traffic.max_road_users={}", self.max_road_users),
+        ];
+        settings.iter().for_each(|setting| {
+            command.args(["--set", setting]);
+        });
+        let taken = self.take(&mut command)?;
+        let path = runs.join(&name).join("report.json");
+        let text = std::fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
+        let report: Value =
+            serde_json::from_str(&text).map_err(|error| Exit::run(format!("{}: {error}", path.display()), ""))?;
+        if report["trainer"]["received_ticks"] != report["ticks"] {
+            return Err(Exit::run(
+                format!(
+                    "the consumer got {} of {} ticks",
+                    report["trainer"]["received_ticks"], report["ticks"]
+                ),
+                "",
+            ));
+        }
+        let results = runs.join(&name).join("sumo");
+        Ok(Ours { taken, report, results })
+    }
+
+    /// Runs a program that must succeed; what it says goes to a file.
+    fn take(&self, command: &mut Command) -> Result<Taken, Exit> {
+        let program = command.get_program().to_string_lossy().into_owned();
+        let path = self.place.path().join("output.txt");
+        let output = std::fs::File::create(&path).map_err(|error| Exit::io("create", &path, &error))?;
+        let errors = output.try_clone().map_err(|error| Exit::io("create", &path, &error))?;
+        let begin = Instant::now();
+        let failed = |error: &std::io::Error| Exit::io("start", program.as_ref(), error);
+        let mut child = command
+            .stdin(Stdio::null())
+            .stdout(output)
+            .stderr(errors)
+            .spawn()
+            .map_err(|error| failed(&error))?;
+        let pid = i32::try_from(child.id()).ok().and_then(Pid::from_raw);
+        if let Some(pid) = pid {
+            // Its end is awaited without taking note of it, so that the system still knows what it used.
+            let options = WaitIdOptions::EXITED | WaitIdOptions::NOWAIT;
+            while matches!(waitid(WaitId::Pid(pid), options), Err(Errno::INTR)) {}
+        }
+        let wall_s = begin.elapsed().as_secs_f64();
+        let cpu_s = usage::of_family_s(child.id()).unwrap_or(0.0);
+        let status = child.wait().map_err(|error| failed(&error))?;
+        if status.success() {
+            return Ok(Taken { wall_s, cpu_s });
+        }
+        let text = std::fs::read_to_string(&path).unwrap_or_default();
+        let tail: Vec<&str> = text.lines().rev().take(12).collect();
+        Err(Exit::run(
+            format!(
+                "{program} ended with {status}\n{}",
+                tail.into_iter().rev().collect::<Vec<_>>().join("\n")
+            ),
+            "",
+        ))
+    }
+}
+
+/// Compares the files that SUMO wrote on both sides and returns how many they are.
+///
+/// Left out: the comment at the head of each, which tells time and options, and in summaries the milliseconds that a step took.
+///
+/// # Errors
+/// One is missing or differs.
+pub fn same_results(bare: &Path, ours: &Path) -> Result<usize, Exit> {
+    let names = |directory: &Path| -> Result<Vec<String>, Exit> {
+        let entries = std::fs::read_dir(directory).map_err(|error| Exit::io("list", directory, &error))?;
+        let mut names: Vec<_> = entries
+            .flatten()
+            .map(|entry| entry.file_name().to_string_lossy().into_owned())
+            .collect();
+        names.sort();
+        Ok(names)
+    };
+    let (theirs, files) = (names(bare)?, names(ours)?);
+    let differ = |what: String| Exit::run(what, "the mirror must not change what SUMO does: please report this");
+    if theirs != files {
+        return Err(differ(format!("bare SUMO wrote {theirs:?}, ours {files:?}")));
+    }
+    for name in &files {
+        let read = |directory: &Path| {
+            let path = directory.join(name);
+            std::fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))
+        };
+        let (bare, ours) = (read(bare)?, read(ours)?);
+        let unlike = content(&bare).zip(content(&ours)).find(|(a, b)| a != b);
+        if let Some((bare, ours)) = unlike {
+            return Err(differ(format!("{name} differs:\n{bare}\n{ours}")));
+        }
+        if content(&bare).count() != content(&ours).count() {
+            return Err(differ(format!("{name} is longer on one side")));
+        }
+    }
+    Ok(files.len())
+}
+
+/// The lines of a result file that say something about traffic.
+fn content(text: &str) -> impl Iterator<Item = String> {
+    let body = text.split_once("-->").map_or(text, |(_, body)| body);
+    body.lines().map(|line| {
+        let is_step = line.trim_start().starts_with("<step ");
+        match line.rsplit_once(" duration=") {
+            Some((traffic, _)) if is_step => traffic.to_owned(),
+            _ => line.to_owned(),
+        }
+    })
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn results_differ_in_traffic_alone() {
+        let [bare, ours] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+        let write = |directory: &tempfile::TempDir, name: &str, text: &str| {
+            std::fs::write(directory.path().join(name), text).unwrap();
+        };
+        let compare = || same_results(bare.path(), ours.path());
+        write(&bare, "a.xml", "<!-- 1 --><s>\n <step n=\"1\" duration=\"4\"/>\n</s>");
+        write(&ours, "a.xml", "<!-- 2 --><s>\n <step n=\"1\" duration=\"5\"/>\n</s>");
+        assert_eq!(compare().unwrap(), 1);
+        write(&bare, "b.xml", "<trip duration=\"4\"/>");
+        assert!(compare().is_err(), "a file is missing");
+        write(&ours, "b.xml", "<trip duration=\"5\"/>");
+        assert!(compare().is_err(), "a trip took longer");
+        write(&ours, "b.xml", "<trip duration=\"4\"/>\n<trip/>");
+        assert!(compare().is_err(), "a trip more");
+        write(&ours, "b.xml", "<trip duration=\"4\"/>");
+        assert_eq!(compare().unwrap(), 2);
+    }
+}
