@@ -123,8 +123,10 @@ fn users_read_and_commanders_command() {
         sim.board_of(Process::Fanout).unwrap().progress().attached == 1
     });
     let frames = harness::watch(&alice, run.key(Topic::World));
+    // Only a fresh tick goes out, and the first may be gone before the subscription is there.
+    let mut tick = 0..;
     until("a subscription", || {
-        send_world(&sim, &worlds, 0, 0, 3);
+        send_world(&sim, &worlds, tick.next().unwrap(), 0, 3);
         frames.try_recv().unwrap().is_some()
     });
     assert!(ask(&alice, &run.key(Topic::Map)).is_some());
