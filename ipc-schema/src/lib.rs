@@ -22,6 +22,7 @@
 pub mod block;
 pub mod board;
 mod board_port;
+pub mod clock;
 pub mod config;
 pub mod control;
 mod control_port;

@@ -1,14 +1,17 @@
 //! What a process has used of the machine: for the report of a run.
 
+use rustix::time::ClockId;
 use serde::Serialize;
 
-/// Clock ticks in a second, as Linux tells processor time on every machine.
+use crate::clock;
+
+/// Clock ticks in a second, as Linux tells the processor time of other processes on every machine.
 const CLOCK_TICKS_PER_S: f64 = 100.0;
 
 /// Processor time and memory of one process.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Usage {
-    /// Processor time of all threads since the process started, seconds, to 10 ms.
+    /// Processor time of all threads since the process started, seconds.
     pub cpu_s: f64,
     /// The part of it since all ports were open: without loading programs, maps and scenes.
     pub loop_cpu_s: f64,
@@ -29,25 +32,24 @@ impl Usage {
     }
 }
 
-/// Processor time of all threads of this process, seconds; 0 if the system does not tell.
+/// Processor time of all threads of this process, seconds.
 #[must_use]
 pub fn processor_time_s() -> f64 {
-    let text = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    ticks(&text, 2).map_or(0.0, |ticks| ticks / CLOCK_TICKS_PER_S)
+    clock::seconds(ClockId::ProcessCPUTime)
 }
 
 /// Processor time of a process that nobody has taken note of yet if it has ended, and of its children that it has, seconds.
 #[must_use]
 pub fn of_family_s(pid: u32) -> Option<f64> {
     let text = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    Some(ticks(&text, 4)? / CLOCK_TICKS_PER_S)
+    Some(family_ticks(&text)? / CLOCK_TICKS_PER_S)
 }
 
-/// Sum of `count` fields of `/proc/<pid>/stat` from the 14th on, counted from the name in brackets, which is the second: user and
-/// system time of the process, and those of its children.
-fn ticks(stat: &str, count: usize) -> Option<f64> {
+/// Sum of the fields 14 to 17 of `/proc/<pid>/stat`, counted from the name in brackets, which is the second: user and system time
+/// of the process, and those of its children.
+fn family_ticks(stat: &str) -> Option<f64> {
     let (_, fields) = stat.rsplit_once(')')?;
-    let numbers = fields.split_whitespace().skip(11).take(count);
+    let numbers = fields.split_whitespace().skip(11).take(4);
     numbers.map(|text| text.parse::<f64>().ok()).sum()
 }
 
@@ -65,7 +67,7 @@ mod tests {
     #[test]
     fn the_name_of_a_program_may_hold_anything() {
         let stat = "7 (a) b (c)) S 1 7 7 0 -1 4 100 0 0 0 250 50 9 9 20 0 1 0 5 6 7";
-        assert_eq!([ticks(stat, 2), ticks(stat, 4)], [Some(300.0), Some(318.0)]);
+        assert_eq!(family_ticks(stat), Some(318.0));
     }
 
     #[test]

@@ -11,6 +11,7 @@ use std::{
 use ipc_schema::{
     block,
     board::State,
+    clock::monotonic_ns,
     header::{LAST_OF_RUN, MessageHeader},
     observation::ObservationLayout,
     ports::{BoardReader, RosterWriter},
@@ -19,7 +20,6 @@ use ipc_schema::{
     services::{self, Channel, ServiceHolder},
     session::Session,
 };
-use rustix::time::{ClockId, clock_gettime};
 use serde::Deserialize;
 
 use super::{Curve, Line, Options, Report, Table};
@@ -221,7 +221,7 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut Receiver) -> Resu
                 columns: u32::try_from(FIELDS).unwrap_or(u32::MAX),
                 sequence: 1,
                 flags: if is_last { LAST_OF_RUN } else { 0 },
-                sim_time_ns: now_ns(),
+                sim_time_ns: monotonic_ns(),
                 ..session.header()
             };
             draft.send()?;
@@ -229,12 +229,6 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut Receiver) -> Resu
         }
     }
     Ok(())
-}
-
-/// The system's monotonic clock, the same in all processes and in Python.
-fn now_ns() -> u64 {
-    let time = clock_gettime(ClockId::Monotonic);
-    u64::try_from(time.tv_sec).unwrap_or_default() * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap_or_default()
 }
 
 fn peers(options: &Options) -> Result<BTreeMap<String, BySize>, Exit> {

@@ -9,6 +9,7 @@ use std::{
 use ipc_schema::{
     block::Section,
     board::{State, TrainingStatus},
+    clock::monotonic_ns,
     header::{self, MessageHeader},
     observation::ObservationLayout,
     ports::{BoardReader, Message, Publisher, Subscriber, Waker},
@@ -22,8 +23,6 @@ use pyo3::{
     exceptions::{PyKeyError, PyRuntimeError, PyValueError},
     prelude::*,
 };
-
-use rustix::time::{ClockId, clock_gettime};
 
 mod scans;
 mod view;
@@ -373,13 +372,6 @@ impl Attachment {
     }
 }
 
-/// The system's monotonic clock, the same in all processes and in Python's `time.monotonic_ns`.
-fn now_ns() -> u64 {
-    let time = clock_gettime(ClockId::Monotonic);
-    let seconds = u64::try_from(time.tv_sec).unwrap_or_default();
-    seconds * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap_or_default()
-}
-
 /// The header of an answer to `question`: our identity, its episode, tick, time and count.
 fn answer(ours: MessageHeader, question: &MessageHeader) -> MessageHeader {
     MessageHeader {
@@ -409,7 +401,7 @@ struct ObservationBlock {
 
 impl ObservationBlock {
     fn new(message: Message) -> PyResult<Self> {
-        let received_ns = now_ns();
+        let received_ns = monotonic_ns();
         let header = *message.header();
         let payload_address = message.payload().as_ptr().expose_provenance();
         let layout = ObservationLayout::of(&header);

@@ -18,7 +18,7 @@ use iceoryx2::{
     prelude::{FileName, NodeBuilder, Path as IpcPath, SemanticString as _, ServiceName, ipc},
     service::port_factory::publish_subscribe::PortFactory,
 };
-use rustix::time::{ClockId, clock_gettime};
+use ipc_schema::clock::monotonic_ns;
 
 /// Messages before the measurement, while pages and caches warm up.
 const WARM_UP: u64 = 2_000;
@@ -29,10 +29,26 @@ const PAUSE_NS: u64 = 20_000;
 const STAMPS: &str = "stamps";
 const TAKEN: &str = "taken";
 
-/// The system's monotonic clock, nanoseconds, the same in all processes.
-fn now_ns() -> u64 {
-    let time = clock_gettime(ClockId::Monotonic);
-    u64::try_from(time.tv_sec).unwrap() * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap()
+/// What the names of the shared memory of a measurement below `root` begin with.
+fn prefix(root: &Path) -> String {
+    format!("{}_", root.file_name().unwrap().to_string_lossy())
+}
+
+/// The shared memory of a measurement: whatever is left of it goes with this.
+struct Place {
+    root: PathBuf,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let prefix = prefix(&self.root);
+        for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+            if entry.file_name().to_string_lossy().starts_with(&prefix) {
+                let _ = std::fs::remove_file(entry.path());
+            }
+        }
+        let _ = std::fs::remove_dir_all(&self.root);
+    }
 }
 
 /// The service `name` below `root`.
@@ -41,7 +57,7 @@ fn service(root: &Path, name: &str) -> PortFactory<ipc::Service, u64, ()> {
     config
         .global
         .set_root_path(&IpcPath::new(root.as_os_str().as_encoded_bytes()).unwrap());
-    config.global.prefix = FileName::new(b"caraware_bench_").unwrap();
+    config.global.prefix = FileName::new(prefix(root).as_bytes()).unwrap();
     let node = NodeBuilder::new().config(&config).create::<ipc::Service>().unwrap();
     node.service_builder(&ServiceName::new(name).unwrap())
         .publish_subscribe::<u64>()
@@ -61,7 +77,7 @@ fn receive(root: &Path, messages: u64, json: &Path) {
             }
             std::hint::spin_loop();
         };
-        latencies.push(now_ns() - *sample);
+        latencies.push(monotonic_ns() - *sample);
         drop(sample);
         taken.send_copy(0).unwrap();
     }
@@ -73,12 +89,12 @@ fn send(root: &Path, messages: u64) {
     let publisher = service(root, STAMPS).publisher_builder().create().unwrap();
     let taken = service(root, TAKEN).subscriber_builder().create().unwrap();
     for _ in 0..messages + WARM_UP {
-        let begin = now_ns();
-        while now_ns() - begin < PAUSE_NS {
+        let begin = monotonic_ns();
+        while monotonic_ns() - begin < PAUSE_NS {
             std::hint::spin_loop();
         }
         let sample = publisher.loan_uninit().unwrap();
-        sample.write_payload(now_ns()).send().unwrap();
+        sample.write_payload(monotonic_ns()).send().unwrap();
         while taken.receive().unwrap().is_none() {
             std::hint::spin_loop();
         }
@@ -105,6 +121,7 @@ fn main() {
     }
     let root = std::env::temp_dir().join(format!("ipc-bench-{}", std::process::id()));
     std::fs::create_dir_all(&root).unwrap();
+    let place = Place { root: root.clone() };
     // Held here, so that the service outlives whoever leaves first.
     let held = [STAMPS, TAKEN].map(|name| service(&root, name));
     let mut receiver = Command::new(std::env::current_exe().unwrap())
@@ -120,6 +137,6 @@ fn main() {
     send(&root, messages);
     let status = receiver.wait().unwrap();
     drop(held);
-    std::fs::remove_dir_all(&root).unwrap();
+    drop(place);
     assert!(status.success(), "the receiver ended with {status}");
 }

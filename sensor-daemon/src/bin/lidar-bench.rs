@@ -144,8 +144,7 @@ impl Round {
 
 /// Time that this thread has had a core, seconds: others may be at work on the machine.
 fn cpu_s() -> f64 {
-    let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
-    time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
+    ipc_schema::clock::seconds(rustix::time::ClockId::ThreadCPUTime)
 }
 
 /// A city, its traffic tick by tick, and LIDARs in it that write into shared memory.
