@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 import torch
-from caraware.benchmark_trainer import BATCH, EPOCHS, HORIZON, OBSERVATIONS, PlainAgent, plain_update, random_batch
+from caraware.benchmarks.trainer import BATCH, EPOCHS, HORIZON, OBSERVATIONS, PlainAgent, plain_update, random_batch
 from caraware.config import MapBounds, TrainerConfig
 from caraware.ppo import Batch, Ppo
 

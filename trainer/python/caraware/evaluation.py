@@ -94,25 +94,20 @@ NO_HEADLINE: dict[str, float | None] = {
 """The headline of a run that has not been evaluated: every key, without a value."""
 
 
-class ErrorMeter:
-    """Running mean errors of policy and raw GNSS, in metres; cheap enough for every training tick."""
+class Mean:
+    """Mean of what comes bit by bit; the same bits for the same bits in the same order."""
 
     def __init__(self) -> None:
-        self.samples = 0
-        self._policy_sum_m = 0.0
-        self._raw_sum_m = 0.0
+        self._count, self._sum = 0, 0.0
 
-    def add(self, policy_m: np.ndarray, raw_m: np.ndarray) -> None:
-        """Add the errors `[v]` of valid rows."""
-        self.samples += len(policy_m)
-        self._policy_sum_m += float(policy_m.sum(dtype=np.float64))
-        self._raw_sum_m += float(raw_m.sum(dtype=np.float64))
+    def add(self, values: np.ndarray) -> None:
+        """Add some values."""
+        self._count += len(values)
+        self._sum += float(values.sum(dtype=np.float64))
 
-    def means_m(self) -> tuple[float, float]:
-        """Mean error of the policy and of raw GNSS; nan without samples."""
-        if self.samples == 0:
-            return math.nan, math.nan
-        return self._policy_sum_m / self.samples, self._raw_sum_m / self.samples
+    def value(self) -> float:
+        """The mean so far; nan without a value."""
+        return self._sum / self._count if self._count else math.nan
 
 
 class Evaluation:
@@ -237,19 +232,19 @@ def _pool(phase: Sequence[EvaluationResult]) -> EvaluationResult:
 
 def errors_m(obs: Observation, predictions_m: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Distances to the truth `[v]` of predictions `[n, 2]` and of raw GNSS, on the valid rows of a tick."""
-    return errors_of_ticks_m([obs], [predictions_m])[0]
+    policy = _distance_m(predictions_m.numpy(), obs.truth.numpy())[obs.valid]
+    return policy, raw_errors_m([obs])[0]
 
 
-def errors_of_ticks_m(
-    ticks: Sequence[Observation], predictions_m: Sequence[Tensor]
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """As `errors_m`, for each of some ticks: the same numbers, bit for bit, whichever ticks come together."""
+def raw_errors_m(ticks: Sequence[Observation]) -> list[np.ndarray]:
+    """Distances to the truth `[v]` of raw GNSS, on the valid rows of each of some ticks.
+
+    The same numbers, bit for bit, whichever ticks come together.
+    """
     truth = torch.cat([obs.truth for obs in ticks]).numpy()
-    policy = _distance_m(torch.cat(list(predictions_m)).numpy(), truth)
-    raw = _distance_m(torch.cat([obs.gnss_m for obs in ticks]).numpy(), truth)
+    errors = _distance_m(torch.cat([obs.gnss_m for obs in ticks]).numpy(), truth)
     ends = np.cumsum([len(obs.valid) for obs in ticks])[:-1]
-    parts = zip(ticks, np.split(policy, ends), np.split(raw, ends), strict=True)
-    return [(policy[obs.valid], raw[obs.valid]) for obs, policy, raw in parts]
+    return [error[obs.valid] for obs, error in zip(ticks, np.split(errors, ends), strict=True)]
 
 
 def _distance_m(position: np.ndarray, truth: np.ndarray) -> np.ndarray:

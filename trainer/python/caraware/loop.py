@@ -24,7 +24,7 @@ from caraware.checkpoint import (
 from caraware.config import RunConfig
 from caraware.curriculum import Curriculum
 from caraware.environment import Environment, EpisodeStarts, Place, share
-from caraware.evaluation import NO_HEADLINE, ErrorMeter, Evaluation, EvaluationResult, errors_of_ticks_m, pooled
+from caraware.evaluation import NO_HEADLINE, Evaluation, EvaluationResult, Mean, errors_m, pooled, raw_errors_m
 from caraware.manifest import Counters
 from caraware.metrics import Metrics, TrainingPoint
 from caraware.plots import plot_error, plot_sigma
@@ -121,7 +121,8 @@ class TrainingLoop:
         self._agreed_episode = 0
         self._learns = True
         """Until an environment ends before its share of the horizon is full."""
-        self._meter = ErrorMeter()
+        self._raw_gnss_error_m = Mean()
+        """Since the last update."""
         self._curriculum = Curriculum(config.curriculum, channel)
         self._curriculum.begin(learner.course.curriculum if learner else None)
         self._lesson_end: Observation | None = None
@@ -222,7 +223,7 @@ class TrainingLoop:
             for environment in going_on:
                 ticks = list(environment.pending)
                 predicted_m = [next(predictions_m) for _ in ticks]
-                if not self._take_all(environment, predicted_m, errors_of_ticks_m(ticks, predicted_m)):
+                if not self._take_all(environment, predicted_m, raw_errors_m(ticks)):
                     return
         if self._ppo is not None and self._learns:
             self._learn_or_give_up()
@@ -231,16 +232,14 @@ class TrainingLoop:
         if self._commit_due:
             self.commit()
 
-    def _take_all(
-        self, environment: Environment, predicted_m: list[Tensor], errors_m: list[tuple[np.ndarray, np.ndarray]]
-    ) -> bool:
+    def _take_all(self, environment: Environment, predicted_m: list[Tensor], raw_m: list[np.ndarray]) -> bool:
         """Take waiting ticks while the environment may go on; False if a successor takes over."""
         taken = 0
-        for prediction_m, (policy_m, raw_m) in zip(predicted_m, errors_m, strict=True):
+        for prediction_m, raw_error_m in zip(predicted_m, raw_m, strict=True):
             if not self._may_go_on(environment):
                 break
             obs = environment.pending.popleft()
-            self._take(environment, obs, prediction_m, policy_m, raw_m)
+            self._take(environment, obs, prediction_m, raw_error_m)
             taken += 1
             if taken % CREDIT_TICKS == 0:
                 environment.channel.consumed(obs.tick)
@@ -294,15 +293,8 @@ class TrainingLoop:
         predicted_m = self._ppo.supervised.predict_m(self._visible(obs).index_select(0, rows))
         return distance_m(predicted_m, obs.truth.index_select(0, rows)).numpy()
 
-    def _take(
-        self,
-        environment: Environment,
-        obs: Observation,
-        predicted_m: Tensor,
-        policy_m: np.ndarray,
-        raw_m: np.ndarray,
-    ) -> None:
-        """Everything that one tick causes; its rows' errors are those of the policy and of raw GNSS."""
+    def _take(self, environment: Environment, obs: Observation, predicted_m: Tensor, raw_m: np.ndarray) -> None:
+        """Everything that one tick causes; `raw_m` are the errors of raw GNSS on its valid rows."""
         assert self._ppo is not None
         channel = environment.channel
         estimates_m = environment.estimates_m(obs)
@@ -320,16 +312,17 @@ class TrainingLoop:
                 environment.evaluation = environment.evaluation or Evaluation(
                     self._config.sensors, supervised=self._ppo.supervised is not None
                 )
+                policy_m, _ = errors_m(obs, predicted_m)
                 environment.evaluation.add(obs, policy_m, raw_m, self._supervised_errors_m(obs))
                 environment.evaluation_tick = obs.tick
             return
         self._finish_evaluation(environment)
-        self._meter.add(policy_m, raw_m)
-        self._env_steps += len(policy_m)
+        self._raw_gnss_error_m.add(raw_m)
+        self._env_steps += len(raw_m)
         if self._learns:
             environment.rollout.add(obs)
         else:
-            self._passed_steps += len(policy_m)
+            self._passed_steps += len(raw_m)
 
     def _end_lesson(self) -> None:
         """Before the next lesson the simulation waits for its step of the curriculum."""
@@ -352,7 +345,7 @@ class TrainingLoop:
             raise
         for environment, horizon in zip(self._environments, horizons, strict=True):
             environment.committed_tick = horizon.last_tick()
-        self._record(stats)
+        self._record(stats, batch.error_m.double().mean().item())
         self._commit_due = self._ppo.updates % self._config.trainer.checkpoint_interval_updates == 0
 
     def _progress(self) -> float:
@@ -365,9 +358,9 @@ class TrainingLoop:
         """The episode of the environment that is farthest behind."""
         return min(environment.episode for environment in self._environments)
 
-    def _record(self, stats: UpdateStats) -> None:
-        error_m, raw_gnss_error_m = self._meter.means_m()
-        self._meter = ErrorMeter()
+    def _record(self, stats: UpdateStats, error_m: float) -> None:
+        raw_gnss_error_m = self._raw_gnss_error_m.value()
+        self._raw_gnss_error_m = Mean()
         now, (since, steps) = time.monotonic(), self._sample_clock
         self._sample_clock = (now, self._env_steps)
         rate = (self._env_steps - steps) / max(now - since, 1e-9)

@@ -64,6 +64,8 @@ class Batch:
     """f32 `[s]`."""
     truth: Tensor
     """f32 `[s, 4]`."""
+    error_m: Tensor
+    """f32 `[s]`: distance of the policy's mean, which nobody sampled, to the truth."""
     vehicle: Tensor
     """i64 `[s]`."""
     tick: Tensor
@@ -255,6 +257,7 @@ class Ppo:
             advantage=advantage,
             value_target=value_target,
             truth=truth,
+            error_m=rewards.distance_m(self.bounds.to_world_m(mean), truth),
             vehicle=horizon.vehicle.flatten()[rows],
             tick=horizon.tick.repeat_interleave(horizon.valid.shape[1])[rows],
         )

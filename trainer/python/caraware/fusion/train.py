@@ -22,7 +22,7 @@ from torch import Tensor
 from caraware import rewards, train
 from caraware.config import ConfigError, RunConfig
 from caraware.environment import TickLedger
-from caraware.evaluation import NO_HEADLINE, ErrorMeter, Evaluation, errors_m
+from caraware.evaluation import NO_HEADLINE, Evaluation, Mean, errors_m
 from caraware.fusion.carrier import COLUMNS, Carried, Carrier
 from caraware.fusion.learner import Episode, FusionConfig, FusionLearner, FusionStats
 from caraware.fusion.store import Progress, load_fusion, newest_sound, save_fusion
@@ -115,7 +115,8 @@ class FusionLoop:
         if progress.updates > 0:
             self._metrics.resume(progress.training, progress.evaluations, progress.env_steps)
         self._saved_updates = progress.updates
-        self._recording, self._meter = Recording(), ErrorMeter()
+        self._recording = Recording()
+        self._error_m, self._raw_gnss_error_m = Mean(), Mean()
         self._evaluation: Evaluation | None = None
         self._evaluation_tick = -1
         self._seeds_m: list[dict[str, float]] = []
@@ -163,7 +164,8 @@ class FusionLoop:
             self._left = self._leave_requested()
             return
         self._finish_evaluation()
-        self._meter.add(policy_m, raw_m)
+        self._error_m.add(policy_m)
+        self._raw_gnss_error_m.add(raw_m)
         self._env_steps += len(policy_m)
         truth_m = torch.from_numpy(np.asarray(obs.truth)[:, :2].astype(np.float32)) - self._learner.estimator.centre_m
         counts = torch.from_numpy(np.array(obs.valid)).float() * (Carried.of(table).running[:, 0] > 0)
@@ -195,8 +197,8 @@ class FusionLoop:
             self.commit()
 
     def _record(self, stats: FusionStats, episode: int) -> None:
-        error_m, raw_m = self._meter.means_m()
-        self._meter = ErrorMeter()
+        error_m, raw_m = self._error_m.value(), self._raw_gnss_error_m.value()
+        self._error_m, self._raw_gnss_error_m = Mean(), Mean()
         now, (since, steps) = time.monotonic(), self._clock
         self._clock = (now, self._env_steps)
         rate = (self._env_steps - steps) / max(now - since, 1e-9)

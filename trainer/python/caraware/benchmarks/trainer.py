@@ -1,4 +1,4 @@
-"""`python -m caraware.benchmark_trainer [--pairs N] [--threads N]`: the learner beside SB3 and a plain loop.
+"""`python -m caraware.benchmarks.trainer [--pairs N] [--threads N]`: the learner beside SB3 and a plain loop.
 
 Same networks, horizon, batch, epochs, and threads; ours and theirs alternate in one process. Prints JSON, which
 `caraware bench trainer` turns into a report. A sample visit is one sample in one epoch.
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from caraware.config import MapBounds, TrainerConfig
-from caraware.evaluation import ErrorMeter, errors_m
+from caraware.evaluation import Mean, raw_errors_m
 from caraware.ppo import Batch, Ppo
 from caraware.rollout import Rollout
 
@@ -85,6 +85,7 @@ def random_batch(ppo: Ppo) -> Batch:
         advantage=torch.randn(HORIZON),
         value_target=target,
         truth=torch.zeros(HORIZON, 4),
+        error_m=nothing,
         vehicle=nothing.long(),
         tick=nothing.long(),
     )
@@ -126,18 +127,19 @@ class FreeTicks:
             yield window
 
 
-def take(ppo: Ppo, rollout: Rollout, meter: ErrorMeter, window: list[FreeTick]) -> None:
-    """What the training loop does with the ticks that wait: one forward pass, then error and copy for each."""
-    for obs, predicted_m in zip(window, ppo.predict_m([obs.observation for obs in window]), strict=True):
-        meter.add(*errors_m(obs, predicted_m))
+def take(ppo: Ppo, rollout: Rollout, raw_m: Mean, window: list[FreeTick]) -> None:
+    """What the training loop does with the ticks that wait: one forward pass, all errors, then a copy of each."""
+    ppo.predict_m([obs.observation for obs in window])
+    for obs, error_m in zip(window, raw_errors_m(window), strict=True):
+        raw_m.add(error_m)
         rollout.add(obs)
 
 
 def our_horizon(ppo: Ppo, rollout: Rollout, ticks: Iterator[list[FreeTick]]) -> None:
     """A horizon of ticks and its update."""
-    meter = ErrorMeter()
+    raw_m = Mean()
     while not rollout.full():
-        take(ppo, rollout, meter, next(ticks))
+        take(ppo, rollout, raw_m, next(ticks))
     ppo.learn(rollout.take())
 
 
@@ -220,13 +222,13 @@ def python_calls(work: Callable[[], object]) -> int:
 
 def measure_tick(ppo: Ppo, vehicles: int) -> dict[str, float]:
     """What a tick of so many vehicles costs before the update: time, and calls from Python, which must not grow."""
-    rollout, meter, ticks = Rollout(10**9, OBSERVATIONS, bootstrap=False), ErrorMeter(), iter(FreeTicks(vehicles))
+    rollout, raw_m, ticks = Rollout(10**9, OBSERVATIONS, bootstrap=False), Mean(), iter(FreeTicks(vehicles))
     for _ in range(2):
-        take(ppo, rollout, meter, next(ticks))
+        take(ppo, rollout, raw_m, next(ticks))
     window = next(ticks)
     forward = seconds(lambda: ppo.predict_m([obs.observation for obs in window]))
-    calls = python_calls(lambda: take(ppo, rollout, meter, window))
-    whole = seconds(lambda: take(ppo, rollout, meter, next(ticks)))
+    calls = python_calls(lambda: take(ppo, rollout, raw_m, window))
+    whole = seconds(lambda: take(ppo, rollout, raw_m, next(ticks)))
     per_tick = 1e6 / WINDOW_TICKS
     return {
         "vehicles": vehicles,
