@@ -61,10 +61,12 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
 /// Size of the block, bytes → latencies.
 type BySize = BTreeMap<usize, Percentiles>;
 
-/// Ours: until the block is in the receiver's hands, and until it is a tensor.
+/// Ours: until the block is in the receiver's hands, until it is a tensor that is lent, and until it is a tensor of an observation that
+/// may be kept.
 struct Ours {
     taken: BySize,
     tensor: BySize,
+    received: BySize,
 }
 
 /// One-way latencies, microseconds.
@@ -138,18 +140,23 @@ fn ours() -> Result<Ours, Exit> {
     receiver.wait_until("attach", || board.progress().attached == 1)?;
     send_all(&run, &board, &mut receiver)?;
     receiver.wait_until("finish", || State::from_u32(board.health().state) == State::Done)?;
-    let latencies: BTreeMap<usize, Vec<[f64; 2]>> = read(&run.run_dir.join("latencies.json"))?;
-    let of = |which: usize| {
+    let latencies: BTreeMap<String, BTreeMap<usize, Vec<[f64; 2]>>> = read(&run.run_dir.join("latencies.json"))?;
+    let of = |way: &str, which: usize| {
         let sizes = SIZES.iter().map(|&bytes| {
-            let all = latencies.get(&rows(bytes)).into_iter().flatten();
-            let measured = all.skip(WARM_UP).map(|latencies| latencies[which]);
+            let all = latencies.get(way).and_then(|by_rows| by_rows.get(&rows(bytes)));
+            let measured = all
+                .into_iter()
+                .flatten()
+                .skip(WARM_UP / 2)
+                .map(|latencies| latencies[which]);
             Ok((bytes, Percentiles::of(measured.collect())?))
         });
         sizes.collect::<Result<BySize, Exit>>()
     };
     Ok(Ours {
-        taken: of(0)?,
-        tensor: of(1)?,
+        taken: of("lent", 0)?,
+        tensor: of("lent", 1)?,
+        received: of("received", 1)?,
     })
 }
 
@@ -279,13 +286,18 @@ fn report(bare: Percentiles, ours: &Ours, peers: &BTreeMap<String, BySize>) -> R
         "ipc",
         "Observation hop",
         "One way, from right before publish in one process, microseconds, both sides polling. Ours is the `observation` channel of a run and \
-         `Channel.receive(busy=True)`, read in place whatever the size: until the block is in the receiver's hands, and until Python has a torch \
-         tensor over it. The bare message is eight bytes between two Rust processes that poll iceoryx2. The peers send the same number of bytes \
+         `Channel.lease`, read in place whatever the size: until the block is in the receiver's hands, and until Python has a torch tensor \
+         over it, which is lent until the next is taken. Every other tick comes by `Channel.receive(busy=True)`: a tensor of an observation \
+         with all its arrays that may be kept. The bare message is eight bytes between two Rust processes that poll iceoryx2. The peers send the same number of bytes \
          from Python to Python and make a tensor of what arrives without further copies; they sleep until the kernel wakes them. One message is \
          under way at a time.",
     );
     let all = || {
-        let ours = [("ours, taken", &ours.taken), ("ours, tensor", &ours.tensor)];
+        let ours = [
+            ("ours, taken", &ours.taken),
+            ("ours, tensor", &ours.tensor),
+            ("ours, tensor of an observation to keep", &ours.received),
+        ];
         ours.into_iter()
             .chain(peers.iter().map(|(name, by_size)| (name.as_str(), by_size)))
     };
@@ -301,7 +313,11 @@ fn report(bare: Percentiles, ours: &Ours, peers: &BTreeMap<String, BySize>) -> R
         }
     }
     let mut ratios = Table::new("", &["ratio of medians", "figure"]);
-    for (what, by_size) in [("taken", &ours.taken), ("tensor", &ours.tensor)] {
+    for (what, by_size) in [
+        ("taken", &ours.taken),
+        ("tensor", &ours.tensor),
+        ("tensor of an observation to keep", &ours.received),
+    ] {
         let medians = || by_size.values().map(|percentiles| percentiles.median);
         let (smallest, largest) = (medians().fold(f64::MAX, f64::min), medians().fold(0.0, f64::max));
         for (of, ratio) in [

@@ -24,8 +24,10 @@ use pyo3::{
     prelude::*,
 };
 
+mod lease;
 mod scans;
 mod view;
+use lease::Lease;
 use scans::PointCloud;
 use view::SectionView;
 
@@ -385,6 +387,23 @@ fn answer(ours: MessageHeader, question: &MessageHeader) -> MessageHeader {
     }
 }
 
+/// The layout of a message that is long enough for it.
+fn checked_layout(message: &Message) -> PyResult<ObservationLayout> {
+    let header = message.header();
+    let layout = ObservationLayout::of(header);
+    if layout.len > message.payload().len() {
+        return Err(PyValueError::new_err(format!(
+            "tick {}: {} slots of {} fields need {} bytes, the message has {}",
+            header.tick,
+            header.count,
+            header.columns,
+            layout.len,
+            message.payload().len()
+        )));
+    }
+    Ok(layout)
+}
+
 /// One tick's observations in shared memory; the memory stays valid while this object or a view of it lives.
 #[pyclass(frozen, module = "caraware._native")]
 struct ObservationBlock {
@@ -404,17 +423,7 @@ impl ObservationBlock {
         let received_ns = monotonic_ns();
         let header = *message.header();
         let payload_address = message.payload().as_ptr().expose_provenance();
-        let layout = ObservationLayout::of(&header);
-        if layout.len > message.payload().len() {
-            return Err(PyValueError::new_err(format!(
-                "tick {}: {} slots of {} fields need {} bytes, the message has {}",
-                header.tick,
-                header.count,
-                header.columns,
-                layout.len,
-                message.payload().len()
-            )));
-        }
+        let layout = checked_layout(&message)?;
         Ok(Self {
             received_ns,
             header,
@@ -530,6 +539,7 @@ fn observation_size(run_file: &str) -> PyResult<usize> {
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Attachment>()?;
     module.add_class::<ObservationBlock>()?;
+    module.add_class::<Lease>()?;
     module.add_class::<SectionView>()?;
     module.add_class::<PointCloud>()?;
     module.add_function(wrap_pyfunction!(id_hash, module)?)?;

@@ -72,3 +72,21 @@ def test_a_trainer_that_is_no_module_ends_the_run_with_its_log(tmp_path: Path) -
     finished = run_with(tmp_path, "no_such_trainer")
     assert finished.returncode == 1
     assert "no_such_trainer" in finished.stderr and "its log is" in finished.stderr
+
+
+def test_a_lent_tensor_shows_what_an_observation_to_keep_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = {}
+    for way in ("lent", "received"):
+        monkeypatch.setenv("LEASE", way)
+        (tmp_path / way).mkdir()
+        finished = run_with(tmp_path / way, "lease_probe")
+        assert finished.returncode == 0, finished.stdout + finished.stderr
+        part = tmp_path / way / "runs" / "probe" / "parts" / "trainer.json"
+        found[way] = json.loads(part.read_text())
+    lent = found["lent"]
+    assert len(lent["digests"]) == 320
+    assert lent["digests"] == found["received"]["digests"]
+    assert lent["in_shared_memory"] and lent["refused_writes"] == 320
+    assert lent["nothing_after_the_last"] and lent["kept"]
+    # A tensor for each place in shared memory, not for each tick.
+    assert lent["places"] < 100

@@ -22,8 +22,8 @@ use ipc_schema::clock::monotonic_ns;
 
 /// Messages before the measurement, while pages and caches warm up.
 const WARM_UP: u64 = 2_000;
-/// Pause between two messages: the receiver has read the last one and polls again.
-const PAUSE_NS: u64 = 20_000;
+/// Pause between two messages, that of `caraware bench ipc`: the receiver has read the last one and polls again.
+const PAUSE_NS: u64 = 100_000;
 
 /// The services: there, and back once a message has been taken.
 const STAMPS: &str = "stamps";

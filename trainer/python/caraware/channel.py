@@ -15,6 +15,11 @@ from caraware import _native
 from caraware.pointcloud import PointCloud
 
 
+def _lent_tensor(view: object, slots: int, fields: int) -> Tensor:
+    """The tensor over a place in shared memory, f32 [slots, fields], whatever lies there."""
+    return read_only_tensor(np.frombuffer(view, np.float32).reshape(slots, fields))
+
+
 class StreamEndedError(Exception):
     """The last tick of the run has been received: nothing will follow."""
 
@@ -236,6 +241,15 @@ class Channel:
         if self._attachment.ended:
             raise StreamEndedError
         return [Observation(block) for block in self._attachment.receive(timeout_s, busy=busy)]
+
+    def lease(self) -> _native.Lease:
+        """The observations one by one, each lent until the next is taken: a microsecond from publish to tensor.
+
+        `lease.next(timeout_s)` is f32 [n, d] as `Observation.observation`, or None. It busy-polls, gives no other
+        array, and takes back the tensor before: clone what is to stay. `lease.tick`, `episode`, `sim_time_ns`, `last` and
+        `episode_last` are those of the newest; `consumed` and `committed` are called as ever.
+        """
+        return _native.Lease(self._attachment, _lent_tensor)
 
     def scans(self) -> list[PointCloud]:
         """LIDAR scans since the last call, oldest first; the newest of them if more came than shared memory holds.

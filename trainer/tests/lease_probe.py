@@ -1,0 +1,77 @@
+"""A trainer that only looks: run by `caraware train --set trainer.module=lease_probe`.
+
+It takes all ticks by the way that the environment variable LEASE names, `lent` or `received`.
+`parts/trainer.json` gets a digest of every observation, to be compared between both ways.
+"""
+
+import hashlib
+import json
+import os
+import sys
+from pathlib import Path
+
+from caraware.channel import Channel
+from probe import lies_in_shared_memory
+from torch import Tensor
+
+
+def digest(tensor: Tensor) -> str:
+    """Of the numbers of a tensor."""
+    return hashlib.sha256(tensor.clone().numpy().tobytes()).hexdigest()
+
+
+def leased(channel: Channel) -> dict:
+    """All ticks of a run, each lent."""
+    lease = channel.lease()
+    digests, in_shared_memory, refused_writes, last = [], True, 0, False
+    while not last:
+        tensor = lease.next(60.0)
+        assert tensor is not None and lease.tick == len(digests), lease.tick
+        digests.append(digest(tensor))
+        in_shared_memory &= lies_in_shared_memory(tensor.data_ptr())
+        try:
+            tensor.add_(1)
+        except RuntimeError:
+            refused_writes += 1
+        channel.consumed(lease.tick)
+        channel.committed(lease.tick)
+        last = lease.last
+    nothing = lease.next(0.01)
+    places = lease.places
+    del lease
+    # Whoever keeps a tensor keeps the memory mapped.
+    kept = digest(tensor) == digests[-1]
+    return {
+        "digests": digests,
+        "in_shared_memory": in_shared_memory,
+        "refused_writes": refused_writes,
+        "nothing_after_the_last": nothing is None,
+        "kept": kept,
+        "places": places,
+    }
+
+
+def received(channel: Channel) -> dict:
+    """All ticks of a run, each an observation of its own."""
+    digests, last = [], False
+    while not last:
+        for observation in channel.receive(60.0):
+            digests.append(digest(observation.observation))
+            channel.consumed(observation.tick)
+            channel.committed(observation.tick)
+            last = observation.last
+    return {"digests": digests}
+
+
+def main() -> None:
+    """Take all ticks and write what was found."""
+    channel = Channel(sys.argv[1])
+    found = leased(channel) if os.environ["LEASE"] == "lent" else received(channel)
+    path = Path(channel.run["run_dir"]) / "parts" / "trainer.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(found))
+    channel.done()
+
+
+if __name__ == "__main__":
+    main()
