@@ -40,6 +40,7 @@ pub mod process;
 pub mod props;
 pub mod run;
 pub mod schedule;
+pub mod scheduling;
 pub mod services;
 pub mod session;
 pub mod traffic;
@@ -47,4 +48,4 @@ pub mod usage;
 pub mod world;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 10;
+pub const SCHEMA_VERSION: u32 = 11;

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::{SCHEMA_VERSION, config::Config, schedule};
+use crate::{SCHEMA_VERSION, config::Config, process::Process, schedule};
 
 /// What a run is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -199,6 +199,17 @@ impl RunFile {
             source,
         })?;
         Ok(path)
+    }
+
+    /// True if a tick of this run is due at a time of the clock, and waits for `process`.
+    #[must_use]
+    pub fn keeps_time(&self, process: Process) -> bool {
+        let waited_for = match process {
+            Process::TrafficBridge | Process::SimCore | Process::SensorDaemon => true,
+            Process::Trainer => self.config.drives(),
+            Process::Fanout => false,
+        };
+        waited_for && self.config.run.real_time_factor > 0.0
     }
 
     /// The same run as environment `env_index` sees it. `self` is environment 0's.

@@ -305,6 +305,8 @@ fn invalid(name: &str) -> impl FnOnce(&dyn std::fmt::Debug) -> ServiceError {
 /// # Errors
 /// The root directory or prefix is unusable.
 pub fn node(memory: &SharedMemory) -> Result<Node<Shm>, ServiceError> {
+    // A supervisor that ends removes the files of the run, from under whoever looks on too; iceoryx2 would warn of each.
+    iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Error);
     NodeBuilder::new()
         .config(&ipc_config(memory)?)
         .signal_handling_mode(SignalHandlingMode::Disabled)

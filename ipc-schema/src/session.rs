@@ -22,6 +22,7 @@ use crate::{
     ports::{BoardError, BoardReader, BoardWriter, ControlServer, PortError, Publisher, Subscriber, Waker, wait},
     process::Process,
     run::{RunFile, RunFileError},
+    scheduling,
     services::{self, Channel, ServiceError, Shm, WakeListener},
     usage::{self, Usage},
 };
@@ -147,8 +148,6 @@ impl Session {
                 pid: run.supervisor_pid,
             });
         }
-        // A supervisor that ends removes the files of the run, from under this process too; iceoryx2 would warn of each.
-        iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Error);
         Self::open(run, process, env_index, stop)
     }
 
@@ -159,6 +158,11 @@ impl Session {
     }
 
     fn open(run: RunFile, process: Process, env_index: u32, stop: Arc<AtomicBool>) -> Result<Self, SessionError> {
+        if run.keeps_time(process)
+            && let Err(error) = scheduling::ask_for_short_turns()
+        {
+            tracing::debug!(%error, "ticks may have to wait for a core");
+        }
         let node = Arc::new(services::node(&run.shared_memory)?);
         let wake = services::open_wake(&node, &run, env_index, process)?
             .listener_builder()
