@@ -125,8 +125,13 @@ struct View {
     sim_time_s: f64,
     cavs: u32,
     road_users: u32,
+    arrived: u64,
+    /// Ticks behind SUMO: dynamics, sensors and, where there is one, the trainer.
+    lags: Vec<u64>,
     steps: u64,
     steps_per_s: f64,
+    /// Simulated seconds per wall second, all environments.
+    real_time_factor: f64,
     policy_std: f64,
     reward: f64,
     error_m: f64,
@@ -143,6 +148,7 @@ impl View {
             healths.collect::<Vec<_>>()
         };
         let (sensings, movings) = (all(Process::SensorDaemon), all(Process::SimCore));
+        let sources = all(Process::TrafficBridge);
         let slowest = sensings.iter().min_by_key(|health| health.ticks).copied();
         let sensing = Health {
             cavs: sensings.iter().map(|health| health.cavs).sum(),
@@ -153,9 +159,24 @@ impl View {
         let training = first.map_or_else(TrainingStatus::default, |first| {
             first.board(Process::Trainer).training()
         });
+        let behind = |healths: &[Health]| {
+            let lags = sources
+                .iter()
+                .zip(healths)
+                .map(|(source, health)| source.ticks.saturating_sub(health.ticks));
+            lags.max().unwrap_or(0)
+        };
+        let mut lags = vec![behind(&movings), behind(&sensings)];
+        if first.is_some_and(|first| first.run.mode.has_trainer()) {
+            lags.push(behind(&all(Process::Trainer)));
+        }
+        let tick_s = first.map_or(0.0, |first| first.run.config.run.tick_s);
         let wall_s = ready_at.map_or(0.0, |ready| ready.elapsed().as_secs_f64());
         #[expect(clippy::cast_precision_loss, reason = "for display")]
         let (steps, sim_time_s) = (sensing.vehicle_steps as f64, sensing.sim_time_ns as f64 * 1e-9);
+        #[expect(clippy::cast_precision_loss, reason = "for display")]
+        let simulated_s = tick_s * sensings.iter().map(|health| health.ticks).sum::<u64>() as f64;
+        let each_second = |amount: f64| if wall_s > 0.0 { amount / wall_s } else { 0.0 };
         let episodes = first.map(|first| first.run.episodes()).unwrap_or_default();
         let total: Option<u64> = episodes.iter().map(|episode| episode.ticks).sum();
         Self {
@@ -166,8 +187,11 @@ impl View {
             sim_time_s,
             cavs: sensing.cavs,
             road_users: movings.iter().map(|health| health.road_users).sum(),
+            arrived: sources.iter().map(|health| health.arrived).sum(),
+            lags,
             steps: sensing.vehicle_steps,
-            steps_per_s: if wall_s > 0.0 { steps / wall_s } else { 0.0 },
+            steps_per_s: each_second(steps),
+            real_time_factor: each_second(simulated_s),
             policy_std: training.policy_std,
             reward: training.reward,
             error_m: training.error_m,
@@ -176,19 +200,38 @@ impl View {
     }
 
     fn text(&self) -> String {
-        let traffic = format!(
-            "episode {:3}  {:7.1} s  {} of {} road users sensing  {:.0} steps/s",
-            self.episode, self.sim_time_s, self.cavs, self.road_users, self.steps_per_s
-        );
+        let (rate, traffic) = (self.rate(), self.traffic());
         // Before the first update, and where nothing learns to localise, there is no error to show.
         match self.updates {
-            0 => traffic,
+            0 => format!(
+                "episode {:3}  {:7.1} s  {rate}  {traffic}",
+                self.episode, self.sim_time_s
+            ),
             // The error first: a narrow terminal cuts the end.
             _ => format!(
-                "episode {:3}  error {:.2} m (raw GNSS {:.2} m)  σ {:.3}  reward {:.3}  {:.0} steps/s",
-                self.episode, self.error_m, self.raw_gnss_error_m, self.policy_std, self.reward, self.steps_per_s
+                "episode {:3}  error {:.2} m (raw GNSS {:.2} m)  σ {:.3}  reward {:.3}  {rate}  {traffic}",
+                self.episode, self.error_m, self.raw_gnss_error_m, self.policy_std, self.reward
             ),
         }
+    }
+
+    fn rate(&self) -> String {
+        format!(
+            "{:.0} steps/s  {:.1} × real time",
+            self.steps_per_s, self.real_time_factor
+        )
+    }
+
+    /// Who is there, who has arrived, and how far each stage is behind SUMO.
+    fn traffic(&self) -> String {
+        let lags: Vec<String> = self.lags.iter().map(ToString::to_string).collect();
+        format!(
+            "{} of {} road users sensing, {} arrived  lag {} ticks",
+            self.cavs,
+            self.road_users,
+            self.arrived,
+            lags.join("/")
+        )
     }
 
     fn line(&self) -> String {

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use ipc_schema::{
     board::{Health, Progress, State},
     ports::BoardReader,
+    process::Process,
     run::RunFile,
     services,
 };
@@ -51,6 +52,7 @@ pub fn ps(name: Option<&str>) -> Result<(), Exit> {
 /// A process of a run.
 struct Seat {
     label: String,
+    process: Process,
     env_index: u32,
     scope: Scope,
     board: BoardReader,
@@ -83,6 +85,7 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
             let label = row.label(&environment);
             boards.push(Seat {
                 label,
+                process: row.process,
                 env_index: environment.env_index,
                 scope: row.scope,
                 board,
@@ -118,7 +121,41 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
             memory_mib(now.health.pid)
         );
     }
+    println!();
+    print_environments(run, &boards, [&first, &second]);
     Ok(())
+}
+
+/// A line for each environment: where it stands, how fast it goes, and who is there.
+fn print_environments(run: &RunFile, boards: &[Seat], [before, now]: [&[Look]; 2]) {
+    for env_index in 0..run.config.run.envs {
+        let seat_of = |process: Process| {
+            let is_it = |seat: &Seat| seat.env_index == env_index && seat.process == process;
+            boards.iter().position(is_it)
+        };
+        let seats = [Process::TrafficBridge, Process::SimCore, Process::SensorDaemon].map(seat_of);
+        let [Some(source), Some(moving), Some(sensing)] = seats else {
+            continue;
+        };
+        let (traffic, moved, sensed) = (now[source].health, now[moving].health, now[sensing].health);
+        let since = before[sensing].health;
+        let each_second = |now: u64, before: u64| {
+            #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+            let more = now.saturating_sub(before) as f64;
+            more / RATE_OVER.as_secs_f64()
+        };
+        println!(
+            "{:<16} environment {env_index}: episode {}, {:.1} s, {} of {} road users sensing, {} arrived, {:.0} steps/s, {:.1} × real time",
+            run.name,
+            sensed.episode,
+            Duration::from_nanos(sensed.sim_time_ns).as_secs_f64(),
+            sensed.cavs,
+            moved.road_users,
+            traffic.arrived,
+            each_second(sensed.vehicle_steps, since.vehicle_steps),
+            each_second(sensed.ticks, since.ticks) * run.config.run.tick_s,
+        );
+    }
 }
 
 /// Resident memory of a process, MiB.

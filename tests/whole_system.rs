@@ -192,6 +192,7 @@ fn process_table(workplace: &Workplace) -> Vec<(String, String, u32)> {
         let rows: Vec<(String, String, u32)> = String::from_utf8_lossy(&output.stdout)
             .lines()
             .skip(1)
+            .take_while(|line| !line.is_empty())
             .map(|line| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>())
             .map(|words| (words[1].clone(), words[2].clone(), words[3].parse().unwrap()))
             .collect();
@@ -226,6 +227,15 @@ fn the_processes_are_separate_and_stop_ends_them_in_order() {
             name => name,
         };
         assert!(command.contains(expected), "{process}: {command}");
+    }
+    let pace = eventually("vehicles on the road", || {
+        let output = workplace.run(&["ps"]);
+        let said = String::from_utf8_lossy(&output.stdout).into_owned();
+        let line = said.lines().find(|line| line.contains("environment 0"))?.to_owned();
+        (!line.contains(" 0.0 × real time")).then_some(line)
+    });
+    for part in [" of 12 road users sensing", "arrived", "steps/s"] {
+        assert!(pace.contains(part), "{part}: {pace}");
     }
     let output = workplace.run(&["stop"]);
     assert!(output.status.success(), "{}", text(&output));

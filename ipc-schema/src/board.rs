@@ -115,6 +115,8 @@ pub struct Health {
     pub drops: u64,
     /// Vehicle-steps produced so far (sensor-daemon: observations).
     pub vehicle_steps: u64,
+    /// Road users that have left the network so far: they have arrived, or were removed (traffic-bridge).
+    pub arrived: u64,
     /// Mirrors set onto SUMO because no motion leads there (sim-core).
     pub resynchronisations: u64,
     /// Total ticks of the run, 0 if unknown.

@@ -210,6 +210,7 @@ pub fn table() -> Vec<TypeLayout> {
             cavs,
             drops,
             vehicle_steps,
+            arrived,
             resynchronisations,
             total_ticks
         }),

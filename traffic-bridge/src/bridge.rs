@@ -14,7 +14,7 @@ use ipc_schema::{
     schedule::{Course, Due, Episode},
     services::Channel,
     session::{Session as Membership, Wait},
-    traffic::{EVENTS_PER_MESSAGE, ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout},
+    traffic::{EVENTS_PER_MESSAGE, MetaEvent, ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout},
 };
 
 use crate::{
@@ -167,6 +167,8 @@ struct Bridge {
     /// Ticks sent.
     ticks: u64,
     vehicle_steps: u64,
+    /// Road users that have left the network.
+    arrived: u64,
     /// Where processor time went, over the episodes so far.
     cost: Option<Cost>,
 }
@@ -220,6 +222,7 @@ impl Bridge {
             meta_messages: 0,
             ticks,
             vehicle_steps: 0,
+            arrived: 0,
             cost: None,
         })
     }
@@ -582,6 +585,11 @@ impl Bridge {
         }
         self.ticks += self.ticks_per_step;
         self.vehicle_steps += frame.states.len() as u64;
+        let arrivals = frame
+            .events
+            .iter()
+            .filter(|meta| meta.event == MetaEvent::Arrived as u32);
+        self.arrived += arrivals.count() as u64;
         self.report(frame, &header);
         Ok(())
     }
@@ -613,7 +621,7 @@ impl Bridge {
     }
 
     fn report(&mut self, frame: &Frame, header: &MessageHeader) {
-        let (ticks, vehicle_steps) = (self.ticks, self.vehicle_steps);
+        let (ticks, vehicle_steps, arrived) = (self.ticks, self.vehicle_steps, self.arrived);
         let drops = self.traffic.drops() + self.meta.drops();
         self.membership.report(|health| {
             health.ticks = ticks;
@@ -622,6 +630,7 @@ impl Bridge {
             health.road_users = header.count;
             health.cavs = frame.cavs;
             health.vehicle_steps = vehicle_steps;
+            health.arrived = arrived;
             health.drops = drops;
         });
     }

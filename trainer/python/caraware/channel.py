@@ -246,8 +246,8 @@ class Channel:
         """The observations one by one, each lent until the next is taken: a microsecond from publish to tensor.
 
         `lease.next(timeout_s)` is f32 [n, d] as `Observation.observation`, or None. It busy-polls, gives no other
-        array, and takes back the tensor before: clone what is to stay. `lease.tick`, `episode`, `sim_time_ns`, `last` and
-        `episode_last` are those of the newest; `consumed` and `committed` are called as ever.
+        array, and takes back the tensor before: clone what is to stay. `lease.tick`, `episode`, `sim_time_ns`, `last`
+        and `episode_last` are those of the newest; `consumed` and `committed` are called as ever.
         """
         return _native.Lease(self._attachment, _lent_tensor)
 
