@@ -26,8 +26,21 @@ const PACKAGES: [&str; 10] = [
     "rerun",
     "zenoh",
 ];
-/// Programs any of which the viewer's test can use.
-const BROWSERS: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
+/// Programs that a run does without: any of these, what for, and the Debian package.
+const EXTRAS: [(&[&str], &str, &str); 4] = [
+    (
+        &["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"],
+        "browser for the viewer's test",
+        "chromium",
+    ),
+    (
+        &["ip"],
+        "network namespaces for the tests of remote viewers",
+        "iproute2",
+    ),
+    (&["unshare"], "namespaces for the same tests", "util-linux"),
+    (&["openssl"], "keys for remote viewers (docs/remote.md)", "openssl"),
+];
 /// Least free space worth starting with, MiB.
 const SHARED_MEMORY_MIB: u64 = 64;
 const DISK_MIB: u64 = 512;
@@ -70,7 +83,7 @@ pub fn doctor(clean: bool) -> Result<(), Exit> {
     );
     space(&mut checks, "disk", ".", DISK_MIB, "free some disk space");
     port(&mut checks);
-    browser();
+    extras();
     runs(clean);
     match checks.missing {
         0 => Ok(()),
@@ -158,17 +171,20 @@ fn port(checks: &mut Checks) {
     checks.say(result, "port for viewers");
 }
 
-/// Watching needs any browser, of this machine or another; the viewer's test a certain one here.
-fn browser() {
+/// What only tests and remote viewers need.
+fn extras() {
     let directories = std::env::var_os("PATH").unwrap_or_default();
-    let found = std::env::split_paths(&directories)
-        .flat_map(|directory| BROWSERS.map(|name| directory.join(name)))
-        .find(|path| path.is_file());
-    match found {
-        Some(path) => println!("ok       browser for the viewer's test: {}", path.display()),
-        None => println!(
-            "note     browser for the viewer's test: none; `make test` needs one\n         → apt-get install chromium"
-        ),
+    for (names, purpose, package) in EXTRAS {
+        let found = std::env::split_paths(&directories)
+            .flat_map(|directory| names.iter().map(move |name| directory.join(name)))
+            .find(|path| path.is_file());
+        match found {
+            Some(path) => println!("ok       {purpose}: {}", path.display()),
+            None => println!(
+                "note     {purpose}: no {}\n         → apt-get install {package}",
+                names.join(" or ")
+            ),
+        }
     }
 }
 
