@@ -3,12 +3,13 @@
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 VENV := .venv
+PYTHON310 ?= python3.10
 CARGO_FLAGS := --release --locked
 export PYO3_PYTHON = $(CURDIR)/$(VENV)/bin/python
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
 
-.PHONY: train test build prerequisites browser lint format test-rust test-python deny bench peers clean
+.PHONY: train test build prerequisites browser lint format test-rust test-python deny bench peers peers-metadrive peers-smarts clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -71,10 +72,25 @@ bench: build ## the benchmarks of docs/benchmarks.md
 
 peers: build ## what `caraware bench` compares with, in an environment of its own that sees the project's packages
 	$(VENV)/bin/python -m venv .venv-peers
-	$(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))' \
+	($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))'; echo "$(CURDIR)/trainer/python") \
 		> $$(.venv-peers/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/project.pth
 	.venv-peers/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements-peers.txt
 
+# These two pin other versions of what the rest has: each in an environment of its own that sees none of the project's packages
+# but the program that measures it.
+OWN_ENVIRONMENT = echo "$(CURDIR)/trainer/python" > $$($(1)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/project.pth
+
+peers-metadrive: ## MetaDrive for `caraware bench peers`: 60 MB to download for its models beside its packages, 1 GB on disk
+	$(PYTHON) -m venv .venv-metadrive
+	.venv-metadrive/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements-metadrive.txt
+	$(call OWN_ENVIRONMENT,.venv-metadrive)
+	.venv-metadrive/bin/python -m caraware.benchmarks.metadrive_assets
+
+peers-smarts: ## SMARTS for `caraware bench peers`, which needs Python 3.10 (PYTHON310=PATH): 1.1 GB on disk
+	$(PYTHON310) -m venv .venv-smarts
+	.venv-smarts/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements-smarts.txt
+	$(call OWN_ENVIRONMENT,.venv-smarts)
+
 clean:
 	cargo clean
-	rm -rf $(VENV) .venv-peers
+	rm -rf $(VENV) .venv-peers .venv-metadrive .venv-smarts
