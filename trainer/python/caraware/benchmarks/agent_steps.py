@@ -1,0 +1,36 @@
+"""The rate of a driving environment with many agents."""
+
+import time
+from typing import Protocol
+
+WARM_UP_STEPS = 10
+
+
+class World(Protocol):
+    """A driving environment that is being stepped."""
+
+    def ready(self) -> None:
+        """Resets it if nobody is left to drive."""
+
+    def step(self) -> int:
+        """One step with an action for every agent; how many agents got an observation."""
+
+    def close(self) -> None:
+        """Ends it."""
+
+
+def agent_steps_per_s(world: World, seconds: float) -> float:
+    """Agent-steps per wall second over at least `seconds` of stepping; resets and the first steps are left out."""
+    try:
+        for _ in range(WARM_UP_STEPS):
+            world.ready()
+            world.step()
+        taken_s, agent_steps = 0.0, 0
+        while taken_s < seconds:
+            world.ready()
+            begin = time.perf_counter()
+            agent_steps += world.step()
+            taken_s += time.perf_counter() - begin
+        return agent_steps / taken_s
+    finally:
+        world.close()

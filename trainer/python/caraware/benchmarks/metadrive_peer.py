@@ -1,0 +1,56 @@
+"""MetaDrive's multi-agent roundabout, headless: `make peers-metadrive`."""
+
+import logging
+from pathlib import Path
+
+import metadrive
+from metadrive.constants import VERSION as VERSION
+from metadrive.envs.marl_envs import MultiAgentRoundaboutEnv
+
+from caraware.benchmarks.agent_steps import agent_steps_per_s
+
+AGENTS = 40
+ACTION = [0.0, 0.1]
+"""Steering, throttle (−1 to 1): everybody rolls on; whoever crashes or leaves comes in anew."""
+BLIND = {
+    "lidar": {"num_lasers": 0, "num_others": 0, "distance": 0},
+    "side_detector": {"num_lasers": 0},
+    "lane_line_detector": {"num_lasers": 0},
+}
+
+
+class Roundabout:
+    """40 agents, 0.1 s a step: five sub-steps of Bullet's physics."""
+
+    def __init__(self, vehicle: dict[str, object]) -> None:
+        config = {"num_agents": AGENTS, "use_render": False, "log_level": logging.ERROR, "vehicle_config": vehicle}
+        self._env = MultiAgentRoundaboutEnv(config)
+        self._env.reset(seed=0)
+        self._over = False
+
+    def ready(self) -> None:
+        """Resets at the end of the episode."""
+        if self._over:
+            self._env.reset(seed=0)
+
+    def step(self) -> int:
+        """One step of everybody who is on the road."""
+        _, reward, terminated, truncated, _ = self._env.step({agent: ACTION for agent in self._env.agents})
+        self._over = terminated["__all__"] or truncated["__all__"]
+        return len(reward)
+
+    def close(self) -> None:
+        """Frees the engine, of which there is one in a process."""
+        self._env.close()
+
+
+def rates(seconds: float) -> dict[str, float]:
+    """Agent-steps per second with the observation as it comes, and without the rays."""
+    if not (Path(metadrive.__file__).parent / "assets" / "version.txt").exists():
+        # It would try to download them.
+        raise ImportError("MetaDrive's assets are not there")
+    cases: dict[str, dict[str, object]] = {
+        "MetaDrive, roundabout, 40 agents, LIDAR of 72 rays": {},
+        "MetaDrive, roundabout, 40 agents, own state only": dict(BLIND),
+    }
+    return {name: agent_steps_per_s(Roundabout(vehicle), seconds) for name, vehicle in cases.items()}

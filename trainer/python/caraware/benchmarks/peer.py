@@ -1,0 +1,84 @@
+"""One peer of `caraware bench peers`: `python -m caraware.benchmarks.peer NAME … --json FILE`.
+
+Runs in the environment that the peer is installed in, with nothing of the project but this package. Writes
+`{"version": …, "rates": {case: rate}}`, vehicle-updates or agent-steps per wall second, or `{"missing": why}` if the
+peer is not installed there.
+"""
+
+import argparse
+import json
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+Rates = dict[str, float]
+"""Case → updates per wall second."""
+
+
+def libsumo(options: argparse.Namespace) -> tuple[str, Rates]:
+    """A Python loop over libsumo, SUMO in the same process."""
+    import libsumo
+
+    from caraware.benchmarks.traffic_loop import measure
+
+    return version("libsumo"), {"libsumo, Python loop": measure(libsumo, arguments(options), options.steps)}
+
+
+def traci(options: argparse.Namespace) -> tuple[str, Rates]:
+    """A Python loop over TraCI, SUMO at the other end of a socket."""
+    import traci
+
+    from caraware.benchmarks.traffic_loop import measure
+
+    return version("traci"), {"TraCI, Python loop": measure(traci, arguments(options), options.steps)}
+
+
+def arguments(options: argparse.Namespace) -> list[str]:
+    """SUMO's command line."""
+    return [options.sumo, "-c", options.sumocfg, "--output-prefix", options.prefix, "--no-step-log", "true"]
+
+
+def metadrive(options: argparse.Namespace) -> tuple[str, Rates]:
+    """MetaDrive's multi-agent roundabout."""
+    from caraware.benchmarks.metadrive_peer import VERSION, rates
+
+    return VERSION, rates(options.seconds)
+
+
+def smarts(options: argparse.Namespace) -> tuple[str, Rates]:
+    """SMARTS's HiWayEnv on a net of SUMO's."""
+    from caraware.benchmarks.smarts_peer import VERSION, rates
+
+    return VERSION, rates(options.net, options.seconds)
+
+
+PEERS: dict[str, Callable[[argparse.Namespace], tuple[str, Rates]]] = {
+    "libsumo": libsumo,
+    "traci": traci,
+    "metadrive": metadrive,
+    "smarts": smarts,
+}
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measures one peer and writes what came of it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("peer", choices=PEERS)
+    parser.add_argument("--sumo", help="the program `sumo`")
+    parser.add_argument("--sumocfg", help="scenario of a loop over SUMO")
+    parser.add_argument("--prefix", default="", help="what SUMO puts before the names of its result files")
+    parser.add_argument("--steps", type=int, help="SUMO steps of a loop")
+    parser.add_argument("--net", type=Path, help="SUMO net that the agents drive on, where the peer has none")
+    parser.add_argument("--seconds", type=float, default=10.0, help="wall time of each case of a driving environment")
+    parser.add_argument("--json", type=Path, required=True, help="where to write the rates")
+    options = parser.parse_args(argv)
+    try:
+        release, rates = PEERS[options.peer](options)
+        measured: dict[str, object] = {"version": release, "rates": rates}
+    except ImportError as reason:
+        measured = {"missing": str(reason)}
+    options.json.write_text(json.dumps(measured))
+
+
+if __name__ == "__main__":
+    main()

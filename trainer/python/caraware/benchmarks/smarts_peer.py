@@ -1,0 +1,68 @@
+"""SMARTS's HiWayEnv, headless, on a net of SUMO's: `make peers-smarts` (Python 3.10)."""
+
+import shutil
+import tempfile
+import xml.etree.ElementTree as ElementTree
+from importlib.metadata import version
+from pathlib import Path
+
+from smarts.core.agent_interface import AgentInterface, AgentType
+from smarts.core.controllers import ActionSpaceType
+from smarts.env.gymnasium.hiway_env_v1 import HiWayEnvV1
+from smarts.sstudio import gen_scenario
+from smarts.sstudio.sstypes import EndlessMission, Scenario
+
+from caraware.benchmarks.agent_steps import agent_steps_per_s
+
+VERSION = version("smarts")
+AGENTS = [f"agent-{number}" for number in range(8)]
+"""Few: SMARTS goes through all orders of its missions before it begins."""
+
+
+KEEP_LANE = 0
+
+
+def streets(net: Path) -> list[str]:
+    """Ids of the first streets of a net, one for each agent."""
+    edges = ElementTree.parse(net).iterfind("edge")
+    return [edge.attrib["id"] for edge in edges if edge.get("function") != "internal"][: len(AGENTS)]
+
+
+class HighWay:
+    """Eight agents that keep to their lane wherever it leads, and no other traffic, 0.1 s a step."""
+
+    def __init__(self, scenario: Path, interface: AgentInterface) -> None:
+        interfaces = dict.fromkeys(AGENTS, interface)
+        self._env = HiWayEnvV1(scenarios=[str(scenario)], agent_interfaces=interfaces, headless=True, seed=1)
+        self._driving: set[str] = set()
+
+    def ready(self) -> None:
+        """Resets once everybody has ended."""
+        if not self._driving:
+            observation, _ = self._env.reset()
+            self._driving = set(observation)
+
+    def step(self) -> int:
+        """One step of everybody who still drives."""
+        actions = dict.fromkeys(self._driving, KEEP_LANE)
+        observation, _, terminated, truncated, _ = self._env.step(actions)
+        self._driving = {agent for agent in observation if not (terminated[agent] or truncated[agent])}
+        return len(observation)
+
+    def close(self) -> None:
+        """Ends SUMO as well."""
+        self._env.close()
+
+
+def rates(net: Path, seconds: float) -> dict[str, float]:
+    """Agent-steps per second with way points, as its examples have them, and with nothing but the agent's own state."""
+    cases = {
+        "SMARTS, 8 agents, way points": AgentInterface.from_type(AgentType.Laner),
+        "SMARTS, 8 agents, own state only": AgentInterface(action=ActionSpaceType.Lane),
+    }
+    with tempfile.TemporaryDirectory() as directory:
+        scenario = Path(directory)
+        shutil.copy(net, scenario / "map.net.xml")
+        missions = [EndlessMission(begin=(street, 0, 50.0)) for street in streets(net)]
+        gen_scenario(Scenario(ego_missions=missions), output_dir=scenario)
+        return {name: agent_steps_per_s(HighWay(scenario, interface), seconds) for name, interface in cases.items()}

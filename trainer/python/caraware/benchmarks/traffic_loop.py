@@ -1,0 +1,59 @@
+"""What a Python program does to have every vehicle's state at every step of SUMO, through libsumo or TraCI.
+
+The fields are those that `traffic-bridge/src/shim.cc` reads at every step on a flat net, as often as it reads them;
+what it reads once at a departure, and traffic lights, are left out. As there, the list of live vehicles is kept
+from departures and arrivals.
+"""
+
+import time
+from dataclasses import dataclass, field
+from types import ModuleType
+
+SIGNAL_PERIOD_STEPS = 4
+"""Each vehicle's signals are read once in this many steps."""
+
+State = tuple[float, float, float, float, float]
+"""x, y, z in metres of the net, SUMO's angle in degrees, speed in m/s."""
+
+
+@dataclass
+class Mirror:
+    """The last known state of everybody on the road; `sumo` is the module libsumo or traci."""
+
+    sumo: ModuleType
+    states: dict[str, State] = field(default_factory=dict)
+    signals: dict[str, int] = field(default_factory=dict)
+    steps: int = 0
+
+    def step(self) -> int:
+        """Lets SUMO make a step and reads every vehicle; how many there are."""
+        self.sumo.simulationStep()
+        for vehicle in self.sumo.simulation.getArrivedIDList():
+            self.states.pop(vehicle, None)
+            self.signals.pop(vehicle, None)
+        for vehicle in self.sumo.simulation.getDepartedIDList():
+            self.states[vehicle] = (0.0, 0.0, 0.0, 0.0, 0.0)
+        self.read()
+        self.steps += 1
+        return len(self.states)
+
+    def read(self) -> None:
+        """One pass of getters over all vehicles."""
+        get = self.sumo.vehicle
+        position, angle, speed, signals = get.getPosition3D, get.getAngle, get.getSpeed, get.getSignals
+        for index, vehicle in enumerate(self.states):
+            self.states[vehicle] = (*position(vehicle), angle(vehicle), speed(vehicle))
+            if (self.steps + index) % SIGNAL_PERIOD_STEPS == 0:
+                self.signals[vehicle] = signals(vehicle)
+
+
+def measure(sumo: ModuleType, arguments: list[str], steps: int) -> float:
+    """Vehicle-updates per wall second over `steps` steps from the first, SUMO's own time included, loading left out."""
+    sumo.start(arguments)
+    try:
+        mirror = Mirror(sumo)
+        begin = time.perf_counter()
+        updates = sum(mirror.step() for _ in range(steps))
+        return updates / (time.perf_counter() - begin)
+    finally:
+        sumo.close()

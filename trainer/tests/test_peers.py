@@ -1,0 +1,117 @@
+"""What the peers of `caraware bench peers` are asked to do, on stand-ins for them."""
+
+import json
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+from caraware.benchmarks import agent_steps, peer
+from caraware.benchmarks.agent_steps import WARM_UP_STEPS, agent_steps_per_s
+from caraware.benchmarks.traffic_loop import SIGNAL_PERIOD_STEPS, Mirror, measure
+
+VEHICLES = 6
+
+
+class FakeSumo(ModuleType):
+    """Departures of six vehicles in the first step; the first of them arrives in the third."""
+
+    def __init__(self) -> None:
+        super().__init__("fake")
+        self.steps = 0
+        self.calls: Counter[str] = Counter()
+        self.simulation = SimpleNamespace(
+            getDepartedIDList=lambda: tuple(f"v{i}" for i in range(VEHICLES)) if self.steps == 1 else (),
+            getArrivedIDList=lambda: ("v0",) if self.steps == 3 else (),
+        )
+        answers = {"getPosition3D": (1.0, 2.0, 3.0), "getAngle": 90.0, "getSpeed": 5.0, "getSignals": 8}
+        self.vehicle = SimpleNamespace(**{name: self._getter(name, value) for name, value in answers.items()})
+
+    def _getter(self, name: str, value: object) -> object:
+        def get(vehicle: str) -> object:
+            self.calls[name] += 1
+            return value
+
+        return get
+
+    def start(self, arguments: list[str]) -> None:
+        self.calls["start"] += 1
+
+    def simulationStep(self) -> None:
+        self.steps += 1
+
+    def close(self) -> None:
+        self.calls["close"] += 1
+
+
+def test_the_loop_reads_the_bridges_fields_of_everybody_at_every_step() -> None:
+    sumo = FakeSumo()
+    mirror = Mirror(sumo)
+    assert [mirror.step() for _ in range(2)] == [VEHICLES, VEHICLES]
+    assert mirror.states["v0"] == (1.0, 2.0, 3.0, 90.0, 5.0)
+    assert mirror.step() == VEHICLES - 1
+    assert "v0" not in mirror.states and "v0" not in mirror.signals
+    reads = 3 * VEHICLES - 1
+    assert [sumo.calls[name] for name in ("getPosition3D", "getAngle", "getSpeed")] == [reads] * 3
+
+
+def test_signals_are_read_in_turn() -> None:
+    sumo = FakeSumo()
+    mirror = Mirror(sumo)
+    mirror.step()
+    counts = [sumo.calls["getSignals"]]
+    for _ in range(SIGNAL_PERIOD_STEPS):
+        mirror.step()
+        counts.append(sumo.calls["getSignals"])
+    assert all(1 <= later - before <= 2 for before, later in pairwise(counts)), counts
+    assert mirror.signals.keys() == mirror.states.keys()
+
+
+def test_a_loop_that_fails_ends_sumo() -> None:
+    sound, broken = FakeSumo(), FakeSumo()
+    assert measure(sound, ["sumo"], steps=2) > 0
+    broken.vehicle.getAngle = None
+    with pytest.raises(TypeError):
+        measure(broken, ["sumo"], steps=2)
+    assert [sumo.calls[name] for sumo in (sound, broken) for name in ("start", "close")] == [1] * 4
+
+
+def test_agent_steps_are_counted_while_stepping_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 0.0
+    monkeypatch.setattr(agent_steps.time, "perf_counter", lambda: now_s)
+
+    class World:
+        """Seven agents, half a second a step; a reset takes ten."""
+
+        steps = 0
+        closed = False
+
+        def ready(self) -> None:
+            nonlocal now_s
+            now_s += 10.0
+
+        def step(self) -> int:
+            nonlocal now_s
+            now_s += 0.5
+            self.steps += 1
+            return 7
+
+        def close(self) -> None:
+            self.closed = True
+
+    world = World()
+    assert agent_steps_per_s(world, 3.0) == 14.0
+    assert world.closed and world.steps == WARM_UP_STEPS + 6
+
+
+def test_a_peer_that_is_not_installed_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(options: object) -> tuple[str, dict[str, float]]:
+        raise ImportError("No module named 'smarts'")
+
+    monkeypatch.setitem(peer.PEERS, "smarts", absent)
+    peer.main(["smarts", "--json", str(tmp_path / "out.json")])
+    assert json.loads((tmp_path / "out.json").read_text()) == {"missing": "No module named 'smarts'"}
+    monkeypatch.setitem(peer.PEERS, "smarts", lambda options: ("2", {"a": 1.5}))
+    peer.main(["smarts", "--json", str(tmp_path / "out.json")])
+    assert json.loads((tmp_path / "out.json").read_text()) == {"version": "2", "rates": {"a": 1.5}}
