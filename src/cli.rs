@@ -323,6 +323,8 @@ pub enum Part {
     Overhead,
     /// 1 000 to 50 000 vehicles: cost and memory of each; a motorway, and long steps of SUMO
     Scale,
+    /// Python loops over TraCI and libsumo, MetaDrive and SMARTS: vehicle-steps per second of each, beside ours
+    Peers,
     /// Everything above, one after the other
     All,
 }

@@ -6,6 +6,9 @@ use ipc_schema::process::Process;
 
 use crate::failure::Exit;
 
+/// The environment of `make peers`, which has most of what the benchmarks compare with.
+pub const PEERS: &str = ".venv-peers";
+
 /// The parts, found.
 #[derive(Debug, Clone)]
 pub struct Install {
@@ -79,11 +82,11 @@ pub fn program(bin: &Path, name: &str) -> Result<PathBuf, Exit> {
     ))
 }
 
-/// Python of `make peers`, which has what the benchmarks compare with, if it is there.
+/// Python of an environment beside the project's own ([`PEERS`] or that of a peer that needs one to itself), if it is there.
 #[must_use]
-pub fn peers_python(bin: &Path) -> Option<PathBuf> {
+pub fn environment_python(bin: &Path, environment: &str) -> Option<PathBuf> {
     bin.ancestors()
-        .map(|directory| directory.join(".venv-peers/bin/python"))
+        .map(|directory| directory.join(environment).join("bin/python"))
         .find(|path| path.exists())
 }
 

@@ -35,6 +35,31 @@ fn bare_sumo_and_ours_write_the_same_results_and_the_bench_says_so() {
 }
 
 #[test]
+fn every_peer_has_its_ratio_or_the_reason_why_not() {
+    let workplace = Workplace::new();
+    workplace.succeed(&["bench", "peers", "--quick", "--json", "peers.json"]);
+    let text = std::fs::read_to_string(workplace.path().join("peers.json")).unwrap();
+    let report: Value = serde_json::from_str(&text).unwrap();
+    let ratio = &report["figures"]["ratio to TraCI, Python loop"];
+    assert!(ratio.as_f64().unwrap() > 0.0, "{report:#}");
+    let rows = report["tables"].as_array().unwrap().iter();
+    let rows: Vec<&Value> = rows.flat_map(|table| table["rows"].as_array().unwrap()).collect();
+    for peer in ["TraCI", "libsumo", "MetaDrive", "SMARTS"] {
+        let of_peer = |row: &&&Value| row[0].as_str().unwrap().starts_with(peer);
+        let row = rows
+            .iter()
+            .find(of_peer)
+            .unwrap_or_else(|| panic!("{peer}: {report:#}"));
+        let told = row[1].as_str().unwrap();
+        assert!(
+            told.parse::<f64>().is_ok_and(|rate| rate > 0.0) || told.starts_with("not installed: "),
+            "{peer}: {told}"
+        );
+    }
+    workplace.assert_nothing_left();
+}
+
+#[test]
 fn neither_the_window_nor_a_consumer_changes_what_is_observed_at_long_steps() {
     let workplace = Workplace::new();
     let city = ["--vehicles", "60", "--duration-s", "12", "--step-s", "1"];

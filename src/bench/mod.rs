@@ -8,6 +8,7 @@ mod ipc;
 mod lidar;
 mod overhead;
 mod page;
+mod peers;
 mod plots;
 pub mod report;
 mod scale;
@@ -43,7 +44,10 @@ pub struct Options {
 pub fn bench(args: &BenchArgs) -> Result<(), Exit> {
     let bin = install::programs()?;
     // The peers are Python packages that nothing else needs: without them, ours is measured alone.
-    let python = args.python.clone().or_else(|| install::peers_python(&bin));
+    let python = args
+        .python
+        .clone()
+        .or_else(|| install::environment_python(&bin, install::PEERS));
     let python = python.or_else(|| install::python(&bin).ok());
     let options = Options {
         bin,
@@ -89,6 +93,7 @@ fn measure(part: Part, options: &Options) -> Result<Report, Exit> {
         Part::Trainer => trainer::measure(options),
         Part::Overhead => overhead::measure(options),
         Part::Scale => scale::measure(options),
+        Part::Peers => peers::measure(options),
         Part::All => Err(Exit::config("`all` is not a part", "")),
     }
 }

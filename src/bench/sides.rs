@@ -122,22 +122,50 @@ impl<'a> Scenario<'a> {
     /// # Errors
     /// SUMO fails.
     pub fn bare(&mut self) -> Result<(Taken, PathBuf), Exit> {
-        self.runs += 1;
-        let results = self.place.path().join(format!("bare-{}", self.runs));
-        std::fs::create_dir_all(&results).map_err(|error| Exit::io("create", &results, &error))?;
-        let from_root = results.to_string_lossy().trim_start_matches('/').to_owned();
-        let data = self.install.sumo_home.join("data/proj");
+        let (results, prefix) = self.results("bare")?;
         let mut command = Command::new(self.install.sumo_program("sumo"));
         command
             .arg("-c")
             .arg(&self.sumocfg)
-            .arg("--output-prefix")
-            .arg(format!("{}{from_root}/", "../".repeat(TO_THE_ROOT)))
-            .args(["--scale", &self.scale.to_string(), "--no-step-log", "true"])
+            .args(["--output-prefix", &prefix])
+            .args(["--scale", &self.scale.to_string(), "--no-step-log", "true"]);
+        self.equip(&mut command);
+        Ok((self.take(&mut command)?, results))
+    }
+
+    /// A loop of Python over SUMO's steps (`caraware.benchmarks.peer`); its results will be in the directory returned.
+    ///
+    /// # Errors
+    /// No place for the results.
+    pub fn python_loop(&mut self, python: &Path, peer: &str, steps: u32) -> Result<(Command, PathBuf), Exit> {
+        let (results, prefix) = self.results(peer)?;
+        let mut command = Command::new(python);
+        command
+            .args(["-m", "caraware.benchmarks.peer", peer, "--sumo"])
+            .arg(self.install.sumo_program("sumo"))
+            .arg("--sumocfg")
+            .arg(&self.sumocfg)
+            .args(["--prefix", &prefix, "--steps", &steps.to_string()]);
+        self.equip(&mut command);
+        Ok((command, results))
+    }
+
+    /// A new directory for SUMO's results, and the prefix of their names that puts them there.
+    fn results(&mut self, side: &str) -> Result<(PathBuf, String), Exit> {
+        self.runs += 1;
+        let results = self.place.path().join(format!("{side}-{}", self.runs));
+        std::fs::create_dir_all(&results).map_err(|error| Exit::io("create", &results, &error))?;
+        let from_root = results.to_string_lossy().trim_start_matches('/').to_owned();
+        Ok((results, format!("{}{from_root}/", "../".repeat(TO_THE_ROOT))))
+    }
+
+    /// Tells a program where SUMO has its data.
+    fn equip(&self, command: &mut Command) {
+        let data = self.install.sumo_home.join("data/proj");
+        command
             .env("SUMO_HOME", &self.install.sumo_home)
             .env("PROJ_DATA", &data)
             .env("PROJ_LIB", &data);
-        Ok((self.take(&mut command)?, results))
     }
 
     /// Runs ours, every vehicle sensing, every observation delivered to the consumer.

@@ -1,0 +1,364 @@
+//! What else one would use: Python loops over TraCI and libsumo on the same traffic, MetaDrive and SMARTS.
+
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use serde::Deserialize;
+
+use super::{
+    Options, Report, Spread, Table,
+    report::from_program,
+    sides::{Place, Scenario, same_results},
+};
+use crate::{failure::Exit, generate::City, install, install::Install};
+
+/// How much is measured.
+struct Size {
+    /// Vehicles of the city, all on the road throughout.
+    vehicles: u32,
+    /// Simulated time there, seconds.
+    duration_s: f64,
+    /// Of its steps, those of the TraCI loop, which is slow.
+    traci_steps: u32,
+    /// Simulated time with as many vehicles as a driving environment has agents, seconds: the start of torch is to be a small part.
+    few_duration_s: f64,
+    /// Wall time of each case of a driving environment, seconds.
+    driving_s: f64,
+    /// Rounds; everybody is measured once in each.
+    rounds: usize,
+}
+
+const SIZE: Size = Size {
+    vehicles: 5000,
+    duration_s: 60.0,
+    traci_steps: 20,
+    few_duration_s: 6000.0,
+    driving_s: 10.0,
+    rounds: 5,
+};
+/// The same when only the way is tried.
+const QUICK: Size = Size {
+    vehicles: 60,
+    duration_s: 6.0,
+    traci_steps: 5,
+    few_duration_s: 6.0,
+    driving_s: 0.2,
+    rounds: 1,
+};
+/// SUMO's step, seconds.
+const STEP_S: f64 = 0.1;
+/// Room for road users that a run asks for at least: the default demand, which a scenario replaces, has to fit.
+const LEAST_ROOM: u32 = 64;
+/// As many vehicles as MetaDrive's roundabout has agents.
+const FEW: u32 = 40;
+
+/// A driving environment in a Python environment of its own.
+struct Driving {
+    /// Its name.
+    name: &'static str,
+    /// How `caraware.benchmarks.peer` calls it.
+    peer: &'static str,
+    /// Its environment.
+    environment: &'static str,
+}
+
+const DRIVING: [Driving; 2] = [
+    Driving {
+        name: "MetaDrive",
+        peer: "metadrive",
+        environment: ".venv-metadrive",
+    },
+    Driving {
+        name: "SMARTS",
+        peer: "smarts",
+        environment: ".venv-smarts",
+    },
+];
+
+/// What `caraware.benchmarks.peer` writes.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(untagged)]
+enum Answer {
+    /// It was measured.
+    Rates {
+        version: String,
+        /// Case → steps of a vehicle in a wall second.
+        rates: BTreeMap<String, f64>,
+    },
+    /// It is not installed there.
+    Missing { missing: String },
+}
+
+/// A kind of peers over all rounds.
+#[derive(Debug, Default)]
+struct Rounds {
+    /// Case → rates, one for each round.
+    rates: BTreeMap<String, Vec<f64>>,
+    /// Peer → why there is none.
+    missing: BTreeMap<String, String>,
+    /// Peer → version.
+    versions: BTreeMap<String, String>,
+}
+
+impl Rounds {
+    fn add(&mut self, peer: &str, answer: Answer, install_by: &str) {
+        match answer {
+            Answer::Rates { version, rates } => {
+                self.versions.insert(peer.into(), version);
+                for (case, rate) in rates {
+                    self.rates.entry(case).or_default().push(rate);
+                }
+            }
+            Answer::Missing { missing } => {
+                let why = format!("not installed: {missing} (`make {install_by}`)");
+                self.missing.insert(peer.into(), why);
+            }
+        }
+    }
+}
+
+/// Everything that was measured, by round.
+#[derive(Debug, Default)]
+struct Measured {
+    /// Ours, many vehicles: sensed vehicle-steps in a wall second.
+    many: Vec<f64>,
+    /// Ours, as many vehicles as a driving environment has agents.
+    few: Vec<f64>,
+    loops: Rounds,
+    driving: Rounds,
+}
+
+impl Measured {
+    fn versions(&self) -> String {
+        let all = self.loops.versions.iter().chain(&self.driving.versions);
+        let named: Vec<String> = all.map(|(peer, version)| format!("{peer} {version}")).collect();
+        named.join(", ")
+    }
+}
+
+/// Measures ours and every peer in turn.
+///
+/// # Errors
+/// A run fails, an installed peer fails, or SUMO's results differ between ours and the loop over libsumo.
+pub fn measure(options: &Options) -> Result<Report, Exit> {
+    let size = if options.quick { &QUICK } else { &SIZE };
+    // One each: both sides number their runs.
+    let (place, few_place) = (Place::new("peers")?, Place::new("peers-few")?);
+    let (mut many, _) = city(options, &place, size.vehicles, size.duration_s)?;
+    let (mut few, few_net) = city(options, &few_place, FEW, size.few_duration_s)?;
+    let mut measured = Measured::default();
+    for _ in 0..size.rounds {
+        let results = loops(options, size, &mut many, &mut measured.loops)?;
+        let ours = many.ours()?;
+        if let Some(theirs) = results {
+            same_results(&theirs, &ours.results)?;
+        }
+        measured.many.push(ours.number("/env_steps_per_s"));
+        for peer in &DRIVING {
+            let answer = drive(options, &place, peer, &few_net, size.driving_s)?;
+            let install_by = format!("peers-{}", peer.peer);
+            measured.driving.add(peer.name, answer, &install_by);
+        }
+        measured.few.push(few.ours()?.number("/env_steps_per_s"));
+    }
+    report(size, &measured)
+}
+
+/// A generated city for both sides, and its net.
+fn city<'a>(
+    options: &Options,
+    place: &'a Place,
+    vehicles: u32,
+    duration_s: f64,
+) -> Result<(Scenario<'a>, PathBuf), Exit> {
+    let install = Install::find()?;
+    let directory = place.path().join(format!("city-{vehicles}"));
+    let sumocfg = City::of(vehicles, duration_s, STEP_S, 1).write(&install, &directory)?;
+    let scenario = Scenario::new(options, place, install, sumocfg, 1.0, vehicles.max(LEAST_ROOM))?;
+    Ok((scenario, directory.join("city.net.xml")))
+}
+
+/// Both Python loops over SUMO; where the one over libsumo, which goes to the end, has SUMO's results.
+fn loops(options: &Options, size: &Size, city: &mut Scenario, rounds: &mut Rounds) -> Result<Option<PathBuf>, Exit> {
+    let python = match &options.python {
+        Some(python) => python.clone(),
+        None => install::python(&options.bin)?,
+    };
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "some hundred steps"
+    )]
+    let all_steps = (size.duration_s / STEP_S).round() as u32;
+    let mut run = |peer: &str, steps: u32| -> Result<(Answer, PathBuf), Exit> {
+        let (command, results) = city.python_loop(&python, peer, steps)?;
+        Ok((from_program(command)?, results))
+    };
+    let (traci, _) = run("traci", size.traci_steps)?;
+    rounds.add("TraCI", traci, "build");
+    let (libsumo, results) = run("libsumo", all_steps)?;
+    let results = matches!(libsumo, Answer::Rates { .. }).then_some(results);
+    rounds.add("libsumo", libsumo, "peers");
+    Ok(results)
+}
+
+/// One driving environment in its own Python.
+fn drive(options: &Options, place: &Place, peer: &Driving, net: &Path, seconds: f64) -> Result<Answer, Exit> {
+    let Some(python) = install::environment_python(&options.bin, peer.environment) else {
+        let missing = format!("there is no {}", peer.environment);
+        return Ok(Answer::Missing { missing });
+    };
+    let mut command = Command::new(python);
+    command
+        .args(["-m", "caraware.benchmarks.peer", peer.peer, "--net"])
+        .arg(net)
+        .args(["--seconds", &seconds.to_string()])
+        // SMARTS keeps logs there.
+        .env("HOME", place.path());
+    from_program(command)
+}
+
+fn report(size: &Size, measured: &Measured) -> Result<Report, Exit> {
+    let Size {
+        vehicles,
+        duration_s,
+        traci_steps,
+        rounds,
+        ..
+    } = size;
+    let mut report = Report::new(
+        "peers",
+        "Beside Python loops over SUMO, MetaDrive and SMARTS",
+        format!(
+            "Steps of a vehicle in a wall second, loading left out, but for the consumer's torch, which counts against ours; everybody in turn, median of {rounds} rounds; a ratio is of one round, with the \
+             smallest and the largest. Ours makes everybody's state at every 0.1 s, moves everybody at 100 Hz, samples GNSS, IMU, speed and steering of \
+             everybody, and delivers them to a consumer's torch tensor in a process of its own. The Python loops run the same generated city of \
+             {vehicles} vehicles at steps of 0.1 s, SUMO's own time included, and call the getters that our bridge calls at every step \
+             (position, angle, speed, signals at every fourth), for every vehicle; they compute nothing from them. The one over libsumo goes to the \
+             end at {duration_s} s and leaves the same results of SUMO as ours; the one over TraCI makes {traci_steps} steps. The driving environments step \
+             their agents by 0.1 s; resets are left out. Their own vehicle models and observations differ from ours and from each other: they \
+             are compared in how many vehicles a learner gets a new observation of in a second. MetaDrive steers 40 agents by its Bullet \
+             physics (without a window, with the models and textures of its version 0.3.0.1); SMARTS has eight agents and no other traffic on \
+             the net of our city of {FEW} vehicles, moved by its lane-following controller. Versions: {}.",
+            measured.versions()
+        ),
+    );
+    let loops = loops_table(measured, &mut report)?;
+    let driving = driving_table(size, measured, &mut report)?;
+    report.tables = vec![loops, driving];
+    Ok(report)
+}
+
+fn loops_table(measured: &Measured, report: &mut Report) -> Result<Table, Exit> {
+    let mut table = Table::new(
+        "Every vehicle of SUMO in a program's hands",
+        &["how", "vehicle-updates/s", "ours is faster by", "smallest–largest"],
+    );
+    let ours = Spread::of(measured.many.iter().copied())?;
+    report.figure("ours, vehicle-steps/s", ours.median);
+    table.row([
+        "ours, with dynamics, sensors and delivery".into(),
+        format!("{:.0}", ours.median),
+        String::new(),
+        String::new(),
+    ]);
+    for (case, theirs) in &measured.loops.rates {
+        let rate = Spread::of(theirs.iter().copied())?;
+        let ratio = ratio(&measured.many, theirs)?;
+        report.figure(format!("{case}, vehicle-updates/s"), rate.median);
+        report.figure(format!("ratio to {case}"), ratio.median);
+        table.row([
+            case.clone(),
+            format!("{:.0}", rate.median),
+            format!("{:.2} ×", ratio.median),
+            format!("{:.2}–{:.2}", ratio.smallest, ratio.largest),
+        ]);
+    }
+    for (peer, why) in &measured.loops.missing {
+        table.row([peer.clone(), why.clone(), String::new(), String::new()]);
+    }
+    Ok(table)
+}
+
+fn driving_table(size: &Size, measured: &Measured, report: &mut Report) -> Result<Table, Exit> {
+    let (of_many, of_few) = (
+        format!("ours, {} vehicles, is faster by", size.vehicles),
+        format!("ours, {FEW} vehicles, is faster by"),
+    );
+    let mut table = Table::new(
+        "Driving environments",
+        &["environment", "agent-steps/s", &of_many, &of_few],
+    );
+    for (vehicles, rates) in [(size.vehicles, &measured.many), (FEW, &measured.few)] {
+        let rate = Spread::of(rates.iter().copied())?;
+        table.row([
+            format!("ours, {vehicles} vehicles"),
+            format!("{:.0}", rate.median),
+            String::new(),
+            String::new(),
+        ]);
+    }
+    for (case, theirs) in &measured.driving.rates {
+        let rate = Spread::of(theirs.iter().copied())?;
+        let (many, few) = (ratio(&measured.many, theirs)?, ratio(&measured.few, theirs)?);
+        report.figure(format!("{case}, agent-steps/s"), rate.median);
+        report.figure(format!("ratio to {case}"), many.median);
+        report.figure(format!("ratio of ours with {FEW} vehicles to {case}"), few.median);
+        table.row([
+            case.clone(),
+            format!("{:.0}", rate.median),
+            format!("{many:.0} ×"),
+            format!("{few:.0} ×"),
+        ]);
+    }
+    for (peer, why) in &measured.driving.missing {
+        table.row([peer.clone(), why.clone(), String::new(), String::new()]);
+    }
+    Ok(table)
+}
+
+/// How much faster ours was, round by round.
+fn ratio(ours: &[f64], theirs: &[f64]) -> Result<Spread, Exit> {
+    Spread::of(ours.iter().zip(theirs).map(|(ours, theirs)| ours / theirs))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::float_cmp, reason = "tests assert by unwrapping")]
+mod tests {
+    use super::*;
+
+    fn answer(json: &str) -> Answer {
+        serde_json::from_str(json).unwrap()
+    }
+
+    #[test]
+    fn a_peer_that_is_not_installed_has_a_row_that_says_so() {
+        let mut measured = Measured {
+            many: vec![200.0, 300.0],
+            few: vec![50.0, 50.0],
+            ..Measured::default()
+        };
+        for rate in ["100", "100"] {
+            let fast = answer(&format!(r#"{{"version": "1", "rates": {{"libsumo loop": {rate}}}}}"#));
+            measured.loops.add("libsumo", fast, "peers");
+            let absent = answer(r#"{"missing": "No module named 'smarts'"}"#);
+            measured.driving.add("SMARTS", absent, "peers-smarts");
+        }
+        let report = report(&QUICK, &measured).unwrap();
+        assert_eq!(report.figures["ratio to libsumo loop"], 2.5);
+        let [loops, driving] = report.tables.as_slice() else {
+            unreachable!("{report}")
+        };
+        assert_eq!(loops.rows[1], ["libsumo loop", "100", "2.50 ×", "2.00–3.00"]);
+        assert_eq!(
+            driving.rows.last().unwrap()[..2],
+            [
+                "SMARTS",
+                "not installed: No module named 'smarts' (`make peers-smarts`)"
+            ]
+        );
+    }
+}
