@@ -6,10 +6,10 @@ use std::{
 };
 
 use ipc_schema::{
-    config::Config,
+    config::{Activation, Config},
     run::{Beginning, RunFile},
 };
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::{failure::Exit, install::Install};
 
@@ -18,6 +18,7 @@ use crate::{failure::Exit, install::Install};
 struct Manifest {
     observation_size: u64,
     hidden: Vec<u64>,
+    activation: Activation,
     counters: Counters,
 }
 
@@ -27,6 +28,11 @@ struct Counters {
     committed_tick: i64,
     next_episode: u64,
     next_episode_tick: u64,
+}
+
+/// A choice as a configuration writes it.
+fn word(choice: impl Serialize) -> String {
+    serde_json::to_string(&choice).unwrap_or_default()
 }
 
 /// What the Python side answers.
@@ -137,6 +143,11 @@ impl Found {
         if size != width {
             let help = "set observation.fields and observation.history as in the run that learnt it";
             return refuse("observation has", format!("{size} numbers"), width.to_string(), help);
+        }
+        if self.manifest.activation != config.trainer.activation {
+            let (has, wants) = (self.manifest.activation, config.trainer.activation);
+            let help = "set trainer.activation as in the run that learnt it";
+            return refuse("network has the activation", word(has), word(wants), help);
         }
         if self.manifest.hidden != config.trainer.hidden {
             let (has, wants) = (&self.manifest.hidden, &config.trainer.hidden);

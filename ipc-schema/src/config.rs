@@ -372,6 +372,9 @@ pub struct Trainer {
     pub epochs: u64,
     /// Width of the hidden layers of policy and value network.
     pub hidden: Vec<u64>,
+    /// What follows a hidden layer.
+    #[serde(default)]
+    pub activation: Activation,
     /// Train a network of the policy's size by regression beside it.
     pub supervised: bool,
     /// Reward by name.
@@ -430,6 +433,17 @@ pub struct Fanout {
     pub vehicles_hz: f64,
     /// The same of `status`.
     pub status_hz: f64,
+}
+
+/// What follows a hidden layer of policy and value network.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Activation {
+    /// max(0, x).
+    #[default]
+    Relu,
+    /// tanh x.
+    Tanh,
 }
 
 /// When the trainer runs the Kalman filter beside the policy, for whoever watches.

@@ -333,6 +333,7 @@ pub const KEYS: &[Key] = &[
     integer("trainer.batch_size", "samples", 1, 100_000_000, "Samples in one gradient step; at most the horizon."),
     integer("trainer.epochs", "", 1, 1000, "Passes over a horizon."),
     other("trainer.hidden", Kind::Integers { min: 1, max: 65536 }, "Widths of the hidden layers of the policy and of the value network."),
+    other("trainer.activation", Kind::Choice(&["relu", "tanh"]), "Activation of the hidden layers; the last one of the policy is tanh in any case."),
     other("trainer.supervised", Kind::Flag, "Train a network of the policy's size by regression to the truth beside it, for comparison (docs/baselines.md)."),
     other("trainer.reward", Kind::Choice(&["inverse", "bounded_inverse", "exponential"]), "Reward of a prediction at distance d from the truth: 1/d, 1/(1+d/scale), exp(−d/scale)."),
     float("trainer.reward_scale_m", "m", 0.001, 1e6, "The scale in those."),

@@ -51,7 +51,7 @@ def train(ppo: Ppo, from_update: int, to_update: int) -> None:
 
 
 def everything(ppo: Ppo) -> list[Tensor]:
-    networks = (ppo.policy.mlp.parameters.values, ppo.value.mlp.parameters.values)
+    networks = (ppo.policy.network.parameters.values, ppo.value.network.parameters.values)
     moments = [
         moment
         for adam in (ppo.policy_optimiser, ppo.value_optimiser)
@@ -148,6 +148,8 @@ def test_another_size_is_refused_with_both_sizes(tmp_path: Path) -> None:
         load_checkpoint(written, Ppo(config, 9, MapBounds(0.0, 0.0, 1.0, 1.0)))
     with pytest.raises(CheckpointError, match="hidden"):
         load_checkpoint(written, fresh(hidden=[16, 16]))
+    with pytest.raises(CheckpointError, match="activation is relu, this run's is tanh"):
+        load_checkpoint(written, fresh(activation="tanh"))
 
 
 def test_a_refused_checkpoint_changes_nothing(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The networks' shapes, and their written-out gradients against autograd."""
 
 import torch
-from caraware.networks import GaussianPolicy, Mlp, ValueNetwork, entropy, log_probability
+from caraware.networks import Activation, GaussianPolicy, Mlp, ValueNetwork, entropy, log_probability
 from caraware.objective import clipped_surrogate
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
@@ -41,9 +41,21 @@ def test_the_written_out_gradients_are_autograd_s() -> None:
     policy, value = GaussianPolicy(9, 2, (50, 30), CPU), ValueNetwork(9, (50, 30, 20), CPU)
     policy.initialise(torch.Generator().manual_seed(1), 0.5)
     value.initialise(torch.Generator().manual_seed(2))
-    for mlp in (policy.mlp, value.mlp):
+    for mlp in (policy.network, value.network):
         gradients_agree(mlp, torch.randn(64, 9))
         gradients_agree(mlp, torch.randn(10, 9))
+
+
+def test_tanh_layers_where_the_configuration_says_so() -> None:
+    torch.set_float32_matmul_precision("highest")
+    policy = GaussianPolicy(9, 2, (50, 30), CPU, Activation.TANH)
+    value = ValueNetwork(9, (50, 30), CPU, Activation.TANH)
+    policy.initialise(torch.Generator().manual_seed(1), 0.5)
+    value.initialise(torch.Generator().manual_seed(2))
+    assert [layer.activation.value for layer in policy.network.layers] == ["tanh", "tanh", "tanh"]
+    assert [layer.activation.value for layer in value.network.layers] == ["tanh", "tanh", "linear"]
+    for network in (policy.network, value.network):
+        gradients_agree(network, torch.randn(64, 9))
 
 
 def test_inference_in_blocks_is_inference_in_one() -> None:
@@ -51,21 +63,21 @@ def test_inference_in_blocks_is_inference_in_one() -> None:
     value = ValueNetwork(9, (50, 30), CPU)
     value.initialise(torch.Generator().manual_seed(2))
     x = torch.randn(3000, 9)
-    expected = modules(value.mlp)(x).detach()
-    torch.testing.assert_close(value.mlp.infer(x), expected)
-    torch.testing.assert_close(value.mlp.infer(*x.split([1, 500, 0, 2000, 499])), expected)
+    expected = modules(value.network)(x).detach()
+    torch.testing.assert_close(value.network.infer(x), expected)
+    torch.testing.assert_close(value.network.infer(*x.split([1, 500, 0, 2000, 499])), expected)
 
 
 def test_the_paper_s_shape_and_a_start_in_the_middle_of_the_map() -> None:
     policy = GaussianPolicy(9, 2, (500, 300), CPU)
     policy.initialise(torch.Generator().manual_seed(0), 0.7)
-    assert [(layer.inputs, layer.outputs, layer.activation.value) for layer in policy.mlp.layers] == [
+    assert [(layer.inputs, layer.outputs, layer.activation.value) for layer in policy.network.layers] == [
         (9, 500, "relu"),
         (500, 300, "tanh"),
         (300, 2, "tanh"),
     ]
     torch.testing.assert_close(policy.log_std.exp(), torch.tensor([0.7, 0.7]))
-    mean = policy.mlp.infer(torch.rand(2000, 9) * 2 - 1)
+    mean = policy.network.infer(torch.rand(2000, 9) * 2 - 1)
     assert mean.shape == (2000, 2)
     assert mean.abs().mean() < 0.4
 

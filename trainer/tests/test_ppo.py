@@ -46,7 +46,7 @@ def train(ppo: Ppo, updates: int) -> list[UpdateStats]:
 
 
 def parameters(ppo: Ppo) -> Tensor:
-    return torch.cat((ppo.policy.mlp.parameters.values, ppo.value.mlp.parameters.values))
+    return torch.cat((ppo.policy.network.parameters.values, ppo.value.network.parameters.values))
 
 
 def errors_m(ppo: Ppo) -> tuple[float, float]:
@@ -145,7 +145,7 @@ def test_a_gradient_is_clipped_to_the_largest_norm() -> None:
     ppo = fresh(max_grad_norm=1e-3, epochs=1, batch_size=256)
     (stats,) = train(ppo, 1)
     assert stats.policy_gradient_norm > 1e-3
-    assert ppo.policy.mlp.parameters.gradient.norm().item() == pytest.approx(1e-3, rel=1e-3)
+    assert ppo.policy.network.parameters.gradient.norm().item() == pytest.approx(1e-3, rel=1e-3)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -164,7 +164,7 @@ def test_a_loss_that_is_no_number_stops_before_the_step(threads: int, tmp_path: 
     assert ppo.updates == 0
     assert torch.isfinite(parameters(ppo)).all()
     file = tmp_path / "logs" / "batch.safetensors"
-    save_batch(broken, ppo.policy.mlp.parameters, file)
+    save_batch(broken, ppo.policy.network.parameters, file)
     saved = load_file(file)
     assert torch.isnan(saved["advantage"]).sum() == 1
     assert torch.equal(saved["policy.log_std"], ppo.policy.log_std)

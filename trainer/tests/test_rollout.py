@@ -82,7 +82,7 @@ def test_action_reward_and_truth_of_a_sample_are_of_one_vehicle_and_tick() -> No
         assert sent[key] == (batch.observation[row].tolist(), batch.truth[row].tolist())
     expected = bounded_inverse(distance_m(ppo.bounds.to_world_m(batch.action), batch.truth), 5.0)
     torch.testing.assert_close(batch.reward, expected)
-    mean = ppo.policy.mlp.infer(batch.observation)
+    mean = ppo.policy.network.infer(batch.observation)
     deviation = (batch.action - mean) / ppo.policy.log_std.exp()
     assert abs(deviation.mean().item()) < 4 / len(sent) ** 0.5
     assert deviation.abs().max() < 6

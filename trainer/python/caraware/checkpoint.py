@@ -105,6 +105,7 @@ def save_checkpoint(
         config_sha256=config_sha256,
         observation_size=ppo.observation_size,
         hidden=ppo.config.hidden,
+        activation=ppo.config.activation,
         counters=counters,
         schedules=_schedules(ppo),
         files=files,
@@ -138,9 +139,7 @@ def _schedules(ppo: Ppo) -> Schedules:
 def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
     """Verify a checkpoint and continue `ppo` from it, bit for bit on a CPU. Raises `CheckpointError`."""
     manifest = read_manifest(checkpoint)
-    for name, expected in (("observation_size", ppo.observation_size), ("hidden", ppo.config.hidden)):
-        if (found := getattr(manifest, name)) != expected:
-            raise CheckpointError(checkpoint / MANIFEST, f"its {name} is {found}, this run's is {expected}")
+    _check_network(checkpoint / MANIFEST, manifest, ppo)
     current = {name: tensors for name, tensors in _tensors(ppo).items() if name != SUPERVISED or name in manifest.files}
     stored = {
         name: _read_tensors(checkpoint / name, digest) for name, digest in manifest.files.items() if name in current
@@ -157,6 +156,15 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
     ppo.shuffling.set_state(stored[RANDOM]["shuffling"])
     ppo.updates = manifest.counters.updates
     return manifest.counters
+
+
+def _check_network(file: Path, manifest: Manifest, ppo: Ppo) -> None:
+    """Raises `CheckpointError` where the networks are others."""
+    expected = {"observation_size": ppo.observation_size}
+    expected |= {name: getattr(ppo.config, name) for name in ("hidden", "activation")}
+    for name, own in expected.items():
+        if (found := getattr(manifest, name)) != own:
+            raise CheckpointError(file, f"its {name} is {found}, this run's is {own}")
 
 
 def load_course(checkpoint: Path) -> Course:
@@ -185,14 +193,14 @@ def _tensors(ppo: Ppo) -> dict[str, dict[str, Tensor]]:
     """Every tensor of the trainer by file and name. Parameters and moments are views: filling them loads them."""
     parameters: dict[str, Tensor] = {}
     moments: dict[str, Tensor] = {}
-    for network, mlp, optimiser in (
-        ("policy", ppo.policy.mlp, ppo.policy_optimiser),
-        ("value", ppo.value.mlp, ppo.value_optimiser),
+    for name_of, network, optimiser in (
+        ("policy", ppo.policy.network, ppo.policy_optimiser),
+        ("value", ppo.value.network, ppo.value_optimiser),
     ):
-        parameters |= {f"{network}.{name}": tensor for name, tensor in mlp.parameters.value.items()}
-        moments[f"{network}.mean"] = optimiser.mean
-        moments[f"{network}.square"] = optimiser.square
-        moments[f"{network}.steps"] = optimiser.steps
+        parameters |= {f"{name_of}.{name}": tensor for name, tensor in network.parameters.value.items()}
+        moments[f"{name_of}.mean"] = optimiser.mean
+        moments[f"{name_of}.square"] = optimiser.square
+        moments[f"{name_of}.steps"] = optimiser.steps
     random = {name: generator.get_state() for name, generator in ppo.sampling_generators().items()}
     random["shuffling"] = ppo.shuffling.get_state()
     tensors = {"parameters.safetensors": parameters, "optimiser.safetensors": moments, RANDOM: random}

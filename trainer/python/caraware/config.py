@@ -69,6 +69,8 @@ class TrainerConfig:
     """Samples in a gradient step."""
     epochs: int = 4
     hidden: tuple[int, ...] = (500, 300)
+    activation: str = "relu"
+    """Of the hidden layers: `relu` or `tanh`. The policy's last hidden layer is tanh in any case, as CarAware's."""
     supervised: bool = True
     """Teach a network of the policy's size by regression to the truth beside it (`caraware.supervised`)."""
     reward: str = "bounded_inverse"
@@ -112,6 +114,7 @@ class TrainerConfig:
     def _check(self) -> None:
         _choice("algorithm", self.algorithm, ("ppo",))
         _choice("device", self.device, ("cpu", "auto"))
+        _choice("activation", self.activation, ("relu", "tanh"))
         _choice("estimates", self.estimates, ("paced", "always", "never"))
         _choice("reward", self.reward, tuple(rewards.REWARDS))
         _choice("matmul_precision", self.matmul_precision, ("auto", "float32", "bfloat16"))

@@ -57,8 +57,8 @@ class GraphedUpdate:
         self._learning_rate, self._clip_epsilon, self._entropy_scale = (
             torch.zeros((), device=self._device) for _ in range(3)
         )
-        self._policy_adam = _DeviceAdam(ppo.policy_optimiser, ppo.policy.mlp.parameters, self._learning_rate)
-        self._value_adam = _DeviceAdam(ppo.value_optimiser, ppo.value.mlp.parameters, self._learning_rate)
+        self._policy_adam = _DeviceAdam(ppo.policy_optimiser, ppo.policy.network.parameters, self._learning_rate)
+        self._value_adam = _DeviceAdam(ppo.value_optimiser, ppo.value.network.parameters, self._learning_rate)
 
     def run(self, batch: "Batch", orders: list[Tensor], now: "Settings") -> StepTable:
         """Take all steps. If a number is not finite, the parameters and moments are as before the update."""
@@ -113,7 +113,7 @@ class GraphedUpdate:
         self._samples, self._rows, self._steps = samples + samples // 8, rows, steps
         full, device = self._samples + 1, self._device
         # The graph remembers addresses: no later pass without gradient may make the networks ask for more.
-        for network in (self._ppo.policy.mlp, self._ppo.value.mlp):
+        for network in (self._ppo.policy.network, self._ppo.value.network):
             network.reserve(max(rows, CHUNK_ROWS))
         self._observation = torch.zeros(full, self._ppo.observation_size, device=device)
         tries = self._ppo.config.actions_per_observation
@@ -165,7 +165,7 @@ class GraphedUpdate:
         share = weight / (weight.sum() * advantage.shape[1])
         centred = advantage - (advantage * share).sum()
         advantage = centred / ((centred.square() * share).sum().sqrt() + SMALLEST_DEVIATION)
-        mean = policy.mlp.forward(observation).unsqueeze(1)
+        mean = policy.network.forward(observation).unsqueeze(1)
         inverse_std = torch.exp(-policy.log_std)
         deviation = (action - mean) * inverse_std
         log_ratio = (log_probability(action, mean, policy.log_std) - old) * weight
@@ -173,7 +173,7 @@ class GraphedUpdate:
         unclipped = ratio * advantage
         clipped = torch.minimum(torch.maximum(ratio, 1 - self._clip_epsilon), 1 + self._clip_epsilon) * advantage
         pull = (torch.where(unclipped <= clipped, unclipped, 0.0) * -share).unsqueeze(2)
-        policy.mlp.backward(observation, (pull * deviation * inverse_std).sum(1))
+        policy.network.backward(observation, (pull * deviation * inverse_std).sum(1))
         policy.log_std_gradient.copy_((pull * (deviation.square() - 1)).sum((0, 1)) - self._entropy_scale)
         norm = self._policy_adam.step(config.max_grad_norm)
         loss = -(torch.minimum(unclipped, clipped) * share).sum() - self._entropy_scale * entropy(policy.log_std)
@@ -189,7 +189,7 @@ class GraphedUpdate:
 
     def _value_step(self, step: Tensor) -> None:
         """As `Ppo._improve_value`, with weights."""
-        config, network = self._ppo.config, self._ppo.value.mlp
+        config, network = self._ppo.config, self._ppo.value.network
         columns = (self._observation, self._target, self._advantage, self._weight)
         observation, target, advantage, weight = self._minibatch(step, *columns)
         share = weight / weight.sum()

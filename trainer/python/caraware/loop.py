@@ -341,7 +341,7 @@ class TrainingLoop:
             stats = self._ppo.update(batch)
         except NonFiniteLoss as error:
             error.batch_file = self._config.run_dir / "logs" / f"nonfinite-update-{error.update:06d}.safetensors"
-            save_batch(batch, self._ppo.policy.mlp.parameters, error.batch_file)
+            save_batch(batch, self._ppo.policy.network.parameters, error.batch_file)
             raise
         for environment, horizon in zip(self._environments, horizons, strict=True):
             environment.committed_tick = horizon.last_tick()
@@ -434,7 +434,7 @@ class TrainingLoop:
         assert self._ppo is not None
         own = self._course()
         self._ranks.check_equal(
-            "the parameters", [self._ppo.policy.mlp.parameters.values, self._ppo.value.mlp.parameters.values]
+            "the parameters", [self._ppo.policy.network.parameters.values, self._ppo.value.network.parameters.values]
         )
         states = {name: generator.get_state() for name, generator in self._ppo.sampling_generators().items()}
         first, *others = self._ranks.gather((own, [environment.place() for environment in self._environments], states))

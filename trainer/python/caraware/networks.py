@@ -151,38 +151,50 @@ class Mlp:
 class GaussianPolicy:
     """Actions are normal around the MLP's mean, with one standard deviation per action for all observations.
 
-    ReLU layers, tanh in the last hidden one, tanh mean in [-1, 1] (the map). A sample is never clipped: its
-    log-probability must be that of what was sampled. CarAware clips first and takes the density of the clipped
-    action, which biases the ratio wherever a prediction nears the edge of the map.
+    ReLU layers (or `activation`), tanh in the last hidden one, tanh mean in [-1, 1] (the map). A sample is never
+    clipped: its log-probability must be that of what was sampled. CarAware clips first and takes the density of the
+    clipped action, which biases the ratio wherever a prediction nears the edge of the map.
     """
 
-    def __init__(self, observations: int, actions: int, hidden: Sequence[int], device: torch.device) -> None:
+    def __init__(
+        self,
+        observations: int,
+        actions: int,
+        hidden: Sequence[int],
+        device: torch.device,
+        activation: Activation = Activation.RELU,
+    ) -> None:
         widths = (observations, *hidden)
-        layers = [_hidden(a, b, Activation.RELU) for a, b in pairwise(widths[:-1])]
-        layers.append(_hidden(widths[-2], widths[-1], Activation.TANH))
-        layers.append(Layer(widths[-1], actions, Activation.TANH, _fan_in_bound(widths[-1], MEAN_HEAD_SCALE)))
-        self.mlp = Mlp(layers, {"log_std": (actions,)}, device)
-        self.log_std = self.mlp.parameters.value["log_std"]
-        self.log_std_gradient = self.mlp.parameters.grad["log_std"]
+        layers = [hidden_layer(a, b, activation) for a, b in pairwise(widths[:-1])]
+        layers.append(hidden_layer(widths[-2], widths[-1], Activation.TANH))
+        layers.append(mean_layer(widths[-1], actions))
+        self.network = Mlp(layers, {"log_std": (actions,)}, device)
+        self.log_std = self.network.parameters.value["log_std"]
+        self.log_std_gradient = self.network.parameters.grad["log_std"]
 
     def initialise(self, generator: torch.Generator, initial_std: float) -> None:
         """Draw the weights and set the standard deviation."""
-        self.mlp.initialise(generator)
+        self.network.initialise(generator)
         self.log_std.fill_(math.log(initial_std))
 
 
 class ValueNetwork:
-    """The expected reward of an observation: ReLU layers and one linear output."""
+    """The expected reward of an observation: ReLU layers (or `activation`) and one linear output."""
 
-    def __init__(self, observations: int, hidden: Sequence[int], device: torch.device) -> None:
+    def __init__(
+        self,
+        observations: int,
+        hidden: Sequence[int],
+        device: torch.device,
+        activation: Activation = Activation.RELU,
+    ) -> None:
         widths = (observations, *hidden)
-        layers = [_hidden(a, b, Activation.RELU) for a, b in pairwise(widths)]
-        layers.append(Layer(widths[-1], 1, Activation.LINEAR, _fan_in_bound(widths[-1], 1.0)))
-        self.mlp = Mlp(layers, {}, device)
+        layers = [hidden_layer(a, b, activation) for a, b in pairwise(widths)]
+        self.network = Mlp([*layers, value_layer(widths[-1])], {}, device)
 
     def initialise(self, generator: torch.Generator) -> None:
         """Draw the weights."""
-        self.mlp.initialise(generator)
+        self.network.initialise(generator)
 
 
 def log_probability(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
@@ -208,10 +220,20 @@ def _groups(pieces: Iterable[Tensor]) -> Iterator[list[Tensor]]:
         yield group
 
 
-def _hidden(inputs: int, outputs: int, activation: Activation) -> Layer:
+def hidden_layer(inputs: int, outputs: int, activation: Activation) -> Layer:
     """A hidden layer: He et al. (2015) uniform before ReLU, Glorot & Bengio (2010) uniform before tanh."""
     relu = activation is Activation.RELU
     return Layer(inputs, outputs, activation, math.sqrt(6 / inputs if relu else 6 / (inputs + outputs)))
+
+
+def mean_layer(inputs: int, actions: int) -> Layer:
+    """The policy's last layer."""
+    return Layer(inputs, actions, Activation.TANH, _fan_in_bound(inputs, MEAN_HEAD_SCALE))
+
+
+def value_layer(inputs: int) -> Layer:
+    """The value network's last layer."""
+    return Layer(inputs, 1, Activation.LINEAR, _fan_in_bound(inputs, 1.0))
 
 
 def _fan_in_bound(inputs: int, scale: float) -> float:

@@ -23,7 +23,7 @@ from caraware.adam import Adam
 from caraware.config import MapBounds, TrainerConfig
 from caraware.gae import generalised_advantage
 from caraware.graphed import GraphedUpdate, StepTable
-from caraware.networks import FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
+from caraware.networks import Activation, FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
 from caraware.objective import clipped_error, clipped_surrogate
 from caraware.ranks import Minibatch, Ranks, Union
 from caraware.rollout import Horizon
@@ -186,14 +186,15 @@ class Ppo:
         self.device = _configure_torch(config)
         self.sampling = torch.Generator().manual_seed(config.seed)
         self.shuffling = torch.Generator().manual_seed(config.seed + 1)
-        self.policy = GaussianPolicy(observation_size, ACTIONS, config.hidden, self.device)
-        self.value = ValueNetwork(observation_size, config.hidden, self.device)
+        activation = Activation(config.activation)
+        self.policy = GaussianPolicy(observation_size, ACTIONS, config.hidden, self.device, activation)
+        self.value = ValueNetwork(observation_size, config.hidden, self.device, activation)
         self.policy.initialise(self.sampling, config.initial_std)
         self.value.initialise(self.sampling)
         self._environments = tuple(environments)
         self._samplings = [self._sampling_of(index) for index in environments]
-        self.policy_optimiser = Adam(self.policy.mlp.parameters)
-        self.value_optimiser = Adam(self.value.mlp.parameters)
+        self.policy_optimiser = Adam(self.policy.network.parameters)
+        self.value_optimiser = Adam(self.value.network.parameters)
         self._reward = rewards.by_name(config.reward)
         self._second_core = _worker(config, self.device)
         self.supervised = (
@@ -222,9 +223,9 @@ class Ppo:
         """
         rows = sum(len(block) for block in observations)
         if len(observations) > 1 and rows < SMALL_ROWS * len(observations):
-            mean = self.policy.mlp.infer(torch.cat(list(observations)).to(self.device))
+            mean = self.policy.network.infer(torch.cat(list(observations)).to(self.device))
         else:
-            mean = self.policy.mlp.infer(*(block.to(self.device) for block in observations))
+            mean = self.policy.network.infer(*(block.to(self.device) for block in observations))
         return self.bounds.to_world_m(mean).cpu().split([len(block) for block in observations])
 
     def learn(self, horizon: Horizon) -> UpdateStats:
@@ -237,8 +238,8 @@ class Ppo:
         rows = horizon.valid.flatten().nonzero().squeeze(1)
         observation = horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device)
         truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
-        mean = self.policy.mlp.infer(observation)
-        value = self.value.mlp.infer(observation).squeeze(1)
+        mean = self.policy.network.infer(observation)
+        value = self.value.network.infer(observation).squeeze(1)
         tries = self.config.actions_per_observation
         centre, place = (mean, truth) if tries == 1 else (mean.unsqueeze(1), truth.unsqueeze(1))
         noise = torch.randn(len(mean), tries, ACTIONS, generator=self._samplings[environment]).to(self.device)
@@ -297,7 +298,7 @@ class Ppo:
             steps: list[tuple[float, ...]] = []
             for part in union.minibatches(columns, order, self._parts(union)):
                 *told, ratio_max = self._policy_gradient(part, now)
-                norm = self._step("policy", policy.mlp.parameters, self.policy_optimiser, now.learning_rate)
+                norm = self._step("policy", policy.network.parameters, self.policy_optimiser, now.learning_rate)
                 steps.append(tuple(number * part.share for number in (*told, norm)))
                 largest.append(ratio_max)
             log += self._of_all("policy", steps)
@@ -312,14 +313,14 @@ class Ppo:
         """This rank's part of the gradient; its loss, KL, clip fraction, mean and largest ratio."""
         policy = self.policy
         if part.share == 0.0:
-            policy.mlp.parameters.gradient.zero_()
+            policy.network.parameters.gradient.zero_()
             return 0.0, 0.0, 0.0, 0.0, 0.0
         observation, action, old_log_probability = part.own
-        mean = policy.mlp.forward(observation)
+        mean = policy.network.forward(observation)
         advantage = part.mine(_normalised(part.advantage))
         surrogate = clipped_surrogate(mean, policy.log_std, action, old_log_probability, advantage, now.clip_epsilon)
         loss = self._finite("the policy's loss", surrogate.loss - now.entropy_scale * entropy(policy.log_std))
-        policy.mlp.backward(observation, surrogate.mean_gradient * part.share)
+        policy.network.backward(observation, surrogate.mean_gradient * part.share)
         policy.log_std_gradient.copy_((surrogate.log_std_gradient - now.entropy_scale) * part.share)
         ratio, kl = surrogate.ratio, surrogate.approximate_kl()
         return loss, kl, surrogate.clip_fraction(), ratio.mean().item(), ratio.max().item()
@@ -342,14 +343,14 @@ class Ppo:
         for order in orders:
             for part in union.minibatches(columns, order, self._parts(union)):
                 loss = self._value_gradient(part)
-                norm = self._step("value", self.value.mlp.parameters, self.value_optimiser, now.learning_rate)
+                norm = self._step("value", self.value.network.parameters, self.value_optimiser, now.learning_rate)
                 steps.append((loss * part.share, norm * part.share))
         loss, norm = _means(self._of_all("value", steps))
         return _ValueMeans(loss, norm)
 
     def _value_gradient(self, part: Minibatch) -> float:
         """This rank's part of the gradient; its loss."""
-        network = self.value.mlp
+        network = self.value.network
         if part.share == 0.0:
             network.parameters.gradient.zero_()
             return 0.0
@@ -382,7 +383,7 @@ class Ppo:
         ]
         next_value = on_grid[1].roll(-1, 0)
         if horizon.bootstrap is not None:
-            next_value[-1] = self.value.mlp.infer(horizon.bootstrap.to(self.device)).squeeze(1).cpu()
+            next_value[-1] = self.value.network.infer(horizon.bootstrap.to(self.device)).squeeze(1).cpu()
         # What follows a cut is not observed; the value at the cut is the nearest estimate of it.
         next_value = torch.where(horizon.truncated, on_grid[1], next_value)
         results = generalised_advantage(

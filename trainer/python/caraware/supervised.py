@@ -12,7 +12,7 @@ from torch import Tensor
 
 from caraware.adam import Adam
 from caraware.config import MapBounds, TrainerConfig
-from caraware.networks import GaussianPolicy
+from caraware.networks import Activation, GaussianPolicy
 from caraware.ranks import Minibatch, Ranks, Union
 from caraware.rewards import distance_m
 
@@ -35,7 +35,8 @@ class Supervised:
         self, config: TrainerConfig, observation_size: int, bounds: MapBounds, device: torch.device, ranks: Ranks
     ) -> None:
         self._seed, self._bounds, self._device, self._ranks = config.seed + SEED_OFFSET, bounds, device, ranks
-        self.mlp = GaussianPolicy(observation_size, ACTIONS, config.hidden, device).mlp
+        activation = Activation(config.activation)
+        self.mlp = GaussianPolicy(observation_size, ACTIONS, config.hidden, device, activation).network
         self.mlp.initialise(torch.Generator().manual_seed(self._seed))
         self.optimiser = Adam(self.mlp.parameters)
         corner, centre = (bounds.to_world_m(torch.full((ACTIONS,), place, device=device)) for place in (1.0, 0.0))

@@ -73,7 +73,7 @@ def random_batch(ppo: Ppo) -> Batch:
     """Actions of the given policy with made-up advantages."""
     observation = torch.rand(HORIZON, OBSERVATIONS) * 2 - 1
     with torch.no_grad():
-        action = ppo.policy.mlp.infer(observation.to(ppo.device)).cpu() + torch.randn(HORIZON, 2)
+        action = ppo.policy.network.infer(observation.to(ppo.device)).cpu() + torch.randn(HORIZON, 2)
     nothing = torch.zeros(HORIZON)
     log_probability = -0.5 * torch.randn(HORIZON, 2).square().sum(1) - 1.8379
     target = torch.rand(HORIZON)

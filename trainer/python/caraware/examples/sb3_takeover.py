@@ -60,7 +60,8 @@ def first_tick(run_dir: Path) -> int:
 def take_networks(model: PPO, checkpoint: Path) -> None:
     """Give the model the networks of a checkpoint of `caraware.train`: their layers, activations and parameters."""
     stored, policy = load_file(checkpoint / "parameters.safetensors"), model.policy
-    for name, last, head in (("policy", nn.Tanh, nn.Tanh), ("value", nn.ReLU, nn.Identity)):
+    activation = {"relu": nn.ReLU, "tanh": nn.Tanh}[read_manifest(checkpoint).activation]
+    for name, last, head in (("policy", nn.Tanh, nn.Tanh), ("value", activation, nn.Identity)):
         layers = sum(key.startswith(f"{name}.layer") and key.endswith("weight") for key in stored)
         linear = []
         for i in range(layers):
@@ -69,7 +70,7 @@ def take_networks(model: PPO, checkpoint: Path) -> None:
             layer.weight.data.copy_(weight)
             layer.bias.data.copy_(bias)
             linear.append(layer)
-        hidden = [module for layer in linear[:-1] for module in (layer, nn.ReLU())]
+        hidden = [module for layer in linear[:-1] for module in (layer, activation())]
         hidden[-1] = last()
         out = nn.Sequential(linear[-1], head())
         if name == "policy":
