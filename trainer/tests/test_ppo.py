@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from caraware.batch import save_batch
 from caraware.config import MapBounds, TrainerConfig
 from caraware.objective import clipped_error
-from caraware.ppo import NonFiniteLoss, Ppo, Settings, UpdateStats, save_batch
+from caraware.ppo import NonFiniteLoss, Ppo, Settings, UpdateStats
 from caraware.rewards import distance_m
 from caraware.rollout import Rollout
 from safetensors.torch import load_file

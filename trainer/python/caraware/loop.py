@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caraware.batch import Batch, save_batch
 from caraware.checkpoint import (
     Course,
     Keeping,
@@ -28,7 +29,8 @@ from caraware.evaluation import NO_HEADLINE, Evaluation, EvaluationResult, Mean,
 from caraware.manifest import Counters
 from caraware.metrics import Metrics, TrainingPoint
 from caraware.plots import plot_error, plot_sigma
-from caraware.ppo import Batch, NonFiniteLoss, Ppo, UpdateStats, save_batch
+from caraware.ppo import NonFiniteLoss, Ppo, UpdateStats
+from caraware.prediction import visible
 from caraware.ranks import RankError, Ranks, Verdict
 from caraware.rewards import distance_m
 from caraware.stream import Channel, Observation
@@ -71,6 +73,8 @@ class Learner:
         updates = self.ppo.updates
         load_checkpoint(checkpoint, self.ppo)
         self.ppo.updates = updates
+        # What another network remembers of other ticks says nothing about this run's.
+        self.ppo.restore_memory({})
 
     def places(self) -> list[Place]:
         """Where each environment stands; one that the checkpoint does not know stands at its beginning."""
@@ -195,6 +199,7 @@ class TrainingLoop:
             self._saved_updates = counters.updates
             self._metrics.resume(course.training, course.evaluations, counters.env_steps)
         self._sample_clock = (time.monotonic(), self._env_steps)
+        self._predictor = self._ppo.predictor(self._config.dark_is_nan)
         log.info("observations of %d fields, %s", size, self._config.trainer)
 
     def _receive(self) -> None:
@@ -219,11 +224,10 @@ class TrainingLoop:
         going_on = [each for each in self._environments if each.pending and self._may_go_on(each)]
         if going_on:
             assert self._ppo is not None
-            predictions_m = iter(self._predict_m([obs for environment in going_on for obs in environment.pending]))
+            predicted_m = self._predictor.predict_m({each.index: each.pending for each in going_on})
             for environment in going_on:
-                ticks = list(environment.pending)
-                predicted_m = [next(predictions_m) for _ in ticks]
-                if not self._take_all(environment, predicted_m, raw_errors_m(ticks)):
+                raw_m = raw_errors_m(environment.pending)
+                if not self._take_all(environment, predicted_m[environment.index], raw_m):
                     return
         if self._ppo is not None and self._learns:
             self._learn_or_give_up()
@@ -263,34 +267,14 @@ class TrainingLoop:
         elif any(environment.ended and not full[environment.index] for environment in self._environments):
             self._agree(Verdict.ENDED)
 
-    def _predict_m(self, ticks: Sequence[Observation]) -> list[Tensor]:
-        """Predicted positions `[n, 2]` for each tick. Training ticks go through the network together.
-
-        An evaluation tick goes alone and without empty slots: a matrix product rounds as its shape demands, and what an
-        evaluation says must not depend on how many ticks happened to wait.
-        """
-        assert self._ppo is not None
-        training = iter(self._ppo.predict_m([self._visible(obs) for obs in ticks if not obs.evaluation]))
-        return [self._predict_alone_m(obs) if obs.evaluation else next(training) for obs in ticks]
-
-    def _predict_alone_m(self, obs: Observation) -> Tensor:
-        assert self._ppo is not None
-        rows = torch.from_numpy(np.flatnonzero(obs.valid))
-        predicted_m = torch.zeros(len(obs.valid), 2)
-        predicted_m[rows] = self._ppo.predict_m([self._visible(obs).index_select(0, rows)])[0]
-        return predicted_m
-
-    def _visible(self, obs: Observation) -> Tensor:
-        """The observation as the networks take it: in place, unless fields of dark sensors must become numbers."""
-        return torch.nan_to_num(obs.observation) if self._config.dark_is_nan else obs.observation
-
     def _supervised_errors_m(self, obs: Observation) -> np.ndarray | None:
         """Of the baseline that is taught beside the policy, on the valid rows; None without it."""
         assert self._ppo is not None
         if self._ppo.supervised is None:
             return None
         rows = torch.from_numpy(np.flatnonzero(obs.valid))
-        predicted_m = self._ppo.supervised.predict_m(self._visible(obs).index_select(0, rows))
+        observation = visible(obs, self._config.dark_is_nan)
+        predicted_m = self._ppo.supervised.predict_m(observation.index_select(0, rows))
         return distance_m(predicted_m, obs.truth.index_select(0, rows)).numpy()
 
     def _take(self, environment: Environment, obs: Observation, predicted_m: Tensor, raw_m: np.ndarray) -> None:

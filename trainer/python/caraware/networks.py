@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -148,6 +149,21 @@ class Mlp:
             self._rows = rows
 
 
+class Network(Protocol):
+    """What PPO needs of a network: an `Mlp`, whose inputs are rows, or one with memory, whose inputs are sequences."""
+
+    parameters: FlatParameters
+
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draw the weights."""
+
+    def forward(self, inputs: Any) -> Tensor:
+        """Outputs `[b, outputs]`; keeps what `backward` needs."""
+
+    def backward(self, inputs: Any, output_gradient: Tensor) -> None:
+        """Overwrite the gradient of all weights, for the inputs of the last `forward` and dLoss/dOutput."""
+
+
 class GaussianPolicy:
     """Actions are normal around the MLP's mean, with one standard deviation per action for all observations.
 
@@ -168,9 +184,13 @@ class GaussianPolicy:
         layers = [hidden_layer(a, b, activation) for a, b in pairwise(widths[:-1])]
         layers.append(hidden_layer(widths[-2], widths[-1], Activation.TANH))
         layers.append(mean_layer(widths[-1], actions))
-        self.network = Mlp(layers, {"log_std": (actions,)}, device)
-        self.log_std = self.network.parameters.value["log_std"]
-        self.log_std_gradient = self.network.parameters.grad["log_std"]
+        self._take(Mlp(layers, {"log_std": (actions,)}, device))
+
+    def _take(self, network: Network) -> None:
+        """The network of the mean, with room for the logarithm of the standard deviation among its parameters."""
+        self.network = network
+        self.log_std = network.parameters.value["log_std"]
+        self.log_std_gradient = network.parameters.grad["log_std"]
 
     def initialise(self, generator: torch.Generator, initial_std: float) -> None:
         """Draw the weights and set the standard deviation."""

@@ -153,6 +153,9 @@ class PlayLoop:
         self._live = config.run_dir / LIVE
         self._board = Scoreboard(channel.run, config, Tally.read(self._live))
         self._shown_at = -math.inf
+        # What the checkpoint remembers is of another run's vehicles.
+        learner.ppo.restore_memory({})
+        self._predictor = learner.ppo.predictor(config.dark_is_nan, evaluations_alone=False)
 
     def run(self) -> None:
         """Predict until the last tick or a request to stop; then write `parts/trainer.json`."""
@@ -170,11 +173,10 @@ class PlayLoop:
             self._channel.done()
 
     def _take(self, ticks: Sequence[Observation]) -> None:
-        ppo = self._learner.ppo
-        visible = [obs.observation.nan_to_num() if self._config.dark_is_nan else obs.observation for obs in ticks]
-        for obs, predicted_m in zip(ticks, ppo.predict_m(visible), strict=True):
+        updates = self._learner.ppo.updates
+        for obs, predicted_m in zip(ticks, self._predictor.predict_m({0: ticks})[0], strict=True):
             self._board.add(obs, predicted_m)
-            self._channel.publish_predictions(obs, predicted_m, ppo.updates, self._board.estimates_m(obs))
+            self._channel.publish_predictions(obs, predicted_m, updates, self._board.estimates_m(obs))
             self._channel.consumed(obs.tick)
 
     def _show(self) -> None:

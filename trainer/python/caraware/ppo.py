@@ -9,22 +9,23 @@ samples depend on the seed and on the data alone, never on how many ticks happen
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from caraware import rewards
 from caraware.adam import Adam
+from caraware.batch import Batch
 from caraware.config import MapBounds, TrainerConfig
 from caraware.gae import generalised_advantage
 from caraware.graphed import GraphedUpdate, StepTable
 from caraware.networks import Activation, FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
 from caraware.objective import clipped_error, clipped_surrogate
+from caraware.prediction import Predictor, RowPredictor
 from caraware.ranks import Minibatch, Ranks, Union
 from caraware.rollout import Horizon
 from caraware.supervised import Supervised
@@ -44,44 +45,6 @@ class NonFiniteLoss(Exception):
         super().__init__(f"{what} is not finite in update {update}")
         self.update = update
         self.batch_file: Path | None = None
-
-
-@dataclass(frozen=True)
-class Batch:
-    """The samples of one horizon, `[s]` rows in order of tick, then slot."""
-
-    observation: Tensor
-    """f32 `[s, d]`."""
-    action: Tensor
-    """f32 `[s, 2]`, as sampled, not clipped; `[s, k, 2]` with k > 1 actions per observation."""
-    log_probability: Tensor
-    """f32 `[s]` or `[s, k]` of the action under the policy that sampled it."""
-    reward: Tensor
-    """f32 `[s]`, mean over the actions of an observation."""
-    advantage: Tensor
-    """f32 `[s]` or `[s, k]`, before normalisation."""
-    value_target: Tensor
-    """f32 `[s]`."""
-    truth: Tensor
-    """f32 `[s, 4]`."""
-    error_m: Tensor
-    """f32 `[s]`: distance of the policy's mean, which nobody sampled, to the truth."""
-    vehicle: Tensor
-    """i64 `[s]`."""
-    tick: Tensor
-    """i64 `[s]`."""
-
-    @classmethod
-    def joined(cls, batches: Sequence["Batch"]) -> "Batch":
-        """The rows of all, one batch after the other."""
-        if len(batches) == 1:
-            return batches[0]
-        columns = (f.name for f in fields(cls))
-        return cls(**{name: torch.cat([getattr(batch, name) for batch in batches]) for name in columns})
-
-    def value_advantage(self) -> Tensor:
-        """f32 `[s]`: the value target minus the value before the update."""
-        return self.advantage if self.advantage.ndim == 1 else self.advantage.mean(1)
 
 
 @dataclass(frozen=True)
@@ -148,6 +111,22 @@ class Settings:
 
 
 @dataclass(frozen=True)
+class ForwardPass:
+    """What both networks say of a horizon."""
+
+    rows: Tensor
+    """i64 `[s]`: where the samples are in the flattened horizon."""
+    observation: Tensor
+    """f32 `[s, d]`."""
+    mean: Tensor
+    """f32 `[s, 2]`: the policy's mean action."""
+    value: Tensor
+    """f32 `[s]`."""
+    value_after: Tensor | None
+    """f32 `[N]`: of what followed the last tick in each slot; None where no discount asks for it."""
+
+
+@dataclass(frozen=True)
 class _PolicyMeans:
     epochs: int
     loss: float
@@ -186,12 +165,10 @@ class Ppo:
         self.device = _configure_torch(config)
         self.sampling = torch.Generator().manual_seed(config.seed)
         self.shuffling = torch.Generator().manual_seed(config.seed + 1)
-        activation = Activation(config.activation)
-        self.policy = GaussianPolicy(observation_size, ACTIONS, config.hidden, self.device, activation)
-        self.value = ValueNetwork(observation_size, config.hidden, self.device, activation)
+        self._environments = tuple(environments)
+        self.policy, self.value = self._networks()
         self.policy.initialise(self.sampling, config.initial_std)
         self.value.initialise(self.sampling)
-        self._environments = tuple(environments)
         self._samplings = [self._sampling_of(index) for index in environments]
         self.policy_optimiser = Adam(self.policy.network.parameters)
         self.value_optimiser = Adam(self.value.network.parameters)
@@ -200,8 +177,17 @@ class Ppo:
         self.supervised = (
             Supervised(config, observation_size, bounds, self.device, self.ranks) if config.supervised else None
         )
-        # The steps of several ranks meet on the way, which a graph of one rank's step does not know of.
-        self._graphed = GraphedUpdate(self) if self.device.type == "cuda" and self.ranks.size == 1 else None
+        self._graphed = self._graphed_update()
+
+    def _networks(self) -> tuple[GaussianPolicy, ValueNetwork]:
+        """Policy and value network, before a weight is drawn."""
+        config, activation = self.config, Activation(self.config.activation)
+        policy = GaussianPolicy(self.observation_size, ACTIONS, config.hidden, self.device, activation)
+        return policy, ValueNetwork(self.observation_size, config.hidden, self.device, activation)
+
+    def _graphed_update(self) -> GraphedUpdate | None:
+        """On a GPU. The steps of several ranks meet on the way, which a graph of one rank's step does not know of."""
+        return GraphedUpdate(self) if self.device.type == "cuda" and self.ranks.size == 1 else None
 
     def _sampling_of(self, environment: int) -> torch.Generator:
         """Every environment has its own random actions, whoever learns from it; the first goes on after the weights."""
@@ -213,6 +199,17 @@ class Ppo:
         """The random numbers of the actions, by the name that a checkpoint gives them."""
         names = (f"sampling{index or ''}" for index in self._environments)
         return dict(zip(names, self._samplings, strict=True))
+
+    def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> Predictor:
+        """What predicts for the ticks of a stream as they come (`caraware.prediction`)."""
+        return RowPredictor(self, dark_is_nan, evaluations_alone)
+
+    def memory_tensors(self) -> dict[str, Tensor]:
+        """What the networks remember of trajectories up to the newest horizon; nothing, if they see one moment."""
+        return {}
+
+    def restore_memory(self, tensors: dict[str, Tensor]) -> None:
+        """Remember what `memory_tensors` told; with nothing, forget everything."""
 
     @torch.no_grad()
     def predict_m(self, observations: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -235,23 +232,35 @@ class Ppo:
     @torch.no_grad()
     def score(self, horizon: Horizon, environment: int = 0) -> Batch:
         """Give every sample of one environment's horizon its action, reward and advantage."""
+        return self._scored(horizon, self._forward(horizon), environment)
+
+    def _forward(self, horizon: Horizon) -> ForwardPass:
+        """Both networks over all samples."""
         rows = horizon.valid.flatten().nonzero().squeeze(1)
         observation = horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device)
-        truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
         mean = self.policy.network.infer(observation)
         value = self.value.network.infer(observation).squeeze(1)
+        if horizon.bootstrap is None or self.config.discount == 0.0:
+            return ForwardPass(rows, observation, mean, value, None)
+        after = self.value.network.infer(horizon.bootstrap.to(self.device)).squeeze(1)
+        return ForwardPass(rows, observation, mean, value, after.cpu())
+
+    def _scored(self, horizon: Horizon, forward: ForwardPass, environment: int) -> Batch:
+        """Actions around the policy's means, their rewards and advantages."""
+        rows, mean, value = forward.rows, forward.mean, forward.value
+        truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
         tries = self.config.actions_per_observation
         centre, place = (mean, truth) if tries == 1 else (mean.unsqueeze(1), truth.unsqueeze(1))
         noise = torch.randn(len(mean), tries, ACTIONS, generator=self._samplings[environment]).to(self.device)
         action = centre + self.policy.log_std.exp() * (noise.squeeze(1) if tries == 1 else noise)
         reward = self._reward(rewards.distance_m(self.bounds.to_world_m(action), place), self.config.reward_scale_m)
         if tries == 1:
-            advantage, value_target = self._advantages(horizon, rows, reward, value)
+            advantage, value_target = self._advantages(horizon, forward, reward)
         else:
             advantage = reward - value.unsqueeze(1)
             reward = value_target = reward.mean(1)
         return Batch(
-            observation=observation,
+            observation=forward.observation,
             action=action,
             log_probability=log_probability(action, centre, self.policy.log_std),
             reward=reward,
@@ -268,7 +277,8 @@ class Ppo:
         """All epochs of minibatches over one batch. Policy and value share nothing, so each has its own core."""
         now = Settings.at(self.config, self.updates, self.progress)
         union = self.ranks.union(batch.advantage, batch.reward, batch.value_target)
-        orders = [torch.randperm(len(union), generator=self.shuffling) for _ in range(self.config.epochs)]
+        pieces = self._pieces(batch, union)
+        orders = [torch.randperm(pieces, generator=self.shuffling) for _ in range(self.config.epochs)]
         orders = [order.to(self.device) for order in orders]
         if self._graphed is not None:
             policy, value = self._means_of(self._graphed.run(batch, orders, now), len(orders))
@@ -287,16 +297,26 @@ class Ppo:
         self.updates += 1
         return self._stats(batch, union, policy, value, now)
 
+    def _pieces(self, batch: Batch, union: Union) -> int:
+        """How many pieces of the union are shuffled: its samples."""
+        return len(union)
+
+    def _minibatches(
+        self, lane: str, batch: Batch, union: Union, columns: Sequence[Tensor], order: Tensor
+    ) -> Iterator[Minibatch]:
+        """The pieces in `order`, cut into minibatches: what the network of `lane` takes, then rows of `columns`."""
+        return union.minibatches((batch.observation, *columns), order, self._parts(union))
+
     @torch.no_grad()
     def _improve_policy(self, batch: Batch, union: Union, orders: list[Tensor], now: Settings) -> _PolicyMeans:
         """Climb the clipped surrogate objective plus the entropy bonus."""
         policy, epochs = self.policy, 0
         log: list[list[float]] = []
         largest: list[float] = []
-        columns = (batch.observation, batch.action, batch.log_probability)
+        columns = (batch.action, batch.log_probability)
         for order in orders:
             steps: list[tuple[float, ...]] = []
-            for part in union.minibatches(columns, order, self._parts(union)):
+            for part in self._minibatches("policy", batch, union, columns, order):
                 *told, ratio_max = self._policy_gradient(part, now)
                 norm = self._step("policy", policy.network.parameters, self.policy_optimiser, now.learning_rate)
                 steps.append(tuple(number * part.share for number in (*told, norm)))
@@ -339,9 +359,9 @@ class Ppo:
     def _improve_value(self, batch: Batch, union: Union, orders: list[Tensor], now: Settings) -> _ValueMeans:
         """Regress on the value targets with the mean squared error, clipped where `value_clip` says so."""
         steps = []
-        columns = (batch.observation, batch.value_target, batch.value_advantage())
+        columns = (batch.value_target, batch.value_advantage())
         for order in orders:
-            for part in union.minibatches(columns, order, self._parts(union)):
+            for part in self._minibatches("value", batch, union, columns, order):
                 loss = self._value_gradient(part)
                 norm = self._step("value", self.value.network.parameters, self.value_optimiser, now.learning_rate)
                 steps.append((loss * part.share, norm * part.share))
@@ -373,8 +393,9 @@ class Ppo:
         policy = _PolicyMeans(epochs, loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
         return policy, _ValueMeans(value_loss, value_norm)
 
-    def _advantages(self, horizon: Horizon, rows: Tensor, reward: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
+    def _advantages(self, horizon: Horizon, forward: ForwardPass, reward: Tensor) -> tuple[Tensor, Tensor]:
         """Advantages and value targets `[s]` of the samples, by way of the `[T, N]` grid that GAE needs."""
+        rows, value = forward.rows, forward.value
         if self.config.discount == 0.0:
             return reward - value, reward
         grid = horizon.valid.shape
@@ -382,8 +403,8 @@ class Ppo:
             torch.zeros(grid.numel()).index_copy_(0, rows, column.cpu()).view(grid) for column in (reward, value)
         ]
         next_value = on_grid[1].roll(-1, 0)
-        if horizon.bootstrap is not None:
-            next_value[-1] = self.value.network.infer(horizon.bootstrap.to(self.device)).squeeze(1).cpu()
+        if forward.value_after is not None:
+            next_value[-1] = forward.value_after
         # What follows a cut is not observed; the value at the cut is the nearest estimate of it.
         next_value = torch.where(horizon.truncated, on_grid[1], next_value)
         results = generalised_advantage(
@@ -457,13 +478,6 @@ class Ppo:
     def sigma(self) -> float:
         """Standard deviation of the policy, mean over the actions; 1 is half the map."""
         return self.policy.log_std.exp().mean().item()
-
-
-def save_batch(batch: Batch, policy: FlatParameters, file: Path) -> None:
-    """Write a batch and the policy that met it, for whoever must find out why its loss is not a number."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    columns = {name: column.clone().cpu() for name, column in vars(batch).items()}
-    save_file(columns | {f"policy.{name}": value.clone().cpu() for name, value in policy.value.items()}, file)
 
 
 def _normalised(advantage: Tensor) -> Tensor:

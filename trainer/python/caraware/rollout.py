@@ -31,6 +31,8 @@ class Horizon:
     """bool `[T, N]`: the trajectory ended with this row."""
     truncated: Tensor
     """bool `[T, N]`: it went on, but the next row of the slot is not its continuation."""
+    cut: Tensor
+    """bool `[N]`: the flags of the first tick say that the trajectory in the slot before it ended there."""
     bootstrap: Tensor | None
     """f32 `[N, d]`: what followed the last tick; None where no discount asks for it."""
 
@@ -57,6 +59,7 @@ class Rollout:
         self._samples = self._newest_samples = 0
         self._last_tick = -1
         self._taken = 0
+        self._cut = np.zeros(0, bool)
         self._allocate(ticks=16, slots=1)
 
     def add(self, obs: Observation) -> None:
@@ -71,6 +74,8 @@ class Rollout:
         if self._ticks == self._capacity:
             self._grow(2 * self._capacity, self._slots)
         t = self._ticks
+        if t == 0:
+            self._cut = obs.terminated | obs.truncated
         self._observation[t, :rows].copy_(obs.observation)
         if self._dark_is_nan:
             self._observation[t, :rows].nan_to_num_()
@@ -116,6 +121,7 @@ class Rollout:
             valid=torch.from_numpy(self._valid[:end].copy()),
             terminated=torch.from_numpy(self._terminated[:end].copy()),
             truncated=torch.from_numpy(self._truncated[:end].copy()),
+            cut=torch.from_numpy(np.pad(self._cut, (0, self._slots - len(self._cut)))),
             bootstrap=self._observation[end].clone() if self._bootstrap else None,
         )
         self._taken, self._samples = end, self._newest_samples if self._bootstrap else 0
@@ -129,6 +135,8 @@ class Rollout:
             array[: self._ticks - self._taken] = array[self._taken : self._ticks]
         self._ticks -= self._taken
         self._taken = 0
+        # How trajectories ended before a tick that only served as a bootstrap, the horizon before it has told.
+        self._cut = np.zeros(0, bool)
 
     def _close_changed_slots(self, t: int) -> None:
         """A slot that changed hands, or has a gap, without a flag: its trajectory went on unseen."""

@@ -1,0 +1,59 @@
+"""The samples of one horizon, scored: what an update learns from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from caraware.networks import FlatParameters
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The samples of one horizon, `[s]` rows in order of tick, then slot."""
+
+    observation: Tensor
+    """f32 `[s, d]`."""
+    action: Tensor
+    """f32 `[s, 2]`, as sampled, not clipped; `[s, k, 2]` with k > 1 actions per observation."""
+    log_probability: Tensor
+    """f32 `[s]` or `[s, k]` of the action under the policy that sampled it."""
+    reward: Tensor
+    """f32 `[s]`, mean over the actions of an observation."""
+    advantage: Tensor
+    """f32 `[s]` or `[s, k]`, before normalisation."""
+    value_target: Tensor
+    """f32 `[s]`."""
+    truth: Tensor
+    """f32 `[s, 4]`."""
+    error_m: Tensor
+    """f32 `[s]`: distance of the policy's mean, which nobody sampled, to the truth."""
+    vehicle: Tensor
+    """i64 `[s]`."""
+    tick: Tensor
+    """i64 `[s]`."""
+
+    @staticmethod
+    def joined(batches: Sequence["Batch"]) -> "Batch":
+        """The rows of all, one batch after the other."""
+        first, *others = batches
+        return first.followed_by(others) if others else first
+
+    def followed_by(self, others: Sequence["Batch"]) -> "Batch":
+        """The rows of this one, then those of the others."""
+        columns = (f.name for f in fields(Batch))
+        return Batch(**{name: torch.cat([getattr(batch, name) for batch in (self, *others)]) for name in columns})
+
+    def value_advantage(self) -> Tensor:
+        """f32 `[s]`: the value target minus the value before the update."""
+        return self.advantage if self.advantage.ndim == 1 else self.advantage.mean(1)
+
+
+def save_batch(batch: Batch, policy: FlatParameters, file: Path) -> None:
+    """Write a batch and the policy that met it, for whoever must find out why its loss is not a number."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    columns = {name: column.clone().cpu() for name, column in vars(batch).items()}
+    save_file(columns | {f"policy.{name}": value.clone().cpu() for name, value in policy.value.items()}, file)
