@@ -6,7 +6,7 @@ use std::{
 };
 
 use ipc_schema::{
-    config::{Activation, Config},
+    config::{Activation, Config, Network},
     run::{Beginning, RunFile},
 };
 use serde::{Deserialize, Serialize};
@@ -18,6 +18,7 @@ use crate::{failure::Exit, install::Install};
 struct Manifest {
     observation_size: u64,
     hidden: Vec<u64>,
+    network: Network,
     activation: Activation,
     counters: Counters,
 }
@@ -143,6 +144,11 @@ impl Found {
         if size != width {
             let help = "set observation.fields and observation.history as in the run that learnt it";
             return refuse("observation has", format!("{size} numbers"), width.to_string(), help);
+        }
+        if self.manifest.network != config.trainer.network {
+            let (has, wants) = (self.manifest.network, config.trainer.network);
+            let help = "set trainer.network as in the run that learnt it";
+            return refuse("network is", word(has), word(wants), help);
         }
         if self.manifest.activation != config.trainer.activation {
             let (has, wants) = (self.manifest.activation, config.trainer.activation);

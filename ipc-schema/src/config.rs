@@ -370,11 +370,17 @@ pub struct Trainer {
     pub batch_size: u64,
     /// Passes over a horizon.
     pub epochs: u64,
+    /// Networks of policy and value.
+    #[serde(default)]
+    pub network: Network,
     /// Width of the hidden layers of policy and value network.
     pub hidden: Vec<u64>,
     /// What follows a hidden layer.
     #[serde(default)]
     pub activation: Activation,
+    /// Ticks that a gradient reaches back in a network with memory.
+    #[serde(default = "default_truncation_ticks")]
+    pub truncation_ticks: u64,
     /// Train a network of the policy's size by regression beside it.
     pub supervised: bool,
     /// Reward by name.
@@ -433,6 +439,22 @@ pub struct Fanout {
     pub vehicles_hz: f64,
     /// The same of `status`.
     pub status_hz: f64,
+}
+
+/// Of a run file that was written before there were networks with memory.
+fn default_truncation_ticks() -> u64 {
+    32
+}
+
+/// Networks of policy and value.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Network {
+    /// Hidden layers: sees one moment.
+    #[default]
+    Mlp,
+    /// The last hidden layer is a gated recurrent unit, with a state for each slot.
+    Gru,
 }
 
 /// What follows a hidden layer of policy and value network.

@@ -212,6 +212,22 @@ fn a_batch_larger_than_the_horizon_is_refused() {
 }
 
 #[test]
+fn networks_are_known_by_name_and_one_with_memory_has_no_ranks() {
+    assert!(error_of("trainer.network = \"lstm\"\n").1.contains("\"mlp\", \"gru\""));
+    assert!(
+        error_of("trainer.activation = \"gelu\"\n")
+            .1
+            .contains("\"relu\", \"tanh\"")
+    );
+    let (message, help) = error_of("trainer.network = \"gru\"\ntrainer.ranks = 2\n");
+    assert!(
+        message.contains("`trainer.network` = \"gru\" with `trainer.ranks` = 2"),
+        "{message}"
+    );
+    assert!(help.contains("run.envs"), "{help}");
+}
+
+#[test]
 fn a_word_on_the_command_line_is_a_word() {
     for assignment in ["blackout.policy=nan", "blackout.policy=\"nan\"", "trainer.module=nan"] {
         assert!(layer::parse_assignment(assignment).is_ok(), "{assignment}");

@@ -39,6 +39,8 @@ def test_the_seed_of_the_run_is_the_trainer_s() -> None:
         ("horizon", True, "`trainer.horizon` is True"),
         ("batch_size", 1000, "`trainer.batch_size` is 1000"),
         ("hidden", [], "`trainer.hidden` is"),
+        ("network", "lstm", "`trainer.network` is 'lstm'"),
+        ("truncation_ticks", 0, "`trainer.truncation_ticks` is 0"),
         ("activation", "gelu", "`trainer.activation` is 'gelu'"),
         ("reward", "best", "`trainer.reward` is 'best'"),
         ("algorithm", "sac", "`trainer.algorithm` is 'sac'"),

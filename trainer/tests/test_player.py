@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from caraware.baselines import Ekf, SensorNoise
 from caraware.baselines.samples import read_samples
 from caraware.config import RunConfig
 from caraware.loop import Learner
+from caraware.memory import Memory
 from caraware.player import LIVE, PlayLoop, Tally
 from synthetic import SyntheticChannel
 from synthetic_vehicle import VehicleObservation, observations, sensor_tables, town_track, vehicle_run
@@ -104,6 +106,26 @@ def test_a_successor_counts_on_from_the_file(tmp_path: Path) -> None:
         assert one[key] == two[key]
     for key in ("ppo_mean_error_m", "raw_gnss_mean_error_m", "ppo_ci95_m"):
         assert two[key] == pytest.approx(one[key], rel=1e-6)
+
+
+def test_a_policy_with_memory_plays_without_that_of_the_checkpoint(tmp_path: Path) -> None:
+    played = vehicle_run(str(tmp_path), network="gru")
+    played["config"]["traffic"] = {}
+    config, shown = RunConfig.from_run(played), []
+    for group in (1, 8):
+        channel = SyntheticChannel(played, ticks(), group)
+        learner = Learner.begin(config, next(ticks()).observation.shape[1])
+        everybody = torch.arange(VEHICLES)
+        width = learner.ppo.memories[0].state.shape[1]
+        known = Memory(torch.tensor(-1), everybody, torch.ones(VEHICLES, width))
+        learner.ppo.memories = [known]
+        PlayLoop(channel, config, learner, lambda: False).run()
+        (tmp_path / LIVE).unlink()
+        shown.append(channel.predictions)
+    assert all(torch.equal(shown[0][tick], shown[1][tick]) for tick in range(2 * TICKS))
+    seen = next(ticks()).observation
+    first_m = learner.ppo.predict_m([seen])[0]
+    torch.testing.assert_close(shown[0][0], first_m)
 
 
 def test_a_file_that_is_no_table_is_no_predecessor(tmp_path: Path) -> None:

@@ -36,6 +36,8 @@ from caraware.ppo import Ppo, Settings
 COURSE = "course.json"
 RANDOM = "random.safetensors"
 POINTS = "points.safetensors"
+MEMORY = "memory.safetensors"
+"""What networks remember of trajectories at the committed tick; those that see one moment have none."""
 SUPERVISED = "supervised.safetensors"
 """Of the baseline beside PPO; a checkpoint of a run without it has none, and the baseline then begins anew."""
 
@@ -94,6 +96,8 @@ def save_checkpoint(
     tensors_of = _tensors(ppo)
     tensors_of[RANDOM] |= random or {}
     files = {name: _write(temporary / name, save(tensors)) for name, tensors in tensors_of.items()}
+    if memory := ppo.memory_tensors():
+        files[MEMORY] = _write(temporary / MEMORY, save(memory))
     if course is not None:
         rows = torch.tensor([astuple(point) for point in course.training], dtype=torch.float64)
         files[POINTS] = _write(temporary / POINTS, save({"training": rows}))
@@ -105,6 +109,7 @@ def save_checkpoint(
         config_sha256=config_sha256,
         observation_size=ppo.observation_size,
         hidden=ppo.config.hidden,
+        network=ppo.config.network,
         activation=ppo.config.activation,
         counters=counters,
         schedules=_schedules(ppo),
@@ -144,6 +149,7 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
     stored = {
         name: _read_tensors(checkpoint / name, digest) for name, digest in manifest.files.items() if name in current
     }
+    memory = _read_tensors(checkpoint / MEMORY, manifest.files[MEMORY]) if MEMORY in manifest.files else {}
     for name, tensors in current.items():
         found = set(stored.get(name, {}))
         # A checkpoint of several ranks holds the generators of all.
@@ -154,6 +160,7 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
     for name, generator in ppo.sampling_generators().items():
         generator.set_state(stored[RANDOM][name])
     ppo.shuffling.set_state(stored[RANDOM]["shuffling"])
+    ppo.restore_memory(memory)
     ppo.updates = manifest.counters.updates
     return manifest.counters
 
@@ -161,7 +168,7 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
 def _check_network(file: Path, manifest: Manifest, ppo: Ppo) -> None:
     """Raises `CheckpointError` where the networks are others."""
     expected = {"observation_size": ppo.observation_size}
-    expected |= {name: getattr(ppo.config, name) for name in ("hidden", "activation")}
+    expected |= {name: getattr(ppo.config, name) for name in ("network", "hidden", "activation")}
     for name, own in expected.items():
         if (found := getattr(manifest, name)) != own:
             raise CheckpointError(file, f"its {name} is {found}, this run's is {own}")

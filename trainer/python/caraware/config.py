@@ -68,9 +68,13 @@ class TrainerConfig:
     batch_size: int = 1024
     """Samples in a gradient step."""
     epochs: int = 4
+    network: str = "mlp"
+    """`mlp`, or `gru`: the last hidden layer remembers the ticks before (`caraware.recurrent`)."""
     hidden: tuple[int, ...] = (500, 300)
     activation: str = "relu"
     """Of the hidden layers: `relu` or `tanh`. The policy's last hidden layer is tanh in any case, as CarAware's."""
+    truncation_ticks: int = 32
+    """Ticks that a gradient reaches back in a network with memory."""
     supervised: bool = True
     """Teach a network of the policy's size by regression to the truth beside it (`caraware.supervised`)."""
     reward: str = "bounded_inverse"
@@ -114,6 +118,7 @@ class TrainerConfig:
     def _check(self) -> None:
         _choice("algorithm", self.algorithm, ("ppo",))
         _choice("device", self.device, ("cpu", "auto"))
+        _choice("network", self.network, ("mlp", "gru"))
         _choice("activation", self.activation, ("relu", "tanh"))
         _choice("estimates", self.estimates, ("paced", "always", "never"))
         _choice("reward", self.reward, tuple(rewards.REWARDS))
@@ -133,13 +138,18 @@ class TrainerConfig:
                 f"`trainer.actions_per_observation` = {self.actions_per_observation} with several ranks",
                 "ranks already share more samples: set trainer.actions_per_observation = 1",
             )
+        if self.network != "mlp" and self.ranks > 1:
+            raise ConfigError(
+                f'`trainer.network` = "{self.network}" with several ranks',
+                'ranks share samples, not sequences: set trainer.network = "mlp", or run.envs instead of ranks',
+            )
         if self.actions_per_observation > 1 and self.discount > 0.0:
             raise ConfigError(
                 f"`trainer.actions_per_observation` = {self.actions_per_observation} with `trainer.discount`"
                 f" = {self.discount}",
                 "several actions on one observation have one future: set trainer.discount = 0",
             )
-        for name in ("actions_per_observation", "horizon", "batch_size", "epochs", "ranks"):
+        for name in ("actions_per_observation", "horizon", "batch_size", "epochs", "ranks", "truncation_ticks"):
             _range(name, getattr(self, name), 1, math.inf)
         for name in ("checkpoint_interval_updates", "checkpoints_kept"):
             _range(name, getattr(self, name), 1, math.inf)

@@ -32,6 +32,7 @@ from caraware.plots import plot_error, plot_sigma
 from caraware.ppo import NonFiniteLoss, Ppo, UpdateStats
 from caraware.prediction import visible
 from caraware.ranks import RankError, Ranks, Verdict
+from caraware.recurrent import RecurrentPpo
 from caraware.rewards import distance_m
 from caraware.stream import Channel, Observation
 
@@ -39,6 +40,7 @@ log = logging.getLogger(__name__)
 
 CREDIT_TICKS = 8
 """The simulation gets its credit back after so many ticks, or when no more wait: each time it is woken."""
+PPO_OF_NETWORK = {"mlp": Ppo, "gru": RecurrentPpo}
 RECEIVE_TIMEOUT_S = 0.2
 """How long a request to stop may wait for the next tick."""
 
@@ -54,7 +56,8 @@ class Learner:
     @classmethod
     def begin(cls, config: RunConfig, observation_size: int, ranks: Ranks | None = None) -> "Learner":
         """A learner for observations of this size, continued from `config.resume_from`. Raises `CheckpointError`."""
-        ppo = Ppo(config.trainer, observation_size, config.bounds, config.environments, ranks)
+        kind = PPO_OF_NETWORK[config.trainer.network]
+        ppo = kind(config.trainer, observation_size, config.bounds, config.environments, ranks)
         learner = cls(ppo, Counters(0, 0, 0, -1), Course())
         if config.resume_from is not None:
             learner.load(config.resume_from)

@@ -66,8 +66,9 @@ class Manifest:
     schedules: Schedules
     files: dict[str, str]
     """Name to SHA-256. `random.safetensors` holds the states of the random numbers."""
+    network: str = "mlp"
     activation: str = "relu"
-    """Of the hidden layers; a manifest without it is of a time when there was no other."""
+    """Of the hidden layers; a manifest without these two is of a time when there was no other."""
 
 
 def best_checkpoint(folder: Path) -> Path | None:

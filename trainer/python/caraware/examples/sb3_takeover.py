@@ -60,7 +60,10 @@ def first_tick(run_dir: Path) -> int:
 def take_networks(model: PPO, checkpoint: Path) -> None:
     """Give the model the networks of a checkpoint of `caraware.train`: their layers, activations and parameters."""
     stored, policy = load_file(checkpoint / "parameters.safetensors"), model.policy
-    activation = {"relu": nn.ReLU, "tanh": nn.Tanh}[read_manifest(checkpoint).activation]
+    manifest = read_manifest(checkpoint)
+    if manifest.network != "mlp":
+        raise SystemExit(f"{checkpoint}: its network is {manifest.network}; this example takes over from an MLP")
+    activation = {"relu": nn.ReLU, "tanh": nn.Tanh}[manifest.activation]
     for name, last, head in (("policy", nn.Tanh, nn.Tanh), ("value", activation, nn.Identity)):
         layers = sum(key.startswith(f"{name}.layer") and key.endswith("weight") for key in stored)
         linear = []

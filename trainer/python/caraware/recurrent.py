@@ -1,0 +1,231 @@
+"""PPO whose networks remember: what differs from `caraware.ppo` (docs/decisions/0018).
+
+A horizon is walked through tick by tick from the states that the horizon before left. Its trajectories are cut into
+sequences of at most `trainer.truncation_ticks`, each with the state that the walk had at its first row; minibatches
+are whole sequences, and no gradient reaches back beyond one. Objective, optimisers and statistics are `Ppo`'s.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caraware.batch import Batch
+from caraware.gru import RecurrentPolicy, RecurrentValue, Sequences, Steps, Walk
+from caraware.memory import Memory
+from caraware.networks import Activation
+from caraware.ppo import ACTIONS, ForwardPass, Ppo
+from caraware.prediction import Ticks, visible
+from caraware.ranks import Minibatch, Union
+from caraware.rollout import Horizon
+from caraware.stream import Observation
+
+NOBODY = -1
+"""In a table of sequences: a shorter one has no sample there."""
+
+
+@dataclass(frozen=True)
+class RecurrentBatch(Batch):
+    """Samples, and which of them follow each other."""
+
+    sequence: Tensor
+    """i64 `[c, L]`: rows of each sequence in order, then `NOBODY`."""
+    policy_start: Tensor
+    """f32 `[c, h]`: the policy's state before each sequence."""
+    value_start: Tensor
+    """f32 `[c, h]`: the value network's."""
+
+    def followed_by(self, others: Sequence[Batch]) -> "RecurrentBatch":
+        """See `Batch.followed_by`."""
+        batches = [self, *others]
+        assert all(isinstance(batch, RecurrentBatch) for batch in batches)
+        longest = max(batch.sequence.shape[1] for batch in batches)
+        tables, first = [], 0
+        for batch in batches:
+            shifted = torch.where(batch.sequence == NOBODY, NOBODY, batch.sequence + first)
+            missing = longest - shifted.shape[1]
+            tables.append(torch.nn.functional.pad(shifted, (0, missing), value=NOBODY))
+            first += len(batch.reward)
+        return RecurrentBatch(
+            **vars(super().followed_by(others)),
+            sequence=torch.cat(tables),
+            policy_start=torch.cat([batch.policy_start for batch in batches]),
+            value_start=torch.cat([batch.value_start for batch in batches]),
+        )
+
+    def lengths(self) -> Tensor:
+        """i64 `[c]`: samples of each sequence."""
+        return (self.sequence != NOBODY).sum(1)
+
+
+class RecurrentPpo(Ppo):
+    """`Ppo` with memory: what the networks remember at the last tick of the newest horizon is part of its state."""
+
+    policy: RecurrentPolicy
+    value: RecurrentValue
+
+    def _networks(self) -> tuple[RecurrentPolicy, RecurrentValue]:
+        config, activation = self.config, Activation(self.config.activation)
+        policy = RecurrentPolicy(self.observation_size, ACTIONS, config.hidden, self.device, activation)
+        value = RecurrentValue(self.observation_size, config.hidden, self.device, activation)
+        self._widths = (policy.network.width, value.network.width)
+        self.memories = [Memory.nothing(sum(self._widths)) for _ in self._environments]
+        return policy, value
+
+    def _graphed_update(self) -> None:
+        """The steps of sequences are as many as the longest has rows: no two minibatches have one shape."""
+
+    def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> "SequencePredictor":
+        """See `Ppo.predictor`. Every tick goes alone."""
+        return SequencePredictor(self, dark_is_nan)
+
+    def policy_memory(self, environment: int) -> Memory:
+        """What the policy remembers of an environment, after the last tick of its newest horizon."""
+        return self.memories[environment].part(0, self._widths[0])
+
+    def memory_tensors(self) -> dict[str, Tensor]:
+        """See `Ppo.memory_tensors`: by the number of the environment."""
+        named = zip(self._environments, self.memories, strict=True)
+        return {name: tensor for number, memory in named for name, tensor in memory.tensors(f"{number}").items()}
+
+    def restore_memory(self, tensors: dict[str, Tensor]) -> None:
+        """See `Ppo.restore_memory`."""
+        nothing = Memory.nothing(sum(self._widths))
+        self.memories = [Memory.restored(tensors, f"{number}") or nothing for number in self._environments]
+
+    @torch.no_grad()
+    def score(self, horizon: Horizon, environment: int = 0) -> RecurrentBatch:
+        """See `Ppo.score`. The next horizon of the environment begins with the memory that this one leaves."""
+        goes_on = continues(horizon)
+        rows = horizon.valid.flatten().nonzero().squeeze(1)
+        slots = horizon.valid.shape[1]
+        steps = Steps(
+            observation=horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device),
+            slot=(rows % slots).to(self.device),
+            goes_on=goes_on.flatten()[rows].to(self.device),
+            sizes=horizon.valid.sum(1).tolist(),
+        )
+        start = self.memories[environment].before(int(horizon.tick[0]), horizon.vehicle[0], horizon.cut)
+        policy_start, value_start = start.to(self.device).split(self._widths, 1)
+        policy = self.policy.network.walk(steps, policy_start)
+        value = self.value.network.walk(steps, value_start)
+        after = self._value_after(horizon, value)
+        forward = ForwardPass(rows, steps.observation, policy.output, value.output.squeeze(1), after)
+        scored = self._scored(horizon, forward, environment)
+        self.memories[environment] = Memory.after(
+            int(horizon.tick[-1]), horizon.vehicle[-1], outlives(horizon), torch.cat((policy.last, value.last), 1).cpu()
+        )
+        table = sequences(horizon.valid, goes_on, self.config.truncation_ticks).to(self.device)
+        first = table[:, 0]
+        return RecurrentBatch(
+            **vars(scored), sequence=table, policy_start=policy.before[first], value_start=value.before[first]
+        )
+
+    def _value_after(self, horizon: Horizon, walk: Walk) -> Tensor | None:
+        """f32 `[N]`: the value of what followed the last tick; 0 where the trajectory did not go on."""
+        if horizon.bootstrap is None or self.config.discount == 0.0:
+            return None
+        rows = outlives(horizon).nonzero().squeeze(1)
+        observation, state = (each.index_select(0, rows.to(each.device)) for each in (horizon.bootstrap, walk.last))
+        value, _ = self.value.network.step(observation.to(self.device), state)
+        return torch.zeros(len(horizon.bootstrap)).index_copy_(0, rows, value.squeeze(1).cpu())
+
+    def _pieces(self, batch: Batch, union: Union) -> int:
+        """Sequences are shuffled, not samples."""
+        assert isinstance(batch, RecurrentBatch)
+        return len(batch.sequence)
+
+    def _minibatches(
+        self, lane: str, batch: Batch, union: Union, columns: Sequence[Tensor], order: Tensor
+    ) -> Iterator[Minibatch]:
+        """Whole sequences, about `batch_size` samples of them."""
+        assert isinstance(batch, RecurrentBatch)
+        starts = batch.policy_start if lane == "policy" else batch.value_start
+        lengths = batch.lengths()
+        for chosen in cut(order, lengths, self._parts(union)):
+            longest_first = chosen[lengths[chosen].argsort(descending=True, stable=True)]
+            by_step = batch.sequence[longest_first].t()
+            is_sample = by_step != NOBODY
+            rows, sizes = by_step[is_sample], is_sample.sum(1)
+            packed = Sequences(batch.observation[rows], sizes[sizes > 0].cpu(), starts[longest_first])
+            yield Minibatch((packed, *(column[rows] for column in columns)), union.advantage[rows], None, 1.0)
+
+
+class SequencePredictor:
+    """Predicts tick by tick with states of its own, of the valid rows of every tick alone."""
+
+    def __init__(self, ppo: RecurrentPpo, dark_is_nan: bool) -> None:
+        """It begins with what `ppo` remembers."""
+        self._ppo, self._dark_is_nan = ppo, dark_is_nan
+        known = [ppo.policy_memory(index) for index in range(len(ppo.memories))]
+        self._memories = [{int(memory.tick): memory} for memory in known]
+        """Of each environment, by tick: the newest that was taken and those that may be asked for again."""
+
+    def predict_m(self, ticks: Ticks) -> dict[int, list[Tensor]]:
+        """See `caraware.prediction.Predictor.predict_m`."""
+        return {index: self._of_one(index, of_one) for index, of_one in ticks.items()}
+
+    def _of_one(self, index: int, ticks: Sequence[Observation]) -> list[Tensor]:
+        memories, before = self._memories[index], ticks[0].tick - 1
+        for old in [tick for tick in memories if tick < before]:
+            del memories[old]
+        return [self._step_m(memories, obs) for obs in ticks]
+
+    @torch.no_grad()
+    def _step_m(self, memories: dict[int, Memory], obs: Observation) -> Tensor:
+        network, device = self._ppo.policy.network, self._ppo.device
+        valid = torch.from_numpy(np.asarray(obs.valid))
+        rows = valid.nonzero().squeeze(1)
+        vehicle = torch.from_numpy(np.asarray(obs.vehicle).astype(np.int64))
+        cut_before = torch.from_numpy(np.asarray(obs.terminated | obs.truncated))
+        known = memories.get(obs.tick - 1) or Memory.nothing(network.width)
+        state = known.before(obs.tick, vehicle, cut_before)
+        seen = visible(obs, self._dark_is_nan).index_select(0, rows).to(device)
+        mean, after = network.step(seen, state.index_select(0, rows).to(device))
+        memories[obs.tick] = Memory.after(obs.tick, vehicle, valid, state.index_copy_(0, rows, after.cpu()))
+        predicted_m = self._ppo.bounds.to_world_m(mean).cpu()
+        return torch.zeros(len(valid), ACTIONS).index_copy_(0, rows, predicted_m)
+
+
+def outlives(horizon: Horizon) -> Tensor:
+    """bool `[N]`: the slot's trajectory was not over, as far as the horizon knows, with its last tick."""
+    return horizon.valid[-1] & ~horizon.terminated[-1] & ~horizon.truncated[-1]
+
+
+def continues(horizon: Horizon) -> Tensor:
+    """bool `[T, N]`: the row continues the slot's trajectory; in the first row, as far as the memory says so."""
+    went_on = horizon.valid & ~horizon.terminated & ~horizon.truncated
+    return torch.cat((torch.ones_like(went_on[:1]), went_on[:-1])) & horizon.valid
+
+
+def sequences(valid: Tensor, goes_on: Tensor, length: int) -> Tensor:
+    """i64 `[c, L]`: the sequences of at most `length` samples that the trajectories of a horizon are cut into.
+
+    `valid` and `goes_on` are bool `[T, N]`; samples are counted tick by tick. Every trajectory is cut from its first
+    row in the horizon on, which may be the middle of its life.
+    """
+    is_valid, follows = valid.numpy(), goes_on.numpy()
+    ticks, slots = is_valid.shape
+    place, number, count = np.zeros(slots, np.int64), np.zeros(slots, np.int64), 0
+    cells: list[tuple[np.ndarray, np.ndarray]] = []
+    for t in range(ticks):
+        place = np.where(follows[t] & (t > 0), (place + 1) % length, 0)
+        begins = np.flatnonzero(is_valid[t] & (place == 0))
+        number[begins] = np.arange(count, count + len(begins))
+        count += len(begins)
+        rows = np.flatnonzero(is_valid[t])
+        cells.append((number[rows], place[rows]))
+    numbers, places = (np.concatenate(column) for column in zip(*cells, strict=True))
+    table = np.full((count, int(places.max()) + 1), NOBODY)
+    table[numbers, places] = np.arange(len(numbers))
+    return torch.from_numpy(table)
+
+
+def cut(order: Tensor, lengths: Tensor, parts: int) -> list[Tensor]:
+    """Sequences in `order`, i64 `[c]`, in at most `parts` pieces with about as many samples each; `lengths` `[c]`."""
+    ordered = lengths[order]
+    twice_the_middle = 2 * ordered.cumsum(0) - ordered
+    part = twice_the_middle * parts // (2 * int(ordered.sum()))
+    return [piece for piece in order.split(torch.bincount(part, minlength=parts).tolist()) if len(piece)]
