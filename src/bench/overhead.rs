@@ -21,7 +21,7 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
     let place = Place::new("overhead")?;
     let install = Install::find()?;
     let sumocfg = City::of(vehicles, duration_s, 0.1, 1).write(&install, &place.path().join("city"))?;
-    let mut scenario = Scenario::new(options, &place, install, sumocfg, 1.0, vehicles)?;
+    let scenario = Scenario::new(options, &place, install, sumocfg, 1.0, vehicles)?;
     let mut table = Table::new(
         "Alternating pairs",
         &["pair", "sumo, s", "ours, s", "ratio", "sumo, CPU s", "ours, CPU s"],

@@ -146,12 +146,12 @@ impl Measured {
 pub fn measure(options: &Options) -> Result<Report, Exit> {
     let size = if options.quick { &QUICK } else { &SIZE };
     // One each: both sides number their runs.
-    let (place, few_place) = (Place::new("peers")?, Place::new("peers-few")?);
-    let (mut many, _) = city(options, &place, size.vehicles, size.duration_s)?;
-    let (mut few, few_net) = city(options, &few_place, FEW, size.few_duration_s)?;
+    let place = Place::new("peers")?;
+    let (many, _) = city(options, &place, size.vehicles, size.duration_s)?;
+    let (few, few_net) = city(options, &place, FEW, size.few_duration_s)?;
     let mut measured = Measured::default();
     for _ in 0..size.rounds {
-        let results = loops(options, size, &mut many, &mut measured.loops)?;
+        let results = loops(options, size, &many, &mut measured.loops)?;
         let ours = many.ours()?;
         if let Some(theirs) = results {
             same_results(&theirs, &ours.results)?;
@@ -182,7 +182,7 @@ fn city<'a>(
 }
 
 /// Both Python loops over SUMO; where the one over libsumo, which goes to the end, has SUMO's results.
-fn loops(options: &Options, size: &Size, city: &mut Scenario, rounds: &mut Rounds) -> Result<Option<PathBuf>, Exit> {
+fn loops(options: &Options, size: &Size, city: &Scenario, rounds: &mut Rounds) -> Result<Option<PathBuf>, Exit> {
     let python = match &options.python {
         Some(python) => python.clone(),
         None => install::python(&options.bin)?,
@@ -193,7 +193,7 @@ fn loops(options: &Options, size: &Size, city: &mut Scenario, rounds: &mut Round
         reason = "some hundred steps"
     )]
     let all_steps = (size.duration_s / STEP_S).round() as u32;
-    let mut run = |peer: &str, steps: u32| -> Result<(Answer, PathBuf), Exit> {
+    let run = |peer: &str, steps: u32| -> Result<(Answer, PathBuf), Exit> {
         let (command, results) = city.python_loop(&python, peer, steps)?;
         Ok((from_program(command)?, results))
     };

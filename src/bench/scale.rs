@@ -34,7 +34,7 @@ struct Case {
 }
 
 impl Case {
-    fn measure(scenario: &mut Scenario, vehicles: u32) -> Result<Self, Exit> {
+    fn measure(scenario: &Scenario, vehicles: u32) -> Result<Self, Exit> {
         let (bare, results) = scenario.bare()?;
         let ours = scenario.ours()?;
         same_results(&results, &ours.results)?;
@@ -111,8 +111,8 @@ fn city(options: &Options, place: &Place, vehicles: u32, duration_s: f64, step_s
     let install = Install::find()?;
     let directory = place.path().join(format!("city-{vehicles}-{step_s}"));
     let sumocfg = City::of(vehicles, duration_s, step_s, 1).write(&install, &directory)?;
-    let mut scenario = Scenario::new(options, place, install, sumocfg, 1.0, vehicles)?;
-    Case::measure(&mut scenario, vehicles)
+    let scenario = Scenario::new(options, place, install, sumocfg, 1.0, vehicles)?;
+    Case::measure(&scenario, vehicles)
 }
 
 fn costs(cases: &[Case]) -> Table {
@@ -199,8 +199,8 @@ fn large(options: &Options, place: &Place, report: &mut Report) -> Result<(), Ex
     for &scale in scales {
         let install = Install::find()?;
         let sumocfg = install.sumo_home.join("tools/game/A10KW.sumocfg");
-        let mut scenario = Scenario::new(options, place, install, sumocfg, scale, MOTORWAY_ROAD_USERS)?;
-        let case = Case::measure(&mut scenario, 1)?;
+        let scenario = Scenario::new(options, place, install, sumocfg, scale, MOTORWAY_ROAD_USERS)?;
+        let case = Case::measure(&scenario, 1)?;
         report.figure(
             format!("A10KW at {scale} × its demand, × real time"),
             case.ours.number("/real_time_factor"),

@@ -1,6 +1,7 @@
 //! The two sides of a comparison with SUMO alone: the bare program, and ours with a consumer of every observation, on one scenario.
 
 use std::{
+    cell::Cell,
     path::{Path, PathBuf},
     process::{Command, Stdio},
     time::Instant,
@@ -51,7 +52,11 @@ impl Ours {
 
 /// A directory for a measurement, removed at its end.
 #[derive(Debug)]
-pub struct Place(PathBuf);
+pub struct Place {
+    path: PathBuf,
+    /// Runs in it so far, of all scenarios.
+    runs: Cell<u32>,
+}
 
 impl Place {
     /// A new one below the system's directory for temporary files.
@@ -61,20 +66,29 @@ impl Place {
     pub fn new(part: &str) -> Result<Self, Exit> {
         let path = std::env::temp_dir().join(format!("caraware-bench-{part}-{}", std::process::id()));
         std::fs::create_dir_all(&path).map_err(|error| Exit::io("create", &path, &error))?;
-        Ok(Self(path))
+        Ok(Self {
+            path,
+            runs: Cell::new(0),
+        })
     }
 
     /// Where it is.
     #[must_use]
     pub fn path(&self) -> &Path {
-        &self.0
+        &self.path
+    }
+
+    /// The number of a new run.
+    fn next_run(&self) -> u32 {
+        self.runs.set(self.runs.get() + 1);
+        self.runs.get()
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        if let Err(error) = std::fs::remove_dir_all(&self.0) {
-            tracing::warn!(%error, path = %self.0.display(), "cannot remove what a measurement leaves");
+        if let Err(error) = std::fs::remove_dir_all(&self.path) {
+            tracing::warn!(%error, path = %self.path.display(), "cannot remove what a measurement leaves");
         }
     }
 }
@@ -89,8 +103,6 @@ pub struct Scenario<'a> {
     /// Factor on its demand.
     scale: f64,
     max_road_users: u32,
-    /// Runs so far.
-    runs: u32,
 }
 
 impl<'a> Scenario<'a> {
@@ -113,7 +125,6 @@ impl<'a> Scenario<'a> {
             sumocfg,
             scale,
             max_road_users,
-            runs: 0,
         })
     }
 
@@ -121,7 +132,7 @@ impl<'a> Scenario<'a> {
     ///
     /// # Errors
     /// SUMO fails.
-    pub fn bare(&mut self) -> Result<(Taken, PathBuf), Exit> {
+    pub fn bare(&self) -> Result<(Taken, PathBuf), Exit> {
         let (results, prefix) = self.results("bare")?;
         let mut command = Command::new(self.install.sumo_program("sumo"));
         command
@@ -137,7 +148,7 @@ impl<'a> Scenario<'a> {
     ///
     /// # Errors
     /// No place for the results.
-    pub fn python_loop(&mut self, python: &Path, peer: &str, steps: u32) -> Result<(Command, PathBuf), Exit> {
+    pub fn python_loop(&self, python: &Path, peer: &str, steps: u32) -> Result<(Command, PathBuf), Exit> {
         let (results, prefix) = self.results(peer)?;
         let mut command = Command::new(python);
         command
@@ -151,9 +162,8 @@ impl<'a> Scenario<'a> {
     }
 
     /// A new directory for SUMO's results, and the prefix of their names that puts them there.
-    fn results(&mut self, side: &str) -> Result<(PathBuf, String), Exit> {
-        self.runs += 1;
-        let results = self.place.path().join(format!("{side}-{}", self.runs));
+    fn results(&self, side: &str) -> Result<(PathBuf, String), Exit> {
+        let results = self.place.path().join(format!("{side}-{}", self.place.next_run()));
         std::fs::create_dir_all(&results).map_err(|error| Exit::io("create", &results, &error))?;
         let from_root = results.to_string_lossy().trim_start_matches('/').to_owned();
         Ok((results, format!("{}{from_root}/", "../".repeat(TO_THE_ROOT))))
@@ -172,9 +182,8 @@ impl<'a> Scenario<'a> {
     ///
     /// # Errors
     /// The run fails.
-    pub fn ours(&mut self) -> Result<Ours, Exit> {
-        self.runs += 1;
-        let name = format!("ours-{}", self.runs);
+    pub fn ours(&self) -> Result<Ours, Exit> {
+        let name = format!("ours-{}", self.place.next_run());
         let runs = self.place.path().join("runs");
         let mut command = Command::new(&self.program);
         command

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -243,6 +244,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--json", type=Path, help="write the seconds there in place of standard output")
     options = parser.parse_args()
     config = TrainerConfig(
         horizon=HORIZON,
@@ -285,7 +287,10 @@ def main() -> None:
         "horizon_s": {"ours": pairs["our_horizon"], "sb3": pairs["sb3_horizon"]},
         "ticks": [measure_tick(ppo, vehicles) for vehicles in SIZES],
     }
-    print(json.dumps(result))
+    if options.json:
+        options.json.write_text(json.dumps(result))
+    else:
+        print(json.dumps(result))
 
 
 if __name__ == "__main__":
