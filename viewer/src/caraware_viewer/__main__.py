@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import os
 import re
 import signal
 import sys
+import threading
 from collections.abc import Sequence
 
 # rerun reads this when it is loaded and started: a viewer of one's own simulation does not report on its user.
@@ -16,6 +18,10 @@ from caraware_viewer import access, command
 from caraware_viewer.display import DisplayError
 from caraware_viewer.link import LinkError
 from caraware_viewer.watch import watch
+
+INTERRUPTED = 130
+LEAVE_WITHIN_S = 15.0
+"""Longest time from Ctrl-C to the end: what is left is written within ten, unless something does not come back."""
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
@@ -41,14 +47,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return command.main(arguments[1:])
     options = _parser().parse_args(arguments)
     # Asked to end, it writes what is left, as at Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for asked in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(asked, leave)
     try:
         return watch(options)
     except (LinkError, access.AccessError, DisplayError) as error:
         print(f"caraware-viewer: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
+
+
+def leave(*_: object) -> None:
+    """Interrupts the main thread. If that has not ended the process in time, says where it stands and ends it."""
+    faulthandler.dump_traceback_later(LEAVE_WITHIN_S)
+    end = threading.Timer(LEAVE_WITHIN_S + 0.5, os._exit, (INTERRUPTED,))
+    end.daemon = True
+    end.start()
+    raise KeyboardInterrupt
 
 
 def _parser() -> argparse.ArgumentParser:
