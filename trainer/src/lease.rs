@@ -168,7 +168,10 @@ impl Lease {
         let view = LentView::new(Arc::clone(&self.held), address, layout);
         *lock(&self.held) = Some(message);
         let tensor = self.make.call1(py, (view, header.count, header.columns))?;
-        lock(&self.lent).tensors.push((place, tensor.clone_ref(py)));
+        let tensors = &mut lock(&self.lent).tensors;
+        // Of a place that is laid out anew, with more slots, the old tensor is of no more use.
+        tensors.retain(|((known, ..), _)| *known != address);
+        tensors.push((place, tensor.clone_ref(py)));
         Ok(tensor)
     }
 }
