@@ -18,6 +18,8 @@ from torch import Tensor
 
 CHUNK_ROWS = 1024
 """Rows in a forward pass without gradient: its activations stay in the second-level cache."""
+NARROW = 12
+"""Inputs of a layer below which its weights' gradient is made transposed: 4 × as fast with 9 inputs, 1 × with 16."""
 MEAN_HEAD_SCALE = 0.1
 """Variance scaling of the last policy layer (CarAware): predictions start near the middle of the map."""
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
@@ -34,7 +36,7 @@ class Activation(Enum):
         """Activate `z` in place."""
         if self is Activation.RELU:
             return z.clamp_min_(0)
-        return z.tanh_() if self is Activation.TANH else z
+        return _tanh_(z) if self is Activation.TANH else z
 
     def backward_(self, gradient: Tensor, activated: Tensor) -> Tensor:
         """Turn the gradient of the loss with respect to `activated` into that of its input, in place."""
@@ -126,7 +128,7 @@ class Mlp:
         for i in range(len(self.layers) - 1, -1, -1):
             below = self._activated[i - 1][:rows] if i else x
             self.layers[i].activation.backward_(upstream, self._activated[i][:rows])
-            torch.mm(upstream.t(), below, out=grad[f"layer{i}.weight"])
+            _weight_gradient(upstream, below, grad[f"layer{i}.weight"])
             torch.sum(upstream, 0, out=grad[f"layer{i}.bias"])
             if i:
                 upstream = torch.mm(upstream, value[f"layer{i}.weight"], out=self._gradients[i - 1][:rows])
@@ -226,6 +228,24 @@ def log_probability(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
 def entropy(log_std: Tensor) -> Tensor:
     """Differential entropy (nats) of those normals; the same for every observation."""
     return (log_std + 0.5 + HALF_LOG_TWO_PI).sum()
+
+
+def _tanh_(z: Tensor) -> Tensor:
+    """Hyperbolic tangent in place, to 1e-7 of its range.
+
+    As 2 / (1 + exp(-2 z)) - 1 on a CPU: 0.4 × the time of torch's own, which keeps all digits of the smallest values
+    and whose gradient autograd knows.
+    """
+    by_sigmoid = z.device.type == "cpu" and not z.requires_grad
+    return z.mul_(2).sigmoid_().mul_(2).sub_(1) if by_sigmoid else z.tanh_()
+
+
+def _weight_gradient(upstream: Tensor, below: Tensor, gradient: Tensor) -> None:
+    """Upstream `[b, outputs]` times `below` `[b, inputs]`, summed over the rows, into `[outputs, inputs]`."""
+    if below.shape[1] < NARROW and below.device.type == "cpu":
+        gradient.copy_(torch.mm(below.t(), upstream).t())
+    else:
+        torch.mm(upstream.t(), below, out=gradient)
 
 
 def _groups(pieces: Iterable[Tensor]) -> Iterator[list[Tensor]]:

@@ -9,10 +9,11 @@ samples depend on the seed and on the data alone, never on how many ticks happen
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -30,6 +31,7 @@ from caraware.ranks import Minibatch, Ranks, Union
 from caraware.rollout import Horizon
 from caraware.supervised import Supervised
 
+P, V = TypeVar("P"), TypeVar("V")
 ACTIONS = 2
 SMALL_ROWS = 256
 """Rows of a block below which blocks are put together before the network sees them."""
@@ -238,8 +240,9 @@ class Ppo:
         """Both networks over all samples."""
         rows = horizon.valid.flatten().nonzero().squeeze(1)
         observation = horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device)
-        mean = self.policy.network.infer(observation)
-        value = self.value.network.infer(observation).squeeze(1)
+        mean, value = self._both(
+            lambda: self.policy.network.infer(observation), lambda: self.value.network.infer(observation).squeeze(1)
+        )
         if horizon.bootstrap is None or self.config.discount == 0.0:
             return ForwardPass(rows, observation, mean, value, None)
         after = self.value.network.infer(horizon.bootstrap.to(self.device)).squeeze(1)
@@ -282,20 +285,26 @@ class Ppo:
         orders = [order.to(self.device) for order in orders]
         if self._graphed is not None:
             policy, value = self._means_of(self._graphed.run(batch, orders, now), len(orders))
-        elif self._second_core is None:
-            policy = self._improve_policy(batch, union, orders, now)
-            value = self._improve_value(batch, union, orders, now)
         else:
-            value_job = self._second_core.submit(self._improve_value, batch, union, orders, now)
-            try:
-                policy = self._improve_policy(batch, union, orders, now)
-            finally:
-                value_job.exception()
-            value = value_job.result()
+            policy, value = self._both(
+                lambda: self._improve_policy(batch, union, orders, now),
+                lambda: self._improve_value(batch, union, orders, now),
+            )
         if self.supervised is not None:
             self.supervised.learn(batch, union, self._parts(union), now.learning_rate)
         self.updates += 1
         return self._stats(batch, union, policy, value, now)
+
+    def _both(self, of_policy: Callable[[], P], of_value: Callable[[], V]) -> tuple[P, V]:
+        """What both jobs return: side by side where there is a second core, and none goes on when one has failed."""
+        if self._second_core is None:
+            return of_policy(), of_value()
+        value_job = self._second_core.submit(of_value)
+        try:
+            policy = of_policy()
+        finally:
+            value_job.exception()
+        return policy, value_job.result()
 
     def _pieces(self, batch: Batch, union: Union) -> int:
         """How many pieces of the union are shuffled: its samples."""

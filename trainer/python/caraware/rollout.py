@@ -76,13 +76,13 @@ class Rollout:
         t = self._ticks
         if t == 0:
             self._cut = obs.terminated | obs.truncated
-        self._observation[t, :rows].copy_(obs.observation)
+        self._observation[t, :rows] = obs.observation
         if self._dark_is_nan:
             self._observation[t, :rows].nan_to_num_()
-        self._truth[t, :rows].copy_(obs.truth)
+        self._truth[t, :rows] = obs.truth
         self._set_row(self._vehicle[t], obs.vehicle, EMPTY_SLOT)
         self._set_row(self._valid[t], obs.valid, False)
-        self._terminated[t], self._truncated[t] = False, False
+        self._terminated[t] = self._truncated[t] = False
         self._tick[t] = obs.tick
         self._close_changed_slots(t)
         self._ticks, self._last_tick = t + 1, obs.tick
