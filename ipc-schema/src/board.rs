@@ -121,6 +121,8 @@ pub struct Health {
     pub resynchronisations: u64,
     /// Total ticks of the run, 0 if unknown.
     pub total_ticks: u64,
+    /// When this was written, monotonic clock of the machine, nanoseconds.
+    pub written_ns: u64,
 }
 
 /// How learning goes.

@@ -212,7 +212,8 @@ pub fn table() -> Vec<TypeLayout> {
             vehicle_steps,
             arrived,
             resynchronisations,
-            total_ticks
+            total_ticks,
+            written_ns
         }),
         layout!(Roster {
             incarnations,

@@ -48,4 +48,4 @@ pub mod usage;
 pub mod world;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 11;
+pub const SCHEMA_VERSION: u32 = 12;

@@ -16,6 +16,7 @@ use tracing_subscriber::{EnvFilter, Layer, Registry, layer::SubscriberExt as _, 
 use crate::{
     SCHEMA_VERSION,
     board::{Health, Progress, State},
+    clock,
     failure::{Failure, FailureKind},
     flow,
     header::MessageHeader,
@@ -175,8 +176,8 @@ impl Session {
         Self::take_place(run, process, env_index, stop, node, Arc::new(wake))
     }
 
-    /// The place of this process, which is the trainer and has joined environment 0, in another environment of its run. Both are woken
-    /// and wait together.
+    /// The place of this process, which is one for the whole run and has joined environment 0, in another of its environments. Both are
+    /// woken and wait together.
     ///
     /// # Errors
     /// There is no such environment.
@@ -281,7 +282,15 @@ impl Session {
     /// # Errors
     /// The service cannot be opened.
     pub fn board_of(&self, process: Process) -> Result<BoardReader, SessionError> {
-        Ok(BoardReader::open(&self.node, &self.run, self.env_index, process)?)
+        self.board_in(self.env_index, process)
+    }
+
+    /// The board of `process` in environment `env_index`.
+    ///
+    /// # Errors
+    /// The service cannot be opened.
+    pub fn board_in(&self, env_index: u32, process: Process) -> Result<BoardReader, SessionError> {
+        Ok(BoardReader::open(&self.node, &self.run, env_index, process)?)
     }
 
     /// Header for a message of this process; the caller adds episode, tick, time and sizes.
@@ -354,6 +363,7 @@ impl Session {
     /// Changes the health on the board.
     pub fn report(&mut self, change: impl FnOnce(&mut Health)) {
         change(&mut self.health);
+        self.health.written_ns = clock::monotonic_ns();
         self.board.set_health(self.health);
     }
 
