@@ -42,12 +42,12 @@ fn simulate(name: &str, settings: &[String]) -> Vec<String> {
     [head.as_slice(), settings].concat()
 }
 
-/// A viewer that counts.
-fn watch(run: &str, port: u16, seconds: u64, log: &Path) -> Child {
+/// A viewer of environment `env` that counts.
+fn watch(run: &str, env: u32, port: u16, seconds: u64, log: &Path) -> Child {
     let program = caraware::install::programs().unwrap().join("fanout-watch");
     Command::new(program)
         .args([&format!("tcp/127.0.0.1:{port}"), run, "--seconds", &seconds.to_string()])
-        .arg("--log")
+        .args(["--env", &env.to_string(), "--log"])
         .arg(log)
         .stdout(Stdio::piped())
         .spawn()
@@ -96,8 +96,8 @@ fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
     };
     until(&mut run, || works(0));
     let logs = ["viewer", "victim"].map(|name| workplace.path().join(name));
-    let viewer = watch("watched", port, 15, &logs[0]);
-    let mut victim = Victim(watch("watched", port, 60, &logs[1]));
+    let viewer = watch("watched", 0, port, 15, &logs[0]);
+    let mut victim = Victim(watch("watched", 0, port, 60, &logs[1]));
     // Both have seen a frame: what comes after a kill comes to a viewer that was there before.
     until(&mut run, || {
         logs.iter()
@@ -127,5 +127,45 @@ fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
     assert_eq!(watched["observation_hash"], alone["observation_hash"]);
     assert_eq!(watched["ticks"], alone["ticks"]);
     assert_eq!(watched["restarts"], KILLS);
+    workplace.assert_nothing_left();
+}
+
+/// Every environment is shown under its own number, behind one endpoint, and what it observes is what it observes unwatched.
+#[test]
+fn every_environment_of_a_run_is_shown() {
+    let workplace = Workplace::new();
+    let both = |name: &str, fanout: &str| {
+        let mut arguments = simulate(name, &settings(fanout));
+        arguments.extend(["--envs".into(), "2".into()]);
+        arguments
+    };
+    let alone = both("alone", "fanout.enabled=false");
+    workplace.succeed(&alone.iter().map(String::as_str).collect::<Vec<_>>());
+    let port = free_port();
+    let mut arguments = both("watched", &format!("fanout.listen=tcp/127.0.0.1:{port}"));
+    arguments.extend(["--set".into(), "run.real_time_factor=6".into()]);
+    let mut command = workplace.command(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+    let mut run = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let spectator = Spectator::join(&workplace.path().join("runs/watched/run.json"), &mut run);
+    let board = spectator.board(Process::Fanout);
+    until(&mut run, || (board.progress().attached == 1).then_some(()));
+    let viewers = [0, 1].map(|env| {
+        let log = workplace.path().join(format!("viewer-{env}"));
+        watch("watched", env, port, 8, &log)
+    });
+    let seen = viewers.map(count);
+    assert!(run.wait().unwrap().success());
+    for seen in &seen {
+        for topic in ["status", "vehicles", "world", "observation"] {
+            assert!(seen[topic]["received"].as_u64().unwrap() > 3, "{topic}: {seen:#}");
+            assert_eq!(seen[topic]["refused"], 0, "{topic}: {seen:#}");
+        }
+    }
+    let (alone, watched) = (workplace.report("alone"), workplace.report("watched"));
+    for env in [0, 1] {
+        let hash = |report: &Value| report["environments"][env]["observation_hash"].clone();
+        assert!(hash(&alone).is_string());
+        assert_eq!(hash(&watched), hash(&alone));
+    }
     workplace.assert_nothing_left();
 }

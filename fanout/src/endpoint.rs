@@ -70,3 +70,56 @@ fn reason(error: &io::Error, address: &str) -> String {
         _ => error.to_string(),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use ipc_schema::failure::{Failure, FailureKind};
+
+    use super::*;
+
+    fn failure(endpoint: &str) -> Failure {
+        let config: ipc_schema::config::Config =
+            serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).unwrap();
+        let settings = Fanout {
+            listen: endpoint.to_owned(),
+            ..config.fanout
+        };
+        match listen(&settings) {
+            Ok(_) => panic!("{endpoint} was accepted"),
+            Err(error) => error.into(),
+        }
+    }
+
+    #[test]
+    fn a_port_in_use_is_named() {
+        let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = taken.local_addr().unwrap().port();
+        let failure = failure(&format!("tcp/127.0.0.1:{port}"));
+        assert_eq!(failure.kind, FailureKind::Config);
+        assert_eq!(
+            failure.message,
+            format!("`fanout.listen`: cannot listen on tcp/127.0.0.1:{port}: port {port} is in use")
+        );
+        assert!(failure.help.is_some());
+    }
+
+    #[test]
+    fn what_is_no_endpoint_of_this_machine_is_refused() {
+        for endpoint in [
+            "",
+            "7447",
+            "udp/127.0.0.1:7447",
+            "tcp/127.0.0.1",
+            "tcp/192.0.2.1:7447",
+            "tcp/127.0.0.1:99999",
+        ] {
+            let failure = failure(endpoint);
+            assert_eq!(failure.kind, FailureKind::Config);
+            assert!(
+                failure.message.starts_with("`fanout.listen`: cannot listen on"),
+                "{}",
+                failure.message
+            );
+        }
+    }
+}

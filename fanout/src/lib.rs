@@ -30,6 +30,5 @@ use ipc_schema::{failure::Failure, process::Process, session::Session};
 /// The run cannot be joined, the endpoint cannot be listened on, or a port broke.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
     let session = Session::join(run_file, Process::Fanout)?;
-    let env_index = session.run.env_index;
-    Ok(relay::Relay::open(session, env_index)?.run()?)
+    Ok(relay::Relays::open(session)?.run()?)
 }

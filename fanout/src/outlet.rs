@@ -10,10 +10,7 @@ use std::{
     time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
-use ipc_schema::{
-    config::Fanout,
-    failure::{Failure, FailureKind},
-};
+use ipc_schema::failure::{Failure, FailureKind};
 use zenoh::{
     Wait,
     bytes::{Encoding, ZBytes},
@@ -25,10 +22,7 @@ use zenoh::{
     sample::Locality,
 };
 
-use crate::{
-    endpoint,
-    keys::{Keys, Topic},
-};
+use crate::keys::{Keys, Topic};
 
 /// The zenoh side failed.
 #[derive(Debug, thiserror::Error)]
@@ -104,7 +98,7 @@ impl Line {
     }
 }
 
-/// Everything a run shows to viewers.
+/// Everything that one environment of a run shows to viewers.
 pub struct Outlet {
     session: zenoh::Session,
     keys: Keys,
@@ -118,12 +112,11 @@ pub struct Outlet {
 }
 
 impl Outlet {
-    /// Listens and declares all keys; `map` is the JSON that answers for [`Topic::Map`].
+    /// Declares all keys; `map` is the JSON that answers for [`Topic::Map`].
     ///
     /// # Errors
-    /// The endpoint is malformed, taken, or not of this machine.
-    pub fn open(settings: &Fanout, keys: &Keys, map: &str) -> Result<Self, OutletError> {
-        let session = endpoint::listen(settings)?;
+    /// zenoh or the system refuses.
+    pub fn open(session: zenoh::Session, keys: &Keys, map: &str) -> Result<Self, OutletError> {
         let latest: Latest = Arc::default();
         let (sender, questions) = sync_channel(QUESTIONS);
         answer_on_a_thread(&latest, questions)?;
@@ -184,12 +177,6 @@ impl Outlet {
             encoding,
             sequence: 0,
         })
-    }
-
-    /// The session, for others who declare keys.
-    #[must_use]
-    pub fn session(&self) -> &zenoh::Session {
-        &self.session
     }
 
     /// Says that the run is here.
@@ -276,16 +263,22 @@ impl Outlet {
         self.latest.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Lets viewers, if there are any, have what is queued, and takes leave of them. zenoh does not tell when its queues are
-    /// empty and drops them when it closes, so the last frames get [`FAREWELL`].
-    pub fn close(mut self) {
-        if self.lines.values().any(Line::is_watched) {
-            std::thread::park_timeout(FAREWELL);
-        }
-        drop(self.token.take());
-        if let Err(error) = self.session.close().wait() {
-            tracing::warn!(%error, "zenoh did not close in order");
-        }
+    fn is_watched(&self) -> bool {
+        self.lines.values().any(Line::is_watched)
+    }
+}
+
+/// Lets viewers, if there are any, have what is queued, and takes leave of them. zenoh does not tell when its queues are
+/// empty and drops them when it closes, so the last frames get [`FAREWELL`].
+pub fn close(mut outlets: Vec<Outlet>, session: &zenoh::Session) {
+    if outlets.iter().any(Outlet::is_watched) {
+        std::thread::park_timeout(FAREWELL);
+    }
+    for outlet in &mut outlets {
+        drop(outlet.token.take());
+    }
+    if let Err(error) = session.close().wait() {
+        tracing::warn!(%error, "zenoh did not close in order");
     }
 }
 
@@ -390,55 +383,7 @@ fn answer(latest: &Latest, query: &Query) {
 
 #[cfg(test)]
 mod tests {
-    use std::net::TcpListener;
-
     use super::*;
-
-    fn failure(endpoint: &str) -> Failure {
-        let config: ipc_schema::config::Config =
-            serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).unwrap();
-        let settings = Fanout {
-            listen: endpoint.to_owned(),
-            ..config.fanout
-        };
-        match Outlet::open(&settings, &Keys::new("t", 0), "{}") {
-            Ok(_) => panic!("{endpoint} was accepted"),
-            Err(error) => error.into(),
-        }
-    }
-
-    #[test]
-    fn a_port_in_use_is_named() {
-        let taken = TcpListener::bind("127.0.0.1:0").unwrap();
-        let port = taken.local_addr().unwrap().port();
-        let failure = failure(&format!("tcp/127.0.0.1:{port}"));
-        assert_eq!(failure.kind, FailureKind::Config);
-        assert_eq!(
-            failure.message,
-            format!("`fanout.listen`: cannot listen on tcp/127.0.0.1:{port}: port {port} is in use")
-        );
-        assert!(failure.help.is_some());
-    }
-
-    #[test]
-    fn what_is_no_endpoint_of_this_machine_is_refused() {
-        for endpoint in [
-            "",
-            "7447",
-            "udp/127.0.0.1:7447",
-            "tcp/127.0.0.1",
-            "tcp/192.0.2.1:7447",
-            "tcp/127.0.0.1:99999",
-        ] {
-            let failure = failure(endpoint);
-            assert_eq!(failure.kind, FailureKind::Config);
-            assert!(
-                failure.message.starts_with("`fanout.listen`: cannot listen on"),
-                "{}",
-                failure.message
-            );
-        }
-    }
 
     #[test]
     fn attachments_come_back() {

@@ -15,12 +15,13 @@ use ipc_schema::{
 use crate::{
     access,
     commands::Commands,
+    endpoint,
     facts::Facts,
     feed::{Feed, newest_common},
     frame,
     keys::{Keys, Topic},
     meter::{Delivering, Errors, Observed, Rate, RoadUsers},
-    outlet::{Outlet, OutletError},
+    outlet::{self, Outlet, OutletError},
     pace::{Budget, Patience},
     scans::Scans,
     status::{self, Counters, ProcessStatus, Status},
@@ -64,17 +65,76 @@ impl From<RelayError> for Failure {
     }
 }
 
-/// A fan-out at work.
-pub struct Relay {
+/// A fan-out at work: a relay for each environment of the run, all behind one endpoint.
+pub struct Relays {
+    zenoh: zenoh::Session,
+    /// By environment.
+    relays: Vec<Relay>,
+    patience: Patience,
+}
+
+impl Relays {
+    /// Opens everything; `session` is of environment 0.
+    ///
+    /// # Errors
+    /// A service of the run is not there, or the endpoint cannot be listened on.
+    pub fn open(session: Session) -> Result<Self, RelayError> {
+        let zenoh = endpoint::listen(&session.run.config.fanout)?;
+        let patience = Patience::new(Channel::World.queue_length(&session.run));
+        let others: Vec<Session> = (1..session.run.config.run.envs)
+            .map(|env_index| session.in_environment(env_index))
+            .collect::<Result<_, _>>()?;
+        let relays = std::iter::once(session)
+            .chain(others)
+            .zip(0..)
+            .map(|(session, env_index)| Relay::open(session, env_index, &zenoh))
+            .collect::<Result<_, _>>()?;
+        Ok(Self {
+            zenoh,
+            relays,
+            patience,
+        })
+    }
+
+    /// Works until the last tick of every environment is out, or the process is asked to stop.
+    ///
+    /// # Errors
+    /// A port or zenoh broke.
+    pub fn run(mut self) -> Result<(), RelayError> {
+        for relay in &mut self.relays {
+            relay.begin()?;
+        }
+        let mut came = 0;
+        while let Some(relay) = self.relays.iter().find(|relay| !relay.has_left)
+            && !relay.session.stopped()
+        {
+            relay.session.wait(self.patience.next(came))?;
+            came = 0;
+            for relay in self.relays.iter_mut().filter(|relay| !relay.has_left) {
+                came = relay.turn()?.max(came);
+            }
+        }
+        for relay in self.relays.iter_mut().filter(|relay| !relay.has_left) {
+            relay.leave()?;
+        }
+        let outlets = self.relays.into_iter().map(|relay| relay.outlet).collect();
+        outlet::close(outlets, &self.zenoh);
+        Ok(())
+    }
+}
+
+/// What shows one environment.
+struct Relay {
     session: Session,
     env_index: u32,
     feeds: Vec<Stream>,
     facts: Facts,
     scans: Option<Scans>,
     boards: Vec<(Process, BoardReader)>,
+    /// The trainer's in environment 0, where it tells how learning goes.
+    learning: BoardReader,
     outlet: Outlet,
     commands: Commands,
-    patience: Patience,
     started: Instant,
     run_age_s: f64,
     counters: Counters,
@@ -85,6 +145,8 @@ pub struct Relay {
     errors_m: Errors,
     apart_since: Option<Duration>,
     ended_at: Option<Duration>,
+    /// Everything is out; questions are still answered.
+    has_left: bool,
     status_budget: Budget,
 }
 
@@ -96,17 +158,12 @@ struct Stream {
 }
 
 impl Relay {
-    /// Opens everything.
-    ///
-    /// # Errors
-    /// A service of the run is not there, or the endpoint cannot be listened on.
-    pub fn open(mut session: Session, env_index: u32) -> Result<Self, RelayError> {
+    fn open(mut session: Session, env_index: u32, zenoh: &zenoh::Session) -> Result<Self, RelayError> {
         let run = &session.run;
         let settings = run.config.fanout.clone();
         let keys = Keys::new(&run.name, env_index);
-        let outlet = Outlet::open(&settings, &keys, &status::map(run, env_index))?;
-        let commands = Commands::open(outlet.session(), keys.control(), env_index, run.control_socket())?;
-        let queue_length = Channel::World.queue_length(run);
+        let outlet = Outlet::open(zenoh.clone(), &keys, &status::map(run, env_index))?;
+        let commands = Commands::open(zenoh, keys.control(), env_index, run.control_socket())?;
         let rates_hz = [settings.world_hz, settings.observation_hz, settings.prediction_hz];
         let feeds = CHANNELS
             .into_iter()
@@ -124,13 +181,13 @@ impl Relay {
             facts: Facts::open(&mut session)?,
             scans: Scans::open(&mut session)?,
             run_age_s: status::age_s(session.run.supervisor_pid),
+            learning: session.board_in(0, Process::Trainer)?,
             session,
             env_index,
             feeds,
             boards,
             outlet,
             commands,
-            patience: Patience::new(queue_length),
             started: Instant::now(),
             counters: Counters::default(),
             newest: MessageHeader::default(),
@@ -140,36 +197,35 @@ impl Relay {
             errors_m: Errors::default(),
             apart_since: None,
             ended_at: None,
+            has_left: false,
             status_budget: Budget::new(settings.status_hz),
         })
     }
 
-    /// Works until the last tick of the run is out, or the process is asked to stop.
-    ///
-    /// # Errors
-    /// A port or zenoh broke.
-    pub fn run(mut self) -> Result<(), RelayError> {
-        tracing::info!(endpoint = %self.session.run.config.fanout.listen, "viewers may attach");
+    fn begin(&mut self) -> Result<(), RelayError> {
+        let endpoint = &self.session.run.config.fanout.listen;
+        tracing::info!(%endpoint, env = self.env_index, "viewers may attach");
         self.session.attach();
-        self.outlet.announce()?;
-        while !self.session.stopped() {
-            let came = self.look()?;
-            let now = self.started.elapsed();
-            self.publish_if_due(now)?;
-            self.facts.relay(now, &mut self.outlet, &mut self.counters)?;
-            if let Some(scans) = &mut self.scans {
-                scans.relay(now, self.facts.directory(), &self.outlet, &mut self.counters)?;
-            }
-            if self.status_budget.allows(now) {
-                self.status_budget.spend(0);
-                self.tell(State::Running, now)?;
-            }
-            if self.finished(now) {
-                break;
-            }
-            self.session.wait(self.patience.next(came))?;
+        Ok(self.outlet.announce()?)
+    }
+
+    /// Shows what is due, and leaves after the last tick; returns the most messages that waited in a queue.
+    fn turn(&mut self) -> Result<usize, RelayError> {
+        let came = self.look()?;
+        let now = self.started.elapsed();
+        self.publish_if_due(now)?;
+        self.facts.relay(now, &mut self.outlet, &mut self.counters)?;
+        if let Some(scans) = &mut self.scans {
+            scans.relay(now, self.facts.directory(), &self.outlet, &mut self.counters)?;
         }
-        self.leave()
+        if self.status_budget.allows(now) {
+            self.status_budget.spend(0);
+            self.tell(State::Running, now)?;
+        }
+        if self.finished(now) {
+            self.leave()?;
+        }
+        Ok(came)
     }
 
     /// Empties the queues; returns the most messages that one of them held.
@@ -309,7 +365,6 @@ impl Relay {
             .map(|(process, board)| (*process, board.health()))
             .collect();
         let sumo = health.first().map_or(0, |(_, health)| health.ticks);
-        let trainer = self.boards.iter().find(|(process, _)| *process == Process::Trainer);
         let run = &self.session.run;
         let tick_s = run.config.run.tick_s;
         #[expect(
@@ -339,9 +394,7 @@ impl Relay {
                 .iter()
                 .map(|(process, health)| ProcessStatus::of(*process, health, sumo))
                 .collect(),
-            training: trainer
-                .filter(|_| run.mode.has_trainer())
-                .map(|(_, board)| board.training().into()),
+            training: run.mode.has_trainer().then(|| self.learning.training().into()),
             fanout: Counters {
                 refused_messages: self.counters.refused_messages + refused,
                 ..self.counters.clone()
@@ -377,8 +430,8 @@ impl Relay {
         in_use.all(|feed| Some(feed.tally().ticks) == newest && feed.fresh_ticks().next().is_none())
     }
 
-    /// Publishes what is left, whatever the rate, and closes.
-    fn leave(mut self) -> Result<(), RelayError> {
+    /// Publishes what is left, whatever the rate.
+    fn leave(&mut self) -> Result<(), RelayError> {
         self.look()?;
         let now = self.started.elapsed();
         let ticks = match self.common_tick() {
@@ -389,8 +442,8 @@ impl Relay {
         self.publish_set(now, &ticks)?;
         self.tell(State::Done, now)?;
         self.session.report(|health| health.state = State::Done as u32);
-        tracing::info!(counters = ?self.counters, "done");
-        self.outlet.close();
+        tracing::info!(env = self.env_index, counters = ?self.counters, "done");
+        self.has_left = true;
         Ok(())
     }
 }

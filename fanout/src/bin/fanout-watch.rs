@@ -1,4 +1,4 @@
-//! `fanout-watch ENDPOINT RUN [--viewers N] [--seconds S] [--bytes-per-s B] [--log FILE]`: viewers that draw nothing. They count
+//! `fanout-watch ENDPOINT RUN [--env N] [--viewers N] [--seconds S] [--bytes-per-s B] [--log FILE]`: viewers that draw nothing. They count
 //! what comes, what is lost on the way and what is to be refused, and print it as JSON. For tests and `caraware bench fanout`.
 
 use std::{
@@ -13,6 +13,7 @@ use std::{
 };
 
 use fanout::{keys::Keys, outlet::read_attachment, reader};
+use ipc_schema::header::MessageHeader;
 use zenoh::{Wait, sample::Sample};
 
 type Failure = Box<dyn std::error::Error + Send + Sync>;
@@ -21,6 +22,7 @@ type Failure = Box<dyn std::error::Error + Send + Sync>;
 struct Options {
     endpoint: String,
     run: String,
+    env: u32,
     viewers: usize,
     seconds: f64,
     /// Speed of the link, 0 = as it is.
@@ -36,6 +38,7 @@ impl Options {
         let mut options = Self {
             endpoint: next("ENDPOINT")?,
             run: next("RUN")?,
+            env: 0,
             viewers: 1,
             seconds: 10.0,
             bytes_per_s: 0,
@@ -44,6 +47,7 @@ impl Options {
         while let Ok(name) = next("") {
             let value = next(&name)?;
             match name.as_str() {
+                "--env" => options.env = value.parse()?,
                 "--viewers" => options.viewers = value.parse()?,
                 "--seconds" => options.seconds = value.parse()?,
                 "--bytes-per-s" => options.bytes_per_s = value.parse()?,
@@ -74,14 +78,16 @@ struct Count {
 }
 
 impl Count {
-    fn add(&mut self, viewer: usize, sample: &Sample, topic: &str, now_ns: u64) {
+    fn add(&mut self, viewer: usize, env: u32, sample: &Sample, topic: &str, now_ns: u64) {
         let bytes = sample.payload().to_bytes();
         self.received += 1;
         self.bytes += bytes.len() as u64;
         let told = sample
             .attachment()
             .and_then(|attachment| read_attachment(&attachment.to_bytes()));
-        let (Ok(_), Some((sequence, taken_ns))) = (reader::check(topic, &bytes, None), told) else {
+        let checked = reader::check(topic, &bytes, None);
+        let is_of_env = |header: Option<MessageHeader>| header.is_none_or(|header| header.env_index == env);
+        let (true, Some((sequence, taken_ns))) = (checked.is_ok_and(is_of_env), told) else {
             self.refused += 1;
             return;
         };
@@ -97,6 +103,7 @@ impl Count {
 
 #[derive(Default)]
 struct Counts {
+    env: u32,
     topics: BTreeMap<String, Count>,
     log: Option<LineWriter<File>>,
 }
@@ -111,7 +118,7 @@ impl Counts {
         self.topics
             .entry(name.to_owned())
             .or_default()
-            .add(viewer, sample, topic, now_ns);
+            .add(viewer, self.env, sample, topic, now_ns);
         if let (Some(log), "world") = (&mut self.log, name)
             && let Some((header, _)) = fanout::frame::decode(&sample.payload().to_bytes())
             && writeln!(log, "{},{now_ns}", header.tick).is_err()
@@ -171,9 +178,10 @@ fn watch(mut options: Options) -> Result<(), Failure> {
     if options.bytes_per_s > 0 {
         options.endpoint = slow_link(&options.endpoint, options.bytes_per_s)?;
     }
-    let all = Keys::new(&options.run, 0).all();
+    let all = Keys::new(&options.run, options.env).all();
     let prefix = all.len() - "**".len();
     let counts = Arc::new(Mutex::new(Counts {
+        env: options.env,
         log: options.log.take().map(LineWriter::new),
         ..Counts::default()
     }));
