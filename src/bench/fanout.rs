@@ -26,8 +26,8 @@ const PACED_S: u64 = 20;
 /// Time that viewers take to start and to get the whole picture.
 const SETTLING: Duration = Duration::from_secs(3);
 /// Pairs of paced runs, and of free ones.
-const PACED_PAIRS: usize = 2;
-const FREE_PAIRS: usize = 3;
+const PACED_PAIRS: usize = 3;
+const FREE_PAIRS: usize = 9;
 /// Ticks of a free run.
 const FREE_TICKS: u64 = 12_000;
 /// Kills of the fan-out.
@@ -329,6 +329,8 @@ struct Running {
     run: RunFile,
     node: RunNode,
     sensors: BoardReader,
+    /// UNIX time at which the machine's monotonic clock was 0, ns.
+    epoch_ns: u64,
 }
 
 impl Drop for Running {
@@ -357,6 +359,7 @@ impl Running {
                     run,
                     node,
                     sensors,
+                    epoch_ns: unix_ns().saturating_sub(clock::monotonic_ns()),
                 });
             }
             pause();
@@ -393,13 +396,12 @@ impl Running {
     /// have to wait for a core like everybody else.
     fn observe(&mut self, time: Duration) -> Vec<(u64, u64)> {
         let begun = Instant::now();
-        let epoch_ns = unix_ns().saturating_sub(clock::monotonic_ns());
         let mut seen = Vec::new();
         let mut last = u64::MAX;
         while begun.elapsed() < time {
             let health = self.sensors.health();
             if health.ticks != last {
-                seen.push((health.ticks, epoch_ns + health.written_ns));
+                seen.push((health.ticks, self.epoch_ns + health.written_ns));
                 last = health.ticks;
             }
             pause();

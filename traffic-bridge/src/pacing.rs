@@ -6,6 +6,9 @@ use ipc_schema::session::{Session as Membership, SessionError, Wait};
 
 /// Longest wait between two looks at the stop flag.
 const LOOK: Duration = Duration::from_millis(50);
+/// The last wait before a step, which nobody can end early: the time-outs of sockets, on which wake-ups come, are rounded to the
+/// kernel's ticks, of which each takes up to 10 ms.
+const EXACT: Duration = Duration::from_millis(20);
 /// Whoever is this late does not hurry to catch up.
 const FORGIVEN: Duration = Duration::from_secs(1);
 
@@ -36,7 +39,10 @@ impl Pacing {
             if membership.stopped() {
                 return Ok(Wait::Stopped);
             }
-            membership.wait(left.min(LOOK))?;
+            match left.checked_sub(EXACT) {
+                Some(rest) if !rest.is_zero() => membership.wait(rest.min(LOOK))?,
+                _ => std::thread::park_timeout(left),
+            }
         }
     }
 
