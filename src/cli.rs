@@ -102,12 +102,12 @@ stop`; then a report. On a terminal the table is live, otherwise there is a line
 /// What `train` takes.
 #[derive(Debug, Args, Clone)]
 pub struct TrainArgs {
-    /// The run.
-    #[command(flatten)]
-    pub run: RunArgs,
     /// Go on with a run (its name or directory), or from one of its checkpoints (a directory) in another run
     #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "commands"])]
     pub resume: Option<String>,
+    /// The run.
+    #[command(flatten)]
+    pub run: RunArgs,
 }
 
 /// What `play` takes.
@@ -116,12 +116,12 @@ pub struct PlayArgs {
     /// Name or directory of a run, whose best checkpoint is taken, or a checkpoint directory
     #[arg(value_name = "RUN|CHECKPOINT")]
     pub checkpoint: String,
-    /// The run; without CONFIG it is like the one that learnt.
-    #[command(flatten)]
-    pub run: RunArgs,
     /// End after so many episodes of `episode.ticks` each [default: never]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub episodes: Option<u64>,
+    /// The run; without CONFIG it is like the one that learnt.
+    #[command(flatten)]
+    pub run: RunArgs,
 }
 
 const CONTROL: &str = "Examples:
@@ -277,7 +277,7 @@ pub struct ViewArgs {
 }
 
 /// Who a viewer is, if the run asks (docs/remote.md).
-#[derive(Debug, Args, Clone)]
+#[derive(Debug, Args, Clone, Default, PartialEq, Eq)]
 #[command(next_help_heading = "Who you are, if the run asks")]
 pub struct Credentials {
     /// User
@@ -419,6 +419,9 @@ pub struct RunArgs {
     /// Watch it, as `caraware view` does: in a window, or with --viewer=web in a browser
     #[arg(long, value_name = "WHERE", num_args = 0..=1, require_equals = true, default_missing_value = "window")]
     pub viewer: Option<ViewerKind>,
+    /// Who that viewer is.
+    #[command(flatten)]
+    pub credentials: Credentials,
 }
 
 impl RunArgs {

@@ -49,7 +49,7 @@ fn run(prepared: Prepared) -> Result<(), Exit> {
         eprintln!("run {}: results go to {}", run.name, run.run_dir.display());
     }
     // Dropped, and so ended, after the run.
-    let _viewer = prepared.viewer.map(|kind| Beside::start(&run, kind)).transpose()?;
+    let _viewer = prepared.viewer.map(|wanted| Beside::start(&run, &wanted)).transpose()?;
     let supervisor = Supervisor::new(prepared.run, prepared.install, prepared.claim)?;
     let outcome = supervisor.supervise(&mut if quiet { Display::silent() } else { Display::new() })?;
     let (report, path) = report::write(&run, &outcome)?;

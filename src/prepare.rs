@@ -13,7 +13,7 @@ use serde_json::Value;
 
 use crate::{
     checkpoint::Found,
-    cli::{PlayArgs, RunArgs, ViewerKind},
+    cli::{PlayArgs, RunArgs},
     config::{self, ConfigError, Settings},
     failure::Exit,
     install::Install,
@@ -21,6 +21,7 @@ use crate::{
     remote, resume,
     scenario::{self, Scenario},
     town,
+    view::Wanted,
 };
 
 /// SUMO's own default step, seconds.
@@ -42,7 +43,7 @@ pub struct Prepared {
     /// Show no progress and no summary.
     pub quiet: bool,
     /// Where to show it meanwhile, if at all.
-    pub viewer: Option<ViewerKind>,
+    pub viewer: Option<Wanted>,
 }
 
 /// What CONFIG names.
@@ -103,6 +104,7 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<Prepared, Exit> {
     found.check_fit(&config)?;
     if found.is_run && args.name.is_none() {
         remote::check(&mut config.fanout)?;
+        let viewer = Wanted::of(args, &config.fanout)?;
         registry::sweep();
         let (run, claim) = resume::go_on(&found, old, config, &install)?;
         check_shared_memory(&run)?;
@@ -111,7 +113,7 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<Prepared, Exit> {
             install,
             claim,
             quiet: args.quiet,
-            viewer: args.viewer,
+            viewer,
         });
     }
     let (_, named) = of_run(&old, &[])?;
@@ -145,6 +147,7 @@ fn make(
         Named::Map => None,
     };
     remote::check(&mut config.fanout)?;
+    let viewer = Wanted::of(args, &config.fanout)?;
     let actions = actions(args.commands.as_deref(), config.run.envs)?;
     registry::sweep();
     let run_dir = create_run_dir(args, label)?;
@@ -162,7 +165,7 @@ fn make(
         install,
         claim,
         quiet: args.quiet,
-        viewer: args.viewer,
+        viewer,
     })
 }
 

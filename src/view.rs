@@ -7,11 +7,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ipc_schema::run::RunFile;
+use ipc_schema::{config::Fanout, run::RunFile};
 use rustix::process::{Pid, Signal, kill_process_group};
 
 use crate::{
-    cli::{ViewArgs, ViewerKind},
+    cli::{Credentials, RunArgs, ViewArgs, ViewerKind},
     failure::Exit,
     install, registry,
 };
@@ -41,21 +41,30 @@ pub fn view(args: &ViewArgs) -> Result<(), Exit> {
     if let Some(name) = &args.run {
         command.arg(format!("--run={name}"));
     }
-    let who = &args.credentials;
-    command.args(who.user.as_ref().map(|user| format!("--user={user}")));
-    for (option, path) in [
-        ("password-file", &who.password_file),
-        ("ca", &who.ca),
-        ("certificate", &who.certificate),
-        ("key", &who.key),
-    ] {
-        command.args(path.as_ref().map(|path| format!("--{option}={}", path.display())));
-    }
+    command.args(arguments_of(&args.credentials));
     let error = command.exec();
     Err(Exit::missing(
         format!("cannot start {}: {error}", command.get_program().to_string_lossy()),
         "run `make build`, then `caraware doctor`",
     ))
+}
+
+/// The same credentials for the Python viewer.
+fn arguments_of(who: &Credentials) -> Vec<String> {
+    let files = [
+        ("password-file", &who.password_file),
+        ("ca", &who.ca),
+        ("certificate", &who.certificate),
+        ("key", &who.key),
+    ];
+    let files = files
+        .into_iter()
+        .filter_map(|(option, path)| Some(format!("--{option}={}", path.as_ref()?.display())));
+    who.user
+        .iter()
+        .map(|user| format!("--user={user}"))
+        .chain(files)
+        .collect()
 }
 
 /// Where a run is fanned out.
@@ -92,10 +101,15 @@ impl Target {
             ));
         }
         Ok(Self {
-            endpoint: run.config.fanout.listen.clone(),
+            endpoint: reachable(&run.config.fanout.listen),
             run: Some(run.name.clone()),
         })
     }
+}
+
+/// An endpoint to connect to for one to listen on: every address of this machine is no address to call.
+fn reachable(listen: &str) -> String {
+    listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 }
 
 /// `tcp/host:port` and its like.
@@ -142,6 +156,59 @@ fn check_installed(python: &Path) -> Result<(), Exit> {
     }
 }
 
+/// A viewer that is wanted beside a run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Wanted {
+    kind: ViewerKind,
+    credentials: Credentials,
+}
+
+impl Wanted {
+    /// What the command line asks for, if the run will let such a viewer in.
+    ///
+    /// # Errors
+    /// The run is not fanned out, or asks who the viewer is and the command line does not say.
+    pub fn of(args: &RunArgs, fanout: &Fanout) -> Result<Option<Self>, Exit> {
+        let who = &args.credentials;
+        let Some(kind) = args.viewer else {
+            return match *who == Credentials::default() {
+                true => Ok(None),
+                false => Err(Exit::config(
+                    "--user, --password-file, --ca, --certificate and --key say who the viewer is, and none is asked for",
+                    "add --viewer or --viewer=web, or leave them out; who may watch is said by fanout.users and fanout.tls_client_ca",
+                )),
+            };
+        };
+        let (users, certificates) = (!fanout.users.is_empty(), !fanout.tls_client_ca.is_empty());
+        let missing = [
+            (users && who.user.is_none(), "--user NAME --password-file FILE"),
+            (
+                certificates && who.certificate.is_none(),
+                "--certificate FILE --key FILE",
+            ),
+            (fanout.listen.starts_with("tls/") && who.ca.is_none(), "--ca FILE"),
+        ];
+        let missing: Vec<&str> = missing
+            .iter()
+            .filter(|(lacks, _)| *lacks)
+            .map(|(_, what)| *what)
+            .collect();
+        if fanout.enabled && !missing.is_empty() {
+            return Err(Exit::config(
+                format!(
+                    "this run lets in only those who say who they are, and so has its own viewer to: {}",
+                    missing.join(" ")
+                ),
+                "add that to the command line, or leave --viewer out (docs/remote.md)",
+            ));
+        }
+        Ok(Some(Self {
+            kind,
+            credentials: who.clone(),
+        }))
+    }
+}
+
 /// A viewer beside a run: it ends with the run, and its own end disturbs nobody.
 #[derive(Debug)]
 pub struct Beside {
@@ -154,10 +221,11 @@ impl Beside {
     ///
     /// # Errors
     /// The run is not fanned out, or no viewer is installed.
-    pub fn start(run: &RunFile, kind: ViewerKind) -> Result<Self, Exit> {
+    pub fn start(run: &RunFile, wanted: &Wanted) -> Result<Self, Exit> {
         let mut command = viewer(&Target::of(run)?)?;
         command.args(["--timeout", FIRST_TICK_WITHIN_S]);
-        command.args((kind == ViewerKind::Web).then_some("--web"));
+        command.args((wanted.kind == ViewerKind::Web).then_some("--web"));
+        command.args(arguments_of(&wanted.credentials));
         command.stdin(Stdio::null()).process_group(0);
         let child = command.spawn().map_err(|error| {
             Exit::missing(

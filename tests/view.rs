@@ -60,6 +60,40 @@ fn a_python_without_the_viewer_is_said() {
     assert!(said.contains("pip install ./viewer"), "{said}");
 }
 
+/// A run that asks who comes asks its own viewer too, before anything is started; with credentials it is let in.
+#[test]
+fn a_viewer_beside_a_guarded_run_says_who_it_is() {
+    let workplace = Workplace::new();
+    let secret = |name: &str, text: &str| {
+        let path = workplace.write(name, text);
+        std::fs::set_permissions(&path, std::os::unix::fs::PermissionsExt::from_mode(0o600)).unwrap();
+        path.display().to_string()
+    };
+    let users = format!("fanout.users={}", secret("users", "alice:a-secret\n"));
+    let password = secret("password", "a-secret\n");
+    let endpoint = format!("fanout.listen={}", free_endpoint());
+    let mut arguments = vec!["simulate", "--name", "guarded"];
+    for setting in [
+        &users,
+        &endpoint,
+        "episode.ticks=60",
+        "episode.training_episodes=1",
+        "run.real_time_factor=1.0",
+    ] {
+        arguments.extend(["--set", setting]);
+    }
+    arguments.push("--viewer=web");
+    let refused = workplace.run(&arguments);
+    let said = text(&refused);
+    assert_eq!(refused.status.code(), Some(2), "{said}");
+    assert!(said.contains("--user NAME --password-file FILE"), "{said}");
+    assert!(!workplace.path().join("runs/guarded").exists());
+    arguments.extend(["--user", "alice", "--password-file", &password]);
+    let said = text(&workplace.succeed(&arguments));
+    assert!(said.contains("watching run guarded"), "{said}");
+    workplace.assert_nothing_left();
+}
+
 /// The viewer draws into a page that nobody opens, and leaves with the run; the run is as it is without.
 #[test]
 fn a_viewer_beside_a_run_changes_nothing() {

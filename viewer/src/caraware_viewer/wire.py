@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-SCHEMA_VERSION = 11
+SCHEMA_VERSION = 12
 
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""
