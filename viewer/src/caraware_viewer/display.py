@@ -98,6 +98,10 @@ class Display:
         return self
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends it, the page first; nothing if that has been done."""
         if self.page is not None:
             self.page.close()
         self._process.terminate()

@@ -49,8 +49,7 @@ def watch(options: argparse.Namespace) -> int:
             _wait_for_end(drawing, link, display)
         finally:
             link.frames.close()
-            drawing.join(_FLUSH_S)
-            _finish(recording, stalled=drawing.is_alive())
+            _finish(recording, drawing, display)
     print(f"run {run.run} has ended" if link.frames.ended else "the display was closed", file=sys.stderr)
     return 0
 
@@ -61,15 +60,25 @@ def _wait_for_end(drawing: threading.Thread, link: Link, display: Display | None
         drawing.join(_LOOK_S)
 
 
-def _finish(recording: rr.RecordingStream, *, stalled: bool) -> None:
-    """Writes what is left; a display that takes nothing is not waited for."""
-    with contextlib.suppress(RuntimeError):
-        recording.flush(timeout_sec=_FLUSH_S)
-    if stalled:
-        print("caraware-viewer: the display takes nothing any more: left it", file=sys.stderr)
+def _finish(recording: rr.RecordingStream, drawing: threading.Thread, display: Display | None) -> None:
+    """Writes what is left. A display that takes nothing is not waited for, as rerun would without end."""
+
+    def write() -> None:
+        drawing.join()
+        recording.disconnect()
+
+    writing = threading.Thread(target=write, name="write", daemon=True)
+    writing.start()
+    writing.join(_FLUSH_S)
+    if not writing.is_alive():
+        return
+    print("caraware-viewer: the display takes nothing any more: left it", file=sys.stderr)
+    if display is None:
         sys.stderr.flush()
         os._exit(1)
-    recording.disconnect()
+    # What waits for it goes on once it is gone.
+    display.close()
+    writing.join(_FLUSH_S)
 
 
 def _draw(link: Link, scene: Scene) -> None:
