@@ -14,6 +14,7 @@ pub mod generate;
 pub mod install;
 pub mod line;
 pub mod live_table;
+pub mod maps;
 pub mod prepare;
 pub mod process_table;
 pub mod registry;

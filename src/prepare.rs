@@ -6,7 +6,7 @@ use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
     control,
-    run::{Beginning, MapInfo, Mode, RunFile, SceneFiles, Source},
+    run::{Beginning, MapInfo, Mode, RunFile, RunMap, SceneFiles, Source},
     services::Channel,
 };
 use serde_json::Value;
@@ -17,10 +17,10 @@ use crate::{
     config::{self, ConfigError, Settings},
     failure::Exit,
     install::Install,
+    maps,
     registry::{self, Claim},
     remote, resume,
     scenario::{self, Scenario},
-    town,
     view::Wanted,
 };
 
@@ -148,6 +148,7 @@ fn make(
     };
     remote::check(&mut config.fanout)?;
     let viewer = Wanted::of(args, &config.fanout)?;
+    maps::locate(&mut config.curriculum)?;
     let actions = actions(args.commands.as_deref(), config.run.envs)?;
     registry::sweep();
     let run_dir = create_run_dir(args, label)?;
@@ -217,6 +218,12 @@ fn check_task(config: &Config, mode: Mode, named: &Named) -> Result<(), Exit> {
         return Err(Exit::config(
             "`episode.whole_scenario` and `traffic.scale` are for a .sumocfg, and there is none",
             "name one in place of the preset, or leave them out",
+        ));
+    }
+    if matches!(named, Named::Scenario(..)) && !config.curriculum.steps.is_empty() {
+        return Err(Exit::config(
+            "the steps of a curriculum say how many vehicles there are, and a .sumocfg has its own",
+            "name the .sumocfg in curriculum.maps, and a preset or .toml in its place: its net is then run with population control",
         ));
     }
     if !config.drives() {
@@ -332,6 +339,41 @@ fn check_name(name: &str) -> Result<(), Exit> {
     ))
 }
 
+/// What a run is on, as its run file says it.
+struct Ground {
+    source: Source,
+    map: MapInfo,
+    scene_files: SceneFiles,
+    maps: Vec<RunMap>,
+}
+
+impl Ground {
+    fn of_scenario(sumocfg: PathBuf, scenario: Scenario, map: MapInfo) -> Self {
+        Self {
+            source: Source::Scenario { sumocfg },
+            map,
+            scene_files: SceneFiles {
+                net_file: scenario.net_file,
+                additional_files: scenario.additional_files,
+            },
+            maps: Vec::new(),
+        }
+    }
+
+    fn of_maps(maps: Vec<RunMap>) -> Result<Self, Exit> {
+        let map = maps::together(&maps);
+        let (Some(map), Some(first)) = (map, maps.first().cloned()) else {
+            return Err(Exit::run("the run has no map", "name one in curriculum.maps"));
+        };
+        Ok(Self {
+            source: first.source,
+            map,
+            scene_files: first.scene_files,
+            maps: if maps.len() > 1 { maps } else { Vec::new() },
+        })
+    }
+}
+
 fn assemble(
     run_dir: &RunDir,
     mode: Mode,
@@ -344,30 +386,9 @@ fn assemble(
         let path = run_dir.path.join(part);
         std::fs::create_dir(&path).map_err(|error| Exit::io("create", &path, &error))?;
     }
-    let (source, map, scene_files) = match (named, scenario_map) {
-        (Named::Scenario(sumocfg, scenario), Some(map)) => {
-            let files = SceneFiles {
-                net_file: scenario.net_file,
-                additional_files: scenario.additional_files,
-            };
-            (Source::Scenario { sumocfg }, map, files)
-        }
-        _ => {
-            let source = town::build(install, &run_dir.path.join("map"))?;
-            let Source::Population {
-                net_file,
-                additional_files,
-            } = &source
-            else {
-                return Err(Exit::run("the town has no net", ""));
-            };
-            let map = scenario::map_info(net_file, None)?;
-            let files = SceneFiles {
-                net_file: net_file.clone(),
-                additional_files: additional_files.clone(),
-            };
-            (source, map, files)
-        }
+    let ground = match (named, scenario_map) {
+        (Named::Scenario(sumocfg, scenario), Some(map)) => Ground::of_scenario(sumocfg, scenario, map),
+        _ => Ground::of_maps(maps::build(install, &config, &run_dir.path.join("map"))?)?,
     };
     let claim = Claim::new(&run_dir.path)?;
     let config_hash = config::hash(&config);
@@ -383,9 +404,10 @@ fn assemble(
         mode,
         supervisor_pid: i32::try_from(std::process::id()).unwrap_or(0),
         shared_memory: claim.memory.clone(),
-        source,
-        map,
-        scene_files,
+        source: ground.source,
+        map: ground.map,
+        scene_files: ground.scene_files,
+        maps: ground.maps,
         sumo_home: install.sumo_home.clone(),
         config,
         config_hash,

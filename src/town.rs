@@ -5,8 +5,6 @@ use std::{
     process::Command,
 };
 
-use ipc_schema::run::Source;
-
 use crate::{failure::Exit, install::Install};
 
 macro_rules! sources {
@@ -24,22 +22,37 @@ const SOURCES: [(&str, &str); 7] = sources![
     "town.vtypes.add.xml",
 ];
 
-/// Writes the sources of the town to `directory` and builds its net there.
+/// The file among them that says who moves.
+const VEHICLE_TYPES: &str = "town.vtypes.add.xml";
+
+/// Writes the sources of the town to `directory` and builds its net there; returns the net, and vehicle types and polygons.
 ///
 /// # Errors
 /// Not writable, or netconvert refuses.
-pub fn build(install: &Install, directory: &Path) -> Result<Source, Exit> {
-    std::fs::create_dir_all(directory).map_err(|error| Exit::io("create", directory, &error))?;
+pub fn build(install: &Install, directory: &Path) -> Result<(PathBuf, Vec<PathBuf>), Exit> {
     for (name, text) in SOURCES {
-        let path = directory.join(name);
-        std::fs::write(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
+        write(directory, name, text)?;
     }
     let net_file = directory.join("town.net.xml");
     netconvert(install, &directory.join("town.netccfg"), &net_file)?;
-    Ok(Source::Population {
-        net_file,
-        additional_files: vec![directory.join("town.vtypes.add.xml"), directory.join("town.poly.xml")],
-    })
+    let additional_files = [VEHICLE_TYPES, "town.poly.xml"].map(|name| directory.join(name));
+    Ok((net_file, additional_files.to_vec()))
+}
+
+/// Writes the vehicle types of the town to `directory`, for other maps.
+///
+/// # Errors
+/// Not writable.
+pub fn vehicle_types(directory: &Path) -> Result<PathBuf, Exit> {
+    let source = SOURCES.into_iter().find(|(name, _)| *name == VEHICLE_TYPES);
+    write(directory, VEHICLE_TYPES, source.map_or("", |(_, text)| text))
+}
+
+fn write(directory: &Path, name: &str, text: &str) -> Result<PathBuf, Exit> {
+    std::fs::create_dir_all(directory).map_err(|error| Exit::io("create", directory, &error))?;
+    let path = directory.join(name);
+    std::fs::write(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
+    Ok(path)
 }
 
 fn netconvert(install: &Install, config: &Path, net_file: &PathBuf) -> Result<(), Exit> {

@@ -15,11 +15,19 @@ pub const LAST_OF_RUN: u32 = 1 << 3;
 pub const LAST_OF_LESSON: u32 = 1 << 4;
 /// First bit of the step of the curriculum, counted from 1; 0 is the base configuration.
 const STEP_SHIFT: u32 = 16;
+/// First bit of the map, counted from 0.
+const MAP_SHIFT: u32 = 24;
 
 /// The flags of a tick in step `step` of the curriculum, counted from 1; 0 is the base configuration.
 #[must_use]
 pub const fn step_flags(step: u8) -> u32 {
     (step as u32) << STEP_SHIFT
+}
+
+/// The flags of a tick on map `map` of a curriculum, counted from 0, the run's own.
+#[must_use]
+pub const fn map_flags(map: u8) -> u32 {
+    (map as u32) << MAP_SHIFT
 }
 
 /// Identity and time of a message. 72 bytes, no implicit padding.
@@ -36,7 +44,7 @@ pub struct MessageHeader {
     /// Counts the replacements of the sending process. `observation`: of the trainer that it is meant for.
     pub incarnation: u32,
     /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`], [`LAST_OF_LESSON`]; from bit 8 on what the
-    /// payload says; from bit 16 on [`step_flags`].
+    /// payload says; from bit 16 on [`step_flags`]; from bit 24 on [`map_flags`].
     pub flags: u32,
     /// Episode number, 0-based over the run.
     pub episode: u64,
@@ -66,5 +74,11 @@ impl MessageHeader {
     #[must_use]
     pub const fn step(&self) -> usize {
         (self.flags >> STEP_SHIFT & 0xff) as usize
+    }
+
+    /// Place of the map among those of the curriculum; 0 is the run's own.
+    #[must_use]
+    pub const fn map(&self) -> usize {
+        (self.flags >> MAP_SHIFT) as usize
     }
 }

@@ -66,7 +66,8 @@ pub struct MapInfo {
     pub projection: String,
     /// Added to projected coordinates to give net coordinates, metres.
     pub net_offset_m: [f64; 2],
-    /// x_min, y_min, x_max, y_max of the net with a margin of 20 m, metres: the range of positions and predictions.
+    /// x_min, y_min, x_max, y_max of the net with a margin of 20 m, metres: the range of positions and predictions. Of a run with several
+    /// maps: of all of them.
     pub bounds_m: [f64; 4],
     /// Programs of traffic lights in the net: at least as many as there are lights.
     pub traffic_lights: u32,
@@ -79,6 +80,19 @@ pub struct SceneFiles {
     pub net_file: PathBuf,
     /// Polygons (buildings) and whatever else SUMO is given beside the routes.
     pub additional_files: Vec<PathBuf>,
+}
+
+/// A map of a run whose curriculum has several.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunMap {
+    /// By which steps call it.
+    pub name: String,
+    /// What traffic runs on.
+    pub source: Source,
+    /// The map, with its own bounds.
+    pub info: MapInfo,
+    /// The files that the static scene is built from.
+    pub scene_files: SceneFiles,
 }
 
 /// Where the run's shared memory lives: nothing outside it is touched.
@@ -119,6 +133,10 @@ pub struct RunFile {
     pub map: MapInfo,
     /// The files that the static scene is built from.
     pub scene_files: SceneFiles,
+    /// The maps of a curriculum that has several, the one above first. `map` above then has the bounds of all of them, and as many
+    /// traffic lights as the one with the most.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub maps: Vec<RunMap>,
     /// Installation of SUMO (the `sumo` directory of the `eclipse-sumo` wheel).
     pub sumo_home: PathBuf,
     /// The validated configuration.
@@ -224,6 +242,20 @@ impl RunFile {
             run_dir,
             ..self.clone()
         }
+    }
+
+    /// Every map of the run, at least one, by its place in [`crate::header::MessageHeader::map`].
+    #[must_use]
+    pub fn every_map(&self) -> Vec<RunMap> {
+        if !self.maps.is_empty() {
+            return self.maps.clone();
+        }
+        vec![RunMap {
+            name: self.config.curriculum.map_names()[0].to_owned(),
+            source: self.source.clone(),
+            info: self.map.clone(),
+            scene_files: self.scene_files.clone(),
+        }]
     }
 
     /// Seed of everything random in this environment; that of the run in the first one of all.

@@ -1,6 +1,6 @@
 //! Which episodes a run consists of: a pure function of configuration and seed, so that every process knows it.
 
-use crate::config::{Curriculum, Episode as Lengths};
+use crate::config::{Curriculum, Episode as Lengths, MapChoice, Step};
 
 /// One episode of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -75,13 +75,17 @@ pub fn environment_seed(run_seed: u64, environment: u32) -> u64 {
     let mut hasher = blake3::Hasher::new_derive_key("caraware environment");
     hasher.update(&run_seed.to_le_bytes());
     hasher.update(&environment.to_le_bytes());
-    first_eight(&hasher)
+    first_words(&hasher)[0]
 }
 
-fn first_eight(hasher: &blake3::Hasher) -> u64 {
-    let mut first = [0_u8; 8];
-    first.copy_from_slice(&hasher.finalize().as_bytes()[..8]);
-    u64::from_le_bytes(first)
+/// The first bytes of a hash as two numbers.
+fn first_words(hasher: &blake3::Hasher) -> [u64; 2] {
+    let hash = hasher.finalize();
+    [0, 8].map(|from| {
+        let mut word = [0_u8; 8];
+        word.copy_from_slice(&hash.as_bytes()[from..from + 8]);
+        u64::from_le_bytes(word)
+    })
 }
 
 /// The `index`-th episode of play: its seed is one that no training sees.
@@ -116,6 +120,8 @@ pub enum Due {
 pub struct Lesson {
     /// Its step, counted from 0.
     pub step: usize,
+    /// Its map among those of the run.
+    pub map: usize,
     /// The episode that begins with it; `None`: the one that is running goes on.
     pub begins: Option<Episode>,
 }
@@ -125,7 +131,7 @@ pub struct Lesson {
 #[derive(Debug)]
 pub struct Course {
     lengths: Lengths,
-    restarts: Vec<bool>,
+    ways: Vec<Way>,
     seed: u64,
     lessons: u64,
     episodes: u64,
@@ -135,6 +141,57 @@ pub struct Course {
     is_over: bool,
     /// Step of the episode that is running.
     running: Option<usize>,
+    /// Step of the newest lesson, and the first lesson of that step.
+    since: Option<(usize, u64)>,
+}
+
+/// What a course has to know of a step.
+#[derive(Debug, Clone)]
+struct Way {
+    restart: bool,
+    maps: Vec<usize>,
+    choice: MapChoice,
+    until_lessons: Option<u64>,
+}
+
+impl Way {
+    fn new(curriculum: &Curriculum, step: &Step) -> Self {
+        Self {
+            restart: step.restart,
+            maps: curriculum.maps_of(step),
+            choice: step.map_choice,
+            until_lessons: step.until_lessons,
+        }
+    }
+
+    /// The map of the lesson that is `since` lessons behind the step's first, `first`, in a run of at most `most` lessons.
+    fn map(&self, seed: u64, first: u64, since: u64, most: u64) -> usize {
+        let count = self.maps.len() as u64;
+        let [share, draw] = map_words(seed, first + since);
+        #[expect(clippy::cast_possible_truncation, reason = "less than the number of maps")]
+        let at = |place: u64| self.maps[place as usize];
+        let lessons = self.until_lessons.unwrap_or(most.saturating_sub(first));
+        match self.choice {
+            MapChoice::InOrder => at(since % count),
+            MapChoice::Random => at(draw % count),
+            // Probability since / (lessons − 1), in whole numbers: `share` is one of 2⁶⁴, each as likely.
+            MapChoice::GraduallyRandom => {
+                let (since, last) = (u128::from(since), u128::from(lessons.saturating_sub(1)));
+                match u128::from(share) * last < since << 64 {
+                    true => at(draw % count),
+                    false => at(0),
+                }
+            }
+        }
+    }
+}
+
+/// Two random numbers for the map of a lesson: the first bytes of a BLAKE3 hash.
+fn map_words(run_seed: u64, lesson: u64) -> [u64; 2] {
+    let mut hasher = blake3::Hasher::new_derive_key("caraware map of a lesson");
+    hasher.update(&run_seed.to_le_bytes());
+    hasher.update(&lesson.to_le_bytes());
+    first_words(&hasher)
 }
 
 impl Course {
@@ -143,7 +200,7 @@ impl Course {
     pub fn new(lengths: &Lengths, curriculum: &Curriculum, seed: u64) -> Self {
         Self {
             lengths: lengths.clone(),
-            restarts: curriculum.steps.iter().map(|step| step.restart).collect(),
+            ways: curriculum.steps.iter().map(|step| Way::new(curriculum, step)).collect(),
             seed,
             lessons: 0,
             episodes: 0,
@@ -152,6 +209,7 @@ impl Course {
             evaluated_lessons: 0,
             is_over: false,
             running: None,
+            since: None,
         }
     }
 
@@ -192,15 +250,22 @@ impl Course {
 
     /// Begins the lesson that is due, in `step`, counted from 0; `None` if that is behind the last: no lesson follows.
     pub fn enter(&mut self, step: usize) -> Option<Lesson> {
-        let Some(restart) = self.restarts.get(step) else {
+        let Some(way) = self.ways.get(step) else {
             self.is_over = true;
             return None;
         };
-        let goes_on = !restart && self.running == Some(step);
+        let first = match self.since {
+            Some((newest, first)) if newest == step => first,
+            _ => self.lessons,
+        };
+        // An episode that goes on cannot change its map.
+        let since = if way.restart { self.lessons - first } else { 0 };
+        let map = way.map(self.seed, first, since, self.lengths.training_episodes);
+        let goes_on = !way.restart && self.running == Some(step);
         let begins = (!goes_on).then(|| self.begin(false, self.lessons, self.lengths.ticks));
-        self.running = Some(step);
+        (self.running, self.since) = (Some(step), Some((step, first)));
         self.lessons += 1;
-        Some(Lesson { step, begins })
+        Some(Lesson { step, map, begins })
     }
 }
 
@@ -214,7 +279,7 @@ pub fn episode_seed(run_seed: u64, evaluation: bool, count: u64) -> u64 {
     });
     hasher.update(&run_seed.to_le_bytes());
     hasher.update(&count.to_le_bytes());
-    first_eight(&hasher)
+    first_words(&hasher)[0]
 }
 
 #[cfg(test)]
@@ -251,7 +316,7 @@ mod tests {
             steps: [true, false]
                 .map(|restart| serde_json::from_value(serde_json::json!({"cavs": 1, "restart": restart})).unwrap())
                 .to_vec(),
-            log: String::new(),
+            ..Curriculum::default()
         };
         let mut course = Course::new(lengths, &curriculum, 7);
         let mut told = String::new();
@@ -282,6 +347,70 @@ mod tests {
         assert_eq!(course(&lengths(9, 2, 1), &[0, 1, 1, 1, 2]), "LLELlE!");
         // A gate that is never passed.
         assert_eq!(course(&lengths(4, 0, 1), &[0, 0, 0, 0, 0]), "LLLL!");
+    }
+
+    /// Maps of lessons whose steps are `steps`, in a curriculum over the maps a, b and c.
+    fn maps(seed: u64, most: u64, kinds: &serde_json::Value, steps: &[usize]) -> Vec<usize> {
+        let curriculum = Curriculum {
+            steps: serde_json::from_value(kinds.clone()).unwrap(),
+            maps: ["a.net.xml", "b.net.xml", "some/c.sumocfg"].map(str::to_owned).to_vec(),
+            ..Curriculum::default()
+        };
+        let mut course = Course::new(&lengths(most, 0, 1), &curriculum, seed);
+        steps.iter().map(|step| course.enter(*step).unwrap().map).collect()
+    }
+
+    #[test]
+    fn maps_are_taken_in_order_and_stay_while_an_episode_goes_on() {
+        let kinds = serde_json::json!([
+            {"cavs": 1},
+            {"cavs": 1, "maps": ["c", "a"]},
+            {"cavs": 1, "maps": ["b", "c"], "restart": false},
+        ]);
+        // The count begins anew with the step.
+        assert_eq!(
+            maps(7, 99, &kinds, &[0, 0, 1, 1, 1, 2, 2, 2]),
+            [0, 0, 2, 0, 2, 1, 1, 1]
+        );
+        let drawn = serde_json::json!([{"cavs": 1, "maps": ["a", "b", "c"], "map_choice": "random", "restart": false}]);
+        for seed in 0..20 {
+            let found = maps(seed, 99, &drawn, &[0; 9]);
+            assert!(found.iter().all(|map| *map == found[0]), "{found:?}");
+        }
+    }
+
+    #[test]
+    fn a_random_map_depends_on_seed_and_lesson_alone() {
+        let kinds = serde_json::json!([
+            {"cavs": 1, "maps": ["a", "b", "c"], "map_choice": "random"},
+            {"cavs": 1, "maps": ["a", "b", "c"], "map_choice": "random", "noise": 2.0},
+        ]);
+        let all = maps(3, 3000, &kinds, &[0; 3000]);
+        let split: Vec<usize> = (0..3000).map(|lesson| usize::from(lesson >= 1234)).collect();
+        assert_eq!(maps(3, 9999, &kinds, &split), all);
+        assert_ne!(maps(4, 3000, &kinds, &[0; 3000]), all);
+        for map in 0..3 {
+            // Binomial: 5 standard deviations are 130.
+            let count = all.iter().filter(|found| **found == map).count();
+            assert!((870..=1130).contains(&count), "{count}");
+        }
+    }
+
+    #[test]
+    fn gradually_random_begins_on_the_first_map_and_ends_on_any() {
+        let kinds = |until: Option<u64>| {
+            serde_json::json!([{"cavs": 1, "maps": ["b", "a"], "map_choice": "gradually_random", "until_lessons": until}])
+        };
+        // Over the lessons of the step, and over those of training where nobody knows how many the step has.
+        for (most, until) in [(9999, Some(2000)), (2000, None)] {
+            let found = maps(5, most, &kinds(until), &[0; 2000]);
+            assert_eq!(found[0], 1);
+            let away = |part: std::ops::Range<usize>| found[part].iter().filter(|map| **map == 0).count();
+            // Half of the drawn ones: 1/8 and 3/8 of 1000, 5 standard deviations are 53 and 77.
+            let (early, late) = (away(0..1000), away(1000..2000));
+            assert!((72..=178).contains(&early) && (298..=452).contains(&late), "{early} {late}");
+        }
+        assert_eq!(maps(5, 1, &kinds(Some(1)), &[0]), [1]);
     }
 
     proptest! {

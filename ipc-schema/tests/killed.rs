@@ -46,6 +46,7 @@ fn run_in(directory: &Path) -> RunFile {
             traffic_lights: 0,
         },
         scene_files: SceneFiles::default(),
+        maps: Vec::new(),
         sumo_home: "none".into(),
         config,
         config_hash: String::new(),

@@ -79,6 +79,7 @@ impl Corner {
                 traffic_lights: 0,
             },
             scene_files: SceneFiles::default(),
+            maps: Vec::new(),
             sumo_home: "none".into(),
             config: config(),
             config_hash: String::new(),

@@ -76,6 +76,7 @@ impl Run {
                 net_file,
                 additional_files: vec![poly],
             },
+            maps: Vec::new(),
             sumo_home: PathBuf::new(),
             config,
             config_hash: String::new(),

@@ -65,6 +65,7 @@ fn run(net_file: &Path, additional_files: &[PathBuf]) -> RunFile {
             net_file: net_file.into(),
             additional_files: additional_files.to_vec(),
         },
+        maps: Vec::new(),
         sumo_home: PathBuf::new(),
         config,
         config_hash: String::new(),

@@ -1,17 +1,19 @@
 //! The process: episode after episode, SUMO's steps go out as `traffic` and `traffic-meta` messages.
 
-use std::path::Path;
+use std::{collections::BTreeMap, path::Path};
 
 use ipc_schema::{
     block::Section,
     board::State,
     failure::{Failure, FailureKind},
     flow,
-    header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader, step_flags},
+    header::{
+        EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader, map_flags, step_flags,
+    },
     ports::{BoardReader, ControlServer, PortError, Publisher, Subscriber, Waker},
     process::Process,
-    run::{RunFile, Source},
-    schedule::{Course, Due, Episode},
+    run::{RunFile, RunMap, Source},
+    schedule::{Course, Due, Episode, Lesson},
     services::Channel,
     session::{Session as Membership, Wait},
     traffic::{EVENTS_PER_MESSAGE, MetaEvent, ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout},
@@ -85,10 +87,19 @@ struct Stretch {
     is_last: bool,
 }
 
+/// Where an episode takes place, and who is there.
+#[derive(Debug, Clone, Copy, Default)]
+struct Setting {
+    /// Step of the curriculum, counted from 1; 0: the base configuration.
+    step: usize,
+    /// Map among those of the run.
+    map: usize,
+}
+
 /// What SUMO is to be told for `episode`.
-fn options(run: &RunFile, episode: &Episode) -> Result<Options, SumoError> {
+fn options(run: &RunFile, source: &Source, episode: &Episode) -> Result<Options, SumoError> {
     let traffic = &run.config.traffic;
-    match &run.source {
+    match source {
         Source::Population {
             net_file,
             additional_files,
@@ -162,6 +173,10 @@ struct Bridge {
     resets: u64,
     repeated_ticks: u64,
     ticks_per_step: u64,
+    /// The maps of the run.
+    maps: Vec<RunMap>,
+    /// Lessons and ticks on each of them, in a run with a curriculum.
+    taught: Vec<Taught>,
     /// `traffic-meta` messages sent.
     meta_messages: u64,
     /// Ticks sent.
@@ -173,9 +188,17 @@ struct Bridge {
     cost: Option<Cost>,
 }
 
+/// What a map was used for.
+#[derive(Debug, Clone, serde::Serialize)]
+struct Taught {
+    name: String,
+    lessons: u64,
+    ticks: u64,
+}
+
 /// What this process adds to the run's report: processor time, seconds.
 #[derive(Debug, serde::Serialize)]
-struct Part {
+struct Part<'a> {
     /// SUMO's own steps.
     sumo_step_s: f64,
     /// Finding out what happened and where everybody is.
@@ -184,6 +207,9 @@ struct Part {
     signals_s: f64,
     /// Road users, over SUMO's steps.
     vehicle_steps: u64,
+    /// The maps of a curriculum that has several: lessons on each, and their ticks.
+    #[serde(skip_serializing_if = "<[Taught]>::is_empty")]
+    maps: &'a [Taught],
 }
 
 impl Bridge {
@@ -203,7 +229,15 @@ impl Bridge {
         let control = Control::of_run(&membership.run.run_dir)?;
         let switches = membership.publisher(Channel::Switch)?;
         let sensing = membership.board_of(Process::SensorDaemon)?;
+        let maps = membership.run.every_map();
+        let taught = maps.iter().map(|map| Taught {
+            name: map.name.clone(),
+            lessons: 0,
+            ticks: 0,
+        });
         Ok(Self {
+            taught: taught.collect(),
+            maps,
             commands,
             control,
             switches,
@@ -272,7 +306,7 @@ impl Bridge {
                 ..Stretch::default()
             };
             loop {
-                let mut underway = self.begin(before.take(), &episode, 0)?;
+                let mut underway = self.begin(before.take(), &episode, Setting::default())?;
                 self.announce(&underway.session);
                 let end = self.run(&mut underway, stretch)?;
                 before = Some(underway);
@@ -289,16 +323,16 @@ impl Bridge {
     /// Runs lessons and evaluations as `course` has them, in the steps that are decided on the way.
     fn follow(&mut self, mut course: Course) -> Result<Wait, Failure> {
         let mut decisions = Decisions::open(&self.membership)?;
-        let mut underway: Option<Underway> = None;
+        let mut underway = self.try_maps()?;
         loop {
-            let (begins, step, stretch) = match course.due() {
+            let (begins, setting, stretch) = match course.due() {
                 Due::Nothing => return Ok(Wait::Ready),
                 Due::Evaluation { episode, is_last } => {
                     let stretch = Stretch {
                         is_last,
                         ..Stretch::default()
                     };
-                    (Some(episode), 0, stretch)
+                    (Some(episode), Setting::default(), stretch)
                 }
                 Due::Lesson(number) => {
                     let Some(step) = decisions.step_of(&self.membership, number, self.ticks)? else {
@@ -307,30 +341,17 @@ impl Bridge {
                     let Some(lesson) = course.enter(step) else {
                         continue;
                     };
-                    let past = match lesson.begins {
+                    let Lesson { step, map, begins } = lesson;
+                    let past = match begins {
                         Some(_) => 0,
-                        None => underway
-                            .as_ref()
-                            .map_or(0, |underway| underway.frame.step * self.ticks_per_step),
+                        None => underway.as_ref().map_or(0, |now| now.frame.step * self.ticks_per_step),
                     };
-                    let config = &self.membership.run.config;
-                    let kind = &config.curriculum.steps[step];
-                    let ticks = kind.ticks.unwrap_or(config.episode.ticks);
-                    #[expect(clippy::cast_possible_truncation, reason = "validated: at most 255 steps")]
-                    let stretch = Stretch {
-                        ticks: Some(past + ticks.next_multiple_of(self.ticks_per_step)),
-                        flags: step_flags(step as u8 + 1),
-                        last_flags: match kind.restart {
-                            true => LAST_OF_LESSON | LAST_OF_EPISODE,
-                            false => LAST_OF_LESSON,
-                        },
-                        is_last: false,
-                    };
-                    (lesson.begins, step + 1, stretch)
+                    let setting = Setting { step: step + 1, map };
+                    (begins, setting, self.lesson(setting, past))
                 }
             };
             let mut now = match (begins, underway.take()) {
-                (Some(episode), before) => self.begin(before, &episode, step)?,
+                (Some(episode), before) => self.begin(before, &episode, setting)?,
                 (None, Some(now)) => now.go_on()?,
                 (None, None) => return Ok(Wait::Ready),
             };
@@ -342,10 +363,62 @@ impl Bridge {
         }
     }
 
-    /// SUMO at the beginning of `episode`, in `step` of the curriculum (counted from 1; 0: none).
-    fn begin(&mut self, before: Option<Underway>, episode: &Episode, step: usize) -> Result<Underway, Failure> {
+    /// The stretch of the lesson that follows, in an episode that has `past` ticks behind it; it is counted.
+    fn lesson(&mut self, Setting { step, map }: Setting, past: u64) -> Stretch {
+        let config = &self.membership.run.config;
+        let kind = &config.curriculum.steps[step - 1];
+        let ticks = kind.ticks.unwrap_or(config.episode.ticks);
+        let ticks = ticks.next_multiple_of(self.ticks_per_step);
+        self.taught[map].lessons += 1;
+        self.taught[map].ticks += ticks;
+        #[expect(clippy::cast_possible_truncation, reason = "validated: at most 255 steps and 256 maps")]
+        let flags = step_flags(step as u8) | map_flags(map as u8);
+        Stretch {
+            ticks: Some(past + ticks),
+            flags,
+            last_flags: match kind.restart {
+                true => LAST_OF_LESSON | LAST_OF_EPISODE,
+                false => LAST_OF_LESSON,
+            },
+            is_last: false,
+        }
+    }
+
+    /// Of several maps, each that a step names is tried with that step's road users: one that does not serve is found before the first
+    /// tick, not in the last step.
+    fn try_maps(&mut self) -> Result<Option<Underway>, Failure> {
+        let mut tried = None;
         let run = &self.membership.run;
-        let options = options(run, episode)?;
+        if run.maps.is_empty() {
+            return Ok(tried);
+        }
+        let episode = Episode {
+            index: 0,
+            evaluation: false,
+            seed: run.config.run.seed,
+            ticks: None,
+        };
+        let curriculum = run.config.curriculum.clone();
+        let steps = curriculum.steps.iter().map(|step| curriculum.maps_of(step));
+        let settings: BTreeMap<usize, usize> = (1..)
+            .zip(steps)
+            .flat_map(|(step, maps)| maps.into_iter().map(move |map| (map, step)))
+            .collect();
+        for (map, step) in settings {
+            tried = Some(self.begin(tried, &episode, Setting { step, map })?);
+        }
+        Ok(tried)
+    }
+
+    /// SUMO at the beginning of `episode`.
+    fn begin(
+        &mut self,
+        before: Option<Underway>,
+        episode: &Episode,
+        Setting { step, map }: Setting,
+    ) -> Result<Underway, Failure> {
+        let run = &self.membership.run;
+        let options = options(run, &self.maps[map].source, episode)?;
         let mut session = match before {
             None => Session::start(options)?,
             Some(before) => Session::reload(before.session, options)?,
@@ -655,6 +728,7 @@ impl Bridge {
             getters_s: cost.getters_s,
             signals_s: cost.signals_s,
             vehicle_steps: self.vehicle_steps,
+            maps: if self.taught.len() > 1 { &self.taught } else { &[] },
         })
     }
 }

@@ -326,6 +326,7 @@ fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
             traffic_lights: 0,
         },
         scene_files: SceneFiles::default(),
+        maps: Vec::new(),
         sumo_home: "none".into(),
         config: serde_json::from_value(config(port)).unwrap(),
         config_hash: String::new(),

@@ -12,6 +12,61 @@ pub struct Curriculum {
     pub steps: Vec<Step>,
     /// `actions.jsonl` of a run whose steps a simulation without learner repeats; "" = none.
     pub log: String,
+    /// Maps that steps choose from, each "town", a `.net.xml` or a `.sumocfg`; the first is the run's own, that of evaluations. None =
+    /// the town alone.
+    #[serde(default)]
+    pub maps: Vec<String>,
+}
+
+/// The project's own map.
+pub const TOWN: &str = "town";
+/// Endings of files that are maps.
+const MAP_ENDINGS: [&str; 3] = [".sumocfg", ".net.xml", ".net.xml.gz"];
+
+/// Name of a map in `curriculum.maps`: "town", or that of the file without its ending; `None` if it is neither.
+#[must_use]
+pub fn map_name(entry: &str) -> Option<&str> {
+    if entry == TOWN {
+        return Some(TOWN);
+    }
+    let file = entry.rsplit('/').next().unwrap_or(entry);
+    let name = MAP_ENDINGS.iter().find_map(|ending| file.strip_suffix(ending))?;
+    (!name.is_empty()).then_some(name)
+}
+
+impl Curriculum {
+    /// Names of the run's maps, in order; at least one.
+    #[must_use]
+    pub fn map_names(&self) -> Vec<&str> {
+        match self.maps.as_slice() {
+            [] => vec![TOWN],
+            maps => maps.iter().map(|entry| map_name(entry).unwrap_or(entry)).collect(),
+        }
+    }
+
+    /// The maps that lessons of `step` choose from, as places in [`Curriculum::map_names`]; at least one.
+    #[must_use]
+    pub fn maps_of(&self, step: &Step) -> Vec<usize> {
+        let names = self.map_names();
+        let known = step.maps.iter();
+        let known: Vec<usize> = known
+            .filter_map(|name| names.iter().position(|known| known == name))
+            .collect();
+        if known.is_empty() { vec![0] } else { known }
+    }
+}
+
+/// Which of a step's maps a lesson is on.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MapChoice {
+    /// One after the other, and from the first again.
+    #[default]
+    InOrder,
+    /// Drawn for each lesson.
+    Random,
+    /// The first, and a share of lessons on a drawn one, that grows from none to all.
+    GraduallyRandom,
 }
 
 /// One step.
@@ -26,6 +81,12 @@ pub struct Step {
     /// Every lesson begins with all vehicles at new places; else it goes on where the one before ended.
     #[serde(default = "yes")]
     pub restart: bool,
+    /// Names of the maps that its lessons are on; none = the run's first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub maps: Vec<String>,
+    /// Which of them, lesson by lesson.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub map_choice: MapChoice,
     /// Factor on the random errors and biases of all sensors.
     #[serde(default = "one")]
     pub noise: f64,
@@ -41,6 +102,10 @@ pub struct Step {
     /// Passed after so many lessons.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub until_lessons: Option<u64>,
+}
+
+fn is_default(choice: &MapChoice) -> bool {
+    *choice == MapChoice::default()
 }
 
 fn yes() -> bool {

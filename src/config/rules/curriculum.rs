@@ -1,11 +1,15 @@
 //! Rules of a curriculum: every step complete, with room for its vehicles, and a learner that can pass its gates.
 
-use ipc_schema::config::Config;
+use std::collections::BTreeSet;
+
+use ipc_schema::config::{Config, MapChoice, Step, map_name};
 
 use super::{ConfigError, LOCALISING_TRAINER, Settings, conflict};
 
 /// Steps fit into a byte of the header's flags, counted from 1.
 const MOST_STEPS: usize = 255;
+/// Maps fit into another, counted from 0.
+const MOST_MAPS: usize = 256;
 
 pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
     let (steps, traffic) = (&config.curriculum.steps, &config.traffic);
@@ -48,6 +52,91 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
                 format!("set traffic.max_road_users to {road_users} or more"),
             );
         }
+    }
+    maps(settings, config)?;
+    (1..)
+        .zip(steps)
+        .try_for_each(|(number, step)| maps_of_step(settings, config, number, step))
+}
+
+/// Every map has a name of its own, and somebody who asks for it.
+fn maps(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+    let maps = &config.curriculum.maps;
+    let refuse = |message: String, help: &str| Err(conflict(settings, "curriculum.maps", message, help.into()));
+    if maps.len() > MOST_MAPS {
+        let message = format!("`curriculum.maps` has {} maps", maps.len());
+        return refuse(message, &format!("give at most {MOST_MAPS}"));
+    }
+    if !maps.is_empty() && config.curriculum.steps.is_empty() {
+        return refuse(
+            "`curriculum.maps` are for the steps of a curriculum, and there are none".into(),
+            "add a [[curriculum.steps]], or set curriculum.maps = []; a .sumocfg in place of the preset runs a scenario as it is",
+        );
+    }
+    let mut names = BTreeSet::new();
+    for entry in maps {
+        let Some(name) = map_name(entry) else {
+            return refuse(
+                format!("`curriculum.maps` has \"{entry}\", which is no map"),
+                "give \"town\", a .net.xml (or .net.xml.gz), or a .sumocfg",
+            );
+        };
+        if !names.insert(name) {
+            return refuse(
+                format!("`curriculum.maps` has two maps of the name \"{name}\""),
+                "steps call a map by its file's name without the ending: rename one of the files",
+            );
+        }
+    }
+    if maps.len() < 2 {
+        return Ok(());
+    }
+    match placed(config) {
+        None => Ok(()),
+        Some(key) => Err(conflict(
+            settings,
+            key,
+            format!(
+                "`{key}` names places of one map, and `curriculum.maps` has {}",
+                maps.len()
+            ),
+            "leave it out; buildings come with each map, and `scene.random_props` stand on all".into(),
+        )),
+    }
+}
+
+/// The first key in use that holds places of a map.
+fn placed(config: &Config) -> Option<&'static str> {
+    let (scene, region) = (&config.scene, &config.region);
+    let keys = [
+        ("scene.obstacles", !scene.obstacles.is_empty()),
+        ("scene.meshes", !scene.meshes.is_empty()),
+        ("region.polygon_m", !region.polygon_m.is_empty()),
+        ("region.radius_m", region.radius_m > 0.0),
+    ];
+    keys.into_iter().find_map(|(key, is_used)| is_used.then_some(key))
+}
+
+fn maps_of_step(settings: &Settings, config: &Config, number: usize, step: &Step) -> Result<(), ConfigError> {
+    let names = config.curriculum.map_names();
+    let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.steps", message, help));
+    if let Some(unknown) = step.maps.iter().find(|name| !names.contains(&name.as_str())) {
+        return refuse(
+            format!("step {number} of `curriculum.steps` is on the map \"{unknown}\", which the run does not have"),
+            format!(
+                "its maps are \"{}\": add the file to `curriculum.maps`, or name one of them",
+                names.join("\", \"")
+            ),
+        );
+    }
+    if step.map_choice != MapChoice::InOrder && step.maps.len() < 2 {
+        return refuse(
+            format!(
+                "step {number} of `curriculum.steps` draws its maps, and names {}",
+                step.maps.len()
+            ),
+            "give `maps` with two or more, or leave `map_choice` out".into(),
+        );
     }
     Ok(())
 }

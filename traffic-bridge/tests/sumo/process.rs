@@ -313,6 +313,7 @@ fn run_file(run_dir: PathBuf, source: Source, ticks: u64, step_s: f64) -> RunFil
             traffic_lights: 0,
         },
         scene_files: SceneFiles::default(),
+        maps: Vec::new(),
         sumo_home: sumo_home(),
         config: serde_json::from_value(config(ticks, step_s)).unwrap(),
         config_hash: String::new(),

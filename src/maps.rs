@@ -1,0 +1,161 @@
+//! The maps of a run with population control: from `curriculum.maps` to nets, scenes and one box around all.
+
+use std::path::{Path, PathBuf};
+
+use ipc_schema::{
+    config::{Config, Curriculum, TOWN, map_name},
+    run::{MapInfo, RunMap, SceneFiles, Source},
+};
+
+use crate::{failure::Exit, install::Install, scenario, town};
+
+/// Checks that every file of `curriculum.maps` is there, and makes its path absolute.
+///
+/// # Errors
+/// One is not there.
+pub fn locate(curriculum: &mut Curriculum) -> Result<(), Exit> {
+    for entry in curriculum.maps.iter_mut().filter(|entry| *entry != TOWN) {
+        let path = std::path::absolute(&*entry).map_err(|error| Exit::io("resolve", Path::new(&*entry), &error))?;
+        if !path.is_file() {
+            return Err(Exit::config(
+                format!(
+                    "`curriculum.maps` has \"{entry}\", and there is no file {}",
+                    path.display()
+                ),
+                "correct the path: it is relative to the directory that caraware is started in",
+            ));
+        }
+        *entry = path.to_string_lossy().into_owned();
+    }
+    Ok(())
+}
+
+/// Brings every map of `config` to where SUMO and the scene can be made of it; what has to be built goes to `directory`.
+///
+/// # Errors
+/// A file cannot be read, a net lacks what it needs, or the town cannot be built.
+pub fn build(install: &Install, config: &Config, directory: &Path) -> Result<Vec<RunMap>, Exit> {
+    let origin = config.map.origin_latitude_deg.zip(config.map.origin_longitude_deg);
+    let town = [TOWN.to_owned()];
+    let entries = match config.curriculum.maps.as_slice() {
+        [] => &town,
+        entries => entries,
+    };
+    let map = |entry: &String| {
+        let (source, scene_files) = match entry.as_str() {
+            TOWN => built(install, directory)?,
+            file => given(Path::new(file), directory)?,
+        };
+        Ok(RunMap {
+            name: map_name(entry).unwrap_or(entry).to_owned(),
+            info: scenario::map_info(&scene_files.net_file, origin)?,
+            source,
+            scene_files,
+        })
+    };
+    entries.iter().map(map).collect()
+}
+
+/// The town, whose files SUMO is given too.
+fn built(install: &Install, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
+    let (net_file, additional_files) = town::build(install, directory)?;
+    let source = Source::Population {
+        net_file: net_file.clone(),
+        additional_files: additional_files.clone(),
+    };
+    let scene_files = SceneFiles {
+        net_file,
+        additional_files,
+    };
+    Ok((source, scene_files))
+}
+
+/// A net or a scenario of the user's. Additional files may define demand and outputs beside themselves: the scene is made of them, and
+/// SUMO has the town's vehicle types alone.
+fn given(file: &Path, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
+    let scene_files = match file.extension().is_some_and(|ending| ending == "sumocfg") {
+        true => {
+            let scenario = scenario::read(file)?;
+            SceneFiles {
+                net_file: scenario.net_file,
+                additional_files: scenario.additional_files,
+            }
+        }
+        false => SceneFiles {
+            net_file: PathBuf::from(file),
+            additional_files: Vec::new(),
+        },
+    };
+    let source = Source::Population {
+        net_file: scene_files.net_file.clone(),
+        additional_files: vec![town::vehicle_types(directory)?],
+    };
+    Ok((source, scene_files))
+}
+
+/// What the run file says of all `maps` together: the first one's, in a box around all, with room for the lights of any.
+#[must_use]
+pub fn together(maps: &[RunMap]) -> Option<MapInfo> {
+    let (first, others) = maps.split_first()?;
+    let mut whole = first.info.clone();
+    for RunMap { info, .. } in others {
+        for side in 0..4 {
+            let (a, b) = (whole.bounds_m[side], info.bounds_m[side]);
+            whole.bounds_m[side] = if side < 2 { a.min(b) } else { a.max(b) };
+        }
+        whole.traffic_lights = whole.traffic_lights.max(info.traffic_lights);
+    }
+    Some(whole)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
+mod tests {
+    use super::*;
+
+    fn map(bounds_m: [f64; 4], traffic_lights: u32, projection: &str) -> RunMap {
+        RunMap {
+            name: projection.into(),
+            source: Source::Scenario { sumocfg: "none".into() },
+            info: MapInfo {
+                projection: projection.into(),
+                net_offset_m: [1.0, 2.0],
+                bounds_m,
+                traffic_lights,
+            },
+            scene_files: SceneFiles::default(),
+        }
+    }
+
+    #[test]
+    fn one_box_holds_all_maps() {
+        let maps = [
+            map([-20.0, -20.0, 500.0, 100.0], 3, "a"),
+            map([-50.0, 0.0, 400.0, 300.0], 7, "b"),
+        ];
+        let whole = together(&maps).unwrap();
+        assert_eq!(whole.bounds_m, [-50.0, -20.0, 500.0, 300.0]);
+        assert_eq!((whole.projection.as_str(), whole.traffic_lights), ("a", 7));
+        assert_eq!(together(&maps[1..]).unwrap(), maps[1].info);
+    }
+
+    #[test]
+    fn a_map_that_is_not_there_is_named_with_its_key() {
+        let folder = tempfile::tempdir().unwrap();
+        let net = folder.path().join("here.net.xml");
+        std::fs::write(&net, "").unwrap();
+        let entry = net.to_string_lossy().into_owned();
+        let mut curriculum = Curriculum {
+            maps: vec![TOWN.to_owned(), entry.clone()],
+            ..Curriculum::default()
+        };
+        locate(&mut curriculum).unwrap();
+        assert_eq!(curriculum.maps, [TOWN.to_owned(), entry]);
+        curriculum.maps.push("nowhere/city.sumocfg".into());
+        let message = format!("{:?}", locate(&mut curriculum).unwrap_err());
+        assert!(
+            message.contains("`curriculum.maps`") && message.contains("nowhere/city.sumocfg"),
+            "{message}"
+        );
+    }
+}
