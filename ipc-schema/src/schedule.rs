@@ -368,10 +368,7 @@ mod tests {
             {"cavs": 1, "maps": ["b", "c"], "restart": false},
         ]);
         // The count begins anew with the step.
-        assert_eq!(
-            maps(7, 99, &kinds, &[0, 0, 1, 1, 1, 2, 2, 2]),
-            [0, 0, 2, 0, 2, 1, 1, 1]
-        );
+        assert_eq!(maps(7, 99, &kinds, &[0, 0, 1, 1, 1, 2, 2, 2]), [0, 0, 2, 0, 2, 1, 1, 1]);
         let drawn = serde_json::json!([{"cavs": 1, "maps": ["a", "b", "c"], "map_choice": "random", "restart": false}]);
         for seed in 0..20 {
             let found = maps(seed, 99, &drawn, &[0; 9]);
@@ -398,9 +395,7 @@ mod tests {
 
     #[test]
     fn gradually_random_begins_on_the_first_map_and_ends_on_any() {
-        let kinds = |until: Option<u64>| {
-            serde_json::json!([{"cavs": 1, "maps": ["b", "a"], "map_choice": "gradually_random", "until_lessons": until}])
-        };
+        let kinds = |until: Option<u64>| serde_json::json!([{"cavs": 1, "maps": ["b", "a"], "map_choice": "gradually_random", "until_lessons": until}]);
         // Over the lessons of the step, and over those of training where nobody knows how many the step has.
         for (most, until) in [(9999, Some(2000)), (2000, None)] {
             let found = maps(5, most, &kinds(until), &[0; 2000]);
@@ -408,7 +403,10 @@ mod tests {
             let away = |part: std::ops::Range<usize>| found[part].iter().filter(|map| **map == 0).count();
             // Half of the drawn ones: 1/8 and 3/8 of 1000, 5 standard deviations are 53 and 77.
             let (early, late) = (away(0..1000), away(1000..2000));
-            assert!((72..=178).contains(&early) && (298..=452).contains(&late), "{early} {late}");
+            assert!(
+                (72..=178).contains(&early) && (298..=452).contains(&late),
+                "{early} {late}"
+            );
         }
         assert_eq!(maps(5, 1, &kinds(Some(1)), &[0]), [1]);
     }

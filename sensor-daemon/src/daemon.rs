@@ -10,6 +10,7 @@ use ipc_schema::{
     observation::ObservationLayout,
     ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
+    run::MapInfo,
     services::Channel,
     session::{Session, Wait},
     world::WorldLayout,
@@ -54,7 +55,9 @@ struct Part {
 /// The map's projection is not understood, the scene or a LIDAR's ray table cannot be read, or a port fails.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut session = Session::join(run_file, Process::SensorDaemon)?;
-    let mut sensing = Sensing::new(&session.run.config, &session.run.map).map_err(unprojected)?;
+    let (config, maps) = (&session.run.config, session.run.every_map());
+    let maps: Vec<MapInfo> = maps.into_iter().map(|map| map.info).collect();
+    let mut sensing = Sensing::on_maps(config, session.run.map.bounds_m, &maps).map_err(unprojected)?;
     let scanning = look_around(&mut session, &mut sensing)?;
     let world = session.subscriber(Channel::World)?;
     let mut daemon = Daemon::open(session, sensing, scanning)?;
@@ -78,25 +81,30 @@ fn look_around(session: &mut Session, sensing: &mut Sensing) -> Result<Option<Sc
     if !sky_view && !has_lidars {
         return Ok(None);
     }
-    let scene = Arc::new(Scene::of_run(&session.run)?);
+    let scenes = Scene::of_every_map(&session.run)?;
     if sky_view {
-        let map = &session.run.map;
-        let [x_min, y_min, x_max, y_max] = map.bounds_m;
-        let middle = NetPosition {
-            x_m: 0.5 * (x_min + x_max),
-            y_m: 0.5 * (y_min + y_max),
-        };
-        let middle = Projection::new(map)
-            .and_then(|projection| projection.geodetic_from_net(middle))
-            .map_err(unprojected)?;
-        let sky = SkyMap::new(Arc::clone(&scene), middle, map.bounds_m, session.run.seed());
-        sensing.set_sky(Box::new(sky));
+        for (index, (map, scene)) in session.run.every_map().iter().zip(&scenes).enumerate() {
+            let sky = sky_over(&map.info, scene, session.run.seed())?;
+            sensing.set_sky_of(index, Box::new(sky));
+        }
     }
     if !has_lidars {
         return Ok(None);
     }
     let publisher = session.publisher(Channel::Pointcloud)?;
-    Scanning::new(&session.run.config, &scene, publisher).map(Some)
+    Scanning::new(&session.run.config, &scenes, publisher).map(Some)
+}
+
+fn sky_over(map: &MapInfo, scene: &Arc<Scene>, seed: u64) -> Result<SkyMap, Failure> {
+    let [x_min, y_min, x_max, y_max] = map.bounds_m;
+    let middle = NetPosition {
+        x_m: 0.5 * (x_min + x_max),
+        y_m: 0.5 * (y_min + y_max),
+    };
+    let middle = Projection::new(map)
+        .and_then(|projection| projection.geodetic_from_net(middle))
+        .map_err(unprojected)?;
+    Ok(SkyMap::new(Arc::clone(scene), middle, map.bounds_m, seed))
 }
 
 fn unprojected(error: GeodesyError) -> Failure {

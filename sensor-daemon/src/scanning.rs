@@ -1,5 +1,7 @@
 //! LIDARs in a run: scans of every vehicle that carries one, into shared memory, and what they say about the nearest objects.
 
+use std::sync::Arc;
+
 use ipc_schema::{
     block,
     config::{Config, Field},
@@ -30,7 +32,8 @@ pub struct Tally {
 
 /// The LIDARs of a run.
 pub struct Scanning {
-    lidar: Lidar,
+    /// One for each map of the run.
+    lidars: Vec<Lidar>,
     targets: Targets,
     scratch: Scratch,
     publisher: Publisher,
@@ -41,14 +44,15 @@ pub struct Scanning {
 }
 
 impl Scanning {
-    /// LIDARs as configured, in a scene.
+    /// LIDARs as configured, in the scenes of the run's maps.
     ///
     /// # Errors
     /// A ray table or mesh cannot be used.
-    pub fn new(config: &Config, scene: &Scene, publisher: Publisher) -> Result<Self, Failure> {
+    pub fn new(config: &Config, scenes: &[Arc<Scene>], publisher: Publisher) -> Result<Self, Failure> {
         let objects = Field::Object1X..=Field::Object4Y;
+        let lidars = scenes.iter().map(|scene| Lidar::new(config, scene));
         Ok(Self {
-            lidar: Lidar::new(config, scene)?,
+            lidars: lidars.collect::<Result<_, _>>()?,
             targets: Targets::default(),
             scratch: Scratch::default(),
             publisher,
@@ -91,12 +95,13 @@ impl Scanning {
         carrier: &VehicleState,
         row: usize,
     ) -> Result<Option<[[f32; 2]; 4]>, Failure> {
-        let layout = PointcloudLayout::new(self.lidar.max_points());
+        let lidar = &self.lidars[header.map().min(self.lidars.len() - 1)];
+        let layout = PointcloudLayout::new(lidar.max_points());
         let mut draft = self.publisher.loan_unwritten(*header, layout.len)?;
         let [head, body] = block::split_mut(draft.payload_mut(), &[layout.scan, layout.points]).map_err(broken)?;
         let points: &mut [LidarPoint] = bytemuck::cast_slice_mut(body);
         let mut scan = Scan::default();
-        let count = self.lidar.scan(
+        let count = lidar.scan(
             &self.targets,
             row,
             header.tick,
@@ -105,16 +110,14 @@ impl Scanning {
             &mut scan,
             points,
         );
-        let objects = self
-            .shows_objects
-            .then(|| nearest_objects(&points[..count], &self.lidar));
+        let objects = self.shows_objects.then(|| nearest_objects(&points[..count], lidar));
         self.tally.scans += 1;
         self.tally.rays += u64::from(scan.rays);
         self.tally.points += count as u64;
         head.copy_from_slice(bytemuck::bytes_of(&scan));
         *draft.header_mut() = MessageHeader {
             count: count as u32,
-            columns: self.lidar.columns() as u32,
+            columns: lidar.columns() as u32,
             sequence: u64::from(carrier.vehicle),
             ..*header
         };

@@ -45,12 +45,22 @@ pub struct World<'a> {
     pub views: &'a [HeroView],
 }
 
+/// The sensors of a step of the curriculum on one of its maps.
+struct Placed {
+    /// Counted from 1; 0 is the base configuration.
+    step: usize,
+    map: usize,
+    suite: Suite,
+}
+
 /// Sensors of a run, with what they remember from tick to tick.
 pub struct Sensing {
-    /// The base configuration's, then one for each step of the curriculum.
-    suites: Vec<Suite>,
+    /// The base configuration's on the run's own map, then one for each map of each step of the curriculum.
+    suites: Vec<Placed>,
     /// Which of them is at work.
-    step: usize,
+    at: usize,
+    /// By map; that of the map at hand is with its suite.
+    skies: Vec<Option<Box<dyn Sky>>>,
     normaliser: Normaliser,
     history: History,
     policy: BlackoutPolicy,
@@ -83,14 +93,26 @@ impl Sensing {
     /// # Errors
     /// The map's projection is not understood, or the map is outside its domain.
     pub fn new(config: &Config, map: &MapInfo) -> Result<Self, GeodesyError> {
+        Self::on_maps(config, map.bounds_m, std::slice::from_ref(map))
+    }
+
+    /// Sensors as configured, on the maps of a curriculum, which all lie in `bounds_m` (x_min, y_min, x_max, y_max, metres).
+    ///
+    /// # Errors
+    /// A map's projection is not understood, or the map is outside its domain.
+    pub fn on_maps(config: &Config, bounds_m: [f64; 4], maps: &[MapInfo]) -> Result<Self, GeodesyError> {
         let tick_ns = ((config.run.tick_s * 1e9).round() as u64).max(1);
-        let normaliser = Normaliser::new(&config.observation, map.bounds_m, config.lidar.range_m);
-        let projection = Projection::new(map)?;
-        let suites = (0..=config.curriculum.steps.len())
-            .map(|step| Suite::new(&config.in_step(step), &projection, map.bounds_m, tick_ns));
+        let normaliser = Normaliser::new(&config.observation, bounds_m, config.lidar.range_m);
+        let projections: Vec<Projection> = maps.iter().map(Projection::new).collect::<Result<_, _>>()?;
+        let places = places(config).into_iter().filter(|(_, map)| *map < maps.len());
+        let suites = places.map(|(step, map)| {
+            let suite = Suite::new(&config.in_step(step), &projections[map], maps[map].bounds_m, tick_ns)?;
+            Ok(Placed { step, map, suite })
+        });
         Ok(Self {
             suites: suites.collect::<Result<_, _>>()?,
-            step: 0,
+            at: 0,
+            skies: maps.iter().map(|_| None).collect(),
             history: History::new(normaliser.width(), config.observation.history as usize),
             normaliser,
             policy: config.blackout.policy,
@@ -111,19 +133,36 @@ impl Sensing {
         })
     }
 
-    /// Puts satellites, and what hides them, into the sky; without, it is open.
+    /// Puts satellites, and what hides them, into the sky of the run's own map; without, it is open.
     pub fn set_sky(&mut self, sky: Box<dyn Sky>) {
-        self.suites[self.step].set_sky(sky);
+        self.set_sky_of(0, sky);
     }
 
-    /// The sensors of a step of the curriculum are at work from now on, under the same sky.
-    fn enter(&mut self, step: usize) {
-        let step = step.min(self.suites.len() - 1);
-        let sky = self.suites[self.step].take_sky();
-        self.step = step;
-        if let Some(sky) = sky {
-            self.suites[step].set_sky(sky);
+    /// The same of another map.
+    pub fn set_sky_of(&mut self, map: usize, sky: Box<dyn Sky>) {
+        match self.suites[self.at].map == map {
+            true => self.suites[self.at].suite.set_sky(sky),
+            false => self.skies[map] = Some(sky),
         }
+    }
+
+    /// The sensors of a step of the curriculum are at work from now on, under the sky of a map.
+    fn enter(&mut self, step: usize, map: usize) {
+        let Placed { map: before, suite, .. } = &mut self.suites[self.at];
+        self.skies[*before] = suite.take_sky();
+        let found = self
+            .suites
+            .iter()
+            .position(|placed| (placed.step, placed.map) == (step, map));
+        self.at = found.unwrap_or(0);
+        let Placed { map, suite, .. } = &mut self.suites[self.at];
+        if let Some(sky) = self.skies[*map].take() {
+            suite.set_sky(sky);
+        }
+    }
+
+    fn suite(&self) -> &Suite {
+        &self.suites[self.at].suite
     }
 
     /// Sensors that commands switch, to be filled before the tick at which they hold is assigned.
@@ -162,8 +201,8 @@ impl Sensing {
     pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
         if header.has(FIRST_OF_EPISODE) {
-            self.enter(header.step());
-            self.suites[self.step].begin_episode(header.episode_seed);
+            self.enter(header.step(), header.map());
+            self.suites[self.at].suite.begin_episode(header.episode_seed);
             self.switches.begin_episode();
         }
         self.switches.advance(header.tick);
@@ -192,14 +231,16 @@ impl Sensing {
     /// Takes the carrier in `slot` to this tick, a new one for a new trajectory.
     fn carry(&mut self, slot: usize, state: &VehicleState, now: &Now) {
         if self.slots.rows()[slot].step == 0 {
-            let carrier = self.suites[self.step].begin(state, slot, now);
+            let carrier = self.suite().begin(state, slot, now);
             match self.carriers.get_mut(slot) {
                 Some(place) => *place = carrier,
                 // Slots are lent in ascending order: this is the next one.
                 None => self.carriers.push(carrier),
             }
         } else {
-            self.suites[self.step].advance(&mut self.carriers[slot], state.id_hash, now);
+            self.suites[self.at]
+                .suite
+                .advance(&mut self.carriers[slot], state.id_hash, now);
         }
         if self.switches.in_use() {
             self.carriers[slot].off = self.switches.off(state.id_hash);
@@ -258,7 +299,7 @@ impl Sensing {
         let now = self.now(header);
         let mut draws = std::mem::take(&mut self.draws);
         draws.clear();
-        self.suites[self.step].plan(&mut draws, &now);
+        self.suite().plan(&mut draws, &now);
         for first in (0..n).step_by(LANES) {
             let ids = std::array::from_fn(|lane| self.id_hash(first + lane, world));
             draws.draw(now.episode_seed, &ids);
@@ -303,7 +344,7 @@ impl Sensing {
         };
         let carrier = &mut self.carriers[slot];
         let samples = &mut out.imu[slot * self.imu_samples..(slot + 1) * self.imu_samples];
-        self.suites[self.step].sample(carrier, &motion, now, drawn, samples);
+        self.suites[self.at].suite.sample(carrier, &motion, now, drawn, samples);
         // Both are in ascending order of the vehicle.
         if let Ok(place) = world.views.binary_search_by_key(&state.vehicle, |view| view.vehicle) {
             carrier.readings.route = world.views[place];
@@ -350,6 +391,19 @@ impl Sensing {
             self.raw_error.count += 1;
         }
     }
+}
+
+/// Step and map of every suite that is needed: the base configuration on the run's own map, then the maps of each step.
+fn places(config: &Config) -> Vec<(usize, usize)> {
+    let curriculum = &config.curriculum;
+    let mut places = vec![(0, 0)];
+    for (number, step) in (1..).zip(&curriculum.steps) {
+        let mut maps = curriculum.maps_of(step);
+        maps.sort_unstable();
+        maps.dedup();
+        places.extend(maps.into_iter().map(|map| (number, map)));
+    }
+    places
 }
 
 /// Writes the newest raw samples of a slot. While a sensor is dark they are its last: estimators that read them look at age and bit.

@@ -34,7 +34,7 @@ struct Part {
     /// Heroes, in the driving task.
     #[serde(skip_serializing_if = "Option::is_none")]
     heroes: Option<Account>,
-    /// Buildings and props in the scene.
+    /// Buildings and props in the scene, of all maps.
     buildings: usize,
     props: usize,
     /// Contacts that began, if anybody looked.
@@ -72,7 +72,8 @@ struct Core {
     mirror: Mirror,
     /// The heroes and their actions, in the driving task.
     actions: Option<Actions>,
-    scene: Arc<Scene>,
+    /// By map.
+    scenes: Vec<Arc<Scene>>,
     contacts: Option<Contacts>,
     world: Publisher,
     consumer: BoardReader,
@@ -87,11 +88,13 @@ impl Core {
         let world = session.publisher(Channel::World)?;
         let consumer = session.board_of(Process::SensorDaemon)?;
         let consumer_wake = session.waker(Process::SensorDaemon)?;
-        let scene = Arc::new(Scene::of_run(&session.run)?);
-        let contacts = Contacts::open(&session, Arc::clone(&scene))?;
+        let scenes = Scene::of_every_map(&session.run)?;
+        let contacts = Contacts::open(&session, &scenes)?;
+        // Viewers are told of the run's own map, and heroes have no other.
+        let scene = scenes.first().cloned().unwrap_or_default();
         draw_chart(&session, &scene)?;
         let actions = match session.run.config.drives() {
-            true => Some(Actions::open(&mut session, Arc::clone(&scene))?),
+            true => Some(Actions::open(&mut session, scene)?),
             false => None,
         };
         session.attach();
@@ -104,7 +107,7 @@ impl Core {
             meta_messages: 0,
             mirror,
             actions,
-            scene,
+            scenes,
             contacts,
             world,
             consumer,
@@ -276,8 +279,8 @@ impl Core {
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
             heroes: self.actions.as_ref().map(Actions::account),
-            buildings: self.scene.buildings().len(),
-            props: self.scene.props().len(),
+            buildings: self.scenes.iter().map(|scene| scene.buildings().len()).sum(),
+            props: self.scenes.iter().map(|scene| scene.props().len()).sum(),
             collisions,
         })
     }

@@ -8,7 +8,8 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     flow,
     header::{
-        EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader, map_flags, step_flags,
+        EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader, map_flags,
+        step_flags,
     },
     ports::{BoardReader, ControlServer, PortError, Publisher, Subscriber, Waker},
     process::Process,
@@ -371,7 +372,10 @@ impl Bridge {
         let ticks = ticks.next_multiple_of(self.ticks_per_step);
         self.taught[map].lessons += 1;
         self.taught[map].ticks += ticks;
-        #[expect(clippy::cast_possible_truncation, reason = "validated: at most 255 steps and 256 maps")]
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "validated: at most 255 steps and 256 maps"
+        )]
         let flags = step_flags(step as u8) | map_flags(map as u8);
         Stretch {
             ticks: Some(past + ticks),
@@ -399,11 +403,11 @@ impl Bridge {
             ticks: None,
         };
         let curriculum = run.config.curriculum.clone();
-        let steps = curriculum.steps.iter().map(|step| curriculum.maps_of(step));
-        let settings: BTreeMap<usize, usize> = (1..)
-            .zip(steps)
-            .flat_map(|(step, maps)| maps.into_iter().map(move |map| (map, step)))
-            .collect();
+        // Evaluations are on the first, in the base configuration.
+        let mut settings = BTreeMap::from([(0, 0)]);
+        for (number, step) in (1..).zip(&curriculum.steps) {
+            settings.extend(curriculum.maps_of(step).into_iter().map(|map| (map, number)));
+        }
         for (map, step) in settings {
             tried = Some(self.begin(tried, &episode, Setting { step, map })?);
         }

@@ -82,7 +82,8 @@ impl From<WriteError> for Failure {
 /// Contacts of a run: found, told and counted.
 #[derive(Debug)]
 pub struct Contacts {
-    detector: Detector,
+    /// One for each map of the run.
+    detectors: Vec<Detector>,
     publisher: Publisher,
     /// Most collisions in one message.
     most: usize,
@@ -95,11 +96,11 @@ pub struct Contacts {
 }
 
 impl Contacts {
-    /// Contacts of the run of `session` in `scene`; `None` if nobody looks for them.
+    /// Contacts of the run of `session` in the scenes of its maps; `None` if nobody looks for them.
     ///
     /// # Errors
     /// The service is not there, or the file cannot be made.
-    pub fn open(session: &Session, scene: Arc<Scene>) -> Result<Option<Self>, Failure> {
+    pub fn open(session: &Session, scenes: &[Arc<Scene>]) -> Result<Option<Self>, Failure> {
         if !session.run.config.collision.detect {
             return Ok(None);
         }
@@ -112,7 +113,7 @@ impl Contacts {
             source,
         })?;
         Ok(Some(Self {
-            detector: Detector::new(scene),
+            detectors: scenes.iter().cloned().map(Detector::new).collect(),
             publisher,
             most: (session.run.config.traffic.max_road_users as usize).max(1),
             path,
@@ -145,8 +146,10 @@ impl Contacts {
     pub fn tick(&mut self, header: &MessageHeader, payload: &mut [u8], states: Section) -> Result<(), Failure> {
         let states: &mut [VehicleState] =
             block::view_mut(payload, states).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
-        self.detector.detect(header.episode, states);
-        let begun = self.detector.begun();
+        let map = header.map().min(self.detectors.len() - 1);
+        let detector = &mut self.detectors[map];
+        detector.detect(header.episode, states);
+        let begun = detector.begun();
         if begun.is_empty() {
             return Ok(());
         }
@@ -163,7 +166,7 @@ impl Contacts {
         }
         for collision in begun {
             self.counts.add(collision.other_class);
-            let line = line(header, collision, &self.names, self.detector.scene());
+            let line = line(header, collision, &self.names, detector.scene());
             let written = serde_json::to_writer(&mut self.lines, &line).map_err(std::io::Error::from);
             written
                 .and_then(|()| self.lines.write_all(b"\n"))

@@ -2,12 +2,12 @@
 //!
 //! A pure function of net file, additional files, configuration and seed: processes that need it read it themselves.
 
-use std::path::PathBuf;
+use std::{path::PathBuf, sync::Arc};
 
 use ipc_schema::{
     failure::{Failure, FailureKind},
     props::{Obstacle, ObstacleError},
-    run::{MapInfo, RunFile, SceneFiles},
+    run::{MapInfo, RunFile, RunMap, SceneFiles},
 };
 
 use crate::geodesy::GeodesyError;
@@ -116,8 +116,21 @@ impl Scene {
     /// # Errors
     /// A file is unreadable or malformed, or an entry of `scene.obstacles` cannot be used.
     pub fn of_run(run: &RunFile) -> Result<Self, SceneError> {
+        Self::of_map(run, &run.scene_files, &run.map)
+    }
+
+    /// Reads the scene of every map of a run, in the order of [`RunFile::every_map`].
+    ///
+    /// # Errors
+    /// As [`Scene::of_run`].
+    pub fn of_every_map(run: &RunFile) -> Result<Vec<Arc<Self>>, SceneError> {
+        let scene = |map: RunMap| Self::of_map(run, &map.scene_files, &map.info).map(Arc::new);
+        run.every_map().into_iter().map(scene).collect()
+    }
+
+    fn of_map(run: &RunFile, files: &SceneFiles, map: &MapInfo) -> Result<Self, SceneError> {
         let config = &run.config.scene;
-        let mut scene = Self::read(&run.scene_files, &run.map, config.building_height_m)?;
+        let mut scene = Self::read(files, map, config.building_height_m)?;
         let obstacles: Result<Vec<_>, _> = config.obstacles.iter().map(|text| Obstacle::parse(text)).collect();
         let placed = obstacles?.iter().map(|obstacle| scene.prop(obstacle)).collect();
         scene.set_props(placed);
