@@ -342,3 +342,33 @@ fn stopping_what_does_not_run() {
         &["no run named `ghost` is alive"],
     );
 }
+
+#[test]
+fn map_of_a_curriculum_that_is_not_there_or_does_not_serve() {
+    let workplace = Workplace::new();
+    let steps = "curriculum.steps=[{cavs=1,until_lessons=1},{cavs=1,maps=[\"city\"]}]";
+    let missing = "curriculum.maps=[\"town\",\"city.net.xml\"]";
+    let said = refused(&workplace, &["simulate", "paper", "--set", missing, "--set", steps], 2);
+    assert_says(
+        &said,
+        &[
+            "`curriculum.maps` has \"city.net.xml\", and there is no file",
+            "relative to the directory",
+        ],
+    );
+    assert!(!workplace.path().join("runs").exists());
+
+    workplace.succeed(&["generate", "city", "--vehicles", "20"]);
+    let there = "curriculum.maps=[\"town\",\"city/city.sumocfg\"]";
+    // It has no sidewalks; the first step does not need any, and nobody waits for the second to find out.
+    let walkers = "traffic.pedestrians=2";
+    let command = ["simulate", "paper", "--set", there, "--set", steps, "--set", walkers];
+    let said = refused(&workplace, &command, 2);
+    assert_says(&said, &["city.net.xml has too few connected edges for", "pedestrian"]);
+    let scenario = ["simulate", "city/city.sumocfg", "--set", "curriculum.steps=[{cavs=1}]"];
+    let said = refused(&workplace, &scenario, 2);
+    assert_says(
+        &said,
+        &["a .sumocfg has its own", "name the .sumocfg in curriculum.maps"],
+    );
+}

@@ -8,10 +8,20 @@
 
 mod common;
 
-use std::time::{Duration, Instant};
+use std::{
+    process::Child,
+    time::{Duration, Instant},
+};
 
-use common::Workplace;
-use ipc_schema::{ports::BoardReader, process::Process, run::RunFile, services};
+use common::{Spectator, Workplace};
+use ipc_schema::{
+    block,
+    observation::{ObservationLayout, VALID},
+    ports::BoardReader,
+    process::Process,
+    run::RunFile,
+    services::{self, Channel, RunNode},
+};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -46,6 +56,21 @@ fn actions(workplace: &Workplace, name: &str) -> Vec<[u64; 3]> {
     lines
         .map(|line: Value| ["step", "lesson", "tick"].map(|key| number(&line, key)))
         .collect()
+}
+
+/// A run under way, and the board of its trainer.
+fn trainer_of(workplace: &Workplace, name: &str, child: &mut Child) -> (RunNode, BoardReader) {
+    let file = workplace.path().join("runs").join(name).join("run.json");
+    loop {
+        assert!(child.try_wait().unwrap().is_none(), "the run is over");
+        if let Ok(run) = RunFile::read(&file)
+            && let Ok(node) = services::node(&run.shared_memory)
+            && let Ok(board) = BoardReader::open(&node, &run, 0, Process::Trainer)
+        {
+            break (node, board);
+        }
+        std::thread::park_timeout(Duration::from_millis(5));
+    }
 }
 
 /// Kills the trainer once it has consumed `tick` ticks as incarnation `incarnation`.
@@ -94,17 +119,7 @@ fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
     // Killed before the first checkpoint, in each of the steps, and while others wait for the word of the last lesson.
     let mut command = workplace.command(&arguments("train", "killed", &["run.window_ticks=5"]));
     let mut child = command.spawn().unwrap();
-    let file = workplace.path().join("runs/killed/run.json");
-    let run = loop {
-        assert!(child.try_wait().unwrap().is_none(), "the run is over");
-        if let Ok(run) = RunFile::read(&file)
-            && let Ok(node) = services::node(&run.shared_memory)
-            && let Ok(board) = BoardReader::open(&node, &run, 0, Process::Trainer)
-        {
-            break (node, board);
-        }
-        std::thread::park_timeout(Duration::from_millis(5));
-    };
+    let run = trainer_of(&workplace, "killed", &mut child);
     let ticks = [200, taken[1][2] - 1, taken[2][2] + 120, last[2] - 1];
     for (incarnation, tick) in (0..).zip(ticks) {
         kill_trainer(&run.1, incarnation, tick);
@@ -144,4 +159,130 @@ fn a_gate_that_is_never_passed_ends_with_the_training_episodes() {
         (&3.into(), 1)
     );
     assert_eq!(report["ticks"], 3 * 120 + 80);
+}
+
+/// Steps over the town and a grid of 300 m: in order, at random, and gradually so.
+const MAPS: [&str; 5] = [
+    "curriculum.maps=[\"town\",\"city/city.sumocfg\"]",
+    "curriculum.steps=[{cavs=2,until_lessons=4,maps=[\"town\",\"city\"]},\
+     {cavs=3,until_lessons=6,maps=[\"town\",\"city\"],map_choice=\"random\",noise=2.0},\
+     {cavs=2,until_lessons=8,maps=[\"city\",\"town\"],map_choice=\"gradually_random\"}]",
+    "episode.ticks=120",
+    // It looks at what stands on each map.
+    "gnss.sky_view=true",
+    "traffic.others=0",
+];
+
+fn with_city() -> Workplace {
+    let workplace = Workplace::new();
+    let size = ["--vehicles", "20", "--junctions", "4", "--block-m", "300"];
+    workplace.succeed(&[&["generate", "city"][..], &size].concat());
+    workplace
+}
+
+/// Lessons by map that follow from a run's configuration and the steps that were taken.
+fn lessons_by_map(workplace: &Workplace, name: &str, steps: &[usize]) -> [u64; 2] {
+    let run = RunFile::read(&workplace.path().join("runs").join(name).join("run.json")).unwrap();
+    let mut course = run.course().unwrap();
+    let mut lessons = [0; 2];
+    for step in steps {
+        lessons[course.enter(*step).unwrap().map] += 1;
+    }
+    lessons
+}
+
+#[test]
+fn lessons_are_on_the_maps_of_their_steps_and_the_same_seed_gives_the_same_bytes() {
+    let workplace = with_city();
+    workplace.succeed(&arguments("train", "maps", &MAPS));
+    let report = workplace.report("maps");
+    let maps = &report["traffic"]["maps"];
+    let steps: Vec<usize> = [(0, 4), (1, 6), (2, 8)]
+        .into_iter()
+        .flat_map(|(step, count)| vec![step; count])
+        .collect();
+    let expected = lessons_by_map(&workplace, "maps", &steps);
+    assert!(expected.iter().all(|lessons| *lessons > 2), "{expected:?}");
+    for (map, (name, lessons)) in ["town", "city"].into_iter().zip(expected).enumerate() {
+        let told = serde_json::json!({"name": name, "lessons": lessons, "ticks": 120 * lessons});
+        assert_eq!(maps[map], told);
+    }
+
+    // Before the first checkpoint, and at borders between maps.
+    let mut child = workplace.command(&arguments("train", "killed", &MAPS)).spawn().unwrap();
+    let run = trainer_of(&workplace, "killed", &mut child);
+    for (incarnation, tick) in (0..).zip([120, 600, 1500]) {
+        kill_trainer(&run.1, incarnation, tick);
+    }
+    drop(run);
+    assert!(child.wait().unwrap().success());
+    let killed = workplace.report("killed");
+    assert_eq!(killed["observation_hash"], report["observation_hash"]);
+    assert_eq!((&killed["lost_ticks"], &killed["restarts"]), (&0.into(), &3.into()));
+    assert_eq!(&killed["traffic"]["maps"], maps);
+
+    let log = workplace.path().join("runs/maps/actions.jsonl");
+    let log = format!("curriculum.log={}", log.display());
+    workplace.succeed(&arguments("simulate", "again", &[&MAPS[..], &[&log]].concat()));
+    let again = workplace.report("again");
+    assert_eq!(again["observation_hash"], report["observation_hash"]);
+    assert_eq!(&again["traffic"]["maps"], maps);
+    // Another seed takes other maps at random.
+    workplace.succeed(&arguments("simulate", "other", &[&MAPS[..], &["run.seed=99"]].concat()));
+    assert_ne!(lessons_by_map(&workplace, "other", &steps), [0, 18]);
+    assert_ne!(
+        workplace.report("other")["observation_hash"],
+        report["observation_hash"]
+    );
+    workplace.assert_nothing_left();
+}
+
+/// Whether a place is on a street of the generated grid: lines 300 m apart.
+fn is_on_the_grid([x_m, y_m]: [f32; 2]) -> bool {
+    let off_m = |place_m: f32| (place_m - 300.0 * (place_m / 300.0).round()).abs();
+    off_m(x_m).min(off_m(y_m)) < 12.0
+}
+
+#[test]
+fn vehicles_are_on_the_map_that_their_tick_says() {
+    let workplace = with_city();
+    let paced = [
+        "curriculum.steps=[{cavs=12,maps=[\"town\",\"city\"]}]",
+        "episode.ticks=60",
+        "episode.training_episodes=150",
+        "run.real_time_factor=100",
+    ];
+    let mut child = workplace
+        .command(&arguments("simulate", "paced", &[&MAPS[..], &paced].concat()))
+        .spawn()
+        .unwrap();
+    let spectator = Spectator::join(&workplace.path().join("runs/paced/run.json"), &mut child);
+    let observations = spectator.subscribe(Channel::Observation);
+    // Rows by map, and how many of them are on the grid.
+    let mut rows = [[0_u32; 2]; 2];
+    while child.try_wait().unwrap().is_none() {
+        let Some(message) = observations.receive().unwrap() else {
+            std::thread::yield_now();
+            continue;
+        };
+        let header = message.header();
+        let layout = ObservationLayout::of(header);
+        let truth: &[[f32; 4]] = block::view(message.payload(), layout.truth).unwrap();
+        let flags: &[u32] = block::view(message.payload(), layout.flags).unwrap();
+        for ([x_m, y_m, ..], _) in truth.iter().zip(flags).filter(|(_, flags)| **flags & VALID != 0) {
+            rows[header.map()][0] += 1;
+            rows[header.map()][1] += u32::from(is_on_the_grid([*x_m, *y_m]));
+            assert!(
+                header.map() == 1 || *x_m < 260.0 && *y_m < 260.0,
+                "{x_m} {y_m} is not in the town"
+            );
+        }
+    }
+    drop((observations, spectator));
+    assert!(child.wait().unwrap().success());
+    let [[town, by_chance], [city, on_grid]] = rows;
+    assert!(town > 500 && city > 500, "{rows:?}");
+    assert_eq!(city, on_grid);
+    assert!(by_chance < town / 2, "{rows:?}");
+    workplace.assert_nothing_left();
 }

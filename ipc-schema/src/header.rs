@@ -82,3 +82,20 @@ impl MessageHeader {
         (self.flags >> MAP_SHIFT) as usize
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn step_and_map_have_bytes_of_their_own() {
+        for (step, map) in [(0, 0), (1, 255), (255, 1), (255, 255)] {
+            let header = MessageHeader {
+                flags: LAST_OF_LESSON | step_flags(step) | map_flags(map),
+                ..MessageHeader::default()
+            };
+            assert_eq!((header.step(), header.map()), (usize::from(step), usize::from(map)));
+            assert!(header.has(LAST_OF_LESSON) && !header.has(EVALUATION));
+        }
+    }
+}

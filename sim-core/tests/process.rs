@@ -14,10 +14,10 @@ use ipc_schema::{
     config::Config,
     event::{Collision, Struck},
     failure::{Failure, FailureKind},
-    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader, map_flags},
     ports::{Message, Publisher, Subscriber},
     process::Process,
-    run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
+    run::{MapInfo, Mode, RunFile, RunMap, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
     session::Session,
     traffic::{Kind, MetaEvent, SignalMeta, TrafficMetaLayout, TrafficState, VehicleMeta, id_hash},
@@ -158,6 +158,11 @@ fn departure() -> VehicleMeta {
 
 /// Drives one vehicle straight through crate and house for `ticks`; what came on `world` and `event`.
 fn drive(run: &Run, ticks: u64) -> (Vec<VehicleState>, Vec<(u64, Collision)>) {
+    drive_on(run, ticks, 0)
+}
+
+/// The same on a map of the run.
+fn drive_on(run: &Run, ticks: u64, map: u8) -> (Vec<VehicleState>, Vec<(u64, Collision)>) {
     let bridge = run.join(Process::TrafficBridge);
     let mut daemon = run.join(Process::SensorDaemon);
     let (traffic, metas) = (
@@ -181,7 +186,9 @@ fn drive(run: &Run, ticks: u64) -> (Vec<VehicleState>, Vec<(u64, Collision)>) {
             sim_time_ns: (tick + 1) * 100_000_000,
             sequence: 1,
             count: 1,
-            flags: flag(FIRST_OF_EPISODE, tick == 0) | flag(LAST_OF_EPISODE | LAST_OF_RUN, tick + 1 == ticks),
+            flags: flag(FIRST_OF_EPISODE, tick == 0)
+                | flag(LAST_OF_EPISODE | LAST_OF_RUN, tick + 1 == ticks)
+                | map_flags(map),
             ..bridge.header()
         };
         if tick == 0 {
@@ -214,6 +221,34 @@ fn drive(run: &Run, ticks: u64) -> (Vec<VehicleState>, Vec<(u64, Collision)>) {
         daemon.consumed(tick + 1);
     }
     (states, told)
+}
+
+#[test]
+fn contacts_are_with_what_stands_on_the_map_of_the_tick() {
+    let mut run = Run::new("maps", |config| config.scene.obstacles.clear());
+    let poly = run.file.run_dir.join("b.poly.xml");
+    let tower = "<poly id=\"tower\" type=\"building\" shape=\"70,-5 80,-5 80,5 70,5\"/>";
+    std::fs::write(&poly, format!("<additional>{tower}</additional>")).unwrap();
+    let map = |name: &str, additional: PathBuf| RunMap {
+        name: name.into(),
+        source: run.file.source.clone(),
+        info: run.file.map.clone(),
+        scene_files: SceneFiles {
+            additional_files: vec![additional],
+            ..run.file.scene_files.clone()
+        },
+    };
+    let first = run.file.scene_files.additional_files[0].clone();
+    run.file.maps = vec![map("a", first), map("b", poly)];
+    run.file.write().unwrap();
+    for (number, name, near_side_m) in [(0, "house", 50.0), (1, "tower", 70.0)] {
+        let mut process = run.start();
+        let (_, told) = drive_on(&run, 100, number);
+        assert_eq!(process.wait().unwrap().code(), Some(0));
+        let struck: Vec<u64> = told.iter().map(|(_, event)| event.other_id_hash).collect();
+        assert_eq!(struck, [id_hash(name)], "map {number}");
+        assert!((told[0].1.position_m[0] - near_side_m).abs() < 1.1);
+    }
 }
 
 #[test]

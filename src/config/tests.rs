@@ -376,6 +376,82 @@ fn a_step_of_a_curriculum_is_checked_value_by_value() {
 }
 
 #[test]
+fn maps_of_a_curriculum_are_names_that_the_run_has() {
+    let steps = "[[curriculum.steps]]\ncavs = 1\n[[curriculum.steps]]\ncavs = 2\nmaps = [\"b\", \"town\"]\nmap_choice = \"random\"\n";
+    let curriculum = config_of(&format!("[curriculum]\nmaps = [\"town\", \"nets/b.net.xml\"]\n{steps}"))
+        .unwrap()
+        .curriculum;
+    assert_eq!(curriculum.map_names(), ["town", "b"]);
+    let maps: Vec<_> = curriculum.steps.iter().map(|step| curriculum.maps_of(step)).collect();
+    assert_eq!(maps, [vec![0], vec![1, 0]]);
+
+    let (message, help) = error_of(&format!("[curriculum]\nmaps = [\"town\", \"c.sumocfg\"]\n{steps}"));
+    assert!(message.contains("my.toml:"), "{message}");
+    assert!(
+        message.contains("step 2 of `curriculum.steps` is on the map \"b\", which the run does not have"),
+        "{message}"
+    );
+    assert!(help.contains("its maps are \"town\", \"c\""), "{help}");
+    let (message, help) = error_of(steps);
+    assert!(
+        message.contains("on the map \"b\"") && help.contains("\"town\""),
+        "{message} {help}"
+    );
+
+    let (message, help) = error_of("[curriculum]\nmaps = [\"town\"]\n");
+    assert!(
+        message.contains("my.toml:2: `curriculum.maps` are for the steps of a curriculum"),
+        "{message}"
+    );
+    assert!(help.contains("[[curriculum.steps]]"), "{help}");
+    let one = "[[curriculum.steps]]\ncavs = 1\n";
+    let (message, help) = error_of(&format!("[curriculum]\nmaps = [\"town\", \"Town02\"]\n{one}"));
+    assert!(
+        message.contains("\"Town02\", which is no map") && help.contains(".net.xml"),
+        "{message} {help}"
+    );
+    let (message, _) = error_of(&format!(
+        "[curriculum]\nmaps = [\"a/x.net.xml\", \"b/x.sumocfg\"]\n{one}"
+    ));
+    assert!(message.contains("two maps of the name \"x\""), "{message}");
+
+    let (message, help) = error_of("[[curriculum.steps]]\ncavs = 1\nmap_choice = \"random\"\n");
+    assert!(
+        message.contains("step 1 of `curriculum.steps` draws its maps, and names 0"),
+        "{message}"
+    );
+    assert!(help.contains("two or more"), "{help}");
+    let (message, _) = error_of("[[curriculum.steps]]\ncavs = 1\nmap_choice = \"gradual\"\n");
+    assert!(
+        message.contains("`curriculum.steps.map_choice` cannot be \"gradual\""),
+        "{message}"
+    );
+}
+
+#[test]
+fn what_stands_on_one_map_is_refused_with_several() {
+    let maps = "[curriculum]\nmaps = [\"town\", \"b.net.xml\"]\n[[curriculum.steps]]\ncavs = 1\n";
+    for (key, setting) in [
+        ("scene.obstacles", "[scene]\nobstacles = [\"cone 10 20\"]\n"),
+        ("scene.meshes", "[scene]\nmeshes = [\"a.obj 1 2\"]\n"),
+        (
+            "region.polygon_m",
+            "[region]\npolygon_m = [\"0 0\", \"9 0\", \"9 9\"]\n",
+        ),
+        ("region.radius_m", "[region]\nradius_m = 50.0\n"),
+    ] {
+        let (message, _) = error_of(&format!("{setting}{maps}"));
+        assert!(
+            message.contains(&format!(
+                "my.toml:2: `{key}` names places of one map, and `curriculum.maps` has 2"
+            )),
+            "{message}"
+        );
+        assert!(config_of(&format!("{setting}{}", maps.replace(", \"b.net.xml\"", ""))).is_ok());
+    }
+}
+
+#[test]
 fn a_step_changes_population_noise_and_blackouts_and_nothing_else() {
     let text = "[blackout]\nenabled = true\n[[curriculum.steps]]\ncavs = 3\nnoise = 2.0\nblackout = 0.0\n[[curriculum.steps]]\ncavs = 5\n";
     let config = config_of(text).unwrap();

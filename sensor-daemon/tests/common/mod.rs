@@ -95,8 +95,12 @@ pub struct Run {
 
 impl Run {
     pub fn new(config: &Config) -> Self {
+        Self::with(config, Sensing::new(config, &map()).unwrap())
+    }
+
+    pub fn with(config: &Config, sensing: Sensing) -> Self {
         Self {
-            sensing: Sensing::new(config, &map()).unwrap(),
+            sensing,
             tick: 0,
             seed: 5,
             tick_ns: (config.run.tick_s * 1e9) as u64,
@@ -106,7 +110,12 @@ impl Run {
 
     /// A new episode begins, from time 0 on.
     pub fn restart(&mut self, seed: u64) {
-        (self.tick, self.seed, self.flags) = (0, seed, FIRST_OF_EPISODE);
+        self.restart_in(seed, 0);
+    }
+
+    /// The same in the step and on the map that `flags` say.
+    pub fn restart_in(&mut self, seed: u64, flags: u32) {
+        (self.tick, self.seed, self.flags) = (0, seed, FIRST_OF_EPISODE | flags);
     }
 
     pub fn tick(&mut self, states: &[VehicleState]) -> Tick {

@@ -44,6 +44,25 @@ fn episode(session: &mut Session, seed: u64, steps: usize) -> (Vec<u8>, Vec<(i64
 }
 
 #[test]
+fn an_episode_on_a_map_does_not_depend_on_the_map_before() {
+    let bench = Bench::new();
+    let (town_net, types) = bench.town();
+    let town = |seed| Options::population(&sumo_home(), &town_net, &types, STEP_S, seed).unwrap();
+    let mut session = Session::start(options(&bench, 7)).unwrap();
+    let (grid_before, _) = episode(&mut session, 7, 300);
+    session = session.reload(town(8)).unwrap();
+    let (after_the_grid, _) = episode(&mut session, 8, 300);
+    session = session.reload(options(&bench, 7)).unwrap();
+    let (grid_after, _) = episode(&mut session, 7, 300);
+    session.close().unwrap();
+    let mut fresh = Session::start(town(8)).unwrap();
+    let (alone, _) = episode(&mut fresh, 8, 300);
+    assert!(after_the_grid == alone);
+    assert!(grid_before == grid_after);
+    assert!(alone != grid_before);
+}
+
+#[test]
 fn the_same_seed_gives_the_same_bytes_and_another_does_not() {
     let bench = Bench::new();
     let mut session = Session::start(options(&bench, 7)).unwrap();
