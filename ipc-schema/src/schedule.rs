@@ -377,6 +377,30 @@ mod tests {
     }
 
     #[test]
+    fn an_evaluation_between_does_not_change_the_map_of_a_step_that_stays() {
+        let kinds = serde_json::json!([{"cavs": 1, "maps": ["a", "b", "c"], "map_choice": "random", "restart": false}]);
+        let curriculum = Curriculum {
+            steps: serde_json::from_value(kinds).unwrap(),
+            maps: ["a.net.xml", "b.net.xml", "c.net.xml"].map(str::to_owned).to_vec(),
+            ..Curriculum::default()
+        };
+        let mut course = Course::new(&lengths(20, 2, 1), &curriculum, 5);
+        let (mut maps, mut begun) = (BTreeSet::new(), 0);
+        loop {
+            match course.due() {
+                Due::Evaluation { .. } => {}
+                Due::Lesson(_) => {
+                    let lesson = course.enter(0).unwrap();
+                    begun += u64::from(lesson.begins.is_some());
+                    maps.insert(lesson.map);
+                }
+                Due::Nothing => break,
+            }
+        }
+        assert_eq!((maps.len(), begun), (1, 10));
+    }
+
+    #[test]
     fn a_random_map_depends_on_seed_and_lesson_alone() {
         let kinds = serde_json::json!([
             {"cavs": 1, "maps": ["a", "b", "c"], "map_choice": "random"},
