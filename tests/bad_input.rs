@@ -358,14 +358,34 @@ fn map_of_a_curriculum_that_is_not_there_or_does_not_serve() {
     );
     assert!(!workplace.path().join("runs").exists());
 
-    workplace.succeed(&["generate", "city", "--vehicles", "20"]);
-    let there = "curriculum.maps=[\"town\",\"city/city.sumocfg\"]";
-    // It has no sidewalks; the first step does not need any, and nobody waits for the second to find out.
-    let walkers = "traffic.pedestrians=2";
-    let command = ["simulate", "paper", "--set", there, "--set", steps, "--set", walkers];
+    let net = [
+        "--grid",
+        "--grid.number",
+        "4",
+        "--default.disallow",
+        "pedestrian",
+        "-o",
+        "city.net.xml",
+    ];
+    tool(&sumo_program("netgenerate"), &net, workplace.path());
+    let command = ["simulate", "paper", "--set", missing, "--set", steps];
     let said = refused(&workplace, &command, 2);
-    assert_says(&said, &["city.net.xml has too few connected edges for", "pedestrian"]);
-    let scenario = ["simulate", "city/city.sumocfg", "--set", "curriculum.steps=[{cavs=1}]"];
+    assert_says(&said, &["city.net.xml", "has no projection", "map.origin_latitude_deg"]);
+    // Nobody may walk there. The first step is on the town, and nobody waits for the second to find out.
+    let more = [
+        "map.origin_latitude_deg=52.0",
+        "map.origin_longitude_deg=10.0",
+        "traffic.pedestrians=2",
+        "episode.training_episodes=4",
+    ];
+    let more: Vec<&str> = more.into_iter().flat_map(|setting| ["--set", setting]).collect();
+    let said = refused(&workplace, &[&command[..], &more].concat(), 2);
+    assert_says(&said, &["city.net.xml has too few connected edges for pedestrian"]);
+    workplace.write(
+        "a.sumocfg",
+        "<configuration><input><net-file value=\"city.net.xml\"/></input></configuration>",
+    );
+    let scenario = ["simulate", "a.sumocfg", "--set", "curriculum.steps=[{cavs=1}]"];
     let said = refused(&workplace, &scenario, 2);
     assert_says(
         &said,

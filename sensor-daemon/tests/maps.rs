@@ -122,10 +122,13 @@ fn what_came_before_on_another_map_changes_nothing() {
     let sensing = || Run::with(&config, Sensing::on_maps(&config, BOX_M, &maps).unwrap());
     let ticks = |run: &mut Run| -> Vec<u64> { (0..20).flat_map(|_| run.tick(&cavs(3)).bytes().to_vec()).collect() };
     let on_far = step_flags(1) | map_flags(1);
-    let mut alone = sensing();
-    alone.restart_in(11, on_far);
-    let mut after = sensing();
-    ticks(&mut after);
-    after.restart_in(11, on_far);
-    assert_eq!(ticks(&mut after), ticks(&mut alone));
+    let after = |before: u32| {
+        let mut run = sensing();
+        run.restart_in(3, before);
+        ticks(&mut run);
+        run.restart_in(11, on_far);
+        ticks(&mut run)
+    };
+    assert_eq!(after(step_flags(1)), after(on_far));
+    assert_eq!(after(step_flags(2) | map_flags(1)), after(on_far));
 }
