@@ -190,6 +190,8 @@ impl Spectator {
 pub fn until<T>(run: &mut Child, mut ask: impl FnMut() -> Option<T>) -> T {
     let begin = Instant::now();
     loop {
+        // Looked at first: what the run said last is there once it has ended.
+        let has_ended = run.try_wait().unwrap().is_some();
         if let Some(answer) = ask() {
             return answer;
         }
@@ -197,7 +199,7 @@ pub fn until<T>(run: &mut Child, mut ask: impl FnMut() -> Option<T>) -> T {
             run.kill().unwrap();
             panic!("nothing came for a minute");
         }
-        assert!(run.try_wait().unwrap().is_none(), "the run ended early");
+        assert!(!has_ended, "the run ended early");
         std::thread::yield_now();
     }
 }
