@@ -1,29 +1,29 @@
 //! The process: episode after episode, SUMO's steps go out as `traffic` and `traffic-meta` messages.
 
-use std::{collections::BTreeMap, path::Path};
+mod lessons;
+
+use std::path::Path;
 
 use ipc_schema::{
     block::Section,
     board::State,
     failure::{Failure, FailureKind},
     flow,
-    header::{
-        EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader, map_flags,
-        step_flags,
-    },
+    header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     ports::{BoardReader, ControlServer, PortError, Publisher, Subscriber, Waker},
     process::Process,
     run::{RunFile, RunMap, Source},
-    schedule::{Course, Due, Episode, Lesson},
+    schedule::Episode,
     services::Channel,
     session::{Session as Membership, Wait},
     traffic::{EVENTS_PER_MESSAGE, MetaEvent, ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout},
 };
 
+use lessons::Taught;
+
 use crate::{
     census::Census,
     control::{Control, Place},
-    decisions::Decisions,
     error::SumoError,
     fleet::Fleet,
     frame::Frame,
@@ -189,14 +189,6 @@ struct Bridge {
     cost: Option<Cost>,
 }
 
-/// What a map was used for.
-#[derive(Debug, Clone, serde::Serialize)]
-struct Taught {
-    name: String,
-    lessons: u64,
-    ticks: u64,
-}
-
 /// What this process adds to the run's report: processor time, seconds.
 #[derive(Debug, serde::Serialize)]
 struct Part<'a> {
@@ -319,99 +311,6 @@ impl Bridge {
             }
         }
         Ok(Wait::Ready)
-    }
-
-    /// Runs lessons and evaluations as `course` has them, in the steps that are decided on the way.
-    fn follow(&mut self, mut course: Course) -> Result<Wait, Failure> {
-        let mut decisions = Decisions::open(&self.membership)?;
-        let mut underway = self.try_maps()?;
-        loop {
-            let (begins, setting, stretch) = match course.due() {
-                Due::Nothing => return Ok(Wait::Ready),
-                Due::Evaluation { episode, is_last } => {
-                    let stretch = Stretch {
-                        is_last,
-                        ..Stretch::default()
-                    };
-                    (Some(episode), Setting::default(), stretch)
-                }
-                Due::Lesson(number) => {
-                    let Some(step) = decisions.step_of(&self.membership, number, self.ticks)? else {
-                        return Ok(Wait::Stopped);
-                    };
-                    let Some(lesson) = course.enter(step) else {
-                        continue;
-                    };
-                    let Lesson { step, map, begins } = lesson;
-                    let past = match begins {
-                        Some(_) => 0,
-                        None => underway.as_ref().map_or(0, |now| now.frame.step * self.ticks_per_step),
-                    };
-                    let setting = Setting { step: step + 1, map };
-                    (begins, setting, self.lesson(setting, past))
-                }
-            };
-            let mut now = match (begins, underway.take()) {
-                (Some(episode), before) => self.begin(before, &episode, setting)?,
-                (None, Some(now)) => now.go_on()?,
-                (None, None) => return Ok(Wait::Ready),
-            };
-            self.announce(&now.session);
-            if self.run(&mut now, stretch)? == End::Stopped {
-                return Ok(Wait::Stopped);
-            }
-            underway = Some(now);
-        }
-    }
-
-    /// The stretch of the lesson that follows, in an episode that has `past` ticks behind it; it is counted.
-    fn lesson(&mut self, Setting { step, map }: Setting, past: u64) -> Stretch {
-        let config = &self.membership.run.config;
-        let kind = &config.curriculum.steps[step - 1];
-        let ticks = kind.ticks.unwrap_or(config.episode.ticks);
-        let ticks = ticks.next_multiple_of(self.ticks_per_step);
-        self.taught[map].lessons += 1;
-        self.taught[map].ticks += ticks;
-        #[expect(
-            clippy::cast_possible_truncation,
-            reason = "validated: at most 255 steps and 256 maps"
-        )]
-        let flags = step_flags(step as u8) | map_flags(map as u8);
-        Stretch {
-            ticks: Some(past + ticks),
-            flags,
-            last_flags: match kind.restart {
-                true => LAST_OF_LESSON | LAST_OF_EPISODE,
-                false => LAST_OF_LESSON,
-            },
-            is_last: false,
-        }
-    }
-
-    /// Of several maps, each that a step names is tried with that step's road users: one that does not serve is found before the first
-    /// tick, not in the last step.
-    fn try_maps(&mut self) -> Result<Option<Underway>, Failure> {
-        let mut tried = None;
-        let run = &self.membership.run;
-        if run.maps.is_empty() {
-            return Ok(tried);
-        }
-        let episode = Episode {
-            index: 0,
-            evaluation: false,
-            seed: run.config.run.seed,
-            ticks: None,
-        };
-        let curriculum = run.config.curriculum.clone();
-        // Evaluations are on the first, in the base configuration.
-        let mut settings = BTreeMap::from([(0, 0)]);
-        for (number, step) in (1..).zip(&curriculum.steps) {
-            settings.extend(curriculum.maps_of(step).into_iter().map(|map| (map, number)));
-        }
-        for (map, step) in settings {
-            tried = Some(self.begin(tried, &episode, Setting { step, map })?);
-        }
-        Ok(tried)
     }
 
     /// SUMO at the beginning of `episode`.
