@@ -294,6 +294,17 @@ mod tests {
     }
 
     #[test]
+    fn every_address_of_this_machine_is_called_by_one() {
+        for (listen, calls) in [
+            ("tls/0.0.0.0:7447", "tls/127.0.0.1:7447"),
+            ("tcp/[::]:7447", "tcp/[::1]:7447"),
+            ("tcp/10.0.0.0:7447", "tcp/10.0.0.0:7447"),
+        ] {
+            assert_eq!(reachable(listen), calls);
+        }
+    }
+
+    #[test]
     fn an_address_without_protocol_is_told_how_to_be_written() {
         let Err(Exit::Failure(failure)) = Target::find(Some("laptop:7447")) else {
             unreachable!("an address is no run");

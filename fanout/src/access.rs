@@ -104,8 +104,10 @@ static REFUSED: Mutex<Refused> = Mutex::new(Refused {
     count: 0,
     newest: String::new(),
 });
+/// Those told of.
+static TOLD: AtomicU64 = AtomicU64::new(0);
 
-/// Logs who has been refused since the last call, and returns how many.
+/// Logs who has been refused since the last call, and returns how many have been at all.
 pub fn tell_refusals() -> u64 {
     let refused = std::mem::take(&mut *REFUSED.lock().unwrap_or_else(PoisonError::into_inner));
     match refused.count {
@@ -113,7 +115,7 @@ pub fn tell_refusals() -> u64 {
         1 => tracing::warn!("refused a connection: {}", refused.newest),
         count => tracing::warn!("refused {count} connections, the last: {}", refused.newest),
     }
-    refused.count
+    TOLD.fetch_add(refused.count, Ordering::Relaxed) + refused.count
 }
 
 /// Samples that were put where nobody may write.

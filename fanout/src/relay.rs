@@ -343,7 +343,7 @@ impl Relay {
         self.counters.missed_ticks = missed;
         self.counters.refused_samples = self.outlet.foreign_samples() + access::forged_samples();
         self.counters.refused_commands = self.commands.refused();
-        self.counters.refused_connections += access::tell_refusals();
+        self.counters.refused_connections = access::tell_refusals();
         let newest = self.newest;
         self.session.report(|health| {
             health.state = if ticks > 0 { state as u32 } else { health.state };
