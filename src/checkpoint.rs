@@ -7,7 +7,7 @@ use std::{
 
 use ipc_schema::{
     config::{Activation, Config, Network},
-    run::{Beginning, RunFile},
+    run::{Beginning, RunFile, Start},
 };
 use serde::{Deserialize, Serialize};
 
@@ -27,8 +27,22 @@ struct Manifest {
 struct Counters {
     /// -1 before the first.
     committed_tick: i64,
+    #[serde(default)]
     next_episode: u64,
+    #[serde(default)]
     next_episode_tick: u64,
+}
+
+impl Counters {
+    /// Where a simulation that goes on begins.
+    fn start(&self) -> Start {
+        Start {
+            committed_ticks: u64::try_from(self.committed_tick + 1).unwrap_or(0),
+            episode: self.next_episode,
+            episode_tick: self.next_episode_tick,
+            resets: 0,
+        }
+    }
 }
 
 /// A choice as a configuration writes it.
@@ -41,6 +55,9 @@ fn word(choice: impl Serialize) -> String {
 struct Answer {
     checkpoint: Option<PathBuf>,
     manifest: Option<Manifest>,
+    /// Environments after the first.
+    #[serde(default)]
+    others: Vec<Counters>,
     refused: Option<String>,
 }
 
@@ -53,6 +70,7 @@ pub struct Found {
     pub is_run: bool,
     run_dir: PathBuf,
     manifest: Manifest,
+    others: Vec<Counters>,
 }
 
 impl Found {
@@ -101,6 +119,7 @@ impl Found {
             is_run,
             run_dir,
             manifest,
+            others: answer.others,
         })
     }
 
@@ -171,12 +190,10 @@ impl Found {
     /// Where a run that goes on from it begins.
     #[must_use]
     pub fn beginning(&self) -> Beginning {
-        let counters = &self.manifest.counters;
         Beginning {
             checkpoint: self.checkpoint.clone(),
-            committed_ticks: u64::try_from(counters.committed_tick + 1).unwrap_or(0),
-            episode: counters.next_episode,
-            episode_tick: counters.next_episode_tick,
+            start: self.manifest.counters.start(),
+            others: self.others.iter().map(Counters::start).collect(),
             episodes: None,
         }
     }

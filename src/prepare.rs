@@ -6,7 +6,7 @@ use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
     control,
-    run::{Beginning, MapInfo, Mode, RunFile, RunMap, SceneFiles, Source},
+    run::{Beginning, MapInfo, Mode, RunFile, RunMap, SceneFiles, Source, Start},
     services::Channel,
 };
 use serde_json::Value;
@@ -84,9 +84,8 @@ pub fn prepare_play(args: &PlayArgs) -> Result<Prepared, Exit> {
     let mut prepared = make(&args.run, Mode::Play, config, named, &label, install)?;
     prepared.run.beginning = Some(Beginning {
         checkpoint: found.checkpoint,
-        committed_ticks: 0,
-        episode: 0,
-        episode_tick: 0,
+        start: Start::default(),
+        others: Vec::new(),
         episodes: args.episodes,
     });
     Ok(prepared)
@@ -118,7 +117,8 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<Prepared, Exit> {
     }
     let (_, named) = of_run(&old, &[])?;
     let mut prepared = make(args, Mode::Train, config, named, &found.label(), install)?;
-    prepared.run.beginning = Some(found.copy_into(&prepared.run.run_dir)?);
+    let beginning = found.copy_into(&prepared.run.run_dir)?;
+    prepared.run.beginning = Some(resume::follow(&old, &prepared.run.run_dir, beginning)?);
     Ok(prepared)
 }
 

@@ -1,12 +1,12 @@
 //! `caraware train --resume`: a run that was stopped goes on from a checkpoint.
 
-use std::path::Path;
+use std::{io::ErrorKind, path::Path};
 
 use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
-    control,
-    run::{Mode, RunFile},
+    control::{self, Action, Command},
+    run::{Beginning, Mode, RunFile, STEP_LOG},
 };
 
 use crate::{
@@ -39,29 +39,10 @@ pub fn changed(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
             "only a run of `caraware train` that learns to localise goes on from a checkpoint",
         ));
     }
-    if run.config.run.envs > 1 || run.config.trainer.ranks > 1 {
+    if run.config.trainer.ranks > 1 {
         return Err(Exit::config(
-            format!(
-                "{} has several environments or trainers, and cannot be resumed",
-                run.name
-            ),
-            "only a run of one environment and one trainer goes on from a checkpoint",
-        ));
-    }
-    if !run.config.curriculum.steps.is_empty() {
-        return Err(Exit::config(
-            format!("{} follows a curriculum, and cannot be resumed", run.name),
-            "where its lessons begin is known while it runs; start another run",
-        ));
-    }
-    if run.run_dir.join(control::COMMAND_LOG).exists() {
-        return Err(Exit::config(
-            format!(
-                "{} was given commands ({}), and cannot be resumed",
-                run.name,
-                control::COMMAND_LOG
-            ),
-            "its episodes are not those of its configuration any more; make it again with --commands, or start another run",
+            format!("{} was one of several trainers, and cannot be resumed", run.name),
+            "only a run whose trainer learns alone goes on from a checkpoint",
         ));
     }
     for assignment in set {
@@ -97,7 +78,10 @@ pub fn go_on(found: &Found, old: RunFile, config: Config, install: &Install) -> 
             "put it back, or start another run",
         ));
     }
-    forget_the_end(&old.run_dir)?;
+    let beginning = follow(&old, &old.run_dir, found.beginning())?;
+    for index in 0..old.config.run.envs {
+        forget_the_end(&old.environment(index).run_dir)?;
+    }
     let claim = Claim::new(&old.run_dir)?;
     let config_hash = config::hash(&config);
     let path = old.run_dir.join("config.toml");
@@ -111,10 +95,90 @@ pub fn go_on(found: &Found, old: RunFile, config: Config, install: &Install) -> 
         sumo_home: install.sumo_home.clone(),
         config,
         config_hash,
-        beginning: Some(found.beginning()),
+        beginning: Some(beginning),
         ..old
     };
     Ok((run, claim))
+}
+
+/// Puts what decided about `old` where the run in `run_dir`, which begins at `beginning`, looks for it: the steps of a curriculum, and the
+/// commands, of which it carries out those behind its first tick again. Counts the episodes that commands began anew before that.
+///
+/// # Errors
+/// A log cannot be read or written.
+pub fn follow(old: &RunFile, run_dir: &Path, mut beginning: Beginning) -> Result<Beginning, Exit> {
+    let steps = old.run_dir.join(STEP_LOG);
+    if steps.exists() && old.run_dir != run_dir {
+        std::fs::copy(&steps, run_dir.join(STEP_LOG)).map_err(|error| Exit::io("copy", &steps, &error))?;
+    }
+    for index in 0..old.config.run.envs {
+        let from = old.environment(index).run_dir;
+        let to = match index {
+            0 => run_dir.to_owned(),
+            index => run_dir.join(format!("env-{index}")),
+        };
+        let start = match index {
+            0 => Some(&mut beginning.start),
+            index => beginning.others.get_mut(index as usize - 1),
+        };
+        let first_tick = start.as_ref().map_or(0, |start| start.episode_tick);
+        let (done, due): (Vec<Action>, Vec<Action>) = commands(&from)?
+            .into_iter()
+            .partition(|action| action.tick < first_tick);
+        // In this order: cut off between the two, the run still knows all that it was told.
+        write_commands(&to.join(control::COMMAND_REPLAY), &due)?;
+        write_commands(&to.join(control::COMMAND_LOG), &done)?;
+        let resets = done.iter().filter(|action| matches!(action.control, Command::Reset {}));
+        if let Some(start) = start {
+            start.resets = resets.count() as u64;
+        }
+    }
+    Ok(beginning)
+}
+
+/// What the run in `run_dir` was told and did, and then what it was still to be told by the log that it followed.
+fn commands(run_dir: &Path) -> Result<Vec<Action>, Exit> {
+    let read = |name: &str| {
+        let path = run_dir.join(name);
+        let wrong = |reason: String| {
+            Exit::run(
+                format!("cannot follow {}: {reason}", path.display()),
+                "it tells what the run was told; without its last lines the run goes on as if those had not been said",
+            )
+        };
+        match std::fs::read_to_string(&path) {
+            Ok(text) => control::actions(&text).map_err(|(line, reason)| wrong(format!("line {line}: {reason}"))),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+            Err(error) => Err(wrong(error.to_string())),
+        }
+    };
+    let mut actions = read(control::COMMAND_LOG)?;
+    let told = actions.last().map(|action| action.tick);
+    let due = read(control::COMMAND_REPLAY)?;
+    actions.extend(
+        due.into_iter()
+            .filter(|action| told.is_none_or(|told| action.tick > told)),
+    );
+    Ok(actions)
+}
+
+/// A log with these lines; none at all without them.
+fn write_commands(path: &Path, actions: &[Action]) -> Result<(), Exit> {
+    if actions.is_empty() {
+        return match std::fs::remove_file(path) {
+            Err(error) if error.kind() != ErrorKind::NotFound => Err(Exit::io("remove", path, &error)),
+            _ => Ok(()),
+        };
+    }
+    let lines: String = actions
+        .iter()
+        .filter_map(|action| serde_json::to_string(action).ok())
+        .map(|line| line + "\n")
+        .collect();
+    let directory = path.parent().unwrap_or(path);
+    std::fs::create_dir_all(directory)
+        .and_then(|()| std::fs::write(path, lines))
+        .map_err(|error| Exit::io("write", path, &error))
 }
 
 fn sources(run: &RunFile) -> Vec<&Path> {

@@ -159,3 +159,115 @@ fn a_run_that_goes_on_ends_where_the_one_does_that_was_never_stopped() {
         &["cannot be used with"],
     );
 }
+
+/// From each of `kept`, in a run of its own, to the end of the run `whole`; what the simulation was told is logged as there.
+fn every_checkpoint_leads_to_the_same_end(workplace: &Workplace, log: &str, kept: &[&str]) {
+    let expected = outcome(workplace, "whole");
+    let told = |name: &str| std::fs::read_to_string(run_dir(workplace, name).join(log)).unwrap();
+    for kept in kept {
+        let checkpoint = format!("runs/whole/checkpoints/{kept}");
+        workplace.succeed(&["train", "--resume", &checkpoint, "--name", kept]);
+        assert_eq!(outcome(workplace, kept), expected, "{kept}");
+        assert_eq!(told(kept), told("whole"), "{kept}");
+    }
+}
+
+/// Starts `arguments` at a pace that leaves time to stop it after the checkpoint `kept`, and lets it go on in its directory.
+fn stop_and_go_on(workplace: &Workplace, name: &str, arguments: &[&str], kept: &str) {
+    let pace = [arguments, &["--set", "run.real_time_factor=40"]].concat();
+    let mut command = workplace.command(&pace);
+    let mut run = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let checkpoint = run_dir(workplace, name).join("checkpoints").join(kept);
+    until(&mut run, || checkpoint.exists().then_some(()));
+    kill_process(Pid::from_child(&run), Signal::INT).unwrap();
+    assert_eq!(run.wait().unwrap().code(), Some(130));
+    workplace.succeed(&["train", "--resume", name, "--set", "run.real_time_factor=0"]);
+}
+
+#[test]
+fn every_environment_goes_on_where_it_stood() {
+    let workplace = Workplace::new();
+    let two = ["run.envs=2", "trainer.horizon=1200"];
+    workplace.succeed(&arguments("whole", &two));
+    let expected = outcome(&workplace, "whole");
+    stop_and_go_on(&workplace, "cut", &arguments("cut", &two), "update-000005");
+    assert_eq!(outcome(&workplace, "cut"), expected);
+    let beginning = workplace.report("cut")["beginning"].clone();
+    let second = &beginning["others"][0];
+    assert!(second["episode"].as_u64().unwrap() > 0, "{beginning}");
+    let [learnt, made] = ["committed_ticks", "episode_tick"].map(|key| second[key].as_u64().unwrap());
+    assert!(learnt > made && made > 0, "{beginning}");
+
+    let checkpoint = "runs/whole/checkpoints/update-000003";
+    workplace.succeed(&["train", "--resume", checkpoint, "--name", "from-3"]);
+    assert_eq!(outcome(&workplace, "from-3"), expected);
+    workplace.assert_nothing_left();
+}
+
+/// Three steps of which the first goes on and on, and a horizon that ends within lessons; evaluations in between.
+const CURRICULUM: [&str; 12] = [
+    "curriculum.steps=[{cavs=1,restart=false,until_std=0.66},{cavs=1,ticks=350,until_std=0.63,noise=2.0},{cavs=5,ticks=100,until_std=0.6}]",
+    "episode.ticks=450",
+    "episode.training_episodes=60",
+    "episode.evaluation_interval=4",
+    "episode.evaluation_ticks=80",
+    "episode.final_evaluations=1",
+    "trainer.horizon=500",
+    "trainer.batch_size=100",
+    "trainer.hidden=[32, 32]",
+    "trainer.learning_rate=1e-3",
+    "trainer.supervised=false",
+    "traffic.others=2",
+];
+
+#[test]
+fn a_curriculum_goes_on_with_its_lessons() {
+    let workplace = Workplace::new();
+    let settings = SMALL[10..]
+        .iter()
+        .chain(&["trainer.checkpoint_interval=1", "trainer.checkpoint_keep_every=1"]);
+    let settings: Vec<&str> = settings
+        .chain(&CURRICULUM)
+        .flat_map(|setting| ["--set", setting])
+        .collect();
+    let arguments = |name| [&["train", "paper", "--name", name][..], &settings].concat();
+    workplace.succeed(&arguments("whole"));
+    let log = |name: &str| std::fs::read_to_string(run_dir(&workplace, name).join("actions.jsonl")).unwrap();
+    assert_eq!(log("whole").lines().count(), 4, "{}", log("whole"));
+    // In the first step, which is one episode, in the second, and in the third.
+    let kept = ["update-000002", "update-000005", "update-000007"];
+    every_checkpoint_leads_to_the_same_end(&workplace, "actions.jsonl", &kept);
+    let begins = kept.map(|name| workplace.report(name)["beginning"]["episode_tick"].as_u64().unwrap());
+    assert!(
+        begins[0] == 0 && begins.is_sorted() && begins[2] > begins[1],
+        "{begins:?}"
+    );
+    stop_and_go_on(&workplace, "cut", &arguments("cut"), "update-000004");
+    assert_eq!(outcome(&workplace, "cut"), outcome(&workplace, "whole"));
+    assert_eq!(log("cut"), log("whole"));
+    workplace.assert_nothing_left();
+}
+
+/// In the first episode, which is begun anew at tick 150, in what follows on it, and in the second, begun anew at tick 620.
+const COMMANDS: &str = r#"{"tick":100,"episode":0,"control":{"command":"sensor","vehicle":"cav.1","sensor":"gnss","state":"off"}}
+{"tick":150,"episode":0,"control":{"command":"reset"}}
+{"tick":200,"episode":1,"control":{"command":"destination","vehicle":"cav.1","edge":"ring_west_2"}}
+{"tick":620,"episode":2,"control":{"command":"reset"}}
+{"tick":700,"episode":3,"control":{"command":"sensor","vehicle":null,"sensor":"imu","state":"off"}}
+{"tick":760,"episode":3,"control":{"command":"start","vehicle":"cav.3","edge":"ring_north_1"}}
+"#;
+
+#[test]
+fn commands_are_carried_out_again_behind_the_checkpoint() {
+    let workplace = Workplace::new();
+    let file = workplace.write("commands.jsonl", COMMANDS);
+    let commanded = |name| [&arguments(name, &[])[..], &["--commands", file.to_str().unwrap()]].concat();
+    workplace.succeed(&commanded("whole"));
+    every_checkpoint_leads_to_the_same_end(&workplace, "commands.jsonl", &["update-000002", "update-000008"]);
+    let beginning = |name: &str| workplace.report(name)["beginning"].clone();
+    assert_eq!(beginning("update-000002")["resets"], 1);
+    assert_eq!(beginning("update-000008")["resets"], 2);
+    stop_and_go_on(&workplace, "cut", &commanded("cut"), "update-000004");
+    assert_eq!(outcome(&workplace, "cut"), outcome(&workplace, "whole"));
+    workplace.assert_nothing_left();
+}

@@ -26,19 +26,36 @@ impl Mode {
     }
 }
 
+/// Log of the steps of a curriculum, in the run directory: which each lesson was in.
+pub const STEP_LOG: &str = "actions.jsonl";
+
 /// The checkpoint that a run begins with.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Beginning {
     /// Its directory.
     pub checkpoint: PathBuf,
-    /// Ticks of the run that it has learnt from: none of them is delivered again.
+    /// Where this environment stands in it; in the file of a run that is environment 0.
+    #[serde(flatten)]
+    pub start: Start,
+    /// Where those after environment 0 stand.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub others: Vec<Start>,
+    /// Play: most episodes; `None`: without end.
+    pub episodes: Option<u64>,
+}
+
+/// Where an environment stands in a checkpoint.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Start {
+    /// Ticks of the environment that the checkpoint has learnt from: none of them is delivered again.
     pub committed_ticks: u64,
-    /// The episode that the first of the others belongs to: the simulation begins with it.
+    /// Number of the episode that the first of the others belongs to: the simulation begins with it.
     pub episode: u64,
     /// The first tick of that episode.
     pub episode_tick: u64,
-    /// Play: most episodes; `None`: without end.
-    pub episodes: Option<u64>,
+    /// How many episodes before it were begun anew by a command: so far its number is ahead of its place in the schedule.
+    #[serde(default)]
+    pub resets: u64,
 }
 
 /// What traffic runs on.
@@ -237,9 +254,17 @@ impl RunFile {
             0 => self.run_dir.clone(),
             index => self.run_dir.join(format!("env-{index}")),
         };
+        let beginning = self.beginning.clone().map(|beginning| match env_index {
+            0 => beginning,
+            index => Beginning {
+                start: beginning.others.get(index as usize - 1).copied().unwrap_or_default(),
+                ..beginning
+            },
+        });
         Self {
             env_index,
             run_dir,
+            beginning,
             ..self.clone()
         }
     }
@@ -306,24 +331,30 @@ impl RunFile {
         }
     }
 
+    /// Where this environment begins: at its first tick, or as the checkpoint says which the run begins with.
+    #[must_use]
+    pub fn start(&self) -> Start {
+        self.beginning
+            .as_ref()
+            .map_or(Start::default(), |beginning| beginning.start)
+    }
+
     /// Number of the first tick that is made.
     #[must_use]
     pub fn first_tick(&self) -> u64 {
-        self.beginning.as_ref().map_or(0, |beginning| beginning.episode_tick)
+        self.start().episode_tick
     }
 
     /// Ticks that the checkpoint which the run begins with has learnt from.
     #[must_use]
     pub fn committed_ticks(&self) -> u64 {
-        self.beginning.as_ref().map_or(0, |beginning| beginning.committed_ticks)
+        self.start().committed_ticks
     }
 
     /// The episodes that are made, in order; in play they may have no end.
     pub fn schedule(&self) -> Box<dyn Iterator<Item = schedule::Episode>> {
-        let (first, episodes) = match &self.beginning {
-            Some(beginning) => (beginning.episode, beginning.episodes),
-            None => (0, None),
-        };
+        let episodes = self.beginning.as_ref().and_then(|beginning| beginning.episodes);
+        let Start { episode, resets, .. } = self.start();
         if self.mode == Mode::Play {
             let ticks = match self.source {
                 Source::Population { .. } => Some(self.config.episode.ticks),
@@ -335,7 +366,7 @@ impl RunFile {
         Box::new(
             self.episodes()
                 .into_iter()
-                .filter(move |episode| episode.index >= first),
+                .filter(move |due| due.index + resets >= episode),
         )
     }
 

@@ -220,6 +220,7 @@ impl Bridge {
         let ticks = membership.run.first_tick();
         let commands = membership.control_server()?;
         let control = Control::of_run(&membership.run.run_dir)?;
+        let resets = membership.run.start().resets;
         let switches = membership.publisher(Channel::Switch)?;
         let sensing = membership.board_of(Process::SensorDaemon)?;
         let maps = membership.run.every_map();
@@ -235,7 +236,7 @@ impl Bridge {
             control,
             switches,
             sensing,
-            resets: 0,
+            resets,
             repeated_ticks: 0,
             membership,
             traffic,

@@ -12,13 +12,10 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     ports::BoardReader,
     process::Process,
-    run::Mode,
+    run::{Mode, STEP_LOG},
     session::{Session, Wait},
 };
 use serde::{Deserialize, Serialize};
-
-/// Where the decisions are written, in the run directory.
-const LOG: &str = "actions.jsonl";
 
 /// A line of the log: from this lesson on, which begins with this tick, training is in this step, counted from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -38,6 +35,9 @@ enum Judge {
 /// The steps of all lessons so far.
 pub(crate) struct Decisions {
     judge: Judge,
+    /// Ticks that a checkpoint has learnt from, in a run that goes on, and what had been decided in them.
+    committed_ticks: u64,
+    stand: Vec<Action>,
     newest: Option<Action>,
     path: PathBuf,
     log: File,
@@ -51,19 +51,36 @@ impl Decisions {
     pub(crate) fn open(membership: &Session) -> Result<Self, Failure> {
         let run = &membership.run;
         let curriculum = &run.config.curriculum;
+        let path = run.run_dir.join(STEP_LOG);
         let judge = match (run.mode, curriculum.log.as_str()) {
             (Mode::Train, _) => Judge::Trainer(membership.board_of(Process::Trainer)?),
             (Mode::Simulate | Mode::Play, "") => Judge::Count(curriculum.steps.clone()),
             (Mode::Simulate | Mode::Play, path) => Judge::Log(read(Path::new(path))?),
         };
-        let path = run.run_dir.join(LOG);
+        let mut stand = match run.beginning {
+            Some(_) => read(&path)?,
+            None => Vec::new(),
+        };
+        // What was decided behind the checkpoint, the trainer decides again. It has decided about a lesson that begins with the tick after.
+        stand.retain(|action| action.tick <= run.committed_ticks());
         let log = File::create(&path).map_err(|error| unwritten(&path, &error))?;
-        Ok(Self {
+        let mut decisions = Self {
             judge,
+            committed_ticks: run.committed_ticks(),
             newest: None,
+            stand,
             path,
             log,
-        })
+        };
+        for action in decisions.stand.clone() {
+            decisions.write(action)?;
+        }
+        Ok(decisions)
+    }
+
+    /// The step, counted from 0, of `lesson`, which the checkpoint that the run goes on from has behind it.
+    pub(crate) fn step_behind(&self, lesson: u64) -> usize {
+        logged(&self.stand, lesson)
     }
 
     /// The step, counted from 0, of `lesson`, which would begin with `tick`; waits for the trainer's word. `None`: asked to stop.
@@ -74,6 +91,7 @@ impl Decisions {
         let step = match &self.judge {
             // SUMO must have taken its input before a trainer is started.
             Judge::Trainer(_) if lesson == 0 => 0,
+            Judge::Trainer(_) if tick < self.committed_ticks => return Ok(Some(self.step_behind(lesson))),
             Judge::Trainer(board) => {
                 let mut step = None;
                 let waited = membership.wait_until(|| {
@@ -91,12 +109,15 @@ impl Decisions {
         // What a trainer with other settings says later does not lead back.
         let step = self.newest.map_or(step, |newest| newest.step.max(step));
         if self.newest.is_none_or(|newest| newest.step != step) {
-            let action = Action { lesson, tick, step };
-            self.newest = Some(action);
-            let line = serde_json::to_string(&action).unwrap_or_default();
-            writeln!(self.log, "{line}").map_err(|error| unwritten(&self.path, &error))?;
+            self.write(Action { lesson, tick, step })?;
         }
         Ok(Some(step))
+    }
+
+    fn write(&mut self, action: Action) -> Result<(), Failure> {
+        self.newest = Some(action);
+        let line = serde_json::to_string(&action).unwrap_or_default();
+        writeln!(self.log, "{line}").map_err(|error| unwritten(&self.path, &error))
     }
 }
 
@@ -124,7 +145,7 @@ fn counted(steps: &[Step], lesson: u64) -> usize {
 fn read(path: &Path) -> Result<Vec<Action>, Failure> {
     let unread = |reason: &dyn std::fmt::Display| {
         Failure::new(FailureKind::Config, format!("cannot read {}: {reason}", path.display()))
-            .with_help(format!("`curriculum.log` names the {LOG} in a run directory"))
+            .with_help(format!("`curriculum.log` names the {STEP_LOG} in a run directory"))
     };
     let text = std::fs::read_to_string(path).map_err(|error| unread(&error))?;
     let lines = text.lines().map(serde_json::from_str);

@@ -26,6 +26,9 @@ impl Bridge {
     pub(super) fn follow(&mut self, mut course: Course) -> Result<Wait, Failure> {
         let mut decisions = Decisions::open(&self.membership)?;
         let mut underway = self.try_maps()?;
+        // What a checkpoint has learnt from, up to the episode that it goes on with, is not made again.
+        let first = self.membership.run.start().episode;
+        let mut is_behind = first > 0;
         loop {
             let (begins, setting, stretch) = match course.due() {
                 Due::Nothing => return Ok(Wait::Ready),
@@ -37,7 +40,11 @@ impl Bridge {
                     (Some(episode), Setting::default(), stretch)
                 }
                 Due::Lesson(number) => {
-                    let Some(step) = decisions.step_of(&self.membership, number, self.ticks)? else {
+                    let step = match is_behind {
+                        true => Some(decisions.step_behind(number)),
+                        false => decisions.step_of(&self.membership, number, self.ticks)?,
+                    };
+                    let Some(step) = step else {
                         return Ok(Wait::Stopped);
                     };
                     let Some(lesson) = course.enter(step) else {
@@ -52,6 +59,10 @@ impl Bridge {
                     (begins, setting, self.lesson(setting, past))
                 }
             };
+            is_behind &= begins.is_none_or(|episode| episode.index < first);
+            if is_behind {
+                continue;
+            }
             let mut now = match (begins, underway.take()) {
                 (Some(episode), before) => self.begin(before, &episode, setting)?,
                 (None, Some(now)) => now.go_on()?,

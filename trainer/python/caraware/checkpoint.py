@@ -17,6 +17,7 @@ from caraware.environment import Place
 from caraware.evaluation import EvaluationResult
 from caraware.manifest import (
     BEST,
+    COURSE,
     LATEST,
     MANIFEST,
     OWN_HASH,
@@ -33,7 +34,6 @@ from caraware.manifest import (
 from caraware.metrics import TrainingPoint
 from caraware.ppo import Ppo, Settings
 
-COURSE = "course.json"
 RANDOM = "random.safetensors"
 POINTS = "points.safetensors"
 MEMORY = "memory.safetensors"

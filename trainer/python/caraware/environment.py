@@ -69,6 +69,10 @@ class Place:
     duplicated_ticks: int = 0
     evaluated_tick: int = -1
     """Newest tick of the finished evaluations; -1 before the first."""
+    next_episode: int = 0
+    """The episode that the tick after the committed one belongs to: a resumed simulation begins there."""
+    next_episode_tick: int = 0
+    """The first tick of that episode."""
 
 
 class Environment:
@@ -99,6 +103,7 @@ class Environment:
         self.ledger = TickLedger(place.committed_tick if place.committed_tick >= 0 else None)
         self.ledger.received, self.ledger.lost = place.received_ticks, place.lost_ticks
         self.ledger.duplicated = place.duplicated_ticks
+        self.starts = EpisodeStarts(place.next_episode, place.next_episode_tick)
         self.rollout = Rollout(
             horizon,
             observation_size,
@@ -128,12 +133,15 @@ class Environment:
         """How far it has come; ticks after the committed one do not count, they will be delivered again."""
         newest = self.ledger.newest
         beyond = 0 if newest is None else newest - self.committed_tick
+        next_episode, next_episode_tick = self.starts.behind(self.committed_tick)
         return Place(
             committed_tick=self.committed_tick,
             received_ticks=self.ledger.received - beyond,
             lost_ticks=self.ledger.lost,
             duplicated_ticks=self.ledger.duplicated,
             evaluated_tick=self.evaluated_tick,
+            next_episode=next_episode,
+            next_episode_tick=next_episode_tick,
         )
 
 

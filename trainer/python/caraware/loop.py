@@ -24,7 +24,7 @@ from caraware.checkpoint import (
 )
 from caraware.config import RunConfig
 from caraware.curriculum import Curriculum
-from caraware.environment import Environment, EpisodeStarts, Place, share
+from caraware.environment import Environment, Place, share
 from caraware.evaluation import NO_HEADLINE, Evaluation, EvaluationResult, Mean, errors_m, pooled, raw_errors_m
 from caraware.manifest import Counters
 from caraware.metrics import Metrics, TrainingPoint
@@ -88,6 +88,8 @@ class Learner:
             lost_ticks=course.lost_ticks,
             duplicated_ticks=course.duplicated_ticks,
             evaluated_tick=course.evaluated_tick,
+            next_episode=counters.next_episode,
+            next_episode_tick=counters.next_episode_tick,
         )
         return [first, *course.others]
 
@@ -196,8 +198,6 @@ class TrainingLoop:
             place = places[environment.index] if environment.index < len(places) else Place()
             environment.start(place, share(trainer.horizon, count, environment.index), size)
             environment.episode = counters.episode
-        # Only a run of one environment can be resumed.
-        self._environments[0].starts = EpisodeStarts(counters.next_episode, counters.next_episode_tick)
         if counters.updates > 0:
             self._saved_updates = counters.updates
             self._metrics.resume(course.training, course.evaluations, counters.env_steps)

@@ -14,6 +14,8 @@ log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
+COURSE = "course.json"
+"""How training went, and where the environments after the first stand."""
 LATEST, BEST = "latest", "best"
 """Files beside the checkpoints that name the newest, and the one whose evaluation had the least mean error."""
 OWN_HASH = "manifest_sha256"
@@ -148,10 +150,11 @@ def main(arguments: list[str]) -> int:
     try:
         checkpoint = _choose(place / "checkpoints", which) if (place / "checkpoints").is_dir() else place
         manifest = verify_checkpoint(checkpoint)
+        others = json.loads((checkpoint / COURSE).read_bytes())["others"] if COURSE in manifest.files else []
     except CheckpointError as error:
         print(json.dumps({"refused": str(error)}))
         return 1
-    print(json.dumps({"checkpoint": str(checkpoint), "manifest": asdict(manifest)}))
+    print(json.dumps({"checkpoint": str(checkpoint), "manifest": asdict(manifest), "others": others}))
     return 0
 
 
