@@ -18,7 +18,7 @@ const CITIES: [(u32, f64); 5] = [
 /// The same when only the way is tried.
 const QUICK: [(u32, f64); 2] = [(50, 5.0), (100, 5.0)];
 /// Vehicles and simulated seconds of the city at steps of 1 s.
-const LONG_STEPS: (u32, f64) = (20_000, 60.0);
+const LONG_STEPS: (u32, f64) = (20_000, 180.0);
 const LONG_STEPS_QUICK: (u32, f64) = (100, 10.0);
 /// Factors on the motorway's demand.
 const MOTORWAY_SCALES: [f64; 2] = [1.0, 3.0];

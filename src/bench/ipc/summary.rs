@@ -1,0 +1,168 @@
+//! What the latencies say: percentiles over all rounds, ratios within each.
+
+use std::collections::BTreeMap;
+
+use super::{BySize, Ours, ROUNDS, Round};
+use crate::{
+    bench::{Curve, Line, Report, Spread, Table},
+    failure::Exit,
+};
+
+/// One-way latencies, microseconds.
+#[derive(Debug, Clone, Copy)]
+struct Percentiles {
+    median: f64,
+    ninety: f64,
+    ninety_nine: f64,
+}
+
+impl Percentiles {
+    fn of(mut latencies_ns: Vec<f64>) -> Result<Self, Exit> {
+        latencies_ns.sort_by(f64::total_cmp);
+        #[expect(
+            clippy::cast_precision_loss,
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "an index of a short list"
+        )]
+        let at = |share: f64| {
+            let index = (share * latencies_ns.len().saturating_sub(1) as f64).round() as usize;
+            latencies_ns.get(index).map(|ns| ns / 1e3)
+        };
+        match (at(0.5), at(0.9), at(0.99)) {
+            (Some(median), Some(ninety), Some(ninety_nine)) => Ok(Self {
+                median,
+                ninety,
+                ninety_nine,
+            }),
+            _ => Err(Exit::run("a receiver measured nothing", "")),
+        }
+    }
+
+    fn cells(self) -> [String; 3] {
+        [self.median, self.ninety, self.ninety_nine].map(|us| format!("{us:.2}"))
+    }
+}
+
+/// What is told of ours, and where it is.
+const WAYS: [(&str, fn(&Ours) -> &BySize); 3] = [
+    ("taken", |ours| &ours.taken),
+    ("tensor", |ours| &ours.tensor),
+    ("tensor of an observation to keep", |ours| &ours.received),
+];
+
+/// The report over all rounds.
+///
+/// # Errors
+/// A receiver measured nothing.
+pub(super) fn report(rounds: &[Round], peers: &BTreeMap<String, BySize>) -> Result<Report, Exit> {
+    let mut report = Report::new(
+        "ipc",
+        "Observation hop",
+        format!(
+            "One way, from right before publish in one process, microseconds, both sides polling. Ours is the `observation` channel of a run \
+             and `Channel.lease`, read in place whatever the size: until the block is in the receiver's hands, and until Python has a torch \
+             tensor over it, which is lent until the next is taken. Every other tick comes by `Channel.receive(busy=True)`: a tensor of an \
+             observation with all its arrays that may be kept. The bare message is eight bytes between two Rust processes that poll \
+             iceoryx2. Bare and ours alternate, {ROUNDS} rounds in which the sizes take turns; ratios are of medians of one round, the \
+             median round (smallest–largest). The peers send the same number of bytes from Python to Python and make a tensor of what \
+             arrives without further copies; they sleep until the kernel wakes them. One message is under way at a time."
+        ),
+    );
+    let bare = Percentiles::of(rounds.iter().flat_map(|round| round.bare.clone()).collect())?;
+    report.figure("bare iceoryx2, median µs", bare.median);
+    let mut all: Vec<(String, BTreeMap<usize, Percentiles>)> = Vec::new();
+    for (way, of) in WAYS {
+        all.push((
+            format!("ours, {way}"),
+            pooled(rounds.iter().map(|round| of(&round.ours)))?,
+        ));
+    }
+    for (peer, by_size) in peers {
+        all.push((peer.clone(), pooled(std::iter::once(by_size))?));
+    }
+    let tensor = all[1].1.clone();
+    let mut ratios = own_ratios(&mut report, rounds)?;
+    for (peer, by_size) in &all[WAYS.len()..] {
+        for bytes in [1 << 10, 1 << 20, 1 << 24] {
+            if let (Some(theirs), Some(ours)) = (by_size.get(&bytes), tensor.get(&bytes)) {
+                let ratio = format!("{:.0} ×", theirs.median / ours.median);
+                ratios.row([format!("{peer} to our tensor, {}", name(bytes)), ratio]);
+            }
+        }
+    }
+    let mut table = Table::new("", &["message", "median µs", "90 %", "99 %"]);
+    let [median, ninety, ninety_nine] = bare.cells();
+    table.row(["bare iceoryx2, 8 bytes".into(), median, ninety, ninety_nine]);
+    for (who, by_size) in &all {
+        for (bytes, percentiles) in by_size {
+            let [median, ninety, ninety_nine] = percentiles.cells();
+            table.row([format!("{who}, {}", name(*bytes)), median, ninety, ninety_nine]);
+            report.figure(format!("{who}, {}, median µs", name(*bytes)), percentiles.median);
+        }
+    }
+    report.tables.extend([ratios, table]);
+    report.curves.push(curve(&all));
+    Ok(report)
+}
+
+/// Percentiles of each size over everything that was measured.
+fn pooled<'a>(parts: impl Iterator<Item = &'a BySize>) -> Result<BTreeMap<usize, Percentiles>, Exit> {
+    let mut all = BySize::new();
+    for (bytes, latencies) in parts.flatten() {
+        all.entry(*bytes).or_default().extend(latencies);
+    }
+    let each = all.into_iter().map(|(bytes, all)| Ok((bytes, Percentiles::of(all)?)));
+    each.collect()
+}
+
+/// Sizes among each other and beside the bare message, round by round.
+fn own_ratios(report: &mut Report, rounds: &[Round]) -> Result<Table, Exit> {
+    let mut table = Table::new("", &["ratio of medians", "figure"]);
+    for (way, of) in WAYS {
+        let (mut among_sizes, mut to_bare) = (Vec::new(), Vec::new());
+        for round in rounds {
+            let bare = Percentiles::of(round.bare.clone())?.median;
+            let by_size = pooled(std::iter::once(of(&round.ours)))?;
+            let medians = || by_size.values().map(|percentiles| percentiles.median);
+            let (smallest, largest) = (medians().fold(f64::MAX, f64::min), medians().fold(0.0, f64::max));
+            among_sizes.push(largest / smallest);
+            to_bare.push(largest / bare);
+        }
+        for (of, ratios) in [
+            ("slowest size to fastest size, 1 KiB to 16 MiB", among_sizes),
+            ("slowest size to the bare message", to_bare),
+        ] {
+            let spread = Spread::of(ratios)?;
+            table.row([format!("ours, {way}: {of}"), format!("{spread} ×")]);
+            report.figure(format!("{way}: {of}"), spread.median);
+        }
+    }
+    Ok(table)
+}
+
+fn curve(all: &[(String, BTreeMap<usize, Percentiles>)]) -> Curve {
+    let line = |(who, by_size): &(String, BTreeMap<usize, Percentiles>)| {
+        #[expect(clippy::cast_precision_loss, reason = "a coordinate")]
+        let points = by_size.iter().map(|(bytes, p)| [*bytes as f64, p.median]);
+        Line {
+            name: who.clone(),
+            points: points.collect(),
+        }
+    };
+    Curve {
+        name: "ipc".into(),
+        title: "From publish to a visible tensor".into(),
+        x: "message (bytes)".into(),
+        y: "one way, median (µs)".into(),
+        logarithmic: [true, true],
+        lines: all.iter().map(line).collect(),
+    }
+}
+
+fn name(bytes: usize) -> String {
+    match bytes >> 10 {
+        kibi if kibi < 1024 => format!("{kibi} KiB"),
+        kibi => format!("{} MiB", kibi >> 10),
+    }
+}
