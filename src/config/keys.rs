@@ -331,7 +331,7 @@ pub const KEYS: &[Key] = &[
     optional("trainer.value_clip", "", 0.0, 1e6, "A value moves at most this far from the value before the update in one update; unset = unbounded."),
     optional("trainer.target_kl", "", 1e-9, 1e6, "An update of the policy ends with the epoch whose mean KL divergence from the policy before is larger; unset = all epochs."),
     float("trainer.max_grad_norm", "", 0.0001, 1e6, "Largest norm of the gradient."),
-    integer("trainer.actions_per_observation", "", 1, 1024, "Actions tried on every observation (`trainer.discount` = 0 only): predictions do not influence the world, so the reward of each is known, and more of them make the gradient less noisy for nearly nothing."),
+    integer("trainer.actions_per_observation", "", 1, 1024, "Actions tried on every observation (`trainer.discount` = 0 only): predictions do not influence the world, so the reward of each is known, and more of them make the gradient less noisy for nearly nothing; an even number comes in pairs on both sides of the mean."),
     integer("trainer.horizon", "samples", 1, 100_000_000, "Samples in one update."),
     integer("trainer.batch_size", "samples", 1, 100_000_000, "Samples in one gradient step; at most the horizon."),
     integer("trainer.epochs", "", 1, 1000, "Passes over a horizon."),

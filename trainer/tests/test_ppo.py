@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.batch import save_batch
+from caraware.batch import Batch, save_batch
 from caraware.config import MapBounds, TrainerConfig
 from caraware.objective import clipped_error
 from caraware.ppo import NonFiniteLoss, Ppo, Settings, UpdateStats
 from caraware.rewards import distance_m
-from caraware.rollout import Rollout
+from caraware.rollout import Horizon, Rollout
 from safetensors.torch import load_file
 from synthetic import FIELDS, SIZE_M, run_file, street_ticks
 from torch import Tensor
@@ -140,6 +140,45 @@ def test_the_statistics_are_what_they_say() -> None:
     assert (first.learning_rate, second.learning_rate) == (1e-3, 5e-4)
     assert second.sigma == ppo.sigma()
     assert first.explained_variance <= 1
+
+
+def horizon_of_the_toy() -> Horizon:
+    rollout = Rollout(2048, FIELDS, bootstrap=False)
+    for obs in street_ticks(32, 64, NOISE_M, seed=5):
+        rollout.add(obs)
+    return rollout.take()
+
+
+def mean_gradient(ppo: Ppo, batch: Batch) -> Tensor:
+    """The surrogate's gradient before the first step: every ratio is one."""
+    gradient = (batch.action - ppo.policy.network.infer(batch.observation).unsqueeze(1)) * batch.advantage.unsqueeze(2)
+    return gradient.mean(1)
+
+
+def test_an_even_number_of_actions_comes_in_pairs_on_both_sides_of_the_mean() -> None:
+    ppo, alone = (fresh(actions_per_observation=tries, discount=0.0, initial_std=0.6) for tries in (8, 7))
+    horizon = horizon_of_the_toy()
+    batch = ppo.score(horizon)
+    deviation = batch.action - ppo.policy.network.infer(batch.observation).unsqueeze(1)
+    assert torch.allclose(deviation[:, :4], -deviation[:, 4:], atol=1e-6)
+    # Each is a sample of the policy, and none is like another but for the sign.
+    assert deviation.std().item() == pytest.approx(0.6, rel=0.01)
+    assert deviation.mean().abs().item() < 1e-6
+    assert (deviation[:, :4].flatten().unique(return_counts=True)[1] == 1).float().mean() > 0.99
+    lone = alone.score(horizon)
+    assert lone.action.shape[1] == 7
+    assert lone.action.std().item() == pytest.approx(batch.action.std().item(), rel=0.05)
+
+    # The same mean gradient with a fraction of its variance: what makes them worth having.
+    def of_many(tries: int) -> Tensor:
+        ppo = fresh(actions_per_observation=tries, discount=0.0, initial_std=0.6)
+        return torch.stack([mean_gradient(ppo, ppo.score(horizon)) for _ in range(40)])
+
+    paired, single = of_many(8), of_many(7)
+    noise = [each.var(0).mean().item() for each in (paired, single)]
+    assert noise[0] < 0.3 * noise[1], noise
+    apart = (paired.mean(0) - single.mean(0)).square().mean().item()
+    assert apart < 1.5 * (noise[0] + noise[1]) / 40, (apart, noise)
 
 
 def test_a_gradient_is_clipped_to_the_largest_norm() -> None:

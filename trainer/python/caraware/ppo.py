@@ -254,7 +254,7 @@ class Ppo:
         truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
         tries = self.config.actions_per_observation
         centre, place = (mean, truth) if tries == 1 else (mean.unsqueeze(1), truth.unsqueeze(1))
-        noise = torch.randn(len(mean), tries, ACTIONS, generator=self._samplings[environment]).to(self.device)
+        noise = _noise(len(mean), tries, self._samplings[environment]).to(self.device)
         action = centre + self.policy.log_std.exp() * (noise.squeeze(1) if tries == 1 else noise)
         reward = self._reward(rewards.distance_m(self.bounds.to_world_m(action), place), self.config.reward_scale_m)
         if tries == 1:
@@ -487,6 +487,18 @@ class Ppo:
     def sigma(self) -> float:
         """Standard deviation of the policy, mean over the actions; 1 is half the map."""
         return self.policy.log_std.exp().mean().item()
+
+
+def _noise(samples: int, tries: int, generator: torch.Generator) -> Tensor:
+    """Standard normal `[samples, tries, 2]`; an even number of tries comes in pairs on both sides of the mean.
+
+    Each is still a sample of the policy, and the mean gradient that of the policy. What two opposite actions have in
+    common drops out of it, which is most of its variance (antithetic variates; Owen, Monte Carlo, section 8.2).
+    """
+    if tries % 2:
+        return torch.randn(samples, tries, ACTIONS, generator=generator)
+    half = torch.randn(samples, tries // 2, ACTIONS, generator=generator)
+    return torch.cat((half, -half), 1)
 
 
 def _normalised(advantage: Tensor) -> Tensor:
