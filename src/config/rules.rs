@@ -1,7 +1,7 @@
 //! Rules between keys: rates that must divide each other, sizes that must fit.
 
 use ipc_schema::{
-    config::{Config, Network, class_model},
+    config::{Config, class_model},
     props::Obstacle,
     traffic::VEHICLE_CLASSES,
 };
@@ -43,17 +43,6 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
                 trainer.batch_size, trainer.horizon
             ),
             "a batch is a part of the horizon: lower the one or raise the other".into(),
-        ));
-    }
-    if trainer.network == Network::Gru && trainer.ranks > 1 {
-        return Err(conflict(
-            settings,
-            "trainer.network",
-            format!(
-                "`trainer.network` = \"gru\" with `trainer.ranks` = {}: ranks share samples, not sequences",
-                trainer.ranks
-            ),
-            "set trainer.network = \"mlp\", or feed one trainer with run.envs".into(),
         ));
     }
     task(settings, config)?;

@@ -212,19 +212,13 @@ fn a_batch_larger_than_the_horizon_is_refused() {
 }
 
 #[test]
-fn networks_are_known_by_name_and_one_with_memory_has_no_ranks() {
+fn networks_and_activations_are_known_by_name() {
     assert!(error_of("trainer.network = \"lstm\"\n").1.contains("\"mlp\", \"gru\""));
     assert!(
         error_of("trainer.activation = \"gelu\"\n")
             .1
             .contains("\"relu\", \"tanh\"")
     );
-    let (message, help) = error_of("trainer.network = \"gru\"\ntrainer.ranks = 2\n");
-    assert!(
-        message.contains("`trainer.network` = \"gru\" with `trainer.ranks` = 2"),
-        "{message}"
-    );
-    assert!(help.contains("run.envs"), "{help}");
 }
 
 #[test]

@@ -1,5 +1,6 @@
 """One rank of a small data-parallel training over prepared ticks; `torchrun` starts it for test_ranks.py."""
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -10,14 +11,16 @@ from caraware.loop import TrainingLoop
 from synthetic import SyntheticChannel, run_file, with_evaluation
 
 DEVICE = os.environ.get("RANK_PROBE_DEVICE", "cpu")
+SETTINGS = json.loads(os.environ.get("RANK_PROBE_SETTINGS", "{}"))
+"""Of the trainer, beside the sizes below."""
 HORIZON, BATCH, VEHICLES, TRAINING_TICKS = 256, 64, 16, 64
 
 
-def settings(folder: Path, envs: int, first_env: int, world: int) -> dict:
+def settings(folder: Path, envs: int, first_env: int, world: int, more: dict | None = None) -> dict:
     """The run file of one trainer with `envs` environments among `world` ranks; sizes are of each environment."""
-    run = run_file(
-        str(folder), ranks=world, horizon=envs * HORIZON, batch_size=envs * BATCH, checkpoint_interval=1, device=DEVICE
-    )
+    sizes = {"ranks": world, "horizon": envs * HORIZON, "batch_size": envs * BATCH}
+    own = sizes | {"checkpoint_interval": 1, "device": DEVICE} | (SETTINGS if more is None else more)
+    run = run_file(str(folder), **own)
     run["config"]["run"] = {"envs": envs, "first_env": first_env, "seed": 1}
     return run
 

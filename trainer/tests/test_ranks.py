@@ -32,13 +32,13 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def launch(folder: Path, *options: str, fault: str = "") -> subprocess.Popen:
-    """`torchrun` over the probe, started and not waited for."""
+def launch(folder: Path, *options: str, fault: str = "", more: dict | None = None) -> subprocess.Popen:
+    """`torchrun` over the probe with `more` settings of the trainer, started and not waited for."""
     path = os.pathsep.join(filter(None, (str(HERE), os.environ.get("PYTHONPATH"))))
     torchrun = [sys.executable, "-m", "torch.distributed.run", *options]
     return subprocess.Popen(
         [*torchrun, str(HERE / "rank_probe.py"), str(folder), fault],
-        env=os.environ | {"PYTHONPATH": path},
+        env=os.environ | {"PYTHONPATH": path, "RANK_PROBE_SETTINGS": json.dumps(more or {})},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -59,14 +59,18 @@ def part(folder: Path) -> dict:
     return json.loads((folder / "parts" / "trainer.json").read_text())
 
 
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def learn_alone(folder: Path, more: dict | None = None) -> Path:
     """One trainer with both environments, and a horizon and batch of twice the size."""
-    folder = tmp_path_factory.mktemp("alone")
-    run = settings(folder, 2, 0, 1)
+    run = settings(folder, 2, 0, 1, more or {})
     first, *others = channels(run)
     TrainingLoop(first, RunConfig.from_run(run), lambda: False, others=others).run()
     return folder
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What one trainer comes to, with the default network."""
+    return learn_alone(tmp_path_factory.mktemp("alone"))
 
 
 def assert_the_same(alone: Path, rank0: Path) -> None:
@@ -90,6 +94,27 @@ def test_two_ranks_learn_what_one_does_with_twice_the_batch(tmp_path: Path, alon
     for name, state in load_file(mine / "random.safetensors").items():
         assert torch.equal(state, load_file(theirs / "random.safetensors")[name])
     assert not (tmp_path / "rank1" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"network": "gru", "hidden": [24, 12], "truncation_ticks": 5},
+        {"actions_per_observation": 4, "discount": 0.0},
+    ],
+    ids=["with memory", "several actions"],
+)
+def test_ranks_share_sequences_and_several_actions_too(tmp_path: Path, more: dict) -> None:
+    alone = learn_alone(tmp_path / "alone", more)
+    finish(launch(tmp_path, "--standalone", "--nproc-per-node=2", more=more))
+    assert_the_same(alone, tmp_path / "rank0")
+    mine, theirs = (latest_checkpoint(folder / "checkpoints") / "memory.safetensors" for folder in (alone, tmp_path / "rank0"))
+    assert mine.exists() == theirs.exists() == (more.get("network") == "gru")
+    if mine.exists():
+        remembered, together = load_file(mine), load_file(theirs)
+        assert remembered.keys() == together.keys()
+        for name, tensor in remembered.items():
+            assert torch.allclose(tensor, together[name], atol=1e-4), name
 
 
 def test_two_nodes_meet_at_a_rendezvous_address(tmp_path: Path, alone: Path) -> None:

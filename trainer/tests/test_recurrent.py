@@ -382,9 +382,3 @@ def test_another_network_is_refused_with_both_named(tmp_path: Path) -> None:
     loaded = fresh(seed=5)
     load_checkpoint(config.resume_from, loaded)
     assert isinstance(loaded, RecurrentPpo) and int(loaded.memories[0].tick) == 31
-
-
-def test_ranks_are_refused_with_the_key_and_the_cure() -> None:
-    with pytest.raises(ConfigError, match=r'`trainer\.network` = "gru" with several ranks') as caught:
-        TrainerConfig.from_run(run_file("x", network="gru", ranks=2))
-    assert 'trainer.network = "mlp"' in caught.value.help

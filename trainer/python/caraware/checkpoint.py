@@ -83,11 +83,12 @@ def save_checkpoint(
     keep: Keeping,
     course: Course | None = None,
     random: dict[str, Tensor] | None = None,
+    memory: dict[str, Tensor] | None = None,
 ) -> Path:
     """Write `folder/update-NNNNNN`, then point `folder/latest` at it; older ones that `keep` does not name are removed.
 
     Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there. `random`
-    adds the generators of other ranks.
+    and `memory` add the generators of other ranks and what they remember of their environments.
     """
     target = folder / checkpoint_name(counters.updates)
     temporary = folder / f".{target.name}.partial"
@@ -96,7 +97,7 @@ def save_checkpoint(
     tensors_of = _tensors(ppo)
     tensors_of[RANDOM] |= random or {}
     files = {name: _write(temporary / name, save(tensors)) for name, tensors in tensors_of.items()}
-    if memory := ppo.memory_tensors():
+    if memory := (memory or {}) | ppo.memory_tensors():
         files[MEMORY] = _write(temporary / MEMORY, save(memory))
     if course is not None:
         rows = torch.tensor([astuple(point) for point in course.training], dtype=torch.float64)

@@ -133,16 +133,6 @@ class TrainerConfig:
         for name in ("learning_rate_final", "clip_epsilon_final", "entropy_scale_final", "value_clip", "target_kl"):
             if (value := getattr(self, name)) is not None:
                 _range(name, value, 0.0, math.inf)
-        if self.actions_per_observation > 1 and self.ranks > 1:
-            raise ConfigError(
-                f"`trainer.actions_per_observation` = {self.actions_per_observation} with several ranks",
-                "ranks already share more samples: set trainer.actions_per_observation = 1",
-            )
-        if self.network != "mlp" and self.ranks > 1:
-            raise ConfigError(
-                f'`trainer.network` = "{self.network}" with several ranks',
-                'ranks share samples, not sequences: set trainer.network = "mlp", or run.envs instead of ranks',
-            )
         if self.actions_per_observation > 1 and self.discount > 0.0:
             raise ConfigError(
                 f"`trainer.actions_per_observation` = {self.actions_per_observation} with `trainer.discount`"

@@ -405,9 +405,10 @@ class TrainingLoop:
             *self._environments[0].starts.behind(committed_tick),
         )
         keep = Keeping.of(self._config.trainer)
-        course, random = self._of_all_ranks()
+        course, random, memory = self._of_all_ranks()
         if self._ranks.rank == 0:
-            saved = save_checkpoint(folder, self._ppo, counters, self._config.config_sha256, keep, course, random)
+            config = self._config.config_sha256
+            saved = save_checkpoint(folder, self._ppo, counters, config, keep, course, random, memory)
             log.info("checkpoint %s, learnt up to tick %d", saved.name, committed_tick)
         # The checkpoint of rank 0 is that of all.
         self._ranks.gather(None)
@@ -416,20 +417,25 @@ class TrainingLoop:
             if environment.committed_tick >= 0:
                 environment.channel.committed(environment.committed_tick)
 
-    def _of_all_ranks(self) -> tuple[Course, dict[str, Tensor]]:
-        """What the checkpoint of all ranks says of their environments: those of one trainer that has them all."""
+    def _of_all_ranks(self) -> tuple[Course, dict[str, Tensor], dict[str, Tensor]]:
+        """What the checkpoint of all ranks says of their environments: those of one trainer that has them all.
+
+        How training went, the states of the random numbers, and what networks remember.
+        """
         assert self._ppo is not None
         own = self._course()
         self._ranks.check_equal(
             "the parameters", [self._ppo.policy.network.parameters.values, self._ppo.value.network.parameters.values]
         )
         states = {name: generator.get_state() for name, generator in self._ppo.sampling_generators().items()}
-        first, *others = self._ranks.gather((own, [environment.place() for environment in self._environments], states))
-        places = [*own.others, *(place for _, theirs, _ in others for place in theirs)]
+        places = [environment.place() for environment in self._environments]
+        everybody = self._ranks.gather((places, states, self._ppo.memory_tensors()))
         if self._ranks.rank > 0:
-            return own, {}
-        random = {name: state for _, _, theirs in (first, *others) for name, state in theirs.items()}
-        return replace(own, others=places), random
+            return own, {}, {}
+        beside = [place for theirs, *_ in everybody[1:] for place in theirs]
+        random = {name: state for _, theirs, _ in everybody for name, state in theirs.items()}
+        memory = {name: tensor for *_, theirs in everybody for name, tensor in theirs.items()}
+        return replace(own, others=[*own.others, *beside]), random, memory
 
     def _course(self) -> Course:
         """How training went, of what the checkpoint contains."""

@@ -43,7 +43,7 @@ class Union:
     """The samples of all ranks in the order of the ranks, and which of them are this one's."""
 
     advantage: Tensor
-    """f32 `[S]`."""
+    """f32 `[S]`, or `[S, k]` with k > 1 actions per observation."""
     reward: Tensor
     """f32 `[S]`."""
     value_target: Tensor
@@ -102,8 +102,12 @@ class Ranks:
         return verdict, episode
 
     def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> Union:
-        """The samples of all, `[s]` of this rank given."""
+        """The samples of all, `[s]` (of the advantage `[s]` or `[s, k]`) of this rank given."""
         return Union(advantage, reward, value_target, 0, len(advantage))
+
+    def tables(self, own: Tensor) -> list[Tensor]:
+        """The tables `[rows, columns]` of all ranks, in their order; they may differ in both sizes."""
+        return [own]
 
     def add_up(self, lane: str, values: Tensor) -> None:
         """Replace `values` by their sum over the ranks. The lanes `policy` and `value` may be in use side by side."""
@@ -159,16 +163,24 @@ class TorchRanks(Ranks):
 
     def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> Union:
         """See `Ranks.union`."""
-        own = torch.stack((advantage, reward, value_target)).cpu()
-        sizes = self.gather(own.shape[1])
-        padded = torch.zeros(3, max(sizes))
-        padded[:, : own.shape[1]] = own
+        tries = advantage.reshape(len(reward), -1)
+        everybody = self.tables(torch.cat((tries, reward.unsqueeze(1), value_target.unsqueeze(1)), 1))
+        before = sum(len(each) for each in everybody[: self.rank])
+        columns = torch.cat(everybody).t().contiguous()
+        advantages = columns[:-2].t().contiguous().view(-1, *advantage.shape[1:])
+        return Union(advantages, columns[-2], columns[-1], before, len(reward))
+
+    def tables(self, own: Tensor) -> list[Tensor]:
+        """See `Ranks.tables`."""
+        sizes = self.gather(tuple(own.shape))
+        padded = torch.zeros(max(rows for rows, _ in sizes), max(columns for _, columns in sizes), dtype=own.dtype)
+        padded[: own.shape[0], : own.shape[1]] = own.cpu()
         everybody = [torch.empty_like(padded) for _ in sizes]
-        with self._together("telling each other the advantages"):
+        with self._together("telling each other what they have"):
             self._dist.all_gather(everybody, padded)
-        columns = torch.cat([each[:, :size] for each, size in zip(everybody, sizes, strict=True)], 1)
-        columns = columns.to(advantage.device)
-        return Union(columns[0], columns[1], columns[2], sum(sizes[: self.rank]), own.shape[1])
+        return [
+            each[:rows, :columns].to(own.device) for each, (rows, columns) in zip(everybody, sizes, strict=True)
+        ]
 
     def add_up(self, lane: str, values: Tensor) -> None:
         """See `Ranks.add_up`."""

@@ -41,23 +41,50 @@ class RecurrentBatch(Batch):
         """See `Batch.followed_by`."""
         batches = [self, *others]
         assert all(isinstance(batch, RecurrentBatch) for batch in batches)
-        longest = max(batch.sequence.shape[1] for batch in batches)
-        tables, first = [], 0
-        for batch in batches:
-            shifted = torch.where(batch.sequence == NOBODY, NOBODY, batch.sequence + first)
-            missing = longest - shifted.shape[1]
-            tables.append(torch.nn.functional.pad(shifted, (0, missing), value=NOBODY))
-            first += len(batch.reward)
         return RecurrentBatch(
             **vars(super().followed_by(others)),
-            sequence=torch.cat(tables),
+            sequence=one_table([batch.sequence for batch in batches]),
             policy_start=torch.cat([batch.policy_start for batch in batches]),
             value_start=torch.cat([batch.value_start for batch in batches]),
         )
 
-    def lengths(self) -> Tensor:
-        """i64 `[c]`: samples of each sequence."""
-        return (self.sequence != NOBODY).sum(1)
+@dataclass(frozen=True)
+class SharedSequences:
+    """The sequences of all ranks in the order of the ranks, and which of them are this one's."""
+
+    table: Tensor
+    """i64 `[c, L]`: rows of the union."""
+    offset: int
+    """First sequence that is this rank's."""
+    own: int
+
+    def packed(self, chosen: Tensor) -> "PackedSequences":
+        """Some of them, longest first, step by step."""
+        lengths = (self.table[chosen] != NOBODY).sum(1)
+        longest_first = chosen[lengths.argsort(descending=True, stable=True)]
+        by_step = self.table[longest_first].t()
+        mine = (longest_first >= self.offset) & (longest_first < self.offset + self.own)
+        is_sample, is_mine = by_step != NOBODY, mine.expand_as(by_step)
+        return PackedSequences(
+            rows=by_step[is_sample],
+            is_own=is_mine[is_sample],
+            sizes=(is_sample & is_mine).sum(1),
+            own=longest_first[mine] - self.offset,
+        )
+
+
+@dataclass(frozen=True)
+class PackedSequences:
+    """The samples of some sequences: the first of each, the second of each, and so on."""
+
+    rows: Tensor
+    """i64 `[b]`: where they are in the union."""
+    is_own: Tensor
+    """bool `[b]`: those of this rank."""
+    sizes: Tensor
+    """i64 `[L]`: how many of this rank's sequences go on so long."""
+    own: Tensor
+    """i64: this rank's sequences, among its own."""
 
 
 class RecurrentPpo(Ppo):
@@ -135,7 +162,10 @@ class RecurrentPpo(Ppo):
     def _pieces(self, batch: Batch, union: Union) -> int:
         """Sequences are shuffled, not samples."""
         assert isinstance(batch, RecurrentBatch)
-        return len(batch.sequence)
+        tables = self.ranks.tables(batch.sequence)
+        before = sum(len(table) for table in tables[: self.ranks.rank])
+        self._shared = SharedSequences(one_table(tables), before, len(batch.sequence))
+        return len(self._shared.table)
 
     def _minibatches(
         self, lane: str, batch: Batch, union: Union, columns: Sequence[Tensor], order: Tensor
@@ -143,14 +173,15 @@ class RecurrentPpo(Ppo):
         """Whole sequences, about `batch_size` samples of them."""
         assert isinstance(batch, RecurrentBatch)
         starts = batch.policy_start if lane == "policy" else batch.value_start
-        lengths = batch.lengths()
+        lengths = (self._shared.table != NOBODY).sum(1)
         for chosen in cut(order, lengths, self._parts(union)):
-            longest_first = chosen[lengths[chosen].argsort(descending=True, stable=True)]
-            by_step = batch.sequence[longest_first].t()
-            is_sample = by_step != NOBODY
-            rows, sizes = by_step[is_sample], is_sample.sum(1)
-            packed = Sequences(batch.observation[rows], sizes[sizes > 0].cpu(), starts[longest_first])
-            yield Minibatch((packed, *(column[rows] for column in columns)), union.advantage[rows], None, 1.0)
+            packed = self._shared.packed(chosen)
+            rows, sizes = packed.rows[packed.is_own] - union.offset, packed.sizes
+            sequences = Sequences(batch.observation[rows], sizes[sizes > 0].cpu(), starts[packed.own])
+            own = (sequences, *(column[rows] for column in columns))
+            is_all = len(rows) == len(packed.rows)
+            share = len(rows) / len(packed.rows)
+            yield Minibatch(own, union.advantage[packed.rows], None if is_all else packed.is_own, share)
 
 
 class SequencePredictor:
@@ -221,6 +252,17 @@ def sequences(valid: Tensor, goes_on: Tensor, length: int) -> Tensor:
     table = np.full((count, int(places.max()) + 1), NOBODY)
     table[numbers, places] = np.arange(len(numbers))
     return torch.from_numpy(table)
+
+
+def one_table(tables: Sequence[Tensor]) -> Tensor:
+    """Tables of sequences `[_, _]` one below the other, rows counted on through all: each has every row once."""
+    longest = max(table.shape[1] for table in tables)
+    shifted, first = [], 0
+    for table in tables:
+        rows = torch.where(table == NOBODY, NOBODY, table + first)
+        shifted.append(torch.nn.functional.pad(rows, (0, longest - table.shape[1]), value=NOBODY))
+        first += int((table != NOBODY).sum())
+    return torch.cat(shifted)
 
 
 def cut(order: Tensor, lengths: Tensor, parts: int) -> list[Tensor]:
