@@ -333,7 +333,7 @@ impl Daemon {
             lidar: self.scanning.as_ref().map(Scanning::tally),
             redelivered_ticks: self.consumer.as_ref().map_or(0, Delivery::redelivered),
             journal_mib: self.consumer.as_ref().map_or(0, Delivery::journal_mib),
-            hand_overs: self.consumer.as_ref().map_or(&[][..], Delivery::hand_overs).to_vec(),
+            hand_overs: self.consumer.as_ref().map(Delivery::hand_overs).unwrap_or_default(),
         };
         self.session.write_part(&part)
     }

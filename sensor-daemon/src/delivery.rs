@@ -92,6 +92,8 @@ impl Delivery {
         self.goes_on
             && self.journal.has_room(len)
             && match &self.hand_over {
+                // The successor of that one leaves in its turn, before it has caught up.
+                Some(before) if before.has_successor() && self.board.is_handing_over() => true,
                 Some(hand_over) => hand_over.allows(&self.board.progress(), self.journal.ticks()),
                 None => self.board.is_handing_over(),
             }
@@ -104,6 +106,10 @@ impl Delivery {
             return;
         }
         let (now, made, progress) = (Instant::now(), self.journal.ticks(), self.board.progress());
+        // The next one may begin while a successor still catches up.
+        if under_way && let Some(before) = self.hand_over.take_if(|before| before.has_successor()) {
+            self.hand_overs.push(before.account(progress.incarnation));
+        }
         let hand_over = self
             .hand_over
             .get_or_insert_with(|| HandOver::begin(now, progress.incarnation));
@@ -116,10 +122,12 @@ impl Delivery {
         }
     }
 
-    /// Planned hand-overs so far.
+    /// Planned hand-overs so far, that of a successor that still catches up included.
     #[must_use]
-    pub fn hand_overs(&self) -> &[Account] {
-        &self.hand_overs
+    pub fn hand_overs(&self) -> Vec<Account> {
+        let newest = self.hand_over.as_ref().filter(|newest| newest.has_successor());
+        let newest = newest.map(|newest| newest.account(self.board.progress().incarnation));
+        self.hand_overs.iter().copied().chain(newest).collect()
     }
 
     /// True once the trainer has done all its work.

@@ -97,6 +97,12 @@ impl HandOver {
         }
     }
 
+    /// True once the successor has taken up its work.
+    #[must_use]
+    pub fn has_successor(&self) -> bool {
+        self.taken.is_some()
+    }
+
     /// True once a trainer is at work and has nothing to catch up with.
     #[must_use]
     pub fn is_over(&self, is_level: bool) -> bool {

@@ -108,7 +108,9 @@ def test_ranks_share_sequences_and_several_actions_too(tmp_path: Path, more: dic
     alone = learn_alone(tmp_path / "alone", more)
     finish(launch(tmp_path, "--standalone", "--nproc-per-node=2", more=more))
     assert_the_same(alone, tmp_path / "rank0")
-    mine, theirs = (latest_checkpoint(folder / "checkpoints") / "memory.safetensors" for folder in (alone, tmp_path / "rank0"))
+    mine, theirs = (
+        latest_checkpoint(folder / "checkpoints") / "memory.safetensors" for folder in (alone, tmp_path / "rank0")
+    )
     assert mine.exists() == theirs.exists() == (more.get("network") == "gru")
     if mine.exists():
         remembered, together = load_file(mine), load_file(theirs)

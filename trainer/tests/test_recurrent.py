@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from caraware.checkpoint import MEMORY, load_checkpoint
-from caraware.config import ConfigError, MapBounds, RunConfig, TrainerConfig
+from caraware.config import MapBounds, RunConfig, TrainerConfig
 from caraware.gru import RecurrentNetwork, RecurrentPolicy, Sequences, Steps
 from caraware.loop import PPO_OF_NETWORK, Learner, TrainingLoop
 from caraware.manifest import CheckpointError, latest_checkpoint, newest_sound_checkpoint

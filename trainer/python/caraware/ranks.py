@@ -178,9 +178,7 @@ class TorchRanks(Ranks):
         everybody = [torch.empty_like(padded) for _ in sizes]
         with self._together("telling each other what they have"):
             self._dist.all_gather(everybody, padded)
-        return [
-            each[:rows, :columns].to(own.device) for each, (rows, columns) in zip(everybody, sizes, strict=True)
-        ]
+        return [each[:rows, :columns].to(own.device) for each, (rows, columns) in zip(everybody, sizes, strict=True)]
 
     def add_up(self, lane: str, values: Tensor) -> None:
         """See `Ranks.add_up`."""

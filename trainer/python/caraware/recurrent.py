@@ -48,6 +48,7 @@ class RecurrentBatch(Batch):
             value_start=torch.cat([batch.value_start for batch in batches]),
         )
 
+
 @dataclass(frozen=True)
 class SharedSequences:
     """The sequences of all ranks in the order of the ranks, and which of them are this one's."""
