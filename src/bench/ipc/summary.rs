@@ -44,8 +44,14 @@ impl Percentiles {
     }
 }
 
+/// Size of the block, bytes → what is told of it.
+type Told = BTreeMap<usize, Percentiles>;
+
+/// Where the latencies of a way are.
+type Way = fn(&Ours) -> &BySize;
+
 /// What is told of ours, and where it is.
-const WAYS: [(&str, fn(&Ours) -> &BySize); 3] = [
+const WAYS: [(&str, Way); 3] = [
     ("taken", |ours| &ours.taken),
     ("tensor", |ours| &ours.tensor),
     ("tensor of an observation to keep", |ours| &ours.received),
@@ -71,7 +77,7 @@ pub(super) fn report(rounds: &[Round], peers: &BTreeMap<String, BySize>) -> Resu
     );
     let bare = Percentiles::of(rounds.iter().flat_map(|round| round.bare.clone()).collect())?;
     report.figure("bare iceoryx2, median µs", bare.median);
-    let mut all: Vec<(String, BTreeMap<usize, Percentiles>)> = Vec::new();
+    let mut all: Vec<(String, Told)> = Vec::new();
     for (way, of) in WAYS {
         all.push((
             format!("ours, {way}"),
@@ -107,7 +113,7 @@ pub(super) fn report(rounds: &[Round], peers: &BTreeMap<String, BySize>) -> Resu
 }
 
 /// Percentiles of each size over everything that was measured.
-fn pooled<'a>(parts: impl Iterator<Item = &'a BySize>) -> Result<BTreeMap<usize, Percentiles>, Exit> {
+fn pooled<'a>(parts: impl Iterator<Item = &'a BySize>) -> Result<Told, Exit> {
     let mut all = BySize::new();
     for (bytes, latencies) in parts.flatten() {
         all.entry(*bytes).or_default().extend(latencies);
@@ -141,8 +147,8 @@ fn own_ratios(report: &mut Report, rounds: &[Round]) -> Result<Table, Exit> {
     Ok(table)
 }
 
-fn curve(all: &[(String, BTreeMap<usize, Percentiles>)]) -> Curve {
-    let line = |(who, by_size): &(String, BTreeMap<usize, Percentiles>)| {
+fn curve(all: &[(String, Told)]) -> Curve {
+    let line = |(who, by_size): &(String, Told)| {
         #[expect(clippy::cast_precision_loss, reason = "a coordinate")]
         let points = by_size.iter().map(|(bytes, p)| [*bytes as f64, p.median]);
         Line {
