@@ -25,9 +25,9 @@ const KEEPS_PYTHON: Duration = Duration::from_millis(1);
 /// Where a message lies and how it is laid out: address, slots, fields, IMU samples.
 type Place = (usize, u32, u32, u64);
 
-/// The newest message, and until the next is asked for the one before it: giving a place back takes a tenth of a microsecond, which
-/// nobody has to wait for. While a message is held, its publisher's memory stays mapped, that of all earlier messages included: whoever
-/// has a tensor over any of them holds this.
+/// The newest message, and until the next is asked for the one before it: nobody has to wait while a place is given back. While a
+/// message is held, its publisher's memory stays mapped, that of all earlier messages included: whoever has a tensor over any of them
+/// holds this.
 type Held = Arc<Mutex<[Option<Message>; 2]>>;
 
 struct Lent {

@@ -150,11 +150,11 @@ def main(arguments: list[str]) -> int:
     try:
         checkpoint = _choose(place / "checkpoints", which) if (place / "checkpoints").is_dir() else place
         manifest = verify_checkpoint(checkpoint)
-        others = json.loads((checkpoint / COURSE).read_bytes())["others"] if COURSE in manifest.files else []
+        course = json.loads((checkpoint / COURSE).read_bytes()) if COURSE in manifest.files else {}
     except CheckpointError as error:
         print(json.dumps({"refused": str(error)}))
         return 1
-    print(json.dumps({"checkpoint": str(checkpoint), "manifest": asdict(manifest), "others": others}))
+    print(json.dumps({"checkpoint": str(checkpoint), "manifest": asdict(manifest), "others": course.get("others", [])}))
     return 0
 
 
