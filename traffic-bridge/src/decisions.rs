@@ -63,19 +63,15 @@ impl Decisions {
         };
         // What was decided behind the checkpoint, the trainer decides again. It has decided about a lesson that begins with the tick after.
         stand.retain(|action| action.tick <= run.committed_ticks());
-        let log = File::create(&path).map_err(|error| unwritten(&path, &error))?;
-        let mut decisions = Self {
+        let log = begin_log(&path, &stand).map_err(|error| unwritten(&path, &error))?;
+        Ok(Self {
             judge,
             committed_ticks: run.committed_ticks(),
-            newest: None,
+            newest: stand.last().copied(),
             stand,
             path,
             log,
-        };
-        for action in decisions.stand.clone() {
-            decisions.write(action)?;
-        }
-        Ok(decisions)
+        })
     }
 
     /// The step, counted from 0, of `lesson`, which the checkpoint that the run goes on from has behind it.
@@ -119,6 +115,17 @@ impl Decisions {
         let line = serde_json::to_string(&action).unwrap_or_default();
         writeln!(self.log, "{line}").map_err(|error| unwritten(&self.path, &error))
     }
+}
+
+/// The log with the decisions that stand, renamed into place, so that the one before is never half gone; open for those that follow.
+fn begin_log(path: &Path, stand: &[Action]) -> std::io::Result<File> {
+    let partial = path.with_extension("partial");
+    let mut log = File::create(&partial)?;
+    for action in stand {
+        writeln!(log, "{}", serde_json::to_string(action)?)?;
+    }
+    std::fs::rename(&partial, path)?;
+    Ok(log)
 }
 
 /// The step of `lesson` by a log.
