@@ -391,6 +391,9 @@ pub struct GenerateArgs {
     /// Lanes in each direction
     #[arg(long, default_value_t = 1)]
     pub lanes: u32,
+    /// Speed limit, km/h
+    #[arg(long, default_value_t = 50.0)]
+    pub speed_kmh: f64,
 }
 
 /// What `train` and `simulate` take.

@@ -15,8 +15,8 @@ use crate::{cli::GenerateArgs, failure::Exit, install::Install};
 use demand::Demand;
 use streets::Streets;
 
-/// Vehicles for each street (one direction of a block) of a city whose size is not given: ten on a kilometre of lane.
-const VEHICLES_PER_STREET: f64 = 2.0;
+/// Vehicles on a kilometre of lane where the size of the grid is not given.
+const VEHICLES_PER_KM: f64 = 10.0;
 /// Where the middle of the city lies: latitude and longitude, degrees.
 const ORIGIN_DEG: [f64; 2] = [52.26, 10.52];
 /// WGS 84: semi-major axis (metres), squared eccentricity.
@@ -39,21 +39,51 @@ pub struct City {
     pub block_m: f64,
     /// Lanes in each direction.
     pub lanes: u32,
+    /// Speed limit, km/h.
+    pub speed_kmh: f64,
 }
 
 impl City {
-    /// A city that has room for its vehicles: ten on a kilometre of lane, blocks of 200 m, one lane in each direction.
+    /// A city that has room for its vehicles: ten on a kilometre of lane, blocks of 200 m, one lane in each direction, 50 km/h.
     #[must_use]
     pub fn of(vehicles: u32, duration_s: f64, step_s: f64, seed: u64) -> Self {
-        Self {
+        let city = Self {
             vehicles,
             duration_s,
             step_s,
             seed,
-            junctions: junctions_for(vehicles),
+            junctions: 2,
             block_m: 200.0,
             lanes: 1,
-        }
+            speed_kmh: 50.0,
+        };
+        city.with_room()
+    }
+
+    /// Country roads with as many vehicles on a kilometre of lane: 2 km from junction to junction, 100 km/h. SUMO spends its time at
+    /// junctions, so a step costs it about half of what it does in a city.
+    #[must_use]
+    pub fn country(vehicles: u32, duration_s: f64, step_s: f64, seed: u64) -> Self {
+        let country = Self {
+            block_m: 2000.0,
+            speed_kmh: 100.0,
+            ..Self::of(vehicles, duration_s, step_s, seed)
+        };
+        country.with_room()
+    }
+
+    /// With junctions for [`VEHICLES_PER_KM`]: n on each side make 4·n·(n − 1) streets.
+    #[must_use]
+    fn with_room(self) -> Self {
+        let street = VEHICLES_PER_KM * 1e-3 * self.block_m * f64::from(self.lanes);
+        let enough = |n: &u32| f64::from(4 * n) * f64::from(n - 1) * street >= f64::from(self.vehicles);
+        let junctions = (2..1 << 14).find(enough).unwrap_or(1 << 14);
+        Self { junctions, ..self }
+    }
+
+    /// Speed limit, m/s.
+    fn speed_mps(&self) -> f64 {
+        self.speed_kmh / 3.6
     }
 
     /// Writes `city.net.xml`, `city.rou.xml` and `city.sumocfg` to `directory`; returns the path of the last.
@@ -87,6 +117,7 @@ impl City {
         positive("step-s", self.step_s)?;
         positive("vehicles", self.vehicles.into())?;
         positive("lanes", self.lanes.into())?;
+        positive("speed-kmh", self.speed_kmh)?;
         // Shorter blocks have no room left between their junctions.
         if self.junctions < 2 || self.block_m < 50.0 {
             return Err(Exit::config(
@@ -109,6 +140,7 @@ impl City {
             .args(["--grid.number", &self.junctions.to_string()])
             .args(["--grid.length", &self.block_m.to_string()])
             .args(["--default.lanenumber", &self.lanes.to_string()])
+            .args(["--default.speed", &format!("{:.2}", self.speed_mps())])
             .arg("--output-file")
             .arg(&file)
             .env("SUMO_HOME", &install.sumo_home)
@@ -197,22 +229,21 @@ impl City {
     }
 }
 
-/// Junctions a side whose 4·n·(n − 1) streets have [`VEHICLES_PER_STREET`].
-fn junctions_for(vehicles: u32) -> u32 {
-    let enough = |n: &u32| f64::from(4 * n) * f64::from(n - 1) * VEHICLES_PER_STREET >= f64::from(vehicles);
-    (2..1 << 14).find(enough).unwrap_or(1 << 14)
-}
-
 /// Generates what the command line asks for and says how to run it.
 ///
 /// # Errors
 /// As [`City::write`].
 pub fn generate(args: &GenerateArgs) -> Result<(), Exit> {
-    let city = City {
-        junctions: args.junctions.unwrap_or_else(|| junctions_for(args.vehicles)),
+    let roomy = City {
         block_m: args.block_m,
         lanes: args.lanes,
+        speed_kmh: args.speed_kmh,
         ..City::of(args.vehicles, args.duration_s, args.step_s, args.seed)
+    }
+    .with_room();
+    let city = City {
+        junctions: args.junctions.unwrap_or(roomy.junctions),
+        ..roomy
     };
     let sumocfg = city.write(&Install::find()?, &args.directory)?;
     let (path, junctions) = (sumocfg.display(), city.junctions * city.junctions);
@@ -267,8 +298,15 @@ mod tests {
     }
 
     #[test]
-    fn room_grows_with_the_vehicles() {
-        assert_eq!([1, 16, 17, 5000, 50_000].map(junctions_for), [2, 2, 3, 26, 80]);
+    fn room_grows_with_the_vehicles_and_shrinks_with_longer_blocks_and_more_lanes() {
+        let junctions = |vehicles| City::of(vehicles, 30.0, 0.5, 1).junctions;
+        assert_eq!([1, 16, 17, 5000, 50_000].map(junctions), [2, 2, 3, 26, 80]);
+        assert_eq!(City::country(20_000, 30.0, 1.0, 1).junctions, 17);
+        let wide = City {
+            lanes: 3,
+            ..City::country(20_000, 30.0, 1.0, 1)
+        };
+        assert_eq!(wide.with_room().junctions, 10);
     }
 
     #[test]

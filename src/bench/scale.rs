@@ -17,7 +17,7 @@ const CITIES: [(u32, f64); 5] = [
 ];
 /// The same when only the way is tried.
 const QUICK: [(u32, f64); 2] = [(50, 5.0), (100, 5.0)];
-/// Vehicles and simulated seconds of the city at steps of 1 s.
+/// Vehicles and simulated seconds of city and country at steps of 1 s.
 const LONG_STEPS: (u32, f64) = (20_000, 180.0);
 const LONG_STEPS_QUICK: (u32, f64) = (100, 10.0);
 /// Factors on the motorway's demand.
@@ -76,7 +76,8 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
     let cities = if options.quick { &QUICK[..] } else { &CITIES[..] };
     let mut cases = Vec::new();
     for &(vehicles, duration_s) in cities {
-        cases.push(city(options, &place, vehicles, duration_s, 0.1)?);
+        let city = City::of(vehicles, duration_s, 0.1, 1);
+        cases.push(generated(options, &place, &city, &format!("city-{vehicles}"))?);
     }
     report.tables.push(costs(&cases));
     report.curves.push(curve(&cases));
@@ -107,12 +108,11 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
     Ok(report)
 }
 
-fn city(options: &Options, place: &Place, vehicles: u32, duration_s: f64, step_s: f64) -> Result<Case, Exit> {
+fn generated(options: &Options, place: &Place, city: &City, name: &str) -> Result<Case, Exit> {
     let install = Install::find()?;
-    let directory = place.path().join(format!("city-{vehicles}-{step_s}"));
-    let sumocfg = City::of(vehicles, duration_s, step_s, 1).write(&install, &directory)?;
-    let scenario = Scenario::new(options, place, install, sumocfg, 1.0, vehicles)?;
-    Case::measure(&scenario, vehicles)
+    let sumocfg = city.write(&install, &place.path().join(name))?;
+    let scenario = Scenario::new(options, place, install, sumocfg, 1.0, city.vehicles)?;
+    Case::measure(&scenario, city.vehicles)
 }
 
 fn costs(cases: &[Case]) -> Table {
@@ -189,12 +189,18 @@ fn large(options: &Options, place: &Place, report: &mut Report) -> Result<(), Ex
         ],
     );
     let (vehicles, duration_s) = if options.quick { LONG_STEPS_QUICK } else { LONG_STEPS };
-    let case = city(options, place, vehicles, duration_s, 1.0)?;
-    report.figure(
-        format!("{vehicles} vehicles at steps of 1 s, sensed vehicle-steps/s"),
-        case.ours.number("/env_steps_per_s"),
-    );
-    table.row(row(&format!("city of {vehicles}, steps of 1 s"), &case));
+    let cities = [
+        ("city", City::of(vehicles, duration_s, 1.0, 1)),
+        ("country roads", City::country(vehicles, duration_s, 1.0, 1)),
+    ];
+    for (name, city) in cities {
+        let case = generated(options, place, &city, name)?;
+        report.figure(
+            format!("{name}, {vehicles} vehicles at steps of 1 s, sensed vehicle-steps/s"),
+            case.ours.number("/env_steps_per_s"),
+        );
+        table.row(row(&format!("{name}, {vehicles} vehicles, steps of 1 s"), &case));
+    }
     let scales = if options.quick { &[][..] } else { &MOTORWAY_SCALES[..] };
     for &scale in scales {
         let install = Install::find()?;

@@ -20,8 +20,8 @@ const CLASSES: [(&str, u64); 5] = [
 ];
 /// The longest vehicle (a bus) with the gap before it, metres.
 const ROOM_M: f64 = 15.0;
-/// Faster than anybody is on average: nobody gets to the end of a way of this speed times the duration, m/s.
-const FASTEST_MPS: f64 = 14.0;
+/// Faster than anybody is on average, in terms of the speed limit: drivers keep to 1.0 ± 0.1 of it.
+const FASTEST: f64 = 1.3;
 
 /// The vehicles of a city.
 pub struct Demand<'a> {
@@ -83,7 +83,7 @@ impl<'a> Demand<'a> {
         let class = class(below(100, &mut rng));
         let _ = writeln!(
             text,
-            "    <vehicle id=\"v{number}\" type=\"{class}\" depart=\"0\" departLane=\"{lane}\" departPos=\"{position_m:.1}\" departSpeed=\"max\">"
+            "    <vehicle id=\"v{number}\" type=\"{class}\" depart=\"0\" departLane=\"{lane}\" departPos=\"{position_m:.1}\" departSpeed=\"avg\">"
         );
         text.push_str("        <route edges=\"");
         self.walk(text, street, -position_m, &mut rng);
@@ -92,7 +92,7 @@ impl<'a> Demand<'a> {
 
     /// A random way from `street` on that is longer than anybody gets.
     fn walk(&self, text: &mut String, mut street: usize, mut way_m: f64, rng: &mut ChaCha8Rng) {
-        let enough_m = FASTEST_MPS * self.city.duration_s + self.city.block_m;
+        let enough_m = FASTEST * self.city.speed_mps() * self.city.duration_s + self.city.block_m;
         text.push_str(&self.streets.all[street].id);
         loop {
             way_m += self.streets.all[street].lanes_m.first().copied().unwrap_or(ROOM_M);
@@ -169,7 +169,7 @@ mod tests {
             }
             places.push((street, position_m));
             let ahead_m = edges.split(' ').count() as f64 * 100.0 - position_m;
-            assert!(ahead_m >= FASTEST_MPS * 30.0, "{edges} is {ahead_m} m");
+            assert!(ahead_m >= FASTEST * city.speed_mps() * 30.0, "{edges} is {ahead_m} m");
         }
     }
 }
