@@ -121,7 +121,10 @@ fn revision() -> String {
             .ok()?;
         (output.status.success()).then(|| String::from_utf8_lossy(&output.stdout).trim().to_owned())
     };
-    let changed = git(&["status", "--porcelain", "--untracked-files=no"]).is_some_and(|text| !text.is_empty());
+    // Figures that are kept change nothing that is measured.
+    let measured = ["--", ":(top)", ":(top,exclude)docs"];
+    let status = [&["status", "--porcelain", "--untracked-files=no"][..], &measured].concat();
+    let changed = git(&status).is_some_and(|text| !text.is_empty());
     git(&["rev-parse", "--short=7", "HEAD"]).map_or_else(
         || env!("CARGO_PKG_VERSION").into(),
         |revision| if changed { revision + "+" } else { revision },
