@@ -88,7 +88,8 @@ const RESUME: &str = "Examples:
   caraware train --resume town-1                             goes on from its newest sound checkpoint, in runs/town-1
   caraware train --resume runs/town-1/checkpoints/update-000300    another run, which begins there
 
-A resumed run ends with the parameters, bit for bit, of the run that was never stopped (on a CPU).";
+A resumed run ends with the parameters, bit for bit, of the run that was never stopped (on a CPU).
+Trainers that learn together go on together: torchrun … -m caraware.parallel --resume RUN (docs/parallel.md).";
 
 const PLAY: &str = "Examples:
   caraware play town-1                                       the best checkpoint of the run, on its own map, on unseen seeds

@@ -39,10 +39,12 @@ pub fn changed(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
             "only a run of `caraware train` that learns to localise goes on from a checkpoint",
         ));
     }
-    if run.config.trainer.ranks > 1 {
+    let ranks = run.config.trainer.ranks;
+    let started = std::env::var("WORLD_SIZE").ok().and_then(|size| size.parse().ok());
+    if ranks > 1 && started != Some(ranks) {
         return Err(Exit::config(
-            format!("{} was one of several trainers, and cannot be resumed", run.name),
-            "only a run whose trainer learns alone goes on from a checkpoint",
+            format!("{} was one of {ranks} trainers that learn together", run.name),
+            format!("all go on together: torchrun --nproc-per-node {ranks} -m caraware.parallel --resume RUN"),
         ));
     }
     for assignment in set {

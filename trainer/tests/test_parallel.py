@@ -2,17 +2,19 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
-from caraware.manifest import latest_checkpoint
+from caraware.checkpoint import POINTS
+from caraware.manifest import latest_checkpoint, read_manifest
 from caraware.program import caraware_program
 from safetensors.torch import load_file
 
@@ -42,11 +44,15 @@ def registry() -> Iterator[Path]:
         assert not registry.exists(), "something is left of a run"
 
 
-def start(folder: Path, registry: Path, words: list[str], horizon: int) -> subprocess.Popen:
+def start(folder: Path, registry: Path, words: list[str], horizon: int, *more: str) -> subprocess.Popen:
     sizes = {"trainer.horizon": horizon, "trainer.batch_size": horizon // 2}
     settings = [f"--set={key}={value}" for key, value in (SETTINGS | sizes).items()]
+    return launch(folder, registry, [*words, "town", *settings, *(f"--set={setting}" for setting in more)])
+
+
+def launch(folder: Path, registry: Path, words: list[str]) -> subprocess.Popen:
     return subprocess.Popen(
-        [*words, "town", "--runs", str(folder), *settings],
+        [*words, "--runs", str(folder)],
         env=os.environ | {"CARAWARE_RUNTIME_DIR": str(registry), "CARAWARE_PYTHON": sys.executable},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -54,9 +60,17 @@ def start(folder: Path, registry: Path, words: list[str], horizon: int) -> subpr
     )
 
 
-def two_ranks(folder: Path, registry: Path) -> subprocess.Popen:
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    return start(folder, registry, [*torchrun, "-m", "caraware.parallel", "--name=two"], 256)
+TWO_RANKS = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "caraware.parallel"]
+
+
+def two_ranks(folder: Path, registry: Path, name: str = "two", *more: str) -> subprocess.Popen:
+    return start(folder, registry, [sys.executable, *TWO_RANKS, f"--name={name}"], 256, *more)
+
+
+def resume(folder: Path, registry: Path, named: str, *more: str) -> tuple[int, str]:
+    process = launch(folder, registry, [sys.executable, *TWO_RANKS, f"--resume={named}", *more])
+    said, _ = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, said
 
 
 def report(run: Path) -> dict:
@@ -65,6 +79,20 @@ def report(run: Path) -> dict:
 
 def parameters(run: Path) -> dict[str, torch.Tensor]:
     return load_file(latest_checkpoint(run / "checkpoints") / "parameters.safetensors")
+
+
+def tensors(run: Path) -> dict[str, str]:
+    """SHA-256 of what a rank ended with: parameters, moments, random numbers."""
+    files = read_manifest(latest_checkpoint(run / "checkpoints")).files
+    return {name: digest for name, digest in files.items() if name.endswith(".safetensors") and name != POINTS}
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_two_ranks_are_one_trainer_with_two_environments(tmp_path: Path, registry: Path) -> None:
@@ -87,14 +115,49 @@ def test_two_ranks_are_one_trainer_with_two_environments(tmp_path: Path, registr
     assert "two-rank1" not in said
 
 
+def test_ranks_go_on_from_the_newest_checkpoint_that_all_have(tmp_path: Path, registry: Path) -> None:
+    every_update = ("trainer.checkpoint_interval=1", "trainer.checkpoint_keep_every=1")
+    whole = two_ranks(tmp_path, registry, "whole", *every_update)
+    said, _ = whole.communicate(timeout=PATIENCE_S)
+    assert whole.returncode == 0, said
+    expected = [tensors(tmp_path / name) for name in ("whole", "whole-rank1")]
+
+    cut = two_ranks(tmp_path, registry, "cut", *every_update, "run.real_time_factor=10")
+    checkpoints = tmp_path / "cut-rank1" / "checkpoints"
+    wait_until(lambda: (checkpoints / "update-000003").exists(), cut)
+    os.kill(cut.pid, signal.SIGINT)
+    said, _ = cut.communicate(timeout=PATIENCE_S)
+    newest = latest_checkpoint(checkpoints)
+    assert newest == latest_checkpoint(checkpoints).parent / latest_checkpoint(tmp_path / "cut" / "checkpoints").name
+    # As if it had been killed before all had the newest.
+    shutil.rmtree(newest)
+    code, said = resume(tmp_path, registry, "cut", "--set=run.real_time_factor=0")
+    assert code == 0, said
+    beginning = report(tmp_path / "cut")["beginning"]
+    assert int(Path(beginning["checkpoint"]).name.removeprefix("update-")) == int(newest.name[-6:]) - 1
+    assert [tensors(tmp_path / name) for name in ("cut", "cut-rank1")] == expected
+
+    # Another run, from a checkpoint amid the second episode.
+    older = tmp_path / "whole" / "checkpoints" / "update-000003"
+    code, said = resume(tmp_path, registry, str(older), "--name=other")
+    assert code == 0, said
+    assert report(tmp_path / "other-rank1")["beginning"]["episode"] > 0
+    assert [tensors(tmp_path / name) for name in ("other", "other-rank1")] == expected
+
+    alone = launch(tmp_path, registry, [str(caraware_program()), "train", "--resume=whole"])
+    said, _ = alone.communicate(timeout=PATIENCE_S)
+    assert alone.returncode == 2, said
+    assert "torchrun --nproc-per-node 2 -m caraware.parallel" in " ".join(said.replace("│", "").split())
+    shutil.rmtree(tmp_path / "whole-rank1" / "checkpoints")
+    code, said = resume(tmp_path, registry, "whole")
+    assert code != 0
+    assert "no checkpoint here that all 2 ranks have" in said
+
+
 def test_a_killed_trainer_ends_all_ranks(tmp_path: Path, registry: Path) -> None:
     two = two_ranks(tmp_path, registry)
     log = tmp_path / "two-rank1" / "logs" / "trainer.log"
-    deadline = time.monotonic() + PATIENCE_S
-    while not (log.is_file() and "observations of" in log.read_text()):
-        assert two.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    wait_until(lambda: log.is_file() and "observations of" in log.read_text(), two)
     run_file = str(tmp_path / "two-rank1" / "run.json")
     [trainer] = [pid for pid, line in command_lines() if run_file in line and "caraware.train" in line]
     os.kill(trainer, signal.SIGKILL)

@@ -12,7 +12,7 @@ import torch
 from caraware.checkpoint import load_course
 from caraware.config import RunConfig
 from caraware.loop import TrainingLoop
-from caraware.manifest import latest_checkpoint
+from caraware.manifest import latest_checkpoint, read_manifest
 from caraware.parallel import Place, command
 from caraware.ranks import Ranks, Union
 from rank_probe import TRAINING_TICKS, VEHICLES, channels, settings
@@ -88,12 +88,16 @@ def assert_the_same(alone: Path, rank0: Path) -> None:
 def test_two_ranks_learn_what_one_does_with_twice_the_batch(tmp_path: Path, alone: Path) -> None:
     finish(launch(tmp_path, "--standalone", "--nproc-per-node=2"))
     assert_the_same(alone, tmp_path / "rank0")
-    # The checkpoint is that of one trainer with both environments; only rank 0 writes it.
+    # Rank 0's checkpoint is that of one trainer with both environments.
     mine, theirs = (latest_checkpoint(folder / "checkpoints") for folder in (alone, tmp_path / "rank0"))
     assert load_course(theirs).others == load_course(mine).others
     for name, state in load_file(mine / "random.safetensors").items():
         assert torch.equal(state, load_file(theirs / "random.safetensors")[name])
-    assert not (tmp_path / "rank1" / "checkpoints").exists()
+    # Rank 1's has the same parameters, and where its own environment stands.
+    own = latest_checkpoint(tmp_path / "rank1" / "checkpoints")
+    assert read_manifest(own).files["parameters.safetensors"] == read_manifest(theirs).files["parameters.safetensors"]
+    assert not load_course(own).others
+    assert load_file(own / "random.safetensors").keys() == {"sampling1", "shuffling"}
 
 
 @pytest.mark.parametrize(
@@ -149,14 +153,18 @@ def test_a_minibatch_of_the_union_is_what_the_ranks_have_of_it_together() -> Non
         assert torch.equal(first.own[0], first.mine(together.advantage))
 
 
+def nobody(place: Place, own: list[str]) -> list[set[str]]:
+    raise AssertionError("there is nothing to agree on")
+
+
 def test_each_rank_gets_its_own_environments_and_cores() -> None:
     place = Place(rank=1, ranks=2, local_rank=1, local_ranks=2)
-    words = command(["town", "--set", "traffic.cavs=8", "--envs", "3", "--name", "x"], place, 7)
+    words = command(["town", "--set", "traffic.cavs=8", "--envs", "3", "--name", "x"], place, 7, nobody)
     assert words[:4] == ["train", "town", "--set", "traffic.cavs=8"]
     assert words[words.index("--name") + 1] == "x-rank1"
     for setting in ("run.envs=3", "run.first_env=3", "trainer.ranks=2", "fanout.enabled=false"):
         assert f"--set={setting}" in words
-    first = command([], Place(0, 2, 0, 2), 7)
+    first = command([], Place(0, 2, 0, 2), 7, nobody)
     assert first[first.index("--name") + 1] == "town-p7"
     assert not any("fanout" in word for word in first)
     assert place.cores([0, 1, 2, 3, 8]) == [2, 3]

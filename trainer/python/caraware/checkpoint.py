@@ -71,8 +71,9 @@ class Keeping:
 
     @classmethod
     def of(cls, config: TrainerConfig) -> "Keeping":
-        """As configured."""
-        return cls(config.checkpoints_kept, config.checkpoint_keep_every)
+        """As configured. Ranks keep two at least: killed amid a checkpoint they go on from the one before."""
+        least = 2 if config.ranks > 1 else 1
+        return cls(max(config.checkpoints_kept, least), config.checkpoint_keep_every)
 
 
 def save_checkpoint(

@@ -406,11 +406,10 @@ class TrainingLoop:
         )
         keep = Keeping.of(self._config.trainer)
         course, random, memory = self._of_all_ranks()
-        if self._ranks.rank == 0:
-            config = self._config.config_sha256
-            saved = save_checkpoint(folder, self._ppo, counters, config, keep, course, random, memory)
-            log.info("checkpoint %s, learnt up to tick %d", saved.name, committed_tick)
-        # The checkpoint of rank 0 is that of all.
+        config = self._config.config_sha256
+        saved = save_checkpoint(folder, self._ppo, counters, config, keep, course, random, memory)
+        log.info("checkpoint %s, learnt up to tick %d", saved.name, committed_tick)
+        # Learnt is what all ranks have kept.
         self._ranks.gather(None)
         self._saved_updates, self._commit_due = counters.updates, False
         for environment in self._environments:
@@ -418,9 +417,9 @@ class TrainingLoop:
                 environment.channel.committed(environment.committed_tick)
 
     def _of_all_ranks(self) -> tuple[Course, dict[str, Tensor], dict[str, Tensor]]:
-        """What the checkpoint of all ranks says of their environments: those of one trainer that has them all.
+        """How training went, the states of the random numbers, and what networks remember.
 
-        How training went, the states of the random numbers, and what networks remember.
+        Of a rank's own environments, from which it goes on; rank 0's is that of one trainer that has them all.
         """
         assert self._ppo is not None
         own = self._course()

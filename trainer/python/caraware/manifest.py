@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -83,13 +84,17 @@ def best_checkpoint(folder: Path) -> Path | None:
 
 def newest_sound_checkpoint(folder: Path) -> Path | None:
     """The newest checkpoint that verifies, None if there is none."""
+    return next(sound_checkpoints(folder), None)
+
+
+def sound_checkpoints(folder: Path) -> Iterator[Path]:
+    """Those that verify, the newest first."""
     for checkpoint in sorted(folder.glob("update-*"), reverse=True):
         try:
             verify_checkpoint(checkpoint)
-            return checkpoint
+            yield checkpoint
         except CheckpointError as error:
             log.warning("checkpoint refused, the one before it is used: %s", error)
-    return None
 
 
 def verify_checkpoint(checkpoint: Path) -> Manifest:

@@ -2,21 +2,31 @@
 
 Every process that `torchrun` starts becomes a `caraware train` with environments, shared memory and a supervisor of its
 own; the arguments are those of `caraware train`. The same command with a rendezvous address, on several machines,
-learns on all of them. docs/parallel.md
+learns on all of them. With `--resume RUN` they go on from the newest checkpoint that all of them have. docs/parallel.md
 """
 
 import argparse
 import ctypes
+import json
 import os
+import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 
+from caraware.manifest import LATEST, sound_checkpoints
 from caraware.program import ProgramError, caraware_program
 
 PR_SET_PDEATHSIG = 1
+WAIT_AT_MOST = timedelta(minutes=5)
+"""For the other ranks to say which checkpoints they have."""
+
+
+class ResumeError(Exception):
+    """The ranks cannot go on."""
 
 
 @dataclass(frozen=True)
@@ -40,26 +50,73 @@ class Place:
         each = len(available) // self.local_ranks
         return list(available[self.local_rank * each :][:each] if each else available)
 
+    def named(self, name: str) -> str:
+        """The name of this rank's run, where that of rank 0 is `name`."""
+        return f"{name}-rank{self.rank}" if self.rank > 0 else name
 
-def command(arguments: Sequence[str], place: Place, launch: int) -> list[str]:
-    """Arguments of `caraware` for one rank; `launch` tells launches on one machine apart."""
+
+Agree = Callable[[Place, list[str]], list[set[str]]]
+"""Tells the other ranks the names of this one's checkpoints; those of all ranks."""
+
+
+def command(arguments: Sequence[str], place: Place, launch: int, agree: Agree) -> list[str]:
+    """Arguments of `caraware` for one rank; `launch` tells launches on one machine apart. Raises `ResumeError`."""
     parser = argparse.ArgumentParser(prog="torchrun … -m caraware.parallel", description=__doc__, add_help=False)
-    parser.add_argument("--name")
-    parser.add_argument("--envs", type=int, default=1)
+    for name, kind in (("--name", str), ("--resume", Path), ("--runs", Path), ("--envs", int)):
+        parser.add_argument(name, type=kind)
     known, others = parser.parse_known_args(arguments)
-    config = others[0] if others and not others[0].startswith("-") else "town"
-    name = known.name or f"{Path(config).stem}-p{launch}"
-    settings = {
-        "run.envs": known.envs,
-        "run.first_env": place.rank * known.envs,
-        "trainer.ranks": place.ranks,
-    }
+    runs, config = known.runs or Path("runs"), others[0] if others and not others[0].startswith("-") else "town"
+    others = [*others, "--runs", str(runs)]
     if place.rank > 0:
         # One run can be watched; the others show nothing and say only what went wrong.
-        settings["fanout.enabled"] = "false"
         others = [*others, "--quiet"]
-        name = f"{name}-rank{place.rank}"
+    if known.resume:
+        if known.envs is not None:
+            raise ResumeError("--envs cannot change in a run that goes on")
+        return ["train", *others, *_resume(known.resume, runs, known.name, place, launch, agree)]
+    envs = known.envs or 1
+    settings = {"run.envs": envs, "run.first_env": place.rank * envs, "trainer.ranks": place.ranks}
+    if place.rank > 0:
+        settings["fanout.enabled"] = "false"
+    name = place.named(known.name or f"{Path(config).stem}-p{launch}")
     return ["train", *others, "--name", name, *(f"--set={key}={value}" for key, value in settings.items())]
+
+
+def _resume(named: Path, runs: Path, name: str | None, place: Place, launch: int, agree: Agree) -> list[str]:
+    """Goes on from the checkpoint `named`, or from the newest that all ranks have of the run `named`.
+
+    Without another name the run goes on in its directory, and checkpoints that not all have are given up.
+    """
+    is_checkpoint = named.parent.name == "checkpoints"
+    run = named.parents[1] if is_checkpoint else next((at for at in (runs / named, named) if at.is_dir()), runs / named)
+    own = run.with_name(place.named(run.name))
+    folder = own / "checkpoints"
+    newest = named.name if is_checkpoint else _newest_of_all(folder, place, agree)
+    if is_checkpoint or name is not None:
+        return ["--resume", str(folder / newest), "--name", place.named(name or f"{run.name}-p{launch}")]
+    for checkpoint in folder.glob("update-*"):
+        if checkpoint.name > newest:
+            shutil.rmtree(checkpoint)
+    (folder / LATEST).write_text(newest)
+    return ["--resume", str(own)]
+
+
+def _newest_of_all(folder: Path, place: Place, agree: Agree) -> str:
+    common = set.intersection(*agree(place, [checkpoint.name for checkpoint in sound_checkpoints(folder)]))
+    if not common:
+        raise ResumeError(f"{folder}: no checkpoint here that all {place.ranks} ranks have, each on its machine")
+    return max(common)
+
+
+def tell_each_other(place: Place, own: list[str]) -> list[set[str]]:
+    """By the store that `torchrun` keeps for its processes."""
+    from torch.distributed import TCPStore
+
+    address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+    attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+    store = TCPStore(address, port, is_master=False, timeout=WAIT_AT_MOST)
+    store.set(f"caraware/{attempt}/checkpoints/{place.rank}", json.dumps(own))
+    return [set(json.loads(store.get(f"caraware/{attempt}/checkpoints/{rank}"))) for rank in range(place.ranks)]
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -72,11 +129,16 @@ def main(arguments: Sequence[str]) -> int:
     except ProgramError as error:
         print(error, file=sys.stderr)
         return 3
+    try:
+        words = command(arguments, place, os.getppid(), tell_each_other)
+    except ResumeError as error:
+        print(error, file=sys.stderr)
+        return 2
     os.sched_setaffinity(0, place.cores(sorted(os.sched_getaffinity(0))))
     # Whatever ends torchrun ends its runs; what they started ends with them.
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     os.environ.setdefault("CARAWARE_PYTHON", sys.executable)
-    os.execv(program, [str(program), *command(arguments, place, os.getppid())])
+    os.execv(program, [str(program), *words])
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from caraware.config import RunConfig
     from caraware.loop import Learner
+    from caraware.ranks import Ranks
 
 log = logging.getLogger("caraware.train")
 
@@ -130,7 +131,7 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
         if succession.is_shadow:
             return
     else:
-        learner = _resumed(config)
+        learner = _resumed(config, together)
     first_ticks = [learner.first_tick(index) if learner else 0 for index in range(len(config.environments))]
     channel = Channel(str(run_file), first_ticks[0])
     loop = TrainingLoop(
@@ -151,7 +152,7 @@ def _train(run_file: Path, stop: StopSignal, succession: Succession) -> None:
     together.close()
 
 
-def _resumed(config: "RunConfig") -> "Learner | None":
+def _resumed(config: "RunConfig", ranks: "Ranks") -> "Learner | None":
     """A learner that stands where the checkpoint does that the run begins with; None if it begins anew."""
     from caraware.checkpoint import remove_partial
     from caraware.loop import Learner
@@ -160,7 +161,7 @@ def _resumed(config: "RunConfig") -> "Learner | None":
     if config.resume_from is None:
         return None
     remove_partial(config.run_dir / "checkpoints")
-    learner = Learner.begin(config, read_manifest(config.resume_from).observation_size)
+    learner = Learner.begin(config, read_manifest(config.resume_from).observation_size, ranks)
     log.info("resumed from %s at tick %d", config.resume_from, learner.first_tick())
     return learner
 
