@@ -70,7 +70,7 @@ impl<'a> Run<'a> {
             .spawn()
             .unwrap();
         let run_file = workplace.path().join("runs").join(name).join("run.json");
-        let (node, file, board) = common::until(&mut child, || {
+        let (node, file, board) = common::until(&mut child, "a board", || {
             let file = RunFile::read(&run_file).ok()?;
             let node = services::node(&file.shared_memory).ok()?;
             let board = BoardReader::open(&node, &file, 0, Process::TrafficBridge).ok()?;
@@ -116,7 +116,9 @@ impl<'a> Run<'a> {
 
     fn until_ticks(&mut self, ticks: u64) {
         let board = &self.board;
-        common::until(&mut self.child, || (board.health().ticks >= ticks).then_some(()));
+        common::until(&mut self.child, "ticks", || {
+            (board.health().ticks >= ticks).then_some(())
+        });
     }
 
     /// Lets it run to its end; the hash of everything observed.

@@ -13,7 +13,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use common::{Spectator, Workplace};
+use common::{CURRICULUM, Spectator, Workplace};
 use ipc_schema::{
     block,
     observation::{ObservationLayout, VALID},
@@ -25,27 +25,19 @@ use ipc_schema::{
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Three steps of which the first goes on and on, a horizon that ends within lessons, gates of σ that some updates pass.
-const SMALL: [&str; 15] = [
-    "curriculum.steps=[{cavs=1,restart=false,until_std=0.66},{cavs=1,ticks=350,until_std=0.63,noise=2.0},{cavs=5,ticks=100,until_std=0.6}]",
-    "episode.ticks=450",
-    "episode.training_episodes=60",
+/// Of [`CURRICULUM`] without evaluations in between.
+const MORE: [&str; 3] = [
     "episode.evaluation_interval=0",
-    "episode.evaluation_ticks=80",
-    "episode.final_evaluations=1",
-    "trainer.horizon=500",
-    "trainer.batch_size=100",
-    "trainer.hidden=[32, 32]",
-    "trainer.learning_rate=1e-3",
     "trainer.checkpoint_interval=2",
-    "trainer.matmul_precision=float32",
     "run.window_ticks=16",
-    "traffic.others=2",
-    "fanout.enabled=false",
 ];
 
 fn arguments<'a>(mode: &'a str, name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-    let settings = SMALL.iter().chain(more).flat_map(|setting| ["--set", setting]);
+    let settings = CURRICULUM
+        .iter()
+        .chain(&MORE)
+        .chain(more)
+        .flat_map(|setting| ["--set", setting]);
     [mode, "paper", "--name", name].into_iter().chain(settings).collect()
 }
 

@@ -11,10 +11,9 @@ mod common;
 use std::{
     path::Path,
     process::{Child, Stdio},
-    time::{Duration, Instant},
 };
 
-use common::{Workplace, shared_memory, text};
+use common::{Workplace, shared_memory, text, until};
 use ipc_schema::{
     ports::BoardReader,
     process::Process,
@@ -71,7 +70,7 @@ impl Live {
             .spawn()
             .unwrap();
         let path = workplace.path().join("runs").join(name).join("run.json");
-        let (node, file) = eventually(&mut child, || {
+        let (node, file) = until(&mut child, "boards", || {
             let file = RunFile::read(&path).ok()?;
             let node = services::node(&file.shared_memory).ok()?;
             BoardReader::open(&node, &file, file.config.run.envs - 1, Process::Trainer).ok()?;
@@ -83,7 +82,9 @@ impl Live {
     /// Kills a process once its environment has consumed or made `ticks`.
     fn kill(&mut self, process: Process, environment: u32, ticks: u64) {
         let board = BoardReader::open(&self.node, &self.file, environment, process).unwrap();
-        eventually(&mut self.child, || (board.health().ticks >= ticks).then_some(()));
+        until(&mut self.child, "ticks", || {
+            (board.health().ticks >= ticks).then_some(())
+        });
         kill_process(Pid::from_raw(board.health().pid).unwrap(), Signal::KILL).unwrap();
     }
 
@@ -93,19 +94,6 @@ impl Live {
         let output = self.child.wait_with_output().unwrap();
         (output.status.code(), text(&output))
     }
-}
-
-fn eventually<T>(child: &mut Child, mut ask: impl FnMut() -> Option<T>) -> T {
-    let deadline = Instant::now() + Duration::from_secs(120);
-    while Instant::now() < deadline {
-        if let Some(answer) = ask() {
-            return answer;
-        }
-        assert!(child.try_wait().unwrap().is_none(), "the run is over");
-        std::thread::park_timeout(Duration::from_millis(1));
-    }
-    child.kill().unwrap();
-    panic!("not within two minutes");
 }
 
 /// Nothing of the run is left in shared memory, in the registry or as a process.

@@ -94,18 +94,18 @@ fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
         let there = board.progress().attached == 1 && u64::from(board.progress().incarnation) == incarnation;
         (there && board.health().state == State::Running as u32).then_some(board.health().pid)
     };
-    until(&mut run, || works(0));
+    until(&mut run, "a first fan-out", || works(0));
     let logs = ["viewer", "victim"].map(|name| workplace.path().join(name));
     let viewer = watch("watched", 0, port, 15, &logs[0]);
     let mut victim = Victim(watch("watched", 0, port, 60, &logs[1]));
     // Both have seen a frame: what comes after a kill comes to a viewer that was there before.
-    until(&mut run, || {
+    until(&mut run, "frames", || {
         logs.iter()
             .all(|log| log.metadata().is_ok_and(|log| log.len() > 0))
             .then_some(())
     });
     for kill in 0..KILLS {
-        let pid = until(&mut run, || works(kill));
+        let pid = until(&mut run, "a fan-out", || works(kill));
         let moment = Instant::now();
         while moment.elapsed() < Duration::from_millis(kill * 137 % 400) {
             std::thread::park_timeout(Duration::from_millis(5));
@@ -115,7 +115,7 @@ fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
             victim.kill();
         }
     }
-    until(&mut run, || works(KILLS));
+    until(&mut run, "the last fan-out", || works(KILLS));
     let frames = || std::fs::read_to_string(&logs[0]).unwrap().lines().count();
     let before_the_last = frames();
     let seen = count(viewer);
@@ -148,7 +148,7 @@ fn every_environment_of_a_run_is_shown() {
     let mut run = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let spectator = Spectator::join(&workplace.path().join("runs/watched/run.json"), &mut run);
     let board = spectator.board(Process::Fanout);
-    until(&mut run, || (board.progress().attached == 1).then_some(()));
+    until(&mut run, "a trainer", || (board.progress().attached == 1).then_some(()));
     let viewers = [0, 1].map(|env| {
         let log = workplace.path().join(format!("viewer-{env}"));
         watch("watched", env, port, 8, &log)

@@ -10,7 +10,7 @@ mod common;
 
 use std::{collections::BTreeMap, process::Stdio};
 
-use common::{Spectator, Workplace, until};
+use common::{Spectator, Workplace, caught};
 use ipc_schema::{
     block,
     header::{LAST_OF_RUN, MessageHeader},
@@ -62,7 +62,7 @@ fn watch(workplace: &Workplace, name: &str, settings: &[&str]) -> Watched {
     };
     let mut is_over = false;
     while !is_over {
-        let header = until(&mut run, || {
+        let header = caught(&mut run, "a scan", || {
             while let Some(message) = clouds.receive().unwrap() {
                 let header = *message.header();
                 let layout = PointcloudLayout::new(header.count as usize);

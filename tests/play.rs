@@ -10,7 +10,7 @@ mod common;
 
 use std::process::{Output, Stdio};
 
-use common::{Spectator, Workplace, text, until};
+use common::{Spectator, Workplace, caught, text, until};
 use ipc_schema::services::Channel;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
@@ -96,7 +96,7 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
         .unwrap();
     let spectator = Spectator::join(&workplace.path().join("runs/on/run.json"), &mut run);
     let predictions = spectator.subscribe(Channel::Prediction);
-    let message = until(&mut run, || predictions.receive().unwrap());
+    let message = caught(&mut run, "a prediction", || predictions.receive().unwrap());
     assert_eq!(
         (message.header().columns, message.header().sequence),
         (2, 2),
@@ -108,7 +108,9 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
         let live: Value = serde_json::from_str(&std::fs::read_to_string(&file).ok()?).ok()?;
         live["table"]["episode"].as_u64()
     };
-    until(&mut run, || episode().filter(|episode| *episode >= 5));
+    until(&mut run, "the sixth episode", || {
+        episode().filter(|episode| *episode >= 5)
+    });
     kill_process(Pid::from_child(&run), Signal::INT).unwrap();
     assert_eq!(run.wait().unwrap().code(), Some(130));
     let report = workplace.report("on");

@@ -140,7 +140,7 @@ impl Run {
 
     fn board(&mut self, process: Process) -> BoardReader {
         let run_file = self.directory.join("run.json");
-        common::until(&mut self.child, || {
+        common::until(&mut self.child, "a board", || {
             let file = RunFile::read(&run_file).ok()?;
             let node = services::node(&file.shared_memory).ok()?;
             let board = BoardReader::open(&node, &file, 0, process).ok()?;
@@ -233,7 +233,7 @@ fn another_host_sees_the_run_and_is_refused_without_a_password() {
         message.contains("refused by") && message.contains("--user and --password-file"),
         "{message}"
     );
-    common::until(&mut run.child, || {
+    common::until(&mut run.child, "a refusal", || {
         let log = std::fs::read_to_string(run.directory.join("logs/fanout.log")).ok()?;
         log.contains("no user and password given").then_some(())
     });
@@ -261,7 +261,7 @@ fn another_host_sees_the_run_and_is_refused_without_a_password() {
         .read_line(&mut said)
         .unwrap();
     assert!(said.contains("watching run shown"), "{said}");
-    common::until(&mut run.child, || {
+    common::until(&mut run.child, "a recording", || {
         (std::fs::metadata(&recording).ok()?.len() > 20_000).then_some(())
     });
     watching.kill().unwrap();
@@ -278,7 +278,9 @@ fn another_host_sees_the_run_and_is_refused_without_a_password() {
     assert_eq!(output.status.code(), Some(1), "{}", text(&output));
     assert!(text(&output).contains("fanout.commanders"), "{}", text(&output));
     let before = board.health().ticks;
-    common::until(&mut run.child, || (board.health().ticks > before + 5).then_some(()));
+    common::until(&mut run.child, "ticks", || {
+        (board.health().ticks > before + 5).then_some(())
+    });
     assert_eq!(board.health().episode, 0, "a reader has begun the episode anew");
 
     let output = command(carol, &carol_pw, "pause");

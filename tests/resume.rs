@@ -13,7 +13,7 @@ use std::{
     process::{Output, Stdio},
 };
 
-use common::{Workplace, text, until};
+use common::{CURRICULUM, Workplace, text, until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -104,7 +104,9 @@ fn a_run_that_goes_on_ends_where_the_one_does_that_was_never_stopped() {
         .spawn()
         .unwrap();
     let checkpoints = run_dir(&workplace, "cut").join("checkpoints");
-    until(&mut run, || checkpoints.join("update-000006").exists().then_some(()));
+    until(&mut run, "a checkpoint", || {
+        checkpoints.join("update-000006").exists().then_some(())
+    });
     refused(
         &workplace.run(&["train", "--resume", "cut"]),
         2,
@@ -178,7 +180,7 @@ fn stop_and_go_on(workplace: &Workplace, name: &str, arguments: &[&str], kept: &
     let mut command = workplace.command(&pace);
     let mut run = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let checkpoint = run_dir(workplace, name).join("checkpoints").join(kept);
-    until(&mut run, || checkpoint.exists().then_some(()));
+    until(&mut run, kept, || checkpoint.exists().then_some(()));
     kill_process(Pid::from_child(&run), Signal::INT).unwrap();
     assert_eq!(run.wait().unwrap().code(), Some(130));
     workplace.succeed(&["train", "--resume", name, "--set", "run.real_time_factor=0"]);
@@ -204,32 +206,17 @@ fn every_environment_goes_on_where_it_stood() {
     workplace.assert_nothing_left();
 }
 
-/// Three steps of which the first goes on and on, and a horizon that ends within lessons; evaluations in between.
-const CURRICULUM: [&str; 12] = [
-    "curriculum.steps=[{cavs=1,restart=false,until_std=0.66},{cavs=1,ticks=350,until_std=0.63,noise=2.0},{cavs=5,ticks=100,until_std=0.6}]",
-    "episode.ticks=450",
-    "episode.training_episodes=60",
-    "episode.evaluation_interval=4",
-    "episode.evaluation_ticks=80",
-    "episode.final_evaluations=1",
-    "trainer.horizon=500",
-    "trainer.batch_size=100",
-    "trainer.hidden=[32, 32]",
-    "trainer.learning_rate=1e-3",
-    "trainer.supervised=false",
-    "traffic.others=2",
-];
-
 #[test]
 fn a_curriculum_goes_on_with_its_lessons() {
     let workplace = Workplace::new();
-    let settings = SMALL[10..]
-        .iter()
-        .chain(&["trainer.checkpoint_interval=1", "trainer.checkpoint_keep_every=1"]);
-    let settings: Vec<&str> = settings
-        .chain(&CURRICULUM)
-        .flat_map(|setting| ["--set", setting])
-        .collect();
+    let more = [
+        "episode.evaluation_interval=4",
+        "trainer.supervised=false",
+        "trainer.checkpoint_interval=1",
+        "trainer.checkpoint_keep_every=1",
+    ];
+    let settings = CURRICULUM.iter().chain(&more).flat_map(|setting| ["--set", setting]);
+    let settings: Vec<&str> = settings.collect();
     let arguments = |name| [&["train", "paper", "--name", name][..], &settings].concat();
     workplace.succeed(&arguments("whole"));
     let log = |name: &str| std::fs::read_to_string(run_dir(&workplace, name).join("actions.jsonl")).unwrap();

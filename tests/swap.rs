@@ -15,7 +15,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use common::{Workplace, shared_memory, text};
+use common::{Workplace, shared_memory, text, until};
 use ipc_schema::{
     board::{Health, Progress},
     ports::BoardReader,
@@ -71,7 +71,7 @@ impl Run {
             .spawn()
             .unwrap();
         let directory = workplace.path().join("runs").join(name);
-        let (node, trainer, sensing) = eventually(&mut child, "boards", || {
+        let (node, trainer, sensing) = until(&mut child, "boards", || {
             let run = RunFile::read(&directory.join("run.json")).ok()?;
             let node = services::node(&run.shared_memory).ok()?;
             let trainer = BoardReader::open(&node, &run, 0, Process::Trainer).ok()?;
@@ -90,7 +90,7 @@ impl Run {
     /// Waits until `condition` holds of the trainer that is at work.
     fn until(&mut self, what: &str, condition: impl Fn(Progress, Health) -> bool) {
         let trainer = &self.trainer;
-        eventually(&mut self.child, what, || {
+        until(&mut self.child, what, || {
             condition(trainer.progress(), trainer.health()).then_some(())
         });
     }
@@ -122,21 +122,6 @@ impl Run {
     fn log(&self) -> String {
         std::fs::read_to_string(self.directory.join("logs/trainer.log")).unwrap_or_default()
     }
-}
-
-/// Asks until there is an answer, or the run is over.
-fn eventually<T>(child: &mut Child, what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
-    let deadline = Instant::now() + Duration::from_secs(120);
-    while Instant::now() < deadline {
-        if let Some(answer) = ask() {
-            return answer;
-        }
-        let over = child.try_wait().unwrap();
-        assert!(over.is_none(), "{what}: the run is over: {over:?}");
-        std::thread::park_timeout(Duration::from_millis(1));
-    }
-    child.kill().unwrap();
-    panic!("{what}: not within two minutes");
 }
 
 /// Nothing of the run is left in shared memory, in the registry or as a process, and nothing half-written in its directory.

@@ -14,7 +14,7 @@ use std::{
     process::{Child, Stdio},
 };
 
-use common::{Spectator, Workplace, until};
+use common::{Spectator, Workplace, caught};
 use ipc_schema::{
     block,
     header::LAST_OF_RUN,
@@ -51,7 +51,7 @@ fn receive(run_file: &Path, run: &mut Child) -> Vec<Vec<Moved>> {
     let world = spectator.subscribe(Channel::World);
     let mut ticks: Vec<Vec<Moved>> = Vec::new();
     loop {
-        let message = until(run, || world.receive().unwrap());
+        let message = caught(run, "a tick", || world.receive().unwrap());
         let header = *message.header();
         assert_eq!(header.tick, ticks.len() as u64, "a tick was missed");
         let layout = WorldLayout::new(header.count as usize, header.columns as usize);

@@ -167,7 +167,7 @@ impl Spectator {
     /// Joins the run as soon as it is there.
     pub fn join(run_file: &Path, run: &mut Child) -> Self {
         let started = run_file.with_file_name("logs").join("traffic-bridge.log");
-        until(run, || {
+        caught(run, "services", || {
             // Processes start when all services are there: looking earlier would meet them half made.
             started.exists().then_some(())?;
             let file = RunFile::read(run_file).ok()?;
@@ -186,20 +186,46 @@ impl Spectator {
     }
 }
 
+/// Of the preset `paper`: three steps of which the first goes on and on, a horizon that ends within lessons, gates of σ that some
+/// updates pass.
+pub const CURRICULUM: [&str; 12] = [
+    "curriculum.steps=[{cavs=1,restart=false,until_std=0.66},{cavs=1,ticks=350,until_std=0.63,noise=2.0},{cavs=5,ticks=100,until_std=0.6}]",
+    "episode.ticks=450",
+    "episode.training_episodes=60",
+    "episode.evaluation_ticks=80",
+    "episode.final_evaluations=1",
+    "trainer.horizon=500",
+    "trainer.batch_size=100",
+    "trainer.hidden=[32, 32]",
+    "trainer.learning_rate=1e-3",
+    "trainer.matmul_precision=float32",
+    "traffic.others=2",
+    "fanout.enabled=false",
+];
+
 /// What `ask` answers, asked again and again while the run lives.
-pub fn until<T>(run: &mut Child, mut ask: impl FnMut() -> Option<T>) -> T {
+pub fn until<T>(run: &mut Child, what: &str, ask: impl FnMut() -> Option<T>) -> T {
+    asked(run, what, ask, || std::thread::park_timeout(Duration::from_millis(1)))
+}
+
+/// The same of what is gone soon after it is there, as a message when the run is over: without a pause.
+pub fn caught<T>(run: &mut Child, what: &str, ask: impl FnMut() -> Option<T>) -> T {
+    asked(run, what, ask, std::thread::yield_now)
+}
+
+fn asked<T>(run: &mut Child, what: &str, mut ask: impl FnMut() -> Option<T>, pause: impl Fn()) -> T {
     let begin = Instant::now();
     loop {
         // Looked at first: what the run said last is there once it has ended.
-        let has_ended = run.try_wait().unwrap().is_some();
+        let over = run.try_wait().unwrap();
         if let Some(answer) = ask() {
             return answer;
         }
-        if begin.elapsed() > Duration::from_mins(1) {
+        if begin.elapsed() > Duration::from_mins(2) {
             run.kill().unwrap();
-            panic!("nothing came for a minute");
+            panic!("{what}: not within two minutes");
         }
-        assert!(!has_ended, "the run ended early");
-        std::thread::yield_now();
+        assert!(over.is_none(), "{what}: the run is over: {over:?}");
+        pause();
     }
 }
