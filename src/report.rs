@@ -218,55 +218,16 @@ fn hashes(report: &Value) -> Vec<String> {
 /// The report in a few lines for the terminal.
 #[must_use]
 pub fn summary(report: &Value, path: &Path) -> String {
-    let number = |key: &str, digits: usize| {
-        report[key]
-            .as_f64()
-            .map_or("–".into(), |value| format!("{value:.digits$}"))
-    };
-    let error = |name: &str| match report[format!("{name}_ci95_m")].as_f64() {
-        Some(half_m) => format!("{} ± {half_m:.2} m", number(&format!("{name}_mean_error_m"), 2)),
-        None => format!("{} m", number(&format!("{name}_mean_error_m"), 2)),
-    };
     let mut lines = vec![format!(
         "{} {}: {} vehicle-steps in {} s ({} per second, {} × real time)",
         report["name"].as_str().unwrap_or_default(),
         report["result"].as_str().unwrap_or_default(),
         report["vehicle_steps"],
-        number("wall_s", 1),
-        number("env_steps_per_s", 0),
-        number("real_time_factor", 1),
+        number(report, "wall_s", 1),
+        number(report, "env_steps_per_s", 0),
+        number(report, "real_time_factor", 1),
     )];
-    if !report["ppo_mean_error_m"].is_null() {
-        let seeds = match report["evaluation_seeds"].as_u64() {
-            Some(seeds) if seeds > 1 => format!("{seeds} unseen seeds (± 95 %)"),
-            _ => "unseen seeds".to_owned(),
-        };
-        lines.push(format!(
-            "mean error on {seeds}: policy {}, raw GNSS {}   (policy σ {})",
-            error("ppo"),
-            error("raw_gnss"),
-            number("policy_std", 3)
-        ));
-    }
-    if !report["supervised_mean_error_m"].is_null() {
-        lines.push(format!(
-            "from the same samples: the policy's network taught by regression to the truth {}",
-            error("supervised")
-        ));
-    }
-    if !report["ekf_mean_error_m"].is_null() {
-        lines.push(format!(
-            "from the same samples: EKF {}{}",
-            error("ekf"),
-            match report["rts_mean_error_m"].is_null() {
-                true => String::new(),
-                false => format!(
-                    ", RTS smoother {} (sees the future: a bound, not an estimator)",
-                    error("rts")
-                ),
-            }
-        ));
-    }
+    lines.extend(errors(report));
     let heroes = &report["dynamics"]["heroes"];
     if !heroes.is_null() {
         lines.push(format!(
@@ -293,4 +254,49 @@ pub fn summary(report: &Value, path: &Path) -> String {
     lines.extend(hashes(report));
     lines.push(format!("report: {}", path.display()));
     lines.join("\n")
+}
+
+/// A number of the report with so many decimals; a dash where there is none.
+fn number(report: &Value, key: &str, digits: usize) -> String {
+    report[key]
+        .as_f64()
+        .map_or("–".into(), |value| format!("{value:.digits$}"))
+}
+
+/// Mean errors of the policy and of what it is compared with.
+fn errors(report: &Value) -> Vec<String> {
+    let error = |name: &str| {
+        let mean = number(report, &format!("{name}_mean_error_m"), 2);
+        match report[format!("{name}_ci95_m")].as_f64() {
+            Some(half_m) => format!("{mean} ± {half_m:.2} m"),
+            None => format!("{mean} m"),
+        }
+    };
+    let measured = |name: &str| !report[format!("{name}_mean_error_m")].is_null();
+    let mut lines = Vec::new();
+    if measured("ppo") {
+        let seeds = match report["evaluation_seeds"].as_u64() {
+            Some(seeds) if seeds > 1 => format!("{seeds} unseen seeds (± 95 %)"),
+            _ => "unseen seeds".to_owned(),
+        };
+        lines.push(format!(
+            "mean error on {seeds}: policy {}, raw GNSS {}   (policy σ {})",
+            error("ppo"),
+            error("raw_gnss"),
+            number(report, "policy_std", 3)
+        ));
+    }
+    if measured("supervised") {
+        let by = "the policy's network taught by regression to the truth";
+        lines.push(format!("from the same samples: {by} {}", error("supervised")));
+    }
+    if measured("ekf") {
+        let mut line = format!("from the same samples: EKF {}", error("ekf"));
+        if measured("rts") {
+            let note = "sees the future: a bound, not an estimator";
+            line += &format!(", RTS smoother {} ({note})", error("rts"));
+        }
+        lines.push(line);
+    }
+    lines
 }

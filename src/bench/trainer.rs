@@ -65,65 +65,64 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
             measured.update_s.ours.len()
         ),
     );
-    let (update, horizon) = (&measured.update_s, &measured.horizon_s);
-    let mut updates = Table::new(
-        "",
-        &["one update", "sample-visits/s", "ours is faster by", "smallest–largest"],
-    );
-    updates.row([
+    report.tables = vec![
+        updates(&mut report, &measured.update_s)?,
+        rollouts(&mut report, &measured.horizon_s)?,
+        ticks(&mut report, &measured.ticks),
+    ];
+    Ok(report)
+}
+
+fn updates(report: &mut Report, seconds: &Update) -> Result<Table, Exit> {
+    let visits = HORIZON * EPOCHS;
+    let columns = ["one update", "sample-visits/s", "ours is faster by", "smallest–largest"];
+    let mut table = Table::new("", &columns);
+    table.row([
         "ours".into(),
-        rate(&update.ours, HORIZON * EPOCHS)?,
+        rate(&seconds.ours, visits)?,
         String::new(),
         String::new(),
     ]);
     for (name, theirs) in [
-        ("plain loop (CleanRL's manner)", &update.plain),
-        ("Stable-Baselines3's PPO", &update.sb3),
+        ("plain loop (CleanRL's manner)", &seconds.plain),
+        ("Stable-Baselines3's PPO", &seconds.sb3),
     ] {
-        let [ratio, range] = compare(&mut report, &format!("update, ratio to {name}"), &update.ours, theirs)?;
-        updates.row([name.into(), rate(theirs, HORIZON * EPOCHS)?, ratio, range]);
+        let [ratio, range] = compare(report, &format!("update, ratio to {name}"), &seconds.ours, theirs)?;
+        table.row([name.into(), rate(theirs, visits)?, ratio, range]);
     }
-    let mut rollouts = Table::new(
-        "",
-        &[
-            "rollout and update, environment for nothing",
-            "env-steps/s",
-            "ours is faster by",
-            "smallest–largest",
-        ],
-    );
-    rollouts.row([
-        "ours, 8 vehicles".into(),
-        rate(&horizon.ours, HORIZON)?,
-        String::new(),
-        String::new(),
-    ]);
-    let [ratio, range] = compare(
-        &mut report,
-        "rollout and update, ratio to Stable-Baselines3's PPO",
-        &horizon.ours,
-        &horizon.sb3,
-    )?;
-    rollouts.row([
-        "Stable-Baselines3's PPO, 8 environments".into(),
-        rate(&horizon.sb3, HORIZON)?,
-        ratio,
-        range,
-    ]);
-    let mut ticks = Table::new(
-        "",
-        &[
-            "vehicles in a tick",
-            "µs/tick",
-            "of these the policy's forward pass",
-            "µs/vehicle",
-            "calls from Python/tick",
-        ],
-    );
-    for tick in &measured.ticks {
+    Ok(table)
+}
+
+fn rollouts(report: &mut Report, seconds: &Horizon) -> Result<Table, Exit> {
+    let columns = [
+        "rollout and update, environment for nothing",
+        "env-steps/s",
+        "ours is faster by",
+        "smallest–largest",
+    ];
+    let mut table = Table::new("", &columns);
+    let ours = rate(&seconds.ours, HORIZON)?;
+    table.row(["ours, 8 vehicles".into(), ours, String::new(), String::new()]);
+    let name = "rollout and update, ratio to Stable-Baselines3's PPO";
+    let [ratio, range] = compare(report, name, &seconds.ours, &seconds.sb3)?;
+    let theirs = rate(&seconds.sb3, HORIZON)?;
+    table.row(["Stable-Baselines3's PPO, 8 environments".into(), theirs, ratio, range]);
+    Ok(table)
+}
+
+fn ticks(report: &mut Report, ticks: &[Tick]) -> Table {
+    let columns = [
+        "vehicles in a tick",
+        "µs/tick",
+        "of these the policy's forward pass",
+        "µs/vehicle",
+        "calls from Python/tick",
+    ];
+    let mut table = Table::new("", &columns);
+    for tick in ticks {
         #[expect(clippy::cast_precision_loss, reason = "some thousands")]
         let each = tick.us_per_tick / tick.vehicles as f64;
-        ticks.row([
+        table.row([
             tick.vehicles.to_string(),
             format!("{:.0}", tick.us_per_tick),
             format!("{:.0}", tick.forward_us_per_tick),
@@ -135,8 +134,7 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
             tick.calls_per_tick,
         );
     }
-    report.tables = vec![updates, rollouts, ticks];
-    Ok(report)
+    table
 }
 
 /// Median rate of rounds of `amount` each.
