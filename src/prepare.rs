@@ -181,7 +181,7 @@ fn resolve(args: &RunArgs) -> Result<(Settings, Named, String), Exit> {
         Some("sumocfg") => {
             let scenario = scenario::read(path)?;
             let mut settings = defaults.with_assignments(&args.set)?;
-            suggest_scenario(&mut settings, &scenario, name);
+            suggest_scenario(&mut settings, &scenario, name)?;
             let path = std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error))?;
             Ok((settings, Named::Scenario(path, scenario), label))
         }
@@ -201,8 +201,17 @@ fn resolve(args: &RunArgs) -> Result<(Settings, Named, String), Exit> {
     }
 }
 
-/// A scenario's own step and seed count, unless the user says otherwise.
-fn suggest_scenario(settings: &mut Settings, scenario: &Scenario, source: &str) {
+/// A scenario's own step and seed count, unless the user says otherwise, and its own road users.
+fn suggest_scenario(settings: &mut Settings, scenario: &Scenario, source: &str) -> Result<(), Exit> {
+    for (path, none) in [("traffic.cavs", 1), ("traffic.others", 0), ("traffic.pedestrians", 0)] {
+        if settings.is_set_by_user(path) {
+            return Err(Exit::config(
+                format!("`{path}` is for maps with population control, and {source} has its own road users"),
+                "traffic.cav_share says how many of its vehicles carry sensors; traffic.scale changes its demand",
+            ));
+        }
+        settings.suggest(path, Value::from(none), source);
+    }
     settings.suggest(
         "traffic.step_s",
         Value::from(scenario.step_s.unwrap_or(SUMO_STEP_S)),
@@ -210,6 +219,7 @@ fn suggest_scenario(settings: &mut Settings, scenario: &Scenario, source: &str) 
     );
     settings.suggest("run.seed", Value::from(scenario.seed.unwrap_or(SUMO_SEED)), source);
     settings.suggest("traffic.max_road_users", Value::from(SCENARIO_ROAD_USERS), source);
+    Ok(())
 }
 
 /// Actions need somebody who gives them, and heroes that the source of traffic has.

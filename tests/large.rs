@@ -8,7 +8,7 @@
 
 mod common;
 
-use common::{Workplace, sumo_program, tool};
+use common::{Workplace, sumo_program, text, tool};
 use serde_json::Value;
 
 const QUIET: [&str; 2] = ["--set", "fanout.enabled=false"];
@@ -84,6 +84,27 @@ fn neither_the_window_nor_a_consumer_changes_what_is_observed_at_long_steps() {
         );
     }
     workplace.assert_nothing_left();
+}
+
+#[test]
+fn a_generated_city_runs_as_its_generator_says() {
+    let workplace = Workplace::new();
+    let city = [
+        "--vehicles",
+        "12",
+        "--duration-s",
+        "2",
+        "--block-m",
+        "500",
+        "--speed-kmh",
+        "100",
+    ];
+    let said = text(&workplace.succeed(&[&["generate", "country"], &city[..]].concat()));
+    let command = said.lines().find_map(|line| line.strip_prefix("caraware ")).unwrap();
+    let arguments: Vec<&str> = command.split_whitespace().chain(["--name", "said"]).collect();
+    workplace.succeed(&arguments);
+    // Their own number, not that of the preset's vehicles.
+    assert_eq!(workplace.report("said")["vehicles"], 12);
 }
 
 /// Vehicles of every kind that roads and rails carry, and a person.
