@@ -59,7 +59,8 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
         "The learner",
         format!(
             "The paper's networks (9 → 500 → 300, policy and value apart), horizon 32 768, batch 2 048, four epochs, {} threads, {} matrix \
-             products; all learners alternate in one process, median of {} rounds.",
+             products, PPO alone (the network that is taught beside it, `trainer.supervised`, is left out); all learners alternate in one \
+             process, median of {} rounds.",
             measured.threads,
             measured.precision,
             measured.update_s.ours.len()

@@ -45,6 +45,7 @@ def main() -> None:
         threads=options.threads,
         matmul_precision=options.precision,
         device=options.device,
+        supervised=False,
     )
     ppo = Ppo(config, OBSERVATIONS, MapBounds(0.0, 0.0, 220.0, 220.0))
     threads_ours, precision_ours = torch.get_num_threads(), torch.get_float32_matmul_precision()

@@ -1,10 +1,8 @@
 """Adam (Kingma & Ba, arXiv 1412.6980, algorithm 1) over one flat vector of parameters.
 
-Five operations on one tensor cost about 1 % of a gradient step. torch's own optimiser is no faster here, and
-importing it pulls in torch's compiler: seconds before the first tick.
+By torch's fused step, one pass over the four vectors instead of seven. `torch.optim.Adam(fused=True)` takes the same,
+but importing it pulls in torch's compiler: seconds before the first tick.
 """
-
-import math
 
 import torch
 
@@ -23,15 +21,22 @@ class Adam:
         self.square = torch.zeros_like(parameters.values)
         self.steps = torch.zeros((), dtype=torch.int64)
         self._parameters = parameters
-        self._scratch = torch.empty_like(parameters.values)
 
     def step(self, learning_rate: float) -> None:
         """Move the parameters against their gradient."""
-        gradient = self._parameters.gradient
         self.steps += 1
-        step = int(self.steps)
-        self.mean.lerp_(gradient, 1 - BETA_MEAN)
-        self.square.mul_(BETA_SQUARE).addcmul_(gradient, gradient, value=1 - BETA_SQUARE)
-        scale = torch.sqrt(self.square, out=self._scratch)
-        scale.div_(math.sqrt(1 - BETA_SQUARE**step)).add_(EPSILON)
-        self._parameters.values.addcdiv_(self.mean, scale, value=-learning_rate / (1 - BETA_MEAN**step))
+        torch._fused_adam_(
+            [self._parameters.values],
+            [self._parameters.gradient],
+            [self.mean],
+            [self.square],
+            [],
+            [self.steps.float()],
+            lr=learning_rate,
+            beta1=BETA_MEAN,
+            beta2=BETA_SQUARE,
+            weight_decay=0.0,
+            eps=EPSILON,
+            amsgrad=False,
+            maximize=False,
+        )

@@ -253,6 +253,7 @@ def main() -> None:
         learning_rate=1e-4,
         threads=options.threads,
         matmul_precision="float32",
+        supervised=False,
     )
     ppo = Ppo(config, OBSERVATIONS, BOUNDS)
     own_threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
