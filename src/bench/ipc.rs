@@ -35,8 +35,10 @@ const FIELDS: usize = 9;
 const ROUNDS: usize = 5;
 /// Bare messages in a round.
 const BARE: usize = 4_000;
-/// Turns that all sizes take within a round. The machine's pace changes from second to second: no size has a second of its own.
-const TURNS: usize = 20;
+/// Turns that all sizes take within a round. The machine's pace changes from second to second: no size has a second of its own. In every
+/// other turn the sender writes the whole block, as `sensor-daemon` does; in the others its first and last value, so that what it has
+/// in its caches does not depend on the size.
+const TURNS: usize = 40;
 /// Messages of a turn, and those at its beginning that are not measured.
 const MESSAGES: usize = 50;
 const WARM_UP: usize = 10;
@@ -80,11 +82,12 @@ struct Round {
 type BySize = BTreeMap<usize, Vec<f64>>;
 
 /// Ours: until the block is in the receiver's hands, until it is a tensor that is lent, and until it is a tensor of an observation that
-/// may be kept.
+/// may be kept; and the second of these where the sender has written two values of the block.
 struct Ours {
     taken: BySize,
     tensor: BySize,
     received: BySize,
+    hardly_written: BySize,
 }
 
 /// Rows whose block has `bytes` bytes.
@@ -123,11 +126,13 @@ fn ours() -> Result<Ours, Exit> {
     send_all(&run, &board, &mut receiver)?;
     receiver.wait_until("finish", || State::from_u32(board.health().state) == State::Done)?;
     let latencies: BTreeMap<String, BTreeMap<usize, Vec<[f64; 2]>>> = read(&run.run_dir.join("latencies.json"))?;
-    let of = |way: &str, which: usize| -> BySize {
+    let of = |way: &str, which: usize, first_turn: usize| -> BySize {
         let measured = |bytes: usize| {
             let all = latencies.get(way).and_then(|by_rows| by_rows.get(&rows(bytes)));
             let turns = all.map_or(&[][..], Vec::as_slice).chunks(MESSAGES / 2);
             turns
+                .skip(first_turn)
+                .step_by(2)
                 .flat_map(|turn| turn.iter().skip(WARM_UP / 2))
                 .map(|latencies| latencies[which])
                 .collect()
@@ -135,9 +140,10 @@ fn ours() -> Result<Ours, Exit> {
         SIZES.iter().map(|&bytes| (bytes, measured(bytes))).collect()
     };
     Ok(Ours {
-        taken: of("lent", 0),
-        tensor: of("lent", 1),
-        received: of("received", 1),
+        taken: of("lent", 0, 0),
+        tensor: of("lent", 1, 0),
+        received: of("received", 1, 0),
+        hardly_written: of("lent", 1, 1),
     })
 }
 
@@ -176,20 +182,10 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut Receiver) -> Resu
     let session = Session::join_from_outside(run.clone(), Process::SensorDaemon, 0, Arc::new(AtomicBool::new(false)))
         .map_err(failed)?;
     let publisher = session.publisher(Channel::Observation).map_err(failed)?;
-    let turns = (0..TURNS).flat_map(|_| SIZES);
-    let messages = turns.flat_map(|bytes| std::iter::repeat_n(rows(bytes), MESSAGES));
+    let turns = (0..TURNS).flat_map(|turn| SIZES.map(|bytes| (rows(bytes), turn % 2 == 0)));
+    let messages = turns.flat_map(|turn| std::iter::repeat_n(turn, MESSAGES));
     let last = (TURNS * SIZES.len() * MESSAGES - 1) as u64;
-    for (tick, rows) in (0..).zip(messages) {
-        let layout = ObservationLayout::new(rows, FIELDS, 1);
-        let mut draft = publisher.loan_unwritten(session.header(), layout.len)?;
-        let values: &mut [f32] = block::view_mut(draft.payload_mut(), layout.observation)
-            .map_err(|error| Exit::run(error.to_string(), ""))?;
-        #[expect(clippy::cast_precision_loss, reason = "numbers below 2^24")]
-        let (first, newest) = (rows as f32, tick as f32);
-        values.fill(first);
-        if let Some(value) = values.last_mut() {
-            *value = newest;
-        }
+    for (tick, (rows, whole)) in (0..).zip(messages) {
         let asked = Instant::now();
         while board.progress().consumed_ticks < tick {
             std::hint::spin_loop();
@@ -201,15 +197,28 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut Receiver) -> Resu
         while taken.elapsed() < PAUSE {
             std::hint::spin_loop();
         }
+        let layout = ObservationLayout::new(rows, FIELDS, 1);
+        let mut draft = publisher.loan_unwritten(session.header(), layout.len)?;
+        let values: &mut [f32] = block::view_mut(draft.payload_mut(), layout.observation)
+            .map_err(|error| Exit::run(error.to_string(), ""))?;
+        #[expect(clippy::cast_precision_loss, reason = "numbers below 2^24")]
+        let (first, newest) = (rows as f32, tick as f32);
+        if whole {
+            values.fill(first);
+        }
+        if let [begin, .., end] = values {
+            (*begin, *end) = (first, newest);
+        }
         *draft.header_mut() = MessageHeader {
             tick,
             count: u32::try_from(rows).unwrap_or(u32::MAX),
             columns: u32::try_from(FIELDS).unwrap_or(u32::MAX),
             sequence: 1,
             flags: if tick == last { LAST_OF_RUN } else { 0 },
-            sim_time_ns: monotonic_ns(),
             ..session.header()
         };
+        // The message is complete. Only the time is still to come.
+        draft.header_mut().sim_time_ns = monotonic_ns();
         draft.send()?;
     }
     Ok(())

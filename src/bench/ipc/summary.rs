@@ -51,10 +51,11 @@ type Told = BTreeMap<usize, Percentiles>;
 type Way = fn(&Ours) -> &BySize;
 
 /// What is told of ours, and where it is.
-const WAYS: [(&str, Way); 3] = [
+const WAYS: [(&str, Way); 4] = [
     ("taken", |ours| &ours.taken),
     ("tensor", |ours| &ours.tensor),
     ("tensor of an observation to keep", |ours| &ours.received),
+    ("tensor, two values written", |ours| &ours.hardly_written),
 ];
 
 /// The report over all rounds.
@@ -69,7 +70,9 @@ pub(super) fn report(rounds: &[Round], peers: &BTreeMap<String, BySize>) -> Resu
             "One way, from right before publish in one process, microseconds, both sides polling. Ours is the `observation` channel of a run \
              and `Channel.lease`, read in place whatever the size: until the block is in the receiver's hands, and until Python has a torch \
              tensor over it, which is lent until the next is taken. Every other tick comes by `Channel.receive(busy=True)`: a tensor of an \
-             observation with all its arrays that may be kept. The bare message is eight bytes between two Rust processes that poll \
+             observation with all its arrays that may be kept. The sender writes the whole block before it publishes, as `sensor-daemon` does; \
+             after 16 MiB its caches hold little of what publishing needs. Where it writes the first and the last value only, what is left is \
+             the size itself. The bare message is eight bytes between two Rust processes that poll \
              iceoryx2. Bare and ours alternate, {ROUNDS} rounds in which the sizes take turns; ratios are of medians of one round, the \
              median round (smallest–largest). The peers send the same number of bytes from Python to Python and make a tensor of what \
              arrives without further copies; they sleep until the kernel wakes them. One message is under way at a time."
