@@ -31,7 +31,7 @@ class Adam:
             [self.mean],
             [self.square],
             [],
-            [self.steps.float()],
+            [self.steps.to(self.mean.device, torch.float32)],
             lr=learning_rate,
             beta1=BETA_MEAN,
             beta2=BETA_SQUARE,
