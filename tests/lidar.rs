@@ -10,10 +10,10 @@ mod common;
 
 use std::{collections::BTreeMap, process::Stdio};
 
-use common::{Spectator, Workplace, caught};
+use common::{Spectator, Workplace};
 use ipc_schema::{
     block,
-    header::{LAST_OF_RUN, MessageHeader},
+    header::MessageHeader,
     pointcloud::{GROUND, LidarPoint, PointcloudLayout, STATIC_OBJECT, Scan, Tag},
     services::Channel,
     world::{VehicleState, WorldLayout},
@@ -60,27 +60,32 @@ fn watch(workplace: &Workplace, name: &str, settings: &[&str]) -> Watched {
         scans: BTreeMap::new(),
         world: BTreeMap::new(),
     };
-    let mut is_over = false;
-    while !is_over {
-        let header = caught(&mut run, "a scan", || {
-            while let Some(message) = clouds.receive().unwrap() {
-                let header = *message.header();
-                let layout = PointcloudLayout::new(header.count as usize);
-                let seen = Seen {
-                    header,
-                    scan: block::view::<Scan>(message.payload(), layout.scan).unwrap()[0],
-                    points: block::view(message.payload(), layout.points).unwrap().to_vec(),
-                };
-                watched.scans.insert((header.tick, header.sequence), seen);
-            }
-            let message = world.receive().unwrap()?;
+    // A spectator may miss messages, also the last.
+    loop {
+        let over = run.try_wait().unwrap().is_some();
+        let mut news = 0;
+        while let Some(message) = clouds.receive().unwrap() {
+            let header = *message.header();
+            let layout = PointcloudLayout::new(header.count as usize);
+            let seen = Seen {
+                header,
+                scan: block::view::<Scan>(message.payload(), layout.scan).unwrap()[0],
+                points: block::view(message.payload(), layout.points).unwrap().to_vec(),
+            };
+            watched.scans.insert((header.tick, header.sequence), seen);
+            news += 1;
+        }
+        while let Some(message) = world.receive().unwrap() {
             let header = *message.header();
             let layout = WorldLayout::new(header.count as usize, header.columns as usize);
             let states = block::view(message.payload(), layout.states).unwrap().to_vec();
             watched.world.insert(header.tick, states);
-            Some(header)
-        });
-        is_over = header.has(LAST_OF_RUN);
+            news += 1;
+        }
+        if over && news == 0 {
+            break;
+        }
+        std::thread::yield_now();
     }
     drop((clouds, world, spectator));
     let output = run.wait_with_output().unwrap();
