@@ -6,6 +6,7 @@ Imports nothing heavy: `python -m caraware.manifest RUN|CHECKPOINT newest|best` 
 import hashlib
 import json
 import logging
+import os
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -19,6 +20,8 @@ COURSE = "course.json"
 """How training went, and where the environments after the first stand."""
 LATEST, BEST = "latest", "best"
 """Files beside the checkpoints that name the newest, and the one whose evaluation had the least mean error."""
+NEWEST = "CARAWARE_NEWEST_CHECKPOINT"
+"""Environment variable: the name of the newest checkpoint of a run that counts. Ranks go on from one that all have."""
 OWN_HASH = "manifest_sha256"
 """Entry of the manifest: SHA-256 of all its other entries, as canonical JSON."""
 
@@ -172,7 +175,8 @@ def _choose(folder: Path, which: str) -> Path:
             return best
         except CheckpointError as error:
             log.warning("checkpoint refused, the newest is used: %s", error)
-    newest = newest_sound_checkpoint(folder)
+    limit = os.environ.get(NEWEST)
+    newest = next((each for each in sound_checkpoints(folder) if limit is None or each.name <= limit), None)
     if newest is None:
         raise CheckpointError(folder, "holds no checkpoint that can be used")
     return newest

@@ -9,7 +9,6 @@ import argparse
 import ctypes
 import json
 import os
-import shutil
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
-from caraware.manifest import LATEST, sound_checkpoints
+from caraware.manifest import NEWEST, sound_checkpoints
 from caraware.program import ProgramError, caraware_program
 
 PR_SET_PDEATHSIG = 1
@@ -83,10 +82,7 @@ def command(arguments: Sequence[str], place: Place, launch: int, agree: Agree) -
 
 
 def _resume(named: Path, runs: Path, name: str | None, place: Place, launch: int, agree: Agree) -> list[str]:
-    """Goes on from the checkpoint `named`, or from the newest that all ranks have of the run `named`.
-
-    Without another name the run goes on in its directory, and checkpoints that not all have are given up.
-    """
+    """Goes on from the checkpoint `named`, or from the newest that all ranks have of the run `named`."""
     is_checkpoint = named.parent.name == "checkpoints"
     run = named.parents[1] if is_checkpoint else next((at for at in (runs / named, named) if at.is_dir()), runs / named)
     own = run.with_name(place.named(run.name))
@@ -94,10 +90,7 @@ def _resume(named: Path, runs: Path, name: str | None, place: Place, launch: int
     newest = named.name if is_checkpoint else _newest_of_all(folder, place, agree)
     if is_checkpoint or name is not None:
         return ["--resume", str(folder / newest), "--name", place.named(name or f"{run.name}-p{launch}")]
-    for checkpoint in folder.glob("update-*"):
-        if checkpoint.name > newest:
-            shutil.rmtree(checkpoint)
-    (folder / LATEST).write_text(newest)
+    os.environ[NEWEST] = newest
     return ["--resume", str(own)]
 
 
