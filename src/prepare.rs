@@ -207,7 +207,7 @@ fn suggest_scenario(settings: &mut Settings, scenario: &Scenario, source: &str) 
         if settings.is_set_by_user(path) {
             return Err(Exit::config(
                 format!("`{path}` is for maps with population control, and {source} has its own road users"),
-                "traffic.cav_share says how many of its vehicles carry sensors; traffic.scale changes its demand",
+                "traffic.cav_share and traffic.max_cavs say how many of its vehicles carry sensors; traffic.scale changes its demand",
             ));
         }
         settings.suggest(path, Value::from(none), source);

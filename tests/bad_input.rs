@@ -393,5 +393,5 @@ fn map_of_a_curriculum_that_is_not_there_or_does_not_serve() {
     );
     // Whoever wants other vehicles than the scenario's own hears how.
     let said = refused(&workplace, &["simulate", "a.sumocfg", "--set", "traffic.cavs=8"], 2);
-    assert_says(&said, &["a.sumocfg has its own road users", "traffic.cav_share"]);
+    assert_says(&said, &["a.sumocfg has its own road users", "traffic.max_cavs"]);
 }

@@ -105,6 +105,16 @@ fn a_generated_city_runs_as_its_generator_says() {
     workplace.succeed(&arguments);
     // Their own number, not that of the preset's vehicles.
     assert_eq!(workplace.report("said")["vehicles"], 12);
+    let five = [
+        "simulate",
+        "country/city.sumocfg",
+        "--name",
+        "five",
+        "--set",
+        "traffic.max_cavs=5",
+    ];
+    workplace.succeed(&[&five[..], &QUIET].concat());
+    assert_eq!(workplace.report("five")["vehicles"], 5);
 }
 
 /// Vehicles of every kind that roads and rails carry, and a person.

@@ -147,6 +147,9 @@ pub struct Traffic {
     pub hero_ids: Vec<String>,
     /// Share of a scenario's own vehicles that carry sensors (`.sumocfg`).
     pub cav_share: f64,
+    /// Most of them at a time (`.sumocfg`); 0 = no limit.
+    #[serde(default)]
+    pub max_cavs: u32,
     /// Share of all trips, from road to road, that only evaluation episodes make, which make no others; 0 = none.
     pub held_out_trips: f64,
     /// Factor on a scenario's demand, SUMO's `--scale` (`.sumocfg`); `None` = as the scenario says.

@@ -202,6 +202,7 @@ pub const KEYS: &[Key] = &[
     other("traffic.hero_route", Kind::Texts, "Edges of the route of every hero, from its first to its last (maps with population control); [] = at random."),
     other("traffic.hero_ids", Kind::Texts, "Vehicles of a `.sumocfg` that are driven by actions, by their ids (the driving task only)."),
     float("traffic.cav_share", "", 0.0, 1.0, "Share of a `.sumocfg`'s vehicles that carry sensors."),
+    integer("traffic.max_cavs", "vehicles", 0, 100_000, "Most of them that do so at a time: whoever departs while fewer are on the road; 0 = no limit."),
     float("traffic.held_out_trips", "", 0.0, 0.9, "Share of all trips, from road to road, that only evaluation episodes make, which make no others (maps with population control); 0 = all trips everywhere."),
     optional("traffic.scale", "", 0.001, 1000.0, "Factor on the demand of a `.sumocfg`, as SUMO's `--scale`; unset = as the scenario says."),
     integer("traffic.max_road_users", "", 1, 1_000_000, "Most road users alive at once; shared memory is laid out for them."),

@@ -110,6 +110,7 @@ fn options(run: &RunFile, source: &Source, episode: &Episode) -> Result<Options,
             let fleet = Fleet::Scenario {
                 heroes: traffic.hero_ids.iter().cloned().collect(),
                 cav_share: traffic.cav_share,
+                max_cavs: traffic.max_cavs,
             };
             let options = Options::scenario(
                 &run.sumo_home,

@@ -9,7 +9,7 @@ pub const CAV_PREFIX: &str = "cav.";
 /// Ids of the population's heroes start with this.
 pub const HERO_PREFIX: &str = "hero.";
 
-/// The rule that tells connected vehicles and heroes from others: a function of the id alone.
+/// The rule that tells connected vehicles and heroes from others: a function of the id, and in a scenario of how many are on the road.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Fleet {
     /// Population control names its connected vehicles `cav.N` and its heroes `hero.N`.
@@ -20,6 +20,8 @@ pub enum Fleet {
         heroes: BTreeSet<String>,
         /// Share of all others that are connected, by the hash of their ids.
         cav_share: f64,
+        /// Most connected vehicles at a time; 0 = no limit.
+        max_cavs: u32,
     },
 }
 
@@ -30,15 +32,23 @@ impl Fleet {
         Self::Scenario {
             heroes: BTreeSet::new(),
             cav_share,
+            max_cavs: 0,
         }
     }
 
-    /// The kind of the vehicle `id`.
+    /// The kind of the vehicle `id`, which departs while so many connected vehicles are on the road.
     #[must_use]
-    pub fn kind_of_vehicle(&self, id: &str) -> Kind {
+    pub fn kind_of_vehicle(&self, id: &str, cavs: u32) -> Kind {
         let (hero, connected) = match self {
             Self::Population => (id.starts_with(HERO_PREFIX), id.starts_with(CAV_PREFIX)),
-            Self::Scenario { heroes, cav_share } => (heroes.contains(id), unit(id_hash(id)) < *cav_share),
+            Self::Scenario {
+                heroes,
+                cav_share,
+                max_cavs,
+            } => {
+                let has_room = *max_cavs == 0 || cavs < *max_cavs;
+                (heroes.contains(id), has_room && unit(id_hash(id)) < *cav_share)
+            }
         };
         match (hero, connected) {
             (true, _) => Kind::Hero,
@@ -63,21 +73,29 @@ mod tests {
         Fleet::Scenario {
             heroes: BTreeSet::from(["h".into()]),
             cav_share,
+            max_cavs: 2,
         }
     }
 
     #[test]
     fn heroes_are_told_by_their_ids() {
-        assert_eq!(scenario(1.0).kind_of_vehicle("h"), Kind::Hero);
-        assert_eq!(Fleet::Population.kind_of_vehicle("hero.3"), Kind::Hero);
-        assert_eq!(Fleet::Population.kind_of_vehicle("other.3"), Kind::Other);
+        assert_eq!(scenario(1.0).kind_of_vehicle("h", 2), Kind::Hero);
+        assert_eq!(Fleet::Population.kind_of_vehicle("hero.3", 0), Kind::Hero);
+        assert_eq!(Fleet::Population.kind_of_vehicle("other.3", 0), Kind::Other);
+    }
+
+    #[test]
+    fn nobody_is_connected_beside_the_most_there_may_be() {
+        let kinds = [0, 1, 2, 3].map(|cavs| scenario(1.0).kind_of_vehicle("v", cavs));
+        assert_eq!(kinds, [Kind::Cav, Kind::Cav, Kind::Other, Kind::Other]);
+        assert_eq!(Fleet::connected(1.0).kind_of_vehicle("v", u32::MAX), Kind::Cav);
     }
 
     #[test]
     fn shares_are_exact_at_the_ends_and_fair_between() {
         let cavs = |share| {
             (0..10_000)
-                .filter(|i| scenario(share).kind_of_vehicle(&format!("v{i}")) == Kind::Cav)
+                .filter(|i| scenario(share).kind_of_vehicle(&format!("v{i}"), 0) == Kind::Cav)
                 .count()
         };
         assert_eq!((cavs(0.0), cavs(1.0)), (0, 10_000));

@@ -34,6 +34,8 @@ pub struct Frame {
 pub(crate) struct Register {
     fleet: Fleet,
     kinds: Vec<Kind>,
+    /// Connected vehicles that have departed and not arrived.
+    cavs: u32,
     types: BTreeMap<String, u32>,
 }
 
@@ -42,6 +44,7 @@ impl Register {
         Self {
             fleet,
             kinds: Vec::new(),
+            cavs: 0,
             types: BTreeMap::new(),
         }
     }
@@ -72,8 +75,14 @@ impl Register {
             self.kinds.push(if event.is_person {
                 Kind::Person
             } else {
-                self.fleet.kind_of_vehicle(&event.id)
+                self.fleet.kind_of_vehicle(&event.id, self.cavs)
             });
+        }
+        let is_cav = self.kind(event.index) == Kind::Cav;
+        match event.kind {
+            RawEventKind::Departed => self.cavs += u32::from(is_cav),
+            RawEventKind::Arrived => self.cavs -= u32::from(is_cav),
+            _ => {}
         }
         let mut meta = VehicleMeta {
             id_hash: 0,

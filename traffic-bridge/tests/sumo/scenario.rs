@@ -3,6 +3,7 @@
 use std::{collections::BTreeSet, path::Path, time::SystemTime};
 
 use crate::support::{Bench, run, sumo_home};
+use ipc_schema::traffic::{Kind, MetaEvent, VehicleMeta};
 use traffic_bridge::{fleet::Fleet, options::Options, session::Session};
 
 /// Files below `folder` with their times of change.
@@ -30,13 +31,22 @@ fn a10kw_runs_and_writes_into_the_run_directory_alone() {
         &output,
         0.5,
         23423,
-        Fleet::connected(1.0),
+        Fleet::Scenario {
+            heroes: BTreeSet::new(),
+            cav_share: 1.0,
+            max_cavs: 20,
+        },
     )
     .unwrap();
     let mut session = Session::start(options).unwrap();
     assert_eq!((session.step_s(), session.duration_s()), (0.5, Some(1800.0)));
     let (mut most, mut vehicle_steps) = (0, 0);
-    run(&mut session, 120, |_, frame| {
+    let (mut cavs, mut departed_cavs) = (0, 0);
+    run(&mut session, 240, |_, frame| {
+        assert!(frame.cavs <= 20, "{}", frame.cavs);
+        cavs = frame.cavs;
+        let departed = |meta: &&VehicleMeta| meta.event == MetaEvent::Departed as u32 && meta.kind == Kind::Cav as u32;
+        departed_cavs += frame.events.iter().filter(departed).count();
         most = most.max(frame.states.len());
         vehicle_steps += frame.states.len();
         assert!(
@@ -47,6 +57,10 @@ fn a10kw_runs_and_writes_into_the_run_directory_alone() {
         );
     });
     assert!(most > 50, "{most}");
+    assert!(
+        cavs == 20 && departed_cavs > 20,
+        "{cavs} at the end of {departed_cavs}: who arrives makes room"
+    );
     session.close().unwrap();
     assert_eq!(listing(&games), before, "nothing was written into the wheel");
     let written: Vec<_> = listing(&output).into_iter().map(|(path, _)| path).collect();
