@@ -71,8 +71,7 @@ pub(super) fn report(rounds: &[Round], peers: &BTreeMap<String, BySize>) -> Resu
              and `Channel.lease`, read in place whatever the size: until the block is in the receiver's hands, and until Python has a torch \
              tensor over it, which is lent until the next is taken. Every other tick comes by `Channel.receive(busy=True)`: a tensor of an \
              observation with all its arrays that may be kept. The sender writes the whole block before it publishes, as `sensor-daemon` does; \
-             after 16 MiB its caches hold little of what publishing needs. Where it writes the first and the last value only, what is left is \
-             the size itself. The bare message is eight bytes between two Rust processes that poll \
+             after 16 MiB it publishes later. Where it writes the first and the last value only, what is left is the size itself. The bare message is eight bytes between two Rust processes that poll \
              iceoryx2. Bare and ours alternate, {ROUNDS} rounds in which the sizes take turns; ratios are of medians of one round, the \
              median round (smallest–largest). The peers send the same number of bytes from Python to Python and make a tensor of what \
              arrives without further copies; they sleep until the kernel wakes them. One message is under way at a time."
