@@ -1,4 +1,4 @@
-//! Checkpoints on disk, as `caraware.manifest` (Python, which writes them) verifies them.
+//! Checkpoints on disk, as `caraware.run.manifest` (Python, which writes them) verifies them.
 
 use std::{
     path::{Path, PathBuf},
@@ -93,7 +93,7 @@ impl Found {
     fn ask(install: &Install, named: &str, runs: &Path, which: &str) -> Result<Self, Exit> {
         let (place, is_run) = place(named, runs)?;
         let output = Command::new(&install.python)
-            .args(["-m", "caraware.manifest"])
+            .args(["-m", "caraware.run.manifest"])
             .arg(&place)
             .arg(which)
             .output()

@@ -317,7 +317,7 @@ pub const KEYS: &[Key] = &[
     float("observation.speed_range_mps", "m/s", 0.1, 1000.0, "Full scale of the speed field."),
     float("observation.steering_range_rad", "rad", 0.1, 1000.0, "Full scale of the steering field."),
     float("observation.age_range_s", "s", 0.001, 1e6, "Full scale of the fields of ages."),
-    other("trainer.module", Kind::Text, "Python module that is run as the trainer; your own takes its part through `caraware.channel`."),
+    other("trainer.module", Kind::Text, "Python module that is run as the trainer; your own takes its part through `caraware.ipc.channel`."),
     float("trainer.learning_rate", "", 1e-9, 1.0, "Learning rate of Adam at the start."),
     float("trainer.learning_rate_decay", "", 0.01, 1.0, "Factor on the learning rate after each update."),
     optional("trainer.learning_rate_final", "", 0.0, 1.0, "Learning rate at the end of training: then it falls linearly with the training episodes instead of by `trainer.learning_rate_decay`."),

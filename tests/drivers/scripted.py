@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from caraware.channel import Channel
+from caraware.ipc.channel import Channel
 
 SCRIPT = json.loads(os.environ["DRIVER_SCRIPT"])
 PHASES = sorted(

@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import torch
 from caraware.benchmarks.trainer import BATCH, EPOCHS, HORIZON, OBSERVATIONS, PlainAgent, plain_update, random_batch
-from caraware.config import MapBounds, TrainerConfig
-from caraware.ppo import Batch, Ppo
+from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.ppo import Batch, Ppo
 
 
 def on(device: torch.device, batch: Batch) -> Batch:

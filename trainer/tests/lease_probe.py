@@ -10,7 +10,7 @@ import os
 import sys
 from pathlib import Path
 
-from caraware.channel import Channel
+from caraware.ipc.channel import Channel
 from probe import lies_in_shared_memory
 from torch import Tensor
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from caraware.channel import Channel, Observation
-from caraware.config import RunConfig
-from caraware.ppo import Ppo
-from caraware.rewards import REWARDS
-from caraware.rollout import Rollout
+from caraware.ipc.channel import Channel, Observation
+from caraware.learn.ppo import Ppo
+from caraware.learn.rewards import REWARDS
+from caraware.learn.rollout import Rollout
+from caraware.run.config import RunConfig
 
 
 def shared_segments() -> list[tuple[int, int]]:

@@ -5,9 +5,9 @@ import os
 import sys
 from pathlib import Path
 
-from caraware import ranks
-from caraware.config import RunConfig
-from caraware.loop import TrainingLoop
+from caraware.learn import ranks
+from caraware.run.config import RunConfig
+from caraware.run.loop import TrainingLoop
 from synthetic import SyntheticChannel, run_file, with_evaluation
 
 DEVICE = os.environ.get("RANK_PROBE_DEVICE", "cpu")

@@ -16,7 +16,7 @@ FIELDS = 4
 
 @dataclass
 class SyntheticObservation:
-    """One tick, as `caraware.stream.Observation` describes it."""
+    """One tick, as `caraware.ipc.stream.Observation` describes it."""
 
     tick: int
     observation: Tensor

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from caraware import _native
 from caraware.baselines.noise import GRAVITY_MPS2, METRES_PER_DEGREE
-from caraware.stream import EMPTY_SLOT
+from caraware.ipc.stream import EMPTY_SLOT
 from synthetic import SyntheticObservation, run_file
 
 TICK_S = 0.1

@@ -4,8 +4,8 @@ import math
 
 import pytest
 import torch
-from caraware.adam import EPSILON, Adam
-from caraware.networks import FlatParameters
+from caraware.learn.adam import EPSILON, Adam
+from caraware.learn.networks import FlatParameters
 
 
 def test_algorithm_1_two_steps_by_hand() -> None:

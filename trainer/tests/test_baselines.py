@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from caraware import evaluation
 from caraware.baselines import Baselines, SensorNoise
 from caraware.baselines.samples import read_samples
-from caraware.channel import read_only_tensor
-from caraware.config import RunConfig
-from caraware.evaluation import ESTIMATORS, Evaluation
-from caraware.loop import TrainingLoop
+from caraware.ipc.channel import read_only_tensor
+from caraware.report import evaluation
+from caraware.report.evaluation import ESTIMATORS, Evaluation
+from caraware.run.config import RunConfig
+from caraware.run.loop import TrainingLoop
 from synthetic import SyntheticChannel, run_file, street_ticks
 from synthetic_vehicle import VehicleObservation, observations, sensor_tables, town_track, vehicle_run
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator

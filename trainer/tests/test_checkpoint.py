@@ -7,7 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.checkpoint import (
+from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.ppo import Ppo
+from caraware.learn.rollout import Rollout
+from caraware.report.evaluation import EvaluationResult
+from caraware.report.metrics import TrainingPoint
+from caraware.run.checkpoint import (
     Course,
     Keeping,
     load_checkpoint,
@@ -16,9 +21,7 @@ from caraware.checkpoint import (
     remove_partial,
     save_checkpoint,
 )
-from caraware.config import MapBounds, TrainerConfig
-from caraware.evaluation import EvaluationResult
-from caraware.manifest import (
+from caraware.run.manifest import (
     CheckpointError,
     Counters,
     best_checkpoint,
@@ -26,9 +29,6 @@ from caraware.manifest import (
     newest_sound_checkpoint,
     read_manifest,
 )
-from caraware.metrics import TrainingPoint
-from caraware.ppo import Ppo
-from caraware.rollout import Rollout
 from synthetic import FIELDS, SIZE_M, run_file, street_ticks
 from torch import Tensor
 

@@ -2,7 +2,8 @@
 
 import pytest
 import torch
-from caraware.config import ConfigError, MapBounds, RunConfig, TrainerConfig
+from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
+from caraware.run.config import RunConfig
 from synthetic import run_file
 
 

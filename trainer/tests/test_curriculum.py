@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from caraware.curriculum import Curriculum, Step
+from caraware.run.curriculum import Curriculum, Step
 
 STEPS = (Step(until_std=0.5), Step(until_error_m=7.0, until_lessons=3), Step())
 

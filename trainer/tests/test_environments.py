@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.checkpoint import load_course
-from caraware.config import RunConfig
-from caraware.environment import share
-from caraware.evaluation import EvaluationResult, pooled
-from caraware.loop import Learner, TrainingLoop
-from caraware.manifest import latest_checkpoint, read_manifest
+from caraware.report.evaluation import EvaluationResult, pooled
+from caraware.run.checkpoint import load_course
+from caraware.run.config import RunConfig
+from caraware.run.environment import share
+from caraware.run.loop import Learner, TrainingLoop
+from caraware.run.manifest import latest_checkpoint, read_manifest
 from safetensors.torch import load_file
 from synthetic import FIELDS, SyntheticChannel, SyntheticObservation, run_file, with_evaluation
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from caraware.envs import CarAwareEnv, CarAwareParallelEnv, CarAwareVecEnv, CarAwareVectorEnv, RunEndedError, Transition
 from caraware.envs.fields import Fields, UnknownFieldError
-from caraware.envs.names import Names
 from caraware.envs.slots import RUN_ON_TICKS
-from caraware.stream import EMPTY_SLOT
+from caraware.ipc.names import Names
+from caraware.ipc.stream import EMPTY_SLOT
 from synthetic import SyntheticChannel, SyntheticObservation
 
 E = EMPTY_SLOT

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from caraware.config import RunConfig
-from caraware.estimates import Estimates
+from caraware.run.config import RunConfig
+from caraware.run.estimates import Estimates
 from synthetic import run_file
 from synthetic_vehicle import in_slots, observations, sensor_tables, steady_track
 from test_ekf import noise_of

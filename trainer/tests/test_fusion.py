@@ -12,13 +12,13 @@ import torch
 from caraware.baselines.ekf import Ekf
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import read_samples
-from caraware.checkpoint import CheckpointError
-from caraware.config import ConfigError
 from caraware.fusion.carrier import COLUMNS, Carried, Carrier
 from caraware.fusion.lanes import LaneMap, Pieces, read_pieces
 from caraware.fusion.learner import Episode, FusionConfig, FusionLearner
 from caraware.fusion.store import Progress, load_fusion, newest_sound, save_fusion
 from caraware.fusion.train import Estimating, FusionLoop, Recording, begin
+from caraware.learn.config import ConfigError
+from caraware.run.checkpoint import CheckpointError
 from synthetic import SyntheticChannel
 from synthetic_vehicle import Track, VehicleObservation, observations, sensor_tables, town_track, vehicle_run
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from caraware.gae import generalised_advantage
+from caraware.learn.gae import generalised_advantage
 from torch import Tensor
 
 DISCOUNT, LAMBDA = 0.5, 0.5

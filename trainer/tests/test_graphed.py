@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from caraware.graphed import GraphedUpdate
-from caraware.ppo import NonFiniteLoss, Ppo
-from caraware.rollout import Rollout
+from caraware.learn.graphed import GraphedUpdate
+from caraware.learn.ppo import NonFiniteLoss, Ppo
+from caraware.learn.rollout import Rollout
 from synthetic import FIELDS, street_ticks
 from test_ppo import TOY, fresh, parameters
 

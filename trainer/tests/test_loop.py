@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import torch
 from caraware import train
-from caraware.config import RunConfig
-from caraware.environment import TickLedger
-from caraware.loop import Learner, TrainingLoop
-from caraware.manifest import best_checkpoint, latest_checkpoint, newest_sound_checkpoint, read_manifest
-from caraware.ppo import NonFiniteLoss, UpdateStats
+from caraware.learn.ppo import NonFiniteLoss, UpdateStats
+from caraware.run.config import RunConfig
+from caraware.run.environment import TickLedger
+from caraware.run.loop import Learner, TrainingLoop
+from caraware.run.manifest import best_checkpoint, latest_checkpoint, newest_sound_checkpoint, read_manifest
 from safetensors.torch import load_file
 from synthetic import SyntheticChannel, SyntheticObservation, run_file, street_ticks, with_evaluation
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -210,7 +210,7 @@ def test_a_loss_that_is_no_number_saves_its_batch(tmp_path: Path) -> None:
 
 
 class ProcessChannel(SyntheticChannel):
-    """What `caraware.channel.Channel` would be in the process under test."""
+    """What `caraware.ipc.channel.Channel` would be in the process under test."""
 
     def __init__(self, run_file_path: str, first_tick: int = 0) -> None:
         run = json.loads(Path(run_file_path).read_text())
@@ -232,9 +232,9 @@ class TerminatedChannel(SyntheticChannel):
 
 
 def install(monkeypatch: pytest.MonkeyPatch, channel: type[SyntheticChannel]) -> None:
-    module = types.ModuleType("caraware.channel")
+    module = types.ModuleType("caraware.ipc.channel")
     module.Channel = channel  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "caraware.channel", module)
+    monkeypatch.setitem(sys.modules, "caraware.ipc.channel", module)
 
 
 @pytest.fixture(autouse=True)
@@ -293,7 +293,7 @@ def test_a_damaged_checkpoint_ends_with_1(tmp_path: Path) -> None:
 
 
 def test_a_missing_package_ends_with_3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "caraware.channel", None)
+    monkeypatch.setitem(sys.modules, "caraware.ipc.channel", None)
     assert train.main([write_run(tmp_path, run_file(str(tmp_path)))]) == 3
     assert failure(tmp_path)["kind"] == "missing"
 

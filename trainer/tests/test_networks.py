@@ -1,8 +1,8 @@
 """The networks' shapes, and their written-out gradients against autograd."""
 
 import torch
-from caraware.networks import Activation, GaussianPolicy, Mlp, ValueNetwork, entropy, log_probability
-from caraware.objective import clipped_surrogate
+from caraware.learn.networks import Activation, GaussianPolicy, Mlp, ValueNetwork, entropy, log_probability
+from caraware.learn.objective import clipped_surrogate
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 

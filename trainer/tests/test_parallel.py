@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.checkpoint import POINTS
-from caraware.manifest import latest_checkpoint, read_manifest
-from caraware.program import caraware_program
+from caraware.run.checkpoint import POINTS
+from caraware.run.manifest import latest_checkpoint, read_manifest
+from caraware.run.program import caraware_program
 from safetensors.torch import load_file
 
 SETTINGS = {

@@ -11,10 +11,10 @@ import pytest
 import torch
 from caraware.baselines import Ekf, SensorNoise
 from caraware.baselines.samples import read_samples
-from caraware.config import RunConfig
-from caraware.loop import Learner
-from caraware.memory import Memory
-from caraware.player import LIVE, PlayLoop, Tally
+from caraware.learn.memory import Memory
+from caraware.run.config import RunConfig
+from caraware.run.loop import Learner
+from caraware.run.player import LIVE, PlayLoop, Tally
 from synthetic import SyntheticChannel
 from synthetic_vehicle import VehicleObservation, observations, sensor_tables, town_track, vehicle_run
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from caraware.pointcloud import POINT, SCAN, PointCloud, rotation
+from caraware.ipc.pointcloud import POINT, SCAN, PointCloud, rotation
 
 LAYOUT = Path(__file__).parents[2] / "ipc-schema" / "layout.json"
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.batch import Batch, save_batch
-from caraware.config import MapBounds, TrainerConfig
-from caraware.objective import clipped_error
-from caraware.ppo import NonFiniteLoss, Ppo, Settings, UpdateStats
-from caraware.rewards import distance_m
-from caraware.rollout import Horizon, Rollout
+from caraware.learn.batch import Batch, save_batch
+from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.objective import clipped_error
+from caraware.learn.ppo import NonFiniteLoss, Ppo, Settings, UpdateStats
+from caraware.learn.rewards import distance_m
+from caraware.learn.rollout import Horizon, Rollout
 from safetensors.torch import load_file
 from synthetic import FIELDS, SIZE_M, run_file, street_ticks
 from torch import Tensor

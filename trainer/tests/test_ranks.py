@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.checkpoint import load_course
-from caraware.config import RunConfig
-from caraware.loop import TrainingLoop
-from caraware.manifest import latest_checkpoint, read_manifest
+from caraware.learn.ranks import Ranks, Union
 from caraware.parallel import Place, command
-from caraware.ranks import Ranks, Union
+from caraware.run.checkpoint import load_course
+from caraware.run.config import RunConfig
+from caraware.run.loop import TrainingLoop
+from caraware.run.manifest import latest_checkpoint, read_manifest
 from rank_probe import TRAINING_TICKS, VEHICLES, channels, settings
 from safetensors.torch import load_file
 

@@ -8,17 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from caraware.checkpoint import MEMORY, load_checkpoint
-from caraware.config import MapBounds, RunConfig, TrainerConfig
-from caraware.gru import RecurrentNetwork, RecurrentPolicy, Sequences, Steps
-from caraware.loop import PPO_OF_NETWORK, Learner, TrainingLoop
-from caraware.manifest import CheckpointError, latest_checkpoint, newest_sound_checkpoint
-from caraware.memory import Memory
-from caraware.networks import Activation
-from caraware.ppo import Ppo
-from caraware.recurrent import NOBODY, RecurrentPpo, continues, cut, sequences
-from caraware.rollout import Rollout
-from caraware.stream import EMPTY_SLOT
+from caraware.ipc.stream import EMPTY_SLOT
+from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.gru import RecurrentNetwork, RecurrentPolicy, Sequences, Steps
+from caraware.learn.memory import Memory
+from caraware.learn.networks import Activation
+from caraware.learn.ppo import Ppo
+from caraware.learn.recurrent import NOBODY, RecurrentPpo, continues, cut, sequences
+from caraware.learn.rollout import Rollout
+from caraware.run.checkpoint import MEMORY, load_checkpoint
+from caraware.run.config import RunConfig
+from caraware.run.loop import PPO_OF_NETWORK, Learner, TrainingLoop
+from caraware.run.manifest import CheckpointError, latest_checkpoint, newest_sound_checkpoint
 from safetensors.torch import load_file
 from synthetic import FIELDS, SIZE_M, SyntheticChannel, SyntheticObservation, run_file, street_ticks
 from test_loop import KilledError, final_parameters, loop_over, part, stream

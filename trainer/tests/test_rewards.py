@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from caraware import rewards
+from caraware.learn import rewards
 
 
 def test_equation_5_euclidean_distance() -> None:

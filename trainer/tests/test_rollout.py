@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from caraware.config import MapBounds, TrainerConfig
-from caraware.ppo import Ppo
-from caraware.rewards import bounded_inverse, distance_m
-from caraware.rollout import Horizon, Rollout
-from caraware.stream import EMPTY_SLOT
+from caraware.ipc.stream import EMPTY_SLOT
+from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.ppo import Ppo
+from caraware.learn.rewards import bounded_inverse, distance_m
+from caraware.learn.rollout import Horizon, Rollout
 from synthetic import SIZE_M, SyntheticObservation, run_file, street_ticks
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from caraware.statistics import mean_interval, student_t
+from caraware.report.statistics import mean_interval, student_t
 
 
 @pytest.mark.parametrize(

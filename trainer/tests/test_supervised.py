@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware import supervised
-from caraware.checkpoint import Keeping, load_checkpoint, save_checkpoint
-from caraware.config import RunConfig
-from caraware.loop import Learner, TrainingLoop
-from caraware.manifest import Counters, newest_sound_checkpoint
-from caraware.ppo import Ppo
-from caraware.rewards import distance_m
-from caraware.rollout import Rollout
-from caraware.supervised import Supervised
+from caraware.learn import supervised
+from caraware.learn.ppo import Ppo
+from caraware.learn.rewards import distance_m
+from caraware.learn.rollout import Rollout
+from caraware.learn.supervised import Supervised
+from caraware.run.checkpoint import Keeping, load_checkpoint, save_checkpoint
+from caraware.run.config import RunConfig
+from caraware.run.loop import Learner, TrainingLoop
+from caraware.run.manifest import Counters, newest_sound_checkpoint
 from safetensors.torch import load_file
 from synthetic import FIELDS, SyntheticChannel, run_file, street_ticks
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator

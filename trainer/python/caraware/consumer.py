@@ -18,7 +18,7 @@ def consume(attachment: _native.Attachment, stop: list[int]) -> dict[str, object
     # torch takes seconds to import: the simulation runs its window ahead meanwhile.
     import torch
 
-    from caraware.channel import Observation
+    from caraware.ipc.channel import Observation
 
     # Tensors are small: a second thread would cost more than it saves, on a core that has other work.
     torch.set_num_threads(1)

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
-from caraware.manifest import NEWEST, sound_checkpoints
-from caraware.program import ProgramError, caraware_program
+from caraware.run.manifest import NEWEST, sound_checkpoints
+from caraware.run.program import ProgramError, caraware_program
 
 PR_SET_PDEATHSIG = 1
 WAIT_AT_MOST = timedelta(minutes=5)

@@ -1,25 +1,25 @@
 """`python -m caraware.play RUN_FILE`: the policy of a checkpoint predicts, an EKF runs beside it, nothing learns.
 
-Takes the trainer's place in a run of `caraware play`. What it has counted is in `<run>/live.json`, anew twice a second:
-the supervisor shows it, and a successor goes on from it. Exit codes are those of `caraware.train`.
+Runs in the trainer's place in `caraware play`. Twice a second it writes its counts to `<run>/live.json`: the supervisor
+shows them, and a successor continues from them. Exit codes: `caraware.run.process`.
 """
 
 import logging
 import sys
 from pathlib import Path
 
-from caraware.train import StopSignal, main, read_run
+from caraware.run.process import HandoverRole, StopSignal, read_run, run_process
 
 log = logging.getLogger("caraware.play")
 
 
-def play(run_file: Path, stop: StopSignal) -> None:
+def play(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
     """Play the checkpoint that the run file names, until the run ends or a request to stop."""
     from caraware import _native
-    from caraware.channel import Channel
-    from caraware.config import RunConfig
-    from caraware.loop import Learner
-    from caraware.player import LIVE, PlayLoop, Tally
+    from caraware.ipc.channel import Channel
+    from caraware.run.config import RunConfig
+    from caraware.run.loop import Learner
+    from caraware.run.player import LIVE, PlayLoop, Tally
 
     config = RunConfig.from_run(read_run(run_file))
     learner = Learner.begin(config, _native.observation_size(str(run_file)))
@@ -29,4 +29,4 @@ def play(run_file: Path, stop: StopSignal) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:], lambda run_file, stop, _: play(run_file, stop)))
+    sys.exit(run_process(sys.argv[1:], play))

@@ -12,7 +12,7 @@ from caraware.baselines.motion import MotionModel
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.rts import SmoothedTick, Smoother
 from caraware.baselines.samples import read_samples
-from caraware.stream import Observation
+from caraware.ipc.stream import Observation
 
 __all__ = ["BaselineErrors", "Baselines", "Ekf", "MotionModel", "SensorNoise", "Smoother"]
 

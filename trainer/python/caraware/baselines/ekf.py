@@ -30,7 +30,7 @@ from caraware.baselines.motion import (
 )
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import Samples
-from caraware.stream import EMPTY_SLOT
+from caraware.ipc.stream import EMPTY_SLOT
 
 NO_HEADING_VARIANCE = math.pi**2 / 3.0
 """Variance of a heading of which nothing is known: uniform on the circle. Beyond, the next fix starts a filter anew."""

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caraware.stream import Observation
+from caraware.ipc.stream import Observation
 
 GNSS, IMU, SPEED_STEERING = 1, 2, 4
 """Bits of `sensors` (ipc-schema/src/observation.rs): the sensor delivers."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from torch import Tensor
 
 from caraware import _native
-from caraware.channel import Channel, Observation
+from caraware.ipc.channel import Channel, Observation
 
 
 def main() -> None:

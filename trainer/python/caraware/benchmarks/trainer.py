@@ -18,10 +18,10 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
 
-from caraware.config import MapBounds, TrainerConfig
-from caraware.evaluation import Mean, raw_errors_m
-from caraware.ppo import Batch, Ppo
-from caraware.rollout import Rollout
+from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.ppo import Batch, Ppo
+from caraware.learn.rollout import Rollout
+from caraware.report.evaluation import Mean, raw_errors_m
 
 OBSERVATIONS, HORIZON, BATCH, EPOCHS = 9, 32_768, 2_048, 4
 VEHICLES = 8

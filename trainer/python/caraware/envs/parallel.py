@@ -8,10 +8,10 @@ import numpy as np
 from gymnasium.spaces import Box
 from pettingzoo import ParallelEnv
 
-from caraware.envs.names import Names
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Slots, Source, Tick
-from caraware.stream import Channel
+from caraware.ipc.names import Names
+from caraware.ipc.stream import Channel
 
 
 class CarAwareParallelEnv(ParallelEnv):

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from caraware import rewards
 from caraware.envs.task import Task
 from caraware.envs.transition import Transition
+from caraware.learn import rewards
 
 Reward = Callable[[Transition, np.ndarray], np.ndarray]
 """`(obs, action [N, 2]) -> reward [N]`. What it says of rows without a vehicle does not count."""
@@ -26,7 +26,7 @@ def default(task: Task) -> Reward:
 
 
 def localisation(name: str, scale_m: float) -> Reward:
-    """The reward called `name` in `caraware.rewards`, of the distance between prediction and truth."""
+    """The reward called `name` in `caraware.learn.rewards`, of the distance between prediction and truth."""
     function = rewards.by_name(name)
 
     def reward(obs: Transition, action: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Policy, Slots, Source
 from caraware.envs.transition import Transition
-from caraware.stream import Channel
+from caraware.ipc.stream import Channel
 
 
 class CarAwareVecEnv(VecEnv):

@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from caraware.channel import Channel, Observation
 from caraware.envs import outside
-from caraware.program import ProgramError, caraware_program
+from caraware.ipc.channel import Channel, Observation
+from caraware.run.program import ProgramError, caraware_program
 
 RECEIVE_TIMEOUT_S = 0.2
 """Time between two looks at whether the simulation still runs, while it sends nothing."""

@@ -7,10 +7,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from caraware.envs.names import Names
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Slots, Source, Tick
-from caraware.stream import Channel
+from caraware.ipc.names import Names
+from caraware.ipc.stream import Channel
 
 
 class CarAwareEnv(gymnasium.Env):

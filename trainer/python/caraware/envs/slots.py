@@ -20,11 +20,11 @@ import numpy as np
 import torch
 
 from caraware import _native
-from caraware.channel import StreamEndedError
 from caraware.envs import rewards
 from caraware.envs.task import Task
 from caraware.envs.transition import Rows, Transition
-from caraware.stream import EMPTY_SLOT, Channel, Observation
+from caraware.ipc.channel import StreamEndedError
+from caraware.ipc.stream import EMPTY_SLOT, Channel, Observation
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from caraware.envs.rewards import Reward, error_m
 from caraware.envs.slots import Policy, Slots, Source, Tick
 from caraware.envs.transition import Transition
-from caraware.stream import Channel
+from caraware.ipc.stream import Channel
 
 
 class CarAwareVectorEnv(VectorEnv):

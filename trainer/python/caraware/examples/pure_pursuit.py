@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from caraware.channel import Channel
+from caraware.ipc.channel import Channel
 
 AHEAD_M, WHEELBASE_M, BRAKING_MPS2, LATERAL_MPS2, STAND_OFF_M, KP, KI = (5, 10, 20), 2.7, 2.0, 2.0, 5.0, 1.0, 0.1
 

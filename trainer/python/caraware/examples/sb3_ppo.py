@@ -12,8 +12,8 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import HumanOutputFormat, Logger
 
-from caraware.channel import Channel
 from caraware.envs import CarAwareVecEnv, RunEndedError, make
+from caraware.ipc.channel import Channel
 
 
 def ppo(env: CarAwareVecEnv, horizon: int = 8192, batch_size: int = 1024) -> PPO:

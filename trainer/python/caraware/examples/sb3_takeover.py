@@ -15,11 +15,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
-from caraware.channel import Channel
 from caraware.envs import CarAwareVecEnv, RunEndedError
 from caraware.examples.sb3_ppo import ppo
-from caraware.manifest import newest_sound_checkpoint, read_manifest
-from caraware.train import Succession
+from caraware.ipc.channel import Channel
+from caraware.run.manifest import newest_sound_checkpoint, read_manifest
+from caraware.run.process import HandoverRole
 
 MODEL, PLACE = "sb3_takeover.zip", "sb3_takeover.json"
 """In the run directory: the model, and the first tick that it has not learnt from."""
@@ -86,8 +86,8 @@ def take_networks(model: PPO, checkpoint: Path) -> None:
 
 def main(run_file: str) -> int:
     """Take over the run, and learn until it ends or is stopped."""
-    succession = Succession.from_environment()
-    if succession.is_shadow and not succession.wait_for_turn():
+    role = HandoverRole.from_environment()
+    if role.gets_ready and not role.wait_for_turn():
         return 0
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     run_dir = Path(json.loads(Path(run_file).read_text())["run_dir"])

@@ -16,7 +16,7 @@ from caraware.baselines.ekf import Ekf
 from caraware.baselines.motion import SPEED, YAW, X, Y
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import Samples, read_samples
-from caraware.stream import Observation
+from caraware.ipc.stream import Observation
 
 SMALLEST_VARIANCE_M2 = 1e-4
 

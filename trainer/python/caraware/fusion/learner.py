@@ -12,13 +12,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from caraware.adam import Adam
-from caraware.config import ConfigError, MapBounds, TrainerConfig
 from caraware.fusion.carrier import COLUMNS, Carried
 from caraware.fusion.estimator import FusionEstimator, FusionNetwork, distance_loss
 from caraware.fusion.lanes import Pieces, read_pieces
-from caraware.networks import FlatParameters
-from caraware.ppo import NonFiniteLoss
+from caraware.learn.adam import Adam
+from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
+from caraware.learn.networks import FlatParameters
+from caraware.learn.ppo import NonFiniteLoss
 
 
 @dataclass(frozen=True)

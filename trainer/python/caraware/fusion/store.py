@@ -10,10 +10,10 @@ from pathlib import Path
 
 from safetensors.torch import load, save
 
-from caraware.checkpoint import CheckpointError
-from caraware.evaluation import EvaluationResult
 from caraware.fusion.learner import FusionLearner
-from caraware.metrics import TrainingPoint
+from caraware.report.evaluation import EvaluationResult
+from caraware.report.metrics import TrainingPoint
+from caraware.run.checkpoint import CheckpointError
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ import json
 import subprocess
 from pathlib import Path
 
-from caraware.statistics import mean_interval
+from caraware.report.statistics import mean_interval
 
 DEFAULT_NOISE = ["gnss.correlated_std_m=0.0", "blackout.enabled=false"]
 SETTINGS = {"default noise": DEFAULT_NOISE, "slow GNSS error and blackouts": []}

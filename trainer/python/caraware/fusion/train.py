@@ -2,7 +2,7 @@
 
 The estimator runs on every tick as it comes, in training as in evaluations, and learns at the end of every training
 episode. There nothing is carried on: all vehicles begin anew. So a checkpoint needs no state of filters, and whoever
-continues from it gives the same bytes. How processes take over from each other is `caraware.train`'s.
+continues from it gives the same bytes. The handover between processes: `caraware.run.process`.
 """
 
 import json
@@ -19,17 +19,19 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from caraware import rewards, train
-from caraware.config import ConfigError, RunConfig
-from caraware.environment import TickLedger
-from caraware.evaluation import NO_HEADLINE, Evaluation, Mean, errors_m
 from caraware.fusion.carrier import COLUMNS, Carried, Carrier
 from caraware.fusion.learner import Episode, FusionConfig, FusionLearner, FusionStats
 from caraware.fusion.store import Progress, load_fusion, newest_sound, save_fusion
-from caraware.metrics import Metrics, TrainingPoint
-from caraware.plots import plot_error
-from caraware.ppo import NonFiniteLoss
-from caraware.stream import Channel, Observation
+from caraware.ipc.stream import Channel, Observation
+from caraware.learn import rewards
+from caraware.learn.config import ConfigError
+from caraware.learn.ppo import NonFiniteLoss
+from caraware.report.evaluation import NO_HEADLINE, Evaluation, Mean, errors_m
+from caraware.report.metrics import Metrics, TrainingPoint
+from caraware.report.plots import plot_error
+from caraware.run.config import RunConfig
+from caraware.run.environment import TickLedger
+from caraware.run.process import HandoverRole, StopSignal, read_run, run_process
 
 log = logging.getLogger(__name__)
 
@@ -277,26 +279,26 @@ def begin(run: dict, resume_from: Path | None) -> tuple[RunConfig, FusionLearner
     return config, learner, load_fusion(checkpoint, learner) if checkpoint else Progress()
 
 
-def work(run_file: Path, stop: train.StopSignal, succession: train.Succession) -> None:
-    """What `caraware.train.main` runs."""
-    run = train.read_run(run_file)
-    from caraware.channel import Channel as SharedChannel
+def work(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
+    """Train the estimator of one run file."""
+    run = read_run(run_file)
+    from caraware.ipc.channel import Channel as SharedChannel
 
     folder = Path(run["run_dir"]) / "checkpoints"
-    if succession.is_shadow:
+    if role.gets_ready:
         # Whatever could be wrong with the settings or the checkpoint shows here, while the predecessor is at work.
-        begin(run, succession.checkpoint or newest_sound(folder))
-        if not succession.wait_for_turn():
+        begin(run, role.checkpoint or newest_sound(folder))
+        if not role.wait_for_turn():
             return
-    config, learner, progress = begin(run, newest_sound(folder) if succession.replaces else None)
-    if succession.checkpoint is not None:
+    config, learner, progress = begin(run, newest_sound(folder) if role.replaces else None)
+    if role.checkpoint is not None:
         updates = learner.updates
-        load_fusion(succession.checkpoint, learner)
+        load_fusion(role.checkpoint, learner)
         learner.updates = updates
     log.info("%d columns, %s, %s", COLUMNS, config.trainer, learner.fusion)
     channel = SharedChannel(str(run_file), progress.committed_tick + 1)
     loop = FusionLoop(channel, config, learner, progress, lambda: stop.requested, lambda: stop.leave_requested)
-    if succession.checkpoint is not None:
+    if role.checkpoint is not None:
         loop.commit()
     if not loop.run():
         logging.shutdown()
@@ -304,4 +306,4 @@ def work(run_file: Path, stop: train.StopSignal, succession: train.Succession) -
 
 
 if __name__ == "__main__":
-    sys.exit(train.main(sys.argv[1:], work))
+    sys.exit(run_process(sys.argv[1:], work))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from caraware.stream import EMPTY_SLOT
+from caraware.ipc.stream import EMPTY_SLOT
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Memory:
         """The states f32 `[n, h]` that the slots of `tick` begin with: zero where a trajectory begins.
 
         It does with another `vehicle` `[n]` than before, where the flags say so (`cut`, bool `[n]`), and where a tick
-        is missing: the rules by which `caraware.rollout` ends trajectories.
+        is missing: the rules by which `caraware.learn.rollout` ends trajectories.
         """
         state = torch.zeros(len(vehicle), self.state.shape[1])
         if tick == int(self.tick) + 1:

@@ -7,8 +7,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
-from caraware.evaluation import EvaluationResult
-from caraware.metrics import TrainingPoint
+from caraware.report.evaluation import EvaluationResult
+from caraware.report.metrics import TrainingPoint
 
 POLICY, EVALUATION, RAW, REWARD = "#7fb3d5", "#1a5276", "#b03a2e", "#ca6f1e"
 EKF, RTS, SUPERVISED = "#e69f00", "#555555", "#009e73"

@@ -1,4 +1,4 @@
-"""PPO whose networks remember: what differs from `caraware.ppo` (docs/decisions/0018).
+"""PPO whose networks remember: what differs from `caraware.learn.ppo` (docs/decisions/0018).
 
 A horizon is walked through tick by tick from the states that the horizon before left. Its trajectories are cut into
 sequences of at most `trainer.truncation_ticks`, each with the state that the walk had at its first row; minibatches
@@ -12,15 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caraware.batch import Batch
-from caraware.gru import RecurrentPolicy, RecurrentValue, Sequences, Steps, Walk
-from caraware.memory import Memory
-from caraware.networks import Activation
-from caraware.ppo import ACTIONS, ForwardPass, Ppo
-from caraware.prediction import Ticks, visible
-from caraware.ranks import Minibatch, Union
-from caraware.rollout import Horizon
-from caraware.stream import Observation
+from caraware.ipc.stream import Observation
+from caraware.learn.batch import Batch
+from caraware.learn.gru import RecurrentPolicy, RecurrentValue, Sequences, Steps, Walk
+from caraware.learn.memory import Memory
+from caraware.learn.networks import Activation
+from caraware.learn.ppo import ACTIONS, ForwardPass, Ppo
+from caraware.learn.prediction import Ticks, visible
+from caraware.learn.ranks import Minibatch, Union
+from caraware.learn.rollout import Horizon
 
 NOBODY = -1
 """In a table of sequences: a shorter one has no sample there."""
@@ -196,7 +196,7 @@ class SequencePredictor:
         """Of each environment, by tick: the newest that was taken and those that may be asked for again."""
 
     def predict_m(self, ticks: Ticks) -> dict[int, list[Tensor]]:
-        """See `caraware.prediction.Predictor.predict_m`."""
+        """See `caraware.learn.prediction.Predictor.predict_m`."""
         return {index: self._of_one(index, of_one) for index, of_one in ticks.items()}
 
     def _of_one(self, index: int, ticks: Sequence[Observation]) -> list[Tensor]:

@@ -18,18 +18,18 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from caraware import rewards
-from caraware.adam import Adam
-from caraware.batch import Batch
-from caraware.config import MapBounds, TrainerConfig
-from caraware.gae import generalised_advantage
-from caraware.graphed import GraphedUpdate, StepTable
-from caraware.networks import Activation, FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
-from caraware.objective import clipped_error, clipped_surrogate
-from caraware.prediction import Predictor, RowPredictor
-from caraware.ranks import Minibatch, Ranks, Union
-from caraware.rollout import Horizon
-from caraware.supervised import Supervised
+from caraware.learn import rewards
+from caraware.learn.adam import Adam
+from caraware.learn.batch import Batch
+from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.gae import generalised_advantage
+from caraware.learn.graphed import GraphedUpdate, StepTable
+from caraware.learn.networks import Activation, FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
+from caraware.learn.objective import clipped_error, clipped_surrogate
+from caraware.learn.prediction import Predictor, RowPredictor
+from caraware.learn.ranks import Minibatch, Ranks, Union
+from caraware.learn.rollout import Horizon
+from caraware.learn.supervised import Supervised
 
 P, V = TypeVar("P"), TypeVar("V")
 ACTIONS = 2
@@ -203,7 +203,7 @@ class Ppo:
         return dict(zip(names, self._samplings, strict=True))
 
     def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> Predictor:
-        """What predicts for the ticks of a stream as they come (`caraware.prediction`)."""
+        """What predicts for the ticks of a stream as they come (`caraware.learn.prediction`)."""
         return RowPredictor(self, dark_is_nan, evaluations_alone)
 
     def memory_tensors(self) -> dict[str, Tensor]:

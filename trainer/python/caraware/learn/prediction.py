@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caraware.stream import Observation
+from caraware.ipc.stream import Observation
 
 if TYPE_CHECKING:
-    from caraware.ppo import Ppo
+    from caraware.learn.ppo import Ppo
 
 Ticks = Mapping[int, Sequence[Observation]]
 """Waiting ticks, oldest first, by the index of their environment."""

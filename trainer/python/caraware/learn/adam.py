@@ -6,7 +6,7 @@ but importing it pulls in torch's compiler: seconds before the first tick.
 
 import torch
 
-from caraware.networks import FlatParameters
+from caraware.learn.networks import FlatParameters
 
 BETA_MEAN, BETA_SQUARE = 0.9, 0.999
 EPSILON = 1e-5

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caraware.config import RunConfig
-from caraware.estimates import Estimates
-from caraware.evaluation import Evaluation
-from caraware.rollout import Rollout
-from caraware.stream import Channel, Observation
+from caraware.ipc.stream import Channel, Observation
+from caraware.learn.rollout import Rollout
+from caraware.report.evaluation import Evaluation
+from caraware.run.config import RunConfig
+from caraware.run.estimates import Estimates
 
 
 class TickLedger:

@@ -4,7 +4,7 @@ import numpy as np
 
 from caraware.baselines import Ekf, SensorNoise
 from caraware.baselines.samples import read_samples
-from caraware.stream import Observation
+from caraware.ipc.stream import Observation
 
 
 class Estimates:

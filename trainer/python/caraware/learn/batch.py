@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from caraware.networks import FlatParameters
+from caraware.learn.networks import FlatParameters
 
 
 @dataclass(frozen=True)

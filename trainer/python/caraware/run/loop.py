@@ -12,8 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caraware.batch import Batch, save_batch
-from caraware.checkpoint import (
+from caraware.ipc.stream import Channel, Observation
+from caraware.learn.batch import Batch, save_batch
+from caraware.learn.ppo import NonFiniteLoss, Ppo, UpdateStats
+from caraware.learn.prediction import visible
+from caraware.learn.ranks import RankError, Ranks, Verdict
+from caraware.learn.recurrent import RecurrentPpo
+from caraware.learn.rewards import distance_m
+from caraware.report.evaluation import NO_HEADLINE, Evaluation, EvaluationResult, Mean, errors_m, pooled, raw_errors_m
+from caraware.report.metrics import Metrics, TrainingPoint
+from caraware.report.plots import plot_error, plot_sigma
+from caraware.run.checkpoint import (
     Course,
     Keeping,
     checkpoint_name,
@@ -22,19 +31,10 @@ from caraware.checkpoint import (
     mark_best,
     save_checkpoint,
 )
-from caraware.config import RunConfig
-from caraware.curriculum import Curriculum
-from caraware.environment import Environment, Place, share
-from caraware.evaluation import NO_HEADLINE, Evaluation, EvaluationResult, Mean, errors_m, pooled, raw_errors_m
-from caraware.manifest import Counters
-from caraware.metrics import Metrics, TrainingPoint
-from caraware.plots import plot_error, plot_sigma
-from caraware.ppo import NonFiniteLoss, Ppo, UpdateStats
-from caraware.prediction import visible
-from caraware.ranks import RankError, Ranks, Verdict
-from caraware.recurrent import RecurrentPpo
-from caraware.rewards import distance_m
-from caraware.stream import Channel, Observation
+from caraware.run.config import RunConfig
+from caraware.run.curriculum import Curriculum
+from caraware.run.environment import Environment, Place, share
+from caraware.run.manifest import Counters
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""What the trainer needs of a stream of observations; `caraware.channel` provides it over shared memory."""
+"""What the trainer needs of a stream of observations; `caraware.ipc.channel` provides it over shared memory."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol

@@ -12,10 +12,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
-from caraware.config import TrainerConfig
-from caraware.environment import Place
-from caraware.evaluation import EvaluationResult
-from caraware.manifest import (
+from caraware.learn.config import TrainerConfig
+from caraware.learn.ppo import Ppo, Settings
+from caraware.report.evaluation import EvaluationResult
+from caraware.report.metrics import TrainingPoint
+from caraware.run.environment import Place
+from caraware.run.manifest import (
     BEST,
     COURSE,
     LATEST,
@@ -31,8 +33,6 @@ from caraware.manifest import (
     read_manifest,
     verified,
 )
-from caraware.metrics import TrainingPoint
-from caraware.ppo import Ppo, Settings
 
 RANDOM = "random.safetensors"
 POINTS = "points.safetensors"
@@ -58,7 +58,7 @@ class Course:
     others: list[Place] = field(default_factory=list)
     """The environments after the first, of which `Counters` and the fields above tell."""
     curriculum: dict = field(default_factory=dict)
-    """`caraware.curriculum.Standing`; empty without a curriculum."""
+    """`caraware.run.curriculum.Standing`; empty without a curriculum."""
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from caraware.adam import Adam
-from caraware.config import MapBounds, TrainerConfig
-from caraware.networks import Activation, GaussianPolicy
-from caraware.ranks import Minibatch, Ranks, Union
-from caraware.rewards import distance_m
+from caraware.learn.adam import Adam
+from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.networks import Activation, GaussianPolicy
+from caraware.learn.ranks import Minibatch, Ranks, Union
+from caraware.learn.rewards import distance_m
 
 if TYPE_CHECKING:
-    from caraware.ppo import Batch
+    from caraware.learn.ppo import Batch
 
 SEED_OFFSET = 0x5E_ED00
 """Between the seed of a run and those of this baseline."""

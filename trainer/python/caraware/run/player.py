@@ -11,12 +11,12 @@ import numpy as np
 
 from caraware.baselines import Ekf
 from caraware.baselines.samples import read_samples
-from caraware.config import RunConfig
-from caraware.envs.names import Names
-from caraware.evaluation import errors_m
-from caraware.loop import RECEIVE_TIMEOUT_S, Learner
-from caraware.statistics import mean_interval
-from caraware.stream import Channel, Observation
+from caraware.ipc.names import Names
+from caraware.ipc.stream import Channel, Observation
+from caraware.report.evaluation import errors_m
+from caraware.report.statistics import mean_interval
+from caraware.run.config import RunConfig
+from caraware.run.loop import RECEIVE_TIMEOUT_S, Learner
 
 LIVE = "live.json"
 """File in the run's directory with the newest table."""

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from torch.utils.tensorboard import SummaryWriter
 
-from caraware.evaluation import EvaluationResult
-from caraware.ppo import UpdateStats
+from caraware.learn.ppo import UpdateStats
+from caraware.report.evaluation import EvaluationResult
 
 
 @dataclass(frozen=True)

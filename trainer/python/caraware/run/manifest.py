@@ -1,6 +1,6 @@
 """What a checkpoint says of itself, and whether that is true: manifests, hashes, which one is the newest or the best.
 
-Imports nothing heavy: `python -m caraware.manifest RUN|CHECKPOINT newest|best` answers the command line in a moment.
+Imports nothing heavy, so `python -m caraware.run.manifest RUN|CHECKPOINT newest|best` answers at once.
 """
 
 import hashlib

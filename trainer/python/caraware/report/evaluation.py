@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from caraware.baselines import BaselineErrors, Baselines, SensorNoise
-from caraware.statistics import mean_interval
-from caraware.stream import Observation
+from caraware.ipc.stream import Observation
+from caraware.report.statistics import mean_interval
 
 CI95_STANDARD_ERRORS = 1.96
 """Half the width of a 95 % confidence interval of a mean of many, in standard errors."""

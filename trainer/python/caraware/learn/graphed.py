@@ -1,9 +1,10 @@
 """PPO's gradient steps on a GPU: a CUDA graph for a minibatch of each network, replayed without asking anything back.
 
-The steps of `caraware.ppo` read losses and norms back after every minibatch, which costs nothing on a CPU and most of
-the time on a GPU, whose kernels here last microseconds. So on a GPU an update runs as replays of captured steps:
-a step finds its own rows (a counter on the device), takes its own Adam step, and writes its numbers into a table that
-is read when the update is over (with `target_kl`, after every epoch). Policy and value network have a stream each.
+The steps of `caraware.learn.ppo` read losses and norms back after every minibatch, which costs nothing on a CPU and
+most of the time on a GPU, whose kernels here last microseconds. So on a GPU an update runs as replays of captured
+steps: a step finds its own rows (a counter on the device), takes its own Adam step, and writes its numbers into a
+table that is read when the update is over (with `target_kl`, after every epoch). Policy and value network have a
+stream each.
 
 A graph has fixed shapes, but horizons differ by some samples: minibatches are filled up with rows of weight 0.
 """
@@ -17,12 +18,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from caraware.adam import BETA_MEAN, BETA_SQUARE, EPSILON, Adam
-from caraware.networks import CHUNK_ROWS, FlatParameters, entropy, log_probability
-from caraware.objective import clipped_error
+from caraware.learn.adam import BETA_MEAN, BETA_SQUARE, EPSILON, Adam
+from caraware.learn.networks import CHUNK_ROWS, FlatParameters, entropy, log_probability
+from caraware.learn.objective import clipped_error
 
 if TYPE_CHECKING:
-    from caraware.ppo import Batch, Ppo, Settings
+    from caraware.learn.ppo import Batch, Ppo, Settings
 
 WARM_UP_STEPS = 3
 """Steps before the capture: libraries choose their kernels and workspaces in the first calls."""
@@ -262,7 +263,7 @@ class _Lane:
 
 
 class _DeviceAdam:
-    """`caraware.adam.Adam` with the step count and the learning rate on the device, after clipping the gradient."""
+    """`Adam` with the step count and the learning rate on the device; it clips the gradient first."""
 
     def __init__(self, optimiser: Adam, parameters: FlatParameters, learning_rate: Tensor) -> None:
         self.optimiser, self.parameters = optimiser, parameters

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caraware.stream import EMPTY_SLOT, Observation
+from caraware.ipc.stream import EMPTY_SLOT, Observation
 
 
 @dataclass(frozen=True)

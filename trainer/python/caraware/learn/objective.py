@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from caraware.networks import log_probability
+from caraware.learn.networks import log_probability
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Policy and value network with memory: the MLP's layers, with a gated recurrent unit in place of the last hidden one.
 
 Gated recurrent unit: Cho et al., arXiv 1406.1078, in torch's form. Parameters and gradient lie in flat vectors, and
-`forward` and `backward` are called as those of `caraware.networks.Mlp`; behind them is autograd.
+`forward` and `backward` are called as those of `caraware.learn.networks.Mlp`; behind them is autograd.
 """
 
 import math
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from caraware.networks import (
+from caraware.learn.networks import (
     Activation,
     FlatParameters,
     GaussianPolicy,

@@ -66,7 +66,7 @@ class Standing:
 
 
 class Decided(Protocol):
-    """Where decisions go: `caraware.channel.Channel`."""
+    """Where decisions go: `caraware.ipc.channel.Channel`."""
 
     def decided(self, lessons: int, since: int, step: int) -> None:
         """All lessons below `lessons` have a step; those from `since` on have `step`, counted from 0."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from caraware import _native
-from caraware.pointcloud import PointCloud
+from caraware.ipc.pointcloud import PointCloud
 
 
 def _lent_tensor(view: object, slots: int, fields: int) -> Tensor:
@@ -270,7 +270,7 @@ class Channel:
     def decided(self, lessons: int, since: int, step: int) -> None:
         """All lessons of a curriculum below `lessons` have a step; those from `since` on `step`, counted from 0.
 
-        The simulation waits for that before every lesson, the first included. `caraware.curriculum` says it.
+        The simulation waits for that before every lesson, the first included. `caraware.run.curriculum` says it.
         """
         self._attachment.decided(lessons, since, step)
 

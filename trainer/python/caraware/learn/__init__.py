@@ -1,0 +1,1 @@
+"""The learner: proximal policy optimisation, its networks, and what makes it fast."""

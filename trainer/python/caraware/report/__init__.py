@@ -1,0 +1,1 @@
+"""What a run reports: metrics, evaluations against the baselines, statistics, plots."""

@@ -1,0 +1,72 @@
+"""Everything that the trainer reads of a run file, read once, then frozen."""
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from caraware.baselines.noise import SensorNoise
+from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
+from caraware.run.curriculum import Step
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything the trainer reads of a run file."""
+
+    run_dir: Path
+    trainer: TrainerConfig
+    bounds: MapBounds
+    config_sha256: str
+    """Of the resolved configuration, as canonical JSON: a checkpoint remembers what it was trained with."""
+    dark_is_nan: bool = False
+    """Fields of a sensor in a blackout are not numbers (`blackout.policy`); the networks see 0, mid-range, instead."""
+    training_episodes: int = 1
+    """With a curriculum: most lessons."""
+    curriculum: tuple[Step, ...] = ()
+    evaluation_interval: int = 0
+    """Training episodes between two evaluation episodes; 0: none between."""
+    sensors: SensorNoise | None = None
+    """Errors of the sensors, which the classical baselines are tuned with; None for a run file without sensors."""
+    environments: tuple[int, ...] = (0,)
+    """Indices of this run's environments among those of all runs that learn together."""
+    is_paced: bool = False
+    """The simulation keeps to the wall clock: there is time for what only a watcher sees."""
+    resume_from: Path | None = field(default=None)
+    """A checkpoint directory to continue from."""
+
+    @classmethod
+    def from_run(cls, run: dict) -> "RunConfig":
+        """Check the whole run file. Raises `ConfigError`."""
+        if "run_dir" not in run:
+            raise ConfigError("the run file has no `run_dir`", "start the trainer through `caraware train`")
+        canonical = json.dumps(run.get("config", {}), sort_keys=True, separators=(",", ":")).encode()
+        resume = (run.get("beginning") or {}).get("checkpoint")
+        episodes = run.get("config", {}).get("episode", {})
+        place = run.get("config", {}).get("run", {})
+        first_env = place.get("first_env", 0)
+        return cls(
+            run_dir=Path(run["run_dir"]),
+            trainer=TrainerConfig.from_run(run),
+            bounds=MapBounds.from_run(run),
+            config_sha256=hashlib.sha256(canonical).hexdigest(),
+            dark_is_nan=run.get("config", {}).get("blackout", {}).get("policy") == "nan",
+            training_episodes=max(1, episodes.get("training_episodes", 1)),
+            curriculum=Step.from_run(run),
+            evaluation_interval=episodes.get("evaluation_interval", 0),
+            sensors=SensorNoise.from_run(run),
+            environments=tuple(range(first_env, first_env + place.get("envs", 1))),
+            is_paced=run.get("config", {}).get("run", {}).get("real_time_factor", 0.0) > 0.0,
+            resume_from=Path(resume) if resume else None,
+        )
+
+    def shows_estimates(self) -> bool:
+        """The Kalman filter runs beside the policy. At full speed it would cost more than the policy."""
+        wanted = {"paced": self.is_paced, "always": True, "never": False}[self.trainer.estimates]
+        return wanted and self.sensors is not None
+
+    def progress(self, episode: int) -> float:
+        """Share of the training episodes that lie before the run's `episode`-th; evaluations stand between them."""
+        interval = self.evaluation_interval
+        trained = episode - episode // (interval + 1) if interval > 0 else episode
+        return min(1.0, trained / self.training_episodes)

@@ -1,0 +1,143 @@
+"""A process in the trainer's place: signals, its part in a handover, exit codes, and how it reports a failure.
+
+Exit codes: 0 done, or stopped by SIGTERM or SIGINT after a checkpoint; 1 the run failed; 2 configuration;
+3 something is missing on this machine. A failure is reported once, in `<run>/logs/trainer.error.json`.
+"""
+
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+log = logging.getLogger("caraware.train")
+
+EXIT_CODES = {"run": 1, "config": 2, "missing": 3}
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What went wrong, for the supervisor to show."""
+
+    kind: str
+    message: str
+    help: str
+
+    def write(self, run_dir: Path, process: str) -> None:
+        """Write it to the file that the supervisor reads."""
+        file = run_dir / "logs" / f"{process}.error.json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps({"kind": self.kind, "message": self.message, "help": self.help}) + "\n")
+
+
+class StopSignal:
+    """Remembers signals until the loop is between two batches: SIGTERM and SIGINT stop, SIGUSR1 asks for a handover."""
+
+    def __init__(self) -> None:
+        self.requested = self.leave_requested = False
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
+            signal.signal(number, self._remember)
+
+    def _remember(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGUSR1:
+            self.leave_requested = True
+        else:
+            self.requested = True
+
+
+@dataclass
+class HandoverRole:
+    """The part of this process in a handover; the supervisor passes it in environment variables."""
+
+    replaces: bool
+    """Another trainer of this run came before."""
+    gets_ready: bool
+    """The other trainer is still running: get ready, then wait for the handover."""
+    checkpoint: Path | None
+    """Parameters to take instead of the newest of the run."""
+
+    @classmethod
+    def from_environment(cls) -> "HandoverRole":
+        """Without the variables, the process is the first trainer of its run."""
+        checkpoint = os.environ.get("CARAWARE_CHECKPOINT")
+        return cls(
+            replaces=int(os.environ.get("CARAWARE_INCARNATION", "0")) > 0,
+            gets_ready=bool(os.environ.get("CARAWARE_SHADOW")),
+            checkpoint=Path(checkpoint) if checkpoint else None,
+        )
+
+    def wait_for_turn(self) -> bool:
+        """Report that this successor is ready, and wait for the handover; False if the supervisor cancels it."""
+        os.write(1, b"ready\n")
+        os.dup2(2, 1)
+        if os.read(0, 16) != b"go\n":
+            return False
+        self.gets_ready = False
+        return True
+
+
+TrainerWork = Callable[[Path, StopSignal, HandoverRole], None]
+"""The work of a trainer process, given its run file."""
+
+
+def run_process(arguments: list[str], work: TrainerWork) -> int:
+    """Run `work` for the run file in `arguments`; returns the exit code of the process."""
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
+    if len(arguments) != 1:
+        print("usage: python -m caraware.train RUN_FILE", file=sys.stderr)
+        return EXIT_CODES["config"]
+    run_file = Path(arguments[0])
+    stop, role = StopSignal(), HandoverRole.from_environment()
+    try:
+        work(run_file, stop, role)
+    except Exception as error:  # the edge of the process: every failure is reported in one place
+        failure = _explain(error)
+        log.exception("%s", failure.message)
+        failure.write(_run_dir(run_file), "successor" if role.gets_ready else "trainer")
+        return EXIT_CODES[failure.kind]
+    return 0
+
+
+def read_run(run_file: Path) -> dict:
+    """The run file, parsed. Raises `ConfigError`."""
+    from caraware.learn.config import ConfigError
+
+    try:
+        return json.loads(run_file.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cannot read the run file {run_file}: {error}", "start it by `caraware train`") from error
+
+
+def _run_dir(run_file: Path) -> Path:
+    """The run's directory; where the run file cannot be read, the directory that contains it."""
+    try:
+        return Path(json.loads(run_file.read_text())["run_dir"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return run_file.parent
+
+
+def _explain(error: Exception) -> Failure:
+    """Sort an exception into the three kinds, each with what to do about it."""
+    if isinstance(error, ImportError):
+        return Failure(
+            "missing", f"cannot import {error.name}: {error}", "`make train` installs what the trainer needs"
+        )
+    from caraware.learn.config import ConfigError
+    from caraware.learn.ppo import NonFiniteLoss
+    from caraware.learn.ranks import RankError
+    from caraware.run.manifest import CheckpointError
+
+    if isinstance(error, ConfigError):
+        return Failure("config", str(error), error.help)
+    if isinstance(error, CheckpointError):
+        return Failure("run", f"checkpoint refused: {error}", "continue from another checkpoint of the run")
+    if isinstance(error, NonFiniteLoss):
+        saved = f"the batch is in {error.batch_file}; " if error.batch_file else ""
+        return Failure("run", str(error), f"{saved}a smaller `trainer.learning_rate` is the usual cure")
+    if isinstance(error, RankError):
+        return Failure("run", str(error), "all ranks end together; the first to fail says why")
+    return Failure("run", f"{type(error).__name__}: {error}", "the traceback is in the trainer's log")
