@@ -15,12 +15,12 @@ train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
 
 test: prerequisites browser $(VENV)/.installed ## all tests
-	cargo test $(CARGO_FLAGS) --workspace --no-run
+	cargo test $(CARGO_FLAGS) --no-run
 	$(EXTENSION)
 	$(MAKE) test-rust test-python
 
 build: prerequisites $(VENV)/.installed ## virtual environment, SUMO, all programs, the Python extension
-	cargo build $(CARGO_FLAGS) --workspace
+	cargo build $(CARGO_FLAGS)
 	$(EXTENSION)
 
 EXTENSION = VIRTUAL_ENV=$(CURDIR)/$(VENV) $(VENV)/bin/maturin develop --quiet $(CARGO_FLAGS) --manifest-path trainer/Cargo.toml --skip-install
@@ -40,7 +40,7 @@ $(VENV)/.installed: requirements.lock trainer/pyproject.toml viewer/pyproject.to
 	touch $@
 
 test-rust:
-	cargo test $(CARGO_FLAGS) --workspace --no-fail-fast
+	cargo test $(CARGO_FLAGS) --no-fail-fast
 
 # One pytest each: test modules of different packages may share names.
 test-python:
@@ -51,7 +51,7 @@ test-python:
 
 lint: $(VENV)/.installed ## formatting and lints, as errors
 	cargo fmt --all --check
-	cargo clippy --locked --workspace --all-targets -- -D warnings
+	cargo clippy --locked --all-targets -- -D warnings
 	$(VENV)/bin/ruff check trainer viewer
 	$(VENV)/bin/ruff check --config trainer/pyproject.toml sim-core sensor-daemon docs
 	$(VENV)/bin/ruff format --check trainer viewer
@@ -68,7 +68,7 @@ deny: ## licences, sources and advisories of all dependencies (needs: cargo inst
 	cargo deny check
 
 bench: build ## the benchmarks of docs/benchmarks.md
-	cargo bench --locked --workspace
+	cargo bench --locked
 
 peers: build ## what `caraware bench` compares with, in an environment of its own that sees the project's packages
 	$(VENV)/bin/python -m venv .venv-peers

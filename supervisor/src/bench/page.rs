@@ -12,7 +12,7 @@ figures between runs: the machines are shared and noisy. A figure with a range i
 ";
 
 fn documentation() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("docs")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs")
 }
 
 /// Keeps a report in the documentation.

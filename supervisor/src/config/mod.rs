@@ -15,10 +15,10 @@ use layer::{Layer, Setting};
 
 /// Embedded presets by name; the first is the default and holds every key that must have a value.
 pub const PRESETS: [(&str, &str); 4] = [
-    ("town", include_str!("../../configs/town.toml")),
-    ("paper", include_str!("../../configs/paper.toml")),
-    ("driving", include_str!("../../configs/driving.toml")),
-    ("fusion", include_str!("../../configs/fusion.toml")),
+    ("town", include_str!("../../../configs/town.toml")),
+    ("paper", include_str!("../../../configs/paper.toml")),
+    ("driving", include_str!("../../../configs/driving.toml")),
+    ("fusion", include_str!("../../../configs/fusion.toml")),
 ];
 
 /// Merged settings, each remembering where it was set.

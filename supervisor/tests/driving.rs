@@ -23,7 +23,7 @@ const QUIET: [&str; 2] = ["--set", "fanout.enabled=false"];
 /// `caraware train` with the scripted driver of `tests/drivers`.
 fn driven(workplace: &Workplace, script: &str, arguments: &[&str]) -> Command {
     let drivers = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/drivers");
-    let trainer = Path::new(env!("CARGO_MANIFEST_DIR")).join("trainer/python");
+    let trainer = Path::new(env!("CARGO_MANIFEST_DIR")).join("../trainer/python");
     let mut command = workplace.command(&[&["train"], arguments, &QUIET].concat());
     command
         .env("PYTHONPATH", std::env::join_paths([drivers, trainer]).unwrap())
@@ -343,7 +343,7 @@ fn the_scripted_driver_drives_laps_of_the_town_the_same_for_the_same_seed() {
         let mut command = workplace.command(&[&["train"], &settings[..], more, &QUIET].concat());
         command.env(
             "PYTHONPATH",
-            Path::new(env!("CARGO_MANIFEST_DIR")).join("trainer/python"),
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("../trainer/python"),
         );
         succeed(command);
         workplace.report(name)

@@ -8,7 +8,7 @@ use std::{
 use crate::{failure::Exit, install::Install};
 
 macro_rules! sources {
-    ($($name:literal),+ $(,)?) => { [$(($name, include_str!(concat!("../maps/town/", $name)))),+] };
+    ($($name:literal),+ $(,)?) => { [$(($name, include_str!(concat!("../../maps/town/", $name)))),+] };
 }
 
 /// The plain sources of the town.

@@ -262,7 +262,7 @@ fn assignments_take_numbers_words_and_lists() {
 /// `CARAWARE_BLESS=1 cargo test -p caraware` rewrites the reference after a deliberate change.
 #[test]
 fn the_reference_of_keys_is_true() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/configs/README.md");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/README.md");
     let expected = reference::markdown();
     if std::env::var_os("CARAWARE_BLESS").is_some() {
         std::fs::write(path, &expected).unwrap();
@@ -329,7 +329,7 @@ refused with the file, the line and the allowed values.
 /// The default preset as JSON, for tests and benchmarks of the other crates; written with `CARAWARE_BLESS=1`.
 #[test]
 fn the_resolved_default_preset_for_tests_is_true() {
-    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/ipc-schema/tests/town.json");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../ipc-schema/tests/town.json");
     let expected = serde_json::to_string_pretty(&Settings::defaults().unwrap().validate().unwrap()).unwrap() + "\n";
     if std::env::var_os("CARAWARE_BLESS").is_some() {
         std::fs::write(path, &expected).unwrap();

@@ -108,7 +108,7 @@ impl Machines {
     }
 
     fn on_the_laptop(&self, arguments: &[&str]) -> Command {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let root = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/.."));
         let mut command = self.inside(self.laptop, &root.join(".venv/bin/python"));
         command
             .args(arguments)
@@ -161,7 +161,7 @@ impl Run {
 
 /// Certificates by the lines of docs/remote.md, for the lab's address.
 fn make_certificates(directory: &Path) {
-    let page = include_str!("../docs/remote.md");
+    let page = include_str!("../../docs/remote.md");
     let lines = page
         .split("```bash certificates\n")
         .nth(1)
