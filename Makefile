@@ -31,11 +31,12 @@ prerequisites:
 browser: ## a Chromium for the viewer's test
 	@scripts/browser.sh
 
-# The pins are in requirements.lock; the two packages of this project are installed in place.
-$(VENV)/.installed: requirements.lock trainer/pyproject.toml viewer/pyproject.toml
+# The pins are in requirements.lock; the packages of this project are installed in place.
+$(VENV)/.installed: requirements.lock trainer/pyproject.toml viewer/pyproject.toml bench/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements.lock
-	echo "$(CURDIR)/trainer/python" > $$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/caraware.pth
+	printf '%s\n' "$(CURDIR)/trainer/python" "$(CURDIR)/bench/python" \
+		> $$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/caraware.pth
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable ./viewer
 	touch $@
 
@@ -45,6 +46,7 @@ test-rust:
 # One pytest each: test modules of different packages may share names.
 test-python:
 	$(VENV)/bin/python -m pytest -q trainer/tests
+	$(VENV)/bin/python -m pytest -q bench/tests
 	cd viewer && ../$(VENV)/bin/python -m pytest -q tests
 	$(VENV)/bin/python -m pytest -q maps/town/tests
 	$(VENV)/bin/python -m pytest -q sim-core/tests
@@ -52,16 +54,16 @@ test-python:
 lint: $(VENV)/.installed ## formatting and lints, as errors
 	cargo fmt --all --check
 	cargo clippy --locked --all-targets -- -D warnings
-	$(VENV)/bin/ruff check trainer viewer
+	$(VENV)/bin/ruff check trainer viewer bench
 	$(VENV)/bin/ruff check --config trainer/pyproject.toml sim-core sensor-daemon docs
-	$(VENV)/bin/ruff format --check trainer viewer
+	$(VENV)/bin/ruff format --check trainer viewer bench
 	$(VENV)/bin/ruff format --config trainer/pyproject.toml --check sim-core sensor-daemon docs
 
 format: $(VENV)/.installed
 	cargo fmt --all
-	$(VENV)/bin/ruff check --fix trainer viewer
+	$(VENV)/bin/ruff check --fix trainer viewer bench
 	$(VENV)/bin/ruff check --config trainer/pyproject.toml --fix sim-core sensor-daemon docs
-	$(VENV)/bin/ruff format trainer viewer
+	$(VENV)/bin/ruff format trainer viewer bench
 	$(VENV)/bin/ruff format --config trainer/pyproject.toml sim-core sensor-daemon docs
 
 deny: ## licences, sources and advisories of all dependencies (needs: cargo install cargo-deny --locked)
@@ -72,23 +74,23 @@ bench: build ## the benchmarks of docs/benchmarks.md
 
 peers: build ## what `caraware bench` compares with, in an environment of its own that sees the project's packages
 	$(VENV)/bin/python -m venv .venv-peers
-	($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))'; echo "$(CURDIR)/trainer/python") \
+	($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))'; \
+		printf '%s\n' "$(CURDIR)/trainer/python" "$(CURDIR)/bench/python") \
 		> $$(.venv-peers/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/project.pth
-	.venv-peers/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements-peers.txt
+	.venv-peers/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r bench/requirements-peers.txt
 
-# These two pin other versions of what the rest has: each in an environment of its own that sees none of the project's packages
-# but the program that measures it.
-OWN_ENVIRONMENT = echo "$(CURDIR)/trainer/python" > $$($(1)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/project.pth
+# These two pin other versions of shared packages: each has an environment of its own that sees the benchmarks' package alone.
+OWN_ENVIRONMENT = echo "$(CURDIR)/bench/python" > $$($(1)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/project.pth
 
 peers-metadrive: ## MetaDrive for `caraware bench peers`: 60 MB to download for its models beside its packages, 1 GB on disk
 	$(PYTHON) -m venv .venv-metadrive
-	.venv-metadrive/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements-metadrive.txt
+	.venv-metadrive/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r bench/requirements-metadrive.txt
 	$(call OWN_ENVIRONMENT,.venv-metadrive)
-	.venv-metadrive/bin/python -m caraware.benchmarks.metadrive_assets
+	.venv-metadrive/bin/python -m caraware_bench.metadrive_assets
 
 peers-smarts: ## SMARTS for `caraware bench peers`, which needs Python 3.10 (PYTHON310=PATH): 1.1 GB on disk
 	$(PYTHON310) -m venv .venv-smarts
-	.venv-smarts/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements-smarts.txt
+	.venv-smarts/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r bench/requirements-smarts.txt
 	$(call OWN_ENVIRONMENT,.venv-smarts)
 
 clean:

@@ -34,7 +34,7 @@ fn main() -> ExitCode {
         Command::Stop { run } => status::stop(run.as_deref()),
         Command::View(args) => view::view(&args),
         Command::Generate(args) => generate::generate(&args),
-        Command::Bench(args) => bench::bench(&args),
+        Command::Bench { arguments } => bench::bench(&arguments),
         Command::Doctor { clean } => doctor::doctor(clean),
     };
     match result {

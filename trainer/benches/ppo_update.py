@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 import torch
-from caraware.benchmarks.trainer import BATCH, EPOCHS, HORIZON, OBSERVATIONS, PlainAgent, plain_update, random_batch
+from caraware_bench.trainer import BATCH, EPOCHS, HORIZON, OBSERVATIONS, PlainAgent, plain_update, random_batch
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.ppo import Batch, Ppo
 

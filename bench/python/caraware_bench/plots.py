@@ -1,6 +1,6 @@
-"""Pictures of `caraware bench`: `python -m caraware.benchmarks.plots DIRECTORY < reports.json`.
+"""Pictures of `caraware bench`: `python -m caraware_bench.plots DIRECTORY < reports.json`.
 
-The input is a list of reports (`supervisor/src/bench/report.rs`); every curve becomes `DIRECTORY/<name>.png`.
+The input is a list of reports (`bench/src/report.rs`); every curve becomes `DIRECTORY/<name>.png`.
 """
 
 import json

@@ -10,6 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use caraware::{cli::RunArgs, failure::Exit, install, prepare::prepare};
 use ipc_schema::{
     block,
     board::State,
@@ -25,7 +26,6 @@ use ipc_schema::{
 use serde::Deserialize;
 
 use super::{Options, Report};
-use crate::{cli::RunArgs, failure::Exit, install, prepare::prepare};
 
 /// Sizes of the block, bytes.
 const SIZES: [usize; 8] = [1 << 10, 1 << 12, 1 << 14, 1 << 16, 1 << 18, 1 << 20, 1 << 22, 1 << 24];
@@ -103,7 +103,7 @@ fn ours() -> Result<Ours, Exit> {
             format!("traffic.max_road_users={}", rows(1 << 24)),
             "fanout.enabled=false".into(),
             "run.window_ticks=1".into(),
-            "trainer.module=caraware.benchmarks.ipc_receive".into(),
+            "trainer.module=caraware_bench.ipc_receive".into(),
         ],
         runs: directory.path().into(),
         ..RunArgs::default()
@@ -231,7 +231,7 @@ fn peers(options: &Options) -> Result<BTreeMap<String, BySize>, Exit> {
     let file = std::env::temp_dir().join(format!("caraware-bench-{}.json", std::process::id()));
     let sizes: Vec<String> = SIZES.iter().map(ToString::to_string).collect();
     let status = Command::new(python)
-        .args(["-m", "caraware.benchmarks.ipc_peers", &sizes.join(",")])
+        .args(["-m", "caraware_bench.ipc_peers", &sizes.join(",")])
         .arg(&file)
         .status()
         .map_err(|error| Exit::io("start", python, &error))?;

@@ -1,4 +1,4 @@
-"""`python -m caraware.benchmarks.metadrive_assets`: gives the MetaDrive of this environment its models and textures.
+"""`python -m caraware_bench.metadrive_assets`: gives the MetaDrive of this environment its models and textures.
 
 MetaDrive downloads them from its project's releases when it first runs. The wheel of an older version has them as well,
 and a package index is all that the rest needs. Without a window they are hardly used: nothing is drawn.

@@ -2,10 +2,10 @@
 
 use std::{collections::BTreeMap, process::Command};
 
+use caraware::{failure::Exit, install};
 use serde::Deserialize;
 
 use super::{Options, Report, Table};
-use crate::{failure::Exit, install};
 
 /// What `lidar-bench` writes.
 #[derive(Debug, Deserialize)]

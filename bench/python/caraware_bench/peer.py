@@ -1,4 +1,4 @@
-"""One peer of `caraware bench peers`: `python -m caraware.benchmarks.peer NAME … --json FILE`.
+"""One peer of `caraware bench peers`: `python -m caraware_bench.peer NAME … --json FILE`.
 
 Runs in the environment that the peer is installed in, with nothing of the project but this package. Writes
 `{"version": …, "rates": {case: rate}}`, vehicle-updates or agent-steps per wall second, or `{"missing": why}` if the
@@ -19,7 +19,7 @@ def libsumo(options: argparse.Namespace) -> tuple[str, Rates]:
     """A Python loop over libsumo, SUMO in the same process."""
     import libsumo
 
-    from caraware.benchmarks.traffic_loop import measure
+    from caraware_bench.traffic_loop import measure
 
     return version("libsumo"), {"libsumo, Python loop": measure(libsumo, arguments(options), options.steps)}
 
@@ -28,7 +28,7 @@ def traci(options: argparse.Namespace) -> tuple[str, Rates]:
     """A Python loop over TraCI, SUMO at the other end of a socket."""
     import traci
 
-    from caraware.benchmarks.traffic_loop import measure
+    from caraware_bench.traffic_loop import measure
 
     return version("traci"), {"TraCI, Python loop": measure(traci, arguments(options), options.steps)}
 
@@ -40,14 +40,14 @@ def arguments(options: argparse.Namespace) -> list[str]:
 
 def metadrive(options: argparse.Namespace) -> tuple[str, Rates]:
     """MetaDrive's multi-agent roundabout."""
-    from caraware.benchmarks.metadrive_peer import VERSION, rates
+    from caraware_bench.metadrive_peer import VERSION, rates
 
     return VERSION, rates(options.seconds)
 
 
 def smarts(options: argparse.Namespace) -> tuple[str, Rates]:
     """SMARTS's HiWayEnv on a net of SUMO's."""
-    from caraware.benchmarks.smarts_peer import VERSION, rates
+    from caraware_bench.smarts_peer import VERSION, rates
 
     return VERSION, rates(options.net, options.seconds)
 

@@ -7,7 +7,7 @@ import metadrive
 from metadrive.constants import VERSION as VERSION
 from metadrive.envs.marl_envs import MultiAgentRoundaboutEnv
 
-from caraware.benchmarks.agent_steps import agent_steps_per_s
+from caraware_bench.agent_steps import agent_steps_per_s
 
 AGENTS = 40
 ACTION = [0.0, 0.1]

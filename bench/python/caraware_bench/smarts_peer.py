@@ -12,7 +12,7 @@ from smarts.env.gymnasium.hiway_env_v1 import HiWayEnvV1
 from smarts.sstudio import gen_scenario
 from smarts.sstudio.sstypes import EndlessMission, Scenario
 
-from caraware.benchmarks.agent_steps import agent_steps_per_s
+from caraware_bench.agent_steps import agent_steps_per_s
 
 VERSION = version("smarts")
 AGENTS = [f"agent-{number}" for number in range(8)]

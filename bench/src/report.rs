@@ -2,9 +2,8 @@
 
 use std::{collections::BTreeMap, fmt, process::Command};
 
+use caraware::failure::Exit;
 use serde::{Deserialize, Serialize};
-
-use crate::failure::Exit;
 
 /// What one part's measurement found.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,6 +1,6 @@
 """The consumer of `caraware bench ipc`: the time from publish to a visible tensor.
 
-`python -m caraware.benchmarks.ipc_receive RUN_FILE` attaches as the trainer of a run, takes every observation while
+`python -m caraware_bench.ipc_receive RUN_FILE` attaches as the trainer of a run, takes every observation while
 busy-polling, and writes `latencies.json` into the run directory: for each number of rows and each way, the nanoseconds
 until the block was taken from shared memory, and until a tensor existed. Ticks come in turn by `Channel.lease` and by
 `Channel.receive`. The sender stamps `sim_time_ns` with the monotonic

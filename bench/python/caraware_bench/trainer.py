@@ -1,4 +1,4 @@
-"""`python -m caraware.benchmarks.trainer [--pairs N] [--threads N]`: the learner beside SB3 and a plain loop.
+"""`python -m caraware_bench.trainer [--pairs N] [--threads N]`: the learner beside SB3 and a plain loop.
 
 Same networks, horizon, batch, epochs, and threads; ours and theirs alternate in one process. Prints JSON, which
 `caraware bench trainer` turns into a report. A sample visit is one sample in one epoch.

@@ -2,8 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use super::Report;
-use crate::{cli::Part, failure::Exit};
+use caraware::failure::Exit;
+
+use crate::{Report, cli::Part};
 
 const HEAD: &str = "# Benchmarks
 
@@ -78,7 +79,7 @@ mod tests {
         }
         assert_eq!(
             kept, made,
-            "docs/benchmarks.md: CARAWARE_BLESS=1 cargo test -p caraware --lib bench"
+            "docs/benchmarks.md: CARAWARE_BLESS=1 cargo test -p caraware-bench"
         );
     }
 }

@@ -6,8 +6,9 @@ use std::{
     process::{Command, Stdio},
 };
 
+use caraware::failure::Exit;
+
 use super::Report;
-use crate::failure::Exit;
 
 /// Draws every curve of `reports` into `directory`.
 ///
@@ -17,7 +18,7 @@ pub fn draw(python: &Path, reports: &[Report], directory: &Path) -> Result<(), E
     std::fs::create_dir_all(directory).map_err(|error| Exit::io("create", directory, &error))?;
     let failed = |error: &std::io::Error| Exit::io("start", python, error);
     let mut process = Command::new(python)
-        .args(["-m", "caraware.benchmarks.plots"])
+        .args(["-m", "caraware_bench.plots"])
         .arg(directory)
         .stdin(Stdio::piped())
         .spawn()

@@ -1,6 +1,6 @@
 """The peers of `caraware bench ipc`: one-way latency of what Python programs usually send arrays with.
 
-`python -m caraware.benchmarks.ipc_peers SIZES FILE` sends messages of each size (bytes, comma-separated) from one
+`python -m caraware_bench.ipc_peers SIZES FILE` sends messages of each size (bytes, comma-separated) from one
 process to another through a pipe of `multiprocessing`, a TCP connection over loopback and, if pyzmq is installed,
 ZeroMQ's `ipc://`, and writes `{peer: {size: [latency_ns, …]}}`. The sender stamps the monotonic clock right before it
 sends; the receiver once the message is a tensor. One message is under way at a time.

@@ -6,10 +6,10 @@ use std::{
     process::{Command, Stdio},
 };
 
+use caraware::{cores, failure::Exit, install};
 use serde::Deserialize;
 
 use super::{Curve, Line, Options, Report, Spread, Table};
-use crate::{cores, failure::Exit, install};
 
 /// Numbers of environments.
 const ENVIRONMENTS: [usize; 3] = [1, 2, 4];

@@ -1,7 +1,8 @@
 //! `caraware bench`: measures a part of caraware on this machine, side by side with what others use for the same work.
 //!
-//! One file for each part; all end in a [`Report`]. Decision 9.
+//! The `caraware` command starts this program with its arguments. One file for each part; all end in a [`Report`]. Decision 9.
 
+mod cli;
 mod envs;
 mod fanout;
 mod ipc;
@@ -10,21 +11,19 @@ mod overhead;
 mod page;
 mod peers;
 mod plots;
-pub mod report;
+mod report;
 mod scale;
 mod sides;
 mod stages;
 mod trainer;
 
-use std::{io::Write as _, path::PathBuf};
+use std::{io::Write as _, path::PathBuf, process::ExitCode};
 
-pub use report::{Curve, Line, Machine, Report, Spread, Table};
+use caraware::{failure::Exit, install};
+use clap::Parser as _;
 
-use crate::{
-    cli::{BenchArgs, Part},
-    failure::Exit,
-    install,
-};
+use crate::cli::{BenchArgs, Part};
+use report::{Curve, Line, Report, Spread, Table};
 
 /// What every measurement may need.
 #[derive(Debug, Clone)]
@@ -37,11 +36,18 @@ pub struct Options {
     pub quick: bool,
 }
 
+fn main() -> ExitCode {
+    match bench(&BenchArgs::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(exit) => exit.report(),
+    }
+}
+
 /// Measures, prints, and writes what is asked for.
 ///
 /// # Errors
 /// Something the measurement needs is missing, or it fails.
-pub fn bench(args: &BenchArgs) -> Result<(), Exit> {
+fn bench(args: &BenchArgs) -> Result<(), Exit> {
     let bin = install::programs()?;
     // The peers are Python packages that nothing else needs: without them, ours is measured alone.
     let python = args

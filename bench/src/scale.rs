@@ -1,11 +1,12 @@
 //! Cost and memory for each vehicle, from a thousand to fifty thousand; and what a real motorway and long steps of SUMO do.
 
+use caraware::{failure::Exit, generate::City, install::Install};
+
 use super::{
     Curve, Line, Options, Report, Table,
     sides::{Ours, Place, Scenario, Taken, same_results},
     stages::Stages,
 };
-use crate::{failure::Exit, generate::City, install::Install};
 
 /// Vehicles and simulated seconds of each city.
 const CITIES: [(u32, f64); 5] = [

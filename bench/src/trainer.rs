@@ -2,16 +2,16 @@
 
 use std::process::Command;
 
+use caraware::{failure::Exit, install};
 use serde::Deserialize;
 
 use super::{Options, Report, Spread, Table};
-use crate::{failure::Exit, install};
 
-/// Samples in a horizon, and visits of a sample in an update, as `caraware.benchmarks.trainer` has them.
+/// Samples in a horizon, and visits of a sample in an update, as `caraware_bench.trainer` has them.
 const HORIZON: f64 = 32_768.0;
 const EPOCHS: f64 = 4.0;
 
-/// What `caraware.benchmarks.trainer` prints: seconds, by round.
+/// What `caraware_bench.trainer` prints: seconds, by round.
 #[derive(Debug, Deserialize)]
 struct Measured {
     threads: u32,
@@ -42,7 +42,7 @@ struct Tick {
     calls_per_tick: f64,
 }
 
-/// Runs `python -m caraware.benchmarks.trainer`.
+/// Runs `python -m caraware_bench.trainer`.
 ///
 /// # Errors
 /// There is no Python with the trainer, or it fails.
@@ -52,7 +52,7 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
         None => install::python(&options.bin)?,
     };
     let mut command = Command::new(python);
-    command.args(["-m", "caraware.benchmarks.trainer"]);
+    command.args(["-m", "caraware_bench.trainer"]);
     let measured: Measured = super::report::from_program(command)?;
     let mut report = Report::new(
         "trainer",

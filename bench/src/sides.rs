@@ -7,6 +7,7 @@ use std::{
     time::Instant,
 };
 
+use caraware::{failure::Exit, install, install::Install};
 use ipc_schema::usage;
 use rustix::{
     io::Errno,
@@ -15,7 +16,6 @@ use rustix::{
 use serde_json::Value;
 
 use super::Options;
-use crate::{failure::Exit, install, install::Install};
 
 /// Vehicle-ticks that ours may run ahead: with 5 000 vehicles as long as the consumer takes to import torch.
 const WINDOW_VEHICLE_TICKS: u32 = 64 * 5000;
@@ -144,7 +144,7 @@ impl<'a> Scenario<'a> {
         Ok((self.take(&mut command)?, results))
     }
 
-    /// A loop of Python over SUMO's steps (`caraware.benchmarks.peer`); its results will be in the directory returned.
+    /// A loop of Python over SUMO's steps (`caraware_bench.peer`); its results will be in the directory returned.
     ///
     /// # Errors
     /// No place for the results.
@@ -152,7 +152,7 @@ impl<'a> Scenario<'a> {
         let (results, prefix) = self.results(peer)?;
         let mut command = Command::new(python);
         command
-            .args(["-m", "caraware.benchmarks.peer", peer, "--sumo"])
+            .args(["-m", "caraware_bench.peer", peer, "--sumo"])
             .arg(self.install.sumo_program("sumo"))
             .arg("--sumocfg")
             .arg(&self.sumocfg)

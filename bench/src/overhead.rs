@@ -1,11 +1,12 @@
 //! What co-simulation costs beside bare SUMO on the same scenario.
 
+use caraware::{failure::Exit, generate::City, install::Install};
+
 use super::{
     Options, Report, Spread, Table,
     sides::{Ours, Place, Scenario, same_results},
     stages::Stages,
 };
-use crate::{failure::Exit, generate::City, install::Install};
 
 /// Vehicles, simulated seconds, pairs.
 const SIZE: (u32, f64, usize) = (5000, 60.0, 5);

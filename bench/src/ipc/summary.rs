@@ -2,11 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use caraware::failure::Exit;
+
 use super::{BySize, Ours, ROUNDS, Round};
-use crate::{
-    bench::{Curve, Line, Report, Spread, Table},
-    failure::Exit,
-};
+use crate::{Curve, Line, Report, Spread, Table};
 
 /// One-way latencies, microseconds.
 #[derive(Debug, Clone, Copy)]

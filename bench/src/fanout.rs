@@ -7,6 +7,7 @@ use std::{
     time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
+use caraware::{failure::Exit, install};
 use ipc_schema::{
     board::State,
     clock,
@@ -19,7 +20,6 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
 use super::{Options, Report, Spread, Table};
-use crate::{failure::Exit, install};
 
 /// Wall time of a paced run, seconds.
 const PACED_S: u64 = 20;

@@ -6,6 +6,7 @@ use std::{
     process::Command,
 };
 
+use caraware::{failure::Exit, generate::City, install, install::Install};
 use serde::Deserialize;
 
 use super::{
@@ -13,7 +14,6 @@ use super::{
     report::from_program,
     sides::{Place, Scenario, same_results},
 };
-use crate::{failure::Exit, generate::City, install, install::Install};
 
 /// How much is measured.
 struct Size {
@@ -59,7 +59,7 @@ const FEW: u32 = 40;
 struct Driving {
     /// Its name.
     name: &'static str,
-    /// How `caraware.benchmarks.peer` calls it.
+    /// How `caraware_bench.peer` calls it.
     peer: &'static str,
     /// Its environment.
     environment: &'static str,
@@ -78,7 +78,7 @@ const DRIVING: [Driving; 2] = [
     },
 ];
 
-/// What `caraware.benchmarks.peer` writes.
+/// What `caraware_bench.peer` writes.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(untagged)]
 enum Answer {
@@ -213,7 +213,7 @@ fn drive(options: &Options, place: &Place, peer: &Driving, net: &Path, seconds: 
     };
     let mut command = Command::new(python);
     command
-        .args(["-m", "caraware.benchmarks.peer", peer.peer, "--net"])
+        .args(["-m", "caraware_bench.peer", peer.peer, "--net"])
         .arg(net)
         .args(["--seconds", &seconds.to_string()])
         // SMARTS keeps logs there.

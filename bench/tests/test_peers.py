@@ -7,9 +7,9 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
-from caraware.benchmarks import agent_steps, peer
-from caraware.benchmarks.agent_steps import WARM_UP_STEPS, agent_steps_per_s
-from caraware.benchmarks.traffic_loop import SIGNAL_PERIOD_STEPS, Mirror, measure
+from caraware_bench import agent_steps, peer
+from caraware_bench.agent_steps import WARM_UP_STEPS, agent_steps_per_s
+from caraware_bench.traffic_loop import SIGNAL_PERIOD_STEPS, Mirror, measure
 
 VEHICLES = 6
 
