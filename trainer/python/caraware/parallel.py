@@ -103,7 +103,7 @@ def _newest_of_all(folder: Path, place: Place, agree: Agree) -> str:
 
 def tell_each_other(place: Place, own: list[str]) -> list[set[str]]:
     """By the store that `torchrun` keeps for its processes."""
-    from torch.distributed import TCPStore
+    from torch.distributed import TCPStore  # type: ignore[attr-defined]  # torch lists it without exporting it
 
     address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
     attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")

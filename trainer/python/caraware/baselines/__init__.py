@@ -12,6 +12,7 @@ from caraware.baselines.motion import MotionModel
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.rts import SmoothedTick, Smoother
 from caraware.baselines.samples import read_samples
+from caraware.ipc.arrays import Float64Array, Int64Array
 from caraware.ipc.stream import Observation
 
 __all__ = ["BaselineErrors", "Baselines", "Ekf", "MotionModel", "SensorNoise", "Smoother"]
@@ -21,9 +22,9 @@ __all__ = ["BaselineErrors", "Baselines", "Ekf", "MotionModel", "SensorNoise", "
 class BaselineErrors:
     """Errors of the valid rows of one tick of an episode; `[v]` each."""
 
-    vehicle: np.ndarray
+    vehicle: Int64Array
     """i64: dense index within the episode."""
-    error_m: np.ndarray
+    error_m: Float64Array
 
 
 class Baselines:
@@ -58,5 +59,7 @@ def _errors(tick: SmoothedTick) -> BaselineErrors:
     return BaselineErrors(vehicle, _distance_m(tick.mean[:2, rows].T, truth_m))
 
 
-def _distance_m(estimate_m: np.ndarray, truth_m: np.ndarray) -> np.ndarray:
-    return np.hypot(*(estimate_m - truth_m).T)
+def _distance_m(estimate_m: Float64Array, truth_m: Float64Array) -> Float64Array:
+    east, north = (estimate_m - truth_m).T
+    distance_m: Float64Array = np.hypot(east, north)
+    return distance_m

@@ -17,6 +17,7 @@ from caraware.baselines.motion import (
     SLIP,
     SPEED,
     YAW,
+    Entry,
     Motion,
     MotionModel,
     StateLayout,
@@ -30,7 +31,11 @@ from caraware.baselines.motion import (
 )
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import Samples
+from caraware.ipc.arrays import BoolArray, Float64Array
 from caraware.ipc.stream import EMPTY_SLOT
+
+Coefficients = list[tuple[int, Float64Array | float]]
+"""A row of a Jacobian: index and coefficient `[n]` of what is not zero."""
 
 NO_HEADING_VARIANCE = math.pi**2 / 3.0
 """Variance of a heading of which nothing is known: uniform on the circle. Beyond, the next fix starts a filter anew."""
@@ -48,12 +53,12 @@ FORGOTTEN_TIMES = 40.0
 """Correlation times after which a held sample says nothing."""
 
 
-def wrapped(angle_rad: np.ndarray) -> np.ndarray:
+def wrapped(angle_rad: Float64Array) -> Float64Array:
     """Angles in [−π, π)."""
     return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def never_negative(value: np.ndarray, std: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def never_negative(value: Float64Array, std: float) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Mean, derivative by `value` and variance of `max(0, value + n)`, `n` of standard deviation `std`.
 
     A wheel at rest that cannot count backwards reads 0.4 σ on average; taken at its word it creeps away (B. Allik et
@@ -72,9 +77,9 @@ def never_negative(value: np.ndarray, std: float) -> tuple[np.ndarray, np.ndarra
 class Belief:
     """A Gaussian for each of `n` slots."""
 
-    mean: np.ndarray
+    mean: Float64Array
     """f64 `[d, n]`."""
-    covariance: np.ndarray
+    covariance: Float64Array
     """f64 `[d, d, n]`, symmetric to the last bit."""
 
     @classmethod
@@ -82,7 +87,7 @@ class Belief:
         """Zero with unit covariance, which keeps the arithmetic of empty slots finite."""
         return cls(np.zeros((size, slots)), np.repeat(np.eye(size)[:, :, None], slots, axis=2))
 
-    def predict(self, moved: np.ndarray, jacobian: list, noise: list) -> None:
+    def predict(self, moved: Float64Array, jacobian: list[Entry], noise: list[Entry]) -> None:
         """`x ← f(x)`, `P ← F P Fᵀ + Q`."""
         propagate_rows(self.covariance, jacobian)
         propagate_columns(self.covariance, jacobian)
@@ -92,14 +97,16 @@ class Belief:
             self.covariance[row + 1 :, row] = self.covariance[row, row + 1 :]
         self.mean = moved
 
-    def correct(self, row: list, innovation: np.ndarray, variance: np.ndarray | float, use: np.ndarray) -> None:
+    def correct(
+        self, row: Coefficients, innovation: Float64Array, variance: Float64Array | float, use: BoolArray
+    ) -> None:
         """One scalar measurement with Jacobian `row` = [(index, coefficient)], innovation `[n]`, in the slots `use`.
 
         `S = H P Hᵀ + R`, `x ← x + P Hᵀ S⁻¹ (z − h)`, `P ← P − P Hᵀ S⁻¹ H P`. Measurements with independent noise may
         be taken one after the other (Bar-Shalom, section 7.3), which needs no inverse. Written as `P − g gᵀ` with
         `g = P Hᵀ / √S` the covariance stays exactly symmetric.
         """
-        toward = sum(coefficient * self.covariance[:, index] for index, coefficient in row)
+        toward = np.asarray(sum(coefficient * self.covariance[:, index] for index, coefficient in row))
         spread = sum(coefficient * toward[index] for index, coefficient in row) + variance
         root = use / np.sqrt(spread)
         gain = toward * root
@@ -133,7 +140,7 @@ class Ekf:
         """Newest IMU sample: yaw rate, acceleration."""
 
     @property
-    def position_m(self) -> np.ndarray:
+    def position_m(self) -> Float64Array:
         """f64 `[n, 2]`: east and north; the truth's place is the rear axle, and so is this."""
         return self.belief.mean[:2].T
 
@@ -161,7 +168,7 @@ class Ekf:
             self._start(samples)
         self._remember(samples, fix_new, imu_new, wheel_new)
 
-    def _predict(self, samples: Samples, imu_new: np.ndarray) -> None:
+    def _predict(self, samples: Samples, imu_new: BoolArray) -> None:
         """Through every IMU sample since the tick before; where there are none, through the last one, held."""
         steps = len(samples.accel_mps2)
         dt_s = (samples.time_s - self._time_s) / steps if self._time_s is not None else 0.0
@@ -183,7 +190,7 @@ class Ekf:
         if self.keep_prediction:
             self.predicted = Belief(self.belief.mean.copy(), self.belief.covariance.copy())
 
-    def _motion_between(self, samples: Samples, i: int, imu_new: np.ndarray, end_s: float, dt_s: float) -> Motion:
+    def _motion_between(self, samples: Samples, i: int, imu_new: BoolArray, end_s: float, dt_s: float) -> Motion:
         """What is known about the `i`-th interval of a tick.
 
         Between two samples the rate goes in a line from one to the other; what it does beside that has a quarter of
@@ -205,7 +212,9 @@ class Ekf:
         (rate_trust, yaw_variance), (accel_trust, speed_variance) = parts
         return Motion(dt_s, mean[0], mean[1], rate_trust, accel_trust, yaw_variance, speed_variance)
 
-    def _trust(self, imu_new: np.ndarray, end_s: float, dt_s: float, std: float, time_s: float) -> tuple:
+    def _trust(
+        self, imu_new: BoolArray, end_s: float, dt_s: float, std: float, time_s: float
+    ) -> tuple[Float64Array | float, Float64Array | float]:
         """How much the sample counts `[n]`, and the variance of what the interval adds to its integral `[n]`."""
         bridge = forgotten(dt_s, std, time_s) / 4.0
         if imu_new.all():
@@ -215,11 +224,11 @@ class Ekf:
         held = np.exp(-(age_s + 0.5 * dt_s) / time_s)
         return np.where(imu_new, 1.0, held), np.where(imu_new, bridge, added)
 
-    def _correct_compass(self, samples: Samples, use: np.ndarray) -> None:
+    def _correct_compass(self, samples: Samples, use: BoolArray) -> None:
         """`z = ψ + b_c + n` at every IMU sample of the tick; their mean, as the gyro links them within the tick."""
         if not use.any():
             return
-        row = [(YAW, 1.0)]
+        row: Coefficients = [(YAW, 1.0)]
         expected = self._yaw_at_sample
         if self.layout.compass is not None:
             row.append((self.layout.compass, 1.0))
@@ -227,7 +236,7 @@ class Ekf:
         innovation = wrapped(samples.yaw_rad - expected).mean(0)
         self.belief.correct(row, innovation, self.noise.compass_std_rad**2 / len(samples.yaw_rad), use)
 
-    def _correct_wheel_speed(self, samples: Samples, use: np.ndarray) -> None:
+    def _correct_wheel_speed(self, samples: Samples, use: BoolArray) -> None:
         """`z = max(0, (1 + s) v + n)`, of the speed when the sample was taken. Nobody drives backwards.
 
         The cut is linearised at the prediction, which only a prediction sharper than the sensor allows; else
@@ -238,8 +247,8 @@ class Ekf:
         mean = self.belief.mean
         _, accel = self._rates()
         speed = mean[SPEED] - samples.wheel_age_s * accel
-        row: list = [(SPEED, 1.0)]
-        scale = 0.0
+        row: Coefficients = [(SPEED, 1.0)]
+        scale: Float64Array | float = 0.0
         if self.layout.scale is not None:
             scale = mean[self.layout.scale]
             row = [(SPEED, 1.0 + scale), (self.layout.scale, speed)]
@@ -252,7 +261,7 @@ class Ekf:
         row = [(index, coefficient * passed) for index, coefficient in row]
         self.belief.correct(row, samples.wheel_mps - expected, variance, use)
 
-    def _correct_position(self, samples: Samples, use: np.ndarray) -> None:
+    def _correct_position(self, samples: Samples, use: BoolArray) -> None:
         """`z = p − s (cos ψ_m, sin ψ_m) + e + b + n`: the place `a` seconds ago, when the fix was taken.
 
         `s = a v − a² α/2` and `ψ_m = ψ − a ω/2` lead back there, with the newest acceleration and yaw rate.
@@ -265,11 +274,11 @@ class Ekf:
             row, expected = self._fix_row(axis, samples.fix_age_s)
             self.belief.correct(row, samples.fix_m[axis] - expected, variance[axis], use)
 
-    def _fix_row(self, axis: int, age_s: np.ndarray) -> tuple[list, np.ndarray]:
+    def _fix_row(self, axis: int, age_s: Float64Array) -> tuple[Coefficients, Float64Array]:
         """Jacobian and expectation of a fix's `axis` (0 east, 1 north)."""
         mean = self.belief.mean
         rows = [rows[axis] for rows in (self.layout.slow, self.layout.bias) if rows is not None]
-        row: list = [(X + axis, 1.0)] + [(error, 1.0) for error in rows]
+        row: Coefficients = [(X + axis, 1.0), *((error, 1.0) for error in rows)]
         expected = sum(mean[error] for error in [X + axis, *rows])
         if not age_s.any():
             return row, expected
@@ -279,20 +288,22 @@ class Ekf:
         back_m = age_s * mean[SPEED] - 0.5 * age_s**2 * accel
         return [*row, (SPEED, -age_s * along), (YAW, -back_m * turned)], expected - back_m * along
 
-    def _rates(self) -> tuple[np.ndarray, np.ndarray]:
+    def _rates(self) -> tuple[Float64Array, Float64Array]:
         """Yaw rate and acceleration now `[n]`. H leaves their biases out: they lead back no further than an age."""
         motion, mean = self._motion, self.belief.mean
         rate = motion.yaw_rate_trust * (motion.yaw_rate_radps - mean[GYRO_BIAS])
         return rate, motion.accel_trust * (motion.accel_mps2 - mean[ACCEL_BIAS])
 
-    def _fix_variance(self, samples: Samples) -> np.ndarray:
+    def _fix_variance(self, samples: Samples) -> Float64Array:
         """R of both axes `[2, n]`: the configuration's, or more where the receiver says that the fix is worse."""
         noise = self.noise
         nominal_m = math.hypot(*noise.fix_std_m, *noise.fix_slow_std_m, *noise.fix_bias_std_m)
         factor = np.maximum(samples.fix_error_m / nominal_m, 1.0)
-        return np.square(np.array(noise.fix_std_m)[:, None] * np.where(np.isfinite(factor), factor, 1.0))
+        std_m = np.array(noise.fix_std_m)[:, None] * np.where(np.isfinite(factor), factor, 1.0)
+        variance_m2: Float64Array = np.square(std_m)
+        return variance_m2
 
-    def _passes(self, samples: Samples, variance: np.ndarray, use: np.ndarray) -> np.ndarray:
+    def _passes(self, samples: Samples, variance: Float64Array, use: BoolArray) -> BoolArray:
         """Chi-square test of the innovation, two degrees of freedom (Bar-Shalom, section 5.4): bool `[n]`."""
         if not self.noise.fix_outliers:
             return use
@@ -301,13 +312,13 @@ class Ekf:
         ee, en, nn = (self._spread(a[0], b[0]) for a, b in ((east, east), (east, north), (north, north)))
         ee, nn = ee + variance[0], nn + variance[1]
         distance = nn * innovation[0] ** 2 - 2.0 * en * innovation[0] * innovation[1] + ee * innovation[1] ** 2
-        passes = distance <= -2.0 * math.log(1.0 - GATE_PROBABILITY) * (ee * nn - en**2)
+        passes: BoolArray = distance <= -2.0 * math.log(1.0 - GATE_PROBABILITY) * (ee * nn - en**2)
         self._refused = np.where(use, np.where(passes, 0, self._refused + 1), self._refused)
         return passes
 
-    def _spread(self, one: list, other: list) -> np.ndarray:
+    def _spread(self, one: Coefficients, other: Coefficients) -> Float64Array:
         """`H₁ P H₂ᵀ` `[n]`."""
-        return sum(a * b * self.belief.covariance[i, j] for i, a in one for j, b in other)
+        return np.asarray(sum(a * b * self.belief.covariance[i, j] for i, a in one for j, b in other))
 
     def _start(self, samples: Samples) -> None:
         """New filters from the first fix, compass and wheel speed, as far as there are.
@@ -340,16 +351,16 @@ class Ekf:
         self.belief.mean = np.where(use, mean, self.belief.mean)
         self.belief.covariance = np.where(use, covariance, self.belief.covariance)
 
-    def _first_speed(self, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
+    def _first_speed(self, samples: Samples) -> tuple[Float64Array, Float64Array]:
         unknown = self.model.first_speed_std_mps**2
         variance = np.where(samples.wheel_on, self.noise.wheel_std_mps**2, unknown)
         return np.where(samples.wheel_on, samples.wheel_mps, 0.0), variance
 
-    def _first_yaw(self, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
+    def _first_yaw(self, samples: Samples) -> tuple[Float64Array, Float64Array]:
         variance = np.where(samples.imu_on, self.noise.compass_std_rad**2, NO_HEADING_VARIANCE)
         return np.where(samples.imu_on, wrapped(samples.yaw_rad[-1]), 0.0), variance
 
-    def _is_new(self, last_s: np.ndarray, on: np.ndarray, age_s: np.ndarray, time_s: float) -> np.ndarray:
+    def _is_new(self, last_s: Float64Array, on: BoolArray, age_s: Float64Array, time_s: float) -> BoolArray:
         """bool `[n]`: the sensor delivers, and its newest sample was taken after the last one that counted."""
         fresh_s = np.where(self.running, last_s, -np.inf) + 0.25 * self._shortest_period_s()
         return on & (time_s - age_s > fresh_s)
@@ -358,7 +369,7 @@ class Ekf:
         """Samples are at least this far apart as seen from a tick."""
         return min(self.noise.tick_s, self.noise.fix_period_s, self.noise.imu_period_s, self.noise.wheel_period_s)
 
-    def _remember(self, samples: Samples, fix_new: np.ndarray, imu_new: np.ndarray, wheel_new: np.ndarray) -> None:
+    def _remember(self, samples: Samples, fix_new: BoolArray, imu_new: BoolArray, wheel_new: BoolArray) -> None:
         """When the newest samples were taken, and the IMU's; a filter that starts has seen what it started from."""
         now, begun = samples.time_s, self.started
         self._fix_time_s = np.where(fix_new | begun, now - samples.fix_age_s, self._fix_time_s)
@@ -394,7 +405,7 @@ class Ekf:
         self._held = np.concatenate((self._held, np.zeros((2, more))), axis=1)
 
 
-def _owe(covariance: np.ndarray, row: int, error: int, coefficient: np.ndarray | float, std: float) -> None:
+def _owe(covariance: Float64Array, row: int, error: int, coefficient: Float64Array | float, std: float) -> None:
     """Row `row` was set from a measurement with the error in row `error`, times `coefficient`."""
     covariance[error, error] = std**2
     covariance[row, error] = covariance[error, row] = coefficient * std**2

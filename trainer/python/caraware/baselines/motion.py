@@ -4,15 +4,17 @@ Arrays have slots last: a mean is `[d, n]`, a covariance `[d, d, n]`, and everyt
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from caraware.baselines.noise import GRAVITY_MPS2, SensorNoise
+from caraware.ipc.arrays import Float64Array
 
 X, Y, YAW, SPEED, GYRO_BIAS, ACCEL_BIAS, SLIP = range(7)
 """Rows that every state has: m, m, rad, m/s, rad/s, m/s², rad per g; the position is the centre of the rear axle."""
 
-Entry = tuple[int, int, np.ndarray | float]
+Entry = tuple[int, int, Float64Array | float]
 """Row, column and value `[n]` of what a matrix has beside the identity."""
 
 
@@ -58,7 +60,7 @@ class StateLayout:
     @classmethod
     def of(cls, noise: SensorNoise) -> "StateLayout":
         """Only what has an error gets a row."""
-        rows: dict = {}
+        rows: dict[str, Any] = {}
         size = 7
         for name, stds in (("slow", noise.fix_slow_std_m), ("bias", noise.fix_bias_std_m)):
             if max(stds) > 0:
@@ -74,18 +76,20 @@ class Motion:
     """What an IMU says about an interval: means over it `[n]`, and how much they still count."""
 
     dt_s: float
-    yaw_rate_radps: np.ndarray
-    accel_mps2: np.ndarray
-    yaw_rate_trust: np.ndarray | float = 1.0
+    yaw_rate_radps: Float64Array
+    accel_mps2: Float64Array
+    yaw_rate_trust: Float64Array | float = 1.0
     """1 for a fresh sample; `exp(−age/τ)` for one that is held, the expectation of a Gauss–Markov process."""
-    accel_trust: np.ndarray | float = 1.0
-    yaw_variance: np.ndarray | float = field(default=0.0)
+    accel_trust: Float64Array | float = 1.0
+    yaw_variance: Float64Array | float = field(default=0.0)
     """rad²: what the yaw does in the interval that the IMU does not say, sensor noise included."""
-    speed_variance: np.ndarray | float = field(default=0.0)
+    speed_variance: Float64Array | float = field(default=0.0)
     """(m/s)²: the same of the speed."""
 
 
-def transition(mean: np.ndarray, motion: Motion, layout: StateLayout, slow_kept: float) -> tuple[np.ndarray, list]:
+def transition(
+    mean: Float64Array, motion: Motion, layout: StateLayout, slow_kept: float
+) -> tuple[Float64Array, list[Entry]]:
     """The mean after an interval, and the Jacobian F as entries beside the identity.
 
     An arc is driven along the heading half-way (second order in dt), less the slip of the rear axle:
@@ -130,21 +134,21 @@ def transition(mean: np.ndarray, motion: Motion, layout: StateLayout, slow_kept:
     return moved, entries
 
 
-def propagate_rows(matrix: np.ndarray, entries: list[Entry]) -> None:
+def propagate_rows(matrix: Float64Array, entries: list[Entry]) -> None:
     """`F M`, in place."""
     for row, column, value in entries:
         matrix[row] += value * matrix[column]
 
 
-def propagate_columns(matrix: np.ndarray, entries: list[Entry]) -> None:
+def propagate_columns(matrix: Float64Array, entries: list[Entry]) -> None:
     """`M Fᵀ`, in place."""
     for row, column, value in entries:
         matrix[:, row] += value * matrix[:, column]
 
 
 def process_noise(
-    before: np.ndarray,
-    covariance: np.ndarray,
+    before: Float64Array,
+    covariance: Float64Array,
     motion: Motion,
     noise: SensorNoise,
     model: MotionModel,
@@ -184,7 +188,7 @@ def process_noise(
     return entries
 
 
-def forgotten(age_s: np.ndarray | float, std: float, time_s: float) -> np.ndarray | float:
+def forgotten(age_s: Float64Array | float, std: float, time_s: float) -> Float64Array | float:
     """Variance of the integral of a Gauss–Markov process over `age_s` after it was known exactly.
 
     `σ² τ² (2 a/τ − 3 + 4 e^(−a/τ) − e^(−2a/τ))`: `2 σ² a³/(3 τ)` at first, `2 σ² τ a` in the end (Brown and Hwang,

@@ -6,6 +6,9 @@ filter's units, or a constant that stands at the top with its reason. Formulas a
 
 import math
 from dataclasses import dataclass
+from typing import Any
+
+from caraware.ipc.run_file import ConfigTable, RunFile
 
 METRES_PER_DEGREE = math.radians(1.0) * 6_378_137.0
 """Metres on the ground in a degree of arc, on WGS 84's equator; elsewhere within 0.6 % of it."""
@@ -62,7 +65,7 @@ class SensorNoise:
     wheel_scale_std: float
 
     @classmethod
-    def from_run(cls, run: dict) -> "SensorNoise | None":
+    def from_run(cls, run: RunFile) -> "SensorNoise | None":
         """Read `run["config"]`, which `caraware` has validated; None for a run without sensor tables."""
         config = run.get("config", {})
         if not all(table in config for table in ("gnss", "imu", "speed_steering")):
@@ -73,7 +76,7 @@ class SensorNoise:
         )
 
 
-def _of_gnss(gnss: dict) -> dict:
+def _of_gnss(gnss: ConfigTable) -> dict[str, Any]:
     """Degrees come as latitude, longitude; metres as east, north, up."""
     north_deg, east_deg = _axes(gnss["noise_std_deg"], 2)
     bias_north_deg, bias_east_deg = _axes(gnss["bias_deg"], 2)
@@ -96,7 +99,7 @@ def _of_gnss(gnss: dict) -> dict:
     }
 
 
-def _of_imu(imu: dict) -> dict:
+def _of_imu(imu: ConfigTable) -> dict[str, Any]:
     """Forward is axis 0, up is axis 2."""
     period_s, convention = float(imu["period_s"]), str(imu["convention"])
     slope_mps2 = 0.0 if convention == "kinematic" else GRAVITY_MPS2 * SLOPE_STD_RAD
@@ -119,7 +122,7 @@ def _of_imu(imu: dict) -> dict:
     }
 
 
-def _of_wheels(sensor: dict) -> dict:
+def _of_wheels(sensor: ConfigTable) -> dict[str, Any]:
     return {
         "wheel_period_s": float(sensor["period_s"]),
         "wheel_std_mps": max(float(sensor["speed_noise_std_mps"]), SMALLEST_WHEEL_STD_MPS),
@@ -127,7 +130,7 @@ def _of_wheels(sensor: dict) -> dict:
     }
 
 
-def _sample_std(imu: dict, sensor: str, unit: str, axis: int, period_s: float) -> float:
+def _sample_std(imu: ConfigTable, sensor: str, unit: str, axis: int, period_s: float) -> float:
     """White noise of a sample: its own, the density over the period (σ = N/√T), and rounding (step/√12)."""
     white = _axes(imu[f"{sensor}_noise_std_{unit}"], 3)[axis]
     density = _axes(imu[f"{sensor}_noise_density"], 3)[axis]

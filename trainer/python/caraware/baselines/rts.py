@@ -11,6 +11,7 @@ import numpy as np
 
 from caraware.baselines.ekf import Belief, Ekf, wrapped
 from caraware.baselines.motion import YAW
+from caraware.ipc.arrays import Float64Array
 
 MEMORY_BYTES = 512 * 2**20
 """Largest memory of a smoother. An episode that fits is smoothed as a whole: 300 ticks of 3 500 vehicles."""
@@ -22,9 +23,9 @@ class SmoothedTick:
 
     label: Any
     """What the tick was pushed with."""
-    mean: np.ndarray
+    mean: Float64Array
     """f64 `[d, n]`."""
-    covariance: np.ndarray | None = None
+    covariance: Float64Array | None = None
     """f64 `[d, d, n]`, where the smoother keeps covariances."""
 
 
@@ -34,13 +35,13 @@ class _Remembered:
     filtered: Belief
     predicted: Belief | None = None
     """Of the tick after."""
-    gain: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    gain: Float64Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
     """`C = P Fᵀ P⁻¹` to the tick after `[d, d, m]`; 0 where no trajectory goes on."""
 
     def bytes(self) -> int:
         """Memory of the arrays, gain and prediction included."""
         d, n = self.filtered.mean.shape
-        return 8 * n * (d * d + 2 * d + (2 * d * d if self.filtered.covariance.size else 0))
+        return int(8 * n * (d * d + 2 * d + (2 * d * d if self.filtered.covariance.size else 0)))
 
 
 class Smoother:
@@ -110,7 +111,7 @@ class Smoother:
         return SmoothedTick(tick.label, mean, kept)
 
 
-def right_divided(left: np.ndarray, positive: np.ndarray) -> np.ndarray:
+def right_divided(left: Float64Array, positive: Float64Array) -> Float64Array:
     """`A B⁻¹` for `A` `[m, d, n]` and symmetric positive definite `B` `[d, d, n]`, by Cholesky factors of all slots."""
     factor = cholesky(positive)
     size = len(factor)
@@ -126,7 +127,7 @@ def right_divided(left: np.ndarray, positive: np.ndarray) -> np.ndarray:
     return solved.transpose(1, 0, 2)
 
 
-def cholesky(positive: np.ndarray) -> np.ndarray:
+def cholesky(positive: Float64Array) -> Float64Array:
     """Lower factor `L` `[d, d, n]` of `L Lᵀ`, column by column (G. Golub, C. Van Loan, Matrix Computations, 4.2)."""
     size = len(positive)
     factor = np.zeros_like(positive)

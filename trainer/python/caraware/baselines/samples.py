@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caraware.ipc.arrays import BoolArray, Float64Array, UInt32Array
 from caraware.ipc.stream import Observation
 
 GNSS, IMU, SPEED_STEERING = 1, 2, 4
@@ -21,29 +22,29 @@ class Samples:
     """One tick of `n` slots, `k` IMU samples each, oldest first. Ages are those of the newest sample."""
 
     time_s: float
-    vehicle: np.ndarray
+    vehicle: UInt32Array
     """u32 `[n]`: who holds the slot, `EMPTY_SLOT` if nobody does."""
-    valid: np.ndarray
+    valid: BoolArray
     """bool `[n]`: all sensors have delivered, so that there is a fix."""
-    begins: np.ndarray
+    begins: BoolArray
     """bool `[n]`: another trajectory than at the tick before."""
-    fix_m: np.ndarray
+    fix_m: Float64Array
     """f64 `[2, n]`: east, north."""
-    fix_error_m: np.ndarray
+    fix_error_m: Float64Array
     """f64 `[n]`: the receiver's own estimate of its horizontal error; 0 where it has none."""
-    fix_age_s: np.ndarray
-    fix_on: np.ndarray
-    accel_mps2: np.ndarray
+    fix_age_s: Float64Array
+    fix_on: BoolArray
+    accel_mps2: Float64Array
     """f64 `[k, n]`: forward."""
-    yaw_rate_radps: np.ndarray
+    yaw_rate_radps: Float64Array
     """f64 `[k, n]`: counter-clockwise seen from above."""
-    yaw_rad: np.ndarray
+    yaw_rad: Float64Array
     """f64 `[k, n]`: the compass as a yaw, counter-clockwise from east."""
-    imu_age_s: np.ndarray
-    imu_on: np.ndarray
-    wheel_mps: np.ndarray
-    wheel_age_s: np.ndarray
-    wheel_on: np.ndarray
+    imu_age_s: Float64Array
+    imu_on: BoolArray
+    wheel_mps: Float64Array
+    wheel_age_s: Float64Array
+    wheel_on: BoolArray
 
 
 def read_samples(obs: Observation, convention: str) -> Samples:
@@ -75,5 +76,5 @@ def read_samples(obs: Observation, convention: str) -> Samples:
     )
 
 
-def _f64(array: object) -> np.ndarray:
+def _f64(array: object) -> Float64Array:
     return np.asarray(array).astype(np.float64)

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caraware.ipc.arrays import Float32Array, Float64Array
+from caraware.ipc.run_file import RunFile
+
 
 class UnknownFieldError(KeyError):
     """The observation has no such field, or its range is not known here."""
@@ -24,7 +27,7 @@ class Fields:
     _ranges: dict[str, tuple[float, float]]
 
     @classmethod
-    def from_run(cls, run: dict) -> Fields:
+    def from_run(cls, run: RunFile) -> Fields:
         """The fields that the run file names."""
         settings = run["config"]["observation"]
         low = 0.0 if settings.get("scale") == "zero_to_one" else -1.0
@@ -35,7 +38,7 @@ class Fields:
         """Numbers in a row."""
         return len(self.names) * self.history
 
-    def si(self, observation: np.ndarray, name: str) -> np.ndarray:
+    def si(self, observation: Float32Array, name: str) -> Float64Array:
         """Field `name` of rows `[..., d]` in SI units, `[...]`; of the newest tick. Clipped at the field's range."""
         if name not in self.names or name not in self._ranges:
             known = ", ".join(field for field in self.names if field in self._ranges)
@@ -46,7 +49,7 @@ class Fields:
         return low + unit * (high - low)
 
 
-def _ranges(run: dict) -> dict[str, tuple[float, float]]:
+def _ranges(run: RunFile) -> dict[str, tuple[float, float]]:
     settings, lidar = run["config"]["observation"], run["config"].get("lidar", {})
     x_min, y_min, x_max, y_max = run["map"]["bounds_m"]
     ranges = {"gnss_x": (x_min, x_max), "gnss_y": (y_min, y_max), "compass": (0.0, math.tau)}

@@ -29,7 +29,8 @@ def _hold(run_file: str) -> None:
     with socket.socket(socket.AF_UNIX) as line:
         line.connect("\0" + os.environ[LINE])
         line.sendall(run_file.encode() + b"\n")
-        ready, _, _ = select.select([line, user, supervisor], [], [])
+        waited: list[socket.socket | int] = [line, user, supervisor]
+        ready, _, _ = select.select(waited, [], [])
         if supervisor not in ready and (user in ready or line.recv(len(DONE)) != DONE):
             raise UserGoneError
 

@@ -10,11 +10,12 @@ from pettingzoo import ParallelEnv
 
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Slots, Source, Tick
+from caraware.ipc.arrays import Float32Array
 from caraware.ipc.names import Names
 from caraware.ipc.stream import Channel
 
 
-class CarAwareParallelEnv(ParallelEnv):
+class CarAwareParallelEnv(ParallelEnv):  # type: ignore[misc]  # pettingzoo has no types
     """Agents are vehicles, such as `cav.12`, that come and go. In an episode, the simulation's, no id is used twice.
 
     Nobody knows beforehand who will come: `possible_agents` holds the ids seen so far and grows. Observation and action
@@ -45,7 +46,7 @@ class CarAwareParallelEnv(ParallelEnv):
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, dict]]:
+    ) -> tuple[dict[str, Float32Array], dict[str, dict[str, Any]]]:
         """The first tick of a run with `seed`; without, of the simulation's next episode."""
         if seed is not None or not self._between or self.slots.over:
             self.slots.reset(seed)
@@ -56,8 +57,8 @@ class CarAwareParallelEnv(ParallelEnv):
         return {agent: now.rows.observation[slot] for agent, slot in rows}, {a: _info(now, slot) for a, slot in rows}
 
     def step(
-        self, actions: dict[str, np.ndarray]
-    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict]]:
+        self, actions: dict[str, Float32Array]
+    ) -> tuple[dict[str, Float32Array], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """One tick for all agents."""
         if not self.agents:
             return {}, {}, {}, {}, {}

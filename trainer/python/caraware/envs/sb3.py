@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Policy, Slots, Source
 from caraware.envs.transition import Transition
+from caraware.ipc.arrays import Float32Array
 from caraware.ipc.stream import Channel
 
 
@@ -38,7 +38,7 @@ class CarAwareVecEnv(VecEnv):
         self._lengths = np.zeros(self.slots.count, np.int64)
         super().__init__(self.slots.count, task.observation_space(), task.action_space())
 
-    def reset(self) -> np.ndarray:
+    def reset(self) -> Float32Array:
         """First observation `[N, d]`; the seed is the first of those that `seed()` set."""
         tick = self.slots.reset(self._seeds[0])
         self._reset_seeds()
@@ -47,7 +47,7 @@ class CarAwareVecEnv(VecEnv):
         self.reset_infos = [{"mask": bool(held)} for held in tick.mask]
         return tick.rows.observation
 
-    def step_async(self, actions: np.ndarray) -> None:
+    def step_async(self, actions: Float32Array) -> None:
         """Remembers the actions; in the driving task the world waits for them in `step_wait`."""
         self._actions = actions
 
@@ -79,7 +79,7 @@ class CarAwareVecEnv(VecEnv):
         """Refused: sub-environments have no methods of their own."""
         raise NotImplementedError(f"{method_name}: slots share one simulation and have no methods of their own")
 
-    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> Sequence[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
         """Nothing is wrapped."""
         return [False for _ in self._get_indices(indices)]
 

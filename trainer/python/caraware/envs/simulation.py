@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 
 from caraware.envs import outside
-from caraware.ipc.channel import Channel, Observation
+from caraware.ipc.channel import Channel
+from caraware.ipc.stream import Observation
 from caraware.run.program import ProgramError, caraware_program
 
 RECEIVE_TIMEOUT_S = 0.2
@@ -78,6 +79,7 @@ class Simulation:
         self._owner = os.getpid()
         self._program = Path(program) if program else _find_program()
         self._restarts = 0
+        self._seed = self._first_seed = int(seed)
         self.current: Observation | None = None
         self._temporary: _TemporaryRuns | None = None
         self._run: _Run | None = None
@@ -236,7 +238,7 @@ class _Run:
                     raise SimulationError(f"cannot join the run: {error}\n{self._message()}") from error
                 raise
 
-    def _started(self, command: list[str | Path], line: str) -> subprocess.Popen:
+    def _started(self, command: list[str | Path], line: str) -> subprocess.Popen[bytes]:
         told = {outside.LINE: line, outside.USER: str(os.getpid()), "PYTHONPATH": _python_path()}
         try:
             return subprocess.Popen(
@@ -309,7 +311,8 @@ class _Run:
         ended = os.pidfd_open(self.process.pid)
         try:
             while True:
-                ready, _, _ = select.select([listener, ended], [], [])
+                waited: list[socket.socket | int] = [listener, ended]
+                ready, _, _ = select.select(waited, [], [])
                 if listener not in ready:
                     raise SimulationError(self._message())
                 line, _ = listener.accept()
@@ -359,7 +362,8 @@ def _exit_text(status: int | None) -> str:
 def _user_of(line: socket.socket) -> int:
     """User id of whoever is at the other end: anybody on this machine may connect to an abstract name."""
     credentials = line.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    return struct.unpack("3i", credentials)[1]
+    _pid, user, _group = struct.unpack("3i", credentials)
+    return int(user)
 
 
 def _python_path() -> str:

@@ -18,11 +18,13 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from caraware import _native
 from caraware.envs import rewards
 from caraware.envs.task import Task
 from caraware.envs.transition import Rows, Transition
+from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Scalar, UInt32Array, UInt64Array
 from caraware.ipc.channel import StreamEndedError
 from caraware.ipc.stream import EMPTY_SLOT, Channel, Observation
 
@@ -33,7 +35,7 @@ RUN_ON_TICKS = 2000
 REPORT_S = 1.0
 """Time between two reports of the status."""
 
-Policy = Callable[[np.ndarray], np.ndarray]
+Policy = Callable[[Float32Array], Float32Array]
 """`observation f32 [N, d] -> action [N, 2]`."""
 
 
@@ -44,13 +46,17 @@ class RunEndedError(Exception):
 class Source(Protocol):
     """Where ticks come from."""
 
-    channel: Any
-    """The trainer's place in the present run."""
-    seed: int
-    """Seed of the present run."""
     can_restart: bool
     current: Observation | None
     """The tick received last. Nobody else may keep it: memory of a run must be let go before the run is left."""
+
+    @property
+    def channel(self) -> Any:
+        """The trainer's place in the present run: a `Channel` that takes actions too."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the present run."""
 
     def receive(self) -> Observation | None:
         """The next tick, or None after the last of the run."""
@@ -58,7 +64,7 @@ class Source(Protocol):
     def restart(self, seed: int | None = None) -> None:
         """Begin another run, where that is possible."""
 
-    def close(self, part: dict | None = None) -> None:
+    def close(self, part: dict[str, Any] | None = None) -> None:
         """Leave the run; `part` goes into its report."""
 
 
@@ -95,7 +101,7 @@ class GivenChannel:
         """Never called: the run is its supervisor's."""
         raise RunEndedError
 
-    def close(self, part: dict | None = None) -> None:
+    def close(self, part: dict[str, Any] | None = None) -> None:
         """Write the trainer's part of the report; say that all is done, if it is."""
         if part is not None:
             part = part | {"lost_ticks": self.lost_ticks, "duplicated_ticks": self.duplicated_ticks}
@@ -119,12 +125,12 @@ class Tick:
     episode: tuple[int, int]
     """Number of the run and of the episode in it."""
     rows: Rows
-    mask: np.ndarray
-    vehicle: np.ndarray
-    id_hash: np.ndarray
-    terminated: np.ndarray
+    mask: BoolArray
+    vehicle: UInt32Array
+    id_hash: UInt64Array
+    terminated: BoolArray
     """Of the trajectory that held the slot a tick before."""
-    truncated: np.ndarray
+    truncated: BoolArray
 
 
 class Slots:
@@ -185,7 +191,7 @@ class Slots:
             self._now = self._settle(self._take())
         return self.now
 
-    def step(self, action: np.ndarray) -> tuple[Transition, np.ndarray]:
+    def step(self, action: Float32Array) -> tuple[Transition, Float64Array]:
         """Answers the present tick with actions `[N, 2]` and goes on to the next.
 
         Returns what happened and its rewards, f64 `[N]`.
@@ -229,7 +235,7 @@ class Slots:
         self.source.restart(seed)
         self._runs, self._answered = self._runs + 1, -1
 
-    def _checked(self, action: np.ndarray) -> np.ndarray:
+    def _checked(self, action: Float32Array) -> Float32Array:
         action = np.asarray(action, np.float32)
         if action.shape != (self.count, 2):
             raise ValueError(f"actions of shape {action.shape}, {self.count} slots take ({self.count}, 2)")
@@ -289,7 +295,7 @@ class Slots:
             self._evaluation.add(tick, self.task.to_world_m(action))
             self._raw_evaluation.add(tick, tick.rows.gnss_m)
 
-    def _answer(self, action: np.ndarray, *, publish: bool = True) -> None:
+    def _answer(self, action: Float32Array, *, publish: bool = True) -> None:
         """Answers the tick received last, once: an interrupted step may be taken again."""
         obs, channel = self.source.current, self.source.channel
         if obs is None:
@@ -375,7 +381,7 @@ class Slots:
         self._reported = (clock, self._env_steps)
         self.source.channel.report(episode=self.now.episode[1], env_steps=self._env_steps, env_steps_per_s=rate)
 
-    def _part(self) -> dict:
+    def _part(self) -> dict[str, Any]:
         """The trainer's part of the run's report."""
         part: dict[str, Any] = {"env_steps": self._env_steps}
         if self._evaluation.count:
@@ -391,7 +397,7 @@ class _Errors:
         self.episode: int | None = None
         self.count, self._sum_m = 0, 0.0
 
-    def add(self, tick: Tick, place_m: np.ndarray) -> None:
+    def add(self, tick: Tick, place_m: FloatArray) -> None:
         away = np.asarray(place_m, np.float64) - tick.rows.truth[:, :2]
         self._sum_m += float(np.hypot(away[:, 0], away[:, 1])[tick.mask].sum())
         self.count += int(np.count_nonzero(tick.mask))
@@ -401,16 +407,18 @@ class _Errors:
         return self._sum_m / self.count
 
 
-def _array(obs: Observation, name: str) -> np.ndarray:
+def _array(obs: Observation, name: str) -> Float32Array:
     """f32 `[n, …]` of a tick. Straight from shared memory where it lies there: a tensor on the way takes 20 µs."""
     block = getattr(obs, "block", None)
     if block is None:
-        return getattr(obs, name).numpy()
+        numbers: Float32Array = getattr(obs, name).numpy()
+        return numbers
     columns = {"observation": block.fields, "truth": _native.TRUTH_COLUMNS, "gnss_m": _native.GNSS_COLUMNS}[name]
-    return np.frombuffer(block.section(name), np.float32).reshape(block.slots, columns)
+    array: Float32Array = np.frombuffer(memoryview(block.section(name)), np.float32).reshape(block.slots, columns)
+    return array
 
 
-def _padded(values: np.ndarray, n: int, empty: int = 0) -> np.ndarray:
+def _padded(values: NDArray[Scalar], n: int, empty: int = 0) -> NDArray[Scalar]:
     """A copy of the first `n` rows, filled up to `n` where there are fewer."""
     if len(values) >= n:
         return values[:n].copy()
@@ -419,7 +427,7 @@ def _padded(values: np.ndarray, n: int, empty: int = 0) -> np.ndarray:
     return rows
 
 
-def _where(ended: np.ndarray, now: Rows, following: Rows) -> Rows:
+def _where(ended: BoolArray, now: Rows, following: Rows) -> Rows:
     """The following rows, those of `now` where `ended`."""
     if not ended.any():
         return following

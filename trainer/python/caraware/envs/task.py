@@ -9,6 +9,8 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from caraware.envs.fields import Fields
+from caraware.ipc.arrays import Float32Array, Float64Array
+from caraware.ipc.run_file import ConfigTable, RunFile
 
 
 @dataclass(frozen=True)
@@ -33,16 +35,17 @@ class Task:
     reward_scale_m: float
 
     @classmethod
-    def from_run(cls, run: dict) -> Task:
+    def from_run(cls, run: RunFile) -> Task:
         """Read the run file."""
         config = run["config"]
+        x_min, y_min, x_max, y_max = (float(value) for value in run["map"]["bounds_m"])
         population = "population" in run.get("source", {"population": None})
         drives = config["task"]["kind"] == "driving"
         return cls(
             drives=drives,
             tick_s=float(config["run"]["tick_s"]),
             fields=Fields.from_run(run),
-            bounds_m=tuple(float(value) for value in run["map"]["bounds_m"]),
+            bounds_m=(x_min, y_min, x_max, y_max),
             slots=_slots(config, population),
             episode_ticks=int(config["episode"]["ticks"]),
             credit_ticks=1 if drives else max(1, int(config["run"].get("window_ticks", 1)) // 2),
@@ -59,18 +62,19 @@ class Task:
         """Of one vehicle: f32 `[2]`, each from −1 to 1."""
         return Box(-1.0, 1.0, (2,), np.float32)
 
-    def to_world_m(self, action: np.ndarray) -> np.ndarray:
+    def to_world_m(self, action: Float32Array) -> Float64Array:
         """Actions `[..., 2]` as positions in world metres: ±1 is the edge of the map."""
         centre, half = self._box_m
-        return action * half + centre
+        position_m: Float64Array = action * half + centre
+        return position_m
 
     @cached_property
-    def _box_m(self) -> tuple[np.ndarray, np.ndarray]:
+    def _box_m(self) -> tuple[Float64Array, Float64Array]:
         """Centre and half the size of the map's box, f64 `[2]` each."""
         low, high = np.array(self.bounds_m[:2]), np.array(self.bounds_m[2:])
         return (low + high) / 2, (high - low) / 2
 
-    def answer(self, action: np.ndarray, rows: int) -> np.ndarray:
+    def answer(self, action: Float32Array, rows: int) -> Float32Array:
         """Actions `[N, 2]` as the simulation takes them: f32 `[rows, 2]`, those of the driving task within ±1."""
         answer = np.zeros((rows, 2), np.float32)
         used = min(rows, len(action))
@@ -78,7 +82,7 @@ class Task:
         return answer
 
 
-def _slots(config: dict, population: bool) -> int | None:
+def _slots(config: ConfigTable, population: bool) -> int | None:
     traffic = config["traffic"]
     if config["task"]["kind"] == "driving":
         return len(traffic.get("hero_ids", ())) or int(traffic["heroes"])

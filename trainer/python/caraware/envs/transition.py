@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from caraware.envs.task import Task
+from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, UInt32Array, UInt64Array
 
 
 @dataclass(frozen=True)
@@ -14,14 +13,14 @@ class Rows:
     """What all slots are at one tick. Row `i` is slot `i`; rows without a vehicle are zero."""
 
     task: Task
-    observation: np.ndarray
+    observation: Float32Array
     """f32 `[N, d]`, normalised."""
-    truth: np.ndarray
+    truth: Float32Array
     """f32 `[N, 4]`: x and y of the rear axle (m, world), yaw (rad), speed (m/s). No policy may see it."""
-    gnss_m: np.ndarray
+    gnss_m: Float32Array
     """f32 `[N, 2]`: newest raw GNSS fix (m, world)."""
 
-    def si(self, field: str) -> np.ndarray:
+    def si(self, field: str) -> Float64Array:
         """f64 `[N]`: a field of the observation in SI units, such as `si("leader_gap")`; clipped at its range."""
         return self.task.fields.si(self.observation, field)
 
@@ -30,15 +29,15 @@ class Rows:
 class Transition(Rows):
     """One tick that has been answered, and what came of it."""
 
-    mask: np.ndarray
+    mask: BoolArray
     """bool `[N]`: the slot holds a vehicle. Other rows earn nothing, whatever a reward says of them."""
-    vehicle: np.ndarray
+    vehicle: UInt32Array
     """u32 `[N]`: dense index within the simulation's episode."""
-    id_hash: np.ndarray
+    id_hash: UInt64Array
     """u64 `[N]`: hash of the vehicle's SUMO id."""
-    terminated: np.ndarray
+    terminated: BoolArray
     """bool `[N]`: the trajectory ended with this tick."""
-    truncated: np.ndarray
+    truncated: BoolArray
     """bool `[N]`: it was cut after this tick."""
     next: Rows
     """A tick later; for trajectories that ended, this tick again: they have no other."""
@@ -48,6 +47,7 @@ class Transition(Rows):
         """Time between the two, seconds."""
         return self.task.tick_s
 
-    def to_world_m(self, action: np.ndarray) -> np.ndarray:
+    def to_world_m(self, action: Float32Array) -> Float64Array:
         """Actions `[N, 2]` of the localisation task as positions in world metres."""
-        return self.task.to_world_m(action)
+        position_m: Float64Array = self.task.to_world_m(action)
+        return position_m

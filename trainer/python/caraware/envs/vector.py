@@ -11,6 +11,7 @@ from gymnasium.vector.utils import batch_space
 from caraware.envs.rewards import Reward, error_m
 from caraware.envs.slots import Policy, Slots, Source, Tick
 from caraware.envs.transition import Transition
+from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array
 from caraware.ipc.stream import Channel
 
 
@@ -45,7 +46,7 @@ class CarAwareVectorEnv(VectorEnv):
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """First observation `[N, d]` of a run with `seed`; without, of the simulation's next episode.
 
         All slots share a world, so there is one seed: of a list the first counts.
@@ -60,7 +61,7 @@ class CarAwareVectorEnv(VectorEnv):
         tick = self.slots.reset(seed)
         return tick.rows.observation, self._info(tick)
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: Float32Array) -> tuple[Float32Array, Float64Array, BoolArray, BoolArray, dict[str, Any]]:
         """Observations `[N, d]`, rewards, terminated, truncated `[N]`, infos."""
         transition, reward = self.slots.step(actions)
         tick = self.slots.now
@@ -87,7 +88,7 @@ class CarAwareVectorEnv(VectorEnv):
         return infos
 
 
-def _final(transition: Transition, ended: np.ndarray) -> dict[str, Any]:
+def _final(transition: Transition, ended: BoolArray) -> dict[str, Any]:
     """Gymnasium's keys for trajectories that ended in this step."""
     final_obs = np.full(len(ended), None, dtype=object)
     for slot in np.flatnonzero(ended):

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from caraware.envs import CarAwareVectorEnv, make
+from caraware.ipc.arrays import BoolArray, Float32Array
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,8 @@ class Agent(nn.Module):
 
     def value(self, observation: Tensor) -> Tensor:
         """What an observation is worth, `[…]`."""
-        return self.critic(observation)[..., 0]
+        value: Tensor = self.critic(observation)[..., 0]
+        return value
 
 
 @dataclass
@@ -75,21 +77,23 @@ class Collected:
 
 
 @torch.no_grad()
-def collect(env: CarAwareVectorEnv, agent: Agent, observation: np.ndarray, mask: np.ndarray, ticks: int):
+def collect(
+    env: CarAwareVectorEnv, agent: Agent, observation: Float32Array, mask: BoolArray, ticks: int
+) -> tuple[Collected, Float32Array, BoolArray, float]:
     """`ticks` ticks, the observation and mask after them, and the mean error of the predictions."""
     rows, error_m, samples = [], 0.0, 0
     for _ in range(ticks):
         seen = torch.from_numpy(observation)
         policy = agent.policy(seen)
         action = policy.sample()
-        following, reward, terminated, truncated, infos = env.step(action.numpy())
+        following, earned, terminated, truncated, infos = env.step(action.numpy())
         after = torch.from_numpy(following.copy())
         for slot in np.flatnonzero(truncated):
             after[slot] = torch.from_numpy(infos["final_obs"][slot])
         alive = torch.from_numpy(~terminated).float()
         goes_on = torch.from_numpy(~(terminated | truncated)).float()
         log_prob, value = policy.log_prob(action).sum(-1), agent.value(seen)
-        reward = torch.from_numpy(reward).float()
+        reward = torch.from_numpy(earned).float()
         next_value = agent.value(after) * alive
         rows.append((seen, action, log_prob, reward, value, next_value, goes_on, torch.from_numpy(mask)))
         error_m, samples = error_m + float(infos.get("error_m", np.zeros(1)).sum()), samples + int(mask.sum())
@@ -130,7 +134,8 @@ def main(steps: int, settings: Settings | None = None, config: str = "town", **c
     torch.set_num_threads(1)  # of two cores the simulation needs one; torch's idle threads would spin on it
     with make(config, changes) as simulation:
         env = CarAwareVectorEnv(simulation)
-        agent = Agent(env.single_observation_space.shape[0], env.single_action_space.shape[0])
+        task = env.slots.task
+        agent = Agent(task.fields.width, task.action_space().shape[0])
         optimizer = torch.optim.Adam(agent.parameters(), settings.learning_rate)
         observation, infos = env.reset()
         mask = infos["mask"]

@@ -3,13 +3,15 @@
 import numpy as np
 
 from caraware.envs import CarAwareVectorEnv, Transition, make
+from caraware.ipc.arrays import Float32Array, Float64Array
 
 
-def reward(obs: Transition, action: np.ndarray) -> np.ndarray:
+def reward(obs: Transition, action: Float32Array) -> Float64Array:
     """Half for the position, half for doing better than the raw GNSS fix."""
     error_m = np.linalg.norm(obs.to_world_m(action) - obs.truth[:, :2], axis=1)
     raw_m = np.linalg.norm(obs.gnss_m - obs.truth[:, :2], axis=1)
-    return 0.5 * np.exp(-error_m / 5.0) + 0.5 * (error_m < raw_m)
+    earned: Float64Array = 0.5 * np.exp(-error_m / 5.0) + 0.5 * (error_m < raw_m)
+    return earned
 
 
 def main(steps: int = 500, **settings: object) -> float:

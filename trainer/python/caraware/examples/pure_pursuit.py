@@ -6,13 +6,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from caraware.ipc.channel import Channel
+from caraware.ipc.run_file import ConfigTable
 
 AHEAD_M, WHEELBASE_M, BRAKING_MPS2, LATERAL_MPS2, STAND_OFF_M, KP, KI = (5, 10, 20), 2.7, 2.0, 2.0, 5.0, 1.0, 0.1
 
 
-def si_units(row: np.ndarray, config: dict) -> dict[str, float]:
+def si_units(row: Tensor, config: ConfigTable) -> dict[str, float]:
     """A normalised row of the observation (-1 ... 1) by field, in SI units."""
     settings = config["observation"]
     values = zip(settings["fields"], row.tolist(), strict=True)
@@ -22,7 +24,7 @@ def si_units(row: np.ndarray, config: dict) -> dict[str, float]:
     return {name: ((1 - v) * low.get(name, 0) + (1 + v) * high[name]) / 2 for name, v in values if name in high}
 
 
-def drive(o: dict[str, float], integral_m: float, config: dict) -> tuple[float, float, float]:
+def drive(o: dict[str, float], integral_m: float, config: ConfigTable) -> tuple[float, float, float]:
     """Steering and acceleration (-1 ... 1), and the next value of the controller's integral."""
     ahead_m = float(np.clip(0.7 * o["speed"], 5.0, 15.0))
     x, y = (np.interp(ahead_m, AHEAD_M, [o[f"route_{axis}_{d}"] for d in AHEAD_M]) for axis in "xy")
@@ -40,7 +42,9 @@ def drive(o: dict[str, float], integral_m: float, config: dict) -> tuple[float, 
 
 
 def main(run_file: str) -> None:
-    channel, stop, integrals, ended, steps = Channel(run_file), [], {}, False, 0
+    channel, ended, steps = Channel(run_file), False, 0
+    stop: list[int] = []
+    integrals: dict[int, float] = {}
     config = channel.run["config"]
     signal.signal(signal.SIGTERM, lambda number, _: stop.append(number))
     while not ended and not stop:

@@ -9,9 +9,11 @@ import os
 import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 from safetensors.torch import load_file
 from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
@@ -41,7 +43,7 @@ class SaveAndCommit(BaseCallback):
             self._env.slots.commit()
 
 
-def save(model: PPO, env: CarAwareVecEnv, run_dir: Path) -> None:
+def save(model: BaseAlgorithm, env: CarAwareVecEnv, run_dir: Path) -> None:
     """Both files under temporary names, then renamed; the model first: the place never says too much."""
     model.save(run_dir / f".partial.{MODEL}")
     (run_dir / f".partial.{MODEL}").rename(run_dir / MODEL)
@@ -77,11 +79,14 @@ def take_networks(model: PPO, checkpoint: Path) -> None:
         hidden[-1] = last()
         out = nn.Sequential(linear[-1], head())
         if name == "policy":
-            policy.mlp_extractor.policy_net, policy.action_net = nn.Sequential(*hidden), out
+            policy.mlp_extractor.policy_net = nn.Sequential(*hidden)
+            policy.action_net = out
         else:
-            policy.mlp_extractor.value_net, policy.value_net = nn.Sequential(*hidden), out
+            policy.mlp_extractor.value_net = nn.Sequential(*hidden)
+            policy.value_net = out  # type: ignore[assignment]  # as above
     policy.log_std.data.copy_(stored["policy.log_std"])
-    policy.optimizer = policy.optimizer_class(policy.parameters(), lr=model.lr_schedule(1.0), **policy.optimizer_kwargs)
+    settings: dict[str, Any] = {"lr": model.lr_schedule(1.0), **policy.optimizer_kwargs}
+    policy.optimizer = policy.optimizer_class(policy.parameters(), **settings)
 
 
 def main(run_file: str) -> int:
@@ -100,7 +105,7 @@ def main(run_file: str) -> int:
     if checkpoint is not None:
         take_networks(model, checkpoint)
     if (run_dir / MODEL).exists():
-        model.set_parameters(run_dir / MODEL)
+        model.set_parameters(str(run_dir / MODEL))
     print(f"Stable-Baselines3 takes over at tick {begin}", file=sys.stderr, flush=True)
     try:
         model.learn(sys.maxsize, callback=SaveAndCommit(env, run_dir))

@@ -16,6 +16,7 @@ from caraware.baselines.ekf import Ekf
 from caraware.baselines.motion import SPEED, YAW, X, Y
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import Samples, read_samples
+from caraware.ipc.arrays import Float32Array, Float64Array
 from caraware.ipc.stream import Observation
 
 SMALLEST_VARIANCE_M2 = 1e-4
@@ -111,7 +112,7 @@ class Carrier:
         self._since_s = np.where(self._ekf.started | ~self._ekf.running, 0.0, since_s + passed_s)
         self._time_s = samples.time_s
 
-    def _table(self, samples: Samples, before: np.ndarray) -> np.ndarray:
+    def _table(self, samples: Samples, before: Float64Array) -> Float32Array:
         ekf = self._ekf
         mean, predicted = ekf.belief.mean, ekf.predicted.mean
         covariance, prior = ekf.belief.covariance, ekf.predicted.covariance
@@ -145,5 +146,5 @@ class Carrier:
         return np.where(ekf.running[:, None], table, np.float32(0.0))
 
     @staticmethod
-    def _padded(rows: np.ndarray, slots: int) -> np.ndarray:
+    def _padded(rows: Float64Array, slots: int) -> Float64Array:
         return np.pad(rows, ((0, 0), (0, slots - rows.shape[1])))

@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caraware.ipc.arrays import Float32Array
+
 HEADING_BINS = 24
 """Of 15 degrees each."""
 CELL_M = 1.0
@@ -129,7 +131,7 @@ class LaneMap:
                 np.copyto(nearest[i][window], piece, where=better)
         return torch.from_numpy(nearest.reshape(-1)).long()
 
-    def _squares(self, x: float, y: float, heading: float, length: float) -> tuple[tuple[slice, slice], np.ndarray]:
+    def _squares(self, x: float, y: float, heading: float, length: float) -> tuple[tuple[slice, slice], Float32Array]:
         """Rows and columns within reach of a piece, and their squared distances to it (m²)."""
         cos, sin = math.cos(heading), math.sin(heading)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from caraware.fusion.carrier import COLUMNS, Carried
 from caraware.fusion.estimator import FusionEstimator, FusionNetwork, distance_loss
 from caraware.fusion.lanes import Pieces, read_pieces
+from caraware.ipc.run_file import RunFile
 from caraware.learn.adam import Adam
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
 from caraware.learn.networks import FlatParameters
@@ -33,7 +34,7 @@ class FusionConfig:
     """Ticks between two gradient steps; the gradient reaches no further back."""
 
     @classmethod
-    def from_run(cls, run: dict) -> "FusionConfig":
+    def from_run(cls, run: RunFile) -> "FusionConfig":
         """Read `run["config"]["fusion"]`. Raises `ConfigError`."""
         section = run.get("config", {}).get("fusion", {})
         config = cls(**{key: section[key] for key in ("map", "segment_ticks", "truncation_ticks") if key in section})
@@ -45,7 +46,7 @@ class FusionConfig:
             )
         return config
 
-    def pieces(self, run: dict) -> Pieces:
+    def pieces(self, run: RunFile) -> Pieces:
         """The lanes of the run's net; none without a map. Raises `OSError`."""
         if not self.map:
             return Pieces(*torch.zeros(6, 0))

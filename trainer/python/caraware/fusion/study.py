@@ -43,7 +43,8 @@ def _seeds_m(options: argparse.Namespace, label: str, changes: list[str], seed: 
         sets = [f"run.seed={seed}", *changes, *options.settings]
         command = [options.caraware, "train", "fusion", "--runs", str(options.runs), "--name", name]
         subprocess.run([*command, *(word for change in sets for word in ("--set", change))], check=True)
-    return json.loads(part.read_text())["seeds_m"]
+    seeds_m: list[dict[str, float]] = json.loads(part.read_text())["seeds_m"]
+    return seeds_m
 
 
 def _mean(seeds: list[dict[str, float]]) -> dict[str, float]:

@@ -22,6 +22,7 @@ from torch import Tensor
 from caraware.fusion.carrier import COLUMNS, Carried, Carrier
 from caraware.fusion.learner import Episode, FusionConfig, FusionLearner, FusionStats
 from caraware.fusion.store import Progress, load_fusion, newest_sound, save_fusion
+from caraware.ipc.run_file import RunFile
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn import rewards
 from caraware.learn.config import ConfigError
@@ -264,7 +265,7 @@ class FusionLoop:
         file.write_text(json.dumps(part, indent=2) + "\n")
 
 
-def begin(run: dict, resume_from: Path | None) -> tuple[RunConfig, FusionLearner, Progress]:
+def begin(run: RunFile, resume_from: Path | None) -> tuple[RunConfig, FusionLearner, Progress]:
     """The learner of a run file, new or continued. Raises `ConfigError` and `CheckpointError`."""
     config, fusion = RunConfig.from_run(run), FusionConfig.from_run(run)
     if len(config.environments) > 1:

@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from caraware import _native
+from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, Scalar, UInt32Array, UInt64Array
 from caraware.ipc.pointcloud import PointCloud
+from caraware.ipc.run_file import RunFile
+from caraware.ipc.stream import TrainingReport
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
 
 
-def _lent_tensor(view: object, slots: int, fields: int) -> Tensor:
+def _lent_tensor(view: Buffer, slots: int, fields: int) -> Tensor:
     """The tensor over a place in shared memory, f32 [slots, fields], whatever lies there."""
-    return read_only_tensor(np.frombuffer(view, np.float32).reshape(slots, fields))
+    return read_only_tensor(np.frombuffer(memoryview(view), np.float32).reshape(slots, fields))
 
 
 class StreamEndedError(Exception):
@@ -32,7 +40,13 @@ class ReadOnlyTensor(Tensor):
     """
 
     @classmethod
-    def __torch_function__(cls, func, types, args=(), kwargs=None):
+    def __torch_function__(
+        cls,
+        func: Callable[..., Any],
+        types: Sequence[type],
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
         kwargs = kwargs or {}
         name = getattr(func, "__name__", "")
         writes = name in {"__setitem__", "set_", "data"} or (name.endswith("_") and not name.endswith("__"))
@@ -41,7 +55,7 @@ class ReadOnlyTensor(Tensor):
             raise RuntimeError(f"{name}: observations are read-only shared memory; write to a clone()")
         if isinstance(kwargs.get("out"), cls):
             raise RuntimeError(f"{name}(out=…): observations are read-only shared memory")
-        result = super().__torch_function__(func, types, args, kwargs)
+        result: Any = super().__torch_function__(func, types, args, kwargs)  # type: ignore[no-untyped-call]  # torch: no types
         if isinstance(result, cls) and not any(_shares_memory(result, arg) for arg in args if isinstance(arg, cls)):
             return result.as_subclass(Tensor)
         return result
@@ -52,7 +66,7 @@ def _shares_memory(a: Tensor, b: Tensor) -> bool:
         return a.untyped_storage().data_ptr() == b.untyped_storage().data_ptr()
 
 
-def read_only_tensor(array: np.ndarray) -> Tensor:
+def read_only_tensor(array: NDArray[Any]) -> Tensor:
     """A tensor over a read-only numpy array, without a copy."""
     return torch.from_numpy(array).as_subclass(ReadOnlyTensor)
 
@@ -112,8 +126,8 @@ class Observation:
         """Step of the curriculum, counted from 1; 0 without one, and in evaluations."""
         return self.block.step
 
-    def _array(self, name: str, dtype: type, columns: int | None = None) -> np.ndarray:
-        array = np.frombuffer(self.block.section(name), dtype=dtype)
+    def _array(self, name: str, dtype: type[Scalar], columns: int | None = None) -> NDArray[Scalar]:
+        array = np.frombuffer(memoryview(self.block.section(name)), dtype=dtype)
         return array if columns is None else array.reshape(self.block.slots, columns)
 
     @cached_property
@@ -132,12 +146,12 @@ class Observation:
         return read_only_tensor(self._array("gnss_m", np.float32, _native.GNSS_COLUMNS))
 
     @cached_property
-    def gnss_geodetic(self) -> np.ndarray:
+    def gnss_geodetic(self) -> Float64Array:
         """f64 [n, 3]: the same fix as latitude, longitude (degrees) and altitude (m)."""
         return self._array("gnss_geodetic", np.float64, 3)
 
     @cached_property
-    def gnss_quality(self) -> np.ndarray:
+    def gnss_quality(self) -> Float32Array:
         """f32 [n, 2]: the receiver's estimate of its horizontal error (m, 1σ of the distance), satellites in use."""
         return self._array("gnss_quality", np.float32, 2)
 
@@ -157,48 +171,53 @@ class Observation:
         return read_only_tensor(self._array("speed_steering", np.float32, 2))
 
     @cached_property
-    def sensors(self) -> np.ndarray:
+    def sensors(self) -> UInt32Array:
         """u32 [n]: bits `GNSS`, `IMU`, `SPEED_STEERING`, `LIDAR` of `caraware._native`: which sensors deliver."""
         return self._array("sensors", np.uint32)
 
     @cached_property
-    def vehicle(self) -> np.ndarray:
+    def vehicle(self) -> UInt32Array:
         """u32 [n]: dense index of the vehicle within its episode, 0xFFFFFFFF for an empty slot."""
         return self._array("vehicle", np.uint32)
 
     @cached_property
-    def id_hash(self) -> np.ndarray:
+    def id_hash(self) -> UInt64Array:
         """u64 [n]: hash of the vehicle's SUMO id."""
         return self._array("id_hash", np.uint64)
 
     @cached_property
-    def age_s(self) -> np.ndarray:
+    def age_s(self) -> Float32Array:
         """f32 [n, 4]: age of the newest GNSS, IMU, speed-steering and LIDAR sample (s)."""
         return self._array("age_s", np.float32, 4)
 
     @cached_property
-    def episode_step(self) -> np.ndarray:
+    def episode_step(self) -> UInt32Array:
         """u32 [n]: ticks since the vehicle took the slot."""
         return self._array("episode_step", np.uint32)
 
     @cached_property
-    def _flags(self) -> np.ndarray:
+    def _flags(self) -> UInt32Array:
         return self._array("flags", np.uint32)
 
+    def _flag(self, bit: int) -> BoolArray:
+        """bool [n]: the slots whose flags have the bit."""
+        flagged: BoolArray = (self._flags & bit) != 0
+        return flagged
+
     @cached_property
-    def valid(self) -> np.ndarray:
+    def valid(self) -> BoolArray:
         """bool [n]: the slot holds a vehicle whose sensors have all delivered."""
-        return (self._flags & _native.VALID) != 0
+        return self._flag(_native.VALID)
 
     @cached_property
-    def terminated(self) -> np.ndarray:
+    def terminated(self) -> BoolArray:
         """bool [n]: the trajectory in this slot at the previous tick ended there (arrival, removal)."""
-        return (self._flags & _native.TERMINATED) != 0
+        return self._flag(_native.TERMINATED)
 
     @cached_property
-    def truncated(self) -> np.ndarray:
+    def truncated(self) -> BoolArray:
         """bool [n]: the trajectory in this slot at the previous tick was cut there (end of episode)."""
-        return (self._flags & _native.TRUNCATED) != 0
+        return self._flag(_native.TRUNCATED)
 
 
 class Channel:
@@ -215,7 +234,7 @@ class Channel:
 
     def _hold(self, attachment: _native.Attachment) -> None:
         self._attachment = attachment
-        self.run: dict[str, Any] = json.loads(attachment.run_json)
+        self.run: RunFile = json.loads(attachment.run_json)
 
     def in_environment(self, index: int, first_tick: int = 0) -> Channel:
         """This trainer's place in another environment of the run (`run.envs`); this one is environment 0's.
@@ -279,7 +298,7 @@ class Channel:
         observation: Observation,
         predictions: Tensor,
         policy_version: int,
-        estimates: np.ndarray | None = None,
+        estimates: Float32Array | None = None,
     ) -> None:
         """Predicted positions, f32 [n, 2] in world metres, for everybody who watches.
 
@@ -289,7 +308,7 @@ class Channel:
         beside = None if estimates is None else np.ascontiguousarray(estimates, dtype=np.float32).tobytes()
         self._attachment.publish_predictions(observation.block, rows.tobytes(), rows.shape[1], policy_version, beside)
 
-    def publish_actions(self, observation: Observation, actions: np.ndarray, policy_version: int = 0) -> None:
+    def publish_actions(self, observation: Observation, actions: Float32Array, policy_version: int = 0) -> None:
         """Actions of the driving task: steering (left is positive) and acceleration, each in -1 ... 1.
 
         f32 [n, 2], a row for every slot; rows of empty slots are not read. The simulation waits for the actions of
@@ -301,8 +320,8 @@ class Channel:
             raise ValueError(f"actions of shape {rows.shape}, the task takes ({observation.block.slots}, 2)")
         self._attachment.publish_predictions(observation.block, rows.tobytes(), 2, policy_version)
 
-    def report(self, **status: float) -> None:
-        """Shows episode, env_steps, updates, env_steps_per_s, policy_std, reward, error_m, raw_gnss_error_m."""
+    def report(self, **status: Unpack[TrainingReport]) -> None:
+        """Shows how training goes; what is left out keeps its last value."""
         self._attachment.report(**status)
 
     def lag_ticks(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from caraware import _native
+from caraware.ipc.run_file import RunFile
 
 PREFIXES = ("cav.", "hero.", "person.")
 """Population control numbers whom it adds within an episode: `cav.0`, `cav.1`, …; nobody gets an old number."""
@@ -13,9 +14,11 @@ FIRST_NUMBERS, MOST_NUMBERS = 256, 1 << 16
 class Names:
     """Finds the id that belongs to a hash, among those that the run gives; in a scenario only heroes are known so."""
 
-    def __init__(self, run: dict) -> None:
+    def __init__(self, run: RunFile) -> None:
         self._population = "population" in run.get("source", {"population": None})
-        self._known = {_native.id_hash(name): name for name in run["config"]["traffic"].get("hero_ids", ())}
+        self._known: dict[int, str] = {
+            _native.id_hash(name): name for name in run["config"]["traffic"].get("hero_ids", ())
+        }
         self._numbers = 0
 
     def of(self, id_hash: int) -> str:

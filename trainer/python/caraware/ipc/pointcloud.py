@@ -5,8 +5,10 @@ from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from caraware import _native
+from caraware.ipc.arrays import Float64Array
 
 POINT = np.dtype(
     [
@@ -71,7 +73,7 @@ class PointCloud:
     """Dense index of the vehicle within its episode, as in `Observation.vehicle`."""
     scan: np.void
     """`SCAN`."""
-    points: np.ndarray
+    points: NDArray[np.void]
     """`POINT [count]`, read-only."""
 
     @classmethod
@@ -86,19 +88,20 @@ class PointCloud:
         )
 
     @cached_property
-    def world_m(self) -> np.ndarray:
+    def world_m(self) -> Float64Array:
         """f64 [count, 3]: the points in the world frame, with the pose of the sensor at the end of the tick.
 
         With a rolling shutter a point was fired up to a tick earlier, when the sensor was up to `speed * age` behind:
         so far what stands still is drawn out of place, as a LIDAR without motion compensation has it.
         """
-        points = self.points["position_m"].astype(np.float64)
+        points: Float64Array = self.points["position_m"].astype(np.float64)
         if self.scan["axes"] == 1:  # the paper's: y backward, x left, z down
             points = np.stack((-points[:, 1], points[:, 0], -points[:, 2]), 1)
-        return points @ rotation(*self.scan["attitude_rad"]).T + self.scan["position_m"]
+        world_m: Float64Array = points @ rotation(*self.scan["attitude_rad"]).T + self.scan["position_m"]
+        return world_m
 
 
-def rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
+def rotation(roll: float, pitch: float, yaw: float) -> Float64Array:
     """World from sensor, f64 [3, 3]: heading counter-clockwise, then pitch with the nose up, then roll to the right."""
     (sr, cr), (sp, cp), (sy, cy) = ((np.sin(angle), np.cos(angle)) for angle in (roll, -pitch, yaw))
     return np.array(

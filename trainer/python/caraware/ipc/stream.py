@@ -1,10 +1,12 @@
 """What the trainer needs of a stream of observations; `caraware.ipc.channel` provides it over shared memory."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypedDict, Unpack
 
-import numpy as np
 from torch import Tensor
+
+from caraware.ipc.arrays import BoolArray, Float32Array, UInt32Array, UInt64Array
+from caraware.ipc.run_file import RunFile
 
 EMPTY_SLOT = 0xFFFFFFFF
 """`vehicle` of a slot that holds nobody."""
@@ -61,7 +63,7 @@ class Observation(Protocol):
         """f32 `[n, 2]` or `[n, 3]`: newest raw GNSS fix in world metres. Only for the baselines."""
 
     @property
-    def gnss_quality(self) -> np.ndarray:
+    def gnss_quality(self) -> Float32Array:
         """f32 `[n, 2]`: the receiver's estimate of its horizontal error (m, 1σ of the distance, 0 = none), satellites.
 
         This and the other raw sections are only for the baselines, which read them in evaluation episodes.
@@ -76,43 +78,56 @@ class Observation(Protocol):
         """f32 `[n, 2]`: newest wheel speed (m/s) and steering-wheel angle (rad)."""
 
     @property
-    def sensors(self) -> np.ndarray:
+    def sensors(self) -> UInt32Array:
         """u32 `[n]`: bits of the sensors that deliver: 1 GNSS, 2 IMU, 4 speed and steering, 8 LIDAR."""
 
     @property
-    def age_s(self) -> np.ndarray:
+    def age_s(self) -> Float32Array:
         """f32 `[n, 4]`: age of the newest sample of each sensor, in the order of the bits."""
 
     @property
-    def episode_step(self) -> np.ndarray:
+    def episode_step(self) -> UInt32Array:
         """u32 `[n]`: ticks since the vehicle took the slot."""
 
     @property
-    def vehicle(self) -> np.ndarray:
+    def vehicle(self) -> UInt32Array:
         """u32 `[n]`: dense vehicle index within the episode, `EMPTY_SLOT` where there is none."""
 
     @property
-    def id_hash(self) -> np.ndarray:
+    def id_hash(self) -> UInt64Array:
         """u64 `[n]`: hash of the vehicle's SUMO id. Only for its name."""
 
     @property
-    def valid(self) -> np.ndarray:
+    def valid(self) -> BoolArray:
         """bool `[n]`: the row holds a vehicle with valid sensors."""
 
     @property
-    def terminated(self) -> np.ndarray:
+    def terminated(self) -> BoolArray:
         """bool `[n]`: the trajectory in this slot at the previous tick ended there (arrival, removal)."""
 
     @property
-    def truncated(self) -> np.ndarray:
+    def truncated(self) -> BoolArray:
         """bool `[n]`: ... was cut there from outside (episode reset, time limit)."""
+
+
+class TrainingReport(TypedDict, total=False):
+    """How training goes, as the trainer's board shows it."""
+
+    episode: int
+    env_steps: int
+    updates: int
+    env_steps_per_s: float
+    policy_std: float
+    reward: float
+    error_m: float
+    raw_gnss_error_m: float
 
 
 class Channel(Protocol):
     """The trainer's end of the observation stream of one run."""
 
     @property
-    def run(self) -> dict:
+    def run(self) -> RunFile:
         """The parsed run file."""
 
     def receive(self, timeout_s: float) -> Sequence[Observation]:
@@ -135,7 +150,7 @@ class Channel(Protocol):
         observation: Any,
         predictions: Tensor,
         policy_version: int,
-        estimates: np.ndarray | None = None,
+        estimates: Float32Array | None = None,
     ) -> None:
         """Send f32 `[n, 2]` predicted positions in world metres for the tick of `observation`, and a filter's."""
 
@@ -145,5 +160,5 @@ class Channel(Protocol):
     def done(self) -> None:
         """Say that all work is done, so that the run may end."""
 
-    def report(self, **status: float) -> None:
+    def report(self, **status: Unpack[TrainingReport]) -> None:
         """Tell the supervisor how training goes."""

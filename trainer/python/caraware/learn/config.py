@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
+from caraware.ipc.run_file import ConfigTable, RunFile
 from caraware.learn import rewards
 
 _KEY_OF_FIELD = {"checkpoint_interval_updates": "checkpoint_interval"}
@@ -91,7 +92,7 @@ class TrainerConfig:
     """When the Kalman filter runs beside the policy for whoever watches: `paced`, `always`, `never`."""
 
     @classmethod
-    def from_run(cls, run: dict) -> "TrainerConfig":
+    def from_run(cls, run: RunFile) -> "TrainerConfig":
         """Read `run["config"]["trainer"]`; the seed may stand in `run["config"]["run"]`. Raises `ConfigError`."""
         section = dict(_table(run, "trainer"))
         section.pop("module", None)
@@ -153,7 +154,7 @@ class MapBounds:
     y_max_m: float
 
     @classmethod
-    def from_run(cls, run: dict) -> "MapBounds":
+    def from_run(cls, run: RunFile) -> "MapBounds":
         """Read `run["map"]["bounds_m"]` = [x_min, y_min, x_max, y_max]. Raises `ConfigError`."""
         bounds = run.get("map", {}).get("bounds_m")
         if not isinstance(bounds, list) or len(bounds) != 4 or not all(isinstance(v, int | float) for v in bounds):
@@ -174,14 +175,14 @@ def _key(field_name: str) -> str:
     return _KEY_OF_FIELD.get(field_name, field_name)
 
 
-def _table(run: dict, name: str) -> dict:
+def _table(run: RunFile, name: str) -> ConfigTable:
     table = run.get("config", {}).get(name)
     if not isinstance(table, dict):
         raise ConfigError(f"the run file has no table `config.{name}`", "start the trainer through `caraware train`")
     return table
 
 
-def _typed(name: str, kind: object, section: dict) -> Any:
+def _typed(name: str, kind: object, section: ConfigTable) -> Any:
     """The value of a field, where an integer may stand for a float but nothing else is converted."""
     value = section[_key(name)]
     if kind == tuple[int, ...] and isinstance(value, list) and all(type(v) is int for v in value):

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caraware.ipc.arrays import Int64Array
 from caraware.ipc.stream import Observation
 from caraware.learn.batch import Batch
 from caraware.learn.gru import RecurrentPolicy, RecurrentValue, Sequences, Steps, Walk
@@ -241,7 +242,7 @@ def sequences(valid: Tensor, goes_on: Tensor, length: int) -> Tensor:
     is_valid, follows = valid.numpy(), goes_on.numpy()
     ticks, slots = is_valid.shape
     place, number, count = np.zeros(slots, np.int64), np.zeros(slots, np.int64), 0
-    cells: list[tuple[np.ndarray, np.ndarray]] = []
+    cells: list[tuple[Int64Array, Int64Array]] = []
     for t in range(ticks):
         place = np.where(follows[t] & (t > 0), (place + 1) % length, 0)
         begins = np.flatnonzero(is_valid[t] & (place == 0))

@@ -43,4 +43,5 @@ def by_name(name: str) -> Reward:
 
 def distance_m(predicted_m: Tensor, truth: Tensor) -> Tensor:
     """Euclidean distance (paper, equation 5) of the x, y of `[..., 2 or 3]` positions to `[..., 4]` truth, metres."""
-    return torch.linalg.vector_norm(predicted_m[..., :2] - truth[..., :2], dim=-1)
+    distance_m: Tensor = torch.linalg.vector_norm(predicted_m[..., :2] - truth[..., :2], dim=-1)
+    return distance_m

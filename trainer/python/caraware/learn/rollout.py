@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from caraware.ipc.arrays import Scalar
 from caraware.ipc.stream import EMPTY_SLOT, Observation
 
 
@@ -146,7 +148,7 @@ class Rollout:
         self._truncated[t - 1] |= self._valid[t - 1] & ~went_on & ~self._terminated[t - 1]
 
     @staticmethod
-    def _set_row(row: np.ndarray, values: np.ndarray, empty: int) -> None:
+    def _set_row(row: NDArray[Scalar], values: NDArray[Scalar], empty: int) -> None:
         row[: len(values)] = values
         row[len(values) :] = empty
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from caraware.baselines import BaselineErrors, Baselines, SensorNoise
+from caraware.ipc.arrays import Float32Array, Float64Array, FloatArray, Int64Array
 from caraware.ipc.stream import Observation
 from caraware.report.statistics import mean_interval
 
@@ -54,14 +55,15 @@ class EvaluationResult:
     supervised_ci95_m: float | None = None
 
     @classmethod
-    def restored(cls, values: dict) -> "EvaluationResult":
+    def restored(cls, values: dict[str, Any]) -> "EvaluationResult":
         """From what `dataclasses.asdict` made of one."""
         return cls(**{known.name: values[known.name] for known in fields(cls) if known.name in values})
 
     def half_width_m(self, name: str) -> float:
         """Half a 95 % interval of an estimator's mean: over seeds, or over vehicles where there is one seed only."""
-        over_seeds = getattr(self, f"{name}_ci95_m")
-        return CI95_STANDARD_ERRORS * getattr(self, f"{name}_standard_error_m") if over_seeds is None else over_seeds
+        over_seeds: float | None = getattr(self, f"{name}_ci95_m")
+        standard_error_m: float = getattr(self, f"{name}_standard_error_m")
+        return CI95_STANDARD_ERRORS * standard_error_m if over_seeds is None else over_seeds
 
     def headline(self) -> dict[str, float | None]:
         """Mean errors, half their confidence intervals and the number of seeds, for the run's report."""
@@ -100,7 +102,7 @@ class Mean:
     def __init__(self) -> None:
         self._count, self._sum = 0, 0.0
 
-    def add(self, values: np.ndarray) -> None:
+    def add(self, values: FloatArray) -> None:
         """Add some values."""
         self._count += len(values)
         self._sum += float(values.sum(dtype=np.float64))
@@ -122,13 +124,13 @@ class Evaluation:
         self._baselines = Baselines(noise) if noise else None
         missing = ("ekf", "rts")[: 0 if noise else 2] + ("supervised",)[: 0 if supervised else 1]
         self._known = [name for name in ESTIMATORS if name not in missing]
-        self._finished: list[np.ndarray] = []
+        self._finished: list[Float64Array] = []
         self._episode: int | None = None
         self._sums = np.zeros((0, 1 + len(ESTIMATORS)))
         """f64 `[vehicle, 6]` of the current episode: samples, and the sum of the errors of each estimator."""
 
     def add(
-        self, obs: Observation, policy_m: np.ndarray, raw_m: np.ndarray, supervised_m: np.ndarray | None = None
+        self, obs: Observation, policy_m: FloatArray, raw_m: FloatArray, supervised_m: FloatArray | None = None
     ) -> None:
         """Add the errors `[v]` of the valid rows of one evaluation tick."""
         if obs.episode != self._episode:
@@ -148,7 +150,7 @@ class Evaluation:
         for tick in ticks:
             self._sums[tick.vehicle, 5] += tick.error_m
 
-    def _make_room(self, vehicle: np.ndarray) -> None:
+    def _make_room(self, vehicle: Int64Array) -> None:
         missing = int(vehicle.max(initial=-1)) + 1 - len(self._sums)
         if missing > 0:
             self._sums = np.pad(self._sums, ((0, missing), (0, 0)))
@@ -230,13 +232,13 @@ def _pool(phase: Sequence[EvaluationResult]) -> EvaluationResult:
     return replace(phase[0], samples=samples, episodes=sum(result.episodes for result in phase), **values)
 
 
-def errors_m(obs: Observation, predictions_m: Tensor) -> tuple[np.ndarray, np.ndarray]:
+def errors_m(obs: Observation, predictions_m: Tensor) -> tuple[Float32Array, Float32Array]:
     """Distances to the truth `[v]` of predictions `[n, 2]` and of raw GNSS, on the valid rows of a tick."""
     policy = _distance_m(predictions_m.numpy(), obs.truth.numpy())[obs.valid]
     return policy, raw_errors_m([obs])[0]
 
 
-def raw_errors_m(ticks: Sequence[Observation]) -> list[np.ndarray]:
+def raw_errors_m(ticks: Sequence[Observation]) -> list[Float32Array]:
     """Distances to the truth `[v]` of raw GNSS, on the valid rows of each of some ticks.
 
     The same numbers, bit for bit, whichever ticks come together.
@@ -247,7 +249,8 @@ def raw_errors_m(ticks: Sequence[Observation]) -> list[np.ndarray]:
     return [error[obs.valid] for obs, error in zip(ticks, np.split(errors, ends), strict=True)]
 
 
-def _distance_m(position: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def _distance_m(position: Float32Array, truth: Float32Array) -> Float32Array:
     """Horizontal distance `[n]`. Elementwise, so that a row's result does not depend on the rows beside it."""
     east, north = position[:, 0] - truth[:, 0], position[:, 1] - truth[:, 1]
-    return np.sqrt(east * east + north * north)
+    distance_m: Float32Array = np.sqrt(east * east + north * north)
+    return distance_m

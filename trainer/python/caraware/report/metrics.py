@@ -3,11 +3,14 @@
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from torch.utils.tensorboard import SummaryWriter
 
-from caraware.learn.ppo import UpdateStats
 from caraware.report.evaluation import EvaluationResult
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Metrics:
     def _writer(self) -> SummaryWriter:
         return SummaryWriter(str(self._folder), purge_step=self._purge_step)
 
-    def updated(self, point: TrainingPoint, stats: UpdateStats, lag_ticks: int = 0) -> None:
+    def updated(self, point: TrainingPoint, stats: "DataclassInstance", lag_ticks: int = 0) -> None:
         """Record one update, after which the simulation was `lag_ticks` ahead."""
         self.training.append(point)
         for name, value in asdict(stats).items():

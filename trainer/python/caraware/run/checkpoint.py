@@ -6,6 +6,7 @@ import os
 import shutil
 from dataclasses import asdict, astuple, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -57,7 +58,7 @@ class Course:
     training: list[TrainingPoint] = field(default_factory=list)
     others: list[Place] = field(default_factory=list)
     """The environments after the first, of which `Counters` and the fields above tell."""
-    curriculum: dict = field(default_factory=dict)
+    curriculum: dict[str, Any] = field(default_factory=dict)
     """`caraware.run.curriculum.Standing`; empty without a curriculum."""
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from caraware.baselines.noise import SensorNoise
+from caraware.ipc.run_file import RunFile
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
 from caraware.run.curriculum import Step
 
@@ -36,7 +37,7 @@ class RunConfig:
     """A checkpoint directory to continue from."""
 
     @classmethod
-    def from_run(cls, run: dict) -> "RunConfig":
+    def from_run(cls, run: RunFile) -> "RunConfig":
         """Check the whole run file. Raises `ConfigError`."""
         if "run_dir" not in run:
             raise ConfigError("the run file has no `run_dir`", "start the trainer through `caraware train`")

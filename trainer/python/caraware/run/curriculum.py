@@ -4,6 +4,8 @@ import math
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
+from caraware.ipc.run_file import RunFile
+
 
 @dataclass(frozen=True)
 class Step:
@@ -16,7 +18,7 @@ class Step:
     until_lessons: int | None = None
 
     @classmethod
-    def from_run(cls, run: dict) -> "tuple[Step, ...]":
+    def from_run(cls, run: RunFile) -> "tuple[Step, ...]":
         """The steps of a run file's configuration; none without a curriculum."""
         steps = run.get("config", {}).get("curriculum", {}).get("steps", [])
         return tuple(cls(**{name: step.get(name) for name in cls.__dataclass_fields__}) for step in steps)
@@ -60,7 +62,7 @@ class Standing:
     passed: list[Passed] = field(default_factory=list)
 
     @classmethod
-    def restored(cls, values: dict) -> "Standing":
+    def restored(cls, values: dict[str, Any]) -> "Standing":
         """From what `dataclasses.asdict` made of one."""
         return cls(**values | {"passed": [Passed(**gate) for gate in values.get("passed", [])]})
 
@@ -91,7 +93,7 @@ class Curriculum:
         self._steps, self._channel = steps, channel
         self.standing = Standing()
 
-    def begin(self, standing: dict | None = None) -> None:
+    def begin(self, standing: dict[str, Any] | None = None) -> None:
         """Tell the simulation where a run stands: at its beginning, or as a checkpoint says."""
         if standing:
             self.standing = Standing.restored(standing)

@@ -8,8 +8,7 @@ environments' own ticks alone, never on how they happen to arrive together.
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
+from caraware.ipc.arrays import Float32Array
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.rollout import Rollout
 from caraware.report.evaluation import Evaluation
@@ -93,7 +92,7 @@ class Environment:
         self._estimates = Estimates(shown) if shown else None
         self._received_last = False
 
-    def estimates_m(self, obs: Observation) -> np.ndarray | None:
+    def estimates_m(self, obs: Observation) -> Float32Array | None:
         """f32 `[n, 2]`: the Kalman filter's positions (m, world), for whoever watches; None if it is not to run."""
         return self._estimates.position_m(obs) if self._estimates else None
 

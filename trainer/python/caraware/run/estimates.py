@@ -4,6 +4,7 @@ import numpy as np
 
 from caraware.baselines import Ekf, SensorNoise
 from caraware.baselines.samples import read_samples
+from caraware.ipc.arrays import Float32Array
 from caraware.ipc.stream import Observation
 
 
@@ -15,7 +16,7 @@ class Estimates:
         self._episode: int | None = None
         self._ekf = Ekf(noise)
 
-    def position_m(self, obs: Observation) -> np.ndarray:
+    def position_m(self, obs: Observation) -> Float32Array:
         """f32 `[n, 2]`: x, y in the world (m) at the tick of `obs`; not-a-number where a row is not valid."""
         if obs.episode != self._episode:
             self._episode, self._ekf = obs.episode, Ekf(self._noise)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caraware.ipc.arrays import FloatArray
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.batch import Batch, save_batch
 from caraware.learn.ppo import NonFiniteLoss, Ppo, UpdateStats
@@ -239,7 +240,7 @@ class TrainingLoop:
         if self._commit_due:
             self.commit()
 
-    def _take_all(self, environment: Environment, predicted_m: list[Tensor], raw_m: list[np.ndarray]) -> bool:
+    def _take_all(self, environment: Environment, predicted_m: list[Tensor], raw_m: list[FloatArray]) -> bool:
         """Take waiting ticks while the environment may go on; False if a successor takes over."""
         taken = 0
         for prediction_m, raw_error_m in zip(predicted_m, raw_m, strict=True):
@@ -270,7 +271,7 @@ class TrainingLoop:
         elif any(environment.ended and not full[environment.index] for environment in self._environments):
             self._agree(Verdict.ENDED)
 
-    def _supervised_errors_m(self, obs: Observation) -> np.ndarray | None:
+    def _supervised_errors_m(self, obs: Observation) -> FloatArray | None:
         """Of the baseline that is taught beside the policy, on the valid rows; None without it."""
         assert self._ppo is not None
         if self._ppo.supervised is None:
@@ -280,7 +281,7 @@ class TrainingLoop:
         predicted_m = self._ppo.supervised.predict_m(observation.index_select(0, rows))
         return distance_m(predicted_m, obs.truth.index_select(0, rows)).numpy()
 
-    def _take(self, environment: Environment, obs: Observation, predicted_m: Tensor, raw_m: np.ndarray) -> None:
+    def _take(self, environment: Environment, obs: Observation, predicted_m: Tensor, raw_m: FloatArray) -> None:
         """Everything that one tick causes; `raw_m` are the errors of raw GNSS on its valid rows."""
         assert self._ppo is not None
         channel = environment.channel

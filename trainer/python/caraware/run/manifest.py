@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 log = logging.getLogger(__name__)
 
@@ -146,7 +147,7 @@ def verified(file: Path, sha256: str) -> bytes:
     return content
 
 
-def own_hash(entries: dict) -> str:
+def own_hash(entries: dict[str, Any]) -> str:
     """Of a manifest without this hash."""
     return hashlib.sha256(json.dumps(entries, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 

@@ -6,12 +6,16 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from caraware.baselines import Ekf
 from caraware.baselines.samples import read_samples
+from caraware.ipc.arrays import Float32Array, FloatArray
 from caraware.ipc.names import Names
+from caraware.ipc.run_file import RunFile
 from caraware.ipc.stream import Channel, Observation
 from caraware.report.evaluation import errors_m
 from caraware.report.statistics import mean_interval
@@ -31,7 +35,7 @@ class Sums:
     samples: int = 0
     error_m: dict[str, float] = field(default_factory=lambda: dict.fromkeys(ESTIMATORS, 0.0))
 
-    def add(self, error_m: dict[str, np.ndarray]) -> None:
+    def add(self, error_m: dict[str, FloatArray]) -> None:
         """Add the errors `[v]` of some rows."""
         self.samples += len(error_m["ppo"])
         for name, values in error_m.items():
@@ -78,7 +82,7 @@ class Tally:
 class Scoreboard:
     """Position errors of policy, EKF and raw fix, of each vehicle at this tick and over its time on the road."""
 
-    def __init__(self, run: dict, config: RunConfig, tally: Tally) -> None:
+    def __init__(self, run: RunFile, config: RunConfig, tally: Tally) -> None:
         assert config.sensors is not None
         self.tally = tally
         self._noise = config.sensors
@@ -88,7 +92,7 @@ class Scoreboard:
         self._now: dict[int, dict[str, float]] = {}
         self._sim_time_s = 0.0
 
-    def add(self, obs: Observation, predicted_m: object) -> None:
+    def add(self, obs: Observation, predicted_m: Tensor) -> None:
         """Count one tick."""
         if obs.episode != self.tally.episode or self.tally.tick < 0:
             self.tally.begin_episode(obs.episode)
@@ -97,7 +101,7 @@ class Scoreboard:
         policy_m, raw_m = errors_m(obs, predicted_m)
         rows = np.flatnonzero(obs.valid)
         offset_m = self._ekf.position_m[rows] - np.asarray(obs.truth)[rows, :2]
-        error_m = {"ppo": policy_m, "ekf": np.hypot(*offset_m.T), "raw_gnss": raw_m}
+        error_m: dict[str, FloatArray] = {"ppo": policy_m, "ekf": np.hypot(*offset_m.T), "raw_gnss": raw_m}
         self.tally.sums.add(error_m)
         self.tally.running.add(error_m)
         self.tally.tick, self._sim_time_s = obs.tick, obs.sim_time_ns * 1e-9
@@ -112,12 +116,12 @@ class Scoreboard:
         if obs.episode_last:
             self.tally.end_episode()
 
-    def estimates_m(self, obs: Observation) -> np.ndarray:
+    def estimates_m(self, obs: Observation) -> Float32Array:
         """f32 `[n, 2]`: the filter's positions at the tick added last; not-a-number where a row is not valid."""
         position_m = np.asarray(self._ekf.position_m, dtype=np.float32)
         return np.where(np.asarray(obs.valid)[:, None], position_m, np.float32(np.nan))
 
-    def table(self) -> dict:
+    def table(self) -> dict[str, Any]:
         """What is shown: means over the run, and a row for each vehicle on the road."""
         tally = self.tally
         rows = [

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from caraware.ipc.run_file import RunFile
+
 log = logging.getLogger("caraware.train")
 
 EXIT_CODES = {"run": 1, "config": 2, "missing": 3}
@@ -102,12 +104,13 @@ def run_process(arguments: list[str], work: TrainerWork) -> int:
     return 0
 
 
-def read_run(run_file: Path) -> dict:
+def read_run(run_file: Path) -> RunFile:
     """The run file, parsed. Raises `ConfigError`."""
     from caraware.learn.config import ConfigError
 
     try:
-        return json.loads(run_file.read_text())
+        run: RunFile = json.loads(run_file.read_text())
+        return run
     except (OSError, ValueError) as error:
         raise ConfigError(f"cannot read the run file {run_file}: {error}", "start it by `caraware train`") from error
 

@@ -1,0 +1,303 @@
+"""A trainer's place in a run: observations as read-only views over shared memory, and the answers to them.
+
+Shapes use n for slots, d for observation fields and k for IMU samples of a tick. Times are in seconds where the name
+ends in `_s` and in nanoseconds where it ends in `_ns`. A failure of the run raises RuntimeError, an argument out of
+range ValueError.
+"""
+
+from collections.abc import Callable
+from typing import final
+
+from torch import Tensor
+from typing_extensions import Buffer
+
+__all__ = [
+    "CLIPPED",
+    "EMPTY_SLOT",
+    "GNSS",
+    "GNSS_COLUMNS",
+    "IMU",
+    "IMU_COLUMNS",
+    "LIDAR",
+    "SCHEMA_VERSION",
+    "SPEED_STEERING",
+    "TERMINATED",
+    "TRUNCATED",
+    "TRUTH_COLUMNS",
+    "VALID",
+    "Attachment",
+    "Lease",
+    "ObservationBlock",
+    "PointCloud",
+    "SectionView",
+    "id_hash",
+    "observation_size",
+]
+
+SCHEMA_VERSION: int
+"""Version of the layouts in shared memory; every process of a run has the same."""
+
+VALID: int
+"""Bit of `flags`: the slot holds a vehicle whose sensors have all delivered."""
+TERMINATED: int
+"""Bit of `flags`: the trajectory that held the slot a tick before ended there."""
+TRUNCATED: int
+"""Bit of `flags`: the trajectory that held the slot a tick before was cut there."""
+CLIPPED: int
+"""Bit of `flags`: a field of the observation was outside its range."""
+EMPTY_SLOT: int
+"""Vehicle index of a slot without a vehicle."""
+
+GNSS: int
+"""Bit of `sensors`: the GNSS receiver delivers."""
+IMU: int
+"""Bit of `sensors`: the inertial measurement unit delivers."""
+SPEED_STEERING: int
+"""Bit of `sensors`: wheel speed and steering-wheel angle are delivered."""
+LIDAR: int
+"""Bit of `sensors`: the LIDAR delivers."""
+
+GNSS_COLUMNS: int
+"""Columns of the section `gnss_m`: east, north, up (m, world)."""
+IMU_COLUMNS: int
+"""Columns of the section `imu`: acceleration x, y, z (m/s²), angular rate x, y, z (rad/s), compass (rad)."""
+TRUTH_COLUMNS: int
+"""Columns of the section `truth`: x, y (m, world), yaw (rad), speed (m/s)."""
+
+@final
+class Attachment:
+    """A trainer's place in one environment of a run, and its ports.
+
+    A process that the supervisor started has one for each environment; a process from outside may have any number.
+    Methods may be called from any thread; `receive` and `wait_for_any` release the GIL while they wait.
+    """
+
+    def __new__(cls, run_file: str, first_tick: int = 0, *, outside: bool = False) -> Attachment:
+        """Join the run that `run_file` describes. Producers send from `first_tick` on: all before are committed.
+
+        With `outside`, the supervisor did not start this process. It then does not end with the supervisor; `receive`
+        raises RuntimeError instead.
+        """
+
+    @property
+    def run_json(self) -> str:
+        """The run file's text."""
+
+    def in_environment(self, env_index: int, first_tick: int) -> Attachment:
+        """This trainer's place in environment `env_index` of the run, whose ticks begin with `first_tick`."""
+
+    def wait_for_any(self, timeout_s: float) -> None:
+        """Wait for a message in any environment, at most `timeout_s` and at most 50 ms.
+
+        Call `receive(0)` before it, or a message that is already there waits for the next one.
+        """
+
+    def receive(self, timeout_s: float, *, busy: bool = False) -> list[ObservationBlock]:
+        """All waiting blocks, oldest first; an empty list after `timeout_s` without any.
+
+        With `busy` the call polls on its core instead of sleeping, which saves the wake-up of some 30 µs.
+        """
+
+    def scans(self) -> list[PointCloud]:
+        """LIDAR scans since the last call, oldest first; the newest of them if there were more than fit.
+
+        The first call subscribes and returns none.
+        """
+
+    def lag_ticks(self) -> int:
+        """Ticks that `traffic-bridge` is ahead of the newest tick consumed here."""
+
+    @property
+    def incarnation(self) -> int:
+        """Number of this trainer in the run; 0 for the first."""
+
+    @property
+    def refused(self) -> int:
+        """Messages that were refused because they came from another run or from a replaced incarnation."""
+
+    @property
+    def ended(self) -> bool:
+        """True once the last block of the run has been received."""
+
+    def consumed(self, tick: int) -> None:
+        """Return credit to the producer for all ticks up to and including `tick`."""
+
+    def committed(self, tick: int) -> None:
+        """Publish that all ticks up to and including `tick` are in a checkpoint that has been renamed into place."""
+
+    def decided(self, lessons: int, since: int, step: int) -> None:
+        """Publish that all lessons below `lessons` have a stage; lessons from `since` on have `step`, counted from 0.
+
+        `traffic-bridge` waits for this before each lesson of a curriculum.
+        """
+
+    def done(self) -> None:
+        """Publish that all work is done."""
+
+    def publish_predictions(
+        self,
+        block: ObservationBlock,
+        rows: bytes,
+        columns: int,
+        policy_version: int,
+        estimates: bytes | None = None,
+    ) -> None:
+        """Publish the answer to `block`: `rows` is f32 `[n, columns]` in C order.
+
+        In the localisation task a row is a position (m, world). In the driving task it is steering and acceleration,
+        each in -1 … 1, and the simulation waits for it. `estimates`, f32 `[n, 2]`, are a filter's positions (m, world)
+        beside them. Raises ValueError for a length that does not fit the block.
+        """
+
+    def report(
+        self,
+        *,
+        episode: int | None = None,
+        env_steps: int | None = None,
+        updates: int | None = None,
+        env_steps_per_s: float | None = None,
+        policy_std: float | None = None,
+        reward: float | None = None,
+        error_m: float | None = None,
+        raw_gnss_error_m: float | None = None,
+    ) -> None:
+        """Publish the progress of training on the trainer's board; a value that is left out keeps its last one."""
+
+@final
+class ObservationBlock:
+    """One tick of one environment in shared memory, which stays valid while this object or a view of it lives."""
+
+    @property
+    def received_ns(self) -> int:
+        """When the block was taken, on the system's monotonic clock, nanoseconds."""
+
+    @property
+    def tick(self) -> int:
+        """Tick number, 0-based over the run."""
+
+    @property
+    def episode(self) -> int:
+        """Episode number, 0-based over the run."""
+
+    @property
+    def sim_time_ns(self) -> int:
+        """Simulated time since the start of the episode, nanoseconds."""
+
+    @property
+    def slots(self) -> int:
+        """Number of slots n."""
+
+    @property
+    def fields(self) -> int:
+        """Number of observation fields d."""
+
+    @property
+    def imu_samples(self) -> int:
+        """Number of IMU samples k."""
+
+    @property
+    def evaluation(self) -> bool:
+        """True in an evaluation episode."""
+
+    @property
+    def episode_last(self) -> bool:
+        """True for the last tick of its episode."""
+
+    @property
+    def lesson_last(self) -> bool:
+        """True for the last tick of a lesson; before the next lesson the simulation waits for `Attachment.decided`."""
+
+    @property
+    def step(self) -> int:
+        """Stage of the curriculum, counted from 1; 0 without a curriculum and in evaluations."""
+
+    @property
+    def last(self) -> bool:
+        """True for the last tick of the run."""
+
+    @property
+    def address(self) -> int:
+        """Address of the payload, which proves where it lies."""
+
+    def section(self, name: str) -> SectionView:
+        """The bytes of one array (`observation`, `truth`, `gnss_m`, …) as a read-only buffer over shared memory.
+
+        `ipc_schema::observation::ObservationLayout` lists the names. Raises KeyError for any other.
+        """
+
+@final
+class SectionView:
+    """One array of an observation block as a read-only buffer of bytes; it keeps the block alive."""
+
+    def __buffer__(self, flags: int, /) -> memoryview: ...
+
+@final
+class Lease:
+    """The observations of an attachment one at a time, each lent until the next is taken."""
+
+    def __new__(cls, attachment: Attachment, make: Callable[[Buffer, int, int], Tensor]) -> Lease:
+        """`make(buffer, n, d)` returns the tensor f32 `[n, d]` over a buffer; it is called once for each place."""
+
+    def next(self, timeout_s: float) -> Tensor | None:
+        """The tensor f32 `[n, d]` of the next tick; None after `timeout_s`. Polls on its core.
+
+        The tensor before it is given back: its content is undefined from now on.
+        """
+
+    @property
+    def tick(self) -> int:
+        """Tick number of the newest, 0-based over the run."""
+
+    @property
+    def episode(self) -> int:
+        """Episode of the newest, 0-based over the run."""
+
+    @property
+    def sim_time_ns(self) -> int:
+        """Simulated time of the newest since the start of the episode, nanoseconds."""
+
+    @property
+    def received_ns(self) -> int:
+        """When the newest was taken, on the system's monotonic clock, nanoseconds."""
+
+    @property
+    def episode_last(self) -> bool:
+        """True if the newest is the last of its episode."""
+
+    @property
+    def last(self) -> bool:
+        """True if the newest is the last of the run."""
+
+    @property
+    def places(self) -> int:
+        """Number of tensors made: one for each place in shared memory that a message has lain in."""
+
+@final
+class PointCloud:
+    """The scan of one LIDAR in one tick, copied out of shared memory."""
+
+    @property
+    def tick(self) -> int:
+        """Tick number, 0-based over the run."""
+
+    @property
+    def sim_time_ns(self) -> int:
+        """Simulated time at the end of the tick, nanoseconds since the start of the episode."""
+
+    @property
+    def vehicle(self) -> int:
+        """Dense index of the vehicle within the episode."""
+
+    @property
+    def scan(self) -> bytes:
+        """The bytes of one `Scan`: pose of the sensor and counts."""
+
+    @property
+    def points(self) -> bytes:
+        """The bytes of the points, `LidarPoint [count]`."""
+
+def id_hash(id: str) -> int:
+    """Hash of a SUMO id, as the section `id_hash` of an observation has it."""
+
+def observation_size(run_file: str) -> int:
+    """Numbers in a row of the observation (d) of the run that `run_file` describes. Raises RuntimeError."""
