@@ -1,6 +1,6 @@
-"""Disturbs one run on purpose, by planned swaps and kills of its trainer at random moments; compares with a quiet one.
+"""Disturbs one run by handovers and kills of its trainer at random moments, and compares it with an undisturbed run.
 
-    PYTHONPATH=trainer/python .venv/bin/python docs/endurance.py --swaps 20 --kills 50 --seed 1
+    PYTHONPATH=trainer/python .venv/bin/python docs/endurance.py --handovers 20 --kills 50 --seed 1
 
 Both runs go to a temporary directory. Prints one line of JSON; the exit code is 0 if nothing was lost or learnt twice,
 observation hash and final tensors are equal, and nothing is left in shared memory.
@@ -64,26 +64,26 @@ def newest(run: Path) -> str:
     return latest.read_text() if latest.exists() else ""
 
 
-def disturb(run: Path, process: subprocess.Popen, deeds: list[str], rng: random.Random) -> dict:
-    """Swap and kill at random moments until all is done or the run is over.
+def disturb(run: Path, process: subprocess.Popen, disturbances: list[str], rng: random.Random) -> dict:
+    """Hands over and kills at random moments until all is done or the run is over.
 
-    Between two deeds there is a new checkpoint: five deaths in a row without one would end the run, as they should.
+    Waits for a new checkpoint between two disturbances: five deaths in a row without one end the run, by design.
     """
-    done = {"swaps": 0, "refused": 0, "kills": 0, "hand_overs_s": []}
+    done = {"handovers": 0, "refused": 0, "kills": 0, "handovers_s": []}
     before = ""
-    for deed in deeds:
+    for disturbance in disturbances:
         while process.poll() is None and newest(run) == before:
             time.sleep(0.01)
         time.sleep(rng.uniform(0.0, 1.0))
         if process.poll() is not None:
             break
         before = newest(run)
-        if deed == "swap":
+        if disturbance == "handover":
             answer = subprocess.run(
                 [CARAWARE, "swap", run.name], cwd=run.parents[1], capture_output=True, text=True, check=False
             )
-            done["swaps" if answer.returncode == 0 else "refused"] += 1
-            done["hand_overs_s"] += [float(answer.stdout.split()[-2])] if answer.returncode == 0 else []
+            done["handovers" if answer.returncode == 0 else "refused"] += 1
+            done["handovers_s"] += [float(answer.stdout.split()[-2])] if answer.returncode == 0 else []
         elif (pid := trainer_pid(run)) is not None:
             os.kill(pid, signal.SIGKILL)
             done["kills"] += 1
@@ -93,24 +93,24 @@ def disturb(run: Path, process: subprocess.Popen, deeds: list[str], rng: random.
 def main() -> int:
     """Both runs and the comparison."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--swaps", type=int, default=20)
+    parser.add_argument("--handovers", type=int, default=20)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--episodes", type=int, default=400)
     parser.add_argument("--pace", type=float, default=0.0, help="simulated seconds per second of the disturbed run")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     rng = random.Random(arguments.seed)
-    deeds = ["swap"] * arguments.swaps + ["kill"] * arguments.kills
-    rng.shuffle(deeds)
+    disturbances = ["handover"] * arguments.handovers + ["kill"] * arguments.kills
+    rng.shuffle(disturbances)
     with tempfile.TemporaryDirectory(prefix="endure") as directory:
         os.environ["CARAWARE_RUNTIME_DIR"] = f"{directory}/r"
-        quiet = {"cwd": directory, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        silent = {"cwd": directory, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         pace = f"--set=run.real_time_factor={arguments.pace}"
-        process = subprocess.Popen(command("disturbed", arguments.episodes, pace), **quiet)
+        process = subprocess.Popen(command("disturbed", arguments.episodes, pace), **silent)
         run = Path(directory, "runs", "disturbed")
-        done = disturb(run, process, deeds, rng)
+        done = disturb(run, process, disturbances, rng)
         code = process.wait()
-        subprocess.run(command("undisturbed", arguments.episodes), check=True, **quiet)
+        subprocess.run(command("undisturbed", arguments.episodes), check=True, **silent)
         reports = [json.loads((run.parent / n / "report.json").read_text()) for n in ("disturbed", "undisturbed")]
         result = {
             **done,
