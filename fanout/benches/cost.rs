@@ -1,4 +1,4 @@
-//! What fanning out costs: `cargo bench -p fanout`.
+//! Processor time of the fan-out: `cargo bench -p fanout`.
 
 #![allow(
     clippy::unwrap_used,
@@ -12,7 +12,7 @@ mod harness;
 
 use std::time::{Duration, Instant};
 
-use fanout::{frame, keys::Topic};
+use fanout::{frame, network::keys::Topic};
 use harness::{Run, ask, publisher, send_observation, send_prediction, send_world, until, watch};
 use ipc_schema::{process::Process, run::Mode, services::Channel};
 
@@ -25,7 +25,7 @@ fn cpu_ticks(pid: u32) -> u64 {
     fields[11].parse::<u64>().unwrap() + fields[12].parse::<u64>().unwrap()
 }
 
-/// Publishes ticks of `vehicles` at `ticks_per_s` and tells the fan-out's share of a core.
+/// Publishes ticks of `vehicles` at `ticks_per_s`, and prints the fan-out's share of a core.
 fn measure(vehicles: usize, ticks_per_s: u32, viewers: usize) {
     let run = Run::at_rate("cost", Mode::Train, 10.0);
     let fanout = run.start_fanout();

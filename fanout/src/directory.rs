@@ -1,4 +1,4 @@
-//! Who is who: road users and traffic lights, from a census now and then and the changes between.
+//! The directory of road users and traffic lights, kept up to date from a census each simulated second and the changes between.
 
 use std::collections::BTreeMap;
 
@@ -9,31 +9,31 @@ use ipc_schema::{
     traffic::{MetaEvent, ROUTES, SignalMeta, TrafficMetaLayout, VehicleMeta},
 };
 
-/// A fact and the tick that it is of.
+/// A fact and the tick from which it is known.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Dated<T> {
     tick: u64,
     fact: T,
 }
 
-/// Road users and traffic lights of the episode at hand.
+/// Road users and traffic lights of the current episode.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Directory {
+pub struct RoadUserDirectory {
     header: MessageHeader,
     vehicles: BTreeMap<u32, Dated<VehicleMeta>>,
     signals: BTreeMap<u32, Dated<SignalMeta>>,
-    /// Who left after the census: the tick of it.
+    /// The tick at which each road user left, of those that left since the last census.
     gone: BTreeMap<u32, u64>,
     signals_changed: bool,
 }
 
-impl Directory {
-    /// Enters a `traffic-meta` message: what changed in its tick.
+impl RoadUserDirectory {
+    /// Applies a `traffic-meta` message: the changes of its tick.
     ///
     /// # Errors
     /// The payload does not hold what its header promises.
     pub fn apply_changes(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<(), BlockError> {
-        if header.has(ROUTES) || !self.turn_to(header) {
+        if header.has(ROUTES) || !self.is_current(header) {
             return Ok(());
         }
         let (vehicles, signals) = rows(header, payload)?;
@@ -53,12 +53,12 @@ impl Directory {
         Ok(())
     }
 
-    /// Enters a `census` message: everybody there is. What is known of a later tick stays.
+    /// Applies a `census` message, which lists every road user and traffic light. Facts of a later tick stay.
     ///
     /// # Errors
-    /// As [`Directory::apply_changes`].
+    /// As [`RoadUserDirectory::apply_changes`].
     pub fn apply_census(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<(), BlockError> {
-        if !self.turn_to(header) {
+        if !self.is_current(header) {
             return Ok(());
         }
         let (vehicles, signals) = rows(header, payload)?;
@@ -76,8 +76,8 @@ impl Directory {
         Ok(())
     }
 
-    /// Begins anew with a new episode; false for what is of an old one.
-    fn turn_to(&mut self, header: &MessageHeader) -> bool {
+    /// False for a message of an old episode. A new episode empties the directory.
+    fn is_current(&mut self, header: &MessageHeader) -> bool {
         if header.episode < self.header.episode {
             return false;
         }
@@ -90,6 +90,7 @@ impl Directory {
         true
     }
 
+    /// Replaces what is known of each traffic light, unless that is newer.
     fn enter_signals(&mut self, header: &MessageHeader, signals: &[SignalMeta]) {
         for fact in signals {
             let dated = Dated {
@@ -104,31 +105,31 @@ impl Directory {
         }
     }
 
-    /// Header of the newest tick entered.
+    /// Header of the newest message applied.
     #[must_use]
     pub fn header(&self) -> &MessageHeader {
         &self.header
     }
 
-    /// The road user with this dense index, if it is known.
+    /// The road user with this index, if it is known.
     #[must_use]
     pub fn vehicle(&self, index: u32) -> Option<&VehicleMeta> {
         self.vehicles.get(&index).map(|dated| &dated.fact)
     }
 
-    /// Road users that are known.
+    /// Number of known road users.
     #[must_use]
     pub fn len(&self) -> usize {
         self.vehicles.len()
     }
 
-    /// True if nobody is known.
+    /// True if no road user is known.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.vehicles.is_empty()
     }
 
-    /// All road users as bytes, row after row by ascending index.
+    /// All road users as bytes, in rows by ascending index.
     #[must_use]
     pub fn vehicle_rows(&self) -> Vec<u8> {
         self.vehicles
@@ -138,7 +139,7 @@ impl Directory {
             .collect()
     }
 
-    /// All traffic lights as bytes, if one has changed since the last call.
+    /// All traffic lights as bytes, in rows by ascending index, if one has changed since the last call.
     pub fn take_signal_rows(&mut self) -> Option<Vec<u8>> {
         std::mem::take(&mut self.signals_changed).then(|| {
             self.signals
@@ -150,6 +151,7 @@ impl Directory {
     }
 }
 
+/// The two tables of a message.
 fn rows<'a>(header: &MessageHeader, payload: &'a [u8]) -> Result<(&'a [VehicleMeta], &'a [SignalMeta]), BlockError> {
     let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
     let signals: &[SignalMeta] = match header.columns {
@@ -201,15 +203,15 @@ mod tests {
         (header, words)
     }
 
-    fn known(directory: &Directory) -> Vec<u32> {
+    fn known(directory: &RoadUserDirectory) -> Vec<u32> {
         directory.vehicles.keys().copied().collect()
     }
 
     #[test]
-    fn a_census_mends_what_was_missed_and_undoes_nothing_newer() {
+    fn a_census_fills_gaps_and_undoes_nothing_newer() {
         use MetaEvent::{Arrived, Departed};
-        let mut directory = Directory::default();
-        let change = |tick, vehicles: &[VehicleMeta], signals: &[SignalMeta], directory: &mut Directory| {
+        let mut directory = RoadUserDirectory::default();
+        let change = |tick, vehicles: &[VehicleMeta], signals: &[SignalMeta], directory: &mut RoadUserDirectory| {
             let (header, words) = message(0, tick, vehicles, signals);
             directory.apply_changes(&header, bytemuck::cast_slice(&words)).unwrap();
         };
@@ -225,14 +227,14 @@ mod tests {
             &[signal(0, b'G')],
             &mut directory,
         );
-        // Of tick 7: vehicle 0 has left unseen, 2 has come unseen, 1 had not left, 3 had not come.
+        // A census of tick 7: the departure of 0 and the arrival of 2 were missed; 1 had not left yet, and 3 had not come yet.
         let (header, words) = message(0, 7, &[vehicle(1, Departed), vehicle(2, Departed)], &[signal(0, b'y')]);
         directory.apply_census(&header, bytemuck::cast_slice(&words)).unwrap();
         assert_eq!(known(&directory), [2, 3]);
         assert_eq!(directory.signals[&0].fact.state[0], b'G');
         assert!(directory.take_signal_rows().is_some());
         assert!(directory.take_signal_rows().is_none());
-        // The next episode begins anew, and what is late of the old one does not count.
+        // The next episode empties the directory, and a late message of the old one changes nothing.
         let (header, words) = message(1, 9, &[vehicle(0, Departed)], &[]);
         directory.apply_census(&header, bytemuck::cast_slice(&words)).unwrap();
         change(8, &[vehicle(7, Departed)], &[], &mut directory);
@@ -246,6 +248,6 @@ mod tests {
             count: 1000,
             ..MessageHeader::default()
         };
-        assert!(Directory::default().apply_census(&header, &[0; 64]).is_err());
+        assert!(RoadUserDirectory::default().apply_census(&header, &[0; 64]).is_err());
     }
 }

@@ -1,4 +1,4 @@
-//! What the fan-out holds of each channel: the last few messages, in place in shared memory, and what it missed.
+//! The channels as the fan-out reads them: it holds the newest messages, in place in shared memory, and counts the ticks that it missed.
 
 use std::collections::VecDeque;
 
@@ -10,19 +10,19 @@ use ipc_schema::{
     session::{Session, SessionError},
 };
 
-/// Where ticks are counted: what came, what is missing.
+/// Counts the ticks of a channel: those that arrived and those that were missed.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Tally {
+pub struct TickTally {
     /// One more than the newest tick, 0 before the first.
     pub ticks: u64,
-    /// Ticks that never came since the first one: the queue was full.
+    /// Ticks since the first one that never arrived, because the queue was full.
     pub missed: u64,
-    /// True once the last tick of the run has come.
+    /// True once the last tick of the run has arrived.
     pub ended: bool,
 }
 
-impl Tally {
-    /// Counts a message. A tick sent again (by a restarted producer) is not missed twice.
+impl TickTally {
+    /// Counts a message. A tick that a restarted producer sends again is not counted as missed twice.
     pub fn count(&mut self, header: &MessageHeader) {
         if self.ticks > 0 {
             self.missed += header.tick.saturating_sub(self.ticks);
@@ -32,26 +32,26 @@ impl Tally {
     }
 }
 
-/// A channel as a spectator sees it: what is of another run or another version is refused and counted, and nobody dies of it.
+/// A channel as a watcher reads it: a message of another run or another version is dropped and counted, and is not fatal.
 #[derive(Debug)]
-pub struct Watch {
+pub struct ChannelWatcher {
     subscriber: Subscriber,
     wrong_versions: u64,
 }
 
-impl Watch {
-    /// Attends `channel`, as a consumer nobody waits for.
+impl ChannelWatcher {
+    /// Subscribes to `channel` as a watcher: its producer does not wait for it.
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn open(session: &mut Session, channel: Channel) -> Result<Self, SessionError> {
+    pub fn open(membership: &mut Session, channel: Channel) -> Result<Self, SessionError> {
         Ok(Self {
-            subscriber: session.subscriber(channel)?,
+            subscriber: membership.subscriber(channel)?,
             wrong_versions: 0,
         })
     }
 
-    /// The next message, if one waits.
+    /// The next message in the queue, if there is one.
     ///
     /// # Errors
     /// The port is broken.
@@ -73,49 +73,51 @@ impl Watch {
 
 /// One channel with a message for each tick.
 #[derive(Debug)]
-pub struct Feed {
+pub struct ChannelFeed {
     channel: Channel,
-    watch: Watch,
+    watcher: ChannelWatcher,
     held: VecDeque<Message>,
-    most: usize,
-    tally: Tally,
+    /// Most messages held.
+    max_held: usize,
+    tally: TickTally,
+    /// The newest tick that was published or passed over.
     published: Option<u64>,
 }
 
-impl Feed {
-    /// Attends `channel`, as a consumer nobody waits for.
+impl ChannelFeed {
+    /// Subscribes to `channel` as a watcher: its producer does not wait for it.
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn open(session: &mut Session, channel: Channel) -> Result<Self, SessionError> {
+    pub fn open(membership: &mut Session, channel: Channel) -> Result<Self, SessionError> {
         Ok(Self {
             channel,
-            watch: Watch::open(session, channel)?,
+            watcher: ChannelWatcher::open(membership, channel)?,
             held: VecDeque::new(),
-            most: most_held(&session.run, channel),
-            tally: Tally::default(),
+            max_held: max_held(&membership.run, channel),
+            tally: TickTally::default(),
             published: None,
         })
     }
 
-    /// Takes everything that waits, keeps the newest, and returns how many messages came.
+    /// Empties the queue and holds its newest messages; returns how many messages were queued.
     ///
     /// # Errors
     /// The port is broken.
     pub fn drain(&mut self) -> Result<usize, PortError> {
-        let mut came = 0;
-        while let Some(message) = self.watch.receive()? {
+        let mut received = 0;
+        while let Some(message) = self.watcher.receive()? {
             self.tally.count(message.header());
             self.held.push_back(message);
-            if self.held.len() > self.most {
+            if self.held.len() > self.max_held {
                 self.held.pop_front();
             }
-            came += 1;
-            if came > self.most {
+            received += 1;
+            if received > self.max_held {
                 break;
             }
         }
-        Ok(came)
+        Ok(received)
     }
 
     /// The channel.
@@ -124,19 +126,19 @@ impl Feed {
         self.channel
     }
 
-    /// What came and what is missing.
+    /// Ticks that arrived and ticks that were missed.
     #[must_use]
-    pub fn tally(&self) -> &Tally {
+    pub fn tally(&self) -> &TickTally {
         &self.tally
     }
 
     /// Messages that were refused.
     #[must_use]
     pub fn refused(&self) -> u64 {
-        self.watch.refused()
+        self.watcher.refused()
     }
 
-    /// Ticks that are held and have not been published, newest first.
+    /// Ticks that are held and not published yet, newest first.
     pub fn fresh_ticks(&self) -> impl Iterator<Item = u64> {
         let published = self.published;
         self.held
@@ -146,7 +148,7 @@ impl Feed {
             .filter(move |tick| published.is_none_or(|p| *tick > p))
     }
 
-    /// The message of `tick`, if it is held and has not been published.
+    /// The message of `tick`, if it is held and not published yet.
     #[must_use]
     pub fn fresh(&self, tick: u64) -> Option<&Message> {
         if self.published.is_some_and(|p| tick <= p) {
@@ -155,21 +157,21 @@ impl Feed {
         self.held.iter().find(|message| message.header().tick == tick)
     }
 
-    /// `tick` is out: it and everything older goes back to shared memory.
+    /// Marks `tick` as published, and returns it and everything older to shared memory.
     pub fn release(&mut self, tick: u64) {
         self.published = Some(tick);
         self.held.retain(|message| message.header().tick > tick);
     }
 }
 
-/// A subscriber may hold as many messages as its queue; one is needed to look at the next.
-fn most_held(run: &RunFile, channel: Channel) -> usize {
+/// A subscriber may hold as many messages as its queue; one of them is needed to read the next.
+fn max_held(run: &RunFile, channel: Channel) -> usize {
     channel.queue_length(run).saturating_sub(1).max(1)
 }
 
-/// The newest tick that all of `feeds` hold, of those that hold anything.
+/// The newest tick that all of `feeds` hold, each given as the ticks that it holds, newest first.
 ///
-/// Prediction, observation and world of one tick belong together; each arrives up to a window after the one before.
+/// World, observation and prediction of one tick belong together; each arrives up to a window after the one before it.
 #[must_use]
 pub fn newest_common(feeds: &[Vec<u64>]) -> Option<u64> {
     let (first, rest) = feeds.split_first()?;
@@ -195,7 +197,7 @@ mod tests {
 
     #[test]
     fn gaps_are_counted_once_and_joining_late_is_none() {
-        let mut tally = Tally::default();
+        let mut tally = TickTally::default();
         for tick in [5, 6, 9, 10, 9, 10, 11] {
             tally.count(&header(tick, 0));
         }
@@ -205,14 +207,14 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_tick_that_everybody_has_wins() {
+    fn the_newest_tick_that_all_feeds_hold_wins() {
         assert_eq!(newest_common(&[vec![9, 8, 7], vec![8, 7, 6], vec![7, 6]]), Some(7));
         assert_eq!(newest_common(&[vec![9, 8], vec![7]]), None);
         assert_eq!(newest_common(&[]), None);
     }
 
     proptest! {
-        /// A pipeline whose stages lag by less than what is held always has a tick in common.
+        /// Two feeds always have a tick in common if one lags by fewer ticks than are held.
         #[test]
         fn a_lag_below_the_held_length_always_meets(held in 2_u64..20, lag in 0_u64..20, newest in 100_u64..200) {
             prop_assume!(lag < held);

@@ -1,5 +1,4 @@
-//! Frames: a message as it stands in shared memory, header first, then the payload, little endian and without padding
-//! between the two. A decoder needs the layouts of `ipc-schema/layout.json` and nothing else.
+//! Frames: a message as it is in shared memory, first the header, then the payload, little endian and without padding between the two. A decoder needs the layouts of `ipc-schema/layout.json` and nothing else.
 
 use bytemuck::{bytes_of, pod_read_unaligned};
 use ipc_schema::{
@@ -13,13 +12,13 @@ use ipc_schema::{
     world::{VehicleState, WorldLayout},
 };
 
-/// Bytes of the header in front of every payload.
+/// Length of the header of a frame, bytes.
 pub const HEADER_BYTES: usize = size_of::<MessageHeader>();
 
-/// Longest frame, bytes. zenoh queues 16 batches of 64 KiB for each priority and drops a message that does not fit: of
-/// frames of 1.05 MB a third to a half were lost on loopback, of 0.52 MB none.
+/// Longest frame, bytes. zenoh queues 16 batches of 64 KiB for each priority and drops a message that does not fit. On loopback, a third
+/// to a half of frames of 1.05 MB were lost, and none of 0.52 MB.
 pub const MAX_FRAME_BYTES: usize = 900_000;
-/// Longest frame of one scan, bytes: two fit the queue.
+/// Longest frame of one scan, bytes: two fit into the queue.
 pub const MAX_SCAN_BYTES: usize = 480_000;
 
 /// A message cannot be framed.
@@ -28,53 +27,53 @@ pub enum FrameError {
     /// The payload does not hold what its header promises.
     #[error(transparent)]
     Block(#[from] BlockError),
-    /// Longer than [`MAX_FRAME_BYTES`], and rows belong together.
-    #[error("a frame of {0} bytes is over the {MAX_FRAME_BYTES} that a viewer's queue holds")]
+    /// Longer than [`MAX_FRAME_BYTES`], and no row may be left out.
+    #[error("a frame of {0} bytes is longer than the {MAX_FRAME_BYTES} bytes that a viewer's queue holds")]
     TooLong(usize),
 }
 
-/// A message framed.
+/// A message as bytes for the network.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Frame {
+pub struct EncodedFrame {
     /// Header and payload.
     pub bytes: Vec<u8>,
-    /// Rows left out so that a viewer's queue holds it.
+    /// Rows left out so that the frame fits into a viewer's queue.
     pub left_out: usize,
 }
 
-/// Frames a message of `channel`.
+/// Encodes a message of `channel` as a frame.
 ///
-/// Of `world` the sub-steps stay behind (`columns` = 0) and, of more road users or points than fit, all but every second (third, …).
-/// Observations and predictions are cut to their first slots.
+/// A frame of `world` has no sub-steps (`columns` = 0). If there are more road users or points than fit, it has every second (third, …)
+/// of them. Observations and predictions are cut to their first slots.
 ///
 /// # Errors
-/// The payload is too short for its header, or the frame too long.
-pub fn encode(channel: Channel, header: &MessageHeader, payload: &[u8]) -> Result<Frame, FrameError> {
+/// The payload is shorter than its header promises, or the frame is too long.
+pub fn encode(channel: Channel, header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
     let columns = header.columns as usize;
     match channel {
-        Channel::World => world(header, payload),
+        Channel::World => encode_world(header, payload),
         Channel::Observation => {
             let samples = usize::try_from(header.sequence).unwrap_or(usize::MAX);
-            plausible(header, columns.max(samples.saturating_mul(IMU_COLUMNS)), payload)?;
-            slots(header, payload, |header| {
+            check_plausible(header, columns.max(samples.saturating_mul(IMU_COLUMNS)), payload)?;
+            encode_slots(header, payload, |header| {
                 let layout = ObservationLayout::of(header);
                 (layout.named().map(|(_, section)| section).to_vec(), layout.len)
             })
         }
         Channel::Prediction => {
-            plausible(header, columns, payload)?;
-            slots(header, payload, |header| {
+            check_plausible(header, columns, payload)?;
+            encode_slots(header, payload, |header| {
                 let layout = PredictionLayout::of(header);
                 (vec![layout.prediction, layout.estimate_m], layout.len)
             })
         }
-        Channel::Pointcloud => scan(header, payload),
-        _ => collisions(header, payload),
+        Channel::Pointcloud => encode_scan(header, payload),
+        _ => encode_collisions(header, payload),
     }
 }
 
-/// Refuses sizes that no payload of this length holds, before anything is computed from them.
-fn plausible(header: &MessageHeader, columns: usize, payload: &[u8]) -> Result<(), BlockError> {
+/// Refuses sizes that a payload of this length cannot hold, before anything is computed from them.
+fn check_plausible(header: &MessageHeader, columns: usize, payload: &[u8]) -> Result<(), BlockError> {
     let len = (header.count as usize)
         .saturating_mul(columns.max(1))
         .saturating_mul(size_of::<f32>());
@@ -89,6 +88,7 @@ fn plausible(header: &MessageHeader, columns: usize, payload: &[u8]) -> Result<(
     })
 }
 
+/// The header with another number of rows.
 fn with_count(header: &MessageHeader, count: usize) -> MessageHeader {
     MessageHeader {
         count: u32::try_from(count).unwrap_or(u32::MAX),
@@ -96,61 +96,64 @@ fn with_count(header: &MessageHeader, count: usize) -> MessageHeader {
     }
 }
 
-/// A block whose sections have a row for each slot, cut to the slots that fit.
-fn slots(
+/// Encodes a block whose sections have a row for each slot, cut to the slots that fit.
+fn encode_slots(
     header: &MessageHeader,
     payload: &[u8],
-    parts: impl Fn(&MessageHeader) -> (Vec<Section>, usize),
-) -> Result<Frame, FrameError> {
+    layout_of: impl Fn(&MessageHeader) -> (Vec<Section>, usize),
+) -> Result<EncodedFrame, FrameError> {
     let rows = header.count as usize;
-    let (sections, len) = parts(header);
+    let (sections, len) = layout_of(header);
     if HEADER_BYTES + len <= MAX_FRAME_BYTES {
         let bytes: &[u8] = view(payload, Section { offset: 0, len })?;
-        return Ok(Frame {
+        return Ok(EncodedFrame {
             bytes: [bytes_of(header), bytes].concat(),
             left_out: 0,
         });
     }
-    // Sections are padded to a border each: room for that is left.
+    // Each section is padded to its alignment: leave room for that.
     let room = MAX_FRAME_BYTES.saturating_sub(HEADER_BYTES + 64 * sections.len());
     let kept = rows * room / len;
     let header = with_count(header, kept);
-    let (shorter, len) = parts(&header);
+    let (shorter, len) = layout_of(&header);
     let mut bytes = bytes_of(&header).to_vec();
     bytes.resize(HEADER_BYTES + len, 0);
     for (from, to) in sections.into_iter().zip(shorter) {
-        let part = Section { len: to.len, ..from };
+        let kept_rows = Section { len: to.len, ..from };
         let start = HEADER_BYTES + to.offset;
-        bytes[start..start + to.len].copy_from_slice(view(payload, part)?);
+        bytes[start..start + to.len].copy_from_slice(view(payload, kept_rows)?);
     }
     if bytes.len() > MAX_FRAME_BYTES {
         return Err(FrameError::TooLong(bytes.len()));
     }
-    Ok(Frame {
+    Ok(EncodedFrame {
         bytes,
         left_out: rows - kept,
     })
 }
 
-fn collisions(header: &MessageHeader, payload: &[u8]) -> Result<Frame, FrameError> {
+/// Encodes contacts, which are all kept.
+fn encode_collisions(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
     let len = (header.count as usize).saturating_mul(size_of::<Collision>());
     let bytes: &[u8] = view(payload, Section { offset: 0, len })?;
     if HEADER_BYTES + len > MAX_FRAME_BYTES {
         return Err(FrameError::TooLong(HEADER_BYTES + len));
     }
-    Ok(Frame {
+    Ok(EncodedFrame {
         bytes: [bytes_of(header), bytes].concat(),
         left_out: 0,
     })
 }
 
-fn world(header: &MessageHeader, payload: &[u8]) -> Result<Frame, FrameError> {
+/// Encodes the states of road users, without sub-steps.
+fn encode_world(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
     let states: &[VehicleState] = view(payload, WorldLayout::new(header.count as usize, 0).states)?;
     let header = MessageHeader { columns: 0, ..*header };
     Ok(thinned(&header, &[], states, MAX_FRAME_BYTES))
 }
 
-fn scan(header: &MessageHeader, payload: &[u8]) -> Result<Frame, FrameError> {
+/// Encodes a scan: where the sensor was, and the points that fit.
+fn encode_scan(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
     let layout = PointcloudLayout::new(header.count as usize);
     let scan: &[Scan] = view(payload, layout.scan)?;
     let points: &[LidarPoint] = view(payload, layout.points)?;
@@ -159,25 +162,25 @@ fn scan(header: &MessageHeader, payload: &[u8]) -> Result<Frame, FrameError> {
     Ok(thinned(header, &head, points, MAX_SCAN_BYTES))
 }
 
-/// Header, `head`, and as many of `rows` as `most_bytes` hold, evenly.
-fn thinned<T: bytemuck::Pod>(header: &MessageHeader, head: &[u8], rows: &[T], most_bytes: usize) -> Frame {
-    let most = (most_bytes - HEADER_BYTES - head.len()) / size_of::<T>();
-    let kept = rows.iter().step_by(rows.len().div_ceil(most).max(1));
+/// Header, `head`, and every row, or every second (third, …) so that the frame has at most `max_bytes`.
+fn thinned<T: bytemuck::Pod>(header: &MessageHeader, head: &[u8], rows: &[T], max_bytes: usize) -> EncodedFrame {
+    let max_rows = (max_bytes - HEADER_BYTES - head.len()) / size_of::<T>();
+    let kept = rows.iter().step_by(rows.len().div_ceil(max_rows).max(1));
     let count = kept.len();
     let mut bytes = Vec::with_capacity(HEADER_BYTES + head.len() + count * size_of::<T>());
     bytes.extend_from_slice(bytes_of(&with_count(header, count)));
     bytes.extend_from_slice(head);
     kept.for_each(|row| bytes.extend_from_slice(bytes_of(row)));
-    Frame {
+    EncodedFrame {
         bytes,
         left_out: rows.len() - count,
     }
 }
 
-/// A whole table as one frame, for those who ask; and its next part for those who listen, from row `place` on, which it moves.
-/// `rows` are bytes, `row_bytes` each.
+/// A table as two frames: its next part from row `next_row` on, for subscribers, and the whole, for queries. Moves `next_row` to the end
+/// of the part. `rows` are bytes, `row_bytes` for each row.
 #[must_use]
-pub fn table(header: &MessageHeader, rows: &[u8], row_bytes: usize, place: &mut usize) -> (Vec<u8>, Vec<u8>) {
+pub fn table(header: &MessageHeader, rows: &[u8], row_bytes: usize, next_row: &mut usize) -> (Vec<u8>, Vec<u8>) {
     let count = rows.len() / row_bytes;
     let frame = |rows: &[u8]| {
         let header = MessageHeader {
@@ -187,14 +190,14 @@ pub fn table(header: &MessageHeader, rows: &[u8], row_bytes: usize, place: &mut 
         };
         [bytes_of(&header), rows].concat()
     };
-    let most = (MAX_FRAME_BYTES - HEADER_BYTES) / row_bytes;
-    let from = if *place < count { *place } else { 0 };
-    let to = count.min(from + most);
-    *place = to;
+    let max_rows = (MAX_FRAME_BYTES - HEADER_BYTES) / row_bytes;
+    let from = if *next_row < count { *next_row } else { 0 };
+    let to = count.min(from + max_rows);
+    *next_row = to;
     (frame(&rows[from * row_bytes..to * row_bytes]), frame(rows))
 }
 
-/// Takes a frame apart; `None` if it is shorter than a header.
+/// Splits a frame into header and payload; `None` if it is shorter than a header.
 #[must_use]
 pub fn decode(frame: &[u8]) -> Option<(MessageHeader, &[u8])> {
     let (header, payload) = frame.split_at_checked(HEADER_BYTES)?;

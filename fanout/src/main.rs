@@ -2,14 +2,14 @@
 
 use std::process::ExitCode;
 
-use fanout::access::{HEARD, RefusalLayer};
+use fanout::network::access::{REFUSAL_FILTER, RefusalLayer};
 use ipc_schema::{process::Process, session};
 
-/// How far it stands back behind the run, on a scale of 19: whoever keeps to the clock gets a core at once.
+/// Niceness of the fan-out, of at most 19: a process that the run waits for gets a core before it.
 const NICENESS: i32 = 10;
 
 fn main() -> ExitCode {
-    // Threads inherit it, so it comes first. A machine that forbids even this loses nothing but the courtesy.
+    // Threads inherit the niceness, so it is set first. Where the system forbids it, the fan-out runs without it.
     let _ = rustix::process::setpriority_process(None, NICENESS);
-    session::main_heard(Process::Fanout, RefusalLayer, HEARD, fanout::run)
+    session::main_heard(Process::Fanout, RefusalLayer, REFUSAL_FILTER, fanout::run)
 }

@@ -1,4 +1,4 @@
-//! What a viewer reads off a run: how fast it goes, who is there, whose sensors deliver, and how far estimates are from the truth.
+//! Figures of the `status` topic: ticks per second, road users by kind, sensors that deliver, and errors of position.
 
 use std::time::Duration;
 
@@ -14,22 +14,23 @@ use ipc_schema::{
 };
 use serde::Serialize;
 
-/// Time over which the rate is taken.
-const RATE_OVER: Duration = Duration::from_secs(2);
+/// Time over which the rate is measured.
+const RATE_PERIOD: Duration = Duration::from_secs(2);
 
-/// Ticks per wall second, lately.
+/// Measures ticks per wall second, over the last two seconds.
 #[derive(Debug, Clone, Default)]
-pub struct Rate {
+pub struct TickRate {
+    /// When the current period began, and the ticks by then.
     begun: Option<(Duration, u64)>,
     per_s: f64,
 }
 
-impl Rate {
-    /// `ticks` have come by `now`.
-    pub fn note(&mut self, now: Duration, ticks: u64) {
+impl TickRate {
+    /// Records that `ticks` have arrived by `now`.
+    pub fn update(&mut self, now: Duration, ticks: u64) {
         let (since, then) = *self.begun.get_or_insert((now, ticks));
         let elapsed = now.saturating_sub(since);
-        if elapsed >= RATE_OVER || (self.per_s == 0.0 && elapsed >= RATE_OVER / 4) {
+        if elapsed >= RATE_PERIOD || (self.per_s == 0.0 && elapsed >= RATE_PERIOD / 4) {
             self.per_s = ticks.saturating_sub(then) as f64 / elapsed.as_secs_f64();
             self.begun = Some((now, ticks));
         }
@@ -42,9 +43,9 @@ impl Rate {
     }
 }
 
-/// Road users by kind.
+/// Numbers of road users by kind.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-pub struct RoadUsers {
+pub struct RoadUserCounts {
     /// Connected vehicles.
     pub cav: u32,
     /// Vehicles without sensors.
@@ -55,8 +56,8 @@ pub struct RoadUsers {
     pub hero: u32,
 }
 
-impl RoadUsers {
-    /// Of a `world` message; `None` if it does not hold what its header promises.
+impl RoadUserCounts {
+    /// Counts the road users of a `world` message; `None` if its payload is shorter than its header promises.
     #[must_use]
     pub fn of(header: &MessageHeader, payload: &[u8]) -> Option<Self> {
         let states: &[VehicleState] = view(payload, WorldLayout::new(header.count as usize, 0).states).ok()?;
@@ -73,9 +74,9 @@ impl RoadUsers {
     }
 }
 
-/// Vehicles whose sensor delivers.
+/// Number of vehicles on which each sensor delivers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-pub struct Delivering {
+pub struct DeliveringSensors {
     /// GNSS.
     pub gnss: u32,
     /// IMU.
@@ -88,18 +89,29 @@ pub struct Delivering {
 
 /// Mean distances from the truth over the valid rows of one tick, metres.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-pub struct Errors {
-    /// Of the policy.
+pub struct PositionErrors {
+    /// Of the policy's predictions.
     pub policy: Option<f64>,
-    /// Of the newest fixes.
+    /// Of the newest GNSS fixes.
     pub raw_gnss: Option<f64>,
-    /// Of the filter.
+    /// Of the extended Kalman filter's estimates.
     pub ekf: Option<f64>,
 }
 
-/// Sensors and truth of an `observation` message.
+/// Figures of the newest set of messages that was published.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct TickFigures {
+    /// Road users by kind.
+    pub road_users: RoadUserCounts,
+    /// Vehicles on which each sensor delivers.
+    pub sensors: DeliveringSensors,
+    /// Mean errors of position, metres.
+    pub errors_m: PositionErrors,
+}
+
+/// The sections of an `observation` message from which figures are taken.
 #[derive(Debug, Clone, Copy)]
-pub struct Observed<'a> {
+pub struct ObservationView<'a> {
     truth: &'a [[f32; TRUTH_COLUMNS]],
     gnss_m: &'a [[f32; GNSS_COLUMNS]],
     vehicle: &'a [u32],
@@ -107,8 +119,8 @@ pub struct Observed<'a> {
     sensors: &'a [u32],
 }
 
-impl<'a> Observed<'a> {
-    /// `None` if the message does not hold what its header promises.
+impl<'a> ObservationView<'a> {
+    /// Views a message; `None` if its payload is shorter than its header promises.
     #[must_use]
     pub fn of(header: &MessageHeader, payload: &'a [u8]) -> Option<Self> {
         let layout = ObservationLayout::of(header);
@@ -121,15 +133,15 @@ impl<'a> Observed<'a> {
         })
     }
 
-    /// Whose sensors deliver.
+    /// Number of vehicles on which each sensor delivers.
     #[must_use]
-    pub fn delivering(&self) -> Delivering {
+    pub fn delivering(&self) -> DeliveringSensors {
         let held = self
             .vehicle
             .iter()
             .zip(self.sensors)
             .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT);
-        held.fold(Delivering::default(), |count, (_, sensors)| Delivering {
+        held.fold(DeliveringSensors::default(), |count, (_, sensors)| DeliveringSensors {
             gnss: count.gnss + u32::from(sensors & GNSS != 0),
             imu: count.imu + u32::from(sensors & IMU != 0),
             speed_steering: count.speed_steering + u32::from(sensors & SPEED_STEERING != 0),
@@ -137,9 +149,9 @@ impl<'a> Observed<'a> {
         })
     }
 
-    /// How far fixes, and what `prediction` holds if it holds positions, are from the truth.
+    /// Mean distances from the truth of the GNSS fixes, and of the positions of `prediction` if it holds positions.
     #[must_use]
-    pub fn errors(&self, prediction: Option<(&MessageHeader, &[u8])>) -> Errors {
+    pub fn position_errors(&self, prediction: Option<(&MessageHeader, &[u8])>) -> PositionErrors {
         let xy = |rows: &'a [[f32; GNSS_COLUMNS]]| rows.iter().map(|[x, y, _]| [*x, *y]);
         let (policy, ekf) =
             prediction
@@ -149,13 +161,14 @@ impl<'a> Observed<'a> {
                     let rows = |section| view::<[f32; 2]>(payload, section).ok().filter(|rows| !rows.is_empty());
                     (rows(layout.prediction), rows(layout.estimate_m))
                 });
-        Errors {
+        PositionErrors {
             policy: policy.and_then(|rows| self.mean_m(rows.iter().copied())),
             raw_gnss: self.mean_m(xy(self.gnss_m)),
             ekf: ekf.and_then(|rows| self.mean_m(rows.iter().copied())),
         }
     }
 
+    /// Mean distance of `rows` from the truth, over valid rows; `None` without any.
     fn mean_m(&self, rows: impl Iterator<Item = [f32; 2]>) -> Option<f64> {
         let held = self.vehicle.iter().zip(self.flags);
         let (mut sum, mut count) = (0.0, 0_u32);
@@ -196,40 +209,40 @@ mod tests {
             .copy_from_slice(&[0, 1, EMPTY_SLOT]);
         view_mut::<u32>(bytes, layout.flags).unwrap().fill(VALID);
         view_mut::<u32>(bytes, layout.sensors).unwrap().fill(GNSS | LIDAR);
-        let observed = Observed::of(&header, bytemuck::cast_slice(&words)).unwrap();
-        let told = MessageHeader {
+        let observation = ObservationView::of(&header, bytemuck::cast_slice(&words)).unwrap();
+        let predicted = MessageHeader {
             columns: 2,
             flags: ESTIMATES,
             ..header
         };
-        let layout = PredictionLayout::of(&told);
+        let layout = PredictionLayout::of(&predicted);
         let mut words = vec![0_u64; layout.len / 8];
         let bytes: &mut [u8] = cast_slice_mut(&mut words);
         view_mut::<[f32; 2]>(bytes, layout.prediction).unwrap().fill([2.0, 0.0]);
         view_mut::<[f32; 2]>(bytes, layout.estimate_m)
             .unwrap()
             .copy_from_slice(&[[f32::NAN; 2], [0.0, 0.5], [0.0; 2]]);
-        let errors = observed.errors(Some((&told, bytemuck::cast_slice(&words))));
+        let errors = observation.position_errors(Some((&predicted, bytemuck::cast_slice(&words))));
         assert_eq!(
             (errors.policy, errors.raw_gnss, errors.ekf),
             (Some(2.0), Some(3.0), Some(0.5))
         );
-        assert_eq!(observed.errors(None).policy, None);
+        assert_eq!(observation.position_errors(None).policy, None);
         assert_eq!(
-            observed.delivering(),
-            Delivering {
+            observation.delivering(),
+            DeliveringSensors {
                 gnss: 2,
                 lidar: 2,
-                ..Delivering::default()
+                ..DeliveringSensors::default()
             }
         );
-        assert!(Observed::of(&header, &[0; 64]).is_none());
+        assert!(ObservationView::of(&header, &[0; 64]).is_none());
     }
 
     #[test]
-    fn the_rate_follows_what_comes() {
-        let mut rate = Rate::default();
-        (0..=100_u64).for_each(|i| rate.note(Duration::from_millis(100 * i), 5 * i));
+    fn the_rate_follows_the_ticks() {
+        let mut rate = TickRate::default();
+        (0..=100_u64).for_each(|i| rate.update(Duration::from_millis(100 * i), 5 * i));
         assert!((rate.per_s() - 50.0).abs() < 1e-9);
     }
 }

@@ -1,4 +1,4 @@
-//! What a reader must refuse (docs/fanout.md): a sample that is not what it says it is.
+//! The checks of a reader (docs/fanout.md): refuses a sample that does not hold what its header or its key says.
 
 use ipc_schema::{
     SCHEMA_VERSION,
@@ -13,68 +13,70 @@ use ipc_schema::{
 
 use crate::frame;
 
-/// Why a sample is of no use.
+/// Why a sample is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Refusal {
-    /// Shorter than a header, or than its header promises.
-    #[error("{actual} bytes, its header promises {promised}")]
+pub enum SampleRefusal {
+    /// Shorter than a header, or shorter than its header promises.
+    #[error("{actual} bytes, but {promised} are promised")]
     Short {
-        /// Bytes there.
+        /// Length of the sample, bytes.
         actual: usize,
-        /// Bytes promised.
+        /// Length that it must have, bytes.
         promised: usize,
     },
     /// Of another version of the schema.
-    #[error("schema version {0}, this reader speaks {SCHEMA_VERSION}")]
+    #[error("schema version {0}, but this reader knows {SCHEMA_VERSION}")]
     Version(u64),
     /// Of another run.
-    #[error("of run {0:#018x}")]
+    #[error("a sample of another run, {0:#018x}")]
     Run(u64),
-    /// No JSON that tells its schema version.
-    #[error("no JSON of ours")]
+    /// JSON that does not parse, or does not name its schema version.
+    #[error("not JSON with a schema version")]
     Json,
-    /// A key that is not of the table.
-    #[error("an unknown key")]
+    /// A key of no known topic.
+    #[error("a key of no known topic")]
     Unknown,
 }
 
-/// Checks a sample of `topic`, the part of its key after run and environment. The header, if it is a frame.
+/// Checks a sample of `topic`, which is the part of its key after run and environment. Returns the header of a frame, and `None` for JSON.
 ///
 /// # Errors
-/// It is to be refused.
-pub fn check(topic: &str, bytes: &[u8], run_id: Option<u64>) -> Result<Option<MessageHeader>, Refusal> {
+/// The sample must be refused.
+pub fn check(topic: &str, bytes: &[u8], run_id: Option<u64>) -> Result<Option<MessageHeader>, SampleRefusal> {
     if matches!(topic, "map" | "status") {
-        return json(bytes).map(|()| None);
+        return check_json(bytes).map(|()| None);
     }
-    let short = |promised| Refusal::Short {
+    let short = |promised| SampleRefusal::Short {
         actual: bytes.len(),
         promised,
     };
     let (header, payload) = frame::decode(bytes).ok_or_else(|| short(frame::HEADER_BYTES))?;
     if header.schema_version != SCHEMA_VERSION {
-        return Err(Refusal::Version(header.schema_version.into()));
+        return Err(SampleRefusal::Version(header.schema_version.into()));
     }
     if run_id.is_some_and(|run_id| run_id != header.run_id) {
-        return Err(Refusal::Run(header.run_id));
+        return Err(SampleRefusal::Run(header.run_id));
     }
-    let promised = promised(topic, &header, payload.len()).ok_or(Refusal::Unknown)?;
+    let promised = promised(topic, &header, payload.len()).ok_or(SampleRefusal::Unknown)?;
     if payload.len() < promised {
         return Err(short(promised.saturating_add(frame::HEADER_BYTES)));
     }
     Ok(Some(header))
 }
 
-fn json(bytes: &[u8]) -> Result<(), Refusal> {
-    let value: serde_json::Value = serde_json::from_slice(bytes).map_err(|_| Refusal::Json)?;
+/// Checks that JSON names the schema version of this reader.
+fn check_json(bytes: &[u8]) -> Result<(), SampleRefusal> {
+    let value: serde_json::Value = serde_json::from_slice(bytes).map_err(|_| SampleRefusal::Json)?;
     match value["schema_version"].as_u64() {
         Some(version) if version == u64::from(SCHEMA_VERSION) => Ok(()),
-        Some(version) => Err(Refusal::Version(version)),
-        None => Err(Refusal::Json),
+        Some(version) => Err(SampleRefusal::Version(version)),
+        None => Err(SampleRefusal::Json),
     }
 }
 
-/// Bytes of payload that a header promises; more than `there` without computing further if it promises too much.
-fn promised(topic: &str, header: &MessageHeader, there: usize) -> Option<usize> {
+/// Length of the payload that a header promises, bytes. If that is more than `actual`, it may be any number above `actual`: sizes are not
+/// computed from implausible headers.
+fn promised(topic: &str, header: &MessageHeader, actual: usize) -> Option<usize> {
     let (rows, columns) = (header.count as usize, header.columns as usize);
     let rows_of = |bytes: usize| rows.saturating_mul(bytes);
     let least = |columns: usize| rows.saturating_mul(columns).saturating_mul(size_of::<f32>());
@@ -84,13 +86,13 @@ fn promised(topic: &str, header: &MessageHeader, there: usize) -> Option<usize> 
         "signals" => rows_of(size_of::<SignalMeta>()),
         "event" => rows_of(size_of::<Collision>()),
         "prediction" => match least(columns.max(1)) {
-            bytes if bytes > there => bytes,
+            bytes if bytes > actual => bytes,
             _ => PredictionLayout::of(header).len,
         },
         "observation" => {
             let samples = usize::try_from(header.sequence).unwrap_or(usize::MAX);
             match least(columns.max(samples.saturating_mul(IMU_COLUMNS)).max(1)) {
-                bytes if bytes > there => bytes,
+                bytes if bytes > actual => bytes,
                 _ => ObservationLayout::of(header).len,
             }
         }
@@ -140,29 +142,29 @@ mod tests {
         assert_eq!(check("world", &whole, Some(7)).unwrap().unwrap().count, 2);
         assert!(matches!(
             check("world", &whole[..whole.len() - 1], None),
-            Err(Refusal::Short { .. })
+            Err(SampleRefusal::Short { .. })
         ));
         assert!(matches!(
             check("world", &whole[..71], None),
-            Err(Refusal::Short { promised: 72, .. })
+            Err(SampleRefusal::Short { promised: 72, .. })
         ));
-        assert_eq!(check("world", &whole, Some(8)), Err(Refusal::Run(7)));
+        assert_eq!(check("world", &whole, Some(8)), Err(SampleRefusal::Run(7)));
         assert_eq!(
             check("world", &frame(SCHEMA_VERSION + 1, 0, 0), None),
-            Err(Refusal::Version(u64::from(SCHEMA_VERSION) + 1))
+            Err(SampleRefusal::Version(u64::from(SCHEMA_VERSION) + 1))
         );
         assert_eq!(
             check("status", b"{\"schema_version\": 1}", None),
-            Err(Refusal::Version(1))
+            Err(SampleRefusal::Version(1))
         );
-        assert_eq!(check("status", b"{", None), Err(Refusal::Json));
-        assert_eq!(check("other", &whole, None), Err(Refusal::Unknown));
+        assert_eq!(check("status", b"{", None), Err(SampleRefusal::Json));
+        assert_eq!(check("other", &whole, None), Err(SampleRefusal::Unknown));
     }
 
     proptest! {
-        /// Nothing that comes over the network makes a reader panic or compute with what is not there.
+        /// No bytes from the network make a reader panic or read beyond them.
         #[test]
-        fn nonsense_is_refused_and_no_panic(mut bytes in prop::collection::vec(any::<u8>(), 0..300), ours in any::<bool>()) {
+        fn random_bytes_are_refused_without_a_panic(mut bytes in prop::collection::vec(any::<u8>(), 0..300), ours in any::<bool>()) {
             if ours && bytes.len() >= 4 {
                 bytes[..4].copy_from_slice(&SCHEMA_VERSION.to_le_bytes());
             }

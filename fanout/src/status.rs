@@ -1,4 +1,4 @@
-//! What is told in JSON: the map once, the state of the run twice a second.
+//! The JSON topics: `map`, which is constant over a run, and `status`, which is published twice a second.
 
 use std::collections::BTreeMap;
 
@@ -13,13 +13,13 @@ use serde_json::{Value, json};
 
 use crate::{
     frame::FrameError,
-    keys::Topic,
-    meter::{Delivering, Errors, RoadUsers},
+    meter::{DeliveringSensors, PositionErrors, RoadUserCounts},
+    network::keys::Topic,
 };
 
-/// What a viewer needs to know once.
+/// The `map` topic, without the scene.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-struct Map<'a> {
+struct MapDocument<'a> {
     schema_version: u32,
     run: &'a str,
     run_id: String,
@@ -34,20 +34,20 @@ struct Map<'a> {
     lidar: Value,
 }
 
-/// The run's identity as text: JSON has no integers of 64 bits.
+/// The run's identity as text, because JSON has no integers of 64 bits.
 #[must_use]
-pub fn run_id(run: &RunFile) -> String {
+pub fn run_id_text(run: &RunFile) -> String {
     format!("{:#018x}", run.run_id)
 }
 
-/// What the run file says, and the scene that `sim-core` has written down, as JSON.
+/// The `map` topic: facts from the run file, and the scene that `sim-core` has written, as JSON.
 #[must_use]
-pub fn map(run: &RunFile, env: u32) -> String {
+pub fn map_json(run: &RunFile, env: u32) -> String {
     let (fanout, lidar) = (&run.config.fanout, &run.config.lidar);
-    let map = Map {
+    let map = MapDocument {
         schema_version: run.schema_version,
         run: &run.name,
-        run_id: run_id(run),
+        run_id: run_id_text(run),
         env,
         mode: run.mode,
         map: &run.map,
@@ -68,24 +68,25 @@ pub fn map(run: &RunFile, env: u32) -> String {
         lidar: json!({ "vehicles": lidar.vehicles, "range_m": lidar.range_m, "mode": lidar.mode }),
     };
     let text = serde_json::to_string(&map).unwrap_or_default();
-    // A large net's scene has many megabytes: it is passed on as it stands.
-    let scene = scene(run).unwrap_or_else(|| "null".into());
+    // The scene of a large net has many megabytes, so its text is inserted without parsing it into values.
+    let scene = scene_json(run).unwrap_or_else(|| "null".into());
     format!("{},\"scene\":{scene}}}", text.strip_suffix('}').unwrap_or(&text))
 }
 
-fn scene(run: &RunFile) -> Option<String> {
+/// The scene that `sim-core` has written, if it is there and is JSON.
+fn scene_json(run: &RunFile) -> Option<String> {
     let path = run.chart_path();
     let text = std::fs::read_to_string(&path).ok()?;
     match serde_json::from_str::<serde::de::IgnoredAny>(&text) {
         Ok(_) => Some(text),
         Err(error) => {
-            tracing::warn!(%error, path = %path.display(), "viewers see no scene");
+            tracing::warn!(%error, path = %path.display(), "the scene is not JSON: viewers get the map without it");
             None
         }
     }
 }
 
-/// How one process fares.
+/// State of one process.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ProcessStatus {
     /// Its name.
@@ -94,15 +95,15 @@ pub struct ProcessStatus {
     pub state: &'static str,
     /// Ticks produced or consumed.
     pub ticks: u64,
-    /// Ticks behind SUMO.
+    /// Ticks that it is behind SUMO.
     pub lag: u64,
-    /// Episode at work.
+    /// Current episode.
     pub episode: u64,
     /// Road users in its newest tick.
     pub road_users: u32,
     /// Connected vehicles in its newest tick.
     pub cavs: u32,
-    /// Messages dropped.
+    /// Messages dropped because a watcher's queue was full.
     pub drops: u64,
     /// Vehicle-steps so far.
     pub vehicle_steps: u64,
@@ -111,14 +112,14 @@ pub struct ProcessStatus {
 }
 
 impl ProcessStatus {
-    /// What `process` wrote on its board, when SUMO stands at `newest` ticks.
+    /// The state that `process` wrote onto its board, when SUMO has made `sumo_ticks` ticks.
     #[must_use]
-    pub fn of(process: Process, health: &Health, newest: u64) -> Self {
+    pub fn of(process: Process, health: &Health, sumo_ticks: u64) -> Self {
         Self {
             name: process.name(),
             state: State::from_u32(health.state).name(),
             ticks: health.ticks,
-            lag: newest.saturating_sub(health.ticks),
+            lag: sumo_ticks.saturating_sub(health.ticks),
             episode: health.episode,
             road_users: health.road_users,
             cavs: health.cavs,
@@ -129,22 +130,22 @@ impl ProcessStatus {
     }
 }
 
-/// How learning goes, from the trainer's board.
+/// Progress of learning, from the trainer's board.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Training {
+pub struct LearningStatus {
     /// Episode of the newest sample.
     pub episode: u64,
     /// Samples used for training so far.
     pub env_steps: u64,
     /// Updates of the policy so far.
     pub updates: u64,
-    /// Samples per wall second, lately.
+    /// Recent rate of samples, per wall second.
     pub env_steps_per_s: f64,
     /// Standard deviation of the policy.
     pub policy_std: f64,
-    /// Mean reward, lately.
+    /// Recent mean reward.
     pub reward: f64,
-    /// Largest of those so far.
+    /// Largest mean reward so far.
     pub best_reward: f64,
     /// Mean error of the policy, metres.
     pub error_m: f64,
@@ -152,7 +153,7 @@ pub struct Training {
     pub raw_gnss_error_m: f64,
 }
 
-impl From<TrainingStatus> for Training {
+impl From<TrainingStatus> for LearningStatus {
     fn from(status: TrainingStatus) -> Self {
         Self {
             episode: status.episode,
@@ -168,16 +169,16 @@ impl From<TrainingStatus> for Training {
     }
 }
 
-/// What the fan-out itself did.
+/// FanoutCounters of the fan-out itself.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
-pub struct Counters {
-    /// Frames handed to zenoh.
+pub struct FanoutCounters {
+    /// Frames passed to zenoh.
     pub frames: u64,
-    /// Ticks that came too fast for the queues in shared memory.
+    /// Ticks that came faster than the queues in shared memory were read.
     pub missed_ticks: u64,
-    /// Messages refused: of another run, or not what their header promises.
+    /// Messages refused: of another run or version, or shorter than their header promises.
     pub refused_messages: u64,
-    /// Samples that others have put on this run's keys.
+    /// Samples that other clients have put on this run's keys.
     pub refused_samples: u64,
     /// Road users and points left out of frames that were too long.
     pub thinned_rows: u64,
@@ -185,18 +186,18 @@ pub struct Counters {
     pub cut_rows: u64,
     /// Frames that were too long and could not be thinned.
     pub oversize_frames: u64,
-    /// Sets that lowered the rate because a frame was long.
+    /// Sets after which the rate was lowered because a frame was long.
     pub slowed_sets: u64,
-    /// Scans of vehicles whose name was not known yet.
+    /// Scans of vehicles whose id was not known yet.
     pub unnamed_scans: u64,
     /// Commands from the network that were refused.
     pub refused_commands: u64,
-    /// Peers that were not let in.
+    /// Connections that were refused.
     pub refused_connections: u64,
 }
 
-impl Counters {
-    /// The count of rows that frames of `topic` leave out.
+impl FanoutCounters {
+    /// The counter of the rows that frames of `topic` leave out.
     pub fn left_out(&mut self, topic: Topic) -> &mut u64 {
         match topic {
             Topic::Observation | Topic::Prediction => &mut self.cut_rows,
@@ -204,7 +205,7 @@ impl Counters {
         }
     }
 
-    /// Counts a message that is not published; tells of the first.
+    /// Counts a message that is not published, and logs the first.
     pub fn refuse(&mut self, topic: &'static str, error: &FrameError) {
         let counter = match error {
             FrameError::Block(_) => &mut self.refused_messages,
@@ -212,29 +213,29 @@ impl Counters {
         };
         *counter += 1;
         if *counter == 1 {
-            tracing::warn!(topic, %error, "not published; later ones are only counted");
+            tracing::warn!(topic, %error, "a message was not published; later ones are only counted");
         }
     }
 }
 
-/// The state of the run.
+/// The `status` topic.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Status {
-    /// Of every frame of this run.
+pub struct RunStatus {
+    /// Version of the schema, as in every frame of this run.
     pub schema_version: u32,
     /// Name of the run.
     pub run: String,
-    /// Its identity.
+    /// Identity of the run.
     pub run_id: String,
     /// Number of the environment.
     pub env: u32,
-    /// What the run is for.
+    /// Mode of the run.
     pub mode: Mode,
     /// Newest tick published.
     pub tick: u64,
     /// Episode of that tick.
     pub episode: u64,
-    /// Ticks of that episode before it.
+    /// Ticks of that episode before this one.
     pub step: u64,
     /// Simulated time within that episode, nanoseconds.
     pub sim_time_ns: u64,
@@ -242,25 +243,25 @@ pub struct Status {
     pub evaluation: bool,
     /// Wall seconds since the run was started.
     pub run_age_s: f64,
-    /// Ticks per wall second, lately.
+    /// Ticks per wall second over the last two seconds.
     pub ticks_per_s: f64,
-    /// Simulated seconds per wall second, lately.
+    /// Simulated seconds per wall second over the last two seconds.
     pub real_time_factor: f64,
-    /// Who is on the road.
-    pub road_users: RoadUsers,
-    /// Whose sensors deliver.
-    pub sensors: Delivering,
-    /// Errors of the newest set.
-    pub errors_m: Errors,
-    /// Every process of the run.
+    /// Road users by kind.
+    pub road_users: RoadUserCounts,
+    /// Vehicles on which each sensor delivers.
+    pub sensors: DeliveringSensors,
+    /// Mean errors of position of the newest set.
+    pub errors_m: PositionErrors,
+    /// State of every process of the run.
     pub processes: Vec<ProcessStatus>,
-    /// How learning goes; `None` in a run without.
-    pub training: Option<Training>,
-    /// What the fan-out itself did.
-    pub fanout: Counters,
+    /// Progress of learning; `None` in a run without a learner.
+    pub training: Option<LearningStatus>,
+    /// FanoutCounters of the fan-out itself.
+    pub fanout: FanoutCounters,
 }
 
-/// Seconds since process `pid` was started; 0 if it is gone.
+/// Seconds since process `pid` was started; 0 if there is no such process.
 #[must_use]
 pub fn age_s(pid: i32) -> f64 {
     let read = |path: &str| std::fs::read_to_string(path).unwrap_or_default();
@@ -269,7 +270,7 @@ pub fn age_s(pid: i32) -> f64 {
         .next()
         .and_then(|text| text.parse::<f64>().ok());
     let stat = read(&format!("/proc/{pid}/stat"));
-    // After the name in parentheses; the 22nd field of all, in hundredths of a second (proc(5)).
+    // The 22nd field, which is the 20th after the name in parentheses, in hundredths of a second (proc(5)).
     let started = stat.rsplit(')').next().and_then(|rest| rest.split_whitespace().nth(19));
     let started_s = started
         .and_then(|text| text.parse::<f64>().ok())

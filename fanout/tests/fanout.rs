@@ -6,7 +6,7 @@ mod harness;
 use std::{io::Write as _, mem::offset_of, net::TcpStream};
 
 use bytemuck::{cast_slice, pod_read_unaligned};
-use fanout::keys::Topic;
+use fanout::network::keys::Topic;
 use harness::{
     PATIENCE, Run, ask, header, next, observation, publisher, send, send_census, send_observation, send_prediction,
     send_scan, send_world, states, until, watch,
@@ -24,7 +24,7 @@ use ipc_schema::{
 };
 use zenoh::{Wait, sample::SampleKind};
 
-/// The whole of a train run: frames are the bytes of shared memory, of one tick, newest wins, and the end is an end.
+/// A train run from start to end: each frame has the bytes of one tick in shared memory, and the fan-out ends with the run.
 #[test]
 fn frames_are_the_bytes_of_shared_memory() {
     let run = Run::new("a run/with #odd? $name*", Mode::Train);
@@ -74,7 +74,7 @@ fn frames_are_the_bytes_of_shared_memory() {
     }
 }
 
-/// Somebody who comes late asks, and has the whole picture at once; the token tells when the run is over.
+/// A viewer that joins late gets the whole picture from one query, and the liveliness token disappears with the run.
 #[test]
 fn a_late_joiner_has_the_whole_picture() {
     let run = Run::new("late", Mode::Simulate);
@@ -119,7 +119,7 @@ fn a_late_joiner_has_the_whole_picture() {
     assert_eq!((health.state, health.ticks, health.drops), (State::Done as u32, 2, 0));
 }
 
-/// A producer far ahead of the rate loses nothing itself: the fan-out misses ticks, counts them, and shows the newest.
+/// A producer far ahead of the rate is not slowed down: the fan-out misses ticks, counts them, and publishes the newest.
 #[test]
 fn a_fast_producer_is_decimated_and_counted() {
     let run = Run::new("fast", Mode::Simulate);
@@ -149,7 +149,7 @@ fn a_fast_producer_is_decimated_and_counted() {
     assert!(board.health().drops > 0);
 }
 
-/// 2 000 road users at the rate of a paced run arrive whole and without gaps.
+/// Ticks of 2 000 road users at the rate of a paced run arrive complete and without gaps.
 #[test]
 fn two_thousand_road_users_arrive_without_a_gap() {
     let run = Run::new("crowd", Mode::Simulate);
@@ -170,7 +170,7 @@ fn two_thousand_road_users_arrive_without_a_gap() {
 }
 
 #[test]
-fn a_port_in_use_is_a_mistake_in_the_configuration() {
+fn a_port_in_use_is_a_configuration_error() {
     let run = Run::new("taken", Mode::Train);
     let _taken = std::net::TcpListener::bind(("127.0.0.1", run.port)).unwrap();
     assert_eq!(run.start_fanout().exit_code(), Some(2));
@@ -182,7 +182,7 @@ fn a_port_in_use_is_a_mistake_in_the_configuration() {
 }
 
 #[test]
-fn it_stops_when_asked() {
+fn it_stops_at_sigterm() {
     let run = Run::new("stop", Mode::Train);
     let mut fanout = run.start_fanout();
     let _viewer = run.attach();
@@ -190,9 +190,9 @@ fn it_stops_when_asked() {
     assert_eq!(fanout.exit_code(), Some(0));
 }
 
-/// What changes slowly comes whole with a question, whatever characters ids have; scans only to those who want them.
+/// A query gets the whole tables, whatever characters the ids have. A scan is published only while a viewer subscribes to it.
 #[test]
-fn ids_lights_and_scans_of_any_name_reach_who_asks() {
+fn ids_lights_and_scans_reach_viewers_whatever_the_ids() {
     const IDS: [&str; 3] = ["plain", "a/b #?$*", "ünï%41"];
     let run = Run::new("names", Mode::Simulate);
     let _fanout = run.start_fanout();
@@ -224,7 +224,7 @@ fn ids_lights_and_scans_of_any_name_reach_who_asks() {
     });
     assert!(ask(&late, &run.key(Topic::Signals)).is_some_and(|frame| state(&frame[72..], 1) == b'G'));
 
-    // Nobody watches: nothing goes out. Then somebody does.
+    // Without a subscriber no scan is published; with one, its scans are.
     send_scan(&sensors, &scans, 1, (IDS[1], 1), 50);
     let wanted = watch(&late, run.scan_key(IDS[1]));
     let mut tick = 1;
@@ -243,9 +243,9 @@ fn ids_lights_and_scans_of_any_name_reach_who_asks() {
     assert!(ask(&late, &run.scan_key(IDS[2])).is_none());
 }
 
-/// Random bytes on the port, nonsense on every key, another version in shared memory: counted, and nobody dies of it.
+/// Random bytes on the port and on every key, and another version in shared memory, are counted, and the run's frames still arrive.
 #[test]
-fn garbage_is_counted_and_hurts_nobody() {
+fn garbage_is_counted_and_not_fatal() {
     let run = Run::new("garbage", Mode::Simulate);
     let mut fanout = run.start_fanout();
     let viewer = run.attach();
@@ -260,12 +260,12 @@ fn garbage_is_counted_and_hurts_nobody() {
         let bytes: Vec<u8> = (0..200 * seed)
             .map(|i| (i.wrapping_mul(6_364_136_223_846_793_005 ^ seed) >> 33) as u8)
             .collect();
-        // It may be cut off in the middle: that is a refusal.
+        // The fan-out may close the connection in the middle: that is a refusal.
         let _ = port.write_all(&bytes);
-        // A length that promises more than comes, and a torn connection.
+        // A length that promises more than follows, and a closed connection.
         let _ = port.write_all(&[0xff, 0xff, 1, 2, 3]);
     }
-    let vandal = run.attach();
+    let forger = run.attach();
     let keys = Topic::ALL.map(|topic| run.key(topic)).into_iter();
     let keys: Vec<String> = keys
         .chain([
@@ -276,12 +276,12 @@ fn garbage_is_counted_and_hurts_nobody() {
         .collect();
     for key in &keys {
         for bytes in [vec![], vec![0xff; 71], vec![7; 300]] {
-            vandal.put(key, bytes).wait().unwrap();
+            forger.put(key, bytes).wait().unwrap();
         }
-        vandal.delete(key).wait().unwrap();
-        let _ = vandal.get(format!("{key}?_anyke;x=%")).payload(vec![1; 99]).wait();
+        forger.delete(key).wait().unwrap();
+        let _ = forger.get(format!("{key}?_anyke;x=%")).payload(vec![1; 99]).wait();
     }
-    // A sender of another version, and one that promises more than it holds.
+    // A message of another version, and one whose header promises more than its payload holds.
     let old = MessageHeader {
         schema_version: SCHEMA_VERSION - 1,
         ..header(&sim, 0, 0, 1, 0)
@@ -289,11 +289,11 @@ fn garbage_is_counted_and_hurts_nobody() {
     send(&worlds, old, &[0; 136]);
     send(&observations, header(&sensors, 0, 0, 4000, 9), &[0; 64]);
     send_world(&sim, &worlds, 1, 0, 3);
-    let mine = |payload: &[u8]| payload == cast_slice::<_, u8>(&states(1, 3));
-    until("a frame of the run among the nonsense", || {
+    let is_the_runs = |payload: &[u8]| payload == cast_slice::<_, u8>(&states(1, 3));
+    until("a frame of the run among the garbage", || {
         let sample = world.recv_timeout(PATIENCE).unwrap().unwrap();
         let bytes = sample.payload().to_bytes();
-        fanout::reader::check("world", &bytes, Some(run.file.run_id)).is_ok() && mine(&bytes[72..])
+        fanout::reader::check("world", &bytes, Some(run.file.run_id)).is_ok() && is_the_runs(&bytes[72..])
     });
     until("the counts", || {
         let status = ask(&viewer, &run.key(Topic::Status)).unwrap();
@@ -307,9 +307,9 @@ fn garbage_is_counted_and_hurts_nobody() {
     assert_eq!(fanout.exit_code(), Some(0));
 }
 
-/// A killed fan-out that is started again shows the run to the viewer that watched the one before.
+/// A killed fan-out that is started again shows the run to a viewer that was connected before.
 #[test]
-fn viewers_come_back_to_the_next_fan_out() {
+fn viewers_reconnect_to_a_restarted_fan_out() {
     let run = Run::new("again", Mode::Simulate);
     let (sim, worlds) = publisher(&run, Channel::World);
     let (bridge, censuses) = publisher(&run, Channel::Census);

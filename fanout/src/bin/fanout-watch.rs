@@ -1,5 +1,6 @@
 //! `fanout-watch ENDPOINT RUN [--env N] [--viewers N] [--seconds S] [--bytes-per-s B] [--log FILE]`: viewers that draw nothing. They count
-//! what comes, what is lost on the way and what is to be refused, and print it as JSON. For tests and `caraware bench fanout`.
+//! the samples that arrive, that are lost on the way and that must be refused, and print the counts as JSON. For tests and
+//! `caraware bench fanout`.
 
 use std::{
     collections::BTreeMap,
@@ -12,26 +13,29 @@ use std::{
     time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
-use fanout::{keys::Keys, outlet::read_attachment, reader};
+use fanout::{
+    network::{keys::RunKeys, publisher::read_attachment},
+    reader,
+};
 use ipc_schema::header::MessageHeader;
 use zenoh::{Wait, sample::Sample};
 
 type Failure = Box<dyn std::error::Error + Send + Sync>;
 
-/// What the command line says.
-struct Options {
+/// The command line.
+struct WatchOptions {
     endpoint: String,
     run: String,
     env: u32,
     viewers: usize,
     seconds: f64,
-    /// Speed of the link, 0 = as it is.
+    /// Speed of the link; 0 leaves it as it is.
     bytes_per_s: u64,
-    /// Where to note each `world` frame: tick and UNIX time in nanoseconds.
+    /// Receives a line for each `world` frame: tick and UNIX time in nanoseconds.
     log: Option<File>,
 }
 
-impl Options {
+impl WatchOptions {
     fn read() -> Result<Self, Failure> {
         let mut arguments = std::env::args().skip(1);
         let mut next = |what: &str| arguments.next().ok_or_else(|| format!("{what} is missing"));
@@ -59,17 +63,17 @@ impl Options {
     }
 }
 
-/// What came of one topic, of all viewers together.
+/// Counts of one topic, over all viewers.
 #[derive(Default, serde::Serialize)]
-struct Count {
+struct TopicCounts {
     received: u64,
     bytes: u64,
-    /// Gaps in the sequence numbers: lost on the way.
+    /// Samples lost on the way, from the gaps in the sequence numbers.
     lost: u64,
-    /// Sequences that began anew: another fan-out.
+    /// Sequences that started again at 0, which means another fan-out.
     begun_anew: u64,
     refused: u64,
-    /// From shared memory to here, median, milliseconds.
+    /// Median time from shared memory to here, milliseconds.
     median_age_ms: f64,
     #[serde(skip)]
     ages_ms: Vec<f64>,
@@ -77,17 +81,17 @@ struct Count {
     sequences: BTreeMap<(usize, String), u64>,
 }
 
-impl Count {
+impl TopicCounts {
     fn add(&mut self, viewer: usize, env: u32, sample: &Sample, topic: &str, now_ns: u64) {
         let bytes = sample.payload().to_bytes();
         self.received += 1;
         self.bytes += bytes.len() as u64;
-        let told = sample
+        let attached = sample
             .attachment()
             .and_then(|attachment| read_attachment(&attachment.to_bytes()));
         let checked = reader::check(topic, &bytes, None);
         let is_of_env = |header: Option<MessageHeader>| header.is_none_or(|header| header.env_index == env);
-        let (true, Some((sequence, taken_ns))) = (checked.is_ok_and(is_of_env), told) else {
+        let (true, Some((sequence, taken_ns))) = (checked.is_ok_and(is_of_env), attached) else {
             self.refused += 1;
             return;
         };
@@ -101,16 +105,17 @@ impl Count {
     }
 }
 
+/// Counts of all topics.
 #[derive(Default)]
-struct Counts {
+struct WatchCounts {
     env: u32,
-    topics: BTreeMap<String, Count>,
+    topics: BTreeMap<String, TopicCounts>,
     log: Option<LineWriter<File>>,
 }
 
-impl Counts {
+impl WatchCounts {
     fn add(&mut self, viewer: usize, sample: &Sample, prefix: usize) {
-        #[expect(clippy::disallowed_methods, reason = "compared with the time on what comes")]
+        #[expect(clippy::disallowed_methods, reason = "compared with the time that samples carry")]
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now_ns = u64::try_from(now.as_nanos()).unwrap_or(u64::MAX);
         let topic = sample.key_expr().as_str().get(prefix..).unwrap_or_default();
@@ -128,8 +133,8 @@ impl Counts {
     }
 }
 
-/// A viewer's zenoh, once the fan-out listens.
-fn attach(endpoint: &str) -> Result<zenoh::Session, Failure> {
+/// A viewer's zenoh session, once the fan-out listens.
+fn connect(endpoint: &str) -> Result<zenoh::Session, Failure> {
     let endpoint = serde_json::to_string(endpoint)?;
     let config = zenoh::Config::from_json5(&format!(
         r#"{{ mode: "client", connect: {{ endpoints: [{endpoint}], timeout_ms: 20000 }},
@@ -139,8 +144,8 @@ fn attach(endpoint: &str) -> Result<zenoh::Session, Failure> {
     zenoh::open(config).wait()
 }
 
-/// A link of `bytes_per_s` to `endpoint`: its address. Little is in flight, as in a real one.
-fn slow_link(endpoint: &str, bytes_per_s: u64) -> Result<String, Failure> {
+/// Starts a link of `bytes_per_s` to `endpoint`, and returns its address. Its buffers are short, as those of a real link.
+fn start_slow_link(endpoint: &str, bytes_per_s: u64) -> Result<String, Failure> {
     let address = endpoint.strip_prefix("tcp/").ok_or("only tcp/HOST:PORT")?.to_owned();
     let listener = TcpListener::bind("127.0.0.1:0")?;
     let local = format!("tcp/{}", listener.local_addr()?);
@@ -152,42 +157,44 @@ fn slow_link(endpoint: &str, bytes_per_s: u64) -> Result<String, Failure> {
             let (Ok(up), Ok(up_to)) = (client.try_clone(), server.try_clone()) else {
                 continue;
             };
-            thread::spawn(move || pass(up, up_to, u64::MAX));
-            thread::spawn(move || pass(server, client, bytes_per_s));
+            thread::spawn(move || copy_at_rate(up, up_to, u64::MAX));
+            thread::spawn(move || copy_at_rate(server, client, bytes_per_s));
         }
     });
     Ok(local)
 }
 
-fn pass(mut from: TcpStream, mut to: TcpStream, bytes_per_s: u64) -> io::Result<()> {
+/// Copies bytes at no more than `bytes_per_s`.
+fn copy_at_rate(mut from: TcpStream, mut to: TcpStream, bytes_per_s: u64) -> io::Result<()> {
     let mut buffer = [0; 2048];
-    let (begun, mut passed) = (Instant::now(), 0_u64);
+    let (begun, mut copied) = (Instant::now(), 0_u64);
     loop {
         let length = from.read(&mut buffer)?;
         if length == 0 {
             return Ok(());
         }
         to.write_all(&buffer[..length])?;
-        passed += length as u64;
-        let due = Duration::from_secs_f64(passed as f64 / bytes_per_s as f64);
+        copied += length as u64;
+        let due = Duration::from_secs_f64(copied as f64 / bytes_per_s as f64);
         thread::park_timeout(due.saturating_sub(begun.elapsed()));
     }
 }
 
-fn watch(mut options: Options) -> Result<(), Failure> {
+/// Counts what all viewers receive, and prints the counts.
+fn watch(mut options: WatchOptions) -> Result<(), Failure> {
     if options.bytes_per_s > 0 {
-        options.endpoint = slow_link(&options.endpoint, options.bytes_per_s)?;
+        options.endpoint = start_slow_link(&options.endpoint, options.bytes_per_s)?;
     }
-    let all = Keys::new(&options.run, options.env).all();
+    let all = RunKeys::new(&options.run, options.env).all();
     let prefix = all.len() - "**".len();
-    let counts = Arc::new(Mutex::new(Counts {
+    let counts = Arc::new(Mutex::new(WatchCounts {
         env: options.env,
         log: options.log.take().map(LineWriter::new),
-        ..Counts::default()
+        ..WatchCounts::default()
     }));
-    let mut held = Vec::new();
+    let mut viewers = Vec::new();
     for viewer in 0..options.viewers {
-        let session = attach(&options.endpoint)?;
+        let session = connect(&options.endpoint)?;
         let counts = Arc::clone(&counts);
         let count = move |sample: Sample| {
             counts
@@ -196,14 +203,14 @@ fn watch(mut options: Options) -> Result<(), Failure> {
                 .add(viewer, &sample, prefix);
         };
         let subscriber = session.declare_subscriber(all.clone()).callback(count).wait()?;
-        held.push((subscriber, session));
+        viewers.push((subscriber, session));
     }
     let _ = writeln!(io::stdout(), "watching");
     let until = Instant::now() + Duration::from_secs_f64(options.seconds);
     while Instant::now() < until {
         thread::park_timeout(until.saturating_duration_since(Instant::now()));
     }
-    drop(held);
+    drop(viewers);
     let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
     for count in counts.topics.values_mut() {
         count.ages_ms.sort_by(f64::total_cmp);
@@ -217,7 +224,7 @@ fn watch(mut options: Options) -> Result<(), Failure> {
 }
 
 fn main() -> ExitCode {
-    match Options::read().and_then(watch) {
+    match WatchOptions::read().and_then(watch) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let _ = writeln!(io::stderr(), "fanout-watch: {error}");

@@ -25,7 +25,7 @@ fn states(count: usize) -> Vec<VehicleState> {
         .collect()
 }
 
-/// Words, so that sections are aligned as in shared memory.
+/// A payload as words of 8 bytes, so that sections are aligned as in shared memory.
 fn payload(len: usize) -> Vec<u64> {
     (0..len.div_ceil(8) as u64).collect()
 }
@@ -72,7 +72,7 @@ fn a_dense_scan_is_thinned_and_keeps_where_the_sensor_was() {
     assert_eq!(body.len(), layout.points.offset + kept * size_of::<LidarPoint>());
 }
 
-/// Slot by slot what stood there, of as many slots as fit.
+/// The frame holds as many slots as fit, each as in the block.
 #[test]
 fn long_observations_are_cut_to_their_first_slots() {
     let layout = ObservationLayout::new(20_000, 9, 1);
@@ -124,9 +124,9 @@ fn a_long_table_goes_out_in_parts_that_make_the_whole() {
         .flat_map(|i| [i; 19])
         .flat_map(u64::to_le_bytes)
         .collect();
-    let (mut place, mut parts) = (0, Vec::new());
+    let (mut next_row, mut parts) = (0, Vec::new());
     for _ in 0..2 {
-        let (part, whole) = table(&header(0, 3), &rows, 152, &mut place);
+        let (part, whole) = table(&header(0, 3), &rows, 152, &mut next_row);
         assert!(part.len() <= MAX_FRAME_BYTES);
         assert_eq!(decode(&whole).unwrap(), (header(10_000, 0), rows.as_slice()));
         let (head, body) = decode(&part).unwrap();
@@ -134,9 +134,12 @@ fn a_long_table_goes_out_in_parts_that_make_the_whole() {
         parts.extend_from_slice(body);
     }
     assert_eq!(parts, rows);
-    assert_eq!(place, 10_000);
+    assert_eq!(next_row, 10_000);
     assert_eq!(
-        decode(&table(&header(0, 0), &[], 152, &mut place).0).unwrap().0.count,
+        decode(&table(&header(0, 0), &[], 152, &mut next_row).0)
+            .unwrap()
+            .0
+            .count,
         0
     );
 }
@@ -155,9 +158,9 @@ proptest! {
         }
     }
 
-    /// Nothing that stands in shared memory, however wrong, ends the fan-out.
+    /// No content of shared memory, however wrong, ends the fan-out.
     #[test]
-    fn nonsense_is_an_error_and_no_panic(header in prop::array::uniform18(any::<u32>()), len in 0_usize..40) {
+    fn random_content_is_an_error_and_no_panic(header in prop::array::uniform18(any::<u32>()), len in 0_usize..40) {
         let header: MessageHeader = bytemuck::cast(header);
         let words = vec![u64::MAX; 8 * len];
         for channel in Channel::ALL {

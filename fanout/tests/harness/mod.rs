@@ -1,6 +1,7 @@
-//! A run without simulator or trainer: real services in a private corner of shared memory, real messages, the real binary.
+//! A run without simulator or trainer: real services under private names in shared memory, real messages, the real binary.
 
 use std::{
+    fs::File,
     io,
     net::TcpListener,
     path::PathBuf,
@@ -10,7 +11,7 @@ use std::{
 };
 
 use bytemuck::{cast_slice, cast_slice_mut};
-use fanout::keys::{Keys, Topic};
+use fanout::network::keys::{RunKeys, Topic};
 use ipc_schema::{
     SCHEMA_VERSION,
     block::view_mut,
@@ -29,33 +30,57 @@ use ipc_schema::{
 use tempfile::TempDir;
 use zenoh::{Wait, handlers::RingChannelHandler, pubsub::Subscriber, sample::Sample};
 
-/// Longest wait for anything.
-pub const PATIENCE: Duration = Duration::from_secs(20);
+/// Longest wait for any condition, long enough for a machine whose cores are busy with other work.
+pub const PATIENCE: Duration = Duration::from_secs(60);
 /// Fields of an observation in these runs.
 pub const FIELDS: u32 = 2;
 const SUB_STEPS: u32 = 10;
 
-/// Services and run file of a run; children of this test are its processes.
+/// Services and run file of a run, whose processes are children of this test.
 pub struct Run {
     pub file: RunFile,
     pub port: u16,
+    _reserved_port: ReservedPort,
     path: PathBuf,
     _holder: ServiceHolder,
     node: services::RunNode,
     _dir: TempDir,
-    _sweep: Sweep,
+    _sweep: SharedMemorySweep,
 }
 
-/// Removes what is left of a run in shared memory, be it of a killed process; dropped last.
-struct Sweep(String);
+/// Removes what is left of a run in shared memory, also that of killed processes; dropped last.
+struct SharedMemorySweep(String);
 
-impl Drop for Sweep {
+impl Drop for SharedMemorySweep {
     fn drop(&mut self) {
         for file in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
             if file.file_name().to_string_lossy().starts_with(&self.0) {
                 let _ = std::fs::remove_file(file.path());
             }
         }
+    }
+}
+
+/// A TCP port that no other test takes while this exists. It lies below Linux's ephemeral ports (32768 to 60999), which outgoing
+/// connections of other programs may take at any time.
+struct ReservedPort {
+    number: u16,
+    _lock: File,
+}
+
+impl ReservedPort {
+    fn take() -> Self {
+        let locks = std::env::temp_dir().join("caraware-test-ports");
+        std::fs::create_dir_all(&locks).unwrap();
+        let first = u16::try_from(std::process::id() % 10_000).unwrap();
+        (0..10_000)
+            .map(|offset| 20_000 + (first + offset) % 10_000)
+            .find_map(|number| {
+                let lock = File::create(locks.join(number.to_string())).ok()?;
+                let is_free = lock.try_lock().is_ok() && TcpListener::bind(("127.0.0.1", number)).is_ok();
+                is_free.then_some(Self { number, _lock: lock })
+            })
+            .expect("a free port")
     }
 }
 
@@ -67,8 +92,8 @@ impl Run {
     pub fn at_rate(name: &str, mode: Mode, rate_hz: f64) -> Self {
         let dir = tempfile::tempdir().unwrap();
         std::fs::create_dir(dir.path().join("logs")).unwrap();
-        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        let mut file = run_file(name, mode, dir.path().into(), port);
+        let port = ReservedPort::take();
+        let mut file = run_file(name, mode, dir.path().into(), port.number);
         let settings = &mut file.config.fanout;
         settings.world_hz = rate_hz;
         settings.observation_hz = rate_hz;
@@ -77,9 +102,10 @@ impl Run {
         let node = services::node(&file.shared_memory).unwrap();
         let holder = ServiceHolder::create(&node, &file, 0).unwrap();
         Self {
-            _sweep: Sweep(file.shared_memory.prefix.clone()),
+            _sweep: SharedMemorySweep(file.shared_memory.prefix.clone()),
             file,
-            port,
+            port: port.number,
+            _reserved_port: port,
             path,
             _holder: holder,
             node,
@@ -91,7 +117,7 @@ impl Run {
         self.start_incarnation(0)
     }
 
-    /// The fan-out, started for the `incarnation`-th time again.
+    /// Starts the fan-out as incarnation `incarnation`, counted from 0.
     pub fn start_incarnation(&self, incarnation: u32) -> Fanout {
         let child = Command::new(env!("CARGO_BIN_EXE_fanout"))
             .arg(&self.path)
@@ -113,26 +139,26 @@ impl Run {
     }
 
     pub fn key(&self, topic: Topic) -> String {
-        Keys::new(&self.file.name, 0).topic(topic)
+        RunKeys::new(&self.file.name, 0).topic(topic)
     }
 
     pub fn scan_key(&self, id: &str) -> String {
-        Keys::new(&self.file.name, 0).scan(id)
+        RunKeys::new(&self.file.name, 0).scan(id)
     }
 
-    /// What `caraware` does when a process has died.
+    /// Cleans up after a dead process, as `caraware` does.
     pub fn forget_dead(&self) {
         services::forget_dead(&self.node);
     }
 
     pub fn alive_key(&self) -> String {
-        Keys::new(&self.file.name, 0).alive()
+        RunKeys::new(&self.file.name, 0).alive()
     }
 
     /// A viewer's zenoh session, once the fan-out listens.
     pub fn attach(&self) -> zenoh::Session {
         let config = zenoh::Config::from_json5(&format!(
-            r#"{{ mode: "client", connect: {{ endpoints: ["tcp/127.0.0.1:{}"], timeout_ms: 20000 }},
+            r#"{{ mode: "client", connect: {{ endpoints: ["tcp/127.0.0.1:{}"], timeout_ms: 60000 }},
                  scouting: {{ multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }} }}"#,
             self.port
         ));
@@ -149,7 +175,7 @@ pub fn watch(session: &zenoh::Session, key: String) -> Subscriber<RingChannelHan
         .unwrap()
 }
 
-/// The next frame, taken apart into header and payload.
+/// The next frame, as header and payload.
 pub fn next(frames: &Subscriber<RingChannelHandler<Sample>>) -> (MessageHeader, Vec<u8>) {
     let sample = frames.recv_timeout(PATIENCE).unwrap().expect("no frame came");
     let bytes = sample.payload().to_bytes();
@@ -164,7 +190,7 @@ pub fn ask(session: &zenoh::Session, key: &str) -> Option<Vec<u8>> {
     Some(reply.result().ok()?.payload().to_bytes().into_owned())
 }
 
-/// Waits for a condition, with a deadline.
+/// Waits for a condition; fails after [`PATIENCE`].
 pub fn until(what: &str, mut condition: impl FnMut() -> bool) {
     let deadline = Instant::now() + PATIENCE;
     while !condition() {
@@ -173,7 +199,7 @@ pub fn until(what: &str, mut condition: impl FnMut() -> bool) {
     }
 }
 
-/// A fan-out process; killed if the test fails.
+/// A fan-out process, killed when it is dropped.
 pub struct Fanout(pub Child);
 
 impl Fanout {
@@ -264,7 +290,7 @@ pub fn send_prediction(session: &Session, publisher: &Publisher, tick: u64, coun
     send(publisher, header, &payload);
 }
 
-/// One of each of `ids`, by dense index, and a traffic light in the state of each letter.
+/// Sends a census: a road user for each of `ids`, by index, and a traffic light in the state of each letter.
 pub fn send_census(session: &Session, publisher: &Publisher, tick: u64, ids: &[&str], letters: &str) {
     let layout = TrafficMetaLayout::new(ids.len(), letters.len());
     let header = header(session, tick, 0, ids.len(), u32::try_from(letters.len()).unwrap());
@@ -281,7 +307,7 @@ pub fn send_census(session: &Session, publisher: &Publisher, tick: u64, ids: &[&
     draft.send().unwrap();
 }
 
-/// A scan of `points` points by the vehicle with this id and dense index.
+/// Sends a scan of `points` points by the vehicle with this id and index.
 pub fn send_scan(session: &Session, publisher: &Publisher, tick: u64, (id, index): (&str, u32), points: usize) {
     let layout = PointcloudLayout::new(points);
     let header = MessageHeader {
@@ -297,7 +323,7 @@ pub fn send_scan(session: &Session, publisher: &Publisher, tick: u64, (id, index
     draft.send().unwrap();
 }
 
-/// The publishers of a run, in the order of the data.
+/// Joins as the producer of `channel`, and opens its publisher.
 pub fn publisher(run: &Run, channel: Channel) -> (Session, Publisher) {
     let session = run.join(channel.producer());
     let publisher = session.publisher(channel).unwrap();
@@ -335,7 +361,7 @@ fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
     }
 }
 
-/// The default preset, faster and with room for many.
+/// The default preset with fewer sub-steps, room for more road users, and LIDARs.
 fn config(port: u16) -> serde_json::Value {
     let mut config: serde_json::Value =
         serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();

@@ -1,23 +1,23 @@
-//! When to look at shared memory and when to publish: pure functions of the time since the start.
+//! When to read shared memory and when to publish: pure functions of the time since the start.
 
 use std::time::Duration;
 
-/// Frames up to this size, bytes, go out at the full rate; longer ones leave a viewer's queue time to empty.
+/// Frames up to this size, bytes, are published at the full rate; longer ones less often, so that a viewer's queue has time to empty.
 pub const FULL_RATE_FRAME_BYTES: usize = 500_000;
 
-/// Sets that may be saved up: the half above one makes good the jitter of a run paced at the rate, and is no burst.
+/// Sets that may be saved up. The half above one absorbs the jitter of a run paced at the rate; it is too little for a burst.
 const BURST_FRAMES: f64 = 1.5;
 
 /// A token bucket: at most `rate_hz` sets of frames per second in the long run.
 #[derive(Debug, Clone)]
-pub struct Budget {
+pub struct RateBudget {
     rate_hz: f64,
     tokens: f64,
     at: Duration,
 }
 
-impl Budget {
-    /// A full budget of `rate_hz` sets per second; with 0 there is never one.
+impl RateBudget {
+    /// A full budget of `rate_hz` sets per second; a rate of 0 never allows a set.
     #[must_use]
     pub fn new(rate_hz: f64) -> Self {
         Self {
@@ -35,7 +35,7 @@ impl Budget {
         self.tokens >= 1.0
     }
 
-    /// One more set may be published at once, whatever was before; none with a rate of 0.
+    /// Fills the budget, so that a set may be published at once; a rate of 0 still allows none.
     pub fn refill(&mut self) {
         self.tokens = Self::new(self.rate_hz).tokens;
     }
@@ -49,20 +49,20 @@ impl Budget {
     }
 }
 
-/// How long to leave shared memory alone: long enough to cost nothing, short enough for the queues not to overflow.
+/// How long to wait between two reads of shared memory: long enough to cost little, short enough for the queues not to overflow.
 #[derive(Debug, Clone)]
-pub struct Patience {
+pub struct PollInterval {
     wait: Duration,
     queue_length: usize,
 }
 
-impl Patience {
-    /// Shortest wait: 500 looks a second cost about one per cent of a core.
+impl PollInterval {
+    /// Shortest wait: 500 reads a second cost about one per cent of a core.
     const SHORTEST: Duration = Duration::from_millis(2);
-    /// Longest wait: what a viewer sees is at most this much older.
+    /// Longest wait: it makes what a viewer sees at most this much older.
     const LONGEST: Duration = Duration::from_millis(20);
 
-    /// For queues of `queue_length` messages.
+    /// The interval for queues of `queue_length` messages.
     #[must_use]
     pub fn new(queue_length: usize) -> Self {
         Self {
@@ -71,7 +71,7 @@ impl Patience {
         }
     }
 
-    /// The next wait, after a look that found `messages` in the fullest queue.
+    /// The next wait, after a read that found `messages` in the fullest queue.
     pub fn next(&mut self, messages: usize) -> Duration {
         if 2 * messages > self.queue_length {
             self.wait = (self.wait / 2).max(Self::SHORTEST);
@@ -90,7 +90,7 @@ mod tests {
     proptest! {
         #[test]
         fn the_rate_is_never_exceeded(rate_hz in 0.5_f64..200.0, steps_ms in prop::collection::vec(0_u64..50, 1..400)) {
-            let mut budget = Budget::new(rate_hz);
+            let mut budget = RateBudget::new(rate_hz);
             let (mut now, mut sets) = (Duration::ZERO, 0);
             for step in steps_ms {
                 now += Duration::from_millis(step);
@@ -102,10 +102,10 @@ mod tests {
             prop_assert!(f64::from(sets) <= now.as_secs_f64() * rate_hz + BURST_FRAMES + 1e-6);
         }
 
-        /// Ticks of a run paced at the rate, each seen up to a look late, all get through.
+        /// Every tick of a run paced at the rate is published, though each is read up to one interval late.
         #[test]
         fn jitter_costs_no_frame(late_ms in prop::collection::vec(0_u64..20, 1..300)) {
-            let mut budget = Budget::new(10.0);
+            let mut budget = RateBudget::new(10.0);
             for (tick, late) in late_ms.into_iter().enumerate() {
                 prop_assert!(budget.allows(Duration::from_millis(100 * tick as u64 + late)));
                 budget.spend(100_000);
@@ -115,7 +115,7 @@ mod tests {
 
     #[test]
     fn long_frames_halve_the_rate() {
-        let mut budget = Budget::new(10.0);
+        let mut budget = RateBudget::new(10.0);
         let published = (0..1000)
             .filter(|i| {
                 let due = budget.allows(Duration::from_millis(10 * i));
@@ -127,11 +127,11 @@ mod tests {
 
     #[test]
     fn waits_follow_the_load_within_bounds() {
-        let mut patience = Patience::new(10);
-        let idle: Vec<Duration> = (0..30).map(|_| patience.next(0)).collect();
-        assert_eq!(idle.last(), Some(&Patience::LONGEST));
-        assert_eq!(patience.next(4), Patience::LONGEST);
-        let busy: Vec<Duration> = (0..30).map(|_| patience.next(10)).collect();
-        assert_eq!(busy.last(), Some(&Patience::SHORTEST));
+        let mut interval = PollInterval::new(10);
+        let idle: Vec<Duration> = (0..30).map(|_| interval.next(0)).collect();
+        assert_eq!(idle.last(), Some(&PollInterval::LONGEST));
+        assert_eq!(interval.next(4), PollInterval::LONGEST);
+        let busy: Vec<Duration> = (0..30).map(|_| interval.next(10)).collect();
+        assert_eq!(busy.last(), Some(&PollInterval::SHORTEST));
     }
 }

@@ -1,28 +1,28 @@
-//! Keys of a run in zenoh. Names go through percent-encoding: zenoh refuses `# ? $ *` and empty parts, and `/` separates.
+//! Keys of a run in zenoh. Names are percent-encoded, because zenoh refuses `# ? $ *` and empty parts, and `/` separates parts.
 
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 
-/// Characters that stand for themselves: RFC 3986's unreserved ones.
+/// Characters that are encoded: all but RFC 3986's unreserved ones.
 const ENCODED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b'_').remove(b'~');
 
-/// What is published under a run's prefix; scans have keys of their own ([`Keys::scan`]).
+/// What is published under a run's prefix; each vehicle's scans have their own key ([`RunKeys::scan`]).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Topic {
     /// The scene and the tick, as JSON; answers queries only.
     Map,
-    /// How the run fares, as JSON.
+    /// State of the run, as JSON.
     Status,
-    /// Who is who, as a frame.
+    /// Table of road users, as a frame.
     Vehicles,
     /// Traffic lights, as a frame.
     Signals,
-    /// Road users, as a frame.
+    /// Poses and motion of road users, as a frame.
     World,
     /// What connected vehicles sense, with the truth, as a frame.
     Observation,
-    /// What policy and filter make of it, as a frame.
+    /// Predictions of the policy and estimates of the filter, as a frame.
     Prediction,
-    /// Contacts that begin, as a frame.
+    /// Contacts that begin in a tick, as a frame.
     Event,
 }
 
@@ -39,7 +39,7 @@ impl Topic {
         Self::Event,
     ];
 
-    /// Last part of the key.
+    /// Name of the topic: the last part of its key.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -66,11 +66,11 @@ pub fn encode(name: &str) -> String {
 
 /// The keys of one environment of a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Keys {
+pub struct RunKeys {
     prefix: String,
 }
 
-impl Keys {
+impl RunKeys {
     /// Keys of environment `env_index` of the run called `run_name`.
     #[must_use]
     pub fn new(run_name: &str, env_index: u32) -> Self {
@@ -91,7 +91,7 @@ impl Keys {
         format!("{}/alive", self.prefix)
     }
 
-    /// Key that takes commands: under a prefix of its own, so that a right to read is none to command.
+    /// Key that takes commands. Its prefix differs from that of the topics, so that a right to read is no right to command.
     #[must_use]
     pub fn control(&self) -> String {
         format!("caraware-control{}", &self.prefix["caraware".len()..])
@@ -103,7 +103,7 @@ impl Keys {
         format!("{}/pointcloud/{}", self.prefix, encode(id))
     }
 
-    /// Key expression over all of them.
+    /// Key expression over all of these.
     #[must_use]
     pub fn all(&self) -> String {
         format!("{}/**", self.prefix)
@@ -120,7 +120,7 @@ mod tests {
     #[test]
     fn plain_names_stay_readable() {
         assert_eq!(
-            Keys::new("town-2026.01_a~b", 0).topic(Topic::World),
+            RunKeys::new("town-2026.01_a~b", 0).topic(Topic::World),
             "caraware/town-2026.01_a~b/0/world"
         );
     }
@@ -134,7 +134,7 @@ mod tests {
     proptest! {
         #[test]
         fn any_name_makes_a_key_of_four_parts_and_comes_back(name in any::<String>(), env in any::<u32>()) {
-            let keys = Keys::new(&name, env);
+            let keys = RunKeys::new(&name, env);
             for topic in Topic::ALL {
                 let key = keys.topic(topic);
                 prop_assert!(KeyExpr::new(key.as_str()).is_ok_and(|k| k.as_str() == key && !k.is_wild()), "{}", key);

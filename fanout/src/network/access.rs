@@ -1,7 +1,7 @@
-//! Who may connect, read and command: the part of zenoh's configuration that follows from `fanout.*`, and a count of those refused.
+//! Access control: the part of zenoh's configuration that follows from `fanout.*`, and a count of refused connections.
 //!
-//! Access control is always on and denies by default. Whoever may connect may read [`READ`] and ask it questions; only
-//! `fanout.commanders` may query [`COMMAND`]; nobody may write.
+//! Access control is always on and denies by default. Every client that may connect may subscribe to [`READ`] and query it; only
+//! `fanout.commanders` may query [`COMMAND`]; no client may write.
 
 use std::sync::{
     Mutex, PoisonError,
@@ -13,17 +13,17 @@ use serde_json::{Value, json};
 use tracing::{Event, Subscriber, field::Visit};
 use tracing_subscriber::layer::{Context, Layer};
 
-/// What everybody may read who may connect.
+/// What every connected client may read.
 pub const READ: &str = "caraware/**";
 /// What commanders may query.
 pub const COMMAND: &str = "caraware-control/**";
-/// In `fanout.commanders`: everybody who may connect.
-pub const ANYBODY: &str = "*";
+/// In `fanout.commanders`: every client that may connect.
+pub const EVERY_CLIENT: &str = "*";
 
-/// Whoever has connected says who he is within this time, milliseconds; longer, idle connections would keep others out.
+/// Time within which a client must identify itself, milliseconds. With a longer one, idle connections keep other clients out.
 const ACCEPT_TIMEOUT_MS: u32 = 3000;
 
-/// zenoh's settings, key and JSON, in the order in which they are to be inserted.
+/// Settings for zenoh, as key and JSON, in the order in which to insert them.
 #[must_use]
 pub fn settings(fanout: &Fanout) -> Vec<(&'static str, String)> {
     let mut settings = vec![
@@ -62,117 +62,119 @@ fn tls_settings(fanout: &Fanout) -> Value {
 }
 
 fn access_control(commanders: &[String]) -> Value {
-    let asks = [
+    let client_to_run = [
         "query",
         "declare_subscriber",
         "liveliness_query",
         "declare_liveliness_subscriber",
     ];
-    let tells = ["put", "delete", "reply", "declare_queryable", "liveliness_token"];
-    let mut subjects = vec![json!({ "id": "everybody" })];
-    let mut policies = vec![json!({ "rules": ["asks", "tells"], "subjects": ["everybody"] })];
-    if commanders.iter().any(|name| name == ANYBODY) {
-        policies.push(json!({ "rules": ["commands", "answers"], "subjects": ["everybody"] }));
+    let run_to_client = ["put", "delete", "reply", "declare_queryable", "liveliness_token"];
+    let mut subjects = vec![json!({ "id": "every-client" })];
+    let mut policies = vec![json!({ "rules": ["ask-for-data", "send-data"], "subjects": ["every-client"] })];
+    let command_rules = ["send-commands", "answer-commands"];
+    if commanders.iter().any(|name| name == EVERY_CLIENT) {
+        policies.push(json!({ "rules": command_rules, "subjects": ["every-client"] }));
     } else if !commanders.is_empty() {
         subjects.push(json!({ "id": "users", "usernames": commanders }));
         subjects.push(json!({ "id": "certificates", "cert_common_names": commanders }));
-        policies.push(json!({ "rules": ["commands", "answers"], "subjects": ["users", "certificates"] }));
+        policies.push(json!({ "rules": command_rules, "subjects": ["users", "certificates"] }));
     }
     let allow = |id: &str, flow: &str, messages: &[&str], key: &str| json!({ "id": id, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": [key] });
     json!({
         "enabled": true,
         "default_permission": "deny",
         "rules": [
-            allow("asks", "ingress", &asks, READ),
-            allow("tells", "egress", &tells, READ),
-            allow("commands", "ingress", &["query"], COMMAND),
-            allow("answers", "egress", &["reply", "declare_queryable"], COMMAND),
+            allow("ask-for-data", "ingress", &client_to_run, READ),
+            allow("send-data", "egress", &run_to_client, READ),
+            allow("send-commands", "ingress", &["query"], COMMAND),
+            allow("answer-commands", "egress", &["reply", "declare_queryable"], COMMAND),
         ],
         "subjects": subjects,
         "policies": policies,
     })
 }
 
-/// Those refused since the last look, and the reason of the newest.
+/// Refused connections that are not logged yet, and the reason of the newest.
 #[derive(Debug, Default)]
-struct Refused {
+struct UnloggedRefusals {
     count: u64,
     newest: String,
 }
 
-static REFUSED: Mutex<Refused> = Mutex::new(Refused {
+static UNLOGGED: Mutex<UnloggedRefusals> = Mutex::new(UnloggedRefusals {
     count: 0,
     newest: String::new(),
 });
-/// Those told of.
-static TOLD: AtomicU64 = AtomicU64::new(0);
+/// Refused connections that are logged.
+static LOGGED: AtomicU64 = AtomicU64::new(0);
 
-/// Logs who has been refused since the last call, and returns how many have been at all.
-pub fn tell_refusals() -> u64 {
-    let refused = std::mem::take(&mut *REFUSED.lock().unwrap_or_else(PoisonError::into_inner));
+/// Logs the connections refused since the last call; returns the number of all refused connections.
+pub fn log_refusals() -> u64 {
+    let refused = std::mem::take(&mut *UNLOGGED.lock().unwrap_or_else(PoisonError::into_inner));
     match refused.count {
         0 => {}
         1 => tracing::warn!("refused a connection: {}", refused.newest),
         count => tracing::warn!("refused {count} connections, the last: {}", refused.newest),
     }
-    TOLD.fetch_add(refused.count, Ordering::Relaxed) + refused.count
+    LOGGED.fetch_add(refused.count, Ordering::Relaxed) + refused.count
 }
 
-/// Samples that were put where nobody may write.
+/// Samples that access control kept from being written.
 static FORGED: AtomicU64 = AtomicU64::new(0);
 
-/// Samples that others tried to put on keys of ours, and that went nowhere.
+/// Samples that clients tried to put on keys of a run; access control dropped them.
 pub fn forged_samples() -> u64 {
     FORGED.load(Ordering::Relaxed)
 }
 
-/// Where zenoh says what it lets through and what not, in words like these, at level trace.
-const GATE: &str = "zenoh::net::routing::interceptor::access_control";
+/// The module of zenoh that logs each message that access control drops, at level trace, and the texts that it logs for writing.
+const ACCESS_CONTROL_LOG: &str = "zenoh::net::routing::interceptor::access_control";
 const DENIED: [&str; 2] = ["unauthorized to Put (ingress)", "unauthorized to Delete (ingress)"];
 
-/// Places in zenoh that say why a connection was refused, at level debug.
-const WITNESSES: [(&str, &str); 3] = [
+/// Modules of zenoh that log why a connection was refused, at level debug, and how that text begins.
+const REFUSAL_LOGS: [(&str, &str); 3] = [
     ("zenoh_transport::unicast::establishment::accept", ""),
     ("zenoh_transport::unicast::manager", "Failed to accept link"),
     ("zenoh_link_tls::unicast", "Can not accept TLS connection"),
 ];
 
-/// What they say of somebody who is let in, or who looked whether the port is open and left.
+/// Texts of the same modules about a client that was let in, or that only tried whether the port is open.
 const HARMLESS: [&str; 3] = ["New transport link accepted", "early eof", "handshake eof"];
 
-/// Hears from zenoh whom it refuses: it answers a peer that it does not let in by hanging up, and tells nobody else.
+/// Counts refused connections from zenoh's log. zenoh refuses a peer by closing the connection, and reports that nowhere else.
 #[derive(Debug, Clone, Copy)]
 pub struct RefusalLayer;
 
-/// What zenoh must be heard of for [`RefusalLayer`].
-pub const HEARD: &str = "off,zenoh_transport::unicast::establishment::accept=debug,zenoh_transport::unicast::manager=debug,zenoh_link_tls::unicast=debug,\
+/// The filter for [`RefusalLayer`]: the modules and levels of zenoh that it reads.
+pub const REFUSAL_FILTER: &str = "off,zenoh_transport::unicast::establishment::accept=debug,zenoh_transport::unicast::manager=debug,zenoh_link_tls::unicast=debug,\
 zenoh::net::routing::interceptor::access_control=trace";
 
 impl<S: Subscriber> Layer<S> for RefusalLayer {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let target = event.metadata().target();
-        let mut words = Words::default();
-        event.record(&mut words);
-        if target == GATE {
-            if DENIED.iter().any(|denied| words.0.contains(denied)) {
+        let mut message = MessageText::default();
+        event.record(&mut message);
+        let text = message.0;
+        if target == ACCESS_CONTROL_LOG {
+            if DENIED.iter().any(|denied| text.contains(denied)) {
                 FORGED.fetch_add(1, Ordering::Relaxed);
             }
             return;
         }
-        let told = WITNESSES
+        let is_refusal = REFUSAL_LOGS
             .iter()
-            .any(|(witness, begin)| *witness == target && words.0.starts_with(begin))
-            && !HARMLESS.iter().any(|harmless| words.0.contains(harmless));
-        if told {
-            let mut refused = REFUSED.lock().unwrap_or_else(PoisonError::into_inner);
+            .any(|(module, begin)| *module == target && text.starts_with(begin))
+            && !HARMLESS.iter().any(|harmless| text.contains(harmless));
+        if is_refusal {
+            let mut refused = UNLOGGED.lock().unwrap_or_else(PoisonError::into_inner);
             refused.count += 1;
-            refused.newest = plain(&words.0);
+            refused.newest = plain_reason(&text);
         }
     }
 }
 
-/// zenoh's words in ours where they are about credentials; its own are kept behind.
-fn plain(words: &str) -> String {
+/// zenoh's reason in plain words where it is about credentials, with its own text in parentheses.
+fn plain_reason(text: &str) -> String {
     let known = [
         ("Invalid password", "wrong password"),
         ("Invalid user", "unknown user"),
@@ -183,17 +185,18 @@ fn plain(words: &str) -> String {
         ("UnknownCA", "it does not trust our certificate"),
         ("UnknownIssuer", "its certificate is of another authority"),
     ];
-    let short: String = words.split(" at ").next().unwrap_or(words).chars().take(200).collect();
-    match known.iter().find(|(theirs, _)| words.contains(theirs)) {
+    let short: String = text.split(" at ").next().unwrap_or(text).chars().take(200).collect();
+    match known.iter().find(|(theirs, _)| text.contains(theirs)) {
         Some((_, ours)) => format!("{ours} ({short})"),
         None => short,
     }
 }
 
+/// The message of a log event.
 #[derive(Default)]
-struct Words(String);
+struct MessageText(String);
 
-impl Visit for Words {
+impl Visit for MessageText {
     fn record_debug(&mut self, field: &tracing::field::Field, value: &dyn std::fmt::Debug) {
         if field.name() == "message" {
             self.0 = format!("{value:?}");
@@ -207,7 +210,7 @@ mod tests {
 
     fn fanout(listen: &str, commanders: &[&str]) -> Fanout {
         let mut config: ipc_schema::config::Config =
-            serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).unwrap();
+            serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
         config.fanout.listen = listen.into();
         config.fanout.commanders = commanders.iter().map(|&name| name.into()).collect();
         config.fanout
@@ -233,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_may_write_and_only_those_named_may_command() {
+    fn no_client_may_write_and_only_commanders_may_command() {
         let rules = |commanders: &[&str]| access_control(&fanout("tcp/127.0.0.1:1", commanders).commanders);
         for commanders in [&[][..], &["alice"], &["*"]] {
             let control = rules(commanders);
@@ -252,11 +255,11 @@ mod tests {
             let policies = control["policies"].as_array().unwrap();
             policies
                 .iter()
-                .find(|policy| policy["rules"][0] == "commands")
+                .find(|policy| policy["rules"][0] == "send-commands")
                 .map(|policy| policy["subjects"].clone())
         };
         assert_eq!(granted(&rules(&[])), None);
         assert_eq!(granted(&rules(&["alice"])), Some(json!(["users", "certificates"])));
-        assert_eq!(granted(&rules(&["*"])), Some(json!(["everybody"])));
+        assert_eq!(granted(&rules(&["*"])), Some(json!(["every-client"])));
     }
 }

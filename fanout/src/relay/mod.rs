@@ -1,0 +1,91 @@
+//! The main loop: reads shared memory, publishes what is due, reports, and ends with the run.
+//!
+//! [`environment`] is the loop's body for one environment. Its topics come in three groups: [`ticks`] belong to one tick and
+//! are published together, [`slow`] ones change seldom, and [`scans`] are published on demand.
+
+pub mod environment;
+pub mod pace;
+pub mod reporter;
+pub mod scans;
+pub mod slow;
+pub mod ticks;
+
+use ipc_schema::{services::Channel, session::Session};
+
+use crate::{
+    error::FanoutError,
+    network::{endpoint, publisher},
+    relay::{environment::EnvironmentRelay, pace::PollInterval},
+};
+
+/// The fan-out of a run: a relay for each environment, all behind one endpoint.
+pub struct RunRelay {
+    zenoh: zenoh::Session,
+    /// By the number of the environment.
+    environments: Vec<EnvironmentRelay>,
+    poll_interval: PollInterval,
+}
+
+impl RunRelay {
+    /// Opens every channel and key; `membership` is of environment 0.
+    ///
+    /// # Errors
+    /// A service of the run is missing, or the endpoint cannot be listened on.
+    pub fn open(membership: Session) -> Result<Self, FanoutError> {
+        let zenoh = endpoint::listen(&membership.run.config.fanout)?;
+        let poll_interval = PollInterval::new(Channel::World.queue_length(&membership.run));
+        let others: Vec<Session> = (1..membership.run.config.run.envs)
+            .map(|env_index| membership.in_environment(env_index))
+            .collect::<Result<_, _>>()?;
+        let environments = std::iter::once(membership)
+            .chain(others)
+            .zip(0..)
+            .map(|(membership, env_index)| EnvironmentRelay::open(membership, env_index, &zenoh))
+            .collect::<Result<_, _>>()?;
+        Ok(Self {
+            zenoh,
+            environments,
+            poll_interval,
+        })
+    }
+
+    /// Publishes until the last tick of every environment is out, or the process receives a signal to stop.
+    ///
+    /// # Errors
+    /// A port or zenoh broke.
+    pub fn run(mut self) -> Result<(), FanoutError> {
+        for environment in &mut self.environments {
+            environment.announce()?;
+        }
+        // The environments share one wake-up: waiting in the first unfinished one serves all.
+        let mut most_queued = 0;
+        while let Some(environment) = self.environments.iter().find(|environment| !environment.is_finished())
+            && !environment.stop_requested()
+        {
+            environment.wait(self.poll_interval.next(most_queued))?;
+            most_queued = 0;
+            for environment in self
+                .environments
+                .iter_mut()
+                .filter(|environment| !environment.is_finished())
+            {
+                most_queued = environment.publish_due()?.max(most_queued);
+            }
+        }
+        // After a signal, every environment still publishes its newest tick.
+        for environment in self
+            .environments
+            .iter_mut()
+            .filter(|environment| !environment.is_finished())
+        {
+            environment.finish()?;
+        }
+        let publishers = self
+            .environments
+            .into_iter()
+            .map(EnvironmentRelay::into_publisher)
+            .collect();
+        publisher::close(publishers, &self.zenoh);
+        Ok(())
+    }
+}

@@ -1,0 +1,157 @@
+//! The topics `pointcloud/<id>`: a key for each vehicle with a LIDAR, published while a viewer subscribes to it.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use bytemuck::pod_read_unaligned;
+use ipc_schema::{
+    pointcloud::Scan,
+    ports::Message,
+    services::Channel,
+    session::{Session, SessionError},
+};
+use zenoh::bytes::ZBytes;
+
+use crate::{
+    directory::RoadUserDirectory,
+    error::FanoutError,
+    feed::ChannelWatcher,
+    frame::{self, MAX_SCAN_BYTES},
+    network::publisher::{EnvironmentPublisher, KeyPublisher},
+    relay::pace::RateBudget,
+    status::FanoutCounters,
+};
+
+/// How often zenoh is asked whether a key has a subscriber.
+const MATCHING_INTERVAL: Duration = Duration::from_millis(200);
+/// A vehicle without a scan for this long has left.
+const VEHICLE_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// The scans of one vehicle.
+struct ScanStream {
+    key_publisher: KeyPublisher,
+    budget: RateBudget,
+    has_subscriber: bool,
+    /// When zenoh is next asked for subscribers.
+    ask_at: Duration,
+    last_scan_at: Duration,
+}
+
+/// The scans of an environment.
+pub struct ScanTopics {
+    watcher: ChannelWatcher,
+    rate_hz: f64,
+    /// By the hash of the vehicle's id.
+    streams: BTreeMap<u64, ScanStream>,
+}
+
+impl ScanTopics {
+    /// Subscribes to the channel; `None` if no vehicle carries a LIDAR, or `fanout.pointcloud_hz` is 0.
+    ///
+    /// # Errors
+    /// The service cannot be opened.
+    pub fn open(membership: &mut Session) -> Result<Option<Self>, SessionError> {
+        let rate_hz = membership.run.config.fanout.pointcloud_hz;
+        if membership.run.config.lidar.vehicles == 0 || rate_hz <= 0.0 {
+            return Ok(None);
+        }
+        Ok(Some(Self {
+            watcher: ChannelWatcher::open(membership, Channel::Pointcloud)?,
+            rate_hz,
+            streams: BTreeMap::new(),
+        }))
+    }
+
+    /// Messages that were refused.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.watcher.refused()
+    }
+
+    /// Publishes the queued scans that are due, at most as many as a viewer's queue holds.
+    ///
+    /// # Errors
+    /// A port or zenoh broke.
+    pub fn publish_due(
+        &mut self,
+        now: Duration,
+        directory: &RoadUserDirectory,
+        publisher: &EnvironmentPublisher,
+        counters: &mut FanoutCounters,
+    ) -> Result<(), FanoutError> {
+        let mut burst_bytes = 0;
+        while let Some(message) = self.watcher.receive()? {
+            if burst_bytes < MAX_SCAN_BYTES {
+                burst_bytes += self.publish_scan(&message, now, directory, publisher, counters)?;
+            }
+        }
+        self.streams.retain(|_, stream| {
+            let stays = now.saturating_sub(stream.last_scan_at) < VEHICLE_TIMEOUT;
+            if !stays {
+                publisher.forget(&stream.key_publisher);
+            }
+            stays
+        });
+        Ok(())
+    }
+
+    /// Publishes one scan if it is due; returns its length, bytes.
+    fn publish_scan(
+        &mut self,
+        message: &Message,
+        now: Duration,
+        directory: &RoadUserDirectory,
+        publisher: &EnvironmentPublisher,
+        counters: &mut FanoutCounters,
+    ) -> Result<usize, FanoutError> {
+        // Find the vehicle's stream, or declare one for a vehicle whose id is known.
+        let header = message.header();
+        let Some(scan) = message.payload().get(..size_of::<Scan>()) else {
+            counters.refused_messages += 1;
+            return Ok(0);
+        };
+        let id_hash = pod_read_unaligned::<Scan>(scan).id_hash;
+        if !self.streams.contains_key(&id_hash) {
+            let index = u32::try_from(header.sequence).unwrap_or(u32::MAX);
+            let Some(meta) = directory.vehicle(index).filter(|meta| meta.id_hash == id_hash) else {
+                counters.unnamed_scans += 1;
+                return Ok(0);
+            };
+            let stream = ScanStream {
+                key_publisher: publisher.declare_scan(&meta.id_text())?,
+                budget: RateBudget::new(self.rate_hz),
+                has_subscriber: false,
+                ask_at: Duration::ZERO,
+                last_scan_at: now,
+            };
+            self.streams.insert(id_hash, stream);
+        }
+        let Some(stream) = self.streams.get_mut(&id_hash) else {
+            return Ok(0);
+        };
+        // Is there a subscriber, and is a scan due?
+        stream.last_scan_at = now;
+        if now >= stream.ask_at {
+            stream.ask_at = now + MATCHING_INTERVAL;
+            stream.has_subscriber = stream.key_publisher.has_subscriber();
+        }
+        if !stream.has_subscriber || !stream.budget.allows(now) {
+            return Ok(0);
+        }
+        // Publish it.
+        match frame::encode(Channel::Pointcloud, header, message.payload()) {
+            Ok(frame) => {
+                let bytes = frame.bytes.len();
+                stream.budget.spend(bytes);
+                counters.frames += 1;
+                counters.thinned_rows += frame.left_out as u64;
+                let value = ZBytes::from(frame.bytes);
+                publisher.publish_on(&mut stream.key_publisher, value.clone(), Some(value))?;
+                Ok(bytes)
+            }
+            Err(error) => {
+                counters.refuse("pointcloud", &error);
+                Ok(0)
+            }
+        }
+    }
+}
