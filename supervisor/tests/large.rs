@@ -86,6 +86,43 @@ fn neither_the_window_nor_a_consumer_changes_what_is_observed_at_long_steps() {
     workplace.assert_nothing_left();
 }
 
+/// A grid where the first vehicle departs after two seconds, as SUMO's `grid6` and `corridor` begin: its first ticks are empty.
+#[test]
+fn training_begins_on_a_scenario_whose_first_ticks_have_no_vehicle() {
+    let workplace = Workplace::new();
+    tool(
+        &sumo_program("netgenerate"),
+        &["--grid", "--grid.number", "3", "-o", "a.net.xml"],
+        workplace.path(),
+    );
+    let vehicles: String = (2..20)
+        .map(|second| format!("<vehicle id=\"{second}\" depart=\"{second}\"><route edges=\"A0A1 A1A2 A2B2\"/></vehicle>"))
+        .collect();
+    workplace.write("a.rou.xml", &format!("<routes>{vehicles}</routes>"));
+    workplace.write(
+        "a.sumocfg",
+        "<configuration><input><net-file value=\"a.net.xml\"/><route-files value=\"a.rou.xml\"/></input>\
+         <time><step-length value=\"0.1\"/></time></configuration>",
+    );
+    let settings = [
+        "episode.training_episodes=2",
+        "episode.ticks=120",
+        "episode.evaluation_ticks=40",
+        "trainer.horizon=200",
+        "trainer.batch_size=100",
+        "map.origin_latitude_deg=52",
+        "map.origin_longitude_deg=10",
+        "fanout.enabled=false",
+    ];
+    let settings = settings.iter().flat_map(|setting| ["--set", *setting]);
+    let arguments: Vec<&str> = ["train", "a.sumocfg", "--name", "late"].into_iter().chain(settings).collect();
+    workplace.succeed(&arguments);
+    let report = workplace.report("late");
+    assert_eq!(report["trainer"]["lost_ticks"], 0, "{report:#}");
+    assert!(report["trainer"]["updates"].as_u64().unwrap() > 0, "{report:#}");
+    workplace.assert_nothing_left();
+}
+
 #[test]
 fn a_generated_city_runs_as_its_generator_says() {
     let workplace = Workplace::new();

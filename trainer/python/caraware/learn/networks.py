@@ -147,8 +147,8 @@ class Mlp:
         return output
 
     def reserve(self, rows: int) -> None:
-        """Room for so many rows. It stays where it is until more are asked for."""
-        if rows > self._rows:
+        """Make room for `rows` rows, also for none; the workspace stays where it is until more are asked for."""
+        if rows > self._rows or not self._activated:
             self._activated = [torch.empty(rows, layer.outputs, device=self._device) for layer in self.layers]
             self._gradients = [torch.empty(rows, layer.outputs, device=self._device) for layer in self.layers]
             self._rows = rows
