@@ -142,6 +142,14 @@ fn option(
                 scenario.additional_files = files;
             }
         }
+        // SUMO would open the port on all interfaces and wait for a client before its first step.
+        "remote-port" if value.trim() != "0" => {
+            return Err(problem(
+                path,
+                format!("line {line}: remote-port = \"{value}\" makes SUMO wait for a TraCI client, and none can connect to a run"),
+                "remove remote-port from the .sumocfg (traffic-bridge steps SUMO in its own process), or keep a copy without it",
+            ));
+        }
         "step-length" => scenario.step_s = Some(number(&value, &name, path, line)?),
         "seed" => scenario.seed = Some(number(&value, &name, path, line)?),
         _ => {}
