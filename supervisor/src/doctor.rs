@@ -207,4 +207,7 @@ fn runs(clean: bool) {
     if entries.is_empty() {
         println!("ok       no stale run");
     }
+    for path in registry::strangers() {
+        println!("note     {}: not a run of caraware; left alone", path.display());
+    }
 }

@@ -1,42 +1,117 @@
 //! Which runs are alive on this machine, and what dead ones left in shared memory.
 //!
-//! Every run has a directory of its own below `/tmp/caraware-<user id>/` (or `CARAWARE_RUNTIME_DIR`): a lock that its supervisor
-//! holds, the path of its run directory, and iceoryx2's files. Files in `/dev/shm` carry the directory's name in their prefix.
+//! Every run has a directory of its own below `/tmp/caraware-<user id>/` (or `CARAWARE_RUNTIME_DIR`): a marker that names its
+//! owner and its run directory, a lock that its supervisor holds, and iceoryx2's files. Files in `/dev/shm` carry the
+//! directory's name in their prefix. Only a directory with a valid marker is ever removed: [`base`] may be any directory
+//! of the user.
 
 use std::{
-    fs::{DirBuilder, File, OpenOptions},
+    fs::{DirBuilder, File, OpenOptions, Permissions},
     io::{Read as _, Write as _},
-    os::unix::fs::DirBuilderExt as _,
+    os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _, PermissionsExt as _},
     path::{Path, PathBuf},
 };
 
-use ipc_schema::run::{RunFile, SharedMemory};
-use rustix::fs::{FlockOperation, flock};
+use ipc_schema::{
+    SCHEMA_VERSION,
+    run::{RunFile, SharedMemory},
+};
+use rustix::fs::{FlockOperation, OFlags, flock};
+use serde::{Deserialize, Serialize};
 
 use crate::failure::Exit;
 
 /// Where iceoryx2 puts shared memory.
 pub const SHARED_MEMORY: &str = "/dev/shm";
 const LOCK: &str = "lock";
-const RUN_DIR: &str = "run_dir";
+/// File that makes a directory recognisable as one of ours.
+const MARKER: &str = "caraware-run.json";
+/// Value of [`Marker::program`].
+const PROGRAM: &str = "caraware";
+/// A longer marker is not ours, bytes.
+const MARKER_BYTES: u64 = 16 << 10;
+/// Hexadecimal digits of a directory's name.
+const NAME_DIGITS: usize = 8;
 
 /// Environment variable that moves [`base`].
 const RUNTIME_DIR: &str = "CARAWARE_RUNTIME_DIR";
 /// Longest [`base`]: iceoryx2's sockets lie below it, and Unix allows their paths 107 bytes.
 const BASE_BYTES: usize = 40;
 
+/// What a run writes into its directory before the directory gets its name.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+struct Marker {
+    /// [`PROGRAM`].
+    program: String,
+    /// User that owns the run.
+    user_id: u32,
+    /// [`SCHEMA_VERSION`] of the program that wrote it.
+    schema_version: u32,
+    /// Where the run writes its results.
+    run_dir: PathBuf,
+}
+
+impl Marker {
+    fn new(run_dir: &Path) -> Self {
+        Self {
+            program: PROGRAM.into(),
+            user_id: user_id(),
+            schema_version: SCHEMA_VERSION,
+            run_dir: run_dir.into(),
+        }
+    }
+
+    /// The marker of a directory that this program wrote for this user; `None` for every other directory. Links are not followed.
+    fn of(directory: &Path) -> Option<Self> {
+        let name = directory.file_name()?.to_str()?;
+        let is_name = name.len() == NAME_DIGITS && name.bytes().all(|byte| byte.is_ascii_hexdigit());
+        let data = directory.symlink_metadata().ok()?;
+        if !is_name || !data.is_dir() || data.uid() != user_id() {
+            return None;
+        }
+        // Without NONBLOCK a FIFO in the marker's place would never open.
+        let file = OpenOptions::new()
+            .read(true)
+            .custom_flags((OFlags::NOFOLLOW | OFlags::NONBLOCK).bits().cast_signed())
+            .open(directory.join(MARKER))
+            .ok()?;
+        let data = file.metadata().ok()?;
+        if !data.is_file() || data.uid() != user_id() {
+            return None;
+        }
+        let mut text = String::new();
+        file.take(MARKER_BYTES).read_to_string(&mut text).ok()?;
+        let marker: Self = serde_json::from_str(&text).ok()?;
+        (marker.program == PROGRAM && marker.user_id == user_id()).then_some(marker)
+    }
+
+    fn write(&self, directory: &Path) -> std::io::Result<()> {
+        OpenOptions::new()
+            .create_new(true)
+            .write(true)
+            .mode(0o600)
+            .open(directory.join(MARKER))?
+            .write_all(&serde_json::to_vec(self)?)
+    }
+}
+
+fn user_id() -> u32 {
+    rustix::process::getuid().as_raw()
+}
+
+/// True if the user chose [`base`]: then it is not ours to remove or to change.
+fn is_chosen() -> bool {
+    std::env::var_os(RUNTIME_DIR).is_some()
+}
+
 /// The directory of all runs of this user. Not in `TMPDIR`, which may be long and differ between terminals.
 #[must_use]
 pub fn base() -> PathBuf {
-    std::env::var_os(RUNTIME_DIR).map_or_else(
-        || format!("/tmp/caraware-{}", rustix::process::getuid().as_raw()).into(),
-        PathBuf::from,
-    )
+    std::env::var_os(RUNTIME_DIR).map_or_else(|| format!("/tmp/caraware-{}", user_id()).into(), PathBuf::from)
 }
 
 /// Creates [`base`] for this user alone.
 fn create_base() -> Result<PathBuf, Exit> {
-    use std::os::unix::fs::MetadataExt as _;
     let base = base();
     let help = format!("set {RUNTIME_DIR} to a short path of your own, up to {BASE_BYTES} bytes");
     if base.as_os_str().len() > BASE_BYTES || !base.is_absolute() {
@@ -50,12 +125,21 @@ fn create_base() -> Result<PathBuf, Exit> {
         .mode(0o700)
         .create(&base)
         .map_err(|error| Exit::io("create", &base, &error))?;
-    let owner = base
-        .metadata()
-        .map_err(|error| Exit::io("look at", &base, &error))?
-        .uid();
-    if owner != rustix::process::getuid().as_raw() {
+    let looked_at = if is_chosen() {
+        base.metadata()
+    } else {
+        base.symlink_metadata()
+    };
+    let data = looked_at.map_err(|error| Exit::io("look at", &base, &error))?;
+    if data.uid() != user_id() {
         return Err(Exit::run(format!("{} belongs to another user", base.display()), help));
+    }
+    if !data.is_dir() {
+        return Err(Exit::run(format!("{} is not a directory", base.display()), help));
+    }
+    if !is_chosen() && data.mode() & 0o077 != 0 {
+        std::fs::set_permissions(&base, Permissions::from_mode(0o700))
+            .map_err(|error| Exit::io("close to other users", &base, &error))?;
     }
     Ok(base)
 }
@@ -75,30 +159,33 @@ pub struct Claim {
 impl Claim {
     /// Claims a fresh corner for the run in `run_dir`.
     ///
+    /// The directory gets its name when it is complete and locked, so that no other run takes it for a dead one.
+    ///
     /// # Errors
-    /// The temporary directory is not writable.
+    /// The runtime directory is not writable.
     pub fn new(run_dir: &Path) -> Result<Self, Exit> {
         let run_id = random_u64()?;
         let name = format!("{:08x}", run_id >> 32);
-        let directory = create_base()?.join(&name);
+        let base = create_base()?;
+        let directory = base.join(&name);
+        let unnamed = base.join(format!(".{name}"));
         DirBuilder::new()
-            .recursive(true)
             .mode(0o700)
-            .create(&directory)
-            .map_err(|error| Exit::io("create", &directory, &error))?;
-        let path = directory.join(LOCK);
+            .create(&unnamed)
+            .map_err(|error| Exit::io("create", &unnamed, &error))?;
+        let path = unnamed.join(LOCK);
         let lock = OpenOptions::new()
-            .create(true)
-            .truncate(false)
+            .create_new(true)
             .write(true)
+            .mode(0o600)
             .open(&path)
             .map_err(|error| Exit::io("create", &path, &error))?;
         flock(&lock, FlockOperation::NonBlockingLockExclusive)
             .map_err(|error| Exit::io("lock", &path, &error.into()))?;
-        let path = directory.join(RUN_DIR);
-        File::create(&path)
-            .and_then(|mut file| file.write_all(run_dir.as_os_str().as_encoded_bytes()))
-            .map_err(|error| Exit::io("write", &path, &error))?;
+        Marker::new(run_dir)
+            .write(&unnamed)
+            .map_err(|error| Exit::io("write", &unnamed.join(MARKER), &error))?;
+        std::fs::rename(&unnamed, &directory).map_err(|error| Exit::io("create", &directory, &error))?;
         let memory = SharedMemory {
             root: directory.clone(),
             prefix: prefix(&name),
@@ -115,6 +202,9 @@ impl Claim {
 impl Drop for Claim {
     fn drop(&mut self) {
         remove(&self.directory);
+        if is_chosen() {
+            return;
+        }
         // The last run leaves nothing; with another one alive the directory is not empty, and stays.
         if let Err(error) = std::fs::remove_dir(base()) {
             tracing::debug!(%error, "the registry stays");
@@ -145,27 +235,37 @@ pub struct Entry {
     pub run: Option<RunFile>,
 }
 
-/// All runs of this user, dead or alive, in a stable order.
-#[must_use]
-pub fn entries() -> Vec<Entry> {
-    let mut directories: Vec<PathBuf> = std::fs::read_dir(base())
+/// Paths directly below [`base`], in a stable order.
+fn paths() -> Vec<PathBuf> {
+    let mut paths: Vec<PathBuf> = std::fs::read_dir(base())
         .into_iter()
         .flatten()
         .flatten()
         .map(|entry| entry.path())
         .collect();
-    directories.sort();
-    directories.into_iter().map(Entry::read).collect()
+    paths.sort();
+    paths
+}
+
+/// All runs of this user, dead or alive, in a stable order.
+#[must_use]
+pub fn entries() -> Vec<Entry> {
+    paths().into_iter().filter_map(Entry::read).collect()
+}
+
+/// What lies in [`base`] and is not a run of this user: it is never touched.
+#[must_use]
+pub fn strangers() -> Vec<PathBuf> {
+    paths().into_iter().filter(|path| Marker::of(path).is_none()).collect()
 }
 
 impl Entry {
-    fn read(directory: PathBuf) -> Self {
+    fn read(directory: PathBuf) -> Option<Self> {
+        let marker = Marker::of(&directory)?;
         let alive = File::open(directory.join(LOCK))
             .is_ok_and(|lock| flock(&lock, FlockOperation::NonBlockingLockShared).is_err());
-        let run = std::fs::read_to_string(directory.join(RUN_DIR))
-            .ok()
-            .and_then(|run_dir| RunFile::read(&Path::new(&run_dir).join("run.json")).ok());
-        Self { directory, alive, run }
+        let run = RunFile::read(&marker.run_dir.join("run.json")).ok();
+        Some(Self { directory, alive, run })
     }
 
     /// Bytes the run holds in shared memory.
@@ -260,5 +360,53 @@ pub fn find(name: Option<&str>) -> Result<RunFile, Exit> {
             "several runs are alive",
             format!("name one of them: {names}"),
         )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A directory called `name` as a run leaves it that died; `change` spoils the marker.
+    fn dead(base: &Path, name: &str, change: impl FnOnce(&mut Marker)) -> PathBuf {
+        let directory = base.join(name);
+        std::fs::create_dir_all(&directory).unwrap();
+        File::create(directory.join(LOCK)).unwrap();
+        let mut marker = Marker::new(Path::new("/nowhere"));
+        change(&mut marker);
+        marker.write(&directory).unwrap();
+        directory
+    }
+
+    #[test]
+    fn only_a_directory_with_our_marker_is_a_run() {
+        let base = tempfile::tempdir().unwrap();
+        let ours = dead(base.path(), "0123abcd", |_| {});
+        assert_eq!(Marker::of(&ours), Some(Marker::new(Path::new("/nowhere"))));
+        assert!(!Entry::read(ours).unwrap().alive);
+        let strange = [
+            dead(base.path(), "0123abc", |_| {}),
+            dead(base.path(), "my-thesis", |_| {}),
+            dead(base.path(), "0123abc1", |marker| marker.program = "other".into()),
+            dead(base.path(), "0123abc2", |marker| marker.user_id += 1),
+        ];
+        for directory in strange {
+            assert_eq!(Marker::of(&directory), None, "{}", directory.display());
+        }
+    }
+
+    #[test]
+    fn a_link_to_a_run_and_a_damaged_marker_are_no_runs() {
+        let base = tempfile::tempdir().unwrap();
+        let ours = dead(base.path(), "0123abcd", |_| {});
+        let link = base.path().join("89abcdef");
+        std::os::unix::fs::symlink(&ours, &link).unwrap();
+        assert_eq!(Marker::of(&link), None);
+        let linked = base.path().join("89abcde0");
+        std::fs::create_dir(&linked).unwrap();
+        std::os::unix::fs::symlink(ours.join(MARKER), linked.join(MARKER)).unwrap();
+        assert_eq!(Marker::of(&linked), None);
+        std::fs::write(ours.join(MARKER), "{\"program\": \"caraware\"").unwrap();
+        assert_eq!(Marker::of(&ours), None);
     }
 }

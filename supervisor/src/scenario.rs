@@ -146,7 +146,9 @@ fn option(
         "remote-port" if value.trim() != "0" => {
             return Err(problem(
                 path,
-                format!("line {line}: remote-port = \"{value}\" makes SUMO wait for a TraCI client, and none can connect to a run"),
+                format!(
+                    "line {line}: remote-port = \"{value}\" makes SUMO wait for a TraCI client, and none can connect to a run"
+                ),
                 "remove remote-port from the .sumocfg (traffic-bridge steps SUMO in its own process), or keep a copy without it",
             ));
         }

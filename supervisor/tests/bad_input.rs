@@ -10,7 +10,7 @@ mod common;
 
 use std::net::TcpListener;
 
-use common::{Workplace, shared_memory, sumo_program, text, tool};
+use common::{Workplace, shared_memory, sumo_program, text, tool, tree};
 
 /// Runs a command that must be refused, and returns what it said in one line.
 fn refused(workplace: &Workplace, arguments: &[&str], exit_code: i32) -> String {
@@ -190,6 +190,46 @@ fn simulate(workplace: &Workplace, routes: &str, settings: &[&str]) -> String {
     ];
     arguments.extend(settings);
     refused(workplace, &arguments, 2)
+}
+
+#[test]
+fn remote_port_is_refused_before_sumo_would_wait() {
+    let workplace = Workplace::new();
+    scenario(&workplace, "<routes/>");
+    workplace.write(
+        "grid.sumocfg",
+        "<configuration>\n  <input>\n    <net-file value=\"grid.net.xml\"/>\n  </input>\n  <traci_server>\n    \
+         <remote-port value=\"8813\"/>\n  </traci_server>\n</configuration>\n",
+    );
+    for mode in ["simulate", "train"] {
+        let said = refused(&workplace, &[mode, "grid.sumocfg"], 2);
+        assert_says(
+            &said,
+            &["grid.sumocfg", "line 6", "remote-port = \"8813\"", "remove remote-port"],
+        );
+    }
+    assert!(!workplace.path().join("runs").exists());
+}
+
+/// A runtime directory that the user chose may hold anything: neither a run nor `doctor --clean` removes what is not a run's.
+#[test]
+fn what_lies_in_the_runtime_directory_and_is_not_a_run_stays() {
+    let workplace = Workplace::new();
+    let runtime = workplace.path().join("run");
+    for directory in ["thesis/chapters", ".config", "0123abcd"] {
+        std::fs::create_dir_all(runtime.join(directory)).unwrap();
+        std::fs::write(runtime.join(directory).join("precious"), "years of work").unwrap();
+    }
+    // As a dead run of another program might look: an unlocked file of this name, and no marker of ours.
+    std::fs::write(runtime.join("0123abcd").join("lock"), "").unwrap();
+    std::os::unix::fs::symlink(runtime.join("thesis"), runtime.join("89abcdef")).unwrap();
+    let before = tree(&runtime);
+    let short = ["--set", "run.real_time_factor=0", "--set", "fanout.enabled=false"];
+    let episode = ["--set", "episode.training_episodes=1", "--set", "episode.ticks=20"];
+    workplace.succeed(&[&["simulate", "town", "--name", "beside"], &short[..], &episode[..]].concat());
+    let said = text(&workplace.succeed(&["doctor", "--clean"]));
+    assert!(said.contains("thesis: not a run of caraware; left alone"), "{said}");
+    assert_eq!(tree(&runtime), before);
 }
 
 #[test]

@@ -96,7 +96,9 @@ fn training_begins_on_a_scenario_whose_first_ticks_have_no_vehicle() {
         workplace.path(),
     );
     let vehicles: String = (2..20)
-        .map(|second| format!("<vehicle id=\"{second}\" depart=\"{second}\"><route edges=\"A0A1 A1A2 A2B2\"/></vehicle>"))
+        .map(|second| {
+            format!("<vehicle id=\"{second}\" depart=\"{second}\"><route edges=\"A0A1 A1A2 A2B2\"/></vehicle>")
+        })
         .collect();
     workplace.write("a.rou.xml", &format!("<routes>{vehicles}</routes>"));
     workplace.write(
@@ -115,7 +117,10 @@ fn training_begins_on_a_scenario_whose_first_ticks_have_no_vehicle() {
         "fanout.enabled=false",
     ];
     let settings = settings.iter().flat_map(|setting| ["--set", *setting]);
-    let arguments: Vec<&str> = ["train", "a.sumocfg", "--name", "late"].into_iter().chain(settings).collect();
+    let arguments: Vec<&str> = ["train", "a.sumocfg", "--name", "late"]
+        .into_iter()
+        .chain(settings)
+        .collect();
     workplace.succeed(&arguments);
     let report = workplace.report("late");
     assert_eq!(report["trainer"]["lost_ticks"], 0, "{report:#}");
