@@ -1,4 +1,4 @@
-"""Headless Chromium, driven by the DevTools protocol over a pipe: no package beside the browser is needed."""
+"""Headless Chromium, driven by the DevTools protocol over a pipe, without a package beside the browser."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ QUIET = "console.debug = () => {};"
 
 
 def find() -> str:
-    """Path of the browser; fails with what to do if there is none: a test left out would be a test passed."""
+    """Path of the browser. Without one the test fails and says what to install."""
     for name in filter(None, (os.environ.get(CHOSEN), *NAMES)):
         path = shutil.which(name)
         if path is not None:
@@ -56,21 +56,21 @@ class Browser:
         self._profile = tempfile.TemporaryDirectory(prefix="caraware-browser-", ignore_cleanup_errors=True)
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
-        # Chromium reads commands from descriptor 3 and writes answers to 4: out of their way first.
+        # Chromium reads commands from descriptor 3 and writes answers to 4, so our ends move to other numbers first.
         ours = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, 10) for descriptor in (to_read, to_write)]
         os.close(to_read)
         os.close(to_write)
 
-        def hand_over() -> None:
-            for descriptor, place in zip(ours, (3, 4), strict=True):
-                os.dup2(descriptor, place)
+        def pass_descriptors() -> None:
+            for descriptor, number in zip(ours, (3, 4), strict=True):
+                os.dup2(descriptor, number)
 
         arguments = [find(), *ARGUMENTS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}"]
         self._process = subprocess.Popen(
             [*arguments, "about:blank"],
             stderr=subprocess.DEVNULL,
             close_fds=False,
-            preexec_fn=hand_over,
+            preexec_fn=pass_descriptors,
             start_new_session=True,
         )
         for descriptor in ours:
@@ -78,9 +78,9 @@ class Browser:
         self._buffer = b""
         self._id = 0
         self.requests: list[str] = []
-        """Addresses that the page asked for."""
+        """Addresses that the page requested."""
         self.refused: list[str] = []
-        """What the page wrote to its console about its content security policy."""
+        """Messages of the page's console about its content security policy."""
         self._session: str | None = None
         targets = self.call("Target.getTargets")["targetInfos"]
         page = next(target for target in targets if target["type"] == "page")
@@ -92,7 +92,7 @@ class Browser:
         self.call("Page.addScriptToEvaluateOnNewDocument", source=QUIET)
 
     def open(self, url: str) -> None:
-        """Goes to an address."""
+        """Opens an address."""
         self.call("Page.navigate", url=url)
 
     def evaluate(self, expression: str) -> Any:
@@ -108,11 +108,11 @@ class Browser:
             time.sleep(0.1)
 
     def screenshot(self) -> NDArray[np.uint8]:
-        """What is to be seen, `[height, width, 3]`."""
-        data = self.call("Page.captureScreenshot", format="png", timeout_s=120.0)["data"]
+        """A picture of the page, `[height, width, 3]`."""
+        data = self.call("Page.captureScreenshot", format="png", timeout_s=300.0)["data"]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
-    def call(self, method: str, timeout_s: float = 30.0, **parameters: Any) -> dict[str, Any]:
+    def call(self, method: str, timeout_s: float = 120.0, **parameters: Any) -> dict[str, Any]:
         """Sends a command and waits for its answer."""
         self._id += 1
         message: dict[str, Any] = {"id": self._id, "method": method, "params": parameters}
@@ -125,10 +125,11 @@ class Browser:
             if answer.get("id") == self._id:
                 if "error" in answer:
                     raise RuntimeError(f"{method}: {answer['error']['message']}")
-                return answer["result"]
-            self._note(answer)
+                result: dict[str, Any] = answer["result"]
+                return result
+            self._record(answer)
 
-    def _note(self, event: dict[str, Any]) -> None:
+    def _record(self, event: dict[str, Any]) -> None:
         if event.get("method") == "Network.requestWillBeSent":
             self.requests.append(event["params"]["request"]["url"])
         elif event.get("method") == "Log.entryAdded" and "Content Security Policy" in event["params"]["entry"]["text"]:
@@ -144,7 +145,8 @@ class Browser:
                 raise RuntimeError(f"the browser ended with exit code {self._process.wait()}")
             self._buffer += chunk
         line, _, self._buffer = self._buffer.partition(b"\0")
-        return json.loads(line)
+        answer: dict[str, Any] = json.loads(line)
+        return answer
 
     def __enter__(self) -> Browser:
         return self

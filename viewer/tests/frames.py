@@ -1,4 +1,4 @@
-"""Frames made by hand, as a fan-out would send them."""
+"""Builds frames as the fan-out sends them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def header(tick: int, count: int, columns: int, **fields: int) -> bytes:
 
 
 def states(count: int = 3, tick: int = 0, **fields: Any) -> np.ndarray:
-    """A row of vehicles heading east, 10 m apart; the third of every three is a pedestrian."""
+    """Road users in a row, 10 m apart, heading east; every third one is a pedestrian."""
     rows = np.zeros(count, wire.VEHICLE_STATE)
     rows["x_m"] = 10.0 * np.arange(count) + tick
     rows["y_m"] = 50.0

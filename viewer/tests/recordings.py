@@ -1,4 +1,4 @@
-"""Recordings read back: what was logged, when, on which entity."""
+"""Reads a recording back: the values of each entity, and their times."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from rerun.chunk import RrdReader
 from caraware_viewer.canvas import TIMELINE
 
 ALWAYS = float("-inf")
-"""Time of what is static."""
+"""Time of a static row."""
 
 
 @dataclass
 class Entity:
-    """Everything logged on one path."""
+    """Everything that was logged on one path."""
 
     rows: list[tuple[float, dict[str, Any]]] = field(default_factory=list)
     """Simulated time in seconds, values by component ("Points2D:positions")."""
 
     def newest(self, component: str) -> Any:
-        """Its last value."""
+        """The last value of a component."""
         return [row[component] for _, row in self.rows if row.get(component) is not None][-1]
 
 

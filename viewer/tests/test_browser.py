@@ -1,4 +1,4 @@
-"""The whole way: a run on the town, `caraware view --web`, and what a real browser shows of it.
+"""The whole chain: a run on the town, `caraware view --web`, and the page in a real browser.
 
 `CARAWARE_SCREENSHOT=docs/images/viewer.png pytest viewer/tests/test_browser.py` makes the README's picture.
 """
@@ -9,11 +9,10 @@ import contextlib
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -23,6 +22,7 @@ import recordings
 from browser import Browser
 from numpy.typing import NDArray
 from PIL import Image
+from ports import free_port
 
 from caraware_viewer import plots, scene, space, static_map, top
 
@@ -30,7 +30,8 @@ ROOT = Path(__file__).parents[2]
 COMMAND = ROOT / "target" / "release" / "caraware"
 PICTURE = os.environ.get("CARAWARE_SCREENSHOT")
 SIZE = (1000, 600)
-# Paced, so that the browser's software renderer keeps up and the filter runs; a learner that updates after seconds.
+# Paced, so that the browser's software renderer keeps up and the filter runs. Small batches make the learner update
+# after seconds.
 SETTINGS = (
     "run.real_time_factor=1.0",
     "lidar.vehicles=4",
@@ -38,19 +39,14 @@ SETTINGS = (
     "trainer.batch_size=256",
     *(f"fanout.{topic}_hz=2" for topic in ("world", "observation", "prediction", "pointcloud", "status")),
 )
-SEEN_WITHIN_S = 150.0
+PICTURE_LIMIT_S = 300.0
 
 Picture = NDArray[np.uint8]
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
 @contextlib.contextmanager
 def started(arguments: list[str], log: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that is asked to end at the end, and must do so."""
+    """Starts a process; at the end it gets SIGINT, and must end."""
     with log.open("wb") as output:
         process = subprocess.Popen(arguments, stdout=output, stderr=output, env=environment, cwd=ROOT)
     try:
@@ -58,15 +54,15 @@ def started(arguments: list[str], log: Path, environment: dict[str, str]) -> Ite
     finally:
         process.send_signal(signal.SIGINT)
         try:
-            process.wait(60)
+            process.wait(180)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
             raise
 
 
-def said(log: Path, pattern: str, process: subprocess.Popen[bytes], timeout_s: float) -> str:
-    """Waits until the log says something; the first group of the pattern."""
+def wait_for_line(log: Path, pattern: str, process: subprocess.Popen[bytes], timeout_s: float) -> str:
+    """Waits for a line in the log; returns the first group of the pattern."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         found = re.search(pattern, log.read_text(errors="replace"))
@@ -101,7 +97,8 @@ def plots_of(picture: Picture) -> Picture:
 
 def of_color(region: Picture, rgb: list[int] | tuple[int, ...], tolerance: int = 20) -> NDArray[np.bool_]:
     """Pixels near a colour."""
-    return (np.abs(region.astype(int) - np.array(rgb)) <= tolerance).all(axis=-1)
+    near: NDArray[np.bool_] = (np.abs(region.astype(int) - np.array(rgb)) <= tolerance).all(axis=-1)
+    return near
 
 
 def rgb(rgba: int) -> tuple[int, ...]:
@@ -112,7 +109,7 @@ CAV = rgb(top.KIND_COLORS[0])
 
 
 def missing(picture: Picture) -> list[str]:
-    """What is not to be seen (yet)."""
+    """What the picture does not show (yet)."""
     seen = {
         "roads": of_color(map_of(picture), static_map.ROAD_COLOR, 5).sum() > 3000,
         "sidewalks": of_color(map_of(picture), static_map.WALK_COLOR, 6).sum() > 500,
@@ -141,18 +138,18 @@ def unmoved(before: Picture, after: Picture) -> list[str]:
     return [what for what, has in moved.items() if not has]
 
 
-def look(browser: Browser, wanted, what: str) -> Picture:
-    """Takes pictures until nothing wanted is missing."""
-    deadline = time.monotonic() + SEEN_WITHIN_S
+def wait_for_picture(browser: Browser, find_missing: Callable[[Picture], list[str]], what: str) -> Picture:
+    """Takes pictures until nothing is missing."""
+    deadline = time.monotonic() + PICTURE_LIMIT_S
     while True:
         picture = browser.screenshot()
-        absent = wanted(picture)
+        absent = find_missing(picture)
         if not absent:
             return picture
         if time.monotonic() > deadline:
             path = Path(os.environ.get("TMPDIR", "/tmp")) / "caraware-viewer-failed.png"
             Image.fromarray(picture).save(path)
-            pytest.fail(f"{what} after {SEEN_WITHIN_S:g} s: {', '.join(absent)}; the picture is {path}")
+            pytest.fail(f"{what} after {PICTURE_LIMIT_S:g} s: {', '.join(absent)}; the picture is {path}")
         time.sleep(0.5)
 
 
@@ -169,26 +166,28 @@ def test_a_browser_shows_the_run_and_it_moves(tmp_path: Path) -> None:
     recorded = tmp_path / "run.rrd"
     view = [str(COMMAND), "view", "--web", "--web-port", str(free_port()), "--save", str(recorded), "--lidar", "all"]
     with started(run, tmp_path / "run.log", environment) as running:
-        said(tmp_path / "run.log", r"(error \d)", running, 90)
+        wait_for_line(tmp_path / "run.log", r"(error \d)", running, 300)
         with started(view, tmp_path / "view.log", environment) as viewing:
-            url = said(tmp_path / "view.log", r"open (http://\S+) in a browser", viewing, 30)
+            url = wait_for_line(tmp_path / "view.log", r"open (http://\S+) in a browser", viewing, 120)
             with Browser(*SIZE) as browser:
                 browser.open(f"{url}?renderer=webgl")
-                browser.wait_for("window._handle !== undefined", 60)
-                first = look(browser, missing, "not to be seen")
-                second = look(browser, lambda picture: missing(picture) + unmoved(first, picture), "still")
+                browser.wait_for("window._handle !== undefined", 180)
+                first = wait_for_picture(browser, missing, "not in the picture")
+                second = wait_for_picture(
+                    browser, lambda picture: missing(picture) + unmoved(first, picture), "not moving"
+                )
                 hosts = {urlsplit(address).hostname for address in browser.requests}
             assert viewing.poll() is None
         assert viewing.returncode == 130, (tmp_path / "view.log").read_text()
         assert running.poll() is None, "the run ended with its viewer"
-    assert hosts <= {"127.0.0.1", None}, "the page asked other hosts"
+    assert hosts <= {"127.0.0.1", None}, "the page sent requests to other hosts"
     if PICTURE:
         Image.fromarray(second).quantize(192, dither=Image.Dither.NONE).save(ROOT / PICTURE, optimize=True)
     check_recording(recorded)
 
 
 def check_recording(path: Path) -> None:
-    """The same run, as recorded beside: everything has data, over simulated time."""
+    """The recording of the same run has data of every entity, over simulated time."""
     found = recordings.read(path)
     figures = [
         plots.POLICY_ERROR,

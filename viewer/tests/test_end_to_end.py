@@ -1,10 +1,9 @@
-"""The command against a real zenoh session that plays the fan-out."""
+"""The command line, against a real zenoh session that stands in for the fan-out."""
 
 from __future__ import annotations
 
 import json
 import os
-import socket
 import struct
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import frames
 import numpy as np
 import pytest
 import zenoh
+from ports import free_port
 
 from caraware_viewer import canvas, plots, scene, static_map, top
 from caraware_viewer.link import LatestFrames, RunKey, Sample, encoded
@@ -26,11 +26,13 @@ MAP = {"run": RUN.run, "tick_s": 0.1, "map": {"bounds_m": [0.0, 0.0, 220.0, 200.
 STATUS = {"tick": 2, "training": {"updates": 3, "policy_std": 0.5, "reward": 0.25}, "processes": []}
 TRUTH = np.array([[10.0, 20.0], [30.0, 40.0]], np.float32)
 VEHICLE = "flow#1/car *?$ ü"
+PATIENCE_S = 120.0
+"""Longest wait, for a machine whose cores are busy with other work."""
 GNSS_OFFSET_M = np.array([3.0, 4.0], np.float32)
 
 
 class StandIn:
-    """Listens, answers for the map, announces the run and publishes."""
+    """Listens, answers queries for the map, declares the liveliness token and publishes."""
 
     def __init__(self, port: int) -> None:
         config = zenoh.Config()
@@ -54,14 +56,14 @@ class StandIn:
         self.sent += 1
 
     def publish_until_clouds_are_wanted(self) -> None:
-        """A viewer asks for point clouds once it knows who is there."""
+        """Publishes until the viewer subscribes to a point cloud, which it does once it knows the vehicle's id."""
         clouds = self.session.declare_publisher(f"{RUN.prefix}/pointcloud/{encoded(VEHICLE)}")
-        for tick in range(200):
+        for tick in range(int(PATIENCE_S / 0.1)):
             self.publish(tick)
-            if clouds.matching_status.matching:
+            if clouds.matching_status:
                 return
             time.sleep(0.1)
-        raise TimeoutError("nobody asked for a point cloud")
+        raise TimeoutError("the viewer did not subscribe to the point cloud")
 
     def publish(self, tick: int) -> None:
         self.put("vehicles", frames.vehicles(tick, {100: VEHICLE}))
@@ -74,14 +76,8 @@ class StandIn:
 
 
 @pytest.fixture
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
-@pytest.fixture
-def fanout(free_port: int) -> Iterator[StandIn]:
-    stand_in = StandIn(free_port)
+def fanout() -> Iterator[StandIn]:
+    stand_in = StandIn(free_port())
     yield stand_in
     stand_in.session.close()
 
@@ -93,7 +89,13 @@ def viewer(*arguments: str) -> subprocess.Popen[str]:
 
 def rerun(*arguments: str) -> str:
     command = [sys.executable, "-m", "rerun", "rrd", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE_S).stdout
+
+
+def put_garbage_until(fanout: StandIn, refused: threading.Event) -> None:
+    """Puts garbage until the viewer has refused some: a newer sample may replace one before the viewer takes it."""
+    while not refused.wait(0.05):
+        fanout.put("world", b"garbage")
 
 
 def test_a_run_becomes_a_recording(fanout: StandIn, tmp_path: Path) -> None:
@@ -102,16 +104,21 @@ def test_a_run_becomes_a_recording(fanout: StandIn, tmp_path: Path) -> None:
     assert process.stderr is not None
     assert "watching run" in process.stderr.readline()
     fanout.publish_until_clouds_are_wanted()
-    for tick in range(1000, 1003):
-        fanout.put("world", b"garbage")
-        time.sleep(0.2)
-        fanout.publish(tick)
-        time.sleep(0.2)
+    # The viewer reports the first sample that it refuses, and only that one.
+    refusal = threading.Event()
+    garbage = threading.Thread(target=put_garbage_until, args=(fanout, refusal))
+    garbage.start()
+    assert "shorter than its 72 bytes of header" in process.stderr.readline()
+    refusal.set()
+    garbage.join()
+    fanout.put("world", b"garbage")
+    # The newest sample of each topic is drawn, also if the run ends at once.
+    fanout.publish(1000)
     fanout.token.undeclare()
-    assert process.wait(timeout=20) == 0
+    assert process.wait(timeout=PATIENCE_S) == 0
     output = process.stderr.read()
     assert "has ended" in output
-    assert output.count("shorter than its 72 bytes of header") == 1
+    assert "72 bytes" not in output
 
     rerun("verify", str(file))
     listing = rerun("print", "-vv", str(file))
@@ -122,7 +129,7 @@ def test_a_run_becomes_a_recording(fanout: StandIn, tmp_path: Path) -> None:
 
 
 def stand_in_process(port: int) -> subprocess.Popen[str]:
-    code = f"import test_end_to_end as t, time; s = t.StandIn({port}); print('up', flush=True); time.sleep(60)"
+    code = f"import test_end_to_end as t, time; s = t.StandIn({port}); print('up', flush=True); time.sleep(600)"
     process = subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent
     )
@@ -131,43 +138,45 @@ def stand_in_process(port: int) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_killed_fan_out_ends_the_run(free_port: int, tmp_path: Path) -> None:
-    fanout = stand_in_process(free_port)
-    process = viewer(f"tcp/127.0.0.1:{free_port}", "--save", str(tmp_path / "run.rrd"))
+def test_a_killed_fan_out_ends_the_run(tmp_path: Path) -> None:
+    port = free_port()
+    fanout = stand_in_process(port)
+    process = viewer(f"tcp/127.0.0.1:{port}", "--save", str(tmp_path / "run.rrd"))
     assert process.stderr is not None
     assert "watching run" in process.stderr.readline()
     fanout.kill()
-    assert process.wait(timeout=20) == 0
+    assert process.wait(timeout=PATIENCE_S) == 0
     fanout.wait()
 
 
-def test_nothing_there_is_said_with_the_endpoint(free_port: int) -> None:
-    process = viewer(f"tcp/127.0.0.1:{free_port}", "--timeout", "1", "--save", "unused.rrd")
-    _, output = process.communicate(timeout=20)
+def test_without_a_run_the_message_names_the_endpoint() -> None:
+    port = free_port()
+    process = viewer(f"tcp/127.0.0.1:{port}", "--timeout", "1", "--save", "unused.rrd")
+    _, output = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
-    assert f"nothing answers at tcp/127.0.0.1:{free_port} within 1 s" in output
+    assert f"nothing answers at tcp/127.0.0.1:{port} within 1 s" in output
     assert "fanout.listen" in output
     assert "Traceback" not in output
 
 
-def test_another_run_is_said_with_those_there(fanout: StandIn) -> None:
+def test_a_wrong_run_name_gives_the_names_of_the_runs(fanout: StandIn) -> None:
     process = viewer(fanout.endpoint, "--run", "other", "--timeout", "1", "--save", "unused.rrd")
-    _, output = process.communicate(timeout=20)
+    _, output = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1
     assert "no run called 'other'" in output
     assert RUN.run in output
     assert "Traceback" not in output
 
 
-def test_what_is_no_endpoint_is_a_usage_error() -> None:
+def test_a_wrong_endpoint_is_a_usage_error() -> None:
     process = viewer("localhost:7447")
-    _, output = process.communicate(timeout=20)
+    _, output = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert "tcp/HOST:PORT" in output
 
 
 def odd_names() -> list[str]:
-    """Those that have been trouble, and random ones over all of Unicode."""
+    """Names that caused errors before, and random names over all of Unicode."""
     random = np.random.default_rng(5)
     codes = [random.integers(0, 0x10FFFF, size=int(random.integers(1, 12))) for _ in range(200)]
     drawn = ["".join(chr(int(code)) for code in row if not 0xD800 <= code < 0xE000) for row in codes]
@@ -176,7 +185,7 @@ def odd_names() -> list[str]:
 
 
 def test_any_name_makes_a_key_and_comes_back() -> None:
-    parts = {}
+    parts: dict[str, str] = {}
     for name in odd_names():
         key = RunKey(name, 3)
         assert str(zenoh.KeyExpr(f"{key.prefix}/alive")) == f"{key.prefix}/alive"
@@ -204,7 +213,7 @@ def test_gaps_in_the_numbers_are_losses_and_a_jump_back_is_a_new_fan_out() -> No
     assert latest.lost == 2 + 1
 
 
-def test_an_age_that_cannot_be_is_not_told() -> None:
+def test_an_implausible_age_is_unknown() -> None:
     now_ns = time.time_ns()
     assert 100 <= Sample(b"", 0, now_ns - 100_000_000).age_ms() < 50_000
     for sample in (Sample(b""), Sample(b"", 0, 0), Sample(b"", 0, now_ns + 3_600_000_000_000)):
@@ -215,6 +224,6 @@ def test_a_close_ends_the_wait() -> None:
     latest = LatestFrames()
     threading.Timer(0.05, latest.close).start()
     begun = time.monotonic()
-    assert latest.take(20) == {}
-    assert time.monotonic() - begun < 10
+    assert latest.take(600) == {}
+    assert time.monotonic() - begun < 300
     assert latest.closed

@@ -1,4 +1,4 @@
-"""Geometry of what is drawn."""
+"""Geometry of road users, map and point clouds."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 
 from caraware_viewer import cloud, geometry, static_map, wire
 from caraware_viewer.canvas import on_screen
+from caraware_viewer.documents import Lane
 
 
 def states(**fields: float) -> np.ndarray:
@@ -53,7 +54,7 @@ def test_a_body_stays_inside_its_outline() -> None:
         (geometry.BLINKER_BOTH, [[9, 21], [14, 21], [9, 19], [14, 19]]),
     ],
 )
-def test_blinkers_are_at_the_corners_of_their_side(signals: int, expected: list) -> None:
+def test_blinkers_are_at_the_corners_of_their_side(signals: int, expected: list[list[float]]) -> None:
     found = geometry.blinkers_m(states(signals=signals))
     np.testing.assert_allclose(found, np.array(expected).reshape(-1, 2), atol=1e-5)
 
@@ -84,15 +85,19 @@ def test_a_dashed_line_is_in_pieces_along_its_bends() -> None:
     np.testing.assert_allclose(pieces, [[[0, 0], [3, 0]], [[9, 0], [10, 2]], [[10, 8], [10, 10]]])
 
 
+def lane(points_m: list[list[float]]) -> Lane:
+    """A lane of 4 m."""
+    return Lane(id="", kind="car", inside=False, width_m=4.0, right="none", left="none", points_m=points_m)
+
+
 def test_the_left_edge_lies_to_the_left() -> None:
-    lane = {"points_m": [[0, 0, 1], [10, 0, 1]], "width_m": 4.0}
-    np.testing.assert_allclose(static_map.edge_m(lane, 1), [[0, 2], [10, 2]])
-    np.testing.assert_allclose(static_map.edge_m(lane, -1), [[0, -2], [10, -2]])
+    along_x = lane([[0, 0, 1], [10, 0, 1]])
+    np.testing.assert_allclose(static_map.edge_m(along_x, 1), np.array([[0.0, 2.0], [10.0, 2.0]]))
+    np.testing.assert_allclose(static_map.edge_m(along_x, -1), np.array([[0.0, -2.0], [10.0, -2.0]]))
 
 
-def test_stripes_of_a_crossing_lie_across_the_way_of_who_walks() -> None:
-    lane = {"points_m": [[0, 0, 0], [3, 0, 0]], "width_m": 4.0}
-    stripes = np.array(static_map.stripes_m(lane))
+def test_stripes_of_a_crossing_lie_across_the_way_of_pedestrians() -> None:
+    stripes = np.array(static_map.stripes_m(lane([[0, 0, 0], [3, 0, 0]])))
     assert len(stripes) == 3
     np.testing.assert_allclose(stripes[0], [[0.25, 1.75], [0.25, -1.75]])
 
@@ -101,7 +106,8 @@ def scan(**fields: object) -> np.void:
     head = np.zeros(1, wire.SCAN)
     for name, value in fields.items():
         head[name] = value
-    return head[0]
+    row: np.void = head[0]
+    return row
 
 
 def point(position_m: list[float], age_us: int = 0) -> np.ndarray:
@@ -133,10 +139,10 @@ def test_points_fired_earlier_were_fired_from_farther_back() -> None:
     np.testing.assert_allclose(placed, [[5 * np.cos(angle) - 1, 5 * np.sin(angle), 0]], atol=1e-5)
 
 
-def test_interest_is_what_moves() -> None:
+def test_points_of_interest_are_on_road_users_and_lost_loads() -> None:
     points = np.zeros(14, wire.LIDAR_POINT)
     points["tag"] = np.arange(14)
-    assert cloud.of_interest(points)["tag"].tolist() == [4, 5, 6, 12]
+    assert cloud.points_of_interest(points)["tag"].tolist() == [4, 5, 6, 12]
     points["tag"] += 1000
     assert (cloud.colors(points) == cloud.TAG_COLORS[-1]).all()
 

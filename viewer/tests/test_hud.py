@@ -1,4 +1,4 @@
-"""The HUD says what is known and leaves out what is not."""
+"""The HUD shows the figures that are known and leaves out the others."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from caraware_viewer import wire
-from caraware_viewer.hud import Shown, compass_letters, hud
+from caraware_viewer.documents import RunMap
+from caraware_viewer.hud import ViewerFigures, compass_letters, hud
 from caraware_viewer.pairing import distances
 from caraware_viewer.picture import Picture
 
-MAP = {"run": "town-1", "mode": "train", "tick_s": 0.1, "scene": None}
+MAP: RunMap = {"run": "town-1", "mode": "train", "tick_s": 0.1, "scene": None}
 TRUTH = np.array([[10.0, 20.0], [30.0, 40.0]], np.float32)
 
 
@@ -23,47 +24,47 @@ def picture(wanted: tuple[str, ...] = (), **fields: np.ndarray) -> Picture:
     result.observation = wire.decode_observation(frames.observation(35999, TRUTH, TRUTH + np.array([3, 4]), **fields))
     result.distances = distances(result.observation, wire.decode_prediction(frames.prediction(0, TRUTH + 1)))
     result.enter_names(
-        wire.decode_rows(frames.vehicles(0, {100: "cav|0", 101: "<b>\n`1`", 102: "walker"}), wire.VEHICLE_META)
+        wire.decode_table(frames.vehicles(0, {100: "cav|0", 101: "<b>\n`1`", 102: "walker"}), wire.VEHICLE_META)
     )
     return result
 
 
 def test_it_has_counts_times_sensors_and_errors() -> None:
-    text = hud(picture(), MAP, [], Shown(9.87, 12.3, 4, 5))
+    text = hud(picture(), MAP, [], ViewerFigures(9.87, 12.3, 4, 5))
     for part in ("town-1", "01:00:00", "1 CAV", "1 others", "1 pedestrians", "0 obstacles", "GNSS 2", "LIDAR 0"):
         assert part in text, part
     for part in ("policy 1.41 m", "EKF –", "GNSS 5.00 m", "9.9 frames/s", "12 ms old", "4 lost", "5 refused"):
         assert part in text, part
 
 
-def test_the_vehicle_looked_at_is_told_as_its_sensors_say() -> None:
+def test_a_followed_vehicle_has_the_figures_of_its_sensors() -> None:
     imu = np.zeros((2, 1, 7), np.float32)
     imu[1, 0] = [1, -2, 9.8, 0, 0, math.radians(30), math.radians(93)]
-    text = hud(picture(imu=imu, speed_steering=np.array([[0, 0], [10, -0.5]])), MAP, [101], Shown())
+    text = hud(picture(imu=imu, speed_steering=np.array([[0, 0], [10, -0.5]])), MAP, [101], ViewerFigures())
     for part in ("36.0 km/h", "-28.6°", "93.0° E", "+1.00 -2.00 +9.80 m/s²", "+30.00 °/s", "(sensed)"):
         assert part in text, part
 
 
-def test_without_sensors_it_is_told_as_it_is() -> None:
-    text = hud(picture(), MAP, [102], Shown())
+def test_without_sensors_a_vehicle_has_its_true_figures() -> None:
+    text = hud(picture(), MAP, [102], ViewerFigures())
     assert "walker (true)" in text
     assert "90.0° E" in text
 
 
 def test_names_cannot_break_the_tables() -> None:
-    text = hud(picture(), MAP, [], Shown())
+    text = hud(picture(), MAP, [], ViewerFigures())
     assert r"cav\|0" in text
     assert r"\<b> \`1\`" in text
 
 
-def test_errors_of_vehicles_looked_at_come_first() -> None:
-    lines = hud(picture(), MAP, [101], Shown()).split("error (m)")[1].splitlines()
+def test_errors_of_followed_vehicles_come_first() -> None:
+    lines = hud(picture(), MAP, [101], ViewerFigures()).split("error (m)")[1].splitlines()
     assert "1.41" in lines[3]
     assert r"\<b>" in lines[3]
 
 
 def test_with_nothing_known_there_is_still_a_text() -> None:
-    assert "town-1" in hud(Picture(), MAP, [], Shown())
+    assert "town-1" in hud(Picture(), MAP, [], ViewerFigures())
 
 
 @pytest.mark.parametrize(("degrees", "letters"), [(0, "N"), (44, "NE"), (91, "E"), (180, "S"), (270, "W"), (359, "N")])
@@ -71,29 +72,29 @@ def test_compass_letters(degrees: float, letters: str) -> None:
     assert compass_letters(math.radians(degrees)) == letters
 
 
-def test_who_is_looked_at() -> None:
-    assert picture().looked_at() == [100]
-    assert picture(("<b>\n`1`", "nobody", "cav|0")).looked_at() == [101, 100]
-    assert picture(sensors=np.array([7, 15])).looked_at() == [101]
+def test_who_is_followed() -> None:
+    assert picture().followed() == [100]
+    assert picture(("<b>\n`1`", "absent", "cav|0")).followed() == [101, 100]
+    assert picture(sensors=np.array([7, 15])).followed() == [101]
     with_hero = picture()
     with_hero.world = wire.decode_world(frames.world(0, 3, kind=[0, 0, 3]))
-    assert with_hero.looked_at() == [102]
-    assert Picture().looked_at() == []
+    assert with_hero.followed() == [102]
+    assert Picture().followed() == []
 
 
 def test_the_default_stays_while_it_is_on_the_road() -> None:
     seen = picture()
-    assert seen.looked_at() == [100]
+    assert seen.followed() == [100]
     seen.observation = wire.decode_observation(frames.observation(1, TRUTH, TRUTH, id_hash=np.array([101, 100])))
-    assert seen.looked_at() == [100]
+    assert seen.followed() == [100]
     seen.world = wire.decode_world(frames.world(1, 2, id_hash=[101, 102]))
-    assert seen.looked_at() == [101]
+    assert seen.followed() == [101]
 
 
 def test_names_start_anew_with_each_episode() -> None:
     seen = picture()
-    seen.enter_names(wire.decode_rows(frames.vehicles(1, {7: "more"}), wire.VEHICLE_META))
+    seen.enter_names(wire.decode_table(frames.vehicles(1, {7: "more"}), wire.VEHICLE_META))
     assert seen.name(100) == "cav|0"
-    seen.enter_names(wire.decode_rows(frames.vehicles(2, {7: "more"}, episode=1), wire.VEHICLE_META))
+    seen.enter_names(wire.decode_table(frames.vehicles(2, {7: "more"}, episode=1), wire.VEHICLE_META))
     assert seen.name(7) == "more"
     assert seen.name(100) == "#0064"

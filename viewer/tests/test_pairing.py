@@ -1,9 +1,10 @@
-"""Errors are measured between what is guessed and the truth of the same tick and slot."""
+"""Errors are distances between a position and the truth of the same tick and slot."""
 
 from __future__ import annotations
 
 import frames
 import numpy as np
+from numpy.typing import NDArray
 
 from caraware_viewer import wire
 from caraware_viewer.pairing import Pairing, distances, mean_m
@@ -15,7 +16,9 @@ def observation(tick: int, valid: list[int]) -> wire.Observation:
     return wire.decode_observation(frames.observation(tick, TRUTH, TRUTH + np.array([6, 8]), np.array(valid)))
 
 
-def prediction(tick: int, points: np.ndarray, estimates: np.ndarray | None = None) -> wire.Prediction:
+def prediction(
+    tick: int, points: NDArray[np.floating], estimates: NDArray[np.floating] | None = None
+) -> wire.Prediction:
     return wire.decode_prediction(frames.prediction(tick, points, estimates))
 
 
@@ -35,7 +38,7 @@ def test_without_valid_slots_or_a_policy_there_is_no_error() -> None:
     assert np.isnan(mean_m(found.policy))
 
 
-def test_actions_of_a_driver_are_no_positions() -> None:
+def test_actions_of_a_driving_policy_are_not_positions() -> None:
     found = distances(observation(0, [1, 1, 1]), prediction(0, TRUTH, TRUTH), driving=True)
     assert found.policy is None
     assert mean_m(found.ekf) == 0.0

@@ -1,11 +1,11 @@
-"""Frames become entities: what is logged is read back from a recording."""
+"""Draws frames into a recording, and reads the entities back."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import frames
 import numpy as np
@@ -14,12 +14,13 @@ import recordings
 import rerun as rr
 
 from caraware_viewer import plots, scene, space, static_map, top, wire
-from caraware_viewer.layout import blueprint
+from caraware_viewer.documents import RunMap
 from caraware_viewer.link import Sample
 from caraware_viewer.scene import Scene
+from caraware_viewer.views import blueprint
 
 TRUTH = np.array([[10.0, 20.0], [30.0, 40.0]], np.float32)
-SCENE = {
+SCENE: dict[str, list[dict[str, Any]]] = {
     "lanes": [
         {"id": "a_0", "kind": "sidewalk", "inside": False, "width_m": 2.0, "right": "none", "left": "none"},
         {"id": "a_1", "kind": "car", "inside": False, "width_m": 3.2, "right": "solid", "left": "dashed"},
@@ -65,18 +66,19 @@ STATUS = {
     "training": {"updates": 3, "policy_std": 0.5, "reward": 0.25, "best_reward": 0.75, "env_steps_per_s": 1234.0},
 }
 
-Drawn = Callable[..., tuple[Scene, dict[str, recordings.Entity]]]
+Drawing = tuple[Scene, dict[str, recordings.Entity]]
+Drawn = Callable[..., Drawing]
 
 
 @pytest.fixture
 def drawn(tmp_path: Path) -> Drawn:
     """Draws samples into a recording and reads it back."""
 
-    def draw(*samples: tuple[str, bytes], run_map: dict[str, Any] = MAP, **options: Any) -> tuple[Scene, dict]:
+    def draw(*samples: tuple[str, bytes], run_map: dict[str, Any] = MAP, **options: Any) -> Drawing:
         recording = rr.RecordingStream("test", recording_id="test")
         path = tmp_path / "run.rrd"
         recording.save(path, default_blueprint=blueprint(run_map["map"]["bounds_m"]))
-        drawing = Scene(recording, run_map, **options)
+        drawing = Scene(recording, cast(RunMap, run_map), **options)
         for topic, payload in samples:
             drawing.draw(topic, Sample(payload))
         recording.flush()
@@ -113,7 +115,7 @@ def test_a_map_without_a_scene_has_its_bounds(drawn: Drawn) -> None:
 
 
 @pytest.mark.parametrize("scene_part", [{"lanes": [{}]}, {"signals": [{"id": "j"}]}, {"buildings": [{"points_m": 3}]}])
-def test_a_map_that_lacks_what_is_needed_is_refused(drawn: Drawn, scene_part: dict) -> None:
+def test_a_map_without_a_required_member_is_refused(drawn: Drawn, scene_part: dict[str, Any]) -> None:
     with pytest.raises(wire.FrameError, match="map"):
         drawn(run_map=MAP | {"scene": scene_part})
 
@@ -132,7 +134,7 @@ def test_kinds_have_colours_of_their_own(drawn: Drawn) -> None:
     assert found[top.OUTLINES].newest("LineStrips2D:colors") == top.KIND_COLORS[[0, 1, 2, 3, 3]].tolist()
 
 
-def test_few_vehicles_have_their_names_of_many_those_looked_at(drawn: Drawn) -> None:
+def test_few_vehicles_have_names_and_of_many_only_the_followed_ones(drawn: Drawn) -> None:
     names = {100 + i: f"cav {i}" for i in range(100)}
     for count, expected in ((3, ["cav 0", "cav 1", "cav 2"]), (100, ["cav 7"])):
         _, found = drawn(
@@ -156,7 +158,7 @@ def test_signals_of_vehicles_and_lights_are_drawn(drawn: Drawn) -> None:
     ]
 
 
-def test_guesses_are_linked_to_their_vehicles(drawn: Drawn) -> None:
+def test_positions_are_linked_to_their_vehicles(drawn: Drawn) -> None:
     _, found = drawn(
         ("observation", frames.observation(2, TRUTH, TRUTH + np.array([3, 4]))),
         ("prediction", frames.prediction(2, TRUTH + np.array([0, 2]), TRUTH + np.array([1, 0]))),
@@ -188,7 +190,7 @@ def test_a_drivers_actions_are_not_drawn_as_positions(drawn: Drawn) -> None:
     assert not [row for _, row in found[plots.POLICY_ERROR].rows if "Scalars:scalars" in row]
 
 
-def test_the_vehicle_looked_at_is_the_origin_of_the_3d_view(drawn: Drawn) -> None:
+def test_the_followed_vehicle_is_the_origin_of_the_3d_view(drawn: Drawn) -> None:
     _, found = drawn(
         ("vehicles", frames.vehicles(0, {101: "cav 1", 100: "cav 0"})),
         ("world", frames.world(0, 3, yaw_rad=np.pi / 2)),
@@ -199,7 +201,7 @@ def test_the_vehicle_looked_at_is_the_origin_of_the_3d_view(drawn: Drawn) -> Non
     np.testing.assert_allclose(turn @ [10, 50, 0] + move, [0, 0, 0], atol=1e-4)
     np.testing.assert_allclose(turn @ [10, 55, 0] + move, [5, 0, 0], atol=1e-4)
     assert len(found[space.VEHICLES].newest("Boxes3D:centers")) == 3
-    ring = np.array(found[top.LOOKED_AT].newest("LineStrips2D:strips"))
+    ring = np.array(found[top.FOLLOWED].newest("LineStrips2D:strips"))
     np.testing.assert_allclose(ring[0].mean(axis=0), [10, -50], atol=0.2)
 
 
@@ -213,7 +215,7 @@ def test_a_cloud_is_drawn_in_the_world_with_its_range(drawn: Drawn) -> None:
         ("pointcloud/other", frames.pointcloud(1, points, id_hash=100)),
     ]
     drawing, found = drawn(*samples, wanted=["x/y"])
-    assert drawing.clouds_wanted() == ["x/y"]
+    assert drawing.cloud_vehicles() == ["x/y"]
     near(found[top.CLOUD], "Points2D:positions", [[15, -50]])
     near(found[space.CLOUD], "Points3D:positions", [[15, 50, 2]])
     ring = np.array(found[top.RING].newest("LineStrips2D:strips")[0])
@@ -221,7 +223,7 @@ def test_a_cloud_is_drawn_in_the_world_with_its_range(drawn: Drawn) -> None:
     _, whole = drawn(*samples, wanted=["x/y"], lidar="all")
     assert len(whole[top.CLOUD].newest("Points2D:positions")) == 2
     drawing, _ = drawn(*samples[:2], wanted=["x/y"], lidar="off")
-    assert drawing.clouds_wanted() == []
+    assert drawing.cloud_vehicles() == []
 
 
 def test_contacts_stay_for_a_while(drawn: Drawn) -> None:
@@ -234,7 +236,7 @@ def test_contacts_stay_for_a_while(drawn: Drawn) -> None:
     assert [len(row["Points2D:positions"]) for _, row in found[top.CONTACTS].rows] == [1, 1, 0]
 
 
-def test_the_status_is_plotted_and_told(drawn: Drawn) -> None:
+def test_the_status_is_plotted_and_in_the_hud(drawn: Drawn) -> None:
     _, found = drawn(("status", json.dumps(STATUS).encode()), ("world", frames.world(2)))
     for path, value in ((plots.STD, 0.5), (plots.REWARD, 0.25), (plots.STEPS, 250.0), (plots.REAL_TIME, 5.0)):
         near(found[path], "Scalars:scalars", [value])
@@ -261,14 +263,14 @@ def test_seeking_is_in_simulated_time_over_episodes(drawn: Drawn) -> None:
 def test_frames_of_another_run_are_refused(drawn: Drawn) -> None:
     other = frames.header(0, 0, 0, run_id=8)
     for topic in ("world", "vehicles", "signals", "event", "pointcloud/x"):
-        with pytest.raises(scene.AnotherRun):
+        with pytest.raises(scene.AnotherRunError):
             drawn((topic, other))
 
 
 @pytest.mark.parametrize(
     "payload", [b"", b"{", b"[]", b"null", b'{"tick": null}', b'{"tick": 1, "training": 3}', b"\xff"]
 )
-def test_a_status_that_is_none_is_refused(drawn: Drawn, payload: bytes) -> None:
+def test_an_unreadable_status_is_refused(drawn: Drawn, payload: bytes) -> None:
     with pytest.raises(wire.FrameError):
         drawn(("status", payload))
 
@@ -276,7 +278,7 @@ def test_a_status_that_is_none_is_refused(drawn: Drawn, payload: bytes) -> None:
 def test_random_bytes_are_refused_on_every_topic(drawn: Drawn) -> None:
     random = np.random.default_rng(3)
     recording = rr.RecordingStream("test", recording_id="garbage")
-    drawing = Scene(recording, MAP)
+    drawing = Scene(recording, cast(RunMap, MAP))
     for topic in ("world", "observation", "prediction", "status", "vehicles", "signals", "event", "pointcloud/a"):
         for size in (0, 1, 71, 72, 500, 4000):
             with pytest.raises(wire.FrameError):

@@ -1,8 +1,9 @@
-"""The wire layout is the committed one, and frames mean what they say."""
+"""The wire layout equals the committed one, and frames are decoded or refused."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import frames
@@ -26,10 +27,11 @@ TYPES = {
 
 
 @pytest.mark.parametrize(("name", "dtype"), TYPES.items())
-def test_types_repeat_the_committed_table(name: str, dtype: np.dtype) -> None:
+def test_types_repeat_the_committed_table(name: str, dtype: np.dtype[np.void]) -> None:
     table = {row["name"]: row for row in json.loads(LAYOUT.read_text())}
     assert dtype.itemsize == table[name]["size"]
-    assert [[field, dtype.fields[field][1]] for field in dtype.names] == table[name]["fields"]
+    assert dtype.fields is not None
+    assert [[field, at[1]] for field, at in dtype.fields.items()] == table[name]["fields"]
 
 
 def test_world_comes_back() -> None:
@@ -70,11 +72,11 @@ def test_estimates_follow_predictions_where_the_header_says_so() -> None:
 
 def test_rows_come_back() -> None:
     names = {5: "flow#1/a b", 6: "ü €", 7: ""}
-    rows = wire.decode_rows(frames.vehicles(3, names), wire.VEHICLE_META).rows
-    assert {int(row["id_hash"]): wire.text(row["id"], int(row["id_len"])) for row in rows} == names
-    lights = wire.decode_rows(frames.signals(3, {9: "rGy"}), wire.SIGNAL_META).rows
-    assert [wire.text(row["state"], int(row["links"])) for row in lights] == ["rGy"]
-    contacts = wire.decode_rows(frames.event(3, np.array([[1, 2, 3], [4, 5, 6]])), wire.COLLISION).rows
+    rows = wire.decode_table(frames.vehicles(3, names), wire.VEHICLE_META).rows
+    assert {int(row["id_hash"]): wire.decode_text(row["id"], int(row["id_len"])) for row in rows} == names
+    lights = wire.decode_table(frames.signals(3, {9: "rGy"}), wire.SIGNAL_META).rows
+    assert [wire.decode_text(row["state"], int(row["links"])) for row in lights] == ["rGy"]
+    contacts = wire.decode_table(frames.event(3, np.array([[1, 2, 3], [4, 5, 6]])), wire.COLLISION).rows
     np.testing.assert_array_equal(contacts["position_m"], [[1, 2, 3], [4, 5, 6]])
 
 
@@ -87,7 +89,7 @@ def test_a_cloud_comes_back() -> None:
 
 
 def test_a_name_that_is_cut_within_a_character_is_still_text() -> None:
-    assert wire.text(np.void("aü".encode()[:2]), 2) == "a\ufffd"
+    assert wire.decode_text(np.void("aü".encode()[:2]), 2) == "a\ufffd"
 
 
 @pytest.mark.parametrize(
@@ -97,11 +99,11 @@ def test_a_name_that_is_cut_within_a_character_is_still_text() -> None:
         wire.decode_observation,
         wire.decode_prediction,
         wire.decode_cloud,
-        lambda frame: wire.decode_rows(frame, wire.VEHICLE_META),
-        lambda frame: wire.decode_rows(frame, wire.SIGNAL_META),
+        lambda frame: wire.decode_table(frame, wire.VEHICLE_META),
+        lambda frame: wire.decode_table(frame, wire.SIGNAL_META),
     ],
 )
-def test_garbage_is_refused(decode) -> None:
+def test_garbage_is_refused(decode: Callable[[bytes], object]) -> None:
     whole = frames.header(0, 4, 2)
     for frame in (b"", whole[:71], whole, whole + bytes(8), frames.header(0, 2**32 - 1, 2) + bytes(1000)):
         with pytest.raises(wire.FrameError):

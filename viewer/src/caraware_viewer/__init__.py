@@ -1,1 +1,1 @@
-"""zenoh → rerun: watch a run from anywhere. Needs the documented wire layout and nothing else of the project."""
+"""zenoh → rerun: watch a run from anywhere. It needs the documented wire layout and no other part of the project."""

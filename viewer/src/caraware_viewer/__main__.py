@@ -11,46 +11,46 @@ import sys
 import threading
 from collections.abc import Sequence
 
-# rerun reads this when it is loaded and started: a viewer of one's own simulation does not report on its user.
+# rerun reads CI when it is loaded and started: with it set, rerun sends no usage statistics.
 os.environ.setdefault("CI", "1")
 
 from caraware_viewer import access, command
 from caraware_viewer.display import DisplayError
 from caraware_viewer.link import LinkError
-from caraware_viewer.watch import watch
+from caraware_viewer.watch import watch_run
 
 INTERRUPTED = 130
-LEAVE_WITHIN_S = 15.0
-"""Longest time from Ctrl-C to the end: what is left is written within ten, unless something does not come back."""
+EXIT_LIMIT_S = 15.0
+"""Longest time from Ctrl-C to the end. Writing the rest of a recording takes at most ten, unless a call hangs."""
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 _EXAMPLES = """Examples:
   caraware-viewer                                  the run on this machine, in a window
-  caraware-viewer --web                            in a browser: prints the address to open
-  caraware-viewer --save run.rrd                   record; look later with `rerun run.rrd`
+  caraware-viewer --web                            in a browser; prints the address to open
+  caraware-viewer --save run.rrd                   record; open it later with `rerun run.rrd`
   caraware-viewer --web --save run.rrd             both
-  caraware-viewer --vehicle cav.3 --lidar all      the 3-D view and the figures follow cav.3, with its whole point cloud
+  caraware-viewer --vehicle cav.3 --lidar all      the 3-D view and the figures follow cav.3, with all LIDAR points
   caraware-viewer tcp/127.0.0.1:7448 --run town-2  another endpoint, one of several runs there
 
 A run on another machine listens on its own loopback. From your laptop:
   ssh -N -L 7447:127.0.0.1:7447 HOST &
   caraware-viewer
 
-Exit codes: 0 the run ended or the window was closed, 1 nothing to watch, 2 usage, 130 interrupted."""
+Exit codes: 0 the run ended or the window was closed, 1 there is nothing to watch, 2 usage error, 130 interrupted."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Watches a run until it ends. Exit code 0: it ended, 1: nothing to watch, 2: usage, 130: interrupted."""
+    """Watches a run until it ends. Exit codes: 0 the run ended, 1 nothing to watch, 2 usage error, 130 Ctrl-C."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments[:1] == ["command"]:
         return command.main(arguments[1:])
     options = _parser().parse_args(arguments)
-    # Asked to end, it writes what is left, as at Ctrl-C.
-    for asked in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(asked, leave)
+    # SIGTERM ends the viewer as Ctrl-C does: it writes the rest of the recording first.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupt)
     try:
-        return watch(options)
+        return watch_run(options)
     except (LinkError, access.AccessError, DisplayError) as error:
         print(f"caraware-viewer: {error}", file=sys.stderr)
         return 1
@@ -58,10 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
-def leave(*_: object) -> None:
-    """Interrupts the main thread. If that has not ended the process in time, says where it stands and ends it."""
-    faulthandler.dump_traceback_later(LEAVE_WITHIN_S)
-    end = threading.Timer(LEAVE_WITHIN_S + 0.5, os._exit, (INTERRUPTED,))
+def interrupt(*_: object) -> None:
+    """Interrupts the main thread. If the process has not ended in time, prints where each thread is and ends it."""
+    faulthandler.dump_traceback_later(EXIT_LIMIT_S)
+    end = threading.Timer(EXIT_LIMIT_S + 0.5, os._exit, (INTERRUPTED,))
     end.daemon = True
     end.start()
     raise KeyboardInterrupt
@@ -81,24 +81,32 @@ def _parser() -> argparse.ArgumentParser:
         default=DEFAULT_ENDPOINT,
         help="the run's `fanout.listen` (default %(default)s)",
     )
-    parser.add_argument("--run", metavar="NAME", help="name of the run, if several are fanned out there")
-    parser.add_argument("--env", metavar="N", type=int, help="environment of the run (default: its first)")
+    parser.add_argument("--run", metavar="NAME", help="name of the run, if the endpoint has several")
     parser.add_argument(
-        "--timeout", type=_seconds, default=5.0, metavar="S", help="longest wait for an answer (default %(default)s s)"
+        "--env", metavar="N", type=int, help="number of the environment (default: the first of the run)"
     )
-    access.add_arguments(parser.add_argument_group("who you are, if the run asks"))
-    _add_sinks(parser.add_argument_group("where it is shown (a window, if nothing is said and there is a screen)"))
-    _add_scene(parser.add_argument_group("what is shown"))
+    parser.add_argument(
+        "--timeout",
+        type=_seconds,
+        default=5.0,
+        metavar="S",
+        help="longest wait for the run to answer (default %(default)s s)",
+    )
+    access.add_arguments(parser.add_argument_group("credentials, if the run requires them"))
+    _add_sinks(parser.add_argument_group("where to show the run (default: a window; without a screen, a browser)"))
+    _add_scene(parser.add_argument_group("what to show"))
     return parser
 
 
 def _add_sinks(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--web", action="store_true", help="serve browsers on this machine and print the address")
     group.add_argument(
-        "--web-port", type=_port, metavar="PORT", help="port of that address (default 9090 if it is free)"
+        "--web", action="store_true", help="serve a page for browsers on this machine, and print its address"
     )
-    group.add_argument("--save", metavar="F.rrd", help="record to a file")
-    group.add_argument("--connect", metavar="URL", help="a rerun viewer that is already open (rerun+http://…/proxy)")
+    group.add_argument("--web-port", type=_port, metavar="PORT", help="port of that page (default: 9090 if it is free)")
+    group.add_argument("--save", metavar="F.rrd", help="record the run to a file")
+    group.add_argument(
+        "--connect", metavar="URL", help="send the run to a rerun viewer that is already open (rerun+http://…/proxy)"
+    )
 
 
 def _add_scene(group: argparse._ArgumentGroup) -> None:
@@ -106,27 +114,27 @@ def _add_scene(group: argparse._ArgumentGroup) -> None:
         "--vehicle",
         metavar="ID",
         action="append",
-        help="a vehicle to look at (repeatable): figures and point cloud; the first is in the 3-D view (default: a "
-        "hero, else one with a LIDAR, else the first that senses)",
+        help="a vehicle to follow (repeatable): shows its figures and its point cloud; the 3-D view follows the first "
+        "(default: a hero, else a vehicle with a LIDAR, else the first with sensors)",
     )
     group.add_argument(
         "--lidar",
         choices=("interest", "all", "off"),
         default="interest",
-        help="points on road users only, with the range ring; all points; none (default %(default)s)",
+        help="LIDAR points on road users only, with the ring of the range; all points; none (default %(default)s)",
     )
 
 
 def _endpoint(text: str) -> str:
     if not re.fullmatch(r"[a-z][a-z-]*/\S+:\d{1,5}", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no endpoint: write tcp/HOST:PORT, as in {DEFAULT_ENDPOINT}")
+        raise argparse.ArgumentTypeError(f"{text!r} is not an endpoint: write tcp/HOST:PORT, as in {DEFAULT_ENDPOINT}")
     return text
 
 
 def _port(text: str) -> int:
     value = int(text)
     if not 0 < value < 65536:
-        raise argparse.ArgumentTypeError(f"{text} is no port")
+        raise argparse.ArgumentTypeError(f"{text} is not a port")
     return value
 
 

@@ -1,4 +1,4 @@
-"""Getting in: what a run's endpoint asks of those who connect, and what went wrong if it does not let us in."""
+"""Access: connects to a run's endpoint with credentials, and explains why the endpoint refuses a connection."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from pathlib import Path
 
 import zenoh
 
-_REFUSALS = 2
-"""Times in a row that something listens and hangs up before we take it for a refusal."""
+_REFUSED_ATTEMPTS = 2
+"""The endpoint has refused us after it has accepted and closed this many connections in a row."""
 
-_PAUSE_S = 0.2
+_RETRY_INTERVAL_S = 0.2
 
 _OPEN_TIMEOUT_MS = 5000
-"""Longest wait for an endpoint that accepts a connection and then says nothing."""
+"""Longest wait for an endpoint that accepts a connection and then sends nothing."""
 
 
 class AccessError(RuntimeError):
-    """The endpoint does not let us in, or nothing answers; the message says which, and what to do."""
+    """The endpoint refuses the connection, or nothing answers; the message says which, and what to do."""
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """Who we are, and whom we trust. Paths are of PEM files; `None` = not used."""
+    """Our identity, and the authority that we trust. Paths name PEM files; `None` = not used."""
 
     user: str | None = None
     password: str | None = None
@@ -38,7 +38,7 @@ class Credentials:
     key: str | None = None
 
     def settings(self) -> dict[str, object]:
-        """What zenoh is to be told."""
+        """The settings of zenoh that follow from these credentials."""
         settings: dict[str, object] = {}
         if self.user is not None:
             settings["transport/auth/usrpwd/user"] = self.user
@@ -57,29 +57,33 @@ ANONYMOUS = Credentials()
 
 
 def add_arguments(group: argparse._ArgumentGroup) -> None:
-    """Options that say who we are."""
-    group.add_argument("--user", metavar="NAME", help="user, if the run asks for one")
-    group.add_argument("--password-file", metavar="FILE", help="file with the user's password, readable by you alone")
-    group.add_argument("--ca", metavar="FILE", help="certificate of the authority behind a tls/ endpoint (PEM)")
-    group.add_argument("--certificate", metavar="FILE", help="your own certificate, if the run asks for one (PEM)")
-    group.add_argument("--key", metavar="FILE", help="its private key (PEM)")
+    """Adds the options for credentials."""
+    group.add_argument("--user", metavar="NAME", help="user name, if the run requires one")
+    group.add_argument(
+        "--password-file", metavar="FILE", help="file with the user's password, readable by its owner only"
+    )
+    group.add_argument(
+        "--ca", metavar="FILE", help="certificate of the authority that signed the certificate of a tls/ endpoint (PEM)"
+    )
+    group.add_argument("--certificate", metavar="FILE", help="your own certificate, if the run requires one (PEM)")
+    group.add_argument("--key", metavar="FILE", help="private key of your certificate (PEM)")
 
 
-def of_options(options: argparse.Namespace) -> Credentials:
-    """The credentials that these options name. Raises `AccessError` for what cannot be used."""
+def credentials_from(options: argparse.Namespace) -> Credentials:
+    """The credentials that these options name. Raises `AccessError` if a file is missing or unsafe."""
     if (options.user is None) != (options.password_file is None):
-        raise AccessError("--user and --password-file go together")
+        raise AccessError("--user and --password-file must be given together")
     if (options.certificate is None) != (options.key is None):
-        raise AccessError("--certificate and --key go together")
+        raise AccessError("--certificate and --key must be given together")
     for name in ("ca", "certificate", "key"):
         path = getattr(options, name)
         if path is not None and not Path(path).is_file():
             raise AccessError(f"--{name} {path}: there is no such file")
-    password = None if options.password_file is None else _password(Path(options.password_file))
+    password = None if options.password_file is None else _read_password(Path(options.password_file))
     return Credentials(options.user, password, options.ca, options.certificate, options.key)
 
 
-def _password(path: Path) -> str:
+def _read_password(path: Path) -> str:
     try:
         mode, text = path.stat().st_mode, path.read_text(encoding="utf-8")
     except OSError as error:
@@ -93,7 +97,7 @@ def _password(path: Path) -> str:
 
 
 def config(endpoint: str, credentials: Credentials = ANONYMOUS) -> zenoh.Config:
-    """A client of `endpoint` that neither scouts nor is found, and tries once to connect."""
+    """Configuration of a client of `endpoint` that does not scout, cannot be scouted, and tries once to connect."""
     settings: dict[str, object] = {
         "mode": "client",
         "connect/endpoints": [endpoint],
@@ -110,25 +114,25 @@ def config(endpoint: str, credentials: Credentials = ANONYMOUS) -> zenoh.Config:
 
 
 def connect(endpoint: str, timeout_s: float, credentials: Credentials = ANONYMOUS) -> zenoh.Session:
-    """Opens a session to the fan-out at `endpoint`, waiting for it at most `timeout_s`.
+    """Opens a session to the fan-out at `endpoint`, and waits at most `timeout_s` for the fan-out to listen.
 
-    What listens there and hangs up on us is a refusal, which is not waited for. Raises `AccessError`.
+    An endpoint that accepts connections and closes them refuses us: the wait ends at once. Raises `AccessError`.
     """
-    deadline, refusals = time.monotonic() + timeout_s, 0
+    deadline, refused_attempts = time.monotonic() + timeout_s, 0
     while True:
         try:
             return zenoh.open(config(endpoint, credentials))
         except zenoh.ZError as error:
             reason = str(error)
-        refusals = refusals + 1 if _listens(endpoint) else 0
-        if refusals == _REFUSALS:
-            raise AccessError(_refusal(endpoint, credentials, reason))
-        if time.monotonic() + _PAUSE_S > deadline:
-            raise AccessError(_silence(endpoint, timeout_s))
-        time.sleep(_PAUSE_S)
+        refused_attempts = refused_attempts + 1 if _is_listening(endpoint) else 0
+        if refused_attempts == _REFUSED_ATTEMPTS:
+            raise AccessError(_refusal_message(endpoint, credentials, reason))
+        if time.monotonic() + _RETRY_INTERVAL_S > deadline:
+            raise AccessError(_no_answer_message(endpoint, timeout_s))
+        time.sleep(_RETRY_INTERVAL_S)
 
 
-def _listens(endpoint: str) -> bool:
+def _is_listening(endpoint: str) -> bool:
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=1.0):
@@ -137,26 +141,30 @@ def _listens(endpoint: str) -> bool:
         return False
 
 
-def _refusal(endpoint: str, credentials: Credentials, reason: str) -> str:
+def _refusal_message(endpoint: str, credentials: Credentials, reason: str) -> str:
     if credentials.user is None and credentials.certificate is None:
-        hint = "it lets in only those who say who they are: give --user and --password-file, or --certificate and --key"
+        hint = "it requires credentials: give --user and --password-file, or --certificate and --key"
     elif credentials.user is None:
-        hint = "it does not take this certificate, or asks for --user and --password-file as well"
+        hint = "it does not accept this certificate, or it requires --user and --password-file as well"
     else:
-        hint = f"it does not know the user {credentials.user!r} with this password (or asks for none: leave --user out)"
+        hint = (
+            f"it does not know the user {credentials.user!r} with this password (or it requires none: leave --user out)"
+        )
     if endpoint.startswith("tls/") and credentials.ca is None:
-        hint += ".\n  A tls/ endpoint also needs --ca, the certificate of the authority that signed the run's"
+        hint += (
+            ".\n  A tls/ endpoint also needs --ca, the certificate of the authority that signed the run's certificate"
+        )
     elif endpoint.startswith("tcp/"):
         hint += ".\n  If its `fanout.listen` is tls/…, write tls/HOST:PORT and give --ca"
     if "ertificate" in reason or "UnknownIssuer" in reason:
-        hint += f".\n  TLS says: {reason.split(' at ')[0][:200]}"
+        hint += f".\n  TLS reports: {reason.split(' at ')[0][:200]}"
     return f"refused by {endpoint}: {hint}. The run's logs/fanout.log says why it refused."
 
 
-def _silence(endpoint: str, timeout_s: float) -> str:
+def _no_answer_message(endpoint: str, timeout_s: float) -> str:
     return (
         f"nothing answers at {endpoint} within {timeout_s:g} s.\n"
-        "  Is a run going, with `fanout.enabled = true`? Its endpoint is `fanout.listen` in its configuration.\n"
+        "  Is a run active, with `fanout.enabled = true`? Its endpoint is `fanout.listen` in its configuration.\n"
         "  A run on another machine listens on its own loopback: open a tunnel first, "
         "`ssh -L 7447:127.0.0.1:7447 HOST`."
     )

@@ -1,4 +1,4 @@
-"""Points of a LIDAR in the world: each was fired a little before the end of its tick, from where the sensor was."""
+"""Points of a LIDAR in the world. Each was fired before the end of its tick, from where the sensor was then."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ PAPER_AXES = 1
 """Value of `Scan.axes`: y backward, x left, z down."""
 
 INTEREST = (4, 5, 6, 12)
-"""Tags of points on vehicles, two-wheelers, pedestrians and lost loads: what `interest` shows."""
+"""Tags of points on vehicles, two-wheelers, pedestrians and lost loads, which `--lidar interest` shows."""
 
 TAG_COLORS = np.array(
     [
@@ -34,33 +34,39 @@ TAG_COLORS = np.array(
 """RGBA by `LidarPoint.tag`."""
 
 
-def of_interest(points: NDArray[np.void]) -> NDArray[np.void]:
-    """Points on what moves."""
-    return points[np.isin(points["tag"], INTEREST)]
+def points_of_interest(points: NDArray[np.void]) -> NDArray[np.void]:
+    """The points on vehicles, two-wheelers, pedestrians and lost loads."""
+    chosen: NDArray[np.void] = points[np.isin(points["tag"], INTEREST)]
+    return chosen
 
 
 def colors(points: NDArray[np.void]) -> NDArray[np.uint32]:
-    """RGBA `[n]`."""
-    return TAG_COLORS[np.minimum(points["tag"], len(TAG_COLORS) - 1)]
+    """Colours of points by their tags, RGBA `[n]`."""
+    by_tag: NDArray[np.uint32] = TAG_COLORS[np.minimum(points["tag"], len(TAG_COLORS) - 1)]
+    return by_tag
 
 
 def in_world_m(
     scan: np.void, points: NDArray[np.void], velocity_mps: NDArray[np.floating], yaw_rate_radps: float
 ) -> NDArray[np.float32]:
-    """World positions `[n, 3]` of points, the sensor having moved with `velocity_mps` (world) and turned meanwhile."""
+    """World positions `[n, 3]` of points. The sensor moved with `velocity_mps` (world) and turned meanwhile."""
+    # Into the axes x forward, y left, z up.
     age_s = points["age_us"].astype(np.float64) * 1e-6
     forward = points["position_m"].astype(np.float64)
     if scan["axes"] == PAPER_AXES:
         forward = np.column_stack([-forward[:, 1], forward[:, 0], -forward[:, 2]])
+    # Level them by the attitude of the sensor.
     roll, pitch, yaw = (float(angle) for angle in scan["attitude_rad"])
     level = forward @ (_pitched(pitch) @ _rolled(roll)).T
+    # Turn and move each to where the sensor was when it fired.
     heading = yaw - yaw_rate_radps * age_s
     cos, sin = np.cos(heading), np.sin(heading)
     turned = np.column_stack(
         [cos * level[:, 0] - sin * level[:, 1], sin * level[:, 0] + cos * level[:, 1], level[:, 2]]
     )
     moved = scan["position_m"] - age_s[:, None] * np.asarray(velocity_mps, np.float64)
-    return (turned + moved).astype(np.float32)
+    world_m: NDArray[np.float64] = turned + moved
+    return world_m.astype(np.float32)
 
 
 def _rolled(roll_rad: float) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
-"""Where a recording is shown: the `rerun` program of the wheel, as a window or as a server for browsers, on loopback.
+"""Shows a recording with the `rerun` program of the wheel: in a window, or served to browsers on loopback.
 
-rerun's Python functions for the same listen on every interface.
+rerun's own Python functions for this listen on every network interface.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 
-import rerun_cli
+import rerun_cli  # type: ignore[import-untyped]  # the wheel that holds the program has no stubs
 
 from caraware_viewer.page import Page
 
@@ -25,40 +25,41 @@ HOST = "127.0.0.1"
 GRPC_PORT = 9876
 WEB_PORT = 9090
 SERVER_MEMORY = "256MiB"
-"""What rerun's server keeps for browsers that come later; then it forgets the oldest."""
+"""Most data that rerun's server keeps for browsers that join later; it drops the oldest."""
 
-_READY_S = 30.0
-_LOOK_S = 0.05
+_START_LIMIT_S = 30.0
+_POLL_INTERVAL_S = 0.05
 _PR_SET_PDEATHSIG = 1
 
 
 class DisplayError(RuntimeError):
-    """rerun does not come up; the message says why and what to do."""
+    """rerun does not start; the message says why and what to do."""
 
 
 def has_screen(environment: Mapping[str, str] = os.environ) -> bool:
-    """True where a window can be opened."""
+    """True if a window can be opened."""
     return sys.platform == "darwin" or any(environment.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def free_port(wanted: int) -> int:
-    """`wanted` if nobody listens there on this machine, else one that is free."""
+    """`wanted` if no program listens on it on this machine, else another free port."""
     for port in (wanted, 0):
         with socket.socket() as attempt, contextlib.suppress(OSError):
             attempt.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             attempt.bind((HOST, port))
-            return attempt.getsockname()[1]
+            port_number: int = attempt.getsockname()[1]
+            return port_number
     raise DisplayError(f"no port is free on {HOST}")
 
 
 class Display:
-    """A `rerun` process, ended with this one. Use as a context manager."""
+    """A `rerun` process that ends with this one. Use as a context manager."""
 
     def __init__(self, process: subprocess.Popen[bytes], grpc_port: int, page: Page | None = None) -> None:
         self.url = f"rerun+http://{HOST}:{grpc_port}/proxy"
-        """Where recordings are sent."""
+        """Address to which a recording is sent."""
         self.page = page
-        """What a browser opens, if it is not a window."""
+        """The page for browsers; `None` for a window."""
         self._process = process
 
     @classmethod
@@ -71,7 +72,7 @@ class Display:
 
     @classmethod
     def web(cls, web_port: int | None = None) -> Display:
-        """Serves browsers at `web_port`, or at the usual port if that is free, or at another."""
+        """Serves browsers at `web_port`; without one, at 9090 if it is free, else at another port."""
         grpc_port, upstream_port = free_port(GRPC_PORT), free_port(0)
         ports = ("--port", str(grpc_port), "--web-viewer-port", str(upstream_port))
         process = _start("--serve-web", *ports, "--server-memory-limit", SERVER_MEMORY)
@@ -101,7 +102,7 @@ class Display:
         self.close()
 
     def close(self) -> None:
-        """Ends it, the page first; nothing if that has been done."""
+        """Ends the page and the process; does nothing the second time."""
         if self.page is not None:
             self.page.close()
         self._process.terminate()
@@ -115,29 +116,31 @@ class Display:
 def _start(*arguments: str) -> subprocess.Popen[bytes]:
     program = Path(rerun_cli.__file__).parent / "rerun"
     if not program.exists():
-        raise DisplayError(
-            f"{program} is not there: install rerun-sdk anew (`pip install --force-reinstall rerun-sdk`)"
-        )
-    # With CI set, rerun does not report on its user.
+        raise DisplayError(f"{program} is missing: install rerun-sdk again (`pip install --force-reinstall rerun-sdk`)")
+    # With CI set, rerun sends no usage statistics.
     environment = {"RUST_LOG": "error"} | os.environ | {"CI": "1"}
     return subprocess.Popen(
         [str(program), "--bind", HOST, *arguments],
         env=environment,
         stdout=subprocess.DEVNULL,
-        preexec_fn=_die_with_parent(),
+        preexec_fn=_end_with_parent(),
     )
 
 
-def _die_with_parent() -> Callable[[], None] | None:
-    """Linux ends the child even if this process is killed; elsewhere nobody does."""
+def _end_with_parent() -> Callable[[], None] | None:
+    """Makes Linux end the child even if this process is killed; other systems cannot."""
     if not sys.platform.startswith("linux"):
         return None
     libc = ctypes.CDLL(None)
-    return lambda: libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+    def request_signal() -> None:
+        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+    return request_signal
 
 
 def _wait_for(process: subprocess.Popen[bytes], port: int) -> None:
-    deadline = time.monotonic() + _READY_S
+    deadline = time.monotonic() + _START_LIMIT_S
     while time.monotonic() < deadline:
         if process.poll() is not None:
             raise DisplayError(
@@ -145,6 +148,6 @@ def _wait_for(process: subprocess.Popen[bytes], port: int) -> None:
             )
         with contextlib.suppress(OSError), socket.create_connection((HOST, port), timeout=1):
             return
-        time.sleep(_LOOK_S)
+        time.sleep(_POLL_INTERVAL_S)
     process.kill()
-    raise DisplayError(f"rerun did not listen at {HOST}:{port} within {_READY_S:g} s")
+    raise DisplayError(f"rerun did not listen at {HOST}:{port} within {_START_LIMIT_S:g} s")

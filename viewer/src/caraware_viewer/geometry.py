@@ -1,4 +1,4 @@
-"""Shapes of what is drawn, as arrays. World frame: metres, x east, y north; nothing here knows of a screen."""
+"""Shapes of road users and the scene, as arrays in the world frame: metres, x east, y north."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _RING_POINTS = 97
 
 
 def outlines_m(states: NDArray[np.void]) -> NDArray[np.float32]:
-    """Closed outlines `[n, 8, 2]` of road users seen from above; an arrow inside points ahead."""
+    """Closed outlines `[n, 8, 2]` of road users seen from above; an arrow inside points forward."""
     return _in_world(states, _OUTLINE)
 
 
 def bodies_m(states: NDArray[np.void]) -> NDArray[np.float32]:
-    """Centre lines `[n, 2, 2]` of road users that fill their outlines when drawn as wide as [`body_radii_m`]."""
+    """Centre lines `[n, 2, 2]` of road users; drawn with the radii of `body_radii_m`, they fill the outlines."""
     radius_m = body_radii_m(states)
     ends = np.stack([radius_m, states["length_m"] - radius_m], axis=1)
     along_m = ends - _rear_m(states)[:, None]
@@ -34,12 +34,13 @@ def bodies_m(states: NDArray[np.void]) -> NDArray[np.float32]:
 
 
 def body_radii_m(states: NDArray[np.void]) -> NDArray[np.float32]:
-    """Radius `[n]` of [`bodies_m`]: a little less than half the width."""
-    return (0.45 * np.minimum(states["width_m"], states["length_m"])).astype(np.float32)
+    """Radius `[n]` of the lines of `bodies_m`: 0.45 of the width."""
+    radius_m: NDArray[np.float32] = 0.45 * np.minimum(states["width_m"], states["length_m"])
+    return radius_m.astype(np.float32)
 
 
 def blinkers_m(states: NDArray[np.void]) -> NDArray[np.float32]:
-    """Where a blinker is on, `[m, 2]`: the front and rear corners of that side."""
+    """Positions of the blinkers that are on, `[m, 2]`: the front and rear corners of that side."""
     left = states[states["signals"] & (BLINKER_LEFT | BLINKER_BOTH) != 0]
     right = states[states["signals"] & (BLINKER_RIGHT | BLINKER_BOTH) != 0]
     corners = [_in_world(left, np.array([[0, 1], [1, 1]])), _in_world(right, np.array([[0, -1], [1, -1]]))]
@@ -47,20 +48,20 @@ def blinkers_m(states: NDArray[np.void]) -> NDArray[np.float32]:
 
 
 def brake_lights_m(states: NDArray[np.void]) -> NDArray[np.float32]:
-    """Where a brake light is on, `[m, 2]`: two at the rear."""
+    """Positions of the brake lights that are on, `[m, 2]`: two at the rear."""
     braking = states[(states["signals"] & BRAKE != 0) & (states["kind"] != wire.PERSON)]
     return _in_world(braking, np.array([[0, 0.7], [0, -0.7]])).reshape(-1, 2)
 
 
 def centres_m(states: NDArray[np.void]) -> NDArray[np.float32]:
-    """Middles `[n, 3]` of the boxes around road users."""
+    """Centres `[n, 3]` of the boxes around road users."""
     along_m = (states["length_m"] / 2 - _rear_m(states))[:, None]
     flat = _turned(states, along_m, np.zeros_like(along_m))[:, 0]
     return np.column_stack([flat, states["z_m"] + states["height_m"] / 2]).astype(np.float32)
 
 
 def quaternions(yaw_rad: Points) -> NDArray[np.float32]:
-    """Turns `[n, 4]` (x, y, z, w) about the vertical."""
+    """Rotations about the vertical as quaternions `[n, 4]` (x, y, z, w)."""
     zero = np.zeros_like(yaw_rad)
     return np.stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)], axis=-1).astype(np.float32)
 
@@ -73,14 +74,14 @@ def ring_m(centre_m: Sequence[float] | Points, radius_m: float) -> NDArray[np.fl
 
 
 def links_m(points_m: Points, vehicles_m: Points) -> NDArray[np.float32]:
-    """Segments `[n, 2, 2]` from points to their vehicles."""
+    """Segments `[n, 2, 2]` from points to vehicles."""
     return np.stack([points_m, vehicles_m], axis=1).astype(np.float32)
 
 
 def hatching_m(outline_m: Points, spacing_m: float) -> list[NDArray[np.float32]]:
     """Horizontal segments `[2, 2]` inside a polygon `[n, 2]` (even-odd), `spacing_m` apart.
 
-    Drawn with half the spacing as radius they fill it: rerun's 2-D views have no filled polygons.
+    Drawn with half the spacing as radius, the segments fill the polygon; rerun's 2-D views have no filled polygons.
     """
     start, end = np.asarray(outline_m, np.float64), np.roll(outline_m, -1, axis=0).astype(np.float64)
     rows = np.arange(start[:, 1].min() + spacing_m / 2, start[:, 1].max(), spacing_m)
@@ -96,7 +97,7 @@ def hatching_m(outline_m: Points, spacing_m: float) -> list[NDArray[np.float32]]
 
 
 def frame_m(outline_m: Points, base_m: float, height_m: float) -> list[NDArray[np.float32]]:
-    """Edges of a prism over a polygon `[n, 2]`: its foot, its top, and its corners, as strips `[·, 3]`."""
+    """Edges of a prism over a polygon `[n, 2]`, as strips `[·, 3]`: its base, its top, and its vertical edges."""
     closed = np.vstack([outline_m, outline_m[:1]])
     levels = [np.column_stack([closed, np.full(len(closed), z)]) for z in (base_m, base_m + height_m)]
     corners = np.stack([level[:-1] for level in levels], axis=1)
@@ -104,16 +105,19 @@ def frame_m(outline_m: Points, base_m: float, height_m: float) -> list[NDArray[n
 
 
 def _rear_m(states: NDArray[np.void]) -> NDArray[np.float32]:
+    """Distance `[n]` from the rear end to the origin; the origin of a person is its centre."""
     return np.where(states["kind"] == wire.PERSON, states["length_m"] / 2, states["rear_overhang_m"])
 
 
 def _in_world(states: NDArray[np.void], shape: NDArray[np.floating]) -> NDArray[np.float32]:
+    """World positions `[n, k, 2]` of a shape `[k, 2]` that is scaled to each road user."""
     along_m = shape[:, 0] * states["length_m"][:, None] - _rear_m(states)[:, None]
     across_m = shape[:, 1] * states["width_m"][:, None] / 2
     return _turned(states, along_m, across_m)
 
 
 def _turned(states: NDArray[np.void], along_m: Points, across_m: Points) -> NDArray[np.float32]:
+    """World positions `[n, k, 2]` of points in the frames of road users, x forward, y left."""
     cos, sin = np.cos(states["yaw_rad"])[:, None], np.sin(states["yaw_rad"])[:, None]
     x_m = states["x_m"][:, None] + cos * along_m - sin * across_m
     y_m = states["y_m"][:, None] + sin * along_m + cos * across_m

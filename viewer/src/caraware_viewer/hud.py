@@ -1,57 +1,56 @@
-"""The HUD: a text with the figures of the run and of the vehicles looked at. Pure functions of what is known."""
+"""The HUD: a text with the figures of the run and of the followed vehicles. Pure functions of the newest state."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from caraware_viewer import wire
+from caraware_viewer.documents import RunMap, RunStatus, TrainingStatus
 from caraware_viewer.pairing import mean_m
 from caraware_viewer.picture import Picture
 
 KMH = 3.6
-MOST_VEHICLES = 40
-"""Rows of the table of errors, at most; those looked at come first."""
+MAX_VEHICLES = 40
+"""Most rows of the table of errors; the followed vehicles come first."""
 
-_SENSORS = ((wire.GNSS, "GNSS"), (wire.IMU, "IMU"), (wire.SPEED_STEERING, "speed+steering"), (wire.LIDAR, "LIDAR"))
 _COMPASS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
-_NOTHING = "–"
+_NO_VALUE = "–"
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What the viewer itself does."""
+class ViewerFigures:
+    """Figures of the viewer itself."""
 
     frames_per_s: float = math.nan
     """Ticks drawn per wall second."""
     age_ms: float = math.nan
-    """Age of the newest tick when it was drawn, if both clocks agree."""
+    """Age of the newest tick when it was drawn; NaN if the clocks of both machines differ."""
     lost: int = 0
-    """Samples that did not arrive."""
+    """Samples that were lost on the network."""
     refused: int = 0
-    """Samples that are not what they say they are."""
+    """Samples that were refused."""
 
 
-def hud(picture: Picture, run_map: dict[str, Any], looked_at: Sequence[int], shown: Shown) -> str:
-    """The whole text, as markdown."""
-    blocks = [_run(picture, run_map, shown)]
-    blocks += [_vehicle(picture, id_hash) for id_hash in looked_at[:4]]
-    blocks.append(_errors(picture, looked_at))
+def hud(picture: Picture, run_map: RunMap, followed: Sequence[int], viewer: ViewerFigures) -> str:
+    """The whole text, as Markdown."""
+    blocks = [_run(picture, run_map, viewer)]
+    blocks += [_vehicle(picture, id_hash) for id_hash in followed[:4]]
+    blocks.append(_errors(picture, followed))
     return "\n\n".join(block for block in blocks if block)
 
 
-def _run(picture: Picture, run_map: dict[str, Any], shown: Shown) -> str:
+def _run(picture: Picture, run_map: RunMap, viewer: ViewerFigures) -> str:
     status = picture.status
-    training = status.get("training") or {}
+    training = status.get("training") or TrainingStatus()
     title = f"#### {_escaped(str(run_map.get('run', 'run')))} · {run_map.get('mode', '')}"
     title += " · evaluation" if status.get("evaluation") else ""
     rows = [
         ("episode", _text(status.get("episode")) + f" · step {_text(status.get('step'))}"),
-        ("time", f"{_clock(_sim_time_s(picture, run_map))} in all · {_episode_s(picture):.1f} s in this episode"),
+        ("time", f"{_clock(_sim_time_s(picture, run_map))} in total · {_episode_s(picture):.1f} s in this episode"),
         ("simulation", _speed(status, training)),
         ("road users", _counts(picture, run_map)),
         ("sensors on", _sensors(picture)),
@@ -68,11 +67,11 @@ def _run(picture: Picture, run_map: dict[str, Any], shown: Shown) -> str:
         rows.append(("mean error", means))
     if picture.collisions:
         rows.append(("contacts", f"{picture.collisions} since this viewer joined"))
-    rows.append(("viewer", _viewer(shown)))
+    rows.append(("viewer", _viewer(viewer)))
     return title + "\n" + _table(rows[0], rows[1:])
 
 
-def _speed(status: dict[str, Any], training: dict[str, Any]) -> str:
+def _speed(status: RunStatus, training: TrainingStatus) -> str:
     parts = []
     if training.get("env_steps_per_s"):
         parts.append(f"{training['env_steps_per_s']:,.0f} samples/s".replace(",", " "))
@@ -80,36 +79,37 @@ def _speed(status: dict[str, Any], training: dict[str, Any]) -> str:
         parts.append(f"{status['ticks_per_s']:.0f} ticks/s")
     if status.get("real_time_factor") is not None:
         parts.append(f"{status['real_time_factor']:.1f} × real time")
-    return " · ".join(parts) or _NOTHING
+    return " · ".join(parts) or _NO_VALUE
 
 
-def _counts(picture: Picture, run_map: dict[str, Any]) -> str:
+def _counts(picture: Picture, run_map: RunMap) -> str:
     if picture.world is None:
-        return _NOTHING
+        return _NO_VALUE
     of_kind = np.bincount(picture.world.states["kind"], minlength=4)
     counts = [(wire.HERO, "heroes"), (wire.CAV, "CAV"), (wire.OTHER, "others"), (wire.PERSON, "pedestrians")]
     parts = [f"{of_kind[kind]} {name}" for kind, name in counts if of_kind[kind] or kind != wire.HERO]
-    obstacles = len((run_map.get("scene") or {}).get("obstacles", []))
+    scene = run_map.get("scene")
+    obstacles = 0 if scene is None else len(scene.get("obstacles", []))
     return " · ".join([*parts, f"{obstacles} obstacles"])
 
 
 def _sensors(picture: Picture) -> str:
     if picture.observation is None:
-        return _NOTHING
+        return _NO_VALUE
     held = picture.observation.vehicle != wire.EMPTY_SLOT
     sensors = picture.observation.sensors[held]
-    return " · ".join(f"{name} {int((sensors & bit != 0).sum())}" for bit, name in _SENSORS)
+    return " · ".join(f"{sensor.label} {int((sensors & sensor.bit != 0).sum())}" for sensor in wire.SENSORS)
 
 
-def _viewer(shown: Shown) -> str:
-    parts = [f"{_number(shown.frames_per_s, 1)} frames/s", f"{_number(shown.age_ms, 0)} ms old"]
-    parts += [f"{shown.lost} lost"] if shown.lost else []
-    parts += [f"{shown.refused} refused"] if shown.refused else []
+def _viewer(viewer: ViewerFigures) -> str:
+    parts = [f"{_number(viewer.frames_per_s, 1)} frames/s", f"{_number(viewer.age_ms, 0)} ms old"]
+    parts += [f"{viewer.lost} lost"] if viewer.lost else []
+    parts += [f"{viewer.refused} refused"] if viewer.refused else []
     return " · ".join(parts)
 
 
 def _vehicle(picture: Picture, id_hash: int) -> str:
-    """Speed, steering, heading, accelerations and rates as the sensors tell them; without sensors, as they are."""
+    """Speed, steering, heading, accelerations and rates as the sensors measure them; without sensors, the true ones."""
     row, slot = picture.row(id_hash), picture.slot(id_hash)
     if row is None:
         return ""
@@ -138,24 +138,24 @@ def compass_letters(compass_rad: float) -> str:
     return _COMPASS[round(math.degrees(compass_rad) / 45) % 8]
 
 
-def _errors(picture: Picture, looked_at: Sequence[int]) -> str:
-    """Error of each vehicle; those looked at first, then by slot."""
+def _errors(picture: Picture, followed: Sequence[int]) -> str:
+    """The table of each vehicle's errors; the followed vehicles come first, then the others by slot."""
     observation, distances = picture.observation, picture.distances
     if observation is None or distances is None:
         return ""
     slots = np.flatnonzero(observation.valid)
     if not len(slots):
         return ""
-    ordered = sorted(slots.tolist(), key=lambda slot: int(observation.id_hash[slot]) not in looked_at)
+    ordered = sorted(slots.tolist(), key=lambda slot: int(observation.id_hash[slot]) not in followed)
     rows = [
         (
             picture.name(int(observation.id_hash[slot])),
-            *(_NOTHING if d is None else _number(float(d[slot]), 2) for d in (distances.policy, distances.ekf)),
+            *(_NO_VALUE if d is None else _number(float(d[slot]), 2) for d in (distances.policy, distances.ekf)),
             _number(float(distances.raw_gnss[slot]), 2),
         )
-        for slot in ordered[:MOST_VEHICLES]
+        for slot in ordered[:MAX_VEHICLES]
     ]
-    rest = f"\n\n… and {len(slots) - MOST_VEHICLES} more" if len(slots) > MOST_VEHICLES else ""
+    rest = f"\n\n… and {len(slots) - MAX_VEHICLES} more" if len(slots) > MAX_VEHICLES else ""
     return "#### error (m)\n" + _table(("vehicle", "policy", "EKF", "GNSS"), rows) + rest
 
 
@@ -165,11 +165,11 @@ def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def _escaped(cell: str) -> str:
-    """Ids may hold any characters."""
+    """Text for a cell of a Markdown table; ids may hold any characters."""
     return cell.replace("\\", "\\\\").replace("|", "\\|").replace("\n", " ").replace("<", "\\<").replace("`", "\\`")
 
 
-def _sim_time_s(picture: Picture, run_map: dict[str, Any]) -> float:
+def _sim_time_s(picture: Picture, run_map: RunMap) -> float:
     if picture.world is None:
         return 0.0
     return (picture.world.header.tick + 1) * float(run_map["tick_s"])
@@ -186,15 +186,15 @@ def _clock(seconds: float) -> str:
 
 
 def _text(value: object) -> str:
-    return _NOTHING if value is None else str(value)
+    return _NO_VALUE if value is None else str(value)
 
 
 def _number(value: float | None, digits: int) -> str:
-    return _NOTHING if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+    return _NO_VALUE if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def _metres(value: float) -> str:
-    return f"{value:.2f} m" if math.isfinite(value) else _NOTHING
+    return f"{value:.2f} m" if math.isfinite(value) else _NO_VALUE
 
 
 def _vector(values: Iterable[float], unit: str) -> str:

@@ -1,6 +1,6 @@
-"""The zenoh side: find a run, listen to it, keep the newest frame of each topic.
+"""The zenoh side: finds a run, subscribes to it, and keeps the newest frame of each topic.
 
-zenoh's callbacks only store: a slow display skips frames, it never holds up the network or the run.
+zenoh's callbacks only store: a slow display skips frames, and never delays the network or the run.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 from urllib.parse import quote, unquote
 
 import zenoh
 
 from caraware_viewer import access
+from caraware_viewer.documents import RunMap
 from caraware_viewer.wire import SCHEMA_VERSION
 
 TOPICS = ("world", "observation", "prediction", "status", "vehicles", "signals", "event")
-CLOUDS = "pointcloud/"
-"""Topics of point clouds begin with this; a vehicle's id follows."""
+CLOUD_PREFIX = "pointcloud/"
+"""Beginning of the topics of point clouds; a vehicle's id follows."""
 
-RETURN_S = 5.0
-"""How long a fan-out may be away before its run counts as ended: long enough to be started again."""
+RESTART_LIMIT_S = 5.0
+"""Time without a liveliness token after which the run counts as ended; a dead fan-out is restarted sooner."""
 
 _EMPTY_NAME = "%"
 _ATTACHMENT = struct.Struct("<QQ")
@@ -33,7 +33,7 @@ _PLAUSIBLE_AGE_MS = 60_000.0
 
 
 class LinkError(RuntimeError):
-    """There is nothing to watch; the message says where it was looked for and what to do."""
+    """There is nothing to watch; the message says where the viewer looked and what to do."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class RunKey:
 
     @property
     def prefix(self) -> str:
-        """Prefix of its keys."""
+        """Prefix of the keys."""
         return f"caraware/{encoded(self.run)}/{self.env}"
 
     @classmethod
@@ -62,29 +62,29 @@ def encoded(name: str) -> str:
 
 @dataclass(frozen=True)
 class Sample:
-    """What came on a topic."""
+    """A sample of a topic."""
 
     payload: bytes
     sequence: int | None = None
-    """Number of the sample on its topic, if it says."""
+    """Sequence number on its topic; `None` without an attachment."""
     taken_ns: int | None = None
-    """UNIX time at which it was taken out of shared memory, if it says."""
+    """UNIX time at which the fan-out took it out of shared memory; `None` without an attachment."""
 
     @classmethod
     def of(cls, sample: zenoh.Sample) -> Sample:
-        """With the attachment: sequence number and time."""
+        """A sample of zenoh, with the sequence number and time of its attachment."""
         attachment = b"" if sample.attachment is None else bytes(sample.attachment)
         payload = bytes(sample.payload)
         return cls(payload, *_ATTACHMENT.unpack(attachment)) if len(attachment) == _ATTACHMENT.size else cls(payload)
 
     def age_ms(self) -> float:
-        """Age by this machine's clock; NaN if unknown or if the clocks plainly differ."""
+        """Age by this machine's clock; NaN if unknown, or if the clocks of both machines clearly differ."""
         age_ms = float("nan") if self.taken_ns is None else (time.time_ns() - self.taken_ns) * 1e-6
         return age_ms if 0 <= age_ms < _PLAUSIBLE_AGE_MS else float("nan")
 
 
 class LatestFrames:
-    """The newest sample of each topic that was not taken; counts those that nobody saw and those that never came."""
+    """The newest sample of each topic, until it is taken; counts the samples that were replaced and that were lost."""
 
     def __init__(self) -> None:
         self._frames: dict[str, Sample] = {}
@@ -93,9 +93,9 @@ class LatestFrames:
         self.ended = False
         """True once the run has ended."""
         self.skipped: Counter[str] = Counter()
-        """Samples that were replaced before anybody took them, by topic."""
+        """Samples that were replaced before they were taken, by topic."""
         self.lost = 0
-        """Samples that the network dropped, by their sequence numbers."""
+        """Samples that were lost on the network, from the gaps in the sequence numbers."""
         self._newest: dict[str, int] = {}
 
     def store(self, topic: str, sample: Sample) -> None:
@@ -103,7 +103,7 @@ class LatestFrames:
         with self._changed:
             if sample.sequence is not None:
                 before = self._newest.get(topic, sample.sequence)
-                # A jump back is a fan-out that was started again.
+                # After a jump back, the samples are of a restarted fan-out.
                 self.lost += max(0, sample.sequence - before - 1)
                 self._newest[topic] = sample.sequence
             self.skipped[topic] += topic in self._frames
@@ -111,26 +111,26 @@ class LatestFrames:
             self._changed.notify()
 
     def add(self, topic: str, sample: Sample) -> None:
-        """Stores an older sample, unless there is a newer one."""
+        """Stores a sample that is older than the subscription, unless there is a newer one."""
         with self._changed:
             self._frames.setdefault(topic, sample)
             self._changed.notify()
 
     def take(self, timeout_s: float) -> dict[str, Sample]:
-        """All samples that came since the last call, waiting at most `timeout_s` for one."""
+        """The newest samples since the last call; waits at most `timeout_s` for one."""
         with self._changed:
-            self._changed.wait_for(lambda: self._frames or self._closed, timeout_s)
+            self._changed.wait_for(lambda: bool(self._frames) or self._closed, timeout_s)
             frames, self._frames = self._frames, {}
             return frames
 
     def close(self) -> None:
-        """No more frames are wanted: ends the wait of `take`."""
+        """Ends the wait of `take`: the viewer needs no more frames."""
         with self._changed:
             self._closed = True
             self._changed.notify()
 
     def end(self) -> None:
-        """The run is over: no more frames will come."""
+        """Marks the run as ended, and ends the wait of `take`."""
         self.ended = True
         self.close()
 
@@ -148,104 +148,109 @@ def connect(endpoint: str, timeout_s: float, credentials: access.Credentials = a
         raise LinkError(str(error)) from error
 
 
-def alive(session: zenoh.Session, timeout_s: float) -> list[RunKey]:
-    """The runs that are fanned out behind this session."""
+def list_runs(session: zenoh.Session, timeout_s: float) -> list[RunKey]:
+    """The runs that this session can watch, by their liveliness tokens."""
     replies = session.liveliness().get("caraware/*/*/alive", timeout=timeout_s)
     keys = {RunKey.of_alive_key(str(reply.ok.key_expr)) for reply in replies if reply.ok}
     return sorted(keys, key=lambda key: (key.run, key.env))
 
 
-def choose(session: zenoh.Session, endpoint: str, name: str | None, timeout_s: float, env: int | None = None) -> RunKey:
-    """The run called `name`, or the only one, its environment `env` or its first; waits for it at most `timeout_s`."""
+def find_run(
+    session: zenoh.Session, endpoint: str, name: str | None, timeout_s: float, env: int | None = None
+) -> RunKey:
+    """The run called `name`, or the only run, and its environment `env`, or its first. Waits at most `timeout_s`."""
     deadline = time.monotonic() + timeout_s
     while True:
-        runs = alive(session, max(0.5, deadline - time.monotonic()))
+        runs = list_runs(session, max(0.5, deadline - time.monotonic()))
         wanted = [key for key in runs if name in (None, key.run) and env in (None, key.env)]
         if len({key.run for key in wanted}) == 1:
             return wanted[0]
         if time.monotonic() > deadline:
             break
         time.sleep(0.1)
-    there = ", ".join(sorted({key.run for key in runs})) or "none"
+    found = ", ".join(sorted({key.run for key in runs})) or "none"
     if wanted:
-        raise LinkError(f"several runs are fanned out at {endpoint} ({there}): name one with --run NAME")
-    what = "no run" if name is None else f"no run called {name!r}"
-    what += "" if env is None else f" with an environment {env}"
-    raise LinkError(f"{endpoint} answers, but {what} is fanned out there within {timeout_s:g} s (there: {there})")
+        raise LinkError(f"{endpoint} has several runs ({found}): name one with --run NAME")
+    missing = "no run" if name is None else f"no run called {name!r}"
+    missing += "" if env is None else f" with an environment {env}"
+    raise LinkError(f"{endpoint} answers, but {missing} appeared there within {timeout_s:g} s (runs there: {found})")
 
 
-class Link:
-    """A run being watched. Use as a context manager."""
+class RunLink:
+    """The subscriptions to a run. Use as a context manager."""
 
     def __init__(self, session: zenoh.Session, run: RunKey) -> None:
         self.run = run
         self.frames = LatestFrames()
         self._session = session
-        self._farewell: threading.Timer | None = None
-        # Subscribers end when they are collected: keep them.
+        self._end_timer: threading.Timer | None = None
+        # A subscriber ends when it is garbage-collected, so they are kept here.
         self._subscribers = [self._subscribe(topic) for topic in TOPICS]
-        self._clouds: dict[str, zenoh.Subscriber] = {}
-        # With the history: a client is told that a killed peer's token is gone only if it knew of it.
+        self._clouds: dict[str, zenoh.Subscriber[None]] = {}
+        # zenoh reports the end of a killed peer's token only to clients that have seen the token: hence the history.
         self._tokens = session.liveliness().declare_subscriber(f"{run.prefix}/alive", self._on_token, history=True)
-        self._catch_up()
+        self._query_newest()
 
-    def __enter__(self) -> Link:
+    def __enter__(self) -> RunLink:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.frames.close()
         self._session.close()
 
-    def map(self, timeout_s: float) -> dict[str, Any]:
-        """The run's map and tick settings."""
+    def map(self, timeout_s: float) -> RunMap:
+        """Queries the run's map and tick settings."""
         for reply in self._session.get(f"{self.run.prefix}/map", timeout=timeout_s):
             if reply.ok:
-                return _known(bytes(reply.ok.payload), self.run.run)
+                return _parse_map(bytes(reply.ok.payload), self.run.run)
         raise LinkError(
-            f"run {self.run.run!r} did not tell its map within {timeout_s:g} s: is its fan-out being killed?"
+            f"run {self.run.run!r} did not send its map within {timeout_s:g} s: its fan-out may have just ended"
         )
 
-    def follow_clouds(self, vehicles: Iterable[str]) -> None:
-        """Subscribes to the point clouds of these vehicles, by their ids, and of no others."""
-        wanted = {CLOUDS + encoded(vehicle) for vehicle in vehicles}
+    def subscribe_clouds(self, vehicles: Iterable[str]) -> None:
+        """Subscribes to the point clouds of the vehicles with these ids, and to no others."""
+        wanted = {CLOUD_PREFIX + encoded(vehicle) for vehicle in vehicles}
         for topic in self._clouds.keys() - wanted:
             self._clouds.pop(topic).undeclare()
         for topic in wanted - self._clouds.keys():
             self._clouds[topic] = self._subscribe(topic)
 
-    def _subscribe(self, topic: str) -> zenoh.Subscriber:
+    def _subscribe(self, topic: str) -> zenoh.Subscriber[None]:
         def store(sample: zenoh.Sample) -> None:
             self.frames.store(topic, Sample.of(sample))
 
         return self._session.declare_subscriber(f"{self.run.prefix}/{topic}", store)
 
-    def _catch_up(self) -> None:
-        """Asks for what was published before the subscription."""
+    def _query_newest(self) -> None:
+        """Queries the values that were published before the subscription."""
         for reply in self._session.get(f"{self.run.prefix}/**", timeout=2.0):
-            topic = str(reply.ok.key_expr).removeprefix(f"{self.run.prefix}/") if reply.ok else ""
+            if reply.ok is None:
+                continue
+            topic = str(reply.ok.key_expr).removeprefix(f"{self.run.prefix}/")
             if topic in TOPICS:
                 self.frames.add(topic, Sample.of(reply.ok))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        if self._farewell is not None:
-            self._farewell.cancel()
-            self._farewell = None
+        """Ends the run when its token has been away for `RESTART_LIMIT_S`."""
+        if self._end_timer is not None:
+            self._end_timer.cancel()
+            self._end_timer = None
         if sample.kind == zenoh.SampleKind.DELETE:
-            self._farewell = threading.Timer(RETURN_S, self.frames.end)
-            self._farewell.daemon = True
-            self._farewell.start()
+            self._end_timer = threading.Timer(RESTART_LIMIT_S, self.frames.end)
+            self._end_timer.daemon = True
+            self._end_timer.start()
 
 
-def _known(payload: bytes, run: str) -> dict[str, Any]:
-    """The map, if it is one of this viewer's version."""
+def _parse_map(payload: bytes, run: str) -> RunMap:
+    """The map, if it has this viewer's schema version."""
     try:
-        run_map = json.loads(payload)
+        run_map: RunMap = json.loads(payload)
         version = run_map.get("schema_version", SCHEMA_VERSION)
     except (ValueError, AttributeError) as error:
-        raise LinkError(f"the map of run {run!r} is not what this viewer knows: {error}") from error
+        raise LinkError(f"the map of run {run!r} cannot be read: {error}") from error
     if version != SCHEMA_VERSION:
         raise LinkError(
-            f"run {run!r} speaks schema version {version}, this viewer {SCHEMA_VERSION}: "
+            f"run {run!r} has schema version {version}, and this viewer knows {SCHEMA_VERSION}: "
             "install the viewer of the run's version"
         )
     return run_map

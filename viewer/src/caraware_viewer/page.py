@@ -1,4 +1,4 @@
-"""rerun's web page without what calls home: no fonts from elsewhere, and a policy that binds it to this machine."""
+"""Serves rerun's page without access to other hosts: no remote fonts, and a policy that allows this machine only."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ FILES = {
     "/re_viewer_bg.wasm": "/re_viewer_bg.wasm",
     "/favicon.ico": "/favicon.ico",
 }
-"""What is handed out, and where rerun's own server has it."""
+"""The paths that are served, and their paths on rerun's own server."""
 
-_ELSEWHERE = re.compile(rb'<link\b[^>]*"https?://[^>]*>', re.DOTALL)
+_REMOTE_LINK = re.compile(rb'<link\b[^>]*"https?://[^>]*>', re.DOTALL)
 _LENGTH = "rerun-final-length"
 _CHUNK = 1 << 16
 
 
-def without_elsewhere(page: bytes) -> bytes:
+def without_remote_links(page: bytes) -> bytes:
     """The page without links to other hosts."""
-    return _ELSEWHERE.sub(b"", page)
+    return _REMOTE_LINK.sub(b"", page)
 
 
-def policy(grpc_port: int) -> str:
+def security_policy(grpc_port: int) -> str:
     """A content security policy: this page, and rerun's server on this machine."""
     return "; ".join(
         [
@@ -45,14 +45,15 @@ def policy(grpc_port: int) -> str:
 
 
 class Page:
-    """A server of its own, in threads of this process."""
+    """A web server in threads of this process."""
 
     def __init__(self, host: str, port: int, upstream_port: int, grpc_port: int) -> None:
-        handler = type(
-            "Handler", (_Handler,), {"upstream": f"http://{host}:{upstream_port}", "policy": policy(grpc_port)}
-        )
-        handler.target = "/?" + _query(host, grpc_port)
-        self._server = ThreadingHTTPServer((host, port), handler)
+        class Handler(_PageHandler):
+            upstream = f"http://{host}:{upstream_port}"
+            policy = security_policy(grpc_port)
+            target = "/?" + _query(host, grpc_port)
+
+        self._server = ThreadingHTTPServer((host, port), Handler)
         self._server.daemon_threads = True
         self.url = f"http://{host}:{self._server.server_address[1]}/"
         threading.Thread(target=self._server.serve_forever, name="page", daemon=True).start()
@@ -68,26 +69,28 @@ def _query(host: str, grpc_port: int) -> str:
     return f"url={url}&hide_welcome_screen&persist=false&theme=dark"
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _PageHandler(BaseHTTPRequestHandler):
     upstream: str
+    """Address of rerun's own server."""
     policy: str
     target: str
+    """Path of the page with the address of the recording."""
 
     def do_GET(self) -> None:
-        asked = urlsplit(self.path)
-        path = FILES.get(asked.path)
+        request = urlsplit(self.path)
+        path = FILES.get(request.path)
         if path is None:
             self.send_error(404)
-        elif path == "/" and "url=" not in asked.query:
-            # Whoever asks for more than the page (`?renderer=webgl`) gets both.
+        elif path == "/" and "url=" not in request.query:
+            # Options of the request, such as `?renderer=webgl`, are kept beside the address of the recording.
             self.send_response(302)
-            self.send_header("Location", "&".join(filter(None, [self.target, asked.query])))
+            self.send_header("Location", "&".join(filter(None, [self.target, request.query])))
             self.send_header("Content-Length", "0")
             self.end_headers()
         else:
-            self._hand_out(path)
+            self._serve(path)
 
-    def _hand_out(self, path: str) -> None:
+    def _serve(self, path: str) -> None:
         try:
             with urllib.request.urlopen(self.upstream + path, timeout=30) as answer:
                 body = answer.read()
@@ -99,7 +102,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(502, "rerun's server does not answer")
             return
         if path == "/":
-            body, length = without_elsewhere(body), None
+            body, length = without_remote_links(body), None
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(body)))

@@ -1,32 +1,35 @@
-"""Observation and prediction of one tick belong together, but travel apart: this joins them again."""
+"""Pairs observation and prediction of one tick, which arrive separately, and measures their errors."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from caraware_viewer.wire import Observation, Prediction
 
-_KEPT = 8
-"""Ticks to wait for a counterpart: the simulator is at most a window of eight ticks ahead of the learner."""
+TickFrame = TypeVar("TickFrame", Observation, Prediction)
+
+_MAX_WAITING = 8
+"""Most frames that wait for a counterpart: the simulator is at most a window of eight ticks ahead of the learner."""
 
 
 class Pairing:
-    """Keeps the last few of each until both of a tick are there."""
+    """Keeps the newest observations and predictions until both of a tick have arrived."""
 
     def __init__(self) -> None:
         self._observations: dict[tuple[int, int], Observation] = {}
         self._predictions: dict[tuple[int, int], Prediction] = {}
 
     def observation(self, frame: Observation) -> tuple[Observation, Prediction] | None:
-        """Adds an observation; the pair, if its prediction is there."""
+        """Adds an observation; returns the pair if its prediction has arrived."""
         _keep(self._observations, frame)
         return self._pair(frame)
 
     def prediction(self, frame: Prediction) -> tuple[Observation, Prediction] | None:
-        """Adds a prediction; the pair, if its observation is there."""
+        """Adds a prediction; returns the pair if its observation has arrived."""
         _keep(self._predictions, frame)
         return self._pair(frame)
 
@@ -41,15 +44,15 @@ def _key(frame: Observation | Prediction) -> tuple[int, int]:
     return frame.header.run_id, frame.header.tick
 
 
-def _keep(frames: dict[tuple[int, int], Observation] | dict[tuple[int, int], Prediction], frame) -> None:
+def _keep(frames: dict[tuple[int, int], TickFrame], frame: TickFrame) -> None:
     frames[_key(frame)] = frame
-    while len(frames) > _KEPT:
+    while len(frames) > _MAX_WAITING:
         frames.pop(next(iter(frames)))
 
 
 @dataclass(frozen=True)
 class Distances:
-    """Euclidean distances from the truth at one tick, one for each slot, metres; NaN where nothing can be compared."""
+    """Euclidean distances from the truth at one tick, `[n]` by slot, metres; NaN where there is nothing to compare."""
 
     raw_gnss: NDArray[np.float32]
     policy: NDArray[np.float32] | None = None
@@ -57,7 +60,7 @@ class Distances:
 
 
 def distances(observation: Observation, prediction: Prediction | None, *, driving: bool = False) -> Distances:
-    """Of an observation and what was made of it; a driving policy's actions are no positions."""
+    """Errors of an observation's fixes and of its prediction; a driving policy's actions are not positions."""
     raw_gnss = distance_m(observation, observation.gnss_m[:, :2])
     policy = None if prediction is None or driving else distance_m(observation, prediction.position_m)
     estimate_m = None if prediction is None else prediction.estimate_m
@@ -75,7 +78,7 @@ def distance_m(observation: Observation, points_m: NDArray[np.float32]) -> NDArr
 
 
 def mean_m(distance: NDArray[np.float32] | None) -> float:
-    """Mean of what is there; NaN if nothing is."""
+    """Mean over the slots that are not NaN; NaN without any."""
     if distance is None or np.isnan(distance).all():
         return float("nan")
     return float(np.nanmean(distance))

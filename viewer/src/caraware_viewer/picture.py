@@ -1,51 +1,49 @@
-"""The newest state of a run as its frames tell it, and who is looked at."""
+"""The newest state of a run, from its frames, and the vehicles that the views follow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from caraware_viewer import wire
+from caraware_viewer.documents import RunStatus
 from caraware_viewer.pairing import Distances
-
-Status = dict[str, Any]
 
 
 @dataclass
 class Picture:
-    """What is known now; every part may be missing."""
+    """The newest state of a run; any part may be missing."""
 
     wanted: Sequence[str] = ()
-    """Names of the vehicles to look at; empty: a hero, else the first that senses."""
+    """SUMO ids of the vehicles to follow; empty: a hero, else a vehicle with a LIDAR, else the first with sensors."""
     world: wire.World | None = None
     observation: wire.Observation | None = None
     distances: Distances | None = None
     """Of the newest tick that has an observation and, if there is a policy, its prediction."""
     names: dict[int, str] = field(default_factory=dict)
-    """SUMO's id of each road user, by the hash of it."""
-    status: Status = field(default_factory=dict)
+    """SUMO id of each road user, by the hash of the id."""
+    status: RunStatus = field(default_factory=RunStatus)
     signals: dict[int, str] = field(default_factory=dict)
-    """Letters of each traffic light's links, by the hash of its id."""
+    """State of each traffic light, a letter for each link, by the hash of its id."""
     collisions: int = 0
     """Contacts seen since the viewer joined."""
     _last_default: int | None = None
     _names_of: tuple[int, int] | None = None
 
-    def enter_names(self, frame: wire.Rows) -> None:
-        """Enters a part of the table of names; a new episode begins an empty one."""
+    def enter_names(self, frame: wire.Table) -> None:
+        """Enters rows of the table of road users; a new episode empties it."""
         episode = (frame.header.run_id, frame.header.episode)
         if episode != self._names_of:
             self.names.clear()
             self._names_of = episode
         for row in frame.rows:
-            self.names[int(row["id_hash"])] = wire.text(row["id"], int(row["id_len"]))
+            self.names[int(row["id_hash"])] = wire.decode_text(row["id"], int(row["id_len"]))
 
     def name(self, id_hash: int) -> str:
-        """SUMO's id, or something to tell vehicles apart until it is known."""
+        """SUMO id of a road user, or four digits of its hash until the id is known."""
         return self.names.get(id_hash, f"#{id_hash & 0xFFFF:04x}")
 
     @property
@@ -53,29 +51,29 @@ class Picture:
         """True in a run with heroes, where predictions are actions."""
         return self.world is not None and bool((self.world.states["kind"] == wire.HERO).any())
 
-    def looked_at(self) -> list[int]:
-        """Hashes of the ids of the vehicles looked at that are on the road, the main one first."""
+    def followed(self) -> list[int]:
+        """Hashes of the ids of the followed vehicles that are on the road, the main one first."""
         if self.world is None:
             return []
         states = self.world.states
-        there = {int(id_hash) for id_hash in states["id_hash"]}
+        present = {int(id_hash) for id_hash in states["id_hash"]}
         if self.wanted:
             of_name = {name: id_hash for id_hash, name in self.names.items()}
-            return [of_name[name] for name in self.wanted if of_name.get(name) in there]
-        if self._last_default not in there:
-            self._last_default = self._default(states)
+            return [of_name[name] for name in self.wanted if of_name.get(name) in present]
+        if self._last_default not in present:
+            self._last_default = self._default_vehicle(states)
         return [] if self._last_default is None else [self._last_default]
 
-    def _default(self, states: NDArray[np.void]) -> int | None:
-        """A hero; else a vehicle with a LIDAR; else the first that senses; else the first of all."""
+    def _default_vehicle(self, states: NDArray[np.void]) -> int | None:
+        """A hero, else a vehicle with a LIDAR, else the first with sensors. Without observations, the first CAV."""
         heroes = states["id_hash"][states["kind"] == wire.HERO]
         if len(heroes):
             return int(heroes[0])
-        there = set(states["id_hash"].tolist())
+        present = set(states["id_hash"].tolist())
         if self.observation is not None:
             valid = self.observation.valid
-            for chosen in (valid & (self.observation.sensors & wire.LIDAR != 0), valid):
-                sensing = [int(h) for h in self.observation.id_hash[chosen] if int(h) in there]
+            for chosen in (valid & (self.observation.sensors & wire.sensor_bit("lidar") != 0), valid):
+                sensing = [int(h) for h in self.observation.id_hash[chosen] if int(h) in present]
                 if sensing:
                     return sensing[0]
             return None
@@ -83,14 +81,14 @@ class Picture:
         return int(cavs[0]) if len(cavs) else None
 
     def row(self, id_hash: int) -> np.void | None:
-        """State of a road user."""
+        """State of a road user; `None` if it is not on the road."""
         if self.world is None:
             return None
         found = np.flatnonzero(self.world.states["id_hash"] == id_hash)
         return self.world.states[found[0]] if len(found) else None
 
     def slot(self, id_hash: int) -> int | None:
-        """Slot of a vehicle in the newest observation."""
+        """Slot of a vehicle in the newest observation; `None` if it has none."""
         if self.observation is None:
             return None
         taken = self.observation.vehicle != wire.EMPTY_SLOT

@@ -1,10 +1,10 @@
-"""Figures over simulated time."""
+"""Plots figures over simulated time."""
 
 from __future__ import annotations
 
 from caraware_viewer.canvas import Canvas
+from caraware_viewer.documents import RunStatus
 from caraware_viewer.pairing import Distances, mean_m
-from caraware_viewer.picture import Status
 from caraware_viewer.top import ESTIMATE_COLOR, GNSS_COLOR, PREDICTION_COLOR
 
 ERRORS = "plots/error_m"
@@ -23,20 +23,20 @@ SERIES = {
 
 
 def name_series(canvas: Canvas) -> None:
-    """Names and colours of all figures."""
+    """Sets the names and colours of all figures."""
     for path, (name, color) in SERIES.items():
         canvas.series(path, name, color)
 
 
 def plot_errors(canvas: Canvas, distances: Distances) -> None:
-    """Mean errors of one tick."""
+    """Plots the mean errors of one tick."""
     canvas.scalar(POLICY_ERROR, mean_m(distances.policy))
     canvas.scalar(EKF_ERROR, mean_m(distances.ekf))
     canvas.scalar(GNSS_ERROR, mean_m(distances.raw_gnss))
 
 
-def plot_status(canvas: Canvas, status: Status, steps_per_s: float | None) -> None:
-    """How learning goes and how fast; before the first update there is no policy to speak of."""
+def plot_status(canvas: Canvas, status: RunStatus, steps_per_s: float | None) -> None:
+    """Plots the progress of learning and the speed; before the first update the policy has no figures."""
     training = status.get("training") or {}
     if training.get("updates"):
         canvas.scalar(STD, training["policy_std"])

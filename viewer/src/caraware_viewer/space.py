@@ -1,4 +1,4 @@
-"""The 3-D view: the world below a transform that puts a vehicle into the origin, so the camera stays with it."""
+"""The 3-D view: a transform puts the followed vehicle at the origin, so that the camera stays with it."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ WORLD = "space/world"
 VEHICLES = "space/world/vehicles"
 CLOUD = "space/world/lidar"
 
-SIGHT_M = 120.0
+VIEW_RADIUS_M = 120.0
 """Road users farther from the vehicle than this are left out."""
 
 
 def draw_space(canvas: Canvas, states: NDArray[np.void], centre: np.void | None) -> None:
-    """Boxes of the road users near `centre`, which is at the origin with its nose along x."""
+    """Draws boxes of the road users near `centre`, which stands at the origin and faces along x."""
     if centre is None:
         canvas.log(VEHICLES, rr.Boxes3D(centers=[], half_sizes=[]))
         return
     origin_m = np.array([centre["x_m"], centre["y_m"], centre["z_m"]])
     yaw_rad = float(centre["yaw_rad"])
     canvas.log(WORLD, vehicle_from_world(origin_m, yaw_rad))
-    near = np.hypot(states["x_m"] - origin_m[0], states["y_m"] - origin_m[1]) < SIGHT_M
+    near = np.hypot(states["x_m"] - origin_m[0], states["y_m"] - origin_m[1]) < VIEW_RADIUS_M
     shown = states[near]
     boxes = rr.Boxes3D(
         centers=geometry.centres_m(shown),
@@ -39,12 +39,12 @@ def draw_space(canvas: Canvas, states: NDArray[np.void], centre: np.void | None)
 
 
 def vehicle_from_world(origin_m: NDArray[np.float64], yaw_rad: float) -> rr.Transform3D:
-    """Turns and moves the world so that `origin_m` lies at zero, heading along x."""
+    """The transform that moves `origin_m` to zero and turns the heading `yaw_rad` to x."""
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
     return rr.Transform3D(translation=-turn @ origin_m, mat3x3=turn)
 
 
 def draw_cloud(canvas: Canvas, points_m: NDArray[np.floating], colors: NDArray[np.uint32]) -> None:
-    """Points of the vehicle's LIDAR."""
+    """Draws the points of the vehicle's LIDAR."""
     canvas.log(CLOUD, rr.Points3D(points_m, colors=colors, radii=rr.Radius.ui_points(1.2)))

@@ -1,15 +1,15 @@
-"""What stands still: roads with their markings, sidewalks, crossings, buildings, obstacles. Drawn once."""
+"""Draws the static map once: roads with their markings, sidewalks, crossings, buildings, obstacles."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from caraware_viewer.canvas import Canvas, on_screen
+from caraware_viewer.documents import Area, Building, Lane, Obstacle, RunMap, SceneDocument
 from caraware_viewer.geometry import frame_m, hatching_m, quaternions
 from caraware_viewer.wire import FrameError
 
@@ -33,16 +33,16 @@ _ROAD_KINDS = ("car", "bus", "bicycle", "rail")
 _MARKING_M = 0.12
 _DASH_M, _GAP_M = 3.0, 6.0
 _STRIPE_M = 0.5
-_MOST_HATCHES = 60_000
-"""Segments that fill polygons, at most: beyond, the rows lie farther apart."""
-_FINEST_M = 0.5
+_MAX_HATCHES = 60_000
+"""Most segments that fill polygons; a larger map has its rows farther apart."""
+_MIN_SPACING_M = 0.5
 
 
-def draw_map(canvas: Canvas, run_map: dict[str, Any]) -> None:
-    """Draws the static map; a map without a scene has its bounds alone."""
+def draw_map(canvas: Canvas, run_map: RunMap) -> None:
+    """Draws the static map; of a map without a scene, only the bounds."""
     try:
         _draw_bounds(canvas, run_map["map"]["bounds_m"])
-        scene = run_map.get("scene") or {}
+        scene = run_map.get("scene") or SceneDocument()
         lanes, areas = scene.get("lanes", []), scene.get("areas", [])
         _draw_lanes(canvas, lanes)
         _draw_polygons(canvas, JUNCTIONS, [a for a in areas if a["kind"] == "junction"], ROAD_COLOR, 2.0)
@@ -50,7 +50,7 @@ def draw_map(canvas: Canvas, run_map: dict[str, Any]) -> None:
         _draw_buildings(canvas, scene.get("buildings", []))
         _draw_obstacles(canvas, scene.get("obstacles", []))
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise FrameError(f"the map is not what this viewer knows: {error!r}") from error
+        raise FrameError(f"the map cannot be read: {error!r}") from error
 
 
 def _draw_bounds(canvas: Canvas, bounds_m: list[float]) -> None:
@@ -59,8 +59,8 @@ def _draw_bounds(canvas: Canvas, bounds_m: list[float]) -> None:
     canvas.log(BOUNDS, rr.LineStrips2D([on_screen(corners)], colors=BOUNDS_COLOR, draw_order=0.0), static=True)
 
 
-def _draw_lanes(canvas: Canvas, lanes: list[dict[str, Any]]) -> None:
-    """Lanes are strips as wide as they are; where they cross a junction they have no markings."""
+def _draw_lanes(canvas: Canvas, lanes: list[Lane]) -> None:
+    """Draws each lane as a strip of its width; lanes inside a junction have no markings."""
     roads = [lane for lane in lanes if lane["kind"] in _ROAD_KINDS]
     _strips(canvas, ROADS, roads, ROAD_COLOR, 1.0)
     _strips(canvas, WALKS, [lane for lane in lanes if lane["kind"] == "sidewalk"], WALK_COLOR, 1.5)
@@ -70,40 +70,41 @@ def _draw_lanes(canvas: Canvas, lanes: list[dict[str, Any]]) -> None:
     _segments(canvas, MARKINGS, markings, MARKING_COLOR, _MARKING_M / 2, 5.0)
     if roads:
         edges = [edge_m(lane, side) for lane in roads for side in (-1, 1) if not lane["inside"]]
-        strips = [_lifted(edge, lane) for edge, lane in zip(edges, _twice(roads), strict=True)]
+        strips = [_lifted(edge, lane) for edge, lane in zip(edges, _once_for_each_side(roads), strict=True)]
         canvas.log(SPACE_ROADS, rr.LineStrips3D(strips, colors=MARKING_COLOR, radii=_MARKING_M / 2), static=True)
 
 
-def _twice(lanes: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:
+def _once_for_each_side(lanes: list[Lane]) -> Iterable[Lane]:
     return (lane for lane in lanes if not lane["inside"] for _ in range(2))
 
 
-def _lifted(edge_points_m: NDArray[np.float64], lane: dict[str, Any]) -> NDArray[np.float32]:
+def _lifted(edge_points_m: NDArray[np.float64], lane: Lane) -> NDArray[np.float32]:
     height_m = np.asarray(lane["points_m"], np.float64)[:, 2]
     return np.column_stack([edge_points_m, height_m]).astype(np.float32)
 
 
-def edge_m(lane: dict[str, Any], side: int) -> NDArray[np.float64]:
+def edge_m(lane: Lane, side: int) -> NDArray[np.float64]:
     """Edge `[n, 2]` of a lane: to the left of its direction for `side` 1, to the right for -1."""
     line = np.asarray(lane["points_m"], np.float64)[:, :2]
     along = np.gradient(line, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    return line + side * lane["width_m"] / 2 * np.column_stack([-along[:, 1], along[:, 0]])
+    edge: NDArray[np.float64] = line + side * lane["width_m"] / 2 * np.column_stack([-along[:, 1], along[:, 0]])
+    return edge
 
 
-def markings_m(lane: dict[str, Any]) -> list[NDArray[np.float64]]:
-    """Painted lines of a lane's edges; a dashed one is a piece each."""
+def markings_m(lane: Lane) -> list[NDArray[np.float64]]:
+    """Painted lines of a lane's edges; a dashed line is a list of pieces."""
     pieces = []
-    for side, name in ((1, "left"), (-1, "right")):
-        if lane[name] == "solid":
+    for side, marking in ((1, lane["left"]), (-1, lane["right"])):
+        if marking == "solid":
             pieces.append(edge_m(lane, side))
-        elif lane[name] == "dashed":
+        elif marking == "dashed":
             pieces += pieces_m(edge_m(lane, side), _DASH_M, _GAP_M)
     return pieces
 
 
-def stripes_m(lane: dict[str, Any]) -> list[NDArray[np.float64]]:
-    """Stripes of a crossing, along the direction of the traffic it crosses."""
+def stripes_m(lane: Lane) -> list[NDArray[np.float64]]:
+    """Stripes of a crossing, in the direction of the traffic that it crosses."""
     line = np.asarray(lane["points_m"], np.float64)[:, :2]
     stripes = []
     for piece in pieces_m(line, _STRIPE_M, _STRIPE_M):
@@ -116,7 +117,7 @@ def stripes_m(lane: dict[str, Any]) -> list[NDArray[np.float64]]:
 
 
 def pieces_m(line_m: NDArray[np.float64], piece_m: float, gap_m: float) -> list[NDArray[np.float64]]:
-    """Pieces `[2, 2]` of a line, with gaps between; the last may be cut."""
+    """Pieces `[2, 2]` of a line, with gaps between them; the last piece may be shorter."""
     steps_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1)
     at_m = np.concatenate([[0.0], np.cumsum(steps_m)])
     begins = np.arange(0.0, at_m[-1], piece_m + gap_m)
@@ -125,7 +126,7 @@ def pieces_m(line_m: NDArray[np.float64], piece_m: float, gap_m: float) -> list[
     return list(np.stack([np.interp(both, at_m, line_m[:, axis]) for axis in range(2)], axis=-1))
 
 
-def _strips(canvas: Canvas, path: str, lanes: list[dict[str, Any]], color: list[int], order: float) -> None:
+def _strips(canvas: Canvas, path: str, lanes: list[Lane], color: list[int], order: float) -> None:
     if not lanes:
         return
     strips = [on_screen(np.asarray(lane["points_m"], np.float64)[:, :2]) for lane in lanes]
@@ -133,30 +134,34 @@ def _strips(canvas: Canvas, path: str, lanes: list[dict[str, Any]], color: list[
     canvas.log(path, rr.LineStrips2D(strips, colors=color, radii=radii, draw_order=order), static=True)
 
 
-def _segments(canvas: Canvas, path: str, lines: list, color: list[int], radius_m: float, order: float) -> None:
+def _segments(
+    canvas: Canvas, path: str, lines: Sequence[NDArray[np.floating]], color: list[int], radius_m: float, order: float
+) -> None:
     if lines:
         strips = [on_screen(line) for line in lines]
         canvas.log(path, rr.LineStrips2D(strips, colors=color, radii=radius_m, draw_order=order), static=True)
 
 
-def _draw_polygons(canvas: Canvas, path: str, polygons: list[dict[str, Any]], color: list[int], order: float) -> None:
+def _draw_polygons(
+    canvas: Canvas, path: str, polygons: Sequence[Area | Building], color: list[int], order: float
+) -> None:
     outlines = [np.asarray(polygon["points_m"], np.float64)[:, :2] for polygon in polygons]
     outlines = [outline for outline in outlines if len(outline) > 2]
     if not outlines:
         return
     rows_m = sum(float(np.ptp(outline[:, 1])) for outline in outlines)
-    spacing_m = max(_FINEST_M, rows_m / _MOST_HATCHES)
+    spacing_m = max(_MIN_SPACING_M, rows_m / _MAX_HATCHES)
     filling = [segment for outline in outlines for segment in hatching_m(outline, spacing_m)]
     _segments(canvas, path, filling, color, 0.55 * spacing_m, order)
 
 
-def _draw_buildings(canvas: Canvas, buildings: list[dict[str, Any]]) -> None:
+def _draw_buildings(canvas: Canvas, buildings: list[Building]) -> None:
     _draw_polygons(canvas, BUILDINGS, buildings, BUILDING_COLOR, 6.0)
     outlines = [np.asarray(building["points_m"], np.float64)[:, :2] for building in buildings]
     _segments(canvas, BUILDINGS + "/walls", [np.vstack([o, o[:1]]) for o in outlines], WALL_COLOR, 0.25, 6.5)
     if not buildings:
         return
-    # Filled walls would hide the vehicle from the camera behind it.
+    # Edges only: filled walls would hide the vehicle from the camera behind it.
     strips = [
         strip
         for building, outline in zip(buildings, outlines, strict=True)
@@ -166,7 +171,7 @@ def _draw_buildings(canvas: Canvas, buildings: list[dict[str, Any]]) -> None:
     canvas.log(SPACE_BUILDINGS, frames, static=True)
 
 
-def _draw_obstacles(canvas: Canvas, obstacles: list[dict[str, Any]]) -> None:
+def _draw_obstacles(canvas: Canvas, obstacles: list[Obstacle]) -> None:
     if not obstacles:
         return
     centres_m = np.array([obstacle["center_m"] for obstacle in obstacles], np.float64)

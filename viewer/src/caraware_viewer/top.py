@@ -1,4 +1,4 @@
-"""The top view: everybody who moves, and where sensors and estimators think they are. World metres, north up."""
+"""The top view: road users, and their positions by sensors and estimators. World metres, north up."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BODIES = "top/vehicles/bodies"
 BLINKERS = "top/vehicles/blinkers"
 BRAKES = "top/vehicles/brakes"
 NAMES = "top/vehicles/names"
-LOOKED_AT = "top/looked_at"
+FOLLOWED = "top/followed"
 GNSS = "top/gnss"
 PREDICTIONS = "top/predictions"
 ESTIMATES = "top/ekf"
@@ -32,17 +32,17 @@ GNSS_COLOR, PREDICTION_COLOR, ESTIMATE_COLOR = [235, 94, 85], [94, 214, 125], [1
 LINK_ALPHA = 120
 BLINKER_COLOR, BRAKE_COLOR, RING_COLOR, CONTACT_COLOR = [255, 170, 0], [255, 30, 30], [120, 200, 255], [255, 0, 90]
 SIGNAL_COLORS = {"r": 0xF03C32FF, "u": 0xF0783CFF, "y": 0xF5D23CFF, "g": 0x32C85AFF, "G": 0x32C85AFF, "o": 0xF5A03CFF}
-"""RGBA by SUMO's letter; all others are off."""
+"""RGBA by SUMO's letter; the lights of all other letters are off."""
 SIGNAL_OFF = 0x707070FF
 
-NAMED_AT_MOST = 12
-"""Connected vehicles with their names beside them; of more, those looked at alone: the others would hide the map."""
+MAX_NAMED = 12
+"""Most connected vehicles with names beside them. Of more, only the followed ones are named: names hide the map."""
 
 
 def draw_road_users(
-    canvas: Canvas, states: NDArray[np.void], names: dict[int, str], looked_at: Sequence[int] = ()
+    canvas: Canvas, states: NDArray[np.void], names: dict[int, str], followed: Sequence[int] = ()
 ) -> None:
-    """Boxes with an arrow ahead, blinkers, brake lights, and the names of a few."""
+    """Draws boxes with an arrow that points forward, blinkers, brake lights, and names."""
     colors = KIND_COLORS[np.minimum(states["kind"], wire.HERO)]
     outlines = on_screen(geometry.outlines_m(states))
     canvas.log(OUTLINES, rr.LineStrips2D(outlines, colors=colors, radii=rr.Radius.ui_points(0.8), draw_order=21.0))
@@ -52,8 +52,8 @@ def draw_road_users(
     canvas.points(BLINKERS, geometry.blinkers_m(states), BLINKER_COLOR, 2.0, 23.0)
     canvas.points(BRAKES, geometry.brake_lights_m(states), BRAKE_COLOR, 1.6, 22.0)
     connected = states[(states["kind"] == wire.CAV) | (states["kind"] == wire.HERO)]
-    if len(connected) > NAMED_AT_MOST:
-        connected = states[np.isin(states["id_hash"], np.array(looked_at, np.uint64))]
+    if len(connected) > MAX_NAMED:
+        connected = states[np.isin(states["id_hash"], np.array(followed, np.uint64))]
     _draw_names(canvas, connected, names)
 
 
@@ -68,14 +68,14 @@ def _draw_names(canvas: Canvas, states: NDArray[np.void], names: dict[int, str])
     canvas.log(NAMES, labels)
 
 
-def draw_looked_at(canvas: Canvas, states: Sequence[np.void]) -> None:
-    """A ring around each vehicle that the other views follow."""
+def draw_followed(canvas: Canvas, states: Sequence[np.void]) -> None:
+    """Draws a ring around each followed vehicle."""
     rings = [on_screen(geometry.ring_m([row["x_m"], row["y_m"]], 0.9 * float(row["length_m"]))) for row in states]
     color = [255, 255, 255]
-    canvas.log(LOOKED_AT, rr.LineStrips2D(rings, colors=color, radii=rr.Radius.ui_points(1.0), draw_order=24.0))
+    canvas.log(FOLLOWED, rr.LineStrips2D(rings, colors=color, radii=rr.Radius.ui_points(1.0), draw_order=24.0))
 
 
-def draw_guesses(
+def draw_positions(
     canvas: Canvas,
     path: str,
     points_m: NDArray[np.floating],
@@ -83,7 +83,7 @@ def draw_guesses(
     color: list[int],
     order: float,
 ) -> None:
-    """Points with a line each to the vehicle they stand for."""
+    """Draws measured or estimated positions, each with a line to its vehicle."""
     canvas.points(path, points_m, color, 2.5, order)
     links = on_screen(geometry.links_m(points_m, truth_m))
     line = rr.LineStrips2D(links, colors=[*color, LINK_ALPHA], radii=rr.Radius.ui_points(0.6), draw_order=order - 0.5)
@@ -91,35 +91,35 @@ def draw_guesses(
 
 
 def draw_observation(canvas: Canvas, observation: wire.Observation) -> None:
-    """Raw GNSS fixes."""
+    """Draws raw GNSS fixes."""
     valid = observation.valid
-    draw_guesses(canvas, GNSS, observation.gnss_m[valid, :2], observation.truth[valid, :2], GNSS_COLOR, 26.0)
+    draw_positions(canvas, GNSS, observation.gnss_m[valid, :2], observation.truth[valid, :2], GNSS_COLOR, 26.0)
 
 
 def draw_estimates(canvas: Canvas, path: str, observation: wire.Observation, points_m: NDArray[np.float32]) -> None:
-    """What a policy or filter thinks, where it says something."""
+    """Draws the positions of a policy or filter, where it gives any."""
     n = min(len(points_m), observation.header.count)
     chosen = observation.valid[:n] & np.isfinite(points_m[:n]).all(axis=1)
     color, order = {PREDICTIONS: (PREDICTION_COLOR, 28.0), ESTIMATES: (ESTIMATE_COLOR, 30.0)}[path]
-    draw_guesses(canvas, path, points_m[:n][chosen], observation.truth[:n, :2][chosen], color, order)
+    draw_positions(canvas, path, points_m[:n][chosen], observation.truth[:n, :2][chosen], color, order)
 
 
-def draw_signals(canvas: Canvas, lights: list[tuple[Sequence[float], str]]) -> None:
-    """A dot at the stop line of each link, in the colour of its letter."""
+def draw_signals(canvas: Canvas, lights: Sequence[tuple[Sequence[float], str]]) -> None:
+    """Draws a dot at the stop line of each link, in the colour of its letter."""
     points = on_screen(np.array([position[:2] for position, _ in lights], np.float64).reshape(-1, 2))
     colors = np.array([SIGNAL_COLORS.get(letter, SIGNAL_OFF) for _, letter in lights], np.uint32)
     canvas.log(SIGNALS, rr.Points2D(points, colors=colors, radii=rr.Radius.ui_points(3.0), draw_order=15.0))
 
 
 def draw_contacts(canvas: Canvas, positions_m: NDArray[np.floating]) -> None:
-    """Where somebody ran into something lately."""
+    """Draws the recent contacts."""
     canvas.points(CONTACTS, positions_m, CONTACT_COLOR, 6.0, 31.0)
 
 
 def draw_clouds(
     canvas: Canvas, points_m: NDArray[np.floating], colors: NDArray[np.uint32], rings_m: list[NDArray[np.float32]]
 ) -> None:
-    """LIDAR points from above, and how far the LIDARs see."""
+    """Draws LIDAR points from above, and rings of the ranges."""
     cloud = rr.Points2D(on_screen(points_m[:, :2]), colors=colors, radii=rr.Radius.ui_points(0.8), draw_order=18.0)
     canvas.log(CLOUD, cloud)
     rings = [on_screen(ring) for ring in rings_m]

@@ -1,4 +1,4 @@
-"""A run being watched: one thread draws, this one waits for the end of the run, of the display, or for Ctrl-C."""
+"""Watches a run: one thread draws; the main thread waits for the end of the run, the end of the display, or Ctrl-C."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ import rerun as rr
 
 from caraware_viewer import access
 from caraware_viewer.display import Display, has_screen
-from caraware_viewer.layout import blueprint
-from caraware_viewer.link import Link, choose, connect
+from caraware_viewer.link import RunLink, connect, find_run
 from caraware_viewer.scene import Scene
+from caraware_viewer.views import blueprint
 from caraware_viewer.wire import FrameError
 
-_LOOK_S = 0.25
-_FLUSH_S = 5.0
+_POLL_INTERVAL_S = 0.25
+_FLUSH_LIMIT_S = 5.0
 
 
-def watch(options: argparse.Namespace) -> int:
-    """Connects, opens the recording, and draws what comes until the run ends; returns the exit code."""
-    session = connect(options.endpoint, options.timeout, access.of_options(options))
+def watch_run(options: argparse.Namespace) -> int:
+    """Connects to a run, opens the recording, and draws frames until the run ends; returns the exit code."""
+    session = connect(options.endpoint, options.timeout, access.credentials_from(options))
     try:
-        run = choose(session, options.endpoint, options.run, options.timeout, options.env)
+        run = find_run(session, options.endpoint, options.run, options.timeout, options.env)
     except BaseException:
         session.close()
         raise
-    with Link(session, run) as link, _display(options) as display:
+    with RunLink(session, run) as link, _open_display(options) as display:
         run_map = link.map(options.timeout)
         recording = rr.RecordingStream("caraware", recording_id=f"{run.run}/{run.env}")
         views = blueprint(run_map["map"]["bounds_m"], run_map.get("real_time_factor", 0.0))
@@ -39,7 +39,7 @@ def watch(options: argparse.Namespace) -> int:
         if display is not None and display.page is not None:
             print(f"open {display.page.url} in a browser", file=sys.stderr)
         drawing = threading.Thread(
-            target=_draw,
+            target=_draw_frames,
             args=(link, Scene(recording, run_map, options.vehicle, options.lidar)),
             name="draw",
             daemon=True,
@@ -54,14 +54,14 @@ def watch(options: argparse.Namespace) -> int:
     return 0
 
 
-def _wait_for_end(drawing: threading.Thread, link: Link, display: Display | None) -> None:
+def _wait_for_end(drawing: threading.Thread, link: RunLink, display: Display | None) -> None:
     """Waits until the run has ended and is drawn, or the display was closed."""
     while drawing.is_alive() and not (display is not None and display.closed):
-        drawing.join(_LOOK_S)
+        drawing.join(_POLL_INTERVAL_S)
 
 
 def _finish(recording: rr.RecordingStream, drawing: threading.Thread, display: Display | None) -> None:
-    """Writes what is left. A display that takes nothing is not waited for, as rerun would without end."""
+    """Writes the rest of the recording. Abandons a display that accepts no data, for which rerun waits without end."""
 
     def write() -> None:
         drawing.join()
@@ -69,35 +69,37 @@ def _finish(recording: rr.RecordingStream, drawing: threading.Thread, display: D
 
     writing = threading.Thread(target=write, name="write", daemon=True)
     writing.start()
-    writing.join(_FLUSH_S)
+    writing.join(_FLUSH_LIMIT_S)
     if not writing.is_alive():
         return
-    print("caraware-viewer: the display takes nothing any more: left it", file=sys.stderr)
+    print("caraware-viewer: the display no longer accepts data: the rest is not shown", file=sys.stderr)
     if display is None:
         sys.stderr.flush()
         os._exit(1)
-    # What waits for it goes on once it is gone.
+    # The writing thread continues once the display has ended.
     display.close()
-    writing.join(_FLUSH_S)
+    writing.join(_FLUSH_LIMIT_S)
 
 
-def _draw(link: Link, scene: Scene) -> None:
-    told: set[str] = set()
+def _draw_frames(link: RunLink, scene: Scene) -> None:
+    reported: set[str] = set()
     while True:
-        # Looked at before taking: what was stored before the end is drawn.
+        # Read before taking, so that everything stored before the end is drawn.
         closed = link.frames.closed
         scene.lost = link.frames.lost
-        for topic, sample in link.frames.take(_LOOK_S).items():
+        for topic, sample in link.frames.take(_POLL_INTERVAL_S).items():
             try:
                 scene.draw(topic, sample)
             except FrameError as error:
                 scene.refused += 1
-                if topic not in told:
-                    print(f"caraware-viewer: {topic}: {error} (later ones are left out in silence)", file=sys.stderr)
-                told.add(topic)
+                if topic not in reported:
+                    print(
+                        f"caraware-viewer: {topic}: {error} (later ones are refused without a message)", file=sys.stderr
+                    )
+                reported.add(topic)
         if closed:
             return
-        link.follow_clouds(scene.clouds_wanted())
+        link.subscribe_clouds(scene.cloud_vehicles())
 
 
 def _sinks(options: argparse.Namespace, display: Display | None) -> Iterator[rr.GrpcSink | rr.FileSink]:
@@ -109,12 +111,12 @@ def _sinks(options: argparse.Namespace, display: Display | None) -> Iterator[rr.
         yield rr.GrpcSink(display.url)
 
 
-def _display(options: argparse.Namespace) -> contextlib.AbstractContextManager[Display | None]:
+def _open_display(options: argparse.Namespace) -> contextlib.AbstractContextManager[Display | None]:
     if options.web or options.web_port:
         return Display.web(options.web_port)
     if options.save or options.connect:
         return contextlib.nullcontext()
     if not has_screen():
-        print("there is no screen here (DISPLAY is not set): serving a browser instead, as --web does", file=sys.stderr)
+        print("no screen was found (DISPLAY is not set): serving a browser instead, as with --web", file=sys.stderr)
         return Display.web()
     return Display.window()

@@ -1,13 +1,14 @@
-"""The wire layout: what a frame's bytes mean (`docs/fanout.md`).
+"""The wire layout: decodes frames (`docs/fanout.md`).
 
-A frame is a message as it stands in the simulator's shared memory: 72 bytes of header, then the payload, little endian.
-`ipc-schema/layout.json` is the committed table that the types below repeat; a test compares the two.
+A frame is a message as it is in the simulator's shared memory: 72 bytes of header, then the payload, little endian.
+The types below repeat the committed table `ipc-schema/layout.json`; a test compares the two.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +22,40 @@ LAST_OF_EPISODE = 1 << 2
 LAST_OF_RUN = 1 << 3
 
 ESTIMATES = 1 << 8
-"""Of a prediction: a section with the filter's estimates follows."""
+"""Bit of a prediction's `MessageHeader.flags`: a section with the filter's estimates follows."""
 
 CAV, OTHER, PERSON, HERO = 0, 1, 2, 3
 """Values of `VehicleState.kind`."""
 
-GNSS, IMU, SPEED_STEERING, LIDAR = 1, 2, 4, 8
-"""Bits of an observation's `sensors`: which deliver."""
+
+@dataclass(frozen=True)
+class Sensor:
+    """A kind of sensor."""
+
+    name: str
+    """Name in commands and JSON."""
+    label: str
+    """Name in the HUD."""
+    bit: int
+    """Bit of an observation's `sensors`: the sensor delivers."""
+
+
+SENSORS = (
+    Sensor("gnss", "GNSS", 1),
+    Sensor("imu", "IMU", 2),
+    Sensor("speed_steering", "speed+steering", 4),
+    Sensor("lidar", "LIDAR", 8),
+)
+"""Every sensor, in the order of an observation's ages."""
+
+
+def sensor_bit(name: str) -> int:
+    """Bit of the sensor called `name`."""
+    return next(sensor.bit for sensor in SENSORS if sensor.name == name)
+
 
 EMPTY_SLOT = 0xFFFF_FFFF
-"""`vehicle` of a slot that nobody holds."""
+"""`vehicle` of an empty slot."""
 VALID = 1
 """Bit of an observation's `flags`: the slot's vehicle has delivered every sensor at least once."""
 
@@ -100,7 +125,7 @@ VEHICLE_META = np.dtype(
         ("type_id", "V32"),
     ]
 )
-"""`VehicleMeta`: who a road user is."""
+"""`VehicleMeta`: id, type and size of a road user."""
 
 SIGNAL_META = np.dtype(
     [
@@ -113,7 +138,7 @@ SIGNAL_META = np.dtype(
         ("state", "V128"),
     ]
 )
-"""`SignalMeta`: the letters of a traffic light's links."""
+"""`SignalMeta`: the state of a traffic light, a letter for each link."""
 
 COLLISION = np.dtype(
     [
@@ -157,12 +182,12 @@ LIDAR_POINT = np.dtype(
 
 
 class FrameError(ValueError):
-    """A frame is not what it says it is."""
+    """A frame must be refused: it does not hold what its header promises, or has another schema version."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a frame says about itself."""
+    """The header of a frame."""
 
     run_id: int
     flags: int
@@ -185,7 +210,7 @@ class World:
 
 @dataclass(frozen=True)
 class Observation:
-    """What every connected vehicle senses at a tick, one row for each slot (`n` slots, `d` fields)."""
+    """The sensors of every connected vehicle at a tick, one row for each slot (`n` slots, `d` fields)."""
 
     header: Header
     observation: NDArray[np.float32]
@@ -206,39 +231,40 @@ class Observation:
     vehicle: NDArray[np.uint32]
     flags: NDArray[np.uint32]
     sensors: NDArray[np.uint32]
-    """Bits 1 GNSS, 2 IMU, 4 speed and steering, 8 LIDAR: which sensors deliver."""
+    """Which sensors deliver: bits of `SENSORS`."""
     episode_step: NDArray[np.uint32]
     age_s: NDArray[np.float32]
-    """`[n, 4]`: age of the newest GNSS, IMU, speed-steering and LIDAR sample, seconds."""
+    """`[n, s]`: age of the newest sample of each sensor, in the order of `SENSORS`, seconds."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:
         """`[n]`: the slot holds a vehicle whose sensors have all delivered."""
-        return (self.vehicle != EMPTY_SLOT) & (self.flags & VALID != 0)
+        valid: NDArray[np.bool_] = (self.vehicle != EMPTY_SLOT) & (self.flags & VALID != 0)
+        return valid
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """What the policy makes of the observation of the same tick."""
+    """The policy's predictions from the observation of the same tick."""
 
     header: Header
     position_m: NDArray[np.float32]
     """`[n, 2]`: predicted x, y, metres, world frame, one row for each slot of the observation."""
     estimate_m: NDArray[np.float32] | None
-    """`[n, 2]`: where the Kalman filter thinks it is, metres; NaN where it does not say. `None`: it is not run."""
+    """`[n, 2]`: estimates of the Kalman filter, metres; NaN where it has none. `None` if the filter does not run."""
 
 
 @dataclass(frozen=True)
-class Rows:
-    """A frame of equal rows: `VEHICLE_META`, `SIGNAL_META`, or `COLLISION`."""
+class Table:
+    """A frame of `VEHICLE_META`, `SIGNAL_META` or `COLLISION` rows."""
 
     header: Header
     rows: NDArray[np.void]
 
 
 @dataclass(frozen=True)
-class Cloud:
-    """What one LIDAR has seen during a tick."""
+class PointCloud:
+    """The returns of one LIDAR during a tick."""
 
     header: Header
     scan: np.void
@@ -262,18 +288,18 @@ def observation_sections(n: int, d: int, k: int) -> list[tuple[str, str, tuple[i
         ("flags", "<u4", (n,)),
         ("sensors", "<u4", (n,)),
         ("episode_step", "<u4", (n,)),
-        ("age_s", "<f4", (n, 4)),
+        ("age_s", "<f4", (n, len(SENSORS))),
     ]
 
 
 def decode_header(frame: bytes) -> Header:
-    """The header of a frame; refuses what is too short and other versions of the schema."""
+    """The header of a frame; refuses a frame that is too short or has another schema version."""
     if len(frame) < HEADER.itemsize:
         raise FrameError(f"a frame of {len(frame)} bytes is shorter than its {HEADER.itemsize} bytes of header")
     row = np.frombuffer(frame, HEADER, count=1)[0]
     if row["schema_version"] != SCHEMA_VERSION:
         raise FrameError(
-            f"the run speaks schema version {row['schema_version']}, this viewer speaks {SCHEMA_VERSION}: "
+            f"the run has schema version {row['schema_version']}, and this viewer knows {SCHEMA_VERSION}: "
             "install the viewer of the run's version"
         )
     return Header(**{name: int(row[name]) for name in Header.__dataclass_fields__})
@@ -285,10 +311,10 @@ def decode_world(frame: bytes) -> World:
     return World(header, _array(frame, 0, VEHICLE_STATE, (header.count,)))
 
 
-def decode_rows(frame: bytes, row: np.dtype) -> Rows:
+def decode_table(frame: bytes, row: np.dtype[np.void]) -> Table:
     """A frame of `vehicles`, `signals` or `event`."""
     header = decode_header(frame)
-    return Rows(header, _array(frame, 0, row, (header.count,)))
+    return Table(header, _array(frame, 0, row, (header.count,)))
 
 
 def decode_observation(frame: bytes) -> Observation:
@@ -307,7 +333,7 @@ def decode_prediction(frame: bytes) -> Prediction:
     """A `prediction` frame."""
     header = decode_header(frame)
     if header.columns != 2:
-        raise FrameError(f"a prediction has x and y, this one {header.columns} columns")
+        raise FrameError(f"a prediction has the columns x and y, but this one has {header.columns}")
     shape = (header.count, 2)
     position_m = _array(frame, 0, np.dtype("<f4"), shape)
     if not header.flags & ESTIMATES:
@@ -315,24 +341,24 @@ def decode_prediction(frame: bytes) -> Prediction:
     return Prediction(header, position_m, _array(frame, _aligned(position_m.nbytes), np.dtype("<f4"), shape))
 
 
-def decode_cloud(frame: bytes) -> Cloud:
+def decode_cloud(frame: bytes) -> PointCloud:
     """A `pointcloud/<id>` frame."""
     header = decode_header(frame)
     scan = _array(frame, 0, SCAN, (1,))[0]
-    return Cloud(header, scan, _array(frame, _aligned(SCAN.itemsize), LIDAR_POINT, (header.count,)))
+    return PointCloud(header, scan, _array(frame, _aligned(SCAN.itemsize), LIDAR_POINT, (header.count,)))
 
 
-def text(field: np.void, length: int) -> str:
-    """UTF-8 in a field of fixed size."""
-    return bytes(field)[:length].decode(errors="replace")
+def decode_text(field: np.void, length: int) -> str:
+    """UTF-8 text in a field of fixed size."""
+    return field.tobytes()[:length].decode(errors="replace")
 
 
 def _aligned(offset: int) -> int:
     return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
-def _array(frame: bytes, offset: int, element: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    """Elements `offset` bytes into the payload."""
+def _array(frame: bytes, offset: int, element: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """The elements that begin `offset` bytes into the payload."""
     count = math.prod(shape)
     if HEADER.itemsize + offset + count * element.itemsize > len(frame):
         raise FrameError(

@@ -1,4 +1,4 @@
-"""The arrangement of views that is sent with the stream."""
+"""The arrangement of the views, which is sent with the recording."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from caraware_viewer import plots
 from caraware_viewer.canvas import TIMELINE
 
 _MARGIN = 0.02
-_WINDOW_S = 60.0
+_PLOT_WINDOW_S = 60.0
 _BACKGROUND = [20, 23, 29]
 
 
 def blueprint(bounds_m: Sequence[float], real_time_factor: float = 0.0) -> rrb.Blueprint:
     """Top view of the map (`bounds_m`: x_min, y_min, x_max, y_max), HUD, 3-D view, and plots.
 
-    The plots show the last minute, or the last so many seconds as pass in a minute of a run that is not paced.
+    In a run paced at `real_time_factor`, the plots show the last minute of wall time; otherwise they show everything.
     """
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -62,7 +62,7 @@ def _plots(real_time_factor: float) -> list[rrb.TimeSeriesView]:
     if real_time_factor > 0:
         ranges = rrb.VisibleTimeRanges(
             timeline=TIMELINE,
-            start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_WINDOW_S * real_time_factor),
+            start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_PLOT_WINDOW_S * real_time_factor),
             end=rrb.TimeRangeBoundary.cursor_relative(seconds=0),
         )
     views = {
