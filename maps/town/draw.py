@@ -1,4 +1,4 @@
-"""Draw the built town (streets, crossings, signals, buildings) into town.png: `python draw.py TOWN.net.xml`."""
+"""Draws a built town (streets, crossings, signals, buildings) into town.png: `python draw.py TOWN.net.xml`."""
 
 import sys
 import xml.etree.ElementTree as ET
@@ -20,7 +20,7 @@ def points(shape):
 
 
 def thick_line(shape, width_m):
-    """Outline of a lane: its centre line widened to both sides, in metres."""
+    """Outline `[(x, y)]` of a lane in metres: its centre line, widened to both sides."""
     left, right = [], []
     for i, (x, y) in enumerate(shape):
         (x0, y0), (x1, y1) = shape[max(i - 1, 0)], shape[min(i + 1, len(shape) - 1)]
@@ -32,7 +32,7 @@ def thick_line(shape, width_m):
 
 
 def stripes(shape, width_m, stripe_m=0.5):
-    """Zebra stripes over a crossing, every metre along its centre line."""
+    """Outlines of the zebra stripes of a crossing, one for each metre of its centre line."""
     (x0, y0), (x1, y1) = shape[0], shape[-1]
     length = ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
     ux, uy = (x1 - x0) / length, (y1 - y0) / length
@@ -42,11 +42,12 @@ def stripes(shape, width_m, stripe_m=0.5):
 
 
 def fill(axes, outlines, color, layer, **style):
+    """Fills polygons; a polygon of a higher layer covers those of lower layers."""
     axes.add_collection(PolyCollection(outlines, facecolors=color, zorder=layer, **style))
 
 
 def draw_net(axes, net):
-    """Carriageways, sidewalks, crossings and signals of a net."""
+    """Draws the carriageways, sidewalks, crossings and signals of a net."""
     road, walk, zebra, middle = [], [], [], []
     for edge in net.findall("edge"):
         for lane in edge.findall("lane"):
@@ -73,7 +74,7 @@ def draw_net(axes, net):
 
 
 def draw_polygons(axes, additional):
-    """Buildings, darker the higher, and greens."""
+    """Draws the buildings, the higher the darker, and the park and orchard."""
     for poly in additional.findall("poly"):
         outline = points(poly.get("shape"))
         if poly.get("type") != "building":
@@ -85,6 +86,7 @@ def draw_polygons(axes, additional):
 
 
 def main(net_path):
+    """Draws the net of `net_path` and the polygons beside this script."""
     figure, axes = plt.subplots(figsize=(8, 7.8), dpi=110)
     axes.set_facecolor("#e3e6d8")
     draw_net(axes, ET.parse(net_path).getroot())

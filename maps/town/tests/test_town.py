@@ -1,4 +1,4 @@
-"""The town builds without a warning, hangs together, and carries sixty vehicles and thirty pedestrians for ten minutes."""
+"""The town builds without a warning, is connected, and has room for 60 vehicles and 30 pedestrians for ten minutes."""
 
 import random
 import re
@@ -44,7 +44,7 @@ def net(net_path):
 
 @pytest.fixture(scope="module")
 def successors(net):
-    """Normal edge -> the normal edges a vehicle can take next."""
+    """The normal edges that a vehicle can take next, for each normal edge."""
     after = {e.get("id"): set() for e in net.findall("edge") if e.get("function") is None}
     for link in net.findall("connection"):
         if link.get("from") in after and link.get("to") in after and link.get("fromLane") == "1":
@@ -53,7 +53,7 @@ def successors(net):
 
 
 def simulate(net_path, folder, demand, end_s, additional=(), options=()):
-    """Run `demand` (the body of a route file) at 0.1 s a step; answer SUMO's statistics."""
+    """Runs `demand` (the body of a route file) at 0.1 s a step, and returns SUMO's statistics."""
     (folder / "demand.rou.xml").write_text(f"<routes>{demand}</routes>")
     command = [BIN / "sumo", "-n", net_path, "-r", folder / "demand.rou.xml"]
     files = [TOWN / "town.vtypes.add.xml", TOWN / "town.poly.xml", *additional]
@@ -109,7 +109,7 @@ def test_every_arm_of_every_junction_has_a_crossing(net):
 
 
 def test_buildings_stand_clear_of_streets_and_of_each_other(net):
-    """On a raster of 0.5 m: nothing walkable or drivable under a building, no two buildings on one spot."""
+    """On a raster of 0.5 m, no point of a street or sidewalk lies under a building, and no point under two buildings."""
     xs, ys = np.meshgrid(np.arange(0, SIZE_M[0], 0.5), np.arange(0, SIZE_M[1], 0.5))
     spots = np.c_[xs.ravel(), ys.ravel()]
     taken = np.zeros(len(spots), dtype=bool)
@@ -133,7 +133,7 @@ def test_buildings_stand_clear_of_streets_and_of_each_other(net):
 
 
 def inside(spots, outline):
-    """Which of `spots` [N, 2] lie inside a polygon; only those within its bounding box are looked at closely."""
+    """True for each of `spots` [N, 2] inside a polygon; only those within its bounding box are tested exactly."""
     outline = np.asarray(outline)
     answer = np.all((spots >= outline.min(axis=0)) & (spots <= outline.max(axis=0)), axis=1)
     answer[answer] = Outline(outline).contains_points(spots[answer])
@@ -141,7 +141,7 @@ def inside(spots, outline):
 
 
 def near(spots, a, b, reach_m):
-    """Which of `spots` [N, 2] are closer than `reach_m` to the line from `a` to `b`."""
+    """True for each of `spots` [N, 2] that is closer than `reach_m` to the line from `a` to `b`."""
     along = np.clip((spots - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
     return np.sum((spots - a - along[:, None] * (b - a)) ** 2, axis=1) < reach_m**2
 
@@ -157,7 +157,7 @@ def test_a_vehicle_can_start_on_any_edge(vehicle_type, net_path, successors, tmp
 
 
 def busy_town(successors, seed):
-    """60 vehicles that drive at random for longer than the run, 30 pedestrians that walk from street to street."""
+    """A demand of 60 vehicles that drive at random for longer than the run, and 30 pedestrians that walk between streets."""
     rng = random.Random(seed)
     edges = sorted(successors)
     demand = []
@@ -179,8 +179,8 @@ def busy_town(successors, seed):
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_ten_busy_minutes(seed, net_path, successors, tmp_path):
-    """Three seeds that pass; README.md has the figures over forty, of which a few do not."""
+def test_ten_minutes_of_dense_traffic(seed, net_path, successors, tmp_path):
+    """Three demands without teleport and collision; README.md has the figures of forty, of which a few have some."""
     fcd, tls = tmp_path / "fcd.xml", tmp_path / "tls.add.xml"
     signals = [t.get("id") for t in ET.parse(net_path).getroot().findall("tlLogic")]
     tls.write_text(
