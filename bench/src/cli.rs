@@ -4,20 +4,20 @@ use std::path::PathBuf;
 
 use clap::{Parser, ValueEnum};
 
-/// What can be measured.
+/// The parts that can be measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Part {
     /// LIDAR: rays per second on one core beside Open3D's ray caster (Embree), same scene and rays
     Lidar,
-    /// Environments: vehicle-steps per second of 1, 2 and 4 side by side, beside one that has one core to itself
+    /// Environments: vehicle-steps per second of 1, 2 and 4 side by side, beside one on a single core
     Envs,
     /// Fan-out: lateness and rate of a run with eight viewers, one stopped and one slow, beside the same run alone; kills of the fan-out
     Fanout,
     /// Observation hop: from publish to a visible tensor, 1 KiB to 16 MiB, beside pyzmq, pipe and TCP
     Ipc,
-    /// The learner: updates per second beside Stable-Baselines3 and a plain loop, and what a tick costs it
+    /// The learner: updates per second beside Stable-Baselines3 and a plain loop, and its cost of a tick
     Trainer,
-    /// What co-simulation of 5 000 vehicles costs beside bare SUMO
+    /// The cost of co-simulating 5 000 vehicles beside bare SUMO
     Overhead,
     /// 1 000 to 50 000 vehicles: cost and memory of each; a motorway, and long steps of SUMO
     Scale,
@@ -53,10 +53,10 @@ pub struct BenchArgs {
     /// Draw the curves as pictures into this directory
     #[arg(long, value_name = "DIRECTORY")]
     pub plots: Option<PathBuf>,
-    /// Keep the figures in docs/benchmarks/ and write docs/benchmarks.md anew
+    /// Keep the figures in docs/benchmarks/ and regenerate docs/benchmarks.md
     #[arg(long)]
     pub keep: bool,
-    /// Small and short: whether it works, not how fast it is
+    /// Small and short: tests that it works, not how fast it is
     #[arg(long, conflicts_with = "keep")]
     pub quick: bool,
     /// Python that has the peers installed [default: what `make peers` installed, or the project's]

@@ -4,31 +4,31 @@ use std::{ffi::OsString, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
-/// Co-simulation of SUMO traffic with sensing vehicles, feeding a learner in another process.
+/// Co-simulation bridge: SUMO traffic with sensing vehicles, for a learner in another process.
 #[derive(Debug, Parser)]
 #[command(name = "caraware", version, about, long_about = LONG, after_help = AFTER, max_term_width = 110)]
 pub struct Cli {
-    /// What to do.
+    /// The subcommand.
     #[command(subcommand)]
     pub command: Command,
 }
 
-const LONG: &str = "Co-simulation of SUMO traffic with sensing vehicles, feeding a learner in another process.\n\n\
+const LONG: &str = "Co-simulation bridge: SUMO traffic with sensing vehicles, for a learner in another process.\n\n\
 SUMO moves the traffic; a nanoscopic core mirrors every vehicle with real dynamics; sensors observe it; a PyTorch process learns \
-from the observations to tell where every vehicle is. Each part is a process of its own; they share memory.";
+from the observations where every vehicle is. Each part is a process of its own, and they share memory.";
 
 const AFTER: &str = "Examples:
   caraware train                                  learn on the town with the default preset
   caraware train --set traffic.cavs=8 --set run.seed=7
   caraware simulate my.sumocfg                    your own scenario, every vehicle sensing
+  caraware train --viewer                         learn, and open a viewer
   caraware play town-1                            watch what it has learnt, beside a Kalman filter
-  caraware train --viewer                         the same, and watch it
-  caraware ps                                     what runs, from another terminal
+  caraware ps                                     list the processes of live runs, from another terminal
   caraware view --web                             watch it in a browser
   caraware generate city --vehicles 20000         a city of any size: city/city.sumocfg
   caraware bench lidar                            rays per second, beside Open3D's
-  caraware swap --set trainer.learning_rate=0.001 another trainer for a live run, which loses nothing
-  caraware stop                                   end it; the trainer writes a checkpoint first
+  caraware swap --set trainer.learning_rate=0.001 replace the trainer of a live run; nothing is lost
+  caraware stop                                   end the run; the trainer writes a checkpoint first
 
 Exit codes: 0 done, 1 the run failed, 2 usage or configuration, 3 something is missing on this machine, 130 interrupted.
 All configuration keys: configs/README.md";
@@ -39,7 +39,7 @@ pub enum Command {
     /// Simulate and learn
     #[command(after_help = RESUME)]
     Train(TrainArgs),
-    /// Let the policy of a checkpoint predict, without end; nothing learns
+    /// Run the policy of a checkpoint without learning, until Ctrl-C
     #[command(after_help = PLAY)]
     Play(PlayArgs),
     /// Simulate without learning; a `.sumocfg` runs to its end
@@ -49,13 +49,13 @@ pub enum Command {
         /// Name of a run; all live runs if not given
         run: Option<String>,
     },
-    /// Replace the trainer of a live run; the simulation goes on, and no observation is lost
+    /// Replace the trainer of a live run; the simulation continues, and no observation is lost
     #[command(after_help = SWAP)]
     Swap(SwapArgs),
     /// Pause, step or reset a live simulation, switch sensors, place vehicles
     #[command(after_help = CONTROL)]
     Control(ControlArgs),
-    /// End a run in order
+    /// End a run in order: the trainer writes a checkpoint and a report
     Stop {
         /// Name of the run; may be left out if only one is alive
         run: Option<String>,
@@ -75,7 +75,7 @@ pub enum Command {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENT")]
         arguments: Vec<OsString>,
     },
-    /// Say what is missing on this machine and what dead runs left
+    /// Report what is missing on this machine and what dead runs left
     Doctor {
         /// Remove what dead runs left in shared memory
         #[arg(long)]
@@ -84,34 +84,34 @@ pub enum Command {
 }
 
 const SWAP: &str = "Examples:
-  caraware swap                                          the same trainer anew: after an upgrade of its code
+  caraware swap                                          the same trainer again, after an upgrade of its code
   caraware swap town-1 --set trainer.learning_rate=0.001
   caraware swap --checkpoint runs/town-0/checkpoints/update-000400
 
 The successor starts beside the trainer at work and gets ready. Only then does the old one write a checkpoint and leave. A successor
-that fails is refused, and the old trainer goes on.";
+that fails is refused, and the old trainer continues.";
 
 const RESUME: &str = "Examples:
   caraware train                                             the default preset, from the beginning
-  caraware train --resume town-1                             goes on from its newest sound checkpoint, in runs/town-1
+  caraware train --resume town-1                             continues from its newest sound checkpoint, in runs/town-1
   caraware train --resume runs/town-1/checkpoints/update-000300    another run, which begins there
 
 A resumed run ends with the parameters, bit for bit, of the run that was never stopped (on a CPU).
-Trainers that learn together go on together: torchrun … -m caraware.parallel --resume RUN (docs/parallel.md).";
+Trainers that learn together resume together: torchrun … -m caraware.parallel --resume RUN (docs/parallel.md).";
 
 const PLAY: &str = "Examples:
   caraware play town-1                                       the best checkpoint of the run, on its own map, on unseen seeds
   caraware play runs/town-1/checkpoints/update-000300
   caraware play town-1 my/scenario.sumocfg                   on other roads; the observation must have the same size
-  caraware play town-1 --set run.real_time_factor=1          as fast as time goes by, for a viewer
+  caraware play town-1 --set run.real_time_factor=1          in real time, for a viewer
 
 Shows each vehicle's position error by the policy and by an extended Kalman filter over the same samples, until Ctrl-C or `caraware
-stop`; then a report. On a terminal the table is live, otherwise there is a line every few seconds. Predictions go to viewers.";
+stop`; then a report. On a terminal the table is live, otherwise a line appears every few seconds. Viewers show the predictions.";
 
 /// What `train` takes.
 #[derive(Debug, Args, Clone)]
 pub struct TrainArgs {
-    /// Go on with a run (its name or directory), or from one of its checkpoints (a directory) in another run
+    /// Continue a run (its name or directory), or begin another run from one of its checkpoints (a directory)
     #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "commands"])]
     pub resume: Option<String>,
     /// The run.
@@ -122,13 +122,13 @@ pub struct TrainArgs {
 /// What `play` takes.
 #[derive(Debug, Args, Clone)]
 pub struct PlayArgs {
-    /// Name or directory of a run, whose best checkpoint is taken, or a checkpoint directory
+    /// Name or directory of a run, to use its best checkpoint, or a checkpoint directory
     #[arg(value_name = "RUN|CHECKPOINT")]
     pub checkpoint: String,
-    /// End after so many episodes of `episode.ticks` each [default: never]
+    /// End after this many episodes of `episode.ticks` each [default: never]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub episodes: Option<u64>,
-    /// The run; without CONFIG it is like the one that learnt.
+    /// The run; without CONFIG, the configuration of the run that learnt.
     #[command(flatten)]
     pub run: RunArgs,
 }
@@ -142,7 +142,7 @@ const CONTROL: &str = "Examples:
   caraware control destination cav.3 C2D2
   caraware control reset                         the same episode from its beginning
 
-Every command takes effect at a tick, which the answer names. Those that change the simulation are written to the run's commands.jsonl:
+Every command takes effect at a tick, which the answer names. The run's commands.jsonl lists those that change the simulation:
 `caraware train --commands FILE` with the same configuration makes the same run again. From another host: `caraware-viewer command`.";
 
 /// What `control` takes.
@@ -154,25 +154,25 @@ pub struct ControlArgs {
     /// Environment of the run [default: all of them]
     #[arg(long, global = true, value_name = "N")]
     pub env: Option<u32>,
-    /// What to do
+    /// The command
     #[command(subcommand)]
     pub action: ControlAction,
 }
 
-/// What may be asked of a live simulation.
+/// The commands to a live simulation.
 #[derive(Debug, Clone, Subcommand)]
 pub enum ControlAction {
-    /// Make no more ticks
+    /// Stop making ticks
     Pause,
-    /// Make ticks again
+    /// Continue making ticks
     Resume,
-    /// Make some ticks, whole SUMO steps, and pause
+    /// Make some ticks, in whole SUMO steps, and pause again
     Step {
-        /// How many
+        /// Number of ticks
         #[arg(default_value_t = 1)]
         ticks: u64,
     },
-    /// Begin the episode anew, with its own seed
+    /// Start the episode again, with its own seed
     Reset,
     /// Switch a sensor until the episode ends
     Sensor {
@@ -180,10 +180,10 @@ pub enum ControlAction {
         vehicle: String,
         /// Which sensor
         sensor: SensorName,
-        /// Where to
+        /// On or off
         state: SwitchState,
     },
-    /// Let a vehicle start anew from an edge
+    /// Start a vehicle again from an edge
     Start {
         /// SUMO's id of the vehicle
         #[arg(allow_hyphen_values = true)]
@@ -192,7 +192,7 @@ pub enum ControlAction {
         #[arg(allow_hyphen_values = true)]
         edge: String,
     },
-    /// Lead a vehicle to an edge
+    /// Send a vehicle to an edge
     Destination {
         /// SUMO's id of the vehicle
         #[arg(allow_hyphen_values = true)]
@@ -219,7 +219,7 @@ pub enum SensorName {
     All,
 }
 
-/// Where a sensor is switched to.
+/// State of a switched sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum SwitchState {
     /// It delivers
@@ -236,20 +236,20 @@ pub struct SwapArgs {
     /// Change one setting of the trainer, e.g. --set trainer.learning_rate=0.001 (repeatable)
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// Take the parameters of this checkpoint (a directory) instead of the run's newest
+    /// Use the parameters of this checkpoint (a directory) instead of the run's newest
     #[arg(long, value_name = "DIRECTORY")]
     pub checkpoint: Option<PathBuf>,
 }
 
 const VIEW: &str = "Examples:
   caraware view                          the run on this machine, in a window (a browser where there is no screen)
-  caraware view --web                    prints an address to open; any number of browsers may
-  caraware view --save run.rrd           record; look later with `.venv/bin/rerun run.rrd`
+  caraware view --web                    print an address, for any number of browsers
+  caraware view --save run.rrd           record; open it later with `.venv/bin/rerun run.rrd`
   caraware view town-2                   one of several runs
   caraware view --vehicle cav.3 --lidar all
   caraware view tcp/127.0.0.1:7448       an endpoint (`fanout.listen` of a run)
 
-Come and go as you like, several at once: no viewer can hold up the run. Ctrl-C ends the viewer alone.
+Viewers may come and go, several at once: none can hold up the run. Ctrl-C ends the viewer alone.
 From another machine, which needs neither Rust nor this command (pip install ./viewer):
   ssh -N -L 7447:127.0.0.1:7447 HOST &
   caraware-viewer";
@@ -265,10 +265,10 @@ pub struct ViewArgs {
     /// Port of that address [default: 9090 if it is free]
     #[arg(long, value_name = "PORT", value_parser = clap::value_parser!(u16).range(1..))]
     pub web_port: Option<u16>,
-    /// Record to a file; with --web, both
+    /// Record to a file; with --web, in addition to the browser
     #[arg(long, value_name = "F.rrd")]
     pub save: Option<PathBuf>,
-    /// A vehicle to look at (repeatable): figures and point cloud; the first is in the 3-D view
+    /// A vehicle to show (repeatable): figures and point cloud; the first is in the 3-D view
     #[arg(long, value_name = "ID")]
     pub vehicle: Vec<String>,
     /// Points of the LIDARs: on road users only, with the range ring; all; none [default: interest]
@@ -277,19 +277,19 @@ pub struct ViewArgs {
     /// Environment of the run [default: its first]
     #[arg(long, value_name = "N")]
     pub env: Option<u32>,
-    /// Name of the run, if several are behind an endpoint
+    /// Name of the run, if an endpoint has several
     #[arg(long, value_name = "NAME")]
     pub run: Option<String>,
-    /// Who you are.
+    /// Credentials of the viewer.
     #[command(flatten)]
     pub credentials: Credentials,
 }
 
-/// Who a viewer is, if the run asks (docs/remote.md).
+/// Credentials of a viewer, if the run requires them (docs/remote.md).
 #[derive(Debug, Args, Clone, Default, PartialEq, Eq)]
-#[command(next_help_heading = "Who you are, if the run asks")]
+#[command(next_help_heading = "Credentials, if the run requires them")]
 pub struct Credentials {
-    /// User
+    /// User name
     #[arg(long, value_name = "NAME", requires = "password_file")]
     pub user: Option<String>,
     /// File with the user's password, readable by you alone
@@ -298,7 +298,7 @@ pub struct Credentials {
     /// Certificate of the authority behind a tls/ endpoint (PEM)
     #[arg(long, value_name = "FILE")]
     pub ca: Option<PathBuf>,
-    /// Your own certificate, if the run asks for one (PEM)
+    /// Your own certificate, if the run requires one (PEM)
     #[arg(long, value_name = "FILE", requires = "key")]
     pub certificate: Option<PathBuf>,
     /// Its private key (PEM)
@@ -306,7 +306,7 @@ pub struct Credentials {
     pub key: Option<PathBuf>,
 }
 
-/// Where a viewer beside a run shows it.
+/// Where a viewer beside a run draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum ViewerKind {
     /// In a window; where there is no screen, in a browser
@@ -329,13 +329,13 @@ pub struct GenerateArgs {
     /// SUMO's step, seconds
     #[arg(long, default_value_t = 0.1)]
     pub step_s: f64,
-    /// Seed of the routes and of SUMO: the same gives the same files
+    /// Seed of the routes and of SUMO: the same seed gives the same files
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Junctions along each side of the grid [default: so many that ten vehicles share a kilometre of lane]
+    /// Junctions along each side of the grid [default: enough for ten vehicles on a kilometre of lane]
     #[arg(long)]
     pub junctions: Option<u32>,
-    /// From junction to junction, metres
+    /// Distance between two junctions, metres
     #[arg(long, default_value_t = 200.0)]
     pub block_m: f64,
     /// Lanes in each direction
@@ -354,25 +354,25 @@ pub struct RunArgs {
     /// Change one setting, e.g. --set traffic.cavs=8 (repeatable; see configs/README.md)
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// Environments side by side, each with its own seed, feeding one trainer; short for --set run.envs=N
+    /// Environments side by side, each with its own seed, for one trainer; short for --set run.envs=N
     #[arg(long, value_name = "N")]
     pub envs: Option<u32>,
-    /// Show no progress and no summary, only what goes wrong
+    /// Show no progress and no summary, only errors
     #[arg(long)]
     pub quiet: bool,
     /// Name of the run [default: CONFIG and the first free number]
     #[arg(long)]
     pub name: Option<String>,
-    /// Carry out the commands of another run's commands.jsonl, each at its tick
+    /// Repeat the commands of another run's commands.jsonl, each at its tick
     #[arg(long, value_name = "FILE")]
     pub commands: Option<PathBuf>,
     /// Directory that holds run directories
     #[arg(long, default_value = "runs")]
     pub runs: PathBuf,
-    /// Watch it, as `caraware view` does: in a window, or with --viewer=web in a browser
+    /// Open a viewer, as `caraware view` does: in a window, or with --viewer=web in a browser
     #[arg(long, value_name = "WHERE", num_args = 0..=1, require_equals = true, default_missing_value = "window")]
     pub viewer: Option<ViewerKind>,
-    /// Who that viewer is.
+    /// Credentials of that viewer.
     #[command(flatten)]
     pub credentials: Credentials,
 }

@@ -126,7 +126,7 @@ fn one_number_stands_for_all_axes_and_a_list_must_be_whole() {
     ] {
         assert_eq!(
             error_of(text).1,
-            "allowed: 3 × 0 … 10000, or one for all in m. Standard deviation east, north and up, beside `gnss.noise_std_deg`."
+            "allowed: 3 × 0 … 10000, or one for all in m. Standard deviation east, north and up, in addition to `gnss.noise_std_deg`."
         );
     }
     for text in [
@@ -317,12 +317,13 @@ mod reference {
     const INTRODUCTION: &str = "\
 # Configuration
 
-`caraware train`, `caraware simulate` take a CONFIG: the name of a preset, your own `.toml`, or a `.sumocfg`. A `.toml` needs only the
-keys that differ from the default preset [`town`](town.toml); `--set key=value` (repeatable) comes last. The resolved configuration
-of every run is written to its run directory as `config.toml` and can be given back as CONFIG.
+`caraware train`, `caraware simulate` and `caraware play` take a CONFIG: the name of a preset, your own
+`.toml`, or a `.sumocfg`. A `.toml` needs only the keys that differ from the default preset
+[`town`](town.toml); `--set key=value` (repeatable) comes last. Every run writes its resolved
+configuration to `config.toml` in its run directory, which is a valid CONFIG too.
 
-Units are SI with angles in radians, except where a key's name says degrees. An unknown key, a wrong type or a value out of range is
-refused with the file, the line and the allowed values.
+Units are SI with angles in radians, except where a key's name says degrees. An unknown key, a wrong
+type or a value out of range is refused with the file, the line and the allowed values.
 ";
 }
 
