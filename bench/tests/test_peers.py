@@ -7,6 +7,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
+
 from caraware_bench import agent_steps, peer
 from caraware_bench.agent_steps import WARM_UP_STEPS, agent_steps_per_s
 from caraware_bench.traffic_loop import SIGNAL_PERIOD_STEPS, Mirror, measure

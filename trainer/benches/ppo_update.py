@@ -10,9 +10,10 @@ import time
 from collections.abc import Callable
 
 import torch
-from caraware_bench.trainer import BATCH, EPOCHS, HORIZON, OBSERVATIONS, PlainAgent, plain_update, random_batch
+from caraware.learn.batch import Batch
+from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
-from caraware.learn.ppo import Batch, Ppo
+from caraware_bench.trainer import BATCH, EPOCHS, HORIZON, OBSERVATIONS, PlainAgent, plain_update, random_batch
 
 
 def on(device: torch.device, batch: Batch) -> Batch:
@@ -47,7 +48,7 @@ def main() -> None:
         device=options.device,
         supervised=False,
     )
-    ppo = Ppo(config, OBSERVATIONS, MapBounds(0.0, 0.0, 220.0, 220.0))
+    ppo = build_ppo(config, OBSERVATIONS, MapBounds(0.0, 0.0, 220.0, 220.0))
     threads_ours, precision_ours = torch.get_num_threads(), torch.get_float32_matmul_precision()
     batch, agent = on(ppo.device, random_batch(ppo)), PlainAgent().to(ppo.device)
     adam = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5)

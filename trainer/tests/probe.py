@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from caraware.ipc.channel import Channel, Observation
+from caraware.learn.build import build_ppo
 from caraware.learn.ppo import Ppo
 from caraware.learn.rewards import REWARDS
 from caraware.learn.rollout import Rollout
@@ -86,7 +87,7 @@ def main(run_file: str) -> None:
             check_tick(obs, bounds, found)
             found["ticks"].append(obs.tick)
             if ppo is None:
-                ppo = Ppo(config.trainer, obs.observation.shape[1], config.bounds)
+                ppo = build_ppo(config.trainer, obs.observation.shape[1], config.bounds)
                 rollout = Rollout(config.trainer.horizon, obs.observation.shape[1], bootstrap=False)
             for row in np.flatnonzero(obs.valid):
                 seen[obs.tick, int(obs.vehicle[row])] = obs.truth[row].clone()

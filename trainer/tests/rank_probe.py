@@ -45,7 +45,7 @@ def main(folder: Path, fault: str) -> None:
     if rank == 1 and fault == "differs":
         loop._ensure_started(next(with_evaluation(1, 0, VEHICLES, 5.0, 1)))
         assert loop._ppo is not None
-        loop._ppo.policy.network.parameters.values[0] += 1e-3
+        loop._ppo.updater.parameters()["policy.layer0.weight"][0, 0] += 1e-3
     loop.run()
     together.close()
 

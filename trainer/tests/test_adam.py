@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from caraware.learn.adam import EPSILON, Adam
-from caraware.learn.networks import FlatParameters
+from caraware.learn.flat import FlatParameters
 
 
 def test_algorithm_1_two_steps_by_hand() -> None:

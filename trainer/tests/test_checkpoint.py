@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.ppo import Ppo
 from caraware.learn.rollout import Rollout
@@ -35,7 +36,7 @@ from torch import Tensor
 
 def fresh(**trainer: object) -> Ppo:
     config = TrainerConfig.from_run(run_file("x", **trainer))
-    return Ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
+    return build_ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
 
 
 def train(ppo: Ppo, from_update: int, to_update: int) -> None:
@@ -51,13 +52,8 @@ def train(ppo: Ppo, from_update: int, to_update: int) -> None:
 
 
 def everything(ppo: Ppo) -> list[Tensor]:
-    networks = (ppo.policy.network.parameters.values, ppo.value.network.parameters.values)
-    moments = [
-        moment
-        for adam in (ppo.policy_optimiser, ppo.value_optimiser)
-        for moment in (adam.mean, adam.square, adam.steps)
-    ]
-    return [*networks, *moments, ppo.sampling.get_state(), ppo.shuffling.get_state()]
+    tensors = [*ppo.updater.parameters().values(), *ppo.updater.moments().values()]
+    return [*tensors, ppo.sampling_generators()["sampling"].get_state(), ppo.shuffling.get_state()]
 
 
 def counters(ppo: Ppo) -> Counters:
@@ -90,7 +86,6 @@ def test_what_is_in_the_directory(tmp_path: Path) -> None:
         "parameters.safetensors",
         "optimiser.safetensors",
         "random.safetensors",
-        "supervised.safetensors",
     }
     manifest = read_manifest(written)
     assert manifest.counters.committed_tick == 7
@@ -145,7 +140,7 @@ def test_another_size_is_refused_with_both_sizes(tmp_path: Path) -> None:
     written = save(tmp_path, fresh())
     config = TrainerConfig.from_run(run_file("x"))
     with pytest.raises(CheckpointError, match=f"observation_size is {FIELDS}, this run's is 9"):
-        load_checkpoint(written, Ppo(config, 9, MapBounds(0.0, 0.0, 1.0, 1.0)))
+        load_checkpoint(written, build_ppo(config, 9, MapBounds(0.0, 0.0, 1.0, 1.0)))
     with pytest.raises(CheckpointError, match="hidden"):
         load_checkpoint(written, fresh(hidden=[16, 16]))
     with pytest.raises(CheckpointError, match="activation is relu, this run's is tanh"):

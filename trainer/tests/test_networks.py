@@ -1,15 +1,21 @@
 """The networks' shapes, and their written-out gradients against autograd."""
 
 import torch
-from caraware.learn.networks import Activation, GaussianPolicy, Mlp, ValueNetwork, entropy, log_probability
+from caraware.learn.fast_mlp import FastMlp
+from caraware.learn.networks import Activation, GaussianPolicy, Mlp, entropy, log_probability, policy_mlp, value_mlp
 from caraware.learn.objective import clipped_surrogate
 from torch import Tensor, nn
 from torch.distributions import Independent, Normal
 
-CPU = torch.device("cpu")
+RELU = Activation.RELU
 
 
-def modules(mlp: Mlp) -> nn.Sequential:
+def drawn(network: Mlp, seed: int) -> FastMlp:
+    network.initialise(torch.Generator().manual_seed(seed))
+    return FastMlp(network)
+
+
+def modules(mlp: FastMlp) -> nn.Sequential:
     """The same network of torch's own modules."""
     of = {"relu": nn.ReLU, "tanh": nn.Tanh, "linear": nn.Identity}
     result = nn.Sequential()
@@ -21,7 +27,7 @@ def modules(mlp: Mlp) -> nn.Sequential:
     return result
 
 
-def gradients_agree(mlp: Mlp, x: Tensor) -> None:
+def gradients_agree(mlp: FastMlp, x: Tensor) -> None:
     for i in range(len(mlp.layers)):
         mlp.parameters.value[f"layer{i}.bias"].uniform_(-0.1, 0.1)
     reference = modules(mlp)
@@ -48,46 +54,49 @@ def test_no_rows_give_no_outputs_also_at_first() -> None:
 def test_the_written_out_gradients_are_autograd_s() -> None:
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("highest")
-    policy, value = GaussianPolicy(9, 2, (50, 30), CPU), ValueNetwork(9, (50, 30, 20), CPU)
-    policy.initialise(torch.Generator().manual_seed(1), 0.5)
-    value.initialise(torch.Generator().manual_seed(2))
-    for mlp in (policy.network, value.network):
+    for mlp in (drawn(policy_mlp(9, 2, (50, 30), RELU), 1), drawn(value_mlp(9, (50, 30, 20), RELU), 2)):
         gradients_agree(mlp, torch.randn(64, 9))
         gradients_agree(mlp, torch.randn(10, 9))
 
 
 def test_tanh_layers_where_the_configuration_says_so() -> None:
     torch.set_float32_matmul_precision("highest")
-    policy = GaussianPolicy(9, 2, (50, 30), CPU, Activation.TANH)
-    value = ValueNetwork(9, (50, 30), CPU, Activation.TANH)
-    policy.initialise(torch.Generator().manual_seed(1), 0.5)
-    value.initialise(torch.Generator().manual_seed(2))
-    assert [layer.activation.value for layer in policy.network.layers] == ["tanh", "tanh", "tanh"]
-    assert [layer.activation.value for layer in value.network.layers] == ["tanh", "tanh", "linear"]
-    for network in (policy.network, value.network):
+    policy = drawn(policy_mlp(9, 2, (50, 30), Activation.TANH), 1)
+    value = drawn(value_mlp(9, (50, 30), Activation.TANH), 2)
+    assert [layer.activation.value for layer in policy.layers] == ["tanh", "tanh", "tanh"]
+    assert [layer.activation.value for layer in value.layers] == ["tanh", "tanh", "linear"]
+    for network in (policy, value):
         gradients_agree(network, torch.randn(64, 9))
 
 
 def test_inference_in_blocks_is_inference_in_one() -> None:
     torch.set_float32_matmul_precision("highest")
-    value = ValueNetwork(9, (50, 30), CPU)
-    value.initialise(torch.Generator().manual_seed(2))
+    value = drawn(value_mlp(9, (50, 30), RELU), 2)
     x = torch.randn(3000, 9)
-    expected = modules(value.network)(x).detach()
-    torch.testing.assert_close(value.network.infer(x), expected)
-    torch.testing.assert_close(value.network.infer(*x.split([1, 500, 0, 2000, 499])), expected)
+    expected = modules(value)(x).detach()
+    torch.testing.assert_close(value.infer(x), expected)
+    torch.testing.assert_close(value.infer(*x.split([1, 500, 0, 2000, 499])), expected)
+
+
+def test_no_rows_give_no_outputs_also_at_first() -> None:
+    policy = drawn(policy_mlp(11, 2, (8, 4), RELU), 1)
+    empty = torch.empty(0, 11)
+    assert policy.infer(empty).shape == (0, 2)
+    assert policy.infer(empty, empty).shape == (0, 2)
+    assert policy.infer().shape == (0, 2)
+    assert policy.infer(torch.ones(3, 11)).shape == (3, 2)
 
 
 def test_the_paper_s_shape_and_a_start_in_the_middle_of_the_map() -> None:
-    policy = GaussianPolicy(9, 2, (500, 300), CPU)
-    policy.initialise(torch.Generator().manual_seed(0), 0.7)
-    assert [(layer.inputs, layer.outputs, layer.activation.value) for layer in policy.network.layers] == [
+    network = drawn(policy_mlp(9, 2, (500, 300), RELU), 0)
+    policy = GaussianPolicy(nn.Identity(), 2, 0.7)
+    assert [(layer.inputs, layer.outputs, layer.activation.value) for layer in network.layers] == [
         (9, 500, "relu"),
         (500, 300, "tanh"),
         (300, 2, "tanh"),
     ]
     torch.testing.assert_close(policy.log_std.exp(), torch.tensor([0.7, 0.7]))
-    mean = policy.network.infer(torch.rand(2000, 9) * 2 - 1)
+    mean = network.infer(torch.rand(2000, 9) * 2 - 1)
     assert mean.shape == (2000, 2)
     assert mean.abs().mean() < 0.4
 

@@ -6,9 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 from caraware.learn.batch import Batch, save_batch
+from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.fast import FastUpdate
 from caraware.learn.objective import clipped_error
-from caraware.learn.ppo import NonFiniteLoss, Ppo, Settings, UpdateStats
+from caraware.learn.ppo import NonFiniteLoss, Ppo, ScheduledValues, UpdateStats
 from caraware.learn.rewards import distance_m
 from caraware.learn.rollout import Horizon, Rollout
 from safetensors.torch import load_file
@@ -30,7 +32,7 @@ TOY: dict[str, object] = {
 
 def fresh(**trainer: object) -> Ppo:
     config = TrainerConfig.from_run(run_file("x", **trainer))
-    return Ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
+    return build_ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
 
 
 def train(ppo: Ppo, updates: int) -> list[UpdateStats]:
@@ -47,7 +49,7 @@ def train(ppo: Ppo, updates: int) -> list[UpdateStats]:
 
 
 def parameters(ppo: Ppo) -> Tensor:
-    return torch.cat((ppo.policy.network.parameters.values, ppo.value.network.parameters.values))
+    return torch.cat([each.flatten() for each in ppo.updater.parameters().values()])
 
 
 def errors_m(ppo: Ppo) -> tuple[float, float]:
@@ -71,20 +73,20 @@ def test_schedules_run_from_the_first_value_to_the_last() -> None:
             entropy_scale=0.01,
         )
     )
-    half = Settings.at(config, updates=3, progress=0.5)
+    half = ScheduledValues.at(config, updates=3, progress=0.5)
     assert half.learning_rate == pytest.approx(5.5e-4)
     assert half.clip_epsilon == pytest.approx(0.15)
     assert half.entropy_scale == 0.01
-    assert Settings.at(config, 0, 7.0).learning_rate == pytest.approx(1e-4)
+    assert ScheduledValues.at(config, 0, 7.0).learning_rate == pytest.approx(1e-4)
     decayed = TrainerConfig.from_run(run_file("x", learning_rate=1e-3, learning_rate_decay=0.5))
-    assert Settings.at(decayed, updates=3, progress=0.5).learning_rate == pytest.approx(1.25e-4)
+    assert ScheduledValues.at(decayed, updates=3, progress=0.5).learning_rate == pytest.approx(1.25e-4)
 
 
 def test_an_update_of_the_policy_ends_where_it_has_gone_too_far() -> None:
     free, held = fresh(**TOY), fresh(**TOY, target_kl=1e-9)
     assert [train(ppo, 1)[0].policy_epochs for ppo in (free, held)] == [4, 1]
-    assert [int(ppo.policy_optimiser.steps) for ppo in (free, held)] == [32, 8]
-    assert [int(ppo.value_optimiser.steps) for ppo in (free, held)] == [32, 32]
+    assert [int(ppo.updater.moments()["policy.steps"]) for ppo in (free, held)] == [32, 8]
+    assert [int(ppo.updater.moments()["value.steps"]) for ppo in (free, held)] == [32, 32]
 
 
 def test_clipped_values_by_hand() -> None:
@@ -151,7 +153,7 @@ def horizon_of_the_toy() -> Horizon:
 
 def mean_gradient(ppo: Ppo, batch: Batch) -> Tensor:
     """The surrogate's gradient before the first step: every ratio is one."""
-    gradient = (batch.action - ppo.policy.network.infer(batch.observation).unsqueeze(1)) * batch.advantage.unsqueeze(2)
+    gradient = (batch.action - ppo.updater.mean(batch.observation).unsqueeze(1)) * batch.advantage.unsqueeze(2)
     return gradient.mean(1)
 
 
@@ -159,7 +161,7 @@ def test_an_even_number_of_actions_comes_in_pairs_on_both_sides_of_the_mean() ->
     ppo, alone = (fresh(actions_per_observation=tries, discount=0.0, initial_std=0.6) for tries in (8, 7))
     horizon = horizon_of_the_toy()
     batch = ppo.score(horizon)
-    deviation = batch.action - ppo.policy.network.infer(batch.observation).unsqueeze(1)
+    deviation = batch.action - ppo.updater.mean(batch.observation).unsqueeze(1)
     assert torch.allclose(deviation[:, :4], -deviation[:, 4:], atol=1e-6)
     # Each is a sample of the policy, and none is like another but for the sign.
     assert deviation.std().item() == pytest.approx(0.6, rel=0.01)
@@ -185,7 +187,8 @@ def test_a_gradient_is_clipped_to_the_largest_norm() -> None:
     ppo = fresh(max_grad_norm=1e-3, epochs=1, batch_size=256)
     (stats,) = train(ppo, 1)
     assert stats.policy_gradient_norm > 1e-3
-    assert ppo.policy.network.parameters.gradient.norm().item() == pytest.approx(1e-3, rel=1e-3)
+    assert isinstance(ppo.updater, FastUpdate)
+    assert ppo.updater.policy_network.parameters.gradient.norm().item() == pytest.approx(1e-3, rel=1e-3)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -204,7 +207,7 @@ def test_a_loss_that_is_no_number_stops_before_the_step(threads: int, tmp_path: 
     assert ppo.updates == 0
     assert torch.isfinite(parameters(ppo)).all()
     file = tmp_path / "logs" / "batch.safetensors"
-    save_batch(broken, ppo.policy.network.parameters, file)
+    save_batch(broken, ppo.updater.parameters(), file)
     saved = load_file(file)
     assert torch.isnan(saved["advantage"]).sum() == 1
-    assert torch.equal(saved["policy.log_std"], ppo.policy.log_std)
+    assert torch.equal(saved["policy.log_std"], ppo.updater.log_std)

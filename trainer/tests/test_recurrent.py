@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 import torch
 from caraware.ipc.stream import EMPTY_SLOT
+from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
-from caraware.learn.gru import RecurrentNetwork, RecurrentPolicy, Sequences, Steps
+from caraware.learn.gru import RecurrentNetwork, Sequences, Steps, recurrent_policy
 from caraware.learn.memory import Memory
 from caraware.learn.networks import Activation
 from caraware.learn.ppo import Ppo
-from caraware.learn.recurrent import NOBODY, RecurrentPpo, continues, cut, sequences
+from caraware.learn.recurrent import NO_SAMPLE, RecurrentPpo, continues, cut, sequences
 from caraware.learn.rollout import Rollout
 from caraware.run.checkpoint import MEMORY, load_checkpoint
 from caraware.run.config import RunConfig
-from caraware.run.loop import PPO_OF_NETWORK, Learner, TrainingLoop
+from caraware.run.loop import Learner, TrainingLoop
 from caraware.run.manifest import CheckpointError, latest_checkpoint, newest_sound_checkpoint
 from safetensors.torch import load_file
 from synthetic import FIELDS, SIZE_M, SyntheticChannel, SyntheticObservation, run_file, street_ticks
@@ -48,7 +49,7 @@ def exact_products() -> None:
 
 def fresh(network: str = "gru", **trainer: object) -> Ppo:
     config = TrainerConfig.from_run(run_file("x", network=network, **trainer))
-    return PPO_OF_NETWORK[network](config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
+    return build_ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
 
 
 def recall_ticks(vehicles: int, seed: int) -> Iterator[SyntheticObservation]:
@@ -106,8 +107,7 @@ def reference(network: RecurrentNetwork, inputs: int, layers: list[nn.Module]) -
 
 def test_outputs_and_gradients_are_those_of_torch_s_gru() -> None:
     torch.manual_seed(0)
-    policy = RecurrentPolicy(5, 2, (12, 7), CPU, Activation.TANH)
-    network = policy.network
+    network = recurrent_policy(5, 2, (12, 7), Activation.TANH, CPU)
     network.initialise(torch.Generator().manual_seed(1))
     for name in ("layer0.bias", "gru.bias_ih", "gru.bias_hh", "head.bias"):
         network.parameters.value[name].uniform_(-0.3, 0.3)
@@ -134,7 +134,7 @@ def test_outputs_and_gradients_are_those_of_torch_s_gru() -> None:
 
 
 def test_a_walk_is_the_sequences_one_after_the_other() -> None:
-    network = RecurrentPolicy(FIELDS, 2, (8, 6), CPU, Activation.RELU).network
+    network = recurrent_policy(FIELDS, 2, (8, 6), Activation.RELU, CPU)
     network.initialise(torch.Generator().manual_seed(1))
     # Two slots; the second one's trajectory begins anew in the third of four ticks.
     x, start = torch.randn(8, FIELDS), torch.randn(2, 6)
@@ -153,7 +153,7 @@ def test_trajectories_are_cut_into_sequences() -> None:
     goes_on = valid & torch.tensor([[1, 1, 1], [1, 1, 0], [1, 0, 0], [1, 1, 1], [0, 1, 1]], dtype=torch.bool)
     # Samples: tick 0: 0 1; tick 1: 2; tick 2: 3 4 5; tick 3: 6 7 8; tick 4: 9 10 11.
     table = sequences(valid, goes_on, 3)
-    found = sorted([row for row in rows if row != NOBODY] for rows in table.tolist())
+    found = sorted([row for row in rows if row != NO_SAMPLE] for rows in table.tolist())
     assert found == [[0, 2, 3], [1], [4, 7, 10], [5, 8, 11], [6], [9]]
     assert sequences(valid, goes_on, 1).shape == (12, 1)
     assert sequences(valid, goes_on, 100).shape == (5, 4)
@@ -240,7 +240,7 @@ def test_empty_slots_change_no_bit() -> None:
             rollout.add(obs)
             if rollout.full():
                 ppo.learn(rollout.take())
-        learnt.append(torch.cat((ppo.policy.network.parameters.values, ppo.value.network.parameters.values)))
+        learnt.append(torch.cat([each.flatten() for each in ppo.updater.parameters().values()]))
         assert ppo.updates == 3
     assert torch.equal(*learnt)
 
@@ -267,8 +267,8 @@ def test_the_same_seed_gives_the_same_parameters(threads: int) -> None:
             rollout.add(obs)
             if rollout.full():
                 ppo.learn(rollout.take())
-    assert torch.equal(one.policy.network.parameters.values, two.policy.network.parameters.values)
-    assert torch.equal(one.value.network.parameters.values, two.value.network.parameters.values)
+    for name, parameter in one.updater.parameters().items():
+        assert torch.equal(parameter, two.updater.parameters()[name])
 
 
 def test_what_is_shown_is_what_is_learnt_from(tmp_path: Path) -> None:
@@ -346,7 +346,7 @@ def test_the_memory_of_the_committed_tick_is_in_the_checkpoint(tmp_path: Path) -
         channel = SyntheticChannel(run_file(str(tmp_path / str(forgets))), ticks)
         loop = TrainingLoop(channel, config, lambda channel=channel: channel.consumed_up_to >= 50, learner=learner)
         loop.run()
-        rest[forgets] = learner.ppo.policy.network.parameters.values
+        rest[forgets] = learner.ppo.updater.policy_network.parameters.values
     assert not torch.equal(rest[False], rest[True])
 
 

@@ -18,8 +18,10 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
 
+from caraware.learn.batch import Batch
+from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
-from caraware.learn.ppo import Batch, Ppo
+from caraware.learn.ppo import Ppo
 from caraware.learn.rollout import Rollout
 from caraware.report.evaluation import Mean, raw_errors_m
 
@@ -74,7 +76,7 @@ def random_batch(ppo: Ppo) -> Batch:
     """Actions of the given policy with made-up advantages."""
     observation = torch.rand(HORIZON, OBSERVATIONS) * 2 - 1
     with torch.no_grad():
-        action = ppo.policy.network.infer(observation.to(ppo.device)).cpu() + torch.randn(HORIZON, 2)
+        action = ppo.updater.mean(observation.to(ppo.device)).cpu() + torch.randn(HORIZON, 2)
     nothing = torch.zeros(HORIZON)
     log_probability = -0.5 * torch.randn(HORIZON, 2).square().sum(1) - 1.8379
     target = torch.rand(HORIZON)
@@ -255,7 +257,7 @@ def main() -> None:
         matmul_precision="float32",
         supervised=False,
     )
-    ppo = Ppo(config, OBSERVATIONS, BOUNDS)
+    ppo = build_ppo(config, OBSERVATIONS, BOUNDS)
     own_threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
     batch, agent, model = random_batch(ppo), PlainAgent(), sb3_model()
     adam = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5)

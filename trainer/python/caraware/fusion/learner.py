@@ -18,7 +18,7 @@ from caraware.fusion.lanes import Pieces, read_pieces
 from caraware.ipc.run_file import RunFile
 from caraware.learn.adam import Adam
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
-from caraware.learn.networks import FlatParameters
+from caraware.learn.flat import FlatParameters
 from caraware.learn.ppo import NonFiniteLoss
 
 

@@ -5,8 +5,9 @@ but importing it pulls in torch's compiler: seconds before the first tick.
 """
 
 import torch
+from torch import Tensor
 
-from caraware.learn.networks import FlatParameters
+from caraware.learn.flat import FlatParameters
 
 BETA_MEAN, BETA_SQUARE = 0.9, 0.999
 EPSILON = 1e-5
@@ -21,6 +22,10 @@ class Adam:
         self.square = torch.zeros_like(parameters.values)
         self.steps = torch.zeros((), dtype=torch.int64)
         self._parameters = parameters
+
+    def state(self) -> dict[str, Tensor]:
+        """The tensors of a checkpoint by name; filling them restores the state."""
+        return {"mean": self.mean, "square": self.square, "steps": self.steps}
 
     def step(self, learning_rate: float) -> None:
         """Move the parameters against their gradient."""

@@ -8,8 +8,6 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from caraware.learn.networks import FlatParameters
-
 
 @dataclass(frozen=True)
 class Batch:
@@ -52,8 +50,8 @@ class Batch:
         return self.advantage if self.advantage.ndim == 1 else self.advantage.mean(1)
 
 
-def save_batch(batch: Batch, policy: FlatParameters, file: Path) -> None:
-    """Write a batch and the policy that met it, for whoever must find out why its loss is not a number."""
+def save_batch(batch: Batch, parameters: dict[str, Tensor], file: Path) -> None:
+    """Write a batch and the parameters that met it, to find out later why its loss is not a number."""
     file.parent.mkdir(parents=True, exist_ok=True)
     columns = {name: column.clone().cpu() for name, column in vars(batch).items()}
-    save_file(columns | {f"policy.{name}": value.clone().cpu() for name, value in policy.value.items()}, file)
+    save_file(columns | {name: value.clone().cpu() for name, value in parameters.items()}, file)

@@ -13,21 +13,29 @@ import math
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from caraware.learn.adam import BETA_MEAN, BETA_SQUARE, EPSILON, Adam
-from caraware.learn.networks import CHUNK_ROWS, FlatParameters, entropy, log_probability
+from caraware.learn.batch import Batch
+from caraware.learn.config import TrainerConfig
+from caraware.learn.fast import FastUpdate
+from caraware.learn.fast_mlp import CHUNK_ROWS, FastMlp
+from caraware.learn.flat import FlatParameters
+from caraware.learn.networks import entropy, log_probability
 from caraware.learn.objective import clipped_error
-
-if TYPE_CHECKING:
-    from caraware.learn.ppo import Batch, Ppo, Settings
+from caraware.learn.ppo import (
+    SMALLEST_DEVIATION,
+    NonFiniteLoss,
+    PolicyFigures,
+    ScheduledValues,
+    UpdateFigures,
+    ValueFigures,
+)
 
 WARM_UP_STEPS = 3
 """Steps before the capture: libraries choose their kernels and workspaces in the first calls."""
-SMALLEST_DEVIATION = 1e-8
 POLICY_COLUMNS, VALUE_COLUMNS = 6, 2
 
 
@@ -47,26 +55,49 @@ class StepTable:
         return bool(self.policy.isfinite().all() and self.value.isfinite().all())
 
 
-class GraphedUpdate:
-    """The gradient steps of an update in fixed memory. With a CPU device they run one by one, for the tests."""
+class GraphedUpdate(FastUpdate):
+    """A `FastUpdate` whose steps run in fixed memory. With a CPU device they run one by one, for the tests.
 
-    def __init__(self, ppo: "Ppo") -> None:
-        self._ppo, self._device = ppo, ppo.device
+    The steps of several ranks meet on the way, which a graph of one rank's step does not know of: it learns alone.
+    """
+
+    def __init__(self, config: TrainerConfig, policy: FastMlp, value: FastMlp, device: torch.device) -> None:
+        super().__init__(config, policy, value, device)
+        self._networks = (policy, value)
         self._samples = self._rows = self._steps = 0
-        self._policy_lane = _Lane(self._device, self._policy_step)
-        self._value_lane = _Lane(self._device, self._value_step)
-        self._learning_rate, self._clip_epsilon, self._entropy_scale = (
-            torch.zeros((), device=self._device) for _ in range(3)
-        )
-        self._policy_adam = _DeviceAdam(ppo.policy_optimiser, ppo.policy.network.parameters, self._learning_rate)
-        self._value_adam = _DeviceAdam(ppo.value_optimiser, ppo.value.network.parameters, self._learning_rate)
+        self._policy_steps = _NetworkSteps(device, self._policy_step)
+        self._value_steps = _NetworkSteps(device, self._value_step)
+        scalars = (torch.zeros((), device=device) for _ in range(3))
+        self._learning_rate, self._clip_epsilon, self._entropy_scale = scalars
+        self._device_policy_adam = _DeviceAdam(self.policy_adam, policy.parameters, self._learning_rate)
+        self._device_value_adam = _DeviceAdam(self.value_adam, value.parameters, self._learning_rate)
 
-    def run(self, batch: "Batch", orders: list[Tensor], now: "Settings") -> StepTable:
+    @torch.no_grad()
+    def improve(self, batch: Batch, shuffling: torch.Generator, now: ScheduledValues) -> UpdateFigures:
+        """See `PolicyUpdate.improve`. The figures are read back at the end."""
+        orders = self._orders(len(batch.reward), shuffling)
+        table = self.run(batch, orders, now)
+        if not table.finite():
+            raise NonFiniteLoss("a loss or gradient", now.update)
+        epochs = min(len(orders), table.policy_epochs)
+        loss, kl, clipped, ratio_mean, _, norm = table.policy.mean(0).tolist()
+        ratio_max = table.policy[:, 4].max().item()
+        return UpdateFigures(
+            policy=PolicyFigures(
+                epochs, loss, entropy(self.log_std).item(), kl, clipped, ratio_mean, ratio_max, gradient_norm=norm
+            ),
+            value=ValueFigures(*table.value.mean(0).tolist()),
+            advantage=batch.advantage,
+            reward=batch.reward,
+            value_target=batch.value_target,
+        )
+
+    def run(self, batch: Batch, orders: list[Tensor], now: ScheduledValues) -> StepTable:
         """Take all steps. If a number is not finite, the parameters and moments are as before the update."""
-        parts = max(1, round(len(batch.reward) / self._ppo.config.batch_size))
+        parts = max(1, round(len(batch.reward) / self._config.batch_size))
         rows = -(-len(batch.reward) // parts)
         if (rows, parts * len(orders)) != (self._rows, self._steps) or len(batch.reward) > self._samples:
-            self._allocate(len(batch.reward), rows, parts * len(orders))
+            self._allocate(batch, rows, parts * len(orders))
             self._load(batch, orders, parts)
             self._capture()
         self._load(batch, orders, parts)
@@ -83,42 +114,43 @@ class GraphedUpdate:
         if not table.finite():
             self._restore(before)
             return table
-        self._policy_adam.optimiser.steps += epochs * parts
-        self._value_adam.optimiser.steps += self._steps
+        self.policy_adam.steps += epochs * parts
+        self.value_adam.steps += self._steps
         return table
 
     def _replay(self, parts: int, epochs: int) -> int:
         """All steps of both networks side by side; returns the epochs that the policy went through."""
         policy_epochs = 0
-        for lane in (self._policy_lane, self._value_lane):
-            lane.begin()
+        for steps in (self._policy_steps, self._value_steps):
+            steps.begin()
         for epoch in range(epochs):
-            self._value_lane.run(parts)
-            if policy_epochs == epoch and not self._went_far(policy_epochs, parts):
-                self._policy_lane.run(parts)
+            self._value_steps.run(parts)
+            if policy_epochs == epoch and not self._left_after(policy_epochs, parts):
+                self._policy_steps.run(parts)
                 policy_epochs += 1
-        for lane in (self._policy_lane, self._value_lane):
-            lane.end()
+        for steps in (self._policy_steps, self._value_steps):
+            steps.end()
         return policy_epochs
 
-    def _went_far(self, epochs: int, parts: int) -> bool:
-        """Whether the last of `epochs` epochs took the policy farther than `target_kl`: then the GPU is asked."""
-        target = self._ppo.config.target_kl
-        if target is None or epochs == 0:
+    def _left_after(self, epochs: int, parts: int) -> bool:
+        """Whether the last of `epochs` epochs took the policy farther than `target_kl`; reads from the GPU if set."""
+        if self._config.target_kl is None or epochs == 0:
             return False
-        self._policy_lane.end()
-        return self._policy_log[(epochs - 1) * parts : epochs * parts, 1].mean().item() > target
+        self._policy_steps.end()
+        kl = self._policy_log[(epochs - 1) * parts : epochs * parts, 1].mean().item()
+        return kl > self._config.target_kl
 
-    def _allocate(self, samples: int, rows: int, steps: int) -> None:
-        """Room for `samples` and one row of weight 0, and for the numbers of `steps` steps."""
+    def _allocate(self, batch: Batch, rows: int, steps: int) -> None:
+        """Room for the samples of `batch` and one row of weight 0, and for the numbers of `steps` steps."""
+        samples = len(batch.reward)
         self._samples, self._rows, self._steps = samples + samples // 8, rows, steps
-        full, device = self._samples + 1, self._device
+        full, device = self._samples + 1, self.device
         # The graph remembers addresses: no later pass without gradient may make the networks ask for more.
-        for network in (self._ppo.policy.network, self._ppo.value.network):
+        for network in self._networks:
             network.reserve(max(rows, CHUNK_ROWS))
-        self._observation = torch.zeros(full, self._ppo.observation_size, device=device)
-        tries = self._ppo.config.actions_per_observation
-        self._action = torch.zeros(full, tries, 2, device=device)
+        self._observation = torch.zeros(full, *batch.observation.shape[1:], device=device)
+        tries = self._config.actions_per_observation
+        self._action = torch.zeros(full, tries, len(self.log_std), device=device)
         self._old_log_probability = torch.zeros(full, tries, device=device)
         self._advantage = torch.zeros(full, tries, device=device)
         self._target = torch.zeros(full, device=device)
@@ -127,7 +159,7 @@ class GraphedUpdate:
         self._policy_log = torch.zeros(steps, POLICY_COLUMNS, device=device)
         self._value_log = torch.zeros(steps, VALUE_COLUMNS, device=device)
 
-    def _load(self, batch: "Batch", orders: list[Tensor], parts: int) -> None:
+    def _load(self, batch: Batch, orders: list[Tensor], parts: int) -> None:
         """Put a batch into the fixed memory, and its minibatches, filled up, into the table of orders."""
         count = len(batch.reward)
         columns = (batch.observation, batch.action, batch.log_probability, batch.advantage, batch.value_target)
@@ -135,21 +167,21 @@ class GraphedUpdate:
         for room, column in zip(rooms, columns, strict=True):
             room[:count].copy_(column.view(count, *room.shape[1:]))
         self._weight.zero_()[:count].fill_(1)
-        nobody = self._samples
+        weightless = self._samples
         pieces = [piece for order in orders for piece in order.tensor_split(parts)]
-        self._order.fill_(nobody)
+        self._order.fill_(weightless)
         for row, piece in zip(self._order, pieces, strict=True):
             row[: len(piece)].copy_(piece)
-        for lane in (self._policy_lane, self._value_lane):
-            lane.step.zero_()
-        self._policy_adam.load()
-        self._value_adam.load()
+        for steps in (self._policy_steps, self._value_steps):
+            steps.step.zero_()
+        self._device_policy_adam.load()
+        self._device_value_adam.load()
 
     def _capture(self) -> None:
         """Record a step of each network. What the warm-up moved is put back."""
         before = self._snapshot()
-        for lane in (self._policy_lane, self._value_lane):
-            lane.capture()
+        for steps in (self._policy_steps, self._value_steps):
+            steps.capture()
         self._restore(before)
 
     def _minibatch(self, step: Tensor, *columns: Tensor) -> tuple[Tensor, ...]:
@@ -157,8 +189,8 @@ class GraphedUpdate:
         return tuple(column.index_select(0, rows) for column in columns)
 
     def _policy_step(self, step: Tensor) -> None:
-        """As `Ppo._improve_policy`, with weights: equation 7's gradient, clipped, and Adam."""
-        config, policy = self._ppo.config, self._ppo.policy
+        """As `FastUpdate._policy_gradient`, with weights: equation 7's gradient, clipped, and Adam."""
+        network, log_std = self.policy_network, self.log_std
         observation, action, old, advantage, weight = self._minibatch(
             step, self._observation, self._action, self._old_log_probability, self._advantage, self._weight
         )
@@ -166,18 +198,18 @@ class GraphedUpdate:
         share = weight / (weight.sum() * advantage.shape[1])
         centred = advantage - (advantage * share).sum()
         advantage = centred / ((centred.square() * share).sum().sqrt() + SMALLEST_DEVIATION)
-        mean = policy.network.forward(observation).unsqueeze(1)
-        inverse_std = torch.exp(-policy.log_std)
+        mean = network.forward(observation).unsqueeze(1)
+        inverse_std = torch.exp(-log_std)
         deviation = (action - mean) * inverse_std
-        log_ratio = (log_probability(action, mean, policy.log_std) - old) * weight
+        log_ratio = (log_probability(action, mean, log_std) - old) * weight
         ratio = log_ratio.exp()
         unclipped = ratio * advantage
         clipped = torch.minimum(torch.maximum(ratio, 1 - self._clip_epsilon), 1 + self._clip_epsilon) * advantage
         pull = (torch.where(unclipped <= clipped, unclipped, 0.0) * -share).unsqueeze(2)
-        policy.network.backward(observation, (pull * deviation * inverse_std).sum(1))
-        policy.log_std_gradient.copy_((pull * (deviation.square() - 1)).sum((0, 1)) - self._entropy_scale)
-        norm = self._policy_adam.step(config.max_grad_norm)
-        loss = -(torch.minimum(unclipped, clipped) * share).sum() - self._entropy_scale * entropy(policy.log_std)
+        network.backward(observation, (pull * deviation * inverse_std).sum(1))
+        self._log_std_gradient.copy_((pull * (deviation.square() - 1)).sum((0, 1)) - self._entropy_scale)
+        norm = self._device_policy_adam.step(self._config.max_grad_norm)
+        loss = -(torch.minimum(unclipped, clipped) * share).sum() - self._entropy_scale * entropy(log_std)
         numbers = (
             loss,
             ((ratio - 1 - log_ratio) * share).sum(),
@@ -189,21 +221,21 @@ class GraphedUpdate:
         self._policy_log.index_copy_(0, step.view(1), torch.stack(numbers).unsqueeze(0))
 
     def _value_step(self, step: Tensor) -> None:
-        """As `Ppo._improve_value`, with weights."""
-        config, network = self._ppo.config, self._ppo.value.network
+        """As `FastUpdate._value_gradient`, with weights."""
+        config, network = self._config, self.value_network
         columns = (self._observation, self._target, self._advantage, self._weight)
         observation, target, advantage, weight = self._minibatch(step, *columns)
         share = weight / weight.sum()
         error = clipped_error(network.forward(observation).squeeze(1), target, advantage.mean(1), config.value_clip)
         network.backward(observation, (2 * config.value_scale * error.pull * share).unsqueeze(1))
-        norm = self._value_adam.step(config.max_grad_norm)
+        norm = self._device_value_adam.step(config.max_grad_norm)
         numbers = torch.stack(((error.loss * share).sum(), norm))
         self._value_log.index_copy_(0, step.view(1), numbers.unsqueeze(0))
 
     def _state(self) -> list[Tensor]:
         return [
             tensor
-            for adam in (self._policy_adam, self._value_adam)
+            for adam in (self._device_policy_adam, self._device_value_adam)
             for tensor in (adam.parameters.values, adam.optimiser.mean, adam.optimiser.square, adam.steps)
         ]
 
@@ -215,7 +247,7 @@ class GraphedUpdate:
             tensor.copy_(kept)
 
 
-class _Lane:
+class _NetworkSteps:
     """The steps of one network, with a counter of their own; on a GPU a stream and the graph of one step."""
 
     def __init__(self, device: torch.device, take: Callable[[Tensor], None]) -> None:

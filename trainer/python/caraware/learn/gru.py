@@ -1,7 +1,7 @@
 """Policy and value network with memory: the MLP's layers, with a gated recurrent unit in place of the last hidden one.
 
 Gated recurrent unit: Cho et al., arXiv 1406.1078, in torch's form. Parameters and gradient lie in flat vectors, and
-`forward` and `backward` are called as those of `caraware.learn.networks.Mlp`; behind them is autograd.
+`forward` and `backward` are called as those of `caraware.learn.fast_mlp.FastMlp`; behind them is autograd.
 """
 
 import math
@@ -13,16 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from caraware.learn.networks import (
-    Activation,
-    FlatParameters,
-    GaussianPolicy,
-    Layer,
-    ValueNetwork,
-    hidden_layer,
-    mean_layer,
-    value_layer,
-)
+from caraware.learn.fast_mlp import activate_
+from caraware.learn.flat import FlatParameters
+from caraware.learn.networks import Activation, Layer, hidden_layer, mean_layer, value_layer
 
 GATES = 3
 """Reset, update and candidate: rows of the weights, each as many as the unit is wide."""
@@ -156,31 +149,24 @@ class RecurrentNetwork:
     def _enter(self, x: Tensor) -> Tensor:
         for i, layer in enumerate(self._entry):
             x = functional.linear(x, self._leaf[f"layer{i}.weight"], self._leaf[f"layer{i}.bias"])
-            x = layer.activation.apply_(x)
+            x = activate_(layer.activation, x)
         return x
 
     def _leave(self, states: Tensor) -> Tensor:
         head = functional.linear(states, self._leaf["head.weight"], self._leaf["head.bias"])
-        return self._head.activation.apply_(head)
+        return activate_(self._head.activation, head)
 
 
-class RecurrentPolicy(GaussianPolicy):
-    """Actions are normal around a mean that depends on what was seen before."""
-
-    network: RecurrentNetwork
-
-    def __init__(
-        self, observations: int, actions: int, hidden: Sequence[int], device: torch.device, activation: Activation
-    ) -> None:
-        head = mean_layer(hidden[-1], actions)
-        network = RecurrentNetwork(observations, hidden, activation, head, {"log_std": (actions,)}, device)
-        self._take(network)
+def recurrent_policy(
+    observations: int, actions: int, hidden: Sequence[int], activation: Activation, device: torch.device
+) -> RecurrentNetwork:
+    """The policy's network: a mean in [-1, 1] that depends on what was seen before; `log_std` is a parameter of it."""
+    head = mean_layer(hidden[-1], actions)
+    return RecurrentNetwork(observations, hidden, activation, head, {"log_std": (actions,)}, device)
 
 
-class RecurrentValue(ValueNetwork):
-    """The expected reward of an observation, given those before."""
-
-    network: RecurrentNetwork
-
-    def __init__(self, observations: int, hidden: Sequence[int], device: torch.device, activation: Activation) -> None:
-        self.network = RecurrentNetwork(observations, hidden, activation, value_layer(hidden[-1]), {}, device)
+def recurrent_value(
+    observations: int, hidden: Sequence[int], activation: Activation, device: torch.device
+) -> RecurrentNetwork:
+    """The value network: the expected reward of an observation, given those before."""
+    return RecurrentNetwork(observations, hidden, activation, value_layer(hidden[-1]), {}, device)

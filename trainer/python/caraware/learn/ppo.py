@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (Schulman et al., arXiv 1707.06347) for the paper's localisation task.
+"""Proximal policy optimisation (Schulman et al., arXiv 1707.06347), algorithm 1, on `torch.nn` and autograd.
 
 A horizon of observations is collected; every observation gets a sampled action (a predicted position), its reward
 (from the distance to the truth) and its advantage; then, for some epochs, the policy climbs the clipped surrogate
@@ -6,35 +6,29 @@ objective in minibatches while the value network regresses on the returns.
 
 Actions are sampled when the horizon is full, not tick by tick: predictions do not influence the world. So the
 samples depend on the seed and on the data alone, never on how many ticks happened to arrive together.
+
+Read `Ppo.score`, then `PlainUpdate`. The forms that are faster (`caraware.learn.fast`, `caraware.learn.graphed`) keep
+the contract of `PolicyUpdate`; docs/decisions/0020.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from caraware.learn import rewards
-from caraware.learn.adam import Adam
+from caraware.learn.adam import EPSILON
 from caraware.learn.batch import Batch
-from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.config import TrainerConfig
 from caraware.learn.gae import generalised_advantage
-from caraware.learn.graphed import GraphedUpdate, StepTable
-from caraware.learn.networks import Activation, FlatParameters, GaussianPolicy, ValueNetwork, entropy, log_probability
-from caraware.learn.objective import clipped_error, clipped_surrogate
+from caraware.learn.localisation import Localisation
+from caraware.learn.networks import GaussianPolicy, entropy, log_probability
 from caraware.learn.prediction import Predictor, RowPredictor
-from caraware.learn.ranks import Minibatch, Ranks, Union
 from caraware.learn.rollout import Horizon
-from caraware.learn.supervised import Supervised
 
-P, V = TypeVar("P"), TypeVar("V")
-ACTIONS = 2
-SMALL_ROWS = 256
-"""Rows of a block below which blocks are put together before the network sees them."""
 SMALLEST_DEVIATION = 1e-8
 SEED_STRIDE = 0x9E3779B97F4A7C15
 """Between the seeds of neighbouring environments: 2^64 over the golden ratio, so that they look nothing alike."""
@@ -50,8 +44,255 @@ class NonFiniteLoss(Exception):
 
 
 @dataclass(frozen=True)
+class ScheduledValues:
+    """The values that change over training, as they are in one update."""
+
+    update: int
+    """Counted from 1."""
+    learning_rate: float
+    clip_epsilon: float
+    entropy_scale: float
+
+    @classmethod
+    def at(cls, config: TrainerConfig, updates: int, progress: float) -> "ScheduledValues":
+        """After `updates` updates, with the share `progress` of all training episodes done."""
+
+        def scheduled(start: float, end: float | None) -> float:
+            return start if end is None else start + (end - start) * min(max(progress, 0.0), 1.0)
+
+        decayed = config.learning_rate * config.learning_rate_decay**updates
+        linear = config.learning_rate_final is not None
+        return cls(
+            update=updates + 1,
+            learning_rate=scheduled(config.learning_rate, config.learning_rate_final) if linear else decayed,
+            clip_epsilon=scheduled(config.clip_epsilon, config.clip_epsilon_final),
+            entropy_scale=scheduled(config.entropy_scale, config.entropy_scale_final),
+        )
+
+
+@dataclass(frozen=True)
+class PolicyFigures:
+    """Means over the policy's gradient steps in one update, unless the name says otherwise."""
+
+    epochs: int
+    loss: float
+    entropy: float
+    approximate_kl: float
+    clip_fraction: float
+    ratio_mean: float
+    ratio_max: float
+    gradient_norm: float
+
+
+@dataclass(frozen=True)
+class ValueFigures:
+    """Means over the value network's gradient steps in one update."""
+
+    loss: float
+    gradient_norm: float
+
+
+@dataclass(frozen=True)
+class UpdateFigures:
+    """What an update returns: its figures, and the numbers of all samples that it learned from, of all ranks."""
+
+    policy: PolicyFigures
+    value: ValueFigures
+    advantage: Tensor
+    """f32 `[S]`, or `[S, k]` with k > 1 actions per observation."""
+    reward: Tensor
+    """f32 `[S]`."""
+    value_target: Tensor
+    """f32 `[S]`."""
+
+
+class PolicyUpdate(Protocol):
+    """Policy and value network with their optimisers: what PPO asks of them, however they are computed."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        ...
+
+    @property
+    def log_std(self) -> Tensor:
+        """f32 `[a]`: logarithm of the policy's standard deviation."""
+        ...
+
+    def mean(self, *observations: Tensor) -> Tensor:
+        """Mean actions `[n, a]` of some blocks of observations `[_, d]`, without gradient."""
+        ...
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Values `[n]` of observations `[n, d]`, without gradient."""
+        ...
+
+    def mean_and_value(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Both, of the same observations."""
+        ...
+
+    def improve(self, batch: Batch, shuffling: torch.Generator, now: ScheduledValues) -> UpdateFigures:
+        """All epochs of minibatches over one batch. Raises `NonFiniteLoss`."""
+        ...
+
+    def parameters(self) -> dict[str, Tensor]:
+        """All parameters by name; the tensors are the networks' own, so filling them loads them."""
+        ...
+
+    def moments(self) -> dict[str, Tensor]:
+        """The optimisers' state by name, to be stored."""
+        ...
+
+    def restore_moments(self, moments: dict[str, Tensor]) -> None:
+        """Continue with the state that `moments` returned."""
+        ...
+
+
+class PlainUpdate:
+    """The reference: autograd and `torch.optim.Adam`, for any two networks that are `nn.Module`s."""
+
+    def __init__(self, config: TrainerConfig, policy: GaussianPolicy, value: nn.Module, device: torch.device) -> None:
+        """`policy` maps observations `[b, d]` to mean actions `[b, a]`, `value` to `[b, 1]`."""
+        self.device = device
+        self._config = config
+        self._policy, self._value = policy.to(device), value.to(device)
+        self._adam = {
+            name: torch.optim.Adam(network.parameters(), eps=EPSILON)
+            for name, network in (("policy", self._policy), ("value", self._value))
+        }
+
+    def improve(self, batch: Batch, shuffling: torch.Generator, now: ScheduledValues) -> UpdateFigures:
+        """See `PolicyUpdate.improve`. K epochs of minibatches of about M samples (algorithm 1)."""
+        minibatches = max(1, round(len(batch.reward) / self._config.batch_size))
+        policy_steps: list[list[float]] = []
+        value_steps: list[list[float]] = []
+        policy_epochs, is_near = 0, True
+        for _ in range(self._config.epochs):
+            order = torch.randperm(len(batch.reward), generator=shuffling).to(self.device)
+            for rows in order.tensor_split(minibatches):
+                if is_near:
+                    policy_steps.append(self._policy_step(batch, rows, now))
+                value_steps.append(self._value_step(batch, rows, now))
+            if is_near:
+                policy_epochs += 1
+                kl = sum(step[1] for step in policy_steps[-minibatches:]) / minibatches
+                is_near = self._config.target_kl is None or kl <= self._config.target_kl
+        loss, kl, clipped, ratio_mean, _, norm = mean_columns(policy_steps)
+        largest = max(step[4] for step in policy_steps)
+        spread = entropy(self.log_std).item()
+        return UpdateFigures(
+            policy=PolicyFigures(policy_epochs, loss, spread, kl, clipped, ratio_mean, largest, norm),
+            value=ValueFigures(*mean_columns(value_steps)),
+            advantage=batch.advantage,
+            reward=batch.reward,
+            value_target=batch.value_target,
+        )
+
+    def _policy_step(self, batch: Batch, rows: Tensor, now: ScheduledValues) -> list[float]:
+        """One step up the clipped surrogate objective (equation 7) and the entropy bonus (equation 9)."""
+        # How much more probable each action is now than when it was sampled.
+        mean = self._policy(batch.observation[rows])
+        mean = mean if batch.action.ndim == 2 else mean.unsqueeze(1)
+        log_ratio = log_probability(batch.action[rows], mean, self._policy.log_std) - batch.log_probability[rows]
+        ratio = log_ratio.exp()
+        # Beyond 1 ± ε a change of that probability earns nothing more.
+        advantage = normalised(batch.advantage[rows])
+        clipped = ratio.clamp(1 - now.clip_epsilon, 1 + now.clip_epsilon)
+        surrogate = torch.minimum(ratio * advantage, clipped * advantage).mean()
+        loss = -surrogate - now.entropy_scale * entropy(self._policy.log_std)
+        norm = self._step("policy", loss, now)
+        with torch.no_grad():
+            kl = (ratio - 1 - log_ratio).mean().item()
+            outside = ((ratio - 1).abs() > now.clip_epsilon).float().mean().item()
+            return [loss.item(), kl, outside, ratio.mean().item(), ratio.max().item(), norm]
+
+    def _value_step(self, batch: Batch, rows: Tensor, now: ScheduledValues) -> list[float]:
+        """One step down the squared error of the values, clipped about those before the update if so configured."""
+        value = self._value(batch.observation[rows]).squeeze(1)
+        target = batch.value_target[rows]
+        error = (value - target).square()
+        if self._config.value_clip is not None:
+            before = target - batch.value_advantage()[rows]
+            held = before + (value - before).clamp(-self._config.value_clip, self._config.value_clip)
+            error = torch.maximum(error, (held - target).square())
+        loss = error.mean()
+        norm = self._step("value", self._config.value_scale * loss, now)
+        return [loss.item(), norm]
+
+    def _step(self, name: str, loss: Tensor, now: ScheduledValues) -> float:
+        """Back-propagate, clip the gradient to `max_grad_norm`, take one Adam step; the norm before clipping."""
+        adam, network = self._adam[name], self._policy if name == "policy" else self._value
+        finite(f"the {name} loss", loss, now)
+        adam.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(network.parameters(), self._config.max_grad_norm)
+        finite(f"the {name} gradient", norm, now)
+        for group in adam.param_groups:
+            group["lr"] = now.learning_rate
+        adam.step()
+        return norm.item()
+
+    @property
+    def log_std(self) -> Tensor:
+        """See `PolicyUpdate.log_std`."""
+        return self._policy.log_std.detach()
+
+    @torch.no_grad()
+    def mean(self, *observations: Tensor) -> Tensor:
+        """See `PolicyUpdate.mean`."""
+        return self._policy(torch.cat([block.to(self.device) for block in observations]))
+
+    @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """See `PolicyUpdate.value`."""
+        return self._value(observation.to(self.device)).squeeze(1)
+
+    def mean_and_value(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """See `PolicyUpdate.mean_and_value`."""
+        return self.mean(observation), self.value(observation)
+
+    def parameters(self) -> dict[str, Tensor]:
+        """See `PolicyUpdate.parameters`. Buffers of a network, running means for example, are among them."""
+        names = {f"policy.{name}": tensor for name, tensor in self._policy.network.state_dict().items()}
+        names["policy.log_std"] = self._policy.log_std.data
+        return names | {f"value.{name}": tensor for name, tensor in self._value.state_dict().items()}
+
+    def moments(self) -> dict[str, Tensor]:
+        """See `PolicyUpdate.moments`: of each network the running moments in one vector, and the count of steps."""
+        moments: dict[str, Tensor] = {}
+        for name, adam in self._adam.items():
+            states = [adam.state[parameter] for parameter in self._ordered(name)]
+            for own, torchs in (("mean", "exp_avg"), ("square", "exp_avg_sq")):
+                columns = zip(states, self._ordered(name), strict=True)
+                zero_before = [state.get(torchs, torch.zeros_like(parameter)) for state, parameter in columns]
+                moments[f"{name}.{own}"] = torch.cat([column.detach().flatten() for column in zero_before])
+            moments[f"{name}.steps"] = torch.tensor(int(states[0].get("step", 0)))
+        return moments
+
+    def restore_moments(self, moments: dict[str, Tensor]) -> None:
+        """See `PolicyUpdate.restore_moments`."""
+        for name, adam in self._adam.items():
+            ordered = self._ordered(name)
+            sizes = [parameter.numel() for parameter in ordered]
+            steps = moments[f"{name}.steps"].to(torch.float32)
+            columns = (moments[f"{name}.{own}"].to(self.device).split(sizes) for own in ("mean", "square"))
+            for parameter, mean, square in zip(ordered, *columns, strict=True):
+                adam.state[parameter] = {
+                    "step": steps.clone(),
+                    "exp_avg": mean.view_as(parameter).clone(),
+                    "exp_avg_sq": square.view_as(parameter).clone(),
+                }
+
+    def _ordered(self, name: str) -> list[nn.Parameter]:
+        """The parameters in the order of a checkpoint: the logarithm of the standard deviation is the last."""
+        if name == "value":
+            return list(self._value.parameters())
+        return [*self._policy.network.parameters(), self._policy.log_std]
+
+
+@dataclass(frozen=True)
 class UpdateStats:
-    """What one update did: means over its minibatches, unless the name says otherwise."""
+    """The figures of one update: means over its minibatches, unless the name says otherwise."""
 
     policy_loss: float
     value_loss: float
@@ -89,61 +330,19 @@ class UpdateStats:
 
 
 @dataclass(frozen=True)
-class Settings:
-    """What schedules say of one update."""
-
-    learning_rate: float
-    clip_epsilon: float
-    entropy_scale: float
-
-    @classmethod
-    def at(cls, config: TrainerConfig, updates: int, progress: float) -> "Settings":
-        """After `updates` updates, with the share `progress` of all training episodes behind."""
-
-        def scheduled(start: float, end: float | None) -> float:
-            return start if end is None else start + (end - start) * min(max(progress, 0.0), 1.0)
-
-        decayed = config.learning_rate * config.learning_rate_decay**updates
-        linear = config.learning_rate_final is not None
-        return cls(
-            learning_rate=scheduled(config.learning_rate, config.learning_rate_final) if linear else decayed,
-            clip_epsilon=scheduled(config.clip_epsilon, config.clip_epsilon_final),
-            entropy_scale=scheduled(config.entropy_scale, config.entropy_scale_final),
-        )
-
-
-@dataclass(frozen=True)
 class ForwardPass:
-    """What both networks say of a horizon."""
+    """The outputs of both networks for a horizon."""
 
     rows: Tensor
     """i64 `[s]`: where the samples are in the flattened horizon."""
     observation: Tensor
     """f32 `[s, d]`."""
     mean: Tensor
-    """f32 `[s, 2]`: the policy's mean action."""
+    """f32 `[s, a]`: the policy's mean action."""
     value: Tensor
     """f32 `[s]`."""
     value_after: Tensor | None
-    """f32 `[N]`: of what followed the last tick in each slot; None where no discount asks for it."""
-
-
-@dataclass(frozen=True)
-class _PolicyMeans:
-    epochs: int
-    loss: float
-    entropy: float
-    approximate_kl: float
-    clip_fraction: float
-    ratio_mean: float
-    ratio_max: float
-    gradient_norm: float
-
-
-@dataclass(frozen=True)
-class _ValueMeans:
-    loss: float
-    gradient_norm: float
+    """f32 `[N]`: of the tick after the last one in each slot; None where no discount asks for it."""
 
 
 class Ppo:
@@ -152,111 +351,50 @@ class Ppo:
     def __init__(
         self,
         config: TrainerConfig,
+        task: Localisation,
         observation_size: int,
-        bounds: MapBounds,
+        updater: PolicyUpdate,
+        sampling: torch.Generator,
         environments: Sequence[int] = (0,),
-        ranks: Ranks | None = None,
     ) -> None:
-        """`environments` are the indices, among those of all `ranks`, of those whose horizons it scores."""
-        self.ranks = ranks or Ranks()
-        self.config, self.bounds = config, bounds
+        """`environments` are the indices, among those of all ranks, of those whose horizons it scores.
+
+        `sampling` has drawn the first weights, and draws the actions of environment 0. `caraware.learn.build` makes
+        all of this from a configuration.
+        """
+        self.config, self.task, self.updater = config, task, updater
         self.observation_size = observation_size
         self.updates = 0
         self.progress = 0.0
-        """Share of all training episodes that is behind; schedules follow it."""
-        self.device = _configure_torch(config)
-        self.sampling = torch.Generator().manual_seed(config.seed)
+        """Share of all training episodes that is done; schedules follow it."""
         self.shuffling = torch.Generator().manual_seed(config.seed + 1)
         self._environments = tuple(environments)
-        self.policy, self.value = self._networks()
-        self.policy.initialise(self.sampling, config.initial_std)
-        self.value.initialise(self.sampling)
-        self._samplings = [self._sampling_of(index) for index in environments]
-        self.policy_optimiser = Adam(self.policy.network.parameters)
-        self.value_optimiser = Adam(self.value.network.parameters)
-        self._reward = rewards.by_name(config.reward)
-        self._second_core = _worker(config, self.device)
-        self.supervised = (
-            Supervised(config, observation_size, bounds, self.device, self.ranks) if config.supervised else None
-        )
-        self._graphed = self._graphed_update()
-
-    def _networks(self) -> tuple[GaussianPolicy, ValueNetwork]:
-        """Policy and value network, before a weight is drawn."""
-        config, activation = self.config, Activation(self.config.activation)
-        policy = GaussianPolicy(self.observation_size, ACTIONS, config.hidden, self.device, activation)
-        return policy, ValueNetwork(self.observation_size, config.hidden, self.device, activation)
-
-    def _graphed_update(self) -> GraphedUpdate | None:
-        """On a GPU. The steps of several ranks meet on the way, which a graph of one rank's step does not know of."""
-        return GraphedUpdate(self) if self.device.type == "cuda" and self.ranks.size == 1 else None
-
-    def _sampling_of(self, environment: int) -> torch.Generator:
-        """Every environment has its own random actions, whoever learns from it; the first goes on after the weights."""
-        if environment == 0:
-            return self.sampling
-        return torch.Generator().manual_seed((self.config.seed + environment * SEED_STRIDE) % 2**63)
-
-    def sampling_generators(self) -> dict[str, torch.Generator]:
-        """The random numbers of the actions, by the name that a checkpoint gives them."""
-        names = (f"sampling{index or ''}" for index in self._environments)
-        return dict(zip(names, self._samplings, strict=True))
-
-    def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> Predictor:
-        """What predicts for the ticks of a stream as they come (`caraware.learn.prediction`)."""
-        return RowPredictor(self, dark_is_nan, evaluations_alone)
-
-    def memory_tensors(self) -> dict[str, Tensor]:
-        """What the networks remember of trajectories up to the newest horizon; nothing, if they see one moment."""
-        return {}
-
-    def restore_memory(self, tensors: dict[str, Tensor]) -> None:
-        """Remember what `memory_tensors` told; with nothing, forget everything."""
-
-    @torch.no_grad()
-    def predict_m(self, observations: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Predicted positions `[n, 2]` in world metres for each of some `[n, d]` blocks: the policy's mean.
-
-        One forward pass over all rows. Large blocks are read where they lie, which is shared memory; small ones are
-        put together first, which costs less than to call for each.
-        """
-        rows = sum(len(block) for block in observations)
-        if len(observations) > 1 and rows < SMALL_ROWS * len(observations):
-            mean = self.policy.network.infer(torch.cat(list(observations)).to(self.device))
-        else:
-            mean = self.policy.network.infer(*(block.to(self.device) for block in observations))
-        return self.bounds.to_world_m(mean).cpu().split([len(block) for block in observations])
+        self._samplings = [sampling if index == 0 else _sampling(config.seed, index) for index in environments]
 
     def learn(self, horizon: Horizon) -> UpdateStats:
-        """Sample, score and learn from one horizon. Raises `NonFiniteLoss` with the batch in memory."""
+        """Sample, score and learn from one horizon. Raises `NonFiniteLoss`."""
         return self.update(self.score(horizon))
 
     @torch.no_grad()
     def score(self, horizon: Horizon, environment: int = 0) -> Batch:
         """Give every sample of one environment's horizon its action, reward and advantage."""
-        return self._scored(horizon, self._forward(horizon), environment)
-
-    def _forward(self, horizon: Horizon) -> ForwardPass:
-        """Both networks over all samples."""
         rows = horizon.valid.flatten().nonzero().squeeze(1)
         observation = horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device)
-        mean, value = self._both(
-            lambda: self.policy.network.infer(observation), lambda: self.value.network.infer(observation).squeeze(1)
-        )
-        if horizon.bootstrap is None or self.config.discount == 0.0:
-            return ForwardPass(rows, observation, mean, value, None)
-        after = self.value.network.infer(horizon.bootstrap.to(self.device)).squeeze(1)
-        return ForwardPass(rows, observation, mean, value, after.cpu())
+        mean, value = self.updater.mean_and_value(observation)
+        after = None
+        if horizon.bootstrap is not None and self.config.discount > 0.0:
+            after = self.updater.value(horizon.bootstrap.to(self.device)).cpu()
+        return self._scored(horizon, ForwardPass(rows, observation, mean, value, after), environment)
 
     def _scored(self, horizon: Horizon, forward: ForwardPass, environment: int) -> Batch:
         """Actions around the policy's means, their rewards and advantages."""
-        rows, mean, value = forward.rows, forward.mean, forward.value
+        rows, mean, value, log_std = forward.rows, forward.mean, forward.value, self.updater.log_std
         truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
         tries = self.config.actions_per_observation
         centre, place = (mean, truth) if tries == 1 else (mean.unsqueeze(1), truth.unsqueeze(1))
-        noise = _noise(len(mean), tries, self._samplings[environment]).to(self.device)
-        action = centre + self.policy.log_std.exp() * (noise.squeeze(1) if tries == 1 else noise)
-        reward = self._reward(rewards.distance_m(self.bounds.to_world_m(action), place), self.config.reward_scale_m)
+        noise = self._noise(len(mean), tries, self._samplings[environment]).to(self.device)
+        action = centre + log_std.exp() * (noise.squeeze(1) if tries == 1 else noise)
+        reward = self.task.reward(action, place)
         if tries == 1:
             advantage, value_target = self._advantages(horizon, forward, reward)
         else:
@@ -265,142 +403,26 @@ class Ppo:
         return Batch(
             observation=forward.observation,
             action=action,
-            log_probability=log_probability(action, centre, self.policy.log_std),
+            log_probability=log_probability(action, centre, log_std),
             reward=reward,
             advantage=advantage,
             value_target=value_target,
             truth=truth,
-            error_m=rewards.distance_m(self.bounds.to_world_m(mean), truth),
+            error_m=self.task.error_m(mean, truth),
             vehicle=horizon.vehicle.flatten()[rows],
             tick=horizon.tick.repeat_interleave(horizon.valid.shape[1])[rows],
         )
 
-    @torch.no_grad()
-    def update(self, batch: Batch) -> UpdateStats:
-        """All epochs of minibatches over one batch. Policy and value share nothing, so each has its own core."""
-        now = Settings.at(self.config, self.updates, self.progress)
-        union = self.ranks.union(batch.advantage, batch.reward, batch.value_target)
-        pieces = self._pieces(batch, union)
-        orders = [torch.randperm(pieces, generator=self.shuffling) for _ in range(self.config.epochs)]
-        orders = [order.to(self.device) for order in orders]
-        if self._graphed is not None:
-            policy, value = self._means_of(self._graphed.run(batch, orders, now), len(orders))
-        else:
-            policy, value = self._both(
-                lambda: self._improve_policy(batch, union, orders, now),
-                lambda: self._improve_value(batch, union, orders, now),
-            )
-        if self.supervised is not None:
-            self.supervised.learn(batch, union, self._parts(union), now.learning_rate)
-        self.updates += 1
-        return self._stats(batch, union, policy, value, now)
+    def _noise(self, samples: int, tries: int, generator: torch.Generator) -> Tensor:
+        """Standard normal `[samples, tries, a]`; an even number of tries comes in pairs on both sides of the mean.
 
-    def _both(self, of_policy: Callable[[], P], of_value: Callable[[], V]) -> tuple[P, V]:
-        """What both jobs return: side by side where there is a second core, and none goes on when one has failed."""
-        if self._second_core is None:
-            return of_policy(), of_value()
-        value_job = self._second_core.submit(of_value)
-        try:
-            policy = of_policy()
-        finally:
-            value_job.exception()
-        return policy, value_job.result()
-
-    def _pieces(self, batch: Batch, union: Union) -> int:
-        """How many pieces of the union are shuffled: its samples."""
-        return len(union)
-
-    def _minibatches(
-        self, lane: str, batch: Batch, union: Union, columns: Sequence[Tensor], order: Tensor
-    ) -> Iterator[Minibatch]:
-        """The pieces in `order`, cut into minibatches: what the network of `lane` takes, then rows of `columns`."""
-        return union.minibatches((batch.observation, *columns), order, self._parts(union))
-
-    @torch.no_grad()
-    def _improve_policy(self, batch: Batch, union: Union, orders: list[Tensor], now: Settings) -> _PolicyMeans:
-        """Climb the clipped surrogate objective plus the entropy bonus."""
-        policy, epochs = self.policy, 0
-        log: list[list[float]] = []
-        largest: list[float] = []
-        columns = (batch.action, batch.log_probability)
-        for order in orders:
-            steps: list[tuple[float, ...]] = []
-            for part in self._minibatches("policy", batch, union, columns, order):
-                *told, ratio_max = self._policy_gradient(part, now)
-                norm = self._step("policy", policy.network.parameters, self.policy_optimiser, now.learning_rate)
-                steps.append(tuple(number * part.share for number in (*told, norm)))
-                largest.append(ratio_max)
-            log += self._of_all("policy", steps)
-            epochs += 1
-            if self._went_far([row[1] for row in log[-len(steps) :]]):
-                break
-        loss, kl, clipped, ratio_mean, norm = _means(log)
-        spread, ratio_max = entropy(policy.log_std).item(), self.ranks.largest(max(largest))
-        return _PolicyMeans(epochs, loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
-
-    def _policy_gradient(self, part: Minibatch, now: Settings) -> tuple[float, float, float, float, float]:
-        """This rank's part of the gradient; its loss, KL, clip fraction, mean and largest ratio."""
-        policy = self.policy
-        if part.share == 0.0:
-            policy.network.parameters.gradient.zero_()
-            return 0.0, 0.0, 0.0, 0.0, 0.0
-        observation, action, old_log_probability = part.own
-        mean = policy.network.forward(observation)
-        advantage = part.mine(_normalised(part.advantage))
-        surrogate = clipped_surrogate(mean, policy.log_std, action, old_log_probability, advantage, now.clip_epsilon)
-        loss = self._finite("the policy's loss", surrogate.loss - now.entropy_scale * entropy(policy.log_std))
-        policy.network.backward(observation, surrogate.mean_gradient * part.share)
-        policy.log_std_gradient.copy_((surrogate.log_std_gradient - now.entropy_scale) * part.share)
-        ratio, kl = surrogate.ratio, surrogate.approximate_kl()
-        return loss, kl, surrogate.clip_fraction(), ratio.mean().item(), ratio.max().item()
-
-    def _of_all(self, lane: str, steps: Sequence[tuple[float, ...]]) -> list[list[float]]:
-        """The numbers of every step, weighted with the shares of the ranks, of all ranks."""
-        table = torch.tensor(steps, dtype=torch.float64)
-        self.ranks.add_up(lane, table)
-        return table.tolist()
-
-    @torch.no_grad()
-    def _went_far(self, kl_of_steps: Sequence[float]) -> bool:
-        """Whether the policy has left the one that sampled by more than `target_kl` in an epoch."""
-        return self.config.target_kl is not None and sum(kl_of_steps) / len(kl_of_steps) > self.config.target_kl
-
-    def _improve_value(self, batch: Batch, union: Union, orders: list[Tensor], now: Settings) -> _ValueMeans:
-        """Regress on the value targets with the mean squared error, clipped where `value_clip` says so."""
-        steps = []
-        columns = (batch.value_target, batch.value_advantage())
-        for order in orders:
-            for part in self._minibatches("value", batch, union, columns, order):
-                loss = self._value_gradient(part)
-                norm = self._step("value", self.value.network.parameters, self.value_optimiser, now.learning_rate)
-                steps.append((loss * part.share, norm * part.share))
-        loss, norm = _means(self._of_all("value", steps))
-        return _ValueMeans(loss, norm)
-
-    def _value_gradient(self, part: Minibatch) -> float:
-        """This rank's part of the gradient; its loss."""
-        network = self.value.network
-        if part.share == 0.0:
-            network.parameters.gradient.zero_()
-            return 0.0
-        observation, target, advantage = part.own
-        error = clipped_error(network.forward(observation).squeeze(1), target, advantage, self.config.value_clip)
-        loss = self._finite("the value network's loss", error.loss.mean())
-        weight = 2 * self.config.value_scale / len(target) * part.share
-        network.backward(observation, error.pull.unsqueeze(1) * weight)
-        return loss
-
-    def _means_of(self, table: StepTable, epochs: int) -> tuple[_PolicyMeans, _ValueMeans]:
-        """The means of an update on a GPU, which tells its numbers at its end."""
-        if not table.finite():
-            raise NonFiniteLoss("a loss or gradient", self.updates + 1)
-        epochs = min(epochs, table.policy_epochs)
-        loss, kl, clipped, ratio_mean, _, norm = table.policy.mean(0).tolist()
-        ratio_max = table.policy[:, 4].max().item()
-        spread = entropy(self.policy.log_std).item()
-        value_loss, value_norm = table.value.mean(0).tolist()
-        policy = _PolicyMeans(epochs, loss, spread, kl, clipped, ratio_mean, ratio_max, norm)
-        return policy, _ValueMeans(value_loss, value_norm)
+        Each is still a sample of the policy, and the mean gradient that of the policy. What two opposite actions have
+        in common drops out of it, which is most of its variance (antithetic variates; Owen, Monte Carlo, section 8.2).
+        """
+        if tries % 2:
+            return torch.randn(samples, tries, self.task.actions, generator=generator)
+        half = torch.randn(samples, tries // 2, self.task.actions, generator=generator)
+        return torch.cat((half, -half), 1)
 
     def _advantages(self, horizon: Horizon, forward: ForwardPass, reward: Tensor) -> tuple[Tensor, Tensor]:
         """Advantages and value targets `[s]` of the samples, by way of the `[T, N]` grid that GAE needs."""
@@ -429,30 +451,17 @@ class Ppo:
         advantage, value_target = (result.flatten()[rows].to(self.device) for result in results)
         return advantage, value_target
 
-    def _parts(self, union: Union) -> int:
-        """Minibatches of about `batch_size` samples of each rank."""
-        return max(1, round(len(union) / (self.config.batch_size * self.ranks.size)))
+    def update(self, batch: Batch) -> UpdateStats:
+        """Learn from a scored batch. Raises `NonFiniteLoss`."""
+        now = ScheduledValues.at(self.config, self.updates, self.progress)
+        figures = self.updater.improve(batch, self.shuffling, now)
+        self.updates += 1
+        return self._stats(batch, figures, now)
 
-    def _step(self, lane: str, parameters: FlatParameters, optimiser: Adam, learning_rate: float) -> float:
-        """Add up the gradient of all ranks, clip it to `max_grad_norm`, take an Adam step; the norm before clipping."""
-        self.ranks.add_up(lane, parameters.gradient)
-        norm = self._finite(f"the {lane} gradient", torch.linalg.vector_norm(parameters.gradient))
-        if norm > self.config.max_grad_norm:
-            parameters.gradient.mul_(self.config.max_grad_norm / norm)
-        optimiser.step(learning_rate)
-        return norm
-
-    def _finite(self, what: str, value: Tensor) -> float:
-        number = value.item()
-        if not math.isfinite(number):
-            raise NonFiniteLoss(what, self.updates + 1)
-        return number
-
-    def _stats(
-        self, batch: Batch, union: Union, policy: _PolicyMeans, value: _ValueMeans, now: Settings
-    ) -> UpdateStats:
+    def _stats(self, batch: Batch, figures: UpdateFigures, now: ScheduledValues) -> UpdateStats:
+        policy, value = figures.policy, figures.value
         # With several actions for an observation they lie side by side.
-        actions = batch.action.reshape(-1, ACTIONS)
+        actions = batch.action.reshape(-1, self.task.actions)
         action_mean_x, action_mean_y = actions.mean(0).tolist()
         action_std_x, action_std_y = actions.std(0, correction=0).tolist()
         return UpdateStats(
@@ -464,80 +473,83 @@ class Ppo:
             ratio_mean=policy.ratio_mean,
             ratio_max=policy.ratio_max,
             sigma=self.sigma(),
-            advantage_mean=union.advantage.mean().item(),
-            advantage_std=union.advantage.std(correction=0).item(),
-            return_mean=union.value_target.mean().item(),
-            return_std=union.value_target.std(correction=0).item(),
-            reward_mean=union.reward.mean().item(),
+            advantage_mean=figures.advantage.mean().item(),
+            advantage_std=figures.advantage.std(correction=0).item(),
+            return_mean=figures.value_target.mean().item(),
+            return_std=figures.value_target.std(correction=0).item(),
+            reward_mean=figures.reward.mean().item(),
             action_mean_x=action_mean_x,
             action_mean_y=action_mean_y,
             action_std_x=action_std_x,
             action_std_y=action_std_y,
             action_outside=(actions.abs() > 1).any(1).float().mean().item(),
-            explained_variance=_explained_variance(union),
+            explained_variance=_explained_variance(figures),
             policy_gradient_norm=policy.gradient_norm,
             value_gradient_norm=value.gradient_norm,
             learning_rate=now.learning_rate,
             clip_epsilon=now.clip_epsilon,
             entropy_scale=now.entropy_scale,
             policy_epochs=policy.epochs,
-            samples=len(union),
+            samples=len(figures.advantage),
         )
+
+    @property
+    def device(self) -> torch.device:
+        """Where the networks are."""
+        return self.updater.device
 
     def sigma(self) -> float:
         """Standard deviation of the policy, mean over the actions; 1 is half the map."""
-        return self.policy.log_std.exp().mean().item()
+        return self.updater.log_std.exp().mean().item()
+
+    @torch.no_grad()
+    def predict_m(self, observations: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Predicted positions `[n, 2]` in world metres for each of some `[n, d]` blocks: the policy's mean."""
+        mean = self.updater.mean(*observations)
+        return self.task.position_m(mean).cpu().split([len(block) for block in observations])
+
+    def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> Predictor:
+        """A predictor for the ticks of a stream as they come (`caraware.learn.prediction`)."""
+        return RowPredictor(self, dark_is_nan, evaluations_alone)
+
+    def sampling_generators(self) -> dict[str, torch.Generator]:
+        """The random numbers of the actions, by the name that a checkpoint gives them."""
+        names = (f"sampling{index or ''}" for index in self._environments)
+        return dict(zip(names, self._samplings, strict=True))
+
+    def memory_tensors(self) -> dict[str, Tensor]:
+        """What the networks remember of trajectories up to the newest horizon; nothing, if they see one moment."""
+        return {}
+
+    def restore_memory(self, tensors: dict[str, Tensor]) -> None:
+        """Continue with what `memory_tensors` returned; with nothing, forget everything."""
 
 
-def _noise(samples: int, tries: int, generator: torch.Generator) -> Tensor:
-    """Standard normal `[samples, tries, 2]`; an even number of tries comes in pairs on both sides of the mean.
-
-    Each is still a sample of the policy, and the mean gradient that of the policy. What two opposite actions have in
-    common drops out of it, which is most of its variance (antithetic variates; Owen, Monte Carlo, section 8.2).
-    """
-    if tries % 2:
-        return torch.randn(samples, tries, ACTIONS, generator=generator)
-    half = torch.randn(samples, tries // 2, ACTIONS, generator=generator)
-    return torch.cat((half, -half), 1)
+def finite(what: str, value: Tensor, now: ScheduledValues) -> float:
+    """The number in a scalar. Raises `NonFiniteLoss`."""
+    number = value.item()
+    if not math.isfinite(number):
+        raise NonFiniteLoss(what, now.update)
+    return number
 
 
-def _normalised(advantage: Tensor) -> Tensor:
+def normalised(advantage: Tensor) -> Tensor:
+    """Advantages of a minibatch with mean 0 and standard deviation 1."""
     deviation = advantage.std(correction=0) + SMALLEST_DEVIATION
     return (advantage - advantage.mean()) / deviation
 
 
-def _means(rows: Sequence[Sequence[float]]) -> list[float]:
+def mean_columns(rows: Sequence[Sequence[float]]) -> list[float]:
+    """The mean of each column."""
     return [sum(column) / len(rows) for column in zip(*rows, strict=True)]
 
 
-def _explained_variance(union: Union) -> float:
-    spread = union.value_target.var(correction=0).item()
-    advantage = union.advantage if union.advantage.ndim == 1 else union.advantage.mean(1)
+def _sampling(seed: int, environment: int) -> torch.Generator:
+    """Every environment has its own random actions, whichever trainer learns from it."""
+    return torch.Generator().manual_seed((seed + environment * SEED_STRIDE) % 2**63)
+
+
+def _explained_variance(figures: UpdateFigures) -> float:
+    spread = figures.value_target.var(correction=0).item()
+    advantage = figures.advantage if figures.advantage.ndim == 1 else figures.advantage.mean(1)
     return 1 - advantage.var(correction=0).item() / spread if spread > 0 else 0.0
-
-
-def _configure_torch(config: TrainerConfig) -> torch.device:
-    """Settings that torch keeps per process: threads within an operation, and the precision of matrix products."""
-    torch.set_num_threads(_threads_per_network(config))
-    amx = hasattr(torch.cpu, "get_capabilities") and torch.cpu.get_capabilities().get("amx_bf16", False)
-    gpu = config.device == "auto" and torch.cuda.is_available()
-    reduced = config.matmul_precision == "bfloat16" or (config.matmul_precision == "auto" and amx and not gpu)
-    # On a GPU "auto" is TensorFloat-32: 10 bits of mantissa, float32's range.
-    full = "high" if gpu and config.matmul_precision == "auto" else "highest"
-    torch.set_float32_matmul_precision("medium" if reduced else full)
-    return torch.device("cuda" if gpu else "cpu")
-
-
-def _threads_per_network(config: TrainerConfig) -> int:
-    return max(1, config.thread_count() // 2)
-
-
-def _worker(config: TrainerConfig, device: torch.device) -> ThreadPoolExecutor | None:
-    """A thread for the value network where there is a second core for it.
-
-    Two threads, each with its own network, scale better than one network's operations spread over two threads:
-    nothing waits at the end of every operation, least of all for a core that another process is using.
-    """
-    if config.thread_count() < 2 or device.type != "cpu":
-        return None
-    return ThreadPoolExecutor(1, "value", initializer=torch.set_num_threads, initargs=(_threads_per_network(config),))

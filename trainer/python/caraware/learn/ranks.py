@@ -39,7 +39,7 @@ class Verdict(IntEnum):
 
 
 @dataclass(frozen=True)
-class Union:
+class SampleUnion:
     """The samples of all ranks in the order of the ranks, and which of them are this one's."""
 
     advantage: Tensor
@@ -101,16 +101,16 @@ class Ranks:
         """The least verdict and episode of all ranks. Waits for all of them."""
         return verdict, episode
 
-    def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> Union:
+    def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> SampleUnion:
         """The samples of all, `[s]` (of the advantage `[s]` or `[s, k]`) of this rank given."""
-        return Union(advantage, reward, value_target, 0, len(advantage))
+        return SampleUnion(advantage, reward, value_target, 0, len(advantage))
 
     def tables(self, own: Tensor) -> list[Tensor]:
         """The tables `[rows, columns]` of all ranks, in their order; they may differ in both sizes."""
         return [own]
 
-    def add_up(self, lane: str, values: Tensor) -> None:
-        """Replace `values` by their sum over the ranks. The lanes `policy` and `value` may be in use side by side."""
+    def add_up(self, network: str, values: Tensor) -> None:
+        """Replace `values` by their sum over the ranks. The networks `policy` and `value` may add up side by side."""
 
     def largest(self, value: float) -> float:
         """The largest of all ranks."""
@@ -142,7 +142,7 @@ class TorchRanks(Ranks):
         with self._together("meeting"):
             backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
             dist.init_process_group(backend, timeout=WAIT_AT_MOST)
-            self._groups = {lane: dist.new_group() for lane in ("policy", "value")}
+            self._groups = {network: dist.new_group() for network in ("policy", "value")}
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
 
     @contextmanager
@@ -161,14 +161,14 @@ class TorchRanks(Ranks):
             self._dist.all_reduce(values, op=self._dist.ReduceOp.MIN)
         return Verdict(int(values[0])), int(values[1])
 
-    def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> Union:
+    def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> SampleUnion:
         """See `Ranks.union`."""
         tries = advantage.reshape(len(reward), -1)
         everybody = self.tables(torch.cat((tries, reward.unsqueeze(1), value_target.unsqueeze(1)), 1))
         before = sum(len(each) for each in everybody[: self.rank])
         columns = torch.cat(everybody).t().contiguous()
         advantages = columns[:-2].t().contiguous().view(-1, *advantage.shape[1:])
-        return Union(advantages, columns[-2], columns[-1], before, len(reward))
+        return SampleUnion(advantages, columns[-2], columns[-1], before, len(reward))
 
     def tables(self, own: Tensor) -> list[Tensor]:
         """See `Ranks.tables`."""
@@ -180,10 +180,10 @@ class TorchRanks(Ranks):
             self._dist.all_gather(everybody, padded)
         return [each[:rows, :columns].to(own.device) for each, (rows, columns) in zip(everybody, sizes, strict=True)]
 
-    def add_up(self, lane: str, values: Tensor) -> None:
+    def add_up(self, network: str, values: Tensor) -> None:
         """See `Ranks.add_up`."""
         with self._together("adding up gradients"):
-            self._dist.all_reduce(values, group=self._groups[lane])
+            self._dist.all_reduce(values, group=self._groups[network])
 
     def largest(self, value: float) -> float:
         """See `Ranks.largest`."""

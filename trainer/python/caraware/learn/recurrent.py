@@ -15,15 +15,17 @@ from torch import Tensor
 from caraware.ipc.arrays import Int64Array
 from caraware.ipc.stream import Observation
 from caraware.learn.batch import Batch
-from caraware.learn.gru import RecurrentPolicy, RecurrentValue, Sequences, Steps, Walk
+from caraware.learn.config import TrainerConfig
+from caraware.learn.fast import FastUpdate, SharedBatch
+from caraware.learn.gru import RecurrentNetwork, Sequences, Steps, Walk
+from caraware.learn.localisation import Localisation
 from caraware.learn.memory import Memory
-from caraware.learn.networks import Activation
-from caraware.learn.ppo import ACTIONS, ForwardPass, Ppo
+from caraware.learn.ppo import ForwardPass, Ppo
 from caraware.learn.prediction import Ticks, visible
-from caraware.learn.ranks import Minibatch, Union
+from caraware.learn.ranks import Minibatch
 from caraware.learn.rollout import Horizon
 
-NOBODY = -1
+NO_SAMPLE = -1
 """In a table of sequences: a shorter one has no sample there."""
 
 
@@ -32,7 +34,7 @@ class RecurrentBatch(Batch):
     """Samples, and which of them follow each other."""
 
     sequence: Tensor
-    """i64 `[c, L]`: rows of each sequence in order, then `NOBODY`."""
+    """i64 `[c, L]`: rows of each sequence in order, then `NO_SAMPLE`."""
     policy_start: Tensor
     """f32 `[c, h]`: the policy's state before each sequence."""
     value_start: Tensor
@@ -62,11 +64,11 @@ class SharedSequences:
 
     def packed(self, chosen: Tensor) -> "PackedSequences":
         """Some of them, longest first, step by step."""
-        lengths = (self.table[chosen] != NOBODY).sum(1)
+        lengths = (self.table[chosen] != NO_SAMPLE).sum(1)
         longest_first = chosen[lengths.argsort(descending=True, stable=True)]
         by_step = self.table[longest_first].t()
         mine = (longest_first >= self.offset) & (longest_first < self.offset + self.own)
-        is_sample, is_mine = by_step != NOBODY, mine.expand_as(by_step)
+        is_sample, is_mine = by_step != NO_SAMPLE, mine.expand_as(by_step)
         return PackedSequences(
             rows=by_step[is_sample],
             is_own=is_mine[is_sample],
@@ -89,22 +91,56 @@ class PackedSequences:
     """i64: this rank's sequences, among its own."""
 
 
+class SequenceUpdate(FastUpdate):
+    """A `FastUpdate` whose minibatches are whole sequences."""
+
+    policy_network: RecurrentNetwork
+    value_network: RecurrentNetwork
+
+    def _pieces(self, shared: SharedBatch) -> int:
+        """Sequences are shuffled, not samples."""
+        assert isinstance(shared.batch, RecurrentBatch)
+        tables = self.ranks.tables(shared.batch.sequence)
+        before = sum(len(table) for table in tables[: self.ranks.rank])
+        self._shared = SharedSequences(one_table(tables), before, len(shared.batch.sequence))
+        return len(self._shared.table)
+
+    def _minibatches(
+        self, network: str, shared: SharedBatch, columns: Sequence[Tensor], order: Tensor
+    ) -> Iterator[Minibatch]:
+        """Whole sequences, about `batch_size` samples of them."""
+        batch, union = shared.batch, shared.union
+        assert isinstance(batch, RecurrentBatch)
+        starts = batch.policy_start if network == "policy" else batch.value_start
+        lengths = (self._shared.table != NO_SAMPLE).sum(1)
+        for chosen in cut(order, lengths, shared.minibatches):
+            packed = self._shared.packed(chosen)
+            rows, sizes = packed.rows[packed.is_own] - union.offset, packed.sizes
+            sequences = Sequences(batch.observation[rows], sizes[sizes > 0].cpu(), starts[packed.own])
+            own = (sequences, *(column[rows] for column in columns))
+            is_all = len(rows) == len(packed.rows)
+            share = len(rows) / len(packed.rows)
+            yield Minibatch(own, union.advantage[packed.rows], None if is_all else packed.is_own, share)
+
+
 class RecurrentPpo(Ppo):
     """`Ppo` with memory: what the networks remember at the last tick of the newest horizon is part of its state."""
 
-    policy: RecurrentPolicy
-    value: RecurrentValue
+    updater: SequenceUpdate
 
-    def _networks(self) -> tuple[RecurrentPolicy, RecurrentValue]:
-        config, activation = self.config, Activation(self.config.activation)
-        policy = RecurrentPolicy(self.observation_size, ACTIONS, config.hidden, self.device, activation)
-        value = RecurrentValue(self.observation_size, config.hidden, self.device, activation)
-        self._widths = (policy.network.width, value.network.width)
-        self.memories = [Memory.nothing(sum(self._widths)) for _ in self._environments]
-        return policy, value
-
-    def _graphed_update(self) -> None:
-        """The steps of sequences are as many as the longest has rows: no two minibatches have one shape."""
+    def __init__(
+        self,
+        config: TrainerConfig,
+        task: Localisation,
+        observation_size: int,
+        updater: SequenceUpdate,
+        sampling: torch.Generator,
+        environments: Sequence[int] = (0,),
+    ) -> None:
+        """See `Ppo`."""
+        super().__init__(config, task, observation_size, updater, sampling, environments)
+        self._widths = (updater.policy_network.width, updater.value_network.width)
+        self.memories = [Memory.nothing(sum(self._widths)) for _ in environments]
 
     def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> "SequencePredictor":
         """See `Ppo.predictor`. Every tick goes alone."""
@@ -138,8 +174,8 @@ class RecurrentPpo(Ppo):
         )
         start = self.memories[environment].before(int(horizon.tick[0]), horizon.vehicle[0], horizon.cut)
         policy_start, value_start = start.to(self.device).split(self._widths, 1)
-        policy = self.policy.network.walk(steps, policy_start)
-        value = self.value.network.walk(steps, value_start)
+        policy = self.updater.policy_network.walk(steps, policy_start)
+        value = self.updater.value_network.walk(steps, value_start)
         after = self._value_after(horizon, value)
         forward = ForwardPass(rows, steps.observation, policy.output, value.output.squeeze(1), after)
         scored = self._scored(horizon, forward, environment)
@@ -158,32 +194,8 @@ class RecurrentPpo(Ppo):
             return None
         rows = outlives(horizon).nonzero().squeeze(1)
         observation, state = (each.index_select(0, rows.to(each.device)) for each in (horizon.bootstrap, walk.last))
-        value, _ = self.value.network.step(observation.to(self.device), state)
+        value, _ = self.updater.value_network.step(observation.to(self.device), state)
         return torch.zeros(len(horizon.bootstrap)).index_copy_(0, rows, value.squeeze(1).cpu())
-
-    def _pieces(self, batch: Batch, union: Union) -> int:
-        """Sequences are shuffled, not samples."""
-        assert isinstance(batch, RecurrentBatch)
-        tables = self.ranks.tables(batch.sequence)
-        before = sum(len(table) for table in tables[: self.ranks.rank])
-        self._shared = SharedSequences(one_table(tables), before, len(batch.sequence))
-        return len(self._shared.table)
-
-    def _minibatches(
-        self, lane: str, batch: Batch, union: Union, columns: Sequence[Tensor], order: Tensor
-    ) -> Iterator[Minibatch]:
-        """Whole sequences, about `batch_size` samples of them."""
-        assert isinstance(batch, RecurrentBatch)
-        starts = batch.policy_start if lane == "policy" else batch.value_start
-        lengths = (self._shared.table != NOBODY).sum(1)
-        for chosen in cut(order, lengths, self._parts(union)):
-            packed = self._shared.packed(chosen)
-            rows, sizes = packed.rows[packed.is_own] - union.offset, packed.sizes
-            sequences = Sequences(batch.observation[rows], sizes[sizes > 0].cpu(), starts[packed.own])
-            own = (sequences, *(column[rows] for column in columns))
-            is_all = len(rows) == len(packed.rows)
-            share = len(rows) / len(packed.rows)
-            yield Minibatch(own, union.advantage[packed.rows], None if is_all else packed.is_own, share)
 
 
 class SequencePredictor:
@@ -208,7 +220,7 @@ class SequencePredictor:
 
     @torch.no_grad()
     def _step_m(self, memories: dict[int, Memory], obs: Observation) -> Tensor:
-        network, device = self._ppo.policy.network, self._ppo.device
+        network, device = self._ppo.updater.policy_network, self._ppo.device
         valid = torch.from_numpy(np.asarray(obs.valid))
         rows = valid.nonzero().squeeze(1)
         vehicle = torch.from_numpy(np.asarray(obs.vehicle).astype(np.int64))
@@ -218,8 +230,8 @@ class SequencePredictor:
         seen = visible(obs, self._dark_is_nan).index_select(0, rows).to(device)
         mean, after = network.step(seen, state.index_select(0, rows).to(device))
         memories[obs.tick] = Memory.after(obs.tick, vehicle, valid, state.index_copy_(0, rows, after.cpu()))
-        predicted_m = self._ppo.bounds.to_world_m(mean).cpu()
-        return torch.zeros(len(valid), ACTIONS).index_copy_(0, rows, predicted_m)
+        predicted_m = self._ppo.task.position_m(mean).cpu()
+        return torch.zeros(len(valid), self._ppo.task.actions).index_copy_(0, rows, predicted_m)
 
 
 def outlives(horizon: Horizon) -> Tensor:
@@ -251,7 +263,7 @@ def sequences(valid: Tensor, goes_on: Tensor, length: int) -> Tensor:
         rows = np.flatnonzero(is_valid[t])
         cells.append((number[rows], place[rows]))
     numbers, places = (np.concatenate(column) for column in zip(*cells, strict=True))
-    table = np.full((count, int(places.max()) + 1), NOBODY)
+    table = np.full((count, int(places.max()) + 1), NO_SAMPLE)
     table[numbers, places] = np.arange(len(numbers))
     return torch.from_numpy(table)
 
@@ -261,9 +273,9 @@ def one_table(tables: Sequence[Tensor]) -> Tensor:
     longest = max(table.shape[1] for table in tables)
     shifted, first = [], 0
     for table in tables:
-        rows = torch.where(table == NOBODY, NOBODY, table + first)
-        shifted.append(torch.nn.functional.pad(rows, (0, longest - table.shape[1]), value=NOBODY))
-        first += int((table != NOBODY).sum())
+        rows = torch.where(table == NO_SAMPLE, NO_SAMPLE, table + first)
+        shifted.append(torch.nn.functional.pad(rows, (0, longest - table.shape[1]), value=NO_SAMPLE))
+        first += int((table != NO_SAMPLE).sum())
     return torch.cat(shifted)
 
 

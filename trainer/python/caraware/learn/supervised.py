@@ -1,27 +1,25 @@
-"""What the policy's network reaches when it is told the truth: a baseline taught by regression beside PPO.
+"""What the policy's network reaches when it sees the truth: a baseline taught by regression beside PPO.
 
 PPO learns from rewards alone. A network of the same size, on the same samples, that is shown where the vehicle was
 has an easier task: its error is what the observation and the network are worth, and PPO's distance to it the price of
 learning by trial. It takes no part in PPO: random numbers, parameters and moments are its own.
 """
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from caraware.learn.adam import Adam
-from caraware.learn.config import MapBounds, TrainerConfig
-from caraware.learn.networks import Activation, GaussianPolicy
-from caraware.learn.ranks import Minibatch, Ranks, Union
+from caraware.learn.batch import Batch
+from caraware.learn.config import TrainerConfig
+from caraware.learn.fast import minibatches
+from caraware.learn.fast_mlp import FastMlp
+from caraware.learn.localisation import Localisation
+from caraware.learn.networks import Activation, GaussianPolicy, policy_mlp
+from caraware.learn.ranks import Minibatch, Ranks
 from caraware.learn.rewards import distance_m
-
-if TYPE_CHECKING:
-    from caraware.learn.ppo import Batch
 
 SEED_OFFSET = 0x5E_ED00
 """Between the seed of a run and those of this baseline."""
-ACTIONS = 2
 LEARNT_EVERY = 2
 """One of so many samples is learnt from: a pass over all costs 11 % of the CPU time of an update with 4 epochs."""
 SMALLEST_DISTANCE_M = 1e-6
@@ -32,30 +30,42 @@ class Supervised:
     """The policy's network, taught to be close to the truth: from half the samples of every horizon, once each."""
 
     def __init__(
-        self, config: TrainerConfig, observation_size: int, bounds: MapBounds, device: torch.device, ranks: Ranks
+        self,
+        config: TrainerConfig,
+        observation_size: int,
+        task: Localisation,
+        device: torch.device,
+        ranks: Ranks | None = None,
     ) -> None:
-        self._seed, self._bounds, self._device, self._ranks = config.seed + SEED_OFFSET, bounds, device, ranks
-        activation = Activation(config.activation)
-        self.mlp = GaussianPolicy(observation_size, ACTIONS, config.hidden, device, activation).network
-        self.mlp.initialise(torch.Generator().manual_seed(self._seed))
+        self._config, self._task, self._device, self._ranks = config, task, device, ranks or Ranks()
+        self._seed = config.seed + SEED_OFFSET
+        network = policy_mlp(observation_size, task.actions, config.hidden, Activation(config.activation))
+        network.initialise(torch.Generator().manual_seed(self._seed))
+        policy = GaussianPolicy(network, task.actions, initial_std=1.0).to(device)
+        self.mlp = FastMlp(network, {"log_std": policy.log_std})
         self.optimiser = Adam(self.mlp.parameters)
-        corner, centre = (bounds.to_world_m(torch.full((ACTIONS,), place, device=device)) for place in (1.0, 0.0))
+        corner, centre = (task.position_m(torch.full((task.actions,), place, device=device)) for place in (1.0, 0.0))
         self._metres_per_action = corner - centre
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Parameters and moments by name, for a checkpoint; filling them restores the baseline."""
+        return dict(self.mlp.parameters.value) | self.optimiser.state()
 
     @torch.no_grad()
     def predict_m(self, observation: Tensor) -> Tensor:
         """Positions `[n, 2]` in world metres for `[n, d]` observations."""
-        return self._bounds.to_world_m(self.mlp.infer(observation.to(self._device))).cpu()
+        return self._task.position_m(self.mlp.infer(observation.to(self._device))).cpu()
 
     @torch.no_grad()
-    def learn(self, batch: "Batch", union: Union, parts: int, learning_rate: float) -> float:
-        """Walk once over half the union of all ranks' samples, of `parts` minibatches; the mean error, in metres.
+    def learn(self, batch: Batch, learning_rate: float) -> float:
+        """Walk once over half the samples of all ranks, in minibatches of PPO's size; the mean error, in metres.
 
         The order follows from the seed and the steps taken, so a checkpoint needs no state of a generator.
         """
+        union = self._ranks.union(batch.advantage, batch.reward, batch.value_target)
         generator = torch.Generator().manual_seed(self._seed + 1 + int(self.optimiser.steps))
         order = torch.randperm(len(union), generator=generator)[::LEARNT_EVERY].to(self._device)
-        parts = max(1, parts // LEARNT_EVERY)
+        parts = max(1, minibatches(union, self._config, self._ranks) // LEARNT_EVERY)
         error_m = torch.zeros((), device=self._device)
         for part in union.minibatches((batch.observation, batch.truth), order, parts):
             error_m += self._gradient(part) / parts
@@ -69,7 +79,7 @@ class Supervised:
             self.mlp.parameters.gradient.zero_()
             return torch.zeros((), device=self._device)
         observation, truth = part.own
-        predicted_m = self._bounds.to_world_m(self.mlp.forward(observation))
+        predicted_m = self._task.position_m(self.mlp.forward(observation))
         distances_m = distance_m(predicted_m, truth)
         towards = (predicted_m - truth[:, :2]) / distances_m.clamp_min(SMALLEST_DISTANCE_M).unsqueeze(1)
         self.mlp.backward(observation, towards * self._metres_per_action * (part.share / len(truth)))

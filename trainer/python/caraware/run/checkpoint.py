@@ -14,7 +14,8 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from caraware.learn.config import TrainerConfig
-from caraware.learn.ppo import Ppo, Settings
+from caraware.learn.ppo import Ppo, ScheduledValues
+from caraware.learn.supervised import Supervised
 from caraware.report.evaluation import EvaluationResult
 from caraware.report.metrics import TrainingPoint
 from caraware.run.environment import Place
@@ -35,6 +36,8 @@ from caraware.run.manifest import (
     verified,
 )
 
+PARAMETERS = "parameters.safetensors"
+OPTIMISER = "optimiser.safetensors"
 RANDOM = "random.safetensors"
 POINTS = "points.safetensors"
 MEMORY = "memory.safetensors"
@@ -86,6 +89,7 @@ def save_checkpoint(
     course: Course | None = None,
     random: dict[str, Tensor] | None = None,
     memory: dict[str, Tensor] | None = None,
+    supervised: Supervised | None = None,
 ) -> Path:
     """Write `folder/update-NNNNNN`, then point `folder/latest` at it; older ones that `keep` does not name are removed.
 
@@ -96,7 +100,7 @@ def save_checkpoint(
     temporary = folder / f".{target.name}.partial"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
-    tensors_of = _tensors(ppo)
+    tensors_of = _tensors(ppo, supervised)
     tensors_of[RANDOM] |= random or {}
     files = {name: _write(temporary / name, save(tensors)) for name, tensors in tensors_of.items()}
     if memory := (memory or {}) | ppo.memory_tensors():
@@ -141,14 +145,16 @@ def mark_best(checkpoint: Path) -> None:
 
 def _schedules(ppo: Ppo) -> Schedules:
     """Of the newest update; before the first, of that one."""
-    return Schedules(ppo.progress, **asdict(Settings.at(ppo.config, max(ppo.updates - 1, 0), ppo.progress)))
+    now = ScheduledValues.at(ppo.config, max(ppo.updates - 1, 0), ppo.progress)
+    return Schedules(ppo.progress, now.learning_rate, now.clip_epsilon, now.entropy_scale)
 
 
-def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
-    """Verify a checkpoint and continue `ppo` from it, bit for bit on a CPU. Raises `CheckpointError`."""
+def load_checkpoint(checkpoint: Path, ppo: Ppo, supervised: Supervised | None = None) -> Counters:
+    """Verify a checkpoint and continue from it, bit for bit on a CPU. Raises `CheckpointError`."""
     manifest = read_manifest(checkpoint)
     _check_network(checkpoint / MANIFEST, manifest, ppo)
-    current = {name: tensors for name, tensors in _tensors(ppo).items() if name != SUPERVISED or name in manifest.files}
+    own = _tensors(ppo, supervised)
+    current = {name: tensors for name, tensors in own.items() if name != SUPERVISED or name in manifest.files}
     stored = {
         name: _read_tensors(checkpoint / name, digest) for name, digest in manifest.files.items() if name in current
     }
@@ -158,8 +164,10 @@ def load_checkpoint(checkpoint: Path, ppo: Ppo) -> Counters:
         # A checkpoint of several ranks holds the generators of all.
         if not found.issuperset(tensors) or (name != RANDOM and found != set(tensors)):
             raise CheckpointError(checkpoint / name, "does not hold the tensors of this trainer")
-        for key, tensor in tensors.items():
-            tensor.copy_(stored[name][key])
+        if name != OPTIMISER:
+            for key, tensor in tensors.items():
+                tensor.copy_(stored[name][key])
+    ppo.updater.restore_moments(stored[OPTIMISER])
     for name, generator in ppo.sampling_generators().items():
         generator.set_state(stored[RANDOM][name])
     ppo.shuffling.set_state(stored[RANDOM]["shuffling"])
@@ -199,26 +207,12 @@ def remove_partial(folder: Path) -> None:
             partial.unlink()
 
 
-def _tensors(ppo: Ppo) -> dict[str, dict[str, Tensor]]:
-    """Every tensor of the trainer by file and name. Parameters and moments are views: filling them loads them."""
-    parameters: dict[str, Tensor] = {}
-    moments: dict[str, Tensor] = {}
-    for name_of, network, optimiser in (
-        ("policy", ppo.policy.network, ppo.policy_optimiser),
-        ("value", ppo.value.network, ppo.value_optimiser),
-    ):
-        parameters |= {f"{name_of}.{name}": tensor for name, tensor in network.parameters.value.items()}
-        moments[f"{name_of}.mean"] = optimiser.mean
-        moments[f"{name_of}.square"] = optimiser.square
-        moments[f"{name_of}.steps"] = optimiser.steps
+def _tensors(ppo: Ppo, supervised: Supervised | None) -> dict[str, dict[str, Tensor]]:
+    """Every tensor of the trainer by file and name. Filling them loads them, but for the optimisers' moments."""
     random = {name: generator.get_state() for name, generator in ppo.sampling_generators().items()}
     random["shuffling"] = ppo.shuffling.get_state()
-    tensors = {"parameters.safetensors": parameters, "optimiser.safetensors": moments, RANDOM: random}
-    if ppo.supervised is not None:
-        mlp, optimiser = ppo.supervised.mlp, ppo.supervised.optimiser
-        own = {"mean": optimiser.mean, "square": optimiser.square, "steps": optimiser.steps}
-        tensors[SUPERVISED] = dict(mlp.parameters.value) | own
-    return tensors
+    tensors = {PARAMETERS: ppo.updater.parameters(), OPTIMISER: ppo.updater.moments(), RANDOM: random}
+    return tensors | ({SUPERVISED: supervised.tensors()} if supervised is not None else {})
 
 
 def _read_tensors(file: Path, sha256: str) -> dict[str, Tensor]:

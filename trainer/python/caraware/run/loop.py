@@ -15,11 +15,12 @@ from torch import Tensor
 from caraware.ipc.arrays import FloatArray
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.batch import Batch, save_batch
+from caraware.learn.build import build_ppo
 from caraware.learn.ppo import NonFiniteLoss, Ppo, UpdateStats
 from caraware.learn.prediction import visible
 from caraware.learn.ranks import RankError, Ranks, Verdict
-from caraware.learn.recurrent import RecurrentPpo
 from caraware.learn.rewards import distance_m
+from caraware.learn.supervised import Supervised
 from caraware.report.evaluation import NO_HEADLINE, Evaluation, EvaluationResult, Mean, errors_m, pooled, raw_errors_m
 from caraware.report.metrics import Metrics, TrainingPoint
 from caraware.report.plots import plot_error, plot_sigma
@@ -41,7 +42,6 @@ log = logging.getLogger(__name__)
 
 CREDIT_TICKS = 8
 """The simulation gets its credit back after so many ticks, or when no more wait: each time it is woken."""
-PPO_OF_NETWORK = {"mlp": Ppo, "gru": RecurrentPpo}
 RECEIVE_TIMEOUT_S = 0.2
 """How long a request to stop may wait for the next tick."""
 
@@ -51,15 +51,18 @@ class Learner:
     """Policy, value network and how far they have come: new, or continued from a checkpoint."""
 
     ppo: Ppo
+    supervised: Supervised | None
+    """The baseline by regression, taught from the same batches."""
     counters: Counters
     course: Course
 
     @classmethod
     def begin(cls, config: RunConfig, observation_size: int, ranks: Ranks | None = None) -> "Learner":
         """A learner for observations of this size, continued from `config.resume_from`. Raises `CheckpointError`."""
-        kind = PPO_OF_NETWORK[config.trainer.network]
-        ppo = kind(config.trainer, observation_size, config.bounds, config.environments, ranks)
-        learner = cls(ppo, Counters(0, 0, 0, -1), Course())
+        trainer = config.trainer
+        ppo = build_ppo(trainer, observation_size, config.bounds, config.environments, ranks)
+        beside = Supervised(trainer, observation_size, ppo.task, ppo.device, ranks) if trainer.supervised else None
+        learner = cls(ppo, beside, Counters(0, 0, 0, -1), Course())
         if config.resume_from is not None:
             learner.load(config.resume_from)
         return learner
@@ -70,12 +73,13 @@ class Learner:
 
     def load(self, checkpoint: Path) -> None:
         """Continue from a checkpoint. Raises `CheckpointError`."""
-        self.counters, self.course = load_checkpoint(checkpoint, self.ppo), load_course(checkpoint)
+        self.counters = load_checkpoint(checkpoint, self.ppo, self.supervised)
+        self.course = load_course(checkpoint)
 
     def take_parameters(self, checkpoint: Path) -> None:
         """Parameters, moments and generators of any checkpoint; the count of updates and ticks stays this run's."""
         updates = self.ppo.updates
-        load_checkpoint(checkpoint, self.ppo)
+        load_checkpoint(checkpoint, self.ppo, self.supervised)
         self.ppo.updates = updates
         # What another network remembers of other ticks says nothing about this run's.
         self.ppo.restore_memory({})
@@ -124,6 +128,7 @@ class TrainingLoop:
         self._leave_requested, self._left = leave_requested, False
         self._metrics = Metrics(config.run_dir / "tensorboard")
         self._ppo: Ppo | None = None
+        self._supervised: Supervised | None = None
         self._env_steps = self._passed_steps = self._vehicles = 0
         """Samples seen, and those among them that came when no horizon could be filled any more."""
         self._saved_updates = -1
@@ -192,7 +197,7 @@ class TrainingLoop:
     def _start(self, learner: Learner) -> None:
         """Go on where `learner` stands."""
         trainer, counters, course = self._config.trainer, learner.counters, learner.course
-        self._ppo = learner.ppo
+        self._ppo, self._supervised = learner.ppo, learner.supervised
         size, places, count = self._ppo.observation_size, learner.places(), len(self._environments)
         self._env_steps, self._vehicles = counters.env_steps, course.vehicles
         for environment in self._environments:
@@ -273,12 +278,11 @@ class TrainingLoop:
 
     def _supervised_errors_m(self, obs: Observation) -> FloatArray | None:
         """Of the baseline that is taught beside the policy, on the valid rows; None without it."""
-        assert self._ppo is not None
-        if self._ppo.supervised is None:
+        if self._supervised is None:
             return None
         rows = torch.from_numpy(np.flatnonzero(obs.valid))
         observation = visible(obs, self._config.dark_is_nan)
-        predicted_m = self._ppo.supervised.predict_m(observation.index_select(0, rows))
+        predicted_m = self._supervised.predict_m(observation.index_select(0, rows))
         return distance_m(predicted_m, obs.truth.index_select(0, rows)).numpy()
 
     def _take(self, environment: Environment, obs: Observation, predicted_m: Tensor, raw_m: FloatArray) -> None:
@@ -298,7 +302,7 @@ class TrainingLoop:
             # A predecessor may have evaluated ticks that it had not learnt up to.
             if obs.tick > environment.evaluated_tick:
                 environment.evaluation = environment.evaluation or Evaluation(
-                    self._config.sensors, supervised=self._ppo.supervised is not None
+                    self._config.sensors, supervised=self._supervised is not None
                 )
                 policy_m, _ = errors_m(obs, predicted_m)
                 environment.evaluation.add(obs, policy_m, raw_m, self._supervised_errors_m(obs))
@@ -329,8 +333,10 @@ class TrainingLoop:
             stats = self._ppo.update(batch)
         except NonFiniteLoss as error:
             error.batch_file = self._config.run_dir / "logs" / f"nonfinite-update-{error.update:06d}.safetensors"
-            save_batch(batch, self._ppo.policy.network.parameters, error.batch_file)
+            save_batch(batch, self._ppo.updater.parameters(), error.batch_file)
             raise
+        if self._supervised is not None:
+            self._supervised.learn(batch, stats.learning_rate)
         for environment, horizon in zip(self._environments, horizons, strict=True):
             environment.committed_tick = horizon.last_tick()
         self._record(stats, batch.error_m.double().mean().item())
@@ -408,7 +414,7 @@ class TrainingLoop:
         keep = Keeping.of(self._config.trainer)
         course, random, memory = self._of_all_ranks()
         config = self._config.config_sha256
-        saved = save_checkpoint(folder, self._ppo, counters, config, keep, course, random, memory)
+        saved = save_checkpoint(folder, self._ppo, counters, config, keep, course, random, memory, self._supervised)
         log.info("checkpoint %s, learnt up to tick %d", saved.name, committed_tick)
         # Learnt is what all ranks have kept.
         self._ranks.gather(None)
@@ -424,9 +430,7 @@ class TrainingLoop:
         """
         assert self._ppo is not None
         own = self._course()
-        self._ranks.check_equal(
-            "the parameters", [self._ppo.policy.network.parameters.values, self._ppo.value.network.parameters.values]
-        )
+        self._ranks.check_equal("the parameters", list(self._ppo.updater.parameters().values()))
         states = {name: generator.get_state() for name, generator in self._ppo.sampling_generators().items()}
         places = [environment.place() for environment in self._environments]
         everybody = self._ranks.gather((places, states, self._ppo.memory_tensors()))

@@ -1,0 +1,131 @@
+"""A learner as the configuration says: its networks, and the update that is the fastest for them.
+
+`"mlp"` and `"gru"` are the paper's networks and the one with memory. `"package.module:Class"` names any other: it is
+constructed as `Class(inputs, outputs, hidden)`, with the widths of `trainer.hidden`, and maps rows `[b, inputs]` to
+`[b, outputs]`. PPO makes two of it: the policy's mean, which is bounded to the map by a tanh behind it, and the values.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from importlib import import_module
+
+import torch
+from torch import nn
+
+from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
+from caraware.learn.fast import FastUpdate, threads_per_network
+from caraware.learn.fast_mlp import FastMlp
+from caraware.learn.graphed import GraphedUpdate
+from caraware.learn.gru import recurrent_policy, recurrent_value
+from caraware.learn.localisation import Localisation
+from caraware.learn.networks import Activation, GaussianPolicy, policy_mlp, value_mlp
+from caraware.learn.ppo import PlainUpdate, Ppo
+from caraware.learn.ranks import Ranks
+from caraware.learn.recurrent import RecurrentPpo, SequenceUpdate
+
+NetworkClass = Callable[[int, int, tuple[int, ...]], nn.Module]
+
+
+def build_ppo(
+    config: TrainerConfig,
+    observation_size: int,
+    bounds: MapBounds,
+    environments: Sequence[int] = (0,),
+    ranks: Ranks | None = None,
+) -> Ppo:
+    """A new learner for these environments, counted among those of all `ranks`. Raises `ConfigError`."""
+    device = configure_torch(config)
+    task = Localisation(config, bounds)
+    # The weights are drawn first; the actions of environment 0 continue with the same generator.
+    sampling = torch.Generator().manual_seed(config.seed)
+    if config.network == "gru":
+        sequences = _sequence_update(config, observation_size, task.actions, device, sampling, ranks)
+        return RecurrentPpo(config, task, observation_size, sequences, sampling, environments)
+    if config.network == "mlp":
+        policy, value = paper_networks(config, observation_size, task.actions, sampling)
+        fast = fast_update(config, policy, value, device, ranks)
+        return Ppo(config, task, observation_size, fast, sampling, environments)
+    if config.ranks > 1:
+        raise ConfigError(
+            f"`trainer.network` is {config.network!r} with `trainer.ranks` = {config.ranks}",
+            "several ranks learn with `mlp` or `gru`; set trainer.ranks = 1",
+        )
+    policy, value = _own_networks(config, observation_size, task.actions, sampling)
+    plain = PlainUpdate(config, policy, value, device)
+    return Ppo(config, task, observation_size, plain, sampling, environments)
+
+
+def paper_networks(
+    config: TrainerConfig, observation_size: int, actions: int, generator: torch.Generator
+) -> tuple[GaussianPolicy, nn.Module]:
+    """The paper's policy and value network, drawn from `generator`."""
+    activation = Activation(config.activation)
+    mean = policy_mlp(observation_size, actions, config.hidden, activation)
+    value = value_mlp(observation_size, config.hidden, activation)
+    mean.initialise(generator)
+    value.initialise(generator)
+    return GaussianPolicy(mean, actions, config.initial_std), value
+
+
+def fast_update(
+    config: TrainerConfig, policy: GaussianPolicy, value: nn.Module, device: torch.device, ranks: Ranks | None = None
+) -> FastUpdate:
+    """The paper's networks with their backward pass written out; on a GPU, alone, with captured steps."""
+    policy.to(device)
+    networks = FastMlp(policy.network, {"log_std": policy.log_std}), FastMlp(value.to(device))
+    if device.type == "cuda" and (ranks is None or ranks.size == 1):
+        return GraphedUpdate(config, *networks, device)
+    return FastUpdate(config, *networks, device, ranks)
+
+
+def _sequence_update(
+    config: TrainerConfig,
+    observation_size: int,
+    actions: int,
+    device: torch.device,
+    generator: torch.Generator,
+    ranks: Ranks | None,
+) -> SequenceUpdate:
+    """Networks with memory, drawn from `generator`. No two of their minibatches have one shape: no captured steps."""
+    activation = Activation(config.activation)
+    policy = recurrent_policy(observation_size, actions, config.hidden, activation, device)
+    value = recurrent_value(observation_size, config.hidden, activation, device)
+    policy.initialise(generator)
+    policy.parameters.value["log_std"].fill_(math.log(config.initial_std))
+    value.initialise(generator)
+    return SequenceUpdate(config, policy, value, device, ranks)
+
+
+def _own_networks(
+    config: TrainerConfig, observation_size: int, actions: int, generator: torch.Generator
+) -> tuple[GaussianPolicy, nn.Module]:
+    """Two networks of the class that `trainer.network` names; their first weights follow from the run's seed."""
+    network_class = _class_of(config.network)
+    seed = int(torch.randint(2**62, (), generator=generator))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        mean = network_class(observation_size, actions, config.hidden)
+        value = network_class(observation_size, 1, config.hidden)
+    return GaussianPolicy(nn.Sequential(mean, nn.Tanh()), actions, config.initial_std), value
+
+
+def _class_of(name: str) -> NetworkClass:
+    """The class called `package.module:Class`. Raises `ConfigError`."""
+    module, _, attribute = name.partition(":")
+    help = "write `mlp`, `gru` or `package.module:Class`; the module must be in PYTHONPATH"
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"`trainer.network` is {name!r}: {error}", help) from error
+
+
+def configure_torch(config: TrainerConfig) -> torch.device:
+    """Set what torch keeps per process: threads within an operation, and the precision of matrix products."""
+    torch.set_num_threads(threads_per_network(config))
+    amx = hasattr(torch.cpu, "get_capabilities") and torch.cpu.get_capabilities().get("amx_bf16", False)
+    gpu = config.device == "auto" and torch.cuda.is_available()
+    reduced = config.matmul_precision == "bfloat16" or (config.matmul_precision == "auto" and amx and not gpu)
+    # On a GPU "auto" is TensorFloat-32: 10 bits of mantissa, float32's range.
+    full = "high" if gpu and config.matmul_precision == "auto" else "highest"
+    torch.set_float32_matmul_precision("medium" if reduced else full)
+    return torch.device("cuda" if gpu else "cpu")
