@@ -450,14 +450,36 @@ fn default_truncation_ticks() -> u64 {
 }
 
 /// Networks of policy and value.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "String", into = "String")]
 pub enum Network {
     /// Hidden layers: sees one moment.
     #[default]
     Mlp,
     /// The last hidden layer is a gated recurrent unit, with a state for each slot.
     Gru,
+    /// A Python class, as `package.module:Class`.
+    Class(String),
+}
+
+impl From<String> for Network {
+    fn from(word: String) -> Self {
+        match word.as_str() {
+            "mlp" => Self::Mlp,
+            "gru" => Self::Gru,
+            _ => Self::Class(word),
+        }
+    }
+}
+
+impl From<Network> for String {
+    fn from(network: Network) -> Self {
+        match network {
+            Network::Mlp => "mlp".to_owned(),
+            Network::Gru => "gru".to_owned(),
+            Network::Class(name) => name,
+        }
+    }
 }
 
 /// What follows a hidden layer of policy and value network.

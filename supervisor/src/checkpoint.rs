@@ -165,7 +165,7 @@ impl Found {
             return refuse("observation has", format!("{size} numbers"), width.to_string(), help);
         }
         if self.manifest.network != config.trainer.network {
-            let (has, wants) = (self.manifest.network, config.trainer.network);
+            let (has, wants) = (&self.manifest.network, &config.trainer.network);
             let help = "set trainer.network as in the run that learnt it";
             return refuse("network is", word(has), word(wants), help);
         }

@@ -12,8 +12,16 @@ from collections.abc import Callable
 import torch
 from caraware.learn.batch import Batch
 from caraware.learn.build import build_ppo
-from caraware.learn.config import MapBounds, TrainerConfig
-from caraware_bench.trainer import BATCH, EPOCHS, HORIZON, OBSERVATIONS, PlainAgent, plain_update, random_batch
+from caraware.learn.config import MapBounds
+from caraware_bench.trainer import (
+    EPOCHS,
+    HORIZON,
+    OBSERVATIONS,
+    PlainAgent,
+    learner_config,
+    plain_update,
+    random_batch,
+)
 
 
 def on(device: torch.device, batch: Batch) -> Batch:
@@ -38,16 +46,7 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "auto"), default="cpu", help="auto: a GPU if there is one")
     parser.add_argument("--pairs", type=int, default=5)
     options = parser.parse_args()
-    config = TrainerConfig(
-        horizon=HORIZON,
-        batch_size=BATCH,
-        epochs=EPOCHS,
-        learning_rate=1e-4,
-        threads=options.threads,
-        matmul_precision=options.precision,
-        device=options.device,
-        supervised=False,
-    )
+    config = learner_config(options.threads, options.precision, options.device)
     ppo = build_ppo(config, OBSERVATIONS, MapBounds(0.0, 0.0, 220.0, 220.0))
     threads_ours, precision_ours = torch.get_num_threads(), torch.get_float32_matmul_precision()
     batch, agent = on(ppo.device, random_batch(ppo)), PlainAgent().to(ppo.device)

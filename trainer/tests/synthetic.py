@@ -1,13 +1,18 @@
 """A street map with noisy GNSS, in numpy, and a channel over it; for the trainer's unit tests."""
 
 import math
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+PRESET = tomllib.loads((Path(__file__).parents[2] / "configs" / "town.toml").read_text())
+OPTIONAL_KEYS = ("learning_rate_final", "clip_epsilon_final", "entropy_scale_final", "value_clip", "target_kl")
+"""Unset in the presets; a run file has them as null."""
 SIZE_M = 220.0
 STREETS_M = np.array([10.0, 75.0, 140.0, 210.0])
 FIELDS = 4
@@ -135,7 +140,15 @@ def with_evaluation(
 
 
 def run_file(run_dir: str, **trainer: object) -> dict:
-    """A run file with small, single-threaded defaults."""
-    section = {"threads": 1, "matmul_precision": "float32", "hidden": [32, 16], "horizon": 256, "batch_size": 64}
+    """A run file of the preset `town`, but small and single-threaded, with these changes."""
+    small = {
+        "threads": 1,
+        "matmul_precision": "float32",
+        "hidden": [32, 16],
+        "horizon": 256,
+        "batch_size": 64,
+        "seed": 1,
+    }
+    section = dict.fromkeys(OPTIONAL_KEYS) | PRESET["trainer"] | small | {"checkpoint_interval": 10}
     bounds = [0.0, 0.0, SIZE_M, SIZE_M]
     return {"run_dir": run_dir, "config": {"trainer": section | trainer}, "map": {"bounds_m": bounds}}

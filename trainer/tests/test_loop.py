@@ -278,11 +278,11 @@ def test_sigterm_commits_a_checkpoint_and_ends_with_0(tmp_path: Path, monkeypatc
 
 @pytest.mark.usefixtures("channel_module")
 def test_a_bad_configuration_ends_with_2_and_the_cure(tmp_path: Path) -> None:
-    assert train.main([write_run(tmp_path, run_file(str(tmp_path), reward="best"))]) == 2
+    assert train.main([write_run(tmp_path, run_file(str(tmp_path), learning_rate="fast"))]) == 2
     told = failure(tmp_path)
     assert told["kind"] == "config"
-    assert "trainer.reward" in told["message"]
-    assert "bounded_inverse" in told["help"]
+    assert "trainer.learning_rate" in told["message"]
+    assert "float" in told["help"]
 
 
 @pytest.mark.usefixtures("channel_module")

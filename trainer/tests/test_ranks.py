@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.learn.ranks import Ranks, Union
+from caraware.learn.ranks import Ranks, SampleUnion
 from caraware.parallel import Place, command
 from caraware.run.checkpoint import load_course
 from caraware.run.config import RunConfig
@@ -143,7 +143,7 @@ def test_a_minibatch_of_the_union_is_what_the_ranks_have_of_it_together() -> Non
     columns = torch.arange(10.0)
     whole = Ranks().union(columns, columns, columns)
     order = torch.randperm(10, generator=torch.Generator().manual_seed(3))
-    parts = [Union(columns, columns, columns, offset, own) for offset, own in ((0, 3), (3, 7))]
+    parts = [SampleUnion(columns, columns, columns, offset, own) for offset, own in ((0, 3), (3, 7))]
     cut = [list(part.minibatches([columns[part.offset :][: part.own]], order, 4)) for part in parts]
     for together, first, second in zip(whole.minibatches([columns], order, 4), *cut, strict=True):
         assert first.share + second.share == together.share == 1.0

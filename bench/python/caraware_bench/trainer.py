@@ -72,6 +72,46 @@ def plain_update(agent: PlainAgent, adam: torch.optim.Adam, batch: Batch) -> Non
             adam.step()
 
 
+def learner_config(threads: int, matmul_precision: str = "float32", device: str = "cpu") -> TrainerConfig:
+    """The paper's learner at the sizes of this comparison."""
+    return TrainerConfig(
+        learning_rate=1e-4,
+        learning_rate_decay=0.995,
+        learning_rate_final=None,
+        discount=0.0,
+        gae_lambda=0.95,
+        clip_epsilon=0.2,
+        clip_epsilon_final=None,
+        initial_std=1.0,
+        entropy_scale=0.001,
+        entropy_scale_final=None,
+        value_scale=1.0,
+        value_clip=None,
+        target_kl=None,
+        max_grad_norm=0.5,
+        actions_per_observation=1,
+        horizon=HORIZON,
+        batch_size=BATCH,
+        epochs=EPOCHS,
+        network="mlp",
+        hidden=(500, 300),
+        activation="relu",
+        truncation_ticks=32,
+        supervised=False,
+        reward="bounded_inverse",
+        reward_scale_m=5.0,
+        matmul_precision=matmul_precision,
+        ranks=1,
+        threads=threads,
+        device=device,
+        seed=1,
+        checkpoint_interval_updates=10,
+        checkpoints_kept=5,
+        checkpoint_keep_every=0,
+        estimates="never",
+    )
+
+
 def random_batch(ppo: Ppo) -> Batch:
     """Actions of the given policy with made-up advantages."""
     observation = torch.rand(HORIZON, OBSERVATIONS) * 2 - 1
@@ -248,15 +288,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--json", type=Path, help="write the seconds there in place of standard output")
     options = parser.parse_args()
-    config = TrainerConfig(
-        horizon=HORIZON,
-        batch_size=BATCH,
-        epochs=EPOCHS,
-        learning_rate=1e-4,
-        threads=options.threads,
-        matmul_precision="float32",
-        supervised=False,
-    )
+    config = learner_config(options.threads)
     ppo = build_ppo(config, OBSERVATIONS, BOUNDS)
     own_threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
     batch, agent, model = random_batch(ppo), PlainAgent(), sb3_model()

@@ -21,6 +21,8 @@ pub enum Kind {
     Flag,
     /// One of these words.
     Choice(&'static [&'static str]),
+    /// One of these words, or a Python class as `package.module:Class`.
+    ChoiceOrClass(&'static [&'static str]),
     /// Any text.
     Text,
     /// Observation fields: a preset by name or a list of field names.
@@ -336,7 +338,7 @@ pub const KEYS: &[Key] = &[
     integer("trainer.horizon", "samples", 1, 100_000_000, "Samples in one update."),
     integer("trainer.batch_size", "samples", 1, 100_000_000, "Samples in one gradient step; at most the horizon."),
     integer("trainer.epochs", "", 1, 1000, "Passes over a horizon."),
-    other("trainer.network", Kind::Choice(&["mlp", "gru"]), "Networks of policy and value: hidden layers alone, or with a gated recurrent unit in place of the last layer, which remembers a vehicle's earlier ticks (docs/networks.md)."),
+    other("trainer.network", Kind::ChoiceOrClass(&["mlp", "gru"]), "Networks of policy and value: hidden layers alone (\"mlp\"), with a gated recurrent unit in place of the last layer, which remembers a vehicle's earlier ticks (\"gru\"), or a Python class of your own (docs/networks.md)."),
     other("trainer.hidden", Kind::Integers { min: 1, max: 65536 }, "Widths of the hidden layers of the policy and of the value network."),
     other("trainer.activation", Kind::Choice(&["relu", "tanh"]), "Activation of the hidden layers; that of the policy's last hidden layer is always tanh."),
     integer("trainer.truncation_ticks", "ticks", 1, 100_000, "Ticks over which a gradient propagates back in a network with memory."),
@@ -417,11 +419,8 @@ impl Key {
             Kind::Integer { min, max: i64::MAX } => format!("{min} …"),
             Kind::Integer { min, max } => format!("{min} … {max}"),
             Kind::Flag => "true, false".into(),
-            Kind::Choice(words) => words
-                .iter()
-                .map(|word| format!("\"{word}\""))
-                .collect::<Vec<_>>()
-                .join(", "),
+            Kind::Choice(words) => quoted(words),
+            Kind::ChoiceOrClass(words) => format!("{}, \"package.module:Class\"", quoted(words)),
             Kind::Text => "text".into(),
             Kind::Texts => "list of texts".into(),
             Kind::Fields => format!(
@@ -437,4 +436,10 @@ impl Key {
             ),
         }
     }
+}
+
+/// The words in quotation marks, separated by commas.
+fn quoted(words: &[&str]) -> String {
+    let quoted: Vec<String> = words.iter().map(|word| format!("\"{word}\"")).collect();
+    quoted.join(", ")
 }

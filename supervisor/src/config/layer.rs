@@ -69,7 +69,7 @@ pub fn parse_assignment(assignment: &str) -> Result<Layer, ConfigError> {
     let (key, value) = (key.trim(), value.trim());
     let plain = format!("{key} = {value}");
     // A word is a word where one belongs, also "nan" and "true", which TOML takes for something else.
-    let takes_a_word = keys::find(key).is_some_and(|key| matches!(key.kind, Kind::Choice(_) | Kind::Text));
+    let takes_a_word = keys::find(key).is_some_and(|key| matches!(key.kind, Kind::Choice(_) | Kind::ChoiceOrClass(_) | Kind::Text));
     let is_quoted = value.starts_with(['"', '\'']);
     let text = if DeTable::parse(&plain).is_ok() && (is_quoted || !takes_a_word) {
         plain
@@ -162,6 +162,10 @@ fn check(key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Value> {
         Kind::Integer { min, max } => integer(value, min, max).map(Value::from),
         Kind::Flag => value.as_bool().map(Value::from),
         Kind::Choice(words) => value.as_str().filter(|word| words.contains(word)).map(Value::from),
+        Kind::ChoiceOrClass(words) => value
+            .as_str()
+            .filter(|word| words.contains(word) || is_python_class(word))
+            .map(Value::from),
         Kind::Text => value.as_str().map(Value::from),
         Kind::Fields => fields(value),
         Kind::Texts => texts(value),
@@ -180,6 +184,15 @@ fn check(key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Value> {
         // Its values have places of their own (`tables`).
         Kind::Tables(_) => None,
     }
+}
+
+/// Whether a word reads `package.module:Class`.
+fn is_python_class(word: &str) -> bool {
+    let is_name = |name: &str| {
+        name.chars().all(|c| c.is_alphanumeric() || c == '_') && name.starts_with(|c: char| !c.is_numeric())
+    };
+    word.split_once(':')
+        .is_some_and(|(module, class)| module.split('.').all(is_name) && is_name(class))
 }
 
 fn float(value: &DeValue<'_>) -> Option<f64> {

@@ -213,7 +213,11 @@ fn a_batch_larger_than_the_horizon_is_refused() {
 
 #[test]
 fn networks_and_activations_are_known_by_name() {
-    assert!(error_of("trainer.network = \"lstm\"\n").1.contains("\"mlp\", \"gru\""));
+    for unknown in ["lstm", ":Wide", "networks:", "my networks:Wide", "networks:Wide:er"] {
+        let (_, help) = error_of(&format!("trainer.network = \"{unknown}\"\n"));
+        assert!(help.contains("\"mlp\", \"gru\", \"package.module:Class\""), "{unknown}: {help}");
+    }
+    assert!(layer::parse_assignment("trainer.network=my.networks:Wide").is_ok());
     assert!(
         error_of("trainer.activation = \"gelu\"\n")
             .1

@@ -1,6 +1,5 @@
 """The learner's hyper-parameters and the map's box, read from the run file, checked once, then frozen."""
 
-import math
 import os
 from dataclasses import dataclass, fields
 from typing import Any
@@ -8,14 +7,9 @@ from typing import Any
 from torch import Tensor
 
 from caraware.ipc.run_file import ConfigTable, RunFile
-from caraware.learn import rewards
 
 _KEY_OF_FIELD = {"checkpoint_interval_updates": "checkpoint_interval"}
 """Fields whose name in the configuration file differs (there, the unit stands in the table of keys)."""
-
-
-SMALLEST = math.ulp(0.0)
-"""The smallest number greater than 0."""
 
 
 class ConfigError(Exception):
@@ -28,68 +22,67 @@ class ConfigError(Exception):
 
 @dataclass(frozen=True)
 class TrainerConfig:
-    """Hyper-parameters in the paper's words (section IV), with their defaults for the preset `town`."""
+    """Hyper-parameters in the paper's words (section IV); the supervisor has their defaults and checks their ranges."""
 
-    algorithm: str = "ppo"
-    learning_rate: float = 2e-3
+    learning_rate: float
     """Adam's step size at the first update, for the policy and the value network."""
-    learning_rate_decay: float = 0.995
+    learning_rate_decay: float
     """Factor on the learning rate after every update."""
-    learning_rate_final: float | None = None
+    learning_rate_final: float | None
     """Learning rate at the end of training, reached linearly with the training episodes; None: the decay alone."""
-    discount: float = 0.0
+    discount: float
     """γ. Predictions do not influence the world, so 0 (a bandit) loses nothing and has the least variance."""
-    gae_lambda: float = 0.95
-    clip_epsilon: float = 0.2
+    gae_lambda: float
+    clip_epsilon: float
     """ε: probability ratios beyond 1 ± ε earn nothing more."""
-    clip_epsilon_final: float | None = None
+    clip_epsilon_final: float | None
     """ε at the end of training; None: constant."""
-    initial_std: float = 1.0
+    initial_std: float
     """Standard deviation of the policy at the start, in actions: 1 is half the map's width."""
-    entropy_scale: float = 0.001
-    entropy_scale_final: float | None = None
+    entropy_scale: float
+    entropy_scale_final: float | None
     """Entropy scale at the end of training; None: constant."""
-    value_scale: float = 1.0
-    value_clip: float | None = None
+    value_scale: float
+    value_clip: float | None
     """How far a value may move from the value before the update; None: any way."""
-    target_kl: float | None = None
+    target_kl: float | None
     """The policy's update ends with the epoch whose mean KL divergence is larger; None: after all epochs."""
-    max_grad_norm: float = 0.5
+    max_grad_norm: float
     """Largest gradient norm, of the policy and of the value network each."""
-    actions_per_observation: int = 1
+    actions_per_observation: int
     """Actions tried on every observation: a prediction does not influence the world, so each one's reward is known.
     More of them make the gradient's noise smaller for the same samples."""
-    horizon: int = 8192
+    horizon: int
     """Samples (one vehicle at one tick) collected before every update."""
-    batch_size: int = 1024
+    batch_size: int
     """Samples in a gradient step."""
-    epochs: int = 4
-    network: str = "mlp"
-    """`mlp`, or `gru`: the last hidden layer remembers the ticks before (`caraware.learn.recurrent`)."""
-    hidden: tuple[int, ...] = (500, 300)
-    activation: str = "relu"
+    epochs: int
+    network: str
+    """`mlp`; `gru`, which remembers the ticks before; or `package.module:Class` (`caraware.learn.build`)."""
+    hidden: tuple[int, ...]
+    activation: str
     """Of the hidden layers: `relu` or `tanh`. The policy's last hidden layer is tanh in any case, as CarAware's."""
-    truncation_ticks: int = 32
+    truncation_ticks: int
     """Ticks that a gradient reaches back in a network with memory."""
-    supervised: bool = True
+    supervised: bool
     """Teach a network of the policy's size by regression to the truth beside it (`caraware.learn.supervised`)."""
-    reward: str = "bounded_inverse"
-    reward_scale_m: float = 5.0
-    matmul_precision: str = "auto"
+    reward: str
+    reward_scale_m: float
+    matmul_precision: str
     """`float32`, `bfloat16` (inputs of matrix products only), or `auto`: bfloat16 where the CPU has AMX tiles."""
-    ranks: int = 1
+    ranks: int
     """Trainers that learn together by torch.distributed, each with a run of its own; horizon and batch are of each."""
-    threads: int = 0
+    threads: int
     """CPU threads; 0 is one per core this process may use."""
-    device: str = "cpu"
+    device: str
     """`cpu`, or `auto`: a GPU if there is one."""
-    seed: int = 1
-    checkpoint_interval_updates: int = 10
-    checkpoints_kept: int = 5
-    checkpoint_keep_every: int = 0
+    seed: int
+    checkpoint_interval_updates: int
+    checkpoints_kept: int
+    checkpoint_keep_every: int
     """Checkpoints after a multiple of so many updates stay for good; 0: only the newest and the best."""
-    estimates: str = "paced"
-    """When the Kalman filter runs beside the policy for whoever watches: `paced`, `always`, `never`."""
+    estimates: str
+    """When the Kalman filter runs beside the policy for viewers: `paced`, `always`, `never`."""
 
     @classmethod
     def from_run(cls, run: RunFile) -> "TrainerConfig":
@@ -99,49 +92,22 @@ class TrainerConfig:
         seed_of_run = run.get("config", {}).get("run", {}).get("seed")
         if seed_of_run is not None:
             section.setdefault("seed", seed_of_run)
-        values = {f.name: _typed(f.name, f.type, section) for f in fields(cls) if _key(f.name) in section}
-        known = {_key(f.name) for f in fields(cls)}
-        if unknown := sorted(set(section) - known):
-            raise ConfigError(f"unknown key `trainer.{unknown[0]}`", f"known keys: {', '.join(sorted(known))}")
-        config = cls(**values)
-        config._check()
+        keys = {_key(f.name) for f in fields(cls)}
+        if wrong := sorted(keys ^ set(section)):
+            what = "lacks the key" if wrong[0] in keys else "has the unknown key"
+            raise ConfigError(f"the run file {what} `trainer.{wrong[0]}`", "it is of another version of `caraware`")
+        config = cls(**{f.name: _typed(f.name, f.type, section) for f in fields(cls)})
+        if config.actions_per_observation > 1 and config.discount > 0.0:
+            raise ConfigError(
+                f"`trainer.actions_per_observation` = {config.actions_per_observation} with `trainer.discount`"
+                f" = {config.discount}",
+                "several actions on one observation have one future: set trainer.discount = 0",
+            )
         return config
 
     def thread_count(self) -> int:
         """Threads to use, with 0 resolved to the cores this process may run on."""
         return self.threads or len(os.sched_getaffinity(0))
-
-    def _check(self) -> None:
-        _choice("algorithm", self.algorithm, ("ppo",))
-        _choice("device", self.device, ("cpu", "auto"))
-        _choice("network", self.network, ("mlp", "gru"))
-        _choice("activation", self.activation, ("relu", "tanh"))
-        _choice("estimates", self.estimates, ("paced", "always", "never"))
-        _choice("reward", self.reward, tuple(rewards.REWARDS))
-        _choice("matmul_precision", self.matmul_precision, ("auto", "float32", "bfloat16"))
-        for name in ("learning_rate", "learning_rate_decay", "initial_std", "max_grad_norm", "reward_scale_m"):
-            _range(name, getattr(self, name), SMALLEST, math.inf)
-        for name in ("discount", "gae_lambda"):
-            _range(name, getattr(self, name), 0.0, 1.0)
-        for name in ("entropy_scale", "value_scale", "threads", "seed", "checkpoint_keep_every"):
-            _range(name, getattr(self, name), 0, math.inf)
-        _range("clip_epsilon", self.clip_epsilon, SMALLEST, 1.0)
-        for name in ("learning_rate_final", "clip_epsilon_final", "entropy_scale_final", "value_clip", "target_kl"):
-            if (value := getattr(self, name)) is not None:
-                _range(name, value, 0.0, math.inf)
-        if self.actions_per_observation > 1 and self.discount > 0.0:
-            raise ConfigError(
-                f"`trainer.actions_per_observation` = {self.actions_per_observation} with `trainer.discount`"
-                f" = {self.discount}",
-                "several actions on one observation have one future: set trainer.discount = 0",
-            )
-        for name in ("actions_per_observation", "horizon", "batch_size", "epochs", "ranks", "truncation_ticks"):
-            _range(name, getattr(self, name), 1, math.inf)
-        for name in ("checkpoint_interval_updates", "checkpoints_kept"):
-            _range(name, getattr(self, name), 1, math.inf)
-        _range("batch_size", self.batch_size, 1, self.horizon)
-        if not self.hidden or min(self.hidden) < 1:
-            raise ConfigError(f"`trainer.hidden` is {list(self.hidden)}", "give one or more widths, as [500, 300]")
 
 
 @dataclass(frozen=True)
@@ -195,15 +161,3 @@ def _typed(name: str, kind: object, section: ConfigTable) -> Any:
         return value
     wanted = "list of integers" if kind == tuple[int, ...] else getattr(kind, "__name__", str(kind))
     raise ConfigError(f"`trainer.{_key(name)}` is {value!r}", f"give a value of type {wanted}")
-
-
-def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ConfigError(f"`trainer.{name}` is {value!r}", f"one of: {', '.join(choices)}")
-
-
-def _range(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high or math.isinf(value):
-        limit = "greater than 0" if low == SMALLEST else f"at least {low:g}"
-        limit += f" and at most {high:g}" if math.isfinite(high) else ""
-        raise ConfigError(f"`trainer.{_key(name)}` is {value}", f"give a value {limit}")

@@ -505,6 +505,8 @@ class Ppo:
     @torch.no_grad()
     def predict_m(self, observations: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Predicted positions `[n, 2]` in world metres for each of some `[n, d]` blocks: the policy's mean."""
+        if not observations:
+            return ()
         mean = self.updater.mean(*observations)
         return self.task.position_m(mean).cpu().split([len(block) for block in observations])
 

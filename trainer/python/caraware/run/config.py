@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from caraware.baselines.noise import SensorNoise
@@ -20,20 +20,20 @@ class RunConfig:
     bounds: MapBounds
     config_sha256: str
     """Of the resolved configuration, as canonical JSON: a checkpoint remembers what it was trained with."""
-    dark_is_nan: bool = False
+    dark_is_nan: bool
     """Fields of a sensor in a blackout are not numbers (`blackout.policy`); the networks see 0, mid-range, instead."""
-    training_episodes: int = 1
+    training_episodes: int
     """With a curriculum: most lessons."""
-    curriculum: tuple[Step, ...] = ()
-    evaluation_interval: int = 0
+    curriculum: tuple[Step, ...]
+    evaluation_interval: int
     """Training episodes between two evaluation episodes; 0: none between."""
-    sensors: SensorNoise | None = None
+    sensors: SensorNoise | None
     """Errors of the sensors, which the classical baselines are tuned with; None for a run file without sensors."""
-    environments: tuple[int, ...] = (0,)
+    environments: tuple[int, ...]
     """Indices of this run's environments among those of all runs that learn together."""
-    is_paced: bool = False
+    is_paced: bool
     """The simulation keeps to the wall clock: there is time for what only a watcher sees."""
-    resume_from: Path | None = field(default=None)
+    resume_from: Path | None
     """A checkpoint directory to continue from."""
 
     @classmethod
