@@ -41,16 +41,6 @@ def gradients_agree(mlp: FastMlp, x: Tensor) -> None:
         torch.testing.assert_close(mlp.parameters.grad[f"layer{i}.bias"], linear.bias.grad, rtol=1e-4, atol=1e-5)
 
 
-def test_no_rows_give_no_outputs_also_at_first() -> None:
-    policy = GaussianPolicy(11, 2, (8, 4), CPU)
-    policy.initialise(torch.Generator().manual_seed(1), 0.5)
-    empty = torch.empty(0, 11)
-    assert policy.network.infer(empty).shape == (0, 2)
-    assert policy.network.infer(empty, empty).shape == (0, 2)
-    assert policy.network.infer().shape == (0, 2)
-    assert policy.network.infer(torch.ones(3, 11)).shape == (3, 2)
-
-
 def test_the_written_out_gradients_are_autograd_s() -> None:
     torch.manual_seed(0)
     torch.set_float32_matmul_precision("highest")
