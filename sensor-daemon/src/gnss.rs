@@ -1,9 +1,9 @@
 //! GNSS receiver: white and correlated noise and bias east, north and up, as angles or metres, and the position they give.
 
 use ipc_schema::config::Gnss as Params;
-use sim_core::{
-    displacement::{Arc, DisplacementMap},
-    geodesy::{GeodesyError, NetPosition, Projection},
+use sim_core::geodesy::{
+    GeodesyError, NetPosition, Projection,
+    displacement::{DisplacementMap, GroundArc},
 };
 
 use crate::normals::Block;
@@ -65,9 +65,9 @@ pub trait Sky {
     }
 }
 
-/// Degrees of [`Arc`] for a metre on the ground, by place.
+/// Degrees of [`GroundArc`] for a metre on the ground, by place.
 ///
-/// A metre north is 1/M radians, a metre east 1/N radians of the arc that [`Arc`] divides by the cosine of the latitude; M and N are
+/// A metre north is 1/M radians, a metre east 1/N radians of the arc that [`GroundArc`] divides by the cosine of the latitude; M and N are
 /// the radii of curvature of the ellipsoid of WGS 84 in the meridian and in the prime vertical (NIMA TR8350.2, 1997, section 4).
 /// Between the southern and the northern border of the map both change linearly with y: to 1e-7 of themselves over 50 km.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -94,9 +94,9 @@ impl Ground {
         })
     }
 
-    fn arc(&self, y_m: f64, [east_m, north_m]: [f64; 2]) -> Arc {
+    fn arc(&self, y_m: f64, [east_m, north_m]: [f64; 2]) -> GroundArc {
         let at = |axis: usize| self.arc_deg[0][axis] + self.arc_deg[1][axis] * (y_m - self.y_m);
-        Arc {
+        GroundArc {
             east_deg: east_m * at(0),
             north_deg: north_m * at(1),
         }
@@ -123,7 +123,7 @@ pub struct Receiver {
     /// Standard deviation of the white noise east, north and up, metres: angles and metres together.
     white_m: [f64; 3],
     correlated_m: [f64; 3],
-    bias: Arc,
+    bias: GroundArc,
     bias_m: [f64; 3],
     /// What is left of the correlated error after a period, and the standard deviation of what joins it, as shares.
     decay: [f32; 2],
@@ -161,7 +161,7 @@ impl Receiver {
             up_m,
         ];
         let correlated_m = params.correlated_std_m;
-        let bias = Arc {
+        let bias = GroundArc {
             east_deg: params.bias_deg[1],
             north_deg: params.bias_deg[0],
         };
@@ -227,7 +227,7 @@ impl Receiver {
         let arc = self.ground.arc(y_m, [error_m[0], error_m[1]]);
         let displaced = self.map.displaced(
             NetPosition { x_m, y_m },
-            Arc {
+            GroundArc {
                 east_deg: arc.east_deg + factor * self.bias.east_deg,
                 north_deg: arc.north_deg + factor * self.bias.north_deg,
             },

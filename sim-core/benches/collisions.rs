@@ -11,7 +11,7 @@ use ipc_schema::{
     world::{COLLIDED, VehicleState},
 };
 use sim_core::{
-    collision::Detector,
+    collision::CollisionDetector,
     scene::{Prism, Road, Scene, SolidClass},
 };
 
@@ -90,7 +90,7 @@ fn measure(vehicles: u32) {
     let blocks = f64::from(streets.div_ceil(2)).sqrt().ceil() as u32;
     let scene = Arc::new(Scene::new(Road::default(), houses(blocks, blocks), Vec::new()));
     let buildings = scene.buildings().len();
-    let mut detector = Detector::new(scene);
+    let mut detector = CollisionDetector::new(scene);
     let mut costs_us = Vec::new();
     let mut contacts = 0;
     for tick in 0..TICKS {

@@ -13,7 +13,7 @@ use ipc_schema::{
     header::MessageHeader,
     traffic::{Kind, MetaEvent, TrafficState, VehicleMeta},
 };
-use sim_core::mirror::{Mirror, Settings};
+use sim_core::mirror::{Mirror, MirrorSettings};
 
 const TICKS: usize = 60;
 const WARM_UP: usize = 10;
@@ -51,9 +51,9 @@ fn meta(vehicle: u32, cavs: u32) -> VehicleMeta {
     meta
 }
 
-fn settings() -> Settings {
+fn settings() -> MirrorSettings {
     let vehicle = preset::town().vehicle;
-    Settings {
+    MirrorSettings {
         vehicle,
         surface: config::Surface::Dry,
         tick_s: 0.1,

@@ -15,10 +15,10 @@ mod preset;
 use std::{hint::black_box, time::Instant};
 
 use ipc_schema::config;
-use sim_core::{
-    parameters::Catalogue,
+use sim_core::models::{
+    parameters::ParameterCatalogue,
     rigid_body::{RigidBody, RigidState},
-    vehicle::{Input, State},
+    state::{ControlInput, ModelState},
 };
 
 const TICKS: u32 = 2000;
@@ -31,15 +31,15 @@ fn main() {
         max_decel_mps2: 10.0,
         ..preset::town().vehicle
     };
-    let catalogue = Catalogue::new().unwrap();
+    let catalogue = ParameterCatalogue::new().unwrap();
     let set = &catalogue.sets()[catalogue.choose(b"passenger", 4.8).set];
     let body = set.dimensions(4.8, 1.8, 1.5);
     let mut vehicle = RigidBody::new(set, &body, &limits, 1.0, DT_S).unwrap();
-    let mut state: RigidState = State::new(0.0, 0.0, 0.0, 15.0).into();
+    let mut state: RigidState = ModelState::new(0.0, 0.0, 0.0, 15.0).into();
     let mut ticks_us: Vec<f64> = (0..TICKS)
         .map(|tick| {
             let t = f64::from(tick * SUB_STEPS) * DT_S;
-            let input = Input {
+            let input = ControlInput {
                 accel_mps2: 2.0 * (0.7 * t).sin(),
                 road_wheel_angle_rad: 0.05 * t.sin(),
             };

@@ -14,13 +14,14 @@
 mod preset;
 
 use ipc_schema::config::{self, Surface};
-use sim_core::{
-    dimensions::Dimensions,
+use sim_core::models::{
+    catalogue::{MotionModel, friction_share},
+    dimensions::VehicleDimensions,
     dynamic::DynamicParams,
-    fleet::friction_share,
-    parameters::{Catalogue, Set},
+    kinematic::KinematicParams,
+    parameters::{ParameterCatalogue, ParameterSet},
     rigid_body::{RigidBody, RigidState},
-    vehicle::{Input, KinematicParams, Model, Motion, State},
+    state::{ControlInput, ModelState, SubStepMotion},
 };
 
 const DT_S: f64 = 0.005;
@@ -36,20 +37,20 @@ fn limits() -> config::Vehicle {
 /// A vehicle under way.
 #[expect(clippy::large_enum_variant, reason = "two values in all")]
 enum Vehicle {
-    Plain(Model, State),
+    Plain(MotionModel, ModelState),
     Rigid(Box<RigidBody>, RigidState),
 }
 
 impl Vehicle {
-    fn new(model: &str, set: &Set, body: &Dimensions, surface: Surface, speed_mps: f64) -> Self {
-        let (share, start) = (friction_share(surface), State::new(0.0, 0.0, 0.0, speed_mps));
+    fn new(model: &str, set: &ParameterSet, body: &VehicleDimensions, surface: Surface, speed_mps: f64) -> Self {
+        let (share, start) = (friction_share(surface), ModelState::new(0.0, 0.0, 0.0, speed_mps));
         match model {
             "kinematic" => Self::Plain(
-                Model::Kinematic(KinematicParams::new(set, &limits(), body.wheelbase_m)),
+                MotionModel::Kinematic(KinematicParams::new(set, &limits(), body.wheelbase_m)),
                 start,
             ),
             "dynamic" => Self::Plain(
-                Model::Dynamic(DynamicParams::new(set, body, &limits(), share, DT_S)),
+                MotionModel::Dynamic(DynamicParams::new(set, body, &limits(), share, DT_S)),
                 start,
             ),
             _ => Self::Rigid(
@@ -59,15 +60,15 @@ impl Vehicle {
         }
     }
 
-    fn state(&self) -> State {
+    fn state(&self) -> ModelState {
         match self {
             Self::Plain(_, state) => *state,
             Self::Rigid(_, state) => state.level,
         }
     }
 
-    fn step(&mut self, accel_mps2: f64, road_wheel_angle_rad: f64) -> Motion {
-        let input = Input {
+    fn step(&mut self, accel_mps2: f64, road_wheel_angle_rad: f64) -> SubStepMotion {
+        let input = ControlInput {
             accel_mps2,
             road_wheel_angle_rad,
         };
@@ -93,7 +94,7 @@ struct Case<'a> {
     surface: Surface,
 }
 
-fn print(case: &Case<'_>, time_s: f64, vehicle: &Vehicle, motion: &Motion, cg_to_rear_m: f64) {
+fn print(case: &Case<'_>, time_s: f64, vehicle: &Vehicle, motion: &SubStepMotion, cg_to_rear_m: f64) {
     let state = vehicle.state();
     let slip = libm::atan2(
         state.lateral_mps + cg_to_rear_m * state.yaw_rate_radps,
@@ -115,7 +116,7 @@ fn print(case: &Case<'_>, time_s: f64, vehicle: &Vehicle, motion: &Motion, cg_to
 }
 
 fn main() {
-    let catalogue = Catalogue::new().unwrap();
+    let catalogue = ParameterCatalogue::new().unwrap();
     let set = catalogue.sets().iter().find(|set| set.name == "sedan").unwrap();
     let body = set.dimensions(set.length_m, set.width_m, set.height_m);
     let cg = set.front_load_share * body.wheelbase_m;
@@ -123,18 +124,19 @@ fn main() {
         "figure,model,surface,t_s,road_wheel_angle_rad,speed_mps,x_m,lateral_mps2,yaw_rate_radps,slip_rad,roll_rad,pitch_rad"
     );
     let models = ["kinematic", "dynamic", "rigid_body"];
-    let run = |case: &Case<'_>, speed: f64, duration_s: f64, each: u32, input: &dyn Fn(f64, &State) -> (f64, f64)| {
-        let mut vehicle = Vehicle::new(case.model, set, &body, case.surface, speed);
-        let steps = (duration_s / DT_S).round() as u32;
-        for step in 1..=steps {
-            let (accel, angle) = input(f64::from(step - 1) * DT_S, &vehicle.state());
-            let motion = vehicle.step(accel, angle);
-            if step.is_multiple_of(each) || (each == 0 && step == steps) {
-                print(case, f64::from(step) * DT_S, &vehicle, &motion, cg);
+    let run =
+        |case: &Case<'_>, speed: f64, duration_s: f64, each: u32, input: &dyn Fn(f64, &ModelState) -> (f64, f64)| {
+            let mut vehicle = Vehicle::new(case.model, set, &body, case.surface, speed);
+            let steps = (duration_s / DT_S).round() as u32;
+            for step in 1..=steps {
+                let (accel, angle) = input(f64::from(step - 1) * DT_S, &vehicle.state());
+                let motion = vehicle.step(accel, angle);
+                if step.is_multiple_of(each) || (each == 0 && step == steps) {
+                    print(case, f64::from(step) * DT_S, &vehicle, &motion, cg);
+                }
             }
-        }
-    };
-    let hold = |state: &State| 2.0 * (SPEED_MPS - state.speed_mps);
+        };
+    let hold = |state: &ModelState| 2.0 * (SPEED_MPS - state.speed_mps);
     for model in models {
         for surface in [Surface::Dry, Surface::Snow] {
             let case = Case {

@@ -1,4 +1,4 @@
-//! `sim-core RUN_FILE`: started by `caraware`.
+//! `sim-core RUN_FILE`: `caraware` starts this program.
 
 use std::process::ExitCode;
 

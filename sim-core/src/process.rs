@@ -1,4 +1,4 @@
-//! The process: `traffic` and `traffic-meta` in, one `world` for each tick out.
+//! The process: reads `traffic` and `traffic-meta`, publishes one `world` message for each tick.
 
 use std::{path::Path, sync::Arc};
 
@@ -16,28 +16,26 @@ use ipc_schema::{
 };
 
 use crate::{
-    actions::Actions,
-    collision::{CollisionCounts, Contacts},
-    driving::Account,
-    mirror::{Mirror, MirrorError, Settings},
+    collision::{CollisionCounts, ContactReporter},
+    driving::{HeroCounts, ports::HeroPorts},
+    mirror::{Mirror, MirrorError, MirrorSettings, statistics::TrackingSummary},
     scene::{Scene, chart::Chart},
-    statistics::Summary,
 };
 
 /// What this process adds to the run's report.
 #[derive(Debug, serde::Serialize)]
-struct Part {
-    tracking: Summary,
+struct CoreReport {
+    tracking: TrackingSummary,
     resynchronisations: u64,
     vehicle_steps: u64,
     drops: u64,
     /// Heroes, in the driving task.
     #[serde(skip_serializing_if = "Option::is_none")]
-    heroes: Option<Account>,
+    heroes: Option<HeroCounts>,
     /// Buildings and props in the scene, of all maps.
     buildings: usize,
     props: usize,
-    /// Contacts that began, if anybody looked.
+    /// Contacts that began, if the run detects them.
     collisions: Option<CollisionCounts>,
 }
 
@@ -49,7 +47,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut session = Session::join(run_file, Process::SimCore)?;
     let metas = session.subscriber(Channel::TrafficMeta)?;
     let traffic = session.subscriber(Channel::Traffic)?;
-    let mut core = Core::open(session, metas)?;
+    let mut core = CoreProcess::open(session, metas)?;
     while let Some(frame) = core.session.next(&traffic)? {
         let header = *frame.header();
         if core.frame(&frame)? == Wait::Stopped {
@@ -61,20 +59,20 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
             return core.leave();
         }
     }
-    core.write_part()
+    core.write_report()
 }
 
-struct Core {
+struct CoreProcess {
     session: Session,
     metas: Subscriber,
     /// `traffic-meta` messages applied.
     meta_messages: u64,
     mirror: Mirror,
     /// The heroes and their actions, in the driving task.
-    actions: Option<Actions>,
+    actions: Option<HeroPorts>,
     /// By map.
     scenes: Vec<Arc<Scene>>,
-    contacts: Option<Contacts>,
+    contacts: Option<ContactReporter>,
     world: Publisher,
     consumer: BoardReader,
     consumer_wake: Waker,
@@ -83,22 +81,22 @@ struct Core {
     vehicle_steps: u64,
 }
 
-impl Core {
+impl CoreProcess {
     fn open(mut session: Session, metas: Subscriber) -> Result<Self, Failure> {
         let world = session.publisher(Channel::World)?;
         let consumer = session.board_of(Process::SensorDaemon)?;
         let consumer_wake = session.waker(Process::SensorDaemon)?;
         let scenes = Scene::of_every_map(&session.run)?;
-        let contacts = Contacts::open(&session, &scenes)?;
-        // Viewers are told of the run's own map, and heroes have no other.
+        let contacts = ContactReporter::open(&session, &scenes)?;
+        // Viewers see the run's own map, and heroes have no other.
         let scene = scenes.first().cloned().unwrap_or_default();
         draw_chart(&session, &scene)?;
         let actions = match session.run.config.drives() {
-            true => Some(Actions::open(&mut session, scene)?),
+            true => Some(HeroPorts::open(&mut session, scene)?),
             false => None,
         };
         session.attach();
-        let mirror = Mirror::new(Settings::of_run(&session.run))
+        let mirror = Mirror::new(MirrorSettings::of_run(&session.run))
             .map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
         let ticks = session.run.first_tick();
         Ok(Self {
@@ -117,7 +115,7 @@ impl Core {
         })
     }
 
-    /// One SUMO step: what happened, where everybody is, and the ticks that lead there.
+    /// One SUMO step: its events, the states of all road users, and the ticks that lead there.
     fn frame(&mut self, frame: &Message) -> Result<Wait, Failure> {
         let ticks_per_step = self.session.run.ticks_per_traffic_step();
         let header = *frame.header();
@@ -152,7 +150,7 @@ impl Core {
         Ok(Wait::Ready)
     }
 
-    /// Applies announcements up to the one that belongs to the frame at hand; they were sent before it.
+    /// Applies announcements up to the one that belongs to the current frame; they were sent before it.
     fn apply_metas(&mut self, sequence: u64) -> Result<(), Failure> {
         while self.meta_messages < sequence {
             let Some(message) = self.session.next(&self.metas)? else {
@@ -187,7 +185,7 @@ impl Core {
         for class in self.mirror.take_unknown_classes() {
             tracing::warn!(
                 class,
-                "no parameter set lists this vehicle class: the set `{}` is taken",
+                "no parameter set lists this vehicle class: using the set `{}`",
                 self.mirror.default_set()
             );
         }
@@ -222,7 +220,7 @@ impl Core {
         };
         let layout = WorldLayout::with_heroes(count, header.columns as usize, heroes);
         let mut draft = match &self.actions {
-            // What heroes see is only written where there is something to see.
+            // Heroes' views are written only where there is something to see, so the loan is zeroed.
             Some(_) => self.world.loan(header, layout.len)?,
             None => self.world.loan_unwritten(header, layout.len)?,
         };
@@ -264,21 +262,21 @@ impl Core {
 
     /// Leaves once everything sent has been consumed.
     fn leave(mut self) -> Result<(), Failure> {
-        self.write_part()?;
+        self.write_report()?;
         if self.session.wait_until_consumed(&self.consumer, self.ticks)? == Wait::Ready {
             self.session.report(|health| health.state = State::Done as u32);
         }
         Ok(())
     }
 
-    fn write_part(&mut self) -> Result<(), Failure> {
-        let collisions = self.contacts.as_mut().map(Contacts::finish).transpose()?;
-        self.session.write_part(&Part {
+    fn write_report(&mut self) -> Result<(), Failure> {
+        let collisions = self.contacts.as_mut().map(ContactReporter::finish).transpose()?;
+        self.session.write_part(&CoreReport {
             tracking: self.mirror.tracking().summary(),
             resynchronisations: self.mirror.resynchronisations(),
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
-            heroes: self.actions.as_ref().map(Actions::account),
+            heroes: self.actions.as_ref().map(HeroPorts::counts),
             buildings: self.scenes.iter().map(|scene| scene.buildings().len()).sum(),
             props: self.scenes.iter().map(|scene| scene.props().len()).sum(),
             collisions,
@@ -286,7 +284,7 @@ impl Core {
     }
 }
 
-/// Tells viewers what the scene looks like, if there may be any.
+/// Writes the chart of the scene for viewers, if the run allows viewers.
 fn draw_chart(session: &Session, scene: &Scene) -> Result<(), Failure> {
     if !session.run.config.fanout.enabled {
         return Ok(());

@@ -19,7 +19,7 @@ use ipc_schema::{
     header::MessageHeader,
     traffic::{Kind, MetaEvent, TrafficState, VehicleMeta},
 };
-use sim_core::mirror::{Mirror, Settings};
+use sim_core::mirror::{Mirror, MirrorSettings};
 
 thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
@@ -71,7 +71,7 @@ fn state(vehicle: u32, step: u32) -> TrafficState {
 
 #[test]
 fn a_tick_allocates_nothing() {
-    let settings = Settings {
+    let settings = MirrorSettings {
         vehicle: preset::town().vehicle,
         surface: config::Surface::Dry,
         tick_s: 0.1,

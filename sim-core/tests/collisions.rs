@@ -18,8 +18,8 @@ use parry3d_f64::{
 use proptest::prelude::*;
 use sim_core::{
     collision::{
-        Detector,
-        body::{Body, box_touches_prism, boxes_touch},
+        CollisionDetector,
+        body::{CollisionBody, box_touches_prism, boxes_touch},
     },
     scene::{Prism, Prop, Road, Scene, SolidClass, shape::OrientedBox},
 };
@@ -95,11 +95,11 @@ proptest! {
     fn a_person_touches_a_box_as_parry_says(
         solid in any_box(), x in -6.0_f64..6.0, y in -6.0_f64..6.0, z in -4.0_f64..4.0, radius in 0.1_f64..0.5, height in 1.1_f64..2.0,
     ) {
-        let person = Body {
+        let person = CollisionBody {
             solid: OrientedBox { centre_m: [x, y], along: [1.0, 0.0], half_m: [radius; 2], z_m: [z, z + height] },
             is_capsule: true,
         };
-        let vehicle = Body { solid, is_capsule: false };
+        let vehicle = CollisionBody { solid, is_capsule: false };
         let capsule = Capsule::new_z(0.5 * height - radius, radius);
         let (q, c) = cuboid(&solid);
         let p = Pose::translation(x, y, z + 0.5 * height);
@@ -173,14 +173,14 @@ fn person(index: u32, x_m: f64, y_m: f64) -> VehicleState {
 }
 
 /// One tick: what began, and who is flagged.
-fn tick(detector: &mut Detector, episode: u64, mut states: Vec<VehicleState>) -> (Vec<Collision>, Vec<u32>) {
+fn tick(detector: &mut CollisionDetector, episode: u64, mut states: Vec<VehicleState>) -> (Vec<Collision>, Vec<u32>) {
     detector.detect(episode, &mut states);
     let flagged = states.iter().filter(|state| state.flags & COLLIDED != 0);
     (detector.begun().to_vec(), flagged.map(|state| state.vehicle).collect())
 }
 
-fn empty() -> Detector {
-    Detector::new(Arc::new(Scene::default()))
+fn empty() -> CollisionDetector {
+    CollisionDetector::new(Arc::new(Scene::default()))
 }
 
 #[test]
@@ -293,7 +293,7 @@ fn buildings_and_obstacles_are_struck_where_they_stand() {
         6.0,
     );
     let cone = Prop::new(&Obstacle::parse("cone 5 -20").unwrap(), 0.0);
-    let mut detector = Detector::new(Arc::new(Scene::new(
+    let mut detector = CollisionDetector::new(Arc::new(Scene::new(
         Road::default(),
         house.into_iter().collect(),
         vec![cone],

@@ -3,10 +3,10 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "test code may assert by unwrapping")]
 
 use ipc_schema::run::MapInfo;
-use sim_core::{
-    geodesy::{GeodesyError, Geodetic, NetPosition, Projection, origin_projection},
-    spherical,
-};
+use sim_core::geodesy::{GeodesyError, Geodetic, NetPosition, Projection, origin_projection};
+
+#[path = "common/spherical.rs"]
+mod spherical;
 
 const A10KW: &str = "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs";
 const ORIGIN: Geodetic = Geodetic {

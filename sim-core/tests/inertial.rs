@@ -6,7 +6,10 @@ use std::f64::consts::FRAC_PI_2;
 
 use common::{Road, drive, kinematic, limits, mirror_one, settings};
 use ipc_schema::world::{SubStep, VehicleState};
-use sim_core::vehicle::{Input, Model, State};
+use sim_core::models::{
+    catalogue::MotionModel,
+    state::{ControlInput, ModelState},
+};
 
 /// Dead reckoning as a user would do it: heading from the angular rate, velocity from the body's acceleration turned by
 /// the heading half-way, position from the mean velocity.
@@ -81,15 +84,15 @@ fn sub_steps_lie_on_the_path_between_two_ticks() {
     }
 }
 
-fn slalom(steps: u32) -> State {
+fn slalom(steps: u32) -> ModelState {
     let mut limits = limits();
     (limits.max_road_wheel_rate_radps, limits.max_accel_mps2) = (10.0, 50.0);
-    let model = Model::Kinematic(kinematic(&limits, 2.6));
+    let model = MotionModel::Kinematic(kinematic(&limits, 2.6));
     let dt_s = 4.0 / f64::from(steps);
-    let mut state = State::new(0.0, 0.0, 0.3, 10.0);
+    let mut state = ModelState::new(0.0, 0.0, 0.3, 10.0);
     for i in 0..steps {
         let t = (f64::from(i) + 0.5) * dt_s;
-        let input = Input {
+        let input = ControlInput {
             accel_mps2: (2.0 * t).sin(),
             road_wheel_angle_rad: 0.1 * (1.5 * t).sin(),
         };
@@ -114,17 +117,17 @@ fn halving_the_sub_step_at_least_halves_the_error() {
 /// With held actuators only the arc remains: an exact circle whatever the sub-step.
 #[test]
 fn a_circle_closes_whatever_the_sub_step() {
-    let model = Model::Kinematic(kinematic(&limits(), 2.6));
+    let model = MotionModel::Kinematic(kinematic(&limits(), 2.6));
     let angle = 0.2;
     let radius = 2.6 / f64::tan(angle);
     for steps in [50_u32, 100, 1000] {
         let time_s = std::f64::consts::TAU * radius / 8.0;
-        let mut state = State {
+        let mut state = ModelState {
             road_wheel_angle_rad: angle,
-            ..State::new(3.0, 4.0, 0.0, 8.0)
+            ..ModelState::new(3.0, 4.0, 0.0, 8.0)
         };
         for _ in 0..steps {
-            let input = Input {
+            let input = ControlInput {
                 accel_mps2: 0.0,
                 road_wheel_angle_rad: angle,
             };
@@ -142,16 +145,16 @@ fn a_circle_closes_whatever_the_sub_step() {
 /// Constant deceleration from 20 m/s: the actuator's lag aside, v² / 2a.
 #[test]
 fn straight_braking_distance() {
-    let model = Model::Kinematic(kinematic(&limits(), 2.6));
-    let mut state = State {
+    let model = MotionModel::Kinematic(kinematic(&limits(), 2.6));
+    let mut state = ModelState {
         accel_mps2: -5.0,
-        ..State::new(0.0, 0.0, 0.0, 20.0)
+        ..ModelState::new(0.0, 0.0, 0.0, 20.0)
     };
     for _ in 0..500 {
         state = model
             .step(
                 &state,
-                &Input {
+                &ControlInput {
                     accel_mps2: -5.0,
                     road_wheel_angle_rad: 0.0,
                 },

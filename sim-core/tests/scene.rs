@@ -17,7 +17,7 @@ use ipc_schema::{
     props::ObstacleError,
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
 };
-use sim_core::scene::{Scene, SceneError, Surface, chart::Chart, shape};
+use sim_core::scene::{Scene, SceneError, Solid, SurfaceKind, chart::Chart, shape};
 
 /// The SUMO that `make build` installed, or the one that is named instead.
 fn sumo_home() -> PathBuf {
@@ -30,6 +30,33 @@ fn sumo_home() -> PathBuf {
         .map(|entry| entry.path().join("site-packages/sumo"))
         .find(|home| home.is_dir())
         .unwrap()
+}
+
+/// Heights of the road at a place, by lanes where there are any, else by junctions and crossings, metres.
+fn road_heights_m(scene: &Scene, point: shape::Point) -> Vec<f64> {
+    let road = scene.road();
+    let on_lane = road.under(point).any(|(piece, _)| piece.surface == SurfaceKind::Lane);
+    let wanted = |surface: SurfaceKind| surface.is_road() && (surface == SurfaceKind::Lane || !on_lane);
+    let pieces = road.under(point).filter(|(piece, _)| wanted(piece.surface));
+    pieces.map(|(_, height_m)| height_m).collect()
+}
+
+/// Height of the road at a place, the lowest where several cross; `None` beside the road. Metres.
+fn road_height_m(scene: &Scene, x_m: f64, y_m: f64) -> Option<f64> {
+    road_heights_m(scene, [x_m, y_m]).into_iter().min_by(f64::total_cmp)
+}
+
+/// True if a building or prop covers the place.
+fn is_in_solid(scene: &Scene, x_m: f64, y_m: f64) -> bool {
+    let mut near = Vec::new();
+    scene.solids_near(&shape::Bounds::about([x_m, y_m], 0.0), &mut near);
+    near.into_iter().any(|number| match scene.solid(number) {
+        Solid::Building(building) => building.contains([x_m, y_m]),
+        Solid::Prop(prop) => {
+            let [ahead_m, left_m] = prop.body.local_from_world([x_m, y_m]);
+            ahead_m.abs() <= prop.body.half_m[0] && left_m.abs() <= prop.body.half_m[1]
+        }
+    })
 }
 
 fn maps() -> PathBuf {
@@ -126,13 +153,13 @@ fn lanes_of_the_town_are_road_and_houses_are_not() {
                 let middle = shape::between(a, b, f64::from(step) / 20.0);
                 if piece.surface.is_road() {
                     assert!(scene.is_on_road(middle[0], middle[1]), "{} at {middle:?}", piece.id);
-                    assert_eq!(scene.road_height_m(middle[0], middle[1]), Some(0.0));
+                    assert_eq!(road_height_m(&scene, middle[0], middle[1]), Some(0.0));
                 }
                 // Nothing is built on any part of the surface.
-                assert!(!scene.is_in_solid(middle[0], middle[1]), "{} at {middle:?}", piece.id);
+                assert!(!is_in_solid(&scene, middle[0], middle[1]), "{} at {middle:?}", piece.id);
             }
             let is_far_from_junctions = shape::distance(a, b) > 20.0;
-            if piece.surface == Surface::Lane && !piece.id.starts_with(':') && is_far_from_junctions {
+            if piece.surface == SurfaceKind::Lane && !piece.id.starts_with(':') && is_far_from_junctions {
                 // SUMO drives on the right: beyond the right edge is the sidewalk, beyond the left one the lane back.
                 let d = shape::from_to(a, b);
                 let right = [d[1], -d[0]].map(|v| v / shape::distance(a, b));
@@ -156,10 +183,10 @@ fn lanes_of_the_town_are_road_and_houses_are_not() {
             .fold([0.0; 2], |sum, p| [sum[0] + p[0] / count, sum[1] + p[1] / count]);
         assert!(!scene.is_on_road(mean[0], mean[1]), "{}", building.id);
         if building.outline_m.len() == 4 {
-            assert!(scene.is_in_solid(mean[0], mean[1]), "{}", building.id);
+            assert!(is_in_solid(&scene, mean[0], mean[1]), "{}", building.id);
         }
     }
-    assert!(!scene.is_on_road(-500.0, 0.0) && scene.road_height_m(1e9, 1e9).is_none());
+    assert!(!scene.is_on_road(-500.0, 0.0) && road_height_m(&scene, 1e9, 1e9).is_none());
 }
 
 #[test]
@@ -179,7 +206,7 @@ fn random_props_stand_beside_the_road_and_depend_on_the_seed_alone() {
     for (place, prop) in random.iter().enumerate() {
         let near_m = scene
             .road()
-            .nearest(prop.body.centre_m, 15.0, |surface| surface == Surface::Lane)
+            .nearest(prop.body.centre_m, 15.0, |surface| surface == SurfaceKind::Lane)
             .unwrap()
             .0;
         assert!(near_m < 12.0, "{} is {near_m} m from any lane", prop.kind.name);
@@ -235,13 +262,16 @@ fn a_net_with_elevation_gives_heights_and_bridges_are_told_apart() {
     )
     .unwrap();
     let scene = Scene::of_run(&run(&net, &[poly])).unwrap();
-    assert!((scene.road_height_m(25.0, 1.0).unwrap() - 4.5).abs() < 1e-9);
+    assert!((road_height_m(&scene, 25.0, 1.0).unwrap() - 4.5).abs() < 1e-9);
     assert!(
-        (scene.road_height_m(50.0, 0.0).unwrap() - 7.0).abs() < 1e-9,
+        (road_height_m(&scene, 50.0, 0.0).unwrap() - 7.0).abs() < 1e-9,
         "the lower of two"
     );
-    assert_eq!(scene.road_height_near_m(50.0, 0.0, 14.0), Some(15.0));
-    assert_eq!(scene.road_height_m(25.0, 4.0), None, "a sidewalk is no road");
+    assert_eq!(
+        road_heights_m(&scene, [50.0, 0.0]).into_iter().fold(0.0, f64::max),
+        15.0
+    );
+    assert_eq!(road_height_m(&scene, 25.0, 4.0), None, "a sidewalk is no road");
     assert!(scene.is_on_road(25.0, 2.04) && !scene.is_on_road(25.0, 2.2));
     assert!(!scene.is_on_road(-0.5, 0.0), "a road ends where it ends");
     let [house, tower] = scene.buildings() else {
@@ -350,7 +380,7 @@ fn the_motorway_of_the_wheel_has_road_and_a_shopping_centre() {
         .road()
         .pieces()
         .iter()
-        .filter(|piece| piece.surface == Surface::Lane)
+        .filter(|piece| piece.surface == SurfaceKind::Lane)
     {
         for [x, y, _] in &piece.shape_m {
             assert!(scene.is_on_road(*x, *y), "{} at {x}, {y}", piece.id);

@@ -6,15 +6,15 @@ use std::fmt::Write as _;
 
 use ipc_schema::traffic::VEHICLE_CLASSES;
 use sim_core::{
-    dynamic::GRAVITY_MPS2,
-    parameters::{Catalogue, Set},
+    models::dynamic::GRAVITY_MPS2,
+    models::parameters::{ParameterCatalogue, ParameterSet},
 };
 
 const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/vehicle-model.md");
 const MARKS: [&str; 2] = ["<!-- sets -->\n", "<!-- end of sets -->"];
 
 /// A row of the table: its name, its unit, and the value for a set.
-type Row = (&'static str, &'static str, fn(&Set) -> String);
+type Row = (&'static str, &'static str, fn(&ParameterSet) -> String);
 
 const ROWS: [Row; 22] = [
     ("longest", "m", |set| set.longest_m.to_string()),
@@ -64,7 +64,7 @@ const ROWS: [Row; 22] = [
     ("steering ratio", "", |set| set.steering_ratio.to_string()),
 ];
 
-fn understeer(set: &Set) -> f64 {
+fn understeer(set: &ParameterSet) -> f64 {
     (1.0 / set.cornering_stiffness_front_per_rad - 1.0 / set.cornering_stiffness_rear_per_rad).to_degrees()
 }
 
@@ -72,8 +72,9 @@ fn degrees_per_g(gain: f64) -> String {
     format!("{:.1}", (gain * GRAVITY_MPS2).to_degrees())
 }
 
-fn table(sets: &[Set]) -> String {
-    let cells = |cell: &dyn Fn(&Set) -> String| sets.iter().map(|set| format!(" {} |", cell(set))).collect::<String>();
+fn table(sets: &[ParameterSet]) -> String {
+    let cells =
+        |cell: &dyn Fn(&ParameterSet) -> String| sets.iter().map(|set| format!(" {} |", cell(set))).collect::<String>();
     let mut table = format!("| | unit |{}\n", cells(&|set| format!("`{}`", set.name)));
     writeln!(table, "|---|---|{}", "---|".repeat(sets.len())).unwrap();
     for (name, unit, value) in ROWS {
@@ -88,7 +89,7 @@ fn the_page_shows_the_sets() {
     let page = std::fs::read_to_string(PAGE).unwrap();
     let (before, rest) = page.split_once(MARKS[0]).unwrap();
     let (_, after) = rest.split_once(MARKS[1]).unwrap();
-    let table = table(Catalogue::new().unwrap().sets());
+    let table = table(ParameterCatalogue::new().unwrap().sets());
     let wanted = format!("{before}{}{table}{}{after}", MARKS[0], MARKS[1]);
     if std::env::var_os("CARAWARE_BLESS").is_some() {
         std::fs::write(PAGE, wanted).unwrap();
@@ -99,7 +100,7 @@ fn the_page_shows_the_sets() {
 
 #[test]
 fn every_class_of_sumo_has_a_set_at_any_length() {
-    let catalogue = Catalogue::new().unwrap();
+    let catalogue = ParameterCatalogue::new().unwrap();
     for class in VEHICLE_CLASSES {
         for length_m in [0.2, 4.0, 5.0, 12.0, 200.0] {
             assert!(catalogue.choose(class.as_bytes(), length_m).known, "{class}");
@@ -109,7 +110,7 @@ fn every_class_of_sumo_has_a_set_at_any_length() {
 
 #[test]
 fn nothing_oversteers_and_brakes_stay_within_the_friction_of_both_axles() {
-    for set in Catalogue::new().unwrap().sets() {
+    for set in ParameterCatalogue::new().unwrap().sets() {
         assert!(understeer(set) >= 0.0, "{}", set.name);
         let transfer = set.max_decel_mps2 * set.cg_height_m / set.wheelbase_m;
         let front = set.friction * (GRAVITY_MPS2 * set.front_load_share + transfer);
@@ -125,7 +126,7 @@ fn nothing_oversteers_and_brakes_stay_within_the_friction_of_both_axles() {
 
 #[test]
 fn every_set_is_possible() {
-    for set in Catalogue::new().unwrap().sets() {
+    for set in ParameterCatalogue::new().unwrap().sets() {
         let front_overhang_m = set.length_m - set.wheelbase_m - set.rear_overhang_m;
         assert!(front_overhang_m > 0.0 && set.rear_overhang_m > 0.0, "{}", set.name);
         // The radius of gyration lies within the body.

@@ -6,7 +6,6 @@ use ipc_schema::pointcloud::STATIC_OBJECT;
 use ipc_schema::world::SubStep;
 use sensor_daemon::lidar::Lidar;
 use sim_core::scene::{Road, Scene};
-use sim_core::spherical::top_view_from_lidar;
 
 /// Figure 3: y backward, x left, z down. A car 10 m ahead is at y = −10; equation 4 with the heading brings (−y, x) into the world.
 #[test]
@@ -27,7 +26,9 @@ fn equation_4_and_the_papers_axes() {
     let point = paper.points.iter().find(|point| point.object == 1).unwrap();
     let [x, y, z] = point.position_m.map(f64::from);
     assert!(y < -8.9 && z > 0.0);
-    let [east, north] = top_view_from_lidar(states[0].yaw_rad, [-y, x]);
+    // Equation 4: a rotation by the heading, of (−y, x).
+    let (sin, cos) = states[0].yaw_rad.sin_cos();
+    let [east, north] = [-cos * y - sin * x, cos * x - sin * y];
     // The world's plane in the frame of the other car: its rear is 1 m behind its origin, its half width 1 m.
     let (dx, dy) = (
         states[0].x_m + east - states[1].x_m,

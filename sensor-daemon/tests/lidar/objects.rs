@@ -9,7 +9,7 @@ use ipc_schema::traffic::Kind;
 use ipc_schema::world::VehicleState;
 use proptest::prelude::*;
 use sensor_daemon::lidar::{Lidar, LidarError, nearest_objects};
-use sim_core::scene::{Piece, Road, Scene, Surface};
+use sim_core::scene::{RoadPiece, Road, Scene, SurfaceKind};
 
 #[test]
 fn the_own_body_is_not_seen_and_others_are() {
@@ -119,9 +119,9 @@ fn meshes_and_ground_with_elevation_are_seen() {
     );
     assert!(scanned.points.iter().any(|point| point.object == 1));
     // A road that climbs by 10 %.
-    let road = Road::new(vec![Piece {
+    let road = Road::new(vec![RoadPiece {
         id: "hill_0".into(),
-        surface: Surface::Lane,
+        surface: SurfaceKind::Lane,
         shape_m: vec![[-50.0, 0.0, 0.0], [50.0, 0.0, 10.0]],
         half_width_m: Some(60.0),
         junctions: [u32::MAX; 2],

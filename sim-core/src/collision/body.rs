@@ -9,14 +9,14 @@ use crate::{
 
 /// A road user as a solid: vehicles are boxes, persons upright capsules.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Body {
+pub struct CollisionBody {
     /// The box; of a person the one about the capsule.
     pub solid: OrientedBox,
     /// True for a person: both half sides are the radius.
     pub is_capsule: bool,
 }
 
-impl Body {
+impl CollisionBody {
     /// The body of a road user where its state says.
     ///
     /// A vehicle reaches `rear_overhang_m` behind its origin and the rest of its length ahead. A person is a capsule about its origin,
@@ -65,7 +65,7 @@ impl Body {
         if self.is_capsule { l } else { l.max(w) + 0.5 * l.min(w) }
     }
 
-    /// True if the two share a point. Two capsules never do: nobody asks about two persons.
+    /// True if the two share a point. Two capsules never do: contacts between persons are not detected.
     #[must_use]
     pub fn touches(&self, other: &Self) -> bool {
         match (self.is_capsule, other.is_capsule) {
@@ -76,7 +76,7 @@ impl Body {
         }
     }
 
-    /// Where two bodies that touch touch each other, metres.
+    /// The contact point of two bodies that touch, metres.
     #[must_use]
     pub fn contact_m(&self, other: &Self) -> [f64; 3] {
         let flat = match (self.is_capsule, other.is_capsule) {
@@ -241,7 +241,7 @@ mod tests {
             rear_overhang_m: 1.0,
             ..VehicleState::default()
         };
-        let body = Body::of(&state);
+        let body = CollisionBody::of(&state);
         // Facing north: front bumper 3.5 m ahead of the rear axle.
         let bounds = body.solid.bounds();
         let expected = [[10.0 - 0.875, 4.0], [10.0 + 0.875, 8.5]];
@@ -249,7 +249,7 @@ mod tests {
             assert!((0..2).all(|axis| (got[axis] - wanted[axis]).abs() < 1e-6), "{bounds:?}");
         }
         assert_eq!(body.solid.z_m, [2.0, 3.5]);
-        let uphill = Body::of(&VehicleState {
+        let uphill = CollisionBody::of(&VehicleState {
             pitch_rad: 0.1,
             ..state
         });
@@ -267,13 +267,13 @@ mod tests {
             height_m: 1.719,
             ..VehicleState::default()
         };
-        let body = Body::of(&state);
+        let body = CollisionBody::of(&state);
         assert!(body.is_capsule && (body.solid.half_m[0] - 0.239).abs() < 1e-6);
     }
 
     #[test]
     fn the_contact_of_two_boxes_is_in_the_middle_of_what_they_share() {
-        let at = |x: f64, z: f64| Body {
+        let at = |x: f64, z: f64| CollisionBody {
             solid: OrientedBox {
                 centre_m: [x, 0.0],
                 along: [1.0, 0.0],

@@ -1,24 +1,24 @@
-//! Broad phase: pairs of road users whose surrounding rectangles meet, by a hashed grid that is built anew every tick.
+//! Broad phase: pairs of road users whose surrounding rectangles meet, by a hashed grid that is built again every tick.
 //!
 //! Cells are as wide as the largest body, so partners are in the same or a neighbouring cell. The hash is linear in the column,
-//! so three neighbouring cells of a row are one stretch of memory; two stretches serve half the neighbourhood, and each pair is
+//! so three neighbouring cells of a row are one range of memory; two ranges cover half the neighbourhood, and each pair is
 //! seen from one side. Nothing is allocated once the buffers have grown.
 
-use super::body::Body;
+use super::body::CollisionBody;
 use crate::scene::shape::Point;
 
-/// Bodies that reach farther than this (trains) are compared with everybody instead of widening the cells, metres.
+/// Bodies that reach farther than this (trains) are compared with all others instead of widening the cells, metres.
 pub(super) const LARGE_M: f64 = 12.0;
 /// Fixed point of the rectangles: parts of a metre.
 const PER_METRE: f64 = 512.0;
-/// Row stride of the hash. Its last bits keep a row's stretch apart from the next one's for every table size.
+/// Row stride of the hash. Its last bits keep the ranges of two rows apart for every table size.
 const STRIDE: u32 = 0x9E37_79B1;
 /// Least size of the table.
 const LEAST_BUCKETS: usize = 64;
 
 /// The rectangle about a body, rounded outward.
 #[derive(Debug, Clone, Copy, Default)]
-struct Entry {
+struct BodyRectangle {
     min: [i32; 2],
     max: [i32; 2],
     /// Row in the world.
@@ -27,7 +27,7 @@ struct Entry {
     watched: u32,
 }
 
-impl Entry {
+impl BodyRectangle {
     #[inline]
     fn meets(&self, other: &Self) -> bool {
         // `&` instead of `&&`: four comparisons cost less than a missed branch.
@@ -41,20 +41,20 @@ impl Entry {
 
 /// Buffers of the broad phase.
 #[derive(Debug, Default)]
-pub(super) struct Broad {
-    entries: Vec<Entry>,
+pub(super) struct BroadPhase {
+    entries: Vec<BodyRectangle>,
     buckets: Vec<u32>,
     /// First of `sorted` by bucket, one past the last.
     starts: Vec<u32>,
-    sorted: Vec<Entry>,
-    large: Vec<Entry>,
+    sorted: Vec<BodyRectangle>,
+    large: Vec<BodyRectangle>,
     pairs: Vec<(u32, u32)>,
 }
 
-impl Broad {
+impl BroadPhase {
     /// Pairs of rows whose rectangles meet, of which at least one is watched; the lower row first, some pairs twice. No body but
     /// the large reaches farther than `reach_m`.
-    pub(super) fn pairs(&mut self, bodies: &[Body], watched: &[bool], reach_m: f64) -> &[(u32, u32)] {
+    pub(super) fn pairs(&mut self, bodies: &[CollisionBody], watched: &[bool], reach_m: f64) -> &[(u32, u32)] {
         self.pairs.clear();
         self.fill(bodies, watched, reach_m);
         self.sort();
@@ -68,8 +68,8 @@ impl Broad {
         &self.pairs
     }
 
-    /// Rectangles and buckets of everybody.
-    fn fill(&mut self, bodies: &[Body], watched: &[bool], reach_m: f64) {
+    /// Rectangles and buckets of all road users.
+    fn fill(&mut self, bodies: &[CollisionBody], watched: &[bool], reach_m: f64) {
         let origin = bodies.first().map_or([0.0; 2], |body| body.solid.centre_m);
         let cells_per_m = 0.5 / reach_m.max(0.5);
         let size = bodies.len().next_power_of_two().max(LEAST_BUCKETS);
@@ -102,7 +102,7 @@ impl Broad {
             sum += std::mem::replace(start, sum);
         }
         self.sorted.clear();
-        self.sorted.resize(self.entries.len(), Entry::default());
+        self.sorted.resize(self.entries.len(), BodyRectangle::default());
         for (entry, bucket) in self.entries.iter().zip(&self.buckets) {
             let next = &mut self.starts[*bucket as usize + 1];
             self.sorted[*next as usize] = *entry;
@@ -119,13 +119,13 @@ impl Broad {
                 continue;
             }
             let right = bucket.wrapping_add(1) & mask;
-            let right = self.stretch(right, right);
+            let right = self.range(right, right);
             let above = bucket.wrapping_add(STRIDE);
             let (low, high) = (above.wrapping_sub(1) & mask, above.wrapping_add(1) & mask);
             let above = if low <= high {
-                [self.stretch(low, high), (0, 0)]
+                [self.range(low, high), (0, 0)]
             } else {
-                [self.stretch(low, mask), self.stretch(0, high)]
+                [self.range(low, mask), self.range(0, high)]
             };
             for place in from as usize..to as usize {
                 let one = self.sorted[place];
@@ -141,7 +141,7 @@ impl Broad {
         }
     }
 
-    fn stretch(&self, low: u32, high: u32) -> (usize, usize) {
+    fn range(&self, low: u32, high: u32) -> (usize, usize) {
         (
             self.starts[low as usize] as usize,
             self.starts[high as usize + 1] as usize,
@@ -158,12 +158,12 @@ fn cell(value: f64) -> u32 {
     (value + f64::from(1_u32 << 30)) as u32
 }
 
-fn entry(body: &Body, origin: Point, row: u32, watched: u32) -> Entry {
+fn entry(body: &CollisionBody, origin: Point, row: u32, watched: u32) -> BodyRectangle {
     let [cos, sin] = body.solid.along.map(f64::abs);
     let [l, w] = body.solid.half_m;
     let reach = [l * cos + w * sin, l * sin + w * cos];
     let centre = [0, 1].map(|axis: usize| body.solid.centre_m[axis] - origin[axis]);
-    Entry {
+    BodyRectangle {
         min: [0, 1].map(|axis: usize| ((centre[axis] - reach[axis]) * PER_METRE) as i32 - 1),
         max: [0, 1].map(|axis: usize| ((centre[axis] + reach[axis]) * PER_METRE) as i32 + 1),
         row,
@@ -179,14 +179,14 @@ mod tests {
     use std::collections::BTreeSet;
 
     proptest! {
-        /// Exactly the pairs that comparing everybody with everybody gives.
+        /// Exactly the pairs that comparing all with all gives.
         #[test]
         fn no_pair_is_missed(
             bodies in prop::collection::vec((prop::array::uniform2(-120.0_f64..120.0), -3.1_f64..3.1, 0.2_f64..9.0, any::<bool>()), 0..120),
             shift in -5e6_f64..5e6, long in 12.0_f64..80.0,
         ) {
             let mut watched: Vec<bool> = bodies.iter().map(|body| body.3).collect();
-            let mut bodies: Vec<Body> = bodies.iter().map(|([x, y], yaw, half, _)| Body {
+            let mut bodies: Vec<CollisionBody> = bodies.iter().map(|([x, y], yaw, half, _)| CollisionBody {
                 solid: OrientedBox { centre_m: [x + shift, *y], along: [yaw.cos(), yaw.sin()], half_m: [*half, 1.0], z_m: [0.0, 1.0] },
                 is_capsule: false,
             }).collect();
@@ -194,8 +194,8 @@ mod tests {
                 bodies[1].solid.half_m[0] = long;
                 watched[1] = true;
             }
-            let mut broad = Broad::default();
-            let reach_m = bodies.iter().map(Body::reach_m).filter(|reach_m| *reach_m <= LARGE_M).fold(0.0, f64::max);
+            let mut broad = BroadPhase::default();
+            let reach_m = bodies.iter().map(CollisionBody::reach_m).filter(|reach_m| *reach_m <= LARGE_M).fold(0.0, f64::max);
             // Twice: buffers must not remember.
             broad.pairs(&bodies[..bodies.len() / 2], &watched, reach_m);
             let found: BTreeSet<(u32, u32)> = broad.pairs(&bodies, &watched, reach_m).iter().copied().collect();

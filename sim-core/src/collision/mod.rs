@@ -1,8 +1,8 @@
 //! Contacts of connected vehicles and heroes with everything: vehicles, persons, buildings and props, from the states of a finished tick.
 //!
-//! Broad phase: a grid of everybody, built anew each tick, and a fixed grid of what stands still. Narrow phase: exact for upright
-//! boxes, capsules and prisms with their heights, so that what passes under a bridge touches nothing on it. A net without
-//! elevation says by its junctions where roads cross at different levels ([`crate::scene::Road::are_levels_apart`]). The order of
+//! Broad phase: a grid of all road users, built again each tick, and a fixed grid of static objects. Narrow phase: exact for upright
+//! boxes, capsules and prisms with their heights, so that a vehicle under a bridge touches nothing on it. In a net without
+//! elevation the junctions show where roads cross at different levels ([`crate::scene::Road::are_levels_apart`]). The order of
 //! events depends on the road users' indices alone.
 
 use std::sync::Arc;
@@ -22,16 +22,16 @@ pub mod body;
 mod broad;
 mod record;
 
-use body::{Body, box_touches_prism, boxes_touch, common_height, common_point};
-use broad::{Broad, LARGE_M};
-pub use record::{CollisionCounts, Contacts};
+use body::{CollisionBody, box_touches_prism, boxes_touch, common_height, common_point};
+use broad::{BroadPhase, LARGE_M};
+pub use record::{CollisionCounts, ContactReporter};
 
-/// Reaches of vehicles (cars, lorries) up to which one look at the cell of the centre finds every solid: an index for each, metres.
+/// Reaches of vehicles (cars, lorries) up to which the cell of the centre holds every solid nearby: one index for each, metres.
 const REACHES_M: [f64; 2] = [3.2, 11.0];
 /// Size of a cell of the index over solids, metres.
 const CELL_M: f64 = 8.0;
 
-/// A contact in a tick. Ordered by who touches what.
+/// A contact in a tick. Ordered by the vehicle, then by what it touches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Contact {
     /// Dense index of the vehicle: of two watched ones the lower.
@@ -44,23 +44,23 @@ struct Contact {
 }
 
 impl Contact {
-    fn who(&self) -> (u32, u32, u32) {
+    fn key(&self) -> (u32, u32, u32) {
         (self.vehicle, self.class, self.other)
     }
 }
 
-/// Finds contacts, and tells those that begin from those that last.
+/// Finds contacts, and separates those that begin from those that last.
 #[derive(Debug)]
-pub struct Detector {
+pub struct CollisionDetector {
     scene: Arc<Scene>,
     /// Rectangle of any heading about each solid.
     rectangles: Vec<OrientedBox>,
     solid_hashes: Vec<u64>,
     /// Over solids grown by [`REACHES_M`].
     indices: [Grid; 2],
-    bodies: Vec<Body>,
+    bodies: Vec<CollisionBody>,
     watched: Vec<bool>,
-    broad: Broad,
+    broad: BroadPhase,
     near: Vec<u32>,
     episode: Option<u64>,
     contacts: Vec<Contact>,
@@ -68,7 +68,7 @@ pub struct Detector {
     begun: Vec<Collision>,
 }
 
-impl Detector {
+impl CollisionDetector {
     /// A detector over a scene.
     #[must_use]
     pub fn new(scene: Arc<Scene>) -> Self {
@@ -88,7 +88,7 @@ impl Detector {
             scene,
             bodies: Vec::new(),
             watched: Vec::new(),
-            broad: Broad::default(),
+            broad: BroadPhase::default(),
             near: Vec::new(),
             episode: None,
             contacts: Vec::new(),
@@ -109,7 +109,7 @@ impl Detector {
         &self.begun
     }
 
-    /// Looks for contacts at the end of a tick and sets [`COLLIDED`] where one begins; [`Detector::begun`] tells which.
+    /// Looks for contacts at the end of a tick and sets [`COLLIDED`] where one begins; [`CollisionDetector::begun`] lists them.
     pub fn detect(&mut self, episode: u64, states: &mut [VehicleState]) {
         if self.episode != Some(episode) {
             self.episode = Some(episode);
@@ -126,13 +126,13 @@ impl Detector {
         self.begin(states);
     }
 
-    /// Takes everybody's body and returns the farthest reach of those that are not large.
+    /// Takes the bodies of all road users and returns the farthest reach of those that are not large.
     fn take(&mut self, states: &[VehicleState]) -> f64 {
         self.bodies.clear();
         self.watched.clear();
         let mut most_m = 0.0;
         for state in states {
-            let body = Body::of(state);
+            let body = CollisionBody::of(state);
             let reach_m = body.reach_m();
             if reach_m <= LARGE_M && reach_m > most_m {
                 most_m = reach_m;
@@ -195,12 +195,12 @@ impl Detector {
         }
     }
 
-    /// Flags and describes contacts that were not there in the tick before.
+    /// Flags and describes contacts that did not exist in the tick before.
     fn begin(&mut self, states: &mut [VehicleState]) {
         self.contacts.sort_unstable();
         self.contacts.dedup();
         for contact in &self.contacts {
-            let known = self.before.binary_search_by_key(&contact.who(), Contact::who);
+            let known = self.before.binary_search_by_key(&contact.key(), Contact::key);
             if known.is_ok() {
                 continue;
             }
@@ -241,7 +241,7 @@ impl Detector {
         }
     }
 
-    fn contact_with_solid(&self, number: u32, body: &Body) -> [f64; 3] {
+    fn contact_with_solid(&self, number: u32, body: &CollisionBody) -> [f64; 3] {
         let (flat, z_m) = match self.scene.solid(number) {
             Solid::Building(building) => (common_point(&body.solid, &building.outline_m), building.z_m()),
             Solid::Prop(prop) => (common_point(&body.solid, &prop.body.corners()), prop.body.z_m),
@@ -250,8 +250,8 @@ impl Detector {
     }
 }
 
-/// What `body`, which touches the rectangle about it, touches there, if anything.
-fn struck(scene: &Scene, number: u32, body: &Body) -> Option<Struck> {
+/// The class of the solid, if `body`, which touches the rectangle about it, also touches the solid.
+fn struck(scene: &Scene, number: u32, body: &CollisionBody) -> Option<Struck> {
     match scene.solid(number) {
         Solid::Building(building) => {
             box_touches_prism(&body.solid, &building.outline_m, building.z_m()).then_some(Struck::Building)
@@ -261,7 +261,7 @@ fn struck(scene: &Scene, number: u32, body: &Body) -> Option<Struck> {
 }
 
 /// Velocity of the origin in the world frame, m/s.
-fn world_velocity(state: &VehicleState, body: &Body) -> [f64; 3] {
+fn world_velocity(state: &VehicleState, body: &CollisionBody) -> [f64; 3] {
     let [ahead, left, up] = state.velocity_body_mps.map(f64::from);
     let [cos, sin] = body.solid.along;
     [ahead * cos - left * sin, ahead * sin + left * cos, up]

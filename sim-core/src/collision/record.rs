@@ -1,4 +1,4 @@
-//! What becomes of contacts: a message, a line in the run's directory, a count in its report.
+//! Reporting of contacts: a message, a line in the run's directory, a count in its report.
 
 use std::{
     fs::File,
@@ -20,7 +20,7 @@ use ipc_schema::{
 };
 use serde::Serialize;
 
-use super::Detector;
+use super::CollisionDetector;
 use crate::scene::{Scene, Solid};
 
 /// Contacts that began in the run, by what was struck.
@@ -53,7 +53,7 @@ impl CollisionCounts {
 
 /// A line of `events/collisions.jsonl`.
 #[derive(Debug, Serialize)]
-struct Line<'a> {
+struct CollisionLine<'a> {
     tick: u64,
     episode: u64,
     sim_time_s: f64,
@@ -79,11 +79,11 @@ impl From<WriteError> for Failure {
     }
 }
 
-/// Contacts of a run: found, told and counted.
+/// Finds, publishes and counts the contacts of a run.
 #[derive(Debug)]
-pub struct Contacts {
+pub struct ContactReporter {
     /// One for each map of the run.
-    detectors: Vec<Detector>,
+    detectors: Vec<CollisionDetector>,
     publisher: Publisher,
     /// Most collisions in one message.
     most: usize,
@@ -95,11 +95,11 @@ pub struct Contacts {
     counts: CollisionCounts,
 }
 
-impl Contacts {
-    /// Contacts of the run of `session` in the scenes of its maps; `None` if nobody looks for them.
+impl ContactReporter {
+    /// Opens the contacts of a run in the scenes of its maps; `None` if the run does not detect them.
     ///
     /// # Errors
-    /// The service is not there, or the file cannot be made.
+    /// The service does not exist, or the file cannot be created.
     pub fn open(session: &Session, scenes: &[Arc<Scene>]) -> Result<Option<Self>, Failure> {
         if !session.run.config.collision.detect {
             return Ok(None);
@@ -113,7 +113,7 @@ impl Contacts {
             source,
         })?;
         Ok(Some(Self {
-            detectors: scenes.iter().cloned().map(Detector::new).collect(),
+            detectors: scenes.iter().cloned().map(CollisionDetector::new).collect(),
             publisher,
             most: (session.run.config.traffic.max_road_users as usize).max(1),
             path,
@@ -124,7 +124,7 @@ impl Contacts {
         }))
     }
 
-    /// Remembers who is who.
+    /// Remembers the ids of road users that depart.
     pub fn learn(&mut self, header: &MessageHeader, metas: &[VehicleMeta]) {
         if self.episode != Some(header.episode) {
             self.episode = Some(header.episode);
@@ -139,7 +139,7 @@ impl Contacts {
         }
     }
 
-    /// Looks for contacts in the states of a finished tick (section `states` of `payload`), flags them there, and tells them.
+    /// Looks for contacts in the states of a finished tick (section `states` of `payload`), flags them there, and publishes those that begin.
     ///
     /// # Errors
     /// The payload is too short, or an event can be neither sent nor written.
@@ -178,7 +178,7 @@ impl Contacts {
         Ok(())
     }
 
-    /// How many so far; everything told before is in the file.
+    /// Writes what is buffered to the file and returns the counts so far.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -191,7 +191,12 @@ impl Contacts {
     }
 }
 
-fn line<'a>(header: &MessageHeader, collision: &Collision, names: &'a [Box<str>], scene: &'a Scene) -> Line<'a> {
+fn line<'a>(
+    header: &MessageHeader,
+    collision: &Collision,
+    names: &'a [Box<str>],
+    scene: &'a Scene,
+) -> CollisionLine<'a> {
     let name = |index: u32| names.get(index as usize).map_or("", |name| &**name);
     let is = |class: Struck| collision.other_class == class as u32;
     let (what, other) = if is(Struck::Vehicle) {
@@ -204,9 +209,9 @@ fn line<'a>(header: &MessageHeader, collision: &Collision, names: &'a [Box<str>]
             Solid::Prop(prop) => ("obstacle", prop.kind.name),
         }
     };
-    #[expect(clippy::cast_precision_loss, reason = "a time for people")]
+    #[expect(clippy::cast_precision_loss, reason = "a time for human readers")]
     let sim_time_s = header.sim_time_ns as f64 / 1e9;
-    Line {
+    CollisionLine {
         tick: header.tick,
         episode: header.episode,
         sim_time_s,

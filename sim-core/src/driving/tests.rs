@@ -6,7 +6,7 @@ use super::*;
 #[derive(Debug)]
 struct Strip;
 
-impl Ground for Strip {
+impl DrivableGround for Strip {
     fn is_on_road(&self, _: f64, y_m: f64) -> bool {
         y_m.abs() < 2.0
     }
@@ -21,8 +21,8 @@ fn config() -> config::Config {
 }
 
 /// One hero (index 3) on a straight route of 200 m with a stop line at 100 m.
-fn driving() -> Driving<Strip> {
-    let mut driving = Driving::new(&config(), Strip);
+fn driving() -> DrivingTask<Strip> {
+    let mut driving = DrivingTask::new(&config(), Strip);
     driving.enter_episode(0);
     let points: Vec<RoutePoint> = [0.0, 100.0, 200.0]
         .into_iter()
@@ -55,7 +55,7 @@ fn car(vehicle: u32, kind: Kind, x_m: f64, y_m: f64) -> VehicleState {
     }
 }
 
-fn tick(driving: &mut Driving<Strip>, states: &mut [VehicleState]) -> (HeroView, EgoPose) {
+fn tick(driving: &mut DrivingTask<Strip>, states: &mut [VehicleState]) -> (HeroView, EgoPose) {
     let mut views = [HeroView::default()];
     let poses = driving.end_tick(states, &mut views);
     (views[0], poses[0])
@@ -110,7 +110,7 @@ fn off_the_road_for_half_a_second_arrival_and_time_end_the_episode_each_with_its
         .map(|_| tick(&mut off, &mut [car(3, Kind::Hero, 10.0, 2.5)]).1.flags)
         .collect();
     assert_eq!(flags, [0, 0, 0, 0, OFF_ROAD]);
-    // Back on the road in between: the time begins anew.
+    // Back on the road in between: the time starts again.
     let mut back = driving();
     for y_m in [2.5, 2.5, 2.5, 0.0, 2.5, 2.5] {
         assert_eq!(tick(&mut back, &mut [car(3, Kind::Hero, 10.0, y_m)]).1.flags, 0);
@@ -134,18 +134,18 @@ fn off_the_road_for_half_a_second_arrival_and_time_end_the_episode_each_with_its
         .map(|_| tick(&mut waiting, &mut [car(3, Kind::Hero, 10.0, 0.0)]).1.flags)
         .collect();
     assert_eq!((flags[18], flags[19]), (0, TIME_LIMIT));
-    let account = |driving: &Driving<Strip>| {
-        let Account {
+    let counts = |driving: &DrivingTask<Strip>| {
+        let HeroCounts {
             off_road,
             arrived,
             time_limit,
             collided,
             ..
-        } = driving.account();
+        } = driving.counts();
         [off_road, arrived, time_limit, collided]
     };
     assert_eq!(
-        (account(&off), account(&arriving), account(&waiting)),
+        (counts(&off), counts(&arriving), counts(&waiting)),
         ([1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0])
     );
 }
@@ -161,24 +161,24 @@ fn a_collision_ends_the_episode_and_what_has_ended_is_not_cut() {
         ..car(3, Kind::Hero, 10.0, 0.0)
     }];
     assert_eq!(tick(&mut driving, &mut states).1.flags, COLLIDED);
-    assert_eq!(driving.account().collided, 1);
+    assert_eq!(driving.counts().collided, 1);
 }
 
 #[test]
-fn a_refused_action_is_flagged_counted_told_once_and_the_last_valid_one_is_held() {
+fn a_refused_action_is_flagged_counted_reported_once_and_the_last_valid_one_is_held() {
     let mut driving = driving();
     let (good, refusal) = driving.act(3, [0.5, -0.5]);
     assert_eq!(refusal, None);
     assert_eq!((good.road_wheel_angle_rad, good.accel_mps2), (0.5 * 0.6, -0.5 * 9.0));
     assert_eq!(tick(&mut driving, &mut [car(3, Kind::Hero, 10.0, 0.0)]).0.vehicle, 3);
-    for (action, told) in [
+    for (action, is_reported) in [
         ([0.0, f32::NAN], true),
         ([2.0, 0.0], false),
         ([f32::INFINITY, 0.0], false),
     ] {
         let (held, refusal) = driving.act(3, action);
         assert_eq!(held, good);
-        assert_eq!(refusal.is_some(), told, "{refusal:?}");
+        assert_eq!(refusal.is_some(), is_reported, "{refusal:?}");
         let mut states = [car(3, Kind::Hero, 10.0, 0.0)];
         tick(&mut driving, &mut states);
         assert_eq!(states[0].flags, ACTION_REFUSED);
@@ -186,5 +186,5 @@ fn a_refused_action_is_flagged_counted_told_once_and_the_last_valid_one_is_held(
     let mut states = [car(3, Kind::Hero, 10.0, 0.0)];
     driving.act(3, [0.0, 1.0]);
     tick(&mut driving, &mut states);
-    assert_eq!((states[0].flags, driving.account().refused_actions), (0, 3));
+    assert_eq!((states[0].flags, driving.counts().refused_actions), (0, 3));
 }

@@ -1,4 +1,4 @@
-//! What stands beside the road, from polygon files: which polygons are solid, and how high.
+//! Objects beside the road, from polygon files: which polygons are solid, and how high.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use quick_xml::events::BytesStart;
 use super::{
     SceneError,
     shape::{Bounds, Point, contains, hull, is_simple, signed_area},
-    xml::{Place, Tag, attribute, for_each_tag, points},
+    xml::{ElementPosition, XmlTag, attribute, for_each_tag, points},
 };
 use crate::geodesy::{Geodetic, Projection};
 
@@ -39,8 +39,8 @@ const OPEN_TYPES: [&str; 4] = [
 
 /// Types of polygon that are solid, with the height of those that state none (`None`: `scene.building_height_m`). A type matches a
 /// row if it is its name or begins with it and a dot; the first row that matches counts. Every other type (parks, water, land
-/// use, parking, …) is solid only if its polygon states a height. Heights: one to five storeys of 3 m with a roof for what people
-/// live and work in; of works, a common size.
+/// use, parking, …) is solid only if its polygon states a height. Heights: one to five storeys of 3 m with a roof for houses,
+/// offices and shops; a common size for works.
 const SOLID_TYPES: [(&str, SolidClass, Option<f64>); 20] = [
     ("building.house", SolidClass::Building, Some(7.0)),
     ("building.detached", SolidClass::Building, Some(7.0)),
@@ -141,7 +141,7 @@ fn by_type(name: &str) -> Option<(SolidClass, Option<f64>)> {
 
 /// A polygon as it is read, until its element ends.
 #[derive(Debug, Default)]
-struct Polygon {
+struct SolidPolygon {
     id: String,
     kind: String,
     shape: Vec<[f64; 3]>,
@@ -150,8 +150,8 @@ struct Polygon {
     levels: Option<f64>,
 }
 
-impl Polygon {
-    fn open(element: &BytesStart<'_>, place: &Place<'_>) -> Result<Self, SceneError> {
+impl SolidPolygon {
+    fn open(element: &BytesStart<'_>, place: &ElementPosition<'_>) -> Result<Self, SceneError> {
         let text = |name: &str| attribute(element, name).unwrap_or_default();
         Ok(Self {
             id: text("id"),
@@ -202,27 +202,27 @@ pub(super) fn read(
     ground_m: &dyn Fn(Point) -> f64,
     into: &mut Vec<Prism>,
 ) -> Result<(), SceneError> {
-    let mut open: Option<Polygon> = None;
+    let mut open: Option<SolidPolygon> = None;
     let mut included: Vec<PathBuf> = Vec::new();
     let mut projection: Option<Projection> = None;
     for_each_tag(path, |tag, place| {
         match tag {
-            Tag::Open(element) => match element.local_name().as_ref() {
-                "poly" | "polygon" => open = Some(Polygon::open(element, place)?),
+            XmlTag::Open(element) => match element.local_name().as_ref() {
+                "poly" | "polygon" => open = Some(SolidPolygon::open(element, place)?),
                 "param" => open.iter_mut().for_each(|polygon| polygon.parameter(element)),
                 "include" => included.extend(attribute(element, "href").map(|href| path.with_file_name(href))),
                 _ => {}
             },
-            Tag::Close("poly" | "polygon") => {
+            XmlTag::Close("poly" | "polygon") => {
                 if let Some(polygon) = open.take() {
                     into.extend(prism(polygon, path, map, fallback_m, ground_m, &mut projection)?);
                 }
             }
-            Tag::Close(_) => {}
+            XmlTag::Close(_) => {}
         }
         Ok(())
     })?;
-    // A file that includes itself is for SUMO to refuse.
+    // SUMO refuses a file that includes itself.
     included
         .iter()
         .filter(|file| file.as_path() != path)
@@ -230,7 +230,7 @@ pub(super) fn read(
 }
 
 fn prism(
-    polygon: Polygon,
+    polygon: SolidPolygon,
     path: &Path,
     map: &MapInfo,
     fallback_m: f64,
@@ -294,9 +294,9 @@ mod tests {
 
     #[test]
     fn a_stated_height_wins_over_storeys_over_type_over_fallback() {
-        let mut polygon = Polygon {
+        let mut polygon = SolidPolygon {
             kind: "building.house".into(),
-            ..Polygon::default()
+            ..SolidPolygon::default()
         };
         assert_eq!(polygon.class_and_height(9.0), Some((SolidClass::Building, 7.0)));
         polygon.levels = Some(4.0);
@@ -305,9 +305,9 @@ mod tests {
         assert_eq!(polygon.class_and_height(9.0), Some((SolidClass::Building, 10.5)));
         polygon.kind = "park".into();
         assert_eq!(polygon.class_and_height(9.0), Some((SolidClass::Structure, 10.5)));
-        let plain = Polygon {
+        let plain = SolidPolygon {
             kind: "building".into(),
-            ..Polygon::default()
+            ..SolidPolygon::default()
         };
         assert_eq!(plain.class_and_height(9.0), Some((SolidClass::Building, 9.0)));
         assert_eq!(metres("-3"), None);

@@ -1,4 +1,4 @@
-//! The scene as viewers are told of it (docs/fanout.md, `map`): written once into the run's directory, in centimetres.
+//! The scene as viewers receive it (docs/fanout.md, `map`): written once into the run's directory, in centimetres.
 
 use std::{collections::BTreeMap, path::Path};
 
@@ -7,31 +7,31 @@ use quick_xml::events::BytesStart;
 use serde::Serialize;
 
 use super::{
-    Piece, Prism, Prop, Scene, SceneError, SolidClass, Surface,
-    xml::{Tag, attribute, for_each_tag},
+    Prism, Prop, RoadPiece, Scene, SceneError, SolidClass, SurfaceKind,
+    xml::{XmlTag, attribute, for_each_tag},
 };
 
 /// Classes that make a lane one for buses: it admits none but these.
 const BUS_CLASSES: [&str; 5] = ["bus", "coach", "taxi", "emergency", "authority"];
 
-/// Everything that stands still.
+/// All static objects.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Chart {
     /// Lanes, crossings, sidewalks.
-    pub lanes: Vec<Lane>,
+    pub lanes: Vec<ChartLane>,
     /// Junctions and walking areas.
-    pub areas: Vec<Area>,
+    pub areas: Vec<ChartArea>,
     /// Buildings and walls.
-    pub buildings: Vec<Building>,
+    pub buildings: Vec<ChartBuilding>,
     /// Props.
-    pub obstacles: Vec<Obstacle>,
+    pub obstacles: Vec<ChartObstacle>,
     /// Traffic lights.
-    pub signals: Vec<Signal>,
+    pub signals: Vec<ChartSignal>,
 }
 
-/// A strip.
+/// A lane, crossing or sidewalk.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Lane {
+pub struct ChartLane {
     /// SUMO's id.
     pub id: String,
     /// Its edge.
@@ -54,7 +54,7 @@ pub struct Lane {
 
 /// A polygon on the ground.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Area {
+pub struct ChartArea {
     /// SUMO's id.
     pub id: String,
     /// `junction` or `walking_area`.
@@ -65,7 +65,7 @@ pub struct Area {
 
 /// An upright prism.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Building {
+pub struct ChartBuilding {
     /// SUMO's id of the polygon.
     pub id: String,
     /// `building`, `wall` or `structure`.
@@ -80,7 +80,7 @@ pub struct Building {
 
 /// A prop.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Obstacle {
+pub struct ChartObstacle {
     /// Its name in the catalogue.
     pub kind: &'static str,
     /// On the ground, metres.
@@ -93,21 +93,21 @@ pub struct Obstacle {
 
 /// A traffic light.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Signal {
+pub struct ChartSignal {
     /// SUMO's id.
     pub id: String,
     /// Its hash, as traffic lights carry it.
     pub id_hash: String,
-    /// What it governs, by number.
-    pub links: Vec<Link>,
+    /// The links that it controls, by number.
+    pub links: Vec<ChartLink>,
 }
 
 /// Where a link of a traffic light stands.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Link {
+pub struct ChartLink {
     /// Its number.
     pub link: u32,
-    /// The lane that it governs.
+    /// The lane that it controls.
     pub lane: String,
     /// End of that lane; of a crossing its begin. Metres.
     pub position_m: [f64; 3],
@@ -115,23 +115,23 @@ pub struct Link {
     pub yaw_rad: f64,
 }
 
-/// What only the net file says.
+/// Attributes that only the net file has.
 #[derive(Default)]
-struct Net {
+struct NetAttributes {
     /// Classes that a lane admits, where it names them.
     allowed: BTreeMap<String, String>,
     /// Traffic light and link → from lane, to lane.
     links: BTreeMap<(String, u32), (String, String)>,
 }
 
-impl Net {
+impl NetAttributes {
     fn read(path: &Path) -> Result<Self, SceneError> {
         let mut net = Self::default();
         if path.as_os_str().is_empty() {
             return Ok(net);
         }
         for_each_tag(path, |tag, _| {
-            let Tag::Open(element) = tag else { return Ok(()) };
+            let XmlTag::Open(element) = tag else { return Ok(()) };
             match element.local_name().as_ref() {
                 "lane" => net.add_lane(element),
                 "connection" => net.add_link(element),
@@ -166,7 +166,7 @@ impl Chart {
     /// # Errors
     /// The net file is unreadable or malformed.
     pub fn of_run(run: &RunFile, scene: &Scene) -> Result<Self, SceneError> {
-        let net = Net::read(&run.scene_files.net_file)?;
+        let net = NetAttributes::read(&run.scene_files.net_file)?;
         let pieces = scene.road().pieces();
         let kinds: BTreeMap<&str, &'static str> = pieces
             .iter()
@@ -196,13 +196,13 @@ impl Chart {
 }
 
 /// What a strip is for; `None` for polygons.
-fn lane_kind(piece: &Piece, net: &Net) -> Option<&'static str> {
+fn lane_kind(piece: &RoadPiece, net: &NetAttributes) -> Option<&'static str> {
     piece.half_width_m?;
     Some(match piece.surface {
-        Surface::Crossing => "crossing",
-        Surface::Sidewalk => "sidewalk",
-        Surface::Track => "rail",
-        Surface::Verge => "verge",
+        SurfaceKind::Crossing => "crossing",
+        SurfaceKind::Sidewalk => "sidewalk",
+        SurfaceKind::Track => "rail",
+        SurfaceKind::Verge => "verge",
         _ => {
             let allowed = net.allowed.get(&piece.id).map_or("", String::as_str);
             let only = |classes: &[&str]| {
@@ -219,7 +219,7 @@ fn lane_kind(piece: &Piece, net: &Net) -> Option<&'static str> {
     })
 }
 
-fn lane(piece: &Piece, kinds: &BTreeMap<&str, &'static str>) -> Option<Lane> {
+fn lane(piece: &RoadPiece, kinds: &BTreeMap<&str, &'static str>) -> Option<ChartLane> {
     let kind = *kinds.get(piece.id.as_str())?;
     let (edge, index) = piece.id.rsplit_once('_')?;
     let index: u32 = index.parse().ok()?;
@@ -233,7 +233,7 @@ fn lane(piece: &Piece, kinds: &BTreeMap<&str, &'static str>) -> Option<Lane> {
         (false, Some(_)) => "dashed",
         (false, None) => "solid",
     };
-    Some(Lane {
+    Some(ChartLane {
         id: piece.id.clone(),
         edge: edge.to_owned(),
         index,
@@ -246,21 +246,21 @@ fn lane(piece: &Piece, kinds: &BTreeMap<&str, &'static str>) -> Option<Lane> {
     })
 }
 
-fn area(piece: &Piece) -> Option<Area> {
+fn area(piece: &RoadPiece) -> Option<ChartArea> {
     let kind = match (piece.half_width_m, piece.surface) {
-        (None, Surface::Junction) => "junction",
-        (None, Surface::WalkingArea) => "walking_area",
+        (None, SurfaceKind::Junction) => "junction",
+        (None, SurfaceKind::WalkingArea) => "walking_area",
         _ => return None,
     };
-    Some(Area {
+    Some(ChartArea {
         id: piece.id.clone(),
         kind,
         points_m: piece.shape_m.iter().map(|point| point.map(centimetres)).collect(),
     })
 }
 
-fn building(prism: &Prism) -> Building {
-    Building {
+fn building(prism: &Prism) -> ChartBuilding {
+    ChartBuilding {
         id: prism.id.clone(),
         kind: match prism.class {
             SolidClass::Building => "building",
@@ -273,9 +273,9 @@ fn building(prism: &Prism) -> Building {
     }
 }
 
-fn obstacle(prop: &Prop) -> Obstacle {
+fn obstacle(prop: &Prop) -> ChartObstacle {
     let body = &prop.body;
-    Obstacle {
+    ChartObstacle {
         kind: prop.kind.name,
         center_m: [body.centre_m[0], body.centre_m[1], body.z_m[0]].map(centimetres),
         yaw_rad: libm::atan2(body.along[1], body.along[0]),
@@ -283,23 +283,23 @@ fn obstacle(prop: &Prop) -> Obstacle {
     }
 }
 
-fn signals(net: &Net, pieces: &[Piece]) -> Vec<Signal> {
-    let strips: BTreeMap<&str, &Piece> = pieces
+fn signals(net: &NetAttributes, pieces: &[RoadPiece]) -> Vec<ChartSignal> {
+    let strips: BTreeMap<&str, &RoadPiece> = pieces
         .iter()
         .filter(|piece| piece.half_width_m.is_some())
         .map(|piece| (piece.id.as_str(), piece))
         .collect();
-    let mut signals: BTreeMap<&str, Vec<Link>> = BTreeMap::new();
+    let mut signals: BTreeMap<&str, Vec<ChartLink>> = BTreeMap::new();
     for ((signal, link), (from, to)) in &net.links {
         let links = signals.entry(signal).or_default();
-        links.extend(place(&strips, from, to).map(|(lane, position_m, yaw_rad)| Link {
+        links.extend(place(&strips, from, to).map(|(lane, position_m, yaw_rad)| ChartLink {
             link: *link,
             lane: lane.to_owned(),
             position_m: position_m.map(centimetres),
             yaw_rad,
         }));
     }
-    let signal = |(id, links): (&str, Vec<Link>)| Signal {
+    let signal = |(id, links): (&str, Vec<ChartLink>)| ChartSignal {
         id: id.to_owned(),
         id_hash: format!("{:#018x}", id_hash(id)),
         links,
@@ -307,10 +307,10 @@ fn signals(net: &Net, pieces: &[Piece]) -> Vec<Signal> {
     signals.into_iter().map(signal).collect()
 }
 
-/// Where who is governed has to stop: at the end of its lane, or in front of the crossing that it is to take.
-fn place<'a>(strips: &BTreeMap<&str, &Piece>, from: &'a str, to: &'a str) -> Option<(&'a str, [f64; 3], f64)> {
+/// The stop position of a controlled road user: at the end of its lane, or in front of the crossing that it takes.
+fn place<'a>(strips: &BTreeMap<&str, &RoadPiece>, from: &'a str, to: &'a str) -> Option<(&'a str, [f64; 3], f64)> {
     let heading = |a: [f64; 3], b: [f64; 3]| libm::atan2(b[1] - a[1], b[0] - a[0]);
-    if let Some(crossing) = strips.get(to).filter(|piece| piece.surface == Surface::Crossing) {
+    if let Some(crossing) = strips.get(to).filter(|piece| piece.surface == SurfaceKind::Crossing) {
         let [first, second] = *crossing.shape_m.first_chunk()?;
         return Some((to, first, heading(first, second)));
     }
@@ -318,7 +318,7 @@ fn place<'a>(strips: &BTreeMap<&str, &Piece>, from: &'a str, to: &'a str) -> Opt
     Some((from, last, heading(before, last)))
 }
 
-/// SUMO writes no more.
+/// SUMO writes no more digits.
 fn centimetres(value_m: f64) -> f64 {
     libm::round(value_m * 100.0) / 100.0
 }

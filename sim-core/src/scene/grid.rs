@@ -1,8 +1,8 @@
-//! A uniform grid over things that do not move: which of them are near a place. Answers come in ascending order of their number.
+//! A uniform grid over static objects: which of them are near a position. Answers come in ascending order of their number.
 
 use super::shape::{Bounds, Point};
 
-/// Most cells of one grid: a continent gets larger cells instead of more memory.
+/// Most cells of one grid: a very large map gets larger cells instead of more memory.
 const MAX_CELLS: f64 = 4e6;
 
 /// Numbers of things by cell.

@@ -1,7 +1,7 @@
 //! Levels of a net without elevation: where two roads cross and no junction joins them, one passes over the other.
 
 use super::{
-    road::{NO_JUNCTION, Piece, Road},
+    road::{NO_JUNCTION, Road, RoadPiece},
     shape::{OrientedBox, Point, cross, distance, from_to},
 };
 
@@ -10,7 +10,7 @@ const SIDE_BY_SIDE: f64 = 0.342;
 
 impl Road {
     /// True if two road users that seem to touch are on roads that cross without a junction that joins them: one of them is on a bridge.
-    /// Only nets without elevation need to be asked; with elevation the heights tell.
+    /// Only nets without elevation need this; elsewhere the heights decide.
     #[must_use]
     pub fn are_levels_apart(&self, [a, b]: [&OrientedBox; 2]) -> bool {
         if self.flat_height_m().is_none() || cross(a.along, b.along).abs() < SIDE_BY_SIDE {
@@ -42,7 +42,7 @@ impl Road {
 }
 
 /// Unit vector along a segment of a strip; a polygon has none.
-fn direction(piece: &Piece, part: usize) -> Option<Point> {
+fn direction(piece: &RoadPiece, part: usize) -> Option<Point> {
     piece.half_width_m?;
     let [a, b] = [piece.shape_m[part], piece.shape_m[part + 1]].map(|[x, y, _]| [x, y]);
     let length_m = distance(a, b);
@@ -52,12 +52,12 @@ fn direction(piece: &Piece, part: usize) -> Option<Point> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Surface;
+    use crate::scene::SurfaceKind;
 
-    fn lane(id: &str, shape: [Point; 2], junctions: [u32; 2]) -> Piece {
-        Piece {
+    fn lane(id: &str, shape: [Point; 2], junctions: [u32; 2]) -> RoadPiece {
+        RoadPiece {
             id: id.into(),
-            surface: Surface::Lane,
+            surface: SurfaceKind::Lane,
             shape_m: shape.map(|[x, y]| [x, y, 0.0]).to_vec(),
             half_width_m: Some(1.6),
             junctions,
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_is_on_no_road_may_touch_anybody() {
+    fn a_road_user_on_no_road_may_touch_any_other() {
         let road = crossing([2, 3]);
         assert!(
             !road.are_levels_apart([&car(20.0, 0.0, EAST), &car(20.0, 2.0, NORTH)]),
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn a_net_with_elevation_speaks_for_itself() {
+    fn heights_decide_in_a_net_with_elevation() {
         let mut high = lane("b_0", [[0.0, -50.0], [0.0, 50.0]], [2, 3]);
         high.shape_m[0][2] = 8.0;
         let road = Road::new(vec![lane("a_0", [[-50.0, 0.0], [50.0, 0.0]], [0, 1]), high]);

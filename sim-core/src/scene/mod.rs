@@ -1,4 +1,4 @@
-//! The static scene: buildings, props and the road surface, read once from the files SUMO runs on, the same for collisions and for rays.
+//! The static scene: buildings, props and the road surface, read once from SUMO's own files, the same for collisions and for rays.
 //!
 //! A pure function of net file, additional files, configuration and seed: processes that need it read it themselves.
 
@@ -24,12 +24,12 @@ mod xml;
 pub use building::{Prism, SolidClass};
 pub use grid::Grid;
 pub use prop::Prop;
-pub use road::{NO_JUNCTION, Piece, Road, Surface};
+pub use road::{NO_JUNCTION, Road, RoadPiece, SurfaceKind};
 use shape::{Bounds, Point};
 
 /// Size of a cell of the index over buildings and props, metres.
 const CELL_M: f64 = 20.0;
-/// How far from a building the road is looked for that says how high the ground is, metres; doubled until there is some.
+/// Distance from a building within which a road sets the height of the ground, metres; doubled until there is a road.
 const GROUND_REACH_M: f64 = 25.0;
 /// Beyond this distance from any road the ground has no height of its own, metres.
 const GROUND_LIMIT_M: f64 = 2_000.0;
@@ -56,8 +56,8 @@ pub enum SceneError {
         /// Why.
         reason: String,
     },
-    /// A value makes no sense.
-    #[error("{path}, line {line}: \"{value}\" is no usable {what}")]
+    /// A value is not usable.
+    #[error("{path}, line {line}: \"{value}\" is not a usable {what}")]
     Value {
         /// The file.
         path: PathBuf,
@@ -65,7 +65,7 @@ pub enum SceneError {
         line: usize,
         /// Attribute.
         what: &'static str,
-        /// What it says.
+        /// The value.
         value: String,
     },
     /// A polygon in latitude and longitude cannot be brought onto the map.
@@ -100,7 +100,7 @@ impl From<SceneError> for Failure {
     }
 }
 
-/// Everything that stands still.
+/// All static objects.
 #[derive(Debug, Clone, Default)]
 pub struct Scene {
     road: Road,
@@ -141,7 +141,7 @@ impl Scene {
         Ok(scene)
     }
 
-    /// Reads what stands in the files: roads and buildings, those without a height `building_height_m` high.
+    /// Reads roads and buildings from the files, those without a height `building_height_m` high.
     ///
     /// # Errors
     /// A file is unreadable or malformed.
@@ -183,7 +183,7 @@ impl Scene {
         buildings.chain(self.props.iter().map(|prop| prop.body.bounds()))
     }
 
-    /// A prop where an entry of the configuration wants it, on the ground.
+    /// A prop at the position of an entry of the configuration, on the ground.
     #[must_use]
     pub fn prop(&self, obstacle: &Obstacle) -> Prop {
         let ground_m = ground_height_m(&self.road, [obstacle.x_m, obstacle.y_m]);
@@ -214,45 +214,10 @@ impl Scene {
         self.road.under([x_m, y_m]).any(|(piece, _)| piece.surface.is_road())
     }
 
-    /// Height of the road at a place, the lowest where several cross; `None` beside the road. Metres.
-    #[must_use]
-    pub fn road_height_m(&self, x_m: f64, y_m: f64) -> Option<f64> {
-        self.road_heights([x_m, y_m]).min_by(f64::total_cmp)
-    }
-
-    /// Height of the road at a place that is nearest to `z_m`: the right one of a bridge and what it crosses. Metres.
-    #[must_use]
-    pub fn road_height_near_m(&self, x_m: f64, y_m: f64, z_m: f64) -> Option<f64> {
-        self.road_heights([x_m, y_m])
-            .min_by(|a, b| (a - z_m).abs().total_cmp(&(b - z_m).abs()))
-    }
-
-    /// Heights by lanes where there are any, else by junctions.
-    fn road_heights(&self, point: Point) -> impl Iterator<Item = f64> {
-        let on_lane = self.road.under(point).any(|(piece, _)| piece.surface == Surface::Lane);
-        self.road.under(point).filter_map(move |(piece, height_m)| {
-            let wanted = piece.surface.is_road() && (piece.surface == Surface::Lane || !on_lane);
-            wanted.then_some(height_m)
-        })
-    }
-
     /// Height of the ground: of the road, or of the nearest one. Metres.
     #[must_use]
     pub fn ground_height_m(&self, x_m: f64, y_m: f64) -> f64 {
         ground_height_m(&self.road, [x_m, y_m])
-    }
-
-    /// True if a building or prop covers the place.
-    #[must_use]
-    pub fn is_in_solid(&self, x_m: f64, y_m: f64) -> bool {
-        let point = [x_m, y_m];
-        self.index.at(point).iter().any(|&number| match self.solid(number) {
-            Solid::Building(building) => building.contains(point),
-            Solid::Prop(prop) => {
-                let [ahead, left] = prop.body.local_from_world(point);
-                ahead.abs() <= prop.body.half_m[0] && left.abs() <= prop.body.half_m[1]
-            }
-        })
     }
 
     /// A building or prop by its number in [`Scene::bounds`] and [`Scene::solids_near`].
@@ -271,7 +236,7 @@ impl Scene {
     }
 }
 
-/// A thing that stands still.
+/// A static object.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Solid<'a> {
     /// A building.

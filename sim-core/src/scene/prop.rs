@@ -7,20 +7,20 @@ use rand_chacha::{
 };
 
 use super::{
-    Scene, Surface,
+    Scene, SurfaceKind,
     grid::Grid,
-    road::{Piece, left_of},
+    road::{RoadPiece, left_of},
     shape::{Bounds, OrientedBox, Point, between, distance},
 };
 
-/// Random places tried for one prop before it is left out.
+/// Random positions tried for one prop before it is left out.
 const TRIES: u32 = 64;
 /// Free ground between a random prop and everything else, metres.
 const CLEARANCE_M: f64 = 0.3;
 /// Most distance of a random prop from the edge of the lane it belongs to, beyond the clearance, metres.
 const REACH_M: f64 = 6.0;
 
-/// A prop in its place.
+/// A prop and its position.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Prop {
     /// What it is.
@@ -55,12 +55,12 @@ impl Prop {
 /// `count` props beside the road: off every surface, clear of buildings and of each other. Prop *i* draws from stream *i* of the
 /// seed, so the first props are the same whatever the number. Where there is no room a prop is left out.
 pub(super) fn beside_the_road(scene: &Scene, count: u32, seed: u64) -> Vec<Prop> {
-    let lanes = Lanes::new(scene);
+    let lanes = OuterLanes::new(scene);
     let mut placed: Vec<Prop> = Vec::new();
     if lanes.is_empty() {
         return placed;
     }
-    let mut neighbours = Neighbours::new(scene);
+    let mut neighbours = PropNeighbours::new(scene);
     for number in 0..u64::from(count) {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(number);
@@ -84,18 +84,18 @@ fn share(random: &mut ChaCha8Rng) -> f64 {
 }
 
 /// Outer lanes to draw places from, in proportion to their length.
-struct Lanes<'a> {
+struct OuterLanes<'a> {
     /// Segment of a lane, and the length of all segments up to its end.
-    segments: Vec<(&'a Piece, usize, f64)>,
+    segments: Vec<(&'a RoadPiece, usize, f64)>,
 }
 
-impl<'a> Lanes<'a> {
+impl<'a> OuterLanes<'a> {
     fn new(scene: &'a Scene) -> Self {
         let mut total_m = 0.0;
         let mut segments = Vec::new();
-        // Lanes within junctions have ids that begin with a colon: nobody stands there.
+        // Lanes within junctions have ids that begin with a colon: no prop stands there.
         let lanes = scene.road().pieces().iter();
-        for piece in lanes.filter(|piece| piece.surface == Surface::Lane && !piece.id.starts_with(':')) {
+        for piece in lanes.filter(|piece| piece.surface == SurfaceKind::Lane && !piece.id.starts_with(':')) {
             for place in 0..piece.shape_m.len() - 1 {
                 let [a, b] = ends(piece, place);
                 total_m += distance(a, b);
@@ -132,18 +132,18 @@ impl<'a> Lanes<'a> {
     }
 }
 
-fn ends(piece: &Piece, place: usize) -> [Point; 2] {
+fn ends(piece: &RoadPiece, place: usize) -> [Point; 2] {
     [piece.shape_m[place], piece.shape_m[place + 1]].map(|[x, y, _]| [x, y])
 }
 
-/// Random props by cell, and what the scene already has.
-struct Neighbours {
+/// Random props by cell, and the props of the configuration.
+struct PropNeighbours {
     cells: std::collections::BTreeMap<[i64; 2], Vec<usize>>,
     found: Vec<u32>,
     obstacles: Grid,
 }
 
-impl Neighbours {
+impl PropNeighbours {
     /// No prop is longer than this, metres.
     const CELL_M: f64 = 8.0;
 

@@ -4,7 +4,7 @@ use super::{
     SceneError,
     grid::Grid,
     shape::{Bounds, Point, between, contains, distance, dot, from_to, nearest_on_segment, share_along},
-    xml::{Place, Tag, attribute, for_each_tag, points},
+    xml::{ElementPosition, XmlTag, attribute, for_each_tag, points},
 };
 use quick_xml::events::BytesStart;
 use std::{collections::BTreeMap, path::Path};
@@ -15,7 +15,7 @@ const DEFAULT_WIDTH_M: f64 = 3.2;
 const SEAM_M: f64 = 0.05;
 /// Size of a cell of the index, metres.
 const CELL_M: f64 = 15.0;
-/// What does not drive on a road.
+/// Classes that do not drive on a road.
 const OFF_ROAD_CLASSES: [&str; 12] = [
     "pedestrian",
     "wheelchair",
@@ -33,7 +33,7 @@ const OFF_ROAD_CLASSES: [&str; 12] = [
 
 /// What a piece of the surface is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Surface {
+pub enum SurfaceKind {
     /// A lane that road vehicles may use, also within a junction.
     Lane,
     /// The polygon of a junction.
@@ -46,11 +46,11 @@ pub enum Surface {
     Sidewalk,
     /// Rails and waterways.
     Track,
-    /// A lane that nobody may use: a verge.
+    /// A lane that no class may use: a verge.
     Verge,
 }
 
-impl Surface {
+impl SurfaceKind {
     /// True if vehicles drive on it.
     #[must_use]
     pub fn is_road(self) -> bool {
@@ -83,11 +83,11 @@ impl Surface {
 
 /// One lane, junction, crossing or walking area.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Piece {
+pub struct RoadPiece {
     /// SUMO's id.
     pub id: String,
     /// What it is for.
-    pub surface: Surface,
+    pub surface: SurfaceKind,
     /// Centre line of a strip, outline of a polygon (not closed), metres.
     pub shape_m: Vec<[f64; 3]>,
     /// Half the width of a strip; `None` for a polygon. Metres.
@@ -96,10 +96,10 @@ pub struct Piece {
     pub junctions: [u32; 2],
 }
 
-/// No junction, in [`Piece::junctions`].
+/// No junction, in [`RoadPiece::junctions`].
 pub const NO_JUNCTION: u32 = u32::MAX;
 
-impl Piece {
+impl RoadPiece {
     /// Its border as a closed polygon without the last point repeated, counter-clockwise for strips; corners are mitred.
     #[must_use]
     pub fn outline(&self) -> Vec<[f64; 3]> {
@@ -224,7 +224,7 @@ fn flat([x, y, _]: [f64; 3]) -> Point {
 /// The whole surface, with an index over the parts of its pieces.
 #[derive(Debug, Clone, Default)]
 pub struct Road {
-    pieces: Vec<Piece>,
+    pieces: Vec<RoadPiece>,
     /// Piece and part (segment of a strip) of each entry of the index.
     parts: Vec<(u32, u32)>,
     index: Grid,
@@ -234,7 +234,7 @@ pub struct Road {
 impl Road {
     /// The surface of these pieces.
     #[must_use]
-    pub fn new(pieces: Vec<Piece>) -> Self {
+    pub fn new(pieces: Vec<RoadPiece>) -> Self {
         let mut parts = Vec::new();
         for (number, piece) in (0_u32..).zip(&pieces) {
             parts.extend((0..piece.parts() as u32).map(|part| (number, part)));
@@ -260,12 +260,12 @@ impl Road {
     /// # Errors
     /// Unreadable, malformed, or a shape that is no list of points.
     pub(super) fn read(net_file: &Path) -> Result<Self, SceneError> {
-        let mut pieces: Vec<Piece> = Vec::new();
+        let mut pieces: Vec<RoadPiece> = Vec::new();
         let mut junctions = Junctions::default();
         let mut function = String::new();
         let mut ends = [NO_JUNCTION; 2];
         for_each_tag(net_file, |tag, place| {
-            let Tag::Open(element) = tag else { return Ok(()) };
+            let XmlTag::Open(element) = tag else { return Ok(()) };
             let found = match element.local_name().as_ref() {
                 "edge" => {
                     function = attribute(element, "function").unwrap_or_default();
@@ -279,7 +279,7 @@ impl Road {
                 }
                 _ => None,
             };
-            pieces.extend(found.map(|(piece, junctions)| Piece { junctions, ..piece }));
+            pieces.extend(found.map(|(piece, junctions)| RoadPiece { junctions, ..piece }));
             Ok(())
         })?;
         Ok(Self::new(pieces))
@@ -287,7 +287,7 @@ impl Road {
 
     /// Its pieces, in the order of the net file.
     #[must_use]
-    pub fn pieces(&self) -> &[Piece] {
+    pub fn pieces(&self) -> &[RoadPiece] {
         &self.pieces
     }
 
@@ -298,12 +298,12 @@ impl Road {
     }
 
     /// Pieces that `point` lies on, with the height there.
-    pub fn under(&self, point: Point) -> impl Iterator<Item = (&Piece, f64)> {
+    pub fn under(&self, point: Point) -> impl Iterator<Item = (&RoadPiece, f64)> {
         self.parts_under(point).map(|(piece, _, height_m)| (piece, height_m))
     }
 
     /// As [`Road::under`], with the part of the piece.
-    pub(super) fn parts_under(&self, point: Point) -> impl Iterator<Item = (&Piece, usize, f64)> {
+    pub(super) fn parts_under(&self, point: Point) -> impl Iterator<Item = (&RoadPiece, usize, f64)> {
         self.index.at(point).iter().filter_map(move |&entry| {
             let (piece, part) = self.parts[entry as usize];
             let (piece, part) = (&self.pieces[piece as usize], part as usize);
@@ -313,7 +313,7 @@ impl Road {
 
     /// The piece nearest to `point` within `reach_m`: distance and height of its nearest corner, metres.
     #[must_use]
-    pub fn nearest(&self, point: Point, reach_m: f64, wanted: impl Fn(Surface) -> bool) -> Option<(f64, f64)> {
+    pub fn nearest(&self, point: Point, reach_m: f64, wanted: impl Fn(SurfaceKind) -> bool) -> Option<(f64, f64)> {
         let mut found = Vec::new();
         self.index.near(&Bounds::about(point, reach_m), &mut found);
         let mut nearest: Option<(f64, f64)> = None;
@@ -353,7 +353,11 @@ impl Junctions {
     }
 }
 
-fn lane(element: &BytesStart<'_>, function: &str, place: &Place<'_>) -> Result<Option<Piece>, SceneError> {
+fn lane(
+    element: &BytesStart<'_>,
+    function: &str,
+    place: &ElementPosition<'_>,
+) -> Result<Option<RoadPiece>, SceneError> {
     let width_m = match attribute(element, "width") {
         Some(text) => text
             .parse()
@@ -362,25 +366,25 @@ fn lane(element: &BytesStart<'_>, function: &str, place: &Place<'_>) -> Result<O
             .ok_or_else(|| place.value("width", &text))?,
         None => DEFAULT_WIDTH_M,
     };
-    let surface = Surface::of_lane(function, element);
-    let half_width_m = (surface != Surface::WalkingArea).then_some(0.5 * width_m);
+    let surface = SurfaceKind::of_lane(function, element);
+    let half_width_m = (surface != SurfaceKind::WalkingArea).then_some(0.5 * width_m);
     piece(element, surface, half_width_m, place)
 }
 
-fn junction(element: &BytesStart<'_>, place: &Place<'_>) -> Result<Option<Piece>, SceneError> {
+fn junction(element: &BytesStart<'_>, place: &ElementPosition<'_>) -> Result<Option<RoadPiece>, SceneError> {
     match attribute(element, "type").as_deref() {
         Some("internal" | "rail_signal" | "rail_crossing") => Ok(None),
-        _ => piece(element, Surface::Junction, None, place),
+        _ => piece(element, SurfaceKind::Junction, None, place),
     }
 }
 
 /// The piece of an element with a shape; `None` if it covers nothing.
 fn piece(
     element: &BytesStart<'_>,
-    surface: Surface,
+    surface: SurfaceKind,
     half_width_m: Option<f64>,
-    place: &Place<'_>,
-) -> Result<Option<Piece>, SceneError> {
+    place: &ElementPosition<'_>,
+) -> Result<Option<RoadPiece>, SceneError> {
     let text = attribute(element, "shape").unwrap_or_default();
     let mut shape_m = points(&text, place)?;
     for point in &mut shape_m {
@@ -390,7 +394,7 @@ fn piece(
         shape_m.pop();
     }
     let least = if half_width_m.is_some() { 2 } else { 3 };
-    Ok((shape_m.len() >= least).then(|| Piece {
+    Ok((shape_m.len() >= least).then(|| RoadPiece {
         id: attribute(element, "id").unwrap_or_default(),
         surface,
         shape_m,

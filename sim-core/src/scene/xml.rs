@@ -15,13 +15,13 @@ use super::SceneError;
 
 /// Where an element stands, for messages.
 #[derive(Debug, Clone)]
-pub(super) struct Place<'a> {
+pub(super) struct ElementPosition<'a> {
     path: &'a Path,
     text: &'a str,
     position: u64,
 }
 
-impl Place<'_> {
+impl ElementPosition<'_> {
     fn line(&self) -> usize {
         let end = usize::try_from(self.position)
             .unwrap_or(usize::MAX)
@@ -45,7 +45,7 @@ impl Place<'_> {
 }
 
 /// What a reader of a file sees.
-pub(super) enum Tag<'a> {
+pub(super) enum XmlTag<'a> {
     /// An element begins.
     Open(&'a BytesStart<'a>),
     /// The element of this name ends.
@@ -72,11 +72,11 @@ fn read(path: &Path) -> Result<String, SceneError> {
 /// Calls `visit` at the begin and end of every element.
 pub(super) fn for_each_tag(
     path: &Path,
-    mut visit: impl FnMut(Tag<'_>, &Place<'_>) -> Result<(), SceneError>,
+    mut visit: impl FnMut(XmlTag<'_>, &ElementPosition<'_>) -> Result<(), SceneError>,
 ) -> Result<(), SceneError> {
     let text = read(path)?;
     let mut reader = Reader::from_str(&text);
-    let place = |position| Place {
+    let place = |position| ElementPosition {
         path,
         text: &text,
         position,
@@ -84,12 +84,12 @@ pub(super) fn for_each_tag(
     loop {
         let position = reader.buffer_position();
         match reader.read_event() {
-            Ok(Event::Start(element)) => visit(Tag::Open(&element), &place(position))?,
+            Ok(Event::Start(element)) => visit(XmlTag::Open(&element), &place(position))?,
             Ok(Event::Empty(element)) => {
-                visit(Tag::Open(&element), &place(position))?;
-                visit(Tag::Close(element.local_name().as_ref()), &place(position))?;
+                visit(XmlTag::Open(&element), &place(position))?;
+                visit(XmlTag::Close(element.local_name().as_ref()), &place(position))?;
             }
-            Ok(Event::End(element)) => visit(Tag::Close(element.local_name().as_ref()), &place(position))?,
+            Ok(Event::End(element)) => visit(XmlTag::Close(element.local_name().as_ref()), &place(position))?,
             Ok(Event::Eof) => return Ok(()),
             Ok(_) => {}
             Err(error) => {
@@ -110,7 +110,7 @@ pub(super) fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> 
 }
 
 /// The `shape` attribute: "x,y x,y" or "x,y,z x,y,z", metres (or degrees). Without z, z is not a number.
-pub(super) fn points(text: &str, place: &Place<'_>) -> Result<Vec<[f64; 3]>, SceneError> {
+pub(super) fn points(text: &str, place: &ElementPosition<'_>) -> Result<Vec<[f64; 3]>, SceneError> {
     let point = |word: &str| {
         let mut numbers = word
             .split(',')

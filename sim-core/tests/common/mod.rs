@@ -11,14 +11,14 @@ use ipc_schema::{
     traffic::{Kind, MetaEvent, TrafficState, VehicleMeta},
     world::{SubStep, VehicleState},
 };
-use sim_core::mirror::{Mirror, Settings};
-use sim_core::vehicle::KinematicParams;
+use sim_core::mirror::{Mirror, MirrorSettings};
+use sim_core::models::kinematic::KinematicParams;
 
 /// Body of the vehicles in these tests, metres.
 pub const LENGTH_M: f64 = 4.3;
 
-pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> Settings {
-    Settings {
+pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> MirrorSettings {
+    MirrorSettings {
         vehicle: limits(),
         surface: config::Surface::Dry,
         tick_s,
@@ -151,7 +151,7 @@ impl Aligned {
 }
 
 /// The ticks of one vehicle that SUMO moves through `states`.
-pub fn mirror_one(settings: Settings, states: &[TrafficState]) -> (Vec<VehicleState>, Vec<SubStep>) {
+pub fn mirror_one(settings: MirrorSettings, states: &[TrafficState]) -> (Vec<VehicleState>, Vec<SubStep>) {
     let mut mirror = Mirror::new(settings).unwrap();
     mirror
         .apply_meta(&MessageHeader::default(), &[meta(0, Kind::Cav)])

@@ -1,10 +1,10 @@
-//! Positions displaced by small angles on the ground: what a GNSS receiver's error does, many times a second.
+//! Positions displaced by small angles on the ground, as a GNSS receiver's error displaces them many times a second.
 //!
 //! The exact way is inverse projection, addition in latitude and longitude, forward projection: some 0.4 µs. This is its
 //! Taylor series about the nodes of a grid over the map, computed from the exact way once at the start: some 0.02 µs, and
 //! within 0.1 mm of the exact way over a map of 50 km × 50 km for displacements up to 300 m (a test compares them).
 
-use crate::geodesy::{GeodesyError, Geodetic, NetPosition, Projection};
+use super::{GeodesyError, Geodetic, NetPosition, Projection};
 
 /// Most cells along one side of the grid.
 const MOST_CELLS: usize = 32;
@@ -18,7 +18,7 @@ const SECOND_DEG: f64 = 1e-3;
 /// An angle of arc on the ground, degrees: the same angle is the same distance in both directions (to 0.5 %, the flattening
 /// of the ellipsoid); one degree of latitude is 111.3 km.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Arc {
+pub struct GroundArc {
     /// To the east: the longitude changes by this divided by the cosine of the latitude.
     pub east_deg: f64,
     /// To the north: the latitude changes by this.
@@ -27,7 +27,7 @@ pub struct Arc {
 
 /// A displaced position.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Displaced {
+pub struct DisplacedPosition {
     /// Latitude and longitude.
     pub geodetic: Geodetic,
     /// Net coordinates.
@@ -38,13 +38,17 @@ pub struct Displaced {
 ///
 /// # Errors
 /// Outside the domain of the projection.
-pub fn displaced_exactly(projection: &Projection, from: NetPosition, arc: Arc) -> Result<Displaced, GeodesyError> {
+pub fn displaced_exactly(
+    projection: &Projection,
+    from: NetPosition,
+    arc: GroundArc,
+) -> Result<DisplacedPosition, GeodesyError> {
     let start = projection.geodetic_from_net(from)?;
     let geodetic = Geodetic {
         latitude_deg: start.latitude_deg + arc.north_deg,
         longitude_deg: start.longitude_deg + arc.east_deg / libm::cos(start.latitude_deg.to_radians()),
     };
-    Ok(Displaced {
+    Ok(DisplacedPosition {
         geodetic,
         net: projection.net_from_geodetic(geodetic)?,
     })
@@ -54,7 +58,7 @@ type Pair = [f64; 2];
 
 /// Derivatives of the exact way at one point of the map. Columns of matrices: east, north (angles), or x, y (metres).
 #[derive(Debug, Clone, Copy)]
-struct Node {
+struct SeriesNode {
     at: Pair,
     /// Latitude and longitude, degrees, their derivatives by x and y, and by xx, xy, yy.
     geodetic: [Pair; 6],
@@ -75,7 +79,7 @@ pub struct DisplacementMap {
     cell_m: f64,
     columns: usize,
     rows: usize,
-    nodes: Vec<Node>,
+    nodes: Vec<SeriesNode>,
 }
 
 impl DisplacementMap {
@@ -91,7 +95,7 @@ impl DisplacementMap {
         let centre = |corner: f64, index: usize| corner + (index as f64 + 0.5) * cell_m;
         let nodes = (0..rows * columns)
             .map(|i| {
-                Node::new(
+                SeriesNode::new(
                     projection,
                     [centre(x_min, i % columns), centre(y_min, i / columns)],
                     0.5 * cell_m,
@@ -109,7 +113,7 @@ impl DisplacementMap {
 
     /// The displaced position.
     #[must_use]
-    pub fn displaced(&self, from: NetPosition, arc: Arc) -> Displaced {
+    pub fn displaced(&self, from: NetPosition, arc: GroundArc) -> DisplacedPosition {
         let cell = |value: f64, corner: f64, count: usize| (((value - corner) / self.cell_m) as usize).min(count - 1);
         let column = cell(from.x_m, self.corner_m[0], self.columns);
         let row = cell(from.y_m, self.corner_m[1], self.rows);
@@ -117,7 +121,7 @@ impl DisplacementMap {
     }
 }
 
-impl Node {
+impl SeriesNode {
     fn new(projection: &Projection, at: Pair, reach_m: f64) -> Result<Self, GeodesyError> {
         let moved = |x: f64, y: f64| [at[0] + x * reach_m, at[1] + y * reach_m];
         let geodetic = |x: f64, y: f64| {
@@ -164,7 +168,7 @@ impl Node {
         })
     }
 
-    fn displaced(&self, from: NetPosition, arc: Arc) -> Displaced {
+    fn displaced(&self, from: NetPosition, arc: GroundArc) -> DisplacedPosition {
         let (x, y) = (from.x_m - self.at[0], from.y_m - self.at[1]);
         let (e, n) = (arc.east_deg, arc.north_deg);
         let [g, gx, gy, gxx, gxy, gyy] = &self.geodetic;
@@ -176,7 +180,7 @@ impl Node {
         let [ee, en, nn] = &self.curvature;
         let net =
             |axis: usize| e * (metres(0, axis) + e * ee[axis] + n * en[axis]) + n * (metres(1, axis) + n * nn[axis]);
-        Displaced {
+        DisplacedPosition {
             geodetic: Geodetic {
                 latitude_deg: start(0) + n,
                 longitude_deg: start(1) + e * stretch,
@@ -192,7 +196,7 @@ impl Node {
 /// How far an arc takes a position, metres.
 fn moved_m(projection: &Projection, at: Pair, east_deg: f64, north_deg: f64) -> Result<Pair, GeodesyError> {
     let from = NetPosition { x_m: at[0], y_m: at[1] };
-    let to = displaced_exactly(projection, from, Arc { east_deg, north_deg })?.net;
+    let to = displaced_exactly(projection, from, GroundArc { east_deg, north_deg })?.net;
     Ok([to.x_m - from.x_m, to.y_m - from.y_m])
 }
 
@@ -257,7 +261,7 @@ mod tests {
         let maps = maps();
         let arcs = [0.0, 5e-5, -3e-4, 3e-3];
         proptest!(|(x_m in -25_100.0_f64..25_100.0, y_m in -25_100.0_f64..25_100.0, e in 0..4_usize, n in 0..4_usize)| {
-            let (from, arc) = (NetPosition { x_m, y_m }, Arc { east_deg: arcs[e], north_deg: arcs[n] });
+            let (from, arc) = (NetPosition { x_m, y_m }, GroundArc { east_deg: arcs[e], north_deg: arcs[n] });
             for (projection, series) in &maps {
                 let (fast, exact) = (series.displaced(from, arc), displaced_exactly(projection, from, arc).unwrap());
                 let off = (fast.net.x_m - exact.net.x_m).hypot(fast.net.y_m - exact.net.y_m);
@@ -279,6 +283,6 @@ mod tests {
         let series = DisplacementMap::new(&Projection::new(&info).unwrap(), [0.0, 0.0, 220.0, 220.0]).unwrap();
         assert_eq!(series.nodes.len(), 1);
         let from = NetPosition { x_m: 12.5, y_m: -300.0 };
-        assert_eq!(series.displaced(from, Arc::default()).net, from);
+        assert_eq!(series.displaced(from, GroundArc::default()).net, from);
     }
 }

@@ -1,4 +1,4 @@
-//! How well the mirror follows, over a run: percentiles from counts, so that millions of samples cost nothing to keep.
+//! Tracking statistics of a run: percentiles from counts, so that millions of samples need no memory.
 
 use ipc_schema::world::{APPEARED, RESYNCHRONISED, VehicleState};
 use serde::Serialize;
@@ -76,7 +76,7 @@ impl Histogram {
 
 /// Tracking of a run's vehicles.
 #[derive(Debug, Clone, Default)]
-pub struct Tracking {
+pub struct TrackingStatistics {
     lateral: Histogram,
     longitudinal: Histogram,
     reference: Histogram,
@@ -84,7 +84,7 @@ pub struct Tracking {
 
 /// Tracking as it stands in the report.
 #[derive(Debug, Clone, Serialize)]
-pub struct Summary {
+pub struct TrackingSummary {
     /// Vehicle-ticks counted: those in which the pose was reached by moving.
     pub samples: u64,
     /// Reference minus front bumper, across the heading.
@@ -95,7 +95,7 @@ pub struct Summary {
     pub reference_from_sumo: Option<Percentiles>,
 }
 
-impl Tracking {
+impl TrackingStatistics {
     /// Counts a vehicle at the end of a tick, unless its pose was set.
     #[inline]
     pub fn add(&mut self, state: &VehicleState) {
@@ -109,8 +109,8 @@ impl Tracking {
 
     /// For the report.
     #[must_use]
-    pub fn summary(&self) -> Summary {
-        Summary {
+    pub fn summary(&self) -> TrackingSummary {
+        TrackingSummary {
             samples: self.lateral.count,
             lateral: self.lateral.percentiles(),
             longitudinal: self.longitudinal.percentiles(),

@@ -12,30 +12,33 @@
 //! `e'' + 2 ω e' + ω² e = 0`; what is left, the yaw about P, is a damped oscillation (`ω₀² = m/I L C N / (1 + x m/I lf)`, damped by
 //! `ω₀² d / v`), because P lies ahead of the centre of percussion.
 
+use super::curve::ReferencePoint;
 use crate::{
-    curve::Target,
-    dynamic::{DynamicParams, GRAVITY_MPS2, SLIP_SPEED_MPS, inverses},
+    models::{
+        dynamic::{DynamicParams, GRAVITY_MPS2, SLIP_SPEED_MPS, inverses},
+        kinematic::KinematicParams,
+        state::{ACCEL_RATE_PER_S, ControlInput, MAX_JERK_MPS3, ModelState},
+    },
     trig::{atan_demand, bound, larger, pick, smaller},
-    vehicle::{ACCEL_RATE_PER_S, Input, KinematicParams, MAX_JERK_MPS3, State},
 };
 
 /// Gain of the longitudinal error, 1/s. With [`SPEED_GAIN_PER_S`] and the model's lag of 12/s: three poles at −4/s.
 const POSITION_GAIN_PER_S: f64 = 4.0 / 3.0;
 /// Gain of the speed error, 1/s.
 const SPEED_GAIN_PER_S: f64 = 4.0;
-/// Most that a position error may change the wanted speed, m/s.
+/// Largest change of the wanted speed by a position error, m/s.
 const MAX_CATCH_UP_MPS: f64 = 3.0;
 /// Gain of the lateral error, 1/s.
 const LATERAL_GAIN_PER_S: f64 = 2.5;
 /// Below this speed the lateral error is corrected per distance instead of per time, m/s.
 const LOW_SPEED_MPS: f64 = 3.0;
-/// Most that tan β may be: 55°.
+/// Largest tan β: 55°.
 const MAX_TAN_BETA: f64 = 1.43;
 /// ω of the lateral error of a vehicle with tyres, 1/s.
 const LATERAL_FREQUENCY_PER_S: f64 = 4.0;
 /// Below this speed a vehicle with tyres is steered as if it rolled without slip, at twice this speed by its forces alone, m/s.
 const ROLLING_MPS: f64 = 2.0;
-/// Share of the friction that tracking asks for: the rest keeps the tyres' slip small.
+/// Share of the friction that tracking uses: the rest keeps the tyres' slip small.
 const FRICTION_SHARE: f64 = 0.9;
 /// Below this speed of vehicle or path the wheels are held, m/s.
 const HOLD_MPS: f64 = 0.05;
@@ -46,9 +49,9 @@ const STOP_JERK_MPS3: f64 = 0.25 * MAX_JERK_MPS3;
 /// Deceleration in the last moment before standstill, m/s².
 const LEAST_STOPPING_MPS2: f64 = 0.1;
 
-/// What the tracker knows of the vehicle it drives, whichever model moves it.
+/// The parameters that the tracker needs of a vehicle, for every model.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Driven {
+pub struct TrackedVehicle {
     /// Rear axle to front bumper, metres.
     pub front_m: f64,
     /// Rear axle to front axle, metres.
@@ -61,7 +64,7 @@ pub struct Driven {
     pub max_lateral_mps2: f64,
 }
 
-impl Driven {
+impl TrackedVehicle {
     /// A vehicle of the kinematic model with its front bumper `front_m` ahead of the rear axle.
     #[must_use]
     #[inline(always)]
@@ -78,7 +81,7 @@ impl Driven {
 
 /// Reference minus front bumper in the body frame.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Error {
+pub struct TrackingError {
     /// Positive ahead, metres.
     pub longitudinal_m: f64,
     /// Positive to the left, metres.
@@ -88,11 +91,11 @@ pub struct Error {
 /// How far the front bumper, `front_m` ahead of the rear axle, is from its target.
 #[must_use]
 #[inline(always)]
-pub fn error(state: &State, front_m: f64, target: &Target) -> Error {
+pub fn error(state: &ModelState, front_m: f64, target: &ReferencePoint) -> TrackingError {
     let front = state.point_ahead(front_m);
     let [cos, sin] = state.heading;
     let (dx, dy) = (target.position_m[0] - front[0], target.position_m[1] - front[1]);
-    Error {
+    TrackingError {
         longitudinal_m: dx * cos + dy * sin,
         lateral_m: dy * cos - dx * sin,
     }
@@ -101,12 +104,12 @@ pub fn error(state: &State, front_m: f64, target: &Target) -> Error {
 /// The demand that brings the front bumper onto its target.
 #[must_use]
 #[inline(always)]
-pub fn demand(driven: &Driven, state: &State, target: &Target) -> Input {
+pub fn demand(driven: &TrackedVehicle, state: &ModelState, target: &ReferencePoint) -> ControlInput {
     let error = error(state, driven.front_m, target);
     let [cos, sin] = state.heading;
     let [vx, vy] = target.velocity_mps;
     let (along, across) = (vx * cos + vy * sin, vy * cos - vx * sin);
-    Input {
+    ControlInput {
         accel_mps2: accel_demand(driven, state, target.accel_mps2, along, error.longitudinal_m),
         road_wheel_angle_rad: steering_demand(driven, state, [along, across], error.lateral_m),
     }
@@ -114,7 +117,7 @@ pub fn demand(driven: &Driven, state: &State, target: &Target) -> Input {
 
 /// Acceleration from the wanted speed: never backwards, at rest when the path rests, with a soft end of every stop.
 #[inline(always)]
-fn accel_demand(driven: &Driven, state: &State, path_accel: f64, along: f64, ahead_m: f64) -> f64 {
+fn accel_demand(driven: &TrackedVehicle, state: &ModelState, path_accel: f64, along: f64, ahead_m: f64) -> f64 {
     let catch_up = bound(POSITION_GAIN_PER_S * ahead_m, -MAX_CATCH_UP_MPS, MAX_CATCH_UP_MPS);
     let wanted = along + catch_up;
     let path_rests = (along < HOLD_MPS) & (ahead_m < START_M);
@@ -126,10 +129,10 @@ fn accel_demand(driven: &Driven, state: &State, path_accel: f64, along: f64, ahe
     pick(stays, 0.0, bound(demand, -least, driven.max_accel_mps2))
 }
 
-/// Deceleration that reaches zero together with the speed, at constant jerk, m/s². It looks at the speed that will be left
-/// when the actuator, which lags, has followed.
+/// Deceleration that reaches zero together with the speed, at constant jerk, m/s². It uses the speed that remains when
+/// the actuator, which lags, has followed.
 #[inline(always)]
-fn stopping_decel(state: &State) -> f64 {
+fn stopping_decel(state: &ModelState) -> f64 {
     let left_mps = state.speed_mps + smaller(state.accel_mps2, 0.0) * (1.0 / ACCEL_RATE_PER_S);
     larger(
         (2.0 * STOP_JERK_MPS3 * larger(left_mps, 0.0)).sqrt(),
@@ -139,7 +142,7 @@ fn stopping_decel(state: &State) -> f64 {
 
 /// Road-wheel angle from the direction in which the front bumper should move.
 #[inline(always)]
-fn steering_demand(driven: &Driven, state: &State, [along, across]: [f64; 2], left_m: f64) -> f64 {
+fn steering_demand(driven: &TrackedVehicle, state: &ModelState, [along, across]: [f64; 2], left_m: f64) -> f64 {
     let holds = (state.speed_mps < HOLD_MPS) | (along < HOLD_MPS);
     let feed_forward = across / larger(along, 0.5 * across.abs());
     let pace = 1.0 / larger(state.speed_mps, LOW_SPEED_MPS);
@@ -157,12 +160,17 @@ fn steering_demand(driven: &Driven, state: &State, [along, across]: [f64; 2], le
 /// The demand that brings the front bumper, `front_m` ahead of the rear axle, of a vehicle with tyres onto its target.
 #[must_use]
 #[inline(always)]
-pub fn demand_with_tyres(params: &DynamicParams, front_m: f64, state: &State, target: &Target) -> Input {
+pub fn demand_with_tyres(
+    params: &DynamicParams,
+    front_m: f64,
+    state: &ModelState,
+    target: &ReferencePoint,
+) -> ControlInput {
     let error = error(state, front_m, target);
     let [cos, sin] = state.heading;
     let [vx, vy] = target.velocity_mps;
     let along = vx * cos + vy * sin;
-    let driven = Driven {
+    let driven = TrackedVehicle {
         front_m,
         wheelbase_m: params.wheelbase_m,
         max_accel_mps2: params.max_accel_mps2,
@@ -178,7 +186,7 @@ pub fn demand_with_tyres(params: &DynamicParams, front_m: f64, state: &State, ta
     let rolling = steering_demand(&driven, state, [along, across], error.lateral_m);
     let slipping = angle_for(params, state, wanted);
     let share = bound((state.speed_mps - ROLLING_MPS) * (1.0 / ROLLING_MPS), 0.0, 1.0);
-    Input {
+    ControlInput {
         accel_mps2: accel_demand(&driven, state, target.accel_mps2, along, error.longitudinal_m),
         road_wheel_angle_rad: rolling + share * (slipping - rolling),
     }
@@ -186,7 +194,7 @@ pub fn demand_with_tyres(params: &DynamicParams, front_m: f64, state: &State, ta
 
 /// Road-wheel angle that accelerates the front bumper to the left by `wanted_mps2`.
 #[inline(always)]
-fn angle_for(params: &DynamicParams, state: &State, wanted_mps2: f64) -> f64 {
+fn angle_for(params: &DynamicParams, state: &ModelState, wanted_mps2: f64) -> f64 {
     let loads = params.loads_mps2(state.accel_mps2);
     let moving = 1.0 / larger(state.speed_mps, HOLD_MPS);
     let pace = larger(state.speed_mps, SLIP_SPEED_MPS) * moving;

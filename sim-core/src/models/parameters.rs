@@ -2,10 +2,10 @@
 
 use serde::Deserialize;
 
-use crate::dimensions::Dimensions;
+use super::dimensions::VehicleDimensions;
 
 /// The committed sets.
-const SETS: &str = include_str!("../data/vehicles.toml");
+const SETS: &str = include_str!("../../data/vehicles.toml");
 
 /// The parameter sets cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -24,10 +24,10 @@ pub enum ParameterError {
 /// One parameter set. SI units and radians.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Set {
+pub struct ParameterSet {
     /// Name.
     pub name: String,
-    /// Taken for a class that no set lists.
+    /// True for the set of classes that no set lists.
     pub default: bool,
     /// SUMO vehicle classes.
     pub classes: Vec<String>,
@@ -93,13 +93,13 @@ pub struct Set {
     pub source: String,
 }
 
-impl Set {
+impl ParameterSet {
     /// Size and axles of a vehicle of SUMO with this set: lengths along the body scale with its length.
     #[must_use]
-    pub fn dimensions(&self, length_m: f64, width_m: f64, height_m: f64) -> Dimensions {
+    pub fn dimensions(&self, length_m: f64, width_m: f64, height_m: f64) -> VehicleDimensions {
         let length_m = length_m.max(SHORTEST_M);
         let scale = length_m / self.length_m;
-        Dimensions {
+        VehicleDimensions {
             length_m,
             width_m,
             height_m,
@@ -110,39 +110,39 @@ impl Set {
 
     /// Mass of a vehicle of this size: it scales with length × width, kg.
     #[must_use]
-    pub fn mass_kg(&self, body: &Dimensions) -> f64 {
+    pub fn mass_kg(&self, body: &VehicleDimensions) -> f64 {
         self.mass_kg * (body.length_m / self.length_m) * (body.width_m.max(NARROWEST_M) / self.width_m)
     }
 
     /// Moment of inertia by mass, m²: it scales with the length squared.
     #[must_use]
-    pub fn yaw_inertia_by_mass_m2(&self, body: &Dimensions) -> f64 {
+    pub fn yaw_inertia_by_mass_m2(&self, body: &VehicleDimensions) -> f64 {
         let scale = body.length_m / self.length_m;
         self.yaw_inertia_kgm2 / self.mass_kg * scale * scale
     }
 
     /// Height of the centre of gravity: it scales with the height, metres.
     #[must_use]
-    pub fn cg_height_m(&self, body: &Dimensions) -> f64 {
+    pub fn cg_height_m(&self, body: &VehicleDimensions) -> f64 {
         self.cg_height_m * body.height_m.max(LOWEST_M) / self.height_m
     }
 }
 
-/// Shortest, narrowest and lowest body that is taken seriously, metres: SUMO lets a user write anything.
+/// Shortest, narrowest and lowest body that is accepted, metres: SUMO itself does not check sizes.
 const SHORTEST_M: f64 = 0.5;
 const NARROWEST_M: f64 = 0.3;
 const LOWEST_M: f64 = 0.5;
 
 /// All parameter sets.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Catalogue {
-    sets: Vec<Set>,
+pub struct ParameterCatalogue {
+    sets: Vec<ParameterSet>,
     default: usize,
 }
 
 /// Which set a vehicle gets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Choice {
+pub struct SetChoice {
     /// Index of the set.
     pub set: usize,
     /// True if a set lists the class.
@@ -151,17 +151,17 @@ pub struct Choice {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct File {
-    set: Vec<Set>,
+struct SetsFile {
+    set: Vec<ParameterSet>,
 }
 
-impl Catalogue {
+impl ParameterCatalogue {
     /// The committed sets.
     ///
     /// # Errors
     /// The committed file is damaged (a test reads it).
     pub fn new() -> Result<Self, ParameterError> {
-        let File { set: sets } = toml::from_str(SETS)?;
+        let SetsFile { set: sets } = toml::from_str(SETS)?;
         let mut defaults = sets.iter().enumerate().filter(|(_, set)| set.default);
         let default = defaults.next().map(|(index, _)| index);
         let count = usize::from(default.is_some()) + defaults.count();
@@ -173,27 +173,27 @@ impl Catalogue {
 
     /// The sets in the order of the file.
     #[must_use]
-    pub fn sets(&self) -> &[Set] {
+    pub fn sets(&self) -> &[ParameterSet] {
         &self.sets
     }
 
     /// The set for classes that none lists.
     #[must_use]
-    pub fn default_set(&self) -> &Set {
+    pub fn default_set(&self) -> &ParameterSet {
         &self.sets[self.default]
     }
 
     /// The first set that lists SUMO class `class` (UTF-8, zero padded) and admits the length; the last that lists it if none
     /// does; the default if none lists it.
     #[must_use]
-    pub fn choose(&self, class: &[u8], length_m: f64) -> Choice {
+    pub fn choose(&self, class: &[u8], length_m: f64) -> SetChoice {
         let end = class.iter().position(|&b| b == 0).unwrap_or(class.len());
-        let lists = |set: &Set| set.classes.iter().any(|known| known.as_bytes() == &class[..end]);
+        let lists = |set: &ParameterSet| set.classes.iter().any(|known| known.as_bytes() == &class[..end]);
         let mut listing = self.sets.iter().enumerate().filter(|(_, set)| lists(set));
         let fitting = listing.clone().find(|(_, set)| length_m <= set.longest_m);
         match fitting.or_else(|| listing.next_back()) {
-            Some((set, _)) => Choice { set, known: true },
-            None => Choice {
+            Some((set, _)) => SetChoice { set, known: true },
+            None => SetChoice {
                 set: self.default,
                 known: false,
             },

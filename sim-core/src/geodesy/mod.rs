@@ -4,6 +4,8 @@
 //! the net's `<location>`; a net without one gets [`origin_projection`] from the configuration. The implementation is
 //! `proj4rs`: for transverse Mercator and UTM the Poder–Engsager series, which agrees with PROJ to nanometres.
 
+pub mod displacement;
+
 use ipc_schema::run::MapInfo;
 use proj4rs::{Proj, transform::transform};
 
@@ -28,12 +30,12 @@ pub struct NetPosition {
 /// A position cannot be projected, or the projection cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum GeodesyError {
-    /// The net says it has no projection.
+    /// The net has no projection.
     #[error(
         "the net has no projection (projParameter=\"{0}\"): set `map.origin_latitude_deg` and `map.origin_longitude_deg`"
     )]
     NoProjection(String),
-    /// Not a projection this program knows.
+    /// The program does not support this projection.
     #[error("the projection \"{definition}\" cannot be used: {reason}")]
     Unsupported {
         /// PROJ string.
@@ -89,7 +91,7 @@ impl Projection {
             return Err(unsupported("its coordinates are not metres on a plane".into()));
         }
         if !net.has_inverse() || !net.has_forward() {
-            return Err(unsupported("it does not work both ways".into()));
+            return Err(unsupported("it has no inverse".into()));
         }
         let geodetic =
             Proj::from_proj_string("+proj=longlat +datum=WGS84 +no_defs").map_err(|e| unsupported(e.to_string()))?;

@@ -1,4 +1,4 @@
-//! Which model with which parameters moves which vehicle.
+//! The catalogue of vehicle models: which model with which parameters moves which vehicle.
 
 use std::collections::BTreeMap;
 
@@ -7,12 +7,13 @@ use ipc_schema::{
     traffic::{Kind, VehicleMeta},
 };
 
-use crate::{
-    dimensions::Dimensions,
+use super::{
+    dimensions::VehicleDimensions,
     dynamic::DynamicParams,
-    parameters::{Catalogue, ParameterError},
+    kinematic::KinematicParams,
+    parameters::{ParameterCatalogue, ParameterError},
     rigid_body::RigidBody,
-    vehicle::{KinematicParams, Model},
+    state::{ControlInput, ModelState, SubStepMotion},
 };
 
 /// Share of the friction on dry asphalt that a surface leaves (J. Wong, *Theory of Ground Vehicles*, table 1.5: 0.85 dry, 0.6
@@ -28,11 +29,11 @@ pub fn friction_share(surface: Surface) -> f64 {
 
 /// The vehicle models cannot be set up.
 #[derive(Debug, thiserror::Error)]
-pub enum FleetError {
+pub enum ModelCatalogueError {
     /// The parameter sets are damaged.
     #[error(transparent)]
     Parameters(#[from] ParameterError),
-    /// An entry of `vehicle.class_models` is not understood.
+    /// An entry of `vehicle.class_models` cannot be parsed.
     #[error(
         "`vehicle.class_models` has \"{entry}\": give \"class=kinematic\" or \"class=dynamic\" with a vehicle class of SUMO"
     )]
@@ -42,49 +43,70 @@ pub enum FleetError {
     },
 }
 
-/// A model for one kind and size of vehicle.
+/// A vehicle model with its parameters.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Built {
-    /// What moves it.
-    pub model: Model,
-    /// Its size.
-    pub dimensions: Dimensions,
+#[non_exhaustive]
+pub enum MotionModel {
+    /// Kinematic single-track model.
+    Kinematic(KinematicParams),
+    /// Single-track model with tyres, load transfer, roll and pitch.
+    Dynamic(DynamicParams),
 }
 
-/// The same for all vehicles that share it: parameter set, model, and size (bits of length, width and height).
-type Key = (usize, u8, [u32; 3]);
+impl MotionModel {
+    /// The state after `dt_s` seconds of `input`, and the mean motion over them.
+    #[must_use]
+    pub fn step(&self, state: &ModelState, input: &ControlInput, dt_s: f64) -> (ModelState, SubStepMotion) {
+        match self {
+            Self::Kinematic(params) => params.step(state, input, dt_s),
+            Self::Dynamic(params) => params.step(state, input, 0.0, dt_s),
+        }
+    }
+}
+
+/// A model for one kind and size of vehicle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SizedModel {
+    /// The model that moves it.
+    pub model: MotionModel,
+    /// Its size.
+    pub dimensions: VehicleDimensions,
+}
+
+/// What vehicles of one model have in common: parameter set, model, and size (bits of length, width and height).
+type ModelKey = (usize, u8, [u32; 3]);
 
 /// All models of a run, one for each kind and size of vehicle.
 #[derive(Debug)]
-pub struct Fleet {
-    catalogue: Catalogue,
+pub struct ModelCatalogue {
+    catalogue: ParameterCatalogue,
     limits: config::Vehicle,
     by_class: BTreeMap<String, VehicleModel>,
     surface: f64,
     sub_step_s: f64,
-    built: Vec<Built>,
-    places: BTreeMap<Key, u32>,
-    /// rapier's worlds, for the places whose model they are.
+    built: Vec<SizedModel>,
+    places: BTreeMap<ModelKey, u32>,
+    /// rapier's worlds of rigid bodies, by index.
     bodies: BTreeMap<u32, RigidBody>,
-    /// Classes that no set lists, and whether that has been told.
+    /// Classes that no set lists, and whether [`ModelCatalogue::take_unknown`] has returned them.
     unknown: BTreeMap<String, bool>,
 }
 
-impl Fleet {
+impl ModelCatalogue {
     /// The models of a run with sub-steps of `sub_step_s`.
     ///
     /// # Errors
     /// A class is given a model that does not exist.
-    pub fn new(limits: &config::Vehicle, surface: Surface, sub_step_s: f64) -> Result<Self, FleetError> {
+    pub fn new(limits: &config::Vehicle, surface: Surface, sub_step_s: f64) -> Result<Self, ModelCatalogueError> {
         let by_class = limits
             .class_models
             .iter()
             .map(|entry| match config::class_model(entry) {
                 Some((class, model)) => Ok((class.to_owned(), model)),
-                None => Err(FleetError::ClassModel { entry: entry.clone() }),
+                None => Err(ModelCatalogueError::ClassModel { entry: entry.clone() }),
             });
         Ok(Self {
-            catalogue: Catalogue::new()?,
+            catalogue: ParameterCatalogue::new()?,
             limits: limits.clone(),
             by_class: by_class.collect::<Result<_, _>>()?,
             surface: friction_share(surface),
@@ -97,7 +119,7 @@ impl Fleet {
     }
 
     /// Index of the model for an announced road user.
-    pub fn place(&mut self, meta: &VehicleMeta) -> u32 {
+    pub fn index_for(&mut self, meta: &VehicleMeta) -> u32 {
         let choice = self.catalogue.choose(&meta.vehicle_class, f64::from(meta.length_m));
         let class = class_text(meta);
         if !choice.known && meta.kind != Kind::Person as u32 {
@@ -120,24 +142,24 @@ impl Fleet {
         place
     }
 
-    /// Two-wheelers stay with the dynamic model: four wheels do not lean into a bend.
-    fn add_body(&mut self, place: u32, set: usize, size: &Dimensions) {
+    /// Two-wheelers keep the dynamic model: four wheels do not lean into a bend.
+    fn add_body(&mut self, place: u32, set: usize, size: &VehicleDimensions) {
         let set = &self.catalogue.sets()[set];
         if let Ok(body) = RigidBody::new(set, size, &self.limits, self.surface, self.sub_step_s) {
             self.bodies.insert(place, body);
         }
     }
 
-    /// The model at a place and, if it is that of a rigid body, rapier's world for it.
-    pub fn with_body(&mut self, place: u32) -> (&Built, Option<&mut RigidBody>) {
+    /// The model at an index and, for a rigid body, rapier's world.
+    pub fn with_body(&mut self, place: u32) -> (&SizedModel, Option<&mut RigidBody>) {
         (&self.built[place as usize], self.bodies.get_mut(&place))
     }
 
-    fn build(&self, set: usize, model: VehicleModel, [length, width, height]: [f64; 3]) -> Built {
+    fn build(&self, set: usize, model: VehicleModel, [length, width, height]: [f64; 3]) -> SizedModel {
         let set = &self.catalogue.sets()[set];
         let dimensions = set.dimensions(length, width, height);
         let model = if model != VehicleModel::Kinematic {
-            Model::Dynamic(DynamicParams::new(
+            MotionModel::Dynamic(DynamicParams::new(
                 set,
                 &dimensions,
                 &self.limits,
@@ -145,9 +167,9 @@ impl Fleet {
                 self.sub_step_s,
             ))
         } else {
-            Model::Kinematic(KinematicParams::new(set, &self.limits, dimensions.wheelbase_m))
+            MotionModel::Kinematic(KinematicParams::new(set, &self.limits, dimensions.wheelbase_m))
         };
-        Built { model, dimensions }
+        SizedModel { model, dimensions }
     }
 
     fn model_of(&self, class: &str, kind: u32) -> VehicleModel {
@@ -162,10 +184,10 @@ impl Fleet {
         })
     }
 
-    /// The model at a place given by [`Fleet::place`].
+    /// The model at an index that [`ModelCatalogue::index_for`] returned.
     #[must_use]
     #[inline]
-    pub fn at(&self, place: u32) -> &Built {
+    pub fn at(&self, place: u32) -> &SizedModel {
         &self.built[place as usize]
     }
 
@@ -177,13 +199,12 @@ impl Fleet {
 
     /// Vehicle classes met since the last call that no parameter set lists; each comes once in a run.
     pub fn take_unknown(&mut self) -> Vec<String> {
-        let untold = self.unknown.iter_mut().filter(|(_, told)| !**told);
-        untold
-            .map(|(class, told)| {
-                *told = true;
-                class.clone()
-            })
-            .collect()
+        let new = self.unknown.iter_mut().filter(|(_, returned)| !**returned);
+        new.map(|(class, returned)| {
+            *returned = true;
+            class.clone()
+        })
+        .collect()
     }
 }
 
@@ -217,43 +238,43 @@ mod tests {
         meta
     }
 
-    fn dynamic(fleet: &mut Fleet, kind: Kind, class: &str) -> bool {
-        let place = fleet.place(&meta(kind, class));
-        matches!(fleet.at(place).model, Model::Dynamic(_))
+    fn dynamic(fleet: &mut ModelCatalogue, kind: Kind, class: &str) -> bool {
+        let place = fleet.index_for(&meta(kind, class));
+        matches!(fleet.at(place).model, MotionModel::Dynamic(_))
     }
 
     #[test]
     fn models_follow_the_role_unless_the_class_says_otherwise() {
-        let mut fleet = Fleet::new(&limits(), Surface::Dry, 0.01).unwrap();
+        let mut fleet = ModelCatalogue::new(&limits(), Surface::Dry, 0.01).unwrap();
         assert!(dynamic(&mut fleet, Kind::Cav, "passenger"));
         assert!(!dynamic(&mut fleet, Kind::Other, "passenger"));
         assert!(!dynamic(&mut fleet, Kind::Cav, "bus"));
         assert!(dynamic(&mut fleet, Kind::Other, "truck"));
         let (hero, motorcycle) = (
-            fleet.place(&meta(Kind::Hero, "passenger")),
-            fleet.place(&meta(Kind::Hero, "moped")),
+            fleet.index_for(&meta(Kind::Hero, "passenger")),
+            fleet.index_for(&meta(Kind::Hero, "moped")),
         );
         assert!(fleet.with_body(hero).1.is_some());
         assert!(fleet.with_body(motorcycle).1.is_none(), "two wheels lean into a bend");
         assert_eq!(
-            fleet.place(&meta(Kind::Hero, "passenger")),
+            fleet.index_for(&meta(Kind::Hero, "passenger")),
             hero,
             "one world for all of a kind"
         );
     }
 
     #[test]
-    fn an_unknown_class_gets_the_named_default_and_is_told_once() {
-        let mut fleet = Fleet::new(&limits(), Surface::Dry, 0.01).unwrap();
+    fn an_unknown_class_gets_the_named_default_and_is_reported_once() {
+        let mut fleet = ModelCatalogue::new(&limits(), Surface::Dry, 0.01).unwrap();
         let (unknown, sedan) = (
-            fleet.place(&meta(Kind::Cav, "hovercraft")),
-            fleet.place(&meta(Kind::Cav, "passenger")),
+            fleet.index_for(&meta(Kind::Cav, "hovercraft")),
+            fleet.index_for(&meta(Kind::Cav, "passenger")),
         );
         assert_eq!(fleet.default_set(), "sedan");
         assert_eq!(fleet.at(unknown), fleet.at(sedan));
-        fleet.place(&meta(Kind::Other, "hovercraft"));
+        fleet.index_for(&meta(Kind::Other, "hovercraft"));
         assert_eq!(fleet.take_unknown(), ["hovercraft"]);
-        fleet.place(&meta(Kind::Cav, "hovercraft"));
+        fleet.index_for(&meta(Kind::Cav, "hovercraft"));
         assert!(fleet.take_unknown().is_empty());
     }
 
@@ -264,7 +285,7 @@ mod tests {
                 class_models: vec![entry.into()],
                 ..limits()
             };
-            let error = Fleet::new(&limits, Surface::Dry, 0.01).unwrap_err();
+            let error = ModelCatalogue::new(&limits, Surface::Dry, 0.01).unwrap_err();
             assert!(error.to_string().contains(entry), "{error}");
         }
     }

@@ -1,4 +1,4 @@
-//! The line that a hero is to follow, by arc length ("station").
+//! The line that a hero should follow, by arc length ("station").
 
 use ipc_schema::traffic::{NO_SIGNAL, RoutePoint};
 
@@ -13,9 +13,9 @@ pub struct StopLine {
     pub link: u32,
 }
 
-/// A place beside the route.
+/// A position relative to the route.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Place {
+pub struct RoutePosition {
     /// Station of the nearest point of the route, metres.
     pub station_m: f64,
     /// Distance from the route, positive to its left, metres.
@@ -26,7 +26,7 @@ pub struct Place {
 
 /// A polyline with speed limits and stop lines.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Route {
+pub struct HeroRoute {
     points_m: Vec<[f64; 2]>,
     stations_m: Vec<f64>,
     speed_limits_mps: Vec<f32>,
@@ -34,7 +34,7 @@ pub struct Route {
     first_edge_m: f64,
 }
 
-impl Route {
+impl HeroRoute {
     /// Adds the next point.
     pub fn push(&mut self, point: &RoutePoint) {
         let here = [point.x_m, point.y_m];
@@ -97,11 +97,11 @@ impl Route {
         Some([ax + t * (bx - ax), ay + t * (by - ay)])
     }
 
-    /// The place of `point` seen from the part of the route between two stations; `None` if no segment lies there.
+    /// The position of `point` relative to the part of the route between two stations; `None` if no segment lies there.
     #[must_use]
-    pub fn project(&self, point: [f64; 2], from_m: f64, to_m: f64) -> Option<Place> {
+    pub fn project(&self, point: [f64; 2], from_m: f64, to_m: f64) -> Option<RoutePosition> {
         let first = self.stations_m.partition_point(|end| *end < from_m).saturating_sub(1);
-        let mut nearest: Option<(f64, Place)> = None;
+        let mut nearest: Option<(f64, RoutePosition)> = None;
         for segment in first..self.points_m.len().saturating_sub(1) {
             if self.stations_m[segment] > to_m {
                 break;
@@ -114,8 +114,8 @@ impl Route {
         nearest.map(|(_, place)| place)
     }
 
-    /// Square of the distance to a segment, and the place beside it.
-    fn beside(&self, segment: usize, [x, y]: [f64; 2]) -> (f64, Place) {
+    /// Square of the distance to a segment, and the position relative to it.
+    fn beside(&self, segment: usize, [x, y]: [f64; 2]) -> (f64, RoutePosition) {
         let ([ax, ay], [bx, by]) = (self.points_m[segment], self.points_m[segment + 1]);
         let length_m = self.stations_m[segment + 1] - self.stations_m[segment];
         let [ux, uy] = [(bx - ax) / length_m, (by - ay) / length_m];
@@ -123,7 +123,7 @@ impl Route {
         let (dx, dy) = (x - ax - along_m * ux, y - ay - along_m * uy);
         let square = dx * dx + dy * dy;
         let side = if ux * dy - uy * dx < 0.0 { -1.0 } else { 1.0 };
-        let place = Place {
+        let place = RoutePosition {
             station_m: self.stations_m[segment] + along_m,
             left_m: side * square.sqrt(),
             direction: [ux, uy],
@@ -141,8 +141,8 @@ mod tests {
     use super::*;
 
     /// 100 m east, then 50 m north.
-    fn corner() -> Route {
-        let mut route = Route::default();
+    fn corner() -> HeroRoute {
+        let mut route = HeroRoute::default();
         for (index, (x_m, y_m)) in [(0.0, 0.0), (100.0, 0.0), (100.0, 50.0)].into_iter().enumerate() {
             route.push(&RoutePoint {
                 x_m,
@@ -167,7 +167,7 @@ mod tests {
             (10.0, 11.0)
         );
         assert_eq!(route.stop_lines()[0].station_m, 100.0);
-        assert_eq!(Route::default().at(0.0), None);
+        assert_eq!(HeroRoute::default().at(0.0), None);
     }
 
     #[test]

@@ -4,12 +4,12 @@ use bytemuck::{Pod, Zeroable};
 
 /// Where the front bumper should be.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Target {
+pub struct ReferencePoint {
     /// World frame, metres.
     pub position_m: [f64; 2],
     /// World frame, m/s.
     pub velocity_mps: [f64; 2],
-    /// Acceleration along the path to be felt ahead of the error, m/s².
+    /// Feed-forward acceleration along the path, m/s².
     pub accel_mps2: f64,
     /// Derivative of the velocity, world frame, m/s².
     pub bend_mps2: [f64; 2],
@@ -18,7 +18,7 @@ pub struct Target {
 /// A cubic curve in the plane: `start + a t + b t² + c t³`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
-pub struct Curve {
+pub struct ReferenceCurve {
     /// Metres.
     pub start_m: [f64; 2],
     /// Coefficients a, b, c: metres per power of a second.
@@ -27,7 +27,7 @@ pub struct Curve {
     pub accel_mps2: f64,
 }
 
-impl Curve {
+impl ReferenceCurve {
     /// A straight line.
     #[must_use]
     pub fn straight(start_m: [f64; 2], velocity_mps: [f64; 2]) -> Self {
@@ -54,11 +54,11 @@ impl Curve {
     /// Where the front bumper should be after `t_s`.
     #[must_use]
     #[inline(always)]
-    pub fn at(&self, t_s: f64) -> Target {
+    pub fn at(&self, t_s: f64) -> ReferencePoint {
         let [a, b, c] = &self.cubic;
         let position = |i: usize| self.start_m[i] + t_s * (a[i] + t_s * (b[i] + t_s * c[i]));
         let velocity = |i: usize| a[i] + t_s * (2.0 * b[i] + 3.0 * t_s * c[i]);
-        Target {
+        ReferencePoint {
             position_m: [position(0), position(1)],
             velocity_mps: [velocity(0), velocity(1)],
             accel_mps2: self.accel_mps2,
@@ -99,14 +99,14 @@ impl Curve {
 /// The road under the front bumper over one tick: height and slope, each `start + a t + b t²`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
-pub struct Rise {
+pub struct RoadRise {
     /// Height above that at the start, metres per power of a second; the first is zero.
     pub height_m: [f64; 3],
     /// Slope, positive uphill, radians per power of a second.
     pub slope_rad: [f64; 3],
 }
 
-impl Rise {
+impl RoadRise {
     /// The same road with its time and its height counted from `t_s` on.
     #[must_use]
     pub fn from_time(&self, t_s: f64) -> Self {
@@ -149,7 +149,7 @@ mod tests {
     proptest! {
         #[test]
         fn hermite_meets_both_ends(start in pair(), moved in pair(), u0 in pair(), u1 in pair(), t in 0.1_f64..1.0) {
-            let curve = Curve::hermite(start, moved, [u0, u1], t);
+            let curve = ReferenceCurve::hermite(start, moved, [u0, u1], t);
             prop_assert!(close(curve.at(0.0).position_m, start) && close(curve.at(0.0).velocity_mps, u0));
             let end = curve.at(t);
             prop_assert!(close(end.position_m, [start[0] + moved[0], start[1] + moved[1]]));
@@ -158,7 +158,7 @@ mod tests {
 
         #[test]
         fn counting_from_later_is_the_same_curve(a in pair(), b in pair(), u in pair(), s in 0.0_f64..1.0, t in 0.0_f64..1.0) {
-            let curve = Curve::hermite(a, b, [u, a], 1.0);
+            let curve = ReferenceCurve::hermite(a, b, [u, a], 1.0);
             let (later, direct) = (curve.from_time(s).at(t), curve.at(s + t));
             prop_assert!(close(later.position_m, direct.position_m) && close(later.velocity_mps, direct.velocity_mps));
         }

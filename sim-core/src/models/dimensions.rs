@@ -2,7 +2,7 @@
 
 /// Size of a vehicle and the place of its axles.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Dimensions {
+pub struct VehicleDimensions {
     /// Bumper to bumper, metres.
     pub length_m: f64,
     /// Metres.
@@ -15,7 +15,7 @@ pub struct Dimensions {
     pub rear_overhang_m: f64,
 }
 
-impl Dimensions {
+impl VehicleDimensions {
     /// Rear axle to front bumper, metres.
     #[must_use]
     pub fn front_m(&self) -> f64 {

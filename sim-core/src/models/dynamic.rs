@@ -14,20 +14,21 @@
 //!
 //! `w` and `r` are stiff at low speed (their rate is about `2 C g / u`). They are integrated by the two-stage Rosenbrock method
 //! ROS2 (J. Verwer et al., *A second-order Rosenbrock method applied to photochemical dispersion problems*, 1999), which is of
-//! second order for any Jacobian and damps stiff parts entirely: the model goes over into the kinematic one as the vehicle
+//! second order for any Jacobian and damps stiff parts entirely: the model becomes the kinematic one as the vehicle
 //! slows down, without a switch. Slip is divided by at least [`SLIP_SPEED_MPS`].
 
 use bytemuck::{Pod, Zeroable};
 use ipc_schema::config;
 
-use crate::{
-    dimensions::Dimensions,
-    parameters::Set,
-    trig::{bound, larger, pick, sin_cos_small, smaller},
-    vehicle::{
-        ACCEL_RATE_PER_S, Input, MAX_JERK_MPS3, Motion, STANDSTILL_MPS, STEERING_RATE_PER_S, State, rotate, share,
+use super::{
+    dimensions::VehicleDimensions,
+    parameters::ParameterSet,
+    state::{
+        ACCEL_RATE_PER_S, ControlInput, MAX_JERK_MPS3, ModelState, STANDSTILL_MPS, STEERING_RATE_PER_S, SubStepMotion,
+        rotate, share,
     },
 };
+use crate::trig::{bound, larger, pick, sin_cos_small, smaller};
 
 /// Acceleration of gravity, m/s².
 pub const GRAVITY_MPS2: f64 = 9.81;
@@ -39,11 +40,11 @@ const LONGITUDINAL_SHARE: f64 = 0.95;
 const FRONT_GRIP: f64 = 0.95;
 /// Least vertical load of an axle by mass, m/s²: none lifts off.
 pub(crate) const LEAST_LOAD_MPS2: f64 = 0.5;
-/// A standing vehicle that slides and turns by less than this rests (m/s and rad/s).
+/// A standing vehicle that slides and turns by less than this comes to rest (m/s and rad/s).
 pub(crate) const RESTING: f64 = 0.02;
 /// Square of the lateral force that is always left, m²/s⁴.
 const LEAST_FORCE_SQUARED: f64 = 1e-4;
-/// Share of the cornering resistance that the driver makes up for: all up to a sideslip of 0.1 at the rear axle, none from 0.25.
+/// Share of the cornering resistance that the driver compensates: all up to a sideslip of 0.1 at the rear axle, none from 0.25.
 const SLIDE: [f64; 2] = [5.0 / 3.0, 20.0 / 3.0];
 /// γ of ROS2: 1 − 1/√2.
 const GAMMA: f64 = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
@@ -51,12 +52,12 @@ const GAMMA: f64 = 1.0 - std::f64::consts::FRAC_1_SQRT_2;
 /// A damped spring over one sub-step of held input: `x ← e + M (x − e)`, e = gain · input.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-pub struct Spring {
+pub struct DampedSpring {
     gain: f64,
     step: [[f64; 2]; 2],
 }
 
-impl Spring {
+impl DampedSpring {
     /// A spring with this steady deflection by input, natural frequency (Hz, above 0) and damping ratio (below 1), for
     /// sub-steps of `dt_s`.
     #[must_use]
@@ -76,12 +77,6 @@ impl Spring {
         Self { gain, step }
     }
 
-    /// Where it rests under a held input.
-    #[must_use]
-    pub fn steady(&self, input: f64) -> f64 {
-        self.gain * input
-    }
-
     #[inline(always)]
     fn after(&self, [angle, rate]: [f64; 2], input: f64) -> [f64; 2] {
         let rest = self.gain * input;
@@ -91,7 +86,7 @@ impl Spring {
     }
 }
 
-/// Parameters of the dynamic model, made from a [`Set`] for one size of vehicle and one length of sub-step.
+/// Parameters of the dynamic model, made from a [`ParameterSet`] for one size of vehicle and one length of sub-step.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub struct DynamicParams {
@@ -124,16 +119,16 @@ pub struct DynamicParams {
     /// Rolling resistance by mass, m/s².
     pub rolling_mps2: f64,
     /// Roll by lateral acceleration.
-    pub roll: Spring,
+    pub roll: DampedSpring,
     /// Pitch by longitudinal acceleration.
-    pub pitch: Spring,
+    pub pitch: DampedSpring,
     /// Rate at which acceleration and road-wheel angle follow their demands, 1/s.
     pub actuator_rate_per_s: [f64; 2],
     /// Largest jerk of the drive and brake actuators, m/s³.
     pub max_jerk_mps3: f64,
     /// Largest curvature of the rear axle's way, 1/m.
     pub max_curvature_per_m: f64,
-    /// How the front bumper answers to forces by mass: 1 / (1 + x m/I lf) of the front and (1 − x m/I lr) of the rear axle, with the
+    /// Acceleration of the front bumper by forces by mass: 1 / (1 + x m/I lf) of the front and (1 − x m/I lr) of the rear axle, with the
     /// bumper x ahead of the centre of gravity.
     pub bumper: [f64; 2],
 }
@@ -145,7 +140,13 @@ impl DynamicParams {
     /// A vehicle of this size with a parameter set, none of its limits above the configured ones, on a road that leaves
     /// `surface` of the tyres' friction on dry asphalt.
     #[must_use]
-    pub fn new(set: &Set, body: &Dimensions, limits: &config::Vehicle, surface: f64, dt_s: f64) -> Self {
+    pub fn new(
+        set: &ParameterSet,
+        body: &VehicleDimensions,
+        limits: &config::Vehicle,
+        surface: f64,
+        dt_s: f64,
+    ) -> Self {
         let mass_kg = set.mass_kg(body);
         let cg_to_rear_m = set.front_load_share * body.wheelbase_m;
         let mass_by_inertia_per_m2 = 1.0 / set.yaw_inertia_by_mass_m2(body);
@@ -174,13 +175,13 @@ impl DynamicParams {
             share_front: [set.drive_share_front, set.brake_share_front],
             drag_by_mass_per_m: 0.5 * AIR_KGPM3 * set.drag_area_m2 / mass_kg,
             rolling_mps2: set.rolling_resistance * GRAVITY_MPS2,
-            roll: Spring::new(
+            roll: DampedSpring::new(
                 set.roll_per_mps2_rad,
                 set.roll_frequency_hz,
                 set.roll_damping_ratio,
                 dt_s,
             ),
-            pitch: Spring::new(
+            pitch: DampedSpring::new(
                 set.pitch_per_mps2_rad,
                 set.pitch_frequency_hz,
                 set.pitch_damping_ratio,
@@ -209,7 +210,7 @@ impl DynamicParams {
 
     /// Acceleration after `dt_s`: lag, bounded jerk, bounded demand.
     #[inline(always)]
-    pub(crate) fn accel_after(&self, state: &State, demand_mps2: f64, dt_s: f64) -> f64 {
+    pub(crate) fn accel_after(&self, state: &ModelState, demand_mps2: f64, dt_s: f64) -> f64 {
         let most = self.max_jerk_mps3 * dt_s;
         let lag = share(self.actuator_rate_per_s[0] * dt_s);
         let change = bound((demand_mps2 - state.accel_mps2) * lag, -most, most);
@@ -218,7 +219,7 @@ impl DynamicParams {
 
     /// Road-wheel angle after `dt_s`: lag, bounded rate, bounded angle.
     #[inline(always)]
-    pub(crate) fn road_wheel_angle_after(&self, state: &State, demand_rad: f64, dt_s: f64) -> f64 {
+    pub(crate) fn road_wheel_angle_after(&self, state: &ModelState, demand_rad: f64, dt_s: f64) -> f64 {
         let most = self.max_road_wheel_rate_radps * dt_s;
         let lag = share(self.actuator_rate_per_s[1] * dt_s);
         let change = bound((demand_rad - state.road_wheel_angle_rad) * lag, -most, most);
@@ -229,8 +230,8 @@ impl DynamicParams {
         )
     }
 
-    /// Longitudinal forces of the axles by mass for a total of `force_mps2`: shared as built. What one axle's friction cannot
-    /// take goes to the other when braking; a driven axle spins no further than its friction.
+    /// Longitudinal forces of the axles by mass for a total of `force_mps2`: shared as built. When braking, force beyond the friction
+    /// of one axle goes to the other; a driven axle spins no further than its friction.
     #[inline(always)]
     pub(crate) fn axle_forces(&self, force_mps2: f64, loads_mps2: [f64; 2]) -> [f64; 2] {
         let driving = force_mps2 > 0.0;
@@ -243,15 +244,23 @@ impl DynamicParams {
         [front, pick(driving, rear, handed_over)]
     }
 
-    /// The state after `dt_s` on a road with this sine of the slope (positive uphill), and what moved on the way.
+    /// The state after `dt_s` on a road with this sine of the slope (positive uphill), and the mean motion over it.
     #[must_use]
     #[inline(always)]
-    pub fn step(&self, state: &State, input: &Input, slope_sin: f64, dt_s: f64) -> (State, Motion) {
+    pub fn step(
+        &self,
+        state: &ModelState,
+        input: &ControlInput,
+        slope_sin: f64,
+        dt_s: f64,
+    ) -> (ModelState, SubStepMotion) {
+        // Actuators: road-wheel angle and demanded acceleration.
         let angle = self.road_wheel_angle_after(state, input.road_wheel_angle_rad, dt_s);
         let wanted = self.accel_after(state, input.accel_mps2, dt_s);
         let resistance = self.drag_by_mass_per_m * state.speed_mps * state.speed_mps
             + pick(state.speed_mps > 0.0, self.rolling_mps2, 0.0)
             + GRAVITY_MPS2 * slope_sin;
+        // Tyres at the start of the sub-step.
         let before = Slipping {
             lateral_mps: state.lateral_mps + self.cg_to_rear_m * state.yaw_rate_radps,
             yaw_rate_radps: state.yaw_rate_radps,
@@ -263,19 +272,20 @@ impl DynamicParams {
         );
         let wheels = self.wheels(state, &before, angle, loads, level, dt_s);
         let start = self.forces(&wheels, &before);
-        // What cornering costs. The driver makes up for it, but not for what a slide costs.
+        // Resistance of cornering. The driver compensates it, but not the resistance of a slide.
         let cornering = start.lateral_front_mps2 * wheels.sin - before.yaw_rate_radps * before.lateral_mps;
         let slide = state.lateral_mps.abs() * smaller(wheels.inverse_mps[1], 0.5);
         let made_up = cornering * bound(SLIDE[0] - SLIDE[1] * slide, 0.0, 1.0);
         let asked = self.force(wheels.inverse_mps[1], wanted + resistance + made_up, resistance);
         let [front, rear] = self.axle_forces(asked, loads);
         let accel = front * wheels.cos + rear - cornering - resistance;
-        // What the driver gets is the actuator's state; the losses beyond it are not, or they would add up.
+        // The actuator's state is the acceleration that the driver gets. Further losses are not part of it: they would add up.
         let got = front + rear - made_up - resistance;
         let speed = state.speed_mps + (accel - 0.5 * (got - state.accel_mps2)) * dt_s;
         let stands = (speed <= 0.0) | ((speed < STANDSTILL_MPS) & (input.accel_mps2 <= 0.0));
+        // Lateral velocity and yaw rate after the sub-step.
         let after = self.slip_after(&wheels, &before, &start, dt_s);
-        // A body that still slides sideways is stopped by its tyres alone.
+        // Only the tyres stop a body that still slides sideways.
         let rests = stands & (after.lateral_mps.abs() + after.yaw_rate_radps.abs() < RESTING);
         let after = Slipping {
             lateral_mps: pick(rests, 0.0, after.lateral_mps),
@@ -284,7 +294,8 @@ impl DynamicParams {
         let felt = (after.lateral_mps - before.lateral_mps) * (1.0 / dt_s)
             + 0.5 * (after.yaw_rate_radps + before.yaw_rate_radps) * wheels.speed_mps;
         let got = pick(stands, 0.0, got);
-        let mut next = State {
+        // The body on its springs, and the pose.
+        let mut next = ModelState {
             speed_mps: pick(stands, 0.0, speed),
             accel_mps2: got,
             road_wheel_angle_rad: angle,
@@ -310,7 +321,7 @@ impl DynamicParams {
     #[inline(always)]
     fn wheels(
         &self,
-        state: &State,
+        state: &ModelState,
         before: &Slipping,
         angle: f64,
         loads: [f64; 2],
@@ -328,7 +339,7 @@ impl DynamicParams {
                 larger(speed_mps * cos + at_front * sin, SLIP_SPEED_MPS),
                 larger(speed_mps, SLIP_SPEED_MPS),
             ),
-            // A wheel that hardly rolls forward has no direction to brake in.
+            // A wheel that hardly rolls forward has no direction in which to brake.
             drive_front_mps2: used[0] * bound(speed_mps * cos + at_front * sin, 0.0, 1.0),
             stiffness: [0, 1].map(|axle: usize| self.stiffness_per_rad[axle] * loads[axle]),
             most_squared: [0, 1].map(|axle: usize| {
@@ -339,7 +350,7 @@ impl DynamicParams {
         }
     }
 
-    /// What the tyres do at this slip, and how it changes.
+    /// Forces of the tyres at this slip, and their derivatives.
     #[inline(always)]
     fn forces(&self, wheels: &Wheels, slipping: &Slipping) -> Forces {
         let Wheels {
@@ -443,7 +454,7 @@ struct Forces {
 
 /// Moves the origin with the mean of the two velocities and turns it with the mean of the two yaw rates.
 #[inline(always)]
-pub(crate) fn carry(state: &State, next: &mut State, dt_s: f64) -> Motion {
+pub(crate) fn carry(state: &ModelState, next: &mut ModelState, dt_s: f64) -> SubStepMotion {
     let turn = 0.5 * (state.yaw_rate_radps + next.yaw_rate_radps) * dt_s;
     let (sin, cos) = sin_cos_small(0.5 * turn);
     let half_way = rotate(state.heading, cos, sin);
@@ -459,7 +470,7 @@ pub(crate) fn carry(state: &State, next: &mut State, dt_s: f64) -> Motion {
     next.y_m = state.y_m + moved[1];
     next.yaw_rad = state.yaw_rad + turn;
     next.heading = rotate(half_way, cos, sin);
-    Motion {
+    SubStepMotion {
         accel_level_mps2: [(after[0] - before[0]) * rate, (after[1] - before[1]) * rate],
         yaw_rate_radps: turn * rate,
     }

@@ -1,24 +1,24 @@
-//! What a vehicle cannot drive is taken out of its path and let back in.
+//! The governor: limits a path to what the vehicle can drive, and returns to the path afterwards.
 //!
-//! SUMO drives kinks of 80° at 17 m/s, bends at more than the tyres hold, and accelerates at 30 m/s as at 3. The reference
-//! leaves SUMO's path there: `reference = path + offset`, with an acceleration that never exceeds what the vehicle can do. Once
-//! the path is drivable again the offset returns like a critically damped spring, in the time that the vehicle drives: it
-//! freezes while the vehicle stands.
+//! SUMO drives kinks of 80° at 17 m/s, takes bends faster than the tyres allow, and accelerates at 30 m/s as at 3 m/s. The
+//! reference leaves SUMO's path there: `reference = path + offset`, with an acceleration that never exceeds what the vehicle can do. Once
+//! the path is drivable again the offset returns like a critically damped spring, in driving time: it freezes
+//! while the vehicle stands.
 
-use crate::curve::Curve;
+use super::curve::ReferenceCurve;
 
 /// Rate at which an offset returns, 1/s.
 const RETURN_PER_S: f64 = 1.2;
 /// Below this speed offsets return by distance, m/s.
 const SLOW_MPS: f64 = 3.0;
-/// Below this speed nothing is limited: what moves so slowly can be steered, m/s.
+/// Below this speed nothing is limited, because a slow vehicle can be steered, m/s.
 const CRAWL_MPS: f64 = 1.0;
-/// Offsets and their rates below this are none, metres and m/s.
+/// Offsets and rates below this count as zero, metres and m/s.
 const NONE: f64 = 1e-4;
 
 /// What a vehicle can do on a level road.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Ability {
+pub struct DrivingLimits {
     /// Largest lateral acceleration, m/s².
     pub lateral_mps2: f64,
     /// Largest curvature, 1/m.
@@ -35,7 +35,7 @@ pub struct Ability {
     pub rolling_mps2: f64,
 }
 
-impl Ability {
+impl DrivingLimits {
     /// Largest acceleration, deceleration and lateral acceleration at a speed, m/s².
     fn at(&self, speed_mps: f64) -> [f64; 3] {
         let power =
@@ -50,14 +50,14 @@ impl Ability {
 
 /// The offset of a reference from its path.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Governor {
+pub struct ReferenceGovernor {
     /// World frame, metres.
     offset_m: [f64; 2],
     /// Its rate while the vehicle moves at [`SLOW_MPS`] or more, m/s.
     rate_mps: [f64; 2],
 }
 
-impl Governor {
+impl ReferenceGovernor {
     /// Distance of the reference from its path, metres.
     #[must_use]
     pub fn distance_m(&self) -> f64 {
@@ -66,7 +66,7 @@ impl Governor {
 
     /// The reference over a tick of `tick_s` for a path over the same tick.
     #[must_use]
-    pub fn tick(&mut self, path: &Curve, tick_s: f64, ability: &Ability) -> Curve {
+    pub fn tick(&mut self, path: &ReferenceCurve, tick_s: f64, ability: &DrivingLimits) -> ReferenceCurve {
         let middle = path.at(0.5 * tick_s);
         let speed = norm(middle.velocity_mps);
         let away = self.offset_m != [0.0; 2] || self.rate_mps != [0.0; 2];
@@ -97,7 +97,7 @@ impl Governor {
             before.rate_mps.map(|rate| first * rate),
             self.rate_mps.map(|rate| last * rate),
         ];
-        let mut reference = path.plus(&Curve::hermite(before.offset_m, moved, rates, tick_s));
+        let mut reference = path.plus(&ReferenceCurve::hermite(before.offset_m, moved, rates, tick_s));
         let along = [0, 1].map(|axis: usize| (rates[1][axis] - rates[0][axis]) / tick_s * middle.velocity_mps[axis]);
         reference.accel_mps2 += (along[0] + along[1]) / speed.max(CRAWL_MPS);
         reference
@@ -112,14 +112,14 @@ fn split(accel: [f64; 2], velocity: [f64; 2], speed: f64) -> [f64; 2] {
     ]
 }
 
-fn within(accel: [f64; 2], velocity: [f64; 2], speed: f64, ability: &Ability) -> bool {
+fn within(accel: [f64; 2], velocity: [f64; 2], speed: f64, ability: &DrivingLimits) -> bool {
     let [along, left] = split(accel, velocity, speed);
     let [accel, decel, lateral] = ability.at(speed);
     along <= accel && along >= -decel && left.abs() <= lateral
 }
 
 /// The acceleration nearest to `accel` that the vehicle can do.
-fn hold(accel: [f64; 2], velocity: [f64; 2], speed: f64, ability: &Ability) -> [f64; 2] {
+fn hold(accel: [f64; 2], velocity: [f64; 2], speed: f64, ability: &DrivingLimits) -> [f64; 2] {
     let [along, left] = split(accel, velocity, speed);
     let [most, decel, lateral] = ability.at(speed);
     let (along, left) = (along.clamp(-decel, most), left.clamp(-lateral, lateral));
@@ -139,7 +139,7 @@ mod tests {
     use proptest::prelude::*;
 
     const TICK_S: f64 = 0.1;
-    const ABILITY: Ability = Ability {
+    const ABILITY: DrivingLimits = DrivingLimits {
         lateral_mps2: 7.0,
         curvature_per_m: 0.2,
         accel_mps2: 4.0,
@@ -150,17 +150,17 @@ mod tests {
     };
 
     /// A path at 15 m/s that turns at once by `angle_rad` (spread over one tick, as the path does), then goes straight.
-    fn kink(angle_rad: f64) -> impl Fn(usize) -> Curve {
+    fn kink(angle_rad: f64) -> impl Fn(usize) -> ReferenceCurve {
         move |tick| {
             let (sin, cos) = libm::sincos(angle_rad);
             let (before, after) = ([15.0, 0.0], [15.0 * cos, 15.0 * sin]);
             let mean = [0, 1].map(|i: usize| 0.5 * TICK_S * (before[i] + after[i]));
             match tick {
-                0..10 => Curve::straight([1.5 * tick as f64, 0.0], before),
-                10 => Curve::hermite([15.0, 0.0], mean, [before, after], TICK_S),
+                0..10 => ReferenceCurve::straight([1.5 * tick as f64, 0.0], before),
+                10 => ReferenceCurve::hermite([15.0, 0.0], mean, [before, after], TICK_S),
                 _ => {
                     let since = TICK_S * (tick - 11) as f64;
-                    Curve::straight([0, 1].map(|i| [15.0, 0.0][i] + mean[i] + since * after[i]), after)
+                    ReferenceCurve::straight([0, 1].map(|i| [15.0, 0.0][i] + mean[i] + since * after[i]), after)
                 }
             }
         }
@@ -170,8 +170,8 @@ mod tests {
         #[test]
         fn a_reference_can_be_driven_and_returns(angle_rad in -1.2_f64..1.2) {
             let path = kink(angle_rad);
-            let mut governor = Governor::default();
-            let mut end: Option<crate::curve::Target> = None;
+            let mut governor = ReferenceGovernor::default();
+            let mut end: Option<super::super::curve::ReferencePoint> = None;
             for tick in 0..200 {
                 let reference = governor.tick(&path(tick), TICK_S, &ABILITY);
                 let start = reference.at(0.0);
@@ -190,9 +190,9 @@ mod tests {
 
     #[test]
     fn a_drivable_path_is_left_alone() {
-        let curve = Curve::hermite([0.0, 0.0], [1.5, 0.01], [[15.0, 0.0], [15.0, 0.2]], TICK_S);
-        let mut governor = Governor::default();
+        let curve = ReferenceCurve::hermite([0.0, 0.0], [1.5, 0.01], [[15.0, 0.0], [15.0, 0.2]], TICK_S);
+        let mut governor = ReferenceGovernor::default();
         assert_eq!(governor.tick(&curve, TICK_S, &ABILITY), curve);
-        assert_eq!(governor, Governor::default());
+        assert_eq!(governor, ReferenceGovernor::default());
     }
 }

@@ -1,4 +1,4 @@
-//! The driving task's ports: `prediction` and `observation` in (who sits in which slot), `ego-pose` out.
+//! The driving task's ports: reads `prediction` and `observation` (which vehicle has which slot), publishes `ego-pose`.
 
 use std::{collections::BTreeMap, sync::Arc};
 
@@ -16,19 +16,16 @@ use ipc_schema::{
     world::{HeroView, VehicleState, WorldLayout},
 };
 
-use crate::{
-    driving::{Account, Driving, Refusal},
-    mirror::Mirror,
-    scene::Scene,
-};
+use super::{DrivingTask, HeroCounts, RefusedAction};
+use crate::{mirror::Mirror, scene::Scene};
 
-/// Numbers of an action: steering and acceleration.
+/// Values of an action: steering and acceleration.
 const ACTION_COLUMNS: u32 = 2;
 
 /// Heroes, and the ports that drive them.
 #[derive(Debug)]
-pub struct Actions {
-    driving: Driving<Arc<Scene>>,
+pub struct HeroPorts {
+    driving: DrivingTask<Arc<Scene>>,
     /// SUMO's ids of the heroes of this episode, by dense index.
     ids: BTreeMap<u32, String>,
     predictions: Subscriber,
@@ -37,15 +34,15 @@ pub struct Actions {
     bridge_wake: Waker,
 }
 
-impl Actions {
-    /// Opens the ports, before the process is attached: the trainer's first answer cannot be missed.
+impl HeroPorts {
+    /// Opens the ports before the process is attached, so that the trainer's first prediction is not lost.
     ///
     /// # Errors
     /// A service cannot be opened.
     pub fn open(session: &mut Session, scene: Arc<Scene>) -> Result<Self, Failure> {
         Ok(Self {
             ids: BTreeMap::new(),
-            driving: Driving::new(&session.run.config, scene),
+            driving: DrivingTask::new(&session.run.config, scene),
             predictions: session.subscriber(Channel::Prediction)?,
             observations: session.subscriber(Channel::Observation)?,
             poses: session.publisher(Channel::EgoPose)?,
@@ -53,19 +50,19 @@ impl Actions {
         })
     }
 
-    /// What became of the heroes so far.
+    /// Counts so far.
     #[must_use]
-    pub fn account(&self) -> Account {
-        self.driving.account()
+    pub fn counts(&self) -> HeroCounts {
+        self.driving.counts()
     }
 
-    /// Takes points of routes.
+    /// Adds points of routes.
     pub fn add_route(&mut self, header: &MessageHeader, points: &[RoutePoint]) {
         self.driving.enter_episode(header.episode);
         self.driving.add_route(points);
     }
 
-    /// Takes who came, and states of traffic lights.
+    /// Adds heroes that departed, and states of traffic lights.
     pub fn add_metas(&mut self, header: &MessageHeader, metas: &[VehicleMeta], signals: &[SignalMeta]) {
         self.driving.enter_episode(header.episode);
         for meta in metas.iter().filter(|meta| meta.kind == Kind::Hero as u32) {
@@ -74,10 +71,10 @@ impl Actions {
         self.driving.add_signals(signals);
     }
 
-    /// Waits for the answer to the observation before the tick of `frame`, and asks the heroes for what it says.
+    /// Waits for the prediction to the observation before the tick of `frame`, and applies its actions to the heroes.
     ///
     /// # Errors
-    /// A port fails, or the answer is not one of actions.
+    /// A port fails, or the prediction does not contain actions.
     pub fn take(&mut self, session: &Session, frame: &MessageHeader, mirror: &mut Mirror) -> Result<Wait, Failure> {
         self.driving.enter_episode(frame.episode);
         let Some(before) = frame.tick.checked_sub(1) else {
@@ -89,7 +86,7 @@ impl Actions {
         let Some(question) = next(session, &self.observations, Channel::Observation, before)? else {
             return Ok(Wait::Stopped);
         };
-        // The heroes of the episode before went with it.
+        // Actions of the episode before belong to heroes that ended with it.
         if question.header().episode == frame.episode {
             let actions = actions(&answer, question.header().count)?;
             let vehicles = vehicles(&question).map_err(unreadable)?;
@@ -99,11 +96,11 @@ impl Actions {
                 .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT)
             {
                 let (input, refusal) = self.driving.act(*vehicle, *action);
-                mirror.ask(*vehicle, input);
-                if let Some(Refusal { part, value, held }) = refusal {
+                mirror.set_input(*vehicle, input);
+                if let Some(RefusedAction { part, value, held }) = refusal {
                     let (id, tick) = (self.ids.get(vehicle).map_or("", String::as_str), frame.tick);
                     tracing::warn!(
-                        "hero {id}, tick {tick}: {part} {value} is not a number in -1 … 1; {held:?} is held; further refusals of this hero are counted only"
+                        "hero {id}, tick {tick}: {part} {value} is not a number in -1 … 1; {held:?} is held; further refusals of this hero are only counted"
                     );
                 }
             }
@@ -111,7 +108,7 @@ impl Actions {
         Ok(Wait::Ready)
     }
 
-    /// Ends the heroes' tick in the `world` message; where they are for SUMO.
+    /// Ends the heroes' tick in the `world` message and returns their poses for SUMO.
     ///
     /// # Errors
     /// The payload is too short.
@@ -130,7 +127,7 @@ impl Actions {
         Ok(self.driving.end_tick(states, views))
     }
 
-    /// Tells traffic-bridge where the heroes are; it waits for this after every tick.
+    /// Sends the heroes' poses to `traffic-bridge`, which waits for them after every tick.
     ///
     /// # Errors
     /// The port fails.
@@ -150,7 +147,7 @@ impl Actions {
     }
 }
 
-/// The message of `tick`; older ones are passed over. `None` once the process is asked to stop.
+/// The message of `tick`; skips older ones. `None` once the process is asked to stop.
 fn next(session: &Session, port: &Subscriber, channel: Channel, tick: u64) -> Result<Option<Message>, Failure> {
     loop {
         let Some(message) = session.next(port)? else {
@@ -171,7 +168,7 @@ fn next(session: &Session, port: &Subscriber, channel: Channel, tick: u64) -> Re
     }
 }
 
-/// The actions in an answer, one for each slot.
+/// The actions in a prediction, one for each slot.
 fn actions(answer: &Message, slots: u32) -> Result<&[[f32; 2]], Failure> {
     let header = answer.header();
     if header.columns != ACTION_COLUMNS || header.count != slots {

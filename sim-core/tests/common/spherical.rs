@@ -1,5 +1,5 @@
 //! The paper's own conversions (section III.C, equations 1 to 4): a sphere, no altitude. They are the option they are, for
-//! comparison with published results; everything else uses [`crate::geodesy`], which is exact.
+//! comparison with published results; everything else uses [`sim_core::geodesy`], which is exact.
 //!
 //! The paper's text names the origin `λ = lat_o, φ = long_o`; these functions follow the formulas with that reading.
 //! Equation 1 gives no z, so equation 2's z is the sphere's `R sin(lat)`. A sphere for the ellipsoid costs up to 0.7 %: 25 km north-east of an
@@ -8,7 +8,7 @@
 //! Equation 4 turns and does not mirror. The axes of the paper's figure 3 (x left, y backward) and those of a window (x right, y down)
 //! run round in opposite senses seen from above, so points in those axes change the sign of x first.
 
-use crate::geodesy::Geodetic;
+use sim_core::geodesy::Geodetic;
 
 /// Radius of the sphere: the equatorial radius of WGS 84, metres.
 pub const EARTH_RADIUS_M: f64 = 6_378_137.0;

@@ -1,21 +1,21 @@
-//! Persons pass through: SUMO's positions smoothed like those of vehicles, velocity and acceleration from differences.
+//! Persons: SUMO's positions, smoothed like those of vehicles, with velocity and acceleration from differences.
 
 use ipc_schema::{
     traffic::TrafficState,
     world::{SubStep, VehicleState},
 };
 
-use crate::{
-    curve::{Curve, Target},
+use super::{
+    curve::{ReferenceCurve, ReferencePoint},
     reference::half_a_step_before,
-    road_user::Settings,
-    trig::wrap_angle,
+    settings::MirrorSettings,
 };
+use crate::trig::wrap_angle;
 
 /// Motion of a person over the current SUMO step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Person {
-    curve: Curve,
+    curve: ReferenceCurve,
     /// Velocity over the last chord, world frame, m/s.
     chord_mps: [f64; 2],
     /// Heading at the start of the step and its rate, rad and rad/s.
@@ -29,7 +29,7 @@ impl Person {
     pub fn advance(&mut self, before: &TrafficState, now: &TrafficState, step_s: f64) {
         let from = [before.front_x_m, before.front_y_m];
         let chord = [(now.front_x_m - from[0]) / step_s, (now.front_y_m - from[1]) / step_s];
-        self.curve = Curve::straight(half_a_step_before(from, self.chord_mps, step_s), self.chord_mps);
+        self.curve = ReferenceCurve::straight(half_a_step_before(from, self.chord_mps, step_s), self.chord_mps);
         self.curve.cubic[1] = [0, 1].map(|axis: usize| 0.5 * (chord[axis] - self.chord_mps[axis]) / step_s);
         self.chord_mps = chord;
         let turn = wrap_angle(f64::from(now.yaw_rad) - f64::from(before.yaw_rad));
@@ -37,25 +37,25 @@ impl Person {
         self.set = false;
     }
 
-    /// Puts the person where SUMO has it, with SUMO's speed.
+    /// Sets the person to SUMO's position and speed.
     pub fn set(&mut self, now: &TrafficState, step_s: f64) {
         let (sin, cos) = libm::sincos(f64::from(now.yaw_rad));
         let speed = f64::from(now.speed_mps);
         self.chord_mps = [speed * cos, speed * sin];
         let from = half_a_step_before([now.front_x_m, now.front_y_m], self.chord_mps, step_s);
-        self.curve = Curve::straight(from, self.chord_mps);
+        self.curve = ReferenceCurve::straight(from, self.chord_mps);
         self.heading = [f64::from(now.yaw_rad), 0.0];
         self.set = true;
     }
 
-    /// Goes on as in the last step: what a person does until it is set elsewhere.
+    /// Continues as in the last step: what a person does until it is set elsewhere.
     pub fn coast(&mut self, before: &TrafficState, step_s: f64) {
         let from = half_a_step_before([before.front_x_m, before.front_y_m], self.chord_mps, step_s);
-        self.curve = Curve::straight(from, self.chord_mps);
+        self.curve = ReferenceCurve::straight(from, self.chord_mps);
         self.heading = [f64::from(before.yaw_rad), 0.0];
     }
 
-    fn at(&self, time_s: f64) -> (Target, f64) {
+    fn at(&self, time_s: f64) -> (ReferencePoint, f64) {
         let time_s = if self.set { 0.0 } else { time_s };
         (self.curve.at(time_s), self.heading[0] + time_s * self.heading[1])
     }
@@ -64,7 +64,7 @@ impl Person {
     pub(crate) fn write(
         &self,
         start_s: f64,
-        settings: &Settings,
+        settings: &MirrorSettings,
         z_m: f64,
         out: &mut VehicleState,
         rows: &mut [SubStep],

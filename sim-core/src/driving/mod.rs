@@ -1,4 +1,4 @@
-//! The driving task: actions of heroes are checked, their ways along their routes followed, and their episodes ended.
+//! The driving task: checks the actions of heroes, follows heroes along their routes, and ends their episodes.
 
 use std::{collections::BTreeMap, sync::Arc};
 
@@ -12,39 +12,40 @@ use ipc_schema::{
     },
 };
 
-use crate::{
-    hero::{self, Action},
-    route::{Place, Route},
-    scene::Scene,
-    vehicle::Input,
-};
+pub mod action;
+pub mod ports;
+pub mod route;
 
-/// A hero is off the road after this long beside it, seconds.
+use crate::{models::state::ControlInput, scene::Scene};
+use action::HeroAction;
+use route::{HeroRoute, RoutePosition};
+
+/// A hero that is beside the road for this long is off the road, seconds.
 const OFF_ROAD_AFTER_S: f64 = 0.5;
-/// Its front bumper this near to the end of its route, a hero has arrived, metres.
+/// A hero has arrived when its front bumper is this near to the end of its route, metres.
 const ARRIVED_WITHIN_M: f64 = 5.0;
-/// Part of the route before and behind its last place where a hero is looked for, metres.
+/// Part of the route behind and ahead of its last position that is searched for a hero, metres.
 const SEARCH_M: [f64; 2] = [5.0, 20.0];
-/// Room beside a hero and what it meets that still counts as in its way, metres.
+/// Room beside a hero and another road user that still counts as in the hero's way, metres.
 const SIDE_ROOM_M: f64 = 0.2;
 /// Room beside a person.
 const PERSON_ROOM_M: f64 = 0.8;
 
-/// Says whether a place (x, y, world, metres) is on the road.
-pub trait Ground {
+/// Ground that has roads (x, y, world frame, metres).
+pub trait DrivableGround {
     /// True if vehicles drive there.
     fn is_on_road(&self, x_m: f64, y_m: f64) -> bool;
 }
 
-impl Ground for Arc<Scene> {
+impl DrivableGround for Arc<Scene> {
     fn is_on_road(&self, x_m: f64, y_m: f64) -> bool {
         Scene::is_on_road(self, x_m, y_m)
     }
 }
 
-/// What became of heroes and their actions, for the run's report.
+/// Counts of heroes' episodes and actions, for the run's report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
-pub struct Account {
+pub struct HeroCounts {
     /// Episodes of heroes that began.
     pub episodes: u64,
     /// Ended by a collision.
@@ -55,30 +56,31 @@ pub struct Account {
     pub arrived: u64,
     /// Cut by the time limit.
     pub time_limit: u64,
-    /// Actions that were refused: no numbers, or out of range.
+    /// Actions that were refused: not a number, or out of range.
     pub refused_actions: u64,
 }
 
 /// An action that was refused.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Refusal {
+pub struct RefusedAction {
     /// "steering" or "acceleration".
     pub part: &'static str,
-    /// What was asked.
+    /// The value of the action.
     pub value: f32,
     /// The action that is held instead.
-    pub held: Action,
+    pub held: HeroAction,
 }
 
 /// One hero's episode.
 #[derive(Debug, Default)]
-struct Trip {
-    route: Route,
+struct HeroTrip {
+    route: HeroRoute,
     /// Station of the rear axle, metres; `None` before the first tick.
     station_m: Option<f64>,
-    action: Action,
+    action: HeroAction,
     refused: bool,
-    told: bool,
+    /// The first refusal has been returned.
+    reported: bool,
     off_road_ticks: u32,
     ticks: u64,
     over: bool,
@@ -86,19 +88,19 @@ struct Trip {
 
 /// All heroes of the current episode.
 #[derive(Debug)]
-pub struct Driving<G> {
+pub struct DrivingTask<G> {
     ground: G,
     limits: config::Vehicle,
     off_road_ticks: u32,
     time_limit_ticks: u64,
     episode: Option<u64>,
-    trips: BTreeMap<u32, Trip>,
+    trips: BTreeMap<u32, HeroTrip>,
     /// Letters of each traffic light's links.
     signals: BTreeMap<u32, [u8; SIGNAL_LINKS]>,
-    account: Account,
+    counts: HeroCounts,
 }
 
-impl<G: Ground> Driving<G> {
+impl<G: DrivableGround> DrivingTask<G> {
     /// No heroes yet.
     #[must_use]
     pub fn new(config: &config::Config, ground: G) -> Self {
@@ -111,14 +113,14 @@ impl<G: Ground> Driving<G> {
             episode: None,
             trips: BTreeMap::new(),
             signals: BTreeMap::new(),
-            account: Account::default(),
+            counts: HeroCounts::default(),
         }
     }
 
-    /// What became of the heroes so far.
+    /// Counts so far.
     #[must_use]
-    pub fn account(&self) -> Account {
-        self.account
+    pub fn counts(&self) -> HeroCounts {
+        self.counts
     }
 
     /// Forgets everything when a new episode begins.
@@ -135,7 +137,7 @@ impl<G: Ground> Driving<G> {
         for point in points {
             let trip = self.trips.entry(point.vehicle).or_default();
             if point.index == 0 {
-                trip.route = Route::default();
+                trip.route = HeroRoute::default();
             }
             trip.route.push(point);
         }
@@ -148,18 +150,18 @@ impl<G: Ground> Driving<G> {
         }
     }
 
-    /// Takes the action for the hero `vehicle` and returns what it asks for. What cannot be used is refused and counted: the
-    /// last valid action is held. The first refusal in a hero's episode is returned, to be told.
-    pub fn act(&mut self, vehicle: u32, action: Action) -> (Input, Option<Refusal>) {
+    /// Accepts the action for the hero `vehicle` and returns its control input. An unusable action is refused and counted, and the
+    /// last valid action is held. Returns the first refusal in a hero's episode, for the log.
+    pub fn act(&mut self, vehicle: u32, action: HeroAction) -> (ControlInput, Option<RefusedAction>) {
         let trip = self.trips.entry(vehicle).or_default();
         let mut refusal = None;
-        match hero::fault(action) {
+        match action::fault(action) {
             None => trip.action = action,
             Some((part, value)) => {
                 trip.refused = true;
-                self.account.refused_actions += 1;
-                if !std::mem::replace(&mut trip.told, true) {
-                    refusal = Some(Refusal {
+                self.counts.refused_actions += 1;
+                if !std::mem::replace(&mut trip.reported, true) {
+                    refusal = Some(RefusedAction {
                         part,
                         value,
                         held: trip.action,
@@ -167,10 +169,10 @@ impl<G: Ground> Driving<G> {
                 }
             }
         }
-        (hero::input(trip.action, &self.limits), refusal)
+        (action::input(trip.action, &self.limits), refusal)
     }
 
-    /// Ends a tick, after everybody has moved and contacts are known: sets the flags of heroes in `states`, fills `views` (one
+    /// Ends a tick, after all road users have moved and contacts are known: sets the flags of heroes in `states`, fills `views` (one
     /// for each hero, in their order) and returns where they are for SUMO.
     pub fn end_tick(&mut self, states: &mut [VehicleState], views: &mut [HeroView]) -> Vec<EgoPose> {
         let mut poses = Vec::new();
@@ -193,9 +195,9 @@ impl<G: Ground> Driving<G> {
     }
 
     /// Flags of a hero at the end of a tick: why its episode ends, and whether its action was refused.
-    fn judge(&mut self, trip: &mut Trip, state: &VehicleState, view: &HeroView) -> u32 {
-        let account = &mut self.account;
-        account.episodes += u64::from(state.flags & APPEARED != 0);
+    fn judge(&mut self, trip: &mut HeroTrip, state: &VehicleState, view: &HeroView) -> u32 {
+        let counts = &mut self.counts;
+        counts.episodes += u64::from(state.flags & APPEARED != 0);
         let on_road = [0.0, front_m(state)].iter().all(|ahead_m| {
             let [x_m, y_m] = ahead(state, *ahead_m);
             self.ground.is_on_road(x_m, y_m)
@@ -214,22 +216,22 @@ impl<G: Ground> Driving<G> {
         ] {
             flags |= if holds { bit } else { 0 };
         }
-        // What has ended by itself is not cut.
+        // A hero whose episode has ended by itself is not cut by the time limit.
         if (flags | state.flags) & HERO_ENDS == 0 && trip.ticks >= self.time_limit_ticks {
             flags |= TIME_LIMIT;
         }
         let ends = (flags | state.flags) & HERO_ENDS;
         if ends != 0 && !std::mem::replace(&mut trip.over, true) {
-            account.collided += u64::from(ends & COLLIDED != 0);
-            account.off_road += u64::from(ends & OFF_ROAD != 0);
-            account.arrived += u64::from(ends & ARRIVED != 0);
-            account.time_limit += u64::from(ends & TIME_LIMIT != 0);
+            counts.collided += u64::from(ends & COLLIDED != 0);
+            counts.off_road += u64::from(ends & OFF_ROAD != 0);
+            counts.arrived += u64::from(ends & ARRIVED != 0);
+            counts.time_limit += u64::from(ends & TIME_LIMIT != 0);
         }
         flags
     }
 
-    /// What the hero in `row` sees at `station_m` of its route.
-    fn view(&self, route: &Route, station_m: f64, row: usize, states: &[VehicleState]) -> HeroView {
+    /// The view of the hero in `row` at `station_m` of its route.
+    fn view(&self, route: &HeroRoute, station_m: f64, row: usize, states: &[VehicleState]) -> HeroView {
         let hero = &states[row];
         let (sin, cos) = libm::sincos(hero.yaw_rad);
         let seen = |[x, y]: [f64; 2]| {
@@ -255,8 +257,8 @@ impl<G: Ground> Driving<G> {
         }
     }
 
-    /// Way to the next stop line that is not green, metres.
-    fn signal_gap_m(&self, route: &Route, front_station_m: f64) -> f64 {
+    /// Distance to the next stop line whose signal is not green, metres.
+    fn signal_gap_m(&self, route: &HeroRoute, front_station_m: f64) -> f64 {
         let is_closed = |signal: u32, link: u32| {
             let letter = self.signals.get(&signal).and_then(|links| links.get(link as usize));
             letter.is_some_and(|letter| matches!(letter, b'r' | b'R' | b'y' | b'Y' | b'u'))
@@ -270,8 +272,8 @@ impl<G: Ground> Driving<G> {
     }
 }
 
-impl Trip {
-    /// Follows the hero along its route; the station of its rear axle, metres.
+impl HeroTrip {
+    /// Follows the hero along its route; returns the station of its rear axle, metres.
     fn follow(&mut self, state: &VehicleState) -> f64 {
         let point = [state.x_m, state.y_m];
         let (from_m, to_m) = match self.station_m {
@@ -286,7 +288,7 @@ impl Trip {
 }
 
 /// Gap to and speed of the next road user in the way of the hero in `row`: metres, m/s.
-fn leader(route: &Route, station_m: f64, row: usize, states: &[VehicleState]) -> (f64, f64) {
+fn leader(route: &HeroRoute, station_m: f64, row: usize, states: &[VehicleState]) -> (f64, f64) {
     let hero = &states[row];
     let front_station_m = station_m + front_m(hero);
     let mut found = (SIGHT_M, 0.0);
@@ -322,7 +324,7 @@ fn spine(state: &VehicleState) -> [[f64; 2]; 3] {
     [0.0, 0.5, 1.0].map(|share| ahead(state, rear_m + share * f64::from(state.length_m)))
 }
 
-fn speed_along(state: &VehicleState, place: &Place) -> f64 {
+fn speed_along(state: &VehicleState, place: &RoutePosition) -> f64 {
     let (sin, cos) = libm::sincos(state.yaw_rad);
     let [forward, left, _] = state.velocity_body_mps.map(f64::from);
     let (vx, vy) = (cos * forward - sin * left, sin * forward + cos * left);

@@ -1,71 +1,38 @@
-//! One road user in the mirror: how it takes SUMO's states in and what it does in every tick between them.
+//! One road user in the mirror: how it accepts SUMO's states and what it does in every tick between them.
 
 use ipc_schema::{
-    config,
     traffic::{DISCONTINUOUS, Kind, TrafficState, VehicleMeta},
     world::{APPEARED, RESYNCHRONISED, SubStep, VehicleState},
 };
 
-use crate::{
-    attitude::{Lean, body_from_level},
-    curve::Curve,
-    dimensions::Dimensions,
-    fleet::{Built, Fleet, FleetError},
-    hero::{self, Hero},
-    lanes::{Drive, Lanes},
+use super::{
+    batch::{BatchModel, VehicleBatch},
+    curve::ReferenceCurve,
+    hero::Hero,
     person::Person,
-    reference::{Join, Path},
-    rigid_body::RigidBody,
+    reference::{PathJoin, ReferencePath},
+    settings::MirrorSettings,
     tracking,
+};
+use crate::{
+    models::{
+        attitude::{BodyLean, body_from_level},
+        catalogue::{ModelCatalogue, SizedModel},
+        dimensions::VehicleDimensions,
+        rigid_body::RigidBody,
+        state::{ControlInput, ModelState},
+    },
     trig::wrap_angle,
-    vehicle::{Input, State},
 };
 
-/// Times of a run and limits of its vehicles.
-#[derive(Debug, Clone)]
-pub struct Settings {
-    /// Models of the vehicles and their limits.
-    pub vehicle: config::Vehicle,
-    /// What the road is covered with.
-    pub surface: config::Surface,
-    /// Length of a tick, seconds.
-    pub tick_s: f64,
-    /// Nano sub-steps in a tick.
-    pub sub_steps: u32,
-    /// Ticks in a SUMO step.
-    pub ticks_per_step: u32,
-}
-
-impl Settings {
-    /// The models of these settings.
-    ///
-    /// # Errors
-    /// A class is given a model that does not exist.
-    pub fn fleet(&self) -> Result<Fleet, FleetError> {
-        Fleet::new(&self.vehicle, self.surface, self.sub_step_s())
-    }
-
-    /// Length of a sub-step, seconds.
-    #[must_use]
-    pub fn sub_step_s(&self) -> f64 {
-        self.tick_s / f64::from(self.sub_steps)
-    }
-
-    /// Length of a SUMO step, seconds.
-    #[must_use]
-    pub fn step_s(&self) -> f64 {
-        self.tick_s * f64::from(self.ticks_per_step)
-    }
-}
-
-/// How a road user comes into the current SUMO step.
+/// How a road user enters the current SUMO step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Arrival {
-    /// It was there a step ago and moves on.
+    /// It existed a step ago and keeps moving.
     Continuing,
-    /// It was there a step ago and is set onto SUMO at the end of the step.
+    /// It existed a step ago and is set to SUMO's state at the end of the step.
     Jumping,
-    /// It is there from the end of the step on.
+    /// It exists from the end of the step on.
     Entering,
 }
 
@@ -77,8 +44,8 @@ enum Arrival {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Mover {
     /// A vehicle that tracks SUMO's front bumper.
-    Vehicle { state: State, path: Path },
-    /// A person, moved by SUMO alone.
+    Vehicle { state: ModelState, path: ReferencePath },
+    /// A person, which SUMO alone moves.
     Person(Person),
     /// A vehicle that actions move; SUMO follows it.
     Hero(Hero),
@@ -88,9 +55,9 @@ enum Mover {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RoadUser {
     id_hash: u64,
-    /// Place of its model in the [`Fleet`].
+    /// Index of its model in the [`ModelCatalogue`].
     model: u32,
-    dimensions: Dimensions,
+    dimensions: VehicleDimensions,
     mover: Mover,
     before: TrafficState,
     now: TrafficState,
@@ -104,17 +71,17 @@ pub struct RoadUser {
 impl RoadUser {
     /// A road user that SUMO has announced.
     #[must_use]
-    pub fn new(meta: &VehicleMeta, fleet: &mut Fleet) -> Self {
-        let model = fleet.place(meta);
-        let dimensions = fleet.at(model).dimensions;
+    pub fn new(meta: &VehicleMeta, catalogue: &mut ModelCatalogue) -> Self {
+        let model = catalogue.index_for(meta);
+        let dimensions = catalogue.at(model).dimensions;
         let mover = if meta.kind == Kind::Person as u32 {
             Mover::Person(Person::default())
         } else if meta.kind == Kind::Hero as u32 {
             Mover::Hero(Hero::default())
         } else {
             Mover::Vehicle {
-                state: State::new(0.0, 0.0, 0.0, 0.0),
-                path: Path::from_here(&TrafficState::default(), 0.0),
+                state: ModelState::new(0.0, 0.0, 0.0, 0.0),
+                path: ReferencePath::from_here(&TrafficState::default(), 0.0),
             }
         };
         Self {
@@ -131,7 +98,7 @@ impl RoadUser {
     }
 
     /// Takes SUMO's state at the end of the step in frame number `frame` (counted from 1).
-    pub fn accept(&mut self, now: &TrafficState, frame: u64, settings: &Settings) {
+    pub fn accept(&mut self, now: &TrafficState, frame: u64, settings: &MirrorSettings) {
         let known = self.seen_frame != 0 && self.seen_frame + 1 == frame;
         (self.before, self.now, self.seen_frame) = (self.now, *now, frame);
         self.arrival = if !known {
@@ -143,7 +110,7 @@ impl RoadUser {
         };
         match (&mut self.mover, self.arrival) {
             (_, Arrival::Entering) => {}
-            // Wherever SUMO has put a hero: it is where its model has brought it.
+            // SUMO's position of a hero does not matter: its model decides where it is.
             (Mover::Hero(_), _) => self.arrival = Arrival::Continuing,
             (Mover::Person(person), Arrival::Jumping) => person.coast(&self.before, settings.step_s()),
             (Mover::Person(person), Arrival::Continuing) => {
@@ -151,7 +118,9 @@ impl RoadUser {
             }
             (Mover::Vehicle { path, .. }, Arrival::Jumping) => path.coast(&self.before, settings.step_s()),
             (Mover::Vehicle { path, .. }, Arrival::Continuing) => {
-                if path.advance(&self.before, &self.now, self.dimensions.length_m, settings.step_s()) == Join::Broken {
+                if path.advance(&self.before, &self.now, self.dimensions.length_m, settings.step_s())
+                    == PathJoin::Broken
+                {
                     path.coast(&self.before, settings.step_s());
                     self.arrival = Arrival::Jumping;
                 }
@@ -159,10 +128,10 @@ impl RoadUser {
         }
     }
 
-    /// What a hero is asked for from now on; others do not listen.
-    pub fn ask(&mut self, input: Input) {
+    /// Sets the control input of a hero from now on; other road users ignore it.
+    pub fn set_input(&mut self, input: ControlInput) {
         if let Mover::Hero(hero) = &mut self.mover {
-            hero.ask(input);
+            hero.set_input(input);
         }
     }
 
@@ -173,49 +142,55 @@ impl RoadUser {
     }
 
     /// True if the road user is a vehicle that moves through tick `tick` (0-based within the SUMO step) by itself: its tick
-    /// goes through [`RoadUser::load`] and [`RoadUser::store`], any other's through [`RoadUser::write_unmoved`].
+    /// takes [`RoadUser::load`] and [`RoadUser::store`], any other [`RoadUser::write_unmoved`].
     #[must_use]
-    pub fn moves(&self, tick: u32, settings: &Settings) -> bool {
+    pub fn moves(&self, tick: u32, settings: &MirrorSettings) -> bool {
         matches!(self.mover, Mover::Vehicle { .. }) && !self.is_set_in(tick, settings)
     }
 
-    /// True if the road user is set onto SUMO at the end of this tick.
-    fn is_set_in(&self, tick: u32, settings: &Settings) -> bool {
+    /// True if the road user is set to SUMO's state at the end of this tick.
+    fn is_set_in(&self, tick: u32, settings: &MirrorSettings) -> bool {
         self.arrival != Arrival::Continuing && tick + 1 == settings.ticks_per_step
     }
 
-    /// Place of its model in the [`Fleet`].
+    /// Index of its model in the [`ModelCatalogue`].
     #[must_use]
     pub fn model(&self) -> u32 {
         self.model
     }
 
-    /// Puts the vehicle into a lane for one tick.
-    pub fn load<P: Drive<N>, const N: usize>(
+    /// Loads the vehicle into a batch for one tick.
+    pub fn load<P: BatchModel<N>, const N: usize>(
         &mut self,
         tick: u32,
-        settings: &Settings,
+        settings: &MirrorSettings,
         params: &P,
-        lanes: &mut Lanes<P, N>,
-        lane: usize,
+        batch: &mut VehicleBatch<P, N>,
+        member: usize,
     ) {
         if let Mover::Vehicle { state, path } = &mut self.mover {
             let start_s = f64::from(tick) * settings.tick_s;
             let spread_s = settings.vehicle.lane_change_s;
-            let curve = path.tick(start_s, settings.tick_s, state.speed_mps, spread_s, &params.ability());
+            let curve = path.tick(
+                start_s,
+                settings.tick_s,
+                state.speed_mps,
+                spread_s,
+                &params.driving_limits(),
+            );
             let rise = path.road(start_s).1;
-            lanes.load(lane, params, state, (&curve, &rise), self.dimensions.front_m());
+            batch.load(member, params, state, (&curve, &rise), self.dimensions.front_m());
         }
     }
 
-    /// Takes the vehicle out of its lane and writes the tick. Returns true if it has been set onto its path because it was
-    /// too far away.
-    pub fn store<P: Drive<N>, const N: usize>(
+    /// Takes the vehicle from its batch and writes the tick. Returns true if the vehicle was set to its path because it was too far
+    /// away.
+    pub fn store<P: BatchModel<N>, const N: usize>(
         &mut self,
         tick: u32,
-        settings: &Settings,
-        lanes: &Lanes<P, N>,
-        lane: usize,
+        settings: &MirrorSettings,
+        batch: &VehicleBatch<P, N>,
+        member: usize,
         out: &mut VehicleState,
         rows: &mut [SubStep],
     ) -> bool {
@@ -224,14 +199,14 @@ impl RoadUser {
         let Mover::Vehicle { state, path } = &mut self.mover else {
             return false;
         };
-        *state = lanes.state(lane);
+        *state = batch.state(member);
         let start_s = f64::from(tick) * settings.tick_s;
         let end_s = start_s + settings.tick_s;
         *state = state.settled();
-        lanes.write(lane, rows);
-        write_moved(state, lanes.road(lane), path.road(start_s).0, rows, out);
+        batch.write(member, rows);
+        write_moved(state, batch.road(member), path.road(start_s).0, rows, out);
         out.reference_offset_m = path.offset_m(end_s, settings.step_s()) as f32;
-        let target = lanes.curve(lane).at(settings.tick_s);
+        let target = batch.curve(member).at(settings.tick_s);
         let error = tracking::error(state, front_m, &target);
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;
         let limit = settings.vehicle.resynchronise_m;
@@ -247,13 +222,13 @@ impl RoadUser {
         self.flag(lost, out)
     }
 
-    /// Writes the tick of a person, or of a vehicle that is set onto SUMO in it. Returns true if a road user that was already
-    /// there has been set.
+    /// Writes the tick of a person or a hero, or of a vehicle that is set to SUMO's state in it. Returns true if a road user that
+    /// already existed was set.
     pub fn write_unmoved(
         &mut self,
         tick: u32,
-        settings: &Settings,
-        (built, body): (&Built, Option<&mut RigidBody>),
+        settings: &MirrorSettings,
+        (built, body): (&SizedModel, Option<&mut RigidBody>),
         out: &mut VehicleState,
         rows: &mut [SubStep],
     ) -> bool {
@@ -279,13 +254,13 @@ impl RoadUser {
                     hero.set(&self.now, front_m, out, rows);
                 } else {
                     let road = [&self.before, &self.now];
-                    let models = (&hero::model(built), body);
+                    let models = (&built.model, body);
                     hero.advance(models, road, front_m, settings.sub_step_s(), out, rows);
                 }
             }
             Mover::Vehicle { state, path } => {
                 let front_m = self.dimensions.front_m();
-                *path = Path::from_here(&self.now, settings.step_s());
+                *path = ReferencePath::from_here(&self.now, settings.step_s());
                 *state = set_onto(&path.start(), front_m, f64::from(self.now.yaw_rad));
                 write_set(state, path, 0.0, front_m, out, rows);
             }
@@ -293,7 +268,7 @@ impl RoadUser {
         self.flag(set, out)
     }
 
-    /// Flags the first tick and a set pose; returns true if the pose was set on a road user that was already there.
+    /// Flags the first tick and a set pose; returns true if the pose of a road user that already existed was set.
     fn flag(&mut self, set: bool, out: &mut VehicleState) -> bool {
         let appeared = std::mem::take(&mut self.new);
         out.flags = if appeared { APPEARED } else { 0 } | if set { RESYNCHRONISED } else { 0 };
@@ -301,14 +276,14 @@ impl RoadUser {
     }
 
     fn describe(&self, out: &mut VehicleState) {
-        let Dimensions {
+        let VehicleDimensions {
             length_m,
             width_m,
             height_m,
             wheelbase_m,
             rear_overhang_m,
         } = self.dimensions;
-        // Whatever lay there before.
+        // Overwrites whatever the loan of shared memory contained.
         *out = VehicleState::default();
         out.id_hash = self.id_hash;
         out.vehicle = self.now.vehicle;
@@ -324,10 +299,10 @@ impl RoadUser {
     }
 }
 
-/// Writes the state at the end of a tick: `road` is that of the lane (see [`Lanes::road`]), `height_m` that of the road under the
+/// Writes the state at the end of a tick: `road` is that of the lane (see [`VehicleBatch::road`]), `height_m` that of the road under the
 /// front bumper at the start of the tick.
-fn write_moved(state: &State, road: [f64; 3], height_m: f64, rows: &[SubStep], out: &mut VehicleState) {
-    let lean = Lean::of(state, road[2]);
+fn write_moved(state: &ModelState, road: [f64; 3], height_m: f64, rows: &[SubStep], out: &mut VehicleState) {
+    let lean = BodyLean::of(state, road[2]);
     out.x_m = state.x_m;
     out.y_m = state.y_m;
     out.z_m = height_m + road[0];
@@ -344,9 +319,9 @@ fn write_moved(state: &State, road: [f64; 3], height_m: f64, rows: &[SubStep], o
 }
 
 /// A state with the front bumper at the start of the curve, rolling straight ahead.
-fn set_onto(curve: &Curve, front_m: f64, yaw_rad: f64) -> State {
+fn set_onto(curve: &ReferenceCurve, front_m: f64, yaw_rad: f64) -> ModelState {
     let [vx, vy] = curve.cubic[0];
-    let mut state = State::new(
+    let mut state = ModelState::new(
         curve.start_m[0],
         curve.start_m[1],
         wrap_angle(yaw_rad),
@@ -356,12 +331,19 @@ fn set_onto(curve: &Curve, front_m: f64, yaw_rad: f64) -> State {
     state
 }
 
-/// Writes a state that was set, not reached: all sub-steps show it, nothing accelerates or turns. It stands on the road of its
-/// path at `time_s`.
-fn write_set(state: &State, path: &Path, time_s: f64, front_m: f64, out: &mut VehicleState, rows: &mut [SubStep]) {
+/// Writes a state that was set, not reached by moving: all sub-steps show it, without acceleration or rotation. The vehicle stands
+/// on the road of its path at `time_s`.
+fn write_set(
+    state: &ModelState,
+    path: &ReferencePath,
+    time_s: f64,
+    front_m: f64,
+    out: &mut VehicleState,
+    rows: &mut [SubStep],
+) {
     let (height_m, rise) = path.road(time_s);
     let [_, climb_mps, slope_rad, slope_rate] = rise.at(0.0);
-    let lean = Lean {
+    let lean = BodyLean {
         roll_rad: 0.0,
         pitch_rad: slope_rad,
     };

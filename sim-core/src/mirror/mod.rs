@@ -2,27 +2,39 @@
 //!
 //! A SUMO state that arrives is the *end* of a SUMO step. The mirror then moves through the `m` ticks of that step, the last
 //! of which ends at SUMO's own time: with `m = 1` a tick follows from each frame at once, with more the mirror knows both
-//! ends of the step it moves through. Within it vehicles follow SUMO's positions smoothed, which puts them half a SUMO step
-//! behind (see [`crate::reference`]). A road user is there from the tick at which SUMO first has it.
+//! ends of the step it moves through. Within the step vehicles follow SUMO's smoothed positions, which puts them half a SUMO step
+//! behind (see [`reference`]). A road user exists from the tick at which SUMO first has it.
 
 use ipc_schema::{
     block::{self, BlockError},
-    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader},
-    run::RunFile,
+    header::MessageHeader,
     traffic::{MetaEvent, TrafficState, VehicleMeta},
     world::{SubStep, VehicleState, WorldLayout},
 };
 
-pub use crate::road_user::Settings;
-use crate::{
+pub mod batch;
+pub mod curve;
+pub mod governor;
+pub mod hero;
+pub mod person;
+pub mod prefetch;
+pub mod reference;
+pub mod road_user;
+pub mod settings;
+pub mod statistics;
+pub mod tracking;
+
+use crate::models::{
+    catalogue::{ModelCatalogue, ModelCatalogueError, MotionModel},
     dynamic::DynamicParams,
-    fleet::{Fleet, FleetError},
-    lanes::{DYNAMIC, Drive, KINEMATIC, LANES, Lanes},
-    prefetch::Ahead,
-    road_user::RoadUser,
-    statistics::Tracking,
-    vehicle::{Input, KinematicParams, Model},
+    kinematic::KinematicParams,
+    state::ControlInput,
 };
+use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch};
+use prefetch::PrefetchRange;
+use road_user::RoadUser;
+pub use settings::MirrorSettings;
+use statistics::TrackingStatistics;
 
 /// What SUMO sent cannot be mirrored.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -51,52 +63,15 @@ pub enum MirrorError {
         /// Tick of the frame.
         tick: u64,
     },
-    /// The dense index of a road user is beyond all reason.
+    /// The dense index of a road user is out of range.
     #[error("road user {vehicle}: more than {MAX_ANNOUNCED} road users in one episode")]
     TooMany {
         /// Dense index.
         vehicle: u32,
     },
-    /// The payload does not hold what it should.
+    /// The payload is too short or misaligned.
     #[error(transparent)]
     Block(#[from] BlockError),
-}
-
-impl Settings {
-    /// The settings of a run.
-    #[must_use]
-    pub fn of_run(run: &RunFile) -> Self {
-        Self {
-            vehicle: run.config.vehicle.clone(),
-            surface: run.config.surface(),
-            tick_s: run.config.run.tick_s,
-            sub_steps: run.config.run.sub_steps,
-            ticks_per_step: u32::try_from(run.ticks_per_traffic_step()).unwrap_or(u32::MAX),
-        }
-    }
-
-    /// Header of tick `tick` (0-based within the SUMO step) from the header of the frame.
-    ///
-    /// The frame carries number and time of the last of its ticks. The first tick of the step keeps [`FIRST_OF_EPISODE`], the
-    /// last [`LAST_OF_EPISODE`], [`LAST_OF_LESSON`] and [`LAST_OF_RUN`].
-    #[must_use]
-    pub fn tick_header(&self, frame: &MessageHeader, tick: u32, count: u32) -> MessageHeader {
-        let left = self.ticks_per_step.saturating_sub(tick + 1);
-        let mut header = *frame;
-        header.tick = frame.tick.saturating_sub(u64::from(left));
-        header.sim_time_ns = frame
-            .sim_time_ns
-            .saturating_sub(u64::from(left) * libm::round(self.tick_s * 1e9) as u64);
-        header.count = count;
-        header.columns = self.sub_steps;
-        if tick > 0 {
-            header.flags &= !FIRST_OF_EPISODE;
-        }
-        if left > 0 {
-            header.flags &= !(LAST_OF_EPISODE | LAST_OF_LESSON | LAST_OF_RUN);
-        }
-        header
-    }
 }
 
 /// Not in the slab.
@@ -107,9 +82,9 @@ const MAX_ANNOUNCED: u32 = 1 << 26;
 /// All road users of the current episode.
 #[derive(Debug)]
 pub struct Mirror {
-    settings: Settings,
+    settings: MirrorSettings,
     episode: Option<u64>,
-    /// Place in `slab` of each road user by dense index, or [`NOWHERE`].
+    /// Position in `slab` of each road user by dense index, or [`NOWHERE`].
     places: Vec<u32>,
     slab: Vec<RoadUser>,
     free: Vec<u32>,
@@ -118,18 +93,18 @@ pub struct Mirror {
     /// How many of them have a state in all ticks of the step.
     in_whole_step: usize,
     frame: u64,
-    fleet: Fleet,
-    kinematic: Bank<KinematicParams, KINEMATIC>,
-    dynamic: Bank<DynamicParams, DYNAMIC>,
-    tracking: Tracking,
+    catalogue: ModelCatalogue,
+    kinematic: ModelBatch<KinematicParams, KINEMATIC>,
+    dynamic: ModelBatch<DynamicParams, DYNAMIC>,
+    tracking: TrackingStatistics,
     resynchronisations: u64,
 }
 
-/// Vehicles of one model on their way through a tick.
+/// A batch of one model, and where the states of its members belong.
 #[derive(Debug)]
-struct Bank<P, const N: usize> {
-    lanes: Lanes<P, N>,
-    /// Place and row in the message of the vehicle in each lane.
+struct ModelBatch<P, const N: usize> {
+    batch: VehicleBatch<P, N>,
+    /// Position in the slab and row in the message of each member.
     loaded: Vec<(u32, usize)>,
 }
 
@@ -138,10 +113,10 @@ impl Mirror {
     ///
     /// # Errors
     /// A class is given a model that does not exist.
-    pub fn new(settings: Settings) -> Result<Self, FleetError> {
+    pub fn new(settings: MirrorSettings) -> Result<Self, ModelCatalogueError> {
         let sub_steps = settings.sub_steps as usize;
         Ok(Self {
-            fleet: settings.fleet()?,
+            catalogue: settings.catalogue()?,
             settings,
             episode: None,
             places: Vec::new(),
@@ -150,33 +125,33 @@ impl Mirror {
             present: Vec::new(),
             in_whole_step: 0,
             frame: 0,
-            kinematic: Bank::new(sub_steps),
-            dynamic: Bank::new(sub_steps),
-            tracking: Tracking::default(),
+            kinematic: ModelBatch::new(sub_steps),
+            dynamic: ModelBatch::new(sub_steps),
+            tracking: TrackingStatistics::default(),
             resynchronisations: 0,
         })
     }
 
     /// How well vehicles have been tracked, over the run.
     #[must_use]
-    pub fn tracking(&self) -> &Tracking {
+    pub fn tracking(&self) -> &TrackingStatistics {
         &self.tracking
     }
 
     /// Name of the parameter set that unknown classes get.
     #[must_use]
     pub fn default_set(&self) -> &str {
-        self.fleet.default_set()
+        self.catalogue.default_set()
     }
 
     /// Vehicle classes met since the last call that no parameter set lists; each comes once in a run.
     pub fn take_unknown_classes(&mut self) -> Vec<String> {
-        self.fleet.take_unknown()
+        self.catalogue.take_unknown()
     }
 
     /// Times and limits.
     #[must_use]
-    pub fn settings(&self) -> &Settings {
+    pub fn settings(&self) -> &MirrorSettings {
         &self.settings
     }
 
@@ -208,7 +183,7 @@ impl Mirror {
             return Err(MirrorError::TooMany { vehicle });
         }
         self.dismiss(vehicle);
-        let road_user = RoadUser::new(meta, &mut self.fleet);
+        let road_user = RoadUser::new(meta, &mut self.catalogue);
         let place = match self.free.pop() {
             Some(place) => {
                 self.slab[place as usize] = road_user;
@@ -285,10 +260,10 @@ impl Mirror {
         }
     }
 
-    /// What the hero `vehicle` is asked for from now on.
-    pub fn ask(&mut self, vehicle: u32, input: Input) {
+    /// Sets the control input of the hero `vehicle` from now on.
+    pub fn set_input(&mut self, vehicle: u32, input: ControlInput) {
         if let Some(place) = self.place(vehicle) {
-            self.slab[place as usize].ask(input);
+            self.slab[place as usize].set_input(input);
         }
     }
 
@@ -306,7 +281,7 @@ impl Mirror {
         tick + 1 >= self.settings.ticks_per_step
     }
 
-    /// Where the arrays of tick `tick` lie in its message.
+    /// The layout of the message of tick `tick`.
     #[must_use]
     pub fn layout(&self, tick: u32) -> WorldLayout {
         WorldLayout::new(self.count(tick), self.settings.sub_steps as usize)
@@ -337,64 +312,64 @@ impl Mirror {
                 self.load(tick, place, row, states, rows);
             } else {
                 let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
-                let models = self.fleet.with_body(road_user.model());
+                let models = self.catalogue.with_body(road_user.model());
                 let set = road_user.write_unmoved(tick, &self.settings, models, &mut states[row], sub_steps);
                 self.resynchronisations += u64::from(set);
             }
         }
-        let mut follow = Follow::new(
+        let mut context = BatchContext::new(
             &self.settings,
             &mut self.slab,
             &mut self.tracking,
             &mut self.resynchronisations,
         );
-        self.kinematic.advance(tick, &mut follow, states, rows);
-        self.dynamic.advance(tick, &mut follow, states, rows);
+        self.kinematic.advance(tick, &mut context, states, rows);
+        self.dynamic.advance(tick, &mut context, states, rows);
         Ok(())
     }
 
-    /// Puts a vehicle into the lanes of its model, and moves them if they are full.
+    /// Loads a vehicle into the batch of its model, and advances the batch if it is full.
     fn load(&mut self, tick: u32, place: u32, row: usize, states: &mut [VehicleState], rows: &mut [SubStep]) {
         let Self {
             settings,
             slab,
-            fleet,
+            catalogue,
             kinematic,
             dynamic,
             tracking,
             resynchronisations,
             ..
         } = self;
-        let built = fleet.at(slab[place as usize].model());
-        let mut follow = Follow::new(settings, slab, tracking, resynchronisations);
+        let built = catalogue.at(slab[place as usize].model());
+        let mut context = BatchContext::new(settings, slab, tracking, resynchronisations);
         match &built.model {
-            Model::Kinematic(params) => {
-                if kinematic.load(tick, params, &mut follow, (place, row)) {
-                    kinematic.advance(tick, &mut follow, states, rows);
+            MotionModel::Kinematic(params) => {
+                if kinematic.load(tick, params, &mut context, (place, row)) {
+                    kinematic.advance(tick, &mut context, states, rows);
                 }
             }
-            Model::Dynamic(params) => {
-                if dynamic.load(tick, params, &mut follow, (place, row)) {
-                    dynamic.advance(tick, &mut follow, states, rows);
+            MotionModel::Dynamic(params) => {
+                if dynamic.load(tick, params, &mut context, (place, row)) {
+                    dynamic.advance(tick, &mut context, states, rows);
                 }
             }
         }
     }
 }
 
-/// What the lanes need of the mirror.
-struct Follow<'a> {
-    settings: &'a Settings,
+/// The parts of the mirror that a batch needs.
+struct BatchContext<'a> {
+    settings: &'a MirrorSettings,
     slab: &'a mut [RoadUser],
-    tracking: &'a mut Tracking,
+    tracking: &'a mut TrackingStatistics,
     resynchronisations: &'a mut u64,
 }
 
-impl<'a> Follow<'a> {
+impl<'a> BatchContext<'a> {
     fn new(
-        settings: &'a Settings,
+        settings: &'a MirrorSettings,
         slab: &'a mut [RoadUser],
-        tracking: &'a mut Tracking,
+        tracking: &'a mut TrackingStatistics,
         resynchronisations: &'a mut u64,
     ) -> Self {
         Self {
@@ -406,45 +381,51 @@ impl<'a> Follow<'a> {
     }
 }
 
-impl<P: Drive<N>, const N: usize> Bank<P, N> {
+impl<P: BatchModel<N>, const N: usize> ModelBatch<P, N> {
     fn new(sub_steps: usize) -> Self {
         Self {
-            lanes: Lanes::new(sub_steps),
-            loaded: Vec::with_capacity(LANES),
+            batch: VehicleBatch::new(sub_steps),
+            loaded: Vec::with_capacity(BATCH),
         }
     }
 
-    /// Loads the road user at a place, whose tick goes to a row of the message. True if the lanes are full.
-    fn load(&mut self, tick: u32, params: &P, follow: &mut Follow<'_>, (place, row): (u32, usize)) -> bool {
-        let lane = self.loaded.len();
-        follow.slab[place as usize].load(tick, follow.settings, params, &mut self.lanes, lane);
+    /// Loads the road user at a position of the slab, whose tick belongs to a row of the message. True if the batch is full.
+    fn load(&mut self, tick: u32, params: &P, context: &mut BatchContext<'_>, (place, row): (u32, usize)) -> bool {
+        let member = self.loaded.len();
+        context.slab[place as usize].load(tick, context.settings, params, &mut self.batch, member);
         self.loaded.push((place, row));
-        self.loaded.len() == LANES
+        self.loaded.len() == BATCH
     }
 
-    /// Moves the vehicles in the lanes through the tick and writes them.
-    fn advance(&mut self, tick: u32, follow: &mut Follow<'_>, states: &mut [VehicleState], rows: &mut [SubStep]) {
+    /// Moves the members through the tick and writes them.
+    fn advance(
+        &mut self,
+        tick: u32,
+        context: &mut BatchContext<'_>,
+        states: &mut [VehicleState],
+        rows: &mut [SubStep],
+    ) {
         if self.loaded.is_empty() {
             return;
         }
-        let per_tick = follow.settings.sub_steps as usize;
+        let per_tick = context.settings.sub_steps as usize;
         let (place, row) = self.loaded.last().copied().unwrap_or_default();
         let next = (
-            Ahead::new(follow.slab, place as usize + 1, LANES),
-            Ahead::new(rows, (row + 1) * per_tick, LANES * per_tick),
-            Ahead::new(states, row + 1, LANES),
+            PrefetchRange::new(context.slab, place as usize + 1, BATCH),
+            PrefetchRange::new(rows, (row + 1) * per_tick, BATCH * per_tick),
+            PrefetchRange::new(states, row + 1, BATCH),
         );
-        self.lanes.advance(follow.settings.sub_step_s(), &|sub_step| {
+        self.batch.advance(context.settings.sub_step_s(), &|sub_step| {
             next.0.fetch(sub_step, per_tick);
             next.1.fetch(sub_step, per_tick);
             next.2.fetch(sub_step, per_tick);
         });
-        for (lane, (place, row)) in self.loaded.drain(..).enumerate() {
+        for (member, (place, row)) in self.loaded.drain(..).enumerate() {
             let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
-            let (road_user, out) = (&mut follow.slab[place as usize], &mut states[row]);
-            let set = road_user.store(tick, follow.settings, &self.lanes, lane, out, sub_steps);
-            *follow.resynchronisations += u64::from(set);
-            follow.tracking.add(out);
+            let (road_user, out) = (&mut context.slab[place as usize], &mut states[row]);
+            let set = road_user.store(tick, context.settings, &self.batch, member, out, sub_steps);
+            *context.resynchronisations += u64::from(set);
+            context.tracking.add(out);
         }
     }
 }

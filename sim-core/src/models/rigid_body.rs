@@ -1,20 +1,20 @@
-//! The rigid-body model for heroes: rapier's ray-cast vehicle under the tyres, limits and actuators of [`crate::dynamic`].
+//! The rigid-body model for heroes: rapier's ray-cast vehicle under the tyres, limits and actuators of [`super::dynamic`].
 //!
 //! A box with mass and moments of inertia stands on four springs. In every sub-step
 //! [`rapier3d_f64::control::DynamicRayCastVehicleController`] casts a ray along each spring, presses the spring's and damper's force on
 //! the body and drives or brakes it; rapier then moves the body as a free rigid body and keeps it out of the ground. Two
-//! things of the controller are replaced, because they have no unit: its lateral constraint, by the tyre of the dynamic model
-//! at the load that each wheel's spring really has, and its clamp on friction, by that tyre's friction ellipse.
+//! parts of the controller have no physical unit and are replaced: its lateral constraint by the tyre of the dynamic model at the
+//! load of each wheel's spring, and its clamp on friction by that tyre's friction ellipse.
 //!
 //! The springs are made from the parameter set so that the body rolls by `roll_per_mps2_rad` with the frequency and damping of
 //! the set (T. Gillespie, *Fundamentals of Vehicle Dynamics*, ch. 5, 6): with mass `m`, height of the centre of gravity `h` and
 //! track `t`, each of four springs has `k = m (h / gain + g h) / t²`, the moment of inertia about the roll axis is `m h / (gain ω²)`.
-//! How far it pitches follows from the springs, its pitch frequency from the set.
+//! The springs determine how far it pitches, the set its pitch frequency.
 //!
-//! All state is in [`RigidState`], in the frame of the road: the slope tilts gravity, not the ground. rapier's world is only a
-//! workshop that is laid out anew in every sub-step, near its origin, so that nothing is lost to rounding far from it.
+//! All state is in [`RigidState`], in the frame of the road: the slope tilts gravity, not the ground. rapier's world is set
+//! up again in every sub-step near its origin, so that rounding far from the origin loses nothing.
 
-use std::f64::consts::{FRAC_PI_4, TAU};
+use std::f64::consts::TAU;
 
 use ipc_schema::config;
 use rapier3d_f64::{
@@ -26,17 +26,17 @@ use rapier3d_f64::{
     pipeline::{PhysicsWorld, QueryFilter},
 };
 
-use crate::{
-    dimensions::Dimensions,
+use super::{
+    dimensions::VehicleDimensions,
     dynamic::{DynamicParams, GRAVITY_MPS2, LEAST_LOAD_MPS2, RESTING, SLIP_SPEED_MPS, carry},
-    parameters::Set,
-    trig::{bound, larger, smaller},
-    vehicle::{Input, Motion, STANDSTILL_MPS, State, rotate},
+    parameters::ParameterSet,
+    state::{ControlInput, ModelState, STANDSTILL_MPS, SubStepMotion, rotate},
 };
+use crate::trig::{bound, larger, smaller};
 
 /// Track by width: 0.83 to 0.86 on the three cars of commonroad-vehicle-models.
 const TRACK_BY_WIDTH: f64 = 0.85;
-/// Radius of the wheels, metres. It does not matter to a ray.
+/// Radius of the wheels, metres. Rays do not depend on it.
 const WHEEL_RADIUS_M: f64 = 0.3;
 /// Height at which the springs are fixed to the body: the rays start there, metres.
 const SPRING_TOP_M: f64 = 0.6;
@@ -63,16 +63,16 @@ pub enum RigidBodyError {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RigidState {
     /// Position, heading, roll and pitch against the road, and their rates. Speeds are along the heading and to its left.
-    pub level: State,
+    pub level: ModelState,
     /// Height of the origin above the road and its rate, metres and m/s.
     pub heave: [f64; 2],
     /// Acceleration that the driver has by drive and brakes: the actuator's state, m/s².
     pub drive_mps2: f64,
 }
 
-impl From<State> for RigidState {
+impl From<ModelState> for RigidState {
     /// A body on springs at rest.
-    fn from(level: State) -> Self {
+    fn from(level: ModelState) -> Self {
         Self {
             level,
             heave: [0.0; 2],
@@ -81,26 +81,18 @@ impl From<State> for RigidState {
     }
 }
 
-impl RigidState {
-    /// True if the body does not come back onto its wheels: it leans by more than 45°.
-    #[must_use]
-    pub fn is_overturned(&self) -> bool {
-        self.level.roll[0].abs() > FRAC_PI_4 || self.level.pitch[0].abs() > FRAC_PI_4
-    }
-}
-
 /// Forces of the axles by mass, m/s².
-struct Drive {
+struct AxleForces {
     front_mps2: f64,
     rear_mps2: f64,
     /// Drag and rolling resistance.
     resistance_mps2: f64,
-    /// What the driver gets of what he wants: less than it where power, brakes or friction end.
+    /// Acceleration that the driver gets: less than demanded where power, brakes or friction are exhausted.
     got_mps2: f64,
 }
 
 /// The body in rapier's world at the start of a sub-step.
-struct Moving {
+struct BodyMotion {
     cg_m: Vector,
     velocity_mps: Vector,
     spin_radps: Vector,
@@ -137,8 +129,8 @@ impl RigidBody {
     /// # Errors
     /// The set is one of a vehicle that leans into bends.
     pub fn new(
-        set: &Set,
-        body: &Dimensions,
+        set: &ParameterSet,
+        body: &VehicleDimensions,
         limits: &config::Vehicle,
         surface: f64,
         dt_s: f64,
@@ -149,7 +141,7 @@ impl RigidBody {
         let params = DynamicParams::new(set, body, limits, surface, dt_s);
         let (lf, lr, height) = (params.cg_to_front_m(), params.cg_to_rear_m, set.cg_height_m(body));
         let turn = params.mass_by_inertia_per_m2 * (lf * lf + lr * lr);
-        let suspension = Suspension::new(set, &params, body, height, dt_s);
+        let suspension = SuspensionTuning::new(set, &params, body, height, dt_s);
         let mass_kg = set.mass_kg(body);
         let cg_m = Vector::new(lr, 0.0, height);
         let mut world = PhysicsWorld::new();
@@ -164,7 +156,7 @@ impl RigidBody {
             .additional_mass_properties(MassProperties::new(cg_m, mass_kg, inertia))
             .can_sleep(false);
         let (chassis, _) = world.insert(chassis, box_of(body, surface));
-        // Makes rapier know the ground.
+        // Registers the ground in rapier's broad phase.
         world.step();
         Ok(Self {
             params,
@@ -179,8 +171,8 @@ impl RigidBody {
     }
 
     /// The state after one sub-step of `input` on a road with this sine of the slope along the heading (positive uphill), and
-    /// what moved on the way.
-    pub fn step(&mut self, before: &RigidState, input: &Input, slope_sin: f64) -> (RigidState, Motion) {
+    /// the mean motion over it.
+    pub fn step(&mut self, before: &RigidState, input: &ControlInput, slope_sin: f64) -> (RigidState, SubStepMotion) {
         let state = &before.level;
         let angle = self
             .params
@@ -195,10 +187,10 @@ impl RigidBody {
         self.read(before, input, angle, &drive)
     }
 
-    /// Shares the acceleration that the driver gets between the axles; he makes up for resistance, slope and cornering.
-    fn drive(&self, before: &RigidState, input: &Input, slope_sin: f64, angle_rad: f64) -> Drive {
+    /// Shares the acceleration that the driver gets between the axles; the driver compensates resistance, slope and cornering.
+    fn drive(&self, before: &RigidState, input: &ControlInput, slope_sin: f64, angle_rad: f64) -> AxleForces {
         let (params, state) = (&self.params, &before.level);
-        let actuator = State {
+        let actuator = ModelState {
             accel_mps2: before.drive_mps2,
             ..*state
         };
@@ -224,7 +216,7 @@ impl RigidBody {
         let grip = params.friction * loads[0];
         let mut forces = [0.0; 2];
         let mut cornering = 0.0;
-        // Twice: what cornering costs depends on the lateral force that driving leaves to the front tyres.
+        // Twice: the resistance of cornering depends on the lateral force that driving leaves to the front tyres.
         for _ in 0..2 {
             let left = larger(grip * grip - forces[0] * forces[0], 0.0).sqrt();
             let lateral = tyre(params.stiffness_per_rad[0] * loads[0], left, front_mps);
@@ -232,7 +224,7 @@ impl RigidBody {
             let total = bound(wanted + opposing + cornering, -params.max_decel_mps2, most);
             forces = params.axle_forces(total, loads);
         }
-        Drive {
+        AxleForces {
             front_mps2: forces[0],
             rear_mps2: forces[1],
             resistance_mps2,
@@ -240,8 +232,8 @@ impl RigidBody {
         }
     }
 
-    /// Puts the body into rapier's world: heading along x, origin above the world's.
-    fn place(&mut self, before: &RigidState) -> Moving {
+    /// Sets the body in rapier's world: heading along x, origin above the world's origin.
+    fn place(&mut self, before: &RigidState) -> BodyMotion {
         let state = &before.level;
         let rotation = lean(state.roll[0], state.pitch[0]);
         let (sin, cos) = libm::sincos(state.pitch[0]);
@@ -254,7 +246,7 @@ impl RigidBody {
         let chassis = &mut self.world.bodies[self.chassis];
         chassis.set_position(Pose::from_parts(Vector::new(0.0, 0.0, before.heave[0]), rotation), true);
         let lever = rotation * self.cg_m;
-        let moving = Moving {
+        let moving = BodyMotion {
             cg_m: Vector::new(lever.x, lever.y, lever.z + before.heave[0]),
             velocity_mps: velocity + spin.cross(lever),
             spin_radps: spin,
@@ -265,7 +257,7 @@ impl RigidBody {
     }
 
     /// Gravity, drag and rolling resistance. The slope turns gravity, so that the ground can stay where it is.
-    fn weigh(&mut self, drive: &Drive, slope_sin: f64) {
+    fn weigh(&mut self, drive: &AxleForces, slope_sin: f64) {
         let slope_cos = (1.0 - slope_sin * slope_sin).max(0.0).sqrt();
         let force_by_mass = Vector::new(
             -GRAVITY_MPS2 * slope_sin - drive.resistance_mps2,
@@ -275,8 +267,8 @@ impl RigidBody {
         self.world.bodies[self.chassis].apply_impulse(force_by_mass * (self.mass_kg * self.dt_s), true);
     }
 
-    /// rapier's part: rays, springs, dampers, driving and braking forces.
-    fn press_and_drive(&mut self, drive: &Drive, angle_rad: f64) {
+    /// Runs rapier's controller: rays, springs, dampers, driving and braking forces.
+    fn press_and_drive(&mut self, drive: &AxleForces, angle_rad: f64) {
         let driving = drive.front_mps2 + drive.rear_mps2 > 0.0;
         for (index, wheel) in self.wheels.wheels_mut().iter_mut().enumerate() {
             let front = index < 2;
@@ -295,8 +287,8 @@ impl RigidBody {
         self.wheels.update_vehicle(self.dt_s, queries);
     }
 
-    /// Lateral forces of the four tyres, at the slip at the start of the sub-step: by now the springs have begun to turn the body.
-    fn grip(&mut self, moving: &Moving) {
+    /// Lateral forces of the four tyres, at the slip at the start of the sub-step: later the springs have begun to turn the body.
+    fn grip(&mut self, moving: &BodyMotion) {
         let chassis = &mut self.world.bodies[self.chassis];
         let mut impulses = [(Vector::ZERO, Vector::ZERO); 4];
         for (index, (wheel, impulse)) in self.wheels.wheels().iter().zip(&mut impulses).enumerate() {
@@ -323,8 +315,14 @@ impl RigidBody {
         }
     }
 
-    /// Takes the velocities out of rapier's world; the pose follows from the mean of the velocities before and after.
-    fn read(&self, before: &RigidState, input: &Input, angle_rad: f64, drive: &Drive) -> (RigidState, Motion) {
+    /// Reads the velocities from rapier's world; the pose follows from the mean of the velocities before and after.
+    fn read(
+        &self,
+        before: &RigidState,
+        input: &ControlInput,
+        angle_rad: f64,
+        drive: &AxleForces,
+    ) -> (RigidState, SubStepMotion) {
         let (state, dt) = (&before.level, self.dt_s);
         let chassis = &self.world.bodies[self.chassis];
         let (velocity, spin) = (chassis.linvel(), chassis.angvel());
@@ -346,7 +344,7 @@ impl RigidBody {
         let stands = speed <= 0.0 || (speed < STANDSTILL_MPS && input.accel_mps2 <= 0.0);
         let speed = if stands { 0.0 } else { speed };
         let rests = stands && at_origin.y.abs() + yaw_rate.abs() < RESTING;
-        let mut level = State {
+        let mut level = ModelState {
             speed_mps: speed,
             accel_mps2: (speed - state.speed_mps) / dt,
             road_wheel_angle_rad: angle_rad,
@@ -367,7 +365,7 @@ impl RigidBody {
 }
 
 /// Springs and moments of inertia, by mass.
-struct Suspension {
+struct SuspensionTuning {
     /// Front and rear spring, 1/s².
     stiffness: [f64; 2],
     /// Front and rear damper, 1/s.
@@ -379,18 +377,18 @@ struct Suspension {
     inertia_by_mass_m2: Vector,
 }
 
-impl Suspension {
-    fn new(set: &Set, params: &DynamicParams, body: &Dimensions, height_m: f64, dt_s: f64) -> Self {
+impl SuspensionTuning {
+    fn new(set: &ParameterSet, params: &DynamicParams, body: &VehicleDimensions, height_m: f64, dt_s: f64) -> Self {
         let track = TRACK_BY_WIDTH * body.width_m;
         let roll_natural = TAU * set.roll_frequency_hz;
         let pitch_natural = TAU * set.pitch_frequency_hz;
-        // What is left of the springs' moment after that of the weight.
+        // The springs' moment less that of the weight.
         let roll_moment = height_m / set.roll_per_mps2_rad;
         let spring = (roll_moment + GRAVITY_MPS2 * height_m) / (track * track);
         let damper = 2.0 * set.roll_damping_ratio * roll_moment / (roll_natural * track * track);
         let (lf, lr) = (params.cg_to_front_m(), params.cg_to_rear_m);
         let pitch_moment = 4.0 * spring * lf * lr - GRAVITY_MPS2 * height_m;
-        // As the load is shared: heave and pitch leave each other alone.
+        // As the load is shared, so that heave and pitch are decoupled.
         let shares = [2.0 * lr / params.wheelbase_m, 2.0 * lf / params.wheelbase_m];
         Self {
             stiffness: shares.map(|share| share * spring),
@@ -437,7 +435,7 @@ impl Suspension {
 }
 
 /// The body's box, without mass of its own.
-fn box_of(body: &Dimensions, friction: f64) -> ColliderBuilder {
+fn box_of(body: &VehicleDimensions, friction: f64) -> ColliderBuilder {
     let floor = FLOOR_BY_HEIGHT * body.height_m;
     ColliderBuilder::cuboid(
         0.5 * body.length_m,
@@ -453,7 +451,7 @@ fn box_of(body: &Dimensions, friction: f64) -> ColliderBuilder {
     .friction(friction)
 }
 
-/// Lateral force of a tyre that rolls with `[along, across]` its plane: that of [`crate::dynamic`].
+/// Lateral force of a tyre that rolls with `[along, across]` its plane: that of [`super::dynamic`].
 fn tyre(stiffness: f64, most: f64, [along_mps, across_mps]: [f64; 2]) -> f64 {
     let linear = -stiffness * across_mps / larger(along_mps.abs(), SLIP_SPEED_MPS);
     let saturation = linear / larger(most, LEAST_LOAD_MPS2 * 0.01);

@@ -1,4 +1,4 @@
-//! The path a mirror follows between two SUMO states: where the front bumper should be, and how fast, at any time in between.
+//! The path that a mirrored vehicle follows between two SUMO states: position and speed of the front bumper at any time.
 //!
 //! SUMO's positions are those of its Euler update: the new speed holds for the whole step, so the speed jumps where a step
 //! begins, and its headings are chords from rear to front bumper. The path is therefore built from the positions alone, as
@@ -7,28 +7,28 @@
 //! to Splines*, chapter IX). It cannot overshoot, has no jump in velocity, and cuts a corner by an eighth of the change of
 //! chord. The price: the mirror runs half a SUMO step behind SUMO (0.05 s at steps of 0.1 s), all road users alike.
 //!
-//! Height and slope of the road run the same way. SUMO changes lanes in one step. The sideways jump is taken out of the path and
-//! let back in over a configured time with a minimum-jerk profile, as far as the vehicle moves at all.
+//! Height and slope of the road are smoothed the same way. SUMO changes lanes in one step: the mirror removes the sideways jump from
+//! the path and returns it over a configured time with a minimum-jerk profile, while the vehicle moves.
 
 use ipc_schema::traffic::TrafficState;
 
-use crate::{
-    curve::{Curve, Rise},
-    governor::{Ability, Governor},
-    trig::wrap_angle,
+use super::{
+    curve::{ReferenceCurve, RoadRise},
+    governor::{DrivingLimits, ReferenceGovernor},
 };
+use crate::trig::wrap_angle;
 
 /// Shortest distance over which it is spread, metres.
 const LANE_CHANGE_M: f64 = 12.0;
 /// Sideways jump within one SUMO step that counts as a lane change, metres.
 const LANE_JUMP_M: f64 = 1.0;
-/// Further than this nobody changes lanes in one step, metres.
+/// No vehicle changes lanes by more than this in one step, metres.
 const LANE_JUMP_MOST_M: f64 = 5.0;
 /// A step that turns the vehicle by more than this is a turn, not a lane change, radians.
 const LANE_JUMP_TURN_RAD: f64 = 0.35;
-/// A step longer than this plus twice what the speed explains is no driving, metres.
+/// A step longer than this plus twice the distance at the vehicle's speed is not driving, metres.
 const UNEXPLAINED_M: f64 = 2.0;
-/// Slower than this at both ends of a step, a sideways jump is no lane change, m/s.
+/// Slower than this at both ends of a step, a sideways jump is not a lane change, m/s.
 const MOVING_MPS: f64 = 0.1;
 
 /// A sideways offset on its way to zero.
@@ -57,8 +57,8 @@ impl LaneChange {
 
 /// How a new SUMO state joins the path so far.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Join {
-    /// The path goes on.
+pub enum PathJoin {
+    /// The path continues.
     Continued,
     /// No vehicle moves like that: the mirror has to be set.
     Broken,
@@ -66,25 +66,25 @@ pub enum Join {
 
 /// The path over the current SUMO step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Path {
+pub struct ReferencePath {
     /// Without the offset of a lane change.
-    curve: Curve,
+    curve: ReferenceCurve,
     /// SUMO's heading at the start of the step and its rate, rad and rad/s.
     heading: [f64; 2],
     /// Velocity over the last chord, m/s.
     chord_mps: [f64; 2],
     /// Road under the front bumper over the step, from `height_m` on.
-    rise: Rise,
+    rise: RoadRise,
     height_m: f64,
     /// Rates of height and slope over the last chord, m/s and rad/s.
     rising: [f64; 2],
     /// SUMO's path over the step: start, and the two half chords that the curve rounds.
     chords: [[f64; 2]; 3],
     lane_change: LaneChange,
-    governor: Governor,
+    governor: ReferenceGovernor,
 }
 
-impl Path {
+impl ReferencePath {
     /// The path of a road user seen for the first time, or set anew, in a simulation with steps of `step_s`: straight ahead.
     #[must_use]
     pub fn from_here(now: &TrafficState, step_s: f64) -> Self {
@@ -93,29 +93,29 @@ impl Path {
         let velocity = [speed * cos, speed * sin];
         let start_m = half_a_step_before([now.front_x_m, now.front_y_m], velocity, step_s);
         let mut path = Self {
-            curve: Curve::straight(start_m, velocity),
+            curve: ReferenceCurve::straight(start_m, velocity),
             heading: [f64::from(now.yaw_rad), 0.0],
             chord_mps: velocity,
-            rise: Rise::default(),
+            rise: RoadRise::default(),
             height_m: 0.0,
             rising: [speed * libm::tan(f64::from(now.pitch_rad)), 0.0],
             chords: [start_m, start_m, start_m],
             lane_change: LaneChange::default(),
-            governor: Governor::default(),
+            governor: ReferenceGovernor::default(),
         };
         path.climb(now, path.rising, step_s);
         path
     }
 
     /// Takes the step from `before` to `now`, `step_s` later, of a body of `length_m`.
-    pub fn advance(&mut self, before: &TrafficState, now: &TrafficState, length_m: f64, step_s: f64) -> Join {
+    pub fn advance(&mut self, before: &TrafficState, now: &TrafficState, length_m: f64, step_s: f64) -> PathJoin {
         let mut start_m = [before.front_x_m, before.front_y_m];
         let mut moved_m = [now.front_x_m - start_m[0], now.front_y_m - start_m[1]];
         let turn = wrap_angle(f64::from(now.yaw_rad) - f64::from(before.yaw_rad));
         let speed_mps = f64::from(before.speed_mps.max(now.speed_mps));
         if let Some(jump) = sideways_jump(moved_m, f64::from(before.yaw_rad) + 0.5 * turn, turn, length_m) {
             if speed_mps < MOVING_MPS || jump.left_m.abs() > LANE_JUMP_MOST_M {
-                return Join::Broken;
+                return PathJoin::Broken;
             }
             for axis in 0..2 {
                 start_m[axis] += jump.vector_m[axis];
@@ -127,20 +127,20 @@ impl Path {
             };
         }
         if norm(moved_m) > 2.0 * speed_mps * step_s + UNEXPLAINED_M {
-            return Join::Broken;
+            return PathJoin::Broken;
         }
         self.heading = [f64::from(before.yaw_rad), turn / step_s];
         self.bend(start_m, moved_m, step_s);
         let slope_change = f64::from(now.pitch_rad) - f64::from(before.pitch_rad);
         let rising = [now.front_z_m - before.front_z_m, slope_change].map(|change| change / step_s);
         self.climb(before, rising, step_s);
-        Join::Continued
+        PathJoin::Continued
     }
 
-    /// Goes on as in the last step: what a road user does until it is set elsewhere.
+    /// Continues as in the last step: what a road user does until it is set elsewhere.
     pub fn coast(&mut self, before: &TrafficState, step_s: f64) {
         let start_m = half_a_step_before([before.front_x_m, before.front_y_m], self.chord_mps, step_s);
-        self.curve = Curve::straight(start_m, self.chord_mps);
+        self.curve = ReferenceCurve::straight(start_m, self.chord_mps);
         self.heading = [f64::from(before.yaw_rad), 0.0];
         self.chords = [start_m; 3];
         self.climb(before, self.rising, step_s);
@@ -151,7 +151,7 @@ impl Path {
         let [height, slope] = [0, 1].map(|i: usize| 0.5 * (rising[i] - self.rising[i]) / step_s);
         self.height_m = from.front_z_m - 0.5 * step_s * self.rising[0];
         let slope_rad = f64::from(from.pitch_rad) - 0.5 * step_s * self.rising[1];
-        self.rise = Rise {
+        self.rise = RoadRise {
             height_m: [0.0, self.rising[0], height],
             slope_rad: [slope_rad, self.rising[1], slope],
         };
@@ -160,12 +160,12 @@ impl Path {
 
     /// Height of the road and the road itself from `start_s` after the start of the step on.
     #[must_use]
-    pub fn road(&self, start_s: f64) -> (f64, Rise) {
+    pub fn road(&self, start_s: f64) -> (f64, RoadRise) {
         (self.height_m + self.rise.at(start_s)[0], self.rise.from_time(start_s))
     }
 
-    /// How far the reference is from SUMO's own path `t_s` after the start of the step of `step_s`, at most: what is left of a lane change,
-    /// what the curve cuts off the corner, and what could not be driven, metres.
+    /// How far the reference is from SUMO's own path `t_s` after the start of the step of `step_s`, at most: the sum of the rest of a lane change, the distance by which the curve cuts the corner,
+    /// and the distance that could not be driven, metres.
     #[must_use]
     pub fn offset_m(&self, t_s: f64, step_s: f64) -> f64 {
         let undriven = self.lane_change.remaining()[0].abs() + self.governor.distance_m();
@@ -182,7 +182,7 @@ impl Path {
     /// From the middle of the last chord to the middle of this one.
     fn bend(&mut self, start_m: [f64; 2], moved_m: [f64; 2], step_s: f64) {
         let (before, chord) = (self.chord_mps, moved_m.map(|moved| moved / step_s));
-        self.curve = Curve::straight(half_a_step_before(start_m, before, step_s), before);
+        self.curve = ReferenceCurve::straight(half_a_step_before(start_m, before, step_s), before);
         self.curve.cubic[1] = [0, 1].map(|axis: usize| 0.5 * (chord[axis] - before[axis]) / step_s);
         self.curve.accel_mps2 = (norm(chord) - norm(before)) / step_s;
         self.chords = [
@@ -194,22 +194,29 @@ impl Path {
     }
 
     /// The reference over one tick that starts `start_s` after the start of the step, for a vehicle at this speed, which
-    /// carries a lane change that takes `spread_s` on, kept to what the vehicle is able to do.
-    pub fn tick(&mut self, start_s: f64, tick_s: f64, speed_mps: f64, spread_s: f64, ability: &Ability) -> Curve {
+    /// continues a lane change that takes `spread_s`, limited to what the vehicle can do.
+    pub fn tick(
+        &mut self,
+        start_s: f64,
+        tick_s: f64,
+        speed_mps: f64,
+        spread_s: f64,
+        ability: &DrivingLimits,
+    ) -> ReferenceCurve {
         let path = self.with_lane_change(start_s, tick_s, speed_mps, spread_s);
         self.governor.tick(&path, tick_s, ability)
     }
 
     /// The path itself at the start of the step.
     #[must_use]
-    pub fn start(&self) -> Curve {
+    pub fn start(&self) -> ReferenceCurve {
         self.curve
     }
 
-    /// Forgets lane change and offset, and gives SUMO's own path from `t_s` after the start of the step on.
-    pub fn resynchronise(&mut self, t_s: f64) -> Curve {
+    /// Drops lane change and offset, and returns SUMO's own path from `t_s` after the start of the step on.
+    pub fn resynchronise(&mut self, t_s: f64) -> ReferenceCurve {
         self.lane_change = LaneChange::default();
-        self.governor = Governor::default();
+        self.governor = ReferenceGovernor::default();
         self.curve.from_time(t_s)
     }
 
@@ -219,7 +226,7 @@ impl Path {
         self.governor.distance_m()
     }
 
-    fn with_lane_change(&mut self, start_s: f64, tick_s: f64, speed_mps: f64, spread_s: f64) -> Curve {
+    fn with_lane_change(&mut self, start_s: f64, tick_s: f64, speed_mps: f64, spread_s: f64) -> ReferenceCurve {
         let curve = self.curve.from_time(start_s);
         if self.lane_change.offset_m == 0.0 {
             return curve;
@@ -231,7 +238,7 @@ impl Path {
         if self.lane_change.phase >= 1.0 {
             self.lane_change = LaneChange::default();
         }
-        curve.plus(&Curve::hermite(
+        curve.plus(&ReferenceCurve::hermite(
             from,
             [to[0] - from[0], to[1] - from[1]],
             [u0, u1],
@@ -239,7 +246,7 @@ impl Path {
         ))
     }
 
-    /// What is left of a lane change, to the left of SUMO's heading at `t_s`: offset and its velocity, world frame.
+    /// The rest of a lane change, to the left of SUMO's heading at `t_s`: offset and its velocity, world frame.
     fn shift(&self, t_s: f64, phase_rate_per_s: f64) -> [[f64; 2]; 2] {
         let [offset, slope] = self.lane_change.remaining();
         let (sin, cos) = libm::sincos(self.heading_at(t_s));
@@ -258,7 +265,7 @@ impl Path {
 }
 
 /// A lane change in one step.
-struct Jump {
+struct LaneJump {
     /// World frame, metres.
     vector_m: [f64; 2],
     /// Positive to the left, metres.
@@ -268,7 +275,7 @@ struct Jump {
 /// The sideways part of a chord that the heading half-way and the turn do not explain, if it is a lane change.
 ///
 /// SUMO's heading is the chord of the body, so in a turn the front bumper moves `turn · length / 2` further to the inside.
-fn sideways_jump(chord_m: [f64; 2], heading_rad: f64, turn_rad: f64, length_m: f64) -> Option<Jump> {
+fn sideways_jump(chord_m: [f64; 2], heading_rad: f64, turn_rad: f64, length_m: f64) -> Option<LaneJump> {
     let far = dot(chord_m, chord_m) > LANE_JUMP_M * LANE_JUMP_M;
     if !far || turn_rad.abs() > LANE_JUMP_TURN_RAD {
         return None;
@@ -276,7 +283,7 @@ fn sideways_jump(chord_m: [f64; 2], heading_rad: f64, turn_rad: f64, length_m: f
     let (sin, cos) = libm::sincos(heading_rad);
     let left_m = -chord_m[0] * sin + chord_m[1] * cos;
     let unexplained_m = left_m - 0.5 * turn_rad * length_m;
-    (unexplained_m.abs() > LANE_JUMP_M).then(|| Jump {
+    (unexplained_m.abs() > LANE_JUMP_M).then(|| LaneJump {
         vector_m: [-left_m * sin, left_m * cos],
         left_m,
     })

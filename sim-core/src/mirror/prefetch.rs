@@ -1,17 +1,17 @@
-//! Asking for memory before it is needed: with tens of thousands of vehicles the mirror waits for memory as long as it computes,
-//! unless the lines of the next vehicles come in while those in the lanes move.
+//! Prefetching: with tens of thousands of vehicles the mirror waits for memory as long as it computes, unless the cache lines of
+//! the next vehicles arrive while the current batch moves.
 
 /// Bytes that the processor fetches at a time.
 const LINE: usize = 64;
 
-/// A stretch of memory that will be needed soon.
+/// A range of memory that will be needed soon.
 #[derive(Debug, Clone, Copy)]
-pub struct Ahead {
+pub struct PrefetchRange {
     start: *const i8,
     lines: usize,
 }
 
-impl Ahead {
+impl PrefetchRange {
     /// Up to `count` values from `first` on.
     #[must_use]
     pub fn new<T>(values: &[T], first: usize, count: usize) -> Self {
@@ -23,7 +23,7 @@ impl Ahead {
         }
     }
 
-    /// Asks for one of `parts` equal parts.
+    /// Prefetches one of `parts` equal parts.
     #[inline(always)]
     pub fn fetch(self, part: usize, parts: usize) {
         let (from, to) = (self.lines * part / parts, self.lines * (part + 1) / parts);

@@ -1,0 +1,363 @@
+//! A batch of vehicles: the tracker and one model on [`BATCH`] vehicles side by side, for all sub-steps of a tick.
+//!
+//! One vehicle alone is a chain of some 300 dependent operations in each sub-step, and the processor waits for each of them:
+//! 0.7 µs per tick of 10 sub-steps, measured. A batch fills its vector units. The functions are those of [`super::tracking`] and
+//! [`crate::models`]. No operation is fused or reordered, so every vehicle gets the same bits as alone, on any machine.
+
+use bytemuck::Pod;
+use ipc_schema::world::SubStep;
+
+use super::{
+    curve::{ReferenceCurve, ReferencePoint, RoadRise},
+    governor::DrivingLimits,
+    tracking::{self, TrackedVehicle},
+};
+use crate::models::{
+    attitude::{BodyLean, FeltMotion},
+    dynamic::{DynamicParams, GRAVITY_MPS2},
+    kinematic::KinematicParams,
+    state::{ControlInput, ModelState, SubStepMotion},
+};
+
+/// Vehicles in a batch: two registers of AVX-512 or eight of SSE2 for each number.
+pub const BATCH: usize = 16;
+
+/// Shares of a vehicle's friction, steering and power that references use; the tracker uses the rest to follow them.
+const LATERAL_SHARE: f64 = 0.6;
+const LONGITUDINAL_SHARE: f64 = 0.85;
+const POWER_SHARE: f64 = 0.8;
+const CURVATURE_SHARE: f64 = 0.9;
+
+/// Time between two demands of the tracker, seconds.
+const DEMAND_S: f64 = 0.02;
+
+/// One number of each member.
+type BatchColumn = [f64; BATCH];
+/// Numbers in a [`ModelState`], a [`ReferenceCurve`] and a [`RoadRise`].
+const STATE: usize = size_of::<ModelState>() / 8;
+const CURVE: usize = size_of::<ReferenceCurve>() / 8;
+const RISE: usize = size_of::<RoadRise>() / 8;
+/// Numbers in a [`SubStep`].
+const SUB_STEP: usize = size_of::<SubStep>() / 4;
+
+/// A model with `N` parameters that can run in a batch: free of branches.
+pub trait BatchModel<const N: usize>: Pod {
+    /// The demand that brings the front bumper, `front_m` ahead of the rear axle, to `target`.
+    fn demand(&self, front_m: f64, state: &ModelState, target: &ReferencePoint) -> ControlInput;
+    /// The state after `dt_s`, and the mean motion over it.
+    fn step(&self, state: &ModelState, input: &ControlInput, slope_sin: f64, dt_s: f64) -> (ModelState, SubStepMotion);
+    /// The limits that a reference respects.
+    fn driving_limits(&self) -> DrivingLimits;
+    /// Parameters that keep the numbers of an empty member finite.
+    fn empty() -> [f64; N];
+}
+
+/// Parameters of the kinematic model.
+pub const KINEMATIC: usize = size_of::<KinematicParams>() / 8;
+/// Parameters of the dynamic model.
+pub const DYNAMIC: usize = size_of::<DynamicParams>() / 8;
+
+impl BatchModel<KINEMATIC> for KinematicParams {
+    #[inline(always)]
+    fn demand(&self, front_m: f64, state: &ModelState, target: &ReferencePoint) -> ControlInput {
+        tracking::demand(&TrackedVehicle::new(self, front_m), state, target)
+    }
+
+    #[inline(always)]
+    fn step(&self, state: &ModelState, input: &ControlInput, _: f64, dt_s: f64) -> (ModelState, SubStepMotion) {
+        Self::step(self, state, input, dt_s)
+    }
+
+    fn driving_limits(&self) -> DrivingLimits {
+        DrivingLimits {
+            lateral_mps2: self.max_lateral_mps2,
+            curvature_per_m: CURVATURE_SHARE * self.max_curvature_per_m,
+            accel_mps2: self.max_accel_mps2,
+            decel_mps2: self.max_decel_mps2,
+            power_by_mass: f64::INFINITY,
+            drag_by_mass_per_m: 0.0,
+            rolling_mps2: 0.0,
+        }
+    }
+
+    fn empty() -> [f64; KINEMATIC] {
+        [1.0; KINEMATIC]
+    }
+}
+
+impl BatchModel<DYNAMIC> for DynamicParams {
+    #[inline(always)]
+    fn demand(&self, front_m: f64, state: &ModelState, target: &ReferencePoint) -> ControlInput {
+        tracking::demand_with_tyres(self, front_m, state, target)
+    }
+
+    #[inline(always)]
+    fn step(&self, state: &ModelState, input: &ControlInput, slope_sin: f64, dt_s: f64) -> (ModelState, SubStepMotion) {
+        Self::step(self, state, input, slope_sin, dt_s)
+    }
+
+    fn driving_limits(&self) -> DrivingLimits {
+        let friction = self.friction * GRAVITY_MPS2;
+        DrivingLimits {
+            lateral_mps2: LATERAL_SHARE * friction,
+            curvature_per_m: CURVATURE_SHARE * self.max_curvature_per_m,
+            accel_mps2: self.max_accel_mps2.min(LONGITUDINAL_SHARE * friction),
+            decel_mps2: self.max_decel_mps2.min(LONGITUDINAL_SHARE * friction),
+            power_by_mass: POWER_SHARE * self.max_power_by_mass,
+            drag_by_mass_per_m: self.drag_by_mass_per_m,
+            rolling_mps2: self.rolling_mps2,
+        }
+    }
+
+    fn empty() -> [f64; DYNAMIC] {
+        [0.25; DYNAMIC]
+    }
+}
+
+/// Motion of all members over one sub-step in the order of [`SubStep`]; the first four fields count from the start of the tick.
+pub type BatchRow = [[f32; BATCH]; SUB_STEP];
+
+/// Vehicles of one model side by side.
+#[derive(Debug, Clone)]
+pub struct VehicleBatch<P, const N: usize> {
+    state: [BatchColumn; STATE],
+    curve: [BatchColumn; CURVE],
+    rise: [BatchColumn; RISE],
+    front_m: BatchColumn,
+    params: [BatchColumn; N],
+    /// Height of the rear axle above the road under the front bumper at the start of the tick (metres), its rate (m/s), and the
+    /// pitch of the road (radians).
+    road: [BatchColumn; 3],
+    /// x, y, z and yaw at the start of the tick.
+    origin: [BatchColumn; 4],
+    /// Demanded acceleration and road-wheel angle.
+    input: [BatchColumn; 2],
+    /// The motion, one row for each sub-step.
+    pub rows: Vec<BatchRow>,
+    model: std::marker::PhantomData<P>,
+}
+
+#[inline(always)]
+fn scatter<T: Pod, const N: usize>(batch: &mut [BatchColumn; N], member: usize, value: &T) {
+    let numbers: &[f64; N] = bytemuck::must_cast_ref(value);
+    for (place, number) in batch.iter_mut().zip(numbers) {
+        place[member] = *number;
+    }
+}
+
+#[inline(always)]
+fn gather<T: Pod, const N: usize>(batch: &[BatchColumn; N], member: usize) -> T {
+    bytemuck::must_cast(std::array::from_fn::<f64, N, _>(|i| batch[i][member]))
+}
+
+impl<P: BatchModel<N>, const N: usize> VehicleBatch<P, N> {
+    /// An empty batch for `sub_steps` sub-steps.
+    #[must_use]
+    pub fn new(sub_steps: usize) -> Self {
+        let zero = [0.0; BATCH];
+        let mut batch = Self {
+            state: [zero; STATE],
+            curve: [zero; CURVE],
+            rise: [zero; RISE],
+            front_m: [1.0; BATCH],
+            params: P::empty().map(|value| [value; BATCH]),
+            road: [zero; 3],
+            origin: [zero; 4],
+            input: [zero; 2],
+            rows: vec![[[0.0; BATCH]; SUB_STEP]; sub_steps],
+            model: std::marker::PhantomData,
+        };
+        let standing = ModelState::new(0.0, 0.0, 0.0, 0.0);
+        (0..BATCH).for_each(|member| scatter(&mut batch.state, member, &standing));
+        batch
+    }
+
+    /// Loads a vehicle as `member`, with its reference and the road under its front bumper, `front_m` ahead of the rear axle.
+    pub fn load(
+        &mut self,
+        member: usize,
+        params: &P,
+        state: &ModelState,
+        reference: (&ReferenceCurve, &RoadRise),
+        front_m: f64,
+    ) {
+        scatter(&mut self.state, member, state);
+        scatter(&mut self.curve, member, reference.0);
+        scatter(&mut self.rise, member, reference.1);
+        scatter(&mut self.params, member, params);
+        self.front_m[member] = front_m;
+    }
+
+    /// Writes the sub-steps of a member, relative to the last of them.
+    pub fn write(&self, member: usize, rows: &mut [SubStep]) {
+        let Some(last) = self.rows.last() else { return };
+        let end: [f32; 4] = std::array::from_fn(|i| last[i][member]);
+        for (row, moved) in rows.iter_mut().zip(&self.rows) {
+            let mut numbers: [f32; SUB_STEP] = std::array::from_fn(|i| moved[i][member]);
+            numbers.iter_mut().zip(end).for_each(|(number, end)| *number -= end);
+            *row = bytemuck::must_cast(numbers);
+        }
+    }
+
+    /// Height of the rear axle above the road under the front bumper at the start of the tick (metres), its rate (m/s), and the
+    /// pitch of the road (radians), at the end of the tick.
+    #[must_use]
+    pub fn road(&self, member: usize) -> [f64; 3] {
+        gather(&self.road, member)
+    }
+
+    /// The state of a member.
+    #[must_use]
+    #[inline(always)]
+    pub fn state(&self, member: usize) -> ModelState {
+        gather(&self.state, member)
+    }
+
+    /// The reference of a member.
+    #[must_use]
+    #[inline(always)]
+    pub fn curve(&self, member: usize) -> ReferenceCurve {
+        gather(&self.curve, member)
+    }
+
+    /// Tracks all members through one tick of `rows.len()` sub-steps, with the widest vectors of this machine. Calls `meanwhile` with
+    /// the number of each sub-step: there the mirror prefetches the next vehicles.
+    pub fn advance(&mut self, dt_s: f64, meanwhile: &impl Fn(usize)) {
+        #[cfg(target_arch = "x86_64")]
+        #[expect(
+            unsafe_code,
+            reason = "calls of functions compiled for more than the baseline processor: twice as fast"
+        )]
+        {
+            if std::arch::is_x86_feature_detected!("avx512f") {
+                // SAFETY: this condition has just found the feature on this processor.
+                return unsafe { self.advance_avx512(dt_s, meanwhile) };
+            }
+            if std::arch::is_x86_feature_detected!("avx2") {
+                // SAFETY: as above.
+                return unsafe { self.advance_avx2(dt_s, meanwhile) };
+            }
+        }
+        self.advance_here(dt_s, meanwhile);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx512f")]
+    fn advance_avx512(&mut self, dt_s: f64, meanwhile: &impl Fn(usize)) {
+        self.advance_here(dt_s, meanwhile);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn advance_avx2(&mut self, dt_s: f64, meanwhile: &impl Fn(usize)) {
+        self.advance_here(dt_s, meanwhile);
+    }
+
+    /// The same code for every processor: compiled anew into each caller.
+    #[inline(always)]
+    fn advance_here(&mut self, dt_s: f64, meanwhile: &impl Fn(usize)) {
+        let mut rows = std::mem::take(&mut self.rows);
+        self.start_road();
+        let between = between_demands(dt_s);
+        for (index, row) in rows.iter_mut().enumerate() {
+            let time_s = index as f64 * dt_s;
+            if index.is_multiple_of(between) {
+                self.update_demands(time_s);
+            }
+            self.sub_step(time_s, dt_s, row);
+            meanwhile(index);
+        }
+        self.rows = rows;
+    }
+
+    /// The road under the rear axle at the start of the tick.
+    #[inline(always)]
+    fn start_road(&mut self) {
+        for member in 0..BATCH {
+            let road = road_at(&gather(&self.rise, member), self.front_m[member], 0.0);
+            scatter(&mut self.road, member, &road);
+            let state: ModelState = gather(&self.state, member);
+            scatter(
+                &mut self.origin,
+                member,
+                &[state.x_m, state.y_m, road[0], state.yaw_rad],
+            );
+        }
+    }
+
+    /// Updates the demands of all members.
+    #[inline(always)]
+    fn update_demands(&mut self, time_s: f64) {
+        for member in 0..BATCH {
+            let (state, params): (ModelState, P) = (gather(&self.state, member), gather(&self.params, member));
+            let input = params.demand(self.front_m[member], &state, &self.curve(member).at(time_s));
+            scatter(&mut self.input, member, &[input.accel_mps2, input.road_wheel_angle_rad]);
+        }
+    }
+
+    /// One sub-step of all members: the loop that the compiler turns into vector instructions.
+    #[inline(always)]
+    fn sub_step(&mut self, time_s: f64, dt_s: f64, row: &mut BatchRow) {
+        for member in 0..BATCH {
+            let state: ModelState = gather(&self.state, member);
+            let params: P = gather(&self.params, member);
+            let front_m = self.front_m[member];
+            let road: [f64; 3] = gather(&self.road, member);
+            let [accel_mps2, road_wheel_angle_rad] = gather(&self.input, member);
+            let input = ControlInput {
+                accel_mps2,
+                road_wheel_angle_rad,
+            };
+            let (next, motion) = params.step(&state, &input, road[2], dt_s);
+            let road_next = road_at(&gather(&self.rise, member), front_m, time_s + dt_s);
+            let leans = [BodyLean::of(&state, road[2]), BodyLean::of(&next, road_next[2])];
+            let rate = 1.0 / dt_s;
+            let felt = FeltMotion::new(leans, &motion, (road_next[1] - road[1]) * rate, rate);
+            scatter(&mut self.state, member, &next);
+            scatter(&mut self.road, member, &road_next);
+            let origin: [f64; 4] = gather(&self.origin, member);
+            let numbers = [
+                next.x_m - origin[0],
+                next.y_m - origin[1],
+                road_next[0] - origin[2],
+                next.yaw_rad - origin[3],
+                leans[1].roll_rad,
+                leans[1].pitch_rad,
+                next.speed_mps,
+                next.lateral_mps,
+                felt.accel_mps2[0],
+                felt.accel_mps2[1],
+                felt.accel_mps2[2],
+                felt.rate_radps[0],
+                felt.rate_radps[1],
+                felt.rate_radps[2],
+                next.road_wheel_angle_rad,
+                0.0,
+            ];
+            for (field, number) in row.iter_mut().zip(numbers) {
+                field[member] = number as f32;
+            }
+        }
+    }
+}
+
+/// Sub-steps of `dt_s` from one demand to the next: the tracker updates demands 50 times a second, as often as a steering actuator
+/// that follows at 20/s needs.
+fn between_demands(dt_s: f64) -> usize {
+    libm::round(DEMAND_S / dt_s).max(1.0) as usize
+}
+
+/// Height of the rear axle above the road under the front bumper at the start of the tick, its rate, and the pitch of the road,
+/// `time_s` into the tick. The slope stands for its own sine and tangent: an error of 0.3 % at a slope of 10 %.
+#[inline(always)]
+fn road_at(rise: &RoadRise, front_m: f64, time_s: f64) -> [f64; 3] {
+    let [height_m, climb_mps, slope_rad, slope_rate] = rise.at(time_s);
+    [
+        height_m - front_m * slope_rad,
+        climb_mps - front_m * slope_rate,
+        slope_rad,
+    ]
+}
+
+#[cfg(test)]
+mod tests;

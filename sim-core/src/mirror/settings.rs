@@ -1,0 +1,81 @@
+//! Times of a run and limits of its vehicles, as the mirror needs them.
+
+use ipc_schema::{
+    config,
+    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader},
+    run::RunFile,
+};
+
+use crate::models::catalogue::{ModelCatalogue, ModelCatalogueError};
+
+/// Times of a run and limits of its vehicles.
+#[derive(Debug, Clone)]
+pub struct MirrorSettings {
+    /// Models of the vehicles and their limits.
+    pub vehicle: config::Vehicle,
+    /// What the road is covered with.
+    pub surface: config::Surface,
+    /// Length of a tick, seconds.
+    pub tick_s: f64,
+    /// Nano sub-steps in a tick.
+    pub sub_steps: u32,
+    /// Ticks in a SUMO step.
+    pub ticks_per_step: u32,
+}
+
+impl MirrorSettings {
+    /// The models of these settings.
+    ///
+    /// # Errors
+    /// A class is given a model that does not exist.
+    pub fn catalogue(&self) -> Result<ModelCatalogue, ModelCatalogueError> {
+        ModelCatalogue::new(&self.vehicle, self.surface, self.sub_step_s())
+    }
+
+    /// Length of a sub-step, seconds.
+    #[must_use]
+    pub fn sub_step_s(&self) -> f64 {
+        self.tick_s / f64::from(self.sub_steps)
+    }
+
+    /// Length of a SUMO step, seconds.
+    #[must_use]
+    pub fn step_s(&self) -> f64 {
+        self.tick_s * f64::from(self.ticks_per_step)
+    }
+
+    /// The settings of a run.
+    #[must_use]
+    pub fn of_run(run: &RunFile) -> Self {
+        Self {
+            vehicle: run.config.vehicle.clone(),
+            surface: run.config.surface(),
+            tick_s: run.config.run.tick_s,
+            sub_steps: run.config.run.sub_steps,
+            ticks_per_step: u32::try_from(run.ticks_per_traffic_step()).unwrap_or(u32::MAX),
+        }
+    }
+
+    /// Header of tick `tick` (0-based within the SUMO step) from the header of the frame.
+    ///
+    /// The frame carries number and time of the last of its ticks. The first tick of the step keeps [`FIRST_OF_EPISODE`], the
+    /// last [`LAST_OF_EPISODE`], [`LAST_OF_LESSON`] and [`LAST_OF_RUN`].
+    #[must_use]
+    pub fn tick_header(&self, frame: &MessageHeader, tick: u32, count: u32) -> MessageHeader {
+        let left = self.ticks_per_step.saturating_sub(tick + 1);
+        let mut header = *frame;
+        header.tick = frame.tick.saturating_sub(u64::from(left));
+        header.sim_time_ns = frame
+            .sim_time_ns
+            .saturating_sub(u64::from(left) * libm::round(self.tick_s * 1e9) as u64);
+        header.count = count;
+        header.columns = self.sub_steps;
+        if tick > 0 {
+            header.flags &= !FIRST_OF_EPISODE;
+        }
+        if left > 0 {
+            header.flags &= !(LAST_OF_EPISODE | LAST_OF_LESSON | LAST_OF_RUN);
+        }
+        header
+    }
+}
