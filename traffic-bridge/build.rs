@@ -11,16 +11,16 @@ const SUMO_HOME_VARIABLE: &str = "CARAWARE_SUMO_HOME";
 
 fn main() {
     for file in [
-        "sumo.rs",
+        "libsumo.rs",
         "shim.h",
         "shim.cc",
-        "control.cc",
+        "population.cc",
         "heroes.cc",
         "lanes.h",
         "error_tee.h",
         "text.h",
     ] {
-        println!("cargo:rerun-if-changed=src/{file}");
+        println!("cargo:rerun-if-changed=src/sumo/{file}");
     }
     println!("cargo:rerun-if-env-changed={SUMO_HOME_VARIABLE}");
     let Some(sumo) = sumo_home() else {
@@ -30,8 +30,8 @@ fn main() {
         );
         exit(1);
     };
-    cxx_build::bridge("src/sumo.rs")
-        .files(["src/shim.cc", "src/control.cc", "src/heroes.cc"])
+    cxx_build::bridge("src/sumo/libsumo.rs")
+        .files(["src/sumo/shim.cc", "src/sumo/population.cc", "src/sumo/heroes.cc"])
         .std("c++17")
         .include(sumo.join("include"))
         .flag_if_supported("-Wno-unused-parameter")
@@ -45,7 +45,7 @@ fn link(sumo: &Path) {
     println!("cargo:rustc-link-search=native={}", library.display());
     println!("cargo:rustc-link-lib=dylib=sumocpp");
     println!("cargo:rustc-link-arg=-Wl,-rpath,{}", library.display());
-    // Tests and examples find the wheel's scenarios and tools here; the program itself is told by its run file.
+    // Tests and examples find the wheel's scenarios and tools here; the program itself reads the path from its run file.
     println!("cargo:rustc-env=CARAWARE_BUILD_SUMO_HOME={}", sumo.display());
 }
 

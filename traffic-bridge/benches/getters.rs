@@ -6,16 +6,13 @@ use std::{
 };
 
 use traffic_bridge::{
-    error::SumoError,
-    frame::Frame,
-    options::Options,
-    population::{Population, Size},
-    session::{Session, processor_time_s},
+    population::{Population, PopulationSize},
+    sumo::{Sumo, error::SumoError, frame::TrafficFrame, options::SumoOptions, processor_time_s},
 };
 
 const STEPS: usize = 3000;
 const WARM_UP_STEPS: usize = 100;
-const SIZE: Size = Size {
+const SIZE: PopulationSize = PopulationSize {
     cavs: 250,
     others: 250,
     heroes: 0,
@@ -23,7 +20,7 @@ const SIZE: Size = Size {
 };
 
 /// A grid of 12 × 12 junctions, 150 m apart, of this type.
-fn grid(sumo: &Path, folder: &Path, junctions: &str) -> std::io::Result<PathBuf> {
+fn grid(sumo_home: &Path, folder: &Path, junctions: &str) -> std::io::Result<PathBuf> {
     let net = folder.join("grid.net.xml");
     let size = [
         "--grid",
@@ -35,8 +32,8 @@ fn grid(sumo: &Path, folder: &Path, junctions: &str) -> std::io::Result<PathBuf>
         "2",
         "-o",
     ];
-    Command::new(sumo.join("bin/netgenerate"))
-        .env("SUMO_HOME", sumo)
+    Command::new(sumo_home.join("bin/netgenerate"))
+        .env("SUMO_HOME", sumo_home)
         .args(["--default-junction-type", junctions])
         .args(size)
         .arg(&net)
@@ -44,24 +41,24 @@ fn grid(sumo: &Path, folder: &Path, junctions: &str) -> std::io::Result<PathBuf>
     Ok(net)
 }
 
-fn measure(net: &Path, sumo: &Path) -> Result<(), SumoError> {
-    let mut session = Session::start(Options::population(sumo, net, &[], 0.1, 1)?)?;
-    let mut population = Population::start(&mut session, SIZE, &[], 1)?;
-    let (mut frame, mut control_s, mut step_s, mut rows) = (Frame::default(), 0.0, 0.0, 0);
-    let mut before = session.cost();
+fn measure(net: &Path, sumo_home: &Path) -> Result<(), SumoError> {
+    let mut sumo = Sumo::start(SumoOptions::population(sumo_home, net, &[], 0.1, 1)?)?;
+    let mut population = Population::start(&mut sumo, SIZE, &[], 1)?;
+    let (mut frame, mut control_s, mut step_s, mut rows) = (TrafficFrame::default(), 0.0, 0.0, 0);
+    let mut before = sumo.cost();
     for step in 0..WARM_UP_STEPS + STEPS {
         if step == WARM_UP_STEPS {
-            (control_s, step_s, rows, before) = (0.0, 0.0, 0, session.cost());
+            (control_s, step_s, rows, before) = (0.0, 0.0, 0, sumo.cost());
         }
         let start = processor_time_s();
-        session.step(&mut frame)?;
+        sumo.step(&mut frame)?;
         step_s += processor_time_s() - start;
         let start = processor_time_s();
-        population.after_step(&mut session, &frame)?;
+        population.after_step(&mut sumo, &frame)?;
         control_s += processor_time_s() - start;
         rows += frame.states.len();
     }
-    let cost = session.cost();
+    let cost = sumo.cost();
     let (sumo_s, getters_s) = (cost.step_s - before.step_s, cost.getters_s - before.getters_s);
     #[expect(clippy::cast_precision_loss, reason = "a count of rows")]
     let micros = |seconds: f64| seconds * 1e6 / rows as f64;
@@ -87,10 +84,10 @@ fn measure(net: &Path, sumo: &Path) -> Result<(), SumoError> {
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = tempfile::tempdir()?;
-    let sumo = Path::new(env!("CARAWARE_BUILD_SUMO_HOME"));
+    let sumo_home = Path::new(env!("CARAWARE_BUILD_SUMO_HOME"));
     for junctions in ["priority", "traffic_light"] {
         println!("12 × 12 junctions of type {junctions}:");
-        measure(&grid(sumo, folder.path(), junctions)?, sumo)?;
+        measure(&grid(sumo_home, folder.path(), junctions)?, sumo_home)?;
     }
     Ok(())
 }

@@ -1,11 +1,11 @@
-//! `traffic-bridge RUN_FILE`: started by `caraware`.
+//! `traffic-bridge RUN_FILE`: `caraware` starts this program.
 
 use std::process::ExitCode;
 
 use ipc_schema::{process::Process, session};
 
-/// Overrides `malloc` and `new` for SUMO as well, whose step walks over millions of small objects: they lie closer together, in
-/// larger pages, and a step takes a quarter less time than with the system's allocator.
+/// Overrides `malloc` and `new` for SUMO too. SUMO's step visits millions of small objects: with mimalloc they lie closer together,
+/// in larger pages, and a step takes a quarter less time than with the system's allocator.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 

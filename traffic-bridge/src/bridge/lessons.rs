@@ -9,92 +9,113 @@ use ipc_schema::{
     session::Wait,
 };
 
-use super::{Bridge, End, Setting, Stretch, Underway};
-use crate::decisions::Decisions;
+use super::{
+    Bridge,
+    decisions::StageDecisions,
+    episode::{EpisodeEnd, EpisodeSegment, RunningEpisode, StageMap},
+};
 
 /// What a map was used for.
 #[derive(Debug, Clone, serde::Serialize)]
-pub(super) struct Taught {
-    pub(super) name: String,
-    /// Those that have been given to their end.
-    pub(super) lessons: u64,
-    pub(super) ticks: u64,
+pub(super) struct MapUsage {
+    name: String,
+    /// Lessons that ran to their end.
+    lessons: u64,
+    ticks: u64,
+}
+
+impl MapUsage {
+    /// A map without lessons so far.
+    pub(super) fn new(name: &str) -> Self {
+        Self {
+            name: name.to_owned(),
+            lessons: 0,
+            ticks: 0,
+        }
+    }
 }
 
 impl Bridge {
-    /// Runs lessons and evaluations as `course` has them, in the steps that are decided on the way.
-    pub(super) fn follow(&mut self, mut course: Course) -> Result<Wait, Failure> {
-        let mut decisions = Decisions::open(&self.membership)?;
-        let mut underway = self.try_maps()?;
-        // What a checkpoint has learnt from, up to the episode that it goes on with, is not made again.
+    /// Runs the lessons and evaluations of `course`, in the stages that are decided on the way.
+    pub(super) fn run_curriculum(&mut self, mut course: Course) -> Result<Wait, Failure> {
+        let mut decisions = StageDecisions::open(&self.membership)?;
+        let mut running = self.try_maps()?;
+        // Episodes before this one are in the checkpoint and are not simulated again.
         let first = self.membership.run.start().episode;
         let mut is_behind = first > 0;
         loop {
-            let (begins, setting, stretch) = match course.due() {
+            // Find out what comes next: an evaluation, or a lesson with its stage and map.
+            let (begins, place, segment) = match course.due() {
                 Due::Nothing => return Ok(Wait::Ready),
                 Due::Evaluation { episode, is_last } => {
-                    let stretch = Stretch {
+                    let segment = EpisodeSegment {
                         is_last,
-                        ..Stretch::default()
+                        ..EpisodeSegment::default()
                     };
-                    (Some(episode), Setting::default(), stretch)
+                    (Some(episode), StageMap::default(), segment)
                 }
                 Due::Lesson(number) => {
-                    let step = match is_behind {
-                        true => Some(decisions.step_behind(number)),
-                        false => decisions.step_of(&self.membership, number, self.ticks)?,
+                    let stage = match is_behind {
+                        true => Some(decisions.stage_in_checkpoint(number)),
+                        false => decisions.stage_of(&self.membership, number, self.totals.ticks)?,
                     };
-                    let Some(step) = step else {
+                    let Some(stage) = stage else {
                         return Ok(Wait::Stopped);
                     };
-                    let Some(lesson) = course.enter(step) else {
+                    let Some(lesson) = course.enter(stage) else {
                         continue;
                     };
                     let Lesson { step, map, begins } = lesson;
                     let past = match begins {
                         Some(_) => 0,
-                        None => underway.as_ref().map_or(0, |now| now.frame.step * self.ticks_per_step),
+                        None => running.as_ref().map_or(0, |now| now.frame.step * self.ticks_per_step),
                     };
-                    let setting = Setting { step: step + 1, map };
-                    (begins, setting, self.lesson(setting, past))
+                    let place = StageMap { stage: step + 1, map };
+                    (begins, place, self.lesson_segment(place, past))
                 }
             };
+
+            // Skip what the checkpoint has.
             is_behind &= begins.is_none_or(|episode| episode.index < first);
             if is_behind {
                 continue;
             }
-            let mut now = match (begins, underway.take()) {
-                (Some(episode), before) => self.begin(before, &episode, setting)?,
-                (None, Some(now)) => now.go_on()?,
+
+            // Begin an episode, or resume the one that is running.
+            let mut now = match (begins, running.take()) {
+                (Some(episode), before) => self.begin_episode(before, &episode, place)?,
+                (None, Some(now)) => now.resume()?,
                 (None, None) => return Ok(Wait::Ready),
             };
-            self.announce(&now.session);
-            let before = self.ticks;
-            let end = self.run(&mut now, stretch)?;
-            if setting.step > 0 {
-                let taught = &mut self.taught[setting.map];
-                taught.lessons += u64::from(end != End::Stopped);
-                taught.ticks += self.ticks - before;
+            self.announce_length(&now.sumo);
+
+            // Run the segment, and count the lesson for its map.
+            let before = self.totals.ticks;
+            let end = self.run_segment(&mut now, segment)?;
+            if place.stage > 0 {
+                let usage = &mut self.map_usage[place.map];
+                usage.lessons += u64::from(end != EpisodeEnd::Stopped);
+                usage.ticks += self.totals.ticks - before;
             }
-            if end == End::Stopped {
+            if end == EpisodeEnd::Stopped {
                 return Ok(Wait::Stopped);
             }
-            underway = Some(now);
+            running = Some(now);
         }
     }
 
-    /// The stretch of the lesson that follows, in an episode that has `past` ticks behind it.
-    fn lesson(&self, Setting { step, map }: Setting, past: u64) -> Stretch {
+    /// The segment of the next lesson, in an episode that has run for `past` ticks.
+    fn lesson_segment(&self, StageMap { stage, map }: StageMap, past: u64) -> EpisodeSegment {
         let config = &self.membership.run.config;
-        let kind = &config.curriculum.steps[step - 1];
+        let kind = &config.curriculum.steps[stage - 1];
         let ticks = kind.ticks.unwrap_or(config.episode.ticks);
         let ticks = ticks.next_multiple_of(self.ticks_per_step);
         #[expect(
             clippy::cast_possible_truncation,
-            reason = "validated: at most 255 steps and 256 maps"
+            reason = "validated: at most 255 stages and 256 maps"
         )]
-        let flags = step_flags(step as u8) | map_flags(map as u8);
-        Stretch {
+        let flags = step_flags(stage as u8) | map_flags(map as u8);
+        EpisodeSegment {
             ticks: Some(past + ticks),
             flags,
             last_flags: match kind.restart {
@@ -105,9 +126,9 @@ impl Bridge {
         }
     }
 
-    /// Of several maps, each that a step names is tried with that step's road users: one that does not serve is found before the first
-    /// tick, not in the last step.
-    fn try_maps(&mut self) -> Result<Option<Underway>, Failure> {
+    /// Of several maps, starts each that a stage names with the road users of that stage: a map that does not serve is found
+    /// before the first tick, not in the last stage.
+    fn try_maps(&mut self) -> Result<Option<RunningEpisode>, Failure> {
         let mut tried = None;
         let run = &self.membership.run;
         if run.maps.is_empty() {
@@ -120,13 +141,13 @@ impl Bridge {
             ticks: None,
         };
         let curriculum = run.config.curriculum.clone();
-        // Evaluations are on the first, in the base configuration.
-        let mut settings = BTreeMap::from([(0, 0)]);
-        for (number, step) in (1..).zip(&curriculum.steps) {
-            settings.extend(curriculum.maps_of(step).into_iter().map(|map| (map, number)));
+        // Evaluations are on the first map, in the base configuration.
+        let mut stages = BTreeMap::from([(0, 0)]);
+        for (number, stage) in (1..).zip(&curriculum.steps) {
+            stages.extend(curriculum.maps_of(stage).into_iter().map(|map| (map, number)));
         }
-        for (map, step) in settings {
-            tried = Some(self.begin(tried, &episode, Setting { step, map })?);
+        for (map, stage) in stages {
+            tried = Some(self.begin_episode(tried, &episode, StageMap { stage, map })?);
         }
         Ok(tried)
     }

@@ -1,9 +1,9 @@
 //! The crate over real SUMO, with nets built by the wheel's own tools.
 #![expect(clippy::unwrap_used, reason = "tests assert by unwrapping, their helpers too")]
 
+mod lifecycle;
 mod population;
 mod process;
 mod scenario;
-mod session;
 mod signals;
 mod support;

@@ -5,13 +5,11 @@ use std::collections::BTreeSet;
 use crate::support::{Bench, run, sumo_home};
 use ipc_schema::traffic::{Kind, MetaEvent};
 use traffic_bridge::{
-    error::SumoError,
-    options::Options,
-    population::{Population, Size},
-    session::Session,
+    population::{Population, PopulationSize},
+    sumo::{Sumo, error::SumoError, options::SumoOptions},
 };
 
-const SIZE: Size = Size {
+const SIZE: PopulationSize = PopulationSize {
     cavs: 24,
     others: 12,
     heroes: 0,
@@ -19,15 +17,15 @@ const SIZE: Size = Size {
 };
 const STEP_S: f64 = 0.1;
 
-fn options(bench: &Bench, seed: u64) -> Options {
-    Options::population(&sumo_home(), &bench.grid(), &[], STEP_S, seed).unwrap()
+fn options(bench: &Bench, seed: u64) -> SumoOptions {
+    SumoOptions::population(&sumo_home(), &bench.grid(), &[], STEP_S, seed).unwrap()
 }
 
 /// All bytes of all frames of an episode, and where connected vehicles begin.
-fn episode(session: &mut Session, seed: u64, steps: usize) -> (Vec<u8>, Vec<(i64, i64)>) {
-    let mut population = Population::start(session, SIZE, &[], seed).unwrap();
+fn episode(sumo: &mut Sumo, seed: u64, steps: usize) -> (Vec<u8>, Vec<(i64, i64)>) {
+    let mut population = Population::start(sumo, SIZE, &[], seed).unwrap();
     let (mut bytes, mut places) = (Vec::new(), Vec::new());
-    run(session, steps, |session, frame| {
+    run(sumo, steps, |sumo, frame| {
         bytes.extend_from_slice(bytemuck::cast_slice(&frame.states));
         bytes.extend_from_slice(bytemuck::cast_slice(&frame.events));
         if frame.step == 2 {
@@ -38,7 +36,7 @@ fn episode(session: &mut Session, seed: u64, steps: usize) -> (Vec<u8>, Vec<(i64
                 .map(|state| (place(state.front_x_m), place(state.front_y_m)))
                 .collect();
         }
-        population.after_step(session, frame).unwrap();
+        population.after_step(sumo, frame).unwrap();
     });
     (bytes, places)
 }
@@ -47,15 +45,15 @@ fn episode(session: &mut Session, seed: u64, steps: usize) -> (Vec<u8>, Vec<(i64
 fn an_episode_on_a_map_does_not_depend_on_the_map_before() {
     let bench = Bench::new();
     let (town_net, types) = bench.town();
-    let town = |seed| Options::population(&sumo_home(), &town_net, &types, STEP_S, seed).unwrap();
-    let mut session = Session::start(options(&bench, 7)).unwrap();
-    let (grid_before, _) = episode(&mut session, 7, 300);
-    session = session.reload(town(8)).unwrap();
-    let (after_the_grid, _) = episode(&mut session, 8, 300);
-    session = session.reload(options(&bench, 7)).unwrap();
-    let (grid_after, _) = episode(&mut session, 7, 300);
-    session.close().unwrap();
-    let mut fresh = Session::start(town(8)).unwrap();
+    let town = |seed| SumoOptions::population(&sumo_home(), &town_net, &types, STEP_S, seed).unwrap();
+    let mut sumo = Sumo::start(options(&bench, 7)).unwrap();
+    let (grid_before, _) = episode(&mut sumo, 7, 300);
+    sumo = sumo.reload(town(8)).unwrap();
+    let (after_the_grid, _) = episode(&mut sumo, 8, 300);
+    sumo = sumo.reload(options(&bench, 7)).unwrap();
+    let (grid_after, _) = episode(&mut sumo, 7, 300);
+    sumo.close().unwrap();
+    let mut fresh = Sumo::start(town(8)).unwrap();
     let (alone, _) = episode(&mut fresh, 8, 300);
     assert!(after_the_grid == alone);
     assert!(grid_before == grid_after);
@@ -65,14 +63,14 @@ fn an_episode_on_a_map_does_not_depend_on_the_map_before() {
 #[test]
 fn the_same_seed_gives_the_same_bytes_and_another_does_not() {
     let bench = Bench::new();
-    let mut session = Session::start(options(&bench, 7)).unwrap();
-    let (first, places) = episode(&mut session, 7, 600);
-    session = session.reload(options(&bench, 8)).unwrap();
-    let (other, other_places) = episode(&mut session, 8, 600);
-    session = session.reload(options(&bench, 7)).unwrap();
-    let (again, _) = episode(&mut session, 7, 600);
-    session.close().unwrap();
-    let mut fresh = Session::start(options(&bench, 7)).unwrap();
+    let mut sumo = Sumo::start(options(&bench, 7)).unwrap();
+    let (first, places) = episode(&mut sumo, 7, 600);
+    sumo = sumo.reload(options(&bench, 8)).unwrap();
+    let (other, other_places) = episode(&mut sumo, 8, 600);
+    sumo = sumo.reload(options(&bench, 7)).unwrap();
+    let (again, _) = episode(&mut sumo, 7, 600);
+    sumo.close().unwrap();
+    let mut fresh = Sumo::start(options(&bench, 7)).unwrap();
     let (restarted, _) = episode(&mut fresh, 7, 600);
     assert!(first == again, "an episode does not depend on those before it");
     assert!(first == restarted);
@@ -84,10 +82,10 @@ fn the_same_seed_gives_the_same_bytes_and_another_does_not() {
 #[test]
 fn everybody_stays_alive_for_ever() {
     let bench = Bench::new();
-    let mut session = Session::start(options(&bench, 3)).unwrap();
-    let mut population = Population::start(&mut session, SIZE, &[], 3).unwrap();
+    let mut sumo = Sumo::start(options(&bench, 3)).unwrap();
+    let mut population = Population::start(&mut sumo, SIZE, &[], 3).unwrap();
     let (mut arrived, mut edges_of_time) = (0, BTreeSet::new());
-    run(&mut session, 6000, |session, frame| {
+    run(&mut sumo, 6000, |sumo, frame| {
         let alive = |kind: Kind| frame.states.iter().filter(|state| state.kind == kind as u32).count();
         if frame.step >= 20 {
             assert_eq!(alive(Kind::Cav), 24, "at {} s", frame.time_s);
@@ -109,7 +107,7 @@ fn everybody_stays_alive_for_ever() {
                     .map(|s| ((s.front_x_m / 100.0) as i32, (s.front_y_m / 100.0) as i32)),
             );
         }
-        population.after_step(session, frame).unwrap();
+        population.after_step(sumo, frame).unwrap();
     });
     assert_eq!(arrived, 0, "routes are prolonged in time");
     assert!(
@@ -127,11 +125,11 @@ fn whoever_leaves_is_replaced() {
     let text = "<additional><rerouter id=\"end\" edges=\"B1C1 C3B3 D2D1\"><interval begin=\"0\" end=\"1e6\">\
                 <destProbReroute id=\"terminateRoute\"/></interval></rerouter></additional>";
     let additional = bench.file("end.add.xml", text);
-    let options = Options::population(&sumo_home(), &net, &[additional], STEP_S, 3).unwrap();
-    let mut session = Session::start(options).unwrap();
-    let mut population = Population::start(&mut session, SIZE, &[], 3).unwrap();
+    let options = SumoOptions::population(&sumo_home(), &net, &[additional], STEP_S, 3).unwrap();
+    let mut sumo = Sumo::start(options).unwrap();
+    let mut population = Population::start(&mut sumo, SIZE, &[], 3).unwrap();
     let (mut arrived, mut names) = (0, BTreeSet::new());
-    run(&mut session, 3000, |session, frame| {
+    run(&mut sumo, 3000, |sumo, frame| {
         arrived += frame
             .events
             .iter()
@@ -145,7 +143,7 @@ fn whoever_leaves_is_replaced() {
             frame.cavs,
             frame.time_s
         );
-        population.after_step(session, frame).unwrap();
+        population.after_step(sumo, frame).unwrap();
     });
     assert!(arrived >= 20, "{arrived}");
     assert!(names.contains("cav.24"), "a successor has a new name");
@@ -154,18 +152,18 @@ fn whoever_leaves_is_replaced() {
 #[test]
 fn a_crowd_finds_room() {
     let bench = Bench::new();
-    let mut session = Session::start(options(&bench, 3)).unwrap();
-    let crowd = Size {
+    let mut sumo = Sumo::start(options(&bench, 3)).unwrap();
+    let crowd = PopulationSize {
         cavs: 400,
         others: 0,
         heroes: 0,
         pedestrians: 0,
     };
-    let mut population = Population::start(&mut session, crowd, &[], 3).unwrap();
+    let mut population = Population::start(&mut sumo, crowd, &[], 3).unwrap();
     let mut cavs = 0;
     // One vehicle to 20 m of lane: whoever finds none where it wants to start is moved.
-    run(&mut session, 100, |session, frame| {
-        population.after_step(session, frame).unwrap();
+    run(&mut sumo, 100, |sumo, frame| {
+        population.after_step(sumo, frame).unwrap();
         cavs = frame.cavs;
     });
     assert!(cavs >= 396, "{cavs} of 400 after ten seconds");
@@ -176,13 +174,13 @@ fn a_net_without_sidewalks_refuses_pedestrians() {
     let bench = Bench::new();
     let net = bench.file("road.net.xml", ONE_WAY);
     let start = |size| {
-        let options = Options::population(&sumo_home(), &net, &[], STEP_S, 1).unwrap();
-        let mut session = Session::start(options).unwrap();
-        Population::start(&mut session, size, &[], 1).unwrap_err()
+        let options = SumoOptions::population(&sumo_home(), &net, &[], STEP_S, 1).unwrap();
+        let mut sumo = Sumo::start(options).unwrap();
+        Population::start(&mut sumo, size, &[], 1).unwrap_err()
     };
-    for (size, who) in [
+    for (size, class) in [
         (
-            Size {
+            PopulationSize {
                 cavs: 1,
                 others: 0,
                 heroes: 0,
@@ -191,7 +189,7 @@ fn a_net_without_sidewalks_refuses_pedestrians() {
             "passenger",
         ),
         (
-            Size {
+            PopulationSize {
                 cavs: 0,
                 others: 0,
                 heroes: 0,
@@ -202,7 +200,7 @@ fn a_net_without_sidewalks_refuses_pedestrians() {
     ] {
         let error = start(size);
         assert!(
-            matches!(&error, SumoError::NoRoads { who: found, .. } if found == who),
+            matches!(&error, SumoError::NoRoads { class: found, .. } if found == class),
             "{error}"
         );
         assert!(error.to_string().contains("road.net.xml"));

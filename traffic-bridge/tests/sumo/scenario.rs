@@ -4,7 +4,7 @@ use std::{collections::BTreeSet, path::Path, time::SystemTime};
 
 use crate::support::{Bench, run, sumo_home};
 use ipc_schema::traffic::{Kind, MetaEvent, VehicleMeta};
-use traffic_bridge::{fleet::Fleet, options::Options, session::Session};
+use traffic_bridge::sumo::{Sumo, connected::ConnectedRule, options::SumoOptions};
 
 /// Files below `folder` with their times of change.
 fn listing(folder: &Path) -> BTreeSet<(std::path::PathBuf, SystemTime)> {
@@ -25,24 +25,24 @@ fn a10kw_runs_and_writes_into_the_run_directory_alone() {
     let games = sumo_home().join("tools/game");
     let before = listing(&games);
     let output = bench.folder.path().join("sumo");
-    let options = Options::scenario(
+    let options = SumoOptions::scenario(
         &sumo_home(),
         &games.join("A10KW.sumocfg"),
         &output,
         0.5,
         23423,
-        Fleet::Scenario {
+        ConnectedRule::Scenario {
             heroes: BTreeSet::new(),
             cav_share: 1.0,
             max_cavs: 20,
         },
     )
     .unwrap();
-    let mut session = Session::start(options).unwrap();
-    assert_eq!((session.step_s(), session.duration_s()), (0.5, Some(1800.0)));
+    let mut sumo = Sumo::start(options).unwrap();
+    assert_eq!((sumo.step_s(), sumo.duration_s()), (0.5, Some(1800.0)));
     let (mut most, mut vehicle_steps) = (0, 0);
     let (mut cavs, mut departed_cavs) = (0, 0);
-    run(&mut session, 240, |_, frame| {
+    run(&mut sumo, 240, |_, frame| {
         assert!(frame.cavs <= 20, "{}", frame.cavs);
         cavs = frame.cavs;
         let departed = |meta: &&VehicleMeta| meta.event == MetaEvent::Departed as u32 && meta.kind == Kind::Cav as u32;
@@ -61,7 +61,7 @@ fn a10kw_runs_and_writes_into_the_run_directory_alone() {
         cavs == 20 && departed_cavs > 20,
         "{cavs} at the end of {departed_cavs}: who arrives makes room"
     );
-    session.close().unwrap();
+    sumo.close().unwrap();
     assert_eq!(listing(&games), before, "nothing was written into the wheel");
     let written: Vec<_> = listing(&output).into_iter().map(|(path, _)| path).collect();
     assert_eq!(written, [output.join("netstate.xml"), output.join("tlsstate.xml")]);

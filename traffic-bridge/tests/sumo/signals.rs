@@ -8,11 +8,13 @@ use std::{
 use crate::support::{Bench, run, sumo_home};
 use ipc_schema::traffic::id_hash;
 use traffic_bridge::{
-    frame::Frame,
-    inputs::{attribute, for_each_element},
-    options::Options,
-    population::{Population, Size},
-    session::Session,
+    population::{Population, PopulationSize},
+    sumo::{
+        Sumo,
+        frame::TrafficFrame,
+        inputs::{attribute, for_each_element},
+        options::SumoOptions,
+    },
 };
 
 /// Junctions with signals in the town.
@@ -26,18 +28,18 @@ fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32)
         .map(|id| format!("<timedEvent type=\"SaveTLSStates\" source=\"{id}\" dest=\"{id}.states.xml\"/>"))
         .collect();
     files.push(bench.file("a.add.xml", &format!("<additional>{events}</additional>")));
-    let options = Options::population(&sumo_home(), net, &files, 0.5, 1).unwrap();
-    let mut session = Session::start(options).unwrap();
-    let size = Size {
+    let options = SumoOptions::population(&sumo_home(), net, &files, 0.5, 1).unwrap();
+    let mut sumo = Sumo::start(options).unwrap();
+    let size = PopulationSize {
         cavs: 20,
         others: 0,
         heroes: 0,
         pedestrians,
     };
-    let mut population = Population::start(&mut session, size, &[], 1).unwrap();
+    let mut population = Population::start(&mut sumo, size, &[], 1).unwrap();
     let mut now: BTreeMap<String, String> = BTreeMap::new();
     let (mut told, mut changes) = (Vec::new(), 0);
-    run(&mut session, 400, |session: &mut Session, frame: &Frame| {
+    run(&mut sumo, 400, |sumo: &mut Sumo, frame: &TrafficFrame| {
         if frame.step == 1 {
             let all: Vec<String> = frame.signals.iter().map(|signal| signal.id_text()).collect();
             assert_eq!(all, lights, "all of them, in the order of their ids");
@@ -50,9 +52,9 @@ fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32)
             changes += u32::from(before.is_some());
         }
         told.push(now.clone());
-        population.after_step(session, frame).unwrap();
+        population.after_step(sumo, frame).unwrap();
     });
-    session.close().unwrap();
+    sumo.close().unwrap();
     let mut compared = 0;
     for id in &lights {
         for_each_element(&bench.folder.path().join(format!("{id}.states.xml")), |element| {
@@ -94,12 +96,12 @@ fn lights_with_fixed_times_are_told_as_sumo_writes_them() {
 fn a_new_episode_tells_every_light_again() {
     let bench = Bench::new();
     let (net, files) = bench.town();
-    let options = || Options::population(&sumo_home(), &net, &files, 1.0, 1).unwrap();
-    let mut session = Session::start(options()).unwrap();
+    let options = || SumoOptions::population(&sumo_home(), &net, &files, 1.0, 1).unwrap();
+    let mut sumo = Sumo::start(options()).unwrap();
     let mut counts = Vec::new();
-    run(&mut session, 3, |_, frame| counts.push(frame.signals.len()));
-    let mut session = session.reload(options()).unwrap();
-    run(&mut session, 1, |_, frame| counts.push(frame.signals.len()));
+    run(&mut sumo, 3, |_, frame| counts.push(frame.signals.len()));
+    let mut sumo = sumo.reload(options()).unwrap();
+    run(&mut sumo, 1, |_, frame| counts.push(frame.signals.len()));
     assert_eq!((counts[0], counts[3]), (LIGHTS, LIGHTS), "{counts:?}");
     assert!(counts[1] < LIGHTS && counts[2] < LIGHTS, "{counts:?}");
 }

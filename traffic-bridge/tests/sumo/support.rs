@@ -7,12 +7,12 @@ use std::{
 };
 
 use tempfile::TempDir;
-use traffic_bridge::{
-    fleet::Fleet,
-    frame::Frame,
+use traffic_bridge::sumo::{
+    Sumo,
+    connected::ConnectedRule,
+    frame::TrafficFrame,
     inputs::{attribute, for_each_element},
-    options::Options,
-    session::Session,
+    options::SumoOptions,
 };
 
 /// Tests run as threads of one process, SUMO runs once in a process: they take turns.
@@ -128,14 +128,14 @@ impl Bench {
     }
 
     /// Options for a scenario whose outputs go to `sumo/`.
-    pub fn scenario_options(&self, sumocfg: &Path, step_s: f64) -> Options {
-        Options::scenario(
+    pub fn scenario_options(&self, sumocfg: &Path, step_s: f64) -> SumoOptions {
+        SumoOptions::scenario(
             &sumo_home(),
             sumocfg,
             &self.folder.path().join("sumo"),
             step_s,
             23423,
-            Fleet::connected(0.5),
+            ConnectedRule::connected(0.5),
         )
         .unwrap()
     }
@@ -150,10 +150,10 @@ fn tool(name: &str) -> Command {
 }
 
 /// Runs `steps` steps and calls `see` after each.
-pub fn run(session: &mut Session, steps: usize, mut see: impl FnMut(&mut Session, &Frame)) {
-    let mut frame = Frame::default();
+pub fn run(sumo: &mut Sumo, steps: usize, mut see: impl FnMut(&mut Sumo, &TrafficFrame)) {
+    let mut frame = TrafficFrame::default();
     for _ in 0..steps {
-        session.step(&mut frame).unwrap();
-        see(session, &frame);
+        sumo.step(&mut frame).unwrap();
+        see(sumo, &frame);
     }
 }

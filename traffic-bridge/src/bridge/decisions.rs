@@ -1,0 +1,196 @@
+//! Which stage of the curriculum a lesson belongs to. The trainer decides; without a trainer the log of an earlier run does, or
+//! the number of lessons.
+
+use std::{
+    fs::File,
+    io::Write as _,
+    path::{Path, PathBuf},
+};
+
+use ipc_schema::{
+    board::Progress,
+    config::Step,
+    failure::{Failure, FailureKind},
+    ports::BoardReader,
+    process::Process,
+    run::{Mode, STEP_LOG},
+    session::{Session, Wait},
+};
+use serde::{Deserialize, Serialize};
+
+/// A line of the log: from this lesson on, which begins with this tick, training is in this stage, counted from 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+struct StageDecision {
+    lesson: u64,
+    tick: u64,
+    step: usize,
+}
+
+/// Where decisions come from.
+enum StageSource {
+    Trainer(BoardReader),
+    Log(Vec<StageDecision>),
+    Count(Vec<Step>),
+}
+
+/// The stages of all lessons so far.
+pub(crate) struct StageDecisions {
+    judge: StageSource,
+    /// Ticks in the checkpoint of a resumed run, and the decisions that were taken in them.
+    committed_ticks: u64,
+    kept: Vec<StageDecision>,
+    newest: Option<StageDecision>,
+    path: PathBuf,
+    log: File,
+}
+
+impl StageDecisions {
+    /// Opens the source of decisions and begins the log.
+    ///
+    /// # Errors
+    /// A log cannot be read or written, or the trainer's board cannot be opened.
+    pub(crate) fn open(membership: &Session) -> Result<Self, Failure> {
+        let run = &membership.run;
+        let curriculum = &run.config.curriculum;
+        let path = run.run_dir.join(STEP_LOG);
+        let judge = match (run.mode, curriculum.log.as_str()) {
+            (Mode::Train, _) => StageSource::Trainer(membership.board_of(Process::Trainer)?),
+            (Mode::Simulate | Mode::Play, "") => StageSource::Count(curriculum.steps.clone()),
+            (Mode::Simulate | Mode::Play, path) => StageSource::Log(read(Path::new(path))?),
+        };
+        let mut kept = match run.beginning {
+            Some(_) => read(&path)?,
+            None => Vec::new(),
+        };
+        // The trainer repeats decisions that are later than the checkpoint. A lesson that begins with the tick after the checkpoint
+        // was already decided.
+        kept.retain(|action| action.tick <= run.committed_ticks());
+        let log = begin_log(&path, &kept).map_err(|error| unwritten(&path, &error))?;
+        Ok(Self {
+            judge,
+            committed_ticks: run.committed_ticks(),
+            newest: kept.last().copied(),
+            kept,
+            path,
+            log,
+        })
+    }
+
+    /// The stage, counted from 0, of `lesson`, which is in the checkpoint that the run resumes from.
+    pub(crate) fn stage_in_checkpoint(&self, lesson: u64) -> usize {
+        logged(&self.kept, lesson)
+    }
+
+    /// The stage, counted from 0, of `lesson`, which would begin with `tick`; waits for the trainer's decision. `None`: the process
+    /// was asked to stop.
+    ///
+    /// # Errors
+    /// The wake-up is broken, or the log cannot be written.
+    pub(crate) fn stage_of(&mut self, membership: &Session, lesson: u64, tick: u64) -> Result<Option<usize>, Failure> {
+        let step = match &self.judge {
+            // The trainer starts only after SUMO has accepted its input, so the first lesson cannot wait for it.
+            StageSource::Trainer(_) if lesson == 0 => 0,
+            StageSource::Trainer(_) if tick < self.committed_ticks => {
+                return Ok(Some(self.stage_in_checkpoint(lesson)));
+            }
+            StageSource::Trainer(board) => {
+                let mut step = None;
+                let waited = membership.wait_until(|| {
+                    step = Progress::step_of(&board.progress(), lesson);
+                    step.is_some()
+                })?;
+                if waited == Wait::Stopped {
+                    return Ok(None);
+                }
+                step.unwrap_or(0) as usize
+            }
+            StageSource::Log(actions) => logged(actions, lesson),
+            StageSource::Count(steps) => counted(steps, lesson),
+        };
+        // Stages never go back, not even when a trainer with other settings takes over.
+        let step = self.newest.map_or(step, |newest| newest.step.max(step));
+        if self.newest.is_none_or(|newest| newest.step != step) {
+            self.write(StageDecision { lesson, tick, step })?;
+        }
+        Ok(Some(step))
+    }
+
+    fn write(&mut self, action: StageDecision) -> Result<(), Failure> {
+        self.newest = Some(action);
+        let line = serde_json::to_string(&action).unwrap_or_default();
+        writeln!(self.log, "{line}").map_err(|error| unwritten(&self.path, &error))
+    }
+}
+
+/// Writes a log with the decisions that are kept and renames it into place, so that the log is complete at any time; it stays open
+/// for later decisions.
+fn begin_log(path: &Path, kept: &[StageDecision]) -> std::io::Result<File> {
+    let partial = path.with_extension("partial");
+    let mut log = File::create(&partial)?;
+    for action in kept {
+        writeln!(log, "{}", serde_json::to_string(action)?)?;
+    }
+    std::fs::rename(&partial, path)?;
+    Ok(log)
+}
+
+/// The stage of `lesson` by a log.
+fn logged(actions: &[StageDecision], lesson: u64) -> usize {
+    let before = actions.iter().take_while(|action| action.lesson <= lesson);
+    before.last().map_or(0, |action| action.step)
+}
+
+/// The stage of `lesson` if only the number of lessons opens gates.
+fn counted(steps: &[Step], lesson: u64) -> usize {
+    let mut first = 0_u64;
+    for (number, step) in steps.iter().enumerate() {
+        let Some(lessons) = step.until_lessons else {
+            return number;
+        };
+        first = first.saturating_add(lessons);
+        if lesson < first {
+            return number;
+        }
+    }
+    steps.len()
+}
+
+fn read(path: &Path) -> Result<Vec<StageDecision>, Failure> {
+    let unread = |reason: &dyn std::fmt::Display| {
+        Failure::new(FailureKind::Config, format!("cannot read {}: {reason}", path.display()))
+            .with_help(format!("`curriculum.log` names the {STEP_LOG} in a run directory"))
+    };
+    let text = std::fs::read_to_string(path).map_err(|error| unread(&error))?;
+    let lines = text.lines().map(serde_json::from_str);
+    lines.collect::<Result<_, _>>().map_err(|error| unread(&error))
+}
+
+fn unwritten(path: &Path, error: &std::io::Error) -> Failure {
+    Failure::new(FailureKind::Run, format!("cannot write {}: {error}", path.display()))
+        .with_help("check permissions and free space (`caraware doctor`)")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lessons_are_counted_without_a_learner() {
+        let step = |lessons: Option<u64>| -> Step {
+            serde_json::from_value(serde_json::json!({"cavs": 1, "until_lessons": lessons})).unwrap()
+        };
+        let steps = [step(Some(2)), step(Some(1))];
+        assert_eq!([0, 1, 2, 3].map(|lesson| counted(&steps, lesson)), [0, 0, 1, 2]);
+        assert_eq!(
+            counted(&[step(None), step(Some(1))], 99),
+            0,
+            "a gate that only a learner can pass"
+        );
+    }
+
+    #[test]
+    fn a_log_is_followed() {
+        let actions = [(0, 0), (3, 1), (4, 2)].map(|(lesson, step)| StageDecision { lesson, tick: 0, step });
+        assert_eq!([0, 2, 3, 4, 9].map(|lesson| logged(&actions, lesson)), [0, 0, 1, 2, 2]);
+    }
+}

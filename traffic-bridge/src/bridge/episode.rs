@@ -1,0 +1,395 @@
+//! The loop over the steps of an episode: waits for credit, steps SUMO, publishes.
+
+use ipc_schema::{
+    failure::{Failure, FailureKind},
+    flow,
+    header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    ports::PortError,
+    run::{RunFile, Source},
+    schedule::Episode,
+    services::Channel,
+    session::Wait,
+};
+
+use super::{Bridge, commands::CommandContext};
+use crate::{
+    heroes,
+    population::{Population, PopulationSize, trips::TripSelection},
+    sumo::{Sumo, connected::ConnectedRule, error::SumoError, frame::TrafficFrame, options::SumoOptions},
+};
+
+/// SUMO with the road users of one episode.
+pub(super) struct RunningEpisode {
+    pub(super) sumo: Sumo,
+    population: Option<Population>,
+    pub(super) frame: TrafficFrame,
+    episode: Episode,
+}
+
+impl RunningEpisode {
+    /// Runs the population update that the pause between two lessons skipped.
+    pub(super) fn resume(mut self) -> Result<Self, SumoError> {
+        if let Some(population) = &mut self.population {
+            population.after_step(&mut self.sumo, &self.frame)?;
+        }
+        Ok(self)
+    }
+}
+
+/// A segment of an episode that belongs to one lesson, or the whole episode.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct EpisodeSegment {
+    /// Ticks of the episode at the segment's end; `None`: the segment ends with the episode.
+    pub(super) ticks: Option<u64>,
+    /// Flags of all its ticks, beside those of the episode.
+    pub(super) flags: u32,
+    /// Flags of its last tick.
+    pub(super) last_flags: u32,
+    /// The run ends with the episode.
+    pub(super) is_last: bool,
+}
+
+/// The stage and the map of an episode.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct StageMap {
+    /// Stage of the curriculum, counted from 1; 0: the base configuration.
+    pub(super) stage: usize,
+    /// Map among those of the run.
+    pub(super) map: usize,
+}
+
+/// How an episode ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum EpisodeEnd {
+    /// The episode or its segment is complete.
+    Over,
+    /// A command reset the episode: it begins again.
+    Again,
+    /// The process was asked to stop.
+    Stopped,
+}
+
+/// SUMO's options for `episode`.
+fn options(run: &RunFile, source: &Source, episode: &Episode) -> Result<SumoOptions, SumoError> {
+    let traffic = &run.config.traffic;
+    match source {
+        Source::Population {
+            net_file,
+            additional_files,
+        } => SumoOptions::population(&run.sumo_home, net_file, additional_files, traffic.step_s, episode.seed),
+        Source::Scenario { sumocfg } => {
+            let output_dir = run.run_dir.join("sumo");
+            let rule = ConnectedRule::Scenario {
+                heroes: traffic.hero_ids.iter().cloned().collect(),
+                cav_share: traffic.cav_share,
+                max_cavs: traffic.max_cavs,
+            };
+            let options =
+                SumoOptions::scenario(&run.sumo_home, sumocfg, &output_dir, traffic.step_s, episode.seed, rule)?;
+            Ok(options.with_scale(traffic.scale))
+        }
+    }
+}
+
+/// Puts road users into an empty net; a scenario brings its own.
+fn population(
+    run: &RunFile,
+    sumo: &mut Sumo,
+    episode: &Episode,
+    stage: usize,
+) -> Result<Option<Population>, SumoError> {
+    match run.source {
+        Source::Population { .. } => {
+            let traffic = &run.config.in_step(stage).traffic;
+            let trips = TripSelection::of_episode(traffic.held_out_trips, episode.evaluation);
+            let size = PopulationSize::from(traffic);
+            Population::start_on(sumo, size, &traffic.hero_route, trips, episode.seed).map(Some)
+        }
+        Source::Scenario { .. } => Ok(None),
+    }
+}
+
+impl Bridge {
+    /// Runs all episodes of a run without a curriculum.
+    pub(super) fn run_episodes(&mut self, episodes: impl Iterator<Item = Episode>) -> Result<Wait, Failure> {
+        let (mut before, mut episodes) = (None, episodes.peekable());
+        while let Some(episode) = episodes.next() {
+            let segment = EpisodeSegment {
+                is_last: episodes.peek().is_none(),
+                ..EpisodeSegment::default()
+            };
+            loop {
+                let mut running = self.begin_episode(before.take(), &episode, StageMap::default())?;
+                self.announce_length(&running.sumo);
+                let end = self.run_segment(&mut running, segment)?;
+                before = Some(running);
+                match end {
+                    EpisodeEnd::Over => break,
+                    EpisodeEnd::Again => {}
+                    EpisodeEnd::Stopped => return Ok(Wait::Stopped),
+                }
+            }
+        }
+        Ok(Wait::Ready)
+    }
+
+    /// Starts SUMO for `episode`, in the place of the episode before.
+    pub(super) fn begin_episode(
+        &mut self,
+        before: Option<RunningEpisode>,
+        episode: &Episode,
+        StageMap { stage, map }: StageMap,
+    ) -> Result<RunningEpisode, Failure> {
+        let run = &self.membership.run;
+        let options = options(run, &self.maps[map].source, episode)?;
+        let mut sumo = match before {
+            None => Sumo::start(options)?,
+            Some(before) => Sumo::reload(before.sumo, options)?,
+        };
+        let population = population(run, &mut sumo, episode, stage)?;
+        self.commands.begin_episode();
+        Ok(RunningEpisode {
+            sumo,
+            population,
+            frame: TrafficFrame::default(),
+            episode: *episode,
+        })
+    }
+
+    /// Runs an episode to the end of the segment, or to its own.
+    pub(super) fn run_segment(
+        &mut self,
+        running: &mut RunningEpisode,
+        segment: EpisodeSegment,
+    ) -> Result<EpisodeEnd, Failure> {
+        let RunningEpisode {
+            sumo,
+            population,
+            frame,
+            episode,
+        } = running;
+        loop {
+            // Wait for credit and, in the driving task, for the heroes' poses.
+            let tick = self.totals.ticks + self.ticks_per_step - 1;
+            if self.wait_to_send(tick, sumo, population.as_mut(), episode, frame)? == Wait::Stopped {
+                return Ok(EpisodeEnd::Stopped);
+            }
+            if self.move_heroes(sumo, episode, frame)? == Wait::Stopped {
+                return Ok(EpisodeEnd::Stopped);
+            }
+
+            // Step SUMO, and find out what ends with the step.
+            sumo.step(frame)?;
+            self.commands.track_presence(&frame.events);
+            let is_reset = self.commands.take_reset();
+            let pauses = segment
+                .ticks
+                .is_some_and(|ticks| frame.step * self.ticks_per_step >= ticks);
+            let ends = is_reset || segment.ticks.is_none() && self.episode_ends(sumo, episode, frame)?;
+            let flags = segment.flags | if pauses { segment.last_flags } else { 0 };
+            let ends_run = ends && segment.is_last && !is_reset;
+            let header = self.header(episode, frame, tick, sumo.step_s(), ends, ends_run);
+            let header = MessageHeader {
+                flags: header.flags | flags,
+                ..header
+            };
+
+            // Publish: switches and routes first, so that they are there when the step is processed.
+            if self.publish_switches(episode)? == Wait::Stopped {
+                return Ok(EpisodeEnd::Stopped);
+            }
+            if self.poses.is_some() {
+                let points = heroes::take_over(sumo, frame)?;
+                self.outbox.publish_routes(&points, header)?;
+            }
+            self.publish_step(frame, header)?;
+
+            // Close the episode or the segment, or prepare the next step.
+            if ends {
+                self.check_that_road_users_came()?;
+                self.totals.cost = Some(sumo.cost());
+            }
+            if is_reset {
+                self.totals.resets += 1;
+                self.totals.repeated_ticks += frame.step * self.ticks_per_step;
+                return Ok(EpisodeEnd::Again);
+            }
+            if ends || pauses {
+                return Ok(EpisodeEnd::Over);
+            }
+            if let Some(population) = population {
+                population.after_step(sumo, frame)?;
+            }
+        }
+    }
+
+    /// A scenario in which no vehicle ever drives is a mistake: an end before the first departure, or no routes.
+    fn check_that_road_users_came(&self) -> Result<(), Failure> {
+        match &self.membership.run.source {
+            Source::Scenario { sumocfg } if self.totals.vehicle_steps == 0 => Err(Failure::new(
+                FailureKind::Config,
+                format!("{}: no road user came before its end", sumocfg.display()),
+            )
+            .with_help("name routes or flows in its route-files, and look at its begin, end and their depart times")),
+            _ => Ok(()),
+        }
+    }
+
+    /// Executes commands while it waits for credit up to `tick`, for the end of a pause, and for its time if the run is paced.
+    fn wait_to_send(
+        &mut self,
+        tick: u64,
+        sumo: &mut Sumo,
+        population: Option<&mut Population>,
+        episode: &Episode,
+        frame: &TrafficFrame,
+    ) -> Result<Wait, Failure> {
+        let step_s = sumo.step_s();
+        let number = self.episode_number(episode);
+        let run = &self.membership.run;
+        let mut context = CommandContext {
+            sumo,
+            population,
+            tick: self.totals.ticks,
+            episode: number,
+            step: frame.step,
+            ticks_per_step: self.ticks_per_step,
+            has_lidars: run.config.lidar.vehicles > 0,
+            has_lessons: !run.config.curriculum.steps.is_empty(),
+            senses_persons: run.config.gnss.pedestrians,
+        };
+        self.commands.replay(&mut context)?;
+        let window = run.traffic_window_ticks();
+        let (commands, server, consumer) = (&mut self.commands, &self.command_server, &self.consumer);
+        let mut failure = None;
+        let waited = self.membership.wait_until(|| {
+            while failure.is_none() {
+                match server.serve(|command| commands.answer(command, &mut context)) {
+                    Ok(true) => {}
+                    Ok(false) => break,
+                    Err(error) => failure = Some(error),
+                }
+            }
+            failure.is_some() || !commands.holds(context.tick) && flow::has_credit(tick, &consumer.progress(), window)
+        })?;
+        match (failure, waited) {
+            (Some(failure), _) => Err(failure),
+            (None, Wait::Ready) => Ok(self.pacing.wait(&self.membership, step_s)?),
+            (None, Wait::Stopped) => Ok(Wait::Stopped),
+        }
+    }
+
+    /// Sends what commands switch at the next tick, before the tick itself: `sensor-daemon` has the switch when it senses that tick.
+    fn publish_switches(&mut self, episode: &Episode) -> Result<Wait, Failure> {
+        let switches = self.commands.take_switches();
+        if switches.is_empty() {
+            return Ok(Wait::Ready);
+        }
+        // Wait until `sensor-daemon` is attached: a message sent earlier is lost, while ticks wait for it in `sim-core`.
+        let sensing = &self.sensing;
+        let waited = self.membership.wait_until(|| sensing.progress().attached == 1)?;
+        if waited == Wait::Ready {
+            let header = MessageHeader {
+                tick: self.totals.ticks,
+                episode: self.episode_number(episode),
+                ..self.membership.header()
+            };
+            self.outbox.publish_switches(&switches, header)?;
+        }
+        Ok(waited)
+    }
+
+    /// In the driving task: waits for the poses of the last tick sent and moves the heroes of `frame`, its step, to them.
+    fn move_heroes(&mut self, sumo: &mut Sumo, episode: &Episode, frame: &TrafficFrame) -> Result<Wait, Failure> {
+        let Some(poses) = &self.poses else {
+            return Ok(Wait::Ready);
+        };
+        let Some(before) = self.totals.ticks.checked_sub(1) else {
+            return Ok(Wait::Ready);
+        };
+        let Some(message) = self.membership.next(poses)? else {
+            return Ok(Wait::Stopped);
+        };
+        let header = message.header();
+        if header.tick != before {
+            return Err(PortError::Gap {
+                channel: Channel::EgoPose.name(),
+                expected: before,
+                received: header.tick,
+            }
+            .into());
+        }
+        // Poses of the episode before belong to heroes that ended with it.
+        if header.episode == self.episode_number(episode) {
+            let poses = heroes::poses(&message).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
+            heroes::apply(sumo, frame, poses)?;
+        }
+        Ok(Wait::Ready)
+    }
+
+    fn episode_ends(&self, sumo: &Sumo, episode: &Episode, frame: &TrafficFrame) -> Result<bool, SumoError> {
+        let full = episode
+            .ticks
+            .is_some_and(|ticks| frame.step * self.ticks_per_step >= ticks);
+        match self.membership.run.source {
+            Source::Population { .. } => Ok(full),
+            Source::Scenario { .. } => Ok(full || sumo.finished()?),
+        }
+    }
+
+    /// Number of the episode in the run: by its schedule, and one more for each episode that was reset.
+    fn episode_number(&self, episode: &Episode) -> u64 {
+        episode.index + self.totals.resets
+    }
+
+    fn header(
+        &self,
+        episode: &Episode,
+        frame: &TrafficFrame,
+        tick: u64,
+        step_s: f64,
+        ends: bool,
+        ends_run: bool,
+    ) -> MessageHeader {
+        let flag = |bit: u32, is_set: bool| if is_set { bit } else { 0 };
+        MessageHeader {
+            flags: flag(EVALUATION, episode.evaluation)
+                | flag(FIRST_OF_EPISODE, frame.step == 1)
+                | flag(LAST_OF_EPISODE, ends)
+                | flag(LAST_OF_RUN, ends_run),
+            episode: self.episode_number(episode),
+            episode_seed: episode.seed,
+            tick,
+            sim_time_ns: frame.step * nanoseconds(step_s),
+            ..self.membership.header()
+        }
+    }
+
+    /// Sends one step, counts it and reports the progress.
+    fn publish_step(&mut self, frame: &TrafficFrame, header: MessageHeader) -> Result<(), Failure> {
+        let header = self.outbox.publish_step(frame, header)?;
+        self.totals.add_step(frame, self.ticks_per_step);
+        let (totals, drops) = (&self.totals, self.outbox.drops());
+        self.membership.report(|health| {
+            health.ticks = totals.ticks;
+            health.episode = header.episode;
+            health.sim_time_ns = header.sim_time_ns;
+            health.road_users = header.count;
+            health.cavs = frame.cavs;
+            health.vehicle_steps = totals.vehicle_steps;
+            health.arrived = totals.arrived;
+            health.drops = drops;
+        });
+        Ok(())
+    }
+}
+
+fn nanoseconds(seconds: f64) -> u64 {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a step is positive and short"
+    )]
+    let nanoseconds = (seconds * 1e9).round() as u64;
+    nanoseconds
+}

@@ -1,0 +1,197 @@
+//! The process: runs SUMO episode after episode and publishes each step as `traffic` and `traffic-meta` messages.
+
+pub mod census;
+pub(crate) mod commands;
+mod decisions;
+mod episode;
+mod lessons;
+mod outbox;
+mod pacing;
+
+use std::path::Path;
+
+use ipc_schema::{
+    board::State,
+    failure::Failure,
+    ports::{BoardReader, ControlServer, Subscriber},
+    process::Process,
+    run::RunMap,
+    schedule::Episode,
+    services::Channel,
+    session::{Session as Membership, Wait},
+    traffic::MetaEvent,
+};
+
+use crate::sumo::{Sumo, SumoCost, frame::TrafficFrame};
+use commands::CommandExecutor;
+use lessons::MapUsage;
+use outbox::Outbox;
+use pacing::Pacing;
+
+/// Runs all episodes of the run that `run_file` describes, or until the process is asked to stop.
+///
+/// # Errors
+/// The user's files are wrong, the shared memory is gone, or SUMO fails.
+pub fn run(run_file: &Path) -> Result<(), Failure> {
+    let mut membership = Membership::join(run_file, Process::TrafficBridge)?;
+    let episodes = membership.run.schedule();
+    let poses = match membership.run.config.drives() {
+        true => Some(membership.subscriber(Channel::EgoPose)?),
+        false => None,
+    };
+    let mut bridge = Bridge::open(membership, poses)?;
+    let waited = match bridge.membership.run.course() {
+        Some(course) => bridge.run_curriculum(course)?,
+        None => bridge.run_episodes(episodes)?,
+    };
+    match waited {
+        Wait::Ready => bridge.leave(),
+        Wait::Stopped => Ok(()),
+    }
+}
+
+/// This process's place in the run: what it reads, what it publishes, and how far it has come.
+struct Bridge {
+    membership: Membership,
+    outbox: Outbox,
+    totals: BridgeTotals,
+    /// Progress of `sim-core`, which returns credit.
+    consumer: BoardReader,
+    /// Progress of `sensor-daemon`, which must be attached before sensors are switched.
+    sensing: BoardReader,
+    /// Poses of the heroes, in the driving task.
+    poses: Option<Subscriber>,
+    pacing: Pacing,
+    command_server: ControlServer,
+    commands: CommandExecutor,
+    ticks_per_step: u64,
+    /// The maps of the run.
+    maps: Vec<RunMap>,
+    /// Lessons and ticks on each map, in a run with a curriculum.
+    map_usage: Vec<MapUsage>,
+}
+
+/// What the bridge has done so far.
+struct BridgeTotals {
+    /// Ticks sent.
+    ticks: u64,
+    vehicle_steps: u64,
+    /// Road users that have left the network.
+    arrived: u64,
+    /// Episodes that a command has reset, and the ticks that these episodes had.
+    resets: u64,
+    repeated_ticks: u64,
+    /// Processor time of SUMO over the finished episodes.
+    cost: Option<SumoCost>,
+}
+
+impl BridgeTotals {
+    /// Counts a step that has been sent.
+    fn add_step(&mut self, frame: &TrafficFrame, ticks_per_step: u64) {
+        self.ticks += ticks_per_step;
+        self.vehicle_steps += frame.states.len() as u64;
+        let arrivals = frame
+            .events
+            .iter()
+            .filter(|meta| meta.event == MetaEvent::Arrived as u32);
+        self.arrived += arrivals.count() as u64;
+    }
+}
+
+/// What this process adds to the run's report: processor time, seconds.
+#[derive(Debug, serde::Serialize)]
+struct BridgeReport<'a> {
+    /// SUMO's own steps.
+    sumo_step_s: f64,
+    /// Reading events and states of all road users.
+    getters_s: f64,
+    /// Reading traffic lights.
+    signals_s: f64,
+    /// Road users, summed over SUMO's steps.
+    vehicle_steps: u64,
+    /// The maps of a curriculum that has several: lessons on each, and their ticks.
+    #[serde(skip_serializing_if = "<[MapUsage]>::is_empty")]
+    maps: &'a [MapUsage],
+}
+
+impl Bridge {
+    fn open(membership: Membership, poses: Option<Subscriber>) -> Result<Self, Failure> {
+        let outbox = Outbox::open(&membership)?;
+        let maps = membership.run.every_map();
+        let totals = BridgeTotals {
+            ticks: membership.run.first_tick(),
+            vehicle_steps: 0,
+            arrived: 0,
+            resets: membership.run.start().resets,
+            repeated_ticks: 0,
+            cost: None,
+        };
+        Ok(Self {
+            outbox,
+            totals,
+            consumer: membership.board_of(Process::SimCore)?,
+            sensing: membership.board_of(Process::SensorDaemon)?,
+            poses,
+            pacing: Pacing::new(membership.run.config.run.real_time_factor),
+            command_server: membership.control_server()?,
+            commands: CommandExecutor::of_run(&membership.run.run_dir)?,
+            ticks_per_step: membership.run.ticks_per_traffic_step(),
+            map_usage: maps.iter().map(|map| MapUsage::new(&map.name)).collect(),
+            maps,
+            membership,
+        })
+    }
+
+    /// Reports that the run has begun, and its length where it is known.
+    fn announce_length(&mut self, sumo: &Sumo) {
+        let per_step = self.ticks_per_step;
+        let scenario = sumo.duration_s().map_or(0, |duration_s| {
+            #[expect(
+                clippy::cast_possible_truncation,
+                clippy::cast_sign_loss,
+                reason = "a number of steps"
+            )]
+            let steps = (duration_s / sumo.step_s()).ceil() as u64;
+            steps * per_step
+        });
+        let ticks = |episode: &Episode| {
+            episode
+                .ticks
+                .map_or(scenario, |ticks| ticks.div_ceil(per_step) * per_step)
+        };
+        let total_ticks: u64 = self.membership.run.episodes().iter().map(ticks).sum();
+        let total_ticks = match total_ticks {
+            0 => 0,
+            ticks => ticks + self.totals.repeated_ticks,
+        };
+        if self.totals.ticks == 0 {
+            self.membership.begin_work();
+        }
+        self.membership.report(|health| {
+            health.state = State::Running as u32;
+            health.total_ticks = total_ticks;
+        });
+    }
+
+    /// Leaves once everything sent has been consumed.
+    fn leave(mut self) -> Result<(), Failure> {
+        self.write_report()?;
+        if self.membership.wait_until_consumed(&self.consumer, self.totals.ticks)? == Wait::Ready {
+            self.membership.report(|health| health.state = State::Done as u32);
+        }
+        Ok(())
+    }
+
+    fn write_report(&self) -> Result<(), Failure> {
+        let Some(cost) = self.totals.cost else {
+            return Ok(());
+        };
+        self.membership.write_part(&BridgeReport {
+            sumo_step_s: cost.step_s,
+            getters_s: cost.getters_s,
+            signals_s: cost.signals_s,
+            vehicle_steps: self.totals.vehicle_steps,
+            maps: if self.map_usage.len() > 1 { &self.map_usage } else { &[] },
+        })
+    }
+}

@@ -1,0 +1,145 @@
+//! Everything the bridge publishes, and the sequence number of its `traffic-meta` messages.
+
+use ipc_schema::{
+    block::Section,
+    control::SensorSwitch,
+    failure::{Failure, FailureKind},
+    header::MessageHeader,
+    ports::{PortError, Publisher, Waker},
+    process::Process,
+    services::Channel,
+    session::Session as Membership,
+    traffic::{EVENTS_PER_MESSAGE, ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout},
+};
+
+use super::census::Census;
+use crate::{heroes, sumo::frame::TrafficFrame};
+
+/// The publishers of the process.
+pub(super) struct Outbox {
+    traffic: Publisher,
+    meta: Publisher,
+    /// Whole state once a second, in a run that viewers may watch.
+    census: Option<(Publisher, Census)>,
+    /// Sensors that commands switch.
+    switches: Publisher,
+    /// Wakes `sim-core`.
+    consumer_wake: Waker,
+    /// `traffic-meta` messages sent.
+    meta_messages: u64,
+}
+
+impl Outbox {
+    pub(super) fn open(membership: &Membership) -> Result<Self, Failure> {
+        let census = match membership.run.config.fanout.enabled {
+            true => Some((membership.publisher(Channel::Census)?, Census::default())),
+            false => None,
+        };
+        Ok(Self {
+            traffic: membership.publisher(Channel::Traffic)?,
+            meta: membership.publisher(Channel::TrafficMeta)?,
+            census,
+            switches: membership.publisher(Channel::Switch)?,
+            consumer_wake: membership.waker(Process::SimCore)?,
+            meta_messages: 0,
+        })
+    }
+
+    /// Messages of steps that were lost because a queue was full.
+    pub(super) fn drops(&self) -> u64 {
+        self.traffic.drops() + self.meta.drops()
+    }
+
+    /// Sends one step: first what happened, then the states of all road users. Returns the header of the states.
+    pub(super) fn publish_step(
+        &mut self,
+        frame: &TrafficFrame,
+        header: MessageHeader,
+    ) -> Result<MessageHeader, Failure> {
+        self.publish_meta(frame, header)?;
+        let header = MessageHeader {
+            sequence: self.meta_messages,
+            ..header
+        };
+        send(
+            &self.traffic,
+            header,
+            frame.states.len(),
+            bytemuck::cast_slice(&frame.states),
+        )?;
+        self.consumer_wake.wake();
+        if let Some((publisher, census)) = &mut self.census {
+            census.enter(frame);
+            census.publish_if_due(publisher, header)?;
+        }
+        Ok(header)
+    }
+
+    /// Sends events of road users and changes of traffic lights, in as many messages as they need; none if nothing happened.
+    fn publish_meta(&mut self, frame: &TrafficFrame, header: MessageHeader) -> Result<(), Failure> {
+        let mut events = frame.events.chunks(EVENTS_PER_MESSAGE);
+        let mut signals = frame.signals.chunks(SIGNALS_PER_MESSAGE);
+        loop {
+            let (vehicles, lights) = match (events.next(), signals.next()) {
+                (None, None) => return Ok(()),
+                (vehicles, lights) => (vehicles.unwrap_or_default(), lights.unwrap_or_default()),
+            };
+            self.meta_messages += 1;
+            let layout = TrafficMetaLayout::new(vehicles.len(), lights.len());
+            let header = MessageHeader {
+                sequence: self.meta_messages,
+                count: rows(vehicles.len()),
+                columns: rows(lights.len()),
+                ..header
+            };
+            let mut draft = self.meta.loan(header, layout.len).map_err(too_many)?;
+            let payload = draft.payload_mut();
+            let at = |section: Section| section.offset..section.offset + section.len;
+            payload[at(layout.vehicles)].copy_from_slice(bytemuck::cast_slice(vehicles));
+            payload[at(layout.signals)].copy_from_slice(bytemuck::cast_slice(lights));
+            draft.send()?;
+        }
+    }
+
+    /// Sends the points of heroes' routes.
+    pub(super) fn publish_routes(&mut self, points: &[RoutePoint], header: MessageHeader) -> Result<(), Failure> {
+        for part in heroes::parts(points) {
+            self.meta_messages += 1;
+            let header = MessageHeader {
+                flags: header.flags | ROUTES,
+                sequence: self.meta_messages,
+                ..header
+            };
+            send(&self.meta, header, part.len(), bytemuck::cast_slice(part))?;
+        }
+        Ok(())
+    }
+
+    /// Sends the sensors that commands switch at the tick of `header`.
+    pub(super) fn publish_switches(&self, switches: &[SensorSwitch], header: MessageHeader) -> Result<(), Failure> {
+        send(&self.switches, header, switches.len(), bytemuck::cast_slice(switches))
+    }
+}
+
+fn rows(count: usize) -> u32 {
+    u32::try_from(count).unwrap_or(u32::MAX)
+}
+
+fn send(publisher: &Publisher, header: MessageHeader, count: usize, bytes: &[u8]) -> Result<(), Failure> {
+    let count = rows(count);
+    let mut draft = publisher
+        .loan(MessageHeader { count, ..header }, bytes.len())
+        .map_err(too_many)?;
+    draft.payload_mut().copy_from_slice(bytes);
+    draft.send()?;
+    Ok(())
+}
+
+/// The user can settle this failure: the configuration reserves room for fewer road users than there are.
+fn too_many(error: PortError) -> Failure {
+    match &error {
+        PortError::TooLong { .. } => Failure::from_error(FailureKind::Config, &error)
+            .with_help("raise `traffic.max_road_users`, or use a scenario with fewer road users at a time"),
+        _ => error.into(),
+    }
+}

@@ -1,0 +1,150 @@
+//! One SUMO step in SI units and the project's frames.
+
+use std::collections::BTreeMap;
+
+use ipc_schema::traffic::{
+    Kind, MetaEvent, SIGNAL_LINKS, SignalMeta, TrafficState, VehicleMeta, id_hash, id_text_bytes,
+};
+
+use super::{
+    connected::ConnectedRule,
+    convention,
+    libsumo::ffi::{RawEvent, RawEventKind, RawSignal, RawState},
+};
+
+/// All road users on the road after one SUMO step, and what happened in it. Reused from step to step.
+#[derive(Debug, Clone, Default)]
+pub struct TrafficFrame {
+    /// All road users on the road, by ascending dense index.
+    pub states: Vec<TrafficState>,
+    /// Arrivals, departures and teleports of this step.
+    pub events: Vec<VehicleMeta>,
+    /// Traffic lights that changed in this step; in the first step of an episode all of them.
+    pub signals: Vec<SignalMeta>,
+    /// Simulated time since the start of the episode, seconds.
+    pub time_s: f64,
+    /// SUMO steps since the start of the episode.
+    pub step: u64,
+    /// Connected vehicles and heroes among `states`.
+    pub cavs: u32,
+}
+
+/// What SUMO reported about road users at their departure and later steps need, for one episode.
+#[derive(Debug)]
+pub(crate) struct RoadUserRegister {
+    rule: ConnectedRule,
+    kinds: Vec<Kind>,
+    /// Connected vehicles that have departed and not arrived.
+    cavs: u32,
+    types: BTreeMap<String, u32>,
+}
+
+impl RoadUserRegister {
+    pub(crate) fn new(rule: ConnectedRule) -> Self {
+        Self {
+            rule,
+            kinds: Vec::new(),
+            cavs: 0,
+            types: BTreeMap::new(),
+        }
+    }
+
+    /// Replaces states and events of `frame`.
+    pub(crate) fn fill(&mut self, frame: &mut TrafficFrame, states: &[RawState], events: &[RawEvent], step_s: f64) {
+        frame.events.clear();
+        frame.events.extend(events.iter().map(|event| self.meta(event)));
+        frame.states.clear();
+        frame.cavs = 0;
+        for raw in states {
+            let kind = self.kind(raw.index);
+            if let Some(state) = convention::traffic_state(raw, kind, step_s) {
+                frame.cavs += u32::from(matches!(kind, Kind::Cav | Kind::Hero));
+                frame.states.push(state);
+            }
+        }
+    }
+
+    fn kind(&self, index: u32) -> Kind {
+        self.kinds.get(index as usize).copied().unwrap_or(Kind::Other)
+    }
+
+    fn meta(&mut self, event: &RawEvent) -> VehicleMeta {
+        let departed = event.kind == RawEventKind::Departed;
+        if departed {
+            // The shim assigns indices in order of departure, without gaps.
+            self.kinds.push(if event.is_person {
+                Kind::Person
+            } else {
+                self.rule.kind_of_vehicle(&event.id, self.cavs)
+            });
+        }
+        let is_cav = self.kind(event.index) == Kind::Cav;
+        match event.kind {
+            RawEventKind::Departed => self.cavs += u32::from(is_cav),
+            RawEventKind::Arrived => self.cavs -= u32::from(is_cav),
+            _ => {}
+        }
+        let mut meta = VehicleMeta {
+            id_hash: 0,
+            vehicle: event.index,
+            event: meta_event(event.kind) as u32,
+            kind: self.kind(event.index) as u32,
+            type_index: if departed {
+                self.type_index(&event.vehicle_type)
+            } else {
+                0
+            },
+            length_m: convention::single(event.length),
+            width_m: convention::single(event.width),
+            height_m: convention::single(event.height),
+            id_len: 0,
+            id: [0; ipc_schema::traffic::ID_BYTES],
+            vehicle_class: padded(&event.vehicle_class),
+            type_id: padded(&event.vehicle_type),
+        };
+        meta.set_id(&event.id);
+        meta
+    }
+
+    fn type_index(&mut self, vehicle_type: &str) -> u32 {
+        if let Some(index) = self.types.get(vehicle_type) {
+            return *index;
+        }
+        let index = u32::try_from(self.types.len()).unwrap_or(u32::MAX);
+        self.types.insert(vehicle_type.to_owned(), index);
+        index
+    }
+}
+
+/// A traffic light as `traffic-meta` carries it; links beyond its size are counted but cut off.
+pub(crate) fn signal_meta(raw: &RawSignal) -> SignalMeta {
+    let (id, id_len) = id_text_bytes(&raw.id);
+    let mut state = [0; SIGNAL_LINKS];
+    let carried = raw.state.len().min(SIGNAL_LINKS);
+    state[..carried].copy_from_slice(&raw.state.as_bytes()[..carried]);
+    SignalMeta {
+        id_hash: id_hash(&raw.id),
+        signal: raw.index,
+        id_len,
+        id,
+        links: u32::try_from(raw.state.len()).unwrap_or(u32::MAX),
+        reserved: 0,
+        state,
+    }
+}
+
+fn meta_event(kind: RawEventKind) -> MetaEvent {
+    match kind {
+        RawEventKind::Arrived => MetaEvent::Arrived,
+        RawEventKind::Teleported => MetaEvent::Teleported,
+        _ => MetaEvent::Departed,
+    }
+}
+
+/// `text` cut at a character border, zero padded.
+fn padded<const N: usize>(text: &str) -> [u8; N] {
+    let mut bytes = [0; N];
+    let len = text.floor_char_boundary(N);
+    bytes[..len].copy_from_slice(&text.as_bytes()[..len]);
+    bytes
+}

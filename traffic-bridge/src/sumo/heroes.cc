@@ -1,0 +1,165 @@
+// Heroes: vehicles that SUMO does not move, and the lanes ahead of them.
+#include <algorithm>
+#include <map>
+#include <stdexcept>
+#include <utility>
+
+#include <libsumo/libsumo.h>
+
+#include "traffic-bridge/src/sumo/error_tee.h"
+#include "traffic-bridge/src/sumo/lanes.h"
+#include "traffic-bridge/src/sumo/shim.h"
+#include "traffic-bridge/src/sumo/libsumo.rs.h"
+#include "traffic-bridge/src/sumo/text.h"
+
+namespace caraware {
+
+namespace {
+
+// moveToXY: any lane nearby, and the exact position even where there is none.
+constexpr int FREE_MOVEMENT = 2;
+// How far from a lane a hero may be and still be found on it, metres.
+constexpr double MATCH_THRESHOLD_M = 20.0;
+// Factor on speed limits, speed (m/s) and deceleration (m/s²) that no hero reaches.
+constexpr double UNLIMITED = 100.0;
+// A link through a junction has at most two internal lanes in sequence; more would be a loop.
+constexpr int MAX_INTERNAL_LANES = 8;
+
+using LaneShape = rust::Vec<double>;
+
+void append(LaneShape& shape, const std::string& lane) {
+    for (const libsumo::TraCIPosition& point : libsumo::Lane::getShape(lane).value) {
+        shape.push_back(point.x);
+        shape.push_back(point.y);
+    }
+}
+
+std::uint32_t number_of(const std::string& lane) {
+    return static_cast<std::uint32_t>(std::stoul(lane.substr(lane.rfind('_') + 1)));
+}
+
+struct Light {
+    std::int32_t signal;
+    std::uint32_t link;
+};
+
+// The traffic light of each link, by its lanes.
+std::map<std::pair<std::string, std::string>, Light> lights() {
+    std::vector<std::string> ids = libsumo::TrafficLight::getIDList();
+    std::sort(ids.begin(), ids.end());
+    std::map<std::pair<std::string, std::string>, Light> result;
+    for (std::size_t signal = 0; signal < ids.size(); ++signal) {
+        const auto links = libsumo::TrafficLight::getControlledLinks(ids[signal]);
+        for (std::size_t link = 0; link < links.size(); ++link) {
+            for (const libsumo::TraCILink& way : links[link]) {
+                result.insert({{way.fromLane, way.toLane},
+                               Light{static_cast<std::int32_t>(signal), static_cast<std::uint32_t>(link)}});
+            }
+        }
+    }
+    return result;
+}
+
+RawWay way(std::uint32_t edge, const std::string& from, const libsumo::TraCIConnection& link) {
+    RawWay result{edge, number_of(from), number_of(link.approachedLane), libsumo::Lane::getMaxSpeed(from), {}, -1, 0};
+    std::string internal = link.approachedInternal;
+    for (int count = 0; !internal.empty() && count < MAX_INTERNAL_LANES; ++count) {
+        append(result.shape, internal);
+        result.speed_limit = libsumo::Lane::getMaxSpeed(internal);
+        const std::vector<libsumo::TraCIConnection> onward = libsumo::Lane::getLinks(internal);
+        internal = onward.empty() ? std::string() : onward.front().approachedInternal;
+    }
+    return result;
+}
+
+}  // namespace
+
+const std::string* Simulation::id_of(std::uint32_t index) const {
+    const auto found = std::lower_bound(states_.begin(), states_.end(), index,
+                                        [](const RawState& state, std::uint32_t wanted) { return state.index < wanted; });
+    if (found == states_.end() || found->index != index) {
+        return nullptr;
+    }
+    return &live_[static_cast<std::size_t>(found - states_.begin())].id;
+}
+
+const std::string& Simulation::known_id(std::uint32_t index) const {
+    const std::string* id = id_of(index);
+    if (id == nullptr) {
+        throw std::out_of_range("no road user has the index " + std::to_string(index));
+    }
+    return *id;
+}
+
+void Simulation::add_vehicle_at_start(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) {
+    const std::string name = text(id);
+    libsumo::Route::add(name, texts(route));
+    libsumo::Vehicle::add(name, name, text(vehicle_type), "now", "best", "base", "0");
+}
+
+void Simulation::take_over(std::uint32_t index) {
+    const std::string& id = known_id(index);
+    libsumo::Vehicle::setSpeedMode(id, 0);
+    libsumo::Vehicle::setLaneChangeMode(id, 0);
+    // SUMO computes a moved vehicle's speed from the distance it covers, but never above these limits.
+    libsumo::Vehicle::setSpeedFactor(id, UNLIMITED);
+    libsumo::Vehicle::setMaxSpeed(id, UNLIMITED);
+    libsumo::Vehicle::setEmergencyDecel(id, UNLIMITED);
+}
+
+void Simulation::move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration) {
+    const std::string& id = known_id(index);
+    libsumo::Vehicle::moveToXY(id, "", -1, x, y, angle, FREE_MOVEMENT, MATCH_THRESHOLD_M);
+    libsumo::Vehicle::setPreviousSpeed(id, speed, acceleration);
+}
+
+void Simulation::remove_by_index(std::uint32_t index) {
+    if (const std::string* id = id_of(index); id != nullptr) {
+        libsumo::Vehicle::remove(*id);
+    }
+}
+
+std::int32_t Simulation::lane_index(std::uint32_t index) const { return libsumo::Vehicle::getLaneIndex(known_id(index)); }
+
+rust::Vec<RawLane> Simulation::route_lanes(std::uint32_t index) const {
+    const std::string& id = known_id(index);
+    const std::string species = libsumo::Vehicle::getVehicleClass(id);
+    rust::Vec<RawLane> result;
+    std::uint32_t place = 0;
+    for (const std::string& edge : libsumo::Vehicle::getRoute(id)) {
+        for (const std::string& lane : lanes_for(edge, species)) {
+            RawLane raw{place, number_of(lane), libsumo::Lane::getMaxSpeed(lane), {}};
+            append(raw.shape, lane);
+            result.push_back(std::move(raw));
+        }
+        ++place;
+    }
+    return result;
+}
+
+rust::Vec<RawWay> Simulation::route_ways(std::uint32_t index) const {
+    const std::string& id = known_id(index);
+    const std::string species = libsumo::Vehicle::getVehicleClass(id);
+    const std::vector<std::string> route = libsumo::Vehicle::getRoute(id);
+    const auto lit = lights();
+    rust::Vec<RawWay> result;
+    for (std::size_t place = 0; place + 1 < route.size(); ++place) {
+        for (const std::string& lane : lanes_for(route[place], species)) {
+            for (const libsumo::TraCIConnection& link : libsumo::Lane::getLinks(lane)) {
+                if (libsumo::Lane::getEdgeID(link.approachedLane) != route[place + 1] ||
+                    !allows(link.approachedLane, species)) {
+                    continue;
+                }
+                RawWay raw = way(static_cast<std::uint32_t>(place), lane, link);
+                if (const auto light = lit.find({lane, link.approachedLane}); light != lit.end()) {
+                    raw.signal = light->second.signal;
+                    raw.link = light->second.link;
+                }
+                result.push_back(std::move(raw));
+            }
+        }
+    }
+    return result;
+}
+
+}  // namespace caraware

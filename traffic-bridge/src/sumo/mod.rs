@@ -1,0 +1,294 @@
+//! SUMO as a value. A [`Sumo`] is a running simulation: starting returns one, closing or reloading consumes it. A process has at
+//! most one, because libsumo keeps its simulation in global variables.
+
+pub mod connected;
+pub mod convention;
+pub mod error;
+pub mod frame;
+pub mod inputs;
+pub mod libsumo;
+pub mod options;
+
+use std::{
+    path::Path,
+    pin::Pin,
+    sync::atomic::{AtomicBool, Ordering},
+};
+
+use cxx::UniquePtr;
+
+use error::SumoError;
+use frame::{RoadUserRegister, TrafficFrame, signal_meta};
+use inputs::InputFiles;
+use libsumo::ffi;
+use options::SumoOptions;
+
+/// True while a [`Sumo`] holds libsumo's global simulation.
+static TAKEN: AtomicBool = AtomicBool::new(false);
+
+/// The text of libsumo's exception when the reason went to standard error.
+const SAYS_NOTHING: &str = "Process Error";
+
+/// Holds libsumo for one [`Sumo`].
+#[derive(Debug)]
+struct LibsumoClaim;
+
+impl LibsumoClaim {
+    fn take() -> Result<Self, SumoError> {
+        if TAKEN.swap(true, Ordering::AcqRel) {
+            Err(SumoError::AlreadyRunning)
+        } else {
+            Ok(Self)
+        }
+    }
+}
+
+impl Drop for LibsumoClaim {
+    fn drop(&mut self) {
+        TAKEN.store(false, Ordering::Release);
+    }
+}
+
+/// Where processor time went, seconds since SUMO was started.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SumoCost {
+    /// SUMO's own steps.
+    pub step_s: f64,
+    /// Reading events and states of all road users.
+    pub getters_s: f64,
+    /// Reading traffic lights.
+    pub signals_s: f64,
+}
+
+/// A running simulation. Not `Send`: libsumo stays on the thread that started it.
+pub struct Sumo {
+    simulation: UniquePtr<ffi::Simulation>,
+    register: RoadUserRegister,
+    files: InputFiles,
+    step_s: f64,
+    begin_s: f64,
+    end_s: f64,
+    steps: u64,
+    // Last: dropped after `simulation`, whose destructor still uses libsumo.
+    claim: LibsumoClaim,
+}
+
+impl std::fmt::Debug for Sumo {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Sumo")
+            .field("files", &self.files)
+            .field("steps", &self.steps)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Sumo {
+    /// Starts SUMO. Sets `SUMO_HOME`, `PROJ_DATA` and `PROJ_LIB` of this process: no other thread may be reading the environment.
+    ///
+    /// # Errors
+    /// SUMO is already running in this process, or it refuses its input.
+    pub fn start(options: SumoOptions) -> Result<Self, SumoError> {
+        let claim = LibsumoClaim::take()?;
+        set_environment(&options.sumo_home);
+        Self::begin(ffi::new_simulation(), claim, options)
+    }
+
+    /// Ends this simulation and starts another in its place: a new episode, where dense indices begin at 0 again.
+    ///
+    /// # Errors
+    /// SUMO refuses its input; SUMO is not running afterwards.
+    pub fn reload(mut self, options: SumoOptions) -> Result<Self, SumoError> {
+        called("end the simulation", self.simulation.pin_mut().close())?;
+        Self::begin(self.simulation, self.claim, options)
+    }
+
+    /// Ends the simulation and completes its output files. Dropping the value does the same but reports no error.
+    ///
+    /// # Errors
+    /// SUMO cannot finish its outputs.
+    pub fn close(mut self) -> Result<(), SumoError> {
+        called("end the simulation", self.simulation.pin_mut().close())
+    }
+
+    fn begin(
+        mut simulation: UniquePtr<ffi::Simulation>,
+        claim: LibsumoClaim,
+        options: SumoOptions,
+    ) -> Result<Self, SumoError> {
+        simulation.pin_mut().take_messages();
+        if let Err(error) = simulation.pin_mut().start(&options.arguments) {
+            let reason = reason(&error, &simulation.pin_mut().take_messages());
+            return Err(SumoError::Refused {
+                place: options.files.place_of(&reason),
+                reason,
+            });
+        }
+        let step_s = called("report its step", simulation.step_length())?;
+        let begin_s = called("report the time", simulation.time())?;
+        let end_s = called("report its end", simulation.end_time())?;
+        let register = RoadUserRegister::new(options.rule);
+        Ok(Self {
+            simulation,
+            register,
+            files: options.files,
+            step_s,
+            begin_s,
+            end_s,
+            steps: 0,
+            claim,
+        })
+    }
+
+    /// Runs one step and replaces the content of `frame`, whose buffers are reused.
+    ///
+    /// # Errors
+    /// SUMO fails, for instance at an input file that it reads while it runs.
+    pub fn step(&mut self, frame: &mut TrafficFrame) -> Result<(), SumoError> {
+        if let Err(error) = self.simulation.pin_mut().step() {
+            let reason = reason(&error, &self.simulation.pin_mut().take_messages());
+            let time_s = self.simulation.time().unwrap_or(self.begin_s);
+            return Err(SumoError::Step {
+                time_s,
+                place: self.files.place_of(&reason),
+                reason,
+            });
+        }
+        self.steps += 1;
+        frame.step = self.steps;
+        frame.time_s = self.time_s()?;
+        self.register
+            .fill(frame, self.simulation.states(), self.simulation.events(), self.step_s);
+        frame.signals.clear();
+        frame.signals.extend(self.simulation.signals().iter().map(signal_meta));
+        Ok(())
+    }
+
+    /// Simulated time since the start of the episode, seconds.
+    ///
+    /// # Errors
+    /// SUMO is no longer loaded.
+    pub fn time_s(&self) -> Result<f64, SumoError> {
+        Ok(called("report the time", self.simulation.time())? - self.begin_s)
+    }
+
+    /// Length of a step, seconds.
+    #[must_use]
+    pub fn step_s(&self) -> f64 {
+        self.step_s
+    }
+
+    /// Length of the episode by the scenario's own `end`, seconds; `None` if it names none.
+    #[must_use]
+    pub fn duration_s(&self) -> Option<f64> {
+        (self.end_s >= 0.0).then_some(self.end_s - self.begin_s)
+    }
+
+    /// True once `sumo` would end by itself: at the scenario's end or, if it names none, when no road user is left or expected.
+    ///
+    /// # Errors
+    /// SUMO is no longer loaded.
+    pub fn finished(&self) -> Result<bool, SumoError> {
+        match self.duration_s() {
+            Some(duration_s) => Ok(self.time_s()? >= duration_s),
+            None => Ok(self.min_expected()? == 0),
+        }
+    }
+
+    /// Road users on the road or known to come; 0 means that the scenario is over.
+    ///
+    /// # Errors
+    /// SUMO is no longer loaded.
+    pub fn min_expected(&self) -> Result<u32, SumoError> {
+        let expected = called("count road users", self.simulation.min_expected())?;
+        Ok(u32::try_from(expected).unwrap_or(0))
+    }
+
+    /// Processor time spent so far, over all reloads.
+    #[must_use]
+    pub fn cost(&self) -> SumoCost {
+        SumoCost {
+            step_s: self.simulation.seconds_in_step(),
+            getters_s: self.simulation.seconds_in_getters(),
+            signals_s: self.simulation.seconds_in_signals(),
+        }
+    }
+
+    /// The files this simulation was started from.
+    #[must_use]
+    pub fn files(&self) -> &InputFiles {
+        &self.files
+    }
+
+    pub(crate) fn simulation(&self) -> &ffi::Simulation {
+        &self.simulation
+    }
+
+    pub(crate) fn simulation_mut(&mut self) -> Pin<&mut ffi::Simulation> {
+        self.simulation.pin_mut()
+    }
+}
+
+/// Processor time of this thread, seconds.
+#[must_use]
+pub fn processor_time_s() -> f64 {
+    ffi::processor_seconds()
+}
+
+/// Turns the failure of a call into an error that names what SUMO was asked to do.
+pub(crate) fn called<T>(action: &'static str, result: Result<T, cxx::Exception>) -> Result<T, SumoError> {
+    result.map_err(|error| SumoError::Call {
+        action,
+        reason: error.what().trim().to_owned(),
+    })
+}
+
+fn set_environment(sumo_home: &Path) {
+    ffi::set_environment("SUMO_HOME", &sumo_home.to_string_lossy());
+    // PROJ before 9.1 reads the second name; the wheel sets both.
+    for name in ["PROJ_DATA", "PROJ_LIB"] {
+        ffi::set_environment(name, &sumo_home.join("data/proj").to_string_lossy());
+    }
+}
+
+/// SUMO's reason on one line: the exception, and the errors (not the warnings) that it wrote before.
+fn reason(error: &cxx::Exception, messages: &str) -> String {
+    let errors = errors_in(messages);
+    let what = error.what().trim();
+    let parts: &[&str] = match (what, errors.as_str()) {
+        (SAYS_NOTHING, "") => &["no reason given, see the log"],
+        (SAYS_NOTHING, errors) => &[errors],
+        (what, "") => &[what],
+        (what, errors) => &[what, errors],
+    };
+    parts.join(" ").split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+fn errors_in(messages: &str) -> String {
+    let mut is_error = false;
+    let mut errors = String::new();
+    for line in messages.lines() {
+        if line.starts_with("Warning:") {
+            is_error = false;
+        }
+        if let Some(error) = line.strip_prefix("Error:") {
+            is_error = true;
+            errors.push_str(error);
+        } else if is_error {
+            errors.push_str(line);
+        }
+        errors.push(' ');
+    }
+    errors.trim().to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::errors_in;
+
+    #[test]
+    fn errors_are_separated_from_warnings() {
+        let messages = "Warning: w1\n more of w1\nError: e1\n more of e1\nWarning: w2\nError: e2\n";
+        let words: Vec<_> = errors_in(messages).split_whitespace().map(str::to_owned).collect();
+        assert_eq!(words.join(" "), "e1 more of e1 e2");
+    }
+}

@@ -1,0 +1,160 @@
+//! SUMO's options for a run.
+
+use std::path::{Path, PathBuf};
+
+use super::{
+    connected::ConnectedRule,
+    convention::sumo_seed,
+    error::SumoError,
+    inputs::{InputFiles, ScenarioFile},
+};
+
+/// SUMO teleports a vehicle of the population out of a jam after this long without movement, seconds.
+const POPULATION_TELEPORT_S: u32 = 120;
+
+/// Steps up to the root directory: more than any path has folders (a path is at most 4096 bytes, a folder two).
+const TO_THE_ROOT: usize = 128;
+
+/// A simulation as it is to be started.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SumoOptions {
+    pub(crate) arguments: Vec<String>,
+    pub(crate) files: InputFiles,
+    pub(crate) rule: ConnectedRule,
+    pub(crate) sumo_home: PathBuf,
+}
+
+impl SumoOptions {
+    /// A net for population control: empty roads, `step_s` seconds a step, SUMO's random numbers from `episode_seed`.
+    ///
+    /// # Errors
+    /// A file is missing.
+    pub fn population(
+        sumo_home: &Path,
+        net_file: &Path,
+        additional_files: &[PathBuf],
+        step_s: f64,
+        episode_seed: u64,
+    ) -> Result<Self, SumoError> {
+        let files = InputFiles {
+            main: net_file.into(),
+            others: additional_files.to_vec(),
+        };
+        files.check()?;
+        let mut arguments = arguments(&[
+            ("--net-file", &net_file.to_string_lossy()),
+            ("--step-length", &step_s.to_string()),
+            ("--seed", &sumo_seed(episode_seed).to_string()),
+            ("--collision.action", "warn"),
+            ("--time-to-teleport", &POPULATION_TELEPORT_S.to_string()),
+            ("--no-step-log", "true"),
+            ("--duration-log.disable", "true"),
+        ]);
+        if !additional_files.is_empty() {
+            let names: Vec<_> = additional_files.iter().map(|file| file.to_string_lossy()).collect();
+            arguments.extend(["--additional-files".to_owned(), names.join(",")]);
+        }
+        Ok(Self {
+            arguments,
+            files,
+            rule: ConnectedRule::Population,
+            sumo_home: sumo_home.into(),
+        })
+    }
+
+    /// A user's scenario exactly as SUMO runs it, except for its outputs, which go to `output_dir`. `step_s` and `seed` are
+    /// those of the run; they replace the scenario's own only if they differ. `rule` says which vehicles are connected or
+    /// heroes.
+    ///
+    /// The demand is the scenario's own unless [`SumoOptions::with_scale`] says otherwise.
+    ///
+    /// # Errors
+    /// A file is missing or malformed, or `output_dir` cannot be made.
+    pub fn scenario(
+        sumo_home: &Path,
+        sumocfg: &Path,
+        output_dir: &Path,
+        step_s: f64,
+        seed: u64,
+        rule: ConnectedRule,
+    ) -> Result<Self, SumoError> {
+        let scenario = ScenarioFile::read(sumocfg)?;
+        scenario.files.check()?;
+        let mut arguments = arguments(&[
+            ("--configuration-file", &sumocfg.to_string_lossy()),
+            ("--output-prefix", &output_prefix(output_dir)?),
+            ("--no-step-log", "true"),
+        ]);
+        #[expect(clippy::float_cmp, reason = "the run took the number from the same text")]
+        if scenario.step_s != step_s {
+            arguments.extend(["--step-length".to_owned(), step_s.to_string()]);
+        }
+        if scenario.seed != seed {
+            arguments.extend(["--seed".to_owned(), sumo_seed(seed).to_string()]);
+        }
+        if matches!(&rule, ConnectedRule::Scenario { heroes, .. } if !heroes.is_empty()) {
+            // `sim-core` reports a hero's collisions and ends its episode; SUMO would move the hero out of the way.
+            arguments.extend(["--collision.action".to_owned(), "warn".to_owned()]);
+        }
+        Ok(Self {
+            arguments,
+            files: scenario.files,
+            rule,
+            sumo_home: sumo_home.into(),
+        })
+    }
+}
+
+impl SumoOptions {
+    /// The same with `scale` times the demand, if it is given: SUMO's `--scale`.
+    #[must_use]
+    pub fn with_scale(mut self, scale: Option<f64>) -> Self {
+        if let Some(scale) = scale {
+            self.arguments.extend(["--scale".to_owned(), scale.to_string()]);
+        }
+        self
+    }
+}
+
+fn arguments(pairs: &[(&str, &str)]) -> Vec<String> {
+    pairs
+        .iter()
+        .flat_map(|(name, value)| [(*name).to_owned(), (*value).to_owned()])
+        .collect()
+}
+
+/// SUMO puts the prefix between the folder of an output and its name, whether the output is named in the
+/// configuration or in an additional file; an absolute prefix would come out as `<folder>//absolute/…`. So the prefix
+/// climbs to the root first, and nothing is written beside the user's files.
+fn output_prefix(output_dir: &Path) -> Result<String, SumoError> {
+    let failed = |source| SumoError::Output {
+        path: output_dir.into(),
+        source,
+    };
+    std::fs::create_dir_all(output_dir).map_err(failed)?;
+    let absolute = output_dir.canonicalize().map_err(failed)?;
+    let from_root = absolute.to_string_lossy().trim_start_matches('/').to_owned();
+    Ok(format!("{}{from_root}/", "../".repeat(TO_THE_ROOT)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_prefix_leads_from_any_folder_to_the_output_directory() {
+        let folder = tempfile::tempdir().unwrap();
+        let output = folder.path().join("sumo");
+        let from = folder.path().join("a/b");
+        std::fs::create_dir_all(&from).unwrap();
+        let prefix = output_prefix(&output).unwrap();
+        std::fs::write(from.join(format!("{prefix}x.xml")), "").unwrap();
+        assert!(output.join("x.xml").is_file());
+    }
+
+    #[test]
+    fn a_missing_net_is_named() {
+        let error = SumoOptions::population(Path::new("/"), Path::new("no.net.xml"), &[], 0.1, 1).unwrap_err();
+        assert!(error.to_string().contains("no.net.xml"), "{error}");
+    }
+}
