@@ -15,26 +15,26 @@ pub struct Progress {
     pub incarnation: u32,
     /// 1 once the process has opened its ports and will miss nothing, else 0.
     pub attached: u32,
-    /// Of a trainer with a curriculum: how many lessons have a step.
+    /// Of a trainer with a curriculum: how many lessons have a stage.
     pub decided_lessons: u64,
-    /// The first lesson of that step, the newest; the lesson before it belongs to the step before.
+    /// The first lesson of the newest stage; the lesson before it belongs to the stage before.
     pub since_lesson: u64,
-    /// The step, counted from 0; as many as there are: all are passed, and `since_lesson` does not take place.
-    pub step: u32,
+    /// The newest stage, counted from 0. Equal to the number of stages when all are done; `since_lesson` is then unused.
+    pub stage: u32,
     /// Zero.
     pub padding: u32,
 }
 
 impl Progress {
-    /// The step, counted from 0, that `lesson` belongs to; `None` before that is decided. Only the newest decided lesson and the one
-    /// before it may be asked for.
+    /// The stage, counted from 0, that `lesson` belongs to; `None` before that is decided. Only the newest decided lesson and the one
+    /// before it have an answer.
     #[must_use]
-    pub fn step_of(&self, lesson: u64) -> Option<u32> {
+    pub fn stage_of(&self, lesson: u64) -> Option<u32> {
         (lesson < self.decided_lessons).then(|| {
             if lesson < self.since_lesson {
-                self.step.saturating_sub(1)
+                self.stage.saturating_sub(1)
             } else {
-                self.step
+                self.stage
             }
         })
     }

@@ -27,7 +27,7 @@ pub struct Config {
     /// Length of episodes and when to evaluate.
     pub episode: Episode,
     /// Steps of training, each with a gate to the next.
-    pub curriculum: Curriculum,
+    pub curriculum: CurriculumConfig,
     /// What the trainer's output means.
     pub task: Task,
     /// Vehicle models and their limits.

@@ -11,17 +11,17 @@ pub const FIRST_OF_EPISODE: u32 = 1 << 1;
 pub const LAST_OF_EPISODE: u32 = 1 << 2;
 /// Last tick of the run: the producer sends nothing after it.
 pub const LAST_OF_RUN: u32 = 1 << 3;
-/// Last tick of a lesson: before the next one the producer waits for the trainer to say which step of the curriculum it belongs to.
+/// Last tick of a lesson: before the next one the producer waits for the trainer's decision about its stage of the curriculum.
 pub const LAST_OF_LESSON: u32 = 1 << 4;
-/// First bit of the step of the curriculum, counted from 1; 0 is the base configuration.
-const STEP_SHIFT: u32 = 16;
+/// First bit of the stage of the curriculum, counted from 1; 0 is the base configuration.
+const STAGE_SHIFT: u32 = 16;
 /// First bit of the map, counted from 0.
 const MAP_SHIFT: u32 = 24;
 
-/// The flags of a tick in step `step` of the curriculum, counted from 1; 0 is the base configuration.
+/// The flags of a tick in stage `stage` of the curriculum, counted from 1; 0 is the base configuration.
 #[must_use]
-pub const fn step_flags(step: u8) -> u32 {
-    (step as u32) << STEP_SHIFT
+pub const fn stage_flags(stage: u8) -> u32 {
+    (stage as u32) << STAGE_SHIFT
 }
 
 /// The flags of a tick on map `map` of a curriculum, counted from 0, the run's own.
@@ -44,7 +44,7 @@ pub struct MessageHeader {
     /// Counts the replacements of the sending process. `observation`: of the trainer that it is meant for.
     pub incarnation: u32,
     /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`], [`LAST_OF_LESSON`]; from bit 8 on what the
-    /// payload says; from bit 16 on [`step_flags`]; from bit 24 on [`map_flags`].
+    /// payload says; from bit 16 on [`stage_flags`]; from bit 24 on [`map_flags`].
     pub flags: u32,
     /// Episode number, 0-based over the run.
     pub episode: u64,
@@ -70,10 +70,10 @@ impl MessageHeader {
         self.flags & flag == flag
     }
 
-    /// Step of the curriculum, counted from 1; 0 is the base configuration.
+    /// Stage of the curriculum, counted from 1; 0 is the base configuration.
     #[must_use]
-    pub const fn step(&self) -> usize {
-        (self.flags >> STEP_SHIFT & 0xff) as usize
+    pub const fn stage(&self) -> usize {
+        (self.flags >> STAGE_SHIFT & 0xff) as usize
     }
 
     /// Place of the map among those of the curriculum; 0 is the run's own.
@@ -88,13 +88,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn step_and_map_have_bytes_of_their_own() {
-        for (step, map) in [(0, 0), (1, 255), (255, 1), (255, 255)] {
+    fn stage_and_map_have_bytes_of_their_own() {
+        for (stage, map) in [(0, 0), (1, 255), (255, 1), (255, 255)] {
             let header = MessageHeader {
-                flags: LAST_OF_LESSON | step_flags(step) | map_flags(map),
+                flags: LAST_OF_LESSON | stage_flags(stage) | map_flags(map),
                 ..MessageHeader::default()
             };
-            assert_eq!((header.step(), header.map()), (usize::from(step), usize::from(map)));
+            assert_eq!((header.stage(), header.map()), (usize::from(stage), usize::from(map)));
             assert!(header.has(LAST_OF_LESSON) && !header.has(EVALUATION));
         }
     }

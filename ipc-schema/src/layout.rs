@@ -197,7 +197,7 @@ pub fn table() -> Vec<TypeLayout> {
             attached,
             decided_lessons,
             since_lesson,
-            step,
+            stage,
             padding
         }),
         layout!(Health {

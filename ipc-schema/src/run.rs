@@ -26,8 +26,10 @@ impl Mode {
     }
 }
 
-/// Log of the steps of a curriculum, in the run directory: which each lesson was in.
-pub const STEP_LOG: &str = "actions.jsonl";
+/// Log of a curriculum in the run directory: the first lesson and tick of each stage.
+pub const CURRICULUM_LOG: &str = "curriculum.jsonl";
+/// Name of that log before it was renamed: a directory with it is refused.
+pub const FORMER_CURRICULUM_LOG: &str = "actions.jsonl";
 
 /// The checkpoint that a run begins with.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -102,7 +104,7 @@ pub struct SceneFiles {
 /// A map of a run whose curriculum has several.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunMap {
-    /// By which steps call it.
+    /// The name by which stages refer to it.
     pub name: String,
     /// What traffic runs on.
     pub source: Source,
@@ -370,15 +372,15 @@ impl RunFile {
         )
     }
 
-    /// The way through this run if it has a curriculum.
+    /// The plan of this run if it has a curriculum.
     #[must_use]
-    pub fn course(&self) -> Option<schedule::Course> {
+    pub fn curriculum_plan(&self) -> Option<schedule::CurriculumPlan> {
         let Config {
             curriculum, episode, ..
         } = &self.config;
-        match (&self.source, curriculum.steps.is_empty()) {
+        match (&self.source, curriculum.stages.is_empty()) {
             (Source::Population { .. }, false) if self.mode != Mode::Play => {
-                Some(schedule::Course::new(episode, curriculum, self.config.run.seed))
+                Some(schedule::CurriculumPlan::new(episode, curriculum, self.config.run.seed))
             }
             _ => None,
         }

@@ -1,6 +1,6 @@
-//! Which episodes a run consists of: a pure function of configuration and seed, so that every process knows it.
+//! The episodes of a run: a pure function of configuration and seed, so that every process can compute them.
 
-use crate::config::{Curriculum, Episode as Lengths, MapChoice, Step};
+use crate::config::{CurriculumConfig, Episode as Lengths, MapChoice, StageConfig};
 
 /// One episode of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -99,9 +99,9 @@ pub fn play(seed: u64, index: u64, ticks: Option<u64>) -> Episode {
     }
 }
 
-/// What a run with a curriculum does next.
+/// The next part of a run with a curriculum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Due {
+pub enum DueWork {
     /// An evaluation, in the base configuration.
     Evaluation {
         /// The episode.
@@ -109,29 +109,29 @@ pub enum Due {
         /// True if nothing follows it.
         is_last: bool,
     },
-    /// A lesson, whose step is to be asked for ([`Course::enter`]).
+    /// A lesson, which [`CurriculumPlan::enter`] puts into its stage.
     Lesson(u64),
-    /// Nothing.
+    /// Nothing: the run is complete.
     Nothing,
 }
 
 /// A lesson of a run with a curriculum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Lesson {
-    /// Its step, counted from 0.
-    pub step: usize,
+    /// Its stage, counted from 0.
+    pub stage: usize,
     /// Its map among those of the run.
     pub map: usize,
-    /// The episode that begins with it; `None`: the one that is running goes on.
+    /// The episode that begins with it; `None`: the running episode continues.
     pub begins: Option<Episode>,
 }
 
-/// The way through a run with a curriculum: lessons, evaluations at the interval, and the final evaluations. A function of
-/// configuration, seed and the steps that lessons are given.
+/// The plan of a run with a curriculum: lessons, evaluations at the interval, and the final evaluations. It is a function of
+/// configuration, seed and the stages of lessons.
 #[derive(Debug)]
-pub struct Course {
+pub struct CurriculumPlan {
     lengths: Lengths,
-    ways: Vec<Way>,
+    stages: Vec<StagePlan>,
     seed: u64,
     lessons: u64,
     episodes: u64,
@@ -139,32 +139,32 @@ pub struct Course {
     final_evaluations: u64,
     evaluated_lessons: u64,
     is_over: bool,
-    /// Step of the episode that is running.
+    /// Stage of the running episode.
     running: Option<usize>,
-    /// Step of the newest lesson, and the first lesson of that step.
+    /// Stage of the newest lesson, and the first lesson of that stage.
     since: Option<(usize, u64)>,
 }
 
-/// What a course has to know of a step.
+/// The part of a stage that the plan needs.
 #[derive(Debug, Clone)]
-struct Way {
+struct StagePlan {
     restart: bool,
     maps: Vec<usize>,
     choice: MapChoice,
     until_lessons: Option<u64>,
 }
 
-impl Way {
-    fn new(curriculum: &Curriculum, step: &Step) -> Self {
+impl StagePlan {
+    fn new(curriculum: &CurriculumConfig, stage: &StageConfig) -> Self {
         Self {
-            restart: step.restart,
-            maps: curriculum.maps_of(step),
-            choice: step.map_choice,
-            until_lessons: step.until_lessons,
+            restart: stage.restart,
+            maps: curriculum.maps_of(stage),
+            choice: stage.map_choice,
+            until_lessons: stage.until_lessons,
         }
     }
 
-    /// The map of the lesson that is `since` lessons behind the step's first, `first`, in a run of at most `most` lessons.
+    /// The map of the lesson that is `since` lessons after the stage's first, `first`, in a run of at most `most` lessons.
     fn map(&self, seed: u64, first: u64, since: u64, most: u64) -> usize {
         let count = self.maps.len() as u64;
         let [share, draw] = map_words(seed, first + since);
@@ -194,13 +194,17 @@ fn map_words(run_seed: u64, lesson: u64) -> [u64; 2] {
     first_words(&hasher)
 }
 
-impl Course {
-    /// At its beginning.
+impl CurriculumPlan {
+    /// The plan at the beginning of the run.
     #[must_use]
-    pub fn new(lengths: &Lengths, curriculum: &Curriculum, seed: u64) -> Self {
+    pub fn new(lengths: &Lengths, curriculum: &CurriculumConfig, seed: u64) -> Self {
         Self {
             lengths: lengths.clone(),
-            ways: curriculum.steps.iter().map(|step| Way::new(curriculum, step)).collect(),
+            stages: curriculum
+                .stages
+                .iter()
+                .map(|stage| StagePlan::new(curriculum, stage))
+                .collect(),
             seed,
             lessons: 0,
             episodes: 0,
@@ -213,14 +217,14 @@ impl Course {
         }
     }
 
-    /// What follows. An evaluation is begun by asking for it.
-    pub fn due(&mut self) -> Due {
+    /// The next part of the run. An evaluation counts as begun once it is returned.
+    pub fn due(&mut self) -> DueWork {
         self.is_over |= self.lessons >= self.lengths.training_episodes;
         let interval = self.lengths.evaluation_interval;
         if self.is_over {
             self.final_evaluations += 1;
             return match self.final_evaluations > self.lengths.final_evaluations {
-                true => Due::Nothing,
+                true => DueWork::Nothing,
                 false => self.evaluation(self.final_evaluations == self.lengths.final_evaluations),
             };
         }
@@ -228,14 +232,14 @@ impl Course {
             self.evaluated_lessons = self.lessons;
             return self.evaluation(false);
         }
-        Due::Lesson(self.lessons)
+        DueWork::Lesson(self.lessons)
     }
 
-    fn evaluation(&mut self, is_last: bool) -> Due {
+    fn evaluation(&mut self, is_last: bool) -> DueWork {
         self.running = None;
         let episode = self.begin(true, self.evaluations, self.lengths.evaluation_ticks);
         self.evaluations += 1;
-        Due::Evaluation { episode, is_last }
+        DueWork::Evaluation { episode, is_last }
     }
 
     fn begin(&mut self, evaluation: bool, count: u64, ticks: u64) -> Episode {
@@ -248,24 +252,24 @@ impl Course {
         }
     }
 
-    /// Begins the lesson that is due, in `step`, counted from 0; `None` if that is behind the last: no lesson follows.
-    pub fn enter(&mut self, step: usize) -> Option<Lesson> {
-        let Some(way) = self.ways.get(step) else {
+    /// Begins the lesson that is due, in `stage`, counted from 0; `None` if that is behind the last: no lesson follows.
+    pub fn enter(&mut self, stage: usize) -> Option<Lesson> {
+        let Some(way) = self.stages.get(stage) else {
             self.is_over = true;
             return None;
         };
         let first = match self.since {
-            Some((newest, first)) if newest == step => first,
+            Some((newest, first)) if newest == stage => first,
             _ => self.lessons,
         };
-        // An episode that goes on cannot change its map.
+        // An episode that continues cannot change its map.
         let since = if way.restart { self.lessons - first } else { 0 };
         let map = way.map(self.seed, first, since, self.lengths.training_episodes);
-        let goes_on = !way.restart && self.running == Some(step);
-        let begins = (!goes_on).then(|| self.begin(false, self.lessons, self.lengths.ticks));
-        (self.running, self.since) = (Some(step), Some((step, first)));
+        let continues = !way.restart && self.running == Some(stage);
+        let begins = (!continues).then(|| self.begin(false, self.lessons, self.lengths.ticks));
+        (self.running, self.since) = (Some(stage), Some((stage, first)));
         self.lessons += 1;
-        Some(Lesson { step, map, begins })
+        Some(Lesson { stage, map, begins })
     }
 }
 
@@ -310,28 +314,28 @@ mod tests {
         assert_eq!(environment_seed(42, 0), 42);
     }
 
-    /// A course through steps of which the second does not restart, as it is given `steps`: L and E begin an episode, l goes on.
-    fn course(lengths: &Lengths, steps: &[usize]) -> String {
-        let curriculum = Curriculum {
-            steps: [true, false]
+    /// A plan through stages of which the second does not restart, with lessons in `stages`: L and E begin an episode, l continues.
+    fn plan(lengths: &Lengths, stages: &[usize]) -> String {
+        let curriculum = CurriculumConfig {
+            stages: [true, false]
                 .map(|restart| serde_json::from_value(serde_json::json!({"cavs": 1, "restart": restart})).unwrap())
                 .to_vec(),
-            ..Curriculum::default()
+            ..CurriculumConfig::default()
         };
-        let mut course = Course::new(lengths, &curriculum, 7);
-        let mut told = String::new();
+        let mut plan = CurriculumPlan::new(lengths, &curriculum, 7);
+        let mut parts = String::new();
         let mut seeds = BTreeSet::new();
         loop {
-            let episode = match course.due() {
-                Due::Evaluation { episode, is_last } => {
-                    told.push(if is_last { '!' } else { 'E' });
+            let episode = match plan.due() {
+                DueWork::Evaluation { episode, is_last } => {
+                    parts.push(if is_last { '!' } else { 'E' });
                     Some(episode)
                 }
-                Due::Lesson(number) => course.enter(steps[number as usize]).and_then(|lesson| {
-                    told.push(if lesson.begins.is_some() { 'L' } else { 'l' });
+                DueWork::Lesson(number) => plan.enter(stages[number as usize]).and_then(|lesson| {
+                    parts.push(if lesson.begins.is_some() { 'L' } else { 'l' });
                     lesson.begins
                 }),
-                Due::Nothing => return told,
+                DueWork::Nothing => return parts,
             };
             if let Some(episode) = episode {
                 assert_eq!(episode.index, seeds.len() as u64);
@@ -341,33 +345,33 @@ mod tests {
     }
 
     #[test]
-    fn a_course_restarts_where_its_step_says_so_and_ends_behind_the_last_step() {
-        assert_eq!(course(&lengths(9, 0, 2), &[0, 0, 1, 1, 1, 2]), "LLLllE!");
-        // An evaluation has the roads to itself; the step it interrupts begins anew.
-        assert_eq!(course(&lengths(9, 2, 1), &[0, 1, 1, 1, 2]), "LLELlE!");
-        // A gate that is never passed.
-        assert_eq!(course(&lengths(4, 0, 1), &[0, 0, 0, 0, 0]), "LLLL!");
+    fn a_plan_restarts_where_its_stage_says_so_and_ends_after_the_last_stage() {
+        assert_eq!(plan(&lengths(9, 0, 2), &[0, 0, 1, 1, 1, 2]), "LLLllE!");
+        // An evaluation has an episode of its own; the stage that it interrupts begins a new episode.
+        assert_eq!(plan(&lengths(9, 2, 1), &[0, 1, 1, 1, 2]), "LLELlE!");
+        // No lesson passes the gate.
+        assert_eq!(plan(&lengths(4, 0, 1), &[0, 0, 0, 0, 0]), "LLLL!");
     }
 
-    /// Maps of lessons whose steps are `steps`, in a curriculum over the maps a, b and c.
-    fn maps(seed: u64, most: u64, kinds: &serde_json::Value, steps: &[usize]) -> Vec<usize> {
-        let curriculum = Curriculum {
-            steps: serde_json::from_value(kinds.clone()).unwrap(),
+    /// Maps of lessons in `stages`, in a curriculum over the maps a, b and c.
+    fn maps(seed: u64, most: u64, kinds: &serde_json::Value, stages: &[usize]) -> Vec<usize> {
+        let curriculum = CurriculumConfig {
+            stages: serde_json::from_value(kinds.clone()).unwrap(),
             maps: ["a.net.xml", "b.net.xml", "some/c.sumocfg"].map(str::to_owned).to_vec(),
-            ..Curriculum::default()
+            ..CurriculumConfig::default()
         };
-        let mut course = Course::new(&lengths(most, 0, 1), &curriculum, seed);
-        steps.iter().map(|step| course.enter(*step).unwrap().map).collect()
+        let mut plan = CurriculumPlan::new(&lengths(most, 0, 1), &curriculum, seed);
+        stages.iter().map(|stage| plan.enter(*stage).unwrap().map).collect()
     }
 
     #[test]
-    fn maps_are_taken_in_order_and_stay_while_an_episode_goes_on() {
+    fn maps_are_taken_in_order_and_stay_while_an_episode_continues() {
         let kinds = serde_json::json!([
             {"cavs": 1},
             {"cavs": 1, "maps": ["c", "a"]},
             {"cavs": 1, "maps": ["b", "c"], "restart": false},
         ]);
-        // The count begins anew with the step.
+        // The count starts again with the stage.
         assert_eq!(maps(7, 99, &kinds, &[0, 0, 1, 1, 1, 2, 2, 2]), [0, 0, 2, 0, 2, 1, 1, 1]);
         let drawn = serde_json::json!([{"cavs": 1, "maps": ["a", "b", "c"], "map_choice": "random", "restart": false}]);
         for seed in 0..20 {
@@ -377,24 +381,24 @@ mod tests {
     }
 
     #[test]
-    fn an_evaluation_between_does_not_change_the_map_of_a_step_that_stays() {
+    fn an_evaluation_between_does_not_change_the_map_of_a_stage_that_stays() {
         let kinds = serde_json::json!([{"cavs": 1, "maps": ["a", "b", "c"], "map_choice": "random", "restart": false}]);
-        let curriculum = Curriculum {
-            steps: serde_json::from_value(kinds).unwrap(),
+        let curriculum = CurriculumConfig {
+            stages: serde_json::from_value(kinds).unwrap(),
             maps: ["a.net.xml", "b.net.xml", "c.net.xml"].map(str::to_owned).to_vec(),
-            ..Curriculum::default()
+            ..CurriculumConfig::default()
         };
-        let mut course = Course::new(&lengths(20, 2, 1), &curriculum, 5);
+        let mut plan = CurriculumPlan::new(&lengths(20, 2, 1), &curriculum, 5);
         let (mut maps, mut begun) = (BTreeSet::new(), 0);
         loop {
-            match course.due() {
-                Due::Evaluation { .. } => {}
-                Due::Lesson(_) => {
-                    let lesson = course.enter(0).unwrap();
+            match plan.due() {
+                DueWork::Evaluation { .. } => {}
+                DueWork::Lesson(_) => {
+                    let lesson = plan.enter(0).unwrap();
                     begun += u64::from(lesson.begins.is_some());
                     maps.insert(lesson.map);
                 }
-                Due::Nothing => break,
+                DueWork::Nothing => break,
             }
         }
         assert_eq!((maps.len(), begun), (1, 10));
@@ -420,7 +424,7 @@ mod tests {
     #[test]
     fn gradually_random_begins_on_the_first_map_and_ends_on_any() {
         let kinds = |until: Option<u64>| serde_json::json!([{"cavs": 1, "maps": ["b", "a"], "map_choice": "gradually_random", "until_lessons": until}]);
-        // Over the lessons of the step, and over those of training where nobody knows how many the step has.
+        // Over the lessons of the stage, and over those of training where the stage has no number of lessons.
         for (most, until) in [(9999, Some(2000)), (2000, None)] {
             let found = maps(5, most, &kinds(until), &[0; 2000]);
             assert_eq!(found[0], 1);

@@ -348,11 +348,11 @@ impl Session {
         self.wake_upstream();
     }
 
-    /// All lessons below `lessons` have a step of the curriculum, the newest from lesson `since` on `step`, counted from 0.
-    pub fn decided(&mut self, lessons: u64, since: u64, step: u32) {
+    /// All lessons below `lessons` have a stage of the curriculum: those from lesson `since` on have `stage`, counted from 0.
+    pub fn decided(&mut self, lessons: u64, since: u64, stage: u32) {
         self.progress.decided_lessons = lessons;
         self.progress.since_lesson = since;
-        self.progress.step = step;
+        self.progress.stage = stage;
         self.board.set_progress(self.progress);
     }
 

@@ -45,17 +45,17 @@ pub struct World<'a> {
     pub views: &'a [HeroView],
 }
 
-/// The sensors of a step of the curriculum on one of its maps.
+/// The sensors of a stage of the curriculum on one of its maps.
 struct Placed {
     /// Counted from 1; 0 is the base configuration.
-    step: usize,
+    stage: usize,
     map: usize,
     suite: Suite,
 }
 
 /// Sensors of a run, with what they remember from tick to tick.
 pub struct Sensing {
-    /// The base configuration's on the run's own map, then one for each map of each step of the curriculum.
+    /// The base configuration's on the run's own map, then one for each map of each stage of the curriculum.
     suites: Vec<Placed>,
     /// Which of them is at work.
     at: usize,
@@ -105,9 +105,9 @@ impl Sensing {
         let normaliser = Normaliser::new(&config.observation, bounds_m, config.lidar.range_m);
         let projections: Vec<Projection> = maps.iter().map(Projection::new).collect::<Result<_, _>>()?;
         let places = places(config).into_iter().filter(|(_, map)| *map < maps.len());
-        let suites = places.map(|(step, map)| {
-            let suite = Suite::new(&config.in_step(step), &projections[map], maps[map].bounds_m, tick_ns)?;
-            Ok(Placed { step, map, suite })
+        let suites = places.map(|(stage, map)| {
+            let suite = Suite::new(&config.in_stage(stage), &projections[map], maps[map].bounds_m, tick_ns)?;
+            Ok(Placed { stage, map, suite })
         });
         Ok(Self {
             suites: suites.collect::<Result<_, _>>()?,
@@ -146,14 +146,14 @@ impl Sensing {
         }
     }
 
-    /// The sensors of a step of the curriculum are at work from now on, under the sky of a map.
-    fn enter(&mut self, step: usize, map: usize) {
+    /// Uses the sensors of a stage of the curriculum from now on, under the sky of a map.
+    fn enter(&mut self, stage: usize, map: usize) {
         let Placed { map: before, suite, .. } = &mut self.suites[self.at];
         self.skies[*before] = suite.take_sky();
         let found = self
             .suites
             .iter()
-            .position(|placed| (placed.step, placed.map) == (step, map));
+            .position(|placed| (placed.stage, placed.map) == (stage, map));
         self.at = found.unwrap_or(0);
         let Placed { map, suite, .. } = &mut self.suites[self.at];
         if let Some(sky) = self.skies[*map].take() {
@@ -201,7 +201,7 @@ impl Sensing {
     pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
         if header.has(FIRST_OF_EPISODE) {
-            self.enter(header.step(), header.map());
+            self.enter(header.stage(), header.map());
             self.suites[self.at].suite.begin_episode(header.episode_seed);
             self.switches.begin_episode();
         }
@@ -393,12 +393,12 @@ impl Sensing {
     }
 }
 
-/// Step and map of every suite that is needed: the base configuration on the run's own map, then the maps of each step.
+/// Stage and map of every suite that is needed: the base configuration on the run's own map, then the maps of each stage.
 fn places(config: &Config) -> Vec<(usize, usize)> {
     let curriculum = &config.curriculum;
     let mut places = vec![(0, 0)];
-    for (number, step) in (1..).zip(&curriculum.steps) {
-        let mut maps = curriculum.maps_of(step);
+    for (number, stage) in (1..).zip(&curriculum.stages) {
+        let mut maps = curriculum.maps_of(stage);
         maps.sort_unstable();
         maps.dedup();
         places.extend(maps.into_iter().map(|map| (number, map)));

@@ -7,7 +7,7 @@ mod common;
 use common::{Run, Tick, cavs, map, quiet};
 use ipc_schema::{
     config::{Config, Field},
-    header::{map_flags, step_flags},
+    header::{map_flags, stage_flags},
     run::MapInfo,
 };
 use sensor_daemon::{
@@ -48,7 +48,7 @@ fn config() -> Config {
     config.observation.fields = vec![Field::GnssX, Field::GnssY];
     config.gnss.bias_m = [0.0, 2.0, 0.0];
     config.curriculum.maps = vec!["town".into(), "far.net.xml".into()];
-    config.curriculum.steps = serde_json::from_value(serde_json::json!([
+    config.curriculum.stages = serde_json::from_value(serde_json::json!([
         {"cavs": 1, "maps": ["town", "far"]},
         {"cavs": 1, "maps": ["far"], "noise": 3.0},
     ]))
@@ -78,7 +78,7 @@ fn an_episode_has_sky_and_projection_of_its_map_and_the_noise_of_its_step() {
         (0, 0, (5.0, 5.0, 2.0)),
     ];
     for (step, map, expected) in told {
-        run.restart_in(7, step_flags(step) | map_flags(map));
+        run.restart_in(7, stage_flags(step) | map_flags(map));
         run.tick(&cavs(1));
         let tick = run.tick(&cavs(1));
         assert_eq!(seen(&tick), expected, "step {step}, map {map}");
@@ -121,7 +121,7 @@ fn what_came_before_on_another_map_changes_nothing() {
     let maps = maps();
     let sensing = || Run::with(&config, Sensing::on_maps(&config, BOX_M, &maps).unwrap());
     let ticks = |run: &mut Run| -> Vec<u64> { (0..20).flat_map(|_| run.tick(&cavs(3)).bytes().to_vec()).collect() };
-    let on_far = step_flags(1) | map_flags(1);
+    let on_far = stage_flags(1) | map_flags(1);
     let after = |before: u32| {
         let mut run = sensing();
         run.restart_in(3, before);
@@ -129,6 +129,6 @@ fn what_came_before_on_another_map_changes_nothing() {
         run.restart_in(11, on_far);
         ticks(&mut run)
     };
-    assert_eq!(after(step_flags(1)), after(on_far));
-    assert_eq!(after(step_flags(2) | map_flags(1)), after(on_far));
+    assert_eq!(after(stage_flags(1)), after(on_far));
+    assert_eq!(after(stage_flags(2) | map_flags(1)), after(on_far));
 }

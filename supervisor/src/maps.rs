@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use ipc_schema::{
-    config::{Config, Curriculum, TOWN, map_name},
+    config::{Config, CurriculumConfig, TOWN, map_name},
     run::{MapInfo, RunMap, SceneFiles, Source},
 };
 
@@ -13,7 +13,7 @@ use crate::{failure::Exit, install::Install, scenario, town};
 ///
 /// # Errors
 /// One is not there.
-pub fn locate(curriculum: &mut Curriculum) -> Result<(), Exit> {
+pub fn locate(curriculum: &mut CurriculumConfig) -> Result<(), Exit> {
     for entry in curriculum.maps.iter_mut().filter(|entry| *entry != TOWN) {
         let path = std::path::absolute(&*entry).map_err(|error| Exit::io("resolve", Path::new(&*entry), &error))?;
         if !path.is_file() {
@@ -145,9 +145,9 @@ mod tests {
         let net = folder.path().join("here.net.xml");
         std::fs::write(&net, "").unwrap();
         let entry = net.to_string_lossy().into_owned();
-        let mut curriculum = Curriculum {
+        let mut curriculum = CurriculumConfig {
             maps: vec![TOWN.to_owned(), entry.clone()],
-            ..Curriculum::default()
+            ..CurriculumConfig::default()
         };
         locate(&mut curriculum).unwrap();
         assert_eq!(curriculum.maps, [TOWN.to_owned(), entry]);

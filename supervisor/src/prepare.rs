@@ -230,9 +230,9 @@ fn check_task(config: &Config, mode: Mode, named: &Named) -> Result<(), Exit> {
             "name one in place of the preset, or leave them out",
         ));
     }
-    if matches!(named, Named::Scenario(..)) && !config.curriculum.steps.is_empty() {
+    if matches!(named, Named::Scenario(..)) && !config.curriculum.stages.is_empty() {
         return Err(Exit::config(
-            "the steps of a curriculum say how many vehicles there are, and a .sumocfg has its own",
+            "the stages of a curriculum say how many vehicles there are, and a .sumocfg has its own",
             "name the .sumocfg in curriculum.maps, and a preset or .toml in its place: its net is then run with population control",
         ));
     }

@@ -6,7 +6,7 @@ use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
     control::{self, Action, Command},
-    run::{Beginning, Mode, RunFile, STEP_LOG},
+    run::{Beginning, CURRICULUM_LOG, FORMER_CURRICULUM_LOG, Mode, RunFile},
 };
 
 use crate::{
@@ -103,15 +103,25 @@ pub fn go_on(found: &Found, old: RunFile, config: Config, install: &Install) -> 
     Ok((run, claim))
 }
 
-/// Puts what decided about `old` where the run in `run_dir`, which begins at `beginning`, looks for it: the steps of a curriculum, and the
+/// Puts what decided about `old` where the run in `run_dir`, which begins at `beginning`, looks for it: the stages of a curriculum, and the
 /// commands, of which it carries out those behind its first tick again. Counts the episodes that commands began anew before that.
 ///
 /// # Errors
 /// A log cannot be read or written.
 pub fn follow(old: &RunFile, run_dir: &Path, mut beginning: Beginning) -> Result<Beginning, Exit> {
-    let steps = old.run_dir.join(STEP_LOG);
-    if steps.exists() && old.run_dir != run_dir {
-        std::fs::copy(&steps, run_dir.join(STEP_LOG)).map_err(|error| Exit::io("copy", &steps, &error))?;
+    let former = old.run_dir.join(FORMER_CURRICULUM_LOG);
+    if former.exists() {
+        return Err(Exit::config(
+            format!(
+                "{} is the name that another version gave to {CURRICULUM_LOG}",
+                former.display()
+            ),
+            "resume the run with the version that wrote it, or start another run",
+        ));
+    }
+    let stages = old.run_dir.join(CURRICULUM_LOG);
+    if stages.exists() && old.run_dir != run_dir {
+        std::fs::copy(&stages, run_dir.join(CURRICULUM_LOG)).map_err(|error| Exit::io("copy", &stages, &error))?;
     }
     for index in 0..old.config.run.envs {
         let from = old.environment(index).run_dir;

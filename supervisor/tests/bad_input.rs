@@ -386,7 +386,7 @@ fn stopping_what_does_not_run() {
 #[test]
 fn map_of_a_curriculum_that_is_not_there_or_does_not_serve() {
     let workplace = Workplace::new();
-    let steps = "curriculum.steps=[{cavs=1,until_lessons=1},{cavs=1,maps=[\"city\"]}]";
+    let steps = "curriculum.stages=[{cavs=1,until_lessons=1},{cavs=1,maps=[\"city\"]}]";
     let missing = "curriculum.maps=[\"town\",\"city.net.xml\"]";
     let said = refused(&workplace, &["simulate", "paper", "--set", missing, "--set", steps], 2);
     assert_says(
@@ -425,7 +425,7 @@ fn map_of_a_curriculum_that_is_not_there_or_does_not_serve() {
         "a.sumocfg",
         "<configuration><input><net-file value=\"city.net.xml\"/></input></configuration>",
     );
-    let scenario = ["simulate", "a.sumocfg", "--set", "curriculum.steps=[{cavs=1}]"];
+    let scenario = ["simulate", "a.sumocfg", "--set", "curriculum.stages=[{cavs=1}]"];
     let said = refused(&workplace, &scenario, 2);
     assert_says(
         &said,

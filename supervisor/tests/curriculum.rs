@@ -42,11 +42,11 @@ fn arguments<'a>(mode: &'a str, name: &'a str, more: &[&'a str]) -> Vec<&'a str>
 }
 
 fn actions(workplace: &Workplace, name: &str) -> Vec<[u64; 3]> {
-    let text = std::fs::read_to_string(workplace.path().join("runs").join(name).join("actions.jsonl")).unwrap();
+    let text = std::fs::read_to_string(workplace.path().join("runs").join(name).join("curriculum.jsonl")).unwrap();
     let number = |line: &Value, key: &str| line[key].as_u64().unwrap();
     let lines = text.lines().map(|line| serde_json::from_str(line).unwrap());
     lines
-        .map(|line: Value| ["step", "lesson", "tick"].map(|key| number(&line, key)))
+        .map(|line: Value| ["stage", "lesson", "tick"].map(|key| number(&line, key)))
         .collect()
 }
 
@@ -92,7 +92,7 @@ fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
         assert!(gate["policy_std"].as_f64().unwrap() <= limit, "{gate}");
     }
     let taken = actions(&workplace, "whole");
-    assert_eq!(taken.iter().map(|[step, ..]| *step).collect::<Vec<_>>(), [0, 1, 2, 3]);
+    assert_eq!(taken.iter().map(|[stage, ..]| *stage).collect::<Vec<_>>(), [0, 1, 2, 3]);
     // A step begins with the tick after the one that its predecessor's gate opened at.
     for (gate, [_, lesson, tick]) in passed.iter().zip(&taken[1..]) {
         assert_eq!(gate["tick"].as_u64().unwrap() + 1, *tick);
@@ -125,7 +125,7 @@ fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
     assert_eq!(killed["trainer"]["curriculum"], report["trainer"]["curriculum"]);
 
     // The training part again without a learner.
-    let log = workplace.path().join("runs/whole/actions.jsonl");
+    let log = workplace.path().join("runs/whole/curriculum.jsonl");
     let log = format!("curriculum.log={}", log.display());
     workplace.succeed(&arguments("simulate", "again", &[&log]));
     assert_eq!(
@@ -138,7 +138,7 @@ fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
 #[test]
 fn a_gate_that_is_never_passed_ends_with_the_training_episodes() {
     let workplace = Workplace::new();
-    let steps = "curriculum.steps=[{cavs=2,until_lessons=1},{cavs=3,until_std=0.001}]";
+    let steps = "curriculum.stages=[{cavs=2,until_lessons=1},{cavs=3,until_std=0.001}]";
     workplace.succeed(&arguments(
         "train",
         "stuck",
@@ -156,7 +156,7 @@ fn a_gate_that_is_never_passed_ends_with_the_training_episodes() {
 /// Steps over the town and a grid of 300 m: in order, at random, and gradually so.
 const MAPS: [&str; 5] = [
     "curriculum.maps=[\"town\",\"city/city.sumocfg\"]",
-    "curriculum.steps=[{cavs=2,until_lessons=4,maps=[\"town\",\"city\"]},\
+    "curriculum.stages=[{cavs=2,until_lessons=4,maps=[\"town\",\"city\"]},\
      {cavs=3,until_lessons=6,maps=[\"town\",\"city\"],map_choice=\"random\",noise=2.0},\
      {cavs=2,until_lessons=8,maps=[\"city\",\"town\"],map_choice=\"gradually_random\"}]",
     "episode.ticks=120",
@@ -175,10 +175,10 @@ fn with_city() -> Workplace {
 /// Lessons by map that follow from a run's configuration and the steps that were taken.
 fn lessons_by_map(workplace: &Workplace, name: &str, steps: &[usize]) -> [u64; 2] {
     let run = RunFile::read(&workplace.path().join("runs").join(name).join("run.json")).unwrap();
-    let mut course = run.course().unwrap();
+    let mut plan = run.curriculum_plan().unwrap();
     let mut lessons = [0; 2];
-    for step in steps {
-        lessons[course.enter(*step).unwrap().map] += 1;
+    for stage in steps {
+        lessons[plan.enter(*stage).unwrap().map] += 1;
     }
     lessons
 }
@@ -191,7 +191,7 @@ fn lessons_are_on_the_maps_of_their_steps_and_the_same_seed_gives_the_same_bytes
     let maps = &report["traffic"]["maps"];
     let steps: Vec<usize> = [(0, 4), (1, 6), (2, 8)]
         .into_iter()
-        .flat_map(|(step, count)| vec![step; count])
+        .flat_map(|(stage, count)| vec![stage; count])
         .collect();
     let expected = lessons_by_map(&workplace, "maps", &steps);
     assert!(expected.iter().all(|lessons| *lessons > 2), "{expected:?}");
@@ -213,7 +213,7 @@ fn lessons_are_on_the_maps_of_their_steps_and_the_same_seed_gives_the_same_bytes
     assert_eq!((&killed["lost_ticks"], &killed["restarts"]), (&0.into(), &3.into()));
     assert_eq!(&killed["traffic"]["maps"], maps);
 
-    let log = workplace.path().join("runs/maps/actions.jsonl");
+    let log = workplace.path().join("runs/maps/curriculum.jsonl");
     let log = format!("curriculum.log={}", log.display());
     workplace.succeed(&arguments("simulate", "again", &[&MAPS[..], &[&log]].concat()));
     let again = workplace.report("again");
@@ -239,7 +239,7 @@ fn is_on_the_grid([x_m, y_m]: [f32; 2]) -> bool {
 fn vehicles_are_on_the_map_that_their_tick_says() {
     let workplace = with_city();
     let paced = [
-        "curriculum.steps=[{cavs=12,maps=[\"town\",\"city\"]}]",
+        "curriculum.stages=[{cavs=12,maps=[\"town\",\"city\"]}]",
         "episode.ticks=60",
         "episode.training_episodes=150",
         "run.real_time_factor=100",

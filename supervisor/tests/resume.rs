@@ -219,11 +219,11 @@ fn a_curriculum_goes_on_with_its_lessons() {
     let settings: Vec<&str> = settings.collect();
     let arguments = |name| [&["train", "paper", "--name", name][..], &settings].concat();
     workplace.succeed(&arguments("whole"));
-    let log = |name: &str| std::fs::read_to_string(run_dir(&workplace, name).join("actions.jsonl")).unwrap();
+    let log = |name: &str| std::fs::read_to_string(run_dir(&workplace, name).join("curriculum.jsonl")).unwrap();
     assert_eq!(log("whole").lines().count(), 4, "{}", log("whole"));
     // In the first step, which is one episode, in the second, and in the third.
     let kept = ["update-000002", "update-000005", "update-000007"];
-    every_checkpoint_leads_to_the_same_end(&workplace, "actions.jsonl", &kept);
+    every_checkpoint_leads_to_the_same_end(&workplace, "curriculum.jsonl", &kept);
     let begins = kept.map(|name| workplace.report(name)["beginning"]["episode_tick"].as_u64().unwrap());
     assert!(
         begins[0] == 0 && begins.is_sorted() && begins[2] > begins[1],

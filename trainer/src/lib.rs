@@ -194,11 +194,11 @@ impl Attachment {
         Ok(())
     }
 
-    /// Says that all lessons below `lessons` have a step of the curriculum: those from `since` on `step`, counted from 0. The
-    /// simulation waits for that before each lesson.
-    fn decided(&self, lessons: u64, since: u64, step: u32) -> PyResult<()> {
+    /// Publishes that all lessons below `lessons` have a stage of the curriculum: those from `since` on have `stage`, counted from 0.
+    /// `traffic-bridge` waits for that before each lesson.
+    fn decided(&self, lessons: u64, since: u64, stage: u32) -> PyResult<()> {
         let mut inner = self.lock()?;
-        inner.session.decided(lessons, since, step);
+        inner.session.decided(lessons, since, stage);
         inner.taught.wake();
         Ok(())
     }
@@ -490,10 +490,10 @@ impl ObservationBlock {
         self.header.has(header::LAST_OF_LESSON)
     }
 
-    /// Step of the curriculum, counted from 1; 0 without one, and in evaluations.
+    /// Stage of the curriculum, counted from 1; 0 without one, and in evaluations.
     #[getter]
-    fn step(&self) -> usize {
-        self.header.step()
+    fn stage(&self) -> usize {
+        self.header.stage()
     }
 
     /// True for the last tick of the run.

@@ -36,7 +36,7 @@ class SyntheticObservation:
     last: bool = False
     episode_last: bool = False
     lesson_last: bool = False
-    step: int = 0
+    stage: int = 0
     sim_time_ns: int = 0
 
 
@@ -67,9 +67,9 @@ class SyntheticChannel:
         assert tick >= self.consumed_up_to
         self.consumed_up_to = tick
 
-    def decided(self, lessons: int, since: int, step: int) -> None:
+    def decided(self, lessons: int, since: int, stage: int) -> None:
         """Remember the newest decision."""
-        self.decisions.append((lessons, since, step))
+        self.decisions.append((lessons, since, stage))
 
     def committed(self, tick: int) -> None:
         """Remember the commit."""

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from caraware.run.curriculum import Curriculum, Step
+from caraware.run.curriculum import Curriculum, Stage
 
-STEPS = (Step(until_std=0.5), Step(until_error_m=7.0, until_lessons=3), Step())
+STAGES = (Stage(until_std=0.5), Stage(until_error_m=7.0, until_lessons=3), Stage())
 
 
 @dataclass
@@ -13,9 +13,9 @@ class Simulation:
 
     told: list[tuple[int, int, int]] = field(default_factory=list)
 
-    def decided(self, lessons: int, since: int, step: int) -> None:
+    def decided(self, lessons: int, since: int, stage: int) -> None:
         """Remember."""
-        self.told.append((lessons, since, step))
+        self.told.append((lessons, since, stage))
 
 
 @dataclass
@@ -23,12 +23,12 @@ class End:
     """The last tick of a lesson."""
 
     tick: int
-    step: int
+    stage: int
 
 
 def test_gates_open_in_order_and_once():
     simulation = Simulation()
-    curriculum = Curriculum(STEPS, simulation)
+    curriculum = Curriculum(STAGES, simulation)
     curriculum.begin()
     assert simulation.told == [(1, 0, 0)], "the first lesson needs no learner"
     curriculum.lesson_ended(End(9, 1), 10, policy_std=0.51, error_m=5.0)
@@ -40,9 +40,9 @@ def test_gates_open_in_order_and_once():
     curriculum.lesson_ended(End(39, 2), 40, policy_std=0.2, error_m=7.0)
     assert simulation.told[-1] == (5, 4, 2)
     curriculum.lesson_ended(End(49, 3), 50, policy_std=0.0, error_m=0.0)
-    assert simulation.told[-1] == (6, 4, 2), "a step without a gate lasts"
+    assert simulation.told[-1] == (6, 4, 2), "a stage without a gate lasts"
     passed = curriculum.report()["passed"]
-    assert [(gate["step"], gate["tick"], gate["lessons"], gate["env_steps"]) for gate in passed] == [
+    assert [(gate["stage"], gate["tick"], gate["lessons"], gate["env_steps"]) for gate in passed] == [
         (1, 19, 2, 20),
         (2, 39, 4, 40),
     ]
@@ -50,7 +50,7 @@ def test_gates_open_in_order_and_once():
 
 def test_a_learner_without_measures_counts_lessons():
     simulation = Simulation()
-    curriculum = Curriculum((Step(until_std=0.5, until_lessons=2),), simulation)
+    curriculum = Curriculum((Stage(until_std=0.5, until_lessons=2),), simulation)
     curriculum.begin()
     for tick in (9, 19):
         curriculum.lesson_ended(End(tick, 1), tick)
@@ -59,10 +59,10 @@ def test_a_learner_without_measures_counts_lessons():
 
 def test_a_successor_decides_nothing_twice():
     simulation = Simulation()
-    predecessor = Curriculum(STEPS, Simulation())
+    predecessor = Curriculum(STAGES, Simulation())
     predecessor.begin()
     predecessor.lesson_ended(End(9, 1), 10, 0.4, 9.0)
-    successor = Curriculum(STEPS, simulation)
+    successor = Curriculum(STAGES, simulation)
     successor.begin(predecessor.saved())
     assert simulation.told == [(2, 1, 1)]
     successor.lesson_ended(End(9, 1), 10, 0.4, 9.0)
@@ -74,13 +74,13 @@ def test_a_successor_decides_nothing_twice():
 
 def test_a_successor_that_would_have_decided_otherwise_follows_the_ticks():
     simulation = Simulation()
-    curriculum = Curriculum(STEPS, simulation)
+    curriculum = Curriculum(STAGES, simulation)
     curriculum.begin()
     curriculum.lesson_ended(End(9, 2), 10, 0.9, 9.0)
     assert simulation.told[-1] == (2, 0, 1)
 
 
-def test_without_steps_nothing_is_said():
+def test_without_stages_nothing_is_said():
     simulation = Simulation()
     curriculum = Curriculum((), simulation)
     curriculum.begin({})

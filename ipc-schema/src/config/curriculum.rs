@@ -1,18 +1,18 @@
-//! Steps of training, each with its own population, noise, blackouts and maps, and a gate to the next.
+//! Stages of training, each with its own population, noise, blackouts and maps, and a gate to the next.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Config, Traffic};
 
-/// Steps of training.
+/// Stages of training.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Curriculum {
+pub struct CurriculumConfig {
     /// In order; none = every training episode is as the rest of the configuration says.
-    pub steps: Vec<Step>,
-    /// `actions.jsonl` of a run whose steps a simulation without learner repeats; "" = none.
+    pub stages: Vec<StageConfig>,
+    /// `curriculum.jsonl` of a run whose stages a simulation without learner repeats; "" = none.
     pub log: String,
-    /// Maps that steps choose from, each "town", a `.net.xml` or a `.sumocfg`; the first is the run's own, that of evaluations. None =
+    /// Maps that stages choose from, each "town", a `.net.xml` or a `.sumocfg`; the first is the run's own, that of evaluations. None =
     /// the town alone.
     #[serde(default)]
     pub maps: Vec<String>,
@@ -34,7 +34,7 @@ pub fn map_name(entry: &str) -> Option<&str> {
     (!name.is_empty()).then_some(name)
 }
 
-impl Curriculum {
+impl CurriculumConfig {
     /// Names of the run's maps, in order; at least one.
     #[must_use]
     pub fn map_names(&self) -> Vec<&str> {
@@ -44,11 +44,11 @@ impl Curriculum {
         }
     }
 
-    /// The maps that lessons of `step` choose from, as places in [`Curriculum::map_names`]; at least one.
+    /// The maps that lessons of `stage` choose from, as indices into [`CurriculumConfig::map_names`]; at least one.
     #[must_use]
-    pub fn maps_of(&self, step: &Step) -> Vec<usize> {
+    pub fn maps_of(&self, stage: &StageConfig) -> Vec<usize> {
         let names = self.map_names();
-        let known = step.maps.iter();
+        let known = stage.maps.iter();
         let known: Vec<usize> = known
             .filter_map(|name| names.iter().position(|known| known == name))
             .collect();
@@ -56,29 +56,29 @@ impl Curriculum {
     }
 }
 
-/// Which of a step's maps a lesson is on.
+/// Which of a stage's maps a lesson is on.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MapChoice {
-    /// One after the other, and from the first again.
+    /// One after the other, then the first again.
     #[default]
     InOrder,
     /// Drawn for each lesson.
     Random,
-    /// The first, and a share of lessons on a drawn one, that grows from none to all.
+    /// The first map, and a share of lessons on a drawn map that grows from none to all.
     GraduallyRandom,
 }
 
-/// One step.
+/// One stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Step {
+pub struct StageConfig {
     /// Connected vehicles kept alive.
     pub cavs: u32,
     /// Ticks in a lesson; none = `episode.ticks`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ticks: Option<u64>,
-    /// Every lesson begins with all vehicles at new places; else it goes on where the one before ended.
+    /// Every lesson begins with all vehicles at new positions; else it continues where the one before ended.
     #[serde(default = "yes")]
     pub restart: bool,
     /// Names of the maps that its lessons are on; none = the run's first.
@@ -117,19 +117,19 @@ fn one() -> f64 {
 }
 
 impl Config {
-    /// What `step` of the curriculum (counted from 1) makes of this configuration; 0 is the configuration itself.
+    /// This configuration in `stage` of the curriculum (counted from 1); 0 is the configuration itself.
     #[must_use]
-    pub fn in_step(&self, step: usize) -> Self {
+    pub fn in_stage(&self, stage: usize) -> Self {
         let mut config = self.clone();
-        let Some(step) = step.checked_sub(1).and_then(|index| self.curriculum.steps.get(index)) else {
+        let Some(stage) = stage.checked_sub(1).and_then(|index| self.curriculum.stages.get(index)) else {
             return config;
         };
         config.traffic = Traffic {
-            cavs: step.cavs,
+            cavs: stage.cavs,
             ..config.traffic
         };
-        config.scale_noise(step.noise);
-        config.scale_blackouts(step.blackout);
+        config.scale_noise(stage.noise);
+        config.scale_blackouts(stage.blackout);
         config
     }
 

@@ -9,7 +9,7 @@ use ipc_schema::traffic::Kind;
 use ipc_schema::world::VehicleState;
 use proptest::prelude::*;
 use sensor_daemon::lidar::{Lidar, LidarError, nearest_objects};
-use sim_core::scene::{RoadPiece, Road, Scene, SurfaceKind};
+use sim_core::scene::{Road, RoadPiece, Scene, SurfaceKind};
 
 #[test]
 fn the_own_body_is_not_seen_and_others_are() {

@@ -25,6 +25,16 @@ pub enum ConfigError {
         /// Where.
         place: Place,
     },
+    /// A key by its former name.
+    #[error("{}: `{path}` is renamed to `{renamed_to}`", at(place))]
+    RenamedKey {
+        /// The key as written.
+        path: String,
+        /// Its name now.
+        renamed_to: &'static str,
+        /// Where.
+        place: Place,
+    },
     /// Wrong type or out of range.
     #[error("{}: `{}` cannot be {}", at(place), key.path, text(place))]
     Value {
@@ -80,6 +90,7 @@ impl ConfigError {
         match self {
             Self::Syntax { place, .. }
             | Self::UnknownKey { place, .. }
+            | Self::RenamedKey { place, .. }
             | Self::Value { place, .. }
             | Self::Conflict { place, .. } => Some(place),
             Self::Assignment { .. } | Self::File { .. } => None,
@@ -93,6 +104,7 @@ impl ConfigError {
                 nearest: Some(nearest), ..
             } => format!("did you mean `{nearest}`? All keys: configs/README.md"),
             Self::UnknownKey { nearest: None, .. } => "all keys are listed in configs/README.md".into(),
+            Self::RenamedKey { renamed_to, .. } => format!("write `{renamed_to}`. All keys: configs/README.md"),
             Self::Value { key, .. } => {
                 let unit = if key.unit.is_empty() {
                     String::new()

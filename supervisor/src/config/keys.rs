@@ -170,20 +170,30 @@ const fn other(path: &'static str, kind: Kind, meaning: &'static str) -> Key {
     key(path, kind, "", meaning)
 }
 
-/// Keys of a step of the curriculum.
+/// Keys of a stage of the curriculum.
 #[rustfmt::skip]
-pub const STEP_KEYS: &[Key] = &[
-    integer("curriculum.steps.cavs", "vehicles", 1, 100_000, "Connected vehicles kept alive in this step."),
-    Key { optional: true, ..integer("curriculum.steps.ticks", "ticks", 1, 1_000_000_000, "Length of a lesson. Unset = `episode.ticks`.") },
-    Key { optional: true, ..other("curriculum.steps.restart", Kind::Flag, "Every lesson begins with all vehicles at new random places; false: it goes on where the one before ended. Unset = true.") },
-    Key { optional: true, ..other("curriculum.steps.maps", Kind::Texts, "Maps of its lessons, by their names: those of `curriculum.maps`, of a file without its ending (\"city\" of \"nets/city.net.xml\"). Unset = the first.") },
-    Key { optional: true, ..other("curriculum.steps.map_choice", Kind::Choice(&["in_order", "random", "gradually_random"]), "Which of them: \"in_order\", one lesson after the other; \"random\", drawn for each; \"gradually_random\", the first, and a share of lessons on a drawn one that grows from none to all over `until_lessons` (without: over what is left of `episode.training_episodes`). Without `restart` a step stays on the map of its first lesson. Unset = \"in_order\".") },
-    optional("curriculum.steps.noise", "", 0.0, 1000.0, "Factor on random errors and biases of all sensors. Unset = 1."),
-    optional("curriculum.steps.blackout", "", 0.0, 1000.0, "Factor on the lengths of blackouts (`blackout.enabled`); 0 = none. Unset = 1."),
-    optional("curriculum.steps.until_std", "", 0.0, 10.0, "Passed once the policy's standard deviation is at most this, in units of half the map."),
-    optional("curriculum.steps.until_error_m", "m", 0.0, 1e9, "Passed once the mean error of the policy in the samples of an update is at most this."),
-    Key { optional: true, ..integer("curriculum.steps.until_lessons", "lessons", 1, 1_000_000_000, "Passed after so many lessons, if not before. Without any of these three the step lasts to the end of training.") },
+pub const STAGE_KEYS: &[Key] = &[
+    integer("curriculum.stages.cavs", "vehicles", 1, 100_000, "Connected vehicles kept alive in this stage."),
+    Key { optional: true, ..integer("curriculum.stages.ticks", "ticks", 1, 1_000_000_000, "Length of a lesson. Unset = `episode.ticks`.") },
+    Key { optional: true, ..other("curriculum.stages.restart", Kind::Flag, "Every lesson begins with all vehicles at new random places; false: it goes on where the one before ended. Unset = true.") },
+    Key { optional: true, ..other("curriculum.stages.maps", Kind::Texts, "Maps of its lessons, by their names: those of `curriculum.maps`, of a file without its ending (\"city\" of \"nets/city.net.xml\"). Unset = the first.") },
+    Key { optional: true, ..other("curriculum.stages.map_choice", Kind::Choice(&["in_order", "random", "gradually_random"]), "Which of them: \"in_order\", one lesson after the other; \"random\", drawn for each; \"gradually_random\", the first, and a share of lessons on a drawn one that grows from none to all over `until_lessons` (without: over what is left of `episode.training_episodes`). Without `restart` a step stays on the map of its first lesson. Unset = \"in_order\".") },
+    optional("curriculum.stages.noise", "", 0.0, 1000.0, "Factor on random errors and biases of all sensors. Unset = 1."),
+    optional("curriculum.stages.blackout", "", 0.0, 1000.0, "Factor on the lengths of blackouts (`blackout.enabled`); 0 = none. Unset = 1."),
+    optional("curriculum.stages.until_std", "", 0.0, 10.0, "Passed once the policy's standard deviation is at most this, in units of half the map."),
+    optional("curriculum.stages.until_error_m", "m", 0.0, 1e9, "Passed once the mean error of the policy in the samples of an update is at most this."),
+    Key { optional: true, ..integer("curriculum.stages.until_lessons", "lessons", 1, 1_000_000_000, "Passed after so many lessons, if not before. Without any of these three the stage lasts to the end of training.") },
 ];
+
+/// Former names of keys, with the names that they have now.
+const RENAMED_KEYS: &[(&str, &str)] = &[("curriculum.steps", "curriculum.stages")];
+
+/// The name that a key has now, if `path` is a former name.
+#[must_use]
+pub fn renamed_to(path: &str) -> Option<&'static str> {
+    let mut renamed = RENAMED_KEYS.iter();
+    renamed.find_map(|(former, now)| (*former == path).then_some(*now))
+}
 
 /// Every key there is.
 #[rustfmt::skip]
@@ -216,9 +226,9 @@ pub const KEYS: &[Key] = &[
     integer("episode.evaluation_ticks", "ticks", 1, 1_000_000_000, "Length of an evaluation episode."),
     integer("episode.final_evaluations", "", 1, 1_000_000, "Evaluation episodes at the end of the run; their mean error is reported."),
     other("episode.whole_scenario", Kind::Flag, "Train on a `.sumocfg` unchanged: one episode with its own seed, to its own end."),
-    other("curriculum.steps", Kind::Tables(STEP_KEYS), "Steps of training in order, each a `[[curriculum.steps]]`; [] = none. Then training is counted in lessons of `episode.ticks` ticks (or the step's `ticks`), at most `episode.training_episodes` of them, and evaluations are in the base configuration."),
-    other("curriculum.maps", Kind::Texts, "Maps that steps choose from: \"town\", a `.net.xml`, or a `.sumocfg`, of which the net and the buildings are taken; all with population control. Evaluations are on the first; predictions and normalised positions are in the smallest box that holds all. [] = [\"town\"]."),
-    other("curriculum.log", Kind::Text, "`actions.jsonl` of a run, whose steps `caraware simulate` repeats without a learner; \"\" = none."),
+    other("curriculum.stages", Kind::Tables(STAGE_KEYS), "Stages of training in order, each a `[[curriculum.stages]]`; [] = none. Then training is counted in lessons of `episode.ticks` ticks (or the stage's `ticks`), at most `episode.training_episodes` of them, and evaluations are in the base configuration."),
+    other("curriculum.maps", Kind::Texts, "Maps that stages choose from: \"town\", a `.net.xml`, or a `.sumocfg`, of which the net and the buildings are taken; all with population control. Evaluations are on the first; predictions and normalised positions are in the smallest box that holds all. [] = [\"town\"]."),
+    other("curriculum.log", Kind::Text, "`curriculum.jsonl` of a run, whose stages `caraware simulate` repeats without a learner; \"\" = none."),
     other("task.kind", Kind::Choice(&["localisation", "driving"]), "Meaning of the trainer's output: a position for every connected vehicle, or steering and acceleration for every hero."),
     float("task.time_limit_s", "s", 0.1, 1e6, "Longest trajectory of a hero. Then it is truncated, and another hero starts."),
     other("vehicle.cav_model", Kind::Choice(&["kinematic", "dynamic"]), "Model of connected vehicles: without slip, or with tyres, load transfer, roll and pitch."),
@@ -376,7 +386,7 @@ pub const KEYS: &[Key] = &[
 /// The key of this dotted path.
 #[must_use]
 pub fn find(path: &str) -> Option<&'static Key> {
-    KEYS.iter().chain(STEP_KEYS).find(|key| key.path == path)
+    KEYS.iter().chain(STAGE_KEYS).find(|key| key.path == path)
 }
 
 /// Keys of earlier versions, and what took their place.
@@ -393,7 +403,7 @@ pub fn nearest(path: &str) -> Option<&'static str> {
     }
     let last = |p: &str| p.rsplit('.').next().unwrap_or_default().to_owned();
     KEYS.iter()
-        .chain(STEP_KEYS)
+        .chain(STAGE_KEYS)
         .map(|key| {
             let whole = strsim::jaro_winkler(path, key.path);
             let leaf = strsim::jaro_winkler(&last(path), &last(key.path));

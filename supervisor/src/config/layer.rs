@@ -97,10 +97,17 @@ fn walk(prefix: &str, table: &DeTable<'_>, source: &Source, layer: &mut Layer) -
                 source: source.clone(),
                 span: name.span(),
             };
-            return Err(ConfigError::UnknownKey {
-                nearest: keys::nearest(&path),
-                path,
-                place,
+            return Err(match keys::renamed_to(&path) {
+                Some(renamed_to) => ConfigError::RenamedKey {
+                    path,
+                    renamed_to,
+                    place,
+                },
+                None => ConfigError::UnknownKey {
+                    nearest: keys::nearest(&path),
+                    path,
+                    place,
+                },
             });
         };
         let place = Place {

@@ -55,6 +55,16 @@ fn an_unknown_key_names_file_line_and_what_was_meant() {
 }
 
 #[test]
+fn a_renamed_key_is_refused_with_its_new_name() {
+    let (message, help) = error_of("[[curriculum.steps]]\ncavs = 1\n");
+    assert_eq!(
+        message,
+        "my.toml:1: `curriculum.steps` is renamed to `curriculum.stages`"
+    );
+    assert!(help.starts_with("write `curriculum.stages`"), "{help}");
+}
+
+#[test]
 fn a_renamed_key_leads_to_the_new_one() {
     let (_, help) = error_of("imu.gravity_mps2 = 9.81\n");
     assert_eq!(help, "did you mean `imu.convention`? All keys: configs/README.md");
@@ -346,29 +356,30 @@ fn the_resolved_default_preset_for_tests_is_true() {
 }
 
 #[test]
-fn a_step_of_a_curriculum_is_checked_value_by_value() {
-    let config =
-        config_of("[[curriculum.steps]]\ncavs = 1\nrestart = false\nuntil_std = 0.5\n[[curriculum.steps]]\ncavs = 8\n")
-            .unwrap();
-    let steps = config.curriculum.steps;
+fn a_stage_of_a_curriculum_is_checked_value_by_value() {
+    let config = config_of(
+        "[[curriculum.stages]]\ncavs = 1\nrestart = false\nuntil_std = 0.5\n[[curriculum.stages]]\ncavs = 8\n",
+    )
+    .unwrap();
+    let steps = config.curriculum.stages;
     assert_eq!(
         (steps.len(), steps[0].restart, steps[1].restart, steps[1].cavs),
         (2, false, true, 8)
     );
     assert_eq!((steps[0].until_std, steps[1].noise), (Some(0.5), 1.0));
-    let (message, help) = error_of("[[curriculum.steps]]\ncavs = 1\nuntil_sigma = 0.5\n");
-    assert_eq!(message, "my.toml:3: unknown key `curriculum.steps.until_sigma`");
-    assert!(help.contains("`curriculum.steps.until_std`"), "{help}");
-    let (message, _) = error_of("[curriculum]\nsteps = [{ cavs = 0 }]\n");
-    assert_eq!(message, "my.toml:2: `curriculum.steps.cavs` cannot be 0");
-    let (message, _) = error_of("[[curriculum.steps]]\nrestart = true\n");
+    let (message, help) = error_of("[[curriculum.stages]]\ncavs = 1\nuntil_sigma = 0.5\n");
+    assert_eq!(message, "my.toml:3: unknown key `curriculum.stages.until_sigma`");
+    assert!(help.contains("`curriculum.stages.until_std`"), "{help}");
+    let (message, _) = error_of("[curriculum]\nstages = [{ cavs = 0 }]\n");
+    assert_eq!(message, "my.toml:2: `curriculum.stages.cavs` cannot be 0");
+    let (message, _) = error_of("[[curriculum.stages]]\nrestart = true\n");
     assert!(
-        message.contains("entry 1 of `curriculum.steps` has no `cavs`"),
+        message.contains("entry 1 of `curriculum.stages` has no `cavs`"),
         "{message}"
     );
-    let (message, help) = error_of("traffic.max_road_users = 60\n[[curriculum.steps]]\ncavs = 100\n");
+    let (message, help) = error_of("traffic.max_road_users = 60\n[[curriculum.stages]]\ncavs = 100\n");
     assert!(
-        message.contains("step 1 of `curriculum.steps` asks for 120 road users"),
+        message.contains("stage 1 of `curriculum.stages` asks for 120 road users"),
         "{message}"
     );
     assert_eq!(help, "set traffic.max_road_users to 120 or more");
@@ -376,18 +387,18 @@ fn a_step_of_a_curriculum_is_checked_value_by_value() {
 
 #[test]
 fn maps_of_a_curriculum_are_names_that_the_run_has() {
-    let steps = "[[curriculum.steps]]\ncavs = 1\n[[curriculum.steps]]\ncavs = 2\nmaps = [\"b\", \"town\"]\nmap_choice = \"random\"\n";
+    let steps = "[[curriculum.stages]]\ncavs = 1\n[[curriculum.stages]]\ncavs = 2\nmaps = [\"b\", \"town\"]\nmap_choice = \"random\"\n";
     let curriculum = config_of(&format!("[curriculum]\nmaps = [\"town\", \"nets/b.net.xml\"]\n{steps}"))
         .unwrap()
         .curriculum;
     assert_eq!(curriculum.map_names(), ["town", "b"]);
-    let maps: Vec<_> = curriculum.steps.iter().map(|step| curriculum.maps_of(step)).collect();
+    let maps: Vec<_> = curriculum.stages.iter().map(|step| curriculum.maps_of(step)).collect();
     assert_eq!(maps, [vec![0], vec![1, 0]]);
 
     let (message, help) = error_of(&format!("[curriculum]\nmaps = [\"town\", \"c.sumocfg\"]\n{steps}"));
     assert!(message.contains("my.toml:"), "{message}");
     assert!(
-        message.contains("step 2 of `curriculum.steps` is on the map \"b\", which the run does not have"),
+        message.contains("stage 2 of `curriculum.stages` is on the map \"b\", which the run does not have"),
         "{message}"
     );
     assert!(help.contains("its maps are \"town\", \"c\""), "{help}");
@@ -399,11 +410,11 @@ fn maps_of_a_curriculum_are_names_that_the_run_has() {
 
     let (message, help) = error_of("[curriculum]\nmaps = [\"town\"]\n");
     assert!(
-        message.contains("my.toml:2: `curriculum.maps` are for the steps of a curriculum"),
+        message.contains("my.toml:2: `curriculum.maps` are for the stages of a curriculum"),
         "{message}"
     );
-    assert!(help.contains("[[curriculum.steps]]"), "{help}");
-    let one = "[[curriculum.steps]]\ncavs = 1\n";
+    assert!(help.contains("[[curriculum.stages]]"), "{help}");
+    let one = "[[curriculum.stages]]\ncavs = 1\n";
     let (message, help) = error_of(&format!("[curriculum]\nmaps = [\"town\", \"Town02\"]\n{one}"));
     assert!(
         message.contains("\"Town02\", which is no map") && help.contains(".net.xml"),
@@ -414,22 +425,22 @@ fn maps_of_a_curriculum_are_names_that_the_run_has() {
     ));
     assert!(message.contains("two maps of the name \"x\""), "{message}");
 
-    let (message, help) = error_of("[[curriculum.steps]]\ncavs = 1\nmap_choice = \"random\"\n");
+    let (message, help) = error_of("[[curriculum.stages]]\ncavs = 1\nmap_choice = \"random\"\n");
     assert!(
-        message.contains("step 1 of `curriculum.steps` draws its maps, and names 0"),
+        message.contains("stage 1 of `curriculum.stages` draws its maps, and names 0"),
         "{message}"
     );
     assert!(help.contains("two or more"), "{help}");
-    let (message, _) = error_of("[[curriculum.steps]]\ncavs = 1\nmap_choice = \"gradual\"\n");
+    let (message, _) = error_of("[[curriculum.stages]]\ncavs = 1\nmap_choice = \"gradual\"\n");
     assert!(
-        message.contains("`curriculum.steps.map_choice` cannot be \"gradual\""),
+        message.contains("`curriculum.stages.map_choice` cannot be \"gradual\""),
         "{message}"
     );
 }
 
 #[test]
 fn what_stands_on_one_map_is_refused_with_several() {
-    let maps = "[curriculum]\nmaps = [\"town\", \"b.net.xml\"]\n[[curriculum.steps]]\ncavs = 1\n";
+    let maps = "[curriculum]\nmaps = [\"town\", \"b.net.xml\"]\n[[curriculum.stages]]\ncavs = 1\n";
     for (key, setting) in [
         ("scene.obstacles", "[scene]\nobstacles = [\"cone 10 20\"]\n"),
         ("scene.meshes", "[scene]\nmeshes = [\"a.obj 1 2\"]\n"),
@@ -451,10 +462,10 @@ fn what_stands_on_one_map_is_refused_with_several() {
 }
 
 #[test]
-fn a_step_changes_population_noise_and_blackouts_and_nothing_else() {
-    let text = "[blackout]\nenabled = true\n[[curriculum.steps]]\ncavs = 3\nnoise = 2.0\nblackout = 0.0\n[[curriculum.steps]]\ncavs = 5\n";
+fn a_stage_changes_population_noise_and_blackouts_and_nothing_else() {
+    let text = "[blackout]\nenabled = true\n[[curriculum.stages]]\ncavs = 3\nnoise = 2.0\nblackout = 0.0\n[[curriculum.stages]]\ncavs = 5\n";
     let config = config_of(text).unwrap();
-    let (base, first, second) = (config.in_step(0), config.in_step(1), config.in_step(2));
+    let (base, first, second) = (config.in_stage(0), config.in_stage(1), config.in_stage(2));
     assert_eq!(base, config);
     assert_eq!((first.traffic.cavs, second.traffic.cavs), (3, 5));
     assert_eq!(

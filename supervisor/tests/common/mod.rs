@@ -189,7 +189,7 @@ impl Spectator {
 /// Of the preset `paper`: three steps of which the first goes on and on, a horizon that ends within lessons, gates of σ that some
 /// updates pass.
 pub const CURRICULUM: [&str; 12] = [
-    "curriculum.steps=[{cavs=1,restart=false,until_std=0.66},{cavs=1,ticks=350,until_std=0.63,noise=2.0},{cavs=5,ticks=100,until_std=0.6}]",
+    "curriculum.stages=[{cavs=1,restart=false,until_std=0.66},{cavs=1,ticks=350,until_std=0.63,noise=2.0},{cavs=5,ticks=100,until_std=0.6}]",
     "episode.ticks=450",
     "episode.training_episodes=60",
     "episode.evaluation_ticks=80",

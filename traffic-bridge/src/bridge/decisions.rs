@@ -9,11 +9,11 @@ use std::{
 
 use ipc_schema::{
     board::Progress,
-    config::Step,
+    config::StageConfig,
     failure::{Failure, FailureKind},
     ports::BoardReader,
     process::Process,
-    run::{Mode, STEP_LOG},
+    run::{CURRICULUM_LOG, FORMER_CURRICULUM_LOG, Mode},
     session::{Session, Wait},
 };
 use serde::{Deserialize, Serialize};
@@ -23,19 +23,19 @@ use serde::{Deserialize, Serialize};
 struct StageDecision {
     lesson: u64,
     tick: u64,
-    step: usize,
+    stage: usize,
 }
 
 /// Where decisions come from.
 enum StageSource {
     Trainer(BoardReader),
     Log(Vec<StageDecision>),
-    Count(Vec<Step>),
+    Count(Vec<StageConfig>),
 }
 
 /// The stages of all lessons so far.
 pub(crate) struct StageDecisions {
-    judge: StageSource,
+    source: StageSource,
     /// Ticks in the checkpoint of a resumed run, and the decisions that were taken in them.
     committed_ticks: u64,
     kept: Vec<StageDecision>,
@@ -52,10 +52,10 @@ impl StageDecisions {
     pub(crate) fn open(membership: &Session) -> Result<Self, Failure> {
         let run = &membership.run;
         let curriculum = &run.config.curriculum;
-        let path = run.run_dir.join(STEP_LOG);
-        let judge = match (run.mode, curriculum.log.as_str()) {
+        let path = run.run_dir.join(CURRICULUM_LOG);
+        let source = match (run.mode, curriculum.log.as_str()) {
             (Mode::Train, _) => StageSource::Trainer(membership.board_of(Process::Trainer)?),
-            (Mode::Simulate | Mode::Play, "") => StageSource::Count(curriculum.steps.clone()),
+            (Mode::Simulate | Mode::Play, "") => StageSource::Count(curriculum.stages.clone()),
             (Mode::Simulate | Mode::Play, path) => StageSource::Log(read(Path::new(path))?),
         };
         let mut kept = match run.beginning {
@@ -64,10 +64,10 @@ impl StageDecisions {
         };
         // The trainer repeats decisions that are later than the checkpoint. A lesson that begins with the tick after the checkpoint
         // was already decided.
-        kept.retain(|action| action.tick <= run.committed_ticks());
+        kept.retain(|decision| decision.tick <= run.committed_ticks());
         let log = begin_log(&path, &kept).map_err(|error| unwritten(&path, &error))?;
         Ok(Self {
-            judge,
+            source,
             committed_ticks: run.committed_ticks(),
             newest: kept.last().copied(),
             kept,
@@ -87,38 +87,39 @@ impl StageDecisions {
     /// # Errors
     /// The wake-up is broken, or the log cannot be written.
     pub(crate) fn stage_of(&mut self, membership: &Session, lesson: u64, tick: u64) -> Result<Option<usize>, Failure> {
-        let step = match &self.judge {
+        let stage = match &self.source {
             // The trainer starts only after SUMO has accepted its input, so the first lesson cannot wait for it.
             StageSource::Trainer(_) if lesson == 0 => 0,
             StageSource::Trainer(_) if tick < self.committed_ticks => {
                 return Ok(Some(self.stage_in_checkpoint(lesson)));
             }
             StageSource::Trainer(board) => {
-                let mut step = None;
+                let mut stage = None;
                 let waited = membership.wait_until(|| {
-                    step = Progress::step_of(&board.progress(), lesson);
-                    step.is_some()
+                    stage = Progress::stage_of(&board.progress(), lesson);
+                    stage.is_some()
                 })?;
                 if waited == Wait::Stopped {
                     return Ok(None);
                 }
-                step.unwrap_or(0) as usize
+                stage.unwrap_or(0) as usize
             }
-            StageSource::Log(actions) => logged(actions, lesson),
-            StageSource::Count(steps) => counted(steps, lesson),
+            StageSource::Log(decisions) => logged(decisions, lesson),
+            StageSource::Count(stages) => counted(stages, lesson),
         };
         // Stages never go back, not even when a trainer with other settings takes over.
-        let step = self.newest.map_or(step, |newest| newest.step.max(step));
-        if self.newest.is_none_or(|newest| newest.step != step) {
-            self.write(StageDecision { lesson, tick, step })?;
+        let stage = self.newest.map_or(stage, |newest| newest.stage.max(stage));
+        if self.newest.is_none_or(|newest| newest.stage != stage) {
+            self.write(StageDecision { lesson, tick, stage })?;
         }
-        Ok(Some(step))
+        Ok(Some(stage))
     }
 
-    fn write(&mut self, action: StageDecision) -> Result<(), Failure> {
-        self.newest = Some(action);
-        let line = serde_json::to_string(&action).unwrap_or_default();
-        writeln!(self.log, "{line}").map_err(|error| unwritten(&self.path, &error))
+    fn write(&mut self, decision: StageDecision) -> Result<(), Failure> {
+        self.newest = Some(decision);
+        let line = serde_json::to_string(&decision).map_err(std::io::Error::from);
+        line.and_then(|line| writeln!(self.log, "{line}"))
+            .map_err(|error| unwritten(&self.path, &error))
     }
 }
 
@@ -127,24 +128,24 @@ impl StageDecisions {
 fn begin_log(path: &Path, kept: &[StageDecision]) -> std::io::Result<File> {
     let partial = path.with_extension("partial");
     let mut log = File::create(&partial)?;
-    for action in kept {
-        writeln!(log, "{}", serde_json::to_string(action)?)?;
+    for decision in kept {
+        writeln!(log, "{}", serde_json::to_string(decision)?)?;
     }
     std::fs::rename(&partial, path)?;
     Ok(log)
 }
 
 /// The stage of `lesson` by a log.
-fn logged(actions: &[StageDecision], lesson: u64) -> usize {
-    let before = actions.iter().take_while(|action| action.lesson <= lesson);
-    before.last().map_or(0, |action| action.step)
+fn logged(decisions: &[StageDecision], lesson: u64) -> usize {
+    let before = decisions.iter().take_while(|decision| decision.lesson <= lesson);
+    before.last().map_or(0, |decision| decision.stage)
 }
 
 /// The stage of `lesson` if only the number of lessons opens gates.
-fn counted(steps: &[Step], lesson: u64) -> usize {
+fn counted(stages: &[StageConfig], lesson: u64) -> usize {
     let mut first = 0_u64;
-    for (number, step) in steps.iter().enumerate() {
-        let Some(lessons) = step.until_lessons else {
+    for (number, stage) in stages.iter().enumerate() {
+        let Some(lessons) = stage.until_lessons else {
             return number;
         };
         first = first.saturating_add(lessons);
@@ -152,13 +153,26 @@ fn counted(steps: &[Step], lesson: u64) -> usize {
             return number;
         }
     }
-    steps.len()
+    stages.len()
 }
 
 fn read(path: &Path) -> Result<Vec<StageDecision>, Failure> {
+    if path.file_name().is_some_and(|name| name == FORMER_CURRICULUM_LOG) {
+        return Err(Failure::new(
+            FailureKind::Config,
+            format!(
+                "{} is the name that another version gave to {CURRICULUM_LOG}",
+                path.display()
+            ),
+        )
+        .with_help(format!(
+            "name the {CURRICULUM_LOG} of a run of this version in `curriculum.log`"
+        )));
+    }
     let unread = |reason: &dyn std::fmt::Display| {
-        Failure::new(FailureKind::Config, format!("cannot read {}: {reason}", path.display()))
-            .with_help(format!("`curriculum.log` names the {STEP_LOG} in a run directory"))
+        Failure::new(FailureKind::Config, format!("cannot read {}: {reason}", path.display())).with_help(format!(
+            "`curriculum.log` names the {CURRICULUM_LOG} in a run directory"
+        ))
     };
     let text = std::fs::read_to_string(path).map_err(|error| unread(&error))?;
     let lines = text.lines().map(serde_json::from_str);
@@ -176,13 +190,13 @@ mod tests {
 
     #[test]
     fn lessons_are_counted_without_a_learner() {
-        let step = |lessons: Option<u64>| -> Step {
+        let stage = |lessons: Option<u64>| -> StageConfig {
             serde_json::from_value(serde_json::json!({"cavs": 1, "until_lessons": lessons})).unwrap()
         };
-        let steps = [step(Some(2)), step(Some(1))];
-        assert_eq!([0, 1, 2, 3].map(|lesson| counted(&steps, lesson)), [0, 0, 1, 2]);
+        let stages = [stage(Some(2)), stage(Some(1))];
+        assert_eq!([0, 1, 2, 3].map(|lesson| counted(&stages, lesson)), [0, 0, 1, 2]);
         assert_eq!(
-            counted(&[step(None), step(Some(1))], 99),
+            counted(&[stage(None), stage(Some(1))], 99),
             0,
             "a gate that only a learner can pass"
         );
@@ -190,7 +204,10 @@ mod tests {
 
     #[test]
     fn a_log_is_followed() {
-        let actions = [(0, 0), (3, 1), (4, 2)].map(|(lesson, step)| StageDecision { lesson, tick: 0, step });
-        assert_eq!([0, 2, 3, 4, 9].map(|lesson| logged(&actions, lesson)), [0, 0, 1, 2, 2]);
+        let decisions = [(0, 0), (3, 1), (4, 2)].map(|(lesson, stage)| StageDecision { lesson, tick: 0, stage });
+        assert_eq!(
+            [0, 2, 3, 4, 9].map(|lesson| logged(&decisions, lesson)),
+            [0, 0, 1, 2, 2]
+        );
     }
 }

@@ -100,7 +100,7 @@ fn population(
 ) -> Result<Option<Population>, SumoError> {
     match run.source {
         Source::Population { .. } => {
-            let traffic = &run.config.in_step(stage).traffic;
+            let traffic = &run.config.in_stage(stage).traffic;
             let trips = TripSelection::of_episode(traffic.held_out_trips, episode.evaluation);
             let size = PopulationSize::from(traffic);
             Population::start_on(sumo, size, &traffic.hero_route, trips, episode.seed).map(Some)
@@ -255,7 +255,7 @@ impl Bridge {
             step: frame.step,
             ticks_per_step: self.ticks_per_step,
             has_lidars: run.config.lidar.vehicles > 0,
-            has_lessons: !run.config.curriculum.steps.is_empty(),
+            has_lessons: !run.config.curriculum.stages.is_empty(),
             senses_persons: run.config.gnss.pedestrians,
         };
         self.commands.replay(&mut context)?;

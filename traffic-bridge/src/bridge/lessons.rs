@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use ipc_schema::{
     failure::Failure,
-    header::{LAST_OF_EPISODE, LAST_OF_LESSON, map_flags, step_flags},
-    schedule::{Course, Due, Episode, Lesson},
+    header::{LAST_OF_EPISODE, LAST_OF_LESSON, map_flags, stage_flags},
+    schedule::{CurriculumPlan, DueWork, Episode, Lesson},
     session::Wait,
 };
 
@@ -36,8 +36,8 @@ impl MapUsage {
 }
 
 impl Bridge {
-    /// Runs the lessons and evaluations of `course`, in the stages that are decided on the way.
-    pub(super) fn run_curriculum(&mut self, mut course: Course) -> Result<Wait, Failure> {
+    /// Runs the lessons and evaluations of `plan`, in the stages that are decided on the way.
+    pub(super) fn run_curriculum(&mut self, mut plan: CurriculumPlan) -> Result<Wait, Failure> {
         let mut decisions = StageDecisions::open(&self.membership)?;
         let mut running = self.try_maps()?;
         // Episodes before this one are in the checkpoint and are not simulated again.
@@ -45,16 +45,16 @@ impl Bridge {
         let mut is_behind = first > 0;
         loop {
             // Find out what comes next: an evaluation, or a lesson with its stage and map.
-            let (begins, place, segment) = match course.due() {
-                Due::Nothing => return Ok(Wait::Ready),
-                Due::Evaluation { episode, is_last } => {
+            let (begins, place, segment) = match plan.due() {
+                DueWork::Nothing => return Ok(Wait::Ready),
+                DueWork::Evaluation { episode, is_last } => {
                     let segment = EpisodeSegment {
                         is_last,
                         ..EpisodeSegment::default()
                     };
                     (Some(episode), StageMap::default(), segment)
                 }
-                Due::Lesson(number) => {
+                DueWork::Lesson(number) => {
                     let stage = match is_behind {
                         true => Some(decisions.stage_in_checkpoint(number)),
                         false => decisions.stage_of(&self.membership, number, self.totals.ticks)?,
@@ -62,15 +62,15 @@ impl Bridge {
                     let Some(stage) = stage else {
                         return Ok(Wait::Stopped);
                     };
-                    let Some(lesson) = course.enter(stage) else {
+                    let Some(lesson) = plan.enter(stage) else {
                         continue;
                     };
-                    let Lesson { step, map, begins } = lesson;
+                    let Lesson { stage, map, begins } = lesson;
                     let past = match begins {
                         Some(_) => 0,
                         None => running.as_ref().map_or(0, |now| now.frame.step * self.ticks_per_step),
                     };
-                    let place = StageMap { stage: step + 1, map };
+                    let place = StageMap { stage: stage + 1, map };
                     (begins, place, self.lesson_segment(place, past))
                 }
             };
@@ -107,14 +107,14 @@ impl Bridge {
     /// The segment of the next lesson, in an episode that has run for `past` ticks.
     fn lesson_segment(&self, StageMap { stage, map }: StageMap, past: u64) -> EpisodeSegment {
         let config = &self.membership.run.config;
-        let kind = &config.curriculum.steps[stage - 1];
+        let kind = &config.curriculum.stages[stage - 1];
         let ticks = kind.ticks.unwrap_or(config.episode.ticks);
         let ticks = ticks.next_multiple_of(self.ticks_per_step);
         #[expect(
             clippy::cast_possible_truncation,
             reason = "validated: at most 255 stages and 256 maps"
         )]
-        let flags = step_flags(stage as u8) | map_flags(map as u8);
+        let flags = stage_flags(stage as u8) | map_flags(map as u8);
         EpisodeSegment {
             ticks: Some(past + ticks),
             flags,
@@ -143,7 +143,7 @@ impl Bridge {
         let curriculum = run.config.curriculum.clone();
         // Evaluations are on the first map, in the base configuration.
         let mut stages = BTreeMap::from([(0, 0)]);
-        for (number, stage) in (1..).zip(&curriculum.steps) {
+        for (number, stage) in (1..).zip(&curriculum.stages) {
             stages.extend(curriculum.maps_of(stage).into_iter().map(|map| (map, number)));
         }
         for (map, stage) in stages {

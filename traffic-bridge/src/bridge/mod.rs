@@ -40,8 +40,8 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
         false => None,
     };
     let mut bridge = Bridge::open(membership, poses)?;
-    let waited = match bridge.membership.run.course() {
-        Some(course) => bridge.run_curriculum(course)?,
+    let waited = match bridge.membership.run.curriculum_plan() {
+        Some(plan) => bridge.run_curriculum(plan)?,
         None => bridge.run_episodes(episodes)?,
     };
     match waited {

@@ -125,8 +125,8 @@ class Attachment:
     def committed(self, tick: int) -> None:
         """Publish that all ticks up to and including `tick` are in a checkpoint that has been renamed into place."""
 
-    def decided(self, lessons: int, since: int, step: int) -> None:
-        """Publish that all lessons below `lessons` have a stage; lessons from `since` on have `step`, counted from 0.
+    def decided(self, lessons: int, since: int, stage: int) -> None:
+        """Publish that all lessons below `lessons` have a stage; lessons from `since` on have `stage`, counted from 0.
 
         `traffic-bridge` waits for this before each lesson of a curriculum.
         """
@@ -208,7 +208,7 @@ class ObservationBlock:
         """True for the last tick of a lesson; before the next lesson the simulation waits for `Attachment.decided`."""
 
     @property
-    def step(self) -> int:
+    def stage(self) -> int:
         """Stage of the curriculum, counted from 1; 0 without a curriculum and in evaluations."""
 
     @property

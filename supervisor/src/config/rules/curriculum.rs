@@ -1,52 +1,52 @@
-//! Rules of a curriculum: every step complete, with room for its vehicles, and a learner that can pass its gates.
+//! Rules of a curriculum: every stage complete, with room for its vehicles, and a learner that can pass its gates.
 
 use std::collections::BTreeSet;
 
-use ipc_schema::config::{Config, MapChoice, Step, map_name};
+use ipc_schema::config::{Config, MapChoice, StageConfig, map_name};
 
 use super::{ConfigError, LOCALISING_TRAINER, Settings, conflict};
 
-/// Steps fit into a byte of the header's flags, counted from 1.
-const MOST_STEPS: usize = 255;
+/// Stages fit into a byte of the header's flags, counted from 1.
+const MOST_STAGES: usize = 255;
 /// Maps fit into another, counted from 0.
 const MOST_MAPS: usize = 256;
 
 pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
-    let (steps, traffic) = (&config.curriculum.steps, &config.traffic);
-    let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.steps", message, help));
-    if steps.len() > MOST_STEPS {
+    let (stages, traffic) = (&config.curriculum.stages, &config.traffic);
+    let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.stages", message, help));
+    if stages.len() > MOST_STAGES {
         return refuse(
-            format!("`curriculum.steps` has {} steps", steps.len()),
-            format!("give at most {MOST_STEPS}"),
+            format!("`curriculum.stages` has {} stages", stages.len()),
+            format!("give at most {MOST_STAGES}"),
         );
     }
-    if !steps.is_empty() && config.drives() {
+    if !stages.is_empty() && config.drives() {
         return refuse(
-            "a curriculum is for the localisation task: its steps say how many connected vehicles there are".into(),
-            "set task.kind = \"localisation\" or curriculum.steps = []".into(),
+            "a curriculum is for the localisation task: its stages say how many connected vehicles there are".into(),
+            "set task.kind = \"localisation\" or curriculum.stages = []".into(),
         );
     }
-    if !steps.is_empty() && (config.run.envs > 1 || config.trainer.ranks > 1) {
+    if !stages.is_empty() && (config.run.envs > 1 || config.trainer.ranks > 1) {
         return refuse(
             "a curriculum is decided by one trainer for one environment".into(),
-            "set run.envs = 1, and start one trainer, or set curriculum.steps = []".into(),
+            "set run.envs = 1, and start one trainer, or set curriculum.stages = []".into(),
         );
     }
-    if !steps.is_empty() && config.trainer.module != LOCALISING_TRAINER {
+    if !stages.is_empty() && config.trainer.module != LOCALISING_TRAINER {
         return refuse(
             format!(
                 "`trainer.module` = \"{}\" decides about no lessons, which a curriculum waits for",
                 config.trainer.module
             ),
-            format!("set trainer.module = \"{LOCALISING_TRAINER}\" or curriculum.steps = []"),
+            format!("set trainer.module = \"{LOCALISING_TRAINER}\" or curriculum.stages = []"),
         );
     }
-    for (number, step) in (1..).zip(steps) {
-        let road_users = step.cavs + traffic.others + traffic.pedestrians;
+    for (number, stage) in (1..).zip(stages) {
+        let road_users = stage.cavs + traffic.others + traffic.pedestrians;
         if road_users > traffic.max_road_users {
             return refuse(
                 format!(
-                    "step {number} of `curriculum.steps` asks for {road_users} road users, `traffic.max_road_users` is {}",
+                    "stage {number} of `curriculum.stages` asks for {road_users} road users, `traffic.max_road_users` is {}",
                     traffic.max_road_users
                 ),
                 format!("set traffic.max_road_users to {road_users} or more"),
@@ -55,11 +55,11 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
     }
     maps(settings, config)?;
     (1..)
-        .zip(steps)
-        .try_for_each(|(number, step)| maps_of_step(settings, config, number, step))
+        .zip(stages)
+        .try_for_each(|(number, stage)| maps_of_stage(settings, config, number, stage))
 }
 
-/// Every map has a name of its own, and somebody who asks for it.
+/// Every map has a unique name, and stages that use it.
 fn maps(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
     let maps = &config.curriculum.maps;
     let refuse = |message: String, help: &str| Err(conflict(settings, "curriculum.maps", message, help.into()));
@@ -67,10 +67,10 @@ fn maps(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
         let message = format!("`curriculum.maps` has {} maps", maps.len());
         return refuse(message, &format!("give at most {MOST_MAPS}"));
     }
-    if !maps.is_empty() && config.curriculum.steps.is_empty() {
+    if !maps.is_empty() && config.curriculum.stages.is_empty() {
         return refuse(
-            "`curriculum.maps` are for the steps of a curriculum, and there are none".into(),
-            "add a [[curriculum.steps]], or set curriculum.maps = []; a .sumocfg in place of the preset runs a scenario as it is",
+            "`curriculum.maps` are for the stages of a curriculum, and there are none".into(),
+            "add a [[curriculum.stages]], or set curriculum.maps = []; a .sumocfg in place of the preset runs a scenario as it is",
         );
     }
     let mut names = BTreeSet::new();
@@ -84,7 +84,7 @@ fn maps(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
         if !names.insert(name) {
             return refuse(
                 format!("`curriculum.maps` has two maps of the name \"{name}\""),
-                "steps call a map by its file's name without the ending: rename one of the files",
+                "stages call a map by its file's name without the ending: rename one of the files",
             );
         }
     }
@@ -117,23 +117,23 @@ fn placed(config: &Config) -> Option<&'static str> {
     keys.into_iter().find_map(|(key, is_used)| is_used.then_some(key))
 }
 
-fn maps_of_step(settings: &Settings, config: &Config, number: usize, step: &Step) -> Result<(), ConfigError> {
+fn maps_of_stage(settings: &Settings, config: &Config, number: usize, stage: &StageConfig) -> Result<(), ConfigError> {
     let names = config.curriculum.map_names();
-    let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.steps", message, help));
-    if let Some(unknown) = step.maps.iter().find(|name| !names.contains(&name.as_str())) {
+    let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.stages", message, help));
+    if let Some(unknown) = stage.maps.iter().find(|name| !names.contains(&name.as_str())) {
         return refuse(
-            format!("step {number} of `curriculum.steps` is on the map \"{unknown}\", which the run does not have"),
+            format!("stage {number} of `curriculum.stages` is on the map \"{unknown}\", which the run does not have"),
             format!(
                 "its maps are \"{}\": add the file to `curriculum.maps`, or name one of them",
                 names.join("\", \"")
             ),
         );
     }
-    if step.map_choice != MapChoice::InOrder && step.maps.len() < 2 {
+    if stage.map_choice != MapChoice::InOrder && stage.maps.len() < 2 {
         return refuse(
             format!(
-                "step {number} of `curriculum.steps` draws its maps, and names {}",
-                step.maps.len()
+                "stage {number} of `curriculum.stages` draws its maps, and names {}",
+                stage.maps.len()
             ),
             "give `maps` with two or more, or leave `map_choice` out".into(),
         );

@@ -122,9 +122,9 @@ class Observation:
         return self.block.lesson_last
 
     @property
-    def step(self) -> int:
-        """Step of the curriculum, counted from 1; 0 without one, and in evaluations."""
-        return self.block.step
+    def stage(self) -> int:
+        """Stage of the curriculum, counted from 1; 0 without one, and in evaluations."""
+        return self.block.stage
 
     def _array(self, name: str, dtype: type[Scalar], columns: int | None = None) -> NDArray[Scalar]:
         array = np.frombuffer(memoryview(self.block.section(name)), dtype=dtype)
@@ -286,12 +286,12 @@ class Channel:
         """All ticks up to and including `tick` are in a checkpoint that has been renamed into place."""
         self._attachment.committed(tick)
 
-    def decided(self, lessons: int, since: int, step: int) -> None:
-        """All lessons of a curriculum below `lessons` have a step; those from `since` on `step`, counted from 0.
+    def decided(self, lessons: int, since: int, stage: int) -> None:
+        """All lessons of a curriculum below `lessons` have a stage; those from `since` on `stage`, counted from 0.
 
         The simulation waits for that before every lesson, the first included. `caraware.run.curriculum` says it.
         """
-        self._attachment.decided(lessons, since, step)
+        self._attachment.decided(lessons, since, stage)
 
     def publish_predictions(
         self,

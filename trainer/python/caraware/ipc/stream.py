@@ -47,8 +47,8 @@ class Observation(Protocol):
         """True for the last tick of a lesson of the curriculum."""
 
     @property
-    def step(self) -> int:
-        """Step of the curriculum, counted from 1; 0 without one, and in evaluations."""
+    def stage(self) -> int:
+        """Stage of the curriculum, counted from 1; 0 without one, and in evaluations."""
 
     @property
     def observation(self) -> Tensor:
@@ -142,8 +142,8 @@ class Channel(Protocol):
     def committed(self, tick: int) -> None:
         """Say that all ticks up to and including `tick` are in a checkpoint: nobody needs to deliver them again."""
 
-    def decided(self, lessons: int, since: int, step: int) -> None:
-        """Say that all lessons below `lessons` have a step of the curriculum, those from `since` on `step`."""
+    def decided(self, lessons: int, since: int, stage: int) -> None:
+        """Say that all lessons below `lessons` have a stage of the curriculum, those from `since` on `stage`."""
 
     def publish_predictions(
         self,

@@ -8,7 +8,7 @@ from pathlib import Path
 from caraware.baselines.noise import SensorNoise
 from caraware.ipc.run_file import RunFile
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
-from caraware.run.curriculum import Step
+from caraware.run.curriculum import Stage
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class RunConfig:
     """Fields of a sensor in a blackout are not numbers (`blackout.policy`); the networks see 0, mid-range, instead."""
     training_episodes: int
     """With a curriculum: most lessons."""
-    curriculum: tuple[Step, ...]
+    curriculum: tuple[Stage, ...]
     evaluation_interval: int
     """Training episodes between two evaluation episodes; 0: none between."""
     sensors: SensorNoise | None
@@ -53,7 +53,7 @@ class RunConfig:
             config_sha256=hashlib.sha256(canonical).hexdigest(),
             dark_is_nan=run.get("config", {}).get("blackout", {}).get("policy") == "nan",
             training_episodes=max(1, episodes.get("training_episodes", 1)),
-            curriculum=Step.from_run(run),
+            curriculum=Stage.from_run(run),
             evaluation_interval=episodes.get("evaluation_interval", 0),
             sensors=SensorNoise.from_run(run),
             environments=tuple(range(first_env, first_env + place.get("envs", 1))),

@@ -1,4 +1,4 @@
-"""The curriculum: which step of training a lesson belongs to, decided by what was learned (docs/decisions/0010)."""
+"""The curriculum: which stage of training a lesson belongs to, decided by what was learned (docs/decisions/0010)."""
 
 import math
 from dataclasses import asdict, dataclass, field
@@ -8,8 +8,8 @@ from caraware.ipc.run_file import RunFile
 
 
 @dataclass(frozen=True)
-class Step:
-    """The gate of one step: passed with any of what it names; without a gate it lasts to the end of training."""
+class Stage:
+    """The gate of one stage: passed with any of what it names; without a gate it lasts to the end of training."""
 
     until_std: float | None = None
     """Standard deviation of the policy, in units of half the map."""
@@ -18,10 +18,10 @@ class Step:
     until_lessons: int | None = None
 
     @classmethod
-    def from_run(cls, run: RunFile) -> "tuple[Step, ...]":
-        """The steps of a run file's configuration; none without a curriculum."""
-        steps = run.get("config", {}).get("curriculum", {}).get("steps", [])
-        return tuple(cls(**{name: step.get(name) for name in cls.__dataclass_fields__}) for step in steps)
+    def from_run(cls, run: RunFile) -> "tuple[Stage, ...]":
+        """The stages of a run file's configuration; none without a curriculum."""
+        stages = run.get("config", {}).get("curriculum", {}).get("stages", [])
+        return tuple(cls(**{name: stage.get(name) for name in cls.__dataclass_fields__}) for stage in stages)
 
     def passed(self, policy_std: float, error_m: float, lessons: int) -> bool:
         """Whether the gate opens; a measure that nobody has is nan, and opens nothing."""
@@ -36,7 +36,7 @@ class Step:
 class Passed:
     """How training stood when a gate opened."""
 
-    step: int
+    stage: int
     """Counted from 1."""
     tick: int
     lessons: int
@@ -53,10 +53,10 @@ class Standing:
 
     lessons: int = 0
     """Lessons that have ended."""
-    step: int = 0
+    stage: int = 0
     """Of the lesson that follows, counted from 0."""
     since: int = 0
-    """The first lesson of that step."""
+    """The first lesson of that stage."""
     decided_tick: int = -1
     """Last tick of the newest lesson that has ended: what is delivered again up to there is not decided again."""
     passed: list[Passed] = field(default_factory=list)
@@ -70,8 +70,8 @@ class Standing:
 class Decided(Protocol):
     """Where decisions go: `caraware.ipc.channel.Channel`."""
 
-    def decided(self, lessons: int, since: int, step: int) -> None:
-        """All lessons below `lessons` have a step; those from `since` on have `step`, counted from 0."""
+    def decided(self, lessons: int, since: int, stage: int) -> None:
+        """All lessons below `lessons` have a stage; those from `since` on have `stage`, counted from 0."""
 
 
 class Ended(Protocol):
@@ -82,15 +82,15 @@ class Ended(Protocol):
         """Number of the tick in the run."""
 
     @property
-    def step(self) -> int:
-        """Step of the lesson, counted from 1."""
+    def stage(self) -> int:
+        """Stage of the lesson, counted from 1."""
 
 
 class Curriculum:
-    """Decides at the end of every lesson which step the next belongs to. Without steps it does nothing."""
+    """Decides at the end of every lesson which stage the next belongs to. Without stages it does nothing."""
 
-    def __init__(self, steps: tuple[Step, ...], channel: Decided) -> None:
-        self._steps, self._channel = steps, channel
+    def __init__(self, stages: tuple[Stage, ...], channel: Decided) -> None:
+        self._stages, self._channel = stages, channel
         self.standing = Standing()
 
     def begin(self, standing: dict[str, Any] | None = None) -> None:
@@ -105,13 +105,13 @@ class Curriculum:
         if obs.tick <= now.decided_tick:
             return
         now.lessons, now.decided_tick = now.lessons + 1, obs.tick
-        if obs.step - 1 > now.step:
+        if obs.stage - 1 > now.stage:
             # A predecessor with other settings led the simulation here.
-            now.step, now.since = obs.step - 1, now.lessons - 1
-        if self._steps[now.step].passed(policy_std, error_m, now.lessons - now.since):
+            now.stage, now.since = obs.stage - 1, now.lessons - 1
+        if self._stages[now.stage].passed(policy_std, error_m, now.lessons - now.since):
             error = None if math.isnan(error_m) else error_m
-            now.passed.append(Passed(now.step + 1, obs.tick, now.lessons, env_steps, policy_std, error))
-            now.step, now.since = now.step + 1, now.lessons
+            now.passed.append(Passed(now.stage + 1, obs.tick, now.lessons, env_steps, policy_std, error))
+            now.stage, now.since = now.stage + 1, now.lessons
         self._tell()
 
     def share(self, lessons: int) -> float:
@@ -120,19 +120,19 @@ class Curriculum:
 
     def report(self) -> dict[str, Any] | None:
         """For the run's report; None without a curriculum."""
-        if not self._steps:
+        if not self._stages:
             return None
         passed = [asdict(gate) for gate in self.standing.passed]
-        return {"steps": len(self._steps), "lessons": self.standing.lessons, "passed": passed}
+        return {"stages": len(self._stages), "lessons": self.standing.lessons, "passed": passed}
 
     def saved(self) -> dict[str, Any]:
         """For a checkpoint."""
         return asdict(self.standing)
 
     def __bool__(self) -> bool:
-        return bool(self._steps)
+        return bool(self._stages)
 
     def _tell(self) -> None:
-        if self._steps:
+        if self._stages:
             now = self.standing
-            self._channel.decided(now.lessons + 1, now.since, now.step)
+            self._channel.decided(now.lessons + 1, now.since, now.stage)

@@ -317,7 +317,7 @@ class TrainingLoop:
             self._passed_steps += len(raw_m)
 
     def _end_lesson(self) -> None:
-        """Before the next lesson the simulation waits for its step of the curriculum."""
+        """Before the next lesson the simulation waits for its stage of the curriculum."""
         if self._lesson_end is not None and self._ppo is not None:
             error_m = self._metrics.training[-1].error_m if self._metrics.training else math.nan
             self._curriculum.lesson_ended(self._lesson_end, self._env_steps, self._ppo.sigma(), error_m)
