@@ -1,4 +1,5 @@
-//! Cost of looking for contacts: every connected vehicle against everybody and everything, without contacts; and of loading scenes.
+//! Cost of the search for contacts: every connected vehicle against all road users and objects, without contacts; and of loading
+//! scenes.
 //!
 //! `cargo bench -p sim-core --bench collisions [VEHICLES]…` prints microseconds per vehicle and tick on one core: the median over the
 //! measured ticks, and the fastest. With `NET[,ADDITIONAL…]` arguments it prints how long these files take to load as a scene.
@@ -22,10 +23,10 @@ const BLOCK_M: f64 = 90.0;
 /// Vehicles on each street between two crossings, one lane each way.
 const ON_STREET: u32 = 8;
 
-/// Turn of the whole grid of streets.
+/// Rotation of the whole grid of streets.
 const TURN_RAD: f64 = 0.5;
 
-/// Streets along both axes in turn, turned so that rectangles about vehicles are fat; gaps of 3 to 7 m move with time.
+/// Streets along both axes in turn, rotated so that rectangles about vehicles are large; gaps of 3 to 7 m move with time.
 fn state(vehicle: u32, time_s: f64, blocks: u32) -> VehicleState {
     let (street, place) = (vehicle / ON_STREET, vehicle % ON_STREET);
     let (column, row, is_up) = (street / 2 % blocks, street / 2 / blocks, street % 2 == 1);

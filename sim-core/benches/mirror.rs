@@ -1,4 +1,4 @@
-//! Cost of the mirror: taking SUMO's states, tracking with 10 sub-steps, and writing the `world` payload.
+//! Cost of the mirror: accepting SUMO's states, tracking with 10 sub-steps, and writing the `world` payload.
 //!
 //! `cargo bench -p sim-core --bench mirror [VEHICLES]…` prints microseconds per vehicle and tick on one core: the median
 //! over the measured ticks, and the fastest.

@@ -1,4 +1,4 @@
-//! Prints how the vehicle models answer, as CSV: the figures of `docs/vehicle-model.md` are drawn from it.
+//! Prints responses of the vehicle models as CSV, from which the figures of `docs/vehicle-model.md` are drawn.
 //!
 //! `cargo run --release -p sim-core --example response > response.csv`. Vehicle: the set `sedan` at its own size, sub-steps of 5 ms.
 //! `circle`: end states after 12 s at a held road-wheel angle and 20 m/s. `step`: 0.03 rad from t = 0.5 s on, at 20 m/s. `brake`: full
@@ -34,7 +34,7 @@ fn limits() -> config::Vehicle {
     }
 }
 
-/// A vehicle under way.
+/// A moving vehicle.
 #[expect(clippy::large_enum_variant, reason = "two values in all")]
 enum Vehicle {
     Plain(MotionModel, ModelState),
@@ -87,7 +87,7 @@ impl Vehicle {
     }
 }
 
-/// Who answers what.
+/// The models, with their names.
 struct Case<'a> {
     figure: &'a str,
     model: &'a str,

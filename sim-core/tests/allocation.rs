@@ -1,4 +1,4 @@
-//! Once everybody is there, a tick of the mirror allocates nothing, however many they are.
+//! Once all road users have appeared, a tick of the mirror allocates nothing, however many there are.
 
 #![allow(
     unsafe_code,
@@ -25,10 +25,10 @@ thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
 }
 
-/// The system's allocator, counting what this thread asks for.
+/// The system's allocator, counting the allocations of this thread.
 struct Counting;
 
-// SAFETY: all calls go to the system's allocator as they are; the counter neither allocates nor unwinds.
+// SAFETY: all calls go to the system's allocator unchanged; the counter neither allocates nor unwinds.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATIONS.set(ALLOCATIONS.get() + 1);
@@ -93,7 +93,7 @@ fn a_tick_allocates_nothing() {
             let before = ALLOCATIONS.get();
             mirror.write_tick(tick, bytemuck::cast_slice_mut(&mut payload)).unwrap();
             let written = ALLOCATIONS.get() - before;
-            // The first steps make room.
+            // The first steps grow the buffers.
             assert!(
                 step < 2 || accepted + written == 0,
                 "step {step}: {accepted} + {written}"

@@ -1,4 +1,4 @@
-//! Contacts: the narrow phase against parry3d, and what the detector makes of contacts from tick to tick.
+//! Contacts: the narrow phase against parry3d, and the detector's events from tick to tick.
 
 #![allow(clippy::unwrap_used, reason = "test code may assert by unwrapping")]
 
@@ -38,7 +38,7 @@ fn cuboid(solid: &OrientedBox) -> (Pose, Cuboid) {
     )
 }
 
-/// Skips what is so close to touching that rounding decides.
+/// Skips pairs so close to touching that rounding decides.
 fn decides(p: &Pose, a: &dyn Shape, q: &Pose, b: &dyn Shape) -> Option<bool> {
     if intersection_test(p, a, q, b).unwrap().intersecting {
         // Still touching when they are drawn apart a little?
@@ -172,7 +172,7 @@ fn person(index: u32, x_m: f64, y_m: f64) -> VehicleState {
     }
 }
 
-/// One tick: what began, and who is flagged.
+/// One tick: the contacts that began, and the vehicles that are flagged.
 fn tick(detector: &mut CollisionDetector, episode: u64, mut states: Vec<VehicleState>) -> (Vec<Collision>, Vec<u32>) {
     detector.detect(episode, &mut states);
     let flagged = states.iter().filter(|state| state.flags & COLLIDED != 0);

@@ -214,7 +214,7 @@ fn a_grade_and_the_engine_limit_the_speed() {
 }
 
 proptest! {
-    /// Whatever the wheels do, brakes never add energy (of the plane motion, by mass), and no axle gives more than its friction.
+    /// At any state of the wheels brakes never add energy (of the plane motion, by mass), and no axle gives more than its friction.
     #[test]
     fn energy_never_grows_under_braking(
         speed in 0.0_f64..40.0, angle in -0.5_f64..0.5, decel in 3.0_f64..9.0, surface in prop::sample::select(vec![0.3, 0.7, 1.0]),
@@ -234,7 +234,7 @@ proptest! {
         prop_assert_eq!(state.speed_mps, 0.0);
     }
 
-    /// However it is steered on any surface, a vehicle neither turns around nor gains speed by itself.
+    /// With any steering on any surface, a vehicle neither turns around nor gains speed by itself.
     #[test]
     fn steering_alone_neither_spins_nor_speeds_up(
         speed in 1.0_f64..25.0, angle in -0.15_f64..0.15, surface in prop::sample::select(vec![0.3, 0.7, 1.0]),
@@ -260,7 +260,7 @@ struct Reference {
     frequency_hz: f64,
 }
 
-/// Our model with the reference's parameters: its tyres are linear (friction out of reach), its stiffness is multiplied by the
+/// The dynamic model with the reference's parameters: its tyres are linear (friction out of reach), its stiffness is multiplied by the
 /// friction, speed is held, steering follows at once.
 fn like(reference: &Reference, dt_s: f64) -> DynamicParams {
     let wheelbase_m = reference.cg_to_front_m + reference.cg_to_rear_m;
@@ -283,8 +283,8 @@ fn like(reference: &Reference, dt_s: f64) -> DynamicParams {
 }
 
 /// commonroad-vehicle-models' single-track model, integrated at a tolerance of 1e-9 (`data/commonroad_st.py`): 10 s of sine steer
-/// at 5, 15 and 30 m/s, at about 2 m/s² of lateral acceleration. What differs is that theirs is linear in the angles. With
-/// friction, and so saturation, as in the reference's parameters they agree as well.
+/// at 5, 15 and 30 m/s, at about 2 m/s² of lateral acceleration. The difference: the reference is linear in the angles. With the
+/// friction of the reference's parameters, and so saturation, they agree too.
 #[test]
 fn trajectories_agree_with_an_independent_single_track_model() {
     let reference: Reference = serde_json::from_str(include_str!("data/commonroad_st.json")).unwrap();

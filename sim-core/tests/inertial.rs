@@ -1,4 +1,4 @@
-//! The inertial truth is the derivative of what moves, and the integrator converges.
+//! The inertial truth is the derivative of the motion, and the integrator converges.
 
 mod common;
 

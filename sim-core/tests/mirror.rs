@@ -1,4 +1,4 @@
-//! The collection: episodes, announcements, order, headers, persons.
+//! The mirror as a collection: episodes, announcements, order, headers, persons.
 
 mod common;
 
@@ -138,7 +138,7 @@ fn persons_pass_through_with_velocities_from_differences() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(30))]
 
-    /// Every vehicle moves the same whoever else is there and in whatever order SUMO names them; rows are ascending.
+    /// Every vehicle moves the same whatever other road users exist and in whatever order SUMO lists them; rows are ascending.
     #[test]
     fn order_and_company_do_not_matter(
         count in 1_u32..12,

@@ -1,4 +1,4 @@
-//! The process itself: the real binary under a test that plays supervisor, traffic-bridge and sensor-daemon.
+//! The process itself: the real binary, with the test in the roles of the supervisor, `traffic-bridge` and `sensor-daemon`.
 
 #![allow(clippy::unwrap_used, reason = "test code may assert by unwrapping")]
 
@@ -102,7 +102,7 @@ impl Run {
         command.unwrap()
     }
 
-    /// This test in the part of another process.
+    /// This test in the role of another process.
     fn join(&self, process: Process) -> Session {
         let parent = rustix::process::getppid().map_or(0, |p| p.as_raw_nonzero().get());
         let file = RunFile {
@@ -156,7 +156,7 @@ fn departure() -> VehicleMeta {
     meta
 }
 
-/// Drives one vehicle straight through crate and house for `ticks`; what came on `world` and `event`.
+/// Drives one vehicle straight through crate and house for `ticks`; returns the messages on `world` and `event`.
 fn drive(run: &Run, ticks: u64) -> (Vec<VehicleState>, Vec<(u64, Collision)>) {
     drive_on(run, ticks, 0)
 }
@@ -178,7 +178,7 @@ fn drive_on(run: &Run, ticks: u64, map: u8) -> (Vec<VehicleState>, Vec<(u64, Col
     until("sim-core at its ports", || {
         (core.progress().attached == 1).then_some(())
     });
-    let (mut states, mut told) = (Vec::new(), Vec::new());
+    let (mut states, mut collisions) = (Vec::new(), Vec::new());
     for tick in 0..ticks {
         let flag = |bit: u32, is_set: bool| if is_set { bit } else { 0 };
         let header = MessageHeader {
@@ -192,7 +192,7 @@ fn drive_on(run: &Run, ticks: u64, map: u8) -> (Vec<VehicleState>, Vec<(u64, Col
             ..bridge.header()
         };
         if tick == 0 {
-            // A traffic light beside it, which sim-core passes over.
+            // A traffic light beside it, which `sim-core` skips.
             let layout = TrafficMetaLayout::new(1, 1);
             let mut payload = vec![0_u64; layout.len / 8];
             let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut payload);
@@ -216,11 +216,11 @@ fn drive_on(run: &Run, ticks: u64, map: u8) -> (Vec<VehicleState>, Vec<(u64, Col
         while let Some(message) = events.receive().unwrap() {
             let rows: &[Collision] = bytemuck::cast_slice(message.payload());
             assert_eq!(rows.len(), message.header().count as usize);
-            told.extend(rows.iter().map(|row| (message.header().tick, *row)));
+            collisions.extend(rows.iter().map(|row| (message.header().tick, *row)));
         }
         daemon.consumed(tick + 1);
     }
-    (states, told)
+    (states, collisions)
 }
 
 #[test]
@@ -243,29 +243,29 @@ fn contacts_are_with_what_stands_on_the_map_of_the_tick() {
     run.file.write().unwrap();
     for (number, name, near_side_m) in [(0, "house", 50.0), (1, "tower", 70.0)] {
         let mut process = run.start();
-        let (_, told) = drive_on(&run, 100, number);
+        let (_, collisions) = drive_on(&run, 100, number);
         assert_eq!(process.wait().unwrap().code(), Some(0));
-        let struck: Vec<u64> = told.iter().map(|(_, event)| event.other_id_hash).collect();
+        let struck: Vec<u64> = collisions.iter().map(|(_, event)| event.other_id_hash).collect();
         assert_eq!(struck, [id_hash(name)], "map {number}");
-        assert!((told[0].1.position_m[0] - near_side_m).abs() < 1.1);
+        assert!((collisions[0].1.position_m[0] - near_side_m).abs() < 1.1);
     }
 }
 
 #[test]
-fn contacts_are_flagged_told_written_and_counted() {
+fn contacts_are_flagged_published_written_and_counted() {
     let run = Run::new("contacts", |_| {});
     let mut process = run.start();
-    let (states, told) = drive(&run, 100);
+    let (states, collisions) = drive(&run, 100);
     assert_eq!(process.wait().unwrap().code(), Some(0));
-    let classes: Vec<u32> = told.iter().map(|(_, event)| event.other_class).collect();
+    let classes: Vec<u32> = collisions.iter().map(|(_, event)| event.other_class).collect();
     assert_eq!(classes, [Struck::Obstacle as u32, Struck::Building as u32]);
     let flagged: Vec<u64> = (0..)
         .zip(&states)
         .filter(|(_, s)| s.flags & COLLIDED != 0)
         .map(|(tick, _)| tick)
         .collect();
-    assert_eq!(flagged, told.iter().map(|(tick, _)| *tick).collect::<Vec<_>>());
-    for ((tick, event), near_side_m) in told.iter().zip([39.4, 50.0]) {
+    assert_eq!(flagged, collisions.iter().map(|(tick, _)| *tick).collect::<Vec<_>>());
+    for ((tick, event), near_side_m) in collisions.iter().zip([39.4, 50.0]) {
         let state = &states[*tick as usize];
         let front_m = state.x_m + f64::from(state.length_m - state.rear_overhang_m);
         assert!(
@@ -279,13 +279,13 @@ fn contacts_are_flagged_told_written_and_counted() {
             "{event:?}"
         );
     }
-    assert_eq!(told[0].1.other_id_hash, id_hash("crate"));
-    assert_eq!(told[1].1.other_id_hash, id_hash("house"));
+    assert_eq!(collisions[0].1.other_id_hash, id_hash("crate"));
+    assert_eq!(collisions[1].1.other_id_hash, id_hash("house"));
 
     let lines = std::fs::read_to_string(run.file.run_dir.join("events/collisions.jsonl")).unwrap();
     let lines: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(lines.len(), 2);
-    for ((tick, event), line) in told.iter().zip(&lines) {
+    for ((tick, event), line) in collisions.iter().zip(&lines) {
         assert_eq!(
             (line["tick"].as_u64(), line["vehicle"].as_str()),
             (Some(*tick), Some("runaway"))
@@ -314,9 +314,9 @@ fn contacts_are_flagged_told_written_and_counted() {
 fn nobody_looks_if_nobody_asks() {
     let run = Run::new("blind", |config| config.collision.detect = false);
     let mut process = run.start();
-    let (states, told) = drive(&run, 60);
+    let (states, collisions) = drive(&run, 60);
     assert_eq!(process.wait().unwrap().code(), Some(0));
-    assert!(told.is_empty() && states.iter().all(|state| state.flags & COLLIDED == 0));
+    assert!(collisions.is_empty() && states.iter().all(|state| state.flags & COLLIDED == 0));
     assert!(!run.file.run_dir.join("events").exists());
     let part = std::fs::read_to_string(run.file.run_dir.join("parts/sim-core.json")).unwrap();
     assert_eq!(serde_json::from_str::<Value>(&part).unwrap()["collisions"], Value::Null);
@@ -331,7 +331,9 @@ fn a_scene_that_cannot_be_read_ends_the_process_with_the_file_and_the_line() {
     let failure = Failure::read(&run.file.run_dir, Process::SimCore.name()).unwrap();
     assert_eq!(failure.kind, FailureKind::Config);
     assert!(
-        failure.message.contains("a.poly.xml, line 2: \"x\" is no usable shape"),
+        failure
+            .message
+            .contains("a.poly.xml, line 2: \"x\" is not a usable shape"),
         "{}",
         failure.message
     );

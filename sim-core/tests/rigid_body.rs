@@ -95,7 +95,7 @@ fn braking_distance() {
         assert!(end.speed_mps.abs() < 1e-12, "{end:?}");
         end.x_m
     };
-    // The brake comes with 30 m/s³ until 2.5 m/s² are missing, then with a lag of 1/12 s: as if applied late by `delay`.
+    // The brake builds up with 30 m/s³ until 2.5 m/s² are missing, then with a lag of 1/12 s: as if applied late by `delay`.
     let linear_s = (decel - 2.5) / 30.0;
     let delay = linear_s * (1.0 - 0.5 * (decel - 2.5) / decel) + 2.5 / decel / 12.0;
     let (found, closed) = (end(1.0), speed * delay + 0.5 * speed * speed / decel);
@@ -208,7 +208,7 @@ fn motion_is_the_derivative_of_the_pose() {
 fn the_state_is_all_there_is() {
     let drive = |t: f64| (2.0 * t.sin(), 0.2 * (3.0 * t).sin());
     let alone = run(&mut vehicle(&sedan(), 1.0), rolling(15.0), 0.02, 5.0, drive);
-    // The same again, with another vehicle using the same workshop in between.
+    // The same again, with another vehicle in the same world in between.
     let mut shared = vehicle(&sedan(), 1.0);
     let (mut one, mut other) = (rolling(15.0), rolling(2.0));
     for (step, expected) in alone[1..].iter().enumerate() {
@@ -257,7 +257,7 @@ fn whatever_is_asked_it_stays_finite_and_gains_no_speed_by_steering() {
                 let note = format!("{} on {surface} from {speed} m/s: {state:?}", set.name);
                 assert!(speed_mps.hypot(lateral_mps) < 1.1 * speed, "{note}");
                 assert!(yaw_rate_radps.abs() < 10.0 && roll[0].is_finite(), "{note}");
-                // What stands higher than half its track over friction tips over; cars do not.
+                // A vehicle whose centre of gravity is higher than half its track over friction tips over; cars do not.
                 let car = set.cg_height_m < 0.6;
                 assert!(!car || (roll[0].abs() < 0.3 && pitch[0].abs() < 0.1), "{note}");
             }

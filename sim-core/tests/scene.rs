@@ -19,7 +19,7 @@ use ipc_schema::{
 };
 use sim_core::scene::{Scene, SceneError, Solid, SurfaceKind, chart::Chart, shape};
 
-/// The SUMO that `make build` installed, or the one that is named instead.
+/// The SUMO that `make build` installed, or that `CARAWARE_SUMO_HOME` names.
 fn sumo_home() -> PathBuf {
     if let Some(home) = std::env::var_os("CARAWARE_SUMO_HOME").filter(|home| !home.is_empty()) {
         return home.into();
@@ -100,7 +100,7 @@ fn run(net_file: &Path, additional_files: &[PathBuf]) -> RunFile {
     }
 }
 
-/// The town as a run has it.
+/// The town as in a run.
 fn town(directory: &Path) -> RunFile {
     let net = directory.join("town.net.xml");
     let output = Command::new(sumo_home().join("bin/netconvert"))
@@ -341,12 +341,12 @@ fn bad_files_are_named_with_their_line() {
     assert!(
         error
             .to_string()
-            .contains("a.net.xml, line 3: \"3,x\" is no usable shape"),
+            .contains("a.net.xml, line 3: \"3,x\" is not a usable shape"),
         "{error}"
     );
     let error = refused("<net>\n<edge id=\"a\"><lane id=\"a_0\" width=\"-1\" shape=\"1,2 3,4\"/></edge></net>");
     assert!(
-        error.to_string().contains("line 2: \"-1\" is no usable width"),
+        error.to_string().contains("line 2: \"-1\" is not a usable width"),
         "{error}"
     );
     assert!(matches!(refused("<net><edge></net>"), SceneError::Malformed { .. }));
@@ -424,6 +424,6 @@ fn viewers_are_told_of_lanes_lights_and_houses() {
     }
     let path = directory.path().join("map/chart.json");
     chart.write(&path).unwrap();
-    let told: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
-    assert_eq!(told["lanes"].as_array().unwrap().len(), chart.lanes.len());
+    let written: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    assert_eq!(written["lanes"].as_array().unwrap().len(), chart.lanes.len());
 }

@@ -257,7 +257,7 @@ fn a_jump_that_nobody_flagged_sets_the_mirror() {
     }
 }
 
-/// A 90° corner without any radius at speed: no vehicle stays on it, so the mirror is set onto SUMO again and again.
+/// A 90° corner without any radius at speed: no vehicle stays on it, so the mirror is set to SUMO's state repeatedly.
 #[test]
 fn an_error_beyond_the_limit_sets_the_mirror() {
     let road = Road(vec![[0.0, 0.0], [40.0, 0.0], [40.0, 40.0]]);
@@ -287,7 +287,7 @@ fn random_drive() -> impl Strategy<Value = Vec<TrafficState>> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(100))]
 
-    /// Within SUMO's own default acceleration (2.6 m/s²) and deceleration (4.5 m/s²), drawn anew in every step, the limits of
+    /// Within SUMO's own default acceleration (2.6 m/s²) and deceleration (4.5 m/s²), drawn in every step, the limits of
     /// the model hold and the front bumper stays near SUMO's.
     #[test]
     fn any_drive_is_tracked_within_the_limits(frames in random_drive()) {
@@ -298,7 +298,7 @@ proptest! {
             prop_assert!(pair[1].speed_mps >= 0.0 && pair[1].road_wheel_angle_rad.abs() <= 0.6001);
             prop_assert!((pair[1].road_wheel_angle_rad - pair[0].road_wheel_angle_rad).abs() <= 0.01 + 1e-6);
             prop_assert!((-9.01..=5.01).contains(&pair[1].accel_body_mps2[0]));
-            // The jerk limit of 30 m/s³; around the instant of rest the brakes let go of what little is left.
+            // The jerk limit of 30 m/s³; around the instant of rest the brakes release the small rest.
             let most = if pair[0].speed_mps.min(pair[1].speed_mps) == 0.0 { 0.5 } else { 0.301 };
             prop_assert!((pair[1].accel_body_mps2[0] - pair[0].accel_body_mps2[0]).abs() <= most, "{:?}", pair);
             let lateral = f64::from(pair[1].speed_mps) * f64::from(pair[1].angular_rate_body_radps[2]);

@@ -1,4 +1,4 @@
-//! What the bridge adds to SUMO, in microseconds of processor time per road user and step: `cargo bench -p traffic-bridge`.
+//! Cost of the bridge on top of SUMO, in microseconds of processor time per road user and step: `cargo bench -p traffic-bridge`.
 
 use std::{
     path::{Path, PathBuf},

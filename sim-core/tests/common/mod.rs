@@ -150,7 +150,7 @@ impl Aligned {
     }
 }
 
-/// The ticks of one vehicle that SUMO moves through `states`.
+/// The ticks of one vehicle with SUMO's `states`.
 pub fn mirror_one(settings: MirrorSettings, states: &[TrafficState]) -> (Vec<VehicleState>, Vec<SubStep>) {
     let mut mirror = Mirror::new(settings).unwrap();
     mirror

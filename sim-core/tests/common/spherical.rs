@@ -1,12 +1,12 @@
-//! The paper's own conversions (section III.C, equations 1 to 4): a sphere, no altitude. They are the option they are, for
-//! comparison with published results; everything else uses [`sim_core::geodesy`], which is exact.
+//! The paper's own conversions (section III.C, equations 1 to 4): a sphere, no altitude. They serve
+//! comparisons with published results; everything else uses [`sim_core::geodesy`], which is exact.
 //!
 //! The paper's text names the origin `λ = lat_o, φ = long_o`; these functions follow the formulas with that reading.
-//! Equation 1 gives no z, so equation 2's z is the sphere's `R sin(lat)`. A sphere for the ellipsoid costs up to 0.7 %: 25 km north-east of an
+//! Equation 1 gives no z, so equation 2's z is the sphere's `R sin(lat)`. A sphere in place of the ellipsoid causes errors of up to 0.7 %: 25 km north-east of an
 //! origin at 52° north east comes out 53 m and north 10 m off (`tests/data/geodesy.csv`).
 //!
 //! Equation 4 turns and does not mirror. The axes of the paper's figure 3 (x left, y backward) and those of a window (x right, y down)
-//! run round in opposite senses seen from above, so points in those axes change the sign of x first.
+//! have opposite orientations seen from above, so points in those axes change the sign of x first.
 
 use sim_core::geodesy::Geodetic;
 

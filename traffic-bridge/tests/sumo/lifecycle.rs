@@ -1,4 +1,4 @@
-//! A session over real SUMO: what its frames say, and how it fails.
+//! The life of a real SUMO: its frames, and its failures.
 
 use crate::support::{Bench, run, sumo_home};
 use ipc_schema::{
@@ -72,7 +72,7 @@ fn departures_and_arrivals_are_told_once_in_order_with_what_they_are() {
 #[test]
 fn a_teleported_vehicle_is_left_out_until_it_is_back_and_then_discontinuous() {
     let bench = Bench::new();
-    // The stopped one blocks the only way of the other for longer than it waits.
+    // The stopped vehicle blocks the only route of the other for longer than it waits.
     let sumocfg = bench.scenario(
         "<routes><vehicle id=\"block\" depart=\"0\"><route edges=\"A0B0 B0C0\"/><stop lane=\"A0B0_1\" endPos=\"60\" duration=\"1000\"/></vehicle>\
          <vehicle id=\"block2\" depart=\"0\"><route edges=\"A0B0 B0C0\"/><stop lane=\"A0B0_2\" endPos=\"60\" duration=\"1000\"/></vehicle>\
@@ -120,7 +120,7 @@ fn a_second_session_is_refused_until_the_first_is_gone() {
     Sumo::start(options).unwrap().close().unwrap();
 }
 
-/// What a user is told who started SUMO with these options.
+/// The error of a start of SUMO with these options, as the user sees it.
 fn refusal(options: Result<SumoOptions, SumoError>, steps: usize) -> Failure {
     let started = options.and_then(Sumo::start);
     let result = started.and_then(|mut sumo| {

@@ -118,10 +118,10 @@ fn everybody_stays_alive_for_ever() {
 }
 
 #[test]
-fn whoever_leaves_is_replaced() {
+fn a_vehicle_that_leaves_is_replaced() {
     let bench = Bench::new();
     let net = bench.grid();
-    // On these edges SUMO ends the route of everybody.
+    // On these edges SUMO ends the route of every vehicle.
     let text = "<additional><rerouter id=\"end\" edges=\"B1C1 C3B3 D2D1\"><interval begin=\"0\" end=\"1e6\">\
                 <destProbReroute id=\"terminateRoute\"/></interval></rerouter></additional>";
     let additional = bench.file("end.add.xml", text);
@@ -136,7 +136,7 @@ fn whoever_leaves_is_replaced() {
             .filter(|event| event.event == MetaEvent::Arrived as u32)
             .count();
         names.extend(frame.events.iter().map(|event| event.id_text()));
-        // Each step at most a few have left and their successors are not in yet.
+        // After each step at most a few vehicles have left whose replacements have not departed.
         assert!(
             frame.step < 20 || frame.cavs >= 20,
             "{} at {} s",
@@ -161,7 +161,7 @@ fn a_crowd_finds_room() {
     };
     let mut population = Population::start(&mut sumo, crowd, &[], 3).unwrap();
     let mut cavs = 0;
-    // One vehicle to 20 m of lane: whoever finds none where it wants to start is moved.
+    // One vehicle to 20 m of lane: a vehicle that finds no room where it should start is added elsewhere.
     run(&mut sumo, 100, |sumo, frame| {
         population.after_step(sumo, frame).unwrap();
         cavs = frame.cavs;

@@ -1,4 +1,4 @@
-//! The process itself: the real binary under a test that plays supervisor and sim-core.
+//! The process itself: the real binary, with the test in the roles of the supervisor and `sim-core`.
 
 use std::{
     os::unix::process::ExitStatusExt,
@@ -30,7 +30,7 @@ const PATIENCE: Duration = Duration::from_secs(20);
 const CAVS: u32 = 6;
 const WINDOW_TICKS: u64 = 4;
 
-/// Tells the runs of one test process apart.
+/// Numbers the runs of one test process.
 static RUNS: AtomicU32 = AtomicU32::new(0);
 
 /// A run whose supervisor and sim-core are this test.
@@ -82,7 +82,7 @@ impl Run {
 }
 
 impl Drop for Run {
-    /// iceoryx2 keeps one file for each prefix: as the supervisor does, the test sweeps after itself.
+    /// iceoryx2 keeps one file for each prefix: the test removes it, as the supervisor does.
     fn drop(&mut self) {
         self.holder = None;
         for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
@@ -136,10 +136,10 @@ fn next(subscriber: &Subscriber) -> Message {
     message.unwrap()
 }
 
-/// One step as sim-core takes it: its header and rows, what was told about road users, and about traffic lights.
+/// One step as `sim-core` receives it: header and rows, and the announcements of road users and traffic lights.
 type Step = (MessageHeader, Vec<TrafficState>, Vec<VehicleMeta>, Vec<SignalMeta>);
 
-/// Everything a run sends.
+/// All messages of a run.
 fn consume(run: &Run) -> Vec<Step> {
     let (mut session, traffic, meta) = run.sim_core();
     let (mut steps, mut meta_messages) = (Vec::new(), 0);
@@ -150,7 +150,7 @@ fn consume(run: &Run) -> Vec<Step> {
         drop(message);
         let (mut events, mut signals) = (Vec::new(), Vec::new());
         while meta_messages < header.sequence {
-            // What happened is told before where everybody is.
+            // Events are sent before the states.
             let message = meta.receive().unwrap().unwrap();
             meta_messages += 1;
             assert_eq!(

@@ -1,4 +1,4 @@
-//! SUMO's own scenario A10KW: a Berlin motorway whose additional files write their results beside themselves.
+//! SUMO's own scenario A10KW: a Berlin motorway whose additional files write their results into their own folder.
 
 use std::{collections::BTreeSet, path::Path, time::SystemTime};
 
@@ -59,7 +59,7 @@ fn a10kw_runs_and_writes_into_the_run_directory_alone() {
     assert!(most > 50, "{most}");
     assert!(
         cavs == 20 && departed_cavs > 20,
-        "{cavs} at the end of {departed_cavs}: who arrives makes room"
+        "{cavs} at the end of {departed_cavs}: a vehicle that arrives makes room"
     );
     sumo.close().unwrap();
     assert_eq!(listing(&games), before, "nothing was written into the wheel");

@@ -1,4 +1,4 @@
-//! Traffic lights as they are told, against what SUMO itself writes.
+//! Traffic lights as they are published, against SUMO's own output.
 
 use std::{
     collections::BTreeMap,
@@ -20,7 +20,7 @@ use traffic_bridge::{
 /// Junctions with signals in the town.
 const LIGHTS: usize = 4;
 
-/// Runs `net` with some traffic and compares every state of every light with what SUMO saves; returns the changes that were told.
+/// Runs `net` with some traffic and compares every state of every light with what SUMO saves; returns the published changes.
 fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32) -> u32 {
     let lights = bench.lights_of(net);
     let events: String = lights
@@ -38,7 +38,7 @@ fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32)
     };
     let mut population = Population::start(&mut sumo, size, &[], 1).unwrap();
     let mut now: BTreeMap<String, String> = BTreeMap::new();
-    let (mut told, mut changes) = (Vec::new(), 0);
+    let (mut published, mut changes) = (Vec::new(), 0);
     run(&mut sumo, 400, |sumo: &mut Sumo, frame: &TrafficFrame| {
         if frame.step == 1 {
             let all: Vec<String> = frame.signals.iter().map(|signal| signal.id_text()).collect();
@@ -48,10 +48,14 @@ fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32)
             assert_eq!(lights[signal.signal as usize], signal.id_text());
             assert_eq!((signal.id_hash, signal.reserved), (id_hash(&signal.id_text()), 0));
             let before = now.insert(signal.id_text(), signal.state_text());
-            assert_ne!(before.as_ref(), Some(&signal.state_text()), "told without a change");
+            assert_ne!(
+                before.as_ref(),
+                Some(&signal.state_text()),
+                "published without a change"
+            );
             changes += u32::from(before.is_some());
         }
-        told.push(now.clone());
+        published.push(now.clone());
         population.after_step(sumo, frame).unwrap();
     });
     sumo.close().unwrap();
@@ -63,8 +67,8 @@ fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32)
             };
             // SUMO's time is that of the start of the step.
             let step = (2.0 * time.parse::<f64>().unwrap()).round() as usize;
-            if let Some(told) = told.get(step) {
-                assert_eq!(told[id], state, "{id} at {time}");
+            if let Some(published) = published.get(step) {
+                assert_eq!(published[id], state, "{id} at {time}");
                 compared += 1;
             }
         })
@@ -74,9 +78,9 @@ fn compare(bench: &Bench, net: &Path, mut files: Vec<PathBuf>, pedestrians: u32)
     changes
 }
 
-/// Its lights are actuated: when they switch depends on traffic.
+/// Its lights are actuated: traffic decides when they switch.
 #[test]
-fn the_lights_of_the_town_are_told_as_sumo_writes_them() {
+fn the_lights_of_the_town_are_published_as_sumo_writes_them() {
     let bench = Bench::new();
     let (net, files) = bench.town();
     assert_eq!(bench.lights_of(&net).len(), LIGHTS);
@@ -85,7 +89,7 @@ fn the_lights_of_the_town_are_told_as_sumo_writes_them() {
 }
 
 #[test]
-fn lights_with_fixed_times_are_told_as_sumo_writes_them() {
+fn lights_with_fixed_times_are_published_as_sumo_writes_them() {
     let bench = Bench::new();
     let net = bench.signalled_grid(3);
     let changes = compare(&bench, &net, Vec::new(), 0);

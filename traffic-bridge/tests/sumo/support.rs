@@ -1,4 +1,4 @@
-//! What the tests of real SUMO share: nets built by the wheel's own tools, and one simulation at a time.
+//! Shared parts of the tests with real SUMO: nets built by the wheel's own tools, and one simulation at a time.
 
 use std::{
     path::{Path, PathBuf},
@@ -15,16 +15,16 @@ use traffic_bridge::sumo::{
     options::SumoOptions,
 };
 
-/// Tests run as threads of one process, SUMO runs once in a process: they take turns.
+/// Tests run as threads of one process, and a process has one SUMO: the tests take turns.
 static TURN: Mutex<()> = Mutex::new(());
 
-/// A place with nets, and the turn to run SUMO.
+/// A folder with nets, and the turn to run SUMO.
 pub struct Bench {
     pub folder: TempDir,
     _turn: MutexGuard<'static, ()>,
 }
 
-/// Where the wheel is.
+/// The directory of the wheel.
 pub fn sumo_home() -> PathBuf {
     PathBuf::from(env!("CARAWARE_BUILD_SUMO_HOME"))
 }
