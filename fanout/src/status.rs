@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use ipc_schema::{
     board::{Health, State, TrainingStatus},
     config::Field,
+    metric,
     process::Process,
     run::{MapInfo, Mode, RunFile},
 };
@@ -147,10 +148,21 @@ pub struct LearningStatus {
     pub reward: f64,
     /// Largest mean reward so far.
     pub best_reward: f64,
-    /// Mean error of the policy, metres.
-    pub error_m: f64,
-    /// Mean error of the raw GNSS fix, metres.
-    pub raw_gnss_error_m: f64,
+    /// What is measured of the policy, and of what it is compared with.
+    pub metrics: Vec<MetricStatus>,
+}
+
+/// One metric of the task.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct MetricStatus {
+    /// Its name in reports.
+    pub name: &'static str,
+    /// Its name for people.
+    pub label: &'static str,
+    /// Its unit for people.
+    pub unit: &'static str,
+    /// Its value on the samples of the newest update.
+    pub value: f64,
 }
 
 impl From<TrainingStatus> for LearningStatus {
@@ -163,8 +175,14 @@ impl From<TrainingStatus> for LearningStatus {
             policy_std: status.policy_std,
             reward: status.reward,
             best_reward: status.best_reward,
-            error_m: status.error_m,
-            raw_gnss_error_m: status.raw_gnss_error_m,
+            metrics: metric::measured(&status.metrics)
+                .map(|(metric, value)| MetricStatus {
+                    name: metric.name,
+                    label: metric.label,
+                    unit: metric.unit,
+                    value,
+                })
+                .collect(),
         }
     }
 }

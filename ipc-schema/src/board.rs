@@ -2,6 +2,8 @@
 
 use iceoryx2::prelude::ZeroCopySend;
 
+use crate::metric::{MetricValues, NOT_MEASURED};
+
 /// Where a process stands in the data it consumes and commits.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
@@ -127,7 +129,7 @@ pub struct Health {
 
 /// How learning goes.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
 #[type_name("caraware::TrainingStatus")]
 pub struct TrainingStatus {
     /// Episode of the newest sample.
@@ -144,8 +146,21 @@ pub struct TrainingStatus {
     pub reward: f64,
     /// Largest of those so far.
     pub best_reward: f64,
-    /// Mean error of the policy, metres: the last evaluation, or of the samples before the first.
-    pub error_m: f64,
-    /// Mean error of the raw GNSS fix on the same samples, metres.
-    pub raw_gnss_error_m: f64,
+    /// Value of each metric on the samples of the newest update, in the order of [`crate::metric::METRICS`].
+    pub metrics: MetricValues,
+}
+
+impl Default for TrainingStatus {
+    fn default() -> Self {
+        Self {
+            episode: 0,
+            env_steps: 0,
+            updates: 0,
+            env_steps_per_s: 0.0,
+            policy_std: 0.0,
+            reward: 0.0,
+            best_reward: 0.0,
+            metrics: NOT_MEASURED,
+        }
+    }
 }

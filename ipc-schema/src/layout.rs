@@ -252,8 +252,7 @@ pub fn table() -> Vec<TypeLayout> {
             policy_std,
             reward,
             best_reward,
-            error_m,
-            raw_gnss_error_m
+            metrics
         }),
     ]
 }

@@ -32,6 +32,7 @@ pub mod failure;
 pub mod flow;
 pub mod header;
 pub mod layout;
+pub mod metric;
 pub mod observation;
 pub mod pointcloud;
 pub mod ports;
@@ -48,4 +49,4 @@ pub mod usage;
 pub mod world;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 12;
+pub const SCHEMA_VERSION: u32 = 13;

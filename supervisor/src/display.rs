@@ -8,6 +8,7 @@ use std::{
 use indicatif::{ProgressBar, ProgressStyle};
 use ipc_schema::{
     board::{Health, TrainingStatus},
+    metric::{self, MetricValues},
     process::Process,
     run::Mode,
 };
@@ -134,8 +135,7 @@ struct View {
     real_time_factor: f64,
     policy_std: f64,
     reward: f64,
-    error_m: f64,
-    raw_gnss_error_m: f64,
+    metrics: MetricValues,
 }
 
 impl View {
@@ -194,25 +194,21 @@ impl View {
             real_time_factor: each_second(simulated_s),
             policy_std: training.policy_std,
             reward: training.reward,
-            error_m: training.error_m,
-            raw_gnss_error_m: training.raw_gnss_error_m,
+            metrics: training.metrics,
         }
     }
 
     fn text(&self) -> String {
         let (rate, traffic) = (self.rate(), self.traffic());
-        // Before the first update, and where nothing learns to localise, there is no error to show.
-        match self.updates {
-            0 => format!(
-                "episode {:3}  {:7.1} s  {rate}  {traffic}",
-                self.episode, self.sim_time_s
-            ),
-            // The error first: a narrow terminal cuts the end.
-            _ => format!(
-                "episode {:3}  error {:.2} m (raw GNSS {:.2} m)  σ {:.3}  reward {:.3}  {rate}  {traffic}",
-                self.episode, self.error_m, self.raw_gnss_error_m, self.policy_std, self.reward
-            ),
-        }
+        let measured = metric::summary(&self.metrics);
+        // The metrics first: a narrow terminal cuts the end.
+        let learning = match (self.updates, measured.is_empty()) {
+            (0, true) => format!("{:7.1} s", self.sim_time_s),
+            (0, false) => measured,
+            (_, true) => format!("σ {:.3}  reward {:.3}", self.policy_std, self.reward),
+            (_, false) => format!("{measured}  σ {:.3}  reward {:.3}", self.policy_std, self.reward),
+        };
+        format!("episode {:3}  {learning}  {rate}  {traffic}", self.episode)
     }
 
     fn rate(&self) -> String {

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use ipc_schema::{
+    metric::{self, METRICS},
     process::Process,
     run::{Mode, RunFile},
 };
@@ -10,6 +11,10 @@ use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use crate::{failure::Exit, supervisor::Outcome, swap::Handover};
+
+/// What an evaluation compares, as the keys of a report begin: the policy, the raw fix, the Kalman filter, the smoother that sees
+/// the future, and the policy's network taught by regression.
+const ESTIMATORS: [&str; 5] = ["ppo", "raw_gnss", "ekf", "rts", "supervised"];
 
 /// What sensor-daemon writes at its end.
 #[derive(Debug, Clone, Deserialize, Default)]
@@ -119,6 +124,7 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
     let sensing = Sensing::total(&sensings);
     let training: Map<String, Value> = part(run, "trainer").unwrap_or_default();
     let moving: Map<String, Value> = part(run, "sim-core").unwrap_or_default();
+    let metric = metric::headline(run.config.task.kind);
     let learned = |key: &str| training.get(key).cloned().unwrap_or(Value::Null);
     let env_steps = match run.mode {
         Mode::Train => learned("env_steps").as_u64().unwrap_or(0),
@@ -140,7 +146,7 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
             Some((process.name().to_owned(), part.get("process")?.clone()))
         })
         .collect();
-    let report = json!({
+    let mut report = json!({
         "name": run.name,
         "mode": run.mode,
         "result": if outcome.interrupted { "interrupted" } else { "completed" },
@@ -148,15 +154,7 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "wall_s": outcome.wall_s,
         "env_steps_per_s": rate,
         "raw_gnss_mean_error_m": raw,
-        "ppo_mean_error_m": learned("ppo_mean_error_m"),
-        "ekf_mean_error_m": learned("ekf_mean_error_m"),
-        "rts_mean_error_m": learned("rts_mean_error_m"),
-        "supervised_mean_error_m": learned("supervised_mean_error_m"),
-        "ppo_ci95_m": learned("ppo_ci95_m"),
-        "raw_gnss_ci95_m": learned("raw_gnss_ci95_m"),
-        "ekf_ci95_m": learned("ekf_ci95_m"),
-        "rts_ci95_m": learned("rts_ci95_m"),
-        "supervised_ci95_m": learned("supervised_ci95_m"),
+        "metric": metric.name,
         "evaluation_seeds": learned("evaluation_seeds"),
         "policy_std": learned("policy_std"),
         "vehicles": sensing.cavs_max,
@@ -182,6 +180,13 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "traffic": part::<Value>(run, "traffic-bridge"),
         "processes": used,
     });
+    for estimator in ESTIMATORS {
+        for key in [metric.mean_key(estimator), metric.interval_key(estimator)] {
+            if report[&key].is_null() {
+                report[&key] = learned(&key);
+            }
+        }
+    }
     let path = run.run_dir.join("report.json");
     let text = serde_json::to_string_pretty(&report).unwrap_or_default();
     std::fs::write(&path, text + "\n").map_err(|error| Exit::io("write", &path, &error))?;
@@ -263,16 +268,19 @@ fn number(report: &Value, key: &str, digits: usize) -> String {
         .map_or("–".into(), |value| format!("{value:.digits$}"))
 }
 
-/// Mean errors of the policy and of what it is compared with.
+/// Means of the task's metric: of the policy and of what it is compared with.
 fn errors(report: &Value) -> Vec<String> {
-    let error = |name: &str| {
-        let mean = number(report, &format!("{name}_mean_error_m"), 2);
-        match report[format!("{name}_ci95_m")].as_f64() {
-            Some(half_m) => format!("{mean} ± {half_m:.2} m"),
-            None => format!("{mean} m"),
+    let Some(metric) = METRICS.iter().find(|metric| report["metric"] == metric.name) else {
+        return Vec::new();
+    };
+    let error = |estimator: &str| {
+        let mean = number(report, &metric.mean_key(estimator), 2);
+        match report[metric.interval_key(estimator)].as_f64() {
+            Some(half) => format!("{mean} ± {half:.2} {}", metric.unit),
+            None => format!("{mean} {}", metric.unit),
         }
     };
-    let measured = |name: &str| !report[format!("{name}_mean_error_m")].is_null();
+    let measured = |estimator: &str| !report[metric.mean_key(estimator)].is_null();
     let mut lines = Vec::new();
     if measured("ppo") {
         let seeds = match report["evaluation_seeds"].as_u64() {
@@ -280,7 +288,8 @@ fn errors(report: &Value) -> Vec<String> {
             _ => "unseen seeds".to_owned(),
         };
         lines.push(format!(
-            "mean error on {seeds}: policy {}, raw GNSS {}   (policy σ {})",
+            "mean {} on {seeds}: policy {}, raw GNSS {}   (policy σ {})",
+            metric.label,
             error("ppo"),
             error("raw_gnss"),
             number(report, "policy_std", 3)

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use ipc_schema::{
     board::{Health, Progress, State},
+    metric,
     ports::BoardReader,
     process::Process,
     run::RunFile,
@@ -123,6 +124,7 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
     }
     println!();
     print_environments(run, &boards, [&first, &second]);
+    print_training(run, &boards);
     Ok(())
 }
 
@@ -154,6 +156,21 @@ fn print_environments(run: &RunFile, boards: &[Seat], [before, now]: [&[Look]; 2
             traffic.arrived,
             each_second(sensed.vehicle_steps, since.vehicle_steps),
             each_second(sensed.ticks, since.ticks) * run.config.run.tick_s,
+        );
+    }
+}
+
+/// A line for the trainer once it reports metrics: how many updates it has made, and what it measures.
+fn print_training(run: &RunFile, boards: &[Seat]) {
+    let Some(trainer) = boards.iter().find(|seat| seat.process == Process::Trainer) else {
+        return;
+    };
+    let training = trainer.board.training();
+    let measured = metric::summary(&training.metrics);
+    if !measured.is_empty() {
+        println!(
+            "{:<16} trainer: {} updates, {measured}, reward {:.3}",
+            run.name, training.updates, training.reward
         );
     }
 }

@@ -1,6 +1,7 @@
 //! Python extension `caraware._native`: a trainer's place in a run, observations as read-only views over shared memory.
 
 use std::{
+    collections::BTreeMap,
     path::Path,
     sync::{Arc, Mutex, MutexGuard, atomic::AtomicBool},
     time::{Duration, Instant},
@@ -11,6 +12,7 @@ use ipc_schema::{
     board::{State, TrainingStatus},
     clock::monotonic_ns,
     header::{self, MessageHeader},
+    metric::{self, METRICS},
     observation::ObservationLayout,
     ports::{BoardReader, Message, Publisher, Subscriber, Waker},
     prediction::{ESTIMATES, PredictionLayout},
@@ -22,12 +24,15 @@ use ipc_schema::{
 use pyo3::{
     exceptions::{PyKeyError, PyRuntimeError, PyValueError},
     prelude::*,
+    types::PyTuple,
 };
 
 mod lease;
+mod metrics;
 mod scans;
 mod view;
 use lease::Lease;
+use metrics::Metric;
 use scans::PointCloud;
 use view::SectionView;
 
@@ -263,8 +268,8 @@ impl Attachment {
         Ok(())
     }
 
-    /// Shows how learning goes; what is left out keeps its last value.
-    #[pyo3(signature = (*, episode=None, env_steps=None, updates=None, env_steps_per_s=None, policy_std=None, reward=None, error_m=None, raw_gnss_error_m=None))]
+    /// Shows how learning goes; what is left out keeps its last value. `metrics` are values by the names of `METRICS`.
+    #[pyo3(signature = (*, episode=None, env_steps=None, updates=None, env_steps_per_s=None, policy_std=None, reward=None, metrics=None))]
     #[expect(
         clippy::too_many_arguments,
         reason = "keyword arguments of a Python method, one for each number of the status"
@@ -277,11 +282,15 @@ impl Attachment {
         env_steps_per_s: Option<f64>,
         policy_std: Option<f64>,
         reward: Option<f64>,
-        error_m: Option<f64>,
-        raw_gnss_error_m: Option<f64>,
+        metrics: Option<BTreeMap<String, f64>>,
     ) -> PyResult<()> {
         let mut inner = self.lock()?;
         let old = inner.training;
+        let mut values = old.metrics;
+        for (name, value) in metrics.into_iter().flatten() {
+            let place = metric::place_of(&name).ok_or_else(|| unknown_metric(&name))?;
+            values[place] = value;
+        }
         inner.training = TrainingStatus {
             episode: episode.unwrap_or(old.episode),
             env_steps: env_steps.unwrap_or(old.env_steps),
@@ -293,8 +302,7 @@ impl Attachment {
                 Some(reward) if old.best_reward == 0.0 || reward > old.best_reward => reward,
                 _ => old.best_reward,
             },
-            error_m: error_m.unwrap_or(old.error_m),
-            raw_gnss_error_m: raw_gnss_error_m.unwrap_or(old.raw_gnss_error_m),
+            metrics: values,
         };
         inner.session.board().set_training(inner.training);
         Ok(())
@@ -372,6 +380,11 @@ impl Attachment {
         }
         Ok(blocks)
     }
+}
+
+fn unknown_metric(name: &str) -> PyErr {
+    let known: Vec<&str> = METRICS.iter().map(|metric| metric.name).collect();
+    PyValueError::new_err(format!("no metric is called {name:?}; there are: {}", known.join(", ")))
 }
 
 /// The header of an answer to `question`: our identity, its episode, tick, time and count.
@@ -542,8 +555,10 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Lease>()?;
     module.add_class::<SectionView>()?;
     module.add_class::<PointCloud>()?;
+    module.add_class::<Metric>()?;
     module.add_function(wrap_pyfunction!(id_hash, module)?)?;
     module.add_function(wrap_pyfunction!(observation_size, module)?)?;
+    module.add("METRICS", PyTuple::new(module.py(), METRICS.iter().map(Metric::of))?)?;
     module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
     module.add("VALID", ipc_schema::observation::VALID)?;
     module.add("TERMINATED", ipc_schema::observation::TERMINATED)?;

@@ -58,7 +58,8 @@ def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
     assert channel.consumed_up_to == 139
     assert channel.committed_up_to == 20 + 6 * 16 - 1
     assert set(channel.predictions) == set(range(140))
-    assert {"episode", "env_steps", "env_steps_per_s", "policy_std", "reward", "error_m"} < set(channel.reports[0])
+    assert {"episode", "env_steps", "env_steps_per_s", "policy_std", "reward", "metrics"} < set(channel.reports[0])
+    assert set(channel.reports[0]["metrics"]) == {"error_m", "raw_gnss_error_m"}
     for name in ("error.png", "sigma.png"):
         assert (tmp_path / "plots" / name).read_bytes().startswith(PNG)
     assert list((tmp_path / "tensorboard").glob("events*"))

@@ -63,7 +63,14 @@ STATUS = {
     "ticks_per_s": 50.0,
     "real_time_factor": 5.0,
     "road_users": {"cav": 4, "other": 1, "person": 0, "hero": 1},
-    "training": {"updates": 3, "policy_std": 0.5, "reward": 0.25, "best_reward": 0.75, "env_steps_per_s": 1234.0},
+    "training": {
+        "updates": 3,
+        "policy_std": 0.5,
+        "reward": 0.25,
+        "best_reward": 0.75,
+        "env_steps_per_s": 1234.0,
+        "metrics": [{"name": "progress_mps", "label": "progress", "unit": "m/s", "value": 8.25}],
+    },
 }
 
 Drawing = tuple[Scene, dict[str, recordings.Entity]]
@@ -241,7 +248,15 @@ def test_the_status_is_plotted_and_in_the_hud(drawn: Drawn) -> None:
     for path, value in ((plots.STD, 0.5), (plots.REWARD, 0.25), (plots.STEPS, 250.0), (plots.REAL_TIME, 5.0)):
         near(found[path], "Scalars:scalars", [value])
     text = found[scene.HUD].newest("TextDocument:text")[0]
-    for part in ("a run", "train", "0.750 best", "1 234 samples/s", "5.0 × real time", "1 obstacles"):
+    for part in (
+        "a run",
+        "train",
+        "0.750 best",
+        "8.25 m/s in the newest update",
+        "1 234 samples/s",
+        "5.0 × real time",
+        "1 obstacles",
+    ):
         assert part in text
 
 

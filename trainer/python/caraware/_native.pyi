@@ -5,7 +5,7 @@ ends in `_s` and in nanoseconds where it ends in `_ns`. A failure of the run rai
 range ValueError.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import final
 
 from torch import Tensor
@@ -19,6 +19,7 @@ __all__ = [
     "IMU",
     "IMU_COLUMNS",
     "LIDAR",
+    "METRICS",
     "SCHEMA_VERSION",
     "SPEED_STEERING",
     "TERMINATED",
@@ -27,6 +28,7 @@ __all__ = [
     "VALID",
     "Attachment",
     "Lease",
+    "Metric",
     "ObservationBlock",
     "PointCloud",
     "SectionView",
@@ -36,6 +38,9 @@ __all__ = [
 
 SCHEMA_VERSION: int
 """Version of the layouts in shared memory; every process of a run has the same."""
+
+METRICS: tuple[Metric, ...]
+"""Every metric of every task, in the order of the board."""
 
 VALID: int
 """Bit of `flags`: the slot holds a vehicle whose sensors have all delivered."""
@@ -158,10 +163,12 @@ class Attachment:
         env_steps_per_s: float | None = None,
         policy_std: float | None = None,
         reward: float | None = None,
-        error_m: float | None = None,
-        raw_gnss_error_m: float | None = None,
+        metrics: Mapping[str, float] | None = None,
     ) -> None:
-        """Publish the progress of training on the trainer's board; a value that is left out keeps its last one."""
+        """Publish the progress of training on the trainer's board; a value that is left out keeps its last one.
+
+        `metrics` are values by the names of `METRICS`. Raises ValueError for another name.
+        """
 
 @final
 class ObservationBlock:
@@ -271,6 +278,34 @@ class Lease:
     @property
     def places(self) -> int:
         """Number of tensors made: one for each place in shared memory that a message has lain in."""
+
+@final
+class Metric:
+    """A row of `METRICS`: a number that a task measures."""
+
+    @property
+    def name(self) -> str:
+        """Name, which ends in its unit: the key in reports, logs and plots."""
+
+    @property
+    def label(self) -> str:
+        """Name for people."""
+
+    @property
+    def unit(self) -> str:
+        """Unit for people."""
+
+    @property
+    def higher_is_better(self) -> bool:
+        """True if larger values are better, as of progress; false as of an error."""
+
+    @property
+    def task(self) -> str:
+        """`task.kind` of the task that measures it."""
+
+    @property
+    def reference_for(self) -> str | None:
+        """Name of the policy's metric that this one is a reference for; None if it is the policy's own."""
 
 @final
 class PointCloud:

@@ -213,8 +213,7 @@ class FusionLoop:
             env_steps_per_s=rate,
             policy_std=0.0,
             reward=reward,
-            error_m=error_m,
-            raw_gnss_error_m=raw_m,
+            metrics={"error_m": error_m, "raw_gnss_error_m": raw_m},
             updates=self._learner.updates,
         )
 

@@ -1,6 +1,6 @@
 """What the trainer needs of a stream of observations; `caraware.ipc.channel` provides it over shared memory."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, TypedDict, Unpack
 
 from torch import Tensor
@@ -119,8 +119,8 @@ class TrainingReport(TypedDict, total=False):
     env_steps_per_s: float
     policy_std: float
     reward: float
-    error_m: float
-    raw_gnss_error_m: float
+    metrics: Mapping[str, float]
+    """Values by the names of `caraware._native.METRICS`; those that are left out keep their last value."""
 
 
 class Channel(Protocol):

@@ -366,8 +366,7 @@ class TrainingLoop:
             env_steps_per_s=rate,
             policy_std=stats.sigma,
             reward=stats.reward_mean,
-            error_m=error_m,
-            raw_gnss_error_m=raw_gnss_error_m,
+            metrics={"error_m": error_m, "raw_gnss_error_m": raw_gnss_error_m},
             updates=self._updates(),
         )
 

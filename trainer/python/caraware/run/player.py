@@ -197,8 +197,7 @@ class PlayLoop:
             env_steps=tally.sums.samples,
             updates=self._learner.ppo.updates,
             policy_std=self._learner.ppo.sigma(),
-            error_m=mean("ppo") or math.nan,
-            raw_gnss_error_m=mean("raw_gnss") or math.nan,
+            metrics={"error_m": mean("ppo") or math.nan, "raw_gnss_error_m": mean("raw_gnss") or math.nan},
         )
 
     def _write_part(self) -> None:

@@ -1,0 +1,183 @@
+//! Metrics of the tasks by name: what a trainer measures, in which unit, and which way is better.
+//!
+//! A trainer reports the metrics of its task on its board; the progress line, `caraware ps`, the fan-out's status, the HUD and
+//! the native extension derive theirs from [`METRICS`]. A new metric is a row here and a value that the task measures.
+
+use crate::config::TaskKind;
+
+/// Which values of a metric are better.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MetricDirection {
+    /// Smaller ones, as of an error.
+    LowerIsBetter,
+    /// Larger ones, as of progress.
+    HigherIsBetter,
+}
+
+/// A metric.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MetricSpec {
+    /// Name, which ends in its unit: the key in reports, logs and plots.
+    pub name: &'static str,
+    /// Name for people.
+    pub label: &'static str,
+    /// Unit for people.
+    pub unit: &'static str,
+    /// Which values are better.
+    pub direction: MetricDirection,
+    /// The task that measures it.
+    pub task: TaskKind,
+    /// The metric of the policy that this one is a reference for, measured without the policy on the same samples.
+    pub reference_for: Option<&'static str>,
+}
+
+impl MetricSpec {
+    /// Key of an estimator's mean in a report, such as `ppo_mean_error_m`.
+    #[must_use]
+    pub fn mean_key(&self, estimator: &str) -> String {
+        format!("{estimator}_mean_{}", self.name)
+    }
+
+    /// Key of half the 95 % confidence interval of that mean, such as `ppo_ci95_m`.
+    #[must_use]
+    pub fn interval_key(&self, estimator: &str) -> String {
+        let unit = self.name.rsplit('_').next().unwrap_or(self.name);
+        format!("{estimator}_ci95_{unit}")
+    }
+}
+
+/// Every metric; the first of a task is its headline. Its place here is its place in [`MetricValues`].
+pub const METRICS: [MetricSpec; 4] = [
+    MetricSpec {
+        name: "error_m",
+        label: "error",
+        unit: "m",
+        direction: MetricDirection::LowerIsBetter,
+        task: TaskKind::Localisation,
+        reference_for: None,
+    },
+    MetricSpec {
+        name: "raw_gnss_error_m",
+        label: "raw GNSS",
+        unit: "m",
+        direction: MetricDirection::LowerIsBetter,
+        task: TaskKind::Localisation,
+        reference_for: Some("error_m"),
+    },
+    MetricSpec {
+        name: "progress_mps",
+        label: "progress",
+        unit: "m/s",
+        direction: MetricDirection::HigherIsBetter,
+        task: TaskKind::Driving,
+        reference_for: None,
+    },
+    MetricSpec {
+        name: "route_offset_m",
+        label: "beside the route",
+        unit: "m",
+        direction: MetricDirection::LowerIsBetter,
+        task: TaskKind::Driving,
+        reference_for: None,
+    },
+];
+
+/// Values that a board has room for.
+pub const METRIC_CAPACITY: usize = 8;
+const _: () = assert!(
+    METRICS.len() <= METRIC_CAPACITY,
+    "a board has room for METRIC_CAPACITY metrics"
+);
+
+/// The value of each metric, in the order of [`METRICS`]; not-a-number where it is not measured.
+pub type MetricValues = [f64; METRIC_CAPACITY];
+
+/// Nothing is measured.
+pub const NOT_MEASURED: MetricValues = [f64::NAN; METRIC_CAPACITY];
+
+/// The metrics that are measured, with their values.
+pub fn measured(values: &MetricValues) -> impl Iterator<Item = (&'static MetricSpec, f64)> {
+    METRICS.iter().zip(*values).filter(|(_, value)| value.is_finite())
+}
+
+/// The metric that a task is judged by.
+#[must_use]
+pub fn headline(task: TaskKind) -> &'static MetricSpec {
+    match task {
+        TaskKind::Localisation => &METRICS[0],
+        TaskKind::Driving => &METRICS[2],
+    }
+}
+
+/// Place of the metric called `name`.
+#[must_use]
+pub fn place_of(name: &str) -> Option<usize> {
+    METRICS.iter().position(|metric| metric.name == name)
+}
+
+/// All measured metrics in a line, such as `error 3.20 m (raw GNSS 4.10 m)`; empty if nothing is measured.
+#[must_use]
+pub fn summary(values: &MetricValues) -> String {
+    let text = |metric: &MetricSpec, value: f64| format!("{} {value:.2} {}", metric.label, metric.unit);
+    let of_policy = measured(values).filter(|(metric, _)| metric.reference_for.is_none());
+    let with_references = of_policy.map(|(metric, value)| {
+        let references: Vec<String> = measured(values)
+            .filter(|(other, _)| other.reference_for == Some(metric.name))
+            .map(|(other, value)| text(other, value))
+            .collect();
+        if references.is_empty() {
+            text(metric, value)
+        } else {
+            format!("{} ({})", text(metric, value), references.join(", "))
+        }
+    });
+    with_references.collect::<Vec<_>>().join("  ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_unique_and_end_in_their_unit() {
+        for (place, metric) in METRICS.iter().enumerate() {
+            assert_eq!(place_of(metric.name), Some(place), "{}", metric.name);
+            let unit = metric.unit.replace('/', "p");
+            assert!(metric.name.ends_with(&format!("_{unit}")), "{}", metric.name);
+        }
+    }
+
+    #[test]
+    fn the_headline_is_the_first_metric_of_its_task() {
+        for task in [TaskKind::Localisation, TaskKind::Driving] {
+            let first = METRICS.iter().find(|metric| metric.task == task).unwrap();
+            assert_eq!(headline(task), first);
+        }
+        let error = headline(TaskKind::Localisation);
+        assert_eq!(error.mean_key("ppo"), "ppo_mean_error_m");
+        assert_eq!(error.interval_key("raw_gnss"), "raw_gnss_ci95_m");
+    }
+
+    #[test]
+    fn a_reference_is_for_a_metric_of_the_policy_in_the_same_task() {
+        for metric in METRICS {
+            let Some(name) = metric.reference_for else { continue };
+            let of_policy = METRICS[place_of(name).unwrap()];
+            assert_eq!((of_policy.reference_for, of_policy.task), (None, metric.task));
+            assert_eq!((of_policy.unit, of_policy.direction), (metric.unit, metric.direction));
+        }
+    }
+
+    #[test]
+    fn a_summary_has_references_in_brackets_and_leaves_out_what_is_not_measured() {
+        let mut values = NOT_MEASURED;
+        assert_eq!(summary(&values), "");
+        values[0] = 3.2;
+        assert_eq!(summary(&values), "error 3.20 m");
+        values[1] = 4.1;
+        assert_eq!(summary(&values), "error 3.20 m (raw GNSS 4.10 m)");
+        let mut values = NOT_MEASURED;
+        (values[2], values[3]) = (5.0, 0.25);
+        assert_eq!(summary(&values), "progress 5.00 m/s  beside the route 0.25 m");
+    }
+}

@@ -1,0 +1,40 @@
+//! The table of metrics for Python, which names its tasks' metrics by it.
+
+use ipc_schema::{
+    config::TaskKind,
+    metric::{MetricDirection, MetricSpec},
+};
+use pyo3::prelude::*;
+
+/// A row of `METRICS`.
+#[pyclass(frozen, get_all, module = "caraware._native")]
+pub(crate) struct Metric {
+    /// Name, which ends in its unit: the key in reports, logs and plots.
+    name: &'static str,
+    /// Name for people.
+    label: &'static str,
+    /// Unit for people.
+    unit: &'static str,
+    /// True if larger values are better, as of progress; false as of an error.
+    higher_is_better: bool,
+    /// `task.kind` of the task that measures it.
+    task: &'static str,
+    /// Name of the policy's metric that this one is a reference for, measured without the policy on the same samples.
+    reference_for: Option<&'static str>,
+}
+
+impl Metric {
+    pub(crate) fn of(spec: &MetricSpec) -> Self {
+        Self {
+            name: spec.name,
+            label: spec.label,
+            unit: spec.unit,
+            higher_is_better: spec.direction == MetricDirection::HigherIsBetter,
+            task: match spec.task {
+                TaskKind::Localisation => "localisation",
+                TaskKind::Driving => "driving",
+            },
+            reference_for: spec.reference_for,
+        }
+    }
+}
