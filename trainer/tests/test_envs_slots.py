@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 from caraware.envs import CarAwareEnv, CarAwareParallelEnv, CarAwareVecEnv, CarAwareVectorEnv, RunEndedError, Transition
-from caraware.envs.fields import Fields, UnknownFieldError
 from caraware.envs.slots import RUN_ON_TICKS
 from caraware.ipc.names import Names
 from caraware.ipc.stream import EMPTY_SLOT
+from caraware.tasks.fields import Fields, UnknownFieldError
 from synthetic import SyntheticChannel, SyntheticObservation
 
 E = EMPTY_SLOT
@@ -27,7 +27,7 @@ def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: i
         "episode": {"ticks": episode_ticks},
         "observation": observation | {"steering_range_rad": 10.0},
         "gnss": {},
-        "trainer": {},
+        "trainer": {"reward": "bounded_inverse", "reward_scale_m": 5.0},
     }
     return {
         "run_dir": run_dir,
@@ -368,24 +368,24 @@ def test_names_of_the_population_and_of_named_heroes_are_found_and_others_shown_
 
 def test_the_driving_reward_tells_arrival_from_other_ends_and_a_time_limit_from_both() -> None:
     from caraware.envs import rewards
-    from caraware.envs.task import Task
+    from caraware.envs.settings import FaceSettings
     from caraware.envs.transition import Rows
 
     run = run_file("", 5, drives=True)
     run["config"]["observation"]["fields"] = ["route_left", "route_offset"]
-    task = Task.from_run(run)
+    settings = FaceSettings.from_run(run)
 
     def rows(left_m: list[float], offset_m: list[float]) -> Rows:
         observation = np.stack((np.array(left_m) / 500 - 1, np.array(offset_m) / 5), 1).astype(np.float32)
         truth = np.tile(np.array([0, 0, 0, 8.0], np.float32), (5, 1))
-        return Rows(task, observation, truth, truth[:, :2])
+        return Rows(settings, observation, truth, truth[:, :2])
 
     # On its way, arrived, crashed, out of time, and too far from its end for the range of `route_left`.
     before, after = rows([100, 4, 50, 50, 1000], [0] * 5), rows([99, 4, 50, 50, 1000], [2.5, 0, 0, 0, 0])
     terminated, truncated = np.array([0, 1, 1, 0, 0], bool), np.array([0, 0, 0, 1, 0], bool)
     ids = np.zeros(5, np.uint64)
     fields = (before.observation, before.truth, before.gnss_m, np.ones(5, bool), ids, ids, terminated, truncated)
-    reward = rewards.driving(Transition(task, *fields, after), np.zeros((5, 2)))
+    reward = rewards.of_task(settings.task)(Transition(settings, *fields, after), np.zeros((5, 2)))
     # 1 m of way and 2.5 m beside the line; 8 m/s for 0.1 s. Steps of 1000 m / 2²⁴ are 0.06 mm.
     assert reward.tolist() == pytest.approx([0.1 - 0.05, 10, -10, 0, 0.08], abs=1e-4)
 

@@ -31,8 +31,8 @@ class CarAwareParallelEnv(ParallelEnv):  # type: ignore[misc]  # pettingzoo has 
         self.agents: list[str] = []
         self.possible_agents: list[str] = []
         self._names = Names(self.slots.source.channel.run)
-        self._observation_space = self.slots.task.observation_space()
-        self._action_space = self.slots.task.action_space()
+        self._observation_space = self.slots.settings.observation_space()
+        self._action_space = self.slots.settings.action_space()
         self._slot_of: dict[str, int] = {}
         self._between = False
 
@@ -63,7 +63,7 @@ class CarAwareParallelEnv(ParallelEnv):  # type: ignore[misc]  # pettingzoo has 
         if not self.agents:
             return {}, {}, {}, {}, {}
         before, acting = self.slots.now, self._slot_of
-        table = np.zeros((self.slots.count, 2), np.float32)
+        table = np.zeros((self.slots.count, self.slots.task.actions.size), np.float32)
         for agent, action in actions.items():
             table[acting[agent]] = action
         transition, reward = self.slots.step(table)

@@ -32,11 +32,11 @@ class CarAwareVecEnv(VecEnv):
         evaluation_policy: Policy | None = None,
     ) -> None:
         self.slots = Slots(source, num_envs, reward, evaluation_policy)
-        task = self.slots.task
+        settings = self.slots.settings
         self.render_mode = None
         self._returns = np.zeros(self.slots.count)
         self._lengths = np.zeros(self.slots.count, np.int64)
-        super().__init__(self.slots.count, task.observation_space(), task.action_space())
+        super().__init__(self.slots.count, settings.observation_space(), settings.action_space())
 
     def reset(self) -> Float32Array:
         """First observation `[N, d]`; the seed is the first of those that `seed()` set."""

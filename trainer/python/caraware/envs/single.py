@@ -26,10 +26,10 @@ class CarAwareEnv(gymnasium.Env):
         self.slots = Slots(source, None if slot == 0 else slot + 1, reward)
         self.metadata = {"render_modes": []}
         self.render_mode = None
-        self.observation_space = self.slots.task.observation_space()
-        self.action_space = self.slots.task.action_space()
+        self.observation_space = self.slots.settings.observation_space()
+        self.action_space = self.slots.settings.action_space()
         self._slot, self._names = slot, Names(self.slots.source.channel.run)
-        self._actions = np.zeros((self.slots.count, 2), np.float32)
+        self._actions = np.zeros((self.slots.count, self.slots.task.actions.size), np.float32)
         self._ended = False
 
     def reset(

@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 
 from caraware import _native
 from caraware.envs import rewards
-from caraware.envs.task import Task
+from caraware.envs.settings import FaceSettings
 from caraware.envs.transition import Rows, Transition
 from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Scalar, UInt32Array, UInt64Array
 from caraware.ipc.channel import StreamEndedError
 from caraware.ipc.stream import EMPTY_SLOT, Channel, Observation
+from caraware.tasks.contract import Sampling
 
 log = logging.getLogger(__name__)
 
@@ -144,19 +145,25 @@ class Slots:
         evaluation_policy: Policy | None = None,
     ) -> None:
         self.source: Source = source if hasattr(source, "can_restart") else GivenChannel(source)  # type: ignore[assignment]
-        self.task = Task.from_run(self.source.channel.run)
-        wanted = num_envs or self.task.slots
+        self.settings = FaceSettings.from_run(self.source.channel.run)
+        self.task = self.settings.task
+        wanted = num_envs or self.settings.slots
         if not wanted:
             raise ValueError("a scenario does not say how many vehicles sense at a time: give num_envs")
         self.count = int(wanted)
-        self._reward = reward or rewards.default(self.task)
+        self._reward = reward or rewards.of_task(self.task)
         self._evaluation_policy, self._evaluation = evaluation_policy, _Errors()
         self._raw_evaluation = _Errors()
-        self._idle = np.zeros((self.count, 2), np.float32)
+        self._idle = np.zeros((self.count, self.task.actions.size), np.float32)
         self._runs, self._answered = 0, -1
         self._untouched, self._stepped, self._told_narrow = True, True, False
         self._now: Tick | None = None
         self._env_steps, self._reported = 0, (time.monotonic(), 0)
+
+    @property
+    def _world_waits(self) -> bool:
+        """The simulation waits for the action of every tick."""
+        return self.task.sampling is Sampling.EACH_TICK
 
     @property
     def now(self) -> Tick:
@@ -237,8 +244,10 @@ class Slots:
 
     def _checked(self, action: Float32Array) -> Float32Array:
         action = np.asarray(action, np.float32)
-        if action.shape != (self.count, 2):
-            raise ValueError(f"actions of shape {action.shape}, {self.count} slots take ({self.count}, 2)")
+        if action.shape != (self.count, self.task.actions.size):
+            raise ValueError(
+                f"actions of shape {action.shape}, {self.count} slots take ({self.count}, {self.task.actions.size})"
+            )
         return action
 
     def _refuse_end(self) -> None:
@@ -256,7 +265,7 @@ class Slots:
         return tick
 
     def _ticks_left(self, tick: Tick) -> float:
-        return self.task.episode_ticks - tick.sim_time_ns / (self.task.tick_s * 1e9)
+        return self.settings.episode_ticks - tick.sim_time_ns / (self.settings.tick_s * 1e9)
 
     def _restart(self) -> None:
         self.source.restart()
@@ -285,14 +294,14 @@ class Slots:
     def _evaluate(self, tick: Tick) -> None:
         """Answers a tick of an evaluation, which nobody learns from."""
         if self._evaluation_policy is None:
-            self._answer(self._idle, publish=self.task.drives)
+            self._answer(self._idle, publish=self._world_waits)
             return
         if self._evaluation.episode is None or tick.episode[1] > self._evaluation.episode + 1:
             self._evaluation, self._raw_evaluation = _Errors(), _Errors()
         action = self._checked(self._evaluation_policy(tick.rows.observation))
         self._answer(action)
-        if not self.task.drives:
-            self._evaluation.add(tick, self.task.to_world_m(action))
+        if not self._world_waits:
+            self._evaluation.add(tick, self.task.answer(torch.from_numpy(action.astype(np.float64))).numpy())
             self._raw_evaluation.add(tick, tick.rows.gnss_m)
 
     def _answer(self, action: Float32Array, *, publish: bool = True) -> None:
@@ -302,12 +311,12 @@ class Slots:
             return
         self.source.current, self._answered = None, obs.tick
         if publish:
-            rows = self.task.answer(action, len(obs.vehicle))
-            if self.task.drives:
+            rows = self.settings.answer(action, len(obs.vehicle))
+            if self._world_waits:
                 channel.publish_actions(obs, rows)
             else:
                 channel.publish_predictions(obs, torch.from_numpy(rows), 0)
-        if obs.last or (obs.tick + 1) % self.task.credit_ticks == 0:
+        if obs.last or (obs.tick + 1) % self.settings.credit_ticks == 0:
             channel.consumed(obs.tick)
             if self.source.can_restart:
                 # Nobody asks for old ticks again: the run does not outlive this process.
@@ -318,10 +327,10 @@ class Slots:
         vehicle = _padded(obs.vehicle, n, EMPTY_SLOT)
         mask = _padded(obs.valid, n) & (vehicle != EMPTY_SLOT)
         observation = _padded(_array(obs, "observation"), n)
-        if self.task.dark_is_nan:
+        if self.settings.dark_is_nan:
             np.nan_to_num(observation, copy=False)
-        if observation.shape[1] != self.task.fields.width:
-            raise ValueError(f"rows of {observation.shape[1]} numbers, the run file tells {self.task.fields.width}")
+        if observation.shape[1] != self.settings.fields.width:
+            raise ValueError(f"rows of {observation.shape[1]} numbers, the run file tells {self.settings.fields.width}")
         truth, gnss_m = _padded(_array(obs, "truth"), n), _padded(_array(obs, "gnss_m")[:, :2], n)
         if not mask.all():
             for rows in (observation, truth, gnss_m):
@@ -334,7 +343,7 @@ class Slots:
             evaluation=obs.evaluation,
             sim_time_ns=obs.sim_time_ns,
             episode=(self._runs, obs.episode),
-            rows=Rows(self.task, observation, truth, gnss_m),
+            rows=Rows(self.settings, observation, truth, gnss_m),
             mask=mask,
             vehicle=vehicle,
             id_hash=_padded(getattr(obs, "id_hash", obs.vehicle).astype(np.uint64), n),
@@ -345,10 +354,10 @@ class Slots:
     def _nobody(self) -> Tick:
         """Beyond the last tick of a run."""
         n, nobody = self.count, np.zeros(self.count, bool)
-        zeros = [np.zeros((n, width), np.float32) for width in (self.task.fields.width, 4, 2)]
+        zeros = [np.zeros((n, width), np.float32) for width in (self.settings.fields.width, 4, 2)]
         vehicle = np.full(n, EMPTY_SLOT, np.uint32)
         ids = np.zeros(n, np.uint64)
-        episode, rows = (self._runs + 1, 0), Rows(self.task, *zeros)
+        episode, rows = (self._runs + 1, 0), Rows(self.settings, *zeros)
         return Tick(True, False, 0, episode, rows, nobody, vehicle, ids, nobody, nobody)
 
     def _transition(self, now: Tick, following: Tick | None) -> Transition:
@@ -361,7 +370,7 @@ class Slots:
             truncated = now.mask & ~terminated & (following.truncated | ~same)
             after = _where(terminated | truncated, now.rows, following.rows)
         return Transition(
-            task=self.task,
+            settings=self.settings,
             observation=now.rows.observation,
             truth=now.rows.truth,
             gnss_m=now.rows.gnss_m,
@@ -432,4 +441,4 @@ def _where(ended: BoolArray, now: Rows, following: Rows) -> Rows:
     if not ended.any():
         return following
     pairs = ((now.observation, following.observation), (now.truth, following.truth), (now.gnss_m, following.gnss_m))
-    return Rows(now.task, *(np.where(ended[:, None], old, new) for old, new in pairs))
+    return Rows(now.settings, *(np.where(ended[:, None], old, new) for old, new in pairs))

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
-from caraware.envs.task import Task
+import numpy as np
+import torch
+
+from caraware.envs.settings import FaceSettings
 from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, UInt32Array, UInt64Array
+from caraware.tasks.contract import TaskOutcome, TaskRows, TaskStep
 
 
 @dataclass(frozen=True)
 class Rows:
     """What all slots are at one tick. Row `i` is slot `i`; rows without a vehicle are zero."""
 
-    task: Task
+    settings: FaceSettings
     observation: Float32Array
     """f32 `[N, d]`, normalised."""
     truth: Float32Array
@@ -22,7 +27,7 @@ class Rows:
 
     def si(self, field: str) -> Float64Array:
         """f64 `[N]`: a field of the observation in SI units, such as `si("leader_gap")`; clipped at its range."""
-        return self.task.fields.si(self.observation, field)
+        return self.settings.fields.si(self.observation, field)
 
 
 @dataclass(frozen=True)
@@ -45,9 +50,22 @@ class Transition(Rows):
     @property
     def tick_s(self) -> float:
         """Time between the two, seconds."""
-        return self.task.tick_s
+        return self.settings.tick_s
 
     def to_world_m(self, action: Float32Array) -> Float64Array:
         """Actions `[N, 2]` of the localisation task as positions in world metres."""
-        position_m: Float64Array = self.task.to_world_m(action)
+        position_m: Float64Array = self.settings.task.answer(torch.from_numpy(action.astype(np.float64))).numpy()
         return position_m
+
+    @cached_property
+    def task_step(self) -> TaskStep:
+        """The same as a task takes it: tensors over the same memory."""
+        return TaskStep(
+            observation=torch.from_numpy(self.observation),
+            truth=torch.from_numpy(self.truth),
+            outcome=TaskOutcome(
+                next=TaskRows(torch.from_numpy(self.next.observation), torch.from_numpy(self.next.truth)),
+                terminated=torch.from_numpy(self.terminated),
+                truncated=torch.from_numpy(self.truncated),
+            ),
+        )

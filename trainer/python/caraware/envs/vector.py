@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from caraware.envs.rewards import Reward, error_m
+from caraware.envs.rewards import Reward, measured
 from caraware.envs.slots import Policy, Slots, Source, Tick
 from caraware.envs.transition import Transition
 from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array
@@ -21,7 +21,7 @@ class CarAwareVectorEnv(VectorEnv):
     `infos["mask"]` (bool `[N]`) tells which slots hold a vehicle. A row without one is zero, earns 0 and its action is
     not used; it is the time before the next trajectory of that slot. Where a trajectory ended, `infos["final_obs"]` has
     its last observation and `infos["final_info"]` what else is known of it. Further keys: `vehicle`, `id_hash`, `truth`
-    of the rows returned, and in the localisation task `error_m` of the actions taken.
+    of the rows returned, and each metric of the task by name, such as `error_m`, of the actions taken.
 
     A `num_envs` other than `traffic.cavs` or the number of heroes takes the first slots only. `evaluation_policy`
     answers the evaluation episodes of a run that `caraware` started; nobody steps or learns from those.
@@ -38,8 +38,8 @@ class CarAwareVectorEnv(VectorEnv):
         self.num_envs = self.slots.count
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
         self.render_mode, self.spec = None, None
-        self.single_observation_space = self.slots.task.observation_space()
-        self.single_action_space = self.slots.task.action_space()
+        self.single_observation_space = self.slots.settings.observation_space()
+        self.single_action_space = self.slots.settings.action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._all = np.ones(self.num_envs, bool)
@@ -66,11 +66,8 @@ class CarAwareVectorEnv(VectorEnv):
         transition, reward = self.slots.step(actions)
         tick = self.slots.now
         infos = self._info(tick)
-        if not self.slots.task.drives:
-            infos |= {
-                "error_m": np.where(transition.mask, error_m(transition, actions), 0.0),
-                "_error_m": transition.mask,
-            }
+        for name, value in measured(transition, np.asarray(actions, np.float32)).items():
+            infos[name], infos[f"_{name}"] = np.where(transition.mask, value, 0.0), transition.mask
         ended = transition.terminated | transition.truncated
         if ended.any():
             infos |= _final(transition, ended)

@@ -134,8 +134,8 @@ def main(steps: int, settings: Settings | None = None, config: str = "town", **c
     torch.set_num_threads(1)  # of two cores the simulation needs one; torch's idle threads would spin on it
     with make(config, changes) as simulation:
         env = CarAwareVectorEnv(simulation)
-        task = env.slots.task
-        agent = Agent(task.fields.width, task.action_space().shape[0])
+        run = env.slots.settings
+        agent = Agent(run.fields.width, run.task.actions.size)
         optimizer = torch.optim.Adam(agent.parameters(), settings.learning_rate)
         observation, infos = env.reset()
         mask = infos["mask"]

@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import HumanOutputFormat, Logger
 
 from caraware.envs import CarAwareVecEnv, RunEndedError, make
 from caraware.ipc.channel import Channel
+from caraware.tasks.contract import Sampling
 
 
 def ppo(env: CarAwareVecEnv, horizon: int = 8192, batch_size: int = 1024) -> PPO:
@@ -27,7 +28,7 @@ def ppo(env: CarAwareVecEnv, horizon: int = 8192, batch_size: int = 1024) -> PPO
         n_steps=max(horizon // env.num_envs, 2),
         batch_size=batch_size,
         n_epochs=4,
-        gamma=0.99 if task.drives else 0.0,
+        gamma=0.99 if task.sampling is Sampling.EACH_TICK else 0.0,
         ent_coef=0.001,
         policy_kwargs={"net_arch": [256, 128]},
         device="cpu",

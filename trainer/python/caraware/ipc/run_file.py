@@ -7,3 +7,11 @@ ConfigTable = dict[str, Any]
 
 RunFile = dict[str, Any]
 """`caraware` has validated it; readers take what they need of it and check its type there (`caraware.run.config`)."""
+
+
+class ConfigError(Exception):
+    """A value in the run file that the trainer cannot use; `help` says what to write instead."""
+
+    def __init__(self, message: str, help: str) -> None:
+        super().__init__(message)
+        self.help = help

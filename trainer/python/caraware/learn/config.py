@@ -4,20 +4,12 @@ import os
 from dataclasses import dataclass, fields
 from typing import Any
 
-from torch import Tensor
-
+from caraware.ipc.run_file import ConfigError as ConfigError
 from caraware.ipc.run_file import ConfigTable, RunFile
+from caraware.tasks.bounds import MapBounds as MapBounds
 
 _KEY_OF_FIELD = {"checkpoint_interval_updates": "checkpoint_interval"}
 """Fields whose name in the configuration file differs (there, the unit stands in the table of keys)."""
-
-
-class ConfigError(Exception):
-    """A value in the run file that the trainer cannot use; `help` says what to write instead."""
-
-    def __init__(self, message: str, help: str) -> None:
-        super().__init__(message)
-        self.help = help
 
 
 @dataclass(frozen=True)
@@ -108,33 +100,6 @@ class TrainerConfig:
     def thread_count(self) -> int:
         """Threads to use, with 0 resolved to the cores this process may run on."""
         return self.threads or len(os.sched_getaffinity(0))
-
-
-@dataclass(frozen=True)
-class MapBounds:
-    """The box of the map in world metres (ENU). Actions in [-1, 1] span it."""
-
-    x_min_m: float
-    y_min_m: float
-    x_max_m: float
-    y_max_m: float
-
-    @classmethod
-    def from_run(cls, run: RunFile) -> "MapBounds":
-        """Read `run["map"]["bounds_m"]` = [x_min, y_min, x_max, y_max]. Raises `ConfigError`."""
-        bounds = run.get("map", {}).get("bounds_m")
-        if not isinstance(bounds, list) or len(bounds) != 4 or not all(isinstance(v, int | float) for v in bounds):
-            raise ConfigError(f"`map.bounds_m` is {bounds}", "four numbers: [x_min, y_min, x_max, y_max] in metres")
-        box = cls(*(float(v) for v in bounds))
-        if not (box.x_min_m < box.x_max_m and box.y_min_m < box.y_max_m):
-            raise ConfigError(f"`map.bounds_m` = {bounds} is an empty box", "[x_min, y_min, x_max, y_max]")
-        return box
-
-    def to_world_m(self, action: Tensor) -> Tensor:
-        """Map actions `[..., 2]` to world metres. Affine and unclipped: ±1 is the edge, beyond it lies outside."""
-        half = action.new_tensor([self.x_max_m - self.x_min_m, self.y_max_m - self.y_min_m]) / 2
-        centre = action.new_tensor([self.x_max_m + self.x_min_m, self.y_max_m + self.y_min_m]) / 2
-        return action * half + centre
 
 
 def _key(field_name: str) -> str:

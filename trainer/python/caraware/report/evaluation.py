@@ -6,13 +6,13 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from caraware.baselines import BaselineErrors, Baselines, SensorNoise
-from caraware.ipc.arrays import Float32Array, Float64Array, FloatArray, Int64Array
+from caraware.ipc.arrays import Float64Array, FloatArray, Int64Array
 from caraware.ipc.stream import Observation
 from caraware.report.statistics import mean_interval
+from caraware.tasks.localisation import errors_m as errors_m
+from caraware.tasks.localisation import raw_errors_m as raw_errors_m
 
 CI95_STANDARD_ERRORS = 1.96
 """Half the width of a 95 % confidence interval of a mean of many, in standard errors."""
@@ -230,27 +230,3 @@ def _pool(phase: Sequence[EvaluationResult]) -> EvaluationResult:
         else:
             values[f"{name}_ci95_m"] = math.hypot(*(s * h for s, h in zip(shares, halves_m, strict=True)))
     return replace(phase[0], samples=samples, episodes=sum(result.episodes for result in phase), **values)
-
-
-def errors_m(obs: Observation, predictions_m: Tensor) -> tuple[Float32Array, Float32Array]:
-    """Distances to the truth `[v]` of predictions `[n, 2]` and of raw GNSS, on the valid rows of a tick."""
-    policy = _distance_m(predictions_m.numpy(), obs.truth.numpy())[obs.valid]
-    return policy, raw_errors_m([obs])[0]
-
-
-def raw_errors_m(ticks: Sequence[Observation]) -> list[Float32Array]:
-    """Distances to the truth `[v]` of raw GNSS, on the valid rows of each of some ticks.
-
-    The same numbers, bit for bit, whichever ticks come together.
-    """
-    truth = torch.cat([obs.truth for obs in ticks]).numpy()
-    errors = _distance_m(torch.cat([obs.gnss_m for obs in ticks]).numpy(), truth)
-    ends = np.cumsum([len(obs.valid) for obs in ticks])[:-1]
-    return [error[obs.valid] for obs, error in zip(ticks, np.split(errors, ends), strict=True)]
-
-
-def _distance_m(position: Float32Array, truth: Float32Array) -> Float32Array:
-    """Horizontal distance `[n]`. Elementwise, so that a row's result does not depend on the rows beside it."""
-    east, north = position[:, 0] - truth[:, 0], position[:, 1] - truth[:, 1]
-    distance_m: Float32Array = np.sqrt(east * east + north * north)
-    return distance_m

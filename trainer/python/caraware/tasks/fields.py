@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from torch import Tensor
 
 from caraware.ipc.arrays import Float32Array, Float64Array
 from caraware.ipc.run_file import RunFile
@@ -38,15 +39,30 @@ class Fields:
         """Numbers in a row."""
         return len(self.names) * self.history
 
+    def has(self, name: str) -> bool:
+        """Whether the observation has field `name`, with a known range."""
+        return name in self.names and name in self._ranges
+
     def si(self, observation: Float32Array, name: str) -> Float64Array:
         """Field `name` of rows `[..., d]` in SI units, `[...]`; of the newest tick. Clipped at the field's range."""
-        if name not in self.names or name not in self._ranges:
+        low, high = self._range(name)
+        unit = (observation[..., self._place(name)].astype(np.float64) - self.low) / (1.0 - self.low)
+        return low + unit * (high - low)
+
+    def si_tensor(self, observation: Tensor, name: str) -> Tensor:
+        """The same of a tensor, f64 `[...]`."""
+        low, high = self._range(name)
+        unit = (observation[..., self._place(name)].double() - self.low) / (1.0 - self.low)
+        return low + unit * (high - low)
+
+    def _place(self, name: str) -> int:
+        return (self.history - 1) * len(self.names) + self.names.index(name)
+
+    def _range(self, name: str) -> tuple[float, float]:
+        if not self.has(name):
             known = ", ".join(field for field in self.names if field in self._ranges)
             raise UnknownFieldError(f"no field {name!r} with a known range in the observation; there are: {known}")
-        low, high = self._ranges[name]
-        place = (self.history - 1) * len(self.names) + self.names.index(name)
-        unit = (observation[..., place].astype(np.float64) - self.low) / (1.0 - self.low)
-        return low + unit * (high - low)
+        return self._ranges[name]
 
 
 def _ranges(run: RunFile) -> dict[str, tuple[float, float]]:

@@ -1,0 +1,93 @@
+"""The paper's task: an action is a predicted position of the vehicle, which earns the more, the closer it is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caraware import _native
+from caraware.ipc.arrays import Float32Array
+from caraware.ipc.run_file import RunFile
+from caraware.ipc.stream import Observation
+from caraware.tasks import rewards
+from caraware.tasks.bounds import MapBounds
+from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskStep, metrics_of
+
+ACTIONS = ActionSpec(names=("x", "y"), low=-1.0, high=1.0, is_clipped=False)
+
+ENDS = (
+    EndReason("arrival", EndKind.TERMINATED),
+    EndReason("removal", EndKind.TERMINATED),
+    EndReason("end of the run's episode", EndKind.TRUNCATED),
+)
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Actions `[..., 2]` are positions in the box of the map: 0 is its middle, ±1 its edge, and beyond lies outside."""
+
+    bounds: MapBounds
+    reward_name: str
+    """A name of `caraware.tasks.rewards.REWARDS`."""
+    reward_scale_m: float
+    name: str = "localisation"
+    actions: ActionSpec = ACTIONS
+    sampling: Sampling = Sampling.WHEN_FULL
+    ends: tuple[EndReason, ...] = ENDS
+    metrics: tuple[_native.Metric, ...] = field(default_factory=lambda: metrics_of("localisation"))
+
+    def __post_init__(self) -> None:
+        """Raises `caraware.tasks.rewards.UnknownReward`."""
+        rewards.by_name(self.reward_name)
+
+    @classmethod
+    def from_run(cls, run: RunFile) -> "Localisation":
+        """Read `map.bounds_m` and the reward. Raises `ConfigError` and `UnknownReward`."""
+        trainer = run["config"]["trainer"]
+        return cls(MapBounds.from_run(run), trainer["reward"], float(trainer["reward_scale_m"]))
+
+    def answer(self, action: Tensor) -> Tensor:
+        """Positions `[..., 2]` (m, world)."""
+        return self.bounds.to_world_m(action)
+
+    def reward(self, step: TaskStep, action: Tensor) -> Tensor:
+        """The named reward of the distance to the truth; see `Task.reward`."""
+        return rewards.by_name(self.reward_name)(self.error_m(action, step.truth), self.reward_scale_m)
+
+    def measure(self, step: TaskStep, action: Tensor) -> dict[str, Tensor]:
+        """`error_m`: distance of the position to the truth (m)."""
+        return {"error_m": self.error_m(action, step.truth)}
+
+    def measure_references(self, ticks: Sequence[Observation]) -> dict[str, list[Float32Array]]:
+        """`raw_gnss_error_m`: distance of the raw GNSS fix to the truth (m)."""
+        return {"raw_gnss_error_m": raw_errors_m(ticks)}
+
+    def error_m(self, action: Tensor, truth: Tensor) -> Tensor:
+        """Distances `[...]` of the positions of actions `[..., 2]` to the truth `[n, 4]` (m)."""
+        return rewards.distance_m(self.answer(action), truth if action.ndim == truth.ndim else truth.unsqueeze(1))
+
+
+def errors_m(obs: Observation, predictions_m: Tensor) -> tuple[Float32Array, Float32Array]:
+    """Distances to the truth `[v]` of predictions `[n, 2]` and of raw GNSS, on the valid rows of a tick."""
+    policy = _distance_m(predictions_m.numpy(), obs.truth.numpy())[obs.valid]
+    return policy, raw_errors_m([obs])[0]
+
+
+def raw_errors_m(ticks: Sequence[Observation]) -> list[Float32Array]:
+    """Distances to the truth `[v]` of raw GNSS, on the valid rows of each of some ticks.
+
+    The same numbers, bit for bit, whichever ticks come together.
+    """
+    truth = torch.cat([obs.truth for obs in ticks]).numpy()
+    errors = _distance_m(torch.cat([obs.gnss_m for obs in ticks]).numpy(), truth)
+    ends = np.cumsum([len(obs.valid) for obs in ticks])[:-1]
+    return [error[obs.valid] for obs, error in zip(ticks, np.split(errors, ends), strict=True)]
+
+
+def _distance_m(position: Float32Array, truth: Float32Array) -> Float32Array:
+    """Horizontal distance `[n]`. Elementwise, so that a row's result does not depend on the rows beside it."""
+    east, north = position[:, 0] - truth[:, 0], position[:, 1] - truth[:, 1]
+    distance_m: Float32Array = np.sqrt(east * east + north * north)
+    return distance_m

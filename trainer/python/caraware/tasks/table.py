@@ -1,0 +1,22 @@
+"""The tasks by name: a new task is a row here and a file beside it (docs/extending.md)."""
+
+from collections.abc import Callable, Mapping
+
+from caraware.ipc.run_file import ConfigError, RunFile
+from caraware.tasks.contract import Task
+from caraware.tasks.driving import Driving
+from caraware.tasks.localisation import Localisation
+
+TASKS: Mapping[str, Callable[[RunFile], Task]] = {
+    "localisation": Localisation.from_run,
+    "driving": Driving.from_run,
+}
+"""By `task.kind`: reads the task of a run out of its run file."""
+
+
+def task_of_run(run: RunFile) -> Task:
+    """The task that the run file names. Raises `ConfigError` where there is none of that name."""
+    kind = run["config"]["task"]["kind"]
+    if kind not in TASKS:
+        raise ConfigError(f"no task is called {kind!r}", f"`task.kind` is one of: {', '.join(TASKS)}")
+    return TASKS[kind](run)
