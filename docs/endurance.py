@@ -15,7 +15,9 @@ import signal
 import subprocess
 import tempfile
 import time
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 CARAWARE = Path(__file__).parents[1] / "target" / "release" / "caraware"
 SETTINGS = {
@@ -64,12 +66,22 @@ def newest(run: Path) -> str:
     return latest.read_text() if latest.exists() else ""
 
 
-def disturb(run: Path, process: subprocess.Popen, disturbances: list[str], rng: random.Random) -> dict:
+@dataclass
+class Disturbances:
+    """How often a run was disturbed."""
+
+    handovers: int = 0
+    refused: int = 0
+    kills: int = 0
+    handovers_s: list[float] = field(default_factory=list)
+
+
+def disturb(run: Path, process: subprocess.Popen[bytes], disturbances: list[str], rng: random.Random) -> Disturbances:
     """Hands over and kills at random moments until all is done or the run is over.
 
     Waits for a new checkpoint between two disturbances: five deaths in a row without one end the run, by design.
     """
-    done = {"handovers": 0, "refused": 0, "kills": 0, "handovers_s": []}
+    done = Disturbances()
     before = ""
     for disturbance in disturbances:
         while process.poll() is None and newest(run) == before:
@@ -82,11 +94,14 @@ def disturb(run: Path, process: subprocess.Popen, disturbances: list[str], rng: 
             answer = subprocess.run(
                 [CARAWARE, "swap", run.name], cwd=run.parents[1], capture_output=True, text=True, check=False
             )
-            done["handovers" if answer.returncode == 0 else "refused"] += 1
-            done["handovers_s"] += [float(answer.stdout.split()[-2])] if answer.returncode == 0 else []
+            if answer.returncode == 0:
+                done.handovers += 1
+                done.handovers_s.append(float(answer.stdout.split()[-2]))
+            else:
+                done.refused += 1
         elif (pid := trainer_pid(run)) is not None:
             os.kill(pid, signal.SIGKILL)
-            done["kills"] += 1
+            done.kills += 1
     return done
 
 
@@ -104,7 +119,7 @@ def main() -> int:
     rng.shuffle(disturbances)
     with tempfile.TemporaryDirectory(prefix="endure") as directory:
         os.environ["CARAWARE_RUNTIME_DIR"] = f"{directory}/r"
-        silent = {"cwd": directory, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        silent: dict[str, Any] = {"cwd": directory, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         pace = f"--set=run.real_time_factor={arguments.pace}"
         process = subprocess.Popen(command("disturbed", arguments.episodes, pace), **silent)
         run = Path(directory, "runs", "disturbed")
@@ -113,7 +128,7 @@ def main() -> int:
         subprocess.run(command("undisturbed", arguments.episodes), check=True, **silent)
         reports = [json.loads((run.parent / n / "report.json").read_text()) for n in ("disturbed", "undisturbed")]
         result = {
-            **done,
+            **asdict(done),
             "exit_code": code,
             "ticks": reports[0]["ticks"],
             "lost_ticks": reports[0]["lost_ticks"],

@@ -13,6 +13,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
 
 HERE = Path(__file__).parent
 COLOUR = {"kinematic": "tab:gray", "dynamic": "tab:blue", "rigid_body": "tab:orange"}
@@ -32,7 +33,7 @@ def read(path: str) -> dict[str, Rows]:
     return figures
 
 
-def lines(axis, rows: Rows, x: str, y: str, scale: float = 1.0, surfaces: tuple[str, ...] = ("dry",)) -> None:
+def lines(axis: Axes, rows: Rows, x: str, y: str, scale: float = 1.0, surfaces: tuple[str, ...] = ("dry",)) -> None:
     """One line for each model and surface; the kinematic model knows no surface."""
     for (model, surface), columns in rows.items():
         if surface not in surfaces or (model == "kinematic" and surface != "dry"):

@@ -10,7 +10,7 @@ DATA = Path(__file__).parent / "data"
 SCRIPT = runpy.run_path(str(DATA / "commonroad_st.py"))
 
 
-def test_trajectories():
+def test_trajectories() -> None:
     header, *lines = (DATA / "commonroad_st.csv").read_text(encoding="utf-8").splitlines()
     assert header.split(",") == SCRIPT["COLUMNS"]
     committed = np.array([line.split(",") for line in lines], dtype=float)
@@ -18,12 +18,12 @@ def test_trajectories():
     np.testing.assert_allclose(committed, SCRIPT["rows"](), rtol=1e-8, atol=1e-8)
 
 
-def test_parameters():
+def test_parameters() -> None:
     committed = json.loads((DATA / "commonroad_st.json").read_text(encoding="utf-8"))
     assert committed == SCRIPT["parameters"]()
 
 
-def test_lateral_acceleration_is_the_stated_one():
+def test_lateral_acceleration_is_the_stated_one() -> None:
     rows = SCRIPT["rows"]()
     for speed_mps, peak_mps2 in {5.0: 1.5, 15.0: 2.0, 30.0: 2.0}.items():
         mine = rows[rows[:, 0] == speed_mps]

@@ -6,20 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pymap3d
+from numpy.typing import NDArray
 from pyproj import Proj, Transformer
 
 DATA = Path(__file__).parent / "data"
 SCRIPT = runpy.run_path(str(DATA / "geodesy.py"))
 
 
-def committed():
+def committed() -> tuple[list[str], NDArray[np.float64]]:
     with open(DATA / "geodesy.csv", newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)
     assert header == SCRIPT["COLUMNS"]
     return [row[0] for row in rows], np.array([row[1:] for row in rows], dtype=float)
 
 
-def test_the_table_is_what_the_script_makes():
+def test_the_table_is_what_the_script_makes() -> None:
     names, numbers = committed()
     fresh = SCRIPT["rows"]()
     assert names == [row[0] for row in fresh]
@@ -28,7 +29,7 @@ def test_the_table_is_what_the_script_makes():
     assert (difference[:, 6:] < 1e-6).all(), "metres"
 
 
-def test_both_packages_have_the_same_earth():
+def test_both_packages_have_the_same_earth() -> None:
     """Earth-centred positions by PROJ's geocentric conversion and by pymap3d's, at heights from -100 m to 10 km."""
     _, numbers = committed()
     lat, lon = numbers[:, 4], numbers[:, 5]
@@ -42,7 +43,7 @@ def test_both_packages_have_the_same_earth():
         np.testing.assert_allclose(back[2], height_m, rtol=0, atol=1e-6)
 
 
-def test_there_and_back_over_50_km_square_within_a_millimetre():
+def test_there_and_back_over_50_km_square_within_a_millimetre() -> None:
     """Net coordinates -> latitude and longitude -> east, north, up -> latitude and longitude -> net coordinates."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-25e3, 25e3, 101), np.linspace(-25e3, 25e3, 101)))
     for definition, (offset_x, offset_y) in SCRIPT["NETS"].items():

@@ -125,7 +125,7 @@ def measure(kind: str, sizes: list[int]) -> dict[int, list[int]]:
                 STAMP.pack_into(message, 0, time.monotonic_ns())
                 send(message)
                 answer.recv_bytes()
-        latencies = answer.recv()
+        latencies: dict[int, list[int]] = answer.recv()
         process.join()
     return latencies
 

@@ -6,6 +6,7 @@ The input is a list of reports (`bench/src/report.rs`); every curve becomes `DIR
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -13,7 +14,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
-def draw(curve: dict, path: Path) -> None:
+def draw(curve: dict[str, Any], path: Path) -> None:
     """Draws one curve (`name`, `title`, `x`, `y`, `logarithmic`, `lines`) into a PNG file."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     for line in curve["lines"]:

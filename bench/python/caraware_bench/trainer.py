@@ -12,18 +12,24 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.distributions import Normal
 
+from caraware.ipc.arrays import BoolArray, Float32Array, UInt32Array
 from caraware.learn.batch import Batch
 from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.ppo import Ppo
 from caraware.learn.rollout import Rollout
 from caraware.report.evaluation import Mean, raw_errors_m
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 OBSERVATIONS, HORIZON, BATCH, EPOCHS = 9, 32_768, 2_048, 4
 VEHICLES = 8
@@ -142,10 +148,10 @@ class FreeTick:
     observation: Tensor
     truth: Tensor
     gnss_m: Tensor
-    vehicle: np.ndarray
-    valid: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
+    vehicle: UInt32Array
+    valid: BoolArray
+    terminated: BoolArray
+    truncated: BoolArray
 
 
 @dataclass
@@ -159,7 +165,14 @@ class FreeTicks:
         n, nobody = self.vehicles, np.zeros(self.vehicles, bool)
         truth = torch.rand(n, 4) * 220
         self._tick = FreeTick(
-            0, torch.rand(n, OBSERVATIONS) * 2 - 1, truth, truth[:, :2] + 5, np.arange(n), ~nobody, nobody, nobody
+            0,
+            torch.rand(n, OBSERVATIONS) * 2 - 1,
+            truth,
+            truth[:, :2] + 5,
+            np.arange(n, dtype=np.uint32),
+            ~nobody,
+            nobody,
+            nobody,
         )
 
     def __iter__(self) -> Iterator[list[FreeTick]]:
@@ -186,7 +199,7 @@ def our_horizon(ppo: Ppo, rollout: Rollout, ticks: Iterator[list[FreeTick]]) -> 
     ppo.learn(rollout.take())
 
 
-def sb3_model() -> object:
+def sb3_model() -> "PPO":
     """Stable-Baselines3's PPO with the same sizes on an environment that costs nothing."""
     from gymnasium import spaces
     from stable_baselines3 import PPO
@@ -199,28 +212,28 @@ def sb3_model() -> object:
             self.render_mode = None
             super().__init__(VEHICLES, box, spaces.Box(-1, 1, (2,), np.float32))
             self._observation = np.random.default_rng(1).uniform(-1, 1, (VEHICLES, OBSERVATIONS)).astype(np.float32)
-            self._infos: list[dict] = [{} for _ in range(VEHICLES)]
+            self._infos: list[dict[str, Any]] = [{} for _ in range(VEHICLES)]
 
-        def reset(self) -> np.ndarray:
+        def reset(self) -> Float32Array:
             return self._observation
 
-        def step_async(self, actions: np.ndarray) -> None:
+        def step_async(self, actions: Float32Array) -> None:
             self._actions = actions
 
-        def step_wait(self) -> tuple:
+        def step_wait(self) -> "VecEnvStepReturn":
             reward = -np.square(self._actions - self._observation[:, :2]).sum(1)
             return self._observation, reward, np.zeros(VEHICLES, bool), self._infos
 
         def close(self) -> None:
             pass
 
-        def get_attr(self, attr_name: str, indices: object = None) -> list:
+        def get_attr(self, attr_name: str, indices: object = None) -> list[Any]:
             return [getattr(self, attr_name)] * VEHICLES
 
         def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
             setattr(self, attr_name, value)
 
-        def env_method(self, method_name: str, *args: object, indices: object = None, **kwargs: object) -> list:
+        def env_method(self, method_name: str, *args: object, indices: object = None, **kwargs: object) -> list[Any]:
             raise NotImplementedError(method_name)
 
         def env_is_wrapped(self, wrapper_class: type, indices: object = None) -> list[bool]:

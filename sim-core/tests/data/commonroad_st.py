@@ -44,7 +44,9 @@ def trajectory(speed_mps: float, amplitude_rad: float) -> np.ndarray:
     pulsation = 2.0 * math.pi * FREQUENCY_HZ
 
     def rates(t: float, state: np.ndarray) -> list[float]:
-        return vehicle_dynamics_st(state, [amplitude_rad * pulsation * math.cos(pulsation * t), 0.0], parameters)
+        inputs = [amplitude_rad * pulsation * math.cos(pulsation * t), 0.0]
+        derivative: list[float] = vehicle_dynamics_st(state, inputs, parameters)
+        return derivative
 
     times = np.linspace(0.0, DURATION_S, round(DURATION_S / ROW_S) + 1)
     start = [0.0, 0.0, 0.0, speed_mps, 0.0, 0.0, 0.0]

@@ -49,7 +49,7 @@ SPHERE = pymap3d.Ellipsoid(6_378_137.0, 6_378_137.0)
 
 def rows() -> list[list[str | float]]:
     """One row for each place of each net."""
-    found = []
+    found: list[list[str | float]] = []
     for definition, (offset_x, offset_y) in NETS.items():
         proj = Proj(definition)
         origin_lon, origin_lat = proj(-offset_x, -offset_y, inverse=True)

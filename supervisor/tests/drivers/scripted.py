@@ -21,7 +21,7 @@ PHASES = sorted(
 )
 
 
-def keep_lane(row: dict, speed: float, wanted: float) -> list[float]:
+def keep_lane(row: dict[str, float], speed: float, wanted: float) -> list[float]:
     """Pure pursuit towards the route 10 m ahead, and a proportional controller of the speed."""
     x, y = row["route_x_10"] * 10, row["route_y_10"] * 10
     return [
@@ -30,7 +30,7 @@ def keep_lane(row: dict, speed: float, wanted: float) -> list[float]:
     ]
 
 
-def act(row: dict, truth: list[float], age_s: float, first_speed: float) -> list[float]:
+def act(row: dict[str, float], truth: list[float], age_s: float, first_speed: float) -> list[float]:
     """Steering and acceleration."""
     x, speed = truth[0], truth[3]
     phase = [action for start, action in PHASES if start <= age_s][-1]
@@ -48,10 +48,12 @@ def act(row: dict, truth: list[float], age_s: float, first_speed: float) -> list
 def main(run_file: str) -> None:
     """Drive every hero from the first tick to the last."""
     channel = Channel(run_file)
-    config, first_speed, seen, ended = channel.run["config"], {}, [], False
+    config, ended = channel.run["config"], False
+    first_speed: dict[tuple[int, int], float] = {}
+    seen: list[list[float]] = []
     while not ended:
         for obs in channel.receive(0.2):
-            steps = np.frombuffer(obs.block.section("episode_step"), np.uint32)
+            steps = obs.episode_step
             actions = np.full((len(obs.vehicle), 2), np.nan, np.float32)
             for slot in range(len(obs.vehicle)):
                 key = (obs.episode, int(obs.vehicle[slot]))

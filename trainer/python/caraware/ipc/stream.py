@@ -12,8 +12,8 @@ EMPTY_SLOT = 0xFFFFFFFF
 """`vehicle` of a slot that holds nobody."""
 
 
-class Observation(Protocol):
-    """One tick of one environment. The arrays are read-only views, valid while the object lives.
+class LearningTick(Protocol):
+    """What a rollout and the reference metrics take of a tick of one environment.
 
     Row `i` is slot `i`. A slot keeps its vehicle until that vehicle is gone; `n` may grow during a run.
     """
@@ -21,6 +21,38 @@ class Observation(Protocol):
     @property
     def tick(self) -> int:
         """Number of the tick in the run."""
+
+    @property
+    def observation(self) -> Tensor:
+        """f32 `[n, d]`, normalised."""
+
+    @property
+    def truth(self) -> Tensor:
+        """f32 `[n, 4]`: x_m, y_m, yaw_rad, speed_mps in the world frame. Only for the reward and the metrics."""
+
+    @property
+    def gnss_m(self) -> Tensor:
+        """f32 `[n, 2]` or `[n, 3]`: newest raw GNSS fix in world metres. Only for the baselines."""
+
+    @property
+    def vehicle(self) -> UInt32Array:
+        """u32 `[n]`: dense vehicle index within the episode, `EMPTY_SLOT` where there is none."""
+
+    @property
+    def valid(self) -> BoolArray:
+        """bool `[n]`: the row holds a vehicle with valid sensors."""
+
+    @property
+    def terminated(self) -> BoolArray:
+        """bool `[n]`: the trajectory in this slot at the previous tick ended there (arrival, removal)."""
+
+    @property
+    def truncated(self) -> BoolArray:
+        """bool `[n]`: ... was cut there from outside (episode reset, time limit)."""
+
+
+class Observation(LearningTick, Protocol):
+    """One tick of one environment. The arrays are read-only views, valid while the object lives."""
 
     @property
     def episode(self) -> int:
@@ -51,18 +83,6 @@ class Observation(Protocol):
         """Stage of the curriculum, counted from 1; 0 without one, and in evaluations."""
 
     @property
-    def observation(self) -> Tensor:
-        """f32 `[n, d]`, normalised."""
-
-    @property
-    def truth(self) -> Tensor:
-        """f32 `[n, 4]`: x_m, y_m, yaw_rad, speed_mps in the world frame. Only for the reward and the error."""
-
-    @property
-    def gnss_m(self) -> Tensor:
-        """f32 `[n, 2]` or `[n, 3]`: newest raw GNSS fix in world metres. Only for the baselines."""
-
-    @property
     def gnss_quality(self) -> Float32Array:
         """f32 `[n, 2]`: the receiver's estimate of its horizontal error (m, 1σ of the distance, 0 = none), satellites.
 
@@ -90,24 +110,8 @@ class Observation(Protocol):
         """u32 `[n]`: ticks since the vehicle took the slot."""
 
     @property
-    def vehicle(self) -> UInt32Array:
-        """u32 `[n]`: dense vehicle index within the episode, `EMPTY_SLOT` where there is none."""
-
-    @property
     def id_hash(self) -> UInt64Array:
         """u64 `[n]`: hash of the vehicle's SUMO id. Only for its name."""
-
-    @property
-    def valid(self) -> BoolArray:
-        """bool `[n]`: the row holds a vehicle with valid sensors."""
-
-    @property
-    def terminated(self) -> BoolArray:
-        """bool `[n]`: the trajectory in this slot at the previous tick ended there (arrival, removal)."""
-
-    @property
-    def truncated(self) -> BoolArray:
-        """bool `[n]`: ... was cut there from outside (episode reset, time limit)."""
 
 
 class TrainingReport(TypedDict, total=False):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from caraware.ipc.arrays import Scalar
-from caraware.ipc.stream import EMPTY_SLOT, Observation
+from caraware.ipc.stream import EMPTY_SLOT, LearningTick
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Rollout:
         self._cut = np.zeros(0, bool)
         self._allocate(ticks=16, slots=1)
 
-    def add(self, obs: Observation) -> None:
+    def add(self, obs: LearningTick) -> None:
         """Copy one training tick. Ticks with no valid row are passed over."""
         self.ended(obs)
         rows = len(obs.vehicle)
@@ -90,7 +90,7 @@ class Rollout:
         self._ticks, self._last_tick = t + 1, obs.tick
         self._samples, self._newest_samples = self._samples + samples, samples
 
-    def ended(self, obs: Observation) -> None:
+    def ended(self, obs: LearningTick) -> None:
         """Note how the trajectories of the newest row ended, which the tick after it, of any episode, tells."""
         self._discard_taken()
         if self._ticks == 0:

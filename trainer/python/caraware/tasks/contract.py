@@ -13,7 +13,7 @@ from torch import Tensor
 
 from caraware import _native
 from caraware.ipc.arrays import Float32Array
-from caraware.ipc.stream import Observation
+from caraware.ipc.stream import LearningTick
 
 
 class Sampling(Enum):
@@ -131,7 +131,7 @@ class Task(Protocol):
         """Each metric of the policy that can be measured, by name: values `[n]` for actions `[n, a]`."""
         ...
 
-    def measure_references(self, ticks: Sequence[Observation]) -> dict[str, list[Float32Array]]:
+    def measure_references(self, ticks: Sequence[LearningTick]) -> dict[str, list[Float32Array]]:
         """Each metric that is a reference, by name: values `[v]` on the valid rows of each tick.
 
         The same numbers, bit for bit, whichever ticks come together.

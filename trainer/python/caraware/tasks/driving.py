@@ -9,7 +9,7 @@ from torch import Tensor
 from caraware import _native
 from caraware.ipc.arrays import Float32Array
 from caraware.ipc.run_file import RunFile
-from caraware.ipc.stream import Observation
+from caraware.ipc.stream import LearningTick
 from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskOutcome, TaskStep, metrics_of
 from caraware.tasks.fields import Fields
 
@@ -83,7 +83,7 @@ class Driving:
             values["route_offset_m"] = self.fields.si_tensor(outcome.next.observation, "route_offset").abs()
         return values
 
-    def measure_references(self, ticks: Sequence[Observation]) -> dict[str, list[Float32Array]]:
+    def measure_references(self, ticks: Sequence[LearningTick]) -> dict[str, list[Float32Array]]:
         """None: nothing drives beside the policy."""
         return {}
 

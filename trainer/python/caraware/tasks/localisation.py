@@ -10,7 +10,7 @@ from torch import Tensor
 from caraware import _native
 from caraware.ipc.arrays import Float32Array
 from caraware.ipc.run_file import RunFile
-from caraware.ipc.stream import Observation
+from caraware.ipc.stream import LearningTick
 from caraware.tasks import rewards
 from caraware.tasks.bounds import MapBounds
 from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskStep, metrics_of
@@ -60,7 +60,7 @@ class Localisation:
         """`error_m`: distance of the position to the truth (m)."""
         return {"error_m": self.error_m(action, step.truth)}
 
-    def measure_references(self, ticks: Sequence[Observation]) -> dict[str, list[Float32Array]]:
+    def measure_references(self, ticks: Sequence[LearningTick]) -> dict[str, list[Float32Array]]:
         """`raw_gnss_error_m`: distance of the raw GNSS fix to the truth (m)."""
         return {"raw_gnss_error_m": raw_errors_m(ticks)}
 
@@ -69,13 +69,13 @@ class Localisation:
         return rewards.distance_m(self.answer(action), truth if action.ndim == truth.ndim else truth.unsqueeze(1))
 
 
-def errors_m(obs: Observation, predictions_m: Tensor) -> tuple[Float32Array, Float32Array]:
+def errors_m(obs: LearningTick, predictions_m: Tensor) -> tuple[Float32Array, Float32Array]:
     """Distances to the truth `[v]` of predictions `[n, 2]` and of raw GNSS, on the valid rows of a tick."""
     policy = _distance_m(predictions_m.numpy(), obs.truth.numpy())[obs.valid]
     return policy, raw_errors_m([obs])[0]
 
 
-def raw_errors_m(ticks: Sequence[Observation]) -> list[Float32Array]:
+def raw_errors_m(ticks: Sequence[LearningTick]) -> list[Float32Array]:
     """Distances to the truth `[v]` of raw GNSS, on the valid rows of each of some ticks.
 
     The same numbers, bit for bit, whichever ticks come together.
