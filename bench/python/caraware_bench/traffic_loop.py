@@ -1,7 +1,7 @@
 """What a Python program does to have every vehicle's state at every step of SUMO, through libsumo or TraCI.
 
-The fields are those that `traffic-bridge/src/sumo/shim.cc` reads at every step on a flat net, as often as it reads them;
-what it reads once at a departure, and traffic lights, are left out. As there, the list of live vehicles is kept
+The fields are those that `traffic-bridge/src/sumo/shim.cc` reads at every step on a flat net, as often as it reads
+them; what it reads once at a departure, and traffic lights, are left out. As there, the list of live vehicles is kept
 from departures and arrivals.
 """
 
