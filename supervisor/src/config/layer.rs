@@ -69,7 +69,8 @@ pub fn parse_assignment(assignment: &str) -> Result<Layer, ConfigError> {
     let (key, value) = (key.trim(), value.trim());
     let plain = format!("{key} = {value}");
     // A word is a word where one belongs, also "nan" and "true", which TOML takes for something else.
-    let takes_a_word = keys::find(key).is_some_and(|key| matches!(key.kind, Kind::Choice(_) | Kind::ChoiceOrClass(_) | Kind::Text));
+    let takes_a_word =
+        keys::find(key).is_some_and(|key| matches!(key.kind, Kind::Choice(_) | Kind::ChoiceOrClass(_) | Kind::Text));
     let is_quoted = value.starts_with(['"', '\'']);
     let text = if DeTable::parse(&plain).is_ok() && (is_quoted || !takes_a_word) {
         plain

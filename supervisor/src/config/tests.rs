@@ -225,7 +225,10 @@ fn a_batch_larger_than_the_horizon_is_refused() {
 fn networks_and_activations_are_known_by_name() {
     for unknown in ["lstm", ":Wide", "networks:", "my networks:Wide", "networks:Wide:er"] {
         let (_, help) = error_of(&format!("trainer.network = \"{unknown}\"\n"));
-        assert!(help.contains("\"mlp\", \"gru\", \"package.module:Class\""), "{unknown}: {help}");
+        assert!(
+            help.contains("\"mlp\", \"gru\", \"package.module:Class\""),
+            "{unknown}: {help}"
+        );
     }
     assert!(layer::parse_assignment("trainer.network=my.networks:Wide").is_ok());
     assert!(
