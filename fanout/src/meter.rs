@@ -5,14 +5,13 @@ use std::time::Duration;
 use ipc_schema::{
     block::view,
     header::MessageHeader,
-    observation::{
-        EMPTY_SLOT, GNSS, GNSS_COLUMNS, IMU, LIDAR, ObservationLayout, SPEED_STEERING, TRUTH_COLUMNS, VALID,
-    },
+    observation::{EMPTY_SLOT, GNSS_COLUMNS, ObservationLayout, TRUTH_COLUMNS, VALID},
     prediction::PredictionLayout,
+    sensor::SensorKind,
     traffic::Kind,
     world::{VehicleState, WorldLayout},
 };
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 /// Time over which the rate is measured.
 const RATE_PERIOD: Duration = Duration::from_secs(2);
@@ -74,17 +73,24 @@ impl RoadUserCounts {
     }
 }
 
-/// Number of vehicles on which each sensor delivers.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-pub struct DeliveringSensors {
-    /// GNSS.
-    pub gnss: u32,
-    /// IMU.
-    pub imu: u32,
-    /// Speed and steering.
-    pub speed_steering: u32,
-    /// LIDAR.
-    pub lidar: u32,
+/// Number of vehicles on which each sensor delivers, by [`SensorKind`]; in JSON by the sensor's name.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct DeliveringSensors([u32; SensorKind::COUNT]);
+
+impl DeliveringSensors {
+    /// Counts the sensors of one vehicle, given as bits.
+    fn count(mut self, sensors: u32) -> Self {
+        for kind in SensorKind::ALL {
+            self.0[kind.index()] += u32::from(kind.is_in(sensors));
+        }
+        self
+    }
+}
+
+impl Serialize for DeliveringSensors {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_map(SensorKind::ALL.map(|kind| (kind.name(), self.0[kind.index()])))
+    }
 }
 
 /// Mean distances from the truth over the valid rows of one tick, metres.
@@ -141,12 +147,7 @@ impl<'a> ObservationView<'a> {
             .iter()
             .zip(self.sensors)
             .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT);
-        held.fold(DeliveringSensors::default(), |count, (_, sensors)| DeliveringSensors {
-            gnss: count.gnss + u32::from(sensors & GNSS != 0),
-            imu: count.imu + u32::from(sensors & IMU != 0),
-            speed_steering: count.speed_steering + u32::from(sensors & SPEED_STEERING != 0),
-            lidar: count.lidar + u32::from(sensors & LIDAR != 0),
-        })
+        held.fold(DeliveringSensors::default(), |count, (_, sensors)| count.count(*sensors))
     }
 
     /// Mean distances from the truth of the GNSS fixes, and of the positions of `prediction` if it holds positions.
@@ -208,7 +209,9 @@ mod tests {
             .unwrap()
             .copy_from_slice(&[0, 1, EMPTY_SLOT]);
         view_mut::<u32>(bytes, layout.flags).unwrap().fill(VALID);
-        view_mut::<u32>(bytes, layout.sensors).unwrap().fill(GNSS | LIDAR);
+        view_mut::<u32>(bytes, layout.sensors)
+            .unwrap()
+            .fill(SensorKind::Gnss.bit() | SensorKind::Lidar.bit());
         let observation = ObservationView::of(&header, bytemuck::cast_slice(&words)).unwrap();
         let predicted = MessageHeader {
             columns: 2,
@@ -229,12 +232,8 @@ mod tests {
         );
         assert_eq!(observation.position_errors(None).policy, None);
         assert_eq!(
-            observation.delivering(),
-            DeliveringSensors {
-                gnss: 2,
-                lidar: 2,
-                ..DeliveringSensors::default()
-            }
+            serde_json::to_value(observation.delivering()).unwrap(),
+            serde_json::json!({ "gnss": 2, "imu": 0, "speed_steering": 0, "lidar": 2 })
         );
         assert!(ObservationView::of(&header, &[0; 64]).is_none());
     }

@@ -7,10 +7,7 @@ use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-use crate::{
-    SCHEMA_VERSION,
-    observation::{GNSS, IMU, LIDAR, SPEED_STEERING},
-};
+use crate::{SCHEMA_VERSION, sensor::SensorSelection};
 
 /// Longest id of a vehicle or an edge in a command, bytes.
 pub const ID_BYTES: usize = 128;
@@ -43,7 +40,7 @@ pub enum Command {
         /// SUMO's id; none = all vehicles.
         vehicle: Option<String>,
         /// Which.
-        sensor: Sensor,
+        sensor: SensorSelection,
         /// Where to.
         state: Switch,
     },
@@ -61,42 +58,6 @@ pub enum Command {
         /// SUMO's id.
         edge: String,
     },
-}
-
-/// A sensor by name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Sensor {
-    /// GNSS receiver.
-    Gnss,
-    /// Inertial unit with compass.
-    Imu,
-    /// Speed and steering angle.
-    SpeedSteering,
-    /// LIDAR.
-    Lidar,
-    /// Every sensor.
-    All,
-}
-
-impl Sensor {
-    /// Bits as in an observation's `sensors`.
-    #[must_use]
-    pub fn bits(self) -> u32 {
-        match self {
-            Self::Gnss => GNSS,
-            Self::Imu => IMU,
-            Self::SpeedSteering => SPEED_STEERING,
-            Self::Lidar => LIDAR,
-            Self::All => GNSS | IMU | SPEED_STEERING | LIDAR,
-        }
-    }
-
-    fn from_bits(bits: u32) -> Option<Self> {
-        [Self::Gnss, Self::Imu, Self::SpeedSteering, Self::Lidar, Self::All]
-            .into_iter()
-            .find(|sensor| sensor.bits() == bits)
-    }
 }
 
 /// Where a sensor is switched to.
@@ -412,7 +373,7 @@ impl TryFrom<&ControlRequest> for Command {
                     NONE => None,
                     _ => Some(vehicle.ok_or_else(malformed)?),
                 },
-                sensor: Sensor::from_bits(request.sensors).ok_or_else(malformed)?,
+                sensor: SensorSelection::from_bits(request.sensors).ok_or_else(malformed)?,
                 state: if request.is_on == 0 { Switch::Off } else { Switch::On },
             },
             5 | 6 => {
@@ -508,13 +469,7 @@ mod tests {
 
     fn commands() -> impl Strategy<Value = Command> {
         let id = "[a-zäß€ .#]{1,40}";
-        let sensor = prop_oneof![
-            Just(Sensor::Gnss),
-            Just(Sensor::Imu),
-            Just(Sensor::SpeedSteering),
-            Just(Sensor::Lidar),
-            Just(Sensor::All)
-        ];
+        let sensor = prop::sample::select(SensorSelection::every().collect::<Vec<_>>());
         let switched =
             (prop::option::of(id), sensor, any::<bool>()).prop_map(|(vehicle, sensor, on)| Command::Sensor {
                 vehicle,

@@ -5,12 +5,14 @@ use std::mem::{align_of, offset_of, size_of};
 use serde::Serialize;
 
 use crate::{
+    SCHEMA_VERSION,
     board::{Health, Progress, Roster, TrainingStatus},
     control::{ControlReply, ControlRequest, SensorSwitch},
     ego::EgoPose,
     event::Collision,
     header::MessageHeader,
     pointcloud::{LidarPoint, Scan},
+    sensor::SENSORS,
     traffic::{RoutePoint, SignalMeta, TrafficState, VehicleMeta},
     world::{HeroView, SubStep, VehicleState},
 };
@@ -257,14 +259,44 @@ pub fn table() -> Vec<TypeLayout> {
     ]
 }
 
-/// The table as committed in `ipc-schema/layout.json`.
+/// A sensor as other languages know it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct SensorLayout {
+    /// Name in commands and keys.
+    pub name: &'static str,
+    /// Name in the HUD.
+    pub label: &'static str,
+    /// Bit in an observation's `sensors`.
+    pub bit: u32,
+}
+
+/// Every sensor, in the order of an observation's ages.
 #[must_use]
-pub fn json() -> String {
-    let rows: Vec<String> = table()
-        .iter()
-        .filter_map(|row| serde_json::to_string(row).ok())
-        .collect();
-    format!("[\n  {}\n]\n", rows.join(",\n  "))
+pub fn sensors() -> Vec<SensorLayout> {
+    let rows = SENSORS.iter().map(|spec| SensorLayout {
+        name: spec.name,
+        label: spec.label,
+        bit: spec.kind.bit(),
+    });
+    rows.collect()
+}
+
+/// A list in JSON with one line for each of its rows.
+fn lines<T: Serialize>(rows: &[T]) -> Result<String, serde_json::Error> {
+    let rows: Result<Vec<String>, _> = rows.iter().map(serde_json::to_string).collect();
+    Ok(format!("[\n    {}\n  ]", rows?.join(",\n    ")))
+}
+
+/// The tables as committed in `ipc-schema/layout.json`.
+///
+/// # Errors
+/// A row has no form in JSON.
+pub fn json() -> Result<String, serde_json::Error> {
+    Ok(format!(
+        "{{\n  \"schema_version\": {SCHEMA_VERSION},\n  \"types\": {},\n  \"sensors\": {}\n}}\n",
+        lines(&table())?,
+        lines(&sensors())?
+    ))
 }
 
 #[cfg(test)]
@@ -273,10 +305,14 @@ mod tests {
     /// (raise `SCHEMA_VERSION` with it).
     #[test]
     fn the_committed_layout_table_is_true() {
-        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/layout.json");
-        if std::env::var_os("CARAWARE_BLESS").is_some() {
-            std::fs::write(path, super::json()).unwrap();
+        let json = super::json().unwrap();
+        // The viewer is installed without this tree and carries a copy.
+        for path in ["/layout.json", "/../viewer/src/caraware_viewer/layout.json"] {
+            let path = format!("{}{path}", env!("CARGO_MANIFEST_DIR"));
+            if std::env::var_os("CARAWARE_BLESS").is_some() {
+                std::fs::write(&path, &json).unwrap();
+            }
+            assert_eq!(std::fs::read_to_string(&path).unwrap(), json, "{path}");
         }
-        assert_eq!(std::fs::read_to_string(path).unwrap(), super::json());
     }
 }

@@ -42,6 +42,7 @@ pub mod props;
 pub mod run;
 pub mod schedule;
 pub mod scheduling;
+pub mod sensor;
 pub mod services;
 pub mod session;
 pub mod traffic;

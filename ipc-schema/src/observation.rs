@@ -3,6 +3,7 @@
 use crate::{
     block::{Section, sections},
     header::MessageHeader,
+    sensor::SensorKind,
 };
 
 /// `vehicle` value of an empty slot.
@@ -20,24 +21,12 @@ pub const QUALITY_COLUMNS: usize = 2;
 pub const IMU_COLUMNS: usize = 7;
 /// Number of columns of speed and steering: wheel speed (m/s), steering-wheel angle (rad).
 pub const SPEED_STEERING_COLUMNS: usize = 2;
-/// Number of sensors with an age: GNSS, IMU, speed and steering, LIDAR.
-pub const SENSORS: usize = 4;
-
 /// The slot holds a vehicle whose sensors have all delivered at least once.
 pub const VALID: u32 = 1;
 /// The trajectory that held this slot at the previous tick ended there: arrival, removal, collision, off-road. Never bootstrap across it.
 pub const TERMINATED: u32 = 1 << 1;
 /// The trajectory that held this slot at the previous tick was cut there: end of episode, or a hero's time limit. Bootstrap, then cut.
 pub const TRUNCATED: u32 = 1 << 2;
-/// Bit of `sensors`: the GNSS receiver delivers (no blackout, satellites enough for a fix).
-pub const GNSS: u32 = 1;
-/// Bit of `sensors`: the IMU delivers.
-pub const IMU: u32 = 1 << 1;
-/// Bit of `sensors`: the speed and steering sensor delivers; never set for pedestrians.
-pub const SPEED_STEERING: u32 = 1 << 2;
-/// Bit of `sensors`: the LIDAR delivers; never set without one.
-pub const LIDAR: u32 = 1 << 3;
-
 /// At least one field was outside its range and has been clipped.
 pub const CLIPPED: u32 = 1 << 3;
 
@@ -67,11 +56,11 @@ pub struct ObservationLayout {
     pub vehicle: Section,
     /// `u32 [n]`: bits [`VALID`], [`TERMINATED`], [`TRUNCATED`], [`CLIPPED`].
     pub flags: Section,
-    /// `u32 [n]`: bits [`GNSS`], [`IMU`], [`SPEED_STEERING`], [`LIDAR`]: which sensors deliver.
+    /// `u32 [n]`: bits of the sensors that deliver ([`SensorKind::bit`]); never that of a sensor which the slot's holder does not carry.
     pub sensors: Section,
     /// `u32 [n]`: ticks since this vehicle took the slot.
     pub episode_step: Section,
-    /// `f32 [n, 4]`: age of the newest GNSS, IMU, speed-steering and LIDAR sample, seconds; 0 for a sensor that it does not have.
+    /// `f32 [n, sensors]`: age of the newest sample of each sensor, by [`SensorKind`], seconds; 0 for one that it does not carry.
     pub age_s: Section,
     /// Length of the payload in bytes.
     pub len: usize,
@@ -112,7 +101,7 @@ impl ObservationLayout {
             n * size_of::<u32>(),
             n * size_of::<u32>(),
             n * size_of::<u32>(),
-            n * SENSORS * f32_size,
+            n * SensorKind::COUNT * f32_size,
         ]);
         Self {
             observation,

@@ -22,9 +22,10 @@ use ipc_schema::{
     block::{self, Section},
     config::Config,
     header::{FIRST_OF_EPISODE, MessageHeader},
-    observation::{GNSS, IMU_COLUMNS, ObservationLayout},
+    observation::{IMU_COLUMNS, ObservationLayout},
     pointcloud::{LidarPoint, Scan},
     run::MapInfo,
+    sensor::SensorKind,
     traffic::Kind,
     world::{SubStep, VehicleState},
 };
@@ -246,7 +247,7 @@ fn write_gnss(out: &mut impl Write) -> io::Result<()> {
         let mut lines = Vec::new();
         sense(&mut sensing, u32::MAX, &driven, &mut |tick, block| {
             let state = driven(tick).unwrap();
-            let has_fix = block.section::<u32>(block.layout.sensors)[0] & GNSS != 0;
+            let has_fix = SensorKind::Gnss.is_in(block.section::<u32>(block.layout.sensors)[0]);
             let [x, y, _] = block.section::<[f32; 3]>(block.layout.gnss_m)[0];
             let [_, satellites] = block.section::<[f32; 2]>(block.layout.gnss_quality)[0];
             if has_fix {

@@ -4,12 +4,14 @@
 //! with a uniform part of a gap: nobody appears in a blackout, so every sensor has a sample to hold, and vehicles that appear
 //! together do not go dark together.
 
-use crate::noise::{Sensor, Stream};
+use ipc_schema::sensor::{BlackoutSpans, NoiseStream};
+
+use crate::noise::Stream;
 
 /// Blackouts of one sensor, as configured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Schedule {
-    sensor: Sensor,
+    sensor: NoiseStream,
     length_ns: [f64; 2],
     gap_ns: [f64; 2],
     tick_ns: u64,
@@ -35,10 +37,11 @@ impl Phase {
 }
 
 impl Schedule {
-    /// Blackouts with lengths and gaps as given (shortest and longest, seconds); none if the longest has no length. What is shorter
+    /// Blackouts with these lengths and gaps; none if the longest has no length. What is shorter
     /// than a tick lasts a tick.
     #[must_use]
-    pub fn new(sensor: Sensor, length_s: [f64; 2], gap_s: [f64; 2], tick_ns: u64) -> Option<Self> {
+    pub fn new(sensor: NoiseStream, spans: BlackoutSpans, tick_ns: u64) -> Option<Self> {
+        let BlackoutSpans { length_s, gap_s } = spans;
         (length_s[1] > 0.0).then(|| Self {
             sensor,
             length_ns: length_s.map(|s| 1e9 * s),
@@ -90,7 +93,7 @@ mod tests {
     const TICK_NS: u64 = 100_000_000;
 
     fn schedule(length_s: [f64; 2], gap_s: [f64; 2]) -> Schedule {
-        Schedule::new(Sensor::GnssBlackout, length_s, gap_s, TICK_NS).unwrap()
+        Schedule::new(NoiseStream::GnssBlackout, BlackoutSpans { length_s, gap_s }, TICK_NS).unwrap()
     }
 
     /// Lengths of the runs of light and darkness, ticks, the first and the last one left out.
@@ -156,7 +159,17 @@ mod tests {
 
     #[test]
     fn no_length_is_no_blackout_and_tiny_ones_last_a_tick() {
-        assert_eq!(Schedule::new(Sensor::GnssBlackout, [0.0; 2], [0.0; 2], TICK_NS), None);
+        assert_eq!(
+            Schedule::new(
+                NoiseStream::GnssBlackout,
+                BlackoutSpans {
+                    length_s: [0.0; 2],
+                    gap_s: [0.0; 2]
+                },
+                TICK_NS
+            ),
+            None
+        );
         let [light, dark] = runs(&schedule([0.0, 1e-9], [0.0, 0.0]), 1, 100);
         assert!(light.iter().chain(&dark).all(|ticks| *ticks == 1.0) && light.len() > 40);
     }

@@ -1,11 +1,8 @@
 //! One carrier of sensors: what a slot remembers from tick to tick.
 
-use ipc_schema::observation::{GNSS, IMU, LIDAR, SENSORS, SPEED_STEERING};
+use ipc_schema::sensor::SensorKind;
 
 use crate::{blackout::Phase, fields::Readings, imu, speed_steering::Scales};
-
-/// All sensors by index, as in the ages of an observation.
-pub const BITS: [u32; SENSORS] = [GNSS, IMU, SPEED_STEERING, LIDAR];
 
 /// What the sensors of one road user remember. It begins anew with every trajectory.
 #[derive(Debug, Clone)]
@@ -21,9 +18,9 @@ pub struct Carrier {
     /// Factor on the errors of its GNSS receiver.
     pub gnss_factor: f64,
     /// Where each sensor is in its sequence of blackouts.
-    pub phases: [Phase; SENSORS],
+    pub phases: [Phase; SensorKind::COUNT],
     /// Step of the newest sample of each sensor.
-    pub sampled: [u32; SENSORS],
+    pub sampled: [u32; SensorKind::COUNT],
     /// Sensors that it has.
     pub present: u32,
     /// Sensors that a command has switched off.
@@ -49,8 +46,8 @@ impl Carrier {
             walk: [0.0; 8],
             scales,
             gnss_factor,
-            phases: [Phase::default(); SENSORS],
-            sampled: [0; SENSORS],
+            phases: [Phase::default(); SensorKind::COUNT],
+            sampled: [0; SensorKind::COUNT],
             present,
             off: 0,
             known: 0,
@@ -63,27 +60,34 @@ impl Carrier {
     #[must_use]
     #[inline(always)]
     pub fn awake(&self) -> u32 {
-        let awake = (0..SENSORS).filter(|i| !self.phases[*i].is_dark());
-        awake.fold(0, |bits, i| bits | BITS[i]) & self.present & !self.off
+        let awake = SensorKind::ALL
+            .into_iter()
+            .filter(|kind| !self.phases[kind.index()].is_dark());
+        awake.fold(0, |bits, kind| bits | kind.bit()) & self.present & !self.off
     }
 
-    /// Takes note of a sample of the sensor with this index at `step`.
+    /// Takes note of a sample of `sensor` at `step`.
     #[inline(always)]
-    pub fn note(&mut self, sensor: usize, step: u32) {
-        self.sampled[sensor] = step;
-        self.known |= BITS[sensor];
+    pub fn note(&mut self, sensor: SensorKind, step: u32) {
+        self.sampled[sensor.index()] = step;
+        self.known |= sensor.bit();
     }
 
     /// Sets the ages and says who delivers at `step`, with ticks of `tick_s`. Sensors that it does not have are 0 s old.
     #[inline(always)]
     pub fn age(&mut self, step: u32, tick_s: f64) {
-        let fix = if self.has_fix { u32::MAX } else { !GNSS };
+        let fix = if self.has_fix {
+            u32::MAX
+        } else {
+            !SensorKind::Gnss.bit()
+        };
         self.readings.delivering = self.awake() & fix & self.known;
-        for (sensor, bit) in BITS.into_iter().enumerate() {
+        for sensor in SensorKind::ALL {
+            let sampled = self.sampled[sensor.index()];
             // Most are fresh.
-            let is_old = self.present & bit != 0 && self.sampled[sensor] != step;
-            self.readings.ages_s[sensor] = if is_old {
-                (f64::from(step - self.sampled[sensor]) * tick_s) as f32
+            let is_old = sensor.is_in(self.present) && sampled != step;
+            self.readings.ages_s[sensor.index()] = if is_old {
+                (f64::from(step - sampled) * tick_s) as f32
             } else {
                 0.0
             };

@@ -11,6 +11,7 @@ use ipc_schema::{
     ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
     run::MapInfo,
+    sensor::{SENSORS, SceneUse},
     services::Channel,
     session::{Session, Wait},
     world::WorldLayout,
@@ -77,18 +78,18 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
 
 /// Gives GNSS receivers their sky and vehicles their LIDARs, if the configuration asks for either: only they need the scene.
 fn look_around(session: &mut Session, sensing: &mut Sensing) -> Result<Option<Scanning>, Failure> {
-    let (sky_view, has_lidars) = (session.run.config.gnss.sky_view, session.run.config.lidar.vehicles > 0);
-    if !sky_view && !has_lidars {
+    let uses = SENSORS.map(|spec| (spec.scene)(&session.run.config));
+    if uses.iter().all(|scene| *scene == SceneUse::Unused) {
         return Ok(None);
     }
     let scenes = Scene::of_every_map(&session.run)?;
-    if sky_view {
+    if uses.contains(&SceneUse::Sky) {
         for (index, (map, scene)) in session.run.every_map().iter().zip(&scenes).enumerate() {
             let sky = sky_over(&map.info, scene, session.run.seed())?;
             sensing.set_sky_of(index, Box::new(sky));
         }
     }
-    if !has_lidars {
+    if !uses.contains(&SceneUse::Rays) {
         return Ok(None);
     }
     let publisher = session.publisher(Channel::Pointcloud)?;

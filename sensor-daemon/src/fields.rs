@@ -2,7 +2,7 @@
 
 use ipc_schema::{
     config::{Field, Observation as Params, Scale},
-    observation::{GNSS, IMU, LIDAR, SENSORS, SPEED_STEERING},
+    sensor::SensorKind,
     world::{HeroView, ROUTE_AHEAD_M, SIGHT_M},
 };
 
@@ -20,7 +20,7 @@ pub struct Readings {
     /// Nearest points of the nearest objects that the LIDAR sees, forward and left of the rear axle, metres.
     pub objects_m: [[f32; 2]; 4],
     /// Ages of the newest samples by sensor, seconds.
-    pub ages_s: [f32; SENSORS],
+    pub ages_s: [f32; SensorKind::COUNT],
     /// Bits of the sensors that deliver.
     pub delivering: u32,
     /// What a hero sees of its route.
@@ -57,9 +57,9 @@ impl Readings {
             Field::GnssAge => f64::from(self.ages_s[0]),
             Field::ImuAge => f64::from(self.ages_s[1]),
             Field::SpeedSteeringAge => f64::from(self.ages_s[2]),
-            Field::GnssValid => deliver(GNSS),
-            Field::ImuValid => deliver(IMU),
-            Field::SpeedSteeringValid => deliver(SPEED_STEERING),
+            Field::GnssValid => deliver(SensorKind::Gnss.bit()),
+            Field::ImuValid => deliver(SensorKind::Imu.bit()),
+            Field::SpeedSteeringValid => deliver(SensorKind::SpeedSteering.bit()),
             Field::Object1X => f64::from(self.objects_m[0][0]),
             Field::Object1Y => f64::from(self.objects_m[0][1]),
             Field::Object2X => f64::from(self.objects_m[1][0]),
@@ -89,12 +89,12 @@ impl Readings {
 /// Bit of the sensor that a field shows; 0 for what is known in a blackout too.
 fn sensor(field: Field) -> u32 {
     match field {
-        Field::GnssX | Field::GnssY | Field::GnssZ | Field::GnssAccuracy => GNSS,
+        Field::GnssX | Field::GnssY | Field::GnssZ | Field::GnssAccuracy => SensorKind::Gnss.bit(),
         Field::AccelX | Field::AccelY | Field::AccelZ | Field::GyroX | Field::GyroY | Field::GyroZ | Field::Compass => {
-            IMU
+            SensorKind::Imu.bit()
         }
-        Field::Speed | Field::Steering => SPEED_STEERING,
-        object if object >= Field::Object1X && object <= Field::Object4Y => LIDAR,
+        Field::Speed | Field::Steering => SensorKind::SpeedSteering.bit(),
+        object if object >= Field::Object1X && object <= Field::Object4Y => SensorKind::Lidar.bit(),
         _ => 0,
     }
 }
@@ -298,7 +298,7 @@ mod tests {
                 ..Fix::default()
             },
             ages_s: [2.5, 0.0, 10.0, 0.0],
-            delivering: IMU,
+            delivering: SensorKind::Imu.bit(),
             objects_m: [[80.0, -40.0], [0.0, 0.0], [0.0, 0.0], [20.0, 80.0]],
             ..Readings::default()
         };
@@ -317,7 +317,7 @@ mod tests {
             Field::Object4Y,
         ];
         let normaliser = Normaliser::new(&params(fields, Scale::ZeroToOne), BOUNDS_M, 80.0);
-        assert_eq!(normaliser.needs(), GNSS | LIDAR);
+        assert_eq!(normaliser.needs(), SensorKind::Gnss.bit() | SensorKind::Lidar.bit());
         let mut row = [9.0; 12];
         assert!(!normaliser.fill(&readings, 0, &mut row));
         assert_eq!(row, [0.75, 0.25, 0.25, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 0.25, 0.625, 1.0]);
@@ -335,10 +335,10 @@ mod tests {
         let fields = vec![Field::GnssX, Field::Speed, Field::GnssAge, Field::AccelX];
         let normaliser = Normaliser::new(&params(fields, Scale::ZeroToOne), BOUNDS_M, 100.0);
         let mut row = [9.0; 4];
-        assert!(!normaliser.fill(&readings, GNSS | IMU, &mut row));
+        assert!(!normaliser.fill(&readings, SensorKind::Gnss.bit() | SensorKind::Imu.bit(), &mut row));
         assert!(row[0].is_nan() && row[3].is_nan());
         assert_eq!(row[1..3], [0.0, 0.0]);
-        assert!(normaliser.fill(&readings, IMU, &mut row));
+        assert!(normaliser.fill(&readings, SensorKind::Imu.bit(), &mut row));
         assert_eq!(row[0], 0.0);
     }
 

@@ -10,11 +10,12 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 use ipc_schema::{
     config::{Imu as Params, ImuConvention},
     observation::IMU_COLUMNS,
+    sensor::NoiseStream,
     world::SubStep,
 };
 
 use crate::{
-    noise::{Drawn, Draws, Sensor},
+    noise::{Drawn, Draws},
     normals::{LANES, cos_sin},
     wide::{Path, Work},
 };
@@ -128,8 +129,8 @@ impl Unit {
     /// Plans the numbers of the samples from `first` on: white noise sample by sample, then the walk, two blocks each.
     pub fn plan(&self, draws: &mut Draws, first: u32) {
         let streams = [
-            (self.is_noisy, [Sensor::ImuFront, Sensor::ImuBack]),
-            (self.is_walking, [Sensor::WalkFront, Sensor::WalkBack]),
+            (self.is_noisy, [NoiseStream::ImuFront, NoiseStream::ImuBack]),
+            (self.is_walking, [NoiseStream::WalkFront, NoiseStream::WalkBack]),
         ];
         for (is_on, halves) in streams {
             for sample in (0_u32..).take(if is_on { self.samples } else { 0 }) {

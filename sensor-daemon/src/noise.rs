@@ -1,5 +1,7 @@
 //! Counter-based random numbers: a value depends on what it is for, never on when or in which order it is drawn.
 
+use ipc_schema::sensor::NoiseStream;
+
 use crate::{
     normals::{self, Block, LANES, Lanes, Purpose},
     wide::Path,
@@ -15,37 +17,7 @@ pub struct Stream {
     /// Hash of the vehicle's SUMO id.
     pub id_hash: u64,
     /// Which sensor.
-    pub sensor: Sensor,
-}
-
-/// Sensors, and parts of sensors, with random streams of their own.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[repr(u32)]
-pub enum Sensor {
-    /// GNSS receiver, white noise: east, north, up.
-    Gnss = 1,
-    /// IMU, white noise: accelerometer, and x of the gyroscope.
-    ImuFront = 2,
-    /// IMU, white noise: y and z of the gyroscope, compass.
-    ImuBack = 3,
-    /// Wheel speed and steering angle.
-    SpeedSteering = 4,
-    /// GNSS receiver, correlated noise: east, north, up.
-    GnssCorrelated = 32,
-    /// IMU, walk of the biases of the accelerometer and of x of the gyroscope.
-    WalkFront = 33,
-    /// IMU, walk of the biases of y and z of the gyroscope.
-    WalkBack = 34,
-    /// Scale errors of wheel speed and steering angle.
-    Scale = 35,
-    /// Blackouts of the GNSS receiver.
-    GnssBlackout = 40,
-    /// Blackouts of the IMU.
-    ImuBlackout = 41,
-    /// Blackouts of the speed and steering sensor.
-    SpeedSteeringBlackout = 42,
-    /// Blackouts of the LIDAR.
-    LidarBlackout = 43,
+    pub sensor: NoiseStream,
 }
 
 /// The key of an episode's numbers.
@@ -109,7 +81,7 @@ impl Draws {
     }
 
     /// Plans a sample of a sensor.
-    pub fn plan(&mut self, sensor: Sensor, sample: u32) {
+    pub fn plan(&mut self, sensor: NoiseStream, sample: u32) {
         self.plan.push([sample, sensor as u32]);
     }
 
@@ -192,7 +164,7 @@ impl Drawn<'_> {
 mod tests {
     use super::*;
 
-    fn stream(id_hash: u64, sensor: Sensor) -> Stream {
+    fn stream(id_hash: u64, sensor: NoiseStream) -> Stream {
         Stream {
             episode_seed: 42,
             id_hash,
@@ -217,7 +189,7 @@ mod tests {
     #[test]
     fn normals_are_standard_normal() {
         const N: u32 = 1_000_000;
-        let stream = stream(7, Sensor::Gnss);
+        let stream = stream(7, NoiseStream::Gnss);
         let blocks: Vec<Block> = (0..N).map(|sample| stream.normals(sample)).collect();
         for axis in 0..4 {
             let values: Vec<f64> = blocks.iter().map(|block| f64::from(block[axis])).collect();
@@ -249,11 +221,11 @@ mod tests {
         (ids[3], ids[15]) = (7, u64::MAX - 5);
         for round in 0..3_u32 {
             draws.clear();
-            draws.plan(Sensor::Gnss, round);
-            draws.plan(Sensor::ImuBack, u32::MAX);
+            draws.plan(NoiseStream::Gnss, round);
+            draws.plan(NoiseStream::ImuBack, u32::MAX);
             draws.draw(42, &ids);
-            assert_eq!(draws.of(3).at(0), stream(7, Sensor::Gnss).normals(round));
-            let back = stream(u64::MAX - 5, Sensor::ImuBack).normals(u32::MAX);
+            assert_eq!(draws.of(3).at(0), stream(7, NoiseStream::Gnss).normals(round));
+            let back = stream(u64::MAX - 5, NoiseStream::ImuBack).normals(u32::MAX);
             let mut drawn = draws.of(15);
             let flat: [[f32; 4]; 4] = bytemuck::must_cast(drawn.four(1));
             assert_eq!(flat, [back, [0.0; 4], [0.0; 4], [0.0; 4]]);
@@ -266,7 +238,7 @@ mod tests {
     #[test]
     fn uniform_pairs_are_uniform_and_parts_differ() {
         const N: u32 = 100_000;
-        let stream = stream(7, Sensor::GnssBlackout);
+        let stream = stream(7, NoiseStream::GnssBlackout);
         let pairs: Vec<[f64; 2]> = (0..N).map(|part| stream.uniform_pair(3, part)).collect();
         for axis in 0..2 {
             let mean = pairs.iter().map(|pair| pair[axis]).sum::<f64>() / f64::from(N);
@@ -280,14 +252,14 @@ mod tests {
         const N: u32 = 100_000;
         let draw =
             |id_hash, sensor, axis: usize| move |sample: u32| f64::from(stream(id_hash, sensor).normals(sample)[axis]);
-        let reference = draw(1, Sensor::Gnss, 0);
+        let reference = draw(1, NoiseStream::Gnss, 0);
         let others: [&dyn Fn(u32) -> f64; 8] = [
-            &draw(2, Sensor::Gnss, 0),
-            &draw(1, Sensor::ImuFront, 0),
-            &draw(1, Sensor::GnssCorrelated, 0),
-            &draw(1, Sensor::Gnss, 1),
-            &draw(1, Sensor::Gnss, 2),
-            &draw(1 << 32, Sensor::Gnss, 0),
+            &draw(2, NoiseStream::Gnss, 0),
+            &draw(1, NoiseStream::ImuFront, 0),
+            &draw(1, NoiseStream::GnssCorrelated, 0),
+            &draw(1, NoiseStream::Gnss, 1),
+            &draw(1, NoiseStream::Gnss, 2),
+            &draw(1 << 32, NoiseStream::Gnss, 0),
             &|sample| reference(sample + 1),
             &|sample| reference(sample + 16),
         ];

@@ -3,9 +3,10 @@
 use ipc_schema::{
     block::{self, BlockError},
     observation::{
-        GEODETIC_COLUMNS, GNSS_COLUMNS, IMU_COLUMNS, ObservationLayout, QUALITY_COLUMNS, SENSORS,
-        SPEED_STEERING_COLUMNS, TRUTH_COLUMNS,
+        GEODETIC_COLUMNS, GNSS_COLUMNS, IMU_COLUMNS, ObservationLayout, QUALITY_COLUMNS, SPEED_STEERING_COLUMNS,
+        TRUTH_COLUMNS,
     },
+    sensor::SensorKind,
 };
 
 /// The sections of [`ObservationLayout`], as their elements.
@@ -36,7 +37,7 @@ pub struct Sections<'a> {
     /// `[n]`.
     pub episode_step: &'a mut [u32],
     /// `[n]`.
-    pub age_s: &'a mut [[f32; SENSORS]],
+    pub age_s: &'a mut [[f32; SensorKind::COUNT]],
 }
 
 impl<'a> Sections<'a> {

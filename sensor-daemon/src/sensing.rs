@@ -4,8 +4,9 @@ use ipc_schema::{
     block::BlockError,
     config::{BlackoutPolicy, Config},
     header::{FIRST_OF_EPISODE, MessageHeader},
-    observation::{CLIPPED, GNSS, LIDAR, ObservationLayout, VALID},
+    observation::{CLIPPED, ObservationLayout, VALID},
     run::MapInfo,
+    sensor::SensorKind,
     traffic::Kind,
     world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, SubStep, TIME_LIMIT, VehicleState},
 };
@@ -266,7 +267,7 @@ impl Sensing {
     pub fn lidars(&self) -> impl Iterator<Item = (usize, usize)> {
         let slots = self.row_of_slot.iter().zip(&self.carriers).enumerate();
         slots.filter_map(|(slot, (row, carrier))| match row {
-            Some(row) if carrier.awake() & LIDAR != 0 => Some((slot, *row as usize)),
+            Some(row) if SensorKind::Lidar.is_in(carrier.awake()) => Some((slot, *row as usize)),
             _ => None,
         })
     }
@@ -384,7 +385,7 @@ impl Sensing {
             out.flags[slot] |= VALID;
             self.observations += 1;
         }
-        if readings.delivering & GNSS != 0 {
+        if SensorKind::Gnss.is_in(readings.delivering) {
             let fix = &readings.fix;
             let (x_m, y_m) = (fix.x_m - state.x_m, fix.y_m - state.y_m);
             self.raw_error.sum_m += (x_m * x_m + y_m * y_m).sqrt();

@@ -56,17 +56,15 @@ pub fn sample(params: &Params, steering_ratio: f64, scales: &Scales, state: &Veh
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{
-        noise::{Sensor, Stream},
-        preset::town,
-    };
+    use crate::{noise::Stream, preset::town};
+    use ipc_schema::sensor::NoiseStream;
 
     const EXACT: Scales = Scales {
         speed: 1.0,
         steering: 1.0,
     };
 
-    fn stream(id_hash: u64, sensor: Sensor) -> Stream {
+    fn stream(id_hash: u64, sensor: NoiseStream) -> Stream {
         Stream {
             episode_seed: 1,
             id_hash,
@@ -124,7 +122,7 @@ mod tests {
             ..VehicleState::default()
         };
         let at = |state: &VehicleState, index| {
-            let normals = stream(1, Sensor::SpeedSteering).normals(index);
+            let normals = stream(1, NoiseStream::SpeedSteering).normals(index);
             sample(&params, 16.0, &EXACT, state, &normals)
         };
         let std = |of: &dyn Fn(u32) -> f64| ((0..N).map(|i| of(i).powi(2)).sum::<f64>() / f64::from(N)).sqrt();
@@ -145,7 +143,7 @@ mod tests {
             ..town().speed_steering
         };
         let scales: Vec<Scales> = (0..N)
-            .map(|id| Scales::new(&params, &stream(id, Sensor::Scale).normals(0)))
+            .map(|id| Scales::new(&params, &stream(id, NoiseStream::Scale).normals(0)))
             .collect();
         let std =
             |of: &dyn Fn(&Scales) -> f64| (scales.iter().map(|s| (of(s) - 1.0).powi(2)).sum::<f64>() / N as f64).sqrt();

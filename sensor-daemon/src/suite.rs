@@ -2,7 +2,7 @@
 
 use ipc_schema::{
     config::Config,
-    observation::{GNSS, IMU, LIDAR, SENSORS, SPEED_STEERING},
+    sensor::{NoiseStream, SENSORS, SensorCarriers, SensorKind},
     traffic::Kind,
     world::{SubStep, VehicleState},
 };
@@ -13,7 +13,7 @@ use crate::{
     carrier::Carrier,
     gnss::{self, Receiver, Sky, SkyView},
     imu::{self, Unit},
-    noise::{Drawn, Draws, Sensor, Stream},
+    noise::{Drawn, Draws, Stream},
     normals::Block,
     speed_steering::{self, Scales},
     wide::Path,
@@ -49,9 +49,9 @@ pub struct Suite {
     speed_steering: ipc_schema::config::SpeedSteering,
     speed_steering_noise: bool,
     steering_ratio: f64,
-    schedules: [Option<Schedule>; SENSORS],
+    schedules: [Option<Schedule>; SensorKind::COUNT],
     /// Ticks between two samples of each sensor.
-    periods: [u32; SENSORS],
+    periods: [u32; SensorKind::COUNT],
     imu_samples: u32,
     lidars: usize,
     lidar_range_m: f32,
@@ -83,12 +83,7 @@ impl Suite {
             speed_steering: config.speed_steering.clone(),
             steering_ratio: config.vehicle.steering_ratio,
             schedules: schedules(config, tick_ns),
-            periods: [
-                ticks(config.gnss.period_s),
-                ticks(config.imu.period_s),
-                ticks(config.speed_steering.period_s),
-                1,
-            ],
+            periods: SENSORS.map(|spec| ticks((spec.period_s)(config))),
             imu_samples: u32::try_from(samples).unwrap_or(u32::MAX),
             lidars: config.lidar.vehicles as usize,
             lidar_range_m: config.lidar.range_m as f32,
@@ -119,19 +114,20 @@ impl Suite {
     #[must_use]
     pub fn begin(&self, state: &VehicleState, slot: usize, now: &Now) -> Carrier {
         let is_person = state.kind == Kind::Person as u32;
-        let (odometer, factor) = if is_person {
-            (0, self.pedestrian_factor)
-        } else {
-            (SPEED_STEERING, 1.0)
+        let carries = |kind: SensorKind| match kind.spec().carriers {
+            SensorCarriers::Vehicles if is_person => false,
+            _ => kind != SensorKind::Lidar || slot < self.lidars,
         };
-        let lidar = if slot < self.lidars && !is_person { LIDAR } else { 0 };
+        let present = SensorKind::ALL.into_iter().filter(|kind| carries(*kind));
+        let present = present.fold(0, |bits, kind| bits | kind.bit());
+        let factor = if is_person { self.pedestrian_factor } else { 1.0 };
         let stream = Stream {
             episode_seed: now.episode_seed,
             id_hash: state.id_hash,
-            sensor: Sensor::Scale,
+            sensor: NoiseStream::Scale,
         };
         let scales = Scales::new(&self.speed_steering, &stream.normals(0));
-        let mut carrier = Carrier::new(GNSS | IMU | odometer | lidar, scales, factor, self.lidar_range_m);
+        let mut carrier = Carrier::new(present, scales, factor, self.lidar_range_m);
         for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
             if let Some(schedule) = schedule {
                 *phase = schedule.begin(now.episode_seed, state.id_hash, now.tick, now.time_ns);
@@ -153,21 +149,21 @@ impl Suite {
     /// Plans the numbers that [`Suite::sample`] takes at this tick if everything is due, with those first that are always needed.
     pub fn plan(&self, draws: &mut Draws, now: &Now) {
         if self.receiver.has_white_noise() {
-            draws.plan(Sensor::Gnss, now.tick);
+            draws.plan(NoiseStream::Gnss, now.tick);
         }
         if self.receiver.has_correlated_noise() {
-            draws.plan(Sensor::GnssCorrelated, now.tick);
+            draws.plan(NoiseStream::GnssCorrelated, now.tick);
         }
         if self.speed_steering_noise {
-            draws.plan(Sensor::SpeedSteering, now.tick);
+            draws.plan(NoiseStream::SpeedSteering, now.tick);
         }
         self.unit.plan(draws, now.tick.wrapping_mul(self.imu_samples));
     }
 
-    /// True if the sensor with this index samples at this step of its carrier; the first step samples everything.
+    /// True if the sensor samples at this step of its carrier; the first step samples everything.
     #[inline]
-    fn is_due(&self, sensor: usize, step: u32) -> bool {
-        let period = self.periods[sensor];
+    fn is_due(&self, sensor: SensorKind, step: u32) -> bool {
+        let period = self.periods[sensor.index()];
         period == 1 || step.is_multiple_of(period)
     }
 
@@ -182,18 +178,24 @@ impl Suite {
             self.speed_steering_noise,
         ]
         .map(|is_planned| drawn.take(is_planned));
-        if self.is_due(0, step) {
-            self.sample_gnss(carrier, motion, now, awake & GNSS != 0, [&normals[0], &normals[1]]);
+        if self.is_due(SensorKind::Gnss, step) {
+            self.sample_gnss(
+                carrier,
+                motion,
+                now,
+                SensorKind::Gnss.is_in(awake),
+                [&normals[0], &normals[1]],
+            );
         }
-        if self.is_due(2, step) && awake & SPEED_STEERING != 0 {
+        if self.is_due(SensorKind::SpeedSteering, step) && SensorKind::SpeedSteering.is_in(awake) {
             let (params, ratio) = (&self.speed_steering, self.steering_ratio);
             carrier.readings.speed_steering =
                 speed_steering::sample(params, ratio, &carrier.scales, motion.state, &normals[2]);
-            carrier.note(2, step);
+            carrier.note(SensorKind::SpeedSteering, step);
         }
-        self.sample_imu(carrier, motion, awake & IMU != 0, drawn, out);
-        if awake & LIDAR != 0 {
-            carrier.note(3, step);
+        self.sample_imu(carrier, motion, SensorKind::Imu.is_in(awake), drawn, out);
+        if SensorKind::Lidar.is_in(awake) {
+            carrier.note(SensorKind::Lidar, step);
         }
         carrier.age(step, self.tick_s);
     }
@@ -232,7 +234,7 @@ impl Suite {
                     factor: carrier.gnss_factor,
                 },
             );
-            carrier.note(0, motion.step);
+            carrier.note(SensorKind::Gnss, motion.step);
         }
     }
 
@@ -245,7 +247,7 @@ impl Suite {
         drawn: Drawn,
         out: &mut [imu::Sample],
     ) {
-        if self.is_due(1, motion.step) {
+        if self.is_due(SensorKind::Imu, motion.step) {
             let body = imu::Body {
                 yaw_rad: motion.state.yaw_rad,
                 rows: motion.rows,
@@ -253,7 +255,7 @@ impl Suite {
             self.unit.sample(self.path, &body, drawn, &mut carrier.walk, out);
             if is_awake && let Some(newest) = out.last() {
                 carrier.readings.imu = *newest;
-                carrier.note(1, motion.step);
+                carrier.note(SensorKind::Imu, motion.step);
                 return;
             }
         }
@@ -261,20 +263,10 @@ impl Suite {
     }
 }
 
-fn schedules(config: &Config, tick_ns: u64) -> [Option<Schedule>; SENSORS] {
-    if !config.blackout.enabled {
-        return [None; SENSORS];
-    }
-    let (gnss, imu, odometer, lidar) = (&config.gnss, &config.imu, &config.speed_steering, &config.lidar);
-    [
-        (Sensor::GnssBlackout, gnss.blackout_length_s, gnss.blackout_gap_s),
-        (Sensor::ImuBlackout, imu.blackout_length_s, imu.blackout_gap_s),
-        (
-            Sensor::SpeedSteeringBlackout,
-            odometer.blackout_length_s,
-            odometer.blackout_gap_s,
-        ),
-        (Sensor::LidarBlackout, lidar.blackout_length_s, lidar.blackout_gap_s),
-    ]
-    .map(|(sensor, length_s, gap_s)| Schedule::new(sensor, length_s, gap_s, tick_ns))
+fn schedules(config: &Config, tick_ns: u64) -> [Option<Schedule>; SensorKind::COUNT] {
+    SENSORS.map(|spec| {
+        let spans = (spec.blackouts)(config);
+        let schedule = || Schedule::new(spec.blackout_noise, spans, tick_ns);
+        config.blackout.enabled.then(schedule).flatten()
+    })
 }

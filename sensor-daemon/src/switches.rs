@@ -92,7 +92,10 @@ impl Switches {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ipc_schema::observation::{GNSS, IMU};
+    use ipc_schema::sensor::SensorKind;
+
+    const GNSS: u32 = SensorKind::Gnss.bit();
+    const IMU: u32 = SensorKind::Imu.bit();
 
     fn switch(id_hash: u64, sensors: u32, flags: u32) -> SensorSwitch {
         SensorSwitch {

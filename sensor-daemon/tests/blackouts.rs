@@ -3,14 +3,19 @@
 mod common;
 
 use common::{Run, cavs, config, quiet, road_user};
+use ipc_schema::sensor::SensorKind;
 use ipc_schema::{
     config::{BlackoutPolicy, Config, Field},
     control::{EVERY_VEHICLE, SWITCHED_ON, SensorSwitch},
-    observation::{CLIPPED, GNSS, IMU, LIDAR, SPEED_STEERING, VALID},
+    observation::{CLIPPED, VALID},
     traffic::Kind,
 };
 use sensor_daemon::gnss::{Sky, SkyView};
 
+const GNSS: u32 = SensorKind::Gnss.bit();
+const IMU: u32 = SensorKind::Imu.bit();
+const SPEED_STEERING: u32 = SensorKind::SpeedSteering.bit();
+const LIDAR: u32 = SensorKind::Lidar.bit();
 const ALL: u32 = GNSS | IMU | SPEED_STEERING;
 
 /// GNSS blackouts of exactly two seconds every four.

@@ -7,12 +7,13 @@ mod common;
 
 use allan::{overlapping_deviation, slope};
 use common::{Run, cavs, config, quiet, road_user};
+use ipc_schema::sensor::NoiseStream;
 use ipc_schema::{
     config::Config,
     traffic::Kind,
     world::{SubStep, VehicleState},
 };
-use sensor_daemon::noise::{Sensor, Stream};
+use sensor_daemon::noise::Stream;
 
 /// By definition: means over two samples of 1 2 3 4 are 1.5 2.5 3.5; their second neighbours differ by 2.
 #[test]
@@ -364,7 +365,7 @@ fn a_slow_imu_samples_when_it_is_due_and_holds() {
     let normals = Stream {
         episode_seed: 5,
         id_hash: cavs(1)[0].id_hash,
-        sensor: Sensor::ImuFront,
+        sensor: NoiseStream::ImuFront,
     }
     .normals(4);
     assert_eq!(all[3][0], 0.001 * normals[0], "the fourth tick's own numbers");

@@ -2,7 +2,11 @@
 
 use std::{ffi::OsString, path::PathBuf};
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{
+    Args, Parser, Subcommand, ValueEnum,
+    builder::{PossibleValue, PossibleValuesParser, TypedValueParser},
+};
+use ipc_schema::sensor::SensorSelection;
 
 /// Co-simulation bridge: SUMO traffic with sensing vehicles, for a learner in another process.
 #[derive(Debug, Parser)]
@@ -179,7 +183,8 @@ pub enum ControlAction {
         /// SUMO's id of the vehicle, or `all`
         vehicle: String,
         /// Which sensor
-        sensor: SensorName,
+        #[arg(value_parser = sensors())]
+        sensor: SensorSelection,
         /// On or off
         state: SwitchState,
     },
@@ -203,20 +208,10 @@ pub enum ControlAction {
     },
 }
 
-/// Sensors by name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-#[value(rename_all = "snake_case")]
-pub enum SensorName {
-    /// GNSS receiver
-    Gnss,
-    /// Inertial unit with compass
-    Imu,
-    /// Speed and steering angle
-    SpeedSteering,
-    /// LIDAR
-    Lidar,
-    /// Every sensor
-    All,
+/// Parses the name of a sensor, or `all`.
+fn sensors() -> impl TypedValueParser<Value = SensorSelection> {
+    let choices = SensorSelection::every().map(|choice| PossibleValue::new(choice.name()).help(choice.description()));
+    PossibleValuesParser::new(choices).try_map(|name| SensorSelection::by_name(&name).ok_or("no such sensor"))
 }
 
 /// State of a switched sensor.

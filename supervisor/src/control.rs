@@ -3,13 +3,13 @@
 use std::time::{Duration, Instant};
 
 use ipc_schema::{
-    control::{Command, Refusal, RefusalKind, Reply, Sensor, Switch},
+    control::{Command, Refusal, RefusalKind, Reply, Switch},
     failure::{Failure, FailureKind},
     ports::{ControlClient, Pending, PortError},
 };
 
 use crate::{
-    cli::{ControlAction, ControlArgs, SensorName, SwitchState},
+    cli::{ControlAction, ControlArgs, SwitchState},
     failure::Exit,
     line::{self, Asking, Line},
     registry,
@@ -168,13 +168,7 @@ fn command(action: &ControlAction) -> Command {
         ControlAction::Reset => Command::Reset {},
         ControlAction::Sensor { vehicle, sensor, state } => Command::Sensor {
             vehicle: (vehicle != EVERYBODY).then_some(vehicle),
-            sensor: match sensor {
-                SensorName::Gnss => Sensor::Gnss,
-                SensorName::Imu => Sensor::Imu,
-                SensorName::SpeedSteering => Sensor::SpeedSteering,
-                SensorName::Lidar => Sensor::Lidar,
-                SensorName::All => Sensor::All,
-            },
+            sensor,
             state: match state {
                 SwitchState::On => Switch::On,
                 SwitchState::Off => Switch::Off,

@@ -18,6 +18,7 @@ use ipc_schema::{
     prediction::{ESTIMATES, PredictionLayout},
     process::Process,
     run::RunFile,
+    sensor::SensorKind,
     services::Channel as Service,
     session::{self, Session, SessionError},
 };
@@ -565,13 +566,8 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("TRUNCATED", ipc_schema::observation::TRUNCATED)?;
     module.add("CLIPPED", ipc_schema::observation::CLIPPED)?;
     module.add("EMPTY_SLOT", ipc_schema::observation::EMPTY_SLOT)?;
-    for (name, bit) in [
-        ("GNSS", ipc_schema::observation::GNSS),
-        ("IMU", ipc_schema::observation::IMU),
-        ("SPEED_STEERING", ipc_schema::observation::SPEED_STEERING),
-        ("LIDAR", ipc_schema::observation::LIDAR),
-    ] {
-        module.add(name, bit)?;
+    for kind in SensorKind::ALL {
+        module.add(kind.name().to_uppercase(), kind.bit())?;
     }
     module.add("GNSS_COLUMNS", ipc_schema::observation::GNSS_COLUMNS)?;
     module.add("IMU_COLUMNS", ipc_schema::observation::IMU_COLUMNS)?;

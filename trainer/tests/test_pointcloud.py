@@ -13,7 +13,7 @@ LAYOUT = Path(__file__).parents[2] / "ipc-schema" / "layout.json"
 
 @pytest.mark.parametrize(("name", "dtype"), [("LidarPoint", POINT), ("Scan", SCAN)])
 def test_types_repeat_the_committed_table(name: str, dtype: np.dtype) -> None:
-    table = {row["name"]: row for row in json.loads(LAYOUT.read_text())}
+    table = {row["name"]: row for row in json.loads(LAYOUT.read_text())["types"]}
     assert dtype.itemsize == table[name]["size"]
     assert [[field, dtype.fields[field][1]] for field in dtype.names] == table[name]["fields"]
 

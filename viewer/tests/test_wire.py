@@ -28,7 +28,7 @@ TYPES = {
 
 @pytest.mark.parametrize(("name", "dtype"), TYPES.items())
 def test_types_repeat_the_committed_table(name: str, dtype: np.dtype[np.void]) -> None:
-    table = {row["name"]: row for row in json.loads(LAYOUT.read_text())}
+    table = {row["name"]: row for row in json.loads(LAYOUT.read_text())["types"]}
     assert dtype.itemsize == table[name]["size"]
     assert dtype.fields is not None
     assert [[field, at[1]] for field, at in dtype.fields.items()] == table[name]["fields"]

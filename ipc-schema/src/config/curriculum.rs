@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Config, Traffic};
+use crate::sensor::SENSORS;
 
 /// Stages of training.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -128,51 +129,10 @@ impl Config {
             cavs: stage.cavs,
             ..config.traffic
         };
-        config.scale_noise(stage.noise);
-        config.scale_blackouts(stage.blackout);
+        for sensor in &SENSORS {
+            (sensor.scale_noise)(&mut config, stage.noise);
+            (sensor.scale_blackouts)(&mut config, stage.blackout);
+        }
         config
-    }
-
-    fn scale_noise(&mut self, factor: f64) {
-        let (gnss, imu, speed) = (&mut self.gnss, &mut self.imu, &mut self.speed_steering);
-        let triples = [
-            &mut gnss.noise_std_m,
-            &mut gnss.bias_m,
-            &mut gnss.correlated_std_m,
-            &mut imu.accel_noise_std_mps2,
-            &mut imu.accel_noise_density,
-            &mut imu.accel_bias_mps2,
-            &mut imu.accel_bias_walk,
-            &mut imu.gyro_noise_std_radps,
-            &mut imu.gyro_noise_density,
-            &mut imu.gyro_bias_radps,
-            &mut imu.gyro_bias_walk,
-        ];
-        let singles = [
-            &mut imu.compass_noise_std_rad,
-            &mut imu.compass_bias_rad,
-            &mut speed.speed_noise_std_mps,
-            &mut speed.speed_scale_std,
-            &mut speed.steering_noise_std_rad,
-            &mut speed.steering_scale_std,
-            &mut speed.steering_bias_rad,
-        ];
-        let pairs = [&mut gnss.noise_std_deg, &mut gnss.bias_deg];
-        let values = triples
-            .into_iter()
-            .flatten()
-            .chain(pairs.into_iter().flatten())
-            .chain(singles);
-        values.for_each(|value| *value *= factor);
-    }
-
-    fn scale_blackouts(&mut self, factor: f64) {
-        let lengths = [
-            &mut self.gnss.blackout_length_s,
-            &mut self.imu.blackout_length_s,
-            &mut self.speed_steering.blackout_length_s,
-            &mut self.lidar.blackout_length_s,
-        ];
-        lengths.into_iter().flatten().for_each(|length_s| *length_s *= factor);
     }
 }

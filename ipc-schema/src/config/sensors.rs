@@ -32,6 +32,16 @@ pub struct Gnss {
     pub blackout_gap_s: [f64; 2],
 }
 
+impl Gnss {
+    /// Multiplies random errors and biases by `factor`.
+    pub(crate) fn scale_noise(&mut self, factor: f64) {
+        let angles = [&mut self.noise_std_deg, &mut self.bias_deg];
+        let lengths = [&mut self.noise_std_m, &mut self.bias_m, &mut self.correlated_std_m];
+        angles.into_iter().flatten().for_each(|value| *value *= factor);
+        lengths.into_iter().flatten().for_each(|value| *value *= factor);
+    }
+}
+
 /// Frame and gravity of what an IMU delivers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -86,6 +96,25 @@ pub struct Imu {
     pub blackout_gap_s: [f64; 2],
 }
 
+impl Imu {
+    /// Multiplies random errors and biases by `factor`.
+    pub(crate) fn scale_noise(&mut self, factor: f64) {
+        let axes = [
+            &mut self.accel_noise_std_mps2,
+            &mut self.accel_noise_density,
+            &mut self.accel_bias_mps2,
+            &mut self.accel_bias_walk,
+            &mut self.gyro_noise_std_radps,
+            &mut self.gyro_noise_density,
+            &mut self.gyro_bias_radps,
+            &mut self.gyro_bias_walk,
+        ];
+        let compass = [&mut self.compass_noise_std_rad, &mut self.compass_bias_rad];
+        axes.into_iter().flatten().for_each(|value| *value *= factor);
+        compass.into_iter().for_each(|value| *value *= factor);
+    }
+}
+
 /// Wheel speed and steering angle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -106,6 +135,20 @@ pub struct SpeedSteering {
     pub blackout_length_s: [f64; 2],
     /// Time between two blackouts, shortest and longest, seconds.
     pub blackout_gap_s: [f64; 2],
+}
+
+impl SpeedSteering {
+    /// Multiplies random errors and biases by `factor`.
+    pub(crate) fn scale_noise(&mut self, factor: f64) {
+        let values = [
+            &mut self.speed_noise_std_mps,
+            &mut self.speed_scale_std,
+            &mut self.steering_noise_std_rad,
+            &mut self.steering_scale_std,
+            &mut self.steering_bias_rad,
+        ];
+        values.into_iter().for_each(|value| *value *= factor);
+    }
 }
 
 /// What a scan holds.

@@ -1,11 +1,8 @@
 //! Fixes against exact geodesy, and their noise against its numbers.
 
 use super::*;
-use crate::{
-    noise::{Sensor, Stream},
-    preset::town,
-};
-use ipc_schema::run::MapInfo;
+use crate::{noise::Stream, preset::town};
+use ipc_schema::{run::MapInfo, sensor::NoiseStream};
 
 const UTM: &str = "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs";
 const SMALL_M: [f64; 4] = [0.0, 0.0, 260.0, 260.0];
@@ -136,7 +133,7 @@ fn the_papers_noise_is_seven_metres_on_average_and_equal_on_both_axes() {
     let stream = Stream {
         episode_seed: 1,
         id_hash: 9,
-        sensor: Sensor::Gnss,
+        sensor: NoiseStream::Gnss,
     };
     let fixes: Vec<Fix> = (0..N)
         .map(|index| open_sky(&receiver, [100.0, 50.0, 0.0], &stream.normals(index)))
@@ -183,11 +180,11 @@ fn the_receivers_estimate_is_the_root_mean_square_of_its_errors() {
     };
     let (mut squares, mut up, mut estimate) = (0.0, 0.0, 0.0);
     for index in 0..N {
-        let [e, n, u, _] = stream(Sensor::GnssCorrelated).normals(index);
+        let [e, n, u, _] = stream(NoiseStream::GnssCorrelated).normals(index);
         let fix = receiver.fix(
             [100.0, 50.0, 0.0],
             &Errors {
-                white: &stream(Sensor::Gnss).normals(index),
+                white: &stream(NoiseStream::Gnss).normals(index),
                 correlated: &[e, n, u],
                 view: &view,
                 factor: 1.5,
@@ -227,7 +224,7 @@ fn the_correlated_error_is_a_stationary_gauss_markov_process() {
         let stream = Stream {
             episode_seed: 1,
             id_hash,
-            sensor: Sensor::GnssCorrelated,
+            sensor: NoiseStream::GnssCorrelated,
         };
         let [a, b, c, _] = stream.normals(0);
         let mut path = vec![[a, b, c]];

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::{noise::Stream, preset::town};
+use ipc_schema::sensor::NoiseStream;
 use proptest::prelude::*;
 use std::f64::consts::PI;
 
@@ -268,7 +269,7 @@ fn streams_are_independent_of_how_many_are_asked_for() {
     let stream = Stream {
         episode_seed: 1,
         id_hash: 3,
-        sensor: Sensor::ImuFront,
+        sensor: NoiseStream::ImuFront,
     };
     assert_eq!(alone.of(2).at(0), stream.normals(77));
 }

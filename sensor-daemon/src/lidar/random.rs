@@ -3,11 +3,13 @@
 //! Numbers depend on (seed of the episode, vehicle, tick, ray) alone. A scan has a key of its own, drawn from Philox with the first
 //! three; then one draw of Philox serves two rays.
 
+use ipc_schema::sensor::NoiseStream;
+
 use super::simd::{Floats, Simd};
 use crate::noise::philox4x32;
 
-/// The LIDAR's number among the sensors with random streams.
-const LIDAR: u32 = 5;
+/// Number of the LIDAR's random stream.
+const LIDAR: u32 = NoiseStream::Lidar as u32;
 
 /// Random numbers of one scan.
 #[derive(Debug, Clone, Copy)]

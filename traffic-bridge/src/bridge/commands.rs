@@ -14,6 +14,7 @@ use ipc_schema::{
         SWITCHED_ON, SensorSwitch, Switch, actions,
     },
     failure::{Failure, FailureKind},
+    sensor::SENSORS,
     traffic::{Kind, MetaEvent, VehicleMeta, id_hash},
 };
 
@@ -35,7 +36,8 @@ pub(crate) struct CommandContext<'a> {
     pub(crate) step: u64,
     /// Ticks in a step.
     pub(crate) ticks_per_step: u64,
-    pub(crate) has_lidars: bool,
+    /// Bits of the sensors that any road user of the run carries.
+    pub(crate) fitted_sensors: u32,
     /// The run follows a curriculum.
     pub(crate) has_lessons: bool,
     pub(crate) senses_persons: bool,
@@ -232,8 +234,14 @@ impl CommandExecutor {
             let message = format!("{MAX_SWITCHES} sensors are already switched for this tick: send the command again");
             return Err(Refusal::new(RefusalKind::Busy, message));
         }
-        if sensors == ipc_schema::observation::LIDAR && !context.has_lidars {
-            let message = "no vehicle of this run has a LIDAR (`lidar.vehicles` = 0)";
+        if sensors & context.fitted_sensors == 0 {
+            let missing = SENSORS.iter().find(|spec| spec.kind.is_in(sensors));
+            let message = missing.map_or_else(String::new, |spec| {
+                format!(
+                    "no vehicle of this run has a {} (`{}.vehicles` = 0)",
+                    spec.label, spec.name
+                )
+            });
             return Err(Refusal::new(RefusalKind::Unsupported, message));
         }
         let id_hash = vehicle.map_or(0, id_hash);

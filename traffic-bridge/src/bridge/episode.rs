@@ -7,6 +7,7 @@ use ipc_schema::{
     ports::PortError,
     run::{RunFile, Source},
     schedule::Episode,
+    sensor::fitted_sensors,
     services::Channel,
     session::Wait,
 };
@@ -254,7 +255,7 @@ impl Bridge {
             episode: number,
             step: frame.step,
             ticks_per_step: self.ticks_per_step,
-            has_lidars: run.config.lidar.vehicles > 0,
+            fitted_sensors: fitted_sensors(&run.config),
             has_lessons: !run.config.curriculum.stages.is_empty(),
             senses_persons: run.config.gnss.pedestrians,
         };

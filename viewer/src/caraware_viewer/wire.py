@@ -1,19 +1,23 @@
 """The wire layout: decodes frames (`docs/fanout.md`).
 
 A frame is a message as it is in the simulator's shared memory: 72 bytes of header, then the payload, little endian.
-The types below repeat the committed table `ipc-schema/layout.json`; a test compares the two.
+`layout.json` beside this file is a copy of the committed tables in `ipc-schema`; a test compares the two.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
+from importlib import resources
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-SCHEMA_VERSION = 12
+_LAYOUT = json.loads(resources.files(__package__).joinpath("layout.json").read_text())
+
+SCHEMA_VERSION: int = _LAYOUT["schema_version"]
 
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""
@@ -40,12 +44,7 @@ class Sensor:
     """Bit of an observation's `sensors`: the sensor delivers."""
 
 
-SENSORS = (
-    Sensor("gnss", "GNSS", 1),
-    Sensor("imu", "IMU", 2),
-    Sensor("speed_steering", "speed+steering", 4),
-    Sensor("lidar", "LIDAR", 8),
-)
+SENSORS = tuple(Sensor(**row) for row in _LAYOUT["sensors"])
 """Every sensor, in the order of an observation's ages."""
 
 

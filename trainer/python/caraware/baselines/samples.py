@@ -4,11 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caraware._native import GNSS, IMU, SPEED_STEERING
 from caraware.ipc.arrays import BoolArray, Float64Array, UInt32Array
 from caraware.ipc.stream import Observation
-
-GNSS, IMU, SPEED_STEERING = 1, 2, 4
-"""Bits of `sensors` (ipc-schema/src/observation.rs): the sensor delivers."""
 
 YAW_RATE_SIGN = {"kinematic": 1.0, "specific_force": 1.0, "carla": -1.0}
 """CARLA's frame is left-handed (y to the right): its rates about the upward axis are clockwise. Forward is forward."""
