@@ -7,12 +7,14 @@ use serde::Serialize;
 use crate::{
     SCHEMA_VERSION,
     board::{Health, Progress, Roster, TrainingStatus},
+    config::TaskKind,
     control::{ControlReply, ControlRequest, SensorSwitch},
     ego::EgoPose,
     event::Collision,
+    field::FIELDS,
     header::MessageHeader,
     pointcloud::{LidarPoint, Scan},
-    sensor::SENSORS,
+    sensor::{SENSORS, SensorKind},
     traffic::{RoutePoint, SignalMeta, TrafficState, VehicleMeta},
     world::{HeroView, SubStep, VehicleState},
 };
@@ -281,6 +283,31 @@ pub fn sensors() -> Vec<SensorLayout> {
     rows.collect()
 }
 
+/// An observation field as other languages know it; the range of a run's fields is in its run file.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct FieldLayout {
+    /// Name in `observation.fields`.
+    pub name: &'static str,
+    /// SI unit, or "".
+    pub unit: &'static str,
+    /// The sensor that has to be there.
+    pub sensor: Option<&'static str>,
+    /// The task that has to be set.
+    pub task: Option<TaskKind>,
+}
+
+/// Every observation field.
+#[must_use]
+pub fn fields() -> Vec<FieldLayout> {
+    let rows = FIELDS.iter().map(|spec| FieldLayout {
+        name: spec.name,
+        unit: spec.unit,
+        sensor: spec.source.sensor().map(SensorKind::name),
+        task: spec.source.task(),
+    });
+    rows.collect()
+}
+
 /// A list in JSON with one line for each of its rows.
 fn lines<T: Serialize>(rows: &[T]) -> Result<String, serde_json::Error> {
     let rows: Result<Vec<String>, _> = rows.iter().map(serde_json::to_string).collect();
@@ -293,9 +320,10 @@ fn lines<T: Serialize>(rows: &[T]) -> Result<String, serde_json::Error> {
 /// A row has no form in JSON.
 pub fn json() -> Result<String, serde_json::Error> {
     Ok(format!(
-        "{{\n  \"schema_version\": {SCHEMA_VERSION},\n  \"types\": {},\n  \"sensors\": {}\n}}\n",
+        "{{\n  \"schema_version\": {SCHEMA_VERSION},\n  \"types\": {},\n  \"sensors\": {},\n  \"fields\": {}\n}}\n",
         lines(&table())?,
-        lines(&sensors())?
+        lines(&sensors())?,
+        lines(&fields())?
     ))
 }
 

@@ -29,6 +29,7 @@ mod control_port;
 pub mod ego;
 pub mod event;
 pub mod failure;
+pub mod field;
 pub mod flow;
 pub mod header;
 pub mod layout;

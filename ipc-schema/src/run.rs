@@ -4,7 +4,13 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::{SCHEMA_VERSION, config::Config, process::Process, schedule};
+use crate::{
+    SCHEMA_VERSION,
+    config::Config,
+    field::{RunField, run_fields},
+    process::Process,
+    schedule,
+};
 
 /// What a run is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -198,6 +204,15 @@ pub enum RunFileError {
     },
 }
 
+/// The run file as it is written: with what readers in other languages would have to work out.
+#[derive(Serialize)]
+struct WrittenRun<'a> {
+    #[serde(flatten)]
+    run: &'a RunFile,
+    /// Every field of an observation with its range.
+    observation_fields: Vec<RunField>,
+}
+
 impl RunFile {
     /// Reads and checks a run file.
     ///
@@ -227,7 +242,11 @@ impl RunFile {
     /// Not writable.
     pub fn write(&self) -> Result<PathBuf, RunFileError> {
         let path = self.run_dir.join("run.json");
-        let text = serde_json::to_string_pretty(self).map_err(|source| RunFileError::Format {
+        let written = WrittenRun {
+            run: self,
+            observation_fields: run_fields(&self.config, &self.map),
+        };
+        let text = serde_json::to_string_pretty(&written).map_err(|source| RunFileError::Format {
             path: path.clone(),
             source,
         })?;

@@ -1,9 +1,9 @@
 //! From sensor values to a normalised row.
 
 use ipc_schema::{
-    config::{Field, Observation as Params, Scale},
+    config::{Config, Field, Scale},
     sensor::SensorKind,
-    world::{HeroView, ROUTE_AHEAD_M, SIGHT_M},
+    world::HeroView,
 };
 
 use crate::{gnss::Fix, imu, speed_steering};
@@ -26,15 +26,6 @@ pub struct Readings {
     /// What a hero sees of its route.
     pub route: HeroView,
 }
-
-/// Range of the distance to the route, metres.
-const ROUTE_OFFSET_M: f64 = 5.0;
-/// Range of the way left, metres.
-const ROUTE_LEFT_M: f64 = 1000.0;
-/// Range of heights above and below the ground, metres.
-const HEIGHT_M: f64 = 100.0;
-/// Range of the receiver's estimate of its error, metres.
-const ACCURACY_M: f64 = 50.0;
 
 impl Readings {
     #[inline(always)]
@@ -86,19 +77,6 @@ impl Readings {
     }
 }
 
-/// Bit of the sensor that a field shows; 0 for what is known in a blackout too.
-fn sensor(field: Field) -> u32 {
-    match field {
-        Field::GnssX | Field::GnssY | Field::GnssZ | Field::GnssAccuracy => SensorKind::Gnss.bit(),
-        Field::AccelX | Field::AccelY | Field::AccelZ | Field::GyroX | Field::GyroY | Field::GyroZ | Field::Compass => {
-            SensorKind::Imu.bit()
-        }
-        Field::Speed | Field::Steering => SensorKind::SpeedSteering.bit(),
-        object if object >= Field::Object1X && object <= Field::Object4Y => SensorKind::Lidar.bit(),
-        _ => 0,
-    }
-}
-
 /// One field with its range.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Column {
@@ -118,21 +96,21 @@ pub struct Normaliser {
 }
 
 impl Normaliser {
-    /// Ranges from the map's bounds `[x_min, y_min, x_max, y_max]` (metres), the LIDAR's range (metres) and the configuration.
+    /// Ranges from the configuration and the map's bounds `[x_min, y_min, x_max, y_max]` (metres).
     #[must_use]
-    pub fn new(params: &Params, bounds_m: [f64; 4], lidar_range_m: f64) -> Self {
-        let columns = params.fields.iter().map(|field| {
-            let (low, high) = range(*field, params, bounds_m, lidar_range_m);
+    pub fn new(config: &Config, bounds_m: [f64; 4]) -> Self {
+        let columns = config.observation.fields.iter().map(|field| {
+            let (low, high) = field.spec().range.ends(config, bounds_m);
             Column {
                 field: *field,
                 low,
                 span: high - low,
-                sensor: sensor(*field),
+                sensor: field.measurement_bit(),
             }
         });
         Self {
             columns: columns.collect(),
-            scale: match params.scale {
+            scale: match config.observation.scale {
                 Scale::ZeroToOne => [1.0, 0.0],
                 Scale::MinusOneToOne => [2.0, -1.0],
             },
@@ -175,50 +153,16 @@ impl Normaliser {
     }
 }
 
-/// Lower and upper end of a field.
-fn range(field: Field, params: &Params, bounds_m: [f64; 4], lidar_range_m: f64) -> (f64, f64) {
-    match field {
-        Field::GnssX => (bounds_m[0], bounds_m[2]),
-        Field::GnssY => (bounds_m[1], bounds_m[3]),
-        Field::GnssZ => (-HEIGHT_M, HEIGHT_M),
-        Field::GnssAccuracy => (0.0, ACCURACY_M),
-        Field::AccelX | Field::AccelY | Field::AccelZ => (-params.accel_range_mps2, params.accel_range_mps2),
-        Field::GyroX | Field::GyroY | Field::GyroZ => (-params.gyro_range_radps, params.gyro_range_radps),
-        Field::Compass => (0.0, std::f64::consts::TAU),
-        Field::GnssAge | Field::ImuAge | Field::SpeedSteeringAge => (0.0, params.age_range_s),
-        Field::GnssValid | Field::ImuValid | Field::SpeedSteeringValid => (0.0, 1.0),
-        Field::RouteX5 | Field::RouteY5 => (-ROUTE_AHEAD_M[0], ROUTE_AHEAD_M[0]),
-        Field::RouteX10 | Field::RouteY10 => (-ROUTE_AHEAD_M[1], ROUTE_AHEAD_M[1]),
-        Field::RouteX20 | Field::RouteY20 => (-ROUTE_AHEAD_M[2], ROUTE_AHEAD_M[2]),
-        Field::RouteX40 | Field::RouteY40 => (-ROUTE_AHEAD_M[3], ROUTE_AHEAD_M[3]),
-        Field::RouteOffset => (-ROUTE_OFFSET_M, ROUTE_OFFSET_M),
-        Field::RouteLeft => (0.0, ROUTE_LEFT_M),
-        Field::LeaderGap | Field::SignalGap => (0.0, SIGHT_M),
-        Field::Speed | Field::SpeedLimit | Field::LeaderSpeed => (0.0, params.speed_range_mps),
-        Field::Steering => (-params.steering_range_rad, params.steering_range_rad),
-        Field::Object1X
-        | Field::Object1Y
-        | Field::Object2X
-        | Field::Object2Y
-        | Field::Object3X
-        | Field::Object3Y
-        | Field::Object4X
-        | Field::Object4Y => (-lidar_range_m, lidar_range_m),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::preset::town;
     use proptest::prelude::*;
 
-    fn params(fields: Vec<Field>, scale: Scale) -> Params {
-        Params {
-            fields,
-            scale,
-            ..town().observation
-        }
+    fn config(fields: Vec<Field>, scale: Scale) -> Config {
+        let mut config = town();
+        (config.observation.fields, config.observation.scale) = (fields, scale);
+        config
     }
 
     const BOUNDS_M: [f64; 4] = [0.0, 100.0, 200.0, 300.0];
@@ -248,12 +192,10 @@ mod tests {
             Field::Steering,
         ];
         let mut row = [9.0; 7];
-        assert!(
-            !Normaliser::new(&params(fields.clone(), Scale::ZeroToOne), BOUNDS_M, 100.0).fill(&readings, 0, &mut row)
-        );
+        assert!(!Normaliser::new(&config(fields.clone(), Scale::ZeroToOne), BOUNDS_M).fill(&readings, 0, &mut row));
         let near = |row: [f32; 7], expected: [f32; 7]| (0..7).all(|i| (row[i] - expected[i]).abs() < 1e-7);
         assert!(near(row, [0.5, 0.25, 1.0, 0.0, 0.75, 0.5, 0.75]), "{row:?}");
-        assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M, 100.0).fill(&readings, 0, &mut row));
+        assert!(!Normaliser::new(&config(fields, Scale::MinusOneToOne), BOUNDS_M).fill(&readings, 0, &mut row));
         assert!(near(row, [0.0, -0.5, 1.0, -1.0, 0.5, 0.0, 0.5]), "{row:?}");
     }
 
@@ -285,7 +227,7 @@ mod tests {
             Field::SignalGap,
         ];
         let mut row = [9.0; 10];
-        assert!(!Normaliser::new(&params(fields, Scale::MinusOneToOne), BOUNDS_M, 100.0).fill(&readings, 0, &mut row));
+        assert!(!Normaliser::new(&config(fields, Scale::MinusOneToOne), BOUNDS_M).fill(&readings, 0, &mut row));
         assert_eq!(row, [1.0, 0.5, -1.0, 0.0, 0.0, -0.5, -0.5, 1.0, -1.0, -0.5]);
     }
 
@@ -316,7 +258,9 @@ mod tests {
             Field::Object4X,
             Field::Object4Y,
         ];
-        let normaliser = Normaliser::new(&params(fields, Scale::ZeroToOne), BOUNDS_M, 80.0);
+        let mut config = config(fields, Scale::ZeroToOne);
+        config.lidar.range_m = 80.0;
+        let normaliser = Normaliser::new(&config, BOUNDS_M);
         assert_eq!(normaliser.needs(), SensorKind::Gnss.bit() | SensorKind::Lidar.bit());
         let mut row = [9.0; 12];
         assert!(!normaliser.fill(&readings, 0, &mut row));
@@ -333,7 +277,7 @@ mod tests {
             ..Readings::default()
         };
         let fields = vec![Field::GnssX, Field::Speed, Field::GnssAge, Field::AccelX];
-        let normaliser = Normaliser::new(&params(fields, Scale::ZeroToOne), BOUNDS_M, 100.0);
+        let normaliser = Normaliser::new(&config(fields, Scale::ZeroToOne), BOUNDS_M);
         let mut row = [9.0; 4];
         assert!(!normaliser.fill(&readings, SensorKind::Gnss.bit() | SensorKind::Imu.bit(), &mut row));
         assert!(row[0].is_nan() && row[3].is_nan());
@@ -348,7 +292,7 @@ mod tests {
             let readings = Readings { fix: Fix { x_m: x, ..Fix::default() }, ..Readings::default() };
             for (scale, low) in [(Scale::ZeroToOne, 0.0), (Scale::MinusOneToOne, -1.0)] {
                 let mut row = [9.0];
-                let clipped = Normaliser::new(&params(vec![Field::GnssX], scale), BOUNDS_M, 100.0).fill(&readings, 0, &mut row);
+                let clipped = Normaliser::new(&config(vec![Field::GnssX], scale), BOUNDS_M).fill(&readings, 0, &mut row);
                 prop_assert!((low..=1.0).contains(&row[0]));
                 prop_assert_eq!(clipped, !(0.0..=200.0).contains(&x));
             }

@@ -4,11 +4,12 @@ use std::sync::Arc;
 
 use ipc_schema::{
     block,
-    config::{Config, Field},
+    config::Config,
     failure::{Failure, FailureKind},
     header::MessageHeader,
     pointcloud::{LidarPoint, PointcloudLayout, Scan},
     ports::Publisher,
+    sensor::SensorKind,
     world::{SubStep, VehicleState},
 };
 use serde::Serialize;
@@ -49,7 +50,6 @@ impl Scanning {
     /// # Errors
     /// A ray table or mesh cannot be used.
     pub fn new(config: &Config, scenes: &[Arc<Scene>], publisher: Publisher) -> Result<Self, Failure> {
-        let objects = Field::Object1X..=Field::Object4Y;
         let lidars = scenes.iter().map(|scene| Lidar::new(config, scene));
         Ok(Self {
             lidars: lidars.collect::<Result<_, _>>()?,
@@ -57,7 +57,11 @@ impl Scanning {
             scratch: Scratch::default(),
             publisher,
             sub_steps: config.run.sub_steps as usize,
-            shows_objects: config.observation.fields.iter().any(|field| objects.contains(field)),
+            shows_objects: config
+                .observation
+                .fields
+                .iter()
+                .any(|field| SensorKind::Lidar.is_in(field.measurement_bit())),
             tally: Tally::default(),
         })
     }

@@ -103,7 +103,7 @@ impl Sensing {
     /// A map's projection is not understood, or the map is outside its domain.
     pub fn on_maps(config: &Config, bounds_m: [f64; 4], maps: &[MapInfo]) -> Result<Self, GeodesyError> {
         let tick_ns = ((config.run.tick_s * 1e9).round() as u64).max(1);
-        let normaliser = Normaliser::new(&config.observation, bounds_m, config.lidar.range_m);
+        let normaliser = Normaliser::new(config, bounds_m);
         let projections: Vec<Projection> = maps.iter().map(Projection::new).collect::<Result<_, _>>()?;
         let places = places(config).into_iter().filter(|(_, map)| *map < maps.len());
         let suites = places.map(|(stage, map)| {

@@ -19,13 +19,13 @@ FIELDS = ["gnss_x", "gnss_y", "speed"]
 
 def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: int = 1000) -> dict:
     """A run file of population control."""
-    observation = {"fields": FIELDS, "accel_range_mps2": 20.0, "gyro_range_radps": 2.0, "speed_range_mps": 30.0}
+    observation = {"fields": FIELDS}
     config = {
         "run": {"seed": 5, "tick_s": 0.1},
         "task": {"kind": "driving" if drives else "localisation"},
         "traffic": {"cavs": slots, "heroes": slots, "pedestrians": 0},
         "episode": {"ticks": episode_ticks},
-        "observation": observation | {"steering_range_rad": 10.0},
+        "observation": observation,
         "gnss": {},
         "trainer": {"reward": "bounded_inverse", "reward_scale_m": 5.0},
     }
@@ -33,6 +33,11 @@ def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: i
         "run_dir": run_dir,
         "config": config,
         "map": {"bounds_m": [0.0, 0.0, 200.0, 100.0]},
+        "observation_fields": [
+            {"name": "gnss_x", "unit": "m", "range": [0.0, 200.0]},
+            {"name": "gnss_y", "unit": "m", "range": [0.0, 100.0]},
+            {"name": "speed", "unit": "m/s", "range": [0.0, 30.0]},
+        ],
         "source": {"population": {}},
     }
 

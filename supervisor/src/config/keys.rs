@@ -1,5 +1,7 @@
 //! The table of configuration keys: name, kind, unit, range, meaning. Checking, `--set` and `configs/README.md` follow it.
 
+use ipc_schema::field::{FIELD_PRESETS, FIELDS};
+
 /// What a key's value may be.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Kind {
@@ -70,61 +72,6 @@ pub struct Key {
     /// True if a configuration need not have a value for it.
     pub optional: bool,
 }
-
-/// Names of observation fields, in the order of the wire.
-pub const FIELD_NAMES: [&str; 41] = [
-    "gnss_x",
-    "gnss_y",
-    "accel_x",
-    "accel_y",
-    "accel_z",
-    "gyro_x",
-    "gyro_y",
-    "gyro_z",
-    "compass",
-    "speed",
-    "steering",
-    "gnss_z",
-    "gnss_accuracy",
-    "gnss_age",
-    "gnss_valid",
-    "imu_age",
-    "imu_valid",
-    "speed_steering_age",
-    "speed_steering_valid",
-    "object_1_x",
-    "object_1_y",
-    "object_2_x",
-    "object_2_y",
-    "object_3_x",
-    "object_3_y",
-    "object_4_x",
-    "object_4_y",
-    "route_x_5",
-    "route_y_5",
-    "route_x_10",
-    "route_y_10",
-    "route_x_20",
-    "route_y_20",
-    "route_x_40",
-    "route_y_40",
-    "speed_limit",
-    "route_offset",
-    "route_left",
-    "leader_gap",
-    "leader_speed",
-    "signal_gap",
-];
-
-/// Presets of `observation.fields`: name and the parts of [`FIELD_NAMES`] that they take, first and past the last.
-pub const FIELD_PRESETS: [(&str, &[[usize; 2]]); 3] = [
-    ("paper", &[[0, 9]]),
-    ("caraware", &[[0, 11]]),
-    ("driving", &[[9, 11], [27, 41]]),
-];
-
-/// First of [`FIELD_NAMES`] that only a hero has.
-pub const FIRST_HERO_FIELD: usize = 27;
 
 const fn key(path: &'static str, kind: Kind, unit: &'static str, meaning: &'static str) -> Key {
     Key {
@@ -433,10 +380,11 @@ impl Key {
             Kind::ChoiceOrClass(words) => format!("{}, \"package.module:Class\"", quoted(words)),
             Kind::Text => "text".into(),
             Kind::Texts => "list of texts".into(),
-            Kind::Fields => format!(
-                "\"paper\", \"caraware\", \"driving\", or a list of {}",
-                FIELD_NAMES.join(", ")
-            ),
+            Kind::Fields => {
+                let presets = FIELD_PRESETS.map(|preset| format!("\"{}\"", preset.name));
+                let names: Vec<&str> = FIELDS.iter().map(|spec| spec.name).collect();
+                format!("{}, or a list of {}", presets.join(", "), names.join(", "))
+            }
             Kind::Floats { count, min, max } => format!("{count} × {min} … {max}, or one for all"),
             Kind::Span { min, max } => format!("[shortest, longest] in {min} … {max}"),
             Kind::Integers { min, max } => format!("list of {min} … {max}"),

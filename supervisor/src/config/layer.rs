@@ -2,6 +2,7 @@
 
 use std::{collections::BTreeMap, ops::Range, sync::Arc};
 
+use ipc_schema::field::{Field, FieldPreset};
 use miette::NamedSource;
 use serde_json::Value;
 use toml::{
@@ -11,7 +12,7 @@ use toml::{
 
 use super::{
     error::ConfigError,
-    keys::{self, FIELD_NAMES, FIELD_PRESETS, Key, Kind},
+    keys::{self, Key, Kind},
 };
 
 /// Text with a name, for messages that show the line.
@@ -237,16 +238,15 @@ fn texts(value: &DeValue<'_>) -> Option<Value> {
 
 fn fields(value: &DeValue<'_>) -> Option<Value> {
     if let Some(preset) = value.as_str() {
-        let (_, parts) = FIELD_PRESETS.iter().find(|(name, _)| *name == preset)?;
-        let names: Vec<&str> = parts
-            .iter()
-            .flat_map(|[first, end]| &FIELD_NAMES[*first..*end])
-            .copied()
+        let names: Vec<&str> = FieldPreset::by_name(preset)?
+            .fields()
+            .into_iter()
+            .map(Field::name)
             .collect();
         return Some(Value::from(names));
     }
     let names: Option<Vec<&str>> = value.as_array()?.iter().map(|item| item.get_ref().as_str()).collect();
     let names = names?;
-    let known = !names.is_empty() && names.iter().all(|name| FIELD_NAMES.contains(name));
+    let known = !names.is_empty() && names.iter().all(|name| Field::by_name(name).is_some());
     known.then(|| Value::from(names))
 }

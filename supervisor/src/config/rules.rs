@@ -1,7 +1,7 @@
 //! Rules between keys: rates that must divide each other, sizes that must fit.
 
 use ipc_schema::{
-    config::{Config, class_model},
+    config::{Config, TaskKind, class_model},
     props::Obstacle,
     traffic::VEHICLE_CLASSES,
 };
@@ -9,10 +9,7 @@ use ipc_schema::{
 mod curriculum;
 mod sensors;
 
-use super::{
-    ConfigError, Settings,
-    keys::{FIELD_NAMES, FIRST_HERO_FIELD},
-};
+use super::{ConfigError, Settings};
 
 /// Checks every rule.
 pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
@@ -163,13 +160,11 @@ fn undrivable(config: &Config) -> Option<Refusal> {
 }
 
 /// The first field of the observation that only a hero has.
-fn hero_field(config: &Config) -> Option<String> {
-    let heroes = &FIELD_NAMES[FIRST_HERO_FIELD..];
-    let names = config.observation.fields.iter().filter_map(|field| {
-        let name = serde_json::to_value(field).ok()?;
-        name.as_str().map(str::to_owned)
-    });
-    names.into_iter().find(|name| heroes.contains(&name.as_str()))
+fn hero_field(config: &Config) -> Option<&'static str> {
+    let mut fields = config.observation.fields.iter().map(|field| field.spec());
+    fields
+        .find(|spec| spec.source.task() == Some(TaskKind::Driving))
+        .map(|spec| spec.name)
 }
 
 /// A polygon has corners, and excludes a circle.

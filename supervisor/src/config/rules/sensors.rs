@@ -1,6 +1,9 @@
 //! Rules of the sensors: rates that divide each other, fields of view that hold something, fields that have a source.
 
-use ipc_schema::config::{Config, Field, Lidar};
+use ipc_schema::{
+    config::{Config, Lidar},
+    sensor::fitted_sensors,
+};
 
 use super::{ConfigError, Settings, conflict, is_multiple};
 
@@ -126,16 +129,18 @@ fn rates(config: &Config) -> Option<Refusal> {
 
 /// What a field shows must be there.
 fn observation(config: &Config) -> Option<Refusal> {
-    let fields = &config.observation.fields;
-    let needs_lidar = fields
-        .iter()
-        .any(|field| *field >= Field::Object1X && *field <= Field::Object4Y);
-    if needs_lidar && config.lidar.vehicles == 0 {
-        return Some((
-            "observation.fields",
-            "`observation.fields` has nearest objects, which only a LIDAR sees".into(),
-            "set lidar.vehicles to the number of vehicles that carry one, or leave the fields out".into(),
-        ));
+    let fitted = fitted_sensors(config);
+    for field in &config.observation.fields {
+        if let Some(sensor) = field.spec().source.sensor()
+            && !sensor.is_in(fitted)
+        {
+            let (field, label, name) = (field.name(), sensor.spec().label, sensor.name());
+            return Some((
+                "observation.fields",
+                format!("`observation.fields` has \"{field}\", which only a {label} sees"),
+                format!("set {name}.vehicles to the number of vehicles that carry one, or leave the field out"),
+            ));
+        }
     }
     if config.gnss.pedestrians && config.drives() {
         return Some((

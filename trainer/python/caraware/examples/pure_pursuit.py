@@ -14,14 +14,10 @@ from caraware.ipc.run_file import ConfigTable
 AHEAD_M, WHEELBASE_M, BRAKING_MPS2, LATERAL_MPS2, STAND_OFF_M, KP, KI = (5, 10, 20), 2.7, 2.0, 2.0, 5.0, 1.0, 0.1
 
 
-def si_units(row: Tensor, config: ConfigTable) -> dict[str, float]:
+def si_units(row: Tensor, names: list[str], ranges: dict[str, list[float]]) -> dict[str, float]:
     """A normalised row of the observation (-1 ... 1) by field, in SI units."""
-    settings = config["observation"]
-    values = zip(settings["fields"], row.tolist(), strict=True)
-    low = {f"route_{axis}_{d}": -d for axis in "xy" for d in AHEAD_M}
-    high = {name: -value for name, value in low.items()} | {"leader_gap": 100, "signal_gap": 100}
-    high |= dict.fromkeys(("speed", "speed_limit", "leader_speed"), settings["speed_range_mps"])
-    return {name: ((1 - v) * low.get(name, 0) + (1 + v) * high[name]) / 2 for name, v in values if name in high}
+    values = zip(names, row.tolist(), strict=True)
+    return {name: ((1 - v) * ranges[name][0] + (1 + v) * ranges[name][1]) / 2 for name, v in values}
 
 
 def drive(o: dict[str, float], integral_m: float, config: ConfigTable) -> tuple[float, float, float]:
@@ -45,13 +41,14 @@ def main(run_file: str) -> None:
     channel, ended, steps = Channel(run_file), False, 0
     stop: list[int] = []
     integrals: dict[int, float] = {}
-    config = channel.run["config"]
+    config, names = channel.run["config"], channel.run["config"]["observation"]["fields"]
+    ranges = {field["name"]: field["range"] for field in channel.run["observation_fields"]}
     signal.signal(signal.SIGTERM, lambda number, _: stop.append(number))
     while not ended and not stop:
         for obs in channel.receive(0.2):
             actions = np.zeros((len(obs.vehicle), 2), np.float32)
             for slot in np.flatnonzero(obs.valid):
-                seen, before = si_units(obs.observation[slot], config), integrals.get(obs.vehicle[slot], 0.0)
+                seen, before = si_units(obs.observation[slot], names, ranges), integrals.get(obs.vehicle[slot], 0.0)
                 *actions[slot], integrals[obs.vehicle[slot]] = drive(seen, before, config)
             channel.publish_actions(obs, np.clip(actions, -1.0, 1.0))
             channel.consumed(obs.tick)

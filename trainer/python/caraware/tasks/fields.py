@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,20 +65,5 @@ class Fields:
 
 
 def _ranges(run: RunFile) -> dict[str, tuple[float, float]]:
-    settings, lidar = run["config"]["observation"], run["config"].get("lidar", {})
-    x_min, y_min, x_max, y_max = run["map"]["bounds_m"]
-    ranges = {"gnss_x": (x_min, x_max), "gnss_y": (y_min, y_max), "compass": (0.0, math.tau)}
-    ranges |= {f"accel_{axis}": _both(settings["accel_range_mps2"]) for axis in "xyz"}
-    ranges |= {f"gyro_{axis}": _both(settings["gyro_range_radps"]) for axis in "xyz"}
-    ranges |= dict.fromkeys(("speed", "speed_limit", "leader_speed"), (0.0, settings["speed_range_mps"]))
-    ranges |= {f"route_{axis}_{ahead}": _both(ahead) for axis in "xy" for ahead in (5, 10, 20, 40)}
-    ranges |= {"steering": _both(settings["steering_range_rad"]), "route_offset": _both(5), "route_left": (0.0, 1e3)}
-    ranges |= dict.fromkeys(("leader_gap", "signal_gap"), (0.0, 100.0)) | {"gnss_accuracy": (0.0, 50.0)}
-    for sensor in ("gnss", "imu", "speed_steering"):
-        ranges |= {f"{sensor}_age": (0.0, settings.get("age_range_s", 10.0)), f"{sensor}_valid": (0.0, 1.0)}
-    reach_m = lidar.get("range_m", 100.0)
-    return ranges | {f"object_{i}_{axis}": _both(reach_m) for i in range(1, 5) for axis in "xy"}
-
-
-def _both(limit: float) -> tuple[float, float]:
-    return (-float(limit), float(limit))
+    """Lower and upper end of every field in SI units, as the run file names them."""
+    return {field["name"]: (field["range"][0], field["range"][1]) for field in run["observation_fields"]}

@@ -1,0 +1,410 @@
+//! The fields of an observation, each specified once: name, unit, range, and what it shows. Names, presets, the check of the
+//! configuration, the normalisation and the ranges that Python reads derive from [`FIELDS`] (decision 21).
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
+
+use crate::{
+    config::{Config, TaskKind},
+    run::MapInfo,
+    sensor::SensorKind,
+    world::{ROUTE_AHEAD_M, SIGHT_M},
+};
+
+/// Range of the distance to the route, metres.
+const ROUTE_OFFSET_M: f64 = 5.0;
+/// Range of the way left, metres.
+const ROUTE_LEFT_M: f64 = 1000.0;
+/// Range of heights above and below the ground, metres.
+const HEIGHT_M: f64 = 100.0;
+/// Range of the receiver's estimate of its error, metres.
+const ACCURACY_M: f64 = 50.0;
+
+/// What a field shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FieldSource {
+    /// What a sensor measures: unknown while the sensor is dark.
+    Measurement(SensorKind),
+    /// How old and how valid a sensor's newest sample is: known while the sensor is dark, too.
+    Delivery(SensorKind),
+    /// The route and the traffic on it, which only a hero has.
+    Route,
+}
+
+/// Which values of a field the normalised range stands for.
+#[derive(Debug, Clone, Copy)]
+pub enum FieldRange {
+    /// West to east of the map.
+    MapX,
+    /// South to north of the map.
+    MapY,
+    /// From the first to the second.
+    Within(f64, f64),
+    /// From 0 to this.
+    UpTo(fn(&Config) -> f64),
+    /// From minus this to plus this.
+    PlusMinus(fn(&Config) -> f64),
+}
+
+impl FieldRange {
+    /// Lower and upper end, in the field's unit, with the map's bounds `[x_min, y_min, x_max, y_max]` (metres).
+    #[must_use]
+    pub fn ends(self, config: &Config, bounds_m: [f64; 4]) -> (f64, f64) {
+        match self {
+            Self::MapX => (bounds_m[0], bounds_m[2]),
+            Self::MapY => (bounds_m[1], bounds_m[3]),
+            Self::Within(low, high) => (low, high),
+            Self::UpTo(high) => (0.0, high(config)),
+            Self::PlusMinus(limit) => (-limit(config), limit(config)),
+        }
+    }
+}
+
+/// One row of [`FIELDS`].
+#[derive(Debug, Clone, Copy)]
+pub struct FieldSpec {
+    /// The field.
+    pub field: Field,
+    /// Name in the configuration and in JSON.
+    pub name: &'static str,
+    /// SI unit, or "" for a number without one.
+    pub unit: &'static str,
+    /// Which values the normalised range stands for; what is outside is clipped.
+    pub range: FieldRange,
+    /// What it shows.
+    pub source: FieldSource,
+}
+
+/// Declares [`Field`] and [`FIELDS`] from one list: variant, name, unit, range and source of each field.
+macro_rules! fields {
+    ($($(#[$doc:meta])* $field:ident: $name:literal, $unit:literal, $range:expr, $source:expr;)+) => {
+        /// One field of the observation.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+        #[repr(u8)]
+        pub enum Field {
+            $($(#[$doc])* $field,)+
+        }
+
+        /// Every field, by [`Field`].
+        pub const FIELDS: &[FieldSpec] = &[
+            $(FieldSpec { field: Field::$field, name: $name, unit: $unit, range: $range, source: $source },)+
+        ];
+    };
+}
+
+use FieldRange::{MapX, MapY, PlusMinus, UpTo, Within};
+use FieldSource::{Delivery, Measurement, Route};
+use SensorKind::{Gnss, Imu, Lidar, SpeedSteering};
+
+const ACCELERATION: FieldRange = PlusMinus(|config| config.observation.accel_range_mps2);
+const ROTATION: FieldRange = PlusMinus(|config| config.observation.gyro_range_radps);
+const SPEED: FieldRange = UpTo(|config| config.observation.speed_range_mps);
+const AGE: FieldRange = UpTo(|config| config.observation.age_range_s);
+const VALIDITY: FieldRange = Within(0.0, 1.0);
+/// The end of the range stands for no object.
+const OBJECT: FieldRange = PlusMinus(|config| config.lidar.range_m);
+/// The end of the range stands for nothing in sight.
+const SIGHT: FieldRange = Within(0.0, SIGHT_M);
+
+/// Range of the route at the `index`-th of [`ROUTE_AHEAD_M`].
+const fn ahead(index: usize) -> FieldRange {
+    Within(-ROUTE_AHEAD_M[index], ROUTE_AHEAD_M[index])
+}
+
+fields! {
+    /// GNSS fix, east, world frame.
+    GnssX: "gnss_x", "m", MapX, Measurement(Gnss);
+    /// GNSS fix, north, world frame.
+    GnssY: "gnss_y", "m", MapY, Measurement(Gnss);
+    /// Accelerometer, forward.
+    AccelX: "accel_x", "m/s²", ACCELERATION, Measurement(Imu);
+    /// Accelerometer, left.
+    AccelY: "accel_y", "m/s²", ACCELERATION, Measurement(Imu);
+    /// Accelerometer, up.
+    AccelZ: "accel_z", "m/s²", ACCELERATION, Measurement(Imu);
+    /// Gyroscope, roll rate.
+    GyroX: "gyro_x", "rad/s", ROTATION, Measurement(Imu);
+    /// Gyroscope, pitch rate.
+    GyroY: "gyro_y", "rad/s", ROTATION, Measurement(Imu);
+    /// Gyroscope, yaw rate.
+    GyroZ: "gyro_z", "rad/s", ROTATION, Measurement(Imu);
+    /// Heading clockwise from north.
+    Compass: "compass", "rad", Within(0.0, std::f64::consts::TAU), Measurement(Imu);
+    /// Wheel speed.
+    Speed: "speed", "m/s", SPEED, Measurement(SpeedSteering);
+    /// Steering-wheel angle.
+    Steering: "steering", "rad", PlusMinus(|config| config.observation.steering_range_rad), Measurement(SpeedSteering);
+    /// GNSS fix, height in the world frame about its origin.
+    GnssZ: "gnss_z", "m", Within(-HEIGHT_M, HEIGHT_M), Measurement(Gnss);
+    /// GNSS receiver's own estimate of its horizontal error (1σ of the distance).
+    GnssAccuracy: "gnss_accuracy", "m", Within(0.0, ACCURACY_M), Measurement(Gnss);
+    /// Age of the newest GNSS fix.
+    GnssAge: "gnss_age", "s", AGE, Delivery(Gnss);
+    /// 1 while the GNSS receiver delivers, 0 in a blackout.
+    GnssValid: "gnss_valid", "", VALIDITY, Delivery(Gnss);
+    /// Age of the newest IMU sample.
+    ImuAge: "imu_age", "s", AGE, Delivery(Imu);
+    /// 1 while the IMU delivers, 0 in a blackout.
+    ImuValid: "imu_valid", "", VALIDITY, Delivery(Imu);
+    /// Age of the newest speed and steering sample.
+    SpeedSteeringAge: "speed_steering_age", "s", AGE, Delivery(SpeedSteering);
+    /// 1 while the speed and steering sensor delivers, 0 in a blackout.
+    SpeedSteeringValid: "speed_steering_valid", "", VALIDITY, Delivery(SpeedSteering);
+    /// Nearest object that the LIDAR sees: its nearest point, forward of the rear axle.
+    Object1X: "object_1_x", "m", OBJECT, Measurement(Lidar);
+    /// Nearest object: its nearest point, to the left of the rear axle.
+    Object1Y: "object_1_y", "m", OBJECT, Measurement(Lidar);
+    /// Second nearest object, forward.
+    Object2X: "object_2_x", "m", OBJECT, Measurement(Lidar);
+    /// Second nearest object, left.
+    Object2Y: "object_2_y", "m", OBJECT, Measurement(Lidar);
+    /// Third nearest object, forward.
+    Object3X: "object_3_x", "m", OBJECT, Measurement(Lidar);
+    /// Third nearest object, left.
+    Object3Y: "object_3_y", "m", OBJECT, Measurement(Lidar);
+    /// Fourth nearest object, forward.
+    Object4X: "object_4_x", "m", OBJECT, Measurement(Lidar);
+    /// Fourth nearest object, left.
+    Object4Y: "object_4_y", "m", OBJECT, Measurement(Lidar);
+    /// The route 5 m ahead, forward of the rear axle.
+    RouteX5: "route_x_5", "m", ahead(0), Route;
+    /// The route 5 m ahead, to the left of the rear axle.
+    RouteY5: "route_y_5", "m", ahead(0), Route;
+    /// The route 10 m ahead, forward of the rear axle.
+    RouteX10: "route_x_10", "m", ahead(1), Route;
+    /// The route 10 m ahead, to the left of the rear axle.
+    RouteY10: "route_y_10", "m", ahead(1), Route;
+    /// The route 20 m ahead, forward of the rear axle.
+    RouteX20: "route_x_20", "m", ahead(2), Route;
+    /// The route 20 m ahead, to the left of the rear axle.
+    RouteY20: "route_y_20", "m", ahead(2), Route;
+    /// The route 40 m ahead, forward of the rear axle.
+    RouteX40: "route_x_40", "m", ahead(3), Route;
+    /// The route 40 m ahead, to the left of the rear axle.
+    RouteY40: "route_y_40", "m", ahead(3), Route;
+    /// Speed limit.
+    SpeedLimit: "speed_limit", "m/s", SPEED, Route;
+    /// Centre line of the route as seen from the rear axle, positive to the left.
+    RouteOffset: "route_offset", "m", Within(-ROUTE_OFFSET_M, ROUTE_OFFSET_M), Route;
+    /// Distance to the end of the route.
+    RouteLeft: "route_left", "m", Within(0.0, ROUTE_LEFT_M), Route;
+    /// Gap to the next road user on the route.
+    LeaderGap: "leader_gap", "m", SIGHT, Route;
+    /// Speed of that road user along the route.
+    LeaderSpeed: "leader_speed", "m/s", SPEED, Route;
+    /// Distance to the next stop line whose signal is not green.
+    SignalGap: "signal_gap", "m", SIGHT, Route;
+}
+
+/// Some fields of a preset.
+#[derive(Debug, Clone, Copy)]
+enum PresetPart {
+    Named(&'static [Field]),
+    All(FieldSource),
+}
+
+/// A choice of fields that has a name.
+#[derive(Debug, Clone, Copy)]
+pub struct FieldPreset {
+    /// Name in `observation.fields`.
+    pub name: &'static str,
+    parts: &'static [PresetPart],
+}
+
+/// The paper's observation: position, acceleration, rotation and heading.
+const PAPER: PresetPart = PresetPart::Named(&[
+    Field::GnssX,
+    Field::GnssY,
+    Field::AccelX,
+    Field::AccelY,
+    Field::AccelZ,
+    Field::GyroX,
+    Field::GyroY,
+    Field::GyroZ,
+    Field::Compass,
+]);
+/// What the wheels say.
+const WHEELS: PresetPart = PresetPart::Named(&[Field::Speed, Field::Steering]);
+
+/// Every preset of `observation.fields`.
+pub const FIELD_PRESETS: [FieldPreset; 3] = [
+    FieldPreset {
+        name: "paper",
+        parts: &[PAPER],
+    },
+    FieldPreset {
+        name: "caraware",
+        parts: &[PAPER, WHEELS],
+    },
+    FieldPreset {
+        name: "driving",
+        parts: &[WHEELS, PresetPart::All(Route)],
+    },
+];
+
+impl FieldPreset {
+    /// The preset with this name.
+    #[must_use]
+    pub fn by_name(name: &str) -> Option<Self> {
+        FIELD_PRESETS.into_iter().find(|preset| preset.name == name)
+    }
+
+    /// Its fields, in the order of the row.
+    #[must_use]
+    pub fn fields(&self) -> Vec<Field> {
+        let fields = |part: &PresetPart| match part {
+            PresetPart::Named(fields) => fields.to_vec(),
+            PresetPart::All(source) => {
+                let rows = FIELDS.iter().filter(|spec| spec.source == *source);
+                rows.map(|spec| spec.field).collect()
+            }
+        };
+        self.parts.iter().flat_map(fields).collect()
+    }
+}
+
+impl FieldSource {
+    /// The sensor that has to be there.
+    #[must_use]
+    pub fn sensor(self) -> Option<SensorKind> {
+        match self {
+            Measurement(sensor) | Delivery(sensor) => Some(sensor),
+            Route => None,
+        }
+    }
+
+    /// The task that has to be set.
+    #[must_use]
+    pub fn task(self) -> Option<TaskKind> {
+        match self {
+            Measurement(_) | Delivery(_) => None,
+            Route => Some(TaskKind::Driving),
+        }
+    }
+}
+
+impl Field {
+    /// Its row.
+    #[must_use]
+    pub const fn spec(self) -> &'static FieldSpec {
+        &FIELDS[self as usize]
+    }
+
+    /// Name in the configuration and in JSON.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        self.spec().name
+    }
+
+    /// The field with this name.
+    #[must_use]
+    pub fn by_name(name: &str) -> Option<Self> {
+        FIELDS.iter().find(|spec| spec.name == name).map(|spec| spec.field)
+    }
+
+    /// Bit of the sensor that the field is a measurement of; 0 for what is known while every sensor is dark.
+    #[must_use]
+    pub const fn measurement_bit(self) -> u32 {
+        match self.spec().source {
+            Measurement(sensor) => sensor.bit(),
+            Delivery(_) | Route => 0,
+        }
+    }
+}
+
+impl Serialize for Field {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
+}
+
+impl<'de> Deserialize<'de> for Field {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let name = String::deserialize(deserializer)?;
+        Self::by_name(&name).ok_or_else(|| D::Error::custom(format!("unknown observation field `{name}`")))
+    }
+}
+
+/// A field as a run's own: with the ends of its range. Part of the run file, for readers in other languages.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct RunField {
+    /// Name in `observation.fields`.
+    pub name: &'static str,
+    /// SI unit, or "".
+    pub unit: &'static str,
+    /// Lower and upper end of the range, in that unit.
+    pub range: [f64; 2],
+}
+
+/// Every field with its range under this configuration on this map.
+#[must_use]
+pub fn run_fields(config: &Config, map: &MapInfo) -> Vec<RunField> {
+    let fields = FIELDS.iter().map(|spec| {
+        let (low, high) = spec.range.ends(config, map.bounds_m);
+        RunField {
+            name: spec.name,
+            unit: spec.unit,
+            range: [low, high],
+        }
+    });
+    fields.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn names_are_unique_and_lead_back_to_their_field() {
+        let names: BTreeSet<&str> = FIELDS.iter().map(|spec| spec.name).collect();
+        assert_eq!(names.len(), FIELDS.len());
+        for spec in FIELDS {
+            assert_eq!(Field::by_name(spec.name), Some(spec.field));
+            assert_eq!(spec.field.name(), spec.name);
+        }
+    }
+
+    #[test]
+    fn ages_and_validities_are_named_after_their_sensor() {
+        for spec in FIELDS {
+            if let Delivery(sensor) = spec.source {
+                assert!(
+                    spec.name == format!("{}_age", sensor.name()) || spec.name == format!("{}_valid", sensor.name())
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn presets_are_those_of_the_papers_and_of_every_run_so_far() {
+        let names = |preset: &str| -> Vec<&str> {
+            let preset = FieldPreset::by_name(preset).unwrap();
+            preset.fields().into_iter().map(Field::name).collect()
+        };
+        let paper = [
+            "gnss_x", "gnss_y", "accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z", "compass",
+        ];
+        assert_eq!(names("paper"), paper);
+        assert_eq!(names("caraware"), [&paper[..], &["speed", "steering"]].concat());
+        let driving = [
+            "speed",
+            "steering",
+            "route_x_5",
+            "route_y_5",
+            "route_x_10",
+            "route_y_10",
+            "route_x_20",
+            "route_y_20",
+            "route_x_40",
+            "route_y_40",
+            "speed_limit",
+            "route_offset",
+            "route_left",
+            "leader_gap",
+            "leader_speed",
+            "signal_gap",
+        ];
+        assert_eq!(names("driving"), driving);
+    }
+}
