@@ -147,7 +147,9 @@ impl<'a> ObservationView<'a> {
             .iter()
             .zip(self.sensors)
             .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT);
-        held.fold(DeliveringSensors::default(), |count, (_, sensors)| count.count(*sensors))
+        held.fold(DeliveringSensors::default(), |count, (_, sensors)| {
+            count.count(*sensors)
+        })
     }
 
     /// Mean distances from the truth of the GNSS fixes, and of the positions of `prediction` if it holds positions.

@@ -340,7 +340,11 @@ mod tests {
             if std::env::var_os("CARAWARE_BLESS").is_some() {
                 std::fs::write(&path, &json).unwrap();
             }
-            assert_eq!(std::fs::read_to_string(&path).unwrap(), json, "{path}");
+            let committed = std::fs::read_to_string(&path).unwrap();
+            assert!(
+                committed == json,
+                "{path} is not what the program has: CARAWARE_BLESS=1 writes it"
+            );
         }
     }
 }

@@ -1,20 +1,23 @@
 //! Everything that crosses a process border, and nothing else: payloads, the service table, flow control, the run file.
 //!
-//! | service       | payload (64-byte aligned bytes, little endian)                    | producer       | required consumer |
-//! |---------------|-------------------------------------------------------------------|----------------|-------------------|
-//! | `traffic`     | `[TrafficState]`                                                  | traffic-bridge | sim-core          |
-//! | `traffic-meta`| [`traffic::TrafficMetaLayout`]: `[VehicleMeta]`, `[SignalMeta]`; or `[RoutePoint]` | traffic-bridge | sim-core          |
-//! | `world`       | [`world::WorldLayout`]: `[VehicleState]`, `[SubStep]`, `[HeroView]` | sim-core       | sensor-daemon     |
-//! | `observation` | [`observation::ObservationLayout`]: obs, truth, GNSS, slots       | sensor-daemon  | trainer           |
-//! | `prediction`  | [`prediction::PredictionLayout`]: one row for each slot of the observation | trainer | none; sim-core when it drives |
-//! | `ego-pose`    | `[EgoPose]`                                                       | sim-core       | traffic-bridge    |
-//! | `event`       | `[Collision]`                                                     | sim-core       | none              |
-//! | `census`      | as `traffic-meta`: everybody and every light, each simulated second | traffic-bridge | none              |
-//! | `switch`      | `[SensorSwitch]`, from the tick in the header on                  | traffic-bridge | sensor-daemon     |
-//! | `control`     | [`control::ControlRequest`] → [`control::ControlReply`]           | supervisor     | traffic-bridge    |
-//! | `board`       | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`] | every process  | none (newest wins)|
-//! | `roster`      | [`board::Roster`]: the incarnation of each process that counts    | supervisor     | none (newest wins)|
-//! | `wake`        | an event without content                                          | every peer     | its process       |
+//! | service | payload (64-byte aligned bytes, little endian) | producer | required consumers |
+//! |---|---|---|---|
+//! | `traffic` | `[TrafficState]` | traffic-bridge | sim-core |
+//! | `traffic-meta` | `[VehicleMeta]`, `[SignalMeta]`; or `[RoutePoint]` | traffic-bridge | sim-core |
+//! | `census` | as `traffic-meta`: every road user and every light | traffic-bridge | none |
+//! | `world` | `[VehicleState]`, `[SubStep]`, `[HeroView]` | sim-core | sensor-daemon |
+//! | `observation` | observations, truth, newest samples, slots | sensor-daemon | trainer |
+//! | `prediction` | positions or actions, estimates of the filter | trainer | none |
+//! | `ego-pose` | `[EgoPose]` | sim-core | traffic-bridge |
+//! | `event` | `[Collision]` | sim-core | none |
+//! | `pointcloud` | `Scan`, `[LidarPoint]`: one message for each LIDAR and tick | sensor-daemon | none |
+//! | `switch` | `[SensorSwitch]`, from the tick in the header on | traffic-bridge | none |
+//! | `control` | [`control::ControlRequest`] → [`control::ControlReply`] | supervisor | traffic-bridge |
+//! | `board` | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`] | every process | none (newest wins) |
+//! | `roster` | [`board::Roster`]: the current incarnation of each process | supervisor | none (newest wins) |
+//! | `wake` | an event without content | every peer | its process |
+//!
+//! The first ten are [`channel::CHANNELS`]. In the driving task sim-core waits for each `prediction`.
 //!
 //! Every message carries a [`header::MessageHeader`]. Services are created in [`services`] by the supervisor alone;
 //! every other process opens them there. The layouts are written down in `layout.json` and asserted from Rust and Python.
@@ -22,6 +25,7 @@
 pub mod block;
 pub mod board;
 mod board_port;
+pub mod channel;
 pub mod clock;
 pub mod config;
 pub mod control;

@@ -16,21 +16,14 @@ use iceoryx2::{
 use crate::{
     block::ALIGNMENT,
     board::{Health, INCARNATIONS, Progress, Roster, TrainingStatus},
-    control::{ControlReply, ControlRequest, MAX_SWITCHES, SensorSwitch},
-    ego::EgoPose,
-    event::Collision,
+    channel::FullQueue,
+    control::{ControlReply, ControlRequest},
     header::MessageHeader,
-    observation::ObservationLayout,
-    pointcloud::PointcloudLayout,
-    prediction::{ESTIMATE_COLUMNS, PredictionLayout},
     process::Process,
     run::{RunFile, SharedMemory},
-    traffic::{
-        EVENTS_PER_MESSAGE, MOST_SIGNALS, ROUTE_POINTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout,
-        TrafficState,
-    },
-    world::WorldLayout,
 };
+
+pub use crate::channel::Channel;
 
 /// The variant of iceoryx2 in use: between processes, ports usable from any thread.
 pub type Shm = ipc_threadsafe::Service;
@@ -76,190 +69,6 @@ const MAX_READERS: usize = 32;
 const MAX_ROSTER_READERS: usize = 5 * MAX_READERS;
 /// Commands that wait for an answer at a time.
 const MAX_PENDING_COMMANDS: usize = 16;
-/// Messages a process may hold besides those in its queue.
-const SPARE_MESSAGES: usize = 2;
-
-/// Messages that the route of one hero may take: 4096 points.
-const ROUTE_MESSAGES_PER_HERO: usize = 2;
-
-/// Most `traffic-meta` messages without routes that one SUMO step takes: everybody may leave and everybody may come in it, and every
-/// traffic light may change.
-fn meta_messages(run: &RunFile) -> usize {
-    let (road_users, lights) = (
-        run.config.traffic.max_road_users as usize,
-        run.map.traffic_lights as usize,
-    );
-    let events = (2 * road_users).div_ceil(EVENTS_PER_MESSAGE);
-    events.max(lights.div_ceil(SIGNALS_PER_MESSAGE)).max(1)
-}
-
-/// A data service.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Channel {
-    /// SUMO's road users.
-    Traffic,
-    /// Arrivals, departures and what a road user is.
-    TrafficMeta,
-    /// Everybody on the road and every traffic light, once per simulated second.
-    Census,
-    /// Road users as the nanoscopic core moves them.
-    World,
-    /// What connected vehicles sense.
-    Observation,
-    /// What the policy makes of it: positions, or actions in the driving task.
-    Prediction,
-    /// Where the heroes are, back to SUMO.
-    EgoPose,
-    /// Collisions.
-    Event,
-    /// What LIDARs see: one message for each of them and each tick.
-    Pointcloud,
-    /// Sensors that commands switch on and off.
-    Switch,
-}
-
-impl Channel {
-    /// All data services.
-    pub const ALL: [Self; 10] = [
-        Self::Traffic,
-        Self::TrafficMeta,
-        Self::Census,
-        Self::World,
-        Self::Observation,
-        Self::Prediction,
-        Self::EgoPose,
-        Self::Event,
-        Self::Pointcloud,
-        Self::Switch,
-    ];
-
-    /// Name in service names and keys.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Traffic => "traffic",
-            Self::TrafficMeta => "traffic-meta",
-            Self::Census => "census",
-            Self::World => "world",
-            Self::Observation => "observation",
-            Self::Prediction => "prediction",
-            Self::EgoPose => "ego-pose",
-            Self::Event => "event",
-            Self::Pointcloud => "pointcloud",
-            Self::Switch => "switch",
-        }
-    }
-
-    /// The one process that sends.
-    #[must_use]
-    pub fn producer(self) -> Process {
-        match self {
-            Self::Traffic | Self::TrafficMeta | Self::Census | Self::Switch => Process::TrafficBridge,
-            Self::World | Self::EgoPose | Self::Event => Process::SimCore,
-            Self::Observation | Self::Pointcloud => Process::SensorDaemon,
-            Self::Prediction => Process::Trainer,
-        }
-    }
-
-    /// The process that must not miss a message, whose credit bounds the producer.
-    #[must_use]
-    pub fn required_consumer(self) -> Option<Process> {
-        match self {
-            Self::Traffic | Self::TrafficMeta => Some(Process::SimCore),
-            Self::World => Some(Process::SensorDaemon),
-            Self::Observation => Some(Process::Trainer),
-            Self::EgoPose => Some(Process::TrafficBridge),
-            // In the driving task sim-core waits for each of them, so the trainer is at most one ahead and no queue overflows.
-            // Whoever looks at point clouds or a census may miss some: the newest win.
-            // A switch goes with a tick, whose own credit bounds both.
-            Self::Prediction | Self::Event | Self::Pointcloud | Self::Census | Self::Switch => None,
-        }
-    }
-
-    /// Subscribers at a time: the required one, its successor, the fan-out, and one spare, which `sim-core` takes of `observation`
-    /// in the driving task.
-    const fn max_subscribers(self) -> usize {
-        4
-    }
-
-    /// Longest payload of a run, bytes.
-    #[must_use]
-    pub fn max_payload(self, run: &RunFile) -> usize {
-        let road_users = run.config.traffic.max_road_users as usize;
-        match self {
-            Self::Traffic => road_users * size_of::<TrafficState>(),
-            Self::TrafficMeta => TrafficMetaLayout::new(EVENTS_PER_MESSAGE, SIGNALS_PER_MESSAGE)
-                .len
-                .max(ROUTE_POINTS_PER_MESSAGE * size_of::<RoutePoint>()),
-            Self::Census => TrafficMetaLayout::new(road_users, MOST_SIGNALS).len,
-            Self::World => {
-                WorldLayout::with_heroes(road_users, run.config.run.sub_steps as usize, run.config.heroes()).len
-            }
-            Self::Observation => {
-                ObservationLayout::new(road_users, run.config.observation_width(), run.config.imu_samples()).len
-            }
-            Self::Prediction => PredictionLayout::new(road_users, ESTIMATE_COLUMNS, true).len,
-            Self::EgoPose => road_users * size_of::<EgoPose>(),
-            Self::Event => road_users * size_of::<Collision>(),
-            Self::Pointcloud => PointcloudLayout::new(run.config.lidar.rays_per_tick(run.config.run.tick_s)).len,
-            Self::Switch => MAX_SWITCHES * size_of::<SensorSwitch>(),
-        }
-    }
-
-    /// Messages a subscriber's queue holds.
-    #[must_use]
-    pub fn queue_length(self, run: &RunFile) -> usize {
-        let window = usize::try_from(run.window_ticks()).unwrap_or(usize::MAX);
-        let per_step = usize::try_from(run.ticks_per_traffic_step()).unwrap_or(usize::MAX);
-        let traffic_window = usize::try_from(run.traffic_window_ticks()).unwrap_or(usize::MAX);
-        let steps = traffic_window.div_ceil(per_step);
-        match self {
-            Self::Traffic => steps + SPARE_MESSAGES,
-            // All heroes may come within one step, each with its route.
-            Self::TrafficMeta => {
-                steps * meta_messages(run) + run.config.heroes() * ROUTE_MESSAGES_PER_HERO + SPARE_MESSAGES
-            }
-            // The newest replaces the one before.
-            Self::Census => SPARE_MESSAGES,
-            // One for each step that is on its way through `sim-core`.
-            Self::Switch => steps + window + SPARE_MESSAGES,
-            // The scans of one tick.
-            Self::Pointcloud => run.config.lidar.vehicles as usize + SPARE_MESSAGES,
-            _ => window + SPARE_MESSAGES,
-        }
-    }
-
-    /// True where the newest message pushes the oldest out of a full queue; else it is the newest that is dropped, and counted.
-    const fn newest_wins(self) -> bool {
-        matches!(self, Self::Pointcloud | Self::Census)
-    }
-
-    /// Messages that one subscriber may hold while it works on them.
-    fn in_hand(self, run: &RunFile) -> usize {
-        match self {
-            Self::Pointcloud | Self::Census => SPARE_MESSAGES,
-            // A batch at work while the next one is taken.
-            _ => 2 * self.queue_length(run),
-        }
-    }
-
-    /// Most shared memory this service can touch, bytes: every queue full, every message of the longest size.
-    #[must_use]
-    pub fn worst_case_bytes(self, run: &RunFile) -> usize {
-        let unused = match self {
-            Self::Pointcloud => run.config.lidar.vehicles == 0,
-            Self::Census => !run.config.fanout.enabled,
-            _ => false,
-        };
-        if unused {
-            return 0;
-        }
-        let per_subscriber = self.queue_length(run) + self.in_hand(run);
-        let messages = 2 * per_subscriber + SPARE_MESSAGES;
-        messages * (self.max_payload(run) + size_of::<MessageHeader>() + 4 * ALIGNMENT)
-    }
-}
-
 /// A service or node could not be created or opened.
 #[derive(Debug, thiserror::Error)]
 pub enum ServiceError {
@@ -354,13 +163,13 @@ fn data_builder(
         .publish_subscribe::<[u8]>()
         .user_header::<MessageHeader>()
         .payload_alignment(alignment)
-        .enable_safe_overflow(channel.newest_wins())
+        .enable_safe_overflow(channel.spec().when_full == FullQueue::DropOldest)
         .history_size(0)
         .max_publishers(2)
         .max_subscribers(channel.max_subscribers())
         .max_nodes(MAX_NODES)
         .subscriber_max_buffer_size(channel.queue_length(run))
-        .subscriber_max_borrowed_samples(channel.in_hand(run)))
+        .subscriber_max_borrowed_samples((channel.spec().in_hand)(run)))
 }
 
 /// Opens a data service.

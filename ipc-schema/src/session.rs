@@ -244,7 +244,7 @@ impl Session {
     /// The service cannot be opened.
     pub fn subscriber(&mut self, channel: Channel) -> Result<Subscriber, SessionError> {
         let service = services::open_data(&self.node, &self.run, self.env_index, channel)?;
-        if channel.required_consumer() == Some(self.process) {
+        if channel.requires(self.process) {
             self.upstream.push(self.waker(channel.producer())?);
         }
         let subscriber = Subscriber::create(&service, channel, &self.run)?;

@@ -1,0 +1,389 @@
+//! The data services of a run: one row of [`CHANNELS`] for each. Creation and opening, credits, the fan-out and the table at the head
+//! of this crate derive from it (decision 21).
+
+use crate::{
+    block::ALIGNMENT,
+    control::{MAX_SWITCHES, SensorSwitch},
+    ego::EgoPose,
+    event::Collision,
+    header::MessageHeader,
+    observation::ObservationLayout,
+    pointcloud::PointcloudLayout,
+    prediction::{ESTIMATE_COLUMNS, PredictionLayout},
+    process::Process::{self, SensorDaemon, SimCore, TrafficBridge, Trainer},
+    run::RunFile,
+    traffic::{
+        EVENTS_PER_MESSAGE, MOST_SIGNALS, ROUTE_POINTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout,
+        TrafficState,
+    },
+    world::WorldLayout,
+};
+
+/// Messages a process may hold besides those in its queue.
+const SPARE_MESSAGES: usize = 2;
+/// Messages that the route of one hero may take: 4096 points.
+const ROUTE_MESSAGES_PER_HERO: usize = 2;
+
+/// A data service; its number is its place in [`CHANNELS`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Channel {
+    /// SUMO's road users.
+    Traffic = 0,
+    /// Arrivals, departures and what a road user is.
+    TrafficMeta = 1,
+    /// Every road user and every traffic light, once per simulated second.
+    Census = 2,
+    /// Road users as the nanoscopic core moves them.
+    World = 3,
+    /// What connected vehicles sense.
+    Observation = 4,
+    /// What the policy makes of it: positions, or actions in the driving task.
+    Prediction = 5,
+    /// Where the heroes are, back to SUMO.
+    EgoPose = 6,
+    /// Collisions.
+    Event = 7,
+    /// What LIDARs see: one message for each LIDAR and tick.
+    Pointcloud = 8,
+    /// Sensors that commands switch on and off.
+    Switch = 9,
+}
+
+/// What happens to a message that finds a subscriber's queue full.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FullQueue {
+    /// The new message is dropped for that subscriber, and counted. Credit keeps the queue of a required consumer from filling.
+    DropNewest,
+    /// The new message pushes the oldest one out.
+    DropOldest,
+}
+
+/// One row of [`CHANNELS`].
+#[derive(Debug, Clone, Copy)]
+pub struct ChannelSpec {
+    /// The channel.
+    pub channel: Channel,
+    /// Name in service names.
+    pub name: &'static str,
+    /// What a payload holds.
+    pub payload: &'static str,
+    /// The one process that sends.
+    pub producer: Process,
+    /// Processes that must not miss a message: their credit bounds the producer.
+    pub required: &'static [Process],
+    /// What happens at a full queue.
+    pub when_full: FullQueue,
+    /// Longest payload of a run, bytes.
+    pub max_payload: fn(&RunFile) -> usize,
+    /// Messages that a subscriber's queue holds.
+    pub queue_length: fn(&RunFile) -> usize,
+    /// Messages that one subscriber may hold while it works on them.
+    pub in_hand: fn(&RunFile) -> usize,
+    /// False for a run in which no message is ever sent: its memory is not counted.
+    pub is_used: fn(&RunFile) -> bool,
+}
+
+/// Ticks that a process may be ahead of the next.
+fn window(run: &RunFile) -> usize {
+    usize::try_from(run.window_ticks()).unwrap_or(usize::MAX)
+}
+
+/// SUMO steps that traffic-bridge may be ahead of sim-core.
+fn traffic_steps(run: &RunFile) -> usize {
+    let per_step = usize::try_from(run.ticks_per_traffic_step()).unwrap_or(usize::MAX);
+    let window = usize::try_from(run.traffic_window_ticks()).unwrap_or(usize::MAX);
+    window.div_ceil(per_step)
+}
+
+/// Most road users alive at once.
+fn road_users(run: &RunFile) -> usize {
+    run.config.traffic.max_road_users as usize
+}
+
+/// Most `traffic-meta` messages without routes that one SUMO step takes: all road users may leave and as many come in it, and every
+/// traffic light may change.
+fn meta_messages(run: &RunFile) -> usize {
+    let events = (2 * road_users(run)).div_ceil(EVENTS_PER_MESSAGE);
+    let lights = run.map.traffic_lights as usize;
+    events.max(lights.div_ceil(SIGNALS_PER_MESSAGE)).max(1)
+}
+
+/// A window of messages.
+fn windowful(run: &RunFile) -> usize {
+    window(run) + SPARE_MESSAGES
+}
+
+/// A batch at work while the next one is taken.
+const fn two_batches(queue_length: usize) -> usize {
+    2 * queue_length
+}
+
+/// Every data service, by [`Channel`].
+pub const CHANNELS: [ChannelSpec; 10] = [
+    ChannelSpec {
+        channel: Channel::Traffic,
+        name: "traffic",
+        payload: "`[TrafficState]`",
+        producer: TrafficBridge,
+        required: &[SimCore],
+        when_full: FullQueue::DropNewest,
+        max_payload: |run| road_users(run) * size_of::<TrafficState>(),
+        queue_length: |run| traffic_steps(run) + SPARE_MESSAGES,
+        in_hand: |run| two_batches(Channel::Traffic.queue_length(run)),
+        is_used: |_| true,
+    },
+    ChannelSpec {
+        channel: Channel::TrafficMeta,
+        name: "traffic-meta",
+        payload: "`[VehicleMeta]`, `[SignalMeta]`; or `[RoutePoint]`",
+        producer: TrafficBridge,
+        required: &[SimCore],
+        when_full: FullQueue::DropNewest,
+        max_payload: |_| {
+            let metas = TrafficMetaLayout::new(EVENTS_PER_MESSAGE, SIGNALS_PER_MESSAGE).len;
+            metas.max(ROUTE_POINTS_PER_MESSAGE * size_of::<RoutePoint>())
+        },
+        // All heroes may come within one step, each with its route.
+        queue_length: |run| {
+            let routes = run.config.heroes() * ROUTE_MESSAGES_PER_HERO;
+            traffic_steps(run) * meta_messages(run) + routes + SPARE_MESSAGES
+        },
+        in_hand: |run| two_batches(Channel::TrafficMeta.queue_length(run)),
+        is_used: |_| true,
+    },
+    ChannelSpec {
+        channel: Channel::Census,
+        name: "census",
+        payload: "as `traffic-meta`: every road user and every light",
+        producer: TrafficBridge,
+        required: &[],
+        when_full: FullQueue::DropOldest,
+        max_payload: |run| TrafficMetaLayout::new(road_users(run), MOST_SIGNALS).len,
+        queue_length: |_| SPARE_MESSAGES,
+        in_hand: |_| SPARE_MESSAGES,
+        is_used: |run| run.config.fanout.enabled,
+    },
+    ChannelSpec {
+        channel: Channel::World,
+        name: "world",
+        payload: "`[VehicleState]`, `[SubStep]`, `[HeroView]`",
+        producer: SimCore,
+        required: &[SensorDaemon],
+        when_full: FullQueue::DropNewest,
+        max_payload: |run| {
+            let sub_steps = run.config.run.sub_steps as usize;
+            WorldLayout::with_heroes(road_users(run), sub_steps, run.config.heroes()).len
+        },
+        queue_length: windowful,
+        in_hand: |run| two_batches(windowful(run)),
+        is_used: |_| true,
+    },
+    ChannelSpec {
+        channel: Channel::Observation,
+        name: "observation",
+        payload: "observations, truth, newest samples, slots",
+        producer: SensorDaemon,
+        required: &[Trainer],
+        when_full: FullQueue::DropNewest,
+        max_payload: |run| {
+            let (width, imu_samples) = (run.config.observation_width(), run.config.imu_samples());
+            ObservationLayout::new(road_users(run), width, imu_samples).len
+        },
+        queue_length: windowful,
+        in_hand: |run| two_batches(windowful(run)),
+        is_used: |_| true,
+    },
+    ChannelSpec {
+        channel: Channel::Prediction,
+        name: "prediction",
+        payload: "positions or actions, estimates of the filter",
+        producer: Trainer,
+        // In the driving task sim-core waits for each message, so the trainer is at most one ahead and no queue overflows.
+        required: &[],
+        when_full: FullQueue::DropNewest,
+        max_payload: |run| PredictionLayout::new(road_users(run), ESTIMATE_COLUMNS, true).len,
+        queue_length: windowful,
+        in_hand: |run| two_batches(windowful(run)),
+        is_used: |_| true,
+    },
+    ChannelSpec {
+        channel: Channel::EgoPose,
+        name: "ego-pose",
+        payload: "`[EgoPose]`",
+        producer: SimCore,
+        required: &[TrafficBridge],
+        when_full: FullQueue::DropNewest,
+        max_payload: |run| road_users(run) * size_of::<EgoPose>(),
+        queue_length: windowful,
+        in_hand: |run| two_batches(windowful(run)),
+        is_used: |_| true,
+    },
+    ChannelSpec {
+        channel: Channel::Event,
+        name: "event",
+        payload: "`[Collision]`",
+        producer: SimCore,
+        required: &[],
+        when_full: FullQueue::DropNewest,
+        max_payload: |run| road_users(run) * size_of::<Collision>(),
+        queue_length: windowful,
+        in_hand: |run| two_batches(windowful(run)),
+        is_used: |_| true,
+    },
+    ChannelSpec {
+        channel: Channel::Pointcloud,
+        name: "pointcloud",
+        payload: "`Scan`, `[LidarPoint]`: one message for each LIDAR and tick",
+        producer: SensorDaemon,
+        required: &[],
+        when_full: FullQueue::DropOldest,
+        max_payload: |run| PointcloudLayout::new(run.config.lidar.rays_per_tick(run.config.run.tick_s)).len,
+        // The scans of one tick.
+        queue_length: |run| run.config.lidar.vehicles as usize + SPARE_MESSAGES,
+        in_hand: |_| SPARE_MESSAGES,
+        is_used: |run| run.config.lidar.vehicles > 0,
+    },
+    ChannelSpec {
+        channel: Channel::Switch,
+        name: "switch",
+        payload: "`[SensorSwitch]`, from the tick in the header on",
+        producer: TrafficBridge,
+        // A switch goes with a tick, whose own credit bounds both.
+        required: &[],
+        when_full: FullQueue::DropNewest,
+        max_payload: |_| MAX_SWITCHES * size_of::<SensorSwitch>(),
+        // One for each step that is on its way through sim-core.
+        queue_length: |run| traffic_steps(run) + windowful(run),
+        in_hand: |run| two_batches(Channel::Switch.queue_length(run)),
+        is_used: |_| true,
+    },
+];
+
+/// Each row stands at the place of its channel.
+const _: () = {
+    let mut row = 0;
+    while row < CHANNELS.len() {
+        assert!(CHANNELS[row].channel as usize == row);
+        row += 1;
+    }
+};
+
+impl Channel {
+    /// Number of data services.
+    pub const COUNT: usize = CHANNELS.len();
+
+    /// Every data service, in the order of [`CHANNELS`].
+    pub const ALL: [Self; Self::COUNT] = {
+        let mut channels = [CHANNELS[0].channel; Self::COUNT];
+        let mut row = 0;
+        while row < Self::COUNT {
+            channels[row] = CHANNELS[row].channel;
+            row += 1;
+        }
+        channels
+    };
+
+    /// Its row.
+    #[must_use]
+    pub const fn spec(self) -> &'static ChannelSpec {
+        const ROWS: &[ChannelSpec] = &CHANNELS;
+        &ROWS[self as usize]
+    }
+
+    /// Name in service names.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        self.spec().name
+    }
+
+    /// The one process that sends.
+    #[must_use]
+    pub const fn producer(self) -> Process {
+        self.spec().producer
+    }
+
+    /// True if `process` must not miss a message.
+    #[must_use]
+    pub fn requires(self, process: Process) -> bool {
+        self.spec().required.contains(&process)
+    }
+
+    /// Subscribers at a time: each required consumer and its successor, the fan-out, and one spare, which sim-core takes of
+    /// `observation` in the driving task.
+    #[must_use]
+    pub const fn max_subscribers(self) -> usize {
+        let required = self.spec().required;
+        if required.is_empty() { 4 } else { 2 * required.len() + 2 }
+    }
+
+    /// Longest payload of a run, bytes.
+    #[must_use]
+    pub fn max_payload(self, run: &RunFile) -> usize {
+        (self.spec().max_payload)(run)
+    }
+
+    /// Messages that a subscriber's queue holds.
+    #[must_use]
+    pub fn queue_length(self, run: &RunFile) -> usize {
+        (self.spec().queue_length)(run)
+    }
+
+    /// Most shared memory that this service can touch, bytes: every queue full, every message of the longest size.
+    #[must_use]
+    pub fn worst_case_bytes(self, run: &RunFile) -> usize {
+        let spec = self.spec();
+        if !(spec.is_used)(run) {
+            return 0;
+        }
+        let per_subscriber = (spec.queue_length)(run) + (spec.in_hand)(run);
+        let messages = 2 * per_subscriber + SPARE_MESSAGES;
+        messages * ((spec.max_payload)(run) + size_of::<MessageHeader>() + 4 * ALIGNMENT)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The rows of the table at the head of this crate, without padding.
+    fn documented() -> Vec<String> {
+        let head = include_str!("lib.rs")
+            .lines()
+            .filter_map(|line| line.strip_prefix("//! |"));
+        let squeeze = |line: &str| line.split('|').map(str::trim).collect::<Vec<_>>().join(" | ");
+        head.map(squeeze).collect()
+    }
+
+    #[test]
+    fn the_table_at_the_head_of_the_crate_has_every_channel() {
+        let documented = documented();
+        for spec in CHANNELS {
+            let required: Vec<&str> = spec.required.iter().map(|process| process.name()).collect();
+            let required = if required.is_empty() {
+                "none".into()
+            } else {
+                required.join(", ")
+            };
+            let row = format!(
+                "`{}` | {} | {} | {required} | ",
+                spec.name,
+                spec.payload,
+                spec.producer.name()
+            );
+            assert!(documented.contains(&row), "{row}\n{documented:#?}");
+        }
+    }
+
+    #[test]
+    fn credit_bounds_every_channel_that_has_a_required_consumer() {
+        for spec in CHANNELS {
+            assert!(
+                spec.required.is_empty() || spec.when_full == FullQueue::DropNewest,
+                "{}",
+                spec.name
+            );
+            assert!(!spec.required.contains(&spec.producer), "{}", spec.name);
+        }
+    }
+}
