@@ -1,4 +1,4 @@
-//! What ends the fan-out: an error of shared memory or of zenoh.
+//! What ends the fan-out: an error of shared memory, of zenoh or of a document.
 
 use ipc_schema::{
     failure::{Failure, FailureKind},
@@ -15,6 +15,9 @@ pub enum FanoutError {
     /// zenoh.
     #[error(transparent)]
     Network(#[from] NetworkError),
+    /// A document has no form in JSON.
+    #[error("cannot write the map or the status as JSON")]
+    Json(#[from] serde_json::Error),
 }
 
 impl From<PortError> for FanoutError {
@@ -28,6 +31,7 @@ impl From<FanoutError> for Failure {
         match error {
             FanoutError::SharedMemory(error) => error.into(),
             FanoutError::Network(error) => error.into(),
+            FanoutError::Json(_) => Self::from_error(FailureKind::Run, &error),
         }
     }
 }

@@ -42,8 +42,10 @@ pub fn run_id_text(run: &RunFile) -> String {
 }
 
 /// The `map` topic: facts from the run file, and the scene that `sim-core` has written, as JSON.
-#[must_use]
-pub fn map_json(run: &RunFile, env: u32) -> String {
+///
+/// # Errors
+/// A value has no form in JSON.
+pub fn map_json(run: &RunFile, env: u32) -> Result<String, serde_json::Error> {
     let (fanout, lidar) = (&run.config.fanout, &run.config.lidar);
     let map = MapDocument {
         schema_version: run.schema_version,
@@ -68,10 +70,13 @@ pub fn map_json(run: &RunFile, env: u32) -> String {
         ]),
         lidar: json!({ "vehicles": lidar.vehicles, "range_m": lidar.range_m, "mode": lidar.mode }),
     };
-    let text = serde_json::to_string(&map).unwrap_or_default();
+    let text = serde_json::to_string(&map)?;
     // The scene of a large net has many megabytes, so its text is inserted without parsing it into values.
     let scene = scene_json(run).unwrap_or_else(|| "null".into());
-    format!("{},\"scene\":{scene}}}", text.strip_suffix('}').unwrap_or(&text))
+    Ok(format!(
+        "{},\"scene\":{scene}}}",
+        text.strip_suffix('}').unwrap_or(&text)
+    ))
 }
 
 /// The scene that `sim-core` has written, if it is there and is JSON.

@@ -111,7 +111,10 @@ fn ask_supervisor(socket: &PathBuf, env_index: u32, command: &Command) -> std::i
 }
 
 fn send_reply(query: &Query, reply: &Reply) {
-    let text = serde_json::to_string(reply).unwrap_or_default();
+    let text = match serde_json::to_string(reply) {
+        Ok(text) => text,
+        Err(error) => return tracing::error!(%error, "the answer to a command has no form in JSON"),
+    };
     let sent = query
         .reply(query.key_expr().clone(), text)
         .encoding(Encoding::APPLICATION_JSON)

@@ -39,7 +39,7 @@ impl EnvironmentRelay {
     pub fn open(mut membership: Session, env_index: u32, zenoh: &zenoh::Session) -> Result<Self, FanoutError> {
         let run = &membership.run;
         let keys = RunKeys::new(&run.name, env_index);
-        let publisher = EnvironmentPublisher::open(zenoh.clone(), &keys, &status::map_json(run, env_index))?;
+        let publisher = EnvironmentPublisher::open(zenoh.clone(), &keys, &status::map_json(run, env_index)?)?;
         let commands = CommandGateway::open(zenoh, keys.control(), env_index, run.control_socket())?;
         Ok(Self {
             ticks: TickTopics::open(&mut membership)?,
@@ -116,7 +116,7 @@ impl EnvironmentRelay {
             ..self.counters.clone()
         };
         let status = self.reporter.status(&self.membership.run, now, &self.ticks, counters);
-        let json = serde_json::to_vec(&status).unwrap_or_default();
+        let json = serde_json::to_vec(&status)?;
         Ok(self.publisher.publish(Topic::Status, json)?)
     }
 
