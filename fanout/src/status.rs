@@ -153,20 +153,20 @@ pub struct LearningStatus {
     pub reward: f64,
     /// Largest mean reward so far.
     pub best_reward: f64,
-    /// What is measured of the policy, and of what it is compared with.
+    /// Metrics of the policy and of its baselines.
     pub metrics: Vec<MetricStatus>,
 }
 
 /// One metric of the task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct MetricStatus {
-    /// Its name in reports.
+    /// Name in reports.
     pub name: &'static str,
-    /// Its name for people.
+    /// Name in the HUD.
     pub label: &'static str,
-    /// Its unit for people.
+    /// Unit in the HUD.
     pub unit: &'static str,
-    /// Its value on the samples of the newest update.
+    /// Value on the samples of the newest update.
     pub value: f64,
 }
 

@@ -92,6 +92,14 @@ class RoadUserCounts(TypedDict, total=False):
     hero: int
 
 
+class MetricStatus(TypedDict):
+    """A metric of the task, on the samples of the newest update."""
+
+    label: str
+    unit: str
+    value: float
+
+
 class TrainingStatus(TypedDict, total=False):
     """Progress of learning; all numbers are 0 before the first update."""
 
@@ -100,6 +108,7 @@ class TrainingStatus(TypedDict, total=False):
     policy_std: float
     reward: float
     best_reward: float
+    metrics: list[MetricStatus]
 
 
 class RunStatus(TypedDict, total=False):

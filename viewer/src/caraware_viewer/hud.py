@@ -60,7 +60,7 @@ def _run(picture: Picture, run_map: RunMap, viewer: ViewerFigures) -> str:
         rows.append(("reward", f"{_number(training.get('reward'), 3)} now · {_number(best, 3)} best"))
         rows.append(("policy", f"σ {_number(training.get('policy_std'), 3)} · {training['updates']} updates"))
     for metric in training.get("metrics") or ():
-        rows.append((_escaped(metric["label"]), f"{metric['value']:.2f} {metric['unit']} in the newest update"))
+        rows.append((metric["label"], f"{metric['value']:.2f} {metric['unit']} in the newest update"))
     if picture.distances is not None:
         d = picture.distances
         means = (
