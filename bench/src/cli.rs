@@ -6,7 +6,7 @@ use clap::{Parser, ValueEnum};
 
 /// The parts that can be measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Part {
+pub enum BenchPart {
     /// LIDAR: rays per second on one core beside Open3D's ray caster (Embree), same scene and rays
     Lidar,
     /// Environments: vehicle-steps per second of 1, 2 and 4 side by side, beside one on a single core
@@ -27,7 +27,7 @@ pub enum Part {
     All,
 }
 
-impl Part {
+impl BenchPart {
     /// The parts that are measured, in the order of the documentation.
     pub fn measured() -> impl Iterator<Item = Self> {
         Self::value_variants().iter().copied().filter(|part| *part != Self::All)
@@ -46,7 +46,7 @@ impl Part {
 #[command(name = "caraware-bench", bin_name = "caraware bench", max_term_width = 110)]
 pub struct BenchArgs {
     /// What to measure
-    pub part: Part,
+    pub part: BenchPart,
     /// Write the figures to this file as well
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,

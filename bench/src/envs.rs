@@ -9,15 +9,15 @@ use std::{
 use caraware::{cores, failure::Exit, install};
 use serde::Deserialize;
 
-use super::{Curve, Line, Options, Report, Spread, Table};
+use super::{BenchOptions, BenchReport, CurveLine, MedianSpread, ReportCurve, ReportTable};
 
 /// Numbers of environments.
 const ENVIRONMENTS: [usize; 3] = [1, 2, 4];
 /// Repetitions: of all numbers in turn, so that a ratio is of runs that follow each other.
 const ROUNDS: usize = 5;
 /// Traffic of the town.
-const LOADS: [Load; 2] = [
-    Load {
+const LOADS: [TownLoad; 2] = [
+    TownLoad {
         name: "town: 32 connected vehicles, 8 others, 12 pedestrians",
         short: "town",
         cavs: 32,
@@ -25,7 +25,7 @@ const LOADS: [Load; 2] = [
         pedestrians: 12,
         ticks: 4000,
     },
-    Load {
+    TownLoad {
         name: "town, busy: 150 connected vehicles, 50 others, 50 pedestrians",
         short: "busy town",
         cavs: 150,
@@ -35,7 +35,7 @@ const LOADS: [Load; 2] = [
     },
 ];
 
-struct Load {
+struct TownLoad {
     name: &'static str,
     short: &'static str,
     cavs: u32,
@@ -46,15 +46,15 @@ struct Load {
 
 /// What is read of a run's report.
 #[derive(Debug, Deserialize)]
-struct Outcome {
+struct RunFigures {
     vehicle_steps: u64,
     wall_s: f64,
 }
 
 /// A directory for the runs, removed with this.
-struct Runs(PathBuf);
+struct RunsDirectory(PathBuf);
 
-impl Drop for Runs {
+impl Drop for RunsDirectory {
     fn drop(&mut self) {
         if let Err(error) = fs::remove_dir_all(&self.0) {
             tracing::warn!(%error, path = %self.0.display(), "cannot remove");
@@ -66,11 +66,11 @@ impl Drop for Runs {
 ///
 /// # Errors
 /// A run fails.
-pub fn measure(options: &Options) -> Result<Report, Exit> {
+pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let caraware = install::program(&options.bin, "caraware")?;
-    let runs = Runs(std::env::temp_dir().join(format!("caraware-bench-envs-{}", std::process::id())));
+    let runs = RunsDirectory(std::env::temp_dir().join(format!("caraware-bench-envs-{}", std::process::id())));
     let cores = cores::available();
-    let mut report = Report::new(
+    let mut report = BenchReport::new(
         "envs",
         "Environments side by side",
         format!(
@@ -84,7 +84,7 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
     for load in &LOADS {
         lines.push(compare(load, &caraware, &runs.0, &cores, &mut report)?);
     }
-    report.curves.push(Curve {
+    report.curves.push(ReportCurve {
         name: "envs".into(),
         title: "Environments side by side".into(),
         x: "environments".into(),
@@ -95,7 +95,13 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
     Ok(report)
 }
 
-fn compare(load: &Load, caraware: &Path, runs: &Path, cores: &[usize], report: &mut Report) -> Result<Line, Exit> {
+fn compare(
+    load: &TownLoad,
+    caraware: &Path,
+    runs: &Path,
+    cores: &[usize],
+    report: &mut BenchReport,
+) -> Result<CurveLine, Exit> {
     let mut base = Vec::new();
     let mut rates = vec![Vec::new(); ENVIRONMENTS.len()];
     for _ in 0..ROUNDS {
@@ -105,13 +111,13 @@ fn compare(load: &Load, caraware: &Path, runs: &Path, cores: &[usize], report: &
         }
     }
     let columns = ["environments", "vehicle-steps/s", "of the base", "of the ideal"];
-    let mut table = Table::new(load.name, &columns);
+    let mut table = ReportTable::new(load.name, &columns);
     let thousand =
-        |rates: &[f64]| Spread::of(rates.iter().map(|rate| rate / 1e3)).map(|spread| format!("{spread:.0} k"));
+        |rates: &[f64]| MedianSpread::of(rates.iter().map(|rate| rate / 1e3)).map(|spread| format!("{spread:.0} k"));
     table.row(["1, on one core (base)".into(), thousand(&base)?, "1".into(), "1".into()]);
     let mut points = Vec::new();
     for (envs, rates) in ENVIRONMENTS.into_iter().zip(&rates) {
-        let ratio = Spread::of(rates.iter().zip(&base).map(|(rate, base)| rate / base))?;
+        let ratio = MedianSpread::of(rates.iter().zip(&base).map(|(rate, base)| rate / base))?;
         #[expect(clippy::cast_precision_loss, reason = "small numbers")]
         let (x, ideal) = (envs as f64, envs.min(cores.len()) as f64);
         let of_ideal = format!("{:.0} %", 100.0 * ratio.median / ideal);
@@ -123,14 +129,14 @@ fn compare(load: &Load, caraware: &Path, runs: &Path, cores: &[usize], report: &
         points.push([x, ratio.median]);
     }
     report.tables.push(table);
-    Ok(Line {
+    Ok(CurveLine {
         name: load.name.into(),
         points,
     })
 }
 
 /// Vehicle-steps per second of one run.
-fn rate(load: &Load, envs: usize, cores: Option<&[usize]>, caraware: &Path, runs: &Path) -> Result<f64, Exit> {
+fn rate(load: &TownLoad, envs: usize, cores: Option<&[usize]>, caraware: &Path, runs: &Path) -> Result<f64, Exit> {
     let settings = [
         format!("run.envs={envs}"),
         format!("traffic.cavs={}", load.cavs),
@@ -155,7 +161,7 @@ fn rate(load: &Load, envs: usize, cores: Option<&[usize]>, caraware: &Path, runs
     }
     let path = runs.join("run").join("report.json");
     let text = fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
-    let result: Outcome =
+    let result: RunFigures =
         serde_json::from_str(&text).map_err(|error| Exit::run(format!("{}: {error}", path.display()), ""))?;
     let run = runs.join("run");
     fs::remove_dir_all(&run).map_err(|error| Exit::io("remove", &run, &error))?;

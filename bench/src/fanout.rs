@@ -19,7 +19,7 @@ use ipc_schema::{
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-use super::{Options, Report, Spread, Table};
+use super::{BenchOptions, BenchReport, MedianSpread, ReportTable};
 
 /// Wall time of a paced run, seconds.
 const PACED_S: u64 = 20;
@@ -43,8 +43,8 @@ const PATIENCE: Duration = Duration::from_secs(120);
 ///
 /// # Errors
 /// A program is missing, or a run fails.
-pub fn measure(options: &Options) -> Result<Report, Exit> {
-    let mut report = Report::new(
+pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
+    let mut report = BenchReport::new(
         "fanout",
         "Fan-out",
         format!(
@@ -53,20 +53,20 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
              behind its time, by the clock that the sensors look at once it is out."
         ),
     );
-    let bench = Bench::new(options)?;
+    let bench = FanoutBench::new(options)?;
     bench.paced(&mut report)?;
     bench.free(&mut report)?;
     bench.kills(&mut report)?;
     Ok(report)
 }
 
-struct Bench {
+struct FanoutBench {
     caraware: PathBuf,
     watch: PathBuf,
     directory: PathBuf,
 }
 
-impl Drop for Bench {
+impl Drop for FanoutBench {
     fn drop(&mut self) {
         if let Err(error) = std::fs::remove_dir_all(&self.directory) {
             tracing::debug!(%error, "cannot remove the measurement's runs");
@@ -74,8 +74,8 @@ impl Drop for Bench {
     }
 }
 
-impl Bench {
-    fn new(options: &Options) -> Result<Self, Exit> {
+impl FanoutBench {
+    fn new(options: &BenchOptions) -> Result<Self, Exit> {
         let directory = std::env::temp_dir().join(format!("caraware-bench-{}", std::process::id()));
         std::fs::create_dir_all(&directory).map_err(|error| Exit::io("create", &directory, &error))?;
         Ok(Self {
@@ -85,7 +85,7 @@ impl Bench {
         })
     }
 
-    fn start(&self, name: &str, port: Option<u16>, settings: &[String]) -> Result<Running, Exit> {
+    fn start(&self, name: &str, port: Option<u16>, settings: &[String]) -> Result<LiveRun, Exit> {
         let fanout = match port {
             Some(port) => format!("fanout.listen=tcp/127.0.0.1:{port}"),
             None => "fanout.enabled=false".into(),
@@ -101,12 +101,12 @@ impl Bench {
         let child = command
             .spawn()
             .map_err(|error| Exit::io("start", &self.caraware, &error))?;
-        Running::join(child, self.directory.join(name))
+        LiveRun::join(child, self.directory.join(name))
     }
 
     /// Viewers: those that count, one that is stopped, one on a slow link.
-    fn audience(&self, run: &str, port: u16, seconds: u64) -> Result<Vec<Viewer>, Exit> {
-        let viewer = |arguments: &[String]| Viewer::start(&self.watch, run, port, seconds, arguments);
+    fn audience(&self, run: &str, port: u16, seconds: u64) -> Result<Vec<CountingViewer>, Exit> {
+        let viewer = |arguments: &[String]| CountingViewer::start(&self.watch, run, port, seconds, arguments);
         let log = self.directory.join("world.csv");
         let healthy = viewer(&[
             "--viewers".into(),
@@ -121,8 +121,8 @@ impl Bench {
     }
 
     /// Paced at real time: lateness of ticks without and with an audience, and the age of what the healthy see.
-    fn paced(&self, report: &mut Report) -> Result<(), Exit> {
-        let mut table = Table::new(
+    fn paced(&self, report: &mut BenchReport) -> Result<(), Exit> {
+        let mut table = ReportTable::new(
             "in real time",
             &[
                 "run",
@@ -152,7 +152,7 @@ impl Bench {
                 // Eight programs that start on the cores of the run are not yet an audience.
                 run.observe(SETTLING);
                 let ticks = run.observe(Duration::from_secs(PACED_S - 1) - SETTLING);
-                let seen = audience.into_iter().map(Viewer::finish).collect::<Vec<_>>();
+                let seen = audience.into_iter().map(CountingViewer::finish).collect::<Vec<_>>();
                 let late = lateness_ms(&ticks);
                 let found = run.finish()?;
                 hashes.push(found["observation_hash"].clone());
@@ -186,7 +186,7 @@ impl Bench {
     }
 
     /// How old what a healthy viewer has just got is: since the tick stood on the sensors' board.
-    fn age(&self, report: &mut Report, ticks: &[(u64, u64)], seen: &[Value]) -> Result<(), Exit> {
+    fn age(&self, report: &mut BenchReport, ticks: &[(u64, u64)], seen: &[Value]) -> Result<(), Exit> {
         let log = self.directory.join("world.csv");
         let text = std::fs::read_to_string(&log).map_err(|error| Exit::io("read", &log, &error))?;
         let made: std::collections::BTreeMap<u64, u64> = ticks.iter().copied().collect();
@@ -213,13 +213,13 @@ impl Bench {
     }
 
     /// As fast as it goes: watched against without a fan-out, in alternating pairs.
-    fn free(&self, report: &mut Report) -> Result<(), Exit> {
+    fn free(&self, report: &mut BenchReport) -> Result<(), Exit> {
         let settings = [
             format!("episode.ticks={FREE_TICKS}"),
             "episode.training_episodes=1".into(),
         ];
         let (mut ratios, mut hashes) = (Vec::new(), Vec::new());
-        let mut table = Table::new(
+        let mut table = ReportTable::new(
             "as fast as it goes",
             &["pair", "off (ticks/s)", "watched (ticks/s)", "ratio"],
         );
@@ -248,7 +248,7 @@ impl Bench {
                 format!("{ratio:.3}"),
             ]);
         }
-        let spread = Spread::of(ratios.iter().copied())?;
+        let spread = MedianSpread::of(ratios.iter().copied())?;
         report.figure("rate watched / off, median", spread.median);
         report.figure("rate watched / off, smallest", spread.smallest);
         report.figure(
@@ -260,7 +260,7 @@ impl Bench {
     }
 
     /// Kills the fan-out again and again; a viewer watches throughout.
-    fn kills(&self, report: &mut Report) -> Result<(), Exit> {
+    fn kills(&self, report: &mut BenchReport) -> Result<(), Exit> {
         let settings = [
             "run.real_time_factor=10".to_owned(),
             "episode.ticks=1000000".into(),
@@ -269,7 +269,7 @@ impl Bench {
         let port = free_port()?;
         let mut run = self.start("kills", Some(port), &settings)?;
         run.wait_for_ticks(10)?;
-        let viewer = Viewer::start(&self.watch, "kills", port, 600, &[])?;
+        let viewer = CountingViewer::start(&self.watch, "kills", port, 600, &[])?;
         let undisturbed = longest_gap_ms(&run.observe(Duration::from_secs(10)));
         let (mut ticks, mut memory_mib) = (Vec::new(), Vec::new());
         for kill in 0..KILLS {
@@ -309,9 +309,12 @@ impl Bench {
             "resident memory of the last fan-out after 20 s, MiB",
             resident_mib(board.health().pid),
         );
-        report.figure("resident memory of fresh fan-outs, MiB", Spread::of(memory_mib)?.median);
+        report.figure(
+            "resident memory of fresh fan-outs, MiB",
+            MedianSpread::of(memory_mib)?.median,
+        );
         drop(viewer);
-        let mut table = Table::new(
+        let mut table = ReportTable::new(
             "fan-out killed 50 times, a tick every 10 ms",
             &["", "longest pause of the run (ms)"],
         );
@@ -323,7 +326,7 @@ impl Bench {
 }
 
 /// A run in the background, with its boards; stopped when dropped.
-struct Running {
+struct LiveRun {
     child: Child,
     directory: PathBuf,
     run: RunFile,
@@ -333,7 +336,7 @@ struct Running {
     epoch_ns: u64,
 }
 
-impl Drop for Running {
+impl Drop for LiveRun {
     fn drop(&mut self) {
         if matches!(self.child.try_wait(), Ok(None)) {
             signal(&self.child, Signal::INT);
@@ -342,7 +345,7 @@ impl Drop for Running {
     }
 }
 
-impl Running {
+impl LiveRun {
     fn join(mut child: Child, directory: PathBuf) -> Result<Self, Exit> {
         let begun = Instant::now();
         let started = directory.join("logs").join("traffic-bridge.log");
@@ -445,19 +448,19 @@ impl Running {
 }
 
 /// A viewer that counts; killed when dropped.
-struct Viewer {
+struct CountingViewer {
     child: Child,
     output: BufReader<ChildStdout>,
 }
 
-impl Drop for Viewer {
+impl Drop for CountingViewer {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-impl Viewer {
+impl CountingViewer {
     /// Starts one and waits until it watches.
     fn start(program: &Path, run: &str, port: u16, seconds: u64, arguments: &[String]) -> Result<Self, Exit> {
         let mut child = Command::new(program)

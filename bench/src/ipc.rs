@@ -25,7 +25,7 @@ use ipc_schema::{
 };
 use serde::Deserialize;
 
-use super::{Options, Report};
+use super::{BenchOptions, BenchReport};
 
 /// Sizes of the block, bytes.
 const SIZES: [usize; 8] = [1 << 10, 1 << 12, 1 << 14, 1 << 16, 1 << 18, 1 << 20, 1 << 22, 1 << 24];
@@ -49,7 +49,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 
 /// What the receivers write: latencies in nanoseconds.
 #[derive(Debug, Deserialize)]
-struct Bare {
+struct BareLatencies {
     latencies_ns: Vec<f64>,
 }
 
@@ -57,13 +57,13 @@ struct Bare {
 ///
 /// # Errors
 /// Shared memory is too small, or a program is missing or fails.
-pub fn measure(options: &Options) -> Result<Report, Exit> {
+pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let mut rounds = Vec::new();
     for _ in 0..ROUNDS {
         let mut program = Command::new(install::program(&options.bin, "ipc-bench")?);
         program.args(["--messages", &BARE.to_string()]);
-        let bare: Bare = super::report::from_program(program)?;
-        rounds.push(Round {
+        let bare: BareLatencies = super::report::from_program(program)?;
+        rounds.push(LatencyRound {
             bare: bare.latencies_ns,
             ours: ours()?,
         });
@@ -73,21 +73,21 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
 }
 
 /// The bare message and ours, one after the other: latencies in nanoseconds.
-struct Round {
+struct LatencyRound {
     bare: Vec<f64>,
-    ours: Ours,
+    ours: OurLatencies,
 }
 
 /// Size of the block, bytes → latencies, nanoseconds.
-type BySize = BTreeMap<usize, Vec<f64>>;
+type LatenciesBySize = BTreeMap<usize, Vec<f64>>;
 
 /// Ours: until the block is in the receiver's hands, until it is a tensor that is lent, and until it is a tensor of an observation that
 /// may be kept; and the second of these where the sender has written two values of the block.
-struct Ours {
-    taken: BySize,
-    tensor: BySize,
-    received: BySize,
-    hardly_written: BySize,
+struct OurLatencies {
+    taken: LatenciesBySize,
+    tensor: LatenciesBySize,
+    received: LatenciesBySize,
+    hardly_written: LatenciesBySize,
 }
 
 /// Rows whose block has `bytes` bytes.
@@ -96,7 +96,7 @@ fn rows(bytes: usize) -> usize {
 }
 
 /// Sends blocks of every size through the services of a real run to a trainer process that polls.
-fn ours() -> Result<Ours, Exit> {
+fn ours() -> Result<OurLatencies, Exit> {
     let directory = tempfile::tempdir().map_err(|error| Exit::io("create", &std::env::temp_dir(), &error))?;
     let args = RunArgs {
         set: vec![
@@ -121,12 +121,12 @@ fn ours() -> Result<Ours, Exit> {
         .stdin(Stdio::null())
         .spawn()
         .map_err(|error| Exit::io("start", &prepared.install.python, &error))?;
-    let mut receiver = Receiver(receiver);
+    let mut receiver = ReceiverProcess(receiver);
     receiver.wait_until("attach", || board.progress().attached == 1)?;
     send_all(&run, &board, &mut receiver)?;
     receiver.wait_until("finish", || State::from_u32(board.health().state) == State::Done)?;
     let latencies: BTreeMap<String, BTreeMap<usize, Vec<[f64; 2]>>> = read(&run.run_dir.join("latencies.json"))?;
-    let of = |way: &str, which: usize, first_turn: usize| -> BySize {
+    let of = |way: &str, which: usize, first_turn: usize| -> LatenciesBySize {
         let measured = |bytes: usize| {
             let all = latencies.get(way).and_then(|by_rows| by_rows.get(&rows(bytes)));
             let turns = all.map_or(&[][..], Vec::as_slice).chunks(MESSAGES / 2);
@@ -139,7 +139,7 @@ fn ours() -> Result<Ours, Exit> {
         };
         SIZES.iter().map(|&bytes| (bytes, measured(bytes))).collect()
     };
-    Ok(Ours {
+    Ok(OurLatencies {
         taken: of("lent", 0, 0),
         tensor: of("lent", 1, 0),
         received: of("received", 1, 0),
@@ -148,9 +148,9 @@ fn ours() -> Result<Ours, Exit> {
 }
 
 /// The trainer's process; killed when dropped.
-struct Receiver(Child);
+struct ReceiverProcess(Child);
 
-impl Receiver {
+impl ReceiverProcess {
     fn wait_until(&mut self, what: &str, done: impl Fn() -> bool) -> Result<(), Exit> {
         let begin = Instant::now();
         while !done() {
@@ -169,7 +169,7 @@ impl Receiver {
     }
 }
 
-impl Drop for Receiver {
+impl Drop for ReceiverProcess {
     fn drop(&mut self) {
         // Gone already, unless the measurement failed.
         let _ = self.0.kill();
@@ -177,7 +177,7 @@ impl Drop for Receiver {
     }
 }
 
-fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut Receiver) -> Result<(), Exit> {
+fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) -> Result<(), Exit> {
     let failed = |error: ipc_schema::session::SessionError| Exit::run(error.to_string(), "");
     let session = Session::join_from_outside(run.clone(), Process::SensorDaemon, 0, Arc::new(AtomicBool::new(false)))
         .map_err(failed)?;
@@ -224,7 +224,7 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut Receiver) -> Resu
     Ok(())
 }
 
-fn peers(options: &Options) -> Result<BTreeMap<String, BySize>, Exit> {
+fn peers(options: &BenchOptions) -> Result<BTreeMap<String, LatenciesBySize>, Exit> {
     let Some(python) = &options.python else {
         return Ok(BTreeMap::new());
     };

@@ -5,26 +5,26 @@ use std::{collections::BTreeMap, process::Command};
 use caraware::{failure::Exit, install};
 use serde::Deserialize;
 
-use super::{Options, Report, Table};
+use super::{BenchOptions, BenchReport, ReportTable};
 
 /// What `lidar-bench` writes.
 #[derive(Debug, Deserialize)]
-struct Measured {
+struct LidarFigures {
     path: String,
-    cases: BTreeMap<String, Rate>,
+    cases: BTreeMap<String, RayRate>,
     lidars: BTreeMap<u32, f64>,
     #[serde(default)]
-    peers: BTreeMap<String, Peer>,
+    peers: BTreeMap<String, RayCasterPeer>,
 }
 
 #[derive(Debug, Deserialize)]
-struct Rate {
+struct RayRate {
     rays_per_s: f64,
     spread: [f64; 2],
 }
 
 #[derive(Debug, Deserialize)]
-struct Peer {
+struct RayCasterPeer {
     rays_per_s: f64,
     ratio: f64,
     spread: [f64; 2],
@@ -34,13 +34,13 @@ struct Peer {
 ///
 /// # Errors
 /// It is not built, or fails.
-pub fn measure(options: &Options) -> Result<Report, Exit> {
+pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let mut command = Command::new(install::program(&options.bin, "lidar-bench")?);
     if let Some(python) = &options.python {
         command.arg("--python").arg(python);
     }
-    let measured: Measured = super::report::from_program(command)?;
-    let mut report = Report::new(
+    let measured: LidarFigures = super::report::from_program(command)?;
+    let mut report = BenchReport::new(
         "lidar",
         "LIDAR",
         format!(
@@ -50,7 +50,7 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
         ),
     );
     let mega = |rate: f64| format!("{:.1}", rate / 1e6);
-    let mut ours = Table::new("", &["scan", "million rays/s", "smallest–largest"]);
+    let mut ours = ReportTable::new("", &["scan", "million rays/s", "smallest–largest"]);
     for (name, rate) in &measured.cases {
         let [smallest, largest] = rate.spread.map(mega);
         ours.row([name.clone(), mega(rate.rays_per_s), format!("{smallest}–{largest}")]);
@@ -64,7 +64,7 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
         ]);
     }
     report.tables.push(ours);
-    let mut peers = Table::new("", &["peer", "million rays/s", "ours is faster by", "smallest–largest"]);
+    let mut peers = ReportTable::new("", &["peer", "million rays/s", "ours is faster by", "smallest–largest"]);
     for (name, peer) in &measured.peers {
         let [smallest, largest] = peer.spread;
         let ratio = format!("{:.1} ×", peer.ratio);

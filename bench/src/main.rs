@@ -1,6 +1,6 @@
 //! `caraware bench`: measures a part of caraware on this machine, side by side with what others use for the same work.
 //!
-//! The `caraware` command starts this program with its arguments. One file for each part; all end in a [`Report`]. Decision 9.
+//! The `caraware` command starts this program with its arguments. One file for each part; all end in a [`BenchReport`]. Decision 9.
 
 mod cli;
 mod envs;
@@ -22,12 +22,12 @@ use std::{io::Write as _, path::PathBuf, process::ExitCode};
 use caraware::{failure::Exit, install};
 use clap::Parser as _;
 
-use crate::cli::{BenchArgs, Part};
-use report::{Curve, Line, Report, Spread, Table};
+use crate::cli::{BenchArgs, BenchPart};
+use report::{BenchReport, CurveLine, MedianSpread, ReportCurve, ReportTable};
 
 /// What every measurement may need.
 #[derive(Debug, Clone)]
-pub struct Options {
+pub struct BenchOptions {
     /// Directory of our programs.
     pub bin: PathBuf,
     /// Python that has the peers installed, if there is one.
@@ -55,13 +55,13 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
         .clone()
         .or_else(|| install::environment_python(&bin, install::PEERS));
     let python = python.or_else(|| install::python(&bin).ok());
-    let options = Options {
+    let options = BenchOptions {
         bin,
         python,
         quick: args.quick,
     };
     let parts = match args.part {
-        Part::All => Part::measured().collect(),
+        BenchPart::All => BenchPart::measured().collect(),
         part => vec![part],
     };
     let mut reports = Vec::new();
@@ -90,16 +90,16 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
     Ok(())
 }
 
-fn measure(part: Part, options: &Options) -> Result<Report, Exit> {
+fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit> {
     match part {
-        Part::Envs => envs::measure(options),
-        Part::Ipc => ipc::measure(options),
-        Part::Lidar => lidar::measure(options),
-        Part::Fanout => fanout::measure(options),
-        Part::Trainer => trainer::measure(options),
-        Part::Overhead => overhead::measure(options),
-        Part::Scale => scale::measure(options),
-        Part::Peers => peers::measure(options),
-        Part::All => Err(Exit::config("`all` is not a part", "")),
+        BenchPart::Envs => envs::measure(options),
+        BenchPart::Ipc => ipc::measure(options),
+        BenchPart::Lidar => lidar::measure(options),
+        BenchPart::Fanout => fanout::measure(options),
+        BenchPart::Trainer => trainer::measure(options),
+        BenchPart::Overhead => overhead::measure(options),
+        BenchPart::Scale => scale::measure(options),
+        BenchPart::Peers => peers::measure(options),
+        BenchPart::All => Err(Exit::config("`all` is not a part", "")),
     }
 }

@@ -1,11 +1,11 @@
 //! What co-simulation costs beside bare SUMO on the same scenario.
 
-use caraware::{failure::Exit, generate::City, install::Install};
+use caraware::{failure::Exit, generate::GeneratedCity, install::Install};
 
 use super::{
-    Options, Report, Spread, Table,
-    sides::{Ours, Place, Scenario, same_results},
-    stages::Stages,
+    BenchOptions, BenchReport, MedianSpread, ReportTable,
+    sides::{BenchDirectory, ComparedScenario, OurRun, same_results},
+    stages::StageTimes,
 };
 
 /// Vehicles, simulated seconds, pairs.
@@ -17,13 +17,13 @@ const QUICK: (u32, f64, usize) = (60, 6.0, 1);
 ///
 /// # Errors
 /// Either fails, or SUMO's results differ.
-pub fn measure(options: &Options) -> Result<Report, Exit> {
+pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let (vehicles, duration_s, pairs) = if options.quick { QUICK } else { SIZE };
-    let place = Place::new("overhead")?;
+    let place = BenchDirectory::new("overhead")?;
     let install = Install::find()?;
-    let sumocfg = City::of(vehicles, duration_s, 0.1, 1).write(&install, &place.path().join("city"))?;
-    let scenario = Scenario::new(options, &place, install, sumocfg, 1.0, vehicles)?;
-    let mut table = Table::new(
+    let sumocfg = GeneratedCity::of(vehicles, duration_s, 0.1, 1).write(&install, &place.path().join("city"))?;
+    let scenario = ComparedScenario::new(options, &place, install, sumocfg, 1.0, vehicles)?;
+    let mut table = ReportTable::new(
         "Alternating pairs",
         &["pair", "sumo, s", "ours, s", "ratio", "sumo, CPU s", "ours, CPU s"],
     );
@@ -44,8 +44,8 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
         ratios.push(ratio);
         last = Some(ours);
     }
-    let ratio = Spread::of(ratios)?;
-    let mut report = Report::new(
+    let ratio = MedianSpread::of(ratios)?;
+    let mut report = BenchReport::new(
         "overhead",
         "Co-simulation beside bare SUMO",
         format!(
@@ -66,9 +66,9 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
 }
 
 /// Where processor time goes in one run.
-fn stages(ours: &Ours, report: &mut Report) -> Table {
-    let stages = Stages::of(ours);
-    let mut table = Table::new(
+fn stages(ours: &OurRun, report: &mut BenchReport) -> ReportTable {
+    let stages = StageTimes::of(ours);
+    let mut table = ReportTable::new(
         "Where processor time goes (the last pair)",
         &["stage", "CPU s", "µs per vehicle-step", "share"],
     );

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use caraware::failure::Exit;
 
-use crate::{Report, cli::Part};
+use crate::{BenchReport, cli::BenchPart};
 
 const HEAD: &str = "# Benchmarks
 
@@ -20,7 +20,7 @@ fn documentation() -> PathBuf {
 ///
 /// # Errors
 /// The source tree is not there or not writable.
-pub fn keep(report: &Report) -> Result<(), Exit> {
+pub fn keep(report: &BenchReport) -> Result<(), Exit> {
     let path = documentation().join("benchmarks").join(format!("{}.json", report.part));
     let text = serde_json::to_string_pretty(report).unwrap_or_default();
     std::fs::write(&path, text + "\n").map_err(|error| Exit::io("write", &path, &error))
@@ -39,12 +39,12 @@ pub fn write() -> Result<(), Exit> {
 fn page() -> Result<String, Exit> {
     let directory = documentation().join("benchmarks");
     let mut text = HEAD.to_owned();
-    for part in Part::measured() {
+    for part in BenchPart::measured() {
         let path = directory.join(format!("{}.json", part.name()));
         let Ok(kept) = std::fs::read_to_string(&path) else {
             continue;
         };
-        let report: Report = serde_json::from_str(&kept)
+        let report: BenchReport = serde_json::from_str(&kept)
             .map_err(|error| Exit::run(format!("{}: {error}", path.display()), "measure it again with --keep"))?;
         text += &section(&report);
     }
@@ -53,7 +53,7 @@ fn page() -> Result<String, Exit> {
     Ok(text + "\n" + &by_hand)
 }
 
-fn section(report: &Report) -> String {
+fn section(report: &BenchReport) -> String {
     let mut text = format!("\n## {}\n\n`{}`. {}\n", report.title, report.command, report.text);
     for table in &report.tables {
         text += "\n";

@@ -6,17 +6,17 @@ use std::{
     process::Command,
 };
 
-use caraware::{failure::Exit, generate::City, install, install::Install};
+use caraware::{failure::Exit, generate::GeneratedCity, install, install::Install};
 use serde::Deserialize;
 
 use super::{
-    Options, Report, Spread, Table,
+    BenchOptions, BenchReport, MedianSpread, ReportTable,
     report::from_program,
-    sides::{Place, Scenario, same_results},
+    sides::{BenchDirectory, ComparedScenario, same_results},
 };
 
 /// How much is measured.
-struct Size {
+struct PeersSize {
     /// Vehicles of the city, all on the road throughout.
     vehicles: u32,
     /// Simulated time there, seconds.
@@ -31,7 +31,7 @@ struct Size {
     rounds: usize,
 }
 
-const SIZE: Size = Size {
+const SIZE: PeersSize = PeersSize {
     vehicles: 5000,
     duration_s: 60.0,
     traci_steps: 20,
@@ -40,7 +40,7 @@ const SIZE: Size = Size {
     rounds: 5,
 };
 /// The same when only the way is tried.
-const QUICK: Size = Size {
+const QUICK: PeersSize = PeersSize {
     vehicles: 60,
     duration_s: 6.0,
     traci_steps: 5,
@@ -56,7 +56,7 @@ const LEAST_ROOM: u32 = 64;
 const FEW: u32 = 40;
 
 /// A driving environment in a Python environment of its own.
-struct Driving {
+struct DrivingPeer {
     /// Its name.
     name: &'static str,
     /// How `caraware_bench.peer` calls it.
@@ -65,13 +65,13 @@ struct Driving {
     environment: &'static str,
 }
 
-const DRIVING: [Driving; 2] = [
-    Driving {
+const DRIVING: [DrivingPeer; 2] = [
+    DrivingPeer {
         name: "MetaDrive",
         peer: "metadrive",
         environment: ".venv-metadrive",
     },
-    Driving {
+    DrivingPeer {
         name: "SMARTS",
         peer: "smarts",
         environment: ".venv-smarts",
@@ -81,7 +81,7 @@ const DRIVING: [Driving; 2] = [
 /// What `caraware_bench.peer` writes.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(untagged)]
-enum Answer {
+enum PeerAnswer {
     /// It was measured.
     Rates {
         version: String,
@@ -94,7 +94,7 @@ enum Answer {
 
 /// A kind of peers over all rounds.
 #[derive(Debug, Default)]
-struct Rounds {
+struct PeerRounds {
     /// Case → rates, one for each round.
     rates: BTreeMap<String, Vec<f64>>,
     /// Peer → why there is none.
@@ -103,16 +103,16 @@ struct Rounds {
     versions: BTreeMap<String, String>,
 }
 
-impl Rounds {
-    fn add(&mut self, peer: &str, answer: Answer, install_by: &str) {
+impl PeerRounds {
+    fn add(&mut self, peer: &str, answer: PeerAnswer, install_by: &str) {
         match answer {
-            Answer::Rates { version, rates } => {
+            PeerAnswer::Rates { version, rates } => {
                 self.versions.insert(peer.into(), version);
                 for (case, rate) in rates {
                     self.rates.entry(case).or_default().push(rate);
                 }
             }
-            Answer::Missing { missing } => {
+            PeerAnswer::Missing { missing } => {
                 let why = format!("not installed: {missing} (`make {install_by}`)");
                 self.missing.insert(peer.into(), why);
             }
@@ -122,16 +122,16 @@ impl Rounds {
 
 /// Everything that was measured, by round.
 #[derive(Debug, Default)]
-struct Measured {
+struct PeersFigures {
     /// Ours, many vehicles: sensed vehicle-steps in a wall second.
     many: Vec<f64>,
     /// Ours, as many vehicles as a driving environment has agents.
     few: Vec<f64>,
-    loops: Rounds,
-    driving: Rounds,
+    loops: PeerRounds,
+    driving: PeerRounds,
 }
 
-impl Measured {
+impl PeersFigures {
     fn versions(&self) -> String {
         let all = self.loops.versions.iter().chain(&self.driving.versions);
         let named: Vec<String> = all.map(|(peer, version)| format!("{peer} {version}")).collect();
@@ -143,13 +143,13 @@ impl Measured {
 ///
 /// # Errors
 /// A run fails, an installed peer fails, or SUMO's results differ between ours and the loop over libsumo.
-pub fn measure(options: &Options) -> Result<Report, Exit> {
+pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let size = if options.quick { &QUICK } else { &SIZE };
     // One each: both sides number their runs.
-    let place = Place::new("peers")?;
+    let place = BenchDirectory::new("peers")?;
     let (many, _) = city(options, &place, size.vehicles, size.duration_s)?;
     let (few, few_net) = city(options, &place, FEW, size.few_duration_s)?;
-    let mut measured = Measured::default();
+    let mut measured = PeersFigures::default();
     for _ in 0..size.rounds {
         let results = loops(options, size, &many, &mut measured.loops)?;
         let ours = many.ours()?;
@@ -169,20 +169,25 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
 
 /// A generated city for both sides, and its net.
 fn city<'a>(
-    options: &Options,
-    place: &'a Place,
+    options: &BenchOptions,
+    place: &'a BenchDirectory,
     vehicles: u32,
     duration_s: f64,
-) -> Result<(Scenario<'a>, PathBuf), Exit> {
+) -> Result<(ComparedScenario<'a>, PathBuf), Exit> {
     let install = Install::find()?;
     let directory = place.path().join(format!("city-{vehicles}"));
-    let sumocfg = City::of(vehicles, duration_s, STEP_S, 1).write(&install, &directory)?;
-    let scenario = Scenario::new(options, place, install, sumocfg, 1.0, vehicles.max(LEAST_ROOM))?;
+    let sumocfg = GeneratedCity::of(vehicles, duration_s, STEP_S, 1).write(&install, &directory)?;
+    let scenario = ComparedScenario::new(options, place, install, sumocfg, 1.0, vehicles.max(LEAST_ROOM))?;
     Ok((scenario, directory.join("city.net.xml")))
 }
 
 /// Both Python loops over SUMO; where the one over libsumo, which goes to the end, has SUMO's results.
-fn loops(options: &Options, size: &Size, city: &Scenario, rounds: &mut Rounds) -> Result<Option<PathBuf>, Exit> {
+fn loops(
+    options: &BenchOptions,
+    size: &PeersSize,
+    city: &ComparedScenario,
+    rounds: &mut PeerRounds,
+) -> Result<Option<PathBuf>, Exit> {
     let python = match &options.python {
         Some(python) => python.clone(),
         None => install::python(&options.bin)?,
@@ -193,23 +198,29 @@ fn loops(options: &Options, size: &Size, city: &Scenario, rounds: &mut Rounds) -
         reason = "some hundred steps"
     )]
     let all_steps = (size.duration_s / STEP_S).round() as u32;
-    let run = |peer: &str, steps: u32| -> Result<(Answer, PathBuf), Exit> {
+    let run = |peer: &str, steps: u32| -> Result<(PeerAnswer, PathBuf), Exit> {
         let (command, results) = city.python_loop(&python, peer, steps)?;
         Ok((from_program(command)?, results))
     };
     let (traci, _) = run("traci", size.traci_steps)?;
     rounds.add("TraCI", traci, "build");
     let (libsumo, results) = run("libsumo", all_steps)?;
-    let results = matches!(libsumo, Answer::Rates { .. }).then_some(results);
+    let results = matches!(libsumo, PeerAnswer::Rates { .. }).then_some(results);
     rounds.add("libsumo", libsumo, "peers");
     Ok(results)
 }
 
 /// One driving environment in its own Python.
-fn drive(options: &Options, place: &Place, peer: &Driving, net: &Path, seconds: f64) -> Result<Answer, Exit> {
+fn drive(
+    options: &BenchOptions,
+    place: &BenchDirectory,
+    peer: &DrivingPeer,
+    net: &Path,
+    seconds: f64,
+) -> Result<PeerAnswer, Exit> {
     let Some(python) = install::environment_python(&options.bin, peer.environment) else {
         let missing = format!("there is no {}", peer.environment);
-        return Ok(Answer::Missing { missing });
+        return Ok(PeerAnswer::Missing { missing });
     };
     let mut command = Command::new(python);
     command
@@ -221,15 +232,15 @@ fn drive(options: &Options, place: &Place, peer: &Driving, net: &Path, seconds: 
     from_program(command)
 }
 
-fn report(size: &Size, measured: &Measured) -> Result<Report, Exit> {
-    let Size {
+fn report(size: &PeersSize, measured: &PeersFigures) -> Result<BenchReport, Exit> {
+    let PeersSize {
         vehicles,
         duration_s,
         traci_steps,
         rounds,
         ..
     } = size;
-    let mut report = Report::new(
+    let mut report = BenchReport::new(
         "peers",
         "Beside Python loops over SUMO, MetaDrive and SMARTS",
         format!(
@@ -252,12 +263,12 @@ fn report(size: &Size, measured: &Measured) -> Result<Report, Exit> {
     Ok(report)
 }
 
-fn loops_table(measured: &Measured, report: &mut Report) -> Result<Table, Exit> {
-    let mut table = Table::new(
+fn loops_table(measured: &PeersFigures, report: &mut BenchReport) -> Result<ReportTable, Exit> {
+    let mut table = ReportTable::new(
         "Every vehicle of SUMO in a program's hands",
         &["how", "vehicle-updates/s", "ours is faster by", "smallest–largest"],
     );
-    let ours = Spread::of(measured.many.iter().copied())?;
+    let ours = MedianSpread::of(measured.many.iter().copied())?;
     report.figure("ours, vehicle-steps/s", ours.median);
     table.row([
         "ours, with dynamics, sensors and delivery".into(),
@@ -266,7 +277,7 @@ fn loops_table(measured: &Measured, report: &mut Report) -> Result<Table, Exit> 
         String::new(),
     ]);
     for (case, theirs) in &measured.loops.rates {
-        let rate = Spread::of(theirs.iter().copied())?;
+        let rate = MedianSpread::of(theirs.iter().copied())?;
         let ratio = ratio(&measured.many, theirs)?;
         report.figure(format!("{case}, vehicle-updates/s"), rate.median);
         report.figure(format!("ratio to {case}"), ratio.median);
@@ -283,17 +294,17 @@ fn loops_table(measured: &Measured, report: &mut Report) -> Result<Table, Exit> 
     Ok(table)
 }
 
-fn driving_table(size: &Size, measured: &Measured, report: &mut Report) -> Result<Table, Exit> {
+fn driving_table(size: &PeersSize, measured: &PeersFigures, report: &mut BenchReport) -> Result<ReportTable, Exit> {
     let (of_many, of_few) = (
         format!("ours, {} vehicles, is faster by", size.vehicles),
         format!("ours, {FEW} vehicles, is faster by"),
     );
-    let mut table = Table::new(
+    let mut table = ReportTable::new(
         "Driving environments",
         &["environment", "agent-steps/s", &of_many, &of_few],
     );
     for (vehicles, rates) in [(size.vehicles, &measured.many), (FEW, &measured.few)] {
-        let rate = Spread::of(rates.iter().copied())?;
+        let rate = MedianSpread::of(rates.iter().copied())?;
         table.row([
             format!("ours, {vehicles} vehicles"),
             format!("{:.0}", rate.median),
@@ -302,7 +313,7 @@ fn driving_table(size: &Size, measured: &Measured, report: &mut Report) -> Resul
         ]);
     }
     for (case, theirs) in &measured.driving.rates {
-        let rate = Spread::of(theirs.iter().copied())?;
+        let rate = MedianSpread::of(theirs.iter().copied())?;
         let (many, few) = (ratio(&measured.many, theirs)?, ratio(&measured.few, theirs)?);
         report.figure(format!("{case}, agent-steps/s"), rate.median);
         report.figure(format!("ratio to {case}"), many.median);
@@ -321,8 +332,8 @@ fn driving_table(size: &Size, measured: &Measured, report: &mut Report) -> Resul
 }
 
 /// How much faster ours was, round by round.
-fn ratio(ours: &[f64], theirs: &[f64]) -> Result<Spread, Exit> {
-    Spread::of(ours.iter().zip(theirs).map(|(ours, theirs)| ours / theirs))
+fn ratio(ours: &[f64], theirs: &[f64]) -> Result<MedianSpread, Exit> {
+    MedianSpread::of(ours.iter().zip(theirs).map(|(ours, theirs)| ours / theirs))
 }
 
 #[cfg(test)]
@@ -330,16 +341,16 @@ fn ratio(ours: &[f64], theirs: &[f64]) -> Result<Spread, Exit> {
 mod tests {
     use super::*;
 
-    fn answer(json: &str) -> Answer {
+    fn answer(json: &str) -> PeerAnswer {
         serde_json::from_str(json).unwrap()
     }
 
     #[test]
     fn a_peer_that_is_not_installed_has_a_row_that_says_so() {
-        let mut measured = Measured {
+        let mut measured = PeersFigures {
             many: vec![200.0, 300.0],
             few: vec![50.0, 50.0],
-            ..Measured::default()
+            ..PeersFigures::default()
         };
         for rate in ["100", "100"] {
             let fast = answer(&format!(r#"{{"version": "1", "rates": {{"libsumo loop": {rate}}}}}"#));

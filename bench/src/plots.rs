@@ -8,13 +8,13 @@ use std::{
 
 use caraware::failure::Exit;
 
-use super::Report;
+use super::BenchReport;
 
 /// Draws every curve of `reports` into `directory`.
 ///
 /// # Errors
 /// Not writable, or Python fails.
-pub fn draw(python: &Path, reports: &[Report], directory: &Path) -> Result<(), Exit> {
+pub fn draw(python: &Path, reports: &[BenchReport], directory: &Path) -> Result<(), Exit> {
     std::fs::create_dir_all(directory).map_err(|error| Exit::io("create", directory, &error))?;
     let failed = |error: &std::io::Error| Exit::io("start", python, error);
     let mut process = Command::new(python)

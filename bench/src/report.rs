@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 /// What one part's measurement found.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Report {
+pub struct BenchReport {
     /// The part, as `caraware bench` names it.
     pub part: String,
     /// One line: what was measured.
@@ -17,17 +17,17 @@ pub struct Report {
     /// The command that prints it again.
     pub command: String,
     /// Where it was measured.
-    pub machine: Machine,
+    pub machine: MachineDescription,
     /// The figures for people.
-    pub tables: Vec<Table>,
+    pub tables: Vec<ReportTable>,
     /// The figures for programs: name with unit → value.
     pub figures: BTreeMap<String, f64>,
     /// What is worth a picture.
     #[serde(default)]
-    pub curves: Vec<Curve>,
+    pub curves: Vec<ReportCurve>,
 }
 
-impl Report {
+impl BenchReport {
     /// A report without figures.
     #[must_use]
     pub fn new(part: &str, title: impl Into<String>, text: impl Into<String>) -> Self {
@@ -36,7 +36,7 @@ impl Report {
             title: title.into(),
             text: text.into(),
             command: format!("caraware bench {part}"),
-            machine: Machine::here(),
+            machine: MachineDescription::here(),
             tables: Vec::new(),
             figures: BTreeMap::new(),
             curves: Vec::new(),
@@ -49,7 +49,7 @@ impl Report {
     }
 }
 
-impl fmt::Display for Report {
+impl fmt::Display for BenchReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{}\n{}\n", self.title, self.text)?;
         self.tables.iter().try_for_each(|table| writeln!(f, "{table}"))?;
@@ -59,7 +59,7 @@ impl fmt::Display for Report {
 
 /// The machine, the build and the day.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Machine {
+pub struct MachineDescription {
     /// The processor's name.
     pub processor: String,
     /// Cores that this process may use.
@@ -72,7 +72,7 @@ pub struct Machine {
     pub date: String,
 }
 
-impl Machine {
+impl MachineDescription {
     /// This machine, now.
     #[must_use]
     pub fn here() -> Self {
@@ -95,7 +95,7 @@ impl Machine {
     }
 }
 
-impl fmt::Display for Machine {
+impl fmt::Display for MachineDescription {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self {
             processor,
@@ -132,7 +132,7 @@ fn revision() -> String {
 
 /// Rows of text under column names.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Table {
+pub struct ReportTable {
     /// What the rows have in common; may be empty.
     pub title: String,
     /// Names of the columns, with units.
@@ -141,7 +141,7 @@ pub struct Table {
     pub rows: Vec<Vec<String>>,
 }
 
-impl Table {
+impl ReportTable {
     /// A table without rows.
     #[must_use]
     pub fn new(title: impl Into<String>, columns: &[&str]) -> Self {
@@ -168,7 +168,7 @@ impl Table {
     }
 }
 
-impl fmt::Display for Table {
+impl fmt::Display for ReportTable {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if !self.title.is_empty() {
             writeln!(f, "{}", self.title)?;
@@ -197,7 +197,7 @@ impl fmt::Display for Table {
 
 /// A picture: lines over one quantity.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Curve {
+pub struct ReportCurve {
     /// Name of the picture's file, without extension.
     pub name: String,
     /// Title over it.
@@ -209,12 +209,12 @@ pub struct Curve {
     /// Whether the axes are logarithmic: horizontal, vertical.
     pub logarithmic: [bool; 2],
     /// The lines.
-    pub lines: Vec<Line>,
+    pub lines: Vec<CurveLine>,
 }
 
-/// One line of a [`Curve`].
+/// One line of a [`ReportCurve`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Line {
+pub struct CurveLine {
     /// What it shows.
     pub name: String,
     /// Its points.
@@ -223,7 +223,7 @@ pub struct Line {
 
 /// Median, smallest and largest of repeated measurements.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Spread {
+pub struct MedianSpread {
     /// The middle one; of an even number, the mean of the middle two.
     pub median: f64,
     /// The smallest.
@@ -232,7 +232,7 @@ pub struct Spread {
     pub largest: f64,
 }
 
-impl Spread {
+impl MedianSpread {
     /// Of at least one value.
     ///
     /// # Errors
@@ -256,7 +256,7 @@ impl Spread {
     }
 }
 
-impl fmt::Display for Spread {
+impl fmt::Display for MedianSpread {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let digits = f.precision().unwrap_or(2);
         write!(
@@ -299,15 +299,15 @@ mod tests {
 
     #[test]
     fn the_median_of_an_even_number_is_between_the_middle_two() {
-        let spread = Spread::of([4.0, 1.0, 3.0, 2.0]).unwrap();
+        let spread = MedianSpread::of([4.0, 1.0, 3.0, 2.0]).unwrap();
         assert_eq!([spread.median, spread.smallest, spread.largest], [2.5, 1.0, 4.0]);
-        assert_eq!(Spread::of([5.0]).unwrap().median, 5.0);
-        assert!(Spread::of([]).is_err());
+        assert_eq!(MedianSpread::of([5.0]).unwrap().median, 5.0);
+        assert!(MedianSpread::of([]).is_err());
     }
 
     #[test]
     fn columns_are_as_wide_as_their_widest_cell() {
-        let mut table = Table::new("rates", &["what", "µs"]);
+        let mut table = ReportTable::new("rates", &["what", "µs"]);
         table.row(["a long name".into(), "1".into()]);
         assert_eq!(table.to_string(), "rates\n  what         µs\n  a long name   1\n");
         assert_eq!(table.markdown(), "| what | µs |\n| --- | --- |\n| a long name | 1 |\n");

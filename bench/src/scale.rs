@@ -1,11 +1,11 @@
 //! Cost and memory for each vehicle, from a thousand to fifty thousand; and what a real motorway and long steps of SUMO do.
 
-use caraware::{failure::Exit, generate::City, install::Install};
+use caraware::{failure::Exit, generate::GeneratedCity, install::Install};
 
 use super::{
-    Curve, Line, Options, Report, Table,
-    sides::{Ours, Place, Scenario, Taken, same_results},
-    stages::Stages,
+    BenchOptions, BenchReport, CurveLine, ReportCurve, ReportTable,
+    sides::{BenchDirectory, ComparedScenario, OurRun, ProcessCost, same_results},
+    stages::StageTimes,
 };
 
 /// Vehicles and simulated seconds of each city.
@@ -27,19 +27,19 @@ const MOTORWAY_SCALES: [f64; 2] = [1.0, 3.0];
 const MOTORWAY_ROAD_USERS: u32 = 8192;
 
 /// One case on both sides.
-struct Case {
+struct ScaleCase {
     vehicles: u32,
-    bare: Taken,
-    ours: Ours,
-    stages: Stages,
+    bare: ProcessCost,
+    ours: OurRun,
+    stages: StageTimes,
 }
 
-impl Case {
-    fn measure(scenario: &Scenario, vehicles: u32) -> Result<Self, Exit> {
+impl ScaleCase {
+    fn measure(scenario: &ComparedScenario, vehicles: u32) -> Result<Self, Exit> {
         let (bare, results) = scenario.bare()?;
         let ours = scenario.ours()?;
         same_results(&results, &ours.results)?;
-        let stages = Stages::of(&ours);
+        let stages = StageTimes::of(&ours);
         Ok(Self {
             vehicles,
             bare,
@@ -65,9 +65,9 @@ impl Case {
 ///
 /// # Errors
 /// A run fails, or SUMO's results differ.
-pub fn measure(options: &Options) -> Result<Report, Exit> {
-    let place = Place::new("scale")?;
-    let mut report = Report::new(
+pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
+    let place = BenchDirectory::new("scale")?;
+    let mut report = BenchReport::new(
         "scale",
         "From a thousand to fifty thousand vehicles",
         "Generated cities with ten vehicles on a kilometre of lane (`caraware generate`), every vehicle dynamic at 100 Hz and sensing every 0.1 s, \
@@ -77,7 +77,7 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
     let cities = if options.quick { &QUICK[..] } else { &CITIES[..] };
     let mut cases = Vec::new();
     for &(vehicles, duration_s) in cities {
-        let city = City::of(vehicles, duration_s, 0.1, 1);
+        let city = GeneratedCity::of(vehicles, duration_s, 0.1, 1);
         cases.push(generated(options, &place, &city, &format!("city-{vehicles}"))?);
     }
     report.tables.push(costs(&cases));
@@ -96,7 +96,7 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
         cases
             .iter()
             .find(|case| case.vehicles == vehicles)
-            .map(Case::outside_us)
+            .map(ScaleCase::outside_us)
     };
     if let (Some(few), Some(many)) = (at(5000), at(50_000)) {
         report.figure("cost outside SUMO at 50 000 vehicles over that at 5 000", many / few);
@@ -109,15 +109,20 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
     Ok(report)
 }
 
-fn generated(options: &Options, place: &Place, city: &City, name: &str) -> Result<Case, Exit> {
+fn generated(
+    options: &BenchOptions,
+    place: &BenchDirectory,
+    city: &GeneratedCity,
+    name: &str,
+) -> Result<ScaleCase, Exit> {
     let install = Install::find()?;
     let sumocfg = city.write(&install, &place.path().join(name))?;
-    let scenario = Scenario::new(options, place, install, sumocfg, 1.0, city.vehicles)?;
-    Case::measure(&scenario, city.vehicles)
+    let scenario = ComparedScenario::new(options, place, install, sumocfg, 1.0, city.vehicles)?;
+    ScaleCase::measure(&scenario, city.vehicles)
 }
 
-fn costs(cases: &[Case]) -> Table {
-    let mut table = Table::new(
+fn costs(cases: &[ScaleCase]) -> ReportTable {
+    let mut table = ReportTable::new(
         "µs per vehicle-step",
         &[
             "vehicles",
@@ -150,15 +155,15 @@ fn costs(cases: &[Case]) -> Table {
     table
 }
 
-fn curve(cases: &[Case]) -> Curve {
-    let line = |name: &str, of: fn(&Stages) -> f64| Line {
+fn curve(cases: &[ScaleCase]) -> ReportCurve {
+    let line = |name: &str, of: fn(&StageTimes) -> f64| CurveLine {
         name: name.to_owned(),
         points: cases
             .iter()
             .map(|case| [f64::from(case.vehicles), case.stages.per_step_us(of(&case.stages))])
             .collect(),
     };
-    Curve {
+    ReportCurve {
         name: "scale".into(),
         title: "Cost of a vehicle-step".into(),
         x: "vehicles".into(),
@@ -166,7 +171,7 @@ fn curve(cases: &[Case]) -> Curve {
         logarithmic: [true, true],
         lines: vec![
             line("SUMO's own step", |stages| stages.sumo_s),
-            line("everything else", Stages::outside_s),
+            line("everything else", StageTimes::outside_s),
             line("dynamics", |stages| stages.dynamics_s),
             line("sensors", |stages| stages.sensors_s),
             line("getters", |stages| stages.getters_s),
@@ -175,8 +180,8 @@ fn curve(cases: &[Case]) -> Curve {
 }
 
 /// Steps of SUMO that are longer than a tick, and SUMO's own motorway at increased demand.
-fn large(options: &Options, place: &Place, report: &mut Report) -> Result<(), Exit> {
-    let mut table = Table::new(
+fn large(options: &BenchOptions, place: &BenchDirectory, report: &mut BenchReport) -> Result<(), Exit> {
+    let mut table = ReportTable::new(
         "SUMO steps longer than the tick of 0.1 s",
         &[
             "scenario",
@@ -191,8 +196,8 @@ fn large(options: &Options, place: &Place, report: &mut Report) -> Result<(), Ex
     );
     let (vehicles, duration_s) = if options.quick { LONG_STEPS_QUICK } else { LONG_STEPS };
     let cities = [
-        ("city", City::of(vehicles, duration_s, 1.0, 1)),
-        ("country roads", City::country(vehicles, duration_s, 1.0, 1)),
+        ("city", GeneratedCity::of(vehicles, duration_s, 1.0, 1)),
+        ("country roads", GeneratedCity::country(vehicles, duration_s, 1.0, 1)),
     ];
     for (name, city) in cities {
         let case = generated(options, place, &city, name)?;
@@ -206,8 +211,8 @@ fn large(options: &Options, place: &Place, report: &mut Report) -> Result<(), Ex
     for &scale in scales {
         let install = Install::find()?;
         let sumocfg = install.sumo_home.join("tools/game/A10KW.sumocfg");
-        let scenario = Scenario::new(options, place, install, sumocfg, scale, MOTORWAY_ROAD_USERS)?;
-        let case = Case::measure(&scenario, 1)?;
+        let scenario = ComparedScenario::new(options, place, install, sumocfg, scale, MOTORWAY_ROAD_USERS)?;
+        let case = ScaleCase::measure(&scenario, 1)?;
         report.figure(
             format!("A10KW at {scale} × its demand, × real time"),
             case.ours.number("/real_time_factor"),
@@ -218,7 +223,7 @@ fn large(options: &Options, place: &Place, report: &mut Report) -> Result<(), Ex
     Ok(())
 }
 
-fn row(name: &str, case: &Case) -> [String; 8] {
+fn row(name: &str, case: &ScaleCase) -> [String; 8] {
     let ours = &case.ours;
     [
         name.to_owned(),

@@ -15,7 +15,7 @@ use rustix::{
 };
 use serde_json::Value;
 
-use super::Options;
+use super::BenchOptions;
 
 /// Vehicle-ticks that ours may run ahead: with 5 000 vehicles as long as the consumer takes to import torch.
 const WINDOW_VEHICLE_TICKS: u32 = 64 * 5000;
@@ -24,7 +24,7 @@ const TO_THE_ROOT: usize = 128;
 
 /// What a program took.
 #[derive(Debug, Clone, Copy)]
-pub struct Taken {
+pub struct ProcessCost {
     /// From its start to its end, seconds.
     pub wall_s: f64,
     /// Processor time of it and of all it started, seconds.
@@ -33,16 +33,16 @@ pub struct Taken {
 
 /// Ours: what it took and what it reports.
 #[derive(Debug, Clone)]
-pub struct Ours {
+pub struct OurRun {
     /// What it took.
-    pub taken: Taken,
+    pub taken: ProcessCost,
     /// Its `report.json`.
     pub report: Value,
     /// Where SUMO wrote its results.
     pub results: PathBuf,
 }
 
-impl Ours {
+impl OurRun {
     /// A number of the report, by its path.
     #[must_use]
     pub fn number(&self, path: &str) -> f64 {
@@ -52,13 +52,13 @@ impl Ours {
 
 /// A directory for a measurement, removed at its end.
 #[derive(Debug)]
-pub struct Place {
+pub struct BenchDirectory {
     path: PathBuf,
     /// Runs in it so far, of all scenarios.
     runs: Cell<u32>,
 }
 
-impl Place {
+impl BenchDirectory {
     /// A new one below the system's directory for temporary files.
     ///
     /// # Errors
@@ -85,7 +85,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for BenchDirectory {
     fn drop(&mut self) {
         if let Err(error) = std::fs::remove_dir_all(&self.path) {
             tracing::warn!(%error, path = %self.path.display(), "cannot remove what a measurement leaves");
@@ -95,8 +95,8 @@ impl Drop for Place {
 
 /// One scenario for both sides.
 #[derive(Debug)]
-pub struct Scenario<'a> {
-    place: &'a Place,
+pub struct ComparedScenario<'a> {
+    place: &'a BenchDirectory,
     install: Install,
     program: PathBuf,
     sumocfg: PathBuf,
@@ -105,14 +105,14 @@ pub struct Scenario<'a> {
     max_road_users: u32,
 }
 
-impl<'a> Scenario<'a> {
+impl<'a> ComparedScenario<'a> {
     /// `sumocfg` with `scale` times its demand, with at most `max_road_users` at once.
     ///
     /// # Errors
     /// Our program is not built.
     pub fn new(
-        options: &Options,
-        place: &'a Place,
+        options: &BenchOptions,
+        place: &'a BenchDirectory,
         install: Install,
         sumocfg: PathBuf,
         scale: f64,
@@ -132,7 +132,7 @@ impl<'a> Scenario<'a> {
     ///
     /// # Errors
     /// SUMO fails.
-    pub fn bare(&self) -> Result<(Taken, PathBuf), Exit> {
+    pub fn bare(&self) -> Result<(ProcessCost, PathBuf), Exit> {
         let (results, prefix) = self.results("bare")?;
         let mut command = Command::new(self.install.sumo_program("sumo"));
         command
@@ -182,7 +182,7 @@ impl<'a> Scenario<'a> {
     ///
     /// # Errors
     /// The run fails.
-    pub fn ours(&self) -> Result<Ours, Exit> {
+    pub fn ours(&self) -> Result<OurRun, Exit> {
         let name = format!("ours-{}", self.place.next_run());
         let runs = self.place.path().join("runs");
         let mut command = Command::new(&self.program);
@@ -222,11 +222,11 @@ impl<'a> Scenario<'a> {
             ));
         }
         let results = runs.join(&name).join("sumo");
-        Ok(Ours { taken, report, results })
+        Ok(OurRun { taken, report, results })
     }
 
     /// Runs a program that must succeed; what it says goes to a file.
-    fn take(&self, command: &mut Command) -> Result<Taken, Exit> {
+    fn take(&self, command: &mut Command) -> Result<ProcessCost, Exit> {
         let program = command.get_program().to_string_lossy().into_owned();
         let path = self.place.path().join("output.txt");
         let output = std::fs::File::create(&path).map_err(|error| Exit::io("create", &path, &error))?;
@@ -249,7 +249,7 @@ impl<'a> Scenario<'a> {
         let cpu_s = usage::of_family_s(child.id()).unwrap_or(0.0);
         let status = child.wait().map_err(|error| failed(&error))?;
         if status.success() {
-            return Ok(Taken { wall_s, cpu_s });
+            return Ok(ProcessCost { wall_s, cpu_s });
         }
         let text = std::fs::read_to_string(&path).unwrap_or_default();
         let tail: Vec<&str> = text.lines().rev().take(12).collect();

@@ -1,10 +1,10 @@
 //! Processor time of a run by stage, from what its processes report.
 
-use super::sides::Ours;
+use super::sides::OurRun;
 
 /// Seconds of processor time in the loop, loading left out.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Stages {
+pub struct StageTimes {
     /// SUMO's own steps.
     pub sumo_s: f64,
     /// Reading every road user and every traffic light out of SUMO.
@@ -25,10 +25,10 @@ pub struct Stages {
     pub sumo_vehicle_steps: f64,
 }
 
-impl Stages {
+impl StageTimes {
     /// Of a finished run.
     #[must_use]
-    pub fn of(ours: &Ours) -> Self {
+    pub fn of(ours: &OurRun) -> Self {
         let used = |process: &str, what: &str| ours.number(&format!("/processes/{process}/{what}"));
         let in_loop = |process| used(process, "loop_cpu_s");
         let processes = ["traffic-bridge", "sim-core", "sensor-daemon", "trainer"];

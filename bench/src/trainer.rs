@@ -5,7 +5,7 @@ use std::process::Command;
 use caraware::{failure::Exit, install};
 use serde::Deserialize;
 
-use super::{Options, Report, Spread, Table};
+use super::{BenchOptions, BenchReport, MedianSpread, ReportTable};
 
 /// Samples in a horizon, and visits of a sample in an update, as `caraware_bench.trainer` has them.
 const HORIZON: f64 = 32_768.0;
@@ -13,29 +13,29 @@ const EPOCHS: f64 = 4.0;
 
 /// What `caraware_bench.trainer` prints: seconds, by round.
 #[derive(Debug, Deserialize)]
-struct Measured {
+struct TrainerFigures {
     threads: u32,
     precision: String,
-    update_s: Update,
-    horizon_s: Horizon,
-    ticks: Vec<Tick>,
+    update_s: UpdateTimes,
+    horizon_s: HorizonTimes,
+    ticks: Vec<TickTimes>,
 }
 
 #[derive(Debug, Deserialize)]
-struct Update {
+struct UpdateTimes {
     ours: Vec<f64>,
     plain: Vec<f64>,
     sb3: Vec<f64>,
 }
 
 #[derive(Debug, Deserialize)]
-struct Horizon {
+struct HorizonTimes {
     ours: Vec<f64>,
     sb3: Vec<f64>,
 }
 
 #[derive(Debug, Deserialize)]
-struct Tick {
+struct TickTimes {
     vehicles: u64,
     us_per_tick: f64,
     forward_us_per_tick: f64,
@@ -46,15 +46,15 @@ struct Tick {
 ///
 /// # Errors
 /// There is no Python with the trainer, or it fails.
-pub fn measure(options: &Options) -> Result<Report, Exit> {
+pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let python = match &options.python {
         Some(python) => python.clone(),
         None => install::python(&options.bin)?,
     };
     let mut command = Command::new(python);
     command.args(["-m", "caraware_bench.trainer"]);
-    let measured: Measured = super::report::from_program(command)?;
-    let mut report = Report::new(
+    let measured: TrainerFigures = super::report::from_program(command)?;
+    let mut report = BenchReport::new(
         "trainer",
         "The learner",
         format!(
@@ -74,10 +74,10 @@ pub fn measure(options: &Options) -> Result<Report, Exit> {
     Ok(report)
 }
 
-fn updates(report: &mut Report, seconds: &Update) -> Result<Table, Exit> {
+fn updates(report: &mut BenchReport, seconds: &UpdateTimes) -> Result<ReportTable, Exit> {
     let visits = HORIZON * EPOCHS;
     let columns = ["one update", "sample-visits/s", "ours is faster by", "smallest–largest"];
-    let mut table = Table::new("", &columns);
+    let mut table = ReportTable::new("", &columns);
     table.row([
         "ours".into(),
         rate(&seconds.ours, visits)?,
@@ -94,14 +94,14 @@ fn updates(report: &mut Report, seconds: &Update) -> Result<Table, Exit> {
     Ok(table)
 }
 
-fn rollouts(report: &mut Report, seconds: &Horizon) -> Result<Table, Exit> {
+fn rollouts(report: &mut BenchReport, seconds: &HorizonTimes) -> Result<ReportTable, Exit> {
     let columns = [
         "rollout and update, environment for nothing",
         "env-steps/s",
         "ours is faster by",
         "smallest–largest",
     ];
-    let mut table = Table::new("", &columns);
+    let mut table = ReportTable::new("", &columns);
     let ours = rate(&seconds.ours, HORIZON)?;
     table.row(["ours, 8 vehicles".into(), ours, String::new(), String::new()]);
     let name = "rollout and update, ratio to Stable-Baselines3's PPO";
@@ -111,7 +111,7 @@ fn rollouts(report: &mut Report, seconds: &Horizon) -> Result<Table, Exit> {
     Ok(table)
 }
 
-fn ticks(report: &mut Report, ticks: &[Tick]) -> Table {
+fn ticks(report: &mut BenchReport, ticks: &[TickTimes]) -> ReportTable {
     let columns = [
         "vehicles in a tick",
         "µs/tick",
@@ -119,7 +119,7 @@ fn ticks(report: &mut Report, ticks: &[Tick]) -> Table {
         "µs/vehicle",
         "calls from Python/tick",
     ];
-    let mut table = Table::new("", &columns);
+    let mut table = ReportTable::new("", &columns);
     for tick in ticks {
         #[expect(clippy::cast_precision_loss, reason = "some thousands")]
         let each = tick.us_per_tick / tick.vehicles as f64;
@@ -140,13 +140,13 @@ fn ticks(report: &mut Report, ticks: &[Tick]) -> Table {
 
 /// Median rate of rounds of `amount` each.
 fn rate(seconds: &[f64], amount: f64) -> Result<String, Exit> {
-    let spread = Spread::of(seconds.iter().map(|seconds| amount / seconds))?;
+    let spread = MedianSpread::of(seconds.iter().map(|seconds| amount / seconds))?;
     Ok(format!("{:.0}", spread.median))
 }
 
 /// How much faster ours is, round by round: median, and smallest and largest.
-fn compare(report: &mut Report, name: &str, ours: &[f64], theirs: &[f64]) -> Result<[String; 2], Exit> {
-    let spread = Spread::of(ours.iter().zip(theirs).map(|(ours, theirs)| theirs / ours))?;
+fn compare(report: &mut BenchReport, name: &str, ours: &[f64], theirs: &[f64]) -> Result<[String; 2], Exit> {
+    let spread = MedianSpread::of(ours.iter().zip(theirs).map(|(ours, theirs)| theirs / ours))?;
     report.figure(name, spread.median);
     Ok([
         format!("{:.2} ×", spread.median),

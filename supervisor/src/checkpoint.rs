@@ -15,16 +15,16 @@ use crate::{failure::Exit, install::Install};
 
 /// What the manifest says that matters here.
 #[derive(Debug, Clone, Deserialize)]
-struct Manifest {
+struct CheckpointManifest {
     observation_size: u64,
     hidden: Vec<u64>,
     network: Network,
     activation: Activation,
-    counters: Counters,
+    counters: CheckpointCounters,
 }
 
 #[derive(Debug, Clone, Deserialize)]
-struct Counters {
+struct CheckpointCounters {
     /// -1 before the first.
     committed_tick: i64,
     #[serde(default)]
@@ -33,7 +33,7 @@ struct Counters {
     next_episode_tick: u64,
 }
 
-impl Counters {
+impl CheckpointCounters {
     /// Where a simulation that goes on begins.
     fn start(&self) -> Start {
         Start {
@@ -52,28 +52,28 @@ fn word(choice: impl Serialize) -> String {
 
 /// What the Python side answers.
 #[derive(Debug, Deserialize)]
-struct Answer {
+struct VerifierAnswer {
     checkpoint: Option<PathBuf>,
-    manifest: Option<Manifest>,
+    manifest: Option<CheckpointManifest>,
     /// Environments after the first.
     #[serde(default)]
-    others: Vec<Counters>,
+    others: Vec<CheckpointCounters>,
     refused: Option<String>,
 }
 
 /// A checkpoint of which every byte is as it was written.
 #[derive(Debug)]
-pub struct Found {
+pub struct FoundCheckpoint {
     /// Its directory.
     pub checkpoint: PathBuf,
     /// True if a run was named, and not this checkpoint of it.
     pub is_run: bool,
     run_dir: PathBuf,
-    manifest: Manifest,
-    others: Vec<Counters>,
+    manifest: CheckpointManifest,
+    others: Vec<CheckpointCounters>,
 }
 
-impl Found {
+impl FoundCheckpoint {
     /// Looks for a checkpoint by its directory, or for the best of a run by the run's directory or its name in `runs`.
     ///
     /// # Errors
@@ -99,7 +99,7 @@ impl Found {
             .output()
             .map_err(|error| Exit::io("start", &install.python, &error))?;
         let said = String::from_utf8_lossy(&output.stderr);
-        let answer: Answer = serde_json::from_slice(&output.stdout).map_err(|_| {
+        let answer: VerifierAnswer = serde_json::from_slice(&output.stdout).map_err(|_| {
             Exit::missing(
                 format!("cannot look into {}: {}", place.display(), said.trim()),
                 "`make build` installs what the trainer needs; `caraware doctor` checks it",
@@ -193,7 +193,7 @@ impl Found {
         Beginning {
             checkpoint: self.checkpoint.clone(),
             start: self.manifest.counters.start(),
-            others: self.others.iter().map(Counters::start).collect(),
+            others: self.others.iter().map(CheckpointCounters::start).collect(),
             episodes: None,
         }
     }

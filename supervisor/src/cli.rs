@@ -14,7 +14,7 @@ use ipc_schema::sensor::SensorSelection;
 pub struct Cli {
     /// The subcommand.
     #[command(subcommand)]
-    pub command: Command,
+    pub command: Subcommands,
 }
 
 const LONG: &str = "Co-simulation bridge: SUMO traffic with sensing vehicles, for a learner in another process.\n\n\
@@ -31,7 +31,7 @@ const AFTER: &str = "Examples:
   caraware view --web                             watch it in a browser
   caraware generate city --vehicles 20000         a city of any size: city/city.sumocfg
   caraware bench lidar                            rays per second, beside Open3D's
-  caraware swap --set trainer.learning_rate=0.001 replace the trainer of a live run; nothing is lost
+  caraware handover town-1                        replace the trainer of a live run; nothing is lost
   caraware stop                                   end the run; the trainer writes a checkpoint first
 
 Exit codes: 0 done, 1 the run failed, 2 usage or configuration, 3 something is missing on this machine, 130 interrupted.
@@ -39,7 +39,7 @@ All configuration keys: configs/README.md";
 
 /// The subcommands.
 #[derive(Debug, Subcommand)]
-pub enum Command {
+pub enum Subcommands {
     /// Simulate and learn
     #[command(after_help = RESUME)]
     Train(TrainArgs),
@@ -54,8 +54,15 @@ pub enum Command {
         run: Option<String>,
     },
     /// Replace the trainer of a live run; the simulation continues, and no observation is lost
-    #[command(after_help = SWAP)]
-    Swap(SwapArgs),
+    #[command(after_help = HANDOVER)]
+    Handover(HandoverArgs),
+    /// The former name of `handover`, which is refused with the new one.
+    #[command(hide = true, disable_help_flag = true)]
+    Swap {
+        /// Anything.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        arguments: Vec<OsString>,
+    },
     /// Pause, step or reset a live simulation, switch sensors, place vehicles
     #[command(after_help = CONTROL)]
     Control(ControlArgs),
@@ -87,13 +94,13 @@ pub enum Command {
     },
 }
 
-const SWAP: &str = "Examples:
-  caraware swap                                          the same trainer again, after an upgrade of its code
-  caraware swap town-1 --set trainer.learning_rate=0.001
-  caraware swap --checkpoint runs/town-0/checkpoints/update-000400
+const HANDOVER: &str = "Examples:
+  caraware handover                                      the same trainer again, after an upgrade of its code
+  caraware handover town-1 --set trainer.learning_rate=0.001
+  caraware handover --checkpoint runs/town-0/checkpoints/update-000400
 
-The successor starts beside the trainer at work and gets ready. Only then does the old one write a checkpoint and leave. A successor
-that fails is refused, and the old trainer continues.";
+The successor starts beside the old trainer and gets ready. Only then does the old trainer write a checkpoint and leave. If the
+successor fails, the handover is refused and the old trainer continues.";
 
 const RESUME: &str = "Examples:
   caraware train                                             the default preset, from the beginning
@@ -223,9 +230,9 @@ pub enum SwitchState {
     Off,
 }
 
-/// What `swap` takes.
+/// What `handover` takes.
 #[derive(Debug, Args, Clone)]
-pub struct SwapArgs {
+pub struct HandoverArgs {
     /// Name of the run; may be left out if only one is alive
     pub run: Option<String>,
     /// Change one setting of the trainer, e.g. --set trainer.learning_rate=0.001 (repeatable)

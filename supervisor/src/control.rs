@@ -11,29 +11,29 @@ use ipc_schema::{
 use crate::{
     cli::{ControlAction, ControlArgs, SwitchState},
     failure::Exit,
-    line::{self, Asking, Line},
     registry,
+    socket::{self, ReplySocket, SupervisorRequest},
 };
 
 /// Longest wait for the simulation to answer; it takes commands while it waits for the learner, but not within a step of SUMO.
 const ANSWER_WITHIN: Duration = Duration::from_secs(10);
 
 /// The supervisor's side: commands that have been passed on.
-pub struct Controls {
+pub struct ControlRelay {
     /// One for each environment.
     clients: Vec<ControlClient>,
-    waiting: Vec<Waiting>,
+    waiting: Vec<PendingCommand>,
 }
 
 /// A command that has not been answered by everybody whom it went to.
-struct Waiting {
+struct PendingCommand {
     asked: Vec<Pending>,
     replies: Vec<Reply>,
-    line: Line,
+    reply: ReplySocket,
     since: Instant,
 }
 
-impl Waiting {
+impl PendingCommand {
     /// Takes the answers that are there; true if these are all.
     fn look(&mut self) -> Result<bool, PortError> {
         for pending in std::mem::take(&mut self.asked) {
@@ -49,12 +49,12 @@ impl Waiting {
     fn answer(mut self) {
         let refused = self.replies.iter().position(|reply| matches!(reply, Reply::Refused(_)));
         if !self.replies.is_empty() {
-            self.line.answer(&self.replies.swap_remove(refused.unwrap_or(0)));
+            self.reply.answer(&self.replies.swap_remove(refused.unwrap_or(0)));
         }
     }
 }
 
-impl Controls {
+impl ControlRelay {
     /// Passes commands on to the peers of `clients`, one for each environment.
     #[must_use]
     pub fn new(clients: Vec<ControlClient>) -> Self {
@@ -64,8 +64,8 @@ impl Controls {
         }
     }
 
-    /// Passes a command on to an environment, or to all of them; the answer will go back over `line`.
-    pub fn pass_on(&mut self, command: &Command, env_index: Option<u32>, line: Line) {
+    /// Passes a command on to an environment, or to all of them; the answer will go back over `reply`.
+    pub fn pass_on(&mut self, command: &Command, env_index: Option<u32>, reply: ReplySocket) {
         let index = env_index.map(|index| index as usize);
         let clients = match index {
             None => self.clients.as_slice(),
@@ -73,12 +73,12 @@ impl Controls {
         };
         if clients.is_empty() {
             let message = format!("the run has {} environments, numbered from 0", self.clients.len());
-            return line.refuse(Refusal::new(RefusalKind::Unsupported, message));
+            return reply.refuse(Refusal::new(RefusalKind::Unsupported, message));
         }
-        let mut waiting = Waiting {
+        let mut waiting = PendingCommand {
             asked: Vec::new(),
             replies: Vec::new(),
-            line,
+            reply,
             since: Instant::now(),
         };
         for client in clients {
@@ -99,7 +99,7 @@ impl Controls {
             if waiting.look()? {
                 waiting.answer();
             } else if waiting.since.elapsed() > ANSWER_WITHIN {
-                waiting.line.refuse(Refusal::new(
+                waiting.reply.refuse(Refusal::new(
                     RefusalKind::Unanswered,
                     format!("the simulation has not answered within {} s", ANSWER_WITHIN.as_secs()),
                 ));
@@ -120,7 +120,7 @@ impl Controls {
     pub fn end(&mut self) {
         for waiting in self.waiting.drain(..) {
             let refusal = Refusal::new(RefusalKind::Unanswered, "the run is over");
-            waiting.line.refuse(refusal);
+            waiting.reply.refuse(refusal);
         }
     }
 }
@@ -147,11 +147,11 @@ pub fn control(args: &ControlArgs) -> Result<(), Exit> {
     };
     command.check().map_err(refused)?;
     let run = registry::find(args.run.as_deref())?;
-    let asking = Asking::Control {
+    let request = SupervisorRequest::Control {
         env: args.env,
         request: command.to_json(),
     };
-    match line::ask(&run, &asking)? {
+    match socket::ask(&run, &request)? {
         Reply::Done(done) => {
             println!("{}: tick {}: {}", run.name, done.tick, done.message);
             Ok(())

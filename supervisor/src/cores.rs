@@ -12,7 +12,7 @@ const TRAINER_CORES: usize = 2;
 
 /// Who may use which core.
 #[derive(Debug, PartialEq, Eq)]
-pub struct Plan {
+pub struct CorePlan {
     /// Cores of each environment.
     pub environments: Vec<Vec<usize>>,
     /// Cores of the processes that belong to the whole run.
@@ -21,14 +21,14 @@ pub struct Plan {
 
 /// Shares `cores` out to `envs` environments and, with `trainer_cores` for it, a trainer. `None`: everybody may use all of them.
 #[must_use]
-pub fn plan(cores: &[usize], envs: usize, trains: bool) -> Option<Plan> {
+pub fn plan(cores: &[usize], envs: usize, trains: bool) -> Option<CorePlan> {
     let spare = if trains { TRAINER_CORES } else { 0 };
     let each = (cores.len().saturating_sub(spare) / envs.max(1)).min(ENVIRONMENT_CORES);
     if envs < 2 || each == 0 || trains && each < ENVIRONMENT_CORES {
         return None;
     }
     let (shared, rest) = cores.split_at(each * envs);
-    Some(Plan {
+    Some(CorePlan {
         environments: shared.chunks(each).map(<[usize]>::to_vec).collect(),
         rest: if rest.is_empty() { cores } else { rest }.to_vec(),
     })

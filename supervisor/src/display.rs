@@ -23,14 +23,14 @@ const TABLE_ROWS: usize = 24;
 
 /// Shows how a run fares.
 #[derive(Debug)]
-pub struct Display {
+pub struct ProgressDisplay {
     bar: Option<ProgressBar>,
     is_silent: bool,
     last_line: Instant,
     last_text: String,
 }
 
-impl Display {
+impl ProgressDisplay {
     /// A bar if standard error is a terminal.
     #[must_use]
     pub fn new() -> Self {
@@ -69,7 +69,7 @@ impl Display {
             self.show(&table);
             return;
         }
-        let view = View::read(environments, ready_at);
+        let view = ProgressView::read(environments, ready_at);
         if let Some(bar) = &self.bar {
             if bar.length() != view.total_ticks && view.total_ticks.is_some() {
                 bar.set_style(style());
@@ -105,7 +105,7 @@ impl Display {
     }
 }
 
-impl Default for Display {
+impl Default for ProgressDisplay {
     fn default() -> Self {
         Self::new()
     }
@@ -117,7 +117,7 @@ fn style() -> ProgressStyle {
 }
 
 /// What is shown.
-struct View {
+struct ProgressView {
     /// Updates of a policy so far.
     updates: u64,
     ticks: u64,
@@ -138,7 +138,7 @@ struct View {
     metrics: MetricValues,
 }
 
-impl View {
+impl ProgressView {
     /// All environments together; where they stand is where the slowest does.
     fn read(environments: &[Environment], ready_at: Option<Instant>) -> Self {
         let all = |process: Process| {

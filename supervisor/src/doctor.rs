@@ -45,11 +45,11 @@ const EXTRAS: [(&[&str], &str, &str); 4] = [
 const SHARED_MEMORY_MIB: u64 = 64;
 const DISK_MIB: u64 = 512;
 
-struct Checks {
+struct DoctorChecks {
     missing: u32,
 }
 
-impl Checks {
+impl DoctorChecks {
     fn say(&mut self, good: Result<String, (String, String)>, what: &str) {
         match good {
             Ok(text) => println!("ok       {what}: {text}"),
@@ -66,7 +66,7 @@ impl Checks {
 /// # Errors
 /// Something needed is missing.
 pub fn doctor(clean: bool) -> Result<(), Exit> {
-    let mut checks = Checks { missing: 0 };
+    let mut checks = DoctorChecks { missing: 0 };
     match Install::find() {
         Ok(install) => installation(&mut checks, &install),
         Err(Exit::Failure(failure)) => {
@@ -94,7 +94,7 @@ pub fn doctor(clean: bool) -> Result<(), Exit> {
     }
 }
 
-fn installation(checks: &mut Checks, install: &Install) {
+fn installation(checks: &mut DoctorChecks, install: &Install) {
     for process in Process::ALL.into_iter().filter(|process| *process != Process::Trainer) {
         let found = install.binary(process);
         checks.say(
@@ -109,7 +109,7 @@ fn installation(checks: &mut Checks, install: &Install) {
 }
 
 /// Asks the dynamic linker whether everything libsumo links is there.
-fn libraries(checks: &mut Checks, install: &Install) {
+fn libraries(checks: &mut DoctorChecks, install: &Install) {
     let library = install.sumo_home.join("lib64/libsumocpp.so");
     let listing = Command::new("ldd")
         .arg(&library)
@@ -129,7 +129,7 @@ fn libraries(checks: &mut Checks, install: &Install) {
     }
 }
 
-fn packages(checks: &mut Checks, install: &Install) {
+fn packages(checks: &mut DoctorChecks, install: &Install) {
     let script = format!(
         "import importlib.util as u; print(' '.join(p for p in {:?} if u.find_spec(p) is None))",
         PACKAGES
@@ -151,7 +151,7 @@ fn packages(checks: &mut Checks, install: &Install) {
     checks.say(result, "Python packages");
 }
 
-fn space(checks: &mut Checks, what: &str, path: &str, least_mib: u64, fix: &str) {
+fn space(checks: &mut DoctorChecks, what: &str, path: &str, least_mib: u64, fix: &str) {
     let result = match free_bytes(Path::new(path)) {
         Ok(bytes) if bytes >> 20 >= least_mib => Ok(format!("{} MiB free", bytes >> 20)),
         Ok(bytes) => Err((format!("only {} MiB free in {path}", bytes >> 20), fix.to_owned())),
@@ -160,7 +160,7 @@ fn space(checks: &mut Checks, what: &str, path: &str, least_mib: u64, fix: &str)
     checks.say(result, what);
 }
 
-fn port(checks: &mut Checks) {
+fn port(checks: &mut DoctorChecks) {
     let result = match TcpListener::bind("127.0.0.1:7447") {
         Ok(_) => Ok("127.0.0.1:7447 is free".to_owned()),
         Err(_) => Ok(

@@ -21,7 +21,7 @@ pub struct Environment {
     /// Which incarnation of each process counts.
     pub roster: RosterWriter,
     boards: Vec<BoardReader>,
-    /// Who makes observations looks at a hand-over at once.
+    /// Wakes `sensor-daemon`, which then reads the state of a handover.
     sensing: Waker,
     services: ServiceHolder,
 }
@@ -66,13 +66,13 @@ impl Environment {
         &self.boards[process.index()]
     }
 
-    /// Says whether a hand-over from one trainer to the next is under way.
-    pub fn set_handing_over(&mut self, under_way: bool) {
-        self.roster.set_handing_over(Process::Trainer, under_way);
+    /// Publishes whether a handover is in progress.
+    pub fn set_handing_over(&mut self, is_in_progress: bool) {
+        self.roster.set_handing_over(Process::Trainer, is_in_progress);
         self.wake_sensing();
     }
 
-    /// Lets sensor-daemon look at once who counts.
+    /// Wakes `sensor-daemon`, which then reads the valid incarnation.
     pub fn wake_sensing(&self) {
         self.sensing.wake();
     }

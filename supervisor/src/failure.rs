@@ -25,9 +25,9 @@ pub enum Exit {
 
 #[derive(Debug, thiserror::Error)]
 #[error("{}", .0.message)]
-struct Shown(Failure);
+struct ShownFailure(Failure);
 
-impl Diagnostic for Shown {
+impl Diagnostic for ShownFailure {
     fn help<'a>(&'a self) -> Option<Box<dyn std::fmt::Display + 'a>> {
         self.0
             .help
@@ -47,7 +47,7 @@ impl Exit {
             }
             Self::Failure(failure) => {
                 let code = failure.kind.exit_code();
-                eprintln!("{:?}", Report::new(Shown(failure)));
+                eprintln!("{:?}", Report::new(ShownFailure(failure)));
                 ExitCode::from(code)
             }
             Self::Interrupted => ExitCode::from(130),

@@ -12,8 +12,8 @@ use std::{
 };
 
 use crate::{cli::GenerateArgs, failure::Exit, install::Install};
-use demand::Demand;
-use streets::Streets;
+use demand::TripDemand;
+use streets::GridStreets;
 
 /// Vehicles on a kilometre of lane where the size of the grid is not given.
 const VEHICLES_PER_KM: f64 = 10.0;
@@ -24,7 +24,7 @@ const WGS84: [f64; 2] = [6_378_137.0, 0.006_694_379_990_14];
 
 /// What is to be generated.
 #[derive(Debug, Clone, PartialEq)]
-pub struct City {
+pub struct GeneratedCity {
     /// Vehicles on the road from the first step to the last.
     pub vehicles: u32,
     /// Simulated time, seconds.
@@ -43,7 +43,7 @@ pub struct City {
     pub speed_kmh: f64,
 }
 
-impl City {
+impl GeneratedCity {
     /// A city that has room for its vehicles: ten on a kilometre of lane, blocks of 200 m, one lane in each direction, 50 km/h.
     #[must_use]
     pub fn of(vehicles: u32, duration_s: f64, step_s: f64, seed: u64) -> Self {
@@ -99,8 +99,8 @@ impl City {
             Ok::<_, Exit>(path)
         };
         let net = self.net(install, directory)?;
-        let streets = Streets::of(&net).map_err(|reason| Exit::run(format!("netgenerate's net: {reason}"), ""))?;
-        let routes = Demand::new(self, &streets)?.text();
+        let streets = GridStreets::of(&net).map_err(|reason| Exit::run(format!("netgenerate's net: {reason}"), ""))?;
+        let routes = TripDemand::new(self, &streets)?.text();
         write("city.net.xml", &net)?;
         write("city.rou.xml", &routes)?;
         write("city.sumocfg", &self.configuration())
@@ -232,22 +232,22 @@ impl City {
 /// Generates what the command line asks for and says how to run it.
 ///
 /// # Errors
-/// As [`City::write`].
+/// As [`GeneratedCity::write`].
 pub fn generate(args: &GenerateArgs) -> Result<(), Exit> {
-    let roomy = City {
+    let roomy = GeneratedCity {
         block_m: args.block_m,
         lanes: args.lanes,
         speed_kmh: args.speed_kmh,
-        ..City::of(args.vehicles, args.duration_s, args.step_s, args.seed)
+        ..GeneratedCity::of(args.vehicles, args.duration_s, args.step_s, args.seed)
     }
     .with_room();
-    let city = City {
+    let city = GeneratedCity {
         junctions: args.junctions.unwrap_or(roomy.junctions),
         ..roomy
     };
     let sumocfg = city.write(&Install::find()?, &args.directory)?;
     let (path, junctions) = (sumocfg.display(), city.junctions * city.junctions);
-    let City {
+    let GeneratedCity {
         vehicles, duration_s, ..
     } = city;
     // A reader that went away (`| head`) does not undo what is written.
@@ -265,14 +265,14 @@ mod tests {
     use super::*;
     use crate::scenario;
 
-    fn small(seed: u64) -> City {
-        City {
+    fn small(seed: u64) -> GeneratedCity {
+        GeneratedCity {
             junctions: 3,
-            ..City::of(40, 30.0, 0.5, seed)
+            ..GeneratedCity::of(40, 30.0, 0.5, seed)
         }
     }
 
-    fn files(city: &City) -> (tempfile::TempDir, [String; 3]) {
+    fn files(city: &GeneratedCity) -> (tempfile::TempDir, [String; 3]) {
         let directory = tempfile::tempdir().unwrap();
         city.write(&Install::find().unwrap(), directory.path()).unwrap();
         let read = |name| std::fs::read_to_string(directory.path().join(name)).unwrap();
@@ -299,19 +299,19 @@ mod tests {
 
     #[test]
     fn room_grows_with_the_vehicles_and_shrinks_with_longer_blocks_and_more_lanes() {
-        let junctions = |vehicles| City::of(vehicles, 30.0, 0.5, 1).junctions;
+        let junctions = |vehicles| GeneratedCity::of(vehicles, 30.0, 0.5, 1).junctions;
         assert_eq!([1, 16, 17, 5000, 50_000].map(junctions), [2, 2, 3, 26, 80]);
-        assert_eq!(City::country(20_000, 30.0, 1.0, 1).junctions, 17);
-        let wide = City {
+        assert_eq!(GeneratedCity::country(20_000, 30.0, 1.0, 1).junctions, 17);
+        let wide = GeneratedCity {
             lanes: 3,
-            ..City::country(20_000, 30.0, 1.0, 1)
+            ..GeneratedCity::country(20_000, 30.0, 1.0, 1)
         };
         assert_eq!(wide.with_room().junctions, 10);
     }
 
     #[test]
     fn more_vehicles_than_fit_are_refused() {
-        let city = City {
+        let city = GeneratedCity {
             vehicles: 4000,
             ..small(1)
         };

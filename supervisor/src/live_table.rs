@@ -12,12 +12,12 @@ const IN_A_LINE: usize = 6;
 const OTHER_ROWS: usize = 5;
 
 #[derive(Debug, Deserialize)]
-struct File {
+struct LiveFile {
     table: LiveTable,
 }
 
 /// Errors by estimator: `ppo`, `ekf`, `raw_gnss`, metres.
-type Errors = BTreeMap<String, Option<f64>>;
+type VehicleErrors = BTreeMap<String, Option<f64>>;
 
 /// The table.
 #[derive(Debug, Clone, Deserialize)]
@@ -25,18 +25,18 @@ pub struct LiveTable {
     episode: u64,
     sim_time_s: f64,
     samples: u64,
-    mean_m: Errors,
-    vehicles: Vec<Vehicle>,
+    mean_m: VehicleErrors,
+    vehicles: Vec<LiveVehicle>,
 }
 
 #[derive(Debug, Clone, Deserialize)]
-struct Vehicle {
+struct LiveVehicle {
     vehicle: String,
-    now_m: Errors,
-    mean_m: Errors,
+    now_m: VehicleErrors,
+    mean_m: VehicleErrors,
 }
 
-fn metres(errors: &Errors, name: &str) -> String {
+fn metres(errors: &VehicleErrors, name: &str) -> String {
     let error = errors.get(name).copied().flatten();
     error.map_or_else(|| "–".into(), |error_m| format!("{error_m:.2}"))
 }
@@ -46,7 +46,7 @@ impl LiveTable {
     #[must_use]
     pub fn read(run_dir: &Path) -> Option<Self> {
         let text = std::fs::read_to_string(run_dir.join(FILE)).ok()?;
-        serde_json::from_str::<File>(&text).ok().map(|file| file.table)
+        serde_json::from_str::<LiveFile>(&text).ok().map(|file| file.table)
     }
 
     fn means(&self) -> String {

@@ -4,17 +4,16 @@ use std::process::ExitCode;
 
 use caraware::{
     bench,
-    cli::{Cli, Command},
+    cli::{Cli, Subcommands},
     control,
-    display::Display,
+    display::ProgressDisplay,
     doctor,
     failure::Exit,
-    generate,
-    prepare::{Prepared, prepare, prepare_play, prepare_resume},
+    generate, handover,
+    prepare::{PreparedRun, prepare, prepare_play, prepare_resume},
     report, status,
     supervisor::Supervisor,
-    swap,
-    view::{self, Beside},
+    view::{self, ViewerProcess},
 };
 use clap::Parser as _;
 use ipc_schema::run::Mode;
@@ -22,20 +21,21 @@ use ipc_schema::run::Mode;
 fn main() -> ExitCode {
     let cli = Cli::parse();
     let result = match cli.command {
-        Command::Train(args) => match &args.resume {
+        Subcommands::Train(args) => match &args.resume {
             Some(resumed) => prepare_resume(&args.run, resumed).and_then(run),
             None => prepare(&args.run, Mode::Train).and_then(run),
         },
-        Command::Play(args) => prepare_play(&args).and_then(run),
-        Command::Simulate(args) => prepare(&args, Mode::Simulate).and_then(run),
-        Command::Ps { run } => status::ps(run.as_deref()),
-        Command::Swap(args) => swap::swap(&args),
-        Command::Control(args) => control::control(&args),
-        Command::Stop { run } => status::stop(run.as_deref()),
-        Command::View(args) => view::view(&args),
-        Command::Generate(args) => generate::generate(&args),
-        Command::Bench { arguments } => bench::bench(&arguments),
-        Command::Doctor { clean } => doctor::doctor(clean),
+        Subcommands::Play(args) => prepare_play(&args).and_then(run),
+        Subcommands::Simulate(args) => prepare(&args, Mode::Simulate).and_then(run),
+        Subcommands::Ps { run } => status::ps(run.as_deref()),
+        Subcommands::Handover(args) => handover::request::handover(&args),
+        Subcommands::Swap { .. } => handover::request::refuse_former_name(),
+        Subcommands::Control(args) => control::control(&args),
+        Subcommands::Stop { run } => status::stop(run.as_deref()),
+        Subcommands::View(args) => view::view(&args),
+        Subcommands::Generate(args) => generate::generate(&args),
+        Subcommands::Bench { arguments } => bench::bench(&arguments),
+        Subcommands::Doctor { clean } => doctor::doctor(clean),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -43,15 +43,22 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(prepared: Prepared) -> Result<(), Exit> {
+fn run(prepared: PreparedRun) -> Result<(), Exit> {
     let (run, quiet) = (prepared.run.clone(), prepared.quiet);
     if !quiet {
         eprintln!("run {}: results go to {}", run.name, run.run_dir.display());
     }
     // Dropped, and so ended, after the run.
-    let _viewer = prepared.viewer.map(|wanted| Beside::start(&run, &wanted)).transpose()?;
-    let supervisor = Supervisor::new(prepared.run, prepared.install, prepared.claim)?;
-    let outcome = supervisor.supervise(&mut if quiet { Display::silent() } else { Display::new() })?;
+    let _viewer = prepared
+        .viewer
+        .map(|wanted| ViewerProcess::start(&run, &wanted))
+        .transpose()?;
+    let supervisor = Supervisor::new(&prepared.run, prepared.install, prepared.claim)?;
+    let outcome = supervisor.supervise(&mut if quiet {
+        ProgressDisplay::silent()
+    } else {
+        ProgressDisplay::new()
+    })?;
     let (report, path) = report::write(&run, &outcome)?;
     if !quiet {
         println!("{}", report::summary(&report, &path));

@@ -12,16 +12,16 @@ use ipc_schema::{
 use serde_json::Value;
 
 use crate::{
-    checkpoint::Found,
+    checkpoint::FoundCheckpoint,
     cli::{PlayArgs, RunArgs},
-    config::{self, ConfigError, Settings},
+    config::{self, ConfigError, LayeredSettings},
     failure::Exit,
     install::Install,
     maps,
-    registry::{self, Claim},
+    registry::{self, RunClaim},
     remote, resume,
-    scenario::{self, Scenario},
-    view::Wanted,
+    scenario::{self, SumoScenario},
+    view::ViewerRequest,
 };
 
 /// SUMO's own default step, seconds.
@@ -33,30 +33,30 @@ const SCENARIO_ROAD_USERS: u64 = 8192;
 
 /// A run that is ready to be supervised.
 #[derive(Debug)]
-pub struct Prepared {
+pub struct PreparedRun {
     /// What every process will read.
     pub run: RunFile,
     /// The parts of caraware.
     pub install: Install,
     /// Its corner of shared memory.
-    pub claim: Claim,
+    pub claim: RunClaim,
     /// Show no progress and no summary.
     pub quiet: bool,
     /// Where to show it meanwhile, if at all.
-    pub viewer: Option<Wanted>,
+    pub viewer: Option<ViewerRequest>,
 }
 
 /// What CONFIG names.
-enum Named {
+enum TrafficInput {
     Map,
-    Scenario(PathBuf, Scenario),
+    Scenario(PathBuf, SumoScenario),
 }
 
 /// Checks everything and claims a run directory and shared memory.
 ///
 /// # Errors
 /// Anything wrong with the configuration, the user's files or this machine.
-pub fn prepare(args: &RunArgs, mode: Mode) -> Result<Prepared, Exit> {
+pub fn prepare(args: &RunArgs, mode: Mode) -> Result<PreparedRun, Exit> {
     let (settings, named, label) = resolve(&args.with_shorthands())?;
     make(args, mode, settings.validate()?, named, &label, Install::find()?)
 }
@@ -65,9 +65,9 @@ pub fn prepare(args: &RunArgs, mode: Mode) -> Result<Prepared, Exit> {
 ///
 /// # Errors
 /// As [`prepare`], or there is no such checkpoint, or it does not fit the configuration.
-pub fn prepare_play(args: &PlayArgs) -> Result<Prepared, Exit> {
+pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
     let install = Install::find()?;
-    let found = Found::best(&install, &args.checkpoint, &args.run.runs)?;
+    let found = FoundCheckpoint::best(&install, &args.checkpoint, &args.run.runs)?;
     let (settings, named) = match &args.run.config {
         Some(_) => resolve(&args.run.with_shorthands()).map(|(settings, named, _)| (settings, named))?,
         None => of_run(&found.run()?, &args.run.with_shorthands().set)?,
@@ -95,19 +95,19 @@ pub fn prepare_play(args: &PlayArgs) -> Result<Prepared, Exit> {
 ///
 /// # Errors
 /// As [`prepare`], or there is no such checkpoint or run, or a setting differs that observations depend on.
-pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<Prepared, Exit> {
+pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<PreparedRun, Exit> {
     let install = Install::find()?;
-    let found = Found::newest(&install, resumed, &args.runs)?;
+    let found = FoundCheckpoint::newest(&install, resumed, &args.runs)?;
     let old = found.run()?;
     let mut config = resume::changed(&old, &args.with_shorthands().set)?;
     found.check_fit(&config)?;
     if found.is_run && args.name.is_none() {
         remote::check(&mut config.fanout)?;
-        let viewer = Wanted::of(args, &config.fanout)?;
+        let viewer = ViewerRequest::of(args, &config.fanout)?;
         registry::sweep();
         let (run, claim) = resume::go_on(&found, old, config, &install)?;
         check_shared_memory(&run)?;
-        return Ok(Prepared {
+        return Ok(PreparedRun {
             run,
             install,
             claim,
@@ -123,11 +123,11 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<Prepared, Exit> {
 }
 
 /// The settings and the source of traffic of another run, and what changes.
-fn of_run(run: &RunFile, set: &[String]) -> Result<(Settings, Named), Exit> {
-    let settings = Settings::of(&run.config)?.with_assignments(set)?;
+fn of_run(run: &RunFile, set: &[String]) -> Result<(LayeredSettings, TrafficInput), Exit> {
+    let settings = LayeredSettings::of(&run.config)?.with_assignments(set)?;
     let named = match &run.source {
-        Source::Scenario { sumocfg } => Named::Scenario(sumocfg.clone(), scenario::read(sumocfg)?),
-        Source::Population { .. } => Named::Map,
+        Source::Scenario { sumocfg } => TrafficInput::Scenario(sumocfg.clone(), scenario::read(sumocfg)?),
+        Source::Population { .. } => TrafficInput::Map,
     };
     Ok((settings, named))
 }
@@ -136,18 +136,18 @@ fn make(
     args: &RunArgs,
     mode: Mode,
     mut config: Config,
-    named: Named,
+    named: TrafficInput,
     label: &str,
     install: Install,
-) -> Result<Prepared, Exit> {
+) -> Result<PreparedRun, Exit> {
     check_task(&config, mode, &named)?;
     let origin = config.map.origin_latitude_deg.zip(config.map.origin_longitude_deg);
     let scenario_map = match &named {
-        Named::Scenario(_, scenario) => Some(scenario::map_info(&scenario.net_file, origin)?),
-        Named::Map => None,
+        TrafficInput::Scenario(_, scenario) => Some(scenario::map_info(&scenario.net_file, origin)?),
+        TrafficInput::Map => None,
     };
     remote::check(&mut config.fanout)?;
-    let viewer = Wanted::of(args, &config.fanout)?;
+    let viewer = ViewerRequest::of(args, &config.fanout)?;
     maps::locate(&mut config.curriculum)?;
     let actions = actions(args.commands.as_deref(), config.run.envs)?;
     registry::sweep();
@@ -161,7 +161,7 @@ fn make(
         }
     }
     let (run, claim) = result?;
-    Ok(Prepared {
+    Ok(PreparedRun {
         run,
         install,
         claim,
@@ -170,10 +170,10 @@ fn make(
     })
 }
 
-fn resolve(args: &RunArgs) -> Result<(Settings, Named, String), Exit> {
+fn resolve(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, String), Exit> {
     let name = args.config.as_deref().unwrap_or("town");
     let path = Path::new(name);
-    let defaults = Settings::defaults()?;
+    let defaults = LayeredSettings::defaults()?;
     let label = path
         .file_stem()
         .map_or_else(|| name.to_owned(), |stem| stem.to_string_lossy().into_owned());
@@ -183,11 +183,11 @@ fn resolve(args: &RunArgs) -> Result<(Settings, Named, String), Exit> {
             let mut settings = defaults.with_assignments(&args.set)?;
             suggest_scenario(&mut settings, &scenario, name)?;
             let path = std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error))?;
-            Ok((settings, Named::Scenario(path, scenario), label))
+            Ok((settings, TrafficInput::Scenario(path, scenario), label))
         }
         Some("toml") => Ok((
             defaults.with_file(path)?.with_assignments(&args.set)?,
-            Named::Map,
+            TrafficInput::Map,
             label,
         )),
         _ => {
@@ -196,13 +196,13 @@ fn resolve(args: &RunArgs) -> Result<(Settings, Named, String), Exit> {
                 message: "is neither a preset, a .toml nor a .sumocfg".into(),
                 help: format!("presets: {}. A path needs its extension.", config::preset_names()),
             })??;
-            Ok((settings.with_assignments(&args.set)?, Named::Map, label))
+            Ok((settings.with_assignments(&args.set)?, TrafficInput::Map, label))
         }
     }
 }
 
 /// A scenario's own step and seed count, unless the user says otherwise, and its own road users.
-fn suggest_scenario(settings: &mut Settings, scenario: &Scenario, source: &str) -> Result<(), Exit> {
+fn suggest_scenario(settings: &mut LayeredSettings, scenario: &SumoScenario, source: &str) -> Result<(), Exit> {
     for (path, none) in [("traffic.cavs", 1), ("traffic.others", 0), ("traffic.pedestrians", 0)] {
         if settings.is_set_by_user(path) {
             return Err(Exit::config(
@@ -223,14 +223,14 @@ fn suggest_scenario(settings: &mut Settings, scenario: &Scenario, source: &str) 
 }
 
 /// Actions need somebody who gives them, and heroes that the source of traffic has.
-fn check_task(config: &Config, mode: Mode, named: &Named) -> Result<(), Exit> {
-    if matches!(named, Named::Map) && (config.episode.whole_scenario || config.traffic.scale.is_some()) {
+fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), Exit> {
+    if matches!(named, TrafficInput::Map) && (config.episode.whole_scenario || config.traffic.scale.is_some()) {
         return Err(Exit::config(
             "`episode.whole_scenario` and `traffic.scale` are for a .sumocfg, and there is none",
             "name one in place of the preset, or leave them out",
         ));
     }
-    if matches!(named, Named::Scenario(..)) && !config.curriculum.stages.is_empty() {
+    if matches!(named, TrafficInput::Scenario(..)) && !config.curriculum.stages.is_empty() {
         return Err(Exit::config(
             "the stages of a curriculum say how many vehicles there are, and a .sumocfg has its own",
             "name the .sumocfg in curriculum.maps, and a preset or .toml in its place: its net is then run with population control",
@@ -245,11 +245,11 @@ fn check_task(config: &Config, mode: Mode, named: &Named) -> Result<(), Exit> {
             "the driving task needs a trainer that drives, and `caraware simulate` has none",
             "use `caraware train`; trainer.module names the driver",
         )),
-        (Mode::Train, Named::Map) if traffic.heroes == 0 || !traffic.hero_ids.is_empty() => Err(Exit::config(
+        (Mode::Train, TrafficInput::Map) if traffic.heroes == 0 || !traffic.hero_ids.is_empty() => Err(Exit::config(
             "on a map with population control heroes come by `traffic.heroes`, not by `traffic.hero_ids`",
             "set traffic.heroes = 1 and traffic.hero_ids = []",
         )),
-        (Mode::Train, Named::Scenario(..)) if traffic.heroes > 0 || !traffic.hero_route.is_empty() => {
+        (Mode::Train, TrafficInput::Scenario(..)) if traffic.heroes > 0 || !traffic.hero_route.is_empty() => {
             Err(Exit::config(
                 "heroes of a .sumocfg are vehicles of its own: `traffic.heroes` and `traffic.hero_route` are for maps with population control",
                 "set traffic.hero_ids to the ids of the vehicles that are to be driven, and traffic.heroes = 0",
@@ -302,20 +302,20 @@ fn write_actions(run_dir: &Path, logs: &[(u32, String)]) -> Result<(), Exit> {
     Ok(())
 }
 
-struct RunDir {
+struct RunDirectory {
     name: String,
     path: PathBuf,
 }
 
 /// `runs/<name>`, created by us alone: the name given, or the label with the first free number.
-fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDir, Exit> {
+fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDirectory, Exit> {
     let runs = std::path::absolute(&args.runs).map_err(|error| Exit::io("resolve", &args.runs, &error))?;
     std::fs::create_dir_all(&runs).map_err(|error| Exit::io("create", &runs, &error))?;
     if let Some(name) = &args.name {
         check_name(name)?;
         let path = runs.join(name);
         return match std::fs::create_dir(&path) {
-            Ok(()) => Ok(RunDir {
+            Ok(()) => Ok(RunDirectory {
                 name: name.clone(),
                 path,
             }),
@@ -330,7 +330,7 @@ fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDir, Exit> {
         let name = format!("{label}-{number}");
         let path = runs.join(&name);
         match std::fs::create_dir(&path) {
-            Ok(()) => return Ok(RunDir { name, path }),
+            Ok(()) => return Ok(RunDirectory { name, path }),
             Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
             Err(error) => return Err(Exit::io("create", &path, &error)),
         }
@@ -350,15 +350,15 @@ fn check_name(name: &str) -> Result<(), Exit> {
 }
 
 /// What a run is on, as its run file says it.
-struct Ground {
+struct MapInputs {
     source: Source,
     map: MapInfo,
     scene_files: SceneFiles,
     maps: Vec<RunMap>,
 }
 
-impl Ground {
-    fn of_scenario(sumocfg: PathBuf, scenario: Scenario, map: MapInfo) -> Self {
+impl MapInputs {
+    fn of_scenario(sumocfg: PathBuf, scenario: SumoScenario, map: MapInfo) -> Self {
         Self {
             source: Source::Scenario { sumocfg },
             map,
@@ -385,22 +385,22 @@ impl Ground {
 }
 
 fn assemble(
-    run_dir: &RunDir,
+    run_dir: &RunDirectory,
     mode: Mode,
     config: Config,
     install: &Install,
-    named: Named,
+    named: TrafficInput,
     scenario_map: Option<MapInfo>,
-) -> Result<(RunFile, Claim), Exit> {
+) -> Result<(RunFile, RunClaim), Exit> {
     for part in ["logs", "parts"] {
         let path = run_dir.path.join(part);
         std::fs::create_dir(&path).map_err(|error| Exit::io("create", &path, &error))?;
     }
     let ground = match (named, scenario_map) {
-        (Named::Scenario(sumocfg, scenario), Some(map)) => Ground::of_scenario(sumocfg, scenario, map),
-        _ => Ground::of_maps(maps::build(install, &config, &run_dir.path.join("map"))?)?,
+        (TrafficInput::Scenario(sumocfg, scenario), Some(map)) => MapInputs::of_scenario(sumocfg, scenario, map),
+        _ => MapInputs::of_maps(maps::build(install, &config, &run_dir.path.join("map"))?)?,
     };
-    let claim = Claim::new(&run_dir.path)?;
+    let claim = RunClaim::new(&run_dir.path)?;
     let config_hash = config::hash(&config);
     let path = run_dir.path.join("config.toml");
     std::fs::write(&path, format!("# BLAKE3 {config_hash}\n{}", config::to_toml(&config)))

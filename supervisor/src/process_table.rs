@@ -22,9 +22,9 @@ use crate::{failure::Exit, install::Install};
 pub enum OnExit {
     /// The run needs it: its end before its work is done ends the run.
     Required,
-    /// The run needs it, and nothing is lost when it dies: it is replaced, unless it told of a failure.
+    /// The run needs it, and nothing is lost when it dies: it is replaced, unless it reported a failure.
     Replace,
-    /// It only watches: it is started again.
+    /// It only watches: it is restarted.
     Restart,
 }
 
@@ -37,9 +37,9 @@ pub enum Scope {
     Run,
 }
 
-/// One row.
+/// A process as the supervisor starts it.
 #[derive(Debug)]
-pub struct Row {
+pub struct ProcessRow {
     /// Which process.
     pub process: Process,
     /// What it belongs to.
@@ -54,7 +54,7 @@ pub struct Row {
     pub command: fn(&Install, &RunFile) -> Result<Command, Exit>,
 }
 
-impl Row {
+impl ProcessRow {
     /// True if the run is not over before this process is done.
     #[must_use]
     pub fn is_required(&self) -> bool {
@@ -86,9 +86,9 @@ impl Row {
     }
 }
 
-/// All rows, in the order of starting. SUMO comes first because it is the one that user's files can upset.
-pub const TABLE: [Row; 5] = [
-    Row {
+/// All rows, in the order of starting. `traffic-bridge` comes first because a user's files can make SUMO fail.
+pub const PROCESSES: [ProcessRow; 5] = [
+    ProcessRow {
         process: Process::TrafficBridge,
         scope: Scope::Environment,
         needs: &[],
@@ -96,7 +96,7 @@ pub const TABLE: [Row; 5] = [
         wanted: |_| true,
         command: |install, _| install.binary(Process::TrafficBridge).map(Command::new),
     },
-    Row {
+    ProcessRow {
         process: Process::SimCore,
         scope: Scope::Environment,
         needs: &[Process::TrafficBridge],
@@ -104,7 +104,7 @@ pub const TABLE: [Row; 5] = [
         wanted: |_| true,
         command: |install, _| install.binary(Process::SimCore).map(Command::new),
     },
-    Row {
+    ProcessRow {
         process: Process::SensorDaemon,
         scope: Scope::Environment,
         needs: &[Process::TrafficBridge],
@@ -112,7 +112,7 @@ pub const TABLE: [Row; 5] = [
         wanted: |_| true,
         command: |install, _| install.binary(Process::SensorDaemon).map(Command::new),
     },
-    Row {
+    ProcessRow {
         process: Process::Trainer,
         scope: Scope::Run,
         // Python takes as long to import torch as SUMO to read a large net.
@@ -121,7 +121,7 @@ pub const TABLE: [Row; 5] = [
         wanted: |run| run.mode.has_trainer(),
         command: trainer,
     },
-    Row {
+    ProcessRow {
         process: Process::Fanout,
         scope: Scope::Run,
         // It shows the scene that sim-core has read.
@@ -132,7 +132,7 @@ pub const TABLE: [Row; 5] = [
     },
 ];
 
-/// What takes the trainer's place where nothing learns.
+/// The Python module in the trainer's place where nothing learns.
 const PLAYER: &str = "caraware.play";
 
 fn trainer(install: &Install, run: &RunFile) -> Result<Command, Exit> {
@@ -147,9 +147,9 @@ fn trainer(install: &Install, run: &RunFile) -> Result<Command, Exit> {
 
 /// A started process; killed with its group when dropped.
 #[derive(Debug)]
-pub struct Running {
+pub struct RunningProcess {
     /// Its row.
-    pub row: &'static Row,
+    pub row: &'static ProcessRow,
     /// Its environment.
     pub env_index: u32,
     /// How often it has been started before.
@@ -158,13 +158,13 @@ pub struct Running {
     exit: Option<ExitStatus>,
 }
 
-impl Running {
+impl RunningProcess {
     /// Starts a row in a process group of its own, its output going to `logs/<process>.log`.
     ///
     /// # Errors
     /// The program is missing or cannot be started.
     pub fn start(
-        row: &'static Row,
+        row: &'static ProcessRow,
         install: &Install,
         run: &RunFile,
         run_file: &Path,
@@ -173,41 +173,41 @@ impl Running {
         Self::spawn(row, install, run, run_file, incarnation, |_| {})
     }
 
-    /// Starts a successor beside the process of `row` that is at work: it says on the standard output that comes with it when it is
-    /// ready, and waits for [`Running::go`]. With `checkpoint`, it takes the parameters from there.
+    /// Starts a successor beside the working process of `row`. It reports its readiness on the returned standard output, and waits for
+    /// [`RunningProcess::begin_work`]. With `checkpoint`, it takes the parameters from there.
     ///
     /// # Errors
-    /// As [`Running::start`].
-    pub fn start_shadow(
-        row: &'static Row,
+    /// As [`RunningProcess::start`].
+    pub fn start_successor(
+        row: &'static ProcessRow,
         install: &Install,
         run: &RunFile,
         run_file: &Path,
         incarnation: u32,
         checkpoint: Option<&PathBuf>,
     ) -> Result<(Self, Option<ChildStdout>), Exit> {
-        let mut shadow = Self::spawn(row, install, run, run_file, incarnation, |command| {
+        let mut successor = Self::spawn(row, install, run, run_file, incarnation, |command| {
             command
-                .env("CARAWARE_SHADOW", "1")
+                .env("CARAWARE_SUCCESSOR", "1")
                 .envs(checkpoint.map(|path| ("CARAWARE_CHECKPOINT", path)))
                 .stdin(Stdio::piped())
                 .stdout(Stdio::piped());
         })?;
-        let output = shadow.child.stdout.take();
-        Ok((shadow, output))
+        let output = successor.child.stdout.take();
+        Ok((successor, output))
     }
 
-    /// Tells a shadow that the place is free.
-    pub fn go(&mut self) {
+    /// Lets a successor that is ready begin its work: the old process has ended.
+    pub fn begin_work(&mut self) {
         if let Some(mut input) = self.child.stdin.take()
             && let Err(error) = input.write_all(b"go\n")
         {
-            tracing::warn!(%error, process = %self.row.process, "a successor that ended before its turn");
+            tracing::warn!(%error, process = %self.row.process, "the successor ended before its turn");
         }
     }
 
     fn spawn(
-        row: &'static Row,
+        row: &'static ProcessRow,
         install: &Install,
         run: &RunFile,
         run_file: &Path,
@@ -246,7 +246,7 @@ impl Running {
         })
     }
 
-    /// How it ended, if it has.
+    /// Its exit status, if it has ended.
     pub fn poll(&mut self) -> Option<ExitStatus> {
         if self.exit.is_none() {
             self.exit = self.child.try_wait().ok().flatten();
@@ -266,7 +266,7 @@ impl Running {
         }
     }
 
-    /// Asks it to make room for a successor; unlike [`Running::signal`], nobody in its group but itself.
+    /// Asks it to make room for a successor; unlike [`RunningProcess::signal`], this reaches the process alone, not its group.
     pub fn ask_to_leave(&mut self) {
         if self.poll().is_none()
             && let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw)
@@ -276,7 +276,7 @@ impl Running {
         }
     }
 
-    /// What it said about its failure, or the end of its log.
+    /// The failure that it reported, or the end of its log.
     #[must_use]
     pub fn failure(&self, run: &RunFile, status: ExitStatus) -> Failure {
         let name = self.row.process.name();
@@ -296,7 +296,7 @@ impl Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for RunningProcess {
     fn drop(&mut self) {
         if self.poll().is_none() {
             self.signal(Signal::KILL);

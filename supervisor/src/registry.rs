@@ -26,7 +26,7 @@ pub const SHARED_MEMORY: &str = "/dev/shm";
 const LOCK: &str = "lock";
 /// File that makes a directory recognisable as one of ours.
 const MARKER: &str = "caraware-run.json";
-/// Value of [`Marker::program`].
+/// Value of [`RunMarker::program`].
 const PROGRAM: &str = "caraware";
 /// A longer marker is not ours, bytes.
 const MARKER_BYTES: u64 = 16 << 10;
@@ -40,7 +40,7 @@ const BASE_BYTES: usize = 40;
 
 /// What a run writes into its directory before the directory gets its name.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-struct Marker {
+struct RunMarker {
     /// [`PROGRAM`].
     program: String,
     /// User that owns the run.
@@ -51,7 +51,7 @@ struct Marker {
     run_dir: PathBuf,
 }
 
-impl Marker {
+impl RunMarker {
     fn new(run_dir: &Path) -> Self {
         Self {
             program: PROGRAM.into(),
@@ -146,7 +146,7 @@ fn create_base() -> Result<PathBuf, Exit> {
 
 /// A claimed corner of shared memory; released and emptied when dropped.
 #[derive(Debug)]
-pub struct Claim {
+pub struct RunClaim {
     directory: PathBuf,
     /// Held as long as the run lives.
     _lock: File,
@@ -156,7 +156,7 @@ pub struct Claim {
     pub memory: SharedMemory,
 }
 
-impl Claim {
+impl RunClaim {
     /// Claims a fresh corner for the run in `run_dir`.
     ///
     /// The directory gets its name when it is complete and locked, so that no other run takes it for a dead one.
@@ -182,7 +182,7 @@ impl Claim {
             .map_err(|error| Exit::io("create", &path, &error))?;
         flock(&lock, FlockOperation::NonBlockingLockExclusive)
             .map_err(|error| Exit::io("lock", &path, &error.into()))?;
-        Marker::new(run_dir)
+        RunMarker::new(run_dir)
             .write(&unnamed)
             .map_err(|error| Exit::io("write", &unnamed.join(MARKER), &error))?;
         std::fs::rename(&unnamed, &directory).map_err(|error| Exit::io("create", &directory, &error))?;
@@ -199,7 +199,7 @@ impl Claim {
     }
 }
 
-impl Drop for Claim {
+impl Drop for RunClaim {
     fn drop(&mut self) {
         remove(&self.directory);
         if is_chosen() {
@@ -227,7 +227,7 @@ fn prefix(name: &str) -> String {
 
 /// A run found in the registry.
 #[derive(Debug)]
-pub struct Entry {
+pub struct RegistryEntry {
     directory: PathBuf,
     /// True while its supervisor lives.
     pub alive: bool,
@@ -249,19 +249,22 @@ fn paths() -> Vec<PathBuf> {
 
 /// All runs of this user, dead or alive, in a stable order.
 #[must_use]
-pub fn entries() -> Vec<Entry> {
-    paths().into_iter().filter_map(Entry::read).collect()
+pub fn entries() -> Vec<RegistryEntry> {
+    paths().into_iter().filter_map(RegistryEntry::read).collect()
 }
 
 /// What lies in [`base`] and is not a run of this user: it is never touched.
 #[must_use]
 pub fn strangers() -> Vec<PathBuf> {
-    paths().into_iter().filter(|path| Marker::of(path).is_none()).collect()
+    paths()
+        .into_iter()
+        .filter(|path| RunMarker::of(path).is_none())
+        .collect()
 }
 
-impl Entry {
+impl RegistryEntry {
     fn read(directory: PathBuf) -> Option<Self> {
-        let marker = Marker::of(&directory)?;
+        let marker = RunMarker::of(&directory)?;
         let alive = File::open(directory.join(LOCK))
             .is_ok_and(|lock| flock(&lock, FlockOperation::NonBlockingLockShared).is_err());
         let run = RunFile::read(&marker.run_dir.join("run.json")).ok();
@@ -323,15 +326,15 @@ fn remove(directory: &Path) {
 
 /// Removes what dead runs left. Returns how many there were.
 pub fn sweep() -> usize {
-    let dead: Vec<Entry> = entries().into_iter().filter(|entry| !entry.alive).collect();
-    dead.iter().for_each(Entry::clean);
+    let dead: Vec<RegistryEntry> = entries().into_iter().filter(|entry| !entry.alive).collect();
+    dead.iter().for_each(RegistryEntry::clean);
     dead.len()
 }
 
 /// True if the supervisor of the run in `run_dir` lives.
 #[must_use]
 pub fn is_alive(run_dir: &Path) -> bool {
-    let is_there = |entry: &Entry| entry.alive && entry.run.as_ref().is_some_and(|run| run.run_dir == run_dir);
+    let is_there = |entry: &RegistryEntry| entry.alive && entry.run.as_ref().is_some_and(|run| run.run_dir == run_dir);
     entries().iter().any(is_there)
 }
 
@@ -368,11 +371,11 @@ mod tests {
     use super::*;
 
     /// A directory called `name` as a run leaves it that died; `change` spoils the marker.
-    fn dead(base: &Path, name: &str, change: impl FnOnce(&mut Marker)) -> PathBuf {
+    fn dead(base: &Path, name: &str, change: impl FnOnce(&mut RunMarker)) -> PathBuf {
         let directory = base.join(name);
         std::fs::create_dir_all(&directory).unwrap();
         File::create(directory.join(LOCK)).unwrap();
-        let mut marker = Marker::new(Path::new("/nowhere"));
+        let mut marker = RunMarker::new(Path::new("/nowhere"));
         change(&mut marker);
         marker.write(&directory).unwrap();
         directory
@@ -382,8 +385,8 @@ mod tests {
     fn only_a_directory_with_our_marker_is_a_run() {
         let base = tempfile::tempdir().unwrap();
         let ours = dead(base.path(), "0123abcd", |_| {});
-        assert_eq!(Marker::of(&ours), Some(Marker::new(Path::new("/nowhere"))));
-        assert!(!Entry::read(ours).unwrap().alive);
+        assert_eq!(RunMarker::of(&ours), Some(RunMarker::new(Path::new("/nowhere"))));
+        assert!(!RegistryEntry::read(ours).unwrap().alive);
         let strange = [
             dead(base.path(), "0123abc", |_| {}),
             dead(base.path(), "my-thesis", |_| {}),
@@ -391,7 +394,7 @@ mod tests {
             dead(base.path(), "0123abc2", |marker| marker.user_id += 1),
         ];
         for directory in strange {
-            assert_eq!(Marker::of(&directory), None, "{}", directory.display());
+            assert_eq!(RunMarker::of(&directory), None, "{}", directory.display());
         }
     }
 
@@ -401,12 +404,12 @@ mod tests {
         let ours = dead(base.path(), "0123abcd", |_| {});
         let link = base.path().join("89abcdef");
         std::os::unix::fs::symlink(&ours, &link).unwrap();
-        assert_eq!(Marker::of(&link), None);
+        assert_eq!(RunMarker::of(&link), None);
         let linked = base.path().join("89abcde0");
         std::fs::create_dir(&linked).unwrap();
         std::os::unix::fs::symlink(ours.join(MARKER), linked.join(MARKER)).unwrap();
-        assert_eq!(Marker::of(&linked), None);
+        assert_eq!(RunMarker::of(&linked), None);
         std::fs::write(ours.join(MARKER), "{\"program\": \"caraware\"").unwrap();
-        assert_eq!(Marker::of(&ours), None);
+        assert_eq!(RunMarker::of(&ours), None);
     }
 }

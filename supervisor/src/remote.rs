@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     fn message(change: impl FnOnce(&mut Fanout)) -> Option<String> {
-        let settings = crate::config::Settings::defaults().unwrap();
+        let settings = crate::config::LayeredSettings::defaults().unwrap();
         let mut fanout = settings.validate().unwrap().fanout;
         fanout.listen = "tcp/127.0.0.1:0".into();
         change(&mut fanout);

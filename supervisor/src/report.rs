@@ -10,7 +10,7 @@ use ipc_schema::{
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-use crate::{failure::Exit, supervisor::Outcome, swap::Handover};
+use crate::{failure::Exit, socket::HandoverReport, supervisor::RunOutcome};
 
 /// What an evaluation compares, as the keys of a report begin: the policy, the raw fix, the Kalman filter, the smoother that sees
 /// the future, and the policy's network taught by regression.
@@ -26,7 +26,8 @@ struct Sensing {
     drops: u64,
     redelivered_ticks: u64,
     journal_mib: u64,
-    hand_overs: Vec<HandOver>,
+    #[serde(alias = "hand_overs")]
+    handovers: Vec<HandoverMeasurement>,
     cavs_max: u64,
     raw_gnss_mean_error_m: Option<f64>,
     lidar: Option<Value>,
@@ -78,23 +79,23 @@ fn part<T: serde::de::DeserializeOwned>(run: &RunFile, process: &str) -> Option<
     read(&run.run_dir.join("parts").join(format!("{process}.json")))
 }
 
-/// A planned hand-over as sensor-daemon saw it.
+/// A planned handover as `sensor-daemon` measured it.
 #[derive(Debug, Clone, Deserialize)]
-struct HandOver {
+struct HandoverMeasurement {
     incarnation: u32,
     stall_s: f64,
     ticks_without_trainer: u64,
     most_ahead_ticks: u64,
 }
 
-/// The swaps of a run, each with what the simulation noticed of it. A tick takes `tick_s` wall seconds on average.
-fn swaps(outcome: &Outcome, sensing: &Sensing, tick_s: f64) -> Vec<Value> {
-    let told = |swap: &Handover| {
-        let mut value = json!(swap);
+/// The handovers of a run, each with its effect on the simulation. A tick takes `tick_s` wall seconds on average.
+fn handovers(outcome: &RunOutcome, sensing: &Sensing, tick_s: f64) -> Vec<Value> {
+    let with_figures = |handover: &HandoverReport| {
+        let mut value = json!(handover);
         if let Some(seen) = sensing
-            .hand_overs
+            .handovers
             .iter()
-            .find(|seen| seen.incarnation == swap.incarnation)
+            .find(|seen| seen.incarnation == handover.incarnation)
         {
             value["stall_s"] = json!(seen.stall_s);
             value["stall_ticks"] = json!(seen.stall_s / tick_s);
@@ -103,14 +104,14 @@ fn swaps(outcome: &Outcome, sensing: &Sensing, tick_s: f64) -> Vec<Value> {
         }
         value
     };
-    outcome.swaps.iter().map(told).collect()
+    outcome.handovers.iter().map(with_figures).collect()
 }
 
 /// Puts the report together, writes it, and returns it with its path.
 ///
 /// # Errors
 /// Not writable.
-pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit> {
+pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<(Value, PathBuf), Exit> {
     let runs: Vec<RunFile> = (0..run.config.run.envs).map(|index| run.environment(index)).collect();
     let sensings: Vec<Sensing> = runs
         .iter()
@@ -163,7 +164,7 @@ pub fn write(run: &RunFile, outcome: &Outcome) -> Result<(Value, PathBuf), Exit>
         "duplicated_ticks": training.get("duplicated_ticks").cloned().unwrap_or(json!(0)),
         "drops": sensing.drops,
         "restarts": outcome.restarts,
-        "swaps": swaps(outcome, &sensing, outcome.wall_s / sensing.ticks.max(1) as f64),
+        "handovers": handovers(outcome, &sensing, outcome.wall_s / sensing.ticks.max(1) as f64),
         "redelivered_ticks": sensing.redelivered_ticks,
         "journal_mib": sensing.journal_mib,
         "vehicle_steps": sensing.observations,

@@ -10,11 +10,11 @@ use ipc_schema::{
 };
 
 use crate::{
-    checkpoint::Found,
-    config::{self, Settings},
+    checkpoint::FoundCheckpoint,
+    config::{self, LayeredSettings},
     failure::Exit,
     install::Install,
-    registry::{self, Claim},
+    registry::{self, RunClaim},
 };
 
 /// What may differ, because no observation that has been made depends on it.
@@ -57,19 +57,24 @@ pub fn changed(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
             ));
         }
     }
-    Ok(Settings::of(&run.config)?.with_assignments(set)?.validate()?)
+    Ok(LayeredSettings::of(&run.config)?.with_assignments(set)?.validate()?)
 }
 
 /// The run goes on in its own directory.
 ///
 /// # Errors
 /// It is alive, what it was made from has gone, or its directory is not writable.
-pub fn go_on(found: &Found, old: RunFile, config: Config, install: &Install) -> Result<(RunFile, Claim), Exit> {
+pub fn go_on(
+    found: &FoundCheckpoint,
+    old: RunFile,
+    config: Config,
+    install: &Install,
+) -> Result<(RunFile, RunClaim), Exit> {
     if registry::is_alive(&old.run_dir) {
         return Err(Exit::config(
             format!("the run {} is alive", old.name),
             format!(
-                "`caraware stop {}` ends it; `caraware swap` replaces its trainer",
+                "`caraware stop {}` ends it; `caraware handover` replaces its trainer",
                 old.name
             ),
         ));
@@ -84,7 +89,7 @@ pub fn go_on(found: &Found, old: RunFile, config: Config, install: &Install) -> 
     for index in 0..old.config.run.envs {
         forget_the_end(&old.environment(index).run_dir)?;
     }
-    let claim = Claim::new(&old.run_dir)?;
+    let claim = RunClaim::new(&old.run_dir)?;
     let config_hash = config::hash(&config);
     let path = old.run_dir.join("config.toml");
     std::fs::write(&path, format!("# BLAKE3 {config_hash}\n{}", config::to_toml(&config)))

@@ -17,7 +17,7 @@ use crate::{config::ConfigError, failure::Exit};
 
 /// The options of a `.sumocfg` that the bridge needs.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Scenario {
+pub struct SumoScenario {
     /// The net.
     pub net_file: PathBuf,
     /// `additional-files`, in order.
@@ -50,7 +50,7 @@ pub(crate) fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> 
 ///
 /// # Errors
 /// Unreadable, malformed, no net, or a named file is missing (with the line).
-pub fn read(path: &Path) -> Result<Scenario, Exit> {
+pub fn read(path: &Path) -> Result<SumoScenario, Exit> {
     let text = std::fs::read_to_string(path).map_err(|error| {
         problem(
             path,
@@ -59,7 +59,7 @@ pub fn read(path: &Path) -> Result<Scenario, Exit> {
         )
     })?;
     let directory = path.parent().unwrap_or(Path::new("."));
-    let mut scenario = Scenario::default();
+    let mut scenario = SumoScenario::default();
     let mut reader = Reader::from_str(&text);
     loop {
         let line = line_of(&text, reader.buffer_position());
@@ -102,7 +102,7 @@ fn line_of(text: &str, position: u64) -> usize {
 }
 
 fn option(
-    scenario: &mut Scenario,
+    scenario: &mut SumoScenario,
     element: &BytesStart<'_>,
     path: &Path,
     directory: &Path,
@@ -317,7 +317,7 @@ mod tests {
         let scenario = read(&cfg).unwrap();
         assert_eq!(
             scenario,
-            Scenario {
+            SumoScenario {
                 net_file: directory.path().join("a.net.xml"),
                 additional_files: Vec::new(),
                 step_s: Some(0.5),

@@ -14,7 +14,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 use crate::{
     failure::Exit,
-    process_table::{Scope, TABLE},
+    process_table::{PROCESSES, Scope},
     registry,
 };
 
@@ -51,7 +51,7 @@ pub fn ps(name: Option<&str>) -> Result<(), Exit> {
 }
 
 /// A process of a run.
-struct Seat {
+struct ProcessBoard {
     label: String,
     process: Process,
     env_index: u32,
@@ -59,15 +59,15 @@ struct Seat {
     board: BoardReader,
 }
 
-struct Look {
+struct BoardReading {
     health: Health,
     progress: Progress,
 }
 
-fn look(boards: &[Seat]) -> Vec<Look> {
+fn look(boards: &[ProcessBoard]) -> Vec<BoardReading> {
     boards
         .iter()
-        .map(|seat| Look {
+        .map(|seat| BoardReading {
             health: seat.board.health(),
             progress: seat.board.progress(),
         })
@@ -78,13 +78,13 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
     let node = services::node(&run.shared_memory)?;
     let mut boards = Vec::new();
     for environment in (0..run.config.run.envs).map(|index| run.environment(index)) {
-        for row in TABLE
+        for row in PROCESSES
             .iter()
             .filter(|row| row.is_in(&environment, environment.env_index))
         {
             let board = BoardReader::open(&node, run, environment.env_index, row.process)?;
             let label = row.label(&environment);
-            boards.push(Seat {
+            boards.push(ProcessBoard {
                 label,
                 process: row.process,
                 env_index: environment.env_index,
@@ -129,10 +129,10 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
 }
 
 /// A line for each environment: where it stands, how fast it goes, and who is there.
-fn print_environments(run: &RunFile, boards: &[Seat], [before, now]: [&[Look]; 2]) {
+fn print_environments(run: &RunFile, boards: &[ProcessBoard], [before, now]: [&[BoardReading]; 2]) {
     for env_index in 0..run.config.run.envs {
         let seat_of = |process: Process| {
-            let is_it = |seat: &Seat| seat.env_index == env_index && seat.process == process;
+            let is_it = |seat: &ProcessBoard| seat.env_index == env_index && seat.process == process;
             boards.iter().position(is_it)
         };
         let seats = [Process::TrafficBridge, Process::SimCore, Process::SensorDaemon].map(seat_of);
@@ -161,7 +161,7 @@ fn print_environments(run: &RunFile, boards: &[Seat], [before, now]: [&[Look]; 2
 }
 
 /// A line for the trainer once it reports metrics: how many updates it has made, and what it measures.
-fn print_training(run: &RunFile, boards: &[Seat]) {
+fn print_training(run: &RunFile, boards: &[ProcessBoard]) {
     let Some(trainer) = boards.iter().find(|seat| seat.process == Process::Trainer) else {
         return;
     };

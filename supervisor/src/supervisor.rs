@@ -1,115 +1,93 @@
-//! The supervisor: owns a run, creates every channel, starts and watches the processes, and ends them all.
+//! The supervisor: creates the channels of a run, starts and watches its processes, and ends them.
 
 use std::{
     collections::BTreeMap,
-    io::{BufRead as _, BufReader},
     os::unix::process::ExitStatusExt as _,
-    path::PathBuf,
-    process::ExitStatus,
     sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel},
     time::{Duration, Instant},
 };
 
 use ipc_schema::{
-    board::{INCARNATIONS, State},
+    board::INCARNATIONS,
     failure::{Failure, FailureKind},
-    ports::{BoardReader, ControlClient},
     process::Process,
     run::RunFile,
-    services::{self, RunNode},
 };
-use rustix::process::Signal;
 use signal_hook::{
     consts::{SIGCHLD, SIGINT, SIGTERM},
     iterator::{Handle, Signals},
 };
 
 use crate::{
-    config,
-    control::Controls,
-    cores,
-    display::Display,
-    environment::Environment,
+    control::ControlRelay,
+    display::ProgressDisplay,
     failure::Exit,
+    handover::Handovers,
     install::Install,
-    line,
-    process_table::{OnExit, Row, Running, Scope, TABLE},
-    registry::Claim,
-    revival::{Revival, Verdict},
-    succession::{self, Succession},
-    swap::{self, Asked, Handover},
+    process_table::OnExit,
+    processes::{EndedProcess, RunProcesses},
+    registry::RunClaim,
+    restart::{RestartVerdict, TrainerRestarts, WatcherRestarts},
+    socket::{self, HandoverReport, ReceivedRequest},
 };
 
-/// What the supervisor waits for.
+/// An event that wakes the supervisor.
 #[derive(Debug)]
-enum Event {
-    /// A signal came.
+enum SupervisorEvent {
+    /// A signal arrived.
     Signal(i32),
-    /// `caraware swap` or `caraware control` asks for something.
-    Asked(line::Asked),
+    /// `caraware handover` or `caraware control` sent a request.
+    Request(ReceivedRequest),
     /// The successor of this incarnation is ready.
-    Ready(u32),
+    SuccessorReady(u32),
 }
 
-/// Time between two looks at the processes when nothing happens.
-const LOOK: Duration = Duration::from_millis(100);
-/// The same while a successor opens its ports, which is timed, or somebody waits for an answer.
-const SHORT_LOOK: Duration = Duration::from_millis(5);
+/// Time between two checks of the processes without an event.
+const CHECK_INTERVAL: Duration = Duration::from_millis(100);
+/// The same while a successor opens its ports, which is timed, or while a command waits for its answer.
+const SHORT_CHECK_INTERVAL: Duration = Duration::from_millis(5);
 /// Longest time from start to ready.
 const READY_WITHIN: Duration = Duration::from_secs(120);
 /// Longest time from SIGTERM to the end of a process, before SIGKILL.
 const STOP_WITHIN: Duration = Duration::from_secs(30);
-/// Most replacements of a trainer in a row without a new commit.
-const MAX_VAIN_REPLACEMENTS: u32 = 5;
 
-/// How a run ended, and what the supervisor saw.
+/// How a run ended, and what the supervisor counted.
 #[derive(Debug)]
-pub struct Outcome {
+pub struct RunOutcome {
     /// True if Ctrl-C or `caraware stop` ended it.
     pub interrupted: bool,
-    /// Wall seconds from everybody ready to the end.
+    /// Wall seconds from the moment when all processes were ready to the end.
     pub wall_s: f64,
     /// Restarts of all processes.
     pub restarts: u32,
-    /// Planned swaps of the trainer.
-    pub swaps: Vec<Handover>,
+    /// Planned handovers of the trainer.
+    pub handovers: Vec<HandoverReport>,
 }
 
-/// A run under supervision. Dropping it kills what is left and empties its shared memory.
+/// A run under supervision. Dropping it kills the remaining processes and removes the run's shared memory.
 pub struct Supervisor {
-    succession: Option<Succession>,
-    /// The trainer has been asked to leave: its end without a word is no failure.
-    asked_to_leave: bool,
-    // Dropped in this order: processes, services, node, shared memory.
-    running: Vec<Running>,
-    /// Environment 0 is the home of what belongs to the whole run.
-    environments: Vec<Environment>,
-    controls: Controls,
-    node: RunNode,
-    _claim: Claim,
-    cores: Option<cores::Plan>,
-    install: Install,
-    events: Receiver<Event>,
-    event_sender: Sender<Event>,
+    handovers: Handovers,
+    // Dropped in this order: clients of the control services, processes and services, shared memory.
+    controls: ControlRelay,
+    processes: RunProcesses,
+    _claim: RunClaim,
+    events: Receiver<SupervisorEvent>,
+    event_sender: Sender<SupervisorEvent>,
     signal_handle: Handle,
-    restarts: u32,
-    /// Deaths of processes that only watch.
-    revivals: BTreeMap<Process, Revival>,
-    swaps: Vec<Handover>,
-    /// Replacements of the trainer since its last commit, and the ticks committed then.
-    vain_replacements: u32,
-    committed_ticks: u64,
+    /// Restarts of processes that only watch.
+    watcher_restarts: BTreeMap<Process, WatcherRestarts>,
+    trainer_restarts: TrainerRestarts,
     ready_at: Option<Instant>,
-    /// The look before the present one: whatever is found ready now got ready after it.
-    last_look: Instant,
+    /// The check before the present one: a process that is found ready now became ready after it.
+    last_check: Instant,
 }
 
 impl Drop for Supervisor {
     fn drop(&mut self) {
         self.signal_handle.close();
-        self.succession = None;
-        self.running.clear();
-        services::forget_dead(&self.node);
+        self.handovers.abandon();
+        self.processes.kill();
+        self.processes.forget_dead();
     }
 }
 
@@ -118,60 +96,45 @@ impl Supervisor {
     ///
     /// # Errors
     /// The run directory is not writable, or iceoryx2 refuses.
-    pub fn new(run: RunFile, install: Install, claim: Claim) -> Result<Self, Exit> {
+    pub fn new(run: &RunFile, install: Install, claim: RunClaim) -> Result<Self, Exit> {
         let (event_sender, events) = channel();
         let signal_handle = watch_signals(event_sender.clone())?;
         let sender = event_sender.clone();
-        line::listen(&run, move |asked| sender.send(Event::Asked(asked)).is_ok())?;
-        let node = services::node(&run.shared_memory)?;
-        let envs = run.config.run.envs;
-        let environments: Vec<_> = (0..envs)
-            .map(|index| Environment::create(&node, &run, index))
-            .collect::<Result<_, Exit>>()?;
-        let clients = environments
-            .iter()
-            .map(|environment: &Environment| ControlClient::create(environment.control()));
-        let controls = Controls::new(clients.collect::<Result<_, _>>()?);
-        let cores = cores::plan(&cores::available(), envs as usize, run.mode.has_trainer());
+        socket::listen(run, move |request| {
+            sender.send(SupervisorEvent::Request(request)).is_ok()
+        })?;
+        let processes = RunProcesses::create(run, install)?;
         Ok(Self {
-            succession: None,
-            asked_to_leave: false,
-            running: Vec::new(),
-            environments,
-            controls,
-            node,
+            handovers: Handovers::default(),
+            controls: ControlRelay::new(processes.control_clients()?),
+            processes,
             _claim: claim,
-            cores,
-            install,
             events,
             event_sender,
             signal_handle,
-            restarts: 0,
-            revivals: BTreeMap::new(),
-            swaps: Vec::new(),
-            vain_replacements: 0,
-            committed_ticks: 0,
+            watcher_restarts: BTreeMap::new(),
+            trainer_restarts: TrainerRestarts::default(),
             ready_at: None,
-            last_look: Instant::now(),
+            last_check: Instant::now(),
         })
     }
 
     /// Runs all processes to their end.
     ///
     /// # Errors
-    /// A required process failed, or one did not get ready in time.
-    pub fn supervise(mut self, display: &mut Display) -> Result<Outcome, Exit> {
+    /// A required process failed, or one was not ready in time.
+    pub fn supervise(mut self, display: &mut ProgressDisplay) -> Result<RunOutcome, Exit> {
         let started = Instant::now();
         let mut interrupted = false;
         loop {
-            self.start_what_can()?;
+            self.processes.start_due()?;
             self.reap()?;
-            self.advance_swap();
+            self.handovers.advance(&mut self.processes);
             self.controls.advance()?;
             self.note_ready(started)?;
-            display.update(&self.environments, self.ready_at);
-            self.last_look = Instant::now();
-            if self.finished() {
+            display.update(self.processes.environments(), self.ready_at);
+            self.last_check = Instant::now();
+            if self.processes.have_finished() {
                 break;
             }
             if self.wait_for_event() {
@@ -179,202 +142,99 @@ impl Supervisor {
                 break;
             }
         }
-        self.refuse_swap("the run is over", "");
+        // The run is over: answer what still waits, then end what still runs.
+        self.handovers
+            .refuse_current(&mut self.processes, "the run is over", "");
         self.controls.end();
         let wall_s = self.ready_at.unwrap_or(started).elapsed().as_secs_f64();
-        display.update(&self.environments, self.ready_at);
+        display.update(self.processes.environments(), self.ready_at);
         display.finish();
         self.stop_all(interrupted);
-        Ok(Outcome {
+        Ok(RunOutcome {
             interrupted,
             wall_s,
-            restarts: self.restarts,
-            swaps: std::mem::take(&mut self.swaps),
+            restarts: self.processes.restarts(),
+            handovers: self.handovers.take_reports(),
         })
     }
 
-    /// The run, as environment 0 and whatever belongs to the whole run see it.
-    fn run(&self) -> &RunFile {
-        &self.environments[0].run
-    }
-
-    /// Every process that the run has: its row and its environment.
-    fn wanted(&self) -> impl Iterator<Item = (&'static Row, &Environment)> {
-        self.environments.iter().flat_map(|environment| {
-            let run = &environment.run;
-            let rows = TABLE.iter().filter(|row| row.is_in(run, run.env_index));
-            rows.map(move |row| (row, environment))
-        })
-    }
-
-    fn trainer(&self) -> &BoardReader {
-        self.environments[0].board(Process::Trainer)
-    }
-
-    fn is_started(&self, row: &Row, env_index: u32) -> bool {
-        self.running
-            .iter()
-            .any(|running| running.row.process == row.process && running.env_index == env_index)
-    }
-
-    /// What belongs to the whole run needs the processes of every environment, another only those of its own.
-    fn may_start(&self, row: &Row, environment: &Environment) -> bool {
-        let is_up = |environment: &Environment| {
-            let mut needs = row.needs.iter();
-            needs.all(|need| environment.state_of(*need) != State::Starting)
-        };
-        match row.scope {
-            Scope::Run => self.environments.iter().all(is_up),
-            Scope::Environment => is_up(environment),
-        }
-    }
-
-    fn start_what_can(&mut self) -> Result<(), Exit> {
-        let due: Vec<(&'static Row, u32)> = self
-            .wanted()
-            .filter(|(row, environment)| !self.is_started(row, environment.run.env_index))
-            .filter(|(row, environment)| self.may_start(row, environment))
-            .map(|(row, environment)| (row, environment.run.env_index))
-            .collect();
-        for (row, env_index) in due {
-            let started = self.start(row, env_index, 0)?;
-            self.running.push(started);
-        }
-        Ok(())
-    }
-
-    /// Starts the process of `row` in its environment, on the cores that are meant for it.
-    fn start(&self, row: &'static Row, env_index: u32, incarnation: u32) -> Result<Running, Exit> {
-        let environment = &self.environments[env_index as usize];
-        cores::within(self.cores_of(row, env_index), || {
-            Running::start(row, &self.install, &environment.run, &environment.run_file, incarnation)
-        })
-    }
-
-    fn cores_of(&self, row: &Row, env_index: u32) -> Option<&[usize]> {
-        let plan = self.cores.as_ref()?;
-        match row.scope {
-            Scope::Environment => plan.environments.get(env_index as usize).map(Vec::as_slice),
-            Scope::Run => Some(&plan.rest),
-        }
-    }
-
-    /// Looks for ended processes: a failure of a required one ends the run; watchers, and a trainer that died, are started again.
+    /// Handles ended processes: the failure of a required one ends the run; watchers, and a trainer that was killed, are restarted.
     fn reap(&mut self) -> Result<(), Exit> {
-        for index in 0..self.running.len() {
-            let Some(status) = self.running[index].poll() else {
+        for index in 0..self.processes.started() {
+            let Some(ended) = self.processes.ended(index) else {
                 continue;
             };
-            let row = self.running[index].row;
-            let environment = &self.environments[self.running[index].env_index as usize];
-            let done = environment.state_of(row.process) == State::Done;
-            if status.success() && done {
+            if ended.status.success() && ended.is_done {
                 continue;
             }
-            services::forget_dead(&self.node);
-            let on_exit = row.on_exit(self.run());
-            if on_exit == OnExit::Replace && self.take_over(index, done)? {
+            self.processes.forget_dead();
+            if ended.on_exit == OnExit::Replace
+                && self
+                    .handovers
+                    .trainer_ended(&mut self.processes, index, ended.is_done)?
+            {
                 continue;
             }
-            match on_exit {
-                OnExit::Restart => self.revive(index)?,
-                // All that it had to do is on disk.
-                OnExit::Replace if done => {}
-                OnExit::Replace if status.signal().is_some() => self.replace(index, status)?,
-                OnExit::Replace if self.asked_to_leave && status.success() => self.restart(index)?,
+            let was_killed = ended.status.signal().is_some();
+            let left = self.handovers.is_trainer_leaving() && ended.status.success();
+            match ended.on_exit {
+                OnExit::Restart => self.restart_watcher(index, &ended)?,
+                // All its results are on disk.
+                OnExit::Replace if ended.is_done => {}
+                OnExit::Replace if was_killed => self.replace_trainer(index, &ended)?,
+                OnExit::Replace if left => self.restart(index, &ended)?,
                 OnExit::Required | OnExit::Replace => {
-                    return Err(self.failure(index, status).into());
+                    return Err(self.processes.failure(index, ended.status).into());
                 }
             }
         }
         Ok(())
     }
 
-    fn failure(&self, index: usize, status: ExitStatus) -> Failure {
-        let running = &self.running[index];
-        running.failure(&self.environments[running.env_index as usize].run, status)
-    }
-
-    /// Starts a process that only watches again, if that has a point. The run goes on without it.
-    fn revive(&mut self, index: usize) -> Result<(), Exit> {
-        let running = &self.running[index];
-        let (process, next) = (running.row.process, running.incarnation + 1);
-        let board = self.environments[running.env_index as usize].board(process);
-        let worked = board.progress().attached == 1;
-        let verdict = self
-            .revivals
-            .entry(process)
-            .or_default()
-            .verdict(worked, Instant::now());
-        if verdict == Verdict::Start && next < INCARNATIONS {
-            return self.restart(index);
+    /// Restarts a process that only watches, unless it never gets to work. The run continues without it.
+    fn restart_watcher(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
+        let restarts = self.watcher_restarts.entry(ended.row.process).or_default();
+        let verdict = restarts.verdict(self.processes.is_attached(index), Instant::now());
+        if verdict == RestartVerdict::Start && self.processes.next_incarnation(index) < INCARNATIONS {
+            return self.restart(index, ended);
         }
         Ok(())
     }
 
-    /// Replaces a trainer that died, unless that has been in vain for too long.
-    fn replace(&mut self, index: usize, status: ExitStatus) -> Result<(), Exit> {
-        let process = self.running[index].row.process;
-        let boards = self.environments.iter().map(|environment| environment.board(process));
-        let committed = boards.map(|board| board.progress().committed_ticks).sum();
-        if committed > self.committed_ticks {
-            self.committed_ticks = committed;
-            self.vain_replacements = 0;
-        }
-        self.vain_replacements += 1;
-        if self.vain_replacements > MAX_VAIN_REPLACEMENTS {
-            let mut failure = self.failure(index, status);
+    /// Replaces a trainer that was killed, unless too many replacements in a row reached no new commit.
+    fn replace_trainer(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
+        let process = ended.row.process;
+        let committed_ticks = self.processes.committed_ticks(process);
+        if let Err(replacements) = self.trainer_restarts.allow(committed_ticks) {
+            let mut failure = self.processes.failure(index, ended.status);
             failure.message = format!(
-                "{}\n  replaced {MAX_VAIN_REPLACEMENTS} times in a row, and it never got to a new checkpoint",
+                "{}\n  replaced {replacements} times in a row without reaching a new checkpoint",
                 failure.message
             );
             return Err(failure.into());
         }
-        eprintln!("{process} ended with {status}; a successor continues from the newest checkpoint");
-        self.restart(index)
+        eprintln!(
+            "{process} ended with {}; a successor continues from the newest checkpoint",
+            ended.status
+        );
+        self.restart(index, ended)
     }
 
-    fn restart(&mut self, index: usize) -> Result<(), Exit> {
-        let (row, env_index) = (self.running[index].row, self.running[index].env_index);
-        let incarnation = self.running[index].incarnation + 1;
-        if !self.counts(row, env_index, incarnation) {
-            return Err(Exit::run(
-                format!(
-                    "{} has been replaced {} times: a run holds no more",
-                    row.process,
-                    incarnation - 1
-                ),
-                "find out from its log why it dies",
-            ));
+    fn restart(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
+        self.processes.restart(index)?;
+        if ended.row.process == Process::Trainer {
+            self.handovers.trainer_restarted();
         }
-        self.restarts += 1;
-        self.asked_to_leave &= row.process != Process::Trainer;
-        self.running[index] = self.start(row, env_index, incarnation)?;
         Ok(())
     }
 
-    /// From now on this incarnation counts, wherever the process has a place. False if there are no more.
-    #[must_use]
-    fn counts(&mut self, row: &Row, env_index: u32, incarnation: u32) -> bool {
-        let places = self.environments.iter_mut().filter(|environment| match row.scope {
-            Scope::Run => true,
-            Scope::Environment => environment.run.env_index == env_index,
-        });
-        let mut set = places.map(|environment| environment.roster.set(row.process, incarnation));
-        set.all(|is_set| is_set)
-    }
-
-    /// Remembers when the last required process got ready; gives up if one does not.
+    /// Remembers when the last required process became ready; fails if one takes too long.
     fn note_ready(&mut self, started: Instant) -> Result<(), Exit> {
         if self.ready_at.is_some() {
             return Ok(());
         }
-        let late = self
-            .wanted()
-            .filter(|(row, _)| row.is_required())
-            .find(|(row, environment)| self.is_starting(row, environment));
-        match late {
-            None => self.ready_at = Some(self.last_look),
+        match self.processes.first_not_ready() {
+            None => self.ready_at = Some(self.last_check),
             Some((row, environment)) if started.elapsed() > READY_WITHIN => {
                 let log = environment
                     .run
@@ -392,192 +252,46 @@ impl Supervisor {
         Ok(())
     }
 
-    /// What belongs to the whole run, and is needed, is ready when it is in every environment.
-    fn is_starting(&self, row: &Row, environment: &Environment) -> bool {
-        let starts = |environment: &Environment| environment.state_of(row.process) == State::Starting;
-        match row.scope {
-            Scope::Run => self.environments.iter().any(starts),
-            Scope::Environment => starts(environment),
-        }
-    }
-
-    fn finished(&mut self) -> bool {
-        let wanted = self.wanted().filter(|(row, _)| row.is_required()).count();
-        let required = self.running.iter_mut().filter(|running| running.row.is_required());
-        required
-            .map(|running| usize::from(running.poll().is_some()))
-            .sum::<usize>()
-            == wanted
-    }
-
-    /// Waits for something to happen, at most [`LOOK`]; true if it asks the run to end.
+    /// Waits for an event, at most [`CHECK_INTERVAL`]; true if it asks the run to end.
     fn wait_for_event(&mut self) -> bool {
-        let taking = self.succession.as_ref().is_some_and(Succession::is_taking);
-        let is_short = taking || self.controls.is_waiting();
-        match self.events.recv_timeout(if is_short { SHORT_LOOK } else { LOOK }) {
-            Ok(Event::Signal(signal)) => return signal != SIGCHLD,
-            Ok(Event::Asked(line::Asked::Swap(asked))) => self.begin_swap(asked),
-            Ok(Event::Asked(line::Asked::Control(command, env, line))) => self.controls.pass_on(&command, env, line),
-            Ok(Event::Ready(incarnation)) => self.successor_ready(incarnation),
+        let is_short = self.handovers.is_opening() || self.controls.is_waiting();
+        let interval = if is_short { SHORT_CHECK_INTERVAL } else { CHECK_INTERVAL };
+        match self.events.recv_timeout(interval) {
+            Ok(SupervisorEvent::Signal(signal)) => return signal != SIGCHLD,
+            Ok(SupervisorEvent::Request(ReceivedRequest::Handover(request, reply))) => {
+                let sender = self.event_sender.clone();
+                let report_ready = move |successor| sender.send(SupervisorEvent::SuccessorReady(successor)).is_ok();
+                self.handovers.begin(&self.processes, request, reply, report_ready);
+            }
+            Ok(SupervisorEvent::Request(ReceivedRequest::Control(command, env, reply))) => {
+                self.controls.pass_on(&command, env, reply);
+            }
+            Ok(SupervisorEvent::SuccessorReady(incarnation)) => {
+                self.handovers.successor_ready(&mut self.processes, incarnation);
+            }
             Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {}
         }
         false
     }
 
-    /// Starts a successor beside the trainer at work, or refuses.
-    fn begin_swap(&mut self, asked: Asked) {
-        let state = self.environments[0].state_of(Process::Trainer);
-        let index = self
-            .running
-            .iter()
-            .position(|running| running.row.on_exit == OnExit::Replace);
-        let learns_alone = self.run().config.trainer.ranks == 1;
-        let refusal = match (&self.succession, index, state) {
-            (Some(_), ..) => "another swap is under way",
-            _ if !learns_alone => "its trainer learns together with others: none of them can be replaced alone",
-            (None, None, _) => "the run has no trainer",
-            (None, Some(_), State::Starting) => "the trainer is only starting",
-            (None, Some(_), State::Done) => "the trainer is done",
-            (None, Some(index), State::Ready | State::Running) => {
-                match self.start_successor(index, &asked) {
-                    Ok((run, run_file, shadow)) => {
-                        self.succession = Some(Succession::new(asked, run, run_file, shadow));
-                    }
-                    Err(Exit::Failure(failure)) => asked.refuse(failure),
-                    Err(exit) => asked.refuse(Failure::new(FailureKind::Config, format!("{exit:?}"))),
-                }
-                return;
-            }
-        };
-        asked.refuse(Failure::new(FailureKind::Run, refusal).with_help("`caraware ps` shows how far it is"));
-    }
-
-    fn start_successor(&self, index: usize, asked: &Asked) -> Result<(RunFile, PathBuf, Running), Exit> {
-        let config = swap::changed(self.run(), &asked.request.set)?;
-        let run = RunFile {
-            config_hash: config::hash(&config),
-            config,
-            ..self.run().clone()
-        };
-        let run_file = succession::write_run(&run, "run.next.json")?;
-        let (row, incarnation) = (self.running[index].row, self.running[index].incarnation + 1);
-        let checkpoint = asked.request.checkpoint.as_ref();
-        let (shadow, output) = cores::within(self.cores_of(row, 0), || {
-            Running::start_shadow(row, &self.install, &run, &run_file, incarnation, checkpoint)
-        })?;
-        let sender = self.event_sender.clone();
-        let wait = move || {
-            let mut line = String::new();
-            let read = output.map(|output| BufReader::new(output).read_line(&mut line));
-            if matches!(read, Some(Ok(_))) && line == "ready\n" && sender.send(Event::Ready(incarnation)).is_err() {
-                tracing::debug!("a successor is ready, but the run is over");
-            }
-        };
-        std::thread::Builder::new()
-            .name("successor".into())
-            .spawn(wait)
-            .map_err(|error| Exit::run(format!("cannot wait for the successor: {error}"), ""))?;
-        Ok((run, run_file, shadow))
-    }
-
-    fn successor_ready(&mut self, incarnation: u32) {
-        let Some(succession) = self.succession.take() else {
-            return;
-        };
-        let (succession, leave) = succession.ready(incarnation);
-        self.succession = Some(succession);
-        if leave
-            && let Some(trainer) = self
-                .running
-                .iter_mut()
-                .find(|running| running.row.on_exit == OnExit::Replace)
-        {
-            for environment in &mut self.environments {
-                environment.set_handing_over(true);
-            }
-            trainer.ask_to_leave();
-            self.asked_to_leave = true;
-        }
-    }
-
-    /// The successor is at work, or nothing comes of it.
-    fn end_hand_over(&mut self) {
-        for environment in &mut self.environments {
-            environment.set_handing_over(false);
-        }
-    }
-
-    /// The trainer has ended: true if a successor that waited for that takes its place.
-    fn take_over(&mut self, index: usize, done: bool) -> Result<bool, Exit> {
-        let Some(succession) = self.succession.take() else {
-            return Ok(false);
-        };
-        if done || !succession.is_leaving() {
-            self.succession = Some(succession);
-            self.refuse_swap("the trainer ended meanwhile", "ask again if the run goes on");
-            return Ok(false);
-        }
-        let (succession, taken) = succession.take();
-        self.succession = Some(succession);
-        let Some((mut successor, run)) = taken else {
-            return Ok(false);
-        };
-        if !self.counts(successor.row, 0, successor.incarnation) {
-            return Err(Exit::run("a run holds no more successors", "start another run"));
-        }
-        self.environments.iter().for_each(Environment::wake_sensing);
-        succession::write_run(&run, "run.json")?;
-        self.environments[0].run = run;
-        self.asked_to_leave = false;
-        successor.go();
-        self.running[index] = successor;
-        Ok(true)
-    }
-
-    /// Looks how a swap goes: a successor that failed is refused, one that has its first tick is at work.
-    fn advance_swap(&mut self) {
-        let Some(mut succession) = self.succession.take() else {
-            return;
-        };
-        if let Some(failure) = succession.failure() {
-            succession.refuse(failure);
-            self.end_hand_over();
-            return;
-        }
-        let progress = self.trainer().progress();
-        if succession.is_taking() && progress.attached == 1 {
-            self.end_hand_over();
-            self.swaps.extend(succession.done(progress.committed_ticks));
-        } else {
-            self.succession = Some(succession);
-        }
-    }
-
-    fn refuse_swap(&mut self, message: &str, help: &str) {
-        if let Some(succession) = self.succession.take() {
-            succession.refuse(Failure::new(FailureKind::Run, message).with_help(help));
-            self.end_hand_over();
-        }
-    }
-
-    /// Asks every process to end and waits; kills what does not, or everything at a second Ctrl-C.
+    /// Asks every process to end and waits; kills the rest after a time limit or a second Ctrl-C.
     fn stop_all(&mut self, interrupted: bool) {
         if interrupted {
             eprintln!("stopping: the trainer writes a checkpoint (press Ctrl-C again to kill)");
         }
-        self.running.iter_mut().for_each(|running| running.signal(Signal::TERM));
+        self.processes.terminate();
         let deadline = Instant::now() + STOP_WITHIN;
-        while Instant::now() < deadline && self.running.iter_mut().any(|running| running.poll().is_none()) {
+        while Instant::now() < deadline && self.processes.is_any_alive() {
             if self.wait_for_event() {
                 break;
             }
         }
-        self.running.clear();
+        self.processes.kill();
     }
 }
 
-/// Signals arrive in a channel, so that the supervisor can wait for them with a deadline.
-fn watch_signals(sender: Sender<Event>) -> Result<Handle, Exit> {
+/// Forwards signals to a channel, so that the supervisor can wait for them with a deadline.
+fn watch_signals(sender: Sender<SupervisorEvent>) -> Result<Handle, Exit> {
     let failed = |error: &std::io::Error| Exit::run(format!("cannot watch signals: {error}"), "");
     let mut signals = Signals::new([SIGINT, SIGTERM, SIGCHLD]).map_err(|error| failed(&error))?;
     let handle = signals.handle();
@@ -586,7 +300,7 @@ fn watch_signals(sender: Sender<Event>) -> Result<Handle, Exit> {
         .spawn(move || {
             signals
                 .forever()
-                .take_while(|signal| sender.send(Event::Signal(*signal)).is_ok())
+                .take_while(|signal| sender.send(SupervisorEvent::Signal(*signal)).is_ok())
                 .for_each(drop)
         })
         .map_err(|error| failed(&error))?;

@@ -30,7 +30,7 @@ const LOOK: Duration = Duration::from_millis(50);
 /// # Errors
 /// No such run, one that is not fanned out, or no viewer on this machine.
 pub fn view(args: &ViewArgs) -> Result<(), Exit> {
-    let target = Target::find(args.endpoint.as_deref())?;
+    let target = ViewTarget::find(args.endpoint.as_deref())?;
     let mut command = viewer(&target)?;
     command.args(args.env.map(|env| format!("--env={env}")));
     command.args(args.web.then_some("--web"));
@@ -69,13 +69,13 @@ fn arguments_of(who: &Credentials) -> Vec<String> {
 
 /// Where a run is fanned out.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Target {
+struct ViewTarget {
     endpoint: String,
     /// Its name, where it is known; else the viewer takes the only one there.
     run: Option<String>,
 }
 
-impl Target {
+impl ViewTarget {
     /// An endpoint as it stands; else a run of this machine, by name or the only one.
     fn find(text: Option<&str>) -> Result<Self, Exit> {
         if let Some(endpoint) = text.filter(|text| is_endpoint(text)) {
@@ -128,7 +128,7 @@ fn looks_like_address(text: &str) -> bool {
 }
 
 /// The command of a viewer of `target`, checked to be installed.
-fn viewer(target: &Target) -> Result<Command, Exit> {
+fn viewer(target: &ViewTarget) -> Result<Command, Exit> {
     let python = install::python(&install::programs()?)?;
     check_installed(&python)?;
     let mut command = Command::new(python);
@@ -158,12 +158,12 @@ fn check_installed(python: &Path) -> Result<(), Exit> {
 
 /// A viewer that is wanted beside a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Wanted {
+pub struct ViewerRequest {
     kind: ViewerKind,
     credentials: Credentials,
 }
 
-impl Wanted {
+impl ViewerRequest {
     /// What the command line asks for, if the run will let such a viewer in.
     ///
     /// # Errors
@@ -211,18 +211,18 @@ impl Wanted {
 
 /// A viewer beside a run: it ends with the run, and its own end disturbs nobody.
 #[derive(Debug)]
-pub struct Beside {
+pub struct ViewerProcess {
     child: Child,
 }
 
-impl Beside {
+impl ViewerProcess {
     /// Starts a viewer that waits for the first tick of `run`, in a process group of its own: Ctrl-C ends the run, and the run's end
     /// the viewer.
     ///
     /// # Errors
     /// The run is not fanned out, or no viewer is installed.
-    pub fn start(run: &RunFile, wanted: &Wanted) -> Result<Self, Exit> {
-        let mut command = viewer(&Target::of(run)?)?;
+    pub fn start(run: &RunFile, wanted: &ViewerRequest) -> Result<Self, Exit> {
+        let mut command = viewer(&ViewTarget::of(run)?)?;
         command.args(["--timeout", FIRST_TICK_WITHIN_S]);
         command.args((wanted.kind == ViewerKind::Web).then_some("--web"));
         command.args(arguments_of(&wanted.credentials));
@@ -249,7 +249,7 @@ impl Beside {
     }
 }
 
-impl Drop for Beside {
+impl Drop for ViewerProcess {
     /// Lets it draw what is left, then ends it.
     fn drop(&mut self) {
         for signal in [Signal::TERM, Signal::KILL] {
@@ -306,7 +306,7 @@ mod tests {
 
     #[test]
     fn an_address_without_protocol_is_told_how_to_be_written() {
-        let Err(Exit::Failure(failure)) = Target::find(Some("laptop:7447")) else {
+        let Err(Exit::Failure(failure)) = ViewTarget::find(Some("laptop:7447")) else {
             unreachable!("an address is no run");
         };
         assert!(failure.help.is_some_and(|help| help.contains("tcp/laptop:7447")));

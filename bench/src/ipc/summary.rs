@@ -4,18 +4,18 @@ use std::collections::BTreeMap;
 
 use caraware::failure::Exit;
 
-use super::{BySize, Ours, ROUNDS, Round};
-use crate::{Curve, Line, Report, Spread, Table};
+use super::{LatenciesBySize, LatencyRound, OurLatencies, ROUNDS};
+use crate::{BenchReport, CurveLine, MedianSpread, ReportCurve, ReportTable};
 
 /// One-way latencies, microseconds.
 #[derive(Debug, Clone, Copy)]
-struct Percentiles {
+struct LatencyPercentiles {
     median: f64,
     ninety: f64,
     ninety_nine: f64,
 }
 
-impl Percentiles {
+impl LatencyPercentiles {
     fn of(mut latencies_ns: Vec<f64>) -> Result<Self, Exit> {
         latencies_ns.sort_by(f64::total_cmp);
         #[expect(
@@ -44,13 +44,13 @@ impl Percentiles {
 }
 
 /// Size of the block, bytes → what is told of it.
-type Told = BTreeMap<usize, Percentiles>;
+type PercentilesBySize = BTreeMap<usize, LatencyPercentiles>;
 
 /// Where the latencies of a way are.
-type Way = fn(&Ours) -> &BySize;
+type LatencySelector = fn(&OurLatencies) -> &LatenciesBySize;
 
 /// What is told of ours, and where it is.
-const WAYS: [(&str, Way); 4] = [
+const WAYS: [(&str, LatencySelector); 4] = [
     ("taken", |ours| &ours.taken),
     ("tensor", |ours| &ours.tensor),
     ("tensor of an observation to keep", |ours| &ours.received),
@@ -61,8 +61,8 @@ const WAYS: [(&str, Way); 4] = [
 ///
 /// # Errors
 /// A receiver measured nothing.
-pub(super) fn report(rounds: &[Round], peers: &BTreeMap<String, BySize>) -> Result<Report, Exit> {
-    let mut report = Report::new(
+pub(super) fn report(rounds: &[LatencyRound], peers: &BTreeMap<String, LatenciesBySize>) -> Result<BenchReport, Exit> {
+    let mut report = BenchReport::new(
         "ipc",
         "Observation hop",
         format!(
@@ -76,9 +76,9 @@ pub(super) fn report(rounds: &[Round], peers: &BTreeMap<String, BySize>) -> Resu
              arrives without further copies; they sleep until the kernel wakes them. One message is under way at a time."
         ),
     );
-    let bare = Percentiles::of(rounds.iter().flat_map(|round| round.bare.clone()).collect())?;
+    let bare = LatencyPercentiles::of(rounds.iter().flat_map(|round| round.bare.clone()).collect())?;
     report.figure("bare iceoryx2, median µs", bare.median);
-    let mut all: Vec<(String, Told)> = Vec::new();
+    let mut all: Vec<(String, PercentilesBySize)> = Vec::new();
     for (way, of) in WAYS {
         all.push((
             format!("ours, {way}"),
@@ -98,7 +98,7 @@ pub(super) fn report(rounds: &[Round], peers: &BTreeMap<String, BySize>) -> Resu
             }
         }
     }
-    let mut table = Table::new("", &["message", "median µs", "90 %", "99 %"]);
+    let mut table = ReportTable::new("", &["message", "median µs", "90 %", "99 %"]);
     let [median, ninety, ninety_nine] = bare.cells();
     table.row(["bare iceoryx2, 8 bytes".into(), median, ninety, ninety_nine]);
     for (who, by_size) in &all {
@@ -114,22 +114,24 @@ pub(super) fn report(rounds: &[Round], peers: &BTreeMap<String, BySize>) -> Resu
 }
 
 /// Percentiles of each size over everything that was measured.
-fn pooled<'a>(parts: impl Iterator<Item = &'a BySize>) -> Result<Told, Exit> {
-    let mut all = BySize::new();
+fn pooled<'a>(parts: impl Iterator<Item = &'a LatenciesBySize>) -> Result<PercentilesBySize, Exit> {
+    let mut all = LatenciesBySize::new();
     for (bytes, latencies) in parts.flatten() {
         all.entry(*bytes).or_default().extend(latencies);
     }
-    let each = all.into_iter().map(|(bytes, all)| Ok((bytes, Percentiles::of(all)?)));
+    let each = all
+        .into_iter()
+        .map(|(bytes, all)| Ok((bytes, LatencyPercentiles::of(all)?)));
     each.collect()
 }
 
 /// Sizes among each other and beside the bare message, round by round.
-fn own_ratios(report: &mut Report, rounds: &[Round]) -> Result<Table, Exit> {
-    let mut table = Table::new("", &["ratio of medians", "figure"]);
+fn own_ratios(report: &mut BenchReport, rounds: &[LatencyRound]) -> Result<ReportTable, Exit> {
+    let mut table = ReportTable::new("", &["ratio of medians", "figure"]);
     for (way, of) in WAYS {
         let (mut among_sizes, mut to_bare) = (Vec::new(), Vec::new());
         for round in rounds {
-            let bare = Percentiles::of(round.bare.clone())?.median;
+            let bare = LatencyPercentiles::of(round.bare.clone())?.median;
             let by_size = pooled(std::iter::once(of(&round.ours)))?;
             let medians = || by_size.values().map(|percentiles| percentiles.median);
             let (smallest, largest) = (medians().fold(f64::MAX, f64::min), medians().fold(0.0, f64::max));
@@ -140,7 +142,7 @@ fn own_ratios(report: &mut Report, rounds: &[Round]) -> Result<Table, Exit> {
             ("slowest size to fastest size, 1 KiB to 16 MiB", among_sizes),
             ("slowest size to the bare message", to_bare),
         ] {
-            let spread = Spread::of(ratios)?;
+            let spread = MedianSpread::of(ratios)?;
             table.row([format!("ours, {way}: {of}"), format!("{spread} ×")]);
             report.figure(format!("{way}: {of}"), spread.median);
         }
@@ -148,16 +150,16 @@ fn own_ratios(report: &mut Report, rounds: &[Round]) -> Result<Table, Exit> {
     Ok(table)
 }
 
-fn curve(all: &[(String, Told)]) -> Curve {
-    let line = |(who, by_size): &(String, Told)| {
+fn curve(all: &[(String, PercentilesBySize)]) -> ReportCurve {
+    let line = |(who, by_size): &(String, PercentilesBySize)| {
         #[expect(clippy::cast_precision_loss, reason = "a coordinate")]
         let points = by_size.iter().map(|(bytes, p)| [*bytes as f64, p.median]);
-        Line {
+        CurveLine {
             name: who.clone(),
             points: points.collect(),
         }
     };
-    Curve {
+    ReportCurve {
         name: "ipc".into(),
         title: "From publish to a visible tensor".into(),
         x: "message (bytes)".into(),

@@ -2,56 +2,56 @@
 
 use miette::{Diagnostic, LabeledSpan, NamedSource, Severity, SourceCode};
 
-use super::{keys::Key, layer::Place};
+use super::{keys::ConfigKey, span::SourceSpan};
 
 /// A configuration that cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// Not TOML.
-    #[error("{}: not valid TOML: {message}", at(place))]
+    #[error("{}: not valid TOML: {message}", place.line())]
     Syntax {
         /// What the parser says.
         message: String,
         /// Where.
-        place: Place,
+        place: SourceSpan,
     },
     /// No such key.
-    #[error("{}: unknown key `{path}`", at(place))]
+    #[error("{}: unknown key `{path}`", place.line())]
     UnknownKey {
         /// The key as written.
         path: String,
         /// What was probably meant.
         nearest: Option<&'static str>,
         /// Where.
-        place: Place,
+        place: SourceSpan,
     },
     /// A key by its former name.
-    #[error("{}: `{path}` is renamed to `{renamed_to}`", at(place))]
+    #[error("{}: `{path}` is renamed to `{renamed_to}`", place.line())]
     RenamedKey {
         /// The key as written.
         path: String,
         /// Its name now.
         renamed_to: &'static str,
         /// Where.
-        place: Place,
+        place: SourceSpan,
     },
     /// Wrong type or out of range.
-    #[error("{}: `{}` cannot be {}", at(place), key.path, text(place))]
+    #[error("{}: `{}` cannot be {}", place.line(), key.path, place.text())]
     Value {
         /// The key.
-        key: &'static Key,
+        key: &'static ConfigKey,
         /// Where.
-        place: Place,
+        place: SourceSpan,
     },
     /// Two values do not go together.
-    #[error("{}: {message}", at(place))]
+    #[error("{}: {message}", place.line())]
     Conflict {
         /// Both keys with their values.
         message: String,
         /// What to change.
         help: String,
         /// Where one of them was set.
-        place: Place,
+        place: SourceSpan,
     },
     /// `--set` without `=`.
     #[error("--set {assignment}: not of the form key=value")]
@@ -71,22 +71,8 @@ pub enum ConfigError {
     },
 }
 
-/// "file:line" of a place.
-fn at(place: &Place) -> String {
-    let text = place.source.inner();
-    let line = text
-        .get(..place.span.start)
-        .map_or(1, |before| before.matches('\n').count() + 1);
-    format!("{}:{line}", place.source.name())
-}
-
-/// The value as written.
-fn text(place: &Place) -> &str {
-    place.source.inner().get(place.span.clone()).unwrap_or_default()
-}
-
 impl ConfigError {
-    fn place(&self) -> Option<&Place> {
+    fn place(&self) -> Option<&SourceSpan> {
         match self {
             Self::Syntax { place, .. }
             | Self::UnknownKey { place, .. }

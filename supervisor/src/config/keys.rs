@@ -4,7 +4,7 @@ use ipc_schema::field::{FIELD_PRESETS, FIELDS};
 
 /// What a key's value may be.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Kind {
+pub enum ValueKind {
     /// A number from `min` to `max`.
     Float {
         /// Least value.
@@ -55,16 +55,16 @@ pub enum Kind {
         max: i64,
     },
     /// A list of tables with these keys.
-    Tables(&'static [Key]),
+    Tables(&'static [ConfigKey]),
 }
 
 /// One key.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Key {
+pub struct ConfigKey {
     /// Dotted path.
     pub path: &'static str,
     /// Allowed values.
-    pub kind: Kind,
+    pub kind: ValueKind,
     /// Unit, or "" for a plain number or word.
     pub unit: &'static str,
     /// Meaning.
@@ -73,8 +73,8 @@ pub struct Key {
     pub optional: bool,
 }
 
-const fn key(path: &'static str, kind: Kind, unit: &'static str, meaning: &'static str) -> Key {
-    Key {
+const fn key(path: &'static str, kind: ValueKind, unit: &'static str, meaning: &'static str) -> ConfigKey {
+    ConfigKey {
         path,
         kind,
         unit,
@@ -83,12 +83,12 @@ const fn key(path: &'static str, kind: Kind, unit: &'static str, meaning: &'stat
     }
 }
 
-const fn float(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> Key {
-    key(path, Kind::Float { min, max }, unit, meaning)
+const fn float(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> ConfigKey {
+    key(path, ValueKind::Float { min, max }, unit, meaning)
 }
 
-const fn integer(path: &'static str, unit: &'static str, min: i64, max: i64, meaning: &'static str) -> Key {
-    key(path, Kind::Integer { min, max }, unit, meaning)
+const fn integer(path: &'static str, unit: &'static str, min: i64, max: i64, meaning: &'static str) -> ConfigKey {
+    key(path, ValueKind::Integer { min, max }, unit, meaning)
 }
 
 const fn floats(
@@ -98,38 +98,38 @@ const fn floats(
     min: f64,
     max: f64,
     meaning: &'static str,
-) -> Key {
-    key(path, Kind::Floats { count, min, max }, unit, meaning)
+) -> ConfigKey {
+    key(path, ValueKind::Floats { count, min, max }, unit, meaning)
 }
 
-const fn span(path: &'static str, max: f64, meaning: &'static str) -> Key {
-    key(path, Kind::Span { min: 0.0, max }, "s", meaning)
+const fn span(path: &'static str, max: f64, meaning: &'static str) -> ConfigKey {
+    key(path, ValueKind::Span { min: 0.0, max }, "s", meaning)
 }
 
-const fn optional(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> Key {
-    Key {
+const fn optional(path: &'static str, unit: &'static str, min: f64, max: f64, meaning: &'static str) -> ConfigKey {
+    ConfigKey {
         optional: true,
         ..float(path, unit, min, max, meaning)
     }
 }
 
-const fn other(path: &'static str, kind: Kind, meaning: &'static str) -> Key {
+const fn other(path: &'static str, kind: ValueKind, meaning: &'static str) -> ConfigKey {
     key(path, kind, "", meaning)
 }
 
 /// Keys of a stage of the curriculum.
 #[rustfmt::skip]
-pub const STAGE_KEYS: &[Key] = &[
+pub const STAGE_KEYS: &[ConfigKey] = &[
     integer("curriculum.stages.cavs", "vehicles", 1, 100_000, "Connected vehicles kept alive in this stage."),
-    Key { optional: true, ..integer("curriculum.stages.ticks", "ticks", 1, 1_000_000_000, "Length of a lesson. Unset = `episode.ticks`.") },
-    Key { optional: true, ..other("curriculum.stages.restart", Kind::Flag, "Every lesson begins with all vehicles at new random places; false: it goes on where the one before ended. Unset = true.") },
-    Key { optional: true, ..other("curriculum.stages.maps", Kind::Texts, "Maps of its lessons, by their names: those of `curriculum.maps`, of a file without its ending (\"city\" of \"nets/city.net.xml\"). Unset = the first.") },
-    Key { optional: true, ..other("curriculum.stages.map_choice", Kind::Choice(&["in_order", "random", "gradually_random"]), "Which of them: \"in_order\", one lesson after the other; \"random\", drawn for each; \"gradually_random\", the first, and a share of lessons on a drawn one that grows from none to all over `until_lessons` (without: over what is left of `episode.training_episodes`). Without `restart` a step stays on the map of its first lesson. Unset = \"in_order\".") },
+    ConfigKey { optional: true, ..integer("curriculum.stages.ticks", "ticks", 1, 1_000_000_000, "Length of a lesson. Unset = `episode.ticks`.") },
+    ConfigKey { optional: true, ..other("curriculum.stages.restart", ValueKind::Flag, "Every lesson begins with all vehicles at new random places; false: it goes on where the one before ended. Unset = true.") },
+    ConfigKey { optional: true, ..other("curriculum.stages.maps", ValueKind::Texts, "Maps of its lessons, by their names: those of `curriculum.maps`, of a file without its ending (\"city\" of \"nets/city.net.xml\"). Unset = the first.") },
+    ConfigKey { optional: true, ..other("curriculum.stages.map_choice", ValueKind::Choice(&["in_order", "random", "gradually_random"]), "Which of them: \"in_order\", one lesson after the other; \"random\", drawn for each; \"gradually_random\", the first, and a share of lessons on a drawn one that grows from none to all over `until_lessons` (without: over what is left of `episode.training_episodes`). Without `restart` a step stays on the map of its first lesson. Unset = \"in_order\".") },
     optional("curriculum.stages.noise", "", 0.0, 1000.0, "Factor on random errors and biases of all sensors. Unset = 1."),
     optional("curriculum.stages.blackout", "", 0.0, 1000.0, "Factor on the lengths of blackouts (`blackout.enabled`); 0 = none. Unset = 1."),
     optional("curriculum.stages.until_std", "", 0.0, 10.0, "Passed once the policy's standard deviation is at most this, in units of half the map."),
     optional("curriculum.stages.until_error_m", "m", 0.0, 1e9, "Passed once the mean error of the policy in the samples of an update is at most this."),
-    Key { optional: true, ..integer("curriculum.stages.until_lessons", "lessons", 1, 1_000_000_000, "Passed after so many lessons, if not before. Without any of these three the stage lasts to the end of training.") },
+    ConfigKey { optional: true, ..integer("curriculum.stages.until_lessons", "lessons", 1, 1_000_000_000, "Passed after so many lessons, if not before. Without any of these three the stage lasts to the end of training.") },
 ];
 
 /// Former names of keys, with the names that they have now.
@@ -144,7 +144,7 @@ pub fn renamed_to(path: &str) -> Option<&'static str> {
 
 /// Every key there is.
 #[rustfmt::skip]
-pub const KEYS: &[Key] = &[
+pub const KEYS: &[ConfigKey] = &[
     integer("run.seed", "", 0, i64::MAX, "Seed of all random numbers: traffic, noise, the learner. The same seed gives the same bytes."),
     integer("run.envs", "", 1, 64, "Environments side by side, each with its own SUMO, dynamics and sensors and a seed derived from `run.seed`; one trainer learns from all (docs/parallel.md)."),
     integer("run.first_env", "", 0, 1_000_000, "Number of this run's first environment among those of all runs that learn together; `caraware.parallel` sets it."),
@@ -158,8 +158,8 @@ pub const KEYS: &[Key] = &[
     integer("traffic.others", "vehicles", 0, 100_000, "Vehicles without sensors kept alive (maps with population control)."),
     integer("traffic.pedestrians", "persons", 0, 100_000, "Pedestrians kept alive (maps with population control)."),
     integer("traffic.heroes", "vehicles", 0, 1000, "Heroes, driven by actions, kept alive (maps with population control; driving task only)."),
-    other("traffic.hero_route", Kind::Texts, "Edges of the route of every hero, from its first to its last (maps with population control); [] = at random."),
-    other("traffic.hero_ids", Kind::Texts, "Ids of the vehicles of a `.sumocfg` that are heroes, driven by actions (driving task only)."),
+    other("traffic.hero_route", ValueKind::Texts, "Edges of the route of every hero, from its first to its last (maps with population control); [] = at random."),
+    other("traffic.hero_ids", ValueKind::Texts, "Ids of the vehicles of a `.sumocfg` that are heroes, driven by actions (driving task only)."),
     float("traffic.cav_share", "", 0.0, 1.0, "Share of a `.sumocfg`'s vehicles that carry sensors."),
     integer("traffic.max_cavs", "vehicles", 0, 100_000, "Limit of vehicles with sensors at a time: a departing vehicle gets sensors while fewer are on the road; 0 = no limit."),
     float("traffic.held_out_trips", "", 0.0, 0.9, "Fraction of origin–destination pairs reserved for evaluation: training episodes never use them, and evaluation episodes use no others (maps with population control); 0 = none reserved."),
@@ -172,16 +172,16 @@ pub const KEYS: &[Key] = &[
     integer("episode.evaluation_interval", "episodes", 0, 1_000_000_000, "Training episodes between two evaluations; 0 = only at the end."),
     integer("episode.evaluation_ticks", "ticks", 1, 1_000_000_000, "Length of an evaluation episode."),
     integer("episode.final_evaluations", "", 1, 1_000_000, "Evaluation episodes at the end of the run; their mean error is reported."),
-    other("episode.whole_scenario", Kind::Flag, "Train on a `.sumocfg` unchanged: one episode with its own seed, to its own end."),
-    other("curriculum.stages", Kind::Tables(STAGE_KEYS), "Stages of training in order, each a `[[curriculum.stages]]`; [] = none. Then training is counted in lessons of `episode.ticks` ticks (or the stage's `ticks`), at most `episode.training_episodes` of them, and evaluations are in the base configuration."),
-    other("curriculum.maps", Kind::Texts, "Maps that stages choose from: \"town\", a `.net.xml`, or a `.sumocfg`, of which the net and the buildings are taken; all with population control. Evaluations are on the first; predictions and normalised positions are in the smallest box that holds all. [] = [\"town\"]."),
-    other("curriculum.log", Kind::Text, "`curriculum.jsonl` of a run, whose stages `caraware simulate` repeats without a learner; \"\" = none."),
-    other("task.kind", Kind::Choice(&["localisation", "driving"]), "Meaning of the trainer's output: a position for every connected vehicle, or steering and acceleration for every hero."),
+    other("episode.whole_scenario", ValueKind::Flag, "Train on a `.sumocfg` unchanged: one episode with its own seed, to its own end."),
+    other("curriculum.stages", ValueKind::Tables(STAGE_KEYS), "Stages of training in order, each a `[[curriculum.stages]]`; [] = none. Then training is counted in lessons of `episode.ticks` ticks (or the stage's `ticks`), at most `episode.training_episodes` of them, and evaluations are in the base configuration."),
+    other("curriculum.maps", ValueKind::Texts, "Maps that stages choose from: \"town\", a `.net.xml`, or a `.sumocfg`, of which the net and the buildings are taken; all with population control. Evaluations are on the first; predictions and normalised positions are in the smallest box that holds all. [] = [\"town\"]."),
+    other("curriculum.log", ValueKind::Text, "`curriculum.jsonl` of a run, whose stages `caraware simulate` repeats without a learner; \"\" = none."),
+    other("task.kind", ValueKind::Choice(&["localisation", "driving"]), "Meaning of the trainer's output: a position for every connected vehicle, or steering and acceleration for every hero."),
     float("task.time_limit_s", "s", 0.1, 1e6, "Longest trajectory of a hero. Then it is truncated, and another hero starts."),
-    other("vehicle.cav_model", Kind::Choice(&["kinematic", "dynamic"]), "Model of connected vehicles: without slip, or with tyres, load transfer, roll and pitch."),
-    other("vehicle.other_model", Kind::Choice(&["kinematic", "dynamic"]), "Model of vehicles without sensors."),
-    other("vehicle.hero_model", Kind::Choice(&["kinematic", "dynamic", "rigid_body"]), "Model of heroes; \"rigid_body\" is a body on four ray-cast wheels."),
-    other("vehicle.class_models", Kind::Texts, "Models by SUMO vehicle class, such as [\"truck=kinematic\", \"bus=dynamic\"]; they have precedence over the three above."),
+    other("vehicle.cav_model", ValueKind::Choice(&["kinematic", "dynamic"]), "Model of connected vehicles: without slip, or with tyres, load transfer, roll and pitch."),
+    other("vehicle.other_model", ValueKind::Choice(&["kinematic", "dynamic"]), "Model of vehicles without sensors."),
+    other("vehicle.hero_model", ValueKind::Choice(&["kinematic", "dynamic", "rigid_body"]), "Model of heroes; \"rigid_body\" is a body on four ray-cast wheels."),
+    other("vehicle.class_models", ValueKind::Texts, "Models by SUMO vehicle class, such as [\"truck=kinematic\", \"bus=dynamic\"]; they have precedence over the three above."),
     float("vehicle.lane_change_s", "s", 0.1, 60.0, "Time over which SUMO's instantaneous lane change is spread."),
     float("vehicle.max_road_wheel_angle_rad", "rad", 0.05, 1.5, "Largest steering angle of the front wheels."),
     float("vehicle.max_road_wheel_rate_radps", "rad/s", 0.05, 20.0, "Largest rate of that angle."),
@@ -190,16 +190,16 @@ pub const KEYS: &[Key] = &[
     float("vehicle.steering_ratio", "", 1.0, 100.0, "Steering-wheel angle per road-wheel angle."),
     float("vehicle.resynchronise_m", "m", 0.1, 1000.0, "Tracking error (reference minus front bumper) above which a vehicle is resynchronised: set onto SUMO's position, flagged and counted."),
     float("vehicle.leave_path_m", "m", 0.1, 1000.0, "Distance that the reference may leave SUMO's path where that cannot be driven; above it the vehicle is resynchronised."),
-    other("region.polygon_m", Kind::Texts, "Vehicles sense only inside this polygon: its corners in order, each \"x y\" (m, world). All traffic is simulated. [] = no polygon."),
+    other("region.polygon_m", ValueKind::Texts, "Vehicles sense only inside this polygon: its corners in order, each \"x y\" (m, world). All traffic is simulated. [] = no polygon."),
     floats("region.centre_m", "m", 2, -1e7, 1e7, "Centre x, y (world) of the circle inside which vehicles sense (`region.radius_m`)."),
     float("region.radius_m", "m", 0.0, 1e7, "Radius of that circle; 0 = no circle."),
-    other("road.surface", Kind::Choice(&["dry", "wet", "snow"]), "Condition of the road: it scales the friction of the tyres."),
-    other("scene.obstacles", Kind::Texts, "Obstacles, each \"name x y heading\": a prop by name, its centre (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
+    other("road.surface", ValueKind::Choice(&["dry", "wet", "snow"]), "Condition of the road: it scales the friction of the tyres."),
+    other("scene.obstacles", ValueKind::Texts, "Obstacles, each \"name x y heading\": a prop by name, its centre (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
     integer("scene.random_props", "", 0, 1_000_000, "Props placed at random beside the road, the same for the same `run.seed`."),
     float("scene.building_height_m", "m", 0.1, 1000.0, "Height of a building whose polygon and type state none."),
-    other("scene.meshes", Kind::Texts, "Triangle meshes that LIDARs see, each \"file.obj x y heading\": its origin on the ground (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
-    other("collision.detect", Kind::Flag, "Detect contacts of connected vehicles and heroes with road users, buildings and obstacles."),
-    other("collision.ends_trajectory", Kind::Flag, "A contact ends the trajectory of a connected vehicle (terminated), as it always ends a hero's."),
+    other("scene.meshes", ValueKind::Texts, "Triangle meshes that LIDARs see, each \"file.obj x y heading\": its origin on the ground (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
+    other("collision.detect", ValueKind::Flag, "Detect contacts of connected vehicles and heroes with road users, buildings and obstacles."),
+    other("collision.ends_trajectory", ValueKind::Flag, "A contact ends the trajectory of a connected vehicle (terminated), as it always ends a hero's."),
     float("weather.rain_mmph", "mm/h", 0.0, 200.0, "Rain: a dry road becomes wet, and LIDAR returns grow weaker and get lost (2.5 light, 10 moderate, 50 violent)."),
     float("weather.visibility_m", "m", 10.0, 1e6, "Meteorological optical range; fog (below 1000 m) attenuates LIDAR returns."),
     float("weather.sun_elevation_deg", "deg", -90.0, 90.0, "Height of the sun above the horizon; below 0 it is night."),
@@ -212,13 +212,13 @@ pub const KEYS: &[Key] = &[
     floats("gnss.bias_m", "m", 3, -10_000.0, 10_000.0, "Bias east, north and up, in addition to `gnss.bias_deg`."),
     floats("gnss.correlated_std_m", "m", 3, 0.0, 10_000.0, "Standard deviation of the slow error (first-order Gauss–Markov) east, north and up."),
     float("gnss.correlation_time_s", "s", 0.001, 1e6, "Time in which the correlation of the slow error falls to 1/e."),
-    other("gnss.sky_view", Kind::Flag, "Buildings block satellites: fewer of them, a worse fix, reflections off walls."),
-    other("gnss.pedestrians", Kind::Flag, "Pedestrians carry a smartphone: a slot in the observation with GNSS and IMU (localisation task only)."),
+    other("gnss.sky_view", ValueKind::Flag, "Buildings block satellites: fewer of them, a worse fix, reflections off walls."),
+    other("gnss.pedestrians", ValueKind::Flag, "Pedestrians carry a smartphone: a slot in the observation with GNSS and IMU (localisation task only)."),
     float("gnss.pedestrian_noise_factor", "", 0.0, 1000.0, "Errors of a smartphone's fix as a multiple of a vehicle's."),
     span("gnss.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn each time; [0, 0] = none."),
     span("gnss.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
     float("imu.period_s", "s", 0.00001, 100.0, "Time between samples: a whole number of sub-steps; all samples of a tick are delivered."),
-    other("imu.convention", Kind::Choice(&["kinematic", "specific_force", "carla"]), "\"kinematic\": no gravity; \"specific_force\": at rest 9.80665 m/s² upwards; \"carla\": the same in CARLA's left-handed frame (y right)."),
+    other("imu.convention", ValueKind::Choice(&["kinematic", "specific_force", "carla"]), "\"kinematic\": no gravity; \"specific_force\": at rest 9.80665 m/s² upwards; \"carla\": the same in CARLA's left-handed frame (y right)."),
     floats("imu.accel_noise_std_mps2", "m/s²", 3, 0.0, 100.0, "White noise of an accelerometer sample, standard deviation by axis; in addition to the density."),
     floats("imu.accel_noise_density", "m/s²/√Hz", 3, 0.0, 100.0, "White noise of the accelerometer by axis as a density (velocity random walk)."),
     floats("imu.accel_bias_mps2", "m/s²", 3, -100.0, 100.0, "Constant bias of the accelerometer by axis."),
@@ -244,8 +244,8 @@ pub const KEYS: &[Key] = &[
     span("speed_steering.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn each time; [0, 0] = none."),
     span("speed_steering.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
     integer("lidar.vehicles", "vehicles", 0, 100_000, "Vehicles that carry a LIDAR: those in the first slots of the observation, this many; 0 = none."),
-    other("lidar.pattern", Kind::Text, "Rays: \"uniform\" (`lidar.channels` between the two elevations), a unit by name (\"vlp16\", \"hdl32e\", \"hdl64e\", \"pandar40p\", \"os1_32\", \"os1_64\", \"os1_128\", \"vls128\"), or \"table\"."),
-    other("lidar.ray_table", Kind::Text, "CSV file of pattern \"table\": a line for each ray with azimuth_deg (counter-clockwise from ahead) and elevation_deg; \"\" = none."),
+    other("lidar.pattern", ValueKind::Text, "Rays: \"uniform\" (`lidar.channels` between the two elevations), a unit by name (\"vlp16\", \"hdl32e\", \"hdl64e\", \"pandar40p\", \"os1_32\", \"os1_64\", \"os1_128\", \"vls128\"), or \"table\"."),
+    other("lidar.ray_table", ValueKind::Text, "CSV file of pattern \"table\": a line for each ray with azimuth_deg (counter-clockwise from ahead) and elevation_deg; \"\" = none."),
     integer("lidar.channels", "", 1, 1024, "Lasers one above the other (pattern \"uniform\")."),
     integer("lidar.points_per_second", "1/s", 1, 20_000_000, "Rays per second of all channels together."),
     float("lidar.rotation_hz", "1/s", 0.1, 1000.0, "Rotations per second: a whole number of rotations per tick, or of ticks per rotation."),
@@ -260,23 +260,23 @@ pub const KEYS: &[Key] = &[
     float("lidar.dropoff", "", 0.0, 1.0, "Share of returns lost whatever their intensity."),
     float("lidar.dropoff_intensity", "", 0.0, 1.0, "Intensity above which no return is lost for being weak."),
     float("lidar.dropoff_zero_intensity", "", 0.0, 1.0, "Share of returns lost at intensity 0, falling linearly to none at `lidar.dropoff_intensity`."),
-    other("lidar.rolling_shutter", Kind::Flag, "True: each azimuth fires at its own time, while all road users move. False: the whole scan shows the end of the tick."),
-    other("lidar.mode", Kind::Choice(&["all", "interest"]), "\"all\" returns, or those of \"interest\": vehicles, persons and `lidar.interest_props`."),
-    other("lidar.interest_props", Kind::Texts, "Props that are of interest, by name (docs/scene.md)."),
-    other("lidar.axes", Kind::Choice(&["forward", "paper"]), "Axes of the points: x forward, y left, z up; or the paper's: y backward, x left, z down."),
+    other("lidar.rolling_shutter", ValueKind::Flag, "True: each azimuth fires at its own time, while all road users move. False: the whole scan shows the end of the tick."),
+    other("lidar.mode", ValueKind::Choice(&["all", "interest"]), "\"all\" returns, or those of \"interest\": vehicles, persons and `lidar.interest_props`."),
+    other("lidar.interest_props", ValueKind::Texts, "Props that are of interest, by name (docs/scene.md)."),
+    other("lidar.axes", ValueKind::Choice(&["forward", "paper"]), "Axes of the points: x forward, y left, z up; or the paper's: y backward, x left, z down."),
     span("lidar.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn each time; [0, 0] = none."),
     span("lidar.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
-    other("blackout.enabled", Kind::Flag, "Switch for the blackouts of all sensors."),
-    other("blackout.policy", Kind::Choice(&["hold", "nan", "drop"]), "During a blackout the fields hold the last sample (\"hold\") or not-a-number (\"nan\"), or the row is invalid (\"drop\")."),
-    other("observation.fields", Kind::Fields, "Fields of the observation in order: \"paper\" (nine: GNSS and IMU), \"caraware\" (eleven: with speed and steering), \"driving\" (sixteen: speed, steering, the route ahead), or a list of names. Fields from \"route_x_5\" on exist for heroes only; those that begin with \"object_\" need a LIDAR."),
+    other("blackout.enabled", ValueKind::Flag, "Switch for the blackouts of all sensors."),
+    other("blackout.policy", ValueKind::Choice(&["hold", "nan", "drop"]), "During a blackout the fields hold the last sample (\"hold\") or not-a-number (\"nan\"), or the row is invalid (\"drop\")."),
+    other("observation.fields", ValueKind::Fields, "Fields of the observation in order: \"paper\" (nine: GNSS and IMU), \"caraware\" (eleven: with speed and steering), \"driving\" (sixteen: speed, steering, the route ahead), or a list of names. Fields from \"route_x_5\" on exist for heroes only; those that begin with \"object_\" need a LIDAR."),
     integer("observation.history", "ticks", 1, 64, "Ticks stacked in one row: the newest last, earlier ones before it (frame stack)."),
-    other("observation.scale", Kind::Choice(&["zero_to_one", "minus_one_to_one"]), "Range to which every field is normalised: 0 … 1 in the paper's text, −1 … 1 in CarAware's code."),
+    other("observation.scale", ValueKind::Choice(&["zero_to_one", "minus_one_to_one"]), "Range to which every field is normalised: 0 … 1 in the paper's text, −1 … 1 in CarAware's code."),
     float("observation.accel_range_mps2", "m/s²", 0.1, 1000.0, "Full scale of the accelerometer fields."),
     float("observation.gyro_range_radps", "rad/s", 0.01, 1000.0, "Full scale of the gyroscope fields."),
     float("observation.speed_range_mps", "m/s", 0.1, 1000.0, "Full scale of the speed field."),
     float("observation.steering_range_rad", "rad", 0.1, 1000.0, "Full scale of the steering field."),
     float("observation.age_range_s", "s", 0.001, 1e6, "Full scale of the fields of ages."),
-    other("trainer.module", Kind::Text, "Python module that runs as the trainer; your own reads observations through `caraware.ipc.channel`."),
+    other("trainer.module", ValueKind::Text, "Python module that runs as the trainer; your own reads observations through `caraware.ipc.channel`."),
     float("trainer.learning_rate", "", 1e-9, 1.0, "Learning rate of Adam at the start."),
     float("trainer.learning_rate_decay", "", 0.01, 1.0, "Factor on the learning rate after each update."),
     optional("trainer.learning_rate_final", "", 0.0, 1.0, "Learning rate at the end of training. If set, the rate falls linearly with the training episodes instead of by `trainer.learning_rate_decay`."),
@@ -295,31 +295,31 @@ pub const KEYS: &[Key] = &[
     integer("trainer.horizon", "samples", 1, 100_000_000, "Samples in one update."),
     integer("trainer.batch_size", "samples", 1, 100_000_000, "Samples in one gradient step; at most the horizon."),
     integer("trainer.epochs", "", 1, 1000, "Passes over a horizon."),
-    other("trainer.network", Kind::ChoiceOrClass(&["mlp", "gru"]), "Networks of policy and value: hidden layers alone (\"mlp\"), with a gated recurrent unit in place of the last layer, which remembers a vehicle's earlier ticks (\"gru\"), or a Python class of your own (docs/networks.md)."),
-    other("trainer.hidden", Kind::Integers { min: 1, max: 65536 }, "Widths of the hidden layers of the policy and of the value network."),
-    other("trainer.activation", Kind::Choice(&["relu", "tanh"]), "Activation of the hidden layers; that of the policy's last hidden layer is always tanh."),
+    other("trainer.network", ValueKind::ChoiceOrClass(&["mlp", "gru"]), "Networks of policy and value: hidden layers alone (\"mlp\"), with a gated recurrent unit in place of the last layer, which remembers a vehicle's earlier ticks (\"gru\"), or a Python class of your own (docs/networks.md)."),
+    other("trainer.hidden", ValueKind::Integers { min: 1, max: 65536 }, "Widths of the hidden layers of the policy and of the value network."),
+    other("trainer.activation", ValueKind::Choice(&["relu", "tanh"]), "Activation of the hidden layers; that of the policy's last hidden layer is always tanh."),
     integer("trainer.truncation_ticks", "ticks", 1, 100_000, "Ticks over which a gradient propagates back in a network with memory."),
-    other("trainer.supervised", Kind::Flag, "Train a network of the policy's size by regression to the truth, for comparison (docs/baselines.md)."),
-    other("trainer.reward", Kind::Choice(&["inverse", "bounded_inverse", "exponential"]), "Reward of a prediction at distance d from the truth: 1/d, 1/(1+d/scale), exp(−d/scale)."),
+    other("trainer.supervised", ValueKind::Flag, "Train a network of the policy's size by regression to the truth, for comparison (docs/baselines.md)."),
+    other("trainer.reward", ValueKind::Choice(&["inverse", "bounded_inverse", "exponential"]), "Reward of a prediction at distance d from the truth: 1/d, 1/(1+d/scale), exp(−d/scale)."),
     float("trainer.reward_scale_m", "m", 0.001, 1e6, "The scale in `trainer.reward`."),
     integer("trainer.ranks", "", 1, 1024, "Trainers that learn one policy together by torch.distributed, each in its own run; `caraware.parallel` sets it (docs/parallel.md)."),
     integer("trainer.threads", "", 0, 1024, "Threads of torch; 0 = one for each core."),
-    other("trainer.device", Kind::Choice(&["cpu", "auto"]), "\"auto\" uses a GPU if there is one."),
-    other("trainer.matmul_precision", Kind::Choice(&["auto", "float32", "bfloat16"]), "Precision of the inputs of matrix products; \"auto\" uses bfloat16 where the processor multiplies it in hardware (AMX)."),
+    other("trainer.device", ValueKind::Choice(&["cpu", "auto"]), "\"auto\" uses a GPU if there is one."),
+    other("trainer.matmul_precision", ValueKind::Choice(&["auto", "float32", "bfloat16"]), "Precision of the inputs of matrix products; \"auto\" uses bfloat16 where the processor multiplies it in hardware (AMX)."),
     integer("trainer.checkpoint_interval", "updates", 1, 1_000_000, "Updates between two checkpoints; the last is always written."),
     integer("trainer.checkpoints_kept", "", 1, 1_000_000, "Number of newest checkpoints that are kept; the one with the best evaluation is kept as well."),
     integer("trainer.checkpoint_keep_every", "updates", 0, 1_000_000, "Every checkpoint after a multiple of this many updates is kept for good; 0 = none."),
-    other("trainer.estimates", Kind::Choice(&["paced", "always", "never"]), "When the Kalman filter runs beside the policy for viewers: in runs paced by `run.real_time_factor`, always, or never. At full speed it costs more than the policy."),
-    other("fusion.map", Kind::Flag, "The learned estimator of `caraware.fusion.train` uses the lanes of the net."),
+    other("trainer.estimates", ValueKind::Choice(&["paced", "always", "never"]), "When the Kalman filter runs beside the policy for viewers: in runs paced by `run.real_time_factor`, always, or never. At full speed it costs more than the policy."),
+    other("fusion.map", ValueKind::Flag, "The learned estimator of `caraware.fusion.train` uses the lanes of the net."),
     integer("fusion.segment_ticks", "ticks", 1, 1_000_000, "The estimator learns from an episode in pieces of this many ticks, side by side."),
     integer("fusion.truncation_ticks", "ticks", 1, 1_000_000, "Ticks between two gradient steps, over which a gradient propagates back; divides `fusion.segment_ticks`."),
-    other("fanout.enabled", Kind::Flag, "Start the fan-out process, which lets viewers attach."),
-    other("fanout.listen", Kind::Text, "zenoh endpoint for viewers: tcp/HOST:PORT or tls/HOST:PORT. Beyond loopback it needs `fanout.users` or `fanout.tls_client_ca` (docs/remote.md)."),
-    other("fanout.users", Kind::Text, "File of the users that may connect, one line user:password each, readable by its owner alone; \"\" = every client that reaches the endpoint."),
-    other("fanout.tls_certificate", Kind::Text, "Certificate of this machine (PEM file), for an endpoint tls/…"),
-    other("fanout.tls_private_key", Kind::Text, "Its private key (PEM file)."),
-    other("fanout.tls_client_ca", Kind::Text, "Certificate of the authority (PEM file) that must have signed the viewers' certificates; \"\" = viewers need none."),
-    other("fanout.commanders", Kind::Texts, "Users that may send commands from the network, by user name or common name of the certificate; \"*\" = every connected user."),
+    other("fanout.enabled", ValueKind::Flag, "Start the fan-out process, which lets viewers attach."),
+    other("fanout.listen", ValueKind::Text, "zenoh endpoint for viewers: tcp/HOST:PORT or tls/HOST:PORT. Beyond loopback it needs `fanout.users` or `fanout.tls_client_ca` (docs/remote.md)."),
+    other("fanout.users", ValueKind::Text, "File of the users that may connect, one line user:password each, readable by its owner alone; \"\" = every client that reaches the endpoint."),
+    other("fanout.tls_certificate", ValueKind::Text, "Certificate of this machine (PEM file), for an endpoint tls/…"),
+    other("fanout.tls_private_key", ValueKind::Text, "Its private key (PEM file)."),
+    other("fanout.tls_client_ca", ValueKind::Text, "Certificate of the authority (PEM file) that must have signed the viewers' certificates; \"\" = viewers need none."),
+    other("fanout.commanders", ValueKind::Texts, "Users that may send commands from the network, by user name or common name of the certificate; \"*\" = every connected user."),
     float("fanout.world_hz", "1/s", 0.0, 1000.0, "Limit of `world` frames per wall second; 0 = none."),
     float("fanout.observation_hz", "1/s", 0.0, 1000.0, "Limit of `observation` frames per wall second; 0 = none."),
     float("fanout.prediction_hz", "1/s", 0.0, 1000.0, "Limit of `prediction` frames per wall second; 0 = none."),
@@ -332,7 +332,7 @@ pub const KEYS: &[Key] = &[
 
 /// The key of this dotted path.
 #[must_use]
-pub fn find(path: &str) -> Option<&'static Key> {
+pub fn find(path: &str) -> Option<&'static ConfigKey> {
     KEYS.iter().chain(STAGE_KEYS).find(|key| key.path == path)
 }
 
@@ -361,7 +361,7 @@ pub fn nearest(path: &str) -> Option<&'static str> {
         .map(|(path, _)| path)
 }
 
-impl Key {
+impl ConfigKey {
     /// The last part of the path.
     #[must_use]
     pub fn leaf(&self) -> &'static str {
@@ -372,23 +372,23 @@ impl Key {
     #[must_use]
     pub fn range(&self) -> String {
         match self.kind {
-            Kind::Float { min, max } => format!("{min} … {max}"),
-            Kind::Integer { min, max: i64::MAX } => format!("{min} …"),
-            Kind::Integer { min, max } => format!("{min} … {max}"),
-            Kind::Flag => "true, false".into(),
-            Kind::Choice(words) => quoted(words),
-            Kind::ChoiceOrClass(words) => format!("{}, \"package.module:Class\"", quoted(words)),
-            Kind::Text => "text".into(),
-            Kind::Texts => "list of texts".into(),
-            Kind::Fields => {
+            ValueKind::Float { min, max } => format!("{min} … {max}"),
+            ValueKind::Integer { min, max: i64::MAX } => format!("{min} …"),
+            ValueKind::Integer { min, max } => format!("{min} … {max}"),
+            ValueKind::Flag => "true, false".into(),
+            ValueKind::Choice(words) => quoted(words),
+            ValueKind::ChoiceOrClass(words) => format!("{}, \"package.module:Class\"", quoted(words)),
+            ValueKind::Text => "text".into(),
+            ValueKind::Texts => "list of texts".into(),
+            ValueKind::Fields => {
                 let presets = FIELD_PRESETS.map(|preset| format!("\"{}\"", preset.name));
                 let names: Vec<&str> = FIELDS.iter().map(|spec| spec.name).collect();
                 format!("{}, or a list of {}", presets.join(", "), names.join(", "))
             }
-            Kind::Floats { count, min, max } => format!("{count} × {min} … {max}, or one for all"),
-            Kind::Span { min, max } => format!("[shortest, longest] in {min} … {max}"),
-            Kind::Integers { min, max } => format!("list of {min} … {max}"),
-            Kind::Tables(keys) => format!(
+            ValueKind::Floats { count, min, max } => format!("{count} × {min} … {max}, or one for all"),
+            ValueKind::Span { min, max } => format!("[shortest, longest] in {min} … {max}"),
+            ValueKind::Integers { min, max } => format!("list of {min} … {max}"),
+            ValueKind::Tables(keys) => format!(
                 "list of tables with {}",
                 keys.iter().map(|key| key.leaf()).collect::<Vec<_>>().join(", ")
             ),

@@ -1,6 +1,6 @@
 //! One source of settings: a preset, a file, or one `--set`. Flat, with the place of every value, checked key by key.
 
-use std::{collections::BTreeMap, ops::Range, sync::Arc};
+use std::{collections::BTreeMap, sync::Arc};
 
 use ipc_schema::field::{Field, FieldPreset};
 use miette::NamedSource;
@@ -12,47 +12,35 @@ use toml::{
 
 use super::{
     error::ConfigError,
-    keys::{self, Key, Kind},
+    keys::{self, ConfigKey, ValueKind},
 };
-
-/// Text with a name, for messages that show the line.
-pub type Source = Arc<NamedSource<String>>;
-
-/// Where a value was set.
-#[derive(Debug, Clone)]
-pub struct Place {
-    /// The text it stands in.
-    pub source: Source,
-    /// Bytes of the value.
-    pub span: Range<usize>,
-}
 
 /// A checked value and where it was set.
 #[derive(Debug, Clone)]
-pub struct Setting {
+pub struct LocatedValue {
     /// The value as the run file will hold it.
     pub value: Value,
     /// Where it was set.
-    pub place: Place,
+    pub place: SourceSpan,
 }
 
 /// Settings by dotted path.
-pub type Layer = BTreeMap<&'static str, Setting>;
+pub type SettingsLayer = BTreeMap<&'static str, LocatedValue>;
 
 /// Reads a whole TOML text.
 ///
 /// # Errors
 /// Not TOML, an unknown key, a wrong type, or a value out of range, each with its line.
-pub fn parse(name: &str, text: &str) -> Result<Layer, ConfigError> {
-    let source: Source = Arc::new(NamedSource::new(name, text.to_owned()).with_language("toml"));
+pub fn parse(name: &str, text: &str) -> Result<SettingsLayer, ConfigError> {
+    let source: NamedText = Arc::new(NamedSource::new(name, text.to_owned()).with_language("toml"));
     let table = DeTable::parse(text).map_err(|error| ConfigError::Syntax {
         message: error.message().to_owned(),
-        place: Place {
+        place: SourceSpan {
             source: source.clone(),
             span: error.span().unwrap_or(0..0),
         },
     })?;
-    let mut layer = Layer::new();
+    let mut layer = SettingsLayer::new();
     walk("", table.get_ref(), &source, &mut layer)?;
     Ok(layer)
 }
@@ -61,7 +49,7 @@ pub fn parse(name: &str, text: &str) -> Result<Layer, ConfigError> {
 ///
 /// # Errors
 /// As [`parse`], or no `=`.
-pub fn parse_assignment(assignment: &str) -> Result<Layer, ConfigError> {
+pub fn parse_assignment(assignment: &str) -> Result<SettingsLayer, ConfigError> {
     let Some((key, value)) = assignment.split_once('=') else {
         return Err(ConfigError::Assignment {
             assignment: assignment.to_owned(),
@@ -70,8 +58,12 @@ pub fn parse_assignment(assignment: &str) -> Result<Layer, ConfigError> {
     let (key, value) = (key.trim(), value.trim());
     let plain = format!("{key} = {value}");
     // A word is a word where one belongs, also "nan" and "true", which TOML takes for something else.
-    let takes_a_word =
-        keys::find(key).is_some_and(|key| matches!(key.kind, Kind::Choice(_) | Kind::ChoiceOrClass(_) | Kind::Text));
+    let takes_a_word = keys::find(key).is_some_and(|key| {
+        matches!(
+            key.kind,
+            ValueKind::Choice(_) | ValueKind::ChoiceOrClass(_) | ValueKind::Text
+        )
+    });
     let is_quoted = value.starts_with(['"', '\'']);
     let text = if DeTable::parse(&plain).is_ok() && (is_quoted || !takes_a_word) {
         plain
@@ -81,7 +73,7 @@ pub fn parse_assignment(assignment: &str) -> Result<Layer, ConfigError> {
     parse("--set", &text)
 }
 
-fn walk(prefix: &str, table: &DeTable<'_>, source: &Source, layer: &mut Layer) -> Result<(), ConfigError> {
+fn walk(prefix: &str, table: &DeTable<'_>, source: &NamedText, layer: &mut SettingsLayer) -> Result<(), ConfigError> {
     for (name, value) in table {
         let path = if prefix.is_empty() {
             name.get_ref().to_string()
@@ -95,7 +87,7 @@ fn walk(prefix: &str, table: &DeTable<'_>, source: &Source, layer: &mut Layer) -
             continue;
         }
         let Some(key) = keys::find(&path) else {
-            let place = Place {
+            let place = SourceSpan {
                 source: source.clone(),
                 span: name.span(),
             };
@@ -112,25 +104,29 @@ fn walk(prefix: &str, table: &DeTable<'_>, source: &Source, layer: &mut Layer) -
                 },
             });
         };
-        let place = Place {
+        let place = SourceSpan {
             source: source.clone(),
             span: value.span(),
         };
         let value = match key.kind {
-            Kind::Tables(_) => tables(key, value, source)?,
+            ValueKind::Tables(_) => tables(key, value, source)?,
             _ => check(key, value),
         };
         let value = value.ok_or_else(|| ConfigError::Value {
             key,
             place: place.clone(),
         })?;
-        layer.insert(key.path, Setting { value, place });
+        layer.insert(key.path, LocatedValue { value, place });
     }
     Ok(())
 }
 
 /// A list of tables, each value checked by its own key; `None` if it is none.
-fn tables(key: &'static Key, value: &Spanned<DeValue<'_>>, source: &Source) -> Result<Option<Value>, ConfigError> {
+fn tables(
+    key: &'static ConfigKey,
+    value: &Spanned<DeValue<'_>>,
+    source: &NamedText,
+) -> Result<Option<Value>, ConfigError> {
     let Some(items) = value.get_ref().as_array() else {
         return Ok(None);
     };
@@ -139,15 +135,15 @@ fn tables(key: &'static Key, value: &Spanned<DeValue<'_>>, source: &Source) -> R
         let DeValue::Table(table) = item.get_ref() else {
             return Ok(None);
         };
-        let mut layer = Layer::new();
+        let mut layer = SettingsLayer::new();
         walk(key.path, table, source, &mut layer)?;
-        if let Kind::Tables(keys) = key.kind
+        if let ValueKind::Tables(keys) = key.kind
             && let Some(missing) = keys.iter().find(|key| !key.optional && !layer.contains_key(key.path))
         {
             return Err(ConfigError::Conflict {
                 message: format!("entry {} of `{}` has no `{}`", list.len() + 1, key.path, missing.leaf()),
                 help: format!("give `{}`. {}", missing.leaf(), missing.meaning),
-                place: Place {
+                place: SourceSpan {
                     source: source.clone(),
                     span: item.span(),
                 },
@@ -161,28 +157,28 @@ fn tables(key: &'static Key, value: &Spanned<DeValue<'_>>, source: &Source) -> R
 }
 
 /// The value if `key` allows it.
-fn check(key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Value> {
+fn check(key: &ConfigKey, value: &Spanned<DeValue<'_>>) -> Option<Value> {
     let value = value.get_ref();
     match key.kind {
-        Kind::Float { min, max } => {
+        ValueKind::Float { min, max } => {
             let number = float(value)?;
             (min..=max).contains(&number).then(|| Value::from(number))
         }
-        Kind::Integer { min, max } => integer(value, min, max).map(Value::from),
-        Kind::Flag => value.as_bool().map(Value::from),
-        Kind::Choice(words) => value.as_str().filter(|word| words.contains(word)).map(Value::from),
-        Kind::ChoiceOrClass(words) => value
+        ValueKind::Integer { min, max } => integer(value, min, max).map(Value::from),
+        ValueKind::Flag => value.as_bool().map(Value::from),
+        ValueKind::Choice(words) => value.as_str().filter(|word| words.contains(word)).map(Value::from),
+        ValueKind::ChoiceOrClass(words) => value
             .as_str()
             .filter(|word| words.contains(word) || is_python_class(word))
             .map(Value::from),
-        Kind::Text => value.as_str().map(Value::from),
-        Kind::Fields => fields(value),
-        Kind::Texts => texts(value),
-        Kind::Floats { count, min, max } => floats(value, count, min, max).map(Value::from),
-        Kind::Span { min, max } => floats(value, 2, min, max)
+        ValueKind::Text => value.as_str().map(Value::from),
+        ValueKind::Fields => fields(value),
+        ValueKind::Texts => texts(value),
+        ValueKind::Floats { count, min, max } => floats(value, count, min, max).map(Value::from),
+        ValueKind::Span { min, max } => floats(value, 2, min, max)
             .filter(|span| span[0] <= span[1])
             .map(Value::from),
-        Kind::Integers { min, max } => {
+        ValueKind::Integers { min, max } => {
             let list: Option<Vec<Value>> = value
                 .as_array()?
                 .iter()
@@ -191,7 +187,7 @@ fn check(key: &Key, value: &Spanned<DeValue<'_>>) -> Option<Value> {
             list.filter(|list| !list.is_empty()).map(Value::from)
         }
         // Its values have places of their own (`tables`).
-        Kind::Tables(_) => None,
+        ValueKind::Tables(_) => None,
     }
 }
 

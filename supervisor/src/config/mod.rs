@@ -4,6 +4,7 @@ pub mod error;
 pub mod keys;
 pub mod layer;
 pub mod rules;
+pub mod span;
 
 use std::path::Path;
 
@@ -11,7 +12,7 @@ use ipc_schema::config::Config;
 use serde_json::{Map, Value};
 
 pub use error::ConfigError;
-use layer::{Layer, Setting};
+use layer::{LocatedValue, SettingsLayer};
 
 /// Embedded presets by name; the first is the default and holds every key that must have a value.
 pub const PRESETS: [(&str, &str); 4] = [
@@ -23,9 +24,9 @@ pub const PRESETS: [(&str, &str); 4] = [
 
 /// Merged settings, each remembering where it was set.
 #[derive(Debug, Clone)]
-pub struct Settings(Layer);
+pub struct LayeredSettings(SettingsLayer);
 
-impl Settings {
+impl LayeredSettings {
     /// The default preset.
     ///
     /// # Errors
@@ -85,11 +86,11 @@ impl Settings {
         {
             let text = format!("{path} = {value}");
             let span = text.len() - value.to_string().len()..text.len();
-            let place = layer::Place {
+            let place = span::SourceSpan {
                 source: std::sync::Arc::new(miette::NamedSource::new(source, text)),
                 span,
             };
-            *setting = Setting { value, place };
+            *setting = LocatedValue { value, place };
         }
     }
 
@@ -101,7 +102,7 @@ impl Settings {
             .is_some_and(|setting| !setting.place.source.name().starts_with("preset "))
     }
 
-    fn setting(&self, path: &str) -> Option<&Setting> {
+    fn setting(&self, path: &str) -> Option<&LocatedValue> {
         self.0.get(path)
     }
 

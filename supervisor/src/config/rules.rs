@@ -9,10 +9,10 @@ use ipc_schema::{
 mod curriculum;
 mod sensors;
 
-use super::{ConfigError, Settings};
+use super::{ConfigError, LayeredSettings};
 
 /// Checks every rule.
-pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let tick_s = config.run.tick_s;
     for (path, value_s) in [
         ("traffic.step_s", config.traffic.step_s),
@@ -78,7 +78,7 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
 const LOCALISING_TRAINER: &str = "caraware.train";
 
 /// Heroes and the driving task go together.
-fn task(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+fn task(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let refused = if config.drives() {
         undrivable(config)
     } else {
@@ -91,9 +91,9 @@ fn task(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
 }
 
 /// Key, message and help of what is wrong.
-type Refusal = (&'static str, String, &'static str);
+type BrokenRule = (&'static str, String, &'static str);
 
-fn heroes_without_a_driver(config: &Config) -> Option<Refusal> {
+fn heroes_without_a_driver(config: &Config) -> Option<BrokenRule> {
     let traffic = &config.traffic;
     if traffic.heroes > 0 {
         return Some((
@@ -126,7 +126,7 @@ fn heroes_without_a_driver(config: &Config) -> Option<Refusal> {
 }
 
 /// Actions must come, and reach SUMO at every tick.
-fn undrivable(config: &Config) -> Option<Refusal> {
+fn undrivable(config: &Config) -> Option<BrokenRule> {
     if config.heroes() == 0 {
         return Some((
             "task.kind",
@@ -168,7 +168,7 @@ fn hero_field(config: &Config) -> Option<&'static str> {
 }
 
 /// A polygon has corners, and excludes a circle.
-fn region(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+fn region(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let refused = |message: String, help: &str| Err(conflict(settings, "region.polygon_m", message, help.into()));
     match config.region.corners_m() {
         Err(entry) => refused(
@@ -191,7 +191,7 @@ fn region(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
 }
 
 /// Every entry of `scene.obstacles` must be a known prop and a place.
-fn obstacles(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+fn obstacles(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     for text in &config.scene.obstacles {
         if let Err(error) = Obstacle::parse(text) {
             return Err(conflict(settings, "scene.obstacles", error.to_string(), error.help()));
@@ -201,7 +201,7 @@ fn obstacles(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
 }
 
 /// Entries of `vehicle.class_models` are "class=model" with a vehicle class of SUMO.
-fn check_class_models(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+fn check_class_models(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     match config
         .vehicle
         .class_models
@@ -226,7 +226,7 @@ fn is_multiple(value_s: f64, tick_s: f64) -> bool {
     ratio.round() >= 1.0 && (ratio - ratio.round()).abs() < 1e-6 * ratio
 }
 
-fn conflict(settings: &Settings, path: &str, message: String, help: String) -> ConfigError {
+fn conflict(settings: &LayeredSettings, path: &str, message: String, help: String) -> ConfigError {
     match settings.setting(path) {
         Some(setting) => ConfigError::Conflict {
             message,

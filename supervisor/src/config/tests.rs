@@ -2,7 +2,7 @@ use super::*;
 
 fn config_of(text: &str) -> Result<Config, ConfigError> {
     layer::parse("my.toml", text).and_then(|layer| {
-        let mut settings = Settings::defaults()?;
+        let mut settings = LayeredSettings::defaults()?;
         settings.0.extend(layer);
         settings.validate()
     })
@@ -18,11 +18,11 @@ fn error_of(text: &str) -> (String, String) {
 
 #[test]
 fn the_default_preset_is_valid_and_complete() {
-    let config = Settings::defaults().unwrap().validate().unwrap();
+    let config = LayeredSettings::defaults().unwrap().validate().unwrap();
     assert_eq!(config.observation.fields.len(), 9);
     let missing: Vec<_> = keys::KEYS
         .iter()
-        .filter(|key| !key.optional && Settings::defaults().unwrap().setting(key.path).is_none())
+        .filter(|key| !key.optional && LayeredSettings::defaults().unwrap().setting(key.path).is_none())
         .collect();
     assert!(missing.is_empty(), "{missing:?}");
 }
@@ -30,7 +30,7 @@ fn the_default_preset_is_valid_and_complete() {
 #[test]
 fn every_preset_is_valid() {
     for (name, _) in PRESETS {
-        Settings::defaults()
+        LayeredSettings::defaults()
             .unwrap()
             .with_preset(name)
             .unwrap()
@@ -42,9 +42,9 @@ fn every_preset_is_valid() {
 
 #[test]
 fn the_resolved_configuration_can_be_given_back() {
-    let config = Settings::defaults().unwrap().validate().unwrap();
+    let config = LayeredSettings::defaults().unwrap().validate().unwrap();
     let layer = layer::parse("again", &to_toml(&config)).unwrap();
-    assert_eq!(Settings(layer).validate().unwrap(), config);
+    assert_eq!(LayeredSettings(layer).validate().unwrap(), config);
 }
 
 #[test]
@@ -248,7 +248,7 @@ fn a_word_on_the_command_line_is_a_word() {
 
 #[test]
 fn assignments_take_numbers_words_and_lists() {
-    let settings = Settings::defaults()
+    let settings = LayeredSettings::defaults()
         .unwrap()
         .with_assignments(&[
             "run.seed=7".into(),
@@ -294,7 +294,7 @@ mod reference {
     use super::*;
 
     pub fn markdown() -> String {
-        let defaults = Settings::defaults().unwrap();
+        let defaults = LayeredSettings::defaults().unwrap();
         let mut text = String::from(INTRODUCTION);
         let mut table = "";
         for key in keys::KEYS {
@@ -315,7 +315,7 @@ mod reference {
                 key.unit,
                 key.meaning
             ));
-            if let keys::Kind::Tables(entries) = key.kind {
+            if let keys::ValueKind::Tables(entries) = key.kind {
                 for entry in entries {
                     let optional = if entry.optional { "none" } else { "" };
                     text.push_str(&format!(
@@ -348,7 +348,8 @@ type or a value out of range is refused with the file, the line and the allowed 
 #[test]
 fn the_resolved_default_preset_for_tests_is_true() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../ipc-schema/tests/town.json");
-    let expected = serde_json::to_string_pretty(&Settings::defaults().unwrap().validate().unwrap()).unwrap() + "\n";
+    let expected =
+        serde_json::to_string_pretty(&LayeredSettings::defaults().unwrap().validate().unwrap()).unwrap() + "\n";
     if std::env::var_os("CARAWARE_BLESS").is_some() {
         std::fs::write(path, &expected).unwrap();
     }

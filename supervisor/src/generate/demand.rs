@@ -7,7 +7,7 @@ use rand_chacha::{
     rand_core::{RngCore as _, SeedableRng as _},
 };
 
-use super::{City, streets::Streets};
+use super::{GeneratedCity, streets::GridStreets};
 use crate::failure::Exit;
 
 /// Vehicle classes and how many of 100 vehicles are of each; lengths are SUMO's.
@@ -24,19 +24,19 @@ const ROOM_M: f64 = 15.0;
 const FASTEST: f64 = 1.3;
 
 /// The vehicles of a city.
-pub struct Demand<'a> {
-    city: &'a City,
-    streets: &'a Streets,
+pub struct TripDemand<'a> {
+    city: &'a GeneratedCity,
+    streets: &'a GridStreets,
     /// Street, number and length (metres) of every lane.
     lanes: Vec<(usize, usize, f64)>,
 }
 
-impl<'a> Demand<'a> {
+impl<'a> TripDemand<'a> {
     /// Demand for these streets.
     ///
     /// # Errors
     /// The vehicles do not fit onto them.
-    pub fn new(city: &'a City, streets: &'a Streets) -> Result<Self, Exit> {
+    pub fn new(city: &'a GeneratedCity, streets: &'a GridStreets) -> Result<Self, Exit> {
         let all = streets.all.iter().enumerate();
         let lanes: Vec<_> = all
             .flat_map(|(street, place)| place.lanes_m.iter().enumerate().map(move |(n, &m)| (street, n, m)))
@@ -138,20 +138,20 @@ mod tests {
     }
 
     /// A ring of four streets each way, so that every way goes round and round.
-    fn ring() -> Streets {
+    fn ring() -> GridStreets {
         let edges: String = (0..4)
             .flat_map(|n| [(n, (n + 1) % 4), ((n + 1) % 4, n)])
             .map(|(a, b)| {
                 format!("<edge id=\"{a}to{b}\" from=\"{a}\" to=\"{b}\"><lane id=\"{a}to{b}_0\" length=\"100\"/></edge>")
             })
             .collect();
-        Streets::of(&format!("<net>{edges}</net>")).unwrap()
+        GridStreets::of(&format!("<net>{edges}</net>")).unwrap()
     }
 
     #[test]
     fn everybody_has_a_place_of_their_own_and_a_long_way() {
-        let (streets, city) = (ring(), City::of(17, 30.0, 0.1, 3));
-        let text = Demand::new(&city, &streets).unwrap().text();
+        let (streets, city) = (ring(), GeneratedCity::of(17, 30.0, 0.1, 3));
+        let text = TripDemand::new(&city, &streets).unwrap().text();
         let value = |line: &str, name: &str| {
             let (_, rest) = line.split_once(&format!("{name}=\"")).unwrap();
             rest.split_once('"').unwrap().0.to_owned()

@@ -8,7 +8,7 @@ use crate::scenario::attribute;
 
 /// One direction of a street between two junctions.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Street {
+pub struct GridStreet {
     /// SUMO's id of the edge.
     pub id: String,
     /// Number of the junction where it begins.
@@ -21,14 +21,14 @@ pub struct Street {
 
 /// All streets, in the order of the net.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Streets {
+pub struct GridStreets {
     /// The streets.
-    pub all: Vec<Street>,
+    pub all: Vec<GridStreet>,
     /// Streets that begin at each junction.
     beginning: Vec<Vec<usize>>,
 }
 
-impl Streets {
+impl GridStreets {
     /// Reads the edges of a net that are no junction's.
     ///
     /// # Errors
@@ -74,7 +74,7 @@ impl Streets {
             self.beginning.resize(from + 1, Vec::new());
         }
         self.beginning[from].push(self.all.len());
-        self.all.push(Street {
+        self.all.push(GridStreet {
             id,
             from,
             to,
@@ -101,7 +101,7 @@ mod tests {
             <edge id="ab" from="a" to="b"><lane id="ab_0" length="100.5"/><lane id="ab_1" length="100.5"/></edge>
             <edge id="ba" from="b" to="a"><lane id="ba_0" length="100"/></edge>
             <edge id="bc" from="b" to="c"><lane id="bc_0" length="50"/></edge></net>"#;
-        let streets = Streets::of(net).unwrap();
+        let streets = GridStreets::of(net).unwrap();
         let ids: Vec<_> = streets.all.iter().map(|street| street.id.as_str()).collect();
         assert_eq!(ids, ["ab", "ba", "bc"]);
         assert_eq!(streets.all[0].lanes_m, [100.5, 100.5]);

@@ -4,14 +4,14 @@ use std::collections::BTreeSet;
 
 use ipc_schema::config::{Config, MapChoice, StageConfig, map_name};
 
-use super::{ConfigError, LOCALISING_TRAINER, Settings, conflict};
+use super::{ConfigError, LOCALISING_TRAINER, LayeredSettings, conflict};
 
 /// Stages fit into a byte of the header's flags, counted from 1.
 const MOST_STAGES: usize = 255;
 /// Maps fit into another, counted from 0.
 const MOST_MAPS: usize = 256;
 
-pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let (stages, traffic) = (&config.curriculum.stages, &config.traffic);
     let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.stages", message, help));
     if stages.len() > MOST_STAGES {
@@ -60,7 +60,7 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
 }
 
 /// Every map has a unique name, and stages that use it.
-fn maps(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+fn maps(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let maps = &config.curriculum.maps;
     let refuse = |message: String, help: &str| Err(conflict(settings, "curriculum.maps", message, help.into()));
     if maps.len() > MOST_MAPS {
@@ -117,7 +117,12 @@ fn placed(config: &Config) -> Option<&'static str> {
     keys.into_iter().find_map(|(key, is_used)| is_used.then_some(key))
 }
 
-fn maps_of_stage(settings: &Settings, config: &Config, number: usize, stage: &StageConfig) -> Result<(), ConfigError> {
+fn maps_of_stage(
+    settings: &LayeredSettings,
+    config: &Config,
+    number: usize,
+    stage: &StageConfig,
+) -> Result<(), ConfigError> {
     let names = config.curriculum.map_names();
     let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.stages", message, help));
     if let Some(unknown) = stage.maps.iter().find(|name| !names.contains(&name.as_str())) {

@@ -5,10 +5,10 @@ use ipc_schema::{
     sensor::fitted_sensors,
 };
 
-use super::{ConfigError, Settings, conflict, is_multiple};
+use super::{ConfigError, LayeredSettings, conflict, is_multiple};
 
 /// Checks the sensors.
-pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigError> {
+pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let refused = imu(config).or_else(|| lidar(config)).or_else(|| observation(config));
     match refused {
         None => Ok(()),
@@ -17,10 +17,10 @@ pub(super) fn check(settings: &Settings, config: &Config) -> Result<(), ConfigEr
 }
 
 /// Key, message and help of what is wrong.
-type Refusal = (&'static str, String, String);
+type BrokenSensorRule = (&'static str, String, String);
 
 /// A fast IMU divides the tick and is divided by the sub-step; a slow one is a whole number of ticks.
-fn imu(config: &Config) -> Option<Refusal> {
+fn imu(config: &Config) -> Option<BrokenSensorRule> {
     let (period_s, tick_s) = (config.imu.period_s, config.run.tick_s);
     let sub_step_s = tick_s / f64::from(config.run.sub_steps);
     let fits = if period_s < tick_s {
@@ -40,7 +40,7 @@ fn imu(config: &Config) -> Option<Refusal> {
     })
 }
 
-fn lidar(config: &Config) -> Option<Refusal> {
+fn lidar(config: &Config) -> Option<BrokenSensorRule> {
     let lidar = &config.lidar;
     if lidar.vehicles == 0 {
         return None;
@@ -50,7 +50,7 @@ fn lidar(config: &Config) -> Option<Refusal> {
         .or_else(|| rates(config))
 }
 
-fn pattern(lidar: &Lidar) -> Option<Refusal> {
+fn pattern(lidar: &Lidar) -> Option<BrokenSensorRule> {
     if !Lidar::PATTERNS.contains(&lidar.pattern.as_str()) {
         return Some((
             "lidar.pattern",
@@ -67,7 +67,7 @@ fn pattern(lidar: &Lidar) -> Option<Refusal> {
     })
 }
 
-fn field_of_view(lidar: &Lidar) -> Option<Refusal> {
+fn field_of_view(lidar: &Lidar) -> Option<BrokenSensorRule> {
     let (lower, upper) = (lidar.lower_fov_deg, lidar.upper_fov_deg);
     if lidar.pattern == "uniform" && (lower > upper || (lidar.channels > 1 && upper - lower <= 0.0)) {
         return Some((
@@ -91,7 +91,7 @@ fn field_of_view(lidar: &Lidar) -> Option<Refusal> {
 }
 
 /// Rotations and ticks divide each other, and every tick fires as many columns.
-fn rates(config: &Config) -> Option<Refusal> {
+fn rates(config: &Config) -> Option<BrokenSensorRule> {
     let (lidar, tick_s) = (&config.lidar, config.run.tick_s);
     let rotation_s = 1.0 / lidar.rotation_hz;
     if !is_multiple(rotation_s, tick_s) && !is_multiple(tick_s, rotation_s) {
@@ -128,7 +128,7 @@ fn rates(config: &Config) -> Option<Refusal> {
 }
 
 /// What a field shows must be there.
-fn observation(config: &Config) -> Option<Refusal> {
+fn observation(config: &Config) -> Option<BrokenSensorRule> {
     let fitted = fitted_sensors(config);
     for field in &config.observation.fields {
         if let Some(sensor) = field.spec().source.sensor()

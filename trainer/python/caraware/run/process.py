@@ -68,7 +68,7 @@ class HandoverRole:
         checkpoint = os.environ.get("CARAWARE_CHECKPOINT")
         return cls(
             replaces=int(os.environ.get("CARAWARE_INCARNATION", "0")) > 0,
-            gets_ready=bool(os.environ.get("CARAWARE_SHADOW")),
+            gets_ready=bool(os.environ.get("CARAWARE_SUCCESSOR")),
             checkpoint=Path(checkpoint) if checkpoint else None,
         )
 

@@ -328,46 +328,46 @@ const PACED: &str = "run.real_time_factor=20";
 const PACED_TICKS_PER_S: f64 = 200.0;
 
 #[test]
-fn a_planned_swap_changes_nothing_but_the_process() {
+fn a_planned_handover_changes_nothing_but_the_process() {
     let workplace = Workplace::new();
-    let mut run = Run::start(&workplace, "swapped", &[PACED]);
+    let mut run = Run::start(&workplace, "replaced", &[PACED]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
     let old = run.trainer.health().pid;
-    let mut swap = workplace
-        .command(&["swap", "swapped"])
+    let mut handover = workplace
+        .command(&["handover", "replaced"])
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    let pause = longest_pause(&run.sensing, || swap.try_wait().unwrap().is_some());
-    let output = swap.wait_with_output().unwrap();
+    let pause = longest_pause(&run.sensing, || handover.try_wait().unwrap().is_some());
+    let output = handover.wait_with_output().unwrap();
     let said = text(&output);
     assert!(output.status.success(), "{said}");
-    assert!(said.contains("trainer 1 has taken over at tick"), "{said}");
+    assert!(said.contains("trainer 1 continues from tick"), "{said}");
     run.until("another process at work", |progress, health| {
         progress.incarnation == 1 && health.pid != old && health.ticks > progress.committed_ticks
     });
     // Another one at once: the successor may still have to catch up.
-    let output = workplace.run(&["swap", "swapped"]);
+    let output = workplace.run(&["handover", "replaced"]);
     assert!(output.status.success(), "{}", text(&output));
     let (code, said) = run.end();
     assert_eq!(code, Some(0), "{said}");
-    assert_undisturbed(&workplace, "swapped", 0);
-    let swaps = workplace.report("swapped")["swaps"].clone();
-    assert_eq!(swaps.as_array().unwrap().len(), 2);
-    for (incarnation, swap) in (1..).zip(swaps.as_array().unwrap()) {
-        assert_eq!(swap["incarnation"], incarnation);
-        // The simulation goes on while nobody is attached: it waits for less than a window, and makes ticks meanwhile if there is time
+    assert_undisturbed(&workplace, "replaced", 0);
+    let handovers = workplace.report("replaced")["handovers"].clone();
+    assert_eq!(handovers.as_array().unwrap().len(), 2);
+    for (incarnation, handover) in (1..).zip(handovers.as_array().unwrap()) {
+        assert_eq!(handover["incarnation"], incarnation);
+        // The simulation continues while no trainer is attached: it waits for less than a window, and makes ticks meanwhile if there is time
         // for any.
-        let figure = |key: &str| swap[key].as_f64().unwrap_or_else(|| panic!("{key}: {swaps:#}"));
-        assert!(figure("stall_ticks") <= 8.0, "{swaps:#}");
+        let figure = |key: &str| handover[key].as_f64().unwrap_or_else(|| panic!("{key}: {handovers:#}"));
+        assert!(figure("stall_ticks") <= 8.0, "{handovers:#}");
         assert!(
             figure("ticks_without_trainer") > 0.0 || figure("pause_s") * PACED_TICKS_PER_S < 8.0,
-            "{swaps:#}"
+            "{handovers:#}"
         );
     }
-    println!("{swaps:#}\nno tick for {pause:?} at most");
-    assert_nothing_left(&workplace, "swapped");
+    println!("{handovers:#}\nno tick for {pause:?} at most");
+    assert_nothing_left(&workplace, "replaced");
 }
 
 #[test]
@@ -376,7 +376,7 @@ fn another_framework_takes_over_and_no_observation_is_lost() {
     let mut run = Run::start(&workplace, "framework", &[PACED]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
     let module = "trainer.module=caraware.examples.sb3_takeover";
-    let output = workplace.run(&["swap", "framework", "--set", module]);
+    let output = workplace.run(&["handover", "framework", "--set", module]);
     assert!(output.status.success(), "{}", text(&output));
     // It learns, saves and commits by itself; killed, it goes on from there.
     let taken_over = run.trainer.progress().committed_ticks;
@@ -394,11 +394,11 @@ fn another_framework_takes_over_and_no_observation_is_lost() {
         (&0.into(), &0.into())
     );
     assert_eq!(
-        (&report["restarts"], &report["swaps"][0]["incarnation"]),
+        (&report["restarts"], &report["handovers"][0]["incarnation"]),
         (&1.into(), &1.into())
     );
     let log = std::fs::read_to_string(log).unwrap();
-    let begun = format!("takes over at tick {}", report["swaps"][0]["first_tick"]);
+    let begun = format!("takes over at tick {}", report["handovers"][0]["first_tick"]);
     assert!(
         log.contains(&begun) && log.matches("takes over at tick").count() == 2,
         "{log}"
@@ -408,13 +408,13 @@ fn another_framework_takes_over_and_no_observation_is_lost() {
 }
 
 #[test]
-fn a_swap_with_other_settings_learns_on_with_them() {
+fn a_handover_with_other_settings_learns_on_with_them() {
     let workplace = Workplace::new();
     let mut run = Run::start(&workplace, "changed", &[PACED]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
-    let output = workplace.run(&["swap", "--set", "trainer.learning_rate=0.0001"]);
+    let output = workplace.run(&["handover", "--set", "trainer.learning_rate=0.0001"]);
     assert!(output.status.success(), "{}", text(&output));
-    // What is killed after the swap comes back with the new settings.
+    // What is killed after the handover comes back with the new settings.
     run.kill_trainer_at(1, run.trainer.progress().committed_ticks + 1);
     let (code, said) = run.end();
     assert_eq!(code, Some(0), "{said}");
@@ -431,7 +431,7 @@ fn a_swap_with_other_settings_learns_on_with_them() {
 }
 
 #[test]
-fn a_swap_that_cannot_be_is_refused_and_the_trainer_goes_on() {
+fn an_impossible_handover_is_refused_and_the_old_trainer_continues() {
     let workplace = Workplace::new();
     let short = [
         "observation.fields=caraware",
@@ -443,7 +443,7 @@ fn a_swap_that_cannot_be_is_refused_and_the_trainer_goes_on() {
     let mut run = Run::start(&workplace, "refused", &[PACED]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
     let refused = |arguments: &[&str], code: i32, words: &[&str]| {
-        let output = workplace.run(&[&["swap", "refused"], arguments].concat());
+        let output = workplace.run(&[&["handover", "refused"], arguments].concat());
         let said = text(&output);
         assert_eq!(output.status.code(), Some(code), "{said}");
         // Messages are wrapped for the terminal.
@@ -466,11 +466,25 @@ fn a_swap_that_cannot_be_is_refused_and_the_trainer_goes_on() {
     refused(
         &["--checkpoint", "runs/wider/checkpoints/update-000001"],
         1,
-        &["the trainer goes on", "observation_size is 11, this run's is 9"],
+        &["the old trainer continues", "observation_size is 11, this run's is 9"],
     );
     assert_eq!(run.trainer.progress().incarnation, 0);
     let (code, said) = run.end();
     assert_eq!(code, Some(0), "{said}");
     assert_undisturbed(&workplace, "refused", 0);
     assert_nothing_left(&workplace, "refused");
+}
+
+#[test]
+fn the_former_name_of_the_command_is_refused_with_the_new_one() {
+    let workplace = Workplace::new();
+    for arguments in [&["swap"][..], &["swap", "town-1", "--set", "trainer.learning_rate=0.1"]] {
+        let output = workplace.run(arguments);
+        assert_eq!(output.status.code(), Some(2), "{}", text(&output));
+        assert!(
+            text(&output).contains("renamed to `caraware handover`"),
+            "{}",
+            text(&output)
+        );
+    }
 }

@@ -1,0 +1,88 @@
+//! `caraware handover`: checks the request, sends it to the supervisor of the run, and prints the answer.
+
+use std::path::{Path, PathBuf};
+
+use ipc_schema::{
+    config::Config,
+    run::{Mode, RunFile},
+};
+
+use crate::{
+    cli::HandoverArgs,
+    config::{self, LayeredSettings},
+    failure::Exit,
+    registry,
+    socket::{self, HandoverAnswer, HandoverRequest, SupervisorRequest},
+};
+
+/// The only settings that may change in a live run.
+const CHANGEABLE: &str = "trainer.";
+
+/// The configuration of `run` with other settings of the trainer.
+///
+/// # Errors
+/// A key or value is wrong, or does not belong to the trainer.
+pub fn changed_config(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
+    for assignment in set {
+        let key = assignment.split('=').next().unwrap_or_default().trim();
+        if config::keys::KEYS.iter().any(|known| known.path == key) && !key.starts_with(CHANGEABLE) {
+            return Err(Exit::config(
+                format!("`{key}` cannot change in a live run"),
+                "a handover replaces the trainer: only keys of `trainer` may differ",
+            ));
+        }
+    }
+    Ok(LayeredSettings::of(&run.config)?.with_assignments(set)?.validate()?)
+}
+
+/// The checkpoint directory that the user named.
+fn checkpoint(path: &Path) -> Result<PathBuf, Exit> {
+    let path = std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error))?;
+    if path.join("manifest.json").is_file() {
+        return Ok(path);
+    }
+    Err(Exit::config(
+        format!("{} is not a checkpoint: it has no manifest.json", path.display()),
+        "give a directory like runs/NAME/checkpoints/update-000100",
+    ))
+}
+
+/// Asks the supervisor of a run to replace its trainer, and waits for the answer.
+///
+/// # Errors
+/// The request is wrong or refused, or no such run is alive.
+pub fn handover(args: &HandoverArgs) -> Result<(), Exit> {
+    let run = registry::find(args.run.as_deref())?;
+    if run.mode != Mode::Train {
+        return Err(Exit::config(
+            format!("{} has no trainer", run.name),
+            "`caraware simulate` only simulates; `caraware train` learns",
+        ));
+    }
+    changed_config(&run, &args.set)?;
+    let request = HandoverRequest {
+        set: args.set.clone(),
+        checkpoint: args.checkpoint.as_deref().map(checkpoint).transpose()?,
+    };
+    match socket::ask(&run, &SupervisorRequest::Handover(request))? {
+        HandoverAnswer::Done(report) => {
+            println!(
+                "{}: trainer {} continues from tick {}; the handover took {:.2} s",
+                run.name, report.incarnation, report.first_tick, report.pause_s
+            );
+            Ok(())
+        }
+        HandoverAnswer::Refused(failure) => Err(failure.into()),
+    }
+}
+
+/// Refuses the former name of the command.
+///
+/// # Errors
+/// Always.
+pub fn refuse_former_name() -> Result<(), Exit> {
+    Err(Exit::config(
+        "`caraware swap` was renamed to `caraware handover`",
+        "the arguments are the same: `caraware handover --help`",
+    ))
+}

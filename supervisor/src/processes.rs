@@ -1,0 +1,349 @@
+//! The processes of a run with the environments they belong to: which of them may start, on which cores, and which have ended.
+
+use std::{
+    path::{Path, PathBuf},
+    process::{ChildStdout, ExitStatus},
+};
+
+use ipc_schema::{
+    board::State,
+    failure::Failure,
+    ports::{BoardReader, ControlClient},
+    process::Process,
+    run::RunFile,
+    services::{self, RunNode},
+};
+use rustix::process::Signal;
+
+use crate::{
+    cores,
+    environment::Environment,
+    failure::Exit,
+    install::Install,
+    process_table::{OnExit, PROCESSES, ProcessRow, RunningProcess, Scope},
+};
+
+/// A process that has ended.
+#[derive(Debug, Clone, Copy)]
+pub struct EndedProcess {
+    /// Its row.
+    pub row: &'static ProcessRow,
+    /// Its exit status.
+    pub status: ExitStatus,
+    /// True if its board says that its work is done.
+    pub is_done: bool,
+    /// What its end means in this run.
+    pub on_exit: OnExit,
+}
+
+/// All processes of a run.
+pub struct RunProcesses {
+    // Dropped in this order: processes, services, node.
+    running: Vec<RunningProcess>,
+    /// Environment 0 also holds what belongs to the whole run.
+    environments: Vec<Environment>,
+    node: RunNode,
+    cores: Option<cores::CorePlan>,
+    install: Install,
+    restarts: u32,
+}
+
+impl RunProcesses {
+    /// Creates the channels of every environment of `run`; starts no process.
+    ///
+    /// # Errors
+    /// The run directory is not writable, or iceoryx2 refuses.
+    pub fn create(run: &RunFile, install: Install) -> Result<Self, Exit> {
+        let node = services::node(&run.shared_memory)?;
+        let envs = run.config.run.envs;
+        let environments = (0..envs)
+            .map(|index| Environment::create(&node, run, index))
+            .collect::<Result<_, Exit>>()?;
+        Ok(Self {
+            running: Vec::new(),
+            environments,
+            node,
+            cores: cores::plan(&cores::available(), envs as usize, run.mode.has_trainer()),
+            install,
+            restarts: 0,
+        })
+    }
+
+    /// A client for the commands to each environment.
+    ///
+    /// # Errors
+    /// iceoryx2 refuses.
+    pub fn control_clients(&self) -> Result<Vec<ControlClient>, Exit> {
+        let clients = self.environments.iter();
+        clients
+            .map(|environment| Ok(ControlClient::create(environment.control())?))
+            .collect()
+    }
+
+    /// The run as environment 0, and whatever belongs to the whole run, sees it.
+    #[must_use]
+    pub fn run(&self) -> &RunFile {
+        &self.environments[0].run
+    }
+
+    /// All environments.
+    #[must_use]
+    pub fn environments(&self) -> &[Environment] {
+        &self.environments
+    }
+
+    /// The board of the trainer.
+    #[must_use]
+    pub fn trainer(&self) -> &BoardReader {
+        self.environments[0].board(Process::Trainer)
+    }
+
+    /// State of a process that belongs to the whole run.
+    #[must_use]
+    pub fn state_of(&self, process: Process) -> State {
+        self.environments[0].state_of(process)
+    }
+
+    /// Ticks that `process` has committed in all environments.
+    #[must_use]
+    pub fn committed_ticks(&self, process: Process) -> u64 {
+        let boards = self.environments.iter().map(|environment| environment.board(process));
+        boards.map(|board| board.progress().committed_ticks).sum()
+    }
+
+    /// Restarts of all processes so far.
+    #[must_use]
+    pub fn restarts(&self) -> u32 {
+        self.restarts
+    }
+
+    /// Started processes, also those that have ended.
+    #[must_use]
+    pub fn started(&self) -> usize {
+        self.running.len()
+    }
+
+    /// Number of the process that may be replaced by a successor.
+    #[must_use]
+    pub fn replaceable(&self) -> Option<usize> {
+        let is_replaceable = |process: &RunningProcess| process.row.on_exit == OnExit::Replace;
+        self.running.iter().position(is_replaceable)
+    }
+
+    /// Every process that the run has: its row and its environment.
+    fn wanted(&self) -> impl Iterator<Item = (&'static ProcessRow, &Environment)> {
+        self.environments.iter().flat_map(|environment| {
+            let run = &environment.run;
+            let rows = PROCESSES.iter().filter(|row| row.is_in(run, run.env_index));
+            rows.map(move |row| (row, environment))
+        })
+    }
+
+    fn is_started(&self, row: &ProcessRow, env_index: u32) -> bool {
+        self.running
+            .iter()
+            .any(|running| running.row.process == row.process && running.env_index == env_index)
+    }
+
+    /// A process of the whole run needs the processes of every environment; another process only those of its own.
+    fn may_start(&self, row: &ProcessRow, environment: &Environment) -> bool {
+        let is_up = |environment: &Environment| {
+            let mut needs = row.needs.iter();
+            needs.all(|need| environment.state_of(*need) != State::Starting)
+        };
+        match row.scope {
+            Scope::Run => self.environments.iter().all(is_up),
+            Scope::Environment => is_up(environment),
+        }
+    }
+
+    /// Starts every process whose needs are ready.
+    ///
+    /// # Errors
+    /// A program is missing or cannot be started.
+    pub fn start_due(&mut self) -> Result<(), Exit> {
+        let due: Vec<(&'static ProcessRow, u32)> = self
+            .wanted()
+            .filter(|(row, environment)| !self.is_started(row, environment.run.env_index))
+            .filter(|(row, environment)| self.may_start(row, environment))
+            .map(|(row, environment)| (row, environment.run.env_index))
+            .collect();
+        for (row, env_index) in due {
+            let started = self.start(row, env_index, 0)?;
+            self.running.push(started);
+        }
+        Ok(())
+    }
+
+    /// Starts the process of `row` in its environment, on the cores that are planned for it.
+    fn start(&self, row: &'static ProcessRow, env_index: u32, incarnation: u32) -> Result<RunningProcess, Exit> {
+        let environment = &self.environments[env_index as usize];
+        cores::within(self.cores_of(row, env_index), || {
+            RunningProcess::start(row, &self.install, &environment.run, &environment.run_file, incarnation)
+        })
+    }
+
+    /// Starts a successor beside the working trainer; returns it with its standard output.
+    ///
+    /// # Errors
+    /// There is no trainer, or the program cannot be started.
+    pub fn start_successor(
+        &self,
+        run: &RunFile,
+        run_file: &Path,
+        checkpoint: Option<&PathBuf>,
+    ) -> Result<(RunningProcess, Option<ChildStdout>), Exit> {
+        let trainer = self.replaceable().map(|index| &self.running[index]);
+        let trainer = trainer.ok_or_else(|| Exit::run("the run has no trainer", ""))?;
+        let (row, incarnation) = (trainer.row, trainer.incarnation + 1);
+        cores::within(self.cores_of(row, 0), || {
+            RunningProcess::start_successor(row, &self.install, run, run_file, incarnation, checkpoint)
+        })
+    }
+
+    /// Puts a successor in the place of the process `index`, and starts its work. `run` replaces the run of environment 0.
+    pub fn install_successor(&mut self, index: usize, mut successor: RunningProcess, run: RunFile) {
+        self.environments[0].run = run;
+        successor.begin_work();
+        self.running[index] = successor;
+    }
+
+    fn cores_of(&self, row: &ProcessRow, env_index: u32) -> Option<&[usize]> {
+        let plan = self.cores.as_ref()?;
+        match row.scope {
+            Scope::Environment => plan.environments.get(env_index as usize).map(Vec::as_slice),
+            Scope::Run => Some(&plan.rest),
+        }
+    }
+
+    /// The process `index`, if it has ended.
+    pub fn ended(&mut self, index: usize) -> Option<EndedProcess> {
+        let status = self.running[index].poll()?;
+        let row = self.running[index].row;
+        let environment = &self.environments[self.running[index].env_index as usize];
+        Some(EndedProcess {
+            row,
+            status,
+            is_done: environment.state_of(row.process) == State::Done,
+            on_exit: row.on_exit(self.run()),
+        })
+    }
+
+    /// The failure of the process `index`, which ended with `status`.
+    #[must_use]
+    pub fn failure(&self, index: usize, status: ExitStatus) -> Failure {
+        let running = &self.running[index];
+        running.failure(&self.environments[running.env_index as usize].run, status)
+    }
+
+    /// True if the process `index` has opened its ports.
+    #[must_use]
+    pub fn is_attached(&self, index: usize) -> bool {
+        let running = &self.running[index];
+        let board = self.environments[running.env_index as usize].board(running.row.process);
+        board.progress().attached == 1
+    }
+
+    /// The incarnation that a restart of the process `index` would have.
+    #[must_use]
+    pub fn next_incarnation(&self, index: usize) -> u32 {
+        self.running[index].incarnation + 1
+    }
+
+    /// Starts the process `index` again as its next incarnation.
+    ///
+    /// # Errors
+    /// The run holds no more incarnations, or the program cannot be started.
+    pub fn restart(&mut self, index: usize) -> Result<(), Exit> {
+        let (row, env_index) = (self.running[index].row, self.running[index].env_index);
+        let incarnation = self.next_incarnation(index);
+        if !self.set_incarnation(row, env_index, incarnation) {
+            return Err(Exit::run(
+                format!(
+                    "{} has been replaced {} times: a run holds no more",
+                    row.process,
+                    incarnation - 1
+                ),
+                "find out from its log why it ends",
+            ));
+        }
+        self.restarts += 1;
+        self.running[index] = self.start(row, env_index, incarnation)?;
+        Ok(())
+    }
+
+    /// Makes this incarnation of a process the valid one in every environment it belongs to. False if the run holds no more.
+    #[must_use]
+    pub fn set_incarnation(&mut self, row: &ProcessRow, env_index: u32, incarnation: u32) -> bool {
+        let places = self.environments.iter_mut().filter(|environment| match row.scope {
+            Scope::Run => true,
+            Scope::Environment => environment.run.env_index == env_index,
+        });
+        let mut set = places.map(|environment| environment.roster.set(row.process, incarnation));
+        set.all(|is_set| is_set)
+    }
+
+    /// The first required process that is not ready, with its environment.
+    #[must_use]
+    pub fn first_not_ready(&self) -> Option<(&'static ProcessRow, &Environment)> {
+        self.wanted()
+            .filter(|(row, _)| row.is_required())
+            .find(|(row, environment)| self.is_starting(row, environment))
+    }
+
+    /// A required process of the whole run is ready once it is ready in every environment.
+    fn is_starting(&self, row: &ProcessRow, environment: &Environment) -> bool {
+        let starts = |environment: &Environment| environment.state_of(row.process) == State::Starting;
+        match row.scope {
+            Scope::Run => self.environments.iter().any(starts),
+            Scope::Environment => starts(environment),
+        }
+    }
+
+    /// True once every required process has been started and has ended.
+    pub fn have_finished(&mut self) -> bool {
+        let wanted = self.wanted().filter(|(row, _)| row.is_required()).count();
+        let required = self.running.iter_mut().filter(|running| running.row.is_required());
+        required
+            .map(|running| usize::from(running.poll().is_some()))
+            .sum::<usize>()
+            == wanted
+    }
+
+    /// True while a started process has not ended.
+    pub fn is_any_alive(&mut self) -> bool {
+        self.running.iter_mut().any(|running| running.poll().is_none())
+    }
+
+    /// Asks every process to end.
+    pub fn terminate(&mut self) {
+        self.running.iter_mut().for_each(|running| running.signal(Signal::TERM));
+    }
+
+    /// Asks the process `index` to make room for a successor.
+    pub fn ask_to_leave(&mut self, index: usize) {
+        self.running[index].ask_to_leave();
+    }
+
+    /// Kills every process that is left.
+    pub fn kill(&mut self) {
+        self.running.clear();
+    }
+
+    /// Publishes whether a handover is in progress.
+    pub fn set_handing_over(&mut self, is_in_progress: bool) {
+        for environment in &mut self.environments {
+            environment.set_handing_over(is_in_progress);
+        }
+    }
+
+    /// Wakes `sensor-daemon` in every environment: the valid incarnation has changed.
+    pub fn wake_sensing(&self) {
+        self.environments.iter().for_each(Environment::wake_sensing);
+    }
+
+    /// Removes what dead processes left in the services of the run.
+    pub fn forget_dead(&self) {
+        services::forget_dead(&self.node);
+    }
+}

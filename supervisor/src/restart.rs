@@ -1,0 +1,121 @@
+//! When an ended process is started again: a watcher at once if it had got to work, else after a growing pause and not for ever; a
+//! trainer while its replacements reach new commits.
+
+use std::time::{Duration, Instant};
+
+/// Ends in a row before a watcher got to work, after which it is not started again.
+const MAX_VAIN_STARTS: u32 = 20;
+/// Most replacements of a trainer in a row without a new commit.
+const MAX_VAIN_REPLACEMENTS: u32 = 5;
+/// First pause after a vain start; it doubles.
+const PAUSE: Duration = Duration::from_millis(100);
+/// Longest pause.
+const LONGEST_PAUSE: Duration = Duration::from_secs(5);
+
+/// What to do about an ended watcher.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RestartVerdict {
+    /// Start it.
+    Start,
+    /// Ask again later.
+    Wait,
+    /// Do not start it any more.
+    GiveUp,
+}
+
+/// The ends of one process that only watches.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct WatcherRestarts {
+    vain: u32,
+    due: Option<Instant>,
+}
+
+impl WatcherRestarts {
+    /// What to do about the process, which is found ended at `now`; `worked` if it had opened its ports.
+    pub fn verdict(&mut self, worked: bool, now: Instant) -> RestartVerdict {
+        let due = *self.due.get_or_insert_with(|| {
+            self.vain = if worked { 0 } else { self.vain + 1 };
+            now + pause(self.vain)
+        });
+        if self.vain > MAX_VAIN_STARTS {
+            RestartVerdict::GiveUp
+        } else if now < due {
+            RestartVerdict::Wait
+        } else {
+            self.due = None;
+            RestartVerdict::Start
+        }
+    }
+}
+
+/// Replacements of a trainer that was killed.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct TrainerRestarts {
+    /// Replacements since the last commit.
+    vain: u32,
+    /// Ticks committed at the last replacement.
+    committed_ticks: u64,
+}
+
+impl TrainerRestarts {
+    /// Counts a replacement of a trainer that has committed `committed_ticks`.
+    ///
+    /// # Errors
+    /// Too many in a row reached no new commit: their number.
+    pub fn allow(&mut self, committed_ticks: u64) -> Result<(), u32> {
+        if committed_ticks > self.committed_ticks {
+            self.committed_ticks = committed_ticks;
+            self.vain = 0;
+        }
+        self.vain += 1;
+        if self.vain > MAX_VAIN_REPLACEMENTS {
+            return Err(MAX_VAIN_REPLACEMENTS);
+        }
+        Ok(())
+    }
+}
+
+fn pause(vain: u32) -> Duration {
+    match vain {
+        0 => Duration::ZERO,
+        vain => (PAUSE * 2_u32.pow((vain - 1).min(10))).min(LONGEST_PAUSE),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_trainer_is_replaced_while_it_commits_and_given_up_after_five_in_vain() {
+        let mut restarts = TrainerRestarts::default();
+        for committed_ticks in [0, 0, 0, 0, 0, 7, 7, 7, 7, 7] {
+            assert_eq!(restarts.allow(committed_ticks), Ok(()));
+        }
+        assert_eq!(restarts.allow(7), Err(MAX_VAIN_REPLACEMENTS));
+    }
+
+    #[test]
+    fn a_watcher_that_works_is_restarted_however_often_it_is_killed() {
+        let (mut restarts, now) = (WatcherRestarts::default(), Instant::now());
+        assert!((0..1000).all(|_| restarts.verdict(true, now) == RestartVerdict::Start));
+    }
+
+    #[test]
+    fn a_watcher_that_never_works_is_started_ever_less_often_and_given_up() {
+        let (mut restarts, mut now) = (WatcherRestarts::default(), Instant::now());
+        let begun = now;
+        for _ in 0..MAX_VAIN_STARTS {
+            assert_eq!(restarts.verdict(false, now), RestartVerdict::Wait);
+            now += LONGEST_PAUSE;
+            assert_eq!(restarts.verdict(false, now), RestartVerdict::Start);
+        }
+        assert_eq!(restarts.verdict(false, now), RestartVerdict::GiveUp);
+        assert_eq!(restarts.verdict(false, now + LONGEST_PAUSE), RestartVerdict::GiveUp);
+        assert!(begun < now);
+        let mut again = WatcherRestarts::default();
+        assert_eq!(again.verdict(false, now), RestartVerdict::Wait);
+        assert_eq!(again.verdict(false, now + PAUSE), RestartVerdict::Start);
+        assert_eq!(again.verdict(true, now + PAUSE), RestartVerdict::Start);
+    }
+}

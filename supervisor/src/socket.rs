@@ -1,0 +1,159 @@
+//! The supervisor's socket in the run's own directory, which only its user can enter: a line of JSON each way.
+
+use std::{
+    io::{BufRead as _, BufReader, Read as _, Write as _},
+    os::unix::net::{UnixListener, UnixStream},
+    path::PathBuf,
+    time::Duration,
+};
+
+use ipc_schema::{
+    control::{Command, Refusal, Reply},
+    failure::{Failure, FailureKind},
+    run::RunFile,
+};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+
+use crate::failure::Exit;
+
+/// Longest request, bytes.
+const MAX_REQUEST_BYTES: u64 = 1 << 16;
+/// Longest time from a connection to its request.
+const REQUEST_WITHIN: Duration = Duration::from_secs(2);
+
+/// A request to a supervisor, as it is sent.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SupervisorRequest {
+    /// Replace the trainer.
+    Handover(HandoverRequest),
+    /// Pass a command on to the simulation.
+    Control {
+        /// Environment; none = all of them.
+        #[serde(default)]
+        env: Option<u32>,
+        /// The command as JSON text, which the supervisor checks.
+        request: String,
+    },
+}
+
+/// What a user asks for with `caraware handover`.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct HandoverRequest {
+    /// Assignments, as after `--set`.
+    pub set: Vec<String>,
+    /// A checkpoint directory to take parameters from, instead of the newest of the run.
+    pub checkpoint: Option<PathBuf>,
+}
+
+/// How the supervisor answers a [`HandoverRequest`].
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum HandoverAnswer {
+    /// The successor works.
+    Done(HandoverReport),
+    /// Nothing has changed.
+    Refused(Failure),
+}
+
+/// A completed handover.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct HandoverReport {
+    /// Number of the successor among the trainers of the run; the first trainer is 0.
+    pub incarnation: u32,
+    /// The first tick that the successor received.
+    pub first_tick: u64,
+    /// Wall seconds from the end of the old trainer to the first tick of the successor.
+    pub pause_s: f64,
+    /// The request.
+    pub request: HandoverRequest,
+}
+
+/// A request that arrived, with the socket for its answer.
+#[derive(Debug)]
+pub enum ReceivedRequest {
+    /// Replace the trainer.
+    Handover(HandoverRequest, ReplySocket),
+    /// Pass a command on to the simulation of one environment, or of all of them.
+    Control(Command, Option<u32>, ReplySocket),
+}
+
+/// The connection over which a request is answered.
+#[derive(Debug)]
+pub struct ReplySocket(UnixStream);
+
+impl ReplySocket {
+    /// Sends the answer; a connection that was closed meanwhile is only logged.
+    pub fn answer(mut self, answer: &impl Serialize) {
+        let line = serde_json::to_string(answer).unwrap_or_default();
+        if let Err(error) = writeln!(self.0, "{line}") {
+            tracing::warn!(%error, "the connection was closed before the answer to its request");
+        }
+    }
+
+    /// Answers a command with a refusal.
+    pub fn refuse(self, refusal: Refusal) {
+        self.answer(&Reply::Refused(refusal));
+    }
+}
+
+/// Listens for requests until the run's directory is removed, and passes each to `take`.
+///
+/// # Errors
+/// The socket cannot be created.
+pub fn listen(run: &RunFile, take: impl Fn(ReceivedRequest) -> bool + Send + 'static) -> Result<(), Exit> {
+    let path = run.control_socket();
+    let listener = UnixListener::bind(&path).map_err(|error| Exit::io("listen on", &path, &error))?;
+    let serve = move || {
+        for stream in listener.incoming().flatten() {
+            if let Some(request) = read(stream)
+                && !take(request)
+            {
+                return;
+            }
+        }
+    };
+    std::thread::Builder::new()
+        .name("control".into())
+        .spawn(serve)
+        .map(drop)
+        .map_err(|error| Exit::run(format!("cannot listen for requests: {error}"), ""))
+}
+
+fn read(stream: UnixStream) -> Option<ReceivedRequest> {
+    stream.set_read_timeout(Some(REQUEST_WITHIN)).ok()?;
+    let mut text = String::new();
+    let mut reader = BufReader::new(stream.take(MAX_REQUEST_BYTES));
+    reader.read_line(&mut text).ok()?;
+    let socket = ReplySocket(reader.into_inner().into_inner());
+    match serde_json::from_str(&text).ok()? {
+        SupervisorRequest::Handover(request) => Some(ReceivedRequest::Handover(request, socket)),
+        SupervisorRequest::Control { env, request } => match Command::from_json(request.as_bytes()) {
+            Ok(command) => Some(ReceivedRequest::Control(command, env, socket)),
+            Err(refusal) => {
+                socket.refuse(refusal);
+                None
+            }
+        },
+    }
+}
+
+/// Sends a request to the supervisor of `run` and waits for its answer.
+///
+/// # Errors
+/// The run is over, or ends before it has answered.
+pub fn ask<Answer: DeserializeOwned>(run: &RunFile, request: &SupervisorRequest) -> Result<Answer, Exit> {
+    let socket = run.control_socket();
+    let failed = |error: &std::io::Error| Exit::io("ask the supervisor through", &socket, error);
+    let mut stream = UnixStream::connect(&socket).map_err(|error| failed(&error))?;
+    writeln!(stream, "{}", serde_json::to_string(request).unwrap_or_default()).map_err(|error| failed(&error))?;
+    let mut line = String::new();
+    BufReader::new(stream)
+        .read_line(&mut line)
+        .map_err(|error| failed(&error))?;
+    serde_json::from_str(&line).map_err(|_| {
+        Exit::Failure(
+            Failure::new(FailureKind::Run, "the run ended before it answered").with_help("its report says how"),
+        )
+    })
+}
