@@ -59,6 +59,7 @@ lint: $(VENV)/.installed ## formatting and lints, as errors
 	$(VENV)/bin/ruff format --check trainer viewer bench
 	$(VENV)/bin/ruff format --config trainer/pyproject.toml --check sim-core sensor-daemon docs
 	cd viewer && ../$(VENV)/bin/mypy
+	cd trainer && ../$(VENV)/bin/mypy
 
 format: $(VENV)/.installed
 	cargo fmt --all

@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from caraware.envs import CarAwareEnv, CarAwareParallelEnv, CarAwareVecEnv, CarAwareVectorEnv, Simulation, make
+from caraware.ipc.channel import Observation
 
 REPEATS = 6
 CONFIGS = {
@@ -33,7 +34,8 @@ def until(seconds: float, step: Callable[[], int]) -> tuple[float, float]:
 
 def raw(simulation: Simulation, seconds: float) -> tuple[float, float]:
     """Take a tick, answer it, give credit: what no face can beat."""
-    channel, rng, waiting = simulation.channel, np.random.default_rng(0), deque()
+    channel, rng = simulation.channel, np.random.default_rng(0)
+    waiting: deque[Observation] = deque()
     drives = channel.run["config"]["task"]["kind"] == "driving"
 
     def step() -> int:
@@ -113,11 +115,13 @@ def main(seconds: float) -> None:
                 with make(config, settings, seed=repeat + 1) as simulation:
                     measured[face.__name__].append(face(simulation, seconds))
         best_raw = max(rate for rate, _ in measured["raw"])
-        for face, results in measured.items():
+        for face_name, results in measured.items():
             rates, cpu_us = zip(*results, strict=True)
             share = max(rates) / best_raw
             told = f"{max(rates):9,.0f} env-steps/s {share:6.0%} of raw {min(cpu_us):6.0f} µs of CPU a step"
-            print(f"{name:18} {face:9} {told}   ({', '.join(f'{rate:,.0f}' for rate in sorted(rates))})", flush=True)
+            print(
+                f"{name:18} {face_name:9} {told}   ({', '.join(f'{rate:,.0f}' for rate in sorted(rates))})", flush=True
+            )
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import torch
 from caraware.learn.batch import Batch
 from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds
+from caraware.tasks.localisation import Localisation
 from caraware_bench.trainer import (
     EPOCHS,
     HORIZON,
@@ -26,7 +27,7 @@ from caraware_bench.trainer import (
 
 def on(device: torch.device, batch: Batch) -> Batch:
     """The batch where the networks are."""
-    return Batch(**{name: column.to(device) for name, column in vars(batch).items()})
+    return batch.to(device)
 
 
 def visits_per_s(update: Callable[[], object]) -> float:
@@ -47,7 +48,9 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=5)
     options = parser.parse_args()
     config = learner_config(options.threads, options.precision, options.device)
-    ppo = build_ppo(config, OBSERVATIONS, MapBounds(0.0, 0.0, 220.0, 220.0))
+    ppo = build_ppo(
+        config, OBSERVATIONS, Localisation(MapBounds(0.0, 0.0, 220.0, 220.0), config.reward, config.reward_scale_m)
+    )
     threads_ours, precision_ours = torch.get_num_threads(), torch.get_float32_matmul_precision()
     batch, agent = on(ppo.device, random_batch(ppo)), PlainAgent().to(ppo.device)
     adam = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5)

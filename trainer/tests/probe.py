@@ -87,7 +87,7 @@ def main(run_file: str) -> None:
             check_tick(obs, bounds, found)
             found["ticks"].append(obs.tick)
             if ppo is None:
-                ppo = build_ppo(config.trainer, obs.observation.shape[1], config.bounds)
+                ppo = build_ppo(config.trainer, obs.observation.shape[1], config.task)
                 rollout = Rollout(config.trainer.horizon, obs.observation.shape[1], bootstrap=False)
             for row in np.flatnonzero(obs.valid):
                 seen[obs.tick, int(obs.vehicle[row])] = obs.truth[row].clone()

@@ -8,6 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from caraware.learn.build import build_ppo
+from caraware.learn.config import TrainerConfig
+from caraware.learn.ppo import Ppo
+from caraware.tasks.bounds import MapBounds
+from caraware.tasks.localisation import Localisation
 from torch import Tensor
 
 PRESET = tomllib.loads((Path(__file__).parents[2] / "configs" / "town.toml").read_text())
@@ -151,4 +156,10 @@ def run_file(run_dir: str, **trainer: object) -> dict:
     }
     section = dict.fromkeys(OPTIONAL_KEYS) | PRESET["trainer"] | small | {"checkpoint_interval": 10}
     bounds = [0.0, 0.0, SIZE_M, SIZE_M]
-    return {"run_dir": run_dir, "config": {"trainer": section | trainer}, "map": {"bounds_m": bounds}}
+    config = {"task": {"kind": "localisation"}, "trainer": section | trainer}
+    return {"run_dir": run_dir, "config": config, "map": {"bounds_m": bounds}}
+
+
+def locating_ppo(config: TrainerConfig, observation_size: int, bounds: MapBounds) -> Ppo:
+    """A new learner of the localisation task on a map of this size."""
+    return build_ppo(config, observation_size, Localisation(bounds, config.reward, config.reward_scale_m))

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.ppo import Ppo
 from caraware.learn.rollout import Rollout
@@ -30,13 +29,13 @@ from caraware.run.manifest import (
     newest_sound_checkpoint,
     read_manifest,
 )
-from synthetic import FIELDS, SIZE_M, run_file, street_ticks
+from synthetic import FIELDS, SIZE_M, locating_ppo, run_file, street_ticks
 from torch import Tensor
 
 
 def fresh(**trainer: object) -> Ppo:
     config = TrainerConfig.from_run(run_file("x", **trainer))
-    return build_ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
+    return locating_ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
 
 
 def train(ppo: Ppo, from_update: int, to_update: int) -> None:
@@ -140,7 +139,7 @@ def test_another_size_is_refused_with_both_sizes(tmp_path: Path) -> None:
     written = save(tmp_path, fresh())
     config = TrainerConfig.from_run(run_file("x"))
     with pytest.raises(CheckpointError, match=f"observation_size is {FIELDS}, this run's is 9"):
-        load_checkpoint(written, build_ppo(config, 9, MapBounds(0.0, 0.0, 1.0, 1.0)))
+        load_checkpoint(written, locating_ppo(config, 9, MapBounds(0.0, 0.0, 1.0, 1.0)))
     with pytest.raises(CheckpointError, match="hidden"):
         load_checkpoint(written, fresh(hidden=[16, 16]))
     with pytest.raises(CheckpointError, match="activation is relu, this run's is tanh"):

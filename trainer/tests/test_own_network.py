@@ -15,7 +15,7 @@ from caraware.run.config import RunConfig
 from caraware.run.loop import Learner, TrainingLoop
 from caraware.run.manifest import CheckpointError, Counters, newest_sound_checkpoint
 from caraware.run.player import PlayLoop
-from synthetic import FIELDS, SIZE_M, SyntheticChannel, run_file
+from synthetic import FIELDS, SIZE_M, SyntheticChannel, locating_ppo, run_file
 from synthetic_vehicle import vehicle_run
 from test_loop import KilledError, final_parameters, loop_over, part, stream
 from test_player import ticks
@@ -61,7 +61,9 @@ def settings(**trainer: object) -> TrainerConfig:
 
 def test_it_learns_by_autograd() -> None:
     toy = {"horizon": 1024, "batch_size": 128, "learning_rate": 4e-3, "initial_std": 0.6, "epochs": 4}
-    ppo = build_ppo(settings(reward="exponential", reward_scale_m=20.0, **toy), FIELDS, MapBounds(0, 0, SIZE_M, SIZE_M))
+    ppo = locating_ppo(
+        settings(reward="exponential", reward_scale_m=20.0, **toy), FIELDS, MapBounds(0, 0, SIZE_M, SIZE_M)
+    )
     assert isinstance(ppo.updater, PlainUpdate)
     before_m, _ = errors_m(ppo)
     stats = train(ppo, 40)
@@ -72,7 +74,7 @@ def test_it_learns_by_autograd() -> None:
 
 def test_the_same_seed_draws_the_same_weights() -> None:
     one, two, other = (
-        build_ppo(settings(seed=s), FIELDS, MapBounds(0, 0, 1, 1)).updater.parameters() for s in (1, 1, 2)
+        locating_ppo(settings(seed=s), FIELDS, MapBounds(0, 0, 1, 1)).updater.parameters() for s in (1, 1, 2)
     )
     assert all(torch.equal(one[name], tensor) for name, tensor in two.items())
     assert not all(torch.equal(one[name], tensor) for name, tensor in other.items())
@@ -101,7 +103,7 @@ def test_a_killed_trainer_s_successor_ends_in_the_same_parameters(tmp_path: Path
 def test_it_plays(tmp_path: Path) -> None:
     trained, played = (vehicle_run(str(tmp_path / name), network=NETWORK, hidden=[24]) for name in ("run", "play"))
     size = next(ticks()).observation.shape[1]
-    ppo = build_ppo(TrainerConfig.from_run(trained), size, RunConfig.from_run(trained).bounds)
+    ppo = build_ppo(TrainerConfig.from_run(trained), size, RunConfig.from_run(trained).task)
     ppo.updater.parameters()["policy.log_std"].fill_(-2.5)
     (tmp_path / "play").mkdir()
     written = save_checkpoint(tmp_path / "run" / "checkpoints", ppo, Counters(3, 96, 1, 31), "0", Keeping(1))
@@ -128,4 +130,4 @@ def test_another_network_s_checkpoint_is_refused(tmp_path: Path) -> None:
 def test_a_class_that_is_not_there_is_named(name: str) -> None:
     config = TrainerConfig.from_run(run_file("x", network=name))
     with pytest.raises(ConfigError, match=name.partition(":")[0]):
-        build_ppo(config, FIELDS, MapBounds(0, 0, 1, 1))
+        locating_ppo(config, FIELDS, MapBounds(0, 0, 1, 1))

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 from caraware.learn.batch import Batch, save_batch
-from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.fast import FastUpdate
 from caraware.learn.objective import clipped_error
@@ -14,7 +13,7 @@ from caraware.learn.ppo import NonFiniteLoss, Ppo, ScheduledValues, UpdateStats
 from caraware.learn.rewards import distance_m
 from caraware.learn.rollout import Horizon, Rollout
 from safetensors.torch import load_file
-from synthetic import FIELDS, SIZE_M, run_file, street_ticks
+from synthetic import FIELDS, SIZE_M, locating_ppo, run_file, street_ticks
 from torch import Tensor
 
 NOISE_M = 15.0
@@ -32,7 +31,7 @@ TOY: dict[str, object] = {
 
 def fresh(**trainer: object) -> Ppo:
     config = TrainerConfig.from_run(run_file("x", **trainer))
-    return build_ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
+    return locating_ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
 
 
 def train(ppo: Ppo, updates: int) -> list[UpdateStats]:

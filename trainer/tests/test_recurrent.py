@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from caraware.ipc.stream import EMPTY_SLOT
-from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.gru import RecurrentNetwork, Sequences, Steps, recurrent_policy
 from caraware.learn.memory import Memory
@@ -22,7 +21,7 @@ from caraware.run.config import RunConfig
 from caraware.run.loop import Learner, TrainingLoop
 from caraware.run.manifest import CheckpointError, latest_checkpoint, newest_sound_checkpoint
 from safetensors.torch import load_file
-from synthetic import FIELDS, SIZE_M, SyntheticChannel, SyntheticObservation, run_file, street_ticks
+from synthetic import FIELDS, SIZE_M, SyntheticChannel, SyntheticObservation, locating_ppo, run_file, street_ticks
 from test_loop import KilledError, final_parameters, loop_over, part, stream
 from torch import Tensor, nn
 
@@ -49,7 +48,7 @@ def exact_products() -> None:
 
 def fresh(network: str = "gru", **trainer: object) -> Ppo:
     config = TrainerConfig.from_run(run_file("x", network=network, **trainer))
-    return build_ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
+    return locating_ppo(config, FIELDS, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
 
 
 def recall_ticks(vehicles: int, seed: int) -> Iterator[SyntheticObservation]:
@@ -73,7 +72,7 @@ def recall_error_m(ppo: Ppo, updates: int) -> float:
         rollout.add(obs)
         if rollout.full():
             batch = ppo.score(rollout.take())
-            error_m = batch.error_m.mean().item()
+            error_m = batch.metrics["error_m"].mean().item()
             ppo.update(batch)
         if ppo.updates == updates:
             break
@@ -176,7 +175,7 @@ def errors_m(ppo: Ppo, ticks: list[SyntheticObservation], horizon: int) -> Tenso
     for obs in ticks:
         rollout.add(obs)
         if rollout.full():
-            found.append(ppo.score(rollout.take()).error_m)
+            found.append(ppo.score(rollout.take()).metrics["error_m"])
     return torch.cat(found)
 
 
@@ -279,7 +278,7 @@ def test_what_is_shown_is_what_is_learnt_from(tmp_path: Path) -> None:
     rollout = Rollout(1, FIELDS, bootstrap=False)
     for obs in ticks:
         rollout.add(obs)
-    error_m = ppo.score(rollout.take()).error_m
+    error_m = ppo.score(rollout.take()).metrics["error_m"]
     shown = [(channel.predictions[obs.tick] - obs.truth[:, :2]).norm(dim=1)[obs.valid] for obs in ticks]
     torch.testing.assert_close(torch.cat(shown), error_m, rtol=1e-4, atol=1e-3)
 

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 from caraware.ipc.stream import EMPTY_SLOT
-from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.rewards import bounded_inverse, distance_m
 from caraware.learn.rollout import Horizon, Rollout
-from synthetic import SIZE_M, SyntheticObservation, run_file, street_ticks
+from synthetic import SIZE_M, SyntheticObservation, locating_ppo, run_file, street_ticks
 
 
 def marked(tick: int, vehicles: list[int], **changes: object) -> SyntheticObservation:
@@ -66,7 +65,7 @@ def test_memory_of_an_observation_may_change_once_it_is_added() -> None:
 
 def test_action_reward_and_truth_of_a_sample_are_of_one_vehicle_and_tick() -> None:
     run = run_file("x", reward="bounded_inverse", reward_scale_m=5.0)
-    ppo = build_ppo(TrainerConfig.from_run(run), 4, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
+    ppo = locating_ppo(TrainerConfig.from_run(run), 4, MapBounds(0.0, 0.0, SIZE_M, SIZE_M))
     rng = np.random.default_rng(0)
     rollout = Rollout(200, 4, bootstrap=False)
     sent: dict[tuple[int, int], tuple[list[float], list[float]]] = {}
@@ -80,7 +79,7 @@ def test_action_reward_and_truth_of_a_sample_are_of_one_vehicle_and_tick() -> No
     assert len(batch.reward) == len(sent)
     for row, key in enumerate(zip(batch.tick.tolist(), batch.vehicle.tolist(), strict=True)):
         assert sent[key] == (batch.observation[row].tolist(), batch.truth[row].tolist())
-    expected = bounded_inverse(distance_m(ppo.task.position_m(batch.action), batch.truth), 5.0)
+    expected = bounded_inverse(distance_m(ppo.task.answer(batch.action), batch.truth), 5.0)
     torch.testing.assert_close(batch.reward, expected)
     mean = ppo.updater.mean(batch.observation)
     deviation = (batch.action - mean) / ppo.updater.log_std.exp()

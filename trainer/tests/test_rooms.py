@@ -12,7 +12,7 @@ MAY_IMPORT = {
     "tasks": {"ipc"},
     "learn": {"ipc", "tasks"},
     "report": {"ipc", "baselines", "tasks"},
-    "run": {"ipc", "baselines", "learn", "report"},
+    "run": {"ipc", "baselines", "tasks", "learn", "report"},
     "envs": {"ipc", "tasks", "run"},
     "fusion": {"ipc", "baselines", "learn", "report", "run"},
     "examples": {"ipc", "tasks", "envs", "run"},

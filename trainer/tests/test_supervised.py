@@ -69,7 +69,7 @@ def test_its_gradient_is_that_of_the_mean_distance(monkeypatch: pytest.MonkeyPat
         rollout.add(obs)
     batch, baseline = ppo.score(rollout.take()), beside(ppo)
     reference = modules(baseline.mlp)
-    expected_m = distance_m(ppo.task.position_m(reference(batch.observation)), batch.truth).mean()
+    expected_m = distance_m(ppo.task.answer(reference(batch.observation)), batch.truth).mean()
     expected_m.backward()
     assert baseline.learn(batch, 0.0) == pytest.approx(expected_m.item(), rel=1e-5)
     gradient = torch.cat([value.grad.flatten() for value in reference.parameters()])

@@ -3,17 +3,19 @@
 The graphed one runs step by step on the CPU here; on a GPU its steps are captured.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
-from caraware.learn.build import build_ppo, fast_update, paper_networks
+from caraware.learn.build import fast_update, paper_networks
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.fast import FastUpdate
 from caraware.learn.fast_mlp import FastMlp
 from caraware.learn.graphed import GraphedUpdate
-from caraware.learn.localisation import Localisation
 from caraware.learn.ppo import NonFiniteLoss, PlainUpdate, PolicyUpdate, Ppo, UpdateStats
 from caraware.learn.rollout import Rollout
-from synthetic import FIELDS, SIZE_M, run_file, street_ticks
+from caraware.tasks.localisation import Localisation
+from synthetic import FIELDS, SIZE_M, locating_ppo, run_file, street_ticks
 from test_ppo import TOY, parameters
 
 SAMPLES_OVER = 40
@@ -39,7 +41,7 @@ def settings(**extra: object) -> TrainerConfig:
 def learner(kind: str, **extra: object) -> Ppo:
     """A learner whose networks are drawn alike, whatever the kind of its update."""
     config = settings(**extra)
-    fresh = build_ppo(config, FIELDS, BOUNDS)
+    fresh = locating_ppo(config, FIELDS, BOUNDS)
     sampling = torch.Generator().manual_seed(config.seed)
     policy, value = paper_networks(config, FIELDS, 2, sampling)
     updater: PolicyUpdate
@@ -50,7 +52,7 @@ def learner(kind: str, **extra: object) -> Ppo:
         updater = GraphedUpdate(config, *networks, CPU)
     else:
         updater = fast_update(config, policy, value, CPU)
-    ppo = Ppo(config, Localisation(config, BOUNDS), FIELDS, updater, sampling)
+    ppo = Ppo(config, Localisation(BOUNDS, config.reward, config.reward_scale_m), FIELDS, updater, sampling)
     assert torch.equal(parameters(ppo), parameters(fresh))
     return ppo
 
@@ -100,7 +102,7 @@ def test_one_step_of_the_plain_update_is_one_of_the_fast_to_the_last_digits() ->
 
 
 def test_the_presets_take_the_fast_update() -> None:
-    assert type(build_ppo(settings(), FIELDS, BOUNDS).updater) is FastUpdate
+    assert type(locating_ppo(settings(), FIELDS, BOUNDS).updater) is FastUpdate
 
 
 def test_the_state_of_the_plain_update_continues_in_the_fast_one() -> None:
@@ -121,7 +123,7 @@ def test_an_update_with_a_loss_that_is_no_number_stops_before_the_step(kind: str
     ppo = learner(kind)
     learn(ppo, 1)
     before, moments = parameters(ppo).clone(), {n: t.clone() for n, t in ppo.updater.moments().items()}
-    ppo.task._scale_m = float("nan")
+    ppo.task = replace(ppo.task, reward_scale_m=float("nan"))
     with pytest.raises(NonFiniteLoss, match="in update 2"):
         learn(ppo, 1)
     assert torch.equal(parameters(ppo), before)
@@ -131,7 +133,7 @@ def test_an_update_with_a_loss_that_is_no_number_stops_before_the_step(kind: str
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_gpu_learns_as_the_cpu_does() -> None:
-    gpu = build_ppo(settings(device="auto"), FIELDS, BOUNDS)
+    gpu = locating_ppo(settings(device="auto"), FIELDS, BOUNDS)
     assert gpu.device.type == "cuda" and isinstance(gpu.updater, GraphedUpdate)
     cpu = learner("fast")
     begin = parameters(cpu).clone()

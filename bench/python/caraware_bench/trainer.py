@@ -26,6 +26,7 @@ from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.ppo import Ppo
 from caraware.learn.rollout import Rollout
 from caraware.report.evaluation import Mean, raw_errors_m
+from caraware.tasks.localisation import Localisation
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
@@ -134,7 +135,7 @@ def random_batch(ppo: Ppo) -> Batch:
         advantage=torch.randn(HORIZON),
         value_target=target,
         truth=torch.zeros(HORIZON, 4),
-        error_m=nothing,
+        metrics={"error_m": nothing},
         vehicle=nothing.long(),
         tick=nothing.long(),
     )
@@ -302,7 +303,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the seconds there in place of standard output")
     options = parser.parse_args()
     config = learner_config(options.threads)
-    ppo = build_ppo(config, OBSERVATIONS, BOUNDS)
+    ppo = build_ppo(config, OBSERVATIONS, Localisation(BOUNDS, config.reward, config.reward_scale_m))
     own_threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
     batch, agent, model = random_batch(ppo), PlainAgent(), sb3_model()
     adam = torch.optim.Adam(agent.parameters(), lr=1e-4, eps=1e-5)

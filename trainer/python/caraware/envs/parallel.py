@@ -10,7 +10,7 @@ from pettingzoo import ParallelEnv
 
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Slots, Source, Tick
-from caraware.ipc.arrays import Float32Array
+from caraware.ipc.arrays import Float32Array, FloatArray
 from caraware.ipc.names import Names
 from caraware.ipc.stream import Channel
 
@@ -57,7 +57,7 @@ class CarAwareParallelEnv(ParallelEnv):  # type: ignore[misc]  # pettingzoo has 
         return {agent: now.rows.observation[slot] for agent, slot in rows}, {a: _info(now, slot) for a, slot in rows}
 
     def step(
-        self, actions: dict[str, Float32Array]
+        self, actions: dict[str, FloatArray]
     ) -> tuple[dict[str, Float32Array], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """One tick for all agents."""
         if not self.agents:

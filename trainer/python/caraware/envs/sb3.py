@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Policy, Slots, Source
 from caraware.envs.transition import Transition
-from caraware.ipc.arrays import Float32Array
+from caraware.ipc.arrays import Float32Array, FloatArray
 from caraware.ipc.stream import Channel
 
 
@@ -47,7 +47,7 @@ class CarAwareVecEnv(VecEnv):
         self.reset_infos = [{"mask": bool(held)} for held in tick.mask]
         return tick.rows.observation
 
-    def step_async(self, actions: Float32Array) -> None:
+    def step_async(self, actions: FloatArray) -> None:
         """Remembers the actions; in the driving task the world waits for them in `step_wait`."""
         self._actions = actions
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Slots, Source, Tick
-from caraware.ipc.arrays import Float32Array
+from caraware.ipc.arrays import Float32Array, FloatArray
 from caraware.ipc.names import Names
 from caraware.ipc.stream import Channel
 
@@ -43,7 +43,7 @@ class CarAwareEnv(gymnasium.Env):
         self._ended = False
         return tick.rows.observation[self._slot], self._info(tick)
 
-    def step(self, action: Float32Array) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
+    def step(self, action: FloatArray) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
         """One tick. At the end of an episode the observation is the vehicle's last once more."""
         if self._ended:
             raise RuntimeError("the episode has ended: call reset() before step()")

@@ -198,7 +198,7 @@ class Slots:
             self._now = self._settle(self._take())
         return self.now
 
-    def step(self, action: Float32Array) -> tuple[Transition, Float64Array]:
+    def step(self, action: FloatArray) -> tuple[Transition, Float64Array]:
         """Answers the present tick with actions `[N, 2]` and goes on to the next.
 
         Returns what happened and its rewards, f64 `[N]`.
@@ -242,7 +242,7 @@ class Slots:
         self.source.restart(seed)
         self._runs, self._answered = self._runs + 1, -1
 
-    def _checked(self, action: Float32Array) -> Float32Array:
+    def _checked(self, action: FloatArray) -> Float32Array:
         action = np.asarray(action, np.float32)
         if action.shape != (self.count, self.task.actions.size):
             raise ValueError(

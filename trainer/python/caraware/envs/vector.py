@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from caraware.envs.rewards import Reward, measured
 from caraware.envs.slots import Policy, Slots, Source, Tick
 from caraware.envs.transition import Transition
-from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array
+from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray
 from caraware.ipc.stream import Channel
 
 
@@ -61,7 +61,7 @@ class CarAwareVectorEnv(VectorEnv):
         tick = self.slots.reset(seed)
         return tick.rows.observation, self._info(tick)
 
-    def step(self, actions: Float32Array) -> tuple[Float32Array, Float64Array, BoolArray, BoolArray, dict[str, Any]]:
+    def step(self, actions: FloatArray) -> tuple[Float32Array, Float64Array, BoolArray, BoolArray, dict[str, Any]]:
         """Observations `[N, d]`, rewards, terminated, truncated `[N]`, infos."""
         transition, reward = self.slots.step(actions)
         tick = self.slots.now

@@ -7,13 +7,14 @@ import os
 import shutil
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from safetensors.torch import load, save
 
 from caraware.fusion.learner import FusionLearner
 from caraware.report.evaluation import EvaluationResult
 from caraware.report.metrics import TrainingPoint
-from caraware.run.checkpoint import CheckpointError
+from caraware.run.manifest import CheckpointError
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +90,7 @@ def newest_sound(folder: Path) -> Path | None:
     return None
 
 
-def _verified(checkpoint: Path) -> tuple[dict, dict[str, bytes]]:
+def _verified(checkpoint: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Manifest and the contents of all files. Raises `CheckpointError`."""
     try:
         manifest = json.loads((checkpoint / MANIFEST).read_bytes())

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from caraware import _native
-from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, Scalar, UInt32Array, UInt64Array
+from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Scalar, UInt32Array, UInt64Array
 from caraware.ipc.pointcloud import PointCloud
 from caraware.ipc.run_file import RunFile
 from caraware.ipc.stream import TrainingReport
@@ -308,7 +308,7 @@ class Channel:
         beside = None if estimates is None else np.ascontiguousarray(estimates, dtype=np.float32).tobytes()
         self._attachment.publish_predictions(observation.block, rows.tobytes(), rows.shape[1], policy_version, beside)
 
-    def publish_actions(self, observation: Observation, actions: Float32Array, policy_version: int = 0) -> None:
+    def publish_actions(self, observation: Observation, actions: FloatArray, policy_version: int = 0) -> None:
         """Actions of the driving task: steering (left is positive) and acceleration, each in -1 ... 1.
 
         f32 [n, 2], a row for every slot; rows of empty slots are not read. The simulation waits for the actions of

@@ -27,8 +27,8 @@ class Batch:
     """f32 `[s]`."""
     truth: Tensor
     """f32 `[s, 4]`."""
-    error_m: Tensor
-    """f32 `[s]`: distance of the policy's mean, which nobody sampled, to the truth."""
+    metrics: dict[str, Tensor]
+    """Each metric of the task by name: f32 `[s]`, of the policy's mean, which was not sampled."""
     vehicle: Tensor
     """i64 `[s]`."""
     tick: Tensor
@@ -42,8 +42,17 @@ class Batch:
 
     def followed_by(self, others: Sequence["Batch"]) -> "Batch":
         """The rows of this one, then those of the others."""
-        columns = (f.name for f in fields(Batch))
-        return Batch(**{name: torch.cat([getattr(batch, name) for batch in (self, *others)]) for name in columns})
+        batches = [self, *others]
+        columns = (f.name for f in fields(Batch) if f.name != "metrics")
+        return Batch(
+            **{name: torch.cat([getattr(batch, name) for batch in batches]) for name in columns},
+            metrics={name: torch.cat([batch.metrics[name] for batch in batches]) for name in self.metrics},
+        )
+
+    def to(self, device: torch.device) -> "Batch":
+        """The same samples on a device."""
+        columns = {name: column.to(device) for name, column in vars(self).items() if name != "metrics"}
+        return Batch(**columns, metrics={name: values.to(device) for name, values in self.metrics.items()})
 
     def value_advantage(self) -> Tensor:
         """f32 `[s]`: the value target minus the value before the update."""
@@ -53,5 +62,6 @@ class Batch:
 def save_batch(batch: Batch, parameters: dict[str, Tensor], file: Path) -> None:
     """Write a batch and the parameters that met it, to find out later why its loss is not a number."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    columns = {name: column.clone().cpu() for name, column in vars(batch).items()}
-    save_file(columns | {name: value.clone().cpu() for name, value in parameters.items()}, file)
+    columns = {name: column for name, column in vars(batch).items() if name != "metrics"}
+    tensors = columns | batch.metrics | parameters
+    save_file({name: tensor.clone().cpu() for name, tensor in tensors.items()}, file)

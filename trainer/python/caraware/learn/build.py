@@ -12,16 +12,16 @@ from importlib import import_module
 import torch
 from torch import nn
 
-from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
+from caraware.learn.config import ConfigError, TrainerConfig
 from caraware.learn.fast import FastUpdate, threads_per_network
 from caraware.learn.fast_mlp import FastMlp
 from caraware.learn.graphed import GraphedUpdate
 from caraware.learn.gru import recurrent_policy, recurrent_value
-from caraware.learn.localisation import Localisation
-from caraware.learn.networks import Activation, GaussianPolicy, policy_mlp, value_mlp
+from caraware.learn.networks import Activation, GaussianPolicy, Mlp, policy_mlp, value_mlp
 from caraware.learn.ppo import PlainUpdate, Ppo
 from caraware.learn.ranks import Ranks
 from caraware.learn.recurrent import RecurrentPpo, SequenceUpdate
+from caraware.tasks.contract import Sampling, Task
 
 NetworkClass = Callable[[int, int, tuple[int, ...]], nn.Module]
 
@@ -29,20 +29,25 @@ NetworkClass = Callable[[int, int, tuple[int, ...]], nn.Module]
 def build_ppo(
     config: TrainerConfig,
     observation_size: int,
-    bounds: MapBounds,
+    task: Task,
     environments: Sequence[int] = (0,),
     ranks: Ranks | None = None,
 ) -> Ppo:
-    """A new learner for these environments, counted among those of all `ranks`. Raises `ConfigError`."""
+    """A new learner of `task` for these environments, counted among those of all `ranks`. Raises `ConfigError`."""
+    if task.sampling is not Sampling.WHEN_FULL:
+        raise ConfigError(
+            f'`trainer.module` = "caraware.train" with `task.kind` = {task.name!r}',
+            "this learner samples actions when its horizon is full; name another module in trainer.module",
+        )
+    actions = task.actions.size
     device = configure_torch(config)
-    task = Localisation(config, bounds)
     # The weights are drawn first; the actions of environment 0 continue with the same generator.
     sampling = torch.Generator().manual_seed(config.seed)
     if config.network == "gru":
-        sequences = _sequence_update(config, observation_size, task.actions, device, sampling, ranks)
+        sequences = _sequence_update(config, observation_size, actions, device, sampling, ranks)
         return RecurrentPpo(config, task, observation_size, sequences, sampling, environments)
     if config.network == "mlp":
-        policy, value = paper_networks(config, observation_size, task.actions, sampling)
+        policy, value = paper_networks(config, observation_size, actions, sampling)
         fast = fast_update(config, policy, value, device, ranks)
         return Ppo(config, task, observation_size, fast, sampling, environments)
     if config.ranks > 1:
@@ -50,14 +55,13 @@ def build_ppo(
             f"`trainer.network` is {config.network!r} with `trainer.ranks` = {config.ranks}",
             "several ranks learn with `mlp` or `gru`; set trainer.ranks = 1",
         )
-    policy, value = _own_networks(config, observation_size, task.actions, sampling)
-    plain = PlainUpdate(config, policy, value, device)
+    plain = PlainUpdate(config, *_own_networks(config, observation_size, actions, sampling), device)
     return Ppo(config, task, observation_size, plain, sampling, environments)
 
 
 def paper_networks(
     config: TrainerConfig, observation_size: int, actions: int, generator: torch.Generator
-) -> tuple[GaussianPolicy, nn.Module]:
+) -> tuple[GaussianPolicy, Mlp]:
     """The paper's policy and value network, drawn from `generator`."""
     activation = Activation(config.activation)
     mean = policy_mlp(observation_size, actions, config.hidden, activation)
@@ -68,10 +72,11 @@ def paper_networks(
 
 
 def fast_update(
-    config: TrainerConfig, policy: GaussianPolicy, value: nn.Module, device: torch.device, ranks: Ranks | None = None
+    config: TrainerConfig, policy: GaussianPolicy, value: Mlp, device: torch.device, ranks: Ranks | None = None
 ) -> FastUpdate:
     """The paper's networks with their backward pass written out; on a GPU, alone, with captured steps."""
     policy.to(device)
+    assert isinstance(policy.network, Mlp)
     networks = FastMlp(policy.network, {"log_std": policy.log_std}), FastMlp(value.to(device))
     if device.type == "cuda" and (ranks is None or ranks.size == 1):
         return GraphedUpdate(config, *networks, device)
@@ -114,7 +119,8 @@ def _class_of(name: str) -> NetworkClass:
     module, _, attribute = name.partition(":")
     help = "write `mlp`, `gru` or `package.module:Class`; the module must be in PYTHONPATH"
     try:
-        return getattr(import_module(module), attribute)
+        network_class: NetworkClass = getattr(import_module(module), attribute)
+        return network_class
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"`trainer.network` is {name!r}: {error}", help) from error
 

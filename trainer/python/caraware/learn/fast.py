@@ -30,7 +30,8 @@ from caraware.learn.ppo import (
 )
 from caraware.learn.ranks import Minibatch, Ranks, SampleUnion
 
-P, V = TypeVar("P"), TypeVar("V")
+P = TypeVar("P")
+V = TypeVar("V")
 SMALL_ROWS = 256
 """Rows of a block below which blocks are put together before the network sees them."""
 

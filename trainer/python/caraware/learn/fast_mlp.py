@@ -114,9 +114,9 @@ def activate_(activation: Activation, z: Tensor) -> Tensor:
 def _activation_backward_(activation: Activation, gradient: Tensor, activated: Tensor) -> Tensor:
     """Turn the gradient of the loss with respect to `activated` into that of its input, in place."""
     if activation is Activation.RELU:
-        return torch.ops.aten.threshold_backward.grad_input(gradient, activated, 0, grad_input=gradient)
+        torch.ops.aten.threshold_backward.grad_input(gradient, activated, 0, grad_input=gradient)
     if activation is Activation.TANH:
-        return torch.ops.aten.tanh_backward.grad_input(gradient, activated, grad_input=gradient)
+        torch.ops.aten.tanh_backward.grad_input(gradient, activated, grad_input=gradient)
     return gradient
 
 

@@ -309,7 +309,7 @@ class _DeviceAdam:
     def step(self, max_grad_norm: float) -> Tensor:
         """One step; returns the norm before clipping."""
         gradient, adam = self.parameters.gradient, self.optimiser
-        norm = torch.linalg.vector_norm(gradient)
+        norm: Tensor = torch.linalg.vector_norm(gradient)
         gradient.mul_((max_grad_norm / norm).clamp(max=1.0))
         self.steps += 1
         adam.mean.lerp_(gradient, 1 - BETA_MEAN)

@@ -4,7 +4,7 @@ The two share nothing, so they can learn on two cores without ever waiting for e
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise
@@ -54,14 +54,18 @@ class Mlp(nn.Module):
     @torch.no_grad()
     def initialise(self, generator: torch.Generator) -> None:
         """Draw the weights; `generator` lives on the CPU, so every device starts alike."""
-        for layer, linear in zip(self.layers, self.children(), strict=True):
+        for layer, linear in zip(self.layers, self._linear(), strict=True):
             uniform = torch.rand(layer.outputs, layer.inputs, generator=generator)
             linear.weight.copy_((2 * uniform - 1) * layer.bound)
             linear.bias.zero_()
 
+    def _linear(self) -> Iterator[nn.Linear]:
+        """The linear part of each layer."""
+        return (child for child in self.children() if isinstance(child, nn.Linear))
+
     def forward(self, rows: Tensor) -> Tensor:
         """Outputs `[b, outputs]`."""
-        for layer, linear in zip(self.layers, self.children(), strict=True):
+        for layer, linear in zip(self.layers, self._linear(), strict=True):
             rows = layer.activation(linear(rows))
         return rows
 
@@ -80,7 +84,8 @@ class GaussianPolicy(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Mean actions `[b, a]` of observations `[b, d]`."""
-        return self.network(observation)
+        mean: Tensor = self.network(observation)
+        return mean
 
 
 def policy_mlp(observations: int, actions: int, hidden: Sequence[int], activation: Activation) -> Mlp:

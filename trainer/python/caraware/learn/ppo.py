@@ -24,10 +24,10 @@ from caraware.learn.adam import EPSILON
 from caraware.learn.batch import Batch
 from caraware.learn.config import TrainerConfig
 from caraware.learn.gae import generalised_advantage
-from caraware.learn.localisation import Localisation
 from caraware.learn.networks import GaussianPolicy, entropy, log_probability
 from caraware.learn.prediction import Predictor, RowPredictor
 from caraware.learn.rollout import Horizon
+from caraware.tasks.contract import Task, TaskStep
 
 SMALLEST_DEVIATION = 1e-8
 SEED_STRIDE = 0x9E3779B97F4A7C15
@@ -240,12 +240,14 @@ class PlainUpdate:
     @torch.no_grad()
     def mean(self, *observations: Tensor) -> Tensor:
         """See `PolicyUpdate.mean`."""
-        return self._policy(torch.cat([block.to(self.device) for block in observations]))
+        mean: Tensor = self._policy(torch.cat([block.to(self.device) for block in observations]))
+        return mean
 
     @torch.no_grad()
     def value(self, observation: Tensor) -> Tensor:
         """See `PolicyUpdate.value`."""
-        return self._value(observation.to(self.device)).squeeze(1)
+        value: Tensor = self._value(observation.to(self.device)).squeeze(1)
+        return value
 
     def mean_and_value(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """See `PolicyUpdate.mean_and_value`."""
@@ -351,7 +353,7 @@ class Ppo:
     def __init__(
         self,
         config: TrainerConfig,
-        task: Localisation,
+        task: Task,
         observation_size: int,
         updater: PolicyUpdate,
         sampling: torch.Generator,
@@ -391,10 +393,11 @@ class Ppo:
         rows, mean, value, log_std = forward.rows, forward.mean, forward.value, self.updater.log_std
         truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
         tries = self.config.actions_per_observation
-        centre, place = (mean, truth) if tries == 1 else (mean.unsqueeze(1), truth.unsqueeze(1))
+        step = TaskStep(forward.observation, truth)
+        centre = mean if tries == 1 else mean.unsqueeze(1)
         noise = self._noise(len(mean), tries, self._samplings[environment]).to(self.device)
         action = centre + log_std.exp() * (noise.squeeze(1) if tries == 1 else noise)
-        reward = self.task.reward(action, place)
+        reward = self.task.reward(step, action)
         if tries == 1:
             advantage, value_target = self._advantages(horizon, forward, reward)
         else:
@@ -408,7 +411,7 @@ class Ppo:
             advantage=advantage,
             value_target=value_target,
             truth=truth,
-            error_m=self.task.error_m(mean, truth),
+            metrics=self.task.measure(step, mean),
             vehicle=horizon.vehicle.flatten()[rows],
             tick=horizon.tick.repeat_interleave(horizon.valid.shape[1])[rows],
         )
@@ -420,8 +423,8 @@ class Ppo:
         in common drops out of it, which is most of its variance (antithetic variates; Owen, Monte Carlo, section 8.2).
         """
         if tries % 2:
-            return torch.randn(samples, tries, self.task.actions, generator=generator)
-        half = torch.randn(samples, tries // 2, self.task.actions, generator=generator)
+            return torch.randn(samples, tries, self.task.actions.size, generator=generator)
+        half = torch.randn(samples, tries // 2, self.task.actions.size, generator=generator)
         return torch.cat((half, -half), 1)
 
     def _advantages(self, horizon: Horizon, forward: ForwardPass, reward: Tensor) -> tuple[Tensor, Tensor]:
@@ -461,7 +464,7 @@ class Ppo:
     def _stats(self, batch: Batch, figures: UpdateFigures, now: ScheduledValues) -> UpdateStats:
         policy, value = figures.policy, figures.value
         # With several actions for an observation they lie side by side.
-        actions = batch.action.reshape(-1, self.task.actions)
+        actions = batch.action.reshape(-1, self.task.actions.size)
         action_mean_x, action_mean_y = actions.mean(0).tolist()
         action_std_x, action_std_y = actions.std(0, correction=0).tolist()
         return UpdateStats(
@@ -508,7 +511,8 @@ class Ppo:
         if not observations:
             return ()
         mean = self.updater.mean(*observations)
-        return self.task.position_m(mean).cpu().split([len(block) for block in observations])
+        answers: tuple[Tensor, ...] = self.task.answer(mean).cpu().split([len(block) for block in observations])
+        return answers
 
     def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> Predictor:
         """A predictor for the ticks of a stream as they come (`caraware.learn.prediction`)."""

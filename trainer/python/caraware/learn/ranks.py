@@ -78,8 +78,8 @@ class SampleUnion:
 class Minibatch:
     """One rank's part of a minibatch of the union."""
 
-    own: tuple[Tensor, ...]
-    """Its rows of the columns asked for."""
+    own: tuple[Any, ...]
+    """Its rows of the columns asked for: tensors, or `Sequences` in the place of the observations."""
     advantage: Tensor
     """f32 `[b]`: of the whole minibatch, before normalisation."""
     is_own: Tensor | None
@@ -142,7 +142,7 @@ class TorchRanks(Ranks):
         with self._together("meeting"):
             backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
             dist.init_process_group(backend, timeout=WAIT_AT_MOST)
-            self._groups = {network: dist.new_group() for network in ("policy", "value")}
+            self._groups: dict[str, Any] = {network: dist.new_group() for network in ("policy", "value")}
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
 
     @contextmanager
@@ -187,7 +187,7 @@ class TorchRanks(Ranks):
 
     def largest(self, value: float) -> float:
         """See `Ranks.largest`."""
-        return max(self.gather(value))
+        return float(max(self.gather(value)))
 
     def gather(self, value: Any) -> list[Any]:
         """See `Ranks.gather`."""

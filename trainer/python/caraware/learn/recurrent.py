@@ -18,12 +18,12 @@ from caraware.learn.batch import Batch
 from caraware.learn.config import TrainerConfig
 from caraware.learn.fast import FastUpdate, SharedBatch
 from caraware.learn.gru import RecurrentNetwork, Sequences, Steps, Walk
-from caraware.learn.localisation import Localisation
 from caraware.learn.memory import Memory
 from caraware.learn.ppo import ForwardPass, Ppo
 from caraware.learn.prediction import Ticks, visible
 from caraware.learn.ranks import Minibatch
 from caraware.learn.rollout import Horizon
+from caraware.tasks.contract import Task
 
 NO_SAMPLE = -1
 """In a table of sequences: a shorter one has no sample there."""
@@ -42,8 +42,8 @@ class RecurrentBatch(Batch):
 
     def followed_by(self, others: Sequence[Batch]) -> "RecurrentBatch":
         """See `Batch.followed_by`."""
-        batches = [self, *others]
-        assert all(isinstance(batch, RecurrentBatch) for batch in batches)
+        batches = [self, *(batch for batch in others if isinstance(batch, RecurrentBatch))]
+        assert len(batches) == 1 + len(others)
         return RecurrentBatch(
             **vars(super().followed_by(others)),
             sequence=one_table([batch.sequence for batch in batches]),
@@ -131,7 +131,7 @@ class RecurrentPpo(Ppo):
     def __init__(
         self,
         config: TrainerConfig,
-        task: Localisation,
+        task: Task,
         observation_size: int,
         updater: SequenceUpdate,
         sampling: torch.Generator,
@@ -230,8 +230,8 @@ class SequencePredictor:
         seen = visible(obs, self._dark_is_nan).index_select(0, rows).to(device)
         mean, after = network.step(seen, state.index_select(0, rows).to(device))
         memories[obs.tick] = Memory.after(obs.tick, vehicle, valid, state.index_copy_(0, rows, after.cpu()))
-        predicted_m = self._ppo.task.position_m(mean).cpu()
-        return torch.zeros(len(valid), self._ppo.task.actions).index_copy_(0, rows, predicted_m)
+        predicted_m = self._ppo.task.answer(mean).cpu()
+        return torch.zeros(len(valid), self._ppo.task.actions.size).index_copy_(0, rows, predicted_m)
 
 
 def outlives(horizon: Horizon) -> Tensor:

@@ -13,10 +13,10 @@ from caraware.learn.batch import Batch
 from caraware.learn.config import TrainerConfig
 from caraware.learn.fast import minibatches
 from caraware.learn.fast_mlp import FastMlp
-from caraware.learn.localisation import Localisation
 from caraware.learn.networks import Activation, GaussianPolicy, policy_mlp
 from caraware.learn.ranks import Minibatch, Ranks
-from caraware.learn.rewards import distance_m
+from caraware.tasks.localisation import Localisation
+from caraware.tasks.rewards import distance_m
 
 SEED_OFFSET = 0x5E_ED00
 """Between the seed of a run and those of this baseline."""
@@ -39,12 +39,12 @@ class Supervised:
     ) -> None:
         self._config, self._task, self._device, self._ranks = config, task, device, ranks or Ranks()
         self._seed = config.seed + SEED_OFFSET
-        network = policy_mlp(observation_size, task.actions, config.hidden, Activation(config.activation))
+        network = policy_mlp(observation_size, task.actions.size, config.hidden, Activation(config.activation))
         network.initialise(torch.Generator().manual_seed(self._seed))
-        policy = GaussianPolicy(network, task.actions, initial_std=1.0).to(device)
+        policy = GaussianPolicy(network, task.actions.size, initial_std=1.0).to(device)
         self.mlp = FastMlp(network, {"log_std": policy.log_std})
         self.optimiser = Adam(self.mlp.parameters)
-        corner, centre = (task.position_m(torch.full((task.actions,), place, device=device)) for place in (1.0, 0.0))
+        corner, centre = (task.answer(torch.full((task.actions.size,), place, device=device)) for place in (1.0, 0.0))
         self._metres_per_action = corner - centre
 
     def tensors(self) -> dict[str, Tensor]:
@@ -54,7 +54,7 @@ class Supervised:
     @torch.no_grad()
     def predict_m(self, observation: Tensor) -> Tensor:
         """Positions `[n, 2]` in world metres for `[n, d]` observations."""
-        return self._task.position_m(self.mlp.infer(observation.to(self._device))).cpu()
+        return self._task.answer(self.mlp.infer(observation.to(self._device))).cpu()
 
     @torch.no_grad()
     def learn(self, batch: Batch, learning_rate: float) -> float:
@@ -79,7 +79,7 @@ class Supervised:
             self.mlp.parameters.gradient.zero_()
             return torch.zeros((), device=self._device)
         observation, truth = part.own
-        predicted_m = self._task.position_m(self.mlp.forward(observation))
+        predicted_m = self._task.answer(self.mlp.forward(observation))
         distances_m = distance_m(predicted_m, truth)
         towards = (predicted_m - truth[:, :2]) / distances_m.clamp_min(SMALLEST_DISTANCE_M).unsqueeze(1)
         self.mlp.backward(observation, towards * self._metres_per_action * (part.share / len(truth)))

@@ -9,6 +9,8 @@ from caraware.baselines.noise import SensorNoise
 from caraware.ipc.run_file import RunFile
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
 from caraware.run.curriculum import Stage
+from caraware.tasks.contract import Task
+from caraware.tasks.table import task_of_run
 
 
 @dataclass(frozen=True)
@@ -18,6 +20,7 @@ class RunConfig:
     run_dir: Path
     trainer: TrainerConfig
     bounds: MapBounds
+    task: Task
     config_sha256: str
     """Of the resolved configuration, as canonical JSON: a checkpoint remembers what it was trained with."""
     dark_is_nan: bool
@@ -50,6 +53,7 @@ class RunConfig:
             run_dir=Path(run["run_dir"]),
             trainer=TrainerConfig.from_run(run),
             bounds=MapBounds.from_run(run),
+            task=task_of_run(run),
             config_sha256=hashlib.sha256(canonical).hexdigest(),
             dark_is_nan=run.get("config", {}).get("blackout", {}).get("policy") == "nan",
             training_episodes=max(1, episodes.get("training_episodes", 1)),

@@ -37,6 +37,7 @@ from caraware.run.config import RunConfig
 from caraware.run.curriculum import Curriculum
 from caraware.run.environment import Environment, Place, share
 from caraware.run.manifest import Counters
+from caraware.tasks.localisation import Localisation
 
 log = logging.getLogger(__name__)
 
@@ -60,8 +61,10 @@ class Learner:
     def begin(cls, config: RunConfig, observation_size: int, ranks: Ranks | None = None) -> "Learner":
         """A learner for observations of this size, continued from `config.resume_from`. Raises `CheckpointError`."""
         trainer = config.trainer
-        ppo = build_ppo(trainer, observation_size, config.bounds, config.environments, ranks)
-        beside = Supervised(trainer, observation_size, ppo.task, ppo.device, ranks) if trainer.supervised else None
+        ppo = build_ppo(trainer, observation_size, config.task, config.environments, ranks)
+        beside = None
+        if trainer.supervised and isinstance(config.task, Localisation):
+            beside = Supervised(trainer, observation_size, config.task, ppo.device, ranks)
         learner = cls(ppo, beside, Counters(0, 0, 0, -1), Course())
         if config.resume_from is not None:
             learner.load(config.resume_from)
@@ -339,7 +342,7 @@ class TrainingLoop:
             self._supervised.learn(batch, stats.learning_rate)
         for environment, horizon in zip(self._environments, horizons, strict=True):
             environment.committed_tick = horizon.last_tick()
-        self._record(stats, batch.error_m.double().mean().item())
+        self._record(stats, batch.metrics["error_m"].double().mean().item())
         self._commit_due = self._ppo.updates % self._config.trainer.checkpoint_interval_updates == 0
 
     def _progress(self) -> float:
