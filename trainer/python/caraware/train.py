@@ -1,8 +1,8 @@
 """`python -m caraware.train RUN_FILE`: the trainer process of one run.
 
 A trainer that replaces another continues from the newest checkpoint that verifies. In a planned handover
-(`CARAWARE_SUCCESSOR`) the successor gets ready first, reports so on standard output, and starts when standard input says
-so. Exit codes: `caraware.run.process`.
+(`CARAWARE_SUCCESSOR`) the successor gets ready first, reports so on standard output, and starts when standard input
+says so. Exit codes: `caraware.run.process`.
 """
 
 import logging

@@ -1,7 +1,7 @@
 """Stable-Baselines3's PPO takes over a running simulation from the trainer at work, with what that has learnt.
 
-`caraware handover RUN --set trainer.module=caraware.examples.sb3_takeover`: it gets ready beside the old trainer, takes its
-networks out of its last checkpoint, and goes on with the tick after it. docs/environments.md
+`caraware handover RUN --set trainer.module=caraware.examples.sb3_takeover`: it gets ready beside the old trainer, takes
+its networks out of its last checkpoint, and continues with the tick after it. docs/environments.md
 """
 
 import json
