@@ -13,6 +13,7 @@ use toml::{
 use super::{
     error::ConfigError,
     keys::{self, ConfigKey, ValueKind},
+    span::{NamedText, SourceSpan},
 };
 
 /// A checked value and where it was set.
