@@ -188,13 +188,6 @@ impl SignalMeta {
         let len = (self.id_len as usize).min(ID_BYTES);
         String::from_utf8_lossy(&self.id[..len]).into_owned()
     }
-
-    /// The letters of the links that are carried.
-    #[must_use]
-    pub fn state_text(&self) -> String {
-        let len = (self.links as usize).min(SIGNAL_LINKS);
-        String::from_utf8_lossy(&self.state[..len]).into_owned()
-    }
 }
 
 /// `id` cut at a character border to [`ID_BYTES`], zero padded, with the number of bytes in use.

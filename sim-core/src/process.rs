@@ -50,7 +50,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut core = CoreProcess::open(session, metas)?;
     while let Some(frame) = core.session.next(&traffic)? {
         let header = *frame.header();
-        if core.frame(&frame)? == Wait::Stopped {
+        if core.process_step(&frame)? == Wait::Stopped {
             break;
         }
         drop(frame);
@@ -116,7 +116,7 @@ impl CoreProcess {
     }
 
     /// One SUMO step: its events, the states of all road users, and the ticks that lead there.
-    fn frame(&mut self, frame: &Message) -> Result<Wait, Failure> {
+    fn process_step(&mut self, frame: &Message) -> Result<Wait, Failure> {
         let ticks_per_step = self.session.run.ticks_per_traffic_step();
         let header = *frame.header();
         // The frame carries the number of the last of its ticks.
@@ -141,7 +141,7 @@ impl CoreProcess {
                 return Ok(Wait::Stopped);
             }
             if let Some(actions) = &mut self.actions
-                && actions.take(&self.session, &header, &mut self.mirror)? == Wait::Stopped
+                && actions.apply_actions(&self.session, &header, &mut self.mirror)? == Wait::Stopped
             {
                 return Ok(Wait::Stopped);
             }
@@ -190,7 +190,7 @@ impl CoreProcess {
             );
         }
         if let Some(contacts) = &mut self.contacts {
-            contacts.learn(header, vehicles);
+            contacts.remember_ids(header, vehicles);
         }
         if let Some(actions) = &mut self.actions {
             let signals = match header.columns {
@@ -226,7 +226,7 @@ impl CoreProcess {
         };
         self.mirror.write_tick(tick, draft.payload_mut()).map_err(unmirrored)?;
         if let Some(contacts) = &mut self.contacts {
-            contacts.tick(&header, draft.payload_mut(), layout.states)?;
+            contacts.report_contacts(&header, draft.payload_mut(), layout.states)?;
         }
         let poses = match &mut self.actions {
             Some(actions) => actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?,

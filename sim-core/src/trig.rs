@@ -56,7 +56,7 @@ pub fn smaller(a: f64, b: f64) -> f64 {
     pick(a < b, a, b)
 }
 
-/// One of two numbers, both computed: a branch would keep [`crate::mirror::batch`] from running side by side.
+/// One of two numbers, both computed: a branch would keep the compiler from vectorising [`crate::mirror::batch`].
 #[must_use]
 #[inline(always)]
 pub fn pick(condition: bool, yes: f64, no: f64) -> f64 {

@@ -261,7 +261,7 @@ fn no_vehicles() {
     let said = simulate(&workplace, "grid.rou.xml", &[]);
     assert_says(
         &said,
-        &["traffic-bridge", "grid.sumocfg", "no road user came", "route-files"],
+        &["traffic-bridge", "grid.sumocfg", "no road user departed", "route-files"],
     );
 }
 

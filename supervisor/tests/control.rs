@@ -239,8 +239,11 @@ fn nonsense_is_refused_for_its_reason_and_nobody_dies() {
     run.refused(&["sensor", "cav.999", "gnss", "off"], "is not on the road now");
     run.refused(&["sensor", "other.0", "gnss", "off"], "carries no sensors");
     run.refused(&["sensor", "all", "lidar", "off"], "has a LIDAR");
-    run.refused(&["start", "nobody", "ring_west_2"], "is no vehicle of the population");
-    run.refused(&["destination", "cav.0", "no_such_edge"], "is no edge");
+    run.refused(
+        &["start", "nobody", "ring_west_2"],
+        "is not a vehicle of the population",
+    );
+    run.refused(&["destination", "cav.0", "no_such_edge"], "is not an edge");
     run.refused(&["step", "0"], "a step has 1 to");
     run.refused(
         &["start", &"x".repeat(500), "ring_west_2"],

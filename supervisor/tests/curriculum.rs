@@ -1,4 +1,5 @@
-//! A curriculum whose gates the learner passes: the same bytes for the same seed, whoever dies on the way, and from its log.
+//! A curriculum whose gates the learner passes: the same bytes for the same seed, with trainers killed on the way, and from its
+//! log.
 
 #![allow(
     clippy::unwrap_used,
@@ -41,7 +42,7 @@ fn arguments<'a>(mode: &'a str, name: &'a str, more: &[&'a str]) -> Vec<&'a str>
     [mode, "paper", "--name", name].into_iter().chain(settings).collect()
 }
 
-fn actions(workplace: &Workplace, name: &str) -> Vec<[u64; 3]> {
+fn decisions(workplace: &Workplace, name: &str) -> Vec<[u64; 3]> {
     let text = std::fs::read_to_string(workplace.path().join("runs").join(name).join("curriculum.jsonl")).unwrap();
     let number = |line: &Value, key: &str| line[key].as_u64().unwrap();
     let lines = text.lines().map(|line| serde_json::from_str(line).unwrap());
@@ -91,9 +92,9 @@ fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
     for (gate, limit) in passed.iter().zip([0.66, 0.63, 0.6]) {
         assert!(gate["policy_std"].as_f64().unwrap() <= limit, "{gate}");
     }
-    let taken = actions(&workplace, "whole");
+    let taken = decisions(&workplace, "whole");
     assert_eq!(taken.iter().map(|[stage, ..]| *stage).collect::<Vec<_>>(), [0, 1, 2, 3]);
-    // A step begins with the tick after the one that its predecessor's gate opened at.
+    // A stage begins with the tick after the one at which the gate before it opened.
     for (gate, [_, lesson, tick]) in passed.iter().zip(&taken[1..]) {
         assert_eq!(gate["tick"].as_u64().unwrap() + 1, *tick);
         assert_eq!(gate["lessons"].as_u64().unwrap(), *lesson);
@@ -108,7 +109,7 @@ fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
     let lessons = |from: usize| taken[from + 1][1] - taken[from][1];
     assert_eq!(last[2], 450 * lessons(0) + 350 * lessons(1) + 100 * lessons(2));
 
-    // Killed before the first checkpoint, in each of the steps, and while others wait for the word of the last lesson.
+    // Kills before the first checkpoint, in each stage, and while other processes wait for the decision about the last lesson.
     let mut command = workplace.command(&arguments("train", "killed", &["run.window_ticks=5"]));
     let mut child = command.spawn().unwrap();
     let run = trainer_of(&workplace, "killed", &mut child);
@@ -121,7 +122,7 @@ fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
     let killed = workplace.report("killed");
     assert_eq!(killed["observation_hash"], report["observation_hash"]);
     assert_eq!((&killed["lost_ticks"], &killed["restarts"]), (&0.into(), &4.into()));
-    assert_eq!(actions(&workplace, "killed"), taken);
+    assert_eq!(decisions(&workplace, "killed"), taken);
     assert_eq!(killed["trainer"]["curriculum"], report["trainer"]["curriculum"]);
 
     // The training part again without a learner.
@@ -172,7 +173,7 @@ fn with_city() -> Workplace {
     workplace
 }
 
-/// Lessons by map that follow from a run's configuration and the steps that were taken.
+/// Lessons by map that follow from a run's configuration and the stages of its lessons.
 fn lessons_by_map(workplace: &Workplace, name: &str, steps: &[usize]) -> [u64; 2] {
     let run = RunFile::read(&workplace.path().join("runs").join(name).join("run.json")).unwrap();
     let mut plan = run.curriculum_plan().unwrap();
@@ -196,11 +197,11 @@ fn lessons_are_on_the_maps_of_their_steps_and_the_same_seed_gives_the_same_bytes
     let expected = lessons_by_map(&workplace, "maps", &steps);
     assert!(expected.iter().all(|lessons| *lessons > 2), "{expected:?}");
     for (map, (name, lessons)) in ["town", "city"].into_iter().zip(expected).enumerate() {
-        let told = serde_json::json!({"name": name, "lessons": lessons, "ticks": 120 * lessons});
-        assert_eq!(maps[map], told);
+        let usage = serde_json::json!({"name": name, "lessons": lessons, "ticks": 120 * lessons});
+        assert_eq!(maps[map], usage);
     }
 
-    // Before the first checkpoint, and at borders between maps.
+    // Kills before the first checkpoint, and at borders between maps.
     let mut child = workplace.command(&arguments("train", "killed", &MAPS)).spawn().unwrap();
     let run = trainer_of(&workplace, "killed", &mut child);
     for (incarnation, tick) in (0..).zip([120, 600, 1500]) {

@@ -1,4 +1,4 @@
-//! SUMO in-process: microscopic traffic as frames in our units, and the population that keeps driving for ever.
+//! SUMO in-process: microscopic traffic as frames in SI units, and a population that drives without end.
 //!
 //! [`sumo::Sumo`] is SUMO as a value: started, stepped, reloaded, closed. [`population::Population`] puts road
 //! users into it, [`heroes`] moves those that our own models drive. [`bridge`] is the process around them.

@@ -118,16 +118,16 @@ impl CollisionDetector {
         std::mem::swap(&mut self.contacts, &mut self.before);
         self.contacts.clear();
         self.begun.clear();
-        let reach_m = self.take(states);
+        let reach_m = self.collect_bodies(states);
         if self.watched.contains(&true) {
-            self.touch_road_users(states, reach_m);
-            self.touch_solids(states);
+            self.find_contacts_with_road_users(states, reach_m);
+            self.find_contacts_with_solids(states);
         }
-        self.begin(states);
+        self.flag_new_contacts(states);
     }
 
     /// Takes the bodies of all road users and returns the farthest reach of those that are not large.
-    fn take(&mut self, states: &[VehicleState]) -> f64 {
+    fn collect_bodies(&mut self, states: &[VehicleState]) -> f64 {
         self.bodies.clear();
         self.watched.clear();
         let mut most_m = 0.0;
@@ -144,7 +144,7 @@ impl CollisionDetector {
         most_m
     }
 
-    fn touch_road_users(&mut self, states: &[VehicleState], reach_m: f64) {
+    fn find_contacts_with_road_users(&mut self, states: &[VehicleState], reach_m: f64) {
         for &(a, b) in self.broad.pairs(&self.bodies, &self.watched, reach_m) {
             let (one, two) = (a as usize, b as usize);
             let bodies = [&self.bodies[one], &self.bodies[two]];
@@ -163,7 +163,7 @@ impl CollisionDetector {
         }
     }
 
-    fn touch_solids(&mut self, states: &[VehicleState]) {
+    fn find_contacts_with_solids(&mut self, states: &[VehicleState]) {
         if self.rectangles.is_empty() {
             return;
         }
@@ -196,7 +196,7 @@ impl CollisionDetector {
     }
 
     /// Flags and describes contacts that did not exist in the tick before.
-    fn begin(&mut self, states: &mut [VehicleState]) {
+    fn flag_new_contacts(&mut self, states: &mut [VehicleState]) {
         self.contacts.sort_unstable();
         self.contacts.dedup();
         for contact in &self.contacts {

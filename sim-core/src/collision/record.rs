@@ -125,7 +125,7 @@ impl ContactReporter {
     }
 
     /// Remembers the ids of road users that depart.
-    pub fn learn(&mut self, header: &MessageHeader, metas: &[VehicleMeta]) {
+    pub fn remember_ids(&mut self, header: &MessageHeader, metas: &[VehicleMeta]) {
         if self.episode != Some(header.episode) {
             self.episode = Some(header.episode);
             self.names.clear();
@@ -143,7 +143,12 @@ impl ContactReporter {
     ///
     /// # Errors
     /// The payload is too short, or an event can be neither sent nor written.
-    pub fn tick(&mut self, header: &MessageHeader, payload: &mut [u8], states: Section) -> Result<(), Failure> {
+    pub fn report_contacts(
+        &mut self,
+        header: &MessageHeader,
+        payload: &mut [u8],
+        states: Section,
+    ) -> Result<(), Failure> {
         let states: &mut [VehicleState] =
             block::view_mut(payload, states).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
         let map = header.map().min(self.detectors.len() - 1);

@@ -152,7 +152,7 @@ impl<G: DrivableGround> DrivingTask<G> {
 
     /// Accepts the action for the hero `vehicle` and returns its control input. An unusable action is refused and counted, and the
     /// last valid action is held. Returns the first refusal in a hero's episode, for the log.
-    pub fn act(&mut self, vehicle: u32, action: HeroAction) -> (ControlInput, Option<RefusedAction>) {
+    pub fn apply_action(&mut self, vehicle: u32, action: HeroAction) -> (ControlInput, Option<RefusedAction>) {
         let trip = self.trips.entry(vehicle).or_default();
         let mut refusal = None;
         match action::fault(action) {
@@ -173,7 +173,7 @@ impl<G: DrivableGround> DrivingTask<G> {
     }
 
     /// Ends a tick, after all road users have moved and contacts are known: sets the flags of heroes in `states`, fills `views` (one
-    /// for each hero, in their order) and returns where they are for SUMO.
+    /// for each hero, in their order) and returns their poses for SUMO.
     pub fn end_tick(&mut self, states: &mut [VehicleState], views: &mut [HeroView]) -> Vec<EgoPose> {
         let mut poses = Vec::new();
         let heroes: Vec<usize> = (0..states.len())
@@ -186,7 +186,7 @@ impl<G: DrivableGround> DrivingTask<G> {
             );
             let station_m = trip.follow(&states[row]);
             *view = self.view(&trip.route, station_m, row, states);
-            let flags = self.judge(&mut trip, &states[row], view);
+            let flags = self.end_flags(&mut trip, &states[row], view);
             states[row].flags |= flags;
             poses.push(pose(&states[row]));
             self.trips.insert(vehicle, trip);
@@ -195,7 +195,7 @@ impl<G: DrivableGround> DrivingTask<G> {
     }
 
     /// Flags of a hero at the end of a tick: why its episode ends, and whether its action was refused.
-    fn judge(&mut self, trip: &mut HeroTrip, state: &VehicleState, view: &HeroView) -> u32 {
+    fn end_flags(&mut self, trip: &mut HeroTrip, state: &VehicleState, view: &HeroView) -> u32 {
         let counts = &mut self.counts;
         counts.episodes += u64::from(state.flags & APPEARED != 0);
         let on_road = [0.0, front_m(state)].iter().all(|ahead_m| {

@@ -75,7 +75,12 @@ impl HeroPorts {
     ///
     /// # Errors
     /// A port fails, or the prediction does not contain actions.
-    pub fn take(&mut self, session: &Session, frame: &MessageHeader, mirror: &mut Mirror) -> Result<Wait, Failure> {
+    pub fn apply_actions(
+        &mut self,
+        session: &Session,
+        frame: &MessageHeader,
+        mirror: &mut Mirror,
+    ) -> Result<Wait, Failure> {
         self.driving.enter_episode(frame.episode);
         let Some(before) = frame.tick.checked_sub(1) else {
             return Ok(Wait::Ready);
@@ -95,7 +100,7 @@ impl HeroPorts {
                 .zip(actions)
                 .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT)
             {
-                let (input, refusal) = self.driving.act(*vehicle, *action);
+                let (input, refusal) = self.driving.apply_action(*vehicle, *action);
                 mirror.set_input(*vehicle, input);
                 if let Some(RefusedAction { part, value, held }) = refusal {
                     let (id, tick) = (self.ids.get(vehicle).map_or("", String::as_str), frame.tick);
@@ -175,11 +180,11 @@ fn actions(answer: &Message, slots: u32) -> Result<&[[f32; 2]], Failure> {
         return Err(Failure::new(
             FailureKind::Run,
             format!(
-                "tick {}: the trainer sent actions of shape [{}, {}], the task takes [{slots}, {ACTION_COLUMNS}]",
+                "tick {}: the trainer sent actions of shape [{}, {}], the task needs [{slots}, {ACTION_COLUMNS}]",
                 header.tick, header.count, header.columns
             ),
         )
-        .with_help("answer every observation with steering and acceleration for each of its slots"));
+        .with_help("send steering and acceleration for each slot of every observation"));
     }
     let len = slots as usize * size_of::<[f32; 2]>();
     block::view(answer.payload(), Section { offset: 0, len }).map_err(unreadable)

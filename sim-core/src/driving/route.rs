@@ -5,7 +5,7 @@ use ipc_schema::traffic::{NO_SIGNAL, RoutePoint};
 /// A traffic light on the route.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StopLine {
-    /// Where, metres from the start.
+    /// Distance from the start of the route, metres.
     pub station_m: f64,
     /// Number of the traffic light.
     pub signal: u32,

@@ -167,7 +167,7 @@ fn a_collision_ends_the_episode_and_what_has_ended_is_not_cut() {
 #[test]
 fn a_refused_action_is_flagged_counted_reported_once_and_the_last_valid_one_is_held() {
     let mut driving = driving();
-    let (good, refusal) = driving.act(3, [0.5, -0.5]);
+    let (good, refusal) = driving.apply_action(3, [0.5, -0.5]);
     assert_eq!(refusal, None);
     assert_eq!((good.road_wheel_angle_rad, good.accel_mps2), (0.5 * 0.6, -0.5 * 9.0));
     assert_eq!(tick(&mut driving, &mut [car(3, Kind::Hero, 10.0, 0.0)]).0.vehicle, 3);
@@ -176,7 +176,7 @@ fn a_refused_action_is_flagged_counted_reported_once_and_the_last_valid_one_is_h
         ([2.0, 0.0], false),
         ([f32::INFINITY, 0.0], false),
     ] {
-        let (held, refusal) = driving.act(3, action);
+        let (held, refusal) = driving.apply_action(3, action);
         assert_eq!(held, good);
         assert_eq!(refusal.is_some(), is_reported, "{refusal:?}");
         let mut states = [car(3, Kind::Hero, 10.0, 0.0)];
@@ -184,7 +184,7 @@ fn a_refused_action_is_flagged_counted_reported_once_and_the_last_valid_one_is_h
         assert_eq!(states[0].flags, ACTION_REFUSED);
     }
     let mut states = [car(3, Kind::Hero, 10.0, 0.0)];
-    driving.act(3, [0.0, 1.0]);
+    driving.apply_action(3, [0.0, 1.0]);
     tick(&mut driving, &mut states);
     assert_eq!((states[0].flags, driving.counts().refused_actions), (0, 3));
 }

@@ -1,8 +1,8 @@
 //! Positions displaced by small angles on the ground, as a GNSS receiver's error displaces them many times a second.
 //!
-//! The exact way is inverse projection, addition in latitude and longitude, forward projection: some 0.4 µs. This is its
-//! Taylor series about the nodes of a grid over the map, computed from the exact way once at the start: some 0.02 µs, and
-//! within 0.1 mm of the exact way over a map of 50 km × 50 km for displacements up to 300 m (a test compares them).
+//! The exact method is inverse projection, addition in latitude and longitude, forward projection: some 0.4 µs. This module uses
+//! its Taylor series about the nodes of a grid over the map, computed from the exact method once at the start: some 0.02 µs, and
+//! within 0.1 mm of the exact method over a map of 50 km × 50 km for displacements up to 300 m (a test compares them).
 
 use super::{GeodesyError, Geodetic, NetPosition, Projection};
 
@@ -56,7 +56,7 @@ pub fn displaced_exactly(
 
 type Pair = [f64; 2];
 
-/// Derivatives of the exact way at one point of the map. Columns of matrices: east, north (angles), or x, y (metres).
+/// Derivatives of the exact method at one point of the map. Columns of matrices: east, north (angles), or x, y (metres).
 #[derive(Debug, Clone, Copy)]
 struct SeriesNode {
     at: Pair,
@@ -193,7 +193,7 @@ impl SeriesNode {
     }
 }
 
-/// How far an arc takes a position, metres.
+/// Displacement of a position by an arc, metres.
 fn moved_m(projection: &Projection, at: Pair, east_deg: f64, north_deg: f64) -> Result<Pair, GeodesyError> {
     let from = NetPosition { x_m: at[0], y_m: at[1] };
     let to = displaced_exactly(projection, from, GroundArc { east_deg, north_deg })?.net;

@@ -253,7 +253,7 @@ impl<P: BatchModel<N>, const N: usize> VehicleBatch<P, N> {
         self.advance_here(dt_s, meanwhile);
     }
 
-    /// The same code for every processor: compiled anew into each caller.
+    /// The same code for every processor, compiled into each caller.
     #[inline(always)]
     fn advance_here(&mut self, dt_s: f64, meanwhile: &impl Fn(usize)) {
         let mut rows = std::mem::take(&mut self.rows);

@@ -2,7 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-/// Where the front bumper should be.
+/// Position and motion that the front bumper should have.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ReferencePoint {
     /// World frame, metres.
@@ -51,7 +51,7 @@ impl ReferenceCurve {
         curve
     }
 
-    /// Where the front bumper should be after `t_s`.
+    /// The reference of the front bumper after `t_s`.
     #[must_use]
     #[inline(always)]
     pub fn at(&self, t_s: f64) -> ReferencePoint {

@@ -16,7 +16,7 @@ const CRAWL_MPS: f64 = 1.0;
 /// Offsets and rates below this count as zero, metres and m/s.
 const NONE: f64 = 1e-4;
 
-/// What a vehicle can do on a level road.
+/// Limits of a vehicle on a level road.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DrivingLimits {
     /// Largest lateral acceleration, m/s².

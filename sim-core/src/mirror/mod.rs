@@ -36,7 +36,7 @@ use road_user::RoadUser;
 pub use settings::MirrorSettings;
 use statistics::TrackingStatistics;
 
-/// What SUMO sent cannot be mirrored.
+/// A message of `traffic-bridge` cannot be mirrored.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum MirrorError {
     /// A road user was never announced in `traffic-meta`.
@@ -56,7 +56,7 @@ pub enum MirrorError {
         tick: u64,
     },
     /// A road user is in a frame twice.
-    #[error("tick {tick}: road user {vehicle} came twice")]
+    #[error("tick {tick}: road user {vehicle} is in the frame twice")]
     Twice {
         /// Dense index.
         vehicle: u32,
@@ -132,7 +132,7 @@ impl Mirror {
         })
     }
 
-    /// How well vehicles have been tracked, over the run.
+    /// Tracking statistics of the run.
     #[must_use]
     pub fn tracking(&self) -> &TrackingStatistics {
         &self.tracking
@@ -144,7 +144,7 @@ impl Mirror {
         self.catalogue.default_set()
     }
 
-    /// Vehicle classes met since the last call that no parameter set lists; each comes once in a run.
+    /// Vehicle classes seen since the last call that no parameter set lists. Each is returned once in a run.
     pub fn take_unknown_classes(&mut self) -> Vec<String> {
         self.catalogue.take_unknown()
     }
@@ -232,7 +232,7 @@ impl Mirror {
     /// Takes the state of all road users at the end of a SUMO step. Their ticks are written by [`Mirror::write_tick`].
     ///
     /// # Errors
-    /// A road user that was not announced, came twice, or has values that are not finite numbers.
+    /// A road user was not announced, is in the frame twice, or has values that are not finite numbers.
     pub fn accept(&mut self, header: &MessageHeader, states: &[TrafficState]) -> Result<(), MirrorError> {
         self.enter_episode(header.episode);
         self.frame += 1;

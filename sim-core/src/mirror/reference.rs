@@ -55,7 +55,7 @@ impl LaneChange {
     }
 }
 
-/// How a new SUMO state joins the path so far.
+/// Whether a new SUMO state continues the path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PathJoin {
     /// The path continues.
@@ -85,7 +85,7 @@ pub struct ReferencePath {
 }
 
 impl ReferencePath {
-    /// The path of a road user seen for the first time, or set anew, in a simulation with steps of `step_s`: straight ahead.
+    /// The path of a road user seen for the first time, or set to a new position, in a simulation with steps of `step_s`: straight ahead.
     #[must_use]
     pub fn from_here(now: &TrafficState, step_s: f64) -> Self {
         let (sin, cos) = libm::sincos(f64::from(now.yaw_rad));
@@ -220,7 +220,7 @@ impl ReferencePath {
         self.curve.from_time(t_s)
     }
 
-    /// How far the reference is from where the path would be if everything could be driven, metres.
+    /// Distance of the reference from the path without the governor's limits, metres.
     #[must_use]
     pub fn undriven_m(&self) -> f64 {
         self.governor.distance_m()

@@ -36,7 +36,7 @@ enum Arrival {
     Entering,
 }
 
-/// What moves a road user.
+/// The model or source that moves a road user.
 #[expect(
     clippy::large_enum_variant,
     reason = "nearly all road users are vehicles, and a box would cost each a cache miss"

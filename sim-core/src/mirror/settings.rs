@@ -13,7 +13,7 @@ use crate::models::catalogue::{ModelCatalogue, ModelCatalogueError};
 pub struct MirrorSettings {
     /// Models of the vehicles and their limits.
     pub vehicle: config::Vehicle,
-    /// What the road is covered with.
+    /// State of the road surface.
     pub surface: config::Surface,
     /// Length of a tick, seconds.
     pub tick_s: f64,

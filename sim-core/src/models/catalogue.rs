@@ -73,7 +73,7 @@ pub struct SizedModel {
     pub dimensions: VehicleDimensions,
 }
 
-/// What vehicles of one model have in common: parameter set, model, and size (bits of length, width and height).
+/// Key of a model: parameter set, model, and size (bits of length, width and height).
 type ModelKey = (usize, u8, [u32; 3]);
 
 /// All models of a run, one for each kind and size of vehicle.
@@ -197,7 +197,7 @@ impl ModelCatalogue {
         &self.catalogue.default_set().name
     }
 
-    /// Vehicle classes met since the last call that no parameter set lists; each comes once in a run.
+    /// Vehicle classes seen since the last call that no parameter set lists. Each is returned once in a run.
     pub fn take_unknown(&mut self) -> Vec<String> {
         let new = self.unknown.iter_mut().filter(|(_, returned)| !**returned);
         new.map(|(class, returned)| {

@@ -14,7 +14,7 @@ pub enum ParameterError {
     #[error("the parameter sets of vehicles cannot be read")]
     Format(#[from] toml::de::Error),
     /// Not exactly one default.
-    #[error("{count} parameter sets of vehicles are marked `default`, one must be")]
+    #[error("{count} parameter sets of vehicles are marked `default`; exactly one must be")]
     Default {
         /// How many are.
         count: usize,

@@ -98,7 +98,7 @@ struct BodyMotion {
     spin_radps: Vector,
 }
 
-/// One vehicle: its parameters and rapier's world around it. Not `Clone`, as rapier's world is not; a copy of the
+/// One vehicle: its parameters and rapier's world around it. It is not `Clone`, because rapier's world is not; a copy of the
 /// [`RigidState`] is a copy of the vehicle.
 pub struct RigidBody {
     params: DynamicParams,
@@ -370,7 +370,7 @@ struct SuspensionTuning {
     stiffness: [f64; 2],
     /// Front and rear damper, 1/s.
     damping: [f64; 2],
-    /// By how much weight presses the springs together, metres.
+    /// Compression of the springs by the weight, metres.
     sag_m: f64,
     half_track_m: f64,
     /// About the body's axes, m².

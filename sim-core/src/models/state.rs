@@ -1,4 +1,4 @@
-//! What every vehicle model works on: state and control input in, state and motion out.
+//! The values that every vehicle model shares: its state, its control input, and its motion over a sub-step.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -21,9 +21,9 @@ pub struct ModelState {
     pub x_m: f64,
     /// Metres.
     pub y_m: f64,
-    /// Heading, counter-clockwise from east, radians; not wrapped while a tick is under way.
+    /// Heading, counter-clockwise from east, radians; not wrapped within a tick.
     pub yaw_rad: f64,
-    /// Cosine and sine of the heading: carried along because they are needed several times in a sub-step.
+    /// Cosine and sine of the heading: stored because a sub-step needs them several times.
     pub heading: [f64; 2],
     /// Speed along the body's x, never negative, m/s.
     pub speed_mps: f64,

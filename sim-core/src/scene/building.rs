@@ -29,7 +29,7 @@ pub enum SolidClass {
     Structure = 2,
 }
 
-/// Types of building that traffic passes under, or that are not there: never solid by their type.
+/// Types of building that traffic passes under, or that do not exist: never solid by their type.
 const OPEN_TYPES: [&str; 4] = [
     "building.roof",
     "building.carport",
@@ -126,7 +126,7 @@ impl Prism {
     }
 }
 
-/// What a type of polygon says about a solid: class and default height; `None` if it is not solid by itself.
+/// Class and default height of a type of polygon; `None` if it is not solid by itself.
 fn by_type(name: &str) -> Option<(SolidClass, Option<f64>)> {
     let matches = |row: &str| {
         name.strip_prefix(row)

@@ -102,7 +102,7 @@ pub struct ChartSignal {
     pub links: Vec<ChartLink>,
 }
 
-/// Where a link of a traffic light stands.
+/// Position of a link of a traffic light.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ChartLink {
     /// Its number.
@@ -195,7 +195,7 @@ impl Chart {
     }
 }
 
-/// What a strip is for; `None` for polygons.
+/// The kind of a strip; `None` for polygons.
 fn lane_kind(piece: &RoadPiece, net: &NetAttributes) -> Option<&'static str> {
     piece.half_width_m?;
     Some(match piece.surface {

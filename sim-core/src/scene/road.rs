@@ -31,7 +31,7 @@ const OFF_ROAD_CLASSES: [&str; 12] = [
     "drone",
 ];
 
-/// What a piece of the surface is for.
+/// The purpose of a piece of the surface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SurfaceKind {
     /// A lane that road vehicles may use, also within a junction.
@@ -86,7 +86,7 @@ impl SurfaceKind {
 pub struct RoadPiece {
     /// SUMO's id.
     pub id: String,
-    /// What it is for.
+    /// Its purpose.
     pub surface: SurfaceKind,
     /// Centre line of a strip, outline of a polygon (not closed), metres.
     pub shape_m: Vec<[f64; 3]>,

@@ -89,7 +89,7 @@ pub fn distance(a: Point, b: Point) -> f64 {
     dot(d, d).sqrt()
 }
 
-/// Where on the segment a → b, as a share of it (not held to 0 … 1), `point` projects to; 0 for a segment without length.
+/// Projection of `point` onto the segment a → b, as a share of it (not limited to 0 … 1); 0 for a segment without length.
 #[must_use]
 pub fn share_along(a: Point, b: Point, point: Point) -> f64 {
     let along = from_to(a, b);
@@ -143,7 +143,7 @@ pub fn contains(outline: &[Point], point: Point) -> bool {
     inside
 }
 
-/// Where two segments cross, if they cross or touch in one point.
+/// The point where two segments cross, if they cross or touch in one point.
 #[must_use]
 pub fn crossing(a: Point, b: Point, c: Point, d: Point) -> Option<Point> {
     let (first, second) = (from_to(a, b), from_to(c, d));

@@ -13,7 +13,7 @@ use quick_xml::{
 
 use super::SceneError;
 
-/// Where an element stands, for messages.
+/// File and line of an element, for messages.
 #[derive(Debug, Clone)]
 pub(super) struct ElementPosition<'a> {
     path: &'a Path,
@@ -33,7 +33,7 @@ impl ElementPosition<'_> {
             + 1
     }
 
-    /// An attribute whose value makes no sense.
+    /// An error for an attribute whose value is not usable.
     pub(super) fn value(&self, what: &'static str, value: &str) -> SceneError {
         SceneError::Value {
             path: self.path.into(),
@@ -44,7 +44,7 @@ impl ElementPosition<'_> {
     }
 }
 
-/// What a reader of a file sees.
+/// The begin or the end of an element.
 pub(super) enum XmlTag<'a> {
     /// An element begins.
     Open(&'a BytesStart<'a>),
@@ -65,7 +65,7 @@ fn read(path: &Path) -> Result<String, SceneError> {
             .map_err(unreadable)?;
         return Ok(text);
     }
-    // Ids in other encodings do not matter to us.
+    // Ids in other encodings do not matter.
     Ok(String::from_utf8(bytes).unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned()))
 }
 
@@ -103,7 +103,7 @@ pub(super) fn for_each_tag(
     }
 }
 
-/// The value of an attribute, if it is there and readable.
+/// The value of an attribute, if it exists and is readable.
 pub(super) fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> {
     let attribute = element.try_get_attribute(name).ok()??;
     Some(attribute.normalized_value(XmlVersion::Implicit1_0).ok()?.into_owned())

@@ -25,7 +25,7 @@ pub struct Census {
 
 impl Census {
     /// Adds the events and signals of a step.
-    pub fn enter(&mut self, frame: &TrafficFrame) {
+    pub fn add_step(&mut self, frame: &TrafficFrame) {
         if frame.step == 1 {
             *self = Self::default();
         }
@@ -96,17 +96,17 @@ mod tests {
     #[test]
     fn it_holds_the_road_users_present_and_starts_empty_in_each_episode() {
         let mut census = Census::default();
-        census.enter(&step(
+        census.add_step(&step(
             1,
             vec![event(0, MetaEvent::Departed), event(1, MetaEvent::Departed)],
         ));
-        census.enter(&step(
+        census.add_step(&step(
             2,
             vec![event(0, MetaEvent::Arrived), event(1, MetaEvent::Teleported)],
         ));
         assert_eq!(census.vehicles.keys().copied().collect::<Vec<_>>(), [1]);
         assert_eq!(census.vehicles[&1].event, MetaEvent::Departed as u32);
-        census.enter(&step(1, vec![event(0, MetaEvent::Departed)]));
+        census.add_step(&step(1, vec![event(0, MetaEvent::Departed)]));
         assert_eq!(census.vehicles.keys().copied().collect::<Vec<_>>(), [0]);
     }
 }

@@ -213,7 +213,7 @@ impl CommandExecutor {
                 Some(population) => population.place_start(context.sumo, vehicle, edge, context.step)?,
                 None => Err(Refusal::new(
                     RefusalKind::Unsupported,
-                    "vehicles of a scenario start where its routes say",
+                    "the routes of a scenario decide where its vehicles start",
                 )),
             },
             Command::Destination { vehicle, edge } => match &mut context.population {
@@ -276,7 +276,7 @@ impl CommandExecutor {
             kind if kind == Kind::Hero as u32 || kind == Kind::Person as u32 => Err(Refusal::new(
                 RefusalKind::Unsupported,
                 format!(
-                    "{vehicle} goes where the scenario says: only vehicles that SUMO drives can get another destination"
+                    "the scenario decides where {vehicle} goes: only vehicles that SUMO drives can get another destination"
                 ),
             )),
             _ => match sumo.simulation_mut().set_destination(vehicle, edge) {

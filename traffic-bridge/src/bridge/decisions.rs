@@ -107,7 +107,7 @@ impl StageDecisions {
             StageSource::Log(decisions) => logged(decisions, lesson),
             StageSource::Count(stages) => counted(stages, lesson),
         };
-        // Stages never go back, not even when a trainer with other settings takes over.
+        // Stages never go back, not even when a trainer with other settings decides.
         let stage = self.newest.map_or(stage, |newest| newest.stage.max(stage));
         if self.newest.is_none_or(|newest| newest.stage != stage) {
             self.write(StageDecision { lesson, tick, stage })?;

@@ -179,7 +179,7 @@ impl Bridge {
                 return Ok(EpisodeEnd::Stopped);
             }
 
-            // Step SUMO, and find out what ends with the step.
+            // Step SUMO, and determine what ends with the step.
             sumo.step(frame)?;
             self.commands.track_presence(&frame.events);
             let is_reset = self.commands.take_reset();
@@ -195,7 +195,7 @@ impl Bridge {
                 ..header
             };
 
-            // Publish: switches and routes first, so that they are there when the step is processed.
+            // Publish: switches and routes first, so that they arrive before the step.
             if self.publish_switches(episode)? == Wait::Stopped {
                 return Ok(EpisodeEnd::Stopped);
             }
@@ -229,9 +229,9 @@ impl Bridge {
         match &self.membership.run.source {
             Source::Scenario { sumocfg } if self.totals.vehicle_steps == 0 => Err(Failure::new(
                 FailureKind::Config,
-                format!("{}: no road user came before its end", sumocfg.display()),
+                format!("{}: no road user departed before its end", sumocfg.display()),
             )
-            .with_help("name routes or flows in its route-files, and look at its begin, end and their depart times")),
+            .with_help("name routes or flows in its route-files, and check its begin, its end and their depart times")),
             _ => Ok(()),
         }
     }

@@ -1,4 +1,4 @@
-//! Lessons of a curriculum: which map and which road users each has, decided while training goes on.
+//! Lessons of a curriculum: their maps and road users, decided while training runs.
 
 use std::collections::BTreeMap;
 
@@ -44,7 +44,7 @@ impl Bridge {
         let first = self.membership.run.start().episode;
         let mut is_behind = first > 0;
         loop {
-            // Find out what comes next: an evaluation, or a lesson with its stage and map.
+            // Determine the next part: an evaluation, or a lesson with its stage and map.
             let (begins, place, segment) = match plan.due() {
                 DueWork::Nothing => return Ok(Wait::Ready),
                 DueWork::Evaluation { episode, is_last } => {

@@ -69,7 +69,7 @@ impl Outbox {
         )?;
         self.consumer_wake.wake();
         if let Some((publisher, census)) = &mut self.census {
-            census.enter(frame);
+            census.add_step(frame);
             census.publish_if_due(publisher, header)?;
         }
         Ok(header)
@@ -139,7 +139,7 @@ fn send(publisher: &Publisher, header: MessageHeader, count: usize, bytes: &[u8]
 fn too_many(error: PortError) -> Failure {
     match &error {
         PortError::TooLong { .. } => Failure::from_error(FailureKind::Config, &error)
-            .with_help("raise `traffic.max_road_users`, or use a scenario with fewer road users at a time"),
+            .with_help("raise `traffic.max_road_users`, or use a scenario with fewer road users at the same time"),
         _ => error.into(),
     }
 }

@@ -129,7 +129,7 @@ impl Population {
     /// [`Self::start`] with vehicles that make only these trips, as far as random draws find them.
     ///
     /// # Errors
-    /// As there.
+    /// As [`Self::start`].
     pub fn start_on(
         sumo: &mut Sumo,
         size: PopulationSize,
@@ -164,8 +164,8 @@ impl Population {
             self.track_event(sumo, event, frame.step)?;
         }
         for place in 0..self.drivers.len() {
-            if self.pace.cares_for(place, frame.step) {
-                self.care(sumo, place, frame.step)?;
+            if self.pace.is_due(place, frame.step) {
+                self.update_place(sumo, place, frame.step)?;
             }
         }
         self.pedestrians.after_step(sumo, frame, self.pace)
@@ -183,7 +183,7 @@ impl Population {
         Ok(())
     }
 
-    fn care(&mut self, sumo: &mut Sumo, place: usize, step: u64) -> Result<(), SumoError> {
+    fn update_place(&mut self, sumo: &mut Sumo, place: usize, step: u64) -> Result<(), SumoError> {
         let driver = &self.drivers[place];
         if driver.departed {
             self.drivers[place].extend_route(sumo);
@@ -238,7 +238,7 @@ impl Driver {
         )
     }
 
-    /// A random road to go to, on an allowed trip; any if none comes up.
+    /// A random destination on an allowed trip; any road if the draws find none.
     fn draw_goal(&mut self, from: usize) -> usize {
         let mut goal = from;
         for _ in 0..DRAWS_OF_A_TRIP {

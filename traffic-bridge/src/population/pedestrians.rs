@@ -98,7 +98,7 @@ impl Pedestrians {
             }
         }
         for (place, walker) in self.walkers.iter_mut().enumerate() {
-            if walker.departed && pace.cares_for(place, frame.step) {
+            if walker.departed && pace.is_due(place, frame.step) {
                 walker.walk_on(sumo)?;
             }
         }

@@ -29,7 +29,7 @@ impl CareSchedule {
     }
 
     /// True once every [`CARE_S`] for each place, for different places at different steps.
-    pub(super) fn cares_for(self, place: usize, step: u64) -> bool {
+    pub(super) fn is_due(self, place: usize, step: u64) -> bool {
         (step + place as u64).is_multiple_of(self.care)
     }
 }

@@ -62,7 +62,7 @@ impl Population {
         };
         let driver = &self.drivers[place];
         if driver.has_given_route() {
-            let message = format!("{id} drives along traffic.hero_route, which the configuration gives");
+            let message = format!("{id} drives along `traffic.hero_route` of the configuration");
             return Err(Refusal::new(RefusalKind::Unsupported, message));
         }
         match driver.roads.find(edge) {

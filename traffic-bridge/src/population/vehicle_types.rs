@@ -11,7 +11,7 @@ use crate::sumo::{
     libsumo::ffi,
 };
 
-/// SUMO's own types, for a net that brings none.
+/// SUMO's own types, for a net without types.
 const DEFAULT_VEHICLE: &str = "DEFAULT_VEHTYPE";
 const DEFAULT_PEDESTRIAN: &str = "DEFAULT_PEDTYPE";
 

@@ -1,4 +1,4 @@
-//! Which vehicles are connected, and which are heroes.
+//! The rule that decides which vehicles are connected and which are heroes.
 
 use std::collections::BTreeSet;
 

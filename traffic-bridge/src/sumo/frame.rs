@@ -29,7 +29,7 @@ pub struct TrafficFrame {
     pub cavs: u32,
 }
 
-/// What SUMO reported about road users at their departure and later steps need, for one episode.
+/// Attributes of road users that SUMO reports at their departure and that later steps need, for one episode.
 #[derive(Debug)]
 pub(crate) struct RoadUserRegister {
     rule: ConnectedRule,

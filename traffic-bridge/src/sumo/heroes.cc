@@ -18,7 +18,7 @@ namespace {
 
 // moveToXY: any lane nearby, and the exact position even where there is none.
 constexpr int FREE_MOVEMENT = 2;
-// How far from a lane a hero may be and still be found on it, metres.
+// Largest distance from a lane at which SUMO still matches a hero to it, metres.
 constexpr double MATCH_THRESHOLD_M = 20.0;
 // Factor on speed limits, speed (m/s) and deceleration (m/s²) that no hero reaches.
 constexpr double UNLIMITED = 100.0;

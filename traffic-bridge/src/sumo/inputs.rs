@@ -157,7 +157,7 @@ pub fn for_each_element(path: &Path, mut visit: impl FnMut(&BytesStart<'_>)) -> 
     }
 }
 
-/// The value of an attribute, if it is there and readable.
+/// The value of an attribute, if it exists and is readable.
 #[must_use]
 pub fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> {
     let attribute = element.try_get_attribute(name).ok()??;

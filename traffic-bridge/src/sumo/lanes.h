@@ -1,4 +1,4 @@
-// Which lanes a class of road users may use.
+// The lanes that a class of road users may use.
 #pragma once
 
 #include <algorithm>

@@ -49,7 +49,7 @@ impl Drop for LibsumoClaim {
     }
 }
 
-/// Where processor time went, seconds since SUMO was started.
+/// Processor time by purpose since SUMO was started, seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SumoCost {
     /// SUMO's own steps.

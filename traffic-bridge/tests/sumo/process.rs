@@ -209,7 +209,7 @@ fn episodes_go_out_step_by_step_under_credit() {
             .flat_map(|(_, _, events, _)| events)
             .map(|event| event.vehicle)
             .collect();
-        assert_eq!(departed, (0..CAVS).collect::<Vec<_>>(), "indices begin anew");
+        assert_eq!(departed, (0..CAVS).collect::<Vec<_>>(), "indices start again");
         assert!(episode[14].1.iter().all(|state| state.kind == Kind::Cav as u32));
         assert_eq!(episode[14].1.len(), CAVS as usize);
     }
