@@ -18,11 +18,14 @@ use ipc_schema::{process::Process, run::Mode, services::Channel};
 
 const MEASURED: Duration = Duration::from_secs(5);
 
-/// Kernel and user time of a process so far, in `1 / 100 s` (Linux's `USER_HZ`).
-fn cpu_ticks(pid: u32) -> u64 {
-    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
-    let fields: Vec<&str> = stat.rsplit(')').next().unwrap().split_whitespace().collect();
-    fields[11].parse::<u64>().unwrap() + fields[12].parse::<u64>().unwrap()
+/// Time that all threads of a process have spent on a core so far (proc(5), `schedstat`).
+fn processor_time(pid: u32) -> Duration {
+    let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).unwrap();
+    let on_core_ns = tasks.map(|task| {
+        let stat = std::fs::read_to_string(task.unwrap().path().join("schedstat")).unwrap();
+        stat.split_whitespace().next().unwrap().parse::<u64>().unwrap()
+    });
+    Duration::from_nanos(on_core_ns.sum())
 }
 
 /// Publishes ticks of `vehicles` at `ticks_per_s`, and prints the fan-out's share of a core.
@@ -37,7 +40,7 @@ fn measure(vehicles: usize, ticks_per_s: u32, viewers: usize) {
     let board = sim.board_of(Process::Fanout).unwrap();
     until("attendance", || board.progress().attached == 1);
 
-    let (begun, cpu) = (Instant::now(), cpu_ticks(fanout.0.id()));
+    let (begun, used) = (Instant::now(), processor_time(fanout.0.id()));
     let mut ticks = 0;
     let mut sent_at = Vec::new();
     let mut ages = Vec::new();
@@ -60,13 +63,13 @@ fn measure(vehicles: usize, ticks_per_s: u32, viewers: usize) {
         }
     }
     ages.sort();
-    let share = (cpu_ticks(fanout.0.id()) - cpu) as f64 / 100.0 / begun.elapsed().as_secs_f64();
+    let share = (processor_time(fanout.0.id()) - used).as_secs_f64() / begun.elapsed().as_secs_f64();
     let bytes = sessions
         .first()
         .and_then(|s| ask(s, &run.key(Topic::World)))
         .map_or(0, |f| f.len());
     println!(
-        "{vehicles} vehicles, {ticks} ticks in {MEASURED:?}, {viewers} viewers: {:.1} % of a core, world frame {bytes} B, \
+        "{vehicles} vehicles, {ticks} ticks in {MEASURED:?}, {viewers} viewers: {:.2} % of a core, world frame {bytes} B, \
          {} received, median age {:?}, missed {}",
         100.0 * share,
         ages.len(),
