@@ -44,8 +44,8 @@ def main(folder: Path, fault: str) -> None:
         loop._learn = lambda: os._exit(9) if loop._updates() == 2 else learn()  # type: ignore[method-assign]
     if rank == 1 and fault == "differs":
         loop._ensure_started(next(with_evaluation(1, 0, VEHICLES, 5.0, 1)))
-        assert loop._ppo is not None
-        loop._ppo.updater.parameters()["policy.layer0.weight"][0, 0] += 1e-3
+        assert loop._learner.ppo is not None
+        loop._learner.ppo.updater.parameters()["policy.layer0.weight"][0, 0] += 1e-3
     loop.run()
     together.close()
 

@@ -13,10 +13,10 @@ from caraware.learn.rollout import Rollout
 from caraware.report.evaluation import EvaluationResult
 from caraware.report.metrics import TrainingPoint
 from caraware.run.checkpoint import (
-    Course,
     Keeping,
+    TrainingHistory,
     load_checkpoint,
-    load_course,
+    load_history,
     mark_best,
     remove_partial,
     save_checkpoint,
@@ -168,8 +168,8 @@ def test_schedules_stand_where_the_newest_update_had_them(tmp_path: Path) -> Non
     ppo.progress = 0.25
     train(ppo, 0, 3)
     schedules = read_manifest(save(tmp_path, ppo)).schedules
-    assert schedules.progress == 0.25
-    assert (schedules.learning_rate, schedules.clip_epsilon) == (pytest.approx(0.0025), pytest.approx(0.175))
+    assert schedules["progress"] == 0.25
+    assert (schedules["learning_rate"], schedules["clip_epsilon"]) == (pytest.approx(0.0025), pytest.approx(0.175))
 
 
 def test_the_best_and_every_nth_outlive_the_newest(tmp_path: Path) -> None:
@@ -269,11 +269,11 @@ def test_the_newest_sound_checkpoint_is_found_past_damaged_ones(
 def test_the_course_of_training_comes_back_exactly(tmp_path: Path) -> None:
     evaluation = EvaluationResult(7, 1, 2, 300, 4.5, 0.1, 7.0, 0.2)
     points = [TrainingPoint(7, 0.3, 0.1, 5.25, math.pi, 1e4), TrainingPoint(2**40, 0.1, 0.2, math.nan, 6.0, 0.0)]
-    course = Course(11, 1, 2, 6, 40, [evaluation], points)
+    course = TrainingHistory(11, 1, 2, 6, 40, [evaluation], points)
     ppo = fresh()
     written = save_checkpoint(tmp_path, ppo, Counters(1, 7, 0, 9), "0", Keeping(3), course)
-    found = load_course(written)
+    found = load_history(written)
     assert (found.evaluations, found.training[0]) == (course.evaluations, points[0])
     assert repr(found) == repr(course)
     assert load_checkpoint(written, fresh()) == Counters(1, 7, 0, 9)
-    assert load_course(save(tmp_path / "bare", ppo)) == Course()
+    assert load_history(save(tmp_path / "bare", ppo)) == TrainingHistory()

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 from caraware.report.evaluation import EvaluationResult, pooled
-from caraware.run.checkpoint import load_course
+from caraware.run.checkpoint import load_history
 from caraware.run.config import RunConfig
 from caraware.run.environment import share
-from caraware.run.loop import Learner, TrainingLoop
+from caraware.run.learner import Learner
+from caraware.run.loop import TrainingLoop
 from caraware.run.manifest import latest_checkpoint, read_manifest
 from safetensors.torch import load_file
 from synthetic import FIELDS, SyntheticChannel, SyntheticObservation, run_file, with_evaluation
@@ -95,7 +96,7 @@ def test_a_successor_goes_on_where_each_environment_stands(tmp_path: Path) -> No
     run = settings(cut)
     loop(run, [SyntheticChannel(run, ticks(env), 4) for env in range(2)], until=40).run()
     checkpoint = latest_checkpoint(cut / "checkpoints")
-    assert [place.committed_tick for place in load_course(checkpoint).others] == [37]
+    assert [place.committed_tick for place in load_history(checkpoint).others] == [37]
     assert read_manifest(checkpoint).counters.committed_tick == 37
     learner = Learner.begin(replace(RunConfig.from_run(run), resume_from=checkpoint), FIELDS)
     first_ticks = [learner.first_tick(env) for env in range(3)]

@@ -13,12 +13,17 @@ from caraware.baselines.ekf import Ekf
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import read_samples
 from caraware.fusion.carrier import COLUMNS, Carried, Carrier
+from caraware.fusion.estimating import Estimating
 from caraware.fusion.lanes import LaneMap, Pieces, read_pieces
 from caraware.fusion.learner import Episode, FusionConfig, FusionLearner
-from caraware.fusion.store import Progress, load_fusion, newest_sound, save_fusion
-from caraware.fusion.train import Estimating, FusionLoop, Recording, begin
+from caraware.fusion.loop import Beginning, FusionLoop, Recording
+from caraware.fusion.train import begin, player
 from caraware.learn.config import ConfigError
-from caraware.run.checkpoint import CheckpointError
+from caraware.run.checkpoint import Keeping, load_checkpoint, save_checkpoint
+from caraware.run.config import RunConfig
+from caraware.run.learner import Learner
+from caraware.run.manifest import CheckpointError, Counters, newest_sound_checkpoint
+from caraware.run.player import PlayLoop
 from synthetic import SyntheticChannel
 from synthetic_vehicle import Track, VehicleObservation, observations, sensor_tables, town_track, vehicle_run
 
@@ -26,6 +31,8 @@ NET = """<net><edge id="a"><lane id="a_0" speed="13.9" length="200" shape="0,{y}
 <lane id="a_1" allow="pedestrian" speed="1" length="200" shape="0,0 200,0"/></edge>
 <edge id="b"><lane id="b_0" disallow="pedestrian" speed="8.3" length="200" shape="{x},0 {x},200"/></edge></net>"""
 STREET_M = 80.0
+SIZE = 11
+"""Of the observation, which the estimator does not read."""
 
 
 def net_file(folder: Path) -> Path:
@@ -39,7 +46,8 @@ def net_file(folder: Path) -> Path:
 def street_run(folder: Path, slow_m: float = 0.0, **trainer: object) -> dict:
     tables = sensor_tables(gnss__correlated_std_m=[slow_m, slow_m, 0.0])
     run = vehicle_run(str(folder), tables, hidden=[16], epochs=4, learning_rate=2e-3, **trainer)
-    run["config"]["fusion"] = {"segment_ticks": 32, "truncation_ticks": 16}
+    run["config"]["fusion"] = {"map": True, "segment_ticks": 32, "truncation_ticks": 16}
+    run["config"]["traffic"] = {}
     run["scene_files"] = {"net_file": str(net_file(folder))}
     return run
 
@@ -77,7 +85,7 @@ def street_ticks(run: dict, episodes: int, vehicles: int = 6, ticks: int = 40) -
 
 
 def learner_of(run: dict) -> FusionLearner:
-    return begin(run, None)[1]
+    return begin(run, SIZE, None)[1]
 
 
 def estimates(run: dict, learner: FusionLearner, ticks: list[VehicleObservation]) -> torch.Tensor:
@@ -171,7 +179,7 @@ def test_without_a_map_no_lane_is_found() -> None:
 
 def test_it_learns_streets_and_beats_the_filter_on_vehicles_it_has_not_seen(tmp_path: Path) -> None:
     run = street_run(tmp_path, slow_m=3.0)
-    run["config"]["fusion"] = {"segment_ticks": 100, "truncation_ticks": 50}
+    run["config"]["fusion"] |= {"segment_ticks": 100, "truncation_ticks": 50}
     learner = learner_of(run)
     for seed in range(3):
         learner.learn(recorded(run, learner, seed), progress=0.0)
@@ -194,8 +202,8 @@ def recorded(run: dict, learner: FusionLearner, seed: int) -> Episode:
 def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
     run = street_run(tmp_path)
     channel = SyntheticChannel(run, street_ticks(run, episodes=2))
-    config, learner, progress = begin(run, None)
-    assert FusionLoop(channel, config, learner, progress, lambda: False).run()
+    config, learner, beginning = begin(run, SIZE, None)
+    assert FusionLoop(channel, config, learner, beginning, lambda: False).run()
     part = json.loads((tmp_path / "parts" / "trainer.json").read_text())
     assert (part["updates"], part["env_steps"], part["untrained_env_steps"]) == (2, 2 * 40 * 6, 0)
     assert (part["lost_ticks"], part["duplicated_ticks"]) == (0, 0)
@@ -206,41 +214,85 @@ def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
     assert channel.committed_up_to == 2 * 40 - 1
 
 
-def test_stopped_and_continued_it_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    def parameters(folder: Path, *limits: int) -> torch.Tensor:
+def test_stopped_and_continued_it_ends_with_the_same_bytes_and_the_same_report(tmp_path: Path) -> None:
+    def final(folder: Path, *limits: int) -> tuple[torch.Tensor, dict]:
         run = street_run(folder, checkpoint_interval=1)
         for limit in limits:
-            config, learner, progress = begin(run, newest_sound(folder / "checkpoints"))
-            ticks = (obs for obs in street_ticks(run, episodes=3) if obs.tick > progress.committed_tick)
+            config, learner, beginning = begin(run, SIZE, newest_sound_checkpoint(folder / "checkpoints"))
+            ticks = (obs for obs in street_ticks(run, episodes=3) if obs.tick > beginning.counters.committed_tick)
             channel = SyntheticChannel(run, ticks)
-            FusionLoop(
-                channel, config, learner, progress, lambda c=channel, limit=limit: c.consumed_up_to >= limit
-            ).run()
+            stop = lambda channel=channel, limit=limit: channel.consumed_up_to >= limit  # noqa: E731
+            FusionLoop(channel, config, learner, beginning, stop).run()
         assert learner.updates == 3
-        return learner.parameters.values
+        part = json.loads((folder / "parts" / "trainer.json").read_text())
+        return learner.parameters.values, part
 
-    whole, cut = parameters(tmp_path / "whole", 10**6), parameters(tmp_path / "cut", 55, 110, 10**6)
-    assert torch.equal(whole, cut)
+    whole, cut = final(tmp_path / "whole", 10**6), final(tmp_path / "cut", 55, 110, 10**6)
+    assert torch.equal(whole[0], cut[0])
+    # The successor's ledger begins with the ticks of the checkpoint.
+    assert cut[1] == whole[1]
+    assert (cut[1]["received_ticks"], cut[1]["lost_ticks"]) == (4 * 40, 0)
+
+
+def test_a_simulation_that_resumes_from_its_checkpoint_begins_with_the_next_episode(tmp_path: Path) -> None:
+    run = street_run(tmp_path, checkpoint_interval=1)
+    config, learner, beginning = begin(run, SIZE, None)
+    channel = SyntheticChannel(run, street_ticks(run, episodes=2))
+    FusionLoop(channel, config, learner, beginning, lambda: channel.consumed_up_to >= 45).run()
+    newest = newest_sound_checkpoint(tmp_path / "checkpoints")
+    run["beginning"] = {"checkpoint": str(newest)}
+    _, resumed, beginning = begin(run, SIZE, None)
+    counters = beginning.counters
+    assert (counters.committed_tick, counters.next_episode, counters.next_episode_tick) == (39, 1, 40)
+    assert torch.equal(resumed.parameters.values, learner.parameters.values)
+
+
+def test_it_plays(tmp_path: Path) -> None:
+    run = street_run(tmp_path / "run")
+    learner = shaken(learner_of(run))
+    written = save_checkpoint(tmp_path / "c", learner, Counters(4, 0, 0, 39), "0", Keeping(1))
+    played = street_run(tmp_path / "play")
+    played["beginning"] = {"checkpoint": str(written)}
+    config = RunConfig.from_run(played)
+    ticks = list(street_ticks(played, episodes=1))
+    channel = SyntheticChannel(played, iter(ticks), group=3)
+    PlayLoop(channel, config, player(played, config, SIZE), lambda: False).run()
+    assert channel.is_done
+    part = json.loads((tmp_path / "play" / "parts" / "trainer.json").read_text())
+    assert (part["updates"], part["policy_std"]) == (4, 0.0)
+    expected = estimates(run, learner, ticks)
+    shown = torch.stack([channel.predictions[obs.tick] for obs in ticks])
+    torch.testing.assert_close(shown, expected)
+
+
+def test_a_checkpoint_of_one_learner_is_refused_by_the_other(tmp_path: Path) -> None:
+    run = street_run(tmp_path)
+    written = save_checkpoint(tmp_path / "c", learner_of(run), Counters(1, 0, 0, 39), "0", Keeping(1))
+    with pytest.raises(CheckpointError, match="its learner is fusion, this run's is ppo"):
+        load_checkpoint(written, Learner.begin(RunConfig.from_run(run), SIZE))
+    (written / "manifest.json").write_text(json.dumps({"format": "caraware-fusion-1", "files": {}}))
+    with pytest.raises(CheckpointError, match="earlier format, which is not read any more"):
+        load_checkpoint(written, learner_of(run))
 
 
 def test_a_damaged_checkpoint_is_refused_and_the_one_before_it_used(tmp_path: Path) -> None:
     run = street_run(tmp_path)
     learner = shaken(learner_of(run))
     for updates in (1, 2):
-        save_fusion(tmp_path / "c", learner, Progress(updates=updates), keep=5)
+        save_checkpoint(tmp_path / "c", learner, Counters(updates, 0, 0, -1), "0", Keeping(5))
     file = tmp_path / "c" / "update-000002" / "parameters.safetensors"
     file.write_bytes(file.read_bytes()[:-1] + b"\x01")
     with pytest.raises(CheckpointError, match="damaged"):
-        load_fusion(file.parent, learner)
-    newest = newest_sound(tmp_path / "c")
+        load_checkpoint(file.parent, learner)
+    newest = newest_sound_checkpoint(tmp_path / "c")
     assert newest is not None
     fresh = learner_of(run)
-    assert load_fusion(newest, fresh).updates == 1
+    assert Beginning.load(newest, fresh).counters.updates == fresh.updates == 1
     assert torch.equal(fresh.parameters.values, learner.parameters.values)
     wider = street_run(tmp_path)
     wider["config"]["trainer"]["hidden"] = [8]
     with pytest.raises(CheckpointError, match=r"16.*8"):
-        load_fusion(newest, learner_of(wider))
+        load_checkpoint(newest, learner_of(wider))
 
 
 def test_pieces_of_an_episode_hold_every_row_once() -> None:
@@ -254,4 +306,4 @@ def test_pieces_of_an_episode_hold_every_row_once() -> None:
 
 def test_ticks_that_do_not_divide_are_refused() -> None:
     with pytest.raises(ConfigError, match="segment_ticks"):
-        FusionConfig.from_run({"config": {"fusion": {"segment_ticks": 100, "truncation_ticks": 64}}})
+        FusionConfig.from_run({"config": {"fusion": {"map": True, "segment_ticks": 100, "truncation_ticks": 64}}})

@@ -12,7 +12,8 @@ from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
 from caraware.learn.ppo import PlainUpdate
 from caraware.run.checkpoint import Keeping, save_checkpoint
 from caraware.run.config import RunConfig
-from caraware.run.loop import Learner, TrainingLoop
+from caraware.run.learner import Learner
+from caraware.run.loop import TrainingLoop
 from caraware.run.manifest import CheckpointError, Counters, newest_sound_checkpoint
 from caraware.run.player import PlayLoop
 from synthetic import FIELDS, SIZE_M, SyntheticChannel, locating_ppo, run_file
@@ -111,7 +112,7 @@ def test_it_plays(tmp_path: Path) -> None:
     played["config"]["traffic"] = {}
     config = RunConfig.from_run(played)
     learner = Learner.begin(config, size)
-    PlayLoop(SyntheticChannel(played, ticks()), config, learner, lambda: False).run()
+    PlayLoop(SyntheticChannel(played, ticks()), config, learner.for_play(), lambda: False).run()
     report = part(tmp_path / "play")
     assert report["updates"] == 3 and report["ppo_mean_error_m"] > 0
     assert report["policy_std"] == pytest.approx(math.exp(-2.5))

@@ -13,8 +13,8 @@ from caraware.baselines import Ekf, SensorNoise
 from caraware.baselines.samples import read_samples
 from caraware.learn.memory import Memory
 from caraware.run.config import RunConfig
-from caraware.run.loop import Learner
-from caraware.run.player import LIVE, PlayLoop, Tally
+from caraware.run.learner import Learner
+from caraware.run.player import LIVE, PlayLoop, PlayTally
 from synthetic import SyntheticChannel
 from synthetic_vehicle import VehicleObservation, observations, sensor_tables, town_track, vehicle_run
 
@@ -52,7 +52,7 @@ def loop_over(folder: Path, stream: Iterator[VehicleObservation], stop_at: int |
     config = RunConfig.from_run(played)
     size = next(ticks()).observation.shape[1]
     stop = lambda: stop_at is not None and channel.consumed_up_to >= stop_at  # noqa: E731
-    PlayLoop(channel, config, Learner.begin(config, size), stop).run()
+    PlayLoop(channel, config, Learner.begin(config, size).for_play(), stop).run()
     return channel
 
 
@@ -98,7 +98,7 @@ def test_a_successor_counts_on_from_the_file(tmp_path: Path) -> None:
     """The filter begins anew in it, policy and fix do not know the difference."""
     loop_over(tmp_path / "whole", ticks())
     loop_over(tmp_path / "cut", ticks(), stop_at=50)
-    tally = Tally.read(tmp_path / "cut" / LIVE)
+    tally = PlayTally.read(tmp_path / "cut" / LIVE)
     assert 50 <= tally.tick < 2 * TICKS - 1
     loop_over(tmp_path / "cut", ticks(first=tally.tick + 1))
     one, two = part(tmp_path / "whole"), part(tmp_path / "cut")
@@ -115,11 +115,11 @@ def test_a_policy_with_memory_plays_without_that_of_the_checkpoint(tmp_path: Pat
     for group in (1, 8):
         channel = SyntheticChannel(played, ticks(), group)
         learner = Learner.begin(config, next(ticks()).observation.shape[1])
-        everybody = torch.arange(VEHICLES)
+        all_vehicles = torch.arange(VEHICLES)
         width = learner.ppo.memories[0].state.shape[1]
-        known = Memory(torch.tensor(-1), everybody, torch.ones(VEHICLES, width))
+        known = Memory(torch.tensor(-1), all_vehicles, torch.ones(VEHICLES, width))
         learner.ppo.memories = [known]
-        PlayLoop(channel, config, learner, lambda: False).run()
+        PlayLoop(channel, config, learner.for_play(), lambda: False).run()
         (tmp_path / LIVE).unlink()
         shown.append(channel.predictions)
     assert all(torch.equal(shown[0][tick], shown[1][tick]) for tick in range(2 * TICKS))
@@ -130,4 +130,4 @@ def test_a_policy_with_memory_plays_without_that_of_the_checkpoint(tmp_path: Pat
 
 def test_a_file_that_is_no_table_is_no_predecessor(tmp_path: Path) -> None:
     (tmp_path / LIVE).write_text("{")
-    assert Tally.read(tmp_path / LIVE) == Tally()
+    assert PlayTally.read(tmp_path / LIVE) == PlayTally()

@@ -11,7 +11,7 @@ import pytest
 import torch
 from caraware.learn.ranks import Ranks, SampleUnion
 from caraware.parallel import Place, command
-from caraware.run.checkpoint import load_course
+from caraware.run.checkpoint import load_history
 from caraware.run.config import RunConfig
 from caraware.run.loop import TrainingLoop
 from caraware.run.manifest import latest_checkpoint, read_manifest
@@ -90,13 +90,13 @@ def test_two_ranks_learn_what_one_does_with_twice_the_batch(tmp_path: Path, alon
     assert_the_same(alone, tmp_path / "rank0")
     # Rank 0's checkpoint is that of one trainer with both environments.
     mine, theirs = (latest_checkpoint(folder / "checkpoints") for folder in (alone, tmp_path / "rank0"))
-    assert load_course(theirs).others == load_course(mine).others
+    assert load_history(theirs).others == load_history(mine).others
     for name, state in load_file(mine / "random.safetensors").items():
         assert torch.equal(state, load_file(theirs / "random.safetensors")[name])
     # Rank 1's has the same parameters, and where its own environment stands.
     own = latest_checkpoint(tmp_path / "rank1" / "checkpoints")
     assert read_manifest(own).files["parameters.safetensors"] == read_manifest(theirs).files["parameters.safetensors"]
-    assert not load_course(own).others
+    assert not load_history(own).others
     assert load_file(own / "random.safetensors").keys() == {"sampling1", "shuffling"}
 
 

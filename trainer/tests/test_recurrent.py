@@ -18,7 +18,8 @@ from caraware.learn.recurrent import NO_SAMPLE, RecurrentPpo, continues, cut, se
 from caraware.learn.rollout import Rollout
 from caraware.run.checkpoint import MEMORY, load_checkpoint
 from caraware.run.config import RunConfig
-from caraware.run.loop import Learner, TrainingLoop
+from caraware.run.learner import Learner
+from caraware.run.loop import TrainingLoop
 from caraware.run.manifest import CheckpointError, latest_checkpoint, newest_sound_checkpoint
 from safetensors.torch import load_file
 from synthetic import FIELDS, SIZE_M, SyntheticChannel, SyntheticObservation, locating_ppo, run_file, street_ticks

@@ -11,9 +11,10 @@ from caraware.learn.ppo import Ppo
 from caraware.learn.rewards import distance_m
 from caraware.learn.rollout import Rollout
 from caraware.learn.supervised import Supervised
-from caraware.run.checkpoint import Keeping, load_checkpoint, save_checkpoint
+from caraware.run.checkpoint import Keeping, TrainingHistory, load_checkpoint, save_checkpoint
 from caraware.run.config import RunConfig
-from caraware.run.loop import Learner, TrainingLoop
+from caraware.run.learner import Learner
+from caraware.run.loop import TrainingLoop
 from caraware.run.manifest import Counters, newest_sound_checkpoint
 from safetensors.torch import load_file
 from synthetic import FIELDS, SyntheticChannel, run_file, street_ticks
@@ -25,6 +26,10 @@ from test_ppo import NOISE_M, TOY, errors_m, fresh, parameters, train
 
 def beside(ppo: Ppo) -> Supervised:
     return Supervised(ppo.config, FIELDS, ppo.task, ppo.device)
+
+
+def both(ppo: Ppo, baseline: Supervised) -> Learner:
+    return Learner(ppo, baseline, Counters(0, 0, 0, -1), TrainingHistory())
 
 
 def train_both(ppo: Ppo, baseline: Supervised, updates: int) -> None:
@@ -100,16 +105,16 @@ def test_it_begins_anew_where_a_checkpoint_has_none(tmp_path: Path) -> None:
     baseline = beside(other)
     train(alone, 2)
     written = save_checkpoint(tmp_path, alone, Counters(2, 512, 0, 7), "0", Keeping(1))
-    load_checkpoint(written, other, baseline)
+    load_checkpoint(written, both(other, baseline))
     assert torch.equal(parameters(other), parameters(alone))
     assert torch.equal(baseline.mlp.parameters.values, beside(fresh()).mlp.parameters.values)
     (tmp_path / "other").mkdir()
     trained = fresh()
     taught = beside(trained)
     train_both(trained, taught, 2)
-    written = save_checkpoint(tmp_path / "other", trained, Counters(2, 512, 0, 7), "0", Keeping(1), supervised=taught)
+    written = save_checkpoint(tmp_path / "other", both(trained, taught), Counters(2, 512, 0, 7), "0", Keeping(1))
     load_checkpoint(written, alone)
-    load_checkpoint(written, other, baseline)
+    load_checkpoint(written, both(other, baseline))
     assert torch.equal(baseline.mlp.parameters.values, taught.mlp.parameters.values)
 
 

@@ -7,8 +7,14 @@ shows them, and a successor continues from them. Exit codes: `caraware.run.proce
 import logging
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from caraware.run.process import HandoverRole, StopSignal, read_run, run_process
+
+if TYPE_CHECKING:
+    from caraware.ipc.run_file import RunFile
+    from caraware.run.config import RunConfig
+    from caraware.run.player import PlayedPolicy
 
 log = logging.getLogger("caraware.play")
 
@@ -18,14 +24,25 @@ def play(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
     from caraware import _native
     from caraware.ipc.channel import Channel
     from caraware.run.config import RunConfig
-    from caraware.run.loop import Learner
-    from caraware.run.player import LIVE, PlayLoop, Tally
+    from caraware.run.player import LIVE, PlayLoop, PlayTally
 
-    config = RunConfig.from_run(read_run(run_file))
-    learner = Learner.begin(config, _native.observation_size(str(run_file)))
-    first_tick = Tally.read(config.run_dir / LIVE).tick + 1
+    run = read_run(run_file)
+    config = RunConfig.from_run(run)
+    policy = _policy(run, config, _native.observation_size(str(run_file)))
+    first_tick = PlayTally.read(config.run_dir / LIVE).tick + 1
     log.info("plays %s from tick %d", config.resume_from, first_tick)
-    PlayLoop(Channel(str(run_file), first_tick), config, learner, lambda: stop.requested).run()
+    PlayLoop(Channel(str(run_file), first_tick), config, policy, lambda: stop.requested).run()
+
+
+def _policy(run: "RunFile", config: "RunConfig", observation_size: int) -> "PlayedPolicy":
+    """The policy of the checkpoint, of whichever learner wrote it. Raises `CheckpointError`."""
+    from caraware.fusion import train as fusion
+    from caraware.run.learner import Learner
+    from caraware.run.manifest import read_manifest
+
+    if config.resume_from is not None and read_manifest(config.resume_from).learner == "fusion":
+        return fusion.player(run, config, observation_size)
+    return Learner.begin(config, observation_size).for_play()
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from caraware.run.process import HandoverRole, StopSignal, read_run, run_process
 if TYPE_CHECKING:
     from caraware.learn.ranks import Ranks
     from caraware.run.config import RunConfig
-    from caraware.run.loop import Learner
+    from caraware.run.learner import Learner
 
 log = logging.getLogger("caraware.train")
 
@@ -62,7 +62,7 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
 def _resumed(config: "RunConfig", ranks: "Ranks") -> "Learner | None":
     """A learner continued from the checkpoint that the run begins with; None if the run begins anew."""
     from caraware.run.checkpoint import remove_partial
-    from caraware.run.loop import Learner
+    from caraware.run.learner import Learner
     from caraware.run.manifest import read_manifest
 
     if config.resume_from is None:
@@ -77,7 +77,7 @@ def _successor(run_file: Path, config: "RunConfig", role: HandoverRole) -> "Lear
     """A learner continued from the run's newest sound checkpoint; None if the supervisor cancels the handover."""
     from caraware import _native
     from caraware.run.checkpoint import remove_partial
-    from caraware.run.loop import Learner
+    from caraware.run.learner import Learner
     from caraware.run.manifest import newest_sound_checkpoint
 
     size, folder = _native.observation_size(str(run_file)), config.run_dir / "checkpoints"

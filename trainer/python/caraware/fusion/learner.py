@@ -6,13 +6,13 @@ the sum and the network's memory (truncated backpropagation through time; R. Wil
 appears in the loss alone.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from caraware.fusion.carrier import COLUMNS, Carried
+from caraware.fusion.carrier import Carried
 from caraware.fusion.estimator import FusionEstimator, FusionNetwork, distance_loss
 from caraware.fusion.lanes import Pieces, read_pieces
 from caraware.ipc.run_file import RunFile
@@ -20,24 +20,28 @@ from caraware.learn.adam import Adam
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
 from caraware.learn.flat import FlatParameters
 from caraware.learn.ppo import NonFiniteLoss
+from caraware.learn.stored import OPTIMISER, PARAMETERS, RANDOM, LearnerShape, StoredTensors
 
 
 @dataclass(frozen=True)
 class FusionConfig:
     """Table `fusion` of the configuration."""
 
-    map: bool = True
+    map: bool
     """Whether the estimator has the lanes of the net."""
-    segment_ticks: int = 256
+    segment_ticks: int
     """An episode is learnt from in pieces of so many ticks, side by side."""
-    truncation_ticks: int = 64
+    truncation_ticks: int
     """Ticks between two gradient steps; the gradient reaches no further back."""
 
     @classmethod
     def from_run(cls, run: RunFile) -> "FusionConfig":
         """Read `run["config"]["fusion"]`. Raises `ConfigError`."""
         section = run.get("config", {}).get("fusion", {})
-        config = cls(**{key: section[key] for key in ("map", "segment_ticks", "truncation_ticks") if key in section})
+        if missing := sorted({f.name for f in fields(cls)} - set(section)):
+            help = "it is of another version of `caraware`"
+            raise ConfigError(f"the run file lacks the key `fusion.{missing[0]}`", help)
+        config = cls(**{f.name: section[f.name] for f in fields(cls)})
         if config.segment_ticks % config.truncation_ticks != 0:
             raise ConfigError(
                 f"`fusion.segment_ticks` = {config.segment_ticks} is no multiple of"
@@ -92,9 +96,19 @@ class Episode:
 class FusionLearner:
     """Estimator, optimiser and random numbers: everything that a checkpoint must hold."""
 
-    def __init__(self, trainer: TrainerConfig, fusion: FusionConfig, pieces: Pieces, bounds: MapBounds) -> None:
-        self.config, self.fusion = trainer, fusion
+    def __init__(
+        self,
+        trainer: TrainerConfig,
+        fusion: FusionConfig,
+        pieces: Pieces,
+        bounds: MapBounds,
+        observation_size: int,
+    ) -> None:
+        """It reads the raw samples; `observation_size` is that of the run, which a checkpoint must agree with."""
+        self.config, self.fusion, self.observation_size = trainer, fusion, observation_size
         self.updates = 0
+        self.progress = 0.0
+        """Share of all training episodes that is done, as of the newest update."""
         torch.set_num_threads(1)  # matrices this small are not worth a second thread
         self.random = torch.Generator().manual_seed(trainer.seed)
         with torch.random.fork_rng(devices=[]):
@@ -106,11 +120,8 @@ class FusionLearner:
         self.estimator = FusionEstimator(network, pieces, centre_m)
 
     def learn(self, episode: Episode, progress: float) -> FusionStats:
-        """Some passes over an episode; `progress` is the share of training that is behind. Raises `NonFiniteLoss`."""
-        final = (
-            self.config.learning_rate if self.config.learning_rate_final is None else self.config.learning_rate_final
-        )
-        learning_rate = self.config.learning_rate + (final - self.config.learning_rate) * progress
+        """Some passes over an episode; `progress` is the share of training that is done. Raises `NonFiniteLoss`."""
+        self.progress, learning_rate = progress, self._learning_rate(progress)
         pieces = episode.pieces(self.fusion.segment_ticks)
         log = [self._pass(pieces, learning_rate) for _ in range(self.config.epochs)]
         self.updates += 1
@@ -149,18 +160,31 @@ class FusionLearner:
             raise NonFiniteLoss(what, self.updates + 1)
         return value.item()
 
-    def tensors(self) -> dict[str, dict[str, Tensor]]:
-        """Every tensor of a checkpoint by file and name. Parameters and moments are views: filling them loads them."""
-        moments = {"mean": self.optimiser.mean, "square": self.optimiser.square, "steps": self.optimiser.steps}
-        return {
-            "parameters.safetensors": dict(self.parameters.value),
-            "optimiser.safetensors": moments,
-            "random.safetensors": {"shuffling": self.random.get_state()},
-        }
+    def _learning_rate(self, progress: float) -> float:
+        first, final = self.config.learning_rate, self.config.learning_rate_final
+        return first if final is None else first + (final - first) * progress
 
-    def shape(self) -> dict[str, int]:
-        """What a checkpoint must agree with."""
-        return {"columns": COLUMNS, "hidden": self.config.hidden[0]}
+    def shape(self) -> LearnerShape:
+        """See `StoredLearner.shape`."""
+        config = self.config
+        return LearnerShape("fusion", self.observation_size, config.network, config.hidden, config.activation)
+
+    def schedules(self) -> dict[str, float]:
+        """See `StoredLearner.schedules`."""
+        return {"progress": self.progress, "learning_rate": self._learning_rate(self.progress)}
+
+    def tensors(self) -> StoredTensors:
+        """See `StoredLearner.tensors`."""
+        random = {"shuffling": self.random.get_state()}
+        return {PARAMETERS: dict(self.parameters.value), OPTIMISER: self.optimiser.state(), RANDOM: random}
+
+    def restore(self, stored: StoredTensors, updates: int) -> None:
+        """See `StoredLearner.restore`."""
+        for name in (PARAMETERS, OPTIMISER):
+            for key, tensor in self.tensors()[name].items():
+                tensor.copy_(stored[name][key])
+        self.random.set_state(stored[RANDOM]["shuffling"])
+        self.updates = updates
 
 
 def _flattened(network: FusionNetwork) -> FlatParameters:

@@ -27,6 +27,7 @@ from caraware.learn.gae import generalised_advantage
 from caraware.learn.networks import GaussianPolicy, entropy, log_probability
 from caraware.learn.prediction import Predictor, RowPredictor
 from caraware.learn.rollout import Horizon
+from caraware.learn.stored import MEMORY, OPTIMISER, PARAMETERS, RANDOM, LearnerShape, StoredTensors
 from caraware.tasks.contract import Task, TaskStep
 
 SMALLEST_DEVIATION = 1e-8
@@ -529,6 +530,41 @@ class Ppo:
 
     def restore_memory(self, tensors: dict[str, Tensor]) -> None:
         """Continue with what `memory_tensors` returned; with nothing, forget everything."""
+
+    def shape(self) -> LearnerShape:
+        """See `StoredLearner.shape`."""
+        config = self.config
+        return LearnerShape("ppo", self.observation_size, config.network, config.hidden, config.activation)
+
+    def schedules(self) -> dict[str, float]:
+        """See `StoredLearner.schedules`; before the first update, those of that one."""
+        now = ScheduledValues.at(self.config, max(self.updates - 1, 0), self.progress)
+        return {
+            "progress": self.progress,
+            "learning_rate": now.learning_rate,
+            "clip_epsilon": now.clip_epsilon,
+            "entropy_scale": now.entropy_scale,
+        }
+
+    def tensors(self) -> StoredTensors:
+        """See `StoredLearner.tensors`."""
+        random = {name: generator.get_state() for name, generator in self._generators().items()}
+        memory = self.memory_tensors()
+        files = {PARAMETERS: self.updater.parameters(), OPTIMISER: self.updater.moments(), RANDOM: random}
+        return files | ({MEMORY: memory} if memory else {})
+
+    def restore(self, stored: StoredTensors, updates: int) -> None:
+        """See `StoredLearner.restore`."""
+        for name, tensor in self.updater.parameters().items():
+            tensor.copy_(stored[PARAMETERS][name])
+        self.updater.restore_moments(stored[OPTIMISER])
+        for name, generator in self._generators().items():
+            generator.set_state(stored[RANDOM][name])
+        self.restore_memory(stored.get(MEMORY, {}))
+        self.updates = updates
+
+    def _generators(self) -> dict[str, torch.Generator]:
+        return self.sampling_generators() | {"shuffling": self.shuffling}
 
 
 def finite(what: str, value: Tensor, now: ScheduledValues) -> float:

@@ -48,8 +48,13 @@ class Supervised:
         self._metres_per_action = corner - centre
 
     def tensors(self) -> dict[str, Tensor]:
-        """Parameters and moments by name, for a checkpoint; filling them restores the baseline."""
+        """Parameters and moments by name, for a checkpoint."""
         return dict(self.mlp.parameters.value) | self.optimiser.state()
+
+    def restore(self, stored: dict[str, Tensor]) -> None:
+        """Continue with what `tensors` returned."""
+        for name, tensor in self.tensors().items():
+            tensor.copy_(stored[name])
 
     @torch.no_grad()
     def predict_m(self, observation: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Checkpoints: directories of safetensors and a manifest, complete or absent, verified when read."""
+"""Checkpoints of any learner: directories of safetensors and a manifest, complete or absent, verified when read."""
 
 import hashlib
 import json
@@ -14,11 +14,9 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from caraware.learn.config import TrainerConfig
-from caraware.learn.ppo import Ppo, ScheduledValues
-from caraware.learn.supervised import Supervised
+from caraware.learn.stored import MEMORY, RANDOM, SUPERVISED, LearnerShape, StoredLearner, StoredTensors
 from caraware.report.evaluation import EvaluationResult
 from caraware.report.metrics import TrainingPoint
-from caraware.run.environment import Place
 from caraware.run.manifest import (
     BEST,
     COURSE,
@@ -29,25 +27,20 @@ from caraware.run.manifest import (
     CheckpointError,
     Counters,
     Manifest,
-    Schedules,
     best_checkpoint,
     own_hash,
     read_manifest,
     verified,
 )
+from caraware.run.stream_position import StreamPosition
 
-PARAMETERS = "parameters.safetensors"
-OPTIMISER = "optimiser.safetensors"
-RANDOM = "random.safetensors"
 POINTS = "points.safetensors"
-MEMORY = "memory.safetensors"
-"""What networks remember of trajectories at the committed tick; those that see one moment have none."""
-SUPERVISED = "supervised.safetensors"
-"""Of the baseline beside PPO; a checkpoint of a run without it has none, and the baseline then begins anew."""
+ONLY_HERE = (COURSE, POINTS)
+"""Files of a checkpoint that are not the learner's."""
 
 
 @dataclass(frozen=True)
-class Course:
+class TrainingHistory:
     """What a successor cannot compute again: how training went up to the checkpoint."""
 
     received_ticks: int = 0
@@ -59,10 +52,33 @@ class Course:
     """Newest tick of `evaluations`; -1 before the first."""
     evaluations: list[EvaluationResult] = field(default_factory=list)
     training: list[TrainingPoint] = field(default_factory=list)
-    others: list[Place] = field(default_factory=list)
-    """The environments after the first, of which `Counters` and the fields above tell."""
+    others: list[StreamPosition] = field(default_factory=list)
+    """The environments after the first, which `Counters` and the fields above describe."""
     curriculum: dict[str, Any] = field(default_factory=dict)
     """`caraware.run.curriculum.Standing`; empty without a curriculum."""
+
+    @classmethod
+    def of(cls, first: StreamPosition, **others: Any) -> "TrainingHistory":
+        """With the position of the first environment; what `Counters` holds of it is left out."""
+        return cls(
+            received_ticks=first.received_ticks,
+            lost_ticks=first.lost_ticks,
+            duplicated_ticks=first.duplicated_ticks,
+            evaluated_tick=first.evaluated_tick,
+            **others,
+        )
+
+    def first_position(self, counters: Counters) -> StreamPosition:
+        """The position of the first environment."""
+        return StreamPosition(
+            committed_tick=counters.committed_tick,
+            received_ticks=self.received_ticks,
+            lost_ticks=self.lost_ticks,
+            duplicated_ticks=self.duplicated_ticks,
+            evaluated_tick=self.evaluated_tick,
+            next_episode=counters.next_episode,
+            next_episode_tick=counters.next_episode_tick,
+        )
 
 
 @dataclass(frozen=True)
@@ -75,55 +91,49 @@ class Keeping:
 
     @classmethod
     def of(cls, config: TrainerConfig) -> "Keeping":
-        """As configured. Ranks keep two at least: killed amid a checkpoint they go on from the one before."""
+        """As configured. Ranks keep two at least: killed amid a checkpoint they continue from the one before."""
         least = 2 if config.ranks > 1 else 1
         return cls(max(config.checkpoints_kept, least), config.checkpoint_keep_every)
 
 
 def save_checkpoint(
     folder: Path,
-    ppo: Ppo,
+    learner: StoredLearner,
     counters: Counters,
     config_sha256: str,
     keep: Keeping,
-    course: Course | None = None,
-    random: dict[str, Tensor] | None = None,
-    memory: dict[str, Tensor] | None = None,
-    supervised: Supervised | None = None,
+    history: TrainingHistory | None = None,
+    of_other_ranks: StoredTensors | None = None,
 ) -> Path:
     """Write `folder/update-NNNNNN`, then point `folder/latest` at it; older ones that `keep` does not name are removed.
 
-    Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there. `random`
-    and `memory` add the generators of other ranks and what they remember of their environments.
+    Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there.
     """
     target = folder / checkpoint_name(counters.updates)
     temporary = folder / f".{target.name}.partial"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
-    tensors_of = _tensors(ppo, supervised)
-    tensors_of[RANDOM] |= random or {}
-    files = {name: _write(temporary / name, save(tensors)) for name, tensors in tensors_of.items()}
-    if memory := (memory or {}) | ppo.memory_tensors():
-        files[MEMORY] = _write(temporary / MEMORY, save(memory))
-    if course is not None:
-        rows = torch.tensor([astuple(point) for point in course.training], dtype=torch.float64)
+    # The tensors of the learner, and of ranks that learn with it.
+    tensors, beside = learner.tensors(), of_other_ranks or {}
+    merged = {name: beside.get(name, {}) | tensors.get(name, {}) for name in tensors | beside}
+    files = {name: _write(temporary / name, save(_contiguous(named))) for name, named in merged.items()}
+    if history is not None:
+        rows = torch.tensor([astuple(point) for point in history.training], dtype=torch.float64)
         files[POINTS] = _write(temporary / POINTS, save({"training": rows}))
-        rest = asdict(course) | {"training": None}
+        rest = asdict(history) | {"training": None}
         files[COURSE] = _write(temporary / COURSE, json.dumps(rest).encode())
     manifest = Manifest(
         schema_version=SCHEMA_VERSION,
         torch_version=torch.__version__,
         config_sha256=config_sha256,
-        observation_size=ppo.observation_size,
-        hidden=ppo.config.hidden,
-        network=ppo.config.network,
-        activation=ppo.config.activation,
         counters=counters,
-        schedules=_schedules(ppo),
+        schedules=learner.schedules(),
         files=files,
+        **asdict(learner.shape()),
     )
     entries = asdict(manifest)
     _write(temporary / MANIFEST, json.dumps(entries | {OWN_HASH: own_hash(entries)}, indent=2).encode())
+    # From one moment to the next it is there under its name.
     _sync_directory(temporary)
     if target.exists():
         shutil.rmtree(target)
@@ -143,63 +153,52 @@ def mark_best(checkpoint: Path) -> None:
     _point(checkpoint.parent, BEST, checkpoint)
 
 
-def _schedules(ppo: Ppo) -> Schedules:
-    """Of the newest update; before the first, of that one."""
-    now = ScheduledValues.at(ppo.config, max(ppo.updates - 1, 0), ppo.progress)
-    return Schedules(ppo.progress, now.learning_rate, now.clip_epsilon, now.entropy_scale)
-
-
-def load_checkpoint(checkpoint: Path, ppo: Ppo, supervised: Supervised | None = None) -> Counters:
+def load_checkpoint(checkpoint: Path, learner: StoredLearner) -> Counters:
     """Verify a checkpoint and continue from it, bit for bit on a CPU. Raises `CheckpointError`."""
     manifest = read_manifest(checkpoint)
-    _check_network(checkpoint / MANIFEST, manifest, ppo)
-    own = _tensors(ppo, supervised)
-    current = {name: tensors for name, tensors in own.items() if name != SUPERVISED or name in manifest.files}
+    _check_shape(checkpoint / MANIFEST, manifest, learner.shape())
     stored = {
-        name: _read_tensors(checkpoint / name, digest) for name, digest in manifest.files.items() if name in current
+        name: _read_tensors(checkpoint / name, digest)
+        for name, digest in manifest.files.items()
+        if name not in ONLY_HERE
     }
-    memory = _read_tensors(checkpoint / MEMORY, manifest.files[MEMORY]) if MEMORY in manifest.files else {}
-    for name, tensors in current.items():
-        found = set(stored.get(name, {}))
-        # A checkpoint of several ranks holds the generators of all.
-        if not found.issuperset(tensors) or (name != RANDOM and found != set(tensors)):
-            raise CheckpointError(checkpoint / name, "does not hold the tensors of this trainer")
-        if name != OPTIMISER:
-            for key, tensor in tensors.items():
-                tensor.copy_(stored[name][key])
-    ppo.updater.restore_moments(stored[OPTIMISER])
-    for name, generator in ppo.sampling_generators().items():
-        generator.set_state(stored[RANDOM][name])
-    ppo.shuffling.set_state(stored[RANDOM]["shuffling"])
-    ppo.restore_memory(memory)
-    ppo.updates = manifest.counters.updates
+    # Nothing is changed before every file is read and fits.
+    for name, tensors in learner.tensors().items():
+        if name != MEMORY and (name != SUPERVISED or name in stored):
+            _check_tensors(checkpoint / name, stored.get(name, {}), tensors)
+    learner.restore(stored, manifest.counters.updates)
     return manifest.counters
 
 
-def _check_network(file: Path, manifest: Manifest, ppo: Ppo) -> None:
-    """Raises `CheckpointError` where the networks are others."""
-    expected = {"observation_size": ppo.observation_size}
-    expected |= {name: getattr(ppo.config, name) for name in ("network", "hidden", "activation")}
-    for name, own in expected.items():
+def _check_shape(file: Path, manifest: Manifest, shape: LearnerShape) -> None:
+    """Raises `CheckpointError` where the learner or its networks are others."""
+    for name, own in asdict(shape).items():
         if (found := getattr(manifest, name)) != own:
             raise CheckpointError(file, f"its {name} is {found}, this run's is {own}")
 
 
-def load_course(checkpoint: Path) -> Course:
+def _check_tensors(file: Path, stored: dict[str, Tensor], own: dict[str, Tensor]) -> None:
+    """Raises `CheckpointError` where names or shapes differ. Of several ranks, a checkpoint holds all generators."""
+    names_fit = set(stored).issuperset(own) if file.name == RANDOM else set(stored) == set(own)
+    if not names_fit or any(stored[name].shape != tensor.shape for name, tensor in own.items()):
+        raise CheckpointError(file, "does not hold the tensors of this trainer")
+
+
+def load_history(checkpoint: Path) -> TrainingHistory:
     """How training went up to a checkpoint; nothing if it was saved without. Raises `CheckpointError`."""
     files = read_manifest(checkpoint).files
     if COURSE not in files:
-        return Course()
+        return TrainingHistory()
     rest = json.loads(verified(checkpoint / COURSE, files[COURSE]))
     rows = _read_tensors(checkpoint / POINTS, files[POINTS])["training"].tolist()
     evaluations = [EvaluationResult.restored(result) for result in rest.pop("evaluations")]
-    others = [Place(**place) for place in rest.pop("others", [])]
+    others = [StreamPosition(**position) for position in rest.pop("others", [])]
     training = [TrainingPoint(int(steps), *values) for steps, *values in rows]
-    return Course(**rest | {"evaluations": evaluations, "training": training, "others": others})
+    return TrainingHistory(**rest | {"evaluations": evaluations, "training": training, "others": others})
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove what a killed trainer left half-written. Nobody may be writing."""
+    """Remove what a killed trainer left half-written; no other process may be writing."""
     for partial in folder.glob(".*.partial"):
         if partial.is_dir():
             shutil.rmtree(partial)
@@ -207,12 +206,9 @@ def remove_partial(folder: Path) -> None:
             partial.unlink()
 
 
-def _tensors(ppo: Ppo, supervised: Supervised | None) -> dict[str, dict[str, Tensor]]:
-    """Every tensor of the trainer by file and name. Filling them loads them, but for the optimisers' moments."""
-    random = {name: generator.get_state() for name, generator in ppo.sampling_generators().items()}
-    random["shuffling"] = ppo.shuffling.get_state()
-    tensors = {PARAMETERS: ppo.updater.parameters(), OPTIMISER: ppo.updater.moments(), RANDOM: random}
-    return tensors | ({SUPERVISED: supervised.tensors()} if supervised is not None else {})
+def _contiguous(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors as safetensors stores them."""
+    return {name: tensor.contiguous() for name, tensor in tensors.items()}
 
 
 def _read_tensors(file: Path, sha256: str) -> dict[str, Tensor]:

@@ -16,6 +16,8 @@ from typing import Any
 log = logging.getLogger(__name__)
 
 SCHEMA_VERSION = 2
+EARLIER_FUSION = "caraware-fusion-1"
+"""Format of the learned estimator's checkpoints before all learners had one."""
 MANIFEST = "manifest.json"
 COURSE = "course.json"
 """How training went, and where the environments after the first stand."""
@@ -51,16 +53,6 @@ class Counters:
 
 
 @dataclass(frozen=True)
-class Schedules:
-    """Where what changes over training stood in the update that the checkpoint follows."""
-
-    progress: float
-    learning_rate: float
-    clip_epsilon: float
-    entropy_scale: float
-
-
-@dataclass(frozen=True)
 class Manifest:
     """What `manifest.json` says."""
 
@@ -70,12 +62,15 @@ class Manifest:
     observation_size: int
     hidden: tuple[int, ...]
     counters: Counters
-    schedules: Schedules
+    schedules: dict[str, float]
+    """Where the values that change over training stood in the update that the checkpoint follows."""
     files: dict[str, str]
     """Name to SHA-256. `random.safetensors` holds the states of the random numbers."""
     network: str = "mlp"
     activation: str = "relu"
     """Of the hidden layers; a manifest without these two is of a time when there was no other."""
+    learner: str = "ppo"
+    """Or `fusion`; a manifest without it is of a time when the learned estimator had a format of its own."""
 
 
 def best_checkpoint(folder: Path) -> Path | None:
@@ -122,12 +117,14 @@ def read_manifest(checkpoint: Path) -> Manifest:
     file = checkpoint / MANIFEST
     try:
         raw = json.loads(file.read_bytes())
+        if "format" in raw and raw["format"] == EARLIER_FUSION:
+            raise CheckpointError(file, "is of the learned estimator's earlier format, which is not read any more")
         if raw["schema_version"] != SCHEMA_VERSION:
             raise CheckpointError(file, f"schema version {raw['schema_version']}, this trainer reads {SCHEMA_VERSION}")
         stated, found = raw.pop(OWN_HASH), own_hash(raw)
         if stated != found:
             raise CheckpointError(file, f"is damaged: SHA-256 {found[:12]}…, it says {stated[:12]}…")
-        parts = {"counters": Counters(**raw["counters"]), "schedules": Schedules(**raw["schedules"])}
+        parts = {"counters": Counters(**raw["counters"])}
         return Manifest(**raw | parts | {"hidden": tuple(raw["hidden"])})
     except OSError as error:
         raise CheckpointError(file, f"cannot be read ({error.strerror})") from error

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from torch import Tensor
@@ -17,10 +17,11 @@ from caraware.ipc.arrays import Float32Array, FloatArray
 from caraware.ipc.names import Names
 from caraware.ipc.run_file import RunFile
 from caraware.ipc.stream import Channel, Observation
+from caraware.learn.prediction import Predictor
 from caraware.report.evaluation import errors_m
 from caraware.report.statistics import mean_interval
 from caraware.run.config import RunConfig
-from caraware.run.loop import RECEIVE_TIMEOUT_S, Learner
+from caraware.run.loop import RECEIVE_TIMEOUT_S
 
 LIVE = "live.json"
 """File in the run's directory with the newest table."""
@@ -29,7 +30,7 @@ ESTIMATORS = ("ppo", "ekf", "raw_gnss")
 
 
 @dataclass
-class Sums:
+class ErrorSums:
     """Samples, and the sum of each estimator's position error over them, in metres."""
 
     samples: int = 0
@@ -47,13 +48,13 @@ class Sums:
 
 
 @dataclass
-class Tally:
-    """Everything counted so far, up to and including `tick`; what a successor goes on from."""
+class PlayTally:
+    """Everything counted so far, up to and including `tick`; a successor continues from it."""
 
     tick: int = -1
     episode: int = 0
-    sums: Sums = field(default_factory=Sums)
-    running: Sums = field(default_factory=Sums)
+    sums: ErrorSums = field(default_factory=ErrorSums)
+    running: ErrorSums = field(default_factory=ErrorSums)
     """Of the episode at work."""
     episodes: list[dict[str, float]] = field(default_factory=list)
     """Mean errors of each whole episode: each had a seed of its own."""
@@ -61,17 +62,17 @@ class Tally:
     """Most at a time."""
 
     @classmethod
-    def read(cls, file: Path) -> "Tally":
+    def read(cls, file: Path) -> "PlayTally":
         """Of a predecessor; a new one if there is none."""
         try:
             raw = json.loads(file.read_text())["tally"]
         except (OSError, ValueError, KeyError):
             return cls()
-        return cls(**raw | {"sums": Sums(**raw["sums"]), "running": Sums(**raw["running"])})
+        return cls(**raw | {"sums": ErrorSums(**raw["sums"]), "running": ErrorSums(**raw["running"])})
 
     def begin_episode(self, episode: int) -> None:
         """The ticks that follow belong to this episode."""
-        self.running, self.episode = Sums(), episode
+        self.running, self.episode = ErrorSums(), episode
 
     def end_episode(self) -> None:
         """The episode at work is over."""
@@ -82,13 +83,13 @@ class Tally:
 class Scoreboard:
     """Position errors of policy, EKF and raw fix, of each vehicle at this tick and over its time on the road."""
 
-    def __init__(self, run: RunFile, config: RunConfig, tally: Tally) -> None:
+    def __init__(self, run: RunFile, config: RunConfig, tally: PlayTally) -> None:
         assert config.sensors is not None
         self.tally = tally
         self._noise = config.sensors
         self._names = Names(run)
         self._ekf = Ekf(self._noise)
-        self._of_vehicle: dict[int, tuple[str, Sums]] = {}
+        self._of_vehicle: dict[int, tuple[str, ErrorSums]] = {}
         self._now: dict[int, dict[str, float]] = {}
         self._sim_time_s = 0.0
 
@@ -110,7 +111,7 @@ class Scoreboard:
         for place, row in enumerate(rows):
             vehicle = int(obs.vehicle[row])
             if vehicle not in self._of_vehicle:
-                self._of_vehicle[vehicle] = (self._names.of(obs.id_hash[row]), Sums())
+                self._of_vehicle[vehicle] = (self._names.of(obs.id_hash[row]), ErrorSums())
             self._of_vehicle[vehicle][1].add({name: values[place : place + 1] for name, values in error_m.items()})
             self._now[vehicle] = {name: float(values[place]) for name, values in error_m.items()}
         if obs.episode_last:
@@ -147,19 +148,34 @@ class Scoreboard:
         partial.rename(file)
 
 
+class PlayedPolicy(Protocol):
+    """A trained policy: `Ppo`, or the learned estimator."""
+
+    @property
+    def updates(self) -> int:
+        """Updates that it has learned from."""
+        ...
+
+    def sigma(self) -> float:
+        """Standard deviation of the policy, mean over the actions; 1 is half the map."""
+        ...
+
+    def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> Predictor:
+        """A predictor for the ticks of a stream as they come."""
+        ...
+
+
 class PlayLoop:
     """Ticks in, predictions out."""
 
     def __init__(
-        self, channel: Channel, config: RunConfig, learner: Learner, stop_requested: Callable[[], bool]
+        self, channel: Channel, config: RunConfig, policy: PlayedPolicy, stop_requested: Callable[[], bool]
     ) -> None:
-        self._channel, self._config, self._learner, self._stop_requested = channel, config, learner, stop_requested
+        self._channel, self._config, self._policy, self._stop_requested = channel, config, policy, stop_requested
         self._live = config.run_dir / LIVE
-        self._board = Scoreboard(channel.run, config, Tally.read(self._live))
+        self._board = Scoreboard(channel.run, config, PlayTally.read(self._live))
         self._shown_at = -math.inf
-        # What the checkpoint remembers is of another run's vehicles.
-        learner.ppo.restore_memory({})
-        self._predictor = learner.ppo.predictor(config.dark_is_nan, evaluations_alone=False)
+        self._predictor = policy.predictor(config.dark_is_nan, evaluations_alone=False)
 
     def run(self) -> None:
         """Predict until the last tick or a request to stop; then write `parts/trainer.json`."""
@@ -167,7 +183,7 @@ class PlayLoop:
         while not ended and not self._stop_requested():
             ticks = self._channel.receive(RECEIVE_TIMEOUT_S)
             if ticks:
-                self._take(ticks)
+                self._process(ticks)
                 ended = ticks[-1].last
             if time.monotonic() - self._shown_at >= SHOW_EVERY_S:
                 self._show()
@@ -176,15 +192,16 @@ class PlayLoop:
         if ended:
             self._channel.done()
 
-    def _take(self, ticks: Sequence[Observation]) -> None:
-        updates = self._learner.ppo.updates
+    def _process(self, ticks: Sequence[Observation]) -> None:
+        """Predict, compare and publish; return the credit."""
+        updates = self._policy.updates
         for obs, predicted_m in zip(ticks, self._predictor.predict_m({0: ticks})[0], strict=True):
             self._board.add(obs, predicted_m)
             self._channel.publish_predictions(obs, predicted_m, updates, self._board.estimates_m(obs))
             self._channel.consumed(obs.tick)
 
     def _show(self) -> None:
-        """Everything up to here is in the file: nobody needs to deliver it again."""
+        """Write the file; the ticks in it need not be delivered again."""
         self._shown_at = time.monotonic()
         tally = self._board.tally
         if tally.tick < 0:
@@ -195,8 +212,8 @@ class PlayLoop:
         self._channel.report(
             episode=tally.episode,
             env_steps=tally.sums.samples,
-            updates=self._learner.ppo.updates,
-            policy_std=self._learner.ppo.sigma(),
+            updates=self._policy.updates,
+            policy_std=self._policy.sigma(),
             metrics={"error_m": mean("ppo") or math.nan, "raw_gnss_error_m": mean("raw_gnss") or math.nan},
         )
 
@@ -206,8 +223,8 @@ class PlayLoop:
         part = {
             "env_steps": tally.sums.samples,
             "checkpoint": str(self._config.resume_from),
-            "policy_std": self._learner.ppo.sigma(),
-            "updates": self._learner.ppo.updates,
+            "policy_std": self._policy.sigma(),
+            "updates": self._policy.updates,
             "vehicles": tally.vehicles,
             "evaluation_seeds": len(tally.episodes),
             "episodes": tally.episodes,

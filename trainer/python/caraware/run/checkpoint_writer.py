@@ -1,0 +1,99 @@
+"""When and what a training run commits: its environments, on rank 0 those of all ranks, and the best policy."""
+
+import logging
+from collections.abc import Sequence
+
+from caraware.learn.ranks import Ranks
+from caraware.learn.stored import MEMORY, RANDOM, StoredTensors
+from caraware.report.evaluation import EvaluationResult
+from caraware.report.metrics import Metrics
+from caraware.run.checkpoint import Keeping, TrainingHistory, checkpoint_name, mark_best, save_checkpoint
+from caraware.run.config import RunConfig
+from caraware.run.curriculum import Curriculum
+from caraware.run.environment import Environment
+from caraware.run.learner import Learner
+from caraware.run.manifest import Counters
+from caraware.run.stream_position import StreamPosition
+
+log = logging.getLogger("caraware.run.loop")
+
+
+class CheckpointWriter:
+    """Writes the checkpoints of a run, then reports to the simulation up to which tick it may forget."""
+
+    def __init__(
+        self,
+        config: RunConfig,
+        ranks: Ranks,
+        environments: Sequence[Environment],
+        curriculum: Curriculum,
+        metrics: Metrics,
+    ) -> None:
+        self._config, self._ranks, self._environments = config, ranks, environments
+        self._curriculum, self._metrics = curriculum, metrics
+        self._folder = config.run_dir / "checkpoints"
+        self.saved_updates = -1
+        """Updates in the newest checkpoint; -1 before the first."""
+
+    def write(self, learner: Learner, trained_steps: int, episode: int, vehicles: int) -> None:
+        """Commit everything learned so far, from `trained_steps` samples."""
+        progress = self._environments[0].progress
+        next_episode, next_episode_tick = progress.starts.after(progress.committed_tick)
+        counters = Counters(
+            learner.ppo.updates, trained_steps, episode, progress.committed_tick, next_episode, next_episode_tick
+        )
+        others, of_other_ranks = self._of_other_ranks(learner)
+        history = self._history(vehicles, others)
+        keep, config_sha256 = Keeping.of(self._config.trainer), self._config.config_sha256
+        saved = save_checkpoint(self._folder, learner, counters, config_sha256, keep, history, of_other_ranks)
+        log.info("checkpoint %s, learned up to tick %d", saved.name, progress.committed_tick)
+        # Ticks may be forgotten when all ranks have written their checkpoints.
+        self._ranks.gather(None)
+        self.saved_updates = counters.updates
+        for environment in self._environments:
+            if environment.progress.committed_tick >= 0:
+                environment.channel.committed(environment.progress.committed_tick)
+
+    def is_best(self, result: EvaluationResult) -> bool:
+        """Whether no policy evaluated before had less error.
+
+        Ranks would have to agree on it, and environments to have finished the same phase: only a run of one decides.
+        """
+        if self._ranks.size > 1 or len(self._environments) > 1 or result.policy_version == 0:
+            return False
+        errors_m = [other.ppo_mean_error_m for other in self._metrics.evaluations if other.policy_version > 0]
+        return result.ppo_mean_error_m <= min(errors_m)
+
+    def mark_best(self, updates: int) -> None:
+        """Let `best` name the checkpoint after so many updates."""
+        mark_best(self._folder / checkpoint_name(updates))
+
+    def _of_other_ranks(self, learner: Learner) -> tuple[list[StreamPosition], StoredTensors]:
+        """Positions of the other ranks' environments, states of their random numbers, and what networks remember.
+
+        A rank stores its own environments, from which it continues; rank 0's checkpoint is that of one trainer that
+        has them all.
+        """
+        ppo = learner.ppo
+        self._ranks.check_equal("the parameters", list(ppo.updater.parameters().values()))
+        states = {name: generator.get_state() for name, generator in ppo.sampling_generators().items()}
+        positions = [environment.progress.position() for environment in self._environments]
+        every_rank = self._ranks.gather((positions, states, ppo.memory_tensors()))
+        if self._ranks.rank > 0:
+            return [], {}
+        others = [position for theirs, *_ in every_rank[1:] for position in theirs]
+        random = {name: state for _, theirs, _ in every_rank for name, state in theirs.items()}
+        memory = {name: tensor for *_, theirs in every_rank for name, tensor in theirs.items()}
+        return others, {RANDOM: random} | ({MEMORY: memory} if memory else {})
+
+    def _history(self, vehicles: int, of_other_ranks: list[StreamPosition]) -> TrainingHistory:
+        """How training went, up to what the checkpoint contains."""
+        first, *others = (environment.progress.position() for environment in self._environments)
+        return TrainingHistory.of(
+            first,
+            vehicles=vehicles,
+            curriculum=self._curriculum.saved(),
+            evaluations=self._metrics.evaluations,
+            training=self._metrics.training,
+            others=[*others, *of_other_ranks],
+        )

@@ -1,0 +1,63 @@
+"""Evaluation phases of a run: ticks of evaluation episodes, environment by environment, until training continues."""
+
+import logging
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caraware.ipc.arrays import FloatArray
+from caraware.ipc.stream import Observation
+from caraware.learn.prediction import visible
+from caraware.learn.rewards import distance_m
+from caraware.learn.supervised import Supervised
+from caraware.report.evaluation import Evaluation, EvaluationResult, errors_m
+from caraware.run.config import RunConfig
+from caraware.run.stream_position import StreamProgress
+
+log = logging.getLogger("caraware.run.loop")
+
+
+class EvaluationPhase:
+    """The open evaluation phase of one environment, if there is one."""
+
+    def __init__(self, config: RunConfig, number: int) -> None:
+        """`number` is the index of the environment among those of all ranks."""
+        self._config, self._number = config, number
+        self._evaluation: Evaluation | None = None
+        self._newest_tick = -1
+
+    def add(
+        self,
+        progress: StreamProgress,
+        obs: Observation,
+        predicted_m: Tensor,
+        raw_m: FloatArray,
+        supervised: Supervised | None,
+    ) -> None:
+        """Count one tick, unless a predecessor has evaluated it; `raw_m` are the errors of raw GNSS."""
+        if obs.tick <= progress.evaluated_tick:
+            return
+        if self._evaluation is None:
+            self._evaluation = Evaluation(self._config.sensors, supervised=supervised is not None)
+        policy_m, _ = errors_m(obs, predicted_m)
+        self._evaluation.add(obs, policy_m, raw_m, self._supervised_errors_m(obs, supervised))
+        self._newest_tick = obs.tick
+
+    def finish(self, progress: StreamProgress, env_steps: int, updates: int) -> EvaluationResult | None:
+        """Close the phase after so many samples and updates; None if none was open."""
+        evaluation, self._evaluation = self._evaluation, None
+        result = evaluation.result(env_steps, updates, self._number) if evaluation else None
+        if result is not None:
+            progress.evaluated_tick = self._newest_tick
+            log.info("evaluation at %d env steps: %s", result.env_steps, result)
+        return result
+
+    def _supervised_errors_m(self, obs: Observation, supervised: Supervised | None) -> FloatArray | None:
+        """Errors of the baseline that learns beside the policy, on the valid rows; None without it."""
+        if supervised is None:
+            return None
+        rows = torch.from_numpy(np.flatnonzero(obs.valid))
+        observation = visible(obs, self._config.dark_is_nan)
+        predicted_m = supervised.predict_m(observation.index_select(0, rows))
+        return distance_m(predicted_m, obs.truth.index_select(0, rows)).numpy()

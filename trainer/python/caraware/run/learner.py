@@ -1,0 +1,89 @@
+"""The learner of a training run: PPO, the baseline beside it, and how far both have come."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from caraware.learn.build import build_ppo
+from caraware.learn.ppo import Ppo
+from caraware.learn.ranks import Ranks
+from caraware.learn.stored import SUPERVISED, LearnerShape, StoredTensors
+from caraware.learn.supervised import Supervised
+from caraware.run.checkpoint import TrainingHistory, load_checkpoint, load_history
+from caraware.run.config import RunConfig
+from caraware.run.manifest import Counters
+from caraware.run.stream_position import StreamPosition
+from caraware.tasks.localisation import Localisation
+
+
+@dataclass
+class Learner:
+    """Policy, value network and how far they have come: new, or continued from a checkpoint."""
+
+    ppo: Ppo
+    supervised: Supervised | None
+    """The baseline by regression, taught from the same batches."""
+    counters: Counters
+    history: TrainingHistory
+
+    @classmethod
+    def begin(cls, config: RunConfig, observation_size: int, ranks: Ranks | None = None) -> "Learner":
+        """A learner for observations of this size, continued from `config.resume_from`. Raises `CheckpointError`."""
+        trainer = config.trainer
+        ppo = build_ppo(trainer, observation_size, config.task, config.environments, ranks)
+        beside = None
+        if trainer.supervised and isinstance(config.task, Localisation):
+            beside = Supervised(trainer, observation_size, config.task, ppo.device, ranks)
+        learner = cls(ppo, beside, Counters(0, 0, 0, -1), TrainingHistory())
+        if config.resume_from is not None:
+            learner.load(config.resume_from)
+        return learner
+
+    def warm_up(self) -> None:
+        """Make a first prediction now, so that the next one does not wait for what it initialises."""
+        self.ppo.predict_m([torch.zeros(1, self.ppo.observation_size)])
+
+    def load(self, checkpoint: Path) -> None:
+        """Continue from a checkpoint. Raises `CheckpointError`."""
+        self.counters, self.history = load_checkpoint(checkpoint, self), load_history(checkpoint)
+
+    def take_parameters(self, checkpoint: Path) -> None:
+        """Parameters, moments and generators of any checkpoint; the count of updates and ticks stays this run's."""
+        updates = self.ppo.updates
+        load_checkpoint(checkpoint, self)
+        self.ppo.updates = updates
+        # What another network remembers of other ticks says nothing about this run's.
+        self.ppo.restore_memory({})
+
+    def positions(self) -> list[StreamPosition]:
+        """How far each environment has come; one that the checkpoint does not know is at its beginning."""
+        return [self.history.first_position(self.counters), *self.history.others]
+
+    def first_tick(self, environment: int = 0) -> int:
+        """The first tick of an environment that is not in the checkpoint."""
+        positions = self.positions()
+        return positions[environment].committed_tick + 1 if environment < len(positions) else 0
+
+    def for_play(self) -> Ppo:
+        """The policy without its memory of the vehicles of the run that trained it."""
+        self.ppo.restore_memory({})
+        return self.ppo
+
+    def shape(self) -> LearnerShape:
+        """See `StoredLearner.shape`."""
+        return self.ppo.shape()
+
+    def schedules(self) -> dict[str, float]:
+        """See `StoredLearner.schedules`."""
+        return self.ppo.schedules()
+
+    def tensors(self) -> StoredTensors:
+        """See `StoredLearner.tensors`."""
+        return self.ppo.tensors() | ({SUPERVISED: self.supervised.tensors()} if self.supervised else {})
+
+    def restore(self, stored: StoredTensors, updates: int) -> None:
+        """See `StoredLearner.restore`."""
+        self.ppo.restore(stored, updates)
+        if self.supervised is not None and SUPERVISED in stored:
+            self.supervised.restore(stored[SUPERVISED])

@@ -1,0 +1,23 @@
+"""The trainer's part of a run's report, `parts/trainer.json`."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from caraware.report.evaluation import NO_HEADLINE, EvaluationResult
+
+RTS_NOTE = "the smoother sees the future: a bound, not an estimator"
+
+
+def write_part(run_dir: Path, entries: Mapping[str, object], phases: Sequence[EvaluationResult]) -> None:
+    """Write the part with these entries. The headline errors are the last evaluation's."""
+    part = {
+        **entries,
+        **(phases[-1].headline() if phases else NO_HEADLINE),
+        "rts_note": RTS_NOTE,
+        "evaluations": [asdict(result) for result in phases],
+    }
+    file = run_dir / "parts" / "trainer.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(part, indent=2) + "\n")
