@@ -1,7 +1,7 @@
-//! Cost of keeping a tick of the town in the journal: 12 kB a message, a commit now and then.
+//! Cost of adding a tick of the town to the journal: 12 kB a message, with a commit at the interval of the default preset.
 //! `cargo bench -p sensor-daemon --bench journal`
 
-#![expect(clippy::unwrap_used, reason = "a measurement that cannot run says why and ends")]
+#![expect(clippy::unwrap_used, reason = "a benchmark that cannot run panics with the reason")]
 
 use std::time::Instant;
 

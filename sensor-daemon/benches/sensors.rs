@@ -1,12 +1,12 @@
-//! Cost of sensing: GNSS, IMU, speed and steering, observation, for 5 000 vehicles on one core: with the default preset, and with ten
-//! IMU samples in a tick and every error that there is. `cargo bench -p sensor-daemon`
+//! Cost of GNSS, IMU, speed and steering sensors and observations of 5 000 vehicles on one core: with the default preset, and with ten
+//! IMU samples in a tick and all errors. `cargo bench -p sensor-daemon`
 
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
     reason = "tests and measurements assert by unwrapping"
 )]
-#![expect(clippy::panic, reason = "a benchmark that cannot run says why and ends")]
+#![expect(clippy::panic, reason = "a benchmark that cannot run panics with the reason")]
 
 use std::time::Instant;
 
@@ -18,11 +18,11 @@ use ipc_schema::{
     world::{SubStep, VehicleState},
 };
 use sensor_daemon::{
-    imu::{Body, Unit},
-    noise::Draws,
-    normals::LANES,
-    sensing::{Sensing, World},
-    wide::Path,
+    imu::{ImuModel, ImuMotion},
+    noise::NormalDraws,
+    normals::BATCH,
+    sensing::{Sensing, WorldTick},
+    wide::VectorPath,
 };
 
 const VEHICLES: u32 = 5000;
@@ -120,7 +120,7 @@ fn round(config: &Config) -> f64 {
     let mut sensing = Sensing::new(config, &map).unwrap_or_else(|error| panic!("{error}"));
     let states = states();
     let sub_steps = vec![SubStep::default(); states.len() * SUB_STEPS];
-    let world = World {
+    let world = WorldTick {
         states: &states,
         sub_steps: &sub_steps,
         views: &[],
@@ -145,27 +145,27 @@ fn round(config: &Config) -> f64 {
     start.elapsed().as_secs_f64() * 1e6 / (TICKS as f64 * f64::from(VEHICLES))
 }
 
-/// Microseconds per sample of the IMU, its numbers included: 16 vehicles, ten samples a tick.
+/// Microseconds per sample of the IMU, including its random numbers: 16 vehicles, ten samples a tick.
 fn imu_alone(config: &Config) -> f64 {
     const RUNS: u32 = 5000;
-    let unit = Unit::new(&config.imu, SUB_STEPS);
-    let mut draws = Draws::default();
+    let unit = ImuModel::new(&config.imu, SUB_STEPS);
+    let mut draws = NormalDraws::default();
     let rows = [SubStep::default(); SUB_STEPS];
-    let body = Body {
+    let body = ImuMotion {
         yaw_rad: 1.0,
         rows: &rows,
     };
-    let ids: [u64; LANES] = std::array::from_fn(|lane| lane as u64);
-    let (mut walks, mut out) = ([[0.0; 8]; LANES], [[0.0; 7]; SUB_STEPS]);
+    let ids: [u64; BATCH] = std::array::from_fn(|member| member as u64);
+    let (mut walks, mut out) = ([[0.0; 8]; BATCH], [[0.0; 7]; SUB_STEPS]);
     let start = Instant::now();
     for run in 0..RUNS {
         draws.clear();
         unit.plan(&mut draws, run * SUB_STEPS as u32);
         draws.draw(1, &ids);
-        for (lane, walk) in walks.iter_mut().enumerate() {
-            unit.sample(Path::widest(), &body, draws.of(lane), walk, &mut out);
+        for (member, walk) in walks.iter_mut().enumerate() {
+            unit.sample(VectorPath::widest(), &body, draws.of(member), walk, &mut out);
             std::hint::black_box(&out);
         }
     }
-    start.elapsed().as_secs_f64() * 1e6 / (f64::from(RUNS) * (SUB_STEPS * LANES) as f64)
+    start.elapsed().as_secs_f64() * 1e6 / (f64::from(RUNS) * (SUB_STEPS * BATCH) as f64)
 }

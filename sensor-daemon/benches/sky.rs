@@ -1,11 +1,11 @@
-//! Cost of a look at the sky: open country, and streets between houses.
+//! Cost of one evaluation of the sky: in open country, and in streets between houses.
 //! `cargo bench -p sensor-daemon --bench sky`
 
-#![expect(clippy::panic, reason = "a benchmark that cannot run says why and ends")]
+#![expect(clippy::panic, reason = "a benchmark that cannot run panics with the reason")]
 
 use std::{hint::black_box, sync::Arc, time::Instant};
 
-use sensor_daemon::gnss::Sky as _;
+use sensor_daemon::gnss::SatelliteSky as _;
 use sensor_daemon::sky::SkyMap;
 use sim_core::{
     geodesy::Geodetic,
@@ -34,7 +34,7 @@ fn town() -> Vec<Prism> {
         .collect()
 }
 
-/// Nanoseconds for one look, vehicles everywhere on the first `streets` streets of `length_m`.
+/// Nanoseconds for one evaluation, with vehicles spread over the first `streets` streets of `length_m`.
 fn look_ns(map: &SkyMap, streets: u32, length_m: u32, time_s: f64) -> f64 {
     let start = Instant::now();
     for i in 0..LOOKS {

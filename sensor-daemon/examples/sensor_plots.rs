@@ -1,4 +1,4 @@
-//! Writes what the sensors deliver, as CSV: the figures of `docs/sensor-models.md` are drawn from it.
+//! Writes sensor values as CSV files, from which the figures of `docs/sensor-models.md` are drawn.
 //!
 //! `cargo run --release -p sensor-daemon --example sensor_plots -- DIR`. `imu.csv`: two hours at rest, x axes of accelerometer and
 //! gyroscope, with the parameters in `imu_model.csv`. `gnss.csv`: a drive past houses (`houses.csv`) with three kinds of error.
@@ -30,13 +30,13 @@ use ipc_schema::{
     world::{SubStep, VehicleState},
 };
 use sensor_daemon::{
-    gnss::{Sky as _, SkyView},
-    lidar::{Lidar, Scratch, Targets},
-    sensing::{Sensing, World},
+    gnss::{SatelliteSky as _, SkyView},
+    lidar::{LidarModel, ScanScratch, Targets},
+    sensing::{Sensing, WorldTick},
     sky::{
         ANTENNA_M, MOST_EXTRA_PATH_M, SkyMap,
-        constellation::Observer,
-        horizon::{Placed, SECTORS, Sky, Skyline},
+        constellation::SkyObserver,
+        horizon::{CellSky, PlacedSatellite, SECTORS, Skyline},
     },
 };
 use sim_core::{
@@ -102,12 +102,12 @@ fn main() -> io::Result<()> {
     write_sky(&mut create("horizons.csv")?, &mut create("satellites.csv")?)
 }
 
-/// One tick of 0.1 s after the other of one vehicle: the bytes of each observation go to `each`.
+/// Runs one vehicle in ticks of 0.1 s and passes the bytes of each observation to `each`.
 fn sense(
     sensing: &mut Sensing,
     ticks: u32,
     state: &dyn Fn(u32) -> Option<VehicleState>,
-    each: &mut dyn FnMut(u32, &Block),
+    each: &mut dyn FnMut(u32, &NormalBlock),
 ) {
     let mut header = MessageHeader {
         flags: FIRST_OF_EPISODE,
@@ -121,25 +121,25 @@ fn sense(
         let n = sensing.assign(&header, &states);
         let layout = ObservationLayout::new(n, sensing.width(), sensing.imu_samples());
         let mut payload = vec![0_u64; layout.len.div_ceil(8)];
-        let world = World {
+        let world = WorldTick {
             states: &states,
-            ..World::default()
+            ..WorldTick::default()
         };
         sensing
             .observe(&header, &world, bytemuck::cast_slice_mut(&mut payload))
             .unwrap();
-        each(tick, &Block { layout, payload });
+        each(tick, &NormalBlock { layout, payload });
         header.flags = 0;
     }
 }
 
 /// An observation.
-struct Block {
+struct NormalBlock {
     layout: ObservationLayout,
     payload: Vec<u64>,
 }
 
-impl Block {
+impl NormalBlock {
     fn section<T: bytemuck::Pod>(&self, section: Section) -> &[T] {
         block::view(bytemuck::cast_slice(&self.payload), section).unwrap()
     }
@@ -197,7 +197,7 @@ fn scene() -> Arc<Scene> {
     Arc::new(Scene::new(Road::default(), HOUSES.map(house).to_vec(), Vec::new()))
 }
 
-/// Where the drive is after a way, metres.
+/// Position on the drive after a distance, metres.
 fn place(mut way_m: f64) -> Option<[f64; 2]> {
     for pair in DRIVE.windows(2) {
         let along = [pair[1][0] - pair[0][0], pair[1][1] - pair[0][1]];
@@ -211,7 +211,7 @@ fn place(mut way_m: f64) -> Option<[f64; 2]> {
     None
 }
 
-/// Where the drive is at a tick.
+/// State of the vehicle on the drive at a tick.
 fn driven(tick: u32) -> Option<VehicleState> {
     let [x_m, y_m] = place(SPEED_MPS * GNSS_S * f64::from(tick))?;
     Some(VehicleState {
@@ -222,7 +222,7 @@ fn driven(tick: u32) -> Option<VehicleState> {
     })
 }
 
-/// The drive with each kind of error alone; the sky's with a little white noise to scale.
+/// The drive with each kind of error alone; the sky's error scales a little white noise.
 fn write_gnss(out: &mut impl Write) -> io::Result<()> {
     let info = map();
     let middle = Projection::new(&info)
@@ -268,12 +268,12 @@ fn write_gnss(out: &mut impl Write) -> io::Result<()> {
 /// Length, width and height of the vehicles on the street, metres.
 const CAR_M: [f32; 3] = [4.5, 1.8, 1.5];
 
-/// A scan amid the houses, other vehicles and persons around.
+/// A scan between the houses, with other vehicles and persons around.
 fn write_scan(out: &mut impl Write) -> io::Result<()> {
     let mut config = town();
     config.lidar.vehicles = 1;
     config.lidar.range_m = 80.0;
-    let lidar = Lidar::new(&config, &scene()).unwrap();
+    let lidar = LidarModel::new(&config, &scene()).unwrap();
     let road_user = |vehicle: u32, [x_m, y_m]: [f64; 2], yaw_rad: f64, kind: Kind| {
         let person = kind == Kind::Person;
         VehicleState {
@@ -308,7 +308,15 @@ fn write_scan(out: &mut impl Write) -> io::Result<()> {
     let mut targets = Targets::default();
     targets.update(&states, &vec![SubStep::default(); states.len()], 1);
     let (mut scan, mut points) = (Scan::default(), vec![LidarPoint::default(); lidar.max_points()]);
-    let count = lidar.scan(&targets, 0, 0, SEED, &mut Scratch::default(), &mut scan, &mut points);
+    let count = lidar.scan(
+        &targets,
+        0,
+        0,
+        SEED,
+        &mut ScanScratch::default(),
+        &mut scan,
+        &mut points,
+    );
     writeln!(out, "x_m,y_m,z_m,tag,intensity")?;
     for point in &points[..count] {
         let [x, y, z] = point.position_m;
@@ -359,13 +367,13 @@ fn write_sky(horizons: &mut impl Write, satellites: &mut impl Write) -> io::Resu
     writeln!(satellites, "place,azimuth_deg,elevation_deg,signal")?;
     let scene = scene();
     let skyline = Skyline::new(scene.buildings());
-    let observer = Observer::at(Geodetic {
+    let observer = SkyObserver::at(Geodetic {
         latitude_deg: 52.0,
         longitude_deg: 10.5,
     });
     for (place, [x, y]) in [("along the street", [75.0, -2.0]), ("at the corner", [148.0, 0.0])] {
         let antenna_m = [x, y, ANTENNA_M];
-        let Sky::Walled(horizon) = skyline.sky(&scene, antenna_m) else {
+        let CellSky::Walled(horizon) = skyline.sky(&scene, antenna_m) else {
             continue;
         };
         for (sector, tangent) in horizon.tangents().enumerate() {
@@ -378,7 +386,7 @@ fn write_sky(horizons: &mut impl Write, satellites: &mut impl Write) -> io::Resu
         }
         let mirrors = horizon.mirrors(antenna_m);
         for satellite in observer.satellites(3000.0) {
-            let placed = Placed::from(satellite);
+            let placed = PlacedSatellite::from(satellite);
             let signal = if horizon.is_in_sight(&placed, antenna_m) {
                 "direct"
             } else if mirrors

@@ -1,25 +1,25 @@
-//! Blackouts: times in which a sensor delivers nothing, one behind the other with gaps between them.
+//! Blackouts: times in which a sensor delivers nothing, with gaps between them.
 //!
 //! Lengths and gaps are uniform between the configured ends. Time counts from the vehicle's own first tick, and a sequence begins
-//! with a uniform part of a gap: nobody appears in a blackout, so every sensor has a sample to hold, and vehicles that appear
-//! together do not go dark together.
+//! with a uniform part of a gap. So no vehicle appears in a blackout and every sensor has a sample to hold; vehicles that appear
+//! together are out of phase.
 
 use ipc_schema::sensor::{BlackoutSpans, NoiseStream};
 
-use crate::noise::Stream;
+use crate::noise::RandomStream;
 
 /// Blackouts of one sensor, as configured.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Schedule {
+pub struct BlackoutSchedule {
     sensor: NoiseStream,
     length_ns: [f64; 2],
     gap_ns: [f64; 2],
     tick_ns: u64,
 }
 
-/// Where one vehicle's sensor is in its sequence.
+/// Position of one vehicle's sensor in its sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Phase {
+pub struct BlackoutPhase {
     /// Time at which the gap or the blackout ends, nanoseconds.
     until_ns: u64,
     /// Tick of the vehicle's first sample: a vehicle that leaves and returns gets another sequence.
@@ -28,7 +28,7 @@ pub struct Phase {
     number: u32,
 }
 
-impl Phase {
+impl BlackoutPhase {
     /// True in a blackout.
     #[must_use]
     pub fn is_dark(&self) -> bool {
@@ -36,7 +36,7 @@ impl Phase {
     }
 }
 
-impl Schedule {
+impl BlackoutSchedule {
     /// Blackouts with these lengths and gaps; none if the longest has no length. What is shorter
     /// than a tick lasts a tick.
     #[must_use]
@@ -52,17 +52,17 @@ impl Schedule {
 
     /// The sequence of a vehicle that is first sensed at `now_ns`, the time of tick `start`.
     #[must_use]
-    pub fn begin(&self, episode_seed: u64, id_hash: u64, start: u32, now_ns: u64) -> Phase {
+    pub fn begin(&self, episode_seed: u64, id_hash: u64, start: u32, now_ns: u64) -> BlackoutPhase {
         let [place, share] = self.stream(episode_seed, id_hash).uniform_pair(start, 0);
-        Phase {
+        BlackoutPhase {
             until_ns: now_ns + (((1.0 - share) * between(self.gap_ns, place)) as u64).max(1),
             start,
             number: 0,
         }
     }
 
-    /// Goes on to `now_ns`.
-    pub fn advance(&self, phase: &mut Phase, episode_seed: u64, id_hash: u64, now_ns: u64) {
+    /// Advances to `now_ns`.
+    pub fn advance(&self, phase: &mut BlackoutPhase, episode_seed: u64, id_hash: u64, now_ns: u64) {
         while now_ns >= phase.until_ns {
             phase.number = phase.number.wrapping_add(1);
             let [place, _] = self
@@ -73,8 +73,8 @@ impl Schedule {
         }
     }
 
-    fn stream(&self, episode_seed: u64, id_hash: u64) -> Stream {
-        Stream {
+    fn stream(&self, episode_seed: u64, id_hash: u64) -> RandomStream {
+        RandomStream {
             episode_seed,
             id_hash,
             sensor: self.sensor,
@@ -92,12 +92,12 @@ mod tests {
 
     const TICK_NS: u64 = 100_000_000;
 
-    fn schedule(length_s: [f64; 2], gap_s: [f64; 2]) -> Schedule {
-        Schedule::new(NoiseStream::GnssBlackout, BlackoutSpans { length_s, gap_s }, TICK_NS).unwrap()
+    fn schedule(length_s: [f64; 2], gap_s: [f64; 2]) -> BlackoutSchedule {
+        BlackoutSchedule::new(NoiseStream::GnssBlackout, BlackoutSpans { length_s, gap_s }, TICK_NS).unwrap()
     }
 
     /// Lengths of the runs of light and darkness, ticks, the first and the last one left out.
-    fn runs(schedule: &Schedule, id_hash: u64, ticks: u64) -> [Vec<f64>; 2] {
+    fn runs(schedule: &BlackoutSchedule, id_hash: u64, ticks: u64) -> [Vec<f64>; 2] {
         let mut phase = schedule.begin(5, id_hash, 0, 0);
         let (mut runs, mut last, mut since) = ([vec![], vec![]], false, None);
         for tick in 0..ticks {
@@ -160,7 +160,7 @@ mod tests {
     #[test]
     fn no_length_is_no_blackout_and_tiny_ones_last_a_tick() {
         assert_eq!(
-            Schedule::new(
+            BlackoutSchedule::new(
                 NoiseStream::GnssBlackout,
                 BlackoutSpans {
                     length_s: [0.0; 2],

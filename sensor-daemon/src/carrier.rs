@@ -1,52 +1,52 @@
-//! One carrier of sensors: what a slot remembers from tick to tick.
+//! A carrier of sensors: the state that a slot keeps from tick to tick.
 
 use ipc_schema::sensor::SensorKind;
 
-use crate::{blackout::Phase, fields::Readings, imu, speed_steering::Scales};
+use crate::{blackout::BlackoutPhase, fields::SensorReadings, imu, speed_steering::SpeedSteeringScales};
 
-/// What the sensors of one road user remember. It begins anew with every trajectory.
+/// State of one road user's sensors. Every trajectory begins with a new one.
 #[derive(Debug, Clone)]
-pub struct Carrier {
-    /// Newest samples, their ages, and who delivers.
-    pub readings: Readings,
+pub struct SensorCarrier {
+    /// Newest samples, their ages, and the sensors that deliver.
+    pub readings: SensorReadings,
     /// Correlated error of the GNSS receiver, unit variance.
     pub correlated: [f32; 3],
-    /// What the biases of the IMU have walked.
-    pub walk: imu::Axes,
-    /// Constant factors of its speed and steering angle.
-    pub scales: Scales,
+    /// Random walk of the IMU's biases so far.
+    pub walk: imu::ImuAxes,
+    /// Constant scale factors of its speed and steering angle.
+    pub scales: SpeedSteeringScales,
     /// Factor on the errors of its GNSS receiver.
     pub gnss_factor: f64,
-    /// Where each sensor is in its sequence of blackouts.
-    pub phases: [Phase; SensorKind::COUNT],
+    /// Position of each sensor in its sequence of blackouts.
+    pub phases: [BlackoutPhase; SensorKind::COUNT],
     /// Step of the newest sample of each sensor.
     pub sampled: [u32; SensorKind::COUNT],
-    /// Sensors that it has.
+    /// Sensors that the road user has.
     pub present: u32,
     /// Sensors that a command has switched off.
     pub off: u32,
     /// Sensors that have delivered at least once.
     pub known: u32,
-    /// The receiver had satellites enough when it last looked.
+    /// The receiver had enough satellites at its last sample.
     pub has_fix: bool,
-    /// An observation of this trajectory has been valid.
+    /// The trajectory has had a valid observation.
     pub is_seen: bool,
 }
 
-impl Carrier {
-    /// A carrier of the sensors `present` that has sensed nothing yet.
+impl SensorCarrier {
+    /// A carrier with the sensors `present`, without any sample.
     #[must_use]
-    pub fn new(present: u32, scales: Scales, gnss_factor: f64, no_object_m: f32) -> Self {
+    pub fn new(present: u32, scales: SpeedSteeringScales, gnss_factor: f64, no_object_m: f32) -> Self {
         Self {
-            readings: Readings {
+            readings: SensorReadings {
                 objects_m: [[no_object_m; 2]; 4],
-                ..Readings::default()
+                ..SensorReadings::default()
             },
             correlated: [0.0; 3],
             walk: [0.0; 8],
             scales,
             gnss_factor,
-            phases: [Phase::default(); SensorKind::COUNT],
+            phases: [BlackoutPhase::default(); SensorKind::COUNT],
             sampled: [0; SensorKind::COUNT],
             present,
             off: 0,
@@ -56,7 +56,7 @@ impl Carrier {
         }
     }
 
-    /// Sensors that are neither in a blackout nor switched off, of those that it has.
+    /// Sensors of the carrier that are neither in a blackout nor switched off.
     #[must_use]
     #[inline(always)]
     pub fn awake(&self) -> u32 {
@@ -66,16 +66,16 @@ impl Carrier {
         awake.fold(0, |bits, kind| bits | kind.bit()) & self.present & !self.off
     }
 
-    /// Takes note of a sample of `sensor` at `step`.
+    /// Records a sample of `sensor` at `step`.
     #[inline(always)]
-    pub fn note(&mut self, sensor: SensorKind, step: u32) {
+    pub fn record(&mut self, sensor: SensorKind, step: u32) {
         self.sampled[sensor.index()] = step;
         self.known |= sensor.bit();
     }
 
-    /// Sets the ages and says who delivers at `step`, with ticks of `tick_s`. Sensors that it does not have are 0 s old.
+    /// Sets the ages and the delivering sensors at `step`, with ticks of `tick_s`. A sensor that the carrier lacks has age 0 s.
     #[inline(always)]
-    pub fn age(&mut self, step: u32, tick_s: f64) {
+    pub fn update_ages(&mut self, step: u32, tick_s: f64) {
         let fix = if self.has_fix {
             u32::MAX
         } else {
@@ -94,7 +94,7 @@ impl Carrier {
         }
     }
 
-    /// Sensors that it has and that do not deliver now.
+    /// Sensors of the carrier that do not deliver now.
     #[must_use]
     #[inline]
     pub fn dark(&self) -> u32 {

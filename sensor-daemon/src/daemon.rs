@@ -1,4 +1,4 @@
-//! The process: `world` in, `observation` out, one for one.
+//! The process: receives `world` messages and publishes one `observation` for each.
 
 use std::{path::Path, sync::Arc, time::Instant};
 
@@ -25,32 +25,32 @@ use sim_core::{
 
 use crate::{
     delivery::Delivery,
-    digest::Digest,
-    hand_over::Account,
-    scanning::{Scanning, Tally},
-    sensing::{Sensing, World},
+    digest::ObservationDigest,
+    handover::HandoverFigures,
+    scanning::{LidarScanning, ScanTotals},
+    sensing::{Sensing, WorldTick},
     sky::SkyMap,
 };
 
-/// What this process adds to the run's report.
+/// The part of the run's report that this process writes.
 #[derive(Debug, Serialize)]
-struct Part {
+struct SensorDaemonReport {
     observation_hash: String,
     observations: u64,
     ticks: u64,
     cavs_max: u32,
     raw_gnss_mean_error_m: Option<f64>,
     drops: u64,
-    lidar: Option<Tally>,
-    /// Observations that successors of the trainer were given again.
+    lidar: Option<ScanTotals>,
+    /// Ticks that were sent again to a successor of the trainer.
     redelivered_ticks: u64,
-    /// Most of the journal in use at a time.
+    /// Largest size of the journal so far.
     journal_mib: usize,
-    /// Planned hand-overs from one trainer to the next.
-    hand_overs: Vec<Account>,
+    /// Planned handovers from one trainer to its successor.
+    handovers: Vec<HandoverFigures>,
 }
 
-/// Senses until the last tick of the run, or until the process is asked to stop.
+/// Makes observations until the last tick of the run, or until the supervisor stops the process.
 ///
 /// # Errors
 /// The map's projection is not understood, the scene or a LIDAR's ray table cannot be read, or a port fails.
@@ -59,10 +59,10 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     let (config, maps) = (&session.run.config, session.run.every_map());
     let maps: Vec<MapInfo> = maps.into_iter().map(|map| map.info).collect();
     let mut sensing = Sensing::on_maps(config, session.run.map.bounds_m, &maps).map_err(unprojected)?;
-    let scanning = look_around(&mut session, &mut sensing)?;
+    let scanning = open_scenes(&mut session, &mut sensing)?;
     let world = session.subscriber(Channel::World)?;
     let mut daemon = Daemon::open(session, sensing, scanning)?;
-    while let Some(message) = daemon.next(&world)? {
+    while let Some(message) = daemon.next_world(&world)? {
         let header = *message.header();
         if daemon.tick(&message)? == Wait::Stopped {
             break;
@@ -70,14 +70,15 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
         drop(message);
         daemon.session.consumed(header.tick + 1);
         if header.has(LAST_OF_RUN) {
-            return daemon.leave();
+            return daemon.wait_for_trainers_end();
         }
     }
     daemon.write_part()
 }
 
-/// Gives GNSS receivers their sky and vehicles their LIDARs, if the configuration asks for either: only they need the scene.
-fn look_around(session: &mut Session, sensing: &mut Sensing) -> Result<Option<Scanning>, Failure> {
+/// Reads the scenes if sky view or LIDARs are configured, sets the sky of the GNSS receivers and returns the LIDARs. No other sensor
+/// needs a scene.
+fn open_scenes(session: &mut Session, sensing: &mut Sensing) -> Result<Option<LidarScanning>, Failure> {
     let uses = SENSORS.map(|spec| (spec.scene)(&session.run.config));
     if uses.iter().all(|scene| *scene == SceneUse::Unused) {
         return Ok(None);
@@ -93,7 +94,7 @@ fn look_around(session: &mut Session, sensing: &mut Sensing) -> Result<Option<Sc
         return Ok(None);
     }
     let publisher = session.publisher(Channel::Pointcloud)?;
-    Scanning::new(&session.run.config, &scenes, publisher).map(Some)
+    LidarScanning::new(&session.run.config, &scenes, publisher).map(Some)
 }
 
 fn sky_over(map: &MapInfo, scene: &Arc<Scene>, seed: u64) -> Result<SkyMap, Failure> {
@@ -117,23 +118,23 @@ fn unprojected(error: GeodesyError) -> Failure {
 struct Daemon {
     session: Session,
     sensing: Sensing,
-    scanning: Option<Scanning>,
-    /// Sensors that commands switch.
+    scanning: Option<LidarScanning>,
+    /// Commands that switch sensors on and off.
     switches: Subscriber,
     observations: Publisher,
-    /// Who must not miss an observation: nobody if nobody learns.
+    /// Delivery to the trainer, which must not miss an observation; `None` in a run without a trainer.
     consumer: Option<Delivery>,
-    digest: Digest,
+    digest: ObservationDigest,
     /// One more than the newest tick made.
     ticks: u64,
-    /// Ticks that are learnt already: those of them that are made, because their episode is, are not sent.
+    /// Ticks below this are in the checkpoint: they are simulated again but not sent.
     committed_ticks: u64,
     vehicle_steps: u64,
     cavs_max: u32,
 }
 
 impl Daemon {
-    fn open(mut session: Session, sensing: Sensing, scanning: Option<Scanning>) -> Result<Self, Failure> {
+    fn open(mut session: Session, sensing: Sensing, scanning: Option<LidarScanning>) -> Result<Self, Failure> {
         let observations = session.publisher(Channel::Observation)?;
         let switches = session.subscriber(Channel::Switch)?;
         let consumer = match session.run.mode.has_trainer() {
@@ -149,7 +150,7 @@ impl Daemon {
             switches,
             observations,
             consumer,
-            digest: Digest::default(),
+            digest: ObservationDigest::default(),
             ticks,
             committed_ticks,
             vehicle_steps: 0,
@@ -157,8 +158,8 @@ impl Daemon {
         })
     }
 
-    /// The next `world` message; meanwhile a successor of the trainer is given what it lacks.
-    fn next(&mut self, world: &Subscriber) -> Result<Option<Message>, Failure> {
+    /// Waits for the next `world` message; meanwhile it resends what a successor of the trainer lacks.
+    fn next_world(&mut self, world: &Subscriber) -> Result<Option<Message>, Failure> {
         let mut received = Ok(None);
         loop {
             let waited = self.session.wait_until(|| {
@@ -182,7 +183,7 @@ impl Daemon {
         }
     }
 
-    /// Waits until `condition` holds for the trainer, and gives its successors what they lack; without a trainer there is no wait.
+    /// Waits until `condition` holds for the trainer, and resends what its successors lack. Returns at once in a run without a trainer.
     fn wait_for_trainer(&mut self, condition: impl Fn(&Delivery, &Session) -> bool) -> Result<Wait, Failure> {
         loop {
             self.catch_up()?;
@@ -198,7 +199,7 @@ impl Daemon {
         }
     }
 
-    /// One tick: waits for credit, senses, publishes.
+    /// One tick: assigns slots, scans, waits for credit, samples and publishes.
     fn tick(&mut self, message: &Message) -> Result<Wait, Failure> {
         let world = message.header();
         if world.tick != self.ticks {
@@ -209,31 +210,34 @@ impl Daemon {
             }
             .into());
         }
-        let everybody = view(message, world)?;
-        self.sensing.switches_mut().receive(&self.switches)?.map_err(broken)?;
-        let n = self.sensing.assign(world, everybody.states);
-        self.scan(world, &everybody)?;
-        let is_learnt = world.tick < self.committed_ticks;
-        if !is_learnt && self.wait_for_credit(n)? == Wait::Stopped {
+        let road_users = world_tick(message, world)?;
+        self.sensing
+            .switches_mut()
+            .receive(&self.switches)?
+            .map_err(unreadable)?;
+        let n = self.sensing.assign(world, road_users.states);
+        self.scan(world, &road_users)?;
+        let is_committed = world.tick < self.committed_ticks;
+        if !is_committed && self.wait_for_credit(n)? == Wait::Stopped {
             return Ok(Wait::Stopped);
         }
-        self.publish(world, &everybody, n)?;
+        self.publish(world, &road_users, n)?;
         Ok(Wait::Ready)
     }
 
-    /// Waits until the tick of `n` slots may be sent, or kept while one trainer hands over to the next.
+    /// Waits until the tick of `n` slots may be sent, or may be kept in the journal during a handover.
     fn wait_for_credit(&mut self, n: usize) -> Result<Wait, Failure> {
         let len = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples()).len;
         let since = Instant::now();
         let waited = self.wait_for_trainer(|consumer, session| consumer.may_send(session) || consumer.may_keep(len))?;
         if let Some(consumer) = &mut self.consumer {
-            consumer.attend_hand_over(since);
+            consumer.update_handover(since);
         }
         Ok(waited)
     }
 
-    /// Scans with all LIDARs; what the observation shows of it is there before the observation is made.
-    fn scan(&mut self, world: &MessageHeader, everybody: &World) -> Result<(), Failure> {
+    /// Scans with all LIDARs. It runs before the observation is made, because the observation shows the nearest objects.
+    fn scan(&mut self, world: &MessageHeader, road_users: &WorldTick) -> Result<(), Failure> {
         let Some(scanning) = &mut self.scanning else {
             return Ok(());
         };
@@ -243,10 +247,11 @@ impl Daemon {
             incarnation: ours.incarnation,
             ..*world
         };
-        scanning.scan(&header, everybody.states, everybody.sub_steps, &mut self.sensing)
+        scanning.scan(&header, road_users.states, road_users.sub_steps, &mut self.sensing)
     }
 
-    fn publish(&mut self, world: &MessageHeader, everybody: &World, n: usize) -> Result<(), Failure> {
+    /// Samples the sensors into a block of shared memory, adds it to the hash, and sends it or keeps it in the journal.
+    fn publish(&mut self, world: &MessageHeader, road_users: &WorldTick, n: usize) -> Result<(), Failure> {
         let d = self.sensing.width();
         let ours = self.session.header();
         let header = MessageHeader {
@@ -262,21 +267,21 @@ impl Daemon {
         };
         let mut draft = self.observations.loan(header, ObservationLayout::of(&header).len)?;
         self.sensing
-            .observe(&header, everybody, draft.payload_mut())
-            .map_err(broken)?;
+            .observe(&header, road_users, draft.payload_mut())
+            .map_err(unreadable)?;
         self.digest.add(&header, draft.payload());
-        if self.is_due(&header, draft.payload())? {
+        if self.keep(&header, draft.payload())? {
             draft.send()?;
         }
         if let Some(consumer) = &self.consumer {
             consumer.wake();
         }
-        self.account(&header, everybody.states.len());
+        self.report_tick(&header, road_users.states.len());
         Ok(())
     }
 
-    /// Keeps the tick for trainers to come. False if the present one has no credit for it: it is sent from the journal later.
-    fn is_due(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<bool, Failure> {
+    /// Keeps the tick in the journal. Returns false if the trainer has no credit for it: the journal sends it later.
+    fn keep(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<bool, Failure> {
         if header.tick < self.committed_ticks {
             return Ok(false);
         }
@@ -286,12 +291,13 @@ impl Daemon {
         let is_due = consumer.may_send(&self.session);
         consumer.keep(*header, payload)?;
         if is_due {
-            consumer.sends_live();
+            consumer.count_live();
         }
         Ok(is_due)
     }
 
-    fn account(&mut self, header: &MessageHeader, road_users: usize) {
+    /// Publishes the counters of a tick on the board.
+    fn report_tick(&mut self, header: &MessageHeader, road_users: usize) {
         let before = self.vehicle_steps;
         self.vehicle_steps = self.sensing.observations();
         let cavs = (self.vehicle_steps - before) as u32;
@@ -310,8 +316,8 @@ impl Daemon {
         });
     }
 
-    /// Leaves once the trainer is done: until then it may die and need everything since its last commit.
-    fn leave(mut self) -> Result<(), Failure> {
+    /// Waits until the trainer is done: until then it may die, and its successor needs everything since the last commit.
+    fn wait_for_trainers_end(mut self) -> Result<(), Failure> {
         let waited = self.wait_for_trainer(|consumer, _| consumer.is_done())?;
         self.write_part()?;
         if waited == Wait::Stopped {
@@ -323,39 +329,39 @@ impl Daemon {
 
     fn write_part(&self) -> Result<(), Failure> {
         let raw = self.sensing.raw_error();
-        #[expect(clippy::cast_precision_loss, reason = "a mean for people")]
-        let part = Part {
+        #[expect(clippy::cast_precision_loss, reason = "a mean in a report")]
+        let part = SensorDaemonReport {
             observation_hash: self.digest.hex(),
             observations: self.vehicle_steps,
             ticks: self.ticks - self.session.run.first_tick(),
             cavs_max: self.cavs_max,
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
             drops: self.observations.drops(),
-            lidar: self.scanning.as_ref().map(Scanning::tally),
+            lidar: self.scanning.as_ref().map(LidarScanning::totals),
             redelivered_ticks: self.consumer.as_ref().map_or(0, Delivery::redelivered),
             journal_mib: self.consumer.as_ref().map_or(0, Delivery::journal_mib),
-            hand_overs: self.consumer.as_ref().map(Delivery::hand_overs).unwrap_or_default(),
+            handovers: self.consumer.as_ref().map(Delivery::handovers).unwrap_or_default(),
         };
         self.session.write_part(&part)
     }
 }
 
-fn layout(header: &MessageHeader) -> WorldLayout {
+fn world_layout(header: &MessageHeader) -> WorldLayout {
     let count = header.count as usize;
     let heroes = usize::try_from(header.sequence).unwrap_or(usize::MAX).min(count);
     WorldLayout::with_heroes(count, header.columns as usize, heroes)
 }
 
-/// The world that a message carries.
-fn view<'a>(message: &'a Message, header: &MessageHeader) -> Result<World<'a>, Failure> {
-    let (payload, layout) = (message.payload(), layout(header));
-    Ok(World {
-        states: block::view(payload, layout.states).map_err(broken)?,
-        sub_steps: block::view(payload, layout.sub_steps).map_err(broken)?,
-        views: block::view(payload, layout.heroes).map_err(broken)?,
+/// The sections of a `world` message.
+fn world_tick<'a>(message: &'a Message, header: &MessageHeader) -> Result<WorldTick<'a>, Failure> {
+    let (payload, layout) = (message.payload(), world_layout(header));
+    Ok(WorldTick {
+        states: block::view(payload, layout.states).map_err(unreadable)?,
+        sub_steps: block::view(payload, layout.sub_steps).map_err(unreadable)?,
+        views: block::view(payload, layout.heroes).map_err(unreadable)?,
     })
 }
 
-fn broken(error: BlockError) -> Failure {
+fn unreadable(error: BlockError) -> Failure {
     Failure::from_error(FailureKind::Run, &error)
 }

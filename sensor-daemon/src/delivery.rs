@@ -1,5 +1,5 @@
-//! Observations to the trainer, each tick in order under its credits: live ones, and those of the journal again for a successor.
-//! During a planned hand-over live ones may be kept for later, so that the simulation goes on.
+//! Sends observations to the trainer, tick by tick, as far as it has credit: live ticks, and ticks of the journal to a successor.
+//! During a planned handover live ticks may stay in the journal, so that the simulation continues.
 
 use std::time::Instant;
 
@@ -15,34 +15,34 @@ use ipc_schema::{
 };
 
 use crate::{
-    hand_over::{Account, HandOver},
+    handover::{HandoverFigures, RunningHandover},
     journal::{Journal, JournalError},
 };
 
 const MIB: usize = 1 << 20;
 
-/// The way to the one consumer that must not miss an observation.
+/// Delivery to the trainer, the one required consumer of observations.
 pub struct Delivery {
     board: BoardReader,
     waker: Waker,
     journal: Journal,
     window: u64,
-    /// The incarnation that is being served; none before the first is attached.
+    /// The incarnation that receives observations; `None` before the first trainer is attached.
     incarnation: Option<u32>,
-    /// The next tick that it has not been sent.
+    /// The next tick to send to it.
     next: u64,
-    /// One more than the newest tick that anybody has been sent.
+    /// One more than the newest tick that any incarnation has been sent.
     sent: u64,
     redelivered: u64,
-    /// A planned hand-over under way, during which the simulation goes on without credit.
-    hand_over: Option<HandOver>,
-    hand_overs: Vec<Account>,
-    /// In the driving task the world waits for every action: nothing can be made in advance.
-    goes_on: bool,
+    /// The planned handover under way, during which the simulation continues without credit.
+    handover: Option<RunningHandover>,
+    handovers: Vec<HandoverFigures>,
+    /// False in the driving task: the world waits for every action, so no tick can be made in advance.
+    makes_ahead: bool,
 }
 
 impl Delivery {
-    /// Nothing sent, nothing kept.
+    /// Opens the trainer's board and wake-up, with an empty journal.
     ///
     /// # Errors
     /// The trainer's board or wake-up cannot be opened.
@@ -55,19 +55,19 @@ impl Delivery {
             board: session.board_of(Process::Trainer)?,
             waker: session.waker(Process::Trainer)?,
             journal,
-            // Strict lock-step has one tick on the way at a time, and so have its ticks when they are sent again.
+            // Strict lock-step has one tick under way at a time, also when ticks are sent again.
             window: if run.config.drives() { 1 } else { run.window_ticks() },
             incarnation: None,
             next: committed,
             sent: committed,
             redelivered: 0,
-            hand_over: None,
-            hand_overs: Vec::new(),
-            goes_on: !run.config.drives(),
+            handover: None,
+            handovers: Vec::new(),
+            makes_ahead: !run.config.drives(),
         })
     }
 
-    /// True if there is something to send again, or somebody new to turn to.
+    /// True if ticks can be sent again, or a new incarnation has attached.
     #[must_use]
     pub fn is_behind(&self) -> bool {
         let progress = self.board.progress();
@@ -76,7 +76,7 @@ impl Delivery {
                 || self.next < self.journal.ticks() && flow::has_credit(self.next, &progress, self.window))
     }
 
-    /// True if the live tick that follows all others may be sent now.
+    /// True if the trainer has received all earlier ticks and has credit for the live one.
     #[must_use]
     pub fn may_send(&self, session: &Session) -> bool {
         let progress = self.board.progress();
@@ -85,73 +85,75 @@ impl Delivery {
             && flow::has_credit(self.next, &progress, session.run.window_ticks())
     }
 
-    /// True if the live tick that follows all others may be made and kept, to be sent when there is credit: a planned hand-over is
-    /// under way, and the journal has room for `len` bytes beside everything that is not committed.
+    /// True if the live tick may be made and kept until the trainer has credit for it: a planned handover is under way, and the
+    /// journal has room for `len` bytes without giving up an older tick.
     #[must_use]
     pub fn may_keep(&self, len: usize) -> bool {
-        self.goes_on
+        self.makes_ahead
             && self.journal.has_room(len)
-            && match &self.hand_over {
-                // The successor of that one leaves in its turn, before it has caught up.
+            && match &self.handover {
+                // The successor itself is replaced before it has caught up.
                 Some(before) if before.has_successor() && self.board.is_handing_over() => true,
-                Some(hand_over) => hand_over.allows(&self.board.progress(), self.journal.ticks()),
+                Some(handover) => handover.allows(&self.board.progress(), self.journal.ticks()),
                 None => self.board.is_handing_over(),
             }
     }
 
-    /// Looks how a planned hand-over goes; the simulation has waited for a trainer since `since`.
-    pub fn attend_hand_over(&mut self, since: Instant) {
-        let under_way = self.goes_on && self.board.is_handing_over();
-        if self.hand_over.is_none() && !under_way {
+    /// Updates the state of a planned handover; the simulation has waited for a trainer since `since`.
+    pub fn update_handover(&mut self, since: Instant) {
+        let under_way = self.makes_ahead && self.board.is_handing_over();
+        if self.handover.is_none() && !under_way {
             return;
         }
         let (now, made, progress) = (Instant::now(), self.journal.ticks(), self.board.progress());
-        // The next one may begin while a successor still catches up.
-        if under_way && let Some(before) = self.hand_over.take_if(|before| before.has_successor()) {
-            self.hand_overs.push(before.account(progress.incarnation));
+        // The next handover may begin while a successor still catches up.
+        if under_way && let Some(before) = self.handover.take_if(|before| before.has_successor()) {
+            self.handovers.push(before.figures(progress.incarnation));
         }
-        let hand_over = self
-            .hand_over
-            .get_or_insert_with(|| HandOver::begin(now, progress.incarnation));
-        hand_over.waited(since, now);
-        hand_over.note(&progress, under_way, made);
+        let handover = self
+            .handover
+            .get_or_insert_with(|| RunningHandover::begin(now, progress.incarnation));
+        handover.add_wait(since, now);
+        handover.update(&progress, under_way, made);
         let is_level = self.incarnation == Some(progress.incarnation) && self.next == made;
-        if hand_over.is_over(is_level) {
-            self.hand_overs.push(hand_over.account(progress.incarnation));
-            self.hand_over = None;
+        if handover.is_over(is_level) {
+            self.handovers.push(handover.figures(progress.incarnation));
+            self.handover = None;
         }
     }
 
-    /// Planned hand-overs so far, that of a successor that still catches up included.
+    /// Planned handovers so far, including one whose successor still catches up.
     #[must_use]
-    pub fn hand_overs(&self) -> Vec<Account> {
-        let newest = self.hand_over.as_ref().filter(|newest| newest.has_successor());
-        let newest = newest.map(|newest| newest.account(self.board.progress().incarnation));
-        self.hand_overs.iter().copied().chain(newest).collect()
+    pub fn handovers(&self) -> Vec<HandoverFigures> {
+        let newest = self.handover.as_ref().filter(|newest| newest.has_successor());
+        let newest = newest.map(|newest| newest.figures(self.board.progress().incarnation));
+        self.handovers.iter().copied().chain(newest).collect()
     }
 
-    /// True once the trainer has done all its work.
+    /// True once the trainer has finished the run.
     #[must_use]
     pub fn is_done(&self) -> bool {
         State::from_u32(self.board.health().state) == State::Done
     }
 
-    /// Notes what has been committed and who is attached, and sends again what a successor lacks and has credit for.
+    /// Reads the trainer's commits and incarnation from the board, and resends what a successor lacks and has credit for.
     ///
     /// # Errors
-    /// A successor asks for what is not there, or the port fails.
+    /// A successor asks for a tick that the journal does not hold, or the port fails.
     pub fn catch_up(&mut self, observations: &Publisher) -> Result<(), Failure> {
         loop {
             let progress = self.board.progress();
-            self.turn_to(&progress).map_err(|error| lost(&error))?;
+            self.follow_incarnation(&progress)
+                .map_err(|error| journal_failure(&error))?;
             if self.next >= self.journal.ticks() || !flow::has_credit(self.next, &progress, self.window) {
                 return Ok(());
             }
-            self.send_again(observations)?;
+            self.resend(observations)?;
         }
     }
 
-    fn turn_to(&mut self, progress: &Progress) -> Result<(), JournalError> {
+    /// Frees what is committed; starts at the first tick that a new incarnation has not consumed.
+    fn follow_incarnation(&mut self, progress: &Progress) -> Result<(), JournalError> {
         if progress.attached == 0 {
             return Ok(());
         }
@@ -172,12 +174,12 @@ impl Delivery {
         Ok(())
     }
 
-    fn send_again(&mut self, observations: &Publisher) -> Result<(), Failure> {
+    fn resend(&mut self, observations: &Publisher) -> Result<(), Failure> {
         if let Some((header, len)) = self.journal.find(self.next) {
             let mut draft = observations.loan_unwritten(self.addressed(header), len)?;
             self.journal
                 .read(self.next, draft.payload_mut())
-                .map_err(|error| lost(&error))?;
+                .map_err(|error| journal_failure(&error))?;
             draft.send()?;
             self.waker.wake();
             self.redelivered += u64::from(self.next < self.sent);
@@ -187,7 +189,7 @@ impl Delivery {
         Ok(())
     }
 
-    /// `header` with the incarnation that it is meant for.
+    /// `header` with the incarnation that receives it.
     #[must_use]
     pub fn addressed(&self, header: MessageHeader) -> MessageHeader {
         MessageHeader {
@@ -196,25 +198,27 @@ impl Delivery {
         }
     }
 
-    /// Keeps a live tick.
+    /// Adds a live tick to the journal.
     ///
     /// # Errors
     /// The journal's file cannot be written.
     pub fn keep(&mut self, header: MessageHeader, payload: &[u8]) -> Result<(), Failure> {
-        self.journal.push(header, payload).map_err(|error| lost(&error))?;
-        if let Some(hand_over) = &mut self.hand_over {
-            hand_over.made_one(&self.board.progress());
+        self.journal
+            .push(header, payload)
+            .map_err(|error| journal_failure(&error))?;
+        if let Some(handover) = &mut self.handover {
+            handover.count_tick(&self.board.progress());
         }
         Ok(())
     }
 
-    /// The live tick that was kept last is being sent.
-    pub fn sends_live(&mut self) {
+    /// Counts the live tick that was kept last as sent.
+    pub fn count_live(&mut self) {
         self.next += 1;
         self.sent = self.sent.max(self.next);
     }
 
-    /// Wakes the trainer: a tick has been sent.
+    /// Wakes the trainer after a tick has been sent.
     pub fn wake(&self) {
         self.waker.wake();
     }
@@ -225,14 +229,14 @@ impl Delivery {
         self.redelivered
     }
 
-    /// Most of the journal in use at a time, MiB.
+    /// Largest size of the journal so far, MiB.
     #[must_use]
     pub fn journal_mib(&self) -> usize {
         self.journal.most_bytes().div_ceil(MIB)
     }
 }
 
-fn lost(error: &JournalError) -> Failure {
+fn journal_failure(error: &JournalError) -> Failure {
     let failure = Failure::from_error(FailureKind::Run, error);
     match error {
         JournalError::Io { .. } => failure.with_help("free space in the run directory, or lower `run.journal_mib`"),

@@ -2,11 +2,11 @@
 
 use ipc_schema::header::MessageHeader;
 
-/// Collects the hash. What depends on the run but not on what was observed (run id, incarnation) stays out.
+/// Computes the hash. Run id and incarnation are left out: they are not observed.
 #[derive(Debug, Clone, Default)]
-pub struct Digest(blake3::Hasher);
+pub struct ObservationDigest(blake3::Hasher);
 
-impl Digest {
+impl ObservationDigest {
     /// Adds one message.
     pub fn add(&mut self, header: &MessageHeader, payload: &[u8]) {
         let numbers = [
@@ -38,7 +38,7 @@ mod tests {
     #[test]
     fn every_byte_and_the_time_count_but_not_the_run() {
         let hash = |header: MessageHeader, payload: &[u8]| {
-            let mut digest = Digest::default();
+            let mut digest = ObservationDigest::default();
             digest.add(&header, payload);
             digest.hex()
         };

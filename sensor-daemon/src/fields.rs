@@ -1,4 +1,4 @@
-//! From sensor values to a normalised row.
+//! Turns sensor values into a normalised row of the observation.
 
 use ipc_schema::{
     config::{Config, Field, Scale},
@@ -6,28 +6,28 @@ use ipc_schema::{
     world::HeroView,
 };
 
-use crate::{gnss::Fix, imu, speed_steering};
+use crate::{gnss::GnssFix, imu, speed_steering};
 
 /// The newest samples of one vehicle's sensors.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Readings {
+pub struct SensorReadings {
     /// GNSS.
-    pub fix: Fix,
+    pub fix: GnssFix,
     /// IMU and compass.
-    pub imu: imu::Sample,
+    pub imu: imu::ImuSample,
     /// Speed and steering.
-    pub speed_steering: speed_steering::Sample,
+    pub speed_steering: speed_steering::SpeedSteeringSample,
     /// Nearest points of the nearest objects that the LIDAR sees, forward and left of the rear axle, metres.
     pub objects_m: [[f32; 2]; 4],
     /// Ages of the newest samples by sensor, seconds.
     pub ages_s: [f32; SensorKind::COUNT],
     /// Bits of the sensors that deliver.
     pub delivering: u32,
-    /// What a hero sees of its route.
+    /// Route and traffic ahead of a hero.
     pub route: HeroView,
 }
 
-impl Readings {
+impl SensorReadings {
     #[inline(always)]
     fn value(&self, field: Field) -> f64 {
         let deliver = |bit: u32| f64::from(u8::from(self.delivering & bit != 0));
@@ -91,12 +91,12 @@ struct Column {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Normaliser {
     columns: Vec<Column>,
-    /// Of a field in 0 … 1: factor and what is added.
+    /// Factor and offset from 0 … 1 to the configured scale.
     scale: [f64; 2],
 }
 
 impl Normaliser {
-    /// Ranges from the configuration and the map's bounds `[x_min, y_min, x_max, y_max]` (metres).
+    /// Takes the ranges from the configuration and the map's bounds `[x_min, y_min, x_max, y_max]` (metres).
     #[must_use]
     pub fn new(config: &Config, bounds_m: [f64; 4]) -> Self {
         let columns = config.observation.fields.iter().map(|field| {
@@ -129,10 +129,10 @@ impl Normaliser {
         self.columns.iter().fold(0, |bits, column| bits | column.sensor)
     }
 
-    /// Fills `row` (one number for each field), with not-a-number where the field's sensor is among the bits `blank`; true if a value
-    /// was outside its range and has been clipped. What is not a number is not clipped.
+    /// Fills `row` with one number for each field, and with not-a-number where the field's sensor is among the bits `blank`. Returns
+    /// true if a value was outside its range and has been clipped; not-a-number is never clipped.
     #[inline(always)]
-    pub fn fill(&self, readings: &Readings, blank: u32, row: &mut [f32]) -> bool {
+    pub fn fill(&self, readings: &SensorReadings, blank: u32, row: &mut [f32]) -> bool {
         let (mut below, mut above) = (0.0_f64, 1.0_f64);
         let [factor, shift] = self.scale;
         for (place, column) in row.iter_mut().zip(&self.columns) {
@@ -142,7 +142,7 @@ impl Normaliser {
                 f64::NAN
             };
             let unit = (value - column.low) / column.span;
-            // Comparisons that are false for what is not a number: it passes through.
+            // Every comparison is false for not-a-number, which passes through.
             below = if unit < below { unit } else { below };
             above = if unit > above { unit } else { above };
             let unit = if unit < 0.0 { 0.0 } else { unit };
@@ -169,18 +169,18 @@ mod tests {
 
     #[test]
     fn a_row_holds_the_fields_in_their_order_and_range() {
-        let readings = Readings {
-            fix: Fix {
+        let readings = SensorReadings {
+            fix: GnssFix {
                 x_m: 50.0,
                 y_m: 300.0,
-                ..Fix::default()
+                ..GnssFix::default()
             },
             imu: [-20.0, 0.0, 10.0, 0.0, 0.0, 0.0, std::f32::consts::PI],
-            speed_steering: speed_steering::Sample {
+            speed_steering: speed_steering::SpeedSteeringSample {
                 speed_mps: 15.0,
                 steering_rad: 5.0,
             },
-            ..Readings::default()
+            ..SensorReadings::default()
         };
         let fields = vec![
             Field::Speed,
@@ -201,7 +201,7 @@ mod tests {
 
     #[test]
     fn a_heros_route_is_normalised_by_its_distances() {
-        let readings = Readings {
+        let readings = SensorReadings {
             route: HeroView {
                 route_m: [[5.0, 0.0], [8.0, 5.0], [20.0, -20.0], [0.0, 40.0]],
                 speed_limit_mps: 15.0,
@@ -212,7 +212,7 @@ mod tests {
                 signal_gap_m: 25.0,
                 ..HeroView::default()
             },
-            ..Readings::default()
+            ..SensorReadings::default()
         };
         let fields = vec![
             Field::RouteX5,
@@ -233,16 +233,16 @@ mod tests {
 
     #[test]
     fn height_accuracy_ages_validity_and_objects_have_their_ranges() {
-        let readings = Readings {
-            fix: Fix {
+        let readings = SensorReadings {
+            fix: GnssFix {
                 z_m: 50.0,
                 accuracy_m: 12.5,
-                ..Fix::default()
+                ..GnssFix::default()
             },
             ages_s: [2.5, 0.0, 10.0, 0.0],
             delivering: SensorKind::Imu.bit(),
             objects_m: [[80.0, -40.0], [0.0, 0.0], [0.0, 0.0], [20.0, 80.0]],
-            ..Readings::default()
+            ..SensorReadings::default()
         };
         let fields = vec![
             Field::GnssZ,
@@ -269,12 +269,12 @@ mod tests {
 
     #[test]
     fn a_blank_sensor_is_not_a_number_and_that_is_not_clipped() {
-        let readings = Readings {
-            fix: Fix {
+        let readings = SensorReadings {
+            fix: GnssFix {
                 x_m: -5000.0,
-                ..Fix::default()
+                ..GnssFix::default()
             },
-            ..Readings::default()
+            ..SensorReadings::default()
         };
         let fields = vec![Field::GnssX, Field::Speed, Field::GnssAge, Field::AccelX];
         let normaliser = Normaliser::new(&config(fields, Scale::ZeroToOne), BOUNDS_M);
@@ -288,8 +288,8 @@ mod tests {
 
     proptest! {
         #[test]
-        fn every_value_stays_in_its_scale_and_clipping_is_told(x in -1e6_f64..1e6) {
-            let readings = Readings { fix: Fix { x_m: x, ..Fix::default() }, ..Readings::default() };
+        fn every_value_stays_in_its_scale_and_clipping_is_reported(x in -1e6_f64..1e6) {
+            let readings = SensorReadings { fix: GnssFix { x_m: x, ..GnssFix::default() }, ..SensorReadings::default() };
             for (scale, low) in [(Scale::ZeroToOne, 0.0), (Scale::MinusOneToOne, -1.0)] {
                 let mut row = [9.0];
                 let clipped = Normaliser::new(&config(vec![Field::GnssX], scale), BOUNDS_M).fill(&readings, 0, &mut row);

@@ -1,4 +1,4 @@
-//! GNSS receiver: white and correlated noise and bias east, north and up, as angles or metres, and the position they give.
+//! GNSS receiver: white noise, correlated noise and bias east, north and up, in degrees or metres, and the position with these errors.
 
 use ipc_schema::config::Gnss as Params;
 use sim_core::geodesy::{
@@ -6,11 +6,11 @@ use sim_core::geodesy::{
     displacement::{DisplacementMap, GroundArc},
 };
 
-use crate::normals::Block;
+use crate::normals::NormalBlock;
 
 /// One fix.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Fix {
+pub struct GnssFix {
     /// Degrees, north positive.
     pub latitude_deg: f64,
     /// Degrees, east positive.
@@ -29,7 +29,7 @@ pub struct Fix {
     pub satellites: u32,
 }
 
-/// What a receiver gets from the sky at a place and time.
+/// Effect of the sky on a receiver at a place and time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SkyView {
     /// Satellites in use.
@@ -54,18 +54,18 @@ impl Default for SkyView {
     }
 }
 
-/// Where satellites stand, and what blocks and reflects them.
-pub trait Sky {
-    /// What the antenna of a road user on the ground at this place (world frame, metres) gets at this time of the episode (seconds).
+/// The satellites in the sky, and the buildings that block and reflect their signals.
+pub trait SatelliteSky {
+    /// The sky of an antenna of a road user on the ground at this place (world frame, metres) and time of the episode (seconds).
     fn at(&self, x_m: f64, y_m: f64, z_m: f64, time_s: f64) -> SkyView;
 
-    /// A new episode, with this seed.
+    /// Begins an episode with this seed.
     fn begin_episode(&mut self, episode_seed: u64) {
         let _ = episode_seed;
     }
 }
 
-/// Degrees of [`GroundArc`] for a metre on the ground, by place.
+/// Degrees of [`GroundArc`] for a metre on the ground, as a function of y.
 ///
 /// A metre north is 1/M radians, a metre east 1/N radians of the arc that [`GroundArc`] divides by the cosine of the latitude; M and N are
 /// the radii of curvature of the ellipsoid of WGS 84 in the meridian and in the prime vertical (NIMA TR8350.2, 1997, section 4).
@@ -117,7 +117,7 @@ fn arc_deg_per_m(latitude_deg: f64) -> [f64; 2] {
 
 /// A receiver as configured, on a map.
 #[derive(Debug, Clone)]
-pub struct Receiver {
+pub struct GnssReceiver {
     map: DisplacementMap,
     ground: Ground,
     /// Standard deviation of the white noise east, north and up, metres: angles and metres together.
@@ -125,30 +125,30 @@ pub struct Receiver {
     correlated_m: [f64; 3],
     bias: GroundArc,
     bias_m: [f64; 3],
-    /// What is left of the correlated error after a period, and the standard deviation of what joins it, as shares.
+    /// Factor on the correlated error after a period, and standard deviation of the noise added to it (unit variance).
     decay: [f32; 2],
     /// Variance of the horizontal distance from white and correlated noise, and square of the horizontal bias, m².
     horizontal_m2: [f64; 2],
 }
 
-/// What the errors of one fix are made of.
+/// Components of the error of one fix.
 #[derive(Debug, Clone, Copy)]
-pub struct Errors<'a> {
+pub struct GnssErrors<'a> {
     /// Standard normal numbers: east, north, up.
-    pub white: &'a Block,
+    pub white: &'a NormalBlock,
     /// State of the correlated error, unit variance: east, north, up.
     pub correlated: &'a [f32; 3],
-    /// What the sky gives.
+    /// Effect of the sky.
     pub view: &'a SkyView,
     /// Factor on all errors but reflections.
     pub factor: f64,
 }
 
-impl Receiver {
+impl GnssReceiver {
     /// A receiver on a map with these bounds (x_min, y_min, x_max, y_max, metres).
     ///
     /// # Errors
-    /// The map is not inside the domain of its projection.
+    /// The map is outside the domain of its projection.
     pub fn new(params: &Params, projection: &Projection, bounds_m: [f64; 4]) -> Result<Self, GeodesyError> {
         let ground = Ground::new(projection, bounds_m)?;
         let middle_m = 0.5 * (bounds_m[1] + bounds_m[3]);
@@ -203,7 +203,7 @@ impl Receiver {
     /// stationary distribution.
     #[must_use]
     #[inline(always)]
-    pub fn correlated(&self, state: [f32; 3], normals: &Block) -> [f32; 3] {
+    pub fn correlated(&self, state: [f32; 3], normals: &NormalBlock) -> [f32; 3] {
         [0, 1, 2].map(|axis: usize| self.decay[0] * state[axis] + self.decay[1] * normals[axis])
     }
 
@@ -212,11 +212,10 @@ impl Receiver {
     /// Angles of arc on the ground are the same for both axes (5e-5° ≙ 5.57 m): latitude gets the angle itself, longitude the angle
     /// divided by the cosine of the latitude. At the equator, where CARLA's towns lie, this is the paper's noise in degrees; elsewhere
     /// the error stays the same in metres instead of shrinking with the parallels. Metres are metres on the ellipsoid, true east and
-    /// north. The receiver estimates its error from all of them: 1σ of the distance is √(σ_east² + σ_north²), with the bias added
-    /// in square.
+    /// north. The receiver estimates its horizontal error from all components: 1σ of the distance is √(σ_east² + σ_north² + bias²).
     #[must_use]
     #[inline(always)]
-    pub fn fix(&self, [x_m, y_m, z_m]: [f64; 3], errors: &Errors) -> Fix {
+    pub fn fix(&self, [x_m, y_m, z_m]: [f64; 3], errors: &GnssErrors) -> GnssFix {
         let (view, factor) = (errors.view, errors.factor);
         let noisy = factor * view.noise_factor;
         let error_m = [0, 1, 2].map(|axis: usize| {
@@ -233,7 +232,7 @@ impl Receiver {
             },
         );
         let [noise_m2, bias_m2] = self.horizontal_m2;
-        Fix {
+        GnssFix {
             latitude_deg: displaced.geodetic.latitude_deg,
             longitude_deg: displaced.geodetic.longitude_deg,
             altitude_m: z_m + error_m[2],

@@ -1,14 +1,14 @@
-//! The last observations of every slot, one behind the other (frame stack).
+//! The last observations of every slot, one after the other (a frame stack).
 
 /// Frames of all slots, oldest first in each.
 #[derive(Debug, Clone)]
-pub struct History {
+pub struct FrameHistory {
     frame: usize,
     frames: usize,
     values: Vec<f32>,
 }
 
-impl History {
+impl FrameHistory {
     /// Histories of `frames` frames of `frame` numbers each.
     #[must_use]
     pub fn new(frame: usize, frames: usize) -> Self {
@@ -25,9 +25,9 @@ impl History {
         self.frame * self.frames
     }
 
-    /// Makes `row` the history of `slot`, whose newest frame `row` already holds at its end. The first frame of a trajectory stands
-    /// for those before it.
-    pub fn stack(&mut self, slot: usize, is_first: First, row: &mut [f32]) {
+    /// Fills `row` with the history of `slot`. `row` already holds the newest frame at its end. The first frame of a trajectory is
+    /// repeated for the frames before it.
+    pub fn stack(&mut self, slot: usize, is_first: TrajectoryFrame, row: &mut [f32]) {
         let (frame, width) = (self.frame, self.width());
         if self.frames == 1 {
             return;
@@ -38,29 +38,29 @@ impl History {
         let past = &mut self.values[slot * width..(slot + 1) * width];
         let (older, newest) = row.split_at_mut(width - frame);
         match is_first {
-            First::Yes => older
+            TrajectoryFrame::First => older
                 .chunks_exact_mut(frame)
                 .for_each(|place| place.copy_from_slice(newest)),
-            First::No => older.copy_from_slice(&past[frame..]),
+            TrajectoryFrame::Later => older.copy_from_slice(&past[frame..]),
         }
         past.copy_from_slice(row);
     }
 }
 
-/// Whether a frame begins a trajectory.
+/// Position of a frame in its trajectory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum First {
-    /// It does.
-    Yes,
-    /// It continues one.
-    No,
+pub enum TrajectoryFrame {
+    /// The frame begins the trajectory.
+    First,
+    /// The frame continues the trajectory.
+    Later,
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn push(history: &mut History, slot: usize, is_first: First, frame: [f32; 2]) -> Vec<f32> {
+    fn push(history: &mut FrameHistory, slot: usize, is_first: TrajectoryFrame, frame: [f32; 2]) -> Vec<f32> {
         let mut row = vec![9.0; history.width()];
         let at = row.len() - 2;
         row[at..].copy_from_slice(&frame);
@@ -70,26 +70,26 @@ mod tests {
 
     #[test]
     fn the_newest_is_last_and_the_first_repeats() {
-        let mut history = History::new(2, 3);
+        let mut history = FrameHistory::new(2, 3);
         assert_eq!(
-            push(&mut history, 1, First::Yes, [1.0, 2.0]),
+            push(&mut history, 1, TrajectoryFrame::First, [1.0, 2.0]),
             [1.0, 2.0, 1.0, 2.0, 1.0, 2.0]
         );
-        push(&mut history, 0, First::Yes, [7.0, 7.0]);
+        push(&mut history, 0, TrajectoryFrame::First, [7.0, 7.0]);
         assert_eq!(
-            push(&mut history, 1, First::No, [3.0, 4.0]),
+            push(&mut history, 1, TrajectoryFrame::Later, [3.0, 4.0]),
             [1.0, 2.0, 1.0, 2.0, 3.0, 4.0]
         );
         assert_eq!(
-            push(&mut history, 1, First::No, [5.0, 6.0]),
+            push(&mut history, 1, TrajectoryFrame::Later, [5.0, 6.0]),
             [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
         );
-        assert_eq!(push(&mut history, 1, First::Yes, [8.0, 8.0]), [8.0; 6]);
+        assert_eq!(push(&mut history, 1, TrajectoryFrame::First, [8.0, 8.0]), [8.0; 6]);
     }
 
     #[test]
     fn one_frame_is_itself() {
-        let mut history = History::new(2, 1);
-        assert_eq!(push(&mut history, 0, First::No, [1.0, 2.0]), [1.0, 2.0]);
+        let mut history = FrameHistory::new(2, 1);
+        assert_eq!(push(&mut history, 0, TrajectoryFrame::Later, [1.0, 2.0]), [1.0, 2.0]);
     }
 }

@@ -1,4 +1,4 @@
-//! Inertial measurement unit: accelerometer, gyroscope and compass in the vehicle's body.
+//! Inertial measurement unit: accelerometer, gyroscope and compass in the vehicle's frame.
 //!
 //! Error model of IEEE Std 952-2020 (annex C): white noise, constant bias and a random walk of the bias on each axis; then full
 //! scale and resolution. A density N (per √Hz) is a standard deviation of N √f for samples at f Hz; a walk K moves the bias by
@@ -15,26 +15,26 @@ use ipc_schema::{
 };
 
 use crate::{
-    noise::{Drawn, Draws},
-    normals::{LANES, cos_sin},
-    wide::{Path, Work},
+    noise::{DrawnNormals, NormalDraws},
+    normals::{BATCH, cos_sin},
+    wide::{VectorPath, VectorWork},
 };
 
 /// Standard gravity, m/s².
 pub const GRAVITY_MPS2: f64 = 9.806_65;
 
 /// One number for each axis: accelerometer x, y, z, gyroscope x, y, z, compass, nothing.
-pub type Axes = [f32; 8];
+pub type ImuAxes = [f32; 8];
 /// One sample: accelerometer x, y, z (m/s²), gyroscope x, y, z (rad/s), compass (clockwise from grid north, radians in [0, 2π)).
-pub type Sample = [f32; IMU_COLUMNS];
+pub type ImuSample = [f32; IMU_COLUMNS];
 
 const COMPASS: usize = 6;
 
 /// An IMU as configured.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Unit {
+pub struct ImuModel {
     samples: usize,
-    /// Sign of each axis; 0 where a sub-step holds something else.
+    /// Sign of each axis; 0 for an element of a sub-step that is no axis.
     signs: Pair,
     gravity_mps2: f32,
     bias: Pair,
@@ -53,9 +53,9 @@ pub struct Unit {
     is_walking: bool,
 }
 
-/// Where a body is at the end of a tick, and how it got there.
+/// Heading of a vehicle at the end of a tick, and its motion during the tick.
 #[derive(Debug, Clone, Copy)]
-pub struct Body<'a> {
+pub struct ImuMotion<'a> {
     /// Heading, counter-clockwise from east, radians.
     pub yaw_rad: f64,
     /// Sub-steps of the tick, at least one.
@@ -68,7 +68,7 @@ fn axes(accel: [f64; 3], gyro: [f64; 3], compass: f64) -> Pair {
     twice([ax, ay, az, gx, gy, gz, compass as f32, 0.0])
 }
 
-fn twice(axes: Axes) -> Pair {
+fn twice(axes: ImuAxes) -> Pair {
     bytemuck::must_cast([axes, axes])
 }
 
@@ -81,8 +81,8 @@ fn full_scale(range: f64, resolution: f64) -> f64 {
     }
 }
 
-impl Unit {
-    /// A unit that takes `samples` samples in a tick (1 for a slow one).
+impl ImuModel {
+    /// An IMU that takes `samples` samples in a tick (1 if its period is longer than a tick).
     #[must_use]
     pub fn new(params: &Params, samples: usize) -> Self {
         let white = |std: [f64; 3], density: [f64; 3]| {
@@ -127,7 +127,7 @@ impl Unit {
     }
 
     /// Plans the numbers of the samples from `first` on: white noise sample by sample, then the walk, two blocks each.
-    pub fn plan(&self, draws: &mut Draws, first: u32) {
+    pub fn plan(&self, draws: &mut NormalDraws, first: u32) {
         let streams = [
             (self.is_noisy, [NoiseStream::ImuFront, NoiseStream::ImuBack]),
             (self.is_walking, [NoiseStream::WalkFront, NoiseStream::WalkBack]),
@@ -146,7 +146,14 @@ impl Unit {
     ///
     /// A sample over several sub-steps is the mean of their accelerations and rates; gravity and heading are those at its end.
     #[inline]
-    pub fn sample(&self, path: Path, body: &Body, drawn: Drawn, walk: &mut Axes, out: &mut [Sample]) {
+    pub fn sample(
+        &self,
+        path: VectorPath,
+        body: &ImuMotion,
+        drawn: DrawnNormals,
+        walk: &mut ImuAxes,
+        out: &mut [ImuSample],
+    ) {
         path.run(Samples {
             unit: self,
             body,
@@ -157,21 +164,21 @@ impl Unit {
     }
 }
 
-/// The samples of one tick, with the widest vectors: [`LANES`] of them, in one pass after the other over plain arrays.
+/// The samples of one tick, with the widest vectors: [`BATCH`] of them, in one pass after the other over plain arrays.
 struct Samples<'a> {
-    unit: &'a Unit,
-    body: &'a Body<'a>,
-    drawn: Drawn<'a>,
-    walk: &'a mut Axes,
-    out: &'a mut [Sample],
+    unit: &'a ImuModel,
+    body: &'a ImuMotion<'a>,
+    drawn: DrawnNormals<'a>,
+    walk: &'a mut ImuAxes,
+    out: &'a mut [ImuSample],
 }
 
 /// Numbers of two samples: one register of AVX-512.
 type Pair = [f32; 16];
-/// Numbers of [`LANES`] samples.
-type Values = [Pair; LANES / 2];
+/// Numbers of [`BATCH`] samples.
+type Values = [Pair; BATCH / 2];
 
-impl Work for Samples<'_> {
+impl VectorWork for Samples<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -182,14 +189,14 @@ impl Work for Samples<'_> {
         let mut drawn = self.drawn;
         let white = drawn.split(of_all(unit.is_noisy));
         let drift = drawn.split(of_all(unit.is_walking));
-        let mut values: Values = [[0.0; 16]; LANES / 2];
+        let mut values: Values = [[0.0; 16]; BATCH / 2];
         let mut first = 0;
-        for some in self.out.chunks_mut(LANES) {
+        for some in self.out.chunks_mut(BATCH) {
             let values = &mut values[..some.len().div_ceil(2)];
             // With fewer sub-steps than samples, the last ones see the newest that there is.
             let rows_of = |i: usize| &rows[((first + i) * steps).min(rows.len() - steps)..][..steps];
             let gravity = if unit.gravity_mps2 == 0.0 {
-                [[0.0; LANES]; 3]
+                [[0.0; BATCH]; 3]
             } else {
                 gravity_body(unit.gravity_mps2, some.len(), &rows_of)
             };
@@ -205,11 +212,11 @@ impl Work for Samples<'_> {
                     value[axis] = felt[axis] + gravity[axis];
                 }
             }
-            unit.err(white, 2 * first, values);
+            unit.add_errors(white, 2 * first, values);
             if unit.is_walking {
                 unit.walk(drift, 2 * first, self.walk, values);
             }
-            unit.deliver(values);
+            unit.quantise(values);
             for (i, out) in some.iter_mut().enumerate() {
                 let value = &values[i / 2][8 * (i % 2)..];
                 out.copy_from_slice(&value[..IMU_COLUMNS]);
@@ -221,10 +228,10 @@ impl Work for Samples<'_> {
     }
 }
 
-impl Unit {
-    /// From what the body feels to the sensor's axes, with constant biases and white noise, whose blocks begin at `from`.
+impl ImuModel {
+    /// Turns the vehicle's motion into the sensor's axes and adds constant biases and white noise, whose blocks begin at `from`.
     #[inline(always)]
-    fn err(&self, white: Drawn, from: usize, values: &mut [Pair]) {
+    fn add_errors(&self, white: DrawnNormals, from: usize, values: &mut [Pair]) {
         for (index, value) in values.iter_mut().enumerate() {
             let normals = white.four(from + 4 * index);
             for i in 0..16 {
@@ -233,9 +240,9 @@ impl Unit {
         }
     }
 
-    /// Lets the biases walk from sample to sample.
+    /// Adds the random walk of the biases, sample by sample.
     #[inline(always)]
-    fn walk(&self, drift: Drawn, from: usize, walk: &mut Axes, values: &mut [Pair]) {
+    fn walk(&self, drift: DrawnNormals, from: usize, walk: &mut ImuAxes, values: &mut [Pair]) {
         let mut walked = *walk;
         for (index, value) in values.iter_mut().enumerate() {
             let normals = drift.four(from + 4 * index);
@@ -255,13 +262,13 @@ impl Unit {
         *walk = walked;
     }
 
-    /// From values to what leaves the sensor: multiples of the resolution within the range.
+    /// Limits values to the sensor's output: multiples of the resolution within the range.
     #[inline(always)]
     #[expect(
         clippy::needless_range_loop,
         reason = "plain indices are what the compiler turns into vectors here"
     )]
-    fn deliver(&self, values: &mut [Pair]) {
+    fn quantise(&self, values: &mut [Pair]) {
         if self.is_stepped {
             for value in &mut *values {
                 let mut steps: Pair = [0.0; 16];
@@ -293,16 +300,16 @@ impl Unit {
     }
 }
 
-/// Acceleration and angular rate of a sub-step; what follows them has the sign 0.
+/// Acceleration and angular rate of a sub-step; the elements after them have the sign 0.
 #[inline(always)]
-fn felt(row: &SubStep) -> Axes {
-    let [_, felt]: [Axes; 2] = bytemuck::must_cast(*row);
+fn felt(row: &SubStep) -> ImuAxes {
+    let [_, felt]: [ImuAxes; 2] = bytemuck::must_cast(*row);
     felt
 }
 
 /// Mean acceleration and angular rate over sub-steps.
 #[inline(always)]
-fn mean(rows: &[SubStep]) -> Axes {
+fn mean(rows: &[SubStep]) -> ImuAxes {
     let mut sum = [0.0; 8];
     for row in rows {
         let felt = felt(row);
@@ -323,36 +330,36 @@ fn mean(rows: &[SubStep]) -> Axes {
 /// `AInertialMeasurementUnit`): acceleration along y changes its sign, and of the angular rate, an axial vector, the two components
 /// that the mirror leaves in place: rolling to the left and turning to the right are positive there, and nose down still is. Its
 /// compass is 0 at (0, −1, 0), which is north there, and grows clockwise as ours. Its gravity is 9.81 m/s², ours 9.806 65.
-fn signs(convention: ImuConvention) -> Axes {
+fn signs(convention: ImuConvention) -> ImuAxes {
     match convention {
         ImuConvention::Kinematic | ImuConvention::SpecificForce => [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0],
         ImuConvention::Carla => [1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 0.0, 0.0],
     }
 }
 
-/// What an accelerometer feels of gravity at the end of each sample: the upward reaction, turned into the body (roll and pitch small
-/// or large).
+/// Gravity as an accelerometer measures it at the end of each sample: the upward reaction, turned into the vehicle's frame (for any
+/// roll and pitch).
 #[inline(always)]
-fn gravity_body<'r>(gravity_mps2: f32, samples: usize, rows_of: &impl Fn(usize) -> &'r [SubStep]) -> [[f32; LANES]; 3] {
-    let (mut roll, mut pitch): ([u32; LANES], [u32; LANES]) = ([0; LANES], [0; LANES]);
+fn gravity_body<'r>(gravity_mps2: f32, samples: usize, rows_of: &impl Fn(usize) -> &'r [SubStep]) -> [[f32; BATCH]; 3] {
+    let (mut roll, mut pitch): ([u32; BATCH], [u32; BATCH]) = ([0; BATCH], [0; BATCH]);
     for (i, (roll, pitch)) in roll.iter_mut().zip(&mut pitch).take(samples).enumerate() {
         if let Some(end) = rows_of(i).last() {
             (*roll, *pitch) = (turns(end.roll_rad), turns(end.pitch_rad));
         }
     }
-    let mut gravity = [[0.0; LANES]; 3];
-    for lane in 0..LANES {
-        let (cos_pitch, sin_pitch) = cos_sin(pitch[lane]);
-        let (cos_roll, sin_roll) = cos_sin(roll[lane]);
-        gravity[0][lane] = gravity_mps2 * sin_pitch;
-        gravity[1][lane] = gravity_mps2 * cos_pitch * sin_roll;
-        gravity[2][lane] = gravity_mps2 * cos_pitch * cos_roll;
+    let mut gravity = [[0.0; BATCH]; 3];
+    for member in 0..BATCH {
+        let (cos_pitch, sin_pitch) = cos_sin(pitch[member]);
+        let (cos_roll, sin_roll) = cos_sin(roll[member]);
+        gravity[0][member] = gravity_mps2 * sin_pitch;
+        gravity[1][member] = gravity_mps2 * cos_pitch * sin_roll;
+        gravity[2][member] = gravity_mps2 * cos_pitch * cos_roll;
     }
     gravity
 }
 
-/// An angle in parts of 2⁻³² of a turn, whole turns left out. The last bit of a number between 2²⁰ and 2²¹ is one such part: the
-/// addition rounds to it, without a conversion that depends on the sign and size.
+/// An angle in units of 2⁻³² turns, without whole turns. The last bit of a number between 2²⁰ and 2²¹ is one such unit: the addition
+/// rounds to it, without a conversion that depends on sign and size.
 #[inline(always)]
 fn turns(angle_rad: impl Into<f64>) -> u32 {
     const ROUNDS: f64 = 1_572_864.0;

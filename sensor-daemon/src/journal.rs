@@ -1,7 +1,7 @@
-//! The journal: every observation since the trainer's commit before the last, so that a successor misses nothing.
+//! The journal holds every observation since the trainer's commit before the last, so that a successor misses none.
 //!
-//! Messages lie one behind the other in chunks; the first chunks are memory, further ones places in a file without a name. A chunk is
-//! freed when all its ticks are committed, and used again. At the ceiling the oldest chunk goes.
+//! Messages are stored one after the other in chunks. The first chunks are memory, further ones are parts of an unlinked file. A chunk
+//! is reused once all its ticks are committed. When the journal reaches its size limit, it drops the oldest chunk.
 
 use std::{
     collections::VecDeque,
@@ -14,12 +14,12 @@ use ipc_schema::header::MessageHeader;
 
 /// Longest chunk, bytes, unless one message is longer: short enough to free often, long enough to allocate seldom.
 const CHUNK_BYTES: usize = 4 << 20;
-/// Chunks that share the ceiling, at least: what the ceiling frees at once is at most an eighth.
+/// Least number of chunks within the size limit: dropping one frees at most an eighth.
 const CHUNKS: usize = 8;
 /// Bytes held in memory before the file is used.
 const MEMORY_BYTES: usize = 64 << 20;
 
-/// The journal cannot do what is asked of it.
+/// The journal cannot store or deliver a tick.
 #[derive(Debug, thiserror::Error)]
 pub enum JournalError {
     /// The file cannot be created, written or read.
@@ -33,7 +33,7 @@ pub enum JournalError {
         #[source]
         source: std::io::Error,
     },
-    /// A successor asks for a tick that the ceiling has pushed out.
+    /// A successor asks for a tick that was dropped at the size limit.
     #[error(
         "the trainer continues at tick {wanted}, the journal begins at tick {first}: raise `run.journal_mib` (now {limit_mib}), or commit more often (`trainer.checkpoint_interval`)"
     )]
@@ -42,12 +42,12 @@ pub enum JournalError {
         wanted: u64,
         /// The oldest tick held.
         first: u64,
-        /// The ceiling, MiB.
+        /// The size limit, MiB.
         limit_mib: usize,
     },
-    /// A successor asks for a tick that has not been.
+    /// A successor asks for a tick that has not been made.
     #[error(
-        "the trainer continues at tick {wanted}, but the newest so far is {ticks} ticks: its checkpoint is of another run"
+        "the trainer continues at tick {wanted}, but only {ticks} ticks have been made: its checkpoint belongs to another run"
     )]
     Future {
         /// The tick asked for.
@@ -59,29 +59,29 @@ pub enum JournalError {
 
 /// Where a chunk's bytes lie.
 #[derive(Debug)]
-enum Place {
+enum ChunkStorage {
     Memory(Vec<u8>),
-    /// Number of a stretch of the file.
+    /// Number of the chunk in the file.
     File(u64),
 }
 
 /// One message in a chunk.
 #[derive(Debug, Clone, Copy)]
-struct Entry {
+struct JournalEntry {
     header: MessageHeader,
     offset: usize,
     len: usize,
 }
 
 #[derive(Debug)]
-struct Chunk {
+struct JournalChunk {
     first_tick: u64,
-    place: Place,
+    place: ChunkStorage,
     used: usize,
-    entries: Vec<Entry>,
+    entries: Vec<JournalEntry>,
 }
 
-impl Chunk {
+impl JournalChunk {
     /// One more than its newest tick.
     fn end(&self) -> u64 {
         self.first_tick + self.entries.len() as u64
@@ -94,9 +94,9 @@ pub struct Journal {
     directory: PathBuf,
     limit_bytes: usize,
     chunk_bytes: usize,
-    chunks: VecDeque<Chunk>,
-    /// Chunks of memory and stretches of the file that are free for use.
-    free: Vec<Place>,
+    chunks: VecDeque<JournalChunk>,
+    /// Chunks in memory and in the file that are free for reuse.
+    free: Vec<ChunkStorage>,
     memory_chunks: usize,
     file_chunks: u64,
     file: Option<File>,
@@ -128,7 +128,7 @@ impl Journal {
         }
     }
 
-    /// The same where all ticks below `tick` are committed already: it begins with that one.
+    /// The same journal beginning at `tick`: all ticks below are committed already.
     #[must_use]
     pub fn beginning_at(self, tick: u64) -> Self {
         Self {
@@ -150,7 +150,7 @@ impl Journal {
         self.ticks
     }
 
-    /// Most bytes of observations held at a time so far.
+    /// Largest number of bytes held so far.
     #[must_use]
     pub fn most_bytes(&self) -> usize {
         self.most_bytes
@@ -162,10 +162,10 @@ impl Journal {
         self.chunks.iter().map(|chunk| chunk.used).sum()
     }
 
-    /// True if a tick of `len` bytes can be added without any older one being given up.
+    /// True if a tick of `len` bytes can be added without dropping an older one.
     #[must_use]
     pub fn has_room(&self, len: usize) -> bool {
-        let fits = |chunk: &Chunk| chunk.used + len <= self.chunk_bytes;
+        let fits = |chunk: &JournalChunk| chunk.used + len <= self.chunk_bytes;
         self.chunks.back().is_some_and(fits) || self.chunks.len() < self.most_chunks()
     }
 
@@ -178,7 +178,7 @@ impl Journal {
     /// # Errors
     /// The file cannot be written.
     pub fn push(&mut self, header: MessageHeader, payload: &[u8]) -> Result<(), JournalError> {
-        let full = |chunk: &Chunk| chunk.used + payload.len() > self.chunk_bytes;
+        let full = |chunk: &JournalChunk| chunk.used + payload.len() > self.chunk_bytes;
         if self.chunks.back().is_none_or(full) {
             self.add_chunk(payload.len())?;
         }
@@ -187,17 +187,17 @@ impl Journal {
         };
         let offset = chunk.used;
         match &mut chunk.place {
-            Place::Memory(bytes) => {
+            ChunkStorage::Memory(bytes) => {
                 bytes.truncate(offset);
                 bytes.extend_from_slice(payload);
             }
-            Place::File(number) => {
+            ChunkStorage::File(number) => {
                 let at = *number * self.chunk_bytes as u64 + offset as u64;
                 let written = self.file.as_ref().map_or(Ok(()), |file| file.write_all_at(payload, at));
                 written.map_err(failed("write", &self.directory))?;
             }
         }
-        chunk.entries.push(Entry {
+        chunk.entries.push(JournalEntry {
             header,
             offset,
             len: payload.len(),
@@ -210,7 +210,7 @@ impl Journal {
         Ok(())
     }
 
-    /// All ticks below `ticks` are committed: what lies before the commit before this one is freed.
+    /// Records that all ticks below `ticks` are committed, and frees the chunks before the previous commit.
     pub fn commit(&mut self, ticks: u64) {
         let [newest, _] = self.commits;
         if ticks > newest {
@@ -219,10 +219,10 @@ impl Journal {
         }
     }
 
-    /// A successor continues at `tick`.
+    /// Lets a successor continue at `tick`.
     ///
     /// # Errors
-    /// That tick is not held any more, or has not been.
+    /// That tick has been dropped, or has not been made.
     pub fn restart(&mut self, tick: u64) -> Result<(), JournalError> {
         if tick > self.ticks {
             return Err(JournalError::Future {
@@ -256,8 +256,8 @@ impl Journal {
             return Ok(false);
         };
         match &chunk.place {
-            Place::Memory(bytes) => payload.copy_from_slice(&bytes[entry.offset..entry.offset + entry.len]),
-            Place::File(number) => {
+            ChunkStorage::Memory(bytes) => payload.copy_from_slice(&bytes[entry.offset..entry.offset + entry.len]),
+            ChunkStorage::File(number) => {
                 let at = *number * self.chunk_bytes as u64 + entry.offset as u64;
                 let read = self
                     .file
@@ -269,7 +269,7 @@ impl Journal {
         Ok(true)
     }
 
-    fn entry(&self, tick: u64) -> Option<(&Chunk, Entry)> {
+    fn entry(&self, tick: u64) -> Option<(&JournalChunk, JournalEntry)> {
         let after = self.chunks.partition_point(|chunk| chunk.first_tick <= tick);
         let chunk = self.chunks.get(after.checked_sub(1)?)?;
         let index = usize::try_from(tick - chunk.first_tick).ok()?;
@@ -289,7 +289,7 @@ impl Journal {
             Some(place) => place,
             None => self.new_place()?,
         };
-        self.chunks.push_back(Chunk {
+        self.chunks.push_back(JournalChunk {
             first_tick: self.ticks,
             place,
             used: 0,
@@ -298,16 +298,16 @@ impl Journal {
         Ok(())
     }
 
-    fn new_place(&mut self) -> Result<Place, JournalError> {
+    fn new_place(&mut self) -> Result<ChunkStorage, JournalError> {
         if (self.memory_chunks + 1) * self.chunk_bytes <= MEMORY_BYTES || self.memory_chunks < 2 {
             self.memory_chunks += 1;
-            return Ok(Place::Memory(Vec::with_capacity(self.chunk_bytes)));
+            return Ok(ChunkStorage::Memory(Vec::with_capacity(self.chunk_bytes)));
         }
         if self.file.is_none() {
-            self.file = Some(nameless(&self.directory).map_err(failed("create", &self.directory))?);
+            self.file = Some(unlinked_file(&self.directory).map_err(failed("create", &self.directory))?);
         }
         self.file_chunks += 1;
-        Ok(Place::File(self.file_chunks - 1))
+        Ok(ChunkStorage::File(self.file_chunks - 1))
     }
 
     fn free_below(&mut self, tick: u64) {
@@ -319,10 +319,10 @@ impl Journal {
     fn free_first(&mut self) {
         if let Some(chunk) = self.chunks.pop_front() {
             self.free.push(chunk.place);
-            // Memory is taken before the file, which costs a system call for each message.
+            // Memory is reused before the file, which costs a system call for each message.
             self.free.sort_by_key(|place| match place {
-                Place::Memory(_) => (1, 0),
-                Place::File(number) => (0, u64::MAX - number),
+                ChunkStorage::Memory(_) => (1, 0),
+                ChunkStorage::File(number) => (0, u64::MAX - number),
             });
         }
     }
@@ -331,15 +331,15 @@ impl Journal {
         if !self.warned {
             self.warned = true;
             tracing::warn!(
-                "the journal of observations is full ({} MiB) before the trainer has committed: the oldest go, and a trainer that dies now cannot be replaced; raise `run.journal_mib` or lower `trainer.checkpoint_interval`",
+                "the journal of observations is full ({} MiB) before the trainer has committed: the oldest ticks are dropped, and a trainer that dies now cannot be replaced; raise `run.journal_mib` or lower `trainer.checkpoint_interval`",
                 self.limit_bytes >> 20
             );
         }
     }
 }
 
-/// A file in `directory` that has no name any more: it goes with this process, however that ends.
-fn nameless(directory: &Path) -> std::io::Result<File> {
+/// Opens an unlinked file in `directory`: the system frees it when this process ends, for whatever reason.
+fn unlinked_file(directory: &Path) -> std::io::Result<File> {
     let path = directory.join("journal.partial");
     let file = OpenOptions::new()
         .create(true)
@@ -372,7 +372,7 @@ mod tests {
         }
     }
 
-    /// What the message of a tick holds.
+    /// Test payload of a tick.
     fn payload(tick: u64, len: usize) -> Vec<u8> {
         (0..len).map(|i| (tick.wrapping_mul(31) + i as u64) as u8).collect()
     }
@@ -392,14 +392,14 @@ mod tests {
     }
 
     #[test]
-    fn ticks_beyond_the_memory_come_back_from_a_file_that_has_no_name() {
+    fn ticks_beyond_the_memory_are_read_back_from_an_unlinked_file() {
         let directory = tempfile::tempdir().unwrap();
         let mut journal = Journal::new(directory.path(), 1 << 30, 1000);
         fill(&mut journal, 90, 1 << 20);
         assert!(journal.file.is_some(), "90 MiB are more than the memory part");
         (0..90).for_each(|tick| check(&journal, tick));
         assert_eq!(std::fs::read_dir(directory.path()).unwrap().count(), 0);
-        // What is freed is used again: never more than 130 MiB are held, 64 of them in memory, in chunks of 4.
+        // Freed chunks are reused: never more than 130 MiB are held, 64 of them in memory, in chunks of 4.
         for _ in 0..5 {
             journal.commit(journal.ticks());
             fill(&mut journal, 40, 1 << 20);
@@ -419,7 +419,7 @@ mod tests {
         }
         journal.restart(2000).unwrap();
         (2000..3000).for_each(|tick| check(&journal, tick));
-        // From there on the commit at 2000 is the newest, and stays reachable until two more have come.
+        // From there on the commit at 2000 is the newest, and stays reachable until two more commits.
         journal.commit(2500);
         fill(&mut journal, 2000, 100);
         journal.restart(2500).unwrap();
@@ -427,12 +427,12 @@ mod tests {
     }
 
     #[test]
-    fn the_ceiling_is_kept_and_named_when_it_matters() {
+    fn the_size_limit_is_kept_and_the_error_names_it() {
         let directory = tempfile::tempdir().unwrap();
         let mut journal = Journal::new(directory.path(), 1 << 20, 1000);
         fill(&mut journal, 5000, 1000);
         assert!(journal.most_bytes() <= 1 << 20, "{} bytes", journal.most_bytes());
-        assert!(journal.first() > 3900, "an eighth too much may go at a time");
+        assert!(journal.first() > 3900, "an eighth too much may be dropped at a time");
         let error = journal.restart(0).unwrap_err().to_string();
         assert!(error.contains("`run.journal_mib` (now 1)"), "{error}");
         assert!(journal.restart(5001).unwrap_err().to_string().contains("another run"));
@@ -456,9 +456,9 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever the order of ticks, commits and restarts: what may be asked for is there, as it was, within the ceiling.
+        /// For any order of ticks, commits and restarts, every tick that may be requested is held unchanged, within the size limit.
         #[test]
-        fn every_tick_since_the_commit_before_the_last_is_there(steps in steps(), limit_kib in prop::sample::select(vec![16_usize, 64, 100_000])) {
+        fn every_tick_since_the_commit_before_the_last_is_held(steps in steps(), limit_kib in prop::sample::select(vec![16_usize, 64, 100_000])) {
             let directory = tempfile::tempdir().unwrap();
             let mut journal = Journal::new(directory.path(), limit_kib << 10, 3000);
             let mut lens = Vec::new();

@@ -1,9 +1,9 @@
-//! Sensors of connected vehicles, and the assembly of what they deliver into observations.
+//! Samples the sensors of connected vehicles and assembles their values into observations.
 //!
-//! A library of pure functions without clock, I/O or shared memory; the `sensor-daemon` binary is a thin shell around
-//! [`sensing::Sensing`]: [`daemon`], with the [`delivery`] to the trainer, its [`journal`], and the [`hand_over`] to the next.
+//! The sensors and [`sensing::Sensing`] are pure functions without clock, I/O or shared memory. The process is a thin shell around
+//! them: [`daemon`] receives `world` and publishes `observation`, and [`delivery`] sends observations to the trainer.
 
-// Sensor values leave in single precision: the wire's precision, see `ipc_schema::observation`.
+// Sensor values are published in single precision, the precision of the wire (`ipc_schema::observation`).
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
 pub mod blackout;
@@ -13,7 +13,7 @@ pub mod delivery;
 pub mod digest;
 pub mod fields;
 pub mod gnss;
-pub mod hand_over;
+pub mod handover;
 pub mod history;
 pub mod imu;
 pub mod journal;

@@ -1,4 +1,4 @@
-//! `sensor-daemon RUN_FILE`: started by `caraware`.
+//! The `sensor-daemon RUN_FILE` command, which `caraware` starts.
 
 use std::process::ExitCode;
 

@@ -1,22 +1,22 @@
-//! Counter-based random numbers: a value depends on what it is for, never on when or in which order it is drawn.
+//! Counter-based random numbers: a value depends on its purpose, never on when or in which order it is drawn.
 
 use ipc_schema::sensor::NoiseStream;
 
 use crate::{
-    normals::{self, Block, LANES, Lanes, Purpose},
-    wide::Path,
+    normals::{self, BATCH, NormalBatch, NormalBlock, NormalPurpose},
+    wide::VectorPath,
 };
 
 pub use crate::normals::philox4x32;
 
-/// Random stream of one sensor of one vehicle in one episode.
+/// Random numbers of one noise stream of one vehicle in one episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Stream {
+pub struct RandomStream {
     /// Seed of the episode.
     pub episode_seed: u64,
     /// Hash of the vehicle's SUMO id.
     pub id_hash: u64,
-    /// Which sensor.
+    /// The sensor, or part of a sensor, that the numbers are for.
     pub sensor: NoiseStream,
 }
 
@@ -25,10 +25,10 @@ fn key(episode_seed: u64) -> [u32; 2] {
     [episode_seed as u32, (episode_seed >> 32) as u32]
 }
 
-impl Stream {
+impl RandomStream {
     /// Four independent standard normal numbers for the sensor's `sample`-th sample.
     #[must_use]
-    pub fn normals(&self, sample: u32) -> Block {
+    pub fn normals(&self, sample: u32) -> NormalBlock {
         normals::block(self.counter(sample, 0), key(self.episode_seed))
     }
 
@@ -50,24 +50,25 @@ impl Stream {
     }
 }
 
-/// Numbers of [`LANES`] vehicles at a time. All need the same at a tick: it is planned once, and drawn for one group after the other.
+/// Random numbers of [`BATCH`] vehicles at a time. All vehicles need the same numbers at a tick, so they are planned once and drawn
+/// batch by batch.
 #[derive(Debug)]
-pub struct Draws {
-    path: Path,
-    plan: Vec<Purpose>,
-    blocks: Vec<Lanes>,
+pub struct NormalDraws {
+    path: VectorPath,
+    plan: Vec<NormalPurpose>,
+    blocks: Vec<NormalBatch>,
 }
 
-impl Default for Draws {
+impl Default for NormalDraws {
     fn default() -> Self {
-        Self::on(Path::widest())
+        Self::on(VectorPath::widest())
     }
 }
 
-impl Draws {
+impl NormalDraws {
     /// Draws with the instructions of `path`.
     #[must_use]
-    pub fn on(path: Path) -> Self {
+    pub fn on(path: VectorPath) -> Self {
         Self {
             path,
             plan: Vec::new(),
@@ -75,44 +76,44 @@ impl Draws {
         }
     }
 
-    /// Forgets everything that was planned.
+    /// Clears the plan.
     pub fn clear(&mut self) {
         self.plan.clear();
     }
 
-    /// Plans a sample of a sensor.
+    /// Plans a block of numbers for a sample of a sensor.
     pub fn plan(&mut self, sensor: NoiseStream, sample: u32) {
         self.plan.push([sample, sensor as u32]);
     }
 
-    /// Draws everything that is planned for the vehicles with these ids.
-    pub fn draw(&mut self, episode_seed: u64, ids: &[u64; LANES]) {
-        self.blocks.resize(self.plan.len(), [[0.0; 4]; LANES]);
+    /// Draws the planned numbers for the vehicles with these ids.
+    pub fn draw(&mut self, episode_seed: u64, ids: &[u64; BATCH]) {
+        self.blocks.resize(self.plan.len(), [[0.0; 4]; BATCH]);
         normals::fill(self.path, key(episode_seed), ids, &self.plan, &mut self.blocks);
     }
 
-    /// What has been drawn for the vehicle in `lane`, in the order of the plan.
+    /// The numbers of vehicle `member` of the batch, in the order of the plan.
     #[must_use]
     #[inline]
-    pub fn of(&self, lane: usize) -> Drawn<'_> {
-        Drawn {
+    pub fn of(&self, member: usize) -> DrawnNormals<'_> {
+        DrawnNormals {
             blocks: &self.blocks,
-            lane: lane % LANES,
+            member: member % BATCH,
         }
     }
 }
 
-/// One vehicle's share of what has been drawn for a group.
+/// One vehicle's numbers of a batch.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Drawn<'a> {
-    blocks: &'a [Lanes],
-    lane: usize,
+pub struct DrawnNormals<'a> {
+    blocks: &'a [NormalBatch],
+    member: usize,
 }
 
-impl Drawn<'_> {
+impl DrawnNormals<'_> {
     /// Takes the next block if one was planned, else zeros.
     #[inline]
-    pub fn take(&mut self, is_planned: bool) -> Block {
+    pub fn take(&mut self, is_planned: bool) -> NormalBlock {
         if is_planned { self.split(1).at(0) } else { [0.0; 4] }
     }
 
@@ -125,23 +126,23 @@ impl Drawn<'_> {
         Self { blocks, ..*self }
     }
 
-    /// The block at an index; zeros behind the last.
+    /// The block at an index; zeros after the last.
     #[must_use]
     #[inline(always)]
-    pub fn at(&self, index: usize) -> Block {
+    pub fn at(&self, index: usize) -> NormalBlock {
         match self.blocks.get(index) {
-            Some(lanes) => lanes[self.lane % LANES],
+            Some(batch) => batch[self.member % BATCH],
             None => [0.0; 4],
         }
     }
 
-    /// Four blocks from an index on; zeros behind the last.
+    /// Four blocks from an index on; zeros after the last.
     #[must_use]
     #[inline(always)]
     pub fn four(&self, index: usize) -> [f32; 16] {
-        let lane = self.lane % LANES;
+        let member = self.member % BATCH;
         let four = match self.blocks.get(index..index + 4) {
-            Some([a, b, c, d]) => [a[lane], b[lane], c[lane], d[lane]],
+            Some([a, b, c, d]) => [a[member], b[member], c[member], d[member]],
             _ => [0, 1, 2, 3].map(|i| self.at(index + i)),
         };
         bytemuck::must_cast(four)
@@ -164,8 +165,8 @@ impl Drawn<'_> {
 mod tests {
     use super::*;
 
-    fn stream(id_hash: u64, sensor: NoiseStream) -> Stream {
-        Stream {
+    fn stream(id_hash: u64, sensor: NoiseStream) -> RandomStream {
+        RandomStream {
             episode_seed: 42,
             id_hash,
             sensor,
@@ -190,7 +191,7 @@ mod tests {
     fn normals_are_standard_normal() {
         const N: u32 = 1_000_000;
         let stream = stream(7, NoiseStream::Gnss);
-        let blocks: Vec<Block> = (0..N).map(|sample| stream.normals(sample)).collect();
+        let blocks: Vec<NormalBlock> = (0..N).map(|sample| stream.normals(sample)).collect();
         for axis in 0..4 {
             let values: Vec<f64> = blocks.iter().map(|block| f64::from(block[axis])).collect();
             let [mean, variance, skewness, kurtosis] = moments(&values);
@@ -215,9 +216,9 @@ mod tests {
 
     #[test]
     fn draws_are_the_streams_own_numbers() {
-        let mut draws = Draws::default();
+        let mut draws = NormalDraws::default();
         assert!(draws.of(3).is_empty());
-        let mut ids = [9; LANES];
+        let mut ids = [9; BATCH];
         (ids[3], ids[15]) = (7, u64::MAX - 5);
         for round in 0..3_u32 {
             draws.clear();

@@ -1,22 +1,22 @@
-//! Standard normal numbers, sixteen blocks of four side by side: Philox, then the Box–Muller transform with polynomials in f32.
+//! Standard normal numbers for a batch of sixteen vehicles: Philox, then the Box–Muller transform with polynomials in f32.
 //!
 //! Four numbers from one block of Philox: radius √(−2 ln u) and angle 2πv, twice. u has 31 bits, so that the largest number is
 //! 6.66 (a normal number exceeds that once in 4·10¹⁰); v has 32. The polynomials are minimax fits over half an octave and a
 //! quarter of a turn; a test compares them with libm.
 
-use crate::wide::{Path, Work};
+use crate::wide::{VectorPath, VectorWork};
 
-/// Blocks side by side: one register of AVX-512 for 32-bit numbers.
-pub const LANES: usize = 16;
+/// Vehicles in a batch: one AVX-512 register of 32-bit numbers.
+pub const BATCH: usize = 16;
 
 /// Four independent standard normal numbers.
-pub type Block = [f32; 4];
+pub type NormalBlock = [f32; 4];
 
-/// Blocks of all lanes for one purpose.
-pub type Lanes = [Block; LANES];
+/// One block for each vehicle of a batch.
+pub type NormalBatch = [NormalBlock; BATCH];
 
-/// What the numbers of all lanes are for: the first two words of their counters.
-pub type Purpose = [u32; 2];
+/// Purpose of the numbers of a batch: the first two words of their counters (sample, noise stream).
+pub type NormalPurpose = [u32; 2];
 
 const MULTIPLIERS: [u64; 2] = [0xD251_1F53, 0xCD9E_8D57];
 const WEYL: [u32; 2] = [0x9E37_79B9, 0xBB67_AE85];
@@ -26,7 +26,7 @@ const LOW: u64 = 0xFFFF_FFFF;
 #[must_use]
 #[inline(always)]
 pub fn philox4x32(counter: [u32; 4], key: [u32; 2]) -> [u32; 4] {
-    // Words in 64 bits with anything above the lower half: the product of two lower halves is one instruction.
+    // Words in 64 bits whose upper halves are ignored: the product of two lower halves is one instruction.
     let [mut c0, mut c1, mut c2, mut c3] = counter.map(u64::from);
     let [mut k0, mut k1] = key;
     for _ in 0..10 {
@@ -41,7 +41,7 @@ pub fn philox4x32(counter: [u32; 4], key: [u32; 2]) -> [u32; 4] {
 #[inline(always)]
 fn minus_two_ln(u: f32) -> f32 {
     const HALF_ROOT_BITS: u32 = std::f32::consts::FRAC_1_SQRT_2.to_bits();
-    // u = m 2^e with m in [√½, √2): the logarithm of m is small where u is close to 1, and keeps its digits.
+    // u = m 2^e with m in [√½, √2): where u is close to 1 the logarithm of m is small and keeps its digits.
     let bits = u.to_bits().wrapping_sub(HALF_ROOT_BITS);
     let e = (bits as i32 >> 23) as f32;
     let f = f32::from_bits((bits & 0x007F_FFFF).wrapping_add(HALF_ROOT_BITS)) - 1.0;
@@ -57,7 +57,7 @@ fn minus_two_ln(u: f32) -> f32 {
 #[inline(always)]
 pub fn cos_sin(turns: u32) -> (f32, f32) {
     const RAD: f32 = (std::f64::consts::TAU / 4_294_967_296.0) as f32;
-    // To the nearest quarter, and what remains: at most an eighth of a turn.
+    // The nearest quarter turn and the remainder, at most an eighth of a turn.
     let quarter = turns.wrapping_add(1 << 29) >> 30;
     let x = turns.wrapping_sub(quarter << 30) as i32 as f32 * RAD;
     let q = x * x;
@@ -87,50 +87,61 @@ fn box_muller(a: u32, b: u32) -> (f32, f32) {
 /// The block at `counter`: the same bits as in [`Normals`].
 #[must_use]
 #[inline(always)]
-pub fn block(counter: [u32; 4], key: [u32; 2]) -> Block {
+pub fn block(counter: [u32; 4], key: [u32; 2]) -> NormalBlock {
     let [a, b, c, d] = philox4x32(counter, key);
     let ((n0, n1), (n2, n3)) = (box_muller(a, b), box_muller(c, d));
     [n0, n1, n2, n3]
 }
 
-/// Blocks of normal numbers for many purposes, of [`LANES`] vehicles side by side.
+/// Normal numbers for many purposes, for a batch of [`BATCH`] vehicles.
 #[derive(Debug)]
 struct Normals<'a> {
     key: [u32; 2],
-    /// The last two words of each lane's counters.
-    ids: [[u32; LANES]; 2],
-    purposes: &'a [Purpose],
-    blocks: &'a mut [Lanes],
+    /// The last two words of each vehicle's counters.
+    ids: [[u32; BATCH]; 2],
+    purposes: &'a [NormalPurpose],
+    blocks: &'a mut [NormalBatch],
 }
 
-impl Work for Normals<'_> {
+impl VectorWork for Normals<'_> {
     type Output = ();
 
     #[inline(always)]
     fn run(self) {
         let [low, high] = self.ids;
         for ([sample, sensor], blocks) in self.purposes.iter().zip(self.blocks) {
-            let mut words = [[0_u32; LANES]; 4];
-            for lane in 0..LANES {
-                let word = philox4x32([*sample, *sensor, low[lane], high[lane]], self.key);
+            let mut words = [[0_u32; BATCH]; 4];
+            for member in 0..BATCH {
+                let word = philox4x32([*sample, *sensor, low[member], high[member]], self.key);
                 for i in 0..4 {
-                    words[i][lane] = word[i];
+                    words[i][member] = word[i];
                 }
             }
-            let mut numbers = [[0.0_f32; LANES]; 4];
-            for lane in 0..LANES {
-                (numbers[0][lane], numbers[1][lane]) = box_muller(words[0][lane], words[1][lane]);
-                (numbers[2][lane], numbers[3][lane]) = box_muller(words[2][lane], words[3][lane]);
+            let mut numbers = [[0.0_f32; BATCH]; 4];
+            for member in 0..BATCH {
+                (numbers[0][member], numbers[1][member]) = box_muller(words[0][member], words[1][member]);
+                (numbers[2][member], numbers[3][member]) = box_muller(words[2][member], words[3][member]);
             }
-            for lane in 0..LANES {
-                blocks[lane] = [numbers[0][lane], numbers[1][lane], numbers[2][lane], numbers[3][lane]];
+            for member in 0..BATCH {
+                blocks[member] = [
+                    numbers[0][member],
+                    numbers[1][member],
+                    numbers[2][member],
+                    numbers[3][member],
+                ];
             }
         }
     }
 }
 
-/// Fills `blocks`, one for each purpose, for the vehicles with these ids, on the given path.
-pub fn fill(path: Path, key: [u32; 2], ids: &[u64; LANES], purposes: &[Purpose], blocks: &mut [Lanes]) {
+/// Fills `blocks`, one for each purpose, for the vehicles with these ids, with the instructions of `path`.
+pub fn fill(
+    path: VectorPath,
+    key: [u32; 2],
+    ids: &[u64; BATCH],
+    purposes: &[NormalPurpose],
+    blocks: &mut [NormalBatch],
+) {
     path.run(Normals {
         key,
         ids: [ids.map(|id| id as u32), ids.map(|id| (id >> 32) as u32)],
@@ -200,16 +211,16 @@ mod tests {
     #[test]
     fn every_path_gives_the_bits_of_a_block_alone() {
         const PURPOSES: usize = 500;
-        let purposes: Vec<Purpose> = (0..PURPOSES as u32)
+        let purposes: Vec<NormalPurpose> = (0..PURPOSES as u32)
             .map(|i| [i.wrapping_mul(0x9E37_79B9), i % 7])
             .collect();
-        let ids: [u64; LANES] = std::array::from_fn(|lane| (lane as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+        let ids: [u64; BATCH] = std::array::from_fn(|member| (member as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         let key = [7, 0xDEAD_BEEF];
-        for path in Path::available() {
-            let mut blocks = vec![[[0.0; 4]; LANES]; PURPOSES];
+        for path in VectorPath::available() {
+            let mut blocks = vec![[[0.0; 4]; BATCH]; PURPOSES];
             fill(path, key, &ids, &purposes, &mut blocks);
-            for ([sample, sensor], lanes) in purposes.iter().zip(&blocks) {
-                for (id, numbers) in ids.iter().zip(lanes) {
+            for ([sample, sensor], batch) in purposes.iter().zip(&blocks) {
+                for (id, numbers) in ids.iter().zip(batch) {
                     let alone = block([*sample, *sensor, *id as u32, (id >> 32) as u32], key);
                     assert_eq!(numbers.map(f32::to_bits), alone.map(f32::to_bits), "{path:?}");
                 }

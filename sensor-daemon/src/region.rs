@@ -2,10 +2,10 @@
 
 use ipc_schema::config;
 
-/// A place is inside it or not; metres, world frame.
+/// The region, in metres of the world frame.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Region {
-    /// Everywhere.
+pub enum SensedRegion {
+    /// The whole map.
     All,
     /// Within a distance of a point.
     Circle {
@@ -14,11 +14,11 @@ pub enum Region {
         /// Its radius.
         radius_m: f64,
     },
-    /// Inside a polygon, which need not be convex; by the even-odd rule where it crosses itself.
+    /// Inside a polygon, convex or not, by the even-odd rule.
     Polygon(Vec<[f64; 2]>),
 }
 
-impl Region {
+impl SensedRegion {
     /// The region of a validated configuration.
     #[must_use]
     pub fn new(config: &config::Region) -> Self {
@@ -40,7 +40,7 @@ impl Region {
             Self::Circle { centre_m, radius_m } => (x_m - centre_m[0]).hypot(y_m - centre_m[1]) <= *radius_m,
             Self::Polygon(corners) => {
                 let ends = corners.iter().zip(corners.iter().cycle().skip(1));
-                // How often a ray to the east crosses an edge.
+                // Counts the edges that a ray to the east crosses.
                 let crossed = ends.filter(|([ax, ay], [bx, by])| {
                     (*ay > y_m) != (*by > y_m) && x_m < ax + (y_m - ay) / (by - ay) * (bx - ax)
                 });
@@ -55,8 +55,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn polygon(corners: &[&str]) -> Region {
-        Region::new(&config::Region {
+    fn polygon(corners: &[&str]) -> SensedRegion {
+        SensedRegion::new(&config::Region {
             polygon_m: corners.iter().map(|corner| (*corner).to_owned()).collect(),
             ..config::Region::default()
         })
@@ -64,8 +64,8 @@ mod tests {
 
     #[test]
     fn without_a_region_everything_is_inside() {
-        assert_eq!(Region::new(&config::Region::default()), Region::All);
-        assert!(Region::All.contains(1e9, -1e9));
+        assert_eq!(SensedRegion::new(&config::Region::default()), SensedRegion::All);
+        assert!(SensedRegion::All.contains(1e9, -1e9));
     }
 
     #[test]
@@ -85,7 +85,7 @@ mod tests {
     }
 
     proptest! {
-        /// A rectangle contains what lies between its sides, whichever way round and wherever its corners begin.
+        /// A rectangle contains the points between its sides, for either order and any first corner.
         #[test]
         fn a_rectangle_is_its_sides(
             x in -50.0..50.0_f64, y in -50.0..50.0_f64, turn in 0..4_usize, reverse: bool,
@@ -99,10 +99,10 @@ mod tests {
             prop_assert_eq!(polygon(&corners).contains(x, y), inside);
         }
 
-        /// A circle contains what is nearer to its centre than its radius.
+        /// A circle contains the points nearer to its centre than its radius.
         #[test]
         fn a_circle_is_its_radius(x in -50.0..50.0_f64, y in -50.0..50.0_f64) {
-            let region = Region::new(&config::Region { centre_m: [3.0, -4.0], radius_m: 20.0, ..config::Region::default() });
+            let region = SensedRegion::new(&config::Region { centre_m: [3.0, -4.0], radius_m: 20.0, ..config::Region::default() });
             prop_assert_eq!(region.contains(x, y), (x - 3.0).powi(2) + (y + 4.0).powi(2) <= 400.0);
         }
     }

@@ -1,4 +1,4 @@
-//! LIDARs in a run: scans of every vehicle that carries one, into shared memory, and what they say about the nearest objects.
+//! LIDARs in a run: publishes the scans of every vehicle that carries one, and passes the nearest objects to the observation.
 
 use std::sync::Arc;
 
@@ -16,13 +16,13 @@ use serde::Serialize;
 use sim_core::scene::Scene;
 
 use crate::{
-    lidar::{Lidar, Scratch, Targets, nearest_objects},
+    lidar::{LidarModel, ScanScratch, Targets, nearest_objects},
     sensing::Sensing,
 };
 
-/// What LIDARs add to the run's report.
+/// Counts of LIDAR scans for the run's report.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
-pub struct Tally {
+pub struct ScanTotals {
     /// Scans: one for each LIDAR and tick.
     pub scans: u64,
     /// Rays cast.
@@ -32,29 +32,29 @@ pub struct Tally {
 }
 
 /// The LIDARs of a run.
-pub struct Scanning {
+pub struct LidarScanning {
     /// One for each map of the run.
-    lidars: Vec<Lidar>,
+    lidars: Vec<LidarModel>,
     targets: Targets,
-    scratch: Scratch,
+    scratch: ScanScratch,
     publisher: Publisher,
     sub_steps: usize,
-    /// The observation shows nearest objects.
+    /// The observation has fields of nearest objects.
     shows_objects: bool,
-    tally: Tally,
+    totals: ScanTotals,
 }
 
-impl Scanning {
+impl LidarScanning {
     /// LIDARs as configured, in the scenes of the run's maps.
     ///
     /// # Errors
     /// A ray table or mesh cannot be used.
     pub fn new(config: &Config, scenes: &[Arc<Scene>], publisher: Publisher) -> Result<Self, Failure> {
-        let lidars = scenes.iter().map(|scene| Lidar::new(config, scene));
+        let lidars = scenes.iter().map(|scene| LidarModel::new(config, scene));
         Ok(Self {
             lidars: lidars.collect::<Result<_, _>>()?,
             targets: Targets::default(),
-            scratch: Scratch::default(),
+            scratch: ScanScratch::default(),
             publisher,
             sub_steps: config.run.sub_steps as usize,
             shows_objects: config
@@ -62,17 +62,17 @@ impl Scanning {
                 .fields
                 .iter()
                 .any(|field| SensorKind::Lidar.is_in(field.measurement_bit())),
-            tally: Tally::default(),
+            totals: ScanTotals::default(),
         })
     }
 
-    /// So far.
+    /// Counts so far.
     #[must_use]
-    pub fn tally(&self) -> Tally {
-        self.tally
+    pub fn totals(&self) -> ScanTotals {
+        self.totals
     }
 
-    /// One tick: scans all around every vehicle that carries a LIDAR, publishes the points and tells `sensing` what is near.
+    /// One tick: scans from every vehicle that carries a LIDAR, publishes the points and passes the nearest objects to `sensing`.
     ///
     /// # Errors
     /// Shared memory fails.
@@ -102,7 +102,7 @@ impl Scanning {
         let lidar = &self.lidars[header.map().min(self.lidars.len() - 1)];
         let layout = PointcloudLayout::new(lidar.max_points());
         let mut draft = self.publisher.loan_unwritten(*header, layout.len)?;
-        let [head, body] = block::split_mut(draft.payload_mut(), &[layout.scan, layout.points]).map_err(broken)?;
+        let [head, body] = block::split_mut(draft.payload_mut(), &[layout.scan, layout.points]).map_err(unreadable)?;
         let points: &mut [LidarPoint] = bytemuck::cast_slice_mut(body);
         let mut scan = Scan::default();
         let count = lidar.scan(
@@ -115,9 +115,9 @@ impl Scanning {
             points,
         );
         let objects = self.shows_objects.then(|| nearest_objects(&points[..count], lidar));
-        self.tally.scans += 1;
-        self.tally.rays += u64::from(scan.rays);
-        self.tally.points += count as u64;
+        self.totals.scans += 1;
+        self.totals.rays += u64::from(scan.rays);
+        self.totals.points += count as u64;
         head.copy_from_slice(bytemuck::bytes_of(&scan));
         *draft.header_mut() = MessageHeader {
             count: count as u32,
@@ -130,6 +130,6 @@ impl Scanning {
     }
 }
 
-fn broken(error: block::BlockError) -> Failure {
+fn unreadable(error: block::BlockError) -> Failure {
     Failure::from_error(FailureKind::Run, &error)
 }

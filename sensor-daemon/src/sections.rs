@@ -1,4 +1,4 @@
-//! The arrays of an observation message, ready to be written slot by slot.
+//! The arrays of an observation message, written slot by slot.
 
 use ipc_schema::{
     block::{self, BlockError},
@@ -11,7 +11,7 @@ use ipc_schema::{
 
 /// The sections of [`ObservationLayout`], as their elements.
 #[derive(Debug)]
-pub struct Sections<'a> {
+pub struct ObservationSections<'a> {
     /// `[n, d]`.
     pub observation: &'a mut [f32],
     /// `[n]`.
@@ -40,7 +40,7 @@ pub struct Sections<'a> {
     pub age_s: &'a mut [[f32; SensorKind::COUNT]],
 }
 
-impl<'a> Sections<'a> {
+impl<'a> ObservationSections<'a> {
     /// The sections of a payload.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! All sensors of all connected road users: one tick of the world in, one observation block out.
+//! Samples all sensors of all connected road users: one tick of the world in, one observation block out.
 
 use ipc_schema::{
     block::BlockError,
@@ -13,78 +13,78 @@ use ipc_schema::{
 use sim_core::geodesy::{GeodesyError, Projection};
 
 use crate::{
-    carrier::Carrier,
+    carrier::SensorCarrier,
     fields::Normaliser,
-    gnss::Sky,
-    history::{First, History},
-    noise::{Drawn, Draws},
-    normals::LANES,
-    region::Region,
-    sections::Sections,
+    gnss::SatelliteSky,
+    history::{FrameHistory, TrajectoryFrame},
+    noise::{DrawnNormals, NormalDraws},
+    normals::BATCH,
+    region::SensedRegion,
+    sections::ObservationSections,
     slots::Slots,
-    suite::{Motion, Now, Suite},
-    switches::Switches,
+    suite::{SensorSuite, TickMotion, TickTime},
+    switches::SensorSwitches,
 };
 
-/// Sums of the raw GNSS error over all fixes.
+/// Sum of the raw GNSS error over all fixes.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct RawError {
+pub struct RawGnssError {
     /// Sum of distances, metres.
     pub sum_m: f64,
     /// Number of vehicle-ticks with a receiver that delivers.
     pub count: u64,
 }
 
-/// One tick of the world, as `world` carries it.
+/// One tick of the world, as a `world` message carries it.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct World<'a> {
-    /// Everybody at the end of the tick.
+pub struct WorldTick<'a> {
+    /// All road users at the end of the tick.
     pub states: &'a [VehicleState],
-    /// As many sub-steps for each of them, one behind the other; none = what the states say.
+    /// The sub-steps of each road user, one after the other; empty = each state stands for one sub-step.
     pub sub_steps: &'a [SubStep],
-    /// What heroes see.
+    /// Route and traffic ahead of each hero.
     pub views: &'a [HeroView],
 }
 
 /// The sensors of a stage of the curriculum on one of its maps.
-struct Placed {
+struct PlacedSuite {
     /// Counted from 1; 0 is the base configuration.
     stage: usize,
     map: usize,
-    suite: Suite,
+    suite: SensorSuite,
 }
 
-/// Sensors of a run, with what they remember from tick to tick.
+/// Sensors of a run, with their state from tick to tick.
 pub struct Sensing {
-    /// The base configuration's on the run's own map, then one for each map of each stage of the curriculum.
-    suites: Vec<Placed>,
-    /// Which of them is at work.
+    /// The base configuration's suite on the run's own map, then one for each map of each stage of the curriculum.
+    suites: Vec<PlacedSuite>,
+    /// Index of the suite in use.
     at: usize,
-    /// By map; that of the map at hand is with its suite.
-    skies: Vec<Option<Box<dyn Sky>>>,
+    /// Sky of each map; the sky of the map in use is held by its suite.
+    skies: Vec<Option<Box<dyn SatelliteSky>>>,
     normaliser: Normaliser,
-    history: History,
+    history: FrameHistory,
     policy: BlackoutPolicy,
     lidar_range_m: f32,
     imu_samples: usize,
     /// Length of a tick, nanoseconds.
     tick_ns: u64,
     slots: Slots,
-    /// What commands have switched off.
-    switches: Switches,
-    /// Who gets a slot: heroes if they drive, else connected vehicles.
+    /// Sensors that commands have switched off.
+    switches: SensorSwitches,
+    /// Kind of road user that gets a slot: heroes in the driving task, else connected vehicles.
     agents: Kind,
-    /// Persons get one too.
+    /// Persons get a slot too.
     pedestrians: bool,
     collision_ends: bool,
-    /// Where they are sensed.
-    region: Region,
-    /// What each slot's sensors remember.
-    carriers: Vec<Carrier>,
-    /// Row in the world, by slot, for the tick at work.
+    /// Part of the map in which road users are sensed.
+    region: SensedRegion,
+    /// State of each slot's sensors.
+    carriers: Vec<SensorCarrier>,
+    /// Row in the world of each slot at the present tick.
     row_of_slot: Vec<Option<u32>>,
-    draws: Draws,
-    raw_error: RawError,
+    draws: NormalDraws,
+    raw_error: RawGnssError,
     observations: u64,
 }
 
@@ -97,7 +97,7 @@ impl Sensing {
         Self::on_maps(config, map.bounds_m, std::slice::from_ref(map))
     }
 
-    /// Sensors as configured, on the maps of a curriculum, which all lie in `bounds_m` (x_min, y_min, x_max, y_max, metres).
+    /// Sensors as configured, on the maps of a curriculum, all within `bounds_m` (x_min, y_min, x_max, y_max, metres).
     ///
     /// # Errors
     /// A map's projection is not understood, or the map is outside its domain.
@@ -105,73 +105,73 @@ impl Sensing {
         let tick_ns = ((config.run.tick_s * 1e9).round() as u64).max(1);
         let normaliser = Normaliser::new(config, bounds_m);
         let projections: Vec<Projection> = maps.iter().map(Projection::new).collect::<Result<_, _>>()?;
-        let places = places(config).into_iter().filter(|(_, map)| *map < maps.len());
-        let suites = places.map(|(stage, map)| {
-            let suite = Suite::new(&config.in_stage(stage), &projections[map], maps[map].bounds_m, tick_ns)?;
-            Ok(Placed { stage, map, suite })
+        let stages = stages_and_maps(config).into_iter().filter(|(_, map)| *map < maps.len());
+        let suites = stages.map(|(stage, map)| {
+            let suite = SensorSuite::new(&config.in_stage(stage), &projections[map], maps[map].bounds_m, tick_ns)?;
+            Ok(PlacedSuite { stage, map, suite })
         });
         Ok(Self {
             suites: suites.collect::<Result<_, _>>()?,
             at: 0,
             skies: maps.iter().map(|_| None).collect(),
-            history: History::new(normaliser.width(), config.observation.history as usize),
+            history: FrameHistory::new(normaliser.width(), config.observation.history as usize),
             normaliser,
             policy: config.blackout.policy,
             lidar_range_m: config.lidar.range_m as f32,
             imu_samples: config.imu_samples(),
             tick_ns,
             slots: Slots::default(),
-            switches: Switches::default(),
+            switches: SensorSwitches::default(),
             agents: if config.drives() { Kind::Hero } else { Kind::Cav },
             pedestrians: config.gnss.pedestrians && !config.drives(),
             collision_ends: config.collision.ends_trajectory,
-            region: Region::new(&config.region),
+            region: SensedRegion::new(&config.region),
             carriers: Vec::new(),
             row_of_slot: Vec::new(),
-            draws: Draws::default(),
-            raw_error: RawError::default(),
+            draws: NormalDraws::default(),
+            raw_error: RawGnssError::default(),
             observations: 0,
         })
     }
 
-    /// Puts satellites, and what hides them, into the sky of the run's own map; without, it is open.
-    pub fn set_sky(&mut self, sky: Box<dyn Sky>) {
+    /// Sets the sky of the run's own map; without one the sky is open.
+    pub fn set_sky(&mut self, sky: Box<dyn SatelliteSky>) {
         self.set_sky_of(0, sky);
     }
 
-    /// The same of another map.
-    pub fn set_sky_of(&mut self, map: usize, sky: Box<dyn Sky>) {
+    /// Sets the sky of another map.
+    pub fn set_sky_of(&mut self, map: usize, sky: Box<dyn SatelliteSky>) {
         match self.suites[self.at].map == map {
             true => self.suites[self.at].suite.set_sky(sky),
             false => self.skies[map] = Some(sky),
         }
     }
 
-    /// Uses the sensors of a stage of the curriculum from now on, under the sky of a map.
-    fn enter(&mut self, stage: usize, map: usize) {
-        let Placed { map: before, suite, .. } = &mut self.suites[self.at];
+    /// Switches to the sensors of a stage of the curriculum, under the sky of a map.
+    fn enter_stage(&mut self, stage: usize, map: usize) {
+        let PlacedSuite { map: before, suite, .. } = &mut self.suites[self.at];
         self.skies[*before] = suite.take_sky();
         let found = self
             .suites
             .iter()
             .position(|placed| (placed.stage, placed.map) == (stage, map));
         self.at = found.unwrap_or(0);
-        let Placed { map, suite, .. } = &mut self.suites[self.at];
+        let PlacedSuite { map, suite, .. } = &mut self.suites[self.at];
         if let Some(sky) = self.skies[*map].take() {
             suite.set_sky(sky);
         }
     }
 
-    fn suite(&self) -> &Suite {
+    fn suite(&self) -> &SensorSuite {
         &self.suites[self.at].suite
     }
 
-    /// Sensors that commands switch, to be filled before the tick at which they hold is assigned.
-    pub fn switches_mut(&mut self) -> &mut Switches {
+    /// Sensors that commands switch. Fill it before [`Sensing::assign`] is called for the tick of a command.
+    pub fn switches_mut(&mut self) -> &mut SensorSwitches {
         &mut self.switches
     }
 
-    /// Numbers in a row: fields times ticks.
+    /// Numbers in a row: fields times ticks of history.
     #[must_use]
     pub fn width(&self) -> usize {
         self.history.width()
@@ -183,9 +183,9 @@ impl Sensing {
         self.imu_samples
     }
 
-    /// Error of the raw GNSS so far.
+    /// Sum of the raw GNSS error so far.
     #[must_use]
-    pub fn raw_error(&self) -> RawError {
+    pub fn raw_error(&self) -> RawGnssError {
         self.raw_error
     }
 
@@ -195,14 +195,14 @@ impl Sensing {
         self.observations
     }
 
-    /// Gives every connected road user in `states` and in the region its slot; returns the number of slots, which is the observation's n.
+    /// Gives every connected road user in `states` and in the region its slot. Returns the number of slots, the observation's n.
     ///
-    /// With `collision.ends_trajectory` a vehicle has no slot at the tick in which it collides, as if it had left: the slot it held
-    /// says [`ipc_schema::observation::TERMINATED`], and from the next tick on it holds one anew, as a trajectory of its own.
+    /// With `collision.ends_trajectory` a vehicle has no slot at the tick in which it collides, as if it had left: its slot is marked
+    /// [`ipc_schema::observation::TERMINATED`], and from the next tick on the vehicle begins a new trajectory.
     pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
         if header.has(FIRST_OF_EPISODE) {
-            self.enter(header.stage(), header.map());
+            self.enter_stage(header.stage(), header.map());
             self.suites[self.at].suite.begin_episode(header.episode_seed);
             self.switches.begin_episode();
         }
@@ -211,7 +211,7 @@ impl Sensing {
         let now = self.now(header);
         for (row, state) in (0_u32..).zip(states) {
             if self.is_sensed(state) && !self.region.contains(state.x_m, state.y_m) {
-                // It drives on where nobody looks: its trajectory is cut here, and another begins if it comes back.
+                // It continues outside the sensed region: its trajectory is cut here, and a new one begins when it returns.
                 self.slots.cut_vehicle(state.vehicle);
             } else if self.is_sensed(state) {
                 let slot = self.slots.occupy(state.vehicle);
@@ -222,20 +222,20 @@ impl Sensing {
                     self.row_of_slot.resize(slot + 1, None);
                 }
                 self.row_of_slot[slot] = Some(row);
-                self.carry(slot, state, &now);
+                self.update_carrier(slot, state, &now);
             }
         }
         self.slots.end();
         self.slots.rows().len()
     }
 
-    /// Takes the carrier in `slot` to this tick, a new one for a new trajectory.
-    fn carry(&mut self, slot: usize, state: &VehicleState, now: &Now) {
+    /// Advances the blackouts of the carrier in `slot` to this tick; a new trajectory begins with a new carrier.
+    fn update_carrier(&mut self, slot: usize, state: &VehicleState, now: &TickTime) {
         if self.slots.rows()[slot].step == 0 {
             let carrier = self.suite().begin(state, slot, now);
             match self.carriers.get_mut(slot) {
                 Some(place) => *place = carrier,
-                // Slots are lent in ascending order: this is the next one.
+                // New slots are taken in ascending order: this is the next one.
                 None => self.carriers.push(carrier),
             }
         } else {
@@ -249,21 +249,21 @@ impl Sensing {
     }
 
     fn is_sensed(&self, state: &VehicleState) -> bool {
-        // What a hero collides with ends its episode after the observation of that tick; SUMO lets it go.
+        // A hero's collision ends its episode after the observation of that tick; SUMO ignores the collision.
         let collides = self.collision_ends && state.flags & COLLIDED != 0;
         let is_agent = state.kind == self.agents as u32 || (self.pedestrians && state.kind == Kind::Person as u32);
         is_agent && (self.agents == Kind::Hero || !collides)
     }
 
-    fn now(&self, header: &MessageHeader) -> Now {
-        Now {
+    fn now(&self, header: &MessageHeader) -> TickTime {
+        TickTime {
             episode_seed: header.episode_seed,
             tick: (header.sim_time_ns / self.tick_ns) as u32,
             time_ns: header.sim_time_ns,
         }
     }
 
-    /// Slot and row in the world of everybody whose LIDAR scans at the tick that [`Sensing::assign`] was called for.
+    /// Slot and row in the world of each road user whose LIDAR scans at the tick of the last [`Sensing::assign`].
     pub fn lidars(&self) -> impl Iterator<Item = (usize, usize)> {
         let slots = self.row_of_slot.iter().zip(&self.carriers).enumerate();
         slots.filter_map(|(slot, (row, carrier))| match row {
@@ -272,8 +272,9 @@ impl Sensing {
         })
     }
 
-    /// What the LIDAR in `slot` sees nearest: points of four objects, forward and left of the rear axle (metres). What is not finite
-    /// stands for no object. To be called between [`Sensing::assign`] and [`Sensing::observe`]; held until it is called again.
+    /// Sets the nearest points of four objects that the LIDAR in `slot` sees, forward and left of the rear axle (metres). A point that
+    /// is not finite stands for no object. Call it between [`Sensing::assign`] and [`Sensing::observe`]; the points hold until the next
+    /// call.
     pub fn set_objects(&mut self, slot: usize, objects_m: [[f32; 2]; 4]) {
         if let Some(carrier) = self.carriers.get_mut(slot) {
             carrier.readings.objects_m = objects_m.map(|[forward_m, left_m]| {
@@ -286,25 +287,25 @@ impl Sensing {
         }
     }
 
-    /// Samples what is due and writes the observation of the tick that [`Sensing::assign`] was called for, into a payload of zeros.
+    /// Samples the sensors that are due and writes the observation of the last [`Sensing::assign`] into a payload of zeros.
     ///
     /// A row is [`VALID`] once every sensor of its road user has delivered; until then its observation and raw samples stay 0. A
-    /// pedestrian has no speed and steering sensor: its bit is never set, speed and steering are the value 0, aged 0 s.
+    /// pedestrian has no speed and steering sensor: its bit is never set, speed and steering are 0, aged 0 s.
     ///
     /// # Errors
     /// The payload is too short.
-    pub fn observe(&mut self, header: &MessageHeader, world: &World, payload: &mut [u8]) -> Result<(), BlockError> {
+    pub fn observe(&mut self, header: &MessageHeader, world: &WorldTick, payload: &mut [u8]) -> Result<(), BlockError> {
         let n = self.slots.rows().len();
         let layout = ObservationLayout::new(n, self.width(), self.imu_samples);
-        let mut sections = Sections::split(payload, &layout)?;
+        let mut sections = ObservationSections::split(payload, &layout)?;
         let now = self.now(header);
         let mut draws = std::mem::take(&mut self.draws);
         draws.clear();
         self.suite().plan(&mut draws, &now);
-        for first in (0..n).step_by(LANES) {
-            let ids = std::array::from_fn(|lane| self.id_hash(first + lane, world));
+        for first in (0..n).step_by(BATCH) {
+            let ids = std::array::from_fn(|member| self.id_hash(first + member, world));
             draws.draw(now.episode_seed, &ids);
-            for slot in first..n.min(first + LANES) {
+            for slot in first..n.min(first + BATCH) {
                 self.sense(slot, world, &now, draws.of(slot - first), &mut sections);
             }
         }
@@ -312,8 +313,8 @@ impl Sensing {
         Ok(())
     }
 
-    /// Hash of the id of the road user in a slot; anything for an empty one.
-    fn id_hash(&self, slot: usize, world: &World) -> u64 {
+    /// Hash of the id of the road user in a slot; 0 for an empty slot, which draws numbers that are not used.
+    fn id_hash(&self, slot: usize, world: &WorldTick) -> u64 {
         match self.row_of_slot.get(slot) {
             Some(Some(row)) => world.states[*row as usize].id_hash,
             _ => 0,
@@ -321,7 +322,14 @@ impl Sensing {
     }
 
     /// Samples and writes one slot with the numbers drawn for it.
-    fn sense(&mut self, slot: usize, world: &World, now: &Now, drawn: Drawn, out: &mut Sections) {
+    fn sense(
+        &mut self,
+        slot: usize,
+        world: &WorldTick,
+        now: &TickTime,
+        drawn: DrawnNormals,
+        out: &mut ObservationSections,
+    ) {
         let lent = self.slots.rows()[slot];
         out.vehicle[slot] = lent.vehicle;
         out.flags[slot] = lent.ended;
@@ -338,7 +346,7 @@ impl Sensing {
         } else {
             &world.sub_steps[row * per..(row + 1) * per]
         };
-        let motion = Motion {
+        let motion = TickMotion {
             state,
             rows,
             step: lent.step,
@@ -346,16 +354,16 @@ impl Sensing {
         let carrier = &mut self.carriers[slot];
         let samples = &mut out.imu[slot * self.imu_samples..(slot + 1) * self.imu_samples];
         self.suites[self.at].suite.sample(carrier, &motion, now, drawn, samples);
-        // Both are in ascending order of the vehicle.
+        // `views` are in ascending order of the vehicle.
         if let Ok(place) = world.views.binary_search_by_key(&state.vehicle, |view| view.vehicle) {
             carrier.readings.route = world.views[place];
         }
         self.write(slot, state, lent.step, out);
     }
 
-    /// Writes what a slot's sensors have delivered.
+    /// Writes the readings of a slot's sensors.
     #[inline]
-    fn write(&mut self, slot: usize, state: &VehicleState, step: u32, out: &mut Sections) {
+    fn write(&mut self, slot: usize, state: &VehicleState, step: u32, out: &mut ObservationSections) {
         let carrier = &mut self.carriers[slot];
         let readings = &carrier.readings;
         out.truth[slot] = [
@@ -377,7 +385,11 @@ impl Sensing {
         let (d, width) = (self.normaliser.width(), self.history.width());
         let row = &mut out.observation[slot * width..(slot + 1) * width];
         let clipped = self.normaliser.fill(readings, blank, &mut row[width - d..]);
-        let first = if carrier.is_seen { First::No } else { First::Yes };
+        let first = if carrier.is_seen {
+            TrajectoryFrame::Later
+        } else {
+            TrajectoryFrame::First
+        };
         carrier.is_seen = true;
         self.history.stack(slot, first, row);
         out.flags[slot] |= if clipped { CLIPPED } else { 0 };
@@ -394,22 +406,22 @@ impl Sensing {
     }
 }
 
-/// Stage and map of every suite that is needed: the base configuration on the run's own map, then the maps of each stage.
-fn places(config: &Config) -> Vec<(usize, usize)> {
+/// Stage and map of each suite: the base configuration on the run's own map, then the maps of each stage.
+fn stages_and_maps(config: &Config) -> Vec<(usize, usize)> {
     let curriculum = &config.curriculum;
-    let mut places = vec![(0, 0)];
+    let mut stages = vec![(0, 0)];
     for (number, stage) in (1..).zip(&curriculum.stages) {
         let mut maps = curriculum.maps_of(stage);
         maps.sort_unstable();
         maps.dedup();
-        places.extend(maps.into_iter().map(|map| (number, map)));
+        stages.extend(maps.into_iter().map(|map| (number, map)));
     }
-    places
+    stages
 }
 
-/// Writes the newest raw samples of a slot. While a sensor is dark they are its last: estimators that read them look at age and bit.
+/// Writes the newest raw samples of a slot. In a blackout these are the last ones: an estimator that reads them checks age and bit.
 #[inline]
-fn write_raw(slot: usize, carrier: &Carrier, out: &mut Sections) {
+fn write_raw(slot: usize, carrier: &SensorCarrier, out: &mut ObservationSections) {
     let readings = &carrier.readings;
     let fix = &readings.fix;
     out.gnss_m[slot] = [fix.x_m as f32, fix.y_m as f32, fix.z_m as f32];
@@ -419,7 +431,7 @@ fn write_raw(slot: usize, carrier: &Carrier, out: &mut Sections) {
     out.speed_steering[slot] = [sample.speed_mps as f32, sample.steering_rad as f32];
 }
 
-/// The sub-step that a state alone tells of.
+/// The one sub-step that a state stands for.
 fn sub_step(state: &VehicleState) -> SubStep {
     SubStep {
         roll_rad: state.roll_rad,
@@ -433,7 +445,7 @@ fn sub_step(state: &VehicleState) -> SubStep {
     }
 }
 
-/// True if the trajectory of a hero is cut at this tick, and does not end by itself.
+/// True if a time limit cuts a hero's trajectory at this tick, rather than an end of its own.
 fn is_cut(state: &VehicleState) -> bool {
     state.flags & TIME_LIMIT != 0 && state.flags & (COLLIDED | OFF_ROAD | ARRIVED) == 0
 }

@@ -1,4 +1,4 @@
-//! Slots: rows of the observation, each lent to one vehicle until that vehicle leaves.
+//! Slots: rows of the observation, each held by one vehicle until that vehicle leaves.
 
 use std::collections::BTreeSet;
 
@@ -14,7 +14,7 @@ pub struct Slot {
     /// [`TERMINATED`], [`TRUNCATED`]: the trajectory that held this slot at the previous tick ended there.
     pub ended: u32,
     seen: bool,
-    /// Its vehicle's trajectory was cut at the last tick and did not end by itself.
+    /// The trajectory of its vehicle was cut at the last tick, rather than ended.
     cut: bool,
 }
 
@@ -74,12 +74,12 @@ impl Slots {
         number
     }
 
-    /// The trajectory in slot `number` is cut at this tick: once its vehicle is gone, the slot says so.
+    /// Cuts the trajectory in slot `number` at this tick: when its vehicle has gone, the slot reports [`TRUNCATED`].
     pub fn cut(&mut self, number: usize) {
         self.slots[number].cut = true;
     }
 
-    /// As [`Slots::cut`] for the slot that `vehicle` held until now, if it held one.
+    /// Applies [`Slots::cut`] to the slot of `vehicle`, if it holds one.
     pub fn cut_vehicle(&mut self, vehicle: u32) {
         if let Some(&number) = self.of_vehicle.get(vehicle as usize)
             && number != EMPTY_SLOT
@@ -103,7 +103,7 @@ impl Slots {
         number
     }
 
-    /// Ends a tick: a vehicle that was not seen has left; its slot can be taken from the next tick on.
+    /// Ends a tick: a vehicle that did not occupy its slot has left, and the slot is free from the next tick on.
     pub fn end(&mut self) {
         for (number, slot) in (0_u32..).zip(&mut self.slots) {
             if slot.vehicle != EMPTY_SLOT && !slot.seen {
@@ -138,13 +138,13 @@ mod tests {
     }
 
     #[test]
-    fn a_slot_is_kept_freed_and_lent_again() {
+    fn a_slot_is_kept_freed_and_reused() {
         let mut slots = Slots::default();
         assert_eq!(tick(&mut slots, true, &[0, 1, 2]), [0, 1, 2]);
         assert_eq!(
             tick(&mut slots, false, &[0, 2, 3]),
             [0, 2, 3],
-            "a slot is not lent again at the tick it becomes free"
+            "a slot is not reused at the tick at which it becomes free"
         );
         assert_eq!(
             (slots.rows()[1].vehicle, slots.rows()[1].ended),
@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_episode_truncates_everybody() {
+    fn a_new_episode_truncates_all_trajectories() {
         let mut slots = Slots::default();
         tick(&mut slots, true, &[0, 1]);
         assert_eq!(tick(&mut slots, true, &[0]), [0]);
@@ -216,7 +216,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever comes and goes: one vehicle a slot, a vehicle keeps its slot, the number of slots never shrinks.
+        /// For any sequence of vehicles: each slot has one vehicle, a vehicle keeps its slot, the number of slots never shrinks.
         #[test]
         fn slots_are_stable(presence in prop::collection::vec(prop::collection::btree_set(0_u32..20, 0..12), 1..40)) {
             let mut slots = Slots::default();

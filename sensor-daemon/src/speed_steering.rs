@@ -1,31 +1,31 @@
-//! Speed and steering sensor: wheel speed, and steering-wheel angle from the road-wheel angle through the steering ratio.
+//! Speed and steering sensor: wheel speed, and steering-wheel angle from the road-wheel angle and the steering ratio.
 
 use ipc_schema::{config::SpeedSteering as Params, world::VehicleState};
 
-use crate::normals::Block;
+use crate::normals::NormalBlock;
 
 /// One sample.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Sample {
-    /// Speed of the rear wheels, m/s; never negative, as a pulse counter's.
+pub struct SpeedSteeringSample {
+    /// Speed of the rear wheels, m/s; never negative, as a pulse counter does not know the direction.
     pub speed_mps: f64,
     /// Steering-wheel angle, positive to the left, radians.
     pub steering_rad: f64,
 }
 
-/// Constant factors of one vehicle's speed and steering angle.
+/// Constant scale factors of one vehicle's speed and steering angle.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Scales {
-    /// Of the speed: tyres worn, or not the size that the counter was set to.
+pub struct SpeedSteeringScales {
+    /// Factor on the speed: tyres are worn, or differ from the size that the counter is set to.
     pub speed: f64,
-    /// Of the steering angle.
+    /// Factor on the steering angle.
     pub steering: f64,
 }
 
-impl Scales {
+impl SpeedSteeringScales {
     /// The factors of a vehicle from its own standard normal numbers.
     #[must_use]
-    pub fn new(params: &Params, normals: &Block) -> Self {
+    pub fn new(params: &Params, normals: &NormalBlock) -> Self {
         Self {
             speed: 1.0 + params.speed_scale_std * f64::from(normals[0]),
             steering: 1.0 + params.steering_scale_std * f64::from(normals[1]),
@@ -42,10 +42,16 @@ pub fn has_noise(params: &Params) -> bool {
 /// The sensor's sample of a vehicle that moves as `state`, with standard normal numbers for speed and steering.
 #[must_use]
 #[inline(always)]
-pub fn sample(params: &Params, steering_ratio: f64, scales: &Scales, state: &VehicleState, normals: &Block) -> Sample {
+pub fn sample(
+    params: &Params,
+    steering_ratio: f64,
+    scales: &SpeedSteeringScales,
+    state: &VehicleState,
+    normals: &NormalBlock,
+) -> SpeedSteeringSample {
     let true_speed = f64::from(state.velocity_body_mps[0]).abs();
     let true_steering = f64::from(state.road_wheel_angle_rad) * steering_ratio;
-    Sample {
+    SpeedSteeringSample {
         speed_mps: (true_speed * scales.speed + params.speed_noise_std_mps * f64::from(normals[0])).max(0.0),
         steering_rad: true_steering * scales.steering
             + params.steering_bias_rad
@@ -56,16 +62,16 @@ pub fn sample(params: &Params, steering_ratio: f64, scales: &Scales, state: &Veh
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{noise::Stream, preset::town};
+    use crate::{noise::RandomStream, preset::town};
     use ipc_schema::sensor::NoiseStream;
 
-    const EXACT: Scales = Scales {
+    const EXACT: SpeedSteeringScales = SpeedSteeringScales {
         speed: 1.0,
         steering: 1.0,
     };
 
-    fn stream(id_hash: u64, sensor: NoiseStream) -> Stream {
-        Stream {
+    fn stream(id_hash: u64, sensor: NoiseStream) -> RandomStream {
+        RandomStream {
             episode_seed: 1,
             id_hash,
             sensor,
@@ -73,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn without_noise_it_tells_wheel_speed_and_steering_wheel_angle() {
+    fn without_noise_it_measures_wheel_speed_and_steering_wheel_angle() {
         let params = Params {
             speed_noise_std_mps: 0.0,
             steering_noise_std_rad: 0.0,
@@ -87,7 +93,7 @@ mod tests {
         };
         assert_eq!(
             sample(&params, 16.0, &EXACT, &state, &[1.0; 4]),
-            Sample {
+            SpeedSteeringSample {
                 speed_mps: 12.5,
                 steering_rad: -4.0
             }
@@ -96,13 +102,13 @@ mod tests {
             steering_bias_rad: 0.5,
             ..params
         };
-        let scales = Scales {
+        let scales = SpeedSteeringScales {
             speed: 1.02,
             steering: 0.5,
         };
         assert_eq!(
             sample(&biased, 16.0, &scales, &state, &[1.0; 4]),
-            Sample {
+            SpeedSteeringSample {
                 speed_mps: 12.75,
                 steering_rad: -1.5
             }
@@ -142,11 +148,12 @@ mod tests {
             steering_scale_std: 0.005,
             ..town().speed_steering
         };
-        let scales: Vec<Scales> = (0..N)
-            .map(|id| Scales::new(&params, &stream(id, NoiseStream::Scale).normals(0)))
+        let scales: Vec<SpeedSteeringScales> = (0..N)
+            .map(|id| SpeedSteeringScales::new(&params, &stream(id, NoiseStream::Scale).normals(0)))
             .collect();
-        let std =
-            |of: &dyn Fn(&Scales) -> f64| (scales.iter().map(|s| (of(s) - 1.0).powi(2)).sum::<f64>() / N as f64).sqrt();
+        let std = |of: &dyn Fn(&SpeedSteeringScales) -> f64| {
+            (scales.iter().map(|s| (of(s) - 1.0).powi(2)).sum::<f64>() / N as f64).sqrt()
+        };
         let share = 5.0 / (2.0 * N as f64).sqrt();
         assert!((std(&|s| s.speed) / 0.02 - 1.0).abs() < share);
         assert!((std(&|s| s.steering) / 0.005 - 1.0).abs() < share);

@@ -1,4 +1,4 @@
-//! The suite of point sensors that every connected road user carries: when each samples, and what it then delivers.
+//! The suite of point sensors that every connected road user carries: it decides which sensors sample at a tick, and samples them.
 
 use ipc_schema::{
     config::Config,
@@ -9,22 +9,22 @@ use ipc_schema::{
 use sim_core::geodesy::{GeodesyError, Projection};
 
 use crate::{
-    blackout::Schedule,
-    carrier::Carrier,
-    gnss::{self, Receiver, Sky, SkyView},
-    imu::{self, Unit},
-    noise::{Drawn, Draws, Stream},
-    normals::Block,
-    speed_steering::{self, Scales},
-    wide::Path,
+    blackout::BlackoutSchedule,
+    carrier::SensorCarrier,
+    gnss::{self, GnssReceiver, SatelliteSky, SkyView},
+    imu::{self, ImuModel},
+    noise::{DrawnNormals, NormalDraws, RandomStream},
+    normals::NormalBlock,
+    speed_steering::{self, SpeedSteeringScales},
+    wide::VectorPath,
 };
 
-/// The time of a tick, as far as noise and blackouts know it.
+/// The time of a tick, as noise and blackouts use it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Now {
+pub struct TickTime {
     /// Seed of the episode.
     pub episode_seed: u64,
-    /// Ticks since the start of the episode: a vehicle that leaves and returns does not meet its old noise again.
+    /// Ticks since the start of the episode: a vehicle that leaves and returns draws new noise.
     pub tick: u32,
     /// Time of the episode, nanoseconds.
     pub time_ns: u64,
@@ -32,24 +32,24 @@ pub struct Now {
 
 /// One road user's motion over a tick.
 #[derive(Debug, Clone, Copy)]
-pub struct Motion<'a> {
+pub struct TickMotion<'a> {
     /// At the end of the tick.
     pub state: &'a VehicleState,
     /// Sub-steps, at least one.
     pub rows: &'a [SubStep],
-    /// Ticks since it took its slot.
+    /// Ticks since the road user took its slot.
     pub step: u32,
 }
 
 /// Sensors as configured.
-pub struct Suite {
-    receiver: Receiver,
-    sky: Option<Box<dyn Sky>>,
-    unit: Unit,
+pub struct SensorSuite {
+    receiver: GnssReceiver,
+    sky: Option<Box<dyn SatelliteSky>>,
+    unit: ImuModel,
     speed_steering: ipc_schema::config::SpeedSteering,
     speed_steering_noise: bool,
     steering_ratio: f64,
-    schedules: [Option<Schedule>; SensorKind::COUNT],
+    schedules: [Option<BlackoutSchedule>; SensorKind::COUNT],
     /// Ticks between two samples of each sensor.
     periods: [u32; SensorKind::COUNT],
     imu_samples: u32,
@@ -57,10 +57,10 @@ pub struct Suite {
     lidar_range_m: f32,
     pedestrian_factor: f64,
     tick_s: f64,
-    path: Path,
+    path: VectorPath,
 }
 
-impl Suite {
+impl SensorSuite {
     /// Sensors on a map with these bounds (x_min, y_min, x_max, y_max, metres).
     ///
     /// # Errors
@@ -76,9 +76,9 @@ impl Suite {
             |period_s: f64| ((period_s / config.run.tick_s).round() as i64).clamp(1, i64::from(u32::MAX)) as u32;
         let samples = config.imu_samples();
         Ok(Self {
-            receiver: Receiver::new(&config.gnss, projection, bounds_m)?,
+            receiver: GnssReceiver::new(&config.gnss, projection, bounds_m)?,
             sky: None,
-            unit: Unit::new(&config.imu, samples),
+            unit: ImuModel::new(&config.imu, samples),
             speed_steering_noise: speed_steering::has_noise(&config.speed_steering),
             speed_steering: config.speed_steering.clone(),
             steering_ratio: config.vehicle.steering_ratio,
@@ -89,30 +89,30 @@ impl Suite {
             lidar_range_m: config.lidar.range_m as f32,
             pedestrian_factor: config.gnss.pedestrian_noise_factor,
             tick_s: config.run.tick_s,
-            path: Path::widest(),
+            path: VectorPath::widest(),
         })
     }
 
-    /// Puts something into the sky.
-    pub fn set_sky(&mut self, sky: Box<dyn Sky>) {
+    /// Sets the sky of the GNSS receivers.
+    pub fn set_sky(&mut self, sky: Box<dyn SatelliteSky>) {
         self.sky = Some(sky);
     }
 
-    /// Takes it out again.
-    pub fn take_sky(&mut self) -> Option<Box<dyn Sky>> {
+    /// Takes the sky out again.
+    pub fn take_sky(&mut self) -> Option<Box<dyn SatelliteSky>> {
         self.sky.take()
     }
 
-    /// A new episode, with this seed.
+    /// Begins an episode with this seed.
     pub fn begin_episode(&mut self, episode_seed: u64) {
         if let Some(sky) = &mut self.sky {
             sky.begin_episode(episode_seed);
         }
     }
 
-    /// The carrier in `slot` of a road user that is sensed for the first time.
+    /// A new carrier in `slot` for a road user that begins a trajectory.
     #[must_use]
-    pub fn begin(&self, state: &VehicleState, slot: usize, now: &Now) -> Carrier {
+    pub fn begin(&self, state: &VehicleState, slot: usize, now: &TickTime) -> SensorCarrier {
         let is_person = state.kind == Kind::Person as u32;
         let carries = |kind: SensorKind| match kind.spec().carriers {
             SensorCarriers::Vehicles if is_person => false,
@@ -121,13 +121,13 @@ impl Suite {
         let present = SensorKind::ALL.into_iter().filter(|kind| carries(*kind));
         let present = present.fold(0, |bits, kind| bits | kind.bit());
         let factor = if is_person { self.pedestrian_factor } else { 1.0 };
-        let stream = Stream {
+        let stream = RandomStream {
             episode_seed: now.episode_seed,
             id_hash: state.id_hash,
             sensor: NoiseStream::Scale,
         };
-        let scales = Scales::new(&self.speed_steering, &stream.normals(0));
-        let mut carrier = Carrier::new(present, scales, factor, self.lidar_range_m);
+        let scales = SpeedSteeringScales::new(&self.speed_steering, &stream.normals(0));
+        let mut carrier = SensorCarrier::new(present, scales, factor, self.lidar_range_m);
         for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
             if let Some(schedule) = schedule {
                 *phase = schedule.begin(now.episode_seed, state.id_hash, now.tick, now.time_ns);
@@ -136,9 +136,9 @@ impl Suite {
         carrier
     }
 
-    /// Takes the sensors' blackouts on to this tick.
+    /// Advances the blackouts of a carrier's sensors to this tick.
     #[inline]
-    pub fn advance(&self, carrier: &mut Carrier, id_hash: u64, now: &Now) {
+    pub fn advance(&self, carrier: &mut SensorCarrier, id_hash: u64, now: &TickTime) {
         for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
             if let Some(schedule) = schedule {
                 schedule.advance(phase, now.episode_seed, id_hash, now.time_ns);
@@ -146,8 +146,8 @@ impl Suite {
         }
     }
 
-    /// Plans the numbers that [`Suite::sample`] takes at this tick if everything is due, with those first that are always needed.
-    pub fn plan(&self, draws: &mut Draws, now: &Now) {
+    /// Plans the random numbers that [`SensorSuite::sample`] takes at this tick, in the order in which it takes them.
+    pub fn plan(&self, draws: &mut NormalDraws, now: &TickTime) {
         if self.receiver.has_white_noise() {
             draws.plan(NoiseStream::Gnss, now.tick);
         }
@@ -167,10 +167,17 @@ impl Suite {
         period == 1 || step.is_multiple_of(period)
     }
 
-    /// Samples what is due with the numbers drawn for its carrier; the IMU's samples of the tick go to `out`. Processes with a memory go
-    /// on in a blackout, whose end does not show how long it was.
+    /// Samples the sensors that are due with the numbers drawn for their carrier, and writes the IMU's samples of the tick to `out`.
+    /// Errors with a memory continue to evolve in a blackout, so its length does not show at its end.
     #[inline]
-    pub fn sample(&self, carrier: &mut Carrier, motion: &Motion, now: &Now, mut drawn: Drawn, out: &mut [imu::Sample]) {
+    pub fn sample(
+        &self,
+        carrier: &mut SensorCarrier,
+        motion: &TickMotion,
+        now: &TickTime,
+        mut drawn: DrawnNormals,
+        out: &mut [imu::ImuSample],
+    ) {
         let (step, awake) = (motion.step, carrier.awake());
         let normals = [
             self.receiver.has_white_noise(),
@@ -191,23 +198,23 @@ impl Suite {
             let (params, ratio) = (&self.speed_steering, self.steering_ratio);
             carrier.readings.speed_steering =
                 speed_steering::sample(params, ratio, &carrier.scales, motion.state, &normals[2]);
-            carrier.note(SensorKind::SpeedSteering, step);
+            carrier.record(SensorKind::SpeedSteering, step);
         }
         self.sample_imu(carrier, motion, SensorKind::Imu.is_in(awake), drawn, out);
         if SensorKind::Lidar.is_in(awake) {
-            carrier.note(SensorKind::Lidar, step);
+            carrier.record(SensorKind::Lidar, step);
         }
-        carrier.age(step, self.tick_s);
+        carrier.update_ages(step, self.tick_s);
     }
 
     #[inline]
     fn sample_gnss(
         &self,
-        carrier: &mut Carrier,
-        motion: &Motion,
-        now: &Now,
+        carrier: &mut SensorCarrier,
+        motion: &TickMotion,
+        now: &TickTime,
         is_awake: bool,
-        [white, fresh]: [&Block; 2],
+        [white, fresh]: [&NormalBlock; 2],
     ) {
         carrier.correlated = if motion.step == 0 {
             [fresh[0], fresh[1], fresh[2]]
@@ -227,35 +234,35 @@ impl Suite {
         if view.has_fix {
             carrier.readings.fix = self.receiver.fix(
                 place_m,
-                &gnss::Errors {
+                &gnss::GnssErrors {
                     white,
                     correlated: &carrier.correlated,
                     view: &view,
                     factor: carrier.gnss_factor,
                 },
             );
-            carrier.note(SensorKind::Gnss, motion.step);
+            carrier.record(SensorKind::Gnss, motion.step);
         }
     }
 
     #[inline]
     fn sample_imu(
         &self,
-        carrier: &mut Carrier,
-        motion: &Motion,
+        carrier: &mut SensorCarrier,
+        motion: &TickMotion,
         is_awake: bool,
-        drawn: Drawn,
-        out: &mut [imu::Sample],
+        drawn: DrawnNormals,
+        out: &mut [imu::ImuSample],
     ) {
         if self.is_due(SensorKind::Imu, motion.step) {
-            let body = imu::Body {
+            let body = imu::ImuMotion {
                 yaw_rad: motion.state.yaw_rad,
                 rows: motion.rows,
             };
             self.unit.sample(self.path, &body, drawn, &mut carrier.walk, out);
             if is_awake && let Some(newest) = out.last() {
                 carrier.readings.imu = *newest;
-                carrier.note(SensorKind::Imu, motion.step);
+                carrier.record(SensorKind::Imu, motion.step);
                 return;
             }
         }
@@ -263,10 +270,10 @@ impl Suite {
     }
 }
 
-fn schedules(config: &Config, tick_ns: u64) -> [Option<Schedule>; SensorKind::COUNT] {
+fn schedules(config: &Config, tick_ns: u64) -> [Option<BlackoutSchedule>; SensorKind::COUNT] {
     SENSORS.map(|spec| {
         let spans = (spec.blackouts)(config);
-        let schedule = || Schedule::new(spec.blackout_noise, spans, tick_ns);
+        let schedule = || BlackoutSchedule::new(spec.blackout_noise, spans, tick_ns);
         config.blackout.enabled.then(schedule).flatten()
     })
 }

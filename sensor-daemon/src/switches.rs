@@ -1,4 +1,4 @@
-//! Sensors that commands have switched off, each from its tick on until the episode ends.
+//! Sensors that commands have switched off. A switch holds from its tick to the end of the episode.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -8,20 +8,20 @@ use ipc_schema::{
     ports::{PortError, Subscriber},
 };
 
-/// Switches that have come, and those whose tick has come.
+/// Switches that wait for their tick, and those in force.
 #[derive(Debug, Clone, Default)]
-pub struct Switches {
+pub struct SensorSwitches {
     waiting: VecDeque<(u64, SensorSwitch)>,
-    /// Sensors that are off for everybody that has no entry of its own.
+    /// Sensors that are off for every vehicle without an entry of its own.
     off: u32,
-    /// Sensors that are off, for those that have been switched by themselves.
+    /// Sensors that are off, for each vehicle that has been switched individually.
     off_for: BTreeMap<u64, u32>,
-    /// Anything has been switched in this episode.
+    /// A switch has come into force in this episode.
     in_use: bool,
 }
 
-impl Switches {
-    /// Takes what is there in the queue: what holds for a tick was sent before the tick itself.
+impl SensorSwitches {
+    /// Receives all switches in the queue: those of a tick are sent before the tick itself.
     ///
     /// # Errors
     /// The port is broken.
@@ -47,13 +47,13 @@ impl Switches {
         self.waiting.push_back((tick, switch));
     }
 
-    /// A new episode: everything is on.
+    /// Begins an episode: all sensors are on.
     pub fn begin_episode(&mut self) {
         (self.off, self.in_use) = (0, false);
         self.off_for.clear();
     }
 
-    /// Switches what is switched up to `tick`.
+    /// Applies the switches up to `tick`.
     pub fn advance(&mut self, tick: u64) {
         while let Some((_, switch)) = self.waiting.pop_front_if(|(at, _)| *at <= tick) {
             self.switch(&switch);
@@ -75,7 +75,7 @@ impl Switches {
         }
     }
 
-    /// True if anything has been switched in this episode.
+    /// True if a switch has come into force in this episode.
     #[must_use]
     #[inline]
     pub fn in_use(&self) -> bool {
@@ -107,7 +107,7 @@ mod tests {
 
     #[test]
     fn a_switch_holds_from_its_tick_to_the_end_of_the_episode() {
-        let mut switches = Switches::default();
+        let mut switches = SensorSwitches::default();
         switches.push(3, switch(7, GNSS, 0));
         switches.push(5, switch(7, GNSS, SWITCHED_ON));
         switches.push(6, switch(7, IMU, 0));
@@ -124,8 +124,8 @@ mod tests {
     }
 
     #[test]
-    fn the_last_word_counts_be_it_to_one_or_to_all() {
-        let mut switches = Switches::default();
+    fn the_last_switch_holds_for_one_vehicle_and_for_all() {
+        let mut switches = SensorSwitches::default();
         switches.push(0, switch(0, GNSS | IMU, EVERY_VEHICLE));
         switches.push(0, switch(7, GNSS, SWITCHED_ON));
         switches.advance(0);

@@ -1,20 +1,20 @@
-//! The widest vectors this machine has: one piece of code compiled for several processors, chosen when it runs.
+//! Runs code with the widest vectors of this machine: it is compiled for several instruction sets and chosen at run time.
 //!
 //! No operation is fused or reordered in any of them, so all give the same bits (tests compare them).
 
-/// Work that the compiler can turn into vector instructions: everything it calls must be inlined into it.
-pub trait Work {
-    /// What it gives.
+/// Work that the compiler turns into vector instructions. Every function that it calls must be inlined.
+pub trait VectorWork {
+    /// Result of the work.
     type Output;
 
-    /// Does it; marked `#[inline(always)]` wherever it is implemented.
+    /// Does the work. Mark each implementation `#[inline(always)]`.
     fn run(self) -> Self::Output;
 }
 
-/// Instructions that a piece of work may be compiled for.
+/// Instruction set that work is compiled for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Path {
-    /// What every processor of the target has.
+pub enum VectorPath {
+    /// The baseline instructions of the target.
     Plain,
     /// 256-bit vectors.
     Avx2,
@@ -22,8 +22,8 @@ pub enum Path {
     Avx512,
 }
 
-impl Path {
-    /// The widest one that this machine has.
+impl VectorPath {
+    /// The widest vectors of this machine.
     #[must_use]
     #[inline]
     pub fn widest() -> Self {
@@ -39,7 +39,7 @@ impl Path {
         Self::Plain
     }
 
-    /// All that this machine has.
+    /// All instruction sets of this machine.
     #[must_use]
     pub fn available() -> Vec<Self> {
         let widest = Self::widest();
@@ -49,7 +49,7 @@ impl Path {
             .collect()
     }
 
-    /// Does the work on this path, or on the widest that the machine has if that is narrower.
+    /// Does the work with these instructions, or with the widest of this machine if those are narrower.
     #[inline]
     #[cfg_attr(
         target_arch = "x86_64",
@@ -58,11 +58,11 @@ impl Path {
             reason = "calls of functions compiled for more than the baseline processor: three times as fast"
         )
     )]
-    pub fn run<W: Work>(self, work: W) -> W::Output {
+    pub fn run<W: VectorWork>(self, work: W) -> W::Output {
         #[cfg(target_arch = "x86_64")]
         {
             if self == Self::Avx512 && std::arch::is_x86_feature_detected!("avx512f") {
-                // SAFETY: the processor has been asked in this very condition and has the feature.
+                // SAFETY: the condition above has detected the feature on this processor.
                 return unsafe { avx512(work) };
             }
             if self != Self::Plain && std::arch::is_x86_feature_detected!("avx2") {
@@ -76,12 +76,12 @@ impl Path {
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
-fn avx512<W: Work>(work: W) -> W::Output {
+fn avx512<W: VectorWork>(work: W) -> W::Output {
     work.run()
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn avx2<W: Work>(work: W) -> W::Output {
+fn avx2<W: VectorWork>(work: W) -> W::Output {
     work.run()
 }

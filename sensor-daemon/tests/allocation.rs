@@ -1,9 +1,9 @@
-//! Once everybody is there, a tick of the sensors allocates nothing, however many they are.
+//! Once all road users have appeared, a tick of the sensors allocates no memory, for any number of them.
 
 #![allow(
     unsafe_code,
     clippy::unwrap_used,
-    reason = "counting allocations takes an allocator; tests assert by unwrapping"
+    reason = "counting allocations needs an allocator; tests assert by unwrapping"
 )]
 
 mod common;
@@ -18,16 +18,16 @@ use ipc_schema::{
     observation::ObservationLayout,
     world::SubStep,
 };
-use sensor_daemon::sensing::{Sensing, World};
+use sensor_daemon::sensing::{Sensing, WorldTick};
 
 thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
 }
 
-/// The system's allocator, counting what this thread asks for.
+/// The system's allocator, which counts the allocations of this thread.
 struct Counting;
 
-// SAFETY: all calls go to the system's allocator as they are; the counter neither allocates nor unwinds.
+// SAFETY: all calls are forwarded unchanged to the system's allocator; the counter neither allocates nor unwinds.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATIONS.set(ALLOCATIONS.get() + 1);
@@ -55,7 +55,7 @@ fn a_tick_allocates_nothing() {
     let mut sensing = Sensing::new(&config, &common::map()).unwrap();
     let states = common::cavs(300);
     let sub_steps = vec![SubStep::default(); states.len() * SUB_STEPS];
-    let world = World {
+    let world = WorldTick {
         states: &states,
         sub_steps: &sub_steps,
         views: &[],
@@ -77,7 +77,7 @@ fn a_tick_allocates_nothing() {
             .observe(&header, &world, bytemuck::cast_slice_mut(&mut payload))
             .unwrap();
         let allocated = ALLOCATIONS.get() - before;
-        // The first ticks make room.
+        // The first ticks may grow buffers.
         assert!(tick < 2 || allocated == 0, "tick {tick}: {allocated}");
     }
     assert!(ALLOCATIONS.get() > 0, "nothing was counted");

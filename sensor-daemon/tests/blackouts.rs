@@ -1,4 +1,4 @@
-//! Blackouts as they are seen: ages, bits and the three policies; a sky without satellites; the LIDAR's share.
+//! Blackouts in observations: ages, bits and the three policies; a sky without satellites; blackouts of the LIDAR.
 
 mod common;
 
@@ -10,7 +10,7 @@ use ipc_schema::{
     observation::{CLIPPED, VALID},
     traffic::Kind,
 };
-use sensor_daemon::gnss::{Sky, SkyView};
+use sensor_daemon::gnss::{SatelliteSky, SkyView};
 
 const GNSS: u32 = SensorKind::Gnss.bit();
 const IMU: u32 = SensorKind::Imu.bit();
@@ -41,7 +41,7 @@ fn a_held_fix_grows_older_and_its_bit_is_cleared() {
         let ages = seen.section::<[f32; 4]>("age_s")[0];
         assert_eq!(seen.section::<u32>("flags")[0] & VALID, VALID);
         assert_eq!(sensors & !GNSS, IMU | SPEED_STEERING);
-        assert!(tick > 0 || sensors & GNSS != 0, "nobody appears in a blackout");
+        assert!(tick > 0 || sensors & GNSS != 0, "no vehicle appears in a blackout");
         if sensors & GNSS == 0 {
             (age, dark_ticks) = (age + 1, dark_ticks + 1);
             assert_eq!(fix, last);
@@ -63,7 +63,7 @@ fn a_held_fix_grows_older_and_its_bit_is_cleared() {
     assert!((180..=220).contains(&dark_ticks), "{dark_ticks}");
 }
 
-/// What a vehicle's sensors have delivered.
+/// Samples that a vehicle's sensors have delivered.
 #[derive(Default)]
 struct Raw {
     fix: Vec<[f32; 3]>,
@@ -121,7 +121,7 @@ fn fields_are_not_a_number_while_dark_and_raw_samples_the_last() {
         assert_eq!(tick.section::<u32>("flags")[0] & CLIPPED, 0);
         seen |= 1 << sensors;
     }
-    assert_eq!(seen, 0b1111_1111, "every combination has been met");
+    assert_eq!(seen, 0b1111_1111, "every combination has occurred");
 }
 
 #[test]
@@ -170,7 +170,7 @@ fn vehicles_go_dark_out_of_phase_and_whoever_else_is_there_does_not_matter() {
         at_once.push(sensors.iter().filter(|bits| **bits & GNSS == 0).count());
         assert_eq!(one.tick(&states[77..78]).section::<u32>("sensors")[0], sensors[77]);
     }
-    // Once they have forgotten their start, a third of 200 is dark: 67 ± 5 standard deviations of 6.7.
+    // Once the phases no longer depend on the start, a third of 200 is dark: 67 ± 5 standard deviations of 6.7.
     let settled = &at_once[300..];
     assert!(settled.iter().all(|count| (33..=100).contains(count)), "{settled:?}");
     let first_dark = at_once.iter().take(10).filter(|count| **count > 0).count();
@@ -180,7 +180,7 @@ fn vehicles_go_dark_out_of_phase_and_whoever_else_is_there_does_not_matter() {
 /// No satellites within 2 s of the start, and later from second 4 to 5.
 struct Tunnel;
 
-impl Sky for Tunnel {
+impl SatelliteSky for Tunnel {
     fn at(&self, _x_m: f64, _y_m: f64, z_m: f64, time_s: f64) -> SkyView {
         assert_eq!(z_m, 0.0);
         SkyView {
@@ -221,7 +221,7 @@ fn without_a_first_fix_a_row_is_not_valid_and_a_lost_one_is_held() {
         );
         assert_eq!(tick.section::<[f32; 2]>("gnss_quality")[0], [0.0, 7.0]);
         assert_eq!(row[3], if lost { -1.0 } else { 1.0 });
-        // The first valid frame stands for those before it.
+        // The first valid frame is repeated for the frames before it.
         assert_eq!(row[1], if lost && number > 40 || number == 50 { -1.0 } else { 1.0 });
     }
 }

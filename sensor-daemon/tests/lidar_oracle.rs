@@ -7,25 +7,25 @@ mod lidar_city;
 use ipc_schema::pointcloud::{LidarPoint, Scan};
 use lidar_city::{
     Moves, SUB_STEPS, exact_config,
-    oracle::{Tally, World, compare, rays},
+    oracle::{ScanTotals, WorldTick, compare, rays},
     scene, traffic,
 };
-use sensor_daemon::lidar::{Lidar, Scratch, Targets};
+use sensor_daemon::lidar::{LidarModel, ScanScratch, Targets};
 
 /// One scan of each of `carriers` against parry.
-fn tally(moves: Moves, is_rolling: bool, lean: [f64; 2], carriers: std::ops::Range<usize>) -> Tally {
+fn tally(moves: Moves, is_rolling: bool, lean: [f64; 2], carriers: std::ops::Range<usize>) -> ScanTotals {
     let mut config = exact_config();
     config.lidar.rolling_shutter = is_rolling;
     config.lidar.mount = [1.0, 0.1, 2.0, lean[0], lean[1], 0.2];
     let scene = scene(500, 1);
     let (states, steps) = traffic(200, 60, moves, 0, 2);
-    let lidar = Lidar::new(&config, &scene).unwrap();
-    let world = World::new(&config, &scene, &states, &steps);
+    let lidar = LidarModel::new(&config, &scene).unwrap();
+    let world = WorldTick::new(&config, &scene, &states, &steps);
     let mut targets = Targets::default();
     targets.update(&states, &steps, SUB_STEPS);
-    let (mut scratch, mut scan) = (Scratch::default(), Scan::default());
+    let (mut scratch, mut scan) = (ScanScratch::default(), Scan::default());
     let mut points = vec![LidarPoint::default(); lidar.max_points()];
-    let mut tally = Tally::default();
+    let mut tally = ScanTotals::default();
     for row in carriers {
         let count = lidar.scan(&targets, row, 0, 1, &mut scratch, &mut scan, &mut points);
         let of_row = &steps[row * SUB_STEPS..(row + 1) * SUB_STEPS];
@@ -39,7 +39,7 @@ fn tally(moves: Moves, is_rolling: bool, lean: [f64; 2], carriers: std::ops::Ran
     tally
 }
 
-fn check(tally: &Tally) {
+fn check(tally: &ScanTotals) {
     println!("{tally:?}, mean range {} m", tally.range_sum_m / tally.hits as f64);
     let off = tally.rays - tally.same;
     assert!(off * 10_000 <= tally.rays, "{off} of {} differ", tally.rays);

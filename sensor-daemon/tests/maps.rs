@@ -1,4 +1,4 @@
-//! Sensors of a curriculum on several maps: each under its own sky and projection, in one box.
+//! Sensors of a curriculum on several maps: each map has its own sky and projection, and all share one bounding box.
 
 #![allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 
@@ -11,15 +11,15 @@ use ipc_schema::{
     run::MapInfo,
 };
 use sensor_daemon::{
-    gnss::{Sky, SkyView},
+    gnss::{SatelliteSky, SkyView},
     sensing::Sensing,
 };
 use sim_core::geodesy::{NetPosition, Projection};
 
-/// As many satellites as it says, and an offset of as many metres to the east.
+/// A sky with this number of satellites, and an offset of as many metres to the east.
 struct Marked(u32);
 
-impl Sky for Marked {
+impl SatelliteSky for Marked {
     fn at(&self, _x_m: f64, _y_m: f64, _z_m: f64, _time_s: f64) -> SkyView {
         SkyView {
             satellites: self.0,
@@ -42,7 +42,7 @@ fn maps() -> [MapInfo; 2] {
 
 const BOX_M: [f64; 4] = [-100.0, -100.0, 900.0, 700.0];
 
-/// Two steps: the first on both maps, the second, which is noisier, on the second alone.
+/// Two stages: the first on both maps, the second, which is noisier, on the second map alone.
 fn config() -> Config {
     let mut config = quiet();
     config.observation.fields = vec![Field::GnssX, Field::GnssY];

@@ -1,4 +1,4 @@
-//! What many ticks of sensing amount to: Allan deviations, correlation times, and streams that nobody else can disturb.
+//! Statistics of many ticks of sensing: Allan deviations, correlation times, and random streams independent of other vehicles.
 
 #![expect(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 
@@ -13,7 +13,7 @@ use ipc_schema::{
     traffic::Kind,
     world::{SubStep, VehicleState},
 };
-use sensor_daemon::noise::Stream;
+use sensor_daemon::noise::RandomStream;
 
 /// By definition: means over two samples of 1 2 3 4 are 1.5 2.5 3.5; their second neighbours differ by 2.
 #[test]
@@ -135,7 +135,7 @@ fn correlated_fixes_forget_in_their_correlation_time() {
     }
 }
 
-/// Everything on, so that every stream and every memory shows.
+/// All errors on, so that every random stream and every memory has an effect.
 fn everything() -> Config {
     let mut config = config();
     config.gnss.noise_std_m = [1.0; 3];
@@ -155,7 +155,7 @@ fn everything() -> Config {
     config
 }
 
-/// Everything that the vehicle's sensors say at a tick, as bits.
+/// All values of a vehicle's sensors at a tick, as bits.
 fn said(run: &mut Run, states: &[VehicleState], id_hash: u64) -> Vec<u32> {
     let tick = run.tick(states);
     let slot = tick
@@ -226,7 +226,7 @@ fn an_episode_begins_cleanly_and_a_seed_is_an_episode() {
     assert!(first.iter().zip(&other).all(|(a, b)| a != b));
 }
 
-/// A slot that changes hands passes on nothing, and who returns in the same episode meets other noise.
+/// A slot passes no state to its next vehicle, and a vehicle that returns in the same episode draws new noise.
 #[test]
 fn a_slot_that_changes_hands_passes_nothing_on() {
     let config = everything();
@@ -260,7 +260,7 @@ fn threads_do_not_matter() {
     });
 }
 
-/// Correlations between everything that two vehicles deliver, over many vehicles.
+/// Correlations between all values of two vehicles, over many vehicles.
 #[test]
 fn vehicles_sensors_axes_and_samples_are_independent() {
     const VEHICLES: u32 = 4000;
@@ -362,7 +362,7 @@ fn a_slow_imu_samples_when_it_is_due_and_holds() {
         .map(|_| run.tick(&cavs(1)).section::<[f32; 7]>("imu")[0])
         .collect();
     assert!(all[0] == all[1] && all[1] == all[2] && all[2] != all[3] && all[3] == all[5]);
-    let normals = Stream {
+    let normals = RandomStream {
         episode_seed: 5,
         id_hash: cavs(1)[0].id_hash,
         sensor: NoiseStream::ImuFront,

@@ -1,4 +1,4 @@
-//! Sensing as a whole: from world to observation block.
+//! Sensing as a whole: from a tick of the world to an observation block.
 
 #![expect(clippy::unwrap_used, reason = "tests assert by unwrapping, their helpers too")]
 
@@ -14,7 +14,7 @@ use ipc_schema::{
     traffic::{Kind, id_hash},
     world::{COLLIDED, VehicleState},
 };
-use sensor_daemon::sensing::{Sensing, World};
+use sensor_daemon::sensing::{Sensing, WorldTick};
 
 /// One tick; the payload as 8-byte words, which are aligned enough for every section.
 fn tick(sensing: &mut Sensing, number: u64, flags: u32, states: &[VehicleState]) -> (usize, Vec<u64>) {
@@ -30,9 +30,9 @@ fn tick(sensing: &mut Sensing, number: u64, flags: u32, states: &[VehicleState])
     sensing
         .observe(
             &header,
-            &World {
+            &WorldTick {
                 states,
-                ..World::default()
+                ..WorldTick::default()
             },
             bytemuck::cast_slice_mut(&mut payload),
         )
@@ -131,7 +131,7 @@ fn a_collision_ends_nothing_unless_asked() {
     assert_eq!(section::<u32>(n, &payload, "episode_step"), [1]);
 }
 
-/// A vehicle's stream depends on its id, not on who else is there or in which slot it sits.
+/// A vehicle's random numbers depend on its id, not on other vehicles or its slot.
 #[test]
 fn a_vehicles_noise_does_not_depend_on_the_others() {
     let alone = road_user(7, Kind::Cav);
@@ -240,7 +240,7 @@ fn a_history_holds_ticks_oldest_first_and_begins_with_its_first() {
     assert_eq!(at(&mut run, 0.0, 15.0, 1), [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
     assert_eq!(at(&mut run, 10.0, 30.0, 1), [0.0, 0.0, 0.0, 0.0, 0.5, 1.0]);
     assert_eq!(at(&mut run, -10.0, 0.0, 1), [0.0, 0.0, 0.5, 1.0, -0.5, -1.0]);
-    // Another vehicle takes a slot of its own; the one that was left is empty, and then lent afresh.
+    // Another vehicle takes a slot of its own; the slot of the first is empty, and then reused.
     assert_eq!(at(&mut run, 20.0, 15.0, 2)[6..], [1.0, 0.0, 1.0, 0.0, 1.0, 0.0]);
     assert_eq!(at(&mut run, 10.0, 15.0, 3)[..6], [0.5, 0.0, 0.5, 0.0, 0.5, 0.0]);
 }

@@ -26,7 +26,6 @@ struct Sensing {
     drops: u64,
     redelivered_ticks: u64,
     journal_mib: u64,
-    #[serde(alias = "hand_overs")]
     handovers: Vec<HandoverMeasurement>,
     cavs_max: u64,
     raw_gnss_mean_error_m: Option<f64>,

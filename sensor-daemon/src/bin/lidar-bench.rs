@@ -2,13 +2,13 @@
 //!
 //! `cargo run --release -p sensor-daemon --bin lidar-bench -- [--python PATH] [--path auto|avx512|avx2|plain] [--json FILE] [--oracle]`
 //!
-//! Without `--python` the peers are left out; it names an interpreter that can `import open3d` (`pip install open3d-cpu`; it needs
-//! libusb-1.0, libGL and libgomp) and, if you like, `embreex`. `--oracle` holds ten million rays against parry3d instead.
+//! `--python` names an interpreter that can `import open3d` (`pip install open3d-cpu`; it needs libusb-1.0, libGL and libgomp) and
+//! optionally `embreex`; without it the peers are left out. `--oracle` compares ten million rays with parry3d instead.
 
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
-    reason = "a measurement that cannot run says why and ends"
+    reason = "a benchmark that cannot run panics with the reason"
 )]
 
 use std::{
@@ -22,7 +22,7 @@ use ipc_schema::{
     pointcloud::{LidarPoint, Scan},
     world::{SubStep, VehicleState},
 };
-use sensor_daemon::lidar::{Lidar, Path, Scratch, Targets};
+use sensor_daemon::lidar::{LidarModel, ScanPath, ScanScratch, Targets};
 use sim_core::scene::Scene;
 
 #[path = "../../tests/lidar_city/mod.rs"]
@@ -36,10 +36,10 @@ const PAIRS: usize = 5;
 /// Ticks of one round.
 const TICKS: u64 = 10;
 
-/// What to do.
+/// Options of the command line.
 struct Options {
     python: Option<PathBuf>,
-    path: Path,
+    path: ScanPath,
     json: Option<PathBuf>,
     is_oracle: bool,
 }
@@ -47,7 +47,7 @@ struct Options {
 fn options() -> Options {
     let mut options = Options {
         python: None,
-        path: Path::best(),
+        path: ScanPath::best(),
         json: None,
         is_oracle: false,
     };
@@ -59,10 +59,10 @@ fn options() -> Options {
             "--json" => options.json = Some(value().into()),
             "--path" => {
                 options.path = match value().as_str() {
-                    "auto" => Path::best(),
-                    "avx512" => Path::Avx512,
-                    "avx2" => Path::Avx2,
-                    "plain" => Path::Plain,
+                    "auto" => ScanPath::best(),
+                    "avx512" => ScanPath::Avx512,
+                    "avx2" => ScanPath::Avx2,
+                    "plain" => ScanPath::Plain,
                     other => panic!("--path {other}: auto, avx512, avx2 or plain"),
                 }
             }
@@ -142,7 +142,7 @@ impl Round {
     }
 }
 
-/// Time that this thread has had a core, seconds: others may be at work on the machine.
+/// CPU time of this thread, seconds: other programs may run on the machine.
 fn cpu_s() -> f64 {
     ipc_schema::clock::seconds(rustix::time::ClockId::ThreadCPUTime)
 }
@@ -151,28 +151,28 @@ fn cpu_s() -> f64 {
 struct Bench {
     config: Config,
     scene: Scene,
-    lidar: Lidar,
+    lidar: LidarModel,
     lidars: usize,
     ticks: Vec<(Vec<VehicleState>, Vec<SubStep>)>,
     targets: Targets,
-    scratch: Scratch,
+    scratch: ScanScratch,
     points: SharedMemory,
 }
 
 impl Bench {
-    fn new(path: Path, moves: Moves, is_rolling: bool, is_tilted: bool, lidars: usize) -> Self {
+    fn new(path: ScanPath, moves: Moves, is_rolling: bool, is_tilted: bool, lidars: usize) -> Self {
         let mut config = lidar_city::config();
         config.lidar.rolling_shutter = is_rolling;
         if is_tilted {
             config.lidar.mount[3..5].copy_from_slice(&[0.02, -0.03]);
         }
         let scene = lidar_city::scene(BUILDINGS, 1);
-        let lidar = Lidar::new(&config, &scene)
+        let lidar = LidarModel::new(&config, &scene)
             .unwrap_or_else(|error| panic!("{error}"))
             .with_path(path);
         let ticks = (0..TICKS).map(|tick| {
             let (mut states, steps) = lidar_city::traffic(VEHICLES, 0, moves, tick, 2);
-            // Carriers do not see themselves; nor do the peers see them.
+            // Carriers do not see themselves, and the peers leave them out too.
             states[..CARRIERS].iter_mut().for_each(|state| state.height_m = 0.0);
             (states, steps)
         });
@@ -184,7 +184,7 @@ impl Bench {
             lidar,
             lidars,
             targets: Targets::default(),
-            scratch: Scratch::default(),
+            scratch: ScanScratch::default(),
         }
     }
 
@@ -223,7 +223,7 @@ impl Bench {
     }
 }
 
-/// A mapping that another process could read, as the one of a real run.
+/// Shared memory that another process could read, as in a real run.
 struct SharedMemory {
     at: *mut LidarPoint,
     count: usize,
@@ -294,7 +294,7 @@ fn box_of(state: &VehicleState, vertices: &mut Vec<[f64; 3]>, faces: &mut Vec<[u
     faces.extend([[4, 5, 6], [4, 6, 7], [0, 2, 1], [0, 3, 2]].map(|face| face.map(|corner| first + corner)));
 }
 
-/// The peers' process: answers a line with their name by a line with seconds, rays and hits.
+/// The process of the peers: for each line with a peer's name it answers a line with seconds, rays and hits.
 struct Peers {
     process: Child,
     answers: BufReader<std::process::ChildStdout>,
@@ -336,7 +336,7 @@ impl Peers {
     }
 }
 
-fn peers(python: &FilePath, path: Path) -> serde_json::Value {
+fn peers(python: &FilePath, path: ScanPath) -> serde_json::Value {
     let directory = std::env::temp_dir().join(format!("lidar-bench-{}", std::process::id()));
     std::fs::create_dir_all(&directory).unwrap();
     let mut bench = Bench::new(path, Moves::Straight, false, false, CARRIERS);
@@ -356,7 +356,7 @@ fn peers(python: &FilePath, path: Path) -> serde_json::Value {
         ratios.sort_by(f64::total_cmp);
         rates.sort_by(f64::total_cmp);
         println!(
-            "{name:10} {:7.2} M rays/s (hits {:.3}, mean range {:.1} m); we are {:.1} x as fast ({:.1} ... {:.1} in {PAIRS} pairs)",
+            "{name:10} {:7.2} M rays/s (hits {:.3}, mean range {:.1} m); sensor-daemon is {:.1} x as fast ({:.1} ... {:.1} in {PAIRS} pairs)",
             rates[PAIRS / 2] / 1e6,
             warm[1],
             warm[2],
@@ -372,9 +372,9 @@ fn peers(python: &FilePath, path: Path) -> serde_json::Value {
     report
 }
 
-/// Ten million rays, upright and tilted, at once and one after the other, against parry3d.
-fn hold_against_parry(path: Path) {
-    let mut all = oracle::Tally::default();
+/// Compares ten million rays, upright and tilted, with and without rolling shutter, with parry3d.
+fn hold_against_parry(path: ScanPath) {
+    let mut all = oracle::ScanTotals::default();
     for (number, (moves, is_rolling, lean)) in [
         (Moves::Straight, false, [0.0, 0.0]),
         (Moves::Straight, true, [0.0, 0.0]),
@@ -389,11 +389,11 @@ fn hold_against_parry(path: Path) {
         config.lidar.mount = [1.0, 0.1, 2.0, lean[0], lean[1], 0.2];
         let scene = lidar_city::scene(BUILDINGS, 1 + number as u64);
         let (states, steps) = lidar_city::traffic(VEHICLES, 60, moves, number as u64, 2);
-        let lidar = Lidar::new(&config, &scene).unwrap().with_path(path);
-        let world = oracle::World::new(&config, &scene, &states, &steps);
+        let lidar = LidarModel::new(&config, &scene).unwrap().with_path(path);
+        let world = oracle::WorldTick::new(&config, &scene, &states, &steps);
         let mut targets = Targets::default();
         targets.update(&states, &steps, SUB_STEPS);
-        let (mut scratch, mut scan) = (Scratch::default(), Scan::default());
+        let (mut scratch, mut scan) = (ScanScratch::default(), Scan::default());
         let mut points = vec![LidarPoint::default(); lidar.max_points()];
         for row in 0..44 {
             let count = lidar.scan(&targets, row, 0, 1, &mut scratch, &mut scan, &mut points);

@@ -1,7 +1,7 @@
-//! Fixes against exact geodesy, and their noise against its numbers.
+//! Fixes against exact geodesy, and their noise against its parameters.
 
 use super::*;
-use crate::{noise::Stream, preset::town};
+use crate::{noise::RandomStream, preset::town};
 use ipc_schema::{run::MapInfo, sensor::NoiseStream};
 
 const UTM: &str = "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs";
@@ -31,14 +31,14 @@ fn quiet() -> Params {
     }
 }
 
-fn receiver(params: &Params) -> Receiver {
-    Receiver::new(params, &small(), SMALL_M).unwrap()
+fn receiver(params: &Params) -> GnssReceiver {
+    GnssReceiver::new(params, &small(), SMALL_M).unwrap()
 }
 
-fn open_sky(receiver: &Receiver, place_m: [f64; 3], white: &Block) -> Fix {
+fn open_sky(receiver: &GnssReceiver, place_m: [f64; 3], white: &NormalBlock) -> GnssFix {
     receiver.fix(
         place_m,
-        &Errors {
+        &GnssErrors {
             white,
             correlated: &[0.0; 3],
             view: &SkyView::default(),
@@ -82,8 +82,8 @@ fn without_noise_the_fix_is_the_truth_to_a_tenth_of_a_millimetre() {
     }
 }
 
-/// Metres and degrees, together, land where exact geodesy says: latitude and longitude to 1 mm of what was asked for, and the
-/// position in the net where the projection puts that latitude and longitude.
+/// Metres and degrees together agree with exact geodesy: latitude and longitude to 1 mm of the requested error, and the position in
+/// the net with the projection of that latitude and longitude.
 #[test]
 fn errors_in_metres_and_degrees_agree_with_exact_geodesy() {
     let bounds_m = [-25_000.0, -25_000.0, 25_000.0, 25_000.0];
@@ -99,7 +99,7 @@ fn errors_in_metres_and_degrees_agree_with_exact_geodesy() {
                     bias_deg: [degrees, -degrees],
                     ..quiet()
                 };
-                let receiver = Receiver::new(&params, projection, *bounds_m).unwrap();
+                let receiver = GnssReceiver::new(&params, projection, *bounds_m).unwrap();
                 for (share_x, share_y) in [(0.0, 0.0), (0.5, 0.5), (1.0, 0.3), (0.2, 1.0)] {
                     let x_m = bounds_m[0] + share_x * (bounds_m[2] - bounds_m[0]);
                     let y_m = bounds_m[1] + share_y * (bounds_m[3] - bounds_m[1]);
@@ -125,20 +125,20 @@ fn errors_in_metres_and_degrees_agree_with_exact_geodesy() {
     }
 }
 
-/// σ = 5e-5° is 5.57 m on each axis, so the mean distance is σ √(π/2) = 6.98 m; the receiver says σ √2.
+/// σ = 5e-5° is 5.57 m on each axis, so the mean distance is σ √(π/2) = 6.98 m; the receiver estimates σ √2.
 #[test]
 fn the_papers_noise_is_seven_metres_on_average_and_equal_on_both_axes() {
     const N: u32 = 40_000;
     let receiver = receiver(&town().gnss);
-    let stream = Stream {
+    let stream = RandomStream {
         episode_seed: 1,
         id_hash: 9,
         sensor: NoiseStream::Gnss,
     };
-    let fixes: Vec<Fix> = (0..N)
+    let fixes: Vec<GnssFix> = (0..N)
         .map(|index| open_sky(&receiver, [100.0, 50.0, 0.0], &stream.normals(index)))
         .collect();
-    let mean = |of: &dyn Fn(&Fix) -> f64| fixes.iter().map(of).sum::<f64>() / f64::from(N);
+    let mean = |of: &dyn Fn(&GnssFix) -> f64| fixes.iter().map(of).sum::<f64>() / f64::from(N);
     let std_x = mean(&|fix| (fix.x_m - 100.0).powi(2)).sqrt();
     let std_y = mean(&|fix| (fix.y_m - 50.0).powi(2)).sqrt();
     let sigma_m = 5e-5_f64.to_radians() * 6_371_000.0;
@@ -168,7 +168,7 @@ fn the_receivers_estimate_is_the_root_mean_square_of_its_errors() {
     };
     let receiver = receiver(&params);
     assert!(receiver.has_white_noise() && receiver.has_correlated_noise());
-    let stream = |sensor| Stream {
+    let stream = |sensor| RandomStream {
         episode_seed: 1,
         id_hash: 9,
         sensor,
@@ -183,7 +183,7 @@ fn the_receivers_estimate_is_the_root_mean_square_of_its_errors() {
         let [e, n, u, _] = stream(NoiseStream::GnssCorrelated).normals(index);
         let fix = receiver.fix(
             [100.0, 50.0, 0.0],
-            &Errors {
+            &GnssErrors {
                 white: &stream(NoiseStream::Gnss).normals(index),
                 correlated: &[e, n, u],
                 view: &view,
@@ -221,7 +221,7 @@ fn the_correlated_error_is_a_stationary_gauss_markov_process() {
     let mut products = [0.0; 3];
     let mut variances = [0.0; 41];
     for id_hash in 0..VEHICLES {
-        let stream = Stream {
+        let stream = RandomStream {
             episode_seed: 1,
             id_hash,
             sensor: NoiseStream::GnssCorrelated,
@@ -262,7 +262,7 @@ fn reflections_move_a_fix_and_a_smartphone_errs_more() {
     };
     let fix = receiver.fix(
         [129.0, 126.0, 0.0],
-        &Errors {
+        &GnssErrors {
             white: &[0.0; 4],
             correlated: &[0.0; 3],
             view: &view,

@@ -1,7 +1,7 @@
-//! Conventions by hand, and errors against their numbers.
+//! Conventions against values by hand, and errors against their parameters.
 
 use super::*;
-use crate::{noise::Stream, preset::town};
+use crate::{noise::RandomStream, preset::town};
 use ipc_schema::sensor::NoiseStream;
 use proptest::prelude::*;
 use std::f64::consts::PI;
@@ -20,19 +20,25 @@ fn with(convention: ImuConvention) -> Params {
 }
 
 /// One sample at the end of these sub-steps, heading north.
-fn sample(params: &Params, rows: &[SubStep]) -> Sample {
+fn sample(params: &Params, rows: &[SubStep]) -> ImuSample {
     samples(params, rows, 1)[0]
 }
 
-fn samples(params: &Params, rows: &[SubStep], count: usize) -> Vec<Sample> {
-    let unit = Unit::new(params, count);
+fn samples(params: &Params, rows: &[SubStep], count: usize) -> Vec<ImuSample> {
+    let unit = ImuModel::new(params, count);
     let mut out = vec![[9.0; 7]; count];
-    let body = Body {
+    let body = ImuMotion {
         yaw_rad: FRAC_PI_2,
         rows,
     };
     assert!(blocks(&unit, 1, 0).of(0).is_empty());
-    unit.sample(Path::widest(), &body, Drawn::default(), &mut [0.0; 8], &mut out);
+    unit.sample(
+        VectorPath::widest(),
+        &body,
+        DrawnNormals::default(),
+        &mut [0.0; 8],
+        &mut out,
+    );
     out
 }
 
@@ -68,7 +74,7 @@ fn at_rest_it_feels_gravity_as_configured() {
 #[test]
 fn slopes_and_rolls_turn_gravity() {
     let angle = (PI / 6.0) as f32;
-    let near = |felt: Sample, expected: [f32; 3]| {
+    let near = |felt: ImuSample, expected: [f32; 3]| {
         let off = (0..3).map(|i| (felt[i] - expected[i]).abs()).fold(0.0, f32::max);
         assert!(off < 1e-5, "{felt:?} is not {expected:?}");
     };
@@ -161,10 +167,10 @@ fn values_are_multiples_of_the_resolution_within_the_range() {
     assert_eq!(read[..6], [10.0, -9.75, 50.0, 1.0, -1.0, 0.0]);
 }
 
-fn blocks(unit: &Unit, id_hash: u64, first: u32) -> Draws {
-    let mut draws = Draws::default();
+fn blocks(unit: &ImuModel, id_hash: u64, first: u32) -> NormalDraws {
+    let mut draws = NormalDraws::default();
     unit.plan(&mut draws, first);
-    draws.draw(1, &[id_hash; LANES]);
+    draws.draw(1, &[id_hash; BATCH]);
     draws
 }
 
@@ -184,15 +190,15 @@ fn white_noise_has_the_configured_level_on_every_axis() {
         compass_bias_rad: 1.0,
         ..town().imu
     };
-    let unit = Unit::new(&params, N);
+    let unit = ImuModel::new(&params, N);
     let mut out = vec![[0.0; 7]; N];
-    let body = Body {
+    let body = ImuMotion {
         yaw_rad: FRAC_PI_2,
         rows: &[SubStep::default()],
     };
     let normals = blocks(&unit, 3, 0);
     assert_eq!(normals.of(5).len(), 2 * N);
-    unit.sample(Path::widest(), &body, normals.of(5), &mut [0.0; 8], &mut out);
+    unit.sample(VectorPath::widest(), &body, normals.of(5), &mut [0.0; 8], &mut out);
     let stds = [0.5, 0.2, 0.1, 0.1, 0.2, 0.3, 0.05];
     let means = [1.0, -2.0, 0.0, 0.0, 0.0, 0.5, 1.0];
     let n = N as f64;
@@ -230,8 +236,8 @@ fn biases_walk_and_remember() {
         gyro_bias_walk: [0.0, 0.0, 0.1],
         ..quiet()
     };
-    let (short, long) = (Unit::new(&params, 10), Unit::new(&params, 100));
-    let body = Body {
+    let (short, long) = (ImuModel::new(&params, 10), ImuModel::new(&params, 100));
+    let body = ImuMotion {
         yaw_rad: 0.0,
         rows: &[SubStep::default()],
     };
@@ -241,14 +247,20 @@ fn biases_walk_and_remember() {
         let (mut few, mut many) = ([[0.0; 7]; 10], vec![[0.0; 7]; 100]);
         for tick in 0..10_u32 {
             short.sample(
-                Path::widest(),
+                VectorPath::widest(),
                 &body,
                 blocks(&short, id, tick * 10).of(1),
                 &mut walk,
                 &mut few,
             );
         }
-        long.sample(Path::widest(), &body, blocks(&long, id, 0).of(9), &mut whole, &mut many);
+        long.sample(
+            VectorPath::widest(),
+            &body,
+            blocks(&long, id, 0).of(9),
+            &mut whole,
+            &mut many,
+        );
         assert_eq!(walk, whole);
         assert_eq!(few[9], many[99]);
         assert_eq!(few[9][0], walk[0]);
@@ -264,9 +276,9 @@ fn biases_walk_and_remember() {
 
 #[test]
 fn streams_are_independent_of_how_many_are_asked_for() {
-    let unit = Unit::new(&town().imu, 1);
+    let unit = ImuModel::new(&town().imu, 1);
     let alone = blocks(&unit, 3, 77);
-    let stream = Stream {
+    let stream = RandomStream {
         episode_seed: 1,
         id_hash: 3,
         sensor: NoiseStream::ImuFront,
@@ -274,7 +286,7 @@ fn streams_are_independent_of_how_many_are_asked_for() {
     assert_eq!(alone.of(2).at(0), stream.normals(77));
 }
 
-/// Everything on, over ticks of several sub-steps: the vectors' bits are the plain ones.
+/// With all errors on, over ticks of several sub-steps: all instruction sets give the same bits.
 #[test]
 fn every_path_gives_the_same_samples() {
     let params = Params {
@@ -299,11 +311,11 @@ fn every_path_gives_the_same_samples() {
         })
         .collect();
     for samples in [1, 10, 20, 40] {
-        let unit = Unit::new(&params, samples);
+        let unit = ImuModel::new(&params, samples);
         let normals = blocks(&unit, 3, 100);
         let on = |path| {
             let (mut walk, mut out) = ([0.5; 8], vec![[0.0; 7]; samples]);
-            let body = Body {
+            let body = ImuMotion {
                 yaw_rad: 2.0,
                 rows: &rows,
             };
@@ -311,8 +323,8 @@ fn every_path_gives_the_same_samples() {
             let bits: Vec<u32> = walk.iter().chain(out.as_flattened()).map(|v| v.to_bits()).collect();
             bits
         };
-        let plain = on(Path::Plain);
-        for path in Path::available() {
+        let plain = on(VectorPath::Plain);
+        for path in VectorPath::available() {
             assert!(on(path) == plain, "{path:?} of {samples}");
         }
     }

@@ -1,26 +1,26 @@
-//! The rays of a span: which way its columns look, and the ground below.
+//! The rays of a span: directions of its columns, and the ground below.
 
 use ipc_schema::pointcloud::{GROUND, Tag};
 
 use super::{
-    raster::{Canvas, Chunk},
-    scan::Work,
+    raster::{ColumnChunk, ScanCanvas},
+    scan::SpanScan,
     sensor::{Rotation, turned},
-    simd::{Floats, LANES, Simd},
+    simd::{Floats, Simd, WIDTH},
     solids::NOTHING,
 };
 
 /// Vectors of length 1 from vectors of nearly that, by a step of Newton's.
 #[inline(always)]
-fn unit(of: &[[f64; LANES]; 3], to: &mut [Floats; 3]) {
+fn unit(of: &[[f64; WIDTH]; 3], to: &mut [Floats; 3]) {
     let [x, y, z] = of;
-    let scale: [f64; LANES] = std::array::from_fn(|i| 1.5 - 0.5 * (x[i] * x[i] + y[i] * y[i] + z[i] * z[i]));
+    let scale: [f64; WIDTH] = std::array::from_fn(|i| 1.5 - 0.5 * (x[i] * x[i] + y[i] * y[i] + z[i] * z[i]));
     for (from, to) in of.iter().zip(to) {
         to.0 = std::array::from_fn(|i| (from[i] * scale[i]) as f32);
     }
 }
 
-impl Work<'_> {
+impl SpanScan<'_> {
     /// The sun in the sensor's frame.
     pub(super) fn sun(&self) -> [f32; 3] {
         let r = &self.sensors[0].world_from_sensor;
@@ -30,11 +30,11 @@ impl Work<'_> {
 
     /// Directions of the columns and their rays, ages, and the ground.
     #[inline(always)]
-    pub(super) fn start<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut Canvas) {
+    pub(super) fn start<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut ScanCanvas) {
         canvas.count = self.span.count;
-        for chunk in 0..self.span.count.div_ceil(LANES) {
-            self.aim_columns::<UPRIGHT>(&mut canvas.columns[chunk], chunk * LANES);
-            canvas.columns[chunk].far = Floats([self.order.lidar.range_m as f32; LANES]);
+        for chunk in 0..self.span.count.div_ceil(WIDTH) {
+            self.aim_columns::<UPRIGHT>(&mut canvas.columns[chunk], chunk * WIDTH);
+            canvas.columns[chunk].far = Floats([self.order.lidar.range_m as f32; WIDTH]);
             if !UPRIGHT && !self.order.lidar.pattern.is_table {
                 self.fan::<S>(&mut canvas.columns[chunk]);
             }
@@ -48,29 +48,29 @@ impl Work<'_> {
         }
     }
 
-    /// Axes, azimuths and ages of sixteen columns; those beyond the end of the span come out as they may.
+    /// Axes, azimuths and ages of sixteen columns; values of columns beyond the end of the span are not used.
     #[inline(always)]
-    fn aim_columns<const UPRIGHT: bool>(&self, chunk: &mut Chunk, first: usize) {
+    fn aim_columns<const UPRIGHT: bool>(&self, chunk: &mut ColumnChunk, first: usize) {
         let lidar = self.order.lidar;
         let [from, to] = self.sensors.map(|sensor| sensor.world_from_sensor);
         let inv = 1.0 / (self.span.count - 1).max(1) as f64;
         let at = self.column(0) + first;
-        let sines: &[f64; LANES] = row(&lidar.firing.sines, at);
-        let cosines: &[f64; LANES] = row(&lidar.firing.cosines, at);
-        let shares: [f64; LANES] = std::array::from_fn(|i| (first + i) as f64 * inv);
+        let sines: &[f64; WIDTH] = row(&lidar.firing.sines, at);
+        let cosines: &[f64; WIDTH] = row(&lidar.firing.cosines, at);
+        let shares: [f64; WIDTH] = std::array::from_fn(|i| (first + i) as f64 * inv);
         let age_s = (1.0 - self.span.at[0]) * lidar.tick_s;
         let shorter_s = (self.span.at[1] - self.span.at[0]) * lidar.tick_s;
-        for i in 0..LANES {
+        for i in 0..WIDTH {
             chunk.share.0[i] = shares[i] as f32;
             chunk.azimuth[0].0[i] = sines[i] as f32;
             chunk.azimuth[1].0[i] = cosines[i] as f32;
             chunk.age_us.0[i] = ((age_s - shorter_s * shares[i]) * 1e6 + 0.5).max(0.0) as i32 as u32;
         }
-        let mut axes = [[[0.0_f64; LANES]; 3]; 3];
+        let mut axes = [[[0.0_f64; WIDTH]; 3]; 3];
         let [ahead, left, up] = &mut axes;
         for part in 0..3 {
             let change = [0, 1, 2].map(|i: usize| to[part][i] - from[part][i]);
-            for i in 0..LANES {
+            for i in 0..WIDTH {
                 let x = from[part][0] + shares[i] * change[0];
                 let y = from[part][1] + shares[i] * change[1];
                 ahead[part][i] = x * cosines[i] + y * sines[i];
@@ -89,10 +89,10 @@ impl Work<'_> {
         }
     }
 
-    /// Between which directions the rays of sixteen columns lie, each column in a plane: between those of its lowest and its highest
-    /// ray. Seen from above they may not spread too far.
+    /// Bounds of the directions of sixteen columns. The rays of a column lie in a plane, between its lowest and its highest ray. Seen
+    /// from above they must spread by less than a right angle.
     #[inline(always)]
-    fn fan<S: Simd>(&self, chunk: &mut Chunk) {
+    fn fan<S: Simd>(&self, chunk: &mut ColumnChunk) {
         let [lowest, highest] = self.order.lidar.pattern.ends;
         let axis = |of: usize, part: usize| S::load(&chunk.axes[of][part]);
         let ray =
@@ -114,10 +114,11 @@ impl Work<'_> {
 
     /// Directions of the rays of a column.
     #[inline(always)]
-    fn aim<S: Simd>(&self, canvas: &mut Canvas, column: usize) {
+    fn aim<S: Simd>(&self, canvas: &mut ScanCanvas, column: usize) {
         let is_table = self.order.lidar.pattern.is_table;
-        let (chunk, lane) = (column / LANES, column % LANES);
-        let part = |canvas: &Canvas, axis: usize, part: usize| S::splat(canvas.columns[chunk].axes[axis][part].0[lane]);
+        let (chunk, element) = (column / WIDTH, column % WIDTH);
+        let part =
+            |canvas: &ScanCanvas, axis: usize, part: usize| S::splat(canvas.columns[chunk].axes[axis][part].0[element]);
         for (group, rays) in self.groups(column).iter().enumerate() {
             let place = column * canvas.groups + group;
             let (alpha, beta, gamma) = (S::load(&rays.alpha), S::load(&rays.beta), S::load(&rays.gamma));
@@ -134,13 +135,13 @@ impl Work<'_> {
             let of_chunk = &mut canvas.columns[chunk];
             let [right, left] = edges;
             for (axis, (right, left)) in right.into_iter().zip(left).enumerate() {
-                of_chunk.right[axis].0[lane] = right;
-                of_chunk.left[axis].0[lane] = left;
+                of_chunk.right[axis].0[element] = right;
+                of_chunk.left[axis].0[element] = left;
             }
         }
     }
 
-    /// Height of the sensor above flat ground at both ends of the span; 0 without.
+    /// Height of the sensor above flat ground at both ends of the span; 0 if the ground is not flat.
     #[inline(always)]
     fn heights_above_ground(&self) -> [f32; 2] {
         let ground_m = self.order.lidar.ground_m;
@@ -149,9 +150,9 @@ impl Work<'_> {
         })
     }
 
-    /// The ground, or nothing, as far as the range goes: the same in every column at the same height.
+    /// Fills all rays with the ground within range, or with no hit: the same in every column at the same height.
     #[inline(always)]
-    fn ground_upright<S: Simd>(&self, canvas: &mut Canvas) {
+    fn ground_upright<S: Simd>(&self, canvas: &mut ScanCanvas) {
         let range = S::splat(self.order.lidar.range_m as f32);
         let [first, last] = self.heights_above_ground();
         for group in 0..canvas.groups {
@@ -170,7 +171,7 @@ impl Work<'_> {
     }
 
     #[inline(always)]
-    fn ground_tilted<S: Simd>(&self, canvas: &mut Canvas, column: usize) {
+    fn ground_tilted<S: Simd>(&self, canvas: &mut ScanCanvas, column: usize) {
         let limit = S::splat(self.order.lidar.range_m as f32);
         let [first, last] = self.heights_above_ground();
         let height = at_share(canvas, column, first, last);
@@ -182,7 +183,14 @@ impl Work<'_> {
     }
 
     #[inline(always)]
-    fn lay<S: Simd>(&self, canvas: &mut Canvas, place: usize, height: f32, (t, limit): (S::F, S::F), incidence: S::F) {
+    fn lay<S: Simd>(
+        &self,
+        canvas: &mut ScanCanvas,
+        place: usize,
+        height: f32,
+        (t, limit): (S::F, S::F),
+        incidence: S::F,
+    ) {
         let is_hit = S::both(S::lt(S::splat(0.0), t), S::lt(t, limit));
         let is_hit = if height > 0.0 { is_hit } else { S::mask(0) };
         S::store(S::select(is_hit, t, limit), &mut canvas.t[place]);
@@ -199,19 +207,19 @@ impl Work<'_> {
 
 /// Sixteen numbers from `at` on.
 #[inline(always)]
-fn row(of: &[f64], at: usize) -> &[f64; LANES] {
+fn row(of: &[f64], at: usize) -> &[f64; WIDTH] {
     // A span and its last chunk reach no further than `SPAN` beyond a rotation: the table is that much longer.
-    of[at..].first_chunk().unwrap_or(&[0.0; LANES])
+    of[at..].first_chunk().unwrap_or(&[0.0; WIDTH])
 }
 
 /// A value between those at both ends of the span.
 #[inline(always)]
-fn at_share(canvas: &Canvas, column: usize, first: f32, last: f32) -> f32 {
-    first + canvas.columns[column / LANES].share.0[column % LANES] * (last - first)
+fn at_share(canvas: &ScanCanvas, column: usize, first: f32, last: f32) -> f32 {
+    first + canvas.columns[column / WIDTH].share.0[column % WIDTH] * (last - first)
 }
 
-/// Horizontal directions right and left of the first `count` rays of a column of one group; none where they spread too far.
-fn wedge(canvas: &Canvas, column: usize, count: usize) -> [[f32; 2]; 2] {
+/// Horizontal directions right and left of the first `count` rays of a column of one group; zeros where they spread too far.
+fn wedge(canvas: &ScanCanvas, column: usize, count: usize) -> [[f32; 2]; 2] {
     let direction = |ray: usize| [0, 1].map(|axis: usize| canvas.direction[axis][column].0[ray]);
     let [a, b] = direction(0);
     let (mut least, mut most) = (0.0_f32, 0.0_f32);

@@ -1,34 +1,34 @@
-//! Which surfaces a scan may see, and in which columns: everything within range, nearest first, sorted into spans.
+//! Finds the surfaces within range that a scan may see and the columns that may see them, and sorts them into spans, nearest first.
 
 use std::f64::consts::{PI, TAU};
 
 use super::{
-    Lidar, Targets,
-    firing::Span,
-    sensor::Sensor,
-    simd::LANES,
-    solids::{Solids, StillWall},
+    LidarModel, Targets,
+    firing::ColumnSpan,
+    sensor::SensorPose,
+    simd::WIDTH,
+    solids::{SolidWall, StillSolids},
 };
 
 /// Added to every angle: the error of [`angle_rad`] and of the directions, radians.
 const MARGIN_RAD: f64 = 1.5e-3;
 
-/// What a candidate is.
+/// Kind of a candidate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum CandidateKind {
     /// A wall of a building or prop: number of the wall, number of the solid.
     Wall(u32, u32),
-    /// Its roof and underside.
+    /// Roof and underside of a solid, by its number.
     Cap(u32),
     /// A road user, by row.
-    Mover(u32),
+    RoadUser(u32),
 }
 
 /// A surface, or a road user.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Candidate {
-    pub(super) kind: Kind,
-    /// No part comes nearer horizontally during the tick, metres.
+pub(super) struct ScanCandidate {
+    pub(super) kind: CandidateKind,
+    /// Lower bound of its horizontal distance during the tick, metres.
     pub(super) near_m: f32,
     /// First and last column of a rotation that may see it, the last beyond a rotation where it lies across its begin.
     columns: [f32; 2],
@@ -36,7 +36,7 @@ pub(super) struct Candidate {
 
 /// A candidate in a span, with the first and last chunk that may see it.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Entry {
+pub(super) struct SpanCandidate {
     pub(super) candidate: u32,
     pub(super) chunks: [u8; 2],
 }
@@ -44,34 +44,34 @@ pub(super) struct Entry {
 /// Candidates of a scan.
 #[derive(Debug, Default)]
 pub(super) struct Candidates {
-    pub(super) all: Vec<Candidate>,
+    pub(super) all: Vec<ScanCandidate>,
     order: Vec<u64>,
     /// Span and entry, nearest candidate first.
-    found: Vec<(u32, Entry)>,
-    /// Entries by span; where each span's begin.
-    pub(super) entries: Vec<Entry>,
+    found: Vec<(u32, SpanCandidate)>,
+    /// Entries sorted by span, and the first entry of each span.
+    pub(super) entries: Vec<SpanCandidate>,
     starts: Vec<u32>,
-    /// By column of the tick: the first span that ends behind it, the last that begins before it (one more).
+    /// For each column of the tick: the first span that ends after it, and one more than the last span that begins before it.
     first_span: Vec<u16>,
     last_span: Vec<u16>,
 }
 
-/// The sensor during a tick, as far as candidates need to know.
-pub(super) struct Watch {
+/// Bounds of the sensor's motion during a tick, for the choice of candidates.
+pub(super) struct SensorSweep {
     pub(super) place_m: [f64; 3],
     heading_rad: f64,
-    /// How far it is from `place_m`, at most, metres; in height alone.
+    /// Upper bounds of its distance from `place_m`: horizontally and in height, metres.
     motion_m: f64,
     rise_m: f64,
-    /// By how much columns look elsewhere than their azimuth says, radians.
+    /// Upper bound of the angle between a ray and the azimuth of its column, radians.
     spread_rad: f64,
 }
 
-impl Watch {
+impl SensorSweep {
     /// From the sensor at the begin and end of each span; `steepest` is the largest tangent of an elevation, infinite for a table.
-    pub(super) fn new(sensors: &[[Sensor; 2]], steepest: f64) -> Option<Self> {
+    pub(super) fn new(sensors: &[[SensorPose; 2]], steepest: f64) -> Option<Self> {
         let middle = &sensors.get(sensors.len() / 2)?[0];
-        let heading = |sensor: &Sensor| angle_rad(sensor.world_from_sensor[0][0], sensor.world_from_sensor[1][0]);
+        let heading = |sensor: &SensorPose| angle_rad(sensor.world_from_sensor[0][0], sensor.world_from_sensor[1][0]);
         let heading_rad = heading(middle);
         let mut watch = Self {
             place_m: middle.position_m,
@@ -94,8 +94,8 @@ impl Watch {
     }
 }
 
-/// By how much a ray's azimuth differs from its column's when the sensor's axis leans by the angle whose cosine is `up`: it moves
-/// sideways by at most `tan e sin θ`, over at least `cos θ − tan e sin θ` ahead; and the column itself by θ²/2.
+/// Upper bound of the difference between the azimuths of a ray and its column when the sensor's axis is tilted by the angle θ whose
+/// cosine is `up`: a ray moves sideways by at most `tan e sin θ`, over at least `cos θ − tan e sin θ` ahead; the column moves by θ²/2.
 fn tilt_rad(up: f64, steepest: f64) -> f64 {
     let sin2 = 1.0 - up * up;
     if sin2 <= 0.0 {
@@ -130,9 +130,9 @@ pub(super) fn angle_rad(x: f64, y: f64) -> f64 {
     if y < 0.0 { -angle } else { angle }
 }
 
-/// How the head of a LIDAR turns, for the columns that may see a thing.
+/// Rotation of the head, for the choice of the columns that may see an object.
 struct Eye<'a> {
-    watch: &'a Watch,
+    watch: &'a SensorSweep,
     per_rotation: f64,
     is_table: bool,
     range_m: f64,
@@ -173,7 +173,7 @@ impl Eye<'_> {
 
     /// Least distance of a wall that shows its outside and is within range, and the columns that may see it.
     #[inline(always)]
-    fn wall(&self, wall: &StillWall) -> Option<(f32, [f32; 2])> {
+    fn wall(&self, wall: &SolidWall) -> Option<(f32, [f32; 2])> {
         let [x, y, _] = self.watch.place_m;
         let motion_m = self.watch.motion_m;
         let (p, q) = ([wall.p_m[0] - x, wall.p_m[1] - y], [wall.q_m[0] - x, wall.q_m[1] - y]);
@@ -209,9 +209,9 @@ impl Eye<'_> {
 }
 
 impl Candidates {
-    /// Everything that the carrier in `row` may see.
+    /// Gathers all surfaces that the carrier in `row` may see.
     #[inline(always)]
-    pub(super) fn gather(&mut self, lidar: &Lidar, targets: &Targets, row: usize, watch: &Watch) {
+    pub(super) fn gather(&mut self, lidar: &LidarModel, targets: &Targets, row: usize, watch: &SensorSweep) {
         self.all.clear();
         let eye = Eye {
             watch,
@@ -229,8 +229,8 @@ impl Candidates {
             let most_m = eye.range_m + reach_m;
             if square < most_m * most_m && number != row {
                 let (distance_m, reach_m) = (square.sqrt(), reach_m + watch.motion_m);
-                self.all.push(Candidate {
-                    kind: Kind::Mover(number as u32),
+                self.all.push(ScanCandidate {
+                    kind: CandidateKind::RoadUser(number as u32),
                     near_m: (distance_m - reach_m).max(0.0) as f32,
                     columns: eye.circle([dx, dy], distance_m, reach_m),
                 });
@@ -238,23 +238,23 @@ impl Candidates {
         }
     }
 
-    /// Roof and walls of what stands still.
+    /// Adds the roof and the walls of a static solid.
     #[inline(always)]
-    fn still(&mut self, solids: &Solids, number: usize, distance_m: f64, eye: &Eye<'_>) {
+    fn still(&mut self, solids: &StillSolids, number: usize, distance_m: f64, eye: &Eye<'_>) {
         let (watch, still) = (eye.watch, &solids.stills[number]);
         let [x, y, z] = watch.place_m;
         if z + watch.rise_m > still.z_m[1] || z - watch.rise_m < still.z_m[0] {
             let centre = [still.centre_m[0] - x, still.centre_m[1] - y];
-            self.all.push(Candidate {
-                kind: Kind::Cap(number as u32),
+            self.all.push(ScanCandidate {
+                kind: CandidateKind::Cap(number as u32),
                 near_m: (distance_m - still.reach_m - watch.motion_m).max(0.0) as f32,
                 columns: eye.circle(centre, distance_m, still.reach_m + watch.motion_m),
             });
         }
         for index in still.walls.clone() {
             if let Some((near_m, columns)) = eye.wall(&solids.walls[index as usize]) {
-                self.all.push(Candidate {
-                    kind: Kind::Wall(index, number as u32),
+                self.all.push(ScanCandidate {
+                    kind: CandidateKind::Wall(index, number as u32),
                     near_m,
                     columns,
                 });
@@ -264,7 +264,7 @@ impl Candidates {
 
     /// Sorts the candidates into the spans of a tick that begins at column `begin` of a rotation and has `count` columns.
     #[inline(always)]
-    pub(super) fn sort(&mut self, spans: &[Span], (begin, count): (usize, usize), per_rotation: usize) {
+    pub(super) fn sort(&mut self, spans: &[ColumnSpan], (begin, count): (usize, usize), per_rotation: usize) {
         self.order.clear();
         let keys = self.all.iter().enumerate();
         self.order
@@ -296,17 +296,18 @@ impl Candidates {
 
     /// Enters a candidate into the spans of some columns.
     #[inline(always)]
-    fn enter(&mut self, candidate: u32, [low, high]: [usize; 2], spans: &[Span]) {
+    fn enter(&mut self, candidate: u32, [low, high]: [usize; 2], spans: &[ColumnSpan]) {
         for number in self.first_span[low]..self.last_span[high] {
             let span = &spans[number as usize];
-            let chunk = |column: usize| (column.saturating_sub(span.first).min(span.count - 1) / LANES) as u8;
+            let chunk = |column: usize| (column.saturating_sub(span.first).min(span.count - 1) / WIDTH) as u8;
             self.starts[number as usize + 1] += 1;
             let chunks = [chunk(low), chunk(high)];
-            self.found.push((u32::from(number), Entry { candidate, chunks }));
+            self.found
+                .push((u32::from(number), SpanCandidate { candidate, chunks }));
         }
     }
 
-    fn columns_to_spans(&mut self, spans: &[Span], count: usize) {
+    fn columns_to_spans(&mut self, spans: &[ColumnSpan], count: usize) {
         self.first_span.clear();
         self.last_span.clear();
         for (number, span) in (0_u16..).zip(spans) {
@@ -321,8 +322,8 @@ impl Candidates {
         for span in 0..spans {
             self.starts[span + 1] += self.starts[span];
         }
-        self.entries.resize(self.found.len(), Entry::default());
-        // `order` serves as the place of the next entry of each span.
+        self.entries.resize(self.found.len(), SpanCandidate::default());
+        // `order` is reused for the index of the next entry of each span.
         self.order.clear();
         self.order.extend(self.starts.iter().map(|&start| u64::from(start)));
         for (span, entry) in &self.found {
@@ -334,7 +335,7 @@ impl Candidates {
 
     /// Entries of a span.
     #[inline(always)]
-    pub(super) fn of_span(&self, span: usize) -> &[Entry] {
+    pub(super) fn of_span(&self, span: usize) -> &[SpanCandidate] {
         &self.entries[self.starts[span] as usize..self.starts[span + 1] as usize]
     }
 }

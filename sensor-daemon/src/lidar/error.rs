@@ -1,4 +1,4 @@
-//! Why a LIDAR cannot be built.
+//! Errors that prevent a LIDAR from being built.
 
 use std::path::PathBuf;
 
@@ -13,7 +13,7 @@ pub enum LidarError {
     /// No such pattern.
     #[error("`lidar.pattern` = \"{name}\" is no known pattern")]
     Pattern {
-        /// What it says.
+        /// The configured name.
         name: String,
     },
     /// A file cannot be read.
@@ -58,10 +58,10 @@ pub enum LidarError {
     /// `lidar.interest_props` names a prop that does not exist.
     #[error("`lidar.interest_props`: \"{name}\" names no known prop")]
     Prop {
-        /// What it says.
+        /// The configured name.
         name: String,
     },
-    /// Rotations and ticks do not fit each other, or there is less than one column in a tick.
+    /// Neither rotation nor tick is a whole number of the other, or a tick has less than one column.
     #[error("`lidar.rotation_hz` = {rotation_hz} with a tick of {tick_s} s: neither is a whole number of the other")]
     Rotation {
         /// Rotations per second.
@@ -72,7 +72,7 @@ pub enum LidarError {
 }
 
 impl LidarError {
-    /// What to do about it.
+    /// The remedy to show to the user.
     #[must_use]
     pub fn help(&self) -> String {
         match self {

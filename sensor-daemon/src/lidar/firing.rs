@@ -1,30 +1,30 @@
-//! When which column fires.
+//! The time at which each column fires.
 //!
-//! The head turns counter-clockwise as seen from above and looks ahead when a rotation begins. A tick is a whole number of rotations
-//! or a whole part of one; which part follows from the tick's number. Column *j* of *n* fires at `(j + 1) / n` of the tick: the
-//! last one at its very end.
+//! The head turns counter-clockwise as seen from above and points ahead when a rotation begins. A tick is a whole number of rotations
+//! or a whole part of one; the tick's number selects the part. Column *j* of *n* fires at `(j + 1) / n` of the tick, the last one at
+//! its end.
 
 use std::f64::consts::TAU;
 
 use ipc_schema::config::Config;
 
-use super::{error::LidarError, pattern::Pattern};
+use super::{error::LidarError, pattern::RayPattern};
 
 /// Most columns of a span: its results stay in the processor's nearest memory.
 pub(super) const SPAN: usize = 64;
-/// Longest span, seconds: over it everything moves along a straight line and turns by a small angle.
+/// Longest span, seconds: within it every object moves along a straight line and turns by a small angle.
 const SPAN_S: f64 = 4e-3;
 
-/// Columns in a row that are worked on together. Within one everything moves along a straight line.
+/// Consecutive columns that are scanned together. Within a span every object moves along a straight line.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Span {
-    /// First column, counted from the begin of the tick, those out of the field of view included.
+pub(super) struct ColumnSpan {
+    /// First column, counted from the begin of the tick, including columns out of the field of view.
     pub(super) first: usize,
     /// Columns.
     pub(super) count: usize,
     /// Columns that are fired before it in this tick.
     pub(super) fired_before: usize,
-    /// When its first and its last column fire, as shares of the tick.
+    /// Times of its first and its last column, as shares of the tick.
     pub(super) at: [f64; 2],
     /// The sub-step it lies in.
     pub(super) sub_step: usize,
@@ -32,15 +32,15 @@ pub(super) struct Span {
 
 /// The turning head.
 #[derive(Debug, Clone)]
-pub(super) struct Firing {
+pub(super) struct FiringSequence {
     /// Columns of a rotation.
     pub(super) per_rotation: usize,
-    /// Columns after which everything repeats.
+    /// Columns after which the sequence repeats.
     cycle: usize,
-    /// Ticks in that.
+    /// Ticks in a cycle.
     phases: usize,
-    /// Sines and cosines of the azimuths of the columns of a rotation, and of the first of the next: a span and a chunk may reach
-    /// beyond the end.
+    /// Sines and cosines of the azimuths of the columns of a rotation and of the first columns of the next: a span and a chunk may
+    /// reach beyond the end.
     pub(super) sines: Vec<f64>,
     pub(super) cosines: Vec<f64>,
     /// Whether a column is within the field of view.
@@ -48,8 +48,8 @@ pub(super) struct Firing {
     tick_s: f64,
 }
 
-impl Firing {
-    pub(super) fn new(config: &Config, pattern: &Pattern) -> Result<Self, LidarError> {
+impl FiringSequence {
+    pub(super) fn new(config: &Config, pattern: &RayPattern) -> Result<Self, LidarError> {
         let (lidar, tick_s) = (&config.lidar, config.run.tick_s);
         let wrong = LidarError::Rotation {
             rotation_hz: lidar.rotation_hz,
@@ -82,7 +82,7 @@ impl Firing {
         })
     }
 
-    /// First column of a tick in the cycle, and how many the tick has.
+    /// First column of a tick within the cycle, and the number of its columns.
     pub(super) fn tick(&self, tick: u64) -> (usize, usize) {
         let phase = (tick % self.phases as u64) as usize;
         let begin = phase * self.cycle / self.phases;
@@ -101,7 +101,7 @@ impl Firing {
     }
 
     /// The spans of a tick of `sub_steps` sub-steps (0: nothing moves), into `spans`.
-    pub(super) fn spans(&self, tick: u64, sub_steps: usize, spans: &mut Vec<Span>) {
+    pub(super) fn spans(&self, tick: u64, sub_steps: usize, spans: &mut Vec<ColumnSpan>) {
         spans.clear();
         let (begin, count) = self.tick(tick);
         let most = ((SPAN_S / self.tick_s * count as f64) as usize).clamp(1, SPAN);
@@ -125,7 +125,7 @@ impl Firing {
                     (column + 1) as f64 / count as f64
                 }
             };
-            spans.push(Span {
+            spans.push(ColumnSpan {
                 first: next,
                 count: seen,
                 fired_before: fired,

@@ -1,4 +1,4 @@
-//! Ground that is not flat, and triangle meshes: rays one by one through a hierarchy of boxes.
+//! Ground that is not flat, and triangle meshes: single rays are cast through a hierarchy of boxes.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use super::error::LidarError;
 const GROUND_CELL_M: f64 = 5.0;
 /// Most cells of the ground: larger nets get larger cells.
 const GROUND_CELLS: f64 = 250_000.0;
-/// The ground goes on beyond the outermost road, metres.
+/// Width of the ground beyond the outermost road, metres.
 const MARGIN_M: f64 = 100.0;
 
 /// One mesh in the world.
@@ -36,9 +36,9 @@ impl std::fmt::Debug for Mesh {
 
 /// All meshes of a scene.
 #[derive(Debug, Default)]
-pub(super) struct Meshes(Vec<Mesh>);
+pub(super) struct SceneMeshes(Vec<Mesh>);
 
-/// What a ray meets.
+/// Hit of a ray on a mesh.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct MeshHit {
     pub(super) range_m: f64,
@@ -46,8 +46,8 @@ pub(super) struct MeshHit {
     pub(super) object: u32,
 }
 
-impl Meshes {
-    /// Tag of all of them.
+impl SceneMeshes {
+    /// Tag of all meshes.
     pub(super) const WORD: u32 = Tag::Mesh as u32;
 
     pub(super) fn new(entries: &[String], scene: &Scene) -> Result<Self, LidarError> {
@@ -57,7 +57,7 @@ impl Meshes {
         }
         let first = (scene.buildings().len() + scene.props().len()) as u32;
         for (number, text) in (first..).zip(entries) {
-            let entry = Entry::parse(text).ok_or_else(|| LidarError::MeshEntry { text: text.clone() })?;
+            let entry = MeshEntry::parse(text).ok_or_else(|| LidarError::MeshEntry { text: text.clone() })?;
             meshes.push(Mesh {
                 triangles: entry.read(scene)?,
                 object: STATIC_OBJECT | number,
@@ -70,7 +70,7 @@ impl Meshes {
         self.0.is_empty()
     }
 
-    /// What a ray meets first within `range_m`; `direction` has length 1.
+    /// The nearest hit of a ray within `range_m`; `direction` has length 1.
     pub(super) fn cast(&self, origin_m: [f64; 3], direction: [f64; 3], range_m: f64) -> Option<MeshHit> {
         let vector = |[x, y, z]: [f64; 3]| Vector::new(x, y, z);
         let ray = Ray::new(vector(origin_m), vector(direction));
@@ -125,13 +125,13 @@ fn ground(scene: &Scene) -> Option<Mesh> {
 }
 
 /// An entry of `scene.meshes`.
-struct Entry<'a> {
+struct MeshEntry<'a> {
     path: &'a Path,
     place_m: [f64; 2],
     heading_deg: f64,
 }
 
-impl<'a> Entry<'a> {
+impl<'a> MeshEntry<'a> {
     fn parse(text: &'a str) -> Option<Self> {
         let words: Vec<&str> = text.split_whitespace().collect();
         let number = |word: &str| word.parse().ok().filter(|value: &f64| value.is_finite());
@@ -160,7 +160,7 @@ impl<'a> Entry<'a> {
             triangulate: true,
             ..tobj::LoadOptions::default()
         };
-        // Materials do not matter: a library that is missing is no error.
+        // Materials are not used: a missing material library is no error.
         let (models, _) = tobj::load_obj(self.path, &options).map_err(|error| wrong(error.to_string()))?;
         let [x, y] = self.place_m;
         let ground_m = scene.ground_height_m(x, y);

@@ -1,8 +1,8 @@
-//! Spinning LIDARs of connected vehicles: what each sees during a tick, point by point.
+//! Spinning LIDARs of connected vehicles: the points that each measures during a tick.
 //!
-//! A LIDAR is drawn like a picture of a city of prisms and boxes, not traced through a tree: see [`raster`](self). Which path a scene
-//! takes and what it costs: `docs/lidar.md`. The result depends on the configuration, the seed, the vehicle and the tick alone, not
-//! on threads, the order of objects or the processor.
+//! A scan is rasterised from prisms and boxes, not traced through a tree: see [`raster`](self). `docs/lidar.md` says which path a scene
+//! takes and what it costs. The result depends on the configuration, the seed, the vehicle and the tick alone, not on threads, the
+//! order of objects or the processor.
 
 use ipc_schema::{
     config::{Config, LidarAxes},
@@ -29,25 +29,25 @@ mod weather;
 
 pub use error::LidarError;
 pub use nearest::nearest_objects;
-pub use scan::Scratch;
+pub use scan::ScanScratch;
 pub use targets::Targets;
 
-/// Instructions that a scan is made with; all give the same bits.
+/// Instruction set of a scan; all give the same bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Path {
+pub enum ScanPath {
     /// AVX-512 F, DQ, BW and VL.
     Avx512,
     /// AVX2.
     Avx2,
-    /// What every processor has.
+    /// The baseline instructions of the target.
     Plain,
 }
 
-impl Path {
-    /// All of them, the fastest first.
+impl ScanPath {
+    /// All instruction sets, the fastest first.
     pub const ALL: [Self; 3] = [Self::Avx512, Self::Avx2, Self::Plain];
 
-    /// True if this processor can.
+    /// True if this processor has the instructions.
     #[must_use]
     pub fn is_here(self) -> bool {
         #[cfg(target_arch = "x86_64")]
@@ -65,28 +65,28 @@ impl Path {
         }
     }
 
-    /// The fastest that this processor can.
+    /// The fastest instructions of this processor.
     #[must_use]
     pub fn best() -> Self {
         Self::ALL.into_iter().find(|path| path.is_here()).unwrap_or(Self::Plain)
     }
 }
 
-/// A LIDAR and the scene it stands in; one serves all vehicles that carry it.
+/// A LIDAR and the scene around it; one model serves all vehicles that carry it.
 #[derive(Debug)]
-pub struct Lidar {
-    pattern: pattern::Pattern,
-    firing: firing::Firing,
-    mount: sensor::Mount,
-    solids: solids::Solids,
-    meshes: mesh::Meshes,
-    receiver: returns::Receiver,
-    path: Path,
-    /// Height of flat ground; none if it is a mesh.
+pub struct LidarModel {
+    pattern: pattern::RayPattern,
+    firing: firing::FiringSequence,
+    mount: sensor::SensorMount,
+    solids: solids::StillSolids,
+    meshes: mesh::SceneMeshes,
+    receiver: returns::ReturnModel,
+    path: ScanPath,
+    /// Height of flat ground; `None` if the ground is a mesh.
     ground_m: Option<f64>,
     /// Largest tangent of an elevation; infinite for a table.
     steepest: f64,
-    /// All lasers of a column in one plane, no mesh, and an upright mounting: upright whenever the carrier is.
+    /// All lasers of a column lie in one plane, there is no mesh, and the mounting is upright: the sensor is upright when its carrier is.
     is_flat_fan: bool,
     is_rolling: bool,
     is_paper: bool,
@@ -94,25 +94,25 @@ pub struct Lidar {
     tick_s: f64,
 }
 
-impl Lidar {
+impl LidarModel {
     /// The LIDAR of a configuration in a scene.
     ///
     /// # Errors
     /// Unknown pattern or prop, unusable ray table or mesh, or rotations that do not fit the tick.
     pub fn new(config: &Config, scene: &Scene) -> Result<Self, LidarError> {
         let lidar = &config.lidar;
-        let pattern = pattern::Pattern::new(lidar)?;
-        let firing = firing::Firing::new(config, &pattern)?;
-        let mount = sensor::Mount::new(lidar.mount);
-        let meshes = mesh::Meshes::new(&config.scene.meshes, scene)?;
+        let pattern = pattern::RayPattern::new(lidar)?;
+        let firing = firing::FiringSequence::new(config, &pattern)?;
+        let mount = sensor::SensorMount::new(lidar.mount);
+        let meshes = mesh::SceneMeshes::new(&config.scene.meshes, scene)?;
         let tangents = pattern.groups.iter().flat_map(|group| group.tan.0);
         let steepest = tangents.fold(0.0_f64, |most, tan| most.max(f64::from(tan.abs())));
         Ok(Self {
             is_flat_fan: !pattern.is_table && mount.is_upright && meshes.is_empty(),
             steepest: if pattern.is_table { f64::INFINITY } else { steepest },
-            solids: solids::Solids::new(lidar, scene)?,
-            receiver: returns::Receiver::new(config),
-            path: Path::best(),
+            solids: solids::StillSolids::new(lidar, scene)?,
+            receiver: returns::ReturnModel::new(config),
+            path: ScanPath::best(),
             ground_m: mesh::flat_ground_m(scene),
             is_rolling: lidar.rolling_shutter,
             is_paper: lidar.axes == LidarAxes::Paper,
@@ -125,9 +125,9 @@ impl Lidar {
         })
     }
 
-    /// The same with other instructions; unchanged if this processor does not have them.
+    /// The same LIDAR with other instructions; unchanged if this processor lacks them.
     #[must_use]
-    pub fn with_path(mut self, path: Path) -> Self {
+    pub fn with_path(mut self, path: ScanPath) -> Self {
         if path.is_here() {
             self.path = path;
         }
@@ -136,7 +136,7 @@ impl Lidar {
 
     /// The instructions it uses.
     #[must_use]
-    pub fn path(&self) -> Path {
+    pub fn path(&self) -> ScanPath {
         self.path
     }
 
@@ -153,16 +153,16 @@ impl Lidar {
     }
 
     /// Scans from the vehicle in `row` of the targets during `tick`: fills `scan` and the first points of `points`, in the order in
-    /// which they were fired; how many. `points` needs room for [`Lidar::max_points`]: what goes beyond its end is lost. A row
-    /// that does not exist sees nothing.
-    #[expect(clippy::too_many_arguments, reason = "what a scan is of, and where it goes")]
+    /// which they were fired. Returns the number of points. `points` needs room for [`LidarModel::max_points`]: points beyond its end
+    /// are lost. The scan of a row that does not exist is empty.
+    #[expect(clippy::too_many_arguments, reason = "inputs and outputs of a scan")]
     pub fn scan(
         &self,
         targets: &Targets,
         row: usize,
         tick: u64,
         episode_seed: u64,
-        scratch: &mut Scratch,
+        scratch: &mut ScanScratch,
         scan: &mut Scan,
         points: &mut [LidarPoint],
     ) -> usize {
@@ -170,7 +170,7 @@ impl Lidar {
             *scan = Scan::default();
             return 0;
         }
-        let order = scan::Order {
+        let order = scan::ScanOrder {
             lidar: self,
             targets,
             row,
@@ -181,19 +181,19 @@ impl Lidar {
     }
 }
 
-impl scan::Order<'_> {
-    fn run_on(&self, path: Path, scratch: &mut Scratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
+impl scan::ScanOrder<'_> {
+    fn run_on(&self, path: ScanPath, scratch: &mut ScanScratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
         #[cfg(target_arch = "x86_64")]
         #[expect(
             unsafe_code,
             reason = "calls of functions compiled for more than the baseline processor"
         )]
         match path {
-            // SAFETY: `Lidar::path` is a path that `Path::is_here` has found on this processor.
-            Path::Avx512 => return unsafe { self.run_avx512(scratch, scan, points) },
+            // SAFETY: `LidarModel::path` holds only instructions that `ScanPath::is_here` has detected on this processor.
+            ScanPath::Avx512 => return unsafe { self.run_avx512(scratch, scan, points) },
             // SAFETY: as above.
-            Path::Avx2 => return unsafe { self.run_avx2(scratch, scan, points) },
-            Path::Plain => {}
+            ScanPath::Avx2 => return unsafe { self.run_avx2(scratch, scan, points) },
+            ScanPath::Plain => {}
         }
         let _ = path;
         self.run::<simd::plain::Plain>(scratch, scan, points)
@@ -201,13 +201,13 @@ impl scan::Order<'_> {
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx512f,avx512dq,avx512bw,avx512vl")]
-    fn run_avx512(&self, scratch: &mut Scratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
+    fn run_avx512(&self, scratch: &mut ScanScratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
         self.run::<simd::avx512::Avx512>(scratch, scan, points)
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn run_avx2(&self, scratch: &mut Scratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
+    fn run_avx2(&self, scratch: &mut ScanScratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
         self.run::<simd::avx2::Avx2>(scratch, scan, points)
     }
 }

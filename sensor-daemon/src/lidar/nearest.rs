@@ -1,8 +1,8 @@
-//! What of a scan goes into the observation: the nearest objects.
+//! The nearest objects of a scan, for the observation.
 
 use ipc_schema::pointcloud::{LidarPoint, Tag};
 
-use super::Lidar;
+use super::LidarModel;
 
 /// Objects in the observation.
 const OBJECTS: usize = 4;
@@ -26,9 +26,9 @@ struct Nearest {
 }
 
 /// The nearest point of each of the four nearest road users and props in a scan of `lidar`, nearest first: forward and left of the
-/// carrier's rear axle, metres, at the time each point was fired. `[range, range]` stands for none.
+/// carrier's rear axle, metres, at the time each point was fired. `[range, range]` stands for no object.
 #[must_use]
-pub fn nearest_objects(points: &[LidarPoint], lidar: &Lidar) -> [[f32; 2]; OBJECTS] {
+pub fn nearest_objects(points: &[LidarPoint], lidar: &LidarModel) -> [[f32; 2]; OBJECTS] {
     let none = Nearest {
         object: 0,
         square: f32::INFINITY,
@@ -42,7 +42,7 @@ pub fn nearest_objects(points: &[LidarPoint], lidar: &Lidar) -> [[f32; 2]; OBJEC
         let place_m = lidar.body_from_point(point);
         let square = place_m[0] * place_m[0] + place_m[1] * place_m[1];
         if square < nearest[OBJECTS - 1].square {
-            enter(
+            insert(
                 &mut nearest,
                 Nearest {
                     object: point.object,
@@ -55,8 +55,8 @@ pub fn nearest_objects(points: &[LidarPoint], lidar: &Lidar) -> [[f32; 2]; OBJEC
     nearest.map(|one| one.place_m)
 }
 
-/// Enters a point that is nearer than the last: in the place of its own object's, or of the last one.
-fn enter(nearest: &mut [Nearest; OBJECTS], new: Nearest) {
+/// Inserts a point that is nearer than the last one: it replaces the point of its own object, or the last one.
+fn insert(nearest: &mut [Nearest; OBJECTS], new: Nearest) {
     let own = nearest
         .iter()
         .position(|one| one.square.is_finite() && one.object == new.object);
@@ -71,7 +71,7 @@ fn enter(nearest: &mut [Nearest; OBJECTS], new: Nearest) {
     nearest[place] = new;
 }
 
-impl Lidar {
+impl LidarModel {
     /// Forward and left of the carrier's rear axle, metres.
     fn body_from_point(&self, point: &LidarPoint) -> [f32; 2] {
         let [x, y, z] = point.position_m.map(f64::from);

@@ -1,8 +1,8 @@
-//! Which way the rays of a LIDAR go, as seen from the sensor.
+//! Directions of a LIDAR's rays in the sensor's frame.
 //!
-//! Rays come in groups of sixteen that fire together. A column is all lasers of one azimuth; of a table it is up to sixteen rays in
-//! the order of the file. Units by name have the elevations of their manuals; the small azimuth offsets between the lasers of real
-//! units are left out, a table can hold them.
+//! Rays form groups of sixteen that fire together. A column is all lasers of one azimuth; in a table it is up to sixteen rays in the
+//! order of the file. A named pattern has the elevations of the unit's manual. The small azimuth offsets between the lasers of real
+//! units are left out; a table can hold them.
 
 use std::path::Path;
 
@@ -10,45 +10,45 @@ use ipc_schema::config;
 
 use super::{
     error::LidarError,
-    simd::{Floats, LANES, Words},
+    simd::{Floats, WIDTH, Words},
 };
 
 /// Rays that fire together. A direction is `alpha` along the azimuth of the column, `beta` to its left, `gamma` up the sensor's axis.
 #[derive(Debug, Clone)]
-pub(super) struct Group {
+pub(super) struct RayGroup {
     pub(super) alpha: Floats,
     pub(super) beta: Floats,
     pub(super) gamma: Floats,
-    /// Of the elevation; for columns in one plane.
+    /// Tangent and cotangent of the elevation, for columns in one plane.
     pub(super) tan: Floats,
     pub(super) cot: Floats,
     /// 1 / cosine of the elevation.
     pub(super) inv_cos: Floats,
     /// Laser, in the upper half of the word.
     pub(super) channel: Words,
-    /// Lanes that are rays: the rest fill up.
+    /// Bits of the elements that are rays; the others are padding.
     pub(super) live: u32,
 }
 
 /// The rays of a rotation.
 #[derive(Debug, Clone)]
-pub(super) struct Pattern {
-    /// Of every column alike, or, of a table, one for each column.
-    pub(super) groups: Vec<Group>,
+pub(super) struct RayPattern {
+    /// The groups of every column, or, of a table, one group for each column.
+    pub(super) groups: Vec<RayGroup>,
     /// Groups in a column.
     pub(super) per_column: usize,
     /// Rays in a full column.
     pub(super) lasers: usize,
     /// `alpha` and `gamma` of the lowest and the highest laser.
     pub(super) ends: [[f32; 2]; 2],
-    /// Rays of a rotation one by one; their azimuth is in `alpha` and `beta`.
+    /// The pattern is a table of the rays of a rotation; their azimuths are in `alpha` and `beta`.
     pub(super) is_table: bool,
 }
 
 /// Longest time over which the rays of a table count as fired together, seconds: 1 mm at 20 m/s.
 const TOGETHER_S: f64 = 50e-6;
 
-impl Pattern {
+impl RayPattern {
     pub(super) fn new(lidar: &config::Lidar) -> Result<Self, LidarError> {
         if lidar.pattern == "table" {
             return table(Path::new(&lidar.ray_table), lidar.rotation_hz);
@@ -64,7 +64,7 @@ impl Pattern {
                 channel,
             })
             .collect();
-        let groups: Vec<Group> = rays.chunks(LANES).map(Group::new).collect();
+        let groups: Vec<RayGroup> = rays.chunks(WIDTH).map(RayGroup::new).collect();
         Ok(Self {
             per_column: groups.len(),
             ends: [&rays[0], &rays[rays.len() - 1]].map(|ray| {
@@ -79,7 +79,7 @@ impl Pattern {
 
     /// The groups of a column of the rotation.
     #[inline(always)]
-    pub(super) fn column(&self, column: usize) -> &[Group] {
+    pub(super) fn column(&self, column: usize) -> &[RayGroup] {
         if self.is_table {
             &self.groups[column..=column]
         } else {
@@ -96,9 +96,9 @@ struct Ray {
     channel: u32,
 }
 
-impl Group {
+impl RayGroup {
     fn new(rays: &[Ray]) -> Self {
-        let lane = |value: &dyn Fn(&Ray) -> f64| {
+        let element = |value: &dyn Fn(&Ray) -> f64| {
             Floats(std::array::from_fn(|i| {
                 let ray = rays.get(i).or(rays.last());
                 ray.map_or(0.0, value) as f32
@@ -106,12 +106,12 @@ impl Group {
         };
         let sin_cos = |degrees: f64| libm::sincos(degrees.to_radians());
         Self {
-            alpha: lane(&|ray| sin_cos(ray.elevation_deg).1 * sin_cos(ray.azimuth_deg).1),
-            beta: lane(&|ray| sin_cos(ray.elevation_deg).1 * sin_cos(ray.azimuth_deg).0),
-            gamma: lane(&|ray| sin_cos(ray.elevation_deg).0),
-            tan: lane(&|ray| sin_cos(ray.elevation_deg).0 / sin_cos(ray.elevation_deg).1),
-            cot: lane(&|ray| sin_cos(ray.elevation_deg).1 / sin_cos(ray.elevation_deg).0),
-            inv_cos: lane(&|ray| 1.0 / sin_cos(ray.elevation_deg).1),
+            alpha: element(&|ray| sin_cos(ray.elevation_deg).1 * sin_cos(ray.azimuth_deg).1),
+            beta: element(&|ray| sin_cos(ray.elevation_deg).1 * sin_cos(ray.azimuth_deg).0),
+            gamma: element(&|ray| sin_cos(ray.elevation_deg).0),
+            tan: element(&|ray| sin_cos(ray.elevation_deg).0 / sin_cos(ray.elevation_deg).1),
+            cot: element(&|ray| sin_cos(ray.elevation_deg).1 / sin_cos(ray.elevation_deg).0),
+            inv_cos: element(&|ray| 1.0 / sin_cos(ray.elevation_deg).1),
             channel: Words(std::array::from_fn(|i| rays.get(i).map_or(0, |ray| ray.channel << 16))),
             live: (1_u32 << rays.len()) - 1,
         }
@@ -168,14 +168,14 @@ fn vls128() -> Vec<f64> {
     below.into_iter().chain(fine).chain(above).collect()
 }
 
-/// A table's line.
+/// A line of a ray table.
 #[derive(serde::Deserialize)]
-struct Line {
+struct TableLine {
     azimuth_deg: f64,
     elevation_deg: f64,
 }
 
-fn table(path: &Path, rotation_hz: f64) -> Result<Pattern, LidarError> {
+fn table(path: &Path, rotation_hz: f64) -> Result<RayPattern, LidarError> {
     let lines = lines(path)?;
     let mut distinct: Vec<f64> = lines.iter().map(|line| line.elevation_deg).collect();
     distinct.sort_by(f64::total_cmp);
@@ -189,9 +189,9 @@ fn table(path: &Path, rotation_hz: f64) -> Result<Pattern, LidarError> {
         })
         .collect();
     let apart_s = 1.0 / (rotation_hz * rays.len() as f64);
-    let together = (TOGETHER_S / apart_s).clamp(1.0, LANES as f64) as usize;
-    Ok(Pattern {
-        groups: rays.chunks(together).map(Group::new).collect(),
+    let together = (TOGETHER_S / apart_s).clamp(1.0, WIDTH as f64) as usize;
+    Ok(RayPattern {
+        groups: rays.chunks(together).map(RayGroup::new).collect(),
         per_column: 1,
         lasers: together,
         ends: [[0.0; 2]; 2],
@@ -199,7 +199,7 @@ fn table(path: &Path, rotation_hz: f64) -> Result<Pattern, LidarError> {
     })
 }
 
-fn lines(path: &Path) -> Result<Vec<Line>, LidarError> {
+fn lines(path: &Path) -> Result<Vec<TableLine>, LidarError> {
     let bytes = std::fs::read(path).map_err(|source| LidarError::Unreadable {
         path: path.into(),
         source,
@@ -219,7 +219,7 @@ fn lines(path: &Path) -> Result<Vec<Line>, LidarError> {
         let place = |error: &csv::Error| error.position().map_or(0, csv::Position::line);
         let record = record.map_err(|error| wrong(place(&error), error.to_string()))?;
         let number = record.position().map_or(0, csv::Position::line);
-        let line: Line = record
+        let line: TableLine = record
             .deserialize(Some(&headers))
             .map_err(|error| wrong(number, reason(&error)))?;
         if !line.azimuth_deg.is_finite() || !(-90.0..=90.0).contains(&line.elevation_deg) {
@@ -237,7 +237,7 @@ fn lines(path: &Path) -> Result<Vec<Line>, LidarError> {
     Ok(lines)
 }
 
-/// What is wrong with a line, without the place that the message names already.
+/// The fault in a line, without its place, which the message already names.
 fn reason(error: &csv::Error) -> String {
     match error.kind() {
         csv::ErrorKind::Deserialize { err, .. } => match err.field() {

@@ -1,7 +1,7 @@
 //! Random numbers and elementary functions, sixteen at a time.
 //!
-//! Numbers depend on (seed of the episode, vehicle, tick, ray) alone. A scan has a key of its own, drawn from Philox with the first
-//! three; then one draw of Philox serves two rays.
+//! A number depends on (seed of the episode, vehicle, tick, ray) alone. Philox draws a key for each scan from the first three; one
+//! further draw serves two rays.
 
 use ipc_schema::sensor::NoiseStream;
 
@@ -13,12 +13,12 @@ const LIDAR: u32 = NoiseStream::Lidar as u32;
 
 /// Random numbers of one scan.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Key {
+pub(super) struct ScanKey {
     key: [u32; 2],
     rest: [u32; 3],
 }
 
-impl Key {
+impl ScanKey {
     pub(super) fn new(episode_seed: u64, id_hash: u64, tick: u64) -> Self {
         let counter = [
             tick as u32,
@@ -36,7 +36,7 @@ impl Key {
 }
 
 /// Random numbers of two groups of rays.
-pub(super) struct Drawn<S: Simd> {
+pub(super) struct RayRandoms<S: Simd> {
     /// Standard normal.
     pub(super) normal: [S::F; 2],
     /// In (0, 1).
@@ -50,10 +50,10 @@ fn uniform<S: Simd>(word: S::U) -> S::F {
     (S::from_signed(S::right::<8>(word)) + centre) * S::splat(1.0 / 16_777_216.0)
 }
 
-/// Random numbers of consecutive groups, two to a draw, from draw `first` on. A loop of its own: draws are long chains of operations,
-/// and two of them have room side by side in the processor where one and the work on its returns have not.
+/// Random numbers of consecutive groups, two to a draw, from draw `first` on. This is a separate loop: a draw is a long chain of
+/// operations, and the processor can overlap two draws but not a draw with the work on its returns.
 #[inline(always)]
-pub(super) fn fill<S: Simd>(key: &Key, first: u32, groups: usize, normal: &mut [Floats], uniform: &mut [Floats]) {
+pub(super) fn fill<S: Simd>(key: &ScanKey, first: u32, groups: usize, normal: &mut [Floats], uniform: &mut [Floats]) {
     let (normals, uniforms) = (normal[..groups].chunks_mut(2), uniform[..groups].chunks_mut(2));
     for (number, (normal, uniform)) in (first..).zip(normals.zip(uniforms)) {
         let drawn = draw::<S>(key, number);
@@ -68,12 +68,12 @@ pub(super) fn fill<S: Simd>(key: &Key, first: u32, groups: usize, normal: &mut [
 
 /// Random numbers of two groups of a scan.
 #[inline(always)]
-pub(super) fn draw<S: Simd>(key: &Key, number: u32) -> Drawn<S> {
+pub(super) fn draw<S: Simd>(key: &ScanKey, number: u32) -> RayRandoms<S> {
     let [a, b, c, d] = S::philox(number.wrapping_mul(16), key.rest, key.key);
     // Box and Muller.
     let radius = S::sqrt(S::splat(-2.0) * ln::<S>(uniform::<S>(a)));
     let [sine, cosine] = sin_cos_turns::<S>(b);
-    Drawn {
+    RayRandoms {
         normal: [radius * cosine, radius * sine],
         uniform: [uniform::<S>(c), uniform::<S>(d)],
     }
@@ -92,7 +92,7 @@ fn horner<S: Simd, const N: usize>(x: S::F, coefficients: [f32; N]) -> S::F {
 #[inline(always)]
 pub(super) fn ln<S: Simd>(x: S::F) -> S::F {
     let bits = S::words(x);
-    // √½ as the begin of an interval of the mantissa.
+    // The mantissa is taken from an interval that begins at √½.
     let shifted = S::minus(bits, S::splat_words(0x3F35_04F3));
     let exponent = S::from_signed(sign_shift::<S>(shifted));
     let mantissa = S::plus(
@@ -168,7 +168,7 @@ pub(super) fn exp_minus<S: Simd>(x: S::F) -> S::F {
 mod tests {
     use super::{super::simd::plain::Plain, *};
 
-    fn lane(value: <Plain as Simd>::F) -> f64 {
+    fn element(value: <Plain as Simd>::F) -> f64 {
         f64::from(value.0[0])
     }
 
@@ -177,22 +177,22 @@ mod tests {
     fn the_functions_are_as_good_as_their_precision() {
         for i in 1..200_000_u32 {
             let x = f64::from(i as f32 / 200_000.0);
-            let error = (lane(ln::<Plain>(Plain::splat(x as f32))) - x.ln()).abs();
+            let error = (element(ln::<Plain>(Plain::splat(x as f32))) - x.ln()).abs();
             assert!(error < 2.5e-7 * x.ln().abs().max(1.0), "ln {x}: {error}");
             let y = f64::from((x * 30.0) as f32);
-            let error = (lane(exp_minus::<Plain>(Plain::splat(y as f32))) / (-y).exp() - 1.0).abs();
+            let error = (element(exp_minus::<Plain>(Plain::splat(y as f32))) / (-y).exp() - 1.0).abs();
             assert!(error < 3e-7, "exp −{y}: {error}");
             let word = i.wrapping_mul(21_474);
             let [sine, cosine] = sin_cos_turns::<Plain>(Plain::splat_words(word));
             let angle = f64::from(word) / 4_294_967_296.0 * std::f64::consts::TAU;
-            assert!((lane(sine) - angle.sin()).abs() < 2e-7 && (lane(cosine) - angle.cos()).abs() < 2e-7);
+            assert!((element(sine) - angle.sin()).abs() < 2e-7 && (element(cosine) - angle.cos()).abs() < 2e-7);
         }
     }
 
     #[test]
     fn normals_are_standard_normal_and_uniforms_uniform() {
         const N: u32 = 10_000;
-        let key = Key::new(42, 7, 3);
+        let key = ScanKey::new(42, 7, 3);
         let (mut normals, mut uniforms) = (Vec::new(), Vec::new());
         for number in 0..N {
             let drawn = draw::<Plain>(&key, number);
@@ -211,7 +211,7 @@ mod tests {
 
     #[test]
     fn keys_differ_by_episode_vehicle_and_tick() {
-        let first = |key: Key| {
+        let first = |key: ScanKey| {
             let [words, ..] = Plain::philox(0, key.rest, key.key);
             words[0]
         };
@@ -224,7 +224,7 @@ mod tests {
             (1, 1 << 32, 1),
             (1, 1, 1 << 32),
         ];
-        let mut drawn = all.map(|(seed, id, tick)| first(Key::new(seed, id, tick)));
+        let mut drawn = all.map(|(seed, id, tick)| first(ScanKey::new(seed, id, tick)));
         drawn.sort_unstable();
         assert!(drawn.windows(2).all(|two| two[0] != two[1]));
     }
@@ -234,15 +234,15 @@ mod tests {
     #[test]
     fn draws_are_the_same_bits_on_every_make() {
         #[target_feature(enable = "avx2")]
-        fn avx2(key: &Key, number: u32) -> [Floats; 4] {
+        fn avx2(key: &ScanKey, number: u32) -> [Floats; 4] {
             stored::<super::super::simd::avx2::Avx2>(key, number)
         }
         #[target_feature(enable = "avx512f,avx512dq,avx512bw,avx512vl")]
-        fn avx512(key: &Key, number: u32) -> [Floats; 4] {
+        fn avx512(key: &ScanKey, number: u32) -> [Floats; 4] {
             stored::<super::super::simd::avx512::Avx512>(key, number)
         }
         #[inline(always)]
-        fn stored<S: Simd>(key: &Key, number: u32) -> [Floats; 4] {
+        fn stored<S: Simd>(key: &ScanKey, number: u32) -> [Floats; 4] {
             let drawn = draw::<S>(key, number);
             let mut out = [Floats::ZERO; 4];
             let values = [drawn.normal[0], drawn.normal[1], drawn.uniform[0], drawn.uniform[1]];
@@ -251,7 +251,7 @@ mod tests {
             }
             out
         }
-        let key = Key::new(1, 2, 3);
+        let key = ScanKey::new(1, 2, 3);
         for number in 0..1000 {
             let expected = stored::<Plain>(&key, number);
             #[expect(

@@ -1,24 +1,23 @@
-//! The kernel: which surface each ray of a span meets first.
+//! The kernel: finds the surface that each ray of a span meets first.
 //!
-//! A spinning LIDAR is drawn like a picture, not traced like a scene: surface after surface, nearest first, into a buffer of
-//! distances. A surface is held against sixteen columns at a time (does it lie in their azimuth, nearer than what they have?), and in
-//! the columns that remain against sixteen rays at a time. Positions are relative to the sensor: differences are taken in double
+//! Surfaces are rasterised one after the other, nearest first, into a buffer of distances. A surface is compared with sixteen columns
+//! at a time (is it in their azimuth, and nearer than the distances so far?), and in the remaining columns with sixteen rays at a time. Positions are relative to the sensor: differences are taken in double
 //! precision, the rest is single. Within a span every quantity of a surface is linear in time.
 //!
-//! Two ways: an upright sensor with its lasers in one plane meets a wall at one horizontal distance in the whole column, and `t` is that
-//! distance; any other sensor has directions of its own for each ray, and `t` is the range. A corner is tested by the same
-//! expression for both walls that share it: no ray slips through between them.
+//! There are two modes. An upright sensor with its lasers in one plane meets a wall at one horizontal distance in the whole column, and
+//! `t` is that distance. Any other sensor has a direction for each ray, and `t` is the range. A corner is tested by the same expression
+//! for both walls that share it, so that no ray slips through between them.
 
-use super::simd::{Floats, LANES, Simd, Words};
+use super::simd::{Floats, Simd, WIDTH, Words};
 
 /// Sixteen columns, four times.
-pub(super) const CHUNKS: usize = super::firing::SPAN / LANES;
+pub(super) const CHUNKS: usize = super::firing::SPAN / WIDTH;
 
-/// A value at the first column of the span, and how much more it is at the last.
+/// A value that is linear over the span: its value at the first column, and the difference at the last.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Line(pub(super) f32, pub(super) f32);
+pub(super) struct LinearValue(pub(super) f32, pub(super) f32);
 
-impl Line {
+impl LinearValue {
     /// From the values at both ends.
     #[inline(always)]
     pub(super) fn between(first: f64, last: f64) -> Self {
@@ -31,9 +30,10 @@ impl Line {
     }
 }
 
-/// Two values at a share of the span. Written out: closures over vectors are not always inlined, and then they go through memory.
+/// Two values at a share of the span. There is no closure over vectors here: the compiler does not always inline one, and then the
+/// vectors go through memory.
 #[inline(always)]
-fn at2<S: Simd>(lines: &[Line; 2], share: S::F) -> [S::F; 2] {
+fn at2<S: Simd>(lines: &[LinearValue; 2], share: S::F) -> [S::F; 2] {
     [lines[0].at::<S>(share), lines[1].at::<S>(share)]
 }
 
@@ -44,23 +44,23 @@ fn splat2<S: Simd>(values: [f32; 2]) -> [S::F; 2] {
 
 /// A wall as the sensor sees it during a span.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Wall {
+pub(super) struct SpanWall {
     /// Corners, counter-clockwise about the solid, relative to the sensor.
-    pub(super) p: [Line; 2],
-    pub(super) q: [Line; 2],
+    pub(super) p: [LinearValue; 2],
+    pub(super) q: [LinearValue; 2],
     /// Outwards.
-    pub(super) normal: [Line; 2],
-    /// `normal · p`: negative if the sensor is before it.
-    pub(super) offset: Line,
+    pub(super) normal: [LinearValue; 2],
+    /// `normal · p`: negative if the sensor is in front of the wall.
+    pub(super) offset: LinearValue,
 }
 
-/// What a surface belongs to, and bounds of it.
+/// The object that a surface belongs to, and bounds of the surface.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Body {
+pub(super) struct SurfaceBody {
     pub(super) object: u32,
     pub(super) word: u32,
     /// Lowest and highest point relative to the sensor.
-    pub(super) z: [Line; 2],
+    pub(super) z: [LinearValue; 2],
     /// No part is nearer horizontally.
     pub(super) near: f32,
     /// First and last chunk of the span that may see it.
@@ -78,21 +78,21 @@ struct Columns {
 
 /// Results of a span, and its columns.
 #[derive(Debug, Default)]
-pub(super) struct Canvas {
+pub(super) struct ScanCanvas {
     /// Groups in a column.
     pub(super) groups: usize,
     /// Columns.
     pub(super) count: usize,
-    pub(super) columns: [Chunk; CHUNKS],
+    pub(super) columns: [ColumnChunk; CHUNKS],
     /// By column, then group: horizontal distance or range, cosine of incidence (in the upright way over the cosine of the
     /// elevation), object and word.
     pub(super) t: Vec<Floats>,
     pub(super) incidence: Vec<Floats>,
     pub(super) object: Vec<Words>,
     pub(super) word: Vec<Words>,
-    /// Directions in the world's axes, of sensors that need one for each ray.
+    /// Directions in world axes, for sensors that need one for each ray.
     pub(super) direction: [Vec<Floats>; 3],
-    /// Tangents and cotangents of the elevations, by group, of those that do not.
+    /// Tangents and cotangents of the elevations, by group, for the other sensors.
     pub(super) tan: Vec<Floats>,
     pub(super) cot: Vec<Floats>,
     crossings: Vec<(Floats, u32)>,
@@ -103,7 +103,7 @@ pub(super) struct Canvas {
 
 /// Sixteen columns.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Chunk {
+pub(super) struct ColumnChunk {
     /// Share of the span's time.
     pub(super) share: Floats,
     /// Horizontal directions: of the column, and such that all its rays lie between the rightmost and the leftmost.
@@ -120,7 +120,7 @@ pub(super) struct Chunk {
     pub(super) axes: [[Floats; 3]; 3],
 }
 
-impl Default for Chunk {
+impl Default for ColumnChunk {
     fn default() -> Self {
         let none = [Floats::ZERO; 2];
         Self {
@@ -168,14 +168,14 @@ fn stored2<S: Simd>(value: [S::F; 2]) -> [Floats; 2] {
 #[inline(always)]
 fn set(mut bits: u32) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
-        let lane = bits.trailing_zeros() as usize;
+        let element = bits.trailing_zeros() as usize;
         let is_any = bits != 0;
         bits &= bits.wrapping_sub(1);
-        is_any.then_some(lane)
+        is_any.then_some(element)
     })
 }
 
-impl Canvas {
+impl ScanCanvas {
     /// Room for the groups of `columns` columns.
     pub(super) fn make_room(&mut self, groups: usize) {
         let places = super::firing::SPAN * groups;
@@ -203,12 +203,12 @@ impl Canvas {
     /// Columns of a chunk that exist.
     #[inline(always)]
     fn live(&self, chunk: usize) -> u32 {
-        let count = self.count.saturating_sub(chunk * LANES).min(LANES);
+        let count = self.count.saturating_sub(chunk * WIDTH).min(WIDTH);
         ((1_u64 << count) - 1) as u32
     }
 
-    /// Lanes of `mask` in a place, where rays have come `best` far, now show `body`; how far they come. The distance is stored whole:
-    /// the next surface loads it, and a processor does not hand a masked store on to a load.
+    /// Sets the rays of `mask` in a place, which reached `best` so far, to a hit on `body`, and returns how far they reach. The distance
+    /// is stored without a mask: the next surface loads it, and a processor does not forward a masked store to a load.
     #[inline(always)]
     fn put<S: Simd>(
         &mut self,
@@ -216,7 +216,7 @@ impl Canvas {
         mask: S::M,
         (t, best): (S::F, S::F),
         incidence: S::F,
-        body: &Body,
+        body: &SurfaceBody,
     ) -> S::F {
         let now = S::select(mask, t, best);
         S::store(now, &mut self.t[place]);
@@ -226,15 +226,15 @@ impl Canvas {
         now
     }
 
-    /// The rays of a column come as far as this.
+    /// Sets how far the rays of a column reach.
     #[inline(always)]
     fn limit<S: Simd>(&mut self, column: usize, far: S::F) {
-        self.columns[column / LANES].far.0[column % LANES] = S::largest(far);
+        self.columns[column / WIDTH].far.0[column % WIDTH] = S::largest(far);
     }
 
-    /// One wall.
+    /// Draws a wall.
     #[inline(always)]
-    pub(super) fn wall<S: Simd, const UPRIGHT: bool>(&mut self, wall: &Wall, body: &Body) {
+    pub(super) fn wall<S: Simd, const UPRIGHT: bool>(&mut self, wall: &SpanWall, body: &SurfaceBody) {
         for chunk in body.chunks[0]..=body.chunks[1] {
             let columns = &self.columns[chunk];
             let share = S::load(&columns.share);
@@ -267,9 +267,9 @@ impl Canvas {
                 seen = S::both(seen, S::lt(t, far));
                 let (t, incidence) = (stored::<S>(t), stored::<S>(facing));
                 let z = [stored::<S>(z[0]), stored::<S>(z[1])];
-                for lane in set(S::bits(seen) & live) {
-                    let z = [z[0].0[lane], z[1].0[lane]];
-                    self.wall_upright::<S>(chunk * LANES + lane, t.0[lane], incidence.0[lane], z, body);
+                for element in set(S::bits(seen) & live) {
+                    let z = [z[0].0[element], z[1].0[element]];
+                    self.wall_upright::<S>(chunk * WIDTH + element, t.0[element], incidence.0[element], z, body);
                 }
             } else {
                 let columns = Columns {
@@ -279,15 +279,15 @@ impl Canvas {
                     offset: stored::<S>(offset),
                     z: stored2::<S>(z),
                 };
-                for lane in set(S::bits(seen) & live) {
-                    self.wall_tilted::<S>(chunk * LANES + lane, lane, &columns, body);
+                for element in set(S::bits(seen) & live) {
+                    self.wall_tilted::<S>(chunk * WIDTH + element, element, &columns, body);
                 }
             }
         }
     }
 
     #[inline(always)]
-    fn wall_upright<S: Simd>(&mut self, column: usize, t: f32, incidence: f32, z: [f32; 2], body: &Body) {
+    fn wall_upright<S: Simd>(&mut self, column: usize, t: f32, incidence: f32, z: [f32; 2], body: &SurfaceBody) {
         let t = S::splat(t);
         let [low, high] = splat2::<S>(z);
         let mut far = S::splat(0.0);
@@ -303,11 +303,11 @@ impl Canvas {
     }
 
     #[inline(always)]
-    fn wall_tilted<S: Simd>(&mut self, column: usize, lane: usize, at: &Columns, body: &Body) {
-        let splat2 = |of: &[Floats; 2]| [S::splat(of[0].0[lane]), S::splat(of[1].0[lane])];
+    fn wall_tilted<S: Simd>(&mut self, column: usize, element: usize, at: &Columns, body: &SurfaceBody) {
+        let splat2 = |of: &[Floats; 2]| [S::splat(of[0].0[element]), S::splat(of[1].0[element])];
         let (p, q, normal) = (splat2(&at.p), splat2(&at.q), splat2(&at.normal));
         let [low, high] = splat2(&at.z);
-        let offset = S::splat(at.offset.0[lane]);
+        let offset = S::splat(at.offset.0[element]);
         let zero = S::splat(0.0);
         let mut far = S::splat(0.0);
         for group in 0..self.groups {
@@ -326,10 +326,10 @@ impl Canvas {
         self.limit::<S>(column, far);
     }
 
-    /// A roof or an underside at height `z`, over the outline that `walls` make: a point is inside if the ray's line has crossed an odd
+    /// Draws a roof or an underside at height `z`, over the outline of `walls`: a point is inside if the ray's line has crossed an odd
     /// number of walls before it.
     #[inline(always)]
-    pub(super) fn cap<S: Simd, const UPRIGHT: bool>(&mut self, walls: &[Wall], z: Line, body: &Body) {
+    pub(super) fn cap<S: Simd, const UPRIGHT: bool>(&mut self, walls: &[SpanWall], z: LinearValue, body: &SurfaceBody) {
         for chunk in body.chunks[0]..=body.chunks[1] {
             let columns = self.columns[chunk];
             let near = S::bits(S::lt(S::splat(body.near), S::load(&columns.far))) & self.live(chunk);
@@ -339,21 +339,21 @@ impl Canvas {
             let heights = stored::<S>(z.at::<S>(S::load(&columns.share)));
             if UPRIGHT {
                 let crossed = self.cross::<S>(walls, &columns);
-                for lane in set(near & crossed) {
-                    self.cap_upright::<S>(chunk * LANES + lane, lane, heights.0[lane], body);
+                for element in set(near & crossed) {
+                    self.cap_upright::<S>(chunk * WIDTH + element, element, heights.0[element], body);
                 }
             } else {
-                for lane in set(near) {
-                    let share = columns.share.0[lane];
-                    self.cap_tilted::<S>(chunk * LANES + lane, share, heights.0[lane], walls, body);
+                for element in set(near) {
+                    let share = columns.share.0[element];
+                    self.cap_tilted::<S>(chunk * WIDTH + element, share, heights.0[element], walls, body);
                 }
             }
         }
     }
 
-    /// Where the columns of a chunk cross each wall; columns that cross any.
+    /// Computes where the columns of a chunk cross each wall, and returns the columns that cross any.
     #[inline(always)]
-    fn cross<S: Simd>(&mut self, walls: &[Wall], columns: &Chunk) -> u32 {
+    fn cross<S: Simd>(&mut self, walls: &[SpanWall], columns: &ColumnChunk) -> u32 {
         let (share, ahead, zero) = (S::load(&columns.share), load2::<S>(&columns.ahead), S::splat(0.0));
         self.crossings.clear();
         let mut any = 0;
@@ -369,7 +369,7 @@ impl Canvas {
     }
 
     #[inline(always)]
-    fn cap_upright<S: Simd>(&mut self, column: usize, lane: usize, height: f32, body: &Body) {
+    fn cap_upright<S: Simd>(&mut self, column: usize, element: usize, height: f32, body: &SurfaceBody) {
         let (height, zero) = (S::splat(height), S::splat(0.0));
         let mut far = S::splat(0.0);
         for group in 0..self.groups {
@@ -379,8 +379,8 @@ impl Canvas {
             let nearer = S::both(S::lt(zero, t), S::lt(t, best));
             let mut inside = S::mask(0);
             for (crossing, crossed) in &self.crossings {
-                if crossed >> lane & 1 == 1 {
-                    inside = S::differ(inside, S::lt(S::splat(crossing.0[lane]), t));
+                if crossed >> element & 1 == 1 {
+                    inside = S::differ(inside, S::lt(S::splat(crossing.0[element]), t));
                 }
             }
             let mask = S::both(nearer, inside);
@@ -391,7 +391,7 @@ impl Canvas {
     }
 
     #[inline(always)]
-    fn cap_tilted<S: Simd>(&mut self, column: usize, share: f32, height: f32, walls: &[Wall], body: &Body) {
+    fn cap_tilted<S: Simd>(&mut self, column: usize, share: f32, height: f32, walls: &[SpanWall], body: &SurfaceBody) {
         let (height, zero, share) = (S::splat(height), S::splat(0.0), S::splat(share));
         let mut far = S::splat(0.0);
         for group in 0..self.groups {
@@ -420,9 +420,14 @@ impl Canvas {
         self.limit::<S>(column, far);
     }
 
-    /// An upright cylinder: mantle and top.
+    /// Draws an upright cylinder: mantle and top.
     #[inline(always)]
-    pub(super) fn cylinder<S: Simd, const UPRIGHT: bool>(&mut self, centre: [Line; 2], radius: f32, body: &Body) {
+    pub(super) fn cylinder<S: Simd, const UPRIGHT: bool>(
+        &mut self,
+        centre: [LinearValue; 2],
+        radius: f32,
+        body: &SurfaceBody,
+    ) {
         for chunk in body.chunks[0]..=body.chunks[1] {
             let columns = self.columns[chunk];
             let share = S::load(&columns.share);
@@ -431,7 +436,7 @@ impl Canvas {
                 continue;
             }
             let at = at2::<S>(&centre, share);
-            // Within a radius of the wedge.
+            // The centre is within a radius of the columns' wedge.
             let reach = S::splat(-1.001 * radius);
             let left = S::le(reach, cross::<S>(load2::<S>(&columns.right), at));
             let right = S::le(reach, cross::<S>(at, load2::<S>(&columns.left)));
@@ -441,11 +446,11 @@ impl Canvas {
                 stored::<S>(body.z[0].at::<S>(share)),
                 stored::<S>(body.z[1].at::<S>(share)),
             ];
-            for lane in set(seen) {
-                let centre = [at[0].0[lane], at[1].0[lane]];
-                let ahead = [columns.ahead[0].0[lane], columns.ahead[1].0[lane]];
-                let z = [z[0].0[lane], z[1].0[lane]];
-                self.cylinder_column::<S, UPRIGHT>(chunk * LANES + lane, centre, radius, ahead, z, body);
+            for element in set(seen) {
+                let centre = [at[0].0[element], at[1].0[element]];
+                let ahead = [columns.ahead[0].0[element], columns.ahead[1].0[element]];
+                let z = [z[0].0[element], z[1].0[element]];
+                self.cylinder_column::<S, UPRIGHT>(chunk * WIDTH + element, centre, radius, ahead, z, body);
             }
         }
     }
@@ -458,7 +463,7 @@ impl Canvas {
         radius: f32,
         ahead: [f32; 2],
         z: [f32; 2],
-        body: &Body,
+        body: &SurfaceBody,
     ) {
         let (at, radius, zero) = (splat2::<S>(centre), S::splat(radius), S::splat(0.0));
         let [low, high] = splat2::<S>(z);
@@ -483,7 +488,7 @@ impl Canvas {
             let inside = S::both(S::le(low, height), S::le(height, high));
             let mantle = S::both(S::both(meets, inside), S::both(S::lt(zero, t), S::lt(t, best)));
             let best = self.put::<S>(place, mantle, (t, best), root / radius, body);
-            // The top, of a sensor that looks down on it.
+            // The top, for a sensor above it.
             let t = high / up;
             let within = S::both(S::lt(along - root, t * square), S::lt(t * square, along + root));
             let below = S::both(S::lt(high, zero), S::lt(zero, t));

@@ -1,4 +1,4 @@
-//! From what a ray has met to a return: range error, intensity, loss, and the point itself.
+//! Turns the hit of a ray into a return: range error, intensity, loss, and the point.
 
 use ipc_schema::{
     config::{Config, LidarAxes, LidarMode},
@@ -6,34 +6,34 @@ use ipc_schema::{
 };
 
 use super::{
-    pattern::Group,
-    random::{Key, exp_minus, fill},
-    raster::Canvas,
-    simd::{LANES, Simd},
+    pattern::RayGroup,
+    random::{ScanKey, exp_minus, fill},
+    raster::ScanCanvas,
+    simd::{Simd, WIDTH},
     solids::{INTEREST, NOTHING},
-    weather::Air,
+    weather::WeatherEffects,
 };
 
-/// What happens to returns.
+/// Errors and losses of returns.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Receiver {
+pub(super) struct ReturnModel {
     min_range_m: f32,
     range_m: f32,
     noise_std_m: f32,
     attenuation_per_m: f32,
     dropoff: f32,
-    /// 1 / `lidar.dropoff_intensity`; 0 = none is lost for being weak.
+    /// 1 / `lidar.dropoff_intensity`; 0 = no return is lost because it is weak.
     inv_weak: f32,
     dropoff_zero: f32,
     is_random: bool,
     /// Bit that a word must have.
     wanted: u32,
     is_paper: bool,
-    pub(super) air: Air,
+    pub(super) air: WeatherEffects,
     is_clear: bool,
 }
 
-/// What the rays of a column share.
+/// Values that the rays of a column share.
 struct Shot {
     /// Sine and cosine of the azimuth in the sensor's frame.
     azimuth: [f32; 2],
@@ -41,11 +41,11 @@ struct Shot {
     sun: [f32; 3],
 }
 
-impl Receiver {
+impl ReturnModel {
     pub(super) fn new(config: &Config) -> Self {
         let lidar = &config.lidar;
-        let air = Air::new(&config.weather);
-        // Of a return from the end of the range: no other is weaker.
+        let air = WeatherEffects::new(&config.weather);
+        // Intensity of a return from the end of the range: no other is weaker.
         let weakest = libm::exp(-(lidar.attenuation_per_m + 2.0 * air.extinction_per_m) * lidar.range_m);
         let weak = lidar.dropoff_zero_intensity > 0.0 && weakest < lidar.dropoff_intensity;
         let noisy = lidar.range_noise_std_m > 0.0 || air.range_share > 0.0 || air.sun_std_m > 0.0;
@@ -69,15 +69,15 @@ impl Receiver {
         }
     }
 
-    /// Writes the returns of a span from `cursor` on; the new cursor. `groups(column)` are the rays of a column, `sun` is the
-    /// direction to the sun in the sensor's frame.
+    /// Writes the returns of a span from `cursor` on and returns the new cursor. `groups(column)` are the rays of a column, `sun` is
+    /// the direction to the sun in the sensor's frame.
     #[inline(always)]
     pub(super) fn write<'a, S: Simd, const UPRIGHT: bool>(
         &self,
-        canvas: &mut Canvas,
-        groups: impl Fn(usize) -> &'a [Group],
+        canvas: &mut ScanCanvas,
+        groups: impl Fn(usize) -> &'a [RayGroup],
         sun: [f32; 3],
-        (key, first): (&Key, u32),
+        (key, first): (&ScanKey, u32),
         points: &mut [LidarPoint],
         mut cursor: usize,
     ) -> usize {
@@ -86,10 +86,10 @@ impl Receiver {
             fill::<S>(key, first, count, &mut canvas.normal, &mut canvas.uniform);
         }
         for column in 0..canvas.count {
-            let (chunk, lane) = (&canvas.columns[column / LANES], column % LANES);
+            let (chunk, element) = (&canvas.columns[column / WIDTH], column % WIDTH);
             let shot = Shot {
-                azimuth: [chunk.azimuth[0].0[lane], chunk.azimuth[1].0[lane]],
-                age_us: chunk.age_us.0[lane],
+                azimuth: [chunk.azimuth[0].0[element], chunk.azimuth[1].0[element]],
+                age_us: chunk.age_us.0[element],
                 sun,
             };
             for (group, rays) in groups(column).iter().enumerate() {
@@ -102,7 +102,7 @@ impl Receiver {
 
     /// Points at `range` along the rays, in the sensor's axes.
     #[inline(always)]
-    fn position<S: Simd, const UPRIGHT: bool>(&self, range: S::F, rays: &Group, shot: &Shot) -> [S::F; 3] {
+    fn position<S: Simd, const UPRIGHT: bool>(&self, range: S::F, rays: &RayGroup, shot: &Shot) -> [S::F; 3] {
         let (sine, cosine) = (S::splat(shot.azimuth[0]), S::splat(shot.azimuth[1]));
         let (ahead, up) = (range * S::load(&rays.alpha), range * S::load(&rays.gamma));
         let (x, y) = if UPRIGHT {
@@ -122,9 +122,9 @@ impl Receiver {
     #[inline(always)]
     fn group<S: Simd, const UPRIGHT: bool>(
         &self,
-        canvas: &Canvas,
+        canvas: &ScanCanvas,
         place: usize,
-        rays: &Group,
+        rays: &RayGroup,
         shot: &Shot,
         points: &mut [LidarPoint],
         cursor: usize,
@@ -176,9 +176,9 @@ impl Receiver {
         S::compact(words, keep, points, cursor)
     }
 
-    /// Which returns come through, and the standard deviation of the range.
+    /// Bits of the returns that the weather lets through, and the standard deviation of the range.
     #[inline(always)]
-    fn weather<S: Simd>(&self, range: S::F, rays: &Group, shot: &Shot) -> (u32, S::F) {
+    fn weather<S: Simd>(&self, range: S::F, rays: &RayGroup, shot: &Shot) -> (u32, S::F) {
         let air = &self.air;
         let (one, zero) = (S::splat(1.0), S::splat(0.0));
         let loss = exp_minus::<S>(range * S::splat((2.0 * air.extinction_per_m) as f32));

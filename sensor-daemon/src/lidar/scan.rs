@@ -1,52 +1,52 @@
-//! One scan: spans, candidates, surfaces, returns.
+//! One scan: splits the tick into spans, gathers candidates, draws surfaces and writes returns.
 
 use ipc_schema::pointcloud::{LidarPoint, Scan};
 
 use super::{
-    Lidar, Targets,
-    candidates::{Candidates, Entry, Kind, Watch},
-    firing::{SPAN, Span},
-    mesh::Meshes,
-    pattern::Group,
-    random::Key,
-    raster::{Body, Canvas, Line, Wall},
-    sensor::Sensor,
-    simd::{LANES, Simd},
+    LidarModel, Targets,
+    candidates::{CandidateKind, Candidates, SensorSweep, SpanCandidate},
+    firing::{ColumnSpan, SPAN},
+    mesh::SceneMeshes,
+    pattern::RayGroup,
+    random::ScanKey,
+    raster::{LinearValue, ScanCanvas, SpanWall, SurfaceBody},
+    sensor::SensorPose,
+    simd::{Simd, WIDTH},
 };
 
 /// Working memory of one thread: empty at first, then kept.
 #[derive(Debug, Default)]
-pub struct Scratch {
-    canvas: Canvas,
+pub struct ScanScratch {
+    canvas: ScanCanvas,
     candidates: Candidates,
-    spans: Vec<Span>,
-    sensors: Vec<[Sensor; 2]>,
-    walls: Vec<Wall>,
+    spans: Vec<ColumnSpan>,
+    sensors: Vec<[SensorPose; 2]>,
+    walls: Vec<SpanWall>,
 }
 
-/// What a scan is of.
+/// Input of a scan.
 #[derive(Clone, Copy)]
-pub(super) struct Order<'a> {
-    pub(super) lidar: &'a Lidar,
+pub(super) struct ScanOrder<'a> {
+    pub(super) lidar: &'a LidarModel,
     pub(super) targets: &'a Targets,
     pub(super) row: usize,
     pub(super) tick: u64,
     pub(super) episode_seed: u64,
 }
 
-/// A span being worked on.
-pub(super) struct Work<'a> {
-    pub(super) order: &'a Order<'a>,
-    pub(super) span: Span,
-    pub(super) sensors: [Sensor; 2],
-    /// First column of the tick in the cycle.
+/// The scan of one span.
+pub(super) struct SpanScan<'a> {
+    pub(super) order: &'a ScanOrder<'a>,
+    pub(super) span: ColumnSpan,
+    pub(super) sensors: [SensorPose; 2],
+    /// First column of the tick within the cycle.
     begin: usize,
     /// Length of a sub-step, seconds.
     dt_s: f64,
 }
 
-impl Order<'_> {
-    /// Sub-steps that count: none if everything is seen as it is at the end of the tick.
+impl ScanOrder<'_> {
+    /// Sub-steps of the scan: 0 if all objects are seen in their pose at the end of the tick.
     fn sub_steps(&self) -> usize {
         if self.lidar.is_rolling {
             self.targets.sub_steps
@@ -59,7 +59,7 @@ impl Order<'_> {
         self.lidar.tick_s / self.targets.sub_steps.max(1) as f64
     }
 
-    fn sensor(&self, span: &Span, end: usize) -> Sensor {
+    fn sensor(&self, span: &ColumnSpan, end: usize) -> SensorPose {
         let pose = match self.sub_steps() {
             0 => self.targets.movers[self.row].end,
             count => {
@@ -70,9 +70,9 @@ impl Order<'_> {
         self.lidar.mount.sensor(&pose)
     }
 
-    /// The whole scan; points written.
+    /// Runs the whole scan and returns the number of points written.
     #[inline(always)]
-    pub(super) fn run<S: Simd>(&self, scratch: &mut Scratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
+    pub(super) fn run<S: Simd>(&self, scratch: &mut ScanScratch, scan: &mut Scan, points: &mut [LidarPoint]) -> usize {
         let lidar = self.lidar;
         let (begin, count) = lidar.firing.tick(self.tick);
         lidar.firing.spans(self.tick, self.sub_steps(), &mut scratch.spans);
@@ -86,7 +86,7 @@ impl Order<'_> {
             scratch.sensors.push(both);
         }
         *scan = self.header(begin, &scratch.spans);
-        let Some(watch) = Watch::new(&scratch.sensors, lidar.steepest) else {
+        let Some(watch) = SensorSweep::new(&scratch.sensors, lidar.steepest) else {
             return 0;
         };
         scratch.candidates.gather(lidar, self.targets, self.row, &watch);
@@ -102,7 +102,7 @@ impl Order<'_> {
         }
     }
 
-    fn header(&self, begin: usize, spans: &[Span]) -> Scan {
+    fn header(&self, begin: usize, spans: &[ColumnSpan]) -> Scan {
         let lidar = self.lidar;
         let mover = &self.targets.movers[self.row];
         let sensor = lidar.mount.sensor(&mover.end);
@@ -142,13 +142,13 @@ impl Order<'_> {
     fn spans<S: Simd, const UPRIGHT: bool>(
         &self,
         begin: usize,
-        scratch: &mut Scratch,
+        scratch: &mut ScanScratch,
         points: &mut [LidarPoint],
     ) -> usize {
         let lidar = self.lidar;
         let mover = &self.targets.movers[self.row];
-        let key = Key::new(self.episode_seed, mover.id_hash, self.tick);
-        let Scratch {
+        let key = ScanKey::new(self.episode_seed, mover.id_hash, self.tick);
+        let ScanScratch {
             canvas,
             candidates,
             spans,
@@ -164,7 +164,7 @@ impl Order<'_> {
         }
         let mut cursor = 0;
         for (number, span) in spans.iter().enumerate() {
-            let work = Work {
+            let work = SpanScan {
                 order: self,
                 span: *span,
                 sensors: sensors[number],
@@ -186,7 +186,7 @@ impl Order<'_> {
     }
 }
 
-impl<'a> Work<'a> {
+impl<'a> SpanScan<'a> {
     /// A column of the span in the rotation.
     #[inline(always)]
     pub(super) fn column(&self, column: usize) -> usize {
@@ -194,7 +194,7 @@ impl<'a> Work<'a> {
     }
 
     #[inline(always)]
-    pub(super) fn groups(&self, column: usize) -> &'a [Group] {
+    pub(super) fn groups(&self, column: usize) -> &'a [RayGroup] {
         let pattern = &self.order.lidar.pattern;
         if pattern.is_table {
             pattern.column(self.column(column))
@@ -206,10 +206,10 @@ impl<'a> Work<'a> {
     #[inline(always)]
     fn surfaces<S: Simd, const UPRIGHT: bool>(
         &self,
-        canvas: &mut Canvas,
+        canvas: &mut ScanCanvas,
         candidates: &Candidates,
-        entries: &[Entry],
-        walls: &mut Vec<Wall>,
+        entries: &[SpanCandidate],
+        walls: &mut Vec<SpanWall>,
     ) {
         let solids = &self.order.lidar.solids;
         for entry in entries {
@@ -217,7 +217,7 @@ impl<'a> Work<'a> {
             if candidate.near_m >= farthest::<S>(canvas) {
                 break;
             }
-            let body = |object: u32, word: u32, z: [Line; 2]| Body {
+            let body = |object: u32, word: u32, z: [LinearValue; 2]| SurfaceBody {
                 object,
                 word,
                 z,
@@ -225,32 +225,32 @@ impl<'a> Work<'a> {
                 chunks: entry.chunks.map(usize::from),
             };
             match candidate.kind {
-                Kind::Wall(index, number) => {
+                CandidateKind::Wall(index, number) => {
                     let still = &solids.stills[number as usize];
                     let body = body(still.object, still.word, self.heights(still.z_m, still.z_m));
                     canvas.wall::<S, UPRIGHT>(&self.still_wall(index), &body);
                 }
-                Kind::Cap(number) => {
+                CandidateKind::Cap(number) => {
                     let still = &solids.stills[number as usize];
                     walls.clear();
                     walls.extend(still.walls.clone().map(|index| self.still_wall(index)));
                     let body = body(still.object, still.word, self.heights(still.z_m, still.z_m));
                     self.caps::<S, UPRIGHT>(canvas, walls, &body);
                 }
-                Kind::Mover(row) => self.mover::<S, UPRIGHT>(canvas, row as usize, &body, walls),
+                CandidateKind::RoadUser(row) => self.mover::<S, UPRIGHT>(canvas, row as usize, &body, walls),
             }
         }
     }
 
     #[inline(always)]
-    fn heights(&self, first: [f64; 2], last: [f64; 2]) -> [Line; 2] {
+    fn heights(&self, first: [f64; 2], last: [f64; 2]) -> [LinearValue; 2] {
         let [z0, z1] = self.sensors.map(|sensor| sensor.position_m[2]);
-        [0, 1].map(|i: usize| Line::between(first[i] - z0, last[i] - z1))
+        [0, 1].map(|i: usize| LinearValue::between(first[i] - z0, last[i] - z1))
     }
 
     /// Corners at both ends of the span, relative to the sensor.
     #[inline(always)]
-    fn seen(&self, first: [f64; 2], last: [f64; 2]) -> ([[f64; 2]; 2], [Line; 2]) {
+    fn seen(&self, first: [f64; 2], last: [f64; 2]) -> ([[f64; 2]; 2], [LinearValue; 2]) {
         let [from, to] = self.sensors.map(|sensor| sensor.position_m);
         let ends = [
             [first[0] - from[0], first[1] - from[1]],
@@ -258,26 +258,26 @@ impl<'a> Work<'a> {
         ];
         (
             ends,
-            [0, 1].map(|axis: usize| Line::between(ends[0][axis], ends[1][axis])),
+            [0, 1].map(|axis: usize| LinearValue::between(ends[0][axis], ends[1][axis])),
         )
     }
 
     #[inline(always)]
-    fn still_wall(&self, index: u32) -> Wall {
+    fn still_wall(&self, index: u32) -> SpanWall {
         let wall = &self.order.lidar.solids.walls[index as usize];
         let (ends, p) = self.seen(wall.p_m, wall.p_m);
         let (_, q) = self.seen(wall.q_m, wall.q_m);
         let offset = ends.map(|end| wall.normal[0] * end[0] + wall.normal[1] * end[1]);
-        Wall {
+        SpanWall {
             p,
             q,
-            normal: wall.normal.map(|part| Line(part as f32, 0.0)),
-            offset: Line::between(offset[0], offset[1]),
+            normal: wall.normal.map(|part| LinearValue(part as f32, 0.0)),
+            offset: LinearValue::between(offset[0], offset[1]),
         }
     }
 
     #[inline(always)]
-    fn caps<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut Canvas, walls: &[Wall], body: &Body) {
+    fn caps<S: Simd, const UPRIGHT: bool>(&self, canvas: &mut ScanCanvas, walls: &[SpanWall], body: &SurfaceBody) {
         let [low, high] = body.z;
         if high.0 < 0.0 || high.0 + high.1 < 0.0 {
             canvas.cap::<S, UPRIGHT>(walls, high, body);
@@ -290,10 +290,10 @@ impl<'a> Work<'a> {
     #[inline(always)]
     fn mover<S: Simd, const UPRIGHT: bool>(
         &self,
-        canvas: &mut Canvas,
+        canvas: &mut ScanCanvas,
         row: usize,
-        body: &impl Fn(u32, u32, [Line; 2]) -> Body,
-        walls: &mut Vec<Wall>,
+        body: &impl Fn(u32, u32, [LinearValue; 2]) -> SurfaceBody,
+        walls: &mut Vec<SpanWall>,
     ) {
         let (targets, span) = (self.order.targets, &self.span);
         let mover = &targets.movers[row];
@@ -322,11 +322,11 @@ impl<'a> Work<'a> {
             let normals = turns.map(|(sin, cos)| [[-sin, cos], [-cos, -sin], [sin, -cos], [cos, sin]][side]);
             let ((ends, p), (_, q)) = (seen[side], seen[(side + 1) % 4]);
             let offset = [0, 1].map(|end: usize| normals[end][0] * ends[end][0] + normals[end][1] * ends[end][1]);
-            let wall = Wall {
+            let wall = SpanWall {
                 p,
                 q,
-                normal: [0, 1].map(|axis: usize| Line::between(normals[0][axis], normals[1][axis])),
-                offset: Line::between(offset[0], offset[1]),
+                normal: [0, 1].map(|axis: usize| LinearValue::between(normals[0][axis], normals[1][axis])),
+                offset: LinearValue::between(offset[0], offset[1]),
             };
             if offset[0] < 0.0 || offset[1] < 0.0 {
                 canvas.wall::<S, UPRIGHT>(&wall, &body);
@@ -338,7 +338,7 @@ impl<'a> Work<'a> {
 
     /// Rays one by one against meshes.
     #[inline(never)]
-    fn meshes(&self, canvas: &mut Canvas) {
+    fn meshes(&self, canvas: &mut ScanCanvas) {
         let lidar = self.order.lidar;
         let [from, to] = self.sensors.map(|sensor| sensor.position_m);
         for column in 0..canvas.count {
@@ -346,14 +346,14 @@ impl<'a> Work<'a> {
             let origin_m = std::array::from_fn(|axis| from[axis] + share * (to[axis] - from[axis]));
             for group in 0..canvas.groups {
                 let (place, live) = (column * canvas.groups + group, self.groups(column)[group].live);
-                for lane in (0..LANES).filter(|lane| live >> lane & 1 == 1) {
-                    let direction = [0, 1, 2].map(|axis: usize| f64::from(canvas.direction[axis][place].0[lane]));
-                    let range_m = f64::from(canvas.t[place].0[lane]);
+                for element in (0..WIDTH).filter(|element| live >> element & 1 == 1) {
+                    let direction = [0, 1, 2].map(|axis: usize| f64::from(canvas.direction[axis][place].0[element]));
+                    let range_m = f64::from(canvas.t[place].0[element]);
                     if let Some(hit) = lidar.meshes.cast(origin_m, direction, range_m) {
-                        canvas.t[place].0[lane] = hit.range_m as f32;
-                        canvas.incidence[place].0[lane] = hit.incidence_cos as f32;
-                        canvas.object[place].0[lane] = hit.object;
-                        canvas.word[place].0[lane] = Meshes::WORD;
+                        canvas.t[place].0[element] = hit.range_m as f32;
+                        canvas.incidence[place].0[element] = hit.incidence_cos as f32;
+                        canvas.object[place].0[element] = hit.object;
+                        canvas.word[place].0[element] = SceneMeshes::WORD;
                     }
                 }
             }
@@ -361,14 +361,14 @@ impl<'a> Work<'a> {
     }
 }
 
-/// Farthest of what any ray of the span has met so far.
+/// Largest distance that any ray of the span still reaches.
 #[inline(always)]
-fn farthest<S: Simd>(canvas: &Canvas) -> f32 {
-    let chunks = canvas.count.div_ceil(LANES);
+fn farthest<S: Simd>(canvas: &ScanCanvas) -> f32 {
+    let chunks = canvas.count.div_ceil(WIDTH);
     let far = canvas.columns[..chunks]
         .iter()
         .fold(S::splat(0.0), |far, chunk| S::max(far, S::load(&chunk.far)));
     S::largest(far)
 }
 
-const _: () = assert!(SPAN.is_multiple_of(LANES));
+const _: () = assert!(SPAN.is_multiple_of(WIDTH));

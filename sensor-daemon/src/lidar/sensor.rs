@@ -1,4 +1,4 @@
-//! Where the sensor is: the carrier's pose and the mounting.
+//! The pose of the sensor from the carrier's pose and the mounting.
 
 use super::targets::Pose;
 
@@ -7,14 +7,14 @@ pub(super) type Rotation = [[f64; 3]; 3];
 
 /// Sensor at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Sensor {
+pub(super) struct SensorPose {
     pub(super) position_m: [f64; 3],
     pub(super) world_from_sensor: Rotation,
 }
 
-/// How it is mounted.
+/// Mounting of a sensor on its carrier.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Mount {
+pub(super) struct SensorMount {
     position_m: [f64; 3],
     body_from_sensor: Rotation,
     pub(super) is_upright: bool,
@@ -45,7 +45,7 @@ pub(super) fn turned(rotation: &Rotation, vector: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|row| (0..3).map(|i| rotation[row][i] * vector[i]).sum())
 }
 
-impl Mount {
+impl SensorMount {
     pub(super) fn new([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Self {
         Self {
             position_m: [x, y, z],
@@ -56,10 +56,10 @@ impl Mount {
 
     /// The sensor on a carrier in this pose.
     #[inline(always)]
-    pub(super) fn sensor(&self, carrier: &Pose) -> Sensor {
+    pub(super) fn sensor(&self, carrier: &Pose) -> SensorPose {
         let world_from_body = rotation(carrier.attitude_rad);
         let arm = turned(&world_from_body, self.position_m);
-        Sensor {
+        SensorPose {
             position_m: std::array::from_fn(|axis| carrier.position_m[axis] + arm[axis]),
             world_from_sensor: product(&world_from_body, &self.body_from_sensor),
         }
@@ -72,7 +72,7 @@ impl Mount {
     }
 }
 
-impl Sensor {
+impl SensorPose {
     /// Roll, pitch and heading.
     pub(super) fn attitude_rad(&self) -> [f64; 3] {
         let r = &self.world_from_sensor;

@@ -1,4 +1,4 @@
-//! What stands still: buildings and props as prisms, by cell of a grid.
+//! Static solids: buildings and props as prisms, indexed by the cells of a grid.
 
 use std::ops::Range;
 
@@ -18,18 +18,18 @@ use super::error::LidarError;
 const CELL_M: f64 = 64.0;
 /// Most cells in a row or column.
 const MOST_CELLS: f64 = 2048.0;
-/// Set in the word of what an interested LIDAR keeps.
+/// Bit in the word of an object that a LIDAR in interest mode keeps.
 pub(super) const INTEREST: u32 = 1 << 15;
-/// Word of a ray that has met nothing.
+/// Word of a ray without a hit.
 pub(super) const NOTHING: u32 = 0xFFFF;
 /// Shorter walls are left out, metres.
 const SHORTEST_M: f64 = 1e-6;
 
 /// A prism: walls over an outline, a roof, an underside.
 #[derive(Debug, Clone)]
-pub(super) struct Still {
+pub(super) struct StillSolid {
     pub(super) object: u32,
-    /// Tag, with [`INTEREST`] where it is of interest.
+    /// Tag, with [`INTEREST`] if the object is of interest.
     pub(super) word: u32,
     /// Lowest and highest point, metres.
     pub(super) z_m: [f64; 2],
@@ -41,18 +41,18 @@ pub(super) struct Still {
 
 /// A wall, from corner to corner counter-clockwise about its prism.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct StillWall {
+pub(super) struct SolidWall {
     pub(super) p_m: Point,
     pub(super) q_m: Point,
     /// Outwards, length 1.
     pub(super) normal: Point,
 }
 
-/// All of it.
+/// All static solids of a scene.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Solids {
-    pub(super) stills: Vec<Still>,
-    pub(super) walls: Vec<StillWall>,
+pub(super) struct StillSolids {
+    pub(super) stills: Vec<StillSolid>,
+    pub(super) walls: Vec<SolidWall>,
     /// Centres and reaches of `stills`, for the test of distance.
     near: Vec<[f64; 3]>,
     min_m: Point,
@@ -64,18 +64,18 @@ pub(super) struct Solids {
     most_reach_m: f64,
 }
 
-/// The wall between two corners; none where they coincide.
-pub(super) fn wall(p_m: Point, q_m: Point) -> Option<StillWall> {
+/// The wall between two corners; `None` if they coincide.
+pub(super) fn wall(p_m: Point, q_m: Point) -> Option<SolidWall> {
     let length_m = distance(p_m, q_m);
     let [x, y] = from_to(p_m, q_m);
-    (length_m > SHORTEST_M).then(|| StillWall {
+    (length_m > SHORTEST_M).then(|| SolidWall {
         p_m,
         q_m,
         normal: [y / length_m, -x / length_m],
     })
 }
 
-impl Solids {
+impl StillSolids {
     pub(super) fn new(lidar: &config::Lidar, scene: &Scene) -> Result<Self, LidarError> {
         let interest = interest(lidar)?;
         let all: Vec<(u32, Solid<'_>, Bounds)> = (0_u32..)
@@ -152,7 +152,7 @@ impl Solids {
             .fold(0.0, f64::max);
         self.most_reach_m = self.most_reach_m.max(reach_m);
         self.near.push([centre_m[0], centre_m[1], reach_m]);
-        self.stills.push(Still {
+        self.stills.push(StillSolid {
             object: STATIC_OBJECT | number,
             word,
             z_m,
@@ -162,7 +162,7 @@ impl Solids {
         });
     }
 
-    /// Calls `found` with the number and the distance of the centre of everything that may be within `range_m` of `place`.
+    /// Calls `found` with the number and the distance of the centre of each solid that may be within `range_m` of `place`.
     #[inline(always)]
     pub(super) fn within(&self, place: Point, range_m: f64, mut found: impl FnMut(usize, f64)) {
         if self.stills.is_empty() {

@@ -1,4 +1,4 @@
-//! What moves: road users and the way each took during the tick.
+//! Moving targets: road users and the path of each during the tick.
 
 use ipc_schema::{
     pointcloud::Tag,
@@ -8,10 +8,10 @@ use ipc_schema::{
 
 use super::solids::INTEREST;
 
-/// A vehicle that is narrower has two wheels, metres: motorcycles are up to 0.95 m wide, the smallest cars 1.4 m.
+/// Narrower vehicles count as two-wheelers, metres: motorcycles are up to 0.95 m wide, the smallest cars 1.4 m.
 const TWO_WHEELER_M: f32 = 1.1;
 
-/// Where a body's origin is and how it is turned.
+/// Position and attitude of a body.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Pose {
     pub(super) position_m: [f64; 3],
@@ -19,14 +19,14 @@ pub(super) struct Pose {
     pub(super) attitude_rad: [f64; 3],
 }
 
-/// Relative to the end of the tick: x, y, z, heading; and roll and pitch themselves.
+/// Pose at the end of a sub-step: x, y, z and heading relative to the end of the tick, then absolute roll and pitch.
 type Knot = [f32; 6];
 
 /// A road user.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Mover {
+pub(super) struct MovingTarget {
     pub(super) end: Pose,
-    /// From the origin: rear, front, half the width, height.
+    /// Extent from the origin: rear, front, half the width, height.
     pub(super) rear_m: f64,
     pub(super) front_m: f64,
     pub(super) half_width_m: f64,
@@ -35,29 +35,30 @@ pub(super) struct Mover {
     pub(super) word: u32,
     pub(super) is_person: bool,
     pub(super) id_hash: u64,
-    /// Stands where it is for the whole tick, as far as anybody knows.
+    /// Keeps its pose for the whole tick, or its motion is not known.
     is_still: bool,
     /// Rates of a knot at the begin of the first sub-step, per second.
     rates: Knot,
-    /// How far its origin was from where it ends, at most, metres.
+    /// Upper bound of the distance of its origin from the end of the tick, metres.
     pub(super) travel_m: f64,
     /// Radius of the circle about its footprint, from the centre, metres.
     pub(super) radius_m: f64,
 }
 
-/// Everything that moves in a tick, for all LIDARs.
+/// All moving targets of a tick, for all LIDARs.
 #[derive(Debug, Clone, Default)]
 pub struct Targets {
-    pub(super) movers: Vec<Mover>,
-    /// Ends of sub-steps, road user by road user.
+    pub(super) movers: Vec<MovingTarget>,
+    /// Poses at the ends of sub-steps, road user by road user.
     knots: Vec<Knot>,
     pub(super) sub_steps: usize,
-    /// Centre and reach of each, for the test of distance.
+    /// Centre and reach of each road user, for the test of distance.
     pub(super) near: Vec<[f64; 3]>,
 }
 
 impl Targets {
-    /// Takes in a tick: `states` and `sub_steps[row * k + i]`, as in a `world` message. With `k` = 0 nothing moves.
+    /// Replaces the targets by those of a tick: `states` and `sub_steps[row * k + i]`, as in a `world` message. With `k` = 0 nothing
+    /// moves.
     pub fn update(&mut self, states: &[VehicleState], sub_steps: &[SubStep], k: usize) {
         let k = if sub_steps.len() < states.len() * k { 0 } else { k };
         self.sub_steps = k;
@@ -75,7 +76,7 @@ impl Targets {
         self.movers.clear();
         self.near.clear();
         for (row, state) in states.iter().enumerate() {
-            let mover = Mover::new(state, &sub_steps[row * k..(row + 1) * k]);
+            let mover = MovingTarget::new(state, &sub_steps[row * k..(row + 1) * k]);
             let [x, y] = mover.centre_m(&mover.end);
             self.near.push([x, y, mover.radius_m + mover.travel_m]);
             self.movers.push(mover);
@@ -126,7 +127,7 @@ impl Targets {
     }
 }
 
-impl Mover {
+impl MovingTarget {
     fn new(state: &VehicleState, steps: &[SubStep]) -> Self {
         let is_person = state.kind == Kind::Person as u32;
         let tag = match is_person {
@@ -164,7 +165,7 @@ impl Mover {
         mover
     }
 
-    /// Rates before the first sub-step ends, from its velocities, and how far it came.
+    /// Sets the rates during the first sub-step, from its velocities, and the bound of the travelled distance.
     fn start(&mut self, yaw_rad: f64, steps: &[SubStep]) {
         let first = &steps[0];
         let yaw_rad = yaw_rad + f64::from(first.dyaw_rad);

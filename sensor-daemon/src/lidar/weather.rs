@@ -1,10 +1,10 @@
-//! What rain, fog and sun do to a return.
+//! Effects of rain, fog and sun on a return.
 //!
 //! Rain: Goodin, Carruth, Doude and Hudson, "Predicting the Influence of Rain on LIDAR in ADAS", Electronics 8 (2019) 89: attenuation
 //! `α = 0.01 R^0.6` 1/m with R in mm/h, both ways; a return is lost when less comes back than of the same surface at the end of the
 //! range in clear air; the range gains an error of standard deviation `0.02 d (1 − exp(−R))²`. Fog: Kruse's form of Koschmieder's law,
 //! `α = 3.912 / V · (λ / 550 nm)^−q`, at 905 nm, less what clear air (50 km) has, for which `lidar.attenuation_per_m` stands. Sun: a
-//! model of ours, without a source: a further error of the range of up to 5 cm towards the sun, falling with the squared cosine.
+//! model of this project, without a source: a further error of the range of up to 5 cm towards the sun, falling with the squared cosine.
 
 use ipc_schema::config::Weather;
 
@@ -15,9 +15,9 @@ const CLEAR_M: f64 = 50_000.0;
 /// Standard deviation of the range when looking into the sun, metres.
 const SUN_STD_M: f64 = 0.05;
 
-/// What the weather does to returns.
+/// Effects of the weather on returns.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Air {
+pub(super) struct WeatherEffects {
     /// Attenuation one way, 1/m.
     pub(super) extinction_per_m: f64,
     /// Standard deviation of the range as a share of it.
@@ -28,7 +28,7 @@ pub(super) struct Air {
     pub(super) sun_std_m: f64,
 }
 
-impl Air {
+impl WeatherEffects {
     pub(super) fn new(weather: &Weather) -> Self {
         let (sin_up, cos_up) = libm::sincos(weather.sun_elevation_deg.to_radians());
         let (sin_az, cos_az) = libm::sincos(weather.sun_azimuth_deg.to_radians());
@@ -79,28 +79,28 @@ mod tests {
 
     #[test]
     fn clear_air_does_nothing() {
-        assert!(Air::new(&weather(0.0, CLEAR_M, 0.0)).is_clear());
-        assert!(Air::new(&weather(0.0, 80_000.0, 0.0)).is_clear());
+        assert!(WeatherEffects::new(&weather(0.0, CLEAR_M, 0.0)).is_clear());
+        assert!(WeatherEffects::new(&weather(0.0, 80_000.0, 0.0)).is_clear());
     }
 
     /// 0.01 · 10^0.6 = 0.039 81; 0.02 (1 − e^−1)² = 0.007 992.
     #[test]
     fn rain_by_hand() {
-        let air = Air::new(&weather(10.0, CLEAR_M, 0.0));
+        let air = WeatherEffects::new(&weather(10.0, CLEAR_M, 0.0));
         assert!((air.extinction_per_m - 0.039_81).abs() < 1e-5);
-        assert!((Air::new(&weather(1.0, CLEAR_M, 0.0)).range_share - 0.007_992).abs() < 1e-5);
+        assert!((WeatherEffects::new(&weather(1.0, CLEAR_M, 0.0)).range_share - 0.007_992).abs() < 1e-5);
     }
 
     /// V = 200 m: q = 0.585 · 0.2^(1/3) = 0.342; 3.912 / 200 · 1.6455^−0.342 = 0.016 50 1/m.
     #[test]
     fn fog_by_hand() {
-        let air = Air::new(&weather(0.0, 200.0, 0.0));
+        let air = WeatherEffects::new(&weather(0.0, 200.0, 0.0));
         assert!((air.extinction_per_m - 0.016_50).abs() < 1e-4, "{air:?}");
     }
 
     #[test]
     fn the_sun_of_noon_is_in_the_south() {
-        let air = Air::new(&weather(0.0, CLEAR_M, 1.0));
+        let air = WeatherEffects::new(&weather(0.0, CLEAR_M, 1.0));
         assert!(air.sun[0].abs() < 1e-12 && air.sun[1] < -0.8 && (air.sun[2] - 0.5).abs() < 1e-12);
         assert!(!air.is_clear());
     }

@@ -1,4 +1,4 @@
-//! Where the satellites are: a constellation like GPS's, as it is seen from one place on the ellipsoid.
+//! A satellite constellation like that of GPS, as seen from one place on the ellipsoid.
 //!
 //! Thirty satellites in a Walker pattern 30/6/1 (J. Walker, "Satellite constellations", Journal of the British Interplanetary
 //! Society 37, 1984): six planes inclined by 55°, five satellites in each, on circular orbits that take half a sidereal day, as
@@ -79,13 +79,13 @@ pub fn satellite_ecef_m(number: u32, time_s: f64) -> [f64; 3] {
 
 /// A place on the WGS 84 ellipsoid with its local axes.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Observer {
+pub struct SkyObserver {
     ecef_m: [f64; 3],
     /// Unit vectors east, north and up, earth-fixed.
     axes: [[f64; 3]; 3],
 }
 
-impl Observer {
+impl SkyObserver {
     /// The place itself, at height zero (Kaplan and Hegarty, section 2.2.3).
     #[must_use]
     pub fn at(place: Geodetic) -> Self {
@@ -133,8 +133,8 @@ impl Observer {
 mod tests {
     use super::*;
 
-    fn place(latitude_deg: f64, longitude_deg: f64) -> Observer {
-        Observer::at(Geodetic {
+    fn place(latitude_deg: f64, longitude_deg: f64) -> SkyObserver {
+        SkyObserver::at(Geodetic {
             latitude_deg,
             longitude_deg,
         })

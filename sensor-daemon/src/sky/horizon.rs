@@ -1,6 +1,6 @@
-//! What buildings hide of the sky at a place, and which of their walls mirror satellites into it.
+//! The part of the sky that buildings hide at a place, and the walls that mirror satellites to it.
 //!
-//! Only prisms count: trees, lamp posts, vehicles and bridges are transparent. A prism hides what is below its roof, down to the ground.
+//! Only prisms count: trees, lamp posts, vehicles and bridges are transparent. A prism hides the sky below its roof, down to the ground.
 
 use std::f64::consts::TAU;
 
@@ -17,15 +17,15 @@ pub const SECTORS: usize = 64;
 const WALLS: usize = 8;
 /// A wall that fills fewer sectors is too small to reflect a signal of 0.19 m wave length from afar (Fresnel zone).
 const LEAST_SECTORS: usize = 2;
-/// Farther walls are not looked for, metres.
+/// Largest distance at which walls are considered, metres.
 const FARTHEST_M: f64 = 1_000.0;
 /// Size of a cell of the index over buildings, metres.
 const INDEX_CELL_M: f64 = 50.0;
 
 /// A wall as seen from the place: everything relative to it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Wall {
-    /// Ends, the left one first for who looks at it, metres.
+struct HorizonWall {
+    /// Ends, metres; seen from the place, the left one comes first.
     left_m: [f32; 2],
     right_m: [f32; 2],
     /// Unit vector out of the wall, towards the place.
@@ -36,14 +36,14 @@ struct Wall {
 
 /// The wall behind which the sky begins in a sector, in whole parts of a metre: all sectors fit four cache lines.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Edge {
+struct HorizonEdge {
     /// Its roof above the antenna, 1/64 m; 0 if there is none.
     top: u16,
     /// Its distance, 1/32 m.
     distance: u16,
 }
 
-impl Edge {
+impl HorizonEdge {
     const TOP: f64 = 64.0;
     const DISTANCE: f64 = 32.0;
 
@@ -69,14 +69,14 @@ pub struct Horizon {
     /// The place: antenna, world, metres.
     pub place_m: [f64; 3],
     /// Along the middle of each sector.
-    edges: [Edge; SECTORS],
+    edges: [HorizonEdge; SECTORS],
     /// The rest is empty.
-    walls: [Wall; WALLS],
+    walls: [HorizonWall; WALLS],
 }
 
 /// A place with a free sky above the mask, a place under some walls, or one inside a building.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Sky {
+pub enum CellSky {
     /// Nothing is higher than the mask.
     Open,
     /// Walls are.
@@ -94,13 +94,13 @@ fn sector([east, north]: Point) -> usize {
 
 /// A satellite with its sector.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Placed {
+pub struct PlacedSatellite {
     /// Where it is.
     pub satellite: Satellite,
     sector: usize,
 }
 
-impl From<Satellite> for Placed {
+impl From<Satellite> for PlacedSatellite {
     fn from(satellite: Satellite) -> Self {
         Self {
             satellite,
@@ -118,7 +118,7 @@ impl Horizon {
 
     /// True if the satellite is in sight of an antenna at `antenna_m`, near the place.
     #[must_use]
-    pub fn is_in_sight(&self, placed: &Placed, antenna_m: [f64; 3]) -> bool {
+    pub fn is_in_sight(&self, placed: &PlacedSatellite, antenna_m: [f64; 3]) -> bool {
         let edge = self.edges[placed.sector];
         let higher_m = antenna_m[2] - self.place_m[2];
         edge.top == 0 || edge.top_m() - higher_m < placed.satellite.tan_elevation * edge.distance_m()
@@ -132,10 +132,10 @@ impl Horizon {
         let mut mirrors = Mirrors {
             edges: &self.edges,
             higher_m,
-            walls: [Mirror::default(); WALLS],
+            walls: [MirrorWall::default(); WALLS],
         };
         for (mirror, wall) in mirrors.walls.iter_mut().zip(&self.walls) {
-            *mirror = Mirror {
+            *mirror = MirrorWall {
                 left: from_to(moved, wall.left_m.map(f64::from)),
                 right: from_to(moved, wall.right_m.map(f64::from)),
                 outward: wall.outward.map(f64::from),
@@ -148,9 +148,9 @@ impl Horizon {
     }
 }
 
-/// A wall relative to an antenna; one without a distance mirrors nothing.
+/// A wall relative to an antenna; a wall with distance 0 mirrors nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Mirror {
+struct MirrorWall {
     left: Point,
     right: Point,
     outward: Point,
@@ -161,9 +161,9 @@ struct Mirror {
 /// Walls about an antenna.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mirrors<'a> {
-    edges: &'a [Edge; SECTORS],
+    edges: &'a [HorizonEdge; SECTORS],
     higher_m: f64,
-    walls: [Mirror; WALLS],
+    walls: [MirrorWall; WALLS],
 }
 
 impl Mirrors<'_> {
@@ -174,7 +174,7 @@ impl Mirrors<'_> {
     /// 9.3.4). It does if the mirrored ray meets the wall between its ends and below its roof, and if the wall is lit there: it
     /// is higher up and farther away from what hides the satellite than the antenna is.
     #[must_use]
-    pub fn extra_path_m(&self, placed: &Placed) -> Option<f64> {
+    pub fn extra_path_m(&self, placed: &PlacedSatellite) -> Option<f64> {
         let satellite = &placed.satellite;
         let (s, tan_e) = (satellite.heading, satellite.tan_elevation);
         let edge = self.edges[placed.sector];
@@ -196,7 +196,7 @@ impl Mirrors<'_> {
     }
 }
 
-impl Mirror {
+impl MirrorWall {
     /// True if the ray towards `s`, mirrored, meets the wall between its ends.
     fn is_met(&self, s: Point, facing: f64) -> bool {
         let mirrored = [
@@ -215,8 +215,8 @@ pub struct Skyline {
     middles: Vec<Point>,
 }
 
-/// Walls over the sectors while they are looked for.
-struct Search {
+/// State of the search for the highest wall in each sector.
+struct HorizonSearch {
     tangent: [f64; SECTORS],
     distance_m: [f64; SECTORS],
     /// Number of the wall in `seen`.
@@ -253,9 +253,9 @@ impl Skyline {
 
     /// The sky of an antenna at `place_m` (world, metres).
     #[must_use]
-    pub fn sky(&self, scene: &Scene, place_m: [f64; 3]) -> Sky {
+    pub fn sky(&self, scene: &Scene, place_m: [f64; 3]) -> CellSky {
         let place = [place_m[0], place_m[1]];
-        let mut search = Search {
+        let mut search = HorizonSearch {
             tangent: [0.0; SECTORS],
             distance_m: [1.0; SECTORS],
             wall: [usize::MAX; SECTORS],
@@ -268,20 +268,20 @@ impl Skyline {
                 continue;
             }
             if building.contains(place) {
-                return Sky::Inside;
+                return CellSky::Inside;
             }
             for (a, b) in edges(&building.outline_m) {
-                search.look_at(&self.middles, from_to(place, a), from_to(place, b), above_m);
+                search.add_wall(&self.middles, from_to(place, a), from_to(place, b), above_m);
             }
         }
         search.sky(place_m)
     }
 }
 
-impl Search {
-    /// Notes a wall from `a` to `b` (relative to the place), the building on its left, where it is the highest so far.
-    fn look_at(&mut self, middles: &[Point], a: Point, b: Point, above_m: f64) {
-        // Of a counter-clockwise outline the place sees the walls that it is to the right of; they run clockwise about it.
+impl HorizonSearch {
+    /// Records a wall from `a` to `b` (relative to the place), the building on its left, in the sectors where it is the highest so far.
+    fn add_wall(&mut self, middles: &[Point], a: Point, b: Point, above_m: f64) {
+        // Outlines are counter-clockwise: the place sees the walls that have it on their right, and they run clockwise around it.
         let along = from_to(a, b);
         let doubled_area = cross(a, along);
         if doubled_area >= 0.0 {
@@ -311,41 +311,41 @@ impl Search {
         }
     }
 
-    fn sky(self, place_m: [f64; 3]) -> Sky {
+    fn sky(self, place_m: [f64; 3]) -> CellSky {
         let tan_mask = libm::tan(MASK_DEG.to_radians());
         if self.tangent.iter().all(|tangent| *tangent <= tan_mask) {
-            return Sky::Open;
+            return CellSky::Open;
         }
-        Sky::Walled(Box::new(Horizon {
+        CellSky::Walled(Box::new(Horizon {
             place_m,
             edges: std::array::from_fn(|sector| {
                 let distance_m = self.distance_m[sector];
-                Edge::new(self.tangent[sector] * distance_m, distance_m)
+                HorizonEdge::new(self.tangent[sector] * distance_m, distance_m)
             }),
             walls: self.largest_walls(),
         }))
     }
 
     /// Walls that fill most sectors; of equals those that were found first.
-    fn largest_walls(&self) -> [Wall; WALLS] {
+    fn largest_walls(&self) -> [HorizonWall; WALLS] {
         let fills = |number: usize| self.wall.iter().filter(|wall| **wall == number).count();
         let mut large: Vec<(usize, usize)> = (0..self.seen.len())
             .map(|number| (fills(number), number))
             .filter(|(sectors, _)| *sectors >= LEAST_SECTORS)
             .collect();
         large.sort_by_key(|(sectors, number)| (std::cmp::Reverse(*sectors), *number));
-        let mut walls = [Wall::default(); WALLS];
+        let mut walls = [HorizonWall::default(); WALLS];
         for (wall, (_, number)) in walls.iter_mut().zip(large) {
             *wall = self.wall(number);
         }
         walls
     }
 
-    fn wall(&self, number: usize) -> Wall {
+    fn wall(&self, number: usize) -> HorizonWall {
         let (a, b, above_m) = self.seen[number];
         let along = from_to(a, b);
         let length_m = libm::hypot(along[0], along[1]);
-        Wall {
+        HorizonWall {
             left_m: a.map(|value| value as f32),
             right_m: b.map(|value| value as f32),
             outward: [(along[1] / length_m) as f32, (-along[0] / length_m) as f32],

@@ -1,8 +1,8 @@
-//! The sky as a GNSS receiver between buildings has it: which satellites it receives, how well they fix a position, and how far
-//! reflections displace it.
+//! The sky of a GNSS receiver between buildings: which satellites it receives, how well they fix a position, and how far
+//! reflections displace the fix.
 //!
-//! A pure function of scene, place of the map, seed of the episode, position and time. Horizons of places and satellites of times are
-//! computed when they are first asked for and kept; nothing depends on whether or when that was.
+//! It is a pure function of scene, place of the map, seed of the episode, position and time. The horizon of a place and the satellites
+//! of a time are computed at first use and kept; no result depends on whether or when that was.
 
 use std::{
     fmt,
@@ -15,7 +15,7 @@ use std::{
 use sim_core::{geodesy::Geodetic, scene::Scene};
 
 use crate::{
-    gnss::{Sky, SkyView},
+    gnss::{SatelliteSky, SkyView},
     noise::philox4x32,
 };
 
@@ -23,9 +23,9 @@ pub mod constellation;
 pub mod horizon;
 pub mod position;
 
-use constellation::{Observer, SIDEREAL_DAY_S};
-use horizon::{Placed, Skyline};
-use position::{NormalEquations, Solution};
+use constellation::{SIDEREAL_DAY_S, SkyObserver};
+use horizon::{PlacedSatellite, Skyline};
+use position::{NormalEquations, PositionSolution};
 
 /// Smallest cell of the map of horizons, metres; a cell has one horizon.
 const CELL_M: f64 = 4.0;
@@ -41,13 +41,14 @@ pub const ANTENNA_M: f64 = 1.5;
 const STEPS: usize = 8616;
 /// Weight of a reflected signal in the position: a wall of concrete returns half the amplitude, a quarter of the power (Groves, section 9.3.4).
 pub const REFLECTED_WEIGHT: f64 = 0.25;
-/// A reflected signal that is late by more does not fit the others, and the receiver leaves it out (RAIM), metres.
+/// Longest extra path of a reflected signal in use, metres: a longer one disagrees with the other signals, and the receiver excludes
+/// it (RAIM).
 pub const MOST_EXTRA_PATH_M: f64 = 60.0;
 /// Fewest satellites for a fix: three coordinates and the clock.
 pub const LEAST_SATELLITES: u32 = 4;
-/// With a greater horizontal dilution of precision there is no fix (a usual mask of receivers).
+/// Largest horizontal dilution of precision of a fix (a usual mask of receivers).
 pub const MOST_HDOP: f64 = 20.0;
-/// Reflections move a fix by no more, metres.
+/// Longest displacement of a fix by reflections, metres.
 pub const MOST_OFFSET_M: f64 = 50.0;
 
 fn without_fix(satellites: u32) -> SkyView {
@@ -61,8 +62,8 @@ fn without_fix(satellites: u32) -> SkyView {
 
 /// The sky at one step.
 #[derive(Debug, Clone, PartialEq)]
-struct Epoch {
-    satellites: Vec<Placed>,
+struct ConstellationEpoch {
+    satellites: Vec<PlacedSatellite>,
     /// Under an open sky.
     hdop: f64,
 }
@@ -71,7 +72,7 @@ struct Epoch {
 pub struct SkyMap {
     scene: Arc<Scene>,
     skyline: Skyline,
-    observer: Observer,
+    observer: SkyObserver,
     /// Time of the constellation at the start of the episode, seconds.
     start_s: f64,
     min_m: [f64; 2],
@@ -79,10 +80,10 @@ pub struct SkyMap {
     columns: usize,
     rows: usize,
     /// By cell.
-    skies: Vec<OnceLock<horizon::Sky>>,
+    skies: Vec<OnceLock<horizon::CellSky>>,
     kept: AtomicUsize,
     /// By step of the sidereal day.
-    epochs: Vec<OnceLock<Epoch>>,
+    epochs: Vec<OnceLock<ConstellationEpoch>>,
 }
 
 impl fmt::Debug for SkyMap {
@@ -110,7 +111,7 @@ impl SkyMap {
         let mut map = Self {
             skyline: Skyline::new(scene.buildings()),
             scene,
-            observer: Observer::at(middle),
+            observer: SkyObserver::at(middle),
             start_s: 0.0,
             min_m: [bounds_m[0], bounds_m[1]],
             cell_m,
@@ -124,36 +125,36 @@ impl SkyMap {
         map
     }
 
-    /// The constellation at the start of an episode: its seed says at what time of the sidereal day it begins. Horizons stay.
+    /// Sets the time of the sidereal day at which an episode begins, from its seed. Horizons are kept.
     fn start(&mut self, episode_seed: u64) {
         let key = [episode_seed as u32, (episode_seed >> 32) as u32];
-        // A counter of its own: sensors count their samples in the first word and have a number in the second.
+        // No sensor uses this counter: a sensor's second word is its noise stream.
         let [random, ..] = philox4x32([0, u32::MAX, 0, 0], key);
         self.start_s = SIDEREAL_DAY_S * f64::from(random) / 4_294_967_296.0;
     }
 
-    /// The satellites at a time, kept.
-    fn epoch(&self, time_s: f64) -> &Epoch {
+    /// The satellites at a time, computed at first use.
+    fn epoch(&self, time_s: f64) -> &ConstellationEpoch {
         let turns = (self.start_s + time_s) / SIDEREAL_DAY_S;
         let step = (((turns - turns.floor()) * STEPS as f64) as usize).min(STEPS - 1);
         self.epochs[step].get_or_init(|| self.epoch_of(step))
     }
 
-    fn epoch_of(&self, step: usize) -> Epoch {
+    fn epoch_of(&self, step: usize) -> ConstellationEpoch {
         let satellites = self
             .observer
             .satellites(SIDEREAL_DAY_S * (step as f64 + 0.5) / STEPS as f64);
-        let satellites: Vec<Placed> = satellites.into_iter().map(Placed::from).collect();
+        let satellites: Vec<PlacedSatellite> = satellites.into_iter().map(PlacedSatellite::from).collect();
         let mut equations = NormalEquations::default();
         for placed in &satellites {
             equations.add(placed.satellite.line_of_sight, 1.0, 0.0);
         }
         let hdop = equations.solve().map_or(f64::INFINITY, |solution| solution.hdop());
-        Epoch { satellites, hdop }
+        ConstellationEpoch { satellites, hdop }
     }
 
     /// The sky of a cell, if it is on the map and there is room to keep it.
-    fn kept_sky(&self, [column, row]: [f64; 2]) -> Option<&horizon::Sky> {
+    fn kept_sky(&self, [column, row]: [f64; 2]) -> Option<&horizon::CellSky> {
         if !(column >= 0.0 && row >= 0.0 && column < self.columns as f64 && row < self.rows as f64) {
             return None;
         }
@@ -166,20 +167,20 @@ impl SkyMap {
         }
         Some(place.get_or_init(|| {
             let sky = self.sky_of([column, row]);
-            let is_large = matches!(sky, horizon::Sky::Walled(_));
+            let is_large = matches!(sky, horizon::CellSky::Walled(_));
             self.kept.fetch_add(usize::from(is_large), Ordering::Relaxed);
             sky
         }))
     }
 
     /// The sky of a cell: from its middle or, if that is inside a building, from the free place nearest to it.
-    fn sky_of(&self, [column, row]: [f64; 2]) -> horizon::Sky {
+    fn sky_of(&self, [column, row]: [f64; 2]) -> horizon::CellSky {
         let middle = [
             self.min_m[0] + (column + 0.5) * self.cell_m,
             self.min_m[1] + (row + 0.5) * self.cell_m,
         ];
         let sky = self.sky_from(middle);
-        if sky != horizon::Sky::Inside {
+        if sky != horizon::CellSky::Inside {
             return sky;
         }
         let mut places: Vec<[i32; 2]> = (0..TRIES * TRIES)
@@ -195,17 +196,17 @@ impl SkyMap {
                     middle[1] + f64::from(*up) * step_m,
                 ])
             })
-            .find(|sky| *sky != horizon::Sky::Inside)
-            .unwrap_or(horizon::Sky::Inside)
+            .find(|sky| *sky != horizon::CellSky::Inside)
+            .unwrap_or(horizon::CellSky::Inside)
     }
 
-    fn sky_from(&self, [x_m, y_m]: [f64; 2]) -> horizon::Sky {
+    fn sky_from(&self, [x_m, y_m]: [f64; 2]) -> horizon::CellSky {
         let ground_m = self.scene.ground_height_m(x_m, y_m);
         self.skyline.sky(&self.scene, [x_m, y_m, ground_m + ANTENNA_M])
     }
 }
 
-impl Sky for SkyMap {
+impl SatelliteSky for SkyMap {
     /// The sky of a road user on the ground at `(x_m, y_m, z_m)` (world, metres), its antenna [`ANTENNA_M`] above, at `time_s` of the
     /// episode.
     fn at(&self, x_m: f64, y_m: f64, z_m: f64, time_s: f64) -> SkyView {
@@ -223,11 +224,11 @@ impl Sky for SkyMap {
     }
 }
 
-fn view(sky: &horizon::Sky, epoch: &Epoch, antenna_m: [f64; 3]) -> SkyView {
+fn view(sky: &horizon::CellSky, epoch: &ConstellationEpoch, antenna_m: [f64; 3]) -> SkyView {
     match sky {
-        horizon::Sky::Open => open_view(epoch),
-        horizon::Sky::Inside => without_fix(0),
-        horizon::Sky::Walled(horizon) => {
+        horizon::CellSky::Open => open_view(epoch),
+        horizon::CellSky::Inside => without_fix(0),
+        horizon::CellSky::Walled(horizon) => {
             // The usual case along wide roads.
             if epoch
                 .satellites
@@ -242,7 +243,7 @@ fn view(sky: &horizon::Sky, epoch: &Epoch, antenna_m: [f64; 3]) -> SkyView {
     }
 }
 
-fn open_view(epoch: &Epoch) -> SkyView {
+fn open_view(epoch: &ConstellationEpoch) -> SkyView {
     SkyView {
         satellites: epoch.satellites.len() as u32,
         noise_factor: 1.0,
@@ -252,7 +253,11 @@ fn open_view(epoch: &Epoch) -> SkyView {
 }
 
 /// Satellites in use, and what they make of it.
-fn received(horizon: &horizon::Horizon, epoch: &Epoch, antenna_m: [f64; 3]) -> (u32, Option<Solution>) {
+fn received(
+    horizon: &horizon::Horizon,
+    epoch: &ConstellationEpoch,
+    antenna_m: [f64; 3],
+) -> (u32, Option<PositionSolution>) {
     let (mut equations, mut satellites) = (NormalEquations::default(), 0);
     let mirrors = horizon.mirrors(antenna_m);
     for placed in &epoch.satellites {
@@ -271,7 +276,7 @@ fn received(horizon: &horizon::Horizon, epoch: &Epoch, antenna_m: [f64; 3]) -> (
     (satellites, solution.flatten())
 }
 
-fn fix(satellites: u32, solution: Option<Solution>, open_hdop: f64) -> SkyView {
+fn fix(satellites: u32, solution: Option<PositionSolution>, open_hdop: f64) -> SkyView {
     let Some(solution) = solution.filter(|solution| solution.hdop() <= MOST_HDOP) else {
         return without_fix(satellites);
     };

@@ -23,14 +23,14 @@ pub struct NormalEquations {
 
 /// What follows from them.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Solution {
+pub struct PositionSolution {
     /// Variances east and north for range errors of variance 1.
     pub variance: [f64; 2],
     /// Error of the position by the range errors: east, north, up, metres.
     pub offset_m: [f64; 3],
 }
 
-impl Solution {
+impl PositionSolution {
     /// Horizontal dilution of precision.
     #[must_use]
     pub fn hdop(&self) -> f64 {
@@ -58,7 +58,7 @@ impl NormalEquations {
 
     /// Solves them, two coordinates eliminated at a time; `None` if the satellites leave a direction open.
     #[must_use]
-    pub fn solve(&self) -> Option<Solution> {
+    pub fn solve(&self) -> Option<PositionSolution> {
         // Up and clock, R = [[uu, uc], [uc, cc]], go first: R⁻¹ Qᵀ, with Q = [[eu, ec], [nu, nc]].
         let r_det = self.uu * self.cc - self.uc * self.uc;
         let scale = 1.0 / r_det;
@@ -79,7 +79,7 @@ impl NormalEquations {
         let left_n = b_n - by_n[0] * b_u - by_n[1] * b_c;
         let (east, north) = ((nn * left_e - en * left_n) / s_det, (ee * left_n - en * left_e) / s_det);
         let up = r_solved(b_u, b_c)[0] - by_e[0] * east - by_n[0] * north;
-        Some(Solution {
+        Some(PositionSolution {
             variance: [nn / s_det, ee / s_det],
             offset_m: [east, north, up],
         })

@@ -1,4 +1,4 @@
-//! The sky of places known by hand, and horizons against rays.
+//! The sky at places computed by hand, and horizons against rays.
 
 use super::*;
 use proptest::prelude::*;
@@ -81,7 +81,7 @@ fn a_street_between_houses_is_worse_across_than_along() {
     assert!(north > 2.0 * east && north > 0.5, "along {east}, across {north}");
     // The variance by geometry alone.
     let cell = street.kept_sky([50.0, 50.0]).unwrap();
-    let horizon::Sky::Walled(horizon) = cell else {
+    let horizon::CellSky::Walled(horizon) = cell else {
         panic!("{cell:?}")
     };
     let variances: Vec<[f64; 2]> = times()
@@ -93,7 +93,7 @@ fn a_street_between_houses_is_worse_across_than_along() {
     assert!(north > 2.0 * east, "along {east}, across {north}");
 }
 
-/// Against an endless wall half of the sky is left; what is left of the other half comes from nowhere, as no wall mirrors it.
+/// An endless wall hides half of the sky; no satellite of the hidden half is received, as no wall mirrors it.
 #[test]
 fn a_tall_wall_takes_half_of_the_sky() {
     let walled = over(vec![block([-200.0, -60.0], [200.0, -0.5], 150.0)]);
@@ -142,12 +142,12 @@ fn a_reflection_by_hand() {
         let scene = Scene::new(Road::default(), houses, Vec::new());
         let antenna_m = [0.0, 0.0, ANTENNA_M];
         let sky = Skyline::new(scene.buildings()).sky(&scene, antenna_m);
-        let horizon::Sky::Walled(horizon) = sky else {
+        let horizon::CellSky::Walled(horizon) = sky else {
             panic!("{sky:?}")
         };
         let cos_e = 30.0_f64.to_radians().cos();
         let line_of_sight = [cos_e * heading[0], cos_e * heading[1], 0.5];
-        let placed = Placed::from(constellation::Satellite::towards(line_of_sight));
+        let placed = PlacedSatellite::from(constellation::Satellite::towards(line_of_sight));
         assert!(!horizon.is_in_sight(&placed, antenna_m));
         horizon.mirrors(antenna_m).extra_path_m(&placed)
     };
@@ -171,7 +171,7 @@ fn a_reflection_by_hand() {
 }
 
 #[test]
-fn a_place_has_its_sky_whoever_asks_first() {
+fn the_sky_of_a_place_does_not_depend_on_the_order_of_requests() {
     let (one, other) = (street(), street());
     let places: Vec<[f64; 4]> = (0..400)
         .map(|i| {
@@ -215,7 +215,7 @@ fn seeds_begin_at_different_times_and_a_day_later_all_is_the_same() {
     assert_eq!(first, views(&map, 0.0));
 }
 
-/// A regular pattern may have moments in which all satellites stand alike: none is bad enough to lose a fix, anywhere on earth.
+/// A regular pattern may have moments in which all satellites are aligned: none is bad enough to lose a fix, anywhere on earth.
 #[test]
 fn an_open_sky_gives_a_fix_everywhere() {
     let scene = Arc::new(Scene::default());
@@ -232,10 +232,10 @@ fn an_open_sky_gives_a_fix_everywhere() {
     }
 }
 
-/// What the bounds on cells and horizons mean: at most 24 MB and 77 MB.
+/// The bounds on cells and horizons limit memory to 24 MB and 77 MB.
 #[test]
 fn memory_is_bounded() {
-    assert!(size_of::<OnceLock<horizon::Sky>>() <= 24 && size_of::<horizon::Horizon>() <= 512);
+    assert!(size_of::<OnceLock<horizon::CellSky>>() <= 24 && size_of::<horizon::Horizon>() <= 512);
     let scene = Arc::new(Scene::default());
     let large = SkyMap::new(Arc::clone(&scene), MIDDLE, [0.0, 0.0, 200_000.0, 100_000.0], 1);
     assert!(large.skies.len() < 1_010_000 && large.at(1e5, 5e4, 0.0, 0.0).has_fix);
@@ -243,8 +243,8 @@ fn memory_is_bounded() {
     assert!(long.skies.len() <= 1_000_001);
 }
 
-/// Height above the antenna and distance of the roof that is seen highest along a heading, by intersecting with every edge; nothing
-/// is [0, 1].
+/// Height above the antenna and distance of the roof with the highest elevation along a heading, by intersection with every edge;
+/// [0, 1] stands for no roof.
 fn highest_roof(buildings: &[Prism], place: Point, antenna_z_m: f64, angle_rad: f64) -> [f64; 2] {
     let far = [place[0] + 5e3 * angle_rad.cos(), place[1] + 5e3 * angle_rad.sin()];
     let mut highest = [0.0, 1.0];
@@ -285,7 +285,7 @@ fn prisms(houses: &Houses) -> Vec<Prism> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
     #[test]
-    fn a_view_keeps_its_promises(houses in houses(), x in -90.0_f64..90.0, y in -90.0_f64..90.0, z in 0.0_f64..10.0, time_s in 0.0_f64..1e5) {
+    fn a_view_keeps_its_invariants(houses in houses(), x in -90.0_f64..90.0, y in -90.0_f64..90.0, z in 0.0_f64..10.0, time_s in 0.0_f64..1e5) {
         let map = over(prisms(&houses));
         let (view, open) = (map.at(x, y, z, time_s), over(Vec::new()).at(x, y, z, time_s));
         prop_assert!(view.satellites <= open.satellites && view.noise_factor >= 1.0, "{view:?}");
@@ -297,7 +297,7 @@ proptest! {
     }
 
     #[test]
-    fn horizons_are_what_rays_say(houses in houses(), x in -60.0_f64..60.0, y in -60.0_f64..60.0, z in 0.0_f64..20.0) {
+    fn horizons_agree_with_rays(houses in houses(), x in -60.0_f64..60.0, y in -60.0_f64..60.0, z in 0.0_f64..20.0) {
         let buildings = prisms(&houses);
         let scene = Scene::new(Road::default(), buildings.clone(), Vec::new());
         let inside = buildings.iter().any(|building| building.contains([x, y]) && building.height_m > z);
@@ -307,9 +307,9 @@ proptest! {
             .collect();
         let is_low = |[top, distance]: [f64; 2]| top / distance <= tan_mask * (1.0 + 1e-6);
         match Skyline::new(&buildings).sky(&scene, [x, y, z]) {
-            horizon::Sky::Inside => prop_assert!(inside),
-            horizon::Sky::Open => prop_assert!(!inside && expected.iter().all(|roof| is_low(*roof))),
-            horizon::Sky::Walled(horizon) => {
+            horizon::CellSky::Inside => prop_assert!(inside),
+            horizon::CellSky::Open => prop_assert!(!inside && expected.iter().all(|roof| is_low(*roof))),
+            horizon::CellSky::Walled(horizon) => {
                 prop_assert!(!inside);
                 for (sector, (found, roof)) in horizon.tangents().zip(&expected).enumerate() {
                     // Rounded to 1/64 m up and 1/32 m away, never 0. Lower than the mask it does not matter.

@@ -1,4 +1,4 @@
-//! What the tests of sensing share: a map, road users, and a run of ticks whose sections can be looked at.
+//! Shared by the tests of sensing: a map, road users, and a run of ticks with access to the sections of each.
 
 #![allow(
     dead_code,
@@ -15,7 +15,7 @@ use ipc_schema::{
     traffic::{Kind, id_hash},
     world::{SubStep, VehicleState},
 };
-use sensor_daemon::sensing::{Sensing, World};
+use sensor_daemon::sensing::{Sensing, WorldTick};
 
 pub fn config() -> Config {
     serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap()
@@ -84,7 +84,7 @@ impl Tick {
     }
 }
 
-/// A run that goes on tick by tick.
+/// A run that advances tick by tick.
 pub struct Run {
     pub sensing: Sensing,
     tick: u64,
@@ -108,12 +108,12 @@ impl Run {
         }
     }
 
-    /// A new episode begins, from time 0 on.
+    /// Begins a new episode at time 0.
     pub fn restart(&mut self, seed: u64) {
         self.restart_in(seed, 0);
     }
 
-    /// The same in the step and on the map that `flags` say.
+    /// Begins a new episode in the stage and on the map of `flags`.
     pub fn restart_in(&mut self, seed: u64, flags: u32) {
         (self.tick, self.seed, self.flags) = (0, seed, FIRST_OF_EPISODE | flags);
     }
@@ -140,7 +140,7 @@ impl Run {
         between(&mut self.sensing);
         let layout = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples());
         let mut payload = vec![0_u64; layout.len / 8];
-        let world = World {
+        let world = WorldTick {
             states,
             sub_steps,
             views: &[],

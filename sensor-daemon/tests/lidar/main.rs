@@ -1,4 +1,4 @@
-//! What a LIDAR delivers, and what it refuses.
+//! Points of a LIDAR, and configurations that it refuses.
 
 #![expect(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 
@@ -7,7 +7,7 @@ use ipc_schema::pointcloud::{LidarPoint, Scan};
 use ipc_schema::traffic::Kind;
 use ipc_schema::world::{SubStep, VehicleState};
 use lidar_city::exact_config;
-use sensor_daemon::lidar::{Lidar, Scratch, Targets};
+use sensor_daemon::lidar::{LidarModel, ScanScratch, Targets};
 use sim_core::scene::{Prism, Road, Scene, SolidClass};
 
 mod disturbances;
@@ -20,7 +20,7 @@ mod patterns;
 
 const DATA: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/");
 
-/// A sensor of few rays at the origin of its carrier, 2 m up, without anything random.
+/// A sensor of few rays at the origin of its carrier, 2 m up, without random errors.
 fn small(channels: u32, columns: u64) -> Config {
     let mut config = exact_config();
     config.lidar.channels = channels;
@@ -64,17 +64,32 @@ struct Scanned {
     points: Vec<LidarPoint>,
 }
 
-fn scan_with(lidar: &Lidar, states: &[VehicleState], steps: &[SubStep], k: usize, tick: u64, seed: u64) -> Scanned {
+fn scan_with(
+    lidar: &LidarModel,
+    states: &[VehicleState],
+    steps: &[SubStep],
+    k: usize,
+    tick: u64,
+    seed: u64,
+) -> Scanned {
     let (mut targets, mut scan) = (Targets::default(), Scan::default());
     targets.update(states, steps, k);
     let mut points = vec![LidarPoint::default(); lidar.max_points()];
-    let count = lidar.scan(&targets, 0, tick, seed, &mut Scratch::default(), &mut scan, &mut points);
+    let count = lidar.scan(
+        &targets,
+        0,
+        tick,
+        seed,
+        &mut ScanScratch::default(),
+        &mut scan,
+        &mut points,
+    );
     points.truncate(count);
     Scanned { scan, points }
 }
 
 fn scan(config: &Config, scene: &Scene, states: &[VehicleState]) -> Scanned {
-    scan_with(&Lidar::new(config, scene).unwrap(), states, &[], 0, 0, 1)
+    scan_with(&LidarModel::new(config, scene).unwrap(), states, &[], 0, 0, 1)
 }
 
 fn range(point: &LidarPoint) -> f64 {

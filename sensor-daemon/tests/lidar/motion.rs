@@ -4,7 +4,7 @@ use crate::{azimuth, car, empty, rectangle, scan, scan_with, small};
 use ipc_schema::config::LidarAxes;
 use ipc_schema::pointcloud::STATIC_OBJECT;
 use ipc_schema::world::SubStep;
-use sensor_daemon::lidar::Lidar;
+use sensor_daemon::lidar::LidarModel;
 use sim_core::scene::{Road, Scene};
 
 /// Figure 3: y backward, x left, z down. A car 10 m ahead is at y = −10; equation 4 with the heading brings (−y, x) into the world.
@@ -65,7 +65,7 @@ fn a_moving_target_is_where_it_was_when_its_azimuth_fired() {
     // Abeam to the right (three quarters of the tick) a car drives past at 20 m/s.
     let states = [car(0, 0.0, 0.0, 0.0), car(1, 0.0, -8.0, 0.0)];
     let steps = [straight([0.0; 2], 0.0, 0.0), straight([20.0, 0.0], 0.0, 0.0)].concat();
-    let lidar = Lidar::new(&config, &empty()).unwrap();
+    let lidar = LidarModel::new(&config, &empty()).unwrap();
     let scanned = scan_with(&lidar, &states, &steps, 10, 0, 1);
     let seen: Vec<_> = scanned.points.iter().filter(|point| point.object == 1).collect();
     assert!(seen.len() > 100);
@@ -98,7 +98,7 @@ fn a_wall_seen_from_a_turning_car_is_straight() {
         Vec::new(),
     );
     let steps = straight(velocity, rate, 0.5);
-    let lidar = Lidar::new(&config, &scene).unwrap();
+    let lidar = LidarModel::new(&config, &scene).unwrap();
     let scanned = scan_with(&lidar, &[car(0, 0.0, 0.0, 0.5)], &steps, 10, 0, 1);
     let mut seen = 0;
     for point in scanned.points.iter().filter(|point| point.object == STATIC_OBJECT) {

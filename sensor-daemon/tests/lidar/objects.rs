@@ -1,4 +1,4 @@
-//! What points lie on: tags, the own body, meshes, the nearest objects, and every point on the surface of its object.
+//! Objects that points lie on: tags, the own body, meshes, the nearest objects, and every point on the surface of its object.
 
 use crate::lidar_city::{Moves, traffic};
 use crate::{DATA, car, empty, lidar_city, range, rectangle, scan, scan_with, small};
@@ -8,7 +8,7 @@ use ipc_schema::props::Obstacle;
 use ipc_schema::traffic::Kind;
 use ipc_schema::world::VehicleState;
 use proptest::prelude::*;
-use sensor_daemon::lidar::{Lidar, LidarError, nearest_objects};
+use sensor_daemon::lidar::{LidarError, LidarModel, nearest_objects};
 use sim_core::scene::{Road, RoadPiece, Scene, SurfaceKind};
 
 #[test]
@@ -98,7 +98,7 @@ fn interest_keeps_road_users_and_the_props_named() {
     seen.dedup();
     assert_eq!(seen, [1, STATIC_OBJECT | 1]);
     config.lidar.interest_props = vec!["unicorn".into()];
-    assert!(matches!(Lidar::new(&config, &scene), Err(LidarError::Prop { .. })));
+    assert!(matches!(LidarModel::new(&config, &scene), Err(LidarError::Prop { .. })));
 }
 
 #[test]
@@ -152,7 +152,7 @@ fn the_nearest_objects_go_into_the_observation() {
         vec![prop],
     );
     let states = [car(0, 0.0, 0.0, 0.0), car(1, 10.0, 0.0, 0.0), car(2, 0.0, -9.0, 0.0)];
-    let lidar = Lidar::new(&config, &scene).unwrap();
+    let lidar = LidarModel::new(&config, &scene).unwrap();
     let scanned = scan_with(&lidar, &states, &[], 0, 0, 1);
     let [first, second, third, fourth] = nearest_objects(&scanned.points, &lidar);
     let near = |a: [f32; 2], b: [f32; 2]| (a[0] - b[0]).abs() < 0.1 && (a[1] - b[1]).abs() < 0.1;
@@ -162,7 +162,7 @@ fn the_nearest_objects_go_into_the_observation() {
     );
     assert_eq!(fourth, [100.0, 100.0]);
     config.lidar.axes = LidarAxes::Paper;
-    let lidar = Lidar::new(&config, &scene).unwrap();
+    let lidar = LidarModel::new(&config, &scene).unwrap();
     let scanned = scan_with(&lidar, &states, &[], 0, 0, 1);
     assert!(near(nearest_objects(&scanned.points, &lidar)[0], [0.0, 5.8]));
     assert_eq!(nearest_objects(&[], &lidar), [[100.0; 2]; 4]);
@@ -206,7 +206,7 @@ fn off_surface_m(scene: &Scene, states: &[VehicleState], object: u32, [x, y, z]:
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
-    /// Without noise every point lies on the surface of what it names.
+    /// Without noise every point lies on the surface of the object that it names.
     #[test]
     fn every_point_lies_on_its_object(
         x in -60.0_f64..60.0, y in -60.0_f64..60.0, z in 0.0_f64..30.0, yaw in -3.0_f64..3.0, roll in -0.3_f32..0.3, pitch in -0.3_f32..0.3, seed in 0_u64..99,

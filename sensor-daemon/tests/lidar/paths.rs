@@ -1,13 +1,13 @@
-//! The same bits on every instruction set, in any order, and at strange places.
+//! Scans have the same bits on every instruction set and in any order of objects, also at degenerate places.
 
 use crate::lidar_city::{Moves, SUB_STEPS, traffic};
 use crate::{DATA, car, lidar_city, range, rectangle, scan, small};
 use ipc_schema::pointcloud::{GROUND, LidarPoint, Scan};
-use sensor_daemon::lidar::{Lidar, Path, Scratch, Targets};
+use sensor_daemon::lidar::{LidarModel, ScanPath, ScanScratch, Targets};
 use sim_core::scene::{Road, Scene};
 
-/// The bits of a scan of everything at once: noise, loss, weather, persons, wild motion.
-fn busy(path: Path, pattern: &str, order: bool, scratch: &mut Scratch) -> Vec<u8> {
+/// The bits of a scan with noise, loss, weather, persons and wild motion at once.
+fn busy(path: ScanPath, pattern: &str, order: bool, scratch: &mut ScanScratch) -> Vec<u8> {
     let mut config = lidar_city::config();
     config.lidar.pattern = pattern.into();
     config.lidar.ray_table = format!("{DATA}rays.csv");
@@ -31,7 +31,7 @@ fn busy(path: Path, pattern: &str, order: bool, scratch: &mut Scratch) -> Vec<u8
             .collect();
         states = rows.iter().map(|row| states[*row]).collect();
     }
-    let lidar = Lidar::new(&config, &scene).unwrap().with_path(path);
+    let lidar = LidarModel::new(&config, &scene).unwrap().with_path(path);
     let (mut targets, mut scan) = (Targets::default(), Scan::default());
     targets.update(&states, &steps, SUB_STEPS);
     let mut points = vec![LidarPoint::default(); lidar.max_points()];
@@ -43,10 +43,10 @@ fn busy(path: Path, pattern: &str, order: bool, scratch: &mut Scratch) -> Vec<u8
 #[test]
 fn every_path_gives_the_same_bits() {
     for pattern in ["uniform", "hdl64e", "pandar40p", "table"] {
-        let expected = busy(Path::Plain, pattern, true, &mut Scratch::default());
-        for path in Path::ALL.into_iter().filter(|path| path.is_here()) {
+        let expected = busy(ScanPath::Plain, pattern, true, &mut ScanScratch::default());
+        for path in ScanPath::ALL.into_iter().filter(|path| path.is_here()) {
             assert!(
-                busy(path, pattern, true, &mut Scratch::default()) == expected,
+                busy(path, pattern, true, &mut ScanScratch::default()) == expected,
                 "{path:?} {pattern}"
             );
         }
@@ -55,11 +55,11 @@ fn every_path_gives_the_same_bits() {
 
 #[test]
 fn neither_the_order_of_targets_nor_used_scratch_matters() {
-    let mut scratch = Scratch::default();
-    let expected = busy(Path::best(), "uniform", true, &mut scratch);
-    let _ = busy(Path::best(), "os1_128", true, &mut scratch);
-    assert!(busy(Path::best(), "uniform", true, &mut scratch) == expected);
-    assert!(busy(Path::best(), "uniform", false, &mut scratch) == expected);
+    let mut scratch = ScanScratch::default();
+    let expected = busy(ScanPath::best(), "uniform", true, &mut scratch);
+    let _ = busy(ScanPath::best(), "os1_128", true, &mut scratch);
+    assert!(busy(ScanPath::best(), "uniform", true, &mut scratch) == expected);
+    assert!(busy(ScanPath::best(), "uniform", false, &mut scratch) == expected);
 }
 
 #[test]
@@ -102,17 +102,17 @@ fn strange_places_do_no_harm() {
         (states[0].x_m, states[0].y_m, states[0].z_m) = (x, y, 0.0);
         let _ = scan(&config, &scene, &states);
     }
-    let lidar = Lidar::new(&config, &scene).unwrap();
+    let lidar = LidarModel::new(&config, &scene).unwrap();
     let (mut targets, mut taken) = (Targets::default(), Scan::default());
     assert_eq!(
-        lidar.scan(&targets, 0, 0, 0, &mut Scratch::default(), &mut taken, &mut []),
+        lidar.scan(&targets, 0, 0, 0, &mut ScanScratch::default(), &mut taken, &mut []),
         0
     );
     targets.update(&states, &[], 0);
     let mut few = [LidarPoint::default(); 20];
     assert_eq!(
-        lidar.scan(&targets, 0, 0, 0, &mut Scratch::default(), &mut taken, &mut few),
+        lidar.scan(&targets, 0, 0, 0, &mut ScanScratch::default(), &mut taken, &mut few),
         20,
-        "no more than fit"
+        "no more points than fit"
     );
 }

@@ -1,22 +1,22 @@
-//! Which rays are fired: the elevations of real units, tables, rotations and fields of view.
+//! The rays that are fired: the elevations of real units, tables, rotations and fields of view.
 
 use crate::{DATA, azimuth, block, car, empty, range, scan, scan_with, small};
 use ipc_schema::failure::Failure;
 use ipc_schema::pointcloud::{GROUND, LidarPoint, Tag};
-use sensor_daemon::lidar::{Lidar, LidarError};
+use sensor_daemon::lidar::{LidarError, LidarModel};
 use sim_core::scene::{Road, Scene};
 
 fn elevations(pattern: &str) -> Vec<f64> {
     let mut config = small(1, 8);
     config.lidar.pattern = pattern.into();
     config.lidar.range_m = 1000.0;
-    // In a pit with walls as high as the sky, every ray returns.
+    // In a pit with very high walls every ray returns.
     let ring = |r: f64| [[-r, -r], [r, -r], [r, r], [-r, r]];
     let [a, b, c, d] = ring(5.0);
     let [e, f, g, h] = ring(6.0);
     let walls = [[a, b, f, e], [b, c, g, f], [c, d, h, g], [d, a, e, h]].map(|outline| block(&outline, 500.0));
     let scene = Scene::new(Road::default(), walls.to_vec(), Vec::new());
-    let lidar = Lidar::new(&config, &scene).unwrap();
+    let lidar = LidarModel::new(&config, &scene).unwrap();
     let scanned = scan_with(&lidar, &[car(0, 0.0, 0.0, 0.0)], &[], 0, 0, 1);
     let lasers = lidar.max_points() / lidar.columns();
     assert_eq!(scanned.points.len(), lidar.max_points(), "{pattern}");
@@ -74,7 +74,7 @@ fn a_tick_may_be_part_of_a_rotation_or_several() {
     let mut config = small(4, 0);
     config.lidar.rotation_hz = 2.5;
     config.lidar.points_per_second = 4 * 101 * 10 / 4;
-    let lidar = Lidar::new(&config, &empty()).unwrap();
+    let lidar = LidarModel::new(&config, &empty()).unwrap();
     assert_eq!(lidar.columns(), 26, "101 columns in four ticks");
     let mut columns = 0;
     for tick in 0..8 {
@@ -94,7 +94,7 @@ fn a_tick_may_be_part_of_a_rotation_or_several() {
     assert_eq!(scanned.scan.rays, 4 * 300);
     config.lidar.rotation_hz = 7.0;
     assert!(matches!(
-        Lidar::new(&config, &empty()),
+        LidarModel::new(&config, &empty()),
         Err(LidarError::Rotation { .. })
     ));
 }
@@ -119,7 +119,7 @@ fn a_field_of_view_is_about_straight_ahead() {
     config.lidar.horizontal_fov_deg = 90.0;
     config.lidar.rolling_shutter = true;
     let states = [car(0, 0.0, 0.0, 0.4), car(1, 6.0, 2.0, 0.0)];
-    let lidar = Lidar::new(&config, &empty()).unwrap();
+    let lidar = LidarModel::new(&config, &empty()).unwrap();
     assert_eq!(lidar.columns(), 91);
     let scanned = scan_with(&lidar, &states, &[], 0, 0, 1);
     assert_eq!(scanned.scan.rays, 8 * 91);
@@ -159,7 +159,7 @@ fn bad_tables_and_meshes_are_named_with_their_place() {
     config.lidar.pattern = "table".into();
     let mut refusal = |file: &str| {
         config.lidar.ray_table = format!("{DATA}{file}");
-        Failure::from(Lidar::new(&config, &empty()).unwrap_err())
+        Failure::from(LidarModel::new(&config, &empty()).unwrap_err())
     };
     let bad = refusal("rays_bad.csv");
     assert!(
@@ -173,7 +173,7 @@ fn bad_tables_and_meshes_are_named_with_their_place() {
     let mut config = small(1, 1);
     let mut refusal = |entry: String| {
         config.scene.meshes = vec![entry];
-        Failure::from(Lidar::new(&config, &empty()).unwrap_err())
+        Failure::from(LidarModel::new(&config, &empty()).unwrap_err())
     };
     assert!(
         refusal(format!("{DATA}nowhere.obj 1 2"))
@@ -192,5 +192,8 @@ fn bad_tables_and_meshes_are_named_with_their_place() {
     );
     let mut config = small(1, 1);
     config.lidar.pattern = "abacus".into();
-    assert!(matches!(Lidar::new(&config, &empty()), Err(LidarError::Pattern { .. })));
+    assert!(matches!(
+        LidarModel::new(&config, &empty()),
+        Err(LidarError::Pattern { .. })
+    ));
 }

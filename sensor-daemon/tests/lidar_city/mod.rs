@@ -1,10 +1,10 @@
-//! A dense city to look at: blocks of buildings, half of them not convex, between streets full of moving vehicles and persons; and
-//! the rays of a LIDAR in it in double precision, worked out without the library under test. Shared by tests and `lidar-bench`.
+//! A dense test city: blocks of buildings, half of them not convex, between streets full of moving vehicles and persons. It also holds
+//! the rays of a LIDAR in double precision, computed without the library under test. Tests and `lidar-bench` share it.
 
 #![allow(
     dead_code,
     clippy::unwrap_used,
-    reason = "every user takes what it needs; tests assert by unwrapping"
+    reason = "each test uses a part; tests assert by unwrapping"
 )]
 
 use ipc_schema::{
@@ -49,7 +49,7 @@ pub fn config() -> Config {
     config
 }
 
-/// The same without anything random, and with every return.
+/// The same configuration without random errors, and with every return.
 pub fn exact_config() -> Config {
     let mut config = config();
     config.lidar.range_noise_std_m = 0.0;
@@ -59,7 +59,7 @@ pub fn exact_config() -> Config {
     config
 }
 
-/// How a fleet moves.
+/// Motion of the vehicles.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Moves {
     /// Along the street, upright.

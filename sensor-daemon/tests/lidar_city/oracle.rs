@@ -1,5 +1,5 @@
-//! The same rays through parry3d, in double precision: buildings as one triangle mesh, vehicles as cuboids, persons as cylinders, each
-//! where it is when the ray is fired.
+//! The same rays cast by parry3d, in double precision: buildings as one triangle mesh, vehicles as cuboids, persons as cylinders, each
+//! in its pose at the time of the ray.
 
 use ipc_schema::{
     config::Config,
@@ -19,7 +19,7 @@ use super::TICK_S;
 /// No hit.
 pub const NOTHING: u32 = u32::MAX - 1;
 
-/// What a ray meets.
+/// The hit of a ray.
 #[derive(Debug, Clone, Copy)]
 pub struct Hit {
     pub range_m: f64,
@@ -143,7 +143,7 @@ pub fn rays(config: &Config, state: &VehicleState, steps: &[SubStep]) -> Vec<One
 }
 
 /// The world of a tick.
-pub struct World<'a> {
+pub struct WorldTick<'a> {
     buildings: TriMesh,
     /// Building of each triangle.
     owner: Vec<u32>,
@@ -198,7 +198,7 @@ fn ears(outline: &[[f64; 2]]) -> Vec<[u32; 3]> {
     ears
 }
 
-impl<'a> World<'a> {
+impl<'a> WorldTick<'a> {
     pub fn new(config: &Config, scene: &Scene, states: &'a [VehicleState], steps: &'a [SubStep]) -> Self {
         let (vertices, faces, owner) = triangles(scene);
         let vertices = vertices.iter().map(|[x, y, z]| Vector::new(*x, *y, *z)).collect();
@@ -212,7 +212,7 @@ impl<'a> World<'a> {
         }
     }
 
-    /// What a ray of the carrier in `row` meets first.
+    /// The nearest hit of a ray of the carrier in `row`.
     pub fn cast(&self, ray: &OneRay, row: usize) -> Hit {
         let mut hit = Hit {
             range_m: self.range_m,
@@ -264,7 +264,7 @@ impl<'a> World<'a> {
             return Cylinder::new(0.5 * height, 0.5 * width.max(length)).cast_ray(&pose, ray, self.range_m, false);
         }
         let ahead = 0.5 * length - rear;
-        // Walls are seen from outside: two vehicles of random traffic may overlap, and a sensor be within another's box.
+        // Walls are seen from outside only: two vehicles of random traffic may overlap, and a sensor may be inside another's box.
         let (dx, dy) = (ray.origin.x - x, ray.origin.y - y);
         let (along, left) = (dx * yaw.cos() + dy * yaw.sin() - ahead, dy * yaw.cos() - dx * yaw.sin());
         if along.abs() < 0.5 * length && left.abs() < 0.5 * width && (z..z + height).contains(&ray.origin.z) {
@@ -276,9 +276,9 @@ impl<'a> World<'a> {
     }
 }
 
-/// How a scan compares with the oracle.
+/// Counts of the comparison of scans with the oracle.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Tally {
+pub struct ScanTotals {
     pub rays: usize,
     pub hits: usize,
     /// Same object (or nothing) and range within 1 mm.
@@ -289,7 +289,7 @@ pub struct Tally {
     printed: usize,
 }
 
-impl Tally {
+impl ScanTotals {
     pub fn add(&mut self, other: &Self) {
         self.rays += other.rays;
         self.hits += other.hits;
@@ -304,10 +304,10 @@ fn is_same(range_m: f64, object: u32, hit: &Hit) -> bool {
 }
 
 /// Compares a scan without noise with the oracle, ray by ray.
-pub fn compare(world: &World<'_>, rays: &[OneRay], row: usize, points: &[LidarPoint]) -> Tally {
-    let mut tally = Tally {
+pub fn compare(world: &WorldTick<'_>, rays: &[OneRay], row: usize, points: &[LidarPoint]) -> ScanTotals {
+    let mut tally = ScanTotals {
         rays: rays.len(),
-        ..Tally::default()
+        ..ScanTotals::default()
     };
     let mut rest = points.iter().peekable();
     for ray in rays {
@@ -331,7 +331,7 @@ pub fn compare(world: &World<'_>, rays: &[OneRay], row: usize, points: &[LidarPo
         } else if tally.printed < 5 {
             tally.printed += 1;
             eprintln!(
-                "ours {object:x} at {range_m}, parry {:x} at {}: {ray:?}",
+                "sensor-daemon {object:x} at {range_m}, parry {:x} at {}: {ray:?}",
                 hit.object, hit.range_m
             );
         }
@@ -340,8 +340,8 @@ pub fn compare(world: &World<'_>, rays: &[OneRay], row: usize, points: &[LidarPo
     tally
 }
 
-/// True if a ray that runs 3 mm beside this one at the place of the hit meets what we say, within what such a shift can do.
-fn is_grazing(world: &World<'_>, ray: &OneRay, row: usize, range_m: f64, object: u32) -> bool {
+/// True if a ray shifted by 3 mm at the place of the hit gives our result, within the effect of such a shift.
+fn is_grazing(world: &WorldTick<'_>, ray: &OneRay, row: usize, range_m: f64, object: u32) -> bool {
     let reach_m = if object == NOTHING {
         world.range_m
     } else {

@@ -1,31 +1,31 @@
 //! AVX-512 (F, DQ, BW, VL): sixteen numbers in one register.
 
 #![expect(unsafe_code, reason = "vector instructions: see the module above for why")]
-// That it is sound to use them here: these functions are inlined into code that is compiled for AVX-512F, DQ, BW and VL, and that
-// code is entered only after the processor has said that it has them (`super::super::Path`).
+// Their use is sound: these functions are inlined into code that is compiled for AVX-512 F, DQ, BW and VL, and that code runs only on a
+// processor on which `super::super::ScanPath` has detected them.
 
-use super::{Floats, LANES, LidarPoint, MULTIPLIERS, Simd, WEYL, Words, compact_rows};
+use super::{Floats, LidarPoint, MULTIPLIERS, Simd, WEYL, WIDTH, Words, compact_rows};
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Sub};
 
-/// The AVX-512 make.
+/// The AVX-512 implementation.
 #[derive(Clone, Copy)]
 pub(in super::super) struct Avx512;
 
 /// Sixteen floats.
 #[derive(Clone, Copy)]
-pub(in super::super) struct F(__m512);
+pub(in super::super) struct Avx512Floats(__m512);
 /// Sixteen words.
 #[derive(Clone, Copy)]
-pub(in super::super) struct U(__m512i);
+pub(in super::super) struct Avx512Words(__m512i);
 
 macro_rules! operator {
     ($name:ident, $function:ident, $intrinsic:ident) => {
-        impl $name for F {
+        impl $name for Avx512Floats {
             type Output = Self;
             #[inline(always)]
             fn $function(self, other: Self) -> Self {
-                // SAFETY: AVX-512 is here (above).
+                // SAFETY: AVX-512 is available (see above).
                 Self(unsafe { $intrinsic(self.0, other.0) })
             }
         }
@@ -38,9 +38,9 @@ operator!(Div, div, _mm512_div_ps);
 
 /// Words 0 … 7 of both halves of a Philox word.
 #[inline(always)]
-fn joined(even: __m512i, odd: __m512i) -> U {
-    // SAFETY: AVX-512 is here (above).
-    U(unsafe {
+fn joined(even: __m512i, odd: __m512i) -> Avx512Words {
+    // SAFETY: AVX-512 is available (see above).
+    Avx512Words(unsafe {
         _mm512_inserti64x4::<1>(
             _mm512_castsi256_si512(_mm512_cvtepi64_epi32(even)),
             _mm512_cvtepi64_epi32(odd),
@@ -49,48 +49,48 @@ fn joined(even: __m512i, odd: __m512i) -> U {
 }
 
 impl Simd for Avx512 {
-    type F = F;
-    type U = U;
+    type F = Avx512Floats;
+    type U = Avx512Words;
     type M = u16;
 
     #[inline(always)]
-    fn splat(value: f32) -> F {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
-        F(unsafe { _mm512_set1_ps(value) })
+    fn splat(value: f32) -> Avx512Floats {
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
+        Avx512Floats(unsafe { _mm512_set1_ps(value) })
     }
     #[inline(always)]
-    fn load(from: &Floats) -> F {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
-        F(unsafe { _mm512_load_ps(from.0.as_ptr()) })
+    fn load(from: &Floats) -> Avx512Floats {
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
+        Avx512Floats(unsafe { _mm512_load_ps(from.0.as_ptr()) })
     }
     #[inline(always)]
-    fn store(value: F, to: &mut Floats) {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
+    fn store(value: Avx512Floats, to: &mut Floats) {
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
         unsafe { _mm512_store_ps(to.0.as_mut_ptr(), value.0) }
     }
     #[inline(always)]
-    fn sqrt(value: F) -> F {
-        // SAFETY: AVX-512 is here (above).
-        F(unsafe { _mm512_sqrt_ps(value.0) })
+    fn sqrt(value: Avx512Floats) -> Avx512Floats {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Floats(unsafe { _mm512_sqrt_ps(value.0) })
     }
     #[inline(always)]
-    fn max(a: F, b: F) -> F {
-        // SAFETY: AVX-512 is here (above).
-        F(unsafe { _mm512_max_ps(a.0, b.0) })
+    fn max(a: Avx512Floats, b: Avx512Floats) -> Avx512Floats {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Floats(unsafe { _mm512_max_ps(a.0, b.0) })
     }
     #[inline(always)]
-    fn min(a: F, b: F) -> F {
-        // SAFETY: AVX-512 is here (above).
-        F(unsafe { _mm512_min_ps(a.0, b.0) })
+    fn min(a: Avx512Floats, b: Avx512Floats) -> Avx512Floats {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Floats(unsafe { _mm512_min_ps(a.0, b.0) })
     }
     #[inline(always)]
-    fn lt(a: F, b: F) -> u16 {
-        // SAFETY: AVX-512 is here (above).
+    fn lt(a: Avx512Floats, b: Avx512Floats) -> u16 {
+        // SAFETY: AVX-512 is available (see above).
         unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a.0, b.0) }
     }
     #[inline(always)]
-    fn le(a: F, b: F) -> u16 {
-        // SAFETY: AVX-512 is here (above).
+    fn le(a: Avx512Floats, b: Avx512Floats) -> u16 {
+        // SAFETY: AVX-512 is available (see above).
         unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(a.0, b.0) }
     }
     #[inline(always)]
@@ -110,104 +110,104 @@ impl Simd for Avx512 {
         bits as u16
     }
     #[inline(always)]
-    fn select(mask: u16, yes: F, no: F) -> F {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
-        F(unsafe { _mm512_mask_blend_ps(mask, no.0, yes.0) })
+    fn select(mask: u16, yes: Avx512Floats, no: Avx512Floats) -> Avx512Floats {
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
+        Avx512Floats(unsafe { _mm512_mask_blend_ps(mask, no.0, yes.0) })
     }
     #[inline(always)]
-    fn store_where(mask: u16, value: F, to: &mut Floats) {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
+    fn store_where(mask: u16, value: Avx512Floats, to: &mut Floats) {
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
         unsafe { _mm512_mask_store_ps(to.0.as_mut_ptr(), mask, value.0) }
     }
     #[inline(always)]
     fn store_words_where(mask: u16, value: u32, to: &mut Words) {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
         unsafe { _mm512_mask_store_epi32(to.0.as_mut_ptr().cast(), mask, _mm512_set1_epi32(value as i32)) }
     }
     #[inline(always)]
-    fn largest(value: F) -> f32 {
-        // SAFETY: AVX-512 is here (above).
+    fn largest(value: Avx512Floats) -> f32 {
+        // SAFETY: AVX-512 is available (see above).
         unsafe {
             let half = _mm256_max_ps(_mm512_castps512_ps256(value.0), _mm512_extractf32x8_ps::<1>(value.0));
             super::avx2::largest_of_8(half)
         }
     }
     #[inline(always)]
-    fn splat_words(value: u32) -> U {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
-        U(unsafe { _mm512_set1_epi32(value as i32) })
+    fn splat_words(value: u32) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
+        Avx512Words(unsafe { _mm512_set1_epi32(value as i32) })
     }
     #[inline(always)]
-    fn load_words(from: &Words) -> U {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
-        U(unsafe { _mm512_load_si512(from.0.as_ptr().cast()) })
+    fn load_words(from: &Words) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
+        Avx512Words(unsafe { _mm512_load_si512(from.0.as_ptr().cast()) })
     }
     #[inline(always)]
-    fn store_words(value: U, to: &mut Words) {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
+    fn store_words(value: Avx512Words, to: &mut Words) {
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
         unsafe { _mm512_store_si512(to.0.as_mut_ptr().cast(), value.0) }
     }
     #[inline(always)]
-    fn and(a: U, b: U) -> U {
-        // SAFETY: AVX-512 is here (above).
-        U(unsafe { _mm512_and_si512(a.0, b.0) })
+    fn and(a: Avx512Words, b: Avx512Words) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Words(unsafe { _mm512_and_si512(a.0, b.0) })
     }
     #[inline(always)]
-    fn or(a: U, b: U) -> U {
-        // SAFETY: AVX-512 is here (above).
-        U(unsafe { _mm512_or_si512(a.0, b.0) })
+    fn or(a: Avx512Words, b: Avx512Words) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Words(unsafe { _mm512_or_si512(a.0, b.0) })
     }
     #[inline(always)]
-    fn xor(a: U, b: U) -> U {
-        // SAFETY: AVX-512 is here (above).
-        U(unsafe { _mm512_xor_si512(a.0, b.0) })
+    fn xor(a: Avx512Words, b: Avx512Words) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Words(unsafe { _mm512_xor_si512(a.0, b.0) })
     }
     #[inline(always)]
-    fn plus(a: U, b: U) -> U {
-        // SAFETY: AVX-512 is here (above).
-        U(unsafe { _mm512_add_epi32(a.0, b.0) })
+    fn plus(a: Avx512Words, b: Avx512Words) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Words(unsafe { _mm512_add_epi32(a.0, b.0) })
     }
     #[inline(always)]
-    fn minus(a: U, b: U) -> U {
-        // SAFETY: AVX-512 is here (above).
-        U(unsafe { _mm512_sub_epi32(a.0, b.0) })
+    fn minus(a: Avx512Words, b: Avx512Words) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Words(unsafe { _mm512_sub_epi32(a.0, b.0) })
     }
     #[inline(always)]
-    fn left<const N: u32>(a: U) -> U {
-        // SAFETY: AVX-512 is here (above).
-        U(unsafe { _mm512_slli_epi32::<N>(a.0) })
+    fn left<const N: u32>(a: Avx512Words) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Words(unsafe { _mm512_slli_epi32::<N>(a.0) })
     }
     #[inline(always)]
-    fn right<const N: u32>(a: U) -> U {
-        // SAFETY: AVX-512 is here (above).
-        U(unsafe { _mm512_srli_epi32::<N>(a.0) })
+    fn right<const N: u32>(a: Avx512Words) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Words(unsafe { _mm512_srli_epi32::<N>(a.0) })
     }
     #[inline(always)]
-    fn equal(a: U, b: U) -> u16 {
-        // SAFETY: AVX-512 is here (above).
+    fn equal(a: Avx512Words, b: Avx512Words) -> u16 {
+        // SAFETY: AVX-512 is available (see above).
         unsafe { _mm512_cmpeq_epi32_mask(a.0, b.0) }
     }
     #[inline(always)]
-    fn words(value: F) -> U {
-        // SAFETY: AVX-512 is here (above).
-        U(unsafe { _mm512_castps_si512(value.0) })
+    fn words(value: Avx512Floats) -> Avx512Words {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Words(unsafe { _mm512_castps_si512(value.0) })
     }
     #[inline(always)]
-    fn floats(value: U) -> F {
-        // SAFETY: AVX-512 is here (above).
-        F(unsafe { _mm512_castsi512_ps(value.0) })
+    fn floats(value: Avx512Words) -> Avx512Floats {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Floats(unsafe { _mm512_castsi512_ps(value.0) })
     }
     #[inline(always)]
-    fn from_signed(value: U) -> F {
-        // SAFETY: AVX-512 is here (above).
-        F(unsafe { _mm512_cvtepi32_ps(value.0) })
+    fn from_signed(value: Avx512Words) -> Avx512Floats {
+        // SAFETY: AVX-512 is available (see above).
+        Avx512Floats(unsafe { _mm512_cvtepi32_ps(value.0) })
     }
 
     /// Eight counters in each register, a word in the lower half of 64 bits: products need no shuffling, and what stands in the upper
     /// halves never matters.
     #[inline(always)]
-    fn philox(first: u32, rest: [u32; 3], key: [u32; 2]) -> [U; 4] {
-        // SAFETY: AVX-512 is here (above); the pointer is that of a reference to as many aligned numbers.
+    fn philox(first: u32, rest: [u32; 3], key: [u32; 2]) -> [Avx512Words; 4] {
+        // SAFETY: AVX-512 is available (see above); the pointer is that of a reference to as many aligned numbers.
         unsafe {
             let splat = |word: u32| _mm512_set1_epi64(i64::from(word));
             let step = _mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0);
@@ -247,16 +247,16 @@ impl Simd for Avx512 {
     }
 
     #[inline(always)]
-    fn compact(words: [U; 8], keep: u32, points: &mut [LidarPoint], cursor: usize) -> usize {
-        if cursor + LANES > points.len() {
-            let mut rows = [[0_u32; LANES]; 8];
+    fn compact(words: [Avx512Words; 8], keep: u32, points: &mut [LidarPoint], cursor: usize) -> usize {
+        if cursor + WIDTH > points.len() {
+            let mut rows = [[0_u32; WIDTH]; 8];
             for (row, word) in rows.iter_mut().zip(words) {
-                // SAFETY: AVX-512 is here (above); a row has room for sixteen words.
+                // SAFETY: AVX-512 is available (see above); a row has room for sixteen words.
                 unsafe { _mm512_storeu_si512(row.as_mut_ptr().cast(), word.0) };
             }
             return compact_rows(&rows, keep, points, cursor);
         }
-        // SAFETY: AVX-512 is here (above); rows are written within `points`, whose end has been compared with `cursor`.
+        // SAFETY: AVX-512 is available (see above); rows are written within `points`, whose end has been compared with `cursor`.
         unsafe {
             // Sixteen rows fit behind the cursor, which moves on by at most one after each of them.
             let [first, second] = [
@@ -288,12 +288,12 @@ impl Simd for Avx512 {
     }
 }
 
-/// Four words of sixteen lanes as rows of four: part `p` of result `k` is lane `4 p + k`.
+/// Four words of sixteen elements as rows of four: part `p` of result `k` is element `4 p + k`.
 #[inline(always)]
-unsafe fn transposed(words: [U; 4]) -> [__m512i; 4] {
-    // SAFETY: AVX-512 is here (above).
+unsafe fn transposed(words: [Avx512Words; 4]) -> [__m512i; 4] {
+    // SAFETY: AVX-512 is available (see above).
     unsafe {
-        let [U(a), U(b), U(c), U(d)] = words;
+        let [Avx512Words(a), Avx512Words(b), Avx512Words(c), Avx512Words(d)] = words;
         let (ab_low, ab_high) = (_mm512_unpacklo_epi32(a, b), _mm512_unpackhi_epi32(a, b));
         let (cd_low, cd_high) = (_mm512_unpacklo_epi32(c, d), _mm512_unpackhi_epi32(c, d));
         [

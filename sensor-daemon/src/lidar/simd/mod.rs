@@ -1,8 +1,8 @@
-//! Sixteen numbers at a time, in three makes: AVX-512, AVX2, and arrays that every processor can do.
+//! Sixteen numbers at a time, in three implementations: AVX-512, AVX2, and arrays for any processor.
 //!
 //! Every operation is an IEEE operation rounded once (no fused multiply-add, no approximate reciprocals), so all three give the same
-//! bits; the tests of [`super`] compare whole scans. Intrinsics and not plain loops, because the loops of these kernels mix
-//! comparisons, masks and 64-bit products, which the compiler turns into scalar code.
+//! bits; the tests of [`super`] compare whole scans. Intrinsics are used instead of plain loops, because these kernels mix comparisons,
+//! masks and 64-bit products, which the compiler turns into scalar code.
 
 use std::ops::{Add, Div, Mul, Sub};
 
@@ -15,37 +15,37 @@ pub(super) mod avx512;
 pub(super) mod plain;
 
 /// Numbers side by side.
-pub(super) const LANES: usize = 16;
+pub(super) const WIDTH: usize = 16;
 
 /// Sixteen numbers in memory, on a cache line of their own.
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Floats(pub(super) [f32; LANES]);
+pub(super) struct Floats(pub(super) [f32; WIDTH]);
 
 /// Sixteen whole numbers in memory.
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Words(pub(super) [u32; LANES]);
+pub(super) struct Words(pub(super) [u32; WIDTH]);
 
 impl Floats {
-    pub(super) const ZERO: Self = Self([0.0; LANES]);
+    pub(super) const ZERO: Self = Self([0.0; WIDTH]);
 }
 
 impl Words {
-    pub(super) const ZERO: Self = Self([0; LANES]);
+    pub(super) const ZERO: Self = Self([0; WIDTH]);
 }
 
 /// Multipliers and key steps of Philox4x32 (Salmon et al., SC 2011).
 pub(super) const MULTIPLIERS: [u32; 2] = [0xD251_1F53, 0xCD9E_8D57];
 pub(super) const WEYL: [u32; 2] = [0x9E37_79B9, 0xBB67_AE85];
 
-/// What the kernels are written in.
+/// Operations of the kernels on sixteen numbers.
 pub(super) trait Simd: Copy {
     /// Sixteen `f32`.
     type F: Copy + Add<Output = Self::F> + Sub<Output = Self::F> + Mul<Output = Self::F> + Div<Output = Self::F>;
     /// Sixteen `u32`.
     type U: Copy;
-    /// Sixteen yes or no.
+    /// Sixteen truth values.
     type M: Copy;
 
     fn splat(value: f32) -> Self::F;
@@ -64,11 +64,11 @@ pub(super) trait Simd: Copy {
     fn mask(bits: u32) -> Self::M;
     /// `mask ? yes : no`
     fn select(mask: Self::M, yes: Self::F, no: Self::F) -> Self::F;
-    /// Stores the lanes of the mask.
+    /// Stores the elements of the mask.
     fn store_where(mask: Self::M, value: Self::F, to: &mut Floats);
-    /// Stores `value` in the lanes of the mask.
+    /// Stores `value` in the elements of the mask.
     fn store_words_where(mask: Self::M, value: u32, to: &mut Words);
-    /// Largest of all lanes.
+    /// Largest of all elements.
     fn largest(value: Self::F) -> f32;
 
     fn splat_words(value: u32) -> Self::U;
@@ -88,24 +88,24 @@ pub(super) trait Simd: Copy {
     fn floats(value: Self::U) -> Self::F;
     /// Signed whole numbers as floats.
     fn from_signed(value: Self::U) -> Self::F;
-    /// Philox4x32-10 of counters `[first + lane, rest…]`.
+    /// Philox4x32-10 of counters `[first + element, rest…]`.
     fn philox(first: u32, rest: [u32; 3], key: [u32; 2]) -> [Self::U; 4];
-    /// Writes the points of the lanes in `keep`, in order, from `cursor` on; the new cursor.
+    /// Writes the points of the elements in `keep`, in order, from `cursor` on and returns the new cursor.
     fn compact(words: [Self::U; 8], keep: u32, points: &mut [LidarPoint], cursor: usize) -> usize;
 }
 
-/// Rows of the lanes in `keep` from memory: the way every processor can go, and the end of the buffer.
+/// Writes the rows of the elements in `keep` from memory: for any processor, and at the end of the buffer.
 pub(super) fn compact_rows(
-    words: &[[u32; LANES]; 8],
+    words: &[[u32; WIDTH]; 8],
     keep: u32,
     points: &mut [LidarPoint],
     mut cursor: usize,
 ) -> usize {
-    for lane in (0..LANES).filter(|lane| keep >> lane & 1 == 1) {
+    for element in (0..WIDTH).filter(|element| keep >> element & 1 == 1) {
         let Some(point) = points.get_mut(cursor) else {
             return cursor;
         };
-        let row: [u32; 8] = std::array::from_fn(|word| words[word][lane]);
+        let row: [u32; 8] = std::array::from_fn(|word| words[word][element]);
         *point = bytemuck::must_cast(row);
         cursor += 1;
     }
