@@ -6,7 +6,7 @@
 use std::time::Instant;
 
 use ipc_schema::header::MessageHeader;
-use sensor_daemon::journal::Journal;
+use sensor_daemon::delivery::journal::Journal;
 
 const TICKS: u32 = 100_000;
 const MESSAGE_BYTES: usize = 12_000;

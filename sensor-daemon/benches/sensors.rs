@@ -18,10 +18,10 @@ use ipc_schema::{
     world::{SubStep, VehicleState},
 };
 use sensor_daemon::{
-    imu::{ImuModel, ImuMotion},
     noise::NormalDraws,
-    normals::BATCH,
+    noise::normals::BATCH,
     sensing::{Sensing, WorldTick},
+    sensors::imu::{ImuModel, ImuMotion},
     wide::VectorPath,
 };
 
@@ -160,7 +160,7 @@ fn imu_alone(config: &Config) -> f64 {
     let start = Instant::now();
     for run in 0..RUNS {
         draws.clear();
-        unit.plan(&mut draws, run * SUB_STEPS as u32);
+        unit.plan(&mut draws, run);
         draws.draw(1, &ids);
         for (member, walk) in walks.iter_mut().enumerate() {
             unit.sample(VectorPath::widest(), &body, draws.of(member), walk, &mut out);

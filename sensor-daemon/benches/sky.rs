@@ -5,8 +5,8 @@
 
 use std::{hint::black_box, sync::Arc, time::Instant};
 
-use sensor_daemon::gnss::SatelliteSky as _;
-use sensor_daemon::sky::SkyMap;
+use sensor_daemon::sensors::gnss::SatelliteSky as _;
+use sensor_daemon::sensors::sky::SkyMap;
 use sim_core::{
     geodesy::Geodetic,
     scene::{Prism, Road, Scene, SolidClass},

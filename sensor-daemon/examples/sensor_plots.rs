@@ -30,10 +30,10 @@ use ipc_schema::{
     world::{SubStep, VehicleState},
 };
 use sensor_daemon::{
-    gnss::{SatelliteSky as _, SkyView},
-    lidar::{LidarModel, ScanScratch, Targets},
     sensing::{Sensing, WorldTick},
-    sky::{
+    sensors::gnss::{SatelliteSky as _, SkyView},
+    sensors::lidar::{LidarModel, ScanScratch, Targets},
+    sensors::sky::{
         ANTENNA_M, MOST_EXTRA_PATH_M, SkyMap,
         constellation::SkyObserver,
         horizon::{CellSky, PlacedSatellite, SECTORS, Skyline},

@@ -2,21 +2,23 @@
 
 use ipc_schema::sensor::SensorKind;
 
-use crate::{blackout::BlackoutPhase, fields::SensorReadings, imu, speed_steering::SpeedSteeringScales};
+use crate::{
+    blackout::BlackoutPhase,
+    observation::fields::SensorReadings,
+    sensors::{gnss::GnssState, imu::ImuAxes, speed_steering::SpeedSteeringScales},
+};
 
 /// State of one road user's sensors. Every trajectory begins with a new one.
 #[derive(Debug, Clone)]
 pub struct SensorCarrier {
     /// Newest samples, their ages, and the sensors that deliver.
     pub readings: SensorReadings,
-    /// Correlated error of the GNSS receiver, unit variance.
-    pub correlated: [f32; 3],
+    /// State of the GNSS receiver.
+    pub gnss: GnssState,
     /// Random walk of the IMU's biases so far.
-    pub walk: imu::ImuAxes,
+    pub walk: ImuAxes,
     /// Constant scale factors of its speed and steering angle.
     pub scales: SpeedSteeringScales,
-    /// Factor on the errors of its GNSS receiver.
-    pub gnss_factor: f64,
     /// Position of each sensor in its sequence of blackouts.
     pub phases: [BlackoutPhase; SensorKind::COUNT],
     /// Step of the newest sample of each sensor.
@@ -27,8 +29,6 @@ pub struct SensorCarrier {
     pub off: u32,
     /// Sensors that have delivered at least once.
     pub known: u32,
-    /// The receiver had enough satellites at its last sample.
-    pub has_fix: bool,
     /// The trajectory has had a valid observation.
     pub is_seen: bool,
 }
@@ -36,22 +36,20 @@ pub struct SensorCarrier {
 impl SensorCarrier {
     /// A carrier with the sensors `present`, without any sample.
     #[must_use]
-    pub fn new(present: u32, scales: SpeedSteeringScales, gnss_factor: f64, no_object_m: f32) -> Self {
+    pub fn new(present: u32, gnss: GnssState, walk: ImuAxes, scales: SpeedSteeringScales, no_object_m: f32) -> Self {
         Self {
             readings: SensorReadings {
                 objects_m: [[no_object_m; 2]; 4],
                 ..SensorReadings::default()
             },
-            correlated: [0.0; 3],
-            walk: [0.0; 8],
+            gnss,
+            walk,
             scales,
-            gnss_factor,
             phases: [BlackoutPhase::default(); SensorKind::COUNT],
             sampled: [0; SensorKind::COUNT],
             present,
             off: 0,
             known: 0,
-            has_fix: true,
             is_seen: false,
         }
     }
@@ -76,7 +74,7 @@ impl SensorCarrier {
     /// Sets the ages and the delivering sensors at `step`, with ticks of `tick_s`. A sensor that the carrier lacks has age 0 s.
     #[inline(always)]
     pub fn update_ages(&mut self, step: u32, tick_s: f64) {
-        let fix = if self.has_fix {
+        let fix = if self.gnss.has_fix {
             u32::MAX
         } else {
             !SensorKind::Gnss.bit()

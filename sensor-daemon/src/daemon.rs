@@ -25,11 +25,11 @@ use sim_core::{
 
 use crate::{
     delivery::Delivery,
-    digest::ObservationDigest,
-    handover::HandoverFigures,
+    delivery::digest::ObservationDigest,
+    delivery::handover::HandoverFigures,
     scanning::{LidarScanning, ScanTotals},
     sensing::{Sensing, WorldTick},
-    sky::SkyMap,
+    sensors::sky::SkyMap,
 };
 
 /// The part of the run's report that this process writes.

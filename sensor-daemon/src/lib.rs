@@ -1,6 +1,6 @@
 //! Samples the sensors of connected vehicles and assembles their values into observations.
 //!
-//! The sensors and [`sensing::Sensing`] are pure functions without clock, I/O or shared memory. The process is a thin shell around
+//! The [`sensors`] and [`sensing::Sensing`] are pure functions without clock, I/O or shared memory. The process is a thin shell around
 //! them: [`daemon`] receives `world` and publishes `observation`, and [`delivery`] sends observations to the trainer.
 
 // Sensor values are published in single precision, the precision of the wire (`ipc_schema::observation`).
@@ -10,26 +10,16 @@ pub mod blackout;
 pub mod carrier;
 pub mod daemon;
 pub mod delivery;
-pub mod digest;
-pub mod fields;
-pub mod gnss;
-pub mod handover;
-pub mod history;
-pub mod imu;
-pub mod journal;
-pub mod lidar;
 pub mod noise;
-pub mod normals;
+pub mod observation;
 #[cfg(test)]
 #[path = "../../sim-core/tests/common/preset.rs"]
 mod preset;
 pub mod region;
 pub mod scanning;
-pub mod sections;
 pub mod sensing;
-pub mod sky;
-pub mod slots;
-pub mod speed_steering;
+pub mod sensors;
 pub mod suite;
 pub mod switches;
+pub mod tick;
 pub mod wide;

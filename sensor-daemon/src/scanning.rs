@@ -16,8 +16,8 @@ use serde::Serialize;
 use sim_core::scene::Scene;
 
 use crate::{
-    lidar::{LidarModel, ScanScratch, Targets, nearest_objects},
     sensing::Sensing,
+    sensors::lidar::{LidarModel, ScanScratch, Targets, nearest_objects},
 };
 
 /// Counts of LIDAR scans for the run's report.

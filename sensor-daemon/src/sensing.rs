@@ -14,16 +14,17 @@ use sim_core::geodesy::{GeodesyError, Projection};
 
 use crate::{
     carrier::SensorCarrier,
-    fields::Normaliser,
-    gnss::SatelliteSky,
-    history::{FrameHistory, TrajectoryFrame},
+    noise::normals::BATCH,
     noise::{DrawnNormals, NormalDraws},
-    normals::BATCH,
+    observation::fields::Normaliser,
+    observation::history::{FrameHistory, TrajectoryFrame},
+    observation::sections::ObservationSections,
+    observation::slots::Slots,
     region::SensedRegion,
-    sections::ObservationSections,
-    slots::Slots,
-    suite::{SensorSuite, TickMotion, TickTime},
+    sensors::gnss::SatelliteSky,
+    suite::SensorSuite,
     switches::SensorSwitches,
+    tick::{TickMotion, TickTime},
 };
 
 /// Sum of the raw GNSS error over all fixes.

@@ -2,60 +2,36 @@
 
 use ipc_schema::{
     config::Config,
-    sensor::{NoiseStream, SENSORS, SensorCarriers, SensorKind},
+    sensor::{SENSORS, SensorCarriers, SensorKind},
     traffic::Kind,
-    world::{SubStep, VehicleState},
+    world::VehicleState,
 };
 use sim_core::geodesy::{GeodesyError, Projection};
 
 use crate::{
     blackout::BlackoutSchedule,
     carrier::SensorCarrier,
-    gnss::{self, GnssReceiver, SatelliteSky, SkyView},
-    imu::{self, ImuModel},
-    noise::{DrawnNormals, NormalDraws, RandomStream},
-    normals::NormalBlock,
-    speed_steering::{self, SpeedSteeringScales},
+    noise::{DrawnNormals, NormalDraws, normals::NormalBlock},
+    sensors::{
+        gnss::{GnssReceiver, SatelliteSky, SkyView},
+        imu::{ImuModel, ImuMotion, ImuSample},
+        speed_steering::SpeedSteeringModel,
+    },
+    tick::{TickMotion, TickTime},
     wide::VectorPath,
 };
 
-/// The time of a tick, as noise and blackouts use it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct TickTime {
-    /// Seed of the episode.
-    pub episode_seed: u64,
-    /// Ticks since the start of the episode: a vehicle that leaves and returns draws new noise.
-    pub tick: u32,
-    /// Time of the episode, nanoseconds.
-    pub time_ns: u64,
-}
-
-/// One road user's motion over a tick.
-#[derive(Debug, Clone, Copy)]
-pub struct TickMotion<'a> {
-    /// At the end of the tick.
-    pub state: &'a VehicleState,
-    /// Sub-steps, at least one.
-    pub rows: &'a [SubStep],
-    /// Ticks since the road user took its slot.
-    pub step: u32,
-}
-
 /// Sensors as configured.
 pub struct SensorSuite {
-    receiver: GnssReceiver,
+    gnss: GnssReceiver,
     sky: Option<Box<dyn SatelliteSky>>,
-    unit: ImuModel,
-    speed_steering: ipc_schema::config::SpeedSteering,
-    speed_steering_noise: bool,
-    steering_ratio: f64,
+    imu: ImuModel,
+    speed_steering: SpeedSteeringModel,
     schedules: [Option<BlackoutSchedule>; SensorKind::COUNT],
     /// Ticks between two samples of each sensor.
     periods: [u32; SensorKind::COUNT],
-    imu_samples: u32,
     lidars: usize,
     lidar_range_m: f32,
-    pedestrian_factor: f64,
     tick_s: f64,
     path: VectorPath,
 }
@@ -74,20 +50,15 @@ impl SensorSuite {
         // Validated to be whole numbers of ticks.
         let ticks =
             |period_s: f64| ((period_s / config.run.tick_s).round() as i64).clamp(1, i64::from(u32::MAX)) as u32;
-        let samples = config.imu_samples();
         Ok(Self {
-            receiver: GnssReceiver::new(&config.gnss, projection, bounds_m)?,
+            gnss: GnssReceiver::new(&config.gnss, projection, bounds_m)?,
             sky: None,
-            unit: ImuModel::new(&config.imu, samples),
-            speed_steering_noise: speed_steering::has_noise(&config.speed_steering),
-            speed_steering: config.speed_steering.clone(),
-            steering_ratio: config.vehicle.steering_ratio,
+            imu: ImuModel::new(&config.imu, config.imu_samples()),
+            speed_steering: SpeedSteeringModel::new(&config.speed_steering, config.vehicle.steering_ratio),
             schedules: schedules(config, tick_ns),
             periods: SENSORS.map(|spec| ticks((spec.period_s)(config))),
-            imu_samples: u32::try_from(samples).unwrap_or(u32::MAX),
             lidars: config.lidar.vehicles as usize,
             lidar_range_m: config.lidar.range_m as f32,
-            pedestrian_factor: config.gnss.pedestrian_noise_factor,
             tick_s: config.run.tick_s,
             path: VectorPath::widest(),
         })
@@ -120,14 +91,13 @@ impl SensorSuite {
         };
         let present = SensorKind::ALL.into_iter().filter(|kind| carries(*kind));
         let present = present.fold(0, |bits, kind| bits | kind.bit());
-        let factor = if is_person { self.pedestrian_factor } else { 1.0 };
-        let stream = RandomStream {
-            episode_seed: now.episode_seed,
-            id_hash: state.id_hash,
-            sensor: NoiseStream::Scale,
-        };
-        let scales = SpeedSteeringScales::new(&self.speed_steering, &stream.normals(0));
-        let mut carrier = SensorCarrier::new(present, scales, factor, self.lidar_range_m);
+        let mut carrier = SensorCarrier::new(
+            present,
+            self.gnss.begin(is_person),
+            ImuModel::begin(),
+            self.speed_steering.begin(now.episode_seed, state.id_hash),
+            self.lidar_range_m,
+        );
         for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
             if let Some(schedule) = schedule {
                 *phase = schedule.begin(now.episode_seed, state.id_hash, now.tick, now.time_ns);
@@ -148,16 +118,9 @@ impl SensorSuite {
 
     /// Plans the random numbers that [`SensorSuite::sample`] takes at this tick, in the order in which it takes them.
     pub fn plan(&self, draws: &mut NormalDraws, now: &TickTime) {
-        if self.receiver.has_white_noise() {
-            draws.plan(NoiseStream::Gnss, now.tick);
-        }
-        if self.receiver.has_correlated_noise() {
-            draws.plan(NoiseStream::GnssCorrelated, now.tick);
-        }
-        if self.speed_steering_noise {
-            draws.plan(NoiseStream::SpeedSteering, now.tick);
-        }
-        self.unit.plan(draws, now.tick.wrapping_mul(self.imu_samples));
+        self.gnss.plan(draws, now.tick);
+        self.speed_steering.plan(draws, now.tick);
+        self.imu.plan(draws, now.tick);
     }
 
     /// True if the sensor samples at this step of its carrier; the first step samples everything.
@@ -176,28 +139,17 @@ impl SensorSuite {
         motion: &TickMotion,
         now: &TickTime,
         mut drawn: DrawnNormals,
-        out: &mut [imu::ImuSample],
+        out: &mut [ImuSample],
     ) {
         let (step, awake) = (motion.step, carrier.awake());
-        let normals = [
-            self.receiver.has_white_noise(),
-            self.receiver.has_correlated_noise(),
-            self.speed_steering_noise,
-        ]
-        .map(|is_planned| drawn.take(is_planned));
+        // The numbers of every sensor are taken, whether it is due or not.
+        let [white, fresh] = self.gnss.take(&mut drawn);
+        let odometer = self.speed_steering.take(&mut drawn);
         if self.is_due(SensorKind::Gnss, step) {
-            self.sample_gnss(
-                carrier,
-                motion,
-                now,
-                SensorKind::Gnss.is_in(awake),
-                [&normals[0], &normals[1]],
-            );
+            self.sample_gnss(carrier, motion, now, SensorKind::Gnss.is_in(awake), [&white, &fresh]);
         }
         if self.is_due(SensorKind::SpeedSteering, step) && SensorKind::SpeedSteering.is_in(awake) {
-            let (params, ratio) = (&self.speed_steering, self.steering_ratio);
-            carrier.readings.speed_steering =
-                speed_steering::sample(params, ratio, &carrier.scales, motion.state, &normals[2]);
+            carrier.readings.speed_steering = self.speed_steering.sample(&carrier.scales, motion.state, &odometer);
             carrier.record(SensorKind::SpeedSteering, step);
         }
         self.sample_imu(carrier, motion, SensorKind::Imu.is_in(awake), drawn, out);
@@ -214,33 +166,15 @@ impl SensorSuite {
         motion: &TickMotion,
         now: &TickTime,
         is_awake: bool,
-        [white, fresh]: [&NormalBlock; 2],
+        normals: [&NormalBlock; 2],
     ) {
-        carrier.correlated = if motion.step == 0 {
-            [fresh[0], fresh[1], fresh[2]]
-        } else {
-            self.receiver.correlated(carrier.correlated, fresh)
+        let view = |[x_m, y_m, z_m]: [f64; 3]| {
+            let time_s = now.time_ns as f64 * 1e-9;
+            let sky = self.sky.as_ref();
+            sky.map_or_else(SkyView::default, |sky| sky.at(x_m, y_m, z_m, time_s))
         };
-        if !is_awake {
-            return;
-        }
-        let state = motion.state;
-        let place_m = [state.x_m, state.y_m, state.z_m];
-        let time_s = now.time_ns as f64 * 1e-9;
-        let view = self.sky.as_ref().map_or_else(SkyView::default, |sky| {
-            sky.at(place_m[0], place_m[1], place_m[2], time_s)
-        });
-        carrier.has_fix = view.has_fix;
-        if view.has_fix {
-            carrier.readings.fix = self.receiver.fix(
-                place_m,
-                &gnss::GnssErrors {
-                    white,
-                    correlated: &carrier.correlated,
-                    view: &view,
-                    factor: carrier.gnss_factor,
-                },
-            );
+        if let Some(fix) = self.gnss.sample(&mut carrier.gnss, motion, is_awake, normals, view) {
+            carrier.readings.fix = fix;
             carrier.record(SensorKind::Gnss, motion.step);
         }
     }
@@ -252,14 +186,14 @@ impl SensorSuite {
         motion: &TickMotion,
         is_awake: bool,
         drawn: DrawnNormals,
-        out: &mut [imu::ImuSample],
+        out: &mut [ImuSample],
     ) {
         if self.is_due(SensorKind::Imu, motion.step) {
-            let body = imu::ImuMotion {
+            let body = ImuMotion {
                 yaw_rad: motion.state.yaw_rad,
                 rows: motion.rows,
             };
-            self.unit.sample(self.path, &body, drawn, &mut carrier.walk, out);
+            self.imu.sample(self.path, &body, drawn, &mut carrier.walk, out);
             if is_awake && let Some(newest) = out.last() {
                 carrier.readings.imu = *newest;
                 carrier.record(SensorKind::Imu, motion.step);

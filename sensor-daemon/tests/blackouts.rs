@@ -10,7 +10,7 @@ use ipc_schema::{
     observation::{CLIPPED, VALID},
     traffic::Kind,
 };
-use sensor_daemon::gnss::{SatelliteSky, SkyView};
+use sensor_daemon::sensors::gnss::{SatelliteSky, SkyView};
 
 const GNSS: u32 = SensorKind::Gnss.bit();
 const IMU: u32 = SensorKind::Imu.bit();

@@ -10,7 +10,7 @@ use lidar_city::{
     oracle::{ScanTotals, WorldTick, compare, rays},
     scene, traffic,
 };
-use sensor_daemon::lidar::{LidarModel, ScanScratch, Targets};
+use sensor_daemon::sensors::lidar::{LidarModel, ScanScratch, Targets};
 
 /// One scan of each of `carriers` against parry.
 fn tally(moves: Moves, is_rolling: bool, lean: [f64; 2], carriers: std::ops::Range<usize>) -> ScanTotals {

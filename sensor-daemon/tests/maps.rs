@@ -11,8 +11,8 @@ use ipc_schema::{
     run::MapInfo,
 };
 use sensor_daemon::{
-    gnss::{SatelliteSky, SkyView},
     sensing::Sensing,
+    sensors::gnss::{SatelliteSky, SkyView},
 };
 use sim_core::geodesy::{NetPosition, Projection};
 

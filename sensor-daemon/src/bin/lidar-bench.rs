@@ -22,7 +22,7 @@ use ipc_schema::{
     pointcloud::{LidarPoint, Scan},
     world::{SubStep, VehicleState},
 };
-use sensor_daemon::lidar::{LidarModel, ScanPath, ScanScratch, Targets};
+use sensor_daemon::sensors::lidar::{LidarModel, ScanPath, ScanScratch, Targets};
 use sim_core::scene::Scene;
 
 #[path = "../../tests/lidar_city/mod.rs"]

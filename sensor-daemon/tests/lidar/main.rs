@@ -7,7 +7,7 @@ use ipc_schema::pointcloud::{LidarPoint, Scan};
 use ipc_schema::traffic::Kind;
 use ipc_schema::world::{SubStep, VehicleState};
 use lidar_city::exact_config;
-use sensor_daemon::lidar::{LidarModel, ScanScratch, Targets};
+use sensor_daemon::sensors::lidar::{LidarModel, ScanScratch, Targets};
 use sim_core::scene::{Prism, Road, Scene, SolidClass};
 
 mod disturbances;

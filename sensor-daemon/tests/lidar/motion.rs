@@ -4,7 +4,7 @@ use crate::{azimuth, car, empty, rectangle, scan, scan_with, small};
 use ipc_schema::config::LidarAxes;
 use ipc_schema::pointcloud::STATIC_OBJECT;
 use ipc_schema::world::SubStep;
-use sensor_daemon::lidar::LidarModel;
+use sensor_daemon::sensors::lidar::LidarModel;
 use sim_core::scene::{Road, Scene};
 
 /// Figure 3: y backward, x left, z down. A car 10 m ahead is at y = −10; equation 4 with the heading brings (−y, x) into the world.

@@ -8,7 +8,7 @@ use ipc_schema::props::Obstacle;
 use ipc_schema::traffic::Kind;
 use ipc_schema::world::VehicleState;
 use proptest::prelude::*;
-use sensor_daemon::lidar::{LidarError, LidarModel, nearest_objects};
+use sensor_daemon::sensors::lidar::{LidarError, LidarModel, nearest_objects};
 use sim_core::scene::{Road, RoadPiece, Scene, SurfaceKind};
 
 #[test]

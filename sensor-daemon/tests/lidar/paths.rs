@@ -3,7 +3,7 @@
 use crate::lidar_city::{Moves, SUB_STEPS, traffic};
 use crate::{DATA, car, lidar_city, range, rectangle, scan, small};
 use ipc_schema::pointcloud::{GROUND, LidarPoint, Scan};
-use sensor_daemon::lidar::{LidarModel, ScanPath, ScanScratch, Targets};
+use sensor_daemon::sensors::lidar::{LidarModel, ScanPath, ScanScratch, Targets};
 use sim_core::scene::{Road, Scene};
 
 /// The bits of a scan with noise, loss, weather, persons and wild motion at once.

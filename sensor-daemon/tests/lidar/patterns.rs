@@ -3,7 +3,7 @@
 use crate::{DATA, azimuth, block, car, empty, range, scan, scan_with, small};
 use ipc_schema::failure::Failure;
 use ipc_schema::pointcloud::{GROUND, LidarPoint, Tag};
-use sensor_daemon::lidar::{LidarError, LidarModel};
+use sensor_daemon::sensors::lidar::{LidarError, LidarModel};
 use sim_core::scene::{Road, Scene};
 
 fn elevations(pattern: &str) -> Vec<f64> {

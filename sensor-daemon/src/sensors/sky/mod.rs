@@ -15,8 +15,8 @@ use std::{
 use sim_core::{geodesy::Geodetic, scene::Scene};
 
 use crate::{
-    gnss::{SatelliteSky, SkyView},
     noise::philox4x32,
+    sensors::gnss::{SatelliteSky, SkyView},
 };
 
 pub mod constellation;

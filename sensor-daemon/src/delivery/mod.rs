@@ -14,10 +14,12 @@ use ipc_schema::{
     session::{Session, SessionError},
 };
 
-use crate::{
-    handover::{HandoverFigures, RunningHandover},
-    journal::{Journal, JournalError},
-};
+pub mod digest;
+pub mod handover;
+pub mod journal;
+
+use handover::{HandoverFigures, RunningHandover};
+use journal::{Journal, JournalError};
 
 const MIB: usize = 1 << 20;
 

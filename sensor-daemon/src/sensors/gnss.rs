@@ -1,12 +1,15 @@
 //! GNSS receiver: white noise, correlated noise and bias east, north and up, in degrees or metres, and the position with these errors.
 
-use ipc_schema::config::Gnss as Params;
+use ipc_schema::{config::Gnss as Params, sensor::NoiseStream};
 use sim_core::geodesy::{
     GeodesyError, NetPosition, Projection,
     displacement::{DisplacementMap, GroundArc},
 };
 
-use crate::normals::NormalBlock;
+use crate::{
+    noise::{DrawnNormals, NormalDraws, normals::NormalBlock},
+    tick::TickMotion,
+};
 
 /// One fix.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -129,6 +132,19 @@ pub struct GnssReceiver {
     decay: [f32; 2],
     /// Variance of the horizontal distance from white and correlated noise, and square of the horizontal bias, m².
     horizontal_m2: [f64; 2],
+    /// Factor on the errors of a person's receiver.
+    pedestrian_factor: f64,
+}
+
+/// State of one road user's receiver.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GnssState {
+    /// Correlated error, unit variance: east, north, up.
+    pub correlated: [f32; 3],
+    /// Factor on all errors but reflections.
+    pub factor: f64,
+    /// The receiver had enough satellites at its last sample.
+    pub has_fix: bool,
 }
 
 /// Components of the error of one fix.
@@ -176,6 +192,7 @@ impl GnssReceiver {
             correlated_m,
             bias,
             bias_m: params.bias_m,
+            pedestrian_factor: params.pedestrian_noise_factor,
             decay: [phi as f32, (1.0 - phi * phi).sqrt() as f32],
             horizontal_m2: [
                 horizontal(&white_m) + horizontal(&correlated_m),
@@ -184,15 +201,72 @@ impl GnssReceiver {
         })
     }
 
-    /// True if fixes have white noise.
+    /// Plans the white noise and the noise that joins the correlated error at a tick, each if the fixes have it.
+    pub fn plan(&self, draws: &mut NormalDraws, tick: u32) {
+        if self.has_white_noise() {
+            draws.plan(NoiseStream::Gnss, tick);
+        }
+        if self.has_correlated_noise() {
+            draws.plan(NoiseStream::GnssCorrelated, tick);
+        }
+    }
+
+    /// Takes the numbers that [`GnssReceiver::plan`] planned, in the same order: white noise, noise of the correlated error.
+    #[inline(always)]
+    pub fn take(&self, drawn: &mut DrawnNormals) -> [NormalBlock; 2] {
+        [self.has_white_noise(), self.has_correlated_noise()].map(|is_planned| drawn.take(is_planned))
+    }
+
+    /// State of the receiver of a road user that begins a trajectory.
     #[must_use]
-    pub fn has_white_noise(&self) -> bool {
+    pub fn begin(&self, is_person: bool) -> GnssState {
+        GnssState {
+            correlated: [0.0; 3],
+            factor: if is_person { self.pedestrian_factor } else { 1.0 },
+            has_fix: true,
+        }
+    }
+
+    /// The fix at the end of the tick; `None` while the receiver is not awake or has too few satellites. The correlated error continues
+    /// to evolve meanwhile.
+    #[inline]
+    pub fn sample(
+        &self,
+        state: &mut GnssState,
+        motion: &TickMotion,
+        is_awake: bool,
+        [white, fresh]: [&NormalBlock; 2],
+        view: impl FnOnce([f64; 3]) -> SkyView,
+    ) -> Option<GnssFix> {
+        state.correlated = if motion.step == 0 {
+            [fresh[0], fresh[1], fresh[2]]
+        } else {
+            self.correlated(state.correlated, fresh)
+        };
+        if !is_awake {
+            return None;
+        }
+        let place_m = [motion.state.x_m, motion.state.y_m, motion.state.z_m];
+        let view = view(place_m);
+        state.has_fix = view.has_fix;
+        view.has_fix.then(|| {
+            self.fix(
+                place_m,
+                &GnssErrors {
+                    white,
+                    correlated: &state.correlated,
+                    view: &view,
+                    factor: state.factor,
+                },
+            )
+        })
+    }
+
+    fn has_white_noise(&self) -> bool {
         self.white_m != [0.0; 3]
     }
 
-    /// True if fixes have a correlated error.
-    #[must_use]
-    pub fn has_correlated_noise(&self) -> bool {
+    fn has_correlated_noise(&self) -> bool {
         self.correlated_m != [0.0; 3]
     }
 

@@ -2,12 +2,12 @@
 
 use ipc_schema::sensor::NoiseStream;
 
-use crate::{
-    normals::{self, BATCH, NormalBatch, NormalBlock, NormalPurpose},
-    wide::VectorPath,
-};
+use crate::wide::VectorPath;
 
-pub use crate::normals::philox4x32;
+pub mod normals;
+
+pub use normals::philox4x32;
+use normals::{BATCH, NormalBatch, NormalBlock, NormalPurpose};
 
 /// Random numbers of one noise stream of one vehicle in one episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

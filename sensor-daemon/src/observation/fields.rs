@@ -6,7 +6,7 @@ use ipc_schema::{
     world::HeroView,
 };
 
-use crate::{gnss::GnssFix, imu, speed_steering};
+use crate::{sensors::gnss::GnssFix, sensors::imu, sensors::speed_steering};
 
 /// The newest samples of one vehicle's sensors.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -45,9 +45,9 @@ impl SensorReadings {
             Field::Compass => f64::from(self.imu[6]),
             Field::Speed => self.speed_steering.speed_mps,
             Field::Steering => self.speed_steering.steering_rad,
-            Field::GnssAge => f64::from(self.ages_s[0]),
-            Field::ImuAge => f64::from(self.ages_s[1]),
-            Field::SpeedSteeringAge => f64::from(self.ages_s[2]),
+            Field::GnssAge => f64::from(self.ages_s[SensorKind::Gnss.index()]),
+            Field::ImuAge => f64::from(self.ages_s[SensorKind::Imu.index()]),
+            Field::SpeedSteeringAge => f64::from(self.ages_s[SensorKind::SpeedSteering.index()]),
             Field::GnssValid => deliver(SensorKind::Gnss.bit()),
             Field::ImuValid => deliver(SensorKind::Imu.bit()),
             Field::SpeedSteeringValid => deliver(SensorKind::SpeedSteering.bit()),

@@ -15,8 +15,8 @@ use ipc_schema::{
 };
 
 use crate::{
+    noise::normals::{BATCH, cos_sin},
     noise::{DrawnNormals, NormalDraws},
-    normals::{BATCH, cos_sin},
     wide::{VectorPath, VectorWork},
 };
 
@@ -126,8 +126,9 @@ impl ImuModel {
         }
     }
 
-    /// Plans the numbers of the samples from `first` on: white noise sample by sample, then the walk, two blocks each.
-    pub fn plan(&self, draws: &mut NormalDraws, first: u32) {
+    /// Plans the numbers of the samples of a tick: white noise sample by sample, then the walk, two blocks each.
+    pub fn plan(&self, draws: &mut NormalDraws, tick: u32) {
+        let first = tick.wrapping_mul(self.samples as u32);
         let streams = [
             (self.is_noisy, [NoiseStream::ImuFront, NoiseStream::ImuBack]),
             (self.is_walking, [NoiseStream::WalkFront, NoiseStream::WalkBack]),
@@ -141,8 +142,13 @@ impl ImuModel {
         }
     }
 
-    /// The samples of a tick, oldest first, into `out` (one place for each), with the numbers that were planned; `walk` is what the
-    /// biases have walked so far.
+    /// Random walk of the biases of a road user that begins a trajectory.
+    #[must_use]
+    pub fn begin() -> ImuAxes {
+        [0.0; 8]
+    }
+
+    /// Writes the samples of a tick to `out`, oldest first, with the planned numbers; `walk` is the random walk of the biases so far.
     ///
     /// A sample over several sub-steps is the mean of their accelerations and rates; gravity and heading are those at its end.
     #[inline]

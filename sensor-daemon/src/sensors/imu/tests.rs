@@ -167,9 +167,9 @@ fn values_are_multiples_of_the_resolution_within_the_range() {
     assert_eq!(read[..6], [10.0, -9.75, 50.0, 1.0, -1.0, 0.0]);
 }
 
-fn blocks(unit: &ImuModel, id_hash: u64, first: u32) -> NormalDraws {
+fn blocks(unit: &ImuModel, id_hash: u64, tick: u32) -> NormalDraws {
     let mut draws = NormalDraws::default();
-    unit.plan(&mut draws, first);
+    unit.plan(&mut draws, tick);
     draws.draw(1, &[id_hash; BATCH]);
     draws
 }
@@ -249,7 +249,7 @@ fn biases_walk_and_remember() {
             short.sample(
                 VectorPath::widest(),
                 &body,
-                blocks(&short, id, tick * 10).of(1),
+                blocks(&short, id, tick).of(1),
                 &mut walk,
                 &mut few,
             );

@@ -1,8 +1,8 @@
 //! Speed and steering sensor: wheel speed, and steering-wheel angle from the road-wheel angle and the steering ratio.
 
-use ipc_schema::{config::SpeedSteering as Params, world::VehicleState};
+use ipc_schema::{config::SpeedSteering as Params, sensor::NoiseStream, world::VehicleState};
 
-use crate::normals::NormalBlock;
+use crate::noise::{DrawnNormals, NormalDraws, RandomStream, normals::NormalBlock};
 
 /// One sample.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -33,37 +33,74 @@ impl SpeedSteeringScales {
     }
 }
 
-/// True if samples have noise.
-#[must_use]
-pub fn has_noise(params: &Params) -> bool {
-    params.speed_noise_std_mps > 0.0 || params.steering_noise_std_rad > 0.0
+/// A sensor as configured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SpeedSteeringModel {
+    params: Params,
+    steering_ratio: f64,
+    has_noise: bool,
 }
 
-/// The sensor's sample of a vehicle that moves as `state`, with standard normal numbers for speed and steering.
-#[must_use]
-#[inline(always)]
-pub fn sample(
-    params: &Params,
-    steering_ratio: f64,
-    scales: &SpeedSteeringScales,
-    state: &VehicleState,
-    normals: &NormalBlock,
-) -> SpeedSteeringSample {
-    let true_speed = f64::from(state.velocity_body_mps[0]).abs();
-    let true_steering = f64::from(state.road_wheel_angle_rad) * steering_ratio;
-    SpeedSteeringSample {
-        speed_mps: (true_speed * scales.speed + params.speed_noise_std_mps * f64::from(normals[0])).max(0.0),
-        steering_rad: true_steering * scales.steering
-            + params.steering_bias_rad
-            + params.steering_noise_std_rad * f64::from(normals[1]),
+impl SpeedSteeringModel {
+    /// The sensor of vehicles with this steering ratio (steering-wheel angle over road-wheel angle).
+    #[must_use]
+    pub fn new(params: &Params, steering_ratio: f64) -> Self {
+        Self {
+            steering_ratio,
+            has_noise: params.speed_noise_std_mps > 0.0 || params.steering_noise_std_rad > 0.0,
+            params: params.clone(),
+        }
+    }
+
+    /// Plans the noise of a tick, if there is any.
+    pub fn plan(&self, draws: &mut NormalDraws, tick: u32) {
+        if self.has_noise {
+            draws.plan(NoiseStream::SpeedSteering, tick);
+        }
+    }
+
+    /// Takes the numbers that [`SpeedSteeringModel::plan`] planned.
+    #[inline(always)]
+    pub fn take(&self, drawn: &mut DrawnNormals) -> NormalBlock {
+        drawn.take(self.has_noise)
+    }
+
+    /// Scale factors of a vehicle that begins a trajectory: the same at each of its trajectories in an episode.
+    #[must_use]
+    pub fn begin(&self, episode_seed: u64, id_hash: u64) -> SpeedSteeringScales {
+        let stream = RandomStream {
+            episode_seed,
+            id_hash,
+            sensor: NoiseStream::Scale,
+        };
+        SpeedSteeringScales::new(&self.params, &stream.normals(0))
+    }
+
+    /// The sample of a vehicle with this state, with standard normal numbers for speed and steering.
+    #[must_use]
+    #[inline(always)]
+    pub fn sample(
+        &self,
+        scales: &SpeedSteeringScales,
+        state: &VehicleState,
+        normals: &NormalBlock,
+    ) -> SpeedSteeringSample {
+        let params = &self.params;
+        let true_speed = f64::from(state.velocity_body_mps[0]).abs();
+        let true_steering = f64::from(state.road_wheel_angle_rad) * self.steering_ratio;
+        SpeedSteeringSample {
+            speed_mps: (true_speed * scales.speed + params.speed_noise_std_mps * f64::from(normals[0])).max(0.0),
+            steering_rad: true_steering * scales.steering
+                + params.steering_bias_rad
+                + params.steering_noise_std_rad * f64::from(normals[1]),
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{noise::RandomStream, preset::town};
-    use ipc_schema::sensor::NoiseStream;
+    use crate::preset::town;
 
     const EXACT: SpeedSteeringScales = SpeedSteeringScales {
         speed: 1.0,
@@ -78,6 +115,10 @@ mod tests {
         }
     }
 
+    fn model(params: &Params) -> SpeedSteeringModel {
+        SpeedSteeringModel::new(params, 16.0)
+    }
+
     #[test]
     fn without_noise_it_measures_wheel_speed_and_steering_wheel_angle() {
         let params = Params {
@@ -85,14 +126,14 @@ mod tests {
             steering_noise_std_rad: 0.0,
             ..town().speed_steering
         };
-        assert!(!has_noise(&params) && has_noise(&town().speed_steering));
+        assert!(!model(&params).has_noise && model(&town().speed_steering).has_noise);
         let state = VehicleState {
             velocity_body_mps: [-12.5, 3.0, 0.0],
             road_wheel_angle_rad: -0.25,
             ..VehicleState::default()
         };
         assert_eq!(
-            sample(&params, 16.0, &EXACT, &state, &[1.0; 4]),
+            model(&params).sample(&EXACT, &state, &[1.0; 4]),
             SpeedSteeringSample {
                 speed_mps: 12.5,
                 steering_rad: -4.0
@@ -107,7 +148,7 @@ mod tests {
             steering: 0.5,
         };
         assert_eq!(
-            sample(&biased, 16.0, &scales, &state, &[1.0; 4]),
+            model(&biased).sample(&scales, &state, &[1.0; 4]),
             SpeedSteeringSample {
                 speed_mps: 12.75,
                 steering_rad: -1.5
@@ -129,7 +170,7 @@ mod tests {
         };
         let at = |state: &VehicleState, index| {
             let normals = stream(1, NoiseStream::SpeedSteering).normals(index);
-            sample(&params, 16.0, &EXACT, state, &normals)
+            model(&params).sample(&EXACT, state, &normals)
         };
         let std = |of: &dyn Fn(u32) -> f64| ((0..N).map(|i| of(i).powi(2)).sum::<f64>() / f64::from(N)).sqrt();
         let share = 5.0 / (2.0 * f64::from(N)).sqrt();
