@@ -3,7 +3,6 @@
 use crate::{
     block::{Section, sections},
     header::MessageHeader,
-    sensor::SensorKind,
 };
 
 /// `vehicle` value of an empty slot.
@@ -21,6 +20,10 @@ pub const QUALITY_COLUMNS: usize = 2;
 pub const IMU_COLUMNS: usize = 7;
 /// Number of columns of speed and steering: wheel speed (m/s), steering-wheel angle (rad).
 pub const SPEED_STEERING_COLUMNS: usize = 2;
+/// Number of columns of ages: the first kinds of [`crate::sensor::SensorKind`], which every run has had. The age of a later kind is an observation
+/// field, so that a sensor that is off changes no byte of an observation.
+pub const AGE_COLUMNS: usize = 4;
+
 /// The slot holds a vehicle whose sensors have all delivered at least once.
 pub const VALID: u32 = 1;
 /// The trajectory that held this slot at the previous tick ended there: arrival, removal, collision, off-road. Never bootstrap across it.
@@ -56,11 +59,11 @@ pub struct ObservationLayout {
     pub vehicle: Section,
     /// `u32 [n]`: bits [`VALID`], [`TERMINATED`], [`TRUNCATED`], [`CLIPPED`].
     pub flags: Section,
-    /// `u32 [n]`: bits of the sensors that deliver ([`SensorKind::bit`]); never that of a sensor which the slot's holder does not carry.
+    /// `u32 [n]`: bits of the sensors that deliver ([`crate::sensor::SensorKind::bit`]); never that of a sensor which the slot's holder does not carry.
     pub sensors: Section,
     /// `u32 [n]`: ticks since this vehicle took the slot.
     pub episode_step: Section,
-    /// `f32 [n, sensors]`: age of the newest sample of each sensor, by [`SensorKind`], seconds; 0 for one that it does not carry.
+    /// `f32 [n, 4]` ([`AGE_COLUMNS`]): age of the newest sample of each sensor, by [`crate::sensor::SensorKind`], seconds; 0 for one that it does not carry.
     pub age_s: Section,
     /// Length of the payload in bytes.
     pub len: usize,
@@ -101,7 +104,7 @@ impl ObservationLayout {
             n * size_of::<u32>(),
             n * size_of::<u32>(),
             n * size_of::<u32>(),
-            n * SensorKind::COUNT * f32_size,
+            n * AGE_COLUMNS * f32_size,
         ]);
         Self {
             observation,

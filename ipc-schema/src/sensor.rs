@@ -30,6 +30,15 @@ pub enum SensorCarriers {
     Vehicles,
 }
 
+/// What a sample of a sensor depends on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SensorInput {
+    /// The motion of its carrier.
+    Motion,
+    /// The surfaces around its carrier, static and moving.
+    Surroundings,
+}
+
 /// What a sensor reads of the static scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SceneUse {
@@ -99,8 +108,10 @@ pub struct SensorSpec {
     pub noise: &'static [NoiseStream],
     /// Random stream of its blackouts.
     pub blackout_noise: NoiseStream,
-    /// True if any road user of the run carries it.
-    pub is_fitted: fn(&Config) -> bool,
+    /// Number of vehicles that carry it, those in the first slots; `u32::MAX` = every vehicle.
+    pub vehicles: fn(&Config) -> u32,
+    /// What its samples depend on.
+    pub input: SensorInput,
     /// What it reads of the static scene.
     pub scene: fn(&Config) -> SceneUse,
     /// Time between two samples, seconds.
@@ -146,7 +157,8 @@ pub const SENSORS: [SensorSpec; 4] = [
         carriers: SensorCarriers::VehiclesAndPersons,
         noise: &[NoiseStream::Gnss, NoiseStream::GnssCorrelated],
         blackout_noise: NoiseStream::GnssBlackout,
-        is_fitted: |_| true,
+        vehicles: |_| u32::MAX,
+        input: SensorInput::Motion,
         scene: |config| match config.gnss.sky_view {
             true => SceneUse::Sky,
             false => SceneUse::Unused,
@@ -169,7 +181,8 @@ pub const SENSORS: [SensorSpec; 4] = [
             NoiseStream::WalkBack,
         ],
         blackout_noise: NoiseStream::ImuBlackout,
-        is_fitted: |_| true,
+        vehicles: |_| u32::MAX,
+        input: SensorInput::Motion,
         scene: |_| SceneUse::Unused,
         period_s: |config| config.imu.period_s,
         blackouts: blackouts!(imu),
@@ -184,7 +197,8 @@ pub const SENSORS: [SensorSpec; 4] = [
         carriers: SensorCarriers::Vehicles,
         noise: &[NoiseStream::SpeedSteering, NoiseStream::Scale],
         blackout_noise: NoiseStream::SpeedSteeringBlackout,
-        is_fitted: |_| true,
+        vehicles: |_| u32::MAX,
+        input: SensorInput::Motion,
         scene: |_| SceneUse::Unused,
         period_s: |config| config.speed_steering.period_s,
         blackouts: blackouts!(speed_steering),
@@ -199,7 +213,8 @@ pub const SENSORS: [SensorSpec; 4] = [
         carriers: SensorCarriers::Vehicles,
         noise: &[NoiseStream::Lidar],
         blackout_noise: NoiseStream::LidarBlackout,
-        is_fitted: |config| config.lidar.vehicles > 0,
+        vehicles: |config| config.lidar.vehicles,
+        input: SensorInput::Surroundings,
         scene: |config| match config.lidar.vehicles {
             0 => SceneUse::Unused,
             _ => SceneUse::Rays,
@@ -228,7 +243,7 @@ pub const ALL_SENSORS: u32 = (1 << SensorKind::COUNT) - 1;
 /// Bits of the sensors that any road user of a run with this configuration carries.
 #[must_use]
 pub fn fitted_sensors(config: &Config) -> u32 {
-    let fitted = SENSORS.iter().filter(|spec| (spec.is_fitted)(config));
+    let fitted = SENSORS.iter().filter(|spec| (spec.vehicles)(config) > 0);
     fitted.fold(0, |bits, spec| bits | spec.kind.bit())
 }
 

@@ -1,6 +1,6 @@
 //! The process: receives `world` messages and publishes one `observation` for each.
 
-use std::{path::Path, sync::Arc, time::Instant};
+use std::{path::Path, time::Instant};
 
 use ipc_schema::{
     block::{self, BlockError},
@@ -11,25 +11,19 @@ use ipc_schema::{
     ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
     run::MapInfo,
-    sensor::{SENSORS, SceneUse},
     services::Channel,
     session::{Session, Wait},
     world::WorldLayout,
 };
 use serde::Serialize;
 
-use sim_core::{
-    geodesy::{GeodesyError, NetPosition, Projection},
-    scene::Scene,
-};
-
 use crate::{
     delivery::Delivery,
     delivery::digest::ObservationDigest,
     delivery::handover::HandoverFigures,
-    scanning::{LidarScanning, ScanTotals},
+    scanning::ScanTotals,
     sensing::{Sensing, WorldTick},
-    sensors::sky::SkyMap,
+    surroundings::{Surroundings, projection_failure},
 };
 
 /// The part of the run's report that this process writes.
@@ -58,10 +52,10 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut session = Session::join(run_file, Process::SensorDaemon)?;
     let (config, maps) = (&session.run.config, session.run.every_map());
     let maps: Vec<MapInfo> = maps.into_iter().map(|map| map.info).collect();
-    let mut sensing = Sensing::on_maps(config, session.run.map.bounds_m, &maps).map_err(unprojected)?;
-    let scanning = open_scenes(&mut session, &mut sensing)?;
+    let mut sensing = Sensing::on_maps(config, session.run.map.bounds_m, &maps).map_err(projection_failure)?;
+    let surroundings = Surroundings::open(&mut session, &mut sensing)?;
     let world = session.subscriber(Channel::World)?;
-    let mut daemon = Daemon::open(session, sensing, scanning)?;
+    let mut daemon = Daemon::open(session, sensing, surroundings)?;
     while let Some(message) = daemon.next_world(&world)? {
         let header = *message.header();
         if daemon.tick(&message)? == Wait::Stopped {
@@ -76,49 +70,10 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     daemon.write_part()
 }
 
-/// Reads the scenes if sky view or LIDARs are configured, sets the sky of the GNSS receivers and returns the LIDARs. No other sensor
-/// needs a scene.
-fn open_scenes(session: &mut Session, sensing: &mut Sensing) -> Result<Option<LidarScanning>, Failure> {
-    let uses = SENSORS.map(|spec| (spec.scene)(&session.run.config));
-    if uses.iter().all(|scene| *scene == SceneUse::Unused) {
-        return Ok(None);
-    }
-    let scenes = Scene::of_every_map(&session.run)?;
-    if uses.contains(&SceneUse::Sky) {
-        for (index, (map, scene)) in session.run.every_map().iter().zip(&scenes).enumerate() {
-            let sky = sky_over(&map.info, scene, session.run.seed())?;
-            sensing.set_sky_of(index, Box::new(sky));
-        }
-    }
-    if !uses.contains(&SceneUse::Rays) {
-        return Ok(None);
-    }
-    let publisher = session.publisher(Channel::Pointcloud)?;
-    LidarScanning::new(&session.run.config, &scenes, publisher).map(Some)
-}
-
-fn sky_over(map: &MapInfo, scene: &Arc<Scene>, seed: u64) -> Result<SkyMap, Failure> {
-    let [x_min, y_min, x_max, y_max] = map.bounds_m;
-    let middle = NetPosition {
-        x_m: 0.5 * (x_min + x_max),
-        y_m: 0.5 * (y_min + y_max),
-    };
-    let middle = Projection::new(map)
-        .and_then(|projection| projection.geodetic_from_net(middle))
-        .map_err(unprojected)?;
-    Ok(SkyMap::new(Arc::clone(scene), middle, map.bounds_m, seed))
-}
-
-fn unprojected(error: GeodesyError) -> Failure {
-    Failure::from_error(FailureKind::Config, &error).with_help(
-        "give a net whose <location> has a projection that proj4rs knows, such as UTM or transverse Mercator",
-    )
-}
-
 struct Daemon {
     session: Session,
     sensing: Sensing,
-    scanning: Option<LidarScanning>,
+    surroundings: Surroundings,
     /// Commands that switch sensors on and off.
     switches: Subscriber,
     observations: Publisher,
@@ -134,7 +89,7 @@ struct Daemon {
 }
 
 impl Daemon {
-    fn open(mut session: Session, sensing: Sensing, scanning: Option<LidarScanning>) -> Result<Self, Failure> {
+    fn open(mut session: Session, sensing: Sensing, surroundings: Surroundings) -> Result<Self, Failure> {
         let observations = session.publisher(Channel::Observation)?;
         let switches = session.subscriber(Channel::Switch)?;
         let consumer = match session.run.mode.has_trainer() {
@@ -146,7 +101,7 @@ impl Daemon {
         Ok(Self {
             session,
             sensing,
-            scanning,
+            surroundings,
             switches,
             observations,
             consumer,
@@ -236,18 +191,15 @@ impl Daemon {
         Ok(waited)
     }
 
-    /// Scans with all LIDARs. It runs before the observation is made, because the observation shows the nearest objects.
+    /// Samples the sensors of the surroundings. It runs before the observation is made, because the observation shows their samples.
     fn scan(&mut self, world: &MessageHeader, road_users: &WorldTick) -> Result<(), Failure> {
-        let Some(scanning) = &mut self.scanning else {
-            return Ok(());
-        };
         let ours = self.session.header();
         let header = MessageHeader {
             run_id: ours.run_id,
             incarnation: ours.incarnation,
             ..*world
         };
-        scanning.scan(&header, road_users.states, road_users.sub_steps, &mut self.sensing)
+        self.surroundings.sample(&header, road_users, &mut self.sensing)
     }
 
     /// Samples the sensors into a block of shared memory, adds it to the hash, and sends it or keeps it in the journal.
@@ -337,7 +289,7 @@ impl Daemon {
             cavs_max: self.cavs_max,
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
             drops: self.observations.drops(),
-            lidar: self.scanning.as_ref().map(LidarScanning::totals),
+            lidar: self.surroundings.lidar_totals(),
             redelivered_ticks: self.consumer.as_ref().map_or(0, Delivery::redelivered),
             journal_mib: self.consumer.as_ref().map_or(0, Delivery::journal_mib),
             handovers: self.consumer.as_ref().map(Delivery::handovers).unwrap_or_default(),

@@ -20,6 +20,7 @@ pub mod scanning;
 pub mod sensing;
 pub mod sensors;
 pub mod suite;
+pub mod surroundings;
 pub mod switches;
 pub mod tick;
 pub mod wide;

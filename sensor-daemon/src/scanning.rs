@@ -84,7 +84,7 @@ impl LidarScanning {
         sensing: &mut Sensing,
     ) -> Result<(), Failure> {
         self.targets.update(states, sub_steps, self.sub_steps);
-        let carriers: Vec<(usize, usize)> = sensing.lidars().collect();
+        let carriers: Vec<(usize, usize)> = sensing.carriers_due(SensorKind::Lidar).collect();
         for (slot, row) in carriers {
             if let Some(objects) = self.scan_one(header, &states[row], row)? {
                 sensing.set_objects(slot, objects);

@@ -4,7 +4,7 @@ use ipc_schema::{
     block::BlockError,
     config::{BlackoutPolicy, Config},
     header::{FIRST_OF_EPISODE, MessageHeader},
-    observation::{CLIPPED, ObservationLayout, VALID},
+    observation::{AGE_COLUMNS, CLIPPED, ObservationLayout, VALID},
     run::MapInfo,
     sensor::SensorKind,
     traffic::Kind,
@@ -16,7 +16,7 @@ use crate::{
     carrier::SensorCarrier,
     noise::normals::BATCH,
     noise::{DrawnNormals, NormalDraws},
-    observation::fields::Normaliser,
+    observation::fields::{Normaliser, SensorReadings},
     observation::history::{FrameHistory, TrajectoryFrame},
     observation::sections::ObservationSections,
     observation::slots::Slots,
@@ -264,13 +264,22 @@ impl Sensing {
         }
     }
 
-    /// Slot and row in the world of each road user whose LIDAR scans at the tick of the last [`Sensing::assign`].
-    pub fn lidars(&self) -> impl Iterator<Item = (usize, usize)> {
+    /// Slot and row in the world of each road user whose `sensor` samples at the tick of the last [`Sensing::assign`].
+    pub fn carriers_due(&self, sensor: SensorKind) -> impl Iterator<Item = (usize, usize)> {
         let slots = self.row_of_slot.iter().zip(&self.carriers).enumerate();
-        slots.filter_map(|(slot, (row, carrier))| match row {
-            Some(row) if SensorKind::Lidar.is_in(carrier.awake()) => Some((slot, *row as usize)),
+        slots.filter_map(move |(slot, (row, carrier))| match row {
+            Some(row) if sensor.is_in(carrier.awake()) => {
+                let is_due = self.suite().is_due(sensor, self.slots.rows()[slot].step);
+                is_due.then_some((slot, *row as usize))
+            }
             _ => None,
         })
+    }
+
+    /// The newest samples of the carrier in `slot`, for sensors of the surroundings. Call it between [`Sensing::assign`] and
+    /// [`Sensing::observe`].
+    pub fn readings_mut(&mut self, slot: usize) -> Option<&mut SensorReadings> {
+        self.carriers.get_mut(slot).map(|carrier| &mut carrier.readings)
     }
 
     /// Sets the nearest points of four objects that the LIDAR in `slot` sees, forward and left of the rear axle (metres). A point that
@@ -376,7 +385,7 @@ impl Sensing {
         out.id_hash[slot] = state.id_hash;
         out.episode_step[slot] = step;
         out.sensors[slot] = readings.delivering;
-        out.age_s[slot] = readings.ages_s;
+        out.age_s[slot].copy_from_slice(&readings.ages_s[..AGE_COLUMNS]);
         write_raw(slot, carrier, out);
         if carrier.present & !carrier.known != 0 {
             return;

@@ -2,7 +2,7 @@
 
 use ipc_schema::{
     config::Config,
-    sensor::{SENSORS, SensorCarriers, SensorKind},
+    sensor::{SENSORS, SensorCarriers, SensorInput, SensorKind},
     traffic::Kind,
     world::VehicleState,
 };
@@ -30,7 +30,10 @@ pub struct SensorSuite {
     schedules: [Option<BlackoutSchedule>; SensorKind::COUNT],
     /// Ticks between two samples of each sensor.
     periods: [u32; SensorKind::COUNT],
-    lidars: usize,
+    /// Number of vehicles that carry each sensor: those in the first slots.
+    vehicles: [u32; SensorKind::COUNT],
+    /// Bits of the sensors whose samples [`crate::surroundings`] takes.
+    of_surroundings: u32,
     lidar_range_m: f32,
     tick_s: f64,
     path: VectorPath,
@@ -57,7 +60,11 @@ impl SensorSuite {
             speed_steering: SpeedSteeringModel::new(&config.speed_steering, config.vehicle.steering_ratio),
             schedules: schedules(config, tick_ns),
             periods: SENSORS.map(|spec| ticks((spec.period_s)(config))),
-            lidars: config.lidar.vehicles as usize,
+            vehicles: SENSORS.map(|spec| (spec.vehicles)(config)),
+            of_surroundings: SENSORS
+                .iter()
+                .filter(|spec| spec.input == SensorInput::Surroundings)
+                .fold(0, |bits, spec| bits | spec.kind.bit()),
             lidar_range_m: config.lidar.range_m as f32,
             tick_s: config.run.tick_s,
             path: VectorPath::widest(),
@@ -87,7 +94,7 @@ impl SensorSuite {
         let is_person = state.kind == Kind::Person as u32;
         let carries = |kind: SensorKind| match kind.spec().carriers {
             SensorCarriers::Vehicles if is_person => false,
-            _ => kind != SensorKind::Lidar || slot < self.lidars,
+            _ => slot < self.vehicles[kind.index()] as usize,
         };
         let present = SensorKind::ALL.into_iter().filter(|kind| carries(*kind));
         let present = present.fold(0, |bits, kind| bits | kind.bit());
@@ -125,7 +132,8 @@ impl SensorSuite {
 
     /// True if the sensor samples at this step of its carrier; the first step samples everything.
     #[inline]
-    fn is_due(&self, sensor: SensorKind, step: u32) -> bool {
+    #[must_use]
+    pub fn is_due(&self, sensor: SensorKind, step: u32) -> bool {
         let period = self.periods[sensor.index()];
         period == 1 || step.is_multiple_of(period)
     }
@@ -153,8 +161,13 @@ impl SensorSuite {
             carrier.record(SensorKind::SpeedSteering, step);
         }
         self.sample_imu(carrier, motion, SensorKind::Imu.is_in(awake), drawn, out);
-        if SensorKind::Lidar.is_in(awake) {
-            carrier.record(SensorKind::Lidar, step);
+        // Those samples have been taken before.
+        if awake & self.of_surroundings != 0 {
+            for sensor in SensorKind::ALL {
+                if sensor.is_in(awake & self.of_surroundings) && self.is_due(sensor, step) {
+                    carrier.record(sensor, step);
+                }
+            }
         }
         carrier.update_ages(step, self.tick_s);
     }

@@ -246,14 +246,16 @@ fn lidars_scan_in_the_first_slots_unless_dark_and_their_objects_are_observed() {
     ];
     let mut run = Run::new(&config);
     let mut scans = vec![];
-    let first = run.tick_with(&states, &[], |sensing| scans = sensing.lidars().collect());
+    let first = run.tick_with(&states, &[], |sensing| {
+        scans = sensing.carriers_due(SensorKind::Lidar).collect()
+    });
     assert_eq!(scans, [(0, 1), (2, 3)], "slot and row; not the person, not the fourth");
     assert_eq!(first.section::<f32>("observation"), [1.0; 12], "none = the range");
     let mut dark = 0;
     for number in 0..60 {
         let forward_m = number as f32 - 30.0;
         let tick = run.tick_with(&states, &[], |sensing| {
-            scans = sensing.lidars().collect();
+            scans = sensing.carriers_due(SensorKind::Lidar).collect();
             for (slot, _) in scans.clone() {
                 let none = [f32::INFINITY; 2];
                 sensing.set_objects(slot, [[forward_m, -25.0], none, none, [f32::NAN, 1.0]]);

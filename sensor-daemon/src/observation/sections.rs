@@ -3,10 +3,9 @@
 use ipc_schema::{
     block::{self, BlockError},
     observation::{
-        GEODETIC_COLUMNS, GNSS_COLUMNS, IMU_COLUMNS, ObservationLayout, QUALITY_COLUMNS, SPEED_STEERING_COLUMNS,
-        TRUTH_COLUMNS,
+        AGE_COLUMNS, GEODETIC_COLUMNS, GNSS_COLUMNS, IMU_COLUMNS, ObservationLayout, QUALITY_COLUMNS,
+        SPEED_STEERING_COLUMNS, TRUTH_COLUMNS,
     },
-    sensor::SensorKind,
 };
 
 /// The sections of [`ObservationLayout`], as their elements.
@@ -37,7 +36,7 @@ pub struct ObservationSections<'a> {
     /// `[n]`.
     pub episode_step: &'a mut [u32],
     /// `[n]`.
-    pub age_s: &'a mut [[f32; SensorKind::COUNT]],
+    pub age_s: &'a mut [[f32; AGE_COLUMNS]],
 }
 
 impl<'a> ObservationSections<'a> {

@@ -53,6 +53,8 @@ def sensor_bit(name: str) -> int:
     return next(sensor.bit for sensor in SENSORS if sensor.name == name)
 
 
+AGE_COLUMNS = 4
+"""Columns of an observation's ages: the first of `SENSORS`."""
 EMPTY_SLOT = 0xFFFF_FFFF
 """`vehicle` of an empty slot."""
 VALID = 1
@@ -287,7 +289,7 @@ def observation_sections(n: int, d: int, k: int) -> list[tuple[str, str, tuple[i
         ("flags", "<u4", (n,)),
         ("sensors", "<u4", (n,)),
         ("episode_step", "<u4", (n,)),
-        ("age_s", "<f4", (n, len(SENSORS))),
+        ("age_s", "<f4", (n, AGE_COLUMNS)),
     ]
 
 

@@ -21,7 +21,7 @@ mod random;
 mod raster;
 mod returns;
 mod scan;
-mod sensor;
+pub(super) mod sensor;
 mod simd;
 mod solids;
 mod targets;

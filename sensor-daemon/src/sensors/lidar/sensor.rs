@@ -3,7 +3,7 @@
 use super::targets::Pose;
 
 /// A rotation; rows are world axes, columns the turned ones.
-pub(super) type Rotation = [[f64; 3]; 3];
+pub(in crate::sensors) type Rotation = [[f64; 3]; 3];
 
 /// Sensor at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -21,7 +21,7 @@ pub(super) struct SensorMount {
 }
 
 /// `Rz(yaw) Ry(−pitch) Rx(roll)`: pitch is positive nose up, roll right side down (as in `sim_core::attitude`).
-pub(super) fn rotation([roll, pitch, yaw]: [f64; 3]) -> Rotation {
+pub(in crate::sensors) fn rotation([roll, pitch, yaw]: [f64; 3]) -> Rotation {
     let ((sr, cr), (sp, cp), (sy, cy)) = (sincos(roll), sincos(pitch), libm::sincos(yaw));
     [
         [cy * cp, -sy * cr - cy * sp * sr, sy * sr - cy * sp * cr],

@@ -1,0 +1,94 @@
+//! Sensors of the surroundings: they read the scene and other road users, and sample before the observation of a tick is made.
+
+use std::sync::Arc;
+
+use ipc_schema::{
+    failure::{Failure, FailureKind},
+    header::MessageHeader,
+    run::MapInfo,
+    sensor::{SENSORS, SceneUse},
+    services::Channel,
+    session::Session,
+};
+use sim_core::{
+    geodesy::{GeodesyError, NetPosition, Projection},
+    scene::Scene,
+};
+
+use crate::{
+    scanning::{LidarScanning, ScanTotals},
+    sensing::{Sensing, WorldTick},
+    sensors::sky::SkyMap,
+};
+
+/// The sensors of the surroundings of a run, those that its configuration has.
+pub struct Surroundings {
+    lidars: Option<LidarScanning>,
+}
+
+impl Surroundings {
+    /// Reads the scenes if a sensor uses them, sets the sky of the GNSS receivers, and opens the LIDARs.
+    ///
+    /// # Errors
+    /// A scene, a ray table or a mesh cannot be read, a map's projection is not understood, or a port fails.
+    pub fn open(session: &mut Session, sensing: &mut Sensing) -> Result<Self, Failure> {
+        let uses = SENSORS.map(|spec| (spec.scene)(&session.run.config));
+        if uses.iter().all(|scene| *scene == SceneUse::Unused) {
+            return Ok(Self { lidars: None });
+        }
+        let scenes = Scene::of_every_map(&session.run)?;
+        if uses.contains(&SceneUse::Sky) {
+            for (index, (map, scene)) in session.run.every_map().iter().zip(&scenes).enumerate() {
+                let sky = sky_over(&map.info, scene, session.run.seed())?;
+                sensing.set_sky_of(index, Box::new(sky));
+            }
+        }
+        let mut lidars = None;
+        if uses.contains(&SceneUse::Rays) {
+            let publisher = session.publisher(Channel::Pointcloud)?;
+            lidars = Some(LidarScanning::new(&session.run.config, &scenes, publisher)?);
+        }
+        Ok(Self { lidars })
+    }
+
+    /// Samples every sensor that is due at the tick of the last [`Sensing::assign`], and passes the samples to `sensing`.
+    ///
+    /// # Errors
+    /// Shared memory fails.
+    pub fn sample(
+        &mut self,
+        header: &MessageHeader,
+        road_users: &WorldTick,
+        sensing: &mut Sensing,
+    ) -> Result<(), Failure> {
+        if let Some(lidars) = &mut self.lidars {
+            lidars.scan(header, road_users.states, road_users.sub_steps, sensing)?;
+        }
+        Ok(())
+    }
+
+    /// Counts of LIDAR scans; `None` without LIDARs.
+    #[must_use]
+    pub fn lidar_totals(&self) -> Option<ScanTotals> {
+        self.lidars.as_ref().map(LidarScanning::totals)
+    }
+}
+
+fn sky_over(map: &MapInfo, scene: &Arc<Scene>, seed: u64) -> Result<SkyMap, Failure> {
+    let [x_min, y_min, x_max, y_max] = map.bounds_m;
+    let middle = NetPosition {
+        x_m: 0.5 * (x_min + x_max),
+        y_m: 0.5 * (y_min + y_max),
+    };
+    let middle = Projection::new(map)
+        .and_then(|projection| projection.geodetic_from_net(middle))
+        .map_err(projection_failure)?;
+    Ok(SkyMap::new(Arc::clone(scene), middle, map.bounds_m, seed))
+}
+
+/// A failure that names the remedy for a projection that is not understood.
+pub fn projection_failure(error: GeodesyError) -> Failure {
+    Failure::from_error(FailureKind::Config, &error).with_help(
+        "give a net whose <location> has a projection that proj4rs knows, such as UTM or transverse Mercator",
+    )
+}
