@@ -115,7 +115,7 @@ fn every_relative_link_leads_to_a_file_and_its_heading() {
         for (number, line) in page.prose() {
             for link in between(line, "](", ')') {
                 // `parts.md` is included in the page above it.
-            if link.contains("://") || page.name() == "parts.md" {
+                if link.contains("://") || page.name() == "parts.md" {
                     continue;
                 }
                 let (target, anchor) = link.split_once('#').unwrap_or((link, ""));
@@ -202,7 +202,12 @@ fn every_command_line_parses() {
                     .filter(|span| span.starts_with("caraware "))
                     .for_each(|span| check(number, span, true)),
                 Some("sh" | "bash" | "text") => {
-                    begun += line.trim_start().trim_start_matches("$ ");
+                    begun += match line.strip_prefix("$ ") {
+                        Some(command) => command,
+                        // What a command prints is not one.
+                        None if language == Some("text") => continue,
+                        None => line.trim_start(),
+                    };
                     if let Some(continued) = begun.strip_suffix('\\') {
                         begun = continued.to_owned();
                         continue;

@@ -122,14 +122,14 @@ const fn other(path: &'static str, kind: ValueKind, meaning: &'static str) -> Co
 pub const STAGE_KEYS: &[ConfigKey] = &[
     integer("curriculum.stages.cavs", "vehicles", 1, 100_000, "Connected vehicles kept alive in this stage."),
     ConfigKey { optional: true, ..integer("curriculum.stages.ticks", "ticks", 1, 1_000_000_000, "Length of a lesson. Unset = `episode.ticks`.") },
-    ConfigKey { optional: true, ..other("curriculum.stages.restart", ValueKind::Flag, "Every lesson begins with all vehicles at new random places; false: it goes on where the one before ended. Unset = true.") },
-    ConfigKey { optional: true, ..other("curriculum.stages.maps", ValueKind::Texts, "Maps of its lessons, by their names: those of `curriculum.maps`, of a file without its ending (\"city\" of \"nets/city.net.xml\"). Unset = the first.") },
-    ConfigKey { optional: true, ..other("curriculum.stages.map_choice", ValueKind::Choice(&["in_order", "random", "gradually_random"]), "Which of them: \"in_order\", one lesson after the other; \"random\", drawn for each; \"gradually_random\", the first, and a share of lessons on a drawn one that grows from none to all over `until_lessons` (without: over what is left of `episode.training_episodes`). Without `restart` a step stays on the map of its first lesson. Unset = \"in_order\".") },
+    ConfigKey { optional: true, ..other("curriculum.stages.restart", ValueKind::Flag, "True: every lesson begins with all vehicles at new random places. False: it continues where the one before ended. Unset = true.") },
+    ConfigKey { optional: true, ..other("curriculum.stages.maps", ValueKind::Texts, "Maps of its lessons, by the names in `curriculum.maps`: a file's name without its ending (\"city\" for \"nets/city.net.xml\"). Unset = the first.") },
+    ConfigKey { optional: true, ..other("curriculum.stages.map_choice", ValueKind::Choice(&["in_order", "random", "gradually_random"]), "Map of each lesson: \"in_order\", one map after the other; \"random\", drawn for each; \"gradually_random\", the first, and a share of lessons on a drawn one that grows from none to all over `until_lessons` (without: over what is left of `episode.training_episodes`). Without `restart` a stage stays on the map of its first lesson. Unset = \"in_order\".") },
     optional("curriculum.stages.noise", "", 0.0, 1000.0, "Factor on random errors and biases of all sensors. Unset = 1."),
     optional("curriculum.stages.blackout", "", 0.0, 1000.0, "Factor on the lengths of blackouts (`blackout.enabled`); 0 = none. Unset = 1."),
-    optional("curriculum.stages.until_std", "", 0.0, 10.0, "Passed once the policy's standard deviation is at most this, in units of half the map."),
-    optional("curriculum.stages.until_error_m", "m", 0.0, 1e9, "Passed once the mean error of the policy in the samples of an update is at most this."),
-    ConfigKey { optional: true, ..integer("curriculum.stages.until_lessons", "lessons", 1, 1_000_000_000, "Passed after so many lessons, if not before. Without any of these three the stage lasts to the end of training.") },
+    optional("curriculum.stages.until_std", "", 0.0, 10.0, "The stage ends once the policy's standard deviation is at most this, in units of half the map."),
+    optional("curriculum.stages.until_error_m", "m", 0.0, 1e9, "The stage ends once the mean error of the policy in the samples of an update is at most this."),
+    ConfigKey { optional: true, ..integer("curriculum.stages.until_lessons", "lessons", 1, 1_000_000_000, "The stage ends after this many lessons, if not before. Without any of these three it lasts to the end of training.") },
 ];
 
 /// Former names of keys, with the names that they have now.
@@ -173,8 +173,8 @@ pub const KEYS: &[ConfigKey] = &[
     integer("episode.evaluation_ticks", "ticks", 1, 1_000_000_000, "Length of an evaluation episode."),
     integer("episode.final_evaluations", "", 1, 1_000_000, "Evaluation episodes at the end of the run; their mean error is reported."),
     other("episode.whole_scenario", ValueKind::Flag, "Train on a `.sumocfg` unchanged: one episode with its own seed, to its own end."),
-    other("curriculum.stages", ValueKind::Tables(STAGE_KEYS), "Stages of training in order, each a `[[curriculum.stages]]`; [] = none. Then training is counted in lessons of `episode.ticks` ticks (or the stage's `ticks`), at most `episode.training_episodes` of them, and evaluations are in the base configuration."),
-    other("curriculum.maps", ValueKind::Texts, "Maps that stages choose from: \"town\", a `.net.xml`, or a `.sumocfg`, of which the net and the buildings are taken; all with population control. Evaluations are on the first; predictions and normalised positions are in the smallest box that holds all. [] = [\"town\"]."),
+    other("curriculum.stages", ValueKind::Tables(STAGE_KEYS), "Stages of training in order, each a `[[curriculum.stages]]`; [] = none. Training then consists of lessons of `episode.ticks` ticks (or the stage's `ticks`), at most `episode.training_episodes` of them. Evaluations use the base configuration (docs/curriculum.md)."),
+    other("curriculum.maps", ValueKind::Texts, "Maps that stages choose from: \"town\", a `.net.xml`, or a `.sumocfg`, of which the net and the buildings are used; all with population control. Evaluations use the first. Predictions and normalised positions are in the smallest box that holds all maps. [] = [\"town\"]."),
     other("curriculum.log", ValueKind::Text, "`curriculum.jsonl` of a run, whose stages `caraware simulate` repeats without a learner; \"\" = none."),
     other("task.kind", ValueKind::Choice(&["localisation", "driving"]), "Meaning of the trainer's output: a position for every connected vehicle, or steering and acceleration for every hero."),
     float("task.time_limit_s", "s", 0.1, 1e6, "Longest trajectory of a hero. Then it is truncated, and another hero starts."),

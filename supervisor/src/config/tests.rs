@@ -334,8 +334,8 @@ mod reference {
     const INTRODUCTION: &str = "\
 # Configuration
 
-`caraware train`, `caraware simulate` and `caraware play` take a CONFIG: the name of a preset, your own
-`.toml`, or a `.sumocfg`. A `.toml` needs only the keys that differ from the default preset
+`caraware train`, `caraware simulate` and `caraware play` take a CONFIG: the name of a preset, your
+own `.toml`, or a `.sumocfg`. A `.toml` needs only the keys that differ from the default preset
 [`town`](town.toml); `--set key=value` (repeatable) comes last. Every run writes its resolved
 configuration to `config.toml` in its run directory, which is a valid CONFIG too.
 
