@@ -92,7 +92,7 @@ def disturb(run: Path, process: subprocess.Popen[bytes], disturbances: list[str]
         before = newest(run)
         if disturbance == "handover":
             answer = subprocess.run(
-                [CARAWARE, "swap", run.name], cwd=run.parents[1], capture_output=True, text=True, check=False
+                [CARAWARE, "handover", run.name], cwd=run.parents[1], capture_output=True, text=True, check=False
             )
             if answer.returncode == 0:
                 done.handovers += 1
