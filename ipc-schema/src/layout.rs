@@ -6,17 +6,22 @@ use serde::Serialize;
 
 use crate::{
     SCHEMA_VERSION,
+    block::ALIGNMENT,
     board::{Health, Progress, Roster, TrainingStatus},
+    channel::Channel,
     config::TaskKind,
     control::{ControlReply, ControlRequest, SensorSwitch},
     ego::EgoPose,
     event::Collision,
     field::FIELDS,
     header::MessageHeader,
-    pointcloud::{LidarPoint, Scan},
+    observation::ObservationLayout,
+    pointcloud::{LidarPoint, PointcloudLayout, Scan},
+    prediction::PredictionLayout,
+    section::{SectionSpec, WireElement, numpy_type},
     sensor::{SENSORS, SensorKind},
-    traffic::{RoutePoint, SignalMeta, TrafficState, VehicleMeta},
-    world::{HeroView, SubStep, VehicleState},
+    traffic::{RoutePoint, SignalMeta, TrafficMetaLayout, TrafficState, VehicleMeta},
+    world::{HeroView, SubStep, VehicleState, WorldLayout},
 };
 
 /// Layout of one payload type.
@@ -28,8 +33,16 @@ pub struct TypeLayout {
     pub size: usize,
     /// Bytes.
     pub alignment: usize,
-    /// Name and offset of each field, in order.
-    pub fields: Vec<(&'static str, usize)>,
+    /// Each field, in order.
+    pub fields: Vec<MemberLayout>,
+}
+
+/// Name, offset in bytes, scalar and shape of a field of a record, as numpy takes them.
+pub type MemberLayout = (&'static str, usize, String, Vec<usize>);
+
+/// Scalar and shape of the field that `member` returns.
+fn member_type<R, T: WireElement>(_: fn(&R) -> &T) -> (String, Vec<usize>) {
+    numpy_type::<T>()
 }
 
 macro_rules! layout {
@@ -38,7 +51,10 @@ macro_rules! layout {
             name: stringify!($type),
             size: size_of::<$type>(),
             alignment: align_of::<$type>(),
-            fields: vec![$((stringify!($field), offset_of!($type, $field))),+],
+            fields: vec![$({
+                let (scalar, shape) = member_type(|record: &$type| &record.$field);
+                (stringify!($field), offset_of!($type, $field), scalar, shape)
+            }),+],
         }
     };
 }
@@ -261,6 +277,73 @@ pub fn table() -> Vec<TypeLayout> {
     ]
 }
 
+/// Names a record by which sections and members refer to it.
+macro_rules! records {
+    ($($record:ident),+ $(,)?) => {
+        $(impl WireElement for $record {
+            const SCALAR: &'static str = stringify!($record);
+        })+
+    };
+}
+
+records!(
+    HeroView,
+    LidarPoint,
+    Scan,
+    SignalMeta,
+    SubStep,
+    VehicleMeta,
+    VehicleState
+);
+
+/// A section of a payload as other languages know it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct SectionLayout {
+    /// Its name.
+    pub name: &'static str,
+    /// The scalar as numpy writes it, or the name of a record.
+    pub scalar: String,
+    /// Names of the dimensions that come first in its shape.
+    pub dimensions: &'static [&'static str],
+    /// The dimensions behind them, which never change.
+    pub shape: Vec<usize>,
+}
+
+/// A payload of several sections, each on a border of [`ALIGNMENT`] bytes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct PayloadLayout {
+    /// Name of the channel.
+    pub name: &'static str,
+    /// Its sections, in order.
+    pub sections: Vec<SectionLayout>,
+}
+
+/// Every payload of several sections.
+#[must_use]
+pub fn payloads() -> Vec<PayloadLayout> {
+    let payloads = [
+        (Channel::TrafficMeta, TrafficMetaLayout::SECTIONS),
+        (Channel::World, WorldLayout::SECTIONS),
+        (Channel::Observation, ObservationLayout::SECTIONS),
+        (Channel::Prediction, PredictionLayout::SECTIONS),
+        (Channel::Pointcloud, PointcloudLayout::SECTIONS),
+    ];
+    let section = |spec: &SectionSpec| {
+        let (scalar, shape) = (spec.element)();
+        SectionLayout {
+            name: spec.name,
+            scalar,
+            dimensions: spec.dimensions,
+            shape,
+        }
+    };
+    let rows = payloads.map(|(channel, sections)| PayloadLayout {
+        name: channel.name(),
+        sections: sections.iter().map(section).collect(),
+    });
+    rows.to_vec()
+}
+
 /// A sensor as other languages know it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct SensorLayout {
@@ -320,8 +403,9 @@ fn lines<T: Serialize>(rows: &[T]) -> Result<String, serde_json::Error> {
 /// A row has no form in JSON.
 pub fn json() -> Result<String, serde_json::Error> {
     Ok(format!(
-        "{{\n  \"schema_version\": {SCHEMA_VERSION},\n  \"types\": {},\n  \"sensors\": {},\n  \"fields\": {}\n}}\n",
+        "{{\n  \"schema_version\": {SCHEMA_VERSION},\n  \"alignment\": {ALIGNMENT},\n  \"types\": {},\n  \"payloads\": {},\n  \"sensors\": {},\n  \"fields\": {}\n}}\n",
         lines(&table())?,
+        lines(&payloads())?,
         lines(&sensors())?,
         lines(&fields())?
     ))

@@ -47,6 +47,7 @@ pub mod props;
 pub mod run;
 pub mod schedule;
 pub mod scheduling;
+pub mod section;
 pub mod sensor;
 pub mod services;
 pub mod session;

@@ -5,7 +5,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::block::{Section, sections};
+use crate::section::payload_layout;
 
 /// What a point lies on. Values are stable; new ones come at the end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -88,22 +88,20 @@ pub struct Scan {
     pub reserved: [u32; 4],
 }
 
-/// Where the arrays of a `pointcloud` message lie.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct PointcloudLayout {
-    /// `Scan [1]`.
-    pub scan: Section,
-    /// `LidarPoint [count]`.
-    pub points: Section,
-    /// Length of the payload in bytes.
-    pub len: usize,
+payload_layout! {
+    /// Where the arrays of a `pointcloud` message lie.
+    PointcloudLayout(scans, point_count) {
+        /// `Scan [1]`.
+        scan: Scan, [scans];
+        /// `LidarPoint [count]`.
+        points: LidarPoint, [point_count];
+    }
 }
 
 impl PointcloudLayout {
     /// Layout for `count` points.
     #[must_use]
     pub fn new(count: usize) -> Self {
-        let ([scan, points], len) = sections([size_of::<Scan>(), count * size_of::<LidarPoint>()]);
-        Self { scan, points, len }
+        Self::sized(1, count)
     }
 }

@@ -1,9 +1,6 @@
 //! `prediction`: what the policy makes of an observation and, where the trainer runs it, the Kalman filter beside it.
 
-use crate::{
-    block::{Section, sections},
-    header::MessageHeader,
-};
+use crate::{header::MessageHeader, section::payload_layout};
 
 /// Header flag of a `prediction` message whose second section holds the estimates of the filter.
 pub const ESTIMATES: u32 = 1 << 8;
@@ -11,30 +8,21 @@ pub const ESTIMATES: u32 = 1 << 8;
 /// Number of columns of an estimate: x, y (metres, world frame, rear axle).
 pub const ESTIMATE_COLUMNS: usize = 2;
 
-/// Where the arrays of a `prediction` message lie, for `n` slots and `a` numbers in a row (the header's `count` and `columns`).
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct PredictionLayout {
-    /// `f32 [n, a]`: positions (metres, world), or actions in the driving task.
-    pub prediction: Section,
-    /// `f32 [n, 2]`: where the extended Kalman filter thinks the vehicle is, not-a-number where it does not say; empty without
-    /// [`ESTIMATES`].
-    pub estimate_m: Section,
-    /// Length of the payload in bytes.
-    pub len: usize,
+payload_layout! {
+    /// Where the arrays of a `prediction` message lie.
+    PredictionLayout(slots, columns, estimated_slots) {
+        /// `f32 [n, a]`: positions (metres, world), or actions in the driving task.
+        prediction: f32, [slots, columns];
+        /// `f32 [n, 2]`: position of the extended Kalman filter, not-a-number where it has none; empty without [`ESTIMATES`].
+        estimate_m: [f32; ESTIMATE_COLUMNS], [estimated_slots];
+    }
 }
 
 impl PredictionLayout {
     /// Layout for `n` slots and `a` numbers in a row, with or without estimates.
     #[must_use]
     pub fn new(n: usize, a: usize, estimates: bool) -> Self {
-        let value = size_of::<f32>();
-        let estimate_len = if estimates { n * ESTIMATE_COLUMNS * value } else { 0 };
-        let ([prediction, estimate_m], len) = sections([n * a * value, estimate_len]);
-        Self {
-            prediction,
-            estimate_m,
-            len,
-        }
+        Self::sized(n, a, if estimates { n } else { 0 })
     }
 
     /// Layout of the message with this header.

@@ -2,7 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::block::{Section, sections};
+use crate::section::payload_layout;
 
 /// Kind of a road user, as carried in [`VehicleMeta::kind`] and [`TrafficState::kind`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -202,24 +202,21 @@ pub fn id_text_bytes(id: &str) -> ([u8; ID_BYTES], u32) {
     (bytes, u32::try_from(len).unwrap_or(0))
 }
 
-/// Where the arrays of a `traffic-meta` message lie: `[VehicleMeta; count]`, then `[SignalMeta; columns]`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct TrafficMetaLayout {
-    /// `VehicleMeta [count]`.
-    pub vehicles: Section,
-    /// `SignalMeta [columns]`.
-    pub signals: Section,
-    /// Length of the payload in bytes.
-    pub len: usize,
+payload_layout! {
+    /// Where the arrays of a `traffic-meta` message lie.
+    TrafficMetaLayout(events, changes) {
+        /// `VehicleMeta [events]`: what happened to road users.
+        vehicles: VehicleMeta, [events];
+        /// `SignalMeta [changes]`: traffic lights that changed.
+        signals: SignalMeta, [changes];
+    }
 }
 
 impl TrafficMetaLayout {
     /// Layout for `vehicles` events of road users and `signals` changes of traffic lights.
     #[must_use]
     pub fn new(vehicles: usize, signals: usize) -> Self {
-        let ([vehicles, signals], len) =
-            sections([vehicles * size_of::<VehicleMeta>(), signals * size_of::<SignalMeta>()]);
-        Self { vehicles, signals, len }
+        Self::sized(vehicles, signals)
     }
 }
 

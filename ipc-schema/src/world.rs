@@ -2,7 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::block::{Section, sections};
+use crate::section::payload_layout;
 
 /// The pose was set, not reached by moving: insertion, teleport or re-synchronisation.
 pub const RESYNCHRONISED: u32 = 1;
@@ -136,40 +136,29 @@ pub struct HeroView {
     pub reserved: u32,
 }
 
-/// Where the arrays of a `world` message lie: `[VehicleState; count]`, `[SubStep; count * sub_steps]` vehicle by vehicle, and
-/// `[HeroView; heroes]` by ascending index, `heroes` being the header's `sequence`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct WorldLayout {
-    /// `VehicleState [count]`.
-    pub states: Section,
-    /// `SubStep [count, sub_steps]`.
-    pub sub_steps: Section,
-    /// `HeroView [heroes]`.
-    pub heroes: Section,
-    /// Length of the payload in bytes.
-    pub len: usize,
+payload_layout! {
+    /// Where the arrays of a `world` message lie: road users, their sub-steps vehicle by vehicle, and views of the heroes by ascending
+    /// index.
+    WorldLayout(road_users, sub_steps_each, hero_count) {
+        /// `VehicleState [count]`.
+        states: VehicleState, [road_users];
+        /// `SubStep [count, sub_steps]`.
+        sub_steps: SubStep, [road_users, sub_steps_each];
+        /// `HeroView [heroes]`.
+        heroes: HeroView, [hero_count];
+    }
 }
 
 impl WorldLayout {
     /// Layout for `count` road users with `sub_steps` samples each, none of them a hero.
     #[must_use]
     pub fn new(count: usize, sub_steps: usize) -> Self {
-        Self::with_heroes(count, sub_steps, 0)
+        Self::sized(count, sub_steps, 0)
     }
 
     /// Layout for `count` road users with `sub_steps` samples each, `heroes` of them heroes.
     #[must_use]
     pub fn with_heroes(count: usize, sub_steps: usize, heroes: usize) -> Self {
-        let ([states, sub_steps, heroes], len) = sections([
-            count * size_of::<VehicleState>(),
-            count * sub_steps * size_of::<SubStep>(),
-            heroes * size_of::<HeroView>(),
-        ]);
-        Self {
-            states,
-            sub_steps,
-            heroes,
-            len,
-        }
+        Self::sized(count, sub_steps, heroes)
     }
 }

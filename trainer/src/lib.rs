@@ -8,7 +8,6 @@ use std::{
 };
 
 use ipc_schema::{
-    block::Section,
     board::{State, TrainingStatus},
     clock::monotonic_ns,
     header::{self, MessageHeader},
@@ -525,13 +524,18 @@ impl ObservationBlock {
     /// The bytes of one array ("observation", "truth", "gnss_m", …: `ipc_schema::observation::ObservationLayout`)
     /// as a read-only buffer over shared memory.
     fn section(slf: Bound<'_, Self>, name: &str) -> PyResult<SectionView> {
-        let table = slf.get().layout.named();
-        let section: Section = table
+        let block = slf.get();
+        let (spec, (_, section)) = ObservationLayout::SECTIONS
             .iter()
-            .find(|(known, _)| *known == name)
-            .map(|(_, section)| *section)
+            .zip(block.layout.named())
+            .find(|(spec, _)| spec.name == name)
             .ok_or_else(|| PyKeyError::new_err(name.to_owned()))?;
-        Ok(SectionView::new(slf.unbind(), section))
+        let shape = spec.shape(|dimension| match dimension {
+            "slots" => block.header.count as usize,
+            "fields" => block.header.columns as usize,
+            _ => block.header.sequence as usize,
+        });
+        Ok(SectionView::new(slf.unbind(), section, (spec.element)().0, shape))
     }
 }
 
@@ -561,6 +565,8 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(observation_size, module)?)?;
     module.add("METRICS", PyTuple::new(module.py(), METRICS.iter().map(Metric::of))?)?;
     module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
+    let layout = ipc_schema::layout::json().map_err(|error| failed(&error))?;
+    module.add("LAYOUT_JSON", layout)?;
     module.add("VALID", ipc_schema::observation::VALID)?;
     module.add("TERMINATED", ipc_schema::observation::TERMINATED)?;
     module.add("TRUNCATED", ipc_schema::observation::TRUNCATED)?;

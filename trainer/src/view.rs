@@ -3,7 +3,7 @@
 use std::ffi::c_int;
 
 use ipc_schema::block::Section;
-use pyo3::{ffi, prelude::*};
+use pyo3::{ffi, prelude::*, types::PyTuple};
 
 use crate::ObservationBlock;
 
@@ -12,16 +12,35 @@ use crate::ObservationBlock;
 pub(crate) struct SectionView {
     block: Py<ObservationBlock>,
     section: Section,
+    scalar: String,
+    shape: Vec<usize>,
 }
 
 impl SectionView {
-    pub(crate) fn new(block: Py<ObservationBlock>, section: Section) -> Self {
-        Self { block, section }
+    pub(crate) fn new(block: Py<ObservationBlock>, section: Section, scalar: String, shape: Vec<usize>) -> Self {
+        Self {
+            block,
+            section,
+            scalar,
+            shape,
+        }
     }
 }
 
 #[pymethods]
 impl SectionView {
+    /// Scalar of the array, as numpy writes it: "<f4".
+    #[getter]
+    fn scalar(&self) -> &str {
+        &self.scalar
+    }
+
+    /// Shape of the array.
+    #[getter]
+    fn shape<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        PyTuple::new(py, &self.shape)
+    }
+
     /// Buffer protocol: refuses writers; the consumer holds this object, which holds the block, which holds the message.
     #[expect(unsafe_code, reason = "the buffer protocol of CPython works on raw pointers")]
     unsafe fn __getbuffer__(slf: Bound<'_, Self>, view: *mut ffi::Py_buffer, flags: c_int) -> PyResult<()> {

@@ -2,5 +2,4 @@
 
 pub mod fields;
 pub mod history;
-pub mod sections;
 pub mod slots;

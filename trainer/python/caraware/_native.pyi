@@ -18,6 +18,7 @@ __all__ = [
     "GNSS_COLUMNS",
     "IMU",
     "IMU_COLUMNS",
+    "LAYOUT_JSON",
     "LIDAR",
     "METRICS",
     "SCHEMA_VERSION",
@@ -41,6 +42,9 @@ SCHEMA_VERSION: int
 
 METRICS: tuple[Metric, ...]
 """Every metric of every task, in the order of the board."""
+
+LAYOUT_JSON: str
+"""The tables of `ipc-schema/layout.json`: records, payloads, sensors and fields."""
 
 VALID: int
 """Bit of `flags`: the slot holds a vehicle whose sensors have all delivered."""
@@ -235,6 +239,14 @@ class ObservationBlock:
 @final
 class SectionView:
     """One array of an observation block as a read-only buffer of bytes; it keeps the block alive."""
+
+    @property
+    def scalar(self) -> str:
+        """Scalar of the array, as numpy writes it: `<f4`."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
 
     def __buffer__(self, flags: int, /) -> memoryview: ...
 

@@ -53,132 +53,47 @@ def sensor_bit(name: str) -> int:
     return next(sensor.bit for sensor in SENSORS if sensor.name == name)
 
 
-AGE_COLUMNS = 4
-"""Columns of an observation's ages: the first of `SENSORS`."""
 EMPTY_SLOT = 0xFFFF_FFFF
 """`vehicle` of an empty slot."""
 VALID = 1
 """Bit of an observation's `flags`: the slot's vehicle has delivered every sensor at least once."""
 
-ALIGNMENT = 64
+ALIGNMENT: int = _LAYOUT["alignment"]
 """Sections of a payload start on multiples of this, bytes from the payload's start."""
 
-HEADER = np.dtype(
-    [
-        ("schema_version", "<u4"),
-        ("env_index", "<u4"),
-        ("run_id", "<u8"),
-        ("incarnation", "<u4"),
-        ("flags", "<u4"),
-        ("episode", "<u8"),
-        ("episode_seed", "<u8"),
-        ("tick", "<u8"),
-        ("sim_time_ns", "<u8"),
-        ("count", "<u4"),
-        ("columns", "<u4"),
-        ("sequence", "<u8"),
-    ]
-)
+
+def _record(name: str) -> np.dtype[np.void]:
+    """The record `name` of the committed tables."""
+    table = next(row for row in _LAYOUT["types"] if row["name"] == name)
+    return np.dtype(
+        {
+            "names": [field for field, *_ in table["fields"]],
+            "formats": [(scalar, tuple(shape)) for _, _, scalar, shape in table["fields"]],
+            "offsets": [offset for _, offset, *_ in table["fields"]],
+            "itemsize": table["size"],
+        }
+    )
+
+
+HEADER = _record("MessageHeader")
 """`MessageHeader`."""
 
-VEHICLE_STATE = np.dtype(
-    [
-        ("x_m", "<f8"),
-        ("y_m", "<f8"),
-        ("z_m", "<f8"),
-        ("yaw_rad", "<f8"),
-        ("id_hash", "<u8"),
-        ("roll_rad", "<f4"),
-        ("pitch_rad", "<f4"),
-        ("velocity_body_mps", "<f4", 3),
-        ("accel_body_mps2", "<f4", 3),
-        ("angular_rate_body_radps", "<f4", 3),
-        ("road_wheel_angle_rad", "<f4"),
-        ("tracking_lateral_m", "<f4"),
-        ("tracking_longitudinal_m", "<f4"),
-        ("length_m", "<f4"),
-        ("width_m", "<f4"),
-        ("height_m", "<f4"),
-        ("wheelbase_m", "<f4"),
-        ("rear_overhang_m", "<f4"),
-        ("vehicle", "<u4"),
-        ("kind", "<u4"),
-        ("signals", "<u4"),
-        ("flags", "<u4"),
-        ("reference_offset_m", "<f4"),
-    ]
-)
+VEHICLE_STATE = _record("VehicleState")
 """`VehicleState`: a road user at the end of a tick; origin at the centre of the rear axle (persons: their centre)."""
 
-VEHICLE_META = np.dtype(
-    [
-        ("id_hash", "<u8"),
-        ("vehicle", "<u4"),
-        ("event", "<u4"),
-        ("kind", "<u4"),
-        ("type_index", "<u4"),
-        ("length_m", "<f4"),
-        ("width_m", "<f4"),
-        ("height_m", "<f4"),
-        ("id_len", "<u4"),
-        ("id", "V64"),
-        ("vehicle_class", "V16"),
-        ("type_id", "V32"),
-    ]
-)
+VEHICLE_META = _record("VehicleMeta")
 """`VehicleMeta`: id, type and size of a road user."""
 
-SIGNAL_META = np.dtype(
-    [
-        ("id_hash", "<u8"),
-        ("signal", "<u4"),
-        ("id_len", "<u4"),
-        ("id", "V64"),
-        ("links", "<u4"),
-        ("reserved", "<u4"),
-        ("state", "V128"),
-    ]
-)
+SIGNAL_META = _record("SignalMeta")
 """`SignalMeta`: the state of a traffic light, a letter for each link."""
 
-COLLISION = np.dtype(
-    [
-        ("position_m", "<f8", 3),
-        ("id_hash", "<u8"),
-        ("other_id_hash", "<u8"),
-        ("vehicle", "<u4"),
-        ("other", "<u4"),
-        ("other_class", "<u4"),
-        ("relative_speed_mps", "<f4"),
-    ]
-)
+COLLISION = _record("Collision")
 """`Collision`: a contact that begins."""
 
-SCAN = np.dtype(
-    [
-        ("position_m", "<f8", 3),
-        ("attitude_rad", "<f8", 3),
-        ("id_hash", "<u8"),
-        ("azimuth_rad", "<f4"),
-        ("range_m", "<f4"),
-        ("rays", "<u4"),
-        ("axes", "<u4"),
-        ("reserved", "<u4", 4),
-    ]
-)
+SCAN = _record("Scan")
 """`Scan`: where a LIDAR was at the end of the tick; `axes` 0: x forward, y left, z up; 1: y back, x left, z down."""
 
-LIDAR_POINT = np.dtype(
-    [
-        ("position_m", "<f4", 3),
-        ("intensity", "<f4"),
-        ("object", "<u4"),
-        ("incidence_cos", "<f4"),
-        ("tag", "<u2"),
-        ("channel", "<u2"),
-        ("age_us", "<u4"),
-    ]
-)
+LIDAR_POINT = _record("LidarPoint")
 """`LidarPoint`: one return, in the axes that the sensor had when it fired."""
 
 
@@ -276,20 +191,11 @@ class PointCloud:
 
 def observation_sections(n: int, d: int, k: int) -> list[tuple[str, str, tuple[int, ...]]]:
     """Name, element type and shape of the sections of an observation, in order; each is aligned to `ALIGNMENT`."""
+    sizes = {"slots": n, "fields": d, "imu_samples": k}
+    payload = next(row for row in _LAYOUT["payloads"] if row["name"] == "observation")
     return [
-        ("observation", "<f4", (n, d)),
-        ("truth", "<f4", (n, 4)),
-        ("gnss_m", "<f4", (n, 3)),
-        ("gnss_geodetic", "<f8", (n, 3)),
-        ("gnss_quality", "<f4", (n, 2)),
-        ("imu", "<f4", (n, k, 7)),
-        ("speed_steering", "<f4", (n, 2)),
-        ("id_hash", "<u8", (n,)),
-        ("vehicle", "<u4", (n,)),
-        ("flags", "<u4", (n,)),
-        ("sensors", "<u4", (n,)),
-        ("episode_step", "<u4", (n,)),
-        ("age_s", "<f4", (n, AGE_COLUMNS)),
+        (row["name"], row["scalar"], (*(sizes[dimension] for dimension in row["dimensions"]), *row["shape"]))
+        for row in payload["sections"]
     ]
 
 
@@ -327,7 +233,8 @@ def decode_observation(frame: bytes) -> Observation:
         array = _array(frame, offset, np.dtype(element), shape)
         arrays[name] = array
         offset = _aligned(offset + array.nbytes)
-    return Observation(header, **arrays)
+    known = {name: array for name, array in arrays.items() if name in Observation.__dataclass_fields__}
+    return Observation(header, **known)
 
 
 def decode_prediction(frame: bytes) -> Prediction:

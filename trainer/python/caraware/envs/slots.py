@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from caraware import _native
 from caraware.envs import rewards
 from caraware.envs.settings import FaceSettings
 from caraware.envs.transition import Rows, Transition
@@ -422,8 +421,8 @@ def _array(obs: Observation, name: str) -> Float32Array:
     if block is None:
         numbers: Float32Array = getattr(obs, name).numpy()
         return numbers
-    columns = {"observation": block.fields, "truth": _native.TRUTH_COLUMNS, "gnss_m": _native.GNSS_COLUMNS}[name]
-    array: Float32Array = np.frombuffer(memoryview(block.section(name)), np.float32).reshape(block.slots, columns)
+    view = block.section(name)
+    array: Float32Array = np.frombuffer(memoryview(view), np.float32).reshape(view.shape)
     return array
 
 

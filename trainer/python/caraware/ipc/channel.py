@@ -126,34 +126,35 @@ class Observation:
         """Stage of the curriculum, counted from 1; 0 without one, and in evaluations."""
         return self.block.stage
 
-    def _array(self, name: str, dtype: type[Scalar], columns: int | None = None) -> NDArray[Scalar]:
-        array = np.frombuffer(memoryview(self.block.section(name)), dtype=dtype)
-        return array if columns is None else array.reshape(self.block.slots, columns)
+    def _array(self, name: str, scalar: type[Scalar]) -> NDArray[Scalar]:
+        """The array `name` in the shape that the extension knows; `scalar` names its type for the type checker."""
+        view = self.block.section(name)
+        return np.frombuffer(memoryview(view), dtype=scalar).reshape(view.shape)
 
     @cached_property
     def observation(self) -> Tensor:
         """f32 [n, d], normalised fields; what a policy may see."""
-        return read_only_tensor(self._array("observation", np.float32, self.block.fields))
+        return read_only_tensor(self._array("observation", np.float32))
 
     @cached_property
     def truth(self) -> Tensor:
         """f32 [n, 4]: x and y of the rear axle (m, world), yaw (rad), speed (m/s). For rewards and errors only."""
-        return read_only_tensor(self._array("truth", np.float32, _native.TRUTH_COLUMNS))
+        return read_only_tensor(self._array("truth", np.float32))
 
     @cached_property
     def gnss_m(self) -> Tensor:
         """f32 [n, 3]: newest raw GNSS fix, east, north and up (m, world); its x and y are the baseline."""
-        return read_only_tensor(self._array("gnss_m", np.float32, _native.GNSS_COLUMNS))
+        return read_only_tensor(self._array("gnss_m", np.float32))
 
     @cached_property
     def gnss_geodetic(self) -> Float64Array:
         """f64 [n, 3]: the same fix as latitude, longitude (degrees) and altitude (m)."""
-        return self._array("gnss_geodetic", np.float64, 3)
+        return self._array("gnss_geodetic", np.float64)
 
     @cached_property
     def gnss_quality(self) -> Float32Array:
         """f32 [n, 2]: the receiver's estimate of its horizontal error (m, 1σ of the distance), satellites in use."""
-        return self._array("gnss_quality", np.float32, 2)
+        return self._array("gnss_quality", np.float32)
 
     @cached_property
     def imu(self) -> Tensor:
@@ -162,13 +163,12 @@ class Observation:
         Columns: acceleration x, y, z (m/s²), angular rate x, y, z (rad/s), compass (rad). Frame and gravity are
         what `imu.convention` says; k is 1 for an IMU that samples once a tick or less often.
         """
-        array = self._array("imu", np.float32)
-        return read_only_tensor(array.reshape(self.block.slots, self.block.imu_samples, _native.IMU_COLUMNS))
+        return read_only_tensor(self._array("imu", np.float32))
 
     @cached_property
     def speed_steering(self) -> Tensor:
         """f32 [n, 2]: newest wheel speed (m/s) and steering-wheel angle (rad, positive to the left)."""
-        return read_only_tensor(self._array("speed_steering", np.float32, 2))
+        return read_only_tensor(self._array("speed_steering", np.float32))
 
     @cached_property
     def sensors(self) -> UInt32Array:
@@ -188,7 +188,7 @@ class Observation:
     @cached_property
     def age_s(self) -> Float32Array:
         """f32 [n, 4]: age of the newest GNSS, IMU, speed-steering and LIDAR sample (s)."""
-        return self._array("age_s", np.float32, 4)
+        return self._array("age_s", np.float32)
 
     @cached_property
     def episode_step(self) -> UInt32Array:

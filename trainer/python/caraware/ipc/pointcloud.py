@@ -9,33 +9,13 @@ from numpy.typing import NDArray
 
 from caraware import _native
 from caraware.ipc.arrays import Float64Array
+from caraware.ipc.layout import record
 
-POINT = np.dtype(
-    [
-        ("position_m", "<f4", 3),
-        ("intensity", "<f4"),
-        ("object", "<u4"),
-        ("incidence_cos", "<f4"),
-        ("tag", "<u2"),
-        ("channel", "<u2"),
-        ("age_us", "<u4"),
-    ]
-)
+POINT = record("LidarPoint")
 """`LidarPoint`: position in the sensor's axes at the time the point was fired (m), intensity 0 ... 1, object, cosine of
 the incidence angle, tag, channel (0 is the lowest), age at the end of the tick (µs)."""
 
-SCAN = np.dtype(
-    [
-        ("position_m", "<f8", 3),
-        ("attitude_rad", "<f8", 3),
-        ("id_hash", "<u8"),
-        ("azimuth_rad", "<f4"),
-        ("range_m", "<f4"),
-        ("rays", "<u4"),
-        ("axes", "<u4"),
-        ("reserved", "<u4", 4),
-    ]
-)
+SCAN = record("Scan")
 """`Scan`: the sensor at the end of the tick in the world (m; roll, pitch, heading in rad), and how it was set up."""
 
 STATIC_OBJECT = 1 << 31

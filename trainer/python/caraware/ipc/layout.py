@@ -1,0 +1,23 @@
+"""Records in shared memory as numpy types, from the tables that the native extension carries."""
+
+import json
+from typing import Any
+
+import numpy as np
+
+from caraware import _native
+
+_LAYOUT: dict[str, Any] = json.loads(_native.LAYOUT_JSON)
+
+
+def record(name: str) -> np.dtype[np.void]:
+    """The record `name` of `ipc-schema/layout.json`: fields, offsets and size."""
+    table = next(row for row in _LAYOUT["types"] if row["name"] == name)
+    return np.dtype(
+        {
+            "names": [field for field, *_ in table["fields"]],
+            "formats": [(scalar, tuple(shape)) for _, _, scalar, shape in table["fields"]],
+            "offsets": [offset for _, offset, *_ in table["fields"]],
+            "itemsize": table["size"],
+        }
+    )
