@@ -37,6 +37,8 @@ def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: i
             {"name": "gnss_x", "unit": "m", "range": [0.0, 200.0]},
             {"name": "gnss_y", "unit": "m", "range": [0.0, 100.0]},
             {"name": "speed", "unit": "m/s", "range": [0.0, 30.0]},
+            {"name": "route_left", "unit": "m", "range": [0.0, 1000.0]},
+            {"name": "route_offset", "unit": "m", "range": [-5.0, 5.0]},
         ],
         "source": {"population": {}},
     }

@@ -22,17 +22,21 @@ ROWS = 6
 
 def run_of(task: str) -> RunFile:
     """A run file with what tasks and faces read."""
-    observation = {"fields": ["route_left", "route_offset"], "speed_range_mps": 30.0, "steering_range_rad": 10.0}
+    observation = {"fields": ["route_left", "route_offset"]}
     config = {
         "run": {"tick_s": 0.1, "window_ticks": 16},
         "task": {"kind": task},
         "traffic": {"cavs": ROWS, "heroes": ROWS, "pedestrians": 0},
         "episode": {"ticks": 100},
-        "observation": observation | {"accel_range_mps2": 20.0, "gyro_range_radps": 2.0},
+        "observation": observation,
         "gnss": {},
         "trainer": {"reward": "exponential", "reward_scale_m": 5.0},
     }
-    return {"config": config, "map": {"bounds_m": [0.0, -50.0, 200.0, 50.0]}}
+    fields = [
+        {"name": "route_left", "unit": "m", "range": [0.0, 1000.0]},
+        {"name": "route_offset", "unit": "m", "range": [-5.0, 5.0]},
+    ]
+    return {"config": config, "map": {"bounds_m": [0.0, -50.0, 200.0, 50.0]}, "observation_fields": fields}
 
 
 def rows(seed: int) -> TaskRows:

@@ -66,4 +66,4 @@ class Fields:
 
 def _ranges(run: RunFile) -> dict[str, tuple[float, float]]:
     """Lower and upper end of every field in SI units, as the run file names them."""
-    return {field["name"]: (field["range"][0], field["range"][1]) for field in run["observation_fields"]}
+    return {field["name"]: (field["range"][0], field["range"][1]) for field in run.get("observation_fields", ())}
