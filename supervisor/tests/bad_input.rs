@@ -10,16 +10,14 @@ mod common;
 
 use std::net::TcpListener;
 
-use common::{Workplace, shared_memory, sumo_program, text, tool, tree};
+use common::{Workplace, sumo_program, text, tool, tree};
 
 /// Runs a command that must be refused, and returns what it said in one line.
 fn refused(workplace: &Workplace, arguments: &[&str], exit_code: i32) -> String {
-    let before = shared_memory();
     let output = workplace.run(arguments);
     let said = text(&output);
     assert_eq!(output.status.code(), Some(exit_code), "{arguments:?}: {said}");
     workplace.assert_nothing_left();
-    assert_eq!(shared_memory(), before, "shared memory left behind");
     // miette wraps lines with a margin.
     said.replace(['│', '×', '╰', '─', '▶'], " ")
         .split_whitespace()

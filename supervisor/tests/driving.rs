@@ -15,7 +15,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use common::{Workplace, shared_memory, sumo_program, text, tool};
+use common::{Workplace, sumo_program, text, tool};
 use serde_json::Value;
 
 const QUIET: [&str; 2] = ["--set", "fanout.enabled=false"];
@@ -371,10 +371,9 @@ fn the_scripted_driver_drives_laps_of_the_town_the_same_for_the_same_seed() {
 #[test]
 fn a_driver_that_falls_silent_can_be_stopped_and_one_that_leaves_ends_the_run() {
     let workplace = Workplace::new();
-    let before = shared_memory();
     let mut silent = in_town(&workplace, "silent", r#"{"0": [0, 0.1], "mute_s": 1.0}"#, &[]);
     let mut child = silent.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-    let deadline = Instant::now() + Duration::from_secs(60);
+    let deadline = Instant::now() + Duration::from_mins(2);
     loop {
         let table = workplace.run(&["ps"]);
         let ticks = |line: &str| line.split_whitespace().nth(4)?.parse::<u64>().ok();
@@ -404,7 +403,6 @@ fn a_driver_that_falls_silent_can_be_stopped_and_one_that_leaves_ends_the_run() 
         text(&output)
     );
     workplace.assert_nothing_left();
-    assert_eq!(shared_memory(), before);
 }
 
 #[test]

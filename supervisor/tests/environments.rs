@@ -13,7 +13,7 @@ use std::{
     process::{Child, Stdio},
 };
 
-use common::{Workplace, shared_memory, text, until};
+use common::{Workplace, text, until};
 use ipc_schema::{
     ports::BoardReader,
     process::Process,
@@ -96,18 +96,6 @@ impl Live {
     }
 }
 
-/// Nothing of the run is left in shared memory, in the registry or as a process.
-fn assert_nothing_left(workplace: &Workplace, name: &str) {
-    workplace.assert_nothing_left();
-    let file = workplace.path().join("runs").join(name).join("run.json");
-    let prefix = RunFile::read(&file).unwrap().shared_memory.prefix;
-    let left: Vec<String> = shared_memory()
-        .into_iter()
-        .filter(|file| file.starts_with(&prefix))
-        .collect();
-    assert!(left.is_empty(), "{left:?}");
-}
-
 /// Hash of the parameters, moments and generators of the newest checkpoint.
 fn learnt(run: &Path) -> String {
     let checkpoints = run.join("checkpoints");
@@ -148,7 +136,7 @@ fn environments_beside_each_other_are_what_they_are_alone() {
     for file in ["logs/sim-core.log", "env-1/logs/sim-core.log", "env-1/run.json"] {
         assert!(run.join(file).is_file(), "{file} is missing");
     }
-    assert_nothing_left(&workplace, "both");
+    workplace.assert_nothing_left();
 }
 
 #[test]
@@ -176,7 +164,7 @@ fn a_killed_trainer_is_given_what_it_lacks_of_every_environment() {
         assert_eq!(one["observation_hash"], other["observation_hash"]);
         assert!(one["redelivered_ticks"].as_u64().unwrap() > 0, "{one:#}");
     }
-    assert_nothing_left(&workplace, "killed");
+    workplace.assert_nothing_left();
 }
 
 #[test]
@@ -193,7 +181,7 @@ fn a_simulator_that_dies_ends_the_run_and_is_named_with_its_environment() {
     assert_eq!(code, Some(1), "{said}");
     assert!(said.contains("sim-core/2 ended with signal: 9"), "{said}");
     assert!(said.contains("env-2/logs/sim-core.log"), "{said}");
-    assert_nothing_left(&workplace, "broken");
+    workplace.assert_nothing_left();
 }
 
 #[test]

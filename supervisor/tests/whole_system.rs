@@ -15,7 +15,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use common::{Workplace, command_lines, free_port, shared_memory, sumo_program, text};
+use common::{Workplace, command_lines, free_port, sumo_program, text};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -51,7 +51,6 @@ const QUIET: [&str; 2] = ["--set", "fanout.enabled=false"];
 #[test]
 fn a_run_trains_reports_and_leaves_nothing_behind() {
     let workplace = Workplace::new();
-    let before = shared_memory();
     let listen = format!("fanout.listen=tcp/127.0.0.1:{}", free_port());
     let output = workplace.succeed(&small("train", "one", &["--set", &listen]));
     let report = workplace.report("one");
@@ -110,7 +109,6 @@ fn a_run_trains_reports_and_leaves_nothing_behind() {
         text(&output)
     );
     workplace.assert_nothing_left();
-    assert_eq!(shared_memory(), before);
 }
 
 #[test]
@@ -175,14 +173,14 @@ impl Drop for Background {
 
 /// Asks until there is an answer.
 fn eventually<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
-    let deadline = Instant::now() + Duration::from_secs(60);
+    let deadline = Instant::now() + Duration::from_mins(2);
     while Instant::now() < deadline {
         if let Some(answer) = ask() {
             return answer;
         }
         std::thread::park_timeout(Duration::from_millis(50));
     }
-    panic!("{what}: not within a minute");
+    panic!("{what}: not within two minutes");
 }
 
 /// Rows of `caraware ps` (process, state, pid) once every process is running.
@@ -204,7 +202,6 @@ fn process_table(workplace: &Workplace) -> Vec<(String, String, u32)> {
 #[test]
 fn the_processes_are_separate_and_stop_ends_them_in_order() {
     let workplace = Workplace::new();
-    let before = shared_memory();
     let listen = format!("fanout.listen=tcp/127.0.0.1:{}", free_port());
     let mut run = Background::start(
         &workplace,
@@ -247,7 +244,6 @@ fn the_processes_are_separate_and_stop_ends_them_in_order() {
         "no checkpoint"
     );
     workplace.assert_nothing_left();
-    assert_eq!(shared_memory(), before);
 }
 
 #[test]

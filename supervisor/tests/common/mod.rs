@@ -2,8 +2,12 @@
 #![allow(dead_code, reason = "each test file uses its own part")]
 
 use std::{
-    collections::BTreeMap,
+    cell::RefCell,
+    collections::{BTreeMap, BTreeSet},
+    fs::DirBuilder,
+    mem::MaybeUninit,
     net::TcpListener,
+    os::{fd::OwnedFd, unix::fs::DirBuilderExt as _},
     path::{Path, PathBuf},
     process::{Child, Command, Output},
     sync::{Mutex, MutexGuard, PoisonError},
@@ -16,23 +20,35 @@ use ipc_schema::{
     run::RunFile,
     services::{self, Channel, RunNode},
 };
+use rustix::fs::inotify;
 use serde_json::Value;
 use tempfile::TempDir;
 
 /// Whole runs use all cores and look at shared memory: one at a time.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
-/// A directory in which runs are made.
+/// A directory for runs, with a registry of its own.
 pub struct Workplace {
     pub directory: TempDir,
+    /// Reports every name that appears in the registry: the shared memory of a run carries it.
+    registry: OwnedFd,
+    names: RefCell<BTreeSet<String>>,
     _turn: MutexGuard<'static, ()>,
 }
 
 impl Workplace {
     pub fn new() -> Self {
         let turn = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("run");
+        DirBuilder::new().mode(0o700).create(&path).unwrap();
+        let registry = inotify::init(inotify::CreateFlags::NONBLOCK | inotify::CreateFlags::CLOEXEC).unwrap();
+        let created = inotify::WatchFlags::CREATE | inotify::WatchFlags::MOVED_TO;
+        inotify::add_watch(&registry, &path, created).unwrap();
         Self {
-            directory: tempfile::tempdir().unwrap(),
+            directory,
+            registry,
+            names: RefCell::default(),
             _turn: turn,
         }
     }
@@ -93,11 +109,27 @@ impl Workplace {
             .filter(|line| line.contains(&here))
             .collect();
         assert!(processes.is_empty(), "still running: {processes:?}");
+        let files = self.shared_memory();
+        assert!(files.is_empty(), "left in shared memory: {files:?}");
+    }
+
+    /// Files that the runs of this workplace have in shared memory. Other runs of the machine come and go meanwhile.
+    pub fn shared_memory(&self) -> Vec<String> {
+        let mut names = self.names.borrow_mut();
+        let mut buffer = [MaybeUninit::uninit(); 4096];
+        let mut events = inotify::Reader::new(&self.registry, &mut buffer);
+        while let Ok(event) = events.next() {
+            names.extend(event.file_name().map(|name| name.to_string_lossy().into_owned()));
+        }
+        let prefixes: Vec<String> = names.iter().map(|name| format!("caraware_{name}_")).collect();
+        let mut files = shared_memory();
+        files.retain(|file| prefixes.iter().any(|prefix| file.starts_with(prefix)));
+        files
     }
 }
 
 /// Files of any run in shared memory.
-pub fn shared_memory() -> Vec<String> {
+fn shared_memory() -> Vec<String> {
     let names = std::fs::read_dir("/dev/shm")
         .unwrap()
         .flatten()
