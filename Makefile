@@ -53,7 +53,7 @@ test-python:
 
 lint: $(VENV)/.installed ## formatting and lints, as errors
 	cargo fmt --all --check
-	cargo clippy --locked --all-targets -- -D warnings
+	cargo clippy $(CARGO_FLAGS) --all-targets -- -D warnings
 	$(VENV)/bin/ruff check trainer viewer bench
 	$(VENV)/bin/ruff check --config trainer/pyproject.toml sim-core sensor-daemon docs maps
 	$(VENV)/bin/ruff format --check trainer viewer bench
