@@ -1,6 +1,6 @@
 """Env-steps per second with random actions through each face, beside the raw channel.
 
-`python trainer/benches/faces.py [SECONDS]`: town and driving, the faces in turn, six times. The best of each is told,
+`python trainer/benches/faces.py [SECONDS]`: town and driving, the faces in turn, six times. It prints the best of each,
 as whatever else the machine does can only slow them down, and the least CPU time of this process for a step of all
 slots.
 """
@@ -118,9 +118,9 @@ def main(seconds: float) -> None:
         for face_name, results in measured.items():
             rates, cpu_us = zip(*results, strict=True)
             share = max(rates) / best_raw
-            told = f"{max(rates):9,.0f} env-steps/s {share:6.0%} of raw {min(cpu_us):6.0f} µs of CPU a step"
+            line = f"{max(rates):9,.0f} env-steps/s {share:6.0%} of raw {min(cpu_us):6.0f} µs of CPU a step"
             print(
-                f"{name:18} {face_name:9} {told}   ({', '.join(f'{rate:,.0f}' for rate in sorted(rates))})", flush=True
+                f"{name:18} {face_name:9} {line}   ({', '.join(f'{rate:,.0f}' for rate in sorted(rates))})", flush=True
             )
 
 

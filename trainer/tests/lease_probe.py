@@ -39,7 +39,7 @@ def leased(channel: Channel) -> dict:
     nothing = lease.next(0.01)
     places = lease.places
     del lease
-    # Whoever keeps a tensor keeps the memory mapped.
+    # A tensor that is kept keeps the memory mapped.
     kept = digest(tensor) == digests[-1]
     return {
         "digests": digests,

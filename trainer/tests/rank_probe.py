@@ -26,7 +26,7 @@ def settings(folder: Path, envs: int, first_env: int, world: int, more: dict | N
 
 
 def channels(run: dict) -> list[SyntheticChannel]:
-    """The ticks of its environments: each the same, whoever has it."""
+    """The ticks of its environments: each the same, in whichever rank."""
     place = run["config"]["run"]
     numbers = range(place["first_env"], place["first_env"] + place["envs"])
     return [SyntheticChannel(run, with_evaluation(TRAINING_TICKS, 6, VEHICLES, 5.0, 1 + env)) for env in numbers]

@@ -118,16 +118,16 @@ def street_ticks(count: int, vehicles: int, noise_m: float, seed: int) -> Iterat
         truth = np.stack((x, y, yaw, np.full(vehicles, 8.0)), 1)
         gnss = truth[:, :2] + rng.normal(0, noise_m, (vehicles, 2))
         fields = np.concatenate((gnss / (SIZE_M / 2) - 1, np.cos(yaw)[:, None], np.sin(yaw)[:, None]), 1)
-        nobody = np.zeros(vehicles, bool)
+        none = np.zeros(vehicles, bool)
         yield SyntheticObservation(
             tick=tick,
             observation=torch.tensor(fields, dtype=torch.float32),
             truth=torch.tensor(truth, dtype=torch.float32),
             gnss_m=torch.tensor(gnss, dtype=torch.float32),
             vehicle=np.arange(vehicles, dtype=np.uint32),
-            valid=~nobody,
-            terminated=nobody.copy(),
-            truncated=nobody.copy(),
+            valid=~none,
+            terminated=none.copy(),
+            truncated=none.copy(),
         )
 
 

@@ -103,7 +103,7 @@ def steady_track(ticks: int, vehicles: int, seed: int, speed_mps: float = 10.0) 
 
 
 def town_track(ticks: int, vehicles: int, seed: int) -> Track:
-    """Accelerations and turns as Gauss–Markov processes, drawn back to 10 m/s; nobody drives backwards."""
+    """Accelerations and turns as Gauss–Markov processes, drawn back to 10 m/s; none drives backwards."""
     rng = np.random.default_rng(seed)
     steps = (ticks - 1) * SUB_STEPS + 1
     accel, rate = np.zeros((steps, vehicles)), np.zeros((steps, vehicles))
@@ -118,7 +118,7 @@ def town_track(ticks: int, vehicles: int, seed: int) -> Track:
 
 
 def standing_track(ticks: int, vehicles: int, seed: int) -> Track:
-    """Nobody moves."""
+    """No vehicle moves."""
     still = np.zeros(((ticks - 1) * SUB_STEPS + 1, vehicles))
     return _driven(np.random.default_rng(seed), still, still, np.zeros(vehicles))
 
@@ -188,16 +188,16 @@ class Sensors:
                 sample(tick, lit)
             self._dark_ticks[i] = np.where(lit & (ages[i] == 0.0), 0, self._dark_ticks[i] + 1)
         truth = self._track.truth(tick)
-        nobody = np.zeros(self._n, bool)
+        none = np.zeros(self._n, bool)
         values: dict = {
             "tick": tick,
             "observation": torch.tensor(np.concatenate((self._fix.T / 100 - 1, truth[:, 2:]), 1), dtype=torch.float32),
             "truth": torch.tensor(truth, dtype=torch.float32),
             "gnss_m": torch.tensor(np.pad(self._fix.T, ((0, 0), (0, 1))), dtype=torch.float32),
             "vehicle": np.arange(self._n, dtype=np.uint32),
-            "valid": ~nobody,
-            "terminated": nobody.copy(),
-            "truncated": nobody.copy(),
+            "valid": ~none,
+            "terminated": none.copy(),
+            "truncated": none.copy(),
             "sim_time_ns": tick * round(TICK_S * 1e9),
             "gnss_quality": np.zeros((self._n, 2), np.float32),
             "imu": torch.tensor(self._imu.transpose(1, 0, 2), dtype=torch.float32),

@@ -82,13 +82,15 @@ def test_the_report_has_every_mean_with_its_interval(tmp_path: Path, caplog: pyt
     for name in ESTIMATORS:
         assert report[f"{name}_mean_error_m"] == final[f"{name}_mean_error_m"] > 0
         assert 0 < report[f"{name}_ci95_m"] < 4 * report[f"{name}_mean_error_m"]
-        # A single seed tells nothing about how seeds differ.
+        # A single seed has no spread.
         assert first[f"{name}_ci95_m"] is None
         assert first[f"{name}_standard_error_m"] > 0
     assert "sees the future" in report["rts_note"]
     (line, _) = (r.message for r in caplog.records if r.message.startswith("evaluation at"))
-    told = [f"{label} {report['evaluations'][0][f'{name}_mean_error_m']:.3f} ± " for name, label in ESTIMATORS.items()]
-    assert all(words in line for words in told)
+    expected_words = [
+        f"{label} {report['evaluations'][0][f'{name}_mean_error_m']:.3f} ± " for name, label in ESTIMATORS.items()
+    ]
+    assert all(words in line for words in expected_words)
     assert "sees the future" in line
 
 

@@ -1,4 +1,4 @@
-"""The curriculum: gates, what is decided once, and what a successor is told."""
+"""The curriculum: gates, what is decided once, and what a successor sends."""
 
 from dataclasses import dataclass, field
 
@@ -9,13 +9,13 @@ STAGES = (Stage(until_std=0.5), Stage(until_error_m=7.0, until_lessons=3), Stage
 
 @dataclass
 class Simulation:
-    """Remembers what it was told."""
+    """Remembers the decisions sent to it."""
 
-    told: list[tuple[int, int, int]] = field(default_factory=list)
+    decisions: list[tuple[int, int, int]] = field(default_factory=list)
 
     def decided(self, lessons: int, since: int, stage: int) -> None:
         """Remember."""
-        self.told.append((lessons, since, stage))
+        self.decisions.append((lessons, since, stage))
 
 
 @dataclass
@@ -30,17 +30,17 @@ def test_gates_open_in_order_and_once():
     simulation = Simulation()
     curriculum = Curriculum(STAGES, simulation)
     curriculum.begin()
-    assert simulation.told == [(1, 0, 0)], "the first lesson needs no learner"
+    assert simulation.decisions == [(1, 0, 0)], "the first lesson needs no learner"
     curriculum.lesson_ended(End(9, 1), 10, policy_std=0.51, error_m=5.0)
-    assert simulation.told[-1] == (2, 0, 0), "an error that is small opens no gate of σ"
+    assert simulation.decisions[-1] == (2, 0, 0), "an error that is small opens no gate of σ"
     curriculum.lesson_ended(End(19, 1), 20, policy_std=0.5, error_m=9.0)
-    assert simulation.told[-1] == (3, 2, 1)
+    assert simulation.decisions[-1] == (3, 2, 1)
     curriculum.lesson_ended(End(29, 2), 30, policy_std=0.2, error_m=7.5)
-    assert simulation.told[-1] == (4, 2, 1), "one gate after the other"
+    assert simulation.decisions[-1] == (4, 2, 1), "one gate after the other"
     curriculum.lesson_ended(End(39, 2), 40, policy_std=0.2, error_m=7.0)
-    assert simulation.told[-1] == (5, 4, 2)
+    assert simulation.decisions[-1] == (5, 4, 2)
     curriculum.lesson_ended(End(49, 3), 50, policy_std=0.0, error_m=0.0)
-    assert simulation.told[-1] == (6, 4, 2), "a stage without a gate lasts"
+    assert simulation.decisions[-1] == (6, 4, 2), "a stage without a gate lasts"
     passed = curriculum.report()["passed"]
     assert [(gate["stage"], gate["tick"], gate["lessons"], gate["env_steps"]) for gate in passed] == [
         (1, 19, 2, 20),
@@ -54,7 +54,7 @@ def test_a_learner_without_measures_counts_lessons():
     curriculum.begin()
     for tick in (9, 19):
         curriculum.lesson_ended(End(tick, 1), tick)
-    assert simulation.told == [(1, 0, 0), (2, 0, 0), (3, 2, 1)]
+    assert simulation.decisions == [(1, 0, 0), (2, 0, 0), (3, 2, 1)]
 
 
 def test_a_successor_decides_nothing_twice():
@@ -64,11 +64,11 @@ def test_a_successor_decides_nothing_twice():
     predecessor.lesson_ended(End(9, 1), 10, 0.4, 9.0)
     successor = Curriculum(STAGES, simulation)
     successor.begin(predecessor.saved())
-    assert simulation.told == [(2, 1, 1)]
+    assert simulation.decisions == [(2, 1, 1)]
     successor.lesson_ended(End(9, 1), 10, 0.4, 9.0)
-    assert len(simulation.told) == 1, "the tick is delivered again, the lesson is not counted again"
+    assert len(simulation.decisions) == 1, "the tick is delivered again, the lesson is not counted again"
     successor.lesson_ended(End(19, 2), 20, 0.4, 9.0)
-    assert simulation.told[-1] == (3, 1, 1)
+    assert simulation.decisions[-1] == (3, 1, 1)
     assert successor.report()["lessons"] == 2
 
 
@@ -77,11 +77,11 @@ def test_a_successor_that_would_have_decided_otherwise_follows_the_ticks():
     curriculum = Curriculum(STAGES, simulation)
     curriculum.begin()
     curriculum.lesson_ended(End(9, 2), 10, 0.9, 9.0)
-    assert simulation.told[-1] == (2, 0, 1)
+    assert simulation.decisions[-1] == (2, 0, 1)
 
 
 def test_without_stages_nothing_is_said():
     simulation = Simulation()
     curriculum = Curriculum((), simulation)
     curriculum.begin({})
-    assert simulation.told == [] and not curriculum and curriculum.report() is None
+    assert simulation.decisions == [] and not curriculum and curriculum.report() is None

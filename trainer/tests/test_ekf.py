@@ -225,7 +225,7 @@ def poisoned(track: Track) -> Iterator[VehicleObservation]:
 
 @pytest.mark.parametrize("convention", ["kinematic", "specific_force", "carla"])
 def test_the_convention_of_the_imu_changes_nothing(convention: str) -> None:
-    """Without a compass to hide behind: a wrong sign would turn everybody the wrong way."""
+    """Without a compass to hide behind: a wrong sign would turn every vehicle the wrong way."""
     tables = tables_of(imu__convention=convention, imu__compass_noise_std_rad=1.0)
     errors = [
         np.abs(wrapped(ekf.belief.mean[YAW] - obs.truth[:, 2].numpy())).max()
@@ -253,7 +253,7 @@ def test_every_compass_sample_of_a_tick_counts() -> None:
 
 
 def test_who_has_lost_its_heading_starts_anew_with_the_next_fix() -> None:
-    """A heading that may be anything tells nothing about where a moving vehicle went."""
+    """A heading that may be anything says nothing about where a moving vehicle went."""
     dark = np.zeros((302, 6), np.uint32)
     dark[20:300] = EVERYTHING
     for obs, ekf in filtered(observations(steady_track(302, 6, 1), seed=1, dark=dark), sensor_tables()):
@@ -328,7 +328,7 @@ def test_a_slot_that_changes_hands_begins_anew() -> None:
 def test_another_episode_begins_anew() -> None:
     ekf = Ekf(noise_of(sensor_tables()))
     first, second = (list(observations(standing_track(20, 3, seed), seed=seed)) for seed in (1, 2))
-    second = second[5:]  # of which nobody saw the beginning
+    second = second[5:]  # whose beginning was not seen
     for obs in (*first, *second):
         ekf.step(read_samples(obs, "kinematic"))
     alone = Ekf(ekf.noise)

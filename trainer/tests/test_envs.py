@@ -62,7 +62,7 @@ def processes_of(pid: int) -> list[psutil.Process]:
 
 
 def gone(process: psutil.Process) -> bool:
-    """Ended, even if nobody has taken note."""
+    """Ended, even if its parent has not reaped it."""
     with contextlib.suppress(psutil.NoSuchProcess):
         return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
     return True
@@ -207,7 +207,7 @@ def test_a_simulation_that_dies_is_an_exception_with_the_reason(victim: str) -> 
             for _ in range(100_000):
                 env.step(np.zeros((1, 2), np.float32))
         wait_until(lambda: all(gone(process) for process in processes))
-    with make("town", TOWN):  # cleans up what nobody alive could
+    with make("town", TOWN):  # cleans up after killed processes
         assert not left_in_shared_memory(prefix)
 
 
@@ -330,7 +330,7 @@ def test_the_example_with_stable_baselines_as_the_trainer_of_a_run(tmp_path: Pat
     )
     assert finished.returncode == 0, finished.stdout + finished.stderr
     report = json.loads((tmp_path / "runs" / "sb3" / "report.json").read_text())
-    # 4 episodes of 40 ticks with 4 vehicles, some of which enter late; the evaluations are nobody's experience.
+    # 4 episodes of 40 ticks with 4 vehicles, some of which enter late; no learner sees the evaluations.
     assert 4 * 40 * 3 < report["env_steps"] <= 4 * 40 * 4
     assert report["ppo_mean_error_m"] > report["raw_gnss_mean_error_m"] > 0
     assert (tmp_path / "runs" / "sb3" / "sb3_ppo.zip").is_file()

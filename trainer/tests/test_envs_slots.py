@@ -48,11 +48,11 @@ def tick(number: int, vehicles: list[int], terminated: tuple = (), truncated: tu
     """A tick whose rows say which vehicle and tick they are of: observation = truth = [vehicle, tick, …] / 1000."""
     vehicle = np.array(vehicles, np.uint32)
     valid = vehicle != E
-    # Rows without a vehicle hold rubbish: whoever uses them is found out.
-    who = np.where(valid, vehicle.astype(float), 777.0)
-    rows = np.stack((who / 1000, np.full(len(who), number / 1000), np.zeros(len(who))), 1).astype(np.float32)
-    truth = np.concatenate((rows[:, :2] * 1000, np.zeros((len(who), 2), np.float32)), 1)
-    flags = [np.isin(np.arange(len(who)), np.array(slots, int)) for slots in (terminated, truncated)]
+    # Rows without a vehicle hold rubbish: a test that uses them fails.
+    ids = np.where(valid, vehicle.astype(float), 777.0)
+    rows = np.stack((ids / 1000, np.full(len(ids), number / 1000), np.zeros(len(ids))), 1).astype(np.float32)
+    truth = np.concatenate((rows[:, :2] * 1000, np.zeros((len(ids), 2), np.float32)), 1)
+    flags = [np.isin(np.arange(len(ids)), np.array(slots, int)) for slots in (terminated, truncated)]
     tensors = [torch.from_numpy(values) for values in (rows, truth, truth[:, :2].copy())]
     return SyntheticObservation(number, *tensors, vehicle, valid, *flags, **more)
 
@@ -79,7 +79,7 @@ def channel_of(ticks: list[SyntheticObservation], tmp_path, slots: int, **option
     return DrivingChannel(run_file(str(tmp_path), slots, **options), iter(ticks))
 
 
-def who(observation: np.ndarray) -> list[int]:
+def vehicles_of(observation: np.ndarray) -> list[int]:
     """Vehicles that rows are of."""
     return np.rint(observation[..., 0] * 1000).astype(int).tolist()
 
@@ -90,7 +90,7 @@ def when(observation: np.ndarray) -> list[int]:
 
 
 def which(obs: Transition, action: np.ndarray) -> np.ndarray:
-    """A reward that tells whom it was given: vehicle, and a thousandth of the tick answered."""
+    """A reward that names its receiver: vehicle, and a thousandth of the tick answered."""
     return obs.truth[:, 0].astype(np.float64) + obs.truth[:, 1] / 1000
 
 
@@ -101,18 +101,20 @@ def test_a_terminated_trajectory_keeps_its_last_observation_and_the_slot_is_empt
     ticks = [tick(0, [1, 2]), tick(1, [1, E], terminated=(1,)), tick(2, [1, 3]), tick(3, [1, 3])]
     env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2), reward=which)
     observation, infos = env.reset()
-    assert who(observation) == [1, 2] and infos["mask"].tolist() == [True, True]
+    assert vehicles_of(observation) == [1, 2] and infos["mask"].tolist() == [True, True]
 
     observation, reward, terminated, truncated, infos = env.step(NOTHING)
     assert terminated.tolist() == [False, True] and truncated.tolist() == [False, False]
     assert reward.tolist() == pytest.approx([1.0, 2.0])  # of tick 0, whose action it was
     assert infos["mask"].tolist() == [True, False] and observation[1].tolist() == [0, 0, 0]
-    assert infos["final_obs"][0] is None and who(infos["final_obs"][1]) == 2 and when(infos["final_obs"][1]) == 0
+    assert (
+        infos["final_obs"][0] is None and vehicles_of(infos["final_obs"][1]) == 2 and when(infos["final_obs"][1]) == 0
+    )
     assert infos["_final_obs"].tolist() == [False, True] and infos["final_info"]["vehicle"][1] == 2
 
     observation, reward, terminated, truncated, infos = env.step(NOTHING)
     assert not terminated.any() and not truncated.any() and "final_obs" not in infos
-    assert who(observation) == [1, 3] and reward.tolist() == pytest.approx([1.001, 0.0])
+    assert vehicles_of(observation) == [1, 3] and reward.tolist() == pytest.approx([1.001, 0.0])
 
 
 def test_the_end_of_an_episode_truncates_and_gives_the_next_episodes_first_row(tmp_path) -> None:
@@ -156,7 +158,7 @@ def test_slots_that_are_not_there_yet_are_empty_and_those_beyond_are_left_out(tm
     _, infos = env.reset()
     assert infos["mask"].tolist() == [True, False]
     observation, *_ = env.step(NOTHING)
-    assert who(observation) == [1, 2]
+    assert vehicles_of(observation) == [1, 2]
     env.step(NOTHING)
     assert channel.predictions[1].shape == (3, 2)
 
@@ -167,10 +169,10 @@ def test_ticks_without_any_vehicle_ask_for_no_decision(tmp_path) -> None:
     channel = channel_of(ticks, tmp_path, 2, drives=True)
     env = CarAwareVectorEnv(channel, reward=which)
     observation, _ = env.reset()
-    assert who(observation)[0] == 1
+    assert vehicles_of(observation)[0] == 1
     observation, _, terminated, _, infos = env.step(np.ones((2, 2), np.float32))
     assert terminated.tolist() == [True, False] and infos["mask"].tolist() == [False, True]
-    assert who(observation)[1] == 2 and who(infos["final_obs"][0]) == 1
+    assert vehicles_of(observation)[1] == 2 and vehicles_of(infos["final_obs"][0]) == 1
     assert sorted(channel.actions) == [0, 1, 2, 3]  # every tick is answered, by whomever
     assert channel.actions[1].tolist() == [[1, 1], [1, 1]] and not channel.actions[2].any()
 
@@ -198,7 +200,7 @@ def test_evaluation_episodes_are_answered_by_their_policy_and_stepped_by_nobody(
     env = CarAwareVectorEnv(channel, evaluation_policy=lambda observation: np.full((2, 2), -1.0))
     env.reset()
     observation, _, _, truncated, infos = env.step(NOTHING)
-    assert truncated.all() and who(infos["final_obs"][0]) == 1 and who(observation) == [4, 5]
+    assert truncated.all() and vehicles_of(infos["final_obs"][0]) == 1 and vehicles_of(observation) == [4, 5]
     assert channel.predictions[1].tolist() == [[0.0, 0.0], [0.0, 0.0]]
     *_, truncated, _ = env.step(NOTHING)
     assert not truncated.any()  # the flags of tick 3 were those of the evaluation
@@ -230,9 +232,9 @@ def test_reset_runs_on_to_the_next_episode_but_not_twice_without_a_step(tmp_path
     ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, 2]), tick(3, [4, 5], truncated=(0, 1), episode=1)]
     ticks += [tick(4, [4, 5], episode=1)]
     env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2))
-    assert who(env.reset()[0]) == [1, 2]
+    assert vehicles_of(env.reset()[0]) == [1, 2]
     env.step(NOTHING)
-    assert who(env.reset()[0]) == [4, 5]
+    assert vehicles_of(env.reset()[0]) == [4, 5]
     assert when(env.reset()[0]) == [3, 3]
     for seed in (99, 5):  # even its own: it is past its beginning
         with pytest.warns(UserWarning, match="cannot begin this run anew"):
@@ -279,7 +281,7 @@ def test_a_run_is_started_anew_for_another_seed_or_where_it_ended_and_only_then(
     assert source.seeds == [5]
     env.step(action)
     assert when(env.reset(seed=5)[0]) == [0] and source.seeds == [5, 5]
-    assert who(env.reset(seed=6)[0]) == [6] and source.seeds == [5, 5, 6]
+    assert vehicles_of(env.reset(seed=6)[0]) == [6] and source.seeds == [5, 5, 6]
     ends = [bool(env.step(action)[3][0]) for _ in range(7)]
     assert ends == [False, False, True, False, False, True, False] and source.seeds[3:] == [1006, 2006]
 
@@ -289,21 +291,21 @@ def test_a_reset_far_from_the_end_of_an_episode_starts_a_new_run(tmp_path) -> No
     env = CarAwareVectorEnv(source)
     env.reset()
     env.step(np.zeros((1, 2), np.float32))
-    assert who(env.reset()[0]) == [1005]
+    assert vehicles_of(env.reset()[0]) == [1005]
 
 
 def test_the_single_face_ends_with_its_vehicle_and_goes_on_with_the_next_in_the_slot(tmp_path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [E, 2], terminated=(0,)), tick(2, [E, 2]), tick(3, [3, 2]), tick(4, [3, 2])]
     env = CarAwareEnv(channel_of(ticks, tmp_path, 2), reward=which)
     observation, info = env.reset()
-    assert who(observation) == 1 and info["vehicle"] == 1
+    assert vehicles_of(observation) == 1 and info["vehicle"] == 1
     observation, reward, terminated, truncated, info = env.step(np.zeros(2, np.float32))
-    assert (terminated, truncated) == (True, False) and who(observation) == 1 and info["vehicle"] == 1
+    assert (terminated, truncated) == (True, False) and vehicles_of(observation) == 1 and info["vehicle"] == 1
     assert reward == pytest.approx(1.0)
     with pytest.raises(RuntimeError, match="reset"):
         env.step(np.zeros(2, np.float32))
     observation, info = env.reset()
-    assert (who(observation), when(observation)) == (3, 3)
+    assert (vehicles_of(observation), when(observation)) == (3, 3)
 
 
 def test_agents_come_and_go_under_their_ids_and_an_episode_ends_with_the_simulations(tmp_path) -> None:
@@ -312,12 +314,12 @@ def test_agents_come_and_go_under_their_ids_and_an_episode_ends_with_the_simulat
     env = CarAwareParallelEnv(channel_of(ticks, tmp_path, 2), reward=which)
     observations, _ = env.reset()
     one, two, three = (f"0x{number:016x}" for number in (1, 2, 3))
-    assert env.agents == [one, two] and who(observations[two]) == 2
+    assert env.agents == [one, two] and vehicles_of(observations[two]) == 2
     observations, rewards, terminated, _, _ = env.step({one: [0, 0], two: [0, 0]})
     assert terminated == {one: False, two: True} and env.agents == [one]
     assert when(observations[two]) == 0 and rewards[two] == pytest.approx(2.0)
     observations, rewards, terminated, _, _ = env.step({one: [0, 0]})
-    assert env.agents == [one, three] and rewards[three] == 0.0 and who(observations[three]) == 3
+    assert env.agents == [one, three] and rewards[three] == 0.0 and vehicles_of(observations[three]) == 3
     env.step({})
     *_, truncated, _ = env.step({})
     assert truncated == {one: True, three: True} and env.agents == []

@@ -121,13 +121,13 @@ def test_it_sees_neither_truth_nor_future(tmp_path: Path) -> None:
     run = street_run(tmp_path)
     ticks = list(observations(town_track(60, 5, 2), run["config"]))
     learner = shaken(learner_of(run))
-    told = estimates(run, learner, ticks)
+    seen = estimates(run, learner, ticks)
     lied = [replace(obs, truth=obs.truth + 100.0) for obs in ticks]
-    assert torch.equal(estimates(run, learner, lied), told)
+    assert torch.equal(estimates(run, learner, lied), seen)
     later = [obs if obs.tick < 40 else replace(obs, gnss_m=obs.gnss_m + 50.0) for obs in ticks]
     changed = estimates(run, learner, later)
-    assert torch.equal(changed[:40], told[:40])
-    assert not torch.equal(changed[40:], told[40:])
+    assert torch.equal(changed[:40], seen[:40])
+    assert not torch.equal(changed[40:], seen[40:])
 
 
 def test_carrier_says_how_far_vehicles_went_and_fixes_pulled(tmp_path: Path) -> None:

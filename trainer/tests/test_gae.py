@@ -50,7 +50,7 @@ def test_after_termination_nothing_is_worth_anything() -> None:
 
 
 def test_after_truncation_the_next_value_counts_but_no_later_advantage() -> None:
-    # δ1 = 3 as if unbroken, A1 = 3: A2 belongs to somebody else. A0 = -2 + 0.25·3
+    # δ1 = 3 as if unbroken, A1 = 3: A2 belongs to another vehicle. A0 = -2 + 0.25·3
     assert advantages(truncated=flags(1))[0] == [-1.25, 3.0, 1.0]
 
 

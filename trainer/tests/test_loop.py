@@ -281,10 +281,10 @@ def test_sigterm_commits_a_checkpoint_and_ends_with_0(tmp_path: Path, monkeypatc
 @pytest.mark.usefixtures("channel_module")
 def test_a_bad_configuration_ends_with_2_and_the_cure(tmp_path: Path) -> None:
     assert train.main([write_run(tmp_path, run_file(str(tmp_path), learning_rate="fast"))]) == 2
-    told = failure(tmp_path)
-    assert told["kind"] == "config"
-    assert "trainer.learning_rate" in told["message"]
-    assert "float" in told["help"]
+    failed = failure(tmp_path)
+    assert failed["kind"] == "config"
+    assert "trainer.learning_rate" in failed["message"]
+    assert "float" in failed["help"]
 
 
 @pytest.mark.usefixtures("channel_module")

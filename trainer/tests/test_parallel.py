@@ -110,7 +110,7 @@ def test_two_ranks_are_one_trainer_with_two_environments(tmp_path: Path, registr
     expected, found = parameters(tmp_path / "one"), parameters(tmp_path / "two")
     differences = {name: ((tensor - found[name]).norm() / tensor.norm()).item() for name, tensor in expected.items()}
     assert max(differences.values()) < LARGEST_DIFFERENCE, differences
-    # Only rank 0 tells how it goes.
+    # Only rank 0 shows its progress.
     assert "run two: results go to" in said
     assert "two-rank1" not in said
 

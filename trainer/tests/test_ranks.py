@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from caraware.learn.ranks import Ranks, SampleUnion
-from caraware.parallel import Place, command
+from caraware.parallel import RankPlace, command
 from caraware.run.checkpoint import load_history
 from caraware.run.config import RunConfig
 from caraware.run.loop import TrainingLoop
@@ -153,18 +153,18 @@ def test_a_minibatch_of_the_union_is_what_the_ranks_have_of_it_together() -> Non
         assert torch.equal(first.own[0], first.mine(together.advantage))
 
 
-def nobody(place: Place, own: list[str]) -> list[set[str]]:
+def disagree(place: RankPlace, own: list[str]) -> list[set[str]]:
     raise AssertionError("there is nothing to agree on")
 
 
 def test_each_rank_gets_its_own_environments_and_cores() -> None:
-    place = Place(rank=1, ranks=2, local_rank=1, local_ranks=2)
-    words = command(["town", "--set", "traffic.cavs=8", "--envs", "3", "--name", "x"], place, 7, nobody)
+    place = RankPlace(rank=1, ranks=2, local_rank=1, local_ranks=2)
+    words = command(["town", "--set", "traffic.cavs=8", "--envs", "3", "--name", "x"], place, 7, disagree)
     assert words[:4] == ["train", "town", "--set", "traffic.cavs=8"]
     assert words[words.index("--name") + 1] == "x-rank1"
     for setting in ("run.envs=3", "run.first_env=3", "trainer.ranks=2", "fanout.enabled=false"):
         assert f"--set={setting}" in words
-    first = command([], Place(0, 2, 0, 2), 7, nobody)
+    first = command([], RankPlace(0, 2, 0, 2), 7, disagree)
     assert first[first.index("--name") + 1] == "town-p7"
     assert not any("fanout" in word for word in first)
     assert place.cores([0, 1, 2, 3, 8]) == [2, 3]

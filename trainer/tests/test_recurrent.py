@@ -53,17 +53,17 @@ def fresh(network: str = "gru", **trainer: object) -> Ppo:
 
 
 def recall_ticks(vehicles: int, seed: int) -> Iterator[SyntheticObservation]:
-    """Every vehicle stands still for some ticks, and is told where in the first of them alone."""
+    """Every vehicle stands still for some ticks, and sees where in the first of them alone."""
     rng = np.random.default_rng(seed)
     for tick, obs in enumerate(street_ticks(1_000_000, vehicles, 0.0, seed)):
-        is_told = tick % RECALL_TICKS == 0
-        if is_told:
+        is_shown = tick % RECALL_TICKS == 0
+        if is_shown:
             place_m = torch.from_numpy(rng.uniform(0.2 * SIZE_M, 0.8 * SIZE_M, (vehicles, 2)).astype(np.float32))
         fields, truth = torch.zeros(vehicles, FIELDS), torch.zeros(vehicles, 4)
         truth[:, :2] = place_m
-        if is_told:
+        if is_shown:
             fields[:, :2], fields[:, 2] = place_m / (SIZE_M / 2) - 1, 1.0
-        yield replace(obs, observation=fields, truth=truth, truncated=np.full(vehicles, is_told and tick > 0))
+        yield replace(obs, observation=fields, truth=truth, truncated=np.full(vehicles, is_shown and tick > 0))
 
 
 def recall_error_m(ppo: Ppo, updates: int) -> float:
@@ -206,12 +206,12 @@ def test_where_horizons_end_changes_nothing_that_is_remembered() -> None:
 
 def test_memory_ends_where_trajectories_do() -> None:
     memory = Memory.after(4, torch.tensor([7, 8, 9]), torch.tensor([True, True, False]), torch.ones(3, 2))
-    nobody = torch.zeros(4, dtype=torch.bool)
+    none = torch.zeros(4, dtype=torch.bool)
     vehicles = torch.tensor([7, 8, 9, 5])
-    assert memory.before(5, vehicles, nobody)[:, 0].tolist() == [1, 1, 0, 0]
-    assert memory.before(5, torch.tensor([7, 3]), nobody[:2])[:, 0].tolist() == [1, 0]
+    assert memory.before(5, vehicles, none)[:, 0].tolist() == [1, 1, 0, 0]
+    assert memory.before(5, torch.tensor([7, 3]), none[:2])[:, 0].tolist() == [1, 0]
     assert memory.before(5, vehicles, torch.tensor([True, False, False, False]))[:, 0].tolist() == [0, 1, 0, 0]
-    assert memory.before(6, vehicles, nobody).sum() == 0
+    assert memory.before(6, vehicles, none).sum() == 0
     rollout = Rollout(1, FIELDS, bootstrap=False)
     for obs in with_ends(30):
         rollout.add(obs)

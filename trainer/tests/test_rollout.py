@@ -14,8 +14,8 @@ from synthetic import SIZE_M, SyntheticObservation, locating_ppo, run_file, stre
 def marked(tick: int, vehicles: list[int], **changes: object) -> SyntheticObservation:
     """A tick in which every number says which vehicle and tick it belongs to."""
     n = len(vehicles)
-    who = torch.tensor([v if v >= 0 else 0 for v in vehicles], dtype=torch.float32)
-    columns = torch.stack((who, torch.full((n,), float(tick)), who + tick / 1000, torch.ones(n)), 1)
+    index = torch.tensor([v if v >= 0 else 0 for v in vehicles], dtype=torch.float32)
+    columns = torch.stack((index, torch.full((n,), float(tick)), index + tick / 1000, torch.ones(n)), 1)
     present = np.array([v >= 0 for v in vehicles])
     obs = SyntheticObservation(
         tick=tick,

@@ -27,14 +27,14 @@ class Linear:
 
     def step(self, fix_m: np.ndarray) -> None:
         """`fix_m` `[2, n]`."""
-        everybody = np.ones(fix_m.shape[1], bool)
+        all_slots = np.ones(fix_m.shape[1], bool)
         self.cross = np.einsum("ijn,kj->ikn", self.belief.covariance, F)
         entries = [(0, 3, DT_S), (1, 2, DT_S)]
         self.belief.predict(F @ self.belief.mean, entries, [(i, i, Q[i, i]) for i in range(4)])
         self.predicted = Belief(self.belief.mean.copy(), self.belief.covariance.copy())
         for axis in (0, 1):
             innovation = fix_m[axis] - self.belief.mean[axis]
-            self.belief.correct([(axis, 1.0)], innovation, MEASURED**2, everybody)
+            self.belief.correct([(axis, 1.0)], innovation, MEASURED**2, all_slots)
 
 
 def linear_case(ticks: int, slots: int) -> tuple[np.ndarray, list[SmoothedTick]]:

@@ -1,6 +1,6 @@
 """`python -m caraware.consumer RUN_FILE`: in the trainer's place, reads every observation and learns nothing.
 
-What it costs to deliver observations, without what somebody does with them: `trainer.module = "caraware.consumer"`.
+It measures the cost of delivering observations without a learner: `trainer.module = "caraware.consumer"`.
 """
 
 import json

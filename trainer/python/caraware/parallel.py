@@ -2,7 +2,7 @@
 
 Every process that `torchrun` starts becomes a `caraware train` with environments, shared memory and a supervisor of its
 own; the arguments are those of `caraware train`. The same command with a rendezvous address, on several machines,
-learns on all of them. With `--resume RUN` they go on from the newest checkpoint that all of them have. docs/parallel.md
+learns on all of them. With `--resume RUN` they continue from the newest checkpoint of all. docs/parallel.md
 """
 
 import argparse
@@ -21,15 +21,15 @@ from caraware.run.program import ProgramError, caraware_program
 
 PR_SET_PDEATHSIG = 1
 WAIT_AT_MOST = timedelta(minutes=5)
-"""For the other ranks to say which checkpoints they have."""
+"""For the names of the other ranks' checkpoints."""
 
 
 class ResumeError(Exception):
-    """The ranks cannot go on."""
+    """The ranks cannot continue."""
 
 
 @dataclass(frozen=True)
-class Place:
+class RankPlace:
     """Which of the processes that `torchrun` started this one is."""
 
     rank: int
@@ -39,7 +39,7 @@ class Place:
     """Those on this machine."""
 
     @classmethod
-    def from_environment(cls) -> "Place":
+    def from_environment(cls) -> "RankPlace":
         """Raises `KeyError` where `torchrun` has not started it."""
         names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
         return cls(*(int(os.environ[name]) for name in names))
@@ -54,12 +54,12 @@ class Place:
         return f"{name}-rank{self.rank}" if self.rank > 0 else name
 
 
-Agree = Callable[[Place, list[str]], list[set[str]]]
-"""Tells the other ranks the names of this one's checkpoints; those of all ranks."""
+Agree = Callable[[RankPlace, list[str]], list[set[str]]]
+"""Sends the names of this rank's checkpoints to the others; returns those of all ranks."""
 
 
-def command(arguments: Sequence[str], place: Place, launch: int, agree: Agree) -> list[str]:
-    """Arguments of `caraware` for one rank; `launch` tells launches on one machine apart. Raises `ResumeError`."""
+def command(arguments: Sequence[str], place: RankPlace, launch: int, agree: Agree) -> list[str]:
+    """Arguments of `caraware` for one rank; `launch` distinguishes launches on one machine. Raises `ResumeError`."""
     parser = argparse.ArgumentParser(prog="torchrun … -m caraware.parallel", description=__doc__, add_help=False)
     for name, kind in (("--name", str), ("--resume", Path), ("--runs", Path), ("--envs", int)):
         parser.add_argument(name, type=kind)
@@ -71,7 +71,7 @@ def command(arguments: Sequence[str], place: Place, launch: int, agree: Agree) -
         others = [*others, "--quiet"]
     if known.resume:
         if known.envs is not None:
-            raise ResumeError("--envs cannot change in a run that goes on")
+            raise ResumeError("--envs cannot change in a run that continues")
         return ["train", *others, *_resume(known.resume, runs, known.name, place, launch, agree)]
     envs = known.envs or 1
     settings = {"run.envs": envs, "run.first_env": place.rank * envs, "trainer.ranks": place.ranks}
@@ -81,8 +81,8 @@ def command(arguments: Sequence[str], place: Place, launch: int, agree: Agree) -
     return ["train", *others, "--name", name, *(f"--set={key}={value}" for key, value in settings.items())]
 
 
-def _resume(named: Path, runs: Path, name: str | None, place: Place, launch: int, agree: Agree) -> list[str]:
-    """Goes on from the checkpoint `named`, or from the newest that all ranks have of the run `named`."""
+def _resume(named: Path, runs: Path, name: str | None, place: RankPlace, launch: int, agree: Agree) -> list[str]:
+    """Continues from the checkpoint `named`, or from the newest that all ranks have of the run `named`."""
     is_checkpoint = named.parent.name == "checkpoints"
     run = named.parents[1] if is_checkpoint else next((at for at in (runs / named, named) if at.is_dir()), runs / named)
     own = run.with_name(place.named(run.name))
@@ -94,14 +94,14 @@ def _resume(named: Path, runs: Path, name: str | None, place: Place, launch: int
     return ["--resume", str(own)]
 
 
-def _newest_of_all(folder: Path, place: Place, agree: Agree) -> str:
+def _newest_of_all(folder: Path, place: RankPlace, agree: Agree) -> str:
     common = set.intersection(*agree(place, [checkpoint.name for checkpoint in sound_checkpoints(folder)]))
     if not common:
         raise ResumeError(f"{folder}: no checkpoint here that all {place.ranks} ranks have, each on its machine")
     return max(common)
 
 
-def tell_each_other(place: Place, own: list[str]) -> list[set[str]]:
+def tell_each_other(place: RankPlace, own: list[str]) -> list[set[str]]:
     """By the store that `torchrun` keeps for its processes."""
     from torch.distributed import TCPStore  # type: ignore[attr-defined]  # torch lists it without exporting it
 
@@ -115,7 +115,7 @@ def tell_each_other(place: Place, own: list[str]) -> list[set[str]]:
 def main(arguments: Sequence[str]) -> int:
     """Become the `caraware train` of this rank; returns only if that cannot be."""
     try:
-        place, program = Place.from_environment(), caraware_program()
+        place, program = RankPlace.from_environment(), caraware_program()
     except KeyError:
         print("start it by torchrun: torchrun --nproc-per-node 2 -m caraware.parallel town", file=sys.stderr)
         return 2

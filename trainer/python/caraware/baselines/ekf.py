@@ -237,7 +237,7 @@ class Ekf:
         self.belief.correct(row, innovation, self.noise.compass_std_rad**2 / len(samples.yaw_rad), use)
 
     def _correct_wheel_speed(self, samples: Samples, use: BoolArray) -> None:
-        """`z = max(0, (1 + s) v + n)`, of the speed when the sample was taken. Nobody drives backwards.
+        """`z = max(0, (1 + s) v + n)`, of the speed when the sample was taken. Vehicles do not drive backwards.
 
         The cut is linearised at the prediction, which only a prediction sharper than the sensor allows; else
         `(1 + s) v + n`.

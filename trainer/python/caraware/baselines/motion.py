@@ -40,7 +40,7 @@ class MotionModel:
     position_walk_m: float = 0.01
     """Per √s, on each axis: what the arcs between samples leave out."""
     first_speed_std_mps: float = 10.0
-    """Of somebody whose wheel speed is not known."""
+    """Of a vehicle whose wheel speed is not known."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ SMALLEST_ACCEL_BIAS_STD_MPS2 = 1e-3
 SMALLEST_ACCEL_BIAS_WALK = 1e-4
 SMALLEST_GYRO_BIAS_STD_RADPS = 1e-4
 SMALLEST_GYRO_BIAS_WALK = 1e-6
-"""A filter that is told of a perfect sensor has a singular covariance: perfect sensors get these instead."""
+"""A perfect sensor would make the covariance of a filter singular: perfect sensors get these instead."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Rauch–Tung–Striebel smoother over the filters' beliefs. It sees the future: a bound, not an estimator.
 
 What it says of a tick uses samples that came later; no vehicle can know it at that tick. It shows how much better
-than the filter anybody could be who has the same sensors and the same model of motion, and all the time in the world.
+than the filter an estimator could be with the same sensors, the same model of motion, and unlimited delay.
 """
 
 from dataclasses import dataclass, field
@@ -36,7 +36,7 @@ class _Remembered:
     predicted: Belief | None = None
     """Of the tick after."""
     gain: Float64Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    """`C = P Fᵀ P⁻¹` to the tick after `[d, d, m]`; 0 where no trajectory goes on."""
+    """`C = P Fᵀ P⁻¹` to the tick after `[d, d, m]`; 0 where no trajectory continues."""
 
     def bytes(self) -> int:
         """Memory of the arrays, gain and prediction included."""

@@ -21,7 +21,7 @@ class Samples:
 
     time_s: float
     vehicle: UInt32Array
-    """u32 `[n]`: who holds the slot, `EMPTY_SLOT` if nobody does."""
+    """u32 `[n]`: the vehicle in the slot, `EMPTY_SLOT` without one."""
     valid: BoolArray
     """bool `[n]`: all sensors have delivered, so that there is a fix."""
     begins: BoolArray

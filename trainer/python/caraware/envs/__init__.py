@@ -1,7 +1,7 @@
-"""Standard faces of a simulation for people who bring their own learner: Gymnasium, PettingZoo, Stable-Baselines3.
+"""Standard faces of a simulation for other learners: Gymnasium, PettingZoo, Stable-Baselines3.
 
 `make` starts a simulation; a face is put on it, or on the `Channel` of a trainer that the supervisor started.
-docs/environments.md tells which face is for what.
+docs/environments.md says which face is for what.
 """
 
 from importlib import import_module
@@ -45,7 +45,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """Imports a face when it is asked for: nobody needs all three libraries, and `caraware.envs.outside` none."""
+    """Imports a face when it is asked for: a user needs one of three libraries, and `caraware.envs.outside` none."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

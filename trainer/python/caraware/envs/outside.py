@@ -1,7 +1,7 @@
 """`python -m caraware.envs.outside RUN_FILE`: keeps the trainer's place in a run whose trainer is a process outside.
 
-The supervisor starts it like any trainer. It tells the process that asked for the simulation where the run file is, and
-then lives as long as that process wants: it ends in order when told, and fails the run when that process is gone. So a
+The supervisor starts it like any trainer. It sends the path of the run file to the process that asked for the
+simulation. It ends in order when that process says so, and fails the run when that process is gone. So a
 simulation never outlives its user, however that one ends. It imports nothing but the standard library.
 """
 

@@ -18,9 +18,9 @@ from caraware.ipc.stream import Channel
 class CarAwareParallelEnv(ParallelEnv):  # type: ignore[misc]  # pettingzoo has no types
     """Agents are vehicles, such as `cav.12`, that come and go. In an episode, the simulation's, no id is used twice.
 
-    Nobody knows beforehand who will come: `possible_agents` holds the ids seen so far and grows. Observation and action
-    spaces are the same for all. An agent's last step has its last observation; whoever comes in a step is in its
-    dictionaries with reward 0 and acts from the next on. Who is given no action gets (0, 0).
+    Which vehicles will come is not known before: `possible_agents` holds the ids seen so far and grows. Spaces of
+    observations and actions are the same for all. An agent's last step has its last observation; a vehicle that comes
+    in a step is in its dictionaries with reward 0 and acts from the next on. An agent without an action gets (0, 0).
     """
 
     metadata = {"name": "caraware_v0", "render_modes": []}  # noqa: RUF012, as PettingZoo wants it
@@ -88,7 +88,7 @@ class CarAwareParallelEnv(ParallelEnv):  # type: ignore[misc]  # pettingzoo has 
         self.slots.close()
 
     def _take_over(self, now: Tick) -> None:
-        """Whoever holds a slot is an agent; nobody is between two episodes."""
+        """The vehicle in a slot is an agent; between two episodes there is none."""
         slots = [] if self._between else np.flatnonzero(now.mask).tolist()
         self._slot_of = {self._names.of(now.id_hash[slot]): slot for slot in slots}
         self.agents = list(self._slot_of)

@@ -33,7 +33,7 @@ STOP_WITHIN_S = 40.0
 """Longest time from the request to stop to the supervisor's end; it gives its own processes 30 s."""
 
 INTERRUPTED = 130
-"""Exit code of `caraware` when somebody stopped it."""
+"""Exit code of `caraware` after an interrupt."""
 
 _TEMPORARY = "caraware-env-"
 
@@ -190,9 +190,9 @@ def make(
 
 
 class _TemporaryRuns:
-    """A directory for the runs of a simulation whose results nobody asked to keep.
+    """A directory for the runs of a simulation whose results are not to be kept.
 
-    It is removed with the simulation, or, if its process was killed, when the next one starts: whoever lives holds a
+    It is removed with the simulation, or, if its process was killed, when the next one starts: a live process holds a
     lock on a file in it.
     """
 
@@ -239,14 +239,14 @@ class _Run:
                 raise
 
     def _started(self, command: list[str | Path], line: str) -> subprocess.Popen[bytes]:
-        told = {outside.LINE: line, outside.USER: str(os.getpid()), "PYTHONPATH": _python_path()}
+        addressed = {outside.LINE: line, outside.USER: str(os.getpid()), "PYTHONPATH": _python_path()}
         try:
             return subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=self._messages,
-                env=os.environ | told,
+                env=os.environ | addressed,
                 start_new_session=True,  # Ctrl-C in a terminal is this process's affair
             )
         except OSError as error:
@@ -333,8 +333,8 @@ class _Run:
         file = self._messages.fileno()
         lines = os.pread(file, os.fstat(file).st_size, 0).decode(errors="replace").rstrip().splitlines()
         errors = [number for number, line in enumerate(lines) if line.lstrip().startswith("×")]
-        told = lines[errors[-1] :] if errors else lines[-3:]
-        return "\n".join([f"the simulation ended (caraware: {_exit_text(status)})", *told])
+        reason = lines[errors[-1] :] if errors else lines[-3:]
+        return "\n".join([f"the simulation ended (caraware: {_exit_text(status)})", *reason])
 
 
 _open_simulations: weakref.WeakSet[Simulation] = weakref.WeakSet()
@@ -360,7 +360,7 @@ def _exit_text(status: int | None) -> str:
 
 
 def _user_of(line: socket.socket) -> int:
-    """User id of whoever is at the other end: anybody on this machine may connect to an abstract name."""
+    """User id of the process at the other end: every process on this machine may connect to an abstract name."""
     credentials = line.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     _pid, user, _group = struct.unpack("3i", credentials)
     return int(user)

@@ -1,6 +1,6 @@
-"""The one loop behind all faces: answers a tick, takes the next, and tells how trajectories went on.
+"""The one loop behind all faces: answers a tick, takes the next, and returns how trajectories continued.
 
-A slot at tick k + 1 tells how the trajectory that held it at k ended; by then a new one may hold it. So a step from k
+A slot at tick k + 1 shows how the trajectory that held it at k ended; by then a new one may hold it. So a step from k
 to k + 1 gives, for each slot, the reward of k's action, whether k was the last tick of its trajectory, and the row of
 k + 1, which is that of another vehicle where a trajectory ended.
 """
@@ -48,7 +48,7 @@ class Source(Protocol):
 
     can_restart: bool
     current: Observation | None
-    """The tick received last. Nobody else may keep it: memory of a run must be let go before the run is left."""
+    """The tick received last. No other object may keep it: the memory of a run must be released before its end."""
 
     @property
     def channel(self) -> Any:
@@ -69,7 +69,7 @@ class Source(Protocol):
 
 
 class GivenChannel:
-    """A channel that somebody opened, in a process that the supervisor started by `trainer.module`."""
+    """A channel that is open already, in a process that the supervisor started by `trainer.module`."""
 
     can_restart = False
 
@@ -198,7 +198,7 @@ class Slots:
         return self.now
 
     def step(self, action: FloatArray) -> tuple[Transition, Float64Array]:
-        """Answers the present tick with actions `[N, 2]` and goes on to the next.
+        """Answers the present tick with actions `[N, 2]` and continues to the next.
 
         Returns what happened and its rewards, f64 `[N]`.
         """
@@ -224,7 +224,7 @@ class Slots:
         return self._answered
 
     def commit(self) -> None:
-        """Says that a checkpoint of yours has what was learnt so far: nobody needs the ticks before the present one."""
+        """Reports that your checkpoint contains what was learned so far: earlier ticks need not be delivered again."""
         if self._answered >= 0:
             self.source.channel.committed(self._answered)
 
@@ -291,7 +291,7 @@ class Slots:
             tick = self._take()
 
     def _evaluate(self, tick: Tick) -> None:
-        """Answers a tick of an evaluation, which nobody learns from."""
+        """Answers a tick of an evaluation; no learner sees it."""
         if self._evaluation_policy is None:
             self._answer(self._idle, publish=self._world_waits)
             return
@@ -318,7 +318,7 @@ class Slots:
         if obs.last or (obs.tick + 1) % self.settings.credit_ticks == 0:
             channel.consumed(obs.tick)
             if self.source.can_restart:
-                # Nobody asks for old ticks again: the run does not outlive this process.
+                # Old ticks are never delivered again: the run does not outlive this process.
                 channel.committed(obs.tick)
 
     def _copied(self, obs: Observation) -> Tick:
@@ -329,7 +329,7 @@ class Slots:
         if self.settings.dark_is_nan:
             np.nan_to_num(observation, copy=False)
         if observation.shape[1] != self.settings.fields.width:
-            raise ValueError(f"rows of {observation.shape[1]} numbers, the run file tells {self.settings.fields.width}")
+            raise ValueError(f"rows of {observation.shape[1]} numbers, the run file says {self.settings.fields.width}")
         truth, gnss_m = _padded(_array(obs, "truth"), n), _padded(_array(obs, "gnss_m")[:, :2], n)
         if not mask.all():
             for rows in (observation, truth, gnss_m):
@@ -352,12 +352,12 @@ class Slots:
 
     def _nobody(self) -> Tick:
         """Beyond the last tick of a run."""
-        n, nobody = self.count, np.zeros(self.count, bool)
+        n, none = self.count, np.zeros(self.count, bool)
         zeros = [np.zeros((n, width), np.float32) for width in (self.settings.fields.width, 4, 2)]
         vehicle = np.full(n, EMPTY_SLOT, np.uint32)
         ids = np.zeros(n, np.uint64)
         episode, rows = (self._runs + 1, 0), Rows(self.settings, *zeros)
-        return Tick(True, False, 0, episode, rows, nobody, vehicle, ids, nobody, nobody)
+        return Tick(True, False, 0, episode, rows, none, vehicle, ids, none, none)
 
     def _transition(self, now: Tick, following: Tick | None) -> Transition:
         if following is None:
@@ -365,7 +365,7 @@ class Slots:
         else:
             terminated = now.mask & following.terminated
             same = following.mask & (following.vehicle == now.vehicle) & (following.episode == now.episode)
-            # A slot that changed hands or has a gap without a flag: its trajectory went on unseen.
+            # A slot that changed hands or has a gap without a flag: its trajectory continued unseen.
             truncated = now.mask & ~terminated & (following.truncated | ~same)
             after = _where(terminated | truncated, now.rows, following.rows)
         return Transition(

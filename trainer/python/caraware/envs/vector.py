@@ -18,13 +18,13 @@ from caraware.ipc.stream import Channel
 class CarAwareVectorEnv(VectorEnv):
     """Slots as sub-environments with SAME_STEP autoreset.
 
-    `infos["mask"]` (bool `[N]`) tells which slots hold a vehicle. A row without one is zero, earns 0 and its action is
+    `infos["mask"]` (bool `[N]`) marks slots with a vehicle. A row without one is zero, earns 0 and its action is
     not used; it is the time before the next trajectory of that slot. Where a trajectory ended, `infos["final_obs"]` has
     its last observation and `infos["final_info"]` what else is known of it. Further keys: `vehicle`, `id_hash`, `truth`
     of the rows returned, and each metric of the task by name, such as `error_m`, of the actions taken.
 
     A `num_envs` other than `traffic.cavs` or the number of heroes takes the first slots only. `evaluation_policy`
-    answers the evaluation episodes of a run that `caraware` started; nobody steps or learns from those.
+    answers the evaluation episodes of a run that `caraware` started; those are neither stepped nor learned from.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's PPO takes over a running simulation from the trainer at work, with what that has learnt.
+"""Stable-Baselines3's PPO replaces the trainer of a running simulation and continues with its networks.
 
 `caraware handover RUN --set trainer.module=caraware.examples.sb3_takeover`: it gets ready beside the old trainer, takes
 its networks out of its last checkpoint, and continues with the tick after it. docs/environments.md
@@ -24,11 +24,11 @@ from caraware.run.manifest import newest_sound_checkpoint, read_manifest
 from caraware.run.process import HandoverRole
 
 MODEL, PLACE = "sb3_takeover.zip", "sb3_takeover.json"
-"""In the run directory: the model, and the first tick that it has not learnt from."""
+"""In the run directory: the model, and the first tick that it has not learned from."""
 
 
 class SaveAndCommit(BaseCallback):
-    """After every update: the model on disk, then the word that nobody needs the ticks before."""
+    """After every update: the model on disk, then the report that earlier ticks need not be delivered again."""
 
     def __init__(self, env: CarAwareVecEnv, run_dir: Path) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ def save(model: BaseAlgorithm, env: CarAwareVecEnv, run_dir: Path) -> None:
 
 
 def first_tick(run_dir: Path) -> int:
-    """The first tick that neither an earlier process of this module nor the trainer before it has learnt from."""
+    """The first tick that neither an earlier process of this module nor the trainer before it has learned from."""
     if (run_dir / PLACE).exists():
         return int(json.loads((run_dir / PLACE).read_text())["tick"])
     checkpoint = newest_sound_checkpoint(run_dir / "checkpoints")
@@ -64,7 +64,7 @@ def take_networks(model: PPO, checkpoint: Path) -> None:
     stored, policy = load_file(checkpoint / "parameters.safetensors"), model.policy
     manifest = read_manifest(checkpoint)
     if manifest.network != "mlp":
-        raise SystemExit(f"{checkpoint}: its network is {manifest.network}; this example takes over from an MLP")
+        raise SystemExit(f"{checkpoint}: its network is {manifest.network}; this example continues from an MLP")
     activation = {"relu": nn.ReLU, "tanh": nn.Tanh}[manifest.activation]
     for name, last, head in (("policy", nn.Tanh, nn.Tanh), ("value", activation, nn.Identity)):
         layers = sum(key.startswith(f"{name}.layer") and key.endswith("weight") for key in stored)

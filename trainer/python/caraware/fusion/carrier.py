@@ -1,7 +1,7 @@
 """What carries an estimate from tick to tick: dead reckoning and the pull of the fixes, from a Kalman filter.
 
 The filter (`caraware.baselines.ekf`) knows nothing of maps. It says how every vehicle moved, how far the newest fix
-pulls and how much that counts. The learned estimator goes on from its own previous estimate with the first, and
+pulls and how much that counts. The learned estimator moves its own previous estimate by the first, and
 decides about the rest.
 """
 

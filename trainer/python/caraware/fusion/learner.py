@@ -30,7 +30,7 @@ class FusionConfig:
     map: bool
     """Whether the estimator has the lanes of the net."""
     segment_ticks: int
-    """An episode is learnt from in pieces of so many ticks, side by side."""
+    """The estimator learns from an episode in pieces of so many ticks, side by side."""
     truncation_ticks: int
     """Ticks between two gradient steps; the gradient reaches no further back."""
 

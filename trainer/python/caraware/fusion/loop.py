@@ -135,7 +135,7 @@ class FusionLoop:
         self._vehicles = max(self._vehicles, len(policy_m))
         self._stream.starts.note(obs)
         if obs.evaluation:
-            # A predecessor may have evaluated ticks that it had not learnt up to.
+            # A predecessor may have evaluated ticks that it had not learned up to.
             if obs.tick > self._stream.evaluated_tick:
                 self._evaluation = self._evaluation or Evaluation(self._config.sensors)
                 self._evaluation.add(obs, policy_m, raw_m)

@@ -71,7 +71,7 @@ def read_only_tensor(array: NDArray[Any]) -> Tensor:
     return torch.from_numpy(array).as_subclass(ReadOnlyTensor)
 
 
-# torch warns once per process of an array that is not writable: here, where nobody sees it.
+# torch warns once per process of an array that is not writable: here, where the warning is ignored.
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
     read_only_tensor(np.frombuffer(bytes(4), np.float32))
@@ -300,7 +300,7 @@ class Channel:
         policy_version: int,
         estimates: Float32Array | None = None,
     ) -> None:
-        """Predicted positions, f32 [n, 2] in world metres, for everybody who watches.
+        """Predicted positions, f32 [n, 2] in world metres, for viewers.
 
         `estimates`, f32 [n, 2], are those of a filter beside the policy, not-a-number where it has none.
         """
@@ -333,5 +333,5 @@ class Channel:
         self._attachment.done()
 
     def close(self) -> None:
-        """Lets go of the run's shared memory, whoever still holds this object, which is of no use afterwards."""
+        """Releases the run's shared memory, even if this object is still referenced; it is of no use afterwards."""
         del self._attachment

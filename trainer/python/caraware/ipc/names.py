@@ -6,7 +6,7 @@ from caraware import _native
 from caraware.ipc.run_file import RunFile
 
 PREFIXES = ("cav.", "hero.", "person.")
-"""Population control numbers whom it adds within an episode: `cav.0`, `cav.1`, …; nobody gets an old number."""
+"""Population control numbers the road users that it adds in an episode: `cav.0`, `cav.1`, …; none is reused."""
 FIRST_NUMBERS, MOST_NUMBERS = 256, 1 << 16
 """Numbers looked through at first and at most."""
 

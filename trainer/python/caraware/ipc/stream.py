@@ -9,7 +9,7 @@ from caraware.ipc.arrays import BoolArray, Float32Array, UInt32Array, UInt64Arra
 from caraware.ipc.run_file import RunFile
 
 EMPTY_SLOT = 0xFFFFFFFF
-"""`vehicle` of a slot that holds nobody."""
+"""`vehicle` of a slot without one."""
 
 
 class LearningTick(Protocol):
@@ -144,7 +144,7 @@ class Channel(Protocol):
         """Give the producer credit up to and including `tick`."""
 
     def committed(self, tick: int) -> None:
-        """Say that all ticks up to and including `tick` are in a checkpoint: nobody needs to deliver them again."""
+        """Say that all ticks up to and including `tick` are in a checkpoint: they need not be delivered again."""
 
     def decided(self, lessons: int, since: int, stage: int) -> None:
         """Say that all lessons below `lessons` have a stage of the curriculum, those from `since` on `stage`."""

@@ -17,8 +17,8 @@ def generalised_advantage(
     """Advantages and value targets of `T` ticks of `N` slots; every argument is `[T, N]`.
 
     `next_value[t]` is the value of what follows tick `t` in the same trajectory. Where the trajectory
-    `terminated` at `t`, nothing follows and it is not read. Where it was `truncated`, life went on unseen: its
-    value counts, but no later tick of the slot does, since that is somebody else's. Rows that are not `valid`
+    `terminated` at `t`, nothing follows and it is not read. Where it was `truncated`, it continued unseen: its
+    value counts, but no later tick of the slot does, since that is of another vehicle. Rows that are not `valid`
     break the chain like a truncation and get zeros.
     """
     if discount == 0.0:

@@ -15,7 +15,7 @@ class Memory:
     tick: Tensor
     """i64 `[]`; -1 before the first."""
     vehicle: Tensor
-    """i64 `[N]`: whose state it is, `EMPTY_SLOT` where the trajectory does not go on."""
+    """i64 `[N]`: the vehicle of the state, `EMPTY_SLOT` where the trajectory does not continue."""
     state: Tensor
     """f32 `[N, h]`, 0 where it does not; the states of several networks lie side by side."""
 
@@ -53,7 +53,7 @@ class Memory:
 
     @classmethod
     def restored(cls, tensors: dict[str, Tensor], suffix: str) -> "Memory | None":
-        """From what `tensors` told; None if it is not there."""
+        """From what `tensors` returned; None if it is not there."""
         names = [f.name for f in fields(cls)]
         if any(f"{name}{suffix}" not in tensors for name in names):
             return None

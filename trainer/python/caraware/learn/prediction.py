@@ -1,4 +1,4 @@
-"""Predictions for the ticks of a stream as they come, for whoever watches and for evaluations."""
+"""Predictions for the ticks of a stream as they come, for viewers and for evaluations."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol

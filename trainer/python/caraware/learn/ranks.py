@@ -1,7 +1,7 @@
 """Trainers that learn together: every gradient step is one of all, over the union of what each has collected.
 
-Each rank is the trainer of a run of its own and sees only its own environments. Before an update the ranks tell each
-other how many samples they have, and their advantages, rewards and value targets: three numbers for each sample. All
+Each rank is the trainer of a run of its own and sees only its own environments. Before an update the ranks exchange
+their numbers of samples, and their advantages, rewards and value targets: three numbers for each sample. All
 shuffle the union alike and cut it into the same minibatches; a rank works on the rows that are its own, its gradient is
 weighted by its share of the minibatch, and the sum over the ranks is the gradient of the whole minibatch. So all take
 the step that one trainer with all the samples would take, and keep equal parameters.
@@ -24,7 +24,7 @@ WAIT_AT_MOST = timedelta(hours=1)
 
 
 class RankError(Exception):
-    """The ranks cannot go on together."""
+    """The ranks cannot continue together."""
 
 
 class Verdict(IntEnum):
@@ -164,9 +164,9 @@ class TorchRanks(Ranks):
     def union(self, advantage: Tensor, reward: Tensor, value_target: Tensor) -> SampleUnion:
         """See `Ranks.union`."""
         tries = advantage.reshape(len(reward), -1)
-        everybody = self.tables(torch.cat((tries, reward.unsqueeze(1), value_target.unsqueeze(1)), 1))
-        before = sum(len(each) for each in everybody[: self.rank])
-        columns = torch.cat(everybody).t().contiguous()
+        of_all = self.tables(torch.cat((tries, reward.unsqueeze(1), value_target.unsqueeze(1)), 1))
+        before = sum(len(each) for each in of_all[: self.rank])
+        columns = torch.cat(of_all).t().contiguous()
         advantages = columns[:-2].t().contiguous().view(-1, *advantage.shape[1:])
         return SampleUnion(advantages, columns[-2], columns[-1], before, len(reward))
 
@@ -175,10 +175,10 @@ class TorchRanks(Ranks):
         sizes = self.gather(tuple(own.shape))
         padded = torch.zeros(max(rows for rows, _ in sizes), max(columns for _, columns in sizes), dtype=own.dtype)
         padded[: own.shape[0], : own.shape[1]] = own.cpu()
-        everybody = [torch.empty_like(padded) for _ in sizes]
-        with self._together("telling each other what they have"):
-            self._dist.all_gather(everybody, padded)
-        return [each[:rows, :columns].to(own.device) for each, (rows, columns) in zip(everybody, sizes, strict=True)]
+        of_all = [torch.empty_like(padded) for _ in sizes]
+        with self._together("exchanging samples"):
+            self._dist.all_gather(of_all, padded)
+        return [each[:rows, :columns].to(own.device) for each, (rows, columns) in zip(of_all, sizes, strict=True)]
 
     def add_up(self, network: str, values: Tensor) -> None:
         """See `Ranks.add_up`."""
@@ -192,7 +192,7 @@ class TorchRanks(Ranks):
     def gather(self, value: Any) -> list[Any]:
         """See `Ranks.gather`."""
         values: list[Any] = [None] * self._dist.get_world_size()
-        with self._together("telling each other"):
+        with self._together("exchanging values"):
             self._dist.all_gather_object(values, value)
         return values
 

@@ -86,7 +86,7 @@ class PackedSequences:
     is_own: Tensor
     """bool `[b]`: those of this rank."""
     sizes: Tensor
-    """i64 `[L]`: how many of this rank's sequences go on so long."""
+    """i64 `[L]`: how many of this rank's sequences are that long."""
     own: Tensor
     """i64: this rank's sequences, among its own."""
 
@@ -189,7 +189,7 @@ class RecurrentPpo(Ppo):
         )
 
     def _value_after(self, horizon: Horizon, walk: Walk) -> Tensor | None:
-        """f32 `[N]`: the value of what followed the last tick; 0 where the trajectory did not go on."""
+        """f32 `[N]`: the value of what followed the last tick; 0 where the trajectory did not continue."""
         if horizon.bootstrap is None or self.config.discount == 0.0:
             return None
         rows = outlives(horizon).nonzero().squeeze(1)

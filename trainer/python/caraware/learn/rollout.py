@@ -32,7 +32,7 @@ class Horizon:
     terminated: Tensor
     """bool `[T, N]`: the trajectory ended with this row."""
     truncated: Tensor
-    """bool `[T, N]`: it went on, but the next row of the slot is not its continuation."""
+    """bool `[T, N]`: it continued, but the next row of the slot is not its continuation."""
     cut: Tensor
     """bool `[N]`: the flags of the first tick say that the trajectory in the slot before it ended there."""
     bootstrap: Tensor | None
@@ -50,7 +50,7 @@ class Horizon:
 class Rollout:
     """Collects training ticks until `horizon` samples are there.
 
-    With `bootstrap`, one more tick is kept: what followed the last tick tells how its trajectories ended and what
+    With `bootstrap`, one more tick is kept: the tick after the last one shows how its trajectories ended and what
     they were still worth. That tick then opens the next horizon.
     """
 
@@ -91,7 +91,7 @@ class Rollout:
         self._samples, self._newest_samples = self._samples + samples, samples
 
     def ended(self, obs: LearningTick) -> None:
-        """Note how the trajectories of the newest row ended, which the tick after it, of any episode, tells."""
+        """Note how the trajectories of the newest row ended: the tick after it, of any episode, has the flags."""
         self._discard_taken()
         if self._ticks == 0:
             return
@@ -113,7 +113,7 @@ class Rollout:
         return self._samples - following >= self._horizon
 
     def take(self) -> Horizon:
-        """The collected horizon, to be learnt from before the next `add`, which starts anew."""
+        """The collected horizon, to be learned from before the next `add`, which starts anew."""
         end = self._ticks - 1 if self._bootstrap else self._ticks
         horizon = Horizon(
             observation=self._observation[:end],
@@ -137,11 +137,11 @@ class Rollout:
             array[: self._ticks - self._taken] = array[self._taken : self._ticks]
         self._ticks -= self._taken
         self._taken = 0
-        # How trajectories ended before a tick that only served as a bootstrap, the horizon before it has told.
+        # The horizon before has the ends of trajectories before a tick that only served as a bootstrap.
         self._cut = np.zeros(0, bool)
 
     def _close_changed_slots(self, t: int) -> None:
-        """A slot that changed hands, or has a gap, without a flag: its trajectory went on unseen."""
+        """A slot that changed hands, or has a gap, without a flag: its trajectory continued unseen."""
         if t == 0:
             return
         went_on = (self._vehicle[t] == self._vehicle[t - 1]) & self._valid[t]

@@ -21,7 +21,7 @@ from caraware.tasks.rewards import distance_m
 SEED_OFFSET = 0x5E_ED00
 """Between the seed of a run and those of this baseline."""
 LEARNT_EVERY = 2
-"""One of so many samples is learnt from: a pass over all costs 11 % of the CPU time of an update with 4 epochs."""
+"""It learns from one of so many samples: a pass over all costs 11 % of the CPU time of an update with 4 epochs."""
 SMALLEST_DISTANCE_M = 1e-6
 """Below this a distance has no direction."""
 

@@ -67,17 +67,17 @@ class EvaluationResult:
 
     def headline(self) -> dict[str, float | None]:
         """Mean errors, half their confidence intervals and the number of seeds, for the run's report."""
-        told = {key: value for key, value in asdict(self).items() if key.endswith(("_mean_error_m", "_ci95_m"))}
-        return told | {"evaluation_seeds": self.episodes}
+        means = {key: value for key, value in asdict(self).items() if key.endswith(("_mean_error_m", "_ci95_m"))}
+        return means | {"evaluation_seeds": self.episodes}
 
     def __str__(self) -> str:
-        told = ", ".join(
+        means = ", ".join(
             f"{label} {getattr(self, f'{name}_mean_error_m'):.3f} ± {self.half_width_m(name):.3f} m"
             for name, label in ESTIMATORS.items()
             if getattr(self, f"{name}_mean_error_m") is not None
         )
         over = f"{self.episodes} seeds" if self.episodes > 1 else "the vehicles of one seed"
-        return f"{told} (95 % over {over}), {self.samples} samples"
+        return f"{means} (95 % over {over}), {self.samples} samples"
 
 
 ESTIMATORS = {
@@ -113,7 +113,7 @@ class Mean:
 
 
 class Evaluation:
-    """Collects one evaluation phase. Vehicles are told apart within an episode.
+    """Collects one evaluation phase. A vehicle keeps its index within an episode.
 
     With the errors of sensors, filter and smoother run beside the policy, over the same rows; without, they have no
     results.

@@ -21,7 +21,7 @@ class TrainingPoint:
     sigma: float
     reward: float
     error_m: float
-    """Mean error of the deterministic policy on the horizon's samples, before it learnt from them."""
+    """Mean error of the deterministic policy on the horizon's samples, before the policy learned from them."""
     raw_gnss_error_m: float
     env_steps_per_s: float
 

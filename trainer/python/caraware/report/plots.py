@@ -12,7 +12,7 @@ from caraware.report.metrics import TrainingPoint
 
 POLICY, EVALUATION, RAW, REWARD = "#7fb3d5", "#1a5276", "#b03a2e", "#ca6f1e"
 EKF, RTS, SUPERVISED = "#e69f00", "#555555", "#009e73"
-"""Told apart by the colour-blind too: they differ in lightness, and each line has its own dashes and marks."""
+"""Colour-blind readers can distinguish them: they differ in lightness, and lines in their dashes and marks."""
 
 
 def plot_error(file: Path, training: list[TrainingPoint], evaluations: list[EvaluationResult]) -> None:
@@ -45,7 +45,7 @@ def _plot_evaluated(
         return
     steps, means_m = [e.env_steps for e in known], [getattr(e, key) for e in known]
     halves_m, seeds = [e.half_width_m(name) for e in known], known[-1].episodes
-    told = f"last {means_m[-1]:.2f} ± {halves_m[-1]:.2f} m" + (f", {seeds} seeds" if seeds > 1 else "")
+    last = f"last {means_m[-1]:.2f} ± {halves_m[-1]:.2f} m" + (f", {seeds} seeds" if seeds > 1 else "")
     axes.errorbar(
         steps,
         means_m,
@@ -56,7 +56,7 @@ def _plot_evaluated(
         markersize=4,
         linewidth=1.5,
         capsize=2,
-        label=f"{label} ({told})",
+        label=f"{label} ({last})",
     )
 
 

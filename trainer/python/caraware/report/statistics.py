@@ -11,7 +11,7 @@ class Interval:
 
     mean: float
     half_width: float
-    """nan for a single value, which tells nothing about its spread."""
+    """nan for a single value, which has no spread."""
     count: int
 
     @property

@@ -24,7 +24,7 @@ class Stage:
         return tuple(cls(**{name: stage.get(name) for name in cls.__dataclass_fields__}) for stage in stages)
 
     def passed(self, policy_std: float, error_m: float, lessons: int) -> bool:
-        """Whether the gate opens; a measure that nobody has is nan, and opens nothing."""
+        """Whether the gate opens; a measure that is not known is nan, and opens nothing."""
         return (
             (self.until_std is not None and policy_std <= self.until_std)
             or (self.until_error_m is not None and error_m <= self.until_error_m)

@@ -1,7 +1,7 @@
 """One environment of a run as the training loop takes it: its ticks in order, and its share of the horizon.
 
 Environments learn together but do not wait for each other tick by tick: each collects its share of the horizon from
-its own ticks, and the update takes the shares in the order of the environments. So what is learnt depends on the
+its own ticks, and the update takes the shares in the order of the environments. So what is learned depends on the
 environments' own ticks alone, never on how they happen to arrive together.
 """
 

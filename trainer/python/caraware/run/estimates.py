@@ -1,4 +1,4 @@
-"""The Kalman filter beside the policy, for whoever watches a run."""
+"""The Kalman filter beside the policy, for the viewers of a run."""
 
 import numpy as np
 

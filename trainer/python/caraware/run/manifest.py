@@ -24,7 +24,7 @@ COURSE = "course.json"
 LATEST, BEST = "latest", "best"
 """Files beside the checkpoints that name the newest, and the one whose evaluation had the least mean error."""
 NEWEST = "CARAWARE_NEWEST_CHECKPOINT"
-"""Environment variable: the name of the newest checkpoint of a run that counts. Ranks go on from one that all have."""
+"""Environment variable: name of the newest checkpoint of a run that counts. Ranks continue from one that all have."""
 OWN_HASH = "manifest_sha256"
 """Entry of the manifest: SHA-256 of all its other entries, as canonical JSON."""
 
@@ -45,7 +45,7 @@ class Counters:
     env_steps: int
     episode: int
     committed_tick: int
-    """Newest tick that the parameters have learnt from; -1 before the first."""
+    """Newest tick that the parameters have learned from; -1 before the first."""
     next_episode: int = 0
     """The episode that the tick after it belongs to: a resumed simulation begins there."""
     next_episode_tick: int = 0

@@ -9,7 +9,7 @@ class TickLedger:
     """Counts the ticks that came, those that did not, and those that came twice."""
 
     def __init__(self, committed_tick: int | None) -> None:
-        """`committed_tick` is the newest that a resumed run has learnt from; without, the first tick is any."""
+        """`committed_tick` is the newest that a resumed run has learned from; without, the first tick is any."""
         self.received = self.lost = self.duplicated = 0
         self.newest = committed_tick
 
@@ -51,7 +51,7 @@ class StreamPosition:
     """How far one environment has come, up to a checkpoint."""
 
     committed_tick: int = -1
-    """Newest tick that the parameters have learnt from; -1 before the first."""
+    """Newest tick that the parameters have learned from; -1 before the first."""
     received_ticks: int = 0
     lost_ticks: int = 0
     duplicated_ticks: int = 0
