@@ -7,8 +7,9 @@ from pathlib import Path
 
 from caraware.learn import ranks
 from caraware.run.config import RunConfig
+from caraware.run.learner import Learner
 from caraware.run.loop import TrainingLoop
-from synthetic import SyntheticChannel, run_file, with_evaluation
+from synthetic import FIELDS, SyntheticChannel, run_file, with_evaluation
 
 DEVICE = os.environ.get("RANK_PROBE_DEVICE", "cpu")
 SETTINGS = json.loads(os.environ.get("RANK_PROBE_SETTINGS", "{}"))
@@ -41,11 +42,11 @@ def main(folder: Path, fault: str) -> None:
     loop = TrainingLoop(first, RunConfig.from_run(run), lambda: False, others=others, ranks=together)
     if rank == 1 and fault == "dies":
         learn = loop._learn
-        loop._learn = lambda: os._exit(9) if loop._updates() == 2 else learn()  # type: ignore[method-assign]
+        loop._learn = lambda learner: os._exit(9) if loop._updates() == 2 else learn(learner)
     if rank == 1 and fault == "differs":
-        loop._ensure_started(next(with_evaluation(1, 0, VEHICLES, 5.0, 1)))
-        assert loop._learner.ppo is not None
-        loop._learner.ppo.updater.parameters()["policy.layer0.weight"][0, 0] += 1e-3
+        learner = Learner.begin(RunConfig.from_run(run), FIELDS, together)
+        loop._start(learner)
+        learner.ppo.updater.parameters()["policy.layer0.weight"][0, 0] += 1e-3
     loop.run()
     together.close()
 
