@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from caraware_viewer import wire
+from caraware_viewer import layout, wire
 
 RUN_ID = 7
 
@@ -14,7 +14,7 @@ RUN_ID = 7
 def header(tick: int, count: int, columns: int, **fields: int) -> bytes:
     row = np.zeros(1, wire.HEADER)
     values = {
-        "schema_version": wire.SCHEMA_VERSION,
+        "schema_version": layout.SCHEMA_VERSION,
         "run_id": RUN_ID,
         "tick": tick,
         "sim_time_ns": (tick + 1) * 100_000_000,
@@ -54,9 +54,10 @@ def observation(
     arrays = {"truth": truth, "gnss_m": np.pad(gnss_m, ((0, 0), (0, 1))), "vehicle": np.arange(n), "flags": flags}
     arrays |= {"id_hash": 100 + np.arange(n), "sensors": np.full(n, 7)} | fields
     payload = b""
-    for name, element, shape in wire.observation_sections(n, d, k):
-        payload += np.asarray(arrays.get(name, np.zeros(shape)), element).reshape(shape).tobytes()
-        payload += bytes(-len(payload) % wire.ALIGNMENT)
+    for section in layout.SECTIONS["observation"]:
+        shape = section.sized({"slots": n, "fields": d, "imu_samples": k})
+        payload += np.asarray(arrays.get(section.name, np.zeros(shape)), section.element).reshape(shape).tobytes()
+        payload += bytes(-len(payload) % layout.ALIGNMENT)
     return header(tick, n, d, sequence=k) + payload
 
 
@@ -64,7 +65,7 @@ def prediction(tick: int, position_m: np.ndarray, estimate_m: np.ndarray | None 
     first = np.asarray(position_m, "<f4").tobytes()
     if estimate_m is None:
         return header(tick, len(position_m), 2) + first
-    second = bytes(-len(first) % wire.ALIGNMENT) + np.asarray(estimate_m, "<f4").tobytes()
+    second = bytes(-len(first) % layout.ALIGNMENT) + np.asarray(estimate_m, "<f4").tobytes()
     return header(tick, len(position_m), 2, flags=wire.ESTIMATES) + first + second
 
 
@@ -96,5 +97,5 @@ def pointcloud(tick: int, points: dict[str, Any], **scan: Any) -> bytes:
     rows = np.zeros(len(points["position_m"]), wire.LIDAR_POINT)
     for name, value in points.items():
         rows[name] = value
-    payload = head.tobytes() + bytes(-wire.SCAN.itemsize % wire.ALIGNMENT) + rows.tobytes()
+    payload = head.tobytes() + bytes(-wire.SCAN.itemsize % layout.ALIGNMENT) + rows.tobytes()
     return header(tick, len(rows), 0) + payload

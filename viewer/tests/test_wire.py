@@ -10,28 +10,22 @@ import frames
 import numpy as np
 import pytest
 
-from caraware_viewer import wire
+from caraware_viewer import layout, wire
 
 LAYOUT = Path(__file__).parents[2] / "ipc-schema" / "layout.json"
 
 
-TYPES = {
-    "MessageHeader": wire.HEADER,
-    "VehicleState": wire.VEHICLE_STATE,
-    "VehicleMeta": wire.VEHICLE_META,
-    "SignalMeta": wire.SIGNAL_META,
-    "Collision": wire.COLLISION,
-    "Scan": wire.SCAN,
-    "LidarPoint": wire.LIDAR_POINT,
-}
+def test_the_tables_are_the_committed_ones() -> None:
+    copy = Path(layout.__file__).parent / "layout.json"
+    assert copy.read_text(encoding="utf-8") == LAYOUT.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(("name", "dtype"), TYPES.items())
-def test_types_repeat_the_committed_table(name: str, dtype: np.dtype[np.void]) -> None:
-    table = {row["name"]: row for row in json.loads(LAYOUT.read_text())["types"]}
-    assert dtype.itemsize == table[name]["size"]
-    assert dtype.fields is not None
-    assert [[field, at[1]] for field, at in dtype.fields.items()] == [field[:2] for field in table[name]["fields"]]
+def test_records_have_the_fields_of_the_table() -> None:
+    for row in json.loads(LAYOUT.read_text(encoding="utf-8"))["types"]:
+        record = layout.RECORDS[row["name"]]
+        assert record.fields is not None
+        found = [[name, at[1], at[0].base.str, list(at[0].shape)] for name, at in record.fields.items()]
+        assert (record.itemsize, found) == (row["size"], row["fields"]), row["name"]
 
 
 def test_world_comes_back() -> None:
@@ -55,7 +49,7 @@ def test_an_empty_slot_is_not_valid() -> None:
     frame = bytearray(frames.observation(0, np.zeros((1, 2)), np.zeros((1, 2))))
     observation = wire.decode_observation(bytes(frame))
     assert observation.valid.tolist() == [True]
-    at = len(frame) - 5 * wire.ALIGNMENT  # vehicle, flags, sensors, episode_step, age_s: one aligned section each
+    at = len(frame) - 5 * layout.ALIGNMENT  # vehicle, flags, sensors, episode_step, age_s: one aligned section each
     frame[at : at + 4] = b"\xff" * 4
     assert wire.decode_observation(bytes(frame)).valid.tolist() == [False]
 

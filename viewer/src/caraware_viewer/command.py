@@ -11,8 +11,8 @@ import zenoh
 
 from caraware_viewer import access
 from caraware_viewer.documents import CommandReply, ControlCommand
+from caraware_viewer.layout import SCHEMA_VERSION, SENSORS
 from caraware_viewer.link import LinkError, RunKey, find_run
-from caraware_viewer.wire import SCHEMA_VERSION, SENSORS
 
 ANSWER_S = 15.0
 """Longest wait for the simulation's answer; the fan-out itself waits 12 s for it."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from caraware_viewer import wire
 from caraware_viewer.documents import RunMap, RunStatus, TrainingStatus
+from caraware_viewer.layout import SENSORS
 from caraware_viewer.pairing import mean_m
 from caraware_viewer.picture import Picture
 
@@ -100,7 +101,7 @@ def _sensors(picture: Picture) -> str:
         return _NO_VALUE
     held = picture.observation.vehicle != wire.EMPTY_SLOT
     sensors = picture.observation.sensors[held]
-    return " · ".join(f"{sensor.label} {int((sensors & sensor.bit != 0).sum())}" for sensor in wire.SENSORS)
+    return " · ".join(f"{sensor.label} {int((sensors & sensor.bit != 0).sum())}" for sensor in SENSORS)
 
 
 def _viewer(viewer: ViewerFigures) -> str:

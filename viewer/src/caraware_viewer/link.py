@@ -18,7 +18,7 @@ import zenoh
 
 from caraware_viewer import access
 from caraware_viewer.documents import RunMap
-from caraware_viewer.wire import SCHEMA_VERSION
+from caraware_viewer.layout import SCHEMA_VERSION
 
 TOPICS = ("world", "observation", "prediction", "status", "vehicles", "signals", "event")
 CLOUD_PREFIX = "pointcloud/"

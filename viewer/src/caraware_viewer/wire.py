@@ -1,23 +1,19 @@
-"""The wire layout: decodes frames (`docs/fanout.md`).
+"""Decodes frames (`docs/fanout.md`).
 
 A frame is a message as it is in the simulator's shared memory: 72 bytes of header, then the payload, little endian.
-`layout.json` beside this file is a copy of the committed tables in `ipc-schema`; a test compares the two.
+The types of its parts come from `layout`.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-_LAYOUT = json.loads(resources.files(__package__).joinpath("layout.json").read_text())
-
-SCHEMA_VERSION: int = _LAYOUT["schema_version"]
+from caraware_viewer.layout import ALIGNMENT, RECORDS, SCHEMA_VERSION, SECTIONS, SENSORS
 
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""
@@ -32,22 +28,6 @@ CAV, OTHER, PERSON, HERO = 0, 1, 2, 3
 """Values of `VehicleState.kind`."""
 
 
-@dataclass(frozen=True)
-class Sensor:
-    """A kind of sensor."""
-
-    name: str
-    """Name in commands and JSON."""
-    label: str
-    """Name in the HUD."""
-    bit: int
-    """Bit of an observation's `sensors`: the sensor delivers."""
-
-
-SENSORS = tuple(Sensor(**row) for row in _LAYOUT["sensors"])
-"""Every sensor, in the order of an observation's ages."""
-
-
 def sensor_bit(name: str) -> int:
     """Bit of the sensor called `name`."""
     return next(sensor.bit for sensor in SENSORS if sensor.name == name)
@@ -58,43 +38,19 @@ EMPTY_SLOT = 0xFFFF_FFFF
 VALID = 1
 """Bit of an observation's `flags`: the slot's vehicle has delivered every sensor at least once."""
 
-ALIGNMENT: int = _LAYOUT["alignment"]
-"""Sections of a payload start on multiples of this, bytes from the payload's start."""
-
-
-def _record(name: str) -> np.dtype[np.void]:
-    """The record `name` of the committed tables."""
-    table = next(row for row in _LAYOUT["types"] if row["name"] == name)
-    return np.dtype(
-        {
-            "names": [field for field, *_ in table["fields"]],
-            "formats": [(scalar, tuple(shape)) for _, _, scalar, shape in table["fields"]],
-            "offsets": [offset for _, offset, *_ in table["fields"]],
-            "itemsize": table["size"],
-        }
-    )
-
-
-HEADER = _record("MessageHeader")
-"""`MessageHeader`."""
-
-VEHICLE_STATE = _record("VehicleState")
-"""`VehicleState`: a road user at the end of a tick; origin at the centre of the rear axle (persons: their centre)."""
-
-VEHICLE_META = _record("VehicleMeta")
-"""`VehicleMeta`: id, type and size of a road user."""
-
-SIGNAL_META = _record("SignalMeta")
-"""`SignalMeta`: the state of a traffic light, a letter for each link."""
-
-COLLISION = _record("Collision")
-"""`Collision`: a contact that begins."""
-
-SCAN = _record("Scan")
-"""`Scan`: where a LIDAR was at the end of the tick; `axes` 0: x forward, y left, z up; 1: y back, x left, z down."""
-
-LIDAR_POINT = _record("LidarPoint")
-"""`LidarPoint`: one return, in the axes that the sensor had when it fired."""
+HEADER = RECORDS["MessageHeader"]
+VEHICLE_STATE = RECORDS["VehicleState"]
+"""A road user at the end of a tick; the origin is the centre of the rear axle (persons: their centre)."""
+VEHICLE_META = RECORDS["VehicleMeta"]
+"""Id, type and size of a road user."""
+SIGNAL_META = RECORDS["SignalMeta"]
+"""State of a traffic light, a letter for each link."""
+COLLISION = RECORDS["Collision"]
+"""A contact that begins."""
+SCAN = RECORDS["Scan"]
+"""Pose of a LIDAR at the end of the tick; `axes` 0: x forward, y left, z up; 1: y back, x left, z down."""
+LIDAR_POINT = RECORDS["LidarPoint"]
+"""One return, in the axes that the sensor had when it fired."""
 
 
 class FrameError(ValueError):
@@ -159,6 +115,9 @@ class Observation:
         return valid
 
 
+_OBSERVED = tuple(Observation.__dataclass_fields__.keys() - {"header"})
+
+
 @dataclass(frozen=True)
 class Prediction:
     """The policy's predictions from the observation of the same tick."""
@@ -189,16 +148,6 @@ class PointCloud:
     """`LIDAR_POINT [count]`."""
 
 
-def observation_sections(n: int, d: int, k: int) -> list[tuple[str, str, tuple[int, ...]]]:
-    """Name, element type and shape of the sections of an observation, in order; each is aligned to `ALIGNMENT`."""
-    sizes = {"slots": n, "fields": d, "imu_samples": k}
-    payload = next(row for row in _LAYOUT["payloads"] if row["name"] == "observation")
-    return [
-        (row["name"], row["scalar"], (*(sizes[dimension] for dimension in row["dimensions"]), *row["shape"]))
-        for row in payload["sections"]
-    ]
-
-
 def decode_header(frame: bytes) -> Header:
     """The header of a frame; refuses a frame that is too short or has another schema version."""
     if len(frame) < HEADER.itemsize:
@@ -213,9 +162,10 @@ def decode_header(frame: bytes) -> Header:
 
 
 def decode_world(frame: bytes) -> World:
-    """A `world` frame."""
+    """A `world` frame, which has neither sub-steps nor views of heroes."""
     header = decode_header(frame)
-    return World(header, _array(frame, 0, VEHICLE_STATE, (header.count,)))
+    sections = _sections(frame, "world", road_users=header.count, sub_steps_each=0, hero_count=0)
+    return World(header, sections["states"])
 
 
 def decode_table(frame: bytes, row: np.dtype[np.void]) -> Table:
@@ -227,14 +177,10 @@ def decode_table(frame: bytes, row: np.dtype[np.void]) -> Table:
 def decode_observation(frame: bytes) -> Observation:
     """An `observation` frame."""
     header = decode_header(frame)
-    arrays = {}
-    offset = 0
-    for name, element, shape in observation_sections(header.count, header.columns, header.sequence):
-        array = _array(frame, offset, np.dtype(element), shape)
-        arrays[name] = array
-        offset = _aligned(offset + array.nbytes)
-    known = {name: array for name, array in arrays.items() if name in Observation.__dataclass_fields__}
-    return Observation(header, **known)
+    sizes = {"slots": header.count, "fields": header.columns, "imu_samples": header.sequence}
+    sections = _sections(frame, "observation", **sizes)
+    # A section that the viewer does not show, such as that of a newer sensor, is passed over.
+    return Observation(header, **{name: sections[name] for name in _OBSERVED})
 
 
 def decode_prediction(frame: bytes) -> Prediction:
@@ -242,18 +188,17 @@ def decode_prediction(frame: bytes) -> Prediction:
     header = decode_header(frame)
     if header.columns != 2:
         raise FrameError(f"a prediction has the columns x and y, but this one has {header.columns}")
-    shape = (header.count, 2)
-    position_m = _array(frame, 0, np.dtype("<f4"), shape)
-    if not header.flags & ESTIMATES:
-        return Prediction(header, position_m, None)
-    return Prediction(header, position_m, _array(frame, _aligned(position_m.nbytes), np.dtype("<f4"), shape))
+    has_estimates = header.flags & ESTIMATES != 0
+    sizes = {"slots": header.count, "columns": 2, "estimated_slots": header.count if has_estimates else 0}
+    sections = _sections(frame, "prediction", **sizes)
+    return Prediction(header, sections["prediction"], sections["estimate_m"] if has_estimates else None)
 
 
 def decode_cloud(frame: bytes) -> PointCloud:
     """A `pointcloud/<id>` frame."""
     header = decode_header(frame)
-    scan = _array(frame, 0, SCAN, (1,))[0]
-    return PointCloud(header, scan, _array(frame, _aligned(SCAN.itemsize), LIDAR_POINT, (header.count,)))
+    sections = _sections(frame, "pointcloud", scans=1, point_count=header.count)
+    return PointCloud(header, sections["scan"][0], sections["points"])
 
 
 def decode_text(field: np.void, length: int) -> str:
@@ -261,13 +206,21 @@ def decode_text(field: np.void, length: int) -> str:
     return field.tobytes()[:length].decode(errors="replace")
 
 
-def _aligned(offset: int) -> int:
-    return -(-offset // ALIGNMENT) * ALIGNMENT
+def _sections(frame: bytes, payload: str, **sizes: int) -> dict[str, NDArray[Any]]:
+    """The sections of a payload by name; each starts at a multiple of `ALIGNMENT`."""
+    arrays, offset = {}, 0
+    for section in SECTIONS[payload]:
+        array = _array(frame, offset, section.element, section.sized(sizes))
+        arrays[section.name] = array
+        offset = -(-(offset + array.nbytes) // ALIGNMENT) * ALIGNMENT
+    return arrays
 
 
 def _array(frame: bytes, offset: int, element: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     """The elements that begin `offset` bytes into the payload."""
     count = math.prod(shape)
+    if count == 0:
+        return np.empty(shape, element)
     if HEADER.itemsize + offset + count * element.itemsize > len(frame):
         raise FrameError(
             f"a frame of {len(frame)} bytes does not hold {shape} elements at byte {offset} of its payload"
