@@ -101,10 +101,11 @@ def test_intervals_are_over_seeds() -> None:
         error_m = np.full(4, [2.0, 3.0, 7.0][obs.tick // 2])
         phase.add(replace(obs, episode=obs.tick // 2), error_m, 2 * error_m)
     result = phase.result(0, 1)
-    assert (result.ppo_mean_error_m, result.episodes) == (4.0, 3)
-    assert result.ppo_ci95_m == pytest.approx(4.302653 * math.sqrt(7 / 3), rel=1e-6)
-    assert result.raw_gnss_ci95_m == pytest.approx(2 * result.ppo_ci95_m)
-    assert result.half_width_m("ppo") == result.ppo_ci95_m
+    policy = result.estimates["ppo"]
+    assert (policy.mean, result.episodes) == (4.0, 3)
+    assert policy.ci95 == pytest.approx(4.302653 * math.sqrt(7 / 3), rel=1e-6)
+    assert result.estimates["raw_gnss"].ci95 == pytest.approx(2 * policy.ci95)
+    assert policy.half_width() == policy.ci95
     assert "95 % over 3 seeds" in str(result)
 
 
@@ -153,7 +154,7 @@ def test_the_interval_covers_the_true_mean() -> None:
             errors_m = level + rng.normal(0, 0.3, 40)
             phase.add(obs, errors_m, errors_m)
         result = phase.result(0, 0)
-        covered += abs(result.ppo_mean_error_m - 2.0) < result.half_width_m("ppo")
+        covered += abs(result.estimates["ppo"].mean - 2.0) < result.estimates["ppo"].half_width()
     assert abs(covered / 400 - 0.95) < 4 * math.sqrt(0.95 * 0.05 / 400)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from caraware.report.evaluation import EvaluationResult, pooled
+from caraware.report.evaluation import Estimate, EvaluationResult, pooled
 from caraware.run.checkpoint import load_history
 from caraware.run.config import RunConfig
 from caraware.run.environment import share
@@ -115,13 +115,14 @@ def test_shares_of_a_horizon_add_up() -> None:
 
 
 def result(environment: int, samples: int, mean_m: float, standard_error_m: float) -> EvaluationResult:
-    return EvaluationResult(100, 1, 1, samples, mean_m, standard_error_m, 7.0, 0.1, environment=environment)
+    estimates = {"ppo": Estimate(mean_m, standard_error_m), "raw_gnss": Estimate(7.0, 0.1)}
+    return EvaluationResult(100, 1, 1, samples, estimates, environment)
 
 
 def test_pooling_weighs_by_samples_and_waits_for_everybody() -> None:
     phases = pooled([result(0, 300, 4.0, 0.2), result(0, 300, 3.0, 0.2), result(1, 100, 8.0, 0.6)])
     assert len(phases) == 1
     assert phases[0].samples == 400
-    assert phases[0].ppo_mean_error_m == pytest.approx(0.75 * 4 + 0.25 * 8)
-    assert phases[0].ppo_standard_error_m == pytest.approx((0.15**2 + 0.15**2) ** 0.5)
-    assert phases[0].ekf_mean_error_m is None
+    assert phases[0].estimates["ppo"].mean == pytest.approx(0.75 * 4 + 0.25 * 8)
+    assert phases[0].estimates["ppo"].standard_error == pytest.approx((0.15**2 + 0.15**2) ** 0.5)
+    assert phases[0].mean("ekf") is None

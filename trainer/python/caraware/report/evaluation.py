@@ -1,8 +1,8 @@
 """Errors of the deterministic policy, of raw GNSS and of the classical baselines, over exactly the same rows."""
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,68 +18,6 @@ CI95_STANDARD_ERRORS = 1.96
 """Half the width of a 95 % confidence interval of a mean of many, in standard errors."""
 
 
-@dataclass(frozen=True)
-class EvaluationResult:
-    """One evaluation phase: every valid row of consecutive evaluation episodes, the policy unchanged.
-
-    Confidence intervals are over seeds: Student's t over the means of the episodes, each of which has a seed of its
-    own. Standard errors are those of the mean with the vehicles of an episode as clusters, since one vehicle's samples
-    are not independent: all that a phase of a single episode can tell.
-    """
-
-    env_steps: int
-    """Training samples seen before it."""
-    policy_version: int
-    episodes: int
-    samples: int
-    ppo_mean_error_m: float
-    ppo_standard_error_m: float
-    raw_gnss_mean_error_m: float
-    raw_gnss_standard_error_m: float
-    ekf_mean_error_m: float | None = None
-    """Of the extended Kalman filter; None for a run without sensor tables."""
-    ekf_standard_error_m: float | None = None
-    rts_mean_error_m: float | None = None
-    """Of the smoother, which sees the future: a bound, not an estimator."""
-    rts_standard_error_m: float | None = None
-    environment: int = 0
-    """Whose episodes; the first one's index if those of all are pooled."""
-    ppo_ci95_m: float | None = None
-    """Half the width of the 95 % confidence interval of the mean over seeds; None for a single seed."""
-    raw_gnss_ci95_m: float | None = None
-    ekf_ci95_m: float | None = None
-    rts_ci95_m: float | None = None
-    supervised_mean_error_m: float | None = None
-    """Of the policy's network taught by regression to the truth; None for a run without it."""
-    supervised_standard_error_m: float | None = None
-    supervised_ci95_m: float | None = None
-
-    @classmethod
-    def restored(cls, values: dict[str, Any]) -> "EvaluationResult":
-        """From what `dataclasses.asdict` made of one."""
-        return cls(**{known.name: values[known.name] for known in fields(cls) if known.name in values})
-
-    def half_width_m(self, name: str) -> float:
-        """Half a 95 % interval of an estimator's mean: over seeds, or over vehicles where there is one seed only."""
-        over_seeds: float | None = getattr(self, f"{name}_ci95_m")
-        standard_error_m: float = getattr(self, f"{name}_standard_error_m")
-        return CI95_STANDARD_ERRORS * standard_error_m if over_seeds is None else over_seeds
-
-    def headline(self) -> dict[str, float | None]:
-        """Mean errors, half their confidence intervals and the number of seeds, for the run's report."""
-        means = {key: value for key, value in asdict(self).items() if key.endswith(("_mean_error_m", "_ci95_m"))}
-        return means | {"evaluation_seeds": self.episodes}
-
-    def __str__(self) -> str:
-        means = ", ".join(
-            f"{label} {getattr(self, f'{name}_mean_error_m'):.3f} ± {self.half_width_m(name):.3f} m"
-            for name, label in ESTIMATORS.items()
-            if getattr(self, f"{name}_mean_error_m") is not None
-        )
-        over = f"{self.episodes} seeds" if self.episodes > 1 else "the vehicles of one seed"
-        return f"{means} (95 % over {over}), {self.samples} samples"
-
-
 ESTIMATORS = {
     "ppo": "policy",
     "raw_gnss": "raw GNSS",
@@ -89,11 +27,94 @@ ESTIMATORS = {
 }
 """Key of each, as in the run's report, and its name for people; the order of the columns of an evaluation's sums."""
 
-NO_HEADLINE: dict[str, float | None] = {
-    **dict.fromkeys(f"{name}_{what}_m" for name in ESTIMATORS for what in ("mean_error", "ci95")),
-    "evaluation_seeds": 0,
-}
-"""The headline of a run that has not been evaluated: every key, without a value."""
+
+@dataclass(frozen=True)
+class Estimate:
+    """What one estimator reached in a phase: the mean of the task's metric over all samples."""
+
+    mean: float
+    standard_error: float
+    """With the vehicles of an episode as clusters, since one vehicle's samples are not independent."""
+    ci95: float | None = None
+    """Half the width of the 95 % confidence interval of the mean over seeds; None for a single seed."""
+
+    def half_width(self) -> float:
+        """Half a 95 % interval: over seeds, or over vehicles where there is one seed only."""
+        return CI95_STANDARD_ERRORS * self.standard_error if self.ci95 is None else self.ci95
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """One evaluation phase: every valid row of consecutive evaluation episodes, the policy unchanged.
+
+    Confidence intervals are over seeds: Student's t over the means of the episodes, each of which has a seed of its
+    own. Standard errors are all that a phase of a single episode can have.
+    """
+
+    env_steps: int
+    """Training samples seen before it."""
+    policy_version: int
+    episodes: int
+    samples: int
+    estimates: Mapping[str, Estimate]
+    """By the keys of `ESTIMATORS`; a run without sensor tables has no filter and no smoother."""
+    environment: int = 0
+    """Whose episodes; the first one's index if those of all are pooled."""
+    metric: str = "error_m"
+    """Name of the task's metric that the estimators are compared by."""
+
+    def mean(self, estimator: str) -> float | None:
+        """Mean of the metric, None without that estimator."""
+        return self.estimates[estimator].mean if estimator in self.estimates else None
+
+    def report(self) -> dict[str, Any]:
+        """For reports and checkpoints: every key of every estimator, such as `ppo_mean_error_m`, None without it."""
+        entries = {key: getattr(self, key) for key in _PHASE_KEYS}
+        for estimator in ESTIMATORS:
+            found = self.estimates.get(estimator)
+            values = (found.mean, found.standard_error, found.ci95) if found else (None, None, None)
+            entries |= zip(_keys(estimator, self.metric), values, strict=True)
+        return entries
+
+    @classmethod
+    def restored(cls, entries: Mapping[str, Any], metric: str = "error_m") -> "EvaluationResult":
+        """The phase whose `report()` this is."""
+        estimates: dict[str, Estimate] = {}
+        for name in ESTIMATORS:
+            mean, standard_error, ci95 = (entries.get(key) for key in _keys(name, metric))
+            if mean is not None and standard_error is not None:
+                estimates[name] = Estimate(mean, standard_error, ci95)
+        return cls(**{key: entries[key] for key in _PHASE_KEYS}, estimates=estimates, metric=metric)
+
+    def headline(self) -> dict[str, float | None]:
+        """Means, half their confidence intervals and the number of seeds, for the run's report."""
+        entries = self.report()
+        return {key: entries[key] for key in no_headline(self.metric)} | {"evaluation_seeds": self.episodes}
+
+    def __str__(self) -> str:
+        unit = self.metric.rsplit("_", 1)[1]
+        compared = ", ".join(
+            f"{label} {self.estimates[name].mean:.3f} ± {self.estimates[name].half_width():.3f} {unit}"
+            for name, label in ESTIMATORS.items()
+            if name in self.estimates
+        )
+        over = f"{self.episodes} seeds" if self.episodes > 1 else "the vehicles of one seed"
+        return f"{compared} (95 % over {over}), {self.samples} samples"
+
+
+_PHASE_KEYS = ("env_steps", "policy_version", "episodes", "samples", "environment")
+
+
+def _keys(estimator: str, metric: str) -> tuple[str, str, str]:
+    """Keys of an estimator's mean, standard error and half 95 % interval in reports."""
+    unit = metric.rsplit("_", 1)[1]
+    return f"{estimator}_mean_{metric}", f"{estimator}_standard_error_{unit}", f"{estimator}_ci95_{unit}"
+
+
+def no_headline(metric: str = "error_m") -> dict[str, float | None]:
+    """The headline of a run that has not been evaluated: every key, without a value."""
+    keys = [_keys(estimator, metric) for estimator in ESTIMATORS]
+    return {**dict.fromkeys(key for mean, _, interval in keys for key in (mean, interval)), "evaluation_seeds": 0}
 
 
 class Mean:
@@ -119,8 +140,9 @@ class Evaluation:
     results.
     """
 
-    def __init__(self, noise: SensorNoise | None = None, *, supervised: bool = False) -> None:
-        """`supervised`: the errors of that baseline will be added too."""
+    def __init__(self, noise: SensorNoise | None = None, *, supervised: bool = False, metric: str = "error_m") -> None:
+        """`supervised`: the errors of that baseline will be added too. `metric` names what is compared."""
+        self._metric = metric
         self._baselines = Baselines(noise) if noise else None
         missing = ("ekf", "rts")[: 0 if noise else 2] + ("supervised",)[: 0 if supervised else 1]
         self._known = [name for name in ESTIMATORS if name not in missing]
@@ -178,24 +200,22 @@ class Evaluation:
         means = sums[:, 1:].sum(0) / count.sum()
         # Ratio estimator over clusters (Cochran, Sampling Techniques, section 6.3).
         errors = np.sqrt(np.square(sums[:, 1:] - count[:, None] * means).sum(0)) / count.sum()
-        results: dict[str, Any] = {}
+        estimates: dict[str, Estimate] = {}
         seeds = [episode[:, 1:].sum(0) / episode[:, 0].sum() for episode in self._finished if len(episode)]
         for column, name in enumerate(ESTIMATORS):
             if name not in self._known:
                 continue
             over_seeds = mean_interval([float(seed[column]) for seed in seeds])
-            results |= {
-                f"{name}_mean_error_m": float(means[column]),
-                f"{name}_standard_error_m": float(errors[column]),
-                f"{name}_ci95_m": over_seeds.half_width if over_seeds.count > 1 else None,
-            }
+            interval = over_seeds.half_width if over_seeds.count > 1 else None
+            estimates[name] = Estimate(float(means[column]), float(errors[column]), interval)
         return EvaluationResult(
             env_steps=env_steps,
             policy_version=policy_version,
             episodes=len(seeds),
             samples=int(count.sum()),
+            estimates=estimates,
             environment=environment,
-            **results,
+            metric=self._metric,
         )
 
 
@@ -215,18 +235,18 @@ def _pool(phase: Sequence[EvaluationResult]) -> EvaluationResult:
         return phase[0]
     samples = sum(result.samples for result in phase)
     shares = [result.samples / samples for result in phase]
-    values: dict[str, Any] = {}
-    for name in ESTIMATORS:
-        means_m = [getattr(result, f"{name}_mean_error_m") for result in phase]
-        if None in means_m:
+    estimates: dict[str, Estimate] = {}
+    for name in phase[0].estimates:
+        each = [result.estimates[name] for result in phase if name in result.estimates]
+        if len(each) < len(phase):
             continue
-        errors_m = [getattr(result, f"{name}_standard_error_m") for result in phase]
-        values[f"{name}_mean_error_m"] = sum(share * mean for share, mean in zip(shares, means_m, strict=True))
-        values[f"{name}_standard_error_m"] = math.hypot(*(s * e for s, e in zip(shares, errors_m, strict=True)))
-        halves_m = [getattr(result, f"{name}_ci95_m") for result in phase]
-        if None in halves_m:
+        intervals = [estimate.ci95 for estimate in each]
+        estimates[name] = Estimate(
+            mean=sum(share * estimate.mean for share, estimate in zip(shares, each, strict=True)),
+            standard_error=math.hypot(*(s * e.standard_error for s, e in zip(shares, each, strict=True))),
             # One episode each: what differs between seeds is what differs between environments.
-            values[f"{name}_ci95_m"] = mean_interval(means_m).half_width
-        else:
-            values[f"{name}_ci95_m"] = math.hypot(*(s * h for s, h in zip(shares, halves_m, strict=True)))
-    return replace(phase[0], samples=samples, episodes=sum(result.episodes for result in phase), **values)
+            ci95=mean_interval([estimate.mean for estimate in each]).half_width
+            if None in intervals
+            else math.hypot(*(s * half for s, half in zip(shares, intervals, strict=True) if half is not None)),
+        )
+    return replace(phase[0], samples=samples, episodes=sum(result.episodes for result in phase), estimates=estimates)

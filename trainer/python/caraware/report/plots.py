@@ -18,7 +18,12 @@ EKF, RTS, SUPERVISED = "#e69f00", "#555555", "#009e73"
 def plot_error(file: Path, training: list[TrainingPoint], evaluations: list[EvaluationResult]) -> None:
     """Mean position error of the policy in training and in evaluations, against the baselines, over env steps."""
     figure, axes = _figure("Position error of the policy against raw GNSS and filters")
-    axes.plot([p.env_steps for p in training], [p.error_m for p in training], color=POLICY, label="policy, training")
+    axes.plot(
+        [p.env_steps for p in training],
+        [p.metrics["error_m"] for p in training],
+        color=POLICY,
+        label="policy, training",
+    )
     raw_m = _last_raw_m(training, evaluations)
     if raw_m is not None:
         axes.axhline(raw_m, color=RAW, linestyle="--", label=f"raw GNSS ({raw_m:.2f} m)")
@@ -39,13 +44,12 @@ def _plot_evaluated(
     axes: Axes, evaluations: list[EvaluationResult], name: str, label: str, colour: str, dashes: str, marker: str
 ) -> None:
     """One estimator's mean errors, if it has any, with 95 % intervals: over seeds, of one seed over its vehicles."""
-    key = f"{name}_mean_error_m"
-    known = [e for e in evaluations if getattr(e, key) is not None]
+    known = [e for e in evaluations if name in e.estimates]
     if not known:
         return
-    steps, means_m = [e.env_steps for e in known], [getattr(e, key) for e in known]
-    halves_m, seeds = [e.half_width_m(name) for e in known], known[-1].episodes
-    last = f"last {means_m[-1]:.2f} ± {halves_m[-1]:.2f} m" + (f", {seeds} seeds" if seeds > 1 else "")
+    steps, means_m = [e.env_steps for e in known], [e.estimates[name].mean for e in known]
+    halves_m, seeds = [e.estimates[name].half_width() for e in known], known[-1].episodes
+    told = f"last {means_m[-1]:.2f} ± {halves_m[-1]:.2f} m" + (f", {seeds} seeds" if seeds > 1 else "")
     axes.errorbar(
         steps,
         means_m,
@@ -77,8 +81,8 @@ def plot_sigma(file: Path, training: list[TrainingPoint]) -> None:
 
 def _last_raw_m(training: list[TrainingPoint], evaluations: list[EvaluationResult]) -> float | None:
     if evaluations:
-        return evaluations[-1].raw_gnss_mean_error_m
-    return training[-1].raw_gnss_error_m if training else None
+        return evaluations[-1].mean("raw_gnss")
+    return training[-1].metrics["raw_gnss_error_m"] if training else None
 
 
 def _figure(title: str) -> tuple[Figure, Axes]:
