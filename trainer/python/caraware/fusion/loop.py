@@ -90,7 +90,7 @@ class FusionLoop:
         counters, history = beginning.counters, beginning.history
         self._samples, self._trained_steps = SampleCount(counters.env_steps), counters.env_steps
         self._stream, self._episode = StreamProgress(history.first_position(counters)), counters.episode
-        self._metrics = Metrics(config.run_dir / "tensorboard")
+        self._metrics = Metrics(config.run_dir / "tensorboard", config.task.metrics)
         if counters.updates > 0:
             self._metrics.resume(history.training, history.evaluations, counters.env_steps)
         self._saved_updates = counters.updates
@@ -144,7 +144,7 @@ class FusionLoop:
             return
         self._finish_evaluation()
         self._error_m.add(policy_m)
-        self._samples.add(raw_m, learns=True)
+        self._samples.add(len(raw_m), {"raw_gnss_error_m": raw_m}, learns=True)
         truth_m = torch.from_numpy(np.asarray(obs.truth)[:, :2].astype(np.float32)) - self._learner.estimator.centre_m
         counts = torch.from_numpy(np.array(obs.valid)).float() * (Carried.of(table).running[:, 0] > 0)
         self._recording.add(table, truth_m, counts)
@@ -169,17 +169,18 @@ class FusionLoop:
             self.commit()
 
     def _record(self, stats: FusionStats, episode: int) -> None:
-        rate, raw_m = self._samples.since_last_update()
+        rate, references = self._samples.since_last_update()
         error_m, self._error_m = self._error_m.value(), Mean()
         reward = float(self._reward(torch.tensor(error_m), self._config.trainer.reward_scale_m))
-        self._metrics.updated(TrainingPoint(self._samples.env_steps, 0.0, reward, error_m, raw_m, rate), stats)
+        metrics = {"error_m": error_m, **references}
+        self._metrics.updated(TrainingPoint(self._samples.env_steps, 0.0, reward, metrics, rate), stats)
         self._channel.report(
             episode=episode,
             env_steps=self._samples.env_steps,
             env_steps_per_s=rate,
             policy_std=0.0,
             reward=reward,
-            metrics={"error_m": error_m, "raw_gnss_error_m": raw_m},
+            metrics=metrics,
             updates=self._learner.updates,
         )
 

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import shutil
-from dataclasses import asdict, astuple, dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -118,9 +118,11 @@ def save_checkpoint(
     merged = {name: beside.get(name, {}) | tensors.get(name, {}) for name in tensors | beside}
     files = {name: _write(temporary / name, save(_contiguous(named))) for name, named in merged.items()}
     if history is not None:
-        rows = torch.tensor([astuple(point) for point in history.training], dtype=torch.float64)
+        names = list(history.training[0].metrics) if history.training else []
+        rows = torch.tensor([point.row(names) for point in history.training], dtype=torch.float64)
         files[POINTS] = _write(temporary / POINTS, save({"training": rows}))
-        rest = asdict(history) | {"training": None}
+        evaluations = [result.report() for result in history.evaluations]
+        rest = asdict(history) | {"training": names, "evaluations": evaluations}
         files[COURSE] = _write(temporary / COURSE, json.dumps(rest).encode())
     manifest = Manifest(
         schema_version=SCHEMA_VERSION,
@@ -193,7 +195,8 @@ def load_history(checkpoint: Path) -> TrainingHistory:
     rows = _read_tensors(checkpoint / POINTS, files[POINTS])["training"].tolist()
     evaluations = [EvaluationResult.restored(result) for result in rest.pop("evaluations")]
     others = [StreamPosition(**position) for position in rest.pop("others", [])]
-    training = [TrainingPoint(int(steps), *values) for steps, *values in rows]
+    names = rest.pop("training")
+    training = [TrainingPoint.of_row(row, names) for row in rows]
     return TrainingHistory(**rest | {"evaluations": evaluations, "training": training, "others": others})
 
 

@@ -55,14 +55,16 @@ class CheckpointWriter:
                 environment.channel.committed(environment.progress.committed_tick)
 
     def is_best(self, result: EvaluationResult) -> bool:
-        """Whether no policy evaluated before had less error.
+        """Whether no policy evaluated before was better by the task's headline metric.
 
         Ranks would have to agree on it, and environments to have finished the same phase: only a run of one decides.
         """
         if self._ranks.size > 1 or len(self._environments) > 1 or result.policy_version == 0:
             return False
-        errors_m = [other.ppo_mean_error_m for other in self._metrics.evaluations if other.policy_version > 0]
-        return result.ppo_mean_error_m <= min(errors_m)
+        evaluated = [other for other in self._metrics.evaluations if other.policy_version > 0]
+        means = [mean for other in evaluated if (mean := other.mean("ppo")) is not None]
+        best = max if self._config.task.metrics[0].higher_is_better else min
+        return result.mean("ppo") == best(means)
 
     def mark_best(self, updates: int) -> None:
         """Let `best` name the checkpoint after so many updates."""

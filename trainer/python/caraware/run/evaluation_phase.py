@@ -1,6 +1,7 @@
 """Evaluation phases of a run: ticks of evaluation episodes, environment by environment, until training continues."""
 
 import logging
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -32,16 +33,18 @@ class EvaluationPhase:
         progress: StreamProgress,
         obs: Observation,
         predicted_m: Tensor,
-        raw_m: FloatArray,
+        references: Mapping[str, FloatArray],
         supervised: Supervised | None,
     ) -> None:
-        """Count one tick, unless a predecessor has evaluated it; `raw_m` are the errors of raw GNSS."""
+        """Count one tick, unless a predecessor has evaluated it; `references` are the reference metrics by name."""
         if obs.tick <= progress.evaluated_tick:
             return
         if self._evaluation is None:
-            self._evaluation = Evaluation(self._config.sensors, supervised=supervised is not None)
+            self._evaluation = Evaluation(
+                self._config.sensors, supervised=supervised is not None, metric=self._config.task.metrics[0].name
+            )
         policy_m, _ = errors_m(obs, predicted_m)
-        self._evaluation.add(obs, policy_m, raw_m, self._supervised_errors_m(obs, supervised))
+        self._evaluation.add(obs, policy_m, references["raw_gnss_error_m"], self._supervised_errors_m(obs, supervised))
         self._newest_tick = obs.tick
 
     def finish(self, progress: StreamProgress, env_steps: int, updates: int) -> EvaluationResult | None:

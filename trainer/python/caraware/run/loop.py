@@ -2,17 +2,17 @@
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from torch import Tensor
 
-from caraware.ipc.arrays import FloatArray
+from caraware.ipc.arrays import Float32Array
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.batch import Batch, save_batch
 from caraware.learn.ppo import NonFiniteLoss, UpdateStats
 from caraware.learn.ranks import RankError, Ranks, Verdict
-from caraware.report.evaluation import pooled, raw_errors_m
+from caraware.report.evaluation import pooled
 from caraware.report.metrics import Metrics, TrainingPoint
 from caraware.report.plots import plot_error, plot_sigma
 from caraware.run.checkpoint_writer import CheckpointWriter
@@ -56,7 +56,7 @@ class TrainingLoop:
         self._environments = [Environment(i, each, config) for i, each in enumerate((channel, *others))]
         self._phases = [EvaluationPhase(config, self._number(i)) for i in range(len(self._environments))]
         self._leave_requested, self._left = leave_requested, False
-        self._metrics = Metrics(config.run_dir / "tensorboard")
+        self._task, self._metrics = config.task, Metrics(config.run_dir / "tensorboard", config.task.metrics)
         self._learner: Learner | None = None
         self._samples, self._vehicles = SampleCount(), 0
         self._others_stopped = False
@@ -149,8 +149,8 @@ class TrainingLoop:
         if continuing:
             predicted_m = self._predictor.predict_m({each.index: each.pending for each in continuing})
             for environment in continuing:
-                raw_m = raw_errors_m(environment.pending)
-                if not self._process_waiting(environment, predicted_m[environment.index], raw_m):
+                references = self._task.measure_references(environment.pending)
+                if not self._process_waiting(environment, predicted_m[environment.index], references):
                     return
         if self._learner is not None and self._learns:
             self._learn_or_give_up(self._learner)
@@ -159,14 +159,19 @@ class TrainingLoop:
         if self._commit_due:
             self.commit()
 
-    def _process_waiting(self, environment: Environment, predicted_m: list[Tensor], raw_m: list[FloatArray]) -> bool:
-        """Process waiting ticks while the environment may continue; False if this trainer leaves to a successor."""
+    def _process_waiting(
+        self, environment: Environment, predicted_m: list[Tensor], references: Mapping[str, list[Float32Array]]
+    ) -> bool:
+        """Process waiting ticks while the environment may continue; False if this trainer leaves to a successor.
+
+        `references` are the task's reference metrics on the valid rows of each tick.
+        """
         processed = 0
-        for prediction_m, raw_error_m in zip(predicted_m, raw_m, strict=True):
+        for index, prediction_m in enumerate(predicted_m):
             if not self._may_continue(environment):
                 break
             obs = environment.pending.popleft()
-            self._process(environment, obs, prediction_m, raw_error_m)
+            self._process(environment, obs, prediction_m, {name: ticks[index] for name, ticks in references.items()})
             processed += 1
             if processed % CREDIT_TICKS == 0:
                 environment.channel.consumed(obs.tick)
@@ -181,8 +186,10 @@ class TrainingLoop:
             environment.channel.consumed(obs.tick)
         return not self._left
 
-    def _process(self, environment: Environment, obs: Observation, predicted_m: Tensor, raw_m: FloatArray) -> None:
-        """Publish the prediction of one tick, then evaluate it or collect it; `raw_m` are the errors of raw GNSS."""
+    def _process(
+        self, environment: Environment, obs: Observation, predicted_m: Tensor, references: Mapping[str, Float32Array]
+    ) -> None:
+        """Publish the prediction of one tick, then evaluate it or collect it."""
         assert self._learner is not None
         channel, progress = environment.channel, environment.progress
         estimates_m = environment.estimates_m(obs)
@@ -192,13 +199,14 @@ class TrainingLoop:
             channel.publish_predictions(obs, predicted_m, self._updates(), estimates_m)
         environment.episode = obs.episode
         progress.starts.note(obs)
-        self._vehicles = max(self._vehicles, int(np.count_nonzero(obs.valid)))
+        samples = int(np.count_nonzero(obs.valid))
+        self._vehicles = max(self._vehicles, samples)
         if obs.evaluation:
             environment.rollout.ended(obs)
-            self._phases[environment.index].add(progress, obs, predicted_m, raw_m, self._learner.supervised)
+            self._phases[environment.index].add(progress, obs, predicted_m, references, self._learner.supervised)
             return
         self._finish_evaluation(environment)
-        self._samples.add(raw_m, learns=self._learns)
+        self._samples.add(samples, references, learns=self._learns)
         if self._learns:
             environment.rollout.add(obs)
 
@@ -228,14 +236,15 @@ class TrainingLoop:
             learner.supervised.learn(batch, stats.learning_rate)
         for environment, horizon in zip(self._environments, horizons, strict=True):
             environment.progress.committed_tick = horizon.last_tick()
-        self._report(stats, batch.metrics["error_m"].double().mean().item())
+        self._report(stats, {name: values.double().mean().item() for name, values in batch.metrics.items()})
         self._commit_due = ppo.updates % self._config.trainer.checkpoint_interval_updates == 0
 
-    def _report(self, stats: UpdateStats, error_m: float) -> None:
+    def _report(self, stats: UpdateStats, of_policy: Mapping[str, float]) -> None:
         """Record an update, and publish how training goes."""
-        rate, raw_gnss_error_m = self._samples.since_last_update()
+        rate, of_references = self._samples.since_last_update()
+        metrics = {**of_policy, **of_references}
         env_steps = self._samples.env_steps
-        point = TrainingPoint(env_steps, stats.sigma, stats.reward_mean, error_m, raw_gnss_error_m, rate)
+        point = TrainingPoint(env_steps, stats.sigma, stats.reward_mean, metrics, rate)
         self._metrics.updated(point, stats, self._channel.lag_ticks())
         self._channel.report(
             episode=self._episode(),
@@ -243,16 +252,18 @@ class TrainingLoop:
             env_steps_per_s=rate,
             policy_std=stats.sigma,
             reward=stats.reward_mean,
-            metrics={"error_m": error_m, "raw_gnss_error_m": raw_gnss_error_m},
+            metrics=metrics,
             updates=self._updates(),
         )
 
     def _end_lesson(self) -> None:
         """Decide the gate after a lesson: the simulation waits for the stage of the next one."""
         if self._lesson_end is not None and self._learner is not None:
-            error_m = self._metrics.training[-1].error_m if self._metrics.training else math.nan
+            metrics = self._metrics.training[-1].metrics if self._metrics.training else {}
             sigma = self._learner.ppo.sigma()
-            self._curriculum.lesson_ended(self._lesson_end, self._samples.env_steps, sigma, error_m)
+            self._curriculum.lesson_ended(
+                self._lesson_end, self._samples.env_steps, sigma, metrics.get("error_m", math.nan)
+            )
         self._lesson_end = None
 
     def _finish_evaluation(self, environment: Environment) -> None:

@@ -2,10 +2,9 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
-from caraware.report.evaluation import NO_HEADLINE, EvaluationResult
+from caraware.report.evaluation import EvaluationResult, no_headline
 
 RTS_NOTE = "the smoother sees the future: a bound, not an estimator"
 
@@ -14,9 +13,9 @@ def write_part(run_dir: Path, entries: Mapping[str, object], phases: Sequence[Ev
     """Write the part with these entries. The headline errors are the last evaluation's."""
     part = {
         **entries,
-        **(phases[-1].headline() if phases else NO_HEADLINE),
+        **(phases[-1].headline() if phases else no_headline()),
         "rts_note": RTS_NOTE,
-        "evaluations": [asdict(result) for result in phases],
+        "evaluations": [result.report() for result in phases],
     }
     file = run_dir / "parts" / "trainer.json"
     file.parent.mkdir(parents=True, exist_ok=True)

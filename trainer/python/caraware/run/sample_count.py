@@ -1,6 +1,7 @@
-"""The samples of a run: how many came, how fast, and how far raw GNSS was off in them."""
+"""The samples of a run: how many came, how fast, and what the reference metrics are on them."""
 
 import time
+from collections.abc import Mapping
 
 from caraware.ipc.arrays import FloatArray
 from caraware.report.evaluation import Mean
@@ -14,18 +15,20 @@ class SampleCount:
         """Samples seen."""
         self.passed_steps = 0
         """Those among them that came when no horizon could be filled any more."""
-        self._raw_gnss_error_m = Mean()
+        self._references: dict[str, Mean] = {}
         self._clock = (time.monotonic(), env_steps)
 
-    def add(self, raw_m: FloatArray, *, learns: bool) -> None:
-        """Count the samples of one tick; `raw_m` are the errors of raw GNSS on its valid rows."""
-        self._raw_gnss_error_m.add(raw_m)
-        self.env_steps += len(raw_m)
-        self.passed_steps += 0 if learns else len(raw_m)
+    def add(self, samples: int, references: Mapping[str, FloatArray], *, learns: bool) -> None:
+        """Count the samples of one tick; `references` are the reference metrics by name, on its valid rows."""
+        for name, values in references.items():
+            self._references.setdefault(name, Mean()).add(values)
+        self.env_steps += samples
+        self.passed_steps += 0 if learns else samples
 
-    def since_last_update(self) -> tuple[float, float]:
-        """Samples per second of wall time, and the mean error of raw GNSS (m); the next call counts from here."""
-        raw_gnss_error_m, self._raw_gnss_error_m = self._raw_gnss_error_m.value(), Mean()
+    def since_last_update(self) -> tuple[float, dict[str, float]]:
+        """Samples per second of wall time, and the means of the references; the next call counts from here."""
+        references = {name: mean.value() for name, mean in self._references.items()}
+        self._references = {}
         now, (since, steps) = time.monotonic(), self._clock
         self._clock = (now, self.env_steps)
-        return (self.env_steps - steps) / max(now - since, 1e-9), raw_gnss_error_m
+        return (self.env_steps - steps) / max(now - since, 1e-9), references
