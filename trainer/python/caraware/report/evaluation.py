@@ -88,8 +88,8 @@ class EvaluationResult:
 
     def headline(self) -> dict[str, float | None]:
         """Means, half their confidence intervals and the number of seeds, for the run's report."""
-        entries = self.report()
-        return {key: entries[key] for key in no_headline(self.metric)} | {"evaluation_seeds": self.episodes}
+        entries = self.report() | {"evaluation_seeds": self.episodes}
+        return {key: entries[key] for key in no_headline(self.metric)}
 
     def __str__(self) -> str:
         unit = self.metric.rsplit("_", 1)[1]
