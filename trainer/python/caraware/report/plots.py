@@ -49,7 +49,7 @@ def _plot_evaluated(
         return
     steps, means_m = [e.env_steps for e in known], [e.estimates[name].mean for e in known]
     halves_m, seeds = [e.estimates[name].half_width() for e in known], known[-1].episodes
-    told = f"last {means_m[-1]:.2f} ± {halves_m[-1]:.2f} m" + (f", {seeds} seeds" if seeds > 1 else "")
+    last = f"last {means_m[-1]:.2f} ± {halves_m[-1]:.2f} m" + (f", {seeds} seeds" if seeds > 1 else "")
     axes.errorbar(
         steps,
         means_m,
