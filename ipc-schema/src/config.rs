@@ -19,47 +19,47 @@ pub use sensors::*;
 #[serde(deny_unknown_fields)]
 pub struct Config {
     /// Time, seed and flow control.
-    pub run: Run,
+    pub run: RunConfig,
     /// Where traffic comes from.
-    pub traffic: Traffic,
+    pub traffic: TrafficConfig,
     /// Geodetic reference of a net that has none.
-    pub map: Map,
+    pub map: MapConfig,
     /// Length of episodes and when to evaluate.
-    pub episode: Episode,
+    pub episode: EpisodeConfig,
     /// Steps of training, each with a gate to the next.
     pub curriculum: CurriculumConfig,
     /// What the trainer's output means.
-    pub task: Task,
+    pub task: TaskConfig,
     /// Vehicle models and their limits.
-    pub vehicle: Vehicle,
+    pub vehicle: VehicleConfig,
     /// The road.
-    pub road: Road,
+    pub road: RoadConfig,
     /// What stands beside it.
-    pub scene: Scene,
+    pub scene: SceneConfig,
     /// Contacts.
-    pub collision: Collision,
+    pub collision: CollisionConfig,
     /// Rain, fog and sun.
-    pub weather: Weather,
+    pub weather: WeatherConfig,
     /// Where vehicles are sensed.
-    pub region: Region,
+    pub region: RegionConfig,
     /// GNSS receiver.
-    pub gnss: Gnss,
+    pub gnss: GnssConfig,
     /// Inertial measurement unit and compass.
-    pub imu: Imu,
+    pub imu: ImuConfig,
     /// Wheel speed and steering angle.
-    pub speed_steering: SpeedSteering,
+    pub speed_steering: SpeedSteeringConfig,
     /// Spinning LIDAR.
-    pub lidar: Lidar,
+    pub lidar: LidarConfig,
     /// What happens while a sensor is dark.
-    pub blackout: Blackout,
+    pub blackout: BlackoutConfig,
     /// Fields and normalisation of the observation.
-    pub observation: Observation,
+    pub observation: ObservationConfig,
     /// The learner.
-    pub trainer: Trainer,
+    pub trainer: TrainerConfig,
     /// The learned estimator of the preset `fusion`.
-    pub fusion: Fusion,
+    pub fusion: FusionConfig,
     /// Shared memory → zenoh.
-    pub fanout: Fanout,
+    pub fanout: FanoutConfig,
 }
 
 impl Config {
@@ -108,7 +108,7 @@ impl Config {
 /// Time, seed and flow control.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Run {
+pub struct RunConfig {
     /// Seed of everything random.
     pub seed: u64,
     /// Environments (SUMO, dynamics, sensors) side by side, feeding one trainer.
@@ -130,7 +130,7 @@ pub struct Run {
 /// Where traffic comes from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Traffic {
+pub struct TrafficConfig {
     /// SUMO step, seconds: an integer multiple of `run.tick_s`.
     pub step_s: f64,
     /// Connected vehicles kept alive (population control).
@@ -161,7 +161,7 @@ pub struct Traffic {
 /// Geodetic reference of a net that has none.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Map {
+pub struct MapConfig {
     /// Latitude of the net's (0, 0), degrees; only for a net without projection.
     pub origin_latitude_deg: Option<f64>,
     /// Longitude of the net's (0, 0), degrees; only for a net without projection.
@@ -171,7 +171,7 @@ pub struct Map {
 /// Length of episodes and when to evaluate.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Episode {
+pub struct EpisodeConfig {
     /// Ticks in a training episode; its end respawns everybody at random places.
     pub ticks: u64,
     /// Training episodes.
@@ -199,7 +199,7 @@ pub enum TaskKind {
 /// What the trainer's output means.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Task {
+pub struct TaskConfig {
     /// Which task.
     pub kind: TaskKind,
     /// Longest episode of a hero, seconds.
@@ -246,7 +246,7 @@ pub enum Surface {
 /// The road.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Road {
+pub struct RoadConfig {
     /// What it is covered with: decides the friction.
     pub surface: Surface,
 }
@@ -254,7 +254,7 @@ pub struct Road {
 /// What stands beside the road, or on it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Scene {
+pub struct SceneConfig {
     /// Obstacles, each "name x y heading": a prop by name, its centre in metres (world), its heading in degrees counter-clockwise
     /// from east (0 if left out).
     pub obstacles: Vec<String>,
@@ -270,7 +270,7 @@ pub struct Scene {
 /// Contacts.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Collision {
+pub struct CollisionConfig {
     /// Look for contacts of connected vehicles and heroes.
     pub detect: bool,
     /// A contact ends the trajectory of a connected vehicle, as it always ends a hero's.
@@ -280,7 +280,7 @@ pub struct Collision {
 /// Vehicle models and their limits.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Vehicle {
+pub struct VehicleConfig {
     /// Model of connected vehicles.
     pub cav_model: VehicleModel,
     /// Model of vehicles without sensors.
@@ -322,7 +322,7 @@ pub enum Reward {
 /// The learned estimator of the preset `fusion` (`caraware.fusion.train`).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Fusion {
+pub struct FusionConfig {
     /// Whether the estimator has the lanes of the net.
     pub map: bool,
     /// Ticks in a piece of an episode that is learnt from.
@@ -334,7 +334,7 @@ pub struct Fusion {
 /// The learner: PPO with the paper's hyper-parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Trainer {
+pub struct TrainerConfig {
     /// Python module that is run as the trainer.
     pub module: String,
     /// Learning rate of Adam at the start.
@@ -411,7 +411,7 @@ pub struct Trainer {
 /// Shared memory → zenoh.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Fanout {
+pub struct FanoutConfig {
     /// Start the fan-out process.
     pub enabled: bool,
     /// zenoh endpoint to listen on.

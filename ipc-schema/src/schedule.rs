@@ -1,6 +1,6 @@
 //! The episodes of a run: a pure function of configuration and seed, so that every process can compute them.
 
-use crate::config::{CurriculumConfig, Episode as Lengths, MapChoice, StageConfig};
+use crate::config::{CurriculumConfig, EpisodeConfig as Lengths, MapChoice, StageConfig};
 
 /// One episode of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -35,7 +35,7 @@ fn main() {
     let preset: Config = serde_json::from_str(include_str!("../../ipc-schema/tests/town.json"))
         .unwrap_or_else(|error| panic!("town.json: {error}"));
     let fast = Config {
-        imu: ipc_schema::config::Imu {
+        imu: ipc_schema::config::ImuConfig {
             period_s: 0.01,
             ..preset.imu.clone()
         },

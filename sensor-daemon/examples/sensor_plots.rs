@@ -148,7 +148,7 @@ impl NormalBlock {
 /// The IMU at rest.
 fn write_imu(out: &mut impl Write) -> io::Result<()> {
     let mut config = town();
-    config.imu = ipc_schema::config::Imu {
+    config.imu = ipc_schema::config::ImuConfig {
         period_s: IMU_S,
         accel_noise_std_mps2: [0.0; 3],
         accel_noise_density: [ACCEL[0]; 3],

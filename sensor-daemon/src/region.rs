@@ -21,7 +21,7 @@ pub enum SensedRegion {
 impl SensedRegion {
     /// The region of a validated configuration.
     #[must_use]
-    pub fn new(config: &config::Region) -> Self {
+    pub fn new(config: &config::RegionConfig) -> Self {
         match config.corners_m() {
             Ok(corners) if !corners.is_empty() => Self::Polygon(corners),
             _ if config.radius_m > 0.0 => Self::Circle {
@@ -56,15 +56,15 @@ mod tests {
     use proptest::prelude::*;
 
     fn polygon(corners: &[&str]) -> SensedRegion {
-        SensedRegion::new(&config::Region {
+        SensedRegion::new(&config::RegionConfig {
             polygon_m: corners.iter().map(|corner| (*corner).to_owned()).collect(),
-            ..config::Region::default()
+            ..config::RegionConfig::default()
         })
     }
 
     #[test]
     fn without_a_region_everything_is_inside() {
-        assert_eq!(SensedRegion::new(&config::Region::default()), SensedRegion::All);
+        assert_eq!(SensedRegion::new(&config::RegionConfig::default()), SensedRegion::All);
         assert!(SensedRegion::All.contains(1e9, -1e9));
     }
 
@@ -102,7 +102,7 @@ mod tests {
         /// A circle contains the points nearer to its centre than its radius.
         #[test]
         fn a_circle_is_its_radius(x in -50.0..50.0_f64, y in -50.0..50.0_f64) {
-            let region = SensedRegion::new(&config::Region { centre_m: [3.0, -4.0], radius_m: 20.0, ..config::Region::default() });
+            let region = SensedRegion::new(&config::RegionConfig { centre_m: [3.0, -4.0], radius_m: 20.0, ..config::RegionConfig::default() });
             prop_assert_eq!(region.contains(x, y), (x - 3.0).powi(2) + (y + 4.0).powi(2) <= 400.0);
         }
     }

@@ -26,7 +26,7 @@ const SUB_STEPS: u32 = 10;
 const DT_S: f64 = 0.005;
 
 fn main() {
-    let limits = config::Vehicle {
+    let limits = config::VehicleConfig {
         max_accel_mps2: 6.0,
         max_decel_mps2: 10.0,
         ..preset::town().vehicle

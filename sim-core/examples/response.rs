@@ -26,8 +26,8 @@ use sim_core::models::{
 
 const DT_S: f64 = 0.005;
 const SPEED_MPS: f64 = 20.0;
-fn limits() -> config::Vehicle {
-    config::Vehicle {
+fn limits() -> config::VehicleConfig {
+    config::VehicleConfig {
         max_accel_mps2: 6.0,
         max_decel_mps2: 10.0,
         ..preset::town().vehicle

@@ -16,8 +16,8 @@ use sim_core::models::{
 
 const DT_S: f64 = 0.01;
 
-fn wide() -> config::Vehicle {
-    config::Vehicle {
+fn wide() -> config::VehicleConfig {
+    config::VehicleConfig {
         max_accel_mps2: 10.0,
         max_decel_mps2: 12.0,
         ..limits()

@@ -6,7 +6,7 @@ use std::{
     path::Path,
 };
 
-use ipc_schema::config::Fanout;
+use ipc_schema::config::FanoutConfig;
 
 use crate::failure::Exit;
 
@@ -14,7 +14,7 @@ use crate::failure::Exit;
 ///
 /// # Errors
 /// The endpoint cannot be listened on, is open to anybody beyond this machine, or a file is missing or readable by others.
-pub fn check(fanout: &mut Fanout) -> Result<(), Exit> {
+pub fn check(fanout: &mut FanoutConfig) -> Result<(), Exit> {
     if !fanout.enabled {
         return Ok(());
     }
@@ -31,7 +31,7 @@ pub fn check(fanout: &mut Fanout) -> Result<(), Exit> {
     check_users(fanout)
 }
 
-fn check_endpoint(fanout: &Fanout) -> Result<(), Exit> {
+fn check_endpoint(fanout: &FanoutConfig) -> Result<(), Exit> {
     let listen = &fanout.listen;
     let encrypted = listen.strip_prefix("tls/");
     let address = encrypted.or_else(|| listen.strip_prefix("tcp/")).ok_or_else(|| {
@@ -96,7 +96,7 @@ fn readable(key: &str, path: &mut String) -> Result<(), Exit> {
 }
 
 /// Passwords and private keys are for their owner alone.
-fn check_secrets(fanout: &Fanout) -> Result<(), Exit> {
+fn check_secrets(fanout: &FanoutConfig) -> Result<(), Exit> {
     for (key, path) in [("users", &fanout.users), ("tls_private_key", &fanout.tls_private_key)] {
         if path.is_empty() {
             continue;
@@ -113,7 +113,7 @@ fn check_secrets(fanout: &Fanout) -> Result<(), Exit> {
 }
 
 /// The file of users says who is who, and commanders are among them.
-fn check_users(fanout: &Fanout) -> Result<(), Exit> {
+fn check_users(fanout: &FanoutConfig) -> Result<(), Exit> {
     let mut known = Vec::new();
     if !fanout.users.is_empty() {
         let path = Path::new(&fanout.users);
@@ -154,7 +154,7 @@ fn check_users(fanout: &Fanout) -> Result<(), Exit> {
 mod tests {
     use super::*;
 
-    fn message(change: impl FnOnce(&mut Fanout)) -> Option<String> {
+    fn message(change: impl FnOnce(&mut FanoutConfig)) -> Option<String> {
         let settings = crate::config::LayeredSettings::defaults().unwrap();
         let mut fanout = settings.validate().unwrap().fanout;
         fanout.listen = "tcp/127.0.0.1:0".into();
@@ -202,7 +202,7 @@ mod tests {
         let open = file(&directory, "open", "alice:secret\n", 0o644);
         let bare = file(&directory, "bare", "alice\n", 0o600);
         let empty = file(&directory, "empty", "\n", 0o600);
-        let says = |part: &str, change: &dyn Fn(&mut Fanout)| {
+        let says = |part: &str, change: &dyn Fn(&mut FanoutConfig)| {
             let message = message(change).unwrap_or_default();
             assert!(message.contains(part), "{part}: {message}");
         };

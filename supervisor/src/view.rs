@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ipc_schema::{config::Fanout, run::RunFile};
+use ipc_schema::{config::FanoutConfig, run::RunFile};
 use rustix::process::{Pid, Signal, kill_process_group};
 
 use crate::{
@@ -168,7 +168,7 @@ impl ViewerRequest {
     ///
     /// # Errors
     /// The run is not fanned out, or asks who the viewer is and the command line does not say.
-    pub fn of(args: &RunArgs, fanout: &Fanout) -> Result<Option<Self>, Exit> {
+    pub fn of(args: &RunArgs, fanout: &FanoutConfig) -> Result<Option<Self>, Exit> {
         let who = &args.credentials;
         let Some(kind) = args.viewer else {
             return match *who == Credentials::default() {

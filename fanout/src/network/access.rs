@@ -8,7 +8,7 @@ use std::sync::{
     atomic::{AtomicU64, Ordering},
 };
 
-use ipc_schema::config::Fanout;
+use ipc_schema::config::FanoutConfig;
 use serde_json::{Value, json};
 use tracing::{Event, Subscriber, field::Visit};
 use tracing_subscriber::layer::{Context, Layer};
@@ -25,7 +25,7 @@ const ACCEPT_TIMEOUT_MS: u32 = 3000;
 
 /// Settings for zenoh, as key and JSON, in the order in which to insert them.
 #[must_use]
-pub fn settings(fanout: &Fanout) -> Vec<(&'static str, String)> {
+pub fn settings(fanout: &FanoutConfig) -> Vec<(&'static str, String)> {
     let mut settings = vec![
         ("transport/unicast/accept_timeout", json!(ACCEPT_TIMEOUT_MS)),
         ("access_control", access_control(&fanout.commanders)),
@@ -48,7 +48,7 @@ pub fn is_encrypted(endpoint: &str) -> bool {
     endpoint.starts_with("tls/")
 }
 
-fn tls_settings(fanout: &Fanout) -> Value {
+fn tls_settings(fanout: &FanoutConfig) -> Value {
     let mut tls = json!({
         "listen_certificate": fanout.tls_certificate,
         "listen_private_key": fanout.tls_private_key,
@@ -208,7 +208,7 @@ impl Visit for MessageText {
 mod tests {
     use super::*;
 
-    fn fanout(listen: &str, commanders: &[&str]) -> Fanout {
+    fn fanout(listen: &str, commanders: &[&str]) -> FanoutConfig {
         let mut config: ipc_schema::config::Config =
             serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
         config.fanout.listen = listen.into();

@@ -2,7 +2,7 @@
 
 use std::{io, net::TcpListener};
 
-use ipc_schema::config::Fanout;
+use ipc_schema::config::FanoutConfig;
 use zenoh::{Wait, config::Config};
 
 use crate::{error::NetworkError, network::access};
@@ -11,7 +11,7 @@ use crate::{error::NetworkError, network::access};
 ///
 /// # Errors
 /// The endpoint is malformed, in use, or not of this machine, or a certificate or the file of users cannot be used.
-pub fn listen(settings: &Fanout) -> Result<zenoh::Session, NetworkError> {
+pub fn listen(settings: &FanoutConfig) -> Result<zenoh::Session, NetworkError> {
     let endpoint = &settings.listen;
     let failed = |error: zenoh::Error| NetworkError::Listen {
         endpoint: endpoint.clone(),
@@ -26,7 +26,7 @@ pub fn listen(settings: &Fanout) -> Result<zenoh::Session, NetworkError> {
 
 /// zenoh's configuration: one endpoint, no discovery, no shared memory, no administration space. With these waits, queues and buffer a
 /// stalled or slow viewer delays `put` by at most 0.6 ms (measured).
-fn config(settings: &Fanout) -> zenoh::Result<Config> {
+fn config(settings: &FanoutConfig) -> zenoh::Result<Config> {
     let endpoint = serde_json::to_string(&settings.listen)?;
     Config::from_json5(&format!(
         r#"{{
@@ -80,7 +80,7 @@ mod tests {
     fn failure(endpoint: &str) -> Failure {
         let config: ipc_schema::config::Config =
             serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
-        let settings = Fanout {
+        let settings = FanoutConfig {
             listen: endpoint.to_owned(),
             ..config.fanout
         };

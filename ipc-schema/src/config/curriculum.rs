@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Config, Traffic};
+use super::{Config, TrafficConfig};
 use crate::sensor::SENSORS;
 
 /// Stages of training.
@@ -125,7 +125,7 @@ impl Config {
         let Some(stage) = stage.checked_sub(1).and_then(|index| self.curriculum.stages.get(index)) else {
             return config;
         };
-        config.traffic = Traffic {
+        config.traffic = TrafficConfig {
             cavs: stage.cavs,
             ..config.traffic
         };

@@ -17,7 +17,7 @@ pub enum Scale {
 /// Fields and normalisation of the observation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Observation {
+pub struct ObservationConfig {
     /// Fields in order.
     pub fields: Vec<Field>,
     /// Ticks in a row: the newest and those before it, oldest first.

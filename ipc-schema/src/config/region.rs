@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 /// The part of the map in which vehicles are sensed; all of it is simulated.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Region {
+pub struct RegionConfig {
     /// Corners of a polygon, each "x y" (metres, world), in order; empty = none.
     pub polygon_m: Vec<String>,
     /// x and y of a circle's centre, metres, world.
@@ -14,7 +14,7 @@ pub struct Region {
     pub radius_m: f64,
 }
 
-impl Region {
+impl RegionConfig {
     /// Corners of the polygon.
     ///
     /// # Errors

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 /// GNSS receiver.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Gnss {
+pub struct GnssConfig {
     /// Time between fixes, seconds.
     pub period_s: f64,
     /// Standard deviation of latitude and of longitude, degrees of arc on the ground (5e-5 ≙ 5.57 m).
@@ -32,7 +32,7 @@ pub struct Gnss {
     pub blackout_gap_s: [f64; 2],
 }
 
-impl Gnss {
+impl GnssConfig {
     /// Multiplies random errors and biases by `factor`.
     pub(crate) fn scale_noise(&mut self, factor: f64) {
         let angles = [&mut self.noise_std_deg, &mut self.bias_deg];
@@ -57,7 +57,7 @@ pub enum ImuConvention {
 /// Inertial measurement unit and compass.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Imu {
+pub struct ImuConfig {
     /// Time between samples, seconds: a whole number of sub-steps.
     pub period_s: f64,
     /// Frame and gravity.
@@ -96,7 +96,7 @@ pub struct Imu {
     pub blackout_gap_s: [f64; 2],
 }
 
-impl Imu {
+impl ImuConfig {
     /// Multiplies random errors and biases by `factor`.
     pub(crate) fn scale_noise(&mut self, factor: f64) {
         let axes = [
@@ -118,7 +118,7 @@ impl Imu {
 /// Wheel speed and steering angle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct SpeedSteering {
+pub struct SpeedSteeringConfig {
     /// Time between samples, seconds.
     pub period_s: f64,
     /// Standard deviation of the speed, m/s.
@@ -137,7 +137,7 @@ pub struct SpeedSteering {
     pub blackout_gap_s: [f64; 2],
 }
 
-impl SpeedSteering {
+impl SpeedSteeringConfig {
     /// Multiplies random errors and biases by `factor`.
     pub(crate) fn scale_noise(&mut self, factor: f64) {
         let values = [
@@ -174,7 +174,7 @@ pub enum LidarAxes {
 /// Spinning LIDAR.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Lidar {
+pub struct LidarConfig {
     /// Vehicles that carry one: those in the first so many slots.
     pub vehicles: u32,
     /// "uniform", a unit by name, or "table".
@@ -223,7 +223,7 @@ pub struct Lidar {
     pub blackout_gap_s: [f64; 2],
 }
 
-impl Lidar {
+impl LidarConfig {
     /// Names of patterns.
     pub const PATTERNS: [&str; 10] = [
         "uniform",
@@ -279,7 +279,7 @@ pub enum BlackoutPolicy {
 /// What happens while a sensor is dark.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Blackout {
+pub struct BlackoutConfig {
     /// Switch for all of them.
     pub enabled: bool,
     /// What the observation holds meanwhile.
@@ -289,7 +289,7 @@ pub struct Blackout {
 /// Rain, fog and sun.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Weather {
+pub struct WeatherConfig {
     /// Rain, mm/h: wets the road, attenuates and loses LIDAR returns.
     pub rain_mmph: f64,
     /// Meteorological optical range (visibility), metres; fog is below 1000.

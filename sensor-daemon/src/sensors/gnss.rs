@@ -1,6 +1,6 @@
 //! GNSS receiver: white noise, correlated noise and bias east, north and up, in degrees or metres, and the position with these errors.
 
-use ipc_schema::{config::Gnss as Params, sensor::NoiseStream};
+use ipc_schema::{config::GnssConfig as Params, sensor::NoiseStream};
 use sim_core::geodesy::{
     GeodesyError, NetPosition, Projection,
     displacement::{DisplacementMap, GroundArc},

@@ -8,7 +8,7 @@
 use std::f64::consts::{FRAC_PI_2, TAU};
 
 use ipc_schema::{
-    config::{Imu as Params, ImuConvention},
+    config::{ImuConfig as Params, ImuConvention},
     observation::IMU_COLUMNS,
     sensor::NoiseStream,
     world::SubStep,

@@ -1,6 +1,6 @@
 //! Speed and steering sensor: wheel speed, and steering-wheel angle from the road-wheel angle and the steering ratio.
 
-use ipc_schema::{config::SpeedSteering as Params, sensor::NoiseStream, world::VehicleState};
+use ipc_schema::{config::SpeedSteeringConfig as Params, sensor::NoiseStream, world::VehicleState};
 
 use crate::noise::{DrawnNormals, NormalDraws, RandomStream, normals::NormalBlock};
 

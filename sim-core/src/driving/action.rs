@@ -10,7 +10,7 @@ pub type HeroAction = [f32; 2];
 /// The control input of an action: −1 … 1 of the largest road-wheel angle (left is positive), and of the largest
 /// acceleration or deceleration.
 #[must_use]
-pub fn input([steering, acceleration]: HeroAction, limits: &config::Vehicle) -> ControlInput {
+pub fn input([steering, acceleration]: HeroAction, limits: &config::VehicleConfig) -> ControlInput {
     let largest_mps2 = if acceleration > 0.0 {
         limits.max_accel_mps2
     } else {

@@ -90,7 +90,7 @@ struct HeroTrip {
 #[derive(Debug)]
 pub struct DrivingTask<G> {
     ground: G,
-    limits: config::Vehicle,
+    limits: config::VehicleConfig,
     off_road_ticks: u32,
     time_limit_ticks: u64,
     episode: Option<u64>,

@@ -12,7 +12,7 @@ use crate::models::catalogue::{ModelCatalogue, ModelCatalogueError};
 #[derive(Debug, Clone)]
 pub struct MirrorSettings {
     /// Models of the vehicles and their limits.
-    pub vehicle: config::Vehicle,
+    pub vehicle: config::VehicleConfig,
     /// State of the road surface.
     pub surface: config::Surface,
     /// Length of a tick, seconds.

@@ -80,7 +80,7 @@ type ModelKey = (usize, u8, [u32; 3]);
 #[derive(Debug)]
 pub struct ModelCatalogue {
     catalogue: ParameterCatalogue,
-    limits: config::Vehicle,
+    limits: config::VehicleConfig,
     by_class: BTreeMap<String, VehicleModel>,
     surface: f64,
     sub_step_s: f64,
@@ -97,7 +97,7 @@ impl ModelCatalogue {
     ///
     /// # Errors
     /// A class is given a model that does not exist.
-    pub fn new(limits: &config::Vehicle, surface: Surface, sub_step_s: f64) -> Result<Self, ModelCatalogueError> {
+    pub fn new(limits: &config::VehicleConfig, surface: Surface, sub_step_s: f64) -> Result<Self, ModelCatalogueError> {
         let by_class = limits
             .class_models
             .iter()
@@ -222,8 +222,8 @@ mod tests {
     use super::*;
     use crate::preset;
 
-    fn limits() -> config::Vehicle {
-        config::Vehicle {
+    fn limits() -> config::VehicleConfig {
+        config::VehicleConfig {
             hero_model: VehicleModel::RigidBody,
             class_models: vec!["bus=kinematic".into(), "truck=dynamic".into()],
             ..preset::town().vehicle
@@ -281,7 +281,7 @@ mod tests {
     #[test]
     fn a_model_for_no_class_is_refused() {
         for entry in ["bus", "bus=flying", "hovercraft=dynamic"] {
-            let limits = config::Vehicle {
+            let limits = config::VehicleConfig {
                 class_models: vec![entry.into()],
                 ..limits()
             };

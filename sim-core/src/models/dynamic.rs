@@ -143,7 +143,7 @@ impl DynamicParams {
     pub fn new(
         set: &ParameterSet,
         body: &VehicleDimensions,
-        limits: &config::Vehicle,
+        limits: &config::VehicleConfig,
         surface: f64,
         dt_s: f64,
     ) -> Self {

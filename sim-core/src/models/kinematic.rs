@@ -43,7 +43,7 @@ pub struct KinematicParams {
 impl KinematicParams {
     /// The limits of a parameter set, none above the configured ones, on a vehicle with this wheelbase.
     #[must_use]
-    pub fn new(set: &ParameterSet, limits: &config::Vehicle, wheelbase_m: f64) -> Self {
+    pub fn new(set: &ParameterSet, limits: &config::VehicleConfig, wheelbase_m: f64) -> Self {
         let max_road_wheel_angle_rad = set.max_road_wheel_angle_rad.min(limits.max_road_wheel_angle_rad);
         Self {
             wheelbase_m,

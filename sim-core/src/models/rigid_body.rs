@@ -131,7 +131,7 @@ impl RigidBody {
     pub fn new(
         set: &ParameterSet,
         body: &VehicleDimensions,
-        limits: &config::Vehicle,
+        limits: &config::VehicleConfig,
         surface: f64,
         dt_s: f64,
     ) -> Result<Self, RigidBodyError> {

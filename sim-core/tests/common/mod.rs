@@ -27,15 +27,15 @@ pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> MirrorSetti
     }
 }
 
-pub fn limits() -> config::Vehicle {
-    config::Vehicle {
+pub fn limits() -> config::VehicleConfig {
+    config::VehicleConfig {
         cav_model: config::VehicleModel::Kinematic,
         ..preset::town().vehicle
     }
 }
 
 /// The kinematic model with these limits.
-pub fn kinematic(limits: &config::Vehicle, wheelbase_m: f64) -> KinematicParams {
+pub fn kinematic(limits: &config::VehicleConfig, wheelbase_m: f64) -> KinematicParams {
     KinematicParams {
         wheelbase_m,
         max_road_wheel_angle_rad: limits.max_road_wheel_angle_rad,

@@ -15,7 +15,7 @@ pub mod vehicle_types;
 use std::{collections::BTreeMap, rc::Rc};
 
 use ipc_schema::{
-    config::Traffic,
+    config::TrafficConfig,
     traffic::{MetaEvent, VehicleMeta},
 };
 use rand_chacha::ChaCha8Rng;
@@ -54,8 +54,8 @@ pub struct PopulationSize {
     pub pedestrians: u32,
 }
 
-impl From<&Traffic> for PopulationSize {
-    fn from(traffic: &Traffic) -> Self {
+impl From<&TrafficConfig> for PopulationSize {
+    fn from(traffic: &TrafficConfig) -> Self {
         Self {
             cavs: traffic.cavs,
             others: traffic.others,

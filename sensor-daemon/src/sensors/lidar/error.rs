@@ -76,7 +76,7 @@ impl LidarError {
     #[must_use]
     pub fn help(&self) -> String {
         match self {
-            Self::Pattern { .. } => format!("the patterns are {}", ipc_schema::config::Lidar::PATTERNS.join(", ")),
+            Self::Pattern { .. } => format!("the patterns are {}", ipc_schema::config::LidarConfig::PATTERNS.join(", ")),
             Self::Unreadable { .. } => "check the path and its permissions".into(),
             Self::Table { .. } | Self::NoRays { .. } => {
                 "write a header `azimuth_deg,elevation_deg` and a line for each ray, for example `12.5,-3.0`".into()

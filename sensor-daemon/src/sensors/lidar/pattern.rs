@@ -49,7 +49,7 @@ pub(super) struct RayPattern {
 const TOGETHER_S: f64 = 50e-6;
 
 impl RayPattern {
-    pub(super) fn new(lidar: &config::Lidar) -> Result<Self, LidarError> {
+    pub(super) fn new(lidar: &config::LidarConfig) -> Result<Self, LidarError> {
         if lidar.pattern == "table" {
             return table(Path::new(&lidar.ray_table), lidar.rotation_hz);
         }
@@ -119,7 +119,7 @@ impl RayGroup {
 }
 
 /// Elevations from the lowest laser up, degrees.
-pub(super) fn elevations_deg(lidar: &config::Lidar) -> Option<Vec<f64>> {
+pub(super) fn elevations_deg(lidar: &config::LidarConfig) -> Option<Vec<f64>> {
     let between = |lower: f64, upper: f64, count: u32| -> Vec<f64> {
         if count == 1 {
             return vec![0.5 * (lower + upper)];

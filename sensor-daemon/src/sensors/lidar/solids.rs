@@ -76,7 +76,7 @@ pub(super) fn wall(p_m: Point, q_m: Point) -> Option<SolidWall> {
 }
 
 impl StillSolids {
-    pub(super) fn new(lidar: &config::Lidar, scene: &Scene) -> Result<Self, LidarError> {
+    pub(super) fn new(lidar: &config::LidarConfig, scene: &Scene) -> Result<Self, LidarError> {
         let interest = interest(lidar)?;
         let all: Vec<(u32, Solid<'_>, Bounds)> = (0_u32..)
             .zip(scene.bounds())
@@ -189,7 +189,7 @@ fn centre(bounds: &Bounds) -> Point {
 }
 
 /// Whether each prop of the catalogue is of interest.
-fn interest(lidar: &config::Lidar) -> Result<Vec<bool>, LidarError> {
+fn interest(lidar: &config::LidarConfig) -> Result<Vec<bool>, LidarError> {
     if let Some(name) = lidar
         .interest_props
         .iter()

@@ -6,7 +6,7 @@
 //! `α = 3.912 / V · (λ / 550 nm)^−q`, at 905 nm, less what clear air (50 km) has, for which `lidar.attenuation_per_m` stands. Sun: a
 //! model of this project, without a source: a further error of the range of up to 5 cm towards the sun, falling with the squared cosine.
 
-use ipc_schema::config::Weather;
+use ipc_schema::config::WeatherConfig;
 
 /// Wavelength over that of Koschmieder's law: 905 nm to 550 nm.
 const WAVELENGTHS: f64 = 905.0 / 550.0;
@@ -29,7 +29,7 @@ pub(super) struct WeatherEffects {
 }
 
 impl WeatherEffects {
-    pub(super) fn new(weather: &Weather) -> Self {
+    pub(super) fn new(weather: &WeatherConfig) -> Self {
         let (sin_up, cos_up) = libm::sincos(weather.sun_elevation_deg.to_radians());
         let (sin_az, cos_az) = libm::sincos(weather.sun_azimuth_deg.to_radians());
         let rain = weather.rain_mmph;
@@ -67,8 +67,8 @@ fn fog_per_m(visibility_m: f64) -> f64 {
 mod tests {
     use super::*;
 
-    fn weather(rain_mmph: f64, visibility_m: f64, sunlight: f64) -> Weather {
-        Weather {
+    fn weather(rain_mmph: f64, visibility_m: f64, sunlight: f64) -> WeatherConfig {
+        WeatherConfig {
             rain_mmph,
             visibility_m,
             sun_elevation_deg: 30.0,

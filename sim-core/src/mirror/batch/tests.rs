@@ -6,7 +6,7 @@ use crate::preset;
 use ipc_schema::config;
 use proptest::prelude::*;
 
-fn limits() -> config::Vehicle {
+fn limits() -> config::VehicleConfig {
     preset::town().vehicle
 }
 

@@ -1,7 +1,7 @@
 //! Rules of the sensors: rates that divide each other, fields of view that hold something, fields that have a source.
 
 use ipc_schema::{
-    config::{Config, Lidar},
+    config::{Config, LidarConfig},
     sensor::fitted_sensors,
 };
 
@@ -50,12 +50,12 @@ fn lidar(config: &Config) -> Option<BrokenSensorRule> {
         .or_else(|| rates(config))
 }
 
-fn pattern(lidar: &Lidar) -> Option<BrokenSensorRule> {
-    if !Lidar::PATTERNS.contains(&lidar.pattern.as_str()) {
+fn pattern(lidar: &LidarConfig) -> Option<BrokenSensorRule> {
+    if !LidarConfig::PATTERNS.contains(&lidar.pattern.as_str()) {
         return Some((
             "lidar.pattern",
             format!("`lidar.pattern` = \"{}\" is no known pattern", lidar.pattern),
-            format!("the patterns are {}", Lidar::PATTERNS.join(", ")),
+            format!("the patterns are {}", LidarConfig::PATTERNS.join(", ")),
         ));
     }
     (lidar.pattern == "table" && lidar.ray_table.is_empty()).then(|| {
@@ -67,7 +67,7 @@ fn pattern(lidar: &Lidar) -> Option<BrokenSensorRule> {
     })
 }
 
-fn field_of_view(lidar: &Lidar) -> Option<BrokenSensorRule> {
+fn field_of_view(lidar: &LidarConfig) -> Option<BrokenSensorRule> {
     let (lower, upper) = (lidar.lower_fov_deg, lidar.upper_fov_deg);
     if lidar.pattern == "uniform" && (lower > upper || (lidar.channels > 1 && upper - lower <= 0.0)) {
         return Some((
