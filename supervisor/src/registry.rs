@@ -33,6 +33,9 @@ const MARKER_BYTES: u64 = 16 << 10;
 /// Hexadecimal digits of a directory's name.
 const NAME_DIGITS: usize = 8;
 
+/// File in a [`base`] that a run created: such a directory is removed with its last run. A directory of the user has none.
+const BASE_MARKER: &str = ".created-by-caraware";
+
 /// Environment variable that moves [`base`].
 const RUNTIME_DIR: &str = "CARAWARE_RUNTIME_DIR";
 /// Longest [`base`]: iceoryx2's sockets lie below it, and Unix allows their paths 107 bytes.
@@ -120,11 +123,7 @@ fn create_base() -> Result<PathBuf, Exit> {
             help,
         ));
     }
-    DirBuilder::new()
-        .recursive(true)
-        .mode(0o700)
-        .create(&base)
-        .map_err(|error| Exit::io("create", &base, &error))?;
+    make_base(&base).map_err(|error| Exit::io("create", &base, &error))?;
     let looked_at = if is_chosen() {
         base.metadata()
     } else {
@@ -142,6 +141,37 @@ fn create_base() -> Result<PathBuf, Exit> {
             .map_err(|error| Exit::io("close to other users", &base, &error))?;
     }
     Ok(base)
+}
+
+/// Creates the directory if it is not there, and marks it as created by a run.
+fn make_base(base: &Path) -> std::io::Result<()> {
+    if base.is_dir() {
+        return Ok(());
+    }
+    DirBuilder::new().recursive(true).mode(0o700).create(base)?;
+    mark_base(base)
+}
+
+fn mark_base(base: &Path) -> std::io::Result<()> {
+    OpenOptions::new()
+        .create(true)
+        .truncate(false)
+        .write(true)
+        .mode(0o600)
+        .open(base.join(BASE_MARKER))
+        .map(drop)
+}
+
+/// Removes [`base`] after its last run, if a run created it.
+fn remove_base(base: &Path) -> std::io::Result<()> {
+    let marker = base.join(BASE_MARKER);
+    let mut entries = std::fs::read_dir(base)?.flatten();
+    if !entries.all(|entry| entry.path() == marker) || !marker.is_file() {
+        return Ok(());
+    }
+    std::fs::remove_file(&marker)?;
+    // Another run may have come in between: the directory is not empty then, and stays marked.
+    std::fs::remove_dir(base).or_else(|_| mark_base(base))
 }
 
 /// A claimed corner of shared memory; released and emptied when dropped.
@@ -202,11 +232,7 @@ impl RunClaim {
 impl Drop for RunClaim {
     fn drop(&mut self) {
         remove(&self.directory);
-        if is_chosen() {
-            return;
-        }
-        // The last run leaves nothing; with another one alive the directory is not empty, and stays.
-        if let Err(error) = std::fs::remove_dir(base()) {
+        if let Err(error) = remove_base(&base()) {
             tracing::debug!(%error, "the registry stays");
         }
     }
@@ -396,6 +422,23 @@ mod tests {
         for directory in strange {
             assert_eq!(RunMarker::of(&directory), None, "{}", directory.display());
         }
+    }
+
+    #[test]
+    fn a_base_is_removed_only_if_a_run_created_it_and_it_is_empty() {
+        let parent = tempfile::tempdir().unwrap();
+        let (created, chosen) = (parent.path().join("a/created"), parent.path().join("chosen"));
+        make_base(&created).unwrap();
+        let run = dead(&created, "0123abcd", |_| {});
+        remove_base(&created).unwrap();
+        assert!(run.is_dir() && created.join(BASE_MARKER).is_file());
+        std::fs::remove_dir_all(run).unwrap();
+        remove_base(&created).unwrap();
+        assert!(!created.exists());
+        std::fs::create_dir(&chosen).unwrap();
+        make_base(&chosen).unwrap();
+        remove_base(&chosen).unwrap();
+        assert!(chosen.is_dir());
     }
 
     #[test]
