@@ -1,8 +1,11 @@
-//! The board of a process: its latest progress and health, newest wins, readable by everybody at any time.
+//! The board of a process: its latest progress and health, newest wins, readable by every process at any time.
 
 use iceoryx2::prelude::ZeroCopySend;
 
-use crate::metric::{MetricValues, NOT_MEASURED};
+use crate::{
+    metric::{MetricValues, NOT_MEASURED},
+    process::Process,
+};
 
 /// Where a process stands in the data it consumes and commits.
 #[repr(C)]
@@ -51,9 +54,9 @@ pub const INCARNATIONS: u32 = 256;
 #[type_name("caraware::Roster")]
 pub struct Roster {
     /// Incarnation of each process.
-    pub incarnations: [u32; 5],
+    pub incarnations: [u32; Process::COUNT],
     /// 1 while a successor that is ready waits for that incarnation to leave, or opens its ports, else 0.
-    pub handing_over: [u32; 5],
+    pub handing_over: [u32; Process::COUNT],
 }
 
 /// State of a process, [`Health::state`].

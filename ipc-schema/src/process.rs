@@ -19,6 +19,9 @@ pub enum Process {
 }
 
 impl Process {
+    /// Number of processes.
+    pub const COUNT: usize = Self::ALL.len();
+
     /// All processes, in the order of the data.
     pub const ALL: [Self; 5] = [
         Self::TrafficBridge,

@@ -66,7 +66,7 @@ const MAX_NODES: usize = 24;
 /// Readers of one board.
 const MAX_READERS: usize = 32;
 /// Readers of the roster: every reader of a board reads it.
-const MAX_ROSTER_READERS: usize = 5 * MAX_READERS;
+const MAX_ROSTER_READERS: usize = Process::COUNT * MAX_READERS;
 /// Commands that wait for an answer at a time.
 const MAX_PENDING_COMMANDS: usize = 16;
 /// A service or node could not be created or opened.

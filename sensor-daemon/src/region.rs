@@ -22,14 +22,16 @@ impl SensedRegion {
     /// The region of a validated configuration.
     #[must_use]
     pub fn new(config: &config::RegionConfig) -> Self {
-        match config.corners_m() {
-            Ok(corners) if !corners.is_empty() => Self::Polygon(corners),
-            _ if config.radius_m > 0.0 => Self::Circle {
+        if !config.polygon_m.is_empty() {
+            return Self::Polygon(config.polygon_m.iter().map(|corner| corner.0).collect());
+        }
+        if config.radius_m > 0.0 {
+            return Self::Circle {
                 centre_m: config.centre_m,
                 radius_m: config.radius_m,
-            },
-            _ => Self::All,
+            };
         }
+        Self::All
     }
 
     /// True if (`x_m`, `y_m`) is inside.
@@ -57,7 +59,7 @@ mod tests {
 
     fn polygon(corners: &[&str]) -> SensedRegion {
         SensedRegion::new(&config::RegionConfig {
-            polygon_m: corners.iter().map(|corner| (*corner).to_owned()).collect(),
+            polygon_m: corners.iter().map(|corner| corner.parse().unwrap()).collect(),
             ..config::RegionConfig::default()
         })
     }

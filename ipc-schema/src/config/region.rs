@@ -1,37 +1,71 @@
 //! Where vehicles are sensed: everywhere, inside a polygon, or around a point.
 
+use std::str::FromStr;
+
 use serde::{Deserialize, Serialize};
 
 /// The part of the map in which vehicles are sensed; all of it is simulated.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RegionConfig {
-    /// Corners of a polygon, each "x y" (metres, world), in order; empty = none.
-    pub polygon_m: Vec<String>,
+    /// Corners of a polygon, in order; empty = none.
+    pub polygon_m: Vec<RegionCorner>,
     /// x and y of a circle's centre, metres, world.
     pub centre_m: [f64; 2],
     /// The circle's radius, metres; 0 = none.
     pub radius_m: f64,
 }
 
-impl RegionConfig {
-    /// Corners of the polygon.
-    ///
-    /// # Errors
-    /// The entry that is not two numbers.
-    pub fn corners_m(&self) -> Result<Vec<[f64; 2]>, &str> {
-        self.polygon_m
-            .iter()
-            .map(|text| corner(text).ok_or(text.as_str()))
-            .collect()
+/// A corner of a polygon: x and y, metres, world. Configurations and run files write it as "x y".
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct RegionCorner(pub [f64; 2]);
+
+/// A text is not a corner.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("\"{0}\" is no corner")]
+pub struct RegionCornerError(pub String);
+
+impl FromStr for RegionCorner {
+    type Err = RegionCornerError;
+
+    fn from_str(text: &str) -> Result<Self, RegionCornerError> {
+        let numbers: Option<Vec<f64>> = text
+            .split_whitespace()
+            .map(|word| word.parse().ok().filter(|number: &f64| number.is_finite()))
+            .collect();
+        match numbers.as_deref() {
+            Some([x_m, y_m]) => Ok(Self([*x_m, *y_m])),
+            _ => Err(RegionCornerError(text.to_owned())),
+        }
     }
 }
 
-fn corner(text: &str) -> Option<[f64; 2]> {
-    let numbers: Result<Vec<f64>, _> = text.split_whitespace().map(str::parse).collect();
-    numbers
-        .ok()?
-        .try_into()
-        .ok()
-        .filter(|corner: &[f64; 2]| corner.iter().all(|part| part.is_finite()))
+impl TryFrom<String> for RegionCorner {
+    type Error = RegionCornerError;
+
+    fn try_from(text: String) -> Result<Self, RegionCornerError> {
+        text.parse()
+    }
+}
+
+impl From<RegionCorner> for String {
+    fn from(RegionCorner([x_m, y_m]): RegionCorner) -> Self {
+        format!("{x_m} {y_m}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_corner_is_two_finite_numbers_and_comes_back_from_json() {
+        let corner: RegionCorner = serde_json::from_str("\" 120  45.5 \"").unwrap();
+        assert_eq!(corner, RegionCorner([120.0, 45.5]));
+        assert_eq!(serde_json::to_string(&corner).unwrap(), "\"120 45.5\"");
+        for text in ["", "1", "1 2 3", "1 zero", "1 inf"] {
+            assert_eq!(text.parse::<RegionCorner>(), Err(RegionCornerError(text.to_owned())));
+        }
+    }
 }

@@ -111,6 +111,7 @@ impl LayeredSettings {
     /// # Errors
     /// Values that do not go together.
     pub fn validate(&self) -> Result<Config, ConfigError> {
+        rules::check_texts(self)?;
         let mut root = Map::new();
         for key in keys::KEYS {
             let value = self

@@ -1,7 +1,7 @@
 //! Rules between keys: rates that must divide each other, sizes that must fit.
 
 use ipc_schema::{
-    config::{Config, TaskKind, class_model},
+    config::{Config, RegionCorner, TaskKind, class_model},
     props::Obstacle,
     traffic::VEHICLE_CLASSES,
 };
@@ -167,27 +167,39 @@ fn hero_field(config: &Config) -> Option<&'static str> {
         .map(|spec| spec.name)
 }
 
-/// A polygon has corners, and excludes a circle.
+/// Checks texts that the validated configuration holds as values of their own type.
+pub(super) fn check_texts(settings: &LayeredSettings) -> Result<(), ConfigError> {
+    let path = "region.polygon_m";
+    let corners = settings.setting(path).and_then(|setting| setting.value.as_array());
+    for corner in corners.into_iter().flatten().filter_map(|corner| corner.as_str()) {
+        if let Err(error) = corner.parse::<RegionCorner>() {
+            let help = "give x and y in metres, such as \"120 45.5\"".to_owned();
+            return Err(conflict(settings, path, format!("`{path}`: {error}"), help));
+        }
+    }
+    Ok(())
+}
+
+/// A polygon has three corners or more, and excludes a circle.
 fn region(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let refused = |message: String, help: &str| Err(conflict(settings, "region.polygon_m", message, help.into()));
-    match config.region.corners_m() {
-        Err(entry) => refused(
-            format!("`region.polygon_m`: \"{entry}\" is no corner"),
-            "give x and y in metres, such as \"120 45.5\"",
-        ),
-        Ok(corners) if (1..3).contains(&corners.len()) => refused(
-            format!("`region.polygon_m` has {} corners", corners.len()),
+    let corners = config.region.polygon_m.len();
+    if (1..3).contains(&corners) {
+        return refused(
+            format!("`region.polygon_m` has {corners} corners"),
             "give three corners or more, or [] for none",
-        ),
-        Ok(corners) if !corners.is_empty() && config.region.radius_m > 0.0 => refused(
+        );
+    }
+    if corners > 0 && config.region.radius_m > 0.0 {
+        return refused(
             format!(
                 "`region.polygon_m` and `region.radius_m` = {} are two regions",
                 config.region.radius_m
             ),
             "set region.polygon_m = [] or region.radius_m = 0",
-        ),
-        Ok(_) => Ok(()),
+        );
     }
+    Ok(())
 }
 
 /// Every entry of `scene.obstacles` must be a known prop and a place.
