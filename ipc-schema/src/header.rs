@@ -58,8 +58,8 @@ pub struct MessageHeader {
     pub count: u32,
     /// Second dimension where a payload has one: sub-steps per vehicle (`world`), fields per row (`observation`, `prediction`).
     pub columns: u32,
-    /// `traffic`: number of `traffic-meta` messages sent before this one. `world`: number of heroes. `prediction`: version of
-    /// the policy.
+    /// `traffic`: number of `traffic-meta` messages sent before this one. `world`: number of heroes. `observation`: IMU samples
+    /// in a tick. `prediction`: version of the policy. `pointcloud`: index of the vehicle.
     pub sequence: u64,
 }
 
