@@ -16,12 +16,12 @@ use ipc_schema::{
     board::State,
     clock::monotonic_ns,
     header::{LAST_OF_RUN, MessageHeader},
+    membership::RunMembership,
     observation::ObservationLayout,
     ports::{BoardReader, RosterWriter},
     process::Process,
     run::{Mode, RunFile},
     services::{self, Channel, ServiceHolder},
-    session::Session,
 };
 use serde::Deserialize;
 
@@ -178,10 +178,11 @@ impl Drop for ReceiverProcess {
 }
 
 fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) -> Result<(), Exit> {
-    let failed = |error: ipc_schema::session::SessionError| Exit::run(error.to_string(), "");
-    let session = Session::join_from_outside(run.clone(), Process::SensorDaemon, 0, Arc::new(AtomicBool::new(false)))
-        .map_err(failed)?;
-    let publisher = session.publisher(Channel::Observation).map_err(failed)?;
+    let failed = |error: ipc_schema::membership::MembershipError| Exit::run(error.to_string(), "");
+    let membership =
+        RunMembership::join_from_outside(run.clone(), Process::SensorDaemon, 0, Arc::new(AtomicBool::new(false)))
+            .map_err(failed)?;
+    let publisher = membership.publisher(Channel::Observation).map_err(failed)?;
     let turns = (0..TURNS).flat_map(|turn| SIZES.map(|bytes| (rows(bytes), turn % 2 == 0)));
     let messages = turns.flat_map(|turn| std::iter::repeat_n(turn, MESSAGES));
     let last = (TURNS * SIZES.len() * MESSAGES - 1) as u64;
@@ -198,7 +199,7 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) 
             std::hint::spin_loop();
         }
         let layout = ObservationLayout::new(rows, FIELDS, 1);
-        let mut draft = publisher.loan_unwritten(session.header(), layout.len)?;
+        let mut draft = publisher.loan_unwritten(membership.header(), layout.len)?;
         let values: &mut [f32] = block::view_mut(draft.payload_mut(), layout.observation)
             .map_err(|error| Exit::run(error.to_string(), ""))?;
         #[expect(clippy::cast_precision_loss, reason = "numbers below 2^24")]
@@ -215,7 +216,7 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) 
             columns: u32::try_from(FIELDS).unwrap_or(u32::MAX),
             sequence: 1,
             flags: if tick == last { LAST_OF_RUN } else { 0 },
-            ..session.header()
+            ..membership.header()
         };
         // The message is complete. Only the time is still to come.
         draft.header_mut().sim_time_ns = monotonic_ns();

@@ -2,8 +2,8 @@
 
 use ipc_schema::{
     failure::{Failure, FailureKind},
+    membership::MembershipError,
     ports::PortError,
-    session::SessionError,
 };
 
 /// The fan-out cannot continue.
@@ -11,7 +11,7 @@ use ipc_schema::{
 pub enum FanoutError {
     /// Shared memory.
     #[error(transparent)]
-    SharedMemory(#[from] SessionError),
+    SharedMemory(#[from] MembershipError),
     /// zenoh.
     #[error(transparent)]
     Network(#[from] NetworkError),

@@ -4,10 +4,10 @@ use std::collections::VecDeque;
 
 use ipc_schema::{
     header::{LAST_OF_RUN, MessageHeader},
+    membership::{MembershipError, RunMembership},
     ports::{Message, PortError, Subscriber},
     run::RunFile,
     services::Channel,
-    session::{Session, SessionError},
 };
 
 /// Counts the ticks of a channel: those that arrived and those that were missed.
@@ -44,7 +44,7 @@ impl ChannelWatcher {
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn open(membership: &mut Session, channel: Channel) -> Result<Self, SessionError> {
+    pub fn open(membership: &mut RunMembership, channel: Channel) -> Result<Self, MembershipError> {
         Ok(Self {
             subscriber: membership.subscriber(channel)?,
             wrong_versions: 0,
@@ -89,7 +89,7 @@ impl ChannelFeed {
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn open(membership: &mut Session, channel: Channel) -> Result<Self, SessionError> {
+    pub fn open(membership: &mut RunMembership, channel: Channel) -> Result<Self, MembershipError> {
         Ok(Self {
             channel,
             watcher: ChannelWatcher::open(membership, channel)?,

@@ -16,13 +16,13 @@ pub mod status;
 
 use std::path::Path;
 
-use ipc_schema::{failure::Failure, process::Process, session::Session};
+use ipc_schema::{failure::Failure, membership::RunMembership, process::Process};
 
 /// Fans out the run of `run_file` until the run ends or the process receives a signal to stop.
 ///
 /// # Errors
 /// The process cannot join the run, the endpoint cannot be listened on, or a port broke.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
-    let membership = Session::join(run_file, Process::Fanout)?;
+    let membership = RunMembership::join(run_file, Process::Fanout)?;
     Ok(relay::RunRelay::open(membership)?.run()?)
 }

@@ -11,5 +11,5 @@ const NICENESS: i32 = 10;
 fn main() -> ExitCode {
     // Threads inherit the niceness, so it is set first. Where the system forbids it, the fan-out runs without it.
     let _ = rustix::process::setpriority_process(None, NICENESS);
-    session::main_heard(Process::Fanout, RefusalLayer, REFUSAL_FILTER, fanout::run)
+    membership::main_heard(Process::Fanout, RefusalLayer, REFUSAL_FILTER, fanout::run)
 }

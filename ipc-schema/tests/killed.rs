@@ -13,11 +13,11 @@ use ipc_schema::{
     board::State,
     config::Config,
     header::MessageHeader,
+    membership::{INCARNATION, RunMembership},
     ports::{BoardReader, RosterWriter},
     process::Process,
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
-    session::{INCARNATION, Session},
 };
 
 /// Set for the process that is to be killed: the run file.
@@ -61,19 +61,19 @@ fn the_victim() {
         return;
     };
     let run = RunFile::read(Path::new(&run_file)).unwrap();
-    let mut session = Session::join_with(run, Process::Trainer, 0, Arc::new(AtomicBool::new(false))).unwrap();
-    let observations = session.subscriber(Channel::Observation).unwrap();
-    let predictions = session.publisher(Channel::Prediction).unwrap();
-    session.attach_from(7);
-    let message = session.next(&observations).unwrap().unwrap();
+    let mut membership = RunMembership::join_with(run, Process::Trainer, 0, Arc::new(AtomicBool::new(false))).unwrap();
+    let observations = membership.subscriber(Channel::Observation).unwrap();
+    let predictions = membership.publisher(Channel::Prediction).unwrap();
+    membership.attach_from(7);
+    let message = membership.next(&observations).unwrap().unwrap();
     let header = MessageHeader {
         tick: message.header().tick,
-        ..session.header()
+        ..membership.header()
     };
     predictions.loan(header, 8).unwrap().send().unwrap();
-    session.consumed(header.tick + 1);
+    membership.consumed(header.tick + 1);
     loop {
-        session.wait(Duration::from_secs(1)).unwrap();
+        membership.wait(Duration::from_secs(1)).unwrap();
     }
 }
 
@@ -106,7 +106,7 @@ fn a_killed_trainer_is_replaced_again_and_again() {
     let mut in_process = run.clone();
     in_process.supervisor_pid = rustix::process::getppid().unwrap().as_raw_nonzero().get();
     let mut sensing =
-        Session::join_with(in_process, Process::SensorDaemon, 0, Arc::new(AtomicBool::new(false))).unwrap();
+        RunMembership::join_with(in_process, Process::SensorDaemon, 0, Arc::new(AtomicBool::new(false))).unwrap();
     let observations = sensing.publisher(Channel::Observation).unwrap();
     let predictions = sensing.subscriber(Channel::Prediction).unwrap();
     let waker = sensing.waker(Process::Trainer).unwrap();

@@ -16,11 +16,11 @@ use ipc_schema::{
     board::State,
     config::Config,
     header::MessageHeader,
+    membership::{MembershipError, RunMembership},
     ports::PortError,
     process::Process,
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
     services::{self, Channel, RunNode, ServiceHolder},
-    session::{Session, SessionError},
 };
 
 /// The default preset, with small queues.
@@ -95,16 +95,16 @@ impl Corner {
         }
     }
 
-    fn join(&self, process: Process) -> Session {
-        Session::join_with(self.run.clone(), process, 0, Arc::new(AtomicBool::new(false))).unwrap()
+    fn join(&self, process: Process) -> RunMembership {
+        RunMembership::join_with(self.run.clone(), process, 0, Arc::new(AtomicBool::new(false))).unwrap()
     }
 }
 
-fn tick(session: &Session, tick: u64) -> MessageHeader {
+fn tick(membership: &RunMembership, tick: u64) -> MessageHeader {
     MessageHeader {
         tick,
         count: 1,
-        ..session.header()
+        ..membership.header()
     }
 }
 
@@ -228,10 +228,10 @@ fn a_board_outlives_its_writer_and_a_wake_up_is_not_lost() {
 #[test]
 fn a_wait_of_less_than_a_microsecond_ends() {
     let run = Corner::new(11);
-    let session = run.join(Process::Trainer);
+    let membership = run.join(Process::Trainer);
     let begin = std::time::Instant::now();
     for nanoseconds in [0, 1, 999, 1_001] {
-        session.wait(Duration::from_nanos(nanoseconds)).unwrap();
+        membership.wait(Duration::from_nanos(nanoseconds)).unwrap();
     }
     assert!(begin.elapsed() < Duration::from_secs(5));
 }
@@ -243,8 +243,8 @@ fn a_process_without_its_supervisor_does_not_start() {
         supervisor_pid: 1_000_000_000,
         ..corner.run.clone()
     };
-    let result = Session::join_with(run, Process::SimCore, 0, Arc::new(AtomicBool::new(false)));
-    assert!(matches!(result, Err(SessionError::Orphaned { .. })));
+    let result = RunMembership::join_with(run, Process::SimCore, 0, Arc::new(AtomicBool::new(false)));
+    assert!(matches!(result, Err(MembershipError::Orphaned { .. })));
 }
 
 #[test]
@@ -255,16 +255,16 @@ fn a_process_from_outside_needs_a_living_supervisor_that_is_not_its_parent() {
             supervisor_pid,
             ..corner.run.clone()
         };
-        Session::join_from_outside(run, Process::Trainer, 0, Arc::new(AtomicBool::new(false)))
+        RunMembership::join_from_outside(run, Process::Trainer, 0, Arc::new(AtomicBool::new(false)))
     };
-    assert!(matches!(joined(1_000_000_000), Err(SessionError::Orphaned { .. })));
+    assert!(matches!(joined(1_000_000_000), Err(MembershipError::Orphaned { .. })));
     let mut supervisor = std::process::Command::new("sleep").arg("60").spawn().unwrap();
-    let mut session = joined(supervisor.id().try_into().unwrap()).unwrap();
-    session.attach();
-    assert!(session.supervisor_lives());
+    let mut membership = joined(supervisor.id().try_into().unwrap()).unwrap();
+    membership.attach();
+    assert!(membership.supervisor_lives());
     supervisor.kill().unwrap();
     supervisor.wait().unwrap();
-    assert!(!session.supervisor_lives());
+    assert!(!membership.supervisor_lives());
 }
 
 #[test]

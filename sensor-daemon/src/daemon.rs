@@ -7,12 +7,12 @@ use ipc_schema::{
     board::State,
     failure::{Failure, FailureKind},
     header::{LAST_OF_RUN, MessageHeader},
+    membership::{RunMembership, Wait},
     observation::ObservationLayout,
     ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
     run::MapInfo,
     services::Channel,
-    session::{Session, Wait},
     world::WorldLayout,
 };
 use serde::Serialize;
@@ -49,20 +49,20 @@ struct SensorDaemonReport {
 /// # Errors
 /// The map's projection is not understood, the scene or a LIDAR's ray table cannot be read, or a port fails.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
-    let mut session = Session::join(run_file, Process::SensorDaemon)?;
-    let (config, maps) = (&session.run.config, session.run.every_map());
+    let mut membership = RunMembership::join(run_file, Process::SensorDaemon)?;
+    let (config, maps) = (&membership.run.config, membership.run.every_map());
     let maps: Vec<MapInfo> = maps.into_iter().map(|map| map.info).collect();
-    let mut sensing = Sensing::on_maps(config, session.run.map.bounds_m, &maps).map_err(projection_failure)?;
-    let surroundings = Surroundings::open(&mut session, &mut sensing)?;
-    let world = session.subscriber(Channel::World)?;
-    let mut daemon = Daemon::open(session, sensing, surroundings)?;
+    let mut sensing = Sensing::on_maps(config, membership.run.map.bounds_m, &maps).map_err(projection_failure)?;
+    let surroundings = Surroundings::open(&mut membership, &mut sensing)?;
+    let world = membership.subscriber(Channel::World)?;
+    let mut daemon = Daemon::open(membership, sensing, surroundings)?;
     while let Some(message) = daemon.next_world(&world)? {
         let header = *message.header();
         if daemon.tick(&message)? == Wait::Stopped {
             break;
         }
         drop(message);
-        daemon.session.consumed(header.tick + 1);
+        daemon.membership.consumed(header.tick + 1);
         if header.has(LAST_OF_RUN) {
             return daemon.wait_for_trainers_end();
         }
@@ -71,7 +71,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
 }
 
 struct Daemon {
-    session: Session,
+    membership: RunMembership,
     sensing: Sensing,
     surroundings: Surroundings,
     /// Commands that switch sensors on and off.
@@ -89,17 +89,17 @@ struct Daemon {
 }
 
 impl Daemon {
-    fn open(mut session: Session, sensing: Sensing, surroundings: Surroundings) -> Result<Self, Failure> {
-        let observations = session.publisher(Channel::Observation)?;
-        let switches = session.subscriber(Channel::Switch)?;
-        let consumer = match session.run.mode.has_trainer() {
-            true => Some(Delivery::open(&session)?),
+    fn open(mut membership: RunMembership, sensing: Sensing, surroundings: Surroundings) -> Result<Self, Failure> {
+        let observations = membership.publisher(Channel::Observation)?;
+        let switches = membership.subscriber(Channel::Switch)?;
+        let consumer = match membership.run.mode.has_trainer() {
+            true => Some(Delivery::open(&membership)?),
             false => None,
         };
-        session.attach();
-        let (ticks, committed_ticks) = (session.run.first_tick(), session.run.committed_ticks());
+        membership.attach();
+        let (ticks, committed_ticks) = (membership.run.first_tick(), membership.run.committed_ticks());
         Ok(Self {
-            session,
+            membership,
             sensing,
             surroundings,
             switches,
@@ -117,7 +117,7 @@ impl Daemon {
     fn next_world(&mut self, world: &Subscriber) -> Result<Option<Message>, Failure> {
         let mut received = Ok(None);
         loop {
-            let waited = self.session.wait_until(|| {
+            let waited = self.membership.wait_until(|| {
                 received = world.receive();
                 !matches!(received, Ok(None)) || self.consumer.as_ref().is_some_and(Delivery::is_behind)
             })?;
@@ -139,16 +139,16 @@ impl Daemon {
     }
 
     /// Waits until `condition` holds for the trainer, and resends what its successors lack. Returns at once in a run without a trainer.
-    fn wait_for_trainer(&mut self, condition: impl Fn(&Delivery, &Session) -> bool) -> Result<Wait, Failure> {
+    fn wait_for_trainer(&mut self, condition: impl Fn(&Delivery, &RunMembership) -> bool) -> Result<Wait, Failure> {
         loop {
             self.catch_up()?;
             let Some(consumer) = &self.consumer else {
                 return Ok(Wait::Ready);
             };
             let waited = self
-                .session
-                .wait_until(|| consumer.is_behind() || condition(consumer, &self.session))?;
-            if waited == Wait::Stopped || condition(consumer, &self.session) {
+                .membership
+                .wait_until(|| consumer.is_behind() || condition(consumer, &self.membership))?;
+            if waited == Wait::Stopped || condition(consumer, &self.membership) {
                 return Ok(waited);
             }
         }
@@ -184,7 +184,8 @@ impl Daemon {
     fn wait_for_credit(&mut self, n: usize) -> Result<Wait, Failure> {
         let len = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples()).len;
         let since = Instant::now();
-        let waited = self.wait_for_trainer(|consumer, session| consumer.may_send(session) || consumer.may_keep(len))?;
+        let waited =
+            self.wait_for_trainer(|consumer, membership| consumer.may_send(membership) || consumer.may_keep(len))?;
         if let Some(consumer) = &mut self.consumer {
             consumer.update_handover(since);
         }
@@ -193,7 +194,7 @@ impl Daemon {
 
     /// Samples the sensors of the surroundings. It runs before the observation is made, because the observation shows their samples.
     fn scan(&mut self, world: &MessageHeader, road_users: &WorldTick) -> Result<(), Failure> {
-        let ours = self.session.header();
+        let ours = self.membership.header();
         let header = MessageHeader {
             run_id: ours.run_id,
             incarnation: ours.incarnation,
@@ -205,7 +206,7 @@ impl Daemon {
     /// Samples the sensors into a block of shared memory, adds it to the hash, and sends it or keeps it in the journal.
     fn publish(&mut self, world: &MessageHeader, road_users: &WorldTick, n: usize) -> Result<(), Failure> {
         let d = self.sensing.width();
-        let ours = self.session.header();
+        let ours = self.membership.header();
         let header = MessageHeader {
             count: n as u32,
             columns: d as u32,
@@ -240,7 +241,7 @@ impl Daemon {
         let Some(consumer) = &mut self.consumer else {
             return Ok(true);
         };
-        let is_due = consumer.may_send(&self.session);
+        let is_due = consumer.may_send(&self.membership);
         consumer.keep(*header, payload)?;
         if is_due {
             consumer.count_live();
@@ -256,7 +257,7 @@ impl Daemon {
         self.cavs_max = self.cavs_max.max(cavs);
         self.ticks += 1;
         let (ticks, vehicle_steps, drops) = (self.ticks, self.vehicle_steps, self.observations.drops());
-        self.session.report(|health| {
+        self.membership.report(|health| {
             health.state = State::Running as u32;
             health.ticks = ticks;
             health.episode = header.episode;
@@ -275,7 +276,7 @@ impl Daemon {
         if waited == Wait::Stopped {
             return Ok(());
         }
-        self.session.report(|health| health.state = State::Done as u32);
+        self.membership.report(|health| health.state = State::Done as u32);
         Ok(())
     }
 
@@ -285,7 +286,7 @@ impl Daemon {
         let part = SensorDaemonReport {
             observation_hash: self.digest.hex(),
             observations: self.vehicle_steps,
-            ticks: self.ticks - self.session.run.first_tick(),
+            ticks: self.ticks - self.membership.run.first_tick(),
             cavs_max: self.cavs_max,
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
             drops: self.observations.drops(),
@@ -294,7 +295,7 @@ impl Daemon {
             journal_mib: self.consumer.as_ref().map_or(0, Delivery::journal_mib),
             handovers: self.consumer.as_ref().map(Delivery::handovers).unwrap_or_default(),
         };
-        self.session.write_part(&part)
+        self.membership.write_part(&part)
     }
 }
 

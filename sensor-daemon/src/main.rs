@@ -2,8 +2,8 @@
 
 use std::process::ExitCode;
 
-use ipc_schema::{process::Process, session};
+use ipc_schema::{membership, process::Process};
 
 fn main() -> ExitCode {
-    session::main(Process::SensorDaemon, sensor_daemon::daemon::run)
+    membership::main(Process::SensorDaemon, sensor_daemon::daemon::run)
 }

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use ipc_schema::{
     failure::{Failure, FailureKind},
     header::MessageHeader,
+    membership::RunMembership,
     run::MapInfo,
     sensor::{SENSORS, SceneUse},
     services::Channel,
-    session::Session,
 };
 use sim_core::{
     geodesy::{GeodesyError, NetPosition, Projection},
@@ -31,22 +31,22 @@ impl Surroundings {
     ///
     /// # Errors
     /// A scene, a ray table or a mesh cannot be read, a map's projection is not understood, or a port fails.
-    pub fn open(session: &mut Session, sensing: &mut Sensing) -> Result<Self, Failure> {
-        let uses = SENSORS.map(|spec| (spec.scene)(&session.run.config));
+    pub fn open(membership: &mut RunMembership, sensing: &mut Sensing) -> Result<Self, Failure> {
+        let uses = SENSORS.map(|spec| (spec.scene)(&membership.run.config));
         if uses.iter().all(|scene| *scene == SceneUse::Unused) {
             return Ok(Self { lidars: None });
         }
-        let scenes = Scene::of_every_map(&session.run)?;
+        let scenes = Scene::of_every_map(&membership.run)?;
         if uses.contains(&SceneUse::Sky) {
-            for (index, (map, scene)) in session.run.every_map().iter().zip(&scenes).enumerate() {
-                let sky = sky_over(&map.info, scene, session.run.seed())?;
+            for (index, (map, scene)) in membership.run.every_map().iter().zip(&scenes).enumerate() {
+                let sky = sky_over(&map.info, scene, membership.run.seed())?;
                 sensing.set_sky_of(index, Box::new(sky));
             }
         }
         let mut lidars = None;
         if uses.contains(&SceneUse::Rays) {
-            let publisher = session.publisher(Channel::Pointcloud)?;
-            lidars = Some(LidarScanning::new(&session.run.config, &scenes, publisher)?);
+            let publisher = membership.publisher(Channel::Pointcloud)?;
+            lidars = Some(LidarScanning::new(&membership.run.config, &scenes, publisher)?);
         }
         Ok(Self { lidars })
     }

@@ -2,8 +2,8 @@
 
 use std::process::ExitCode;
 
-use ipc_schema::{process::Process, session};
+use ipc_schema::{membership, process::Process};
 
 fn main() -> ExitCode {
-    session::main(Process::SimCore, sim_core::process::run)
+    membership::main(Process::SimCore, sim_core::process::run)
 }

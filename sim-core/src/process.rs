@@ -7,10 +7,10 @@ use ipc_schema::{
     board::State,
     failure::{Failure, FailureKind},
     header::{LAST_OF_RUN, MessageHeader},
+    membership::{RunMembership, Wait},
     ports::{BoardReader, Message, PortError, Publisher, Subscriber, Waker},
     process::Process,
     services::Channel,
-    session::{Session, Wait},
     traffic::{Kind, ROUTES, TrafficMetaLayout, TrafficState},
     world::WorldLayout,
 };
@@ -44,17 +44,17 @@ struct CoreReport {
 /// # Errors
 /// The scene's files or obstacles are wrong, a port fails, or what SUMO sent cannot be mirrored.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
-    let mut session = Session::join(run_file, Process::SimCore)?;
-    let metas = session.subscriber(Channel::TrafficMeta)?;
-    let traffic = session.subscriber(Channel::Traffic)?;
-    let mut core = CoreProcess::open(session, metas)?;
-    while let Some(frame) = core.session.next(&traffic)? {
+    let mut membership = RunMembership::join(run_file, Process::SimCore)?;
+    let metas = membership.subscriber(Channel::TrafficMeta)?;
+    let traffic = membership.subscriber(Channel::Traffic)?;
+    let mut core = CoreProcess::open(membership, metas)?;
+    while let Some(frame) = core.membership.next(&traffic)? {
         let header = *frame.header();
         if core.process_step(&frame)? == Wait::Stopped {
             break;
         }
         drop(frame);
-        core.session.consumed(header.tick + 1);
+        core.membership.consumed(header.tick + 1);
         if header.has(LAST_OF_RUN) {
             return core.leave();
         }
@@ -63,7 +63,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
 }
 
 struct CoreProcess {
-    session: Session,
+    membership: RunMembership,
     metas: Subscriber,
     /// `traffic-meta` messages applied.
     meta_messages: u64,
@@ -82,25 +82,25 @@ struct CoreProcess {
 }
 
 impl CoreProcess {
-    fn open(mut session: Session, metas: Subscriber) -> Result<Self, Failure> {
-        let world = session.publisher(Channel::World)?;
-        let consumer = session.board_of(Process::SensorDaemon)?;
-        let consumer_wake = session.waker(Process::SensorDaemon)?;
-        let scenes = Scene::of_every_map(&session.run)?;
-        let contacts = ContactReporter::open(&session, &scenes)?;
+    fn open(mut membership: RunMembership, metas: Subscriber) -> Result<Self, Failure> {
+        let world = membership.publisher(Channel::World)?;
+        let consumer = membership.board_of(Process::SensorDaemon)?;
+        let consumer_wake = membership.waker(Process::SensorDaemon)?;
+        let scenes = Scene::of_every_map(&membership.run)?;
+        let contacts = ContactReporter::open(&membership, &scenes)?;
         // Viewers see the run's own map, and heroes have no other.
         let scene = scenes.first().cloned().unwrap_or_default();
-        draw_chart(&session, &scene)?;
-        let actions = match session.run.config.drives() {
-            true => Some(HeroPorts::open(&mut session, scene)?),
+        draw_chart(&membership, &scene)?;
+        let actions = match membership.run.config.drives() {
+            true => Some(HeroPorts::open(&mut membership, scene)?),
             false => None,
         };
-        session.attach();
-        let mirror = Mirror::new(MirrorSettings::of_run(&session.run))
+        membership.attach();
+        let mirror = Mirror::new(MirrorSettings::of_run(&membership.run))
             .map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
-        let ticks = session.run.first_tick();
+        let ticks = membership.run.first_tick();
         Ok(Self {
-            session,
+            membership,
             metas,
             meta_messages: 0,
             mirror,
@@ -117,7 +117,7 @@ impl CoreProcess {
 
     /// One SUMO step: its events, the states of all road users, and the ticks that lead there.
     fn process_step(&mut self, frame: &Message) -> Result<Wait, Failure> {
-        let ticks_per_step = self.session.run.ticks_per_traffic_step();
+        let ticks_per_step = self.membership.run.ticks_per_traffic_step();
         let header = *frame.header();
         // The frame carries the number of the last of its ticks.
         let first_tick = (header.tick + 1).saturating_sub(ticks_per_step);
@@ -134,14 +134,14 @@ impl CoreProcess {
         self.mirror.accept(&header, states).map_err(unmirrored)?;
         for tick in 0..u32::try_from(ticks_per_step).unwrap_or(u32::MAX) {
             if self
-                .session
+                .membership
                 .wait_for_credit(&self.consumer, first_tick + u64::from(tick))?
                 == Wait::Stopped
             {
                 return Ok(Wait::Stopped);
             }
             if let Some(actions) = &mut self.actions
-                && actions.apply_actions(&self.session, &header, &mut self.mirror)? == Wait::Stopped
+                && actions.apply_actions(&self.membership, &header, &mut self.mirror)? == Wait::Stopped
             {
                 return Ok(Wait::Stopped);
             }
@@ -153,7 +153,7 @@ impl CoreProcess {
     /// Applies announcements up to the one that belongs to the current frame; they were sent before it.
     fn apply_metas(&mut self, sequence: u64) -> Result<(), Failure> {
         while self.meta_messages < sequence {
-            let Some(message) = self.session.next(&self.metas)? else {
+            let Some(message) = self.membership.next(&self.metas)? else {
                 return Ok(());
             };
             self.meta_messages += 1;
@@ -208,7 +208,7 @@ impl CoreProcess {
             Some(_) => states.iter().filter(|state| state.kind == Kind::Hero as u32).count(),
             None => 0,
         };
-        let ours = self.session.header();
+        let ours = self.membership.header();
         let header = MessageHeader {
             run_id: ours.run_id,
             incarnation: ours.incarnation,
@@ -247,7 +247,7 @@ impl CoreProcess {
         let cavs = states.iter().filter(|state| state.kind == Kind::Cav as u32).count();
         let (ticks, vehicle_steps, drops) = (self.ticks, self.vehicle_steps, self.world.drops());
         let resynchronisations = self.mirror.resynchronisations();
-        self.session.report(|health| {
+        self.membership.report(|health| {
             health.state = State::Running as u32;
             health.ticks = ticks;
             health.episode = header.episode;
@@ -263,15 +263,15 @@ impl CoreProcess {
     /// Leaves once everything sent has been consumed.
     fn leave(mut self) -> Result<(), Failure> {
         self.write_report()?;
-        if self.session.wait_until_consumed(&self.consumer, self.ticks)? == Wait::Ready {
-            self.session.report(|health| health.state = State::Done as u32);
+        if self.membership.wait_until_consumed(&self.consumer, self.ticks)? == Wait::Ready {
+            self.membership.report(|health| health.state = State::Done as u32);
         }
         Ok(())
     }
 
     fn write_report(&mut self) -> Result<(), Failure> {
         let collisions = self.contacts.as_mut().map(ContactReporter::finish).transpose()?;
-        self.session.write_part(&CoreReport {
+        self.membership.write_part(&CoreReport {
             tracking: self.mirror.tracking().summary(),
             resynchronisations: self.mirror.resynchronisations(),
             vehicle_steps: self.vehicle_steps,
@@ -285,12 +285,12 @@ impl CoreProcess {
 }
 
 /// Writes the chart of the scene for viewers, if the run allows viewers.
-fn draw_chart(session: &Session, scene: &Scene) -> Result<(), Failure> {
-    if !session.run.config.fanout.enabled {
+fn draw_chart(membership: &RunMembership, scene: &Scene) -> Result<(), Failure> {
+    if !membership.run.config.fanout.enabled {
         return Ok(());
     }
-    let path = session.run.chart_path();
-    Chart::of_run(&session.run, scene)?.write(&path).map_err(|error| {
+    let path = membership.run.chart_path();
+    Chart::of_run(&membership.run, scene)?.write(&path).map_err(|error| {
         Failure::new(FailureKind::Run, format!("cannot write {}: {error}", path.display()))
             .with_help("check free space and permissions of the run directory")
     })

@@ -15,11 +15,11 @@ use ipc_schema::{
     event::{Collision, Struck},
     failure::{Failure, FailureKind},
     header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader, map_flags},
+    membership::RunMembership,
     ports::{Message, Publisher, Subscriber},
     process::Process,
     run::{MapInfo, Mode, RunFile, RunMap, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
-    session::Session,
     traffic::{Kind, MetaEvent, SignalMeta, TrafficMetaLayout, TrafficState, VehicleMeta, id_hash},
     world::{COLLIDED, VehicleState, WorldLayout},
 };
@@ -103,13 +103,13 @@ impl Run {
     }
 
     /// This test in the role of another process.
-    fn join(&self, process: Process) -> Session {
+    fn join(&self, process: Process) -> RunMembership {
         let parent = rustix::process::getppid().map_or(0, |p| p.as_raw_nonzero().get());
         let file = RunFile {
             supervisor_pid: parent,
             ..self.file.clone()
         };
-        Session::join_with(file, process, 0, Arc::new(AtomicBool::new(false))).unwrap()
+        RunMembership::join_with(file, process, 0, Arc::new(AtomicBool::new(false))).unwrap()
     }
 }
 

@@ -224,7 +224,7 @@ impl RunningProcess {
         let mut command = (row.command)(install, run)?;
         command
             .arg(run_file)
-            .env(ipc_schema::session::INCARNATION, incarnation.to_string())
+            .env(ipc_schema::membership::INCARNATION, incarnation.to_string())
             .stdin(Stdio::null())
             .stdout(log)
             .stderr(errors)

@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 
-use ipc_schema::{process::Process, session};
+use ipc_schema::{membership, process::Process};
 
 /// Overrides `malloc` and `new` for SUMO too. SUMO's step visits millions of small objects: with mimalloc they lie closer together,
 /// in larger pages, and a step takes a quarter less time than with the system's allocator.
@@ -10,5 +10,5 @@ use ipc_schema::{process::Process, session};
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() -> ExitCode {
-    session::main(Process::TrafficBridge, traffic_bridge::bridge::run)
+    membership::main(Process::TrafficBridge, traffic_bridge::bridge::run)
 }

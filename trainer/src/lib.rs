@@ -11,6 +11,7 @@ use ipc_schema::{
     board::{State, TrainingStatus},
     clock::monotonic_ns,
     header::{self, MessageHeader},
+    membership::{self, MembershipError, RunMembership},
     metric::{self, METRICS},
     observation::ObservationLayout,
     ports::{BoardReader, Message, Publisher, Subscriber, Waker},
@@ -19,7 +20,6 @@ use ipc_schema::{
     run::RunFile,
     sensor::SensorKind,
     services::Channel as Service,
-    session::{self, Session, SessionError},
 };
 use pyo3::{
     exceptions::{PyKeyError, PyRuntimeError, PyValueError},
@@ -47,12 +47,12 @@ fn failed(error: &dyn std::error::Error) -> PyErr {
     )
 }
 
-fn session_failed(error: SessionError) -> PyErr {
+fn membership_failed(error: MembershipError) -> PyErr {
     failed(&error)
 }
 
 struct Attached {
-    session: Session,
+    membership: RunMembership,
     observations: Subscriber,
     /// Opened when first asked for.
     scans: Option<Subscriber>,
@@ -91,19 +91,19 @@ impl Attachment {
         let run_json = std::fs::read_to_string(run_file).map_err(|error| failed(&error))?;
         let stop = Arc::new(AtomicBool::new(false));
         let join = if outside {
-            Session::join_from_outside
+            RunMembership::join_from_outside
         } else {
-            Session::join_with
+            RunMembership::join_with
         };
-        let session = join(run, Process::Trainer, 0, stop).map_err(session_failed)?;
-        Self::attach(session, run_json, first_tick, outside)
+        let membership = join(run, Process::Trainer, 0, stop).map_err(membership_failed)?;
+        Self::attach(membership, run_json, first_tick, outside)
     }
 
     /// The place of this trainer in another environment of the run; producers there may send from now on, beginning with `first_tick`.
     fn in_environment(&self, env_index: u32, first_tick: u64) -> PyResult<Self> {
         let inner = self.lock()?;
-        let session = inner.session.in_environment(env_index).map_err(session_failed)?;
-        Self::attach(session, self.run_json.clone(), first_tick, inner.outside)
+        let membership = inner.membership.in_environment(env_index).map_err(membership_failed)?;
+        Self::attach(membership, self.run_json.clone(), first_tick, inner.outside)
     }
 
     /// Waits until something happens in any environment, at most `timeout_s` seconds. Look for blocks before, and again after.
@@ -141,7 +141,12 @@ impl Attachment {
     fn scans(&self, py: Python<'_>) -> PyResult<Vec<PointCloud>> {
         let mut inner = self.lock()?;
         if inner.scans.is_none() {
-            inner.scans = Some(inner.session.subscriber(Service::Pointcloud).map_err(session_failed)?);
+            inner.scans = Some(
+                inner
+                    .membership
+                    .subscriber(Service::Pointcloud)
+                    .map_err(membership_failed)?,
+            );
         }
         let mut scans = Vec::new();
         while let Some(subscriber) = &inner.scans
@@ -156,8 +161,8 @@ impl Attachment {
     fn lag_ticks(&self) -> PyResult<u64> {
         let mut inner = self.lock()?;
         if inner.traffic.is_none() {
-            let board = inner.session.board_of(Process::TrafficBridge);
-            inner.traffic = Some(board.map_err(session_failed)?);
+            let board = inner.membership.board_of(Process::TrafficBridge);
+            inner.traffic = Some(board.map_err(membership_failed)?);
         }
         let ahead = inner.traffic.as_ref().map_or(0, |board| board.health().ticks);
         Ok(ahead.saturating_sub(inner.consumed_ticks))
@@ -166,7 +171,7 @@ impl Attachment {
     /// How often this trainer has been replaced before.
     #[getter]
     fn incarnation(&self) -> u32 {
-        session::incarnation()
+        membership::incarnation()
     }
 
     /// Messages of other runs and of replaced incarnations that were refused.
@@ -185,8 +190,8 @@ impl Attachment {
     fn consumed(&self, tick: u64) -> PyResult<()> {
         let mut inner = self.lock()?;
         inner.consumed_ticks = tick + 1;
-        inner.session.consumed(tick + 1);
-        inner.session.report(|health| {
+        inner.membership.consumed(tick + 1);
+        inner.membership.report(|health| {
             health.ticks = tick + 1;
             health.state = State::Running as u32;
         });
@@ -195,7 +200,7 @@ impl Attachment {
 
     /// Says that all ticks up to and including `tick` are in a checkpoint that has been renamed into place.
     fn committed(&self, tick: u64) -> PyResult<()> {
-        self.lock()?.session.committed(tick + 1);
+        self.lock()?.membership.committed(tick + 1);
         Ok(())
     }
 
@@ -203,14 +208,14 @@ impl Attachment {
     /// `traffic-bridge` waits for that before each lesson.
     fn decided(&self, lessons: u64, since: u64, stage: u32) -> PyResult<()> {
         let mut inner = self.lock()?;
-        inner.session.decided(lessons, since, stage);
+        inner.membership.decided(lessons, since, stage);
         inner.taught.wake();
         Ok(())
     }
 
     /// Says that all work is done.
     fn done(&self) -> PyResult<()> {
-        self.lock()?.session.done();
+        self.lock()?.membership.done();
         Ok(())
     }
 
@@ -233,7 +238,7 @@ impl Attachment {
             )));
         }
         let inner = self.lock()?;
-        let answered = answer(inner.session.header(), &block.header);
+        let answered = answer(inner.membership.header(), &block.header);
         let header = MessageHeader {
             columns,
             sequence: policy_version,
@@ -304,24 +309,24 @@ impl Attachment {
             },
             metrics: values,
         };
-        inner.session.board().set_training(inner.training);
+        inner.membership.board().set_training(inner.training);
         Ok(())
     }
 }
 
 impl Attachment {
     /// Opens the ports of a place in a run.
-    fn attach(mut session: Session, run_json: String, first_tick: u64, outside: bool) -> PyResult<Self> {
-        let observations = session.subscriber(Service::Observation).map_err(session_failed)?;
-        let predictions = session.publisher(Service::Prediction).map_err(session_failed)?;
-        let driven = match session.run.config.drives() {
-            true => Some(session.waker(Process::SimCore).map_err(session_failed)?),
+    fn attach(mut membership: RunMembership, run_json: String, first_tick: u64, outside: bool) -> PyResult<Self> {
+        let observations = membership.subscriber(Service::Observation).map_err(membership_failed)?;
+        let predictions = membership.publisher(Service::Prediction).map_err(membership_failed)?;
+        let driven = match membership.run.config.drives() {
+            true => Some(membership.waker(Process::SimCore).map_err(membership_failed)?),
             false => None,
         };
-        let taught = session.waker(Process::TrafficBridge).map_err(session_failed)?;
-        session.attach_from(first_tick);
+        let taught = membership.waker(Process::TrafficBridge).map_err(membership_failed)?;
+        membership.attach_from(first_tick);
         let attached = Attached {
-            session,
+            membership,
             observations,
             scans: None,
             predictions,
@@ -347,11 +352,11 @@ impl Attachment {
 
     fn wait(&self, timeout: Duration) -> PyResult<()> {
         let inner = self.lock()?;
-        if inner.outside && !inner.session.supervisor_lives() {
-            let pid = inner.session.run.supervisor_pid;
-            return Err(session_failed(SessionError::Orphaned { pid }));
+        if inner.outside && !inner.membership.supervisor_lives() {
+            let pid = inner.membership.run.supervisor_pid;
+            return Err(membership_failed(MembershipError::Orphaned { pid }));
         }
-        inner.session.wait(timeout).map_err(session_failed)
+        inner.membership.wait(timeout).map_err(membership_failed)
     }
 
     /// Looks until something is there, the deadline has passed, or it is time to look at Python's signals.

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use ipc_schema::{board::State, ports::PortError, services::Channel, session::Session};
+use ipc_schema::{board::State, membership::RunMembership, ports::PortError, services::Channel};
 
 use crate::{
     error::FanoutError,
@@ -16,7 +16,7 @@ const LAST_TICK_LIMIT: Duration = Duration::from_millis(500);
 
 /// Publishes one environment.
 pub struct EnvironmentRelay {
-    membership: Session,
+    membership: RunMembership,
     started: Instant,
     ticks: TickTopics,
     slow: SlowTopics,
@@ -36,7 +36,7 @@ impl EnvironmentRelay {
     ///
     /// # Errors
     /// A service of the run is missing, or zenoh refuses.
-    pub fn open(mut membership: Session, env_index: u32, zenoh: &zenoh::Session) -> Result<Self, FanoutError> {
+    pub fn open(mut membership: RunMembership, env_index: u32, zenoh: &zenoh::Session) -> Result<Self, FanoutError> {
         let run = &membership.run;
         let keys = RunKeys::new(&run.name, env_index);
         let publisher = EnvironmentPublisher::open(zenoh.clone(), &keys, &status::map_json(run, env_index)?)?;

@@ -10,7 +10,7 @@ pub mod scans;
 pub mod slow;
 pub mod ticks;
 
-use ipc_schema::{services::Channel, session::Session};
+use ipc_schema::{membership::RunMembership, services::Channel};
 
 use crate::{
     error::FanoutError,
@@ -31,10 +31,10 @@ impl RunRelay {
     ///
     /// # Errors
     /// A service of the run is missing, or the endpoint cannot be listened on.
-    pub fn open(membership: Session) -> Result<Self, FanoutError> {
+    pub fn open(membership: RunMembership) -> Result<Self, FanoutError> {
         let zenoh = endpoint::listen(&membership.run.config.fanout)?;
         let poll_interval = PollInterval::new(Channel::World.queue_length(&membership.run));
-        let others: Vec<Session> = (1..membership.run.config.run.envs)
+        let others: Vec<RunMembership> = (1..membership.run.config.run.envs)
             .map(|env_index| membership.in_environment(env_index))
             .collect::<Result<_, _>>()?;
         let environments = std::iter::once(membership)

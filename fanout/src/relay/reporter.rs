@@ -5,10 +5,10 @@ use std::time::Duration;
 use ipc_schema::{
     board::State,
     header::EVALUATION,
+    membership::{MembershipError, RunMembership},
     ports::BoardReader,
     process::Process,
     run::RunFile,
-    session::{Session, SessionError},
 };
 
 use crate::{
@@ -34,11 +34,11 @@ impl StatusReporter {
     ///
     /// # Errors
     /// A board cannot be opened.
-    pub fn open(membership: &Session, env_index: u32) -> Result<Self, SessionError> {
+    pub fn open(membership: &RunMembership, env_index: u32) -> Result<Self, MembershipError> {
         let boards = Process::ALL
             .into_iter()
             .map(|process| Ok((process, membership.board_of(process)?)))
-            .collect::<Result<_, SessionError>>()?;
+            .collect::<Result<_, MembershipError>>()?;
         Ok(Self {
             env_index,
             boards,

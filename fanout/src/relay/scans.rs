@@ -4,10 +4,10 @@ use std::{collections::BTreeMap, time::Duration};
 
 use bytemuck::pod_read_unaligned;
 use ipc_schema::{
+    membership::{MembershipError, RunMembership},
     pointcloud::Scan,
     ports::Message,
     services::Channel,
-    session::{Session, SessionError},
 };
 use zenoh::bytes::ZBytes;
 
@@ -49,7 +49,7 @@ impl ScanTopics {
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn open(membership: &mut Session) -> Result<Option<Self>, SessionError> {
+    pub fn open(membership: &mut RunMembership) -> Result<Option<Self>, MembershipError> {
         let rate_hz = membership.run.config.fanout.pointcloud_hz;
         if membership.run.config.lidar.vehicles == 0 || rate_hz <= 0.0 {
             return Ok(None);

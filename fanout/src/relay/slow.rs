@@ -4,9 +4,9 @@ use std::{collections::VecDeque, time::Duration};
 
 use ipc_schema::{
     block::BlockError,
+    membership::{MembershipError, RunMembership},
     ports::PortError,
     services::Channel,
-    session::{Session, SessionError},
     traffic::{SignalMeta, VehicleMeta},
 };
 
@@ -61,7 +61,7 @@ impl SlowTopics {
     ///
     /// # Errors
     /// A service cannot be opened.
-    pub fn open(membership: &mut Session) -> Result<Self, SessionError> {
+    pub fn open(membership: &mut RunMembership) -> Result<Self, MembershipError> {
         let settings = membership.run.config.fanout.clone();
         Ok(Self {
             directory: RoadUserDirectory::default(),

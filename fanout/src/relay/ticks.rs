@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use ipc_schema::{
     header::MessageHeader,
+    membership::{MembershipError, RunMembership},
     ports::PortError,
     services::Channel,
-    session::{Session, SessionError},
 };
 
 use crate::{
@@ -54,7 +54,7 @@ impl TickTopics {
     ///
     /// # Errors
     /// A service cannot be opened.
-    pub fn open(membership: &mut Session) -> Result<Self, SessionError> {
+    pub fn open(membership: &mut RunMembership) -> Result<Self, MembershipError> {
         let settings = &membership.run.config.fanout;
         let rates_hz = [settings.world_hz, settings.observation_hz, settings.prediction_hz];
         let streams = TICK_CHANNELS
@@ -64,7 +64,7 @@ impl TickTopics {
                 let (feed, budget) = (ChannelFeed::open(membership, channel)?, RateBudget::new(rate_hz));
                 Ok(TickStream { topic, feed, budget })
             })
-            .collect::<Result<_, SessionError>>()?;
+            .collect::<Result<_, MembershipError>>()?;
         Ok(Self {
             streams,
             newest: MessageHeader::default(),

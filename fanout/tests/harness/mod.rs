@@ -16,6 +16,7 @@ use ipc_schema::{
     SCHEMA_VERSION,
     block::view_mut,
     header::MessageHeader,
+    membership::RunMembership,
     observation::ObservationLayout,
     pointcloud::{PointcloudLayout, Scan},
     ports::Publisher,
@@ -23,7 +24,6 @@ use ipc_schema::{
     process::Process,
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
-    session::Session,
     traffic::{SignalMeta, TrafficMetaLayout, VehicleMeta, id_hash},
     world::{VehicleState, WorldLayout},
 };
@@ -121,7 +121,7 @@ impl Run {
     pub fn start_incarnation(&self, incarnation: u32) -> Fanout {
         let child = Command::new(env!("CARGO_BIN_EXE_fanout"))
             .arg(&self.path)
-            .env(ipc_schema::session::INCARNATION, incarnation.to_string())
+            .env(ipc_schema::membership::INCARNATION, incarnation.to_string())
             .stderr(Stdio::inherit())
             .spawn()
             .unwrap();
@@ -129,13 +129,13 @@ impl Run {
     }
 
     /// Joins as another process of the run, within this test's process.
-    pub fn join(&self, process: Process) -> Session {
+    pub fn join(&self, process: Process) -> RunMembership {
         let parent = rustix::process::getppid().map_or(0, |p| p.as_raw_nonzero().get());
         let file = RunFile {
             supervisor_pid: parent,
             ..self.file.clone()
         };
-        Session::join_with(file, process, 0, Arc::new(AtomicBool::new(false))).unwrap()
+        RunMembership::join_with(file, process, 0, Arc::new(AtomicBool::new(false))).unwrap()
     }
 
     pub fn key(&self, topic: Topic) -> String {
@@ -225,14 +225,14 @@ impl Drop for Fanout {
     }
 }
 
-pub fn header(session: &Session, tick: u64, flags: u32, count: usize, columns: u32) -> MessageHeader {
+pub fn header(membership: &RunMembership, tick: u64, flags: u32, count: usize, columns: u32) -> MessageHeader {
     MessageHeader {
         tick,
         sim_time_ns: tick * 100_000_000,
         flags,
         count: u32::try_from(count).unwrap(),
         columns,
-        ..session.header()
+        ..membership.header()
     }
 }
 
@@ -246,10 +246,10 @@ pub fn states(tick: u64, count: usize) -> Vec<VehicleState> {
         .collect()
 }
 
-pub fn send_world(session: &Session, publisher: &Publisher, tick: u64, flags: u32, count: usize) {
+pub fn send_world(membership: &RunMembership, publisher: &Publisher, tick: u64, flags: u32, count: usize) {
     let layout = WorldLayout::new(count, SUB_STEPS as usize);
     let mut draft = publisher
-        .loan(header(session, tick, flags, count, SUB_STEPS), layout.len)
+        .loan(header(membership, tick, flags, count, SUB_STEPS), layout.len)
         .unwrap();
     let rows: &mut [VehicleState] = view_mut(draft.payload_mut(), layout.states).unwrap();
     rows.copy_from_slice(&states(tick, count));
@@ -273,16 +273,16 @@ pub fn send(publisher: &Publisher, header: MessageHeader, payload: &[u8]) {
     draft.send().unwrap();
 }
 
-pub fn send_observation(session: &Session, publisher: &Publisher, tick: u64, flags: u32, count: usize) {
+pub fn send_observation(membership: &RunMembership, publisher: &Publisher, tick: u64, flags: u32, count: usize) {
     send(
         publisher,
-        header(session, tick, flags, count, FIELDS),
+        header(membership, tick, flags, count, FIELDS),
         &observation(tick, count),
     );
 }
 
-pub fn send_prediction(session: &Session, publisher: &Publisher, tick: u64, count: usize) {
-    let header = header(session, tick, 0, count, 2);
+pub fn send_prediction(membership: &RunMembership, publisher: &Publisher, tick: u64, count: usize) {
+    let header = header(membership, tick, 0, count, 2);
     let layout = PredictionLayout::of(&header);
     let mut payload = vec![0; layout.len];
     let rows = vec![[tick as f32, 0.5]; count];
@@ -291,9 +291,9 @@ pub fn send_prediction(session: &Session, publisher: &Publisher, tick: u64, coun
 }
 
 /// Sends a census: a road user for each of `ids`, by index, and a traffic light in the state of each letter.
-pub fn send_census(session: &Session, publisher: &Publisher, tick: u64, ids: &[&str], letters: &str) {
+pub fn send_census(membership: &RunMembership, publisher: &Publisher, tick: u64, ids: &[&str], letters: &str) {
     let layout = TrafficMetaLayout::new(ids.len(), letters.len());
-    let header = header(session, tick, 0, ids.len(), u32::try_from(letters.len()).unwrap());
+    let header = header(membership, tick, 0, ids.len(), u32::try_from(letters.len()).unwrap());
     let mut draft = publisher.loan(header, layout.len).unwrap();
     let vehicles: &mut [VehicleMeta] = view_mut(draft.payload_mut(), layout.vehicles).unwrap();
     for (index, (meta, id)) in vehicles.iter_mut().zip(ids).enumerate() {
@@ -308,11 +308,17 @@ pub fn send_census(session: &Session, publisher: &Publisher, tick: u64, ids: &[&
 }
 
 /// Sends a scan of `points` points by the vehicle with this id and index.
-pub fn send_scan(session: &Session, publisher: &Publisher, tick: u64, (id, index): (&str, u32), points: usize) {
+pub fn send_scan(
+    membership: &RunMembership,
+    publisher: &Publisher,
+    tick: u64,
+    (id, index): (&str, u32),
+    points: usize,
+) {
     let layout = PointcloudLayout::new(points);
     let header = MessageHeader {
         sequence: index.into(),
-        ..header(session, tick, 0, points, 1)
+        ..header(membership, tick, 0, points, 1)
     };
     let mut draft = publisher.loan(header, layout.len).unwrap();
     let scan = Scan {
@@ -324,10 +330,10 @@ pub fn send_scan(session: &Session, publisher: &Publisher, tick: u64, (id, index
 }
 
 /// Joins as the producer of `channel`, and opens its publisher.
-pub fn publisher(run: &Run, channel: Channel) -> (Session, Publisher) {
-    let session = run.join(channel.producer());
-    let publisher = session.publisher(channel).unwrap();
-    (session, publisher)
+pub fn publisher(run: &Run, channel: Channel) -> (RunMembership, Publisher) {
+    let membership = run.join(channel.producer());
+    let publisher = membership.publisher(channel).unwrap();
+    (membership, publisher)
 }
 
 fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {

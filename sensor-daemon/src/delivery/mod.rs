@@ -8,10 +8,10 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     flow,
     header::MessageHeader,
+    membership::{MembershipError, RunMembership},
     ports::{BoardReader, Publisher, Waker},
     process::Process,
     services::Channel,
-    session::{Session, SessionError},
 };
 
 pub mod digest;
@@ -48,14 +48,14 @@ impl Delivery {
     ///
     /// # Errors
     /// The trainer's board or wake-up cannot be opened.
-    pub fn open(session: &Session) -> Result<Self, SessionError> {
-        let run = &session.run;
+    pub fn open(membership: &RunMembership) -> Result<Self, MembershipError> {
+        let run = &membership.run;
         let limit = run.config.run.journal_mib as usize * MIB;
         let (longest, committed) = (Channel::Observation.max_payload(run), run.committed_ticks());
         let journal = Journal::new(&run.run_dir, limit, longest).beginning_at(committed);
         Ok(Self {
-            board: session.board_of(Process::Trainer)?,
-            waker: session.waker(Process::Trainer)?,
+            board: membership.board_of(Process::Trainer)?,
+            waker: membership.waker(Process::Trainer)?,
             journal,
             // Strict lock-step has one tick under way at a time, also when ticks are sent again.
             window: if run.config.drives() { 1 } else { run.window_ticks() },
@@ -80,11 +80,11 @@ impl Delivery {
 
     /// True if the trainer has received all earlier ticks and has credit for the live one.
     #[must_use]
-    pub fn may_send(&self, session: &Session) -> bool {
+    pub fn may_send(&self, membership: &RunMembership) -> bool {
         let progress = self.board.progress();
         self.incarnation == Some(progress.incarnation)
             && self.next == self.journal.ticks()
-            && flow::has_credit(self.next, &progress, session.run.window_ticks())
+            && flow::has_credit(self.next, &progress, membership.run.window_ticks())
     }
 
     /// True if the live tick may be made and kept until the trainer has credit for it: a planned handover is under way, and the

@@ -12,9 +12,9 @@ use ipc_schema::{
     event::{Collision, Struck},
     failure::{Failure, FailureKind},
     header::MessageHeader,
+    membership::RunMembership,
     ports::Publisher,
     services::Channel,
-    session::Session,
     traffic::{MetaEvent, VehicleMeta},
     world::VehicleState,
 };
@@ -100,12 +100,12 @@ impl ContactReporter {
     ///
     /// # Errors
     /// The service does not exist, or the file cannot be created.
-    pub fn open(session: &Session, scenes: &[Arc<Scene>]) -> Result<Option<Self>, Failure> {
-        if !session.run.config.collision.detect {
+    pub fn open(membership: &RunMembership, scenes: &[Arc<Scene>]) -> Result<Option<Self>, Failure> {
+        if !membership.run.config.collision.detect {
             return Ok(None);
         }
-        let publisher = session.publisher(Channel::Event)?;
-        let directory = session.run.run_dir.join("events");
+        let publisher = membership.publisher(Channel::Event)?;
+        let directory = membership.run.run_dir.join("events");
         let path = directory.join("collisions.jsonl");
         let created = std::fs::create_dir_all(&directory).and_then(|()| File::create(&path));
         let file = created.map_err(|source| WriteError {
@@ -115,7 +115,7 @@ impl ContactReporter {
         Ok(Some(Self {
             detectors: scenes.iter().cloned().map(CollisionDetector::new).collect(),
             publisher,
-            most: (session.run.config.traffic.max_road_users as usize).max(1),
+            most: (membership.run.config.traffic.max_road_users as usize).max(1),
             path,
             lines: BufWriter::new(file),
             episode: None,

@@ -7,11 +7,11 @@ use ipc_schema::{
     ego::EgoPose,
     failure::{Failure, FailureKind},
     header::MessageHeader,
+    membership::{RunMembership, Wait},
     observation::{EMPTY_SLOT, ObservationLayout},
     ports::{Message, PortError, Publisher, Subscriber, Waker},
     process::Process,
     services::Channel,
-    session::{Session, Wait},
     traffic::{Kind, RoutePoint, SignalMeta, VehicleMeta},
     world::{HeroView, VehicleState, WorldLayout},
 };
@@ -39,14 +39,14 @@ impl HeroPorts {
     ///
     /// # Errors
     /// A service cannot be opened.
-    pub fn open(session: &mut Session, scene: Arc<Scene>) -> Result<Self, Failure> {
+    pub fn open(membership: &mut RunMembership, scene: Arc<Scene>) -> Result<Self, Failure> {
         Ok(Self {
             ids: BTreeMap::new(),
-            driving: DrivingTask::new(&session.run.config, scene),
-            predictions: session.subscriber(Channel::Prediction)?,
-            observations: session.subscriber(Channel::Observation)?,
-            poses: session.publisher(Channel::EgoPose)?,
-            bridge_wake: session.waker(Process::TrafficBridge)?,
+            driving: DrivingTask::new(&membership.run.config, scene),
+            predictions: membership.subscriber(Channel::Prediction)?,
+            observations: membership.subscriber(Channel::Observation)?,
+            poses: membership.publisher(Channel::EgoPose)?,
+            bridge_wake: membership.waker(Process::TrafficBridge)?,
         })
     }
 
@@ -77,7 +77,7 @@ impl HeroPorts {
     /// A port fails, or the prediction does not contain actions.
     pub fn apply_actions(
         &mut self,
-        session: &Session,
+        membership: &RunMembership,
         frame: &MessageHeader,
         mirror: &mut Mirror,
     ) -> Result<Wait, Failure> {
@@ -85,10 +85,10 @@ impl HeroPorts {
         let Some(before) = frame.tick.checked_sub(1) else {
             return Ok(Wait::Ready);
         };
-        let Some(answer) = next(session, &self.predictions, Channel::Prediction, before)? else {
+        let Some(answer) = next(membership, &self.predictions, Channel::Prediction, before)? else {
             return Ok(Wait::Stopped);
         };
-        let Some(question) = next(session, &self.observations, Channel::Observation, before)? else {
+        let Some(question) = next(membership, &self.observations, Channel::Observation, before)? else {
             return Ok(Wait::Stopped);
         };
         // Actions of the episode before belong to heroes that ended with it.
@@ -153,9 +153,14 @@ impl HeroPorts {
 }
 
 /// The message of `tick`; skips older ones. `None` once the process is asked to stop.
-fn next(session: &Session, port: &Subscriber, channel: Channel, tick: u64) -> Result<Option<Message>, Failure> {
+fn next(
+    membership: &RunMembership,
+    port: &Subscriber,
+    channel: Channel,
+    tick: u64,
+) -> Result<Option<Message>, Failure> {
     loop {
-        let Some(message) = session.next(port)? else {
+        let Some(message) = membership.next(port)? else {
             return Ok(None);
         };
         let received = message.header().tick;

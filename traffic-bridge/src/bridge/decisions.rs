@@ -11,10 +11,10 @@ use ipc_schema::{
     board::Progress,
     config::StageConfig,
     failure::{Failure, FailureKind},
+    membership::{RunMembership, Wait},
     ports::BoardReader,
     process::Process,
     run::{CURRICULUM_LOG, FORMER_CURRICULUM_LOG, Mode},
-    session::{Session, Wait},
 };
 use serde::{Deserialize, Serialize};
 
@@ -49,7 +49,7 @@ impl StageDecisions {
     ///
     /// # Errors
     /// A log cannot be read or written, or the trainer's board cannot be opened.
-    pub(crate) fn open(membership: &Session) -> Result<Self, Failure> {
+    pub(crate) fn open(membership: &RunMembership) -> Result<Self, Failure> {
         let run = &membership.run;
         let curriculum = &run.config.curriculum;
         let path = run.run_dir.join(CURRICULUM_LOG);
@@ -86,7 +86,12 @@ impl StageDecisions {
     ///
     /// # Errors
     /// The wake-up is broken, or the log cannot be written.
-    pub(crate) fn stage_of(&mut self, membership: &Session, lesson: u64, tick: u64) -> Result<Option<usize>, Failure> {
+    pub(crate) fn stage_of(
+        &mut self,
+        membership: &RunMembership,
+        lesson: u64,
+        tick: u64,
+    ) -> Result<Option<usize>, Failure> {
         let stage = match &self.source {
             // The trainer starts only after SUMO has accepted its input, so the first lesson cannot wait for it.
             StageSource::Trainer(_) if lesson == 0 => 0,

@@ -4,12 +4,12 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     flow,
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    membership::Wait,
     ports::PortError,
     run::{RunFile, Source},
     schedule::Episode,
     sensor::fitted_sensors,
     services::Channel,
-    session::Wait,
 };
 
 use super::{Bridge, commands::CommandContext};

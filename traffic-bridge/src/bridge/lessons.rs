@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use ipc_schema::{
     failure::Failure,
     header::{LAST_OF_EPISODE, LAST_OF_LESSON, map_flags, stage_flags},
+    membership::Wait,
     schedule::{CurriculumPlan, DueWork, Episode, Lesson},
-    session::Wait,
 };
 
 use super::{

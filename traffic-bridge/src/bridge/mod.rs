@@ -13,12 +13,12 @@ use std::path::Path;
 use ipc_schema::{
     board::State,
     failure::Failure,
+    membership::{RunMembership, Wait},
     ports::{BoardReader, ControlServer, Subscriber},
     process::Process,
     run::RunMap,
     schedule::Episode,
     services::Channel,
-    session::{Session as Membership, Wait},
     traffic::MetaEvent,
 };
 
@@ -33,7 +33,7 @@ use pacing::Pacing;
 /// # Errors
 /// The user's files are wrong, the shared memory is gone, or SUMO fails.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
-    let mut membership = Membership::join(run_file, Process::TrafficBridge)?;
+    let mut membership = RunMembership::join(run_file, Process::TrafficBridge)?;
     let episodes = membership.run.schedule();
     let poses = match membership.run.config.drives() {
         true => Some(membership.subscriber(Channel::EgoPose)?),
@@ -52,7 +52,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
 
 /// This process's place in the run: what it reads, what it publishes, and how far it has come.
 struct Bridge {
-    membership: Membership,
+    membership: RunMembership,
     outbox: Outbox,
     totals: BridgeTotals,
     /// Progress of `sim-core`, which returns credit.
@@ -115,7 +115,7 @@ struct BridgeReport<'a> {
 }
 
 impl Bridge {
-    fn open(membership: Membership, poses: Option<Subscriber>) -> Result<Self, Failure> {
+    fn open(membership: RunMembership, poses: Option<Subscriber>) -> Result<Self, Failure> {
         let outbox = Outbox::open(&membership)?;
         let maps = membership.run.every_map();
         let totals = BridgeTotals {

@@ -5,10 +5,10 @@ use ipc_schema::{
     control::SensorSwitch,
     failure::{Failure, FailureKind},
     header::MessageHeader,
+    membership::RunMembership,
     ports::{PortError, Publisher, Waker},
     process::Process,
     services::Channel,
-    session::Session as Membership,
     traffic::{EVENTS_PER_MESSAGE, ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout},
 };
 
@@ -30,7 +30,7 @@ pub(super) struct Outbox {
 }
 
 impl Outbox {
-    pub(super) fn open(membership: &Membership) -> Result<Self, Failure> {
+    pub(super) fn open(membership: &RunMembership) -> Result<Self, Failure> {
         let census = match membership.run.config.fanout.enabled {
             true => Some((membership.publisher(Channel::Census)?, Census::default())),
             false => None,

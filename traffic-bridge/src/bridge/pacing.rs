@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use ipc_schema::session::{Session as Membership, SessionError, Wait};
+use ipc_schema::membership::{MembershipError, RunMembership, Wait};
 
 /// Longest time between two checks of the stop flag.
 const LOOK: Duration = Duration::from_millis(50);
@@ -26,7 +26,7 @@ impl Pacing {
     }
 
     /// Waits until the next step of `step_s` simulated seconds is due.
-    pub(crate) fn wait(&mut self, membership: &Membership, step_s: f64) -> Result<Wait, SessionError> {
+    pub(crate) fn wait(&mut self, membership: &RunMembership, step_s: f64) -> Result<Wait, MembershipError> {
         if self.factor <= 0.0 {
             return Ok(Wait::Ready);
         }

@@ -16,11 +16,11 @@ use ipc_schema::{
     board::State,
     failure::{Failure, FailureKind},
     header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    membership::RunMembership,
     ports::{Message, Subscriber},
     process::Process,
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
-    session::Session,
     traffic::{Kind, SIGNALS_PER_MESSAGE, SignalMeta, TrafficMetaLayout, TrafficState, VehicleMeta},
 };
 
@@ -67,17 +67,18 @@ impl Run {
         Running(command.unwrap())
     }
 
-    fn sim_core(&self) -> (Session, Subscriber, Subscriber) {
+    fn sim_core(&self) -> (RunMembership, Subscriber, Subscriber) {
         let parent = rustix::process::getppid().map_or(0, |p| p.as_raw_nonzero().get());
         let file = RunFile {
             supervisor_pid: parent,
             ..self.file.clone()
         };
-        let mut session = Session::join_with(file, Process::SimCore, 0, Arc::new(AtomicBool::new(false))).unwrap();
-        let traffic = session.subscriber(Channel::Traffic).unwrap();
-        let meta = session.subscriber(Channel::TrafficMeta).unwrap();
-        session.attach();
-        (session, traffic, meta)
+        let mut membership =
+            RunMembership::join_with(file, Process::SimCore, 0, Arc::new(AtomicBool::new(false))).unwrap();
+        let traffic = membership.subscriber(Channel::Traffic).unwrap();
+        let meta = membership.subscriber(Channel::TrafficMeta).unwrap();
+        membership.attach();
+        (membership, traffic, meta)
     }
 }
 
@@ -141,7 +142,7 @@ type Step = (MessageHeader, Vec<TrafficState>, Vec<VehicleMeta>, Vec<SignalMeta>
 
 /// All messages of a run.
 fn consume(run: &Run) -> Vec<Step> {
-    let (mut session, traffic, meta) = run.sim_core();
+    let (mut membership, traffic, meta) = run.sim_core();
     let (mut steps, mut meta_messages) = (Vec::new(), 0);
     loop {
         let message = next(&traffic);
@@ -164,7 +165,7 @@ fn consume(run: &Run) -> Vec<Step> {
             events.extend_from_slice(block::view(message.payload(), layout.vehicles).unwrap());
             signals.extend_from_slice(block::view(message.payload(), layout.signals).unwrap());
         }
-        session.consumed(header.tick + 1);
+        membership.consumed(header.tick + 1);
         steps.push((header, states, events, signals));
         if header.has(LAST_OF_RUN) {
             return steps;
@@ -259,7 +260,7 @@ fn a_stop_is_a_clean_end_even_while_waiting_for_credit() {
     };
     let run = Run::new(&bench, source, 1000, 0.1);
     let mut process = run.start();
-    let (_session, traffic, _meta) = run.sim_core();
+    let (_membership, traffic, _meta) = run.sim_core();
     let sent = (0..WINDOW_TICKS)
         .map(|_| next(&traffic).header().tick)
         .collect::<Vec<_>>();

@@ -45,7 +45,7 @@ const LOOK: Duration = Duration::from_millis(50);
 
 /// A process cannot take part in the run any more.
 #[derive(Debug, thiserror::Error)]
-pub enum SessionError {
+pub enum MembershipError {
     /// The run file cannot be used.
     #[error(transparent)]
     RunFile(#[from] RunFileError),
@@ -83,7 +83,7 @@ pub enum Wait {
 }
 
 /// One process's part in a run.
-pub struct Session {
+pub struct RunMembership {
     /// What the supervisor said.
     pub run: RunFile,
     process: Process,
@@ -100,16 +100,16 @@ pub struct Session {
     start_cpu_s: f64,
 }
 
-impl Session {
+impl RunMembership {
     /// Joins the run as `process` of the environment that the run file speaks to: opens its board and wake-up, ends with the
     /// supervisor, stops at SIGTERM and SIGINT.
     ///
     /// # Errors
     /// The run file, the shared memory or the supervisor is not there.
-    pub fn join(run_file: &Path, process: Process) -> Result<Self, SessionError> {
+    pub fn join(run_file: &Path, process: Process) -> Result<Self, MembershipError> {
         let stop = Arc::new(AtomicBool::new(false));
         for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
-            signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|source| SessionError::System {
+            signal_hook::flag::register(signal, Arc::clone(&stop)).map_err(|source| MembershipError::System {
                 what: "signal handling",
                 source,
             })?;
@@ -119,33 +119,33 @@ impl Session {
         Self::join_with(run, process, env_index, stop)
     }
 
-    /// Joins like [`Session::join`] but leaves signals to the caller, who sets `stop`.
+    /// Joins like [`RunMembership::join`] but leaves signals to the caller, who sets `stop`.
     ///
     /// # Errors
-    /// As [`Session::join`].
+    /// As [`RunMembership::join`].
     pub fn join_with(
         run: RunFile,
         process: Process,
         env_index: u32,
         stop: Arc<AtomicBool>,
-    ) -> Result<Self, SessionError> {
+    ) -> Result<Self, MembershipError> {
         end_with_supervisor(run.supervisor_pid)?;
         Self::open(run, process, env_index, stop)
     }
 
-    /// Joins like [`Session::join_with`] from a process that the supervisor did not start, and that outlives the run: it does not end
-    /// with the supervisor, and has to ask [`Session::supervisor_lives`] while it waits.
+    /// Joins like [`RunMembership::join_with`] from a process that the supervisor did not start, and that outlives the run: it does not end
+    /// with the supervisor, and has to ask [`RunMembership::supervisor_lives`] while it waits.
     ///
     /// # Errors
-    /// As [`Session::join`].
+    /// As [`RunMembership::join`].
     pub fn join_from_outside(
         run: RunFile,
         process: Process,
         env_index: u32,
         stop: Arc<AtomicBool>,
-    ) -> Result<Self, SessionError> {
+    ) -> Result<Self, MembershipError> {
         if !lives(run.supervisor_pid) {
-            return Err(SessionError::Orphaned {
+            return Err(MembershipError::Orphaned {
                 pid: run.supervisor_pid,
             });
         }
@@ -158,7 +158,7 @@ impl Session {
         lives(self.run.supervisor_pid)
     }
 
-    fn open(run: RunFile, process: Process, env_index: u32, stop: Arc<AtomicBool>) -> Result<Self, SessionError> {
+    fn open(run: RunFile, process: Process, env_index: u32, stop: Arc<AtomicBool>) -> Result<Self, MembershipError> {
         if run.keeps_time(process)
             && let Err(error) = scheduling::ask_for_short_turns()
         {
@@ -181,7 +181,7 @@ impl Session {
     ///
     /// # Errors
     /// There is no such environment.
-    pub fn in_environment(&self, env_index: u32) -> Result<Self, SessionError> {
+    pub fn in_environment(&self, env_index: u32) -> Result<Self, MembershipError> {
         Self::take_place(
             self.run.environment(env_index),
             self.process,
@@ -199,7 +199,7 @@ impl Session {
         stop: Arc<AtomicBool>,
         node: Arc<Node<Shm>>,
         wake: Arc<WakeListener>,
-    ) -> Result<Self, SessionError> {
+    ) -> Result<Self, MembershipError> {
         let incarnation = incarnation();
         let board = BoardWriter::create(&services::open_board(&node, &run, env_index, process)?, incarnation)?;
         let progress = Progress {
@@ -233,16 +233,16 @@ impl Session {
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn publisher(&self, channel: Channel) -> Result<Publisher, SessionError> {
+    pub fn publisher(&self, channel: Channel) -> Result<Publisher, MembershipError> {
         let service = services::open_data(&self.node, &self.run, self.env_index, channel)?;
         Ok(Publisher::create(&service, channel, &self.run)?)
     }
 
-    /// The receiving end of `channel`; its producer will be woken by [`Session::consumed`].
+    /// The receiving end of `channel`; its producer will be woken by [`RunMembership::consumed`].
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn subscriber(&mut self, channel: Channel) -> Result<Subscriber, SessionError> {
+    pub fn subscriber(&mut self, channel: Channel) -> Result<Subscriber, MembershipError> {
         let service = services::open_data(&self.node, &self.run, self.env_index, channel)?;
         if channel.requires(self.process) {
             self.upstream.push(self.waker(channel.producer())?);
@@ -259,7 +259,7 @@ impl Session {
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn control_server(&self) -> Result<ControlServer, SessionError> {
+    pub fn control_server(&self) -> Result<ControlServer, MembershipError> {
         let service = services::open_control(&self.node, &self.run, self.env_index)?;
         Ok(ControlServer::create(&service)?)
     }
@@ -268,7 +268,7 @@ impl Session {
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn waker(&self, process: Process) -> Result<Waker, SessionError> {
+    pub fn waker(&self, process: Process) -> Result<Waker, MembershipError> {
         Ok(Waker::create(&services::open_wake(
             &self.node,
             &self.run,
@@ -281,7 +281,7 @@ impl Session {
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn board_of(&self, process: Process) -> Result<BoardReader, SessionError> {
+    pub fn board_of(&self, process: Process) -> Result<BoardReader, MembershipError> {
         self.board_in(self.env_index, process)
     }
 
@@ -289,7 +289,7 @@ impl Session {
     ///
     /// # Errors
     /// The service cannot be opened.
-    pub fn board_in(&self, env_index: u32, process: Process) -> Result<BoardReader, SessionError> {
+    pub fn board_in(&self, env_index: u32, process: Process) -> Result<BoardReader, MembershipError> {
         Ok(BoardReader::open(&self.node, &self.run, env_index, process)?)
     }
 
@@ -402,7 +402,7 @@ impl Session {
     ///
     /// # Errors
     /// The wake-up is broken.
-    pub fn wait_for_credit(&self, consumer: &BoardReader, tick: u64) -> Result<Wait, SessionError> {
+    pub fn wait_for_credit(&self, consumer: &BoardReader, tick: u64) -> Result<Wait, MembershipError> {
         let window = self.run.window_ticks();
         self.wait_until(|| flow::has_credit(tick, &consumer.progress(), window))
     }
@@ -411,7 +411,7 @@ impl Session {
     ///
     /// # Errors
     /// The wake-up is broken.
-    pub fn wait_until_consumed(&self, consumer: &BoardReader, ticks: u64) -> Result<Wait, SessionError> {
+    pub fn wait_until_consumed(&self, consumer: &BoardReader, ticks: u64) -> Result<Wait, MembershipError> {
         self.wait_until(|| consumer.progress().consumed_ticks >= ticks)
     }
 
@@ -419,7 +419,7 @@ impl Session {
     ///
     /// # Errors
     /// The wake-up is broken.
-    pub fn wait_until(&self, mut condition: impl FnMut() -> bool) -> Result<Wait, SessionError> {
+    pub fn wait_until(&self, mut condition: impl FnMut() -> bool) -> Result<Wait, MembershipError> {
         loop {
             if condition() {
                 return Ok(Wait::Ready);
@@ -435,7 +435,7 @@ impl Session {
     ///
     /// # Errors
     /// The wake-up is broken.
-    pub fn wait(&self, timeout: Duration) -> Result<(), SessionError> {
+    pub fn wait(&self, timeout: Duration) -> Result<(), MembershipError> {
         Ok(wait(&self.wake, timeout)?)
     }
 
@@ -443,7 +443,7 @@ impl Session {
     ///
     /// # Errors
     /// The port is broken.
-    pub fn next(&self, subscriber: &Subscriber) -> Result<Option<crate::ports::Message>, SessionError> {
+    pub fn next(&self, subscriber: &Subscriber) -> Result<Option<crate::ports::Message>, MembershipError> {
         let mut message = None;
         let mut failure = None;
         let waited = self.wait_until(|| match subscriber.receive() {
@@ -465,9 +465,9 @@ impl Session {
 }
 
 /// Ends this process when the supervisor ends.
-fn end_with_supervisor(pid: i32) -> Result<(), SessionError> {
+fn end_with_supervisor(pid: i32) -> Result<(), MembershipError> {
     rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM)).map_err(|e| {
-        SessionError::System {
+        MembershipError::System {
             what: "the bond to the supervisor",
             source: e.into(),
         }
@@ -476,7 +476,7 @@ fn end_with_supervisor(pid: i32) -> Result<(), SessionError> {
     if parent == pid {
         Ok(())
     } else {
-        Err(SessionError::Orphaned { pid })
+        Err(MembershipError::Orphaned { pid })
     }
 }
 
@@ -520,7 +520,7 @@ pub fn main_heard(
     }
 }
 
-impl From<BoardError> for SessionError {
+impl From<BoardError> for MembershipError {
     fn from(error: BoardError) -> Self {
         match error {
             BoardError::Service(error) => Self::Service(error),
@@ -529,8 +529,8 @@ impl From<BoardError> for SessionError {
     }
 }
 
-impl From<SessionError> for Failure {
-    fn from(error: SessionError) -> Self {
+impl From<MembershipError> for Failure {
+    fn from(error: MembershipError) -> Self {
         Self::from_error(FailureKind::Run, &error)
     }
 }
