@@ -212,9 +212,7 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) 
         }
         *draft.header_mut() = MessageHeader {
             tick,
-            count: u32::try_from(rows).unwrap_or(u32::MAX),
-            columns: u32::try_from(FIELDS).unwrap_or(u32::MAX),
-            sequence: 1,
+            shape: layout.shape,
             flags: if tick == last { LAST_OF_RUN } else { 0 },
             ..membership.header()
         };

@@ -6,7 +6,7 @@ use bytemuck::bytes_of;
 use ipc_schema::{
     block::{BlockError, view},
     header::MessageHeader,
-    traffic::{MetaEvent, ROUTES, SignalMeta, TrafficMetaLayout, VehicleMeta},
+    traffic::{MetaEvent, SignalMeta, TrafficMetaLayout, VehicleMeta},
 };
 
 /// A fact and the tick from which it is known.
@@ -33,7 +33,7 @@ impl RoadUserDirectory {
     /// # Errors
     /// The payload does not hold what its header promises.
     pub fn apply_changes(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<(), BlockError> {
-        if header.has(ROUTES) || !self.is_current(header) {
+        if !self.is_current(header) {
             return Ok(());
         }
         let (vehicles, signals) = rows(header, payload)?;
@@ -153,12 +153,8 @@ impl RoadUserDirectory {
 
 /// The two tables of a message.
 fn rows<'a>(header: &MessageHeader, payload: &'a [u8]) -> Result<(&'a [VehicleMeta], &'a [SignalMeta]), BlockError> {
-    let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
-    let signals: &[SignalMeta] = match header.columns {
-        0 => &[],
-        _ => view(payload, layout.signals)?,
-    };
-    Ok((view(payload, layout.vehicles)?, signals))
+    let layout = TrafficMetaLayout::of(header);
+    Ok((view(payload, layout.vehicles)?, view(payload, layout.signals)?))
 }
 
 #[cfg(test)]
@@ -196,8 +192,7 @@ mod tests {
         let header = MessageHeader {
             episode,
             tick,
-            count: u32::try_from(vehicles.len()).unwrap(),
-            columns: u32::try_from(signals.len()).unwrap(),
+            shape: layout.shape,
             ..MessageHeader::default()
         };
         (header, words)
@@ -245,7 +240,7 @@ mod tests {
     #[test]
     fn a_message_that_promises_too_much_is_refused() {
         let header = MessageHeader {
-            count: 1000,
+            shape: [1000, 0, 0, 0],
             ..MessageHeader::default()
         };
         assert!(RoadUserDirectory::default().apply_census(&header, &[0; 64]).is_err());

@@ -3,9 +3,9 @@
 use bytemuck::{bytes_of, pod_read_unaligned};
 use ipc_schema::{
     block::{BlockError, Section, view},
-    event::Collision,
-    header::MessageHeader,
-    observation::{IMU_COLUMNS, ObservationLayout},
+    event::CollisionLayout,
+    header::{DIMENSIONS, MessageHeader},
+    observation::ObservationLayout,
     pointcloud::{LidarPoint, PointcloudLayout, Scan},
     prediction::PredictionLayout,
     services::Channel,
@@ -43,69 +43,45 @@ pub struct EncodedFrame {
 
 /// Encodes a message of `channel` as a frame.
 ///
-/// A frame of `world` has no sub-steps (`columns` = 0). If there are more road users or points than fit, it has every second (third, …)
+/// A frame of `world` has neither sub-steps nor views of heroes. If there are more road users or points than fit, it has every second (third, …)
 /// of them. Observations and predictions are cut to their first slots.
 ///
 /// # Errors
 /// The payload is shorter than its header promises, or the frame is too long.
 pub fn encode(channel: Channel, header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
-    let columns = header.columns as usize;
     match channel {
         Channel::World => encode_world(header, payload),
-        Channel::Observation => {
-            let samples = usize::try_from(header.sequence).unwrap_or(usize::MAX);
-            check_plausible(header, columns.max(samples.saturating_mul(IMU_COLUMNS)), payload)?;
-            encode_slots(header, payload, |header| {
-                let layout = ObservationLayout::of(header);
-                (layout.named().map(|(_, section)| section).to_vec(), layout.len)
-            })
-        }
-        Channel::Prediction => {
-            check_plausible(header, columns, payload)?;
-            encode_slots(header, payload, |header| {
-                let layout = PredictionLayout::of(header);
-                (vec![layout.prediction, layout.estimate_m], layout.len)
-            })
-        }
+        Channel::Observation => encode_slots(channel, header, payload, |header| {
+            let layout = ObservationLayout::of(header);
+            (layout.named().map(|(_, section)| section).to_vec(), layout.len)
+        }),
+        Channel::Prediction => encode_slots(channel, header, payload, |header| {
+            let layout = PredictionLayout::of(header);
+            (vec![layout.prediction, layout.estimate_m], layout.len)
+        }),
         Channel::Pointcloud => encode_scan(header, payload),
         _ => encode_collisions(header, payload),
     }
 }
 
-/// Refuses sizes that a payload of this length cannot hold, before anything is computed from them.
-fn check_plausible(header: &MessageHeader, columns: usize, payload: &[u8]) -> Result<(), BlockError> {
-    let len = (header.count as usize)
-        .saturating_mul(columns.max(1))
-        .saturating_mul(size_of::<f32>());
-    if len <= payload.len() {
-        return Ok(());
-    }
-    Err(BlockError {
-        actual: payload.len(),
-        offset: 0,
-        len,
-        element: size_of::<f32>(),
-    })
-}
-
 /// The header with another number of rows.
-fn with_count(header: &MessageHeader, count: usize) -> MessageHeader {
-    MessageHeader {
-        count: u32::try_from(count).unwrap_or(u32::MAX),
-        ..*header
-    }
+fn with_rows(header: &MessageHeader, rows: usize) -> MessageHeader {
+    let mut header = *header;
+    header.shape[0] = u32::try_from(rows).unwrap_or(u32::MAX);
+    header
 }
 
 /// Encodes a block whose sections have a row for each slot, cut to the slots that fit.
 fn encode_slots(
+    channel: Channel,
     header: &MessageHeader,
     payload: &[u8],
     layout_of: impl Fn(&MessageHeader) -> (Vec<Section>, usize),
 ) -> Result<EncodedFrame, FrameError> {
-    let rows = header.count as usize;
+    let rows = header.rows();
     let (sections, len) = layout_of(header);
+    let bytes: &[u8] = view(payload, Section { offset: 0, len })?;
     if HEADER_BYTES + len <= MAX_FRAME_BYTES {
-        let bytes: &[u8] = view(payload, Section { offset: 0, len })?;
         return Ok(EncodedFrame {
             bytes: [bytes_of(header), bytes].concat(),
             left_out: 0,
@@ -114,7 +90,11 @@ fn encode_slots(
     // Each section is padded to its alignment: leave room for that.
     let room = MAX_FRAME_BYTES.saturating_sub(HEADER_BYTES + 64 * sections.len());
     let kept = rows * room / len;
-    let header = with_count(header, kept);
+    let mut header = with_rows(header, kept);
+    // A filter that runs has an estimate for each slot: a prediction has fewer of them too.
+    if channel == Channel::Prediction {
+        header.shape[2] = header.shape[2].min(header.shape[0]);
+    }
     let (shorter, len) = layout_of(&header);
     let mut bytes = bytes_of(&header).to_vec();
     bytes.resize(HEADER_BYTES + len, 0);
@@ -134,10 +114,10 @@ fn encode_slots(
 
 /// Encodes contacts, which are all kept.
 fn encode_collisions(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
-    let len = (header.count as usize).saturating_mul(size_of::<Collision>());
-    let bytes: &[u8] = view(payload, Section { offset: 0, len })?;
-    if HEADER_BYTES + len > MAX_FRAME_BYTES {
-        return Err(FrameError::TooLong(HEADER_BYTES + len));
+    let bytes: &[u8] = view(payload, CollisionLayout::of(header).collisions)?;
+    let len = HEADER_BYTES + bytes.len();
+    if len > MAX_FRAME_BYTES {
+        return Err(FrameError::TooLong(len));
     }
     Ok(EncodedFrame {
         bytes: [bytes_of(header), bytes].concat(),
@@ -147,14 +127,18 @@ fn encode_collisions(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFr
 
 /// Encodes the states of road users, without sub-steps.
 fn encode_world(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
-    let states: &[VehicleState] = view(payload, WorldLayout::new(header.count as usize, 0).states)?;
-    let header = MessageHeader { columns: 0, ..*header };
+    let layout = WorldLayout::new(header.rows(), 0);
+    let states: &[VehicleState] = view(payload, layout.states)?;
+    let header = MessageHeader {
+        shape: layout.shape,
+        ..*header
+    };
     Ok(thinned(&header, &[], states, MAX_FRAME_BYTES))
 }
 
 /// Encodes a scan: where the sensor was, and the points that fit.
 fn encode_scan(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
-    let layout = PointcloudLayout::new(header.count as usize);
+    let layout = PointcloudLayout::of(header);
     let scan: &[Scan] = view(payload, layout.scan)?;
     let points: &[LidarPoint] = view(payload, layout.points)?;
     let mut head = bytemuck::cast_slice(scan).to_vec();
@@ -168,7 +152,7 @@ fn thinned<T: bytemuck::Pod>(header: &MessageHeader, head: &[u8], rows: &[T], ma
     let kept = rows.iter().step_by(rows.len().div_ceil(max_rows).max(1));
     let count = kept.len();
     let mut bytes = Vec::with_capacity(HEADER_BYTES + head.len() + count * size_of::<T>());
-    bytes.extend_from_slice(bytes_of(&with_count(header, count)));
+    bytes.extend_from_slice(bytes_of(&with_rows(header, count)));
     bytes.extend_from_slice(head);
     kept.for_each(|row| bytes.extend_from_slice(bytes_of(row)));
     EncodedFrame {
@@ -184,11 +168,11 @@ pub fn table(header: &MessageHeader, rows: &[u8], row_bytes: usize, next_row: &m
     let count = rows.len() / row_bytes;
     let frame = |rows: &[u8]| {
         let header = MessageHeader {
-            columns: 0,
-            sequence: 0,
-            ..with_count(header, rows.len() / row_bytes)
+            shape: [0; DIMENSIONS],
+            meta_messages: 0,
+            ..*header
         };
-        [bytes_of(&header), rows].concat()
+        [bytes_of(&with_rows(&header, rows.len() / row_bytes)), rows].concat()
     };
     let max_rows = (MAX_FRAME_BYTES - HEADER_BYTES) / row_bytes;
     let from = if *next_row < count { *next_row } else { 0 };

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use fanout::network::access::{REFUSAL_FILTER, RefusalLayer};
-use ipc_schema::{process::Process, session};
+use ipc_schema::{membership, process::Process};
 
 /// Niceness of the fan-out, of at most 19: a process that the run waits for gets a core before it.
 const NICENESS: i32 = 10;

@@ -59,7 +59,7 @@ impl RoadUserCounts {
     /// Counts the road users of a `world` message; `None` if its payload is shorter than its header promises.
     #[must_use]
     pub fn of(header: &MessageHeader, payload: &[u8]) -> Option<Self> {
-        let states: &[VehicleState] = view(payload, WorldLayout::new(header.count as usize, 0).states).ok()?;
+        let states: &[VehicleState] = view(payload, WorldLayout::new(header.rows(), 0).states).ok()?;
         let mut count = Self::default();
         for state in states {
             match state.kind {
@@ -158,7 +158,7 @@ impl<'a> ObservationView<'a> {
         let xy = |rows: &'a [[f32; GNSS_COLUMNS]]| rows.iter().map(|[x, y, _]| [*x, *y]);
         let (policy, ekf) =
             prediction
-                .filter(|(header, _)| header.columns == 2)
+                .filter(|(header, _)| header.shape[1] == 2)
                 .map_or((None, None), |(header, payload)| {
                     let layout = PredictionLayout::of(header);
                     let rows = |section| view::<[f32; 2]>(payload, section).ok().filter(|rows| !rows.is_empty());
@@ -190,13 +190,12 @@ impl<'a> ObservationView<'a> {
 mod tests {
     use super::*;
     use bytemuck::cast_slice_mut;
-    use ipc_schema::{block::view_mut, prediction::ESTIMATES};
+    use ipc_schema::block::view_mut;
 
     #[test]
     fn errors_are_means_over_valid_rows() {
         let header = MessageHeader {
-            count: 3,
-            columns: 1,
+            shape: ObservationLayout::new(3, 1, 0).shape,
             ..MessageHeader::default()
         };
         let layout = ObservationLayout::of(&header);
@@ -216,8 +215,7 @@ mod tests {
             .fill(SensorKind::Gnss.bit() | SensorKind::Lidar.bit());
         let observation = ObservationView::of(&header, bytemuck::cast_slice(&words)).unwrap();
         let predicted = MessageHeader {
-            columns: 2,
-            flags: ESTIMATES,
+            shape: PredictionLayout::new(3, 2, true).shape,
             ..header
         };
         let layout = PredictionLayout::of(&predicted);

@@ -4,7 +4,7 @@ use ipc_schema::{
     SCHEMA_VERSION,
     event::Collision,
     header::MessageHeader,
-    observation::{IMU_COLUMNS, ObservationLayout},
+    observation::ObservationLayout,
     pointcloud::PointcloudLayout,
     prediction::PredictionLayout,
     traffic::{SignalMeta, VehicleMeta},
@@ -57,7 +57,7 @@ pub fn check(topic: &str, bytes: &[u8], run_id: Option<u64>) -> Result<Option<Me
     if run_id.is_some_and(|run_id| run_id != header.run_id) {
         return Err(SampleRefusal::Run(header.run_id));
     }
-    let promised = promised(topic, &header, payload.len()).ok_or(SampleRefusal::Unknown)?;
+    let promised = promised(topic, &header).ok_or(SampleRefusal::Unknown)?;
     if payload.len() < promised {
         return Err(short(promised.saturating_add(frame::HEADER_BYTES)));
     }
@@ -74,31 +74,19 @@ fn check_json(bytes: &[u8]) -> Result<(), SampleRefusal> {
     }
 }
 
-/// Length of the payload that a header promises, bytes. If that is more than `actual`, it may be any number above `actual`: sizes are not
-/// computed from implausible headers.
-fn promised(topic: &str, header: &MessageHeader, actual: usize) -> Option<usize> {
-    let (rows, columns) = (header.count as usize, header.columns as usize);
-    let rows_of = |bytes: usize| rows.saturating_mul(bytes);
-    let least = |columns: usize| rows.saturating_mul(columns).saturating_mul(size_of::<f32>());
+/// Length of the payload that a header promises, bytes; the largest `usize` if it is more than any payload has.
+fn promised(topic: &str, header: &MessageHeader) -> Option<usize> {
+    let rows_of = |bytes: usize| header.rows().saturating_mul(bytes);
     Some(match topic {
         "world" => rows_of(size_of::<VehicleState>()),
         "vehicles" => rows_of(size_of::<VehicleMeta>()),
         "signals" => rows_of(size_of::<SignalMeta>()),
         "event" => rows_of(size_of::<Collision>()),
-        "prediction" => match least(columns.max(1)) {
-            bytes if bytes > actual => bytes,
-            _ => PredictionLayout::of(header).len,
-        },
-        "observation" => {
-            let samples = usize::try_from(header.sequence).unwrap_or(usize::MAX);
-            match least(columns.max(samples.saturating_mul(IMU_COLUMNS)).max(1)) {
-                bytes if bytes > actual => bytes,
-                _ => ObservationLayout::of(header).len,
-            }
-        }
+        "prediction" => PredictionLayout::of(header).len,
+        "observation" => ObservationLayout::of(header).len,
         topic if topic.starts_with("pointcloud/") => {
-            let layout = PointcloudLayout::new(rows);
-            layout.points.offset + layout.points.len
+            let layout = PointcloudLayout::of(header);
+            layout.points.offset.saturating_add(layout.points.len)
         }
         _ => return None,
     })
@@ -127,8 +115,7 @@ mod tests {
         let header = MessageHeader {
             schema_version: version,
             run_id: 7,
-            count,
-            columns: 2,
+            shape: [count, 0, 0, 0],
             ..MessageHeader::default()
         };
         let mut bytes = bytemuck::bytes_of(&header).to_vec();
@@ -139,14 +126,14 @@ mod tests {
     #[test]
     fn whole_frames_pass_and_truncated_old_and_foreign_ones_do_not() {
         let whole = frame(SCHEMA_VERSION, 2, 2 * size_of::<VehicleState>());
-        assert_eq!(check("world", &whole, Some(7)).unwrap().unwrap().count, 2);
+        assert_eq!(check("world", &whole, Some(7)).unwrap().unwrap().rows(), 2);
         assert!(matches!(
             check("world", &whole[..whole.len() - 1], None),
             Err(SampleRefusal::Short { .. })
         ));
         assert!(matches!(
-            check("world", &whole[..71], None),
-            Err(SampleRefusal::Short { promised: 72, .. })
+            check("world", &whole[..95], None),
+            Err(SampleRefusal::Short { promised: 96, .. })
         ));
         assert_eq!(check("world", &whole, Some(8)), Err(SampleRefusal::Run(7)));
         assert_eq!(

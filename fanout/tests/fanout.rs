@@ -6,7 +6,7 @@ mod harness;
 use std::{io::Write as _, mem::offset_of, net::TcpStream};
 
 use bytemuck::{cast_slice, pod_read_unaligned};
-use fanout::network::keys::Topic;
+use fanout::{frame::HEADER_BYTES, network::keys::Topic};
 use harness::{
     PATIENCE, Run, ask, header, next, observation, publisher, send, send_census, send_observation, send_prediction,
     send_scan, send_world, states, until, watch,
@@ -44,14 +44,14 @@ fn frames_are_the_bytes_of_shared_memory() {
         send_observation(&sensors, &observations, tick, 0, 4);
         send_prediction(&trainer, &predictions, tick, 4);
         until("publication", || {
-            ask(&viewer, &run.key(Topic::Prediction)).is_some_and(|f| f[40] == tick as u8)
+            ask(&viewer, &run.key(Topic::Prediction)).is_some_and(|f| f[offset_of!(MessageHeader, tick)] == tick as u8)
         });
     }
     for tick in 0..3 {
         let (header, payload) = next(&world);
         assert_eq!(
-            (header.tick, header.count, header.columns, header.run_id),
-            (tick, 5, 0, run.file.run_id)
+            (header.tick, header.shape, header.run_id),
+            (tick, [5, 0, 0, 0], run.file.run_id)
         );
         assert_eq!(payload, cast_slice::<_, u8>(&states(tick, 5)));
         let (header, payload) = next(&seen);
@@ -89,7 +89,7 @@ fn a_late_joiner_has_the_whole_picture() {
 
     let viewer = run.attach();
     let world = ask(&viewer, &run.key(Topic::World)).unwrap();
-    assert_eq!(fanout::frame::decode(&world).unwrap().0.count, 3);
+    assert_eq!(fanout::frame::decode(&world).unwrap().0.rows(), 3);
     let map: serde_json::Value = serde_json::from_slice(&ask(&viewer, &run.key(Topic::Map)).unwrap()).unwrap();
     assert_eq!(map["map"]["bounds_m"], serde_json::json!([0.0, 0.0, 220.0, 200.0]));
     assert_eq!(
@@ -163,7 +163,7 @@ fn two_thousand_road_users_arrive_without_a_gap() {
     for tick in 0..20 {
         send_world(&sim, &worlds, tick, if tick == 19 { LAST_OF_RUN } else { 0 }, 2_000);
         let (header, payload) = next(&world);
-        assert_eq!((header.tick, header.count), (tick, 2_000));
+        assert_eq!((header.tick, header.rows()), (tick, 2_000));
         assert_eq!(payload, cast_slice::<_, u8>(&states(tick, 2_000)));
     }
     assert_eq!(fanout.exit_code(), Some(0));
@@ -208,7 +208,7 @@ fn ids_lights_and_scans_reach_viewers_whatever_the_ids() {
     send_census(&bridge, &censuses, 0, &IDS, "rG");
     let (header, payload) = next(&lights);
     let state = |payload: &[u8], row: usize| payload[row * size_of::<SignalMeta>() + offset_of!(SignalMeta, state)];
-    assert_eq!((header.count, state(&payload, 0), state(&payload, 1)), (2, b'r', b'G'));
+    assert_eq!((header.rows(), state(&payload, 0), state(&payload, 1)), (2, b'r', b'G'));
 
     let late = run.attach();
     until("the table of road users", || {
@@ -220,9 +220,9 @@ fn ids_lights_and_scans_reach_viewers_whatever_the_ids() {
         let ids: Vec<String> = rows
             .map(|row| pod_read_unaligned::<VehicleMeta>(row).id_text())
             .collect();
-        header.count == 3 && ids == IDS
+        header.rows() == 3 && ids == IDS
     });
-    assert!(ask(&late, &run.key(Topic::Signals)).is_some_and(|frame| state(&frame[72..], 1) == b'G'));
+    assert!(ask(&late, &run.key(Topic::Signals)).is_some_and(|frame| state(&frame[HEADER_BYTES..], 1) == b'G'));
 
     // Without a subscriber no scan is published; with one, its scans are.
     send_scan(&sensors, &scans, 1, (IDS[1], 1), 50);
@@ -235,11 +235,8 @@ fn ids_lights_and_scans_reach_viewers_whatever_the_ids() {
         ask(&late, &run.scan_key(IDS[1])).is_some()
     });
     let (header, payload) = next(&wanted);
-    assert_eq!((header.count, header.sequence), (50, 1));
-    assert_eq!(
-        pod_read_unaligned::<Scan>(&payload[..size_of::<Scan>()]).id_hash,
-        id_hash(IDS[1])
-    );
+    let scan: Scan = pod_read_unaligned(&payload[..size_of::<Scan>()]);
+    assert_eq!((header.rows(), scan.vehicle, scan.id_hash), (50, 1, id_hash(IDS[1])));
     assert!(ask(&late, &run.scan_key(IDS[2])).is_none());
 }
 
@@ -284,16 +281,16 @@ fn garbage_is_counted_and_not_fatal() {
     // A message of another version, and one whose header promises more than its payload holds.
     let old = MessageHeader {
         schema_version: SCHEMA_VERSION - 1,
-        ..header(&sim, 0, 0, 1, 0)
+        ..header(&sim, 0, 0, [1, 0, 0, 0])
     };
     send(&worlds, old, &[0; 136]);
-    send(&observations, header(&sensors, 0, 0, 4000, 9), &[0; 64]);
+    send(&observations, header(&sensors, 0, 0, [4000, 9, 0, 0]), &[0; 64]);
     send_world(&sim, &worlds, 1, 0, 3);
     let is_the_runs = |payload: &[u8]| payload == cast_slice::<_, u8>(&states(1, 3));
     until("a frame of the run among the garbage", || {
         let sample = world.recv_timeout(PATIENCE).unwrap().unwrap();
         let bytes = sample.payload().to_bytes();
-        fanout::reader::check("world", &bytes, Some(run.file.run_id)).is_ok() && is_the_runs(&bytes[72..])
+        fanout::reader::check("world", &bytes, Some(run.file.run_id)).is_ok() && is_the_runs(&bytes[HEADER_BYTES..])
     });
     until("the counts", || {
         let status = ask(&viewer, &run.key(Topic::Status)).unwrap();

@@ -20,7 +20,9 @@ pub fn sections<const N: usize>(lengths: [usize; N]) -> ([Section; N], usize) {
     let mut offset = 0;
     let placed = lengths.map(|len| {
         let section = Section { offset, len };
-        offset = (offset + len).next_multiple_of(ALIGNMENT);
+        // Sizes may come from a header that lies: they saturate, and the payload turns out to be too short.
+        let end = offset.saturating_add(len);
+        offset = end.checked_next_multiple_of(ALIGNMENT).unwrap_or(usize::MAX);
         section
     });
     (placed, offset)
@@ -28,7 +30,7 @@ pub fn sections<const N: usize>(lengths: [usize; N]) -> ([Section; N], usize) {
 
 /// A payload does not hold what its header promises.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("payload of {actual} bytes does not hold bytes {offset}..{} as whole elements of {element} bytes", offset + len)]
+#[error("payload of {actual} bytes does not hold bytes {offset}..{} as whole elements of {element} bytes", offset.saturating_add(*len))]
 pub struct BlockError {
     /// Bytes in the payload.
     pub actual: usize,
@@ -40,7 +42,7 @@ pub struct BlockError {
     pub element: usize,
 }
 
-/// The section as a slice of `T`.
+/// The section as a slice of `T`. An empty section may lie anywhere.
 ///
 /// # Errors
 /// The payload is too short, misaligned, or the section is not a whole number of `T`.
@@ -51,6 +53,9 @@ pub fn view<T: Pod>(payload: &[u8], section: Section) -> Result<&[T], BlockError
         len: section.len,
         element: size_of::<T>(),
     };
+    if section.len == 0 {
+        return Ok(&[]);
+    }
     let bytes = payload
         .get(section.offset..section.offset.saturating_add(section.len))
         .ok_or(error)?;
@@ -121,6 +126,15 @@ mod tests {
             }
             prop_assert!(end <= total && total - end < ALIGNMENT);
         }
+    }
+
+    #[test]
+    fn absurd_lengths_saturate_and_no_payload_holds_them() {
+        let (placed, total) = sections([usize::MAX - 3, 8, 0]);
+        assert_eq!(total, usize::MAX);
+        assert!(view::<u8>(&[0; 64], placed[0]).is_err());
+        assert!(view::<u64>(&[0; 64], placed[1]).is_err());
+        assert_eq!(view::<u64>(&[0; 64], placed[2]), Ok(&[][..]));
     }
 
     #[test]

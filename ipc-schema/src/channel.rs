@@ -3,18 +3,19 @@
 
 use crate::{
     block::ALIGNMENT,
-    control::{MAX_SWITCHES, SensorSwitch},
-    ego::EgoPose,
-    event::Collision,
+    control::{MAX_SWITCHES, SensorSwitchLayout},
+    ego::EgoPoseLayout,
+    event::CollisionLayout,
     header::MessageHeader,
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
     prediction::{ESTIMATE_COLUMNS, PredictionLayout},
     process::Process::{self, SensorDaemon, SimCore, TrafficBridge, Trainer},
     run::RunFile,
+    section::SectionSpec,
     traffic::{
-        EVENTS_PER_MESSAGE, MOST_SIGNALS, ROUTE_POINTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout,
-        TrafficState,
+        EVENTS_PER_MESSAGE, MOST_SIGNALS, ROUTE_POINTS_PER_MESSAGE, SIGNALS_PER_MESSAGE, TrafficLayout,
+        TrafficMetaLayout,
     },
     world::WorldLayout,
 };
@@ -66,12 +67,20 @@ pub struct ChannelSpec {
     pub channel: Channel,
     /// Name in service names.
     pub name: &'static str,
-    /// What a payload holds.
+    /// What a payload holds, in words.
     pub payload: &'static str,
+    /// Sections of a payload.
+    pub sections: &'static [SectionSpec],
+    /// Names of the dimensions of the sections, in the order of the header's shape.
+    pub dimensions: &'static [&'static str],
     /// The one process that sends.
     pub producer: Process,
-    /// Processes that must not miss a message: their credit bounds the producer.
+    /// Processes that must not miss a message: the producer needs the credit of each of them that the run has.
     pub required: &'static [Process],
+    /// Ticks that the producer may be ahead of each required consumer.
+    pub window: fn(&RunFile) -> u64,
+    /// Topics on which `fanout` publishes what this channel carries.
+    pub topics: &'static [&'static str],
     /// What happens at a full queue.
     pub when_full: FullQueue,
     /// Longest payload of a run, bytes.
@@ -125,10 +134,14 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::Traffic,
         name: "traffic",
         payload: "`[TrafficState]`",
+        sections: TrafficLayout::SECTIONS,
+        dimensions: TrafficLayout::DIMENSIONS,
         producer: TrafficBridge,
         required: &[SimCore],
+        window: RunFile::traffic_window_ticks,
+        topics: &[],
         when_full: FullQueue::DropNewest,
-        max_payload: |run| road_users(run) * size_of::<TrafficState>(),
+        max_payload: |run| TrafficLayout::sized(road_users(run)).len,
         queue_length: |run| traffic_steps(run) + SPARE_MESSAGES,
         in_hand: |run| two_batches(Channel::Traffic.queue_length(run)),
         is_used: |_| true,
@@ -137,12 +150,16 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::TrafficMeta,
         name: "traffic-meta",
         payload: "`[VehicleMeta]`, `[SignalMeta]`; or `[RoutePoint]`",
+        sections: TrafficMetaLayout::SECTIONS,
+        dimensions: TrafficMetaLayout::DIMENSIONS,
         producer: TrafficBridge,
         required: &[SimCore],
+        window: RunFile::traffic_window_ticks,
+        topics: &["vehicles", "signals"],
         when_full: FullQueue::DropNewest,
         max_payload: |_| {
             let metas = TrafficMetaLayout::new(EVENTS_PER_MESSAGE, SIGNALS_PER_MESSAGE).len;
-            metas.max(ROUTE_POINTS_PER_MESSAGE * size_of::<RoutePoint>())
+            metas.max(TrafficMetaLayout::sized(0, 0, ROUTE_POINTS_PER_MESSAGE).len)
         },
         // All heroes may come within one step, each with its route.
         queue_length: |run| {
@@ -156,8 +173,12 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::Census,
         name: "census",
         payload: "as `traffic-meta`: every road user and every light",
+        sections: TrafficMetaLayout::SECTIONS,
+        dimensions: TrafficMetaLayout::DIMENSIONS,
         producer: TrafficBridge,
         required: &[],
+        window: RunFile::window_ticks,
+        topics: &["vehicles", "signals"],
         when_full: FullQueue::DropOldest,
         max_payload: |run| TrafficMetaLayout::new(road_users(run), MOST_SIGNALS).len,
         queue_length: |_| SPARE_MESSAGES,
@@ -168,8 +189,12 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::World,
         name: "world",
         payload: "`[VehicleState]`, `[SubStep]`, `[HeroView]`",
+        sections: WorldLayout::SECTIONS,
+        dimensions: WorldLayout::DIMENSIONS,
         producer: SimCore,
         required: &[SensorDaemon],
+        window: RunFile::window_ticks,
+        topics: &["world"],
         when_full: FullQueue::DropNewest,
         max_payload: |run| {
             let sub_steps = run.config.run.sub_steps as usize;
@@ -183,8 +208,12 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::Observation,
         name: "observation",
         payload: "observations, truth, newest samples, slots",
+        sections: ObservationLayout::SECTIONS,
+        dimensions: ObservationLayout::DIMENSIONS,
         producer: SensorDaemon,
         required: &[Trainer],
+        window: RunFile::window_ticks,
+        topics: &["observation"],
         when_full: FullQueue::DropNewest,
         max_payload: |run| {
             let (width, imu_samples) = (run.config.observation_width(), run.config.imu_samples());
@@ -198,9 +227,13 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::Prediction,
         name: "prediction",
         payload: "positions or actions, estimates of the filter",
+        sections: PredictionLayout::SECTIONS,
+        dimensions: PredictionLayout::DIMENSIONS,
         producer: Trainer,
         // In the driving task sim-core waits for each message, so the trainer is at most one ahead and no queue overflows.
         required: &[],
+        window: RunFile::window_ticks,
+        topics: &["prediction"],
         when_full: FullQueue::DropNewest,
         max_payload: |run| PredictionLayout::new(road_users(run), ESTIMATE_COLUMNS, true).len,
         queue_length: windowful,
@@ -211,10 +244,14 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::EgoPose,
         name: "ego-pose",
         payload: "`[EgoPose]`",
+        sections: EgoPoseLayout::SECTIONS,
+        dimensions: EgoPoseLayout::DIMENSIONS,
         producer: SimCore,
         required: &[TrafficBridge],
+        window: RunFile::window_ticks,
+        topics: &[],
         when_full: FullQueue::DropNewest,
-        max_payload: |run| road_users(run) * size_of::<EgoPose>(),
+        max_payload: |run| EgoPoseLayout::sized(road_users(run)).len,
         queue_length: windowful,
         in_hand: |run| two_batches(windowful(run)),
         is_used: |_| true,
@@ -223,10 +260,14 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::Event,
         name: "event",
         payload: "`[Collision]`",
+        sections: CollisionLayout::SECTIONS,
+        dimensions: CollisionLayout::DIMENSIONS,
         producer: SimCore,
         required: &[],
+        window: RunFile::window_ticks,
+        topics: &["event"],
         when_full: FullQueue::DropNewest,
-        max_payload: |run| road_users(run) * size_of::<Collision>(),
+        max_payload: |run| CollisionLayout::sized(road_users(run)).len,
         queue_length: windowful,
         in_hand: |run| two_batches(windowful(run)),
         is_used: |_| true,
@@ -235,8 +276,12 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::Pointcloud,
         name: "pointcloud",
         payload: "`Scan`, `[LidarPoint]`: one message for each LIDAR and tick",
+        sections: PointcloudLayout::SECTIONS,
+        dimensions: PointcloudLayout::DIMENSIONS,
         producer: SensorDaemon,
         required: &[],
+        window: RunFile::window_ticks,
+        topics: &["pointcloud"],
         when_full: FullQueue::DropOldest,
         max_payload: |run| PointcloudLayout::new(run.config.lidar.rays_per_tick(run.config.run.tick_s)).len,
         // The scans of one tick.
@@ -248,11 +293,15 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         channel: Channel::Switch,
         name: "switch",
         payload: "`[SensorSwitch]`, from the tick in the header on",
+        sections: SensorSwitchLayout::SECTIONS,
+        dimensions: SensorSwitchLayout::DIMENSIONS,
         producer: TrafficBridge,
         // A switch goes with a tick, whose own credit bounds both.
         required: &[],
+        window: RunFile::traffic_window_ticks,
+        topics: &[],
         when_full: FullQueue::DropNewest,
-        max_payload: |_| MAX_SWITCHES * size_of::<SensorSwitch>(),
+        max_payload: |_| SensorSwitchLayout::sized(MAX_SWITCHES).len,
         // One for each step that is on its way through sim-core.
         queue_length: |run| traffic_steps(run) + windowful(run),
         in_hand: |run| two_batches(Channel::Switch.queue_length(run)),

@@ -7,7 +7,7 @@ use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-use crate::{SCHEMA_VERSION, sensor::SensorSelection};
+use crate::{SCHEMA_VERSION, section::payload_layout, sensor::SensorSelection};
 
 /// Longest id of a vehicle or an edge in a command, bytes.
 pub const ID_BYTES: usize = 128;
@@ -455,6 +455,14 @@ pub struct SensorSwitch {
     pub sensors: u32,
     /// Bits: [`SWITCHED_ON`], [`EVERY_VEHICLE`].
     pub flags: u32,
+}
+
+payload_layout! {
+    /// Where the array of a `switch` message lies.
+    SensorSwitchLayout(commanded) {
+        /// `SensorSwitch [commanded]`.
+        switches: SensorSwitch, [commanded];
+    }
 }
 
 /// The sensors deliver from now on.

@@ -2,6 +2,8 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::section::payload_layout;
+
 /// One hero at the end of a tick; it is moved there in SUMO before the next step.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
@@ -20,4 +22,12 @@ pub struct EgoPose {
     pub vehicle: u32,
     /// Bits of [`crate::world`] that end the hero's episode: `COLLIDED`, `OFF_ROAD`, `ARRIVED`, `TIME_LIMIT`; 0 while it lasts.
     pub flags: u32,
+}
+
+payload_layout! {
+    /// Where the array of an `ego-pose` message lies.
+    EgoPoseLayout(heroes) {
+        /// `EgoPose [heroes]`.
+        poses: EgoPose, [heroes];
+    }
 }

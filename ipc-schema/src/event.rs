@@ -1,6 +1,8 @@
-//! `event`: what happened in a tick that nobody has to wait for.
+//! `event`: what happened in a tick. No process waits for it.
 
 use bytemuck::{Pod, Zeroable};
+
+use crate::section::payload_layout;
 
 /// What a vehicle ran into, [`Collision::other_class`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -34,4 +36,12 @@ pub struct Collision {
     pub other_class: u32,
     /// Magnitude of the difference of the two velocities, m/s.
     pub relative_speed_mps: f32,
+}
+
+payload_layout! {
+    /// Where the array of an `event` message lies.
+    CollisionLayout(contacts) {
+        /// `Collision [contacts]`.
+        collisions: Collision, [contacts];
+    }
 }

@@ -13,24 +13,11 @@ pub const LAST_OF_EPISODE: u32 = 1 << 2;
 pub const LAST_OF_RUN: u32 = 1 << 3;
 /// Last tick of a lesson: before the next one the producer waits for the trainer's decision about its stage of the curriculum.
 pub const LAST_OF_LESSON: u32 = 1 << 4;
-/// First bit of the stage of the curriculum, counted from 1; 0 is the base configuration.
-const STAGE_SHIFT: u32 = 16;
-/// First bit of the map, counted from 0.
-const MAP_SHIFT: u32 = 24;
 
-/// The flags of a tick in stage `stage` of the curriculum, counted from 1; 0 is the base configuration.
-#[must_use]
-pub const fn stage_flags(stage: u8) -> u32 {
-    (stage as u32) << STAGE_SHIFT
-}
+/// Most dimensions that the sections of a payload have between them.
+pub const DIMENSIONS: usize = 4;
 
-/// The flags of a tick on map `map` of a curriculum, counted from 0, the run's own.
-#[must_use]
-pub const fn map_flags(map: u8) -> u32 {
-    (map as u32) << MAP_SHIFT
-}
-
-/// Identity and time of a message. 72 bytes, no implicit padding.
+/// Identity, time and shape of a message. 96 bytes, no implicit padding.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable, ZeroCopySend)]
 #[type_name("caraware::MessageHeader")]
@@ -41,11 +28,16 @@ pub struct MessageHeader {
     pub env_index: u32,
     /// Random identity of the run; a message of another run is refused.
     pub run_id: u64,
-    /// Counts the replacements of the sending process. `observation`: of the trainer that it is meant for.
+    /// Counts the replacements of the sending process.
     pub incarnation: u32,
-    /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`], [`LAST_OF_LESSON`]; from bit 8 on what the
-    /// payload says; from bit 16 on [`stage_flags`]; from bit 24 on [`map_flags`].
+    /// Incarnation of the consumer that the message is meant for; older incarnations of it are stale. 0 if it is meant for all.
+    pub addressee: u32,
+    /// Bits [`EVALUATION`], [`FIRST_OF_EPISODE`], [`LAST_OF_EPISODE`], [`LAST_OF_RUN`], [`LAST_OF_LESSON`].
     pub flags: u32,
+    /// Stage of the curriculum, counted from 1; 0 is the base configuration.
+    pub stage: u16,
+    /// Index of the map among those of the curriculum; 0 is the run's own.
+    pub map: u16,
     /// Episode number, 0-based over the run.
     pub episode: u64,
     /// Seed of the episode: traffic, noise and blackouts draw from it.
@@ -54,13 +46,13 @@ pub struct MessageHeader {
     pub tick: u64,
     /// Simulated time since the start of the episode, nanoseconds.
     pub sim_time_ns: u64,
-    /// Number of rows.
-    pub count: u32,
-    /// Second dimension where a payload has one: sub-steps per vehicle (`world`), fields per row (`observation`, `prediction`).
-    pub columns: u32,
-    /// `traffic`: number of `traffic-meta` messages sent before this one. `world`: number of heroes. `observation`: IMU samples
-    /// in a tick. `prediction`: version of the policy. `pointcloud`: index of the vehicle.
-    pub sequence: u64,
+    /// Size of each dimension of the payload's sections, in the order in which its layout names them; zeros behind them.
+    pub shape: [u32; DIMENSIONS],
+    /// Version of the policy that a `prediction` comes from; 0 on every other channel.
+    pub policy_version: u64,
+    /// Number of `traffic-meta` messages of the run up to this message: a `traffic` message is complete once its receiver has
+    /// applied so many. 0 on every channel that `traffic-bridge` does not send.
+    pub meta_messages: u64,
 }
 
 impl MessageHeader {
@@ -70,32 +62,9 @@ impl MessageHeader {
         self.flags & flag == flag
     }
 
-    /// Stage of the curriculum, counted from 1; 0 is the base configuration.
+    /// Number of rows: size of the first dimension.
     #[must_use]
-    pub const fn stage(&self) -> usize {
-        (self.flags >> STAGE_SHIFT & 0xff) as usize
-    }
-
-    /// Place of the map among those of the curriculum; 0 is the run's own.
-    #[must_use]
-    pub const fn map(&self) -> usize {
-        (self.flags >> MAP_SHIFT) as usize
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn stage_and_map_have_bytes_of_their_own() {
-        for (stage, map) in [(0, 0), (1, 255), (255, 1), (255, 255)] {
-            let header = MessageHeader {
-                flags: LAST_OF_LESSON | stage_flags(stage) | map_flags(map),
-                ..MessageHeader::default()
-            };
-            assert_eq!((header.stage(), header.map()), (usize::from(stage), usize::from(map)));
-            assert!(header.has(LAST_OF_LESSON) && !header.has(EVALUATION));
-        }
+    pub const fn rows(&self) -> usize {
+        self.shape[0] as usize
     }
 }

@@ -8,20 +8,18 @@ use crate::{
     SCHEMA_VERSION,
     block::ALIGNMENT,
     board::{Health, Progress, Roster, TrainingStatus},
-    channel::Channel,
+    channel::CHANNELS,
     config::TaskKind,
     control::{ControlReply, ControlRequest, SensorSwitch},
     ego::EgoPose,
     event::Collision,
     field::FIELDS,
     header::MessageHeader,
-    observation::ObservationLayout,
-    pointcloud::{LidarPoint, PointcloudLayout, Scan},
-    prediction::PredictionLayout,
+    pointcloud::{LidarPoint, Scan},
     section::{SectionSpec, WireElement, numpy_type},
     sensor::{SENSORS, SensorKind},
-    traffic::{RoutePoint, SignalMeta, TrafficMetaLayout, TrafficState, VehicleMeta},
-    world::{HeroView, SubStep, VehicleState, WorldLayout},
+    traffic::{RoutePoint, SignalMeta, TrafficState, VehicleMeta},
+    world::{HeroView, SubStep, VehicleState},
 };
 
 /// Layout of one payload type.
@@ -68,14 +66,17 @@ pub fn table() -> Vec<TypeLayout> {
             env_index,
             run_id,
             incarnation,
+            addressee,
             flags,
+            stage,
+            map,
             episode,
             episode_seed,
             tick,
             sim_time_ns,
-            count,
-            columns,
-            sequence
+            shape,
+            policy_version,
+            meta_messages
         }),
         layout!(TrafficState {
             front_x_m,
@@ -208,6 +209,8 @@ pub fn table() -> Vec<TypeLayout> {
             range_m,
             rays,
             axes,
+            vehicle,
+            azimuths,
             reserved
         }),
         layout!(Progress {
@@ -287,11 +290,16 @@ macro_rules! records {
 }
 
 records!(
+    Collision,
+    EgoPose,
     HeroView,
     LidarPoint,
+    RoutePoint,
     Scan,
+    SensorSwitch,
     SignalMeta,
     SubStep,
+    TrafficState,
     VehicleMeta,
     VehicleState
 );
@@ -309,25 +317,20 @@ pub struct SectionLayout {
     pub shape: Vec<usize>,
 }
 
-/// A payload of several sections, each on a border of [`ALIGNMENT`] bytes.
+/// The payload of a channel: its sections, each on a border of [`ALIGNMENT`] bytes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct PayloadLayout {
     /// Name of the channel.
     pub name: &'static str,
+    /// Names of the dimensions, in the order of the header's shape.
+    pub dimensions: &'static [&'static str],
     /// Its sections, in order.
     pub sections: Vec<SectionLayout>,
 }
 
-/// Every payload of several sections.
+/// The payload of every channel.
 #[must_use]
 pub fn payloads() -> Vec<PayloadLayout> {
-    let payloads = [
-        (Channel::TrafficMeta, TrafficMetaLayout::SECTIONS),
-        (Channel::World, WorldLayout::SECTIONS),
-        (Channel::Observation, ObservationLayout::SECTIONS),
-        (Channel::Prediction, PredictionLayout::SECTIONS),
-        (Channel::Pointcloud, PointcloudLayout::SECTIONS),
-    ];
     let section = |spec: &SectionSpec| {
         let (scalar, shape) = (spec.element)();
         SectionLayout {
@@ -337,11 +340,12 @@ pub fn payloads() -> Vec<PayloadLayout> {
             shape,
         }
     };
-    let rows = payloads.map(|(channel, sections)| PayloadLayout {
-        name: channel.name(),
-        sections: sections.iter().map(section).collect(),
+    let rows = CHANNELS.iter().map(|channel| PayloadLayout {
+        name: channel.name,
+        dimensions: channel.dimensions,
+        sections: channel.sections.iter().map(section).collect(),
     });
-    rows.to_vec()
+    rows.collect()
 }
 
 /// A sensor as other languages know it.

@@ -82,6 +82,43 @@ pub enum Wait {
     Stopped,
 }
 
+/// The required consumers of a channel: the credit that they return, and their wake-ups.
+pub struct RequiredConsumers {
+    boards: Vec<BoardReader>,
+    wakers: Vec<Waker>,
+    /// Ticks that the producer may be ahead of each of them.
+    window: u64,
+}
+
+impl std::fmt::Debug for RequiredConsumers {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let mut debug = f.debug_struct("RequiredConsumers");
+        debug.field("number", &self.boards.len()).field("window", &self.window);
+        debug.finish_non_exhaustive()
+    }
+}
+
+impl RequiredConsumers {
+    /// True if every consumer has credit for `tick`.
+    #[must_use]
+    pub fn have_credit(&self, tick: u64) -> bool {
+        let mut boards = self.boards.iter();
+        boards.all(|board| flow::has_credit(tick, &board.progress(), self.window))
+    }
+
+    /// True if every consumer has consumed all ticks below `ticks`.
+    #[must_use]
+    pub fn have_consumed(&self, ticks: u64) -> bool {
+        let mut boards = self.boards.iter();
+        boards.all(|board| board.progress().consumed_ticks >= ticks)
+    }
+
+    /// Wakes every consumer after a message has been sent.
+    pub fn wake(&self) {
+        self.wakers.iter().for_each(Waker::wake);
+    }
+}
+
 /// One process's part in a run.
 pub struct RunMembership {
     /// What the supervisor said.
@@ -248,11 +285,41 @@ impl RunMembership {
             self.upstream.push(self.waker(channel.producer())?);
         }
         let subscriber = Subscriber::create(&service, channel, &self.run)?;
-        Ok(match (channel, self.process) {
-            // What was sent to the one before this is not for this one.
-            (Channel::Observation, Process::Trainer) => subscriber.since_incarnation(self.incarnation),
-            _ => subscriber,
+        // Refuse what was addressed to an earlier incarnation of this process.
+        Ok(match channel.requires(self.process) {
+            true => subscriber.since_incarnation(self.incarnation),
+            false => subscriber,
         })
+    }
+
+    /// The required consumers of `channel` that the run has.
+    ///
+    /// # Errors
+    /// A service cannot be opened.
+    pub fn required_consumers(&self, channel: Channel) -> Result<RequiredConsumers, MembershipError> {
+        let spec = channel.spec();
+        let present = spec
+            .required
+            .iter()
+            .filter(|process| (process.spec().is_wanted)(&self.run));
+        self.consumers(present.copied(), (spec.window)(&self.run))
+    }
+
+    /// `processes` as consumers, each of which must return credit: the producer may be `window` ticks ahead.
+    ///
+    /// # Errors
+    /// A service cannot be opened.
+    pub fn consumers(
+        &self,
+        processes: impl IntoIterator<Item = Process>,
+        window: u64,
+    ) -> Result<RequiredConsumers, MembershipError> {
+        let (mut boards, mut wakers) = (Vec::new(), Vec::new());
+        for process in processes {
+            boards.push(self.board_of(process)?);
+            wakers.push(self.waker(process)?);
+        }
+        Ok(RequiredConsumers { boards, wakers, window })
     }
 
     /// The end that answers commands.
@@ -398,21 +465,20 @@ impl RunMembership {
         self.stop.load(Ordering::Relaxed)
     }
 
-    /// Waits until `tick` may be sent to `consumer`, or the process is asked to stop.
+    /// Waits until `tick` may be sent to all of `consumers`, or the process is asked to stop.
     ///
     /// # Errors
     /// The wake-up is broken.
-    pub fn wait_for_credit(&self, consumer: &BoardReader, tick: u64) -> Result<Wait, MembershipError> {
-        let window = self.run.window_ticks();
-        self.wait_until(|| flow::has_credit(tick, &consumer.progress(), window))
+    pub fn wait_for_credit(&self, consumers: &RequiredConsumers, tick: u64) -> Result<Wait, MembershipError> {
+        self.wait_until(|| consumers.have_credit(tick))
     }
 
-    /// Waits until `consumer` has consumed all ticks below `ticks`: only then may its producer leave.
+    /// Waits until all of `consumers` have consumed all ticks below `ticks`: only then may their producer leave.
     ///
     /// # Errors
     /// The wake-up is broken.
-    pub fn wait_until_consumed(&self, consumer: &BoardReader, ticks: u64) -> Result<Wait, MembershipError> {
-        self.wait_until(|| consumer.progress().consumed_ticks >= ticks)
+    pub fn wait_until_consumed(&self, consumers: &RequiredConsumers, ticks: u64) -> Result<Wait, MembershipError> {
+        self.wait_until(|| consumers.have_consumed(ticks))
     }
 
     /// Waits until `condition` holds or the process is asked to stop; looks again at every wake-up.

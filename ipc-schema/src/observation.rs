@@ -1,6 +1,6 @@
 //! `observation`: what every connected vehicle senses at a tick, one row for each slot.
 
-use crate::{header::MessageHeader, section::payload_layout};
+use crate::section::payload_layout;
 
 /// `vehicle` value of an empty slot.
 pub const EMPTY_SLOT: u32 = u32::MAX;
@@ -69,11 +69,5 @@ impl ObservationLayout {
     #[must_use]
     pub fn new(n: usize, d: usize, k: usize) -> Self {
         Self::sized(n, d, k)
-    }
-
-    /// Layout of the message with this header.
-    #[must_use]
-    pub fn of(header: &MessageHeader) -> Self {
-        Self::sized(header.count as usize, header.columns as usize, header.sequence as usize)
     }
 }

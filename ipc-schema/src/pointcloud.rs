@@ -1,7 +1,6 @@
 //! `pointcloud`: what one LIDAR has seen during a tick.
 //!
-//! One message for each vehicle that carries a LIDAR and each tick. Its header's `count` is the number of points, `columns` the
-//! number of azimuths fired, `sequence` the dense index of the vehicle; the payload is one [`Scan`], then the points.
+//! One message for each vehicle that carries a LIDAR and each tick. The payload is one [`Scan`], then the points.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -66,7 +65,7 @@ pub struct LidarPoint {
     pub age_us: u32,
 }
 
-/// Where the sensor was, for whoever brings points into the world.
+/// Which sensor it was, and where: what is needed to bring its points into the world.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct Scan {
@@ -84,13 +83,17 @@ pub struct Scan {
     pub rays: u32,
     /// 1 in the paper's axes, 0 with x forward.
     pub axes: u32,
+    /// Dense index of the vehicle within the episode.
+    pub vehicle: u32,
+    /// Azimuths fired.
+    pub azimuths: u32,
     /// Zero.
-    pub reserved: [u32; 4],
+    pub reserved: [u32; 2],
 }
 
 payload_layout! {
     /// Where the arrays of a `pointcloud` message lie.
-    PointcloudLayout(scans, point_count) {
+    PointcloudLayout(point_count, scans) {
         /// `Scan [1]`.
         scan: Scan, [scans];
         /// `LidarPoint [count]`.
@@ -102,6 +105,6 @@ impl PointcloudLayout {
     /// Layout for `count` points.
     #[must_use]
     pub fn new(count: usize) -> Self {
-        Self::sized(1, count)
+        Self::sized(count, 1)
     }
 }

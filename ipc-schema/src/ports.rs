@@ -216,8 +216,10 @@ pub struct Subscriber {
     port: subscriber::Subscriber<Shm, [u8], MessageHeader>,
     channel: Channel,
     run_id: u64,
-    /// The newest incarnation of the sender (`observation`: of the trainer it is meant for); what is older is stale.
+    /// The newest incarnation of the sender; an older message is stale.
     incarnation: AtomicU32,
+    /// The newest incarnation that a message was addressed to; a message to an older one is stale.
+    addressee: AtomicU32,
     refused: AtomicU64,
 }
 
@@ -237,14 +239,15 @@ impl Subscriber {
             channel,
             run_id: run.run_id,
             incarnation: AtomicU32::new(0),
+            addressee: AtomicU32::new(0),
             refused: AtomicU64::new(0),
         })
     }
 
-    /// Refuses messages of incarnations before `incarnation`, also before a newer one has come.
+    /// Refuses messages that are addressed to incarnations before `incarnation`, also before a newer one has come.
     #[must_use]
     pub(crate) fn since_incarnation(self, incarnation: u32) -> Self {
-        self.incarnation.store(incarnation, Ordering::Relaxed);
+        self.addressee.store(incarnation, Ordering::Relaxed);
         self
     }
 
@@ -269,8 +272,11 @@ impl Subscriber {
                     found: header.schema_version,
                 });
             }
+            let is_current =
+                |newest: &AtomicU32, incarnation| incarnation >= newest.fetch_max(incarnation, Ordering::Relaxed);
             if header.run_id == self.run_id
-                && header.incarnation >= self.incarnation.fetch_max(header.incarnation, Ordering::Relaxed)
+                && is_current(&self.incarnation, header.incarnation)
+                && is_current(&self.addressee, header.addressee)
             {
                 return Ok(Some(Message { header, sample }));
             }

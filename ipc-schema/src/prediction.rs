@@ -1,9 +1,6 @@
 //! `prediction`: what the policy makes of an observation and, where the trainer runs it, the Kalman filter beside it.
 
-use crate::{header::MessageHeader, section::payload_layout};
-
-/// Header flag of a `prediction` message whose second section holds the estimates of the filter.
-pub const ESTIMATES: u32 = 1 << 8;
+use crate::section::payload_layout;
 
 /// Number of columns of an estimate: x, y (metres, world frame, rear axle).
 pub const ESTIMATE_COLUMNS: usize = 2;
@@ -13,7 +10,7 @@ payload_layout! {
     PredictionLayout(slots, columns, estimated_slots) {
         /// `f32 [n, a]`: positions (metres, world), or actions in the driving task.
         prediction: f32, [slots, columns];
-        /// `f32 [n, 2]`: position of the extended Kalman filter, not-a-number where it has none; empty without [`ESTIMATES`].
+        /// `f32 [n, 2]`: position of the extended Kalman filter, not-a-number where it has none; empty where the filter does not run.
         estimate_m: [f32; ESTIMATE_COLUMNS], [estimated_slots];
     }
 }
@@ -23,11 +20,5 @@ impl PredictionLayout {
     #[must_use]
     pub fn new(n: usize, a: usize, estimates: bool) -> Self {
         Self::sized(n, a, if estimates { n } else { 0 })
-    }
-
-    /// Layout of the message with this header.
-    #[must_use]
-    pub fn of(header: &MessageHeader) -> Self {
-        Self::new(header.count as usize, header.columns as usize, header.has(ESTIMATES))
     }
 }

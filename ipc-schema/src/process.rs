@@ -1,57 +1,238 @@
-//! The processes of a run, by name.
+//! The processes of a run as a table: one row of [`PROCESSES`] for each. Boards, the roster, wake-ups, starting, restarting and the
+//! status of a run derive from it (decision 23).
 
 use serde::{Deserialize, Serialize};
 
-/// A process that takes part in a run.
+use crate::run::{Mode, RunFile};
+
+/// A process that takes part in a run; its number is its place in [`PROCESSES`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
+#[repr(u8)]
 pub enum Process {
     /// SUMO in-process.
-    TrafficBridge,
+    TrafficBridge = 0,
     /// Dynamics.
-    SimCore,
+    SimCore = 1,
     /// Sensors and observations.
-    SensorDaemon,
+    SensorDaemon = 2,
     /// The learner.
-    Trainer,
+    Trainer = 3,
     /// Shared memory → zenoh.
-    Fanout,
+    Fanout = 4,
+}
+
+/// What a process belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ProcessScope {
+    /// Every environment has its own.
+    Environment,
+    /// There is one for the whole run; it belongs to environment 0.
+    Run,
+}
+
+/// What the end of a process means.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OnExit {
+    /// The run needs it: its end before its work is done ends the run.
+    Required,
+    /// The run needs it, and nothing is lost when it dies: it is replaced, unless it reported a failure.
+    Replace,
+    /// It only watches: it is restarted.
+    Restart,
+}
+
+/// The program of a process. Its one argument is the run file.
+#[derive(Debug, Clone, Copy)]
+pub enum Program {
+    /// The program with the name of the process, beside `caraware`.
+    Binary,
+    /// A Python module.
+    PythonModule(fn(&RunFile) -> &str),
+}
+
+/// One row of [`PROCESSES`].
+#[derive(Debug, Clone, Copy)]
+pub struct ProcessSpec {
+    /// The process.
+    pub process: Process,
+    /// Name in logs, services and the status of a run.
+    pub name: &'static str,
+    /// What it belongs to.
+    pub scope: ProcessScope,
+    /// Processes that must be ready before it is started.
+    pub needs: &'static [Process],
+    /// What its end means.
+    pub on_exit: OnExit,
+    /// Whether a run has it.
+    pub is_wanted: fn(&RunFile) -> bool,
+    /// Whether a tick of a run waits for it.
+    pub holds_up_ticks: fn(&RunFile) -> bool,
+    /// What is started.
+    pub program: Program,
+}
+
+/// The Python module in the trainer's place where nothing learns.
+const PLAYER: &str = "caraware.play";
+
+/// Every process, by [`Process`], in the order of the data and of starting. `traffic-bridge` comes first because a user's files can make
+/// SUMO fail.
+pub const PROCESSES: [ProcessSpec; 5] = [
+    ProcessSpec {
+        process: Process::TrafficBridge,
+        name: "traffic-bridge",
+        scope: ProcessScope::Environment,
+        needs: &[],
+        on_exit: OnExit::Required,
+        is_wanted: |_| true,
+        holds_up_ticks: |_| true,
+        program: Program::Binary,
+    },
+    ProcessSpec {
+        process: Process::SimCore,
+        name: "sim-core",
+        scope: ProcessScope::Environment,
+        needs: &[Process::TrafficBridge],
+        on_exit: OnExit::Required,
+        is_wanted: |_| true,
+        holds_up_ticks: |_| true,
+        program: Program::Binary,
+    },
+    ProcessSpec {
+        process: Process::SensorDaemon,
+        name: "sensor-daemon",
+        scope: ProcessScope::Environment,
+        needs: &[Process::TrafficBridge],
+        on_exit: OnExit::Required,
+        is_wanted: |_| true,
+        holds_up_ticks: |_| true,
+        program: Program::Binary,
+    },
+    ProcessSpec {
+        process: Process::Trainer,
+        name: "trainer",
+        scope: ProcessScope::Run,
+        // Python takes as long to import torch as SUMO to read a large net.
+        needs: &[],
+        on_exit: OnExit::Replace,
+        is_wanted: |run| run.mode.has_trainer(),
+        holds_up_ticks: |run| run.config.drives(),
+        program: Program::PythonModule(|run| match run.mode {
+            Mode::Play => PLAYER,
+            Mode::Train | Mode::Simulate => &run.config.trainer.module,
+        }),
+    },
+    ProcessSpec {
+        process: Process::Fanout,
+        name: "fanout",
+        scope: ProcessScope::Run,
+        // It shows the scene that sim-core has read.
+        needs: &[Process::SimCore],
+        on_exit: OnExit::Restart,
+        is_wanted: |run| run.config.fanout.enabled,
+        holds_up_ticks: |_| false,
+        program: Program::Binary,
+    },
+];
+
+/// Each row stands at the place of its process.
+const _: () = {
+    let mut row = 0;
+    while row < PROCESSES.len() {
+        assert!(PROCESSES[row].process as usize == row);
+        row += 1;
+    }
+};
+
+impl ProcessSpec {
+    /// True if the run is not over before this process is done.
+    #[must_use]
+    pub fn is_required(&self) -> bool {
+        self.on_exit != OnExit::Restart
+    }
+
+    /// What its end means in `run`: of trainers that learn together, none can be replaced in the middle of a step that all take.
+    #[must_use]
+    pub fn on_exit(&self, run: &RunFile) -> OnExit {
+        match self.on_exit {
+            OnExit::Replace if run.config.trainer.ranks > 1 => OnExit::Required,
+            on_exit => on_exit,
+        }
+    }
+
+    /// True if environment `env_index` of `run` has it.
+    #[must_use]
+    pub fn is_in(&self, run: &RunFile, env_index: u32) -> bool {
+        (env_index == 0 || self.scope == ProcessScope::Environment) && (self.is_wanted)(run)
+    }
+
+    /// Its name among those of a run: with the environment, where there are several.
+    #[must_use]
+    pub fn label(&self, run: &RunFile) -> String {
+        match self.scope {
+            ProcessScope::Environment if run.config.run.envs > 1 => format!("{}/{}", self.process, run.env_index),
+            _ => self.process.to_string(),
+        }
+    }
 }
 
 impl Process {
     /// Number of processes.
-    pub const COUNT: usize = Self::ALL.len();
+    pub const COUNT: usize = PROCESSES.len();
 
     /// All processes, in the order of the data.
-    pub const ALL: [Self; 5] = [
-        Self::TrafficBridge,
-        Self::SimCore,
-        Self::SensorDaemon,
-        Self::Trainer,
-        Self::Fanout,
-    ];
+    pub const ALL: [Self; Self::COUNT] = {
+        let mut processes = [PROCESSES[0].process; Self::COUNT];
+        let mut row = 0;
+        while row < Self::COUNT {
+            processes[row] = PROCESSES[row].process;
+            row += 1;
+        }
+        processes
+    };
+
+    /// Its row.
+    #[must_use]
+    pub const fn spec(self) -> &'static ProcessSpec {
+        const ROWS: &[ProcessSpec] = &PROCESSES;
+        &ROWS[self as usize]
+    }
 
     /// Place in [`Process::ALL`].
     #[must_use]
-    pub fn index(self) -> usize {
+    pub const fn index(self) -> usize {
         self as usize
     }
 
-    /// Name as it stands in logs, services and the process table.
+    /// Name as it stands in logs, services and the status of a run.
     #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::TrafficBridge => "traffic-bridge",
-            Self::SimCore => "sim-core",
-            Self::SensorDaemon => "sensor-daemon",
-            Self::Trainer => "trainer",
-            Self::Fanout => "fanout",
-        }
+    pub const fn name(self) -> &'static str {
+        self.spec().name
     }
 }
 
 impl std::fmt::Display for Process {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.pad(self.name())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_has_the_name_of_its_row_in_files_too() {
+        for spec in PROCESSES {
+            let name = serde_json::to_value(spec.process).unwrap();
+            assert_eq!(name, spec.name);
+        }
+    }
+
+    #[test]
+    fn a_process_starts_after_what_it_needs() {
+        for spec in PROCESSES {
+            assert!(spec.needs.iter().all(|need| *need < spec.process), "{}", spec.name);
+        }
     }
 }

@@ -260,12 +260,7 @@ impl RunFile {
     /// True if a tick of this run is due at a time of the clock, and waits for `process`.
     #[must_use]
     pub fn keeps_time(&self, process: Process) -> bool {
-        let waited_for = match process {
-            Process::TrafficBridge | Process::SimCore | Process::SensorDaemon => true,
-            Process::Trainer => self.config.drives(),
-            Process::Fanout => false,
-        };
-        waited_for && self.config.run.real_time_factor > 0.0
+        (process.spec().holds_up_ticks)(self) && self.config.run.real_time_factor > 0.0
     }
 
     /// The same run as environment `env_index` sees it. `self` is environment 0's.

@@ -110,6 +110,8 @@ macro_rules! payload_layout {
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         pub struct $layout {
             $($(#[$doc])* pub $name: $crate::block::Section,)+
+            /// Sizes of the dimensions, as the header carries them.
+            pub shape: [u32; $crate::header::DIMENSIONS],
             /// Length of the payload in bytes.
             pub len: usize,
         }
@@ -124,11 +126,27 @@ macro_rules! payload_layout {
                 },
             )+];
 
-            /// Layout for these dimensions.
+            /// Names of the dimensions, in the order of the header's shape.
+            pub const DIMENSIONS: &'static [&'static str] = &[$(stringify!($dimension)),+];
+
+            /// Layout for these dimensions. Lengths that do not fit into a `usize` saturate: no payload holds them.
             #[must_use]
             pub fn sized($($dimension: usize),+) -> Self {
-                let ([$($name),+], len) = $crate::block::sections([$($($of *)+ size_of::<$element>()),+]);
-                Self { $($name,)+ len }
+                let mut shape = [0; $crate::header::DIMENSIONS];
+                for (place, size) in shape.iter_mut().zip([$($dimension),+]) {
+                    *place = u32::try_from(size).unwrap_or(u32::MAX);
+                }
+                let ([$($name),+], len) = $crate::block::sections([
+                    $(size_of::<$element>()$(.saturating_mul($of))+),+
+                ]);
+                Self { $($name,)+ shape, len }
+            }
+
+            /// Layout of the message with this header.
+            #[must_use]
+            pub fn of(header: &$crate::header::MessageHeader) -> Self {
+                let [$($dimension,)+ ..] = header.shape;
+                Self::sized($($dimension as usize),+)
             }
 
             /// Name and place of every section, in order.

@@ -19,7 +19,7 @@ use crate::{
     channel::FullQueue,
     control::{ControlReply, ControlRequest},
     header::MessageHeader,
-    process::Process,
+    process::{Process, ProcessScope},
     run::{RunFile, SharedMemory},
 };
 
@@ -114,7 +114,7 @@ fn invalid(name: &str) -> impl FnOnce(&dyn std::fmt::Debug) -> ServiceError {
 /// # Errors
 /// The root directory or prefix is unusable.
 pub fn node(memory: &SharedMemory) -> Result<Node<Shm>, ServiceError> {
-    // A supervisor that ends removes the files of the run, from under whoever looks on too; iceoryx2 would warn of each.
+    // A supervisor that ends removes the run's files, also those that a spectator has open; iceoryx2 would warn of each.
     iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Error);
     NodeBuilder::new()
         .config(&ipc_config(memory)?)
@@ -261,9 +261,12 @@ pub fn open_wake(
         .map_err(|e| refused("opening", format!("wake-up of {process}"))(&e))
 }
 
-/// The trainer is one for all environments, and waits for all of them at once: its wake-up is environment 0's.
+/// A process of the whole run waits for all environments at once: its wake-up is that of environment 0.
 fn wake_name(run: &RunFile, env_index: u32, process: Process) -> Result<ServiceName, ServiceError> {
-    let home = if process == Process::Trainer { 0 } else { env_index };
+    let home = match process.spec().scope {
+        ProcessScope::Run => 0,
+        ProcessScope::Environment => env_index,
+    };
     service_name(run, home, &format!("wake/{process}"))
 }
 
@@ -297,7 +300,7 @@ impl ServiceHolder {
             .map(|process| create_board(node, run, env_index, process));
         let wakes = Process::ALL
             .into_iter()
-            .filter(|process| env_index == 0 || *process != Process::Trainer)
+            .filter(|process| env_index == 0 || process.spec().scope == ProcessScope::Environment)
             .map(|process| create_wake(node, run, env_index, process));
         Ok(Self {
             _data: data.collect::<Result<_, _>>()?,

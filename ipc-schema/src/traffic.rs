@@ -204,11 +204,21 @@ pub fn id_text_bytes(id: &str) -> ([u8; ID_BYTES], u32) {
 
 payload_layout! {
     /// Where the arrays of a `traffic-meta` message lie.
-    TrafficMetaLayout(events, changes) {
+    TrafficMetaLayout(events, changes, points) {
         /// `VehicleMeta [events]`: what happened to road users.
         vehicles: VehicleMeta, [events];
         /// `SignalMeta [changes]`: traffic lights that changed.
         signals: SignalMeta, [changes];
+        /// `RoutePoint [points]`: points of heroes' routes. A message that has any has no other rows.
+        route: RoutePoint, [points];
+    }
+}
+
+payload_layout! {
+    /// Where the array of a `traffic` message lies.
+    TrafficLayout(road_users) {
+        /// `TrafficState [road_users]`.
+        states: TrafficState, [road_users];
     }
 }
 
@@ -216,13 +226,11 @@ impl TrafficMetaLayout {
     /// Layout for `vehicles` events of road users and `signals` changes of traffic lights.
     #[must_use]
     pub fn new(vehicles: usize, signals: usize) -> Self {
-        Self::sized(vehicles, signals)
+        Self::sized(vehicles, signals, 0)
     }
 }
 
-/// Header flag of a `traffic-meta` message that carries `[RoutePoint; count]` and nothing else.
-pub const ROUTES: u32 = 1 << 8;
-/// Most points in one such message; longer routes take more messages.
+/// Most points of routes in one message; longer routes take more messages.
 pub const ROUTE_POINTS_PER_MESSAGE: usize = 2048;
 /// [`RoutePoint::signal`] where there is none.
 pub const NO_SIGNAL: u32 = u32::MAX;

@@ -124,7 +124,7 @@ fn a_killed_trainer_is_replaced_again_and_again() {
         );
         let header = MessageHeader {
             tick: 7,
-            incarnation,
+            addressee: incarnation,
             ..sensing.header()
         };
         observations.loan(header, 8).unwrap().send().unwrap();

@@ -103,7 +103,7 @@ impl Corner {
 fn tick(membership: &RunMembership, tick: u64) -> MessageHeader {
     MessageHeader {
         tick,
-        count: 1,
+        shape: [1, 0, 0, 0],
         ..membership.header()
     }
 }
@@ -151,6 +151,48 @@ fn a_producer_waits_for_credit_and_a_full_watcher_only_misses() {
         .collect::<Vec<_>>();
     assert_eq!(seen, (0..6).collect::<Vec<_>>());
     assert_eq!(publisher.drops(), 14);
+}
+
+#[test]
+fn a_tick_is_due_once_every_required_consumer_has_credit_for_it() {
+    let corner = Corner::new(12);
+    let producer = corner.join(Process::SimCore);
+    let [mut first, mut second] = [Process::SensorDaemon, Process::Fanout].map(|process| corner.join(process));
+    let consumers = producer.consumers([Process::SensorDaemon, Process::Fanout], 2).unwrap();
+    first.attach();
+    assert!(!consumers.have_credit(0), "the second is not attached");
+    second.attach();
+    assert!(consumers.have_credit(1) && !consumers.have_credit(2));
+    first.consumed(5);
+    assert!(!consumers.have_credit(2), "the second has consumed nothing");
+    second.consumed(1);
+    assert!(consumers.have_credit(2) && !consumers.have_credit(3));
+    assert!(consumers.have_consumed(1) && !consumers.have_consumed(2));
+    consumers.wake();
+    for woken in [&first, &second] {
+        let before = Instant::now();
+        woken.wait(Duration::from_secs(60)).unwrap();
+        assert!(before.elapsed().as_secs() < 60, "it was woken");
+    }
+}
+
+#[test]
+fn a_message_to_an_earlier_incarnation_is_refused() {
+    let corner = Corner::new(13);
+    let (producer, mut consumer) = (corner.join(Process::SensorDaemon), corner.join(Process::Trainer));
+    let publisher = producer.publisher(Channel::Observation).unwrap();
+    let subscriber = consumer.subscriber(Channel::Observation).unwrap();
+    for (number, addressee) in [(0, 1), (1, 0), (2, 1)] {
+        let header = MessageHeader {
+            addressee,
+            ..tick(&producer, number)
+        };
+        publisher.loan(header, 8).unwrap().send().unwrap();
+    }
+    let ticks: Vec<u64> = std::iter::from_fn(|| subscriber.receive().unwrap())
+        .map(|message| message.header().tick)
+        .collect();
+    assert_eq!((ticks, subscriber.refused()), (vec![0, 2], 1));
 }
 
 #[test]

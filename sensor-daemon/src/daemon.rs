@@ -7,7 +7,7 @@ use ipc_schema::{
     board::State,
     failure::{Failure, FailureKind},
     header::{LAST_OF_RUN, MessageHeader},
-    membership::{RunMembership, Wait},
+    membership::{RequiredConsumers, RunMembership, Wait},
     observation::ObservationLayout,
     ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
@@ -79,6 +79,8 @@ struct Daemon {
     observations: Publisher,
     /// Delivery to the trainer, which must not miss an observation; `None` in a run without a trainer.
     consumer: Option<Delivery>,
+    /// The other required consumers of observations. They receive every tick at least once.
+    other_consumers: RequiredConsumers,
     digest: ObservationDigest,
     /// One more than the newest tick made.
     ticks: u64,
@@ -96,6 +98,10 @@ impl Daemon {
             true => Some(Delivery::open(&membership)?),
             false => None,
         };
+        let required = Channel::Observation.spec().required.iter().copied();
+        let others =
+            required.filter(|process| *process != Process::Trainer && (process.spec().is_wanted)(&membership.run));
+        let other_consumers = membership.consumers(others, membership.run.window_ticks())?;
         membership.attach();
         let (ticks, committed_ticks) = (membership.run.first_tick(), membership.run.committed_ticks());
         Ok(Self {
@@ -105,6 +111,7 @@ impl Daemon {
             switches,
             observations,
             consumer,
+            other_consumers,
             digest: ObservationDigest::default(),
             ticks,
             committed_ticks,
@@ -189,7 +196,10 @@ impl Daemon {
         if let Some(consumer) = &mut self.consumer {
             consumer.update_handover(since);
         }
-        Ok(waited)
+        if waited == Wait::Stopped {
+            return Ok(waited);
+        }
+        Ok(self.membership.wait_for_credit(&self.other_consumers, self.ticks)?)
     }
 
     /// Samples the sensors of the surroundings. It runs before the observation is made, because the observation shows their samples.
@@ -205,20 +215,19 @@ impl Daemon {
 
     /// Samples the sensors into a block of shared memory, adds it to the hash, and sends it or keeps it in the journal.
     fn publish(&mut self, world: &MessageHeader, road_users: &WorldTick, n: usize) -> Result<(), Failure> {
-        let d = self.sensing.width();
+        let layout = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples());
         let ours = self.membership.header();
         let header = MessageHeader {
-            count: n as u32,
-            columns: d as u32,
             run_id: ours.run_id,
-            sequence: self.sensing.imu_samples() as u64,
+            incarnation: ours.incarnation,
+            shape: layout.shape,
             ..*world
         };
         let header = match &self.consumer {
             Some(consumer) => consumer.addressed(header),
             None => header,
         };
-        let mut draft = self.observations.loan(header, ObservationLayout::of(&header).len)?;
+        let mut draft = self.observations.loan(header, layout.len)?;
         self.sensing
             .observe(&header, road_users, draft.payload_mut())
             .map_err(unreadable)?;
@@ -229,6 +238,7 @@ impl Daemon {
         if let Some(consumer) = &self.consumer {
             consumer.wake();
         }
+        self.other_consumers.wake();
         self.report_tick(&header, road_users.states.len());
         Ok(())
     }
@@ -299,15 +309,9 @@ impl Daemon {
     }
 }
 
-fn world_layout(header: &MessageHeader) -> WorldLayout {
-    let count = header.count as usize;
-    let heroes = usize::try_from(header.sequence).unwrap_or(usize::MAX).min(count);
-    WorldLayout::with_heroes(count, header.columns as usize, heroes)
-}
-
 /// The sections of a `world` message.
 fn world_tick<'a>(message: &'a Message, header: &MessageHeader) -> Result<WorldTick<'a>, Failure> {
-    let (payload, layout) = (message.payload(), world_layout(header));
+    let (payload, layout) = (message.payload(), WorldLayout::of(header));
     Ok(WorldTick {
         states: block::view(payload, layout.states).map_err(unreadable)?,
         sub_steps: block::view(payload, layout.sub_steps).map_err(unreadable)?,

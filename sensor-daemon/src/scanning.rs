@@ -86,20 +86,15 @@ impl LidarScanning {
         self.targets.update(states, sub_steps, self.sub_steps);
         let carriers: Vec<(usize, usize)> = sensing.carriers_due(SensorKind::Lidar).collect();
         for (slot, row) in carriers {
-            if let Some(objects) = self.scan_one(header, &states[row], row)? {
+            if let Some(objects) = self.scan_one(header, row)? {
                 sensing.set_objects(slot, objects);
             }
         }
         Ok(())
     }
 
-    fn scan_one(
-        &mut self,
-        header: &MessageHeader,
-        carrier: &VehicleState,
-        row: usize,
-    ) -> Result<Option<[[f32; 2]; 4]>, Failure> {
-        let lidar = &self.lidars[header.map().min(self.lidars.len() - 1)];
+    fn scan_one(&mut self, header: &MessageHeader, row: usize) -> Result<Option<[[f32; 2]; 4]>, Failure> {
+        let lidar = &self.lidars[usize::from(header.map).min(self.lidars.len() - 1)];
         let layout = PointcloudLayout::new(lidar.max_points());
         let mut draft = self.publisher.loan_unwritten(*header, layout.len)?;
         let [head, body] = block::split_mut(draft.payload_mut(), &[layout.scan, layout.points]).map_err(unreadable)?;
@@ -120,9 +115,7 @@ impl LidarScanning {
         self.totals.points += count as u64;
         head.copy_from_slice(bytemuck::bytes_of(&scan));
         *draft.header_mut() = MessageHeader {
-            count: count as u32,
-            columns: lidar.columns() as u32,
-            sequence: u64::from(carrier.vehicle),
+            shape: PointcloudLayout::new(count).shape,
             ..*header
         };
         draft.send()?;

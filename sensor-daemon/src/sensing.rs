@@ -202,7 +202,7 @@ impl Sensing {
     pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
         if header.has(FIRST_OF_EPISODE) {
-            self.enter_stage(header.stage(), header.map());
+            self.enter_stage(header.stage.into(), header.map.into());
             self.suites[self.at].suite.begin_episode(header.episode_seed);
             self.switches.begin_episode();
         }

@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use ipc_schema::{
-    block::{self, BlockError, Section},
-    control::{EVERY_VEHICLE, SWITCHED_ON, SensorSwitch},
+    block::{self, BlockError},
+    control::{EVERY_VEHICLE, SWITCHED_ON, SensorSwitch, SensorSwitchLayout},
     ports::{PortError, Subscriber},
 };
 
@@ -28,11 +28,7 @@ impl SensorSwitches {
     pub fn receive(&mut self, port: &Subscriber) -> Result<Result<(), BlockError>, PortError> {
         while let Some(message) = port.receive()? {
             let header = message.header();
-            let section = Section {
-                offset: 0,
-                len: header.count as usize * size_of::<SensorSwitch>(),
-            };
-            match block::view::<SensorSwitch>(message.payload(), section) {
+            match block::view::<SensorSwitch>(message.payload(), SensorSwitchLayout::of(header).switches) {
                 Ok(switches) => self
                     .waiting
                     .extend(switches.iter().map(|switch| (header.tick, *switch))),

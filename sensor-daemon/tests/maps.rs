@@ -7,7 +7,6 @@ mod common;
 use common::{Run, Tick, cavs, map, quiet};
 use ipc_schema::{
     config::{Config, Field},
-    header::{map_flags, stage_flags},
     run::MapInfo,
 };
 use sensor_daemon::{
@@ -71,14 +70,14 @@ fn an_episode_has_sky_and_projection_of_its_map_and_the_noise_of_its_step() {
     run.sensing.set_sky_of(1, Box::new(Marked(9)));
     let first = run.tick(&cavs(1));
     assert_eq!(seen(&first), (5.0, 5.0, 2.0));
-    let told = [
+    let cases = [
         (1, 1, (9.0, 9.0, 2.0)),
         (2, 1, (9.0, 9.0, 6.0)),
         (1, 0, (5.0, 5.0, 2.0)),
         (0, 0, (5.0, 5.0, 2.0)),
     ];
-    for (step, map, expected) in told {
-        run.restart_in(7, stage_flags(step) | map_flags(map));
+    for (step, map, expected) in cases {
+        run.restart_in(7, step, map);
         run.tick(&cavs(1));
         let tick = run.tick(&cavs(1));
         assert_eq!(seen(&tick), expected, "step {step}, map {map}");
@@ -121,14 +120,14 @@ fn what_came_before_on_another_map_changes_nothing() {
     let maps = maps();
     let sensing = || Run::with(&config, Sensing::on_maps(&config, BOX_M, &maps).unwrap());
     let ticks = |run: &mut Run| -> Vec<u64> { (0..20).flat_map(|_| run.tick(&cavs(3)).bytes().to_vec()).collect() };
-    let on_far = stage_flags(1) | map_flags(1);
-    let after = |before: u32| {
+    // Stage and map before an episode in stage 1 on map 1.
+    let after = |stage: u16, map: u16| {
         let mut run = sensing();
-        run.restart_in(3, before);
+        run.restart_in(3, stage, map);
         ticks(&mut run);
-        run.restart_in(11, on_far);
+        run.restart_in(11, 1, 1);
         ticks(&mut run)
     };
-    assert_eq!(after(stage_flags(1)), after(on_far));
-    assert_eq!(after(stage_flags(2) | map_flags(1)), after(on_far));
+    assert_eq!(after(1, 0), after(1, 1));
+    assert_eq!(after(2, 1), after(1, 1));
 }

@@ -3,15 +3,15 @@
 use std::{path::Path, sync::Arc};
 
 use ipc_schema::{
-    block::{self, BlockError, Section},
+    block::{self, BlockError},
     board::State,
     failure::{Failure, FailureKind},
     header::{LAST_OF_RUN, MessageHeader},
-    membership::{RunMembership, Wait},
-    ports::{BoardReader, Message, PortError, Publisher, Subscriber, Waker},
+    membership::{RequiredConsumers, RunMembership, Wait},
+    ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
     services::Channel,
-    traffic::{Kind, ROUTES, TrafficMetaLayout, TrafficState},
+    traffic::{Kind, TrafficLayout, TrafficMetaLayout, TrafficState},
     world::WorldLayout,
 };
 
@@ -74,8 +74,8 @@ struct CoreProcess {
     scenes: Vec<Arc<Scene>>,
     contacts: Option<ContactReporter>,
     world: Publisher,
-    consumer: BoardReader,
-    consumer_wake: Waker,
+    /// The required consumers of `world`.
+    consumers: RequiredConsumers,
     /// Ticks sent.
     ticks: u64,
     vehicle_steps: u64,
@@ -84,8 +84,7 @@ struct CoreProcess {
 impl CoreProcess {
     fn open(mut membership: RunMembership, metas: Subscriber) -> Result<Self, Failure> {
         let world = membership.publisher(Channel::World)?;
-        let consumer = membership.board_of(Process::SensorDaemon)?;
-        let consumer_wake = membership.waker(Process::SensorDaemon)?;
+        let consumers = membership.required_consumers(Channel::World)?;
         let scenes = Scene::of_every_map(&membership.run)?;
         let contacts = ContactReporter::open(&membership, &scenes)?;
         // Viewers see the run's own map, and heroes have no other.
@@ -108,8 +107,7 @@ impl CoreProcess {
             scenes,
             contacts,
             world,
-            consumer,
-            consumer_wake,
+            consumers,
             ticks,
             vehicle_steps: 0,
         })
@@ -129,13 +127,14 @@ impl CoreProcess {
             }
             .into());
         }
-        self.apply_metas(header.sequence)?;
-        let states: &[TrafficState] = rows(frame).map_err(unreadable)?;
+        self.apply_metas(header.meta_messages)?;
+        let states: &[TrafficState] =
+            block::view(frame.payload(), TrafficLayout::of(&header).states).map_err(unreadable)?;
         self.mirror.accept(&header, states).map_err(unmirrored)?;
         for tick in 0..u32::try_from(ticks_per_step).unwrap_or(u32::MAX) {
             if self
                 .membership
-                .wait_for_credit(&self.consumer, first_tick + u64::from(tick))?
+                .wait_for_credit(&self.consumers, first_tick + u64::from(tick))?
                 == Wait::Stopped
             {
                 return Ok(Wait::Stopped);
@@ -150,14 +149,14 @@ impl CoreProcess {
         Ok(Wait::Ready)
     }
 
-    /// Applies announcements up to the one that belongs to the current frame; they were sent before it.
-    fn apply_metas(&mut self, sequence: u64) -> Result<(), Failure> {
-        while self.meta_messages < sequence {
+    /// Applies announcements up to number `newest`, the last one before the current frame; all were sent before it.
+    fn apply_metas(&mut self, newest: u64) -> Result<(), Failure> {
+        while self.meta_messages < newest {
             let Some(message) = self.membership.next(&self.metas)? else {
                 return Ok(());
             };
             self.meta_messages += 1;
-            let received = message.header().sequence;
+            let received = message.header().meta_messages;
             if received != self.meta_messages {
                 return Err(PortError::Gap {
                     channel: "traffic-meta",
@@ -173,13 +172,15 @@ impl CoreProcess {
 
     fn apply_meta(&mut self, message: &Message) -> Result<(), Failure> {
         let header = message.header();
-        if header.has(ROUTES) {
+        let layout = TrafficMetaLayout::of(header);
+        // A message with points of routes has nothing else.
+        let points = block::view(message.payload(), layout.route).map_err(unreadable)?;
+        if !points.is_empty() {
             if let Some(actions) = &mut self.actions {
-                actions.add_route(header, rows(message).map_err(unreadable)?);
+                actions.add_route(header, points);
             }
             return Ok(());
         }
-        let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
         let vehicles = block::view(message.payload(), layout.vehicles).map_err(unreadable)?;
         self.mirror.apply_meta(header, vehicles).map_err(unmirrored)?;
         for class in self.mirror.take_unknown_classes() {
@@ -193,10 +194,7 @@ impl CoreProcess {
             contacts.remember_ids(header, vehicles);
         }
         if let Some(actions) = &mut self.actions {
-            let signals = match header.columns {
-                0 => &[],
-                _ => block::view(message.payload(), layout.signals).map_err(unreadable)?,
-            };
+            let signals = block::view(message.payload(), layout.signals).map_err(unreadable)?;
             actions.add_metas(header, vehicles, signals);
         }
         Ok(())
@@ -208,17 +206,14 @@ impl CoreProcess {
             Some(_) => states.iter().filter(|state| state.kind == Kind::Hero as u32).count(),
             None => 0,
         };
-        let ours = self.membership.header();
+        let (ours, settings) = (self.membership.header(), self.mirror.settings());
+        let layout = WorldLayout::with_heroes(count, settings.sub_steps as usize, heroes);
         let header = MessageHeader {
             run_id: ours.run_id,
             incarnation: ours.incarnation,
-            sequence: heroes as u64,
-            ..self
-                .mirror
-                .settings()
-                .tick_header(frame, tick, u32::try_from(count).unwrap_or(u32::MAX))
+            shape: layout.shape,
+            ..settings.tick_header(frame, tick)
         };
-        let layout = WorldLayout::with_heroes(count, header.columns as usize, heroes);
         let mut draft = match &self.actions {
             // Heroes' views are written only where there is something to see, so the loan is zeroed.
             Some(_) => self.world.loan(header, layout.len)?,
@@ -233,7 +228,7 @@ impl CoreProcess {
             None => Vec::new(),
         };
         draft.send()?;
-        self.consumer_wake.wake();
+        self.consumers.wake();
         if let Some(actions) = &self.actions {
             actions.send_poses(&header, &poses)?;
         }
@@ -252,7 +247,7 @@ impl CoreProcess {
             health.ticks = ticks;
             health.episode = header.episode;
             health.sim_time_ns = header.sim_time_ns;
-            health.road_users = header.count;
+            health.road_users = header.shape[0];
             health.cavs = cavs as u32;
             health.vehicle_steps = vehicle_steps;
             health.drops = drops;
@@ -263,7 +258,7 @@ impl CoreProcess {
     /// Leaves once everything sent has been consumed.
     fn leave(mut self) -> Result<(), Failure> {
         self.write_report()?;
-        if self.membership.wait_until_consumed(&self.consumer, self.ticks)? == Wait::Ready {
+        if self.membership.wait_until_consumed(&self.consumers, self.ticks)? == Wait::Ready {
             self.membership.report(|health| health.state = State::Done as u32);
         }
         Ok(())
@@ -294,17 +289,6 @@ fn draw_chart(membership: &RunMembership, scene: &Scene) -> Result<(), Failure> 
         Failure::new(FailureKind::Run, format!("cannot write {}: {error}", path.display()))
             .with_help("check free space and permissions of the run directory")
     })
-}
-
-/// The payload as `count` rows.
-fn rows<T: bytemuck::Pod>(message: &Message) -> Result<&[T], BlockError> {
-    block::view(
-        message.payload(),
-        Section {
-            offset: 0,
-            len: message.header().count as usize * size_of::<T>(),
-        },
-    )
 }
 
 fn unreadable(error: BlockError) -> Failure {

@@ -29,16 +29,19 @@ fn every_tick_gets_its_own_header() {
         tick: 43,
         sim_time_ns: 5_000_000_000,
         flags: EVALUATION | FIRST_OF_EPISODE | LAST_OF_EPISODE | LAST_OF_RUN,
+        stage: 2,
+        map: 1,
+        meta_messages: 9,
         ..MessageHeader::default()
     };
-    let headers: Vec<MessageHeader> = (0..4).map(|t| settings(0.25, 5, 4).tick_header(&frame, t, 7)).collect();
+    let headers: Vec<MessageHeader> = (0..4).map(|t| settings(0.25, 5, 4).tick_header(&frame, t)).collect();
     assert_eq!(headers.iter().map(|h| h.tick).collect::<Vec<_>>(), [40, 41, 42, 43]);
     let times: Vec<u64> = headers.iter().map(|h| h.sim_time_ns / 1_000_000).collect();
     assert_eq!(times, [4250, 4500, 4750, 5000]);
     let flags: Vec<u32> = headers.iter().map(|h| h.flags).collect();
     let last = EVALUATION | LAST_OF_EPISODE | LAST_OF_RUN;
     assert_eq!(flags, [EVALUATION | FIRST_OF_EPISODE, EVALUATION, EVALUATION, last]);
-    assert!(headers.iter().all(|h| h.count == 7 && h.columns == 5));
+    assert!(headers.iter().all(|h| (h.stage, h.map, h.meta_messages) == (2, 1, 0)));
 }
 
 #[test]

@@ -12,9 +12,9 @@ use std::{
 use ipc_schema::{
     SCHEMA_VERSION, block,
     config::Config,
-    event::{Collision, Struck},
+    event::{Collision, CollisionLayout, Struck},
     failure::{Failure, FailureKind},
-    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader, map_flags},
+    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::RunMembership,
     ports::{Message, Publisher, Subscriber},
     process::Process,
@@ -162,7 +162,7 @@ fn drive(run: &Run, ticks: u64) -> (Vec<VehicleState>, Vec<(u64, Collision)>) {
 }
 
 /// The same on a map of the run.
-fn drive_on(run: &Run, ticks: u64, map: u8) -> (Vec<VehicleState>, Vec<(u64, Collision)>) {
+fn drive_on(run: &Run, ticks: u64, map: u16) -> (Vec<VehicleState>, Vec<(u64, Collision)>) {
     let bridge = run.join(Process::TrafficBridge);
     let mut daemon = run.join(Process::SensorDaemon);
     let (traffic, metas) = (
@@ -184,11 +184,10 @@ fn drive_on(run: &Run, ticks: u64, map: u8) -> (Vec<VehicleState>, Vec<(u64, Col
         let header = MessageHeader {
             tick,
             sim_time_ns: (tick + 1) * 100_000_000,
-            sequence: 1,
-            count: 1,
-            flags: flag(FIRST_OF_EPISODE, tick == 0)
-                | flag(LAST_OF_EPISODE | LAST_OF_RUN, tick + 1 == ticks)
-                | map_flags(map),
+            shape: [1, 0, 0, 0],
+            meta_messages: 1,
+            flags: flag(FIRST_OF_EPISODE, tick == 0) | flag(LAST_OF_EPISODE | LAST_OF_RUN, tick + 1 == ticks),
+            map,
             ..bridge.header()
         };
         if tick == 0 {
@@ -199,7 +198,14 @@ fn drive_on(run: &Run, ticks: u64, map: u8) -> (Vec<VehicleState>, Vec<(u64, Col
             block::view_mut(bytes, layout.vehicles).unwrap()[0] = departure();
             let light: &mut [SignalMeta] = block::view_mut(bytes, layout.signals).unwrap();
             light[0].links = 3;
-            send(&metas, MessageHeader { columns: 1, ..header }, bytes);
+            send(
+                &metas,
+                MessageHeader {
+                    shape: layout.shape,
+                    ..header
+                },
+                bytes,
+            );
         }
         let state = TrafficState {
             front_x_m: 5.0 + SPEED_MPS * 0.1 * tick as f64,
@@ -210,12 +216,12 @@ fn drive_on(run: &Run, ticks: u64, map: u8) -> (Vec<VehicleState>, Vec<(u64, Col
         send(&traffic, header, bytemuck::bytes_of(&state));
         let message = next(&world);
         let header = *message.header();
-        let layout = WorldLayout::new(header.count as usize, header.columns as usize);
+        let layout = WorldLayout::of(&header);
         states.extend_from_slice(block::view::<VehicleState>(message.payload(), layout.states).unwrap());
         drop(message);
         while let Some(message) = events.receive().unwrap() {
-            let rows: &[Collision] = bytemuck::cast_slice(message.payload());
-            assert_eq!(rows.len(), message.header().count as usize);
+            let contacts = CollisionLayout::of(message.header()).collisions;
+            let rows: &[Collision] = block::view(message.payload(), contacts).unwrap();
             collisions.extend(rows.iter().map(|row| (message.header().tick, *row)));
         }
         daemon.consumed(tick + 1);

@@ -9,25 +9,19 @@ use ipc_schema::{
     board::State,
     failure::Failure,
     ports::{BoardReader, ControlClient},
-    process::Process,
+    process::{OnExit, PROCESSES, Process, ProcessScope, ProcessSpec},
     run::RunFile,
     services::{self, RunNode},
 };
 use rustix::process::Signal;
 
-use crate::{
-    cores,
-    environment::Environment,
-    failure::Exit,
-    install::Install,
-    process_table::{OnExit, PROCESSES, ProcessRow, RunningProcess, Scope},
-};
+use crate::{cores, environment::Environment, failure::Exit, install::Install, running_process::RunningProcess};
 
 /// A process that has ended.
 #[derive(Debug, Clone, Copy)]
 pub struct EndedProcess {
     /// Its row.
-    pub row: &'static ProcessRow,
+    pub row: &'static ProcessSpec,
     /// Its exit status.
     pub status: ExitStatus,
     /// True if its board says that its work is done.
@@ -131,7 +125,7 @@ impl RunProcesses {
     }
 
     /// Every process that the run has: its row and its environment.
-    fn wanted(&self) -> impl Iterator<Item = (&'static ProcessRow, &Environment)> {
+    fn wanted(&self) -> impl Iterator<Item = (&'static ProcessSpec, &Environment)> {
         self.environments.iter().flat_map(|environment| {
             let run = &environment.run;
             let rows = PROCESSES.iter().filter(|row| row.is_in(run, run.env_index));
@@ -139,21 +133,21 @@ impl RunProcesses {
         })
     }
 
-    fn is_started(&self, row: &ProcessRow, env_index: u32) -> bool {
+    fn is_started(&self, row: &ProcessSpec, env_index: u32) -> bool {
         self.running
             .iter()
             .any(|running| running.row.process == row.process && running.env_index == env_index)
     }
 
     /// A process of the whole run needs the processes of every environment; another process only those of its own.
-    fn may_start(&self, row: &ProcessRow, environment: &Environment) -> bool {
+    fn may_start(&self, row: &ProcessSpec, environment: &Environment) -> bool {
         let is_up = |environment: &Environment| {
             let mut needs = row.needs.iter();
             needs.all(|need| environment.state_of(*need) != State::Starting)
         };
         match row.scope {
-            Scope::Run => self.environments.iter().all(is_up),
-            Scope::Environment => is_up(environment),
+            ProcessScope::Run => self.environments.iter().all(is_up),
+            ProcessScope::Environment => is_up(environment),
         }
     }
 
@@ -162,7 +156,7 @@ impl RunProcesses {
     /// # Errors
     /// A program is missing or cannot be started.
     pub fn start_due(&mut self) -> Result<(), Exit> {
-        let due: Vec<(&'static ProcessRow, u32)> = self
+        let due: Vec<(&'static ProcessSpec, u32)> = self
             .wanted()
             .filter(|(row, environment)| !self.is_started(row, environment.run.env_index))
             .filter(|(row, environment)| self.may_start(row, environment))
@@ -176,7 +170,7 @@ impl RunProcesses {
     }
 
     /// Starts the process of `row` in its environment, on the cores that are planned for it.
-    fn start(&self, row: &'static ProcessRow, env_index: u32, incarnation: u32) -> Result<RunningProcess, Exit> {
+    fn start(&self, row: &'static ProcessSpec, env_index: u32, incarnation: u32) -> Result<RunningProcess, Exit> {
         let environment = &self.environments[env_index as usize];
         cores::within(self.cores_of(row, env_index), || {
             RunningProcess::start(row, &self.install, &environment.run, &environment.run_file, incarnation)
@@ -208,11 +202,11 @@ impl RunProcesses {
         self.running[index] = successor;
     }
 
-    fn cores_of(&self, row: &ProcessRow, env_index: u32) -> Option<&[usize]> {
+    fn cores_of(&self, row: &ProcessSpec, env_index: u32) -> Option<&[usize]> {
         let plan = self.cores.as_ref()?;
         match row.scope {
-            Scope::Environment => plan.environments.get(env_index as usize).map(Vec::as_slice),
-            Scope::Run => Some(&plan.rest),
+            ProcessScope::Environment => plan.environments.get(env_index as usize).map(Vec::as_slice),
+            ProcessScope::Run => Some(&plan.rest),
         }
     }
 
@@ -274,10 +268,10 @@ impl RunProcesses {
 
     /// Makes this incarnation of a process the valid one in every environment it belongs to. False if the run holds no more.
     #[must_use]
-    pub fn set_incarnation(&mut self, row: &ProcessRow, env_index: u32, incarnation: u32) -> bool {
+    pub fn set_incarnation(&mut self, row: &ProcessSpec, env_index: u32, incarnation: u32) -> bool {
         let places = self.environments.iter_mut().filter(|environment| match row.scope {
-            Scope::Run => true,
-            Scope::Environment => environment.run.env_index == env_index,
+            ProcessScope::Run => true,
+            ProcessScope::Environment => environment.run.env_index == env_index,
         });
         let mut set = places.map(|environment| environment.roster.set(row.process, incarnation));
         set.all(|is_set| is_set)
@@ -285,18 +279,18 @@ impl RunProcesses {
 
     /// The first required process that is not ready, with its environment.
     #[must_use]
-    pub fn first_not_ready(&self) -> Option<(&'static ProcessRow, &Environment)> {
+    pub fn first_not_ready(&self) -> Option<(&'static ProcessSpec, &Environment)> {
         self.wanted()
             .filter(|(row, _)| row.is_required())
             .find(|(row, environment)| self.is_starting(row, environment))
     }
 
     /// A required process of the whole run is ready once it is ready in every environment.
-    fn is_starting(&self, row: &ProcessRow, environment: &Environment) -> bool {
+    fn is_starting(&self, row: &ProcessSpec, environment: &Environment) -> bool {
         let starts = |environment: &Environment| environment.state_of(row.process) == State::Starting;
         match row.scope {
-            Scope::Run => self.environments.iter().any(starts),
-            Scope::Environment => starts(environment),
+            ProcessScope::Run => self.environments.iter().any(starts),
+            ProcessScope::Environment => starts(environment),
         }
     }
 

@@ -6,17 +6,13 @@ use ipc_schema::{
     board::{Health, Progress, State},
     metric,
     ports::BoardReader,
-    process::Process,
+    process::{PROCESSES, Process, ProcessScope},
     run::RunFile,
     services,
 };
 use rustix::process::{Pid, Signal, kill_process};
 
-use crate::{
-    failure::Exit,
-    process_table::{PROCESSES, Scope},
-    registry,
-};
+use crate::{failure::Exit, registry};
 
 /// Time over which `ps` measures rates.
 const RATE_OVER: Duration = Duration::from_millis(500);
@@ -55,7 +51,7 @@ struct ProcessBoard {
     label: String,
     process: Process,
     env_index: u32,
-    scope: Scope,
+    scope: ProcessScope,
     board: BoardReader,
 }
 
@@ -93,7 +89,7 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
             });
         }
     }
-    boards.sort_by_key(|seat| seat.scope == Scope::Run);
+    boards.sort_by_key(|seat| seat.scope == ProcessScope::Run);
     let first = look(&boards);
     wait(RATE_OVER);
     let second = look(&boards);

@@ -10,7 +10,7 @@ use std::{
 use ipc_schema::{
     board::INCARNATIONS,
     failure::{Failure, FailureKind},
-    process::Process,
+    process::{OnExit, Process},
     run::RunFile,
 };
 use signal_hook::{
@@ -24,7 +24,6 @@ use crate::{
     failure::Exit,
     handover::Handovers,
     install::Install,
-    process_table::OnExit,
     processes::{EndedProcess, RunProcesses},
     registry::RunClaim,
     restart::{RestartVerdict, TrainerRestarts, WatcherRestarts},

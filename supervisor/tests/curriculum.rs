@@ -263,10 +263,10 @@ fn vehicles_are_on_the_map_that_their_tick_says() {
         let truth: &[[f32; 4]] = block::view(message.payload(), layout.truth).unwrap();
         let flags: &[u32] = block::view(message.payload(), layout.flags).unwrap();
         for ([x_m, y_m, ..], _) in truth.iter().zip(flags).filter(|(_, flags)| **flags & VALID != 0) {
-            rows[header.map()][0] += 1;
-            rows[header.map()][1] += u32::from(is_on_the_grid([*x_m, *y_m]));
+            rows[usize::from(header.map)][0] += 1;
+            rows[usize::from(header.map)][1] += u32::from(is_on_the_grid([*x_m, *y_m]));
             assert!(
-                header.map() == 1 || *x_m < 260.0 && *y_m < 260.0,
+                header.map == 1 || *x_m < 260.0 && *y_m < 260.0,
                 "{x_m} {y_m} is not in the town"
             );
         }

@@ -13,7 +13,6 @@ use std::{collections::BTreeMap, process::Stdio};
 use common::{Spectator, Workplace};
 use ipc_schema::{
     block,
-    header::MessageHeader,
     pointcloud::{GROUND, LidarPoint, PointcloudLayout, STATIC_OBJECT, Scan, Tag},
     services::Channel,
     world::{VehicleState, WorldLayout},
@@ -21,14 +20,13 @@ use ipc_schema::{
 
 /// A scan as it came, with everybody at the end of its tick.
 struct Seen {
-    header: MessageHeader,
     scan: Scan,
     points: Vec<LidarPoint>,
 }
 
 /// Scans by tick and vehicle, and road users by tick.
 struct Watched {
-    scans: BTreeMap<(u64, u64), Seen>,
+    scans: BTreeMap<(u64, u32), Seen>,
     world: BTreeMap<u64, Vec<VehicleState>>,
 }
 
@@ -66,18 +64,17 @@ fn watch(workplace: &Workplace, name: &str, settings: &[&str]) -> Watched {
         let mut news = 0;
         while let Some(message) = clouds.receive().unwrap() {
             let header = *message.header();
-            let layout = PointcloudLayout::new(header.count as usize);
+            let layout = PointcloudLayout::of(&header);
             let seen = Seen {
-                header,
                 scan: block::view::<Scan>(message.payload(), layout.scan).unwrap()[0],
                 points: block::view(message.payload(), layout.points).unwrap().to_vec(),
             };
-            watched.scans.insert((header.tick, header.sequence), seen);
+            watched.scans.insert((header.tick, seen.scan.vehicle), seen);
             news += 1;
         }
         while let Some(message) = world.receive().unwrap() {
             let header = *message.header();
-            let layout = WorldLayout::new(header.count as usize, header.columns as usize);
+            let layout = WorldLayout::of(&header);
             let states = block::view(message.payload(), layout.states).unwrap().to_vec();
             watched.world.insert(header.tick, states);
             news += 1;
@@ -140,10 +137,7 @@ fn points_lie_on_what_they_name_and_the_report_counts_them() {
         let Some(states) = watched.world.get(tick) else {
             continue;
         };
-        let carrier = states
-            .iter()
-            .find(|state| u64::from(state.vehicle) == seen.header.sequence)
-            .unwrap();
+        let carrier = states.iter().find(|state| state.vehicle == seen.scan.vehicle).unwrap();
         assert_eq!(carrier.id_hash, seen.scan.id_hash);
         assert_eq!(seen.scan.rays, 57_600);
         for point in &seen.points {
@@ -152,7 +146,7 @@ fn points_lie_on_what_they_name_and_the_report_counts_them() {
             if point.object == GROUND {
                 assert!(at[2].abs() < 2e-3, "ground at {at:?}");
             } else if point.object & STATIC_OBJECT == 0 {
-                assert_ne!(u64::from(point.object), seen.header.sequence, "its own body");
+                assert_ne!(point.object, seen.scan.vehicle, "its own body");
                 let hit = states.iter().find(|state| state.vehicle == point.object).unwrap();
                 if point.tag == Tag::Vehicle as u16 {
                     let out_m = outside_m(hit, at);

@@ -98,7 +98,7 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
     let predictions = spectator.subscribe(Channel::Prediction);
     let message = caught(&mut run, "a prediction", || predictions.receive().unwrap());
     assert_eq!(
-        (message.header().columns, message.header().sequence),
+        (message.header().shape[1], message.header().policy_version),
         (2, 2),
         "policy version 2"
     );

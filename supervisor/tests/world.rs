@@ -54,10 +54,10 @@ fn receive(run_file: &Path, run: &mut Child) -> Vec<Vec<Moved>> {
         let message = caught(run, "a tick", || world.receive().unwrap());
         let header = *message.header();
         assert_eq!(header.tick, ticks.len() as u64, "a tick was missed");
-        let layout = WorldLayout::new(header.count as usize, header.columns as usize);
+        let layout = WorldLayout::of(&header);
         let states: &[VehicleState] = block::view(message.payload(), layout.states).unwrap();
         let rows: &[SubStep] = block::view(message.payload(), layout.sub_steps).unwrap();
-        let rows = rows.chunks(header.columns as usize).map(<[SubStep]>::to_vec);
+        let rows = rows.chunks(header.shape[1] as usize).map(<[SubStep]>::to_vec);
         ticks.push(states.iter().copied().zip(rows).collect());
         if header.has(LAST_OF_RUN) {
             drop(message);

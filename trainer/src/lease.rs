@@ -11,7 +11,7 @@ use std::{
 
 use ipc_schema::{
     clock::monotonic_ns,
-    header::{self, MessageHeader},
+    header::{self, DIMENSIONS, MessageHeader},
     observation::ObservationLayout,
     ports::Message,
 };
@@ -22,8 +22,8 @@ use crate::{Attachment, POLLS, checked_layout, failed};
 /// Longest time that it looks without letting other threads of Python run: a fifth of the time that they leave each other.
 const KEEPS_PYTHON: Duration = Duration::from_millis(1);
 
-/// Where a message lies and how it is laid out: address, slots, fields, IMU samples.
-type Place = (usize, u32, u32, u64);
+/// Where a message lies and how it is laid out: address and shape.
+type MessagePlace = (usize, [u32; DIMENSIONS]);
 
 /// The newest message, and until the next is asked for the one before it: nobody has to wait while a place is given back. While a
 /// message is held, its publisher's memory stays mapped, that of all earlier messages included: whoever has a tensor over any of them
@@ -34,7 +34,7 @@ struct Lent {
     header: MessageHeader,
     received_ns: u64,
     /// The one used last first: a publisher takes the place that has become free last.
-    tensors: Vec<(Place, Py<PyAny>)>,
+    tensors: Vec<(MessagePlace, Py<PyAny>)>,
 }
 
 /// The observations of an attachment, one at a time.
@@ -152,7 +152,7 @@ impl Lease {
         let received_ns = monotonic_ns();
         let header = *message.header();
         let address = message.payload().as_ptr().expose_provenance();
-        let place = (address, header.count, header.columns, header.sequence);
+        let place = (address, header.shape);
         let known = {
             let mut lent = lock(&self.lent);
             (lent.header, lent.received_ns) = (header, received_ns);
@@ -169,7 +169,7 @@ impl Lease {
         let layout = checked_layout(&message)?;
         let view = LentView::new(Arc::clone(&self.held), address, layout);
         hold(&self.held, message);
-        let tensor = self.make.call1(py, (view, header.count, header.columns))?;
+        let tensor = self.make.call1(py, (view, header.shape[0], header.shape[1]))?;
         let tensors = &mut lock(&self.lent).tensors;
         // Of a place that is laid out anew, with more slots, the old tensor is of no more use.
         tensors.retain(|((known, ..), _)| *known != address);

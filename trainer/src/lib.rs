@@ -15,7 +15,7 @@ use ipc_schema::{
     metric::{self, METRICS},
     observation::ObservationLayout,
     ports::{BoardReader, Message, Publisher, Subscriber, Waker},
-    prediction::{ESTIMATES, PredictionLayout},
+    prediction::PredictionLayout,
     process::Process,
     run::RunFile,
     sensor::SensorKind,
@@ -230,7 +230,9 @@ impl Attachment {
         policy_version: u64,
         estimates: Option<&[u8]>,
     ) -> PyResult<()> {
-        let expected = block.header.count as usize * columns as usize * size_of::<f32>();
+        let slots = block.header.rows();
+        let layout = PredictionLayout::new(slots, columns as usize, estimates.is_some());
+        let expected = layout.prediction.len;
         if rows.len() != expected {
             return Err(PyValueError::new_err(format!(
                 "predictions have {} bytes, [n, columns] of f32 has {expected}",
@@ -238,14 +240,11 @@ impl Attachment {
             )));
         }
         let inner = self.lock()?;
-        let answered = answer(inner.membership.header(), &block.header);
         let header = MessageHeader {
-            columns,
-            sequence: policy_version,
-            flags: answered.flags | if estimates.is_some() { ESTIMATES } else { 0 },
-            ..answered
+            shape: layout.shape,
+            policy_version,
+            ..answer(inner.membership.header(), &block.header)
         };
-        let layout = PredictionLayout::of(&header);
         if let Some(estimates) = estimates
             && estimates.len() != layout.estimate_m.len
         {
@@ -392,15 +391,16 @@ fn unknown_metric(name: &str) -> PyErr {
     PyValueError::new_err(format!("no metric is called {name:?}; there are: {}", known.join(", ")))
 }
 
-/// The header of an answer to `question`: our identity, its episode, tick, time and count.
+/// The header of an answer to `question`: our identity, its episode, stage, map, tick and time.
 fn answer(ours: MessageHeader, question: &MessageHeader) -> MessageHeader {
     MessageHeader {
         flags: question.flags,
+        stage: question.stage,
+        map: question.map,
         episode: question.episode,
         episode_seed: question.episode_seed,
         tick: question.tick,
         sim_time_ns: question.sim_time_ns,
-        count: question.count,
         ..ours
     }
 }
@@ -410,11 +410,10 @@ fn checked_layout(message: &Message) -> PyResult<ObservationLayout> {
     let header = message.header();
     let layout = ObservationLayout::of(header);
     if layout.len > message.payload().len() {
+        let [slots, fields, ..] = header.shape;
         return Err(PyValueError::new_err(format!(
-            "tick {}: {} slots of {} fields need {} bytes, the message has {}",
+            "tick {}: {slots} slots of {fields} fields need {} bytes, the message has {}",
             header.tick,
-            header.count,
-            header.columns,
             layout.len,
             message.payload().len()
         )));
@@ -475,19 +474,19 @@ impl ObservationBlock {
     /// Number of slots n.
     #[getter]
     fn slots(&self) -> u32 {
-        self.header.count
+        self.header.shape[0]
     }
 
     /// Number of fields d.
     #[getter]
     fn fields(&self) -> u32 {
-        self.header.columns
+        self.header.shape[1]
     }
 
     /// Number of IMU samples k.
     #[getter]
-    fn imu_samples(&self) -> usize {
-        self.header.sequence as usize
+    fn imu_samples(&self) -> u32 {
+        self.header.shape[2]
     }
 
     /// True in an evaluation episode.
@@ -510,8 +509,8 @@ impl ObservationBlock {
 
     /// Stage of the curriculum, counted from 1; 0 without one, and in evaluations.
     #[getter]
-    fn stage(&self) -> usize {
-        self.header.stage()
+    fn stage(&self) -> u16 {
+        self.header.stage
     }
 
     /// True for the last tick of the run.
@@ -535,10 +534,11 @@ impl ObservationBlock {
             .zip(block.layout.named())
             .find(|(spec, _)| spec.name == name)
             .ok_or_else(|| PyKeyError::new_err(name.to_owned()))?;
-        let shape = spec.shape(|dimension| match dimension {
-            "slots" => block.header.count as usize,
-            "fields" => block.header.columns as usize,
-            _ => block.header.sequence as usize,
+        let shape = spec.shape(|dimension| {
+            let mut sizes = ObservationLayout::DIMENSIONS.iter().zip(block.header.shape);
+            sizes
+                .find(|(name, _)| **name == dimension)
+                .map_or(0, |(_, size)| size as usize)
         });
         Ok(SectionView::new(slf.unbind(), section, (spec.element)().0, shape))
     }

@@ -1,12 +1,19 @@
 //! LIDAR scans for Python: copied out of shared memory, so that nobody holds up the next one.
 
-use ipc_schema::{block, header::MessageHeader, pointcloud::PointcloudLayout, ports::Message};
+use ipc_schema::{
+    block::{self, BlockError},
+    header::MessageHeader,
+    pointcloud::{PointcloudLayout, Scan},
+    ports::Message,
+};
 use pyo3::{exceptions::PyValueError, prelude::*, types::PyBytes};
 
 /// What one LIDAR has seen during a tick.
 #[pyclass(frozen, module = "caraware._native")]
 pub(crate) struct PointCloud {
     header: MessageHeader,
+    /// Dense index of the vehicle within the episode.
+    vehicle: u32,
     scan: Py<PyBytes>,
     points: Py<PyBytes>,
 }
@@ -14,18 +21,27 @@ pub(crate) struct PointCloud {
 impl PointCloud {
     pub(crate) fn new(py: Python<'_>, message: &Message) -> PyResult<Self> {
         let header = *message.header();
-        let layout = PointcloudLayout::new(header.count as usize);
+        let layout = PointcloudLayout::of(&header);
         let bytes = |section| {
             block::view::<u8>(message.payload(), section)
                 .map(|bytes| PyBytes::new(py, bytes).unbind())
-                .map_err(|error| PyValueError::new_err(error.to_string()))
+                .map_err(unreadable)
         };
+        let scans: &[Scan] = block::view(message.payload(), layout.scan).map_err(unreadable)?;
+        let scan = scans
+            .first()
+            .ok_or_else(|| PyValueError::new_err("a point cloud without a scan"))?;
         Ok(Self {
             header,
+            vehicle: scan.vehicle,
             scan: bytes(layout.scan)?,
             points: bytes(layout.points)?,
         })
     }
+}
+
+fn unreadable(error: BlockError) -> PyErr {
+    PyValueError::new_err(error.to_string())
 }
 
 #[pymethods]
@@ -44,8 +60,8 @@ impl PointCloud {
 
     /// Dense index of the vehicle within the episode.
     #[getter]
-    fn vehicle(&self) -> u64 {
-        self.header.sequence
+    fn vehicle(&self) -> u32 {
+        self.vehicle
     }
 
     /// The bytes of one `Scan`.

@@ -11,15 +11,14 @@ from caraware_viewer import layout, wire
 RUN_ID = 7
 
 
-def header(tick: int, count: int, columns: int, **fields: int) -> bytes:
+def header(tick: int, *shape: int, **fields: int) -> bytes:
     row = np.zeros(1, wire.HEADER)
     values = {
         "schema_version": layout.SCHEMA_VERSION,
         "run_id": RUN_ID,
         "tick": tick,
         "sim_time_ns": (tick + 1) * 100_000_000,
-        "count": count,
-        "columns": columns,
+        "shape": shape + (0,) * (4 - len(shape)),
     }
     for name, value in (values | fields).items():
         row[name] = value
@@ -41,7 +40,7 @@ def states(count: int = 3, tick: int = 0, **fields: Any) -> np.ndarray:
 
 
 def world(tick: int, count: int = 3, **fields: Any) -> bytes:
-    return header(tick, count, 0) + states(count, tick, **fields).tobytes()
+    return header(tick, count) + states(count, tick, **fields).tobytes()
 
 
 def observation(
@@ -58,7 +57,7 @@ def observation(
         shape = section.sized({"slots": n, "fields": d, "imu_samples": k})
         payload += np.asarray(arrays.get(section.name, np.zeros(shape)), section.element).reshape(shape).tobytes()
         payload += bytes(-len(payload) % layout.ALIGNMENT)
-    return header(tick, n, d, sequence=k) + payload
+    return header(tick, n, d, k) + payload
 
 
 def prediction(tick: int, position_m: np.ndarray, estimate_m: np.ndarray | None = None) -> bytes:
@@ -66,7 +65,7 @@ def prediction(tick: int, position_m: np.ndarray, estimate_m: np.ndarray | None 
     if estimate_m is None:
         return header(tick, len(position_m), 2) + first
     second = bytes(-len(first) % layout.ALIGNMENT) + np.asarray(estimate_m, "<f4").tobytes()
-    return header(tick, len(position_m), 2, flags=wire.ESTIMATES) + first + second
+    return header(tick, len(position_m), 2, len(estimate_m)) + first + second
 
 
 def vehicles(tick: int, names: dict[int, str], **fields: int) -> bytes:
@@ -74,20 +73,20 @@ def vehicles(tick: int, names: dict[int, str], **fields: int) -> bytes:
     for row, (id_hash, name) in zip(rows, names.items(), strict=True):
         text = name.encode()
         row["id_hash"], row["id_len"], row["id"] = id_hash, len(text), np.void(text.ljust(64, b"\0"))
-    return header(tick, len(names), 0, **fields) + rows.tobytes()
+    return header(tick, len(names), **fields) + rows.tobytes()
 
 
 def signals(tick: int, letters: dict[int, str]) -> bytes:
     rows = np.zeros(len(letters), wire.SIGNAL_META)
     for row, (id_hash, state) in zip(rows, letters.items(), strict=True):
         row["id_hash"], row["links"], row["state"] = id_hash, len(state), np.void(state.encode().ljust(128, b"\0"))
-    return header(tick, len(letters), 0) + rows.tobytes()
+    return header(tick, len(letters)) + rows.tobytes()
 
 
 def event(tick: int, positions_m: np.ndarray) -> bytes:
     rows = np.zeros(len(positions_m), wire.COLLISION)
     rows["position_m"] = positions_m
-    return header(tick, len(rows), 0) + rows.tobytes()
+    return header(tick, len(rows)) + rows.tobytes()
 
 
 def pointcloud(tick: int, points: dict[str, Any], **scan: Any) -> bytes:
@@ -98,4 +97,4 @@ def pointcloud(tick: int, points: dict[str, Any], **scan: Any) -> bytes:
     for name, value in points.items():
         rows[name] = value
     payload = head.tobytes() + bytes(-wire.SCAN.itemsize % layout.ALIGNMENT) + rows.tobytes()
-    return header(tick, len(rows), 0) + payload
+    return header(tick, len(rows), 1) + payload

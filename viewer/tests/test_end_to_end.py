@@ -108,7 +108,7 @@ def test_a_run_becomes_a_recording(fanout: StandIn, tmp_path: Path) -> None:
     refusal = threading.Event()
     garbage = threading.Thread(target=put_garbage_until, args=(fanout, refusal))
     garbage.start()
-    assert "shorter than its 72 bytes of header" in process.stderr.readline()
+    assert "shorter than its 96 bytes of header" in process.stderr.readline()
     refusal.set()
     garbage.join()
     fanout.put("world", b"garbage")
@@ -118,7 +118,7 @@ def test_a_run_becomes_a_recording(fanout: StandIn, tmp_path: Path) -> None:
     assert process.wait(timeout=PATIENCE_S) == 0
     output = process.stderr.read()
     assert "has ended" in output
-    assert "72 bytes" not in output
+    assert "96 bytes" not in output
 
     rerun("verify", str(file))
     listing = rerun("print", "-vv", str(file))

@@ -1,16 +1,14 @@
 use bytemuck::cast_slice;
-use ipc_schema::prediction::ESTIMATES;
 use proptest::prelude::*;
 
 use super::*;
 
-fn header(count: usize, columns: u32) -> MessageHeader {
+fn header(shape: [u32; DIMENSIONS]) -> MessageHeader {
     MessageHeader {
         schema_version: ipc_schema::SCHEMA_VERSION,
         run_id: 7,
         tick: 11,
-        count: u32::try_from(count).unwrap(),
-        columns,
+        shape,
         ..MessageHeader::default()
     }
 }
@@ -36,9 +34,9 @@ fn world_keeps_every_state_and_no_sub_step() {
     let mut words = payload(layout.len);
     let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
     bytes[..layout.states.len].copy_from_slice(cast_slice(&states(3)));
-    let frame = encode(Channel::World, &header(3, 10), bytes).unwrap();
+    let frame = encode(Channel::World, &header(layout.shape), bytes).unwrap();
     let (head, body) = decode(&frame.bytes).unwrap();
-    assert_eq!(head, header(3, 0));
+    assert_eq!(head, header([3, 0, 0, 0]));
     assert_eq!(body, cast_slice::<_, u8>(&states(3)));
     assert_eq!(frame.left_out, 0);
 }
@@ -46,10 +44,10 @@ fn world_keeps_every_state_and_no_sub_step() {
 #[test]
 fn a_crowd_is_thinned_evenly_and_counted() {
     let crowd = states(20_000);
-    let frame = encode(Channel::World, &header(20_000, 0), cast_slice(&crowd)).unwrap();
+    let frame = encode(Channel::World, &header([20_000, 0, 0, 0]), cast_slice(&crowd)).unwrap();
     let (head, body) = decode(&frame.bytes).unwrap();
     assert!(frame.bytes.len() <= MAX_FRAME_BYTES);
-    assert_eq!((head.count, frame.left_out), (5_000, 15_000));
+    assert_eq!((head.rows(), frame.left_out), (5_000, 15_000));
     let second: VehicleState = pod_read_unaligned(&body[136..272]);
     assert_eq!(second.vehicle, 4);
 }
@@ -64,9 +62,9 @@ fn a_dense_scan_is_thinned_and_keeps_where_the_sensor_was() {
         ..Scan::default()
     };
     bytes[..layout.scan.len].copy_from_slice(bytes_of(&scan));
-    let frame = encode(Channel::Pointcloud, &header(40_000, 1800), bytes).unwrap();
+    let frame = encode(Channel::Pointcloud, &header(layout.shape), bytes).unwrap();
     let (head, body) = decode(&frame.bytes).unwrap();
-    let kept = head.count as usize;
+    let kept = head.rows();
     assert!(frame.bytes.len() <= MAX_SCAN_BYTES && kept + frame.left_out == 40_000 && kept > 13_000);
     assert_eq!(pod_read_unaligned::<Scan>(&body[..size_of::<Scan>()]), scan);
     assert_eq!(body.len(), layout.points.offset + kept * size_of::<LidarPoint>());
@@ -77,14 +75,10 @@ fn a_dense_scan_is_thinned_and_keeps_where_the_sensor_was() {
 fn long_observations_are_cut_to_their_first_slots() {
     let layout = ObservationLayout::new(20_000, 9, 1);
     let words = payload(layout.len);
-    let long = MessageHeader {
-        sequence: 1,
-        ..header(20_000, 9)
-    };
-    let frame = encode(Channel::Observation, &long, cast_slice(&words)).unwrap();
+    let frame = encode(Channel::Observation, &header(layout.shape), cast_slice(&words)).unwrap();
     let (head, body) = decode(&frame.bytes).unwrap();
     let short = ObservationLayout::of(&head);
-    assert_eq!(head.count as usize + frame.left_out, 20_000);
+    assert_eq!(head.rows() + frame.left_out, 20_000);
     assert!(
         (850_000..=MAX_FRAME_BYTES).contains(&frame.bytes.len()),
         "{}",
@@ -105,14 +99,12 @@ fn a_header_that_promises_too_much_is_refused() {
         Channel::Event,
         Channel::Pointcloud,
     ] {
-        for columns in [0, 9, u32::MAX] {
-            let error = encode(channel, &header(100, columns), &[0; 64]).unwrap_err();
-            assert!(matches!(error, FrameError::Block(_)), "{error}");
-            let huge = MessageHeader {
-                sequence: u64::MAX,
-                ..header(u32::MAX as usize, columns)
-            };
-            assert!(encode(channel, &huge, &[0; 64]).is_err());
+        for columns in [1, 9, u32::MAX] {
+            for more in [0, 1, u32::MAX] {
+                let error = encode(channel, &header([100, columns, more, 0]), &[0; 64]).unwrap_err();
+                assert!(matches!(error, FrameError::Block(_)), "{error}");
+                assert!(encode(channel, &header([u32::MAX, columns, more, 0]), &[0; 64]).is_err());
+            }
         }
     }
     assert!(decode(&[0; HEADER_BYTES - 1]).is_none());
@@ -126,20 +118,20 @@ fn a_long_table_goes_out_in_parts_that_make_the_whole() {
         .collect();
     let (mut next_row, mut parts) = (0, Vec::new());
     for _ in 0..2 {
-        let (part, whole) = table(&header(0, 3), &rows, 152, &mut next_row);
+        let (part, whole) = table(&header([0, 3, 0, 0]), &rows, 152, &mut next_row);
         assert!(part.len() <= MAX_FRAME_BYTES);
-        assert_eq!(decode(&whole).unwrap(), (header(10_000, 0), rows.as_slice()));
+        assert_eq!(decode(&whole).unwrap(), (header([10_000, 0, 0, 0]), rows.as_slice()));
         let (head, body) = decode(&part).unwrap();
-        assert_eq!(head.count as usize * 152, body.len());
+        assert_eq!(head.rows() * 152, body.len());
         parts.extend_from_slice(body);
     }
     assert_eq!(parts, rows);
     assert_eq!(next_row, 10_000);
     assert_eq!(
-        decode(&table(&header(0, 0), &[], 152, &mut next_row).0)
+        decode(&table(&header([0; DIMENSIONS]), &[], 152, &mut next_row).0)
             .unwrap()
             .0
-            .count,
+            .rows(),
         0
     );
 }
@@ -147,8 +139,11 @@ fn a_long_table_goes_out_in_parts_that_make_the_whole() {
 proptest! {
     #[test]
     fn frames_come_back_as_they_were(n in 0_usize..200, d in 1_u32..12, estimates in any::<bool>()) {
-        let observed = header(n, d);
-        let predicted = MessageHeader { flags: if estimates { ESTIMATES } else { 0 }, sequence: 1 << 40, ..observed };
+        let observed = header(ObservationLayout::new(n, d as usize, 0).shape);
+        let predicted = MessageHeader {
+            policy_version: 1 << 40,
+            ..header(PredictionLayout::new(n, d as usize, estimates).shape)
+        };
         let lengths = [ObservationLayout::of(&observed).len, PredictionLayout::of(&predicted).len];
         for (channel, header, len) in [(Channel::Observation, observed, lengths[0]), (Channel::Prediction, predicted, lengths[1])] {
             let words = payload(len);
@@ -160,7 +155,7 @@ proptest! {
 
     /// No content of shared memory, however wrong, ends the fan-out.
     #[test]
-    fn random_content_is_an_error_and_no_panic(header in prop::array::uniform18(any::<u32>()), len in 0_usize..40) {
+    fn random_content_is_an_error_and_no_panic(header in prop::array::uniform24(any::<u32>()), len in 0_usize..40) {
         let header: MessageHeader = bytemuck::cast(header);
         let words = vec![u64::MAX; 8 * len];
         for channel in Channel::ALL {

@@ -1,5 +1,6 @@
 //! Keys of a run in zenoh. Names are percent-encoded, because zenoh refuses `# ? $ *` and empty parts, and `/` separates parts.
 
+use ipc_schema::services::Channel;
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 
 /// Characters that are encoded: all but RFC 3986's unreserved ones.
@@ -47,10 +48,10 @@ impl Topic {
             Self::Status => "status",
             Self::Vehicles => "vehicles",
             Self::Signals => "signals",
-            Self::World => "world",
-            Self::Observation => "observation",
-            Self::Prediction => "prediction",
-            Self::Event => "event",
+            Self::World => Channel::World.name(),
+            Self::Observation => Channel::Observation.name(),
+            Self::Prediction => Channel::Prediction.name(),
+            Self::Event => Channel::Event.name(),
         }
     }
 }
@@ -100,7 +101,7 @@ impl RunKeys {
     /// Key of the scans of the vehicle with this SUMO id.
     #[must_use]
     pub fn scan(&self, id: &str) -> String {
-        format!("{}/pointcloud/{}", self.prefix, encode(id))
+        format!("{}/{}/{}", self.prefix, Channel::Pointcloud.name(), encode(id))
     }
 
     /// Key expression over all of these.
@@ -112,10 +113,23 @@ impl RunKeys {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
+    use ipc_schema::channel::CHANNELS;
     use percent_encoding::percent_decode_str;
     use proptest::prelude::*;
     use zenoh::key_expr::KeyExpr;
+
+    /// The topics of the channels are those that a run publishes, beside `map`, `status` and the scans.
+    #[test]
+    fn every_topic_of_a_channel_is_published() {
+        let of_channels: BTreeSet<&str> = CHANNELS.iter().flat_map(|channel| channel.topics).copied().collect();
+        let names = Topic::ALL.map(Topic::name);
+        let published: BTreeSet<&str> = names.into_iter().chain([Channel::Pointcloud.name()]).collect();
+        let of_the_run = BTreeSet::from([Topic::Map.name(), Topic::Status.name()]);
+        assert_eq!(&published - &of_the_run, of_channels);
+    }
 
     #[test]
     fn plain_names_stay_readable() {

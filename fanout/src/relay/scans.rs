@@ -109,10 +109,9 @@ impl ScanTopics {
             counters.refused_messages += 1;
             return Ok(0);
         };
-        let id_hash = pod_read_unaligned::<Scan>(scan).id_hash;
+        let Scan { id_hash, vehicle, .. } = pod_read_unaligned(scan);
         if !self.streams.contains_key(&id_hash) {
-            let index = u32::try_from(header.sequence).unwrap_or(u32::MAX);
-            let Some(meta) = directory.vehicle(index).filter(|meta| meta.id_hash == id_hash) else {
+            let Some(meta) = directory.vehicle(vehicle).filter(|meta| meta.id_hash == id_hash) else {
                 counters.unnamed_scans += 1;
                 return Ok(0);
             };

@@ -15,7 +15,7 @@ use fanout::network::keys::{RunKeys, Topic};
 use ipc_schema::{
     SCHEMA_VERSION,
     block::view_mut,
-    header::MessageHeader,
+    header::{DIMENSIONS, MessageHeader},
     membership::RunMembership,
     observation::ObservationLayout,
     pointcloud::{PointcloudLayout, Scan},
@@ -225,13 +225,12 @@ impl Drop for Fanout {
     }
 }
 
-pub fn header(membership: &RunMembership, tick: u64, flags: u32, count: usize, columns: u32) -> MessageHeader {
+pub fn header(membership: &RunMembership, tick: u64, flags: u32, shape: [u32; DIMENSIONS]) -> MessageHeader {
     MessageHeader {
         tick,
         sim_time_ns: tick * 100_000_000,
         flags,
-        count: u32::try_from(count).unwrap(),
-        columns,
+        shape,
         ..membership.header()
     }
 }
@@ -249,7 +248,7 @@ pub fn states(tick: u64, count: usize) -> Vec<VehicleState> {
 pub fn send_world(membership: &RunMembership, publisher: &Publisher, tick: u64, flags: u32, count: usize) {
     let layout = WorldLayout::new(count, SUB_STEPS as usize);
     let mut draft = publisher
-        .loan(header(membership, tick, flags, count, SUB_STEPS), layout.len)
+        .loan(header(membership, tick, flags, layout.shape), layout.len)
         .unwrap();
     let rows: &mut [VehicleState] = view_mut(draft.payload_mut(), layout.states).unwrap();
     rows.copy_from_slice(&states(tick, count));
@@ -274,16 +273,17 @@ pub fn send(publisher: &Publisher, header: MessageHeader, payload: &[u8]) {
 }
 
 pub fn send_observation(membership: &RunMembership, publisher: &Publisher, tick: u64, flags: u32, count: usize) {
+    let shape = ObservationLayout::new(count, FIELDS as usize, 0).shape;
     send(
         publisher,
-        header(membership, tick, flags, count, FIELDS),
+        header(membership, tick, flags, shape),
         &observation(tick, count),
     );
 }
 
 pub fn send_prediction(membership: &RunMembership, publisher: &Publisher, tick: u64, count: usize) {
-    let header = header(membership, tick, 0, count, 2);
-    let layout = PredictionLayout::of(&header);
+    let layout = PredictionLayout::new(count, 2, false);
+    let header = header(membership, tick, 0, layout.shape);
     let mut payload = vec![0; layout.len];
     let rows = vec![[tick as f32, 0.5]; count];
     payload[..layout.prediction.len].copy_from_slice(cast_slice(&rows));
@@ -293,7 +293,7 @@ pub fn send_prediction(membership: &RunMembership, publisher: &Publisher, tick: 
 /// Sends a census: a road user for each of `ids`, by index, and a traffic light in the state of each letter.
 pub fn send_census(membership: &RunMembership, publisher: &Publisher, tick: u64, ids: &[&str], letters: &str) {
     let layout = TrafficMetaLayout::new(ids.len(), letters.len());
-    let header = header(membership, tick, 0, ids.len(), u32::try_from(letters.len()).unwrap());
+    let header = header(membership, tick, 0, layout.shape);
     let mut draft = publisher.loan(header, layout.len).unwrap();
     let vehicles: &mut [VehicleMeta] = view_mut(draft.payload_mut(), layout.vehicles).unwrap();
     for (index, (meta, id)) in vehicles.iter_mut().zip(ids).enumerate() {
@@ -316,13 +316,11 @@ pub fn send_scan(
     points: usize,
 ) {
     let layout = PointcloudLayout::new(points);
-    let header = MessageHeader {
-        sequence: index.into(),
-        ..header(membership, tick, 0, points, 1)
-    };
+    let header = header(membership, tick, 0, layout.shape);
     let mut draft = publisher.loan(header, layout.len).unwrap();
     let scan = Scan {
         id_hash: id_hash(id),
+        vehicle: index,
         ..Scan::default()
     };
     draft.payload_mut()[..size_of::<Scan>()].copy_from_slice(bytemuck::bytes_of(&scan));

@@ -9,14 +9,16 @@ pub struct ObservationDigest(blake3::Hasher);
 impl ObservationDigest {
     /// Adds one message.
     pub fn add(&mut self, header: &MessageHeader, payload: &[u8]) {
+        let [slots, fields, ..] = header.shape;
         let numbers = [
             header.episode,
             header.episode_seed,
             header.tick,
             header.sim_time_ns,
-            u64::from(header.count),
-            u64::from(header.columns),
-            u64::from(header.flags),
+            slots.into(),
+            fields.into(),
+            // Flags, stage and map count as one number, which older runs stored as one field.
+            u64::from(header.flags | u32::from(header.stage) << 16 | u32::from(header.map) << 24),
         ];
         for number in numbers {
             self.0.update(&number.to_le_bytes());

@@ -191,11 +191,11 @@ impl Delivery {
         Ok(())
     }
 
-    /// `header` with the incarnation that receives it.
+    /// `header`, addressed to the incarnation of the trainer that receives it.
     #[must_use]
     pub fn addressed(&self, header: MessageHeader) -> MessageHeader {
         MessageHeader {
-            incarnation: self.incarnation.unwrap_or(0),
+            addressee: self.incarnation.unwrap_or(0),
             ..header
         }
     }

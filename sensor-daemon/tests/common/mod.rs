@@ -91,6 +91,8 @@ pub struct Run {
     seed: u64,
     tick_ns: u64,
     flags: u32,
+    stage: u16,
+    map: u16,
 }
 
 impl Run {
@@ -105,17 +107,20 @@ impl Run {
             seed: 5,
             tick_ns: (config.run.tick_s * 1e9) as u64,
             flags: FIRST_OF_EPISODE,
+            stage: 0,
+            map: 0,
         }
     }
 
     /// Begins a new episode at time 0.
     pub fn restart(&mut self, seed: u64) {
-        self.restart_in(seed, 0);
+        self.restart_in(seed, 0, 0);
     }
 
-    /// Begins a new episode in the stage and on the map of `flags`.
-    pub fn restart_in(&mut self, seed: u64, flags: u32) {
-        (self.tick, self.seed, self.flags) = (0, seed, FIRST_OF_EPISODE | flags);
+    /// Begins a new episode in a stage (from 1; 0 is none) and on a map.
+    pub fn restart_in(&mut self, seed: u64, stage: u16, map: u16) {
+        (self.tick, self.seed, self.flags) = (0, seed, FIRST_OF_EPISODE);
+        (self.stage, self.map) = (stage, map);
     }
 
     pub fn tick(&mut self, states: &[VehicleState]) -> Tick {
@@ -132,6 +137,8 @@ impl Run {
             tick: self.tick,
             sim_time_ns: (self.tick + 1) * self.tick_ns,
             flags: self.flags,
+            stage: self.stage,
+            map: self.map,
             episode_seed: self.seed,
             ..MessageHeader::default()
         };

@@ -8,8 +8,8 @@ use std::{
 };
 
 use ipc_schema::{
-    block::{self, Section},
-    event::{Collision, Struck},
+    block::{self, BlockError, Section},
+    event::{Collision, CollisionLayout, Struck},
     failure::{Failure, FailureKind},
     header::MessageHeader,
     membership::RunMembership,
@@ -149,9 +149,8 @@ impl ContactReporter {
         payload: &mut [u8],
         states: Section,
     ) -> Result<(), Failure> {
-        let states: &mut [VehicleState] =
-            block::view_mut(payload, states).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
-        let map = header.map().min(self.detectors.len() - 1);
+        let states: &mut [VehicleState] = block::view_mut(payload, states).map_err(unreadable)?;
+        let map = usize::from(header.map).min(self.detectors.len() - 1);
         let detector = &mut self.detectors[map];
         detector.detect(header.episode, states);
         let begun = detector.begun();
@@ -159,14 +158,14 @@ impl ContactReporter {
             return Ok(());
         }
         for part in begun.chunks(self.most) {
+            let layout = CollisionLayout::sized(part.len());
             let header = MessageHeader {
-                count: part.len() as u32,
-                columns: 0,
+                shape: layout.shape,
                 ..*header
             };
-            let bytes: &[u8] = bytemuck::cast_slice(part);
-            let mut draft = self.publisher.loan(header, bytes.len())?;
-            draft.payload_mut().copy_from_slice(bytes);
+            let mut draft = self.publisher.loan(header, layout.len)?;
+            let contacts = block::view_mut(draft.payload_mut(), layout.collisions).map_err(unreadable)?;
+            contacts.copy_from_slice(part);
             draft.send()?;
         }
         for collision in begun {
@@ -194,6 +193,10 @@ impl ContactReporter {
         })?;
         Ok(self.counts)
     }
+}
+
+fn unreadable(error: BlockError) -> Failure {
+    Failure::from_error(FailureKind::Run, &error)
 }
 
 fn line<'a>(

@@ -4,13 +4,13 @@ use std::{collections::BTreeMap, sync::Arc};
 
 use ipc_schema::{
     block::{self, BlockError, Section},
-    ego::EgoPose,
+    ego::{EgoPose, EgoPoseLayout},
     failure::{Failure, FailureKind},
     header::MessageHeader,
-    membership::{RunMembership, Wait},
+    membership::{RequiredConsumers, RunMembership, Wait},
     observation::{EMPTY_SLOT, ObservationLayout},
-    ports::{Message, PortError, Publisher, Subscriber, Waker},
-    process::Process,
+    ports::{Message, PortError, Publisher, Subscriber},
+    prediction::PredictionLayout,
     services::Channel,
     traffic::{Kind, RoutePoint, SignalMeta, VehicleMeta},
     world::{HeroView, VehicleState, WorldLayout},
@@ -31,7 +31,8 @@ pub struct HeroPorts {
     predictions: Subscriber,
     observations: Subscriber,
     poses: Publisher,
-    bridge_wake: Waker,
+    /// The required consumers of `ego-pose`.
+    pose_consumers: RequiredConsumers,
 }
 
 impl HeroPorts {
@@ -46,7 +47,7 @@ impl HeroPorts {
             predictions: membership.subscriber(Channel::Prediction)?,
             observations: membership.subscriber(Channel::Observation)?,
             poses: membership.publisher(Channel::EgoPose)?,
-            bridge_wake: membership.waker(Process::TrafficBridge)?,
+            pose_consumers: membership.required_consumers(Channel::EgoPose)?,
         })
     }
 
@@ -93,7 +94,7 @@ impl HeroPorts {
         };
         // Actions of the episode before belong to heroes that ended with it.
         if question.header().episode == frame.episode {
-            let actions = actions(&answer, question.header().count)?;
+            let actions = actions(&answer, question.header().shape[0])?;
             let vehicles = vehicles(&question).map_err(unreadable)?;
             for (vehicle, action) in vehicles
                 .iter()
@@ -137,17 +138,16 @@ impl HeroPorts {
     /// # Errors
     /// The port fails.
     pub fn send_poses(&self, world: &MessageHeader, poses: &[EgoPose]) -> Result<(), Failure> {
+        let layout = EgoPoseLayout::sized(poses.len());
         let header = MessageHeader {
-            count: u32::try_from(poses.len()).unwrap_or(u32::MAX),
-            columns: 0,
-            sequence: 0,
+            shape: layout.shape,
             ..*world
         };
-        let bytes = bytemuck::cast_slice(poses);
-        let mut draft = self.poses.loan(header, bytes.len())?;
-        draft.payload_mut().copy_from_slice(bytes);
+        let mut draft = self.poses.loan(header, layout.len)?;
+        let written = block::view_mut(draft.payload_mut(), layout.poses).map_err(unreadable)?;
+        written.copy_from_slice(poses);
         draft.send()?;
-        self.bridge_wake.wake();
+        self.pose_consumers.wake();
         Ok(())
     }
 }
@@ -181,18 +181,18 @@ fn next(
 /// The actions in a prediction, one for each slot.
 fn actions(answer: &Message, slots: u32) -> Result<&[[f32; 2]], Failure> {
     let header = answer.header();
-    if header.columns != ACTION_COLUMNS || header.count != slots {
+    let [rows, columns, ..] = header.shape;
+    if columns != ACTION_COLUMNS || rows != slots {
         return Err(Failure::new(
             FailureKind::Run,
             format!(
-                "tick {}: the trainer sent actions of shape [{}, {}], the task needs [{slots}, {ACTION_COLUMNS}]",
-                header.tick, header.count, header.columns
+                "tick {}: the trainer sent actions of shape [{rows}, {columns}], the task needs [{slots}, {ACTION_COLUMNS}]",
+                header.tick
             ),
         )
         .with_help("send steering and acceleration for each slot of every observation"));
     }
-    let len = slots as usize * size_of::<[f32; 2]>();
-    block::view(answer.payload(), Section { offset: 0, len }).map_err(unreadable)
+    block::view(answer.payload(), PredictionLayout::of(header).prediction).map_err(unreadable)
 }
 
 fn vehicles(question: &Message) -> Result<&[u32], BlockError> {

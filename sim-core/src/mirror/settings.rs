@@ -56,20 +56,19 @@ impl MirrorSettings {
         }
     }
 
-    /// Header of tick `tick` (0-based within the SUMO step) from the header of the frame.
+    /// Header of tick `tick` (0-based within the SUMO step) from the header of the frame; its shape is still the frame's.
     ///
     /// The frame carries number and time of the last of its ticks. The first tick of the step keeps [`FIRST_OF_EPISODE`], the
     /// last [`LAST_OF_EPISODE`], [`LAST_OF_LESSON`] and [`LAST_OF_RUN`].
     #[must_use]
-    pub fn tick_header(&self, frame: &MessageHeader, tick: u32, count: u32) -> MessageHeader {
+    pub fn tick_header(&self, frame: &MessageHeader, tick: u32) -> MessageHeader {
         let left = self.ticks_per_step.saturating_sub(tick + 1);
         let mut header = *frame;
         header.tick = frame.tick.saturating_sub(u64::from(left));
         header.sim_time_ns = frame
             .sim_time_ns
             .saturating_sub(u64::from(left) * libm::round(self.tick_s * 1e9) as u64);
-        header.count = count;
-        header.columns = self.sub_steps;
+        header.meta_messages = 0;
         if tick > 0 {
             header.flags &= !FIRST_OF_EPISODE;
         }

@@ -22,8 +22,8 @@ use crate::{
         phases::{HandoverInProgress, write_run},
         request::changed_config,
     },
-    process_table::RunningProcess,
     processes::RunProcesses,
+    running_process::RunningProcess,
     socket::{HandoverAnswer, HandoverReport, HandoverRequest, ReplySocket},
 };
 

@@ -12,7 +12,7 @@ use ipc_schema::{
 
 use crate::{
     failure::Exit,
-    process_table::RunningProcess,
+    running_process::RunningProcess,
     socket::{HandoverAnswer, HandoverReport, HandoverRequest, ReplySocket},
 };
 

@@ -52,8 +52,7 @@ impl Census {
         let signals = self.signals.len().min(MOST_SIGNALS);
         let layout = TrafficMetaLayout::new(self.vehicles.len(), signals);
         let header = MessageHeader {
-            count: u32::try_from(self.vehicles.len()).unwrap_or(u32::MAX),
-            columns: u32::try_from(signals).unwrap_or(u32::MAX),
+            shape: layout.shape,
             ..header
         };
         let mut draft = publisher.loan_unwritten(header, layout.len)?;

@@ -2,7 +2,6 @@
 
 use ipc_schema::{
     failure::{Failure, FailureKind},
-    flow,
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::Wait,
     ports::PortError,
@@ -42,9 +41,11 @@ impl RunningEpisode {
 pub(super) struct EpisodeSegment {
     /// Ticks of the episode at the segment's end; `None`: the segment ends with the episode.
     pub(super) ticks: Option<u64>,
-    /// Flags of all its ticks, beside those of the episode.
-    pub(super) flags: u32,
-    /// Flags of its last tick.
+    /// Stage of the curriculum, counted from 1; 0: the base configuration.
+    pub(super) stage: u16,
+    /// Map of the curriculum; 0: the run's own.
+    pub(super) map: u16,
+    /// Flags of its last tick, beside those of the episode.
     pub(super) last_flags: u32,
     /// The run ends with the episode.
     pub(super) is_last: bool,
@@ -187,11 +188,12 @@ impl Bridge {
                 .ticks
                 .is_some_and(|ticks| frame.step * self.ticks_per_step >= ticks);
             let ends = is_reset || segment.ticks.is_none() && self.episode_ends(sumo, episode, frame)?;
-            let flags = segment.flags | if pauses { segment.last_flags } else { 0 };
             let ends_run = ends && segment.is_last && !is_reset;
             let header = self.header(episode, frame, tick, sumo.step_s(), ends, ends_run);
             let header = MessageHeader {
-                flags: header.flags | flags,
+                flags: header.flags | if pauses { segment.last_flags } else { 0 },
+                stage: segment.stage,
+                map: segment.map,
                 ..header
             };
 
@@ -260,8 +262,7 @@ impl Bridge {
             senses_persons: run.config.gnss.pedestrians,
         };
         self.commands.replay(&mut context)?;
-        let window = run.traffic_window_ticks();
-        let (commands, server, consumer) = (&mut self.commands, &self.command_server, &self.consumer);
+        let (commands, server, consumers) = (&mut self.commands, &self.command_server, self.outbox.consumers());
         let mut failure = None;
         let waited = self.membership.wait_until(|| {
             while failure.is_none() {
@@ -271,7 +272,7 @@ impl Bridge {
                     Err(error) => failure = Some(error),
                 }
             }
-            failure.is_some() || !commands.holds(context.tick) && flow::has_credit(tick, &consumer.progress(), window)
+            failure.is_some() || !commands.holds(context.tick) && consumers.have_credit(tick)
         })?;
         match (failure, waited) {
             (Some(failure), _) => Err(failure),
@@ -375,7 +376,7 @@ impl Bridge {
             health.ticks = totals.ticks;
             health.episode = header.episode;
             health.sim_time_ns = header.sim_time_ns;
-            health.road_users = header.count;
+            health.road_users = header.shape[0];
             health.cavs = frame.cavs;
             health.vehicle_steps = totals.vehicle_steps;
             health.arrived = totals.arrived;

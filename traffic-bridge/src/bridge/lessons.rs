@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use ipc_schema::{
     failure::Failure,
-    header::{LAST_OF_EPISODE, LAST_OF_LESSON, map_flags, stage_flags},
+    header::{LAST_OF_EPISODE, LAST_OF_LESSON},
     membership::Wait,
     schedule::{CurriculumPlan, DueWork, Episode, Lesson},
 };
@@ -114,10 +114,11 @@ impl Bridge {
             clippy::cast_possible_truncation,
             reason = "validated: at most 255 stages and 256 maps"
         )]
-        let flags = stage_flags(stage as u8) | map_flags(map as u8);
+        let (stage, map) = (stage as u16, map as u16);
         EpisodeSegment {
             ticks: Some(past + ticks),
-            flags,
+            stage,
+            map,
             last_flags: match kind.restart {
                 true => LAST_OF_LESSON | LAST_OF_EPISODE,
                 false => LAST_OF_LESSON,

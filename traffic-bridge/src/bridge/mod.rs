@@ -55,8 +55,6 @@ struct Bridge {
     membership: RunMembership,
     outbox: Outbox,
     totals: BridgeTotals,
-    /// Progress of `sim-core`, which returns credit.
-    consumer: BoardReader,
     /// Progress of `sensor-daemon`, which must be attached before sensors are switched.
     sensing: BoardReader,
     /// Poses of the heroes, in the driving task.
@@ -129,7 +127,6 @@ impl Bridge {
         Ok(Self {
             outbox,
             totals,
-            consumer: membership.board_of(Process::SimCore)?,
             sensing: membership.board_of(Process::SensorDaemon)?,
             poses,
             pacing: Pacing::new(membership.run.config.run.real_time_factor),
@@ -176,7 +173,11 @@ impl Bridge {
     /// Leaves once everything sent has been consumed.
     fn leave(mut self) -> Result<(), Failure> {
         self.write_report()?;
-        if self.membership.wait_until_consumed(&self.consumer, self.totals.ticks)? == Wait::Ready {
+        if self
+            .membership
+            .wait_until_consumed(self.outbox.consumers(), self.totals.ticks)?
+            == Wait::Ready
+        {
             self.membership.report(|health| health.state = State::Done as u32);
         }
         Ok(())

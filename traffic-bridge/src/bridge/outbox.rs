@@ -1,15 +1,14 @@
-//! Everything the bridge publishes, and the sequence number of its `traffic-meta` messages.
+//! Everything the bridge publishes, and the number of its `traffic-meta` messages.
 
 use ipc_schema::{
     block::Section,
-    control::SensorSwitch,
+    control::{SensorSwitch, SensorSwitchLayout},
     failure::{Failure, FailureKind},
     header::MessageHeader,
-    membership::RunMembership,
-    ports::{PortError, Publisher, Waker},
-    process::Process,
+    membership::{RequiredConsumers, RunMembership},
+    ports::{PortError, Publisher},
     services::Channel,
-    traffic::{EVENTS_PER_MESSAGE, ROUTES, RoutePoint, SIGNALS_PER_MESSAGE, TrafficMetaLayout},
+    traffic::{EVENTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficLayout, TrafficMetaLayout},
 };
 
 use super::census::Census;
@@ -23,8 +22,8 @@ pub(super) struct Outbox {
     census: Option<(Publisher, Census)>,
     /// Sensors that commands switch.
     switches: Publisher,
-    /// Wakes `sim-core`.
-    consumer_wake: Waker,
+    /// The required consumers of `traffic`.
+    consumers: RequiredConsumers,
     /// `traffic-meta` messages sent.
     meta_messages: u64,
 }
@@ -40,9 +39,14 @@ impl Outbox {
             meta: membership.publisher(Channel::TrafficMeta)?,
             census,
             switches: membership.publisher(Channel::Switch)?,
-            consumer_wake: membership.waker(Process::SimCore)?,
+            consumers: membership.required_consumers(Channel::Traffic)?,
             meta_messages: 0,
         })
+    }
+
+    /// The required consumers of `traffic`.
+    pub(super) fn consumers(&self) -> &RequiredConsumers {
+        &self.consumers
     }
 
     /// Messages of steps that were lost because a queue was full.
@@ -57,17 +61,14 @@ impl Outbox {
         header: MessageHeader,
     ) -> Result<MessageHeader, Failure> {
         self.publish_meta(frame, header)?;
+        let layout = TrafficLayout::sized(frame.states.len());
         let header = MessageHeader {
-            sequence: self.meta_messages,
+            shape: layout.shape,
+            meta_messages: self.meta_messages,
             ..header
         };
-        send(
-            &self.traffic,
-            header,
-            frame.states.len(),
-            bytemuck::cast_slice(&frame.states),
-        )?;
-        self.consumer_wake.wake();
+        send(&self.traffic, header, layout.len, layout.states, &frame.states)?;
+        self.consumers.wake();
         if let Some((publisher, census)) = &mut self.census {
             census.add_step(frame);
             census.publish_if_due(publisher, header)?;
@@ -87,9 +88,8 @@ impl Outbox {
             self.meta_messages += 1;
             let layout = TrafficMetaLayout::new(vehicles.len(), lights.len());
             let header = MessageHeader {
-                sequence: self.meta_messages,
-                count: rows(vehicles.len()),
-                columns: rows(lights.len()),
+                shape: layout.shape,
+                meta_messages: self.meta_messages,
                 ..header
             };
             let mut draft = self.meta.loan(header, layout.len).map_err(too_many)?;
@@ -105,32 +105,39 @@ impl Outbox {
     pub(super) fn publish_routes(&mut self, points: &[RoutePoint], header: MessageHeader) -> Result<(), Failure> {
         for part in heroes::parts(points) {
             self.meta_messages += 1;
+            let layout = TrafficMetaLayout::sized(0, 0, part.len());
             let header = MessageHeader {
-                flags: header.flags | ROUTES,
-                sequence: self.meta_messages,
+                shape: layout.shape,
+                meta_messages: self.meta_messages,
                 ..header
             };
-            send(&self.meta, header, part.len(), bytemuck::cast_slice(part))?;
+            send(&self.meta, header, layout.len, layout.route, part)?;
         }
         Ok(())
     }
 
     /// Sends the sensors that commands switch at the tick of `header`.
     pub(super) fn publish_switches(&self, switches: &[SensorSwitch], header: MessageHeader) -> Result<(), Failure> {
-        send(&self.switches, header, switches.len(), bytemuck::cast_slice(switches))
+        let layout = SensorSwitchLayout::sized(switches.len());
+        let header = MessageHeader {
+            shape: layout.shape,
+            ..header
+        };
+        send(&self.switches, header, layout.len, layout.switches, switches)
     }
 }
 
-fn rows(count: usize) -> u32 {
-    u32::try_from(count).unwrap_or(u32::MAX)
-}
-
-fn send(publisher: &Publisher, header: MessageHeader, count: usize, bytes: &[u8]) -> Result<(), Failure> {
-    let count = rows(count);
-    let mut draft = publisher
-        .loan(MessageHeader { count, ..header }, bytes.len())
-        .map_err(too_many)?;
-    draft.payload_mut().copy_from_slice(bytes);
+/// Sends a message of `len` bytes with one section that holds `rows`.
+fn send<T: bytemuck::Pod>(
+    publisher: &Publisher,
+    header: MessageHeader,
+    len: usize,
+    section: Section,
+    rows: &[T],
+) -> Result<(), Failure> {
+    let mut draft = publisher.loan(header, len).map_err(too_many)?;
+    let at = section.offset..section.offset + section.len;
+    draft.payload_mut()[at].copy_from_slice(bytemuck::cast_slice(rows));
     draft.send()?;
     Ok(())
 }

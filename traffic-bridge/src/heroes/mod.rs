@@ -8,8 +8,8 @@
 pub mod route;
 
 use ipc_schema::{
-    block::{self, BlockError, Section},
-    ego::EgoPose,
+    block::{self, BlockError},
+    ego::{EgoPose, EgoPoseLayout},
     ports::Message,
     traffic::{Kind, MetaEvent, ROUTE_POINTS_PER_MESSAGE, RoutePoint},
 };
@@ -21,8 +21,7 @@ use crate::sumo::{Sumo, called, convention::heading_deg_from_yaw_rad, error::Sum
 /// # Errors
 /// The payload is too short.
 pub fn poses(message: &Message) -> Result<&[EgoPose], BlockError> {
-    let len = message.header().count as usize * size_of::<EgoPose>();
-    block::view(message.payload(), Section { offset: 0, len })
+    block::view(message.payload(), EgoPoseLayout::of(message.header()).poses)
 }
 
 /// Takes control of the heroes that departed in this step and returns the points of their routes.

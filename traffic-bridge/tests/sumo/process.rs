@@ -21,7 +21,7 @@ use ipc_schema::{
     process::Process,
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
-    traffic::{Kind, SIGNALS_PER_MESSAGE, SignalMeta, TrafficMetaLayout, TrafficState, VehicleMeta},
+    traffic::{Kind, SIGNALS_PER_MESSAGE, SignalMeta, TrafficLayout, TrafficMetaLayout, TrafficState, VehicleMeta},
 };
 
 use crate::support::{Bench, sumo_home};
@@ -147,21 +147,22 @@ fn consume(run: &Run) -> Vec<Step> {
     loop {
         let message = next(&traffic);
         let header = *message.header();
-        let states = bytemuck::cast_slice(message.payload()).to_vec();
+        let states: &[TrafficState] = block::view(message.payload(), TrafficLayout::of(&header).states).unwrap();
+        let states = states.to_vec();
         drop(message);
         let (mut events, mut signals) = (Vec::new(), Vec::new());
-        while meta_messages < header.sequence {
+        while meta_messages < header.meta_messages {
             // Events are sent before the states.
             let message = meta.receive().unwrap().unwrap();
             meta_messages += 1;
             assert_eq!(
-                (message.header().tick, message.header().sequence),
+                (message.header().tick, message.header().meta_messages),
                 (header.tick, meta_messages)
             );
             let header = message.header();
-            let layout = TrafficMetaLayout::new(header.count as usize, header.columns as usize);
+            let layout = TrafficMetaLayout::of(header);
             assert_eq!(message.payload().len(), layout.len);
-            assert!(header.columns as usize <= SIGNALS_PER_MESSAGE && header.count + header.columns > 0);
+            assert!(header.shape[1] as usize <= SIGNALS_PER_MESSAGE && header.shape[0] + header.shape[1] > 0);
             events.extend_from_slice(block::view(message.payload(), layout.vehicles).unwrap());
             signals.extend_from_slice(block::view(message.payload(), layout.signals).unwrap());
         }
@@ -197,7 +198,7 @@ fn episodes_go_out_step_by_step_under_credit() {
         let step = place as u64 % 15 + 1;
         assert_eq!(header.episode, place as u64 / 15);
         assert_eq!(header.sim_time_ns, step * 200_000_000);
-        assert_eq!(header.count as usize, states.len());
+        assert_eq!(header.rows(), states.len());
         assert_eq!(header.has(FIRST_OF_EPISODE), step == 1);
         assert_eq!(header.has(LAST_OF_EPISODE), step == 15);
         assert_eq!(header.has(LAST_OF_RUN), place == 29);
@@ -233,7 +234,7 @@ fn more_lights_than_a_message_holds_go_out_in_several() {
         assert_eq!(signals, (0..signals.len() as u32).collect::<Vec<_>>());
     }
     // One message for departures and 256 lights, one for the rest; two episodes.
-    let messages = steps.last().unwrap().0.sequence;
+    let messages = steps.last().unwrap().0.meta_messages;
     assert!((4..=8).contains(&messages), "{messages}");
 }
 

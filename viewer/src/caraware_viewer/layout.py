@@ -31,6 +31,7 @@ class _SectionRow(TypedDict):
 
 class _PayloadRow(TypedDict):
     name: str
+    dimensions: list[str]
     sections: list[_SectionRow]
 
 
@@ -96,7 +97,10 @@ def _sections(rows: Iterable[_SectionRow]) -> Sequence[Section]:
 
 
 SECTIONS = {row["name"]: _sections(row["sections"]) for row in _TABLES["payloads"]}
-"""Sections of every payload that has several, by the name of its channel."""
+"""Sections of every payload, by the name of its channel."""
+
+DIMENSIONS = {row["name"]: tuple(row["dimensions"]) for row in _TABLES["payloads"]}
+"""Names of the dimensions of a payload's sections, in the order of a header's `shape`, by the name of its channel."""
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,8 @@ def distances(observation: Observation, prediction: Prediction | None, *, drivin
 
 def distance_m(observation: Observation, points_m: NDArray[np.float32]) -> NDArray[np.float32]:
     """Distance `[n]` of `points_m` `[≤ n, 2]` from the truth; NaN where a slot is not valid or the point not finite."""
-    result = np.full(observation.header.count, np.nan, np.float32)
-    n = min(observation.header.count, len(points_m))
+    result = np.full(observation.header.rows, np.nan, np.float32)
+    n = min(observation.header.rows, len(points_m))
     result[:n] = np.linalg.norm(points_m[:n] - observation.truth[:n, :2], axis=1)
     result[~observation.valid] = np.nan
     result[~np.isfinite(result)] = np.nan

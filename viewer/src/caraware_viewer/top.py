@@ -98,7 +98,7 @@ def draw_observation(canvas: Canvas, observation: wire.Observation) -> None:
 
 def draw_estimates(canvas: Canvas, path: str, observation: wire.Observation, points_m: NDArray[np.float32]) -> None:
     """Draws the positions of a policy or filter, where it gives any."""
-    n = min(len(points_m), observation.header.count)
+    n = min(len(points_m), observation.header.rows)
     chosen = observation.valid[:n] & np.isfinite(points_m[:n]).all(axis=1)
     color, order = {PREDICTIONS: (PREDICTION_COLOR, 28.0), ESTIMATES: (ESTIMATE_COLOR, 30.0)}[path]
     draw_positions(canvas, path, points_m[:n][chosen], observation.truth[:n, :2][chosen], color, order)

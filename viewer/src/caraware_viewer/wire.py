@@ -1,6 +1,6 @@
 """Decodes frames (`docs/fanout.md`).
 
-A frame is a message as it is in the simulator's shared memory: 72 bytes of header, then the payload, little endian.
+A frame is a message as it is in the simulator's shared memory: 96 bytes of header, then the payload, little endian.
 The types of its parts come from `layout`.
 """
 
@@ -13,16 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from caraware_viewer.layout import ALIGNMENT, RECORDS, SCHEMA_VERSION, SECTIONS, SENSORS
+from caraware_viewer.layout import ALIGNMENT, DIMENSIONS, RECORDS, SCHEMA_VERSION, SECTIONS, SENSORS
 
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""
 FIRST_OF_EPISODE = 1 << 1
 LAST_OF_EPISODE = 1 << 2
 LAST_OF_RUN = 1 << 3
-
-ESTIMATES = 1 << 8
-"""Bit of a prediction's `MessageHeader.flags`: a section with the filter's estimates follows."""
 
 CAV, OTHER, PERSON, HERO = 0, 1, 2, 3
 """Values of `VehicleState.kind`."""
@@ -66,9 +63,13 @@ class Header:
     episode: int
     tick: int
     sim_time_ns: int
-    count: int
-    columns: int
-    sequence: int
+    shape: tuple[int, ...]
+    """Sizes of the dimensions of the payload's sections, in the order of `layout.DIMENSIONS`; zeros behind them."""
+
+    @property
+    def rows(self) -> int:
+        """Number of rows: size of the first dimension."""
+        return self.shape[0]
 
 
 @dataclass(frozen=True)
@@ -158,27 +159,27 @@ def decode_header(frame: bytes) -> Header:
             f"the run has schema version {row['schema_version']}, and this viewer knows {SCHEMA_VERSION}: "
             "install the viewer of the run's version"
         )
-    return Header(**{name: int(row[name]) for name in Header.__dataclass_fields__})
+    numbers = {name: int(row[name]) for name in Header.__dataclass_fields__ if name != "shape"}
+    return Header(**numbers, shape=tuple(int(size) for size in row["shape"]))
 
 
 def decode_world(frame: bytes) -> World:
     """A `world` frame, which has neither sub-steps nor views of heroes."""
     header = decode_header(frame)
-    sections = _sections(frame, "world", road_users=header.count, sub_steps_each=0, hero_count=0)
+    sections = _sections(frame, "world", header)
     return World(header, sections["states"])
 
 
 def decode_table(frame: bytes, row: np.dtype[np.void]) -> Table:
     """A frame of `vehicles`, `signals` or `event`."""
     header = decode_header(frame)
-    return Table(header, _array(frame, 0, row, (header.count,)))
+    return Table(header, _array(frame, 0, row, (header.rows,)))
 
 
 def decode_observation(frame: bytes) -> Observation:
     """An `observation` frame."""
     header = decode_header(frame)
-    sizes = {"slots": header.count, "fields": header.columns, "imu_samples": header.sequence}
-    sections = _sections(frame, "observation", **sizes)
+    sections = _sections(frame, "observation", header)
     # A section that the viewer does not show, such as that of a newer sensor, is passed over.
     return Observation(header, **{name: sections[name] for name in _OBSERVED})
 
@@ -186,18 +187,19 @@ def decode_observation(frame: bytes) -> Observation:
 def decode_prediction(frame: bytes) -> Prediction:
     """A `prediction` frame."""
     header = decode_header(frame)
-    if header.columns != 2:
-        raise FrameError(f"a prediction has the columns x and y, but this one has {header.columns}")
-    has_estimates = header.flags & ESTIMATES != 0
-    sizes = {"slots": header.count, "columns": 2, "estimated_slots": header.count if has_estimates else 0}
-    sections = _sections(frame, "prediction", **sizes)
-    return Prediction(header, sections["prediction"], sections["estimate_m"] if has_estimates else None)
+    _, columns, estimated_slots, *_ = header.shape
+    if columns != 2:
+        raise FrameError(f"a prediction has the columns x and y, but this one has {columns}")
+    sections = _sections(frame, "prediction", header)
+    return Prediction(header, sections["prediction"], sections["estimate_m"] if estimated_slots else None)
 
 
 def decode_cloud(frame: bytes) -> PointCloud:
     """A `pointcloud/<id>` frame."""
     header = decode_header(frame)
-    sections = _sections(frame, "pointcloud", scans=1, point_count=header.count)
+    sections = _sections(frame, "pointcloud", header)
+    if len(sections["scan"]) != 1:
+        raise FrameError(f"a point cloud has one scan, but this one has {len(sections['scan'])}")
     return PointCloud(header, sections["scan"][0], sections["points"])
 
 
@@ -206,8 +208,9 @@ def decode_text(field: np.void, length: int) -> str:
     return field.tobytes()[:length].decode(errors="replace")
 
 
-def _sections(frame: bytes, payload: str, **sizes: int) -> dict[str, NDArray[Any]]:
+def _sections(frame: bytes, payload: str, header: Header) -> dict[str, NDArray[Any]]:
     """The sections of a payload by name; each starts at a multiple of `ALIGNMENT`."""
+    sizes = dict(zip(DIMENSIONS[payload], header.shape, strict=False))
     arrays, offset = {}, 0
     for section in SECTIONS[payload]:
         array = _array(frame, offset, section.element, section.sized(sizes))

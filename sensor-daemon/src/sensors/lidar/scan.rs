@@ -134,7 +134,9 @@ impl ScanOrder<'_> {
             range_m: lidar.range_m as f32,
             rays,
             axes: u32::from(lidar.is_paper),
-            reserved: [0; 4],
+            vehicle: mover.object,
+            azimuths: lidar.columns() as u32,
+            reserved: [0; 2],
         }
     }
 

@@ -6,9 +6,9 @@ use ipc_schema::config::{Config, MapChoice, StageConfig, map_name};
 
 use super::{ConfigError, LOCALISING_TRAINER, LayeredSettings, conflict};
 
-/// Stages fit into a byte of the header's flags, counted from 1.
+/// Most stages of a curriculum: each prefetches its maps and keeps statistics of its own.
 const MOST_STAGES: usize = 255;
-/// Maps fit into another, counted from 0.
+/// Most maps of a curriculum.
 const MOST_MAPS: usize = 256;
 
 pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {

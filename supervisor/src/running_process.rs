@@ -1,4 +1,4 @@
-//! The processes of a run as a table: adding a process is adding a row.
+//! A started process of a run: its output, its exit status, its failure, and its end.
 
 use std::{
     fs::OpenOptions,
@@ -10,146 +10,33 @@ use std::{
 
 use ipc_schema::{
     failure::{Failure, FailureKind},
-    process::Process,
-    run::{Mode, RunFile},
+    process::{ProcessSpec, Program},
+    run::RunFile,
 };
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 
 use crate::{failure::Exit, install::Install};
 
-/// What the end of a process means.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum OnExit {
-    /// The run needs it: its end before its work is done ends the run.
-    Required,
-    /// The run needs it, and nothing is lost when it dies: it is replaced, unless it reported a failure.
-    Replace,
-    /// It only watches: it is restarted.
-    Restart,
-}
-
-/// What a process belongs to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Scope {
-    /// Every environment has its own.
-    Environment,
-    /// There is one for the whole run; it belongs to environment 0.
-    Run,
-}
-
-/// A process as the supervisor starts it.
-#[derive(Debug)]
-pub struct ProcessRow {
-    /// Which process.
-    pub process: Process,
-    /// What it belongs to.
-    pub scope: Scope,
-    /// Processes that must be ready before it is started.
-    pub needs: &'static [Process],
-    /// What its end means.
-    pub on_exit: OnExit,
-    /// Whether a run has it.
-    pub wanted: fn(&RunFile) -> bool,
-    /// How it is started.
-    pub command: fn(&Install, &RunFile) -> Result<Command, Exit>,
-}
-
-impl ProcessRow {
-    /// True if the run is not over before this process is done.
-    #[must_use]
-    pub fn is_required(&self) -> bool {
-        self.on_exit != OnExit::Restart
-    }
-
-    /// What its end means in `run`: of trainers that learn together, none can be replaced in the middle of a step that all take.
-    #[must_use]
-    pub fn on_exit(&self, run: &RunFile) -> OnExit {
-        match self.on_exit {
-            OnExit::Replace if run.config.trainer.ranks > 1 => OnExit::Required,
-            on_exit => on_exit,
+/// The command that starts the process of a row.
+///
+/// # Errors
+/// The program has not been built.
+fn command(row: &ProcessSpec, install: &Install, run: &RunFile) -> Result<Command, Exit> {
+    match row.program {
+        Program::Binary => install.binary(row.process).map(Command::new),
+        Program::PythonModule(module) => {
+            let mut command = Command::new(&install.python);
+            command.args(["-m", module(run)]).env("PYTHONUNBUFFERED", "1");
+            Ok(command)
         }
     }
-
-    /// True if environment `env_index` of `run` has it.
-    #[must_use]
-    pub fn is_in(&self, run: &RunFile, env_index: u32) -> bool {
-        (env_index == 0 || self.scope == Scope::Environment) && (self.wanted)(run)
-    }
-
-    /// Its name among those of a run: with the environment, where there are several.
-    #[must_use]
-    pub fn label(&self, run: &RunFile) -> String {
-        match self.scope {
-            Scope::Environment if run.config.run.envs > 1 => format!("{}/{}", self.process, run.env_index),
-            _ => self.process.to_string(),
-        }
-    }
-}
-
-/// All rows, in the order of starting. `traffic-bridge` comes first because a user's files can make SUMO fail.
-pub const PROCESSES: [ProcessRow; 5] = [
-    ProcessRow {
-        process: Process::TrafficBridge,
-        scope: Scope::Environment,
-        needs: &[],
-        on_exit: OnExit::Required,
-        wanted: |_| true,
-        command: |install, _| install.binary(Process::TrafficBridge).map(Command::new),
-    },
-    ProcessRow {
-        process: Process::SimCore,
-        scope: Scope::Environment,
-        needs: &[Process::TrafficBridge],
-        on_exit: OnExit::Required,
-        wanted: |_| true,
-        command: |install, _| install.binary(Process::SimCore).map(Command::new),
-    },
-    ProcessRow {
-        process: Process::SensorDaemon,
-        scope: Scope::Environment,
-        needs: &[Process::TrafficBridge],
-        on_exit: OnExit::Required,
-        wanted: |_| true,
-        command: |install, _| install.binary(Process::SensorDaemon).map(Command::new),
-    },
-    ProcessRow {
-        process: Process::Trainer,
-        scope: Scope::Run,
-        // Python takes as long to import torch as SUMO to read a large net.
-        needs: &[],
-        on_exit: OnExit::Replace,
-        wanted: |run| run.mode.has_trainer(),
-        command: trainer,
-    },
-    ProcessRow {
-        process: Process::Fanout,
-        scope: Scope::Run,
-        // It shows the scene that sim-core has read.
-        needs: &[Process::SimCore],
-        on_exit: OnExit::Restart,
-        wanted: |run| run.config.fanout.enabled,
-        command: |install, _| install.binary(Process::Fanout).map(Command::new),
-    },
-];
-
-/// The Python module in the trainer's place where nothing learns.
-const PLAYER: &str = "caraware.play";
-
-fn trainer(install: &Install, run: &RunFile) -> Result<Command, Exit> {
-    let mut command = Command::new(&install.python);
-    let module = match run.mode {
-        Mode::Play => PLAYER,
-        Mode::Train | Mode::Simulate => &run.config.trainer.module,
-    };
-    command.args(["-m", module]).env("PYTHONUNBUFFERED", "1");
-    Ok(command)
 }
 
 /// A started process; killed with its group when dropped.
 #[derive(Debug)]
 pub struct RunningProcess {
     /// Its row.
-    pub row: &'static ProcessRow,
+    pub row: &'static ProcessSpec,
     /// Its environment.
     pub env_index: u32,
     /// How often it has been started before.
@@ -164,7 +51,7 @@ impl RunningProcess {
     /// # Errors
     /// The program is missing or cannot be started.
     pub fn start(
-        row: &'static ProcessRow,
+        row: &'static ProcessSpec,
         install: &Install,
         run: &RunFile,
         run_file: &Path,
@@ -179,7 +66,7 @@ impl RunningProcess {
     /// # Errors
     /// As [`RunningProcess::start`].
     pub fn start_successor(
-        row: &'static ProcessRow,
+        row: &'static ProcessSpec,
         install: &Install,
         run: &RunFile,
         run_file: &Path,
@@ -207,7 +94,7 @@ impl RunningProcess {
     }
 
     fn spawn(
-        row: &'static ProcessRow,
+        row: &'static ProcessSpec,
         install: &Install,
         run: &RunFile,
         run_file: &Path,
@@ -221,7 +108,7 @@ impl RunningProcess {
             .open(&log_path)
             .map_err(|error| Exit::io("open", &log_path, &error))?;
         let errors = log.try_clone().map_err(|error| Exit::io("open", &log_path, &error))?;
-        let mut command = (row.command)(install, run)?;
+        let mut command = command(row, install, run)?;
         command
             .arg(run_file)
             .env(ipc_schema::membership::INCARNATION, incarnation.to_string())
