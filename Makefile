@@ -5,7 +5,6 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 VENV := .venv
 PYTHON310 ?= python3.10
 CARGO_FLAGS := --release --locked
-export PYO3_PYTHON = $(CURDIR)/$(VENV)/bin/python
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
 
@@ -14,8 +13,10 @@ ARGS ?=
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
 
+# One selection of targets for the tests and the extension: another one would give third-party crates other features, and compile
+# them again.
 test: prerequisites browser $(VENV)/.installed ## all tests
-	cargo test $(CARGO_FLAGS) --no-run
+	cargo build $(CARGO_FLAGS) --lib --bins --tests --examples
 	$(EXTENSION)
 	$(MAKE) test-rust test-python
 
@@ -23,7 +24,8 @@ build: prerequisites $(VENV)/.installed ## virtual environment, SUMO, all progra
 	cargo build $(CARGO_FLAGS)
 	$(EXTENSION)
 
-EXTENSION = VIRTUAL_ENV=$(CURDIR)/$(VENV) $(VENV)/bin/maturin develop --quiet $(CARGO_FLAGS) --manifest-path trainer/Cargo.toml --skip-install
+# `install` replaces the file, so that a trainer that runs keeps the one it has loaded.
+EXTENSION = install -m 755 target/release/lib_native.so trainer/python/caraware/_native.abi3.so
 
 prerequisites:
 	@scripts/prerequisites.sh "$(PYTHON)"
