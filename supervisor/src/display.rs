@@ -1,7 +1,7 @@
 //! Live progress: a bar on a terminal, otherwise one line every few seconds.
 
 use std::{
-    io::IsTerminal as _,
+    io::{IsTerminal as _, Write as _},
     time::{Duration, Instant},
 };
 
@@ -20,6 +20,20 @@ const LINE_EVERY: Duration = Duration::from_secs(5);
 
 /// Rows of a table, so that it fits on most terminals.
 const TABLE_ROWS: usize = 24;
+
+/// Writes a line to standard error. A terminal that has been closed must not end the run.
+pub fn notice(line: &str) {
+    if let Err(error) = writeln!(std::io::stderr(), "{line}") {
+        tracing::debug!(%error, line, "standard error is closed");
+    }
+}
+
+/// Writes `text` to standard output, with the same care.
+pub fn print(text: &str) {
+    if let Err(error) = writeln!(std::io::stdout(), "{text}") {
+        tracing::debug!(%error, "standard output is closed");
+    }
+}
 
 /// Shows how a run fares.
 #[derive(Debug)]
@@ -79,7 +93,7 @@ impl ProgressDisplay {
             bar.set_message(view.text());
         } else if self.last_line.elapsed() >= LINE_EVERY {
             self.last_line = Instant::now();
-            eprintln!("{}", view.line());
+            notice(&view.line());
         }
         self.last_text = view.line();
     }
@@ -90,7 +104,7 @@ impl ProgressDisplay {
             bar.set_message(table.lines(TABLE_ROWS).join("\n"));
         } else if self.last_line.elapsed() >= LINE_EVERY {
             self.last_line = Instant::now();
-            eprintln!("{}", table.line());
+            notice(&table.line());
         }
         self.last_text = table.line();
     }
@@ -100,7 +114,7 @@ impl ProgressDisplay {
         match &self.bar {
             Some(bar) => bar.abandon(),
             None if self.is_silent => {}
-            None => eprintln!("{}", self.last_text),
+            None => notice(&self.last_text),
         }
     }
 }

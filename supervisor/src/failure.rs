@@ -10,7 +10,7 @@ use ipc_schema::{
 };
 use miette::{Diagnostic, Report};
 
-use crate::config::ConfigError;
+use crate::{config::ConfigError, display::notice};
 
 /// Why the command ends without success.
 #[derive(Debug)]
@@ -42,15 +42,25 @@ impl Exit {
     pub fn report(self) -> ExitCode {
         match self {
             Self::Config(error) => {
-                eprintln!("{:?}", Report::new(*error));
+                notice(&format!("{:?}", Report::new(*error)));
                 ExitCode::from(FailureKind::Config.exit_code())
             }
             Self::Failure(failure) => {
                 let code = failure.kind.exit_code();
-                eprintln!("{:?}", Report::new(ShownFailure(failure)));
+                notice(&format!("{:?}", Report::new(ShownFailure(failure))));
                 ExitCode::from(code)
             }
             Self::Interrupted => ExitCode::from(130),
+        }
+    }
+
+    /// Message and advice, for a report.
+    #[must_use]
+    pub fn summary(&self) -> (String, Option<String>) {
+        match self {
+            Self::Config(error) => (error.to_string(), error.help().map(|help| help.to_string())),
+            Self::Failure(failure) => (failure.message.clone(), failure.help.clone()),
+            Self::Interrupted => ("interrupted".into(), None),
         }
     }
 

@@ -6,13 +6,13 @@ use caraware::{
     bench,
     cli::{Cli, Subcommands},
     control,
-    display::ProgressDisplay,
+    display::{self, ProgressDisplay},
     doctor,
     failure::Exit,
     generate, handover,
     prepare::{PreparedRun, prepare, prepare_play, prepare_resume},
     report, status,
-    supervisor::Supervisor,
+    supervisor::{RunEnding, RunOutcome, Supervisor},
     view::{self, ViewerProcess},
 };
 use clap::Parser as _;
@@ -46,26 +46,31 @@ fn main() -> ExitCode {
 fn run(prepared: PreparedRun) -> Result<(), Exit> {
     let (run, quiet) = (prepared.run.clone(), prepared.quiet);
     if !quiet {
-        eprintln!("run {}: results go to {}", run.name, run.run_dir.display());
+        display::notice(&format!("run {}: results go to {}", run.name, run.run_dir.display()));
     }
     // Dropped, and so ended, after the run.
     let _viewer = prepared
         .viewer
         .map(|wanted| ViewerProcess::start(&run, &wanted))
         .transpose()?;
-    let supervisor = Supervisor::new(&prepared.run, prepared.install, prepared.claim)?;
-    let outcome = supervisor.supervise(&mut if quiet {
-        ProgressDisplay::silent()
-    } else {
-        ProgressDisplay::new()
-    })?;
-    let (report, path) = report::write(&run, &outcome)?;
-    if !quiet {
-        println!("{}", report::summary(&report, &path));
+    let mut display = match quiet {
+        true => ProgressDisplay::silent(),
+        false => ProgressDisplay::new(),
+    };
+    let outcome = match Supervisor::new(&prepared.run, prepared.install, prepared.claim) {
+        Ok(supervisor) => supervisor.supervise(&mut display),
+        Err(exit) => RunOutcome::not_started(exit),
+    };
+    // Whatever ended the run, its report says so.
+    let written = report::write(&run, &outcome);
+    if let Ok((report, path)) = &written
+        && !quiet
+    {
+        display::print(&report::summary(report, path));
     }
-    if outcome.interrupted {
-        Err(Exit::Interrupted)
-    } else {
-        Ok(())
+    match outcome.ending {
+        RunEnding::Completed => written.map(drop),
+        RunEnding::Interrupted => Err(Exit::Interrupted),
+        RunEnding::Failed(exit) => Err(exit),
     }
 }

@@ -10,7 +10,7 @@ use ipc_schema::{
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-use crate::{failure::Exit, socket::HandoverReport, supervisor::RunOutcome};
+use crate::{failure::Exit, socket::HandoverReport, supervisor::{RunEnding, RunOutcome}};
 
 /// What an evaluation compares, as the keys of a report begin: the policy, the raw fix, the Kalman filter, the smoother that sees
 /// the future, and the policy's network taught by regression.
@@ -106,6 +106,22 @@ fn handovers(outcome: &RunOutcome, sensing: &Sensing, tick_s: f64) -> Vec<Value>
     outcome.handovers.iter().map(with_figures).collect()
 }
 
+/// Message and advice of the failure that ended the run; null if none did.
+fn failure(ending: &RunEnding) -> Value {
+    let RunEnding::Failed(exit) = ending else {
+        return Value::Null;
+    };
+    let (message, help) = exit.summary();
+    json!({ "message": message, "help": help })
+}
+
+/// The newest checkpoint, from which `caraware train --resume` continues; null without one.
+fn newest_checkpoint(run: &RunFile) -> Option<PathBuf> {
+    let folder = run.run_dir.join("checkpoints");
+    let name = std::fs::read_to_string(folder.join("latest")).ok()?;
+    Some(folder.join(name.trim()))
+}
+
 /// Puts the report together, writes it, and returns it with its path.
 ///
 /// # Errors
@@ -149,7 +165,13 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<(Value, PathBuf), Ex
     let mut report = json!({
         "name": run.name,
         "mode": run.mode,
-        "result": if outcome.interrupted { "interrupted" } else { "completed" },
+        "result": match outcome.ending {
+            RunEnding::Completed => "completed",
+            RunEnding::Interrupted => "interrupted",
+            RunEnding::Failed(_) => "failed",
+        },
+        "failure": failure(&outcome.ending),
+        "checkpoint": newest_checkpoint(run),
         "env_steps": env_steps,
         "wall_s": outcome.wall_s,
         "env_steps_per_s": rate,

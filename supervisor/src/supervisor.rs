@@ -14,13 +14,13 @@ use ipc_schema::{
     run::RunFile,
 };
 use signal_hook::{
-    consts::{SIGCHLD, SIGINT, SIGTERM},
+    consts::{SIGCHLD, SIGHUP, SIGINT, SIGTERM},
     iterator::{Handle, Signals},
 };
 
 use crate::{
     control::ControlRelay,
-    display::ProgressDisplay,
+    display::{self, ProgressDisplay},
     failure::Exit,
     handover::Handovers,
     install::Install,
@@ -50,17 +50,41 @@ const READY_WITHIN: Duration = Duration::from_secs(120);
 /// Longest time from SIGTERM to the end of a process, before SIGKILL.
 const STOP_WITHIN: Duration = Duration::from_secs(30);
 
+/// How a run ended.
+#[derive(Debug)]
+pub enum RunEnding {
+    /// All its work is done.
+    Completed,
+    /// Ctrl-C, `caraware stop` or the end of the terminal ended it.
+    Interrupted,
+    /// A required process failed, or the run could not start.
+    Failed(Exit),
+}
+
 /// How a run ended, and what the supervisor counted.
 #[derive(Debug)]
 pub struct RunOutcome {
-    /// True if Ctrl-C or `caraware stop` ended it.
-    pub interrupted: bool,
+    /// How it ended.
+    pub ending: RunEnding,
     /// Wall seconds from the moment when all processes were ready to the end.
     pub wall_s: f64,
     /// Restarts of all processes.
     pub restarts: u32,
     /// Planned handovers of the trainer.
     pub handovers: Vec<HandoverReport>,
+}
+
+impl RunOutcome {
+    /// The outcome of a run of which no process was started.
+    #[must_use]
+    pub fn not_started(exit: Exit) -> Self {
+        Self {
+            ending: RunEnding::Failed(exit),
+            wall_s: 0.0,
+            restarts: 0,
+            handovers: Vec::new(),
+        }
+    }
 }
 
 /// A run under supervision. Dropping it kills the remaining processes and removes the run's shared memory.
@@ -118,13 +142,31 @@ impl Supervisor {
         })
     }
 
-    /// Runs all processes to their end.
-    ///
-    /// # Errors
-    /// A required process failed, or one was not ready in time.
-    pub fn supervise(mut self, display: &mut ProgressDisplay) -> Result<RunOutcome, Exit> {
+    /// Runs all processes to their end. Whatever ends the run, a trainer that has begun to learn may write a checkpoint.
+    pub fn supervise(mut self, display: &mut ProgressDisplay) -> RunOutcome {
         let started = Instant::now();
-        let mut interrupted = false;
+        let ending = match self.run_until_over(started, display) {
+            Ok(ending) => ending,
+            Err(exit) => RunEnding::Failed(exit),
+        };
+        // The run is over: answer what still waits, then end what still runs.
+        self.handovers
+            .refuse_current(&mut self.processes, "the run is over", "");
+        self.controls.end();
+        let wall_s = self.ready_at.unwrap_or(started).elapsed().as_secs_f64();
+        display.update(self.processes.environments(), self.ready_at);
+        display.finish();
+        self.stop_all(&ending);
+        RunOutcome {
+            ending,
+            wall_s,
+            restarts: self.processes.restarts(),
+            handovers: self.handovers.take_reports(),
+        }
+    }
+
+    /// Starts and watches processes until the work is done, a signal asks the run to end, or a required process has failed.
+    fn run_until_over(&mut self, started: Instant, display: &mut ProgressDisplay) -> Result<RunEnding, Exit> {
         loop {
             self.processes.start_due()?;
             self.reap()?;
@@ -134,27 +176,12 @@ impl Supervisor {
             display.update(self.processes.environments(), self.ready_at);
             self.last_check = Instant::now();
             if self.processes.have_finished() {
-                break;
+                return Ok(RunEnding::Completed);
             }
             if self.wait_for_event() {
-                interrupted = true;
-                break;
+                return Ok(RunEnding::Interrupted);
             }
         }
-        // The run is over: answer what still waits, then end what still runs.
-        self.handovers
-            .refuse_current(&mut self.processes, "the run is over", "");
-        self.controls.end();
-        let wall_s = self.ready_at.unwrap_or(started).elapsed().as_secs_f64();
-        display.update(self.processes.environments(), self.ready_at);
-        display.finish();
-        self.stop_all(interrupted);
-        Ok(RunOutcome {
-            interrupted,
-            wall_s,
-            restarts: self.processes.restarts(),
-            handovers: self.handovers.take_reports(),
-        })
     }
 
     /// Handles ended processes: the failure of a required one ends the run; watchers, and a trainer that was killed, are restarted.
@@ -212,10 +239,10 @@ impl Supervisor {
             );
             return Err(failure.into());
         }
-        eprintln!(
+        display::notice(&format!(
             "{process} ended with {}; a successor continues from the newest checkpoint",
             ended.status
-        );
+        ));
         self.restart(index, ended)
     }
 
@@ -274,9 +301,17 @@ impl Supervisor {
     }
 
     /// Asks every process to end and waits; kills the rest after a time limit or a second Ctrl-C.
-    fn stop_all(&mut self, interrupted: bool) {
-        if interrupted {
-            eprintln!("stopping: the trainer writes a checkpoint (press Ctrl-C again to kill)");
+    fn stop_all(&mut self, ending: &RunEnding) {
+        match ending {
+            RunEnding::Completed => {}
+            RunEnding::Interrupted => {
+                display::notice("stopping: the trainer writes a checkpoint (press Ctrl-C again to kill)");
+            }
+            // Nothing has been simulated or learnt yet.
+            RunEnding::Failed(_) if self.ready_at.is_none() => return self.processes.kill(),
+            RunEnding::Failed(_) => {
+                display::notice("the run has failed: the trainer writes a checkpoint (press Ctrl-C to kill)");
+            }
         }
         self.processes.terminate();
         let deadline = Instant::now() + STOP_WITHIN;
@@ -292,7 +327,7 @@ impl Supervisor {
 /// Forwards signals to a channel, so that the supervisor can wait for them with a deadline.
 fn watch_signals(sender: Sender<SupervisorEvent>) -> Result<Handle, Exit> {
     let failed = |error: &std::io::Error| Exit::run(format!("cannot watch signals: {error}"), "");
-    let mut signals = Signals::new([SIGINT, SIGTERM, SIGCHLD]).map_err(|error| failed(&error))?;
+    let mut signals = Signals::new([SIGINT, SIGTERM, SIGHUP, SIGCHLD]).map_err(|error| failed(&error))?;
     let handle = signals.handle();
     std::thread::Builder::new()
         .name("signals".into())

@@ -275,7 +275,7 @@ fn after_sigkill_of_the_supervisor_everything_ends_and_the_next_run_starts() {
 }
 
 #[test]
-fn a_killed_simulator_ends_the_run_with_its_name() {
+fn a_killed_simulator_ends_the_run_with_its_name_a_checkpoint_and_a_report() {
     let workplace = Workplace::new();
     let mut run = Background::start(
         &workplace,
@@ -293,10 +293,65 @@ fn a_killed_simulator_ends_the_run_with_its_name() {
             .find(|line| line.contains("sim-core") && line.contains("running"))?;
         line.split_whitespace().nth(3)?.parse::<i32>().ok()
     });
+    let checkpoint = workplace.path().join("runs/hit/checkpoints/latest");
+    eventually("a checkpoint", || checkpoint.is_file().then_some(()));
     kill_process(Pid::from_raw(pid).unwrap(), Signal::KILL).unwrap();
     assert_eq!(run.0.wait().unwrap().code(), Some(1));
     let said = run.said();
     assert!(said.contains("sim-core ended with signal: 9"), "{said}");
+    let report = workplace.report("hit");
+    assert_eq!(report["result"], "failed");
+    let message = report["failure"]["message"].as_str().unwrap();
+    assert!(message.contains("sim-core ended with signal: 9"), "{message}");
+    assert!(report["env_steps"].as_u64().unwrap() > 0, "{report:#}");
+    let newest = Path::new(report["checkpoint"].as_str().unwrap());
+    assert!(newest.join("manifest.json").is_file(), "{}", newest.display());
+    workplace.assert_nothing_left();
+}
+
+#[test]
+fn a_run_whose_traffic_cannot_start_says_so_in_its_report() {
+    let workplace = Workplace::new();
+    let arguments = ["--grid", "--grid.number", "3", "-o", "n.net.xml"];
+    tool(&sumo_program("netgenerate"), &arguments, workplace.path());
+    workplace.write(
+        "r.rou.xml",
+        "<routes><trip id=\"lost\" depart=\"0\" from=\"nowhere\" to=\"elsewhere\"/></routes>",
+    );
+    let input = "<net-file value=\"n.net.xml\"/><route-files value=\"r.rou.xml\"/>";
+    let cfg = format!("<configuration><input>{input}</input></configuration>");
+    let cfg = workplace.write("lost.sumocfg", &cfg);
+    let more = [
+        "--name",
+        "lost",
+        "--set",
+        "fanout.enabled=false",
+        "--set",
+        "map.origin_latitude_deg=52",
+        "--set",
+        "map.origin_longitude_deg=10",
+    ];
+    let output = workplace.run(&[&["simulate", cfg.to_str().unwrap()], &more[..]].concat());
+    assert!(!output.status.success(), "{}", text(&output));
+    let report = workplace.report("lost");
+    assert_eq!(report["result"], "failed");
+    let message = report["failure"]["message"].as_str().unwrap();
+    assert!(message.contains("nowhere"), "{message}");
+    workplace.assert_nothing_left();
+}
+
+/// The end of a terminal: SIGHUP, and no place left to write to.
+#[test]
+fn a_closed_terminal_ends_the_run_with_a_checkpoint_and_a_report() {
+    let workplace = Workplace::new();
+    let endless = ["--set", "episode.training_episodes=100000"];
+    let mut run = Background::start(&workplace, &small("train", "hung", &[&QUIET[..], &endless].concat()));
+    let latest = workplace.path().join("runs/hung/checkpoints/latest");
+    eventually("a checkpoint", || latest.is_file().then_some(()));
+    drop((run.0.stdout.take(), run.0.stderr.take()));
+    run.signal(Signal::HUP);
+    assert_eq!(run.0.wait().unwrap().code(), Some(130));
+    assert_eq!(workplace.report("hung")["result"], "interrupted");
     workplace.assert_nothing_left();
 }
 
