@@ -31,6 +31,7 @@ pub mod config;
 pub mod control;
 mod control_port;
 pub mod ego;
+pub mod episode_state;
 pub mod event;
 pub mod failure;
 pub mod field;

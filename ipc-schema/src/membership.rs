@@ -16,7 +16,7 @@ use tracing_subscriber::{EnvFilter, Layer, Registry, layer::SubscriberExt as _, 
 use crate::{
     SCHEMA_VERSION,
     board::{Health, Progress, State},
-    clock,
+    clock, episode_state,
     failure::{Failure, FailureKind},
     flow,
     header::MessageHeader,
@@ -40,6 +40,8 @@ pub fn incarnation() -> u32 {
         .unwrap_or(0)
 }
 
+/// States of episodes that a process keeps in a run without a trainer.
+const KEPT_STATES: usize = 16;
 /// Longest wait between two looks at credit, data and the stop flag.
 const LOOK: Duration = Duration::from_millis(50);
 
@@ -425,6 +427,32 @@ impl RunMembership {
 
     fn wake_upstream(&self) {
         self.upstream.iter().for_each(Waker::wake);
+    }
+
+    /// Stores what this process has counted before `tick`, the first one of an episode, and removes what no restart needs any more.
+    ///
+    /// # Errors
+    /// Not writable, or the trainer's board cannot be opened.
+    pub fn store_episode_state(&self, tick: u64, state: &impl serde::Serialize) -> Result<(), Failure> {
+        episode_state::store(&self.run, self.process, tick, state)?;
+        let committed_ticks = match self.run.mode.has_trainer() {
+            true => self.board_of(Process::Trainer)?.progress().committed_ticks,
+            // No process asks for a tick again. The others of this environment are some episodes behind at most.
+            false => {
+                let ticks = episode_state::stored_ticks(&self.run.run_dir, self.process);
+                ticks.iter().rev().nth(KEPT_STATES).copied().unwrap_or(0)
+            }
+        };
+        episode_state::forget_before(&self.run, self.process, committed_ticks);
+        Ok(())
+    }
+
+    /// What this process had counted before the first tick that it makes; `None` where the run begins.
+    ///
+    /// # Errors
+    /// Not readable, or another version wrote it.
+    pub fn stored_episode_state<T: serde::de::DeserializeOwned>(&self) -> Result<Option<T>, Failure> {
+        episode_state::load(&self.run, self.process, self.run.first_tick())
     }
 
     /// Changes the health on the board.

@@ -66,6 +66,16 @@ pub struct Start {
     pub resets: u64,
 }
 
+/// Where the simulator processes of an environment start again after one of them has died.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RestartPoint {
+    /// Where they begin.
+    #[serde(flatten)]
+    pub start: Start,
+    /// Ticks that had been sensed before. They are made again as fast as possible.
+    pub sensed_ticks: u64,
+}
+
 /// What traffic runs on.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -171,6 +181,9 @@ pub struct RunFile {
     /// The checkpoint to begin with, where there is one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub beginning: Option<Beginning>,
+    /// Where the simulator processes of this environment were started again, after one of them had died.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub restart: Option<RestartPoint>,
 }
 
 /// The run file cannot be used.
@@ -281,6 +294,7 @@ impl RunFile {
             env_index,
             run_dir,
             beginning,
+            restart: None,
             ..self.clone()
         }
     }
@@ -347,12 +361,13 @@ impl RunFile {
         }
     }
 
-    /// Where this environment begins: at its first tick, or as the checkpoint says which the run begins with.
+    /// Where this environment begins: where its processes were started again, as the checkpoint says which the run begins with, or at
+    /// its first tick.
     #[must_use]
     pub fn start(&self) -> Start {
-        self.beginning
-            .as_ref()
-            .map_or(Start::default(), |beginning| beginning.start)
+        let beginning = self.beginning.as_ref().map(|beginning| beginning.start);
+        let restart = self.restart.map(|restart| restart.start);
+        restart.or(beginning).unwrap_or_default()
     }
 
     /// Number of the first tick that is made.

@@ -51,6 +51,7 @@ fn run_in(directory: &Path) -> RunFile {
         config,
         config_hash: String::new(),
         beginning: None,
+        restart: None,
     }
 }
 

@@ -84,6 +84,7 @@ impl Corner {
             config: config(),
             config_hash: String::new(),
             beginning: None,
+            restart: None,
         };
         let node = services::node(&run.shared_memory).unwrap();
         let services = ServiceHolder::create(&node, &run, 0).unwrap();

@@ -6,7 +6,7 @@ use ipc_schema::{
     block::{self, BlockError},
     board::State,
     failure::{Failure, FailureKind},
-    header::{LAST_OF_RUN, MessageHeader},
+    header::{LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::{RequiredConsumers, RunMembership, Wait},
     observation::ObservationLayout,
     ports::{Message, PortError, Publisher, Subscriber},
@@ -15,21 +15,34 @@ use ipc_schema::{
     services::Channel,
     world::WorldLayout,
 };
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::{
     delivery::Delivery,
     delivery::digest::ObservationDigest,
     delivery::handover::HandoverFigures,
     scanning::ScanTotals,
-    sensing::{Sensing, WorldTick},
+    sensing::{Sensing, SensingState, WorldTick},
     surroundings::{Surroundings, projection_failure},
 };
+
+/// What this process has counted when an episode begins.
+#[derive(Debug, Default, Serialize, Deserialize)]
+struct SensorDaemonState {
+    digest: ObservationDigest,
+    /// The first tick that the digest covers.
+    first_tick: u64,
+    cavs_max: u32,
+    sensing: SensingState,
+    lidar: Option<ScanTotals>,
+}
 
 /// The part of the run's report that this process writes.
 #[derive(Debug, Serialize)]
 struct SensorDaemonReport {
     observation_hash: String,
+    /// The first tick that the hash and the counts cover.
+    first_tick: u64,
     observations: u64,
     ticks: u64,
     cavs_max: u32,
@@ -82,6 +95,8 @@ struct Daemon {
     /// The other required consumers of observations. They receive every tick at least once.
     other_consumers: RequiredConsumers,
     digest: ObservationDigest,
+    /// The first tick that the digest and the counts cover: the run's own, unless the run resumed without the state of its first part.
+    counted_from: u64,
     /// One more than the newest tick made.
     ticks: u64,
     /// Ticks below this are in the checkpoint: they are simulated again but not sent.
@@ -91,7 +106,19 @@ struct Daemon {
 }
 
 impl Daemon {
-    fn open(mut membership: RunMembership, sensing: Sensing, surroundings: Surroundings) -> Result<Self, Failure> {
+    fn open(
+        mut membership: RunMembership,
+        mut sensing: Sensing,
+        mut surroundings: Surroundings,
+    ) -> Result<Self, Failure> {
+        // Continue where the part of the run before this one stood when the episode began.
+        let first_tick = membership.run.first_tick();
+        let state = membership.stored_episode_state()?.unwrap_or(SensorDaemonState {
+            first_tick,
+            ..SensorDaemonState::default()
+        });
+        sensing.restore(&state.sensing);
+        surroundings.set_lidar_totals(state.lidar);
         let observations = membership.publisher(Channel::Observation)?;
         let switches = membership.subscriber(Channel::Switch)?;
         let consumer = match membership.run.mode.has_trainer() {
@@ -112,11 +139,12 @@ impl Daemon {
             observations,
             consumer,
             other_consumers,
-            digest: ObservationDigest::default(),
+            digest: state.digest,
+            counted_from: state.first_tick,
             ticks,
             committed_ticks,
-            vehicle_steps: 0,
-            cavs_max: 0,
+            vehicle_steps: state.sensing.observations(),
+            cavs_max: state.cavs_max,
         })
     }
 
@@ -232,6 +260,10 @@ impl Daemon {
             .observe(&header, road_users, draft.payload_mut())
             .map_err(unreadable)?;
         self.digest.add(&header, draft.payload());
+        // Stored before the tick is sent: whoever has received the last tick of an episode can rely on the state of the next one.
+        if header.has(LAST_OF_EPISODE) {
+            self.store_state(header.tick + 1)?;
+        }
         if self.keep(&header, draft.payload())? {
             draft.send()?;
         }
@@ -241,6 +273,20 @@ impl Daemon {
         self.other_consumers.wake();
         self.report_tick(&header, road_users.states.len());
         Ok(())
+    }
+
+    /// Stores what has been counted before `tick`, the first one of an episode.
+    fn store_state(&self, tick: u64) -> Result<(), Failure> {
+        let sensing = self.sensing.state();
+        let cavs = (sensing.observations() - self.vehicle_steps) as u32;
+        let state = SensorDaemonState {
+            digest: self.digest.clone(),
+            first_tick: self.counted_from,
+            cavs_max: self.cavs_max.max(cavs),
+            sensing,
+            lidar: self.surroundings.lidar_totals(),
+        };
+        self.membership.store_episode_state(tick, &state)
     }
 
     /// Keeps the tick in the journal. Returns false if the trainer has no credit for it: the journal sends it later.
@@ -296,7 +342,8 @@ impl Daemon {
         let part = SensorDaemonReport {
             observation_hash: self.digest.hex(),
             observations: self.vehicle_steps,
-            ticks: self.ticks - self.membership.run.first_tick(),
+            first_tick: self.counted_from,
+            ticks: self.ticks - self.counted_from,
             cavs_max: self.cavs_max,
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
             drops: self.observations.drops(),

@@ -12,7 +12,7 @@ use ipc_schema::{
     sensor::SensorKind,
     world::{SubStep, VehicleState},
 };
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use sim_core::scene::Scene;
 
 use crate::{
@@ -21,7 +21,7 @@ use crate::{
 };
 
 /// Counts of LIDAR scans for the run's report.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ScanTotals {
     /// Scans: one for each LIDAR and tick.
     pub scans: u64,
@@ -64,6 +64,11 @@ impl LidarScanning {
                 .any(|field| SensorKind::Lidar.is_in(field.measurement_bit())),
             totals: ScanTotals::default(),
         })
+    }
+
+    /// Continues counting from `totals`.
+    pub fn set_totals(&mut self, totals: ScanTotals) {
+        self.totals = totals;
     }
 
     /// Counts so far.

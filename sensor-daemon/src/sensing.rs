@@ -10,6 +10,7 @@ use ipc_schema::{
     traffic::Kind,
     world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, SubStep, TIME_LIMIT, VehicleState},
 };
+use serde::{Deserialize, Serialize};
 use sim_core::geodesy::{GeodesyError, Projection};
 
 use crate::{
@@ -27,12 +28,29 @@ use crate::{
 };
 
 /// Sum of the raw GNSS error over all fixes.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct RawGnssError {
     /// Sum of distances, metres.
     pub sum_m: f64,
     /// Number of vehicle-ticks with a receiver that delivers.
     pub count: u64,
+}
+
+/// What the sensors of a run have counted at the end of an episode, and what the next one needs to know of it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct SensingState {
+    observations: u64,
+    raw_error: RawGnssError,
+    /// Which slots hold a vehicle.
+    occupied: Vec<bool>,
+}
+
+impl SensingState {
+    /// Observations so far.
+    #[must_use]
+    pub fn observations(&self) -> u64 {
+        self.observations
+    }
 }
 
 /// One tick of the world, as a `world` message carries it.
@@ -193,6 +211,23 @@ impl Sensing {
     #[must_use]
     pub fn observations(&self) -> u64 {
         self.observations
+    }
+
+    /// The state at the end of an episode.
+    #[must_use]
+    pub fn state(&self) -> SensingState {
+        SensingState {
+            observations: self.observations,
+            raw_error: self.raw_error,
+            occupied: self.slots.occupied(),
+        }
+    }
+
+    /// Continues from the end of an episode. The next tick must begin another one.
+    pub fn restore(&mut self, state: &SensingState) {
+        (self.observations, self.raw_error) = (state.observations, state.raw_error);
+        self.slots = Slots::after_episode(&state.occupied);
+        self.row_of_slot = vec![None; state.occupied.len()];
     }
 
     /// Gives every connected road user in `states` and in the region its slot. Returns the number of slots, the observation's n.

@@ -67,6 +67,13 @@ impl Surroundings {
         Ok(())
     }
 
+    /// Continues counting LIDAR scans from `totals`.
+    pub fn set_lidar_totals(&mut self, totals: Option<ScanTotals>) {
+        if let (Some(lidars), Some(totals)) = (&mut self.lidars, totals) {
+            lidars.set_totals(totals);
+        }
+    }
+
     /// Counts of LIDAR scans; `None` without LIDARs.
     #[must_use]
     pub fn lidar_totals(&self) -> Option<ScanTotals> {

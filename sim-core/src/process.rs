@@ -6,7 +6,7 @@ use ipc_schema::{
     block::{self, BlockError},
     board::State,
     failure::{Failure, FailureKind},
-    header::{LAST_OF_RUN, MessageHeader},
+    header::{FIRST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::{RequiredConsumers, RunMembership, Wait},
     ports::{Message, PortError, Publisher, Subscriber},
     process::Process,
@@ -15,15 +15,29 @@ use ipc_schema::{
     world::WorldLayout,
 };
 
+use serde::{Deserialize, Serialize};
+
 use crate::{
-    collision::{CollisionCounts, ContactReporter},
+    collision::{CollisionCounts, ContactReporter, ContactState},
     driving::{HeroCounts, ports::HeroPorts},
-    mirror::{Mirror, MirrorError, MirrorSettings, statistics::TrackingSummary},
+    mirror::{
+        Mirror, MirrorError, MirrorSettings,
+        statistics::{TrackingStatistics, TrackingSummary},
+    },
     scene::{Scene, chart::Chart},
 };
 
+/// What this process has counted when an episode begins.
+#[derive(Debug, Default, Serialize, Deserialize)]
+struct CoreState {
+    tracking: TrackingStatistics,
+    resynchronisations: u64,
+    vehicle_steps: u64,
+    contacts: ContactState,
+}
+
 /// What this process adds to the run's report.
-#[derive(Debug, serde::Serialize)]
+#[derive(Debug, Serialize)]
 struct CoreReport {
     tracking: TrackingSummary,
     resynchronisations: u64,
@@ -86,7 +100,9 @@ impl CoreProcess {
         let world = membership.publisher(Channel::World)?;
         let consumers = membership.required_consumers(Channel::World)?;
         let scenes = Scene::of_every_map(&membership.run)?;
-        let contacts = ContactReporter::open(&membership, &scenes)?;
+        // Continue where the part of the run before this one stood when the episode began.
+        let state: CoreState = membership.stored_episode_state()?.unwrap_or_default();
+        let contacts = ContactReporter::open(&membership, &scenes, state.contacts)?;
         // Viewers see the run's own map, and heroes have no other.
         let scene = scenes.first().cloned().unwrap_or_default();
         draw_chart(&membership, &scene)?;
@@ -95,8 +111,9 @@ impl CoreProcess {
             false => None,
         };
         membership.attach();
-        let mirror = Mirror::new(MirrorSettings::of_run(&membership.run))
+        let mut mirror = Mirror::new(MirrorSettings::of_run(&membership.run))
             .map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
+        mirror.restore_counts(state.tracking, state.resynchronisations);
         let ticks = membership.run.first_tick();
         Ok(Self {
             membership,
@@ -109,7 +126,7 @@ impl CoreProcess {
             world,
             consumers,
             ticks,
-            vehicle_steps: 0,
+            vehicle_steps: state.vehicle_steps,
         })
     }
 
@@ -126,6 +143,9 @@ impl CoreProcess {
                 received: first_tick,
             }
             .into());
+        }
+        if header.has(FIRST_OF_EPISODE) {
+            self.store_state()?;
         }
         self.apply_metas(header.meta_messages)?;
         let states: &[TrafficState] =
@@ -147,6 +167,18 @@ impl CoreProcess {
             self.publish(&header, tick, states)?;
         }
         Ok(Wait::Ready)
+    }
+
+    /// Stores what has been counted before this tick, the first one of an episode.
+    fn store_state(&mut self) -> Result<(), Failure> {
+        let contacts = self.contacts.as_mut().map(ContactReporter::state).transpose()?;
+        let state = CoreState {
+            tracking: self.mirror.tracking().clone(),
+            resynchronisations: self.mirror.resynchronisations(),
+            vehicle_steps: self.vehicle_steps,
+            contacts: contacts.unwrap_or_default(),
+        };
+        self.membership.store_episode_state(self.ticks, &state)
     }
 
     /// Applies announcements up to number `newest`, the last one before the current frame; all were sent before it.

@@ -81,6 +81,7 @@ impl Run {
             config,
             config_hash: String::new(),
             beginning: None,
+            restart: None,
             run_dir,
         };
         file.write().unwrap();

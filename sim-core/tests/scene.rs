@@ -97,6 +97,7 @@ fn run(net_file: &Path, additional_files: &[PathBuf]) -> RunFile {
         config,
         config_hash: String::new(),
         beginning: None,
+        restart: None,
     }
 }
 

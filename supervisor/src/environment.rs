@@ -4,13 +4,24 @@ use std::path::PathBuf;
 
 use ipc_schema::{
     board::State,
+    episode_state,
     ports::{BoardReader, RosterWriter, Waker},
     process::Process,
-    run::RunFile,
+    run::{RestartPoint, RunFile, Start},
     services::{ControlService, RunNode, ServiceHolder},
 };
 
-use crate::failure::Exit;
+use crate::{failure::Exit, resume};
+
+/// The processes that simulate an environment.
+pub const SIMULATORS: [Process; 3] = [Process::TrafficBridge, Process::SimCore, Process::SensorDaemon];
+
+/// The episode that a stored state belongs to.
+#[derive(Debug, Default, serde::Deserialize)]
+struct EpisodePlace {
+    episode: u64,
+    resets: u64,
+}
 
 /// An environment. Its services live as long as this does.
 pub struct Environment {
@@ -20,6 +31,8 @@ pub struct Environment {
     pub run_file: PathBuf,
     /// Which incarnation of each process counts.
     pub roster: RosterWriter,
+    /// Largest number of ticks that a trainer has committed, or that were sensed in a run without one.
+    committed_ticks: u64,
     boards: Vec<BoardReader>,
     /// Wakes `sensor-daemon`, which then reads the state of a handover.
     sensing: Waker,
@@ -48,6 +61,7 @@ impl Environment {
             run,
             run_file,
             roster: RosterWriter::create(&services)?,
+            committed_ticks: 0,
             sensing,
             boards,
             services,
@@ -64,6 +78,66 @@ impl Environment {
     #[must_use]
     pub fn board(&self, process: Process) -> &BoardReader {
         &self.boards[process.index()]
+    }
+
+    /// Remembers how far the learning has come: a trainer's death empties its board.
+    pub fn note_progress(&mut self) {
+        let ticks = match self.run.mode.has_trainer() {
+            true => self.board(Process::Trainer).progress().committed_ticks,
+            false => self.board(Process::SensorDaemon).health().ticks,
+        };
+        self.committed_ticks = self.committed_ticks.max(ticks);
+    }
+
+    /// Ticks that `sensor-daemon` has made.
+    #[must_use]
+    pub fn sensed_ticks(&self) -> u64 {
+        self.board(Process::SensorDaemon).health().ticks
+    }
+
+    /// Prepares the run file and the command log for simulator processes that are started again: they begin with the episode of the
+    /// first tick that is not committed. Returns that episode's first tick.
+    ///
+    /// # Errors
+    /// A file cannot be read or written.
+    pub fn prepare_restart(&mut self) -> Result<u64, Exit> {
+        let run = &self.run;
+        let stored = SIMULATORS.map(|process| episode_state::stored_ticks(&run.run_dir, process));
+        let [first, others @ ..] = &stored;
+        let in_all = |tick: &&u64| others.iter().all(|ticks| ticks.contains(tick));
+        let begins = first
+            .iter()
+            .rev()
+            .filter(|tick| **tick <= self.committed_ticks)
+            .find(in_all);
+        let start = match begins {
+            None => run
+                .beginning
+                .as_ref()
+                .map(|beginning| beginning.start)
+                .unwrap_or_default(),
+            Some(tick) => {
+                let place: Option<EpisodePlace> = episode_state::load(run, Process::TrafficBridge, *tick)?;
+                let EpisodePlace { episode, resets } = place.unwrap_or_default();
+                Start {
+                    committed_ticks: self.committed_ticks,
+                    episode,
+                    episode_tick: *tick,
+                    resets,
+                }
+            }
+        };
+        let start = Start {
+            committed_ticks: start.committed_ticks.max(self.committed_ticks),
+            resets: resume::repeat_commands(&run.run_dir, &run.run_dir, start.episode_tick)?,
+            ..start
+        };
+        self.run.restart = Some(RestartPoint {
+            start,
+            sensed_ticks: self.sensed_ticks(),
+        });
+        self.run.write()?;
+        Ok(start.episode_tick)
     }
 
     /// Publishes whether a handover is in progress.

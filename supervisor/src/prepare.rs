@@ -422,6 +422,7 @@ fn assemble(
         config,
         config_hash,
         beginning: None,
+        restart: None,
     };
     check_shared_memory(&run)?;
     Ok((run, claim))

@@ -1,6 +1,7 @@
 //! The processes of a run with the environments they belong to: which of them may start, on which cores, and which have ended.
 
 use std::{
+    collections::BTreeMap,
     path::{Path, PathBuf},
     process::{ChildStdout, ExitStatus},
 };
@@ -28,6 +29,8 @@ pub struct EndedProcess {
     pub is_done: bool,
     /// What its end means in this run.
     pub on_exit: OnExit,
+    /// Its environment.
+    pub env_index: u32,
 }
 
 /// All processes of a run.
@@ -40,6 +43,8 @@ pub struct RunProcesses {
     cores: Option<cores::CorePlan>,
     install: Install,
     restarts: u32,
+    /// Incarnations of processes that are to be started again, by process and environment.
+    incarnations: BTreeMap<(Process, u32), u32>,
 }
 
 impl RunProcesses {
@@ -60,6 +65,7 @@ impl RunProcesses {
             cores: cores::plan(&cores::available(), envs as usize, run.mode.has_trainer()),
             install,
             restarts: 0,
+            incarnations: BTreeMap::new(),
         })
     }
 
@@ -163,7 +169,8 @@ impl RunProcesses {
             .map(|(row, environment)| (row, environment.run.env_index))
             .collect();
         for (row, env_index) in due {
-            let started = self.start(row, env_index, 0)?;
+            let incarnation = self.incarnations.get(&(row.process, env_index)).copied().unwrap_or(0);
+            let started = self.start(row, env_index, incarnation)?;
             self.running.push(started);
         }
         Ok(())
@@ -220,6 +227,7 @@ impl RunProcesses {
             status,
             is_done: environment.state_of(row.process) == State::Done,
             on_exit: row.on_exit(self.run()),
+            env_index: self.running[index].env_index,
         })
     }
 
@@ -252,18 +260,44 @@ impl RunProcesses {
         let (row, env_index) = (self.running[index].row, self.running[index].env_index);
         let incarnation = self.next_incarnation(index);
         if !self.set_incarnation(row, env_index, incarnation) {
-            return Err(Exit::run(
-                format!(
-                    "{} has been replaced {} times: a run holds no more",
-                    row.process,
-                    incarnation - 1
-                ),
-                "find out from its log why it ends",
-            ));
+            return Err(no_more_incarnations(row, incarnation));
         }
         self.restarts += 1;
         self.running[index] = self.start(row, env_index, incarnation)?;
         Ok(())
+    }
+
+    /// Remembers how far the learning of every environment has come.
+    pub fn note_progress(&mut self) {
+        self.environments.iter_mut().for_each(Environment::note_progress);
+    }
+
+    /// Ends what is left of the simulator processes of environment `env_index` and has them started again, at the episode of the first
+    /// tick that is not committed. Returns the first tick of that episode, and the ticks that have been sensed.
+    ///
+    /// # Errors
+    /// A file cannot be read or written, or the run holds no more incarnations.
+    pub fn restart_environment(&mut self, env_index: u32) -> Result<(u64, u64), Exit> {
+        let (mut ended, others) = std::mem::take(&mut self.running)
+            .into_iter()
+            .partition(|running| running.env_index == env_index && running.row.scope == ProcessScope::Environment);
+        self.running = others;
+        let ended: &mut Vec<RunningProcess> = &mut ended;
+        ended.iter_mut().for_each(RunningProcess::kill);
+        self.forget_dead();
+        let environment = &mut self.environments[env_index as usize];
+        environment.note_progress();
+        let sensed_ticks = environment.sensed_ticks();
+        let first_tick = environment.prepare_restart()?;
+        for before in ended.iter() {
+            let incarnation = before.incarnation + 1;
+            if !self.set_incarnation(before.row, env_index, incarnation) {
+                return Err(no_more_incarnations(before.row, incarnation));
+            }
+            self.incarnations.insert((before.row.process, env_index), incarnation);
+        }
+        self.restarts += 1;
+        Ok((first_tick, sensed_ticks))
     }
 
     /// Makes this incarnation of a process the valid one in every environment it belongs to. False if the run holds no more.
@@ -340,4 +374,15 @@ impl RunProcesses {
     pub fn forget_dead(&self) {
         services::forget_dead(&self.node);
     }
+}
+
+fn no_more_incarnations(row: &ProcessSpec, incarnation: u32) -> Exit {
+    Exit::run(
+        format!(
+            "{} has been replaced {} times: a run holds no more",
+            row.process,
+            incarnation - 1
+        ),
+        "find out from its log why it ends",
+    )
 }

@@ -10,7 +10,11 @@ use ipc_schema::{
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-use crate::{failure::Exit, socket::HandoverReport, supervisor::{RunEnding, RunOutcome}};
+use crate::{
+    failure::Exit,
+    socket::HandoverReport,
+    supervisor::{RunEnding, RunOutcome},
+};
 
 /// What an evaluation compares, as the keys of a report begin: the policy, the raw fix, the Kalman filter, the smoother that sees
 /// the future, and the policy's network taught by regression.
@@ -21,6 +25,8 @@ const ESTIMATORS: [&str; 5] = ["ppo", "raw_gnss", "ekf", "rts", "supervised"];
 #[serde(default)]
 struct Sensing {
     observation_hash: String,
+    /// The first tick that the hash covers.
+    first_tick: u64,
     observations: u64,
     ticks: u64,
     drops: u64,
@@ -181,6 +187,7 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<(Value, PathBuf), Ex
         "policy_std": learned("policy_std"),
         "vehicles": sensing.cavs_max,
         "observation_hash": sensing.observation_hash,
+        "first_tick": sensing.first_tick,
         "lost_ticks": training.get("lost_ticks").cloned().unwrap_or(json!(0)),
         "duplicated_ticks": training.get("duplicated_ticks").cloned().unwrap_or(json!(0)),
         "drops": sensing.drops,
@@ -224,8 +231,8 @@ fn hashes(report: &Value) -> Vec<String> {
     let hash = |of: &Value| of["observation_hash"].as_str().unwrap_or_default().to_owned();
     let environments = report["environments"].as_array().map_or(&[][..], Vec::as_slice);
     if environments.len() < 2 {
-        let since = match report["beginning"]["episode"].as_u64() {
-            Some(episode) if report["mode"] == "train" => format!(" (since episode {episode}, where this part began)"),
+        let since = match report["first_tick"].as_u64() {
+            Some(tick) if tick > 0 => format!(" (since tick {tick}, where this part began)"),
             _ => String::new(),
         };
         return vec![format!("observation hash {}{since}", hash(report))];

@@ -48,6 +48,44 @@ impl WatcherRestarts {
     }
 }
 
+/// Restarts of the simulator processes of one environment.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct EnvironmentRestarts {
+    /// Ends since the last new tick.
+    vain: u32,
+    /// Of these, crashes.
+    crashes: u32,
+    /// Most ticks that were sensed at an end.
+    sensed_ticks: u64,
+    due: Option<Instant>,
+}
+
+impl EnvironmentRestarts {
+    /// What to do about an end that is found at `now`, when `sensed_ticks` had been sensed.
+    pub fn verdict(&mut self, sensed_ticks: u64, is_crash: bool, now: Instant) -> RestartVerdict {
+        let due = match self.due {
+            Some(due) => due,
+            None => {
+                if sensed_ticks > self.sensed_ticks {
+                    (self.sensed_ticks, self.vain, self.crashes) = (sensed_ticks, 0, 0);
+                }
+                let due = now + pause(self.vain);
+                self.vain += 1;
+                self.crashes += u32::from(is_crash);
+                *self.due.insert(due)
+            }
+        };
+        if self.crashes > MAX_VAIN_REPLACEMENTS {
+            return RestartVerdict::GiveUp;
+        }
+        if now < due {
+            return RestartVerdict::Wait;
+        }
+        self.due = None;
+        RestartVerdict::Start
+    }
+}
+
 /// Replacements of a trainer that was killed.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct TrainerRestarts {
@@ -93,6 +131,30 @@ mod tests {
             assert_eq!(restarts.allow(committed_ticks), Ok(()));
         }
         assert_eq!(restarts.allow(7), Err(MAX_VAIN_REPLACEMENTS));
+    }
+
+    #[test]
+    fn a_killed_environment_is_started_ever_less_often_and_a_crashing_one_given_up() {
+        let (mut restarts, now) = (EnvironmentRestarts::default(), Instant::now());
+        assert_eq!(restarts.verdict(5, false, now), RestartVerdict::Start);
+        assert_eq!(
+            restarts.verdict(5, false, now),
+            RestartVerdict::Wait,
+            "nothing new since"
+        );
+        assert_eq!(restarts.verdict(5, false, now + LONGEST_PAUSE), RestartVerdict::Start);
+        for _ in 0..1000 {
+            restarts.verdict(5, false, now);
+            assert_eq!(restarts.verdict(5, false, now + LONGEST_PAUSE), RestartVerdict::Start);
+        }
+        assert_eq!(restarts.verdict(6, true, now), RestartVerdict::Start, "a new tick");
+        let crash = |restarts: &mut EnvironmentRestarts| {
+            restarts.verdict(6, true, now);
+            restarts.verdict(6, true, now + LONGEST_PAUSE)
+        };
+        let verdicts: Vec<_> = (0..MAX_VAIN_REPLACEMENTS).map(|_| crash(&mut restarts)).collect();
+        assert_eq!(verdicts.last(), Some(&RestartVerdict::GiveUp));
+        assert!(verdicts[..4].iter().all(|verdict| *verdict == RestartVerdict::Start));
     }
 
     #[test]

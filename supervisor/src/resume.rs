@@ -6,12 +6,14 @@ use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
     control::{self, Action, Command},
+    episode_state,
     run::{Beginning, CURRICULUM_LOG, FORMER_CURRICULUM_LOG, Mode, RunFile},
 };
 
 use crate::{
     checkpoint::FoundCheckpoint,
     config::{self, LayeredSettings},
+    environment::SIMULATORS,
     failure::Exit,
     install::Install,
     registry::{self, RunClaim},
@@ -86,8 +88,13 @@ pub fn go_on(
         ));
     }
     let beginning = follow(&old, &old.run_dir, found.beginning())?;
-    for index in 0..old.config.run.envs {
-        forget_the_end(&old.environment(index).run_dir)?;
+    let starts = std::iter::once(&beginning.start).chain(&beginning.others);
+    for (index, start) in (0..old.config.run.envs).zip(starts) {
+        let run_dir = old.environment(index).run_dir;
+        forget_the_end(&run_dir)?;
+        for process in SIMULATORS {
+            episode_state::forget_after(&run_dir, process, start.episode_tick)?;
+        }
     }
     let claim = RunClaim::new(&old.run_dir)?;
     let config_hash = config::hash(&config);
@@ -103,6 +110,7 @@ pub fn go_on(
         config,
         config_hash,
         beginning: Some(beginning),
+        restart: None,
         ..old
     };
     Ok((run, claim))
@@ -139,18 +147,27 @@ pub fn follow(old: &RunFile, run_dir: &Path, mut beginning: Beginning) -> Result
             index => beginning.others.get_mut(index as usize - 1),
         };
         let first_tick = start.as_ref().map_or(0, |start| start.episode_tick);
-        let (done, due): (Vec<Action>, Vec<Action>) = commands(&from)?
-            .into_iter()
-            .partition(|action| action.tick < first_tick);
-        // In this order: cut off between the two, the run still knows all that it was told.
-        write_commands(&to.join(control::COMMAND_REPLAY), &due)?;
-        write_commands(&to.join(control::COMMAND_LOG), &done)?;
-        let resets = done.iter().filter(|action| matches!(action.control, Command::Reset {}));
+        let resets = repeat_commands(&from, &to, first_tick)?;
         if let Some(start) = start {
-            start.resets = resets.count() as u64;
+            start.resets = resets;
         }
     }
     Ok(beginning)
+}
+
+/// Makes the commands of the run in `from` that came at or after `first_tick` those that the run in `to` replays. Returns the number of
+/// episodes that earlier commands reset.
+///
+/// # Errors
+/// A log cannot be read or written.
+pub fn repeat_commands(from: &Path, to: &Path, first_tick: u64) -> Result<u64, Exit> {
+    let (done, due): (Vec<Action>, Vec<Action>) =
+        commands(from)?.into_iter().partition(|action| action.tick < first_tick);
+    // In this order: cut off between the two, the run still has every command.
+    write_commands(&to.join(control::COMMAND_REPLAY), &due)?;
+    write_commands(&to.join(control::COMMAND_LOG), &done)?;
+    let resets = done.iter().filter(|action| matches!(action.control, Command::Reset {}));
+    Ok(resets.count() as u64)
 }
 
 /// What the run in `run_dir` was told and did, and then what it was still to be told by the log that it followed.

@@ -153,6 +153,14 @@ impl RunningProcess {
         }
     }
 
+    /// Kills it with its group and waits for its end.
+    pub fn kill(&mut self) {
+        self.signal(Signal::KILL);
+        if self.exit.is_none() {
+            self.exit = self.child.wait().ok();
+        }
+    }
+
     /// Asks it to make room for a successor; unlike [`RunningProcess::signal`], this reaches the process alone, not its group.
     pub fn ask_to_leave(&mut self) {
         if self.poll().is_none()
@@ -185,11 +193,6 @@ impl RunningProcess {
 
 impl Drop for RunningProcess {
     fn drop(&mut self) {
-        if self.poll().is_none() {
-            self.signal(Signal::KILL);
-            if let Err(error) = self.child.wait() {
-                tracing::debug!(%error, process = %self.row.process, "cannot wait");
-            }
-        }
+        self.kill();
     }
 }

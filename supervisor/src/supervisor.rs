@@ -10,11 +10,11 @@ use std::{
 use ipc_schema::{
     board::INCARNATIONS,
     failure::{Failure, FailureKind},
-    process::{OnExit, Process},
-    run::RunFile,
+    process::{OnExit, Process, ProcessScope},
+    run::{Mode, RunFile},
 };
 use signal_hook::{
-    consts::{SIGCHLD, SIGHUP, SIGINT, SIGTERM},
+    consts::{SIGCHLD, SIGHUP, SIGINT, SIGKILL, SIGTERM},
     iterator::{Handle, Signals},
 };
 
@@ -26,7 +26,7 @@ use crate::{
     install::Install,
     processes::{EndedProcess, RunProcesses},
     registry::RunClaim,
-    restart::{RestartVerdict, TrainerRestarts, WatcherRestarts},
+    restart::{EnvironmentRestarts, RestartVerdict, TrainerRestarts, WatcherRestarts},
     socket::{self, HandoverReport, ReceivedRequest},
 };
 
@@ -100,6 +100,8 @@ pub struct Supervisor {
     /// Restarts of processes that only watch.
     watcher_restarts: BTreeMap<Process, WatcherRestarts>,
     trainer_restarts: TrainerRestarts,
+    /// Restarts of the simulator processes of each environment.
+    environment_restarts: BTreeMap<u32, EnvironmentRestarts>,
     ready_at: Option<Instant>,
     /// The check before the present one: a process that is found ready now became ready after it.
     last_check: Instant,
@@ -137,6 +139,7 @@ impl Supervisor {
             signal_handle,
             watcher_restarts: BTreeMap::new(),
             trainer_restarts: TrainerRestarts::default(),
+            environment_restarts: BTreeMap::new(),
             ready_at: None,
             last_check: Instant::now(),
         })
@@ -169,6 +172,7 @@ impl Supervisor {
     fn run_until_over(&mut self, started: Instant, display: &mut ProgressDisplay) -> Result<RunEnding, Exit> {
         loop {
             self.processes.start_due()?;
+            self.processes.note_progress();
             self.reap()?;
             self.handovers.advance(&mut self.processes);
             self.controls.advance()?;
@@ -209,11 +213,50 @@ impl Supervisor {
                 OnExit::Replace if ended.is_done => {}
                 OnExit::Replace if was_killed => self.replace_trainer(index, &ended)?,
                 OnExit::Replace if left => self.restart(index, &ended)?,
+                // The processes of the environment change places: what else has ended is found at the next check.
+                OnExit::Required if was_killed && self.may_simulate_again(&ended) => {
+                    return self.restart_environment(index, &ended);
+                }
                 OnExit::Required | OnExit::Replace => {
                     return Err(self.processes.failure(index, ended.status).into());
                 }
             }
         }
+        Ok(())
+    }
+
+    /// True if the environment of a killed simulator process can be made again: simulation is a function of configuration, seed and
+    /// commands, but heroes' actions are not stored, and a run that plays has no ticks that count.
+    fn may_simulate_again(&self, ended: &EndedProcess) -> bool {
+        let run = self.processes.run();
+        ended.row.scope == ProcessScope::Environment && run.mode != Mode::Play && !run.config.drives()
+    }
+
+    /// Starts the simulator processes of an environment again, after a pause that grows while nothing new is sensed. Only ends of the
+    /// program's own making (a crash, not SIGKILL) can make it give up.
+    fn restart_environment(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
+        let env_index = ended.env_index;
+        let sensed_ticks = self.processes.environments()[env_index as usize].sensed_ticks();
+        let is_crash = ended
+            .status
+            .signal()
+            .is_some_and(|signal| signal != SIGKILL && signal != SIGTERM);
+        let restarts = self.environment_restarts.entry(env_index).or_default();
+        match restarts.verdict(sensed_ticks, is_crash, Instant::now()) {
+            RestartVerdict::Wait => return Ok(()),
+            RestartVerdict::GiveUp => {
+                let mut failure = self.processes.failure(index, ended.status);
+                failure.message += "\n  it crashed again and again without a new tick";
+                return Err(failure.into());
+            }
+            RestartVerdict::Start => {}
+        }
+        let label = ended.row.label(&self.processes.environments()[env_index as usize].run);
+        let (first_tick, sensed_ticks) = self.processes.restart_environment(env_index)?;
+        display::notice(&format!(
+            "{label} ended with {}; the simulation is made again from tick {first_tick} to {sensed_ticks}, and continues",
+            ended.status
+        ));
         Ok(())
     }
 

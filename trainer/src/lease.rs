@@ -135,8 +135,7 @@ impl Lease {
         let until = deadline.min(Instant::now() + KEEPS_PYTHON);
         loop {
             for _ in 0..POLLS {
-                if let Some(message) = inner.observations.receive().map_err(|error| failed(&error))? {
-                    inner.ended |= message.header().has(header::LAST_OF_RUN);
+                if let Some(message) = inner.next_message()? {
                     return Ok(Some(message));
                 }
                 std::hint::spin_loop();

@@ -57,14 +57,16 @@ struct Attached {
     /// Opened when first asked for.
     scans: Option<Subscriber>,
     predictions: Publisher,
-    /// Whoever waits for the predictions: sim-core in the driving task.
+    /// `sim-core`, which waits for the predictions in the driving task.
     driven: Option<Waker>,
-    /// Whoever waits for the step of the next lesson.
+    /// `traffic-bridge`, which waits for the stage of the next lesson.
     taught: Waker,
     training: TrainingStatus,
     /// Board of where ticks begin; opened when first asked for.
     traffic: Option<BoardReader>,
     consumed_ticks: u64,
+    /// One more than the newest tick that Python has been given.
+    received_ticks: u64,
     ended: bool,
     /// The supervisor did not start this process, which does not end with it.
     outside: bool,
@@ -313,6 +315,25 @@ impl Attachment {
     }
 }
 
+impl Attached {
+    /// The next observation, if one is waiting. A `sensor-daemon` that was started again sends what it cannot know to have arrived: what
+    /// has been received before is skipped.
+    fn next_message(&mut self) -> PyResult<Option<Message>> {
+        loop {
+            let Some(message) = self.observations.receive().map_err(|error| failed(&error))? else {
+                return Ok(None);
+            };
+            let header = message.header();
+            let is_repeated = header.incarnation > 0 && header.tick < self.received_ticks;
+            self.received_ticks = self.received_ticks.max(header.tick + 1);
+            self.ended |= header.has(header::LAST_OF_RUN);
+            if !is_repeated {
+                return Ok(Some(message));
+            }
+        }
+    }
+}
+
 impl Attachment {
     /// Opens the ports of a place in a run.
     fn attach(mut membership: RunMembership, run_json: String, first_tick: u64, outside: bool) -> PyResult<Self> {
@@ -334,6 +355,7 @@ impl Attachment {
             training: TrainingStatus::default(),
             traffic: None,
             consumed_ticks: first_tick,
+            received_ticks: first_tick,
             ended: false,
             outside,
         };
@@ -378,8 +400,7 @@ impl Attachment {
     fn take_waiting(&self) -> PyResult<Vec<ObservationBlock>> {
         let mut inner = self.lock()?;
         let mut blocks = Vec::new();
-        while let Some(message) = inner.observations.receive().map_err(|error| failed(&error))? {
-            inner.ended |= message.header().has(header::LAST_OF_RUN);
+        while let Some(message) = inner.next_message()? {
             blocks.push(ObservationBlock::new(message)?);
         }
         Ok(blocks)

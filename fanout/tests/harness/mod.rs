@@ -361,6 +361,7 @@ fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
         config: serde_json::from_value(config(port)).unwrap(),
         config_hash: String::new(),
         beginning: None,
+        restart: None,
         run_dir,
     }
 }

@@ -74,8 +74,15 @@ impl Delivery {
     pub fn is_behind(&self) -> bool {
         let progress = self.board.progress();
         progress.attached == 1
+            && !self.is_trainer_ahead(&progress)
             && (self.incarnation != Some(progress.incarnation)
                 || self.next < self.journal.ticks() && flow::has_credit(self.next, &progress, self.window))
+    }
+
+    /// True if the trainer has consumed more ticks than have been made: the simulator processes were started again, and what it has
+    /// already is made again and not sent.
+    fn is_trainer_ahead(&self, progress: &Progress) -> bool {
+        progress.attached == 1 && progress.consumed_ticks > self.journal.ticks()
     }
 
     /// True if the trainer has received all earlier ticks and has credit for the live one.
@@ -87,10 +94,13 @@ impl Delivery {
             && flow::has_credit(self.next, &progress, membership.run.window_ticks())
     }
 
-    /// True if the live tick may be made and kept until the trainer has credit for it: a planned handover is under way, and the
-    /// journal has room for `len` bytes without giving up an older tick.
+    /// True if the live tick may be made and kept until the trainer has credit for it: the trainer has it already, or a planned handover
+    /// is under way and the journal has room for `len` bytes without giving up an older tick.
     #[must_use]
     pub fn may_keep(&self, len: usize) -> bool {
+        if self.is_trainer_ahead(&self.board.progress()) {
+            return true;
+        }
         self.makes_ahead
             && self.journal.has_room(len)
             && match &self.handover {
@@ -156,7 +166,7 @@ impl Delivery {
 
     /// Frees what is committed; starts at the first tick that a new incarnation has not consumed.
     fn follow_incarnation(&mut self, progress: &Progress) -> Result<(), JournalError> {
-        if progress.attached == 0 {
+        if progress.attached == 0 || self.is_trainer_ahead(progress) {
             return Ok(());
         }
         if self.incarnation != Some(progress.incarnation) {

@@ -117,6 +117,25 @@ impl Slots {
         }
     }
 
+    /// Which slots hold a vehicle: all that an episode needs to know of the one before it.
+    #[must_use]
+    pub fn occupied(&self) -> Vec<bool> {
+        self.slots.iter().map(|slot| slot.vehicle != EMPTY_SLOT).collect()
+    }
+
+    /// Slots as they were at the end of an episode. The next tick must begin another one.
+    #[must_use]
+    pub fn after_episode(occupied: &[bool]) -> Self {
+        let held = Slot { vehicle: 0, ..EMPTY };
+        Self {
+            slots: occupied
+                .iter()
+                .map(|is_held| if *is_held { held } else { EMPTY })
+                .collect(),
+            ..Self::default()
+        }
+    }
+
     /// All rows.
     #[must_use]
     pub fn rows(&self) -> &[Slot] {
@@ -129,6 +148,23 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
     use std::collections::BTreeMap;
+
+    #[test]
+    fn an_episode_begins_as_if_the_one_before_had_not_been_stored() {
+        let mut slots = Slots::default();
+        tick(&mut slots, true, &[3, 4, 5]);
+        tick(&mut slots, false, &[3, 5]);
+        let mut stored = Slots::after_episode(&slots.occupied());
+        for vehicles in [&[0, 1][..], &[0, 1, 2, 3]] {
+            let is_first = vehicles.len() == 2;
+            assert_eq!(
+                tick(&mut slots, is_first, vehicles),
+                tick(&mut stored, is_first, vehicles)
+            );
+            assert_eq!(slots.rows(), stored.rows());
+        }
+        assert_eq!(slots.rows().len(), 4);
+    }
 
     fn tick(slots: &mut Slots, new_episode: bool, vehicles: &[u32]) -> Vec<usize> {
         slots.begin(new_episode);

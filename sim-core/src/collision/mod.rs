@@ -24,7 +24,7 @@ mod record;
 
 use body::{CollisionBody, box_touches_prism, boxes_touch, common_height, common_point};
 use broad::{BroadPhase, LARGE_M};
-pub use record::{CollisionCounts, ContactReporter};
+pub use record::{CollisionCounts, ContactReporter, ContactState};
 
 /// Reaches of vehicles (cars, lorries) up to which the cell of the centre holds every solid nearby: one index for each, metres.
 const REACHES_M: [f64; 2] = [3.2, 11.0];

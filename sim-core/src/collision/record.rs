@@ -1,9 +1,9 @@
 //! Reporting of contacts: a message, a line in the run's directory, a count in its report.
 
 use std::{
-    fs::File,
-    io::{BufWriter, Write as _},
-    path::PathBuf,
+    fs::{File, OpenOptions},
+    io::{BufWriter, Seek as _, SeekFrom, Write as _},
+    path::{Path, PathBuf},
     sync::Arc,
 };
 
@@ -18,13 +18,13 @@ use ipc_schema::{
     traffic::{MetaEvent, VehicleMeta},
     world::VehicleState,
 };
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::CollisionDetector;
 use crate::scene::{Scene, Solid};
 
 /// Contacts that began in the run, by what was struck.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CollisionCounts {
     /// All of them.
     pub total: u64,
@@ -49,6 +49,14 @@ impl CollisionCounts {
         };
         *count += 1;
     }
+}
+
+/// Contacts before an episode: their counts, and the length of their lines.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ContactState {
+    counts: CollisionCounts,
+    /// Bytes in `events/collisions.jsonl`.
+    line_bytes: u64,
 }
 
 /// A line of `events/collisions.jsonl`.
@@ -96,19 +104,24 @@ pub struct ContactReporter {
 }
 
 impl ContactReporter {
-    /// Opens the contacts of a run in the scenes of its maps; `None` if the run does not detect them.
+    /// Opens the contacts of a run in the scenes of its maps; `None` if the run does not detect them. Lines behind those of `before` are
+    /// removed from the file: their ticks are made again.
     ///
     /// # Errors
     /// The service does not exist, or the file cannot be created.
-    pub fn open(membership: &RunMembership, scenes: &[Arc<Scene>]) -> Result<Option<Self>, Failure> {
+    pub fn open(
+        membership: &RunMembership,
+        scenes: &[Arc<Scene>],
+        before: ContactState,
+    ) -> Result<Option<Self>, Failure> {
         if !membership.run.config.collision.detect {
             return Ok(None);
         }
         let publisher = membership.publisher(Channel::Event)?;
         let directory = membership.run.run_dir.join("events");
         let path = directory.join("collisions.jsonl");
-        let created = std::fs::create_dir_all(&directory).and_then(|()| File::create(&path));
-        let file = created.map_err(|source| WriteError {
+        let opened = std::fs::create_dir_all(&directory).and_then(|()| open_at(&path, before.line_bytes));
+        let file = opened.map_err(|source| WriteError {
             path: path.clone(),
             source,
         })?;
@@ -120,8 +133,21 @@ impl ContactReporter {
             lines: BufWriter::new(file),
             episode: None,
             names: Vec::new(),
-            counts: CollisionCounts::default(),
+            counts: before.counts,
         }))
+    }
+
+    /// Contacts so far.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn state(&mut self) -> Result<ContactState, Failure> {
+        let counts = self.finish()?;
+        let line_bytes = self.lines.get_mut().stream_position().map_err(|source| WriteError {
+            path: self.path.clone(),
+            source,
+        })?;
+        Ok(ContactState { counts, line_bytes })
     }
 
     /// Remembers the ids of road users that depart.
@@ -193,6 +219,15 @@ impl ContactReporter {
         })?;
         Ok(self.counts)
     }
+}
+
+/// The file at `path` with its first `bytes`, open behind them.
+fn open_at(path: &Path, bytes: u64) -> std::io::Result<File> {
+    let mut file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
+    let bytes = bytes.min(file.metadata()?.len());
+    file.set_len(bytes)?;
+    file.seek(SeekFrom::Start(bytes))?;
+    Ok(file)
 }
 
 fn unreadable(error: BlockError) -> Failure {

@@ -161,6 +161,11 @@ impl Mirror {
         self.resynchronisations
     }
 
+    /// Continues counting from statistics of earlier episodes.
+    pub fn restore_counts(&mut self, tracking: TrackingStatistics, resynchronisations: u64) {
+        (self.tracking, self.resynchronisations) = (tracking, resynchronisations);
+    }
+
     /// Takes announcements: departures make road users known, arrivals let them go.
     ///
     /// # Errors

@@ -1,7 +1,7 @@
 //! Tracking statistics of a run: percentiles from counts, so that millions of samples need no memory.
 
 use ipc_schema::world::{APPEARED, RESYNCHRONISED, VehicleState};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Width of a bin, metres.
 const BIN_M: f64 = 0.01;
@@ -9,7 +9,7 @@ const BIN_M: f64 = 0.01;
 const BINS: usize = 1_001;
 
 /// Counts of sizes.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Histogram {
     bins: Vec<u64>,
     count: u64,
@@ -75,7 +75,7 @@ impl Histogram {
 }
 
 /// Tracking of a run's vehicles.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrackingStatistics {
     lateral: Histogram,
     longitudinal: Histogram,

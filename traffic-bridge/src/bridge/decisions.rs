@@ -8,7 +8,6 @@ use std::{
 };
 
 use ipc_schema::{
-    board::Progress,
     config::StageConfig,
     failure::{Failure, FailureKind},
     membership::{RunMembership, Wait},
@@ -39,6 +38,8 @@ pub(crate) struct StageDecisions {
     /// Ticks in the checkpoint of a resumed run, and the decisions that were taken in them.
     committed_ticks: u64,
     kept: Vec<StageDecision>,
+    /// The trainer lives: this process was started again, and makes lessons again whose decisions stand in the log.
+    is_restart: bool,
     newest: Option<StageDecision>,
     path: PathBuf,
     log: File,
@@ -58,19 +59,21 @@ impl StageDecisions {
             (Mode::Simulate | Mode::Play, "") => StageSource::Count(curriculum.stages.clone()),
             (Mode::Simulate | Mode::Play, path) => StageSource::Log(read(Path::new(path))?),
         };
-        let mut kept = match run.beginning {
-            Some(_) => read(&path)?,
-            None => Vec::new(),
+        let is_restart = run.restart.is_some();
+        let mut kept = match run.beginning.is_some() || is_restart && path.exists() {
+            true => read(&path)?,
+            false => Vec::new(),
         };
         // The trainer repeats decisions that are later than the checkpoint. A lesson that begins with the tick after the checkpoint
         // was already decided.
-        kept.retain(|decision| decision.tick <= run.committed_ticks());
+        kept.retain(|decision| is_restart || decision.tick <= run.committed_ticks());
         let log = begin_log(&path, &kept).map_err(|error| unwritten(&path, &error))?;
         Ok(Self {
             source,
             committed_ticks: run.committed_ticks(),
             newest: kept.last().copied(),
             kept,
+            is_restart,
             path,
             log,
         })
@@ -92,6 +95,10 @@ impl StageDecisions {
         lesson: u64,
         tick: u64,
     ) -> Result<Option<usize>, Failure> {
+        // A lesson that was begun before this process was started again has its stage in the log.
+        if self.is_restart && self.kept.last().is_some_and(|newest| lesson <= newest.lesson) {
+            return Ok(Some(self.stage_in_checkpoint(lesson)));
+        }
         let stage = match &self.source {
             // The trainer starts only after SUMO has accepted its input, so the first lesson cannot wait for it.
             StageSource::Trainer(_) if lesson == 0 => 0,
@@ -101,7 +108,12 @@ impl StageDecisions {
             StageSource::Trainer(board) => {
                 let mut stage = None;
                 let waited = membership.wait_until(|| {
-                    stage = Progress::stage_of(&board.progress(), lesson);
+                    let progress = board.progress();
+                    // The board answers for the newest two lessons. Since an earlier one the stage has not changed.
+                    stage = match self.is_restart && lesson + 1 < progress.since_lesson {
+                        true => u32::try_from(logged(&self.kept, lesson)).ok(),
+                        false => progress.stage_of(lesson),
+                    };
                     stage.is_some()
                 })?;
                 if waited == Wait::Stopped {

@@ -142,6 +142,7 @@ impl Bridge {
         episode: &Episode,
         StageMap { stage, map }: StageMap,
     ) -> Result<RunningEpisode, Failure> {
+        self.store_state(episode)?;
         let run = &self.membership.run;
         let options = options(run, &self.maps[map].source, episode)?;
         let mut sumo = match before {
@@ -210,7 +211,7 @@ impl Bridge {
             // Close the episode or the segment, or prepare the next step.
             if ends {
                 self.check_that_road_users_came()?;
-                self.totals.cost = Some(sumo.cost());
+                self.totals.cost = Some(self.totals.cost_before.plus(sumo.cost()));
             }
             if is_reset {
                 self.totals.resets += 1;
@@ -276,6 +277,8 @@ impl Bridge {
         })?;
         match (failure, waited) {
             (Some(failure), _) => Err(failure),
+            // Ticks that are made again are not paced.
+            (None, Wait::Ready) if tick < self.paced_from => Ok(Wait::Ready),
             (None, Wait::Ready) => Ok(self.pacing.wait(&self.membership, step_s)?),
             (None, Wait::Stopped) => Ok(Wait::Stopped),
         }

@@ -16,7 +16,7 @@ use super::{
 };
 
 /// What a map was used for.
-#[derive(Debug, Clone, serde::Serialize)]
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 pub(super) struct MapUsage {
     name: String,
     /// Lessons that ran to their end.

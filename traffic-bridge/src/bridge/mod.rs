@@ -22,6 +22,8 @@ use ipc_schema::{
     traffic::MetaEvent,
 };
 
+use serde::{Deserialize, Serialize};
+
 use crate::sumo::{Sumo, SumoCost, frame::TrafficFrame};
 use commands::CommandExecutor;
 use lessons::MapUsage;
@@ -60,12 +62,26 @@ struct Bridge {
     /// Poses of the heroes, in the driving task.
     poses: Option<Subscriber>,
     pacing: Pacing,
+    /// The first tick that the clock paces.
+    paced_from: u64,
     command_server: ControlServer,
     commands: CommandExecutor,
     ticks_per_step: u64,
     /// The maps of the run.
     maps: Vec<RunMap>,
     /// Lessons and ticks on each map, in a run with a curriculum.
+    map_usage: Vec<MapUsage>,
+}
+
+/// What this process has counted when an episode begins, and which episode that is.
+#[derive(Debug, Serialize, Deserialize)]
+struct BridgeState {
+    episode: u64,
+    resets: u64,
+    vehicle_steps: u64,
+    arrived: u64,
+    repeated_ticks: u64,
+    cost: SumoCost,
     map_usage: Vec<MapUsage>,
 }
 
@@ -79,6 +95,8 @@ struct BridgeTotals {
     /// Episodes that a command has reset, and the ticks that these episodes had.
     resets: u64,
     repeated_ticks: u64,
+    /// Processor time of SUMO before this process was started.
+    cost_before: SumoCost,
     /// Processor time of SUMO over the finished episodes.
     cost: Option<SumoCost>,
 }
@@ -116,27 +134,48 @@ impl Bridge {
     fn open(membership: RunMembership, poses: Option<Subscriber>) -> Result<Self, Failure> {
         let outbox = Outbox::open(&membership)?;
         let maps = membership.run.every_map();
+        // Continue where the part of the run before this one stood when the episode began.
+        let state: Option<BridgeState> = membership.stored_episode_state()?;
+        let counted = |count: fn(&BridgeState) -> u64| state.as_ref().map_or(0, count);
         let totals = BridgeTotals {
             ticks: membership.run.first_tick(),
-            vehicle_steps: 0,
-            arrived: 0,
+            vehicle_steps: counted(|state| state.vehicle_steps),
+            arrived: counted(|state| state.arrived),
             resets: membership.run.start().resets,
-            repeated_ticks: 0,
+            repeated_ticks: counted(|state| state.repeated_ticks),
+            cost_before: state.as_ref().map_or(SumoCost::default(), |state| state.cost),
             cost: None,
         };
+        let usage_before = state.map(|state| state.map_usage);
         Ok(Self {
             outbox,
             totals,
             sensing: membership.board_of(Process::SensorDaemon)?,
             poses,
+            paced_from: membership.run.restart.map_or(0, |restart| restart.sensed_ticks),
             pacing: Pacing::new(membership.run.config.run.real_time_factor),
             command_server: membership.control_server()?,
             commands: CommandExecutor::of_run(&membership.run.run_dir)?,
             ticks_per_step: membership.run.ticks_per_traffic_step(),
-            map_usage: maps.iter().map(|map| MapUsage::new(&map.name)).collect(),
+            map_usage: usage_before.unwrap_or_else(|| maps.iter().map(|map| MapUsage::new(&map.name)).collect()),
             maps,
             membership,
         })
+    }
+
+    /// Stores what has been counted before an episode begins.
+    fn store_state(&self, episode: &Episode) -> Result<(), Failure> {
+        let totals = &self.totals;
+        let state = BridgeState {
+            episode: self.episode_number(episode),
+            resets: totals.resets,
+            vehicle_steps: totals.vehicle_steps,
+            arrived: totals.arrived,
+            repeated_ticks: totals.repeated_ticks,
+            cost: totals.cost.unwrap_or(totals.cost_before),
+            map_usage: self.map_usage.clone(),
+        };
+        self.membership.store_episode_state(totals.ticks, &state)
     }
 
     /// Reports that the run has begun, and its length where it is known.

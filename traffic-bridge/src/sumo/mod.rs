@@ -22,6 +22,7 @@ use frame::{RoadUserRegister, TrafficFrame, signal_meta};
 use inputs::InputFiles;
 use libsumo::ffi;
 use options::SumoOptions;
+use serde::{Deserialize, Serialize};
 
 /// True while a [`Sumo`] holds libsumo's global simulation.
 static TAKEN: AtomicBool = AtomicBool::new(false);
@@ -50,7 +51,7 @@ impl Drop for LibsumoClaim {
 }
 
 /// Processor time by purpose since SUMO was started, seconds.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct SumoCost {
     /// SUMO's own steps.
     pub step_s: f64,
@@ -58,6 +59,18 @@ pub struct SumoCost {
     pub getters_s: f64,
     /// Reading traffic lights.
     pub signals_s: f64,
+}
+
+impl SumoCost {
+    /// The sum of both.
+    #[must_use]
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            step_s: self.step_s + other.step_s,
+            getters_s: self.getters_s + other.getters_s,
+            signals_s: self.signals_s + other.signals_s,
+        }
+    }
 }
 
 /// A running simulation. Not `Send`: libsumo stays on the thread that started it.

@@ -320,6 +320,7 @@ fn run_file(run_dir: PathBuf, source: Source, ticks: u64, step_s: f64) -> RunFil
         config: serde_json::from_value(config(ticks, step_s)).unwrap(),
         config_hash: String::new(),
         beginning: None,
+        restart: None,
         run_dir,
     }
 }
