@@ -27,18 +27,18 @@ pub enum Process {
 pub enum ProcessScope {
     /// Every environment has its own.
     Environment,
-    /// There is one for the whole run; it belongs to environment 0.
+    /// The whole run has one; it belongs to environment 0.
     Run,
 }
 
 /// What the end of a process means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OnExit {
-    /// The run needs it: its end before its work is done ends the run.
+    /// The run needs the process: its end before its work is done ends the run.
     Required,
-    /// The run needs it, and nothing is lost when it dies: it is replaced, unless it reported a failure.
+    /// The run needs the process, but loses nothing when it dies: the supervisor replaces it, unless it reported a failure.
     Replace,
-    /// It only watches: it is restarted.
+    /// The process is a watcher: the supervisor restarts it.
     Restart,
 }
 
@@ -145,13 +145,13 @@ const _: () = {
 };
 
 impl ProcessSpec {
-    /// True if the run is not over before this process is done.
+    /// True if the run lasts until this process is done.
     #[must_use]
     pub fn is_required(&self) -> bool {
         self.on_exit != OnExit::Restart
     }
 
-    /// What its end means in `run`: of trainers that learn together, none can be replaced in the middle of a step that all take.
+    /// What its end means in `run`. Trainers that learn together take every step together, so none of them can be replaced alone.
     #[must_use]
     pub fn on_exit(&self, run: &RunFile) -> OnExit {
         match self.on_exit {
@@ -166,7 +166,7 @@ impl ProcessSpec {
         (env_index == 0 || self.scope == ProcessScope::Environment) && (self.is_wanted)(run)
     }
 
-    /// Its name among those of a run: with the environment, where there are several.
+    /// Its name in messages, with the number of its environment if the run has several.
     #[must_use]
     pub fn label(&self, run: &RunFile) -> String {
         match self.scope {

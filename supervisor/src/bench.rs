@@ -1,4 +1,4 @@
-//! `caraware bench`: the benchmarks are a program of their own, `caraware-bench`, which lies beside this one.
+//! `caraware bench`: starts the program `caraware-bench`, which lies beside this one.
 
 use std::{ffi::OsString, os::unix::process::CommandExt as _, process::Command};
 

@@ -1,4 +1,4 @@
-//! Checkpoints on disk, as `caraware.run.manifest` (Python, which writes them) verifies them.
+//! Checkpoints on disk. The Python module `caraware.run.manifest`, which writes them, also verifies them for the supervisor.
 
 use std::{
     path::{Path, PathBuf},
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{failure::Exit, install::Install};
 
-/// What the manifest says that matters here.
+/// The fields of a checkpoint's manifest that the supervisor needs.
 #[derive(Debug, Clone, Deserialize)]
 struct CheckpointManifest {
     observation_size: u64,
@@ -25,7 +25,7 @@ struct CheckpointManifest {
 
 #[derive(Debug, Clone, Deserialize)]
 struct CheckpointCounters {
-    /// -1 before the first.
+    /// The last committed tick; -1 before the first commit.
     committed_tick: i64,
     #[serde(default)]
     next_episode: u64,
@@ -34,7 +34,7 @@ struct CheckpointCounters {
 }
 
 impl CheckpointCounters {
-    /// Where a simulation that goes on begins.
+    /// Where a resumed simulation begins.
     fn start(&self) -> Start {
         Start {
             committed_ticks: u64::try_from(self.committed_tick + 1).unwrap_or(0),
@@ -45,28 +45,28 @@ impl CheckpointCounters {
     }
 }
 
-/// A choice as a configuration writes it.
-fn word(choice: impl Serialize) -> String {
+/// A value as a configuration file writes it.
+fn as_configured(choice: impl Serialize) -> String {
     serde_json::to_string(&choice).unwrap_or_default()
 }
 
-/// What the Python side answers.
+/// The answer of `caraware.run.manifest`: a checkpoint, or the reason why there is none.
 #[derive(Debug, Deserialize)]
 struct VerifierAnswer {
     checkpoint: Option<PathBuf>,
     manifest: Option<CheckpointManifest>,
-    /// Environments after the first.
+    /// Counters of the environments after the first.
     #[serde(default)]
     others: Vec<CheckpointCounters>,
     refused: Option<String>,
 }
 
-/// A checkpoint of which every byte is as it was written.
+/// A verified checkpoint: every byte is as the trainer wrote it.
 #[derive(Debug)]
 pub struct FoundCheckpoint {
     /// Its directory.
     pub checkpoint: PathBuf,
-    /// True if a run was named, and not this checkpoint of it.
+    /// True if the user named a run; false if the user named this checkpoint.
     pub is_run: bool,
     run_dir: PathBuf,
     manifest: CheckpointManifest,
@@ -74,43 +74,43 @@ pub struct FoundCheckpoint {
 }
 
 impl FoundCheckpoint {
-    /// Looks for a checkpoint by its directory, or for the best of a run by the run's directory or its name in `runs`.
+    /// Finds the checkpoint in the directory `named`, or the best checkpoint of the run with this directory or with this name in `runs`.
     ///
     /// # Errors
-    /// There is none, or it is damaged.
+    /// There is no checkpoint, or it is damaged.
     pub fn best(install: &Install, named: &str, runs: &Path) -> Result<Self, Exit> {
-        Self::ask(install, named, runs, "best")
+        Self::find(install, named, runs, "best")
     }
 
-    /// The same, but of a run the newest.
+    /// As [`Self::best`], but finds the newest checkpoint of a run.
     ///
     /// # Errors
-    /// There is none, or it is damaged.
+    /// There is no checkpoint, or it is damaged.
     pub fn newest(install: &Install, named: &str, runs: &Path) -> Result<Self, Exit> {
-        Self::ask(install, named, runs, "newest")
+        Self::find(install, named, runs, "newest")
     }
 
-    fn ask(install: &Install, named: &str, runs: &Path, which: &str) -> Result<Self, Exit> {
-        let (place, is_run) = place(named, runs)?;
+    fn find(install: &Install, named: &str, runs: &Path, which: &str) -> Result<Self, Exit> {
+        let (directory, is_run) = locate(named, runs)?;
         let output = Command::new(&install.python)
             .args(["-m", "caraware.run.manifest"])
-            .arg(&place)
+            .arg(&directory)
             .arg(which)
             .output()
             .map_err(|error| Exit::io("start", &install.python, &error))?;
-        let said = String::from_utf8_lossy(&output.stderr);
+        let warnings = String::from_utf8_lossy(&output.stderr);
         let answer: VerifierAnswer = serde_json::from_slice(&output.stdout).map_err(|_| {
             Exit::missing(
-                format!("cannot look into {}: {}", place.display(), said.trim()),
+                format!("cannot verify {}: {}", directory.display(), warnings.trim()),
                 "`make build` installs what the trainer needs; `caraware doctor` checks it",
             )
         })?;
-        // What was passed over on the way is a warning.
-        eprint!("{said}");
+        // The verifier warns of each damaged checkpoint that it skips.
+        eprint!("{warnings}");
         let (Some(checkpoint), Some(manifest)) = (answer.checkpoint, answer.manifest) else {
             return Err(Exit::run(
                 format!("checkpoint refused: {}", answer.refused.unwrap_or_default()),
-                "give another checkpoint of the run, e.g. runs/NAME/checkpoints/update-000100",
+                "name another checkpoint of the run, e.g. runs/NAME/checkpoints/update-000100",
             ));
         };
         let run_dir = checkpoint.ancestors().nth(2).unwrap_or(&checkpoint).to_owned();
@@ -123,23 +123,23 @@ impl FoundCheckpoint {
         })
     }
 
-    /// The run that it belongs to.
+    /// Reads the run file of the run that the checkpoint belongs to.
     ///
     /// # Errors
-    /// Its run file is not there, or of another version.
+    /// The run file is missing, or another version wrote it.
     pub fn run(&self) -> Result<RunFile, Exit> {
         RunFile::read(&self.run_dir.join("run.json")).map_err(|error| {
             let mut failure =
                 ipc_schema::failure::Failure::from_error(ipc_schema::failure::FailureKind::Config, &error);
             failure.help = Some(format!(
-                "the run of {} tells what it was made with; `caraware play` takes a CONFIG instead",
+                "the configuration of {} comes from the run file beside it; `caraware play` accepts a CONFIG instead",
                 self.checkpoint.display()
             ));
             failure.into()
         })
     }
 
-    /// Name of the run that it belongs to.
+    /// Name of the run that the checkpoint belongs to.
     #[must_use]
     pub fn label(&self) -> String {
         self.run_dir
@@ -147,10 +147,10 @@ impl FoundCheckpoint {
             .map_or_else(|| "run".into(), |name| name.to_string_lossy().into_owned())
     }
 
-    /// Refuses a configuration whose observation or network has another size.
+    /// Checks that the configuration has the checkpoint's size of observation, network, activation and hidden layers.
     ///
     /// # Errors
-    /// They differ: both are named.
+    /// One of them differs; the message holds both values.
     pub fn check_fit(&self, config: &Config) -> Result<(), Exit> {
         let refuse = |what: &str, has: String, wants: String, help: &str| {
             let message = format!(
@@ -167,12 +167,17 @@ impl FoundCheckpoint {
         if self.manifest.network != config.trainer.network {
             let (has, wants) = (&self.manifest.network, &config.trainer.network);
             let help = "set trainer.network as in the run that learnt it";
-            return refuse("network is", word(has), word(wants), help);
+            return refuse("network is", as_configured(has), as_configured(wants), help);
         }
         if self.manifest.activation != config.trainer.activation {
             let (has, wants) = (self.manifest.activation, config.trainer.activation);
             let help = "set trainer.activation as in the run that learnt it";
-            return refuse("network has the activation", word(has), word(wants), help);
+            return refuse(
+                "network has the activation",
+                as_configured(has),
+                as_configured(wants),
+                help,
+            );
         }
         if self.manifest.hidden != config.trainer.hidden {
             let (has, wants) = (&self.manifest.hidden, &config.trainer.hidden);
@@ -187,7 +192,7 @@ impl FoundCheckpoint {
         Ok(())
     }
 
-    /// Where a run that goes on from it begins.
+    /// Where a run that continues from this checkpoint begins.
     #[must_use]
     pub fn beginning(&self) -> Beginning {
         Beginning {
@@ -198,10 +203,10 @@ impl FoundCheckpoint {
         }
     }
 
-    /// Copies it to the checkpoints of another run, which goes on from the copy.
+    /// Copies the checkpoint to the run in `run_dir`, and returns the beginning of that run, which continues from the copy.
     ///
     /// # Errors
-    /// Not readable, or not writable.
+    /// The checkpoint is not readable, or `run_dir` is not writable.
     pub fn copy_into(&self, run_dir: &Path) -> Result<Beginning, Exit> {
         let name = self.checkpoint.file_name().unwrap_or_default();
         let folder = run_dir.join("checkpoints");
@@ -219,25 +224,25 @@ impl FoundCheckpoint {
     }
 }
 
-/// The directory of a checkpoint, or of a run; true if it is a run.
-fn place(named: &str, runs: &Path) -> Result<(PathBuf, bool), Exit> {
+/// The directory of the checkpoint or run that `named` stands for; true if it is a run.
+fn locate(named: &str, runs: &Path) -> Result<(PathBuf, bool), Exit> {
     let absolute = |path: &Path| std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error));
     let path = Path::new(named);
     if path.join("manifest.json").exists() || path.parent().is_some_and(|folder| folder.ends_with("checkpoints")) {
         return Ok((absolute(path)?, false));
     }
-    let places = [runs.join(named), path.to_owned()];
-    if let Some(run) = places.iter().find(|place| place.join("checkpoints").is_dir()) {
+    let candidates = [runs.join(named), path.to_owned()];
+    if let Some(run) = candidates.iter().find(|run| run.join("checkpoints").is_dir()) {
         return Ok((absolute(run)?, true));
     }
-    if let Some(run) = places.iter().find(|place| place.join("run.json").is_file()) {
+    if let Some(run) = candidates.iter().find(|run| run.join("run.json").is_file()) {
         return Err(Exit::run(
             format!("the run {} has no checkpoint", run.display()),
-            "it ended before its first one: start it anew with `caraware train`",
+            "the run ended before its first checkpoint: start another with `caraware train`",
         ));
     }
     Err(Exit::config(
         format!("`{named}` is neither a run in {} nor a checkpoint", runs.display()),
-        "give a run's name or directory, or a directory like runs/NAME/checkpoints/update-000100",
+        "give the name or directory of a run, or a directory like runs/NAME/checkpoints/update-000100",
     ))
 }

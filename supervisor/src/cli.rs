@@ -19,18 +19,18 @@ pub struct Cli {
 
 const LONG: &str = "Co-simulation bridge: SUMO traffic with sensing vehicles, for a learner in another process.\n\n\
 SUMO moves the traffic; a nanoscopic core mirrors every vehicle with real dynamics; sensors observe it; a PyTorch process learns \
-from the observations where every vehicle is. Each part is a process of its own, and they share memory.";
+from the observations where every vehicle is. Each part is its own process, and all processes share memory.";
 
 const AFTER: &str = "Examples:
   caraware train                                  learn on the town with the default preset
   caraware train --set traffic.cavs=8 --set run.seed=7
   caraware simulate my.sumocfg                    your own scenario, every vehicle sensing
   caraware train --viewer                         learn, and open a viewer
-  caraware play town-1                            watch what it has learnt, beside a Kalman filter
+  caraware play town-1                            compare what the run has learnt with a Kalman filter
   caraware ps                                     list the processes of live runs, from another terminal
-  caraware view --web                             watch it in a browser
-  caraware generate city --vehicles 20000         a city of any size: city/city.sumocfg
-  caraware bench lidar                            rays per second, beside Open3D's
+  caraware view --web                             watch a live run in a browser
+  caraware generate city --vehicles 20000         write a scenario of any size: city/city.sumocfg
+  caraware bench lidar                            measure rays per second, compared with Open3D
   caraware handover town-1                        replace the trainer of a live run; nothing is lost
   caraware stop                                   end the run; the trainer writes a checkpoint first
 
@@ -56,7 +56,7 @@ pub enum Subcommands {
     /// Replace the trainer of a live run; the simulation continues, and no observation is lost
     #[command(after_help = HANDOVER)]
     Handover(HandoverArgs),
-    /// The former name of `handover`, which is refused with the new one.
+    /// The former name of `handover`; the refusal names the new one.
     #[command(hide = true, disable_help_flag = true)]
     Swap {
         /// Anything.
@@ -76,13 +76,13 @@ pub enum Subcommands {
     View(ViewArgs),
     /// Write a city and its traffic, of any size, as a scenario of SUMO
     Generate(GenerateArgs),
-    /// Measure a part on this machine, side by side with its peers
+    /// Measure a part of caraware on this machine, compared with its peers
     #[command(
         disable_help_flag = true,
         after_help = "`caraware bench --help` lists the parts and the options."
     )]
     Bench {
-        /// The part and the options: those of the program `caraware-bench`
+        /// The part to measure and its options, as the program `caraware-bench` takes them
         #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENT")]
         arguments: Vec<OsString>,
     },
@@ -95,19 +95,19 @@ pub enum Subcommands {
 }
 
 const HANDOVER: &str = "Examples:
-  caraware handover                                      the same trainer again, after an upgrade of its code
+  caraware handover                                      replace the trainer by its present code, after an upgrade
   caraware handover town-1 --set trainer.learning_rate=0.001
   caraware handover --checkpoint runs/town-0/checkpoints/update-000400
 
-The successor starts beside the old trainer and gets ready. Only then does the old trainer write a checkpoint and leave. If the
-successor fails, the handover is refused and the old trainer continues.";
+The successor starts beside the old trainer. Once it is ready, the old trainer writes a checkpoint and leaves. If the successor
+fails, the handover is refused and the old trainer continues.";
 
 const RESUME: &str = "Examples:
   caraware train                                             the default preset, from the beginning
   caraware train --resume town-1                             continues from its newest sound checkpoint, in runs/town-1
-  caraware train --resume runs/town-1/checkpoints/update-000300    another run, which begins there
+  caraware train --resume runs/town-1/checkpoints/update-000300    starts another run from this checkpoint
 
-A resumed run ends with the parameters, bit for bit, of the run that was never stopped (on a CPU).
+On a CPU a resumed run ends with the same parameters, bit for bit, as a run that was never stopped.
 Trainers that learn together resume together: torchrun … -m caraware.parallel --resume RUN (docs/parallel.md).";
 
 const PLAY: &str = "Examples:
@@ -116,10 +116,11 @@ const PLAY: &str = "Examples:
   caraware play town-1 my/scenario.sumocfg                   on other roads; the observation must have the same size
   caraware play town-1 --set run.real_time_factor=1          in real time, for a viewer
 
-Shows each vehicle's position error by the policy and by an extended Kalman filter over the same samples, until Ctrl-C or `caraware
-stop`; then a report. On a terminal the table is live, otherwise a line appears every few seconds. Viewers show the predictions.";
+Shows the position errors of the policy and of an extended Kalman filter on the same samples, for each vehicle. It ends with
+Ctrl-C or `caraware stop`, and then prints a report. On a terminal the table is live; otherwise a line appears every few seconds.
+Viewers show the predictions.";
 
-/// What `train` takes.
+/// Arguments of `train`.
 #[derive(Debug, Args, Clone)]
 pub struct TrainArgs {
     /// Continue a run (its name or directory), or begin another run from one of its checkpoints (a directory)
@@ -130,7 +131,7 @@ pub struct TrainArgs {
     pub run: RunArgs,
 }
 
-/// What `play` takes.
+/// Arguments of `play`.
 #[derive(Debug, Args, Clone)]
 pub struct PlayArgs {
     /// Name or directory of a run, to use its best checkpoint, or a checkpoint directory
@@ -139,24 +140,24 @@ pub struct PlayArgs {
     /// End after this many episodes of `episode.ticks` each [default: never]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub episodes: Option<u64>,
-    /// The run; without CONFIG, the configuration of the run that learnt.
+    /// The run; without CONFIG it has the configuration of the run that learnt.
     #[command(flatten)]
     pub run: RunArgs,
 }
 
 const CONTROL: &str = "Examples:
   caraware control pause
-  caraware control step 10                       ten ticks, then pause again
-  caraware control sensor cav.3 gnss off         until the episode ends
+  caraware control step 10                       make ten ticks, then pause again
+  caraware control sensor cav.3 gnss off         switch a sensor off until the episode ends
   caraware control sensor all lidar on
-  caraware control start cav.3 A1B1              a successor of cav.3 starts from edge A1B1
+  caraware control start cav.3 A1B1              start a vehicle in place of cav.3 from edge A1B1
   caraware control destination cav.3 C2D2
-  caraware control reset                         the same episode from its beginning
+  caraware control reset                         start the same episode again
 
 Every command takes effect at a tick, which the answer names. The run's commands.jsonl lists those that change the simulation:
 `caraware train --commands FILE` with the same configuration makes the same run again. From another host: `caraware-viewer command`.";
 
-/// What `control` takes.
+/// Arguments of `control`.
 #[derive(Debug, Args, Clone)]
 pub struct ControlArgs {
     /// Name of the run; may be left out if only one is alive
@@ -224,13 +225,13 @@ fn sensors() -> impl TypedValueParser<Value = SensorSelection> {
 /// State of a switched sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum SwitchState {
-    /// It delivers
+    /// The sensor delivers samples
     On,
-    /// It delivers nothing
+    /// The sensor delivers nothing
     Off,
 }
 
-/// What `handover` takes.
+/// Arguments of `handover`.
 #[derive(Debug, Args, Clone)]
 pub struct HandoverArgs {
     /// Name of the run; may be left out if only one is alive
@@ -244,19 +245,19 @@ pub struct HandoverArgs {
 }
 
 const VIEW: &str = "Examples:
-  caraware view                          the run on this machine, in a window (a browser where there is no screen)
+  caraware view                          show the run on this machine in a window (in a browser if there is no screen)
   caraware view --web                    print an address, for any number of browsers
   caraware view --save run.rrd           record; open it later with `.venv/bin/rerun run.rrd`
-  caraware view town-2                   one of several runs
+  caraware view town-2                   show one of several runs
   caraware view --vehicle cav.3 --lidar all
-  caraware view tcp/127.0.0.1:7448       an endpoint (`fanout.listen` of a run)
+  caraware view tcp/127.0.0.1:7448       connect to an endpoint (`fanout.listen` of a run)
 
-Viewers may come and go, several at once: none can hold up the run. Ctrl-C ends the viewer alone.
-From another machine, which needs neither Rust nor this command (pip install ./viewer):
+Several viewers may connect and leave at any time: no viewer delays the run. Ctrl-C ends only the viewer.
+Another machine needs neither Rust nor this command, only the viewer (pip install ./viewer):
   ssh -N -L 7447:127.0.0.1:7447 HOST &
   caraware-viewer";
 
-/// What `view` takes.
+/// Arguments of `view`.
 #[derive(Debug, Args, Clone)]
 pub struct ViewArgs {
     /// Name of a run on this machine, or an endpoint as tcp/HOST:PORT [default: the only run alive]
@@ -273,7 +274,7 @@ pub struct ViewArgs {
     /// A vehicle to show (repeatable): figures and point cloud; the first is in the 3-D view
     #[arg(long, value_name = "ID")]
     pub vehicle: Vec<String>,
-    /// Points of the LIDARs: on road users only, with the range ring; all; none [default: interest]
+    /// Points of the LIDARs: those on road users, with the range ring (interest); all; or none (off) [default: interest]
     #[arg(long, value_parser = ["interest", "all", "off"])]
     pub lidar: Option<String>,
     /// Environment of the run [default: its first]
@@ -308,16 +309,16 @@ pub struct Credentials {
     pub key: Option<PathBuf>,
 }
 
-/// Where a viewer beside a run draws.
+/// How a viewer beside a run is shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum ViewerKind {
-    /// In a window; where there is no screen, in a browser
+    /// In a window, or in a browser if there is no screen
     Window,
-    /// In a browser: prints the address
+    /// In a browser; the address is printed
     Web,
 }
 
-/// What `generate` takes.
+/// Arguments of `generate`.
 #[derive(Debug, Args, Clone)]
 pub struct GenerateArgs {
     /// Where to write city.sumocfg, city.net.xml and city.rou.xml
@@ -348,7 +349,7 @@ pub struct GenerateArgs {
     pub speed_kmh: f64,
 }
 
-/// What `train` and `simulate` take.
+/// Arguments of `train` and `simulate`.
 #[derive(Debug, Args, Clone, Default)]
 pub struct RunArgs {
     /// Preset name, .toml file, or .sumocfg file [default: town]
@@ -380,7 +381,7 @@ pub struct RunArgs {
 }
 
 impl RunArgs {
-    /// The same with every option that is short for a setting written as one.
+    /// Returns the arguments with every shorthand option replaced by the setting that it stands for.
     #[must_use]
     pub fn with_shorthands(&self) -> Self {
         let mut args = self.clone();

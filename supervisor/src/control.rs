@@ -1,4 +1,4 @@
-//! `caraware control`: commands to a live simulation, and the supervisor's part in them: it passes them on and hands answers back.
+//! `caraware control`: sends a command to a live simulation. The supervisor forwards the command and returns the answer.
 
 use std::time::{Duration, Instant};
 
@@ -15,37 +15,39 @@ use crate::{
     socket::{self, ReplySocket, SupervisorRequest},
 };
 
-/// Longest wait for the simulation to answer; it takes commands while it waits for the learner, but not within a step of SUMO.
+/// Longest time that the supervisor waits for an answer. `traffic-bridge` takes commands between two SUMO steps, also while it waits
+/// for the learner.
 const ANSWER_WITHIN: Duration = Duration::from_secs(10);
 
-/// The supervisor's side: commands that have been passed on.
+/// Forwards commands from the supervisor's socket to the environments, and their answers back.
 pub struct ControlRelay {
     /// One for each environment.
     clients: Vec<ControlClient>,
     waiting: Vec<PendingCommand>,
 }
 
-/// A command that has not been answered by everybody whom it went to.
+/// A command that at least one environment has not answered yet.
 struct PendingCommand {
-    asked: Vec<Pending>,
+    /// Environments that have not answered.
+    unanswered: Vec<Pending>,
     replies: Vec<Reply>,
     reply: ReplySocket,
     since: Instant,
 }
 
 impl PendingCommand {
-    /// Takes the answers that are there; true if these are all.
-    fn look(&mut self) -> Result<bool, PortError> {
-        for pending in std::mem::take(&mut self.asked) {
+    /// Collects the answers that have arrived. True once every environment has answered.
+    fn collect_replies(&mut self) -> Result<bool, PortError> {
+        for pending in std::mem::take(&mut self.unanswered) {
             match pending.reply()? {
                 Some(reply) => self.replies.push(reply),
-                None => self.asked.push(pending),
+                None => self.unanswered.push(pending),
             }
         }
-        Ok(self.asked.is_empty())
+        Ok(self.unanswered.is_empty())
     }
 
-    /// Answers: a refusal, if anybody refused.
+    /// Sends the answer: the first refusal if an environment refused, else the first reply.
     fn answer(mut self) {
         let refused = self.replies.iter().position(|reply| matches!(reply, Reply::Refused(_)));
         if !self.replies.is_empty() {
@@ -55,7 +57,7 @@ impl PendingCommand {
 }
 
 impl ControlRelay {
-    /// Passes commands on to the peers of `clients`, one for each environment.
+    /// Creates a relay to the environments of `clients`.
     #[must_use]
     pub fn new(clients: Vec<ControlClient>) -> Self {
         Self {
@@ -64,8 +66,8 @@ impl ControlRelay {
         }
     }
 
-    /// Passes a command on to an environment, or to all of them; the answer will go back over `reply`.
-    pub fn pass_on(&mut self, command: &Command, env_index: Option<u32>, reply: ReplySocket) {
+    /// Forwards a command to one environment, or to all if `env_index` is `None`. The answer goes back over `reply`.
+    pub fn forward(&mut self, command: &Command, env_index: Option<u32>, reply: ReplySocket) {
         let index = env_index.map(|index| index as usize);
         let clients = match index {
             None => self.clients.as_slice(),
@@ -76,27 +78,27 @@ impl ControlRelay {
             return reply.refuse(Refusal::new(RefusalKind::Unsupported, message));
         }
         let mut waiting = PendingCommand {
-            asked: Vec::new(),
+            unanswered: Vec::new(),
             replies: Vec::new(),
             reply,
             since: Instant::now(),
         };
         for client in clients {
             match client.send(command) {
-                Ok(pending) => waiting.asked.push(pending),
+                Ok(pending) => waiting.unanswered.push(pending),
                 Err(refusal) => waiting.replies.push(Reply::Refused(refusal)),
             }
         }
         self.waiting.push(waiting);
     }
 
-    /// Hands answers back.
+    /// Sends the answers that are complete, and refuses commands that were not answered in time.
     ///
     /// # Errors
     /// The port is broken.
     pub fn advance(&mut self) -> Result<(), PortError> {
         for mut waiting in std::mem::take(&mut self.waiting) {
-            if waiting.look()? {
+            if waiting.collect_replies()? {
                 waiting.answer();
             } else if waiting.since.elapsed() > ANSWER_WITHIN {
                 waiting.reply.refuse(Refusal::new(
@@ -116,7 +118,7 @@ impl ControlRelay {
         !self.waiting.is_empty()
     }
 
-    /// Refuses what is left: the run is over.
+    /// Refuses all commands that still wait, because the run is over.
     pub fn end(&mut self) {
         for waiting in self.waiting.drain(..) {
             let refusal = Refusal::new(RefusalKind::Unanswered, "the run is over");
@@ -137,11 +139,11 @@ pub fn control(args: &ControlArgs) -> Result<(), Exit> {
             _ => FailureKind::Config,
         };
         let help = match refusal.kind {
-            RefusalKind::UnknownVehicle => "the viewer, and runs/NAME/events, show who is there",
+            RefusalKind::UnknownVehicle => "the viewer and runs/NAME/events show the ids of all vehicles",
             RefusalKind::UnknownEdge => "`netedit` shows the edges of the net and their ids",
-            RefusalKind::Busy => "ask again",
-            RefusalKind::Unanswered => "`caraware ps` shows how far the run is",
-            _ => "`caraware control --help` says what may be asked",
+            RefusalKind::Busy => "send the command again",
+            RefusalKind::Unanswered => "`caraware ps` shows the state of the run",
+            _ => "`caraware control --help` lists the commands",
         };
         Exit::Failure(Failure::new(kind, format!("refused: {refusal}")).with_help(help))
     };
@@ -167,7 +169,7 @@ fn command(action: &ControlAction) -> Command {
         ControlAction::Step { ticks } => Command::Step { ticks },
         ControlAction::Reset => Command::Reset {},
         ControlAction::Sensor { vehicle, sensor, state } => Command::Sensor {
-            vehicle: (vehicle != EVERYBODY).then_some(vehicle),
+            vehicle: (vehicle != ALL_VEHICLES).then_some(vehicle),
             sensor,
             state: match state {
                 SwitchState::On => Switch::On,
@@ -179,5 +181,5 @@ fn command(action: &ControlAction) -> Command {
     }
 }
 
-/// Stands for all vehicles.
-const EVERYBODY: &str = "all";
+/// The word that stands for all vehicles.
+const ALL_VEHICLES: &str = "all";

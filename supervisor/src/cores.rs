@@ -1,7 +1,7 @@
-//! Which cores the processes of a run may use.
+//! Decides which cores the processes of a run may use.
 //!
-//! Three processes of one environment talk a thousand times a second: kept together they stay in one cache, and
-//! environments do not push each other around. With one environment, or too few cores, the kernel decides.
+//! The three processes of an environment exchange messages a thousand times a second. On neighbouring cores they share a cache,
+//! and environments do not displace each other. With one environment, or with too few cores, the kernel decides.
 
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 
@@ -10,7 +10,7 @@ const ENVIRONMENT_CORES: usize = 3;
 /// Cores that a learner needs beside the environments: one for each of its networks.
 const TRAINER_CORES: usize = 2;
 
-/// Who may use which core.
+/// The cores of each environment and of the other processes.
 #[derive(Debug, PartialEq, Eq)]
 pub struct CorePlan {
     /// Cores of each environment.
@@ -19,7 +19,7 @@ pub struct CorePlan {
     pub rest: Vec<usize>,
 }
 
-/// Shares `cores` out to `envs` environments and, with `trainer_cores` for it, a trainer. `None`: everybody may use all of them.
+/// Distributes `cores` to `envs` environments and, if the run trains, to the trainer. `None` if every process may use all cores.
 #[must_use]
 pub fn plan(cores: &[usize], envs: usize, trains: bool) -> Option<CorePlan> {
     let spare = if trains { TRAINER_CORES } else { 0 };
@@ -42,7 +42,7 @@ pub fn available() -> Vec<usize> {
         .unwrap_or_default()
 }
 
-/// Runs `start` on `cores`, so that a process which it starts is bound to them from its first instruction.
+/// Runs `start` while this thread is bound to `cores`. A process that `start` creates inherits the binding.
 pub fn within<T>(cores: Option<&[usize]>, start: impl FnOnce() -> T) -> T {
     let Some(cores) = cores else { return start() };
     let before = available();
@@ -56,7 +56,7 @@ fn bind(cores: &[usize]) {
     let mut set = CpuSet::new();
     cores.iter().for_each(|core| set.set(*core));
     if let Err(error) = sched_setaffinity(None, &set) {
-        tracing::debug!(%error, "cannot choose cores");
+        tracing::debug!(%error, "cannot bind to cores");
     }
 }
 
@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn a_trainer_shares_two_cores_with_everybody() {
+    fn with_too_few_cores_every_process_shares_all_of_them() {
         assert_eq!(plan(&cores(2), 2, true), None);
         assert_eq!(plan(&cores(16), 8, true), None);
     }

@@ -18,7 +18,7 @@ use crate::{environment::Environment, live_table::LiveTable};
 /// Time between two lines when there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
 
-/// Rows of a table, so that it fits on most terminals.
+/// Rows of a table: it fits on most terminals.
 const TABLE_ROWS: usize = 24;
 
 /// Writes a line to standard error. A terminal that has been closed must not end the run.
@@ -35,7 +35,7 @@ pub fn print(text: &str) {
     }
 }
 
-/// Shows how a run fares.
+/// Shows the progress of a run.
 #[derive(Debug)]
 pub struct ProgressDisplay {
     bar: Option<ProgressBar>,
@@ -45,7 +45,7 @@ pub struct ProgressDisplay {
 }
 
 impl ProgressDisplay {
-    /// A bar if standard error is a terminal.
+    /// Shows a bar if standard error is a terminal, and lines otherwise.
     #[must_use]
     pub fn new() -> Self {
         let bar = std::io::stderr().is_terminal().then(ProgressBar::new_spinner);
@@ -80,7 +80,7 @@ impl ProgressDisplay {
             && run.mode == Mode::Play
             && let Some(table) = LiveTable::read(&run.run_dir)
         {
-            self.show(&table);
+            self.show_table(&table);
             return;
         }
         let view = ProgressView::read(environments, ready_at);
@@ -98,8 +98,8 @@ impl ProgressDisplay {
         self.last_text = view.line();
     }
 
-    /// The errors of each vehicle: a table where there is a terminal, else a line.
-    fn show(&mut self, table: &LiveTable) {
+    /// Shows the errors of each vehicle: a table on a terminal, otherwise a line.
+    fn show_table(&mut self, table: &LiveTable) {
         if let Some(bar) = &self.bar {
             bar.set_message(table.lines(TABLE_ROWS).join("\n"));
         } else if self.last_line.elapsed() >= LINE_EVERY {
@@ -130,7 +130,7 @@ fn style() -> ProgressStyle {
         .unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
-/// What is shown.
+/// The figures that are shown.
 struct ProgressView {
     /// Updates of a policy so far.
     updates: u64,
@@ -153,7 +153,7 @@ struct ProgressView {
 }
 
 impl ProgressView {
-    /// All environments together; where they stand is where the slowest does.
+    /// Sums the boards of all environments. Tick, episode and simulated time are those of the slowest environment.
     fn read(environments: &[Environment], ready_at: Option<Instant>) -> Self {
         let all = |process: Process| {
             let healths = environments
@@ -161,7 +161,8 @@ impl ProgressView {
                 .map(|environment| environment.board(process).health());
             healths.collect::<Vec<_>>()
         };
-        let (sensings, movings) = (all(Process::SensorDaemon), all(Process::SimCore));
+        // Health of every environment, by process.
+        let (sensings, worlds) = (all(Process::SensorDaemon), all(Process::SimCore));
         let sources = all(Process::TrafficBridge);
         let slowest = sensings.iter().min_by_key(|health| health.ticks).copied();
         let sensing = Health {
@@ -173,6 +174,7 @@ impl ProgressView {
         let training = first.map_or_else(TrainingStatus::default, |first| {
             first.board(Process::Trainer).training()
         });
+        // Largest lag behind SUMO of any environment.
         let behind = |healths: &[Health]| {
             let lags = sources
                 .iter()
@@ -180,17 +182,18 @@ impl ProgressView {
                 .map(|(source, health)| source.ticks.saturating_sub(health.ticks));
             lags.max().unwrap_or(0)
         };
-        let mut lags = vec![behind(&movings), behind(&sensings)];
+        let mut lags = vec![behind(&worlds), behind(&sensings)];
         if first.is_some_and(|first| first.run.mode.has_trainer()) {
             lags.push(behind(&all(Process::Trainer)));
         }
+        // Rates since all processes were ready.
         let tick_s = first.map_or(0.0, |first| first.run.config.run.tick_s);
         let wall_s = ready_at.map_or(0.0, |ready| ready.elapsed().as_secs_f64());
         #[expect(clippy::cast_precision_loss, reason = "for display")]
         let (steps, sim_time_s) = (sensing.vehicle_steps as f64, sensing.sim_time_ns as f64 * 1e-9);
         #[expect(clippy::cast_precision_loss, reason = "for display")]
         let simulated_s = tick_s * sensings.iter().map(|health| health.ticks).sum::<u64>() as f64;
-        let each_second = |amount: f64| if wall_s > 0.0 { amount / wall_s } else { 0.0 };
+        let per_second = |amount: f64| if wall_s > 0.0 { amount / wall_s } else { 0.0 };
         let episodes = first.map(|first| first.run.episodes()).unwrap_or_default();
         let total: Option<u64> = episodes.iter().map(|episode| episode.ticks).sum();
         Self {
@@ -200,12 +203,12 @@ impl ProgressView {
             episode: sensing.episode,
             sim_time_s,
             cavs: sensing.cavs,
-            road_users: movings.iter().map(|health| health.road_users).sum(),
+            road_users: worlds.iter().map(|health| health.road_users).sum(),
             arrived: sources.iter().map(|health| health.arrived).sum(),
             lags,
             steps: sensing.vehicle_steps,
-            steps_per_s: each_second(steps),
-            real_time_factor: each_second(simulated_s),
+            steps_per_s: per_second(steps),
+            real_time_factor: per_second(simulated_s),
             policy_std: training.policy_std,
             reward: training.reward,
             metrics: training.metrics,
@@ -215,7 +218,7 @@ impl ProgressView {
     fn text(&self) -> String {
         let (rate, traffic) = (self.rate(), self.traffic());
         let measured = metric::summary(&self.metrics);
-        // The metrics first: a narrow terminal cuts the end.
+        // The metrics come first, because a narrow terminal cuts the end.
         let learning = match (self.updates, measured.is_empty()) {
             (0, true) => format!("{:7.1} s", self.sim_time_s),
             (0, false) => measured,
@@ -232,7 +235,7 @@ impl ProgressView {
         )
     }
 
-    /// Who is there, who has arrived, and how far each stage is behind SUMO.
+    /// Road users, those that sense, arrivals, and how many ticks each process is behind SUMO.
     fn traffic(&self) -> String {
         let lags: Vec<String> = self.lags.iter().map(ToString::to_string).collect();
         format!(

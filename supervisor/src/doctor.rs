@@ -1,4 +1,4 @@
-//! `caraware doctor`: what is missing on this machine, what dead runs left, and how much room there is.
+//! `caraware doctor`: checks the installation, the free memory and disk space, and what dead runs left.
 
 use std::{net::TcpListener, path::Path, process::Command};
 
@@ -26,7 +26,7 @@ const PACKAGES: [&str; 10] = [
     "rerun",
     "zenoh",
 ];
-/// Programs that a run does without: any of these, what for, and the Debian package.
+/// Programs that a run does not need: any one of the names, its purpose, and its Debian package.
 const EXTRAS: [(&[&str], &str, &str); 4] = [
     (
         &["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"],
@@ -41,17 +41,20 @@ const EXTRAS: [(&[&str], &str, &str); 4] = [
     (&["unshare"], "namespaces for the same tests", "util-linux"),
     (&["openssl"], "keys for remote viewers (docs/remote.md)", "openssl"),
 ];
-/// Least free space worth starting with, MiB.
+/// Least free shared memory, MiB.
 const SHARED_MEMORY_MIB: u64 = 64;
+/// Least free disk space, MiB.
 const DISK_MIB: u64 = 512;
 
+/// Counts the checks that failed.
 struct DoctorChecks {
     missing: u32,
 }
 
 impl DoctorChecks {
-    fn say(&mut self, good: Result<String, (String, String)>, what: &str) {
-        match good {
+    /// Prints the result of one check: what was found, or what is missing and how to get it.
+    fn print(&mut self, result: Result<String, (String, String)>, what: &str) {
+        match result {
             Ok(text) => println!("ok       {what}: {text}"),
             Err((text, fix)) => {
                 self.missing += 1;
@@ -61,30 +64,30 @@ impl DoctorChecks {
     }
 }
 
-/// Looks at everything and prints a line each; with `clean`, removes what dead runs left.
+/// Prints a line for each check; with `clean` it also removes what dead runs left.
 ///
 /// # Errors
-/// Something needed is missing.
+/// A check failed.
 pub fn doctor(clean: bool) -> Result<(), Exit> {
     let mut checks = DoctorChecks { missing: 0 };
     match Install::find() {
-        Ok(install) => installation(&mut checks, &install),
+        Ok(install) => check_installation(&mut checks, &install),
         Err(Exit::Failure(failure)) => {
-            checks.say(Err((failure.message, failure.help.unwrap_or_default())), "installation")
+            checks.print(Err((failure.message, failure.help.unwrap_or_default())), "installation")
         }
         Err(other) => return Err(other),
     }
-    space(
+    check_space(
         &mut checks,
         "shared memory",
         registry::SHARED_MEMORY,
         SHARED_MEMORY_MIB,
         "free it, or enlarge it (Docker: --shm-size=1g)",
     );
-    space(&mut checks, "disk", ".", DISK_MIB, "free some disk space");
-    port(&mut checks);
-    extras();
-    runs(clean);
+    check_space(&mut checks, "disk", ".", DISK_MIB, "free some disk space");
+    check_viewer_port(&mut checks);
+    print_extras();
+    print_runs(clean);
     match checks.missing {
         0 => Ok(()),
         count => Err(Exit::missing(
@@ -94,22 +97,22 @@ pub fn doctor(clean: bool) -> Result<(), Exit> {
     }
 }
 
-fn installation(checks: &mut DoctorChecks, install: &Install) {
+fn check_installation(checks: &mut DoctorChecks, install: &Install) {
     for process in Process::ALL.into_iter().filter(|process| *process != Process::Trainer) {
         let found = install.binary(process);
-        checks.say(
+        checks.print(
             found
                 .map(|path| path.display().to_string())
                 .map_err(|_| ("not built".into(), "run `make build`".into())),
             process.name(),
         );
     }
-    libraries(checks, install);
-    packages(checks, install);
+    check_libraries(checks, install);
+    check_packages(checks, install);
 }
 
-/// Asks the dynamic linker whether everything libsumo links is there.
-fn libraries(checks: &mut DoctorChecks, install: &Install) {
+/// Asks the dynamic linker whether every library that libsumo needs is installed.
+fn check_libraries(checks: &mut DoctorChecks, install: &Install) {
     let library = install.sumo_home.join("lib64/libsumocpp.so");
     let listing = Command::new("ldd")
         .arg(&library)
@@ -125,11 +128,11 @@ fn libraries(checks: &mut DoctorChecks, install: &Install) {
         } else {
             Ok(name.to_owned())
         };
-        checks.say(result, "library for SUMO");
+        checks.print(result, "library for SUMO");
     }
 }
 
-fn packages(checks: &mut DoctorChecks, install: &Install) {
+fn check_packages(checks: &mut DoctorChecks, install: &Install) {
     let script = format!(
         "import importlib.util as u; print(' '.join(p for p in {:?} if u.find_spec(p) is None))",
         PACKAGES
@@ -148,31 +151,31 @@ fn packages(checks: &mut DoctorChecks, install: &Install) {
             "run `make build`".into(),
         )),
     };
-    checks.say(result, "Python packages");
+    checks.print(result, "Python packages");
 }
 
-fn space(checks: &mut DoctorChecks, what: &str, path: &str, least_mib: u64, fix: &str) {
+fn check_space(checks: &mut DoctorChecks, what: &str, path: &str, least_mib: u64, fix: &str) {
     let result = match free_bytes(Path::new(path)) {
         Ok(bytes) if bytes >> 20 >= least_mib => Ok(format!("{} MiB free", bytes >> 20)),
         Ok(bytes) => Err((format!("only {} MiB free in {path}", bytes >> 20), fix.to_owned())),
-        Err(_) => Err((format!("{path} cannot be looked at"), fix.to_owned())),
+        Err(_) => Err((format!("the free space of {path} cannot be read"), fix.to_owned())),
     };
-    checks.say(result, what);
+    checks.print(result, what);
 }
 
-fn port(checks: &mut DoctorChecks) {
+fn check_viewer_port(checks: &mut DoctorChecks) {
     let result = match TcpListener::bind("127.0.0.1:7447") {
         Ok(_) => Ok("127.0.0.1:7447 is free".to_owned()),
         Err(_) => Ok(
-            "127.0.0.1:7447 is taken (by a run?): a further run needs --set fanout.listen=tcp/127.0.0.1:PORT"
+            "127.0.0.1:7447 is in use, perhaps by a run: another run needs --set fanout.listen=tcp/127.0.0.1:PORT"
                 .to_owned(),
         ),
     };
-    checks.say(result, "port for viewers");
+    checks.print(result, "port for viewers");
 }
 
-/// What only tests and remote viewers need.
-fn extras() {
+/// Prints which of the programs for tests and remote viewers are installed.
+fn print_extras() {
     let directories = std::env::var_os("PATH").unwrap_or_default();
     for (names, purpose, package) in EXTRAS {
         let found = std::env::split_paths(&directories)
@@ -188,7 +191,7 @@ fn extras() {
     }
 }
 
-fn runs(clean: bool) {
+fn print_runs(clean: bool) {
     let entries = registry::entries();
     for entry in &entries {
         let name = entry.run.as_ref().map_or("(unreadable)", |run| run.name.as_str());
@@ -207,7 +210,7 @@ fn runs(clean: bool) {
     if entries.is_empty() {
         println!("ok       no stale run");
     }
-    for path in registry::strangers() {
-        println!("note     {}: not a run of caraware; left alone", path.display());
+    for path in registry::foreign_paths() {
+        println!("note     {}: not a run of caraware; it is not touched", path.display());
     }
 }

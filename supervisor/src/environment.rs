@@ -1,4 +1,4 @@
-//! One environment of a run as the supervisor sees it: its directory, its services, its boards.
+//! One environment of a run in the supervisor: its directory, its services and its boards.
 
 use std::path::PathBuf;
 
@@ -25,11 +25,11 @@ struct EpisodePlace {
 
 /// An environment. Its services live as long as this does.
 pub struct Environment {
-    /// The run as the processes of this environment see it.
+    /// The run file of this environment's processes.
     pub run: RunFile,
-    /// Where they read it.
+    /// Path of that file.
     pub run_file: PathBuf,
-    /// Which incarnation of each process counts.
+    /// Publishes the valid incarnation of each process.
     pub roster: RosterWriter,
     /// Largest number of ticks that a trainer has committed, or that were sensed in a run without one.
     committed_ticks: u64,
@@ -40,7 +40,7 @@ pub struct Environment {
 }
 
 impl Environment {
-    /// Creates directory, run file and services of environment `env_index` of `run`, which is environment 0's.
+    /// Creates the directory, run file and services of environment `env_index`. `run` is the run file of environment 0.
     ///
     /// # Errors
     /// The run directory is not writable, or iceoryx2 refuses.
@@ -74,7 +74,7 @@ impl Environment {
         self.services.control()
     }
 
-    /// The board of a process; for the trainer, what it says of this environment.
+    /// The board of a process. The trainer has a board in each environment.
     #[must_use]
     pub fn board(&self, process: Process) -> &BoardReader {
         &self.boards[process.index()]

@@ -1,4 +1,4 @@
-//! Failures as the user sees them: once, with file, key or line and the fix, and an exit code.
+//! Failures as the user sees them: printed once, with the file, key or line, with the fix, and with an exit code.
 
 use std::process::ExitCode;
 
@@ -12,12 +12,12 @@ use miette::{Diagnostic, Report};
 
 use crate::{config::ConfigError, display::notice};
 
-/// Why the command ends without success.
+/// The reason why the command ends without success.
 #[derive(Debug)]
 pub enum Exit {
-    /// Shown with its place in the source; exit code 2.
+    /// A wrong configuration, printed with its place in the source; exit code 2.
     Config(Box<ConfigError>),
-    /// Shown with its help; exit code by kind.
+    /// A failure, printed with its help; its kind decides the exit code.
     Failure(Failure),
     /// Ctrl-C: exit code 130.
     Interrupted,

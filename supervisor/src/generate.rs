@@ -1,6 +1,6 @@
-//! `caraware generate`: a city of any size with demand that keeps its vehicles on the road, as a scenario that plain SUMO runs too.
+//! `caraware generate`: writes a scenario of any size in which every vehicle stays on the road until the end. Plain SUMO runs it too.
 //!
-//! The net is netgenerate's grid with signals at every junction, put onto the globe. The same arguments give the same bytes.
+//! The net is the grid of netgenerate with signals at every junction and a position on the globe. The same arguments give the same bytes.
 
 mod demand;
 mod streets;
@@ -15,14 +15,14 @@ use crate::{cli::GenerateArgs, failure::Exit, install::Install};
 use demand::TripDemand;
 use streets::GridStreets;
 
-/// Vehicles on a kilometre of lane where the size of the grid is not given.
+/// Vehicles on a kilometre of lane if the user does not set the size of the grid.
 const VEHICLES_PER_KM: f64 = 10.0;
-/// Where the middle of the city lies: latitude and longitude, degrees.
+/// Latitude and longitude of the city's centre, degrees.
 const ORIGIN_DEG: [f64; 2] = [52.26, 10.52];
 /// WGS 84: semi-major axis (metres), squared eccentricity.
 const WGS84: [f64; 2] = [6_378_137.0, 0.006_694_379_990_14];
 
-/// What is to be generated.
+/// The parameters of a generated scenario.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GeneratedCity {
     /// Vehicles on the road from the first step to the last.
@@ -35,7 +35,7 @@ pub struct GeneratedCity {
     pub seed: u64,
     /// Junctions along each side of the grid.
     pub junctions: u32,
-    /// From junction to junction, metres.
+    /// Distance from junction to junction, metres.
     pub block_m: f64,
     /// Lanes in each direction.
     pub lanes: u32,
@@ -60,8 +60,8 @@ impl GeneratedCity {
         city.with_room()
     }
 
-    /// Country roads with as many vehicles on a kilometre of lane: 2 km from junction to junction, 100 km/h. SUMO spends its time at
-    /// junctions, so a step costs it about half of what it does in a city.
+    /// Country roads with as many vehicles on a kilometre of lane: 2 km from junction to junction, 100 km/h. SUMO spends most time on
+    /// junctions, so a step takes about half as long as in a city.
     #[must_use]
     pub fn country(vehicles: u32, duration_s: f64, step_s: f64, seed: u64) -> Self {
         let country = Self {
@@ -72,7 +72,7 @@ impl GeneratedCity {
         country.with_room()
     }
 
-    /// With junctions for [`VEHICLES_PER_KM`]: n on each side make 4·n·(n − 1) streets.
+    /// Sets the number of junctions that [`VEHICLES_PER_KM`] requires: n on each side make 4·n·(n − 1) streets.
     #[must_use]
     fn with_room(self) -> Self {
         let street = VEHICLES_PER_KM * 1e-3 * self.block_m * f64::from(self.lanes);
@@ -118,7 +118,7 @@ impl GeneratedCity {
         positive("vehicles", self.vehicles.into())?;
         positive("lanes", self.lanes.into())?;
         positive("speed-kmh", self.speed_kmh)?;
-        // Shorter blocks have no room left between their junctions.
+        // In shorter blocks the junctions leave no room for streets.
         if self.junctions < 2 || self.block_m < 50.0 {
             return Err(Exit::config(
                 format!(
@@ -131,7 +131,7 @@ impl GeneratedCity {
         Ok(())
     }
 
-    /// netgenerate's grid, without the head that tells the time, and on the globe.
+    /// Runs netgenerate, and returns its grid without the comment that holds the time, placed on the globe.
     fn net(&self, install: &Install, directory: &Path) -> Result<String, Exit> {
         let file = directory.join("city.net.xml");
         let program = install.sumo_program("netgenerate");
@@ -158,7 +158,7 @@ impl GeneratedCity {
             .ok_or_else(|| Exit::run("netgenerate's net has no <location>", ""))
     }
 
-    /// A net without comment, its `<location>` replaced by that of the city.
+    /// The net without its comment, and with the `<location>` of the city.
     fn placed(&self, net: &str) -> Option<String> {
         let (head, rest) = net.split_once("<!--")?;
         let (_, rest) = rest.split_once("-->")?;
@@ -172,7 +172,7 @@ impl GeneratedCity {
         ))
     }
 
-    /// Transverse Mercator about the middle of the city.
+    /// The `<location>` of the city: a transverse Mercator projection around its centre.
     fn location(&self) -> String {
         let side_m = f64::from(self.junctions - 1) * self.block_m;
         let half_m = 0.5 * side_m;
@@ -229,7 +229,7 @@ impl GeneratedCity {
     }
 }
 
-/// Generates what the command line asks for and says how to run it.
+/// Generates the scenario and prints the command that runs it.
 ///
 /// # Errors
 /// As [`GeneratedCity::write`].
@@ -250,7 +250,7 @@ pub fn generate(args: &GenerateArgs) -> Result<(), Exit> {
     let GeneratedCity {
         vehicles, duration_s, ..
     } = city;
-    // A reader that went away (`| head`) does not undo what is written.
+    // A closed standard output (`| head`) is ignored: the files are written.
     let _ = writeln!(
         std::io::stdout(),
         "{path}: {vehicles} vehicles for {duration_s} s on {junctions} junctions with signals\n\
@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_seed_gives_the_same_bytes_and_another_other_routes() {
+    fn the_same_seed_gives_the_same_bytes_and_another_seed_other_routes() {
         let (one, again, other) = (files(&small(1)).1, files(&small(1)).1, files(&small(2)).1);
         assert_eq!(one, again);
         assert_eq!(one[0], other[0]);

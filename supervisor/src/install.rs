@@ -1,4 +1,4 @@
-//! Where the parts of caraware are on this machine: sibling binaries, the virtual environment, SUMO.
+//! Finds the installed parts of caraware: the programs, the Python environment, and SUMO.
 
 use std::path::{Path, PathBuf};
 
@@ -6,10 +6,10 @@ use ipc_schema::process::Process;
 
 use crate::failure::Exit;
 
-/// The environment of `make peers`, which has most of what the benchmarks compare with.
+/// The virtual environment of `make peers`, which holds most peers of the benchmarks.
 pub const PEERS: &str = ".venv-peers";
 
-/// The parts, found.
+/// Paths of the installed parts.
 #[derive(Debug, Clone)]
 pub struct Install {
     /// Directory of the process binaries.
@@ -21,10 +21,10 @@ pub struct Install {
 }
 
 impl Install {
-    /// Looks beside the running binary, then at `CARAWARE_PYTHON` and `CARAWARE_SUMO_HOME`.
+    /// Finds the parts beside the running program. `CARAWARE_PYTHON` and `CARAWARE_SUMO_HOME` have precedence.
     ///
     /// # Errors
-    /// A part is missing: which one and how to get it.
+    /// A part is missing; the failure names it and the command that installs it.
     pub fn find() -> Result<Self, Exit> {
         let bin = programs()?;
         let python = python(&bin)?;
@@ -47,10 +47,10 @@ impl Install {
     }
 }
 
-/// Directory of the programs: beside the running one.
+/// Directory of the programs, which is that of the running program.
 ///
 /// # Errors
-/// The system does not tell which program is running.
+/// The path of the running program cannot be read.
 pub fn programs() -> Result<PathBuf, Exit> {
     let executable = std::env::current_exe().map_err(|error| {
         Exit::missing(
@@ -67,7 +67,7 @@ pub fn programs() -> Result<PathBuf, Exit> {
     })
 }
 
-/// Path of a program of ours in `bin`.
+/// Path of one of caraware's programs in `bin`.
 ///
 /// # Errors
 /// It has not been built.
@@ -77,12 +77,12 @@ pub fn program(bin: &Path, name: &str) -> Result<PathBuf, Exit> {
         return Ok(path);
     }
     Err(Exit::missing(
-        format!("the program {} is not there", path.display()),
+        format!("the program {} does not exist", path.display()),
         "run `make build`",
     ))
 }
 
-/// Python of an environment beside the project's own ([`PEERS`] or that of a peer that needs one to itself), if it is there.
+/// Python of another virtual environment beside the project's own: [`PEERS`], or that of one peer. `None` if it does not exist.
 #[must_use]
 pub fn environment_python(bin: &Path, environment: &str) -> Option<PathBuf> {
     bin.ancestors()
@@ -103,7 +103,7 @@ pub fn python(bin: &Path) -> Result<PathBuf, Exit> {
         .find(|path| path.exists())
         .ok_or_else(|| {
             Exit::missing(
-                "the Python environment .venv is not there",
+                "the Python environment .venv does not exist",
                 "run `make build`, or set CARAWARE_PYTHON to a Python that has caraware installed",
             )
         })

@@ -1,14 +1,14 @@
-//! What `caraware play` shows: position errors of each vehicle, from the file that `caraware.play` keeps.
+//! The table that `caraware play` shows: position errors of each vehicle, from the file that the player writes.
 
 use std::{collections::BTreeMap, path::Path};
 
 use serde::Deserialize;
 
-/// The file, in the run's directory.
+/// Name of the file in the run directory.
 const FILE: &str = "live.json";
-/// Vehicles named in a line.
-const IN_A_LINE: usize = 6;
-/// Rows around the table: its head, the means, what is left out, the prompt.
+/// Most vehicles in the one-line form.
+const LINE_VEHICLES: usize = 6;
+/// Rows that are not available for vehicles: the means, the table's head, the number of vehicles left out, and the prompt.
 const OTHER_ROWS: usize = 5;
 
 #[derive(Debug, Deserialize)]
@@ -16,10 +16,10 @@ struct LiveFile {
     table: LiveTable,
 }
 
-/// Errors by estimator: `ppo`, `ekf`, `raw_gnss`, metres.
+/// Position errors by estimator (`ppo`, `ekf`, `raw_gnss`), metres.
 type VehicleErrors = BTreeMap<String, Option<f64>>;
 
-/// The table.
+/// Position errors of the vehicles at one tick, and their means.
 #[derive(Debug, Clone, Deserialize)]
 pub struct LiveTable {
     episode: u64,
@@ -42,7 +42,7 @@ fn metres(errors: &VehicleErrors, name: &str) -> String {
 }
 
 impl LiveTable {
-    /// The newest; `None` before the first.
+    /// Reads the newest table; `None` before the first one.
     #[must_use]
     pub fn read(run_dir: &Path) -> Option<Self> {
         let text = std::fs::read_to_string(run_dir.join(FILE)).ok()?;
@@ -62,24 +62,24 @@ impl LiveTable {
         )
     }
 
-    /// Everything in a line: means, and policy/EKF of the first vehicles at this tick.
+    /// The table as one line: the means, and the policy's and the EKF's errors of the first vehicles at this tick.
     #[must_use]
     pub fn line(&self) -> String {
-        let told = self.vehicles.iter().take(IN_A_LINE).map(|vehicle| {
+        let shown = self.vehicles.iter().take(LINE_VEHICLES).map(|vehicle| {
             let error = |name: &str| metres(&vehicle.now_m, name);
             format!("{} {}/{}", vehicle.vehicle, error("ppo"), error("ekf"))
         });
-        let told: Vec<String> = told.collect();
-        let more = self.vehicles.len().saturating_sub(IN_A_LINE);
+        let shown: Vec<String> = shown.collect();
+        let more = self.vehicles.len().saturating_sub(LINE_VEHICLES);
         let more = if more > 0 {
             format!(" and {more} more")
         } else {
             String::new()
         };
-        format!("{}  now policy/EKF: {}{more}", self.means(), told.join(", "))
+        format!("{}  now policy/EKF: {}{more}", self.means(), shown.join(", "))
     }
 
-    /// A table of at most `rows` lines: a vehicle in each, its errors at this tick and on average since it came.
+    /// The table for a terminal of `rows` lines: one line for each vehicle with its errors at this tick and their means since it appeared.
     #[must_use]
     pub fn lines(&self, rows: usize) -> Vec<String> {
         let room = rows.saturating_sub(OTHER_ROWS).max(1);
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn every_vehicle_has_its_line_until_the_terminal_is_full() {
+    fn every_vehicle_has_a_line_until_the_terminal_is_full() {
         let lines = table(3).lines(24);
         assert_eq!(lines.len(), 5);
         assert!(lines[2].starts_with("cav.0") && lines[2].contains("4.50") && lines[2].contains("0.75"));
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_terminal_a_line_says_the_most() {
+    fn without_a_terminal_one_line_has_the_means_and_the_first_vehicles() {
         let line = table(8).line();
         assert!(line.contains("policy 4.50 m  EKF 0.75 m  raw GNSS – m"), "{line}");
         assert!(

@@ -48,10 +48,10 @@ fn run(prepared: PreparedRun) -> Result<(), Exit> {
     if !quiet {
         display::notice(&format!("run {}: results go to {}", run.name, run.run_dir.display()));
     }
-    // Dropped, and so ended, after the run.
+    // The viewer is dropped, and so ended, after the run.
     let _viewer = prepared
         .viewer
-        .map(|wanted| ViewerProcess::start(&run, &wanted))
+        .map(|request| ViewerProcess::start(&run, &request))
         .transpose()?;
     let mut display = match quiet {
         true => ProgressDisplay::silent(),

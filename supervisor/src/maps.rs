@@ -1,4 +1,4 @@
-//! The maps of a run with population control: from `curriculum.maps` to nets, scenes and one box around all.
+//! The maps of a run with population control: finds or builds the nets and scenes of `curriculum.maps`, and the box around all of them.
 
 use std::path::{Path, PathBuf};
 
@@ -9,17 +9,17 @@ use ipc_schema::{
 
 use crate::{failure::Exit, install::Install, scenario, town};
 
-/// Checks that every file of `curriculum.maps` is there, and makes its path absolute.
+/// Checks that every file of `curriculum.maps` exists, and makes its path absolute.
 ///
 /// # Errors
-/// One is not there.
+/// A file does not exist.
 pub fn locate(curriculum: &mut CurriculumConfig) -> Result<(), Exit> {
     for entry in curriculum.maps.iter_mut().filter(|entry| *entry != TOWN) {
         let path = std::path::absolute(&*entry).map_err(|error| Exit::io("resolve", Path::new(&*entry), &error))?;
         if !path.is_file() {
             return Err(Exit::config(
                 format!(
-                    "`curriculum.maps` has \"{entry}\", and there is no file {}",
+                    "`curriculum.maps` has \"{entry}\", but {} is not a file",
                     path.display()
                 ),
                 "correct the path: it is relative to the directory that caraware is started in",
@@ -30,7 +30,7 @@ pub fn locate(curriculum: &mut CurriculumConfig) -> Result<(), Exit> {
     Ok(())
 }
 
-/// Brings every map of `config` to where SUMO and the scene can be made of it; what has to be built goes to `directory`.
+/// Prepares every map of `config` for SUMO and the scene. Files that have to be built go to `directory`.
 ///
 /// # Errors
 /// A file cannot be read, a net lacks what it needs, or the town cannot be built.
@@ -43,8 +43,8 @@ pub fn build(install: &Install, config: &Config, directory: &Path) -> Result<Vec
     };
     let map = |entry: &String| {
         let (source, scene_files) = match entry.as_str() {
-            TOWN => built(install, directory)?,
-            file => given(Path::new(file), directory)?,
+            TOWN => built_town(install, directory)?,
+            file => user_map(Path::new(file), directory)?,
         };
         Ok(RunMap {
             name: map_name(entry).unwrap_or(entry).to_owned(),
@@ -56,8 +56,8 @@ pub fn build(install: &Install, config: &Config, directory: &Path) -> Result<Vec
     entries.iter().map(map).collect()
 }
 
-/// The town, whose files SUMO is given too.
-fn built(install: &Install, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
+/// Builds the town. SUMO and the scene use the same files.
+fn built_town(install: &Install, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
     let (net_file, additional_files) = town::build(install, directory)?;
     let source = Source::Population {
         net_file: net_file.clone(),
@@ -70,9 +70,9 @@ fn built(install: &Install, directory: &Path) -> Result<(Source, SceneFiles), Ex
     Ok((source, scene_files))
 }
 
-/// A net or a scenario of the user's. Additional files may define demand and outputs beside themselves: the scene is made of them, and
-/// SUMO has the town's vehicle types alone.
-fn given(file: &Path, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
+/// Reads a user's net or scenario. The scene uses its additional files; SUMO does not, because they may also define demand and outputs,
+/// and gets only the town's vehicle types.
+fn user_map(file: &Path, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
     let scene_files = match file.extension().is_some_and(|ending| ending == "sumocfg") {
         true => {
             let scenario = scenario::read(file)?;
@@ -93,9 +93,9 @@ fn given(file: &Path, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
     Ok((source, scene_files))
 }
 
-/// What the run file says of all `maps` together: the first one's, in a box around all, with room for the lights of any.
+/// Combines the maps for the run file: the first map's projection, the box around all, and the largest number of traffic lights.
 #[must_use]
-pub fn together(maps: &[RunMap]) -> Option<MapInfo> {
+pub fn combine(maps: &[RunMap]) -> Option<MapInfo> {
     let (first, others) = maps.split_first()?;
     let mut whole = first.info.clone();
     for RunMap { info, .. } in others {
@@ -133,14 +133,14 @@ mod tests {
             map([-20.0, -20.0, 500.0, 100.0], 3, "a"),
             map([-50.0, 0.0, 400.0, 300.0], 7, "b"),
         ];
-        let whole = together(&maps).unwrap();
+        let whole = combine(&maps).unwrap();
         assert_eq!(whole.bounds_m, [-50.0, -20.0, 500.0, 300.0]);
         assert_eq!((whole.projection.as_str(), whole.traffic_lights), ("a", 7));
-        assert_eq!(together(&maps[1..]).unwrap(), maps[1].info);
+        assert_eq!(combine(&maps[1..]).unwrap(), maps[1].info);
     }
 
     #[test]
-    fn a_map_that_is_not_there_is_named_with_its_key() {
+    fn a_missing_map_is_named_with_its_key() {
         let folder = tempfile::tempdir().unwrap();
         let net = folder.path().join("here.net.xml");
         std::fs::write(&net, "").unwrap();

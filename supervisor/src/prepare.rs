@@ -1,4 +1,4 @@
-//! From the command line to a run file: everything that can be wrong is found here, before anything is started.
+//! Turns the command line into a run file. Every mistake of the user is found here, before a process starts.
 
 use std::path::{Path, PathBuf};
 
@@ -28,60 +28,62 @@ use crate::{
 const SUMO_STEP_S: f64 = 1.0;
 /// SUMO's own default seed.
 const SUMO_SEED: u64 = 23423;
-/// Road users that shared memory is laid out for when a scenario does not say.
+/// Road users that shared memory is sized for in a scenario, unless the user sets `traffic.max_road_users`.
 const SCENARIO_ROAD_USERS: u64 = 8192;
 
 /// A run that is ready to be supervised.
 #[derive(Debug)]
 pub struct PreparedRun {
-    /// What every process will read.
+    /// The run file, which every process reads.
     pub run: RunFile,
-    /// The parts of caraware.
+    /// The installed programs.
     pub install: Install,
-    /// Its corner of shared memory.
+    /// The run's part of shared memory.
     pub claim: RunClaim,
-    /// Show no progress and no summary.
+    /// True if neither progress nor a summary is shown.
     pub quiet: bool,
-    /// Where to show it meanwhile, if at all.
+    /// The viewer to start beside the run, if any.
     pub viewer: Option<ViewerRequest>,
 }
 
-/// What CONFIG names.
+/// The source of traffic that the argument CONFIG selects.
 enum TrafficInput {
+    /// A map with population control, which the configuration describes.
     Map,
+    /// A `.sumocfg` with its own demand.
     Scenario(PathBuf, SumoScenario),
 }
 
 /// Checks everything and claims a run directory and shared memory.
 ///
 /// # Errors
-/// Anything wrong with the configuration, the user's files or this machine.
+/// The configuration, the user's files or this machine do not allow the run.
 pub fn prepare(args: &RunArgs, mode: Mode) -> Result<PreparedRun, Exit> {
-    let (settings, named, label) = resolve(&args.with_shorthands())?;
-    make(args, mode, settings.validate()?, named, &label, Install::find()?)
+    let (settings, named, label) = resolve_config(&args.with_shorthands())?;
+    prepare_new(args, mode, settings.validate()?, named, &label, Install::find()?)
 }
 
 /// Checks a run in which the policy of a checkpoint predicts, and claims its directory and shared memory.
 ///
 /// # Errors
-/// As [`prepare`], or there is no such checkpoint, or it does not fit the configuration.
+/// As [`prepare`], or the checkpoint does not exist or does not fit the configuration.
 pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
     let install = Install::find()?;
     let found = FoundCheckpoint::best(&install, &args.checkpoint, &args.run.runs)?;
     let (settings, named) = match &args.run.config {
-        Some(_) => resolve(&args.run.with_shorthands()).map(|(settings, named, _)| (settings, named))?,
-        None => of_run(&found.run()?, &args.run.with_shorthands().set)?,
+        Some(_) => resolve_config(&args.run.with_shorthands()).map(|(settings, named, _)| (settings, named))?,
+        None => settings_of_run(&found.run()?, &args.run.with_shorthands().set)?,
     };
     let config = settings.validate()?;
     if config.drives() {
         return Err(Exit::config(
-            "play is for policies that tell where a vehicle is, not for the driving task",
-            "`caraware train` with a driver as trainer.module drives",
+            "`caraware play` plays policies of the localisation task, not of the driving task",
+            "use `caraware train` with a driver as trainer.module",
         ));
     }
     found.check_fit(&config)?;
     let label = format!("{}-play", found.label());
-    let mut prepared = make(&args.run, Mode::Play, config, named, &label, install)?;
+    let mut prepared = prepare_new(&args.run, Mode::Play, config, named, &label, install)?;
     prepared.run.beginning = Some(Beginning {
         checkpoint: found.checkpoint,
         start: Start::default(),
@@ -91,21 +93,23 @@ pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
     Ok(prepared)
 }
 
-/// Checks a run that goes on from a checkpoint: in its own directory if a run is named, in a new one if a checkpoint is.
+/// Checks a run that continues from a checkpoint. It continues in its own directory if `resumed` names a run, and in a new directory
+/// if `resumed` names a checkpoint.
 ///
 /// # Errors
-/// As [`prepare`], or there is no such checkpoint or run, or a setting differs that observations depend on.
+/// As [`prepare`], or the checkpoint or run does not exist, or a changed setting is one that observations depend on.
 pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<PreparedRun, Exit> {
     let install = Install::find()?;
     let found = FoundCheckpoint::newest(&install, resumed, &args.runs)?;
     let old = found.run()?;
-    let mut config = resume::changed(&old, &args.with_shorthands().set)?;
+    let mut config = resume::changed_config(&old, &args.with_shorthands().set)?;
     found.check_fit(&config)?;
+    // A run is continued in its own directory.
     if found.is_run && args.name.is_none() {
         remote::check(&mut config.fanout)?;
         let viewer = ViewerRequest::of(args, &config.fanout)?;
         registry::sweep();
-        let (run, claim) = resume::go_on(&found, old, config, &install)?;
+        let (run, claim) = resume::resume_in_place(&found, old, config, &install)?;
         check_shared_memory(&run)?;
         return Ok(PreparedRun {
             run,
@@ -115,15 +119,16 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<PreparedRun, Exit
             viewer,
         });
     }
-    let (_, named) = of_run(&old, &[])?;
-    let mut prepared = make(args, Mode::Train, config, named, &found.label(), install)?;
+    // A checkpoint is continued by a new run.
+    let (_, named) = settings_of_run(&old, &[])?;
+    let mut prepared = prepare_new(args, Mode::Train, config, named, &found.label(), install)?;
     let beginning = found.copy_into(&prepared.run.run_dir)?;
-    prepared.run.beginning = Some(resume::follow(&old, &prepared.run.run_dir, beginning)?);
+    prepared.run.beginning = Some(resume::carry_over_logs(&old, &prepared.run.run_dir, beginning)?);
     Ok(prepared)
 }
 
-/// The settings and the source of traffic of another run, and what changes.
-fn of_run(run: &RunFile, set: &[String]) -> Result<(LayeredSettings, TrafficInput), Exit> {
+/// The settings of an earlier run with the assignments `set`, and its source of traffic.
+fn settings_of_run(run: &RunFile, set: &[String]) -> Result<(LayeredSettings, TrafficInput), Exit> {
     let settings = LayeredSettings::of(&run.config)?.with_assignments(set)?;
     let named = match &run.source {
         Source::Scenario { sumocfg } => TrafficInput::Scenario(sumocfg.clone(), scenario::read(sumocfg)?),
@@ -132,7 +137,8 @@ fn of_run(run: &RunFile, set: &[String]) -> Result<(LayeredSettings, TrafficInpu
     Ok((settings, named))
 }
 
-fn make(
+/// Checks a run and creates its directory; without success it removes the directory.
+fn prepare_new(
     args: &RunArgs,
     mode: Mode,
     mut config: Config,
@@ -140,6 +146,7 @@ fn make(
     label: &str,
     install: Install,
 ) -> Result<PreparedRun, Exit> {
+    // Checks that leave no traces come first.
     check_task(&config, mode, &named)?;
     let origin = config.map.origin_latitude_deg.zip(config.map.origin_longitude_deg);
     let scenario_map = match &named {
@@ -149,13 +156,14 @@ fn make(
     remote::check(&mut config.fanout)?;
     let viewer = ViewerRequest::of(args, &config.fanout)?;
     maps::locate(&mut config.curriculum)?;
-    let actions = actions(args.commands.as_deref(), config.run.envs)?;
+    let command_logs = read_command_logs(args.commands.as_deref(), config.run.envs)?;
     registry::sweep();
+    // From here on the run has a directory.
     let run_dir = create_run_dir(args, label)?;
     let result = assemble(&run_dir, mode, config, &install, named, scenario_map)
-        .and_then(|assembled| write_actions(&run_dir.path, &actions).map(|()| assembled));
+        .and_then(|assembled| write_command_logs(&run_dir.path, &command_logs).map(|()| assembled));
     if result.is_err() {
-        // Nothing has been started: leave nothing behind.
+        // No process has started, so the directory holds nothing of use.
         if let Err(error) = std::fs::remove_dir_all(&run_dir.path) {
             tracing::warn!(%error, "cannot remove the run directory");
         }
@@ -170,7 +178,8 @@ fn make(
     })
 }
 
-fn resolve(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, String), Exit> {
+/// Reads CONFIG, a preset, `.toml` or `.sumocfg`. Returns the settings, the source of traffic, and the label of the run's name.
+fn resolve_config(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, String), Exit> {
     let name = args.config.as_deref().unwrap_or("town");
     let path = Path::new(name);
     let defaults = LayeredSettings::defaults()?;
@@ -181,7 +190,7 @@ fn resolve(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, String), Ex
         Some("sumocfg") => {
             let scenario = scenario::read(path)?;
             let mut settings = defaults.with_assignments(&args.set)?;
-            suggest_scenario(&mut settings, &scenario, name)?;
+            apply_scenario_defaults(&mut settings, &scenario, name)?;
             let path = std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error))?;
             Ok((settings, TrafficInput::Scenario(path, scenario), label))
         }
@@ -201,13 +210,13 @@ fn resolve(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, String), Ex
     }
 }
 
-/// A scenario's own step and seed count, unless the user says otherwise, and its own road users.
-fn suggest_scenario(settings: &mut LayeredSettings, scenario: &SumoScenario, source: &str) -> Result<(), Exit> {
+/// Takes step and seed from the scenario unless the user sets them. Road users are always the scenario's own.
+fn apply_scenario_defaults(settings: &mut LayeredSettings, scenario: &SumoScenario, source: &str) -> Result<(), Exit> {
     for (path, none) in [("traffic.cavs", 1), ("traffic.others", 0), ("traffic.pedestrians", 0)] {
         if settings.is_set_by_user(path) {
             return Err(Exit::config(
                 format!("`{path}` is for maps with population control, and {source} has its own road users"),
-                "traffic.cav_share and traffic.max_cavs say how many of its vehicles carry sensors; traffic.scale changes its demand",
+                "traffic.cav_share and traffic.max_cavs set how many of its vehicles carry sensors; traffic.scale changes its demand",
             ));
         }
         settings.suggest(path, Value::from(none), source);
@@ -222,18 +231,18 @@ fn suggest_scenario(settings: &mut LayeredSettings, scenario: &SumoScenario, sou
     Ok(())
 }
 
-/// Actions need somebody who gives them, and heroes that the source of traffic has.
+/// Checks that the mode and the source of traffic can do the task: driving needs a trainer and heroes.
 fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), Exit> {
     if matches!(named, TrafficInput::Map) && (config.episode.whole_scenario || config.traffic.scale.is_some()) {
         return Err(Exit::config(
-            "`episode.whole_scenario` and `traffic.scale` are for a .sumocfg, and there is none",
-            "name one in place of the preset, or leave them out",
+            "`episode.whole_scenario` and `traffic.scale` need a .sumocfg, and CONFIG is not one",
+            "name a .sumocfg in place of the preset, or leave the keys out",
         ));
     }
     if matches!(named, TrafficInput::Scenario(..)) && !config.curriculum.stages.is_empty() {
         return Err(Exit::config(
-            "the stages of a curriculum say how many vehicles there are, and a .sumocfg has its own",
-            "name the .sumocfg in curriculum.maps, and a preset or .toml in its place: its net is then run with population control",
+            "the stages of a curriculum set the number of vehicles, but a .sumocfg has its own vehicles",
+            "name the .sumocfg in curriculum.maps and give a preset or .toml as CONFIG: its net then runs with population control",
         ));
     }
     if !config.drives() {
@@ -242,38 +251,39 @@ fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), E
     let traffic = &config.traffic;
     match (mode, named) {
         (Mode::Simulate, _) => Err(Exit::config(
-            "the driving task needs a trainer that drives, and `caraware simulate` has none",
-            "use `caraware train`; trainer.module names the driver",
+            "the driving task needs a trainer, and `caraware simulate` has none",
+            "use `caraware train` and name the driver in trainer.module",
         )),
         (Mode::Train, TrafficInput::Map) if traffic.heroes == 0 || !traffic.hero_ids.is_empty() => Err(Exit::config(
-            "on a map with population control heroes come by `traffic.heroes`, not by `traffic.hero_ids`",
+            "on a map with population control `traffic.heroes` sets the number of heroes, and `traffic.hero_ids` must be empty",
             "set traffic.heroes = 1 and traffic.hero_ids = []",
         )),
         (Mode::Train, TrafficInput::Scenario(..)) if traffic.heroes > 0 || !traffic.hero_route.is_empty() => {
             Err(Exit::config(
-                "heroes of a .sumocfg are vehicles of its own: `traffic.heroes` and `traffic.hero_route` are for maps with population control",
-                "set traffic.hero_ids to the ids of the vehicles that are to be driven, and traffic.heroes = 0",
+                "heroes of a .sumocfg are its own vehicles: `traffic.heroes` and `traffic.hero_route` are for maps with population control",
+                "set traffic.hero_ids to the ids of the vehicles to drive, and traffic.heroes = 0",
             ))
         }
         (Mode::Train | Mode::Play, _) => Ok(()),
     }
 }
 
-/// The texts of the action logs of all environments that have one: that of environment 0 is `path`, the others lie beside it as in a run
-/// directory.
-fn actions(path: Option<&Path>, envs: u32) -> Result<Vec<(u32, String)>, Exit> {
+/// Reads the logs of commands: each environment that has one, with its text. The log of environment 0 is `path`; the others lie beside
+/// it as in a run directory.
+fn read_command_logs(path: Option<&Path>, envs: u32) -> Result<Vec<(u32, String)>, Exit> {
     let Some(path) = path else { return Ok(Vec::new()) };
-    let mut logs = vec![(0, log(path)?)];
+    let mut logs = vec![(0, read_command_log(path)?)];
     for index in 1..envs {
         let path = path.with_file_name(format!("env-{index}")).join(control::COMMAND_LOG);
         if path.exists() {
-            logs.push((index, log(&path)?));
+            logs.push((index, read_command_log(&path)?));
         }
     }
     Ok(logs)
 }
 
-fn log(path: &Path) -> Result<String, Exit> {
+/// Reads a log of commands and checks every line.
+fn read_command_log(path: &Path) -> Result<String, Exit> {
     let wrong = |reason: String| {
         Exit::config(
             format!("--commands {}: {reason}", path.display()),
@@ -287,8 +297,8 @@ fn log(path: &Path) -> Result<String, Exit> {
     }
 }
 
-/// Puts the logs that the run is to follow where each `traffic-bridge` looks for its own.
-fn write_actions(run_dir: &Path, logs: &[(u32, String)]) -> Result<(), Exit> {
+/// Writes each log of commands to the directory in which `traffic-bridge` of that environment reads it.
+fn write_command_logs(run_dir: &Path, logs: &[(u32, String)]) -> Result<(), Exit> {
     for (index, text) in logs {
         let directory = match index {
             0 => run_dir.to_owned(),
@@ -307,7 +317,7 @@ struct RunDirectory {
     path: PathBuf,
 }
 
-/// `runs/<name>`, created by us alone: the name given, or the label with the first free number.
+/// Creates `runs/<name>`, which must not exist: the given name, or the label with the first free number.
 fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDirectory, Exit> {
     let runs = std::path::absolute(&args.runs).map_err(|error| Exit::io("resolve", &args.runs, &error))?;
     std::fs::create_dir_all(&runs).map_err(|error| Exit::io("create", &runs, &error))?;
@@ -349,7 +359,7 @@ fn check_name(name: &str) -> Result<(), Exit> {
     ))
 }
 
-/// What a run is on, as its run file says it.
+/// The maps of a run and their files, as the run file holds them.
 struct MapInputs {
     source: Source,
     map: MapInfo,
@@ -371,9 +381,9 @@ impl MapInputs {
     }
 
     fn of_maps(maps: Vec<RunMap>) -> Result<Self, Exit> {
-        let map = maps::together(&maps);
+        let map = maps::combine(&maps);
         let (Some(map), Some(first)) = (map, maps.first().cloned()) else {
-            return Err(Exit::run("the run has no map", "name one in curriculum.maps"));
+            return Err(Exit::run("the run has no map", "name a map in curriculum.maps"));
         };
         Ok(Self {
             source: first.source,
@@ -384,6 +394,7 @@ impl MapInputs {
     }
 }
 
+/// Builds the maps, claims shared memory and assembles the run file.
 fn assemble(
     run_dir: &RunDirectory,
     mode: Mode,
@@ -396,7 +407,7 @@ fn assemble(
         let path = run_dir.path.join(part);
         std::fs::create_dir(&path).map_err(|error| Exit::io("create", &path, &error))?;
     }
-    let ground = match (named, scenario_map) {
+    let inputs = match (named, scenario_map) {
         (TrafficInput::Scenario(sumocfg, scenario), Some(map)) => MapInputs::of_scenario(sumocfg, scenario, map),
         _ => MapInputs::of_maps(maps::build(install, &config, &run_dir.path.join("map"))?)?,
     };
@@ -414,10 +425,10 @@ fn assemble(
         mode,
         supervisor_pid: i32::try_from(std::process::id()).unwrap_or(0),
         shared_memory: claim.memory.clone(),
-        source: ground.source,
-        map: ground.map,
-        scene_files: ground.scene_files,
-        maps: ground.maps,
+        source: inputs.source,
+        map: inputs.map,
+        scene_files: inputs.scene_files,
+        maps: inputs.maps,
         sumo_home: install.sumo_home.clone(),
         config,
         config_hash,
@@ -428,7 +439,7 @@ fn assemble(
     Ok((run, claim))
 }
 
-/// Refuses a run whose worst case does not fit: a full `/dev/shm` would kill processes with SIGBUS in mid-run.
+/// Refuses a run whose largest need of shared memory exceeds what is free: a full `/dev/shm` kills processes with SIGBUS.
 fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
     let needed: u64 = Channel::ALL
         .into_iter()
@@ -450,7 +461,7 @@ fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
     let mebi = |bytes: u64| bytes.div_ceil(1 << 20);
     Err(Exit::missing(
         format!(
-            "{} has {} MiB free, this run may need {} MiB",
+            "{} has {} MiB free, but this run may need {} MiB",
             registry::SHARED_MEMORY,
             mebi(free),
             mebi(needed)
@@ -467,8 +478,8 @@ fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
 /// Free bytes of the file system that holds `path`.
 ///
 /// # Errors
-/// It cannot be asked.
+/// The file system cannot be queried.
 pub fn free_bytes(path: &Path) -> Result<u64, Exit> {
-    let stat = rustix::fs::statvfs(path).map_err(|error| Exit::io("look at", path, &error.into()))?;
+    let stat = rustix::fs::statvfs(path).map_err(|error| Exit::io("query", path, &error.into()))?;
     Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
 }

@@ -1,4 +1,4 @@
-//! The processes of a run with the environments they belong to: which of them may start, on which cores, and which have ended.
+//! The processes of a run and the environments they belong to: starts those that may start, on their cores, and finds those that ended.
 
 use std::{
     collections::BTreeMap,
@@ -80,7 +80,7 @@ impl RunProcesses {
             .collect()
     }
 
-    /// The run as environment 0, and whatever belongs to the whole run, sees it.
+    /// The run file of environment 0 and of the processes of the whole run.
     #[must_use]
     pub fn run(&self) -> &RunFile {
         &self.environments[0].run
@@ -117,21 +117,21 @@ impl RunProcesses {
         self.restarts
     }
 
-    /// Started processes, also those that have ended.
+    /// Number of started processes, including those that have ended.
     #[must_use]
     pub fn started(&self) -> usize {
         self.running.len()
     }
 
-    /// Number of the process that may be replaced by a successor.
+    /// Index of the process that a successor may replace.
     #[must_use]
     pub fn replaceable(&self) -> Option<usize> {
         let is_replaceable = |process: &RunningProcess| process.row.on_exit == OnExit::Replace;
         self.running.iter().position(is_replaceable)
     }
 
-    /// Every process that the run has: its row and its environment.
-    fn wanted(&self) -> impl Iterator<Item = (&'static ProcessSpec, &Environment)> {
+    /// Every process that the run needs: its row and its environment.
+    fn members(&self) -> impl Iterator<Item = (&'static ProcessSpec, &Environment)> {
         self.environments.iter().flat_map(|environment| {
             let run = &environment.run;
             let rows = PROCESSES.iter().filter(|row| row.is_in(run, run.env_index));
@@ -145,7 +145,7 @@ impl RunProcesses {
             .any(|running| running.row.process == row.process && running.env_index == env_index)
     }
 
-    /// A process of the whole run needs the processes of every environment; another process only those of its own.
+    /// True if every process that `row` needs is ready: in all environments for a process of the whole run, else in its own.
     fn may_start(&self, row: &ProcessSpec, environment: &Environment) -> bool {
         let is_up = |environment: &Environment| {
             let mut needs = row.needs.iter();
@@ -163,7 +163,7 @@ impl RunProcesses {
     /// A program is missing or cannot be started.
     pub fn start_due(&mut self) -> Result<(), Exit> {
         let due: Vec<(&'static ProcessSpec, u32)> = self
-            .wanted()
+            .members()
             .filter(|(row, environment)| !self.is_started(row, environment.run.env_index))
             .filter(|(row, environment)| self.may_start(row, environment))
             .map(|(row, environment)| (row, environment.run.env_index))
@@ -255,7 +255,7 @@ impl RunProcesses {
     /// Starts the process `index` again as its next incarnation.
     ///
     /// # Errors
-    /// The run holds no more incarnations, or the program cannot be started.
+    /// The run allows no more incarnations, or the program cannot be started.
     pub fn restart(&mut self, index: usize) -> Result<(), Exit> {
         let (row, env_index) = (self.running[index].row, self.running[index].env_index);
         let incarnation = self.next_incarnation(index);
@@ -300,26 +300,26 @@ impl RunProcesses {
         Ok((first_tick, sensed_ticks))
     }
 
-    /// Makes this incarnation of a process the valid one in every environment it belongs to. False if the run holds no more.
+    /// Makes this incarnation of a process the valid one in every environment that it belongs to. False if the run allows no more.
     #[must_use]
     pub fn set_incarnation(&mut self, row: &ProcessSpec, env_index: u32, incarnation: u32) -> bool {
-        let places = self.environments.iter_mut().filter(|environment| match row.scope {
+        let environments = self.environments.iter_mut().filter(|environment| match row.scope {
             ProcessScope::Run => true,
             ProcessScope::Environment => environment.run.env_index == env_index,
         });
-        let mut set = places.map(|environment| environment.roster.set(row.process, incarnation));
+        let mut set = environments.map(|environment| environment.roster.set(row.process, incarnation));
         set.all(|is_set| is_set)
     }
 
     /// The first required process that is not ready, with its environment.
     #[must_use]
     pub fn first_not_ready(&self) -> Option<(&'static ProcessSpec, &Environment)> {
-        self.wanted()
+        self.members()
             .filter(|(row, _)| row.is_required())
             .find(|(row, environment)| self.is_starting(row, environment))
     }
 
-    /// A required process of the whole run is ready once it is ready in every environment.
+    /// True if the process is not ready; a process of the whole run must be ready in every environment.
     fn is_starting(&self, row: &ProcessSpec, environment: &Environment) -> bool {
         let starts = |environment: &Environment| environment.state_of(row.process) == State::Starting;
         match row.scope {
@@ -330,12 +330,12 @@ impl RunProcesses {
 
     /// True once every required process has been started and has ended.
     pub fn have_finished(&mut self) -> bool {
-        let wanted = self.wanted().filter(|(row, _)| row.is_required()).count();
+        let count = self.members().filter(|(row, _)| row.is_required()).count();
         let required = self.running.iter_mut().filter(|running| running.row.is_required());
         required
             .map(|running| usize::from(running.poll().is_some()))
             .sum::<usize>()
-            == wanted
+            == count
     }
 
     /// True while a started process has not ended.
@@ -348,7 +348,7 @@ impl RunProcesses {
         self.running.iter_mut().for_each(|running| running.signal(Signal::TERM));
     }
 
-    /// Asks the process `index` to make room for a successor.
+    /// Asks the process `index` to leave for its successor.
     pub fn ask_to_leave(&mut self, index: usize) {
         self.running[index].ask_to_leave();
     }
@@ -370,7 +370,7 @@ impl RunProcesses {
         self.environments.iter().for_each(Environment::wake_sensing);
     }
 
-    /// Removes what dead processes left in the services of the run.
+    /// Removes the resources of dead processes from the services of the run.
     pub fn forget_dead(&self) {
         services::forget_dead(&self.node);
     }
@@ -379,10 +379,10 @@ impl RunProcesses {
 fn no_more_incarnations(row: &ProcessSpec, incarnation: u32) -> Exit {
     Exit::run(
         format!(
-            "{} has been replaced {} times: a run holds no more",
+            "{} has been replaced {} times, the most that a run allows",
             row.process,
             incarnation - 1
         ),
-        "find out from its log why it ends",
+        "its log in the run directory shows why it ends",
     )
 }

@@ -1,4 +1,4 @@
-//! Which runs are alive on this machine, and what dead ones left in shared memory.
+//! The registry of this user's runs: finds those that are alive, and removes what dead runs left in shared memory.
 //!
 //! Every run has a directory of its own below `/tmp/caraware-<user id>/` (or `CARAWARE_RUNTIME_DIR`): a marker that names its
 //! owner and its run directory, a lock that its supervisor holds, and iceoryx2's files. Files in `/dev/shm` carry the
@@ -24,11 +24,11 @@ use crate::failure::Exit;
 /// Where iceoryx2 puts shared memory.
 pub const SHARED_MEMORY: &str = "/dev/shm";
 const LOCK: &str = "lock";
-/// File that makes a directory recognisable as one of ours.
+/// File that marks a directory as one that caraware created.
 const MARKER: &str = "caraware-run.json";
 /// Value of [`RunMarker::program`].
 const PROGRAM: &str = "caraware";
-/// A longer marker is not ours, bytes.
+/// Largest valid marker, bytes.
 const MARKER_BYTES: u64 = 16 << 10;
 /// Hexadecimal digits of a directory's name.
 const NAME_DIGITS: usize = 8;
@@ -41,7 +41,7 @@ const RUNTIME_DIR: &str = "CARAWARE_RUNTIME_DIR";
 /// Longest [`base`]: iceoryx2's sockets lie below it, and Unix allows their paths 107 bytes.
 const BASE_BYTES: usize = 40;
 
-/// What a run writes into its directory before the directory gets its name.
+/// The marker, which a run writes into its directory before the directory gets its final name.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 struct RunMarker {
     /// [`PROGRAM`].
@@ -102,7 +102,7 @@ fn user_id() -> u32 {
     rustix::process::getuid().as_raw()
 }
 
-/// True if the user chose [`base`]: then it is not ours to remove or to change.
+/// True if the user chose [`base`]: such a directory is neither removed nor changed.
 fn is_chosen() -> bool {
     std::env::var_os(RUNTIME_DIR).is_some()
 }
@@ -124,12 +124,13 @@ fn create_base() -> Result<PathBuf, Exit> {
         ));
     }
     make_base(&base).map_err(|error| Exit::io("create", &base, &error))?;
-    let looked_at = if is_chosen() {
+    // The user's own directory may be a link; the default one must not be.
+    let metadata = if is_chosen() {
         base.metadata()
     } else {
         base.symlink_metadata()
     };
-    let data = looked_at.map_err(|error| Exit::io("look at", &base, &error))?;
+    let data = metadata.map_err(|error| Exit::io("look at", &base, &error))?;
     if data.uid() != user_id() {
         return Err(Exit::run(format!("{} belongs to another user", base.display()), help));
     }
@@ -143,7 +144,7 @@ fn create_base() -> Result<PathBuf, Exit> {
     Ok(base)
 }
 
-/// Creates the directory if it is not there, and marks it as created by a run.
+/// Creates the directory if it does not exist, and marks it as created by a run.
 fn make_base(base: &Path) -> std::io::Result<()> {
     if base.is_dir() {
         return Ok(());
@@ -170,11 +171,11 @@ fn remove_base(base: &Path) -> std::io::Result<()> {
         return Ok(());
     }
     std::fs::remove_file(&marker)?;
-    // Another run may have come in between: the directory is not empty then, and stays marked.
+    // Another run may have started meanwhile: then the directory is not empty, and is marked again.
     std::fs::remove_dir(base).or_else(|_| mark_base(base))
 }
 
-/// A claimed corner of shared memory; released and emptied when dropped.
+/// A run's own part of shared memory. Dropping it removes its files.
 #[derive(Debug)]
 pub struct RunClaim {
     directory: PathBuf,
@@ -182,14 +183,14 @@ pub struct RunClaim {
     _lock: File,
     /// Random identity of the run.
     pub run_id: u64,
-    /// For the run file.
+    /// Where the run's services are; the run file holds it.
     pub memory: SharedMemory,
 }
 
 impl RunClaim {
-    /// Claims a fresh corner for the run in `run_dir`.
+    /// Claims a new part of shared memory for the run in `run_dir`.
     ///
-    /// The directory gets its name when it is complete and locked, so that no other run takes it for a dead one.
+    /// The directory gets its final name once it is complete and locked, so that no other run mistakes it for a dead run's.
     ///
     /// # Errors
     /// The runtime directory is not writable.
@@ -233,7 +234,7 @@ impl Drop for RunClaim {
     fn drop(&mut self) {
         remove(&self.directory);
         if let Err(error) = remove_base(&base()) {
-            tracing::debug!(%error, "the registry stays");
+            tracing::debug!(%error, "cannot remove the runtime directory");
         }
     }
 }
@@ -279,9 +280,9 @@ pub fn entries() -> Vec<RegistryEntry> {
     paths().into_iter().filter_map(RegistryEntry::read).collect()
 }
 
-/// What lies in [`base`] and is not a run of this user: it is never touched.
+/// Paths in [`base`] that are not runs of this user. They are never changed.
 #[must_use]
-pub fn strangers() -> Vec<PathBuf> {
+pub fn foreign_paths() -> Vec<PathBuf> {
     paths()
         .into_iter()
         .filter(|path| RunMarker::of(path).is_none())
@@ -297,7 +298,7 @@ impl RegistryEntry {
         Some(Self { directory, alive, run })
     }
 
-    /// Bytes the run holds in shared memory.
+    /// Shared memory that the run holds, bytes.
     #[must_use]
     pub fn shared_memory_bytes(&self) -> u64 {
         shared_files(&self.directory)
@@ -307,7 +308,7 @@ impl RegistryEntry {
             .sum()
     }
 
-    /// Removes what a dead run left; a live one is left alone.
+    /// Removes the files of a dead run. It does nothing to a live one.
     pub fn clean(&self) {
         if !self.alive {
             remove(&self.directory);
@@ -338,7 +339,7 @@ fn shared_files(directory: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Removes a run's shared memory, then its directory with the lock. Failures are only reported: the next start tries again.
+/// Removes a run's shared memory, then its directory with the lock. Failures are only logged: the next start tries again.
 fn remove(directory: &Path) {
     for path in shared_files(directory) {
         if let Err(error) = std::fs::remove_file(&path) {
@@ -350,7 +351,7 @@ fn remove(directory: &Path) {
     }
 }
 
-/// Removes what dead runs left. Returns how many there were.
+/// Removes the files of all dead runs, and returns the number of these runs.
 pub fn sweep() -> usize {
     let dead: Vec<RegistryEntry> = entries().into_iter().filter(|entry| !entry.alive).collect();
     dead.iter().for_each(RegistryEntry::clean);
@@ -364,10 +365,10 @@ pub fn is_alive(run_dir: &Path) -> bool {
     entries().iter().any(is_there)
 }
 
-/// The live run called `name`, or the only one if `name` is `None`.
+/// The live run called `name`, or the only live run if `name` is `None`.
 ///
 /// # Errors
-/// None, or several to choose from.
+/// No such run is alive, or several are and `name` is `None`.
 pub fn find(name: Option<&str>) -> Result<RunFile, Exit> {
     let mut runs: Vec<RunFile> = entries()
         .into_iter()
@@ -396,8 +397,8 @@ pub fn find(name: Option<&str>) -> Result<RunFile, Exit> {
 mod tests {
     use super::*;
 
-    /// A directory called `name` as a run leaves it that died; `change` spoils the marker.
-    fn dead(base: &Path, name: &str, change: impl FnOnce(&mut RunMarker)) -> PathBuf {
+    /// Makes a directory called `name` as a dead run leaves it; `change` alters the marker.
+    fn make_dead(base: &Path, name: &str, change: impl FnOnce(&mut RunMarker)) -> PathBuf {
         let directory = base.join(name);
         std::fs::create_dir_all(&directory).unwrap();
         File::create(directory.join(LOCK)).unwrap();
@@ -408,18 +409,18 @@ mod tests {
     }
 
     #[test]
-    fn only_a_directory_with_our_marker_is_a_run() {
+    fn only_a_directory_with_a_valid_marker_is_a_run() {
         let base = tempfile::tempdir().unwrap();
-        let ours = dead(base.path(), "0123abcd", |_| {});
+        let ours = make_dead(base.path(), "0123abcd", |_| {});
         assert_eq!(RunMarker::of(&ours), Some(RunMarker::new(Path::new("/nowhere"))));
         assert!(!RegistryEntry::read(ours).unwrap().alive);
-        let strange = [
-            dead(base.path(), "0123abc", |_| {}),
-            dead(base.path(), "my-thesis", |_| {}),
-            dead(base.path(), "0123abc1", |marker| marker.program = "other".into()),
-            dead(base.path(), "0123abc2", |marker| marker.user_id += 1),
+        let foreign = [
+            make_dead(base.path(), "0123abc", |_| {}),
+            make_dead(base.path(), "my-thesis", |_| {}),
+            make_dead(base.path(), "0123abc1", |marker| marker.program = "other".into()),
+            make_dead(base.path(), "0123abc2", |marker| marker.user_id += 1),
         ];
-        for directory in strange {
+        for directory in foreign {
             assert_eq!(RunMarker::of(&directory), None, "{}", directory.display());
         }
     }
@@ -429,7 +430,7 @@ mod tests {
         let parent = tempfile::tempdir().unwrap();
         let (created, chosen) = (parent.path().join("a/created"), parent.path().join("chosen"));
         make_base(&created).unwrap();
-        let run = dead(&created, "0123abcd", |_| {});
+        let run = make_dead(&created, "0123abcd", |_| {});
         remove_base(&created).unwrap();
         assert!(run.is_dir() && created.join(BASE_MARKER).is_file());
         std::fs::remove_dir_all(run).unwrap();
@@ -444,7 +445,7 @@ mod tests {
     #[test]
     fn a_link_to_a_run_and_a_damaged_marker_are_no_runs() {
         let base = tempfile::tempdir().unwrap();
-        let ours = dead(base.path(), "0123abcd", |_| {});
+        let ours = make_dead(base.path(), "0123abcd", |_| {});
         let link = base.path().join("89abcdef");
         std::os::unix::fs::symlink(&ours, &link).unwrap();
         assert_eq!(RunMarker::of(&link), None);

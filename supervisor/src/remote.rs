@@ -1,4 +1,4 @@
-//! Who may watch from where: `fanout.*` is checked before anything listens. Beyond loopback nobody is let in who does not say who he is.
+//! Checks the access rules of `fanout.*` before `fanout` starts. Beyond loopback every viewer must authenticate.
 
 use std::{
     net::{TcpListener, ToSocketAddrs as _},
@@ -10,10 +10,11 @@ use ipc_schema::config::FanoutConfig;
 
 use crate::failure::Exit;
 
-/// Checks endpoint, files and rights, and makes paths absolute.
+/// Checks the endpoint, the files and their permissions, and makes their paths absolute.
 ///
 /// # Errors
-/// The endpoint cannot be listened on, is open to anybody beyond this machine, or a file is missing or readable by others.
+/// The endpoint cannot be listened on or would admit unauthenticated viewers from other machines, or a file is missing or readable
+/// by other users.
 pub fn check(fanout: &mut FanoutConfig) -> Result<(), Exit> {
     if !fanout.enabled {
         return Ok(());
@@ -25,7 +26,7 @@ pub fn check(fanout: &mut FanoutConfig) -> Result<(), Exit> {
         ("tls_private_key", &mut fanout.tls_private_key),
         ("tls_client_ca", &mut fanout.tls_client_ca),
     ] {
-        readable(key, path)?;
+        resolve_readable(key, path)?;
     }
     check_secrets(fanout)?;
     check_users(fanout)
@@ -36,8 +37,8 @@ fn check_endpoint(fanout: &FanoutConfig) -> Result<(), Exit> {
     let encrypted = listen.strip_prefix("tls/");
     let address = encrypted.or_else(|| listen.strip_prefix("tcp/")).ok_or_else(|| {
         Exit::config(
-            format!("`fanout.listen` = \"{listen}\" is not an endpoint caraware knows"),
-            "give tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or tls/HOST:PORT",
+            format!("`fanout.listen` = \"{listen}\" is not an endpoint"),
+            "write tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or tls/HOST:PORT",
         )
     })?;
     let has_certificate = [&fanout.tls_certificate, &fanout.tls_private_key].map(|path| !path.is_empty());
@@ -46,40 +47,40 @@ fn check_endpoint(fanout: &FanoutConfig) -> Result<(), Exit> {
         (Some(_), _) => {
             return Err(Exit::config(
                 format!("`fanout.listen` = \"{listen}\" needs a certificate"),
-                "set fanout.tls_certificate and fanout.tls_private_key; docs/remote.md has the lines of openssl that make them",
+                "set fanout.tls_certificate and fanout.tls_private_key; docs/remote.md shows how openssl makes them",
             ));
         }
     }
     if encrypted.is_none() && !fanout.tls_client_ca.is_empty() {
         return Err(Exit::config(
-            "`fanout.tls_client_ca` asks for certificates, which tcp does not carry",
+            "`fanout.tls_client_ca` requires client certificates, which tcp does not support",
             "listen on tls/HOST:PORT, or set fanout.tls_client_ca = \"\"",
         ));
     }
     if is_beyond_loopback(address) && fanout.users.is_empty() && fanout.tls_client_ca.is_empty() {
         return Err(Exit::config(
-            format!("`fanout.listen` = \"{listen}\" would let anybody in who reaches it"),
-            "name those who may connect in fanout.users, or ask for certificates with fanout.tls_client_ca (docs/remote.md); or stay on \
-             127.0.0.1 and let viewers come through a tunnel: ssh -N -L 7447:127.0.0.1:7447 HOST",
+            format!("`fanout.listen` = \"{listen}\" would admit viewers from other machines without authentication"),
+            "list the users in fanout.users, or require certificates with fanout.tls_client_ca (docs/remote.md); or listen on 127.0.0.1 \
+             and connect viewers through a tunnel: ssh -N -L 7447:127.0.0.1:7447 HOST",
         ));
     }
     TcpListener::bind(address).map(drop).map_err(|error| {
         Exit::config(
             format!("`fanout.listen` = \"{listen}\" cannot be listened on: {error}"),
-            "another run or program has the port: choose another, e.g. --set fanout.listen=tcp/127.0.0.1:7448, or --set fanout.enabled=false",
+            "if another run or program uses the port, choose another, e.g. --set fanout.listen=tcp/127.0.0.1:7448, or --set fanout.enabled=false",
         )
     })
 }
 
-/// True unless every address that the name stands for is of the loopback.
+/// True unless every address that the name resolves to is a loopback address.
 fn is_beyond_loopback(address: &str) -> bool {
     address.to_socket_addrs().map_or(true, |mut addresses| {
         addresses.any(|address| !address.ip().is_loopback())
     })
 }
 
-/// Makes the path absolute and opens the file once.
-fn readable(key: &str, path: &mut String) -> Result<(), Exit> {
+/// Makes the path absolute and checks that the file can be opened. An empty path stays empty.
+fn resolve_readable(key: &str, path: &mut String) -> Result<(), Exit> {
     if path.is_empty() {
         return Ok(());
     }
@@ -88,14 +89,14 @@ fn readable(key: &str, path: &mut String) -> Result<(), Exit> {
     std::fs::File::open(&absolute).map_err(|error| {
         Exit::config(
             format!("`fanout.{key}` = \"{path}\" cannot be read: {error}"),
-            "give a file; docs/remote.md says how it is made",
+            "give a readable file; docs/remote.md shows how to make it",
         )
     })?;
     *path = absolute.to_string_lossy().into_owned();
     Ok(())
 }
 
-/// Passwords and private keys are for their owner alone.
+/// Refuses files of passwords and private keys that other users can read.
 fn check_secrets(fanout: &FanoutConfig) -> Result<(), Exit> {
     for (key, path) in [("users", &fanout.users), ("tls_private_key", &fanout.tls_private_key)] {
         if path.is_empty() {
@@ -112,7 +113,7 @@ fn check_secrets(fanout: &FanoutConfig) -> Result<(), Exit> {
     Ok(())
 }
 
-/// The file of users says who is who, and commanders are among them.
+/// Checks that each line of the file of users is `user:password`, and that every commander is one of its users.
 fn check_users(fanout: &FanoutConfig) -> Result<(), Exit> {
     let mut known = Vec::new();
     if !fanout.users.is_empty() {
@@ -124,15 +125,15 @@ fn check_users(fanout: &FanoutConfig) -> Result<(), Exit> {
                 _ => {
                     return Err(Exit::config(
                         format!("{}, line {number}: not user:password", fanout.users),
-                        "write a line alice:her-password for each who may connect",
+                        "write one line for each user, for example alice:her-password",
                     ));
                 }
             }
         }
         if known.is_empty() {
             return Err(Exit::config(
-                format!("`fanout.users` = \"{}\" names nobody", fanout.users),
-                "write a line alice:her-password for each who may connect",
+                format!("`fanout.users` = \"{}\" lists no user", fanout.users),
+                "write one line for each user, for example alice:her-password",
             ));
         }
     }
@@ -141,10 +142,10 @@ fn check_users(fanout: &FanoutConfig) -> Result<(), Exit> {
         .iter()
         .find(|name| *name != "*" && !known.contains(name));
     match unknown {
-        // Common names of certificates are not known before somebody comes with one.
+        // With `tls_client_ca` a name may be the common name of a certificate, which is only known when a client connects.
         Some(name) if fanout.tls_client_ca.is_empty() => Err(Exit::config(
-            format!("`fanout.commanders` has \"{name}\", who is not in the file `fanout.users`"),
-            "add a line for this user there, or leave the name out; \"*\" = all who may connect",
+            format!("`fanout.commanders` lists \"{name}\", which is not a user of the file `fanout.users`"),
+            "add a line for this user to that file, or remove the name; \"*\" means every user that may connect",
         )),
         _ => Ok(()),
     }
@@ -174,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn beyond_loopback_nobody_is_let_in_without_a_name() {
+    fn beyond_loopback_every_viewer_must_authenticate() {
         let directory = tempfile::tempdir().unwrap();
         let users = file(&directory, "users", "alice:secret\n", 0o600);
         let pem = file(&directory, "pem", "", 0o600);
@@ -183,7 +184,7 @@ mod tests {
                 fanout.listen = listen.into();
                 (fanout.tls_certificate, fanout.tls_private_key) = (pem.clone(), pem.clone());
             });
-            assert!(open.unwrap().contains("would let anybody in"), "{listen}");
+            assert!(open.unwrap().contains("without authentication"), "{listen}");
             let closed = message(|fanout| {
                 fanout.listen = listen.into();
                 fanout.users = users.clone();
@@ -196,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn every_mistake_is_named() {
+    fn every_mistake_has_its_message() {
         let directory = tempfile::tempdir().unwrap();
         let users = file(&directory, "users", "alice:secret\n", 0o600);
         let open = file(&directory, "open", "alice:secret\n", 0o644);
@@ -215,12 +216,12 @@ mod tests {
         says("cannot be read", &|fanout| fanout.users = "/nowhere/users".into());
         says("by other users", &|fanout| fanout.users = open.clone());
         says("line 1: not user:password", &|fanout| fanout.users = bare.clone());
-        says("names nobody", &|fanout| fanout.users = empty.clone());
-        says("who is not in the file", &|fanout| {
+        says("lists no user", &|fanout| fanout.users = empty.clone());
+        says("is not a user of the file", &|fanout| {
             fanout.users = users.clone();
             fanout.commanders = vec!["bob".into()];
         });
-        says("which tcp does not carry", &|fanout| {
+        says("which tcp does not support", &|fanout| {
             fanout.tls_client_ca = users.clone()
         });
     }

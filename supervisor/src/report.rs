@@ -1,4 +1,4 @@
-//! `report.json`: what a run came to, put together from the parts that its processes wrote.
+//! `report.json`: the results of a run, assembled from the parts that its processes write at their end.
 
 use std::path::{Path, PathBuf};
 
@@ -16,11 +16,11 @@ use crate::{
     supervisor::{RunEnding, RunOutcome},
 };
 
-/// What an evaluation compares, as the keys of a report begin: the policy, the raw fix, the Kalman filter, the smoother that sees
-/// the future, and the policy's network taught by regression.
+/// The estimators that an evaluation compares, by their prefixes of the report's keys: the policy, the raw fix, the Kalman filter, the
+/// smoother, which also uses later samples, and the policy's network trained by regression.
 const ESTIMATORS: [&str; 5] = ["ppo", "raw_gnss", "ekf", "rts", "supervised"];
 
-/// What sensor-daemon writes at its end.
+/// The part of the report that `sensor-daemon` writes at its end.
 #[derive(Debug, Clone, Deserialize, Default)]
 #[serde(default)]
 struct Sensing {
@@ -39,7 +39,7 @@ struct Sensing {
 }
 
 impl Sensing {
-    /// Sums over all environments; the hash is the first one's, and the error the mean over all samples.
+    /// Sums over all environments. The hash is that of the first environment, and the error is the mean over all samples.
     fn total(environments: &[Self]) -> Self {
         let sum = |part: fn(&Self) -> u64| environments.iter().map(part).sum();
         #[expect(clippy::cast_precision_loss, reason = "weights of a mean")]
@@ -62,8 +62,8 @@ impl Sensing {
     }
 }
 
-/// What one environment came to.
-fn of_environment(run: &RunFile, sensing: &Sensing) -> Value {
+/// The results of one environment.
+fn environment_report(run: &RunFile, sensing: &Sensing) -> Value {
     json!({
         "environment": run.env_index,
         "seed": run.seed(),
@@ -74,13 +74,13 @@ fn of_environment(run: &RunFile, sensing: &Sensing) -> Value {
         "raw_gnss_mean_error_m": sensing.raw_gnss_mean_error_m,
         "drops": sensing.drops,
         "redelivered_ticks": sensing.redelivered_ticks,
-        "dynamics": part(run, "sim-core").unwrap_or(Value::Null),
+        "dynamics": read_part(run, "sim-core").unwrap_or(Value::Null),
         "lidar": sensing.lidar,
     })
 }
 
-/// What a process of an environment wrote at its end.
-fn part<T: serde::de::DeserializeOwned>(run: &RunFile, process: &str) -> Option<T> {
+/// Reads the part of the report that a process of an environment wrote at its end.
+fn read_part<T: serde::de::DeserializeOwned>(run: &RunFile, process: &str) -> Option<T> {
     read(&run.run_dir.join("parts").join(format!("{process}.json")))
 }
 
@@ -93,7 +93,7 @@ struct HandoverMeasurement {
     most_ahead_ticks: u64,
 }
 
-/// The handovers of a run, each with its effect on the simulation. A tick takes `tick_s` wall seconds on average.
+/// The handovers of a run, each with its effect on the simulation. `tick_s` is the mean wall time of a tick, seconds.
 fn handovers(outcome: &RunOutcome, sensing: &Sensing, tick_s: f64) -> Vec<Value> {
     let with_figures = |handover: &HandoverReport| {
         let mut value = json!(handover);
@@ -128,24 +128,24 @@ fn newest_checkpoint(run: &RunFile) -> Option<PathBuf> {
     Some(folder.join(name.trim()))
 }
 
-/// Puts the report together, writes it, and returns it with its path.
+/// Assembles the report, writes it, and returns it with its path.
 ///
 /// # Errors
-/// Not writable.
+/// The run directory is not writable.
 pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<(Value, PathBuf), Exit> {
     let runs: Vec<RunFile> = (0..run.config.run.envs).map(|index| run.environment(index)).collect();
     let sensings: Vec<Sensing> = runs
         .iter()
-        .map(|run| part(run, "sensor-daemon").unwrap_or_default())
+        .map(|run| read_part(run, "sensor-daemon").unwrap_or_default())
         .collect();
     let environments: Vec<Value> = runs
         .iter()
         .zip(&sensings)
-        .map(|(run, sensing)| of_environment(run, sensing))
+        .map(|(run, sensing)| environment_report(run, sensing))
         .collect();
     let sensing = Sensing::total(&sensings);
-    let training: Map<String, Value> = part(run, "trainer").unwrap_or_default();
-    let moving: Map<String, Value> = part(run, "sim-core").unwrap_or_default();
+    let training: Map<String, Value> = read_part(run, "trainer").unwrap_or_default();
+    let dynamics: Map<String, Value> = read_part(run, "sim-core").unwrap_or_default();
     let metric = metric::headline(run.config.task.kind);
     let learned = |key: &str| training.get(key).cloned().unwrap_or(Value::Null);
     let env_steps = match run.mode {
@@ -164,7 +164,7 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<(Value, PathBuf), Ex
     let used: Map<String, Value> = Process::ALL
         .into_iter()
         .filter_map(|process| {
-            let part: Value = part(run, process.name())?;
+            let part: Value = read_part(run, process.name())?;
             Some((process.name().to_owned(), part.get("process")?.clone()))
         })
         .collect();
@@ -203,12 +203,13 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<(Value, PathBuf), Ex
         "seed": run.seed(),
         "config_hash": run.config_hash,
         "trainer": training,
-        "dynamics": moving,
+        "dynamics": dynamics,
         "lidar": sensing.lidar,
         "environments": environments,
-        "traffic": part::<Value>(run, "traffic-bridge"),
+        "traffic": read_part::<Value>(run, "traffic-bridge"),
         "processes": used,
     });
+    // The task's metric of every estimator, where `report` does not have it yet.
     for estimator in ESTIMATORS {
         for key in [metric.mean_key(estimator), metric.interval_key(estimator)] {
             if report[&key].is_null() {
@@ -226,13 +227,13 @@ fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Option<T> {
     serde_json::from_str(&std::fs::read_to_string(path).ok()?).ok()
 }
 
-/// The observation hash; with several environments that of each, and what it is of.
+/// The observation hash; with several environments a line for each with its hash.
 fn hashes(report: &Value) -> Vec<String> {
     let hash = |of: &Value| of["observation_hash"].as_str().unwrap_or_default().to_owned();
     let environments = report["environments"].as_array().map_or(&[][..], Vec::as_slice);
     if environments.len() < 2 {
         let since = match report["first_tick"].as_u64() {
-            Some(tick) if tick > 0 => format!(" (since tick {tick}, where this part began)"),
+            Some(tick) if tick > 0 => format!(" (from tick {tick} on, where the run was resumed)"),
             _ => String::new(),
         };
         return vec![format!("observation hash {}{since}", hash(report))];
@@ -249,7 +250,7 @@ fn hashes(report: &Value) -> Vec<String> {
     environments.iter().map(line).collect()
 }
 
-/// The report in a few lines for the terminal.
+/// The most important figures of the report, for the terminal.
 #[must_use]
 pub fn summary(report: &Value, path: &Path) -> String {
     let mut lines = vec![format!(
@@ -282,7 +283,7 @@ pub fn summary(report: &Value, path: &Path) -> String {
         ));
     }
     lines.push(format!(
-        "ticks lost {}, duplicated {}; restarts {}; messages that watchers passed over {}",
+        "ticks lost {}, duplicated {}; restarts {}; messages that watchers missed {}",
         report["lost_ticks"], report["duplicated_ticks"], report["restarts"], report["drops"]
     ));
     lines.extend(hashes(report));
@@ -290,14 +291,14 @@ pub fn summary(report: &Value, path: &Path) -> String {
     lines.join("\n")
 }
 
-/// A number of the report with so many decimals; a dash where there is none.
+/// A number of the report with `digits` decimals; a dash if it is missing.
 fn number(report: &Value, key: &str, digits: usize) -> String {
     report[key]
         .as_f64()
         .map_or("–".into(), |value| format!("{value:.digits$}"))
 }
 
-/// Means of the task's metric: of the policy and of what it is compared with.
+/// Means of the task's metric for the policy and for the estimators that it is compared with.
 fn errors(report: &Value) -> Vec<String> {
     let Some(metric) = METRICS.iter().find(|metric| report["metric"] == metric.name) else {
         return Vec::new();
@@ -325,13 +326,13 @@ fn errors(report: &Value) -> Vec<String> {
         ));
     }
     if measured("supervised") {
-        let by = "the policy's network taught by regression to the truth";
+        let by = "the policy's network trained by regression on the truth";
         lines.push(format!("from the same samples: {by} {}", error("supervised")));
     }
     if measured("ekf") {
         let mut line = format!("from the same samples: EKF {}", error("ekf"));
         if measured("rts") {
-            let note = "sees the future: a bound, not an estimator";
+            let note = "uses later samples too: a bound, not an estimator";
             line += &format!(", RTS smoother {} ({note})", error("rts"));
         }
         lines.push(line);

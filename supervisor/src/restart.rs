@@ -1,37 +1,41 @@
-//! When an ended process is started again: a watcher at once if it had got to work, else after a growing pause and not for ever; a
-//! trainer while its replacements reach new commits.
+//! Decides when an ended process is started again.
+//!
+//! A watcher that had opened its ports is started again at once. One that had not is started after a growing pause, a limited
+//! number of times. A trainer is replaced as long as its replacements reach new commits.
 
 use std::time::{Duration, Instant};
 
-/// Ends in a row before a watcher got to work, after which it is not started again.
+/// Number of starts in a row, none of which opened its ports, after which a watcher is not started again.
 const MAX_VAIN_STARTS: u32 = 20;
 /// Most replacements of a trainer in a row without a new commit.
 const MAX_VAIN_REPLACEMENTS: u32 = 5;
-/// First pause after a vain start; it doubles.
+/// Pause after the first start in vain. It doubles with each further one.
 const PAUSE: Duration = Duration::from_millis(100);
 /// Longest pause.
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 
-/// What to do about an ended watcher.
+/// The decision on an ended watcher.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RestartVerdict {
-    /// Start it.
+    /// Start it now.
     Start,
-    /// Ask again later.
+    /// Decide again later.
     Wait,
-    /// Do not start it any more.
+    /// Never start it again.
     GiveUp,
 }
 
-/// The ends of one process that only watches.
+/// Restarts of one watcher.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct WatcherRestarts {
+    /// Starts in vain since the watcher last opened its ports.
     vain: u32,
+    /// Time of the next start.
     due: Option<Instant>,
 }
 
 impl WatcherRestarts {
-    /// What to do about the process, which is found ended at `now`; `worked` if it had opened its ports.
+    /// Decides on the watcher, which has ended by `now`. `worked` is true if it had opened its ports.
     pub fn verdict(&mut self, worked: bool, now: Instant) -> RestartVerdict {
         let due = *self.due.get_or_insert_with(|| {
             self.vain = if worked { 0 } else { self.vain + 1 };
@@ -99,7 +103,7 @@ impl TrainerRestarts {
     /// Counts a replacement of a trainer that has committed `committed_ticks`.
     ///
     /// # Errors
-    /// Too many in a row reached no new commit: their number.
+    /// Too many replacements in a row reached no new commit. The error is their number.
     pub fn allow(&mut self, committed_ticks: u64) -> Result<(), u32> {
         if committed_ticks > self.committed_ticks {
             self.committed_ticks = committed_ticks;

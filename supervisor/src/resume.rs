@@ -1,4 +1,4 @@
-//! `caraware train --resume`: a run that was stopped goes on from a checkpoint.
+//! `caraware train --resume`: continues a stopped run from a checkpoint.
 
 use std::{io::ErrorKind, path::Path};
 
@@ -19,7 +19,7 @@ use crate::{
     registry::{self, RunClaim},
 };
 
-/// What may differ, because no observation that has been made depends on it.
+/// Keys, or prefixes of keys, that a resumed run may change: no observation made so far depends on them.
 const CHANGEABLE: [&str; 7] = [
     "trainer.",
     "fanout.",
@@ -30,23 +30,23 @@ const CHANGEABLE: [&str; 7] = [
     "episode.final_evaluations",
 ];
 
-/// The configuration of a run to be resumed, with other settings.
+/// The configuration of a resumed run: that of the stopped run with the assignments `set`.
 ///
 /// # Errors
-/// A key or value is wrong, or observations depend on it, or the run cannot be resumed.
-pub fn changed(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
+/// A key or value is wrong, observations depend on a changed key, or the run cannot be resumed.
+pub fn changed_config(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
     if run.mode != Mode::Train || run.config.drives() {
         return Err(Exit::config(
             format!("{} cannot be resumed", run.name),
-            "only a run of `caraware train` that learns to localise goes on from a checkpoint",
+            "only a run of `caraware train` in the localisation task can be resumed",
         ));
     }
     let ranks = run.config.trainer.ranks;
     let started = std::env::var("WORLD_SIZE").ok().and_then(|size| size.parse().ok());
     if ranks > 1 && started != Some(ranks) {
         return Err(Exit::config(
-            format!("{} was one of {ranks} trainers that learn together", run.name),
-            format!("all go on together: torchrun --nproc-per-node {ranks} -m caraware.parallel --resume RUN"),
+            format!("the trainer of {} learned together with others as one of {ranks} ranks", run.name),
+            format!("resume all ranks together: torchrun --nproc-per-node {ranks} -m caraware.parallel --resume RUN"),
         ));
     }
     for assignment in set {
@@ -54,19 +54,19 @@ pub fn changed(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
         let is_known = config::keys::KEYS.iter().any(|known| known.path == key);
         if is_known && !CHANGEABLE.iter().any(|part| key.starts_with(part)) {
             return Err(Exit::config(
-                format!("`{key}` cannot change in a run that goes on"),
-                format!("observations depend on it. What may differ: {}", CHANGEABLE.join(", ")),
+                format!("`{key}` cannot change in a resumed run"),
+                format!("observations depend on it. Keys that may change: {}", CHANGEABLE.join(", ")),
             ));
         }
     }
     Ok(LayeredSettings::of(&run.config)?.with_assignments(set)?.validate()?)
 }
 
-/// The run goes on in its own directory.
+/// Prepares a stopped run to continue in its own directory.
 ///
 /// # Errors
-/// It is alive, what it was made from has gone, or its directory is not writable.
-pub fn go_on(
+/// The run is alive, a file that it was made from does not exist any more, or its directory is not writable.
+pub fn resume_in_place(
     found: &FoundCheckpoint,
     old: RunFile,
     config: Config,
@@ -81,21 +81,26 @@ pub fn go_on(
             ),
         ));
     }
-    if let Some(gone) = sources(&old).into_iter().find(|file| !file.exists()) {
+    if let Some(missing) = sources(&old).into_iter().find(|file| !file.exists()) {
         return Err(Exit::config(
-            format!("the run was made from {}, which is not there any more", gone.display()),
-            "put it back, or start another run",
+            format!(
+                "the run was made from {}, which does not exist any more",
+                missing.display()
+            ),
+            "restore the file, or start another run",
         ));
     }
-    let beginning = follow(&old, &old.run_dir, found.beginning())?;
+    // The logs come first: the curriculum and the commands that were not carried out yet.
+    let beginning = carry_over_logs(&old, &old.run_dir, found.beginning())?;
     let starts = std::iter::once(&beginning.start).chain(&beginning.others);
     for (index, start) in (0..old.config.run.envs).zip(starts) {
         let run_dir = old.environment(index).run_dir;
-        forget_the_end(&run_dir)?;
+        remove_end_reports(&run_dir)?;
         for process in SIMULATORS {
             episode_state::forget_after(&run_dir, process, start.episode_tick)?;
         }
     }
+    // The run gets a new part of shared memory, and its directory the new configuration.
     let claim = RunClaim::new(&old.run_dir)?;
     let config_hash = config::hash(&config);
     let path = old.run_dir.join("config.toml");
@@ -116,26 +121,30 @@ pub fn go_on(
     Ok((run, claim))
 }
 
-/// Puts what decided about `old` where the run in `run_dir`, which begins at `beginning`, looks for it: the stages of a curriculum, and the
-/// commands, of which it carries out those behind its first tick again. Counts the episodes that commands began anew before that.
+/// Carries the logs of the run `old` over to the run in `run_dir`, which continues it from `beginning`.
+///
+/// `run_dir` gets the log of the curriculum. Commands from the first tick of the resumed episode on are carried out again; earlier
+/// ones stay in the log of commands. The returned beginning counts the resets among the earlier ones.
 ///
 /// # Errors
 /// A log cannot be read or written.
-pub fn follow(old: &RunFile, run_dir: &Path, mut beginning: Beginning) -> Result<Beginning, Exit> {
+pub fn carry_over_logs(old: &RunFile, run_dir: &Path, mut beginning: Beginning) -> Result<Beginning, Exit> {
     let former = old.run_dir.join(FORMER_CURRICULUM_LOG);
     if former.exists() {
         return Err(Exit::config(
             format!(
-                "{} is the name that another version gave to {CURRICULUM_LOG}",
+                "{} was written by another version of caraware, which used this name for {CURRICULUM_LOG}",
                 former.display()
             ),
             "resume the run with the version that wrote it, or start another run",
         ));
     }
+    // The curriculum is decided once for all environments.
     let stages = old.run_dir.join(CURRICULUM_LOG);
     if stages.exists() && old.run_dir != run_dir {
         std::fs::copy(&stages, run_dir.join(CURRICULUM_LOG)).map_err(|error| Exit::io("copy", &stages, &error))?;
     }
+    // Each environment has commands of its own.
     for index in 0..old.config.run.envs {
         let from = old.environment(index).run_dir;
         let to = match index {
@@ -163,21 +172,21 @@ pub fn follow(old: &RunFile, run_dir: &Path, mut beginning: Beginning) -> Result
 pub fn repeat_commands(from: &Path, to: &Path, first_tick: u64) -> Result<u64, Exit> {
     let (done, due): (Vec<Action>, Vec<Action>) =
         commands(from)?.into_iter().partition(|action| action.tick < first_tick);
-    // In this order: cut off between the two, the run still has every command.
+    // The replay is written first: if the program is killed between the two writes, no command is lost.
     write_commands(&to.join(control::COMMAND_REPLAY), &due)?;
     write_commands(&to.join(control::COMMAND_LOG), &done)?;
     let resets = done.iter().filter(|action| matches!(action.control, Command::Reset {}));
     Ok(resets.count() as u64)
 }
 
-/// What the run in `run_dir` was told and did, and then what it was still to be told by the log that it followed.
+/// The commands that the run in `run_dir` has carried out, followed by those of its replay that were still due.
 fn commands(run_dir: &Path) -> Result<Vec<Action>, Exit> {
     let read = |name: &str| {
         let path = run_dir.join(name);
         let wrong = |reason: String| {
             Exit::run(
-                format!("cannot follow {}: {reason}", path.display()),
-                "it tells what the run was told; without its last lines the run goes on as if those had not been said",
+                format!("cannot read the commands in {}: {reason}", path.display()),
+                "correct the file; the resumed run ignores commands whose lines are removed",
             )
         };
         match std::fs::read_to_string(&path) {
@@ -187,16 +196,16 @@ fn commands(run_dir: &Path) -> Result<Vec<Action>, Exit> {
         }
     };
     let mut actions = read(control::COMMAND_LOG)?;
-    let told = actions.last().map(|action| action.tick);
+    let last_tick = actions.last().map(|action| action.tick);
     let due = read(control::COMMAND_REPLAY)?;
     actions.extend(
         due.into_iter()
-            .filter(|action| told.is_none_or(|told| action.tick > told)),
+            .filter(|action| last_tick.is_none_or(|last| action.tick > last)),
     );
     Ok(actions)
 }
 
-/// A log with these lines; none at all without them.
+/// Writes a log with these commands. Without commands it removes the file.
 fn write_commands(path: &Path, actions: &[Action]) -> Result<(), Exit> {
     if actions.is_empty() {
         return match std::fs::remove_file(path) {
@@ -215,6 +224,7 @@ fn write_commands(path: &Path, actions: &[Action]) -> Result<(), Exit> {
         .map_err(|error| Exit::io("write", path, &error))
 }
 
+/// The files that the run's traffic comes from.
 fn sources(run: &RunFile) -> Vec<&Path> {
     use ipc_schema::run::Source;
     match &run.source {
@@ -229,16 +239,16 @@ fn sources(run: &RunFile) -> Vec<&Path> {
     }
 }
 
-/// Removes what told how the run had ended: it has not.
-fn forget_the_end(run_dir: &Path) -> Result<(), Exit> {
+/// Removes the files that a run writes at its end: its failures, the parts of its report, and the report.
+fn remove_end_reports(run_dir: &Path) -> Result<(), Exit> {
     let files = |folder: &str, end: &'static str| {
         let entries = std::fs::read_dir(run_dir.join(folder)).into_iter().flatten().flatten();
         entries
             .map(|entry| entry.path())
             .filter(move |path| path.to_string_lossy().ends_with(end))
     };
-    let told = files("logs", ".error.json").chain(files("parts", ".json"));
-    for file in told.chain([run_dir.join("report.json")]).filter(|file| file.exists()) {
+    let ends = files("logs", ".error.json").chain(files("parts", ".json"));
+    for file in ends.chain([run_dir.join("report.json")]).filter(|file| file.exists()) {
         std::fs::remove_file(&file).map_err(|error| Exit::io("remove", &file, &error))?;
     }
     Ok(())

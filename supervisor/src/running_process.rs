@@ -32,21 +32,21 @@ fn command(row: &ProcessSpec, install: &Install, run: &RunFile) -> Result<Comman
     }
 }
 
-/// A started process; killed with its group when dropped.
+/// A started process. Dropping it kills its process group.
 #[derive(Debug)]
 pub struct RunningProcess {
     /// Its row.
     pub row: &'static ProcessSpec,
     /// Its environment.
     pub env_index: u32,
-    /// How often it has been started before.
+    /// Number of starts before this one.
     pub incarnation: u32,
     child: Child,
     exit: Option<ExitStatus>,
 }
 
 impl RunningProcess {
-    /// Starts a row in a process group of its own, its output going to `logs/<process>.log`.
+    /// Starts a row in its own process group. Its output goes to `logs/<process>.log`.
     ///
     /// # Errors
     /// The program is missing or cannot be started.
@@ -60,8 +60,8 @@ impl RunningProcess {
         Self::spawn(row, install, run, run_file, incarnation, |_| {})
     }
 
-    /// Starts a successor beside the working process of `row`. It reports its readiness on the returned standard output, and waits for
-    /// [`RunningProcess::begin_work`]. With `checkpoint`, it takes the parameters from there.
+    /// Starts a successor beside the working process of `row`. It reports on the returned standard output that it is ready, and waits
+    /// for [`RunningProcess::begin_work`]. With `checkpoint` it loads its parameters from there.
     ///
     /// # Errors
     /// As [`RunningProcess::start`].
@@ -84,12 +84,12 @@ impl RunningProcess {
         Ok((successor, output))
     }
 
-    /// Lets a successor that is ready begin its work: the old process has ended.
+    /// Starts the work of a ready successor, after the old process has ended.
     pub fn begin_work(&mut self) {
         if let Some(mut input) = self.child.stdin.take()
             && let Err(error) = input.write_all(b"go\n")
         {
-            tracing::warn!(%error, process = %self.row.process, "the successor ended before its turn");
+            tracing::warn!(%error, process = %self.row.process, "the successor ended before it became the trainer");
         }
     }
 
@@ -161,7 +161,7 @@ impl RunningProcess {
         }
     }
 
-    /// Asks it to make room for a successor; unlike [`RunningProcess::signal`], this reaches the process alone, not its group.
+    /// Asks it to leave for its successor. Unlike [`RunningProcess::signal`], the signal goes to the process alone, not to its group.
     pub fn ask_to_leave(&mut self) {
         if self.poll().is_none()
             && let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw)

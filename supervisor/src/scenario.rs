@@ -1,4 +1,4 @@
-//! What a `.sumocfg` and a net file say about themselves, read before anything is started.
+//! Reads the options of a `.sumocfg` and the location of a net, before any process starts.
 
 use std::{
     fs::File,
@@ -46,10 +46,10 @@ pub(crate) fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> 
         .map(|value| value.into_owned())
 }
 
-/// Reads a `.sumocfg` and checks that every file it names is there.
+/// Reads a `.sumocfg` and checks that every file it names exists.
 ///
 /// # Errors
-/// Unreadable, malformed, no net, or a named file is missing (with the line).
+/// The file is unreadable or malformed, it names no net, or a file that it names is missing (with the line).
 pub fn read(path: &Path) -> Result<SumoScenario, Exit> {
     let text = std::fs::read_to_string(path).map_err(|error| {
         problem(
@@ -65,7 +65,7 @@ pub fn read(path: &Path) -> Result<SumoScenario, Exit> {
         let line = line_of(&text, reader.buffer_position());
         match reader.read_event() {
             Ok(Event::Start(element) | Event::Empty(element)) => {
-                option(&mut scenario, &element, path, directory, line)?
+                read_option(&mut scenario, &element, path, directory, line)?
             }
             Ok(Event::Eof) => break,
             Ok(_) => {}
@@ -88,6 +88,7 @@ pub fn read(path: &Path) -> Result<SumoScenario, Exit> {
     Ok(scenario)
 }
 
+/// Line of the first character at or after `position` that is not white space, from 1.
 fn line_of(text: &str, position: u64) -> usize {
     let end = usize::try_from(position).unwrap_or(usize::MAX).min(text.len());
     let start = text.as_bytes()[end..]
@@ -101,7 +102,8 @@ fn line_of(text: &str, position: u64) -> usize {
         + 1
 }
 
-fn option(
+/// Takes one option of the `.sumocfg` over into `scenario`, or refuses it.
+fn read_option(
     scenario: &mut SumoScenario,
     element: &BytesStart<'_>,
     path: &Path,
@@ -117,7 +119,7 @@ fn option(
         "net-file" | "net" | "n" | "route-files" | "routes" | "r" | "additional-files" | "additional" | "a" => {
             let files = files(&value, directory);
             if let Some(missing) = files.iter().find(|file| !file.is_file()) {
-                let message = format!("line {line}: {name} names {}, which is not there", missing.display());
+                let message = format!("line {line}: {name} names {}, which does not exist", missing.display());
                 return Err(problem(
                     path,
                     message,
@@ -128,7 +130,7 @@ fn option(
                 .iter()
                 .filter(|file| file.extension().is_some_and(|kind| kind == "gz"))
             {
-                unpack(file).map_err(|error| {
+                check_gzip(file).map_err(|error| {
                     let message = format!(
                         "line {line}: {name} names {}, which cannot be unpacked: {error}",
                         file.display()
@@ -147,7 +149,7 @@ fn option(
             return Err(problem(
                 path,
                 format!(
-                    "line {line}: remote-port = \"{value}\" makes SUMO wait for a TraCI client, and none can connect to a run"
+                    "line {line}: remote-port = \"{value}\" makes SUMO wait for a TraCI client, but no client can connect to a run"
                 ),
                 "remove remote-port from the .sumocfg (traffic-bridge steps SUMO in its own process), or keep a copy without it",
             ));
@@ -168,8 +170,8 @@ fn files(value: &str, directory: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Reads a gzip file to its end: SUMO would stop in the middle without saying which file is damaged.
-fn unpack(file: &Path) -> std::io::Result<u64> {
+/// Reads a gzip file to its end. SUMO would stop at the damage without naming the file.
+fn check_gzip(file: &Path) -> std::io::Result<u64> {
     std::io::copy(&mut MultiGzDecoder::new(File::open(file)?), &mut std::io::sink())
 }
 
@@ -177,16 +179,17 @@ fn number<T: std::str::FromStr>(value: &str, name: &str, path: &Path, line: usiz
     value.trim().parse().map_err(|_| {
         problem(
             path,
-            format!("line {line}: {name} = \"{value}\" is not a number caraware understands"),
-            "give a plain number",
+            format!("line {line}: {name} = \"{value}\" is not a number"),
+            "write a plain number",
         )
     })
 }
 
-/// Reads a net file (plain or gzip): its `<location>`, and how many traffic lights it has; the geodetic origin of the configuration standing in for a missing projection.
+/// Reads the `<location>` of a net file (plain or gzip) and counts its traffic lights. If the net has no projection, `origin_deg` (latitude
+/// and longitude of its origin) replaces it.
 ///
 /// # Errors
-/// Unreadable, no `<location>`, or no projection and no origin.
+/// The file is unreadable, it has no `<location>`, or there is neither a projection nor an origin.
 pub fn map_info(net: &Path, origin_deg: Option<(f64, f64)>) -> Result<MapInfo, Exit> {
     let unreadable = |error: &dyn std::fmt::Display| {
         problem(
@@ -222,7 +225,7 @@ pub fn map_info(net: &Path, origin_deg: Option<(f64, f64)>) -> Result<MapInfo, E
     Ok(map)
 }
 
-/// Counts the programs of traffic lights in the rest of a net. Large nets have a million elements: each is only looked at.
+/// Counts the programs of traffic lights in the rest of a net. Large nets have a million elements, so only their names are compared.
 fn traffic_lights(net: &mut impl BufRead) -> std::io::Result<u32> {
     let (mut element, mut count) = (Vec::new(), 0);
     while net.read_until(b'>', &mut element)? > 0 {
@@ -232,7 +235,7 @@ fn traffic_lights(net: &mut impl BufRead) -> std::io::Result<u32> {
     Ok(count)
 }
 
-/// Room around the net for what leaves it: GNSS errors, vehicles wider than their lane, metres.
+/// Margin around the net for positions outside it, such as GNSS errors and vehicles wider than their lane, metres.
 const MARGIN_M: f64 = 20.0;
 
 fn location(element: &BytesStart<'_>, net: &Path, origin_deg: Option<(f64, f64)>) -> Result<MapInfo, Exit> {
@@ -270,7 +273,7 @@ fn location(element: &BytesStart<'_>, net: &Path, origin_deg: Option<(f64, f64)>
         problem(
             net,
             "has no projection (projParameter is \"!\"), so GNSS has no latitude and longitude",
-            "give the place of the net's (0, 0): --set map.origin_latitude_deg=52.0 --set map.origin_longitude_deg=10.0",
+            "give the position of the net's (0, 0): --set map.origin_latitude_deg=52.0 --set map.origin_longitude_deg=10.0",
         )
     })?;
     let projection =

@@ -1,4 +1,4 @@
-//! The supervisor's socket in the run's own directory, which only its user can enter: a line of JSON each way.
+//! The supervisor's socket: a request and its answer are a line of JSON each. Only the user of the run can enter its directory.
 
 use std::{
     io::{BufRead as _, BufReader, Read as _, Write as _},
@@ -27,9 +27,9 @@ const REQUEST_WITHIN: Duration = Duration::from_secs(2);
 pub enum SupervisorRequest {
     /// Replace the trainer.
     Handover(HandoverRequest),
-    /// Pass a command on to the simulation.
+    /// Forward a command to the simulation.
     Control {
-        /// Environment; none = all of them.
+        /// Environment; `None` stands for all of them.
         #[serde(default)]
         env: Option<u32>,
         /// The command as JSON text, which the supervisor checks.
@@ -46,7 +46,7 @@ pub struct HandoverRequest {
     pub checkpoint: Option<PathBuf>,
 }
 
-/// How the supervisor answers a [`HandoverRequest`].
+/// The supervisor's answer to a [`HandoverRequest`].
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum HandoverAnswer {
@@ -74,7 +74,7 @@ pub struct HandoverReport {
 pub enum ReceivedRequest {
     /// Replace the trainer.
     Handover(HandoverRequest, ReplySocket),
-    /// Pass a command on to the simulation of one environment, or of all of them.
+    /// Forward a command to one environment, or to all of them.
     Control(Command, Option<u32>, ReplySocket),
 }
 
@@ -97,7 +97,7 @@ impl ReplySocket {
     }
 }
 
-/// Listens for requests until the run's directory is removed, and passes each to `take`.
+/// Listens for requests on a thread and passes each to `take`, until `take` returns false.
 ///
 /// # Errors
 /// The socket cannot be created.
@@ -106,7 +106,7 @@ pub fn listen(run: &RunFile, take: impl Fn(ReceivedRequest) -> bool + Send + 'st
     let listener = UnixListener::bind(&path).map_err(|error| Exit::io("listen on", &path, &error))?;
     let serve = move || {
         for stream in listener.incoming().flatten() {
-            if let Some(request) = read(stream)
+            if let Some(request) = read_request(stream)
                 && !take(request)
             {
                 return;
@@ -120,7 +120,8 @@ pub fn listen(run: &RunFile, take: impl Fn(ReceivedRequest) -> bool + Send + 'st
         .map_err(|error| Exit::run(format!("cannot listen for requests: {error}"), ""))
 }
 
-fn read(stream: UnixStream) -> Option<ReceivedRequest> {
+/// Reads a request. A malformed one is dropped, and a wrong command is refused.
+fn read_request(stream: UnixStream) -> Option<ReceivedRequest> {
     stream.set_read_timeout(Some(REQUEST_WITHIN)).ok()?;
     let mut text = String::new();
     let mut reader = BufReader::new(stream.take(MAX_REQUEST_BYTES));
@@ -153,7 +154,8 @@ pub fn ask<Answer: DeserializeOwned>(run: &RunFile, request: &SupervisorRequest)
         .map_err(|error| failed(&error))?;
     serde_json::from_str(&line).map_err(|_| {
         Exit::Failure(
-            Failure::new(FailureKind::Run, "the run ended before it answered").with_help("its report says how"),
+            Failure::new(FailureKind::Run, "the run ended before it answered")
+                .with_help("report.json in its directory shows how it ended"),
         )
     })
 }

@@ -1,4 +1,4 @@
-//! `caraware ps` and `caraware stop`: runs seen from another terminal.
+//! `caraware ps` and `caraware stop`: lists and stops runs from another terminal.
 
 use std::time::{Duration, Instant};
 
@@ -15,8 +15,8 @@ use rustix::process::{Pid, Signal, kill_process};
 use crate::{failure::Exit, registry};
 
 /// Time over which `ps` measures rates.
-const RATE_OVER: Duration = Duration::from_millis(500);
-/// Longest wait of `stop`.
+const MEASURING_TIME: Duration = Duration::from_millis(500);
+/// Longest time that `stop` waits for the run to end.
 const STOP_WITHIN: Duration = Duration::from_secs(60);
 
 /// Prints the process table of every live run.
@@ -46,7 +46,7 @@ pub fn ps(name: Option<&str>) -> Result<(), Exit> {
     Ok(())
 }
 
-/// A process of a run.
+/// A process of a run with the reader of its board.
 struct ProcessBoard {
     label: String,
     process: Process,
@@ -55,17 +55,18 @@ struct ProcessBoard {
     board: BoardReader,
 }
 
+/// One reading of a board.
 struct BoardReading {
     health: Health,
     progress: Progress,
 }
 
-fn look(boards: &[ProcessBoard]) -> Vec<BoardReading> {
+fn read_boards(boards: &[ProcessBoard]) -> Vec<BoardReading> {
     boards
         .iter()
-        .map(|seat| BoardReading {
-            health: seat.board.health(),
-            progress: seat.board.progress(),
+        .map(|process| BoardReading {
+            health: process.board.health(),
+            progress: process.board.progress(),
         })
         .collect()
 }
@@ -89,25 +90,27 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
             });
         }
     }
-    boards.sort_by_key(|seat| seat.scope == ProcessScope::Run);
-    let first = look(&boards);
-    wait(RATE_OVER);
-    let second = look(&boards);
+    // Processes of the whole run come last.
+    boards.sort_by_key(|process| process.scope == ProcessScope::Run);
+    // Rates are differences of two readings.
+    let first = read_boards(&boards);
+    wait(MEASURING_TIME);
+    let second = read_boards(&boards);
     let supervisor = memory_mib(run.supervisor_pid);
     println!(
         "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>5} MiB",
         run.name, "supervisor", "running", run.supervisor_pid, "", "", "", "", "", supervisor
     );
-    for ((seat, before), now) in boards.iter().zip(&first).zip(&second) {
-        // The first process of an environment is its SUMO.
-        let source = boards.iter().position(|other| other.env_index == seat.env_index);
+    for ((process, before), now) in boards.iter().zip(&first).zip(&second) {
+        // The first process of an environment is its `traffic-bridge`, whose tick all others follow.
+        let source = boards.iter().position(|other| other.env_index == process.env_index);
         let source_ticks = source.map_or(0, |source| second[source].health.ticks);
         #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
-        let rate = now.health.ticks.saturating_sub(before.health.ticks) as f64 / RATE_OVER.as_secs_f64();
+        let rate = now.health.ticks.saturating_sub(before.health.ticks) as f64 / MEASURING_TIME.as_secs_f64();
         println!(
             "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9.0} {:>6} {:>7} {:>9} {:>5} MiB",
             run.name,
-            seat.label,
+            process.label,
             State::from_u32(now.health.state).name(),
             now.health.pid,
             now.health.ticks,
@@ -124,41 +127,41 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
     Ok(())
 }
 
-/// A line for each environment: where it stands, how fast it goes, and who is there.
+/// Prints a line for each environment: its episode and simulated time, its road users, and its rates.
 fn print_environments(run: &RunFile, boards: &[ProcessBoard], [before, now]: [&[BoardReading]; 2]) {
     for env_index in 0..run.config.run.envs {
-        let seat_of = |process: Process| {
-            let is_it = |seat: &ProcessBoard| seat.env_index == env_index && seat.process == process;
+        let index_of = |process: Process| {
+            let is_it = |other: &ProcessBoard| other.env_index == env_index && other.process == process;
             boards.iter().position(is_it)
         };
-        let seats = [Process::TrafficBridge, Process::SimCore, Process::SensorDaemon].map(seat_of);
-        let [Some(source), Some(moving), Some(sensing)] = seats else {
+        let indices = [Process::TrafficBridge, Process::SimCore, Process::SensorDaemon].map(index_of);
+        let [Some(bridge), Some(core), Some(daemon)] = indices else {
             continue;
         };
-        let (traffic, moved, sensed) = (now[source].health, now[moving].health, now[sensing].health);
-        let since = before[sensing].health;
-        let each_second = |now: u64, before: u64| {
+        let (traffic, world, sensing) = (now[bridge].health, now[core].health, now[daemon].health);
+        let sensing_before = before[daemon].health;
+        let per_second = |now: u64, before: u64| {
             #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
-            let more = now.saturating_sub(before) as f64;
-            more / RATE_OVER.as_secs_f64()
+            let increase = now.saturating_sub(before) as f64;
+            increase / MEASURING_TIME.as_secs_f64()
         };
         println!(
             "{:<16} environment {env_index}: episode {}, {:.1} s, {} of {} road users sensing, {} arrived, {:.0} steps/s, {:.1} × real time",
             run.name,
-            sensed.episode,
-            Duration::from_nanos(sensed.sim_time_ns).as_secs_f64(),
-            sensed.cavs,
-            moved.road_users,
+            sensing.episode,
+            Duration::from_nanos(sensing.sim_time_ns).as_secs_f64(),
+            sensing.cavs,
+            world.road_users,
             traffic.arrived,
-            each_second(sensed.vehicle_steps, since.vehicle_steps),
-            each_second(sensed.ticks, since.ticks) * run.config.run.tick_s,
+            per_second(sensing.vehicle_steps, sensing_before.vehicle_steps),
+            per_second(sensing.ticks, sensing_before.ticks) * run.config.run.tick_s,
         );
     }
 }
 
-/// A line for the trainer once it reports metrics: how many updates it has made, and what it measures.
+/// Prints a line for the trainer once it reports metrics: its updates, its metrics and its reward.
 fn print_training(run: &RunFile, boards: &[ProcessBoard]) {
-    let Some(trainer) = boards.iter().find(|seat| seat.process == Process::Trainer) else {
+    let Some(trainer) = boards.iter().find(|board| board.process == Process::Trainer) else {
         return;
     };
     let training = trainer.board.training();
@@ -185,10 +188,10 @@ fn wait(time: Duration) {
     std::thread::park_timeout(time);
 }
 
-/// Asks the supervisor of a run to end it, and waits until nothing of it is left.
+/// Asks the supervisor of a run to end the run, and waits until the run has left the registry.
 ///
 /// # Errors
-/// No such run, or it does not end in time.
+/// The run does not exist, or it does not end in time.
 pub fn stop(name: Option<&str>) -> Result<(), Exit> {
     let run = registry::find(name)?;
     let pid = Pid::from_raw(run.supervisor_pid)

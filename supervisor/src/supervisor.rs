@@ -43,7 +43,7 @@ enum SupervisorEvent {
 
 /// Time between two checks of the processes without an event.
 const CHECK_INTERVAL: Duration = Duration::from_millis(100);
-/// The same while a successor opens its ports, which is timed, or while a command waits for its answer.
+/// The same while a command waits for its answer, or while a successor opens its ports: the report measures that time.
 const SHORT_CHECK_INTERVAL: Duration = Duration::from_millis(5);
 /// Longest time from start to ready.
 const READY_WITHIN: Duration = Duration::from_secs(120);
@@ -97,13 +97,13 @@ pub struct Supervisor {
     events: Receiver<SupervisorEvent>,
     event_sender: Sender<SupervisorEvent>,
     signal_handle: Handle,
-    /// Restarts of processes that only watch.
+    /// Restarts of watchers.
     watcher_restarts: BTreeMap<Process, WatcherRestarts>,
     trainer_restarts: TrainerRestarts,
     /// Restarts of the simulator processes of each environment.
     environment_restarts: BTreeMap<u32, EnvironmentRestarts>,
     ready_at: Option<Instant>,
-    /// The check before the present one: a process that is found ready now became ready after it.
+    /// Time of the check before the present one. A process that is found ready now became ready after it.
     last_check: Instant,
 }
 
@@ -176,7 +176,7 @@ impl Supervisor {
             self.reap()?;
             self.handovers.advance(&mut self.processes);
             self.controls.advance()?;
-            self.note_ready(started)?;
+            self.record_ready(started)?;
             display.update(self.processes.environments(), self.ready_at);
             self.last_check = Instant::now();
             if self.processes.have_finished() {
@@ -209,7 +209,7 @@ impl Supervisor {
             let left = self.handovers.is_trainer_leaving() && ended.status.success();
             match ended.on_exit {
                 OnExit::Restart => self.restart_watcher(index, &ended)?,
-                // All its results are on disk.
+                // The trainer has written all its results.
                 OnExit::Replace if ended.is_done => {}
                 OnExit::Replace if was_killed => self.replace_trainer(index, &ended)?,
                 OnExit::Replace if left => self.restart(index, &ended)?,
@@ -260,7 +260,7 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Restarts a process that only watches, unless it never gets to work. The run continues without it.
+    /// Restarts a watcher, unless none of its last starts opened its ports. Then the run continues without it.
     fn restart_watcher(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
         let restarts = self.watcher_restarts.entry(ended.row.process).or_default();
         let verdict = restarts.verdict(self.processes.is_attached(index), Instant::now());
@@ -297,8 +297,8 @@ impl Supervisor {
         Ok(())
     }
 
-    /// Remembers when the last required process became ready; fails if one takes too long.
-    fn note_ready(&mut self, started: Instant) -> Result<(), Exit> {
+    /// Records the time at which the last required process became ready. Fails if one is not ready in time.
+    fn record_ready(&mut self, started: Instant) -> Result<(), Exit> {
         if self.ready_at.is_some() {
             return Ok(());
         }
@@ -333,7 +333,7 @@ impl Supervisor {
                 self.handovers.begin(&self.processes, request, reply, report_ready);
             }
             Ok(SupervisorEvent::Request(ReceivedRequest::Control(command, env, reply))) => {
-                self.controls.pass_on(&command, env, reply);
+                self.controls.forward(&command, env, reply);
             }
             Ok(SupervisorEvent::SuccessorReady(incarnation)) => {
                 self.handovers.successor_ready(&mut self.processes, incarnation);

@@ -1,4 +1,4 @@
-//! The project's own maps: plain XML carried in the binary, built by netconvert into the run directory.
+//! The town, the project's own map: netconvert builds it in the run directory from plain XML that the program contains.
 
 use std::{
     path::{Path, PathBuf},
@@ -22,13 +22,14 @@ const SOURCES: [(&str, &str); 7] = sources![
     "town.vtypes.add.xml",
 ];
 
-/// The file among them that says who moves.
+/// The one of these files that defines the vehicle types.
 const VEHICLE_TYPES: &str = "town.vtypes.add.xml";
 
-/// Writes the sources of the town to `directory` and builds its net there; returns the net, and vehicle types and polygons.
+/// Writes the sources of the town to `directory` and builds its net there. Returns the net and its additional files: vehicle types and
+/// polygons.
 ///
 /// # Errors
-/// Not writable, or netconvert refuses.
+/// The directory is not writable, or netconvert fails.
 pub fn build(install: &Install, directory: &Path) -> Result<(PathBuf, Vec<PathBuf>), Exit> {
     for (name, text) in SOURCES {
         write(directory, name, text)?;
@@ -42,7 +43,7 @@ pub fn build(install: &Install, directory: &Path) -> Result<(PathBuf, Vec<PathBu
 /// Writes the vehicle types of the town to `directory`, for other maps.
 ///
 /// # Errors
-/// Not writable.
+/// The directory is not writable.
 pub fn vehicle_types(directory: &Path) -> Result<PathBuf, Exit> {
     let source = SOURCES.into_iter().find(|(name, _)| *name == VEHICLE_TYPES);
     write(directory, VEHICLE_TYPES, source.map_or("", |(_, text)| text))

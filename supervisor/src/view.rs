@@ -16,22 +16,22 @@ use crate::{
     install, registry,
 };
 
-/// The Python package that shows a run.
+/// Name of the viewer's Python package.
 const MODULE: &str = "caraware_viewer";
-/// What a viewer beside a run waits for its first tick, seconds.
+/// Longest time that a viewer beside a run waits for the first tick, seconds.
 const FIRST_TICK_WITHIN_S: &str = "120";
 /// Longest time from the end of a run to the end of its viewer.
 const LEAVE_WITHIN: Duration = Duration::from_secs(8);
-/// Time between two looks at a leaving viewer.
-const LOOK: Duration = Duration::from_millis(50);
+/// Interval at which a leaving viewer is polled.
+const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Shows a run until it ends: this process becomes the viewer.
 ///
 /// # Errors
-/// No such run, one that is not fanned out, or no viewer on this machine.
+/// The run does not exist or has no fan-out, or the viewer is not installed.
 pub fn view(args: &ViewArgs) -> Result<(), Exit> {
     let target = ViewTarget::find(args.endpoint.as_deref())?;
-    let mut command = viewer(&target)?;
+    let mut command = viewer_command(&target)?;
     command.args(args.env.map(|env| format!("--env={env}")));
     command.args(args.web.then_some("--web"));
     command.args(args.web_port.map(|port| format!("--web-port={port}")));
@@ -41,7 +41,7 @@ pub fn view(args: &ViewArgs) -> Result<(), Exit> {
     if let Some(name) = &args.run {
         command.arg(format!("--run={name}"));
     }
-    command.args(arguments_of(&args.credentials));
+    command.args(credential_arguments(&args.credentials));
     let error = command.exec();
     Err(Exit::missing(
         format!("cannot start {}: {error}", command.get_program().to_string_lossy()),
@@ -49,34 +49,34 @@ pub fn view(args: &ViewArgs) -> Result<(), Exit> {
     ))
 }
 
-/// The same credentials for the Python viewer.
-fn arguments_of(who: &Credentials) -> Vec<String> {
+/// The credentials as arguments of the Python viewer.
+fn credential_arguments(credentials: &Credentials) -> Vec<String> {
     let files = [
-        ("password-file", &who.password_file),
-        ("ca", &who.ca),
-        ("certificate", &who.certificate),
-        ("key", &who.key),
+        ("password-file", &credentials.password_file),
+        ("ca", &credentials.ca),
+        ("certificate", &credentials.certificate),
+        ("key", &credentials.key),
     ];
     let files = files
         .into_iter()
         .filter_map(|(option, path)| Some(format!("--{option}={}", path.as_ref()?.display())));
-    who.user
-        .iter()
+    let user = credentials.user.iter();
+    user
         .map(|user| format!("--user={user}"))
         .chain(files)
         .collect()
 }
 
-/// Where a run is fanned out.
+/// The endpoint at which a run's `fanout` listens.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct ViewTarget {
     endpoint: String,
-    /// Its name, where it is known; else the viewer takes the only one there.
+    /// Name of the run. Without a name the viewer shows the only run at the endpoint.
     run: Option<String>,
 }
 
 impl ViewTarget {
-    /// An endpoint as it stands; else a run of this machine, by name or the only one.
+    /// Uses `text` if it is an endpoint. Otherwise `text` names a live run of this machine; without `text` it is the only live run.
     fn find(text: Option<&str>) -> Result<Self, Exit> {
         if let Some(endpoint) = text.filter(|text| is_endpoint(text)) {
             return Ok(Self {
@@ -86,8 +86,8 @@ impl ViewTarget {
         }
         if let Some(address) = text.filter(|text| looks_like_address(text)) {
             return Err(Exit::config(
-                format!("`{address}` is no endpoint"),
-                format!("write the protocol too: caraware view tcp/{address}"),
+                format!("`{address}` is not an endpoint: the protocol is missing"),
+                format!("add the protocol: caraware view tcp/{address}"),
             ));
         }
         registry::find(text).and_then(|run| Self::of(&run))
@@ -96,23 +96,24 @@ impl ViewTarget {
     fn of(run: &RunFile) -> Result<Self, Exit> {
         if !run.config.fanout.enabled {
             return Err(Exit::config(
-                format!("{} shows nothing: its `fanout.enabled` is false", run.name),
-                "start it without `--set fanout.enabled=false`",
+                format!("{} cannot be viewed: its `fanout.enabled` is false", run.name),
+                "start the run without `--set fanout.enabled=false`",
             ));
         }
         Ok(Self {
-            endpoint: reachable(&run.config.fanout.listen),
+            endpoint: endpoint_to_connect(&run.config.fanout.listen),
             run: Some(run.name.clone()),
         })
     }
 }
 
-/// An endpoint to connect to for one to listen on: every address of this machine is no address to call.
-fn reachable(listen: &str) -> String {
+/// The endpoint that a viewer on this machine connects to. A wildcard address can be listened on but not connected to, so the
+/// loopback address replaces it.
+fn endpoint_to_connect(listen: &str) -> String {
     listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 }
 
-/// `tcp/host:port` and its like.
+/// True for `tcp/host:port` and other protocols in this form.
 fn is_endpoint(text: &str) -> bool {
     text.split_once('/').is_some_and(|(protocol, address)| {
         !protocol.is_empty()
@@ -121,14 +122,14 @@ fn is_endpoint(text: &str) -> bool {
     })
 }
 
-/// `host:port`.
+/// True for `host:port`.
 fn looks_like_address(text: &str) -> bool {
     text.rsplit_once(':')
         .is_some_and(|(host, port)| !host.is_empty() && port.parse::<u16>().is_ok())
 }
 
-/// The command of a viewer of `target`, checked to be installed.
-fn viewer(target: &ViewTarget) -> Result<Command, Exit> {
+/// The command that starts a viewer of `target`. It fails if the viewer is not installed.
+fn viewer_command(target: &ViewTarget) -> Result<Command, Exit> {
     let python = install::python(&install::programs()?)?;
     check_installed(&python)?;
     let mut command = Command::new(python);
@@ -141,7 +142,7 @@ fn check_installed(python: &Path) -> Result<(), Exit> {
     let script = format!(
         "import importlib.util as u, sys; sys.exit(' '.join(p for p in ('{MODULE}', 'rerun', 'zenoh') if u.find_spec(p) is None))"
     );
-    let help = "run `make build`; elsewhere, with Python alone: pip install ./viewer";
+    let help = "run `make build`; on a machine with only Python: pip install ./viewer";
     let output = Command::new(python)
         .args(["-c", &script])
         .stdin(Stdio::null())
@@ -156,7 +157,7 @@ fn check_installed(python: &Path) -> Result<(), Exit> {
     }
 }
 
-/// A viewer that is wanted beside a run.
+/// The viewer that the command line asks for beside a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ViewerRequest {
     kind: ViewerKind,
@@ -164,29 +165,35 @@ pub struct ViewerRequest {
 }
 
 impl ViewerRequest {
-    /// What the command line asks for, if the run will let such a viewer in.
+    /// Reads the viewer and its credentials from the command line. `None` without `--viewer`.
     ///
     /// # Errors
-    /// The run is not fanned out, or asks who the viewer is and the command line does not say.
+    /// Credentials are given without a viewer, or the run requires credentials that the command line lacks.
     pub fn of(args: &RunArgs, fanout: &FanoutConfig) -> Result<Option<Self>, Exit> {
-        let who = &args.credentials;
+        let credentials = &args.credentials;
         let Some(kind) = args.viewer else {
-            return match *who == Credentials::default() {
+            return match *credentials == Credentials::default() {
                 true => Ok(None),
                 false => Err(Exit::config(
-                    "--user, --password-file, --ca, --certificate and --key say who the viewer is, and none is asked for",
-                    "add --viewer or --viewer=web, or leave them out; who may watch is said by fanout.users and fanout.tls_client_ca",
+                    "--user, --password-file, --ca, --certificate and --key are credentials of the viewer, but --viewer is missing",
+                    "add --viewer or --viewer=web, or leave them out; fanout.users and fanout.tls_client_ca decide which viewers may connect",
                 )),
             };
         };
         let (users, certificates) = (!fanout.users.is_empty(), !fanout.tls_client_ca.is_empty());
         let missing = [
-            (users && who.user.is_none(), "--user NAME --password-file FILE"),
             (
-                certificates && who.certificate.is_none(),
+                users && credentials.user.is_none(),
+                "--user NAME --password-file FILE",
+            ),
+            (
+                certificates && credentials.certificate.is_none(),
                 "--certificate FILE --key FILE",
             ),
-            (fanout.listen.starts_with("tls/") && who.ca.is_none(), "--ca FILE"),
+            (
+                fanout.listen.starts_with("tls/") && credentials.ca.is_none(),
+                "--ca FILE",
+            ),
         ];
         let missing: Vec<&str> = missing
             .iter()
@@ -196,36 +203,36 @@ impl ViewerRequest {
         if fanout.enabled && !missing.is_empty() {
             return Err(Exit::config(
                 format!(
-                    "this run lets in only those who say who they are, and so has its own viewer to: {}",
+                    "every viewer of this run must authenticate, and the credentials of its own viewer are missing: {}",
                     missing.join(" ")
                 ),
-                "add that to the command line, or leave --viewer out (docs/remote.md)",
+                "add them to the command line, or leave --viewer out (docs/remote.md)",
             ));
         }
         Ok(Some(Self {
             kind,
-            credentials: who.clone(),
+            credentials: credentials.clone(),
         }))
     }
 }
 
-/// A viewer beside a run: it ends with the run, and its own end disturbs nobody.
+/// A viewer beside a run. It ends with the run; the run continues if the viewer ends first.
 #[derive(Debug)]
 pub struct ViewerProcess {
     child: Child,
 }
 
 impl ViewerProcess {
-    /// Starts a viewer that waits for the first tick of `run`, in a process group of its own: Ctrl-C ends the run, and the run's end
-    /// the viewer.
+    /// Starts a viewer that waits for the first tick of `run`. The viewer has its own process group, so Ctrl-C does not reach it:
+    /// Ctrl-C ends the run, and the run ends its viewer.
     ///
     /// # Errors
-    /// The run is not fanned out, or no viewer is installed.
-    pub fn start(run: &RunFile, wanted: &ViewerRequest) -> Result<Self, Exit> {
-        let mut command = viewer(&ViewTarget::of(run)?)?;
+    /// The run has no fan-out, or the viewer is not installed.
+    pub fn start(run: &RunFile, request: &ViewerRequest) -> Result<Self, Exit> {
+        let mut command = viewer_command(&ViewTarget::of(run)?)?;
         command.args(["--timeout", FIRST_TICK_WITHIN_S]);
-        command.args((wanted.kind == ViewerKind::Web).then_some("--web"));
-        command.args(arguments_of(&wanted.credentials));
+        command.args((request.kind == ViewerKind::Web).then_some("--web"));
+        command.args(credential_arguments(&request.credentials));
         command.stdin(Stdio::null()).process_group(0);
         let child = command.spawn().map_err(|error| {
             Exit::missing(
@@ -250,7 +257,7 @@ impl ViewerProcess {
 }
 
 impl Drop for ViewerProcess {
-    /// Lets it draw what is left, then ends it.
+    /// Asks the viewer to draw what it has received and to end; kills it if it does not end in time.
     fn drop(&mut self) {
         for signal in [Signal::TERM, Signal::KILL] {
             if self.has_left() {
@@ -259,7 +266,7 @@ impl Drop for ViewerProcess {
             self.signal(signal);
             let deadline = Instant::now() + LEAVE_WITHIN;
             while Instant::now() < deadline && !self.has_left() {
-                std::thread::park_timeout(LOOK);
+                std::thread::park_timeout(POLL_INTERVAL);
             }
         }
     }
@@ -270,7 +277,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn endpoints_and_names_are_told_apart() {
+    fn endpoints_are_distinguished_from_names() {
         for endpoint in [
             "tcp/127.0.0.1:7447",
             "tls/host.example:7448",
@@ -294,20 +301,20 @@ mod tests {
     }
 
     #[test]
-    fn every_address_of_this_machine_is_called_by_one() {
-        for (listen, calls) in [
+    fn a_viewer_connects_to_the_loopback_address_of_a_wildcard() {
+        for (listen, connect) in [
             ("tls/0.0.0.0:7447", "tls/127.0.0.1:7447"),
             ("tcp/[::]:7447", "tcp/[::1]:7447"),
             ("tcp/10.0.0.0:7447", "tcp/10.0.0.0:7447"),
         ] {
-            assert_eq!(reachable(listen), calls);
+            assert_eq!(endpoint_to_connect(listen), connect);
         }
     }
 
     #[test]
-    fn an_address_without_protocol_is_told_how_to_be_written() {
+    fn the_error_on_an_address_without_protocol_shows_the_endpoint() {
         let Err(Exit::Failure(failure)) = ViewTarget::find(Some("laptop:7447")) else {
-            unreachable!("an address is no run");
+            unreachable!("an address is not the name of a run");
         };
         assert!(failure.help.is_some_and(|help| help.contains("tcp/laptop:7447")));
     }

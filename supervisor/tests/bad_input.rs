@@ -1,4 +1,4 @@
-//! Bad input answers with file, key or line and what to do, the right exit code, and leaves nothing behind.
+//! Bad input is refused with its file, key or line, with the fix and with the right exit code, and nothing is left behind.
 
 #![allow(
     clippy::unwrap_used,
@@ -12,7 +12,7 @@ use std::net::TcpListener;
 
 use common::{Workplace, sumo_program, text, tool, tree};
 
-/// Runs a command that must be refused, and returns what it said in one line.
+/// Runs a command that must be refused, and returns its output as one line.
 fn refused(workplace: &Workplace, arguments: &[&str], exit_code: i32) -> String {
     let output = workplace.run(arguments);
     let said = text(&output);
@@ -61,7 +61,7 @@ fn wrong_unit_and_wrong_range() {
 }
 
 #[test]
-fn obstacle_that_is_no_prop() {
+fn unknown_prop_as_obstacle() {
     let workplace = Workplace::new();
     workplace.write("my.toml", "[scene]\nobstacles = [\"cone 10 20\", \"conne 30 40 90\"]\n");
     let said = refused(&workplace, &["simulate", "my.toml"], 2);
@@ -79,7 +79,7 @@ fn obstacle_that_is_no_prop() {
 }
 
 #[test]
-fn vehicle_model_for_no_class() {
+fn vehicle_model_of_an_unknown_class() {
     let workplace = Workplace::new();
     workplace.write("my.toml", "[vehicle]\nclass_models = [\"truk=dynamic\"]\n");
     let said = refused(&workplace, &["simulate", "my.toml"], 2);
@@ -209,16 +209,16 @@ fn remote_port_is_refused_before_sumo_would_wait() {
     assert!(!workplace.path().join("runs").exists());
 }
 
-/// A runtime directory that the user chose may hold anything: neither a run nor `doctor --clean` removes what is not a run's.
+/// The user may choose a runtime directory that holds other files: neither a run nor `doctor --clean` removes them.
 #[test]
-fn what_lies_in_the_runtime_directory_and_is_not_a_run_stays() {
+fn other_files_in_the_runtime_directory_stay() {
     let workplace = Workplace::new();
     let runtime = workplace.path().join("run");
     for directory in ["thesis/chapters", ".config", "0123abcd"] {
         std::fs::create_dir_all(runtime.join(directory)).unwrap();
         std::fs::write(runtime.join(directory).join("precious"), "years of work").unwrap();
     }
-    // As a dead run of another program might look: an unlocked file of this name, and no marker of ours.
+    // A directory that looks like a dead run: it has an unlocked lock file, but no marker of caraware.
     std::fs::write(runtime.join("0123abcd").join("lock"), "").unwrap();
     std::os::unix::fs::symlink(runtime.join("thesis"), runtime.join("89abcdef")).unwrap();
     let before = tree(&runtime);
@@ -226,7 +226,7 @@ fn what_lies_in_the_runtime_directory_and_is_not_a_run_stays() {
     let episode = ["--set", "episode.training_episodes=1", "--set", "episode.ticks=20"];
     workplace.succeed(&[&["simulate", "town", "--name", "beside"], &short[..], &episode[..]].concat());
     let said = text(&workplace.succeed(&["doctor", "--clean"]));
-    assert!(said.contains("thesis: not a run of caraware; left alone"), "{said}");
+    assert!(said.contains("thesis: not a run of caraware; it is not touched"), "{said}");
     assert_eq!(tree(&runtime), before);
 }
 
@@ -264,7 +264,7 @@ fn no_vehicles() {
 }
 
 #[test]
-fn more_vehicles_than_shared_memory_is_laid_out_for() {
+fn more_vehicles_than_shared_memory_has_room_for() {
     let workplace = Workplace::new();
     // The two directions of all twelve roads of the grid, six vehicles on each.
     let roads: Vec<String> = [
@@ -288,7 +288,7 @@ fn more_vehicles_than_shared_memory_is_laid_out_for() {
 }
 
 #[test]
-fn a_region_that_is_none() {
+fn a_region_with_impossible_corners() {
     let workplace = Workplace::new();
     for (text, says) in [
         (
@@ -369,7 +369,7 @@ fn shared_memory_too_small() {
 }
 
 #[test]
-fn stopping_what_does_not_run() {
+fn commands_to_a_run_that_is_not_alive() {
     let workplace = Workplace::new();
     assert_says(
         &refused(&workplace, &["stop"], 2),
@@ -382,7 +382,7 @@ fn stopping_what_does_not_run() {
 }
 
 #[test]
-fn map_of_a_curriculum_that_is_not_there_or_does_not_serve() {
+fn missing_or_unusable_map_of_a_curriculum() {
     let workplace = Workplace::new();
     let steps = "curriculum.stages=[{cavs=1,until_lessons=1},{cavs=1,maps=[\"city\"]}]";
     let missing = "curriculum.maps=[\"town\",\"city.net.xml\"]";
@@ -390,7 +390,8 @@ fn map_of_a_curriculum_that_is_not_there_or_does_not_serve() {
     assert_says(
         &said,
         &[
-            "`curriculum.maps` has \"city.net.xml\", and there is no file",
+            "`curriculum.maps` has \"city.net.xml\", but",
+            "is not a file",
             "relative to the directory",
         ],
     );
@@ -409,7 +410,7 @@ fn map_of_a_curriculum_that_is_not_there_or_does_not_serve() {
     let command = ["simulate", "paper", "--set", missing, "--set", steps];
     let said = refused(&workplace, &command, 2);
     assert_says(&said, &["city.net.xml", "has no projection", "map.origin_latitude_deg"]);
-    // Nobody may walk there. The first step is on the town, and nobody waits for the second to find out.
+    // The city has no sidewalks. The first stage is on the town, but every map is checked before the run begins.
     let more = [
         "map.origin_latitude_deg=52.0",
         "map.origin_longitude_deg=10.0",
@@ -429,7 +430,7 @@ fn map_of_a_curriculum_that_is_not_there_or_does_not_serve() {
         &said,
         &["a .sumocfg has its own", "name the .sumocfg in curriculum.maps"],
     );
-    // Whoever wants other vehicles than the scenario's own hears how.
+    // The number of vehicles is the scenario's own; the message names the keys that change their sensors.
     let said = refused(&workplace, &["simulate", "a.sumocfg", "--set", "traffic.cavs=8"], 2);
     assert_says(&said, &["a.sumocfg has its own road users", "traffic.max_cavs"]);
 }

@@ -1,4 +1,4 @@
-//! Whole runs with something in the way: contacts reach the report and the run's directory, and end trajectories if asked.
+//! Whole runs with an obstacle on the road: contacts reach the report and the run directory, and end trajectories if configured.
 
 #![allow(
     clippy::unwrap_used,
@@ -48,22 +48,22 @@ fn lines(workplace: &Workplace, name: &str) -> Vec<Value> {
 }
 
 #[test]
-fn an_obstacle_on_the_road_is_struck_and_ends_trajectories_if_asked() {
+fn contacts_with_an_obstacle_are_reported_and_end_trajectories_if_configured() {
     let workplace = Workplace::new();
     let report = simulate(&workplace, "watched", &[]);
-    let told = lines(&workplace, "watched");
+    let contacts = lines(&workplace, "watched");
     let counts = &report["dynamics"]["collisions"];
-    assert_eq!(counts["total"], told.len());
+    assert_eq!(counts["total"], contacts.len());
     assert_eq!(
         (&report["dynamics"]["buildings"], &report["dynamics"]["props"]),
         (&62.into(), &21.into())
     );
-    let crates: Vec<&Value> = told.iter().filter(|line| line["other"] == "crate").collect();
+    let crates: Vec<&Value> = contacts.iter().filter(|line| line["other"] == "crate").collect();
     assert!(crates.len() >= 10, "16 vehicles, 8 minutes: {} times", crates.len());
     assert_eq!(
         counts["obstacle"],
         crates.len(),
-        "random props are never on the road: {told:#?}"
+        "random props are never on the road: {contacts:#?}"
     );
     assert_eq!(counts["building"], 0);
     for line in crates {
@@ -76,21 +76,21 @@ fn an_obstacle_on_the_road_is_struck_and_ends_trajectories_if_asked() {
             "{line}"
         );
     }
-    assert!(told.is_sorted_by_key(|line| line["tick"].as_u64().unwrap()));
+    assert!(contacts.is_sorted_by_key(|line| line["tick"].as_u64().unwrap()));
 
-    // Looking changes nothing but the report.
+    // Detection changes nothing but the report.
     let blind = simulate(&workplace, "blind", &["--set", "collision.detect=false"]);
     assert_eq!(blind["observation_hash"], report["observation_hash"]);
     assert_eq!(blind["dynamics"]["collisions"], Value::Null);
     assert!(!workplace.path().join("runs/blind/events").exists());
 
-    // A trajectory that ends leaves out the one observation at which its vehicle collides; traffic does not notice.
+    // Where a trajectory ends, the observation at the tick of the contact is left out. Traffic stays the same.
     let ended = simulate(&workplace, "ended", &["--set", "collision.ends_trajectory=true"]);
-    assert_eq!(lines(&workplace, "ended"), told);
+    assert_eq!(lines(&workplace, "ended"), contacts);
     let mut left_out = BTreeSet::new();
-    for line in &told {
-        for who in ["vehicle", "other"] {
-            let name = line[who].as_str().unwrap();
+    for line in &contacts {
+        for party in ["vehicle", "other"] {
+            let name = line[party].as_str().unwrap();
             if name.starts_with("cav.") {
                 left_out.insert((line["tick"].as_u64().unwrap(), name.to_owned()));
             }

@@ -1,4 +1,4 @@
-//! Commands to a live run: each at its tick, logged, and the same run again from the log.
+//! Commands to a live run: each takes effect at a tick and is logged, and the log makes the same run again.
 
 #![allow(
     clippy::unwrap_used,
@@ -121,7 +121,7 @@ impl<'a> Run<'a> {
         });
     }
 
-    /// Lets it run to its end; the hash of everything observed.
+    /// Lets the run end, and returns the hash of all its observations.
     fn finish(self) -> String {
         self.done(&["resume"]);
         let Self {
@@ -147,7 +147,7 @@ fn log(workplace: &Workplace, name: &str) -> Option<String> {
     std::fs::read_to_string(workplace.path().join("runs").join(name).join("commands.jsonl")).ok()
 }
 
-/// Every command that changes content is carried out again at its tick: the same log, the same bytes, at another pace and window.
+/// A run from a log carries out every logged command at its tick. With another pace and window it makes the same log and the same bytes.
 #[test]
 fn a_run_with_commands_is_made_again_from_its_log() {
     let workplace = Workplace::new();
@@ -178,7 +178,7 @@ fn a_run_with_commands_is_made_again_from_its_log() {
     assert_eq!(
         ticks,
         reset + 1 + 2 * 300,
-        "the episode that was reset is there from its beginning"
+        "the reset episode is made again from its beginning"
     );
 
     let written = log(&workplace, "steered").unwrap();
@@ -189,7 +189,7 @@ fn a_run_with_commands_is_made_again_from_its_log() {
     assert_eq!(hash(&workplace, "again"), steered);
     assert_eq!(log(&workplace, "again").unwrap(), written);
 
-    // A log of another run does not pass unnoticed.
+    // The log of another run is refused.
     let other = written.replacen("cav.3", "cav.77", 1);
     let file = workplace.write("other.jsonl", &other);
     let output = workplace.run(&arguments(
@@ -202,7 +202,7 @@ fn a_run_with_commands_is_made_again_from_its_log() {
     workplace.assert_nothing_left();
 }
 
-/// Time is data: pauses and steps change nothing, and a learner that waits meanwhile loses nothing.
+/// Simulated time does not depend on the clock: pauses and steps change nothing, and a learner that waits meanwhile loses nothing.
 #[test]
 fn pauses_and_steps_leave_no_trace() {
     let workplace = Workplace::new();
@@ -230,9 +230,9 @@ fn pauses_and_steps_leave_no_trace() {
     workplace.assert_nothing_left();
 }
 
-/// Whatever is asked: a typed refusal, and the run goes on as if nothing had been.
+/// Every wrong request is refused with its reason, and the run continues undisturbed.
 #[test]
-fn nonsense_is_refused_for_its_reason_and_nobody_dies() {
+fn wrong_requests_are_refused_with_their_reasons_and_the_run_continues() {
     let workplace = Workplace::new();
     workplace.succeed(&arguments("simulate", "undisturbed", &[]));
     let run = Run::start(&workplace, "simulate", "pestered", &[]);
@@ -240,7 +240,7 @@ fn nonsense_is_refused_for_its_reason_and_nobody_dies() {
     run.refused(&["sensor", "other.0", "gnss", "off"], "carries no sensors");
     run.refused(&["sensor", "all", "lidar", "off"], "has a LIDAR");
     run.refused(
-        &["start", "nobody", "ring_west_2"],
+        &["start", "unknown", "ring_west_2"],
         "is not a vehicle of the population",
     );
     run.refused(&["destination", "cav.0", "no_such_edge"], "is not an edge");
@@ -260,7 +260,7 @@ fn nonsense_is_refused_for_its_reason_and_nobody_dies() {
         line
     };
     for garbage in [&b""[..], b"{}", b"\xff\xfe\x00", b"[[[[[[", &vec![b'x'; 300_000]] {
-        assert_eq!(request(garbage), "", "who does not ask gets no answer");
+        assert_eq!(request(garbage), "", "a malformed request gets no answer");
     }
     let refusal = |control: &str| -> Refusal {
         let line = request(
@@ -279,7 +279,7 @@ fn nonsense_is_refused_for_its_reason_and_nobody_dies() {
         refusal(&pause.replace("schema_version\":", "schema_version\":9")).kind,
         RefusalKind::Schema
     );
-    // Somebody who connects and says nothing keeps the others waiting for two seconds at most.
+    // A connection without a request delays other requests by at most two seconds.
     let silent = UnixStream::connect(&socket).unwrap();
     run.done(&["pause"]);
     drop(silent);

@@ -1,5 +1,4 @@
-//! A curriculum whose gates the learner passes: the same bytes for the same seed, with trainers killed on the way, and from its
-//! log.
+//! A curriculum whose gates the learner passes: it gives the same bytes for the same seed, with killed trainers, and from its log.
 
 #![allow(
     clippy::unwrap_used,
@@ -26,7 +25,7 @@ use ipc_schema::{
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Of [`CURRICULUM`] without evaluations in between.
+/// Settings in addition to [`CURRICULUM`]: no evaluations in between.
 const MORE: [&str; 3] = [
     "episode.evaluation_interval=0",
     "trainer.checkpoint_interval=2",
@@ -125,7 +124,7 @@ fn the_learner_passes_the_gates_and_the_same_seed_gives_the_same_bytes() {
     assert_eq!(decisions(&workplace, "killed"), taken);
     assert_eq!(killed["trainer"]["curriculum"], report["trainer"]["curriculum"]);
 
-    // The training part again without a learner.
+    // The training part is made again without a learner.
     let log = workplace.path().join("runs/whole/curriculum.jsonl");
     let log = format!("curriculum.log={}", log.display());
     workplace.succeed(&arguments("simulate", "again", &[&log]));
@@ -154,14 +153,14 @@ fn a_gate_that_is_never_passed_ends_with_the_training_episodes() {
     assert_eq!(report["ticks"], 3 * 120 + 80);
 }
 
-/// Steps over the town and a grid of 300 m: in order, at random, and gradually so.
+/// Stages over the town and a grid of 300 m: in order, at random, and gradually at random.
 const MAPS: [&str; 5] = [
     "curriculum.maps=[\"town\",\"city/city.sumocfg\"]",
     "curriculum.stages=[{cavs=2,until_lessons=4,maps=[\"town\",\"city\"]},\
      {cavs=3,until_lessons=6,maps=[\"town\",\"city\"],map_choice=\"random\",noise=2.0},\
      {cavs=2,until_lessons=8,maps=[\"city\",\"town\"],map_choice=\"gradually_random\"}]",
     "episode.ticks=120",
-    // It looks at what stands on each map.
+    // The sky view depends on the buildings of each map.
     "gnss.sky_view=true",
     "traffic.others=0",
 ];
@@ -185,7 +184,7 @@ fn lessons_by_map(workplace: &Workplace, name: &str, steps: &[usize]) -> [u64; 2
 }
 
 #[test]
-fn lessons_are_on_the_maps_of_their_steps_and_the_same_seed_gives_the_same_bytes() {
+fn lessons_are_on_the_maps_of_their_stages_and_the_same_seed_gives_the_same_bytes() {
     let workplace = with_city();
     workplace.succeed(&arguments("train", "maps", &MAPS));
     let report = workplace.report("maps");
@@ -220,7 +219,7 @@ fn lessons_are_on_the_maps_of_their_steps_and_the_same_seed_gives_the_same_bytes
     let again = workplace.report("again");
     assert_eq!(again["observation_hash"], report["observation_hash"]);
     assert_eq!(&again["traffic"]["maps"], maps);
-    // Another seed takes other maps at random.
+    // Another seed draws other maps.
     workplace.succeed(&arguments("simulate", "other", &[&MAPS[..], &["run.seed=99"]].concat()));
     assert_ne!(lessons_by_map(&workplace, "other", &steps), [0, 18]);
     assert_ne!(
@@ -230,7 +229,7 @@ fn lessons_are_on_the_maps_of_their_steps_and_the_same_seed_gives_the_same_bytes
     workplace.assert_nothing_left();
 }
 
-/// Whether a place is on a street of the generated grid: lines 300 m apart.
+/// True if a position is on a street of the generated grid: lines 300 m apart.
 fn is_on_the_grid([x_m, y_m]: [f32; 2]) -> bool {
     let off_m = |place_m: f32| (place_m - 300.0 * (place_m / 300.0).round()).abs();
     off_m(x_m).min(off_m(y_m)) < 12.0

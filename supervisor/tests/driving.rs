@@ -1,4 +1,4 @@
-//! The driving task over real SUMO traffic, real processes and real shared memory: both ways.
+//! The driving task with real SUMO traffic, real processes and real shared memory, in both directions.
 
 #![allow(
     clippy::unwrap_used,
@@ -37,7 +37,7 @@ fn succeed(mut command: Command) -> Output {
     output
 }
 
-/// Builds a net from nodes and edges, and a scenario on it that writes down where everybody is (`fcd.xml`).
+/// Builds a net from nodes and edges, and a scenario on it that records the positions of all vehicles (`fcd.xml`).
 fn scenario(workplace: &Workplace, nodes: &str, edges: &str, routes: &str, seconds: u32) {
     workplace.write("a.nod.xml", &format!("<nodes>{nodes}</nodes>"));
     workplace.write("a.edg.xml", &format!("<edges>{edges}</edges>"));
@@ -76,7 +76,7 @@ const ORIGIN: [&str; 4] = [
     "map.origin_longitude_deg=10",
 ];
 
-/// Drives the vehicle `h` of the scenario for two episodes (the second is an evaluation); what SUMO wrote is of the last.
+/// Drives the vehicle `h` of the scenario for two episodes, of which the second is an evaluation. SUMO's files are those of the last.
 fn drive(workplace: &Workplace, name: &str, script: &str) -> Value {
     let settings = [
         "a.sumocfg",
@@ -107,7 +107,7 @@ fn sumo_output(workplace: &Workplace, run: &str, file: &str) -> String {
     std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{path:?}: {error}"))
 }
 
-/// (time, vehicle) → (x, y, speed) of SUMO's own record.
+/// (tick, vehicle) → (x, y, speed) in SUMO's own record.
 fn trace(fcd: &str) -> BTreeMap<(u32, String), (f64, f64, f64)> {
     let value = |line: &str, name: &str| {
         let rest = line.split_once(&format!(" {name}=\"")).unwrap().1;
@@ -185,7 +185,7 @@ fn a_hero_that_stands_across_a_junction_makes_traffic_queue() {
         .iter()
         .filter(|((tick, id), (_, y, _))| *tick > 300 && id.starts_with("f.") && *y < 190.0 && *y > 100.0)
         .count();
-    assert_eq!(passed, 0, "somebody drove through the hero");
+    assert_eq!(passed, 0, "a vehicle drove through the hero");
     assert!(!sumo_output(&workplace, "junction", "collisions.xml").contains("<collision "));
 }
 
@@ -254,20 +254,20 @@ fn in_town(workplace: &Workplace, name: &str, script: &str, more: &[&str]) -> Co
     driven(workplace, script, &[&settings[..], more].concat())
 }
 
-/// What the driver saw: [episode, tick, slot, vehicle, valid, terminated, truncated, x, y, yaw, speed].
+/// The rows that the driver received: [episode, tick, slot, vehicle, valid, terminated, truncated, x, y, yaw, speed].
 fn seen(report: &Value) -> Vec<Vec<Value>> {
     serde_json::from_value(report["trainer"]["seen"].clone()).unwrap()
 }
 
 #[test]
-fn what_ends_by_itself_is_terminated_and_what_is_cut_is_truncated() {
+fn leaving_the_road_terminates_and_the_time_limit_truncates() {
     let workplace = Workplace::new();
     let ends = |name: &str, script: &str| {
         let settings = ["--set", "episode.ticks=200", "--set", "task.time_limit_s=6"];
         succeed(in_town(&workplace, name, script, &settings));
         workplace.report(name)
     };
-    // Straight out of the bend and over the kerb: beside the road long before the time is up.
+    // This hero drives straight out of the bend and over the kerb: it is beside the road long before the time limit.
     let off = ends("off", r#"{"0": [1, 1]}"#);
     let cut = ends("cut", r#"{"0": [0, -1]}"#);
     for (report, key, column) in [(&off, "off_road", 5), (&cut, "time_limit", 6)] {
@@ -291,7 +291,7 @@ fn what_ends_by_itself_is_terminated_and_what_is_cut_is_truncated() {
             );
             assert_eq!(rows[at][4], false, "the slot is empty at the tick that says so");
             assert_eq!(rows[at - 1][4], true, "the last observation was delivered");
-            // Another hero takes its place.
+            // Another hero gets the slot.
             let next = rows[at..].iter().find(|row| row[4] == true);
             assert!(next.is_none_or(|row| row[3] != rows[at - 1][3]));
         }
@@ -306,7 +306,7 @@ fn what_ends_by_itself_is_terminated_and_what_is_cut_is_truncated() {
 }
 
 #[test]
-fn an_action_that_is_no_number_or_out_of_range_is_refused_and_the_last_is_held() {
+fn an_action_that_is_not_finite_or_out_of_range_is_refused_and_the_last_one_is_held() {
     let workplace = Workplace::new();
     let run = |name: &str, script: &str| {
         succeed(in_town(&workplace, name, script, &["--set", "episode.ticks=60"]));
@@ -322,21 +322,21 @@ fn an_action_that_is_no_number_or_out_of_range_is_refused_and_the_last_is_held()
     );
     // 10 + 5 + 10 ticks; the evaluation is over before.
     assert_eq!(bad["dynamics"]["heroes"]["refused_actions"], 20);
-    let told: Vec<&str> = log.lines().filter(|line| line.contains("is held")).collect();
-    assert_eq!(told.len(), 1, "told once for each hero: {log}");
+    let warnings: Vec<&str> = log.lines().filter(|line| line.contains("is held")).collect();
+    assert_eq!(warnings.len(), 1, "one warning for each hero: {log}");
     assert!(
-        told[0].contains("hero hero.0, tick ") && told[0].contains("steering NaN"),
+        warnings[0].contains("hero hero.0, tick ") && warnings[0].contains("steering NaN"),
         "{}",
-        told[0]
+        warnings[0]
     );
-    assert!(told[0].contains("[0.1, 0.2] is held"), "{}", told[0]);
+    assert!(warnings[0].contains("[0.1, 0.2] is held"), "{}", warnings[0]);
     let poses = |report: &Value| -> Vec<Vec<Value>> { seen(report).into_iter().map(|row| row[7..].to_vec()).collect() };
-    assert_eq!(poses(&good), poses(&bad), "held means: as if it had been sent");
+    assert_eq!(poses(&good), poses(&bad), "a held action has the effect of one that was sent again");
     assert_eq!(good["observation_hash"], bad["observation_hash"]);
 }
 
 #[test]
-fn the_scripted_driver_drives_laps_of_the_town_the_same_for_the_same_seed() {
+fn the_scripted_driver_drives_the_same_laps_for_the_same_seed() {
     let workplace = Workplace::new();
     let lap = |name: &str, more: &[&str]| {
         let settings = ["driving", "--name", name, "--set", "episode.evaluation_ticks=10"];
@@ -369,7 +369,7 @@ fn the_scripted_driver_drives_laps_of_the_town_the_same_for_the_same_seed() {
 }
 
 #[test]
-fn a_driver_that_falls_silent_can_be_stopped_and_one_that_leaves_ends_the_run() {
+fn a_run_whose_driver_sends_nothing_can_be_stopped_and_a_driver_that_leaves_ends_it() {
     let workplace = Workplace::new();
     let mut silent = in_town(&workplace, "silent", r#"{"0": [0, 0.1], "mute_s": 1.0}"#, &[]);
     let mut child = silent.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
@@ -419,15 +419,15 @@ fn a_task_that_cannot_be_driven_is_refused_before_anything_starts() {
     };
     let said = refused(&["simulate", "driving"]);
     assert!(
-        said.contains("needs a trainer that drives") && said.contains("caraware train"),
+        said.contains("the driving task needs a trainer") && said.contains("caraware train"),
         "{said}"
     );
     let said = refused(&["train", "driving", "--set", "traffic.hero_ids=[\"a\"]"]);
-    assert!(said.contains("not by `traffic.hero_ids`"), "{said}");
+    assert!(said.contains("`traffic.hero_ids` must be empty"), "{said}");
     let said = refused(&["train", "town", "--set", "traffic.heroes=1"]);
-    assert!(said.contains("without anybody who drives them"), "{said}");
+    assert!(said.contains("`traffic.heroes` = 1 needs the driving task"), "{said}");
     assert!(!workplace.path().join("runs").exists());
-    // Only SUMO knows the edges.
+    // The edges are known once SUMO has read the net.
     let said = refused(&[
         "train",
         "driving",

@@ -1,4 +1,4 @@
-//! Several environments in one run: each is the one it would be alone, and together they feed one trainer.
+//! Several environments in one run: each makes the same observations as alone, and one trainer learns from all.
 
 #![allow(
     clippy::unwrap_used,
@@ -22,7 +22,7 @@ use ipc_schema::{
 };
 use rustix::process::{Pid, Signal, kill_process};
 
-/// Four vehicles, four episodes of which one evaluation between and one at the end: 800 ticks, 8 updates with two environments.
+/// Four vehicles, three training episodes, one evaluation in between and one at the end: 800 ticks, 8 updates with two environments.
 const SMALL: [&str; 12] = [
     "traffic.cavs=4",
     "traffic.others=2",
@@ -53,7 +53,7 @@ fn succeed(workplace: &Workplace, command: &str, name: &str, more: &[&str]) -> S
     text(&workplace.succeed(&arguments.iter().map(String::as_str).collect::<Vec<_>>()))
 }
 
-/// A run in the background, and places from which to look at it.
+/// A run in the background, with access to its shared memory.
 struct Live {
     child: Child,
     node: RunNode,
@@ -88,7 +88,7 @@ impl Live {
         kill_process(Pid::from_raw(board.health().pid).unwrap(), Signal::KILL).unwrap();
     }
 
-    /// Exit code and everything the command said.
+    /// Waits for the end; returns the exit code and the output.
     fn end(self) -> (Option<i32>, String) {
         drop(self.node);
         let output = self.child.wait_with_output().unwrap();
@@ -109,7 +109,7 @@ fn learnt(run: &Path) -> String {
 }
 
 #[test]
-fn environments_beside_each_other_are_what_they_are_alone() {
+fn an_environment_makes_the_same_observations_beside_others_as_alone() {
     let workplace = Workplace::new();
     succeed(&workplace, "simulate", "alone", &[]);
     succeed(&workplace, "simulate", "second", &["--set", "run.first_env=1"]);
@@ -140,7 +140,7 @@ fn environments_beside_each_other_are_what_they_are_alone() {
 }
 
 #[test]
-fn a_killed_trainer_is_given_what_it_lacks_of_every_environment() {
+fn a_restarted_trainer_receives_the_uncommitted_ticks_of_every_environment() {
     let workplace = Workplace::new();
     succeed(&workplace, "train", "undisturbed", &["--envs", "2"]);
     let mut live = Live::start(&workplace, "train", "killed", &["--envs", "2"]);
@@ -185,9 +185,9 @@ fn a_simulator_that_dies_ends_the_run_and_is_named_with_its_environment() {
 }
 
 #[test]
-fn shared_memory_is_asked_for_as_many_environments_as_there_are() {
+fn the_need_of_shared_memory_grows_with_the_number_of_environments() {
     let workplace = Workplace::new();
-    // One such environment asks for half a gibibyte; sixty-four of them are more than any /dev/shm of a test machine.
+    // One such environment needs half a gibibyte; sixty-four need more than the /dev/shm of any test machine.
     let asked = ["--envs", "64", "--set", "traffic.max_road_users=100000"];
     let arguments = arguments("simulate", "many", &asked);
     let output = workplace.run(&arguments.iter().map(String::as_str).collect::<Vec<_>>());

@@ -1,4 +1,4 @@
-//! A run while its fan-out is killed and its viewers come and go.
+//! A run whose fan-out and viewers are killed while it continues.
 
 #![allow(
     clippy::unwrap_used,
@@ -77,9 +77,9 @@ fn count(mut viewer: Child) -> Value {
     serde_json::from_str(&last).unwrap()
 }
 
-/// The fan-out comes back every time, its viewers with it, and the run's bytes are those of a run that nobody watches.
+/// The fan-out is restarted every time and its viewers connect again. The run makes the same bytes as a run without viewers.
 #[test]
-fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
+fn kills_of_fan_out_and_viewer_do_not_change_the_run() {
     let workplace = Workplace::new();
     let alone = simulate("alone", &settings("fanout.enabled=false"));
     workplace.succeed(&alone.iter().map(String::as_str).collect::<Vec<_>>());
@@ -98,7 +98,7 @@ fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
     let logs = ["viewer", "victim"].map(|name| workplace.path().join(name));
     let viewer = watch("watched", 0, port, 15, &logs[0]);
     let mut victim = Victim(watch("watched", 0, port, 60, &logs[1]));
-    // Both have seen a frame: what comes after a kill comes to a viewer that was there before.
+    // Both viewers have received a frame, so frames after a kill reach viewers that were connected before it.
     until(&mut run, "frames", || {
         logs.iter()
             .all(|log| log.metadata().is_ok_and(|log| log.len() > 0))
@@ -120,7 +120,7 @@ fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
     let before_the_last = frames();
     let seen = count(viewer);
     assert!(run.wait().unwrap().success());
-    // Ten a second come again, from the last fan-out: more than could have been on the way.
+    // The last fan-out sends ten frames a second: ten more frames cannot all have been under way before.
     assert!(frames() >= before_the_last + 10, "{before_the_last} of {seen:#}");
     assert_eq!(seen["world"]["refused"], 0, "{seen:#}");
     let (alone, watched) = (workplace.report("alone"), workplace.report("watched"));
@@ -130,7 +130,7 @@ fn kills_of_fan_out_and_viewer_leave_the_run_alone() {
     workplace.assert_nothing_left();
 }
 
-/// Every environment is shown under its own number, behind one endpoint, and what it observes is what it observes unwatched.
+/// One endpoint shows every environment under its own number, and viewers do not change the observations.
 #[test]
 fn every_environment_of_a_run_is_shown() {
     let workplace = Workplace::new();

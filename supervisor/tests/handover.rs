@@ -1,4 +1,4 @@
-//! A learner that is killed or replaced in mid-run: nothing lost, nothing learnt twice, the same policy in the end.
+//! A learner that is killed or replaced during a run: no tick is lost or learnt twice, and the policy at the end is the same.
 
 #![allow(
     clippy::unwrap_used,
@@ -26,7 +26,7 @@ use ipc_schema::{
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Six vehicles, six episodes of which two evaluations between: 3 000 ticks, 24 updates, a checkpoint for every second.
+/// Six vehicles, six training episodes with two evaluations in between: 3 000 ticks, 24 updates, a checkpoint for every second update.
 const SMALL: [&str; 12] = [
     "traffic.cavs=6",
     "traffic.others=3",
@@ -87,7 +87,7 @@ impl Run {
         }
     }
 
-    /// Waits until `condition` holds of the trainer that is at work.
+    /// Waits until the boards of the working trainer satisfy `condition`.
     fn until(&mut self, what: &str, condition: impl Fn(Progress, Health) -> bool) {
         let trainer = &self.trainer;
         until(&mut self.child, what, || {
@@ -104,7 +104,7 @@ impl Run {
         kill_process(pid, Signal::KILL).unwrap();
     }
 
-    /// Exit code and everything the command said.
+    /// Waits for the end; returns the exit code and the output.
     fn end(self) -> (Option<i32>, String) {
         let Self {
             child,
@@ -113,7 +113,7 @@ impl Run {
             _node,
             ..
         } = self;
-        // Spectators go before what they look at.
+        // Readers of shared memory are dropped before its owner ends.
         drop((trainer, sensing, _node));
         let output = child.wait_with_output().unwrap();
         (output.status.code(), text(&output))
@@ -124,7 +124,7 @@ impl Run {
     }
 }
 
-/// Nothing of the run is left in shared memory, in the registry or as a process, and nothing half-written in its directory.
+/// Asserts that the run left nothing in shared memory, in the registry or as a process, and no partial file in its directory.
 fn assert_nothing_left(workplace: &Workplace, name: &str) {
     workplace.assert_nothing_left();
     let directory = workplace.path().join("runs").join(name);
@@ -148,7 +148,7 @@ fn learnt(run: &Path) -> String {
     format!("{} {}", newest.trim(), hasher.finalize().to_hex())
 }
 
-/// What a run of these settings and seed comes to, disturbed or not.
+/// The results of a run, which disturbances must not change.
 #[derive(Debug, Clone, PartialEq)]
 struct Result {
     observation_hash: String,
@@ -185,7 +185,7 @@ impl Result {
     }
 }
 
-/// The undisturbed run, made once.
+/// The results of the undisturbed run, which is made once.
 fn undisturbed(workplace: &Workplace) -> &'static Result {
     static RESULT: OnceLock<Result> = OnceLock::new();
     RESULT.get_or_init(|| {
@@ -211,7 +211,7 @@ fn assert_undisturbed(workplace: &Workplace, name: &str, restarts: u64) {
 }
 
 #[test]
-fn a_trainer_killed_again_and_again_learns_what_the_undisturbed_one_does() {
+fn a_trainer_that_is_killed_again_and_again_learns_the_same_policy() {
     let workplace = Workplace::new();
     let mut run = Run::start(&workplace, "killed", &[]);
     // Before the first checkpoint (tick 200), in the middle, in the first evaluation (ticks 800 to 899), after it, in the last.
@@ -227,7 +227,7 @@ fn a_trainer_killed_again_and_again_learns_what_the_undisturbed_one_does() {
 }
 
 #[test]
-fn a_damaged_newest_checkpoint_is_passed_over() {
+fn a_damaged_newest_checkpoint_is_skipped() {
     let workplace = Workplace::new();
     let mut run = Run::start(&workplace, "damaged", &[]);
     let pid = {
@@ -257,7 +257,7 @@ fn a_damaged_newest_checkpoint_is_passed_over() {
 }
 
 #[test]
-fn a_trainer_that_dies_at_once_each_time_ends_the_run_with_its_last_words() {
+fn a_trainer_that_always_dies_at_once_ends_the_run_with_the_end_of_its_log() {
     let workplace = Workplace::new();
     workplace.write(
         "suicide.py",
@@ -317,7 +317,7 @@ fn longest_pause(sensing: &BoardReader, mut over: impl FnMut() -> bool) -> Durat
     longest
 }
 
-/// Slow enough for a successor to get ready in mid-run: 20 times real time, 15 s.
+/// A pace at which a successor gets ready during the run: 20 times real time, 15 s.
 const PACED: &str = "run.real_time_factor=20";
 const PACED_TICKS_PER_S: f64 = 200.0;
 
@@ -341,7 +341,7 @@ fn a_planned_handover_changes_nothing_but_the_process() {
     run.until("another process at work", |progress, health| {
         progress.incarnation == 1 && health.pid != old && health.ticks > progress.committed_ticks
     });
-    // Another one at once: the successor may still have to catch up.
+    // Another handover follows at once, while the successor may still have to catch up.
     let output = workplace.run(&["handover", "replaced"]);
     assert!(output.status.success(), "{}", text(&output));
     let (code, said) = run.end();
@@ -365,14 +365,14 @@ fn a_planned_handover_changes_nothing_but_the_process() {
 }
 
 #[test]
-fn another_framework_takes_over_and_no_observation_is_lost() {
+fn a_successor_in_another_framework_loses_no_observation() {
     let workplace = Workplace::new();
     let mut run = Run::start(&workplace, "framework", &[PACED]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
     let module = "trainer.module=caraware.examples.sb3_takeover";
     let output = workplace.run(&["handover", "framework", "--set", module]);
     assert!(output.status.success(), "{}", text(&output));
-    // It learns, saves and commits by itself; killed, it goes on from there.
+    // It learns, saves and commits. After a kill it continues from its own commit.
     let taken_over = run.trainer.progress().committed_ticks;
     run.until("an update of its own", |progress, _| {
         progress.incarnation == 1 && progress.committed_ticks > taken_over
@@ -402,13 +402,13 @@ fn another_framework_takes_over_and_no_observation_is_lost() {
 }
 
 #[test]
-fn a_handover_with_other_settings_learns_on_with_them() {
+fn a_successor_learns_with_its_changed_settings() {
     let workplace = Workplace::new();
     let mut run = Run::start(&workplace, "changed", &[PACED]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
     let output = workplace.run(&["handover", "--set", "trainer.learning_rate=0.0001"]);
     assert!(output.status.success(), "{}", text(&output));
-    // What is killed after the handover comes back with the new settings.
+    // A restart after the handover keeps the new settings.
     run.kill_trainer_at(1, run.trainer.progress().committed_ticks + 1);
     let (code, said) = run.end();
     assert_eq!(code, Some(0), "{said}");

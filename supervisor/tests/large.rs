@@ -1,4 +1,4 @@
-//! Generated cities, SUMO's own options and results, and the benchmarks of large runs, each as small as it still means something.
+//! Generated cities, SUMO's own options and results, and the benchmarks of large runs, each at the smallest meaningful size.
 
 #![allow(
     clippy::unwrap_used,
@@ -12,7 +12,7 @@ use common::{Workplace, sumo_program, text, tool};
 use serde_json::Value;
 
 const QUIET: [&str; 2] = ["--set", "fanout.enabled=false"];
-/// The consumer in the trainer's place, on the scenario as it is.
+/// The consumer as the trainer, on the unchanged scenario.
 const CONSUMED: [&str; 4] = [
     "--set",
     "trainer.module=caraware.consumer",
@@ -21,7 +21,7 @@ const CONSUMED: [&str; 4] = [
 ];
 
 #[test]
-fn bare_sumo_and_ours_write_the_same_results_and_the_bench_says_so() {
+fn the_bench_compares_the_result_files_of_bare_sumo_and_of_a_run() {
     let workplace = Workplace::new();
     workplace.succeed(&["bench", "overhead", "--quick", "--json", "overhead.json"]);
     let text = std::fs::read_to_string(workplace.path().join("overhead.json")).unwrap();
@@ -50,17 +50,17 @@ fn every_peer_has_its_ratio_or_the_reason_why_not() {
             .iter()
             .find(of_peer)
             .unwrap_or_else(|| panic!("{peer}: {report:#}"));
-        let told = row[1].as_str().unwrap();
+        let cell = row[1].as_str().unwrap();
         assert!(
-            told.parse::<f64>().is_ok_and(|rate| rate > 0.0) || told.starts_with("not installed: "),
-            "{peer}: {told}"
+            cell.parse::<f64>().is_ok_and(|rate| rate > 0.0) || cell.starts_with("not installed: "),
+            "{peer}: {cell}"
         );
     }
     workplace.assert_nothing_left();
 }
 
 #[test]
-fn neither_the_window_nor_a_consumer_changes_what_is_observed_at_long_steps() {
+fn neither_the_window_nor_a_consumer_changes_observations_at_long_steps() {
     let workplace = Workplace::new();
     let city = ["--vehicles", "60", "--duration-s", "12", "--step-s", "1"];
     workplace.succeed(&[&["generate", "city"], &city[..]].concat());
@@ -129,7 +129,7 @@ fn training_begins_on_a_scenario_whose_first_ticks_have_no_vehicle() {
 }
 
 #[test]
-fn a_generated_city_runs_as_its_generator_says() {
+fn the_printed_command_runs_the_generated_city() {
     let workplace = Workplace::new();
     let city = [
         "--vehicles",
@@ -145,7 +145,7 @@ fn a_generated_city_runs_as_its_generator_says() {
     let command = said.lines().find_map(|line| line.strip_prefix("caraware ")).unwrap();
     let arguments: Vec<&str> = command.split_whitespace().chain(["--name", "said"]).collect();
     workplace.succeed(&arguments);
-    // Their own number, not that of the preset's vehicles.
+    // All vehicles of the scenario sense: the preset's number does not count.
     assert_eq!(workplace.report("said")["vehicles"], 12);
     let five = [
         "simulate",
@@ -175,7 +175,7 @@ const CLASSES: [&str; 12] = [
     "rail",
 ];
 
-/// A grid whose lanes everybody may use, and one vehicle of each class, with SUMO's options as a user may set them.
+/// A grid whose lanes every class may use, one vehicle of each class, and options of SUMO that users set.
 fn scenario(workplace: &Workplace) {
     let grid = [
         "--grid",
@@ -255,11 +255,11 @@ fn a_scenario_keeps_its_own_options_and_all_its_road_users() {
             "{file} was written beside the scenario"
         );
     }
-    // Everybody whom SUMO had on the road at the end of a step has been mirrored there, the person as well.
+    // Every road user that SUMO recorded at the end of a step was mirrored, including the person.
     let fcd = body("bare", "fcd.xml");
     let seen = fcd.matches("<vehicle ").count() + fcd.matches("<person ").count();
     assert_eq!(report["traffic"]["vehicle_steps"], seen, "{report:#}");
-    assert!(fcd.contains("<person "), "nobody walked");
+    assert!(fcd.contains("<person "), "no person walked");
     let log = std::fs::read_to_string(workplace.path().join("runs/ours/logs/sim-core.log")).unwrap();
     assert!(!log.contains("no parameter set"), "{log}");
 }

@@ -1,4 +1,4 @@
-//! The table of dependencies between crates (ARCHITECTURE.md): one direction, heavy dependencies each in one process only.
+//! Compares the table of dependencies between crates (ARCHITECTURE.md) with the crates: one direction, heavy dependencies in one crate.
 
 #![allow(
     clippy::unwrap_used,

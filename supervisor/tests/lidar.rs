@@ -18,7 +18,7 @@ use ipc_schema::{
     world::{VehicleState, WorldLayout},
 };
 
-/// A scan as it came, with everybody at the end of its tick.
+/// A received scan.
 struct Seen {
     scan: Scan,
     points: Vec<LidarPoint>,
@@ -58,7 +58,7 @@ fn watch(workplace: &Workplace, name: &str, settings: &[&str]) -> Watched {
         scans: BTreeMap::new(),
         world: BTreeMap::new(),
     };
-    // A spectator may miss messages, also the last.
+    // A spectator may miss messages, even the last.
     loop {
         let over = run.try_wait().unwrap().is_some();
         let mut news = 0;
@@ -120,7 +120,7 @@ fn outside_m(state: &VehicleState, [x, y, z]: [f64; 3]) -> f64 {
 }
 
 #[test]
-fn points_lie_on_what_they_name_and_the_report_counts_them() {
+fn points_lie_on_their_objects_and_the_report_counts_them() {
     let workplace = Workplace::new();
     let watched = watch(
         &workplace,
@@ -170,7 +170,7 @@ fn points_lie_on_what_they_name_and_the_report_counts_them() {
     workplace.assert_nothing_left();
 }
 
-/// The same seed gives the same points, whoever looks and however fast; the nearest objects are part of the observation.
+/// The same seed gives the same points, whichever scans a spectator misses. The nearest objects are part of the observation.
 #[test]
 fn the_same_seed_gives_the_same_scans() {
     let workplace = Workplace::new();

@@ -1,4 +1,4 @@
-//! `caraware play`: the policy of a checkpoint predicts beside a Kalman filter, and nothing learns.
+//! `caraware play`: the policy of a checkpoint predicts beside a Kalman filter, without learning.
 
 #![allow(
     clippy::unwrap_used,
@@ -53,7 +53,7 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
     let learnt = workplace.path().join("runs/learnt");
     let before = common::tree(&learnt);
 
-    // So many episodes.
+    // A limited number of episodes.
     let output = workplace.succeed(&["play", "learnt", "--episodes", "2", "--name", "twice"]);
     let report = workplace.report("twice");
     assert_eq!(
@@ -79,7 +79,7 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
         assert!(vehicle["mean_m"]["ekf"].as_f64().unwrap() > 0.0);
     }
 
-    // Without end, by its directory; what it predicts goes out; killed, it is replaced and counts on.
+    // Without a limit, from a checkpoint's directory: predictions are published, and Ctrl-C ends the run with a report.
     let checkpoint = learnt.join("checkpoints/update-000002");
     let mut run = workplace
         .command(&[
@@ -119,7 +119,7 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
         (&"play".into(), &"interrupted".into())
     );
     assert!(report["evaluation_seeds"].as_u64().unwrap() >= 5);
-    assert_eq!(common::tree(&learnt), before, "what was learnt is as it was");
+    assert_eq!(common::tree(&learnt), before, "the run of the checkpoint is unchanged");
     workplace.assert_nothing_left();
 
     let fields = ["play", "learnt", "--set", "observation.fields=caraware"];
@@ -135,7 +135,7 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
         &workplace.run(&hidden),
         &["hidden layers [500, 300], the configuration's [32, 32]"],
     );
-    refused(&workplace.run(&["play", "nobody"]), &["`nobody` is neither a run"]);
+    refused(&workplace.run(&["play", "unknown"]), &["`unknown` is neither a run"]);
     let help = text(&workplace.run(&["play", "--help"]));
     for words in ["RUN|CHECKPOINT", "--episodes", "Kalman", "Examples"] {
         assert!(help.contains(words), "{help}");

@@ -1,5 +1,7 @@
-//! Another host: a second network namespace, joined to the run's by one cable. Needs `unshare`, `nsenter` and `ip`, and the right to
-//! make namespaces (root, or user namespaces); without, these tests fail and say so.
+//! Viewers on another host: a second network namespace, joined to that of the run by one virtual cable.
+//!
+//! These tests need `unshare`, `nsenter` and `ip`, and the right to make namespaces (root, or user namespaces). Without them they
+//! fail with a message.
 
 #![allow(
     clippy::unwrap_used,
@@ -20,10 +22,10 @@ use std::{
 use common::{Workplace, text};
 use ipc_schema::{ports::BoardReader, process::Process, run::RunFile, services};
 
-/// Address of the machine that the run is on, on the cable.
+/// Address of the run's machine on the cable.
 const LAB: &str = "10.77.0.1";
 
-/// Two machines: the lab, where runs are, and the laptop.
+/// Two machines: the lab, which has the runs, and the laptop.
 struct Machines {
     lab: Child,
     laptop: u32,
@@ -79,7 +81,7 @@ impl Machines {
         );
     }
 
-    /// A command in the namespaces of a process; its own id is that of the program.
+    /// A command in the namespaces of a process. `nsenter` becomes the program, so both have one process id.
     fn inside(&self, pid: u32, program: &Path) -> Command {
         let mut command = Command::new("nsenter");
         command.args(["--target", &pid.to_string()]);
@@ -159,7 +161,7 @@ impl Run {
     }
 }
 
-/// Certificates by the lines of docs/remote.md, for the lab's address.
+/// Makes certificates with the commands of docs/remote.md, for the lab's address.
 fn make_certificates(directory: &Path) {
     let page = include_str!("../../docs/remote.md");
     let lines = page
@@ -184,8 +186,8 @@ fn secret(path: &Path, content: &str) -> String {
     path.to_string_lossy().into_owned()
 }
 
-/// A viewer on another host sees the run over TLS with a password; without, it is refused at once, and both sides say why. Who may
-/// only read commands nothing.
+/// A viewer on another host sees the run over TLS with a password. Without one it is refused at once, and both sides report the reason.
+/// A user without the right to command can only read.
 #[test]
 fn another_host_sees_the_run_and_is_refused_without_a_password() {
     let workplace = Workplace::new();
@@ -215,7 +217,7 @@ fn another_host_sees_the_run_and_is_refused_without_a_password() {
     let board = run.board(Process::TrafficBridge);
     let fanout = run.board(Process::Fanout);
 
-    // Somebody without credentials, and somebody with wrong ones: how long it took, and what was said.
+    // Viewers without credentials and with wrong ones: the time until the refusal, and its message.
     let knock = |more: &str| -> (f64, String) {
         let program = format!(
             "import time; from caraware_viewer import access; begun = time.monotonic()\n\
@@ -244,7 +246,7 @@ fn another_host_sees_the_run_and_is_refused_without_a_password() {
         "{message}"
     );
 
-    // With them: the real viewer records what the run shows.
+    // With valid credentials the real viewer records the run.
     let viewer = |command: &[&str], user: &str, pw: &str| -> Command {
         let mut arguments = vec!["-m", "caraware_viewer"];
         arguments.extend(command);
@@ -281,7 +283,7 @@ fn another_host_sees_the_run_and_is_refused_without_a_password() {
     common::until(&mut run.child, "ticks", || {
         (board.health().ticks > before + 5).then_some(())
     });
-    assert_eq!(board.health().episode, 0, "a reader has begun the episode anew");
+    assert_eq!(board.health().episode, 0, "a reader has reset the episode");
 
     let output = command(carol, &carol_pw, "pause");
     assert!(output.status.success(), "{}", text(&output));
@@ -302,7 +304,7 @@ fn another_host_sees_the_run_and_is_refused_without_a_password() {
     workplace.assert_nothing_left();
 }
 
-/// Sockets that take what comes from outside, of the network namespace of `pid`: address and port as the kernel writes them.
+/// Sockets in the network namespace of `pid` that accept data from outside: address and port as the kernel writes them.
 fn open_sockets(pid: u32) -> Vec<String> {
     let mut sockets = Vec::new();
     for (table, state) in [
@@ -323,8 +325,8 @@ fn open_sockets(pid: u32) -> Vec<String> {
     sockets
 }
 
-/// A default run, learner and all, in a namespace where nobody else is: one socket listens, on loopback; from the other machine every
-/// port is closed.
+/// A default run with its learner, in a network namespace of its own: one socket listens, on loopback. From the other machine every port
+/// is closed.
 #[test]
 fn a_default_run_is_closed_to_other_machines() {
     let workplace = Workplace::new();

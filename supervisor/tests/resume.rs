@@ -1,4 +1,4 @@
-//! A run that was stopped goes on from a checkpoint, and ends where the run does that was never stopped.
+//! A stopped run resumes from a checkpoint, and ends with the same results as a run that was never stopped.
 
 #![allow(
     clippy::unwrap_used,
@@ -17,7 +17,8 @@ use common::{CURRICULUM, Workplace, text, until};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Six vehicles, four episodes of which one evaluation between: 1 500 ticks of which 400 are evaluations, a checkpoint for every update.
+/// Six vehicles, four training episodes with one evaluation in between: 1 500 ticks of which 400 are evaluations, a checkpoint for every
+/// update.
 const SMALL: [&str; 13] = [
     "traffic.cavs=6",
     "traffic.others=3",
@@ -43,7 +44,7 @@ fn run_dir(workplace: &Workplace, name: &str) -> PathBuf {
     workplace.path().join("runs").join(name)
 }
 
-/// What a run came to: hash of every tensor of the newest checkpoint, every evaluation, and how many samples it learnt from.
+/// The results of a run: the hash of every tensor of the newest checkpoint, every evaluation, and the number of samples.
 fn outcome(workplace: &Workplace, name: &str) -> (String, Vec<(u64, f64, f64)>, Value) {
     let report = workplace.report(name);
     assert_eq!(report["result"], "completed");
@@ -90,13 +91,13 @@ fn refused(output: &Output, code: i32, words: &[&str]) {
 }
 
 #[test]
-fn a_run_that_goes_on_ends_where_the_one_does_that_was_never_stopped() {
+fn a_resumed_run_ends_with_the_results_of_one_that_was_never_stopped() {
     let workplace = Workplace::new();
     workplace.succeed(&arguments("whole", &[]));
     let expected = outcome(&workplace, "whole");
     assert_eq!(expected.1.len(), 2, "an evaluation between and one at the end");
 
-    // Stopped in the second half; its newest checkpoint is damaged, so that it goes on from the one before.
+    // The run is stopped in its second half. Its newest checkpoint is damaged, so it resumes from the one before.
     let mut run = workplace
         .command(&arguments("cut", &["run.real_time_factor=40"]))
         .stdout(Stdio::null())
@@ -131,7 +132,7 @@ fn a_run_that_goes_on_ends_where_the_one_does_that_was_never_stopped() {
     assert!(beginning["committed_ticks"].as_u64().unwrap() > beginning["episode_tick"].as_u64().unwrap());
     assert_eq!(outcome(&workplace, "cut"), expected);
 
-    // From any checkpoint in a new run, which leaves the old one as it is.
+    // A new run may begin at any checkpoint, and leaves the old run as it is.
     let before = common::tree(&run_dir(&workplace, "whole"));
     for (kept, name) in [("update-000002", "from-2"), ("update-000005", "from-5")] {
         let checkpoint = format!("runs/whole/checkpoints/{kept}");
@@ -139,7 +140,7 @@ fn a_run_that_goes_on_ends_where_the_one_does_that_was_never_stopped() {
         assert_eq!(outcome(&workplace, name), expected, "{kept}");
     }
     assert_eq!(common::tree(&run_dir(&workplace, "whole")), before);
-    // The first began with the first episode: its hash is over all that the whole run has made.
+    // The first new run begins with the first episode, so its hash covers the observations of the whole run.
     let hash = |name: &str| workplace.report(name)["observation_hash"].clone();
     assert_eq!(workplace.report("from-2")["beginning"]["episode_tick"], 0);
     assert_eq!(hash("from-2"), hash("whole"));
@@ -151,9 +152,9 @@ fn a_run_that_goes_on_ends_where_the_one_does_that_was_never_stopped() {
     let wide = ["train", "--resume", "whole", "--set", "trainer.hidden=[64]"];
     refused(&workplace.run(&wide), 2, &["hidden layers [500, 300]", "[64]"]);
     refused(
-        &workplace.run(&["train", "--resume", "nobody"]),
+        &workplace.run(&["train", "--resume", "unknown"]),
         2,
-        &["`nobody` is neither a run"],
+        &["`unknown` is neither a run"],
     );
     refused(
         &workplace.run(&["train", "town", "--resume", "whole"]),
@@ -162,20 +163,20 @@ fn a_run_that_goes_on_ends_where_the_one_does_that_was_never_stopped() {
     );
 }
 
-/// From each of `kept`, in a run of its own, to the end of the run `whole`; what the simulation was told is logged as there.
-fn every_checkpoint_leads_to_the_same_end(workplace: &Workplace, log: &str, kept: &[&str]) {
+/// Resumes a new run from each checkpoint of `kept`: its results and its `log` equal those of the run `whole`.
+fn assert_same_end_from_every_checkpoint(workplace: &Workplace, log: &str, kept: &[&str]) {
     let expected = outcome(workplace, "whole");
-    let told = |name: &str| std::fs::read_to_string(run_dir(workplace, name).join(log)).unwrap();
+    let log = |name: &str| std::fs::read_to_string(run_dir(workplace, name).join(log)).unwrap();
     for kept in kept {
         let checkpoint = format!("runs/whole/checkpoints/{kept}");
         workplace.succeed(&["train", "--resume", &checkpoint, "--name", kept]);
         assert_eq!(outcome(workplace, kept), expected, "{kept}");
-        assert_eq!(told(kept), told("whole"), "{kept}");
+        assert_eq!(log(kept), log("whole"), "{kept}");
     }
 }
 
-/// Starts `arguments` at a pace that leaves time to stop it after the checkpoint `kept`, and lets it go on in its directory.
-fn stop_and_go_on(workplace: &Workplace, name: &str, arguments: &[&str], kept: &str) {
+/// Starts `arguments` at a slow pace, stops the run after the checkpoint `kept`, and resumes it in its directory.
+fn stop_and_resume(workplace: &Workplace, name: &str, arguments: &[&str], kept: &str) {
     let pace = [arguments, &["--set", "run.real_time_factor=40"]].concat();
     let mut command = workplace.command(&pace);
     let mut run = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
@@ -187,12 +188,12 @@ fn stop_and_go_on(workplace: &Workplace, name: &str, arguments: &[&str], kept: &
 }
 
 #[test]
-fn every_environment_goes_on_where_it_stood() {
+fn every_environment_resumes_at_its_own_tick() {
     let workplace = Workplace::new();
     let two = ["run.envs=2", "trainer.horizon=1200"];
     workplace.succeed(&arguments("whole", &two));
     let expected = outcome(&workplace, "whole");
-    stop_and_go_on(&workplace, "cut", &arguments("cut", &two), "update-000005");
+    stop_and_resume(&workplace, "cut", &arguments("cut", &two), "update-000005");
     assert_eq!(outcome(&workplace, "cut"), expected);
     let beginning = workplace.report("cut")["beginning"].clone();
     let second = &beginning["others"][0];
@@ -207,7 +208,7 @@ fn every_environment_goes_on_where_it_stood() {
 }
 
 #[test]
-fn a_curriculum_goes_on_with_its_lessons() {
+fn a_curriculum_resumes_within_its_stages() {
     let workplace = Workplace::new();
     let more = [
         "episode.evaluation_interval=4",
@@ -221,21 +222,21 @@ fn a_curriculum_goes_on_with_its_lessons() {
     workplace.succeed(&arguments("whole"));
     let log = |name: &str| std::fs::read_to_string(run_dir(&workplace, name).join("curriculum.jsonl")).unwrap();
     assert_eq!(log("whole").lines().count(), 4, "{}", log("whole"));
-    // In the first step, which is one episode, in the second, and in the third.
+    // In the first stage, which is one episode, in the second, and in the third.
     let kept = ["update-000002", "update-000005", "update-000007"];
-    every_checkpoint_leads_to_the_same_end(&workplace, "curriculum.jsonl", &kept);
+    assert_same_end_from_every_checkpoint(&workplace, "curriculum.jsonl", &kept);
     let begins = kept.map(|name| workplace.report(name)["beginning"]["episode_tick"].as_u64().unwrap());
     assert!(
         begins[0] == 0 && begins.is_sorted() && begins[2] > begins[1],
         "{begins:?}"
     );
-    stop_and_go_on(&workplace, "cut", &arguments("cut"), "update-000004");
+    stop_and_resume(&workplace, "cut", &arguments("cut"), "update-000004");
     assert_eq!(outcome(&workplace, "cut"), outcome(&workplace, "whole"));
     assert_eq!(log("cut"), log("whole"));
     workplace.assert_nothing_left();
 }
 
-/// In the first episode, which is begun anew at tick 150, in what follows on it, and in the second, begun anew at tick 620.
+/// Commands in the first episode, which is reset at tick 150, in the episode after it, which is reset at tick 620, and in the one after that.
 const COMMANDS: &str = r#"{"tick":100,"episode":0,"control":{"command":"sensor","vehicle":"cav.1","sensor":"gnss","state":"off"}}
 {"tick":150,"episode":0,"control":{"command":"reset"}}
 {"tick":200,"episode":1,"control":{"command":"destination","vehicle":"cav.1","edge":"ring_west_2"}}
@@ -245,16 +246,16 @@ const COMMANDS: &str = r#"{"tick":100,"episode":0,"control":{"command":"sensor",
 "#;
 
 #[test]
-fn commands_are_carried_out_again_behind_the_checkpoint() {
+fn commands_after_the_checkpoint_are_carried_out_again() {
     let workplace = Workplace::new();
     let file = workplace.write("commands.jsonl", COMMANDS);
     let commanded = |name| [&arguments(name, &[])[..], &["--commands", file.to_str().unwrap()]].concat();
     workplace.succeed(&commanded("whole"));
-    every_checkpoint_leads_to_the_same_end(&workplace, "commands.jsonl", &["update-000002", "update-000008"]);
+    assert_same_end_from_every_checkpoint(&workplace, "commands.jsonl", &["update-000002", "update-000008"]);
     let beginning = |name: &str| workplace.report(name)["beginning"].clone();
     assert_eq!(beginning("update-000002")["resets"], 1);
     assert_eq!(beginning("update-000008")["resets"], 2);
-    stop_and_go_on(&workplace, "cut", &commanded("cut"), "update-000004");
+    stop_and_resume(&workplace, "cut", &commanded("cut"), "update-000004");
     assert_eq!(outcome(&workplace, "cut"), outcome(&workplace, "whole"));
     workplace.assert_nothing_left();
 }

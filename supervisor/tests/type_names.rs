@@ -1,4 +1,4 @@
-//! Public type names are unique in the workspace: a search for one finds one thing.
+//! Public type names are unique in the workspace, so a search for a name finds one type.
 
 #![allow(
     clippy::unwrap_used,
@@ -46,7 +46,7 @@ fn public_type(line: &str) -> Option<&str> {
         .filter(|name| !name.is_empty())
 }
 
-/// The part of a file before its unit tests, which stand at its end.
+/// The part of a file before its unit tests, which are at its end.
 fn without_tests(text: &str) -> &str {
     let tests = text.find("#[cfg(test)]\nmod tests {");
     tests.map_or(text, |tests| &text[..tests])
@@ -72,15 +72,15 @@ fn two_public_types_never_share_a_name() {
     }
     assert!(places.len() > 300, "only {} types were found", places.len());
     places.retain(|_, places| places.len() > 1);
-    assert!(places.is_empty(), "give each its noun: {places:#?}");
+    assert!(places.is_empty(), "give each type a name of its own: {places:#?}");
 }
 
 #[test]
-fn a_definition_is_told_from_other_lines() {
+fn a_definition_is_distinguished_from_other_lines() {
     for (line, name) in [
         ("pub struct Slot {", Some("Slot")),
         ("    pub(crate) enum Way<T> {", Some("Way")),
-        ("pub(super) type Told = u8;", Some("Told")),
+        ("pub(super) type Bit = u8;", Some("Bit")),
         ("pub unsafe trait Shared: Copy {", Some("Shared")),
         ("pub fn structure() {", None),
         ("struct Private;", None),

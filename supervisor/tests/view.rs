@@ -1,4 +1,4 @@
-//! `caraware view` says what is wrong, and a viewer beside a run ends with it without disturbing it.
+//! `caraware view` reports mistakes, and a viewer beside a run ends with the run without disturbing it.
 
 #![allow(
     clippy::unwrap_used,
@@ -18,7 +18,7 @@ fn free_endpoint() -> String {
 }
 
 #[test]
-fn nothing_to_watch_is_said_with_what_to_do() {
+fn a_view_of_nothing_is_refused_with_the_fix() {
     let workplace = Workplace::new();
     let endpoint = free_endpoint();
     for (arguments, exit_code, parts) in [
@@ -27,7 +27,7 @@ fn nothing_to_watch_is_said_with_what_to_do() {
         (
             vec!["view", "host:7447"],
             2,
-            ["`host:7447` is no endpoint", "tcp/host:7447"],
+            ["`host:7447` is not an endpoint", "tcp/host:7447"],
         ),
         (
             vec!["view", &endpoint, "--save", "unused.rrd"],
@@ -46,7 +46,7 @@ fn nothing_to_watch_is_said_with_what_to_do() {
 }
 
 #[test]
-fn a_python_without_the_viewer_is_said() {
+fn a_python_without_the_viewer_is_reported() {
     let workplace = Workplace::new();
     let bare = workplace.write("python", "#!/bin/sh\necho caraware_viewer rerun >&2\nexit 1\n");
     std::fs::set_permissions(&bare, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
@@ -60,9 +60,9 @@ fn a_python_without_the_viewer_is_said() {
     assert!(said.contains("pip install ./viewer"), "{said}");
 }
 
-/// A run that asks who comes asks its own viewer too, before anything is started; with credentials it is let in.
+/// A run that requires credentials requires them from its own viewer too, before a process starts.
 #[test]
-fn a_viewer_beside_a_guarded_run_says_who_it_is() {
+fn a_viewer_beside_a_guarded_run_must_authenticate() {
     let workplace = Workplace::new();
     let secret = |name: &str, text: &str| {
         let path = workplace.write(name, text);
@@ -94,7 +94,7 @@ fn a_viewer_beside_a_guarded_run_says_who_it_is() {
     workplace.assert_nothing_left();
 }
 
-/// The viewer draws into a page that nobody opens, and leaves with the run; the run is as it is without.
+/// The viewer serves a page that no browser opens, and ends with the run. The run's observations are the same as without it.
 #[test]
 fn a_viewer_beside_a_run_changes_nothing() {
     let workplace = Workplace::new();

@@ -1,4 +1,4 @@
-//! Whole runs on real SUMO traffic, across real processes and real shared memory.
+//! Whole runs with real SUMO traffic, real processes and real shared memory.
 
 #![allow(
     clippy::unwrap_used,
@@ -117,7 +117,7 @@ fn the_same_seed_gives_the_same_bytes_whatever_runs_beside() {
     let workplace = Workplace::new();
     let hash = |name: &str| workplace.report(name)["observation_hash"].as_str().unwrap().to_owned();
     workplace.succeed(&small("train", "a", &QUIET));
-    // The other way round in everything that must not matter: a fan-out beside it, a narrow window, a shorter horizon.
+    // Everything that must not matter differs: a fan-out beside the run, a narrow window, a shorter horizon.
     let listen = format!("fanout.listen=tcp/127.0.0.1:{}", free_port());
     let beside = [
         "--set",
@@ -130,7 +130,7 @@ fn the_same_seed_gives_the_same_bytes_whatever_runs_beside() {
     workplace.succeed(&small("train", "b", &beside));
     workplace.succeed(&small("simulate", "d", &QUIET));
     workplace.succeed(&small("train", "c", &[&QUIET[..], &["--set", "run.seed=2"]].concat()));
-    assert_eq!(hash("a"), hash("b"), "same seed, another window, horizon and audience");
+    assert_eq!(hash("a"), hash("b"), "same seed, another window and horizon, and a fan-out");
     assert_ne!(
         hash("a"),
         hash("d"),
@@ -172,7 +172,7 @@ impl Drop for Background {
     }
 }
 
-/// Asks until there is an answer.
+/// Calls `ask` until it returns a value.
 fn eventually<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + Duration::from_mins(2);
     while Instant::now() < deadline {

@@ -1,4 +1,4 @@
-//! What a whole run on the town says about the motion of every vehicle, read from the shared memory of the run itself.
+//! The motion of every vehicle in a whole run on the town, read from the shared memory of the run.
 
 #![allow(
     clippy::unwrap_used,
@@ -34,7 +34,7 @@ const SUB_STEP_S: f64 = 0.01;
 /// A vehicle at the end of a tick with the sub-steps that led there.
 type Moved = (VehicleState, Vec<SubStep>);
 
-/// All ticks of a run on the town: everybody in order of their index.
+/// All ticks of a run on the town: all road users in the order of their index.
 fn watch(workplace: &Workplace, settings: &[&str]) -> Vec<Vec<Moved>> {
     let mut arguments = vec!["simulate", "--name", "world", "--set", "fanout.enabled=false"];
     settings.iter().for_each(|setting| arguments.extend(["--set", setting]));
@@ -68,7 +68,7 @@ fn receive(run_file: &Path, run: &mut Child) -> Vec<Vec<Moved>> {
     }
 }
 
-/// Ways of vehicles: consecutive states without a pose that was set.
+/// Consecutive states of each vehicle, split where a pose was set.
 fn ways(ticks: &[Vec<Moved>]) -> Vec<Vec<&Moved>> {
     let mut open: BTreeMap<u32, Vec<&Moved>> = BTreeMap::new();
     let mut done = Vec::new();
@@ -149,7 +149,7 @@ fn integrate(start: &VehicleState, way: &[&Moved]) -> (Vector, Rotation) {
 /// Angle between two attitudes, rad.
 fn between(a: &Rotation, b: &Rotation) -> f64 {
     let trace: f64 = (0..3).map(|i| dot(a[i], b[i])).sum();
-    // Near 1 the arc cosine loses all digits: from the sine instead.
+    // Near 1 the arc cosine loses all digits, so the angle comes from the sine.
     let skew = (0..3).map(|i| {
         let (j, k) = ((i + 1) % 3, (i + 2) % 3);
         dot(a[j], b[k]) - dot(a[k], b[j])
@@ -187,14 +187,14 @@ fn acceleration_and_angular_rate_of_every_vehicle_of_the_town_reproduce_its_pose
     }
     println!("{checked} times 10 s: at most {furthest_m} m and {most_rad} rad; roll or pitch up to {leaning} rad");
     assert!(checked > 200, "only {checked}");
-    assert!(leaning > 0.01, "nobody leaned: {leaning}");
+    assert!(leaning > 0.01, "no vehicle rolled or pitched: {leaning}");
     assert!(furthest_m < 0.01, "{furthest_m} m");
     assert!(most_rad < 0.01_f64.to_radians(), "{most_rad} rad");
-    keep_to_their_limits(&ways);
+    assert_within_limits(&ways);
 }
 
-/// No speed changes with more jerk than the actuators', no rear axle slips more than tyres do, no yaw rate is beyond friction.
-fn keep_to_their_limits(ways: &[Vec<&Moved>]) {
+/// Asserts that jerk stays within the actuators' limits, slip of the rear axle within that of tyres, and yaw rate within friction.
+fn assert_within_limits(ways: &[Vec<&Moved>]) {
     let (mut jerk, mut slip, mut lateral) = (0.0_f32, 0.0_f32, 0.0_f32);
     for way in ways {
         let rows: Vec<&SubStep> = way.iter().skip(1).flat_map(|(_, rows)| rows).collect();
@@ -215,7 +215,7 @@ fn keep_to_their_limits(ways: &[Vec<&Moved>]) {
 
 /// The default preset's mirror follows its reference: p99.9 at most 0.5 m across and 1.0 m along, never more than 2 m.
 #[test]
-fn the_report_says_how_well_the_town_is_tracked() {
+fn the_report_measures_how_well_the_town_is_tracked() {
     let workplace = Workplace::new();
     let settings = ["--set", "episode.training_episodes=2", "--set", "fanout.enabled=false"];
     workplace.succeed(&[&["simulate", "--name", "tracked"], &settings[..]].concat());

@@ -1,4 +1,4 @@
-//! What can be wrong with a configuration, each with the place and the fix.
+//! The errors of a configuration, each with the place where it was made and the fix.
 
 use miette::{Diagnostic, LabeledSpan, NamedSource, Severity, SourceCode};
 
@@ -43,7 +43,7 @@ pub enum ConfigError {
         /// Where.
         place: SourceSpan,
     },
-    /// Two values do not go together.
+    /// Two values contradict each other.
     #[error("{}: {message}", place.line())]
     Conflict {
         /// Both keys with their values.

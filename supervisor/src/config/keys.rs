@@ -1,8 +1,8 @@
-//! The table of configuration keys: name, kind, unit, range, meaning. Checking, `--set` and `configs/README.md` follow it.
+//! The table of configuration keys: name, kind, unit, range, meaning. Checks, `--set` and `configs/README.md` derive from it.
 
 use ipc_schema::field::{FIELD_PRESETS, FIELDS};
 
-/// What a key's value may be.
+/// The values that a key allows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ValueKind {
     /// A number from `min` to `max`.
@@ -40,7 +40,7 @@ pub enum ValueKind {
         /// Greatest value.
         max: f64,
     },
-    /// A shortest and a longest duration or the like, from `min` to `max`; one number stands for both.
+    /// A shortest and a longest value, such as durations, from `min` to `max`; one number stands for both.
     Span {
         /// Least value.
         min: f64,
@@ -69,7 +69,7 @@ pub struct ConfigKey {
     pub unit: &'static str,
     /// Meaning.
     pub meaning: &'static str,
-    /// True if a configuration need not have a value for it.
+    /// True if a configuration may leave the key unset.
     pub optional: bool,
 }
 
@@ -142,7 +142,7 @@ pub fn renamed_to(path: &str) -> Option<&'static str> {
     renamed.find_map(|(former, now)| (*former == path).then_some(*now))
 }
 
-/// Every key there is.
+/// All keys.
 #[rustfmt::skip]
 pub const KEYS: &[ConfigKey] = &[
     integer("run.seed", "", 0, i64::MAX, "Seed of all random numbers: traffic, noise, the learner. The same seed gives the same bytes."),
@@ -336,13 +336,13 @@ pub fn find(path: &str) -> Option<&'static ConfigKey> {
     KEYS.iter().chain(STAGE_KEYS).find(|key| key.path == path)
 }
 
-/// Keys of earlier versions, and what took their place.
+/// Keys of earlier versions, and the keys that replaced them.
 const RENAMED: [(&str, &str); 2] = [
     ("imu.gravity_mps2", "imu.convention"),
     ("fanout.rate_hz", "fanout.world_hz"),
 ];
 
-/// The existing path that took the place of `path`, or the one most like it, if any is near.
+/// The key that replaced `path`, or the most similar key, if one is similar enough.
 #[must_use]
 pub fn nearest(path: &str) -> Option<&'static str> {
     if let Some((_, now)) = RENAMED.iter().find(|(then, _)| *then == path) {
@@ -368,7 +368,7 @@ impl ConfigKey {
         self.path.rsplit('.').next().unwrap_or(self.path)
     }
 
-    /// The allowed values, for people.
+    /// The allowed values, as messages and pages show them.
     #[must_use]
     pub fn range(&self) -> String {
         match self.kind {

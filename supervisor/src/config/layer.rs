@@ -1,4 +1,4 @@
-//! One source of settings: a preset, a file, or one `--set`. Flat, with the place of every value, checked key by key.
+//! One source of settings: a preset, a file, or one `--set`. Every value is checked by its key and keeps the place where it was set.
 
 use std::{collections::BTreeMap, sync::Arc};
 
@@ -31,7 +31,7 @@ pub type SettingsLayer = BTreeMap<&'static str, LocatedValue>;
 /// Reads a whole TOML text.
 ///
 /// # Errors
-/// Not TOML, an unknown key, a wrong type, or a value out of range, each with its line.
+/// The text is not TOML, a key is unknown, or a value has a wrong type or is out of range. Each error has its line.
 pub fn parse(name: &str, text: &str) -> Result<SettingsLayer, ConfigError> {
     let source: NamedText = Arc::new(NamedSource::new(name, text.to_owned()).with_language("toml"));
     let table = DeTable::parse(text).map_err(|error| ConfigError::Syntax {
@@ -42,14 +42,14 @@ pub fn parse(name: &str, text: &str) -> Result<SettingsLayer, ConfigError> {
         },
     })?;
     let mut layer = SettingsLayer::new();
-    walk("", table.get_ref(), &source, &mut layer)?;
+    add_table("", table.get_ref(), &source, &mut layer)?;
     Ok(layer)
 }
 
 /// Reads one `key=value` of the command line; a bare word counts as text.
 ///
 /// # Errors
-/// As [`parse`], or no `=`.
+/// As [`parse`], or the assignment has no `=`.
 pub fn parse_assignment(assignment: &str) -> Result<SettingsLayer, ConfigError> {
     let Some((key, value)) = assignment.split_once('=') else {
         return Err(ConfigError::Assignment {
@@ -58,7 +58,7 @@ pub fn parse_assignment(assignment: &str) -> Result<SettingsLayer, ConfigError> 
     };
     let (key, value) = (key.trim(), value.trim());
     let plain = format!("{key} = {value}");
-    // A word is a word where one belongs, also "nan" and "true", which TOML takes for something else.
+    // A key that takes a word takes every word as text, also "nan" and "true", which mean something else in TOML.
     let takes_a_word = keys::find(key).is_some_and(|key| {
         matches!(
             key.kind,
@@ -74,7 +74,8 @@ pub fn parse_assignment(assignment: &str) -> Result<SettingsLayer, ConfigError> 
     parse("--set", &text)
 }
 
-fn walk(prefix: &str, table: &DeTable<'_>, source: &NamedText, layer: &mut SettingsLayer) -> Result<(), ConfigError> {
+/// Adds the values of a table and of its inner tables to the layer.
+fn add_table(prefix: &str, table: &DeTable<'_>, source: &NamedText, layer: &mut SettingsLayer) -> Result<(), ConfigError> {
     for (name, value) in table {
         let path = if prefix.is_empty() {
             name.get_ref().to_string()
@@ -84,7 +85,7 @@ fn walk(prefix: &str, table: &DeTable<'_>, source: &NamedText, layer: &mut Setti
         if let DeValue::Table(inner) = value.get_ref()
             && keys::KEYS.iter().any(|key| key.path.starts_with(&format!("{path}.")))
         {
-            walk(&path, inner, source, layer)?;
+            add_table(&path, inner, source, layer)?;
             continue;
         }
         let Some(key) = keys::find(&path) else {
@@ -122,7 +123,7 @@ fn walk(prefix: &str, table: &DeTable<'_>, source: &NamedText, layer: &mut Setti
     Ok(())
 }
 
-/// A list of tables, each value checked by its own key; `None` if it is none.
+/// Reads a list of tables and checks each value by its own key; `None` if the value is not such a list.
 fn tables(
     key: &'static ConfigKey,
     value: &Spanned<DeValue<'_>>,
@@ -137,7 +138,7 @@ fn tables(
             return Ok(None);
         };
         let mut layer = SettingsLayer::new();
-        walk(key.path, table, source, &mut layer)?;
+        add_table(key.path, table, source, &mut layer)?;
         if let ValueKind::Tables(keys) = key.kind
             && let Some(missing) = keys.iter().find(|key| !key.optional && !layer.contains_key(key.path))
         {
@@ -187,12 +188,12 @@ fn check(key: &ConfigKey, value: &Spanned<DeValue<'_>>) -> Option<Value> {
                 .collect();
             list.filter(|list| !list.is_empty()).map(Value::from)
         }
-        // Its values have places of their own (`tables`).
+        // `tables` checks these.
         ValueKind::Tables(_) => None,
     }
 }
 
-/// Whether a word reads `package.module:Class`.
+/// True if a word has the form `package.module:Class`.
 fn is_python_class(word: &str) -> bool {
     let is_name = |name: &str| {
         name.chars().all(|c| c.is_alphanumeric() || c == '_') && name.starts_with(|c: char| !c.is_numeric())

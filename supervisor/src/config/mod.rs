@@ -1,4 +1,4 @@
-//! From presets, files and `--set` to one validated configuration.
+//! Merges presets, files and `--set` into one validated configuration.
 
 pub mod error;
 pub mod keys;
@@ -36,7 +36,7 @@ impl LayeredSettings {
         layer::parse(&format!("preset {name}"), text).map(Self)
     }
 
-    /// Settings that come to `config`.
+    /// The settings whose configuration is `config`.
     ///
     /// # Errors
     /// Never with a validated configuration.
@@ -56,7 +56,7 @@ impl LayeredSettings {
     /// Adds a user's TOML file.
     ///
     /// # Errors
-    /// Unreadable, or as [`layer::parse`].
+    /// The file is unreadable, or as [`layer::parse`].
     pub fn with_file(mut self, path: &Path) -> Result<Self, ConfigError> {
         let name = path.display().to_string();
         let text = std::fs::read_to_string(path).map_err(|error| ConfigError::File {
@@ -79,7 +79,7 @@ impl LayeredSettings {
         Ok(self)
     }
 
-    /// Replaces one value on behalf of a scenario, unless the user set it (anywhere but in the default preset).
+    /// Replaces a preset's value by that of a scenario, unless the user set the key.
     pub fn suggest(&mut self, path: &'static str, value: Value, source: &str) {
         if let Some(setting) = self.0.get_mut(path)
             && setting.place.source.name().starts_with("preset ")
@@ -109,7 +109,7 @@ impl LayeredSettings {
     /// The validated configuration.
     ///
     /// # Errors
-    /// Values that do not go together.
+    /// Two values contradict each other, or a rule between keys is broken.
     pub fn validate(&self) -> Result<Config, ConfigError> {
         rules::check_texts(self)?;
         let mut root = Map::new();
@@ -140,7 +140,7 @@ pub fn preset_names() -> String {
     PRESETS.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
 }
 
-/// The configuration as TOML that can be given back as CONFIG.
+/// The configuration as TOML, which can be used as CONFIG.
 #[must_use]
 pub fn to_toml(config: &Config) -> String {
     toml::to_string_pretty(config).unwrap_or_else(|error| format!("# not representable: {error}\n"))

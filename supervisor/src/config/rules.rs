@@ -1,4 +1,4 @@
-//! Rules between keys: rates that must divide each other, sizes that must fit.
+//! Rules between keys: rates that must divide each other, sizes that must fit, keys that exclude each other.
 
 use ipc_schema::{
     config::{Config, RegionCorner, TaskKind, class_model},
@@ -77,7 +77,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
 /// The learner that comes with caraware: it predicts positions.
 const LOCALISING_TRAINER: &str = "caraware.train";
 
-/// Heroes and the driving task go together.
+/// Heroes need the driving task, and the driving task needs heroes.
 fn task(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let refused = if config.drives() {
         undrivable(config)
@@ -90,7 +90,7 @@ fn task(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> 
     }
 }
 
-/// Key, message and help of what is wrong.
+/// Key, message and help of a broken rule.
 type BrokenRule = (&'static str, String, &'static str);
 
 fn heroes_without_a_driver(config: &Config) -> Option<BrokenRule> {
@@ -98,14 +98,14 @@ fn heroes_without_a_driver(config: &Config) -> Option<BrokenRule> {
     if traffic.heroes > 0 {
         return Some((
             "traffic.heroes",
-            format!("`traffic.heroes` = {} without anybody who drives them", traffic.heroes),
+            format!("`traffic.heroes` = {} needs the driving task", traffic.heroes),
             "set task.kind = \"driving\", or traffic.heroes = 0",
         ));
     }
     if !traffic.hero_ids.is_empty() {
         return Some((
             "traffic.hero_ids",
-            "`traffic.hero_ids` names heroes without anybody who drives them".into(),
+            "`traffic.hero_ids` names heroes, which need the driving task".into(),
             "set task.kind = \"driving\", or traffic.hero_ids = []",
         ));
     }
@@ -119,13 +119,13 @@ fn heroes_without_a_driver(config: &Config) -> Option<BrokenRule> {
     (traffic.cavs == 0).then(|| {
         (
             "traffic.cavs",
-            "`traffic.cavs` = 0: nobody is to be localised".into(),
-            "ask for one connected vehicle or more",
+            "`traffic.cavs` = 0: the localisation task needs a connected vehicle".into(),
+            "set traffic.cavs to 1 or more",
         )
     })
 }
 
-/// Actions must come, and reach SUMO at every tick.
+/// The driving task needs heroes and a driver, and an action must reach SUMO at every tick.
 fn undrivable(config: &Config) -> Option<BrokenRule> {
     if config.heroes() == 0 {
         return Some((
@@ -146,7 +146,7 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
     if config.run.envs > 1 {
         return Some((
             "run.envs",
-            format!("`run.envs` = {}: a driver drives in one environment", config.run.envs),
+            format!("`run.envs` = {}: the driving task runs in one environment", config.run.envs),
             "start several runs, each with run.envs = 1",
         ));
     }
@@ -202,7 +202,7 @@ fn region(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError
     Ok(())
 }
 
-/// Every entry of `scene.obstacles` must be a known prop and a place.
+/// Every entry of `scene.obstacles` must be a known prop and a position.
 fn obstacles(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     for text in &config.scene.obstacles {
         if let Err(error) = Obstacle::parse(text) {

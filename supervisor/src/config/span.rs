@@ -1,4 +1,4 @@
-//! Where a value stands in a text of settings, for messages that show the line.
+//! The place of a value in a text of settings, for messages that show the line.
 
 use std::{ops::Range, sync::Arc};
 

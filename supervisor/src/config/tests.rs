@@ -48,7 +48,7 @@ fn the_resolved_configuration_can_be_given_back() {
 }
 
 #[test]
-fn an_unknown_key_names_file_line_and_what_was_meant() {
+fn an_unknown_key_is_refused_with_file_line_and_the_nearest_key() {
     let (message, help) = error_of("[run]\nseed = 3\n\n[gnss]\nnoise_deg = 1e-5\n");
     assert_eq!(message, "my.toml:5: unknown key `gnss.noise_deg`");
     assert_eq!(help, "did you mean `gnss.noise_std_deg`? All keys: configs/README.md");
@@ -65,7 +65,7 @@ fn a_renamed_key_is_refused_with_its_new_name() {
 }
 
 #[test]
-fn a_renamed_key_leads_to_the_new_one() {
+fn a_replaced_key_suggests_the_new_one() {
     let (_, help) = error_of("imu.gravity_mps2 = 9.81\n");
     assert_eq!(help, "did you mean `imu.convention`? All keys: configs/README.md");
 }
@@ -153,7 +153,7 @@ fn one_number_stands_for_all_axes_and_a_list_must_be_whole() {
 }
 
 #[test]
-fn a_lidar_that_makes_no_sense_is_refused_with_key_value_and_what_is_allowed() {
+fn an_impossible_lidar_is_refused_with_key_value_and_range() {
     for (text, message, help) in [
         (
             "lidar.points_per_second = 1000000000",
@@ -177,7 +177,7 @@ fn a_lidar_that_makes_no_sense_is_refused_with_key_value_and_what_is_allowed() {
         ),
         (
             "lidar.rotation_hz = 7",
-            "`lidar.rotation_hz` = 7: neither",
+            "`lidar.rotation_hz` = 7: a rotation must be",
             "choose a multiple or a whole part of 10 Hz",
         ),
         (
@@ -192,7 +192,7 @@ fn a_lidar_that_makes_no_sense_is_refused_with_key_value_and_what_is_allowed() {
         ),
         (
             "lidar.pattern = \"table\"",
-            "\"table\" without a table",
+            "\"table\" needs `lidar.ray_table`",
             "name a CSV file",
         ),
         (
@@ -402,13 +402,13 @@ fn maps_of_a_curriculum_are_names_that_the_run_has() {
     let (message, help) = error_of(&format!("[curriculum]\nmaps = [\"town\", \"c.sumocfg\"]\n{steps}"));
     assert!(message.contains("my.toml:"), "{message}");
     assert!(
-        message.contains("stage 2 of `curriculum.stages` is on the map \"b\", which the run does not have"),
+        message.contains("stage 2 of `curriculum.stages` uses the map \"b\", which the run does not have"),
         "{message}"
     );
     assert!(help.contains("its maps are \"town\", \"c\""), "{help}");
     let (message, help) = error_of(steps);
     assert!(
-        message.contains("on the map \"b\"") && help.contains("\"town\""),
+        message.contains("uses the map \"b\"") && help.contains("\"town\""),
         "{message} {help}"
     );
 
@@ -431,7 +431,7 @@ fn maps_of_a_curriculum_are_names_that_the_run_has() {
 
     let (message, help) = error_of("[[curriculum.stages]]\ncavs = 1\nmap_choice = \"random\"\n");
     assert!(
-        message.contains("stage 1 of `curriculum.stages` draws its maps, and names 0"),
+        message.contains("stage 1 of `curriculum.stages` draws its maps, but names 0"),
         "{message}"
     );
     assert!(help.contains("two or more"), "{help}");
@@ -443,7 +443,7 @@ fn maps_of_a_curriculum_are_names_that_the_run_has() {
 }
 
 #[test]
-fn what_stands_on_one_map_is_refused_with_several() {
+fn a_key_with_positions_is_refused_with_several_maps() {
     let maps = "[curriculum]\nmaps = [\"town\", \"b.net.xml\"]\n[[curriculum.stages]]\ncavs = 1\n";
     for (key, setting) in [
         ("scene.obstacles", "[scene]\nobstacles = [\"cone 10 20\"]\n"),
@@ -457,7 +457,7 @@ fn what_stands_on_one_map_is_refused_with_several() {
         let (message, _) = error_of(&format!("{setting}{maps}"));
         assert!(
             message.contains(&format!(
-                "my.toml:2: `{key}` names places of one map, and `curriculum.maps` has 2"
+                "my.toml:2: `{key}` holds positions on one map, but `curriculum.maps` has 2"
             )),
             "{message}"
         );
@@ -485,7 +485,7 @@ fn a_stage_changes_population_noise_and_blackouts_and_nothing_else() {
 }
 
 #[test]
-fn an_obstacle_that_cannot_be_placed_is_named_with_what_can() {
+fn an_obstacle_that_cannot_be_placed_is_named_with_the_known_props() {
     let (message, help) = error_of("[scene]\nobstacles = [\"cone 10 20\", \"cnoe 1 2\"]\n");
     assert!(
         message.contains("`scene.obstacles`: \"cnoe 1 2\" names no known prop"),
@@ -497,22 +497,22 @@ fn an_obstacle_that_cannot_be_placed_is_named_with_what_can() {
 }
 
 #[test]
-fn heroes_and_the_driving_task_go_together() {
+fn heroes_need_the_driving_task_and_the_task_needs_heroes() {
     let cases = [
         (
             "traffic.heroes = 1",
-            "`traffic.heroes` = 1 without anybody who drives them",
+            "`traffic.heroes` = 1 needs the driving task",
             "task.kind = \"driving\"",
         ),
         (
             "traffic.hero_ids = [\"a\"]",
-            "`traffic.hero_ids` names heroes without anybody",
+            "`traffic.hero_ids` names heroes, which need the driving task",
             "task.kind = \"driving\"",
         ),
         (
             "traffic.cavs = 0",
-            "`traffic.cavs` = 0: nobody is to be localised",
-            "one connected vehicle",
+            "`traffic.cavs` = 0: the localisation task needs a connected vehicle",
+            "set traffic.cavs to 1 or more",
         ),
         (
             "observation.fields = \"driving\"",
@@ -531,7 +531,7 @@ fn heroes_and_the_driving_task_go_together() {
         ),
         (
             "task.kind = \"driving\"\ntraffic.heroes = 1\nrun.envs = 2",
-            "`run.envs` = 2: a driver drives in one environment",
+            "`run.envs` = 2: the driving task runs in one environment",
             "start several runs",
         ),
         (

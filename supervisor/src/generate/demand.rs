@@ -1,4 +1,4 @@
-//! Vehicles on every lane at the first step, each with a random way that does not end before the simulation does.
+//! The demand of a generated scenario: vehicles on every lane from the first step, each with a random route that outlasts the simulation.
 
 use std::fmt::Write as _;
 
@@ -10,7 +10,7 @@ use rand_chacha::{
 use super::{GeneratedCity, streets::GridStreets};
 use crate::failure::Exit;
 
-/// Vehicle classes and how many of 100 vehicles are of each; lengths are SUMO's.
+/// Vehicle classes and their shares, percent. Lengths are SUMO's.
 const CLASSES: [(&str, u64); 5] = [
     ("passenger", 80),
     ("delivery", 8),
@@ -18,12 +18,12 @@ const CLASSES: [(&str, u64); 5] = [
     ("bus", 2),
     ("motorcycle", 4),
 ];
-/// The longest vehicle (a bus) with the gap before it, metres.
+/// Length of the longest vehicle (a bus) with the gap ahead of it, metres.
 const ROOM_M: f64 = 15.0;
-/// Faster than anybody is on average, in terms of the speed limit: drivers keep to 1.0 ± 0.1 of it.
+/// A mean speed that no vehicle reaches, as a multiple of the speed limit: SUMO's drivers keep to 1.0 ± 0.1 of it.
 const FASTEST: f64 = 1.3;
 
-/// The vehicles of a city.
+/// The vehicles of a generated scenario and their routes.
 pub struct TripDemand<'a> {
     city: &'a GeneratedCity,
     streets: &'a GridStreets,
@@ -32,7 +32,7 @@ pub struct TripDemand<'a> {
 }
 
 impl<'a> TripDemand<'a> {
-    /// Demand for these streets.
+    /// Prepares the demand for these streets.
     ///
     /// # Errors
     /// The vehicles do not fit onto them.
@@ -54,7 +54,7 @@ impl<'a> TripDemand<'a> {
         Ok(Self { city, streets, lanes })
     }
 
-    /// The route file.
+    /// The content of the route file.
     pub fn text(&self) -> String {
         let mut text = String::from("<routes>\n");
         for (class, _) in CLASSES {
@@ -64,7 +64,7 @@ impl<'a> TripDemand<'a> {
         let (vehicles, lanes) = (self.city.vehicles as usize, self.lanes.len());
         let mut number = 0;
         for (index, &(street, lane, length_m)) in self.lanes.iter().enumerate() {
-            // Evenly over all lanes.
+            // The vehicles are spread evenly over all lanes.
             let end = vehicles * (index + 1) / lanes;
             let here = end - number;
             for place in 0..here {
@@ -77,7 +77,7 @@ impl<'a> TripDemand<'a> {
     }
 
     fn vehicle(&self, text: &mut String, number: usize, street: usize, lane: usize, position_m: f64) {
-        // A stream of random numbers for each vehicle, by its number.
+        // Each vehicle has its own stream of random numbers.
         let mut rng = ChaCha8Rng::seed_from_u64(self.city.seed);
         rng.set_stream(number as u64);
         let class = class(below(100, &mut rng));
@@ -86,12 +86,12 @@ impl<'a> TripDemand<'a> {
             "    <vehicle id=\"v{number}\" type=\"{class}\" depart=\"0\" departLane=\"{lane}\" departPos=\"{position_m:.1}\" departSpeed=\"avg\">"
         );
         text.push_str("        <route edges=\"");
-        self.walk(text, street, -position_m, &mut rng);
+        self.write_route(text, street, -position_m, &mut rng);
         text.push_str("\"/>\n    </vehicle>\n");
     }
 
-    /// A random way from `street` on that is longer than anybody gets.
-    fn walk(&self, text: &mut String, mut street: usize, mut way_m: f64, rng: &mut ChaCha8Rng) {
+    /// Writes a random route from `street` on that is longer than any vehicle can drive.
+    fn write_route(&self, text: &mut String, mut street: usize, mut way_m: f64, rng: &mut ChaCha8Rng) {
         let enough_m = FASTEST * self.city.speed_mps() * self.city.duration_s + self.city.block_m;
         text.push_str(&self.streets.all[street].id);
         loop {
@@ -137,7 +137,7 @@ mod tests {
         }
     }
 
-    /// A ring of four streets each way, so that every way goes round and round.
+    /// A ring of four streets in each direction: every route goes round and round.
     fn ring() -> GridStreets {
         let edges: String = (0..4)
             .flat_map(|n| [(n, (n + 1) % 4), ((n + 1) % 4, n)])
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn everybody_has_a_place_of_their_own_and_a_long_way() {
+    fn every_vehicle_has_its_own_position_and_a_long_route() {
         let (streets, city) = (ring(), GeneratedCity::of(17, 30.0, 0.1, 3));
         let text = TripDemand::new(&city, &streets).unwrap().text();
         let value = |line: &str, name: &str| {

@@ -1,4 +1,4 @@
-//! The streets of a net, as far as demand needs them.
+//! The streets of a net: what the demand needs of it.
 
 use std::collections::BTreeMap;
 
@@ -29,10 +29,10 @@ pub struct GridStreets {
 }
 
 impl GridStreets {
-    /// Reads the edges of a net that are no junction's.
+    /// Reads the edges of a net, without the internal edges of junctions.
     ///
     /// # Errors
-    /// What is wrong with the net.
+    /// The reason why the net cannot be read.
     pub fn of(net: &str) -> Result<Self, String> {
         let mut streets = Self::default();
         let mut junctions = BTreeMap::new();
@@ -82,7 +82,7 @@ impl GridStreets {
         });
     }
 
-    /// Where one may go on from a street without turning round.
+    /// The streets that a vehicle may take after `street` without turning round.
     pub fn onward(&self, street: usize) -> impl Iterator<Item = usize> + Clone {
         let here = &self.all[street];
         let next = self.beginning[here.to].iter().copied();
@@ -96,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_goes_on_anywhere_but_back() {
+    fn a_route_continues_on_every_street_but_the_way_back() {
         let net = r#"<net><edge id=":B_0" function="internal"><lane id=":B_0_0" length="9"/></edge>
             <edge id="ab" from="a" to="b"><lane id="ab_0" length="100.5"/><lane id="ab_1" length="100.5"/></edge>
             <edge id="ba" from="b" to="a"><lane id="ba_0" length="100"/></edge>

@@ -64,12 +64,12 @@ impl Handovers {
         }
     }
 
-    /// The reason against a handover now.
+    /// The reason why no handover can begin now, if there is one.
     fn obstacle(&self, processes: &RunProcesses) -> Option<&'static str> {
         let learns_alone = processes.run().config.trainer.ranks == 1;
         match processes.state_of(Process::Trainer) {
             _ if self.current.is_some() => Some("another handover is in progress"),
-            _ if !learns_alone => Some("its trainer learns together with others: none of them can be replaced alone"),
+            _ if !learns_alone => Some("the trainer learns together with other ranks, and one rank cannot be replaced alone"),
             _ if processes.replaceable().is_none() => Some("the run has no trainer"),
             State::Starting => Some("the trainer is still starting"),
             State::Done => Some("the trainer is done"),
@@ -77,7 +77,7 @@ impl Handovers {
         }
     }
 
-    /// The successor of this incarnation is ready: asks the old trainer to leave.
+    /// Asks the old trainer to leave, because the successor of this incarnation is ready.
     pub fn successor_ready(&mut self, processes: &mut RunProcesses, incarnation: u32) {
         let Some(handover) = self.current.take() else {
             return;
@@ -91,7 +91,7 @@ impl Handovers {
         }
     }
 
-    /// The trainer has ended. True if a successor that waited for its end is the trainer now.
+    /// Handles the end of the trainer: makes the waiting successor the trainer and returns true. Returns false if none waits.
     ///
     /// # Errors
     /// The run holds no more successors, or the run file cannot be written.
@@ -123,7 +123,7 @@ impl Handovers {
         Ok(true)
     }
 
-    /// Refuses a successor that failed; completes the handover once the successor has its first tick.
+    /// Refuses a successor that failed, and completes the handover once the successor has opened its ports.
     pub fn advance(&mut self, processes: &mut RunProcesses) {
         let Some(mut handover) = self.current.take() else {
             return;
@@ -167,7 +167,7 @@ impl Handovers {
         self.is_trainer_leaving
     }
 
-    /// The trainer has been restarted outside a handover: the request to leave went to the one before.
+    /// Forgets the request to leave, which went to the incarnation before this restart.
     pub fn trainer_restarted(&mut self) {
         self.is_trainer_leaving = false;
     }
@@ -178,6 +178,7 @@ impl Handovers {
     }
 }
 
+/// Starts a successor with the requested changes, and a thread that waits until it reports that it is ready.
 fn start_successor(
     processes: &RunProcesses,
     request: &HandoverRequest,

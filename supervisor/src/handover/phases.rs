@@ -18,13 +18,13 @@ use crate::{
 
 /// Longest time from the start of a successor to its readiness.
 const READY_WITHIN: Duration = Duration::from_secs(120);
-/// Under this name a successor reports its failure, beside the other logs.
+/// Name under which a successor writes its failure, beside the other logs.
 const SUCCESSOR: &str = "successor";
 
 /// Progress of a handover.
 #[derive(Debug)]
 enum HandoverPhase {
-    /// The successor gets ready; the old trainer works.
+    /// The successor prepares; the old trainer works.
     GettingReady { successor: RunningProcess, since: Instant },
     /// The supervisor has asked the old trainer to leave.
     Leaving { successor: RunningProcess },
@@ -37,15 +37,15 @@ enum HandoverPhase {
 pub struct HandoverInProgress {
     request: HandoverRequest,
     reply: ReplySocket,
-    /// The run as the successor sees it.
+    /// The run with the successor's configuration.
     run: RunFile,
-    /// The successor reads the run from here.
+    /// The file from which the successor reads the run.
     run_file: PathBuf,
     phase: HandoverPhase,
 }
 
 impl HandoverInProgress {
-    /// Begins with a successor that has been started.
+    /// Begins a handover to a successor that has been started.
     #[must_use]
     pub fn new(
         request: HandoverRequest,
@@ -159,10 +159,10 @@ impl HandoverInProgress {
     }
 }
 
-/// Writes a run file to `run_dir/<name>`, whole or not at all, and returns its path.
+/// Writes a run file to `run_dir/<name>` atomically, and returns its path.
 ///
 /// # Errors
-/// Not writable.
+/// The run directory is not writable.
 pub fn write_run(run: &RunFile, name: &str) -> Result<PathBuf, Exit> {
     let path = run.run_dir.join(name);
     let partial = run.run_dir.join(format!(".{name}.partial"));

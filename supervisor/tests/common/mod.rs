@@ -1,4 +1,4 @@
-//! Starting the real command in a directory of its own, and looking at what it leaves behind.
+//! Starts the real command in its own directory, and checks what it leaves behind.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
 use std::{
@@ -24,7 +24,7 @@ use rustix::fs::inotify;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// Whole runs use all cores and look at shared memory: one at a time.
+/// Whole runs use all cores and check shared memory, so one test runs at a time.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 /// A directory for runs, with a registry of its own.
@@ -72,7 +72,7 @@ impl Workplace {
         self.command(arguments).output().unwrap()
     }
 
-    /// Runs that must succeed.
+    /// Runs a command that must succeed.
     pub fn succeed(&self, arguments: &[&str]) -> Output {
         let output = self.run(arguments);
         assert!(
@@ -95,7 +95,7 @@ impl Workplace {
         path
     }
 
-    /// Nothing of any run of this workplace is left in shared memory, in the registry, or as a process.
+    /// Asserts that no run of this workplace left anything in shared memory, in the registry, or as a process.
     pub fn assert_nothing_left(&self) {
         let registry: Vec<_> = std::fs::read_dir(self.path().join("run"))
             .into_iter()
@@ -113,7 +113,7 @@ impl Workplace {
         assert!(files.is_empty(), "left in shared memory: {files:?}");
     }
 
-    /// Files that the runs of this workplace have in shared memory. Other runs of the machine come and go meanwhile.
+    /// Files that the runs of this workplace have in shared memory. Other runs of the machine may start and end meanwhile.
     pub fn shared_memory(&self) -> Vec<String> {
         let mut names = self.names.borrow_mut();
         let mut buffer = [MaybeUninit::uninit(); 4096];
@@ -189,18 +189,18 @@ pub fn tool(program: &Path, arguments: &[&str], directory: &Path) {
     assert!(output.status.success(), "{program:?}: {}", text(&output));
 }
 
-/// A place in a live run from which to look at its shared memory.
+/// A watcher of a live run: it reads boards and channels in the run's shared memory.
 pub struct Spectator {
     node: RunNode,
     file: RunFile,
 }
 
 impl Spectator {
-    /// Joins the run as soon as it is there.
+    /// Joins the run as soon as its services exist.
     pub fn join(run_file: &Path, run: &mut Child) -> Self {
         let started = run_file.with_file_name("logs").join("traffic-bridge.log");
         caught(run, "services", || {
-            // Processes start when all services are there: looking earlier would meet them half made.
+            // Processes start once all services exist; before that, services may be incomplete.
             started.exists().then_some(())?;
             let file = RunFile::read(run_file).ok()?;
             let node = services::node(&file.shared_memory).ok()?;
@@ -218,8 +218,8 @@ impl Spectator {
     }
 }
 
-/// Of the preset `paper`: three steps of which the first goes on and on, a horizon that ends within lessons, gates of σ that some
-/// updates pass.
+/// A curriculum on the preset `paper`: three stages, of which the first continues without restarts, a horizon that ends within lessons,
+/// and gates of σ that some updates pass.
 pub const CURRICULUM: [&str; 12] = [
     "curriculum.stages=[{cavs=1,restart=false,until_std=0.66},{cavs=1,ticks=350,until_std=0.63,noise=2.0},{cavs=5,ticks=100,until_std=0.6}]",
     "episode.ticks=450",
@@ -235,20 +235,20 @@ pub const CURRICULUM: [&str; 12] = [
     "fanout.enabled=false",
 ];
 
-/// What `ask` answers, asked again and again while the run lives.
+/// Calls `ask` until it returns a value; fails if the run ends before.
 pub fn until<T>(run: &mut Child, what: &str, ask: impl FnMut() -> Option<T>) -> T {
-    asked(run, what, ask, || std::thread::park_timeout(Duration::from_millis(1)))
+    poll(run, what, ask, || std::thread::park_timeout(Duration::from_millis(1)))
 }
 
-/// The same of what is gone soon after it is there, as a message when the run is over: without a pause.
+/// As [`until`], without pauses: for values that exist only for a short time, such as the last message of a run.
 pub fn caught<T>(run: &mut Child, what: &str, ask: impl FnMut() -> Option<T>) -> T {
-    asked(run, what, ask, std::thread::yield_now)
+    poll(run, what, ask, std::thread::yield_now)
 }
 
-fn asked<T>(run: &mut Child, what: &str, mut ask: impl FnMut() -> Option<T>, pause: impl Fn()) -> T {
+fn poll<T>(run: &mut Child, what: &str, mut ask: impl FnMut() -> Option<T>, pause: impl Fn()) -> T {
     let begin = Instant::now();
     loop {
-        // Looked at first: what the run said last is there once it has ended.
+        // The state of the run is read first: if it has ended, `ask` sees everything that it left.
         let over = run.try_wait().unwrap();
         if let Some(answer) = ask() {
             return answer;

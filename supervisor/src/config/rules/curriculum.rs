@@ -1,4 +1,4 @@
-//! Rules of a curriculum: every stage complete, with room for its vehicles, and a learner that can pass its gates.
+//! Rules of a curriculum: every stage has room for its vehicles and maps that exist, and a learner decides its gates.
 
 use std::collections::BTreeSet;
 
@@ -22,20 +22,20 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
     }
     if !stages.is_empty() && config.drives() {
         return refuse(
-            "a curriculum is for the localisation task: its stages say how many connected vehicles there are".into(),
+            "a curriculum is for the localisation task: its stages set the number of connected vehicles".into(),
             "set task.kind = \"localisation\" or curriculum.stages = []".into(),
         );
     }
     if !stages.is_empty() && (config.run.envs > 1 || config.trainer.ranks > 1) {
         return refuse(
-            "a curriculum is decided by one trainer for one environment".into(),
-            "set run.envs = 1, and start one trainer, or set curriculum.stages = []".into(),
+            "a curriculum needs exactly one trainer and one environment".into(),
+            "set run.envs = 1 and start one trainer, or set curriculum.stages = []".into(),
         );
     }
     if !stages.is_empty() && config.trainer.module != LOCALISING_TRAINER {
         return refuse(
             format!(
-                "`trainer.module` = \"{}\" decides about no lessons, which a curriculum waits for",
+                "`trainer.module` = \"{}\" does not decide lessons, and a curriculum waits for these decisions",
                 config.trainer.module
             ),
             format!("set trainer.module = \"{LOCALISING_TRAINER}\" or curriculum.stages = []"),
@@ -59,7 +59,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         .try_for_each(|(number, stage)| maps_of_stage(settings, config, number, stage))
 }
 
-/// Every map has a unique name, and stages that use it.
+/// Every map has a unique name, and the configuration has stages that can use it.
 fn maps(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let maps = &config.curriculum.maps;
     let refuse = |message: String, help: &str| Err(conflict(settings, "curriculum.maps", message, help.into()));
@@ -69,8 +69,8 @@ fn maps(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> 
     }
     if !maps.is_empty() && config.curriculum.stages.is_empty() {
         return refuse(
-            "`curriculum.maps` are for the stages of a curriculum, and there are none".into(),
-            "add a [[curriculum.stages]], or set curriculum.maps = []; a .sumocfg in place of the preset runs a scenario as it is",
+            "`curriculum.maps` are for the stages of a curriculum, and the configuration has no stages".into(),
+            "add a [[curriculum.stages]], or set curriculum.maps = []; to run a scenario unchanged, name its .sumocfg in place of the preset",
         );
     }
     let mut names = BTreeSet::new();
@@ -84,29 +84,29 @@ fn maps(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> 
         if !names.insert(name) {
             return refuse(
                 format!("`curriculum.maps` has two maps of the name \"{name}\""),
-                "stages call a map by its file's name without the ending: rename one of the files",
+                "a map's name is its file's name without the ending: rename one of the files",
             );
         }
     }
     if maps.len() < 2 {
         return Ok(());
     }
-    match placed(config) {
+    match positioned_key(config) {
         None => Ok(()),
         Some(key) => Err(conflict(
             settings,
             key,
             format!(
-                "`{key}` names places of one map, and `curriculum.maps` has {}",
+                "`{key}` holds positions on one map, but `curriculum.maps` has {}",
                 maps.len()
             ),
-            "leave it out; buildings come with each map, and `scene.random_props` stand on all".into(),
+            "leave it out; every map has its own buildings, and `scene.random_props` are placed on all maps".into(),
         )),
     }
 }
 
-/// The first key in use that holds places of a map.
-fn placed(config: &Config) -> Option<&'static str> {
+/// The first key in use that holds positions on a map.
+fn positioned_key(config: &Config) -> Option<&'static str> {
     let (scene, region) = (&config.scene, &config.region);
     let keys = [
         ("scene.obstacles", !scene.obstacles.is_empty()),
@@ -127,7 +127,7 @@ fn maps_of_stage(
     let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.stages", message, help));
     if let Some(unknown) = stage.maps.iter().find(|name| !names.contains(&name.as_str())) {
         return refuse(
-            format!("stage {number} of `curriculum.stages` is on the map \"{unknown}\", which the run does not have"),
+            format!("stage {number} of `curriculum.stages` uses the map \"{unknown}\", which the run does not have"),
             format!(
                 "its maps are \"{}\": add the file to `curriculum.maps`, or name one of them",
                 names.join("\", \"")
@@ -137,7 +137,7 @@ fn maps_of_stage(
     if stage.map_choice != MapChoice::InOrder && stage.maps.len() < 2 {
         return refuse(
             format!(
-                "stage {number} of `curriculum.stages` draws its maps, and names {}",
+                "stage {number} of `curriculum.stages` draws its maps, but names {}",
                 stage.maps.len()
             ),
             "give `maps` with two or more, or leave `map_choice` out".into(),

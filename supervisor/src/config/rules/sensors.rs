@@ -1,4 +1,4 @@
-//! Rules of the sensors: rates that divide each other, fields of view that hold something, fields that have a source.
+//! Rules of the sensors: rates divide each other, fields of view are not empty, and every observation field has its sensor.
 
 use ipc_schema::{
     config::{Config, LidarConfig},
@@ -16,7 +16,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
     }
 }
 
-/// Key, message and help of what is wrong.
+/// Key, message and help of a broken rule.
 type BrokenSensorRule = (&'static str, String, String);
 
 /// A fast IMU divides the tick and is divided by the sub-step; a slow one is a whole number of ticks.
@@ -61,7 +61,7 @@ fn pattern(lidar: &LidarConfig) -> Option<BrokenSensorRule> {
     (lidar.pattern == "table" && lidar.ray_table.is_empty()).then(|| {
         (
             "lidar.pattern",
-            "`lidar.pattern` = \"table\" without a table".into(),
+            "`lidar.pattern` = \"table\" needs `lidar.ray_table`".into(),
             "name a CSV file in lidar.ray_table, or another pattern".into(),
         )
     })
@@ -90,7 +90,7 @@ fn field_of_view(lidar: &LidarConfig) -> Option<BrokenSensorRule> {
     })
 }
 
-/// Rotations and ticks divide each other, and every tick fires as many columns.
+/// Rotations and ticks divide each other, and every tick fires the same whole number of columns.
 fn rates(config: &Config) -> Option<BrokenSensorRule> {
     let (lidar, tick_s) = (&config.lidar, config.run.tick_s);
     let rotation_s = 1.0 / lidar.rotation_hz;
@@ -98,8 +98,8 @@ fn rates(config: &Config) -> Option<BrokenSensorRule> {
         return Some((
             "lidar.rotation_hz",
             format!(
-                "`lidar.rotation_hz` = {}: neither is a rotation a whole number of ticks of `run.tick_s` = {tick_s} s nor a tick one of \
-                 rotations",
+                "`lidar.rotation_hz` = {}: a rotation must be a whole number of ticks of `run.tick_s` = {tick_s} s, or a tick a whole \
+                 number of rotations",
                 lidar.rotation_hz
             ),
             format!("choose a multiple or a whole part of {} Hz", 1.0 / tick_s),
@@ -127,7 +127,7 @@ fn rates(config: &Config) -> Option<BrokenSensorRule> {
     })
 }
 
-/// What a field shows must be there.
+/// Checks that the run has the sensor of every observation field.
 fn observation(config: &Config) -> Option<BrokenSensorRule> {
     let fitted = fitted_sensors(config);
     for field in &config.observation.fields {
