@@ -7,23 +7,23 @@ use clap::{Parser, ValueEnum};
 /// The parts that can be measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum BenchPart {
-    /// LIDAR: rays per second on one core beside Open3D's ray caster (Embree), same scene and rays
+    /// LIDAR: rays per second on one core, compared with Open3D's ray caster (Embree) on the same scene and rays
     Lidar,
-    /// Environments: vehicle-steps per second of 1, 2 and 4 side by side, beside one on a single core
+    /// Environments: vehicle-steps per second of 1, 2 and 4 environments, compared with one on a single core
     Envs,
-    /// Fan-out: lateness and rate of a run with eight viewers, one stopped and one slow, beside the same run alone; kills of the fan-out
+    /// Fan-out: lateness and rate of a run with eight viewers (one stopped, one slow), compared with the run alone; kills of the fan-out
     Fanout,
-    /// Observation hop: from publish to a visible tensor, 1 KiB to 16 MiB, beside pyzmq, pipe and TCP
+    /// Observation hop: time from publish to a visible tensor, 1 KiB to 16 MiB, compared with pyzmq, pipe and TCP
     Ipc,
-    /// The learner: updates per second beside Stable-Baselines3 and a plain loop, and its cost of a tick
+    /// The learner: updates per second, compared with Stable-Baselines3 and a plain loop, and its cost of a tick
     Trainer,
-    /// The cost of co-simulating 5 000 vehicles beside bare SUMO
+    /// The cost of co-simulating 5 000 vehicles, compared with bare SUMO
     Overhead,
-    /// 1 000 to 50 000 vehicles: cost and memory of each; a motorway, and long steps of SUMO
+    /// 1 000 to 50 000 vehicles: cost and memory of a vehicle; also a motorway, and long steps of SUMO
     Scale,
-    /// Python loops over TraCI and libsumo, MetaDrive and SMARTS: vehicle-steps per second of each, beside ours
+    /// Vehicle-steps per second, compared with Python loops over TraCI and libsumo, with MetaDrive and with SMARTS
     Peers,
-    /// Everything above, one after the other
+    /// All of these, one after the other
     All,
 }
 
@@ -41,7 +41,7 @@ impl BenchPart {
     }
 }
 
-/// Measure a part on this machine, side by side with its peers
+/// Measure a part of caraware on this machine, compared with its peers
 #[derive(Debug, Parser, Clone)]
 #[command(name = "caraware-bench", bin_name = "caraware bench", max_term_width = 110)]
 pub struct BenchArgs {
@@ -56,10 +56,10 @@ pub struct BenchArgs {
     /// Keep the figures in docs/benchmarks/ and regenerate docs/benchmarks.md
     #[arg(long)]
     pub keep: bool,
-    /// Small and short: tests that it works, not how fast it is
+    /// Measure only a small case: tests that the benchmark works, not how fast caraware is
     #[arg(long, conflicts_with = "keep")]
     pub quick: bool,
-    /// Python that has the peers installed [default: what `make peers` installed, or the project's]
+    /// Python that has the peers installed [default: that of `make peers`, or the project's]
     #[arg(long, value_name = "PATH")]
     pub python: Option<PathBuf>,
 }

@@ -1,4 +1,4 @@
-//! Environments side by side: vehicle-steps per second of 1, 2 and 4 of them, beside one that has one core to itself.
+//! Measures the rate of 1, 2 and 4 environments side by side, compared with one environment on a single core.
 
 use std::{
     fs,
@@ -13,7 +13,7 @@ use super::{BenchOptions, BenchReport, CurveLine, MedianSpread, ReportCurve, Rep
 
 /// Numbers of environments.
 const ENVIRONMENTS: [usize; 3] = [1, 2, 4];
-/// Repetitions: of all numbers in turn, so that a ratio is of runs that follow each other.
+/// Rounds, each with all numbers of environments in turn. Ratios compare runs of one round.
 const ROUNDS: usize = 5;
 /// Traffic of the town.
 const LOADS: [TownLoad; 2] = [
@@ -44,14 +44,14 @@ struct TownLoad {
     ticks: u32,
 }
 
-/// What is read of a run's report.
+/// The figures that are read from a run's report.
 #[derive(Debug, Deserialize)]
 struct RunFigures {
     vehicle_steps: u64,
     wall_s: f64,
 }
 
-/// A directory for the runs, removed with this.
+/// A directory for the runs. Dropping it removes the directory.
 struct RunsDirectory(PathBuf);
 
 impl Drop for RunsDirectory {
@@ -74,9 +74,10 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "envs",
         "Environments side by side",
         format!(
-            "`caraware simulate town --envs N`: N times SUMO, dynamics and sensors in one run, without a learner; vehicle-steps (observations) per \
-             wall second from everybody ready to the end. The base is one environment whose processes share one core. Ratios of runs that \
-             follow each other, median of {ROUNDS} (smallest–largest); ideal is the number of environments, or of cores ({}) if that is less.",
+            "`caraware simulate town --envs N` runs SUMO, dynamics and sensors N times, without a learner. The figures are vehicle-steps \
+             (observations) per wall second, from the moment when all processes are ready to the end. The base is one environment whose \
+             processes share one core. A ratio compares two runs of one round; it is the median of {ROUNDS} rounds (smallest–largest). The \
+             ideal is the number of environments, or of cores ({}) if that is less.",
             cores.len()
         ),
     );
@@ -95,6 +96,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     Ok(report)
 }
 
+/// Measures one load in all rounds, and adds its table and figures to the report.
 fn compare(
     load: &TownLoad,
     caraware: &Path,

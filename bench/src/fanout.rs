@@ -1,4 +1,4 @@
-//! What watching costs a run: nothing that can be measured while it keeps to the clock, little while it takes all cores.
+//! Measures what viewers cost a run: its lateness in real time, its rate at full speed, and its longest pause while the fan-out is killed.
 
 use std::{
     io::{BufRead as _, BufReader},
@@ -23,7 +23,7 @@ use super::{BenchOptions, BenchReport, MedianSpread, ReportTable};
 
 /// Wall time of a paced run, seconds.
 const PACED_S: u64 = 20;
-/// Time that viewers take to start and to get the whole picture.
+/// Time that viewers take to start and to receive all topics.
 const SETTLING: Duration = Duration::from_secs(3);
 /// Pairs of paced runs, and of free ones.
 const PACED_PAIRS: usize = 3;
@@ -32,14 +32,14 @@ const FREE_PAIRS: usize = 9;
 const FREE_TICKS: u64 = 12_000;
 /// Kills of the fan-out.
 const KILLS: u32 = 50;
-/// Between two looks at a board: often enough to see every tick.
-const LOOK: Duration = Duration::from_millis(2);
-/// A link of 1 Mbit/s.
+/// Interval at which a board is read: short enough to see every tick.
+const POLL_INTERVAL: Duration = Duration::from_millis(2);
+/// Rate of the slow viewer's link: 1 Mbit/s.
 const SLOW_BYTES_PER_S: u64 = 125_000;
-/// Longest wait for anything.
-const PATIENCE: Duration = Duration::from_secs(120);
+/// Longest wait for any event.
+const MAX_WAIT: Duration = Duration::from_secs(120);
 
-/// Measures all of it.
+/// Measures paced runs, free runs, and kills.
 ///
 /// # Errors
 /// A program is missing, or a run fails.
@@ -48,15 +48,15 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "fanout",
         "Fan-out",
         format!(
-            "The town, 52 road users. Watched means six viewers that count frames, one more that is stopped (SIGSTOP) and one behind a proxy that \
-             reads its socket at {SLOW_BYTES_PER_S} bytes/s (1 Mbit/s), on this very machine. Lateness is that of the observation of each tick \
-             behind its time, by the clock that the sensors look at once it is out."
+            "The town with 52 road users. A watched run has eight viewers on the same machine: six count frames, one is stopped (SIGSTOP), and \
+             one is behind a proxy that reads its socket at {SLOW_BYTES_PER_S} bytes/s (1 Mbit/s). Lateness is the time from the moment when an \
+             observation is due to the moment when `sensor-daemon` has sent it, by the clock of `sensor-daemon`."
         ),
     );
     let bench = FanoutBench::new(options)?;
-    bench.paced(&mut report)?;
-    bench.free(&mut report)?;
-    bench.kills(&mut report)?;
+    bench.measure_paced(&mut report)?;
+    bench.measure_free(&mut report)?;
+    bench.measure_kills(&mut report)?;
     Ok(report)
 }
 
@@ -104,8 +104,8 @@ impl FanoutBench {
         LiveRun::join(child, self.directory.join(name))
     }
 
-    /// Viewers: those that count, one that is stopped, one on a slow link.
-    fn audience(&self, run: &str, port: u16, seconds: u64) -> Result<Vec<CountingViewer>, Exit> {
+    /// Starts the viewers: six that count, one that is stopped, and one on a slow link.
+    fn start_viewers(&self, run: &str, port: u16, seconds: u64) -> Result<Vec<CountingViewer>, Exit> {
         let viewer = |arguments: &[String]| CountingViewer::start(&self.watch, run, port, seconds, arguments);
         let log = self.directory.join("world.csv");
         let healthy = viewer(&[
@@ -120,8 +120,8 @@ impl FanoutBench {
         Ok(vec![healthy, slow, stopped])
     }
 
-    /// Paced at real time: lateness of ticks without and with an audience, and the age of what the healthy see.
-    fn paced(&self, report: &mut BenchReport) -> Result<(), Exit> {
+    /// Measures runs in real time: the lateness of ticks without and with viewers, and the age of the frames that healthy viewers receive.
+    fn measure_paced(&self, report: &mut BenchReport) -> Result<(), Exit> {
         let mut table = ReportTable::new(
             "in real time",
             &[
@@ -145,21 +145,21 @@ impl FanoutBench {
                 let port = free_port()?;
                 let mut run = self.start(&name, Some(port), &settings)?;
                 run.wait_for_ticks(10)?;
-                let audience = match watched {
-                    true => self.audience(&name, port, PACED_S)?,
+                let viewers = match watched {
+                    true => self.start_viewers(&name, port, PACED_S)?,
                     false => Vec::new(),
                 };
-                // Eight programs that start on the cores of the run are not yet an audience.
+                // The start of eight programs on the cores of the run does not count.
                 run.observe(SETTLING);
                 let ticks = run.observe(Duration::from_secs(PACED_S - 1) - SETTLING);
-                let seen = audience.into_iter().map(CountingViewer::finish).collect::<Vec<_>>();
+                let seen = viewers.into_iter().map(CountingViewer::finish).collect::<Vec<_>>();
                 let late = lateness_ms(&ticks);
                 let found = run.finish()?;
                 hashes.push(found["observation_hash"].clone());
-                let who = if watched { "watched" } else { "alone" };
+                let case = if watched { "watched" } else { "alone" };
                 let at = |share| percentile(&late, share);
                 table.row([
-                    format!("{who}, {}", pair + 1),
+                    format!("{case}, {}", pair + 1),
                     format!("{:.2}", at(0.5)),
                     format!("{:.2}", at(0.95)),
                     format!("{:.2}", at(0.99)),
@@ -171,9 +171,9 @@ impl FanoutBench {
                         .take(8)
                         .collect(),
                 ]);
-                report.figure(format!("paced, {who}, lateness p99, ms"), at(0.99));
+                report.figure(format!("paced, {case}, lateness p99, ms"), at(0.99));
                 if watched {
-                    self.age(report, &ticks, &seen)?;
+                    self.report_ages(report, &ticks, &seen)?;
                 }
             }
         }
@@ -185,8 +185,8 @@ impl FanoutBench {
         Ok(())
     }
 
-    /// How old what a healthy viewer has just got is: since the tick stood on the sensors' board.
-    fn age(&self, report: &mut BenchReport, ticks: &[(u64, u64)], seen: &[Value]) -> Result<(), Exit> {
+    /// Reports the age of frames at healthy viewers: the time since `sensor-daemon` published the tick on its board.
+    fn report_ages(&self, report: &mut BenchReport, ticks: &[(u64, u64)], seen: &[Value]) -> Result<(), Exit> {
         let log = self.directory.join("world.csv");
         let text = std::fs::read_to_string(&log).map_err(|error| Exit::io("read", &log, &error))?;
         let made: std::collections::BTreeMap<u64, u64> = ticks.iter().copied().collect();
@@ -212,15 +212,15 @@ impl FanoutBench {
         Ok(())
     }
 
-    /// As fast as it goes: watched against without a fan-out, in alternating pairs.
-    fn free(&self, report: &mut BenchReport) -> Result<(), Exit> {
+    /// Measures runs at full speed, with viewers and without a fan-out, in alternating pairs.
+    fn measure_free(&self, report: &mut BenchReport) -> Result<(), Exit> {
         let settings = [
             format!("episode.ticks={FREE_TICKS}"),
             "episode.training_episodes=1".into(),
         ];
         let (mut ratios, mut hashes) = (Vec::new(), Vec::new());
         let mut table = ReportTable::new(
-            "as fast as it goes",
+            "at full speed",
             &["pair", "off (ticks/s)", "watched (ticks/s)", "ratio"],
         );
         for pair in 0..FREE_PAIRS {
@@ -230,13 +230,13 @@ impl FanoutBench {
                 let name = format!("free-{pair}-{watched}");
                 let mut run = self.start(&name, port, &settings)?;
                 run.wait_for_ticks(1)?;
-                let audience = match port {
-                    Some(port) => self.audience(&name, port, 600)?,
+                let viewers = match port {
+                    Some(port) => self.start_viewers(&name, port, 600)?,
                     None => Vec::new(),
                 };
-                // Viewers take their time to start: only what comes after counts.
+                // The rate counts from here on, after the viewers have started.
                 rates[place] = run.rate();
-                drop(audience);
+                drop(viewers);
                 hashes.push(run.finish()?["observation_hash"].clone());
             }
             let ratio = rates[1] / rates[0];
@@ -259,8 +259,8 @@ impl FanoutBench {
         Ok(())
     }
 
-    /// Kills the fan-out again and again; a viewer watches throughout.
-    fn kills(&self, report: &mut BenchReport) -> Result<(), Exit> {
+    /// Kills the fan-out again and again, while a viewer watches the run.
+    fn measure_kills(&self, report: &mut BenchReport) -> Result<(), Exit> {
         let settings = [
             "run.real_time_factor=10".to_owned(),
             "episode.ticks=1000000".into(),
@@ -276,14 +276,14 @@ impl FanoutBench {
             let board = run.fanout()?;
             let begun = Instant::now();
             while board.progress().attached != 1 || board.health().state != State::Running as u32 {
-                if begun.elapsed() > PATIENCE {
-                    return Err(Exit::run("the fan-out did not come back", ""));
+                if begun.elapsed() > MAX_WAIT {
+                    return Err(Exit::run("the fan-out was not restarted in time", ""));
                 }
                 ticks.extend(run.observe(Duration::from_millis(5)));
             }
             let pid = board.health().pid;
             memory_mib.push(resident_mib(pid));
-            // Between 0 and 0.4 s, scattered without a generator of random numbers.
+            // A pause between 0 and 0.4 s, scattered without random numbers.
             let wait = Duration::from_millis(u64::from(kill * 7919 % 400));
             ticks.extend(run.observe(wait));
             if let Some(pid) = Pid::from_raw(pid) {
@@ -325,7 +325,7 @@ impl FanoutBench {
     }
 }
 
-/// A run in the background, with its boards; stopped when dropped.
+/// A run in the background, with its boards. Dropping it stops the run.
 struct LiveRun {
     child: Child,
     directory: PathBuf,
@@ -349,8 +349,8 @@ impl LiveRun {
     fn join(mut child: Child, directory: PathBuf) -> Result<Self, Exit> {
         let begun = Instant::now();
         let started = directory.join("logs").join("traffic-bridge.log");
-        while begun.elapsed() < PATIENCE && matches!(child.try_wait(), Ok(None)) {
-            // Processes start when all services are there: looking earlier would meet them half made.
+        while begun.elapsed() < MAX_WAIT && matches!(child.try_wait(), Ok(None)) {
+            // Processes start once all services exist; before that, services may be incomplete.
             if started.exists()
                 && let Ok(run) = RunFile::read(&directory.join("run.json"))
                 && let Ok(node) = services::node(&run.shared_memory)
@@ -384,7 +384,7 @@ impl LiveRun {
     fn wait_for_ticks(&mut self, ticks: u64) -> Result<(), Exit> {
         let begun = Instant::now();
         while self.ticks() < ticks {
-            if begun.elapsed() > PATIENCE || !self.lives() {
+            if begun.elapsed() > MAX_WAIT || !self.lives() {
                 return Err(Exit::run(
                     format!("the run in {} did not start", self.directory.display()),
                     "",
@@ -395,8 +395,8 @@ impl LiveRun {
         Ok(())
     }
 
-    /// Number of ticks whenever it changes, and the UNIX time (ns) that it changed at: the sensors' own, for whoever looks on may
-    /// have to wait for a core like everybody else.
+    /// Every new number of ticks with the UNIX time (ns) of the change. The time is that of `sensor-daemon`, because this program may
+    /// have to wait for a core.
     fn observe(&mut self, time: Duration) -> Vec<(u64, u64)> {
         let begun = Instant::now();
         let mut seen = Vec::new();
@@ -412,7 +412,7 @@ impl LiveRun {
         seen
     }
 
-    /// Ticks per second from here on to shortly before the end.
+    /// Ticks per second from now to shortly before the end.
     fn rate(&mut self) -> f64 {
         let (from, begun) = (self.ticks(), Instant::now());
         let to = FREE_TICKS * 9 / 10;
@@ -427,7 +427,7 @@ impl LiveRun {
             .map_err(|error| Exit::run(format!("the board of the fan-out cannot be read: {error}"), ""))
     }
 
-    /// Waits for the end: the report.
+    /// Waits for the end and returns the report.
     fn finish(mut self) -> Result<Value, Exit> {
         let status = self.child.wait();
         let path = self.directory.join("report.json");
@@ -447,7 +447,7 @@ impl LiveRun {
     }
 }
 
-/// A viewer that counts; killed when dropped.
+/// A viewer that counts frames. Dropping it kills the viewer.
 struct CountingViewer {
     child: Child,
     output: BufReader<ChildStdout>,
@@ -461,7 +461,7 @@ impl Drop for CountingViewer {
 }
 
 impl CountingViewer {
-    /// Starts one and waits until it watches.
+    /// Starts a viewer and waits until it is connected.
     fn start(program: &Path, run: &str, port: u16, seconds: u64, arguments: &[String]) -> Result<Self, Exit> {
         let mut child = Command::new(program)
             .args([&format!("tcp/127.0.0.1:{port}"), run, "--seconds", &seconds.to_string()])
@@ -474,11 +474,11 @@ impl CountingViewer {
         let mut line = String::new();
         match output.read_line(&mut line) {
             Ok(_) if line.trim() == "watching" => Ok(Self { child, output }),
-            _ => Err(Exit::run("a viewer cannot attach", "its message above says why")),
+            _ => Err(Exit::run("a viewer cannot connect", "its message is above")),
         }
     }
 
-    /// What it counted; null of one that is stopped.
+    /// The counts of the viewer; null if it is stopped.
     fn finish(mut self) -> Value {
         let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap_or_default();
         if stat
@@ -505,12 +505,12 @@ fn signal(child: &Child, signal: Signal) {
 }
 
 fn pause() {
-    std::thread::park_timeout(LOOK);
+    std::thread::park_timeout(POLL_INTERVAL);
 }
 
 #[expect(
     clippy::disallowed_methods,
-    reason = "compared with what viewers, other processes, note"
+    reason = "compared with times that other processes, the viewers, record"
 )]
 fn unix_ns() -> u64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
@@ -524,7 +524,7 @@ fn free_port() -> Result<u16, Exit> {
         .map_err(|error| Exit::run(format!("no free port: {error}"), ""))
 }
 
-/// Lateness of each tick behind a clock of ten ticks a second that none of them is ahead of, sorted, milliseconds.
+/// Lateness of each tick, sorted, milliseconds. The reference is a clock of ten ticks a second that no tick is ahead of.
 fn lateness_ms(ticks: &[(u64, u64)]) -> Vec<f64> {
     let behind = |(tick, at_ns): &(u64, u64)| *at_ns as f64 / 1e6 - *tick as f64 * 100.0;
     let earliest = ticks.iter().map(behind).fold(f64::INFINITY, f64::min);

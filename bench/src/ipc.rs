@@ -1,4 +1,4 @@
-//! The observation hop: from publish to a visible tensor in another process, over the size of the block.
+//! Measures the observation hop: the time from publish to a visible tensor in another process, by the size of the block.
 
 mod summary;
 
@@ -31,23 +31,24 @@ use super::{BenchOptions, BenchReport};
 const SIZES: [usize; 8] = [1 << 10, 1 << 12, 1 << 14, 1 << 16, 1 << 18, 1 << 20, 1 << 22, 1 << 24];
 /// Fields of a row.
 const FIELDS: usize = 9;
-/// Rounds: the bare message, then ours, each in processes of its own.
+/// Rounds. Each measures the bare message and then ours, in new processes.
 const ROUNDS: usize = 5;
 /// Bare messages in a round.
 const BARE: usize = 4_000;
-/// Turns that all sizes take within a round. The machine's pace changes from second to second: no size has a second of its own. In every
-/// other turn the sender writes the whole block, as `sensor-daemon` does; in the others its first and last value, so that what it has
-/// in its caches does not depend on the size.
+/// Turns in a round; each turn sends all sizes, because the machine's pace changes from second to second.
+///
+/// In every other turn the sender writes the whole block, as `sensor-daemon` does. In the others it writes only the first and the last
+/// value, so that the contents of its caches do not depend on the size.
 const TURNS: usize = 40;
 /// Messages of a turn, and those at its beginning that are not measured.
 const MESSAGES: usize = 50;
 const WARM_UP: usize = 10;
-/// Pause after a message has been taken: the receiver polls again.
+/// Pause after a message was taken, until the receiver polls again.
 const PAUSE: Duration = Duration::from_micros(100);
 /// Longest wait for the receiver.
-const PATIENCE: Duration = Duration::from_secs(60);
+const MAX_WAIT: Duration = Duration::from_secs(60);
 
-/// What the receivers write: latencies in nanoseconds.
+/// The output of `ipc-bench`: latencies in nanoseconds.
 #[derive(Debug, Deserialize)]
 struct BareLatencies {
     latencies_ns: Vec<f64>,
@@ -65,14 +66,14 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         let bare: BareLatencies = super::report::from_program(program)?;
         rounds.push(LatencyRound {
             bare: bare.latencies_ns,
-            ours: ours()?,
+            ours: measure_ours()?,
         });
     }
-    let peers = peers(options)?;
+    let peers = measure_peers(options)?;
     summary::report(&rounds, &peers)
 }
 
-/// The bare message and ours, one after the other: latencies in nanoseconds.
+/// Latencies of one round: the bare message, then ours, nanoseconds.
 struct LatencyRound {
     bare: Vec<f64>,
     ours: OurLatencies,
@@ -81,22 +82,26 @@ struct LatencyRound {
 /// Size of the block, bytes → latencies, nanoseconds.
 type LatenciesBySize = BTreeMap<usize, Vec<f64>>;
 
-/// Ours: until the block is in the receiver's hands, until it is a tensor that is lent, and until it is a tensor of an observation that
-/// may be kept; and the second of these where the sender has written two values of the block.
+/// Latencies of the channel `observation`.
 struct OurLatencies {
+    /// Until the receiver has taken the block.
     taken: LatenciesBySize,
+    /// Until Python has a lent tensor over the block.
     tensor: LatenciesBySize,
+    /// Until Python has the tensor of an observation that it may keep.
     received: LatenciesBySize,
-    hardly_written: LatenciesBySize,
+    /// As `tensor`, where the sender wrote only two values of the block.
+    two_values_written: LatenciesBySize,
 }
 
-/// Rows whose block has `bytes` bytes.
+/// Number of rows in a block of `bytes` bytes.
 fn rows(bytes: usize) -> usize {
     bytes / (ObservationLayout::new(1024, FIELDS, 1).len / 1024)
 }
 
 /// Sends blocks of every size through the services of a real run to a trainer process that polls.
-fn ours() -> Result<OurLatencies, Exit> {
+fn measure_ours() -> Result<OurLatencies, Exit> {
+    // A real run without processes: its services, its roster and its run file.
     let directory = tempfile::tempdir().map_err(|error| Exit::io("create", &std::env::temp_dir(), &error))?;
     let args = RunArgs {
         set: vec![
@@ -115,6 +120,7 @@ fn ours() -> Result<OurLatencies, Exit> {
     let _roster = RosterWriter::create(&holder)?;
     let run_file = run.write()?;
     let board = BoardReader::open(&node, &run, 0, Process::Trainer)?;
+    // The receiver attaches as the trainer and receives all blocks.
     let receiver = Command::new(&prepared.install.python)
         .args(["-m", &run.config.trainer.module])
         .arg(&run_file)
@@ -125,6 +131,7 @@ fn ours() -> Result<OurLatencies, Exit> {
     receiver.wait_until("attach", || board.progress().attached == 1)?;
     send_all(&run, &board, &mut receiver)?;
     receiver.wait_until("finish", || State::from_u32(board.health().state) == State::Done)?;
+    // Latencies by way, size and kind of turn, without the first messages of each turn.
     let latencies: BTreeMap<String, BTreeMap<usize, Vec<[f64; 2]>>> = read(&run.run_dir.join("latencies.json"))?;
     let of = |way: &str, which: usize, first_turn: usize| -> LatenciesBySize {
         let measured = |bytes: usize| {
@@ -143,11 +150,11 @@ fn ours() -> Result<OurLatencies, Exit> {
         taken: of("lent", 0, 0),
         tensor: of("lent", 1, 0),
         received: of("received", 1, 0),
-        hardly_written: of("lent", 1, 1),
+        two_values_written: of("lent", 1, 1),
     })
 }
 
-/// The trainer's process; killed when dropped.
+/// The process that receives as the trainer. Dropping it kills the process.
 struct ReceiverProcess(Child);
 
 impl ReceiverProcess {
@@ -157,10 +164,10 @@ impl ReceiverProcess {
             if let Ok(Some(status)) = self.0.try_wait() {
                 return Err(Exit::run(
                     format!("the receiver ended with {status}"),
-                    "its message above says why",
+                    "its message is above",
                 ));
             }
-            if begin.elapsed() > PATIENCE {
+            if begin.elapsed() > MAX_WAIT {
                 return Err(Exit::run(format!("the receiver did not {what} in time"), ""));
             }
             std::thread::park_timeout(Duration::from_millis(5));
@@ -171,12 +178,13 @@ impl ReceiverProcess {
 
 impl Drop for ReceiverProcess {
     fn drop(&mut self) {
-        // Gone already, unless the measurement failed.
+        // It has already ended unless the measurement failed.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
+/// Sends the blocks of all turns, each once the receiver has taken the one before.
 fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) -> Result<(), Exit> {
     let failed = |error: ipc_schema::membership::MembershipError| Exit::run(error.to_string(), "");
     let membership =
@@ -190,7 +198,7 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) 
         let asked = Instant::now();
         while board.progress().consumed_ticks < tick {
             std::hint::spin_loop();
-            if asked.elapsed() > PATIENCE {
+            if asked.elapsed() > MAX_WAIT {
                 return receiver.wait_until("take a block", || false);
             }
         }
@@ -216,14 +224,14 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) 
             flags: if tick == last { LAST_OF_RUN } else { 0 },
             ..membership.header()
         };
-        // The message is complete. Only the time is still to come.
+        // The time is written last, right before the message is sent.
         draft.header_mut().sim_time_ns = monotonic_ns();
         draft.send()?;
     }
     Ok(())
 }
 
-fn peers(options: &BenchOptions) -> Result<BTreeMap<String, LatenciesBySize>, Exit> {
+fn measure_peers(options: &BenchOptions) -> Result<BTreeMap<String, LatenciesBySize>, Exit> {
     let Some(python) = &options.python else {
         return Ok(BTreeMap::new());
     };
@@ -237,11 +245,11 @@ fn peers(options: &BenchOptions) -> Result<BTreeMap<String, LatenciesBySize>, Ex
     if !status.success() {
         return Err(Exit::run(
             format!("the peers ended with {status}"),
-            "their message above says why",
+            "their message is above",
         ));
     }
     let all = read(&file)?;
-    // Read: nobody needs it any more.
+    // The file has been read and is not needed any more.
     let _ = std::fs::remove_file(&file);
     Ok(all)
 }

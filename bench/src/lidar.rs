@@ -1,4 +1,4 @@
-//! Rays per second of the LIDAR, beside general ray tracers on the same scene.
+//! Measures the LIDAR's rays per second, compared with general ray tracers on the same scene.
 
 use std::{collections::BTreeMap, process::Command};
 
@@ -7,7 +7,7 @@ use serde::Deserialize;
 
 use super::{BenchOptions, BenchReport, ReportTable};
 
-/// What `lidar-bench` writes.
+/// The output of `lidar-bench`.
 #[derive(Debug, Deserialize)]
 struct LidarFigures {
     path: String,
@@ -33,7 +33,7 @@ struct RayCasterPeer {
 /// Runs `lidar-bench`.
 ///
 /// # Errors
-/// It is not built, or fails.
+/// The program is not built, or it fails.
 pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let mut command = Command::new(install::program(&options.bin, "lidar-bench")?);
     if let Some(python) = &options.python {
@@ -44,8 +44,9 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "lidar",
         "LIDAR",
         format!(
-            "500 buildings, 200 moving vehicles, 16 LIDARs of 32 × 1800 rays, 100 m, with noise and tags, points written to shared memory; one \
-             core, processor time, {}. The peers cast the same rays at the same triangles in the same run, and return distances only.",
+            "500 buildings, 200 moving vehicles, and 16 LIDARs of 32 × 1800 rays with a range of 100 m, noise and tags, whose points are written \
+             to shared memory. The figures are processor time on one core with {}. The peers cast the same rays at the same triangles in the \
+             same run, and return distances only.",
             measured.path
         ),
     );
@@ -77,7 +78,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         report.figure(format!("ratio to {name}"), peer.ratio);
     }
     if peers.rows.is_empty() {
-        report.text += " No peer is installed here: `pip install open3d-cpu embreex`.";
+        report.text += " No peer is installed on this machine: `pip install open3d-cpu embreex`.";
     } else {
         report.tables.push(peers);
     }

@@ -1,6 +1,6 @@
-//! `caraware bench`: measures a part of caraware on this machine, side by side with what others use for the same work.
+//! `caraware bench`: measures a part of caraware on this machine, compared with other tools for the same work.
 //!
-//! The `caraware` command starts this program with its arguments. One file for each part; all end in a [`BenchReport`]. Decision 9.
+//! The `caraware` command starts this program with its arguments. Each part has a file, and its result is a [`BenchReport`] (decision 9).
 
 mod cli;
 mod envs;
@@ -25,14 +25,14 @@ use clap::Parser as _;
 use crate::cli::{BenchArgs, BenchPart};
 use report::{BenchReport, CurveLine, MedianSpread, ReportCurve, ReportTable};
 
-/// What every measurement may need.
+/// Options of a measurement.
 #[derive(Debug, Clone)]
 pub struct BenchOptions {
-    /// Directory of our programs.
+    /// Directory of caraware's programs.
     pub bin: PathBuf,
     /// Python that has the peers installed, if there is one.
     pub python: Option<PathBuf>,
-    /// Whether only the way is tried: small, short, no figures to keep.
+    /// True if only a small case is measured, whose figures are not kept.
     pub quick: bool,
 }
 
@@ -43,13 +43,13 @@ fn main() -> ExitCode {
     }
 }
 
-/// Measures, prints, and writes what is asked for.
+/// Measures the parts, prints their reports, and writes the files that the arguments ask for.
 ///
 /// # Errors
-/// Something the measurement needs is missing, or it fails.
+/// A program or package is missing, or a measurement fails.
 fn bench(args: &BenchArgs) -> Result<(), Exit> {
     let bin = install::programs()?;
-    // The peers are Python packages that nothing else needs: without them, ours is measured alone.
+    // Only the benchmarks need the peers. Without them caraware is measured alone.
     let python = args
         .python
         .clone()
@@ -67,7 +67,7 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
     let mut reports = Vec::new();
     for part in parts {
         let report = measure(part, &options)?;
-        // A reader that went away (`| head`) does not undo a measurement.
+        // A closed standard output (`| head`) is ignored: the measurement is done.
         let _ = writeln!(std::io::stdout(), "{report}");
         if args.keep {
             page::keep(&report)?;

@@ -1,22 +1,22 @@
-//! What co-simulation costs beside bare SUMO on the same scenario.
+//! Measures the cost of co-simulation, compared with bare SUMO on the same scenario.
 
 use caraware::{failure::Exit, generate::GeneratedCity, install::Install};
 
 use super::{
     BenchOptions, BenchReport, MedianSpread, ReportTable,
-    sides::{BenchDirectory, ComparedScenario, OurRun, same_results},
+    sides::{BenchDirectory, ComparedScenario, OurRun, compare_results},
     stages::StageTimes,
 };
 
 /// Vehicles, simulated seconds, pairs.
 const SIZE: (u32, f64, usize) = (5000, 60.0, 5);
-/// The same when only the way is tried.
+/// The same with `--quick`.
 const QUICK: (u32, f64, usize) = (60, 6.0, 1);
 
-/// Runs bare SUMO and ours in turn on a generated city.
+/// Runs bare SUMO and caraware in turn on a generated city.
 ///
 /// # Errors
-/// Either fails, or SUMO's results differ.
+/// One of them fails, or SUMO's results differ.
 pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let (vehicles, duration_s, pairs) = if options.quick { QUICK } else { SIZE };
     let place = BenchDirectory::new("overhead")?;
@@ -31,7 +31,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     for pair in 1..=pairs {
         let (bare, results) = scenario.bare()?;
         let ours = scenario.ours()?;
-        files = same_results(&results, &ours.results)?;
+        files = compare_results(&results, &ours.results)?;
         let ratio = ours.taken.wall_s / bare.wall_s;
         table.row([
             pair.to_string(),
@@ -49,10 +49,11 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "overhead",
         "Co-simulation beside bare SUMO",
         format!(
-            "{vehicles} vehicles on a generated city (`caraware generate`), {duration_s} s at steps of 0.1 s: bare `sumo`, then ours, in turn. \
-             Ours moves every vehicle at 100 Hz, samples GNSS, IMU, speed and steering of all of them every 0.1 s, and delivers them to a \
-             consumer's torch tensor in a process of its own. Wall time from start to end of the program, loading included: ratio {ratio:.3}. \
-             The {files} result files of SUMO are identical in both, but for the comment at their head and the milliseconds that a step took."
+            "{vehicles} vehicles on a generated city (`caraware generate`), {duration_s} s at steps of 0.1 s. Bare `sumo` and caraware (ours) \
+             run in turn. Ours moves every vehicle at 100 Hz, samples GNSS, IMU, speed and steering of every vehicle each 0.1 s, and delivers \
+             them to a torch tensor in the consumer's process. The ratio of wall times, from start to end of the program with loading, is \
+             {ratio:.3}. The {files} result files of SUMO are identical on both sides, except for the comment at their head and the \
+             milliseconds that a step took."
         ),
     );
     report.figure("ratio of wall times", ratio.median);
@@ -65,7 +66,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     Ok(report)
 }
 
-/// Where processor time goes in one run.
+/// Processor time of one run by stage.
 fn stages(ours: &OurRun, report: &mut BenchReport) -> ReportTable {
     let stages = StageTimes::of(ours);
     let mut table = ReportTable::new(

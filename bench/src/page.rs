@@ -1,4 +1,4 @@
-//! `docs/benchmarks.md`: generated from the reports that are kept in `docs/benchmarks/`.
+//! Generates `docs/benchmarks.md` from the reports that are kept in `docs/benchmarks/`.
 
 use std::path::{Path, PathBuf};
 
@@ -19,23 +19,23 @@ fn documentation() -> PathBuf {
 /// Keeps a report in the documentation.
 ///
 /// # Errors
-/// The source tree is not there or not writable.
+/// The source tree is missing or not writable.
 pub fn keep(report: &BenchReport) -> Result<(), Exit> {
     let path = documentation().join("benchmarks").join(format!("{}.json", report.part));
     let text = serde_json::to_string_pretty(report).unwrap_or_default();
     std::fs::write(&path, text + "\n").map_err(|error| Exit::io("write", &path, &error))
 }
 
-/// Writes the page anew.
+/// Writes the page.
 ///
 /// # Errors
-/// The source tree is not there or not writable, or a kept report cannot be read.
+/// The source tree is missing or not writable, or a kept report cannot be read.
 pub fn write() -> Result<(), Exit> {
     let path = documentation().join("benchmarks.md");
     std::fs::write(&path, page()?).map_err(|error| Exit::io("write", &path, &error))
 }
 
-/// The page as the kept reports have it.
+/// The text of the page, from the kept reports.
 fn page() -> Result<String, Exit> {
     let directory = documentation().join("benchmarks");
     let mut text = HEAD.to_owned();
@@ -71,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_page_is_what_the_kept_reports_make() {
+    fn the_page_is_generated_from_the_kept_reports() {
         let kept = std::fs::read_to_string(documentation().join("benchmarks.md")).unwrap();
         let made = page().unwrap();
         if std::env::var_os("CARAWARE_BLESS").is_some() {

@@ -1,4 +1,4 @@
-//! What else one would use: Python loops over TraCI and libsumo on the same traffic, MetaDrive and SMARTS.
+//! Measures the alternatives: Python loops over TraCI and libsumo on the same traffic, MetaDrive and SMARTS.
 
 use std::{
     collections::BTreeMap,
@@ -12,22 +12,22 @@ use serde::Deserialize;
 use super::{
     BenchOptions, BenchReport, MedianSpread, ReportTable,
     report::from_program,
-    sides::{BenchDirectory, ComparedScenario, same_results},
+    sides::{BenchDirectory, ComparedScenario, compare_results},
 };
 
-/// How much is measured.
+/// The sizes of a measurement.
 struct PeersSize {
-    /// Vehicles of the city, all on the road throughout.
+    /// Vehicles of the large city, all on the road throughout.
     vehicles: u32,
-    /// Simulated time there, seconds.
+    /// Simulated time of the large city, seconds.
     duration_s: f64,
-    /// Of its steps, those of the TraCI loop, which is slow.
+    /// Steps of the TraCI loop, which is slow and makes only a part of the city's steps.
     traci_steps: u32,
-    /// Simulated time with as many vehicles as a driving environment has agents, seconds: the start of torch is to be a small part.
+    /// Simulated time of the small city, seconds: long enough to make the import of torch a small part.
     few_duration_s: f64,
     /// Wall time of each case of a driving environment, seconds.
     driving_s: f64,
-    /// Rounds; everybody is measured once in each.
+    /// Rounds; each measures caraware and every peer once.
     rounds: usize,
 }
 
@@ -39,7 +39,7 @@ const SIZE: PeersSize = PeersSize {
     driving_s: 10.0,
     rounds: 5,
 };
-/// The same when only the way is tried.
+/// The same with `--quick`.
 const QUICK: PeersSize = PeersSize {
     vehicles: 60,
     duration_s: 6.0,
@@ -50,18 +50,18 @@ const QUICK: PeersSize = PeersSize {
 };
 /// SUMO's step, seconds.
 const STEP_S: f64 = 0.1;
-/// Room for road users that a run asks for at least: the default demand, which a scenario replaces, has to fit.
+/// Least `traffic.max_road_users` of a run: the default demand must fit, although a scenario replaces it.
 const LEAST_ROOM: u32 = 64;
-/// As many vehicles as MetaDrive's roundabout has agents.
+/// Vehicles of the small city: as many as MetaDrive's roundabout has agents.
 const FEW: u32 = 40;
 
-/// A driving environment in a Python environment of its own.
+/// A driving environment that is installed in its own virtual environment.
 struct DrivingPeer {
-    /// Its name.
+    /// Its name in the report.
     name: &'static str,
-    /// How `caraware_bench.peer` calls it.
+    /// Its name in `caraware_bench.peer`.
     peer: &'static str,
-    /// Its environment.
+    /// Directory of its virtual environment.
     environment: &'static str,
 }
 
@@ -78,26 +78,26 @@ const DRIVING: [DrivingPeer; 2] = [
     },
 ];
 
-/// What `caraware_bench.peer` writes.
+/// The output of `caraware_bench.peer`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(untagged)]
 enum PeerAnswer {
-    /// It was measured.
+    /// The peer was measured.
     Rates {
         version: String,
         /// Case → steps of a vehicle in a wall second.
         rates: BTreeMap<String, f64>,
     },
-    /// It is not installed there.
+    /// The peer is not installed.
     Missing { missing: String },
 }
 
-/// A kind of peers over all rounds.
+/// The answers of one kind of peers in all rounds.
 #[derive(Debug, Default)]
 struct PeerRounds {
     /// Case → rates, one for each round.
     rates: BTreeMap<String, Vec<f64>>,
-    /// Peer → why there is none.
+    /// Peer → the reason why it was not measured.
     missing: BTreeMap<String, String>,
     /// Peer → version.
     versions: BTreeMap<String, String>,
@@ -120,12 +120,12 @@ impl PeerRounds {
     }
 }
 
-/// Everything that was measured, by round.
+/// All measurements, by round.
 #[derive(Debug, Default)]
 struct PeersFigures {
-    /// Ours, many vehicles: sensed vehicle-steps in a wall second.
+    /// Ours on the large city: sensed vehicle-steps per wall second.
     many: Vec<f64>,
-    /// Ours, as many vehicles as a driving environment has agents.
+    /// The same on the small city.
     few: Vec<f64>,
     loops: PeerRounds,
     driving: PeerRounds,
@@ -139,26 +139,26 @@ impl PeersFigures {
     }
 }
 
-/// Measures ours and every peer in turn.
+/// Measures caraware and every peer in turn.
 ///
 /// # Errors
 /// A run fails, an installed peer fails, or SUMO's results differ between ours and the loop over libsumo.
 pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let size = if options.quick { &QUICK } else { &SIZE };
-    // One each: both sides number their runs.
+    // All cities share one directory, which numbers their runs.
     let place = BenchDirectory::new("peers")?;
     let (many, _) = city(options, &place, size.vehicles, size.duration_s)?;
     let (few, few_net) = city(options, &place, FEW, size.few_duration_s)?;
     let mut measured = PeersFigures::default();
     for _ in 0..size.rounds {
-        let results = loops(options, size, &many, &mut measured.loops)?;
+        let results = run_loops(options, size, &many, &mut measured.loops)?;
         let ours = many.ours()?;
         if let Some(theirs) = results {
-            same_results(&theirs, &ours.results)?;
+            compare_results(&theirs, &ours.results)?;
         }
         measured.many.push(ours.number("/env_steps_per_s"));
         for peer in &DRIVING {
-            let answer = drive(options, &place, peer, &few_net, size.driving_s)?;
+            let answer = run_driving(options, &place, peer, &few_net, size.driving_s)?;
             let install_by = format!("peers-{}", peer.peer);
             measured.driving.add(peer.name, answer, &install_by);
         }
@@ -167,7 +167,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     report(size, &measured)
 }
 
-/// A generated city for both sides, and its net.
+/// Generates a city for both sides; returns it with its net.
 fn city<'a>(
     options: &BenchOptions,
     place: &'a BenchDirectory,
@@ -181,8 +181,8 @@ fn city<'a>(
     Ok((scenario, directory.join("city.net.xml")))
 }
 
-/// Both Python loops over SUMO; where the one over libsumo, which goes to the end, has SUMO's results.
-fn loops(
+/// Runs both Python loops over SUMO. Returns the directory of SUMO's results of the loop over libsumo, which runs to the end.
+fn run_loops(
     options: &BenchOptions,
     size: &PeersSize,
     city: &ComparedScenario,
@@ -210,8 +210,8 @@ fn loops(
     Ok(results)
 }
 
-/// One driving environment in its own Python.
-fn drive(
+/// Measures one driving environment with its own Python.
+fn run_driving(
     options: &BenchOptions,
     place: &BenchDirectory,
     peer: &DrivingPeer,
@@ -219,7 +219,7 @@ fn drive(
     seconds: f64,
 ) -> Result<PeerAnswer, Exit> {
     let Some(python) = install::environment_python(&options.bin, peer.environment) else {
-        let missing = format!("there is no {}", peer.environment);
+        let missing = format!("{} does not exist", peer.environment);
         return Ok(PeerAnswer::Missing { missing });
     };
     let mut command = Command::new(python);
@@ -227,7 +227,7 @@ fn drive(
         .args(["-m", "caraware_bench.peer", peer.peer, "--net"])
         .arg(net)
         .args(["--seconds", &seconds.to_string()])
-        // SMARTS keeps logs there.
+        // SMARTS writes logs to the home directory.
         .env("HOME", place.path());
     from_program(command)
 }
@@ -244,16 +244,17 @@ fn report(size: &PeersSize, measured: &PeersFigures) -> Result<BenchReport, Exit
         "peers",
         "Beside Python loops over SUMO, MetaDrive and SMARTS",
         format!(
-            "Steps of a vehicle in a wall second, loading left out, but for the consumer's torch, which counts against ours; everybody in turn, median of {rounds} rounds; a ratio is of one round, with the \
-             smallest and the largest. Ours makes everybody's state at every 0.1 s, moves everybody at 100 Hz, samples GNSS, IMU, speed and steering of \
-             everybody, and delivers them to a consumer's torch tensor in a process of its own. The Python loops run the same generated city of \
-             {vehicles} vehicles at steps of 0.1 s, SUMO's own time included, and call the getters that our bridge calls at every step \
-             (position, angle, speed, signals at every fourth), for every vehicle; they compute nothing from them. The one over libsumo goes to the \
-             end at {duration_s} s and leaves the same results of SUMO as ours; the one over TraCI makes {traci_steps} steps. The driving environments step \
-             their agents by 0.1 s; resets are left out. Their own vehicle models and observations differ from ours and from each other: they \
-             are compared in how many vehicles a learner gets a new observation of in a second. MetaDrive steers 40 agents by its Bullet \
-             physics (without a window, with the models and textures of its version 0.3.0.1); SMARTS has eight agents and no other traffic on \
-             the net of our city of {FEW} vehicles, moved by its lane-following controller. Versions: {}.",
+            "Vehicle-steps per wall second without loading; only the import of torch in our consumer counts, against ours. caraware (ours) and the \
+             peers are measured in turn; figures are medians of {rounds} rounds, and a ratio compares rates of one round (smallest–largest). Ours \
+             reads every vehicle's state each 0.1 s, moves every vehicle at 100 Hz, samples its GNSS, IMU, speed and steering, and delivers them to \
+             a torch tensor in the consumer's process. The Python loops run the same generated city of {vehicles} vehicles at steps of 0.1 s, with \
+             SUMO's own time included. For every vehicle they call the getters that `traffic-bridge` calls at every step (position, angle, speed, \
+             and signals at every fourth step), and compute nothing from them. The loop over libsumo runs to the end at {duration_s} s and leaves \
+             the same results of SUMO as ours; the loop over TraCI makes {traci_steps} steps. The driving environments step their agents by 0.1 s; \
+             resets do not count. Their vehicle models and observations differ from ours and from each other, so the comparison is the number of \
+             vehicles of which a learner gets a new observation in a second. MetaDrive drives 40 agents with its Bullet physics (without a window, \
+             with the models and textures of its version 0.3.0.1). SMARTS has eight agents, moved by its lane-following controller, and no other \
+             traffic on the net of our city of {FEW} vehicles. Versions: {}.",
             measured.versions()
         ),
     );
@@ -265,7 +266,7 @@ fn report(size: &PeersSize, measured: &PeersFigures) -> Result<BenchReport, Exit
 
 fn loops_table(measured: &PeersFigures, report: &mut BenchReport) -> Result<ReportTable, Exit> {
     let mut table = ReportTable::new(
-        "Every vehicle of SUMO in a program's hands",
+        "Python loops that read every vehicle of SUMO",
         &["how", "vehicle-updates/s", "ours is faster by", "smallest–largest"],
     );
     let ours = MedianSpread::of(measured.many.iter().copied())?;
@@ -331,7 +332,7 @@ fn driving_table(size: &PeersSize, measured: &PeersFigures, report: &mut BenchRe
     Ok(table)
 }
 
-/// How much faster ours was, round by round.
+/// Ratio of our rate to theirs, round by round.
 fn ratio(ours: &[f64], theirs: &[f64]) -> Result<MedianSpread, Exit> {
     MedianSpread::of(ours.iter().zip(theirs).map(|(ours, theirs)| ours / theirs))
 }
@@ -346,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_that_is_not_installed_has_a_row_that_says_so() {
+    fn a_peer_that_is_not_installed_has_a_row_with_the_reason() {
         let mut measured = PeersFigures {
             many: vec![200.0, 300.0],
             few: vec![50.0, 50.0],

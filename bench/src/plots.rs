@@ -1,4 +1,4 @@
-//! Pictures of a report's curves, drawn by the project's Python as the trainer's plots are.
+//! Draws a report's curves as pictures with the project's Python, like the trainer's plots.
 
 use std::{
     io::Write as _,
@@ -13,7 +13,7 @@ use super::BenchReport;
 /// Draws every curve of `reports` into `directory`.
 ///
 /// # Errors
-/// Not writable, or Python fails.
+/// The directory is not writable, or Python fails.
 pub fn draw(python: &Path, reports: &[BenchReport], directory: &Path) -> Result<(), Exit> {
     std::fs::create_dir_all(directory).map_err(|error| Exit::io("create", directory, &error))?;
     let failed = |error: &std::io::Error| Exit::io("start", python, error);
@@ -33,6 +33,6 @@ pub fn draw(python: &Path, reports: &[BenchReport], directory: &Path) -> Result<
     }
     Err(Exit::run(
         format!("drawing the plots ended with {status}"),
-        "its message above says why",
+        "its message is above",
     ))
 }

@@ -1,28 +1,28 @@
-//! What a measurement found, in one form for the terminal, for files and for the documentation.
+//! The report of a measurement: one form for the terminal, for files and for the documentation.
 
 use std::{collections::BTreeMap, fmt, process::Command};
 
 use caraware::failure::Exit;
 use serde::{Deserialize, Serialize};
 
-/// What one part's measurement found.
+/// The results of measuring one part.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BenchReport {
     /// The part, as `caraware bench` names it.
     pub part: String,
-    /// One line: what was measured.
+    /// Title of the part, one line.
     pub title: String,
-    /// What is compared with what, and how.
+    /// What is compared, and how.
     pub text: String,
-    /// The command that prints it again.
+    /// The command that measures it again.
     pub command: String,
-    /// Where it was measured.
+    /// The machine that it was measured on.
     pub machine: MachineDescription,
-    /// The figures for people.
+    /// The figures for readers.
     pub tables: Vec<ReportTable>,
     /// The figures for programs: name with unit → value.
     pub figures: BTreeMap<String, f64>,
-    /// What is worth a picture.
+    /// The curves that can be drawn.
     #[serde(default)]
     pub curves: Vec<ReportCurve>,
 }
@@ -120,7 +120,7 @@ fn revision() -> String {
             .ok()?;
         (output.status.success()).then(|| String::from_utf8_lossy(&output.stdout).trim().to_owned())
     };
-    // Figures that are kept change nothing that is measured.
+    // The documentation, which holds the kept figures, does not change the measured programs.
     let measured = ["--", ":(top)", ":(top,exclude)docs"];
     let status = [&["status", "--porcelain", "--untracked-files=no"][..], &measured].concat();
     let changed = git(&status).is_some_and(|text| !text.is_empty());
@@ -133,7 +133,7 @@ fn revision() -> String {
 /// Rows of text under column names.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ReportTable {
-    /// What the rows have in common; may be empty.
+    /// Title over the rows; may be empty.
     pub title: String,
     /// Names of the columns, with units.
     pub columns: Vec<String>,
@@ -206,7 +206,7 @@ pub struct ReportCurve {
     pub x: String,
     /// The vertical axis, with unit.
     pub y: String,
-    /// Whether the axes are logarithmic: horizontal, vertical.
+    /// True for each logarithmic axis: horizontal, vertical.
     pub logarithmic: [bool; 2],
     /// The lines.
     pub lines: Vec<CurveLine>,
@@ -224,7 +224,7 @@ pub struct CurveLine {
 /// Median, smallest and largest of repeated measurements.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct MedianSpread {
-    /// The middle one; of an even number, the mean of the middle two.
+    /// The middle value; for an even number of values, the mean of the middle two.
     pub median: f64,
     /// The smallest.
     pub smallest: f64,
@@ -233,10 +233,10 @@ pub struct MedianSpread {
 }
 
 impl MedianSpread {
-    /// Of at least one value.
+    /// Computes the spread of at least one value.
     ///
     /// # Errors
-    /// There is none.
+    /// There is no value.
     pub fn of(values: impl IntoIterator<Item = f64>) -> Result<Self, Exit> {
         let mut values: Vec<f64> = values.into_iter().collect();
         values.sort_by(f64::total_cmp);
@@ -267,10 +267,10 @@ impl fmt::Display for MedianSpread {
     }
 }
 
-/// Runs a program of ours that measures and takes `--json FILE`; its own words go to standard error.
+/// Runs a measuring program that takes `--json FILE`, and reads that file. Its standard output goes to standard error.
 ///
 /// # Errors
-/// It cannot be started, fails, or writes something else.
+/// The program cannot be started, fails, or writes another form.
 pub fn from_program<T: serde::de::DeserializeOwned>(mut command: Command) -> Result<T, Exit> {
     let program = command.get_program().to_string_lossy().into_owned();
     let file = std::env::temp_dir().join(format!("caraware-bench-{}.json", std::process::id()));
@@ -281,15 +281,16 @@ pub fn from_program<T: serde::de::DeserializeOwned>(mut command: Command) -> Res
         .status()
         .map_err(|error| Exit::io("start", program.as_ref(), &error))?;
     let text = std::fs::read_to_string(&file).unwrap_or_default();
-    // Absent if the program failed before writing it.
+    // The file is missing if the program failed before it wrote the file.
     let _ = std::fs::remove_file(&file);
     if !status.success() {
         return Err(Exit::run(
             format!("{program} ended with {status}"),
-            "its message above says why",
+            "its message is above",
         ));
     }
-    serde_json::from_str(&text).map_err(|error| Exit::run(format!("{program} wrote no report: {error}"), ""))
+    serde_json::from_str(&text)
+        .map_err(|error| Exit::run(format!("the report of {program} cannot be read: {error}"), ""))
 }
 
 #[cfg(test)]

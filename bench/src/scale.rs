@@ -1,10 +1,10 @@
-//! Cost and memory for each vehicle, from a thousand to fifty thousand; and what a real motorway and long steps of SUMO do.
+//! Measures cost and memory of a vehicle with 1 000 to 50 000 vehicles, on a real motorway, and with long steps of SUMO.
 
 use caraware::{failure::Exit, generate::GeneratedCity, install::Install};
 
 use super::{
     BenchOptions, BenchReport, CurveLine, ReportCurve, ReportTable,
-    sides::{BenchDirectory, ComparedScenario, OurRun, ProcessCost, same_results},
+    sides::{BenchDirectory, ComparedScenario, OurRun, ProcessCost, compare_results},
     stages::StageTimes,
 };
 
@@ -16,7 +16,7 @@ const CITIES: [(u32, f64); 5] = [
     (20_000, 20.0),
     (50_000, 12.0),
 ];
-/// The same when only the way is tried.
+/// The same with `--quick`.
 const QUICK: [(u32, f64); 2] = [(50, 5.0), (100, 5.0)];
 /// Vehicles and simulated seconds of city and country at steps of 1 s.
 const LONG_STEPS: (u32, f64) = (20_000, 180.0);
@@ -26,7 +26,7 @@ const MOTORWAY_SCALES: [f64; 2] = [1.0, 3.0];
 /// Room for the road users of the motorway at the largest factor.
 const MOTORWAY_ROAD_USERS: u32 = 8192;
 
-/// One case on both sides.
+/// One case, measured with bare SUMO and with caraware.
 struct ScaleCase {
     vehicles: u32,
     bare: ProcessCost,
@@ -38,7 +38,7 @@ impl ScaleCase {
     fn measure(scenario: &ComparedScenario, vehicles: u32) -> Result<Self, Exit> {
         let (bare, results) = scenario.bare()?;
         let ours = scenario.ours()?;
-        same_results(&results, &ours.results)?;
+        compare_results(&results, &ours.results)?;
         let stages = StageTimes::of(&ours);
         Ok(Self {
             vehicles,
@@ -53,7 +53,7 @@ impl ScaleCase {
         self.stages.per_step_us(self.stages.outside_s())
     }
 
-    /// Most memory of the three processes that hold vehicles, KiB for each vehicle; shared memory counts in each that touches it.
+    /// Peak memory of the three processes that hold vehicles, KiB for each vehicle. Shared memory counts in every process that uses it.
     fn memory_kib(&self) -> f64 {
         let processes = ["traffic-bridge", "sim-core", "sensor-daemon"];
         let mib = processes.map(|name| self.ours.number(&format!("/processes/{name}/peak_memory_mib")));
@@ -70,9 +70,10 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let mut report = BenchReport::new(
         "scale",
         "From a thousand to fifty thousand vehicles",
-        "Generated cities with ten vehicles on a kilometre of lane (`caraware generate`), every vehicle dynamic at 100 Hz and sensing every 0.1 s, \
-         delivered to a consumer's tensor. Processor time in the loop for each sensed vehicle-step, loading left out; memory is the most that \
-         the bridge with SUMO, dynamics and sensors held, for each vehicle, shared memory counted in each of them.",
+        "Generated cities with ten vehicles on a kilometre of lane (`caraware generate`). Every vehicle moves dynamically at 100 Hz and senses \
+         every 0.1 s, and its observations are delivered to a consumer's tensor. The cost is processor time in the loop for each sensed \
+         vehicle-step, without loading. Memory is the peak of `traffic-bridge` (with SUMO), `sim-core` and `sensor-daemon` for each vehicle; \
+         shared memory counts in each of them.",
     );
     let cities = if options.quick { &QUICK[..] } else { &CITIES[..] };
     let mut cases = Vec::new();
@@ -101,7 +102,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     if let (Some(few), Some(many)) = (at(5000), at(50_000)) {
         report.figure("cost outside SUMO at 50 000 vehicles over that at 5 000", many / few);
         report.text += &format!(
-            " Outside SUMO a vehicle-step at 50 000 vehicles costs {:.2} × one at 5 000.",
+            " Outside SUMO a vehicle-step costs {:.2} times as much at 50 000 vehicles as at 5 000.",
             many / few
         );
     }
@@ -185,9 +186,9 @@ fn large(options: &BenchOptions, place: &BenchDirectory, report: &mut BenchRepor
         "SUMO steps longer than the tick of 0.1 s",
         &[
             "scenario",
-            "at once",
+            "vehicles at once",
             "sensed vehicle-steps",
-            "of them a second",
+            "vehicle-steps/s",
             "× real time",
             "sumo, s",
             "ours, s",

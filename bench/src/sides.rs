@@ -1,4 +1,4 @@
-//! The two sides of a comparison with SUMO alone: the bare program, and ours with a consumer of every observation, on one scenario.
+//! The two sides of a comparison on one scenario: bare SUMO, and caraware with a consumer of every observation.
 
 use std::{
     cell::Cell,
@@ -17,28 +17,28 @@ use serde_json::Value;
 
 use super::BenchOptions;
 
-/// Vehicle-ticks that ours may run ahead: with 5 000 vehicles as long as the consumer takes to import torch.
+/// Vehicle-ticks that a run may be ahead of the consumer: with 5 000 vehicles, as long as the consumer takes to import torch.
 const WINDOW_VEHICLE_TICKS: u32 = 64 * 5000;
-/// Steps up to the root directory from anywhere: SUMO puts the prefix behind the folder of the scenario.
+/// Steps up that reach the root directory from any directory: SUMO appends the prefix to the directory of the scenario.
 const TO_THE_ROOT: usize = 128;
 
-/// What a program took.
+/// The cost of a program.
 #[derive(Debug, Clone, Copy)]
 pub struct ProcessCost {
-    /// From its start to its end, seconds.
+    /// Wall time from its start to its end, seconds.
     pub wall_s: f64,
-    /// Processor time of it and of all it started, seconds.
+    /// Processor time of the program and of all processes that it started, seconds.
     pub cpu_s: f64,
 }
 
-/// Ours: what it took and what it reports.
+/// A finished run of caraware.
 #[derive(Debug, Clone)]
 pub struct OurRun {
-    /// What it took.
+    /// Its cost.
     pub taken: ProcessCost,
     /// Its `report.json`.
     pub report: Value,
-    /// Where SUMO wrote its results.
+    /// Directory of SUMO's results.
     pub results: PathBuf,
 }
 
@@ -50,7 +50,7 @@ impl OurRun {
     }
 }
 
-/// A directory for a measurement, removed at its end.
+/// A directory for a measurement. Dropping it removes the directory.
 #[derive(Debug)]
 pub struct BenchDirectory {
     path: PathBuf,
@@ -59,10 +59,10 @@ pub struct BenchDirectory {
 }
 
 impl BenchDirectory {
-    /// A new one below the system's directory for temporary files.
+    /// Creates a directory below the system's directory for temporary files.
     ///
     /// # Errors
-    /// Not writable.
+    /// The system's directory is not writable.
     pub fn new(part: &str) -> Result<Self, Exit> {
         let path = std::env::temp_dir().join(format!("caraware-bench-{part}-{}", std::process::id()));
         std::fs::create_dir_all(&path).map_err(|error| Exit::io("create", &path, &error))?;
@@ -72,7 +72,7 @@ impl BenchDirectory {
         })
     }
 
-    /// Where it is.
+    /// Its path.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
@@ -88,7 +88,7 @@ impl BenchDirectory {
 impl Drop for BenchDirectory {
     fn drop(&mut self) {
         if let Err(error) = std::fs::remove_dir_all(&self.path) {
-            tracing::warn!(%error, path = %self.path.display(), "cannot remove what a measurement leaves");
+            tracing::warn!(%error, path = %self.path.display(), "cannot remove the directory of a measurement");
         }
     }
 }
@@ -106,10 +106,10 @@ pub struct ComparedScenario<'a> {
 }
 
 impl<'a> ComparedScenario<'a> {
-    /// `sumocfg` with `scale` times its demand, with at most `max_road_users` at once.
+    /// Prepares `sumocfg` with `scale` times its demand and at most `max_road_users` at once.
     ///
     /// # Errors
-    /// Our program is not built.
+    /// The program `caraware` is not built.
     pub fn new(
         options: &BenchOptions,
         place: &'a BenchDirectory,
@@ -128,7 +128,7 @@ impl<'a> ComparedScenario<'a> {
         })
     }
 
-    /// Runs bare SUMO; its results are in the directory returned.
+    /// Runs bare SUMO; returns its cost and the directory of its results.
     ///
     /// # Errors
     /// SUMO fails.
@@ -140,14 +140,14 @@ impl<'a> ComparedScenario<'a> {
             .arg(&self.sumocfg)
             .args(["--output-prefix", &prefix])
             .args(["--scale", &self.scale.to_string(), "--no-step-log", "true"]);
-        self.equip(&mut command);
-        Ok((self.take(&mut command)?, results))
+        self.set_sumo_environment(&mut command);
+        Ok((self.run_measured(&mut command)?, results))
     }
 
-    /// A loop of Python over SUMO's steps (`caraware_bench.peer`); its results will be in the directory returned.
+    /// The command of a Python loop over SUMO's steps (`caraware_bench.peer`), and the directory that its results will be in.
     ///
     /// # Errors
-    /// No place for the results.
+    /// The directory of the results cannot be created.
     pub fn python_loop(&self, python: &Path, peer: &str, steps: u32) -> Result<(Command, PathBuf), Exit> {
         let (results, prefix) = self.results(peer)?;
         let mut command = Command::new(python);
@@ -157,11 +157,11 @@ impl<'a> ComparedScenario<'a> {
             .arg("--sumocfg")
             .arg(&self.sumocfg)
             .args(["--prefix", &prefix, "--steps", &steps.to_string()]);
-        self.equip(&mut command);
+        self.set_sumo_environment(&mut command);
         Ok((command, results))
     }
 
-    /// A new directory for SUMO's results, and the prefix of their names that puts them there.
+    /// Creates a directory for SUMO's results; returns it with the prefix of file names that leads there.
     fn results(&self, side: &str) -> Result<(PathBuf, String), Exit> {
         let results = self.place.path().join(format!("{side}-{}", self.place.next_run()));
         std::fs::create_dir_all(&results).map_err(|error| Exit::io("create", &results, &error))?;
@@ -169,8 +169,8 @@ impl<'a> ComparedScenario<'a> {
         Ok((results, format!("{}{from_root}/", "../".repeat(TO_THE_ROOT))))
     }
 
-    /// Tells a program where SUMO has its data.
-    fn equip(&self, command: &mut Command) {
+    /// Sets the environment variables from which a program finds SUMO's data.
+    fn set_sumo_environment(&self, command: &mut Command) {
         let data = self.install.sumo_home.join("data/proj");
         command
             .env("SUMO_HOME", &self.install.sumo_home)
@@ -178,7 +178,7 @@ impl<'a> ComparedScenario<'a> {
             .env("PROJ_LIB", &data);
     }
 
-    /// Runs ours, every vehicle sensing, every observation delivered to the consumer.
+    /// Runs caraware: every vehicle senses, and every observation is delivered to the consumer.
     ///
     /// # Errors
     /// The run fails.
@@ -207,7 +207,7 @@ impl<'a> ComparedScenario<'a> {
         settings.iter().for_each(|setting| {
             command.args(["--set", setting]);
         });
-        let taken = self.take(&mut command)?;
+        let taken = self.run_measured(&mut command)?;
         let path = runs.join(&name).join("report.json");
         let text = std::fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
         let report: Value =
@@ -215,7 +215,7 @@ impl<'a> ComparedScenario<'a> {
         if report["trainer"]["received_ticks"] != report["ticks"] {
             return Err(Exit::run(
                 format!(
-                    "the consumer got {} of {} ticks",
+                    "the consumer received {} of {} ticks",
                     report["trainer"]["received_ticks"], report["ticks"]
                 ),
                 "",
@@ -225,8 +225,8 @@ impl<'a> ComparedScenario<'a> {
         Ok(OurRun { taken, report, results })
     }
 
-    /// Runs a program that must succeed; what it says goes to a file.
-    fn take(&self, command: &mut Command) -> Result<ProcessCost, Exit> {
+    /// Runs a program that must succeed and measures its cost. Its output goes to a file.
+    fn run_measured(&self, command: &mut Command) -> Result<ProcessCost, Exit> {
         let program = command.get_program().to_string_lossy().into_owned();
         let path = self.place.path().join("output.txt");
         let output = std::fs::File::create(&path).map_err(|error| Exit::io("create", &path, &error))?;
@@ -241,12 +241,12 @@ impl<'a> ComparedScenario<'a> {
             .map_err(|error| failed(&error))?;
         let pid = i32::try_from(child.id()).ok().and_then(Pid::from_raw);
         if let Some(pid) = pid {
-            // Its end is awaited without taking note of it, so that the system still knows what it used.
+            // NOWAIT leaves the ended process in the process table, where its processor time can still be read.
             let options = WaitIdOptions::EXITED | WaitIdOptions::NOWAIT;
             while matches!(waitid(WaitId::Pid(pid), options), Err(Errno::INTR)) {}
         }
         let wall_s = begin.elapsed().as_secs_f64();
-        let cpu_s = usage::of_family_s(child.id()).unwrap_or(0.0);
+        let cpu_s = usage::family_processor_time_s(child.id()).unwrap_or(0.0);
         let status = child.wait().map_err(|error| failed(&error))?;
         if status.success() {
             return Ok(ProcessCost { wall_s, cpu_s });
@@ -263,13 +263,14 @@ impl<'a> ComparedScenario<'a> {
     }
 }
 
-/// Compares the files that SUMO wrote on both sides and returns how many they are.
+/// Compares the files that SUMO wrote on both sides, and returns their number.
 ///
-/// Left out: the comment at the head of each, which tells time and options, and in summaries the milliseconds that a step took.
+/// The comparison leaves out the comment at the head of each file, which holds time and options, and in summaries the milliseconds that
+/// a step took.
 ///
 /// # Errors
-/// One is missing or differs.
-pub fn same_results(bare: &Path, ours: &Path) -> Result<usize, Exit> {
+/// A file is missing on one side, or two files differ.
+pub fn compare_results(bare: &Path, ours: &Path) -> Result<usize, Exit> {
     let names = |directory: &Path| -> Result<Vec<String>, Exit> {
         let entries = std::fs::read_dir(directory).map_err(|error| Exit::io("list", directory, &error))?;
         let mut names: Vec<_> = entries
@@ -301,7 +302,7 @@ pub fn same_results(bare: &Path, ours: &Path) -> Result<usize, Exit> {
     Ok(files.len())
 }
 
-/// The lines of a result file that say something about traffic.
+/// The lines of a result file that depend on traffic alone.
 fn content(text: &str) -> impl Iterator<Item = String> {
     let body = text.split_once("-->").map_or(text, |(_, body)| body);
     body.lines().map(|line| {
@@ -319,12 +320,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn results_differ_in_traffic_alone() {
+    fn only_differences_in_traffic_count() {
         let [bare, ours] = [(); 2].map(|()| tempfile::tempdir().unwrap());
         let write = |directory: &tempfile::TempDir, name: &str, text: &str| {
             std::fs::write(directory.path().join(name), text).unwrap();
         };
-        let compare = || same_results(bare.path(), ours.path());
+        let compare = || compare_results(bare.path(), ours.path());
         write(&bare, "a.xml", "<!-- 1 --><s>\n <step n=\"1\" duration=\"4\"/>\n</s>");
         write(&ours, "a.xml", "<!-- 2 --><s>\n <step n=\"1\" duration=\"5\"/>\n</s>");
         assert_eq!(compare().unwrap(), 1);

@@ -1,8 +1,8 @@
-//! Processor time of a run by stage, from what its processes report.
+//! Processor time of a run by stage, from the reports of its processes.
 
 use super::sides::OurRun;
 
-/// Seconds of processor time in the loop, loading left out.
+/// Processor time in the loop by stage, seconds, without loading.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StageTimes {
     /// SUMO's own steps.
@@ -26,7 +26,7 @@ pub struct StageTimes {
 }
 
 impl StageTimes {
-    /// Of a finished run.
+    /// Reads the times of a finished run.
     #[must_use]
     pub fn of(ours: &OurRun) -> Self {
         let used = |process: &str, what: &str| ours.number(&format!("/processes/{process}/{what}"));
@@ -72,7 +72,7 @@ impl StageTimes {
         self.sum_s() - self.sumo_s
     }
 
-    /// Of `seconds`, the share of one sensed vehicle-step, microseconds.
+    /// The share of one sensed vehicle-step in `seconds`, microseconds.
     #[must_use]
     pub fn per_step_us(&self, seconds: f64) -> f64 {
         1e6 * seconds / self.vehicle_steps.max(1.0)

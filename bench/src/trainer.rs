@@ -1,4 +1,4 @@
-//! The learner beside Stable-Baselines3 and a plain loop, and what a tick costs before the update.
+//! Measures the learner, compared with Stable-Baselines3 and a plain loop, and the cost of a tick before the update.
 
 use std::process::Command;
 
@@ -7,11 +7,12 @@ use serde::Deserialize;
 
 use super::{BenchOptions, BenchReport, MedianSpread, ReportTable};
 
-/// Samples in a horizon, and visits of a sample in an update, as `caraware_bench.trainer` has them.
+/// Samples in a horizon, as in `caraware_bench.trainer`.
 const HORIZON: f64 = 32_768.0;
+/// Visits of a sample in an update, as in `caraware_bench.trainer`.
 const EPOCHS: f64 = 4.0;
 
-/// What `caraware_bench.trainer` prints: seconds, by round.
+/// The output of `caraware_bench.trainer`: seconds, by round.
 #[derive(Debug, Deserialize)]
 struct TrainerFigures {
     threads: u32,
@@ -45,7 +46,7 @@ struct TickTimes {
 /// Runs `python -m caraware_bench.trainer`.
 ///
 /// # Errors
-/// There is no Python with the trainer, or it fails.
+/// Python is missing, or the program fails.
 pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let python = match &options.python {
         Some(python) => python.clone(),
@@ -58,9 +59,9 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "trainer",
         "The learner",
         format!(
-            "The paper's networks (9 → 500 → 300, policy and value apart), horizon 32 768, batch 2 048, four epochs, {} threads, {} matrix \
-             products, PPO alone (the network that is taught beside it, `trainer.supervised`, is left out); all learners alternate in one \
-             process, median of {} rounds.",
+            "The paper's networks (9 → 500 → 300, separate for policy and value) with a horizon of 32 768, minibatches of 2 048, four epochs, {} \
+             threads, and {} matrix products. Only PPO is measured, without the supervised network (`trainer.supervised`). All learners \
+             alternate in one process; figures are medians of {} rounds.",
             measured.threads,
             measured.precision,
             measured.update_s.ours.len()
@@ -96,7 +97,7 @@ fn updates(report: &mut BenchReport, seconds: &UpdateTimes) -> Result<ReportTabl
 
 fn rollouts(report: &mut BenchReport, seconds: &HorizonTimes) -> Result<ReportTable, Exit> {
     let columns = [
-        "rollout and update, environment for nothing",
+        "rollout and update, free environment",
         "env-steps/s",
         "ours is faster by",
         "smallest–largest",
@@ -144,7 +145,7 @@ fn rate(seconds: &[f64], amount: f64) -> Result<String, Exit> {
     Ok(format!("{:.0}", spread.median))
 }
 
-/// How much faster ours is, round by round: median, and smallest and largest.
+/// Ratio of their time to ours, round by round: the median, and the smallest and the largest.
 fn compare(report: &mut BenchReport, name: &str, ours: &[f64], theirs: &[f64]) -> Result<[String; 2], Exit> {
     let spread = MedianSpread::of(ours.iter().zip(theirs).map(|(ours, theirs)| theirs / ours))?;
     report.figure(name, spread.median);

@@ -1,4 +1,4 @@
-//! The command line that `caraware bench` passes on.
+//! The command line of `caraware-bench`, which `caraware bench` forwards.
 
 #![allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 

@@ -1,4 +1,4 @@
-"""What the peers of `caraware bench peers` are asked to do, on stand-ins for them."""
+"""The measuring loops of `caraware bench peers`, with stand-ins for the peers."""
 
 import json
 from collections import Counter
@@ -16,7 +16,7 @@ VEHICLES = 6
 
 
 class FakeSumo(ModuleType):
-    """Departures of six vehicles in the first step; the first of them arrives in the third."""
+    """Six vehicles depart in the first step; the first of them arrives in the third."""
 
     def __init__(self) -> None:
         super().__init__("fake")
@@ -46,7 +46,7 @@ class FakeSumo(ModuleType):
         self.calls["close"] += 1
 
 
-def test_the_loop_reads_the_bridges_fields_of_everybody_at_every_step() -> None:
+def test_the_loop_reads_the_bridges_fields_of_every_vehicle_at_every_step() -> None:
     sumo = FakeSumo()
     mirror = Mirror(sumo)
     assert [mirror.step() for _ in range(2)] == [VEHICLES, VEHICLES]
@@ -106,7 +106,7 @@ def test_agent_steps_are_counted_while_stepping_only(monkeypatch: pytest.MonkeyP
     assert world.closed and world.steps == WARM_UP_STEPS + 6
 
 
-def test_a_peer_that_is_not_installed_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_peer_that_is_not_installed_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(options: object) -> tuple[str, dict[str, float]]:
         raise ImportError("No module named 'smarts'")
 

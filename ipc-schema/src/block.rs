@@ -1,4 +1,4 @@
-//! Several arrays in one payload: sections that each start on a 64-byte border.
+//! Several arrays in one payload: sections that each start on a 64-byte boundary.
 
 use bytemuck::Pod;
 
@@ -14,7 +14,7 @@ pub struct Section {
     pub len: usize,
 }
 
-/// Lays sections of the given byte lengths one behind the other and returns them with the total length.
+/// Places sections of the given byte lengths one after the other; returns them with the total length.
 #[must_use]
 pub fn sections<const N: usize>(lengths: [usize; N]) -> ([Section; N], usize) {
     let mut offset = 0;
@@ -28,7 +28,7 @@ pub fn sections<const N: usize>(lengths: [usize; N]) -> ([Section; N], usize) {
     (placed, offset)
 }
 
-/// A payload does not hold what its header promises.
+/// A payload is too short or misaligned for a section.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("payload of {actual} bytes does not hold bytes {offset}..{} as whole elements of {element} bytes", offset.saturating_add(*len))]
 pub struct BlockError {

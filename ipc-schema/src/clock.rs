@@ -9,7 +9,7 @@ pub fn monotonic_ns() -> u64 {
     u64::try_from(time.tv_sec).unwrap_or_default() * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap_or_default()
 }
 
-/// What `clock` shows, seconds.
+/// The time of `clock`, seconds.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "seconds since a machine or a process started")]
 pub fn seconds(clock: ClockId) -> f64 {

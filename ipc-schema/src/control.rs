@@ -1,7 +1,7 @@
-//! Commands to a running simulation: what may be asked, how it is written, and what is answered.
+//! Commands to a running simulation, their answers, and the form of both in JSON and in shared memory.
 //!
 //! In JSON (`caraware control`, zenoh) a request is `{"schema_version": N, "control": {"command": "pause"}}`, and an answer
-//! `{"done": {…}}` or `{"refused": {…}}`. Between supervisor and `traffic-bridge` both are records of the service `control`.
+//! `{"done": {…}}` or `{"refused": {…}}`. Between the supervisor and `traffic-bridge` both are records of the service `control`.
 
 use bytemuck::{Pod, Zeroable};
 use iceoryx2::prelude::ZeroCopySend;
@@ -11,7 +11,7 @@ use crate::{SCHEMA_VERSION, section::payload_layout, sensor::SensorSelection};
 
 /// Longest id of a vehicle or an edge in a command, bytes.
 pub const ID_BYTES: usize = 128;
-/// Longest answer in words, bytes; longer ones are cut.
+/// Longest message of an answer, bytes; longer ones are cut.
 pub const ANSWER_BYTES: usize = 256;
 /// Longest request in JSON, bytes.
 pub const MAX_REQUEST_BYTES: usize = 4096;
@@ -20,58 +20,58 @@ pub const MAX_SWITCHES: usize = 64;
 /// Most ticks in one `step`.
 pub const MAX_STEP_TICKS: u64 = 1_000_000_000;
 
-/// What may be asked of a running simulation.
+/// A command to a running simulation.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "command", rename_all = "snake_case", deny_unknown_fields)]
 pub enum Command {
-    /// Make no more ticks.
+    /// Stop making ticks.
     Pause {},
-    /// Make ticks again.
+    /// Continue making ticks.
     Resume {},
-    /// Make this many ticks, whole SUMO steps, and pause.
+    /// Make this many ticks, in whole SUMO steps, and pause.
     Step {
-        /// At least 1.
+        /// Number of ticks, at least 1.
         ticks: u64,
     },
-    /// Begin the episode anew, with its own seed.
+    /// Start the episode again, with its own seed.
     Reset {},
     /// Switch a sensor until the episode ends.
     Sensor {
-        /// SUMO's id; none = all vehicles.
+        /// SUMO's id of the vehicle; `None` stands for all vehicles.
         vehicle: Option<String>,
-        /// Which.
+        /// The sensor, or all of them.
         sensor: SensorSelection,
-        /// Where to.
+        /// The new state.
         state: Switch,
     },
-    /// Let the vehicle start anew from an edge.
+    /// Start the vehicle again from an edge.
     Start {
-        /// SUMO's id.
+        /// SUMO's id of the vehicle.
         vehicle: String,
-        /// SUMO's id.
+        /// SUMO's id of the edge.
         edge: String,
     },
-    /// Lead the vehicle to an edge.
+    /// Send the vehicle to an edge.
     Destination {
-        /// SUMO's id.
+        /// SUMO's id of the vehicle.
         vehicle: String,
-        /// SUMO's id.
+        /// SUMO's id of the edge.
         edge: String,
     },
 }
 
-/// Where a sensor is switched to.
+/// State of a switched sensor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Switch {
-    /// It delivers nothing.
+    /// The sensor delivers nothing.
     Off,
-    /// It delivers.
+    /// The sensor delivers samples.
     On,
 }
 
 impl Command {
-    /// False for commands that change when ticks are made and never what is in them.
+    /// True if the command changes the content of ticks; false if it only changes when they are made.
     #[must_use]
     pub fn changes_content(&self) -> bool {
         !matches!(self, Self::Pause {} | Self::Resume {} | Self::Step { .. })
@@ -102,7 +102,7 @@ impl Command {
         Ok(())
     }
 
-    /// Vehicle and edge that it names.
+    /// The vehicle and the edge that the command names.
     fn ids(&self) -> (Option<&str>, Option<&str>) {
         match self {
             Self::Pause {} | Self::Resume {} | Self::Step { .. } | Self::Reset {} => (None, None),
@@ -121,10 +121,10 @@ impl Command {
         serde_json::to_string(&request).unwrap_or_default()
     }
 
-    /// A request in JSON from somebody who may send anything.
+    /// Reads and checks a request in JSON, which may come from any client.
     ///
     /// # Errors
-    /// Too long, not JSON of a request, of another schema version, or out of range.
+    /// The request is too long, is not a request in JSON, has another schema version, or holds a value out of range.
     pub fn from_json(bytes: &[u8]) -> Result<Self, Refusal> {
         if bytes.len() > MAX_REQUEST_BYTES {
             let message = format!(
@@ -133,7 +133,8 @@ impl Command {
             );
             return Err(Refusal::new(RefusalKind::Malformed, message));
         }
-        let malformed = |error: serde_json::Error| Refusal::new(RefusalKind::Malformed, format!("no request: {error}"));
+        let malformed =
+            |error: serde_json::Error| Refusal::new(RefusalKind::Malformed, format!("not a request: {error}"));
         let version: Version = serde_json::from_slice(bytes).map_err(malformed)?;
         if version.schema_version != SCHEMA_VERSION {
             return Err(Refusal::schema(version.schema_version));
@@ -144,7 +145,7 @@ impl Command {
     }
 }
 
-/// What every version of a request has.
+/// The part of a request that is the same in every version.
 #[derive(Deserialize)]
 struct Version {
     schema_version: u32,
@@ -158,34 +159,34 @@ struct Request {
     control: Command,
 }
 
-/// What is answered to a command.
+/// The answer to a command.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Reply {
-    /// It takes effect.
+    /// The command takes effect.
     Done(Done),
-    /// Everything is as before.
+    /// The command changes nothing.
     Refused(Refusal),
 }
 
 /// A command that takes effect.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Done {
-    /// First tick that shows it.
+    /// First tick with its effect.
     pub tick: u64,
     /// Episode of that tick.
     pub episode: u64,
-    /// What happens, in words.
+    /// Its effect as a sentence.
     pub message: String,
 }
 
-/// Why a command is refused.
+/// A refused command with its reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, thiserror::Error)]
 #[error("{message}")]
 pub struct Refusal {
     /// The reason.
     pub kind: RefusalKind,
-    /// The reason in words.
+    /// The reason as a sentence.
     pub message: String,
 }
 
@@ -194,21 +195,21 @@ pub struct Refusal {
 #[serde(rename_all = "snake_case")]
 #[repr(u32)]
 pub enum RefusalKind {
-    /// No request at all, too long, or out of range.
+    /// It is not a request, it is too long, or a value is out of range.
     Malformed = 1,
-    /// Of another schema version.
+    /// It has another schema version.
     Schema = 2,
-    /// No such vehicle is there now.
+    /// The vehicle is not in the simulation now.
     UnknownVehicle = 3,
-    /// No such edge, or none that the vehicle may use.
+    /// The edge does not exist, or the vehicle may not use it.
     UnknownEdge = 4,
-    /// This run or this vehicle has nothing of the kind.
+    /// This run or this vehicle does not support the command.
     Unsupported = 5,
-    /// Too much at a time: ask again.
+    /// Too many commands are under way: send it again.
     Busy = 6,
     /// SUMO refuses.
     Sumo = 7,
-    /// Nobody answers, or the run is over.
+    /// The simulation does not answer, or the run is over.
     Unanswered = 8,
 }
 
@@ -236,42 +237,42 @@ impl Refusal {
     }
 
     fn schema(found: u32) -> Self {
-        let message = format!("the request has schema version {found}, this run speaks {SCHEMA_VERSION}");
+        let message = format!("the request has schema version {found}, this run has {SCHEMA_VERSION}");
         Self::new(RefusalKind::Schema, message)
     }
 }
 
-/// One line of an action log: a command and the tick at which it took effect.
+/// One line of a log of commands: a command and the tick at which it took effect.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Action {
-    /// First tick that shows it.
+    /// First tick with its effect.
     pub tick: u64,
     /// Episode of that tick.
     pub episode: u64,
-    /// What was asked.
+    /// The command.
     pub control: Command,
-    /// SUMO's words, if it refused: it was asked all the same.
+    /// SUMO's message if SUMO refused the command, which is logged all the same.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
 }
 
-/// A run's action log, in its directory.
+/// Name of the log of commands in the run directory.
 pub const COMMAND_LOG: &str = "commands.jsonl";
-/// The action log that a run is to follow, in its directory.
+/// Name of the log that the run repeats, in the run directory.
 pub const COMMAND_REPLAY: &str = "commands.replay.jsonl";
 
-/// The actions in the text of an action log, in order.
+/// Reads the lines of a log of commands, in order.
 ///
 /// # Errors
-/// The number of the first line that is none, with the reason.
+/// A line is wrong. The error has the number of the first such line, and the reason.
 pub fn actions(text: &str) -> Result<Vec<Action>, (usize, String)> {
     let mut actions: Vec<Action> = Vec::new();
     for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty()) {
         let action: Action = serde_json::from_str(line).map_err(|error| (number, error.to_string()))?;
         action.control.check().map_err(|refusal| (number, refusal.message))?;
         if !action.control.changes_content() {
-            return Err((number, "pause, resume and step are no actions".into()));
+            return Err((number, "pause, resume and step are never logged".into()));
         }
         if actions.last().is_some_and(|before| before.tick > action.tick) {
             return Err((number, "its tick is before that of the line above".into()));
@@ -281,7 +282,7 @@ pub fn actions(text: &str) -> Result<Vec<Action>, (usize, String)> {
     Ok(actions)
 }
 
-/// A text of at most `N` bytes on the wire.
+/// The first `N` bytes of a text, cut at a character, with their number.
 fn text_bytes<const N: usize>(text: &str) -> ([u8; N], u32) {
     let mut len = text.len().min(N);
     while !text.is_char_boundary(len) {
@@ -292,7 +293,7 @@ fn text_bytes<const N: usize>(text: &str) -> ([u8; N], u32) {
     (bytes, u32::try_from(len).unwrap_or(0))
 }
 
-/// Stands for no text at all.
+/// Length that stands for no text.
 const NONE: u32 = u32::MAX;
 
 fn text_of(bytes: &[u8], len: u32) -> Option<String> {
@@ -307,7 +308,7 @@ fn text_of(bytes: &[u8], len: u32) -> Option<String> {
 pub struct ControlRequest {
     /// [`SCHEMA_VERSION`] of the sender.
     pub schema_version: u32,
-    /// Place of the command in [`Command`].
+    /// Position of the command in [`Command`].
     pub command: u32,
     /// Sensors that are switched, bits.
     pub sensors: u32,
@@ -315,9 +316,9 @@ pub struct ControlRequest {
     pub is_on: u32,
     /// Ticks of a step.
     pub ticks: u64,
-    /// Bytes of `vehicle` in use; all bits set = none.
+    /// Bytes of `vehicle` in use; all bits set means no vehicle.
     pub vehicle_len: u32,
-    /// Bytes of `edge` in use; all bits set = none.
+    /// Bytes of `edge` in use; all bits set means no edge.
     pub edge_len: u32,
     /// SUMO's id, UTF-8.
     pub vehicle: [u8; ID_BYTES],
@@ -360,7 +361,7 @@ impl TryFrom<&ControlRequest> for Command {
         if request.schema_version != SCHEMA_VERSION {
             return Err(Refusal::schema(request.schema_version));
         }
-        let malformed = || Refusal::new(RefusalKind::Malformed, "no request");
+        let malformed = || Refusal::new(RefusalKind::Malformed, "not a request");
         let vehicle = text_of(&request.vehicle, request.vehicle_len);
         let edge = text_of(&request.edge, request.edge_len);
         let command = match request.command {
@@ -390,7 +391,7 @@ impl TryFrom<&ControlRequest> for Command {
     }
 }
 
-/// An answer on the way back.
+/// An answer on the way from `traffic-bridge` to the supervisor.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
 #[type_name("caraware::ControlReply")]
@@ -399,7 +400,7 @@ pub struct ControlReply {
     pub schema_version: u32,
     /// 0 = done, else a [`RefusalKind`].
     pub outcome: u32,
-    /// First tick that shows it.
+    /// First tick with the command's effect.
     pub tick: u64,
     /// Episode of that tick.
     pub episode: u64,
@@ -407,7 +408,7 @@ pub struct ControlReply {
     pub text_len: u32,
     /// Zero.
     pub reserved: u32,
-    /// What happens, or why not, UTF-8.
+    /// The effect, or the reason of a refusal, UTF-8.
     pub text: [u8; ANSWER_BYTES],
 }
 
@@ -449,7 +450,7 @@ impl From<&ControlReply> for Reply {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 pub struct SensorSwitch {
-    /// Hash of the vehicle's id; not used where it is all of them.
+    /// Hash of the vehicle's id; unused with [`EVERY_VEHICLE`].
     pub id_hash: u64,
     /// Sensors, bits.
     pub sensors: u32,
@@ -465,9 +466,9 @@ payload_layout! {
     }
 }
 
-/// The sensors deliver from now on.
+/// The sensors deliver from this tick on; without this bit they stop.
 pub const SWITCHED_ON: u32 = 1;
-/// All vehicles, those to come as well.
+/// The switch applies to all vehicles, including later ones.
 pub const EVERY_VEHICLE: u32 = 1 << 1;
 
 #[cfg(test)]
@@ -497,7 +498,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn commands_come_back_as_they_were(command in commands()) {
+        fn a_command_survives_json_and_the_record(command in commands()) {
             prop_assert_eq!(Command::from_json(command.to_json().as_bytes()).unwrap(), command.clone());
             prop_assert_eq!(Command::try_from(&ControlRequest::from(&command)).unwrap(), command);
         }
@@ -519,7 +520,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_requests_are_refused_for_their_reason() {
+    fn wrong_requests_are_refused_with_their_reason() {
         let kind = |text: &str| Command::from_json(text.as_bytes()).unwrap_err().kind;
         let version = SCHEMA_VERSION;
         assert_eq!(
@@ -546,7 +547,7 @@ mod tests {
     }
 
     #[test]
-    fn answers_come_back_and_long_ones_are_cut_at_a_character() {
+    fn answers_survive_the_record_and_long_ones_are_cut_at_a_character() {
         let done = Reply::Done(Done {
             tick: 7,
             episode: 2,
@@ -563,7 +564,7 @@ mod tests {
     }
 
     #[test]
-    fn an_action_log_is_read_line_by_line() {
+    fn a_log_of_commands_is_read_line_by_line() {
         let reset = r#"{"tick":5,"episode":0,"control":{"command":"reset"}}"#;
         assert_eq!(actions(&format!("{reset}\n\n{reset}\n")).unwrap().len(), 2);
         let early = r#"{"tick":4,"episode":0,"control":{"command":"reset"}}"#;

@@ -1,4 +1,4 @@
-//! Asking and answering over the service `control`. Neither end ever waits for the other.
+//! The ports of the service `control`: the supervisor sends commands, `traffic-bridge` answers. Neither waits for the other.
 
 use iceoryx2::{
     pending_response::PendingResponse,
@@ -14,14 +14,14 @@ use crate::{
 
 const NAME: &str = "control";
 
-/// The asking end, of the supervisor.
+/// The supervisor's port.
 pub struct ControlClient(Client<Shm, ControlRequest, (), ControlReply, ()>);
 
 /// A command that has been sent and not been answered yet.
 pub struct Pending(PendingResponse<Shm, ControlRequest, (), ControlReply, ()>);
 
 impl ControlClient {
-    /// The asking end of `service`.
+    /// Creates the supervisor's port of `service`.
     ///
     /// # Errors
     /// iceoryx2 refuses.
@@ -37,7 +37,7 @@ impl ControlClient {
     /// Sends a command.
     ///
     /// # Errors
-    /// Too many are on the way, or nobody is there to take it.
+    /// Too many commands are under way, or `traffic-bridge` is not connected.
     pub fn send(&self, command: &Command) -> Result<Pending, Refusal> {
         let pending = self.0.send_copy(ControlRequest::from(command));
         match pending {
@@ -48,14 +48,14 @@ impl ControlClient {
             )),
             Err(error) => Err(Refusal::new(
                 RefusalKind::Busy,
-                format!("too many commands at a time ({error:?}): ask again"),
+                format!("too many commands at a time ({error:?}): send it again"),
             )),
         }
     }
 }
 
 impl Pending {
-    /// The answer, if it is there.
+    /// The answer, if it has arrived.
     ///
     /// # Errors
     /// The port is broken.
@@ -65,11 +65,11 @@ impl Pending {
     }
 }
 
-/// The answering end, of `traffic-bridge`.
+/// The port of `traffic-bridge`.
 pub struct ControlServer(Server<Shm, ControlRequest, (), ControlReply, ()>);
 
 impl ControlServer {
-    /// The answering end of `service`.
+    /// Creates the port of `traffic-bridge` of `service`.
     ///
     /// # Errors
     /// iceoryx2 refuses.
@@ -82,7 +82,7 @@ impl ControlServer {
         Ok(Self(server))
     }
 
-    /// Answers the next command, if there is one; false if there is none. An asker who has gone meanwhile is not missed.
+    /// Takes the next command and sends the result of `answer`. False if no command waits. A closed connection is ignored.
     ///
     /// # Errors
     /// The port is broken, or `answer` fails.
@@ -95,7 +95,7 @@ impl ControlServer {
         };
         let reply = answer(Command::try_from(request.payload()))?;
         if let Err(error) = request.send_copy(ControlReply::from(&reply)) {
-            tracing::debug!(?error, "nobody waits for the answer to a command");
+            tracing::debug!(?error, "the connection was closed before the answer to its command");
         }
         Ok(true)
     }

@@ -1,10 +1,10 @@
-//! `ego-pose`: where the heroes are, on their way back to SUMO.
+//! `ego-pose`: the poses of the heroes, which `sim-core` sends to `traffic-bridge`.
 
 use bytemuck::{Pod, Zeroable};
 
 use crate::section::payload_layout;
 
-/// One hero at the end of a tick; it is moved there in SUMO before the next step.
+/// The pose of one hero at the end of a tick. `traffic-bridge` moves it there in SUMO before the next step.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct EgoPose {

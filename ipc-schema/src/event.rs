@@ -1,10 +1,10 @@
-//! `event`: what happened in a tick. No process waits for it.
+//! `event`: contacts that begin in a tick. No process waits for these messages.
 
 use bytemuck::{Pod, Zeroable};
 
 use crate::section::payload_layout;
 
-/// What a vehicle ran into, [`Collision::other_class`].
+/// Kind of the object that a vehicle touches, [`Collision::other_class`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Struck {
@@ -22,7 +22,7 @@ pub enum Struck {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct Collision {
-    /// Where they touch, world, metres.
+    /// Point of contact, world, metres.
     pub position_m: [f64; 3],
     /// Hash of the vehicle's SUMO id.
     pub id_hash: u64,

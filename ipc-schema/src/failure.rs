@@ -1,10 +1,10 @@
-//! How a process that cannot go on tells why: a small file beside its log, and its exit code.
+//! The failure of a process that cannot continue: it writes a small file beside its log, and ends with an exit code.
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-/// What kind of failure, and so which exit code.
+/// Kind of a failure; it decides the exit code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FailureKind {
@@ -28,19 +28,19 @@ impl FailureKind {
     }
 }
 
-/// Why a process could not go on. The message names file, key or line; the help says what to do.
+/// The reason why a process cannot continue. The message names the file, key or line; the help names the fix.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Failure {
-    /// Decides the exit code.
+    /// Kind of the failure.
     pub kind: FailureKind,
-    /// What is wrong.
+    /// The mistake or the failed operation.
     pub message: String,
-    /// What to do.
+    /// The fix.
     pub help: Option<String>,
 }
 
 impl Failure {
-    /// A failure without advice.
+    /// A failure without help.
     pub fn new(kind: FailureKind, message: impl Into<String>) -> Self {
         Self {
             kind,
@@ -49,7 +49,7 @@ impl Failure {
         }
     }
 
-    /// The same with advice.
+    /// Adds the help.
     #[must_use]
     pub fn with_help(mut self, help: impl Into<String>) -> Self {
         self.help = Some(help.into());
@@ -67,13 +67,13 @@ impl Failure {
         Self::new(kind, message)
     }
 
-    /// Where the failure of process `name` is written.
+    /// Path of the failure of process `name`.
     #[must_use]
     pub fn path(run_dir: &Path, name: &str) -> PathBuf {
         run_dir.join("logs").join(format!("{name}.error.json"))
     }
 
-    /// Writes the failure for the supervisor to show; a failure to write is only logged.
+    /// Writes the failure, which the supervisor then shows. An error while writing is only logged.
     pub fn write(&self, run_dir: &Path, name: &str) {
         let path = Self::path(run_dir, name);
         match serde_json::to_string(self) {

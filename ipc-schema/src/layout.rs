@@ -1,4 +1,4 @@
-//! The committed layout table: size, alignment and field offsets of everything on the wire.
+//! The committed layout table: size, alignment and field offsets of every record on the wire.
 
 use std::mem::{align_of, offset_of, size_of};
 
@@ -304,20 +304,20 @@ records!(
     VehicleState
 );
 
-/// A section of a payload as other languages know it.
+/// A section of a payload for readers in other languages.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct SectionLayout {
     /// Its name.
     pub name: &'static str,
     /// The scalar as numpy writes it, or the name of a record.
     pub scalar: String,
-    /// Names of the dimensions that come first in its shape.
+    /// Names of the first dimensions of its shape.
     pub dimensions: &'static [&'static str],
-    /// The dimensions behind them, which never change.
+    /// The remaining dimensions, which are constant.
     pub shape: Vec<usize>,
 }
 
-/// The payload of a channel: its sections, each on a border of [`ALIGNMENT`] bytes.
+/// The payload of a channel: its sections, each on a boundary of [`ALIGNMENT`] bytes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct PayloadLayout {
     /// Name of the channel.
@@ -348,7 +348,7 @@ pub fn payloads() -> Vec<PayloadLayout> {
     rows.collect()
 }
 
-/// A sensor as other languages know it.
+/// A sensor for readers in other languages.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct SensorLayout {
     /// Name in commands and keys.
@@ -370,16 +370,16 @@ pub fn sensors() -> Vec<SensorLayout> {
     rows.collect()
 }
 
-/// An observation field as other languages know it; the range of a run's fields is in its run file.
+/// An observation field for readers in other languages. Its range in a run is in the run file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct FieldLayout {
     /// Name in `observation.fields`.
     pub name: &'static str,
     /// SI unit, or "".
     pub unit: &'static str,
-    /// The sensor that has to be there.
+    /// The sensor that it needs.
     pub sensor: Option<&'static str>,
-    /// The task that has to be set.
+    /// The task that it needs.
     pub task: Option<TaskKind>,
 }
 
@@ -420,9 +420,9 @@ mod tests {
     /// `CARAWARE_BLESS=1 cargo test -p ipc-schema layout` rewrites the table after a deliberate change
     /// (raise `SCHEMA_VERSION` with it).
     #[test]
-    fn the_committed_layout_table_is_true() {
+    fn the_committed_layout_table_is_current() {
         let json = super::json().unwrap();
-        // The viewer is installed without this tree and carries a copy.
+        // The viewer is installed without this tree and has a copy.
         for path in ["/layout.json", "/../viewer/src/caraware_viewer/layout.json"] {
             let path = format!("{}{path}", env!("CARGO_MANIFEST_DIR"));
             if std::env::var_os("CARAWARE_BLESS").is_some() {

@@ -1,4 +1,4 @@
-//! Everything that crosses a process border, and nothing else: payloads, the service table, flow control, the run file.
+//! Everything that crosses a process boundary, and nothing else: payloads, the table of services, flow control, the run file.
 //!
 //! | service | payload (64-byte aligned bytes, little endian) | producer | required consumers |
 //! |---|---|---|---|
@@ -19,8 +19,8 @@
 //!
 //! The first ten are [`channel::CHANNELS`]. In the driving task sim-core waits for each `prediction`.
 //!
-//! Every message carries a [`header::MessageHeader`]. Services are created in [`services`] by the supervisor alone;
-//! every other process opens them there. The layouts are written down in `layout.json` and asserted from Rust and Python.
+//! Every message has a [`header::MessageHeader`]. The supervisor alone creates the services, in [`services`]; all other processes
+//! open them. `layout.json` holds the layouts, and tests in Rust and Python compare it with the programs.
 
 pub mod block;
 pub mod board;

@@ -1,4 +1,4 @@
-//! Metrics of the tasks by name: what a trainer measures, in which unit, and which way is better.
+//! The metrics of the tasks: name, unit, task, and which values are better.
 //!
 //! A trainer reports the metrics of its task on its board; the progress line, `caraware ps`, the fan-out's status, the HUD and
 //! the native extension derive theirs from [`METRICS`]. A new metric is a row here and a value that the task measures.
@@ -8,9 +8,9 @@ use crate::config::TaskKind;
 /// Which values of a metric are better.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MetricDirection {
-    /// Smaller ones, as of an error.
+    /// Smaller values are better, as with an error.
     LowerIsBetter,
-    /// Larger ones, as of progress.
+    /// Larger values are better, as with progress.
     HigherIsBetter,
 }
 
@@ -19,9 +19,9 @@ pub enum MetricDirection {
 pub struct MetricSpec {
     /// Name, which ends in its unit: the key in reports, logs and plots.
     pub name: &'static str,
-    /// Name for people.
+    /// Name in displays.
     pub label: &'static str,
-    /// Unit for people.
+    /// Unit in displays.
     pub unit: &'static str,
     /// Which values are better.
     pub direction: MetricDirection,
@@ -46,7 +46,7 @@ impl MetricSpec {
     }
 }
 
-/// Every metric; the first of a task is its headline. Its place here is its place in [`MetricValues`].
+/// Every metric, in the order of [`MetricValues`]. The first metric of a task is its headline.
 pub const METRICS: [MetricSpec; 4] = [
     MetricSpec {
         name: "error_m",
@@ -82,17 +82,17 @@ pub const METRICS: [MetricSpec; 4] = [
     },
 ];
 
-/// Values that a board has room for.
+/// Number of metrics that a board has room for.
 pub const METRIC_CAPACITY: usize = 8;
 const _: () = assert!(
     METRICS.len() <= METRIC_CAPACITY,
     "a board has room for METRIC_CAPACITY metrics"
 );
 
-/// The value of each metric, in the order of [`METRICS`]; not-a-number where it is not measured.
+/// The value of each metric, in the order of [`METRICS`]; not-a-number for a metric that is not measured.
 pub type MetricValues = [f64; METRIC_CAPACITY];
 
-/// Nothing is measured.
+/// Values without any measured metric.
 pub const NOT_MEASURED: MetricValues = [f64::NAN; METRIC_CAPACITY];
 
 /// The metrics that are measured, with their values.
@@ -109,7 +109,7 @@ pub fn headline(task: TaskKind) -> &'static MetricSpec {
     }
 }
 
-/// Place of the metric called `name`.
+/// Position of the metric called `name` in [`METRICS`].
 #[must_use]
 pub fn place_of(name: &str) -> Option<usize> {
     METRICS.iter().position(|metric| metric.name == name)
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn a_summary_has_references_in_brackets_and_leaves_out_what_is_not_measured() {
+    fn a_summary_has_references_in_brackets_and_only_measured_metrics() {
         let mut values = NOT_MEASURED;
         assert_eq!(summary(&values), "");
         values[0] = 3.2;

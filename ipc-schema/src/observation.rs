@@ -11,30 +11,33 @@ pub const TRUTH_COLUMNS: usize = 4;
 pub const GNSS_COLUMNS: usize = 3;
 /// Number of geodetic columns: latitude, longitude (degrees), altitude (metres).
 pub const GEODETIC_COLUMNS: usize = 3;
-/// Number of columns of the quality of a fix: own estimate of the horizontal error (metres, 1σ of the distance), satellites in use.
+/// Number of columns of the quality of a fix: the receiver's estimate of its horizontal error (metres, 1σ of the distance), satellites in
+/// use.
 pub const QUALITY_COLUMNS: usize = 2;
 /// Number of columns of an IMU sample: acceleration x, y, z (m/s²), angular rate x, y, z (rad/s), compass (rad), as `imu.convention` says.
 pub const IMU_COLUMNS: usize = 7;
 /// Number of columns of speed and steering: wheel speed (m/s), steering-wheel angle (rad).
 pub const SPEED_STEERING_COLUMNS: usize = 2;
-/// Number of columns of ages: the first kinds of [`crate::sensor::SensorKind`], which every run has had. The age of a later kind is an
-/// observation field, so that a sensor that is off changes no byte of an observation.
+/// Number of columns of ages: those of the first kinds of [`crate::sensor::SensorKind`]. The age of a later kind is an observation field,
+/// so a sensor that is off does not change a byte of an observation.
 pub const AGE_COLUMNS: usize = 4;
 /// The slot holds a vehicle whose sensors have all delivered at least once.
 pub const VALID: u32 = 1;
-/// The trajectory that held this slot at the previous tick ended there: arrival, removal, collision, off-road. Never bootstrap across it.
+/// The trajectory that held this slot at the previous tick ended there by arrival, removal, collision, or leaving the road. Never bootstrap
+/// across it.
 pub const TERMINATED: u32 = 1 << 1;
-/// The trajectory that held this slot at the previous tick was cut there: end of episode, or a hero's time limit. Bootstrap, then cut.
+/// The trajectory that held this slot at the previous tick was cut there by the end of the episode or a hero's time limit. Bootstrap, then
+/// cut.
 pub const TRUNCATED: u32 = 1 << 2;
 /// At least one field was outside its range and has been clipped.
 pub const CLIPPED: u32 = 1 << 3;
 
 payload_layout! {
-    /// Where the arrays of an `observation` message lie, for `n` slots, `d` numbers in a row and `k` IMU samples in a tick.
+    /// Layout of an `observation` message for `n` slots, `d` numbers in a row and `k` IMU samples in a tick.
     ///
     /// A slot belongs to one vehicle until that vehicle leaves; `n` never shrinks within a run.
     ObservationLayout(slots, fields, imu_samples) => ObservationSections {
-        /// `f32 [n, d]`: normalised observation; with a history, ticks one behind the other, the newest last.
+        /// `f32 [n, d]`: normalised observation; with a history, the ticks in order, the newest last.
         observation: f32, [slots, fields];
         /// `f32 [n, 4]`: ground truth ([`TRUTH_COLUMNS`]), never part of the observation.
         truth: [f32; TRUTH_COLUMNS], [slots];
@@ -54,12 +57,13 @@ payload_layout! {
         vehicle: u32, [slots];
         /// `u32 [n]`: bits [`VALID`], [`TERMINATED`], [`TRUNCATED`], [`CLIPPED`].
         flags: u32, [slots];
-        /// `u32 [n]`: bits of the sensors that deliver ([`crate::sensor::SensorKind::bit`]); never that of a sensor which the slot's holder does not carry.
+        /// `u32 [n]`: bits of the sensors that deliver ([`crate::sensor::SensorKind::bit`]). A sensor that the carrier lacks never has its bit
+        /// set.
         sensors: u32, [slots];
         /// `u32 [n]`: ticks since this vehicle took the slot.
         episode_step: u32, [slots];
         /// `f32 [n, 4]`: age of the newest sample of each of the first sensors ([`AGE_COLUMNS`]), by
-        /// [`crate::sensor::SensorKind`], seconds; 0 for one that it does not carry.
+        /// [`crate::sensor::SensorKind`], seconds; 0 for a sensor that the carrier lacks.
         age_s: [f32; AGE_COLUMNS], [slots];
     }
 }

@@ -1,4 +1,4 @@
-//! `pointcloud`: what one LIDAR has seen during a tick.
+//! `pointcloud`: the returns of one LIDAR in a tick.
 //!
 //! One message for each vehicle that carries a LIDAR and each tick. The payload is one [`Scan`], then the points.
 
@@ -6,7 +6,7 @@ use bytemuck::{Pod, Zeroable};
 
 use crate::section::payload_layout;
 
-/// What a point lies on. Values are stable; new ones come at the end.
+/// Kind of the surface that a point lies on. Values are stable; new ones are added at the end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u16)]
 pub enum Tag {
@@ -34,7 +34,7 @@ pub enum Tag {
     Vegetation = 10,
     /// A vehicle that never moves.
     ParkedVehicle = 11,
-    /// What fell off a lorry.
+    /// Loads that fell off a lorry.
     Load = 12,
     /// A triangle mesh of `scene.meshes`, or ground that is not flat.
     Mesh = 13,
@@ -49,9 +49,9 @@ pub const GROUND: u32 = u32::MAX;
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct LidarPoint {
-    /// In the sensor's axes at the time the point was fired (`lidar.axes`), metres, range noise included.
+    /// Position in the sensor's axes (`lidar.axes`) at the time of firing, metres, with range noise.
     pub position_m: [f32; 3],
-    /// 0 … 1, after attenuation.
+    /// Intensity after attenuation, 0 … 1.
     pub intensity: f32,
     /// Dense index of the road user, or [`STATIC_OBJECT`] and a number, or [`GROUND`].
     pub object: u32,
@@ -59,13 +59,13 @@ pub struct LidarPoint {
     pub incidence_cos: f32,
     /// A [`Tag`].
     pub tag: u16,
-    /// Which laser: 0 is the lowest.
+    /// Number of the laser; 0 is the lowest.
     pub channel: u16,
-    /// Before the end of the tick, microseconds.
+    /// Time from firing to the end of the tick, microseconds.
     pub age_us: u32,
 }
 
-/// Which sensor it was, and where: what is needed to bring its points into the world.
+/// Pose and parameters of one scan. The pose transforms its points into the world.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct Scan {
@@ -81,7 +81,7 @@ pub struct Scan {
     pub range_m: f32,
     /// Rays fired.
     pub rays: u32,
-    /// 1 in the paper's axes, 0 with x forward.
+    /// 1 for the paper's axes, 0 for x forward.
     pub axes: u32,
     /// Dense index of the vehicle within the episode.
     pub vehicle: u32,
@@ -92,7 +92,7 @@ pub struct Scan {
 }
 
 payload_layout! {
-    /// Where the arrays of a `pointcloud` message lie.
+    /// Layout of a `pointcloud` message.
     PointcloudLayout(point_count, scans) {
         /// `Scan [1]`.
         scan: Scan, [scans];

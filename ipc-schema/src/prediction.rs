@@ -1,4 +1,4 @@
-//! `prediction`: what the policy makes of an observation and, where the trainer runs it, the Kalman filter beside it.
+//! `prediction`: the policy's output for an observation and, if the trainer runs the Kalman filter, the filter's estimates.
 
 use crate::section::payload_layout;
 
@@ -6,11 +6,11 @@ use crate::section::payload_layout;
 pub const ESTIMATE_COLUMNS: usize = 2;
 
 payload_layout! {
-    /// Where the arrays of a `prediction` message lie.
+    /// Layout of a `prediction` message.
     PredictionLayout(slots, columns, estimated_slots) {
         /// `f32 [n, a]`: positions (metres, world), or actions in the driving task.
         prediction: f32, [slots, columns];
-        /// `f32 [n, 2]`: position of the extended Kalman filter, not-a-number where it has none; empty where the filter does not run.
+        /// `f32 [n, 2]`: position by the extended Kalman filter, not-a-number for a slot without one; empty where the filter does not run.
         estimate_m: [f32; ESTIMATE_COLUMNS], [estimated_slots];
     }
 }

@@ -1,10 +1,10 @@
-//! The catalogue of props, and what an entry of `scene.obstacles` means.
+//! The catalogue of props, and the entries of `scene.obstacles`.
 
-/// What a prop is, for sensors that tell things apart.
+/// Class of a prop, for sensors that distinguish classes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum PropClass {
-    /// Cones, bollards, barriers: what keeps traffic away.
+    /// Cones, bollards, barriers: objects that close a road.
     Barrier = 0,
     /// Benches, bins, boxes, shelters.
     Furniture = 1,
@@ -14,7 +14,7 @@ pub enum PropClass {
     Vegetation = 3,
     /// A vehicle that never moves.
     Vehicle = 4,
-    /// What fell off a lorry.
+    /// Loads that fell off a lorry.
     Load = 5,
 }
 
@@ -23,13 +23,13 @@ pub enum PropClass {
 pub struct PropKind {
     /// Its name in `scene.obstacles`.
     pub name: &'static str,
-    /// What it is.
+    /// Its class.
     pub class: PropClass,
-    /// Along its heading, metres.
+    /// Length along its heading, metres.
     pub length_m: f64,
-    /// Across its heading, metres.
+    /// Width across its heading, metres.
     pub width_m: f64,
-    /// Metres.
+    /// Height, metres.
     pub height_m: f64,
 }
 
@@ -43,7 +43,7 @@ const fn prop(name: &'static str, class: PropClass, length_m: f64, width_m: f64,
     }
 }
 
-/// Every prop there is. Sizes of common products: a 750 mm road cone, a 3 m concrete step barrier, a Euro pallet box, a 120 l bin.
+/// All props. Sizes are those of common products: a 750 mm road cone, a 3 m concrete step barrier, a Euro pallet box, a 120 l bin.
 pub const PROPS: [PropKind; 16] = [
     prop("cone", PropClass::Barrier, 0.40, 0.40, 0.75),
     prop("bollard", PropClass::Barrier, 0.15, 0.15, 1.00),
@@ -66,20 +66,20 @@ pub const PROPS: [PropKind; 16] = [
 /// One entry of `scene.obstacles`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Obstacle {
-    /// What stands there.
+    /// Kind of prop.
     pub kind: &'static PropKind,
     /// Its centre, x, world, metres.
     pub x_m: f64,
     /// Its centre, y, world, metres.
     pub y_m: f64,
-    /// Counter-clockwise from east, radians.
+    /// Heading, counter-clockwise from east, radians.
     pub yaw_rad: f64,
 }
 
 /// An entry of `scene.obstacles` cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ObstacleError {
-    /// No such prop.
+    /// The prop is unknown.
     #[error("`scene.obstacles`: \"{text}\" names no known prop (\"{name}\")")]
     Unknown {
         /// The entry.
@@ -87,7 +87,7 @@ pub enum ObstacleError {
         /// The name in it.
         name: String,
     },
-    /// Not a name and two or three numbers.
+    /// The entry is not a name and two or three numbers.
     #[error("`scene.obstacles`: \"{text}\" is not \"name x y\" or \"name x y heading\" with plain numbers")]
     Malformed {
         /// The entry.
@@ -96,7 +96,7 @@ pub enum ObstacleError {
 }
 
 impl ObstacleError {
-    /// What to do about it.
+    /// The form of an entry, and the known props.
     #[must_use]
     pub fn help(&self) -> String {
         let names: Vec<_> = PROPS.iter().map(|prop| prop.name).collect();
@@ -111,7 +111,7 @@ impl Obstacle {
     /// Reads "name x y heading"; the heading is in degrees and may be left out.
     ///
     /// # Errors
-    /// An unknown name, or something that is not a number.
+    /// The name is unknown, or a value is not a number.
     pub fn parse(text: &str) -> Result<Self, ObstacleError> {
         let malformed = || ObstacleError::Malformed { text: text.into() };
         let mut words = text.split_whitespace();
@@ -143,7 +143,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_entry_is_a_name_a_place_and_perhaps_a_heading() {
+    fn an_entry_is_a_name_a_position_and_an_optional_heading() {
         let obstacle = Obstacle::parse("  cone 1.5 -2e1 ").unwrap();
         assert_eq!(
             (obstacle.kind.name, obstacle.x_m, obstacle.y_m, obstacle.yaw_rad),
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_read_is_named_with_what_can() {
+    fn a_wrong_entry_is_named_with_the_known_props() {
         let error = Obstacle::parse("cnoe 1 2").unwrap_err();
         assert_eq!(
             error.to_string(),

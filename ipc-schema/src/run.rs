@@ -1,4 +1,4 @@
-//! The run file: what the supervisor tells every process at its start.
+//! The run file: the supervisor writes it, and every process reads it at its start.
 
 use std::path::{Path, PathBuf};
 
@@ -12,20 +12,20 @@ use crate::{
     schedule,
 };
 
-/// What a run is for.
+/// Purpose of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
     /// A trainer learns.
     Train,
-    /// No learner.
+    /// The run has no trainer.
     Simulate,
-    /// A policy of a checkpoint predicts, and nothing learns.
+    /// The policy of a checkpoint predicts without learning.
     Play,
 }
 
 impl Mode {
-    /// True if there is a process in the trainer's place, which must not miss an observation.
+    /// True if the run has the process `trainer`, which receives every observation.
     #[must_use]
     pub fn has_trainer(self) -> bool {
         self != Self::Simulate
@@ -34,7 +34,7 @@ impl Mode {
 
 /// Log of a curriculum in the run directory: the first lesson and tick of each stage.
 pub const CURRICULUM_LOG: &str = "curriculum.jsonl";
-/// Name of that log before it was renamed: a directory with it is refused.
+/// Former name of that log. A directory with a file of this name is refused.
 pub const FORMER_CURRICULUM_LOG: &str = "actions.jsonl";
 
 /// The checkpoint that a run begins with.
@@ -42,26 +42,27 @@ pub const FORMER_CURRICULUM_LOG: &str = "actions.jsonl";
 pub struct Beginning {
     /// Its directory.
     pub checkpoint: PathBuf,
-    /// Where this environment stands in it; in the file of a run that is environment 0.
+    /// Where this environment continues. The run file of the whole run is that of environment 0.
     #[serde(flatten)]
     pub start: Start,
-    /// Where those after environment 0 stand.
+    /// Where the environments after environment 0 continue.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub others: Vec<Start>,
-    /// Play: most episodes; `None`: without end.
+    /// Number of episodes in `caraware play`; `None` means without end.
     pub episodes: Option<u64>,
 }
 
-/// Where an environment stands in a checkpoint.
+/// Where an environment continues after a checkpoint.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Start {
-    /// Ticks of the environment that the checkpoint has learnt from: none of them is delivered again.
+    /// Ticks below this are in the checkpoint: they may be simulated again but are not delivered.
     pub committed_ticks: u64,
-    /// Number of the episode that the first of the others belongs to: the simulation begins with it.
+    /// Number of the episode of the first tick that is delivered. The simulation begins with this episode.
     pub episode: u64,
     /// The first tick of that episode.
     pub episode_tick: u64,
-    /// How many episodes before it were begun anew by a command: so far its number is ahead of its place in the schedule.
+    /// Number of resets before that episode. Each reset adds an episode, so the episode's number exceeds its position in the schedule by
+    /// this number.
     #[serde(default)]
     pub resets: u64,
 }
@@ -76,35 +77,35 @@ pub struct RestartPoint {
     pub sensed_ticks: u64,
 }
 
-/// What traffic runs on.
+/// Source of the traffic.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Source {
-    /// A map with population control: random routes for ever.
+    /// A map with population control: road users on random routes, without end.
     Population {
         /// The built net.
         net_file: PathBuf,
         /// Vehicle types and polygons.
         additional_files: Vec<PathBuf>,
     },
-    /// A user's scenario, as SUMO runs it.
+    /// A user's scenario, which SUMO runs unchanged.
     Scenario {
         /// The `.sumocfg`.
         sumocfg: PathBuf,
     },
 }
 
-/// What the net file says about itself.
+/// Location and size of a map, from its net file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MapInfo {
     /// PROJ string of the net, or of the origin given in the configuration.
     pub projection: String,
-    /// Added to projected coordinates to give net coordinates, metres.
+    /// Offset from projected coordinates to net coordinates, metres.
     pub net_offset_m: [f64; 2],
-    /// x_min, y_min, x_max, y_max of the net with a margin of 20 m, metres: the range of positions and predictions. Of a run with several
-    /// maps: of all of them.
+    /// x_min, y_min, x_max, y_max of the net with a margin of 20 m, metres: the range of positions and predictions. In a run with several
+    /// maps the box holds all of them.
     pub bounds_m: [f64; 4],
-    /// Programs of traffic lights in the net: at least as many as there are lights.
+    /// Number of programs of traffic lights in the net, at least the number of traffic lights.
     pub traffic_lights: u32,
 }
 
@@ -113,16 +114,16 @@ pub struct MapInfo {
 pub struct SceneFiles {
     /// The net: road surface, crossings, traffic lights.
     pub net_file: PathBuf,
-    /// Polygons (buildings) and whatever else SUMO is given beside the routes.
+    /// Polygons (buildings) and SUMO's other additional files.
     pub additional_files: Vec<PathBuf>,
 }
 
 /// A map of a run whose curriculum has several.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunMap {
-    /// The name by which stages refer to it.
+    /// Name of the map in the stages of a curriculum.
     pub name: String,
-    /// What traffic runs on.
+    /// Source of the traffic.
     pub source: Source,
     /// The map, with its own bounds.
     pub info: MapInfo,
@@ -130,7 +131,7 @@ pub struct RunMap {
     pub scene_files: SceneFiles,
 }
 
-/// Where the run's shared memory lives: nothing outside it is touched.
+/// Where the run's shared memory is. The run changes nothing outside it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SharedMemory {
     /// Directory of iceoryx2's files.
@@ -139,7 +140,7 @@ pub struct SharedMemory {
     pub prefix: String,
 }
 
-/// SUMO steps under way at least: the one that moves now, the one that waits for it, and the one that SUMO makes meanwhile.
+/// Least number of SUMO steps under way: one that `sim-core` moves, one that waits for it, and one that SUMO makes meanwhile.
 const STEPS_AHEAD: u64 = 3;
 
 /// The run file, `run.json` in the run directory.
@@ -151,25 +152,25 @@ pub struct RunFile {
     pub run_id: u64,
     /// Name of the run.
     pub name: String,
-    /// Index of the environment that this file speaks to, 0-based; what belongs to the whole run belongs to environment 0.
+    /// Index of this file's environment, from 0. Processes of the whole run read the file of environment 0.
     #[serde(default)]
     pub env_index: u32,
-    /// Directory with everything that this environment leaves behind; that of environment 0 holds the others'.
+    /// Directory of this environment's results. That of environment 0 holds the directories of the others.
     pub run_dir: PathBuf,
-    /// What the run is for.
+    /// Purpose of the run.
     pub mode: Mode,
-    /// Process id of the supervisor: processes end when it does.
+    /// Process id of the supervisor. All processes end when it ends.
     pub supervisor_pid: i32,
     /// Shared memory of the run.
     pub shared_memory: SharedMemory,
-    /// What traffic runs on.
+    /// Source of the traffic.
     pub source: Source,
     /// The map.
     pub map: MapInfo,
     /// The files that the static scene is built from.
     pub scene_files: SceneFiles,
-    /// The maps of a curriculum that has several, the one above first. `map` above then has the bounds of all of them, and as many
-    /// traffic lights as the one with the most.
+    /// The maps of a curriculum with several maps; the first is that of `source`. Then `map` has the bounds of all maps, and the largest
+    /// number of traffic lights.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub maps: Vec<RunMap>,
     /// Installation of SUMO (the `sumo` directory of the `eclipse-sumo` wheel).
@@ -178,7 +179,7 @@ pub struct RunFile {
     pub config: Config,
     /// BLAKE3 of the configuration's canonical JSON.
     pub config_hash: String,
-    /// The checkpoint to begin with, where there is one.
+    /// The checkpoint that the run begins with, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub beginning: Option<Beginning>,
     /// Where the simulator processes of this environment were started again, after one of them had died.
@@ -189,25 +190,25 @@ pub struct RunFile {
 /// The run file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RunFileError {
-    /// Not readable or not writable.
+    /// The file cannot be read or written.
     #[error("cannot access the run file {path}")]
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         #[source]
         source: std::io::Error,
     },
-    /// Not a run file.
+    /// The file is not a run file.
     #[error("{path} is not a run file")]
     Format {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         #[source]
         source: serde_json::Error,
     },
-    /// Written by another version.
+    /// Another version wrote the file.
     #[error("{path} has schema version {found}, this program reads {SCHEMA_VERSION}: rebuild with `make build`")]
     Version {
         /// The file.
@@ -217,7 +218,7 @@ pub enum RunFileError {
     },
 }
 
-/// The run file as it is written: with what readers in other languages would have to work out.
+/// The written run file: it also has values that readers in other languages would otherwise have to compute.
 #[derive(Serialize)]
 struct WrittenRun<'a> {
     #[serde(flatten)]
@@ -230,7 +231,7 @@ impl RunFile {
     /// Reads and checks a run file.
     ///
     /// # Errors
-    /// Unreadable, malformed, or of another schema version.
+    /// The file is unreadable or malformed, or has another schema version.
     pub fn read(path: &Path) -> Result<Self, RunFileError> {
         let text = std::fs::read_to_string(path).map_err(|source| RunFileError::Io {
             path: path.into(),
@@ -252,7 +253,7 @@ impl RunFile {
     /// Writes the run file to `run_dir/run.json` and returns its path.
     ///
     /// # Errors
-    /// Not writable.
+    /// The run directory is not writable.
     pub fn write(&self) -> Result<PathBuf, RunFileError> {
         let path = self.run_dir.join("run.json");
         let written = WrittenRun {
@@ -270,13 +271,13 @@ impl RunFile {
         Ok(path)
     }
 
-    /// True if a tick of this run is due at a time of the clock, and waits for `process`.
+    /// True if ticks of this run are due at times of the clock and `process` is needed for them.
     #[must_use]
     pub fn keeps_time(&self, process: Process) -> bool {
         (process.spec().holds_up_ticks)(self) && self.config.run.real_time_factor > 0.0
     }
 
-    /// The same run as environment `env_index` sees it. `self` is environment 0's.
+    /// The run file of environment `env_index`. `self` is that of environment 0.
     #[must_use]
     pub fn environment(&self, env_index: u32) -> Self {
         let run_dir = match env_index {
@@ -299,7 +300,7 @@ impl RunFile {
         }
     }
 
-    /// Every map of the run, at least one, by its place in [`crate::header::MessageHeader::map`].
+    /// Every map of the run, at least one, in the order of [`crate::header::MessageHeader::map`].
     #[must_use]
     pub fn every_map(&self) -> Vec<RunMap> {
         if !self.maps.is_empty() {
@@ -313,26 +314,26 @@ impl RunFile {
         }]
     }
 
-    /// Seed of everything random in this environment; that of the run in the first one of all.
+    /// Seed of all random numbers in this environment. The first environment has the seed of the run.
     #[must_use]
     pub fn seed(&self) -> u64 {
         let run = &self.config.run;
         schedule::environment_seed(run.seed, run.first_env + self.env_index)
     }
 
-    /// Where `sim-core` writes what viewers are told of the scene, as JSON (docs/fanout.md, `map`), before it attaches.
+    /// Path of the scene for viewers, as JSON (docs/fanout.md, `map`). `sim-core` writes it before it attaches.
     #[must_use]
     pub fn chart_path(&self) -> PathBuf {
         self.run_dir.join("map").join("chart.json")
     }
 
-    /// Socket through which the supervisor takes requests, in a directory that only its user can enter.
+    /// Path of the socket for requests to the supervisor, in a directory that only its user can enter.
     #[must_use]
     pub fn control_socket(&self) -> PathBuf {
         self.shared_memory.root.join("control")
     }
 
-    /// SUMO steps per tick are 1 / this: ticks in one SUMO step.
+    /// Number of ticks in one SUMO step.
     #[must_use]
     pub fn ticks_per_traffic_step(&self) -> u64 {
         #[expect(
@@ -344,14 +345,14 @@ impl RunFile {
         ratio.max(1)
     }
 
-    /// Ticks that dynamics and sensors may be ahead of the next process.
+    /// Ticks that `sim-core` and `sensor-daemon` may each be ahead of the next process.
     #[must_use]
     pub fn window_ticks(&self) -> u64 {
         u64::from(self.config.run.window_ticks)
     }
 
-    /// Ticks that traffic may be ahead of the dynamics: the window, and at least [`STEPS_AHEAD`] SUMO steps where a step has several
-    /// ticks. With less SUMO and the dynamics wait for each other instead of working side by side.
+    /// Ticks that `traffic-bridge` may be ahead of `sim-core`: the window, and at least [`STEPS_AHEAD`] SUMO steps if a step has several
+    /// ticks. With fewer, SUMO and `sim-core` wait for each other instead of working side by side.
     #[must_use]
     pub fn traffic_window_ticks(&self) -> u64 {
         let window = self.window_ticks();
@@ -370,19 +371,19 @@ impl RunFile {
         restart.or(beginning).unwrap_or_default()
     }
 
-    /// Number of the first tick that is made.
+    /// Number of the first tick that is simulated.
     #[must_use]
     pub fn first_tick(&self) -> u64 {
         self.start().episode_tick
     }
 
-    /// Ticks that the checkpoint which the run begins with has learnt from.
+    /// Ticks below this are in the checkpoint that the run begins with.
     #[must_use]
     pub fn committed_ticks(&self) -> u64 {
         self.start().committed_ticks
     }
 
-    /// The episodes that are made, in order; in play they may have no end.
+    /// The episodes of this run, in order; in play without end.
     pub fn schedule(&self) -> Box<dyn Iterator<Item = schedule::Episode>> {
         let episodes = self.beginning.as_ref().and_then(|beginning| beginning.episodes);
         let Start { episode, resets, .. } = self.start();
@@ -401,7 +402,7 @@ impl RunFile {
         )
     }
 
-    /// The plan of this run if it has a curriculum.
+    /// The plan of this run's curriculum, if it has one.
     #[must_use]
     pub fn curriculum_plan(&self) -> Option<schedule::CurriculumPlan> {
         let Config {
@@ -415,8 +416,7 @@ impl RunFile {
         }
     }
 
-    /// The episodes of this run, where they have an end that the configuration knows; none in play. Of one with a curriculum the
-    /// longest that it may get.
+    /// The episodes of this run, as the configuration plans them; none in play. With a curriculum the run may end earlier.
     #[must_use]
     pub fn episodes(&self) -> Vec<schedule::Episode> {
         let (lengths, seed) = (&self.config.episode, self.seed());

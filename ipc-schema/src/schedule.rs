@@ -1,17 +1,17 @@
-//! The episodes of a run: a pure function of configuration and seed, so that every process can compute them.
+//! The schedule of a run's episodes: a pure function of configuration and seed, which every process can compute.
 
 use crate::config::{CurriculumConfig, EpisodeConfig as Lengths, MapChoice, StageConfig};
 
 /// One episode of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Episode {
-    /// 0-based over the run.
+    /// Number of the episode in the run, from 0.
     pub index: u64,
-    /// True if nothing is learned in it and training never sees its seed.
+    /// True in an evaluation: the learner does not learn, and no training episode has its seed.
     pub evaluation: bool,
     /// Seed of traffic, noise and blackouts.
     pub seed: u64,
-    /// Length in ticks; `None` = until the scenario ends.
+    /// Length in ticks; `None` means until the scenario ends.
     pub ticks: Option<u64>,
 }
 
@@ -42,7 +42,7 @@ pub fn training(lengths: &Lengths, seed: u64) -> Vec<Episode> {
     episodes
 }
 
-/// The episodes of a run without learning: all training episodes one after the other.
+/// The episodes of a run without learning: all training episodes in order.
 #[must_use]
 pub fn simulation(lengths: &Lengths, seed: u64) -> Vec<Episode> {
     (0..lengths.training_episodes)
@@ -55,7 +55,7 @@ pub fn simulation(lengths: &Lengths, seed: u64) -> Vec<Episode> {
         .collect()
 }
 
-/// The single episode of a user's scenario: to its own end, with the run's seed.
+/// The single episode of a user's scenario. It has the run's seed and lasts until the scenario ends.
 #[must_use]
 pub fn scenario(seed: u64) -> Vec<Episode> {
     vec![Episode {
@@ -88,7 +88,7 @@ fn first_words(hasher: &blake3::Hasher) -> [u64; 2] {
     })
 }
 
-/// The `index`-th episode of play: its seed is one that no training sees.
+/// The `index`-th episode of play. No training episode has its seed.
 #[must_use]
 pub fn play(seed: u64, index: u64, ticks: Option<u64>) -> Episode {
     Episode {
@@ -106,28 +106,28 @@ pub enum DueWork {
     Evaluation {
         /// The episode.
         episode: Episode,
-        /// True if nothing follows it.
+        /// True for the last episode of the run.
         is_last: bool,
     },
-    /// A lesson, which [`CurriculumPlan::enter`] puts into its stage.
+    /// The lesson with this number. [`CurriculumPlan::enter`] begins it in its stage.
     Lesson(u64),
-    /// Nothing: the run is complete.
+    /// The run is complete.
     Nothing,
 }
 
 /// A lesson of a run with a curriculum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Lesson {
-    /// Its stage, counted from 0.
+    /// Number of its stage, from 0.
     pub stage: usize,
-    /// Its map among those of the run.
+    /// Index of its map among those of the run.
     pub map: usize,
-    /// The episode that begins with it; `None`: the running episode continues.
+    /// The episode that begins with it; `None` if the running episode continues.
     pub begins: Option<Episode>,
 }
 
-/// The plan of a run with a curriculum: lessons, evaluations at the interval, and the final evaluations. It is a function of
-/// configuration, seed and the stages of lessons.
+/// The plan of a run with a curriculum: lessons, evaluations at the interval, and the final evaluations. It depends only on the
+/// configuration, the seed and the stages of the lessons.
 #[derive(Debug)]
 pub struct CurriculumPlan {
     lengths: Lengths,
@@ -164,7 +164,7 @@ impl StagePlan {
         }
     }
 
-    /// The map of the lesson that is `since` lessons after the stage's first, `first`, in a run of at most `most` lessons.
+    /// The map of the lesson that comes `since` lessons after `first`, the first lesson of the stage. The run has at most `most` lessons.
     fn map(&self, seed: u64, first: u64, since: u64, most: u64) -> usize {
         let count = self.maps.len() as u64;
         let [share, draw] = map_words(seed, first + since);
@@ -174,7 +174,7 @@ impl StagePlan {
         match self.choice {
             MapChoice::InOrder => at(since % count),
             MapChoice::Random => at(draw % count),
-            // Probability since / (lessons − 1), in whole numbers: `share` is one of 2⁶⁴, each as likely.
+            // The probability is since / (lessons − 1), in whole numbers: `share` is uniform over 2⁶⁴ values.
             MapChoice::GraduallyRandom => {
                 let (since, last) = (u128::from(since), u128::from(lessons.saturating_sub(1)));
                 match u128::from(share) * last < since << 64 {
@@ -252,7 +252,7 @@ impl CurriculumPlan {
         }
     }
 
-    /// Begins the lesson that is due, in `stage`, counted from 0; `None` if that is behind the last: no lesson follows.
+    /// Begins the lesson that is due, in `stage`, counted from 0. `None` if `stage` is after the last one: then the lessons are over.
     pub fn enter(&mut self, stage: usize) -> Option<Lesson> {
         let Some(way) = self.stages.get(stage) else {
             self.is_over = true;
@@ -273,7 +273,8 @@ impl CurriculumPlan {
     }
 }
 
-/// Seed of the `count`-th training or evaluation episode: first eight bytes of a BLAKE3 hash, so the two never meet.
+/// Seed of the `count`-th training or evaluation episode: the first eight bytes of a BLAKE3 hash. The two kinds have different keys, so
+/// they do not share seeds.
 #[must_use]
 pub fn episode_seed(run_seed: u64, evaluation: bool, count: u64) -> u64 {
     let mut hasher = blake3::Hasher::new_derive_key(if evaluation {

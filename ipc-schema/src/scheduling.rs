@@ -1,13 +1,15 @@
-//! A place in front of the kernel's queue for whoever keeps to the clock.
+//! Short time slices for processes that must keep to the clock.
 
 use std::io;
 
-/// The time that a thread asks for at a turn. Whoever asks for less gets it sooner, and no more of the whole.
+/// The requested time slice. The kernel runs a thread with a shorter slice sooner, without giving it more time in total.
 const SLICE_NS: u64 = 100_000;
 
-/// Lets the calling thread, and those that it starts from now on, run soon after they wake, whoever else keeps the cores busy: with
-/// the usual slice of some milliseconds a tick in real time waits as long for a core that a viewer has just taken. Kernels before
-/// Linux 6.12 have no slices to ask for, and nothing changes.
+/// Requests a short time slice for the calling thread and the threads that it starts later: they run soon after they wake, even while
+/// other processes keep the cores busy.
+///
+/// With the usual slice of some milliseconds, a tick in real time waits that long for a core that a viewer has just taken. Kernels
+/// before Linux 6.12 have no such request, and nothing changes there.
 ///
 /// # Errors
 /// The system refuses: a kernel or a sandbox without the call.
@@ -52,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_kernel_takes_the_wish_of_a_thread() {
+    fn the_kernel_accepts_the_request() {
         std::thread::spawn(|| ask_for_short_turns().unwrap()).join().unwrap();
     }
 }

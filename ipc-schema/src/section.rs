@@ -1,7 +1,7 @@
-//! The sections of a payload as data: name, element and dimensions of each, listed once. Layouts, writers, `layout.json` and the
-//! arrays that Python builds derive from that list (decision 21).
+//! The sections of a payload as data: each payload lists the name, element and dimensions of its sections once. Layouts, writers,
+//! `layout.json` and the arrays in Python derive from that list (decision 21).
 
-/// A value that stands in a section or in a record: how other languages read it.
+/// The type of a value in a section or a record, as other languages read it.
 pub trait WireElement {
     /// The scalar as numpy writes it ("<f4", little endian), or the name of a record of `layout.json`.
     const SCALAR: &'static str;
@@ -33,7 +33,7 @@ impl<T: WireElement, const N: usize> WireElement for [T; N] {
     }
 }
 
-/// Scalar and shape of an element, as numpy takes them. Bytes are text: they are one opaque value, not numbers.
+/// Scalar and shape of an element for numpy. An array of bytes is text: one opaque value, not numbers.
 #[must_use]
 pub fn numpy_type<T: WireElement>() -> (String, Vec<usize>) {
     let mut shape = T::shape();

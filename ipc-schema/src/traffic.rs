@@ -1,4 +1,4 @@
-//! `traffic` and `traffic-meta`: what SUMO knows, in our units and frames.
+//! `traffic` and `traffic-meta`: SUMO's road users and traffic lights in SI units and the world frame.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -14,11 +14,11 @@ pub enum Kind {
     Other = 1,
     /// Pedestrian.
     Person = 2,
-    /// Vehicle that is driven by actions (`driving` task); it carries sensors as a [`Kind::Cav`] does.
+    /// Vehicle that actions drive (driving task); it carries sensors like a [`Kind::Cav`].
     Hero = 3,
 }
 
-/// SUMO moved this road user in a way no vehicle can (teleport, insertion, `moveToXY`): do not interpolate across it.
+/// SUMO set this road user's position (teleport, insertion, `moveToXY`): do not interpolate across this step.
 pub const DISCONTINUOUS: u32 = 1;
 
 /// One road user at one SUMO step. World frame: metres in the net's own projected coordinates, x east, y north, z up.
@@ -49,13 +49,13 @@ pub struct TrafficState {
     pub flags: u32,
 }
 
-/// What happened to a road user, as carried in [`VehicleMeta::event`].
+/// An event of a road user, as carried in [`VehicleMeta::event`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub enum MetaEvent {
-    /// It entered the network: the other fields describe it.
+    /// It entered the net; the other fields describe it.
     Departed = 0,
-    /// It left the network by reaching its destination (or being removed).
+    /// It left the net: it reached its destination, or SUMO removed it.
     Arrived = 1,
     /// SUMO began to teleport it.
     Teleported = 2,
@@ -99,7 +99,7 @@ pub const VEHICLE_CLASSES: [&str; 34] = [
     "ignoring",
 ];
 
-/// Longest id carried as text; longer ids are cut, their hash is of the whole.
+/// Longest id that is carried as text. Longer ids are cut; their hash is that of the whole id.
 pub const ID_BYTES: usize = 64;
 /// Longest name of a vehicle type that is carried.
 pub const TYPE_ID_BYTES: usize = 32;
@@ -152,13 +152,13 @@ impl VehicleMeta {
 /// Most links of one traffic light that are carried.
 pub const SIGNAL_LINKS: usize = 128;
 
-/// Most events of road users in one `traffic-meta` message; more in one step take more messages.
+/// Most events of road users in one `traffic-meta` message; a step with more events sends more messages.
 pub const EVENTS_PER_MESSAGE: usize = 1024;
 
-/// Most traffic lights in one `traffic-meta` message; more changes in one step take more messages.
+/// Most traffic lights in one `traffic-meta` message; a step with more changes sends more messages.
 pub const SIGNALS_PER_MESSAGE: usize = 256;
 
-/// Most traffic lights in a census; of those beyond only the changes are told.
+/// Most traffic lights in a census; further ones are sent only when they change.
 pub const MOST_SIGNALS: usize = 4096;
 
 /// State of one traffic light, sent when the episode begins and whenever it changes.
@@ -203,9 +203,9 @@ pub fn id_text_bytes(id: &str) -> ([u8; ID_BYTES], u32) {
 }
 
 payload_layout! {
-    /// Where the arrays of a `traffic-meta` message lie.
+    /// Layout of a `traffic-meta` message.
     TrafficMetaLayout(events, changes, points) {
-        /// `VehicleMeta [events]`: what happened to road users.
+        /// `VehicleMeta [events]`: events of road users.
         vehicles: VehicleMeta, [events];
         /// `SignalMeta [changes]`: traffic lights that changed.
         signals: SignalMeta, [changes];
@@ -235,13 +235,13 @@ pub const ROUTE_POINTS_PER_MESSAGE: usize = 2048;
 /// [`RoutePoint::signal`] where there is none.
 pub const NO_SIGNAL: u32 = u32::MAX;
 
-/// One point of the line that a hero is to follow: centre of its lanes and of its ways across junctions.
+/// One point of a hero's route: a line along the centres of its lanes and across junctions.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct RoutePoint {
-    /// World, metres.
+    /// x, world, metres.
     pub x_m: f64,
-    /// World, metres.
+    /// y, world, metres.
     pub y_m: f64,
     /// Speed limit from here on, m/s.
     pub speed_limit_mps: f32,
@@ -253,7 +253,7 @@ pub struct RoutePoint {
     pub edge: u32,
     /// [`SignalMeta::signal`] of the traffic light whose stop line this is, or [`NO_SIGNAL`].
     pub signal: u32,
-    /// Its link for the hero's way.
+    /// Link of that traffic light that controls the hero.
     pub link: u32,
 }
 

@@ -1,11 +1,11 @@
-//! What a process has used of the machine: for the report of a run.
+//! The processor time and memory of a process, for the report of a run.
 
 use rustix::time::ClockId;
 use serde::Serialize;
 
 use crate::clock;
 
-/// Clock ticks in a second, as Linux tells the processor time of other processes on every machine.
+/// Clock ticks per second: the unit in which Linux reports the processor time of other processes.
 const CLOCK_TICKS_PER_S: f64 = 100.0;
 
 /// Processor time and memory of one process.
@@ -13,14 +13,14 @@ const CLOCK_TICKS_PER_S: f64 = 100.0;
 pub struct Usage {
     /// Processor time of all threads since the process started, seconds.
     pub cpu_s: f64,
-    /// The part of it since all ports were open: without loading programs, maps and scenes.
+    /// The part of it after all ports were open, without the loading of programs, maps and scenes.
     pub loop_cpu_s: f64,
-    /// Most memory at a time, shared memory that it has touched included, MiB.
+    /// Peak of resident memory, including the shared memory that it has touched, MiB.
     pub peak_memory_mib: u64,
 }
 
 impl Usage {
-    /// So far, where `start_cpu_s` was used before the work began.
+    /// The usage so far. `start_cpu_s` is the processor time that was used before the work began.
     #[must_use]
     pub fn so_far(start_cpu_s: f64) -> Self {
         let cpu_s = processor_time_s();
@@ -38,15 +38,16 @@ pub fn processor_time_s() -> f64 {
     clock::seconds(ClockId::ProcessCPUTime)
 }
 
-/// Processor time of a process that nobody has taken note of yet if it has ended, and of its children that it has, seconds.
+/// Processor time of a process and of its children that it has waited for, seconds. A process that has ended is readable until its parent
+/// waits for it.
 #[must_use]
-pub fn of_family_s(pid: u32) -> Option<f64> {
+pub fn family_processor_time_s(pid: u32) -> Option<f64> {
     let text = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     Some(family_ticks(&text)? / CLOCK_TICKS_PER_S)
 }
 
-/// Sum of the fields 14 to 17 of `/proc/<pid>/stat`, counted from the name in brackets, which is the second: user and system time
-/// of the process, and those of its children.
+/// Sum of the fields 14 to 17 of `/proc/<pid>/stat`: user and system time of the process and of its children. Fields are counted from the
+/// name in brackets, which is field 2.
 fn family_ticks(stat: &str) -> Option<f64> {
     let (_, fields) = stat.rsplit_once(')')?;
     let numbers = fields.split_whitespace().skip(11).take(4);

@@ -1,20 +1,20 @@
-//! `world`: every road user after the nanoscopic core has moved it.
+//! `world`: every road user after `sim-core` has moved it.
 
 use bytemuck::{Pod, Zeroable};
 
 use crate::section::payload_layout;
 
-/// The pose was set, not reached by moving: insertion, teleport or re-synchronisation.
+/// The pose was set instead of reached by motion: insertion, teleport or resynchronisation.
 pub const RESYNCHRONISED: u32 = 1;
 /// First tick of this road user in the episode.
 pub const APPEARED: u32 = 1 << 1;
-/// It touches something it did not touch in the tick before.
+/// It touches an object that it did not touch in the tick before.
 pub const COLLIDED: u32 = 1 << 2;
 /// A hero has left the road surface: its episode ends.
 pub const OFF_ROAD: u32 = 1 << 3;
 /// A hero has reached the end of its route: its episode ends.
 pub const ARRIVED: u32 = 1 << 4;
-/// A hero's time is up: its episode is cut.
+/// A hero has reached its time limit: its episode is cut.
 pub const TIME_LIMIT: u32 = 1 << 5;
 /// The action for this tick was refused; the last valid one was held.
 pub const ACTION_REFUSED: u32 = 1 << 6;
@@ -74,7 +74,7 @@ pub struct VehicleState {
     pub reference_offset_m: f32,
 }
 
-/// Motion at one nano sub-step; the last sub-step of a tick coincides with its [`VehicleState`].
+/// Motion at one sub-step; the last sub-step of a tick coincides with its [`VehicleState`].
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct SubStep {
@@ -107,28 +107,28 @@ pub struct SubStep {
 /// Bits that end a hero's episode; [`TIME_LIMIT`] alone cuts it, the others terminate it.
 pub const HERO_ENDS: u32 = COLLIDED | OFF_ROAD | ARRIVED | TIME_LIMIT;
 
-/// Distances along its route at which a hero sees where it leads, metres.
+/// Distances ahead, along the route, of the route points that a hero sees, metres.
 pub const ROUTE_AHEAD_M: [f64; 4] = [5.0, 10.0, 20.0, 40.0];
-/// How far ahead a hero sees road users and signals on its route, metres.
+/// Distance at which a hero sees road users and signals on its route, metres.
 pub const SIGHT_M: f64 = 100.0;
 
-/// What a hero sees of its route and of the traffic on it, at the end of a tick.
+/// A hero's view of its route and of the traffic on it, at the end of a tick.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
 pub struct HeroView {
     /// Points of its route [`ROUTE_AHEAD_M`] ahead, forward and left of the rear axle, body frame, metres.
     pub route_m: [[f32; 2]; 4],
-    /// Speed limit where it is, m/s.
+    /// Speed limit at its position, m/s.
     pub speed_limit_mps: f32,
-    /// Nearest point of its route as seen from the rear axle, positive to the left, metres.
+    /// Offset from the rear axle to the nearest point of its route, positive to the left, metres.
     pub route_offset_m: f32,
-    /// From the front bumper to the end of the route, along it, metres.
+    /// Distance along the route from the front bumper to its end, metres.
     pub route_left_m: f32,
-    /// From bumper to bumper of the next road user on its route, metres, at most [`SIGHT_M`].
+    /// Gap between its front bumper and the next road user on its route, metres, at most [`SIGHT_M`].
     pub leader_gap_m: f32,
     /// Speed of that road user along the route, m/s; 0 if there is none.
     pub leader_speed_mps: f32,
-    /// From the front bumper to the next stop line whose signal is not green, metres, at most [`SIGHT_M`].
+    /// Distance from the front bumper to the next stop line with a signal that is not green, metres, at most [`SIGHT_M`].
     pub signal_gap_m: f32,
     /// Dense index of the hero within the episode.
     pub vehicle: u32,
@@ -137,8 +137,7 @@ pub struct HeroView {
 }
 
 payload_layout! {
-    /// Where the arrays of a `world` message lie: road users, their sub-steps vehicle by vehicle, and views of the heroes by ascending
-    /// index.
+    /// Layout of a `world` message: road users, their sub-steps vehicle by vehicle, and the views of the heroes by ascending index.
     WorldLayout(road_users, sub_steps_each, hero_count) {
         /// `VehicleState [count]`.
         states: VehicleState, [road_users];

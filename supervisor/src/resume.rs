@@ -45,7 +45,10 @@ pub fn changed_config(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
     let started = std::env::var("WORLD_SIZE").ok().and_then(|size| size.parse().ok());
     if ranks > 1 && started != Some(ranks) {
         return Err(Exit::config(
-            format!("the trainer of {} learned together with others as one of {ranks} ranks", run.name),
+            format!(
+                "the trainer of {} learned together with others as one of {ranks} ranks",
+                run.name
+            ),
             format!("resume all ranks together: torchrun --nproc-per-node {ranks} -m caraware.parallel --resume RUN"),
         ));
     }
@@ -55,7 +58,10 @@ pub fn changed_config(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
         if is_known && !CHANGEABLE.iter().any(|part| key.starts_with(part)) {
             return Err(Exit::config(
                 format!("`{key}` cannot change in a resumed run"),
-                format!("observations depend on it. Keys that may change: {}", CHANGEABLE.join(", ")),
+                format!(
+                    "observations depend on it. Keys that may change: {}",
+                    CHANGEABLE.join(", ")
+                ),
             ));
         }
     }

@@ -61,10 +61,7 @@ fn credential_arguments(credentials: &Credentials) -> Vec<String> {
         .into_iter()
         .filter_map(|(option, path)| Some(format!("--{option}={}", path.as_ref()?.display())));
     let user = credentials.user.iter();
-    user
-        .map(|user| format!("--user={user}"))
-        .chain(files)
-        .collect()
+    user.map(|user| format!("--user={user}")).chain(files).collect()
 }
 
 /// The endpoint at which a run's `fanout` listens.
@@ -182,10 +179,7 @@ impl ViewerRequest {
         };
         let (users, certificates) = (!fanout.users.is_empty(), !fanout.tls_client_ca.is_empty());
         let missing = [
-            (
-                users && credentials.user.is_none(),
-                "--user NAME --password-file FILE",
-            ),
+            (users && credentials.user.is_none(), "--user NAME --password-file FILE"),
             (
                 certificates && credentials.certificate.is_none(),
                 "--certificate FILE --key FILE",

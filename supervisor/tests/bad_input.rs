@@ -226,7 +226,10 @@ fn other_files_in_the_runtime_directory_stay() {
     let episode = ["--set", "episode.training_episodes=1", "--set", "episode.ticks=20"];
     workplace.succeed(&[&["simulate", "town", "--name", "beside"], &short[..], &episode[..]].concat());
     let said = text(&workplace.succeed(&["doctor", "--clean"]));
-    assert!(said.contains("thesis: not a run of caraware; it is not touched"), "{said}");
+    assert!(
+        said.contains("thesis: not a run of caraware; it is not touched"),
+        "{said}"
+    );
     assert_eq!(tree(&runtime), before);
 }
 

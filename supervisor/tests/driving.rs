@@ -331,7 +331,11 @@ fn an_action_that_is_not_finite_or_out_of_range_is_refused_and_the_last_one_is_h
     );
     assert!(warnings[0].contains("[0.1, 0.2] is held"), "{}", warnings[0]);
     let poses = |report: &Value| -> Vec<Vec<Value>> { seen(report).into_iter().map(|row| row[7..].to_vec()).collect() };
-    assert_eq!(poses(&good), poses(&bad), "a held action has the effect of one that was sent again");
+    assert_eq!(
+        poses(&good),
+        poses(&bad),
+        "a held action has the effect of one that was sent again"
+    );
     assert_eq!(good["observation_hash"], bad["observation_hash"]);
 }
 

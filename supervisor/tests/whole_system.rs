@@ -130,7 +130,11 @@ fn the_same_seed_gives_the_same_bytes_whatever_runs_beside() {
     workplace.succeed(&small("train", "b", &beside));
     workplace.succeed(&small("simulate", "d", &QUIET));
     workplace.succeed(&small("train", "c", &[&QUIET[..], &["--set", "run.seed=2"]].concat()));
-    assert_eq!(hash("a"), hash("b"), "same seed, another window and horizon, and a fan-out");
+    assert_eq!(
+        hash("a"),
+        hash("b"),
+        "same seed, another window and horizon, and a fan-out"
+    );
     assert_ne!(
         hash("a"),
         hash("d"),

@@ -1,7 +1,7 @@
-//! Observations one by one, each lent until the next is taken: the way with the least between shared memory and a tensor.
+//! Lends observations one at a time, each until the next is taken: the shortest way from shared memory to a tensor.
 //!
-//! Shared memory has a fixed number of places for messages. The tensor over a place is made once and handed out again whenever a
-//! message lies there, so that taking one costs a look into a table instead of a dozen Python objects.
+//! Shared memory has a fixed number of places for messages. The tensor over a place is made once and returned again whenever a message
+//! lies there, so taking a message costs a lookup in a table instead of a dozen new Python objects.
 
 use std::{
     ffi::c_int,
@@ -19,21 +19,22 @@ use pyo3::{exceptions::PyValueError, ffi, prelude::*};
 
 use crate::{Attachment, POLLS, checked_layout, failed};
 
-/// Longest time that it looks without letting other threads of Python run: a fifth of the time that they leave each other.
-const KEEPS_PYTHON: Duration = Duration::from_millis(1);
+/// Longest time that polling holds the GIL: a fifth of Python's own switch interval.
+const GIL_HOLD: Duration = Duration::from_millis(1);
 
-/// Where a message lies and how it is laid out: address and shape.
+/// Address and shape of a message.
 type MessagePlace = (usize, [u32; DIMENSIONS]);
 
-/// The newest message, and until the next is asked for the one before it: nobody has to wait while a place is given back. While a
-/// message is held, its publisher's memory stays mapped, that of all earlier messages included: whoever has a tensor over any of them
-/// holds this.
+/// The newest message and, until the next one is requested, the message before it: releasing a place then delays no tensor.
+///
+/// While a message is held, the memory of its publisher stays mapped, with the places of all earlier messages. Every tensor over a place
+/// therefore holds this.
 type Held = Arc<Mutex<[Option<Message>; 2]>>;
 
 struct Lent {
     header: MessageHeader,
     received_ns: u64,
-    /// The one used last first: a publisher takes the place that has become free last.
+    /// The tensor that was used last comes first, because a publisher takes the place that became free last.
     tensors: Vec<(MessagePlace, Py<PyAny>)>,
 }
 
@@ -41,7 +42,7 @@ struct Lent {
 #[pyclass(frozen, module = "caraware._native")]
 pub(crate) struct Lease {
     attachment: Py<Attachment>,
-    /// Makes a tensor of a buffer of bytes, slots and fields.
+    /// Python function that makes a tensor from a buffer of bytes and the numbers of slots and fields.
     make: Py<PyAny>,
     held: Held,
     lent: Mutex<Lent>,
@@ -67,8 +68,8 @@ impl Lease {
         }
     }
 
-    /// The tensor of the next tick, `None` after `timeout_s` seconds. The one before it is given back: what it shows is undefined from
-    /// now on. Keeps its core and looks again and again.
+    /// Waits for the next tick and returns its tensor; `None` after `timeout_s` seconds. The tick before it is released: the contents of
+    /// its tensor are undefined from now on. Busy-polls.
     fn next(&self, py: Python<'_>, timeout_s: f64) -> PyResult<Option<Py<PyAny>>> {
         let deadline = Instant::now()
             + Duration::try_from_secs_f64(timeout_s).map_err(|error| PyValueError::new_err(error.to_string()))?;
@@ -85,7 +86,7 @@ impl Lease {
         }
     }
 
-    /// Tick number of the newest, 0-based over the run.
+    /// Number of the newest tick, 0-based over the run.
     #[getter]
     fn tick(&self) -> u64 {
         lock(&self.lent).header.tick
@@ -103,7 +104,7 @@ impl Lease {
         lock(&self.lent).header.sim_time_ns
     }
 
-    /// When it was taken, on the system's monotonic clock, nanoseconds.
+    /// Time at which it was taken, on the system's monotonic clock, nanoseconds.
     #[getter]
     fn received_ns(&self) -> u64 {
         lock(&self.lent).received_ns
@@ -121,7 +122,7 @@ impl Lease {
         lock(&self.lent).header.has(header::LAST_OF_RUN)
     }
 
-    /// Number of tensors that have been made: one for each place in shared memory that a message has come to lie in.
+    /// Number of tensors made so far: one for each place in shared memory that held a message.
     #[getter]
     fn places(&self) -> usize {
         lock(&self.lent).tensors.len()
@@ -129,10 +130,10 @@ impl Lease {
 }
 
 impl Lease {
-    /// Looks until a message is there, the deadline has passed, or it is time to let others run.
+    /// Polls until a message arrives, the deadline has passed, or other threads of Python must run.
     fn poll(&self, deadline: Instant) -> PyResult<Option<Message>> {
         let mut inner = self.attachment.get().lock()?;
-        let until = deadline.min(Instant::now() + KEEPS_PYTHON);
+        let until = deadline.min(Instant::now() + GIL_HOLD);
         loop {
             for _ in 0..POLLS {
                 if let Some(message) = inner.next_message()? {
@@ -146,12 +147,13 @@ impl Lease {
         }
     }
 
-    /// The tensor over the place of `message`, which is held from now on in place of the one before.
+    /// Holds `message` as the newest, and returns the tensor over its place.
     fn lend(&self, py: Python<'_>, message: Message) -> PyResult<Py<PyAny>> {
         let received_ns = monotonic_ns();
         let header = *message.header();
         let address = message.payload().as_ptr().expose_provenance();
         let place = (address, header.shape);
+        // Most messages lie in a place that has a tensor already.
         let known = {
             let mut lent = lock(&self.lent);
             (lent.header, lent.received_ns) = (header, received_ns);
@@ -165,25 +167,26 @@ impl Lease {
             hold(&self.held, message);
             return Ok(tensor);
         }
+        // The first message in a place makes its tensor.
         let layout = checked_layout(&message)?;
         let view = LentView::new(Arc::clone(&self.held), address, layout);
         hold(&self.held, message);
         let tensor = self.make.call1(py, (view, header.shape[0], header.shape[1]))?;
         let tensors = &mut lock(&self.lent).tensors;
-        // Of a place that is laid out anew, with more slots, the old tensor is of no more use.
+        // If the layout of a place has changed, with more slots, its old tensor is useless.
         tensors.retain(|((known, ..), _)| *known != address);
         tensors.push((place, tensor.clone_ref(py)));
         Ok(tensor)
     }
 }
 
-/// Keeps `message` as the newest.
+/// Holds `message` as the newest, and the message before it until the next call.
 fn hold(held: &Held, message: Message) {
     let mut held = lock(held);
     held[1] = held[0].replace(message);
 }
 
-/// The observation of whatever message lies in a place of shared memory, as a read-only buffer of bytes.
+/// The observation of the message in one place of shared memory, as a read-only buffer of bytes.
 #[pyclass(frozen, module = "caraware._native")]
 struct LentView {
     _held: Held,
@@ -203,7 +206,7 @@ impl LentView {
 
 #[pymethods]
 impl LentView {
-    /// Buffer protocol: refuses writers; the consumer holds this object, which holds the newest message, which holds the mapping.
+    /// Buffer protocol, read-only. The consumer holds this object, which holds the newest message, which keeps the memory mapped.
     #[expect(unsafe_code, reason = "the buffer protocol of CPython works on raw pointers")]
     unsafe fn __getbuffer__(slf: Bound<'_, Self>, view: *mut ffi::Py_buffer, flags: c_int) -> PyResult<()> {
         let this = slf.get();

@@ -1,4 +1,4 @@
-//! Python extension `caraware._native`: a trainer's place in a run, observations as read-only views over shared memory.
+//! Python extension `caraware._native`: attaches a trainer to a run, with observations as read-only views over shared memory.
 
 use std::{
     collections::BTreeMap,
@@ -36,9 +36,9 @@ use metrics::Metric;
 use scans::PointCloud;
 use view::SectionView;
 
-/// Longest wait between two looks at Python's signals.
-const LOOK: Duration = Duration::from_millis(50);
-/// Looks for a message between two looks at the clock.
+/// Longest time between two checks of Python's signals.
+const SIGNAL_CHECK_INTERVAL: Duration = Duration::from_millis(50);
+/// Polls for a message between two readings of the clock.
 const POLLS: usize = 100;
 
 fn failed(error: &dyn std::error::Error) -> PyErr {
@@ -54,25 +54,25 @@ fn membership_failed(error: MembershipError) -> PyErr {
 struct Attached {
     membership: RunMembership,
     observations: Subscriber,
-    /// Opened when first asked for.
+    /// Opened by the first call of `scans`.
     scans: Option<Subscriber>,
     predictions: Publisher,
-    /// `sim-core`, which waits for the predictions in the driving task.
-    driven: Option<Waker>,
-    /// `traffic-bridge`, which waits for the stage of the next lesson.
-    taught: Waker,
+    /// Wakes `sim-core`, which waits for predictions in the driving task.
+    sim_core: Option<Waker>,
+    /// Wakes `traffic-bridge`, which waits for the stage of the next lesson.
+    traffic_bridge: Waker,
     training: TrainingStatus,
-    /// Board of where ticks begin; opened when first asked for.
+    /// Board of `traffic-bridge`; opened by the first call of `lag_ticks`.
     traffic: Option<BoardReader>,
     consumed_ticks: u64,
     /// One more than the newest tick that Python has been given.
     received_ticks: u64,
     ended: bool,
-    /// The supervisor did not start this process, which does not end with it.
+    /// True if the supervisor did not start this process. Then it does not end with the supervisor.
     outside: bool,
 }
 
-/// A trainer's place in a run: one for each process that the supervisor started, any number for one from outside.
+/// The attachment of a trainer to a run. A process that the supervisor started has one; other processes may have any number.
 #[pyclass(frozen, module = "caraware._native")]
 struct Attachment {
     inner: Mutex<Attached>,
@@ -82,10 +82,10 @@ struct Attachment {
 
 #[pymethods]
 impl Attachment {
-    /// Joins the run that `run_file` describes and opens its ports; producers may send from now on, beginning with `first_tick`:
-    /// all ticks before it are in the checkpoint that this trainer continues from.
+    /// Joins the run that `run_file` describes and opens its ports. Producers may send from now on, beginning with `first_tick`: all
+    /// ticks before it are in the checkpoint from which this trainer continues.
     ///
-    /// With `outside` this process is none that the supervisor started. It does not end with the supervisor; `receive` raises instead.
+    /// `outside` is for a process that the supervisor did not start. It does not end with the supervisor; `receive` raises instead.
     #[new]
     #[pyo3(signature = (run_file, first_tick=0, *, outside=false))]
     fn new(run_file: &str, first_tick: u64, outside: bool) -> PyResult<Self> {
@@ -101,24 +101,24 @@ impl Attachment {
         Self::attach(membership, run_json, first_tick, outside)
     }
 
-    /// The place of this trainer in another environment of the run; producers there may send from now on, beginning with `first_tick`.
+    /// Attaches this trainer to another environment of the run. Producers there may send from now on, beginning with `first_tick`.
     fn in_environment(&self, env_index: u32, first_tick: u64) -> PyResult<Self> {
         let inner = self.lock()?;
         let membership = inner.membership.in_environment(env_index).map_err(membership_failed)?;
         Self::attach(membership, self.run_json.clone(), first_tick, inner.outside)
     }
 
-    /// Waits until something happens in any environment, at most `timeout_s` seconds. Look for blocks before, and again after.
+    /// Waits for an event in any environment, at most `timeout_s` seconds. Call `receive` before and after.
     fn wait_for_any(&self, py: Python<'_>, timeout_s: f64) -> PyResult<()> {
         let timeout =
             Duration::try_from_secs_f64(timeout_s).map_err(|error| PyValueError::new_err(error.to_string()))?;
-        py.detach(|| self.wait(timeout.min(LOOK)))?;
+        py.detach(|| self.wait(timeout.min(SIGNAL_CHECK_INTERVAL)))?;
         py.check_signals()
     }
 
-    /// All blocks that are waiting, at least one; an empty list after `timeout_s` seconds. Releases the GIL while it waits.
+    /// Returns all waiting blocks, at least one, or an empty list after `timeout_s` seconds. Releases the GIL while it waits.
     ///
-    /// With `busy` it keeps its core and looks again and again instead of sleeping: a microsecond instead of a wake-up.
+    /// With `busy` it polls instead of sleeping: it uses its core, but reacts within a microsecond instead of a wake-up.
     #[pyo3(signature = (timeout_s, *, busy=false))]
     fn receive(&self, py: Python<'_>, timeout_s: f64, busy: bool) -> PyResult<Vec<ObservationBlock>> {
         let deadline = Instant::now()
@@ -133,13 +133,13 @@ impl Attachment {
                 return Ok(blocks);
             }
             if !busy {
-                py.detach(|| self.wait(left.min(LOOK)))?;
+                py.detach(|| self.wait(left.min(SIGNAL_CHECK_INTERVAL)))?;
             }
             py.check_signals()?;
         }
     }
 
-    /// LIDAR scans that have come since the last call, the newest of them if there were more than fit; none before the first call.
+    /// LIDAR scans since the last call; only the newest, if there were more than the queue holds. The first call returns none from before it.
     fn scans(&self, py: Python<'_>) -> PyResult<Vec<PointCloud>> {
         let mut inner = self.lock()?;
         if inner.scans.is_none() {
@@ -159,7 +159,7 @@ impl Attachment {
         Ok(scans)
     }
 
-    /// Ticks that the traffic is ahead of the newest one consumed here.
+    /// Number of ticks that `traffic-bridge` is ahead of the newest tick consumed here.
     fn lag_ticks(&self) -> PyResult<u64> {
         let mut inner = self.lock()?;
         if inner.traffic.is_none() {
@@ -170,13 +170,13 @@ impl Attachment {
         Ok(ahead.saturating_sub(inner.consumed_ticks))
     }
 
-    /// How often this trainer has been replaced before.
+    /// Number of trainers before this one in the run.
     #[getter]
     fn incarnation(&self) -> u32 {
         membership::incarnation()
     }
 
-    /// Messages of other runs and of replaced incarnations that were refused.
+    /// Number of refused messages: those of other runs and of replaced incarnations.
     #[getter]
     fn refused(&self) -> PyResult<u64> {
         Ok(self.lock()?.observations.refused())
@@ -200,29 +200,29 @@ impl Attachment {
         Ok(())
     }
 
-    /// Says that all ticks up to and including `tick` are in a checkpoint that has been renamed into place.
+    /// Commits all ticks up to and including `tick`: they are in a checkpoint that has its final name.
     fn committed(&self, tick: u64) -> PyResult<()> {
         self.lock()?.membership.committed(tick + 1);
         Ok(())
     }
 
-    /// Publishes that all lessons below `lessons` have a stage of the curriculum: those from `since` on have `stage`, counted from 0.
-    /// `traffic-bridge` waits for that before each lesson.
+    /// Publishes that the stages of all lessons below `lessons` are decided: lessons from `since` on are in `stage`, counted from 0.
+    /// `traffic-bridge` waits for this decision before each lesson.
     fn decided(&self, lessons: u64, since: u64, stage: u32) -> PyResult<()> {
         let mut inner = self.lock()?;
         inner.membership.decided(lessons, since, stage);
-        inner.taught.wake();
+        inner.traffic_bridge.wake();
         Ok(())
     }
 
-    /// Says that all work is done.
+    /// Publishes that all work of this trainer is done.
     fn done(&self) -> PyResult<()> {
         self.lock()?.membership.done();
         Ok(())
     }
 
-    /// Publishes the predictions for `block`: `rows` is f32 `[n, columns]` in C order. In the driving task these are actions,
-    /// and the simulation waits for them. `estimates` is f32 `[n, 2]`: what the filter says, beside them.
+    /// Publishes the predictions for `block`: `rows` is f32 `[n, columns]` in C order. In the driving task these are actions, and
+    /// `sim-core` waits for them. `estimates` is f32 `[n, 2]`, the estimates of the filter.
     #[pyo3(signature = (block, rows, columns, policy_version, estimates=None))]
     fn publish_predictions(
         &self,
@@ -237,7 +237,7 @@ impl Attachment {
         let expected = layout.prediction.len;
         if rows.len() != expected {
             return Err(PyValueError::new_err(format!(
-                "predictions have {} bytes, [n, columns] of f32 has {expected}",
+                "predictions have {} bytes, but [n, columns] of f32 needs {expected}",
                 rows.len()
             )));
         }
@@ -245,13 +245,13 @@ impl Attachment {
         let header = MessageHeader {
             shape: layout.shape,
             policy_version,
-            ..answer(inner.membership.header(), &block.header)
+            ..prediction_header(inner.membership.header(), &block.header)
         };
         if let Some(estimates) = estimates
             && estimates.len() != layout.estimate_m.len
         {
             return Err(PyValueError::new_err(format!(
-                "estimates have {} bytes, [n, 2] of f32 has {}",
+                "estimates have {} bytes, but [n, 2] of f32 needs {}",
                 estimates.len(),
                 layout.estimate_m.len
             )));
@@ -268,13 +268,14 @@ impl Attachment {
             payload[section.offset..section.offset + section.len].copy_from_slice(rows);
         }
         draft.send().map_err(|error| failed(&error))?;
-        if let Some(waker) = &inner.driven {
+        if let Some(waker) = &inner.sim_core {
             waker.wake();
         }
         Ok(())
     }
 
-    /// Shows how learning goes; what is left out keeps its last value. `metrics` are values by the names of `METRICS`.
+    /// Publishes figures of the training on the board. A figure that is left out keeps its last value. `metrics` maps names of `METRICS` to
+    /// values.
     #[pyo3(signature = (*, episode=None, env_steps=None, updates=None, env_steps_per_s=None, policy_std=None, reward=None, metrics=None))]
     #[expect(
         clippy::too_many_arguments,
@@ -335,23 +336,23 @@ impl Attached {
 }
 
 impl Attachment {
-    /// Opens the ports of a place in a run.
+    /// Opens the ports of an attachment.
     fn attach(mut membership: RunMembership, run_json: String, first_tick: u64, outside: bool) -> PyResult<Self> {
         let observations = membership.subscriber(Service::Observation).map_err(membership_failed)?;
         let predictions = membership.publisher(Service::Prediction).map_err(membership_failed)?;
-        let driven = match membership.run.config.drives() {
+        let sim_core = match membership.run.config.drives() {
             true => Some(membership.waker(Process::SimCore).map_err(membership_failed)?),
             false => None,
         };
-        let taught = membership.waker(Process::TrafficBridge).map_err(membership_failed)?;
+        let traffic_bridge = membership.waker(Process::TrafficBridge).map_err(membership_failed)?;
         membership.attach_from(first_tick);
         let attached = Attached {
             membership,
             observations,
             scans: None,
             predictions,
-            driven,
-            taught,
+            sim_core,
+            traffic_bridge,
             training: TrainingStatus::default(),
             traffic: None,
             consumed_ticks: first_tick,
@@ -368,7 +369,7 @@ impl Attachment {
     fn lock(&self) -> PyResult<MutexGuard<'_, Attached>> {
         self.inner
             .lock()
-            .map_err(|_| PyRuntimeError::new_err("an earlier call failed in the middle: attach anew"))
+            .map_err(|_| PyRuntimeError::new_err("an earlier call failed: attach again"))
     }
 
     fn wait(&self, timeout: Duration) -> PyResult<()> {
@@ -380,9 +381,9 @@ impl Attachment {
         inner.membership.wait(timeout).map_err(membership_failed)
     }
 
-    /// Looks until something is there, the deadline has passed, or it is time to look at Python's signals.
+    /// Polls until a block arrives, the deadline has passed, or Python's signals must be checked.
     fn poll(&self, deadline: Instant) -> PyResult<Vec<ObservationBlock>> {
-        let until = deadline.min(Instant::now() + LOOK);
+        let until = deadline.min(Instant::now() + SIGNAL_CHECK_INTERVAL);
         loop {
             for _ in 0..POLLS {
                 let blocks = self.take_waiting()?;
@@ -409,31 +410,32 @@ impl Attachment {
 
 fn unknown_metric(name: &str) -> PyErr {
     let known: Vec<&str> = METRICS.iter().map(|metric| metric.name).collect();
-    PyValueError::new_err(format!("no metric is called {name:?}; there are: {}", known.join(", ")))
+    PyValueError::new_err(format!("unknown metric {name:?}; the metrics are {}", known.join(", ")))
 }
 
-/// The header of an answer to `question`: our identity, its episode, stage, map, tick and time.
-fn answer(ours: MessageHeader, question: &MessageHeader) -> MessageHeader {
+/// The header of the prediction for an observation: the identity is the trainer's; episode, stage, map, tick and time are the
+/// observation's.
+fn prediction_header(trainer: MessageHeader, observation: &MessageHeader) -> MessageHeader {
     MessageHeader {
-        flags: question.flags,
-        stage: question.stage,
-        map: question.map,
-        episode: question.episode,
-        episode_seed: question.episode_seed,
-        tick: question.tick,
-        sim_time_ns: question.sim_time_ns,
-        ..ours
+        flags: observation.flags,
+        stage: observation.stage,
+        map: observation.map,
+        episode: observation.episode,
+        episode_seed: observation.episode_seed,
+        tick: observation.tick,
+        sim_time_ns: observation.sim_time_ns,
+        ..trainer
     }
 }
 
-/// The layout of a message that is long enough for it.
+/// The layout of a message, which must be long enough for it.
 fn checked_layout(message: &Message) -> PyResult<ObservationLayout> {
     let header = message.header();
     let layout = ObservationLayout::of(header);
     if layout.len > message.payload().len() {
         let [slots, fields, ..] = header.shape;
         return Err(PyValueError::new_err(format!(
-            "tick {}: {slots} slots of {fields} fields need {} bytes, the message has {}",
+            "tick {}: {slots} slots of {fields} fields need {} bytes, but the message has {}",
             header.tick,
             layout.len,
             message.payload().len()
@@ -445,7 +447,7 @@ fn checked_layout(message: &Message) -> PyResult<ObservationLayout> {
 /// One tick's observations in shared memory; the memory stays valid while this object or a view of it lives.
 #[pyclass(frozen, module = "caraware._native")]
 struct ObservationBlock {
-    /// When it was taken, on the system's monotonic clock, nanoseconds.
+    /// Time at which it was taken, on the system's monotonic clock, nanoseconds.
     #[pyo3(get)]
     received_ns: u64,
     header: MessageHeader,
@@ -522,13 +524,13 @@ impl ObservationBlock {
         self.header.has(header::LAST_OF_EPISODE)
     }
 
-    /// True for the last tick of a lesson, before the next of which the simulation waits for `Attachment.decided`.
+    /// True for the last tick of a lesson. Before the next lesson `traffic-bridge` waits for `Attachment.decided`.
     #[getter]
     fn lesson_last(&self) -> bool {
         self.header.has(header::LAST_OF_LESSON)
     }
 
-    /// Stage of the curriculum, counted from 1; 0 without one, and in evaluations.
+    /// Stage of the curriculum, counted from 1; 0 without a curriculum and in evaluations.
     #[getter]
     fn stage(&self) -> u16 {
         self.header.stage
@@ -540,7 +542,7 @@ impl ObservationBlock {
         self.header.has(header::LAST_OF_RUN)
     }
 
-    /// Address of the payload, to prove where it lies.
+    /// Address of the payload; tests compare it to prove that nothing was copied.
     #[getter]
     fn address(&self) -> usize {
         self.payload_address
@@ -565,7 +567,7 @@ impl ObservationBlock {
     }
 }
 
-/// Hash of a SUMO id, as it stands in `id_hash` of an observation.
+/// Hash of a SUMO id, as in `id_hash` of an observation.
 #[pyfunction]
 fn id_hash(id: &str) -> u64 {
     ipc_schema::traffic::id_hash(id)

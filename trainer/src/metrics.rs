@@ -1,4 +1,4 @@
-//! The table of metrics for Python, which names its tasks' metrics by it.
+//! The table of metrics for Python.
 
 use ipc_schema::{
     config::TaskKind,
@@ -11,11 +11,11 @@ use pyo3::prelude::*;
 pub(crate) struct Metric {
     /// Name, which ends in its unit: the key in reports, logs and plots.
     name: &'static str,
-    /// Name for people.
+    /// Name in displays.
     label: &'static str,
-    /// Unit for people.
+    /// Unit in displays.
     unit: &'static str,
-    /// True if larger values are better, as of progress; false as of an error.
+    /// True if larger values are better, as with progress; false as with an error.
     higher_is_better: bool,
     /// `task.kind` of the task that measures it.
     task: &'static str,

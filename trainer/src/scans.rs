@@ -1,4 +1,4 @@
-//! LIDAR scans for Python: copied out of shared memory, so that nobody holds up the next one.
+//! LIDAR scans for Python, copied out of shared memory: a scan that Python keeps does not block the next one.
 
 use ipc_schema::{
     block::{self, BlockError},
@@ -8,7 +8,7 @@ use ipc_schema::{
 };
 use pyo3::{exceptions::PyValueError, prelude::*, types::PyBytes};
 
-/// What one LIDAR has seen during a tick.
+/// The returns of one LIDAR in a tick.
 #[pyclass(frozen, module = "caraware._native")]
 pub(crate) struct PointCloud {
     header: MessageHeader,

@@ -1,4 +1,4 @@
-//! The one place where shared memory is lent to Python: a read-only buffer that keeps its message alive.
+//! Lends one section of an observation to Python: a read-only buffer over shared memory that keeps its message alive.
 
 use std::ffi::c_int;
 
@@ -41,7 +41,7 @@ impl SectionView {
         PyTuple::new(py, &self.shape)
     }
 
-    /// Buffer protocol: refuses writers; the consumer holds this object, which holds the block, which holds the message.
+    /// Buffer protocol, read-only. The consumer holds this object, which holds the block, which holds the message.
     #[expect(unsafe_code, reason = "the buffer protocol of CPython works on raw pointers")]
     unsafe fn __getbuffer__(slf: Bound<'_, Self>, view: *mut ffi::Py_buffer, flags: c_int) -> PyResult<()> {
         let this = slf.get();

@@ -1,1 +1,1 @@
-"""Programs that `caraware bench` starts: the Python side of what it measures."""
+"""Programs that `caraware bench` starts: the Python side of its measurements."""

@@ -1,4 +1,4 @@
-"""The rate of a driving environment with many agents."""
+"""Measures the rate of a driving environment with many agents."""
 
 import time
 from typing import Protocol
@@ -7,20 +7,20 @@ WARM_UP_STEPS = 10
 
 
 class World(Protocol):
-    """A driving environment that is being stepped."""
+    """A driving environment that can be stepped."""
 
     def ready(self) -> None:
-        """Resets it if nobody is left to drive."""
+        """Reset the environment if no agent is left."""
 
     def step(self) -> int:
-        """One step with an action for every agent; how many agents got an observation."""
+        """Make one step with an action for every agent; return the number of agents that got an observation."""
 
     def close(self) -> None:
-        """Ends it."""
+        """End the environment."""
 
 
 def agent_steps_per_s(world: World, seconds: float) -> float:
-    """Agent-steps per wall second over at least `seconds` of stepping; resets and the first steps are left out."""
+    """Agent-steps per wall second over at least `seconds` of stepping, without resets and the first steps."""
     try:
         for _ in range(WARM_UP_STEPS):
             world.ready()

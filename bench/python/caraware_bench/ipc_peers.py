@@ -1,9 +1,9 @@
-"""The peers of `caraware bench ipc`: one-way latency of what Python programs usually send arrays with.
+"""The peers of `caraware bench ipc`: one-way latency of the usual ways to send arrays between Python programs.
 
 `python -m caraware_bench.ipc_peers SIZES FILE` sends messages of each size (bytes, comma-separated) from one
 process to another through a pipe of `multiprocessing`, a TCP connection over loopback and, if pyzmq is installed,
-ZeroMQ's `ipc://`, and writes `{peer: {size: [latency_ns, …]}}`. The sender stamps the monotonic clock right before it
-sends; the receiver once the message is a tensor. One message is under way at a time.
+ZeroMQ's `ipc://`, and writes `{peer: {size: [latency_ns, …]}}`. The sender writes the monotonic time into a message
+right before it sends; the receiver reads the clock once the message is a tensor. One message is under way at a time.
 """
 
 import importlib.util
@@ -30,22 +30,22 @@ Send = Callable[[bytearray], None]
 
 
 def tensor_of(message: bytes | bytearray | memoryview) -> torch.Tensor:
-    """The floats of a message, without a copy."""
+    """A tensor over the floats of a message, without a copy."""
     return torch.from_numpy(np.frombuffer(message, dtype=np.float32))
 
 
 def messages_of(size: int) -> int:
-    """How many messages are measured: fewer of the large ones."""
+    """Number of messages to measure: fewer for large sizes."""
     return max(50, min(1000, (64 << 20) // size))
 
 
 def pipe_receiver(connection: Connection) -> Receive:
-    """A `multiprocessing.Pipe`, as `Connection.send_bytes` and `recv_bytes` use it."""
+    """Receive from a `multiprocessing.Pipe` with `Connection.recv_bytes`."""
     return lambda _: connection.recv_bytes()
 
 
 def tcp_receiver(port_pipe: Connection) -> Receive:
-    """A TCP connection over loopback without Nagle's delay, read into one buffer."""
+    """Receive from a TCP connection over loopback into one buffer. The sender switches Nagle's delay off."""
     listener = socket.create_server(("127.0.0.1", 0))
     port_pipe.send(listener.getsockname()[1])
     stream, _ = listener.accept()
@@ -62,7 +62,7 @@ def tcp_receiver(port_pipe: Connection) -> Receive:
 
 
 def zmq_receiver(address: str) -> Receive:
-    """A ZeroMQ PULL socket; the message is not copied out of its frame."""
+    """Receive from a ZeroMQ PULL socket without copying the message out of its frame."""
     import zmq
 
     receiver = zmq.Context().socket(zmq.PULL)
@@ -71,7 +71,7 @@ def zmq_receiver(address: str) -> Receive:
 
 
 def receiving(kind: str, address: str, sizes: list[int], connection: Connection, answer: Connection) -> None:
-    """The other process: receives everything, then answers with all latencies."""
+    """Run the receiving process: receive all messages, then send all latencies."""
     receive = {
         "multiprocessing pipe": lambda: pipe_receiver(connection),
         "TCP over loopback": lambda: tcp_receiver(answer),
@@ -93,7 +93,7 @@ def receiving(kind: str, address: str, sizes: list[int], connection: Connection,
 
 
 def measure(kind: str, sizes: list[int]) -> dict[int, list[int]]:
-    """All latencies of one peer."""
+    """Measure all latencies of one peer, by size."""
     context = multiprocessing.get_context("spawn")
     theirs, ours = context.Pipe(duplex=False)
     answer, their_answer = context.Pipe(duplex=False)
@@ -115,7 +115,7 @@ def measure(kind: str, sizes: list[int]) -> dict[int, list[int]]:
             stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             send = stream.sendall
         else:
-            # pyzmq hands the buffer over without a copy; it is not written before the receiver has taken the message.
+            # pyzmq sends the buffer without a copy. The next write waits until the receiver has taken the message.
             send = lambda message: socket_.send(message, copy=False)  # noqa: E731
         assert answer.recv() == "ready"
         for size in sizes:
@@ -131,7 +131,7 @@ def measure(kind: str, sizes: list[int]) -> dict[int, list[int]]:
 
 
 def main() -> None:
-    """Measures every peer that is installed."""
+    """Measure every installed peer and write the latencies."""
     sizes = [int(size) for size in sys.argv[1].split(",")]
     kinds = ["multiprocessing pipe", "TCP over loopback"]
     if importlib.util.find_spec("zmq"):

@@ -1,10 +1,9 @@
-"""The consumer of `caraware bench ipc`: the time from publish to a visible tensor.
+"""The consumer of `caraware bench ipc`: measures the time from publish to a visible tensor.
 
 `python -m caraware_bench.ipc_receive RUN_FILE` attaches as the trainer of a run, takes every observation while
-busy-polling, and writes `latencies.json` into the run directory: for each number of rows and each way, the nanoseconds
-until the block was taken from shared memory, and until a tensor existed. Ticks come in turn by `Channel.lease` and by
-`Channel.receive`. The sender stamps `sim_time_ns` with the monotonic
-clock right before it publishes.
+busy-polling, and writes `latencies.json` into the run directory. The file holds, for each way and number of rows, the
+nanoseconds until the block was taken from shared memory, and until a tensor existed. `Channel.lease` and
+`Channel.receive` take ticks in turn. The sender writes the monotonic time into `sim_time_ns` right before it publishes.
 """
 
 import json
@@ -19,18 +18,18 @@ from caraware.ipc.channel import Channel, Observation
 
 
 def main() -> None:
-    """Receives until the last block of the run."""
+    """Receive until the last block of the run, then write the latencies."""
     channel = Channel(sys.argv[1])
     lease = channel.lease()
     latencies: dict[str, dict[int, list[tuple[int, int]]]] = {"lent": {}, "received": {}}
 
     def take(way: str, tick: _native.Lease | Observation, tensor: Tensor, received_ns: int, now_ns: int) -> bool:
-        """Note a tick; True for the last."""
+        """Record the latencies of a tick; True for the last tick."""
         rows = tensor.shape[0]
         sent_ns = tick.sim_time_ns
         latencies[way].setdefault(rows, []).append((received_ns - sent_ns, now_ns - sent_ns))
         if tensor[0, 0].item() != rows or tensor[-1, -1].item() != tick.tick:
-            raise SystemExit(f"tick {tick.tick}: the tensor does not hold what was sent")
+            raise SystemExit(f"tick {tick.tick}: the tensor does not hold the values that were sent")
         channel.consumed(tick.tick)
         channel.committed(tick.tick)
         return tick.last
@@ -40,7 +39,7 @@ def main() -> None:
         tensor = lease.next(10.0)
         now_ns = time.monotonic_ns()
         if tensor is None:
-            raise SystemExit("nothing came for 10 s")
+            raise SystemExit("no block arrived for 10 s")
         last = take("lent", lease, tensor, lease.received_ns, now_ns)
         for observation in [] if last else channel.receive(10.0, busy=True):
             tensor = observation.observation

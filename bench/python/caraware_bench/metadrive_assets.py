@@ -1,7 +1,8 @@
-"""`python -m caraware_bench.metadrive_assets`: gives the MetaDrive of this environment its models and textures.
+"""`python -m caraware_bench.metadrive_assets`: installs the models and textures of MetaDrive in this environment.
 
-MetaDrive downloads them from its project's releases when it first runs. The wheel of an older version has them as well,
-and a package index is all that the rest needs. Without a window they are hardly used: nothing is drawn.
+MetaDrive downloads them from its project's releases when it first runs. This program takes them from the wheel of an
+older version instead, so that only a package index is needed. Without a window MetaDrive draws nothing and hardly uses
+them.
 """
 
 import subprocess
@@ -16,11 +17,11 @@ from metadrive.constants import VERSION
 WITH_ASSETS = "metadrive-simulator==0.3.0.1"
 """The newest wheel that has the assets."""
 ASKED_FOR = "textures/grass1/GroundGrassGreen002_COL_1K.jpg"
-"""What the newer version takes as a sign of its own assets."""
+"""The file from which the newer version concludes that its own assets are installed."""
 
 
 def main() -> None:
-    """Unpacks the older assets where the newer version looks for its own."""
+    """Unpack the older assets into the directory of the newer version."""
     assets = Path(metadrive.__file__).parent / "assets"
     with tempfile.TemporaryDirectory() as directory:
         pip = [sys.executable, "-m", "pip", "download", "--disable-pip-version-check", "--quiet", "--no-deps"]

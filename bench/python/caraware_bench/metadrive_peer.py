@@ -11,7 +11,7 @@ from caraware_bench.agent_steps import agent_steps_per_s
 
 AGENTS = 40
 ACTION = [0.0, 0.1]
-"""Steering, throttle (−1 to 1): everybody rolls on; whoever crashes or leaves comes in anew."""
+"""Steering, throttle (−1 to 1): every agent rolls on; one that crashes or leaves is respawned."""
 BLIND = {
     "lidar": {"num_lasers": 0, "num_others": 0, "distance": 0},
     "side_detector": {"num_lasers": 0},
@@ -29,26 +29,26 @@ class Roundabout:
         self._over = False
 
     def ready(self) -> None:
-        """Resets at the end of the episode."""
+        """Reset at the end of the episode."""
         if self._over:
             self._env.reset(seed=0)
 
     def step(self) -> int:
-        """One step of everybody who is on the road."""
+        """Make one step of all agents on the road."""
         _, reward, terminated, truncated, _ = self._env.step({agent: ACTION for agent in self._env.agents})
         self._over = terminated["__all__"] or truncated["__all__"]
         return len(reward)
 
     def close(self) -> None:
-        """Frees the engine, of which there is one in a process."""
+        """Free the engine, of which a process can have one."""
         self._env.close()
 
 
 def rates(seconds: float) -> dict[str, float]:
-    """Agent-steps per second with the observation as it comes, and without the rays."""
+    """Agent-steps per second with the default observation, and without its rays."""
     if not (Path(metadrive.__file__).parent / "assets" / "version.txt").exists():
-        # It would try to download them.
-        raise ImportError("MetaDrive's assets are not there")
+        # MetaDrive would try to download them.
+        raise ImportError("MetaDrive's assets are not installed")
     cases: dict[str, dict[str, object]] = {
         "MetaDrive, roundabout, 40 agents, LIDAR of 72 rays": {},
         "MetaDrive, roundabout, 40 agents, own state only": dict(BLIND),

@@ -1,8 +1,8 @@
-"""One peer of `caraware bench peers`: `python -m caraware_bench.peer NAME … --json FILE`.
+"""Measures one peer of `caraware bench peers`: `python -m caraware_bench.peer NAME … --json FILE`.
 
-Runs in the environment that the peer is installed in, with nothing of the project but this package. Writes
-`{"version": …, "rates": {case: rate}}`, vehicle-updates or agent-steps per wall second, or `{"missing": why}` if the
-peer is not installed there.
+It runs in the virtual environment in which the peer is installed, and needs only this package of the project. It writes
+`{"version": …, "rates": {case: rate}}`, vehicle-updates or agent-steps per wall second, or `{"missing": reason}` if the
+peer is not installed.
 """
 
 import argparse
@@ -16,7 +16,7 @@ Rates = dict[str, float]
 
 
 def libsumo(options: argparse.Namespace) -> tuple[str, Rates]:
-    """A Python loop over libsumo, SUMO in the same process."""
+    """Measure a Python loop over libsumo, with SUMO in the same process."""
     import libsumo
 
     from caraware_bench.traffic_loop import measure
@@ -25,7 +25,7 @@ def libsumo(options: argparse.Namespace) -> tuple[str, Rates]:
 
 
 def traci(options: argparse.Namespace) -> tuple[str, Rates]:
-    """A Python loop over TraCI, SUMO at the other end of a socket."""
+    """Measure a Python loop over TraCI, with SUMO at the other end of a socket."""
     import traci
 
     from caraware_bench.traffic_loop import measure
@@ -39,14 +39,14 @@ def arguments(options: argparse.Namespace) -> list[str]:
 
 
 def metadrive(options: argparse.Namespace) -> tuple[str, Rates]:
-    """MetaDrive's multi-agent roundabout."""
+    """Measure MetaDrive's multi-agent roundabout."""
     from caraware_bench.metadrive_peer import VERSION, rates
 
     return VERSION, rates(options.seconds)
 
 
 def smarts(options: argparse.Namespace) -> tuple[str, Rates]:
-    """SMARTS's HiWayEnv on a net of SUMO's."""
+    """Measure SMARTS's HiWayEnv on a SUMO net."""
     from caraware_bench.smarts_peer import VERSION, rates
 
     return VERSION, rates(options.net, options.seconds)
@@ -61,14 +61,14 @@ PEERS: dict[str, Callable[[argparse.Namespace], tuple[str, Rates]]] = {
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measures one peer and writes what came of it."""
+    """Measure one peer and write its rates."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("peer", choices=PEERS)
     parser.add_argument("--sumo", help="the program `sumo`")
     parser.add_argument("--sumocfg", help="scenario of a loop over SUMO")
-    parser.add_argument("--prefix", default="", help="what SUMO puts before the names of its result files")
+    parser.add_argument("--prefix", default="", help="prefix of the names of SUMO's result files")
     parser.add_argument("--steps", type=int, help="SUMO steps of a loop")
-    parser.add_argument("--net", type=Path, help="SUMO net that the agents drive on, where the peer has none")
+    parser.add_argument("--net", type=Path, help="SUMO net that the agents drive on, if the peer has no map of its own")
     parser.add_argument("--seconds", type=float, default=10.0, help="wall time of each case of a driving environment")
     parser.add_argument("--json", type=Path, required=True, help="where to write the rates")
     options = parser.parse_args(argv)

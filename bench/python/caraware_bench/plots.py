@@ -1,4 +1,4 @@
-"""Pictures of `caraware bench`: `python -m caraware_bench.plots DIRECTORY < reports.json`.
+"""Draws the pictures of `caraware bench`: `python -m caraware_bench.plots DIRECTORY < reports.json`.
 
 The input is a list of reports (`bench/src/report.rs`); every curve becomes `DIRECTORY/<name>.png`.
 """
@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 
 
 def draw(curve: dict[str, Any], path: Path) -> None:
-    """Draws one curve (`name`, `title`, `x`, `y`, `logarithmic`, `lines`) into a PNG file."""
+    """Draw one curve (`name`, `title`, `x`, `y`, `logarithmic`, `lines`) into a PNG file."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     for line in curve["lines"]:
         x, y = zip(*line["points"], strict=True)
@@ -33,7 +33,7 @@ def draw(curve: dict[str, Any], path: Path) -> None:
 
 
 def main() -> None:
-    """Draws every curve of the reports on standard input."""
+    """Draw every curve of the reports on standard input."""
     directory = Path(sys.argv[1])
     for report in json.load(sys.stdin):
         for curve in report["curves"]:

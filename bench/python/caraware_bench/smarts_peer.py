@@ -1,4 +1,4 @@
-"""SMARTS's HiWayEnv, headless, on a net of SUMO's: `make peers-smarts` (Python 3.10)."""
+"""SMARTS's HiWayEnv, headless, on a SUMO net: `make peers-smarts` (Python 3.10)."""
 
 import shutil
 import tempfile
@@ -16,7 +16,7 @@ from caraware_bench.agent_steps import agent_steps_per_s
 
 VERSION = version("smarts")
 AGENTS = [f"agent-{number}" for number in range(8)]
-"""Few: SMARTS goes through all orders of its missions before it begins."""
+"""Eight agents, because SMARTS enumerates all orders of its missions before it begins."""
 
 
 KEEP_LANE = 0
@@ -37,25 +37,25 @@ class HighWay:
         self._driving: set[str] = set()
 
     def ready(self) -> None:
-        """Resets once everybody has ended."""
+        """Reset once all agents have ended."""
         if not self._driving:
             observation, _ = self._env.reset()
             self._driving = set(observation)
 
     def step(self) -> int:
-        """One step of everybody who still drives."""
+        """Make one step of all agents that still drive."""
         actions = dict.fromkeys(self._driving, KEEP_LANE)
         observation, _, terminated, truncated, _ = self._env.step(actions)
         self._driving = {agent for agent in observation if not (terminated[agent] or truncated[agent])}
         return len(observation)
 
     def close(self) -> None:
-        """Ends SUMO as well."""
+        """End the environment, and SUMO with it."""
         self._env.close()
 
 
 def rates(net: Path, seconds: float) -> dict[str, float]:
-    """Agent-steps per second with way points, as its examples have them, and with nothing but the agent's own state."""
+    """Agent-steps per second with way points, as in SMARTS's examples, and with the agent's own state only."""
     cases = {
         "SMARTS, 8 agents, way points": AgentInterface.from_type(AgentType.Laner),
         "SMARTS, 8 agents, own state only": AgentInterface(action=ActionSpaceType.Lane),

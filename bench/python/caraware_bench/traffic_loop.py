@@ -1,8 +1,8 @@
-"""What a Python program does to have every vehicle's state at every step of SUMO, through libsumo or TraCI.
+"""A Python program that reads every vehicle's state at every step of SUMO, through libsumo or TraCI.
 
-The fields are those that `traffic-bridge/src/sumo/shim.cc` reads at every step on a flat net, as often as it reads
-them; what it reads once at a departure, and traffic lights, are left out. As there, the list of live vehicles is kept
-from departures and arrivals.
+It reads the same fields as `traffic-bridge/src/sumo/shim.cc` on a flat net, and reads them as often. It leaves out
+traffic lights and the fields that are read once at a departure. Like `traffic-bridge`, it updates the list of live
+vehicles from departures and arrivals.
 """
 
 import time
@@ -18,7 +18,7 @@ State = tuple[float, float, float, float, float]
 
 @dataclass
 class Mirror:
-    """The last known state of everybody on the road; `sumo` is the module libsumo or traci."""
+    """The last known state of every vehicle on the road; `sumo` is the module libsumo or traci."""
 
     sumo: ModuleType
     states: dict[str, State] = field(default_factory=dict)
@@ -26,7 +26,7 @@ class Mirror:
     steps: int = 0
 
     def step(self) -> int:
-        """Lets SUMO make a step and reads every vehicle; how many there are."""
+        """Make a step of SUMO and read every vehicle; return the number of vehicles."""
         self.sumo.simulationStep()
         for vehicle in self.sumo.simulation.getArrivedIDList():
             self.states.pop(vehicle, None)
@@ -38,7 +38,7 @@ class Mirror:
         return len(self.states)
 
     def read(self) -> None:
-        """One pass of getters over all vehicles."""
+        """Call the getters of all vehicles once."""
         get = self.sumo.vehicle
         position, angle, speed, signals = get.getPosition3D, get.getAngle, get.getSpeed, get.getSignals
         for index, vehicle in enumerate(self.states):
@@ -48,7 +48,7 @@ class Mirror:
 
 
 def measure(sumo: ModuleType, arguments: list[str], steps: int) -> float:
-    """Vehicle-updates per wall second over `steps` steps from the first, SUMO's own time included, loading left out."""
+    """Vehicle-updates per wall second over the first `steps` steps, with SUMO's own time and without loading."""
     sumo.start(arguments)
     try:
         mirror = Mirror(sumo)

@@ -1,7 +1,7 @@
-"""`python -m caraware_bench.trainer [--pairs N] [--threads N]`: the learner beside SB3 and a plain loop.
+"""`python -m caraware_bench.trainer [--pairs N] [--threads N]`: compares the learner with SB3 and a plain loop.
 
-Same networks, horizon, batch, epochs, and threads; ours and theirs alternate in one process. Prints JSON, which
-`caraware bench trainer` turns into a report. A sample visit is one sample in one epoch.
+All learners have the same networks, horizon, minibatches, epochs and threads, and alternate in one process. The program
+prints JSON, which `caraware bench trainer` turns into a report. A sample visit is one sample in one epoch.
 """
 
 import argparse
@@ -36,12 +36,12 @@ OBSERVATIONS, HORIZON, BATCH, EPOCHS = 9, 32_768, 2_048, 4
 VEHICLES = 8
 WINDOW_TICKS = 64
 SIZES = (50, 500, 5_000)
-"""Vehicles at a time, for what a tick costs."""
+"""Numbers of vehicles for the cost of a tick."""
 BOUNDS = MapBounds(0.0, 0.0, 220.0, 220.0)
 
 
 class PlainAgent(nn.Module):
-    """The paper's networks as anybody would write them."""
+    """The paper's networks in plain `torch.nn`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ class PlainAgent(nn.Module):
 
 
 def plain_update(agent: PlainAgent, adam: torch.optim.Adam, batch: Batch) -> None:
-    """Epochs of minibatches through autograd and a joint optimiser, in CleanRL's manner."""
+    """Run epochs of minibatches through autograd and one optimiser for both networks, in CleanRL's manner."""
     for _ in range(EPOCHS):
         order = torch.randperm(HORIZON).to(batch.reward.device)
         for start in range(0, HORIZON, BATCH):
@@ -80,7 +80,7 @@ def plain_update(agent: PlainAgent, adam: torch.optim.Adam, batch: Batch) -> Non
 
 
 def learner_config(threads: int, matmul_precision: str = "float32", device: str = "cpu") -> TrainerConfig:
-    """The paper's learner at the sizes of this comparison."""
+    """Configuration of the paper's learner at the sizes of this comparison."""
     return TrainerConfig(
         learning_rate=1e-4,
         learning_rate_decay=0.995,
@@ -120,7 +120,7 @@ def learner_config(threads: int, matmul_precision: str = "float32", device: str 
 
 
 def random_batch(ppo: Ppo) -> Batch:
-    """Actions of the given policy with made-up advantages."""
+    """A batch of the given policy's actions with random advantages."""
     observation = torch.rand(HORIZON, OBSERVATIONS) * 2 - 1
     with torch.no_grad():
         action = ppo.updater.mean(observation.to(ppo.device)).cpu() + torch.randn(HORIZON, 2)
@@ -143,7 +143,7 @@ def random_batch(ppo: Ppo) -> Batch:
 
 @dataclass
 class FreeTick:
-    """A tick that cost nothing: the arrays that the rollout and the error meter read."""
+    """A tick without a simulation: the arrays that the rollout and the error meter read."""
 
     tick: int
     observation: Tensor
@@ -157,13 +157,13 @@ class FreeTick:
 
 @dataclass
 class FreeTicks:
-    """Ticks of `vehicles`, over and over."""
+    """Windows of ticks with `vehicles` vehicles, without end."""
 
     vehicles: int
     _tick: FreeTick = field(init=False)
 
     def __post_init__(self) -> None:
-        n, nobody = self.vehicles, np.zeros(self.vehicles, bool)
+        n, never = self.vehicles, np.zeros(self.vehicles, bool)
         truth = torch.rand(n, 4) * 220
         self._tick = FreeTick(
             0,
@@ -171,9 +171,9 @@ class FreeTicks:
             truth,
             truth[:, :2] + 5,
             np.arange(n, dtype=np.uint32),
-            ~nobody,
-            nobody,
-            nobody,
+            ~never,
+            never,
+            never,
         )
 
     def __iter__(self) -> Iterator[list[FreeTick]]:
@@ -185,7 +185,7 @@ class FreeTicks:
 
 
 def take(ppo: Ppo, rollout: Rollout, raw_m: Mean, window: list[FreeTick]) -> None:
-    """What the training loop does with the ticks that wait: one forward pass, all errors, then a copy of each."""
+    """Process the waiting ticks as the training loop does: one forward pass, all errors, then a copy of each tick."""
     ppo.predict_m([obs.observation for obs in window])
     for obs, error_m in zip(window, raw_errors_m(window), strict=True):
         raw_m.add(error_m)
@@ -193,7 +193,7 @@ def take(ppo: Ppo, rollout: Rollout, raw_m: Mean, window: list[FreeTick]) -> Non
 
 
 def our_horizon(ppo: Ppo, rollout: Rollout, ticks: Iterator[list[FreeTick]]) -> None:
-    """A horizon of ticks and its update."""
+    """Collect a horizon of ticks and make its update."""
     raw_m = Mean()
     while not rollout.full():
         take(ppo, rollout, raw_m, next(ticks))
@@ -201,7 +201,7 @@ def our_horizon(ppo: Ppo, rollout: Rollout, ticks: Iterator[list[FreeTick]]) -> 
 
 
 def sb3_model() -> "PPO":
-    """Stable-Baselines3's PPO with the same sizes on an environment that costs nothing."""
+    """Stable-Baselines3's PPO with the same sizes, on an environment without a simulation."""
     from gymnasium import spaces
     from stable_baselines3 import PPO
     from stable_baselines3.common.logger import Logger
@@ -278,7 +278,7 @@ def python_calls(work: Callable[[], object]) -> int:
 
 
 def measure_tick(ppo: Ppo, vehicles: int) -> dict[str, float]:
-    """What a tick of so many vehicles costs before the update: time, and calls from Python, which must not grow."""
+    """Cost of a tick of `vehicles` before the update: its time, and its calls from Python, which must not grow."""
     rollout, raw_m, ticks = Rollout(10**9, OBSERVATIONS, bootstrap=False), Mean(), iter(FreeTicks(vehicles))
     for _ in range(2):
         take(ppo, rollout, raw_m, next(ticks))
@@ -296,11 +296,11 @@ def measure_tick(ppo: Ppo, vehicles: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Alternate all learners and print what came of it."""
+    """Measure all learners in turn and print the seconds."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--json", type=Path, help="write the seconds there in place of standard output")
+    parser.add_argument("--json", type=Path, help="file for the seconds, in place of standard output")
     options = parser.parse_args()
     config = learner_config(options.threads)
     ppo = build_ppo(config, OBSERVATIONS, Localisation(BOUNDS, config.reward, config.reward_scale_m))
@@ -319,15 +319,15 @@ def main() -> None:
 
     pairs: dict[str, list[float]] = {name: [] for name in ("ours", "plain", "sb3", "our_horizon", "sb3_horizon")}
     for number in range(options.pairs + 1):
-        told = {
+        round_s = {
             "plain": theirs(lambda: plain_update(agent, adam, batch)),
             "ours": seconds(lambda: ppo.update(batch)),
             "sb3": theirs(model.train),
             "our_horizon": seconds(lambda: our_horizon(ppo, rollout, ticks)),
             "sb3_horizon": theirs(lambda: model.learn(HORIZON, reset_num_timesteps=False)),
         }
-        for name, value in told.items():
-            # The first round warms up.
+        for name, value in round_s.items():
+            # The first round is a warm-up and does not count.
             pairs[name] += [value] if number > 0 else []
     result = {
         "threads": options.threads,

@@ -1,4 +1,4 @@
-//! What the latencies say: percentiles over all rounds, ratios within each.
+//! Summarises the latencies: percentiles over all rounds, ratios within each round.
 
 use std::collections::BTreeMap;
 
@@ -43,18 +43,18 @@ impl LatencyPercentiles {
     }
 }
 
-/// Size of the block, bytes → what is told of it.
+/// Size of the block, bytes → its latencies.
 type PercentilesBySize = BTreeMap<usize, LatencyPercentiles>;
 
-/// Where the latencies of a way are.
+/// Selects the latencies of one way.
 type LatencySelector = fn(&OurLatencies) -> &LatenciesBySize;
 
-/// What is told of ours, and where it is.
+/// The ways that the report shows, with their labels.
 const WAYS: [(&str, LatencySelector); 4] = [
     ("taken", |ours| &ours.taken),
     ("tensor", |ours| &ours.tensor),
     ("tensor of an observation to keep", |ours| &ours.received),
-    ("tensor, two values written", |ours| &ours.hardly_written),
+    ("tensor, two values written", |ours| &ours.two_values_written),
 ];
 
 /// The report over all rounds.
@@ -66,14 +66,15 @@ pub(super) fn report(rounds: &[LatencyRound], peers: &BTreeMap<String, Latencies
         "ipc",
         "Observation hop",
         format!(
-            "One way, from right before publish in one process, microseconds, both sides polling. Ours is the `observation` channel of a run \
-             and `Channel.lease`, read in place whatever the size: until the block is in the receiver's hands, and until Python has a torch \
-             tensor over it, which is lent until the next is taken. Every other tick comes by `Channel.receive(busy=True)`: a tensor of an \
-             observation with all its arrays that may be kept. The sender writes the whole block before it publishes, as `sensor-daemon` does; \
-             after 16 MiB it publishes later. Where it writes the first and the last value only, what is left is the size itself. The bare message is eight bytes between two Rust processes that poll \
-             iceoryx2. Bare and ours alternate, {ROUNDS} rounds in which the sizes take turns; ratios are of medians of one round, the \
-             median round (smallest–largest). The peers send the same number of bytes from Python to Python and make a tensor of what \
-             arrives without further copies; they sleep until the kernel wakes them. One message is under way at a time."
+            "One-way latency in microseconds, from right before publish in one process; both processes poll. Ours is the channel `observation` \
+             of a run. `Channel.lease` reads it in place, whatever the size: \"taken\" is the time until the receiver has the block, \"tensor\" the \
+             time until Python has a torch tensor over it, which is lent until the next block is taken. Every other tick is received by \
+             `Channel.receive(busy=True)`, which gives a tensor of an observation that may be kept. The sender writes the whole block before it \
+             publishes, as `sensor-daemon` does; after 16 MiB it publishes later. In the rows \"two values written\" it writes only the first and \
+             the last value, so that only the size differs. The bare message is eight bytes between two Rust processes that poll iceoryx2. Bare \
+             message and ours alternate in {ROUNDS} rounds, and the sizes take turns within a round. A ratio compares medians of one round; it \
+             is that of the median round (smallest–largest). The peers send the same number of bytes from Python to Python and make a tensor of \
+             the message without further copies; they sleep until the kernel wakes them. One message is under way at a time."
         ),
     );
     let bare = LatencyPercentiles::of(rounds.iter().flat_map(|round| round.bare.clone()).collect())?;
@@ -101,11 +102,11 @@ pub(super) fn report(rounds: &[LatencyRound], peers: &BTreeMap<String, Latencies
     let mut table = ReportTable::new("", &["message", "median µs", "90 %", "99 %"]);
     let [median, ninety, ninety_nine] = bare.cells();
     table.row(["bare iceoryx2, 8 bytes".into(), median, ninety, ninety_nine]);
-    for (who, by_size) in &all {
+    for (label, by_size) in &all {
         for (bytes, percentiles) in by_size {
             let [median, ninety, ninety_nine] = percentiles.cells();
-            table.row([format!("{who}, {}", name(*bytes)), median, ninety, ninety_nine]);
-            report.figure(format!("{who}, {}, median µs", name(*bytes)), percentiles.median);
+            table.row([format!("{label}, {}", name(*bytes)), median, ninety, ninety_nine]);
+            report.figure(format!("{label}, {}, median µs", name(*bytes)), percentiles.median);
         }
     }
     report.tables.extend([ratios, table]);
@@ -113,7 +114,7 @@ pub(super) fn report(rounds: &[LatencyRound], peers: &BTreeMap<String, Latencies
     Ok(report)
 }
 
-/// Percentiles of each size over everything that was measured.
+/// Percentiles of each size over all rounds.
 fn pooled<'a>(parts: impl Iterator<Item = &'a LatenciesBySize>) -> Result<PercentilesBySize, Exit> {
     let mut all = LatenciesBySize::new();
     for (bytes, latencies) in parts.flatten() {
@@ -125,7 +126,7 @@ fn pooled<'a>(parts: impl Iterator<Item = &'a LatenciesBySize>) -> Result<Percen
     each.collect()
 }
 
-/// Sizes among each other and beside the bare message, round by round.
+/// Ratios between sizes, and to the bare message, round by round.
 fn own_ratios(report: &mut BenchReport, rounds: &[LatencyRound]) -> Result<ReportTable, Exit> {
     let mut table = ReportTable::new("", &["ratio of medians", "figure"]);
     for (way, of) in WAYS {
@@ -151,11 +152,11 @@ fn own_ratios(report: &mut BenchReport, rounds: &[LatencyRound]) -> Result<Repor
 }
 
 fn curve(all: &[(String, PercentilesBySize)]) -> ReportCurve {
-    let line = |(who, by_size): &(String, PercentilesBySize)| {
+    let line = |(label, by_size): &(String, PercentilesBySize)| {
         #[expect(clippy::cast_precision_loss, reason = "a coordinate")]
         let points = by_size.iter().map(|(bytes, p)| [*bytes as f64, p.median]);
         CurveLine {
-            name: who.clone(),
+            name: label.clone(),
             points: points.collect(),
         }
     };

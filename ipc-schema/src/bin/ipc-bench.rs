@@ -1,11 +1,11 @@
-//! The time a bare iceoryx2 message takes from one process to another, both busy-polling: the yardstick of `caraware bench ipc`.
+//! Measures the time that a bare iceoryx2 message takes between two processes that busy-poll: the reference of `caraware bench ipc`.
 //!
-//! `ipc-bench [--messages N] --json FILE`; the other process is this program again.
+//! `ipc-bench [--messages N] --json FILE` starts itself again as the receiving process.
 
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
-    reason = "a measurement that cannot run says why and ends"
+    reason = "a measurement that cannot run ends with the reason"
 )]
 
 use std::{
@@ -22,19 +22,20 @@ use ipc_schema::clock::monotonic_ns;
 
 /// Messages before the measurement, while pages and caches warm up.
 const WARM_UP: u64 = 2_000;
-/// Pause between two messages, that of `caraware bench ipc`: the receiver has read the last one and polls again.
+/// Pause between two messages, as in `caraware bench ipc`: meanwhile the receiver polls again.
 const PAUSE_NS: u64 = 100_000;
 
-/// The services: there, and back once a message has been taken.
+/// Service of the messages, each of which holds the time at which it was sent.
 const STAMPS: &str = "stamps";
+/// Service of the answers: one for each message that was taken.
 const TAKEN: &str = "taken";
 
-/// What the names of the shared memory of a measurement below `root` begin with.
+/// Prefix of the names of a measurement's shared memory.
 fn prefix(root: &Path) -> String {
     format!("{}_", root.file_name().unwrap().to_string_lossy())
 }
 
-/// The shared memory of a measurement: whatever is left of it goes with this.
+/// The shared memory of a measurement. Dropping it removes what is left.
 struct Place {
     root: PathBuf,
 }
@@ -122,7 +123,7 @@ fn main() {
     let root = std::env::temp_dir().join(format!("ipc-bench-{}", std::process::id()));
     std::fs::create_dir_all(&root).unwrap();
     let place = Place { root: root.clone() };
-    // Held here, so that the service outlives whoever leaves first.
+    // Held here, so that the services outlive the process that ends first.
     let held = [STAMPS, TAKEN].map(|name| service(&root, name));
     let mut receiver = Command::new(std::env::current_exe().unwrap())
         .arg("--receive")

@@ -75,7 +75,12 @@ pub fn parse_assignment(assignment: &str) -> Result<SettingsLayer, ConfigError> 
 }
 
 /// Adds the values of a table and of its inner tables to the layer.
-fn add_table(prefix: &str, table: &DeTable<'_>, source: &NamedText, layer: &mut SettingsLayer) -> Result<(), ConfigError> {
+fn add_table(
+    prefix: &str,
+    table: &DeTable<'_>,
+    source: &NamedText,
+    layer: &mut SettingsLayer,
+) -> Result<(), ConfigError> {
     for (name, value) in table {
         let path = if prefix.is_empty() {
             name.get_ref().to_string()

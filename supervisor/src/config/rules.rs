@@ -146,7 +146,10 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
     if config.run.envs > 1 {
         return Some((
             "run.envs",
-            format!("`run.envs` = {}: the driving task runs in one environment", config.run.envs),
+            format!(
+                "`run.envs` = {}: the driving task runs in one environment",
+                config.run.envs
+            ),
             "start several runs, each with run.envs = 1",
         ));
     }

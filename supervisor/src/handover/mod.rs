@@ -69,7 +69,9 @@ impl Handovers {
         let learns_alone = processes.run().config.trainer.ranks == 1;
         match processes.state_of(Process::Trainer) {
             _ if self.current.is_some() => Some("another handover is in progress"),
-            _ if !learns_alone => Some("the trainer learns together with other ranks, and one rank cannot be replaced alone"),
+            _ if !learns_alone => {
+                Some("the trainer learns together with other ranks, and one rank cannot be replaced alone")
+            }
             _ if processes.replaceable().is_none() => Some("the run has no trainer"),
             State::Starting => Some("the trainer is still starting"),
             State::Done => Some("the trainer is done"),
