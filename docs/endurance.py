@@ -68,7 +68,7 @@ def newest(run: Path) -> str:
 
 @dataclass
 class Disturbances:
-    """How often a run was disturbed."""
+    """Numbers of a run's disturbances."""
 
     handovers: int = 0
     refused: int = 0
@@ -77,9 +77,9 @@ class Disturbances:
 
 
 def disturb(run: Path, process: subprocess.Popen[bytes], disturbances: list[str], rng: random.Random) -> Disturbances:
-    """Hands over and kills at random moments until all is done or the run is over.
+    """Hands over and kills at random moments, until all disturbances are made or the run is over.
 
-    Waits for a new checkpoint between two disturbances: five deaths in a row without one end the run, by design.
+    Waits for a new checkpoint between two disturbances: the run ends after five deaths in a row without one, by design.
     """
     done = Disturbances()
     before = ""

@@ -1,4 +1,4 @@
-"""Draws the figures of `docs/vehicle-model.md` from what the vehicle models answer.
+"""Draws the figures of `docs/vehicle-model.md` from the responses of the vehicle models.
 
 cargo run --release -p sim-core --example response > response.csv
 .venv/bin/python docs/images/draw_vehicle_model.py response.csv
@@ -56,7 +56,7 @@ def circle(rows: Rows) -> None:
 
 
 def step(rows: Rows) -> None:
-    """Step steer: what yaws, slips and rolls."""
+    """Step steer: yaw, slip and roll."""
     figure, axes = plt.subplots(2, 2, figsize=(10, 6), layout="constrained", sharex=True)
     panels = [
         ("yaw_rate_radps", 1.0, "yaw rate, rad/s"),
@@ -86,7 +86,7 @@ def brake(rows: Rows) -> None:
 
 
 def main() -> None:
-    """Draws all of them."""
+    """Draws all figures."""
     figures = read(sys.argv[1])
     for draw in (circle, step, brake):
         draw(figures[draw.__name__])

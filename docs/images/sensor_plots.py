@@ -1,4 +1,4 @@
-"""Draws the figures of `docs/sensor-models.md` from what the sensors deliver.
+"""Draws the figures of `docs/sensor-models.md` from sensor samples.
 
 cargo run --release -p sensor-daemon --example sensor_plots -- DIR
 .venv/bin/python docs/images/sensor_plots.py DIR
@@ -174,7 +174,7 @@ FIGURES = {allan: "imu.csv", gnss: "gnss.csv", sky: "satellites.csv", scan: "sca
 
 
 def main() -> None:
-    """Draws those whose tables are there."""
+    """Draws every figure whose tables exist."""
     directory = Path(sys.argv[1])
     for draw, table in FIGURES.items():
         if (directory / table).exists():

@@ -1,4 +1,4 @@
-//! A process that is killed leaves nothing that stands in the way of its successor.
+//! A killed process leaves nothing that prevents the start of its successor.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests assert by unwrapping")]
 
@@ -20,7 +20,7 @@ use ipc_schema::{
     services::{self, Channel, ServiceHolder},
 };
 
-/// Set for the process that is to be killed: the run file.
+/// Environment variable with the path of the run file; set for the process that the test kills.
 const VICTIM: &str = "CARAWARE_TEST_VICTIM";
 
 fn run_in(directory: &Path) -> RunFile {
@@ -55,7 +55,7 @@ fn run_in(directory: &Path) -> RunFile {
     }
 }
 
-/// Not a test of its own: the process that the test below kills.
+/// The process that the test below kills; without the environment variable it does nothing.
 #[test]
 fn the_victim() {
     let Some(run_file) = std::env::var_os(VICTIM) else {

@@ -1,4 +1,4 @@
-//! Services, ports and boards over real shared memory.
+//! Services, ports and boards in real shared memory.
 
 #![allow(
     clippy::unwrap_used,
@@ -32,7 +32,7 @@ fn config() -> Config {
     config
 }
 
-/// A run in a corner of shared memory of its own, removed at the end.
+/// A run with its own part of shared memory, which is removed at the end.
 struct Corner {
     run: RunFile,
     _services: ServiceHolder,
@@ -42,7 +42,7 @@ struct Corner {
 
 impl Drop for Corner {
     fn drop(&mut self) {
-        // As the supervisor does: iceoryx2 leaves one small file of each corner behind.
+        // The supervisor does the same: iceoryx2 leaves one small file behind for each part of shared memory.
         for entry in std::fs::read_dir("/dev/shm").unwrap().flatten() {
             if entry
                 .file_name()
@@ -110,7 +110,7 @@ fn tick(membership: &RunMembership, tick: u64) -> MessageHeader {
 }
 
 #[test]
-fn a_message_arrives_as_it_was_sent_in_the_same_memory_aligned() {
+fn a_message_arrives_unchanged_and_aligned_in_the_same_memory() {
     let corner = Corner::new(1);
     let (producer, mut consumer) = (corner.join(Process::SimCore), corner.join(Process::SensorDaemon));
     let publisher = producer.publisher(Channel::World).unwrap();
@@ -126,7 +126,7 @@ fn a_message_arrives_as_it_was_sent_in_the_same_memory_aligned() {
 }
 
 #[test]
-fn a_producer_waits_for_credit_and_a_full_watcher_only_misses() {
+fn a_producer_waits_for_credit_and_a_full_watcher_only_misses_messages() {
     let corner = Corner::new(2);
     let (producer, mut consumer, mut watcher) = (
         corner.join(Process::SimCore),
@@ -234,7 +234,7 @@ fn a_message_of_another_run_or_version_is_refused() {
 }
 
 #[test]
-fn a_message_longer_than_laid_out_names_the_setting() {
+fn a_message_that_is_too_long_names_the_setting() {
     let corner = Corner::new(4);
     let producer = corner.join(Process::TrafficBridge);
     let publisher = producer.publisher(Channel::Traffic).unwrap();
@@ -267,7 +267,7 @@ fn a_board_outlives_its_writer_and_a_wake_up_is_not_lost() {
     corner.join(Process::Trainer);
 }
 
-/// The socket below takes zero microseconds for ever.
+/// The socket of a wake-up takes zero microseconds as a wait without end.
 #[test]
 fn a_wait_of_less_than_a_microsecond_ends() {
     let run = Corner::new(11);

@@ -1,6 +1,6 @@
 """General ray tracers on the rays and triangles that `lidar-bench` has written: one thread, a line for each name.
 
-Seconds are those that the process had a core, as in `lidar-bench`: others may be at work on the machine.
+Times are processor time, as in `lidar-bench`, because other work may run on the machine.
 """
 
 import os

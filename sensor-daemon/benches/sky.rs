@@ -1,4 +1,4 @@
-//! Cost of one evaluation of the sky: in open country, and in streets between houses.
+//! Cost of one evaluation of the sky view, in open country and in streets between houses.
 //! `cargo bench -p sensor-daemon --bench sky`
 
 #![expect(clippy::panic, reason = "a benchmark that cannot run panics with the reason")]

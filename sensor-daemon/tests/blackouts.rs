@@ -125,7 +125,7 @@ fn fields_are_not_a_number_while_dark_and_raw_samples_the_last() {
 }
 
 #[test]
-fn a_row_is_dropped_while_a_sensor_that_it_needs_is_dark() {
+fn a_row_is_dropped_while_one_of_its_sensors_is_dark() {
     let mut needs = Run::new(&dark(BlackoutPolicy::Drop));
     let mut config = dark(BlackoutPolicy::Drop);
     config.observation.fields = vec![Field::AccelX, Field::GnssAge];
@@ -158,7 +158,7 @@ fn nothing_is_dark_unless_enabled() {
 }
 
 #[test]
-fn vehicles_go_dark_out_of_phase_and_whoever_else_is_there_does_not_matter() {
+fn vehicles_go_dark_out_of_phase_and_independently_of_other_vehicles() {
     let mut config = dark(BlackoutPolicy::Hold);
     config.gnss.blackout_length_s = [0.5, 3.5];
     config.gnss.blackout_gap_s = [1.0, 7.0];
@@ -277,8 +277,8 @@ fn lidars_scan_in_the_first_slots_unless_dark_and_their_objects_are_observed() {
     assert!((15..=25).contains(&dark), "{dark}");
 }
 
-/// A sensor that a command switches off is dark from its tick to the end of the episode, for one vehicle or for all; the others' numbers
-/// are those of the run without commands.
+/// A sensor that a command switches off is dark from its tick to the end of the episode, for one vehicle or for all. Other sensors have
+/// the same values as without commands.
 #[test]
 fn a_switched_sensor_is_dark_until_it_is_switched_on_or_the_episode_ends() {
     let switch = |id: Option<u32>, sensors: u32, on: u32| SensorSwitch {

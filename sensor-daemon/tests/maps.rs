@@ -63,7 +63,7 @@ fn seen(tick: &Tick) -> (f32, f32, f32) {
 }
 
 #[test]
-fn an_episode_has_sky_and_projection_of_its_map_and_the_noise_of_its_step() {
+fn an_episode_has_sky_and_projection_of_its_map_and_the_noise_of_its_stage() {
     let (config, maps) = (config(), maps());
     let mut run = Run::with(&config, Sensing::on_maps(&config, BOX_M, &maps).unwrap());
     run.sensing.set_sky_of(0, Box::new(Marked(5)));
@@ -76,11 +76,11 @@ fn an_episode_has_sky_and_projection_of_its_map_and_the_noise_of_its_step() {
         (1, 0, (5.0, 5.0, 2.0)),
         (0, 0, (5.0, 5.0, 2.0)),
     ];
-    for (step, map, expected) in cases {
-        run.restart_in(7, step, map);
+    for (stage, map, expected) in cases {
+        run.restart_in(7, stage, map);
         run.tick(&cavs(1));
         let tick = run.tick(&cavs(1));
-        assert_eq!(seen(&tick), expected, "step {step}, map {map}");
+        assert_eq!(seen(&tick), expected, "stage {stage}, map {map}");
         let [latitude_deg, longitude_deg, _] = tick.section::<[f64; 3]>("gnss_geodetic")[0];
         let (east, north) = (f64::from(expected.1), f64::from(expected.2));
         let place = NetPosition {
@@ -113,7 +113,7 @@ fn an_episode_has_sky_and_projection_of_its_map_and_the_noise_of_its_step() {
 }
 
 #[test]
-fn what_came_before_on_another_map_changes_nothing() {
+fn earlier_episodes_on_another_map_change_nothing() {
     let mut config = config();
     config.gnss.noise_std_deg = [5e-5; 2];
     config.gnss.correlated_std_m = [1.0; 3];

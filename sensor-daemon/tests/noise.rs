@@ -156,7 +156,7 @@ fn everything() -> Config {
 }
 
 /// All values of a vehicle's sensors at a tick, as bits.
-fn said(run: &mut Run, states: &[VehicleState], id_hash: u64) -> Vec<u32> {
+fn samples(run: &mut Run, states: &[VehicleState], id_hash: u64) -> Vec<u32> {
     let tick = run.tick(states);
     let slot = tick
         .section::<u64>("id_hash")
@@ -191,7 +191,7 @@ fn a_vehicle_senses_the_same_alone_in_another_order_and_among_many() {
         &|_| vec![me],
         &|_| all.clone(),
         &|_| backwards.clone(),
-        // Others come and go, before and behind it.
+        // Other vehicles come and go, with lower and higher numbers.
         &|tick| {
             all.iter()
                 .filter(|v| v.vehicle == 23 || !(v.vehicle as usize + tick).is_multiple_of(3))
@@ -204,31 +204,31 @@ fn a_vehicle_senses_the_same_alone_in_another_order_and_among_many() {
         .iter()
         .map(|states| {
             let mut run = Run::new(&everything);
-            (0..60).map(|tick| said(&mut run, &states(tick), me.id_hash)).collect()
+            (0..60).map(|tick| samples(&mut run, &states(tick), me.id_hash)).collect()
         })
         .collect();
-    assert!(all.iter().all(|said| *said == all[0]));
+    assert!(all.iter().all(|samples| *samples == all[0]));
     assert!(all[0].windows(2).all(|pair| pair[0] != pair[1]));
 }
 
 #[test]
-fn an_episode_begins_cleanly_and_a_seed_is_an_episode() {
+fn an_episode_starts_without_state_and_depends_on_its_seed() {
     let config = everything();
     let states = cavs(20);
     let id = states[7].id_hash;
     let mut run = Run::new(&config);
-    let first: Vec<_> = (0..30).map(|_| said(&mut run, &states, id)).collect();
+    let first: Vec<_> = (0..30).map(|_| samples(&mut run, &states, id)).collect();
     run.restart(6);
-    let other: Vec<_> = (0..30).map(|_| said(&mut run, &states[3..], id)).collect();
+    let other: Vec<_> = (0..30).map(|_| samples(&mut run, &states[3..], id)).collect();
     run.restart(5);
-    let again: Vec<_> = (0..30).map(|_| said(&mut run, &states[2..], id)).collect();
+    let again: Vec<_> = (0..30).map(|_| samples(&mut run, &states[2..], id)).collect();
     assert_eq!(first, again);
     assert!(first.iter().zip(&other).all(|(a, b)| a != b));
 }
 
 /// A slot passes no state to its next vehicle, and a vehicle that returns in the same episode draws new noise.
 #[test]
-fn a_slot_that_changes_hands_passes_nothing_on() {
+fn a_slot_passes_no_state_to_its_next_vehicle() {
     let config = everything();
     let (a, b) = (road_user(1, Kind::Cav), road_user(2, Kind::Cav));
     let mut changed = Run::new(&config);
@@ -237,7 +237,7 @@ fn a_slot_that_changes_hands_passes_nothing_on() {
     let mut fresh = Run::new(&config);
     (0..22).for_each(|_| drop(fresh.tick(&[])));
     for _ in 0..30 {
-        assert_eq!(said(&mut changed, &[b], b.id_hash), said(&mut fresh, &[b], b.id_hash));
+        assert_eq!(samples(&mut changed, &[b], b.id_hash), samples(&mut fresh, &[b], b.id_hash));
     }
 }
 

@@ -86,7 +86,7 @@ fn only_connected_vehicles_get_a_slot_and_a_left_one_is_terminated() {
 }
 
 #[test]
-fn a_collision_ends_the_trajectory_if_it_is_to() {
+fn a_collision_ends_the_trajectory_if_configured() {
     let mut config = config();
     config.collision.ends_trajectory = true;
     let mut sensing = Sensing::new(&config, &map()).unwrap();
@@ -121,7 +121,7 @@ fn a_collision_ends_the_trajectory_if_it_is_to() {
 }
 
 #[test]
-fn a_collision_ends_nothing_unless_asked() {
+fn a_collision_ends_no_trajectory_by_default() {
     let mut sensing = Sensing::new(&config(), &map()).unwrap();
     let mut states = [road_user(0, Kind::Cav)];
     tick(&mut sensing, 0, FIRST_OF_EPISODE, &states);
@@ -145,7 +145,7 @@ fn a_vehicles_noise_does_not_depend_on_the_others() {
 }
 
 #[test]
-fn a_slow_sensor_holds_its_sample_and_tells_its_age() {
+fn a_slow_sensor_holds_its_sample_and_its_age_grows() {
     let mut config = config();
     config.gnss.period_s = 0.3;
     let mut sensing = Sensing::new(&config, &map()).unwrap();

@@ -24,7 +24,7 @@ use sim_core::{
     scene::{Prism, Prop, Road, Scene, SolidClass, shape::OrientedBox},
 };
 
-/// An upright box as parry has it.
+/// An upright box in parry's types.
 fn cuboid(solid: &OrientedBox) -> (Pose, Cuboid) {
     let [l, w] = solid.half_m;
     let yaw = solid.along[1].atan2(solid.along[0]);
@@ -38,10 +38,10 @@ fn cuboid(solid: &OrientedBox) -> (Pose, Cuboid) {
     )
 }
 
-/// Skips pairs so close to touching that rounding decides.
-fn decides(p: &Pose, a: &dyn Shape, q: &Pose, b: &dyn Shape) -> Option<bool> {
+/// True if the shapes touch. `None` if they are so close that rounding decides.
+fn touch(p: &Pose, a: &dyn Shape, q: &Pose, b: &dyn Shape) -> Option<bool> {
     if intersection_test(p, a, q, b).unwrap().intersecting {
-        // Still touching when they are drawn apart a little?
+        // The contact must remain when one of them is moved a little.
         let clear = [
             [1e-5, 0.0, 0.0],
             [-1e-5, 0.0, 0.0],
@@ -85,7 +85,7 @@ proptest! {
     #[test]
     fn boxes_touch_as_parry_says(a in any_box(), b in any_box()) {
         let ((p, c), (q, d)) = (cuboid(&a), cuboid(&b));
-        if let Some(expected) = decides(&p, &c, &q, &d) {
+        if let Some(expected) = touch(&p, &c, &q, &d) {
             prop_assert_eq!(boxes_touch(&a, &b), expected);
             prop_assert_eq!(boxes_touch(&b, &a), expected);
         }
@@ -103,7 +103,7 @@ proptest! {
         let capsule = Capsule::new_z(0.5 * height - radius, radius);
         let (q, c) = cuboid(&solid);
         let p = Pose::translation(x, y, z + 0.5 * height);
-        if let Some(expected) = decides(&p, &capsule, &q, &c) {
+        if let Some(expected) = touch(&p, &capsule, &q, &c) {
             prop_assert_eq!(person.touches(&vehicle), expected);
             prop_assert_eq!(vehicle.touches(&person), expected);
             if expected {
@@ -122,7 +122,7 @@ proptest! {
         let corners: Vec<Vector> = hull.iter().flat_map(|[x, y]| [Vector::new(*x, *y, z), Vector::new(*x, *y, z + height)]).collect();
         let polyhedron = ConvexPolyhedron::from_convex_hull(&corners).unwrap();
         let (p, c) = cuboid(&solid);
-        if let Some(expected) = decides(&p, &c, &Pose::identity(), &polyhedron) {
+        if let Some(expected) = touch(&p, &c, &Pose::identity(), &polyhedron) {
             prop_assert_eq!(box_touches_prism(&solid, &hull, [z, z + height]), expected);
         }
     }
@@ -135,7 +135,7 @@ proptest! {
         let (p, c) = cuboid(&solid);
         let says = wings.map(|wing| {
             let (q, d) = cuboid(&wing);
-            decides(&p, &c, &q, &d)
+            touch(&p, &c, &q, &d)
         });
         if let [Some(one), Some(two)] = says {
             prop_assert_eq!(box_touches_prism(&solid, &outline, [0.0, 1.0]), one || two);
@@ -172,7 +172,7 @@ fn person(index: u32, x_m: f64, y_m: f64) -> VehicleState {
     }
 }
 
-/// One tick: the contacts that began, and the vehicles that are flagged.
+/// Runs one tick; returns the contacts that began, and the flagged vehicles.
 fn tick(detector: &mut CollisionDetector, episode: u64, mut states: Vec<VehicleState>) -> (Vec<Collision>, Vec<u32>) {
     detector.detect(episode, &mut states);
     let flagged = states.iter().filter(|state| state.flags & COLLIDED != 0);
@@ -184,7 +184,7 @@ fn empty() -> CollisionDetector {
 }
 
 #[test]
-fn a_contact_is_told_when_it_begins_and_again_after_it_has_ended() {
+fn a_contact_is_reported_when_it_begins_and_again_after_it_has_ended() {
     let mut detector = empty();
     // Bodies reach from 1 m behind to 3 m ahead of the origin.
     let at = |gap_m: f64| {
@@ -238,11 +238,11 @@ fn only_contacts_of_connected_vehicles_and_heroes_count() {
         0,
         vec![person(3, 1.0, 0.0), vehicle(5, Kind::Other, 0.0, 0.0), oncoming],
     );
-    let who: Vec<_> = begun
+    let contacts: Vec<_> = begun
         .iter()
         .map(|event| (event.vehicle, event.other, event.other_class))
         .collect();
-    assert_eq!(who, [(7, 5, Struck::Vehicle as u32), (7, 3, Struck::Person as u32)]);
+    assert_eq!(contacts, [(7, 5, Struck::Vehicle as u32), (7, 3, Struck::Person as u32)]);
     assert_eq!(flagged, [3, 5, 7]);
     assert!((begun[0].relative_speed_mps - 20.0).abs() < 1e-5, "head on");
     assert!((begun[1].relative_speed_mps - 10.0).abs() < 1e-5);
@@ -260,7 +260,7 @@ fn two_watched_vehicles_have_one_event_of_the_lower_index() {
 }
 
 #[test]
-fn what_passes_on_a_bridge_touches_nothing_below() {
+fn a_vehicle_on_a_bridge_touches_nothing_below() {
     let mut detector = empty();
     let mut above = vehicle(1, Kind::Cav, 0.0, 0.0);
     above.z_m = 5.0;
@@ -312,12 +312,12 @@ fn buildings_and_obstacles_are_struck_where_they_stand() {
         0,
         vec![vehicle(0, Kind::Cav, 7.5, 5.0), vehicle(1, Kind::Cav, 1.9, -20.0)],
     );
-    let who: Vec<_> = begun
+    let contacts: Vec<_> = begun
         .iter()
         .map(|e| (e.vehicle, e.other, e.other_class, e.other_id_hash))
         .collect();
     assert_eq!(
-        who,
+        contacts,
         [
             (0, 0, Struck::Building as u32, id_hash("house")),
             (1, 1, Struck::Obstacle as u32, id_hash("cone"))
@@ -344,7 +344,7 @@ fn buildings_and_obstacles_are_struck_where_they_stand() {
 }
 
 #[test]
-fn the_order_of_states_within_a_tick_and_nothing_else_decides_the_events() {
+fn events_are_the_same_in_every_run_and_sorted() {
     let crowd = |shift: f64| -> Vec<VehicleState> {
         (0..300)
             .map(|i| {

@@ -37,7 +37,7 @@ fn sedan(surface: f64, dt_s: f64) -> DynamicParams {
 }
 
 /// All kinds of vehicle, on a dry road.
-fn everyone() -> Vec<(String, DynamicParams)> {
+fn every_kind() -> Vec<(String, DynamicParams)> {
     let catalogue = ParameterCatalogue::new().unwrap();
     let all = catalogue.sets().iter().map(|set| {
         let body = set.dimensions(set.length_m, set.width_m, set.height_m);
@@ -101,7 +101,7 @@ fn straight_braking_distance() {
 /// Dynamics*, chapter 6).
 #[test]
 fn steady_state_circle_against_the_understeer_gradient() {
-    for (name, params) in everyone() {
+    for (name, params) in every_kind() {
         let [front, rear] = params.stiffness_per_rad;
         let gradient = (1.0 / front - 1.0 / rear) / GRAVITY_MPS2;
         for speed in [8.0, 15.0] {
@@ -121,7 +121,7 @@ fn steady_state_circle_against_the_understeer_gradient() {
 
 #[test]
 fn a_step_of_the_steering_settles_with_its_roll() {
-    for (name, params) in everyone() {
+    for (name, params) in every_kind() {
         let states = run(&params, rolling(15.0), steering(0.02), 12.0, DT_S);
         let end = *states.last().unwrap();
         let settled = &states[800..];
@@ -181,7 +181,7 @@ fn halving_the_sub_step_quarters_the_error() {
 
 #[test]
 fn at_rest_it_stays_at_rest_on_a_grade() {
-    for (name, params) in everyone() {
+    for (name, params) in every_kind() {
         for slope_sin in [-0.12, 0.0, 0.12] {
             let mut state = rolling(0.0);
             for _ in 0..500 {
@@ -234,7 +234,7 @@ proptest! {
         prop_assert_eq!(state.speed_mps, 0.0);
     }
 
-    /// With any steering on any surface, a vehicle neither turns around nor gains speed by itself.
+    /// With any steering on any surface, a vehicle neither spins around nor gains speed.
     #[test]
     fn steering_alone_neither_spins_nor_speeds_up(
         speed in 1.0_f64..25.0, angle in -0.15_f64..0.15, surface in prop::sample::select(vec![0.3, 0.7, 1.0]),

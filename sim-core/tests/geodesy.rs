@@ -1,4 +1,4 @@
-//! The projection against PROJ, and there and back over 50 km × 50 km.
+//! The projection compared with PROJ, and its inverse over 50 km × 50 km.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "test code may assert by unwrapping")]
 
@@ -230,7 +230,7 @@ fn the_papers_equations_agree_with_pymap3d_on_a_sphere() {
 }
 
 #[test]
-fn there_and_back_over_50_km_square() {
+fn the_inverse_returns_the_point_over_50_km_square() {
     for (projection, _) in cases() {
         for i in -25..=25 {
             for j in -25..=25 {

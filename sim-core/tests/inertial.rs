@@ -11,7 +11,7 @@ use sim_core::models::{
     state::{ControlInput, ModelState},
 };
 
-/// Dead reckoning as a user would do it: heading from the angular rate, velocity from the body's acceleration turned by
+/// Dead reckoning of a user: heading from the angular rate, velocity from the body's acceleration turned by
 /// the heading half-way, position from the mean velocity.
 fn integrate(start: &VehicleState, rows: &[SubStep], dt_s: f64) -> [f64; 3] {
     let (mut x, mut y, mut yaw) = (start.x_m, start.y_m, start.yaw_rad);
@@ -114,7 +114,7 @@ fn halving_the_sub_step_at_least_halves_the_error() {
     assert!(medium < 0.15, "{medium}");
 }
 
-/// With held actuators only the arc remains: an exact circle whatever the sub-step.
+/// With held actuators the motion is an exact circle for every sub-step.
 #[test]
 fn a_circle_closes_whatever_the_sub_step() {
     let model = MotionModel::Kinematic(kinematic(&limits(), 2.6));

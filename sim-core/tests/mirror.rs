@@ -58,7 +58,7 @@ fn a_new_episode_forgets_everything_even_if_announcements_come_first() {
 }
 
 #[test]
-fn arrivals_make_room_and_strangers_are_refused() {
+fn arrivals_free_their_place_and_unannounced_vehicles_are_refused() {
     let mut mirror = Mirror::new(settings(0.1, 10, 1)).unwrap();
     mirror
         .apply_meta(&header(0, 0), &[meta(0, Kind::Cav), meta(7, Kind::Other)])
@@ -98,7 +98,7 @@ fn faulty_frames_are_refused_by_name() {
 }
 
 #[test]
-fn a_vehicle_that_was_away_is_set_and_counted() {
+fn a_vehicle_that_was_absent_is_resynchronised_and_counted() {
     let mut mirror = Mirror::new(settings(0.1, 10, 10)).unwrap();
     mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
     frame(&mut mirror, &header(0, 0), &[road().state(0, 50.0, 5.0)]);
@@ -141,9 +141,9 @@ fn persons_pass_through_with_velocities_from_differences() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(30))]
 
-    /// Every vehicle moves the same whatever other road users exist and in whatever order SUMO lists them; rows are ascending.
+    /// The motion of a vehicle does not depend on other road users or on SUMO's order. Rows are ascending.
     #[test]
-    fn order_and_company_do_not_matter(
+    fn order_and_other_vehicles_do_not_matter(
         count in 1_u32..12,
         shuffle in any::<u64>(),
         speeds in prop::collection::vec(0.0_f64..15.0, 12),

@@ -1,4 +1,4 @@
-//! The process itself: the real binary, with the test in the roles of the supervisor, `traffic-bridge` and `sensor-daemon`.
+//! The real program `sim-core`; the test plays the supervisor, `traffic-bridge` and `sensor-daemon`.
 
 #![allow(clippy::unwrap_used, reason = "test code may assert by unwrapping")]
 
@@ -103,7 +103,7 @@ impl Run {
         command.unwrap()
     }
 
-    /// This test in the role of another process.
+    /// Joins the run as another process.
     fn join(&self, process: Process) -> RunMembership {
         let parent = rustix::process::getppid().map_or(0, |p| p.as_raw_nonzero().get());
         let file = RunFile {
@@ -231,7 +231,7 @@ fn drive_on(run: &Run, ticks: u64, map: u16) -> (Vec<VehicleState>, Vec<(u64, Co
 }
 
 #[test]
-fn contacts_are_with_what_stands_on_the_map_of_the_tick() {
+fn contacts_are_with_the_buildings_of_the_ticks_map() {
     let mut run = Run::new("maps", |config| config.scene.obstacles.clear());
     let poly = run.file.run_dir.join("b.poly.xml");
     let tower = "<poly id=\"tower\" type=\"building\" shape=\"70,-5 80,-5 80,5 70,5\"/>";
@@ -318,7 +318,7 @@ fn contacts_are_flagged_published_written_and_counted() {
 }
 
 #[test]
-fn nobody_looks_if_nobody_asks() {
+fn contacts_are_not_searched_unless_configured() {
     let run = Run::new("blind", |config| config.collision.detect = false);
     let mut process = run.start();
     let (states, collisions) = drive(&run, 60);
@@ -330,7 +330,7 @@ fn nobody_looks_if_nobody_asks() {
 }
 
 #[test]
-fn a_scene_that_cannot_be_read_ends_the_process_with_the_file_and_the_line() {
+fn an_unreadable_scene_ends_the_process_with_file_and_line() {
     let run = Run::new("broken", |_| {});
     let poly = &run.file.scene_files.additional_files[0];
     std::fs::write(poly, "<additional>\n<poly id=\"a\" shape=\"1,2 x\"/></additional>").unwrap();

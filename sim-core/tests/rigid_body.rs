@@ -24,7 +24,7 @@ fn limits() -> config::VehicleConfig {
     }
 }
 
-/// The parameter set that a vehicle of this class and length gets, with the size of the set's own vehicle.
+/// The parameter set for a vehicle of this class and length, with the size of the set's own vehicle.
 fn set(class: &str, length_m: f64) -> (ParameterSet, VehicleDimensions) {
     let catalogue = ParameterCatalogue::new().unwrap();
     let set = catalogue.sets()[catalogue.choose(class.as_bytes(), length_m).set].clone();
@@ -205,7 +205,7 @@ fn motion_is_the_derivative_of_the_pose() {
 }
 
 #[test]
-fn the_state_is_all_there_is() {
+fn the_motion_depends_on_the_state_alone() {
     let drive = |t: f64| (2.0 * t.sin(), 0.2 * (3.0 * t).sin());
     let alone = run(&mut vehicle(&sedan(), 1.0), rolling(15.0), 0.02, 5.0, drive);
     // The same again, with another vehicle in the same world in between.
@@ -236,7 +236,7 @@ fn two_wheelers_are_refused() {
 }
 
 #[test]
-fn whatever_is_asked_it_stays_finite_and_gains_no_speed_by_steering() {
+fn any_input_leaves_the_state_finite_and_steering_gains_no_speed() {
     let four_wheels = ParameterCatalogue::new().unwrap();
     for set in four_wheels.sets().iter().filter(|set| set.roll_per_mps2_rad > 0.0) {
         let body = set.dimensions(set.length_m, set.width_m, set.height_m);

@@ -41,7 +41,7 @@ fn road_heights_m(scene: &Scene, point: shape::Point) -> Vec<f64> {
     pieces.map(|(_, height_m)| height_m).collect()
 }
 
-/// Height of the road at a place, the lowest where several cross; `None` beside the road. Metres.
+/// Height of the road at a point, metres: the lowest where several roads cross, `None` beside the road.
 fn road_height_m(scene: &Scene, x_m: f64, y_m: f64) -> Option<f64> {
     road_heights_m(scene, [x_m, y_m]).into_iter().min_by(f64::total_cmp)
 }
@@ -245,7 +245,7 @@ fn random_props_stand_beside_the_road_and_depend_on_the_seed_alone() {
 }
 
 #[test]
-fn a_net_with_elevation_gives_heights_and_bridges_are_told_apart() {
+fn a_net_with_elevation_gives_heights_and_distinguishes_bridges() {
     let directory = tempfile::tempdir().unwrap();
     let net = directory.path().join("hill.net.xml");
     std::fs::write(
@@ -310,7 +310,7 @@ fn outlines_of_strips_have_the_strips_width() {
 }
 
 #[test]
-fn polygons_in_degrees_are_brought_onto_the_map() {
+fn polygons_in_degrees_are_projected_onto_the_map() {
     let directory = tempfile::tempdir().unwrap();
     let net = directory.path().join("a.net.xml.gz");
     let mut packed = flate2::write::GzEncoder::new(std::fs::File::create(&net).unwrap(), flate2::Compression::fast());
@@ -390,7 +390,7 @@ fn the_motorway_of_the_wheel_has_road_and_a_shopping_centre() {
 }
 
 #[test]
-fn viewers_are_told_of_lanes_lights_and_houses() {
+fn the_chart_for_viewers_has_lanes_lights_and_houses() {
     let directory = tempfile::tempdir().unwrap();
     let run = town(directory.path());
     let scene = Scene::of_run(&run).unwrap();

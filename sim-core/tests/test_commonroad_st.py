@@ -1,4 +1,4 @@
-"""The committed reference trajectories are what their script makes of the package."""
+"""The committed reference trajectories equal those that their script computes with the package."""
 
 import json
 import runpy

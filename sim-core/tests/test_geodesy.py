@@ -1,4 +1,4 @@
-"""The committed reference positions are what their script makes of pyproj and pymap3d, and these two agree."""
+"""The committed reference positions equal those of their script, and pyproj and pymap3d agree."""
 
 import csv
 import runpy

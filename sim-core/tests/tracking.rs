@@ -19,7 +19,7 @@ fn front(state: &VehicleState) -> [f64; 2] {
     ]
 }
 
-fn never_set(states: &[VehicleState]) {
+fn assert_never_resynchronised(states: &[VehicleState]) {
     assert_eq!(states[0].flags, APPEARED | RESYNCHRONISED);
     assert!(states[1..].iter().all(|s| s.flags == 0), "the mirror was set onto SUMO");
 }
@@ -40,7 +40,7 @@ fn first_frame_puts_the_rear_axle_behind_the_front_bumper() {
 fn steady_straight_driving_is_exact() {
     let road = Road(vec![[0.0, 0.0], [1000.0, 0.0]]);
     let (states, rows) = mirror_one(settings(0.1, 10, 1), &drive(&road, 10.0, 0.1, &[14.0; 200]));
-    never_set(&states);
+    assert_never_resynchronised(&states);
     let (lateral, longitudinal) = worst(&states);
     assert!(lateral < 1e-5 && longitudinal < 1e-5, "{lateral} {longitudinal}");
     assert!(
@@ -54,7 +54,7 @@ fn steady_straight_driving_is_exact() {
 fn a_circle_has_the_closed_form_yaw_rate_and_lateral_acceleration() {
     let road = Road::corner(100.0, 50.0, 6.0, 600);
     let (states, rows) = mirror_one(settings(0.1, 10, 1), &drive(&road, 60.0, 0.1, &[10.0; 300]));
-    never_set(&states);
+    assert_never_resynchronised(&states);
     let (state, row) = (states[250], rows[2500]);
     let ahead = f64::from(state.length_m - state.rear_overhang_m);
     let rear_radius = (50.0_f64 * 50.0 - ahead * ahead).sqrt();
@@ -92,7 +92,7 @@ fn a_town_corner_of_five_straight_pieces() {
                 settings(0.1, 10, 1),
                 &drive(&road, 30.0, 0.1, &vec![speed; (80.0 / speed / 0.1) as usize]),
             );
-            never_set(&states);
+            assert_never_resynchronised(&states);
             let (lateral, longitudinal) = worst(&states);
             assert!(
                 lateral < bound && longitudinal < 0.3,
@@ -119,7 +119,7 @@ fn one_second_steps_are_tracked_through_ten_ticks() {
         1 + 10 * 15,
         "a vehicle is there from the tick at which SUMO first has it"
     );
-    never_set(&states);
+    assert_never_resynchronised(&states);
     let (lateral, longitudinal) = worst(&states);
     assert!(lateral < 0.15 && longitudinal < 0.1, "{lateral} {longitudinal}");
     // Half a step behind SUMO, at the end of each step as in between.
@@ -138,7 +138,7 @@ fn a_lane_change_is_spread_and_not_set() {
         let mut frames = drive(&road, 10.0, step_s, &vec![speed; count]);
         frames[count / 4..].iter_mut().for_each(|f| f.front_y_m += 3.2);
         let (states, rows) = mirror_one(settings(0.1, 10, m), &frames);
-        never_set(&states);
+        assert_never_resynchronised(&states);
         let (lateral, longitudinal) = worst(&states);
         assert!(
             lateral < 0.25 && longitudinal < 0.25,
@@ -171,7 +171,7 @@ fn stop_and_go() -> Vec<f64> {
 fn stop_and_go_keeps_up_and_never_reverses() {
     let road = Road(vec![[0.0, 0.0], [1000.0, 0.0]]);
     let (states, rows) = mirror_one(settings(0.1, 10, 1), &drive(&road, 10.0, 0.1, &stop_and_go()));
-    never_set(&states);
+    assert_never_resynchronised(&states);
     let (lateral, longitudinal) = worst(&states);
     assert!(lateral < 1e-3 && longitudinal < 0.35, "{lateral} {longitudinal}");
     assert!(rows.iter().all(|r| r.speed_mps >= 0.0));
@@ -187,7 +187,7 @@ fn hard_stops_with_one_second_steps_stay_within_half_a_metre() {
     let road = Road(vec![[0.0, 0.0], [1000.0, 0.0]]);
     let speeds = [14.0, 14.0, 14.0, 9.5, 5.0, 0.5, 0.0, 0.0, 0.0, 2.6, 5.2, 7.8, 7.8, 7.8];
     let (states, rows) = mirror_one(settings(0.1, 10, 10), &drive(&road, 10.0, 1.0, &speeds));
-    never_set(&states);
+    assert_never_resynchronised(&states);
     let (_, longitudinal) = worst(&states);
     assert!(longitudinal < 0.5, "{longitudinal}");
     assert!(rows.iter().all(|r| (-9.01..=5.01).contains(&r.accel_body_mps2[0])));
@@ -202,7 +202,7 @@ fn a_standing_vehicle_stands_whatever_its_heading_says() {
         frame.front_x_m += 1e-3 * (i % 3) as f64;
     }
     let (states, rows) = mirror_one(settings(0.1, 10, 1), &frames);
-    never_set(&states);
+    assert_never_resynchronised(&states);
     assert!(
         states
             .windows(2)
@@ -236,7 +236,7 @@ fn discontinuities_are_set_flagged_and_counted() {
 }
 
 #[test]
-fn a_jump_that_nobody_flagged_sets_the_mirror() {
+fn a_jump_without_a_flag_resynchronises_the_mirror() {
     let road = Road(vec![[0.0, 0.0], [1000.0, 0.0]]);
     for [dx, dy] in [[12.0, 0.0], [0.0, 12.0], [-12.0, 0.0]] {
         let mut frames = drive(&road, 10.0, 0.1, &[10.0; 40]);
@@ -257,9 +257,9 @@ fn a_jump_that_nobody_flagged_sets_the_mirror() {
     }
 }
 
-/// A 90° corner without any radius at speed: no vehicle stays on it, so the mirror is set to SUMO's state repeatedly.
+/// A 90° corner without any radius at speed: no vehicle can follow it, so the mirror is resynchronised repeatedly.
 #[test]
-fn an_error_beyond_the_limit_sets_the_mirror() {
+fn an_error_beyond_the_limit_resynchronises_the_mirror() {
     let road = Road(vec![[0.0, 0.0], [40.0, 0.0], [40.0, 40.0]]);
     let (states, _) = mirror_one(settings(0.1, 10, 1), &drive(&road, 10.0, 0.1, &[20.0; 35]));
     assert!(states.iter().filter(|s| s.flags & RESYNCHRONISED != 0).count() > 1);

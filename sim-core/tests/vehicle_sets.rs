@@ -1,4 +1,4 @@
-//! The committed parameter sets: sound, complete, and as `docs/vehicle-model.md` shows them.
+//! The committed parameter sets are plausible and complete, and `docs/vehicle-model.md` shows them.
 
 #![allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 

@@ -1,4 +1,4 @@
-"""Env-steps per second with random actions through each face, beside the raw channel.
+"""Measures env-steps per second with random actions through each face, compared with the raw channel.
 
 `python trainer/benches/faces.py [SECONDS]`: town and driving, the faces in turn, six times. It prints the best of each,
 as whatever else the machine does can only slow them down, and the least CPU time of this process for a step of all
@@ -33,7 +33,7 @@ def until(seconds: float, step: Callable[[], int]) -> tuple[float, float]:
 
 
 def raw(simulation: Simulation, seconds: float) -> tuple[float, float]:
-    """Take a tick, answer it, give credit: what no face can beat."""
+    """Take a tick, answer it and return its credit: the upper limit of every face."""
     channel, rng = simulation.channel, np.random.default_rng(0)
     waiting: deque[Observation] = deque()
     drives = channel.run["config"]["task"]["kind"] == "driving"
@@ -107,7 +107,7 @@ FACES = (raw, vector, sb3, parallel, single)
 
 
 def main(seconds: float) -> None:
-    """All faces on all configurations, in turn, so that what else the machine does meets all alike."""
+    """Measure all faces on all configurations in turn, so that other work on the machine affects all of them."""
     for name, (config, settings) in CONFIGS.items():
         measured: dict[str, list[tuple[float, float]]] = {face.__name__: [] for face in FACES}
         for repeat in range(REPEATS):

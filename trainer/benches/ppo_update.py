@@ -1,4 +1,4 @@
-"""Samples visited per second by our PPO update and by a plain loop in CleanRL's manner, alternating in one run.
+"""Measures sample visits per second of our PPO update and of a plain loop in CleanRL's manner, alternating in one run.
 
 Same networks, batch, epochs, and threads. `python trainer/benches/ppo_update.py [--threads N] [--precision P]`;
 prints the median of each, and the median of the pairwise ratios. A sample visit is one sample in one epoch.
@@ -26,7 +26,7 @@ from caraware_bench.trainer import (
 
 
 def on(device: torch.device, batch: Batch) -> Batch:
-    """The batch where the networks are."""
+    """The batch on the device of the networks."""
     return batch.to(device)
 
 

@@ -1,7 +1,7 @@
-"""A trainer that only looks: run by `caraware train --set trainer.module=lease_probe`.
+"""A trainer that only reads observations, run by `caraware train --set trainer.module=lease_probe`.
 
-It takes all ticks by the way that the environment variable LEASE names, `lent` or `received`.
-`parts/trainer.json` gets a digest of every observation, to be compared between both ways.
+The environment variable LEASE selects how it takes the ticks: `lent` or `received`. It writes a digest of every
+observation to `parts/trainer.json`, so that a test can compare both ways.
 """
 
 import hashlib
@@ -16,12 +16,12 @@ from torch import Tensor
 
 
 def digest(tensor: Tensor) -> str:
-    """Of the numbers of a tensor."""
+    """Digest of the numbers of a tensor."""
     return hashlib.sha256(tensor.clone().numpy().tobytes()).hexdigest()
 
 
 def leased(channel: Channel) -> dict:
-    """All ticks of a run, each lent."""
+    """Take all ticks of a run, each lent."""
     lease = channel.lease()
     digests, in_shared_memory, refused_writes, last = [], True, 0, False
     while not last:
@@ -52,7 +52,7 @@ def leased(channel: Channel) -> dict:
 
 
 def received(channel: Channel) -> dict:
-    """All ticks of a run, each an observation of its own."""
+    """Take all ticks of a run, each as an observation that is kept."""
     digests, last = [], False
     while not last:
         for observation in channel.receive(60.0):
@@ -64,7 +64,7 @@ def received(channel: Channel) -> dict:
 
 
 def main() -> None:
-    """Take all ticks and write what was found."""
+    """Take all ticks and write the digests."""
     channel = Channel(sys.argv[1])
     found = leased(channel) if os.environ["LEASE"] == "lent" else received(channel)
     path = Path(channel.run["run_dir"]) / "parts" / "trainer.json"

@@ -1,7 +1,7 @@
-"""A trainer that checks instead of learning: run by `caraware train --set trainer.module=probe`.
+"""A trainer that checks instead of learning, run by `caraware train --set trainer.module=probe`.
 
-It takes the trainer's part in a real run with noiseless sensors and looks at every sample on its way from shared
-memory through the rollout buffer to the batch that PPO learns from. What it found goes to `parts/trainer.json`.
+It is the trainer of a real run with noiseless sensors. It checks every sample on its way from shared memory through
+the rollout buffer to the batch that PPO learns from, and writes its findings to `parts/trainer.json`.
 """
 
 import json
@@ -37,7 +37,7 @@ def position_m(normalised: torch.Tensor, bounds: list[float]) -> torch.Tensor:
 
 
 def check_tick(obs: Observation, bounds: list[float], found: dict) -> None:
-    """Everything about one tick where it lies: in shared memory, read-only, rows of one vehicle."""
+    """Check one tick: it lies in shared memory, is read-only, and each row belongs to one vehicle."""
     views = (obs.observation, obs.truth, obs.gnss_m)
     found["in_shared_memory"] &= all(lies_in_shared_memory(view.data_ptr()) for view in views)
     found["in_the_block"] &= obs.observation.data_ptr() == obs.block.address
@@ -54,7 +54,7 @@ def check_tick(obs: Observation, bounds: list[float], found: dict) -> None:
 
 
 def check_batch(ppo: Ppo, rollout: Rollout, config: RunConfig, bounds: list[float], found: dict, seen: dict) -> None:
-    """Observation, action, reward and truth of a sample belong to the same vehicle and the same tick."""
+    """Check that observation, action, reward and truth of a sample belong to the same vehicle and the same tick."""
     batch = ppo.score(rollout.take())
     found["samples"] += len(batch.reward)
     place = position_m(batch.observation, bounds)

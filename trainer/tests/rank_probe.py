@@ -27,14 +27,14 @@ def settings(folder: Path, envs: int, first_env: int, world: int, more: dict | N
 
 
 def channels(run: dict) -> list[SyntheticChannel]:
-    """The ticks of its environments: each the same, in whichever rank."""
+    """The ticks of its environments; an environment has the same ticks in every rank."""
     place = run["config"]["run"]
     numbers = range(place["first_env"], place["first_env"] + place["envs"])
     return [SyntheticChannel(run, with_evaluation(TRAINING_TICKS, 6, VEHICLES, 5.0, 1 + env)) for env in numbers]
 
 
 def main(folder: Path, fault: str) -> None:
-    """Train as rank `RANK`, in a directory of its own; with a fault, one of the ranks does what it should not."""
+    """Train as rank `RANK` in its own directory. A fault makes one of the ranks fail."""
     rank, world = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
     run = settings(folder / f"rank{rank}", 1, rank, world)
     together = ranks.of_run(world)

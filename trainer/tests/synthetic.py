@@ -47,7 +47,7 @@ class SyntheticObservation:
 
 @dataclass
 class SyntheticChannel:
-    """Hands out prepared ticks, up to `window` at a time, and remembers what the trainer sends."""
+    """Returns prepared ticks, up to `window` at a time, and records what the trainer sends."""
 
     run: dict
     ticks: Iterator[SyntheticObservation]
@@ -65,7 +65,7 @@ class SyntheticChannel:
         return [obs for _, obs in zip(range(self.group), self.ticks, strict=False)]
 
     def wait_for_any(self, timeout_s: float) -> None:
-        """Everything is there already."""
+        """All ticks are available already."""
 
     def consumed(self, tick: int) -> None:
         """Remember the credit."""
@@ -82,7 +82,7 @@ class SyntheticChannel:
         self.committed_up_to = tick
 
     def lag_ticks(self) -> int:
-        """Whatever has been handed out has been consumed."""
+        """No lag: every returned tick has been consumed."""
         return 0
 
     def done(self) -> None:
@@ -107,7 +107,7 @@ class SyntheticChannel:
 
 
 def street_ticks(count: int, vehicles: int, noise_m: float, seed: int) -> Iterator[SyntheticObservation]:
-    """Vehicles at independent random places on the streets of a grid, anew at every tick."""
+    """Vehicles at independent random places on the streets of a grid, drawn again at every tick."""
     rng = np.random.default_rng(seed)
     for tick in range(count):
         along = rng.uniform(0, SIZE_M, vehicles)

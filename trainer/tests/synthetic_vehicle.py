@@ -1,4 +1,4 @@
-"""Vehicles with sensors, in numpy: tracks with known truth, and what configured sensors make of them."""
+"""Vehicles with sensors, in numpy: tracks with known truth, and the samples of configured sensors."""
 
 import math
 from collections.abc import Iterator
@@ -73,7 +73,7 @@ class VehicleObservation(SyntheticObservation):
 
 @dataclass(frozen=True)
 class Track:
-    """What vehicles really did, at every sub-step from the first tick on; arrays `[steps, n]`."""
+    """The true motion of vehicles at every sub-step from the first tick on; arrays `[steps, n]`."""
 
     x_m: np.ndarray
     y_m: np.ndarray
@@ -85,7 +85,7 @@ class Track:
     """Acceleration of the rear axle along the body, which slides sideways in bends."""
 
     def ticks(self) -> int:
-        """Ticks in it."""
+        """Number of ticks."""
         return (len(self.x_m) - 1) // SUB_STEPS + 1
 
     def truth(self, tick: int) -> np.ndarray:
@@ -262,7 +262,7 @@ def observations(
 
 
 def in_slots(obs: VehicleObservation, slots: list[int], count: int) -> VehicleObservation:
-    """The same vehicles in other slots of `count`; the rest is empty, its memory filled with what is no number."""
+    """The same vehicles in other slots of `count`; the rest is empty, and its memory holds not-a-number."""
     values = dict(vars(obs))
     empty = np.setdiff1d(np.arange(count), slots)
     for name in ("observation", "truth", "gnss_m", "imu", "speed_steering", "gnss_quality", "age_s"):

@@ -25,7 +25,7 @@ TICKS, VEHICLES = 60, 6
 
 
 def episodes(*evaluations: bool, ticks: int = TICKS) -> Iterator[VehicleObservation]:
-    """One episode for each argument, with seeds of their own; True for evaluation. A third of the rows is not valid."""
+    """One episode for each argument, each with its own seed; True for evaluation. A third of the rows is not valid."""
     rng = np.random.default_rng(9)
     for episode, is_evaluation in enumerate(evaluations):
         for obs in observations(town_track(ticks, VEHICLES, episode), seed=episode):
@@ -51,7 +51,7 @@ def part(tmp_path: Path) -> dict:
 
 
 def test_all_are_measured_on_the_same_valid_rows(tmp_path: Path) -> None:
-    """Against sums taken by hand: the filter by itself, the smoother over each whole episode."""
+    """Compares with sums taken by hand: the filter alone, and the smoother over each whole episode."""
     run_over(tmp_path, episodes(True, True), vehicle_run(str(tmp_path)))
     expected: dict[str, list[float]] = {"raw_gnss": [], "ekf": [], "rts": []}
     noise = SensorNoise.from_run({"config": sensor_tables()})

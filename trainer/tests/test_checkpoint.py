@@ -75,7 +75,7 @@ def test_resuming_is_bit_exact(tmp_path: Path) -> None:
         assert torch.equal(left, right)
 
 
-def test_what_is_in_the_directory(tmp_path: Path) -> None:
+def test_the_directory_has_every_file(tmp_path: Path) -> None:
     ppo = fresh()
     train(ppo, 0, 2)
     written = save(tmp_path, ppo)
@@ -163,7 +163,7 @@ def test_the_manifest_is_plain_json(tmp_path: Path) -> None:
     assert set(manifest["schedules"]) == {"progress", "learning_rate", "clip_epsilon", "entropy_scale"}
 
 
-def test_schedules_stand_where_the_newest_update_had_them(tmp_path: Path) -> None:
+def test_schedules_continue_where_the_newest_update_left_them(tmp_path: Path) -> None:
     ppo = fresh(learning_rate=0.01, learning_rate_decay=0.5, clip_epsilon=0.2, clip_epsilon_final=0.1)
     ppo.progress = 0.25
     train(ppo, 0, 3)
@@ -228,7 +228,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_what_is_damaged_is_refused_with_the_reason_and_the_one_before_is_used(
+def test_a_damaged_checkpoint_is_refused_with_the_reason_and_the_one_before_is_used(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
     ppo = fresh()

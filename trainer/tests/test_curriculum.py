@@ -1,4 +1,4 @@
-"""The curriculum: gates, what is decided once, and what a successor sends."""
+"""The curriculum: its gates, decisions that are made once, and the decisions of a successor."""
 
 from dataclasses import dataclass, field
 
@@ -9,12 +9,12 @@ STAGES = (Stage(until_std=0.5), Stage(until_error_m=7.0, until_lessons=3), Stage
 
 @dataclass
 class Simulation:
-    """Remembers the decisions sent to it."""
+    """Records the decisions sent to it."""
 
     decisions: list[tuple[int, int, int]] = field(default_factory=list)
 
     def decided(self, lessons: int, since: int, stage: int) -> None:
-        """Remember."""
+        """Record the decision."""
         self.decisions.append((lessons, since, stage))
 
 
@@ -80,7 +80,7 @@ def test_a_successor_that_would_have_decided_otherwise_follows_the_ticks():
     assert simulation.decisions[-1] == (2, 0, 1)
 
 
-def test_without_stages_nothing_is_said():
+def test_without_stages_nothing_is_published():
     simulation = Simulation()
     curriculum = Curriculum((), simulation)
     curriculum.begin({})

@@ -1,4 +1,4 @@
-"""The filter: against chi-square, and against what sensors do."""
+"""The filter: its errors against chi-square, and its handling of sensors."""
 
 import math
 from collections.abc import Iterator
@@ -118,7 +118,7 @@ def test_errors_are_as_large_as_the_covariance_says(changes: dict) -> None:
 
 
 def test_with_the_default_model_covariances_are_honest_in_town() -> None:
-    """The model allows for slip and for what happens between samples: errors are no larger than it says."""
+    """The model allows for slip and for motion between samples: errors are no larger than its covariance."""
     tables, vehicles = tables_of(**MANY_ERRORS), 200
     nees = [
         squared_errors(obs, ekf, 4).mean()
@@ -131,7 +131,7 @@ def test_with_the_default_model_covariances_are_honest_in_town() -> None:
 
 @pytest.mark.parametrize("track", [steady_track, town_track, standing_track])
 def test_it_beats_raw_fixes_by_a_wide_margin(track: object) -> None:
-    """After 10 s, 100 fixes: √100 better if nothing moved unknown."""
+    """After 10 s there are 100 fixes: √100 times better without unknown motion."""
     raw, own = [], []
     for obs, ekf in filtered(observations(track(200, 100, 8), seed=9), sensor_tables()):
         if obs.tick >= 100:
@@ -167,7 +167,7 @@ def test_covariances_stay_honest_without_a_heading(bits: int) -> None:
             assert 0.3 < squared_errors(obs, ekf, 2).mean() < 3.0, obs.tick
 
 
-def test_in_the_dark_nothing_diverges_and_light_brings_it_back() -> None:
+def test_without_any_sensor_nothing_diverges_and_fixes_restore_it() -> None:
     """All sensors dark for two minutes: finite, positive definite, and back within a few fixes."""
     ticks, lit = 1350, 1250
     track = steady_track(2, 8, 3)
@@ -225,7 +225,7 @@ def poisoned(track: Track) -> Iterator[VehicleObservation]:
 
 @pytest.mark.parametrize("convention", ["kinematic", "specific_force", "carla"])
 def test_the_convention_of_the_imu_changes_nothing(convention: str) -> None:
-    """Without a compass to hide behind: a wrong sign would turn every vehicle the wrong way."""
+    """Without a compass, which would hide a wrong sign: it would turn every vehicle the wrong way."""
     tables = tables_of(imu__convention=convention, imu__compass_noise_std_rad=1.0)
     errors = [
         np.abs(wrapped(ekf.belief.mean[YAW] - obs.truth[:, 2].numpy())).max()
@@ -246,13 +246,13 @@ def test_pedestrians_without_wheels_are_followed() -> None:
 
 
 def test_every_compass_sample_of_a_tick_counts() -> None:
-    """One at the start and ten in the next tick, of a gyro that knows how they hang together."""
+    """One sample at the start and ten in the next tick, from a gyro that relates them to each other."""
     tables = tables_of(imu__period_s=0.01, imu__compass_noise_std_rad=0.1)
     *_, (_, ekf) = filtered(observations(standing_track(2, 1, 1), tables), tables, EXACT)
     assert ekf.belief.covariance[YAW, YAW, 0] == pytest.approx(0.1**2 / 11, rel=1e-3)
 
 
-def test_who_has_lost_its_heading_starts_anew_with_the_next_fix() -> None:
+def test_a_filter_without_a_heading_starts_again_with_the_next_fix() -> None:
     """A heading that may be anything says nothing about where a moving vehicle went."""
     dark = np.zeros((302, 6), np.uint32)
     dark[20:300] = EVERYTHING
@@ -276,8 +276,8 @@ def test_a_constant_gyro_bias_is_found() -> None:
     assert ekf.belief.mean[4].std() > 0.03
 
 
-def test_what_the_receiver_says_of_its_fix_counts() -> None:
-    """Fixes with ten times the error, and the receiver knows: they correct less."""
+def test_the_quality_that_the_receiver_reports_counts() -> None:
+    """Fixes with ten times the error, which the receiver reports: they correct less."""
     quality = np.full((1, 2), 10 * math.hypot(5.57, 5.57), np.float32)
     good, bad = (
         [ekf for _, ekf in filtered(observations(standing_track(30, 1, 1), **more), sensor_tables())][-1]
@@ -301,7 +301,7 @@ def test_a_gate_refuses_reflections_but_not_for_ever() -> None:
     assert error[True][119] > 10, "the fixes were right and the filter wrong: it gives in"
 
 
-def test_a_slot_that_changes_hands_begins_anew() -> None:
+def test_a_slot_with_a_new_vehicle_starts_again() -> None:
     """The next vehicle is 150 m away, by any of the signs that a slot gives."""
     signs = (
         {"terminated": np.array([True])},
@@ -325,7 +325,7 @@ def test_a_slot_that_changes_hands_begins_anew() -> None:
                 assert position_std_m(ekf)[0] == pytest.approx(math.hypot(*noise.fix_std_m), rel=1e-3)
 
 
-def test_another_episode_begins_anew() -> None:
+def test_another_episode_starts_again() -> None:
     ekf = Ekf(noise_of(sensor_tables()))
     first, second = (list(observations(standing_track(20, 3, seed), seed=seed)) for seed in (1, 2))
     second = second[5:]  # whose beginning was not seen
@@ -337,7 +337,7 @@ def test_another_episode_begins_anew() -> None:
     np.testing.assert_array_equal(ekf.belief.mean, alone.belief.mean)
 
 
-def test_what_is_in_other_slots_changes_nothing() -> None:
+def test_other_slots_change_nothing() -> None:
     """Three vehicles in three slots, and the same in five of seven whose memory holds no numbers."""
     tables = tables_of(**MANY_ERRORS)
     shown = list(observations(town_track(60, 3, 1), tables, 2))
@@ -351,7 +351,7 @@ def test_what_is_in_other_slots_changes_nothing() -> None:
     assert np.isfinite(many.belief.covariance).all()
 
 
-def test_slots_may_become_more() -> None:
+def test_the_number_of_slots_may_grow() -> None:
     shown = list(observations(town_track(40, 2, 1), seed=2))
     alone, growing = Ekf(noise_of(sensor_tables())), Ekf(noise_of(sensor_tables()))
     for obs in shown:
@@ -360,7 +360,7 @@ def test_slots_may_become_more() -> None:
     np.testing.assert_array_equal(growing.belief.mean[:, :2], alone.belief.mean)
 
 
-def test_the_first_covariance_knows_what_rows_owe_to_one_measurement() -> None:
+def test_the_first_covariance_has_the_correlations_of_one_measurement() -> None:
     """Draw truths and sensors many times: errors of first estimates have the covariance that filters begin with."""
     tables, vehicles = tables_of(**MANY_ERRORS), 4000
     ((obs, ekf),) = filtered(observations(steady_track(1, vehicles, 1), tables, 2), tables)

@@ -1,4 +1,4 @@
-"""The filter against filterpy, with the equations of docs/baselines.md written anew."""
+"""The filter compared with filterpy, for which the equations of docs/baselines.md are written a second time."""
 
 import math
 
@@ -14,7 +14,7 @@ from test_ekf import MANY_ERRORS, filtered, noise_of, tables_of
 
 
 class Reference:
-    """One vehicle in filterpy: the equations of docs/baselines.md written anew, their Jacobian by sympy."""
+    """One vehicle in filterpy: a second version of the equations of docs/baselines.md, their Jacobian by sympy."""
 
     def __init__(self, noise: SensorNoise, model: MotionModel, start: np.ndarray, covariance: np.ndarray) -> None:
         self.noise, self.model = noise, model

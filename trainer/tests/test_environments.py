@@ -1,4 +1,4 @@
-"""Several environments feeding one loop: what is learnt depends on their ticks, not on how they arrive together."""
+"""Several environments in one loop: learning depends on their ticks, not on how the ticks arrive together."""
 
 import json
 from collections.abc import Iterator
@@ -65,7 +65,7 @@ def test_how_the_ticks_of_environments_arrive_together_changes_nothing(tmp_path:
         assert torch.equal(tensor, three[name])
 
 
-def test_evaluations_of_all_environments_are_told_as_one(tmp_path: Path) -> None:
+def test_evaluations_of_all_environments_are_reported_as_one(tmp_path: Path) -> None:
     run = settings(tmp_path)
     loop(run, [SyntheticChannel(run, ticks(env)) for env in range(2)]).run()
     report = part(tmp_path)
@@ -75,7 +75,7 @@ def test_evaluations_of_all_environments_are_told_as_one(tmp_path: Path) -> None
     assert report["env_steps"] == 2 * 64 * VEHICLES
 
 
-def test_an_environment_that_ends_early_lets_the_others_go_on(tmp_path: Path) -> None:
+def test_the_other_environments_continue_when_one_ends_early(tmp_path: Path) -> None:
     run = settings(tmp_path)
     short = (replace(obs, last=obs.tick == 30) for obs in ticks(0) if obs.tick <= 30)
     channels = [SyntheticChannel(run, short), SyntheticChannel(run, ticks(1))]
@@ -89,7 +89,7 @@ def test_an_environment_that_ends_early_lets_the_others_go_on(tmp_path: Path) ->
     assert channels[1].is_done
 
 
-def test_a_successor_goes_on_where_each_environment_stands(tmp_path: Path) -> None:
+def test_a_successor_continues_each_environment_at_its_own_tick(tmp_path: Path) -> None:
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     run = settings(whole)
     loop(run, [SyntheticChannel(run, ticks(env)) for env in range(2)]).run()
@@ -119,7 +119,7 @@ def result(environment: int, samples: int, mean_m: float, standard_error_m: floa
     return EvaluationResult(100, 1, 1, samples, estimates, environment)
 
 
-def test_pooling_weighs_by_samples_and_waits_for_everybody() -> None:
+def test_pooling_weighs_by_samples_and_waits_for_every_environment() -> None:
     phases = pooled([result(0, 300, 4.0, 0.2), result(0, 300, 3.0, 0.2), result(1, 100, 8.0, 0.6)])
     assert len(phases) == 1
     assert phases[0].samples == 400

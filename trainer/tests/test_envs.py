@@ -33,7 +33,7 @@ HEROES = DRIVING | {"traffic.heroes": 3, "traffic.hero_route": []}
 
 @pytest.fixture(autouse=True, scope="module")
 def runtime() -> Iterator[Path]:
-    """A registry of these tests' own; nothing is left in it, nor in shared memory, nor a run directory."""
+    """A registry for these tests alone. Nothing may be left in it, in shared memory, or as a run directory."""
     with tempfile.TemporaryDirectory(prefix="caraware") as short, pytest.MonkeyPatch.context() as patch:
         patch.setenv("CARAWARE_RUNTIME_DIR", f"{short}/r")
         patch.setenv("CARAWARE", str(CARAWARE))
@@ -56,7 +56,7 @@ def left_in_shared_memory(prefix: str) -> list[str]:
 
 
 def processes_of(pid: int) -> list[psutil.Process]:
-    """A supervisor and all it started."""
+    """A supervisor and all processes that it started."""
     supervisor = psutil.Process(pid)
     return [supervisor, *supervisor.children(recursive=True)]
 
@@ -114,7 +114,7 @@ def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(config: s
     assert not np.array_equal(eight[0], nine[0])
 
 
-def test_autoreset_goes_on_in_the_same_run_and_gymnasiums_statistics_understand_it() -> None:
+def test_autoreset_continues_the_same_run_and_works_with_gymnasiums_statistics() -> None:
     with make("town", TOWN) as simulation:
         env = RecordEpisodeStatistics(CarAwareVectorEnv(simulation))
         _, infos = env.reset()
@@ -142,7 +142,7 @@ def test_a_run_that_has_ended_is_followed_by_another() -> None:
         assert ends.tolist() == [1, 1] and simulation.seed != 3
 
 
-def test_close_leaves_nothing_and_a_closed_simulation_says_so() -> None:
+def test_close_leaves_nothing_and_a_closed_simulation_raises() -> None:
     simulation = make("town", TOWN)
     env = CarAwareVectorEnv(simulation)
     env.reset()
@@ -166,7 +166,7 @@ def test_kept_runs_have_a_report(tmp_path: Path) -> None:
     assert report["result"] == "interrupted" and 60 <= report["trainer"]["env_steps"] <= 80
 
 
-def test_what_a_killed_user_left_is_removed_and_what_a_living_one_has_is_not() -> None:
+def test_files_of_a_killed_program_are_removed_and_those_of_a_live_one_are_kept() -> None:
     dead = Path(tempfile.mkdtemp(prefix=f"caraware-env-{os.getpid()}-"))
     (dead / "lock").touch()
     with make("town", TOWN) as one:
@@ -187,7 +187,7 @@ def test_seed_and_trainer_are_no_settings() -> None:
             make("town", {key: "1"})
 
 
-def test_a_wrong_setting_is_told_with_the_message_of_caraware() -> None:
+def test_a_wrong_setting_raises_with_the_message_of_caraware() -> None:
     with pytest.raises(SimulationError, match=r"traffic\.cavz"):
         make("town", {"traffic.cavz": 4})
     with pytest.raises(SimulationError, match="cannot start /no/caraware"):
@@ -211,7 +211,7 @@ def test_a_simulation_that_dies_is_an_exception_with_the_reason(victim: str) -> 
         assert not left_in_shared_memory(prefix)
 
 
-def test_a_simulation_that_somebody_stops_is_an_exception_that_says_so() -> None:
+def test_a_simulation_that_is_stopped_raises_with_the_reason() -> None:
     with make("town", TOWN) as simulation:
         env = CarAwareVectorEnv(simulation)
         env.reset()
@@ -235,7 +235,7 @@ USER = """
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_a_user_that_is_killed_or_interrupted_takes_its_simulation_along(number: signal.Signals) -> None:
+def test_a_simulation_ends_with_a_program_that_is_killed_or_interrupted(number: signal.Signals) -> None:
     script = textwrap.dedent(USER.format(settings=DRIVING))
     with subprocess.Popen(
         [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -278,14 +278,14 @@ def test_an_interrupted_step_can_be_taken_again() -> None:
         signal.signal(signal.SIGALRM, before)
 
 
-def test_two_simulations_live_side_by_side() -> None:
+def test_two_simulations_run_side_by_side() -> None:
     with make("town", TOWN, seed=1) as one, make("town", TOWN, seed=1) as two:
         first, second = CarAwareVectorEnv(one), CarAwareVectorEnv(two)
         assert np.array_equal(first.reset()[0], second.reset()[0])
         assert all(np.array_equal(a, b) for a, b in zip(episode_of(first, 10), episode_of(second, 10), strict=True))
 
 
-def test_all_faces_are_told_by_the_package() -> None:
+def test_the_package_exports_all_faces() -> None:
     assert all(getattr(envs, name) is not None for name in envs.__all__)
 
 

@@ -59,7 +59,7 @@ def tick(number: int, vehicles: list[int], terminated: tuple = (), truncated: tu
 
 @dataclass
 class DrivingChannel(SyntheticChannel):
-    """Remembers actions too, and gives one tick at a time: the world waits."""
+    """Records actions too, and returns one tick at a time: the simulation waits."""
 
     group: int = 1
 
@@ -192,7 +192,7 @@ def test_actions_beyond_the_range_are_clipped_where_they_drive_and_not_where_the
     assert channel.predictions[0].tolist() == [[0.0, 100.0], [300.0, 50.0]]
 
 
-def test_evaluation_episodes_are_answered_by_their_policy_and_stepped_by_nobody(tmp_path) -> None:
+def test_evaluation_episodes_are_answered_by_their_policy_without_steps(tmp_path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, 2], truncated=(0, 1), episode=1, evaluation=True)]
     ticks += [tick(2, [1, 2], episode=1, evaluation=True), tick(3, [4, 5], truncated=(0, 1), episode=2)]
     ticks += [tick(4, [4, 5], episode=2)]
@@ -228,7 +228,7 @@ def test_the_end_of_the_run_truncates_and_then_nothing_can_be_stepped(tmp_path) 
     assert channel.is_done
 
 
-def test_reset_runs_on_to_the_next_episode_but_not_twice_without_a_step(tmp_path) -> None:
+def test_reset_continues_to_the_next_episode_but_not_twice_without_a_step(tmp_path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, 2]), tick(3, [4, 5], truncated=(0, 1), episode=1)]
     ticks += [tick(4, [4, 5], episode=1)]
     env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2))
@@ -242,7 +242,7 @@ def test_reset_runs_on_to_the_next_episode_but_not_twice_without_a_step(tmp_path
 
 
 class Restartable:
-    """A source of hand-made runs that can be started anew."""
+    """A source of hand-made runs that can be started again."""
 
     can_restart = True
 
@@ -256,7 +256,7 @@ class Restartable:
         return self.current
 
     def restart(self, seed=None) -> None:
-        """Begin anew."""
+        """Start the run again."""
         self.seed = self.seed + 1000 if seed is None else seed
         self.seeds.append(self.seed)
         self.channel.consumed_up_to = self.channel.committed_up_to = -1
@@ -272,7 +272,7 @@ def restartable(tmp_path, episode_ticks: int) -> Restartable:
     return Restartable(channel, lambda seed: iter([tick(number, [seed]) for number in range(3)]))
 
 
-def test_a_run_is_started_anew_for_another_seed_or_where_it_ended_and_only_then(tmp_path) -> None:
+def test_a_run_is_started_again_only_for_another_seed_or_after_its_end(tmp_path) -> None:
     source = restartable(tmp_path, episode_ticks=3)
     env = CarAwareVectorEnv(source)
     action = np.zeros((1, 2), np.float32)
@@ -294,7 +294,7 @@ def test_a_reset_far_from_the_end_of_an_episode_starts_a_new_run(tmp_path) -> No
     assert vehicles_of(env.reset()[0]) == [1005]
 
 
-def test_the_single_face_ends_with_its_vehicle_and_goes_on_with_the_next_in_the_slot(tmp_path) -> None:
+def test_the_single_face_ends_with_its_vehicle_and_continues_with_the_next_in_the_slot(tmp_path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [E, 2], terminated=(0,)), tick(2, [E, 2]), tick(3, [3, 2]), tick(4, [3, 2])]
     env = CarAwareEnv(channel_of(ticks, tmp_path, 2), reward=which)
     observation, info = env.reset()
@@ -375,7 +375,7 @@ def test_names_of_the_population_and_of_named_heroes_are_found_and_others_shown_
     assert names.of(id_hash("veh7")) == "veh7" and names.of(id_hash("cav.0")) == f"0x{id_hash('cav.0'):016x}"
 
 
-def test_the_driving_reward_tells_arrival_from_other_ends_and_a_time_limit_from_both() -> None:
+def test_the_driving_reward_distinguishes_arrival_other_ends_and_a_time_limit() -> None:
     from caraware.envs import rewards
     from caraware.envs.settings import FaceSettings
     from caraware.envs.transition import Rows

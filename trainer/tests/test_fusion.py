@@ -1,4 +1,4 @@
-"""The learned estimator: where it starts, what it sees, that it learns, and that it goes on where it was stopped."""
+"""The learned estimator: it starts as the filter, sees neither truth nor future, learns, and resumes after a stop."""
 
 import json
 import math
@@ -97,7 +97,7 @@ def estimates(run: dict, learner: FusionLearner, ticks: list[VehicleObservation]
 
 
 def shaken(learner: FusionLearner) -> FusionLearner:
-    """The same with random parameters: a network that has its own opinion."""
+    """The same learner with random parameters, whose network differs from the filter."""
     generator = torch.Generator().manual_seed(1)
     learner.parameters.values.add_(0.1 * torch.randn(learner.parameters.values.shape, generator=generator))
     return learner
@@ -130,7 +130,7 @@ def test_it_sees_neither_truth_nor_future(tmp_path: Path) -> None:
     assert not torch.equal(changed[40:], seen[40:])
 
 
-def test_carrier_says_how_far_vehicles_went_and_fixes_pulled(tmp_path: Path) -> None:
+def test_the_carrier_has_the_distance_of_vehicles_and_the_pull_of_fixes(tmp_path: Path) -> None:
     run = street_run(tmp_path)
     noise = SensorNoise.from_run(run)
     assert noise is not None

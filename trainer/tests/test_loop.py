@@ -1,4 +1,4 @@
-"""The loop and the process around it, over a channel of prepared ticks."""
+"""The training loop and its process, with a channel of prepared ticks."""
 
 import contextlib
 import json
@@ -307,7 +307,7 @@ def test_no_run_file_ends_with_2(tmp_path: Path) -> None:
 
 
 class KilledError(Exception):
-    """The trainer is gone in the middle of a tick."""
+    """The trainer dies in the middle of a tick."""
 
 
 def stream(first: int, death: int | None = None) -> Iterator[SyntheticObservation]:

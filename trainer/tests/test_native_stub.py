@@ -1,4 +1,4 @@
-"""`_native.pyi` says what the built extension has: the same names, signatures and kinds, by mypy's stubtest."""
+"""`_native.pyi` has the names, signatures and kinds of the built extension, by mypy's stubtest."""
 
 import subprocess
 import sys

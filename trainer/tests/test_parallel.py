@@ -1,4 +1,4 @@
-"""`torchrun -m caraware.parallel` over real runs: real SUMO, real processes, two supervisors."""
+"""`torchrun -m caraware.parallel` with real runs: real SUMO, real processes, two supervisors."""
 
 import json
 import os
@@ -82,7 +82,7 @@ def parameters(run: Path) -> dict[str, torch.Tensor]:
 
 
 def tensors(run: Path) -> dict[str, str]:
-    """SHA-256 of what a rank ended with: parameters, moments, random numbers."""
+    """SHA-256 of a rank's last checkpoint: parameters, moments, random numbers."""
     files = read_manifest(latest_checkpoint(run / "checkpoints")).files
     return {name: digest for name, digest in files.items() if name.endswith(".safetensors") and name != POINTS}
 
@@ -115,7 +115,7 @@ def test_two_ranks_are_one_trainer_with_two_environments(tmp_path: Path, registr
     assert "two-rank1" not in said
 
 
-def test_ranks_go_on_from_the_newest_checkpoint_that_all_have(tmp_path: Path, registry: Path) -> None:
+def test_ranks_continue_from_the_newest_checkpoint_that_all_have(tmp_path: Path, registry: Path) -> None:
     every_update = ("trainer.checkpoint_interval=1", "trainer.checkpoint_keep_every=1")
     whole = two_ranks(tmp_path, registry, "whole", *every_update)
     said, _ = whole.communicate(timeout=PATIENCE_S)
@@ -129,7 +129,7 @@ def test_ranks_go_on_from_the_newest_checkpoint_that_all_have(tmp_path: Path, re
     said, _ = cut.communicate(timeout=PATIENCE_S)
     newest = latest_checkpoint(checkpoints)
     assert newest == latest_checkpoint(checkpoints).parent / latest_checkpoint(tmp_path / "cut" / "checkpoints").name
-    # As if it had been killed before all had the newest.
+    # The same state as after a kill before all ranks had the newest checkpoint.
     shutil.rmtree(newest)
     code, said = resume(tmp_path, registry, "cut", "--set=run.real_time_factor=0")
     assert code == 0, said

@@ -1,4 +1,4 @@
-"""Playing a checkpoint over a channel of prepared ticks."""
+"""Playing a checkpoint with a channel of prepared ticks."""
 
 import json
 import math
@@ -22,7 +22,7 @@ TICKS, VEHICLES = 40, 5
 
 
 def ticks(first: int = 0, episodes: int = 2) -> Iterator[VehicleObservation]:
-    """Episodes with seeds of their own."""
+    """Episodes, each with its own seed."""
     for episode in range(episodes):
         for obs in observations(town_track(TICKS, VEHICLES, episode), seed=episode):
             tick = episode * TICKS + obs.tick
@@ -94,8 +94,8 @@ def test_the_table_has_a_row_for_every_vehicle(tmp_path: Path) -> None:
         assert all(math.isfinite(value) for value in [*row["now_m"].values(), *row["mean_m"].values()])
 
 
-def test_a_successor_counts_on_from_the_file(tmp_path: Path) -> None:
-    """The filter begins anew in it, policy and fix do not know the difference."""
+def test_a_successor_continues_the_counts_of_the_file(tmp_path: Path) -> None:
+    """In a successor the filter starts again; errors of policy and fix are the same."""
     loop_over(tmp_path / "whole", ticks())
     loop_over(tmp_path / "cut", ticks(), stop_at=50)
     tally = PlayTally.read(tmp_path / "cut" / LIVE)

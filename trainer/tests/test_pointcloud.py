@@ -1,4 +1,4 @@
-"""Point clouds mean what the committed layout says, and come back into the world where they belong."""
+"""Point clouds have the committed layout, and their points are transformed into the world correctly."""
 
 import json
 import math

@@ -81,7 +81,7 @@ def test_schedules_run_from_the_first_value_to_the_last() -> None:
     assert ScheduledValues.at(decayed, updates=3, progress=0.5).learning_rate == pytest.approx(1.25e-4)
 
 
-def test_an_update_of_the_policy_ends_where_it_has_gone_too_far() -> None:
+def test_an_update_of_the_policy_ends_at_the_largest_divergence() -> None:
     free, held = fresh(**TOY), fresh(**TOY, target_kl=1e-9)
     assert [train(ppo, 1)[0].policy_epochs for ppo in (free, held)] == [4, 1]
     assert [int(ppo.updater.moments()["policy.steps"]) for ppo in (free, held)] == [32, 8]
@@ -132,7 +132,7 @@ def test_with_a_discount_it_learns_from_every_sample_too() -> None:
     assert stats[0].value_loss > stats[-1].value_loss > 0
 
 
-def test_the_statistics_are_what_they_say() -> None:
+def test_the_statistics_of_an_update_are_those_of_its_samples() -> None:
     ppo = fresh(epochs=1, batch_size=256, learning_rate_decay=0.5, learning_rate=1e-3)
     first, second = train(ppo, 2)
     assert first.ratio_mean == pytest.approx(1.0, abs=1e-5)

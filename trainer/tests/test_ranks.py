@@ -69,7 +69,7 @@ def learn_alone(folder: Path, more: dict | None = None) -> Path:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What one trainer comes to, with the default network."""
+    """The run of one trainer with the default network."""
     return learn_alone(tmp_path_factory.mktemp("alone"))
 
 
@@ -132,7 +132,7 @@ def test_two_nodes_meet_at_a_rendezvous_address(tmp_path: Path, alone: Path) -> 
 
 
 @pytest.mark.parametrize(("fault", "says"), [("dies", "exitcode  : 9"), ("differs", "parameters differ")])
-def test_all_ranks_end_when_one_cannot_go_on(tmp_path: Path, fault: str, says: str) -> None:
+def test_all_ranks_end_when_one_cannot_continue(tmp_path: Path, fault: str, says: str) -> None:
     process = launch(tmp_path, "--standalone", "--nproc-per-node=2", fault=fault)
     said, _ = process.communicate(timeout=240)
     assert process.returncode != 0

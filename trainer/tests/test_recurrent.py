@@ -1,4 +1,4 @@
-"""Networks with memory: a task that needs it, gradients, trajectories, and what a successor goes on from."""
+"""Networks with memory: a task that needs it, gradients, trajectories, and the memory in checkpoints."""
 
 import contextlib
 from collections.abc import Iterator
@@ -53,7 +53,7 @@ def fresh(network: str = "gru", **trainer: object) -> Ppo:
 
 
 def recall_ticks(vehicles: int, seed: int) -> Iterator[SyntheticObservation]:
-    """Every vehicle stands still for some ticks, and sees where in the first of them alone."""
+    """Every vehicle stands still for some ticks, and only the first of them shows its position."""
     rng = np.random.default_rng(seed)
     for tick, obs in enumerate(street_ticks(1_000_000, vehicles, 0.0, seed)):
         is_shown = tick % RECALL_TICKS == 0
@@ -67,7 +67,7 @@ def recall_ticks(vehicles: int, seed: int) -> Iterator[SyntheticObservation]:
 
 
 def recall_error_m(ppo: Ppo, updates: int) -> float:
-    """Of the policy in the last of some updates."""
+    """Error of the policy in the last of some updates."""
     rollout, error_m = Rollout(ppo.config.horizon, FIELDS, bootstrap=False), 0.0
     for obs in recall_ticks(64, seed=3):
         rollout.add(obs)
@@ -80,7 +80,7 @@ def recall_error_m(ppo: Ppo, updates: int) -> float:
     return error_m
 
 
-def test_what_was_shown_once_is_remembered_by_the_recurrent_policy_alone() -> None:
+def test_only_the_recurrent_policy_remembers_an_earlier_tick() -> None:
     # Uniform places are 51 m from the middle of their square on average; 7 of 8 ticks show nothing.
     assert recall_error_m(fresh(**TOY), 30) < 5.0
     assert recall_error_m(fresh("mlp", **TOY), 30) > 35.0
@@ -136,7 +136,7 @@ def test_outputs_and_gradients_are_those_of_torch_s_gru() -> None:
 def test_a_walk_is_the_sequences_one_after_the_other() -> None:
     network = recurrent_policy(FIELDS, 2, (8, 6), Activation.RELU, CPU)
     network.initialise(torch.Generator().manual_seed(1))
-    # Two slots; the second one's trajectory begins anew in the third of four ticks.
+    # Two slots; a new trajectory begins in the second one in the third of four ticks.
     x, start = torch.randn(8, FIELDS), torch.randn(2, 6)
     goes_on = torch.tensor([1, 1, 1, 1, 1, 0, 1, 1], dtype=torch.bool)
     walk = network.walk(Steps(x, torch.tensor([0, 1] * 4), goes_on, [2] * 4), start)
@@ -170,7 +170,7 @@ def test_minibatches_hold_every_sequence_once_and_about_as_many_samples() -> Non
 
 
 def errors_m(ppo: Ppo, ticks: list[SyntheticObservation], horizon: int) -> Tensor:
-    """Of the policy's mean in every sample, walked through in horizons."""
+    """Errors of the policy's mean in every sample, computed in horizons."""
     ppo.restore_memory({})
     rollout, found = Rollout(horizon, FIELDS, bootstrap=False), []
     for obs in ticks:
@@ -271,7 +271,7 @@ def test_the_same_seed_gives_the_same_parameters(threads: int) -> None:
         assert torch.equal(parameter, two.updater.parameters()[name])
 
 
-def test_what_is_shown_is_what_is_learnt_from(tmp_path: Path) -> None:
+def test_published_predictions_are_those_of_the_horizon(tmp_path: Path) -> None:
     """Before the first update, the predictions of ticks that came one by one are the means of the horizon."""
     ticks = [replace(obs, last=obs.tick == 39) for obs in with_ends(40)]
     channel = loop_over(tmp_path, iter(ticks), 3, run_file(str(tmp_path), network="gru", horizon=10_000))

@@ -35,6 +35,6 @@ def test_closer_is_never_worse_and_the_reward_stays_in_0_1(name: str) -> None:
     assert reward.max() <= 1
 
 
-def test_an_unknown_name_lists_those_there_are() -> None:
+def test_an_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(rewards.UnknownReward, match="inverse, bounded_inverse, exponential"):
         rewards.by_name("best")

@@ -12,7 +12,7 @@ from synthetic import SIZE_M, SyntheticObservation, locating_ppo, run_file, stre
 
 
 def marked(tick: int, vehicles: list[int], **changes: object) -> SyntheticObservation:
-    """A tick in which every number says which vehicle and tick it belongs to."""
+    """A tick in which every number encodes its vehicle and its tick."""
     n = len(vehicles)
     index = torch.tensor([v if v >= 0 else 0 for v in vehicles], dtype=torch.float32)
     columns = torch.stack((index, torch.full((n,), float(tick)), index + tick / 1000, torch.ones(n)), 1)
@@ -45,7 +45,7 @@ def belongs_together(horizon: Horizon) -> None:
         assert horizon.truth[t, i, :2].tolist() == expected
 
 
-def test_rows_stay_together_while_slots_empty_change_hands_and_grow() -> None:
+def test_rows_stay_together_while_slots_become_empty_get_new_vehicles_and_grow() -> None:
     turns = [[0], [0, 1], [-1, 1, 2], [3, 1, -1, 4, 5], [3, 1, -1, 4, 5], [6], [6, 7, 8, 9, 10, 11]]
     horizon = collect(1, *(marked(t, turn) for t, turn in enumerate(turns))).take()
     belongs_together(horizon)
@@ -106,7 +106,7 @@ def test_a_gap_in_the_ticks_cuts_every_trajectory() -> None:
     assert not horizon.terminated.any()
 
 
-def test_an_evaluation_tick_tells_how_the_last_training_row_ended() -> None:
+def test_an_evaluation_tick_has_the_end_of_the_last_training_row() -> None:
     rollout = collect(1, marked(0, [0, 1]))
     rollout.ended(marked(1, [7, 8], truncated=np.array([True, True])))
     rollout.add(marked(9, [0, 1]))

@@ -59,7 +59,7 @@ def test_the_table_has_no_circle_and_no_arrow_that_nothing_uses() -> None:
         lower.add(room)
 
 
-def test_a_room_says_in_one_sentence_what_it_is_for() -> None:
+def test_every_room_has_its_purpose_in_one_sentence() -> None:
     for room in MAY_IMPORT:
         docstring = ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text()))
         assert docstring and docstring.splitlines()[0].endswith("."), room

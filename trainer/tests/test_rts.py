@@ -19,7 +19,7 @@ FIRST = np.diag([4.0, 4.0, 1e-2, 1.0])
 
 
 class Linear:
-    """Two positions driven by two velocities, position measured: what a smoother takes of an `Ekf`."""
+    """Two positions driven by two velocities, with measured positions: the part of an `Ekf` that the smoother uses."""
 
     def __init__(self, slots: int) -> None:
         self.belief = Belief(np.zeros((4, slots)), np.repeat(FIRST[:, :, None], slots, 2))
@@ -38,7 +38,7 @@ class Linear:
 
 
 def linear_case(ticks: int, slots: int) -> tuple[np.ndarray, list[SmoothedTick]]:
-    """Fixes `[ticks, 2, n]`, and what the smoother makes of them."""
+    """Fixes `[ticks, 2, n]`, and the smoother's results."""
     fixes = np.cumsum(np.random.default_rng(1).normal(0, 0.5, (ticks, 2, slots)), 0)
     linear = Linear(slots)
     smoother = Smoother(linear, covariances=True)  # type: ignore[arg-type]
@@ -93,7 +93,7 @@ def test_dividing_from_the_right() -> None:
 
 
 def smoothed_errors(tables: dict, memory_bytes: int | None = None) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Errors of filter and smoother `[ticks, n]`, and when each tick was given out (in ticks after it)."""
+    """Errors of filter and smoother `[ticks, n]`, and the delay of each smoothed tick, in ticks."""
     noise = noise_of(tables)
     ekf = Ekf(noise)
     smoother = Smoother(ekf, memory_bytes) if memory_bytes else Smoother(ekf)
@@ -111,7 +111,7 @@ def smoothed_errors(tables: dict, memory_bytes: int | None = None) -> tuple[np.n
     return errors, np.hypot(*np.moveaxis(np.array([t.mean[:2].T for t in smoothed]) - truth, 2, 0)), waited
 
 
-def test_who_sees_the_future_knows_more() -> None:
+def test_later_samples_make_the_smoother_better() -> None:
     own, smoothed, waited = smoothed_errors(sensor_tables())
     assert waited == []
     assert smoothed.mean() < 0.8 * own.mean()
@@ -147,8 +147,8 @@ def test_errors_are_as_large_as_the_smoothed_covariance_says() -> None:
 
 
 @pytest.mark.parametrize("sign", ["terminated", "truncated"])
-def test_the_future_of_another_vehicle_says_nothing(sign: str) -> None:
-    """A slot changes hands at tick 40: the ticks before are smoothed as if the stream had ended there."""
+def test_the_samples_of_the_next_vehicle_in_a_slot_do_not_count(sign: str) -> None:
+    """A slot gets another vehicle at tick 40: the ticks before are smoothed as if the stream had ended there."""
     tables = sensor_tables()
     noise = noise_of(tables)
     shown = list(observations(town_track(80, 2, 1), tables, 2))
@@ -166,7 +166,7 @@ def test_the_future_of_another_vehicle_says_nothing(sign: str) -> None:
     assert np.abs(long[:, :2, 1] - short[:, :2, 1]).max() > 0.05
 
 
-def test_slots_may_become_more_and_be_empty() -> None:
+def test_the_number_of_slots_may_grow_and_slots_may_be_empty() -> None:
     noise = SensorNoise.from_run({"config": sensor_tables()})
     dark = np.zeros((60, 2), np.uint32)
     dark[20:40] = GNSS | IMU | SPEED_STEERING

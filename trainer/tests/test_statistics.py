@@ -32,7 +32,7 @@ def test_the_interval_of_five_values_by_hand() -> None:
     assert (interval.low, interval.high) == (3.0 - interval.half_width, 3.0 + interval.half_width)
 
 
-def test_intervals_cover_the_mean_as_often_as_they_say() -> None:
+def test_intervals_cover_the_mean_with_their_confidence() -> None:
     rng = np.random.default_rng(1)
     covered = [
         abs((i := mean_interval(rng.normal(7.0, 2.0, 5).tolist())).mean - 7.0) <= i.half_width for _ in range(4000)

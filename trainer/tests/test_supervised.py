@@ -1,4 +1,4 @@
-"""The baseline that is taught the truth: its gradient, what it learns, and that PPO does not notice it."""
+"""The baseline trained on the truth: its gradient and what it learns. It does not change PPO."""
 
 import contextlib
 from dataclasses import replace
@@ -45,7 +45,7 @@ def train_both(ppo: Ppo, baseline: Supervised, updates: int) -> None:
             return
 
 
-def test_ppo_does_not_notice_it(tmp_path: Path) -> None:
+def test_it_does_not_change_ppo(tmp_path: Path) -> None:
     for name, is_there in (("with", True), ("without", False)):
         loop_over(tmp_path / name, stream(0), run=run_file(str(tmp_path / name), supervised=is_there))
     one, two = (final_parameters(tmp_path / name) for name in ("with", "without"))
@@ -100,7 +100,7 @@ def test_a_successor_of_a_killed_trainer_has_the_same_baseline(
     assert part(tmp_path / "cut") == part(tmp_path / "whole")
 
 
-def test_it_begins_anew_where_a_checkpoint_has_none(tmp_path: Path) -> None:
+def test_it_starts_again_if_the_checkpoint_has_none(tmp_path: Path) -> None:
     alone, other = fresh(), fresh()
     baseline = beside(other)
     train(alone, 2)
@@ -118,7 +118,7 @@ def test_it_begins_anew_where_a_checkpoint_has_none(tmp_path: Path) -> None:
     assert torch.equal(baseline.mlp.parameters.values, taught.mlp.parameters.values)
 
 
-def test_it_stands_in_report_and_tensorboard_with_an_interval(tmp_path: Path) -> None:
+def test_report_and_tensorboard_have_it_with_an_interval(tmp_path: Path) -> None:
     loop_over(tmp_path, stream(0))
     report = part(tmp_path)
     events = EventAccumulator(str(tmp_path / "tensorboard"))

@@ -38,7 +38,7 @@ def run_with(tmp_path: Path, module: str) -> subprocess.CompletedProcess:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict:
-    """What the probe saw in one run."""
+    """The findings of the probe in one run."""
     tmp_path = tmp_path_factory.mktemp("probe")
     finished = run_with(tmp_path, "probe")
     assert finished.returncode == 0, finished.stdout + finished.stderr
@@ -74,7 +74,7 @@ def test_a_trainer_that_is_no_module_ends_the_run_with_its_log(tmp_path: Path) -
     assert "no_such_trainer" in finished.stderr and "its log is" in finished.stderr
 
 
-def test_a_lent_tensor_shows_what_an_observation_to_keep_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lent_tensor_has_the_numbers_of_a_kept_observation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = {}
     for way in ("lent", "received"):
         monkeypatch.setenv("LEASE", way)

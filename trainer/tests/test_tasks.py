@@ -1,4 +1,4 @@
-"""The contract of the tasks: what they declare, and that rows of a learner and slots of a face are the same to them."""
+"""The contract of the tasks: what they declare, and that they treat a learner's rows like a face's slots."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ ROWS = 6
 
 
 def run_of(task: str) -> RunFile:
-    """A run file with what tasks and faces read."""
+    """A run file with the keys that tasks and faces read."""
     observation = {"fields": ["route_left", "route_offset"]}
     config = {
         "run": {"tick_s": 0.1, "window_ticks": 16},
@@ -96,13 +96,13 @@ def test_several_actions_on_a_row_earn_what_each_alone_earns() -> None:
     assert together.equal(torch.stack([task.reward(step(), actions[:, i]) for i in range(3)], 1))
 
 
-def test_an_action_means_a_place_on_the_map_or_a_demand_within_its_range() -> None:
+def test_an_action_is_a_position_on_the_map_or_a_demand_within_its_range() -> None:
     action = torch.tensor([[0.0, 0.0], [1.0, -1.5]])
     assert task_of_run(run_of("localisation")).answer(action).tolist() == [[100.0, 0.0], [200.0, -75.0]]
     assert task_of_run(run_of("driving")).answer(action).tolist() == [[0.0, 0.0], [1.0, -1.0]]
 
 
-def test_a_face_waits_where_the_world_waits() -> None:
+def test_a_face_waits_where_the_simulation_waits() -> None:
     localisation, driving = (FaceSettings.from_run(run_of(name)) for name in ("localisation", "driving"))
     assert localisation.task.sampling is Sampling.WHEN_FULL and localisation.credit_ticks == 8
     assert driving.task.sampling is Sampling.EACH_TICK and driving.credit_ticks == 1
@@ -114,7 +114,7 @@ def test_driving_rewards_what_an_action_did() -> None:
         task.reward(TaskStep(before.observation, before.truth), torch.zeros(ROWS, 2))
 
 
-def test_the_ends_of_driving_are_those_of_its_page() -> None:
+def test_the_ends_of_driving_are_as_documented() -> None:
     page = (DOCS / "driving.md").read_text()
     table = re.search(r"## Ends\n(.*?)\n\n[^|]", page, re.S)
     assert table is not None
@@ -123,7 +123,7 @@ def test_the_ends_of_driving_are_those_of_its_page() -> None:
     assert written == {(end.name, end.kind) for end in task_of_run(run_of("driving")).ends}
 
 
-def test_a_task_that_is_not_there_is_refused_with_those_there_are() -> None:
+def test_an_unknown_task_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="no task is called 'parking'") as refused:
         task_of_run(run_of("parking"))
     assert refused.value.help == "`task.kind` is one of: localisation, driving"

@@ -1,4 +1,4 @@
-"""Plain, fast and graphed updates are one update: same samples and minibatches, parameters equal to rounding.
+"""Plain, fast and graphed updates with the same samples and minibatches give the same parameters, up to rounding.
 
 The graphed one runs step by step on the CPU here; on a GPU its steps are captured.
 """
@@ -39,7 +39,7 @@ def settings(**extra: object) -> TrainerConfig:
 
 
 def learner(kind: str, **extra: object) -> Ppo:
-    """A learner whose networks are drawn alike, whatever the kind of its update."""
+    """A learner with this kind of update; its initial networks are the same for all kinds."""
     config = settings(**extra)
     fresh = locating_ppo(config, FIELDS, BOUNDS)
     sampling = torch.Generator().manual_seed(config.seed)

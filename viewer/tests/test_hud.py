@@ -72,7 +72,7 @@ def test_compass_letters(degrees: float, letters: str) -> None:
     assert compass_letters(math.radians(degrees)) == letters
 
 
-def test_who_is_followed() -> None:
+def test_the_followed_vehicles() -> None:
     assert picture().followed() == [100]
     assert picture(("<b>\n`1`", "absent", "cav|0")).followed() == [101, 100]
     assert picture(sensors=np.array([7, 15])).followed() == [101]
@@ -91,7 +91,7 @@ def test_the_default_stays_while_it_is_on_the_road() -> None:
     assert seen.followed() == [101]
 
 
-def test_names_start_anew_with_each_episode() -> None:
+def test_each_episode_has_its_own_names() -> None:
     seen = picture()
     seen.enter_names(wire.decode_table(frames.vehicles(1, {7: "more"}), wire.VEHICLE_META))
     assert seen.name(100) == "cav|0"

@@ -1,4 +1,4 @@
-//! Shared by the tests of sensing: a map, road users, and a run of ticks with access to the sections of each.
+//! Common parts of the sensing tests: a map, road users, and a run of ticks with access to the sections of each tick.
 
 #![allow(
     dead_code,

@@ -3,7 +3,7 @@
 use crate::{Scanned, car, empty, range, scan, small};
 
 #[test]
-fn noise_has_the_level_that_is_asked_for() {
+fn noise_has_the_configured_level() {
     let mut config = small(32, 1800);
     config.lidar.range_noise_std_m = 0.05;
     let exact = scan(&small(32, 1800), &empty(), &[car(0, 0.0, 0.0, 0.0)]);

@@ -33,7 +33,7 @@ fn the_own_body_is_not_seen_and_others_are() {
 }
 
 #[test]
-fn tags_tell_what_a_point_lies_on() {
+fn tags_name_the_kind_of_object() {
     let config = small(32, 720);
     let mut person = car(1, 0.0, 5.0, 0.0);
     (person.kind, person.length_m, person.width_m, person.height_m) = (Kind::Person as u32, 0.5, 0.4, 1.8);
@@ -141,7 +141,7 @@ fn meshes_and_ground_with_elevation_are_seen() {
 }
 
 #[test]
-fn the_nearest_objects_go_into_the_observation() {
+fn the_observation_has_the_nearest_objects() {
     let mut config = small(32, 720);
     config.lidar.mount = [1.0, 0.0, 2.0, 0.0, 0.0, 0.0];
     let scene = empty();
@@ -168,7 +168,7 @@ fn the_nearest_objects_go_into_the_observation() {
     assert_eq!(nearest_objects(&[], &lidar), [[100.0; 2]; 4]);
 }
 
-/// Distance of a place from the surface of an object, metres.
+/// Distance of a point from the surface of an object, metres.
 fn off_surface_m(scene: &Scene, states: &[VehicleState], object: u32, [x, y, z]: [f64; 3]) -> f64 {
     use sim_core::scene::shape::{distance, edges, nearest_on_segment};
     if object == GROUND {

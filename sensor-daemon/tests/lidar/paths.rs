@@ -1,4 +1,4 @@
-//! Scans have the same bits on every instruction set and in any order of objects, also at degenerate places.
+//! Scans have the same bits on every instruction set and in any order of objects, even at degenerate positions.
 
 use crate::lidar_city::{Moves, SUB_STEPS, traffic};
 use crate::{DATA, car, lidar_city, range, rectangle, scan, small};
@@ -63,7 +63,7 @@ fn neither_the_order_of_targets_nor_used_scratch_matters() {
 }
 
 #[test]
-fn a_lean_of_nothing_gives_the_hits_of_none() {
+fn a_lean_of_zero_gives_the_same_hits_as_no_lean() {
     let mut config = small(32, 900);
     let scene = lidar_city::scene(100, 4);
     let (states, _) = traffic(100, 30, Moves::Straight, 0, 5);
@@ -83,7 +83,7 @@ fn a_lean_of_nothing_gives_the_hits_of_none() {
 }
 
 #[test]
-fn strange_places_do_no_harm() {
+fn degenerate_positions_do_no_harm() {
     let config = small(32, 360);
     let scene = Scene::new(
         Road::default(),

@@ -137,7 +137,7 @@ fn a_field_of_view_is_about_straight_ahead() {
 }
 
 #[test]
-fn a_table_fires_as_it_says() {
+fn a_table_fires_its_rays() {
     let mut config = small(1, 1);
     config.lidar.pattern = "table".into();
     config.lidar.ray_table = format!("{DATA}rays.csv");
@@ -154,7 +154,7 @@ fn a_table_fires_as_it_says() {
 }
 
 #[test]
-fn bad_tables_and_meshes_are_named_with_their_place() {
+fn bad_tables_and_meshes_are_named_with_file_and_line() {
     let mut config = small(1, 1);
     config.lidar.pattern = "table".into();
     let mut refusal = |file: &str| {

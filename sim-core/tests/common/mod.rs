@@ -1,4 +1,4 @@
-//! Synthetic SUMO traffic, and the mirror driven by it.
+//! Synthetic SUMO traffic, and a mirror that follows it.
 #![allow(dead_code, reason = "each test uses a part")]
 #![allow(clippy::unwrap_used, reason = "test code may assert by unwrapping")]
 

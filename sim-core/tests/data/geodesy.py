@@ -1,4 +1,4 @@
-"""Reference positions over 50 km x 50 km by two packages that know nothing of each other: pyproj (PROJ) and pymap3d.
+"""Reference positions over 50 km x 50 km by two independent packages: pyproj (PROJ) and pymap3d.
 
 Run it to write `geodesy.csv` beside this file. For five projections with their offsets (`NETS`), net coordinates every
 12.5 km from (0, 0):

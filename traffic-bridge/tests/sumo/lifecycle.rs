@@ -15,7 +15,7 @@ const TWO_CARS: &str = "<routes>\
     <vehicle id=\"second\" depart=\"3\"><route edges=\"B0A0 A0A1\"/></vehicle></routes>";
 
 #[test]
-fn frames_are_in_our_units_and_frame() {
+fn frames_are_in_si_units_and_the_world_frame() {
     let bench = Bench::new();
     let sumocfg = bench.scenario(TWO_CARS);
     let mut sumo = Sumo::start(bench.scenario_options(&sumocfg, 0.5)).unwrap();
@@ -41,7 +41,7 @@ fn frames_are_in_our_units_and_frame() {
 }
 
 #[test]
-fn departures_and_arrivals_are_told_once_in_order_with_what_they_are() {
+fn departures_and_arrivals_are_sent_once_in_order_with_their_data() {
     let bench = Bench::new();
     let sumocfg = bench.scenario(TWO_CARS);
     let mut sumo = Sumo::start(bench.scenario_options(&sumocfg, 1.0)).unwrap();
@@ -70,7 +70,7 @@ fn departures_and_arrivals_are_told_once_in_order_with_what_they_are() {
 }
 
 #[test]
-fn a_teleported_vehicle_is_left_out_until_it_is_back_and_then_discontinuous() {
+fn a_teleported_vehicle_is_absent_until_it_returns_and_then_discontinuous() {
     let bench = Bench::new();
     // The stopped vehicle blocks the only route of the other for longer than it waits.
     let sumocfg = bench.scenario(
@@ -109,7 +109,7 @@ fn a_teleported_vehicle_is_left_out_until_it_is_back_and_then_discontinuous() {
 }
 
 #[test]
-fn a_second_session_is_refused_until_the_first_is_gone() {
+fn a_second_sumo_is_refused_until_the_first_is_dropped() {
     let bench = Bench::new();
     let sumocfg = bench.scenario(TWO_CARS);
     let options = bench.scenario_options(&sumocfg, 1.0);

@@ -1,4 +1,4 @@
-//! The crate over real SUMO, with nets built by the wheel's own tools.
+//! Tests with real SUMO, and nets built by the wheel's own tools.
 #![expect(clippy::unwrap_used, reason = "tests assert by unwrapping, their helpers too")]
 
 mod lifecycle;

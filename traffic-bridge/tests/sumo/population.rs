@@ -1,4 +1,4 @@
-//! Population control over real SUMO.
+//! Population control with real SUMO.
 
 use std::collections::BTreeSet;
 
@@ -21,7 +21,7 @@ fn options(bench: &Bench, seed: u64) -> SumoOptions {
     SumoOptions::population(&sumo_home(), &bench.grid(), &[], STEP_S, seed).unwrap()
 }
 
-/// All bytes of all frames of an episode, and where connected vehicles begin.
+/// All bytes of all frames of an episode, and the first positions of connected vehicles.
 fn episode(sumo: &mut Sumo, seed: u64, steps: usize) -> (Vec<u8>, Vec<(i64, i64)>) {
     let mut population = Population::start(sumo, SIZE, &[], seed).unwrap();
     let (mut bytes, mut places) = (Vec::new(), Vec::new());
@@ -80,7 +80,7 @@ fn the_same_seed_gives_the_same_bytes_and_another_does_not() {
 }
 
 #[test]
-fn everybody_stays_alive_for_ever() {
+fn the_population_keeps_its_size() {
     let bench = Bench::new();
     let mut sumo = Sumo::start(options(&bench, 3)).unwrap();
     let mut population = Population::start(&mut sumo, SIZE, &[], 3).unwrap();

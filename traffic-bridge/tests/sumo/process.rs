@@ -1,4 +1,4 @@
-//! The process itself: the real binary, with the test in the roles of the supervisor and `sim-core`.
+//! The real program `traffic-bridge`; the test plays the supervisor and `sim-core`.
 
 use std::{
     os::unix::process::ExitStatusExt,
@@ -175,7 +175,7 @@ fn consume(run: &Run) -> Vec<Step> {
 }
 
 #[test]
-fn episodes_go_out_step_by_step_under_credit() {
+fn episodes_are_sent_step_by_step_under_credit() {
     let bench = Bench::new();
     let source = Source::Population {
         net_file: bench.grid(),
@@ -218,7 +218,7 @@ fn episodes_go_out_step_by_step_under_credit() {
 }
 
 #[test]
-fn more_lights_than_a_message_holds_go_out_in_several() {
+fn more_lights_than_a_message_holds_are_sent_in_several() {
     let bench = Bench::new();
     let source = Source::Population {
         net_file: bench.signalled_grid(20),
@@ -325,7 +325,7 @@ fn run_file(run_dir: PathBuf, source: Source, ticks: u64, step_s: f64) -> RunFil
     }
 }
 
-/// The preset with the few values that matter here.
+/// The default preset with the values that these tests need.
 fn config(ticks: u64, step_s: f64) -> serde_json::Value {
     let preset = Path::new(env!("CARGO_MANIFEST_DIR")).join("../ipc-schema/tests/town.json");
     let mut config: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(preset).unwrap()).unwrap();

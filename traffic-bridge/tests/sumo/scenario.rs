@@ -20,7 +20,7 @@ fn listing(folder: &Path) -> BTreeSet<(std::path::PathBuf, SystemTime)> {
 }
 
 #[test]
-fn a10kw_runs_and_writes_into_the_run_directory_alone() {
+fn a10kw_runs_and_writes_only_to_the_run_directory() {
     let bench = Bench::new();
     let games = sumo_home().join("tools/game");
     let before = listing(&games);

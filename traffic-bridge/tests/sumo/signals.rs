@@ -1,4 +1,4 @@
-//! Traffic lights as they are published, against SUMO's own output.
+//! Published traffic lights, compared with SUMO's own output.
 
 use std::{
     collections::BTreeMap,
@@ -99,7 +99,7 @@ fn lights_with_fixed_times_are_published_as_sumo_writes_them() {
 }
 
 #[test]
-fn a_new_episode_tells_every_light_again() {
+fn a_new_episode_sends_every_light_again() {
     let bench = Bench::new();
     let (net, files) = bench.town();
     let options = || SumoOptions::population(&sumo_home(), &net, &files, 1.0, 1).unwrap();

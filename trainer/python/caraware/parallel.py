@@ -101,8 +101,8 @@ def _newest_of_all(folder: Path, place: RankPlace, agree: Agree) -> str:
     return max(common)
 
 
-def tell_each_other(place: RankPlace, own: list[str]) -> list[set[str]]:
-    """By the store that `torchrun` keeps for its processes."""
+def exchange_checkpoints(place: RankPlace, own: list[str]) -> list[set[str]]:
+    """The names of every rank's checkpoints, exchanged by the store that `torchrun` keeps for its processes."""
     from torch.distributed import TCPStore  # type: ignore[attr-defined]  # torch lists it without exporting it
 
     address, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
@@ -123,7 +123,7 @@ def main(arguments: Sequence[str]) -> int:
         print(error, file=sys.stderr)
         return 3
     try:
-        words = command(arguments, place, os.getppid(), tell_each_other)
+        words = command(arguments, place, os.getppid(), exchange_checkpoints)
     except ResumeError as error:
         print(error, file=sys.stderr)
         return 2

@@ -83,7 +83,7 @@ class Belief:
     """f64 `[d, d, n]`, symmetric to the last bit."""
 
     @classmethod
-    def of_nobody(cls, size: int, slots: int) -> "Belief":
+    def of_empty_slots(cls, size: int, slots: int) -> "Belief":
         """Zero with unit covariance, which keeps the arithmetic of empty slots finite."""
         return cls(np.zeros((size, slots)), np.repeat(np.eye(size)[:, :, None], slots, axis=2))
 
@@ -120,7 +120,7 @@ class Ekf:
 
     def __init__(self, noise: SensorNoise, model: MotionModel | None = None) -> None:
         self.noise, self.model, self.layout = noise, model or MotionModel(), StateLayout.of(noise)
-        self.belief = Belief.of_nobody(self.layout.size, 0)
+        self.belief = Belief.of_empty_slots(self.layout.size, 0)
         self.running = np.zeros(0, bool)
         """bool `[n]`: slots with a filter."""
         self.started = np.zeros(0, bool)
@@ -388,7 +388,7 @@ class Ekf:
         more = slots - len(self.running)
         if more <= 0:
             return
-        fresh = Belief.of_nobody(self.layout.size, more)
+        fresh = Belief.of_empty_slots(self.layout.size, more)
         self.belief = Belief(
             np.concatenate((self.belief.mean, fresh.mean), axis=1),
             np.concatenate((self.belief.covariance, fresh.covariance), axis=2),

@@ -155,7 +155,7 @@ class Slots:
         self._raw_evaluation = _Errors()
         self._idle = np.zeros((self.count, self.task.actions.size), np.float32)
         self._runs, self._answered = 0, -1
-        self._untouched, self._stepped, self._told_narrow = True, True, False
+        self._untouched, self._stepped, self._warned_narrow = True, True, False
         self._now: Tick | None = None
         self._env_steps, self._reported = 0, (time.monotonic(), 0)
 
@@ -280,7 +280,7 @@ class Slots:
         while True:
             if tick is None:
                 if not self.source.can_restart:
-                    return self._nobody()
+                    return self._end_of_run()
                 self._restart()
             elif tick.evaluation:
                 self._evaluate(tick)
@@ -334,9 +334,9 @@ class Slots:
         if not mask.all():
             for rows in (observation, truth, gnss_m):
                 rows[~mask] = 0
-        if len(obs.vehicle) > n and not self._told_narrow and np.any(obs.vehicle[n:] != EMPTY_SLOT):
+        if len(obs.vehicle) > n and not self._warned_narrow and np.any(obs.vehicle[n:] != EMPTY_SLOT):
             log.warning("%d slots, of which this environment has the first %d", len(obs.vehicle), n)
-            self._told_narrow = True
+            self._warned_narrow = True
         return Tick(
             over=False,
             evaluation=obs.evaluation,
@@ -350,8 +350,8 @@ class Slots:
             truncated=_padded(obs.truncated, n),
         )
 
-    def _nobody(self) -> Tick:
-        """Beyond the last tick of a run."""
+    def _end_of_run(self) -> Tick:
+        """The tick without vehicles after the last tick of a run."""
         n, none = self.count, np.zeros(self.count, bool)
         zeros = [np.zeros((n, width), np.float32) for width in (self.settings.fields.width, 4, 2)]
         vehicle = np.full(n, EMPTY_SLOT, np.uint32)

@@ -94,10 +94,10 @@ class Curriculum:
         self.standing = Standing()
 
     def begin(self, standing: dict[str, Any] | None = None) -> None:
-        """Tell the simulation where a run stands: at its beginning, or as a checkpoint says."""
+        """Publish the stage of the next lesson: at the beginning of the run, or as a checkpoint says."""
         if standing:
             self.standing = Standing.restored(standing)
-        self._tell()
+        self._publish()
 
     def lesson_ended(self, obs: Ended, env_steps: int, policy_std: float = math.nan, error_m: float = math.nan) -> None:
         """Look at the gate, once for each lesson. Measures that a learner does not have open no gate."""
@@ -112,7 +112,7 @@ class Curriculum:
             error = None if math.isnan(error_m) else error_m
             now.passed.append(Passed(now.stage + 1, obs.tick, now.lessons, env_steps, policy_std, error))
             now.stage, now.since = now.stage + 1, now.lessons
-        self._tell()
+        self._publish()
 
     def share(self, lessons: int) -> float:
         """Share of at most `lessons` that is behind."""
@@ -132,7 +132,7 @@ class Curriculum:
     def __bool__(self) -> bool:
         return bool(self._stages)
 
-    def _tell(self) -> None:
+    def _publish(self) -> None:
         if self._stages:
             now = self.standing
             self._channel.decided(now.lessons + 1, now.since, now.stage)
