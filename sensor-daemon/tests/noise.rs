@@ -204,7 +204,9 @@ fn a_vehicle_senses_the_same_alone_in_another_order_and_among_many() {
         .iter()
         .map(|states| {
             let mut run = Run::new(&everything);
-            (0..60).map(|tick| samples(&mut run, &states(tick), me.id_hash)).collect()
+            (0..60)
+                .map(|tick| samples(&mut run, &states(tick), me.id_hash))
+                .collect()
         })
         .collect();
     assert!(all.iter().all(|samples| *samples == all[0]));
@@ -237,7 +239,10 @@ fn a_slot_passes_no_state_to_its_next_vehicle() {
     let mut fresh = Run::new(&config);
     (0..22).for_each(|_| drop(fresh.tick(&[])));
     for _ in 0..30 {
-        assert_eq!(samples(&mut changed, &[b], b.id_hash), samples(&mut fresh, &[b], b.id_hash));
+        assert_eq!(
+            samples(&mut changed, &[b], b.id_hash),
+            samples(&mut fresh, &[b], b.id_hash)
+        );
     }
 }
 

@@ -242,7 +242,10 @@ fn only_contacts_of_connected_vehicles_and_heroes_count() {
         .iter()
         .map(|event| (event.vehicle, event.other, event.other_class))
         .collect();
-    assert_eq!(contacts, [(7, 5, Struck::Vehicle as u32), (7, 3, Struck::Person as u32)]);
+    assert_eq!(
+        contacts,
+        [(7, 5, Struck::Vehicle as u32), (7, 3, Struck::Person as u32)]
+    );
     assert_eq!(flagged, [3, 5, 7]);
     assert!((begun[0].relative_speed_mps - 20.0).abs() < 1e-5, "head on");
     assert!((begun[1].relative_speed_mps - 10.0).abs() < 1e-5);

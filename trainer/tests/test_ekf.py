@@ -93,7 +93,7 @@ def squared_errors(obs: VehicleObservation, ekf: Ekf, states: int) -> np.ndarray
 
 
 EXACT = MotionModel(1e-4, 1e4, 1e-5, 1e4, slip_noise_rad_per_g=0.0, heading_time_s=0.5, position_walk_m=1e-3)
-"""Vehicles that do what their IMU says, which those of `steady_track` do."""
+"""A model for vehicles that move exactly as their IMU measures, such as those of `steady_track`."""
 
 
 @pytest.mark.parametrize(

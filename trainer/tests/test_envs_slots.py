@@ -237,7 +237,7 @@ def test_reset_continues_to_the_next_episode_but_not_twice_without_a_step(tmp_pa
     assert vehicles_of(env.reset()[0]) == [4, 5]
     assert when(env.reset()[0]) == [3, 3]
     for seed in (99, 5):  # even its own: it is past its beginning
-        with pytest.warns(UserWarning, match="cannot begin this run anew"):
+        with pytest.warns(UserWarning, match="cannot start this run again"):
             env.reset(seed=seed)
 
 

@@ -60,7 +60,7 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
 
 
 def _resumed(config: "RunConfig", ranks: "Ranks") -> "Learner | None":
-    """A learner continued from the checkpoint that the run begins with; None if the run begins anew."""
+    """A learner continued from the checkpoint that the run begins with; None if the run starts from the beginning."""
     from caraware.run.checkpoint import remove_partial
     from caraware.run.learner import Learner
     from caraware.run.manifest import read_manifest

@@ -44,7 +44,7 @@ class Baselines:
         return filtered, [_errors(tick) for tick in self._smoother.push((rows, vehicle, truth_m))]
 
     def finish_episode(self) -> list[BaselineErrors]:
-        """Errors of the smoother at the ticks that waited for the end of the episode; the next one starts anew."""
+        """Errors of the smoother at the ticks that waited for the end of the episode; the next one starts again."""
         left = [_errors(tick) for tick in self._smoother.finish()]
         self._begin()
         return left

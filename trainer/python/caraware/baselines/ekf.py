@@ -38,13 +38,13 @@ Coefficients = list[tuple[int, Float64Array | float]]
 """A row of a Jacobian: index and coefficient `[n]` of what is not zero."""
 
 NO_HEADING_VARIANCE = math.pi**2 / 3.0
-"""Variance of a heading of which nothing is known: uniform on the circle. Beyond, the next fix starts a filter anew."""
+"""Variance of an unknown heading, uniform on the circle. Above it the next fix starts the filter again."""
 
 GATE_PROBABILITY = 0.9999
 """Share of good fixes that pass the gate, where fixes may be reflections."""
 
 GATE_PATIENCE = 20
-"""So many fixes refused in a row show that the filter is wrong, not the fixes: it starts anew from the next."""
+"""After this many refused fixes in a row the filter is wrong, not the fixes: it starts again from the next one."""
 
 CERTAIN = 10.0
 """Standard deviations from which on a wheel turns for certain: what is cut off is below the last bit."""

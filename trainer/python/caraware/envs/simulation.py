@@ -52,7 +52,7 @@ class SimulationError(RuntimeError):
 
 
 class Simulation:
-    """A simulation of this process's own: it starts at once, can be started anew, and ends with this process.
+    """A simulation of this process's own: it starts at once, can be started again, and ends with this process.
 
     It can be used by one thread at a time. After `fork` only the parent may use it.
     """

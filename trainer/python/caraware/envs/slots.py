@@ -173,7 +173,7 @@ class Slots:
 
     @property
     def over(self) -> bool:
-        """True beyond the end of a run that cannot be started anew."""
+        """True beyond the end of a run that cannot be started again."""
         return self._now is not None and self._now.over
 
     def reset(self, seed: int | None) -> Tick:
@@ -234,7 +234,8 @@ class Slots:
 
     def _reseed(self, seed: int) -> None:
         if not self.source.can_restart:
-            message = f"seed {seed} cannot begin this run anew: caraware started it, with `run.seed` {self.source.seed}"
+            started = f"caraware started it, with `run.seed` {self.source.seed}"
+            message = f"seed {seed} cannot start this run again: {started}"
             warnings.warn(message, stacklevel=4)
             return
         self._now, self._untouched = None, True

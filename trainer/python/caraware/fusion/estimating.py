@@ -44,7 +44,7 @@ class Estimating:
 
 
 class FusionPlayer:
-    """A trained estimator in `caraware play`: the filter and the memory begin anew with every episode."""
+    """A trained estimator in `caraware play`: the filter and the memory start again with every episode."""
 
     def __init__(self, learner: FusionLearner, carrier: Carrier) -> None:
         self._learner, self._estimating = learner, Estimating(learner, carrier)

@@ -1,6 +1,6 @@
 """`python -m caraware.fusion.study`: trains the preset `fusion` and prints its errors beside the filter's, over seeds.
 
-Every setting of the sensors is trained on anew, `--training-seeds` times. Evaluation seeds, and the trips of vehicles
+Every setting of the sensors has its own training, `--training-seeds` times. Evaluation seeds, and the trips of vehicles
 in evaluations (`traffic.held_out_trips`), are ones that no training episode has seen. Intervals are 95 % (Student's t)
 over the evaluation seeds of a run, or over runs where there are several.
 """

@@ -1,7 +1,7 @@
 """`python -m caraware.fusion.train RUN_FILE`: the trainer process of the preset `fusion`.
 
 The estimator runs on every tick as it comes, in training as in evaluations, and learns at the end of every training
-episode. There nothing is carried on: all vehicles begin anew. So a checkpoint needs no state of filters, and a trainer
+episode. There nothing is carried on: all vehicles start again. So a checkpoint needs no state of filters, and a trainer
 that continues from it ends in the same bytes. The handover between processes: `caraware.run.process`.
 """
 

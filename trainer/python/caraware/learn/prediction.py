@@ -22,7 +22,7 @@ class Predictor(Protocol):
     def predict_m(self, ticks: Ticks) -> dict[int, list[Tensor]]:
         """Predicted positions f32 `[n, 2]` (m, world) for each tick.
 
-        Ticks that are not taken may be asked for again, and are then predicted anew.
+        Ticks that are not taken may be asked for again, and are then predicted again.
         """
 
 

@@ -113,7 +113,7 @@ class Rollout:
         return self._samples - following >= self._horizon
 
     def take(self) -> Horizon:
-        """The collected horizon, to be learned from before the next `add`, which starts anew."""
+        """The collected horizon, to be learned from before the next `add`, which starts again."""
         end = self._ticks - 1 if self._bootstrap else self._ticks
         horizon = Horizon(
             observation=self._observation[:end],

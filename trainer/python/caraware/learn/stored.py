@@ -12,7 +12,7 @@ RANDOM = "random.safetensors"
 MEMORY = "memory.safetensors"
 """What networks remember of trajectories at the committed tick; networks that see one moment have none."""
 SUPERVISED = "supervised.safetensors"
-"""The baseline beside PPO; a checkpoint of a run without it has none, and the baseline then begins anew."""
+"""The baseline beside PPO. A checkpoint of a run without it has none; then the baseline starts from the beginning."""
 
 StoredTensors = dict[str, dict[str, Tensor]]
 """Tensors by file, then by name."""

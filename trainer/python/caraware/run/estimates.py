@@ -9,7 +9,7 @@ from caraware.ipc.stream import Observation
 
 
 class Estimates:
-    """Where a filter for each slot thinks its vehicle is. It has to see every tick, and begins anew with an episode."""
+    """Estimates of a filter for each slot. It has to see every tick, and starts again with an episode."""
 
     def __init__(self, noise: SensorNoise) -> None:
         self._noise = noise
