@@ -80,7 +80,7 @@ pub struct ChannelFeed {
     /// Most messages held.
     max_held: usize,
     tally: TickTally,
-    /// The newest tick that was published or passed over.
+    /// The newest tick that was published or skipped.
     published: Option<u64>,
 }
 

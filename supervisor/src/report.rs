@@ -332,7 +332,7 @@ fn errors(report: &Value) -> Vec<String> {
     if measured("ekf") {
         let mut line = format!("from the same samples: EKF {}", error("ekf"));
         if measured("rts") {
-            let note = "uses later samples too: a bound, not an estimator";
+            let note = "sees the future: a bound, not an estimator";
             line += &format!(", RTS smoother {} ({note})", error("rts"));
         }
         lines.push(line);

@@ -40,7 +40,7 @@ struct TickStream {
 /// The topics of a tick.
 pub struct TickTopics {
     streams: Vec<TickStream>,
-    /// Header of the newest message that was published or passed over.
+    /// Header of the newest message that was published or skipped.
     newest: MessageHeader,
     figures: TickFigures,
     /// A prediction is a position; in the driving task it is an action.
@@ -238,7 +238,7 @@ impl TickTopics {
         self.feeds().map(ChannelFeed::refused).sum()
     }
 
-    /// Header of the newest message that was published or passed over.
+    /// Header of the newest message that was published or skipped.
     #[must_use]
     pub fn newest(&self) -> &MessageHeader {
         &self.newest

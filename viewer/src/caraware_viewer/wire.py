@@ -180,7 +180,7 @@ def decode_observation(frame: bytes) -> Observation:
     """An `observation` frame."""
     header = decode_header(frame)
     sections = _sections(frame, "observation", header)
-    # A section that the viewer does not show, such as that of a newer sensor, is passed over.
+    # The viewer skips sections that it does not show, such as that of a newer sensor.
     return Observation(header, **{name: sections[name] for name in _OBSERVED})
 
 

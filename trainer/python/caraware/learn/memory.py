@@ -53,7 +53,7 @@ class Memory:
 
     @classmethod
     def restored(cls, tensors: dict[str, Tensor], suffix: str) -> "Memory | None":
-        """From what `tensors` returned; None if it is not there."""
+        """Restore the memory from the result of `tensors`; None if it holds none."""
         names = [f.name for f in fields(cls)]
         if any(f"{name}{suffix}" not in tensors for name in names):
             return None

@@ -65,7 +65,7 @@ class Rollout:
         self._allocate(ticks=16, slots=1)
 
     def add(self, obs: LearningTick) -> None:
-        """Copy one training tick. Ticks with no valid row are passed over."""
+        """Copy one training tick. Ticks without a valid row are skipped."""
         self.ended(obs)
         rows = len(obs.vehicle)
         if rows > self._slots:

@@ -1,4 +1,4 @@
-"""What the policy's network reaches when it sees the truth: a baseline taught by regression beside PPO.
+"""A baseline beside PPO: the policy's network, trained by regression on the truth.
 
 PPO learns from rewards alone. A network of the same size, on the same samples, that is shown where the vehicle was
 has an easier task: its error is what the observation and the network are worth, and PPO's distance to it the price of

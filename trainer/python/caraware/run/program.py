@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 class ProgramError(Exception):
-    """The command is not there."""
+    """The command `caraware` was not found."""
 
 
 def caraware_program() -> Path:
@@ -21,4 +21,4 @@ def caraware_program() -> Path:
             return program
     if found := shutil.which("caraware"):
         return Path(found)
-    raise ProgramError("the program caraware is not there: run `make build`, or set CARAWARE to its path")
+    raise ProgramError("the program caraware was not found: run `make build`, or set CARAWARE to its path")
