@@ -1,6 +1,7 @@
 //! Checks the access rules of `fanout.*` before `fanout` starts. Beyond loopback every viewer must authenticate.
 
 use std::{
+    io::ErrorKind,
     net::{TcpListener, ToSocketAddrs as _},
     os::unix::fs::PermissionsExt as _,
     path::Path,
@@ -8,7 +9,10 @@ use std::{
 
 use ipc_schema::config::FanoutConfig;
 
-use crate::failure::Exit;
+use crate::{display::notice, failure::Exit};
+
+/// The endpoint of the presets: a run that keeps it may listen on another port.
+const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
 
 /// Checks the endpoint, the files and their permissions, and makes their paths absolute.
 ///
@@ -32,8 +36,9 @@ pub fn check(fanout: &mut FanoutConfig) -> Result<(), Exit> {
     check_users(fanout)
 }
 
-fn check_endpoint(fanout: &FanoutConfig) -> Result<(), Exit> {
-    let listen = &fanout.listen;
+/// Checks the endpoint. If the default one is in use, a free port takes its place.
+fn check_endpoint(fanout: &mut FanoutConfig) -> Result<(), Exit> {
+    let listen = fanout.listen.clone();
     let encrypted = listen.strip_prefix("tls/");
     let address = encrypted.or_else(|| listen.strip_prefix("tcp/")).ok_or_else(|| {
         Exit::config(
@@ -64,12 +69,23 @@ fn check_endpoint(fanout: &FanoutConfig) -> Result<(), Exit> {
              and connect viewers through a tunnel: ssh -N -L 7447:127.0.0.1:7447 HOST",
         ));
     }
-    TcpListener::bind(address).map(drop).map_err(|error| {
+    let refuse = |error: std::io::Error| {
         Exit::config(
             format!("`fanout.listen` = \"{listen}\" cannot be listened on: {error}"),
             "if another run or program uses the port, choose another, e.g. --set fanout.listen=tcp/127.0.0.1:7448, or --set fanout.enabled=false",
         )
-    })
+    };
+    match TcpListener::bind(address) {
+        Ok(_) => Ok(()),
+        Err(error) if error.kind() == ErrorKind::AddrInUse && listen == DEFAULT_ENDPOINT => {
+            let free = TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr());
+            let free = free.map_err(refuse)?;
+            notice(&format!("viewers connect to tcp/{free}: another run or program uses {DEFAULT_ENDPOINT}"));
+            fanout.listen = format!("tcp/{free}");
+            Ok(())
+        }
+        Err(error) => Err(refuse(error)),
+    }
 }
 
 /// True unless every address that the name resolves to is a loopback address.

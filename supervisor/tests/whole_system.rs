@@ -348,6 +348,19 @@ fn a_run_whose_traffic_cannot_start_says_so_in_its_report() {
     workplace.assert_nothing_left();
 }
 
+#[test]
+fn a_run_takes_a_free_port_if_the_default_one_is_in_use() {
+    let workplace = Workplace::new();
+    // Another program, or another run on this machine, listens there.
+    let _taken = std::net::TcpListener::bind("127.0.0.1:7447");
+    let output = workplace.succeed(&small("simulate", "second", &["--set", "episode.ticks=30"]));
+    assert!(text(&output).contains("viewers connect to tcp/127.0.0.1:"), "{}", text(&output));
+    let file = std::fs::read_to_string(workplace.path().join("runs/second/run.json")).unwrap();
+    let run: Value = serde_json::from_str(&file).unwrap();
+    assert_ne!(run["config"]["fanout"]["listen"], "tcp/127.0.0.1:7447");
+    workplace.assert_nothing_left();
+}
+
 /// The end of a terminal: SIGHUP, and no place left to write to.
 #[test]
 fn a_closed_terminal_ends_the_run_with_a_checkpoint_and_a_report() {
