@@ -153,7 +153,7 @@ pub fn control(args: &ControlArgs) -> Result<(), Exit> {
         env: args.env,
         request: command.to_json(),
     };
-    match socket::ask(&run, &request)? {
+    match socket::send_request(&run, &request)? {
         Reply::Done(done) => {
             println!("{}: tick {}: {}", run.name, done.tick, done.message);
             Ok(())

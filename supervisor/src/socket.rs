@@ -143,7 +143,7 @@ fn read_request(stream: UnixStream) -> Option<ReceivedRequest> {
 ///
 /// # Errors
 /// The run is over, or ends before it has answered.
-pub fn ask<Answer: DeserializeOwned>(run: &RunFile, request: &SupervisorRequest) -> Result<Answer, Exit> {
+pub fn send_request<Answer: DeserializeOwned>(run: &RunFile, request: &SupervisorRequest) -> Result<Answer, Exit> {
     let socket = run.control_socket();
     let failed = |error: &std::io::Error| Exit::io("ask the supervisor through", &socket, error);
     let mut stream = UnixStream::connect(&socket).map_err(|error| failed(&error))?;

@@ -64,7 +64,7 @@ pub fn handover(args: &HandoverArgs) -> Result<(), Exit> {
         set: args.set.clone(),
         checkpoint: args.checkpoint.as_deref().map(checkpoint).transpose()?,
     };
-    match socket::ask(&run, &SupervisorRequest::Handover(request))? {
+    match socket::send_request(&run, &SupervisorRequest::Handover(request))? {
         HandoverAnswer::Done(report) => {
             println!(
                 "{}: trainer {} continues from tick {}; the handover took {:.2} s",
