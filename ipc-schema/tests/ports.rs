@@ -9,7 +9,7 @@
 use std::{
     path::Path,
     sync::{Arc, atomic::AtomicBool},
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use ipc_schema::{
@@ -272,7 +272,7 @@ fn a_board_outlives_its_writer_and_a_wake_up_is_not_lost() {
 fn a_wait_of_less_than_a_microsecond_ends() {
     let run = Corner::new(11);
     let membership = run.join(Process::Trainer);
-    let begin = std::time::Instant::now();
+    let begin = Instant::now();
     for nanoseconds in [0, 1, 999, 1_001] {
         membership.wait(Duration::from_nanos(nanoseconds)).unwrap();
     }

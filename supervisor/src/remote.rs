@@ -80,7 +80,9 @@ fn check_endpoint(fanout: &mut FanoutConfig) -> Result<(), Exit> {
         Err(error) if error.kind() == ErrorKind::AddrInUse && listen == DEFAULT_ENDPOINT => {
             let free = TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr());
             let free = free.map_err(refuse)?;
-            notice(&format!("viewers connect to tcp/{free}: another run or program uses {DEFAULT_ENDPOINT}"));
+            notice(&format!(
+                "viewers connect to tcp/{free}: another run or program uses {DEFAULT_ENDPOINT}"
+            ));
             fanout.listen = format!("tcp/{free}");
             Ok(())
         }

@@ -354,7 +354,11 @@ fn a_run_takes_a_free_port_if_the_default_one_is_in_use() {
     // Another program, or another run on this machine, listens there.
     let _taken = std::net::TcpListener::bind("127.0.0.1:7447");
     let output = workplace.succeed(&small("simulate", "second", &["--set", "episode.ticks=30"]));
-    assert!(text(&output).contains("viewers connect to tcp/127.0.0.1:"), "{}", text(&output));
+    assert!(
+        text(&output).contains("viewers connect to tcp/127.0.0.1:"),
+        "{}",
+        text(&output)
+    );
     let file = std::fs::read_to_string(workplace.path().join("runs/second/run.json")).unwrap();
     let run: Value = serde_json::from_str(&file).unwrap();
     assert_ne!(run["config"]["fanout"]["listen"], "tcp/127.0.0.1:7447");

@@ -17,7 +17,7 @@ use ipc_schema::{
 };
 use pyo3::{exceptions::PyValueError, ffi, prelude::*};
 
-use crate::{Attachment, POLLS, checked_layout, failed};
+use crate::{Attachment, POLLS, checked_layout};
 
 /// Longest time that polling holds the GIL: a fifth of Python's own switch interval.
 const GIL_HOLD: Duration = Duration::from_millis(1);

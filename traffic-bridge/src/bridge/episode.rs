@@ -343,7 +343,7 @@ impl Bridge {
     }
 
     /// Number of the episode in the run: by its schedule, and one more for each episode that was reset.
-    fn episode_number(&self, episode: &Episode) -> u64 {
+    pub(super) fn episode_number(&self, episode: &Episode) -> u64 {
         episode.index + self.totals.resets
     }
 
