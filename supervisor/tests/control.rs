@@ -238,7 +238,7 @@ fn wrong_requests_are_refused_with_their_reasons_and_the_run_continues() {
     let run = Run::start(&workplace, "simulate", "pestered", &[]);
     run.refused(&["sensor", "cav.999", "gnss", "off"], "is not on the road now");
     run.refused(&["sensor", "other.0", "gnss", "off"], "carries no sensors");
-    run.refused(&["sensor", "all", "lidar", "off"], "has a LIDAR");
+    run.refused(&["sensor", "all", "lidar", "off"], "carries the sensor `lidar`");
     run.refused(
         &["start", "unknown", "ring_west_2"],
         "is not a vehicle of the population",

@@ -14,15 +14,12 @@ use super::{ConfigError, LayeredSettings};
 /// Checks every rule.
 pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let tick_s = config.run.tick_s;
-    for (path, value_s) in [
-        ("traffic.step_s", config.traffic.step_s),
-        ("gnss.period_s", config.gnss.period_s),
-        ("speed_steering.period_s", config.speed_steering.period_s),
-    ] {
+    let step = ("traffic.step_s".to_owned(), config.traffic.step_s);
+    for (path, value_s) in std::iter::once(step).chain(sensors::tick_periods(config)) {
         if !is_multiple(value_s, tick_s) {
             return Err(conflict(
                 settings,
-                path,
+                &path,
                 format!("`{path}` = {value_s} s is not a whole number of ticks of `run.tick_s` = {tick_s} s"),
                 format!("choose a multiple of {tick_s} s, or another `run.tick_s`"),
             ));

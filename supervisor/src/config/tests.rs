@@ -208,7 +208,7 @@ fn an_impossible_lidar_is_refused_with_key_value_and_range() {
     assert!(
         error_of("observation.fields = [\"object_1_x\"]\n")
             .0
-            .contains("only a LIDAR sees")
+            .contains("the sensor `lidar` measures")
     );
 }
 

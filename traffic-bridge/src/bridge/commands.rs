@@ -237,10 +237,8 @@ impl CommandExecutor {
         if sensors & context.fitted_sensors == 0 {
             let missing = SENSORS.iter().find(|spec| spec.kind.is_in(sensors));
             let message = missing.map_or_else(String::new, |spec| {
-                format!(
-                    "no vehicle of this run has a {} (`{}.vehicles` = 0)",
-                    spec.label, spec.name
-                )
+                let name = spec.name;
+                format!("no vehicle of this run carries the sensor `{name}` (`{name}.vehicles` = 0)")
             });
             return Err(Refusal::new(RefusalKind::Unsupported, message));
         }

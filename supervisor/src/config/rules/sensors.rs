@@ -2,7 +2,7 @@
 
 use ipc_schema::{
     config::{Config, LidarConfig},
-    sensor::fitted_sensors,
+    sensor::{SENSORS, SensorKind, fitted_sensors},
 };
 
 use super::{ConfigError, LayeredSettings, conflict, is_multiple};
@@ -14,6 +14,15 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         None => Ok(()),
         Some((path, message, help)) => Err(conflict(settings, path, message, help)),
     }
+}
+
+/// Key and value of each period that is a whole number of ticks: those of all sensors of the run but the IMU, which has its own rule.
+pub(super) fn tick_periods(config: &Config) -> impl Iterator<Item = (String, f64)> {
+    let fitted = fitted_sensors(config);
+    let rows = SENSORS
+        .iter()
+        .filter(move |spec| spec.kind.is_in(fitted) && spec.kind != SensorKind::Imu);
+    rows.map(|spec| (format!("{}.period_s", spec.name), (spec.period_s)(config)))
 }
 
 /// Key, message and help of a broken rule.
@@ -134,10 +143,10 @@ fn observation(config: &Config) -> Option<BrokenSensorRule> {
         if let Some(sensor) = field.spec().source.sensor()
             && !sensor.is_in(fitted)
         {
-            let (field, label, name) = (field.name(), sensor.spec().label, sensor.name());
+            let (field, name) = (field.name(), sensor.name());
             return Some((
                 "observation.fields",
-                format!("`observation.fields` has \"{field}\", which only a {label} sees"),
+                format!("`observation.fields` has \"{field}\", which the sensor `{name}` measures"),
                 format!("set {name}.vehicles to the number of vehicles that carry one, or leave the field out"),
             ));
         }
