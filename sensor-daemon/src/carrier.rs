@@ -34,14 +34,17 @@ pub struct SensorCarrier {
 }
 
 impl SensorCarrier {
-    /// A carrier with the sensors `present`, without any sample.
+    /// A carrier with the sensors `present`, and with the readings `unsensed` until they sample.
     #[must_use]
-    pub fn new(present: u32, gnss: GnssState, walk: ImuAxes, scales: SpeedSteeringScales, no_object_m: f32) -> Self {
+    pub fn new(
+        present: u32,
+        gnss: GnssState,
+        walk: ImuAxes,
+        scales: SpeedSteeringScales,
+        unsensed: SensorReadings,
+    ) -> Self {
         Self {
-            readings: SensorReadings {
-                objects_m: [[no_object_m; 2]; 4],
-                ..SensorReadings::default()
-            },
+            readings: unsensed,
             gnss,
             walk,
             scales,

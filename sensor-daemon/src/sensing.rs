@@ -290,7 +290,9 @@ impl Sensing {
         is_agent && (self.agents == Kind::Hero || !collides)
     }
 
-    fn now(&self, header: &MessageHeader) -> TickTime {
+    /// Time of the tick of `header`, as noise and blackouts use it.
+    #[must_use]
+    pub fn now(&self, header: &MessageHeader) -> TickTime {
         TickTime {
             episode_seed: header.episode_seed,
             tick: (header.sim_time_ns / self.tick_ns) as u32,

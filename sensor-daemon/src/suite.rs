@@ -12,6 +12,7 @@ use crate::{
     blackout::BlackoutSchedule,
     carrier::SensorCarrier,
     noise::{DrawnNormals, NormalDraws, normals::NormalBlock},
+    observation::fields::SensorReadings,
     sensors::{
         gnss::{GnssReceiver, SatelliteSky, SkyView},
         imu::{ImuModel, ImuMotion, ImuSample},
@@ -34,7 +35,8 @@ pub struct SensorSuite {
     vehicles: [u32; SensorKind::COUNT],
     /// Bits of the sensors whose samples [`crate::surroundings`] takes.
     of_surroundings: u32,
-    lidar_range_m: f32,
+    /// Readings of a carrier whose sensors have not sampled.
+    unsensed: SensorReadings,
     tick_s: f64,
     path: VectorPath,
 }
@@ -65,7 +67,7 @@ impl SensorSuite {
                 .iter()
                 .filter(|spec| spec.input == SensorInput::Surroundings)
                 .fold(0, |bits, spec| bits | spec.kind.bit()),
-            lidar_range_m: config.lidar.range_m as f32,
+            unsensed: SensorReadings::unsensed(config),
             tick_s: config.run.tick_s,
             path: VectorPath::widest(),
         })
@@ -103,7 +105,7 @@ impl SensorSuite {
             self.gnss.begin(is_person),
             ImuModel::begin(),
             self.speed_steering.begin(now.episode_seed, state.id_hash),
-            self.lidar_range_m,
+            self.unsensed,
         );
         for (phase, schedule) in carrier.phases.iter_mut().zip(&self.schedules) {
             if let Some(schedule) = schedule {

@@ -28,6 +28,15 @@ pub struct SensorReadings {
 }
 
 impl SensorReadings {
+    /// Readings of a carrier whose sensors have not sampled yet, and of the sensors that it lacks: no object is in sight.
+    #[must_use]
+    pub fn unsensed(config: &Config) -> Self {
+        Self {
+            objects_m: [[config.lidar.range_m as f32; 2]; 4],
+            ..Self::default()
+        }
+    }
+
     #[inline(always)]
     fn value(&self, field: Field) -> f64 {
         let deliver = |bit: u32| f64::from(u8::from(self.delivering & bit != 0));
