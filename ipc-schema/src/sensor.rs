@@ -1,5 +1,5 @@
 //! The sensors of a connected road user: one row of [`SENSORS`] for each kind. Commands, the command line, the curriculum, the
-//! fan-out's counts, the HUD and the native extension derive from it (decision 21).
+//! fan-out's counts, the HUD and the bits that Python knows derive from it (decision 21).
 
 use std::fmt;
 

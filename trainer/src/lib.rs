@@ -18,7 +18,6 @@ use ipc_schema::{
     prediction::PredictionLayout,
     process::Process,
     run::RunFile,
-    sensor::SensorKind,
     services::Channel as Service,
 };
 use pyo3::{
@@ -600,9 +599,6 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("TRUNCATED", ipc_schema::observation::TRUNCATED)?;
     module.add("CLIPPED", ipc_schema::observation::CLIPPED)?;
     module.add("EMPTY_SLOT", ipc_schema::observation::EMPTY_SLOT)?;
-    for kind in SensorKind::ALL {
-        module.add(kind.name().to_uppercase(), kind.bit())?;
-    }
     module.add("GNSS_COLUMNS", ipc_schema::observation::GNSS_COLUMNS)?;
     module.add("IMU_COLUMNS", ipc_schema::observation::IMU_COLUMNS)?;
     module.add("TRUTH_COLUMNS", ipc_schema::observation::TRUTH_COLUMNS)

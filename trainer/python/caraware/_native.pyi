@@ -14,15 +14,11 @@ from typing_extensions import Buffer
 __all__ = [
     "CLIPPED",
     "EMPTY_SLOT",
-    "GNSS",
     "GNSS_COLUMNS",
-    "IMU",
     "IMU_COLUMNS",
     "LAYOUT_JSON",
-    "LIDAR",
     "METRICS",
     "SCHEMA_VERSION",
-    "SPEED_STEERING",
     "TERMINATED",
     "TRUNCATED",
     "TRUTH_COLUMNS",
@@ -56,15 +52,6 @@ CLIPPED: int
 """Bit of `flags`: a field of the observation was outside its range."""
 EMPTY_SLOT: int
 """Vehicle index of a slot without a vehicle."""
-
-GNSS: int
-"""Bit of `sensors`: the GNSS receiver delivers."""
-IMU: int
-"""Bit of `sensors`: the inertial measurement unit delivers."""
-SPEED_STEERING: int
-"""Bit of `sensors`: wheel speed and steering-wheel angle are delivered."""
-LIDAR: int
-"""Bit of `sensors`: the LIDAR delivers."""
 
 GNSS_COLUMNS: int
 """Columns of the section `gnss_m`: east, north, up (m, world)."""

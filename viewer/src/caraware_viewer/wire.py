@@ -107,7 +107,7 @@ class Observation:
     """Which sensors deliver: bits of `SENSORS`."""
     episode_step: NDArray[np.uint32]
     age_s: NDArray[np.float32]
-    """`[n, s]`: age of the newest sample of each sensor, in the order of `SENSORS`, seconds."""
+    """`[n, 4]`: age of the newest sample of each of the first four `SENSORS`, seconds."""
 
     @property
     def valid(self) -> NDArray[np.bool_]:

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from caraware._native import GNSS, IMU, SPEED_STEERING
 from caraware.ipc.arrays import BoolArray, Float64Array, UInt32Array
+from caraware.ipc.layout import SENSOR_BITS
 from caraware.ipc.stream import Observation
 
 YAW_RATE_SIGN = {"kinematic": 1.0, "specific_force": 1.0, "carla": -1.0}
@@ -62,15 +62,15 @@ def read_samples(obs: Observation, convention: str) -> Samples:
         fix_m=fix_m,
         fix_error_m=_f64(obs.gnss_quality)[:, 0],
         fix_age_s=age_s[:, 0],
-        fix_on=((sensors & GNSS) != 0) & np.isfinite(fix_m).all(0),
+        fix_on=((sensors & SENSOR_BITS["gnss"]) != 0) & np.isfinite(fix_m).all(0),
         accel_mps2=accel_mps2,
         yaw_rate_radps=YAW_RATE_SIGN[convention] * yaw_rate_radps,
         yaw_rad=np.pi / 2 - compass_rad,
         imu_age_s=age_s[:, 1],
-        imu_on=((sensors & IMU) != 0) & finite_imu,
+        imu_on=((sensors & SENSOR_BITS["imu"]) != 0) & finite_imu,
         wheel_mps=wheel_mps,
         wheel_age_s=age_s[:, 2],
-        wheel_on=((sensors & SPEED_STEERING) != 0) & np.isfinite(wheel_mps),
+        wheel_on=((sensors & SENSOR_BITS["speed_steering"]) != 0) & np.isfinite(wheel_mps),
     )
 
 

@@ -172,7 +172,7 @@ class Observation:
 
     @cached_property
     def sensors(self) -> UInt32Array:
-        """u32 [n]: bits `GNSS`, `IMU`, `SPEED_STEERING`, `LIDAR` of `caraware._native`: which sensors deliver."""
+        """u32 [n]: bits of the sensors that deliver (`caraware.ipc.layout.SENSOR_BITS`)."""
         return self._array("sensors", np.uint32)
 
     @cached_property

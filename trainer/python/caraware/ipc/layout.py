@@ -1,4 +1,4 @@
-"""Records in shared memory as numpy types, from the tables that the native extension carries."""
+"""Records in shared memory as numpy types, and the sensors' bits, from the tables of the native extension."""
 
 import json
 from typing import Any
@@ -8,6 +8,9 @@ import numpy as np
 from caraware import _native
 
 _LAYOUT: dict[str, Any] = json.loads(_native.LAYOUT_JSON)
+
+SENSOR_BITS: dict[str, int] = {row["name"]: row["bit"] for row in _LAYOUT["sensors"]}
+"""Bit of each sensor in an observation's `sensors`, by its name in commands and keys."""
 
 
 def record(name: str) -> np.dtype[np.void]:

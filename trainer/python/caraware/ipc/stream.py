@@ -99,11 +99,11 @@ class Observation(LearningTick, Protocol):
 
     @property
     def sensors(self) -> UInt32Array:
-        """u32 `[n]`: bits of the sensors that deliver: 1 GNSS, 2 IMU, 4 speed and steering, 8 LIDAR."""
+        """u32 `[n]`: bits of the sensors that deliver (`caraware.ipc.layout.SENSOR_BITS`)."""
 
     @property
     def age_s(self) -> Float32Array:
-        """f32 `[n, 4]`: age of the newest sample of each sensor, in the order of the bits."""
+        """f32 `[n, 4]`: age of the newest GNSS, IMU, speed-steering and LIDAR sample (s)."""
 
     @property
     def episode_step(self) -> UInt32Array:
