@@ -231,10 +231,16 @@ mod tests {
             (Some(2.0), Some(3.0), Some(0.5))
         );
         assert_eq!(observation.position_errors(None).policy, None);
-        assert_eq!(
-            serde_json::to_value(observation.delivering()).unwrap(),
-            serde_json::json!({ "gnss": 2, "imu": 0, "speed_steering": 0, "lidar": 2 })
-        );
+        let delivering = serde_json::to_value(observation.delivering()).unwrap();
+        for kind in SensorKind::ALL {
+            let is_counted = matches!(kind, SensorKind::Gnss | SensorKind::Lidar);
+            assert_eq!(
+                delivering[kind.name()],
+                if is_counted { 2 } else { 0 },
+                "{}",
+                kind.name()
+            );
+        }
         assert!(ObservationView::of(&header, &[0; 64]).is_none());
     }
 

@@ -5,7 +5,7 @@
 mod common;
 
 use common::{Run, config, map, quiet, road_user};
-use ipc_schema::sensor::{ALL_SENSORS, SensorKind};
+use ipc_schema::sensor::{SensorKind, fitted_sensors};
 use ipc_schema::{
     block,
     config::Field,
@@ -185,7 +185,7 @@ fn pedestrians_carry_a_smartphone_without_speed_and_steering() {
     person.accel_body_mps2 = [10.0, 0.0, 0.0];
     let tick = run.tick(&[road_user(0, Kind::Cav), person]);
     assert_eq!(tick.section::<u32>("vehicle"), [0, 1]);
-    let of_vehicle = ALL_SENSORS & !SensorKind::Lidar.bit();
+    let of_vehicle = fitted_sensors(&config);
     let of_person = of_vehicle & !SensorKind::SpeedSteering.bit();
     assert_eq!(tick.section::<u32>("sensors"), [of_vehicle, of_person]);
     assert_eq!(tick.section::<u32>("flags"), [VALID; 2]);
