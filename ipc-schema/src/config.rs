@@ -9,10 +9,12 @@ mod curriculum;
 mod observation;
 mod region;
 mod sensors;
+mod ultrasonic;
 pub use curriculum::*;
 pub use observation::*;
 pub use region::*;
 pub use sensors::*;
+pub use ultrasonic::*;
 
 /// One whole configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -50,6 +52,8 @@ pub struct Config {
     pub speed_steering: SpeedSteeringConfig,
     /// Spinning LIDAR.
     pub lidar: LidarConfig,
+    /// Ultrasonic sensors in the bumpers.
+    pub ultrasonic: UltrasonicConfig,
     /// What happens while a sensor is dark.
     pub blackout: BlackoutConfig,
     /// Fields and normalisation of the observation.

@@ -93,7 +93,7 @@ macro_rules! fields {
 
 use FieldRange::{MapX, MapY, PlusMinus, UpTo, Within};
 use FieldSource::{Delivery, Measurement, Route};
-use SensorKind::{Gnss, Imu, Lidar, SpeedSteering};
+use SensorKind::{Gnss, Imu, Lidar, SpeedSteering, Ultrasonic};
 
 const ACCELERATION: FieldRange = PlusMinus(|config| config.observation.accel_range_mps2);
 const ROTATION: FieldRange = PlusMinus(|config| config.observation.gyro_range_radps);
@@ -102,6 +102,8 @@ const AGE: FieldRange = UpTo(|config| config.observation.age_range_s);
 const VALIDITY: FieldRange = Within(0.0, 1.0);
 /// The end of the range stands for no object.
 const OBJECT: FieldRange = PlusMinus(|config| config.lidar.range_m);
+/// The end of the range stands for no echo.
+const ECHO: FieldRange = UpTo(|config| config.ultrasonic.range_m);
 /// The end of the range stands for nothing in sight.
 const SIGHT: FieldRange = Within(0.0, SIGHT_M);
 
@@ -193,6 +195,34 @@ fields! {
     LeaderSpeed: "leader_speed", "m/s", SPEED, Route;
     /// Distance to the next stop line whose signal is not green.
     SignalGap: "signal_gap", "m", SIGHT, Route;
+    /// Range of the ultrasonic sensor in mount 1.
+    Ultrasonic1: "ultrasonic_1", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 2.
+    Ultrasonic2: "ultrasonic_2", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 3.
+    Ultrasonic3: "ultrasonic_3", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 4.
+    Ultrasonic4: "ultrasonic_4", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 5.
+    Ultrasonic5: "ultrasonic_5", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 6.
+    Ultrasonic6: "ultrasonic_6", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 7.
+    Ultrasonic7: "ultrasonic_7", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 8.
+    Ultrasonic8: "ultrasonic_8", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 9.
+    Ultrasonic9: "ultrasonic_9", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 10.
+    Ultrasonic10: "ultrasonic_10", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 11.
+    Ultrasonic11: "ultrasonic_11", "m", ECHO, Measurement(Ultrasonic);
+    /// Range of the ultrasonic sensor in mount 12.
+    Ultrasonic12: "ultrasonic_12", "m", ECHO, Measurement(Ultrasonic);
+    /// Age of the newest ultrasonic sample.
+    UltrasonicAge: "ultrasonic_age", "s", AGE, Delivery(Ultrasonic);
+    /// 1 while the ultrasonic sensors deliver, 0 in a blackout.
+    UltrasonicValid: "ultrasonic_valid", "", VALIDITY, Delivery(Ultrasonic);
 }
 
 /// Some fields of a preset.
@@ -226,7 +256,7 @@ const PAPER: PresetPart = PresetPart::Named(&[
 const WHEELS: PresetPart = PresetPart::Named(&[Field::Speed, Field::Steering]);
 
 /// Every preset of `observation.fields`.
-pub const FIELD_PRESETS: [FieldPreset; 3] = [
+pub const FIELD_PRESETS: [FieldPreset; 4] = [
     FieldPreset {
         name: "paper",
         parts: &[PAPER],
@@ -238,6 +268,10 @@ pub const FIELD_PRESETS: [FieldPreset; 3] = [
     FieldPreset {
         name: "driving",
         parts: &[WHEELS, PresetPart::All(Route)],
+    },
+    FieldPreset {
+        name: "ultrasonic",
+        parts: &[PAPER, WHEELS, PresetPart::All(Measurement(Ultrasonic))],
     },
 ];
 
@@ -406,5 +440,11 @@ mod tests {
             "signal_gap",
         ];
         assert_eq!(names("driving"), driving);
+        let (ultrasonic, caraware) = (names("ultrasonic"), names("caraware"));
+        assert_eq!(ultrasonic[..11], caraware);
+        assert_eq!(
+            (ultrasonic.len(), ultrasonic[11], ultrasonic[22]),
+            (23, "ultrasonic_1", "ultrasonic_12")
+        );
     }
 }

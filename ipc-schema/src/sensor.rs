@@ -19,6 +19,8 @@ pub enum SensorKind {
     SpeedSteering = 2,
     /// Spinning LIDAR.
     Lidar = 3,
+    /// Ultrasonic sensors in the bumpers.
+    Ultrasonic = 4,
 }
 
 /// Which road users carry a sensor.
@@ -48,6 +50,8 @@ pub enum SceneUse {
     Sky,
     /// Rays that hit surfaces.
     Rays,
+    /// Distances to buildings and props.
+    Solids,
 }
 
 /// A random stream. Its number goes into the counter of every draw, so a new stream takes a number that was never used.
@@ -64,6 +68,8 @@ pub enum NoiseStream {
     SpeedSteering = 4,
     /// LIDAR: the key of a scan, and its rays.
     Lidar = 5,
+    /// Ultrasonic sensors: the range of each.
+    Ultrasonic = 6,
     /// GNSS receiver, correlated noise: east, north, up.
     GnssCorrelated = 32,
     /// IMU, walk of the biases of the accelerometer and of x of the gyroscope.
@@ -80,6 +86,8 @@ pub enum NoiseStream {
     SpeedSteeringBlackout = 42,
     /// Blackouts of the LIDAR.
     LidarBlackout = 43,
+    /// Blackouts of the ultrasonic sensors.
+    UltrasonicBlackout = 44,
 }
 
 /// Lengths and gaps of a sensor's blackouts, shortest and longest, seconds.
@@ -148,7 +156,7 @@ macro_rules! scale_blackouts {
 }
 
 /// Every sensor, by [`SensorKind`].
-pub const SENSORS: [SensorSpec; 4] = [
+pub const SENSORS: [SensorSpec; 5] = [
     SensorSpec {
         kind: SensorKind::Gnss,
         name: "gnss",
@@ -225,6 +233,25 @@ pub const SENSORS: [SensorSpec; 4] = [
         // A curriculum leaves its noise as it is.
         scale_noise: |_, _| (),
         scale_blackouts: scale_blackouts!(lidar),
+    },
+    SensorSpec {
+        kind: SensorKind::Ultrasonic,
+        name: "ultrasonic",
+        label: "ultrasonic",
+        description: "Ultrasonic sensors in the bumpers",
+        carriers: SensorCarriers::Vehicles,
+        noise: &[NoiseStream::Ultrasonic],
+        blackout_noise: NoiseStream::UltrasonicBlackout,
+        vehicles: |config| config.ultrasonic.vehicles,
+        input: SensorInput::Surroundings,
+        scene: |config| match config.ultrasonic.vehicles {
+            0 => SceneUse::Unused,
+            _ => SceneUse::Solids,
+        },
+        period_s: |config| config.ultrasonic.period_s,
+        blackouts: blackouts!(ultrasonic),
+        scale_noise: |config, factor| config.ultrasonic.scale_noise(factor),
+        scale_blackouts: scale_blackouts!(ultrasonic),
     },
 ];
 
@@ -393,7 +420,7 @@ mod tests {
             .collect();
         numbers.sort_unstable();
         // The numbers that every run so far was drawn with: one that changes changes every observation.
-        assert_eq!(numbers, [1, 2, 3, 4, 5, 32, 33, 34, 35, 40, 41, 42, 43]);
+        assert_eq!(numbers, [1, 2, 3, 4, 5, 6, 32, 33, 34, 35, 40, 41, 42, 43, 44]);
         // A stream has the low eight bits of a word, a part of a sample the others.
         assert!(numbers.iter().all(|number| (1..256).contains(number)));
     }
@@ -413,7 +440,7 @@ mod tests {
         let refused = serde_json::from_str::<SensorSelection>("\"nose\"").unwrap_err();
         assert_eq!(
             refused.to_string(),
-            "unknown sensor `nose`, expected one of gnss, imu, speed_steering, lidar, all"
+            "unknown sensor `nose`, expected one of gnss, imu, speed_steering, lidar, ultrasonic, all"
         );
     }
 }

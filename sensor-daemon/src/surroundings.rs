@@ -18,12 +18,13 @@ use sim_core::{
 use crate::{
     scanning::{LidarScanning, ScanTotals},
     sensing::{Sensing, WorldTick},
-    sensors::sky::SkyMap,
+    sensors::{sky::SkyMap, ultrasonic::UltrasonicSampling},
 };
 
 /// The sensors of the surroundings of a run, those that its configuration has.
 pub struct Surroundings {
     lidars: Option<LidarScanning>,
+    ultrasonic: Option<UltrasonicSampling>,
 }
 
 impl Surroundings {
@@ -34,7 +35,10 @@ impl Surroundings {
     pub fn open(membership: &mut RunMembership, sensing: &mut Sensing) -> Result<Self, Failure> {
         let uses = SENSORS.map(|spec| (spec.scene)(&membership.run.config));
         if uses.iter().all(|scene| *scene == SceneUse::Unused) {
-            return Ok(Self { lidars: None });
+            return Ok(Self {
+                lidars: None,
+                ultrasonic: None,
+            });
         }
         let scenes = Scene::of_every_map(&membership.run)?;
         if uses.contains(&SceneUse::Sky) {
@@ -48,7 +52,9 @@ impl Surroundings {
             let publisher = membership.publisher(Channel::Pointcloud)?;
             lidars = Some(LidarScanning::new(&membership.run.config, &scenes, publisher)?);
         }
-        Ok(Self { lidars })
+        let ultrasonic = uses.contains(&SceneUse::Solids);
+        let ultrasonic = ultrasonic.then(|| UltrasonicSampling::new(&session.run.config, &scenes));
+        Ok(Self { lidars, ultrasonic })
     }
 
     /// Samples every sensor that is due at the tick of the last [`Sensing::assign`], and passes the samples to `sensing`.
@@ -63,6 +69,9 @@ impl Surroundings {
     ) -> Result<(), Failure> {
         if let Some(lidars) = &mut self.lidars {
             lidars.scan(header, road_users.states, road_users.sub_steps, sensing)?;
+        }
+        if let Some(ultrasonic) = &mut self.ultrasonic {
+            ultrasonic.sample(header, road_users.states, sensing);
         }
         Ok(())
     }

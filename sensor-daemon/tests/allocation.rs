@@ -11,6 +11,7 @@ mod common;
 use std::{
     alloc::{GlobalAlloc, Layout, System},
     cell::Cell,
+    sync::Arc,
 };
 
 use ipc_schema::{
@@ -18,7 +19,11 @@ use ipc_schema::{
     observation::ObservationLayout,
     world::SubStep,
 };
-use sensor_daemon::sensing::{Sensing, WorldTick};
+use sensor_daemon::{
+    sensing::{Sensing, WorldTick},
+    sensors::ultrasonic::UltrasonicSampling,
+};
+use sim_core::scene::{Prism, Scene, SolidClass};
 
 thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
@@ -52,6 +57,11 @@ fn a_tick_allocates_nothing() {
     config.observation.history = 2;
     config.gnss.correlated_std_m = [1.0; 3];
     config.imu.period_s = 0.01;
+    config.ultrasonic.vehicles = 100;
+    let corners = vec![[40.0, 81.0], [160.0, 81.0], [160.0, 90.0], [40.0, 90.0]];
+    let house = Prism::new("house".into(), SolidClass::Building, corners, 0.0, 6.0).unwrap();
+    let scene = Arc::new(Scene::new(Default::default(), vec![house], Vec::new()));
+    let mut ultrasonic = UltrasonicSampling::new(&config, &[scene]);
     let mut sensing = Sensing::new(&config, &common::map()).unwrap();
     let states = common::cavs(300);
     let sub_steps = vec![SubStep::default(); states.len() * SUB_STEPS];
@@ -73,6 +83,7 @@ fn a_tick_allocates_nothing() {
         payload.resize(layout.len.div_ceil(8), 0_u64);
         let before = ALLOCATIONS.get();
         sensing.assign(&header, &states);
+        ultrasonic.sample(&header, &states, &mut sensing);
         sensing
             .observe(&header, &world, bytemuck::cast_slice_mut(&mut payload))
             .unwrap();

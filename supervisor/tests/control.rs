@@ -202,6 +202,29 @@ fn a_run_with_commands_is_made_again_from_its_log() {
     workplace.assert_nothing_left();
 }
 
+/// Sensors of the surroundings follow commands too, and the log makes the same bytes again.
+#[test]
+fn ultrasonic_sensors_are_switched_off_and_the_run_is_made_again() {
+    let workplace = Workplace::new();
+    let settings = [
+        "--set",
+        "ultrasonic.vehicles=6",
+        "--set",
+        "observation.fields=ultrasonic",
+    ];
+    workplace.succeed(&arguments("simulate", "heard", &settings));
+    let run = Run::start(&workplace, "simulate", "muted", &settings);
+    run.done(&["sensor", "all", "ultrasonic", "off"]);
+    let muted = run.finish();
+    assert_ne!(muted, hash(&workplace, "heard"));
+
+    let file = workplace.write("commands.jsonl", &log(&workplace, "muted").unwrap());
+    let again = [&settings[..], &["--commands", file.to_str().unwrap()]].concat();
+    workplace.succeed(&arguments("simulate", "again", &again));
+    assert_eq!(hash(&workplace, "again"), muted);
+    workplace.assert_nothing_left();
+}
+
 /// Simulated time does not depend on the clock: pauses and steps change nothing, and a learner that waits meanwhile loses nothing.
 #[test]
 fn pauses_and_steps_leave_no_trace() {
@@ -239,6 +262,10 @@ fn wrong_requests_are_refused_with_their_reasons_and_the_run_continues() {
     run.refused(&["sensor", "cav.999", "gnss", "off"], "is not on the road now");
     run.refused(&["sensor", "other.0", "gnss", "off"], "carries no sensors");
     run.refused(&["sensor", "all", "lidar", "off"], "carries the sensor `lidar`");
+    run.refused(
+        &["sensor", "cav.0", "ultrasonic", "off"],
+        "carries the sensor `ultrasonic`",
+    );
     run.refused(
         &["start", "unknown", "ring_west_2"],
         "is not a vehicle of the population",

@@ -37,6 +37,13 @@ def test_it_has_counts_times_sensors_and_errors() -> None:
         assert part in text, part
 
 
+def test_every_sensor_of_the_table_is_counted() -> None:
+    sensors = np.array([wire.sensor_bit("ultrasonic") | wire.sensor_bit("gnss"), wire.sensor_bit("gnss")], np.uint32)
+    text = hud(picture(sensors=sensors), MAP, [], ViewerFigures())
+    assert "GNSS 2" in text
+    assert "ultrasonic 1" in text
+
+
 def test_a_followed_vehicle_has_the_figures_of_its_sensors() -> None:
     imu = np.zeros((2, 1, 7), np.float32)
     imu[1, 0] = [1, -2, 9.8, 0, 0, math.radians(30), math.radians(93)]

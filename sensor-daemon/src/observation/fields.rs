@@ -1,12 +1,12 @@
 //! Turns sensor values into a normalised row of the observation.
 
 use ipc_schema::{
-    config::{Config, Field, Scale},
+    config::{Config, Field, Scale, ULTRASONIC_MOUNTS},
     sensor::SensorKind,
     world::HeroView,
 };
 
-use crate::{sensors::gnss::GnssFix, sensors::imu, sensors::speed_steering};
+use crate::{sensors::gnss::GnssFix, sensors::imu, sensors::speed_steering, sensors::ultrasonic::UltrasonicRanges};
 
 /// The newest samples of one vehicle's sensors.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -19,6 +19,8 @@ pub struct SensorReadings {
     pub speed_steering: speed_steering::SpeedSteeringSample,
     /// Nearest points of the nearest objects that the LIDAR sees, forward and left of the rear axle, metres.
     pub objects_m: [[f32; 2]; 4],
+    /// Range that each ultrasonic sensor measures, metres.
+    pub ultrasonic_m: UltrasonicRanges,
     /// Ages of the newest samples by sensor, seconds.
     pub ages_s: [f32; SensorKind::COUNT],
     /// Bits of the sensors that deliver.
@@ -28,11 +30,12 @@ pub struct SensorReadings {
 }
 
 impl SensorReadings {
-    /// Readings of a carrier whose sensors have not sampled yet, and of the sensors that it lacks: no object is in sight.
+    /// Readings of a carrier whose sensors have not sampled yet, and of the sensors that it lacks: no object is in sight, and no echo is heard.
     #[must_use]
     pub fn unsensed(config: &Config) -> Self {
         Self {
             objects_m: [[config.lidar.range_m as f32; 2]; 4],
+            ultrasonic_m: [config.ultrasonic.range_m as f32; ULTRASONIC_MOUNTS],
             ..Self::default()
         }
     }
@@ -82,6 +85,20 @@ impl SensorReadings {
             Field::LeaderGap => f64::from(self.route.leader_gap_m),
             Field::LeaderSpeed => f64::from(self.route.leader_speed_mps),
             Field::SignalGap => f64::from(self.route.signal_gap_m),
+            Field::Ultrasonic1 => f64::from(self.ultrasonic_m[0]),
+            Field::Ultrasonic2 => f64::from(self.ultrasonic_m[1]),
+            Field::Ultrasonic3 => f64::from(self.ultrasonic_m[2]),
+            Field::Ultrasonic4 => f64::from(self.ultrasonic_m[3]),
+            Field::Ultrasonic5 => f64::from(self.ultrasonic_m[4]),
+            Field::Ultrasonic6 => f64::from(self.ultrasonic_m[5]),
+            Field::Ultrasonic7 => f64::from(self.ultrasonic_m[6]),
+            Field::Ultrasonic8 => f64::from(self.ultrasonic_m[7]),
+            Field::Ultrasonic9 => f64::from(self.ultrasonic_m[8]),
+            Field::Ultrasonic10 => f64::from(self.ultrasonic_m[9]),
+            Field::Ultrasonic11 => f64::from(self.ultrasonic_m[10]),
+            Field::Ultrasonic12 => f64::from(self.ultrasonic_m[11]),
+            Field::UltrasonicAge => f64::from(self.ages_s[SensorKind::Ultrasonic.index()]),
+            Field::UltrasonicValid => deliver(SensorKind::Ultrasonic.bit()),
         }
     }
 }
@@ -248,7 +265,7 @@ mod tests {
                 accuracy_m: 12.5,
                 ..GnssFix::default()
             },
-            ages_s: [2.5, 0.0, 10.0, 0.0],
+            ages_s: [2.5, 0.0, 10.0, 0.0, 0.0],
             delivering: SensorKind::Imu.bit(),
             objects_m: [[80.0, -40.0], [0.0, 0.0], [0.0, 0.0], [20.0, 80.0]],
             ..SensorReadings::default()
