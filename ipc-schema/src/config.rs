@@ -200,6 +200,17 @@ pub enum TaskKind {
     Driving,
 }
 
+impl TaskKind {
+    /// Its name in configurations.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Localisation => "localisation",
+            Self::Driving => "driving",
+        }
+    }
+}
+
 /// What the trainer's output means.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -3,6 +3,8 @@
 //! A trainer reports the metrics of its task on its board; the progress line, `caraware ps`, the fan-out's status, the HUD and
 //! the native extension derive theirs from [`METRICS`]. A new metric is a row here and a value that the task measures.
 
+use serde::{Deserialize, Serialize};
+
 use crate::config::TaskKind;
 
 /// Which values of a metric are better.
@@ -27,11 +29,21 @@ pub struct MetricSpec {
     pub direction: MetricDirection,
     /// The task that measures it.
     pub task: TaskKind,
-    /// The metric of the policy that this one is a reference for, measured without the policy on the same samples.
+    /// The metric of the policy that this one is a reference for, measured without the policy on the same samples. Its name is
+    /// that metric's after the name of the estimator that it measures: `raw_gnss` and `error_m`.
     pub reference_for: Option<&'static str>,
 }
 
 impl MetricSpec {
+    /// What this metric measures, as keys of a report begin: the policy, `ppo`, or of a reference its estimator.
+    #[must_use]
+    pub fn estimator(&self) -> &'static str {
+        match self.reference_for {
+            Some(of_policy) => self.name.trim_end_matches(of_policy).trim_end_matches('_'),
+            None => "ppo",
+        }
+    }
+
     /// Key of an estimator's mean in a report, such as `ppo_mean_error_m`.
     #[must_use]
     pub fn mean_key(&self, estimator: &str) -> String {
@@ -43,6 +55,49 @@ impl MetricSpec {
     pub fn interval_key(&self, estimator: &str) -> String {
         let unit = self.name.rsplit('_').next().unwrap_or(self.name);
         format!("{estimator}_ci95_{unit}")
+    }
+}
+
+/// A metric that measures the policy, in a configuration. It is written as its name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "&'static str")]
+pub struct PolicyMetric(&'static MetricSpec);
+
+impl PolicyMetric {
+    /// All of them, in the order of [`METRICS`].
+    pub fn all() -> impl Iterator<Item = Self> {
+        METRICS.iter().filter(|metric| metric.reference_for.is_none()).map(Self)
+    }
+
+    /// The metric called `name`; `None` if there is none, or if it measures a reference.
+    #[must_use]
+    pub fn by_name(name: &str) -> Option<Self> {
+        Self::all().find(|metric| metric.spec().name == name)
+    }
+
+    /// Its row of [`METRICS`].
+    #[must_use]
+    pub const fn spec(self) -> &'static MetricSpec {
+        self.0
+    }
+}
+
+/// No metric of the policy has this name.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("no metric of the policy is called \"{0}\"")]
+pub struct UnknownMetric(String);
+
+impl TryFrom<String> for PolicyMetric {
+    type Error = UnknownMetric;
+
+    fn try_from(name: String) -> Result<Self, UnknownMetric> {
+        Self::by_name(&name).ok_or(UnknownMetric(name))
+    }
+}
+
+impl From<PolicyMetric> for &'static str {
+    fn from(metric: PolicyMetric) -> Self {
+        metric.spec().name
     }
 }
 
@@ -156,6 +211,7 @@ mod tests {
         let error = headline(TaskKind::Localisation);
         assert_eq!(error.mean_key("ppo"), "ppo_mean_error_m");
         assert_eq!(error.interval_key("raw_gnss"), "raw_gnss_ci95_m");
+        assert_eq!(error.estimator(), "ppo");
     }
 
     #[test]
@@ -164,8 +220,19 @@ mod tests {
             let Some(name) = metric.reference_for else { continue };
             let of_policy = METRICS[place_of(name).unwrap()];
             assert_eq!((of_policy.reference_for, of_policy.task), (None, metric.task));
+            assert_eq!(format!("{}_{name}", metric.estimator()), metric.name);
             assert_eq!((of_policy.unit, of_policy.direction), (metric.unit, metric.direction));
         }
+    }
+
+    #[test]
+    fn a_metric_of_the_policy_is_written_as_its_name() {
+        let names: Vec<&str> = PolicyMetric::all().map(|metric| metric.spec().name).collect();
+        assert_eq!(names, ["error_m", "progress_mps", "route_offset_m"]);
+        let metric: PolicyMetric = serde_json::from_str("\"error_m\"").unwrap();
+        assert_eq!(serde_json::to_string(&metric).unwrap(), "\"error_m\"");
+        let error = serde_json::from_str::<PolicyMetric>("\"raw_gnss_error_m\"").unwrap_err();
+        assert!(error.to_string().contains("no metric of the policy"), "{error}");
     }
 
     #[test]

@@ -317,11 +317,15 @@ fn errors(report: &Value) -> Vec<String> {
             Some(seeds) if seeds > 1 => format!("{seeds} unseen seeds (± 95 %)"),
             _ => "unseen seeds".to_owned(),
         };
+        let references = METRICS
+            .iter()
+            .filter(|other| other.reference_for == Some(metric.name))
+            .map(|other| format!(", {} {}", other.label, error(other.estimator())));
         lines.push(format!(
-            "mean {} on {seeds}: policy {}, raw GNSS {}   (policy σ {})",
+            "mean {} on {seeds}: policy {}{}   (policy σ {})",
             metric.label,
             error("ppo"),
-            error("raw_gnss"),
+            references.collect::<String>(),
             number(report, "policy_std", 3)
         ));
     }

@@ -75,8 +75,8 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
     assert_eq!(vehicles.len(), 4);
     for vehicle in vehicles {
         assert!(vehicle["vehicle"].as_str().unwrap().starts_with("cav."));
-        assert!(vehicle["now_m"]["ppo"].as_f64().unwrap() > 0.0);
-        assert!(vehicle["mean_m"]["ekf"].as_f64().unwrap() > 0.0);
+        assert!(vehicle["now"]["ppo"].as_f64().unwrap() > 0.0);
+        assert!(vehicle["mean"]["ekf"].as_f64().unwrap() > 0.0);
     }
 
     // Without a limit, from a checkpoint's directory: predictions are published, and Ctrl-C ends the run with a report.

@@ -1,9 +1,6 @@
 //! The table of metrics for Python.
 
-use ipc_schema::{
-    config::TaskKind,
-    metric::{MetricDirection, MetricSpec},
-};
+use ipc_schema::metric::{MetricDirection, MetricSpec};
 use pyo3::prelude::*;
 
 /// A row of `METRICS`.
@@ -30,10 +27,7 @@ impl Metric {
             label: spec.label,
             unit: spec.unit,
             higher_is_better: spec.direction == MetricDirection::HigherIsBetter,
-            task: match spec.task {
-                TaskKind::Localisation => "localisation",
-                TaskKind::Driving => "driving",
-            },
+            task: spec.task.name(),
             reference_for: spec.reference_for,
         }
     }

@@ -96,10 +96,10 @@ def test_the_report_has_every_mean_with_its_interval(tmp_path: Path, caplog: pyt
 
 def test_intervals_are_over_seeds() -> None:
     """Three episodes whose mean errors are known by hand: t(0.95, 2) s/√3."""
-    phase = Evaluation()
+    phase = Evaluation("error_m")
     for obs in street_ticks(6, 4, 1.0, seed=1):
         error_m = np.full(4, [2.0, 3.0, 7.0][obs.tick // 2])
-        phase.add(replace(obs, episode=obs.tick // 2), error_m, 2 * error_m)
+        phase.add(replace(obs, episode=obs.tick // 2), {"ppo": error_m, "raw_gnss": 2 * error_m})
     result = phase.result(0, 1)
     policy = result.estimates["ppo"]
     assert (policy.mean, result.episodes) == (4.0, 3)
@@ -148,11 +148,11 @@ def test_the_interval_covers_the_true_mean() -> None:
     rng, covered = np.random.default_rng(1), 0
     (obs,) = street_ticks(1, 40, 5.0, seed=1)
     for _ in range(400):
-        phase = Evaluation()
+        phase = Evaluation("error_m")
         level = rng.normal(2.0, 0.5, 40)
         for _ in range(5):
             errors_m = level + rng.normal(0, 0.3, 40)
-            phase.add(obs, errors_m, errors_m)
+            phase.add(obs, {"ppo": errors_m, "raw_gnss": errors_m})
         result = phase.result(0, 0)
         covered += abs(result.estimates["ppo"].mean - 2.0) < result.estimates["ppo"].half_width()
     assert abs(covered / 400 - 0.95) < 4 * math.sqrt(0.95 * 0.05 / 400)

@@ -267,7 +267,8 @@ def test_the_newest_sound_checkpoint_is_found_past_damaged_ones(
 
 
 def test_the_course_of_training_comes_back_exactly(tmp_path: Path) -> None:
-    evaluation = EvaluationResult(7, 1, 2, 300, {"ppo": Estimate(4.5, 0.1), "raw_gnss": Estimate(7.0, 0.2)})
+    estimates = {"ppo": Estimate(4.5, 0.1), "raw_gnss": Estimate(7.0, 0.2)}
+    evaluation = EvaluationResult(7, 1, 2, 300, estimates, metric="error_m")
     points = [
         TrainingPoint(7, 0.3, 0.1, {"error_m": 5.25, "raw_gnss_error_m": math.pi}, 1e4),
         TrainingPoint(2**40, 0.1, 0.2, {"error_m": math.nan, "raw_gnss_error_m": 6.0}, 0.0),

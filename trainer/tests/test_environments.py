@@ -116,7 +116,7 @@ def test_shares_of_a_horizon_add_up() -> None:
 
 def result(environment: int, samples: int, mean_m: float, standard_error_m: float) -> EvaluationResult:
     estimates = {"ppo": Estimate(mean_m, standard_error_m), "raw_gnss": Estimate(7.0, 0.1)}
-    return EvaluationResult(100, 1, 1, samples, estimates, environment)
+    return EvaluationResult(100, 1, 1, samples, estimates, environment, metric="error_m")
 
 
 def test_pooling_weighs_by_samples_and_waits_for_every_environment() -> None:

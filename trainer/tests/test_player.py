@@ -88,10 +88,10 @@ def test_errors_are_those_of_predictions_filter_and_fix(tmp_path: Path) -> None:
 def test_the_table_has_a_row_for_every_vehicle(tmp_path: Path) -> None:
     loop_over(tmp_path, ticks())
     table = json.loads((tmp_path / LIVE).read_text())["table"]
-    assert (table["episode"], len(table["vehicles"])) == (1, VEHICLES)
+    assert (table["metric"], table["episode"], len(table["vehicles"])) == ("error_m", 1, VEHICLES)
     for row in table["vehicles"]:
-        assert set(row["now_m"]) == set(row["mean_m"]) == {"ppo", "ekf", "raw_gnss"}
-        assert all(math.isfinite(value) for value in [*row["now_m"].values(), *row["mean_m"].values()])
+        assert set(row["now"]) == set(row["mean"]) == {"ppo", "ekf", "raw_gnss"}
+        assert all(math.isfinite(value) for value in [*row["now"].values(), *row["mean"].values()])
 
 
 def test_a_successor_continues_the_counts_of_the_file(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """The contract of the tasks: what they declare, and that they treat a learner's rows like a face's slots."""
 
+import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +12,14 @@ from caraware import _native
 from caraware.envs import Transition, rewards
 from caraware.envs.settings import FaceSettings
 from caraware.envs.transition import Rows
+from caraware.ipc.arrays import BoolArray
 from caraware.ipc.run_file import ConfigError, RunFile
 from caraware.tasks.contract import EndKind, Sampling, Task, TaskOutcome, TaskRows, TaskStep
 from caraware.tasks.driving import Driving, OutcomeMissingError
 from caraware.tasks.localisation import Localisation
+from caraware.tasks.metrics import reference_names
 from caraware.tasks.table import TASKS, task_of_run
+from torch import Tensor
 
 DOCS = Path(__file__).parents[2] / "docs"
 ROWS = 6
@@ -37,6 +42,15 @@ def run_of(task: str) -> RunFile:
         {"name": "route_offset", "unit": "m", "range": [-5.0, 5.0]},
     ]
     return {"config": config, "map": {"bounds_m": [0.0, -50.0, 200.0, 50.0]}, "observation_fields": fields}
+
+
+@dataclass(frozen=True)
+class MeasuredRows:
+    """A tick as metrics take it."""
+
+    truth: Tensor
+    gnss_m: Tensor
+    valid: BoolArray
 
 
 def rows(seed: int) -> TaskRows:
@@ -87,6 +101,22 @@ def test_rows_of_a_learner_earn_what_slots_of_a_face_earn(task: Task) -> None:
     assert earned.tolist() == pytest.approx(task.reward(given, action).tolist(), rel=1e-5)
     for name, value in task.measure(given, action).items():
         assert rewards.measured(transition, action.numpy())[name].tolist() == pytest.approx(value.tolist(), rel=1e-6)
+
+
+def test_what_was_published_is_measured_as_the_action_is() -> None:
+    """Without the rows that are not valid; for a metric of driving the outcome is missing."""
+    run, given, valid = run_of("localisation"), step(), np.arange(ROWS) % 2 == 0
+    action = torch.linspace(-1.2, 1.2, ROWS * 2).view(ROWS, 2)
+    tick = MeasuredRows(given.truth, given.truth[:, :2] + 3.0, valid)
+    task = task_of_run(run)
+    measured = task.measure_answers(tick, task.answer(action))
+    expected = task.measure(given, action)
+    assert measured["error_m"].tolist() == pytest.approx(expected["error_m"][valid].tolist(), rel=1e-6)
+    (raw_m,) = task.measure_references([tick])["raw_gnss_error_m"]
+    assert raw_m.tolist() == pytest.approx([math.sqrt(18.0)] * 3, rel=1e-6)
+    assert reference_names(task.metrics[0]) == {"raw_gnss": "raw_gnss_error_m"}
+    driving = task_of_run(run_of("driving"))
+    assert (driving.measure_answers(tick, action), reference_names(driving.metrics[0])) == ({}, {})
 
 
 def test_several_actions_on_a_row_earn_what_each_alone_earns() -> None:

@@ -25,8 +25,8 @@ from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.ppo import Ppo
 from caraware.learn.rollout import Rollout
-from caraware.report.evaluation import Mean, raw_errors_m
-from caraware.tasks.localisation import Localisation
+from caraware.report.evaluation import Mean
+from caraware.tasks.localisation import Localisation, raw_errors_m
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Config, TrafficConfig};
-use crate::sensor::SENSORS;
+use crate::{metric::PolicyMetric, sensor::SENSORS};
 
 /// Stages of training.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -97,9 +97,12 @@ pub struct StageConfig {
     /// Passed once the policy's standard deviation is at most this.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub until_std: Option<f64>,
-    /// Passed once the policy's mean error in an update's samples is at most this, metres.
+    /// Passed once the mean of this metric in an update's samples is as good as `until_value`, or better.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub until_error_m: Option<f64>,
+    pub until_metric: Option<PolicyMetric>,
+    /// In the unit of `until_metric`, with which it is set.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub until_value: Option<f64>,
     /// Passed after so many lessons.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub until_lessons: Option<u64>,

@@ -2,7 +2,10 @@
 
 use miette::{Diagnostic, LabeledSpan, NamedSource, Severity, SourceCode};
 
-use super::{keys::ConfigKey, span::SourceSpan};
+use super::{
+    keys::{self, ConfigKey},
+    span::SourceSpan,
+};
 
 /// A configuration that cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -90,7 +93,10 @@ impl ConfigError {
                 nearest: Some(nearest), ..
             } => format!("did you mean `{nearest}`? All keys: configs/README.md"),
             Self::UnknownKey { nearest: None, .. } => "all keys are listed in configs/README.md".into(),
-            Self::RenamedKey { renamed_to, .. } => format!("write `{renamed_to}`. All keys: configs/README.md"),
+            Self::RenamedKey { renamed_to, .. } => {
+                let meaning = keys::find(renamed_to).map_or("", |key| key.meaning);
+                format!("write `{renamed_to}`. {meaning} All keys: configs/README.md")
+            }
             Self::Value { key, .. } => {
                 let unit = if key.unit.is_empty() {
                     String::new()

@@ -1,6 +1,9 @@
 //! The table of configuration keys: name, kind, unit, range, meaning. Checks, `--set` and `configs/README.md` derive from it.
 
-use ipc_schema::field::{FIELD_PRESETS, FIELDS};
+use ipc_schema::{
+    field::{FIELD_PRESETS, FIELDS},
+    metric::PolicyMetric,
+};
 
 /// The values that a key allows.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -29,6 +32,8 @@ pub enum ValueKind {
     Text,
     /// Observation fields: a preset by name or a list of field names.
     Fields,
+    /// The name of a metric of the policy.
+    Metric,
     /// A list of texts, which may be empty.
     Texts,
     /// `count` numbers from `min` to `max`; one number stands for all of them.
@@ -128,12 +133,16 @@ pub const STAGE_KEYS: &[ConfigKey] = &[
     optional("curriculum.stages.noise", "", 0.0, 1000.0, "Factor on random errors and biases of all sensors. Unset = 1."),
     optional("curriculum.stages.blackout", "", 0.0, 1000.0, "Factor on the lengths of blackouts (`blackout.enabled`); 0 = none. Unset = 1."),
     optional("curriculum.stages.until_std", "", 0.0, 10.0, "The stage ends once the policy's standard deviation is at most this, in units of half the map."),
-    optional("curriculum.stages.until_error_m", "m", 0.0, 1e9, "The stage ends once the mean error of the policy in the samples of an update is at most this."),
-    ConfigKey { optional: true, ..integer("curriculum.stages.until_lessons", "lessons", 1, 1_000_000_000, "The stage ends after this many lessons, if not before. Without any of these three it lasts to the end of training.") },
+    ConfigKey { optional: true, ..other("curriculum.stages.until_metric", ValueKind::Metric, "The stage ends once the mean of this metric of the task in the samples of an update is `until_value` or better, such as until_metric = \"error_m\" with until_value = 6.0.") },
+    optional("curriculum.stages.until_value", "", -1e9, 1e9, "The value that `until_metric` must reach, in the metric's unit: at most this for an error, at least this for progress."),
+    ConfigKey { optional: true, ..integer("curriculum.stages.until_lessons", "lessons", 1, 1_000_000_000, "The stage ends after this many lessons, if not before. Without a deviation, a metric or a number of lessons it lasts to the end of training.") },
 ];
 
 /// Former names of keys, with the names that they have now.
-const RENAMED_KEYS: &[(&str, &str)] = &[("curriculum.steps", "curriculum.stages")];
+const RENAMED_KEYS: &[(&str, &str)] = &[
+    ("curriculum.steps", "curriculum.stages"),
+    ("curriculum.stages.until_error_m", "curriculum.stages.until_metric"),
+];
 
 /// The name that a key has now, if `path` is a former name.
 #[must_use]
@@ -398,6 +407,10 @@ impl ConfigKey {
                 let presets = FIELD_PRESETS.map(|preset| format!("\"{}\"", preset.name));
                 let names: Vec<&str> = FIELDS.iter().map(|spec| spec.name).collect();
                 format!("{}, or a list of {}", presets.join(", "), names.join(", "))
+            }
+            ValueKind::Metric => {
+                let names: Vec<&str> = PolicyMetric::all().map(|metric| metric.spec().name).collect();
+                quoted(&names)
             }
             ValueKind::Floats { count, min, max } => format!("{count} × {min} … {max}, or one for all"),
             ValueKind::Span { min, max } => format!("[shortest, longest] in {min} … {max}"),

@@ -2,7 +2,10 @@
 
 use std::{collections::BTreeMap, sync::Arc};
 
-use ipc_schema::field::{Field, FieldPreset};
+use ipc_schema::{
+    field::{Field, FieldPreset},
+    metric::PolicyMetric,
+};
 use miette::NamedSource;
 use serde_json::Value;
 use toml::{
@@ -23,6 +26,8 @@ pub struct LocatedValue {
     pub value: Value,
     /// Where it was set.
     pub place: SourceSpan,
+    /// The settings of each entry, if the value is a list of tables.
+    pub entries: Vec<SettingsLayer>,
 }
 
 /// Settings by dotted path.
@@ -115,40 +120,47 @@ fn add_table(
             source: source.clone(),
             span: value.span(),
         };
-        let value = match key.kind {
-            ValueKind::Tables(_) => tables(key, value, source)?,
-            _ => check(key, value),
-        };
-        let value = value.ok_or_else(|| ConfigError::Value {
+        let refused = || ConfigError::Value {
             key,
             place: place.clone(),
-        })?;
-        layer.insert(key.path, LocatedValue { value, place });
+        };
+        let (value, entries) = match key.kind {
+            ValueKind::Tables(keys) => {
+                let entries = tables(key, keys, value, source)?.ok_or_else(refused)?;
+                (list_of(key, &entries), entries)
+            }
+            _ => (check(key, value).ok_or_else(refused)?, Vec::new()),
+        };
+        layer.insert(key.path, LocatedValue { value, place, entries });
     }
     Ok(())
 }
 
-/// Reads a list of tables and checks each value by its own key; `None` if the value is not such a list.
+/// Reads a list of tables and checks each value of an entry by its own key; `None` if the value is not such a list.
 fn tables(
     key: &'static ConfigKey,
+    keys: &[ConfigKey],
     value: &Spanned<DeValue<'_>>,
     source: &NamedText,
-) -> Result<Option<Value>, ConfigError> {
+) -> Result<Option<Vec<SettingsLayer>>, ConfigError> {
     let Some(items) = value.get_ref().as_array() else {
         return Ok(None);
     };
-    let mut list = Vec::new();
+    let mut entries = Vec::new();
     for item in items {
         let DeValue::Table(table) = item.get_ref() else {
             return Ok(None);
         };
         let mut layer = SettingsLayer::new();
         add_table(key.path, table, source, &mut layer)?;
-        if let ValueKind::Tables(keys) = key.kind
-            && let Some(missing) = keys.iter().find(|key| !key.optional && !layer.contains_key(key.path))
-        {
+        if let Some(missing) = keys.iter().find(|key| !key.optional && !layer.contains_key(key.path)) {
             return Err(ConfigError::Conflict {
-                message: format!("entry {} of `{}` has no `{}`", list.len() + 1, key.path, missing.leaf()),
+                message: format!(
+                    "entry {} of `{}` has no `{}`",
+                    entries.len() + 1,
+                    key.path,
+                    missing.leaf()
+                ),
                 help: format!("give `{}`. {}", missing.leaf(), missing.meaning),
                 place: SourceSpan {
                     source: source.clone(),
@@ -156,11 +168,19 @@ fn tables(
                 },
             });
         }
-        let entries = layer.values().zip(layer.keys());
-        let entries = entries.map(|(setting, path)| (path[key.path.len() + 1..].to_owned(), setting.value.clone()));
-        list.push(Value::Object(entries.collect()));
+        entries.push(layer);
     }
-    Ok(Some(Value::from(list)))
+    Ok(Some(entries))
+}
+
+/// A list of tables as the run file will hold it.
+fn list_of(key: &ConfigKey, entries: &[SettingsLayer]) -> Value {
+    let leaf = |path: &str| path[key.path.len() + 1..].to_owned();
+    let table = |layer: &SettingsLayer| {
+        let values = layer.iter().map(|(path, setting)| (leaf(path), setting.value.clone()));
+        Value::Object(values.collect())
+    };
+    entries.iter().map(table).collect()
 }
 
 /// The value if `key` allows it.
@@ -180,6 +200,10 @@ fn check(key: &ConfigKey, value: &Spanned<DeValue<'_>>) -> Option<Value> {
             .map(Value::from),
         ValueKind::Text => value.as_str().map(Value::from),
         ValueKind::Fields => fields(value),
+        ValueKind::Metric => value
+            .as_str()
+            .filter(|name| PolicyMetric::by_name(name).is_some())
+            .map(Value::from),
         ValueKind::Texts => texts(value),
         ValueKind::Floats { count, min, max } => floats(value, count, min, max).map(Value::from),
         ValueKind::Span { min, max } => floats(value, 2, min, max)

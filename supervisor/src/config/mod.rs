@@ -90,7 +90,11 @@ impl LayeredSettings {
                 source: std::sync::Arc::new(miette::NamedSource::new(source, text)),
                 span,
             };
-            *setting = LocatedValue { value, place };
+            *setting = LocatedValue {
+                value,
+                place,
+                entries: Vec::new(),
+            };
         }
     }
 

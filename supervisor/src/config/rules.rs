@@ -9,7 +9,7 @@ use ipc_schema::{
 mod curriculum;
 mod sensors;
 
-use super::{ConfigError, LayeredSettings};
+use super::{ConfigError, LayeredSettings, layer::LocatedValue};
 
 /// Checks every rule.
 pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
@@ -239,7 +239,23 @@ fn is_multiple(value_s: f64, tick_s: f64) -> bool {
 }
 
 fn conflict(settings: &LayeredSettings, path: &str, message: String, help: String) -> ConfigError {
-    match settings.setting(path) {
+    conflict_at(settings.setting(path), message, help)
+}
+
+/// A conflict at a key of one entry of a list of tables: `(list, index, key)`.
+fn conflict_in_entry(
+    settings: &LayeredSettings,
+    (list, index, key): (&str, usize, &str),
+    message: String,
+    help: String,
+) -> ConfigError {
+    let list = settings.setting(list);
+    let setting = list.and_then(|list| list.entries.get(index)?.get(key));
+    conflict_at(setting.or(list), message, help)
+}
+
+fn conflict_at(setting: Option<&LocatedValue>, message: String, help: String) -> ConfigError {
+    match setting {
         Some(setting) => ConfigError::Conflict {
             message,
             help,

@@ -390,6 +390,54 @@ fn a_stage_of_a_curriculum_is_checked_value_by_value() {
 }
 
 #[test]
+fn a_gate_names_a_metric_of_the_task_and_the_value_that_it_must_reach() {
+    let with = |lines: &str| {
+        format!("[[curriculum.stages]]\ncavs = 1\nuntil_std = 0.5\n[[curriculum.stages]]\ncavs = 8\n{lines}\n")
+    };
+    let config = config_of(&with("until_metric = \"error_m\"\nuntil_value = 6")).unwrap();
+    let stage = &config.curriculum.stages[1];
+    assert_eq!(stage.until_metric.unwrap().spec().name, "error_m");
+    assert_eq!(stage.until_value, Some(6.0));
+
+    let (message, help) = error_of(&with("until_metric = \"error_km\""));
+    assert_eq!(
+        message,
+        "my.toml:6: `curriculum.stages.until_metric` cannot be \"error_km\""
+    );
+    assert!(
+        help.starts_with("allowed: \"error_m\", \"progress_mps\", \"route_offset_m\". "),
+        "{help}"
+    );
+    let (message, help) = error_of(&with("until_value = 6.0\nuntil_metric = \"progress_mps\""));
+    assert_eq!(
+        message,
+        "my.toml:7: stage 2 of `curriculum.stages`: `until_metric` = \"progress_mps\" is no metric of the localisation task"
+    );
+    assert_eq!(help, "its metrics are \"error_m\"");
+    let (message, help) = error_of(&with("until_metric = \"error_m\""));
+    assert_eq!(
+        message,
+        "my.toml:6: stage 2 of `curriculum.stages`: `until_metric` is set without `until_value`"
+    );
+    assert_eq!(help, "give the value that ends the stage, in m");
+    let (message, help) = error_of(&with("until_value = 6.0"));
+    assert_eq!(
+        message,
+        "my.toml:6: stage 2 of `curriculum.stages`: `until_value` is set without `until_metric`"
+    );
+    assert_eq!(help, "name the metric: \"error_m\"");
+    let (message, help) = error_of(&with("until_error_m = 6.0"));
+    assert_eq!(
+        message,
+        "my.toml:6: `curriculum.stages.until_error_m` is renamed to `curriculum.stages.until_metric`"
+    );
+    assert!(
+        help.contains("until_metric = \"error_m\" with until_value = 6.0"),
+        "{help}"
+    );
+}
+
+#[test]
 fn maps_of_a_curriculum_are_names_that_the_run_has() {
     let steps = "[[curriculum.stages]]\ncavs = 1\n[[curriculum.stages]]\ncavs = 2\nmaps = [\"b\", \"town\"]\nmap_choice = \"random\"\n";
     let curriculum = config_of(&format!("[curriculum]\nmaps = [\"town\", \"nets/b.net.xml\"]\n{steps}"))

@@ -2,9 +2,12 @@
 
 use std::collections::BTreeSet;
 
-use ipc_schema::config::{Config, MapChoice, StageConfig, map_name};
+use ipc_schema::{
+    config::{Config, MapChoice, StageConfig, map_name},
+    metric::PolicyMetric,
+};
 
-use super::{ConfigError, LOCALISING_TRAINER, LayeredSettings, conflict};
+use super::{ConfigError, LOCALISING_TRAINER, LayeredSettings, conflict, conflict_in_entry};
 
 /// Most stages of a curriculum: each prefetches its maps and keeps statistics of its own.
 const MOST_STAGES: usize = 255;
@@ -54,9 +57,53 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         }
     }
     maps(settings, config)?;
-    (1..)
-        .zip(stages)
-        .try_for_each(|(number, stage)| maps_of_stage(settings, config, number, stage))
+    (1..).zip(stages).try_for_each(|(number, stage)| {
+        gate_of_stage(settings, config, number, stage)?;
+        maps_of_stage(settings, config, number, stage)
+    })
+}
+
+/// A gate has a metric of the run's task and the value that it must reach, or neither.
+fn gate_of_stage(
+    settings: &LayeredSettings,
+    config: &Config,
+    number: usize,
+    stage: &StageConfig,
+) -> Result<(), ConfigError> {
+    let task = config.task.kind;
+    let of_task = PolicyMetric::all().filter(|metric| metric.spec().task == task);
+    let names: Vec<String> = of_task.map(|metric| format!("\"{}\"", metric.spec().name)).collect();
+    let refuse = |key: &str, message: &str, help: String| {
+        let message = format!("stage {number} of `curriculum.stages`: {message}");
+        Err(conflict_in_entry(
+            settings,
+            ("curriculum.stages", number - 1, key),
+            message,
+            help,
+        ))
+    };
+    match (stage.until_metric, stage.until_value) {
+        (Some(metric), _) if metric.spec().task != task => refuse(
+            "curriculum.stages.until_metric",
+            &format!(
+                "`until_metric` = \"{}\" is no metric of the {} task",
+                metric.spec().name,
+                task.name()
+            ),
+            format!("its metrics are {}", names.join(", ")),
+        ),
+        (Some(metric), None) => refuse(
+            "curriculum.stages.until_metric",
+            "`until_metric` is set without `until_value`",
+            format!("give the value that ends the stage, in {}", metric.spec().unit),
+        ),
+        (None, Some(_)) => refuse(
+            "curriculum.stages.until_value",
+            "`until_value` is set without `until_metric`",
+            format!("name the metric: {}", names.join(", ")),
+        ),
+        (Some(_), Some(_)) | (None, None) => Ok(()),
+    }
 }
 
 /// Every map has a unique name, and the configuration has stages that can use it.

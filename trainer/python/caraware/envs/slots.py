@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from caraware.envs import rewards
+from caraware.envs.evaluation import EvaluationMeans
 from caraware.envs.settings import FaceSettings
 from caraware.envs.transition import Rows, Transition
 from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Scalar, UInt32Array, UInt64Array
@@ -151,8 +152,7 @@ class Slots:
             raise ValueError("a scenario does not say how many vehicles sense at a time: give num_envs")
         self.count = int(wanted)
         self._reward = reward or rewards.of_task(self.task)
-        self._evaluation_policy, self._evaluation = evaluation_policy, _Errors()
-        self._raw_evaluation = _Errors()
+        self._evaluation_policy, self._evaluation = evaluation_policy, EvaluationMeans(self.task)
         self._idle = np.zeros((self.count, self.task.actions.size), np.float32)
         self._runs, self._answered = 0, -1
         self._untouched, self._stepped, self._warned_narrow = True, True, False
@@ -297,12 +297,10 @@ class Slots:
             self._answer(self._idle, publish=self._world_waits)
             return
         if self._evaluation.episode is None or tick.episode[1] > self._evaluation.episode + 1:
-            self._evaluation, self._raw_evaluation = _Errors(), _Errors()
+            self._evaluation = EvaluationMeans(self.task)
         action = self._checked(self._evaluation_policy(tick.rows.observation))
         self._answer(action)
-        if not self._world_waits:
-            self._evaluation.add(tick, self.task.answer(torch.from_numpy(action.astype(np.float64))).numpy())
-            self._raw_evaluation.add(tick, tick.rows.gnss_m)
+        self._evaluation.add(tick.episode[1], tick.rows, tick.mask, action)
 
     def _answer(self, action: Float32Array, *, publish: bool = True) -> None:
         """Answers the tick received last, once: an interrupted step may be taken again."""
@@ -392,28 +390,7 @@ class Slots:
 
     def _part(self) -> dict[str, Any]:
         """The trainer's part of the run's report."""
-        part: dict[str, Any] = {"env_steps": self._env_steps}
-        if self._evaluation.count:
-            part["ppo_mean_error_m"] = self._evaluation.mean_m()
-            part["raw_gnss_mean_error_m"] = self._raw_evaluation.mean_m()
-        return part
-
-
-class _Errors:
-    """Mean distance to the truth over one phase of evaluation episodes."""
-
-    def __init__(self) -> None:
-        self.episode: int | None = None
-        self.count, self._sum_m = 0, 0.0
-
-    def add(self, tick: Tick, place_m: FloatArray) -> None:
-        away = np.asarray(place_m, np.float64) - tick.rows.truth[:, :2]
-        self._sum_m += float(np.hypot(away[:, 0], away[:, 1])[tick.mask].sum())
-        self.count += int(np.count_nonzero(tick.mask))
-        self.episode = tick.episode[1]
-
-    def mean_m(self) -> float:
-        return self._sum_m / self.count
+        return {"env_steps": self._env_steps, **self._evaluation.report()}
 
 
 def _array(obs: Observation, name: str) -> Float32Array:

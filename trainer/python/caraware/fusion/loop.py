@@ -16,15 +16,16 @@ from caraware.fusion.learner import Episode, FusionLearner, FusionStats
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn import rewards
 from caraware.learn.ppo import NonFiniteLoss
-from caraware.report.evaluation import Evaluation, Mean, errors_m
+from caraware.report.evaluation import Evaluation, Mean
 from caraware.report.metrics import Metrics, TrainingPoint
-from caraware.report.plots import plot_error
+from caraware.report.plots import plot_headline
 from caraware.run.checkpoint import Keeping, TrainingHistory, load_checkpoint, load_history, save_checkpoint
 from caraware.run.config import RunConfig
 from caraware.run.manifest import Counters
 from caraware.run.report_part import write_part
 from caraware.run.sample_count import SampleCount
 from caraware.run.stream_position import StreamProgress
+from caraware.tasks.metrics import reference_names
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +96,7 @@ class FusionLoop:
             self._metrics.resume(history.training, history.evaluations, counters.env_steps)
         self._saved_updates = counters.updates
         self._recording = Recording()
-        self._error_m = Mean()
+        self._headline, self._of_policy = config.task.metrics[0], Mean()
         self._evaluation: Evaluation | None = None
         self._evaluation_tick = -1
         self._seeds_m: list[dict[str, float]] = []
@@ -120,7 +121,8 @@ class FusionLoop:
         self._metrics.close()
         if self._left:
             return False
-        plot_error(self._config.run_dir / "plots" / "error.png", self._metrics.training, self._metrics.evaluations)
+        folder = self._config.run_dir / "plots"
+        plot_headline(folder, self._headline, self._metrics.training, self._metrics.evaluations)
         self._write_part()
         if self._ended:
             self._channel.done()
@@ -131,20 +133,23 @@ class FusionLoop:
         """Publish the estimate of one tick; only then read its truth, to evaluate or to record it."""
         estimate_m, table = self._estimating.step(obs)
         self._channel.publish_predictions(obs, estimate_m, self._learner.updates)
-        policy_m, raw_m = errors_m(obs, estimate_m)
-        self._vehicles = max(self._vehicles, len(policy_m))
+        task, headline = self._config.task, self._headline
+        policy = task.measure_answers(obs, estimate_m)[headline.name]
+        references = {name: ticks[0] for name, ticks in task.measure_references([obs]).items()}
+        self._vehicles = max(self._vehicles, len(policy))
         self._stream.starts.note(obs)
         if obs.evaluation:
             # A predecessor may have evaluated ticks that it had not learned up to.
             if obs.tick > self._stream.evaluated_tick:
-                self._evaluation = self._evaluation or Evaluation(self._config.sensors)
-                self._evaluation.add(obs, policy_m, raw_m)
+                self._evaluation = self._evaluation or Evaluation(headline.name, self._config.sensors)
+                of_references = {key: references[name] for key, name in reference_names(headline).items()}
+                self._evaluation.add(obs, {"ppo": policy, **of_references})
                 self._evaluation_tick = obs.tick
             self._left = self._leave_requested()
             return
         self._finish_evaluation()
-        self._error_m.add(policy_m)
-        self._samples.add(len(raw_m), {"raw_gnss_error_m": raw_m}, learns=True)
+        self._of_policy.add(policy)
+        self._samples.add(len(policy), references, learns=True)
         truth_m = torch.from_numpy(np.asarray(obs.truth)[:, :2].astype(np.float32)) - self._learner.estimator.centre_m
         counts = torch.from_numpy(np.array(obs.valid)).float() * (Carried.of(table).running[:, 0] > 0)
         self._recording.add(table, truth_m, counts)
@@ -170,9 +175,9 @@ class FusionLoop:
 
     def _record(self, stats: FusionStats, episode: int) -> None:
         rate, references = self._samples.since_last_update()
-        error_m, self._error_m = self._error_m.value(), Mean()
+        error_m, self._of_policy = self._of_policy.value(), Mean()
         reward = float(self._reward(torch.tensor(error_m), self._config.trainer.reward_scale_m))
-        metrics = {"error_m": error_m, **references}
+        metrics = {self._headline.name: error_m, **references}
         self._metrics.updated(TrainingPoint(self._samples.env_steps, 0.0, reward, metrics, rate), stats)
         self._channel.report(
             episode=episode,
@@ -191,7 +196,7 @@ class FusionLoop:
         if evaluation is not None and result is not None:
             self._stream.evaluated_tick = self._evaluation_tick
             self._metrics.evaluated(result)
-            self._seeds_m = evaluation.seeds_m()
+            self._seeds_m = evaluation.seed_means()
             log.info("evaluation at %d env steps: %s", result.env_steps, result)
 
     def commit(self) -> None:
@@ -229,4 +234,4 @@ class FusionLoop:
             "untrained_env_steps": self._samples.env_steps - self._trained_steps,
             "seeds_m": self._seeds_m,
         }
-        write_part(self._config.run_dir, entries, self._metrics.evaluations)
+        write_part(self._config.run_dir, entries, self._metrics.evaluations, self._headline.name)

@@ -12,10 +12,26 @@ EMPTY_SLOT = 0xFFFFFFFF
 """`vehicle` of a slot without one."""
 
 
-class LearningTick(Protocol):
-    """What a rollout and the reference metrics take of a tick of one environment.
+class MeasuredTick(Protocol):
+    """What the metrics of a task take of a tick of one environment. Row `i` is slot `i`."""
 
-    Row `i` is slot `i`. A slot keeps its vehicle until that vehicle is gone; `n` may grow during a run.
+    @property
+    def truth(self) -> Tensor:
+        """f32 `[n, 4]`: x_m, y_m, yaw_rad, speed_mps in the world frame. Only for the reward and the metrics."""
+
+    @property
+    def gnss_m(self) -> Tensor:
+        """f32 `[n, 2]` or `[n, 3]`: newest raw GNSS fix in world metres. Only for the baselines."""
+
+    @property
+    def valid(self) -> BoolArray:
+        """bool `[n]`: the row holds a vehicle with valid sensors."""
+
+
+class LearningTick(MeasuredTick, Protocol):
+    """What a rollout takes of a tick of one environment.
+
+    A slot keeps its vehicle until that vehicle is gone; `n` may grow during a run.
     """
 
     @property
@@ -27,20 +43,8 @@ class LearningTick(Protocol):
         """f32 `[n, d]`, normalised."""
 
     @property
-    def truth(self) -> Tensor:
-        """f32 `[n, 4]`: x_m, y_m, yaw_rad, speed_mps in the world frame. Only for the reward and the metrics."""
-
-    @property
-    def gnss_m(self) -> Tensor:
-        """f32 `[n, 2]` or `[n, 3]`: newest raw GNSS fix in world metres. Only for the baselines."""
-
-    @property
     def vehicle(self) -> UInt32Array:
         """u32 `[n]`: dense vehicle index within the episode, `EMPTY_SLOT` where there is none."""
-
-    @property
-    def valid(self) -> BoolArray:
-        """bool `[n]`: the row holds a vehicle with valid sensors."""
 
     @property
     def terminated(self) -> BoolArray:

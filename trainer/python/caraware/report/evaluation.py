@@ -1,18 +1,18 @@
-"""Errors of the deterministic policy, of raw GNSS and of the classical baselines, over exactly the same rows."""
+"""A metric of the deterministic policy, of its references and of the classical baselines, over the same rows."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from caraware import _native
 from caraware.baselines import BaselineErrors, Baselines, SensorNoise
 from caraware.ipc.arrays import Float64Array, FloatArray, Int64Array
 from caraware.ipc.stream import Observation
 from caraware.report.statistics import mean_interval
-from caraware.tasks.localisation import errors_m as errors_m
-from caraware.tasks.localisation import raw_errors_m as raw_errors_m
+from caraware.tasks.metrics import interval_key, mean_key
 
 CI95_STANDARD_ERRORS = 1.96
 """Half the width of a 95 % confidence interval of a mean of many, in standard errors."""
@@ -60,7 +60,7 @@ class EvaluationResult:
     """By the keys of `ESTIMATORS`; a run without sensor tables has no filter and no smoother."""
     environment: int = 0
     """Whose episodes; the first one's index if those of all are pooled."""
-    metric: str = "error_m"
+    metric: str = field(kw_only=True)
     """Name of the task's metric that the estimators are compared by."""
 
     def mean(self, estimator: str) -> float | None:
@@ -77,8 +77,9 @@ class EvaluationResult:
         return entries
 
     @classmethod
-    def restored(cls, entries: Mapping[str, Any], metric: str = "error_m") -> "EvaluationResult":
+    def restored(cls, entries: Mapping[str, Any]) -> "EvaluationResult":
         """The phase whose `report()` this is."""
+        metric = next(known.name for known in _native.METRICS if mean_key("ppo", known.name) in entries)
         estimates: dict[str, Estimate] = {}
         for name in ESTIMATORS:
             mean, standard_error, ci95 = (entries.get(key) for key in _keys(name, metric))
@@ -108,13 +109,13 @@ _PHASE_KEYS = ("env_steps", "policy_version", "episodes", "samples", "environmen
 def _keys(estimator: str, metric: str) -> tuple[str, str, str]:
     """Keys of an estimator's mean, standard error and half 95 % interval in reports."""
     unit = metric.rsplit("_", 1)[1]
-    return f"{estimator}_mean_{metric}", f"{estimator}_standard_error_{unit}", f"{estimator}_ci95_{unit}"
+    return mean_key(estimator, metric), f"{estimator}_standard_error_{unit}", interval_key(estimator, metric)
 
 
-def no_headline(metric: str = "error_m") -> dict[str, float | None]:
-    """The headline of a run that has not been evaluated: every key, without a value."""
-    keys = [_keys(estimator, metric) for estimator in ESTIMATORS]
-    return {**dict.fromkeys(key for mean, _, interval in keys for key in (mean, interval)), "evaluation_seeds": 0}
+def no_headline(metric: str) -> dict[str, float | None]:
+    """The headline of a run that has not been evaluated by its task's metric: every key, without a value."""
+    keys = [key(estimator, metric) for estimator in ESTIMATORS for key in (mean_key, interval_key)]
+    return {**dict.fromkeys(keys), "evaluation_seeds": 0}
 
 
 class Mean:
@@ -137,11 +138,11 @@ class Evaluation:
     """Collects one evaluation phase. A vehicle keeps its index within an episode.
 
     With the errors of sensors, filter and smoother run beside the policy, over the same rows; without, they have no
-    results.
+    results. Both estimate positions, so they need a task whose metric is a position's error.
     """
 
-    def __init__(self, noise: SensorNoise | None = None, *, supervised: bool = False, metric: str = "error_m") -> None:
-        """`supervised`: the errors of that baseline will be added too. `metric` names what is compared."""
+    def __init__(self, metric: str, noise: SensorNoise | None = None, *, supervised: bool = False) -> None:
+        """`metric` names what is compared. `supervised`: the values of that baseline will be added too."""
         self._metric = metric
         self._baselines = Baselines(noise) if noise else None
         missing = ("ekf", "rts")[: 0 if noise else 2] + ("supervised",)[: 0 if supervised else 1]
@@ -149,20 +150,19 @@ class Evaluation:
         self._finished: list[Float64Array] = []
         self._episode: int | None = None
         self._sums = np.zeros((0, 1 + len(ESTIMATORS)))
-        """f64 `[vehicle, 6]` of the current episode: samples, and the sum of the errors of each estimator."""
+        """f64 `[vehicle, 6]` of the current episode: samples, and the sum of the metric of each estimator."""
 
-    def add(
-        self, obs: Observation, policy_m: FloatArray, raw_m: FloatArray, supervised_m: FloatArray | None = None
-    ) -> None:
-        """Add the errors `[v]` of the valid rows of one evaluation tick."""
+    def add(self, obs: Observation, values: Mapping[str, FloatArray]) -> None:
+        """Add the metric's values `[v]` on the valid rows of one evaluation tick, by estimator."""
         if obs.episode != self._episode:
             self._finish_episode()
             self._episode = obs.episode
         vehicle = obs.vehicle[obs.valid].astype(np.int64)
         self._make_room(vehicle)
-        self._sums[vehicle, :3] += np.column_stack((np.ones(len(vehicle)), policy_m, raw_m))
-        if supervised_m is not None:
-            self._sums[vehicle, 3] += supervised_m
+        self._sums[vehicle, 0] += 1.0
+        for column, name in enumerate(ESTIMATORS, start=1):
+            if name in values:
+                self._sums[vehicle, column] += values[name]
         if self._baselines:
             filtered, smoothed = self._baselines.add(obs)
             self._sums[filtered.vehicle, 4] += filtered.error_m
@@ -184,8 +184,8 @@ class Evaluation:
         self._finished.append(self._sums[self._sums[:, 0] > 0])
         self._sums = np.zeros((0, self._sums.shape[1]))
 
-    def seeds_m(self) -> list[dict[str, float]]:
-        """Mean errors by estimator of every episode that is finished, each of which has a seed of its own."""
+    def seed_means(self) -> list[dict[str, float]]:
+        """Means by estimator of every episode that is finished, each of which has a seed of its own."""
         means = [episode[:, 1:].sum(0) / episode[:, 0].sum() for episode in self._finished if len(episode)]
         every = [dict(zip(ESTIMATORS, map(float, mean), strict=True)) for mean in means]
         return [{name: mean[name] for name in self._known} for mean in every]

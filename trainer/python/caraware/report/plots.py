@@ -1,5 +1,6 @@
-"""The two pictures of a run: error and exploration over training, as PNG files without a display."""
+"""The two pictures of a run: the task's metric and exploration over training, as PNG files without a display."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -7,60 +8,87 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
 
-from caraware.report.evaluation import EvaluationResult
+from caraware import _native
+from caraware.report.evaluation import ESTIMATORS, EvaluationResult
 from caraware.report.metrics import TrainingPoint
+from caraware.tasks.metrics import reference_names
 
-POLICY, EVALUATION, RAW, REWARD = "#7fb3d5", "#1a5276", "#b03a2e", "#ca6f1e"
+POLICY, EVALUATION, REFERENCE, REWARD = "#7fb3d5", "#1a5276", "#b03a2e", "#ca6f1e"
 EKF, RTS, SUPERVISED = "#e69f00", "#555555", "#009e73"
 """Colour-blind readers can distinguish them: they differ in lightness, and lines in their dashes and marks."""
 
 
-def plot_error(file: Path, training: list[TrainingPoint], evaluations: list[EvaluationResult]) -> None:
-    """Mean position error of the policy in training and in evaluations, against the baselines, over env steps."""
-    figure, axes = _figure("Position error of the policy against raw GNSS and filters")
+@dataclass(frozen=True)
+class _Curve:
+    """How an estimator is drawn."""
+
+    estimator: str
+    label: str
+    colour: str
+    dashes: str
+    marker: str
+
+
+CURVES = (
+    _Curve("supervised", "the same network, taught the truth", SUPERVISED, "--", "D"),
+    _Curve("ekf", "EKF, same samples", EKF, "-.", "s"),
+    _Curve("rts", "RTS smoother, sees the future: a bound", RTS, ":", "^"),
+    _Curve("ppo", "policy, evaluation on unseen seeds", EVALUATION, "-", "o"),
+)
+
+
+def plot_headline(
+    folder: Path, metric: _native.Metric, training: list[TrainingPoint], evaluations: list[EvaluationResult]
+) -> None:
+    """Mean of the task's headline metric in training and in evaluations, against the baselines, over env steps.
+
+    The file is called by the metric's quantity, such as `error.png`.
+    """
+    figure, axes = _figure(f"{metric.label.capitalize()} of the policy and of its baselines")
     axes.plot(
         [p.env_steps for p in training],
-        [p.metrics["error_m"] for p in training],
+        [p.metrics[metric.name] for p in training],
         color=POLICY,
         label="policy, training",
     )
-    raw_m = _last_raw_m(training, evaluations)
-    if raw_m is not None:
-        axes.axhline(raw_m, color=RAW, linestyle="--", label=f"raw GNSS ({raw_m:.2f} m)")
-    _plot_evaluated(axes, evaluations, "supervised", "the same network, taught the truth", SUPERVISED, "--", "D")
-    _plot_evaluated(axes, evaluations, "ekf", "EKF, same samples", EKF, "-.", "s")
-    _plot_evaluated(axes, evaluations, "rts", "RTS smoother, sees the future: a bound", RTS, ":", "^")
-    _plot_evaluated(axes, evaluations, "ppo", "policy, evaluation on unseen seeds", EVALUATION, "-", "o")
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylabel("mean position error [m]")
+    for estimator, name in reference_names(metric).items():
+        value = _last_reference(training, evaluations, estimator, name)
+        if value is not None:
+            label = f"{ESTIMATORS[estimator]} ({value:.2f} {metric.unit})"
+            axes.axhline(value, color=REFERENCE, linestyle="--", label=label)
+    for curve in CURVES:
+        _plot_evaluated(axes, evaluations, curve, metric.unit)
+    if not metric.higher_is_better:
+        # An error is positive, and its last tenths count.
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_ylabel(f"mean {metric.label} [{metric.unit}]")
     axes.legend(frameon=False, fontsize=9)
-    _save(figure, file)
+    _save(figure, folder / f"{metric.name.rsplit('_', 1)[0]}.png")
 
 
-def _plot_evaluated(
-    axes: Axes, evaluations: list[EvaluationResult], name: str, label: str, colour: str, dashes: str, marker: str
-) -> None:
-    """One estimator's mean errors, if it has any, with 95 % intervals: over seeds, of one seed over its vehicles."""
+def _plot_evaluated(axes: Axes, evaluations: list[EvaluationResult], curve: _Curve, unit: str) -> None:
+    """One estimator's means, if it has any, with 95 % intervals: over seeds, of one seed over its vehicles."""
+    name = curve.estimator
     known = [e for e in evaluations if name in e.estimates]
     if not known:
         return
-    steps, means_m = [e.env_steps for e in known], [e.estimates[name].mean for e in known]
-    halves_m, seeds = [e.estimates[name].half_width() for e in known], known[-1].episodes
-    last = f"last {means_m[-1]:.2f} ± {halves_m[-1]:.2f} m" + (f", {seeds} seeds" if seeds > 1 else "")
+    steps, means = [e.env_steps for e in known], [e.estimates[name].mean for e in known]
+    halves, seeds = [e.estimates[name].half_width() for e in known], known[-1].episodes
+    last = f"last {means[-1]:.2f} ± {halves[-1]:.2f} {unit}" + (f", {seeds} seeds" if seeds > 1 else "")
     axes.errorbar(
         steps,
-        means_m,
-        yerr=halves_m,
-        color=colour,
-        linestyle=dashes,
-        marker=marker,
+        means,
+        yerr=halves,
+        color=curve.colour,
+        linestyle=curve.dashes,
+        marker=curve.marker,
         markersize=4,
         linewidth=1.5,
         capsize=2,
-        label=f"{label} ({last})",
+        label=f"{curve.label} ({last})",
     )
 
 
@@ -79,10 +107,13 @@ def plot_sigma(file: Path, training: list[TrainingPoint]) -> None:
     _save(figure, file)
 
 
-def _last_raw_m(training: list[TrainingPoint], evaluations: list[EvaluationResult]) -> float | None:
+def _last_reference(
+    training: list[TrainingPoint], evaluations: list[EvaluationResult], estimator: str, name: str
+) -> float | None:
+    """The newest value of a reference metric, which evaluations hold by its estimator."""
     if evaluations:
-        return evaluations[-1].mean("raw_gnss")
-    return training[-1].metrics["raw_gnss_error_m"] if training else None
+        return evaluations[-1].mean(estimator)
+    return training[-1].metrics[name] if training else None
 
 
 def _figure(title: str) -> tuple[Figure, Axes]:

@@ -1,9 +1,11 @@
 """The curriculum: which stage of training a lesson belongs to, decided by what was learned (docs/decisions/0010)."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
+from caraware import _native
 from caraware.ipc.run_file import RunFile
 
 
@@ -13,8 +15,10 @@ class Stage:
 
     until_std: float | None = None
     """Standard deviation of the policy, in units of half the map."""
-    until_error_m: float | None = None
-    """Mean error of the policy in the samples of the newest update."""
+    until_metric: str | None = None
+    """Name of a metric of the policy, whose mean in the samples of the newest update reaches `until_value`."""
+    until_value: float | None = None
+    """In the unit of that metric."""
     until_lessons: int | None = None
 
     @classmethod
@@ -23,13 +27,21 @@ class Stage:
         stages = run.get("config", {}).get("curriculum", {}).get("stages", [])
         return tuple(cls(**{name: stage.get(name) for name in cls.__dataclass_fields__}) for stage in stages)
 
-    def passed(self, policy_std: float, error_m: float, lessons: int) -> bool:
-        """Whether the gate opens; a measure that is not known is nan, and opens nothing."""
+    def passed(self, policy_std: float, metrics: Mapping[str, float], lessons: int) -> bool:
+        """Whether the gate opens; a measure that is not known is nan or missing, and opens nothing."""
         return (
             (self.until_std is not None and policy_std <= self.until_std)
-            or (self.until_error_m is not None and error_m <= self.until_error_m)
+            or self._reached(metrics)
             or (self.until_lessons is not None and lessons >= self.until_lessons)
         )
+
+    def _reached(self, metrics: Mapping[str, float]) -> bool:
+        """Whether the metric is as good as `until_value`, or better."""
+        if self.until_metric is None or self.until_value is None:
+            return False
+        value = metrics.get(self.until_metric, math.nan)
+        metric = next(metric for metric in _native.METRICS if metric.name == self.until_metric)
+        return value >= self.until_value if metric.higher_is_better else value <= self.until_value
 
 
 @dataclass(frozen=True)
@@ -43,8 +55,8 @@ class Passed:
     """Of the whole run."""
     env_steps: int
     policy_std: float
-    error_m: float | None
-    """None before the first update."""
+    metrics: dict[str, float] = field(default_factory=dict)
+    """Mean of each metric of the task in the samples of the newest update, by name; empty before the first."""
 
 
 @dataclass
@@ -99,7 +111,9 @@ class Curriculum:
             self.standing = Standing.restored(standing)
         self._publish()
 
-    def lesson_ended(self, obs: Ended, env_steps: int, policy_std: float = math.nan, error_m: float = math.nan) -> None:
+    def lesson_ended(
+        self, obs: Ended, env_steps: int, policy_std: float = math.nan, metrics: Mapping[str, float] | None = None
+    ) -> None:
         """Look at the gate, once for each lesson. Measures that a learner does not have open no gate."""
         now = self.standing
         if obs.tick <= now.decided_tick:
@@ -108,9 +122,9 @@ class Curriculum:
         if obs.stage - 1 > now.stage:
             # A predecessor with other settings led the simulation here.
             now.stage, now.since = obs.stage - 1, now.lessons - 1
-        if self._stages[now.stage].passed(policy_std, error_m, now.lessons - now.since):
-            error = None if math.isnan(error_m) else error_m
-            now.passed.append(Passed(now.stage + 1, obs.tick, now.lessons, env_steps, policy_std, error))
+        known = {name: value for name, value in (metrics or {}).items() if not math.isnan(value)}
+        if self._stages[now.stage].passed(policy_std, known, now.lessons - now.since):
+            now.passed.append(Passed(now.stage + 1, obs.tick, now.lessons, env_steps, policy_std, known))
             now.stage, now.since = now.stage + 1, now.lessons
         self._publish()
 

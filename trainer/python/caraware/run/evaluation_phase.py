@@ -7,14 +7,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from caraware.ipc.arrays import FloatArray
+from caraware.ipc.arrays import Float32Array, FloatArray
 from caraware.ipc.stream import Observation
 from caraware.learn.prediction import visible
 from caraware.learn.rewards import distance_m
 from caraware.learn.supervised import Supervised
-from caraware.report.evaluation import Evaluation, EvaluationResult, errors_m
+from caraware.report.evaluation import Evaluation, EvaluationResult
 from caraware.run.config import RunConfig
 from caraware.run.stream_position import StreamProgress
+from caraware.tasks.metrics import reference_names
 
 log = logging.getLogger("caraware.run.loop")
 
@@ -25,6 +26,7 @@ class EvaluationPhase:
     def __init__(self, config: RunConfig, number: int) -> None:
         """`number` is the index of the environment among those of all ranks."""
         self._config, self._number = config, number
+        self._headline = config.task.metrics[0]
         self._evaluation: Evaluation | None = None
         self._newest_tick = -1
 
@@ -40,11 +42,12 @@ class EvaluationPhase:
         if obs.tick <= progress.evaluated_tick:
             return
         if self._evaluation is None:
-            self._evaluation = Evaluation(
-                self._config.sensors, supervised=supervised is not None, metric=self._config.task.metrics[0].name
-            )
-        policy_m, _ = errors_m(obs, predicted_m)
-        self._evaluation.add(obs, policy_m, references["raw_gnss_error_m"], self._supervised_errors_m(obs, supervised))
+            self._evaluation = Evaluation(self._headline.name, self._config.sensors, supervised=supervised is not None)
+        values = {"ppo": self._config.task.measure_answers(obs, predicted_m)[self._headline.name]}
+        values |= {estimator: references[name] for estimator, name in reference_names(self._headline).items()}
+        if supervised is not None:
+            values["supervised"] = self._supervised_errors_m(obs, supervised)
+        self._evaluation.add(obs, values)
         self._newest_tick = obs.tick
 
     def finish(self, progress: StreamProgress, env_steps: int, updates: int) -> EvaluationResult | None:
@@ -56,11 +59,10 @@ class EvaluationPhase:
             log.info("evaluation at %d env steps: %s", result.env_steps, result)
         return result
 
-    def _supervised_errors_m(self, obs: Observation, supervised: Supervised | None) -> FloatArray | None:
-        """Errors of the baseline that learns beside the policy, on the valid rows; None without it."""
-        if supervised is None:
-            return None
+    def _supervised_errors_m(self, obs: Observation, supervised: Supervised) -> FloatArray:
+        """Errors of the baseline that learns positions beside the policy, on the valid rows."""
         rows = torch.from_numpy(np.flatnonzero(obs.valid))
         observation = visible(obs, self._config.dark_is_nan)
         predicted_m = supervised.predict_m(observation.index_select(0, rows))
-        return distance_m(predicted_m, obs.truth.index_select(0, rows)).numpy()
+        errors_m: Float32Array = distance_m(predicted_m, obs.truth.index_select(0, rows)).numpy()
+        return errors_m

@@ -1,20 +1,19 @@
 """The training loop: ticks of all environments in, predictions out, an update whenever a horizon is full."""
 
 import logging
-import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from torch import Tensor
 
-from caraware.ipc.arrays import Float32Array
+from caraware.ipc.arrays import FloatArray
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.batch import Batch, save_batch
 from caraware.learn.ppo import NonFiniteLoss, UpdateStats
 from caraware.learn.ranks import RankError, Ranks, Verdict
 from caraware.report.evaluation import pooled
 from caraware.report.metrics import Metrics, TrainingPoint
-from caraware.report.plots import plot_error, plot_sigma
+from caraware.report.plots import plot_headline, plot_sigma
 from caraware.run.checkpoint_writer import CheckpointWriter
 from caraware.run.config import RunConfig
 from caraware.run.curriculum import Curriculum
@@ -160,7 +159,7 @@ class TrainingLoop:
             self.commit()
 
     def _process_waiting(
-        self, environment: Environment, predicted_m: list[Tensor], references: Mapping[str, list[Float32Array]]
+        self, environment: Environment, predicted_m: list[Tensor], references: Mapping[str, list[FloatArray]]
     ) -> bool:
         """Process waiting ticks while the environment may continue; False if this trainer leaves to a successor.
 
@@ -187,7 +186,7 @@ class TrainingLoop:
         return not self._left
 
     def _process(
-        self, environment: Environment, obs: Observation, predicted_m: Tensor, references: Mapping[str, Float32Array]
+        self, environment: Environment, obs: Observation, predicted_m: Tensor, references: Mapping[str, FloatArray]
     ) -> None:
         """Publish the prediction of one tick, then evaluate it or collect it."""
         assert self._learner is not None
@@ -261,9 +260,7 @@ class TrainingLoop:
         if self._lesson_end is not None and self._learner is not None:
             metrics = self._metrics.training[-1].metrics if self._metrics.training else {}
             sigma = self._learner.ppo.sigma()
-            self._curriculum.lesson_ended(
-                self._lesson_end, self._samples.env_steps, sigma, metrics.get("error_m", math.nan)
-            )
+            self._curriculum.lesson_ended(self._lesson_end, self._samples.env_steps, sigma, metrics)
         self._lesson_end = None
 
     def _finish_evaluation(self, environment: Environment) -> None:
@@ -302,7 +299,7 @@ class TrainingLoop:
 
     def _draw(self) -> None:
         folder = self._config.run_dir / "plots"
-        plot_error(folder / "error.png", self._metrics.training, pooled(self._metrics.evaluations))
+        plot_headline(folder, self._task.metrics[0], self._metrics.training, pooled(self._metrics.evaluations))
         plot_sigma(folder / "sigma.png", self._metrics.training)
 
     def _write_part(self) -> None:
@@ -323,7 +320,8 @@ class TrainingLoop:
             "duplicated_ticks": sum(ledger.duplicated for ledger in ledgers),
             "untrained_env_steps": env_steps - self._trained_steps(),
         }
-        write_part(self._config.run_dir, entries, pooled([result for results, _ in every_rank for result in results]))
+        phases = pooled([result for results, _ in every_rank for result in results])
+        write_part(self._config.run_dir, entries, phases, self._task.metrics[0].name)
 
     def _number(self, index: int) -> int:
         """The index of an environment among those of all ranks."""

@@ -1,14 +1,15 @@
-"""Playing a checkpoint: ticks in, predictions out, and the errors of policy, EKF and raw fix for each vehicle."""
+"""Playing a checkpoint: ticks in, predictions out, and the task's metric of policy, EKF and references by vehicle."""
 
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from caraware.baselines import Ekf
@@ -18,33 +19,32 @@ from caraware.ipc.names import Names
 from caraware.ipc.run_file import RunFile
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.prediction import Predictor
-from caraware.report.evaluation import errors_m
 from caraware.report.statistics import mean_interval
 from caraware.run.config import RunConfig
 from caraware.run.loop import RECEIVE_TIMEOUT_S
+from caraware.tasks.metrics import interval_key, mean_key, reference_names
 
 LIVE = "live.json"
 """File in the run's directory with the newest table."""
 SHOW_EVERY_S = 0.5
-ESTIMATORS = ("ppo", "ekf", "raw_gnss")
 
 
 @dataclass
-class ErrorSums:
-    """Samples, and the sum of each estimator's position error over them, in metres."""
+class MetricSums:
+    """Samples, and the sum of the metric over them by estimator."""
 
     samples: int = 0
-    error_m: dict[str, float] = field(default_factory=lambda: dict.fromkeys(ESTIMATORS, 0.0))
+    sums: dict[str, float] = field(default_factory=dict)
 
-    def add(self, error_m: dict[str, FloatArray]) -> None:
-        """Add the errors `[v]` of some rows."""
-        self.samples += len(error_m["ppo"])
-        for name, values in error_m.items():
-            self.error_m[name] += float(values.sum(dtype=np.float64))
+    def add(self, values: Mapping[str, FloatArray]) -> None:
+        """Add the values `[v]` of some rows, by estimator."""
+        self.samples += len(values["ppo"])
+        for name, of_rows in values.items():
+            self.sums[name] = self.sums.get(name, 0.0) + float(of_rows.sum(dtype=np.float64))
 
-    def mean_m(self, name: str) -> float | None:
-        """Mean error of an estimator; None without samples."""
-        return self.error_m[name] / self.samples if self.samples else None
+    def mean(self, estimator: str) -> float | None:
+        """Mean of an estimator; None without samples."""
+        return self.sums[estimator] / self.samples if self.samples else None
 
 
 @dataclass
@@ -53,11 +53,11 @@ class PlayTally:
 
     tick: int = -1
     episode: int = 0
-    sums: ErrorSums = field(default_factory=ErrorSums)
-    running: ErrorSums = field(default_factory=ErrorSums)
+    sums: MetricSums = field(default_factory=MetricSums)
+    running: MetricSums = field(default_factory=MetricSums)
     """Of the episode at work."""
     episodes: list[dict[str, float]] = field(default_factory=list)
-    """Mean errors of each whole episode: each had a seed of its own."""
+    """Means of each whole episode by estimator: each had a seed of its own."""
     vehicles: int = 0
     """Most at a time."""
 
@@ -68,28 +68,32 @@ class PlayTally:
             raw = json.loads(file.read_text())["tally"]
         except (OSError, ValueError, KeyError):
             return cls()
-        return cls(**raw | {"sums": ErrorSums(**raw["sums"]), "running": ErrorSums(**raw["running"])})
+        return cls(**raw | {"sums": MetricSums(**raw["sums"]), "running": MetricSums(**raw["running"])})
 
     def begin_episode(self, episode: int) -> None:
         """The ticks that follow belong to this episode."""
-        self.running, self.episode = ErrorSums(), episode
+        self.running, self.episode = MetricSums(), episode
 
     def end_episode(self) -> None:
         """The episode at work is over."""
-        if self.running.samples:
-            self.episodes.append({name: self.running.error_m[name] / self.running.samples for name in ESTIMATORS})
+        samples = self.running.samples
+        if samples:
+            self.episodes.append({name: value / samples for name, value in self.running.sums.items()})
 
 
 class Scoreboard:
-    """Position errors of policy, EKF and raw fix, of each vehicle at this tick and over its time on the road."""
+    """The task's headline metric of policy, EKF and references, by vehicle: at this tick and over its time."""
 
     def __init__(self, run: RunFile, config: RunConfig, tally: PlayTally) -> None:
         assert config.sensors is not None
         self.tally = tally
+        self._task, self.metric = config.task, config.task.metrics[0]
+        self._references = reference_names(self.metric)
+        self.estimators = ("ppo", "ekf", *self._references)
         self._noise = config.sensors
         self._names = Names(run)
         self._ekf = Ekf(self._noise)
-        self._of_vehicle: dict[int, tuple[str, ErrorSums]] = {}
+        self._of_vehicle: dict[int, tuple[str, MetricSums]] = {}
         self._now: dict[int, dict[str, float]] = {}
         self._sim_time_s = 0.0
 
@@ -99,23 +103,34 @@ class Scoreboard:
             self.tally.begin_episode(obs.episode)
             self._ekf, self._of_vehicle = Ekf(self._noise), {}
         self._ekf.step(read_samples(obs, self._noise.convention))
-        policy_m, raw_m = errors_m(obs, predicted_m)
-        rows = np.flatnonzero(obs.valid)
-        offset_m = self._ekf.position_m[rows] - np.asarray(obs.truth)[rows, :2]
-        error_m: dict[str, FloatArray] = {"ppo": policy_m, "ekf": np.hypot(*offset_m.T), "raw_gnss": raw_m}
-        self.tally.sums.add(error_m)
-        self.tally.running.add(error_m)
+        values, rows = self._measured(obs, predicted_m), np.flatnonzero(obs.valid)
+        self.tally.sums.add(values)
+        self.tally.running.add(values)
         self.tally.tick, self._sim_time_s = obs.tick, obs.sim_time_ns * 1e-9
         self.tally.vehicles = max(self.tally.vehicles, len(rows))
         self._now = {}
         for place, row in enumerate(rows):
             vehicle = int(obs.vehicle[row])
             if vehicle not in self._of_vehicle:
-                self._of_vehicle[vehicle] = (self._names.of(obs.id_hash[row]), ErrorSums())
-            self._of_vehicle[vehicle][1].add({name: values[place : place + 1] for name, values in error_m.items()})
-            self._now[vehicle] = {name: float(values[place]) for name, values in error_m.items()}
+                self._of_vehicle[vehicle] = (self._names.of(obs.id_hash[row]), MetricSums())
+            self._of_vehicle[vehicle][1].add({name: of_rows[place : place + 1] for name, of_rows in values.items()})
+            self._now[vehicle] = {name: float(of_rows[place]) for name, of_rows in values.items()}
         if obs.episode_last:
             self.tally.end_episode()
+
+    def _measured(self, obs: Observation, predicted_m: Tensor) -> dict[str, FloatArray]:
+        """The metric on the valid rows of a tick, by estimator."""
+        references = self._task.measure_references([obs])
+        return {
+            "ppo": self._task.measure_answers(obs, predicted_m)[self.metric.name],
+            "ekf": self._task.measure_answers(obs, torch.from_numpy(self._ekf.position_m))[self.metric.name],
+            **{estimator: references[name][0] for estimator, name in self._references.items()},
+        }
+
+    def metrics(self) -> dict[str, float]:
+        """Means over the run by the metrics' names: of the policy and of the references."""
+        mean, names = self.tally.sums.mean, {"ppo": self.metric.name} | self._references
+        return {name: mean(estimator) or math.nan for estimator, name in names.items()}
 
     def estimates_m(self, obs: Observation) -> Float32Array:
         """f32 `[n, 2]`: the filter's positions at the tick added last; not-a-number where a row is not valid."""
@@ -128,16 +143,17 @@ class Scoreboard:
         rows = [
             {
                 "vehicle": self._of_vehicle[vehicle][0],
-                "now_m": now,
-                "mean_m": {name: self._of_vehicle[vehicle][1].mean_m(name) for name in ESTIMATORS},
+                "now": now,
+                "mean": {name: self._of_vehicle[vehicle][1].mean(name) for name in self.estimators},
             }
             for vehicle, now in self._now.items()
         ]
         return {
+            "metric": self.metric.name,
             "episode": tally.episode,
             "sim_time_s": self._sim_time_s,
             "samples": tally.sums.samples,
-            "mean_m": {name: tally.sums.mean_m(name) for name in ESTIMATORS},
+            "mean": {name: tally.sums.mean(name) for name in self.estimators},
             "vehicles": rows,
         }
 
@@ -208,13 +224,12 @@ class PlayLoop:
             return
         self._board.write(self._live)
         self._channel.committed(tally.tick)
-        mean = tally.sums.mean_m
         self._channel.report(
             episode=tally.episode,
             env_steps=tally.sums.samples,
             updates=self._policy.updates,
             policy_std=self._policy.sigma(),
-            metrics={"error_m": mean("ppo") or math.nan, "raw_gnss_error_m": mean("raw_gnss") or math.nan},
+            metrics=self._board.metrics(),
         )
 
     def _write_part(self) -> None:
@@ -229,10 +244,11 @@ class PlayLoop:
             "evaluation_seeds": len(tally.episodes),
             "episodes": tally.episodes,
         }
-        for name in ESTIMATORS:
-            part[f"{name}_mean_error_m"] = tally.sums.mean_m(name)
+        metric = self._board.metric.name
+        for name in self._board.estimators:
+            part[mean_key(name, metric)] = tally.sums.mean(name)
             seeds = [episode[name] for episode in tally.episodes]
-            part[f"{name}_ci95_m"] = mean_interval(seeds).half_width if len(seeds) > 1 else None
+            part[interval_key(name, metric)] = mean_interval(seeds).half_width if len(seeds) > 1 else None
         file = self._config.run_dir / "parts" / "trainer.json"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(part, indent=2) + "\n")

@@ -9,11 +9,11 @@ from caraware.report.evaluation import EvaluationResult, no_headline
 RTS_NOTE = "the smoother sees the future: a bound, not an estimator"
 
 
-def write_part(run_dir: Path, entries: Mapping[str, object], phases: Sequence[EvaluationResult]) -> None:
-    """Write the part with these entries. The headline errors are the last evaluation's."""
+def write_part(run_dir: Path, entries: Mapping[str, object], phases: Sequence[EvaluationResult], metric: str) -> None:
+    """Write the part with these entries. The headline is the last evaluation's, by the task's `metric`."""
     part = {
         **entries,
-        **(phases[-1].headline() if phases else no_headline()),
+        **(phases[-1].headline() if phases else no_headline(metric)),
         "rts_note": RTS_NOTE,
         "evaluations": [result.report() for result in phases],
     }

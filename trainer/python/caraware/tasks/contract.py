@@ -12,8 +12,8 @@ from typing import Protocol
 from torch import Tensor
 
 from caraware import _native
-from caraware.ipc.arrays import Float32Array
-from caraware.ipc.stream import LearningTick
+from caraware.ipc.arrays import FloatArray
+from caraware.ipc.stream import MeasuredTick
 
 
 class Sampling(Enum):
@@ -131,14 +131,16 @@ class Task(Protocol):
         """Each metric of the policy that can be measured, by name: values `[n]` for actions `[n, a]`."""
         ...
 
-    def measure_references(self, ticks: Sequence[LearningTick]) -> dict[str, list[Float32Array]]:
+    def measure_answers(self, tick: MeasuredTick, answers: Tensor) -> dict[str, FloatArray]:
+        """Each metric of the policy that needs no outcome, by name: values `[v]` of `answers` `[n, a]` to a tick.
+
+        They are those of its valid rows; none depends on the rows beside it.
+        """
+        ...
+
+    def measure_references(self, ticks: Sequence[MeasuredTick]) -> dict[str, list[FloatArray]]:
         """Each metric that is a reference, by name: values `[v]` on the valid rows of each tick.
 
         The same numbers, bit for bit, whichever ticks come together.
         """
         ...
-
-
-def metrics_of(task: str) -> tuple[_native.Metric, ...]:
-    """The rows of `METRICS` that belong to the task with this `task.kind`."""
-    return tuple(metric for metric in _native.METRICS if metric.task == task)

@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 
 from caraware import _native
-from caraware.ipc.arrays import Float32Array
+from caraware.ipc.arrays import FloatArray
 from caraware.ipc.run_file import RunFile
-from caraware.ipc.stream import LearningTick
-from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskOutcome, TaskStep, metrics_of
+from caraware.ipc.stream import MeasuredTick
+from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskOutcome, TaskStep
 from caraware.tasks.fields import Fields
+from caraware.tasks.metrics import metrics_of
 
 ARRIVED_WITHIN_M = 5.0
 """A hero whose episode ends this near to the end of its route has arrived (docs/driving.md)."""
@@ -83,7 +84,11 @@ class Driving:
             values["route_offset_m"] = self.fields.si_tensor(outcome.next.observation, "route_offset").abs()
         return values
 
-    def measure_references(self, ticks: Sequence[LearningTick]) -> dict[str, list[Float32Array]]:
+    def measure_answers(self, tick: MeasuredTick, answers: Tensor) -> dict[str, FloatArray]:
+        """None: every metric of driving measures what follows an action."""
+        return {}
+
+    def measure_references(self, ticks: Sequence[MeasuredTick]) -> dict[str, list[FloatArray]]:
         """None: nothing drives beside the policy."""
         return {}
 

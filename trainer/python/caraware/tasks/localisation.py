@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from caraware import _native
-from caraware.ipc.arrays import Float32Array
+from caraware.ipc.arrays import FloatArray
 from caraware.ipc.run_file import RunFile
-from caraware.ipc.stream import LearningTick
+from caraware.ipc.stream import MeasuredTick
 from caraware.tasks import rewards
 from caraware.tasks.bounds import MapBounds
-from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskStep, metrics_of
+from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskStep
+from caraware.tasks.metrics import metrics_of
 
 ACTIONS = ActionSpec(names=("x", "y"), low=-1.0, high=1.0, is_clipped=False)
 
@@ -60,7 +61,11 @@ class Localisation:
         """`error_m`: distance of the position to the truth (m)."""
         return {"error_m": self.error_m(action, step.truth)}
 
-    def measure_references(self, ticks: Sequence[LearningTick]) -> dict[str, list[Float32Array]]:
+    def measure_answers(self, tick: MeasuredTick, answers: Tensor) -> dict[str, FloatArray]:
+        """`error_m`: distance of the published positions to the truth (m)."""
+        return {"error_m": _distance_m(answers.numpy(), tick.truth.numpy())[tick.valid]}
+
+    def measure_references(self, ticks: Sequence[MeasuredTick]) -> dict[str, list[FloatArray]]:
         """`raw_gnss_error_m`: distance of the raw GNSS fix to the truth (m)."""
         return {"raw_gnss_error_m": raw_errors_m(ticks)}
 
@@ -69,13 +74,7 @@ class Localisation:
         return rewards.distance_m(self.answer(action), truth if action.ndim == truth.ndim else truth.unsqueeze(1))
 
 
-def errors_m(obs: LearningTick, predictions_m: Tensor) -> tuple[Float32Array, Float32Array]:
-    """Distances to the truth `[v]` of predictions `[n, 2]` and of raw GNSS, on the valid rows of a tick."""
-    policy = _distance_m(predictions_m.numpy(), obs.truth.numpy())[obs.valid]
-    return policy, raw_errors_m([obs])[0]
-
-
-def raw_errors_m(ticks: Sequence[LearningTick]) -> list[Float32Array]:
+def raw_errors_m(ticks: Sequence[MeasuredTick]) -> list[FloatArray]:
     """Distances to the truth `[v]` of raw GNSS, on the valid rows of each of some ticks.
 
     The same numbers, bit for bit, whichever ticks come together.
@@ -86,8 +85,12 @@ def raw_errors_m(ticks: Sequence[LearningTick]) -> list[Float32Array]:
     return [error[obs.valid] for obs, error in zip(ticks, np.split(errors, ends), strict=True)]
 
 
-def _distance_m(position: Float32Array, truth: Float32Array) -> Float32Array:
-    """Horizontal distance `[n]`. Elementwise, so that a row's result does not depend on the rows beside it."""
+def _distance_m(position: FloatArray, truth: FloatArray) -> FloatArray:
+    """Horizontal distance `[n]`. Elementwise, so that a row's result does not depend on the rows beside it.
+
+    Positions of float64 are those of filters and faces. Their distance is numpy's `hypot`, as it is of baselines.
+    """
     east, north = position[:, 0] - truth[:, 0], position[:, 1] - truth[:, 1]
-    distance_m: Float32Array = np.sqrt(east * east + north * north)
+    is_double = position.dtype == np.float64
+    distance_m: FloatArray = np.hypot(east, north) if is_double else np.sqrt(east * east + north * north)
     return distance_m
