@@ -1,7 +1,7 @@
 """Measures sample visits per second of our PPO update and of a plain loop in CleanRL's manner, alternating in one run.
 
-Same networks, batch, epochs, and threads. `python trainer/benches/ppo_update.py [--threads N] [--precision P]`;
-prints the median of each, and the median of the pairwise ratios. A sample visit is one sample in one epoch.
+Same networks, batch, epochs, and threads. `python -m caraware_bench.ppo_update [--threads N] [--precision P]` prints
+the median of each, and the median of the pairwise ratios. A sample visit is one sample in one epoch.
 """
 
 import argparse
@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 
 import torch
+
 from caraware.learn.batch import Batch
 from caraware.learn.build import build_ppo
 from caraware.learn.config import MapBounds
