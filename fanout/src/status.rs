@@ -5,7 +5,6 @@ use std::collections::BTreeMap;
 use ipc_schema::{
     board::{Health, State, TrainingStatus},
     config::Field,
-    metric,
     process::Process,
     run::{MapInfo, Mode, RunFile},
 };
@@ -136,62 +135,6 @@ impl ProcessStatus {
     }
 }
 
-/// Progress of learning, from the trainer's board.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct LearningStatus {
-    /// Episode of the newest sample.
-    pub episode: u64,
-    /// Samples used for training so far.
-    pub env_steps: u64,
-    /// Updates of the policy so far.
-    pub updates: u64,
-    /// Recent rate of samples, per wall second.
-    pub env_steps_per_s: f64,
-    /// Standard deviation of the policy.
-    pub policy_std: f64,
-    /// Recent mean reward.
-    pub reward: f64,
-    /// Largest mean reward so far.
-    pub best_reward: f64,
-    /// Metrics of the policy and of its baselines.
-    pub metrics: Vec<MetricStatus>,
-}
-
-/// One metric of the task.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct MetricStatus {
-    /// Name in reports.
-    pub name: &'static str,
-    /// Name in the HUD.
-    pub label: &'static str,
-    /// Unit in the HUD.
-    pub unit: &'static str,
-    /// Value on the samples of the newest update.
-    pub value: f64,
-}
-
-impl From<TrainingStatus> for LearningStatus {
-    fn from(status: TrainingStatus) -> Self {
-        Self {
-            episode: status.episode,
-            env_steps: status.env_steps,
-            updates: status.updates,
-            env_steps_per_s: status.env_steps_per_s,
-            policy_std: status.policy_std,
-            reward: status.reward,
-            best_reward: status.best_reward,
-            metrics: metric::measured(&status.metrics)
-                .map(|(metric, value)| MetricStatus {
-                    name: metric.name,
-                    label: metric.label,
-                    unit: metric.unit,
-                    value,
-                })
-                .collect(),
-        }
-    }
-}
-
 /// FanoutCounters of the fan-out itself.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct FanoutCounters {
@@ -279,7 +222,7 @@ pub struct RunStatus {
     /// State of every process of the run.
     pub processes: Vec<ProcessStatus>,
     /// Progress of learning; `None` in a run without a learner.
-    pub training: Option<LearningStatus>,
+    pub training: Option<TrainingStatus>,
     /// FanoutCounters of the fan-out itself.
     pub fanout: FanoutCounters,
 }

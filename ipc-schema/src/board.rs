@@ -1,9 +1,10 @@
 //! The board of a process: its latest progress and health, newest wins, readable by every process at any time.
 
 use iceoryx2::prelude::ZeroCopySend;
+use serde::Serialize;
 
 use crate::{
-    metric::{MetricValues, NOT_MEASURED},
+    metric::{self, MetricValues, NOT_MEASURED},
     process::Process,
 };
 
@@ -130,9 +131,9 @@ pub struct Health {
     pub written_ns: u64,
 }
 
-/// How learning goes.
+/// How learning goes. Its fields are also those of the fan-out's status, with the measured metrics by name.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, ZeroCopySend)]
 #[type_name("caraware::TrainingStatus")]
 pub struct TrainingStatus {
     /// Episode of the newest sample.
@@ -150,6 +151,7 @@ pub struct TrainingStatus {
     /// Largest of those so far.
     pub best_reward: f64,
     /// Value of each metric on the samples of the newest update, in the order of [`crate::metric::METRICS`].
+    #[serde(serialize_with = "metric::serialize_measured")]
     pub metrics: MetricValues,
 }
 
@@ -165,5 +167,27 @@ impl Default for TrainingStatus {
             best_reward: 0.0,
             metrics: NOT_MEASURED,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn a_training_status_is_written_with_the_measured_metrics_by_name() {
+        let mut status = TrainingStatus {
+            updates: 3,
+            reward: 0.5,
+            ..TrainingStatus::default()
+        };
+        status.metrics[0] = 4.5;
+        let expected = json!({
+            "episode": 0, "env_steps": 0, "updates": 3, "env_steps_per_s": 0.0, "policy_std": 0.0, "reward": 0.5,
+            "best_reward": 0.0, "metrics": [{"name": "error_m", "label": "error", "unit": "m", "value": 4.5}],
+        });
+        assert_eq!(serde_json::to_value(status).unwrap(), expected);
     }
 }

@@ -3,7 +3,7 @@
 //! A trainer reports the metrics of its task on its board; the progress line, `caraware ps`, the fan-out's status, the HUD and
 //! the native extension derive theirs from [`METRICS`]. A new metric is a row here and a value that the task measures.
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, Serializer};
 
 use crate::config::TaskKind;
 
@@ -153,6 +153,26 @@ pub const NOT_MEASURED: MetricValues = [f64::NAN; METRIC_CAPACITY];
 /// The metrics that are measured, with their values.
 pub fn measured(values: &MetricValues) -> impl Iterator<Item = (&'static MetricSpec, f64)> {
     METRICS.iter().zip(*values).filter(|(_, value)| value.is_finite())
+}
+
+/// Writes the metrics that are measured as a list of name, label, unit and value.
+///
+/// # Errors
+/// Those of the serializer.
+pub fn serialize_measured<S: Serializer>(values: &MetricValues, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Measured {
+        name: &'static str,
+        label: &'static str,
+        unit: &'static str,
+        value: f64,
+    }
+    serializer.collect_seq(measured(values).map(|(metric, value)| Measured {
+        name: metric.name,
+        label: metric.label,
+        unit: metric.unit,
+        value,
+    }))
 }
 
 /// The metric that a task is judged by.

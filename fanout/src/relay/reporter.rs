@@ -111,7 +111,7 @@ impl StatusReporter {
                 .iter()
                 .map(|(process, health)| ProcessStatus::of(*process, health, sumo_ticks))
                 .collect(),
-            training: run.mode.has_trainer().then(|| self.trainer_board.training().into()),
+            training: run.mode.has_trainer().then(|| self.trainer_board.training()),
             fanout: counters,
         }
     }
