@@ -103,6 +103,42 @@ def test_rows_of_a_learner_earn_what_slots_of_a_face_earn(task: Task) -> None:
         assert rewards.measured(transition, action.numpy())[name].tolist() == pytest.approx(value.tolist(), rel=1e-6)
 
 
+FACE_ROWS = [
+    # action, truth x and y (m), distance (m)
+    ((0.30022913217544556, 0.9533131122589111), (74.42816162109375, 73.87957763671875), "0x1.ebb851712b7c8p+5"),
+    ((0.2932301461696625, 1.17350435256958), (53.58665084838867, 41.33418273925781), "0x1.36c8f77cba65ap+6"),
+    ((-0.9804105758666992, 0.09874517470598221), (63.25627517700195, 68.53797149658203), "0x1.6153390c50b40p+6"),
+    ((1.122787356376648, -0.6839902997016907), (62.30442810058594, 70.26278686523438), "0x1.6d89f30bfeeddp+7"),
+    ((1.1211557388305664, 0.378625750541687), (92.62158203125, 52.178001403808594), "0x1.f021ae33b8fabp+6"),
+    ((-0.17227141559123993, 0.056976258754730225), (39.17930221557617, 52.67401885986328), "0x1.08d0bd221c3f6p+6"),
+]
+"""Rows on which torch's vector norm differs from hypot in the last bit of float64."""
+FACE_REWARDS = ["0x1.3421d18e7247cp-4", "0x1.ef4e7c00d55f5p-5", "0x1.b6dde8d6cfca7p-5"]
+FACE_REWARDS += ["0x1.b4479d5597c4ep-6", "0x1.3d703dc73fcc3p-5", "0x1.1f9ffa28d8770p-4"]
+
+
+def test_a_face_earns_the_same_bits_as_ever() -> None:
+    run = run_of("localisation")
+    run["config"]["trainer"]["reward"] = "bounded_inverse"
+    settings, count = FaceSettings.from_run(run), len(FACE_ROWS)
+    action = np.array([row[0] for row in FACE_ROWS], np.float32)
+    truth = np.zeros((count, 4), np.float32)
+    truth[:, :2] = [row[1] for row in FACE_ROWS]
+    none, ids = np.zeros(count, bool), (np.zeros(count, np.uint32), np.zeros(count, np.uint64))
+    now = Rows(settings, np.zeros((count, 2), np.float32), truth, np.zeros((count, 2), np.float32))
+    transition = Transition(settings, now.observation, truth, now.gnss_m, ~none, *ids, none, none, now)
+    error_m = rewards.measured(transition, action)["error_m"]
+    assert [float(value).hex() for value in error_m] == [row[2] for row in FACE_ROWS]
+    assert [float(value).hex() for value in rewards.of_task(settings.task)(transition, action)] == FACE_REWARDS
+    # A learner's float32 rows keep torch's vector norm.
+    task = settings.task
+    learnt = task.measure(
+        TaskStep(torch.from_numpy(now.observation), torch.from_numpy(truth)), torch.from_numpy(action)
+    )
+    away = task.answer(torch.from_numpy(action)) - torch.from_numpy(truth)[:, :2]
+    assert torch.equal(learnt["error_m"], torch.linalg.vector_norm(away, dim=-1))
+
+
 def test_what_was_published_is_measured_as_the_action_is() -> None:
     """Without the rows that are not valid; for a metric of driving the outcome is missing."""
     run, given, valid = run_of("localisation"), step(), np.arange(ROWS) % 2 == 0

@@ -70,8 +70,14 @@ class Localisation:
         return {"raw_gnss_error_m": raw_errors_m(ticks)}
 
     def error_m(self, action: Tensor, truth: Tensor) -> Tensor:
-        """Distances `[...]` of the positions of actions `[..., 2]` to the truth `[n, 4]` (m)."""
-        return rewards.distance_m(self.answer(action), truth if action.ndim == truth.ndim else truth.unsqueeze(1))
+        """Distances `[...]` of the positions of actions `[..., 2]` to the truth `[n, 4]` (m).
+
+        A learner's rows are float32 and lie on its device; a face's are float64, and numpy measures them.
+        """
+        position_m, truth = self.answer(action), truth if action.ndim == truth.ndim else truth.unsqueeze(1)
+        if position_m.dtype == torch.float64:
+            return torch.from_numpy(_distance_m(position_m.numpy(), truth.numpy()))
+        return rewards.distance_m(position_m, truth)
 
 
 def raw_errors_m(ticks: Sequence[MeasuredTick]) -> list[FloatArray]:
@@ -86,11 +92,11 @@ def raw_errors_m(ticks: Sequence[MeasuredTick]) -> list[FloatArray]:
 
 
 def _distance_m(position: FloatArray, truth: FloatArray) -> FloatArray:
-    """Horizontal distance `[n]`. Elementwise, so that a row's result does not depend on the rows beside it.
+    """Horizontal distance `[...]`. Elementwise, so that a row's result does not depend on the rows beside it.
 
     Positions of float64 are those of filters and faces. Their distance is numpy's `hypot`, as it is of baselines.
     """
-    east, north = position[:, 0] - truth[:, 0], position[:, 1] - truth[:, 1]
+    east, north = position[..., 0] - truth[..., 0], position[..., 1] - truth[..., 1]
     is_double = position.dtype == np.float64
     distance_m: FloatArray = np.hypot(east, north) if is_double else np.sqrt(east * east + north * north)
     return distance_m
