@@ -8,7 +8,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from caraware_bench import agent_steps, peer
+from caraware_bench import peer
 from caraware_bench.agent_steps import WARM_UP_STEPS, agent_steps_per_s
 from caraware_bench.traffic_loop import SIGNAL_PERIOD_STEPS, Mirror, measure
 
@@ -80,7 +80,7 @@ def test_a_loop_that_fails_ends_sumo() -> None:
 
 def test_agent_steps_are_counted_while_stepping_only(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 0.0
-    monkeypatch.setattr(agent_steps.time, "perf_counter", lambda: now_s)
+    monkeypatch.setattr("caraware_bench.agent_steps.time.perf_counter", lambda: now_s)
 
     class World:
         """Seven agents, half a second a step; a reset takes ten."""

@@ -9,6 +9,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 from caraware.ipc.channel import Channel
 from probe import lies_in_shared_memory
@@ -20,10 +21,12 @@ def digest(tensor: Tensor) -> str:
     return hashlib.sha256(tensor.clone().numpy().tobytes()).hexdigest()
 
 
-def leased(channel: Channel) -> dict:
+def leased(channel: Channel) -> dict[str, Any]:
     """Take all ticks of a run, each lent."""
     lease = channel.lease()
-    digests, in_shared_memory, refused_writes, last = [], True, 0, False
+    digests: list[str] = []
+    tensor: Tensor | None = None
+    in_shared_memory, refused_writes, last = True, 0, False
     while not last:
         tensor = lease.next(60.0)
         assert tensor is not None and lease.tick == len(digests), lease.tick
@@ -40,7 +43,7 @@ def leased(channel: Channel) -> dict:
     places = lease.places
     del lease
     # A tensor that is kept keeps the memory mapped.
-    kept = digest(tensor) == digests[-1]
+    kept = tensor is not None and digest(tensor) == digests[-1]
     return {
         "digests": digests,
         "in_shared_memory": in_shared_memory,
@@ -51,7 +54,7 @@ def leased(channel: Channel) -> dict:
     }
 
 
-def received(channel: Channel) -> dict:
+def received(channel: Channel) -> dict[str, Any]:
     """Take all ticks of a run, each as an observation that is kept."""
     digests, last = [], False
     while not last:

@@ -7,6 +7,7 @@ the rollout buffer to the batch that PPO learns from, and writes its findings to
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +37,7 @@ def position_m(normalised: torch.Tensor, bounds: list[float]) -> torch.Tensor:
     return low + (normalised[..., :2] + 1) / 2 * (high - low)
 
 
-def check_tick(obs: Observation, bounds: list[float], found: dict) -> None:
+def check_tick(obs: Observation, bounds: list[float], found: dict[str, Any]) -> None:
     """Check one tick: it lies in shared memory, is read-only, and each row belongs to one vehicle."""
     views = (obs.observation, obs.truth, obs.gnss_m)
     found["in_shared_memory"] &= all(lies_in_shared_memory(view.data_ptr()) for view in views)
@@ -53,7 +54,14 @@ def check_tick(obs: Observation, bounds: list[float], found: dict) -> None:
             found["refused_writes"] += 1
 
 
-def check_batch(ppo: Ppo, rollout: Rollout, config: RunConfig, bounds: list[float], found: dict, seen: dict) -> None:
+def check_batch(
+    ppo: Ppo,
+    rollout: Rollout,
+    config: RunConfig,
+    bounds: list[float],
+    found: dict[str, Any],
+    seen: dict[tuple[int, int], torch.Tensor],
+) -> None:
     """Check that observation, action, reward and truth of a sample belong to the same vehicle and the same tick."""
     batch = ppo.score(rollout.take())
     found["samples"] += len(batch.reward)
@@ -73,13 +81,13 @@ def main(run_file: str) -> None:
     channel = Channel(run_file)
     config = RunConfig.from_run(channel.run)
     bounds = channel.run["map"]["bounds_m"]
-    found = {
+    found: dict[str, Any] = {
         **dict.fromkeys(("in_shared_memory", "in_the_block", "distinct_vehicles"), True),
         **dict.fromkeys(("largest_position_error_m", "largest_batch_error_m", "largest_reward_error"), 0.0),
         **dict.fromkeys(("writable", "refused_writes", "samples", "foreign_samples", "env_steps"), 0),
         "ticks": [],
     }
-    ppo = rollout = None
+    ppo: Ppo | None = None
     seen: dict[tuple[int, int], torch.Tensor] = {}
     last = False
     while not last:

@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 from caraware.learn import ranks
 from caraware.run.config import RunConfig
@@ -17,7 +18,7 @@ SETTINGS = json.loads(os.environ.get("RANK_PROBE_SETTINGS", "{}"))
 HORIZON, BATCH, VEHICLES, TRAINING_TICKS = 256, 64, 16, 64
 
 
-def settings(folder: Path, envs: int, first_env: int, world: int, more: dict | None = None) -> dict:
+def settings(folder: Path, envs: int, first_env: int, world: int, more: dict[str, Any] | None = None) -> dict[str, Any]:
     """The run file of one trainer with `envs` environments among `world` ranks; sizes are of each environment."""
     sizes = {"ranks": world, "horizon": envs * HORIZON, "batch_size": envs * BATCH}
     own = sizes | {"checkpoint_interval": 1, "device": DEVICE} | (SETTINGS if more is None else more)
@@ -26,7 +27,7 @@ def settings(folder: Path, envs: int, first_env: int, world: int, more: dict | N
     return run
 
 
-def channels(run: dict) -> list[SyntheticChannel]:
+def channels(run: dict[str, Any]) -> list[SyntheticChannel]:
     """The ticks of its environments; an environment has the same ticks in every rank."""
     place = run["config"]["run"]
     numbers = range(place["first_env"], place["first_env"] + place["envs"])
@@ -42,7 +43,7 @@ def main(folder: Path, fault: str) -> None:
     loop = TrainingLoop(first, RunConfig.from_run(run), lambda: False, others=others, ranks=together)
     if rank == 1 and fault == "dies":
         learn = loop._learn
-        loop._learn = lambda learner: os._exit(9) if loop._updates() == 2 else learn(learner)
+        setattr(loop, "_learn", lambda learner: os._exit(9) if loop._updates() == 2 else learn(learner))  # noqa: B010
     if rank == 1 and fault == "differs":
         learner = Learner.begin(RunConfig.from_run(run), FIELDS, together)
         loop._start(learner)

@@ -2,12 +2,14 @@
 
 import math
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Unpack
 
 import numpy as np
 import torch
+from caraware.ipc.stream import TrainingReport
 from caraware.learn.build import build_ppo
 from caraware.learn.config import TrainerConfig
 from caraware.learn.ppo import Ppo
@@ -43,13 +45,24 @@ class SyntheticObservation:
     lesson_last: bool = False
     stage: int = 0
     sim_time_ns: int = 0
+    gnss_quality: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    imu: Tensor = field(default_factory=lambda: torch.zeros(0, 1, 7))
+    speed_steering: Tensor = field(default_factory=lambda: torch.zeros(0, 2))
+    sensors: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint32))
+    age_s: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.float32))
+    episode_step: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint32))
+
+    @property
+    def id_hash(self) -> np.ndarray:
+        """u64 `[n]`."""
+        return self.vehicle.astype(np.uint64)
 
 
 @dataclass
 class SyntheticChannel:
     """Returns prepared ticks, up to `window` at a time, and records what the trainer sends."""
 
-    run: dict
+    run: dict[str, Any]
     ticks: Iterator[SyntheticObservation]
     group: int = 8
     consumed_up_to: int = -1
@@ -57,10 +70,10 @@ class SyntheticChannel:
     is_done: bool = False
     predictions: dict[int, Tensor] = field(default_factory=dict)
     versions: dict[int, int] = field(default_factory=dict)
-    reports: list[dict] = field(default_factory=list)
+    reports: list[TrainingReport] = field(default_factory=list)
     decisions: list[tuple[int, int, int]] = field(default_factory=list)
 
-    def receive(self, timeout_s: float) -> list[SyntheticObservation]:
+    def receive(self, timeout_s: float) -> Sequence[SyntheticObservation]:
         """The next ticks."""
         return [obs for _, obs in zip(range(self.group), self.ticks, strict=False)]
 
@@ -94,14 +107,14 @@ class SyntheticChannel:
         observation: SyntheticObservation,
         predictions: Tensor,
         policy_version: int,
-        estimates_m: np.ndarray | None = None,
+        estimates: np.ndarray | None = None,
     ) -> None:
         """Remember the predictions."""
         assert predictions.shape == (len(observation.vehicle), 2)
         self.predictions[observation.tick] = predictions.clone()
         self.versions[observation.tick] = policy_version
 
-    def report(self, **status: float) -> None:
+    def report(self, **status: Unpack[TrainingReport]) -> None:
         """Remember the status."""
         self.reports.append(status)
 
@@ -144,7 +157,7 @@ def with_evaluation(
         yield replace(obs, evaluation=first or last, episode=episode, truncated=truncated, last=obs.tick == total - 1)
 
 
-def run_file(run_dir: str, **trainer: object) -> dict:
+def run_file(run_dir: str, **trainer: object) -> dict[str, Any]:
     """A run file of the preset `town`, but small and single-threaded, with these changes."""
     small = {
         "threads": 1,

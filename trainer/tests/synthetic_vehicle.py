@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,9 +17,9 @@ SUB_STEPS = 10
 GNSS, IMU, SPEED_STEERING = 1, 2, 4
 
 
-def sensor_tables(**changes: object) -> dict:
+def sensor_tables(**changes: Any) -> dict[str, Any]:
     """The preset's sensor tables; a change is `table__key=value`."""
-    tables: dict = {
+    tables: dict[str, Any] = {
         "run": {"tick_s": TICK_S},
         "gnss": {
             "period_s": 0.1,
@@ -47,7 +48,7 @@ def sensor_tables(**changes: object) -> dict:
     return tables
 
 
-def vehicle_run(run_dir: str, tables: dict | None = None, **trainer: object) -> dict:
+def vehicle_run(run_dir: str, tables: dict[str, Any] | None = None, **trainer: object) -> dict[str, Any]:
     """A run file with sensors."""
     run = run_file(run_dir, **trainer)
     run["config"] |= tables or sensor_tables()
@@ -62,13 +63,6 @@ class VehicleObservation(SyntheticObservation):
     def id_hash(self) -> np.ndarray:
         """u64 `[n]`."""
         return np.array([_native.id_hash(f"cav.{vehicle}") for vehicle in self.vehicle], np.uint64)
-
-    gnss_quality: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    imu: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 1, 7))
-    speed_steering: torch.Tensor = field(default_factory=lambda: torch.zeros(0, 2))
-    sensors: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint32))
-    age_s: np.ndarray = field(default_factory=lambda: np.zeros((0, 4), np.float32))
-    episode_step: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint32))
 
 
 @dataclass(frozen=True)
@@ -133,7 +127,8 @@ def _driven(
     """
     steps, vehicles = accel.shape
     dt_s = TICK_S / SUB_STEPS
-    track = Track(*(np.zeros((steps, vehicles)) for _ in range(4)), accel.copy(), rate, accel.copy())
+    x_m, y_m, yaw_rad, speed_mps = (np.zeros((steps, vehicles)) for _ in range(4))
+    track = Track(x_m, y_m, yaw_rad, speed_mps, accel.copy(), rate, accel.copy())
     track.x_m[0], track.y_m[0] = rng.uniform(0, 200, vehicles), rng.uniform(0, 200, vehicles)
     track.yaw_rad[0], track.speed_mps[0] = rng.uniform(-np.pi, np.pi, vehicles), speed
     slip_s2pm = rng.normal(0.05, 0.04, vehicles) / GRAVITY_MPS2
@@ -155,7 +150,7 @@ def _driven(
 class Sensors:
     """Sensors of the vehicles of a track. Errors that are constant for a vehicle are drawn once."""
 
-    def __init__(self, track: Track, tables: dict, seed: int) -> None:
+    def __init__(self, track: Track, tables: dict[str, Any], seed: int) -> None:
         self._track, self._tables, self._rng = track, tables, np.random.default_rng((seed, 1))
         self._n = track.x_m.shape[1]
         gnss, imu, wheels = tables["gnss"], tables["imu"], tables["speed_steering"]
@@ -171,9 +166,10 @@ class Sensors:
         self._wheel = np.zeros(self._n)
 
     def _per_tick(self) -> int:
-        return max(1, round(TICK_S / self._tables["imu"]["period_s"]))
+        period_s: float = self._tables["imu"]["period_s"]
+        return max(1, round(TICK_S / period_s))
 
-    def observe(self, tick: int, dark: np.ndarray | None = None, **changes: object) -> VehicleObservation:
+    def observe(self, tick: int, dark: np.ndarray | None = None, **changes: Any) -> VehicleObservation:
         """The observation of a tick; ticks in order. `dark` are bits `[n]` of sensors in a blackout."""
         dark = np.zeros(self._n, np.uint32) if dark is None else dark
         ages = [self._age(tick, table) for table in ("gnss", "imu", "speed_steering")]
@@ -189,7 +185,7 @@ class Sensors:
             self._dark_ticks[i] = np.where(lit & (ages[i] == 0.0), 0, self._dark_ticks[i] + 1)
         truth = self._track.truth(tick)
         none = np.zeros(self._n, bool)
-        values: dict = {
+        values: dict[str, Any] = {
             "tick": tick,
             "observation": torch.tensor(np.concatenate((self._fix.T / 100 - 1, truth[:, 2:]), 1), dtype=torch.float32),
             "truth": torch.tensor(truth, dtype=torch.float32),
@@ -209,7 +205,8 @@ class Sensors:
         return VehicleObservation(**(values | changes))
 
     def _age(self, tick: int, table: str) -> float:
-        period = max(1, round(self._tables[table]["period_s"] / TICK_S))
+        period_s: float = self._tables[table]["period_s"]
+        period = max(1, round(period_s / TICK_S))
         return (tick % period) * TICK_S
 
     def _slow_walks(self) -> None:
@@ -253,7 +250,7 @@ class Sensors:
 
 
 def observations(
-    track: Track, tables: dict | None = None, seed: int = 0, dark: np.ndarray | None = None, **changes: object
+    track: Track, tables: dict[str, Any] | None = None, seed: int = 0, dark: np.ndarray | None = None, **changes: Any
 ) -> Iterator[VehicleObservation]:
     """All ticks of a track; `dark` are bits `[ticks, n]`."""
     sensors = Sensors(track, tables or sensor_tables(), seed)

@@ -6,13 +6,15 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from caraware.baselines import Baselines, SensorNoise
+from caraware.baselines import BaselineErrors, Baselines, SensorNoise
 from caraware.baselines.samples import read_samples
 from caraware.ipc.channel import read_only_tensor
+from caraware.ipc.stream import Observation
 from caraware.report import evaluation
 from caraware.report.evaluation import ESTIMATORS, Evaluation
 from caraware.run.config import RunConfig
@@ -40,14 +42,15 @@ def episodes(*evaluations: bool, ticks: int = TICKS) -> Iterator[VehicleObservat
             )
 
 
-def run_over(tmp_path: Path, ticks: Iterator[VehicleObservation], run: dict) -> SyntheticChannel:
+def run_over(tmp_path: Path, ticks: Iterator[VehicleObservation], run: dict[str, Any]) -> SyntheticChannel:
     channel = SyntheticChannel(run, ticks)
     TrainingLoop(channel, RunConfig.from_run(run), lambda: False).run()
     return channel
 
 
-def part(tmp_path: Path) -> dict:
-    return json.loads((tmp_path / "parts" / "trainer.json").read_text())
+def part(tmp_path: Path) -> dict[str, Any]:
+    written: dict[str, Any] = json.loads((tmp_path / "parts" / "trainer.json").read_text())
+    return written
 
 
 def test_all_are_measured_on_the_same_valid_rows(tmp_path: Path) -> None:
@@ -55,10 +58,11 @@ def test_all_are_measured_on_the_same_valid_rows(tmp_path: Path) -> None:
     run_over(tmp_path, episodes(True, True), vehicle_run(str(tmp_path)))
     expected: dict[str, list[float]] = {"raw_gnss": [], "ekf": [], "rts": []}
     noise = SensorNoise.from_run({"config": sensor_tables()})
-    by_hand = None
+    assert noise is not None
+    by_hand = Baselines(noise)
     for obs in episodes(True, True):
         if obs.tick % TICKS == 0:
-            expected["rts"] += [e for tick in (by_hand.finish_episode() if by_hand else []) for e in tick.error_m]
+            expected["rts"] += [e for tick in by_hand.finish_episode() for e in tick.error_m]
             by_hand = Baselines(noise)
         filtered, early = by_hand.add(obs)
         assert early == []
@@ -101,9 +105,10 @@ def test_intervals_are_over_seeds() -> None:
         error_m = np.full(4, [2.0, 3.0, 7.0][obs.tick // 2])
         phase.add(replace(obs, episode=obs.tick // 2), {"ppo": error_m, "raw_gnss": 2 * error_m})
     result = phase.result(0, 1)
+    assert result is not None
     policy = result.estimates["ppo"]
     assert (policy.mean, result.episodes) == (4.0, 3)
-    assert policy.ci95 == pytest.approx(4.302653 * math.sqrt(7 / 3), rel=1e-6)
+    assert policy.ci95 is not None and policy.ci95 == pytest.approx(4.302653 * math.sqrt(7 / 3), rel=1e-6)
     assert result.estimates["raw_gnss"].ci95 == pytest.approx(2 * policy.ci95)
     assert policy.half_width() == policy.ci95
     assert "95 % over 3 seeds" in str(result)
@@ -123,7 +128,7 @@ def test_training_never_runs_a_filter(tmp_path: Path, monkeypatch: pytest.Monkey
     seen: list[bool] = []
 
     class Watched(Baselines):
-        def add(self, obs: VehicleObservation) -> object:
+        def add(self, obs: Observation) -> tuple[BaselineErrors, list[BaselineErrors]]:
             seen.append(obs.evaluation)
             return super().add(obs)
 
@@ -154,6 +159,7 @@ def test_the_interval_covers_the_true_mean() -> None:
             errors_m = level + rng.normal(0, 0.3, 40)
             phase.add(obs, {"ppo": errors_m, "raw_gnss": errors_m})
         result = phase.result(0, 0)
+        assert result is not None
         covered += abs(result.estimates["ppo"].mean - 2.0) < result.estimates["ppo"].half_width()
     assert abs(covered / 400 - 0.95) < 4 * math.sqrt(0.95 * 0.05 / 400)
 
@@ -161,7 +167,10 @@ def test_the_interval_covers_the_true_mean() -> None:
 def test_samples_are_read_from_read_only_memory_and_copied() -> None:
     obs = next(observations(town_track(2, 3, 1)))
     locked = replace(
-        obs, **{name: read_only_tensor(getattr(obs, name).numpy()) for name in ("gnss_m", "imu", "speed_steering")}
+        obs,
+        gnss_m=read_only_tensor(obs.gnss_m.numpy()),
+        imu=read_only_tensor(obs.imu.numpy()),
+        speed_steering=read_only_tensor(obs.speed_steering.numpy()),
     )
     one, two = read_samples(obs, "kinematic"), read_samples(locked, "kinematic")
     for name, array in vars(one).items():

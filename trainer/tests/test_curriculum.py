@@ -42,7 +42,9 @@ def test_gates_open_in_order_and_once() -> None:
     assert simulation.decisions[-1] == (5, 4, 2)
     curriculum.lesson_ended(End(49, 3), 50, policy_std=0.0, metrics={"error_m": 0.0})
     assert simulation.decisions[-1] == (6, 4, 2), "a stage without a gate lasts"
-    passed = curriculum.report()["passed"]
+    report = curriculum.report()
+    assert report is not None
+    passed = report["passed"]
     assert [(gate["stage"], gate["tick"], gate["lessons"], gate["env_steps"]) for gate in passed] == [
         (1, 19, 2, 20),
         (2, 39, 4, 40),
@@ -78,7 +80,8 @@ def test_a_successor_decides_nothing_twice() -> None:
     assert len(simulation.decisions) == 1, "the tick is delivered again, the lesson is not counted again"
     successor.lesson_ended(End(19, 2), 20, 0.4, {"error_m": 9.0})
     assert simulation.decisions[-1] == (3, 1, 1)
-    assert successor.report()["lessons"] == 2
+    report = successor.report()
+    assert report is not None and report["lessons"] == 2
 
 
 def test_a_successor_that_would_have_decided_otherwise_follows_the_ticks() -> None:

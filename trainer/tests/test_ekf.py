@@ -1,8 +1,9 @@
 """The filter: its errors against chi-square, and its handling of sensors."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ MANY_ERRORS = {
 }
 
 
-def tables_of(**changes: object) -> dict:
+def tables_of(**changes: object) -> dict[str, Any]:
     """Tables with one number for all three axes where the changes give one."""
     changes = {
         key: [value] * 3 if key.startswith(("imu__gyro", "imu__accel")) and isinstance(value, float) else value
@@ -55,14 +56,14 @@ def tables_of(**changes: object) -> dict:
     return sensor_tables(**changes)
 
 
-def noise_of(tables: dict) -> SensorNoise:
+def noise_of(tables: dict[str, Any]) -> SensorNoise:
     noise = SensorNoise.from_run({"config": tables})
     assert noise is not None
     return noise
 
 
 def filtered(
-    obs: Iterator[VehicleObservation], tables: dict, model: MotionModel | None = None
+    obs: Iterator[VehicleObservation], tables: dict[str, Any], model: MotionModel | None = None
 ) -> Iterator[tuple[VehicleObservation, Ekf]]:
     """The filter after every tick."""
     noise = noise_of(tables)
@@ -73,15 +74,19 @@ def filtered(
 
 
 def errors_m(obs: VehicleObservation, ekf: Ekf) -> np.ndarray:
-    return np.hypot(*(ekf.position_m - obs.truth[:, :2].numpy()).T)
+    east, north = (ekf.position_m - obs.truth[:, :2].numpy()).T
+    distance_m: np.ndarray = np.hypot(east, north)
+    return distance_m
 
 
 def raw_errors_m(obs: VehicleObservation) -> np.ndarray:
-    return (obs.gnss_m[:, :2] - obs.truth[:, :2]).norm(dim=1).numpy()
+    distance_m: np.ndarray = (obs.gnss_m[:, :2] - obs.truth[:, :2]).norm(dim=1).numpy()
+    return distance_m
 
 
 def position_std_m(ekf: Ekf) -> np.ndarray:
-    return np.sqrt(ekf.belief.covariance[0, 0] + ekf.belief.covariance[1, 1])
+    std_m: np.ndarray = np.sqrt(ekf.belief.covariance[0, 0] + ekf.belief.covariance[1, 1])
+    return std_m
 
 
 def squared_errors(obs: VehicleObservation, ekf: Ekf, states: int) -> np.ndarray:
@@ -89,7 +94,8 @@ def squared_errors(obs: VehicleObservation, ekf: Ekf, states: int) -> np.ndarray
     error = ekf.belief.mean[:states] - obs.truth[:, :states].numpy().T
     error[YAW:3] = wrapped(error[YAW:3])
     covariance = ekf.belief.covariance[:states, :states].transpose(2, 0, 1)
-    return np.einsum("in,ni->n", error, np.linalg.solve(covariance, error.T[:, :, None])[:, :, 0])
+    nees: np.ndarray = np.einsum("in,ni->n", error, np.linalg.solve(covariance, error.T[:, :, None])[:, :, 0])
+    return nees
 
 
 EXACT = MotionModel(1e-4, 1e4, 1e-5, 1e4, slip_noise_rad_per_g=0.0, heading_time_s=0.5, position_walk_m=1e-3)
@@ -106,7 +112,7 @@ EXACT = MotionModel(1e-4, 1e4, 1e-5, 1e4, slip_noise_rad_per_g=0.0, heading_time
     ],
     ids=["few errors", "every error", "other rates", "slow IMU"],
 )
-def test_errors_are_as_large_as_the_covariance_says(changes: dict) -> None:
+def test_errors_are_as_large_as_the_covariance_says(changes: dict[str, Any]) -> None:
     """Mean NEES of 400 vehicles with own seeds within the 99.9 % bounds of chi-square, at many times."""
     tables, vehicles = tables_of(**changes), 400
     low, high = chi2.ppf([0.0005, 0.9995], 4 * vehicles) / vehicles
@@ -130,7 +136,7 @@ def test_with_the_default_model_covariances_are_honest_in_town() -> None:
 
 
 @pytest.mark.parametrize("track", [steady_track, town_track, standing_track])
-def test_it_beats_raw_fixes_by_a_wide_margin(track: object) -> None:
+def test_it_beats_raw_fixes_by_a_wide_margin(track: Callable[[int, int, int], Track]) -> None:
     """After 10 s there are 100 fixes: √100 times better without unknown motion."""
     raw, own = [], []
     for obs, ekf in filtered(observations(track(200, 100, 8), seed=9), sensor_tables()):
@@ -280,8 +286,11 @@ def test_the_quality_that_the_receiver_reports_counts() -> None:
     """Fixes with ten times the error, which the receiver reports: they correct less."""
     quality = np.full((1, 2), 10 * math.hypot(5.57, 5.57), np.float32)
     good, bad = (
-        [ekf for _, ekf in filtered(observations(standing_track(30, 1, 1), **more), sensor_tables())][-1]
-        for more in ({}, {"gnss_quality": quality})
+        [ekf for _, ekf in filtered(ticks, sensor_tables())][-1]
+        for ticks in (
+            observations(standing_track(30, 1, 1)),
+            observations(standing_track(30, 1, 1), gnss_quality=quality),
+        )
     )
     assert position_std_m(bad)[0] == pytest.approx(10 * position_std_m(good)[0], rel=0.02)
 

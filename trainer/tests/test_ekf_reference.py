@@ -54,6 +54,7 @@ class Reference:
                 walked = self.integrated(age + dt, std, time_s) - self.integrated(age, std, time_s)
             trusts.append(trust)
             variances.append(walked + (trust * sensor_std * dt) ** 2)
+        assert self.imu is not None
         mean = self.imu if imu is None else (imu + self.imu) / 2 if self.imu_age_s == 0 else imu
         self.imu, self.imu_age_s = (self.imu, self.imu_age_s + dt) if imu is None else (imu, 0.0)
         kept = math.exp(-dt / noise.fix_slow_time_s)
@@ -150,7 +151,7 @@ def test_state_and_covariance_are_filterpy_s_to_1e_9() -> None:
             reference.update(samples.wheel_mps[1], {3: passed * (1 + s), 11: passed * v}, expected, variance)
         if lit[GNSS] and obs.tick % 3 == 0:
             for axis in (0, 1):
-                h = {axis: 1, 7 + axis: 1, 9 + axis: 1}
+                h = {axis: 1.0, 7 + axis: 1.0, 9 + axis: 1.0}
                 reference.update(samples.fix_m[axis, 1], h, x.x[list(h)].sum(), noise.fix_std_m[axis] ** 2)
         x.x[2] = wrapped(x.x[2])
         np.testing.assert_allclose(ekf.belief.mean[:, 1], x.x, rtol=1e-9, atol=1e-9)

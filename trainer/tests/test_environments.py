@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -26,14 +27,14 @@ def ticks(environment: int) -> Iterator[SyntheticObservation]:
     return with_evaluation(64, 6, VEHICLES, 5.0, 1 + environment)
 
 
-def settings(folder: Path, envs: int = 2, **trainer: object) -> dict:
+def settings(folder: Path, envs: int = 2, **trainer: object) -> dict[str, Any]:
     run = run_file(str(folder), **trainer)
     run["config"]["run"] = {"envs": envs, "first_env": 0, "seed": 1}
     return run
 
 
 def loop(
-    run: dict, channels: list[SyntheticChannel], learner: Learner | None = None, until: int = TICKS
+    run: dict[str, Any], channels: list[SyntheticChannel], learner: Learner | None = None, until: int = TICKS
 ) -> TrainingLoop:
     first, *others = channels
     return TrainingLoop(
@@ -45,8 +46,9 @@ def parameters(folder: Path) -> dict[str, torch.Tensor]:
     return load_file(latest_checkpoint(folder / "checkpoints") / "parameters.safetensors")
 
 
-def part(folder: Path) -> dict:
-    return json.loads((folder / "parts" / "trainer.json").read_text())
+def part(folder: Path) -> dict[str, Any]:
+    written: dict[str, Any] = json.loads((folder / "parts" / "trainer.json").read_text())
+    return written
 
 
 def test_how_the_ticks_of_environments_arrive_together_changes_nothing(tmp_path: Path) -> None:

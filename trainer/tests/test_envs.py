@@ -10,8 +10,9 @@ import sys
 import tempfile
 import textwrap
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -26,9 +27,9 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 ROOT = Path(__file__).parents[2]
 CARAWARE = ROOT / "target" / "release" / "caraware"
-TOWN = {"traffic.cavs": 4, "traffic.others": 2, "traffic.pedestrians": 2, "episode.ticks": 40}
+TOWN: dict[str, Any] = {"traffic.cavs": 4, "traffic.others": 2, "traffic.pedestrians": 2, "episode.ticks": 40}
 DRIVING = {"traffic.others": 3, "traffic.pedestrians": 2, "episode.ticks": 150, "task.time_limit_s": 4.0}
-HEROES = DRIVING | {"traffic.heroes": 3, "traffic.hero_route": []}
+HEROES: dict[str, Any] = DRIVING | {"traffic.heroes": 3, "traffic.hero_route": []}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -42,7 +43,7 @@ def runtime() -> Iterator[Path]:
         assert not list(Path(tempfile.gettempdir()).glob(f"caraware-env-{os.getpid()}-*"))
 
 
-def wait_until(condition, within_s: float = 20.0) -> None:
+def wait_until(condition: Callable[[], object], within_s: float = 20.0) -> None:
     """Waits for a condition on other processes."""
     deadline = time.monotonic() + within_s
     while not condition():
@@ -100,7 +101,7 @@ def episode_of(env: CarAwareVectorEnv, steps: int) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize(("config", "settings"), [("town", TOWN), ("driving", HEROES)])
-def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(config: str, settings: dict) -> None:
+def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(config: str, settings: dict[str, Any]) -> None:
     def run(env: CarAwareVectorEnv, seed: int) -> list[np.ndarray]:
         first, infos = env.reset(seed=seed)
         return [first, infos["mask"], *episode_of(env, 60)]
@@ -240,6 +241,7 @@ def test_a_simulation_ends_with_a_program_that_is_killed_or_interrupted(number: 
     with subprocess.Popen(
         [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as user:
+        assert user.stdout is not None
         pid, prefix = user.stdout.readline().split()
         processes = processes_of(int(pid))
         user.send_signal(number)
@@ -296,7 +298,7 @@ def code_in_the_documentation() -> list[str]:
 
 
 @pytest.mark.parametrize("code", code_in_the_documentation())
-def test_the_code_in_the_documentation_runs(code: str, capsys: pytest.CaptureFixture) -> None:
+def test_the_code_in_the_documentation_runs(code: str, capsys: pytest.CaptureFixture[str]) -> None:
     exec(compile(code, "docs/environments.md", "exec"), {})
     expected = re.findall(r"print\(.*# (\S+\.\d+)", code)
     assert all(name in capsys.readouterr().out for name in expected)
@@ -306,7 +308,7 @@ def test_the_example_with_a_reward_of_its_own() -> None:
     assert 0 < custom_reward.main(50, **TOWN) < 0.5
 
 
-def test_the_example_in_plain_torch_learns(capsys: pytest.CaptureFixture) -> None:
+def test_the_example_in_plain_torch_learns(capsys: pytest.CaptureFixture[str]) -> None:
     settings = cleanrl_style.Settings(ticks=40, batch_size=80, epochs=5, learning_rate=3e-3)
     errors_m = cleanrl_style.main(6000, settings, **TOWN | {"traffic.cavs": 12})
     # 13 updates of 480 samples; random predictions are about 130 m wrong.
@@ -314,16 +316,23 @@ def test_the_example_in_plain_torch_learns(capsys: pytest.CaptureFixture) -> Non
     assert cleanrl_style.main(200, settings, "driving", **HEROES)
 
 
-def test_the_example_with_stable_baselines_alone(capsys: pytest.CaptureFixture) -> None:
+def test_the_example_with_stable_baselines_alone(capsys: pytest.CaptureFixture[str]) -> None:
     model = sb3_ppo.alone(640, horizon=320, batch_size=64, **TOWN)
-    assert model.num_timesteps == 640 and len(model.ep_info_buffer) > 0
+    assert model.num_timesteps == 640 and model.ep_info_buffer
 
 
 def test_the_example_with_stable_baselines_as_the_trainer_of_a_run(tmp_path: Path) -> None:
     settings = TOWN | {"episode.training_episodes": 4, "episode.evaluation_interval": 2, "episode.evaluation_ticks": 20}
     settings |= {"episode.final_evaluations": 1, "trainer.horizon": 320, "trainer.batch_size": 64}
     settings |= {"trainer.module": "caraware.examples.sb3_ppo", "fanout.enabled": "false"}
-    command = [CARAWARE, "train", "town", "--name", "sb3", *(f"--set={key}={value}" for key, value in settings.items())]
+    command: list[str | Path] = [
+        CARAWARE,
+        "train",
+        "town",
+        "--name",
+        "sb3",
+        *(f"--set={key}={value}" for key, value in settings.items()),
+    ]
     package = str(Path(envs.__file__).parents[2])
     finished = subprocess.run(
         command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": package}, capture_output=True, text=True

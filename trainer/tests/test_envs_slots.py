@@ -1,7 +1,9 @@
 """How trajectories in slots become episodes of standard faces: hand-made ticks, no simulation."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import torch
 from caraware.envs import CarAwareEnv, CarAwareParallelEnv, CarAwareVecEnv, CarAwareVectorEnv, RunEndedError, Transition
 from caraware.envs.slots import RUN_ON_TICKS
 from caraware.ipc.names import Names
-from caraware.ipc.stream import EMPTY_SLOT
+from caraware.ipc.stream import EMPTY_SLOT, Observation
 from caraware.tasks.fields import Fields, UnknownFieldError
 from synthetic import SyntheticChannel, SyntheticObservation
 
@@ -17,7 +19,7 @@ E = EMPTY_SLOT
 FIELDS = ["gnss_x", "gnss_y", "speed"]
 
 
-def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: int = 1000) -> dict:
+def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: int = 1000) -> dict[str, Any]:
     """A run file of population control."""
     observation = {"fields": FIELDS}
     config = {
@@ -44,7 +46,13 @@ def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: i
     }
 
 
-def tick(number: int, vehicles: list[int], terminated: tuple = (), truncated: tuple = (), **more: object):
+def tick(
+    number: int,
+    vehicles: list[int],
+    terminated: tuple[int, ...] = (),
+    truncated: tuple[int, ...] = (),
+    **more: Any,
+) -> SyntheticObservation:
     """A tick whose rows say which vehicle and tick they are of: observation = truth = [vehicle, tick, …] / 1000."""
     vehicle = np.array(vehicles, np.uint32)
     valid = vehicle != E
@@ -53,8 +61,8 @@ def tick(number: int, vehicles: list[int], terminated: tuple = (), truncated: tu
     rows = np.stack((ids / 1000, np.full(len(ids), number / 1000), np.zeros(len(ids))), 1).astype(np.float32)
     truth = np.concatenate((rows[:, :2] * 1000, np.zeros((len(ids), 2), np.float32)), 1)
     flags = [np.isin(np.arange(len(ids)), np.array(slots, int)) for slots in (terminated, truncated)]
-    tensors = [torch.from_numpy(values) for values in (rows, truth, truth[:, :2].copy())]
-    return SyntheticObservation(number, *tensors, vehicle, valid, *flags, **more)
+    observation, truths, fixes = (torch.from_numpy(values) for values in (rows, truth, truth[:, :2].copy()))
+    return SyntheticObservation(number, observation, truths, fixes, vehicle, valid, flags[0], flags[1], **more)
 
 
 @dataclass
@@ -73,19 +81,19 @@ class DrivingChannel(SyntheticChannel):
         self.actions[observation.tick] = actions.copy()
 
 
-def channel_of(ticks: list[SyntheticObservation], tmp_path, slots: int, **options: object) -> DrivingChannel:
+def channel_of(ticks: list[SyntheticObservation], tmp_path: Path, slots: int, **options: Any) -> DrivingChannel:
     """A channel over these ticks, the last of which ends the run."""
     ticks = [*ticks[:-1], replace(ticks[-1], last=True)]
     return DrivingChannel(run_file(str(tmp_path), slots, **options), iter(ticks))
 
 
-def vehicles_of(observation: np.ndarray) -> list[int]:
-    """Vehicles that rows are of."""
+def vehicles_of(observation: np.ndarray) -> Any:
+    """Vehicles that rows are of: a list, or a number for a single row."""
     return np.rint(observation[..., 0] * 1000).astype(int).tolist()
 
 
-def when(observation: np.ndarray) -> list[int]:
-    """Ticks that rows are of."""
+def when(observation: np.ndarray) -> Any:
+    """Ticks that rows are of, alike."""
     return np.rint(observation[..., 1] * 1000).astype(int).tolist()
 
 
@@ -97,7 +105,9 @@ def which(obs: Transition, action: np.ndarray) -> np.ndarray:
 NOTHING = np.zeros((2, 2), np.float32)
 
 
-def test_a_terminated_trajectory_keeps_its_last_observation_and_the_slot_is_empty_until_the_next(tmp_path) -> None:
+def test_a_terminated_trajectory_keeps_its_last_observation_and_the_slot_is_empty_until_the_next(
+    tmp_path: Path,
+) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, E], terminated=(1,)), tick(2, [1, 3]), tick(3, [1, 3])]
     env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2), reward=which)
     observation, infos = env.reset()
@@ -117,7 +127,7 @@ def test_a_terminated_trajectory_keeps_its_last_observation_and_the_slot_is_empt
     assert vehicles_of(observation) == [1, 3] and reward.tolist() == pytest.approx([1.001, 0.0])
 
 
-def test_the_end_of_an_episode_truncates_and_gives_the_next_episodes_first_row(tmp_path) -> None:
+def test_the_end_of_an_episode_truncates_and_gives_the_next_episodes_first_row(tmp_path: Path) -> None:
     # The same dense index means another vehicle in the next episode.
     ticks = [tick(0, [1, 2]), tick(1, [1, 2], truncated=(0, 1), episode=1), tick(2, [1, 2], episode=1)]
     env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2), reward=which)
@@ -129,7 +139,7 @@ def test_the_end_of_an_episode_truncates_and_gives_the_next_episodes_first_row(t
     assert not truncated.any()
 
 
-def test_terminated_wins_over_truncated(tmp_path) -> None:
+def test_terminated_wins_over_truncated(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, 2], terminated=(0,), truncated=(0, 1), episode=1), tick(2, [1, 2], episode=1)]
     env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2))
     env.reset()
@@ -137,7 +147,7 @@ def test_terminated_wins_over_truncated(tmp_path) -> None:
     assert terminated.tolist() == [True, False] and truncated.tolist() == [False, True]
 
 
-def test_a_gap_without_a_flag_truncates(tmp_path) -> None:
+def test_a_gap_without_a_flag_truncates(tmp_path: Path) -> None:
     dark = tick(1, [1, 2])
     dark.valid[1] = False
     ticks = [tick(0, [1, 2]), dark, tick(2, [1, 2]), tick(3, [7, 2])]
@@ -151,7 +161,7 @@ def test_a_gap_without_a_flag_truncates(tmp_path) -> None:
     assert truncated.tolist() == [True, False]  # another vehicle
 
 
-def test_slots_that_are_not_there_yet_are_empty_and_those_beyond_are_left_out(tmp_path) -> None:
+def test_slots_that_are_not_there_yet_are_empty_and_those_beyond_are_left_out(tmp_path: Path) -> None:
     ticks = [tick(0, [1]), tick(1, [1, 2, 3]), tick(2, [1, 2, 3])]
     channel = channel_of(ticks, tmp_path, 2)
     env = CarAwareVectorEnv(channel)
@@ -163,7 +173,7 @@ def test_slots_that_are_not_there_yet_are_empty_and_those_beyond_are_left_out(tm
     assert channel.predictions[1].shape == (3, 2)
 
 
-def test_ticks_without_any_vehicle_ask_for_no_decision(tmp_path) -> None:
+def test_ticks_without_any_vehicle_ask_for_no_decision(tmp_path: Path) -> None:
     ticks = [tick(0, [E, E]), tick(1, [1, E]), tick(2, [E, E], terminated=(0,)), tick(3, [E, E]), tick(4, [E, 2])]
     ticks.append(tick(5, [E, 2]))
     channel = channel_of(ticks, tmp_path, 2, drives=True)
@@ -177,7 +187,7 @@ def test_ticks_without_any_vehicle_ask_for_no_decision(tmp_path) -> None:
     assert channel.actions[1].tolist() == [[1, 1], [1, 1]] and not channel.actions[2].any()
 
 
-def test_actions_beyond_the_range_are_clipped_where_they_drive_and_not_where_they_predict(tmp_path) -> None:
+def test_actions_beyond_the_range_are_clipped_where_they_drive_and_not_where_they_predict(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, 2])]
     wild = np.array([[2.0, -3.0], [0.0, np.nan]], np.float32)
     channel = channel_of(ticks, tmp_path, 2, drives=True)
@@ -192,7 +202,7 @@ def test_actions_beyond_the_range_are_clipped_where_they_drive_and_not_where_the
     assert channel.predictions[0].tolist() == [[0.0, 100.0], [300.0, 50.0]]
 
 
-def test_evaluation_episodes_are_answered_by_their_policy_without_steps(tmp_path) -> None:
+def test_evaluation_episodes_are_answered_by_their_policy_without_steps(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, 2], truncated=(0, 1), episode=1, evaluation=True)]
     ticks += [tick(2, [1, 2], episode=1, evaluation=True), tick(3, [4, 5], truncated=(0, 1), episode=2)]
     ticks += [tick(4, [4, 5], episode=2)]
@@ -211,7 +221,7 @@ def test_evaluation_episodes_are_answered_by_their_policy_without_steps(tmp_path
     assert f'"ppo_mean_error_m": {expected}'[:30] in text and '"env_steps": 4' in text
 
 
-def test_the_end_of_the_run_truncates_and_then_nothing_can_be_stepped(tmp_path) -> None:
+def test_the_end_of_the_run_truncates_and_then_nothing_can_be_stepped(tmp_path: Path) -> None:
     channel = channel_of([tick(0, [1, 2]), tick(1, [1, 2])], tmp_path, 2)
     env = CarAwareVectorEnv(channel)
     env.reset()
@@ -228,7 +238,7 @@ def test_the_end_of_the_run_truncates_and_then_nothing_can_be_stepped(tmp_path) 
     assert channel.is_done
 
 
-def test_reset_continues_to_the_next_episode_but_not_twice_without_a_step(tmp_path) -> None:
+def test_reset_continues_to_the_next_episode_but_not_twice_without_a_step(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, 2]), tick(3, [4, 5], truncated=(0, 1), episode=1)]
     ticks += [tick(4, [4, 5], episode=1)]
     env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2))
@@ -246,33 +256,34 @@ class Restartable:
 
     can_restart = True
 
-    def __init__(self, channel: DrivingChannel, make_ticks) -> None:
-        self.channel, self._make, self.seed, self.current, self.seeds = channel, make_ticks, 5, None, [5]
+    def __init__(self, channel: DrivingChannel, make_ticks: Callable[[int], Iterator[SyntheticObservation]]) -> None:
+        self.channel, self._make, self.seed, self.seeds = channel, make_ticks, 5, [5]
+        self.current: Observation | None = None
         self._ticks: Iterator[SyntheticObservation] = make_ticks(5)
 
-    def receive(self):
+    def receive(self) -> Observation | None:
         """The next tick."""
         self.current = next(self._ticks, None)
         return self.current
 
-    def restart(self, seed=None) -> None:
+    def restart(self, seed: int | None = None) -> None:
         """Start the run again."""
         self.seed = self.seed + 1000 if seed is None else seed
         self.seeds.append(self.seed)
         self.channel.consumed_up_to = self.channel.committed_up_to = -1
         self._ticks = self._make(self.seed)
 
-    def close(self, part=None) -> None:
+    def close(self, part: dict[str, Any] | None = None) -> None:
         """Nothing to close."""
 
 
-def restartable(tmp_path, episode_ticks: int) -> Restartable:
+def restartable(tmp_path: Path, episode_ticks: int) -> Restartable:
     """Runs of three ticks whose vehicle is the seed."""
     channel = DrivingChannel(run_file(str(tmp_path), 1, episode_ticks=episode_ticks), iter(()))
     return Restartable(channel, lambda seed: iter([tick(number, [seed]) for number in range(3)]))
 
 
-def test_a_run_is_started_again_only_for_another_seed_or_after_its_end(tmp_path) -> None:
+def test_a_run_is_started_again_only_for_another_seed_or_after_its_end(tmp_path: Path) -> None:
     source = restartable(tmp_path, episode_ticks=3)
     env = CarAwareVectorEnv(source)
     action = np.zeros((1, 2), np.float32)
@@ -286,7 +297,7 @@ def test_a_run_is_started_again_only_for_another_seed_or_after_its_end(tmp_path)
     assert ends == [False, False, True, False, False, True, False] and source.seeds[3:] == [1006, 2006]
 
 
-def test_a_reset_far_from_the_end_of_an_episode_starts_a_new_run(tmp_path) -> None:
+def test_a_reset_far_from_the_end_of_an_episode_starts_a_new_run(tmp_path: Path) -> None:
     source = restartable(tmp_path, episode_ticks=RUN_ON_TICKS + 100)
     env = CarAwareVectorEnv(source)
     env.reset()
@@ -294,7 +305,7 @@ def test_a_reset_far_from_the_end_of_an_episode_starts_a_new_run(tmp_path) -> No
     assert vehicles_of(env.reset()[0]) == [1005]
 
 
-def test_the_single_face_ends_with_its_vehicle_and_continues_with_the_next_in_the_slot(tmp_path) -> None:
+def test_the_single_face_ends_with_its_vehicle_and_continues_with_the_next_in_the_slot(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [E, 2], terminated=(0,)), tick(2, [E, 2]), tick(3, [3, 2]), tick(4, [3, 2])]
     env = CarAwareEnv(channel_of(ticks, tmp_path, 2), reward=which)
     observation, info = env.reset()
@@ -308,17 +319,17 @@ def test_the_single_face_ends_with_its_vehicle_and_continues_with_the_next_in_th
     assert (vehicles_of(observation), when(observation)) == (3, 3)
 
 
-def test_agents_come_and_go_under_their_ids_and_an_episode_ends_with_the_simulations(tmp_path) -> None:
+def test_agents_come_and_go_under_their_ids_and_an_episode_ends_with_the_simulations(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, E], terminated=(1,)), tick(2, [1, 3]), tick(3, [1, 3])]
     ticks += [tick(4, [1, 9], truncated=(0, 1), episode=1), tick(5, [1, 9], episode=1)]
     env = CarAwareParallelEnv(channel_of(ticks, tmp_path, 2), reward=which)
     observations, _ = env.reset()
     one, two, three = (f"0x{number:016x}" for number in (1, 2, 3))
     assert env.agents == [one, two] and vehicles_of(observations[two]) == 2
-    observations, rewards, terminated, _, _ = env.step({one: [0, 0], two: [0, 0]})
+    observations, rewards, terminated, _, _ = env.step({one: NOTHING[0], two: NOTHING[0]})
     assert terminated == {one: False, two: True} and env.agents == [one]
     assert when(observations[two]) == 0 and rewards[two] == pytest.approx(2.0)
-    observations, rewards, terminated, _, _ = env.step({one: [0, 0]})
+    observations, rewards, terminated, _, _ = env.step({one: NOTHING[0]})
     assert env.agents == [one, three] and rewards[three] == 0.0 and vehicles_of(observations[three]) == 3
     env.step({})
     *_, truncated, _ = env.step({})
@@ -329,7 +340,7 @@ def test_agents_come_and_go_under_their_ids_and_an_episode_ends_with_the_simulat
     assert env.possible_agents == [one, two, three, f"0x{9:016x}"]
 
 
-def test_stable_baselines_gets_the_last_observation_and_the_sums_of_an_episode(tmp_path) -> None:
+def test_stable_baselines_gets_the_last_observation_and_the_sums_of_an_episode(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, E], terminated=(1,)), tick(3, [1, E], truncated=(0,))]
     ticks[3] = replace(tick(3, [1, E], truncated=(0,), episode=1))
     ticks.append(tick(4, [1, E], episode=1))
@@ -344,8 +355,9 @@ def test_stable_baselines_gets_the_last_observation_and_the_sums_of_an_episode(t
     assert infos[0]["TimeLimit.truncated"] is True and infos[0]["episode"]["l"] == 3
 
 
-def test_a_reward_of_the_wrong_shape_is_refused(tmp_path) -> None:
-    env = CarAwareVectorEnv(channel_of([tick(0, [1, 2]), tick(1, [1, 2])], tmp_path, 2), reward=lambda obs, action: 1.0)
+def test_a_reward_of_the_wrong_shape_is_refused(tmp_path: Path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [1, 2])]
+    env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2), reward=lambda obs, action: np.ones(1))
     env.reset()
     with pytest.raises(ValueError, match="reward"):
         env.step(NOTHING)
@@ -392,14 +404,14 @@ def test_the_driving_reward_distinguishes_arrival_other_ends_and_a_time_limit() 
     # On its way, arrived, crashed, out of time, and too far from its end for the range of `route_left`.
     before, after = rows([100, 4, 50, 50, 1000], [0] * 5), rows([99, 4, 50, 50, 1000], [2.5, 0, 0, 0, 0])
     terminated, truncated = np.array([0, 1, 1, 0, 0], bool), np.array([0, 0, 0, 1, 0], bool)
-    ids = np.zeros(5, np.uint64)
-    fields = (before.observation, before.truth, before.gnss_m, np.ones(5, bool), ids, ids, terminated, truncated)
-    reward = rewards.of_task(settings.task)(Transition(settings, *fields, after), np.zeros((5, 2)))
+    ids = np.zeros(5, np.uint32), np.zeros(5, np.uint64)
+    fields = (before.observation, before.truth, before.gnss_m, np.ones(5, bool), *ids, terminated, truncated)
+    reward = rewards.of_task(settings.task)(Transition(settings, *fields, after), np.zeros((5, 2), np.float32))
     # 1 m of way and 2.5 m beside the line; 8 m/s for 0.1 s. Steps of 1000 m / 2²⁴ are 0.06 mm.
     assert reward.tolist() == pytest.approx([0.1 - 0.05, 10, -10, 0, 0.08], abs=1e-4)
 
 
-def test_the_localisation_reward_is_that_of_the_configuration_at_the_tick_answered(tmp_path) -> None:
+def test_the_localisation_reward_is_that_of_the_configuration_at_the_tick_answered(tmp_path: Path) -> None:
     env = CarAwareVectorEnv(channel_of([tick(0, [30, 0]), tick(1, [90, 0]), tick(2, [1, 1])], tmp_path, 2))
     env.reset()
     # Predicted (100, 50) and (0, 50), true (30, 0) and (0, 0).

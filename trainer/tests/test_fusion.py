@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def net_file(folder: Path) -> Path:
     return file
 
 
-def street_run(folder: Path, slow_m: float = 0.0, **trainer: object) -> dict:
+def street_run(folder: Path, slow_m: float = 0.0, **trainer: object) -> dict[str, Any]:
     tables = sensor_tables(gnss__correlated_std_m=[slow_m, slow_m, 0.0])
     run = vehicle_run(str(folder), tables, hidden=[16], epochs=4, learning_rate=2e-3, **trainer)
     run["config"]["fusion"] = {"map": True, "segment_ticks": 32, "truncation_ticks": 16}
@@ -70,7 +71,9 @@ def street_track(ticks: int, vehicles: int, seed: int) -> Track:
     )
 
 
-def street_ticks(run: dict, episodes: int, vehicles: int = 6, ticks: int = 40) -> Iterator[VehicleObservation]:
+def street_ticks(
+    run: dict[str, Any], episodes: int, vehicles: int = 6, ticks: int = 40
+) -> Iterator[VehicleObservation]:
     """Training episodes, then one for evaluation."""
     for episode in range(episodes + 1):
         for obs in observations(street_track(ticks, vehicles, episode), run["config"], seed=episode):
@@ -84,11 +87,11 @@ def street_ticks(run: dict, episodes: int, vehicles: int = 6, ticks: int = 40) -
             )
 
 
-def learner_of(run: dict) -> FusionLearner:
+def learner_of(run: dict[str, Any]) -> FusionLearner:
     return begin(run, SIZE, None)[1]
 
 
-def estimates(run: dict, learner: FusionLearner, ticks: list[VehicleObservation]) -> torch.Tensor:
+def estimates(run: dict[str, Any], learner: FusionLearner, ticks: list[VehicleObservation]) -> torch.Tensor:
     noise = SensorNoise.from_run(run)
     assert noise is not None
     x_m, y_m = learner.estimator.centre_m.tolist()
@@ -148,7 +151,8 @@ def test_the_carrier_has_the_distance_of_vehicles_and_the_pull_of_fixes(tmp_path
 
 def test_the_raster_finds_what_a_search_of_all_pieces_finds(tmp_path: Path) -> None:
     pieces = read_pieces(net_file(tmp_path))
-    assert (len(pieces), sorted(set(pieces.speed_limit_mps.tolist()))) == (3, pytest.approx([8.3, 13.9]))
+    assert len(pieces) == 3
+    assert sorted(set(pieces.speed_limit_mps.tolist())) == pytest.approx([8.3, 13.9])
     weights = (4.0, 25.0)
     rng = np.random.default_rng(1)
     x, y = torch.tensor(rng.uniform(60, 100, (2, 400)), dtype=torch.float32)
@@ -190,7 +194,7 @@ def test_it_learns_streets_and_beats_the_filter_on_vehicles_it_has_not_seen(tmp_
     assert float((filter_m + offset_m).norm(dim=-1).mean()) < 0.8 * float(filter_m.norm(dim=-1).mean())
 
 
-def recorded(run: dict, learner: FusionLearner, seed: int) -> Episode:
+def recorded(run: dict[str, Any], learner: FusionLearner, seed: int) -> Episode:
     noise, centre_m, recording = SensorNoise.from_run(run), learner.estimator.centre_m, Recording()
     assert noise is not None
     carrier = Carrier(noise, (float(centre_m[0]), float(centre_m[1])))
@@ -215,7 +219,7 @@ def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
 
 
 def test_stopped_and_continued_it_ends_with_the_same_bytes_and_the_same_report(tmp_path: Path) -> None:
-    def final(folder: Path, *limits: int) -> tuple[torch.Tensor, dict]:
+    def final(folder: Path, *limits: int) -> tuple[torch.Tensor, dict[str, Any]]:
         run = street_run(folder, checkpoint_interval=1)
         for limit in limits:
             config, learner, beginning = begin(run, SIZE, newest_sound_checkpoint(folder / "checkpoints"))

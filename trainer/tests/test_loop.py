@@ -10,6 +10,7 @@ import types
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ PNG = b"\x89PNG"
 
 
 def loop_over(
-    tmp_path: Path, ticks: Iterator[SyntheticObservation], group: int = 8, run: dict | None = None
+    tmp_path: Path, ticks: Iterator[SyntheticObservation], group: int = 8, run: dict[str, Any] | None = None
 ) -> SyntheticChannel:
     """Run the whole loop."""
     channel = SyntheticChannel(run or run_file(str(tmp_path)), ticks, group)
@@ -37,8 +38,9 @@ def loop_over(
     return channel
 
 
-def part(tmp_path: Path) -> dict:
-    return json.loads((tmp_path / "parts" / "trainer.json").read_text())
+def part(tmp_path: Path) -> dict[str, Any]:
+    written: dict[str, Any] = json.loads((tmp_path / "parts" / "trainer.json").read_text())
+    return written
 
 
 def final_parameters(tmp_path: Path) -> dict[str, torch.Tensor]:
@@ -76,7 +78,7 @@ def test_an_evaluation_measures_policy_and_raw_gnss_on_the_same_valid_rows(tmp_p
             yield sent[-1]
 
     channel = loop_over(tmp_path, ticks())
-    expected = {"policy": [], "raw": []}
+    expected: dict[str, list[float]] = {"policy": [], "raw": []}
     for obs in sent:
         truth = obs.truth[:, :2]
         expected["policy"] += (channel.predictions[obs.tick] - truth).norm(dim=1)[obs.valid].tolist()
@@ -253,14 +255,15 @@ def channel_module(monkeypatch: pytest.MonkeyPatch) -> None:
     install(monkeypatch, ProcessChannel)
 
 
-def write_run(tmp_path: Path, run: dict) -> str:
+def write_run(tmp_path: Path, run: dict[str, Any]) -> str:
     file = tmp_path / "run.json"
     file.write_text(json.dumps(run))
     return str(file)
 
 
-def failure(tmp_path: Path) -> dict:
-    return json.loads((tmp_path / "logs" / "trainer.error.json").read_text())
+def failure(tmp_path: Path) -> dict[str, Any]:
+    written: dict[str, Any] = json.loads((tmp_path / "logs" / "trainer.error.json").read_text())
+    return written
 
 
 @pytest.mark.usefixtures("channel_module")
@@ -330,7 +333,7 @@ def test_a_successor_ends_where_the_undisturbed_run_does(
     """An update every 16 training ticks, a checkpoint with every second."""
     monkeypatch.setattr(TrainingLoop, "_draw", lambda loop: None)
 
-    def settings(folder: str) -> dict:
+    def settings(folder: str) -> dict[str, Any]:
         return run_file(str(tmp_path / folder), discount=discount, checkpoint_interval=2)
 
     loop_over(tmp_path / "whole", stream(0), group=1, run=settings("whole"))

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def everything() -> tuple[SensorNoise, StateLayout]:
     return noise, StateLayout.of(noise)
 
 
-def dense(entries: list, size: int, slots: int) -> np.ndarray:
+def dense(entries: list[Any], size: int, slots: int) -> np.ndarray:
     """F `[d, d, n]`."""
     matrix = np.repeat(np.eye(size)[:, :, None], slots, axis=2)
     for row, column, value in entries:
@@ -61,7 +62,8 @@ def motion_of(rng: np.random.Generator, slots: int) -> Motion:
 
 
 def test_only_errors_that_are_configured_have_a_row() -> None:
-    assert StateLayout.of(SensorNoise.from_run({"config": sensor_tables()})) == StateLayout()
+    noise = SensorNoise.from_run({"config": sensor_tables()})
+    assert noise is not None and StateLayout.of(noise) == StateLayout()
     assert everything()[1] == StateLayout(slow=(7, 8), bias=(9, 10), scale=11, compass=12, size=13)
 
 
@@ -132,10 +134,10 @@ def test_the_jacobian_of_wheel_speed_and_compass_is_the_derivative_of_what_is_ex
     mean[SPEED] = [0.0, 1e-4, 3e-3, 0.1, 20.0]
 
     class Recorded(Belief):
-        def correct(self, row: list, innovation: np.ndarray, variance: object, use: np.ndarray) -> None:
+        def correct(self, row: list[Any], innovation: np.ndarray, variance: object, use: np.ndarray) -> None:
             seen.append((dict(row), innovation))
 
-    def given(at: np.ndarray, name: str) -> tuple[dict, np.ndarray]:
+    def given(at: np.ndarray, name: str) -> tuple[dict[int, float], np.ndarray]:
         seen.clear()
         ekf = Ekf(noise)
         ekf.belief, ekf._held = Recorded(at, np.zeros((layout.size, layout.size, 5))), np.zeros((2, 5))
@@ -143,7 +145,7 @@ def test_the_jacobian_of_wheel_speed_and_compass_is_the_derivative_of_what_is_ex
         getattr(ekf, name)(samples, np.ones(5, bool))
         return seen[0]
 
-    seen: list = []
+    seen: list[tuple[dict[int, float], np.ndarray]] = []
     for name in ("_correct_wheel_speed", "_correct_compass"):
         row, _ = given(mean, name)
         for column in range(layout.size):

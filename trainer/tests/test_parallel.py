@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -44,13 +45,13 @@ def registry() -> Iterator[Path]:
         assert not registry.exists(), "something is left of a run"
 
 
-def start(folder: Path, registry: Path, words: list[str], horizon: int, *more: str) -> subprocess.Popen:
+def start(folder: Path, registry: Path, words: list[str], horizon: int, *more: str) -> subprocess.Popen[str]:
     sizes = {"trainer.horizon": horizon, "trainer.batch_size": horizon // 2}
     settings = [f"--set={key}={value}" for key, value in (SETTINGS | sizes).items()]
     return launch(folder, registry, [*words, "town", *settings, *(f"--set={setting}" for setting in more)])
 
 
-def launch(folder: Path, registry: Path, words: list[str]) -> subprocess.Popen:
+def launch(folder: Path, registry: Path, words: list[str]) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [*words, "--runs", str(folder)],
         env=os.environ | {"CARAWARE_RUNTIME_DIR": str(registry), "CARAWARE_PYTHON": sys.executable},
@@ -63,7 +64,7 @@ def launch(folder: Path, registry: Path, words: list[str]) -> subprocess.Popen:
 TWO_RANKS = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", "caraware.parallel"]
 
 
-def two_ranks(folder: Path, registry: Path, name: str = "two", *more: str) -> subprocess.Popen:
+def two_ranks(folder: Path, registry: Path, name: str = "two", *more: str) -> subprocess.Popen[str]:
     return start(folder, registry, [sys.executable, *TWO_RANKS, f"--name={name}"], 256, *more)
 
 
@@ -73,8 +74,9 @@ def resume(folder: Path, registry: Path, named: str, *more: str) -> tuple[int, s
     return process.returncode, said
 
 
-def report(run: Path) -> dict:
-    return json.loads((run / "report.json").read_text())
+def report(run: Path) -> dict[str, Any]:
+    written: dict[str, Any] = json.loads((run / "report.json").read_text())
+    return written
 
 
 def parameters(run: Path) -> dict[str, torch.Tensor]:
@@ -87,7 +89,7 @@ def tensors(run: Path) -> dict[str, str]:
     return {name: digest for name, digest in files.items() if name.endswith(".safetensors") and name != POINTS}
 
 
-def wait_until(condition: Callable[[], bool], process: subprocess.Popen) -> None:
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert process.poll() is None

@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import torch
 from caraware.baselines import Ekf, SensorNoise
 from caraware.baselines.samples import read_samples
 from caraware.learn.memory import Memory
+from caraware.learn.recurrent import RecurrentPpo
 from caraware.run.config import RunConfig
 from caraware.run.learner import Learner
 from caraware.run.player import LIVE, PlayLoop, PlayTally
@@ -39,7 +41,7 @@ def ticks(first: int = 0, episodes: int = 2) -> Iterator[VehicleObservation]:
                 )
 
 
-def run(folder: Path) -> dict:
+def run(folder: Path) -> dict[str, Any]:
     played = vehicle_run(str(folder))
     played["config"]["traffic"] = {}
     return played
@@ -56,13 +58,15 @@ def loop_over(folder: Path, stream: Iterator[VehicleObservation], stop_at: int |
     return channel
 
 
-def part(folder: Path) -> dict:
-    return json.loads((folder / "parts" / "trainer.json").read_text())
+def part(folder: Path) -> dict[str, Any]:
+    written: dict[str, Any] = json.loads((folder / "parts" / "trainer.json").read_text())
+    return written
 
 
 def test_errors_are_those_of_predictions_filter_and_fix(tmp_path: Path) -> None:
     channel = loop_over(tmp_path, ticks())
     noise = SensorNoise.from_run({"config": sensor_tables()})
+    assert noise is not None
     error_m: dict[str, list[float]] = {"ppo": [], "ekf": [], "raw_gnss": []}
     for obs in ticks():
         if obs.tick % TICKS == 0:
@@ -115,6 +119,7 @@ def test_a_policy_with_memory_plays_without_that_of_the_checkpoint(tmp_path: Pat
     for group in (1, 8):
         channel = SyntheticChannel(played, ticks(), group)
         learner = Learner.begin(config, next(ticks()).observation.shape[1])
+        assert isinstance(learner.ppo, RecurrentPpo)
         all_vehicles = torch.arange(VEHICLES)
         width = learner.ppo.memories[0].state.shape[1]
         known = Memory(torch.tensor(-1), all_vehicles, torch.ones(VEHICLES, width))

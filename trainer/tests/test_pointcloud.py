@@ -15,6 +15,7 @@ LAYOUT = Path(__file__).parents[2] / "ipc-schema" / "layout.json"
 def test_types_repeat_the_committed_table(name: str, dtype: np.dtype) -> None:
     table = {row["name"]: row for row in json.loads(LAYOUT.read_text())["types"]}
     assert dtype.itemsize == table[name]["size"]
+    assert dtype.fields is not None and dtype.names is not None
     assert [[field, dtype.fields[field][1]] for field in dtype.names] == [field[:2] for field in table[name]["fields"]]
 
 

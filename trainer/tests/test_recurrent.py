@@ -3,7 +3,9 @@
 import contextlib
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +16,10 @@ from caraware.learn.gru import RecurrentNetwork, Sequences, Steps, recurrent_pol
 from caraware.learn.memory import Memory
 from caraware.learn.networks import Activation
 from caraware.learn.ppo import Ppo
-from caraware.learn.recurrent import NO_SAMPLE, RecurrentPpo, continues, cut, sequences
+from caraware.learn.recurrent import NO_SAMPLE, RecurrentPpo, SequenceUpdate, continues, cut, sequences
 from caraware.learn.rollout import Rollout
-from caraware.run.checkpoint import MEMORY, load_checkpoint
+from caraware.learn.stored import MEMORY
+from caraware.run.checkpoint import load_checkpoint
 from caraware.run.config import RunConfig
 from caraware.run.learner import Learner
 from caraware.run.loop import TrainingLoop
@@ -28,7 +31,7 @@ from torch import Tensor, nn
 
 CPU = torch.device("cpu")
 RECALL_TICKS = 8
-TOY: dict[str, object] = {
+TOY: dict[str, Any] = {
     "hidden": [32],
     "horizon": 1024,
     "batch_size": 256,
@@ -228,9 +231,10 @@ def test_empty_slots_change_no_bit() -> None:
             return np.concatenate((array, np.full(3, fill, array.dtype)))
 
         rows = [torch.cat((each, torch.zeros(3, each.shape[1]))) for each in (obs.observation, obs.truth, obs.gnss_m)]
-        flags = {name: padded(getattr(obs, name), False) for name in ("valid", "terminated", "truncated")}
-        vehicle = padded(obs.vehicle, EMPTY_SLOT)
-        return replace(obs, observation=rows[0], truth=rows[1], gnss_m=rows[2], vehicle=vehicle, **flags)
+        wide = replace(obs, observation=rows[0], truth=rows[1], gnss_m=rows[2], vehicle=padded(obs.vehicle, EMPTY_SLOT))
+        wide.valid, wide.terminated = padded(obs.valid, False), padded(obs.terminated, False)
+        wide.truncated = padded(obs.truncated, False)
+        return wide
 
     learnt = []
     for ticks in (with_ends(40), [wider(obs) for obs in with_ends(40)]):
@@ -255,7 +259,8 @@ def test_the_first_pass_is_the_policy_that_sampled(tries: int) -> None:
             break
     stats = ppo.learn(rollout.take())
     assert stats.ratio_mean == pytest.approx(1.0, abs=1e-5)
-    assert (stats.clip_fraction, stats.approximate_kl) == (0.0, pytest.approx(0.0, abs=1e-5))
+    assert stats.clip_fraction == 0.0
+    assert stats.approximate_kl == pytest.approx(0.0, abs=1e-5)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -303,7 +308,7 @@ def test_a_successor_ends_where_the_undisturbed_run_does(
     """An update every 16 training ticks, in the middle of trajectories; a checkpoint with every second."""
     monkeypatch.setattr(TrainingLoop, "_draw", lambda loop: None)
 
-    def settings(folder: str) -> dict:
+    def settings(folder: str) -> dict[str, Any]:
         return run_file(str(tmp_path / folder), network="gru", discount=discount, checkpoint_interval=2, epochs=2)
 
     loop_over(tmp_path / "whole", stream(0), group=1, run=settings("whole"))
@@ -323,18 +328,23 @@ def test_a_successor_ends_where_the_undisturbed_run_does(
     assert part(tmp_path / "cut") == part(tmp_path / "whole")
 
 
-def stopped_at(folder: Path, tick: int) -> RunConfig:
-    """A run that has been stopped, with a checkpoint of its second update."""
+def _has_consumed(channel: SyntheticChannel, tick: int) -> bool:
+    return channel.consumed_up_to >= tick
+
+
+def stopped_at(folder: Path, tick: int) -> tuple[RunConfig, Path]:
+    """A run that has been stopped, and a checkpoint of its second update, with which its configuration begins."""
     run = run_file(str(folder), network="gru")
     channel = SyntheticChannel(run, street_ticks(200, 16, 5.0, seed=4), 1)
     config = RunConfig.from_run(run)
     TrainingLoop(channel, config, lambda: channel.consumed_up_to >= tick).run()
-    return replace(config, resume_from=latest_checkpoint(folder / "checkpoints"))
+    checkpoint = latest_checkpoint(folder / "checkpoints")
+    return replace(config, resume_from=checkpoint), checkpoint
 
 
 def test_the_memory_of_the_committed_tick_is_in_the_checkpoint(tmp_path: Path) -> None:
-    config = stopped_at(tmp_path, 40)
-    stored = load_file(config.resume_from / MEMORY)
+    config, checkpoint = stopped_at(tmp_path, 40)
+    stored = load_file(checkpoint / MEMORY)
     assert (int(stored["tick0"]), stored["vehicle0"].tolist()) == (31, list(range(16)))
     assert stored["state0"].shape == (16, 2 * 16)
     rest = {}
@@ -344,17 +354,18 @@ def test_the_memory_of_the_committed_tick_is_in_the_checkpoint(tmp_path: Path) -
             learner.ppo.restore_memory({})
         ticks = (obs for obs in street_ticks(60, 16, 5.0, seed=4) if obs.tick > 31)
         channel = SyntheticChannel(run_file(str(tmp_path / str(forgets))), ticks)
-        loop = TrainingLoop(channel, config, lambda channel=channel: channel.consumed_up_to >= 50, learner=learner)
-        loop.run()
+        TrainingLoop(channel, config, partial(_has_consumed, channel, 50), learner=learner).run()
+        assert isinstance(learner.ppo.updater, SequenceUpdate)
         rest[forgets] = learner.ppo.updater.policy_network.parameters.values
     assert not torch.equal(rest[False], rest[True])
 
 
 def test_parameters_of_another_checkpoint_come_without_its_memory(tmp_path: Path) -> None:
-    config = stopped_at(tmp_path, 40)
+    config, checkpoint = stopped_at(tmp_path, 40)
     learner = Learner.begin(config, FIELDS)
+    assert isinstance(learner.ppo, RecurrentPpo)
     assert learner.ppo.memories[0].state.abs().sum() > 0
-    learner.take_parameters(config.resume_from)
+    learner.take_parameters(checkpoint)
     assert len(learner.ppo.memories[0].vehicle) == 0
 
 
@@ -375,11 +386,11 @@ def test_environments_remember_apart(tmp_path: Path) -> None:
 
 
 def test_another_network_is_refused_with_both_named(tmp_path: Path) -> None:
-    config = stopped_at(tmp_path, 40)
+    _, checkpoint = stopped_at(tmp_path, 40)
     with pytest.raises(CheckpointError, match="its network is gru, this run's is mlp"):
-        load_checkpoint(config.resume_from, fresh("mlp"))
+        load_checkpoint(checkpoint, fresh("mlp"))
     with pytest.raises(CheckpointError, match="its hidden is"):
-        load_checkpoint(config.resume_from, fresh(hidden=[32, 8]))
+        load_checkpoint(checkpoint, fresh(hidden=[32, 8]))
     loaded = fresh(seed=5)
-    load_checkpoint(config.resume_from, loaded)
+    load_checkpoint(checkpoint, loaded)
     assert isinstance(loaded, RecurrentPpo) and int(loaded.memories[0].tick) == 31

@@ -1,6 +1,7 @@
 """The rollout: every sample is one vehicle at one tick, whatever the slots do."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from caraware.learn.rollout import Horizon, Rollout
 from synthetic import SIZE_M, SyntheticObservation, locating_ppo, run_file, street_ticks
 
 
-def marked(tick: int, vehicles: list[int], **changes: object) -> SyntheticObservation:
+def marked(tick: int, vehicles: list[int], **changes: Any) -> SyntheticObservation:
     """A tick in which every number encodes its vehicle and its tick."""
     n = len(vehicles)
     index = torch.tensor([v if v >= 0 else 0 for v in vehicles], dtype=torch.float32)

@@ -1,12 +1,15 @@
 """The smoother: against filterpy, against least squares over all samples at once, and within its memory."""
 
+from typing import Any
+
 import numpy as np
 import pytest
-from caraware.baselines import Baselines, SensorNoise
+from caraware.baselines import Baselines
 from caraware.baselines.ekf import Belief, Ekf, wrapped
 from caraware.baselines.motion import YAW
 from caraware.baselines.rts import SmoothedTick, Smoother, cholesky, right_divided
 from caraware.baselines.samples import read_samples
+from caraware.ipc.arrays import Float64Array
 from filterpy.kalman import KalmanFilter
 from scipy.stats import chi2
 from synthetic_vehicle import GNSS, IMU, SPEED_STEERING, in_slots, observations, sensor_tables, steady_track, town_track
@@ -29,8 +32,9 @@ class Linear:
         """`fix_m` `[2, n]`."""
         all_slots = np.ones(fix_m.shape[1], bool)
         self.cross = np.einsum("ijn,kj->ikn", self.belief.covariance, F)
-        entries = [(0, 3, DT_S), (1, 2, DT_S)]
-        self.belief.predict(F @ self.belief.mean, entries, [(i, i, Q[i, i]) for i in range(4)])
+        entries: list[tuple[int, int, Float64Array | float]] = [(0, 3, DT_S), (1, 2, DT_S)]
+        noise: list[tuple[int, int, Float64Array | float]] = [(i, i, float(Q[i, i])) for i in range(4)]
+        self.belief.predict(F @ self.belief.mean, entries, noise)
         self.predicted = Belief(self.belief.mean.copy(), self.belief.covariance.copy())
         for axis in (0, 1):
             innovation = fix_m[axis] - self.belief.mean[axis]
@@ -57,6 +61,7 @@ def test_a_linear_case_is_filterpy_s() -> None:
     means, covariances, _, _ = kf.rts_smoother(means, covariances)
     for tick in smoothed:
         np.testing.assert_allclose(tick.mean[:, 1], means[tick.label], rtol=1e-9, atol=1e-9)
+        assert tick.covariance is not None
         np.testing.assert_allclose(tick.covariance[:, :, 1], covariances[tick.label], rtol=1e-9, atol=1e-9)
 
 
@@ -75,9 +80,9 @@ def test_a_linear_case_is_the_least_squares_of_everything_at_once() -> None:
         values.append(weight @ value)
 
     equation({0: np.eye(4)}, np.zeros(4), FIRST)
-    for tick in range(ticks):
-        equation({tick: -F, tick + 1: np.eye(4)}, np.zeros(4), Q)
-        equation({tick + 1: np.eye(2, 4)}, fixes[tick, :, 0], np.eye(2) * MEASURED**2)
+    for step in range(ticks):
+        equation({step: -F, step + 1: np.eye(4)}, np.zeros(4), Q)
+        equation({step + 1: np.eye(2, 4)}, fixes[step, :, 0], np.eye(2) * MEASURED**2)
     states = np.linalg.lstsq(np.concatenate(rows), np.concatenate(values), rcond=None)[0].reshape(-1, 4)
     for tick in smoothed:
         np.testing.assert_allclose(tick.mean[:, 0], states[tick.label + 1], rtol=1e-8, atol=1e-8)
@@ -92,7 +97,9 @@ def test_dividing_from_the_right() -> None:
     np.testing.assert_allclose(np.einsum("ijn,jkn->ikn", right_divided(left, positive), positive), left, atol=1e-8)
 
 
-def smoothed_errors(tables: dict, memory_bytes: int | None = None) -> tuple[np.ndarray, np.ndarray, list[int]]:
+def smoothed_errors(
+    tables: dict[str, Any], memory_bytes: int | None = None
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Errors of filter and smoother `[ticks, n]`, and the delay of each smoothed tick, in ticks."""
     noise = noise_of(tables)
     ekf = Ekf(noise)
@@ -141,6 +148,7 @@ def test_errors_are_as_large_as_the_smoothed_covariance_says() -> None:
     for tick in smoother.finish()[10::30]:
         error = tick.mean[:4] - truth[tick.label]
         error[YAW] = wrapped(error[YAW])
+        assert tick.covariance is not None
         covariance = tick.covariance[:4, :4].transpose(2, 0, 1)
         nees = np.einsum("in,ni->n", error, np.linalg.solve(covariance, error.T[:, :, None])[:, :, 0]).mean()
         assert low < nees < high
@@ -167,7 +175,7 @@ def test_the_samples_of_the_next_vehicle_in_a_slot_do_not_count(sign: str) -> No
 
 
 def test_the_number_of_slots_may_grow_and_slots_may_be_empty() -> None:
-    noise = SensorNoise.from_run({"config": sensor_tables()})
+    noise = noise_of(sensor_tables())
     dark = np.zeros((60, 2), np.uint32)
     dark[20:40] = GNSS | IMU | SPEED_STEERING
     shown = list(observations(town_track(60, 2, 1), seed=2, dark=dark))

@@ -5,6 +5,7 @@ import os
 import subprocess
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,10 +27,10 @@ NOISELESS = {
 }
 
 
-def run_with(tmp_path: Path, module: str) -> subprocess.CompletedProcess:
+def run_with(tmp_path: Path, module: str) -> subprocess.CompletedProcess[str]:
     """A run whose trainer is a module of this directory."""
     settings = [f"--set={key}={value}" for key, value in (NOISELESS | {"trainer.module": module}).items()]
-    command = [CARAWARE, "train", "town", "--name", "probe", *settings]
+    command: list[str | Path] = [CARAWARE, "train", "town", "--name", "probe", *settings]
     with tempfile.TemporaryDirectory(prefix="caraware") as short:
         path = os.pathsep.join(filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
         environment = os.environ | {"PYTHONPATH": path, "CARAWARE_RUNTIME_DIR": short}
@@ -37,15 +38,16 @@ def run_with(tmp_path: Path, module: str) -> subprocess.CompletedProcess:
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> dict:
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The findings of the probe in one run."""
     tmp_path = tmp_path_factory.mktemp("probe")
     finished = run_with(tmp_path, "probe")
     assert finished.returncode == 0, finished.stdout + finished.stderr
-    return json.loads((tmp_path / "runs" / "probe" / "parts" / "trainer.json").read_text())
+    seen: dict[str, Any] = json.loads((tmp_path / "runs" / "probe" / "parts" / "trainer.json").read_text())
+    return seen
 
 
-def test_observation_action_reward_and_truth_belong_to_the_same_vehicle_and_tick(found: dict) -> None:
+def test_observation_action_reward_and_truth_belong_to_the_same_vehicle_and_tick(found: dict[str, Any]) -> None:
     # Three episodes of 100 ticks with six vehicles, and the evaluation's 20 ticks; a vehicle may enter a tick late.
     assert found["samples"] >= 1500
     assert found["foreign_samples"] == 0
@@ -55,14 +57,14 @@ def test_observation_action_reward_and_truth_belong_to_the_same_vehicle_and_tick
     assert found["largest_reward_error"] < 1e-5
 
 
-def test_the_observation_lies_in_shared_memory_and_cannot_be_written(found: dict) -> None:
+def test_the_observation_lies_in_shared_memory_and_cannot_be_written(found: dict[str, Any]) -> None:
     assert found["in_shared_memory"]
     assert found["in_the_block"]
     assert not found["writable"]
     assert found["refused_writes"] == 2 * found["ticks"]
 
 
-def test_every_tick_arrives_once_in_order(found: dict) -> None:
+def test_every_tick_arrives_once_in_order(found: dict[str, Any]) -> None:
     assert found["consecutive"]
     assert found["ticks"] == 3 * 100 + 20
     assert found["distinct_vehicles"]

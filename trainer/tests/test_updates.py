@@ -4,6 +4,7 @@ The graphed one runs step by step on the CPU here; on a GPU its steps are captur
 """
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from caraware.learn.config import MapBounds, TrainerConfig
 from caraware.learn.fast import FastUpdate
 from caraware.learn.fast_mlp import FastMlp
 from caraware.learn.graphed import GraphedUpdate
+from caraware.learn.networks import Mlp
 from caraware.learn.ppo import NonFiniteLoss, PlainUpdate, PolicyUpdate, Ppo, UpdateStats
 from caraware.learn.rollout import Rollout
 from caraware.tasks.localisation import Localisation
@@ -48,6 +50,7 @@ def learner(kind: str, **extra: object) -> Ppo:
     if kind == "plain":
         updater = PlainUpdate(config, policy, value, CPU)
     elif kind == "graphed":
+        assert isinstance(policy.network, Mlp)
         networks = FastMlp(policy.network, {"log_std": policy.log_std}), FastMlp(value)
         updater = GraphedUpdate(config, *networks, CPU)
     else:
@@ -71,7 +74,7 @@ def learn(ppo: Ppo, updates: int) -> list[UpdateStats]:
 
 @pytest.mark.parametrize("kind", ["plain", "graphed"])
 @pytest.mark.parametrize("extra", EXTRAS, ids=lambda extra: "+".join(extra) or "default")
-def test_it_moves_the_parameters_as_the_fast_update_does(kind: str, extra: dict) -> None:
+def test_it_moves_the_parameters_as_the_fast_update_does(kind: str, extra: dict[str, Any]) -> None:
     fast, other = learner("fast", **extra), learner(kind, **extra)
     begin = parameters(fast).clone()
     for ppo in (fast, other):
@@ -123,6 +126,7 @@ def test_an_update_with_a_loss_that_is_no_number_stops_before_the_step(kind: str
     ppo = learner(kind)
     learn(ppo, 1)
     before, moments = parameters(ppo).clone(), {n: t.clone() for n, t in ppo.updater.moments().items()}
+    assert isinstance(ppo.task, Localisation)
     ppo.task = replace(ppo.task, reward_scale_m=float("nan"))
     with pytest.raises(NonFiniteLoss, match="in update 2"):
         learn(ppo, 1)
