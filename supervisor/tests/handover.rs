@@ -43,8 +43,12 @@ const SMALL: [&str; 12] = [
 ];
 
 fn arguments(name: &str, more: &[&str]) -> Vec<String> {
+    arguments_of("town", name, more)
+}
+
+fn arguments_of(preset: &str, name: &str, more: &[&str]) -> Vec<String> {
     let settings = SMALL.iter().chain(more).flat_map(|setting| ["--set", setting]);
-    ["train", "town", "--name", name]
+    ["train", preset, "--name", name]
         .into_iter()
         .chain(settings)
         .map(str::to_owned)
@@ -62,7 +66,10 @@ struct Run {
 
 impl Run {
     fn start(workplace: &Workplace, name: &str, more: &[&str]) -> Self {
-        let arguments = arguments(name, more);
+        Self::start_with(workplace, name, &arguments(name, more))
+    }
+
+    fn start_with(workplace: &Workplace, name: &str, arguments: &[String]) -> Self {
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
         let mut child = workplace
             .command(&arguments)
@@ -361,6 +368,40 @@ fn a_planned_handover_changes_nothing_but_the_process() {
         );
     }
     println!("{handovers:#}\nno tick for {pause:?} at most");
+    assert_nothing_left(&workplace, "replaced");
+}
+
+/// The learned estimator learns at the end of an episode, and leaves there.
+#[test]
+fn the_learned_estimator_is_handed_over_and_ends_in_the_same_parameters() {
+    let fusion = |name: &str, more: &[&str]| {
+        let sizes = [
+            "episode.final_evaluations=1",
+            "trainer.checkpoint_interval=1",
+            "fusion.segment_ticks=100",
+            "fusion.truncation_ticks=50",
+        ];
+        arguments_of("fusion", name, &[&sizes[..], more].concat())
+    };
+    let workplace = Workplace::new();
+    let undisturbed = fusion("estimator", &[]);
+    workplace.succeed(&undisturbed.iter().map(String::as_str).collect::<Vec<_>>());
+    let mut run = Run::start_with(&workplace, "replaced", &fusion("replaced", &[PACED]));
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    let output = workplace.run(&["handover", "replaced"]);
+    let said = text(&output);
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains("trainer 1 continues from tick"), "{said}");
+    // The journal has what the successor had not learnt when it was killed.
+    run.kill_trainer_at(1, run.trainer.progress().committed_ticks + 1);
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    assert_eq!(Result::of(&workplace, "replaced"), Result::of(&workplace, "estimator"));
+    let report = workplace.report("replaced");
+    assert_eq!(
+        (&report["restarts"], &report["handovers"][0]["incarnation"]),
+        (&1.into(), &1.into())
+    );
     assert_nothing_left(&workplace, "replaced");
 }
 
