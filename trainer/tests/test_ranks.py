@@ -6,9 +6,12 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from caraware.learn.build import build_ppo
+from caraware.learn.config import ConfigError, TrainerConfig
 from caraware.learn.ranks import Ranks, SampleUnion
 from caraware.parallel import RankPlace, command
 from caraware.run.checkpoint import load_history
@@ -17,6 +20,7 @@ from caraware.run.loop import TrainingLoop
 from caraware.run.manifest import latest_checkpoint, read_manifest
 from rank_probe import TRAINING_TICKS, VEHICLES, channels, settings
 from safetensors.torch import load_file
+from synthetic import FIELDS, run_file
 
 HERE = Path(__file__).parent
 UPDATES = 4
@@ -29,10 +33,10 @@ Seen: 2e-7, on CPUs by gloo and on two GPUs by NCCL (RANK_PROBE_DEVICE=auto)."""
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+        return int(probe.getsockname()[1])
 
 
-def launch(folder: Path, *options: str, fault: str = "", more: dict | None = None) -> subprocess.Popen:
+def launch(folder: Path, *options: str, fault: str = "", more: dict[str, Any] | None = None) -> subprocess.Popen[str]:
     """`torchrun` over the probe with `more` settings of the trainer, started and not waited for."""
     path = os.pathsep.join(filter(None, (str(HERE), os.environ.get("PYTHONPATH"))))
     torchrun = [sys.executable, "-m", "torch.distributed.run", *options]
@@ -45,7 +49,7 @@ def launch(folder: Path, *options: str, fault: str = "", more: dict | None = Non
     )
 
 
-def finish(process: subprocess.Popen) -> str:
+def finish(process: subprocess.Popen[str]) -> str:
     said, _ = process.communicate(timeout=240)
     assert process.returncode == 0, said
     return said
@@ -55,11 +59,12 @@ def parameters(folder: Path) -> dict[str, torch.Tensor]:
     return load_file(latest_checkpoint(folder / "checkpoints") / "parameters.safetensors")
 
 
-def part(folder: Path) -> dict:
-    return json.loads((folder / "parts" / "trainer.json").read_text())
+def part(folder: Path) -> dict[str, Any]:
+    written: dict[str, Any] = json.loads((folder / "parts" / "trainer.json").read_text())
+    return written
 
 
-def learn_alone(folder: Path, more: dict | None = None) -> Path:
+def learn_alone(folder: Path, more: dict[str, Any] | None = None) -> Path:
     """One trainer with both environments, and a horizon and batch of twice the size."""
     run = settings(folder, 2, 0, 1, more or {})
     first, *others = channels(run)
@@ -108,7 +113,7 @@ def test_two_ranks_learn_what_one_does_with_twice_the_batch(tmp_path: Path, alon
     ],
     ids=["with memory", "several actions"],
 )
-def test_ranks_share_sequences_and_several_actions_too(tmp_path: Path, more: dict) -> None:
+def test_ranks_share_sequences_and_several_actions_too(tmp_path: Path, more: dict[str, Any]) -> None:
     alone = learn_alone(tmp_path / "alone", more)
     finish(launch(tmp_path, "--standalone", "--nproc-per-node=2", more=more))
     assert_the_same(alone, tmp_path / "rank0")
@@ -121,6 +126,15 @@ def test_ranks_share_sequences_and_several_actions_too(tmp_path: Path, more: dic
         assert remembered.keys() == together.keys()
         for name, tensor in remembered.items():
             assert torch.allclose(tensor, together[name], atol=1e-4), name
+
+
+def test_ranks_share_a_network_of_the_user_s_own(tmp_path: Path) -> None:
+    """`PlainUpdate` alone against `RankedUpdate` in two ranks; its checkpoints of other ranks have the same rows."""
+    more = {"network": "own_residual:Residual", "hidden": [24], "target_kl": 0.02}
+    alone = learn_alone(tmp_path / "alone", more)
+    finish(launch(tmp_path, "--standalone", "--nproc-per-node=2", more=more))
+    assert_the_same(alone, tmp_path / "rank0")
+    assert "policy.0.enter.weight" in parameters(alone)
 
 
 def test_two_nodes_meet_at_a_rendezvous_address(tmp_path: Path, alone: Path) -> None:
@@ -137,6 +151,15 @@ def test_all_ranks_end_when_one_cannot_continue(tmp_path: Path, fault: str, says
     said, _ = process.communicate(timeout=240)
     assert process.returncode != 0
     assert says in said, said
+
+
+def test_batch_statistics_are_refused_with_several_ranks() -> None:
+    ranks = Ranks()
+    ranks.size = 2
+    config = TrainerConfig.from_run(run_file("x", network="own_residual:Normalising", hidden=[8], ranks=2))
+    with pytest.raises(ConfigError, match="its BatchNorm1d takes the statistics of a minibatch") as refused:
+        build_ppo(config, FIELDS, RunConfig.from_run(run_file("x")).task, ranks=ranks)
+    assert "torch.nn.LayerNorm" in refused.value.help
 
 
 def test_a_minibatch_of_the_union_is_what_the_ranks_have_of_it_together() -> None:

@@ -11,6 +11,7 @@ from importlib import import_module
 
 import torch
 from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from caraware.learn.config import ConfigError, TrainerConfig
 from caraware.learn.fast import FastUpdate, threads_per_network
@@ -19,6 +20,7 @@ from caraware.learn.graphed import GraphedUpdate
 from caraware.learn.gru import recurrent_policy, recurrent_value
 from caraware.learn.networks import Activation, GaussianPolicy, Mlp, policy_mlp, value_mlp
 from caraware.learn.ppo import PlainUpdate, Ppo
+from caraware.learn.ranked import RankedUpdate
 from caraware.learn.ranks import Ranks
 from caraware.learn.recurrent import RecurrentPpo, SequenceUpdate
 from caraware.tasks.contract import Sampling, Task
@@ -50,12 +52,11 @@ def build_ppo(
         policy, value = paper_networks(config, observation_size, actions, sampling)
         fast = fast_update(config, policy, value, device, ranks)
         return Ppo(config, task, observation_size, fast, sampling, environments)
-    if config.ranks > 1:
-        raise ConfigError(
-            f"`trainer.network` is {config.network!r} with `trainer.ranks` = {config.ranks}",
-            "several ranks learn with `mlp` or `gru`; set trainer.ranks = 1",
-        )
-    plain = PlainUpdate(config, *_own_networks(config, observation_size, actions, sampling), device)
+    own_policy, own_value = _own_networks(config, observation_size, actions, sampling)
+    plain = PlainUpdate(config, own_policy, own_value, device)
+    if ranks is not None and ranks.size > 1:
+        _refuse_batch_statistics(config, own_policy, own_value)
+        plain = RankedUpdate(config, own_policy, own_value, device, ranks)
     return Ppo(config, task, observation_size, plain, sampling, environments)
 
 
@@ -112,6 +113,17 @@ def _own_networks(
         mean = network_class(observation_size, actions, config.hidden)
         value = network_class(observation_size, 1, config.hidden)
     return GaussianPolicy(nn.Sequential(mean, nn.Tanh()), actions, config.initial_std), value
+
+
+def _refuse_batch_statistics(config: TrainerConfig, *networks: nn.Module) -> None:
+    """Raises `ConfigError` where a row's output depends on the rows beside it, which are others on every rank."""
+    for module in (module for network in networks for module in network.modules()):
+        if isinstance(module, _BatchNorm):
+            raise ConfigError(
+                f"`trainer.network` is {config.network!r} with `trainer.ranks` = {config.ranks}: its "
+                f"{type(module).__name__} takes the statistics of a minibatch, of which each rank sees a part",
+                "normalise each row by itself, as torch.nn.LayerNorm does, or set trainer.ranks = 1",
+            )
 
 
 def _class_of(name: str) -> NetworkClass:

@@ -190,25 +190,40 @@ class PlainUpdate:
         )
 
     def _policy_step(self, batch: Batch, rows: Tensor, now: ScheduledValues) -> list[float]:
-        """One step up the clipped surrogate objective (equation 7) and the entropy bonus (equation 9)."""
+        """One step up the objective of the policy."""
+        loss, figures = self._policy_loss(batch, rows, normalised(batch.advantage[rows]), now)
+        norm = self._step("policy", loss, now)
+        return [loss.item(), *figures, norm]
+
+    def _policy_loss(
+        self, batch: Batch, rows: Tensor, advantage: Tensor, now: ScheduledValues
+    ) -> tuple[Tensor, list[float]]:
+        """The clipped surrogate objective (equation 7) and the entropy bonus (equation 9) of some rows, negative.
+
+        `advantage` are the normalised ones of these rows. The figures are KL, clip fraction, mean and largest ratio.
+        """
         # How much more probable each action is now than when it was sampled.
         mean = self._policy(batch.observation[rows])
         mean = mean if batch.action.ndim == 2 else mean.unsqueeze(1)
         log_ratio = log_probability(batch.action[rows], mean, self._policy.log_std) - batch.log_probability[rows]
         ratio = log_ratio.exp()
         # Beyond 1 ± ε a change of that probability earns nothing more.
-        advantage = normalised(batch.advantage[rows])
         clipped = ratio.clamp(1 - now.clip_epsilon, 1 + now.clip_epsilon)
         surrogate = torch.minimum(ratio * advantage, clipped * advantage).mean()
         loss = -surrogate - now.entropy_scale * entropy(self._policy.log_std)
-        norm = self._step("policy", loss, now)
         with torch.no_grad():
             kl = (ratio - 1 - log_ratio).mean().item()
             outside = ((ratio - 1).abs() > now.clip_epsilon).float().mean().item()
-            return [loss.item(), kl, outside, ratio.mean().item(), ratio.max().item(), norm]
+            return loss, [kl, outside, ratio.mean().item(), ratio.max().item()]
 
     def _value_step(self, batch: Batch, rows: Tensor, now: ScheduledValues) -> list[float]:
-        """One step down the squared error of the values, clipped about those before the update if so configured."""
+        """One step down the error of the values."""
+        loss = self._value_loss(batch, rows)
+        norm = self._step("value", self._config.value_scale * loss, now)
+        return [loss.item(), norm]
+
+    def _value_loss(self, batch: Batch, rows: Tensor) -> Tensor:
+        """The squared error of the values, clipped about those before the update if so configured."""
         value = self._value(batch.observation[rows]).squeeze(1)
         target = batch.value_target[rows]
         error = (value - target).square()
@@ -216,16 +231,19 @@ class PlainUpdate:
             before = target - batch.value_advantage()[rows]
             held = before + (value - before).clamp(-self._config.value_clip, self._config.value_clip)
             error = torch.maximum(error, (held - target).square())
-        loss = error.mean()
-        norm = self._step("value", self._config.value_scale * loss, now)
-        return [loss.item(), norm]
+        loss: Tensor = error.mean()
+        return loss
 
     def _step(self, name: str, loss: Tensor, now: ScheduledValues) -> float:
-        """Back-propagate, clip the gradient to `max_grad_norm`, take one Adam step; the norm before clipping."""
-        adam, network = self._adam[name], self._policy if name == "policy" else self._value
+        """Back-propagate, then take a step with the gradient; its norm before clipping."""
         finite(f"the {name} loss", loss, now)
-        adam.zero_grad()
+        self._adam[name].zero_grad()
         loss.backward()
+        return self._descend(name, now)
+
+    def _descend(self, name: str, now: ScheduledValues) -> float:
+        """Clip the gradient to `max_grad_norm`, take one Adam step; the norm before clipping."""
+        adam, network = self._adam[name], self._policy if name == "policy" else self._value
         norm = nn.utils.clip_grad_norm_(network.parameters(), self._config.max_grad_norm)
         finite(f"the {name} gradient", norm, now)
         for group in adam.param_groups:
