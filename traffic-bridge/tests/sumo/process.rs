@@ -192,6 +192,7 @@ fn episodes_are_sent_step_by_step_under_credit() {
         (State::from_u32(health.state), health.ticks, health.total_ticks),
         (State::Done, 60, 60)
     );
+    assert_eq!((health.road_users, health.cavs), (CAVS, CAVS));
     let ticks: Vec<u64> = steps.iter().map(|(header, ..)| header.tick).collect();
     assert_eq!(ticks, (0..30).map(|step| 2 * step + 1).collect::<Vec<_>>());
     for (place, (header, states, ..)) in steps.iter().enumerate() {
