@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "test code may assert by unwrapping")]
 
 use ipc_schema::run::MapInfo;
-use sim_core::geodesy::{GeodesyError, Geodetic, NetPosition, Projection, origin_projection};
+use sim_core::geodesy::{GeodesyError, Geodetic, NetPosition, Projection};
 
 #[path = "common/spherical.rs"]
 mod spherical;
@@ -17,6 +17,14 @@ const SOUTH: &str = "+proj=utm +zone=23 +south +datum=WGS84 +units=m +no_defs";
 const MERCATOR: &str = "+proj=merc +lon_0=0 +datum=WGS84 +units=m +no_defs";
 const LAMBERT: &str =
     "+proj=lcc +lat_1=49 +lat_2=44 +lat_0=46.5 +lon_0=3 +x_0=700000 +y_0=6600000 +ellps=GRS80 +units=m +no_defs";
+
+/// The projection of a net without one.
+fn origin_projection(origin: Geodetic) -> String {
+    format!(
+        "+proj=tmerc +lat_0={} +lon_0={} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs",
+        origin.latitude_deg, origin.longitude_deg
+    )
+}
 
 fn projection(definition: &str, net_offset_m: [f64; 2]) -> Projection {
     Projection::new(&map(definition, net_offset_m)).unwrap()

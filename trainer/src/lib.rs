@@ -169,12 +169,6 @@ impl Attachment {
         Ok(ahead.saturating_sub(inner.consumed_ticks))
     }
 
-    /// Number of trainers before this one in the run.
-    #[getter]
-    fn incarnation(&self) -> u32 {
-        membership::incarnation()
-    }
-
     /// Number of refused messages: those of other runs and of replaced incarnations.
     #[getter]
     fn refused(&self) -> PyResult<u64> {

@@ -26,11 +26,10 @@ from caraware.run.manifest import (
     CheckpointError,
     Counters,
     best_checkpoint,
-    latest_checkpoint,
     newest_sound_checkpoint,
     read_manifest,
 )
-from synthetic import FIELDS, SIZE_M, locating_ppo, run_file, street_ticks
+from synthetic import FIELDS, SIZE_M, latest_checkpoint, locating_ppo, run_file, street_ticks
 from torch import Tensor
 
 

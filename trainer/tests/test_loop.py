@@ -20,10 +20,10 @@ from caraware.learn.ppo import NonFiniteLoss, UpdateStats
 from caraware.run.config import RunConfig
 from caraware.run.learner import Learner
 from caraware.run.loop import TrainingLoop
-from caraware.run.manifest import best_checkpoint, latest_checkpoint, newest_sound_checkpoint, read_manifest
+from caraware.run.manifest import best_checkpoint, newest_sound_checkpoint, read_manifest
 from caraware.run.stream_position import TickLedger
 from safetensors.torch import load_file
-from synthetic import SyntheticChannel, SyntheticObservation, run_file, street_ticks, with_evaluation
+from synthetic import SyntheticChannel, SyntheticObservation, latest_checkpoint, run_file, street_ticks, with_evaluation
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 PNG = b"\x89PNG"

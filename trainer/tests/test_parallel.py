@@ -15,9 +15,10 @@ from typing import Any
 import pytest
 import torch
 from caraware.run.checkpoint import POINTS
-from caraware.run.manifest import latest_checkpoint, read_manifest
+from caraware.run.manifest import read_manifest
 from caraware.run.program import caraware_program
 from safetensors.torch import load_file
+from synthetic import latest_checkpoint
 
 SETTINGS = {
     "traffic.cavs": 4,

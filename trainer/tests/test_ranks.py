@@ -17,10 +17,10 @@ from caraware.parallel import RankPlace, command
 from caraware.run.checkpoint import load_history
 from caraware.run.config import RunConfig
 from caraware.run.loop import TrainingLoop
-from caraware.run.manifest import latest_checkpoint, read_manifest
+from caraware.run.manifest import read_manifest
 from rank_probe import TRAINING_TICKS, VEHICLES, channels, settings
 from safetensors.torch import load_file
-from synthetic import FIELDS, run_file
+from synthetic import FIELDS, latest_checkpoint, run_file
 
 HERE = Path(__file__).parent
 UPDATES = 4

@@ -1,7 +1,7 @@
 //! Geodesy: the map's own projection, forward and inverse, between net coordinates and latitude and longitude.
 //!
 //! Net coordinates are SUMO's: `net = projected + net_offset`, metres, x east, y north. The projection is the PROJ string of
-//! the net's `<location>`; a net without one gets [`origin_projection`] from the configuration. The implementation is
+//! the net's `<location>`; a net without one gets a transverse Mercator about the origin of the configuration. The implementation is
 //! `proj4rs`: for transverse Mercator and UTM the Poder–Engsager series, which agrees with PROJ to nanometres.
 
 pub mod displacement;
@@ -53,15 +53,6 @@ pub enum GeodesyError {
         /// Why.
         reason: String,
     },
-}
-
-/// The projection of a net without one: transverse Mercator about the given origin, scale 1.
-#[must_use]
-pub fn origin_projection(origin: Geodetic) -> String {
-    format!(
-        "+proj=tmerc +lat_0={} +lon_0={} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs",
-        origin.latitude_deg, origin.longitude_deg
-    )
 }
 
 /// The projection of a map, both ways, with the net's offset.

@@ -156,21 +156,6 @@ pub fn crossing(a: Point, b: Point, c: Point, d: Point) -> Option<Point> {
     ((0.0..=1.0).contains(&s) && (0.0..=1.0).contains(&t)).then(|| between(a, b, s))
 }
 
-/// Squared distance between two segments, 0 if they cross, m².
-#[must_use]
-pub fn segment_distance2(a: Point, b: Point, c: Point, d: Point) -> f64 {
-    if crossing(a, b, c, d).is_some() {
-        return 0.0;
-    }
-    let to_first = [c, d].map(|point| (point, nearest_on_segment(a, b, point)));
-    let to_second = [a, b].map(|point| (point, nearest_on_segment(c, d, point)));
-    to_first
-        .into_iter()
-        .chain(to_second)
-        .map(|(p, q)| dot(from_to(p, q), from_to(p, q)))
-        .fold(f64::INFINITY, f64::min)
-}
-
 /// True if no two edges cross: an outline without loops.
 #[must_use]
 pub fn is_simple(outline: &[Point]) -> bool {

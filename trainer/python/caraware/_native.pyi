@@ -104,10 +104,6 @@ class Attachment:
         """Ticks that `traffic-bridge` is ahead of the newest tick consumed here."""
 
     @property
-    def incarnation(self) -> int:
-        """Number of this trainer in the run; 0 for the first."""
-
-    @property
     def refused(self) -> int:
         """Messages that were refused because they came from another run or from a replaced incarnation."""
 

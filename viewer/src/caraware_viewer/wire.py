@@ -17,9 +17,6 @@ from caraware_viewer.layout import ALIGNMENT, DIMENSIONS, RECORDS, SCHEMA_VERSIO
 
 EVALUATION = 1
 """Bit of `MessageHeader.flags`: the episode is an evaluation."""
-FIRST_OF_EPISODE = 1 << 1
-LAST_OF_EPISODE = 1 << 2
-LAST_OF_RUN = 1 << 3
 
 CAV, OTHER, PERSON, HERO = 0, 1, 2, 3
 """Values of `VehicleState.kind`."""

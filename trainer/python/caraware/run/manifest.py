@@ -104,14 +104,6 @@ def verify_checkpoint(checkpoint: Path) -> Manifest:
     return manifest
 
 
-def latest_checkpoint(folder: Path) -> Path:
-    """The checkpoint that `folder/latest` names. Raises `CheckpointError` if there is none."""
-    try:
-        return folder / (folder / LATEST).read_text().strip()
-    except OSError as error:
-        raise CheckpointError(folder / LATEST, f"cannot be read ({error.strerror})") from error
-
-
 def read_manifest(checkpoint: Path) -> Manifest:
     """The manifest of a checkpoint directory. Raises `CheckpointError`."""
     file = checkpoint / MANIFEST
