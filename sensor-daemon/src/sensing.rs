@@ -17,7 +17,7 @@ use crate::{
     carrier::SensorCarrier,
     noise::normals::BATCH,
     noise::{DrawnNormals, NormalDraws},
-    observation::fields::Normaliser,
+    observation::fields::{Normaliser, SensorReadings},
     observation::history::{FrameHistory, TrajectoryFrame},
     observation::slots::Slots,
     region::SensedRegion,
@@ -310,6 +310,12 @@ impl Sensing {
             }
             _ => None,
         })
+    }
+
+    /// The newest samples of the carrier in `slot`, for sensors of the surroundings. Call it between [`Sensing::assign`] and
+    /// [`Sensing::observe`].
+    pub fn readings_mut(&mut self, slot: usize) -> Option<&mut SensorReadings> {
+        self.carriers.get_mut(slot).map(|carrier| &mut carrier.readings)
     }
 
     /// Sets the nearest points of four objects that the LIDAR in `slot` sees, forward and left of the rear axle (metres). A point that

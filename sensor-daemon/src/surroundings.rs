@@ -53,7 +53,7 @@ impl Surroundings {
             lidars = Some(LidarScanning::new(&membership.run.config, &scenes, publisher)?);
         }
         let ultrasonic = uses.contains(&SceneUse::Solids);
-        let ultrasonic = ultrasonic.then(|| UltrasonicSampling::new(&session.run.config, &scenes));
+        let ultrasonic = ultrasonic.then(|| UltrasonicSampling::new(&membership.run.config, &scenes));
         Ok(Self { lidars, ultrasonic })
     }
 

@@ -11,7 +11,7 @@ use ipc_schema::{
     config::{Config, Field},
     control::{EVERY_VEHICLE, SWITCHED_ON, SensorSwitch},
     field::FieldPreset,
-    header::{MessageHeader, stage_flags},
+    header::MessageHeader,
     observation::VALID,
     props::Obstacle,
     sensor::SensorKind,
@@ -79,7 +79,7 @@ struct Sonar {
     sampling: UltrasonicSampling,
     tick: u64,
     seed: u64,
-    flags: u32,
+    stage: u16,
 }
 
 impl Sonar {
@@ -89,13 +89,13 @@ impl Sonar {
             sampling: UltrasonicSampling::new(config, &[scene()]),
             tick: 0,
             seed: 5,
-            flags: 0,
+            stage: 0,
         }
     }
 
-    fn restart_in(&mut self, seed: u64, flags: u32) {
-        self.run.restart_in(seed, flags);
-        (self.tick, self.seed, self.flags) = (0, seed, flags);
+    fn restart_in(&mut self, seed: u64, stage: u16) {
+        self.run.restart_in(seed, stage, 0);
+        (self.tick, self.seed, self.stage) = (0, seed, stage);
     }
 
     fn tick(&mut self, states: &[VehicleState]) -> Tick {
@@ -103,7 +103,7 @@ impl Sonar {
             tick: self.tick,
             sim_time_ns: (self.tick + 1) * 100_000_000,
             episode_seed: self.seed,
-            flags: self.flags,
+            stage: self.stage,
             ..MessageHeader::default()
         };
         self.tick += 1;
@@ -251,7 +251,7 @@ fn a_range_has_the_noise_of_its_stage() {
     config.curriculum.stages = serde_json::from_value(serde_json::json!([{"cavs": 1, "noise": 3.0}])).unwrap();
     let mut sonar = Sonar::new(&config);
     for (stage, std_m) in [(0, 0.01), (1, 0.03)] {
-        sonar.restart_in(5, stage_flags(stage));
+        sonar.restart_in(5, stage);
         let errors_m: Vec<f64> = (0..TICKS)
             .map(|_| f64::from(ranges_m(&sonar.tick(&[car(0, 100.0)]), 0)[FRONT]) - 2.0)
             .collect();

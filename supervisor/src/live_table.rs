@@ -88,7 +88,7 @@ impl LiveTable {
         format!("{}  now policy/EKF: {}{more}", self.means(), shown.join(", "))
     }
 
-/// The table for a terminal of `rows` lines: one line for each vehicle with its values at this tick and their means since it appeared.
+    /// The table for a terminal of `rows` lines: one line for each vehicle with its values at this tick and their means since it appeared.
     #[must_use]
     pub fn lines(&self, rows: usize) -> Vec<String> {
         let room = rows.saturating_sub(OTHER_ROWS).max(1);

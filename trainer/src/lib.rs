@@ -11,7 +11,7 @@ use ipc_schema::{
     board::{State, TrainingStatus},
     clock::monotonic_ns,
     header::{self, MessageHeader},
-    membership::{self, MembershipError, RunMembership},
+    membership::{MembershipError, RunMembership},
     metric::{self, METRICS},
     observation::ObservationLayout,
     ports::{BoardReader, Message, Publisher, Subscriber, Waker},

@@ -155,8 +155,12 @@ impl UltrasonicSampling {
         }
         self.bodies.update(states);
         let now = sensing.now(header);
-        let noise_std_m = self.noise_std_m.get(header.stage()).copied().unwrap_or_default();
-        let map = header.map().min(self.scenes.len().saturating_sub(1));
+        let noise_std_m = self
+            .noise_std_m
+            .get(usize::from(header.stage))
+            .copied()
+            .unwrap_or_default();
+        let map = usize::from(header.map).min(self.scenes.len().saturating_sub(1));
         let carriers = std::mem::take(&mut self.carriers);
         for &(slot, row) in &carriers {
             let normals = match noise_std_m > 0.0 {
