@@ -13,6 +13,7 @@ from caraware.ipc.stream import TrainingReport
 from caraware.learn.build import build_ppo
 from caraware.learn.config import TrainerConfig
 from caraware.learn.ppo import Ppo
+from caraware.run.manifest import LATEST
 from caraware.tasks.bounds import MapBounds
 from caraware.tasks.localisation import Localisation
 from torch import Tensor
@@ -171,6 +172,11 @@ def run_file(run_dir: str, **trainer: object) -> dict[str, Any]:
     bounds = [0.0, 0.0, SIZE_M, SIZE_M]
     config = {"task": {"kind": "localisation"}, "trainer": section | trainer}
     return {"run_dir": run_dir, "config": config, "map": {"bounds_m": bounds}}
+
+
+def latest_checkpoint(folder: Path) -> Path:
+    """The checkpoint that `folder/latest` names."""
+    return folder / (folder / LATEST).read_text().strip()
 
 
 def locating_ppo(config: TrainerConfig, observation_size: int, bounds: MapBounds) -> Ppo:

@@ -14,9 +14,9 @@ from caraware.run.config import RunConfig
 from caraware.run.environment import share
 from caraware.run.learner import Learner
 from caraware.run.loop import TrainingLoop
-from caraware.run.manifest import latest_checkpoint, read_manifest
+from caraware.run.manifest import read_manifest
 from safetensors.torch import load_file
-from synthetic import FIELDS, SyntheticChannel, SyntheticObservation, run_file, with_evaluation
+from synthetic import FIELDS, SyntheticChannel, SyntheticObservation, latest_checkpoint, run_file, with_evaluation
 
 VEHICLES = 16
 TICKS = 76

@@ -23,9 +23,18 @@ from caraware.run.checkpoint import load_checkpoint
 from caraware.run.config import RunConfig
 from caraware.run.learner import Learner
 from caraware.run.loop import TrainingLoop
-from caraware.run.manifest import CheckpointError, latest_checkpoint, newest_sound_checkpoint
+from caraware.run.manifest import CheckpointError, newest_sound_checkpoint
 from safetensors.torch import load_file
-from synthetic import FIELDS, SIZE_M, SyntheticChannel, SyntheticObservation, locating_ppo, run_file, street_ticks
+from synthetic import (
+    FIELDS,
+    SIZE_M,
+    SyntheticChannel,
+    SyntheticObservation,
+    latest_checkpoint,
+    locating_ppo,
+    run_file,
+    street_ticks,
+)
 from test_loop import KilledError, final_parameters, loop_over, part, stream
 from torch import Tensor, nn
 

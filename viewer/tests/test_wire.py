@@ -30,7 +30,7 @@ def test_records_have_the_fields_of_the_table() -> None:
 
 def test_world_comes_back() -> None:
     world = wire.decode_world(frames.world(4, count=5))
-    assert (world.header.tick, world.header.count, world.header.run_id) == (4, 5, 7)
+    assert (world.header.tick, world.header.rows, world.header.run_id) == (4, 5, 7)
     np.testing.assert_array_equal(world.states["x_m"], [4, 14, 24, 34, 44])
     assert not world.states.flags.writeable
 
