@@ -152,10 +152,13 @@ impl FanoutBench {
                 // The start of eight programs on the cores of the run does not count.
                 run.observe(SETTLING);
                 let ticks = run.observe(Duration::from_secs(PACED_S - 1) - SETTLING);
-                let seen = viewers.into_iter().map(CountingViewer::finish).collect::<Vec<_>>();
+                let seen: Vec<_> = viewers
+                    .into_iter()
+                    .map(CountingViewer::finish)
+                    .collect::<Result<_, _>>()?;
                 let late = lateness_ms(&ticks);
                 let found = run.finish()?;
-                hashes.push(found["observation_hash"].clone());
+                let hash = observation_hash(&found)?;
                 let case = if watched { "watched" } else { "alone" };
                 let at = |share| percentile(&late, share);
                 table.row([
@@ -164,13 +167,9 @@ impl FanoutBench {
                     format!("{:.2}", at(0.95)),
                     format!("{:.2}", at(0.99)),
                     format!("{:.2}", at(1.0)),
-                    found["observation_hash"]
-                        .as_str()
-                        .unwrap_or_default()
-                        .chars()
-                        .take(8)
-                        .collect(),
+                    hash.chars().take(8).collect(),
                 ]);
+                hashes.push(hash);
                 report.figure(format!("paced, {case}, lateness p99, ms"), at(0.99));
                 if watched {
                     self.report_ages(report, &ticks, &seen)?;
@@ -186,7 +185,7 @@ impl FanoutBench {
     }
 
     /// Reports the age of frames at healthy viewers: the time since `sensor-daemon` published the tick on its board.
-    fn report_ages(&self, report: &mut BenchReport, ticks: &[(u64, u64)], seen: &[Value]) -> Result<(), Exit> {
+    fn report_ages(&self, report: &mut BenchReport, ticks: &[(u64, u64)], seen: &[Option<Value>]) -> Result<(), Exit> {
         let log = self.directory.join("world.csv");
         let text = std::fs::read_to_string(&log).map_err(|error| Exit::io("read", &log, &error))?;
         let made: std::collections::BTreeMap<u64, u64> = ticks.iter().copied().collect();
@@ -201,7 +200,7 @@ impl FanoutBench {
         ages_ms.sort_by(f64::total_cmp);
         report.figure("median age of world frames, ms", percentile(&ages_ms, 0.5));
         report.figure("p99 age of world frames, ms", percentile(&ages_ms, 0.99));
-        if let Some(world) = seen.first().map(|counts| &counts["world"]) {
+        if let Some(world) = seen.iter().flatten().next().map(|counts| &counts["world"]) {
             for what in ["received", "lost", "refused"] {
                 report.figure(
                     format!("world frames {what} by six healthy viewers"),
@@ -237,7 +236,7 @@ impl FanoutBench {
                 // The rate counts from here on, after the viewers have started.
                 rates[place] = run.rate();
                 drop(viewers);
-                hashes.push(run.finish()?["observation_hash"].clone());
+                hashes.push(observation_hash(&run.finish()?)?);
             }
             let ratio = rates[1] / rates[0];
             ratios.push(ratio);
@@ -433,7 +432,9 @@ impl LiveRun {
         let path = self.directory.join("report.json");
         let text = std::fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
         match status {
-            Ok(status) if status.success() => Ok(serde_json::from_str(&text).unwrap_or_default()),
+            Ok(status) if status.success() => {
+                serde_json::from_str(&text).map_err(|error| Exit::run(format!("{}: {error}", path.display()), ""))
+            }
             status => Err(Exit::run(format!("a run ended with {status:?}"), "")),
         }
     }
@@ -478,21 +479,27 @@ impl CountingViewer {
         }
     }
 
-    /// The counts of the viewer; null if it is stopped.
-    fn finish(mut self) -> Value {
+    /// The counts of the viewer; `None` if it is stopped.
+    ///
+    /// # Errors
+    /// The viewer writes no counts.
+    fn finish(mut self) -> Result<Option<Value>, Exit> {
         let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap_or_default();
         if stat
             .rsplit(')')
             .next()
             .is_some_and(|rest| rest.trim_start().starts_with('T'))
         {
-            return Value::Null;
+            return Ok(None);
         }
         let mut line = String::new();
-        match self.output.read_line(&mut line) {
-            Ok(_) => serde_json::from_str(&line).unwrap_or_default(),
-            Err(_) => Value::Null,
-        }
+        let counts = match self.output.read_line(&mut line) {
+            Ok(_) => serde_json::from_str(&line),
+            Err(error) => Err(serde_json::Error::io(error)),
+        };
+        counts
+            .map(Some)
+            .map_err(|error| Exit::run(format!("a viewer has written no counts: {error}"), ""))
     }
 }
 
@@ -558,6 +565,13 @@ fn resident_mib(pid: i32) -> f64 {
     pages.map_or(f64::NAN, |pages| pages * 4.0 / 1024.0)
 }
 
-fn all_equal(values: &[Value]) -> bool {
+/// The observation hash of a run's report.
+fn observation_hash(report: &Value) -> Result<String, Exit> {
+    let hash = report["observation_hash"].as_str().filter(|hash| !hash.is_empty());
+    hash.map(str::to_owned)
+        .ok_or_else(|| Exit::run("the report of a run has no observation hash", ""))
+}
+
+fn all_equal(values: &[String]) -> bool {
     values.windows(2).all(|pair| pair[0] == pair[1])
 }

@@ -78,11 +78,10 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
         page::write()?;
     }
     if let Some(path) = &args.json {
-        let text = match reports.as_slice() {
-            [report] => serde_json::to_string_pretty(report),
-            reports => serde_json::to_string_pretty(reports),
-        };
-        std::fs::write(path, text.unwrap_or_default() + "\n").map_err(|error| Exit::io("write", path, &error))?;
+        match reports.as_slice() {
+            [report] => report::write_json(path, report)?,
+            reports => report::write_json(path, reports)?,
+        }
     }
     if let Some(directory) = &args.plots {
         plots::draw(&install::python(&options.bin)?, &reports, directory)?;

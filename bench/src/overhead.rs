@@ -60,15 +60,15 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     report.figure("result files compared", files as f64);
     report.tables.push(table);
     if let Some(ours) = last {
-        let table = stages(&ours, &mut report);
+        let table = stages(&ours, &mut report)?;
         report.tables.push(table);
     }
     Ok(report)
 }
 
 /// Processor time of one run by stage.
-fn stages(ours: &OurRun, report: &mut BenchReport) -> ReportTable {
-    let stages = StageTimes::of(ours);
+fn stages(ours: &OurRun, report: &mut BenchReport) -> Result<ReportTable, Exit> {
+    let stages = StageTimes::of(ours)?;
     let mut table = ReportTable::new(
         "Where processor time goes (the last pair)",
         &["stage", "CPU s", "µs per vehicle-step", "share"],
@@ -95,5 +95,5 @@ fn stages(ours: &OurRun, report: &mut BenchReport) -> ReportTable {
             format!("{:.1} %", 100.0 * seconds / ours.taken.cpu_s),
         ]);
     }
-    table
+    Ok(table)
 }

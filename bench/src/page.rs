@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use caraware::failure::Exit;
 
-use crate::{BenchReport, cli::BenchPart};
+use crate::{BenchReport, cli::BenchPart, report::write_json};
 
 const HEAD: &str = "# Benchmarks
 
@@ -22,8 +22,7 @@ fn documentation() -> PathBuf {
 /// The source tree is missing or not writable.
 pub fn keep(report: &BenchReport) -> Result<(), Exit> {
     let path = documentation().join("benchmarks").join(format!("{}.json", report.part));
-    let text = serde_json::to_string_pretty(report).unwrap_or_default();
-    std::fs::write(&path, text + "\n").map_err(|error| Exit::io("write", &path, &error))
+    write_json(&path, report)
 }
 
 /// Writes the page.
@@ -41,8 +40,11 @@ fn page() -> Result<String, Exit> {
     let mut text = HEAD.to_owned();
     for part in BenchPart::measured() {
         let path = directory.join(format!("{}.json", part.name()));
-        let Ok(kept) = std::fs::read_to_string(&path) else {
-            continue;
+        let kept = match std::fs::read_to_string(&path) {
+            Ok(kept) => kept,
+            // A part that was never kept has no section.
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => continue,
+            Err(error) => return Err(Exit::io("read", &path, &error)),
         };
         let report: BenchReport = serde_json::from_str(&kept)
             .map_err(|error| Exit::run(format!("{}: {error}", path.display()), "measure it again with --keep"))?;

@@ -156,13 +156,13 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         if let Some(theirs) = results {
             compare_results(&theirs, &ours.results)?;
         }
-        measured.many.push(ours.number("/env_steps_per_s"));
+        measured.many.push(ours.number("/env_steps_per_s")?);
         for peer in &DRIVING {
             let answer = run_driving(options, &place, peer, &few_net, size.driving_s)?;
             let install_by = format!("peers-{}", peer.peer);
             measured.driving.add(peer.name, answer, &install_by);
         }
-        measured.few.push(few.ours()?.number("/env_steps_per_s"));
+        measured.few.push(few.ours()?.number("/env_steps_per_s")?);
     }
     report(size, &measured)
 }

@@ -1,7 +1,6 @@
 //! Draws a report's curves as pictures with the project's Python, like the trainer's plots.
 
 use std::{
-    io::Write as _,
     path::Path,
     process::{Command, Stdio},
 };
@@ -24,8 +23,7 @@ pub fn draw(python: &Path, reports: &[BenchReport], directory: &Path) -> Result<
         .spawn()
         .map_err(|error| failed(&error))?;
     if let Some(mut input) = process.stdin.take() {
-        let text = serde_json::to_string(reports).unwrap_or_default();
-        input.write_all(text.as_bytes()).map_err(|error| failed(&error))?;
+        serde_json::to_writer(&mut input, reports).map_err(|error| failed(&error.into()))?;
     }
     let status = process.wait().map_err(|error| failed(&error))?;
     if status.success() {

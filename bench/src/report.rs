@@ -1,6 +1,6 @@
 //! The report of a measurement: one form for the terminal, for files and for the documentation.
 
-use std::{collections::BTreeMap, fmt, process::Command};
+use std::{collections::BTreeMap, fmt, path::Path, process::Command};
 
 use caraware::failure::Exit;
 use serde::{Deserialize, Serialize};
@@ -23,7 +23,6 @@ pub struct BenchReport {
     /// The figures for programs: name with unit → value.
     pub figures: BTreeMap<String, f64>,
     /// The curves that can be drawn.
-    #[serde(default)]
     pub curves: Vec<ReportCurve>,
 }
 
@@ -267,6 +266,16 @@ impl fmt::Display for MedianSpread {
     }
 }
 
+/// Writes reports as JSON.
+///
+/// # Errors
+/// The file is not writable.
+pub fn write_json(path: &Path, reports: &(impl Serialize + ?Sized)) -> Result<(), Exit> {
+    let text = serde_json::to_string_pretty(reports).map_err(std::io::Error::from);
+    text.and_then(|text| std::fs::write(path, text + "\n"))
+        .map_err(|error| Exit::io("write", path, &error))
+}
+
 /// Runs a measuring program that takes `--json FILE`, and reads that file. Its standard output goes to standard error.
 ///
 /// # Errors
@@ -280,7 +289,7 @@ pub fn from_program<T: serde::de::DeserializeOwned>(mut command: Command) -> Res
         .stdout(std::io::stderr())
         .status()
         .map_err(|error| Exit::io("start", program.as_ref(), &error))?;
-    let text = std::fs::read_to_string(&file).unwrap_or_default();
+    let text = std::fs::read_to_string(&file);
     // The file is missing if the program failed before it wrote the file.
     let _ = std::fs::remove_file(&file);
     if !status.success() {
@@ -289,8 +298,8 @@ pub fn from_program<T: serde::de::DeserializeOwned>(mut command: Command) -> Res
             "its message is above",
         ));
     }
-    serde_json::from_str(&text)
-        .map_err(|error| Exit::run(format!("the report of {program} cannot be read: {error}"), ""))
+    let unwritten = |error: &dyn fmt::Display| Exit::run(format!("{program} wrote no report: {error}"), "");
+    serde_json::from_str(&text.map_err(|error| unwritten(&error))?).map_err(|error| unwritten(&error))
 }
 
 #[cfg(test)]

@@ -32,6 +32,8 @@ struct ScaleCase {
     bare: ProcessCost,
     ours: OurRun,
     stages: StageTimes,
+    /// Most memory of the three processes that hold vehicles, KiB for each vehicle; shared memory counts in each that touches it.
+    memory_kib: f64,
 }
 
 impl ScaleCase {
@@ -39,25 +41,24 @@ impl ScaleCase {
         let (bare, results) = scenario.bare()?;
         let ours = scenario.ours()?;
         compare_results(&results, &ours.results)?;
-        let stages = StageTimes::of(&ours);
+        let stages = StageTimes::of(&ours)?;
+        // Shared memory counts in every process that uses it.
+        let mut mib = 0.0;
+        for process in ["traffic-bridge", "sim-core", "sensor-daemon"] {
+            mib += ours.number(&format!("/processes/{process}/peak_memory_mib"))?;
+        }
         Ok(Self {
             vehicles,
             bare,
             ours,
             stages,
+            memory_kib: 1024.0 * mib / f64::from(vehicles),
         })
     }
 
     /// Cost of a vehicle-step outside SUMO, µs.
     fn outside_us(&self) -> f64 {
         self.stages.per_step_us(self.stages.outside_s())
-    }
-
-    /// Peak memory of the three processes that hold vehicles, KiB for each vehicle. Shared memory counts in every process that uses it.
-    fn memory_kib(&self) -> f64 {
-        let processes = ["traffic-bridge", "sim-core", "sensor-daemon"];
-        let mib = processes.map(|name| self.ours.number(&format!("/processes/{name}/peak_memory_mib")));
-        1024.0 * mib.iter().sum::<f64>() / f64::from(self.vehicles)
     }
 }
 
@@ -88,10 +89,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
             format!("{} vehicles, µs per vehicle-step outside SUMO", case.vehicles),
             case.outside_us(),
         );
-        report.figure(
-            format!("{} vehicles, KiB per vehicle", case.vehicles),
-            case.memory_kib(),
-        );
+        report.figure(format!("{} vehicles, KiB per vehicle", case.vehicles), case.memory_kib);
     }
     let at = |vehicles| {
         cases
@@ -149,7 +147,7 @@ fn costs(cases: &[ScaleCase]) -> ReportTable {
             each(case.stages.sensors_s),
             each(case.stages.consumer_s),
             each(case.stages.outside_s()),
-            format!("{:.1}", case.memory_kib()),
+            format!("{:.1}", case.memory_kib),
             format!("{:.2}", case.ours.taken.wall_s / case.bare.wall_s),
         ]);
     }
@@ -204,9 +202,9 @@ fn large(options: &BenchOptions, place: &BenchDirectory, report: &mut BenchRepor
         let case = generated(options, place, &city, name)?;
         report.figure(
             format!("{name}, {vehicles} vehicles at steps of 1 s, sensed vehicle-steps/s"),
-            case.ours.number("/env_steps_per_s"),
+            case.ours.number("/env_steps_per_s")?,
         );
-        table.row(row(&format!("{name}, {vehicles} vehicles, steps of 1 s"), &case));
+        table.row(row(&format!("{name}, {vehicles} vehicles, steps of 1 s"), &case)?);
     }
     let scales = if options.quick { &[][..] } else { &MOTORWAY_SCALES[..] };
     for &scale in scales {
@@ -216,24 +214,24 @@ fn large(options: &BenchOptions, place: &BenchDirectory, report: &mut BenchRepor
         let case = ScaleCase::measure(&scenario, 1)?;
         report.figure(
             format!("A10KW at {scale} × its demand, × real time"),
-            case.ours.number("/real_time_factor"),
+            case.ours.number("/real_time_factor")?,
         );
-        table.row(row(&format!("A10KW, demand × {scale}, steps of 0.5 s"), &case));
+        table.row(row(&format!("A10KW, demand × {scale}, steps of 0.5 s"), &case)?);
     }
     report.tables.push(table);
     Ok(())
 }
 
-fn row(name: &str, case: &ScaleCase) -> [String; 8] {
+fn row(name: &str, case: &ScaleCase) -> Result<[String; 8], Exit> {
     let ours = &case.ours;
-    [
+    Ok([
         name.to_owned(),
-        format!("{:.0}", ours.number("/vehicles")),
-        format!("{:.0}", ours.number("/vehicle_steps")),
-        format!("{:.0}", ours.number("/env_steps_per_s")),
-        format!("{:.1}", ours.number("/real_time_factor")),
+        format!("{:.0}", ours.number("/vehicles")?),
+        format!("{:.0}", ours.number("/vehicle_steps")?),
+        format!("{:.0}", ours.number("/env_steps_per_s")?),
+        format!("{:.1}", ours.number("/real_time_factor")?),
         format!("{:.2}", case.bare.wall_s),
         format!("{:.2}", ours.taken.wall_s),
         format!("{:.2}", ours.taken.wall_s / case.bare.wall_s),
-    ]
+    ])
 }

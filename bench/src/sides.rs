@@ -44,9 +44,12 @@ pub struct OurRun {
 
 impl OurRun {
     /// A number of the report, by its path.
-    #[must_use]
-    pub fn number(&self, path: &str) -> f64 {
-        self.report.pointer(path).and_then(Value::as_f64).unwrap_or(0.0)
+    ///
+    /// # Errors
+    /// The report has no such number.
+    pub fn number(&self, path: &str) -> Result<f64, Exit> {
+        let number = self.report.pointer(path).and_then(Value::as_f64);
+        number.ok_or_else(|| Exit::run(format!("the report of a run has no number {path}"), ""))
     }
 }
 
@@ -246,9 +249,15 @@ impl<'a> ComparedScenario<'a> {
             while matches!(waitid(WaitId::Pid(pid), options), Err(Errno::INTR)) {}
         }
         let wall_s = begin.elapsed().as_secs_f64();
-        let cpu_s = usage::family_processor_time_s(child.id()).unwrap_or(0.0);
+        let cpu_s = usage::family_processor_time_s(child.id());
         let status = child.wait().map_err(|error| failed(&error))?;
         if status.success() {
+            let cpu_s = cpu_s.ok_or_else(|| {
+                Exit::run(
+                    format!("the processor time of {program} is unknown: /proc does not say"),
+                    "",
+                )
+            })?;
             return Ok(ProcessCost { wall_s, cpu_s });
         }
         let text = std::fs::read_to_string(&path).unwrap_or_default();

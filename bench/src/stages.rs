@@ -1,5 +1,7 @@
 //! Processor time of a run by stage, from the reports of its processes.
 
+use caraware::failure::Exit;
+
 use super::sides::OurRun;
 
 /// Processor time in the loop by stage, seconds, without loading.
@@ -21,30 +23,33 @@ pub struct StageTimes {
     pub start_s: f64,
     /// Sensed vehicle-steps.
     pub vehicle_steps: f64,
-    /// Road users, over SUMO's steps.
-    pub sumo_vehicle_steps: f64,
 }
 
 impl StageTimes {
     /// Reads the times of a finished run.
-    #[must_use]
-    pub fn of(ours: &OurRun) -> Self {
+    ///
+    /// # Errors
+    /// The run's report lacks a number.
+    pub fn of(ours: &OurRun) -> Result<Self, Exit> {
         let used = |process: &str, what: &str| ours.number(&format!("/processes/{process}/{what}"));
         let in_loop = |process| used(process, "loop_cpu_s");
         let processes = ["traffic-bridge", "sim-core", "sensor-daemon", "trainer"];
-        let sumo_s = ours.number("/traffic/sumo_step_s");
-        let getters_s = ours.number("/traffic/getters_s") + ours.number("/traffic/signals_s");
-        Self {
+        let sumo_s = ours.number("/traffic/sumo_step_s")?;
+        let getters_s = ours.number("/traffic/getters_s")? + ours.number("/traffic/signals_s")?;
+        let mut start_s = 0.0;
+        for name in processes {
+            start_s += used(name, "cpu_s")? - in_loop(name)?;
+        }
+        Ok(Self {
             sumo_s,
             getters_s,
-            bridge_s: (in_loop("traffic-bridge") - sumo_s - getters_s).max(0.0),
-            dynamics_s: in_loop("sim-core"),
-            sensors_s: in_loop("sensor-daemon"),
-            consumer_s: in_loop("trainer"),
-            start_s: processes.map(|name| used(name, "cpu_s") - in_loop(name)).iter().sum(),
-            vehicle_steps: ours.number("/vehicle_steps"),
-            sumo_vehicle_steps: ours.number("/traffic/vehicle_steps"),
-        }
+            bridge_s: (in_loop("traffic-bridge")? - sumo_s - getters_s).max(0.0),
+            dynamics_s: in_loop("sim-core")?,
+            sensors_s: in_loop("sensor-daemon")?,
+            consumer_s: in_loop("trainer")?,
+            start_s,
+            vehicle_steps: ours.number("/vehicle_steps")?,
+        })
     }
 
     /// The stages with their names.

@@ -112,13 +112,14 @@ impl Command {
     }
 
     /// The request as JSON.
-    #[must_use]
-    pub fn to_json(&self) -> String {
-        let request = Request {
+    ///
+    /// # Errors
+    /// Never: a command holds words and numbers alone.
+    pub fn to_json(&self) -> Result<String, serde_json::Error> {
+        serde_json::to_string(&Request {
             schema_version: SCHEMA_VERSION,
             control: self.clone(),
-        };
-        serde_json::to_string(&request).unwrap_or_default()
+        })
     }
 
     /// Reads and checks a request in JSON, which may come from any client.
@@ -433,15 +434,18 @@ impl From<&Reply> for ControlReply {
 
 impl From<&ControlReply> for Reply {
     fn from(reply: &ControlReply) -> Self {
-        let message = text_of(&reply.text, reply.text_len).unwrap_or_default();
         let refusal = RefusalKind::ALL.into_iter().find(|kind| *kind as u32 == reply.outcome);
-        match (reply.outcome, refusal) {
-            (0, _) => Self::Done(Done {
+        match (text_of(&reply.text, reply.text_len), reply.outcome, refusal) {
+            (Some(message), 0, _) => Self::Done(Done {
                 tick: reply.tick,
                 episode: reply.episode,
                 message,
             }),
-            (_, kind) => Self::Refused(Refusal::new(kind.unwrap_or(RefusalKind::Unanswered), message)),
+            (Some(message), _, Some(kind)) => Self::Refused(Refusal::new(kind, message)),
+            _ => {
+                let message = "the answer of traffic-bridge cannot be read";
+                Self::Refused(Refusal::new(RefusalKind::Unanswered, message))
+            }
         }
     }
 }
@@ -499,7 +503,7 @@ mod tests {
     proptest! {
         #[test]
         fn a_command_survives_json_and_the_record(command in commands()) {
-            prop_assert_eq!(Command::from_json(command.to_json().as_bytes()).unwrap(), command.clone());
+            prop_assert_eq!(Command::from_json(command.to_json().unwrap().as_bytes()).unwrap(), command.clone());
             prop_assert_eq!(Command::try_from(&ControlRequest::from(&command)).unwrap(), command);
         }
 
@@ -542,7 +546,7 @@ mod tests {
             vehicle: "v".repeat(ID_BYTES + 1),
             edge: "e".into(),
         };
-        assert_eq!(kind(&long.to_json()), RefusalKind::Malformed);
+        assert_eq!(kind(&long.to_json().unwrap()), RefusalKind::Malformed);
         assert_eq!(kind(&" ".repeat(MAX_REQUEST_BYTES + 1)), RefusalKind::Malformed);
     }
 

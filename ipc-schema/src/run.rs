@@ -63,7 +63,6 @@ pub struct Start {
     pub episode_tick: u64,
     /// Number of resets before that episode. Each reset adds an episode, so the episode's number exceeds its position in the schedule by
     /// this number.
-    #[serde(default)]
     pub resets: u64,
 }
 
@@ -153,7 +152,6 @@ pub struct RunFile {
     /// Name of the run.
     pub name: String,
     /// Index of this file's environment, from 0. Processes of the whole run read the file of environment 0.
-    #[serde(default)]
     pub env_index: u32,
     /// Directory of this environment's results. That of environment 0 holds the directories of the others.
     pub run_dir: PathBuf,
@@ -208,6 +206,16 @@ pub enum RunFileError {
         #[source]
         source: serde_json::Error,
     },
+    /// A stage of the curriculum is on a map that the run does not have.
+    #[error("{path}: stage {stage} of `curriculum.stages` is on the map \"{map}\", which the run does not have")]
+    UnknownMap {
+        /// The file.
+        path: PathBuf,
+        /// The stage, counted from 1.
+        stage: usize,
+        /// The map.
+        map: String,
+    },
     /// Another version wrote the file.
     #[error("{path} has schema version {found}, this program reads {SCHEMA_VERSION}: rebuild with `make build`")]
     Version {
@@ -216,6 +224,12 @@ pub enum RunFileError {
         /// Its version.
         found: u32,
     },
+}
+
+/// The version in a run file, which the reader checks before the rest of the file.
+#[derive(Deserialize)]
+struct RunFileVersion {
+    schema_version: u32,
 }
 
 /// The written run file: it also has values that readers in other languages would otherwise have to compute.
@@ -237,17 +251,38 @@ impl RunFile {
             path: path.into(),
             source,
         })?;
-        let run: Self = serde_json::from_str(&text).map_err(|source| RunFileError::Format {
+        let malformed = |source| RunFileError::Format {
             path: path.into(),
             source,
-        })?;
-        if run.schema_version != SCHEMA_VERSION {
+        };
+        // The version comes first: a file of another version may have other fields.
+        let RunFileVersion { schema_version } = serde_json::from_str(&text).map_err(malformed)?;
+        if schema_version != SCHEMA_VERSION {
             return Err(RunFileError::Version {
                 path: path.into(),
-                found: run.schema_version,
+                found: schema_version,
+            });
+        }
+        let run: Self = serde_json::from_str(&text).map_err(malformed)?;
+        if let Some((stage, map)) = run.config.curriculum.unknown_map() {
+            return Err(RunFileError::UnknownMap {
+                path: path.into(),
+                stage,
+                map: map.to_owned(),
             });
         }
         Ok(run)
+    }
+
+    /// The run file's text.
+    ///
+    /// # Errors
+    /// A path in it is not UTF-8.
+    pub fn to_json(&self) -> Result<String, serde_json::Error> {
+        serde_json::to_string_pretty(&WrittenRun {
+            run: self,
+            observation_fields: run_fields(&self.config, &self.map),
+        })
     }
 
     /// Writes the run file to `run_dir/run.json` and returns its path.
@@ -256,11 +291,7 @@ impl RunFile {
     /// The run directory is not writable.
     pub fn write(&self) -> Result<PathBuf, RunFileError> {
         let path = self.run_dir.join("run.json");
-        let written = WrittenRun {
-            run: self,
-            observation_fields: run_fields(&self.config, &self.map),
-        };
-        let text = serde_json::to_string_pretty(&written).map_err(|source| RunFileError::Format {
+        let text = self.to_json().map_err(|source| RunFileError::Format {
             path: path.clone(),
             source,
         })?;

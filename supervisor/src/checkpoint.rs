@@ -9,7 +9,7 @@ use ipc_schema::{
     config::{Activation, Config, Network},
     run::{Beginning, RunFile, Start},
 };
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 
 use crate::{failure::Exit, install::Install};
 
@@ -27,9 +27,7 @@ struct CheckpointManifest {
 struct CheckpointCounters {
     /// The last committed tick; -1 before the first commit.
     committed_tick: i64,
-    #[serde(default)]
     next_episode: u64,
-    #[serde(default)]
     next_episode_tick: u64,
 }
 
@@ -45,20 +43,22 @@ impl CheckpointCounters {
     }
 }
 
-/// A value as a configuration file writes it.
-fn as_configured(choice: impl Serialize) -> String {
-    serde_json::to_string(&choice).unwrap_or_default()
-}
-
-/// The answer of `caraware.run.manifest`: a checkpoint, or the reason why there is none.
+/// The answer of `caraware.run.manifest`.
 #[derive(Debug, Deserialize)]
-struct VerifierAnswer {
-    checkpoint: Option<PathBuf>,
-    manifest: Option<CheckpointManifest>,
-    /// Counters of the environments after the first.
-    #[serde(default)]
-    others: Vec<CheckpointCounters>,
-    refused: Option<String>,
+#[serde(untagged)]
+enum VerifierAnswer {
+    /// A verified checkpoint.
+    Sound {
+        checkpoint: PathBuf,
+        manifest: CheckpointManifest,
+        /// Counters of the environments after the first.
+        others: Vec<CheckpointCounters>,
+    },
+    /// No checkpoint is usable.
+    Refused {
+        /// The reason.
+        refused: String,
+    },
 }
 
 /// A verified checkpoint: every byte is as the trainer wrote it.
@@ -107,11 +107,18 @@ impl FoundCheckpoint {
         })?;
         // The verifier warns of each damaged checkpoint that it skips.
         eprint!("{warnings}");
-        let (Some(checkpoint), Some(manifest)) = (answer.checkpoint, answer.manifest) else {
-            return Err(Exit::run(
-                format!("checkpoint refused: {}", answer.refused.unwrap_or_default()),
-                "name another checkpoint of the run, e.g. runs/NAME/checkpoints/update-000100",
-            ));
+        let (checkpoint, manifest, others) = match answer {
+            VerifierAnswer::Sound {
+                checkpoint,
+                manifest,
+                others,
+            } => (checkpoint, manifest, others),
+            VerifierAnswer::Refused { refused } => {
+                return Err(Exit::run(
+                    format!("checkpoint refused: {refused}"),
+                    "name another checkpoint of the run, e.g. runs/NAME/checkpoints/update-000100",
+                ));
+            }
         };
         let run_dir = checkpoint.ancestors().nth(2).unwrap_or(&checkpoint).to_owned();
         Ok(Self {
@@ -119,7 +126,7 @@ impl FoundCheckpoint {
             is_run,
             run_dir,
             manifest,
-            others: answer.others,
+            others,
         })
     }
 
@@ -167,15 +174,15 @@ impl FoundCheckpoint {
         if self.manifest.network != config.trainer.network {
             let (has, wants) = (&self.manifest.network, &config.trainer.network);
             let help = "set trainer.network as in the run that learnt it";
-            return refuse("network is", as_configured(has), as_configured(wants), help);
+            return refuse("network is", format!("\"{has}\""), format!("\"{wants}\""), help);
         }
         if self.manifest.activation != config.trainer.activation {
-            let (has, wants) = (self.manifest.activation, config.trainer.activation);
+            let [has, wants] = [self.manifest.activation, config.trainer.activation].map(Activation::name);
             let help = "set trainer.activation as in the run that learnt it";
             return refuse(
                 "network has the activation",
-                as_configured(has),
-                as_configured(wants),
+                format!("\"{has}\""),
+                format!("\"{wants}\""),
                 help,
             );
         }

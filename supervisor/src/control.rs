@@ -151,7 +151,9 @@ pub fn control(args: &ControlArgs) -> Result<(), Exit> {
     let run = registry::find(args.run.as_deref())?;
     let request = SupervisorRequest::Control {
         env: args.env,
-        request: command.to_json(),
+        request: command
+            .to_json()
+            .map_err(|error| Exit::run(format!("the command has no form in JSON: {error}"), ""))?,
     };
     match socket::send_request(&run, &request)? {
         Reply::Done(done) => {

@@ -114,11 +114,16 @@ fn check_installation(checks: &mut DoctorChecks, install: &Install) {
 /// Asks the dynamic linker whether every library that libsumo needs is installed.
 fn check_libraries(checks: &mut DoctorChecks, install: &Install) {
     let library = install.sumo_home.join("lib64/libsumocpp.so");
-    let listing = Command::new("ldd")
-        .arg(&library)
-        .output()
-        .map(|output| String::from_utf8_lossy(&output.stdout).into_owned())
-        .unwrap_or_default();
+    let listing = match Command::new("ldd").arg(&library).output() {
+        Ok(output) => String::from_utf8_lossy(&output.stdout).into_owned(),
+        Err(error) => {
+            let unknown = (
+                format!("ldd cannot be started: {error}"),
+                "apt-get install libc-bin".into(),
+            );
+            return checks.say(Err(unknown), "libraries for SUMO");
+        }
+    };
     for (name, package) in LIBRARIES {
         let absent = listing
             .lines()

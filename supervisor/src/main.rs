@@ -63,13 +63,13 @@ fn run(prepared: PreparedRun) -> Result<(), Exit> {
     };
     // Whatever ended the run, its report says so.
     let written = report::write(&run, &outcome);
-    if let Ok((report, path)) = &written
+    if let Ok(report) = &written
         && !quiet
     {
-        display::print(&report::summary(report, path));
+        display::print(&report.summary());
     }
     match outcome.ending {
-        RunEnding::Completed => written.map(drop),
+        RunEnding::Completed => written?.check_complete(),
         RunEnding::Interrupted => Err(Exit::Interrupted),
         RunEnding::Failed(exit) => Err(exit),
     }

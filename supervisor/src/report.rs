@@ -20,9 +20,8 @@ use crate::{
 /// smoother, which also uses later samples, and the policy's network trained by regression.
 const ESTIMATORS: [&str; 5] = ["ppo", "raw_gnss", "ekf", "rts", "supervised"];
 
-/// The part of the report that `sensor-daemon` writes at its end.
+/// The part of the report that `sensor-daemon` writes at its end; all zero if `sensor-daemon` was ended before.
 #[derive(Debug, Clone, Deserialize, Default)]
-#[serde(default)]
 struct Sensing {
     observation_hash: String,
     /// The first tick that the hash covers.
@@ -34,8 +33,25 @@ struct Sensing {
     journal_mib: u64,
     handovers: Vec<HandoverMeasurement>,
     cavs_max: u64,
+    // Written as null where there is none: a part without the key is not the daemon's.
+    #[serde(deserialize_with = "Option::deserialize")]
     raw_gnss_mean_error_m: Option<f64>,
+    #[serde(deserialize_with = "Option::deserialize")]
     lidar: Option<Value>,
+}
+
+/// The part of the trainer's report that the run's report repeats; a module of the user's may leave out any of it.
+#[derive(Debug, Deserialize, Default)]
+struct TrainerFigures {
+    env_steps: Option<u64>,
+    lost_ticks: Option<u64>,
+    duplicated_ticks: Option<u64>,
+    evaluation_seeds: Option<u64>,
+    policy_std: Option<f64>,
+    raw_gnss_mean_error_m: Option<f64>,
+    /// Means and intervals of the estimators, and everything else.
+    #[serde(flatten)]
+    others: Map<String, Value>,
 }
 
 impl Sensing {
@@ -48,7 +64,9 @@ impl Sensing {
             Some((one.observations as f64, one.observations as f64 * mean_m))
         });
         let (samples, error_m) = errors_m.fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
-        let first = environments.first().cloned().unwrap_or_default();
+        let Some(first) = environments.first() else {
+            return Self::default();
+        };
         Self {
             observations: sum(|one| one.observations),
             ticks: sum(|one| one.ticks),
@@ -57,13 +75,13 @@ impl Sensing {
             journal_mib: sum(|one| one.journal_mib),
             cavs_max: sum(|one| one.cavs_max),
             raw_gnss_mean_error_m: (samples > 0.0).then(|| error_m / samples),
-            ..first
+            ..first.clone()
         }
     }
 }
 
 /// The results of one environment.
-fn environment_report(run: &RunFile, sensing: &Sensing) -> Value {
+fn environment_report(run: &RunFile, sensing: &Sensing, dynamics: Option<Value>) -> Value {
     json!({
         "environment": run.env_index,
         "seed": run.seed(),
@@ -74,14 +92,36 @@ fn environment_report(run: &RunFile, sensing: &Sensing) -> Value {
         "raw_gnss_mean_error_m": sensing.raw_gnss_mean_error_m,
         "drops": sensing.drops,
         "redelivered_ticks": sensing.redelivered_ticks,
-        "dynamics": read_part(run, "sim-core").unwrap_or(Value::Null),
+        "dynamics": dynamics,
         "lidar": sensing.lidar,
     })
 }
 
-/// Reads the part of the report that a process of an environment wrote at its end.
-fn read_part<T: serde::de::DeserializeOwned>(run: &RunFile, process: &str) -> Option<T> {
-    read(&run.run_dir.join("parts").join(format!("{process}.json")))
+/// Reads the parts of the report that the processes wrote at their ends, and keeps the errors.
+#[derive(Debug, Default)]
+struct PartReader {
+    /// Files that cannot be read, each with the reason.
+    unreadable: Vec<String>,
+}
+
+impl PartReader {
+    /// Reads the part of a process of an environment; `None` if the process was ended before it wrote its part, or if the part is unreadable.
+    fn read<T: serde::de::DeserializeOwned>(&mut self, run_dir: &Path, process: Process) -> Option<T> {
+        let path = run_dir.join("parts").join(format!("{process}.json"));
+        let reason = match std::fs::read_to_string(&path) {
+            Ok(text) => match serde_json::from_str(&text) {
+                Ok(part) => return Some(part),
+                Err(error) => error.to_string(),
+            },
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return None,
+            Err(error) => error.to_string(),
+        };
+        let entry = format!("{}: {reason}", path.display());
+        if !self.unreadable.contains(&entry) {
+            self.unreadable.push(entry);
+        }
+        None
+    }
 }
 
 /// A planned handover as `sensor-daemon` measured it.
@@ -128,46 +168,50 @@ fn newest_checkpoint(run: &RunFile) -> Option<PathBuf> {
     Some(folder.join(name.trim()))
 }
 
-/// Assembles the report, writes it, and returns it with its path.
+/// Assembles the report and writes it.
 ///
 /// # Errors
 /// The run directory is not writable.
-pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<(Value, PathBuf), Exit> {
+pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<WrittenReport, Exit> {
     let runs: Vec<RunFile> = (0..run.config.run.envs).map(|index| run.environment(index)).collect();
+    let mut parts = PartReader::default();
     let sensings: Vec<Sensing> = runs
         .iter()
-        .map(|run| read_part(run, "sensor-daemon").unwrap_or_default())
+        .map(|run| parts.read(&run.run_dir, Process::SensorDaemon).unwrap_or_default())
         .collect();
     let environments: Vec<Value> = runs
         .iter()
         .zip(&sensings)
-        .map(|(run, sensing)| environment_report(run, sensing))
+        .map(|(run, sensing)| environment_report(run, sensing, parts.read(&run.run_dir, Process::SimCore)))
         .collect();
     let sensing = Sensing::total(&sensings);
-    let training: Map<String, Value> = read_part(run, "trainer").unwrap_or_default();
-    let dynamics: Map<String, Value> = read_part(run, "sim-core").unwrap_or_default();
+    let trainer: TrainerFigures = parts.read(&run.run_dir, Process::Trainer).unwrap_or_default();
     let metric = metric::headline(run.config.task.kind);
-    let learned = |key: &str| training.get(key).cloned().unwrap_or(Value::Null);
     let env_steps = match run.mode {
-        Mode::Train => learned("env_steps").as_u64().unwrap_or(0),
-        Mode::Simulate | Mode::Play => sensing.observations,
+        Mode::Train => trainer.env_steps,
+        Mode::Simulate | Mode::Play => Some(sensing.observations),
     };
-    let raw = match run.mode {
-        Mode::Train | Mode::Play => learned("raw_gnss_mean_error_m"),
-        Mode::Simulate => json!(sensing.raw_gnss_mean_error_m),
+    let raw_m = match run.mode {
+        Mode::Train | Mode::Play => trainer.raw_gnss_mean_error_m,
+        Mode::Simulate => sensing.raw_gnss_mean_error_m,
+    };
+    // Without a trainer there is none that could lose a tick.
+    let [lost_ticks, duplicated_ticks] = match run.mode {
+        Mode::Train | Mode::Play => [trainer.lost_ticks, trainer.duplicated_ticks],
+        Mode::Simulate => [Some(0); 2],
     };
     #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
     let (rate, simulated_s) = (
-        env_steps as f64 / outcome.wall_s,
+        env_steps.map(|steps| steps as f64 / outcome.wall_s),
         sensing.ticks as f64 * run.config.run.tick_s,
     );
-    let used: Map<String, Value> = Process::ALL
-        .into_iter()
-        .filter_map(|process| {
-            let part: Value = read_part(run, process.name())?;
-            Some((process.name().to_owned(), part.get("process")?.clone()))
-        })
-        .collect();
+    let mut used = Map::new();
+    for process in Process::ALL {
+        let part: Option<Value> = parts.read(&run.run_dir, process);
+        if let Some(usage) = part.as_ref().and_then(|part| part.get("process")) {
+            used.insert(process.name().to_owned(), usage.clone());
+        }
+    }
     let mut report = json!({
         "name": run.name,
         "mode": run.mode,
@@ -181,15 +225,15 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<(Value, PathBuf), Ex
         "env_steps": env_steps,
         "wall_s": outcome.wall_s,
         "env_steps_per_s": rate,
-        "raw_gnss_mean_error_m": raw,
+        "raw_gnss_mean_error_m": raw_m,
         "metric": metric.name,
-        "evaluation_seeds": learned("evaluation_seeds"),
-        "policy_std": learned("policy_std"),
+        "evaluation_seeds": trainer.evaluation_seeds,
+        "policy_std": trainer.policy_std,
         "vehicles": sensing.cavs_max,
         "observation_hash": sensing.observation_hash,
         "first_tick": sensing.first_tick,
-        "lost_ticks": training.get("lost_ticks").cloned().unwrap_or(json!(0)),
-        "duplicated_ticks": training.get("duplicated_ticks").cloned().unwrap_or(json!(0)),
+        "lost_ticks": lost_ticks,
+        "duplicated_ticks": duplicated_ticks,
         "drops": sensing.drops,
         "restarts": outcome.restarts,
         "handovers": handovers(outcome, &sensing, outcome.wall_s / sensing.ticks.max(1) as f64),
@@ -202,29 +246,59 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<(Value, PathBuf), Ex
         "beginning": run.beginning,
         "seed": run.seed(),
         "config_hash": run.config_hash,
-        "trainer": training,
-        "dynamics": dynamics,
+        "trainer": parts.read::<Map<_, _>>(&run.run_dir, Process::Trainer).unwrap_or_default(),
+        "dynamics": parts.read::<Map<_, _>>(&run.run_dir, Process::SimCore).unwrap_or_default(),
         "lidar": sensing.lidar,
         "environments": environments,
-        "traffic": read_part::<Value>(run, "traffic-bridge"),
+        "traffic": parts.read::<Value>(&run.run_dir, Process::TrafficBridge),
         "processes": used,
     });
     // The task's metric of every estimator, where `report` does not have it yet.
     for estimator in ESTIMATORS {
         for key in [metric.mean_key(estimator), metric.interval_key(estimator)] {
             if report[&key].is_null() {
-                report[&key] = learned(&key);
+                report[&key] = json!(trainer.others.get(&key));
             }
         }
     }
     let path = run.run_dir.join("report.json");
-    let text = serde_json::to_string_pretty(&report).unwrap_or_default();
-    std::fs::write(&path, text + "\n").map_err(|error| Exit::io("write", &path, &error))?;
-    Ok((report, path))
+    std::fs::write(&path, format!("{report:#}\n")).map_err(|error| Exit::io("write", &path, &error))?;
+    Ok(WrittenReport {
+        report,
+        path,
+        unreadable: parts.unreadable,
+    })
 }
 
-fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Option<T> {
-    serde_json::from_str(&std::fs::read_to_string(path).ok()?).ok()
+/// The report as it was written.
+#[derive(Debug)]
+pub struct WrittenReport {
+    report: Value,
+    path: PathBuf,
+    /// Parts that cannot be read, each with the reason: the report lacks them.
+    unreadable: Vec<String>,
+}
+
+impl WrittenReport {
+    /// The report in a few lines for the terminal.
+    #[must_use]
+    pub fn summary(&self) -> String {
+        summary(&self.report, &self.path)
+    }
+
+    /// Checks that the report has every part that a process wrote.
+    ///
+    /// # Errors
+    /// A part cannot be read.
+    pub fn check_complete(&self) -> Result<(), Exit> {
+        match self.unreadable.as_slice() {
+            [] => Ok(()),
+            parts => Err(Exit::run(
+                format!("the report lacks what cannot be read: {}", parts.join("; ")),
+                "a trainer of your own must write its part as JSON, which has no NaN, with counts as whole numbers",
+            )),
+        }
+    }
 }
 
 /// The observation hash; with several environments a line for each with its hash.
@@ -251,8 +325,7 @@ fn hashes(report: &Value) -> Vec<String> {
 }
 
 /// The most important figures of the report, for the terminal.
-#[must_use]
-pub fn summary(report: &Value, path: &Path) -> String {
+fn summary(report: &Value, path: &Path) -> String {
     let mut lines = vec![format!(
         "{} {}: {} vehicle-steps in {} s ({} per second, {} × real time)",
         report["name"].as_str().unwrap_or_default(),
@@ -284,7 +357,10 @@ pub fn summary(report: &Value, path: &Path) -> String {
     }
     lines.push(format!(
         "ticks lost {}, duplicated {}; restarts {}; messages that watchers missed {}",
-        report["lost_ticks"], report["duplicated_ticks"], report["restarts"], report["drops"]
+        number(report, "lost_ticks", 0),
+        number(report, "duplicated_ticks", 0),
+        report["restarts"],
+        report["drops"]
     ));
     lines.extend(hashes(report));
     lines.push(format!("report: {}", path.display()));
@@ -342,4 +418,49 @@ fn errors(report: &Value) -> Vec<String> {
         lines.push(line);
     }
     lines
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_part_that_cannot_be_read_is_named_and_one_that_is_not_there_is_none() {
+        let run_dir = tempfile::tempdir().unwrap();
+        let write = |process: Process, part: &Value| {
+            let path = run_dir.path().join("parts").join(format!("{process}.json"));
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, part.to_string()).unwrap();
+        };
+        let mut sensing = json!({
+            "observation_hash": "ab", "observations": 3, "ticks": 2, "drops": 0, "redelivered_ticks": 0, "journal_mib": 1,
+            "handovers": [], "cavs_max": 2, "raw_gnss_mean_error_m": null, "lidar": null, "process": {},
+        });
+        let mut parts = PartReader::default();
+        let read = |parts: &mut PartReader| parts.read::<Sensing>(run_dir.path(), Process::SensorDaemon);
+        assert!(
+            read(&mut parts).is_none() && parts.unreadable.is_empty(),
+            "it was not written"
+        );
+        write(Process::SensorDaemon, &sensing);
+        assert_eq!(read(&mut parts).unwrap().observations, 3);
+        for key in ["observations", "lidar"] {
+            let value = sensing.as_object_mut().unwrap().remove(key).unwrap();
+            sensing["misspelt"] = value.clone();
+            write(Process::SensorDaemon, &sensing);
+            assert!(read(&mut parts).is_none());
+            assert!(parts.unreadable.last().unwrap().contains(key), "{:?}", parts.unreadable);
+            sensing[key] = value;
+        }
+        write(Process::Trainer, &json!({ "env_steps": "many" }));
+        let trainer = parts.read::<TrainerFigures>(run_dir.path(), Process::Trainer);
+        assert!(trainer.is_none() && parts.unreadable.last().unwrap().contains("trainer.json"));
+        write(Process::Trainer, &json!({ "ppo_mean_error_m": 1.5 }));
+        let trainer: TrainerFigures = parts.read(run_dir.path(), Process::Trainer).unwrap();
+        assert_eq!(
+            (trainer.env_steps, &trainer.others["ppo_mean_error_m"]),
+            (None, &json!(1.5))
+        );
+    }
 }

@@ -108,10 +108,10 @@ pub fn resume_in_place(
     }
     // The run gets a new part of shared memory, and its directory the new configuration.
     let claim = RunClaim::new(&old.run_dir)?;
-    let config_hash = config::hash(&config);
+    let config_hash = config::hash(&config)?;
     let path = old.run_dir.join("config.toml");
-    std::fs::write(&path, format!("# BLAKE3 {config_hash}\n{}", config::to_toml(&config)))
-        .map_err(|error| Exit::io("write", &path, &error))?;
+    let text = format!("# BLAKE3 {config_hash}\n{}", config::to_toml(&config)?);
+    std::fs::write(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
     let run = RunFile {
         schema_version: SCHEMA_VERSION,
         run_id: claim.run_id,
@@ -219,15 +219,16 @@ fn write_commands(path: &Path, actions: &[Action]) -> Result<(), Exit> {
             _ => Ok(()),
         };
     }
-    let lines: String = actions
-        .iter()
-        .filter_map(|action| serde_json::to_string(action).ok())
-        .map(|line| line + "\n")
-        .collect();
+    let failed = |error: std::io::Error| Exit::io("write", path, &error);
+    let mut lines = String::new();
+    for action in actions {
+        lines += &serde_json::to_string(action).map_err(|error| failed(error.into()))?;
+        lines += "\n";
+    }
     let directory = path.parent().unwrap_or(path);
     std::fs::create_dir_all(directory)
         .and_then(|()| std::fs::write(path, lines))
-        .map_err(|error| Exit::io("write", path, &error))
+        .map_err(failed)
 }
 
 /// The files that the run's traffic comes from.

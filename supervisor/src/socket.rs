@@ -85,8 +85,8 @@ pub struct ReplySocket(UnixStream);
 impl ReplySocket {
     /// Sends the answer; a connection that was closed meanwhile is only logged.
     pub fn answer(mut self, answer: &impl Serialize) {
-        let line = serde_json::to_string(answer).unwrap_or_default();
-        if let Err(error) = writeln!(self.0, "{line}") {
+        let sent = serde_json::to_string(answer).map_err(std::io::Error::from);
+        if let Err(error) = sent.and_then(|line| writeln!(self.0, "{line}")) {
             tracing::warn!(%error, "the connection was closed before the answer to its request");
         }
     }
@@ -106,10 +106,14 @@ pub fn listen(run: &RunFile, take: impl Fn(ReceivedRequest) -> bool + Send + 'st
     let listener = UnixListener::bind(&path).map_err(|error| Exit::io("listen on", &path, &error))?;
     let serve = move || {
         for stream in listener.incoming().flatten() {
-            if let Some(request) = read_request(stream)
-                && !take(request)
-            {
-                return;
+            match read_request(stream) {
+                Ok(Some(request)) => {
+                    if !take(request) {
+                        return;
+                    }
+                }
+                Ok(None) => {}
+                Err(error) => tracing::warn!(%error, "a request cannot be read, and is not answered"),
             }
         }
     };
@@ -120,14 +124,14 @@ pub fn listen(run: &RunFile, take: impl Fn(ReceivedRequest) -> bool + Send + 'st
         .map_err(|error| Exit::run(format!("cannot listen for requests: {error}"), ""))
 }
 
-/// Reads a request. A malformed one is dropped, and a wrong command is refused.
-fn read_request(stream: UnixStream) -> Option<ReceivedRequest> {
-    stream.set_read_timeout(Some(REQUEST_WITHIN)).ok()?;
+/// Reads a request. `None`: the request was a wrong command, which is refused.
+fn read_request(stream: UnixStream) -> std::io::Result<Option<ReceivedRequest>> {
+    stream.set_read_timeout(Some(REQUEST_WITHIN))?;
     let mut text = String::new();
     let mut reader = BufReader::new(stream.take(MAX_REQUEST_BYTES));
-    reader.read_line(&mut text).ok()?;
+    reader.read_line(&mut text)?;
     let socket = ReplySocket(reader.into_inner().into_inner());
-    match serde_json::from_str(&text).ok()? {
+    Ok(match serde_json::from_str(&text)? {
         SupervisorRequest::Handover(request) => Some(ReceivedRequest::Handover(request, socket)),
         SupervisorRequest::Control { env, request } => match Command::from_json(request.as_bytes()) {
             Ok(command) => Some(ReceivedRequest::Control(command, env, socket)),
@@ -136,7 +140,7 @@ fn read_request(stream: UnixStream) -> Option<ReceivedRequest> {
                 None
             }
         },
-    }
+    })
 }
 
 /// Sends a request to the supervisor of `run` and waits for its answer.
@@ -147,7 +151,8 @@ pub fn send_request<Answer: DeserializeOwned>(run: &RunFile, request: &Superviso
     let socket = run.control_socket();
     let failed = |error: &std::io::Error| Exit::io("ask the supervisor through", &socket, error);
     let mut stream = UnixStream::connect(&socket).map_err(|error| failed(&error))?;
-    writeln!(stream, "{}", serde_json::to_string(request).unwrap_or_default()).map_err(|error| failed(&error))?;
+    let text = serde_json::to_string(request).map_err(|error| failed(&error.into()))?;
+    writeln!(stream, "{text}").map_err(|error| failed(&error))?;
     let mut line = String::new();
     BufReader::new(stream)
         .read_line(&mut line)

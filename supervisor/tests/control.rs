@@ -301,7 +301,7 @@ fn wrong_requests_are_refused_with_their_reasons_and_the_run_continues() {
         }
     };
     assert_eq!(refusal("no json").kind, RefusalKind::Malformed);
-    let pause = Command::Pause {}.to_json();
+    let pause = Command::Pause {}.to_json().unwrap();
     assert_eq!(
         refusal(&pause.replace("schema_version\":", "schema_version\":9")).kind,
         RefusalKind::Schema

@@ -103,7 +103,7 @@ fn pass_commands(queries: &Receiver<Query>, env_index: u32, socket: &PathBuf, re
 fn ask_supervisor(socket: &PathBuf, env_index: u32, command: &Command) -> std::io::Result<Reply> {
     let mut stream = UnixStream::connect(socket)?;
     stream.set_read_timeout(Some(ANSWER_WITHIN))?;
-    let request = serde_json::json!({ "control": { "env": env_index, "request": command.to_json() } });
+    let request = serde_json::json!({ "control": { "env": env_index, "request": command.to_json()? } });
     writeln!(stream, "{request}")?;
     let mut line = String::new();
     BufReader::new(stream.take(MAX_ANSWER_BYTES)).read_line(&mut line)?;

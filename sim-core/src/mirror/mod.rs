@@ -25,9 +25,10 @@ pub mod statistics;
 pub mod tracking;
 
 use crate::models::{
-    catalogue::{ModelCatalogue, ModelCatalogueError, MotionModel},
+    catalogue::{ModelCatalogue, MotionModel},
     dynamic::DynamicParams,
     kinematic::KinematicParams,
+    parameters::ParameterError,
     state::ControlInput,
 };
 use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch};
@@ -113,7 +114,7 @@ impl Mirror {
     ///
     /// # Errors
     /// A class is given a model that does not exist.
-    pub fn new(settings: MirrorSettings) -> Result<Self, ModelCatalogueError> {
+    pub fn new(settings: MirrorSettings) -> Result<Self, ParameterError> {
         let sub_steps = settings.sub_steps as usize;
         Ok(Self {
             catalogue: settings.catalogue()?,
@@ -410,11 +411,10 @@ impl<P: BatchModel<N>, const N: usize> ModelBatch<P, N> {
         states: &mut [VehicleState],
         rows: &mut [SubStep],
     ) {
-        if self.loaded.is_empty() {
+        let Some(&(place, row)) = self.loaded.last() else {
             return;
-        }
+        };
         let per_tick = context.settings.sub_steps as usize;
-        let (place, row) = self.loaded.last().copied().unwrap_or_default();
         let next = (
             PrefetchRange::new(context.slab, place as usize + 1, BATCH),
             PrefetchRange::new(rows, (row + 1) * per_tick, BATCH * per_tick),

@@ -188,7 +188,7 @@ fn start_successor(
 ) -> Result<(RunFile, PathBuf, RunningProcess), Exit> {
     let config = changed_config(processes.run(), &request.set)?;
     let run = RunFile {
-        config_hash: config::hash(&config),
+        config_hash: config::hash(&config)?,
         config,
         ..processes.run().clone()
     };

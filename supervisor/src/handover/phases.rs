@@ -166,8 +166,9 @@ impl HandoverInProgress {
 pub fn write_run(run: &RunFile, name: &str) -> Result<PathBuf, Exit> {
     let path = run.run_dir.join(name);
     let partial = run.run_dir.join(format!(".{name}.partial"));
-    let text = serde_json::to_string_pretty(run).unwrap_or_default();
-    std::fs::write(&partial, text)
+    run.to_json()
+        .map_err(std::io::Error::from)
+        .and_then(|text| std::fs::write(&partial, text))
         .and_then(|()| std::fs::rename(&partial, &path))
         .map_err(|error| Exit::io("write", &path, &error))?;
     Ok(path)

@@ -72,16 +72,26 @@ fn weighted_type(simulation: &ffi::Simulation, id: String, weight: f64) -> Resul
 
 /// Types of one additional file with their weights. A type without probability counts 1.
 fn listed_in(file: &Path) -> Result<Vec<(String, f64)>, SumoError> {
-    let mut listed = Vec::new();
+    let (mut listed, mut wrong) = (Vec::new(), None);
     for_each_element(file, |element| {
         if element.name().as_ref() == "vType"
             && let Some(id) = attribute(element, "id")
         {
-            let weight = attribute(element, "probability").and_then(|text| text.trim().parse().ok());
-            listed.push((id, weight.unwrap_or(1.0)));
+            let probability = attribute(element, "probability").unwrap_or_else(|| "1".into());
+            match probability.trim().parse() {
+                Ok(weight) => listed.push((id, weight)),
+                Err(_) => wrong = Some((format!("the probability of vehicle type \"{id}\","), probability)),
+            }
         }
     })?;
-    Ok(listed)
+    match wrong {
+        None => Ok(listed),
+        Some((what, value)) => Err(SumoError::NoNumber {
+            path: file.into(),
+            what,
+            value,
+        }),
+    }
 }
 
 /// Draws an entry by weight. `entries` is not empty.
@@ -119,6 +129,22 @@ pub fn below(count: usize, rng: &mut ChaCha8Rng) -> usize {
 mod tests {
     use super::*;
     use rand_chacha::rand_core::SeedableRng;
+
+    #[test]
+    fn a_probability_that_is_no_number_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("types.add.xml");
+        let types =
+            |probability: &str| format!("<additional><vType id=\"a\"/><vType id=\"b\" {probability}/></additional>");
+        std::fs::write(&file, types("probability=\"0.5\"")).unwrap();
+        assert_eq!(
+            listed_in(&file).unwrap(),
+            [("a".to_owned(), 1.0), ("b".to_owned(), 0.5)]
+        );
+        std::fs::write(&file, types("probability=\"often\"")).unwrap();
+        let error = listed_in(&file).unwrap_err();
+        assert!(matches!(error, SumoError::NoNumber { .. }), "{error}");
+    }
 
     #[test]
     fn draws_follow_the_weights() {

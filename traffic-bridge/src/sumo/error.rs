@@ -35,6 +35,16 @@ pub enum SumoError {
         /// Why.
         reason: String,
     },
+    /// A value in a file is no number.
+    #[error("{path}: {what} \"{value}\" is no number")]
+    NoNumber {
+        /// The file.
+        path: PathBuf,
+        /// What the value is of.
+        what: String,
+        /// The value.
+        value: String,
+    },
     /// SUMO refused its input.
     #[error("SUMO refused {place}: {reason}")]
     Refused {
@@ -101,6 +111,7 @@ impl SumoError {
             Self::Missing { .. }
             | Self::Unreadable { .. }
             | Self::Malformed { .. }
+            | Self::NoNumber { .. }
             | Self::Refused { .. }
             | Self::Step { .. }
             | Self::NoRoads { .. }
@@ -112,7 +123,9 @@ impl SumoError {
         match self {
             Self::Missing { .. } => "check the path; paths in a .sumocfg are relative to it",
             Self::Unreadable { .. } => "check the permissions of the file",
-            Self::Malformed { .. } => "repair the file; SUMO's own `sumo` must be able to run it",
+            Self::Malformed { .. } | Self::NoNumber { .. } => {
+                "repair the file; SUMO's own `sumo` must be able to run it"
+            }
             Self::Refused { .. } | Self::Step { .. } => {
                 "correct the file; `sumo` on the same input gives the same message, `netedit` shows the net's edges"
             }

@@ -102,7 +102,7 @@ impl ScenarioFile {
     /// Reads `sumocfg`.
     ///
     /// # Errors
-    /// Missing, unreadable or malformed.
+    /// Missing, unreadable or malformed, or step or seed are no numbers.
     pub fn read(sumocfg: &Path) -> Result<Self, SumoError> {
         let folder = sumocfg.parent().unwrap_or(Path::new(""));
         let mut scenario = Self {
@@ -113,6 +113,7 @@ impl ScenarioFile {
             step_s: DEFAULT_STEP_S,
             seed: DEFAULT_SEED,
         };
+        let mut wrong = None;
         for_each_element(sumocfg, |element| {
             let Some(value) = attribute(element, "value") else {
                 return;
@@ -122,12 +123,25 @@ impl ScenarioFile {
                     let files = value.split([',', ' ']).filter(|name| !name.is_empty());
                     scenario.files.others.extend(files.map(|name| folder.join(name)));
                 }
-                "step-length" => scenario.step_s = value.trim().parse().unwrap_or(DEFAULT_STEP_S),
-                "seed" => scenario.seed = value.trim().parse().unwrap_or(DEFAULT_SEED),
+                "step-length" => match value.trim().parse() {
+                    Ok(step_s) => scenario.step_s = step_s,
+                    Err(_) => wrong = Some(("step-length", value)),
+                },
+                "seed" => match value.trim().parse() {
+                    Ok(seed) => scenario.seed = seed,
+                    Err(_) => wrong = Some(("seed", value)),
+                },
                 _ => {}
             }
         })?;
-        Ok(scenario)
+        match wrong {
+            None => Ok(scenario),
+            Some((what, value)) => Err(SumoError::NoNumber {
+                path: sumocfg.into(),
+                what: what.into(),
+                value,
+            }),
+        }
     }
 }
 
@@ -196,6 +210,19 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = write(folder.path(), "x.sumocfg", "<configuration><input></configuration>");
         assert!(matches!(ScenarioFile::read(&path), Err(SumoError::Malformed { .. })));
+    }
+
+    #[test]
+    fn a_step_that_is_no_number_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = "<configuration><time><step-length value=\"short\"/></time></configuration>";
+        let error = ScenarioFile::read(&write(folder.path(), "x.sumocfg", text)).unwrap_err();
+        assert!(
+            error
+                .to_string()
+                .ends_with("x.sumocfg: step-length \"short\" is no number"),
+            "{error}"
+        );
     }
 
     #[test]
