@@ -32,7 +32,7 @@ struct ScaleCase {
     bare: ProcessCost,
     ours: OurRun,
     stages: StageTimes,
-    /// Most memory of the three processes that hold vehicles, KiB for each vehicle; shared memory counts in each that touches it.
+    /// Peak memory of the three processes that hold vehicles, KiB for each vehicle. Shared memory counts in every process that uses it.
     memory_kib: f64,
 }
 
@@ -42,7 +42,6 @@ impl ScaleCase {
         let ours = scenario.ours()?;
         compare_results(&results, &ours.results)?;
         let stages = StageTimes::of(&ours)?;
-        // Shared memory counts in every process that uses it.
         let mut mib = 0.0;
         for process in ["traffic-bridge", "sim-core", "sensor-daemon"] {
             mib += ours.number(&format!("/processes/{process}/peak_memory_mib"))?;

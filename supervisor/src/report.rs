@@ -33,7 +33,7 @@ struct Sensing {
     journal_mib: u64,
     handovers: Vec<HandoverMeasurement>,
     cavs_max: u64,
-    // Written as null where there is none: a part without the key is not the daemon's.
+    // `sensor-daemon` writes null for a missing value, and always writes the key.
     #[serde(deserialize_with = "Option::deserialize")]
     raw_gnss_mean_error_m: Option<f64>,
     #[serde(deserialize_with = "Option::deserialize")]
@@ -195,7 +195,7 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<WrittenReport, Exit>
         Mode::Train | Mode::Play => trainer.raw_gnss_mean_error_m,
         Mode::Simulate => sensing.raw_gnss_mean_error_m,
     };
-    // Without a trainer there is none that could lose a tick.
+    // Without a trainer, no tick is lost.
     let [lost_ticks, duplicated_ticks] = match run.mode {
         Mode::Train | Mode::Play => [trainer.lost_ticks, trainer.duplicated_ticks],
         Mode::Simulate => [Some(0); 2],
@@ -434,7 +434,7 @@ mod tests {
             std::fs::write(path, part.to_string()).unwrap();
         };
         let mut sensing = json!({
-            "observation_hash": "ab", "observations": 3, "ticks": 2, "drops": 0, "redelivered_ticks": 0, "journal_mib": 1,
+            "observation_hash": "ab", "first_tick": 0, "observations": 3, "ticks": 2, "drops": 0, "redelivered_ticks": 0, "journal_mib": 1,
             "handovers": [], "cavs_max": 2, "raw_gnss_mean_error_m": null, "lidar": null, "process": {},
         });
         let mut parts = PartReader::default();

@@ -23,7 +23,7 @@ def settings(folder: Path, envs: int, first_env: int, world: int, more: dict[str
     sizes = {"ranks": world, "horizon": envs * HORIZON, "batch_size": envs * BATCH}
     own = sizes | {"checkpoint_interval": 1, "device": DEVICE} | (SETTINGS if more is None else more)
     run = run_file(str(folder), **own)
-    run["config"]["run"] = {"envs": envs, "first_env": first_env, "seed": 1}
+    run["config"]["run"] |= {"envs": envs, "first_env": first_env}
     return run
 
 

@@ -166,12 +166,25 @@ def run_file(run_dir: str, **trainer: object) -> dict[str, Any]:
         "hidden": [32, 16],
         "horizon": 256,
         "batch_size": 64,
-        "seed": 1,
     }
-    section = dict.fromkeys(OPTIONAL_KEYS) | PRESET["trainer"] | small | {"checkpoint_interval": 10}
-    bounds = [0.0, 0.0, SIZE_M, SIZE_M]
-    config = {"task": {"kind": "localisation"}, "trainer": section | trainer}
-    return {"run_dir": run_dir, "config": config, "map": {"bounds_m": bounds}}
+    section = dict.fromkeys(OPTIONAL_KEYS) | PRESET["trainer"] | small | {"checkpoint_interval": 10} | trainer
+    config = {
+        "run": PRESET["run"] | {"seed": section.pop("seed", 1)},
+        "episode": PRESET["episode"] | {"training_episodes": 1, "evaluation_interval": 0},
+        **{table: dict(PRESET[table]) for table in ("curriculum", "task", "traffic", "blackout")},
+        "trainer": section,
+    }
+    return {
+        "run_dir": run_dir,
+        "config": config,
+        "map": {"bounds_m": [0.0, 0.0, SIZE_M, SIZE_M]},
+        "source": {"population": {}},
+    }
+
+
+def latest_checkpoint(folder: Path) -> Path:
+    """The checkpoint that `folder/latest` names."""
+    return folder / (folder / LATEST).read_text().strip()
 
 
 def latest_checkpoint(folder: Path) -> Path:

@@ -51,7 +51,8 @@ def sensor_tables(**changes: Any) -> dict[str, Any]:
 def vehicle_run(run_dir: str, tables: dict[str, Any] | None = None, **trainer: object) -> dict[str, Any]:
     """A run file with sensors."""
     run = run_file(run_dir, **trainer)
-    run["config"] |= tables or sensor_tables()
+    for name, table in (tables or sensor_tables()).items():
+        run["config"][name] = run["config"].get(name, {}) | table
     return run
 
 

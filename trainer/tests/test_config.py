@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
+from caraware.learn.config import BuiltInNetwork, ConfigError, MapBounds, PythonClass, TrainerConfig
 from caraware.run.config import RunConfig
 from synthetic import run_file
 
@@ -20,10 +20,35 @@ def test_a_missing_key_is_named() -> None:
         TrainerConfig.from_run(run)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("run.envs", "two", "`run.envs` is 'two'"),
+        ("blackout.policy", "dark", "`blackout.policy` is 'dark'"),
+        ("episode.training_episodes", 1.5, "`episode.training_episodes` is 1.5"),
+    ],
+)
+def test_settings_of_the_run_are_never_guessed(key: str, value: object, message: str) -> None:
+    table, _, name = key.partition(".")
+    run = run_file("x")
+    run["config"][table] |= {name: value}
+    with pytest.raises(ConfigError, match=message):
+        RunConfig.from_run(run)
+    del run["config"][table][name]
+    with pytest.raises(ConfigError, match=f"lacks the key `{key}`"):
+        RunConfig.from_run(run)
+
+
+def test_a_network_is_built_in_or_a_class() -> None:
+    networks = [TrainerConfig.from_run(run_file("x", network=name)).network for name in ("gru", "my.nets:Wide")]
+    assert networks == [BuiltInNetwork.GRU, PythonClass("my.nets", "Wide")]
+    assert [str(network) for network in networks] == ["gru", "my.nets:Wide"]
+
+
 def test_progress_counts_training_episodes_alone() -> None:
     run = run_file("x")
     run["run_dir"] = "x"
-    run["config"]["episode"] = {"training_episodes": 6, "evaluation_interval": 2}
+    run["config"]["episode"] |= {"training_episodes": 6, "evaluation_interval": 2}
     config = RunConfig.from_run(run)
     # Two of training, one of evaluation, and so on: t t e t t e t t e.
     trained = [0, 1, 2, 2, 3, 4, 4, 5, 6]
@@ -33,8 +58,7 @@ def test_progress_counts_training_episodes_alone() -> None:
 
 def test_the_seed_of_the_run_is_the_trainer_s() -> None:
     run = run_file("x")
-    del run["config"]["trainer"]["seed"]
-    run["config"]["run"] = {"seed": 7}
+    run["config"]["run"]["seed"] = 7
     assert TrainerConfig.from_run(run).seed == 7
 
 
@@ -45,7 +69,14 @@ def test_the_seed_of_the_run_is_the_trainer_s() -> None:
         ("learning_rate", "fast", "`trainer.learning_rate` is 'fast'"),
         ("horizon", True, "`trainer.horizon` is True"),
         ("hidden", 500, "`trainer.hidden` is 500"),
+        ("hidden", [8, 4.5], "`trainer.hidden` is 4.5"),
         ("algorithm", "ppo", "unknown key `trainer.algorithm`"),
+        ("network", "mlpp", "`trainer.network` is 'mlpp'"),
+        ("activation", "gelu", "`trainer.activation` is 'gelu'"),
+        ("reward", "best", "`trainer.reward` is 'best'"),
+        ("device", "gpu", "`trainer.device` is 'gpu'"),
+        ("matmul_precision", "float16", "`trainer.matmul_precision` is 'float16'"),
+        ("estimates", "sometimes", "`trainer.estimates` is 'sometimes'"),
     ],
 )
 def test_a_wrong_value_names_the_key_and_the_cure(key: str, value: object, message: str) -> None:

@@ -21,14 +21,15 @@ FIELDS = ["gnss_x", "gnss_y", "speed"]
 
 def run_file(run_dir: str, slots: int, *, drives: bool = False, episode_ticks: int = 1000) -> dict[str, Any]:
     """A run file of population control."""
-    observation = {"fields": FIELDS}
+    observation = {"fields": FIELDS, "history": 1, "scale": "minus_one_to_one"}
     config = {
-        "run": {"seed": 5, "tick_s": 0.1},
+        "run": {"seed": 5, "tick_s": 0.1, "window_ticks": 1},
         "task": {"kind": "driving" if drives else "localisation"},
-        "traffic": {"cavs": slots, "heroes": slots, "pedestrians": 0},
+        "traffic": {"cavs": slots, "heroes": slots, "hero_ids": [], "pedestrians": 0},
         "episode": {"ticks": episode_ticks},
         "observation": observation,
-        "gnss": {},
+        "gnss": {"pedestrians": False},
+        "blackout": {"policy": "hold"},
         "trainer": {"reward": "bounded_inverse", "reward_scale_m": 5.0},
     }
     return {

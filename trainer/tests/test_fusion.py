@@ -48,7 +48,6 @@ def street_run(folder: Path, slow_m: float = 0.0, **trainer: object) -> dict[str
     tables = sensor_tables(gnss__correlated_std_m=[slow_m, slow_m, 0.0])
     run = vehicle_run(str(folder), tables, hidden=[16], epochs=4, learning_rate=2e-3, **trainer)
     run["config"]["fusion"] = {"map": True, "segment_ticks": 32, "truncation_ticks": 16}
-    run["config"]["traffic"] = {}
     run["scene_files"] = {"net_file": str(net_file(folder))}
     return run
 

@@ -109,7 +109,6 @@ def test_it_plays(tmp_path: Path) -> None:
     (tmp_path / "play").mkdir()
     written = save_checkpoint(tmp_path / "run" / "checkpoints", ppo, Counters(3, 96, 1, 31), "0", Keeping(1))
     played["beginning"] = {"checkpoint": str(written)}
-    played["config"]["traffic"] = {}
     config = RunConfig.from_run(played)
     learner = Learner.begin(config, size)
     PlayLoop(SyntheticChannel(played, ticks()), config, learner.for_play(), lambda: False).run()
@@ -129,6 +128,5 @@ def test_another_network_s_checkpoint_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["no_such_module:Net", "own_networks:Missing", "mlpx"])
 def test_a_class_that_is_not_there_is_named(name: str) -> None:
-    config = TrainerConfig.from_run(run_file("x", network=name))
     with pytest.raises(ConfigError, match=name.partition(":")[0]):
-        locating_ppo(config, FIELDS, MapBounds(0, 0, 1, 1))
+        locating_ppo(TrainerConfig.from_run(run_file("x", network=name)), FIELDS, MapBounds(0, 0, 1, 1))

@@ -43,7 +43,6 @@ def ticks(first: int = 0, episodes: int = 2) -> Iterator[VehicleObservation]:
 
 def run(folder: Path) -> dict[str, Any]:
     played = vehicle_run(str(folder))
-    played["config"]["traffic"] = {}
     return played
 
 
@@ -114,7 +113,6 @@ def test_a_successor_continues_the_counts_of_the_file(tmp_path: Path) -> None:
 
 def test_a_policy_with_memory_plays_without_that_of_the_checkpoint(tmp_path: Path) -> None:
     played = vehicle_run(str(tmp_path), network="gru")
-    played["config"]["traffic"] = {}
     config, shown = RunConfig.from_run(played), []
     for group in (1, 8):
         channel = SyntheticChannel(played, ticks(), group)

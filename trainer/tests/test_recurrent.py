@@ -382,7 +382,7 @@ def test_environments_remember_apart(tmp_path: Path) -> None:
     found = {}
     for name, groups in (("even", (8, 8)), ("uneven", (1, 13))):
         run = run_file(str(tmp_path / name), network="gru")
-        run["config"]["run"] = {"envs": 2, "first_env": 0, "seed": 1}
+        run["config"]["run"] |= {"envs": 2, "first_env": 0}
         streams = [street_ticks(40, 16, 5.0, seed) for seed in (1, 2)]
         marked = [(replace(obs, last=obs.tick == 39) for obs in ticks) for ticks in streams]
         first, second = (SyntheticChannel(run, ticks, group) for ticks, group in zip(marked, groups, strict=True))

@@ -23,18 +23,13 @@ def test_equation_5_euclidean_distance() -> None:
     ],
 )
 def test_values(name: str, distance_m: float, expected: float) -> None:
-    reward = rewards.by_name(name)(torch.tensor([distance_m]), 5.0)
+    reward = rewards.REWARDS[name](torch.tensor([distance_m]), 5.0)
     assert reward.item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("name", list(rewards.REWARDS))
 def test_closer_is_never_worse_and_the_reward_stays_in_0_1(name: str) -> None:
-    reward = rewards.by_name(name)(torch.linspace(0, 300, 1000), 10.0)
+    reward = rewards.REWARDS[name](torch.linspace(0, 300, 1000), 10.0)
     assert (reward.diff() <= 0).all()
     assert reward.min() > 0
     assert reward.max() <= 1
-
-
-def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(rewards.UnknownReward, match="inverse, bounded_inverse, exponential"):
-        rewards.by_name("best")

@@ -27,21 +27,27 @@ ROWS = 6
 
 def run_of(task: str) -> RunFile:
     """A run file with the keys that tasks and faces read."""
-    observation = {"fields": ["route_left", "route_offset"]}
+    observation = {"fields": ["route_left", "route_offset"], "history": 1, "scale": "minus_one_to_one"}
     config = {
         "run": {"tick_s": 0.1, "window_ticks": 16},
         "task": {"kind": task},
-        "traffic": {"cavs": ROWS, "heroes": ROWS, "pedestrians": 0},
+        "traffic": {"cavs": ROWS, "heroes": ROWS, "hero_ids": [], "pedestrians": 0},
         "episode": {"ticks": 100},
         "observation": observation,
-        "gnss": {},
+        "gnss": {"pedestrians": False},
+        "blackout": {"policy": "hold"},
         "trainer": {"reward": "exponential", "reward_scale_m": 5.0},
     }
     fields = [
         {"name": "route_left", "unit": "m", "range": [0.0, 1000.0]},
         {"name": "route_offset", "unit": "m", "range": [-5.0, 5.0]},
     ]
-    return {"config": config, "map": {"bounds_m": [0.0, -50.0, 200.0, 50.0]}, "observation_fields": fields}
+    return {
+        "config": config,
+        "map": {"bounds_m": [0.0, -50.0, 200.0, 50.0]},
+        "source": {"population": {}},
+        "observation_fields": fields,
+    }
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 
 from caraware.learn.batch import Batch
 from caraware.learn.build import build_ppo
-from caraware.learn.config import MapBounds
+from caraware.learn.config import MapBounds, MatmulPrecision, TrainerDevice
 from caraware.tasks.localisation import Localisation
 from caraware_bench.trainer import (
     EPOCHS,
@@ -44,8 +44,10 @@ def main() -> None:
     """Alternate the two and print medians."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--precision", choices=("float32", "bfloat16", "auto"), default="float32")
-    parser.add_argument("--device", choices=("cpu", "auto"), default="cpu", help="auto: a GPU if there is one")
+    parser.add_argument("--precision", type=MatmulPrecision, choices=MatmulPrecision, default="float32")
+    parser.add_argument(
+        "--device", type=TrainerDevice, choices=TrainerDevice, default="cpu", help="auto: a GPU if there is one"
+    )
     parser.add_argument("--pairs", type=int, default=5)
     options = parser.parse_args()
     config = learner_config(options.threads, options.precision, options.device)

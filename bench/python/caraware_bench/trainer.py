@@ -22,11 +22,20 @@ from torch.distributions import Normal
 from caraware.ipc.arrays import BoolArray, Float32Array, UInt32Array
 from caraware.learn.batch import Batch
 from caraware.learn.build import build_ppo
-from caraware.learn.config import MapBounds, TrainerConfig
+from caraware.learn.config import (
+    BuiltInNetwork,
+    EstimateTimes,
+    HiddenActivation,
+    MapBounds,
+    MatmulPrecision,
+    TrainerConfig,
+    TrainerDevice,
+)
 from caraware.learn.ppo import Ppo
 from caraware.learn.rollout import Rollout
 from caraware.report.evaluation import Mean
 from caraware.tasks.localisation import Localisation, raw_errors_m
+from caraware.tasks.rewards import RewardName
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
@@ -79,7 +88,11 @@ def plain_update(agent: PlainAgent, adam: torch.optim.Adam, batch: Batch) -> Non
             adam.step()
 
 
-def learner_config(threads: int, matmul_precision: str = "float32", device: str = "cpu") -> TrainerConfig:
+def learner_config(
+    threads: int,
+    matmul_precision: MatmulPrecision = MatmulPrecision.FLOAT32,
+    device: TrainerDevice = TrainerDevice.CPU,
+) -> TrainerConfig:
     """Configuration of the paper's learner at the sizes of this comparison."""
     return TrainerConfig(
         learning_rate=1e-4,
@@ -100,12 +113,12 @@ def learner_config(threads: int, matmul_precision: str = "float32", device: str 
         horizon=HORIZON,
         batch_size=BATCH,
         epochs=EPOCHS,
-        network="mlp",
+        network=BuiltInNetwork.MLP,
         hidden=(500, 300),
-        activation="relu",
+        activation=HiddenActivation.RELU,
         truncation_ticks=32,
         supervised=False,
-        reward="bounded_inverse",
+        reward=RewardName.BOUNDED_INVERSE,
         reward_scale_m=5.0,
         matmul_precision=matmul_precision,
         ranks=1,
@@ -115,7 +128,7 @@ def learner_config(threads: int, matmul_precision: str = "float32", device: str 
         checkpoint_interval_updates=10,
         checkpoints_kept=5,
         checkpoint_keep_every=0,
-        estimates="never",
+        estimates=EstimateTimes.NEVER,
     )
 
 

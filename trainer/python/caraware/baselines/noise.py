@@ -6,9 +6,10 @@ filter's units, or a constant that stands at the top with its reason. Formulas a
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any
 
-from caraware.ipc.run_file import ConfigTable, RunFile
+from caraware.ipc.run_file import ConfigTable, RunFile, setting
 
 METRES_PER_DEGREE = math.radians(1.0) * 6_378_137.0
 """Metres on the ground in a degree of arc, on WGS 84's equator; elsewhere within 0.6 % of it."""
@@ -31,6 +32,14 @@ SMALLEST_GYRO_BIAS_WALK = 1e-6
 """A perfect sensor would make the covariance of a filter singular: perfect sensors get these instead."""
 
 
+class ImuConvention(StrEnum):
+    """Frame and gravity of what an IMU delivers: values of `imu.convention`."""
+
+    KINEMATIC = "kinematic"
+    SPECIFIC_FORCE = "specific_force"
+    CARLA = "carla"
+
+
 @dataclass(frozen=True)
 class SensorNoise:
     """Errors of the sensors of a run, SI units. Standard deviations are 1σ of one sample; pairs are east, north."""
@@ -47,7 +56,7 @@ class SensorNoise:
     fix_outliers: bool
     """Reflections: a fix may be far off, so innovations are gated."""
     imu_period_s: float
-    convention: str
+    convention: ImuConvention
     accel_std_mps2: float
     """Of the axis forward."""
     accel_bias_std_mps2: float
@@ -67,12 +76,15 @@ class SensorNoise:
     @classmethod
     def from_run(cls, run: RunFile) -> "SensorNoise | None":
         """Read `run["config"]`, which `caraware` has validated; None for a run without sensor tables."""
-        config = run.get("config", {})
+        config = run["config"]
         if not all(table in config for table in ("gnss", "imu", "speed_steering")):
             return None
-        tick_s = float(config.get("run", {}).get("tick_s", 0.1))
         return cls(
-            tick_s=tick_s, **_of_gnss(config["gnss"]), **_of_imu(config["imu"]), **_of_wheels(config["speed_steering"])
+            tick_s=setting(run, "run.tick_s", float),
+            convention=setting(run, "imu.convention", ImuConvention),
+            **_of_gnss(config["gnss"]),
+            **_of_imu(config["imu"]),
+            **_of_wheels(config["speed_steering"]),
         )
 
 
@@ -95,19 +107,18 @@ def _of_gnss(gnss: ConfigTable) -> dict[str, Any]:
         ),
         "fix_slow_std_m": (slow_east_m, slow_north_m),
         "fix_slow_time_s": float(gnss["correlation_time_s"]),
-        "fix_outliers": bool(gnss.get("sky_view", False)),
+        "fix_outliers": bool(gnss["sky_view"]),
     }
 
 
 def _of_imu(imu: ConfigTable) -> dict[str, Any]:
     """Forward is axis 0, up is axis 2."""
-    period_s, convention = float(imu["period_s"]), str(imu["convention"])
-    slope_mps2 = 0.0 if convention == "kinematic" else GRAVITY_MPS2 * SLOPE_STD_RAD
+    period_s = float(imu["period_s"])
+    slope_mps2 = 0.0 if imu["convention"] == ImuConvention.KINEMATIC else GRAVITY_MPS2 * SLOPE_STD_RAD
     forward = {key: _axes(imu[f"accel_{key}"], 3)[0] for key in ("bias_mps2", "bias_walk")}
     up = {key: _axes(imu[f"gyro_{key}"], 3)[2] for key in ("bias_radps", "bias_walk")}
     return {
         "imu_period_s": period_s,
-        "convention": convention,
         "accel_std_mps2": _sample_std(imu, "accel", "mps2", 0, period_s),
         "accel_bias_std_mps2": max(math.hypot(forward["bias_mps2"], slope_mps2), SMALLEST_ACCEL_BIAS_STD_MPS2),
         # A slope is a Gauss–Markov process; over less than its time it walks by σ √(2/τ) per √s.

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from caraware.baselines.noise import ImuConvention
 from caraware.ipc.arrays import BoolArray, Float64Array, UInt32Array
 from caraware.ipc.layout import SENSOR_BITS
 from caraware.ipc.stream import Observation
 
-YAW_RATE_SIGN = {"kinematic": 1.0, "specific_force": 1.0, "carla": -1.0}
+YAW_RATE_SIGN = {ImuConvention.KINEMATIC: 1.0, ImuConvention.SPECIFIC_FORCE: 1.0, ImuConvention.CARLA: -1.0}
 """CARLA's frame is left-handed (y to the right): its rates about the upward axis are clockwise. Forward is forward."""
 
 OLDEST_S = 1e5
@@ -45,7 +46,7 @@ class Samples:
     wheel_on: BoolArray
 
 
-def read_samples(obs: Observation, convention: str) -> Samples:
+def read_samples(obs: Observation, convention: ImuConvention) -> Samples:
     """Copies of what the filter needs; the observation's memory may change afterwards."""
     imu = _f64(obs.imu).transpose(2, 1, 0)
     age_s = np.clip(np.nan_to_num(_f64(obs.age_s)), 0.0, OLDEST_S)

@@ -9,7 +9,7 @@ import torch
 from gymnasium.spaces import Box
 
 from caraware.ipc.arrays import Float32Array
-from caraware.ipc.run_file import ConfigTable, RunFile
+from caraware.ipc.run_file import BlackoutPolicy, ConfigTable, RunFile, is_population, setting
 from caraware.tasks.contract import Sampling, Task
 from caraware.tasks.fields import Fields
 from caraware.tasks.table import task_of_run
@@ -35,17 +35,16 @@ class FaceSettings:
     def from_run(cls, run: RunFile) -> FaceSettings:
         """Read the run file."""
         config = run["config"]
-        population = "population" in run.get("source", {"population": None})
         task = task_of_run(run)
-        window_ticks = int(config["run"].get("window_ticks", 1))
+        window_ticks = setting(run, "run.window_ticks", int)
         return cls(
             task=task,
-            tick_s=float(config["run"]["tick_s"]),
+            tick_s=setting(run, "run.tick_s", float),
             fields=Fields.from_run(run),
-            slots=_slots(config, population),
-            episode_ticks=int(config["episode"]["ticks"]),
+            slots=_slots(config, is_population(run)),
+            episode_ticks=setting(run, "episode.ticks", int),
             credit_ticks=1 if task.sampling is Sampling.EACH_TICK else max(1, window_ticks // 2),
-            dark_is_nan=config.get("blackout", {}).get("policy") == "nan",
+            dark_is_nan=setting(run, "blackout.policy", BlackoutPolicy) is BlackoutPolicy.NAN,
         )
 
     def observation_space(self) -> Box:
@@ -68,8 +67,8 @@ class FaceSettings:
 def _slots(config: ConfigTable, population: bool) -> int | None:
     traffic = config["traffic"]
     if config["task"]["kind"] == "driving":
-        return len(traffic.get("hero_ids", ())) or int(traffic["heroes"])
+        return len(traffic["hero_ids"]) or int(traffic["heroes"])
     if not population:
         return None
-    smartphones = int(traffic["pedestrians"]) if config["gnss"].get("pedestrians") else 0
+    smartphones = int(traffic["pedestrians"]) if config["gnss"]["pedestrians"] else 0
     return int(traffic["cavs"]) + smartphones

@@ -26,6 +26,7 @@ from caraware.envs.settings import FaceSettings
 from caraware.envs.transition import Rows, Transition
 from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Scalar, UInt32Array, UInt64Array
 from caraware.ipc.channel import StreamEndedError
+from caraware.ipc.run_file import setting
 from caraware.ipc.stream import EMPTY_SLOT, Channel, Observation
 from caraware.tasks.contract import Sampling
 
@@ -75,7 +76,7 @@ class GivenChannel:
     can_restart = False
 
     def __init__(self, channel: Channel) -> None:
-        self.channel, self.seed = channel, int(channel.run["config"]["run"].get("seed", 0))
+        self.channel, self.seed = channel, setting(channel.run, "run.seed", int)
         self.current: Observation | None = None
         self._queue: list[Observation] = []
         # Where a run is taken over, what comes before the first tick is the predecessor's.

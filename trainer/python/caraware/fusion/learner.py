@@ -15,7 +15,7 @@ from torch import Tensor
 from caraware.fusion.carrier import Carried
 from caraware.fusion.estimator import FusionEstimator, FusionNetwork, distance_loss
 from caraware.fusion.lanes import Pieces, read_pieces
-from caraware.ipc.run_file import RunFile
+from caraware.ipc.run_file import RunFile, config_table
 from caraware.learn.adam import Adam
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
 from caraware.learn.flat import FlatParameters
@@ -37,7 +37,7 @@ class FusionConfig:
     @classmethod
     def from_run(cls, run: RunFile) -> "FusionConfig":
         """Read `run["config"]["fusion"]`. Raises `ConfigError`."""
-        section = run.get("config", {}).get("fusion", {})
+        section = config_table(run, "fusion")
         if missing := sorted({f.name for f in fields(cls)} - set(section)):
             help = "it is of another version of `caraware`"
             raise ConfigError(f"the run file lacks the key `fusion.{missing[0]}`", help)
@@ -167,7 +167,7 @@ class FusionLearner:
     def shape(self) -> LearnerShape:
         """See `StoredLearner.shape`."""
         config = self.config
-        return LearnerShape("fusion", self.observation_size, config.network, config.hidden, config.activation)
+        return LearnerShape("fusion", self.observation_size, str(config.network), config.hidden, config.activation)
 
     def schedules(self) -> dict[str, float]:
         """See `StoredLearner.schedules`."""

@@ -101,7 +101,7 @@ class FusionLoop:
         self._evaluation_tick = -1
         self._seeds_m: list[dict[str, float]] = []
         self._vehicles = history.vehicles
-        self._reward = rewards.by_name(config.trainer.reward)
+        self._reward = rewards.REWARDS[config.trainer.reward]
         self._left = self._ended = False
 
     def run(self) -> bool:

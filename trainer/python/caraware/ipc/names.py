@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from caraware import _native
-from caraware.ipc.run_file import RunFile
+from caraware.ipc.run_file import RunFile, is_population
 
 PREFIXES = ("cav.", "hero.", "person.")
 """Population control numbers the road users that it adds in an episode: `cav.0`, `cav.1`, …; none is reused."""
@@ -15,10 +15,8 @@ class Names:
     """Finds the id that belongs to a hash, among those that the run gives; in a scenario only heroes are known so."""
 
     def __init__(self, run: RunFile) -> None:
-        self._population = "population" in run.get("source", {"population": None})
-        self._known: dict[int, str] = {
-            _native.id_hash(name): name for name in run["config"]["traffic"].get("hero_ids", ())
-        }
+        self._population = is_population(run)
+        self._known: dict[int, str] = {_native.id_hash(name): name for name in run["config"]["traffic"]["hero_ids"]}
         self._numbers = 0
 
     def of(self, id_hash: int) -> str:

@@ -13,7 +13,14 @@ import torch
 from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from caraware.learn.config import ConfigError, TrainerConfig
+from caraware.learn.config import (
+    BuiltInNetwork,
+    ConfigError,
+    MatmulPrecision,
+    PythonClass,
+    TrainerConfig,
+    TrainerDevice,
+)
 from caraware.learn.fast import FastUpdate, threads_per_network
 from caraware.learn.fast_mlp import FastMlp
 from caraware.learn.graphed import GraphedUpdate
@@ -45,14 +52,14 @@ def build_ppo(
     device = configure_torch(config)
     # The weights are drawn first; the actions of environment 0 continue with the same generator.
     sampling = torch.Generator().manual_seed(config.seed)
-    if config.network == "gru":
+    if config.network is BuiltInNetwork.GRU:
         sequences = _sequence_update(config, observation_size, actions, device, sampling, ranks)
         return RecurrentPpo(config, task, observation_size, sequences, sampling, environments)
-    if config.network == "mlp":
+    if config.network is BuiltInNetwork.MLP:
         policy, value = paper_networks(config, observation_size, actions, sampling)
         fast = fast_update(config, policy, value, device, ranks)
         return Ppo(config, task, observation_size, fast, sampling, environments)
-    own_policy, own_value = _own_networks(config, observation_size, actions, sampling)
+    own_policy, own_value = _own_networks(config.network, config, observation_size, actions, sampling)
     plain = PlainUpdate(config, own_policy, own_value, device)
     if ranks is not None and ranks.size > 1:
         _refuse_batch_statistics(config, own_policy, own_value)
@@ -103,10 +110,10 @@ def _sequence_update(
 
 
 def _own_networks(
-    config: TrainerConfig, observation_size: int, actions: int, generator: torch.Generator
+    network: PythonClass, config: TrainerConfig, observation_size: int, actions: int, generator: torch.Generator
 ) -> tuple[GaussianPolicy, nn.Module]:
-    """Two networks of the class that `trainer.network` names; their first weights follow from the run's seed."""
-    network_class = _class_of(config.network)
+    """Two networks of the class `network`; their first weights follow from the run's seed."""
+    network_class = _class_of(network)
     seed = int(torch.randint(2**62, (), generator=generator))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -120,30 +127,30 @@ def _refuse_batch_statistics(config: TrainerConfig, *networks: nn.Module) -> Non
     for module in (module for network in networks for module in network.modules()):
         if isinstance(module, _BatchNorm):
             raise ConfigError(
-                f"`trainer.network` is {config.network!r} with `trainer.ranks` = {config.ranks}: its "
+                f"`trainer.network` is '{config.network}' with `trainer.ranks` = {config.ranks}: its "
                 f"{type(module).__name__} takes the statistics of a minibatch, of which each rank sees a part",
                 "normalise each row by itself, as torch.nn.LayerNorm does, or set trainer.ranks = 1",
             )
 
 
-def _class_of(name: str) -> NetworkClass:
-    """The class called `package.module:Class`. Raises `ConfigError`."""
-    module, _, attribute = name.partition(":")
+def _class_of(network: PythonClass) -> NetworkClass:
+    """The class itself. Raises `ConfigError`."""
     help = "write `mlp`, `gru` or `package.module:Class`; the module must be in PYTHONPATH"
     try:
-        network_class: NetworkClass = getattr(import_module(module), attribute)
+        network_class: NetworkClass = getattr(import_module(network.module), network.name)
         return network_class
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"`trainer.network` is {name!r}: {error}", help) from error
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"`trainer.network` is '{network}': {error}", help) from error
 
 
 def configure_torch(config: TrainerConfig) -> torch.device:
     """Set what torch keeps per process: threads within an operation, and the precision of matrix products."""
     torch.set_num_threads(threads_per_network(config))
     amx = hasattr(torch.cpu, "get_capabilities") and torch.cpu.get_capabilities().get("amx_bf16", False)
-    gpu = config.device == "auto" and torch.cuda.is_available()
-    reduced = config.matmul_precision == "bfloat16" or (config.matmul_precision == "auto" and amx and not gpu)
+    gpu = config.device is TrainerDevice.AUTO and torch.cuda.is_available()
+    is_auto = config.matmul_precision is MatmulPrecision.AUTO
+    reduced = config.matmul_precision is MatmulPrecision.BFLOAT16 or (is_auto and amx and not gpu)
     # On a GPU "auto" is TensorFloat-32: 10 bits of mantissa, float32's range.
-    full = "high" if gpu and config.matmul_precision == "auto" else "highest"
+    full = "high" if gpu and is_auto else "highest"
     torch.set_float32_matmul_precision("medium" if reduced else full)
     return torch.device("cuda" if gpu else "cpu")

@@ -2,14 +2,69 @@
 
 import os
 from dataclasses import dataclass, fields
+from enum import StrEnum
 from typing import Any
 
 from caraware.ipc.run_file import ConfigError as ConfigError
-from caraware.ipc.run_file import ConfigTable, RunFile
+from caraware.ipc.run_file import ConfigTable, RunFile, config_table, setting, typed
 from caraware.tasks.bounds import MapBounds as MapBounds
+from caraware.tasks.rewards import RewardName
 
 _KEY_OF_FIELD = {"checkpoint_interval_updates": "checkpoint_interval"}
 """Fields whose name in the configuration file differs (there, the unit stands in the table of keys)."""
+
+
+class BuiltInNetwork(StrEnum):
+    """Networks that `trainer.network` knows by name."""
+
+    MLP = "mlp"
+    GRU = "gru"
+    """Remembers the ticks before."""
+
+
+@dataclass(frozen=True)
+class PythonClass:
+    """A network of the user's, which `trainer.network` writes as `package.module:Class`."""
+
+    module: str
+    name: str
+
+    def __str__(self) -> str:
+        """As the configuration writes it."""
+        return f"{self.module}:{self.name}"
+
+
+class HiddenActivation(StrEnum):
+    """Values of `trainer.activation`."""
+
+    RELU = "relu"
+    TANH = "tanh"
+
+
+class MatmulPrecision(StrEnum):
+    """Precision of the inputs of matrix products."""
+
+    FLOAT32 = "float32"
+    BFLOAT16 = "bfloat16"
+    AUTO = "auto"
+    """bfloat16 where the CPU has AMX tiles."""
+
+
+class TrainerDevice(StrEnum):
+    """What the trainer computes on."""
+
+    CPU = "cpu"
+    AUTO = "auto"
+    """A GPU if there is one."""
+
+
+class EstimateTimes(StrEnum):
+    """When the Kalman filter runs beside the policy for viewers."""
+
+    PACED = "paced"
+    """In runs that keep to the wall clock."""
+    ALWAYS = "always"
+    NEVER = "never"
 
 
 @dataclass(frozen=True)
@@ -49,41 +104,34 @@ class TrainerConfig:
     batch_size: int
     """Samples in a gradient step."""
     epochs: int
-    network: str
-    """`mlp`; `gru`, which remembers the ticks before; or `package.module:Class` (`caraware.learn.build`)."""
+    network: BuiltInNetwork | PythonClass
     hidden: tuple[int, ...]
-    activation: str
-    """Of the hidden layers: `relu` or `tanh`. The policy's last hidden layer is tanh in any case, as CarAware's."""
+    activation: HiddenActivation
+    """Of the hidden layers. The policy's last hidden layer is tanh in any case, as CarAware's."""
     truncation_ticks: int
     """Ticks that a gradient reaches back in a network with memory."""
     supervised: bool
     """Teach a network of the policy's size by regression to the truth beside it (`caraware.learn.supervised`)."""
-    reward: str
+    reward: RewardName
     reward_scale_m: float
-    matmul_precision: str
-    """`float32`, `bfloat16` (inputs of matrix products only), or `auto`: bfloat16 where the CPU has AMX tiles."""
+    matmul_precision: MatmulPrecision
     ranks: int
     """Trainers that learn together by torch.distributed, each with a run of its own; horizon and batch are of each."""
     threads: int
     """CPU threads; 0 is one per core this process may use."""
-    device: str
-    """`cpu`, or `auto`: a GPU if there is one."""
+    device: TrainerDevice
     seed: int
     checkpoint_interval_updates: int
     checkpoints_kept: int
     checkpoint_keep_every: int
     """Checkpoints after a multiple of so many updates stay for good; 0: only the newest and the best."""
-    estimates: str
-    """When the Kalman filter runs beside the policy for viewers: `paced`, `always`, `never`."""
+    estimates: EstimateTimes
 
     @classmethod
     def from_run(cls, run: RunFile) -> "TrainerConfig":
-        """Read `run["config"]["trainer"]`; the seed may stand in `run["config"]["run"]`. Raises `ConfigError`."""
-        section = dict(_table(run, "trainer"))
+        """Read `run["config"]["trainer"]`, and the seed in `run["config"]["run"]`. Raises `ConfigError`."""
+        section = config_table(run, "trainer") | {"seed": setting(run, "run.seed", int)}
         section.pop("module", None)
-        seed_of_run = run.get("config", {}).get("run", {}).get("seed")
-        if seed_of_run is not None:
-            section.setdefault("seed", seed_of_run)
         keys = {_key(f.name) for f in fields(cls)}
         if wrong := sorted(keys ^ set(section)):
             what = "lacks the key" if wrong[0] in keys else "has the unknown key"
@@ -106,23 +154,25 @@ def _key(field_name: str) -> str:
     return _KEY_OF_FIELD.get(field_name, field_name)
 
 
-def _table(run: RunFile, name: str) -> ConfigTable:
-    table = run.get("config", {}).get(name)
-    if not isinstance(table, dict):
-        raise ConfigError(f"the run file has no table `config.{name}`", "start the trainer through `caraware train`")
-    return table
+def _typed(name: str, kind: Any, section: ConfigTable) -> Any:
+    """The value of a field. Raises `ConfigError`."""
+    key, value = f"trainer.{_key(name)}", section[_key(name)]
+    if kind == BuiltInNetwork | PythonClass:
+        return _network(key, value)
+    if kind == tuple[int, ...]:
+        if not isinstance(value, list):
+            raise ConfigError(f"`{key}` is {value!r}", "give a list of integers")
+        return tuple(typed(key, each, int) for each in value)
+    if kind == float | None:
+        return None if value is None else typed(key, value, float)
+    return typed(key, value, kind)
 
 
-def _typed(name: str, kind: object, section: ConfigTable) -> Any:
-    """The value of a field, where an integer may stand for a float but nothing else is converted."""
-    value = section[_key(name)]
-    if kind == tuple[int, ...] and isinstance(value, list) and all(type(v) is int for v in value):
-        return tuple(value)
-    if kind == float | None and value is None:
-        return None
-    if kind in (float, float | None) and type(value) in (int, float):
-        return float(value)
-    if kind in (int, str, bool) and type(value) is kind:
-        return value
-    wanted = "list of integers" if kind == tuple[int, ...] else getattr(kind, "__name__", str(kind))
-    raise ConfigError(f"`trainer.{_key(name)}` is {value!r}", f"give a value of type {wanted}")
+def _network(key: str, value: object) -> BuiltInNetwork | PythonClass:
+    text: str = typed(key, value, str)
+    module, colon, name = text.partition(":")
+    if colon and module and name:
+        return PythonClass(module, name)
+    if text not in list(BuiltInNetwork):
+        raise ConfigError(f"`{key}` is {text!r}", "give one of: mlp, gru, package.module:Class")
+    return BuiltInNetwork(text)

@@ -552,7 +552,7 @@ class Ppo:
     def shape(self) -> LearnerShape:
         """See `StoredLearner.shape`."""
         config = self.config
-        return LearnerShape("ppo", self.observation_size, config.network, config.hidden, config.activation)
+        return LearnerShape("ppo", self.observation_size, str(config.network), config.hidden, config.activation)
 
     def schedules(self) -> dict[str, float]:
         """See `StoredLearner.schedules`; before the first update, those of that one."""

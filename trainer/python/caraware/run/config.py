@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from caraware.baselines.noise import SensorNoise
-from caraware.ipc.run_file import RunFile
-from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
+from caraware.ipc.run_file import BlackoutPolicy, RunFile, setting
+from caraware.learn.config import ConfigError, EstimateTimes, MapBounds, TrainerConfig
 from caraware.run.curriculum import Stage
 from caraware.tasks.contract import Task
 from caraware.tasks.table import task_of_run
@@ -42,32 +42,31 @@ class RunConfig:
     @classmethod
     def from_run(cls, run: RunFile) -> "RunConfig":
         """Check the whole run file. Raises `ConfigError`."""
-        if "run_dir" not in run:
-            raise ConfigError("the run file has no `run_dir`", "start the trainer through `caraware train`")
-        canonical = json.dumps(run.get("config", {}), sort_keys=True, separators=(",", ":")).encode()
-        resume = (run.get("beginning") or {}).get("checkpoint")
-        episodes = run.get("config", {}).get("episode", {})
-        place = run.get("config", {}).get("run", {})
-        first_env = place.get("first_env", 0)
+        if missing := [key for key in ("run_dir", "config") if key not in run]:
+            raise ConfigError(f"the run file has no `{missing[0]}`", "start the trainer through `caraware train`")
+        canonical = json.dumps(run["config"], sort_keys=True, separators=(",", ":")).encode()
+        beginning = run.get("beginning")
+        first_env = setting(run, "run.first_env", int)
         return cls(
             run_dir=Path(run["run_dir"]),
             trainer=TrainerConfig.from_run(run),
             bounds=MapBounds.from_run(run),
             task=task_of_run(run),
             config_sha256=hashlib.sha256(canonical).hexdigest(),
-            dark_is_nan=run.get("config", {}).get("blackout", {}).get("policy") == "nan",
-            training_episodes=max(1, episodes.get("training_episodes", 1)),
+            dark_is_nan=setting(run, "blackout.policy", BlackoutPolicy) is BlackoutPolicy.NAN,
+            training_episodes=setting(run, "episode.training_episodes", int),
             curriculum=Stage.from_run(run),
-            evaluation_interval=episodes.get("evaluation_interval", 0),
+            evaluation_interval=setting(run, "episode.evaluation_interval", int),
             sensors=SensorNoise.from_run(run),
-            environments=tuple(range(first_env, first_env + place.get("envs", 1))),
-            is_paced=run.get("config", {}).get("run", {}).get("real_time_factor", 0.0) > 0.0,
-            resume_from=Path(resume) if resume else None,
+            environments=tuple(range(first_env, first_env + setting(run, "run.envs", int))),
+            is_paced=setting(run, "run.real_time_factor", float) > 0.0,
+            resume_from=Path(beginning["checkpoint"]) if beginning else None,
         )
 
     def shows_estimates(self) -> bool:
         """The Kalman filter runs beside the policy. At full speed it would cost more than the policy."""
-        wanted = {"paced": self.is_paced, "always": True, "never": False}[self.trainer.estimates]
+        times = self.trainer.estimates
+        wanted = times is EstimateTimes.ALWAYS or (times is EstimateTimes.PACED and self.is_paced)
         return wanted and self.sensors is not None
 
     def progress(self, episode: int) -> float:

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 from caraware import _native
-from caraware.ipc.run_file import RunFile
+from caraware.ipc.run_file import RunFile, config_table
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Stage:
     @classmethod
     def from_run(cls, run: RunFile) -> "tuple[Stage, ...]":
         """The stages of a run file's configuration; none without a curriculum."""
-        stages = run.get("config", {}).get("curriculum", {}).get("stages", [])
+        stages = config_table(run, "curriculum")["stages"]
         return tuple(cls(**{name: stage.get(name) for name in cls.__dataclass_fields__}) for stage in stages)
 
     def passed(self, policy_std: float, metrics: Mapping[str, float], lessons: int) -> bool:

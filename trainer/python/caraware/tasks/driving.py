@@ -8,7 +8,7 @@ from torch import Tensor
 
 from caraware import _native
 from caraware.ipc.arrays import FloatArray
-from caraware.ipc.run_file import RunFile
+from caraware.ipc.run_file import RunFile, setting
 from caraware.ipc.stream import MeasuredTick
 from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskOutcome, TaskStep
 from caraware.tasks.fields import Fields
@@ -50,7 +50,7 @@ class Driving:
     @classmethod
     def from_run(cls, run: RunFile) -> "Driving":
         """Read the fields of the observation and the length of a tick."""
-        return cls(Fields.from_run(run), float(run["config"]["run"]["tick_s"]))
+        return cls(Fields.from_run(run), setting(run, "run.tick_s", float))
 
     def answer(self, action: Tensor) -> Tensor:
         """The demands, clipped to their range."""

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from torch import Tensor
 
 from caraware.ipc.arrays import Float32Array, Float64Array
-from caraware.ipc.run_file import RunFile
+from caraware.ipc.run_file import RunFile, config_table, setting
+
+
+class ObservationScale(StrEnum):
+    """Values of `observation.scale`."""
+
+    ZERO_TO_ONE = "zero_to_one"
+    MINUS_ONE_TO_ONE = "minus_one_to_one"
+
+
+LOWER_END = {ObservationScale.ZERO_TO_ONE: 0.0, ObservationScale.MINUS_ONE_TO_ONE: -1.0}
 
 
 class UnknownFieldError(KeyError):
@@ -29,9 +40,9 @@ class Fields:
     @classmethod
     def from_run(cls, run: RunFile) -> Fields:
         """The fields that the run file names."""
-        settings = run["config"]["observation"]
-        low = 0.0 if settings.get("scale") == "zero_to_one" else -1.0
-        return cls(tuple(settings["fields"]), int(settings.get("history", 1)), low, _ranges(run))
+        names = tuple(config_table(run, "observation")["fields"])
+        low = LOWER_END[setting(run, "observation.scale", ObservationScale)]
+        return cls(names, setting(run, "observation.history", int), low, _ranges(run))
 
     @property
     def width(self) -> int:
@@ -66,4 +77,4 @@ class Fields:
 
 def _ranges(run: RunFile) -> dict[str, tuple[float, float]]:
     """Lower and upper end of every field in SI units, as the run file names them."""
-    return {field["name"]: (field["range"][0], field["range"][1]) for field in run.get("observation_fields", ())}
+    return {field["name"]: (field["range"][0], field["range"][1]) for field in run["observation_fields"]}

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from caraware import _native
 from caraware.ipc.arrays import FloatArray
-from caraware.ipc.run_file import RunFile
+from caraware.ipc.run_file import RunFile, setting
 from caraware.ipc.stream import MeasuredTick
 from caraware.tasks import rewards
 from caraware.tasks.bounds import MapBounds
@@ -30,8 +30,7 @@ class Localisation:
     """Actions `[..., 2]` are positions in the box of the map: 0 is its middle, ±1 its edge, and beyond lies outside."""
 
     bounds: MapBounds
-    reward_name: str
-    """A name of `caraware.tasks.rewards.REWARDS`."""
+    reward_name: rewards.RewardName
     reward_scale_m: float
     name: str = "localisation"
     actions: ActionSpec = ACTIONS
@@ -39,15 +38,11 @@ class Localisation:
     ends: tuple[EndReason, ...] = ENDS
     metrics: tuple[_native.Metric, ...] = field(default_factory=lambda: metrics_of("localisation"))
 
-    def __post_init__(self) -> None:
-        """Raises `caraware.tasks.rewards.UnknownReward`."""
-        rewards.by_name(self.reward_name)
-
     @classmethod
     def from_run(cls, run: RunFile) -> "Localisation":
-        """Read `map.bounds_m` and the reward. Raises `ConfigError` and `UnknownReward`."""
-        trainer = run["config"]["trainer"]
-        return cls(MapBounds.from_run(run), trainer["reward"], float(trainer["reward_scale_m"]))
+        """Read `map.bounds_m` and the reward. Raises `ConfigError`."""
+        reward = setting(run, "trainer.reward", rewards.RewardName)
+        return cls(MapBounds.from_run(run), reward, setting(run, "trainer.reward_scale_m", float))
 
     def answer(self, action: Tensor) -> Tensor:
         """Positions `[..., 2]` (m, world)."""
@@ -55,7 +50,7 @@ class Localisation:
 
     def reward(self, step: TaskStep, action: Tensor) -> Tensor:
         """The named reward of the distance to the truth; see `Task.reward`."""
-        return rewards.by_name(self.reward_name)(self.error_m(action, step.truth), self.reward_scale_m)
+        return rewards.REWARDS[self.reward_name](self.error_m(action, step.truth), self.reward_scale_m)
 
     def measure(self, step: TaskStep, action: Tensor) -> dict[str, Tensor]:
         """`error_m`: distance of the position to the truth (m)."""

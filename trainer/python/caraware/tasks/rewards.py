@@ -1,6 +1,7 @@
 """Named rewards of a prediction, all functions of its Euclidean distance to the truth (paper, equation 5)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from enum import StrEnum
 
 import torch
 from torch import Tensor
@@ -12,8 +13,12 @@ CLOSEST_M = 1.0
 """Distances below this earn no more: 1/d alone is unbounded, and one lucky sample would rule a whole batch."""
 
 
-class UnknownReward(ValueError):
-    """No reward of that name; the message lists those there are."""
+class RewardName(StrEnum):
+    """Values of `trainer.reward`."""
+
+    INVERSE = "inverse"
+    BOUNDED_INVERSE = "bounded_inverse"
+    EXPONENTIAL = "exponential"
 
 
 def inverse(distance_m: Tensor, scale_m: float) -> Tensor:
@@ -31,14 +36,11 @@ def exponential(distance_m: Tensor, scale_m: float) -> Tensor:
     return torch.exp(-distance_m / scale_m)
 
 
-REWARDS: dict[str, Reward] = {"inverse": inverse, "bounded_inverse": bounded_inverse, "exponential": exponential}
-
-
-def by_name(name: str) -> Reward:
-    """The reward called `name`. Raises `UnknownReward`."""
-    if name not in REWARDS:
-        raise UnknownReward(f"no reward is called {name!r}; there are: {', '.join(REWARDS)}")
-    return REWARDS[name]
+REWARDS: Mapping[RewardName, Reward] = {
+    RewardName.INVERSE: inverse,
+    RewardName.BOUNDED_INVERSE: bounded_inverse,
+    RewardName.EXPONENTIAL: exponential,
+}
 
 
 def distance_m(predicted_m: Tensor, truth: Tensor) -> Tensor:

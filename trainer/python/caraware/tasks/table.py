@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 
-from caraware.ipc.run_file import ConfigError, RunFile
+from caraware.ipc.run_file import ConfigError, RunFile, setting
 from caraware.tasks.contract import Task
 from caraware.tasks.driving import Driving
 from caraware.tasks.localisation import Localisation
@@ -16,7 +16,7 @@ TASKS: Mapping[str, Callable[[RunFile], Task]] = {
 
 def task_of_run(run: RunFile) -> Task:
     """The task that the run file names. Raises `ConfigError` where there is none of that name."""
-    kind = run["config"]["task"]["kind"]
+    kind = setting(run, "task.kind", str)
     if kind not in TASKS:
         raise ConfigError(f"no task is called {kind!r}", f"`task.kind` is one of: {', '.join(TASKS)}")
     return TASKS[kind](run)
