@@ -17,6 +17,7 @@ use std::{
 use fanout::network::keys::{RunKeys, Topic};
 use harness::{PATIENCE, Run, ask, publisher, send_world, until};
 use ipc_schema::{
+    config::Commander,
     control::{Command, Done, Refusal, RefusalKind, Reply},
     process::Process,
     run::Mode,
@@ -28,7 +29,7 @@ fn users(run: &mut Run, text: &str) {
     let path = run.file.run_dir.join("users");
     std::fs::write(&path, text).unwrap();
     std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).unwrap();
-    run.file.config.fanout.users = path.to_string_lossy().into_owned();
+    run.file.config.fanout.users = Some(path);
     run.file.write().unwrap();
 }
 
@@ -124,7 +125,7 @@ const SILENCE: Duration = Duration::from_millis(700);
 #[test]
 fn users_read_and_commanders_command() {
     let mut run = Run::new("guarded", Mode::Simulate);
-    run.file.config.fanout.commanders = vec!["carol".into()];
+    run.file.config.fanout.commanders = vec![Commander::Named("carol".into())];
     users(&mut run, "alice:secret\ncarol:other\n");
     let received = start_supervisor(&run);
     let _fanout = start_listening(&run);
@@ -146,7 +147,7 @@ fn users_read_and_commanders_command() {
         frames.try_recv().unwrap().is_some()
     });
     assert!(ask(&alice, &run.key(Topic::Map)).is_some());
-    let request = Command::Pause {}.to_json();
+    let request = Command::Pause {}.to_json().unwrap();
     assert_eq!(command(&run, &alice, request.clone(), SILENCE), None);
     assert_eq!(*received.lock().unwrap(), []);
 
@@ -197,7 +198,10 @@ fn without_commanders_no_client_may_command() {
     let _fanout = start_listening(&run);
     let viewer = until_connected(|| connect(&run, ""));
     assert!(ask(&viewer, &run.key(Topic::Map)).is_some());
-    assert_eq!(command(&run, &viewer, Command::Reset {}.to_json(), SILENCE), None);
+    assert_eq!(
+        command(&run, &viewer, Command::Reset {}.to_json().unwrap(), SILENCE),
+        None
+    );
     assert_eq!(*received.lock().unwrap(), []);
 }
 
@@ -205,7 +209,7 @@ fn without_commanders_no_client_may_command() {
 #[test]
 fn garbage_commands_are_refused_and_counted() {
     let mut run = Run::new("pestered", Mode::Simulate);
-    run.file.config.fanout.commanders = vec!["*".into()];
+    run.file.config.fanout.commanders = vec![Commander::EveryClient];
     run.file.write().unwrap();
     let received = start_supervisor(&run);
     let _fanout = start_listening(&run);
@@ -215,7 +219,7 @@ fn garbage_commands_are_refused_and_counted() {
         Some(Reply::Refused(Refusal { kind, .. })) => kind,
         reply => panic!("{reply:?}"),
     };
-    let pause = Command::Pause {}.to_json();
+    let pause = Command::Pause {}.to_json().unwrap();
     let mut state = 1_u64;
     for length in [0, 1, 72, 500, 4096, 4097, 1_000_000] {
         let garbage = std::iter::repeat_with(|| {
@@ -242,12 +246,12 @@ fn certificates_grant_access() {
     let mut run = Run::new("encrypted", Mode::Simulate);
     let pki = run.file.run_dir.join("pki");
     make_certificates(&pki);
-    let file = |name: &str| pki.join(name).to_string_lossy().into_owned();
+    let file = |name: &str| pki.join(name).display().to_string();
     let fanout = &mut run.file.config.fanout;
-    fanout.listen = format!("tls/127.0.0.1:{}", run.port);
-    (fanout.tls_certificate, fanout.tls_private_key) = (file("server.pem"), file("server.key"));
-    fanout.tls_client_ca = file("ca.pem");
-    fanout.commanders = vec!["carol".into()];
+    fanout.listen = format!("tls/127.0.0.1:{}", run.port).parse().unwrap();
+    (fanout.tls_certificate, fanout.tls_private_key) = (Some(pki.join("server.pem")), Some(pki.join("server.key")));
+    fanout.tls_client_ca = Some(pki.join("ca.pem"));
+    fanout.commanders = vec![Commander::Named("carol".into())];
     run.file.write().unwrap();
     let received = start_supervisor(&run);
     let _fanout = start_listening(&run);
@@ -279,7 +283,7 @@ fn certificates_grant_access() {
         !may_read(connect_tls(&format!(r#"root_ca_certificate: "{}""#, file("ca.pem")))),
         "without a certificate"
     );
-    let request = Command::Reset {}.to_json();
+    let request = Command::Reset {}.to_json().unwrap();
     let alice = until_connected(|| connect_tls(&with("alice")));
     assert!(ask(&alice, &run.key(Topic::Map)).is_some());
     assert_eq!(command(&run, &alice, request.clone(), SILENCE), None);

@@ -3,18 +3,27 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::traffic::VEHICLE_CLASSES;
-
 mod curriculum;
+mod fanout;
+mod lidar_pattern;
 mod observation;
 mod region;
+mod scene;
 mod sensors;
+pub(crate) mod text;
+mod trainer;
 mod ultrasonic;
+mod vehicle;
 pub use curriculum::*;
+pub use fanout::*;
+pub use lidar_pattern::*;
 pub use observation::*;
 pub use region::*;
+pub use scene::*;
 pub use sensors::*;
+pub use trainer::*;
 pub use ultrasonic::*;
+pub use vehicle::*;
 
 /// One whole configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -152,7 +161,6 @@ pub struct TrafficConfig {
     /// Share of a scenario's own vehicles that carry sensors (`.sumocfg`).
     pub cav_share: f64,
     /// Most of them at a time (`.sumocfg`); 0 = no limit.
-    #[serde(default)]
     pub max_cavs: u32,
     /// Share of all trips, from road to road, that only evaluation episodes make, which make no others; 0 = none.
     pub held_out_trips: f64,
@@ -221,67 +229,6 @@ pub struct TaskConfig {
     pub time_limit_s: f64,
 }
 
-/// A vehicle model.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum VehicleModel {
-    /// Single track without slip.
-    Kinematic,
-    /// Single track with saturating tyres, load transfer, roll and pitch.
-    Dynamic,
-    /// Rigid body on four ray-cast wheels; heroes only.
-    RigidBody,
-}
-
-/// Reads an entry of `vehicle.class_models`, "class=kinematic" or "class=dynamic" with a vehicle class of SUMO.
-#[must_use]
-pub fn class_model(entry: &str) -> Option<(&str, VehicleModel)> {
-    let (class, model) = entry.split_once('=')?;
-    let model = match model.trim() {
-        "kinematic" => VehicleModel::Kinematic,
-        "dynamic" => VehicleModel::Dynamic,
-        _ => return None,
-    };
-    let class = class.trim();
-    VEHICLE_CLASSES.contains(&class).then_some((class, model))
-}
-
-/// What the road is covered with.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Surface {
-    /// Dry asphalt.
-    Dry,
-    /// Wet asphalt.
-    Wet,
-    /// Snow.
-    Snow,
-}
-
-/// The road.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RoadConfig {
-    /// What it is covered with: decides the friction.
-    pub surface: Surface,
-}
-
-/// What stands beside the road, or on it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct SceneConfig {
-    /// Obstacles, each "name x y heading": a prop by name, its centre in metres (world), its heading in degrees counter-clockwise
-    /// from east (0 if left out).
-    pub obstacles: Vec<String>,
-    /// Props placed at random beside the road, the same for the same `run.seed`.
-    pub random_props: u32,
-    /// Height of a building whose polygon and type name none, metres.
-    pub building_height_m: f64,
-    /// Triangle meshes, each "file x y heading": a Wavefront OBJ, its origin on the ground in metres (world), its heading in degrees
-    /// counter-clockwise from east (0 if left out). LIDARs see them; traffic and collisions do not.
-    pub meshes: Vec<String>,
-}
-
 /// Contacts.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -290,48 +237,6 @@ pub struct CollisionConfig {
     pub detect: bool,
     /// A contact ends the trajectory of a connected vehicle, as it always ends a hero's.
     pub ends_trajectory: bool,
-}
-
-/// Vehicle models and their limits.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct VehicleConfig {
-    /// Model of connected vehicles.
-    pub cav_model: VehicleModel,
-    /// Model of vehicles without sensors.
-    pub other_model: VehicleModel,
-    /// Model of heroes.
-    pub hero_model: VehicleModel,
-    /// Models by SUMO class, each "class=model"; they win over the three above.
-    pub class_models: Vec<String>,
-    /// Time over which an instantaneous lane change is spread, seconds.
-    pub lane_change_s: f64,
-    /// Largest road-wheel angle, radians.
-    pub max_road_wheel_angle_rad: f64,
-    /// Largest rate of the road-wheel angle, rad/s.
-    pub max_road_wheel_rate_radps: f64,
-    /// Largest acceleration of the mirror, m/s².
-    pub max_accel_mps2: f64,
-    /// Largest deceleration of the mirror, m/s².
-    pub max_decel_mps2: f64,
-    /// Steering-wheel angle per road-wheel angle.
-    pub steering_ratio: f64,
-    /// Tracking error beyond which the mirror is set onto SUMO, metres.
-    pub resynchronise_m: f64,
-    /// Distance between the reference and SUMO's path, because that cannot be driven, beyond which the mirror is set onto SUMO, metres.
-    pub leave_path_m: f64,
-}
-
-/// Reward of a prediction, a function of its Euclidean distance d from the truth.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Reward {
-    /// 1 / d.
-    Inverse,
-    /// 1 / (1 + d / scale).
-    BoundedInverse,
-    /// exp(−d / scale).
-    Exponential,
 }
 
 /// The learned estimator of the preset `fusion` (`caraware.fusion.train`).
@@ -344,178 +249,4 @@ pub struct FusionConfig {
     pub segment_ticks: u64,
     /// Ticks that a gradient reaches back.
     pub truncation_ticks: u64,
-}
-
-/// The learner: PPO with the paper's hyper-parameters.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TrainerConfig {
-    /// Python module that is run as the trainer.
-    pub module: String,
-    /// Learning rate of Adam at the start.
-    pub learning_rate: f64,
-    /// Factor on the learning rate after each update.
-    pub learning_rate_decay: f64,
-    /// Learning rate at the end of training; `None`: `learning_rate_decay` alone.
-    pub learning_rate_final: Option<f64>,
-    /// Discount γ.
-    pub discount: f64,
-    /// GAE λ.
-    pub gae_lambda: f64,
-    /// Clip ε of the probability ratio.
-    pub clip_epsilon: f64,
-    /// ε at the end of training; `None`: constant.
-    pub clip_epsilon_final: Option<f64>,
-    /// Standard deviation of the policy at the start, in the action's −1 … 1.
-    pub initial_std: f64,
-    /// Weight of the entropy bonus.
-    pub entropy_scale: f64,
-    /// Weight of the entropy bonus at the end of training; `None`: constant.
-    pub entropy_scale_final: Option<f64>,
-    /// Weight of the value loss.
-    pub value_scale: f64,
-    /// How far a value may move in one update; `None`: any way.
-    pub value_clip: Option<f64>,
-    /// KL divergence at which an update of the policy ends; `None`: after all epochs.
-    pub target_kl: Option<f64>,
-    /// Largest norm of the gradient.
-    pub max_grad_norm: f64,
-    /// Actions tried on every observation.
-    pub actions_per_observation: u64,
-    /// Samples per update.
-    pub horizon: u64,
-    /// Samples per gradient step.
-    pub batch_size: u64,
-    /// Passes over a horizon.
-    pub epochs: u64,
-    /// Networks of policy and value.
-    #[serde(default)]
-    pub network: Network,
-    /// Width of the hidden layers of policy and value network.
-    pub hidden: Vec<u64>,
-    /// What follows a hidden layer.
-    #[serde(default)]
-    pub activation: Activation,
-    /// Ticks that a gradient reaches back in a network with memory.
-    #[serde(default = "default_truncation_ticks")]
-    pub truncation_ticks: u64,
-    /// Train a network of the policy's size by regression beside it.
-    pub supervised: bool,
-    /// Reward by name.
-    pub reward: Reward,
-    /// Scale of `bounded_inverse` and `exponential`, metres.
-    pub reward_scale_m: f64,
-    /// Trainers that learn together by `torch.distributed`, each with a run of its own.
-    pub ranks: u32,
-    /// Threads of torch; 0 = one for each core.
-    pub threads: u64,
-    /// "cpu" or "auto" (a GPU if there is one).
-    pub device: String,
-    /// Precision of matrix products: "float32", "bfloat16", or "auto" (bfloat16 where the processor has AMX).
-    pub matmul_precision: String,
-    /// Updates between two checkpoints.
-    pub checkpoint_interval: u64,
-    /// Newest checkpoints that are kept.
-    pub checkpoints_kept: u64,
-    /// Updates between two checkpoints that are kept for good; 0 = none.
-    pub checkpoint_keep_every: u64,
-    /// When the Kalman filter's estimates travel beside the predictions.
-    pub estimates: Estimates,
-}
-
-/// Shared memory → zenoh.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct FanoutConfig {
-    /// Start the fan-out process.
-    pub enabled: bool,
-    /// zenoh endpoint to listen on.
-    pub listen: String,
-    /// File of those who may connect, a line `user:password` each; "" = nobody is asked.
-    pub users: String,
-    /// Certificate of this machine, PEM, for an endpoint `tls/…`.
-    pub tls_certificate: String,
-    /// Its private key, PEM.
-    pub tls_private_key: String,
-    /// Certificate of the authority, PEM, that must have signed the certificates of those who connect; "" = they need none.
-    pub tls_client_ca: String,
-    /// Users, or common names of certificates, that may send commands; "*" = all who may connect.
-    pub commanders: Vec<String>,
-    /// Most frames of `world` per wall second.
-    pub world_hz: f64,
-    /// The same of `observation`.
-    pub observation_hz: f64,
-    /// The same of `prediction`.
-    pub prediction_hz: f64,
-    /// The same of each LIDAR's `pointcloud`.
-    pub pointcloud_hz: f64,
-    /// The same of `event`.
-    pub event_hz: f64,
-    /// The same of `signals`.
-    pub signals_hz: f64,
-    /// The same of `vehicles`.
-    pub vehicles_hz: f64,
-    /// The same of `status`.
-    pub status_hz: f64,
-}
-
-/// Of a run file that was written before there were networks with memory.
-fn default_truncation_ticks() -> u64 {
-    32
-}
-
-/// Networks of policy and value.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "String", into = "String")]
-pub enum Network {
-    /// Hidden layers: sees one moment.
-    #[default]
-    Mlp,
-    /// The last hidden layer is a gated recurrent unit, with a state for each slot.
-    Gru,
-    /// A Python class, as `package.module:Class`.
-    Class(String),
-}
-
-impl From<String> for Network {
-    fn from(word: String) -> Self {
-        match word.as_str() {
-            "mlp" => Self::Mlp,
-            "gru" => Self::Gru,
-            _ => Self::Class(word),
-        }
-    }
-}
-
-impl From<Network> for String {
-    fn from(network: Network) -> Self {
-        match network {
-            Network::Mlp => "mlp".to_owned(),
-            Network::Gru => "gru".to_owned(),
-            Network::Class(name) => name,
-        }
-    }
-}
-
-/// What follows a hidden layer of policy and value network.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Activation {
-    /// max(0, x).
-    #[default]
-    Relu,
-    /// tanh x.
-    Tanh,
-}
-
-/// When the trainer runs the Kalman filter beside the policy, for whoever watches.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Estimates {
-    /// In a run paced by the wall clock: at full speed the filter costs more than the policy.
-    Paced,
-    /// Always.
-    Always,
-    /// Never.
-    Never,
 }

@@ -1,4 +1,8 @@
-//! The catalogue of props, and the entries of `scene.obstacles`.
+//! The catalogue of props, and the obstacles made of them.
+
+use std::{fmt, str::FromStr};
+
+use crate::config::text::{finite_numbers, serde_as_text};
 
 /// Class of a prop, for sensors that distinguish classes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,78 +67,98 @@ pub const PROPS: [PropKind; 16] = [
     prop("tyre", PropClass::Load, 0.65, 0.65, 0.22),
 ];
 
-/// One entry of `scene.obstacles`.
+impl PropKind {
+    /// The prop of this name.
+    #[must_use]
+    pub fn by_name(name: &str) -> Option<&'static Self> {
+        PROPS.iter().find(|prop| prop.name == name)
+    }
+}
+
+/// A prop that a configuration or run file refers to by its name.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PropName(pub &'static PropKind);
+
+/// A text is not the name of a prop.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("\"{0}\" names no known prop")]
+pub struct PropNameError(pub String);
+
+/// An obstacle: a prop and its place. Configurations and run files write it as "name x y heading"; the heading may be left out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Obstacle {
     /// Kind of prop.
     pub kind: &'static PropKind,
-    /// Its centre, x, world, metres.
-    pub x_m: f64,
-    /// Its centre, y, world, metres.
-    pub y_m: f64,
-    /// Heading, counter-clockwise from east, radians.
-    pub yaw_rad: f64,
+    /// x and y of its centre, world, metres.
+    pub centre_m: [f64; 2],
+    /// Heading, counter-clockwise from east, degrees.
+    pub heading_deg: f64,
 }
 
-/// An entry of `scene.obstacles` cannot be used.
+/// A text is not an obstacle.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ObstacleError {
     /// The prop is unknown.
-    #[error("`scene.obstacles`: \"{text}\" names no known prop (\"{name}\")")]
+    #[error("\"{text}\" names no known prop (\"{name}\")")]
     Unknown {
-        /// The entry.
+        /// The text.
         text: String,
         /// The name in it.
         name: String,
     },
-    /// The entry is not a name and two or three numbers.
-    #[error("`scene.obstacles`: \"{text}\" is not \"name x y\" or \"name x y heading\" with plain numbers")]
+    /// The text is not a name and two or three numbers.
+    #[error("\"{text}\" is not \"name x y\" or \"name x y heading\" with plain numbers")]
     Malformed {
-        /// The entry.
+        /// The text.
         text: String,
     },
 }
 
-impl ObstacleError {
-    /// The form of an entry, and the known props.
-    #[must_use]
-    pub fn help(&self) -> String {
-        let names: Vec<_> = PROPS.iter().map(|prop| prop.name).collect();
-        format!(
-            "write \"cone 120.5 80 90\": x and y in metres (world), heading in degrees counter-clockwise from east; props: {}",
-            names.join(", ")
-        )
+serde_as_text!(PropName, Obstacle);
+
+impl FromStr for PropName {
+    type Err = PropNameError;
+
+    fn from_str(text: &str) -> Result<Self, PropNameError> {
+        let kind = PropKind::by_name(text).ok_or_else(|| PropNameError(text.to_owned()))?;
+        Ok(Self(kind))
     }
 }
 
-impl Obstacle {
-    /// Reads "name x y heading"; the heading is in degrees and may be left out.
-    ///
-    /// # Errors
-    /// The name is unknown, or a value is not a number.
-    pub fn parse(text: &str) -> Result<Self, ObstacleError> {
+impl fmt::Display for PropName {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(self.0.name)
+    }
+}
+
+impl FromStr for Obstacle {
+    type Err = ObstacleError;
+
+    fn from_str(text: &str) -> Result<Self, ObstacleError> {
         let malformed = || ObstacleError::Malformed { text: text.into() };
         let mut words = text.split_whitespace();
         let name = words.next().ok_or_else(malformed)?;
-        let kind = PROPS.iter().find(|prop| prop.name == name);
-        let kind = kind.ok_or_else(|| ObstacleError::Unknown {
+        let kind = PropKind::by_name(name).ok_or_else(|| ObstacleError::Unknown {
             text: text.into(),
             name: name.into(),
         })?;
-        let numbers: Option<Vec<f64>> = words
-            .map(|word| word.parse().ok().filter(|number: &f64| number.is_finite()))
-            .collect();
-        let (x_m, y_m, heading_deg) = match numbers.as_deref() {
-            Some([x, y]) => (*x, *y, 0.0),
-            Some([x, y, heading]) => (*x, *y, *heading),
+        let (centre_m, heading_deg) = match finite_numbers(words).as_deref() {
+            Some([x_m, y_m]) => ([*x_m, *y_m], 0.0),
+            Some([x_m, y_m, heading_deg]) => ([*x_m, *y_m], *heading_deg),
             _ => return Err(malformed()),
         };
         Ok(Self {
             kind,
-            x_m,
-            y_m,
-            yaw_rad: heading_deg.to_radians(),
+            centre_m,
+            heading_deg,
         })
+    }
+}
+
+impl fmt::Display for Obstacle {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (name, [x_m, y_m], heading_deg) = (self.kind.name, self.centre_m, self.heading_deg);
+        write!(formatter, "{name} {x_m} {y_m} {heading_deg}")
     }
 }
 
@@ -143,24 +167,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_entry_is_a_name_a_position_and_an_optional_heading() {
-        let obstacle = Obstacle::parse("  cone 1.5 -2e1 ").unwrap();
+    fn an_obstacle_is_a_name_a_position_and_an_optional_heading() {
+        let cone: Obstacle = serde_json::from_str("\"  cone 1.5 -2e1 \"").unwrap();
         assert_eq!(
-            (obstacle.kind.name, obstacle.x_m, obstacle.y_m, obstacle.yaw_rad),
-            ("cone", 1.5, -20.0, 0.0)
+            (cone.kind.name, cone.centre_m, cone.heading_deg),
+            ("cone", [1.5, -20.0], 0.0)
         );
-        let turned = Obstacle::parse("parked_car 0 0 -90").unwrap();
-        assert!((turned.yaw_rad + std::f64::consts::FRAC_PI_2).abs() < 1e-12);
+        let car: Obstacle = "parked_car 0 0.1 -90".parse().unwrap();
+        let text = serde_json::to_string(&car).unwrap();
+        assert_eq!(text, "\"parked_car 0 0.1 -90\"");
+        assert_eq!(serde_json::from_str::<Obstacle>(&text).unwrap(), car);
     }
 
     #[test]
-    fn a_wrong_entry_is_named_with_the_known_props() {
-        let error = Obstacle::parse("cnoe 1 2").unwrap_err();
-        assert_eq!(
-            error.to_string(),
-            "`scene.obstacles`: \"cnoe 1 2\" names no known prop (\"cnoe\")"
-        );
-        assert!(error.help().contains("cone, bollard, barrier"));
+    fn the_error_on_a_wrong_obstacle_names_it() {
+        let error = "cnoe 1 2".parse::<Obstacle>().unwrap_err();
+        assert_eq!(error.to_string(), "\"cnoe 1 2\" names no known prop (\"cnoe\")");
         for text in [
             "",
             "cone",
@@ -170,11 +192,10 @@ mod tests {
             "cone NaN 2",
             "cone inf 2",
         ] {
-            assert!(
-                matches!(Obstacle::parse(text), Err(ObstacleError::Malformed { .. })),
-                "{text}"
-            );
+            let malformed = ObstacleError::Malformed { text: text.into() };
+            assert_eq!(text.parse::<Obstacle>(), Err(malformed));
         }
+        assert_eq!("unicorn".parse::<PropName>(), Err(PropNameError("unicorn".into())));
     }
 
     #[test]

@@ -358,7 +358,9 @@ mod tests {
     fn maps(seed: u64, most: u64, kinds: &serde_json::Value, stages: &[usize]) -> Vec<usize> {
         let curriculum = CurriculumConfig {
             stages: serde_json::from_value(kinds.clone()).unwrap(),
-            maps: ["a.net.xml", "b.net.xml", "some/c.sumocfg"].map(str::to_owned).to_vec(),
+            maps: ["a.net.xml", "b.net.xml", "some/c.sumocfg"]
+                .map(|map| map.parse().unwrap())
+                .to_vec(),
             ..CurriculumConfig::default()
         };
         let mut plan = CurriculumPlan::new(&lengths(most, 0, 1), &curriculum, seed);
@@ -386,7 +388,9 @@ mod tests {
         let kinds = serde_json::json!([{"cavs": 1, "maps": ["a", "b", "c"], "map_choice": "random", "restart": false}]);
         let curriculum = CurriculumConfig {
             stages: serde_json::from_value(kinds).unwrap(),
-            maps: ["a.net.xml", "b.net.xml", "c.net.xml"].map(str::to_owned).to_vec(),
+            maps: ["a.net.xml", "b.net.xml", "c.net.xml"]
+                .map(|map| map.parse().unwrap())
+                .to_vec(),
             ..CurriculumConfig::default()
         };
         let mut plan = CurriculumPlan::new(&lengths(20, 2, 1), &curriculum, 5);

@@ -46,7 +46,7 @@ fn config() -> Config {
     let mut config = quiet();
     config.observation.fields = vec![Field::GnssX, Field::GnssY];
     config.gnss.bias_m = [0.0, 2.0, 0.0];
-    config.curriculum.maps = vec!["town".into(), "far.net.xml".into()];
+    config.curriculum.maps = ["town", "far.net.xml"].map(|map| map.parse().unwrap()).into();
     config.curriculum.stages = serde_json::from_value(serde_json::json!([
         {"cavs": 1, "maps": ["town", "far"]},
         {"cavs": 1, "maps": ["far"], "noise": 3.0},

@@ -56,7 +56,7 @@ struct CoreReport {
 /// Mirrors until the last tick of the run, or until the process is asked to stop.
 ///
 /// # Errors
-/// The scene's files or obstacles are wrong, a port fails, or what SUMO sent cannot be mirrored.
+/// The scene's files are wrong, a port fails, or what SUMO sent cannot be mirrored.
 pub fn run(run_file: &Path) -> Result<(), Failure> {
     let mut membership = RunMembership::join(run_file, Process::SimCore)?;
     let metas = membership.subscriber(Channel::TrafficMeta)?;
@@ -104,7 +104,7 @@ impl CoreProcess {
         let state: CoreState = membership.stored_episode_state()?.unwrap_or_default();
         let contacts = ContactReporter::open(&membership, &scenes, state.contacts)?;
         // Viewers see the run's own map, and heroes have no other.
-        let scene = scenes.first().cloned().unwrap_or_default();
+        let scene = Arc::clone(&scenes[0]);
         draw_chart(&membership, &scene)?;
         let actions = match membership.run.config.drives() {
             true => Some(HeroPorts::open(&mut membership, scene)?),

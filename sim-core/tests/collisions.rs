@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use ipc_schema::{
     event::{Collision, Struck},
-    props::Obstacle,
+    props::PropKind,
     traffic::{Kind, id_hash},
     world::{COLLIDED, VehicleState},
 };
@@ -295,7 +295,7 @@ fn buildings_and_obstacles_are_struck_where_they_stand() {
         0.0,
         6.0,
     );
-    let cone = Prop::new(&Obstacle::parse("cone 5 -20").unwrap(), 0.0);
+    let cone = Prop::new(PropKind::by_name("cone").unwrap(), [5.0, -20.0], 0.0, 0.0);
     let mut detector = CollisionDetector::new(Arc::new(Scene::new(
         Road::default(),
         house.into_iter().collect(),

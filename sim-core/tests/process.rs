@@ -50,7 +50,7 @@ impl Run {
         let net_file = run_dir.join("a.net.xml");
         std::fs::write(&net_file, "<net></net>").unwrap();
         let mut config: Config = serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).unwrap();
-        config.scene.obstacles = vec![OBSTACLE.into()];
+        config.scene.obstacles = vec![OBSTACLE.parse().unwrap()];
         change(&mut config);
         let file = RunFile {
             schema_version: SCHEMA_VERSION,

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use ipc_schema::{
-    config::{Config, CurriculumConfig, TOWN, map_name},
+    config::{Config, CurriculumConfig, CurriculumMap},
     run::{MapInfo, RunMap, SceneFiles, Source},
 };
 
@@ -14,18 +14,22 @@ use crate::{failure::Exit, install::Install, scenario, town};
 /// # Errors
 /// A file does not exist.
 pub fn locate(curriculum: &mut CurriculumConfig) -> Result<(), Exit> {
-    for entry in curriculum.maps.iter_mut().filter(|entry| *entry != TOWN) {
-        let path = std::path::absolute(&*entry).map_err(|error| Exit::io("resolve", Path::new(&*entry), &error))?;
-        if !path.is_file() {
+    for map in &mut curriculum.maps {
+        let CurriculumMap::File { path, .. } = map else {
+            continue;
+        };
+        let absolute = std::path::absolute(&*path).map_err(|error| Exit::io("resolve", path, &error))?;
+        if !absolute.is_file() {
             return Err(Exit::config(
                 format!(
-                    "`curriculum.maps` has \"{entry}\", but {} is not a file",
-                    path.display()
+                    "`curriculum.maps` has \"{}\", but {} is not a file",
+                    path.display(),
+                    absolute.display()
                 ),
                 "correct the path: it is relative to the directory that caraware is started in",
             ));
         }
-        *entry = path.to_string_lossy().into_owned();
+        *path = absolute;
     }
     Ok(())
 }
@@ -36,24 +40,19 @@ pub fn locate(curriculum: &mut CurriculumConfig) -> Result<(), Exit> {
 /// A file cannot be read, a net lacks what it needs, or the town cannot be built.
 pub fn build(install: &Install, config: &Config, directory: &Path) -> Result<Vec<RunMap>, Exit> {
     let origin = config.map.origin_latitude_deg.zip(config.map.origin_longitude_deg);
-    let town = [TOWN.to_owned()];
-    let entries = match config.curriculum.maps.as_slice() {
-        [] => &town,
-        entries => entries,
-    };
-    let map = |entry: &String| {
-        let (source, scene_files) = match entry.as_str() {
-            TOWN => built_town(install, directory)?,
-            file => user_map(Path::new(file), directory)?,
+    let map = |map: &CurriculumMap| {
+        let (source, scene_files) = match map {
+            CurriculumMap::Town => built_town(install, directory)?,
+            CurriculumMap::File { path, .. } => user_map(path, directory)?,
         };
         Ok(RunMap {
-            name: map_name(entry).unwrap_or(entry).to_owned(),
+            name: map.name().to_owned(),
             info: scenario::map_info(&scene_files.net_file, origin)?,
             source,
             scene_files,
         })
     };
-    entries.iter().map(map).collect()
+    config.curriculum.run_maps().iter().map(map).collect()
 }
 
 /// Builds the town. SUMO and the scene use the same files.
@@ -144,14 +143,15 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let net = folder.path().join("here.net.xml");
         std::fs::write(&net, "").unwrap();
-        let entry = net.to_string_lossy().into_owned();
+        let here: CurriculumMap = net.to_string_lossy().parse().unwrap();
+        let maps = vec![CurriculumMap::Town, here];
         let mut curriculum = CurriculumConfig {
-            maps: vec![TOWN.to_owned(), entry.clone()],
+            maps: maps.clone(),
             ..CurriculumConfig::default()
         };
         locate(&mut curriculum).unwrap();
-        assert_eq!(curriculum.maps, [TOWN.to_owned(), entry]);
-        curriculum.maps.push("nowhere/city.sumocfg".into());
+        assert_eq!(curriculum.maps, maps);
+        curriculum.maps.push("nowhere/city.sumocfg".parse().unwrap());
         let message = format!("{:?}", locate(&mut curriculum).unwrap_err());
         assert!(
             message.contains("`curriculum.maps`") && message.contains("nowhere/city.sumocfg"),

@@ -412,10 +412,10 @@ fn assemble(
         _ => MapInputs::of_maps(maps::build(install, &config, &run_dir.path.join("map"))?)?,
     };
     let claim = RunClaim::new(&run_dir.path)?;
-    let config_hash = config::hash(&config);
+    let config_hash = config::hash(&config)?;
     let path = run_dir.path.join("config.toml");
-    std::fs::write(&path, format!("# BLAKE3 {config_hash}\n{}", config::to_toml(&config)))
-        .map_err(|error| Exit::io("write", &path, &error))?;
+    let text = format!("# BLAKE3 {config_hash}\n{}", config::to_toml(&config)?);
+    std::fs::write(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
     let run = RunFile {
         schema_version: SCHEMA_VERSION,
         env_index: 0,

@@ -4,10 +4,10 @@ use std::{
     io::ErrorKind,
     net::{TcpListener, ToSocketAddrs as _},
     os::unix::fs::PermissionsExt as _,
-    path::Path,
+    path::PathBuf,
 };
 
-use ipc_schema::config::FanoutConfig;
+use ipc_schema::config::{Commander, EndpointProtocol, FanoutConfig, FanoutEndpoint};
 
 use crate::{display::notice, failure::Exit};
 
@@ -30,7 +30,9 @@ pub fn check(fanout: &mut FanoutConfig) -> Result<(), Exit> {
         ("tls_private_key", &mut fanout.tls_private_key),
         ("tls_client_ca", &mut fanout.tls_client_ca),
     ] {
-        resolve_readable(key, path)?;
+        if let Some(path) = path {
+            resolve_readable(key, path)?;
+        }
     }
     check_secrets(fanout)?;
     check_users(fanout)
@@ -39,30 +41,22 @@ pub fn check(fanout: &mut FanoutConfig) -> Result<(), Exit> {
 /// Checks the endpoint. If the default one is in use, a free port takes its place.
 fn check_endpoint(fanout: &mut FanoutConfig) -> Result<(), Exit> {
     let listen = fanout.listen.clone();
-    let encrypted = listen.strip_prefix("tls/");
-    let address = encrypted.or_else(|| listen.strip_prefix("tcp/")).ok_or_else(|| {
-        Exit::config(
-            format!("`fanout.listen` = \"{listen}\" is not an endpoint"),
-            "write tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or tls/HOST:PORT",
-        )
-    })?;
-    let has_certificate = [&fanout.tls_certificate, &fanout.tls_private_key].map(|path| !path.is_empty());
-    match (encrypted, has_certificate) {
-        (Some(_), [true, true]) | (None, _) => {}
-        (Some(_), _) => {
-            return Err(Exit::config(
-                format!("`fanout.listen` = \"{listen}\" needs a certificate"),
-                "set fanout.tls_certificate and fanout.tls_private_key; docs/remote.md shows how openssl makes them",
-            ));
-        }
+    let is_encrypted = listen.protocol == EndpointProtocol::Tls;
+    let has_certificate = fanout.tls_certificate.is_some() && fanout.tls_private_key.is_some();
+    if is_encrypted && !has_certificate {
+        return Err(Exit::config(
+            format!("`fanout.listen` = \"{listen}\" needs a certificate"),
+            "set fanout.tls_certificate and fanout.tls_private_key; docs/remote.md shows how openssl makes them",
+        ));
     }
-    if encrypted.is_none() && !fanout.tls_client_ca.is_empty() {
+    if !is_encrypted && fanout.tls_client_ca.is_some() {
         return Err(Exit::config(
             "`fanout.tls_client_ca` requires client certificates, which tcp does not support",
             "listen on tls/HOST:PORT, or set fanout.tls_client_ca = \"\"",
         ));
     }
-    if is_beyond_loopback(address) && fanout.users.is_empty() && fanout.tls_client_ca.is_empty() {
+    let address = listen.address();
+    if is_beyond_loopback(&address) && fanout.users.is_none() && fanout.tls_client_ca.is_none() {
         return Err(Exit::config(
             format!("`fanout.listen` = \"{listen}\" would admit viewers from other machines without authentication"),
             "list the users in fanout.users, or require certificates with fanout.tls_client_ca (docs/remote.md); or listen on 127.0.0.1 \
@@ -77,13 +71,17 @@ fn check_endpoint(fanout: &mut FanoutConfig) -> Result<(), Exit> {
     };
     match TcpListener::bind(address) {
         Ok(_) => Ok(()),
-        Err(error) if error.kind() == ErrorKind::AddrInUse && listen == DEFAULT_ENDPOINT => {
+        Err(error) if error.kind() == ErrorKind::AddrInUse && listen.to_string() == DEFAULT_ENDPOINT => {
             let free = TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr());
             let free = free.map_err(refuse)?;
             notice(&format!(
                 "viewers connect to tcp/{free}: another run or program uses {DEFAULT_ENDPOINT}"
             ));
-            fanout.listen = format!("tcp/{free}");
+            fanout.listen = FanoutEndpoint {
+                protocol: EndpointProtocol::Tcp,
+                host: free.ip().to_string(),
+                port: free.port(),
+            };
             Ok(())
         }
         Err(error) => Err(refuse(error)),
@@ -97,31 +95,26 @@ fn is_beyond_loopback(address: &str) -> bool {
     })
 }
 
-/// Makes the path absolute and checks that the file can be opened. An empty path stays empty.
-fn resolve_readable(key: &str, path: &mut String) -> Result<(), Exit> {
-    if path.is_empty() {
-        return Ok(());
-    }
-    let given = Path::new(&*path);
-    let absolute = std::path::absolute(given).map_err(|error| Exit::io("resolve", given, &error))?;
+/// Makes the path absolute and checks that the file can be opened.
+fn resolve_readable(key: &str, path: &mut PathBuf) -> Result<(), Exit> {
+    let absolute = std::path::absolute(&*path).map_err(|error| Exit::io("resolve", path, &error))?;
     std::fs::File::open(&absolute).map_err(|error| {
         Exit::config(
-            format!("`fanout.{key}` = \"{path}\" cannot be read: {error}"),
+            format!("`fanout.{key}` = \"{}\" cannot be read: {error}", path.display()),
             "give a readable file; docs/remote.md shows how to make it",
         )
     })?;
-    *path = absolute.to_string_lossy().into_owned();
+    *path = absolute;
     Ok(())
 }
 
 /// Refuses files of passwords and private keys that other users can read.
 fn check_secrets(fanout: &FanoutConfig) -> Result<(), Exit> {
     for (key, path) in [("users", &fanout.users), ("tls_private_key", &fanout.tls_private_key)] {
-        if path.is_empty() {
-            continue;
-        }
-        let mode = std::fs::metadata(path).map_or(0, |data| data.permissions().mode());
-        if mode & 0o077 != 0 {
+        let Some(path) = path else { continue };
+        let data = std::fs::metadata(path).map_err(|error| Exit::io("read", path, &error))?;
+        if data.permissions().mode() & 0o077 != 0 {
+            let path = path.display();
             return Err(Exit::config(
                 format!("`fanout.{key}` = \"{path}\" can be read by other users of this machine"),
                 format!("chmod 600 {path}"),
@@ -134,15 +127,14 @@ fn check_secrets(fanout: &FanoutConfig) -> Result<(), Exit> {
 /// Checks that each line of the file of users is `user:password`, and that every commander is one of its users.
 fn check_users(fanout: &FanoutConfig) -> Result<(), Exit> {
     let mut known = Vec::new();
-    if !fanout.users.is_empty() {
-        let path = Path::new(&fanout.users);
+    if let Some(path) = &fanout.users {
         let text = std::fs::read_to_string(path).map_err(|error| Exit::io("read", path, &error))?;
         for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.is_empty()) {
             match line.split_once(':') {
                 Some((user, password)) if !user.is_empty() && !password.is_empty() => known.push(user.to_owned()),
                 _ => {
                     return Err(Exit::config(
-                        format!("{}, line {number}: not user:password", fanout.users),
+                        format!("{}, line {number}: not user:password", path.display()),
                         "write one line for each user, for example alice:her-password",
                     ));
                 }
@@ -150,18 +142,18 @@ fn check_users(fanout: &FanoutConfig) -> Result<(), Exit> {
         }
         if known.is_empty() {
             return Err(Exit::config(
-                format!("`fanout.users` = \"{}\" lists no user", fanout.users),
+                format!("`fanout.users` = \"{}\" lists no user", path.display()),
                 "write one line for each user, for example alice:her-password",
             ));
         }
     }
-    let unknown = fanout
-        .commanders
-        .iter()
-        .find(|name| *name != "*" && !known.contains(name));
+    let unknown = fanout.commanders.iter().find_map(|commander| match commander {
+        Commander::Named(name) if !known.contains(name) => Some(name),
+        Commander::Named(_) | Commander::EveryClient => None,
+    });
     match unknown {
         // With `tls_client_ca` a name may be the common name of a certificate, which is only known when a client connects.
-        Some(name) if fanout.tls_client_ca.is_empty() => Err(Exit::config(
+        Some(name) if fanout.tls_client_ca.is_none() => Err(Exit::config(
             format!("`fanout.commanders` lists \"{name}\", which is not a user of the file `fanout.users`"),
             "add a line for this user to that file, or remove the name; \"*\" means every user that may connect",
         )),
@@ -176,7 +168,7 @@ mod tests {
     fn message(change: impl FnOnce(&mut FanoutConfig)) -> Option<String> {
         let settings = crate::config::LayeredSettings::defaults().unwrap();
         let mut fanout = settings.validate().unwrap().fanout;
-        fanout.listen = "tcp/127.0.0.1:0".into();
+        fanout.listen = "tcp/127.0.0.1:0".parse().unwrap();
         change(&mut fanout);
         match check(&mut fanout) {
             Ok(()) => None,
@@ -185,11 +177,11 @@ mod tests {
         }
     }
 
-    fn file(directory: &tempfile::TempDir, name: &str, text: &str, mode: u32) -> String {
+    fn file(directory: &tempfile::TempDir, name: &str, text: &str, mode: u32) -> Option<PathBuf> {
         let path = directory.path().join(name);
         std::fs::write(&path, text).unwrap();
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
-        path.to_string_lossy().into_owned()
+        Some(path)
     }
 
     #[test]
@@ -199,19 +191,22 @@ mod tests {
         let pem = file(&directory, "pem", "", 0o600);
         for listen in ["tcp/0.0.0.0:0", "tcp/[::]:0", "tls/0.0.0.0:0"] {
             let open = message(|fanout| {
-                fanout.listen = listen.into();
+                fanout.listen = listen.parse().unwrap();
                 (fanout.tls_certificate, fanout.tls_private_key) = (pem.clone(), pem.clone());
             });
             assert!(open.unwrap().contains("without authentication"), "{listen}");
             let closed = message(|fanout| {
-                fanout.listen = listen.into();
+                fanout.listen = listen.parse().unwrap();
                 fanout.users = users.clone();
                 (fanout.tls_certificate, fanout.tls_private_key) = (pem.clone(), pem.clone());
             });
             assert_eq!(closed, None, "{listen}");
         }
         assert_eq!(message(|_| {}), None);
-        assert_eq!(message(|fanout| fanout.listen = "tcp/localhost:0".into()), None);
+        assert_eq!(
+            message(|fanout| fanout.listen = "tcp/localhost:0".parse().unwrap()),
+            None
+        );
     }
 
     #[test]
@@ -226,21 +221,18 @@ mod tests {
             assert!(message.contains(part), "{part}: {message}");
         };
         says("needs a certificate", &|fanout| {
-            fanout.listen = "tls/127.0.0.1:0".into()
+            fanout.listen = "tls/127.0.0.1:0".parse().unwrap();
         });
-        says("is not an endpoint", &|fanout| {
-            fanout.listen = "quic/127.0.0.1:0".into()
-        });
-        says("cannot be read", &|fanout| fanout.users = "/nowhere/users".into());
+        says("cannot be read", &|fanout| fanout.users = Some("/nowhere/users".into()));
         says("by other users", &|fanout| fanout.users = open.clone());
         says("line 1: not user:password", &|fanout| fanout.users = bare.clone());
         says("lists no user", &|fanout| fanout.users = empty.clone());
         says("is not a user of the file", &|fanout| {
             fanout.users = users.clone();
-            fanout.commanders = vec!["bob".into()];
+            fanout.commanders = vec![Commander::Named("bob".into())];
         });
         says("which tcp does not support", &|fanout| {
-            fanout.tls_client_ca = users.clone()
+            fanout.tls_client_ca = users.clone();
         });
     }
 }

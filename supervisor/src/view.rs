@@ -7,7 +7,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ipc_schema::{config::FanoutConfig, run::RunFile};
+use ipc_schema::{
+    config::{EndpointProtocol, FanoutConfig},
+    run::RunFile,
+};
 use rustix::process::{Pid, Signal, kill_process_group};
 
 use crate::{
@@ -98,16 +101,10 @@ impl ViewTarget {
             ));
         }
         Ok(Self {
-            endpoint: endpoint_to_connect(&run.config.fanout.listen),
+            endpoint: run.config.fanout.listen.on_this_machine().to_string(),
             run: Some(run.name.clone()),
         })
     }
-}
-
-/// The endpoint that a viewer on this machine connects to. A wildcard address can be listened on but not connected to, so the
-/// loopback address replaces it.
-fn endpoint_to_connect(listen: &str) -> String {
-    listen.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 }
 
 /// True for `tcp/host:port` and other protocols in this form.
@@ -177,17 +174,15 @@ impl ViewerRequest {
                 )),
             };
         };
-        let (users, certificates) = (!fanout.users.is_empty(), !fanout.tls_client_ca.is_empty());
+        let (users, certificates) = (fanout.users.is_some(), fanout.tls_client_ca.is_some());
+        let is_encrypted = fanout.listen.protocol == EndpointProtocol::Tls;
         let missing = [
             (users && credentials.user.is_none(), "--user NAME --password-file FILE"),
             (
                 certificates && credentials.certificate.is_none(),
                 "--certificate FILE --key FILE",
             ),
-            (
-                fanout.listen.starts_with("tls/") && credentials.ca.is_none(),
-                "--ca FILE",
-            ),
+            (is_encrypted && credentials.ca.is_none(), "--ca FILE"),
         ];
         let missing: Vec<&str> = missing
             .iter()
@@ -291,17 +286,6 @@ mod tests {
             "a/b",
         ] {
             assert!(!is_endpoint(other), "{other}");
-        }
-    }
-
-    #[test]
-    fn a_viewer_connects_to_the_loopback_address_of_a_wildcard() {
-        for (listen, connect) in [
-            ("tls/0.0.0.0:7447", "tls/127.0.0.1:7447"),
-            ("tcp/[::]:7447", "tcp/[::1]:7447"),
-            ("tcp/10.0.0.0:7447", "tcp/10.0.0.0:7447"),
-        ] {
-            assert_eq!(endpoint_to_connect(listen), connect);
         }
     }
 

@@ -74,7 +74,7 @@ fn unknown_prop_as_obstacle() {
         ],
     );
     let said = refused(&workplace, &["simulate", "--set", "scene.obstacles=[\"cone here\"]"], 2);
-    assert_says(&said, &["\"cone here\" is not", "x and y in metres"]);
+    assert_says(&said, &["\"cone here\" is not", "its centre (m, world)"]);
     assert!(!workplace.path().join("runs").exists());
 }
 
@@ -92,6 +92,60 @@ fn vehicle_model_of_an_unknown_class() {
             "passenger, private",
         ],
     );
+}
+
+#[test]
+fn texts_that_cannot_be_read() {
+    let workplace = Workplace::new();
+    for (table, entry, says, allowed) in [
+        (
+            "scene",
+            "meshes = [\"wall.obj 1 two\"]",
+            "`scene.meshes`: \"wall.obj 1 two\" is not",
+            "file.obj x y",
+        ),
+        (
+            "lidar",
+            "pattern = \"vlp17\"",
+            "`lidar.pattern` cannot be \"vlp17\"",
+            "\"vlp16\", \"hdl32e\"",
+        ),
+        (
+            "lidar",
+            "interest_props = [\"unicorn\"]",
+            "`lidar.interest_props`: \"unicorn\" names no known prop",
+            "cone, bollard",
+        ),
+        (
+            "fanout",
+            "listen = \"quic/127.0.0.1:7447\"",
+            "`fanout.listen`: \"quic/127.0.0.1:7447\" is no endpoint",
+            "tls/HOST:PORT",
+        ),
+        (
+            "trainer",
+            "network = \"mlpp\"",
+            "`trainer.network`: \"mlpp\" is neither",
+            "package.module:Class",
+        ),
+        (
+            "trainer",
+            "device = \"gpu\"",
+            "`trainer.device` cannot be \"gpu\"",
+            "\"cpu\", \"auto\"",
+        ),
+        (
+            "trainer",
+            "matmul_precision = \"float16\"",
+            "`trainer.matmul_precision` cannot be \"float16\"",
+            "\"float32\", \"bfloat16\"",
+        ),
+    ] {
+        workplace.write("my.toml", &format!("[{table}]\n{entry}\n"));
+        let said = refused(&workplace, &["simulate", "my.toml"], 2);
+        assert_says(&said, &["my.toml:2", says, allowed]);
+    }
+    assert!(!workplace.path().join("runs").exists());
 }
 
 #[test]

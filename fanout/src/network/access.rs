@@ -3,12 +3,15 @@
 //! Access control is always on and denies by default. Every client that may connect may subscribe to [`READ`] and query it; only
 //! `fanout.commanders` may query [`COMMAND`]; no client may write.
 
-use std::sync::{
-    Mutex, PoisonError,
-    atomic::{AtomicU64, Ordering},
+use std::{
+    path::Path,
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
 };
 
-use ipc_schema::config::FanoutConfig;
+use ipc_schema::config::{Commander, EndpointProtocol, FanoutConfig};
 use serde_json::{Value, json};
 use tracing::{Event, Subscriber, field::Visit};
 use tracing_subscriber::layer::{Context, Layer};
@@ -17,8 +20,6 @@ use tracing_subscriber::layer::{Context, Layer};
 pub const READ: &str = "caraware/**";
 /// What commanders may query.
 pub const COMMAND: &str = "caraware-control/**";
-/// In `fanout.commanders`: every client that may connect.
-pub const EVERY_CLIENT: &str = "*";
 
 /// Time within which a client must identify itself, milliseconds. With a longer one, idle connections keep other clients out.
 const ACCEPT_TIMEOUT_MS: u32 = 3000;
@@ -30,10 +31,13 @@ pub fn settings(fanout: &FanoutConfig) -> Vec<(&'static str, String)> {
         ("transport/unicast/accept_timeout", json!(ACCEPT_TIMEOUT_MS)),
         ("access_control", access_control(&fanout.commanders)),
     ];
-    if !fanout.users.is_empty() {
-        settings.push(("transport/auth/usrpwd/dictionary_file", json!(fanout.users)));
+    if let Some(users) = &fanout.users {
+        settings.push((
+            "transport/auth/usrpwd/dictionary_file",
+            json!(users.display().to_string()),
+        ));
     }
-    if is_encrypted(&fanout.listen) {
+    if fanout.listen.protocol == EndpointProtocol::Tls {
         settings.push(("transport/link/tls", tls_settings(fanout)));
     }
     settings
@@ -42,26 +46,21 @@ pub fn settings(fanout: &FanoutConfig) -> Vec<(&'static str, String)> {
         .collect()
 }
 
-/// True if the endpoint is encrypted.
-#[must_use]
-pub fn is_encrypted(endpoint: &str) -> bool {
-    endpoint.starts_with("tls/")
-}
-
 fn tls_settings(fanout: &FanoutConfig) -> Value {
+    let text = |path: &Path| json!(path.display().to_string());
     let mut tls = json!({
-        "listen_certificate": fanout.tls_certificate,
-        "listen_private_key": fanout.tls_private_key,
+        "listen_certificate": fanout.tls_certificate.as_deref().map(text),
+        "listen_private_key": fanout.tls_private_key.as_deref().map(text),
         "so_sndbuf": 65536,
     });
-    if !fanout.tls_client_ca.is_empty() {
-        tls["root_ca_certificate"] = json!(fanout.tls_client_ca);
+    if let Some(authority) = &fanout.tls_client_ca {
+        tls["root_ca_certificate"] = text(authority);
         tls["enable_mtls"] = json!(true);
     }
     tls
 }
 
-fn access_control(commanders: &[String]) -> Value {
+fn access_control(commanders: &[Commander]) -> Value {
     let client_to_run = [
         "query",
         "declare_subscriber",
@@ -72,11 +71,16 @@ fn access_control(commanders: &[String]) -> Value {
     let mut subjects = vec![json!({ "id": "every-client" })];
     let mut policies = vec![json!({ "rules": ["ask-for-data", "send-data"], "subjects": ["every-client"] })];
     let command_rules = ["send-commands", "answer-commands"];
-    if commanders.iter().any(|name| name == EVERY_CLIENT) {
+    let names = commanders.iter().filter_map(|commander| match commander {
+        Commander::Named(name) => Some(name.as_str()),
+        Commander::EveryClient => None,
+    });
+    let names: Vec<&str> = names.collect();
+    if commanders.contains(&Commander::EveryClient) {
         policies.push(json!({ "rules": command_rules, "subjects": ["every-client"] }));
-    } else if !commanders.is_empty() {
-        subjects.push(json!({ "id": "users", "usernames": commanders }));
-        subjects.push(json!({ "id": "certificates", "cert_common_names": commanders }));
+    } else if !names.is_empty() {
+        subjects.push(json!({ "id": "users", "usernames": names }));
+        subjects.push(json!({ "id": "certificates", "cert_common_names": names }));
         policies.push(json!({ "rules": command_rules, "subjects": ["users", "certificates"] }));
     }
     let allow = |id: &str, flow: &str, messages: &[&str], key: &str| json!({ "id": id, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": [key] });
@@ -211,16 +215,16 @@ mod tests {
     fn fanout(listen: &str, commanders: &[&str]) -> FanoutConfig {
         let mut config: ipc_schema::config::Config =
             serde_json::from_str(include_str!("../../../ipc-schema/tests/town.json")).unwrap();
-        config.fanout.listen = listen.into();
-        config.fanout.commanders = commanders.iter().map(|&name| name.into()).collect();
+        config.fanout.listen = listen.parse().unwrap();
+        config.fanout.commanders = commanders.iter().map(|name| name.parse().unwrap()).collect();
         config.fanout
     }
 
     #[test]
     fn zenoh_takes_every_setting() {
         let mut tls = fanout("tls/127.0.0.1:7447", &["alice"]);
-        (tls.tls_certificate, tls.tls_private_key) = ("c.pem".into(), "k.pem".into());
-        (tls.tls_client_ca, tls.users) = ("ca.pem".into(), "users.txt".into());
+        (tls.tls_certificate, tls.tls_private_key) = (Some("c.pem".into()), Some("k.pem".into()));
+        (tls.tls_client_ca, tls.users) = (Some("ca.pem".into()), Some("users.txt".into()));
         for fanout in [
             fanout("tcp/127.0.0.1:7447", &[]),
             fanout("tcp/127.0.0.1:7447", &["*"]),

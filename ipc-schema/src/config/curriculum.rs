@@ -1,8 +1,13 @@
 //! Stages of training, each with its own population, noise, blackouts and maps, and a gate to the next.
 
+use std::{fmt, path::PathBuf, str::FromStr};
+
 use serde::{Deserialize, Serialize};
 
-use super::{Config, TrafficConfig};
+use super::{
+    Config, TrafficConfig,
+    text::{optional_path, serde_as_text},
+};
 use crate::{metric::PolicyMetric, sensor::SENSORS};
 
 /// Stages of training.
@@ -11,49 +16,117 @@ use crate::{metric::PolicyMetric, sensor::SENSORS};
 pub struct CurriculumConfig {
     /// In order; none = every training episode is as the rest of the configuration says.
     pub stages: Vec<StageConfig>,
-    /// `curriculum.jsonl` of a run whose stages a simulation without learner repeats; "" = none.
-    pub log: String,
-    /// Maps that stages choose from, each "town", a `.net.xml` or a `.sumocfg`; the first is the run's own, that of evaluations. None =
-    /// the town alone.
-    #[serde(default)]
-    pub maps: Vec<String>,
+    /// `curriculum.jsonl` of a run whose stages a simulation without learner repeats.
+    #[serde(with = "optional_path")]
+    pub log: Option<PathBuf>,
+    /// Maps that stages choose from; the first is the run's own, that of evaluations. None = the town alone.
+    pub maps: Vec<CurriculumMap>,
 }
 
-/// The project's own map.
-pub const TOWN: &str = "town";
+/// The name of the project's own map.
+const TOWN: &str = "town";
+/// The maps of a run that names none.
+const TOWN_ALONE: &[CurriculumMap] = &[CurriculumMap::Town];
 /// Endings of files that are maps.
 const MAP_ENDINGS: [&str; 3] = [".sumocfg", ".net.xml", ".net.xml.gz"];
 
-/// Name of a map in `curriculum.maps`: "town", or that of the file without its ending; `None` if it is neither.
-#[must_use]
-pub fn map_name(entry: &str) -> Option<&str> {
-    if entry == TOWN {
-        return Some(TOWN);
+/// A map that stages choose from. Configurations and run files write it as "town" or as a path; stages call it by its name.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum CurriculumMap {
+    /// The project's own map.
+    Town,
+    /// A `.net.xml` or a `.sumocfg`.
+    File {
+        /// The file.
+        path: PathBuf,
+        /// Its name without the ending.
+        name: String,
+    },
+}
+
+/// A text is no map.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("\"{0}\" is no map")]
+pub struct CurriculumMapError(pub String);
+
+impl CurriculumMap {
+    /// The name by which stages refer to it.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Town => TOWN,
+            Self::File { name, .. } => name,
+        }
     }
-    let file = entry.rsplit('/').next().unwrap_or(entry);
-    let name = MAP_ENDINGS.iter().find_map(|ending| file.strip_suffix(ending))?;
-    (!name.is_empty()).then_some(name)
+}
+
+serde_as_text!(CurriculumMap);
+
+impl FromStr for CurriculumMap {
+    type Err = CurriculumMapError;
+
+    fn from_str(text: &str) -> Result<Self, CurriculumMapError> {
+        if text == TOWN {
+            return Ok(Self::Town);
+        }
+        let file = text.rsplit_once('/').map_or(text, |(_, file)| file);
+        let name = MAP_ENDINGS.iter().find_map(|ending| file.strip_suffix(ending));
+        match name {
+            Some(name) if !name.is_empty() => Ok(Self::File {
+                path: text.into(),
+                name: name.to_owned(),
+            }),
+            _ => Err(CurriculumMapError(text.to_owned())),
+        }
+    }
+}
+
+impl fmt::Display for CurriculumMap {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Town => formatter.write_str(TOWN),
+            Self::File { path, .. } => path.display().fmt(formatter),
+        }
+    }
 }
 
 impl CurriculumConfig {
-    /// Names of the run's maps, in order; at least one.
+    /// The run's maps, in order; at least one.
     #[must_use]
-    pub fn map_names(&self) -> Vec<&str> {
+    pub fn run_maps(&self) -> &[CurriculumMap] {
         match self.maps.as_slice() {
-            [] => vec![TOWN],
-            maps => maps.iter().map(|entry| map_name(entry).unwrap_or(entry)).collect(),
+            [] => TOWN_ALONE,
+            maps => maps,
         }
     }
 
-    /// The maps that lessons of `stage` choose from, as indices into [`CurriculumConfig::map_names`]; at least one.
+    /// Names of the run's maps, in order; at least one.
+    #[must_use]
+    pub fn map_names(&self) -> Vec<&str> {
+        self.run_maps().iter().map(CurriculumMap::name).collect()
+    }
+
+    /// The first stage, counted from 1, that is on a map which the run does not have, and that map's name. `None` in a validated
+    /// configuration and in a run file that was read.
+    #[must_use]
+    pub fn unknown_map(&self) -> Option<(usize, &str)> {
+        let names = self.map_names();
+        (1..).zip(&self.stages).find_map(|(number, stage)| {
+            let unknown = stage.maps.iter().find(|name| !names.contains(&name.as_str()));
+            unknown.map(|name| (number, name.as_str()))
+        })
+    }
+
+    /// The maps that lessons of `stage` choose from, as indices into [`CurriculumConfig::map_names`]; at least one. The run has all
+    /// of them ([`CurriculumConfig::unknown_map`]).
     #[must_use]
     pub fn maps_of(&self, stage: &StageConfig) -> Vec<usize> {
+        if stage.maps.is_empty() {
+            return vec![0];
+        }
         let names = self.map_names();
-        let known = stage.maps.iter();
-        let known: Vec<usize> = known
-            .filter_map(|name| names.iter().position(|known| known == name))
-            .collect();
-        if known.is_empty() { vec![0] } else { known }
+        let place = |name: &String| names.iter().position(|known| known == name);
+        stage.maps.iter().filter_map(place).collect()
     }
 }
 
@@ -137,5 +210,41 @@ impl Config {
             (sensor.scale_blackouts)(&mut config, stage.blackout);
         }
         config
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_map_is_the_town_or_a_file_that_is_called_by_its_name() {
+        assert_eq!("town".parse(), Ok(CurriculumMap::Town));
+        for text in ["city.net.xml", "nets/city.net.xml.gz", "/nets/city.sumocfg"] {
+            let map: CurriculumMap = text.parse().unwrap();
+            assert_eq!((map.name(), map.to_string().as_str()), ("city", text));
+        }
+        for text in ["", "village", "city.xml", "nets/.net.xml", "nets/"] {
+            assert_eq!(text.parse::<CurriculumMap>(), Err(CurriculumMapError(text.to_owned())));
+        }
+    }
+
+    #[test]
+    fn a_stage_on_a_map_that_the_run_does_not_have_is_found() {
+        let stage = |maps: &[&str]| serde_json::from_value(serde_json::json!({ "cavs": 1, "maps": maps })).unwrap();
+        let mut curriculum = CurriculumConfig {
+            maps: vec![CurriculumMap::Town, "city.net.xml".parse().unwrap()],
+            stages: vec![stage(&[]), stage(&["city", "town"])],
+            ..CurriculumConfig::default()
+        };
+        assert_eq!(curriculum.unknown_map(), None);
+        let places: Vec<_> = curriculum
+            .stages
+            .iter()
+            .map(|stage| curriculum.maps_of(stage))
+            .collect();
+        assert_eq!(places, [vec![0], vec![1, 0]]);
+        curriculum.stages.push(stage(&["village"]));
+        assert_eq!(curriculum.unknown_map(), Some((3, "village")));
     }
 }

@@ -1,8 +1,10 @@
 //! Where vehicles are sensed: everywhere, inside a polygon, or around a point.
 
-use std::str::FromStr;
+use std::{fmt, str::FromStr};
 
 use serde::{Deserialize, Serialize};
+
+use super::text::{finite_numbers, serde_as_text};
 
 /// The part of the map in which vehicles are sensed; all of it is simulated.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -17,8 +19,7 @@ pub struct RegionConfig {
 }
 
 /// A corner of a polygon: x and y, metres, world. Configurations and run files write it as "x y".
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RegionCorner(pub [f64; 2]);
 
 /// A text is not a corner.
@@ -26,32 +27,23 @@ pub struct RegionCorner(pub [f64; 2]);
 #[error("\"{0}\" is no corner")]
 pub struct RegionCornerError(pub String);
 
+serde_as_text!(RegionCorner);
+
 impl FromStr for RegionCorner {
     type Err = RegionCornerError;
 
     fn from_str(text: &str) -> Result<Self, RegionCornerError> {
-        let numbers: Option<Vec<f64>> = text
-            .split_whitespace()
-            .map(|word| word.parse().ok().filter(|number: &f64| number.is_finite()))
-            .collect();
-        match numbers.as_deref() {
+        match finite_numbers(text.split_whitespace()).as_deref() {
             Some([x_m, y_m]) => Ok(Self([*x_m, *y_m])),
             _ => Err(RegionCornerError(text.to_owned())),
         }
     }
 }
 
-impl TryFrom<String> for RegionCorner {
-    type Error = RegionCornerError;
-
-    fn try_from(text: String) -> Result<Self, RegionCornerError> {
-        text.parse()
-    }
-}
-
-impl From<RegionCorner> for String {
-    fn from(RegionCorner([x_m, y_m]): RegionCorner) -> Self {
-        format!("{x_m} {y_m}")
+impl fmt::Display for RegionCorner {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self([x_m, y_m]) = self;
+        write!(formatter, "{x_m} {y_m}")
     }
 }
 

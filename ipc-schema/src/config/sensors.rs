@@ -1,6 +1,11 @@
 //! Sensors, their blackouts, and the weather they work in. Equations and sources: docs/sensor-models.md.
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
+
+use super::{LidarPattern, text::optional_path};
+use crate::props::PropName;
 
 /// GNSS receiver.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -177,10 +182,11 @@ pub enum LidarAxes {
 pub struct LidarConfig {
     /// Vehicles that carry one: those in the first so many slots.
     pub vehicles: u32,
-    /// "uniform", a unit by name, or "table".
-    pub pattern: String,
+    /// Which rays it fires.
+    pub pattern: LidarPattern,
     /// Ray table of pattern "table": a CSV file with columns azimuth_deg and elevation_deg, a line for each ray.
-    pub ray_table: String,
+    #[serde(with = "optional_path")]
+    pub ray_table: Option<PathBuf>,
     /// Lasers one above the other (pattern "uniform").
     pub channels: u32,
     /// Points per second of all channels together.
@@ -213,8 +219,8 @@ pub struct LidarConfig {
     pub rolling_shutter: bool,
     /// What a scan holds.
     pub mode: LidarMode,
-    /// Props that are of interest beside vehicles and persons, by name.
-    pub interest_props: Vec<String>,
+    /// Props that are of interest beside vehicles and persons.
+    pub interest_props: Vec<PropName>,
     /// Axes of the points.
     pub axes: LidarAxes,
     /// Length of a blackout, shortest and longest, seconds; [0, 0] = none.
@@ -224,20 +230,6 @@ pub struct LidarConfig {
 }
 
 impl LidarConfig {
-    /// Names of patterns.
-    pub const PATTERNS: [&str; 10] = [
-        "uniform",
-        "vlp16",
-        "hdl32e",
-        "hdl64e",
-        "pandar40p",
-        "os1_32",
-        "os1_64",
-        "os1_128",
-        "vls128",
-        "table",
-    ];
-
     /// Rays fired in a tick of `tick_s` seconds.
     #[must_use]
     #[expect(
@@ -253,14 +245,7 @@ impl LidarConfig {
     /// Lasers that fire together: a column of the scan. A table fires as it says.
     #[must_use]
     pub fn lasers(&self) -> u32 {
-        match self.pattern.as_str() {
-            "vlp16" => 16,
-            "hdl32e" | "os1_32" => 32,
-            "pandar40p" => 40,
-            "hdl64e" | "os1_64" => 64,
-            "os1_128" | "vls128" => 128,
-            _ => self.channels,
-        }
+        self.pattern.lasers().unwrap_or(self.channels)
     }
 }
 

@@ -2,20 +2,21 @@
 
 use crate::lidar_city::{Moves, SUB_STEPS, traffic};
 use crate::{DATA, car, lidar_city, range, rectangle, scan, small};
+use ipc_schema::config::LidarPattern;
 use ipc_schema::pointcloud::{GROUND, LidarPoint, Scan};
 use sensor_daemon::sensors::lidar::{LidarModel, ScanPath, ScanScratch, Targets};
 use sim_core::scene::{Road, Scene};
 
 /// The bits of a scan with noise, loss, weather, persons and wild motion at once.
-fn busy(path: ScanPath, pattern: &str, order: bool, scratch: &mut ScanScratch) -> Vec<u8> {
+fn busy(path: ScanPath, pattern: LidarPattern, order: bool, scratch: &mut ScanScratch) -> Vec<u8> {
     let mut config = lidar_city::config();
-    config.lidar.pattern = pattern.into();
-    config.lidar.ray_table = format!("{DATA}rays.csv");
+    config.lidar.pattern = pattern;
+    config.lidar.ray_table = Some(format!("{DATA}rays.csv").into());
     config.lidar.dropoff = 0.1;
     config.weather.rain_mmph = 2.0;
     config.weather.sunlight = 0.5;
     let scene = lidar_city::scene(500, 1);
-    let moves = if pattern == "uniform" {
+    let moves = if pattern == LidarPattern::Uniform {
         Moves::Straight
     } else {
         Moves::Wildly
@@ -42,12 +43,13 @@ fn busy(path: ScanPath, pattern: &str, order: bool, scratch: &mut ScanScratch) -
 
 #[test]
 fn every_path_gives_the_same_bits() {
-    for pattern in ["uniform", "hdl64e", "pandar40p", "table"] {
+    use LidarPattern::{Hdl64e, Pandar40p, Table, Uniform};
+    for pattern in [Uniform, Hdl64e, Pandar40p, Table] {
         let expected = busy(ScanPath::Plain, pattern, true, &mut ScanScratch::default());
         for path in ScanPath::ALL.into_iter().filter(|path| path.is_here()) {
             assert!(
                 busy(path, pattern, true, &mut ScanScratch::default()) == expected,
-                "{path:?} {pattern}"
+                "{path:?} {pattern:?}"
             );
         }
     }
@@ -56,10 +58,10 @@ fn every_path_gives_the_same_bits() {
 #[test]
 fn neither_the_order_of_targets_nor_used_scratch_matters() {
     let mut scratch = ScanScratch::default();
-    let expected = busy(ScanPath::best(), "uniform", true, &mut scratch);
-    let _ = busy(ScanPath::best(), "os1_128", true, &mut scratch);
-    assert!(busy(ScanPath::best(), "uniform", true, &mut scratch) == expected);
-    assert!(busy(ScanPath::best(), "uniform", false, &mut scratch) == expected);
+    let expected = busy(ScanPath::best(), LidarPattern::Uniform, true, &mut scratch);
+    let _ = busy(ScanPath::best(), LidarPattern::Os1_128, true, &mut scratch);
+    assert!(busy(ScanPath::best(), LidarPattern::Uniform, true, &mut scratch) == expected);
+    assert!(busy(ScanPath::best(), LidarPattern::Uniform, false, &mut scratch) == expected);
 }
 
 #[test]

@@ -6,7 +6,7 @@ use ipc_schema::{
     run::RunFile,
 };
 
-use crate::models::catalogue::{ModelCatalogue, ModelCatalogueError};
+use crate::models::{catalogue::ModelCatalogue, parameters::ParameterError};
 
 /// Times of a run and limits of its vehicles.
 #[derive(Debug, Clone)]
@@ -28,7 +28,7 @@ impl MirrorSettings {
     ///
     /// # Errors
     /// A class is given a model that does not exist.
-    pub fn catalogue(&self) -> Result<ModelCatalogue, ModelCatalogueError> {
+    pub fn catalogue(&self) -> Result<ModelCatalogue, ParameterError> {
         ModelCatalogue::new(&self.vehicle, self.surface, self.sub_step_s())
     }
 

@@ -6,7 +6,7 @@ use std::{path::PathBuf, sync::Arc};
 
 use ipc_schema::{
     failure::{Failure, FailureKind},
-    props::{Obstacle, ObstacleError},
+    props::{Obstacle, PropKind},
     run::{MapInfo, RunFile, RunMap, SceneFiles},
 };
 
@@ -79,9 +79,6 @@ pub enum SceneError {
         #[source]
         source: GeodesyError,
     },
-    /// An entry of `scene.obstacles`.
-    #[error(transparent)]
-    Obstacle(#[from] ObstacleError),
 }
 
 impl From<SceneError> for Failure {
@@ -94,7 +91,6 @@ impl From<SceneError> for Failure {
             SceneError::Geodetic { .. } => {
                 "give polygons in net coordinates, or a net whose projection covers them".into()
             }
-            SceneError::Obstacle(error) => error.help(),
         };
         Self::from_error(FailureKind::Config, &error).with_help(help)
     }
@@ -114,7 +110,7 @@ impl Scene {
     /// Reads the scene of a run. A run without a net file has an empty one.
     ///
     /// # Errors
-    /// A file is unreadable or malformed, or an entry of `scene.obstacles` cannot be used.
+    /// A file is unreadable or malformed.
     pub fn of_run(run: &RunFile) -> Result<Self, SceneError> {
         Self::of_map(run, &run.scene_files, &run.map)
     }
@@ -131,8 +127,7 @@ impl Scene {
     fn of_map(run: &RunFile, files: &SceneFiles, map: &MapInfo) -> Result<Self, SceneError> {
         let config = &run.config.scene;
         let mut scene = Self::read(files, map, config.building_height_m)?;
-        let obstacles: Result<Vec<_>, _> = config.obstacles.iter().map(|text| Obstacle::parse(text)).collect();
-        let placed = obstacles?.iter().map(|obstacle| scene.prop(obstacle)).collect();
+        let placed = config.obstacles.iter().map(|obstacle| scene.prop(obstacle)).collect();
         scene.set_props(placed);
         let random = prop::beside_the_road(&scene, config.random_props, run.config.run.seed);
         let mut all = std::mem::take(&mut scene.props);
@@ -183,11 +178,15 @@ impl Scene {
         buildings.chain(self.props.iter().map(|prop| prop.body.bounds()))
     }
 
-    /// A prop at the position of an entry of the configuration, on the ground.
+    /// An obstacle of the configuration, on the ground.
     #[must_use]
     pub fn prop(&self, obstacle: &Obstacle) -> Prop {
-        let ground_m = ground_height_m(&self.road, [obstacle.x_m, obstacle.y_m]);
-        Prop::new(obstacle, ground_m)
+        self.prop_at(obstacle.kind, obstacle.centre_m, obstacle.heading_deg.to_radians())
+    }
+
+    /// A prop with its centre at `centre_m`, on the ground.
+    fn prop_at(&self, kind: &'static PropKind, centre_m: Point, yaw_rad: f64) -> Prop {
+        Prop::new(kind, centre_m, yaw_rad, ground_height_m(&self.road, centre_m))
     }
 
     /// The road surface.

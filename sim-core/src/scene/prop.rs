@@ -1,6 +1,6 @@
 //! Props: boxes from the catalogue, placed by the configuration or at random beside the road.
 
-use ipc_schema::props::{Obstacle, PROPS, PropKind};
+use ipc_schema::props::{PROPS, PropKind};
 use rand_chacha::{
     ChaCha8Rng,
     rand_core::{RngCore, SeedableRng},
@@ -30,15 +30,14 @@ pub struct Prop {
 }
 
 impl Prop {
-    /// A prop that stands at height `ground_m`.
+    /// A prop with its centre at `centre_m`, at height `ground_m`; `yaw_rad` is counter-clockwise from east.
     #[must_use]
-    pub fn new(obstacle: &Obstacle, ground_m: f64) -> Self {
-        let (sin, cos) = libm::sincos(obstacle.yaw_rad);
-        let kind = obstacle.kind;
+    pub fn new(kind: &'static PropKind, centre_m: Point, yaw_rad: f64, ground_m: f64) -> Self {
+        let (sin, cos) = libm::sincos(yaw_rad);
         Self {
             kind,
             body: OrientedBox {
-                centre_m: [obstacle.x_m, obstacle.y_m],
+                centre_m,
                 along: [cos, sin],
                 half_m: [0.5 * kind.length_m, 0.5 * kind.width_m],
                 z_m: [ground_m, ground_m + kind.height_m],
@@ -65,7 +64,8 @@ pub(super) fn beside_the_road(scene: &Scene, count: u32, seed: u64) -> Vec<Prop>
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         random.set_stream(number);
         let prop = (0..TRIES).find_map(|_| {
-            let prop = scene.prop(&lanes.draw(&mut random));
+            let (kind, centre_m, yaw_rad) = lanes.draw(&mut random);
+            let prop = scene.prop_at(kind, centre_m, yaw_rad);
             let reach_m = Prop::reach_m(prop.kind) + CLEARANCE_M;
             let off_road = scene.road().nearest(prop.body.centre_m, reach_m, |_| true).is_none();
             (off_road && neighbours.are_clear(scene, &placed, &prop)).then_some(prop)
@@ -109,8 +109,8 @@ impl<'a> OuterLanes<'a> {
         self.segments.is_empty()
     }
 
-    /// A prop beside a random place of a random lane, along the road or across it.
-    fn draw(&self, random: &mut ChaCha8Rng) -> Obstacle {
+    /// A random prop with its centre and heading in radians, beside a random place of a random lane.
+    fn draw(&self, random: &mut ChaCha8Rng) -> (&'static PropKind, Point, f64) {
         let kind = &PROPS[(random.next_u64() % PROPS.len() as u64) as usize];
         let total_m = self.segments.last().map_or(0.0, |segment| segment.2);
         let wanted_m = share(random) * total_m;
@@ -123,12 +123,8 @@ impl<'a> OuterLanes<'a> {
         let off_m = piece.half_width_m.unwrap_or(0.0) + Prop::reach_m(kind) + CLEARANCE_M + REACH_M * share(random);
         let left = left_of(a, b);
         let yaw_rad = libm::atan2(b[1] - a[1], b[0] - a[0]);
-        Obstacle {
-            kind,
-            x_m: at[0] + side * off_m * left[0],
-            y_m: at[1] + side * off_m * left[1],
-            yaw_rad,
-        }
+        let centre_m = [0, 1].map(|axis: usize| at[axis] + side * off_m * left[axis]);
+        (kind, centre_m, yaw_rad)
     }
 }
 

@@ -29,7 +29,7 @@ pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> MirrorSetti
 
 pub fn limits() -> config::VehicleConfig {
     config::VehicleConfig {
-        cav_model: config::VehicleModel::Kinematic,
+        cav_model: config::SingleTrackModel::Kinematic,
         ..preset::town().vehicle
     }
 }

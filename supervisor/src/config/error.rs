@@ -46,6 +46,16 @@ pub enum ConfigError {
         /// Where.
         place: SourceSpan,
     },
+    /// A text does not have the form of its key.
+    #[error("{}: `{}`: {reason}", place.line(), key.path)]
+    Text {
+        /// The key.
+        key: &'static ConfigKey,
+        /// The text and its fault.
+        reason: String,
+        /// Where.
+        place: SourceSpan,
+    },
     /// Two values contradict each other.
     #[error("{}: {message}", place.line())]
     Conflict {
@@ -81,6 +91,7 @@ impl ConfigError {
             | Self::UnknownKey { place, .. }
             | Self::RenamedKey { place, .. }
             | Self::Value { place, .. }
+            | Self::Text { place, .. }
             | Self::Conflict { place, .. } => Some(place),
             Self::Assignment { .. } | Self::File { .. } => None,
         }
@@ -97,7 +108,7 @@ impl ConfigError {
                 let meaning = keys::find(renamed_to).map_or("", |key| key.meaning);
                 format!("write `{renamed_to}`. {meaning} All keys: configs/README.md")
             }
-            Self::Value { key, .. } => {
+            Self::Value { key, .. } | Self::Text { key, .. } => {
                 let unit = if key.unit.is_empty() {
                     String::new()
                 } else {

@@ -1,9 +1,12 @@
 //! The table of configuration keys: name, kind, unit, range, meaning. Checks, `--set` and `configs/README.md` derive from it.
 
 use ipc_schema::{
+    config::LidarPattern,
     field::{FIELD_PRESETS, FIELDS},
     metric::PolicyMetric,
 };
+
+use super::text_form::TextForm;
 
 /// The values that a key allows.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,16 +29,18 @@ pub enum ValueKind {
     Flag,
     /// One of these words.
     Choice(&'static [&'static str]),
-    /// One of these words, or a Python class as `package.module:Class`.
-    ChoiceOrClass(&'static [&'static str]),
     /// Any text.
     Text,
+    /// A text of this form.
+    TextOf(TextForm),
     /// Observation fields: a preset by name or a list of field names.
     Fields,
     /// The name of a metric of the policy.
     Metric,
-    /// A list of texts, which may be empty.
+    /// A list of any texts, which may be empty.
     Texts,
+    /// A list of texts of this form, which may be empty.
+    TextsOf(TextForm),
     /// `count` numbers from `min` to `max`; one number stands for all of them.
     Floats {
         /// How many.
@@ -183,14 +188,14 @@ pub const KEYS: &[ConfigKey] = &[
     integer("episode.final_evaluations", "", 1, 1_000_000, "Evaluation episodes at the end of the run; their mean error is reported."),
     other("episode.whole_scenario", ValueKind::Flag, "Train on a `.sumocfg` unchanged: one episode with its own seed, to its own end."),
     other("curriculum.stages", ValueKind::Tables(STAGE_KEYS), "Stages of training in order, each a `[[curriculum.stages]]`; [] = none. Training then consists of lessons of `episode.ticks` ticks (or the stage's `ticks`), at most `episode.training_episodes` of them. Evaluations use the base configuration (docs/curriculum.md)."),
-    other("curriculum.maps", ValueKind::Texts, "Maps that stages choose from: \"town\", a `.net.xml`, or a `.sumocfg`, of which the net and the buildings are used; all with population control. Evaluations use the first. Predictions and normalised positions are in the smallest box that holds all maps. [] = [\"town\"]."),
+    other("curriculum.maps", ValueKind::TextsOf(TextForm::Map), "Maps that stages choose from: \"town\", a `.net.xml`, or a `.sumocfg`, of which the net and the buildings are used; all with population control. Evaluations use the first. Predictions and normalised positions are in the smallest box that holds all maps. [] = [\"town\"]."),
     other("curriculum.log", ValueKind::Text, "`curriculum.jsonl` of a run, whose stages `caraware simulate` repeats without a learner; \"\" = none."),
     other("task.kind", ValueKind::Choice(&["localisation", "driving"]), "Meaning of the trainer's output: a position for every connected vehicle, or steering and acceleration for every hero."),
     float("task.time_limit_s", "s", 0.1, 1e6, "Longest trajectory of a hero. Then it is truncated, and another hero starts."),
     other("vehicle.cav_model", ValueKind::Choice(&["kinematic", "dynamic"]), "Model of connected vehicles: without slip, or with tyres, load transfer, roll and pitch."),
     other("vehicle.other_model", ValueKind::Choice(&["kinematic", "dynamic"]), "Model of vehicles without sensors."),
     other("vehicle.hero_model", ValueKind::Choice(&["kinematic", "dynamic", "rigid_body"]), "Model of heroes; \"rigid_body\" is a body on four ray-cast wheels."),
-    other("vehicle.class_models", ValueKind::Texts, "Models by SUMO vehicle class, such as [\"truck=kinematic\", \"bus=dynamic\"]; they have precedence over the three above."),
+    other("vehicle.class_models", ValueKind::TextsOf(TextForm::ClassModel), "Models by SUMO vehicle class, such as [\"truck=kinematic\", \"bus=dynamic\"]; they have precedence over the three above."),
     float("vehicle.lane_change_s", "s", 0.1, 60.0, "Time over which SUMO's instantaneous lane change is spread."),
     float("vehicle.max_road_wheel_angle_rad", "rad", 0.05, 1.5, "Largest steering angle of the front wheels."),
     float("vehicle.max_road_wheel_rate_radps", "rad/s", 0.05, 20.0, "Largest rate of that angle."),
@@ -199,14 +204,14 @@ pub const KEYS: &[ConfigKey] = &[
     float("vehicle.steering_ratio", "", 1.0, 100.0, "Steering-wheel angle per road-wheel angle."),
     float("vehicle.resynchronise_m", "m", 0.1, 1000.0, "Tracking error (reference minus front bumper) above which a vehicle is resynchronised: set onto SUMO's position, flagged and counted."),
     float("vehicle.leave_path_m", "m", 0.1, 1000.0, "Distance that the reference may leave SUMO's path where that cannot be driven; above it the vehicle is resynchronised."),
-    other("region.polygon_m", ValueKind::Texts, "Vehicles sense only inside this polygon: its corners in order, each \"x y\" (m, world). All traffic is simulated. [] = no polygon."),
+    other("region.polygon_m", ValueKind::TextsOf(TextForm::Corner), "Vehicles sense only inside this polygon: its corners in order, each \"x y\" (m, world). All traffic is simulated. [] = no polygon."),
     floats("region.centre_m", "m", 2, -1e7, 1e7, "Centre x, y (world) of the circle inside which vehicles sense (`region.radius_m`)."),
     float("region.radius_m", "m", 0.0, 1e7, "Radius of that circle; 0 = no circle."),
     other("road.surface", ValueKind::Choice(&["dry", "wet", "snow"]), "Condition of the road: it scales the friction of the tyres."),
-    other("scene.obstacles", ValueKind::Texts, "Obstacles, each \"name x y heading\": a prop by name, its centre (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
+    other("scene.obstacles", ValueKind::TextsOf(TextForm::Obstacle), "Obstacles, each \"name x y heading\": a prop by name, its centre (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
     integer("scene.random_props", "", 0, 1_000_000, "Props placed at random beside the road, the same for the same `run.seed`."),
     float("scene.building_height_m", "m", 0.1, 1000.0, "Height of a building whose polygon and type state none."),
-    other("scene.meshes", ValueKind::Texts, "Triangle meshes that LIDARs see, each \"file.obj x y heading\": its origin on the ground (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
+    other("scene.meshes", ValueKind::TextsOf(TextForm::Mesh), "Triangle meshes that LIDARs see, each \"file.obj x y heading\": its origin on the ground (m, world), its heading (degrees counter-clockwise from east, 0 if left out)."),
     other("collision.detect", ValueKind::Flag, "Detect contacts of connected vehicles and heroes with road users, buildings and obstacles."),
     other("collision.ends_trajectory", ValueKind::Flag, "A contact ends the trajectory of a connected vehicle (terminated), as it always ends a hero's."),
     float("weather.rain_mmph", "mm/h", 0.0, 200.0, "Rain: a dry road becomes wet, and LIDAR returns grow weaker and get lost (2.5 light, 10 moderate, 50 violent)."),
@@ -253,7 +258,7 @@ pub const KEYS: &[ConfigKey] = &[
     span("speed_steering.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn each time; [0, 0] = none."),
     span("speed_steering.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
     integer("lidar.vehicles", "vehicles", 0, 100_000, "Vehicles that carry a LIDAR: those in the first slots of the observation, this many; 0 = none."),
-    other("lidar.pattern", ValueKind::Text, "Rays: \"uniform\" (`lidar.channels` between the two elevations), a unit by name (\"vlp16\", \"hdl32e\", \"hdl64e\", \"pandar40p\", \"os1_32\", \"os1_64\", \"os1_128\", \"vls128\"), or \"table\"."),
+    other("lidar.pattern", ValueKind::Choice(&LidarPattern::NAMES), "Rays: \"uniform\" (`lidar.channels` between the two elevations), a unit by name (\"vlp16\", \"hdl32e\", \"hdl64e\", \"pandar40p\", \"os1_32\", \"os1_64\", \"os1_128\", \"vls128\"), or \"table\"."),
     other("lidar.ray_table", ValueKind::Text, "CSV file of pattern \"table\": a line for each ray with azimuth_deg (counter-clockwise from ahead) and elevation_deg; \"\" = none."),
     integer("lidar.channels", "", 1, 1024, "Lasers one above the other (pattern \"uniform\")."),
     integer("lidar.points_per_second", "1/s", 1, 20_000_000, "Rays per second of all channels together."),
@@ -271,7 +276,7 @@ pub const KEYS: &[ConfigKey] = &[
     float("lidar.dropoff_zero_intensity", "", 0.0, 1.0, "Share of returns lost at intensity 0, falling linearly to none at `lidar.dropoff_intensity`."),
     other("lidar.rolling_shutter", ValueKind::Flag, "True: each azimuth fires at its own time, while all road users move. False: the whole scan shows the end of the tick."),
     other("lidar.mode", ValueKind::Choice(&["all", "interest"]), "\"all\" returns, or those of \"interest\": vehicles, persons and `lidar.interest_props`."),
-    other("lidar.interest_props", ValueKind::Texts, "Props that are of interest, by name (docs/scene.md)."),
+    other("lidar.interest_props", ValueKind::TextsOf(TextForm::Prop), "Props that are of interest, by name (docs/scene.md)."),
     other("lidar.axes", ValueKind::Choice(&["forward", "paper"]), "Axes of the points: x forward, y left, z up; or the paper's: y backward, x left, z down."),
     span("lidar.blackout_length_s", 1e6, "Length of a blackout, shortest and longest, drawn each time; [0, 0] = none."),
     span("lidar.blackout_gap_s", 1e6, "Time between two blackouts, shortest and longest."),
@@ -318,7 +323,7 @@ pub const KEYS: &[ConfigKey] = &[
     integer("trainer.horizon", "samples", 1, 100_000_000, "Samples in one update."),
     integer("trainer.batch_size", "samples", 1, 100_000_000, "Samples in one gradient step; at most the horizon."),
     integer("trainer.epochs", "", 1, 1000, "Passes over a horizon."),
-    other("trainer.network", ValueKind::ChoiceOrClass(&["mlp", "gru"]), "Networks of policy and value: hidden layers alone (\"mlp\"), with a gated recurrent unit in place of the last layer, which remembers a vehicle's earlier ticks (\"gru\"), or a Python class of your own (docs/networks.md)."),
+    other("trainer.network", ValueKind::TextOf(TextForm::Network), "Networks of policy and value: hidden layers alone (\"mlp\"), with a gated recurrent unit in place of the last layer, which remembers a vehicle's earlier ticks (\"gru\"), or a Python class of your own (docs/networks.md)."),
     other("trainer.hidden", ValueKind::Integers { min: 1, max: 65536 }, "Widths of the hidden layers of the policy and of the value network."),
     other("trainer.activation", ValueKind::Choice(&["relu", "tanh"]), "Activation of the hidden layers; that of the policy's last hidden layer is always tanh."),
     integer("trainer.truncation_ticks", "ticks", 1, 100_000, "Ticks over which a gradient propagates back in a network with memory."),
@@ -337,7 +342,7 @@ pub const KEYS: &[ConfigKey] = &[
     integer("fusion.segment_ticks", "ticks", 1, 1_000_000, "The estimator learns from an episode in pieces of this many ticks, side by side."),
     integer("fusion.truncation_ticks", "ticks", 1, 1_000_000, "Ticks between two gradient steps, over which a gradient propagates back; divides `fusion.segment_ticks`."),
     other("fanout.enabled", ValueKind::Flag, "Start the fan-out process, which lets viewers attach."),
-    other("fanout.listen", ValueKind::Text, "zenoh endpoint for viewers: tcp/HOST:PORT or tls/HOST:PORT. Beyond loopback it needs `fanout.users` or `fanout.tls_client_ca` (docs/remote.md)."),
+    other("fanout.listen", ValueKind::TextOf(TextForm::Endpoint), "zenoh endpoint for viewers: tcp/HOST:PORT or tls/HOST:PORT. Beyond loopback it needs `fanout.users` or `fanout.tls_client_ca` (docs/remote.md)."),
     other("fanout.users", ValueKind::Text, "File of the users that may connect, one line user:password each, readable by its owner alone; \"\" = every client that reaches the endpoint."),
     other("fanout.tls_certificate", ValueKind::Text, "Certificate of this machine (PEM file), for an endpoint tls/…"),
     other("fanout.tls_private_key", ValueKind::Text, "Its private key (PEM file)."),
@@ -400,9 +405,10 @@ impl ConfigKey {
             ValueKind::Integer { min, max } => format!("{min} … {max}"),
             ValueKind::Flag => "true, false".into(),
             ValueKind::Choice(words) => quoted(words),
-            ValueKind::ChoiceOrClass(words) => format!("{}, \"package.module:Class\"", quoted(words)),
             ValueKind::Text => "text".into(),
+            ValueKind::TextOf(form) => form.allowed(),
             ValueKind::Texts => "list of texts".into(),
+            ValueKind::TextsOf(form) => format!("list of {}", form.allowed()),
             ValueKind::Fields => {
                 let presets = FIELD_PRESETS.map(|preset| format!("\"{}\"", preset.name));
                 let names: Vec<&str> = FIELDS.iter().map(|spec| spec.name).collect();

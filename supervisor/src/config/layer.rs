@@ -64,12 +64,8 @@ pub fn parse_assignment(assignment: &str) -> Result<SettingsLayer, ConfigError> 
     let (key, value) = (key.trim(), value.trim());
     let plain = format!("{key} = {value}");
     // A key that takes a word takes every word as text, also "nan" and "true", which mean something else in TOML.
-    let takes_a_word = keys::find(key).is_some_and(|key| {
-        matches!(
-            key.kind,
-            ValueKind::Choice(_) | ValueKind::ChoiceOrClass(_) | ValueKind::Text
-        )
-    });
+    let takes_a_word = keys::find(key)
+        .is_some_and(|key| matches!(key.kind, ValueKind::Choice(_) | ValueKind::Text | ValueKind::TextOf(_)));
     let is_quoted = value.starts_with(['"', '\'']);
     let text = if DeTable::parse(&plain).is_ok() && (is_quoted || !takes_a_word) {
         plain
@@ -120,6 +116,7 @@ fn add_table(
             source: source.clone(),
             span: value.span(),
         };
+        check_form(key, value, source)?;
         let refused = || ConfigError::Value {
             key,
             place: place.clone(),
@@ -183,6 +180,29 @@ fn list_of(key: &ConfigKey, entries: &[SettingsLayer]) -> Value {
     entries.iter().map(table).collect()
 }
 
+/// Checks every text of a key whose texts have a form.
+fn check_form(key: &'static ConfigKey, value: &Spanned<DeValue<'_>>, source: &NamedText) -> Result<(), ConfigError> {
+    let (ValueKind::TextOf(form) | ValueKind::TextsOf(form)) = key.kind else {
+        return Ok(());
+    };
+    let items = match value.get_ref() {
+        DeValue::Array(items) => items.iter().collect(),
+        _ => vec![value],
+    };
+    for item in items {
+        if let Some(text) = item.get_ref().as_str()
+            && let Err(reason) = form.check(text)
+        {
+            let place = SourceSpan {
+                source: source.clone(),
+                span: item.span(),
+            };
+            return Err(ConfigError::Text { key, reason, place });
+        }
+    }
+    Ok(())
+}
+
 /// The value if `key` allows it.
 fn check(key: &ConfigKey, value: &Spanned<DeValue<'_>>) -> Option<Value> {
     let value = value.get_ref();
@@ -194,17 +214,13 @@ fn check(key: &ConfigKey, value: &Spanned<DeValue<'_>>) -> Option<Value> {
         ValueKind::Integer { min, max } => integer(value, min, max).map(Value::from),
         ValueKind::Flag => value.as_bool().map(Value::from),
         ValueKind::Choice(words) => value.as_str().filter(|word| words.contains(word)).map(Value::from),
-        ValueKind::ChoiceOrClass(words) => value
-            .as_str()
-            .filter(|word| words.contains(word) || is_python_class(word))
-            .map(Value::from),
-        ValueKind::Text => value.as_str().map(Value::from),
+        ValueKind::Text | ValueKind::TextOf(_) => value.as_str().map(Value::from),
         ValueKind::Fields => fields(value),
         ValueKind::Metric => value
             .as_str()
             .filter(|name| PolicyMetric::by_name(name).is_some())
             .map(Value::from),
-        ValueKind::Texts => texts(value),
+        ValueKind::Texts | ValueKind::TextsOf(_) => texts(value),
         ValueKind::Floats { count, min, max } => floats(value, count, min, max).map(Value::from),
         ValueKind::Span { min, max } => floats(value, 2, min, max)
             .filter(|span| span[0] <= span[1])
@@ -220,15 +236,6 @@ fn check(key: &ConfigKey, value: &Spanned<DeValue<'_>>) -> Option<Value> {
         // `tables` checks these.
         ValueKind::Tables(_) => None,
     }
-}
-
-/// True if a word has the form `package.module:Class`.
-fn is_python_class(word: &str) -> bool {
-    let is_name = |name: &str| {
-        name.chars().all(|c| c.is_alphanumeric() || c == '_') && name.starts_with(|c: char| !c.is_numeric())
-    };
-    word.split_once(':')
-        .is_some_and(|(module, class)| module.split('.').all(is_name) && is_name(class))
 }
 
 fn float(value: &DeValue<'_>) -> Option<f64> {

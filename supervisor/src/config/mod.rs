@@ -5,6 +5,7 @@ pub mod keys;
 pub mod layer;
 pub mod rules;
 pub mod span;
+pub mod text_form;
 
 use std::path::Path;
 
@@ -41,7 +42,7 @@ impl LayeredSettings {
     /// # Errors
     /// Never with a validated configuration.
     pub fn of(config: &Config) -> Result<Self, ConfigError> {
-        layer::parse("the run's configuration", &to_toml(config)).map(Self)
+        layer::parse("the run's configuration", &to_toml(config)?).map(Self)
     }
 
     /// Adds a preset by name; `None` if there is no such preset.
@@ -115,7 +116,6 @@ impl LayeredSettings {
     /// # Errors
     /// Two values contradict each other, or a rule between keys is broken.
     pub fn validate(&self) -> Result<Config, ConfigError> {
-        rules::check_texts(self)?;
         let mut root = Map::new();
         for key in keys::KEYS {
             let value = self
@@ -145,17 +145,28 @@ pub fn preset_names() -> String {
 }
 
 /// The configuration as TOML, which can be used as CONFIG.
-#[must_use]
-pub fn to_toml(config: &Config) -> String {
-    toml::to_string_pretty(config).unwrap_or_else(|error| format!("# not representable: {error}\n"))
+///
+/// # Errors
+/// A path in it is not UTF-8.
+pub fn to_toml(config: &Config) -> Result<String, ConfigError> {
+    toml::to_string_pretty(config).map_err(|error| unwritable(&error))
 }
 
 /// BLAKE3 of the configuration's canonical JSON, hexadecimal.
-#[must_use]
-pub fn hash(config: &Config) -> String {
-    blake3::hash(serde_json::to_string(config).unwrap_or_default().as_bytes())
-        .to_hex()
-        .to_string()
+///
+/// # Errors
+/// As [`to_toml`].
+pub fn hash(config: &Config) -> Result<String, ConfigError> {
+    let text = serde_json::to_string(config).map_err(|error| unwritable(&error))?;
+    Ok(blake3::hash(text.as_bytes()).to_hex().to_string())
+}
+
+fn unwritable(error: &dyn std::fmt::Display) -> ConfigError {
+    ConfigError::File {
+        path: "configuration".into(),
+        message: format!("cannot be written: {error}"),
+        help: "start caraware in a directory whose path is UTF-8".into(),
+    }
 }
 
 #[cfg(test)]

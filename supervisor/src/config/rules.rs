@@ -1,10 +1,6 @@
 //! Rules between keys: rates that must divide each other, sizes that must fit, keys that exclude each other.
 
-use ipc_schema::{
-    config::{Config, RegionCorner, TaskKind, class_model},
-    props::Obstacle,
-    traffic::VEHICLE_CLASSES,
-};
+use ipc_schema::config::{Config, TaskKind};
 
 mod curriculum;
 mod sensors;
@@ -26,7 +22,6 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         }
     }
     sensors::check(settings, config)?;
-    check_class_models(settings, config)?;
     let trainer = &config.trainer;
     if trainer.batch_size > trainer.horizon {
         return Err(conflict(
@@ -67,8 +62,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
             "set both or neither".into(),
         ));
     }
-    region(settings, config)?;
-    obstacles(settings, config)
+    region(settings, config)
 }
 
 /// The learner that comes with caraware: it predicts positions.
@@ -167,19 +161,6 @@ fn hero_field(config: &Config) -> Option<&'static str> {
         .map(|spec| spec.name)
 }
 
-/// Checks texts that the validated configuration holds as values of their own type.
-pub(super) fn check_texts(settings: &LayeredSettings) -> Result<(), ConfigError> {
-    let path = "region.polygon_m";
-    let corners = settings.setting(path).and_then(|setting| setting.value.as_array());
-    for corner in corners.into_iter().flatten().filter_map(|corner| corner.as_str()) {
-        if let Err(error) = corner.parse::<RegionCorner>() {
-            let help = "give x and y in metres, such as \"120 45.5\"".to_owned();
-            return Err(conflict(settings, path, format!("`{path}`: {error}"), help));
-        }
-    }
-    Ok(())
-}
-
 /// A polygon has three corners or more, and excludes a circle.
 fn region(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
     let refused = |message: String, help: &str| Err(conflict(settings, "region.polygon_m", message, help.into()));
@@ -200,37 +181,6 @@ fn region(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError
         );
     }
     Ok(())
-}
-
-/// Every entry of `scene.obstacles` must be a known prop and a position.
-fn obstacles(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
-    for text in &config.scene.obstacles {
-        if let Err(error) = Obstacle::parse(text) {
-            return Err(conflict(settings, "scene.obstacles", error.to_string(), error.help()));
-        }
-    }
-    Ok(())
-}
-
-/// Entries of `vehicle.class_models` are "class=model" with a vehicle class of SUMO.
-fn check_class_models(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
-    match config
-        .vehicle
-        .class_models
-        .iter()
-        .find(|entry| class_model(entry).is_none())
-    {
-        None => Ok(()),
-        Some(entry) => Err(conflict(
-            settings,
-            "vehicle.class_models",
-            format!("`vehicle.class_models` has \"{entry}\", which is no vehicle class of SUMO with a model"),
-            format!(
-                "give \"class=kinematic\" or \"class=dynamic\"; the classes are {}",
-                VEHICLE_CLASSES.join(", ")
-            ),
-        )),
-    }
 }
 
 fn is_multiple(value_s: f64, tick_s: f64) -> bool {

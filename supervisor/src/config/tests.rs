@@ -43,7 +43,7 @@ fn every_preset_is_valid() {
 #[test]
 fn the_resolved_configuration_can_be_given_back() {
     let config = LayeredSettings::defaults().unwrap().validate().unwrap();
-    let layer = layer::parse("again", &to_toml(&config)).unwrap();
+    let layer = layer::parse("again", &to_toml(&config).unwrap()).unwrap();
     assert_eq!(LayeredSettings(layer).validate().unwrap(), config);
 }
 
@@ -187,8 +187,8 @@ fn an_impossible_lidar_is_refused_with_key_value_and_range() {
         ),
         (
             "lidar.pattern = \"vlp17\"",
-            "`lidar.pattern` = \"vlp17\" is no known pattern",
-            "the patterns are uniform, vlp16",
+            "`lidar.pattern` cannot be \"vlp17\"",
+            "allowed: \"uniform\", \"vlp16\"",
         ),
         (
             "lidar.pattern = \"table\"",
@@ -469,7 +469,7 @@ fn maps_of_a_curriculum_are_names_that_the_run_has() {
     let one = "[[curriculum.stages]]\ncavs = 1\n";
     let (message, help) = error_of(&format!("[curriculum]\nmaps = [\"town\", \"Town02\"]\n{one}"));
     assert!(
-        message.contains("\"Town02\", which is no map") && help.contains(".net.xml"),
+        message.contains("\"Town02\" is no map") && help.contains(".net.xml"),
         "{message} {help}"
     );
     let (message, _) = error_of(&format!(
@@ -533,15 +533,102 @@ fn a_stage_changes_population_noise_and_blackouts_and_nothing_else() {
 }
 
 #[test]
-fn an_obstacle_that_cannot_be_placed_is_named_with_the_known_props() {
-    let (message, help) = error_of("[scene]\nobstacles = [\"cone 10 20\", \"cnoe 1 2\"]\n");
-    assert!(
-        message.contains("`scene.obstacles`: \"cnoe 1 2\" names no known prop"),
-        "{message}"
+fn the_error_on_a_wrong_text_names_its_line_and_the_allowed_form() {
+    for (key, good, bad, fault, allowed) in [
+        (
+            "scene.obstacles",
+            "cone 10 20",
+            "cnoe 1 2",
+            "names no known prop (\"cnoe\")",
+            "props: cone, bollard",
+        ),
+        (
+            "scene.obstacles",
+            "cone 1 2 90",
+            "cone 10",
+            "is not \"name x y\"",
+            "\"name x y heading\"",
+        ),
+        (
+            "scene.meshes",
+            "a.obj 1 2",
+            "a.obj 1 two",
+            "is not \"file.obj x y\"",
+            "\"file.obj x y heading\"",
+        ),
+        (
+            "region.polygon_m",
+            "0 0",
+            "1 zero",
+            "is no corner",
+            "list of \"x y\" such as \"120 45.5\"",
+        ),
+        (
+            "vehicle.class_models",
+            "bus=dynamic",
+            "bus=rigid_body",
+            "is no vehicle class",
+            "passenger, private",
+        ),
+        (
+            "lidar.interest_props",
+            "cone",
+            "unicorn",
+            "names no known prop",
+            "list of props: cone",
+        ),
+        ("curriculum.maps", "town", "Town02", "is no map", ".net.xml"),
+    ] {
+        let (message, help) = error_of(&format!("{key} = [\n  \"{good}\",\n  \"{bad}\",\n]\n"));
+        assert!(
+            message.starts_with(&format!("my.toml:3: `{key}`: \"{bad}\" {fault}")),
+            "{message}"
+        );
+        assert!(
+            help.starts_with("allowed: list of ") && help.contains(allowed),
+            "{help}"
+        );
+    }
+    for (key, bad, allowed) in [
+        (
+            "fanout.listen",
+            "quic/127.0.0.1:7447",
+            "\"tcp/HOST:PORT\", \"tls/HOST:PORT\"",
+        ),
+        ("fanout.listen", "tcp/127.0.0.1", "\"tcp/127.0.0.1:7447\""),
+        ("trainer.network", "lstm", "\"package.module:Class\""),
+    ] {
+        let (message, help) = error_of(&format!("{key} = \"{bad}\"\n"));
+        assert!(
+            message.starts_with(&format!("my.toml:1: `{key}`: \"{bad}\" is n")),
+            "{message}"
+        );
+        assert!(help.starts_with("allowed: ") && help.contains(allowed), "{help}");
+    }
+    assert_eq!(
+        error_of("scene.obstacles = [1]\n").0,
+        "my.toml:1: `scene.obstacles` cannot be [1]"
     );
-    assert!(help.contains("props: cone, bollard"), "{help}");
-    let (message, _) = error_of("[scene]\nobstacles = [\"cone 10\"]\n");
-    assert!(message.contains("\"cone 10\" is not \"name x y\""), "{message}");
+    assert_eq!(
+        error_of("fanout.listen = 1\n").0,
+        "my.toml:1: `fanout.listen` cannot be 1"
+    );
+}
+
+/// A word that the table of keys offers and the type does not know would be a defect of the program, not of the configuration.
+#[test]
+fn every_choice_of_a_key_is_a_value_of_its_type() {
+    for key in keys::KEYS {
+        let keys::ValueKind::Choice(words) = key.kind else {
+            continue;
+        };
+        for word in words {
+            match config_of(&format!("{} = \"{word}\"\n", key.path)) {
+                Ok(_) | Err(ConfigError::Conflict { .. }) => {}
+                Err(error) => panic!("{} = {word}: {error}", key.path),
+            }
+        }
+    }
 }
 
 #[test]

@@ -54,10 +54,10 @@ impl StageDecisions {
         let run = &membership.run;
         let curriculum = &run.config.curriculum;
         let path = run.run_dir.join(CURRICULUM_LOG);
-        let source = match (run.mode, curriculum.log.as_str()) {
+        let source = match (run.mode, &curriculum.log) {
             (Mode::Train, _) => StageSource::Trainer(membership.board_of(Process::Trainer)?),
-            (Mode::Simulate | Mode::Play, "") => StageSource::Count(curriculum.stages.clone()),
-            (Mode::Simulate | Mode::Play, path) => StageSource::Log(read(Path::new(path))?),
+            (Mode::Simulate | Mode::Play, None) => StageSource::Count(curriculum.stages.clone()),
+            (Mode::Simulate | Mode::Play, Some(path)) => StageSource::Log(read(path)?),
         };
         let is_restart = run.restart.is_some();
         let mut kept = match run.beginning.is_some() || is_restart && path.exists() {
@@ -106,20 +106,20 @@ impl StageDecisions {
                 return Ok(Some(self.stage_in_checkpoint(lesson)));
             }
             StageSource::Trainer(board) => {
-                let mut stage = None;
+                let mut decided = None;
                 let waited = membership.wait_until(|| {
                     let progress = board.progress();
                     // The board answers for the newest two lessons. Since an earlier one the stage has not changed.
-                    stage = match self.is_restart && lesson + 1 < progress.since_lesson {
+                    decided = match self.is_restart && lesson + 1 < progress.since_lesson {
                         true => u32::try_from(logged(&self.kept, lesson)).ok(),
                         false => progress.stage_of(lesson),
                     };
-                    stage.is_some()
+                    decided.is_some()
                 })?;
-                if waited == Wait::Stopped {
-                    return Ok(None);
+                match decided {
+                    Some(stage) if waited == Wait::Ready => stage as usize,
+                    _ => return Ok(None),
                 }
-                stage.unwrap_or(0) as usize
             }
             StageSource::Log(decisions) => logged(decisions, lesson),
             StageSource::Count(stages) => counted(stages, lesson),

@@ -2,20 +2,14 @@
 
 use std::path::PathBuf;
 
-use ipc_schema::{
-    failure::{Failure, FailureKind},
-    props::PROPS,
-};
+use ipc_schema::failure::{Failure, FailureKind};
 
 /// The LIDAR of the configuration cannot be built.
 #[derive(Debug, thiserror::Error)]
 pub enum LidarError {
-    /// No such pattern.
-    #[error("`lidar.pattern` = \"{name}\" is no known pattern")]
-    Pattern {
-        /// The configured name.
-        name: String,
-    },
+    /// The pattern is a table, and none is named.
+    #[error("`lidar.pattern` = \"table\" without a table")]
+    NoTable,
     /// A file cannot be read.
     #[error("cannot read {path}")]
     Unreadable {
@@ -41,12 +35,6 @@ pub enum LidarError {
         /// The file.
         path: PathBuf,
     },
-    /// An entry of `scene.meshes` cannot be understood.
-    #[error("`scene.meshes`: \"{text}\" is not \"file.obj x y\" or \"file.obj x y heading\" with plain numbers")]
-    MeshEntry {
-        /// The entry.
-        text: String,
-    },
     /// A mesh cannot be used.
     #[error("{path}: no usable mesh: {reason}")]
     Mesh {
@@ -54,12 +42,6 @@ pub enum LidarError {
         path: PathBuf,
         /// Why.
         reason: String,
-    },
-    /// `lidar.interest_props` names a prop that does not exist.
-    #[error("`lidar.interest_props`: \"{name}\" names no known prop")]
-    Prop {
-        /// The configured name.
-        name: String,
     },
     /// Neither rotation nor tick is a whole number of the other, or a tick has less than one column.
     #[error("`lidar.rotation_hz` = {rotation_hz} with a tick of {tick_s} s: neither is a whole number of the other")]
@@ -74,23 +56,15 @@ pub enum LidarError {
 impl LidarError {
     /// The remedy to show to the user.
     #[must_use]
-    pub fn help(&self) -> String {
+    pub fn help(&self) -> &'static str {
         match self {
-            Self::Pattern { .. } => format!("the patterns are {}", ipc_schema::config::LidarConfig::PATTERNS.join(", ")),
-            Self::Unreadable { .. } => "check the path and its permissions".into(),
+            Self::NoTable => "name a CSV file in lidar.ray_table, or another pattern",
+            Self::Unreadable { .. } => "check the path and its permissions",
             Self::Table { .. } | Self::NoRays { .. } => {
-                "write a header `azimuth_deg,elevation_deg` and a line for each ray, for example `12.5,-3.0`".into()
+                "write a header `azimuth_deg,elevation_deg` and a line for each ray, for example `12.5,-3.0`"
             }
-            Self::MeshEntry { .. } => {
-                "write \"house.obj 120.5 80 90\": x and y in metres (world), heading in degrees counter-clockwise from east"
-                    .into()
-            }
-            Self::Mesh { .. } => "give a Wavefront OBJ with faces, in metres, z up".into(),
-            Self::Prop { .. } => {
-                let names: Vec<_> = PROPS.iter().map(|prop| prop.name).collect();
-                format!("the props are {}", names.join(", "))
-            }
-            Self::Rotation { .. } => "choose a whole number of rotations in a tick, or of ticks in a rotation".into(),
+            Self::Mesh { .. } => "give a Wavefront OBJ with faces, in metres, z up",
+            Self::Rotation { .. } => "choose a whole number of rotations in a tick, or of ticks in a rotation",
         }
     }
 }

@@ -1,8 +1,9 @@
 //! Ground that is not flat, and triangle meshes: single rays are cast through a hierarchy of boxes.
 
-use std::path::Path;
-
-use ipc_schema::pointcloud::{GROUND, STATIC_OBJECT, Tag};
+use ipc_schema::{
+    config::MeshPlacement,
+    pointcloud::{GROUND, STATIC_OBJECT, Tag},
+};
 use parry3d_f64::{
     math::Vector,
     query::{Ray, RayCast},
@@ -50,16 +51,15 @@ impl SceneMeshes {
     /// Tag of all meshes.
     pub(super) const WORD: u32 = Tag::Mesh as u32;
 
-    pub(super) fn new(entries: &[String], scene: &Scene) -> Result<Self, LidarError> {
+    pub(super) fn new(placements: &[MeshPlacement], scene: &Scene) -> Result<Self, LidarError> {
         let mut meshes = Vec::new();
         if flat_ground_m(scene).is_none() {
             meshes.extend(ground(scene));
         }
         let first = (scene.buildings().len() + scene.props().len()) as u32;
-        for (number, text) in (first..).zip(entries) {
-            let entry = MeshEntry::parse(text).ok_or_else(|| LidarError::MeshEntry { text: text.clone() })?;
+        for (number, placement) in (first..).zip(placements) {
             meshes.push(Mesh {
-                triangles: entry.read(scene)?,
+                triangles: read(placement, scene)?,
                 object: STATIC_OBJECT | number,
             });
         }
@@ -124,60 +124,38 @@ fn ground(scene: &Scene) -> Option<Mesh> {
     })
 }
 
-/// An entry of `scene.meshes`.
-struct MeshEntry<'a> {
-    path: &'a Path,
-    place_m: [f64; 2],
-    heading_deg: f64,
-}
-
-impl<'a> MeshEntry<'a> {
-    fn parse(text: &'a str) -> Option<Self> {
-        let words: Vec<&str> = text.split_whitespace().collect();
-        let number = |word: &str| word.parse().ok().filter(|value: &f64| value.is_finite());
-        let (path, x, y, heading) = match words[..] {
-            [path, x, y] => (path, x, y, "0"),
-            [path, x, y, heading] => (path, x, y, heading),
-            _ => return None,
-        };
-        Some(Self {
-            path: Path::new(path),
-            place_m: [number(x)?, number(y)?],
-            heading_deg: number(heading)?,
-        })
+/// The triangles of a mesh, in the world.
+fn read(placement: &MeshPlacement, scene: &Scene) -> Result<TriMesh, LidarError> {
+    let path = &placement.file;
+    let wrong = |reason: String| LidarError::Mesh {
+        path: path.clone(),
+        reason,
+    };
+    std::fs::File::open(path).map_err(|source| LidarError::Unreadable {
+        path: path.clone(),
+        source,
+    })?;
+    let options = tobj::LoadOptions {
+        triangulate: true,
+        ..tobj::LoadOptions::default()
+    };
+    // Materials are not used: a missing material library is no error.
+    let (models, _) = tobj::load_obj(path, &options).map_err(|error| wrong(error.to_string()))?;
+    let [x, y] = placement.origin_m;
+    let ground_m = scene.ground_height_m(x, y);
+    let (sin, cos) = libm::sincos(placement.heading_deg.to_radians());
+    let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
+    for model in &models {
+        let first = vertices.len() as u32;
+        vertices.extend(model.mesh.positions.chunks_exact(3).map(|p| {
+            let [a, b, c] = [p[0], p[1], p[2]].map(f64::from);
+            Vector::new(x + a * cos - b * sin, y + a * sin + b * cos, ground_m + c)
+        }));
+        let of_model = model.mesh.indices.chunks_exact(3);
+        triangles.extend(of_model.map(|corners| [first + corners[0], first + corners[1], first + corners[2]]));
     }
-
-    fn read(&self, scene: &Scene) -> Result<TriMesh, LidarError> {
-        let wrong = |reason: String| LidarError::Mesh {
-            path: self.path.into(),
-            reason,
-        };
-        std::fs::File::open(self.path).map_err(|source| LidarError::Unreadable {
-            path: self.path.into(),
-            source,
-        })?;
-        let options = tobj::LoadOptions {
-            triangulate: true,
-            ..tobj::LoadOptions::default()
-        };
-        // Materials are not used: a missing material library is no error.
-        let (models, _) = tobj::load_obj(self.path, &options).map_err(|error| wrong(error.to_string()))?;
-        let [x, y] = self.place_m;
-        let ground_m = scene.ground_height_m(x, y);
-        let (sin, cos) = libm::sincos(self.heading_deg.to_radians());
-        let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
-        for model in &models {
-            let first = vertices.len() as u32;
-            vertices.extend(model.mesh.positions.chunks_exact(3).map(|p| {
-                let [a, b, c] = [p[0], p[1], p[2]].map(f64::from);
-                Vector::new(x + a * cos - b * sin, y + a * sin + b * cos, ground_m + c)
-            }));
-            let of_model = model.mesh.indices.chunks_exact(3);
-            triangles.extend(of_model.map(|corners| [first + corners[0], first + corners[1], first + corners[2]]));
-        }
-        if triangles.is_empty() {
-            return Err(wrong("it has no faces".into()));
-        }
-        TriMesh::new(vertices, triangles).map_err(|error| wrong(format!("{error:?}")))
+    if triangles.is_empty() {
+        return Err(wrong("it has no faces".into()));
     }
+    TriMesh::new(vertices, triangles).map_err(|error| wrong(format!("{error:?}")))
 }

@@ -98,7 +98,7 @@ impl LidarModel {
     /// The LIDAR of a configuration in a scene.
     ///
     /// # Errors
-    /// Unknown pattern or prop, unusable ray table or mesh, or rotations that do not fit the tick.
+    /// Unusable ray table or mesh, or rotations that do not fit the tick.
     pub fn new(config: &Config, scene: &Scene) -> Result<Self, LidarError> {
         let lidar = &config.lidar;
         let pattern = pattern::RayPattern::new(lidar)?;
@@ -110,7 +110,7 @@ impl LidarModel {
         Ok(Self {
             is_flat_fan: !pattern.is_table && mount.is_upright && meshes.is_empty(),
             steepest: if pattern.is_table { f64::INFINITY } else { steepest },
-            solids: solids::StillSolids::new(lidar, scene)?,
+            solids: solids::StillSolids::new(lidar, scene),
             receiver: returns::ReturnModel::new(config),
             path: ScanPath::best(),
             ground_m: mesh::flat_ground_m(scene),

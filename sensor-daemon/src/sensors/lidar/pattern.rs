@@ -6,7 +6,7 @@
 
 use std::path::Path;
 
-use ipc_schema::config;
+use ipc_schema::config::{self, LidarPattern};
 
 use super::{
     error::LidarError,
@@ -50,12 +50,10 @@ const TOGETHER_S: f64 = 50e-6;
 
 impl RayPattern {
     pub(super) fn new(lidar: &config::LidarConfig) -> Result<Self, LidarError> {
-        if lidar.pattern == "table" {
-            return table(Path::new(&lidar.ray_table), lidar.rotation_hz);
-        }
-        let elevations = elevations_deg(lidar).ok_or_else(|| LidarError::Pattern {
-            name: lidar.pattern.clone(),
-        })?;
+        let Some(elevations) = elevations_deg(lidar) else {
+            let path = lidar.ray_table.as_deref().ok_or(LidarError::NoTable)?;
+            return table(path, lidar.rotation_hz);
+        };
         let rays: Vec<Ray> = (0_u32..)
             .zip(&elevations)
             .map(|(channel, elevation_deg)| Ray {
@@ -118,8 +116,8 @@ impl RayGroup {
     }
 }
 
-/// Elevations from the lowest laser up, degrees.
-pub(super) fn elevations_deg(lidar: &config::LidarConfig) -> Option<Vec<f64>> {
+/// Elevations from the lowest laser up, degrees; `None`: a table holds them.
+fn elevations_deg(lidar: &config::LidarConfig) -> Option<Vec<f64>> {
     let between = |lower: f64, upper: f64, count: u32| -> Vec<f64> {
         if count == 1 {
             return vec![0.5 * (lower + upper)];
@@ -127,20 +125,20 @@ pub(super) fn elevations_deg(lidar: &config::LidarConfig) -> Option<Vec<f64>> {
         let step = (upper - lower) / f64::from(count - 1);
         (0..count).map(|i| lower + f64::from(i) * step).collect()
     };
-    Some(match lidar.pattern.as_str() {
-        "uniform" => between(lidar.lower_fov_deg, lidar.upper_fov_deg, lidar.channels),
+    Some(match lidar.pattern {
+        LidarPattern::Uniform => between(lidar.lower_fov_deg, lidar.upper_fov_deg, lidar.channels),
         // Velodyne VLP-16 user manual (63-9243): every 2°.
-        "vlp16" => between(-15.0, 15.0, 16),
+        LidarPattern::Vlp16 => between(-15.0, 15.0, 16),
         // Velodyne HDL-32E user manual (63-9113): 4/3° from −30.67° to 10.67°.
-        "hdl32e" => between(-92.0 / 3.0, 32.0 / 3.0, 32),
+        LidarPattern::Hdl32e => between(-92.0 / 3.0, 32.0 / 3.0, 32),
         // Velodyne HDL-64E S3 manual: a lower block in steps of 1/2°, an upper one in steps of 1/3°.
-        "hdl64e" => [between(-24.33, -8.83, 32), between(-8.33, 2.0, 32)].concat(),
-        "pandar40p" => pandar40p(),
+        LidarPattern::Hdl64e => [between(-24.33, -8.83, 32), between(-8.33, 2.0, 32)].concat(),
+        LidarPattern::Pandar40p => pandar40p(),
         // Ouster OS1 data sheets: evenly over 45° (revisions 6 and 7: ±21.2° with 128).
-        "os1_32" | "os1_64" => between(-22.5, 22.5, lidar.lasers()),
-        "os1_128" => between(-21.2, 21.2, 128),
-        "vls128" => vls128(),
-        _ => return None,
+        LidarPattern::Os1_32 | LidarPattern::Os1_64 => between(-22.5, 22.5, lidar.lasers()),
+        LidarPattern::Os1_128 => between(-21.2, 21.2, 128),
+        LidarPattern::Vls128 => vls128(),
+        LidarPattern::Table => return None,
     })
 }
 

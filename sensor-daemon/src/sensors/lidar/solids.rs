@@ -5,14 +5,12 @@ use std::ops::Range;
 use ipc_schema::{
     config,
     pointcloud::{STATIC_OBJECT, Tag},
-    props::{PROPS, PropClass},
+    props::{PROPS, PropClass, PropKind},
 };
 use sim_core::scene::{
     Scene, Solid, SolidClass,
     shape::{Bounds, Point, distance, edges, from_to},
 };
-
-use super::error::LidarError;
 
 /// Size of a cell, metres.
 const CELL_M: f64 = 64.0;
@@ -76,8 +74,8 @@ pub(super) fn wall(p_m: Point, q_m: Point) -> Option<SolidWall> {
 }
 
 impl StillSolids {
-    pub(super) fn new(lidar: &config::LidarConfig, scene: &Scene) -> Result<Self, LidarError> {
-        let interest = interest(lidar)?;
+    pub(super) fn new(lidar: &config::LidarConfig, scene: &Scene) -> Self {
+        let interest = interest(lidar);
         let all: Vec<(u32, Solid<'_>, Bounds)> = (0_u32..)
             .zip(scene.bounds())
             .map(|(number, bounds)| (number, scene.solid(number), bounds))
@@ -96,7 +94,7 @@ impl StillSolids {
             starts[cell] += starts[cell - 1];
         }
         solids.starts = starts;
-        Ok(solids)
+        solids
     }
 
     fn empty(all: &[(u32, Solid<'_>, Bounds)]) -> Self {
@@ -189,16 +187,9 @@ fn centre(bounds: &Bounds) -> Point {
 }
 
 /// Whether each prop of the catalogue is of interest.
-fn interest(lidar: &config::LidarConfig) -> Result<Vec<bool>, LidarError> {
-    if let Some(name) = lidar
-        .interest_props
-        .iter()
-        .find(|name| PROPS.iter().all(|prop| prop.name != name.as_str()))
-    {
-        return Err(LidarError::Prop { name: name.clone() });
-    }
-    let is_wanted = |name: &str| lidar.interest_props.iter().any(|wanted| wanted == name);
-    Ok(PROPS.iter().map(|prop| is_wanted(prop.name)).collect())
+fn interest(lidar: &config::LidarConfig) -> Vec<bool> {
+    let is_wanted = |prop: &PropKind| lidar.interest_props.iter().any(|wanted| wanted.0 == prop);
+    PROPS.iter().map(is_wanted).collect()
 }
 
 fn tag(class: SolidClass) -> Tag {

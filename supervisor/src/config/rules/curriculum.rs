@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use ipc_schema::{
-    config::{Config, MapChoice, StageConfig, map_name},
+    config::{Config, CurriculumMap, MapChoice, StageConfig},
     metric::PolicyMetric,
 };
 
@@ -57,9 +57,18 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         }
     }
     maps(settings, config)?;
+    if let Some((number, unknown)) = config.curriculum.unknown_map() {
+        return refuse(
+            format!("stage {number} of `curriculum.stages` uses the map \"{unknown}\", which the run does not have"),
+            format!(
+                "its maps are \"{}\": add the file to `curriculum.maps`, or name one of them",
+                config.curriculum.map_names().join("\", \"")
+            ),
+        );
+    }
     (1..).zip(stages).try_for_each(|(number, stage)| {
         gate_of_stage(settings, config, number, stage)?;
-        maps_of_stage(settings, config, number, stage)
+        choice_of_map(settings, number, stage)
     })
 }
 
@@ -121,13 +130,7 @@ fn maps(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> 
         );
     }
     let mut names = BTreeSet::new();
-    for entry in maps {
-        let Some(name) = map_name(entry) else {
-            return refuse(
-                format!("`curriculum.maps` has \"{entry}\", which is no map"),
-                "give \"town\", a .net.xml (or .net.xml.gz), or a .sumocfg",
-            );
-        };
+    for name in maps.iter().map(CurriculumMap::name) {
         if !names.insert(name) {
             return refuse(
                 format!("`curriculum.maps` has two maps of the name \"{name}\""),
@@ -164,23 +167,9 @@ fn positioned_key(config: &Config) -> Option<&'static str> {
     keys.into_iter().find_map(|(key, is_used)| is_used.then_some(key))
 }
 
-fn maps_of_stage(
-    settings: &LayeredSettings,
-    config: &Config,
-    number: usize,
-    stage: &StageConfig,
-) -> Result<(), ConfigError> {
-    let names = config.curriculum.map_names();
+/// A stage that draws its maps names two or more.
+fn choice_of_map(settings: &LayeredSettings, number: usize, stage: &StageConfig) -> Result<(), ConfigError> {
     let refuse = |message: String, help: String| Err(conflict(settings, "curriculum.stages", message, help));
-    if let Some(unknown) = stage.maps.iter().find(|name| !names.contains(&name.as_str())) {
-        return refuse(
-            format!("stage {number} of `curriculum.stages` uses the map \"{unknown}\", which the run does not have"),
-            format!(
-                "its maps are \"{}\": add the file to `curriculum.maps`, or name one of them",
-                names.join("\", \"")
-            ),
-        );
-    }
     if stage.map_choice != MapChoice::InOrder && stage.maps.len() < 2 {
         return refuse(
             format!(

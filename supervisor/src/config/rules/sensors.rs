@@ -1,7 +1,7 @@
 //! Rules of the sensors: rates divide each other, fields of view are not empty, and every observation field has its sensor.
 
 use ipc_schema::{
-    config::{Config, LidarConfig},
+    config::{Config, LidarConfig, LidarPattern},
     sensor::{SENSORS, SensorKind, fitted_sensors},
 };
 
@@ -60,14 +60,7 @@ fn lidar(config: &Config) -> Option<BrokenSensorRule> {
 }
 
 fn pattern(lidar: &LidarConfig) -> Option<BrokenSensorRule> {
-    if !LidarConfig::PATTERNS.contains(&lidar.pattern.as_str()) {
-        return Some((
-            "lidar.pattern",
-            format!("`lidar.pattern` = \"{}\" is no known pattern", lidar.pattern),
-            format!("the patterns are {}", LidarConfig::PATTERNS.join(", ")),
-        ));
-    }
-    (lidar.pattern == "table" && lidar.ray_table.is_empty()).then(|| {
+    (lidar.pattern == LidarPattern::Table && lidar.ray_table.is_none()).then(|| {
         (
             "lidar.pattern",
             "`lidar.pattern` = \"table\" needs `lidar.ray_table`".into(),
@@ -78,7 +71,7 @@ fn pattern(lidar: &LidarConfig) -> Option<BrokenSensorRule> {
 
 fn field_of_view(lidar: &LidarConfig) -> Option<BrokenSensorRule> {
     let (lower, upper) = (lidar.lower_fov_deg, lidar.upper_fov_deg);
-    if lidar.pattern == "uniform" && (lower > upper || (lidar.channels > 1 && upper - lower <= 0.0)) {
+    if lidar.pattern == LidarPattern::Uniform && (lower > upper || (lidar.channels > 1 && upper - lower <= 0.0)) {
         return Some((
             "lidar.upper_fov_deg",
             format!(
@@ -114,7 +107,7 @@ fn rates(config: &Config) -> Option<BrokenSensorRule> {
             format!("choose a multiple or a whole part of {} Hz", 1.0 / tick_s),
         ));
     }
-    if lidar.pattern == "table" {
+    if lidar.pattern == LidarPattern::Table {
         return None;
     }
     let columns = lidar.points_per_second as f64 * tick_s / lidar.lasers() as f64;
