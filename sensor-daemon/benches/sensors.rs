@@ -129,14 +129,14 @@ fn round(config: &Config) -> f64 {
         flags: FIRST_OF_EPISODE,
         ..MessageHeader::default()
     };
-    let n = sensing.assign(&header, &states);
+    let n = sensing.assign(&header, &states).unwrap();
     let layout = ObservationLayout::new(n, sensing.width(), sensing.imu_samples());
     let mut payload = vec![0_u64; layout.len.div_ceil(8)];
     let start = Instant::now();
     for tick in 0..TICKS {
         header.tick = tick;
         header.sim_time_ns = (tick + 1) * 100_000_000;
-        sensing.assign(&header, &states);
+        sensing.assign(&header, &states).unwrap();
         sensing
             .observe(&header, &world, bytemuck::cast_slice_mut(&mut payload))
             .unwrap_or_else(|error| panic!("{error}"));

@@ -118,7 +118,7 @@ fn sense(
         let Some(state) = state(tick) else { return };
         (header.tick, header.sim_time_ns) = (u64::from(tick), (u64::from(tick) + 1) * 100_000_000);
         let states = [state];
-        let n = sensing.assign(&header, &states);
+        let n = sensing.assign(&header, &states).unwrap();
         let layout = ObservationLayout::new(n, sensing.width(), sensing.imu_samples());
         let mut payload = vec![0_u64; layout.len.div_ceil(8)];
         let world = WorldTick {

@@ -205,7 +205,10 @@ impl Daemon {
             .switches_mut()
             .receive(&self.switches)?
             .map_err(unreadable)?;
-        let n = self.sensing.assign(world, road_users.states);
+        let n = self
+            .sensing
+            .assign(world, road_users.states)
+            .map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
         self.scan(world, &road_users)?;
         let is_committed = world.tick < self.committed_ticks;
         if !is_committed && self.wait_for_credit(n)? == Wait::Stopped {

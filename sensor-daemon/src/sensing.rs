@@ -64,6 +64,16 @@ pub struct WorldTick<'a> {
     pub views: &'a [HeroView],
 }
 
+/// An episode is in a stage of the curriculum, or on a map, that the configuration does not have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("an episode is in stage {stage} of the curriculum on map {map}, which the configuration does not have")]
+pub struct UnknownSuiteError {
+    /// Counted from 1; 0 is the base configuration.
+    pub stage: usize,
+    /// Place among the run's maps.
+    pub map: usize,
+}
+
 /// The sensors of a stage of the curriculum on one of its maps.
 struct PlacedSuite {
     /// Counted from 1; 0 is the base configuration.
@@ -166,18 +176,18 @@ impl Sensing {
     }
 
     /// Switches to the sensors of a stage of the curriculum, under the sky of a map.
-    fn enter_stage(&mut self, stage: usize, map: usize) {
+    fn enter_stage(&mut self, stage: usize, map: usize) -> Result<(), UnknownSuiteError> {
+        let mut suites = self.suites.iter();
+        let found = suites.position(|placed| (placed.stage, placed.map) == (stage, map));
+        let found = found.ok_or(UnknownSuiteError { stage, map })?;
         let PlacedSuite { map: before, suite, .. } = &mut self.suites[self.at];
         self.skies[*before] = suite.take_sky();
-        let found = self
-            .suites
-            .iter()
-            .position(|placed| (placed.stage, placed.map) == (stage, map));
-        self.at = found.unwrap_or(0);
+        self.at = found;
         let PlacedSuite { map, suite, .. } = &mut self.suites[self.at];
         if let Some(sky) = self.skies[*map].take() {
             suite.set_sky(sky);
         }
+        Ok(())
     }
 
     fn suite(&self) -> &SensorSuite {
@@ -234,10 +244,13 @@ impl Sensing {
     ///
     /// With `collision.ends_trajectory` a vehicle has no slot at the tick in which it collides, as if it had left: its slot is marked
     /// [`ipc_schema::observation::TERMINATED`], and from the next tick on the vehicle begins a new trajectory.
-    pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> usize {
+    ///
+    /// # Errors
+    /// An episode begins in a stage or on a map that the configuration does not have.
+    pub fn assign(&mut self, header: &MessageHeader, states: &[VehicleState]) -> Result<usize, UnknownSuiteError> {
         self.slots.begin(header.has(FIRST_OF_EPISODE));
         if header.has(FIRST_OF_EPISODE) {
-            self.enter_stage(header.stage.into(), header.map.into());
+            self.enter_stage(header.stage.into(), header.map.into())?;
             self.suites[self.at].suite.begin_episode(header.episode_seed);
             self.switches.begin_episode();
         }
@@ -261,7 +274,7 @@ impl Sensing {
             }
         }
         self.slots.end();
-        self.slots.rows().len()
+        Ok(self.slots.rows().len())
     }
 
     /// Advances the blackouts of the carrier in `slot` to this tick; a new trajectory begins with a new carrier.

@@ -82,7 +82,7 @@ fn a_tick_allocates_nothing() {
         payload.clear();
         payload.resize(layout.len.div_ceil(8), 0_u64);
         let before = ALLOCATIONS.get();
-        sensing.assign(&header, &states);
+        sensing.assign(&header, &states).unwrap();
         ultrasonic.sample(&header, &states, &mut sensing);
         sensing
             .observe(&header, &world, bytemuck::cast_slice_mut(&mut payload))

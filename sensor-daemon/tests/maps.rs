@@ -7,10 +7,11 @@ mod common;
 use common::{Run, Tick, cavs, map, quiet};
 use ipc_schema::{
     config::{Config, Field},
+    header::{FIRST_OF_EPISODE, MessageHeader},
     run::MapInfo,
 };
 use sensor_daemon::{
-    sensing::Sensing,
+    sensing::{Sensing, UnknownSuiteError},
     sensors::gnss::{SatelliteSky, SkyView},
 };
 use sim_core::geodesy::{NetPosition, Projection};
@@ -130,4 +131,18 @@ fn earlier_episodes_on_another_map_change_nothing() {
     };
     assert_eq!(after(1, 0), after(1, 1));
     assert_eq!(after(2, 1), after(1, 1));
+}
+
+#[test]
+fn an_episode_on_a_map_that_its_stage_does_not_have_is_refused() {
+    let (config, maps) = (config(), maps());
+    let mut sensing = Sensing::on_maps(&config, BOX_M, &maps).unwrap();
+    let header = MessageHeader {
+        flags: FIRST_OF_EPISODE,
+        stage: 2,
+        map: 0,
+        ..MessageHeader::default()
+    };
+    let refused = UnknownSuiteError { stage: 2, map: 0 };
+    assert_eq!(sensing.assign(&header, &cavs(1)), Err(refused));
 }

@@ -25,7 +25,7 @@ fn tick(sensing: &mut Sensing, number: u64, flags: u32, states: &[VehicleState])
         episode_seed: 5,
         ..MessageHeader::default()
     };
-    let n = sensing.assign(&header, states);
+    let n = sensing.assign(&header, states).unwrap();
     let mut payload = vec![0_u64; ObservationLayout::new(n, sensing.width(), sensing.imu_samples()).len / 8];
     sensing
         .observe(

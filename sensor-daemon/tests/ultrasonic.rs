@@ -69,7 +69,7 @@ fn scene() -> Arc<Scene> {
     let corners = vec![[102.0, 70.0], [110.0, 70.0], [110.0, 90.0], [102.0, 90.0]];
     let house = Prism::new("house".into(), SolidClass::Building, corners, 0.0, 6.0).unwrap();
     let empty = Scene::new(Default::default(), Vec::new(), Vec::new());
-    let post = empty.prop(&Obstacle::parse("lamp_post 98.5 82").unwrap());
+    let post = empty.prop(&"lamp_post 98.5 82".parse::<Obstacle>().unwrap());
     Arc::new(Scene::new(Default::default(), vec![house], vec![post]))
 }
 

@@ -121,7 +121,7 @@ fn check_libraries(checks: &mut DoctorChecks, install: &Install) {
                 format!("ldd cannot be started: {error}"),
                 "apt-get install libc-bin".into(),
             );
-            return checks.say(Err(unknown), "libraries for SUMO");
+            return checks.print(Err(unknown), "libraries for SUMO");
         }
     };
     for (name, package) in LIBRARIES {

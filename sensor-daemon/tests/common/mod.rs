@@ -143,7 +143,7 @@ impl Run {
             ..MessageHeader::default()
         };
         (self.tick, self.flags) = (self.tick + 1, 0);
-        let n = self.sensing.assign(&header, states);
+        let n = self.sensing.assign(&header, states).unwrap();
         between(&mut self.sensing);
         let layout = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples());
         let mut payload = vec![0_u64; layout.len / 8];
