@@ -187,11 +187,6 @@ def latest_checkpoint(folder: Path) -> Path:
     return folder / (folder / LATEST).read_text().strip()
 
 
-def latest_checkpoint(folder: Path) -> Path:
-    """The checkpoint that `folder/latest` names."""
-    return folder / (folder / LATEST).read_text().strip()
-
-
 def locating_ppo(config: TrainerConfig, observation_size: int, bounds: MapBounds) -> Ppo:
     """A new learner of the localisation task on a map of this size."""
     return build_ppo(config, observation_size, Localisation(bounds, config.reward, config.reward_scale_m))

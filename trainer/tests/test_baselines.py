@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from caraware.baselines import BaselineErrors, Baselines, SensorNoise
+from caraware.baselines.noise import ImuConvention
 from caraware.baselines.samples import read_samples
 from caraware.ipc.channel import read_only_tensor
 from caraware.ipc.stream import Observation
@@ -172,7 +173,7 @@ def test_samples_are_read_from_read_only_memory_and_copied() -> None:
         imu=read_only_tensor(obs.imu.numpy()),
         speed_steering=read_only_tensor(obs.speed_steering.numpy()),
     )
-    one, two = read_samples(obs, "kinematic"), read_samples(locked, "kinematic")
+    one, two = read_samples(obs, ImuConvention.KINEMATIC), read_samples(locked, ImuConvention.KINEMATIC)
     for name, array in vars(one).items():
         np.testing.assert_array_equal(array, getattr(two, name))
     before = {name: np.array(array) for name, array in vars(one).items()}

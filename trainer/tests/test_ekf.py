@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from caraware.baselines.ekf import GATE_PATIENCE, NO_HEADING_VARIANCE, Ekf, wrapped
 from caraware.baselines.motion import SPEED, YAW, MotionModel, StateLayout
-from caraware.baselines.noise import METRES_PER_DEGREE, SensorNoise
+from caraware.baselines.noise import METRES_PER_DEGREE, ImuConvention, SensorNoise
 from caraware.baselines.samples import read_samples
 from scipy.stats import chi2
 from synthetic_vehicle import (
@@ -208,7 +208,7 @@ def test_an_old_fix_corrects_the_place_where_it_was_taken() -> None:
         late = shown[max(0, tick - 5)]
         age = np.array(obs.age_s)
         age[:, 0] = 0.1 * min(tick, 5)
-        ekf.step(read_samples(replace(obs, gnss_m=late.gnss_m, age_s=age), "kinematic"))
+        ekf.step(read_samples(replace(obs, gnss_m=late.gnss_m, age_s=age), ImuConvention.KINEMATIC))
     assert errors_m(shown[-1], ekf).max() < 0.1
     assert raw_errors_m(shown[-6]).max() < 0.1
 
@@ -327,7 +327,7 @@ def test_a_slot_with_a_new_vehicle_starts_again() -> None:
                 moved[:, 0] += 150
                 lasting = "vehicle" in sign or obs.tick == 30
                 obs = replace(obs, gnss_m=obs.gnss_m + 150, truth=moved, **(sign if lasting else {}))
-            ekf.step(read_samples(obs, "kinematic"))
+            ekf.step(read_samples(obs, ImuConvention.KINEMATIC))
             assert ekf.started[0] == (obs.tick in (0, 30))
             if obs.tick == 30:
                 np.testing.assert_allclose(ekf.position_m[0], obs.gnss_m[0, :2].numpy(), atol=1e-4)
@@ -339,10 +339,10 @@ def test_another_episode_starts_again() -> None:
     first, second = (list(observations(standing_track(20, 3, seed), seed=seed)) for seed in (1, 2))
     second = second[5:]  # whose beginning was not seen
     for obs in (*first, *second):
-        ekf.step(read_samples(obs, "kinematic"))
+        ekf.step(read_samples(obs, ImuConvention.KINEMATIC))
     alone = Ekf(ekf.noise)
     for obs in second:
-        alone.step(read_samples(obs, "kinematic"))
+        alone.step(read_samples(obs, ImuConvention.KINEMATIC))
     np.testing.assert_array_equal(ekf.belief.mean, alone.belief.mean)
 
 
@@ -352,9 +352,9 @@ def test_other_slots_change_nothing() -> None:
     shown = list(observations(town_track(60, 3, 1), tables, 2))
     few, many = Ekf(noise_of(tables)), Ekf(noise_of(tables))
     for obs in shown:
-        few.step(read_samples(obs, "kinematic"))
+        few.step(read_samples(obs, ImuConvention.KINEMATIC))
         with np.errstate(all="raise"):
-            many.step(read_samples(in_slots(obs, [5, 0, 3], 4 if obs.tick < 0 else 7), "kinematic"))
+            many.step(read_samples(in_slots(obs, [5, 0, 3], 4 if obs.tick < 0 else 7), ImuConvention.KINEMATIC))
     np.testing.assert_array_equal(many.belief.mean[:, [5, 0, 3]], few.belief.mean)
     np.testing.assert_array_equal(many.belief.covariance[:, :, [5, 0, 3]], few.belief.covariance)
     assert np.isfinite(many.belief.covariance).all()
@@ -364,8 +364,8 @@ def test_the_number_of_slots_may_grow() -> None:
     shown = list(observations(town_track(40, 2, 1), seed=2))
     alone, growing = Ekf(noise_of(sensor_tables())), Ekf(noise_of(sensor_tables()))
     for obs in shown:
-        alone.step(read_samples(obs, "kinematic"))
-        growing.step(read_samples(in_slots(obs, [0, 1], 2 if obs.tick < 20 else 6), "kinematic"))
+        alone.step(read_samples(obs, ImuConvention.KINEMATIC))
+        growing.step(read_samples(in_slots(obs, [0, 1], 2 if obs.tick < 20 else 6), ImuConvention.KINEMATIC))
     np.testing.assert_array_equal(growing.belief.mean[:, :2], alone.belief.mean)
 
 

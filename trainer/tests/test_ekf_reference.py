@@ -6,7 +6,7 @@ import numpy as np
 import sympy
 from caraware.baselines.ekf import never_negative, wrapped
 from caraware.baselines.motion import SPEED, MotionModel
-from caraware.baselines.noise import SensorNoise
+from caraware.baselines.noise import ImuConvention, SensorNoise
 from caraware.baselines.samples import read_samples
 from filterpy.kalman import ExtendedKalmanFilter
 from synthetic_vehicle import GNSS, IMU, SPEED_STEERING, observations, standing_track, town_track
@@ -132,7 +132,7 @@ def test_state_and_covariance_are_filterpy_s_to_1e_9() -> None:
     dark[140:170] |= SPEED_STEERING
     reference: Reference | None = None
     for obs, ekf in filtered(observations(track, tables, 1, dark), tables, model):
-        samples = read_samples(obs, "kinematic")
+        samples = read_samples(obs, ImuConvention.KINEMATIC)
         imu = np.array([samples.yaw_rate_radps[0, 1], samples.accel_mps2[0, 1]])
         lit = {bit: not dark[obs.tick, 1] & bit for bit in (GNSS, IMU, SPEED_STEERING)}
         if reference is None:

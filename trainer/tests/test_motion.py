@@ -23,7 +23,7 @@ from caraware.baselines.motion import (
     propagate_rows,
     transition,
 )
-from caraware.baselines.noise import SensorNoise
+from caraware.baselines.noise import ImuConvention, SensorNoise
 from caraware.baselines.samples import read_samples
 from synthetic_vehicle import observations, sensor_tables, town_track
 
@@ -128,7 +128,9 @@ def test_the_jacobian_of_an_old_fix_is_its_derivative(axis: int) -> None:
 def test_the_jacobian_of_wheel_speed_and_compass_is_the_derivative_of_what_is_expected() -> None:
     """Seen from outside: innovation and row that `correct` is given, over small changes of the state."""
     noise, layout = everything()
-    samples = read_samples(next(observations(town_track(2, 5, 1), sensor_tables(**ALL_ERRORS))), "kinematic")
+    samples = read_samples(
+        next(observations(town_track(2, 5, 1), sensor_tables(**ALL_ERRORS))), ImuConvention.KINEMATIC
+    )
     samples = replace(samples, yaw_rad=np.full((1, 5), 0.3))
     mean = np.random.default_rng(4).normal(0, 0.3, (layout.size, 5))
     mean[SPEED] = [0.0, 1e-4, 3e-3, 0.1, 20.0]

@@ -7,6 +7,7 @@ import pytest
 from caraware.baselines import Baselines
 from caraware.baselines.ekf import Belief, Ekf, wrapped
 from caraware.baselines.motion import YAW
+from caraware.baselines.noise import ImuConvention
 from caraware.baselines.rts import SmoothedTick, Smoother, cholesky, right_divided
 from caraware.baselines.samples import read_samples
 from caraware.ipc.arrays import Float64Array
@@ -166,7 +167,7 @@ def test_the_samples_of_the_next_vehicle_in_a_slot_do_not_count(sign: str) -> No
         ekf = Ekf(noise)
         smoother = Smoother(ekf)
         for obs in ticks:
-            ekf.step(read_samples(obs, "kinematic"))
+            ekf.step(read_samples(obs, ImuConvention.KINEMATIC))
             smoother.push(obs.tick)
         smoothed.append([tick.mean for tick in smoother.finish()[:40]])
     short, long = np.array(smoothed[0]), np.array(smoothed[1])
