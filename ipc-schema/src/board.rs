@@ -15,6 +15,8 @@ use crate::{
 pub struct Progress {
     /// Number of ticks consumed: all ticks below this one may be overwritten.
     pub consumed_ticks: u64,
+    /// Of a trainer: number of ticks received when it turned to the sender [`Progress::sender_incarnation`].
+    pub received_ticks: u64,
     /// Number of ticks contained in the last checkpoint that was renamed into place.
     pub committed_ticks: u64,
     /// Counts the replacements of the process.
@@ -27,8 +29,8 @@ pub struct Progress {
     pub since_lesson: u64,
     /// The newest stage, counted from 0. Equal to the number of stages when all are done; `since_lesson` is then unused.
     pub stage: u32,
-    /// Zero.
-    pub padding: u32,
+    /// Of a trainer: incarnation of `sensor-daemon` whose observations it receives; it has read all that an earlier one sent.
+    pub sender_incarnation: u32,
 }
 
 impl Progress {

@@ -145,6 +145,12 @@ impl BoardReader {
         *self.entries.borrow().training.get()
     }
 
+    /// The incarnation of the process that counts.
+    #[must_use]
+    pub fn current_incarnation(&self) -> u32 {
+        self.roster.get().incarnations[self.process]
+    }
+
     /// True while a successor that is ready waits for the incarnation that counts to leave, or opens its ports.
     #[must_use]
     pub fn is_handing_over(&self) -> bool {

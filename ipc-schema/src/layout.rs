@@ -215,13 +215,14 @@ pub fn table() -> Vec<TypeLayout> {
         }),
         layout!(Progress {
             consumed_ticks,
+            received_ticks,
             committed_ticks,
             incarnation,
             attached,
             decided_lessons,
             since_lesson,
             stage,
-            padding
+            sender_incarnation
         }),
         layout!(Health {
             state,

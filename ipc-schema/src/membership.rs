@@ -287,10 +287,10 @@ impl RunMembership {
             self.upstream.push(self.waker(channel.producer())?);
         }
         let subscriber = Subscriber::create(&service, channel, &self.run)?;
-        // Refuse what was addressed to an earlier incarnation of this process.
-        Ok(match channel.requires(self.process) {
-            true => subscriber.since_incarnation(self.incarnation),
-            false => subscriber,
+        // An observation is addressed to an incarnation of the trainer: a later one refuses it. Other messages are for any incarnation.
+        Ok(match (channel, self.process) {
+            (Channel::Observation, Process::Trainer) => subscriber.since_incarnation(self.incarnation),
+            _ => subscriber,
         })
     }
 
@@ -383,6 +383,7 @@ impl RunMembership {
     pub fn attach_from(&mut self, tick: u64) {
         self.progress = Progress {
             consumed_ticks: tick,
+            received_ticks: tick,
             committed_ticks: tick,
             attached: 1,
             ..self.progress
@@ -396,6 +397,14 @@ impl RunMembership {
     /// From here on processor time counts as that of the work itself: everything has been loaded.
     pub fn begin_work(&mut self) {
         self.start_cpu_s = usage::processor_time_s();
+    }
+
+    /// Publishes that this process has received all ticks below `ticks`, and receives the next ones from incarnation `sender` of their
+    /// producer.
+    pub fn turn_to_sender(&mut self, sender: u32, ticks: u64) {
+        (self.progress.sender_incarnation, self.progress.received_ticks) = (sender, ticks);
+        self.board.set_progress(self.progress);
+        self.wake_upstream();
     }
 
     /// All ticks below `ticks` have been consumed: their producer gets the credit.

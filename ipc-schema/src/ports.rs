@@ -244,6 +244,11 @@ impl Subscriber {
         })
     }
 
+    /// Refuses messages of senders before `incarnation` from now on.
+    pub fn refuse_senders_before(&self, incarnation: u32) {
+        self.incarnation.fetch_max(incarnation, Ordering::Relaxed);
+    }
+
     /// Refuses messages that are addressed to incarnations before `incarnation`, also before a newer one has come.
     #[must_use]
     pub(crate) fn since_incarnation(self, incarnation: u32) -> Self {

@@ -206,8 +206,8 @@ pub enum RunFileError {
         #[source]
         source: serde_json::Error,
     },
-    /// A stage of the curriculum is on a map that the run does not have.
-    #[error("{path}: stage {stage} of `curriculum.stages` is on the map \"{map}\", which the run does not have")]
+    /// A stage of the curriculum uses a map that the run does not have.
+    #[error("{path}: stage {stage} of `curriculum.stages` uses the map \"{map}\", which the run does not have")]
     UnknownMap {
         /// The file.
         path: PathBuf,

@@ -40,7 +40,7 @@ struct Sensing {
     lidar: Option<Value>,
 }
 
-/// The part of the trainer's report that the run's report repeats; a module of the user's may leave out any of it.
+/// The part of the trainer's report that the run's report repeats; a trainer of the user may leave out any of it.
 #[derive(Debug, Deserialize, Default)]
 struct TrainerFigures {
     env_steps: Option<u64>,
@@ -105,7 +105,7 @@ struct PartReader {
 }
 
 impl PartReader {
-    /// Reads the part of a process of an environment; `None` if the process was ended before it wrote its part, or if the part is unreadable.
+    /// Reads the part of a process of an environment; `None` if the process did not write it, or if it is unreadable.
     fn read<T: serde::de::DeserializeOwned>(&mut self, run_dir: &Path, process: Process) -> Option<T> {
         let path = run_dir.join("parts").join(format!("{process}.json"));
         let reason = match std::fs::read_to_string(&path) {
@@ -270,12 +270,12 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<WrittenReport, Exit>
     })
 }
 
-/// The report as it was written.
+/// The written report.
 #[derive(Debug)]
 pub struct WrittenReport {
     report: Value,
     path: PathBuf,
-    /// Parts that cannot be read, each with the reason: the report lacks them.
+    /// Unreadable parts, which the report lacks, each with the reason.
     unreadable: Vec<String>,
 }
 
@@ -294,7 +294,7 @@ impl WrittenReport {
         match self.unreadable.as_slice() {
             [] => Ok(()),
             parts => Err(Exit::run(
-                format!("the report lacks what cannot be read: {}", parts.join("; ")),
+                format!("the report lacks parts that cannot be read: {}", parts.join("; ")),
                 "a trainer of your own must write its part as JSON, which has no NaN, with counts as whole numbers",
             )),
         }
@@ -426,7 +426,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_part_that_cannot_be_read_is_named_and_one_that_is_not_there_is_none() {
+    fn the_error_names_an_unreadable_part_and_a_missing_part_is_none() {
         let run_dir = tempfile::tempdir().unwrap();
         let write = |process: Process, part: &Value| {
             let path = run_dir.path().join("parts").join(format!("{process}.json"));

@@ -104,6 +104,11 @@ fn assert_same(workplace: &Workplace, names: [&str; 2]) {
     for report in [&whole, &killed] {
         assert_eq!(report["result"], "completed");
     }
+    assert_eq!(
+        (&killed["lost_ticks"], &killed["duplicated_ticks"]),
+        (&0.into(), &0.into()),
+        "{killed:#}"
+    );
     for key in [
         "observation_hash",
         "vehicle_steps",
@@ -202,7 +207,12 @@ fn a_scenario_without_a_learner_is_sensed_again_from_its_beginning() {
         "grid.sumocfg",
         &format!("<configuration><input>{input}</input>{time}</configuration>"),
     );
-    let settings = ["fanout.enabled=false", "collision.detect=true"];
+    let settings = [
+        "fanout.enabled=false",
+        "collision.detect=true",
+        "map.origin_latitude_deg=52",
+        "map.origin_longitude_deg=10",
+    ];
     workplace.succeed(&arguments(
         &["simulate", "grid.sumocfg", "--name", "whole"],
         &settings,

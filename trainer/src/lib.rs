@@ -64,6 +64,10 @@ struct Attached {
     /// Board of `traffic-bridge`; opened by the first call of `lag_ticks`.
     traffic: Option<BoardReader>,
     consumed_ticks: u64,
+    /// Board of `sensor-daemon`: which incarnation sends observations.
+    sensor_daemon: BoardReader,
+    /// The incarnation of `sensor-daemon` whose observations are received.
+    sender: u32,
     /// One more than the newest tick that Python has been given.
     received_ticks: u64,
     ended: bool,
@@ -310,18 +314,29 @@ impl Attachment {
 }
 
 impl Attached {
+    /// Turns to the `sensor-daemon` that counts, once all that an earlier one sent has been received: it sends from there on.
+    fn follow_sender(&mut self) {
+        let sender = self.sensor_daemon.current_incarnation();
+        if sender != self.sender {
+            self.sender = sender;
+            self.observations.refuse_senders_before(sender);
+            self.membership.turn_to_sender(sender, self.received_ticks);
+        }
+    }
+
     /// The next observation, if one is waiting. A `sensor-daemon` that was started again sends what it cannot know to have arrived: what
     /// has been received before is skipped.
     fn next_message(&mut self) -> PyResult<Option<Message>> {
         loop {
             let Some(message) = self.observations.receive().map_err(|error| failed(&error))? else {
+                self.follow_sender();
                 return Ok(None);
             };
             let header = message.header();
             let is_repeated = header.incarnation > 0 && header.tick < self.received_ticks;
-            self.received_ticks = self.received_ticks.max(header.tick + 1);
             self.ended |= header.has(header::LAST_OF_RUN);
             if !is_repeated {
+                self.received_ticks = header.tick + 1;
                 return Ok(Some(message));
             }
         }
@@ -338,6 +353,7 @@ impl Attachment {
             false => None,
         };
         let traffic_bridge = membership.waker(Process::TrafficBridge).map_err(membership_failed)?;
+        let sensor_daemon = membership.board_of(Process::SensorDaemon).map_err(membership_failed)?;
         membership.attach_from(first_tick);
         let attached = Attached {
             membership,
@@ -349,6 +365,8 @@ impl Attachment {
             training: TrainingStatus::default(),
             traffic: None,
             consumed_ticks: first_tick,
+            sensor_daemon,
+            sender: 0,
             received_ticks: first_tick,
             ended: false,
             outside,

@@ -30,7 +30,7 @@ const TOWN_ALONE: &[CurriculumMap] = &[CurriculumMap::Town];
 /// Endings of files that are maps.
 const MAP_ENDINGS: [&str; 3] = [".sumocfg", ".net.xml", ".net.xml.gz"];
 
-/// A map that stages choose from. Configurations and run files write it as "town" or as a path; stages call it by its name.
+/// A map that stages choose from. Configurations and run files write it as "town" or as a path; stages refer to it by its name.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CurriculumMap {
     /// The project's own map.
@@ -44,7 +44,7 @@ pub enum CurriculumMap {
     },
 }
 
-/// A text is no map.
+/// The text is not a map.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("\"{0}\" is no map")]
 pub struct CurriculumMapError(pub String);

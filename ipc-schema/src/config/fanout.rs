@@ -49,7 +49,7 @@ pub struct FanoutConfig {
 /// A zenoh endpoint. Configurations and run files write it as "tcp/HOST:PORT" or "tls/HOST:PORT".
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FanoutEndpoint {
-    /// How clients connect.
+    /// Protocol of the connection.
     pub protocol: EndpointProtocol,
     /// Name or address of this machine; an IPv6 address is in brackets.
     pub host: String,
@@ -57,7 +57,7 @@ pub struct FanoutEndpoint {
     pub port: u16,
 }
 
-/// How clients connect to an endpoint.
+/// Protocol by which clients connect to an endpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EndpointProtocol {
     /// Plain text.
@@ -66,7 +66,7 @@ pub enum EndpointProtocol {
     Tls,
 }
 
-/// A text is no endpoint.
+/// The text is not an endpoint.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("\"{0}\" is no endpoint")]
 pub struct FanoutEndpointError(pub String);
@@ -78,7 +78,7 @@ impl FanoutEndpoint {
         format!("{}:{}", self.host, self.port)
     }
 
-    /// The endpoint that a client on this machine connects to: one that listens on every address is called by that of the loopback.
+    /// The endpoint that a client on this machine connects to: the loopback address replaces a wildcard, which cannot be connected to.
     #[must_use]
     pub fn on_this_machine(&self) -> Self {
         let host = match self.host.as_str() {
@@ -193,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn an_endpoint_on_every_address_is_called_by_the_loopback() {
+    fn the_loopback_address_replaces_a_wildcard() {
         for (listen, call) in [
             ("tcp/0.0.0.0:7447", "tcp/127.0.0.1:7447"),
             ("tls/[::]:1", "tls/[::1]:1"),

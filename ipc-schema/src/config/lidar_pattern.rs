@@ -1,4 +1,4 @@
-//! Which rays a LIDAR fires.
+//! The rays of a LIDAR.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,4 +1,4 @@
-//! The road and what stands beside it.
+//! The surface of the road, and the objects beside it.
 
 use std::{fmt, path::PathBuf, str::FromStr};
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::text::{finite_numbers, serde_as_text};
 use crate::props::Obstacle;
 
-/// What the road is covered with.
+/// Surface of the road.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Surface {
@@ -23,11 +23,11 @@ pub enum Surface {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RoadConfig {
-    /// What it is covered with: decides the friction.
+    /// The surface, which decides the friction.
     pub surface: Surface,
 }
 
-/// What stands beside the road, or on it.
+/// Objects beside the road and on it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SceneConfig {
@@ -35,7 +35,7 @@ pub struct SceneConfig {
     pub obstacles: Vec<Obstacle>,
     /// Props placed at random beside the road, the same for the same `run.seed`.
     pub random_props: u32,
-    /// Height of a building whose polygon and type name none, metres.
+    /// Height of a building whose polygon and type state none, metres.
     pub building_height_m: f64,
     /// Triangle meshes. LIDARs see them; traffic and collisions do not.
     pub meshes: Vec<MeshPlacement>,
@@ -48,11 +48,11 @@ pub struct MeshPlacement {
     pub file: PathBuf,
     /// x and y of its origin, which stands on the ground, metres, world.
     pub origin_m: [f64; 2],
-    /// Counter-clockwise from east, degrees.
+    /// Heading, counter-clockwise from east, degrees.
     pub heading_deg: f64,
 }
 
-/// A text is not a mesh with its place.
+/// The text is not a mesh with its position.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("\"{0}\" is not \"file.obj x y\" or \"file.obj x y heading\" with plain numbers")]
 pub struct MeshPlacementError(pub String);

@@ -1,4 +1,4 @@
-//! How values that users write as text are read and written: by `FromStr` and `Display`, in configurations and run files alike.
+//! Reads and writes values that configurations and run files hold as text, by `FromStr` and `Display`.
 
 use std::{fmt, marker::PhantomData, str::FromStr};
 

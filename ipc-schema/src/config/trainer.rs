@@ -34,7 +34,7 @@ pub struct TrainerConfig {
     pub entropy_scale_final: Option<f64>,
     /// Weight of the value loss.
     pub value_scale: f64,
-    /// How far a value may move in one update; `None`: any way.
+    /// Largest change of a value in one update; `None`: no limit.
     pub value_clip: Option<f64>,
     /// KL divergence at which an update of the policy ends; `None`: after all epochs.
     pub target_kl: Option<f64>,
@@ -52,7 +52,7 @@ pub struct TrainerConfig {
     pub network: Network,
     /// Width of the hidden layers of policy and value network.
     pub hidden: Vec<u64>,
-    /// What follows a hidden layer.
+    /// Activation of the hidden layers.
     pub activation: Activation,
     /// Ticks that a gradient reaches back in a network with memory.
     pub truncation_ticks: u64,
@@ -66,7 +66,7 @@ pub struct TrainerConfig {
     pub ranks: u32,
     /// Threads of torch; 0 = one for each core.
     pub threads: u64,
-    /// What it computes on.
+    /// Device of the trainer.
     pub device: TrainerDevice,
     /// Precision of the inputs of matrix products.
     pub matmul_precision: MatmulPrecision,
@@ -92,7 +92,7 @@ pub enum Reward {
     Exponential,
 }
 
-/// What the trainer computes on.
+/// Device that the trainer computes on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TrainerDevice {
@@ -117,7 +117,7 @@ pub enum MatmulPrecision {
 /// Networks of policy and value. Configurations and run files write "mlp", "gru", or the class.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Network {
-    /// Hidden layers: sees one moment.
+    /// Hidden layers alone, without memory.
     Mlp,
     /// The last hidden layer is a gated recurrent unit, with a state for each slot.
     Gru,
@@ -134,7 +134,7 @@ pub struct PythonClass {
     pub class: String,
 }
 
-/// A text is no network.
+/// The text is not a network.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("\"{0}\" is neither a network by name nor a Python class")]
 pub struct TrainerNetworkError(pub String);
@@ -189,7 +189,7 @@ impl PythonClass {
     }
 }
 
-/// What follows a hidden layer of policy and value network.
+/// Activation of the hidden layers of policy and value network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Activation {
@@ -199,7 +199,7 @@ pub enum Activation {
     Tanh,
 }
 
-/// When the trainer runs the Kalman filter beside the policy, for whoever watches.
+/// Times at which the trainer runs the Kalman filter beside the policy, for viewers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Estimates {

@@ -17,7 +17,7 @@ pub struct VehicleConfig {
     pub other_model: SingleTrackModel,
     /// Model of heroes.
     pub hero_model: VehicleModel,
-    /// Models by SUMO class; they win over the three above.
+    /// Models by SUMO class; they have precedence over the three above.
     pub class_models: Vec<ClassModel>,
     /// Time over which an instantaneous lane change is spread, seconds.
     pub lane_change_s: f64,
@@ -95,7 +95,7 @@ impl VehicleClass {
     }
 }
 
-/// A text is not a vehicle class with its model.
+/// The text is not a vehicle class with its model.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("\"{0}\" is no vehicle class of SUMO with a model")]
 pub struct ClassModelError(pub String);

@@ -8,7 +8,7 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     flow,
     header::MessageHeader,
-    membership::{MembershipError, RunMembership},
+    membership::{self, MembershipError, RunMembership},
     ports::{BoardReader, Publisher, Waker},
     process::Process,
     services::Channel,
@@ -29,6 +29,9 @@ pub struct Delivery {
     waker: Waker,
     journal: Journal,
     window: u64,
+    own_incarnation: u32,
+    /// Ticks that an earlier incarnation of this process has made.
+    sensed_before: u64,
     /// The incarnation that receives observations; `None` before the first trainer is attached.
     incarnation: Option<u32>,
     /// The next tick to send to it.
@@ -59,6 +62,8 @@ impl Delivery {
             journal,
             // Strict lock-step has one tick under way at a time, also when ticks are sent again.
             window: if run.config.drives() { 1 } else { run.window_ticks() },
+            own_incarnation: membership::incarnation(),
+            sensed_before: run.restart.map_or(0, |restart| restart.sensed_ticks),
             incarnation: None,
             next: committed,
             sent: committed,
@@ -79,10 +84,11 @@ impl Delivery {
                 || self.next < self.journal.ticks() && flow::has_credit(self.next, &progress, self.window))
     }
 
-    /// True if the trainer has consumed more ticks than have been made: the simulator processes were started again, and what it has
-    /// already is made again and not sent.
+    /// True if the trainer has received more ticks than have been made, or still reads what an earlier incarnation of this process has
+    /// sent: the simulator processes were started again, and what the trainer has is made again and not sent.
     fn is_trainer_ahead(&self, progress: &Progress) -> bool {
-        progress.attached == 1 && progress.consumed_ticks > self.journal.ticks()
+        let has_turned = progress.sender_incarnation == self.own_incarnation;
+        progress.attached == 1 && (!has_turned || progress.received_ticks > self.journal.ticks())
     }
 
     /// True if the trainer has received all earlier ticks and has credit for the live one.
@@ -99,7 +105,7 @@ impl Delivery {
     #[must_use]
     pub fn may_keep(&self, len: usize) -> bool {
         if self.is_trainer_ahead(&self.board.progress()) {
-            return true;
+            return self.journal.ticks() < self.sensed_before;
         }
         self.makes_ahead
             && self.journal.has_room(len)
@@ -157,7 +163,10 @@ impl Delivery {
             let progress = self.board.progress();
             self.follow_incarnation(&progress)
                 .map_err(|error| journal_failure(&error))?;
-            if self.next >= self.journal.ticks() || !flow::has_credit(self.next, &progress, self.window) {
+            if self.is_trainer_ahead(&progress)
+                || self.next >= self.journal.ticks()
+                || !flow::has_credit(self.next, &progress, self.window)
+            {
                 return Ok(());
             }
             self.resend(observations)?;
@@ -170,16 +179,19 @@ impl Delivery {
             return Ok(());
         }
         if self.incarnation != Some(progress.incarnation) {
-            self.journal.restart(progress.consumed_ticks)?;
+            // A trainer that has received more than it has committed is not new: this process is.
+            if progress.received_ticks == progress.committed_ticks {
+                self.journal.restart(progress.received_ticks)?;
+            }
             if progress.incarnation > 0 {
                 tracing::info!(
                     "trainer {} continues at tick {} of {}",
                     progress.incarnation,
-                    progress.consumed_ticks,
+                    progress.received_ticks,
                     self.journal.ticks()
                 );
             }
-            self.next = progress.consumed_ticks;
+            self.next = progress.received_ticks;
             self.incarnation = Some(progress.incarnation);
         }
         self.journal.commit(progress.committed_ticks);

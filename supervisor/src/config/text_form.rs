@@ -1,4 +1,4 @@
-//! Forms of texts that the validated configuration holds as values of types of their own.
+//! Forms of texts that the validated configuration holds as types.
 
 use std::{fmt::Display, str::FromStr};
 
@@ -8,7 +8,7 @@ use ipc_schema::{
     traffic::VEHICLE_CLASSES,
 };
 
-/// How a text must read.
+/// Form of a text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TextForm {
     /// A [`ClassModel`].
@@ -30,10 +30,10 @@ pub enum TextForm {
 }
 
 impl TextForm {
-    /// Reads `text` as what it stands for.
+    /// Checks that `text` has this form.
     ///
     /// # Errors
-    /// Why it cannot be read.
+    /// The text does not have this form: the error gives the reason.
     pub fn check(self, text: &str) -> Result<(), String> {
         match self {
             Self::ClassModel => read::<ClassModel>(text),
@@ -47,7 +47,7 @@ impl TextForm {
         }
     }
 
-    /// The texts that can be read, for people.
+    /// Description of the allowed texts, for messages and `configs/README.md`.
     #[must_use]
     pub fn allowed(self) -> String {
         match self {
