@@ -196,7 +196,7 @@ impl RosterWriter {
     /// The writing end of the roster.
     ///
     /// # Errors
-    /// Somebody writes it already.
+    /// The roster has a writer already.
     pub fn create(services: &ServiceHolder) -> Result<Self, PortError> {
         let port = services
             .roster()

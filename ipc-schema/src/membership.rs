@@ -158,7 +158,7 @@ impl RunMembership {
         Self::join_with(run, process, env_index, stop)
     }
 
-    /// Joins like [`RunMembership::join`] but leaves signals to the caller, who sets `stop`.
+    /// Joins like [`RunMembership::join`] but leaves signals to the caller, which sets `stop`.
     ///
     /// # Errors
     /// As [`RunMembership::join`].
@@ -420,7 +420,7 @@ impl RunMembership {
         self.board.set_progress(self.progress);
     }
 
-    /// All work is done: whoever stayed for this process may leave.
+    /// All work is done: a process that stayed for this one may leave.
     pub fn done(&mut self) {
         self.report(|health| health.state = State::Done as u32);
         self.wake_upstream();
@@ -593,7 +593,7 @@ pub fn main(process: Process, body: impl FnOnce(&Path) -> Result<(), Failure>) -
     main_heard(process, tracing_subscriber::layer::Identity::new(), "off", body)
 }
 
-/// As [`main`], with somebody who hears what the libraries log, as far as the filter `heard` lets it through.
+/// As [`main`], with a layer that receives what the libraries log, as far as the filter `heard` lets it through.
 pub fn main_heard(
     process: Process,
     hearer: impl Layer<Registry> + Send + Sync + 'static,

@@ -33,6 +33,8 @@ pub struct Environment {
     pub roster: RosterWriter,
     /// Largest number of ticks that a trainer has committed, or that were sensed in a run without one.
     committed_ticks: u64,
+    /// Largest number of ticks that any incarnation of `sensor-daemon` has made.
+    sensed_ticks: u64,
     boards: Vec<BoardReader>,
     /// Wakes `sensor-daemon`, which then reads the state of a handover.
     sensing: Waker,
@@ -62,6 +64,7 @@ impl Environment {
             run_file,
             roster: RosterWriter::create(&services)?,
             committed_ticks: 0,
+            sensed_ticks: 0,
             sensing,
             boards,
             services,
@@ -82,17 +85,18 @@ impl Environment {
 
     /// Remembers how far the learning has come: a trainer's death empties its board.
     pub fn note_progress(&mut self) {
+        self.sensed_ticks = self.sensed_ticks.max(self.board(Process::SensorDaemon).health().ticks);
         let ticks = match self.run.mode.has_trainer() {
             true => self.board(Process::Trainer).progress().committed_ticks,
-            false => self.board(Process::SensorDaemon).health().ticks,
+            false => self.sensed_ticks,
         };
         self.committed_ticks = self.committed_ticks.max(ticks);
     }
 
-    /// Ticks that `sensor-daemon` has made.
+    /// Most ticks that any incarnation of `sensor-daemon` has made.
     #[must_use]
     pub fn sensed_ticks(&self) -> u64 {
-        self.board(Process::SensorDaemon).health().ticks
+        self.sensed_ticks
     }
 
     /// Prepares the run file and the command log for simulator processes that are started again: they begin with the episode of the
@@ -134,7 +138,7 @@ impl Environment {
         };
         self.run.restart = Some(RestartPoint {
             start,
-            sensed_ticks: self.sensed_ticks(),
+            sensed_ticks: self.sensed_ticks,
         });
         self.run.write()?;
         Ok(start.episode_tick)

@@ -215,7 +215,9 @@ impl Supervisor {
                 OnExit::Replace if left => self.restart(index, &ended)?,
                 // The processes of the environment change places: what else has ended is found at the next check.
                 OnExit::Required if was_killed && self.may_simulate_again(&ended) => {
-                    return self.restart_environment(index, &ended);
+                    if self.restart_environment(index, &ended)? {
+                        return Ok(());
+                    }
                 }
                 OnExit::Required | OnExit::Replace => {
                     return Err(self.processes.failure(index, ended.status).into());
@@ -234,7 +236,7 @@ impl Supervisor {
 
     /// Starts the simulator processes of an environment again, after a pause that grows while nothing new is sensed. Only ends of the
     /// program's own making (a crash, not SIGKILL) can make it give up.
-    fn restart_environment(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
+    fn restart_environment(&mut self, index: usize, ended: &EndedProcess) -> Result<bool, Exit> {
         let env_index = ended.env_index;
         let sensed_ticks = self.processes.environments()[env_index as usize].sensed_ticks();
         let is_crash = ended
@@ -243,7 +245,7 @@ impl Supervisor {
             .is_some_and(|signal| signal != SIGKILL && signal != SIGTERM);
         let restarts = self.environment_restarts.entry(env_index).or_default();
         match restarts.verdict(sensed_ticks, is_crash, Instant::now()) {
-            RestartVerdict::Wait => return Ok(()),
+            RestartVerdict::Wait => return Ok(false),
             RestartVerdict::GiveUp => {
                 let mut failure = self.processes.failure(index, ended.status);
                 failure.message += "\n  it crashed again and again without a new tick";
@@ -257,7 +259,7 @@ impl Supervisor {
             "{label} ended with {}; the simulation is made again from tick {first_tick} to {sensed_ticks}, and continues",
             ended.status
         ));
-        Ok(())
+        Ok(true)
     }
 
     /// Restarts a watcher, unless none of its last starts opened its ports. Then the run continues without it.

@@ -87,8 +87,12 @@ impl Delivery {
     /// True if the trainer has received more ticks than have been made, or still reads what an earlier incarnation of this process has
     /// sent: the simulator processes were started again, and what the trainer has is made again and not sent.
     fn is_trainer_ahead(&self, progress: &Progress) -> bool {
-        let has_turned = progress.sender_incarnation == self.own_incarnation;
-        progress.attached == 1 && (!has_turned || progress.received_ticks > self.journal.ticks())
+        progress.attached == 1 && (!self.has_turned(progress) || progress.received_ticks > self.journal.ticks())
+    }
+
+    /// True if the trainer has read all that earlier incarnations of this process have sent.
+    fn has_turned(&self, progress: &Progress) -> bool {
+        progress.sender_incarnation == self.own_incarnation
     }
 
     /// True if the trainer has received all earlier ticks and has credit for the live one.
@@ -104,8 +108,11 @@ impl Delivery {
     /// is under way and the journal has room for `len` bytes without giving up an older tick.
     #[must_use]
     pub fn may_keep(&self, len: usize) -> bool {
-        if self.is_trainer_ahead(&self.board.progress()) {
-            return self.journal.ticks() < self.sensed_before;
+        let progress = self.board.progress();
+        if self.is_trainer_ahead(&progress) {
+            let ticks = self.journal.ticks();
+            // While the trainer still reads the old queue, what it has is unknown, but not more than was sensed.
+            return ticks < self.sensed_before || self.has_turned(&progress) && ticks < progress.received_ticks;
         }
         self.makes_ahead
             && self.journal.has_room(len)
