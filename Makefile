@@ -14,11 +14,11 @@ train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
 
 # One selection of targets for the tests and the extension: another one would give third-party crates other features, and compile
-# them again.
+# them again. Rust's and Python's tests run side by side: both start whole runs, which wait a lot.
 test: prerequisites browser $(VENV)/.installed ## all tests
 	cargo build $(CARGO_FLAGS) --lib --bins --tests --examples
 	$(EXTENSION)
-	$(MAKE) test-rust test-python
+	$(MAKE) --jobs=2 --output-sync=line test-rust test-python
 
 build: prerequisites $(VENV)/.installed ## virtual environment, SUMO, all programs, the Python extension
 	cargo build $(CARGO_FLAGS)

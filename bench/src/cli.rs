@@ -23,7 +23,9 @@ pub enum BenchPart {
     Scale,
     /// Vehicle-steps per second, compared with Python loops over TraCI and libsumo, with MetaDrive and with SMARTS
     Peers,
-    /// All of these, one after the other
+    /// Endurance: kills, stops and replaces every process at random moments, and compares each run with an undisturbed one
+    Endurance,
+    /// All of these but endurance, one after the other
     All,
 }
 
@@ -31,6 +33,11 @@ impl BenchPart {
     /// The parts that are measured, in the order of the documentation.
     pub fn measured() -> impl Iterator<Item = Self> {
         Self::value_variants().iter().copied().filter(|part| *part != Self::All)
+    }
+
+    /// The parts of `all`: those that measure a speed.
+    pub fn speeds() -> impl Iterator<Item = Self> {
+        Self::measured().filter(|part| *part != Self::Endurance)
     }
 
     /// Its name on the command line.
@@ -59,6 +66,12 @@ pub struct BenchArgs {
     /// Measure only a small case: tests that the benchmark works, not how fast caraware is
     #[arg(long, conflicts_with = "keep")]
     pub quick: bool,
+    /// Time for which `endurance` disturbs runs, minutes; it completes the last run
+    #[arg(long, value_name = "MINUTES", default_value_t = 10)]
+    pub minutes: u64,
+    /// Seed of the moments and kinds of `endurance`'s disturbances
+    #[arg(long, value_name = "SEED", default_value_t = 1)]
+    pub seed: u64,
     /// Python that has the peers installed [default: that of `make peers`, or the project's]
     #[arg(long, value_name = "PATH")]
     pub python: Option<PathBuf>,

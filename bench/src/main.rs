@@ -3,6 +3,7 @@
 //! The `caraware` command starts this program with its arguments. Each part has a file, and its result is a [`BenchReport`] (decision 9).
 
 mod cli;
+mod endurance;
 mod envs;
 mod fanout;
 mod ipc;
@@ -34,6 +35,10 @@ pub struct BenchOptions {
     pub python: Option<PathBuf>,
     /// True if only a small case is measured, whose figures are not kept.
     pub quick: bool,
+    /// Time for which runs are disturbed, minutes.
+    pub minutes: u64,
+    /// Seed of the disturbances.
+    pub seed: u64,
 }
 
 fn main() -> ExitCode {
@@ -59,9 +64,11 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
         bin,
         python,
         quick: args.quick,
+        minutes: args.minutes,
+        seed: args.seed,
     };
     let parts = match args.part {
-        BenchPart::All => BenchPart::measured().collect(),
+        BenchPart::All => BenchPart::speeds().collect(),
         part => vec![part],
     };
     let mut reports = Vec::new();
@@ -86,11 +93,20 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
     if let Some(directory) = &args.plots {
         plots::draw(&install::python(&options.bin)?, &reports, directory)?;
     }
-    Ok(())
+    let faults: Vec<&str> = reports
+        .iter()
+        .flat_map(|report| &report.faults)
+        .map(String::as_str)
+        .collect();
+    match faults.is_empty() {
+        true => Ok(()),
+        false => Err(Exit::run(format!("faults were found: {}", faults.join("; ")), "")),
+    }
 }
 
 fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit> {
     match part {
+        BenchPart::Endurance => endurance::measure(options),
         BenchPart::Envs => envs::measure(options),
         BenchPart::Ipc => ipc::measure(options),
         BenchPart::Lidar => lidar::measure(options),

@@ -24,6 +24,9 @@ pub struct BenchReport {
     pub figures: BTreeMap<String, f64>,
     /// The curves that can be drawn.
     pub curves: Vec<ReportCurve>,
+    /// What the measurement found broken. The command fails if there is any.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub faults: Vec<String>,
 }
 
 impl BenchReport {
@@ -39,6 +42,7 @@ impl BenchReport {
             tables: Vec::new(),
             figures: BTreeMap::new(),
             curves: Vec::new(),
+            faults: Vec::new(),
         }
     }
 

@@ -17,7 +17,16 @@ fn the_help_shows_the_command_and_every_part() {
     assert_eq!(code, Some(0), "{text}");
     assert!(text.contains("Usage: caraware bench [OPTIONS] <PART>"), "{text}");
     for part in [
-        "lidar", "envs", "fanout", "ipc", "trainer", "overhead", "scale", "peers", "all",
+        "lidar",
+        "envs",
+        "fanout",
+        "ipc",
+        "trainer",
+        "overhead",
+        "scale",
+        "peers",
+        "endurance",
+        "all",
     ] {
         assert!(text.contains(&format!("- {part}:")), "{part}: {text}");
     }
@@ -28,4 +37,34 @@ fn an_unknown_part_is_refused_as_wrong_usage() {
     let (code, text) = answer(&["soup"]);
     assert_eq!(code, Some(2), "{text}");
     assert!(text.contains("possible values: lidar"), "{text}");
+}
+
+/// Every kind of disturbance may happen: the runs must end as the undisturbed ones.
+#[test]
+fn disturbed_runs_end_as_if_nothing_had_happened() {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    let (code, text) = answer(&[
+        "endurance",
+        "--quick",
+        "--seed",
+        "3",
+        "--json",
+        file.path().to_str().unwrap(),
+    ]);
+    assert_eq!(code, Some(0), "{text}");
+    let report: serde_json::Value = serde_json::from_reader(file).unwrap();
+    let figures = report["figures"].as_object().unwrap();
+    for case in ["town", "grid"] {
+        assert_eq!(figures[&format!("{case}: runs completed")], 1.0, "{text}");
+        for process in [
+            "traffic-bridge",
+            "sim-core",
+            "sensor-daemon",
+            "trainer",
+            "fanout",
+            "supervisor",
+        ] {
+            assert_eq!(figures[&format!("{case}: {process} killed")], 1.0, "{text}");
+        }
+    }
 }

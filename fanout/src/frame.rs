@@ -51,14 +51,29 @@ pub struct EncodedFrame {
 pub fn encode(channel: Channel, header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, FrameError> {
     match channel {
         Channel::World => encode_world(header, payload),
-        Channel::Observation => encode_slots(channel, header, payload, |header| {
-            let layout = ObservationLayout::of(header);
-            (layout.named().map(|(_, section)| section).to_vec(), layout.len)
-        }),
-        Channel::Prediction => encode_slots(channel, header, payload, |header| {
-            let layout = PredictionLayout::of(header);
-            (vec![layout.prediction, layout.estimate_m], layout.len)
-        }),
+        Channel::Observation => {
+            let [_, fields, imu_samples] = dimensions(header);
+            encode_slots(header, payload, |rows| {
+                let layout = ObservationLayout::sized(rows, fields, imu_samples);
+                (
+                    layout.named().map(|(_, section)| section).to_vec(),
+                    layout.shape,
+                    layout.len,
+                )
+            })
+        }
+        Channel::Prediction => {
+            let [_, numbers, estimates] = dimensions(header);
+            encode_slots(header, payload, |rows| {
+                // A filter that runs has an estimate for each slot, so that fewer slots have fewer of them.
+                let layout = PredictionLayout::sized(rows, numbers, estimates.min(rows));
+                (
+                    layout.named().map(|(_, section)| section).to_vec(),
+                    layout.shape,
+                    layout.len,
+                )
+            })
+        }
         Channel::Pointcloud => encode_scan(header, payload),
         _ => encode_collisions(header, payload),
     }
@@ -71,15 +86,21 @@ fn with_rows(header: &MessageHeader, rows: usize) -> MessageHeader {
     header
 }
 
-/// Encodes a block whose sections have a row for each slot, cut to the slots that fit.
+/// Sizes of the first three dimensions.
+fn dimensions(header: &MessageHeader) -> [usize; 3] {
+    let [first, second, third, _] = header.shape;
+    [first as usize, second as usize, third as usize]
+}
+
+/// Encodes a block whose sections have a row for each slot, cut to the slots that fit. `layout_of` gives sections, shape and length of a
+/// block with a number of slots.
 fn encode_slots(
-    channel: Channel,
     header: &MessageHeader,
     payload: &[u8],
-    layout_of: impl Fn(&MessageHeader) -> (Vec<Section>, usize),
+    layout_of: impl Fn(usize) -> (Vec<Section>, [u32; DIMENSIONS], usize),
 ) -> Result<EncodedFrame, FrameError> {
     let rows = header.rows();
-    let (sections, len) = layout_of(header);
+    let (sections, _, len) = layout_of(rows);
     let bytes: &[u8] = view(payload, Section { offset: 0, len })?;
     if HEADER_BYTES + len <= MAX_FRAME_BYTES {
         return Ok(EncodedFrame {
@@ -90,13 +111,8 @@ fn encode_slots(
     // Each section is padded to its alignment: leave room for that.
     let room = MAX_FRAME_BYTES.saturating_sub(HEADER_BYTES + 64 * sections.len());
     let kept = rows * room / len;
-    let mut header = with_rows(header, kept);
-    // A filter that runs has an estimate for each slot: a prediction has fewer of them too.
-    if channel == Channel::Prediction {
-        header.shape[2] = header.shape[2].min(header.shape[0]);
-    }
-    let (shorter, len) = layout_of(&header);
-    let mut bytes = bytes_of(&header).to_vec();
+    let (shorter, shape, len) = layout_of(kept);
+    let mut bytes = bytes_of(&MessageHeader { shape, ..*header }).to_vec();
     bytes.resize(HEADER_BYTES + len, 0);
     for (from, to) in sections.into_iter().zip(shorter) {
         let kept_rows = Section { len: to.len, ..from };

@@ -329,7 +329,7 @@ fn viewers_reconnect_to_a_restarted_fan_out() {
         fanout.0.wait().unwrap();
         run.forget_dead();
         while world.try_recv().unwrap().is_some() {}
-        fanout = run.start_incarnation(incarnation);
+        fanout = run.restart_fanout(incarnation);
     }
     until("a frame", &mut shown);
     let late = run.attach();

@@ -48,9 +48,6 @@ impl Progress {
     }
 }
 
-/// Most incarnations of a process in one run. Each writes entries of its own: iceoryx2 leaves those of a killed writer locked.
-pub const INCARNATIONS: u32 = 256;
-
 /// Which incarnation of each process counts, in the order of [`crate::process::Process::ALL`]; written by the supervisor alone.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]

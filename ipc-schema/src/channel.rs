@@ -2,11 +2,9 @@
 //! of this crate derive from it (decision 21).
 
 use crate::{
-    block::ALIGNMENT,
     control::{MAX_SWITCHES, SensorSwitchLayout},
     ego::EgoPoseLayout,
     event::CollisionLayout,
-    header::MessageHeader,
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
     prediction::{ESTIMATE_COLUMNS, PredictionLayout},
@@ -378,16 +376,15 @@ impl Channel {
         (self.spec().queue_length)(run)
     }
 
-    /// Most shared memory that this service can touch, bytes: every queue full, every message of the longest size.
+    /// Most messages that can be in use at a time, with every queue of a consumer and the fan-out full; none in a run that does not use
+    /// the channel.
     #[must_use]
-    pub fn worst_case_bytes(self, run: &RunFile) -> usize {
+    pub fn worst_case_messages(self, run: &RunFile) -> usize {
         let spec = self.spec();
         if !(spec.is_used)(run) {
             return 0;
         }
-        let per_subscriber = (spec.queue_length)(run) + (spec.in_hand)(run);
-        let messages = 2 * per_subscriber + SPARE_MESSAGES;
-        messages * ((spec.max_payload)(run) + size_of::<MessageHeader>() + 4 * ALIGNMENT)
+        2 * ((spec.queue_length)(run) + (spec.in_hand)(run)) + SPARE_MESSAGES
     }
 }
 

@@ -138,6 +138,20 @@ pub struct RunConfig {
     pub journal_mib: u32,
     /// Simulated seconds per wall second; 0 = as fast as possible.
     pub real_time_factor: f64,
+    /// A process that neither works nor waits in order for this long hangs, seconds.
+    pub stall_s: f64,
+    /// What happens to a process that hangs.
+    pub on_stall: StallAction,
+}
+
+/// What happens to a process that hangs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum StallAction {
+    /// It is named in the log, in the progress line and by `caraware ps`.
+    Report,
+    /// It is killed as well, and started again as after any death.
+    Replace,
 }
 
 /// Where traffic comes from.
@@ -166,6 +180,9 @@ pub struct TrafficConfig {
     pub held_out_trips: f64,
     /// Factor on a scenario's demand, SUMO's `--scale` (`.sumocfg`); `None` = as the scenario says.
     pub scale: Option<f64>,
+    /// A scenario's files may do all that SUMO can (`.sumocfg`); false = what reaches beyond the run's directory is refused.
+    #[serde(default)]
+    pub trust_scenario: bool,
     /// Most road users alive at once; shared memory is laid out for them.
     pub max_road_users: u32,
 }

@@ -10,6 +10,7 @@ use crate::{
     failure::{Failure, FailureKind},
     process::Process,
     run::RunFile,
+    storage,
 };
 
 /// Directory of these files below that of an environment.
@@ -23,9 +24,11 @@ pub fn store(run: &RunFile, process: Process, tick: u64, state: &impl Serialize)
     let directory = run.run_dir.join(DIRECTORY);
     let path = directory.join(file_name(process, tick));
     let partial = path.with_extension("partial");
-    let written = std::fs::create_dir_all(&directory)
-        .and_then(|()| std::fs::write(&partial, serde_json::to_vec(state)?))
-        .and_then(|()| std::fs::rename(&partial, &path));
+    let written = storage::when_there_is_space(&path, || {
+        std::fs::create_dir_all(&directory)
+            .and_then(|()| std::fs::write(&partial, serde_json::to_vec(state)?))
+            .and_then(|()| std::fs::rename(&partial, &path))
+    });
     written.map_err(|error| failed("write", &path, &error))
 }
 

@@ -4,6 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::storage;
+
 /// Kind of a failure; it decides the exit code.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -78,11 +80,21 @@ impl Failure {
         let path = Self::path(run_dir, name);
         match serde_json::to_string(self) {
             Ok(text) => {
-                if let Err(error) = std::fs::write(&path, text) {
+                if let Err(error) = storage::write_whole(&path, text) {
                     tracing::error!(%error, path = %path.display(), "cannot write the failure");
                 }
             }
             Err(error) => tracing::error!(%error, "cannot serialise the failure"),
+        }
+    }
+
+    /// Removes the failure of process `name`, if there is one.
+    pub fn remove(run_dir: &Path, name: &str) {
+        let path = Self::path(run_dir, name);
+        if let Err(error) = std::fs::remove_file(&path)
+            && error.kind() != std::io::ErrorKind::NotFound
+        {
+            tracing::error!(%error, path = %path.display(), "cannot remove the failure");
         }
     }
 

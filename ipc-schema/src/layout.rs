@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use crate::{
     SCHEMA_VERSION,
+    activity::Activity,
     block::ALIGNMENT,
     board::{Health, Progress, Roster, TrainingStatus},
     channel::CHANNELS,
@@ -103,7 +104,11 @@ pub fn table() -> Vec<TypeLayout> {
             id_len,
             id,
             vehicle_class,
-            type_id
+            type_id,
+            type_accel_mps2,
+            type_decel_mps2,
+            type_speed_mps,
+            reserved
         }),
         layout!(SignalMeta {
             id_hash,
@@ -238,6 +243,11 @@ pub fn table() -> Vec<TypeLayout> {
             resynchronisations,
             total_ticks,
             written_ns
+        }),
+        layout!(Activity {
+            noted_ns,
+            awaited,
+            process
         }),
         layout!(Roster {
             incarnations,

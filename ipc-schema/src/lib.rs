@@ -13,7 +13,7 @@
 //! | `pointcloud` | `Scan`, `[LidarPoint]`: one message for each LIDAR and tick | sensor-daemon | none |
 //! | `switch` | `[SensorSwitch]`, from the tick in the header on | traffic-bridge | none |
 //! | `control` | [`control::ControlRequest`] → [`control::ControlReply`] | supervisor | traffic-bridge |
-//! | `board` | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`] | every process | none (newest wins) |
+//! | `board` | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`], [`activity::Activity`] | every process | none (newest wins) |
 //! | `roster` | [`board::Roster`]: the current incarnation of each process | supervisor | none (newest wins) |
 //! | `wake` | an event without content | every peer | its process |
 //!
@@ -22,6 +22,7 @@
 //! Every message has a [`header::MessageHeader`]. The supervisor alone creates the services, in [`services`]; all other processes
 //! open them. `layout.json` holds the layouts, and tests in Rust and Python compare it with the programs.
 
+pub mod activity;
 pub mod block;
 pub mod board;
 mod board_port;
@@ -45,16 +46,24 @@ pub mod pointcloud;
 pub mod ports;
 pub mod prediction;
 pub mod process;
+mod process_main;
 pub mod props;
+mod required_consumers;
+pub mod reserve;
 pub mod run;
 pub mod schedule;
 pub mod scheduling;
 pub mod section;
 pub mod sensor;
 pub mod services;
+pub mod storage;
 pub mod traffic;
 pub mod usage;
 pub mod world;
 
+// What the tests of this crate share names it as other crates do.
+#[cfg(test)]
+extern crate self as ipc_schema;
+
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 14;
+pub const SCHEMA_VERSION: u32 = 15;

@@ -2,7 +2,6 @@
 
 use std::{
     path::Path,
-    process::ExitCode,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
@@ -10,22 +9,25 @@ use std::{
     time::Duration,
 };
 
-use iceoryx2::node::Node;
-use tracing_subscriber::{EnvFilter, Layer, Registry, layer::SubscriberExt as _, util::SubscriberInitExt as _};
-
 use crate::{
     SCHEMA_VERSION,
+    activity::{Activity, Awaited},
     board::{Health, Progress, State},
     clock, episode_state,
     failure::{Failure, FailureKind},
-    flow,
     header::MessageHeader,
     ports::{BoardError, BoardReader, BoardWriter, ControlServer, PortError, Publisher, Subscriber, Waker, wait},
     process::Process,
     run::{RunFile, RunFileError},
     scheduling,
-    services::{self, Channel, ServiceError, Shm, WakeListener},
+    services::{self, BoardSeries, Channel, RunNode, ServiceError, WakeListener},
+    storage,
     usage::{self, Usage},
+};
+
+pub use crate::{
+    process_main::{main, main_heard},
+    required_consumers::RequiredConsumers,
 };
 
 /// Environment variable with the number of times a process has been started before.
@@ -84,43 +86,6 @@ pub enum Wait {
     Stopped,
 }
 
-/// The required consumers of a channel: the credit that they return, and their wake-ups.
-pub struct RequiredConsumers {
-    boards: Vec<BoardReader>,
-    wakers: Vec<Waker>,
-    /// Ticks that the producer may be ahead of each of them.
-    window: u64,
-}
-
-impl std::fmt::Debug for RequiredConsumers {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let mut debug = f.debug_struct("RequiredConsumers");
-        debug.field("number", &self.boards.len()).field("window", &self.window);
-        debug.finish_non_exhaustive()
-    }
-}
-
-impl RequiredConsumers {
-    /// True if every consumer has credit for `tick`.
-    #[must_use]
-    pub fn have_credit(&self, tick: u64) -> bool {
-        let mut boards = self.boards.iter();
-        boards.all(|board| flow::has_credit(tick, &board.progress(), self.window))
-    }
-
-    /// True if every consumer has consumed all ticks below `ticks`.
-    #[must_use]
-    pub fn have_consumed(&self, ticks: u64) -> bool {
-        let mut boards = self.boards.iter();
-        boards.all(|board| board.progress().consumed_ticks >= ticks)
-    }
-
-    /// Wakes every consumer after a message has been sent.
-    pub fn wake(&self) {
-        self.wakers.iter().for_each(Waker::wake);
-    }
-}
-
 /// One process's part in a run.
 pub struct RunMembership {
     /// What the supervisor said.
@@ -128,13 +93,15 @@ pub struct RunMembership {
     process: Process,
     env_index: u32,
     incarnation: u32,
-    node: Arc<Node<Shm>>,
+    node: RunNode,
     board: BoardWriter,
     wake: Arc<WakeListener>,
     stop: Arc<AtomicBool>,
     progress: Progress,
     health: Health,
     upstream: Vec<Waker>,
+    /// The process whose messages this one must consume, if there is one.
+    source: Option<Process>,
     /// Processor time used before the work began, seconds.
     start_cpu_s: f64,
 }
@@ -203,7 +170,8 @@ impl RunMembership {
         {
             tracing::debug!(%error, "ticks may have to wait for a core");
         }
-        let node = Arc::new(services::node(&run.shared_memory)?);
+        storage::stop_waiting_at(&stop);
+        let node = services::node(&run.shared_memory)?;
         let wake = services::open_wake(&node, &run, env_index, process)?
             .listener_builder()
             .create()
@@ -236,11 +204,11 @@ impl RunMembership {
         process: Process,
         env_index: u32,
         stop: Arc<AtomicBool>,
-        node: Arc<Node<Shm>>,
+        node: RunNode,
         wake: Arc<WakeListener>,
     ) -> Result<Self, MembershipError> {
         let incarnation = incarnation();
-        let board = BoardWriter::create(&services::open_board(&node, &run, env_index, process)?, incarnation)?;
+        let board = BoardWriter::create(&BoardSeries::new(&run, env_index, process).open(&node, incarnation)?)?;
         let progress = Progress {
             incarnation,
             ..Progress::default()
@@ -264,6 +232,7 @@ impl RunMembership {
             progress,
             health,
             upstream: Vec::new(),
+            source: None,
             start_cpu_s: 0.0,
         })
     }
@@ -285,6 +254,7 @@ impl RunMembership {
         let service = services::open_data(&self.node, &self.run, self.env_index, channel)?;
         if channel.requires(self.process) {
             self.upstream.push(self.waker(channel.producer())?);
+            self.source = Some(channel.producer());
         }
         let subscriber = Subscriber::create(&service, channel, &self.run)?;
         // An observation is addressed to an incarnation of the trainer: a later one refuses it. Other messages are for any incarnation.
@@ -318,7 +288,7 @@ impl RunMembership {
     ) -> Result<RequiredConsumers, MembershipError> {
         let (mut boards, mut wakers) = (Vec::new(), Vec::new());
         for process in processes {
-            boards.push(self.board_of(process)?);
+            boards.push((process, self.board_of(process)?));
             wakers.push(self.waker(process)?);
         }
         Ok(RequiredConsumers { boards, wakers, window })
@@ -409,6 +379,7 @@ impl RunMembership {
 
     /// All ticks below `ticks` have been consumed: their producer gets the credit.
     pub fn consumed(&mut self, ticks: u64) {
+        self.note(Awaited::Nothing);
         self.progress.consumed_ticks = ticks;
         self.board.set_progress(self.progress);
         self.wake_upstream();
@@ -469,6 +440,12 @@ impl RunMembership {
         change(&mut self.health);
         self.health.written_ns = clock::monotonic_ns();
         self.board.set_health(self.health);
+        self.note(Awaited::Nothing);
+    }
+
+    /// Notes on the board that this process lives, and what it waits for.
+    pub fn note(&self, awaited: Awaited) {
+        self.board.set_activity(Activity::now(awaited));
     }
 
     /// Writes what this process adds to the run's report, `parts/<process>.json`, with what it has used of the machine as `process`.
@@ -487,7 +464,8 @@ impl RunMembership {
             part.insert("process".into(), used);
         }
         let text = serde_json::to_string_pretty(&part).map_err(|error| failed(&error))?;
-        std::fs::write(&path, text).map_err(|error| failed(&error))
+        let written = storage::when_there_is_space(&path, || storage::write_whole(&path, &text));
+        written.map_err(|error| failed(&error))
     }
 
     /// The board, for the training status.
@@ -507,7 +485,8 @@ impl RunMembership {
     /// # Errors
     /// The wake-up is broken.
     pub fn wait_for_credit(&self, consumers: &RequiredConsumers, tick: u64) -> Result<Wait, MembershipError> {
-        self.wait_until(|| consumers.have_credit(tick))
+        let lacking = || consumers.lacks_credit(tick).map(Awaited::Credit);
+        self.wait_while(lacking)
     }
 
     /// Waits until all of `consumers` have consumed all ticks below `ticks`: only then may their producer leave.
@@ -515,21 +494,45 @@ impl RunMembership {
     /// # Errors
     /// The wake-up is broken.
     pub fn wait_until_consumed(&self, consumers: &RequiredConsumers, ticks: u64) -> Result<Wait, MembershipError> {
-        self.wait_until(|| consumers.have_consumed(ticks))
+        let lacking = || consumers.lacks(ticks).map(Awaited::Credit);
+        self.wait_while(lacking)
     }
 
     /// Waits until `condition` holds or the process is asked to stop; looks again at every wake-up.
     ///
     /// # Errors
     /// The wake-up is broken.
-    pub fn wait_until(&self, mut condition: impl FnMut() -> bool) -> Result<Wait, MembershipError> {
+    pub fn wait_until(&self, condition: impl FnMut() -> bool) -> Result<Wait, MembershipError> {
+        self.wait_until_for(Awaited::Other, condition)
+    }
+
+    /// As [`RunMembership::wait_until`], and notes on the board that this process waits for `awaited`.
+    ///
+    /// # Errors
+    /// The wake-up is broken.
+    pub fn wait_until_for(
+        &self,
+        awaited: Awaited,
+        mut condition: impl FnMut() -> bool,
+    ) -> Result<Wait, MembershipError> {
+        self.wait_while(|| (!condition()).then_some(awaited))
+    }
+
+    /// Waits while `lacking` names what this process waits for, until it is asked to stop. Notes every look on the board.
+    fn wait_while(&self, mut lacking: impl FnMut() -> Option<Awaited>) -> Result<Wait, MembershipError> {
+        let mut has_waited = false;
         loop {
-            if condition() {
+            let Some(awaited) = lacking() else {
+                if has_waited {
+                    self.note(Awaited::Nothing);
+                }
                 return Ok(Wait::Ready);
-            }
+            };
             if self.stopped() {
                 return Ok(Wait::Stopped);
             }
+            self.note(awaited);
+            has_waited = true;
             wait(&self.wake, LOOK)?;
         }
     }
@@ -539,7 +542,10 @@ impl RunMembership {
     /// # Errors
     /// The wake-up is broken.
     pub fn wait(&self, timeout: Duration) -> Result<(), MembershipError> {
-        Ok(wait(&self.wake, timeout)?)
+        self.note(self.source.map_or(Awaited::Other, Awaited::Input));
+        let waited = wait(&self.wake, timeout);
+        self.note(Awaited::Nothing);
+        Ok(waited?)
     }
 
     /// The next message of `subscriber`, waiting for it; `None` once the process is asked to stop.
@@ -549,7 +555,8 @@ impl RunMembership {
     pub fn next(&self, subscriber: &Subscriber) -> Result<Option<crate::ports::Message>, MembershipError> {
         let mut message = None;
         let mut failure = None;
-        let waited = self.wait_until(|| match subscriber.receive() {
+        let producer = Awaited::Input(subscriber.channel().producer());
+        let waited = self.wait_until_for(producer, || match subscriber.receive() {
             Ok(received) => {
                 message = received;
                 message.is_some()
@@ -587,42 +594,6 @@ fn lives(pid: i32) -> bool {
     rustix::process::Pid::from_raw(pid).is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok())
 }
 
-/// The `main` of a process binary: reads the run file named by the first argument, logs to standard error, runs `body`,
-/// and turns its failure into a failure file and an exit code.
-pub fn main(process: Process, body: impl FnOnce(&Path) -> Result<(), Failure>) -> ExitCode {
-    main_heard(process, tracing_subscriber::layer::Identity::new(), "off", body)
-}
-
-/// As [`main`], with a layer that receives what the libraries log, as far as the filter `heard` lets it through.
-pub fn main_heard(
-    process: Process,
-    hearer: impl Layer<Registry> + Send + Sync + 'static,
-    heard: &str,
-    body: impl FnOnce(&Path) -> Result<(), Failure>,
-) -> ExitCode {
-    let log = tracing_subscriber::fmt::layer()
-        .with_writer(std::io::stderr)
-        .with_ansi(false)
-        .with_filter(EnvFilter::try_from_default_env().unwrap_or_else(|_| "info,zenoh=error".into()));
-    let hearer = hearer.with_filter(EnvFilter::new(heard));
-    tracing_subscriber::registry().with(hearer).with(log).init();
-    let Some(run_file) = std::env::args_os().nth(1) else {
-        tracing::error!("usage: {process} RUN_FILE   (started by `caraware`, not by hand)");
-        return ExitCode::from(FailureKind::Config.exit_code());
-    };
-    let run_file = Path::new(&run_file);
-    match body(run_file) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(failure) => {
-            tracing::error!(help = failure.help.as_deref(), "{}", failure.message);
-            if let Some(run_dir) = run_file.parent() {
-                failure.write(run_dir, process.name());
-            }
-            ExitCode::from(failure.kind.exit_code())
-        }
-    }
-}
-
 impl From<BoardError> for MembershipError {
     fn from(error: BoardError) -> Self {
         match error {
@@ -634,12 +605,18 @@ impl From<BoardError> for MembershipError {
 
 impl From<MembershipError> for Failure {
     fn from(error: MembershipError) -> Self {
-        Self::from_error(FailureKind::Run, &error)
+        match error {
+            MembershipError::Port(error) => error.into(),
+            error => Self::from_error(FailureKind::Run, &error),
+        }
     }
 }
 
 impl From<PortError> for Failure {
     fn from(error: PortError) -> Self {
-        Self::from_error(FailureKind::Run, &error)
+        match &error {
+            PortError::Reserve(full) => full.failure(),
+            error => Self::from_error(FailureKind::Run, error),
+        }
     }
 }

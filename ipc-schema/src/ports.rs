@@ -17,6 +17,7 @@ use iceoryx2::{
 use crate::{
     SCHEMA_VERSION,
     header::MessageHeader,
+    reserve::{self, ReserveError},
     run::RunFile,
     services::{self, Channel, DataService, RunNode, Shm, WakeListener, WakeService},
 };
@@ -61,6 +62,9 @@ pub enum PortError {
         /// The sender's version.
         found: u32,
     },
+    /// Shared memory is full.
+    #[error(transparent)]
+    Reserve(#[from] ReserveError),
     /// A tick is missing, or came twice.
     #[error("{channel}: expected tick {expected}, received tick {received}")]
     Gap {
@@ -108,6 +112,12 @@ impl Publisher {
             })
             .create()
             .map_err(|e| refused(channel.name(), "creation of the publisher")(&e))?;
+        {
+            let loan = || port.loan_slice_uninit(limit.max(1));
+            let first = loan().map_err(|e| refused(channel.name(), "loan")(&e))?;
+            let second = loan().map_err(|e| refused(channel.name(), "loan")(&e))?;
+            reserve::back_messages(run, channel, first.payload().as_ptr(), second.payload().as_ptr())?;
+        }
         Ok(Self {
             port,
             channel,
@@ -134,8 +144,8 @@ impl Publisher {
         })
     }
 
-    /// A message of `len` payload bytes in shared memory whose bytes are those of whatever lay there before: for whoever writes all
-    /// that is to be read. Zeroing a long message takes longer than filling it.
+    /// A message of `len` payload bytes in shared memory that still has the bytes of an older message. The caller writes all that is to
+    /// be read: zeroing a long message takes longer than filling it.
     ///
     /// # Errors
     /// As [`Publisher::loan`].
@@ -224,8 +234,8 @@ pub struct Subscriber {
 }
 
 impl Subscriber {
-    /// The receiving end of an opened service: for whoever watches a run without taking part in it. It may miss messages, and
-    /// holds nobody up.
+    /// The receiving end of an opened service for a watcher, which takes no part in the run. It may miss messages, and no process waits
+    /// for it.
     ///
     /// # Errors
     /// iceoryx2 refuses.
@@ -289,6 +299,12 @@ impl Subscriber {
         }
     }
 
+    /// The channel that it receives.
+    #[must_use]
+    pub fn channel(&self) -> Channel {
+        self.channel
+    }
+
     /// Messages of other runs and of replaced incarnations that were refused.
     #[must_use]
     pub fn refused(&self) -> u64 {
@@ -331,7 +347,7 @@ impl Waker {
         ))
     }
 
-    /// Wakes `process` of environment `env_index`, for whoever is no process of the run itself.
+    /// Wakes `process` of environment `env_index`, for a program that is no process of the run itself.
     ///
     /// # Errors
     /// The service is not there, or all who may wake it are.

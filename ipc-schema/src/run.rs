@@ -1,6 +1,9 @@
 //! The run file: the supervisor writes it, and every process reads it at its start.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +12,7 @@ use crate::{
     config::Config,
     field::{RunField, run_fields},
     process::Process,
-    schedule,
+    schedule, storage,
 };
 
 /// Purpose of a run.
@@ -141,6 +144,8 @@ pub struct SharedMemory {
 
 /// Least number of SUMO steps under way: one that `sim-core` moves, one that waits for it, and one that SUMO makes meanwhile.
 const STEPS_AHEAD: u64 = 3;
+/// Longest wait for space on a full disk before the run file is given up.
+const SPACE_WITHIN: Duration = Duration::from_secs(10);
 
 /// The run file, `run.json` in the run directory.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -295,7 +300,8 @@ impl RunFile {
             path: path.clone(),
             source,
         })?;
-        std::fs::write(&path, text).map_err(|source| RunFileError::Io {
+        let written = storage::wait_for_space(&path, SPACE_WITHIN, || storage::write_whole(&path, &text));
+        written.map_err(|source| RunFileError::Io {
             path: path.clone(),
             source,
         })?;

@@ -1,6 +1,8 @@
 //! The services of a run: names, sizes and quality of service. The supervisor creates them all and keeps them open;
 //! every other process only opens them (killing a process while it creates a service can leave its name unusable).
 
+use std::{collections::VecDeque, sync::Arc};
+
 use iceoryx2::{
     config::Config as IpcConfig,
     node::{Node, NodeBuilder},
@@ -14,12 +16,14 @@ use iceoryx2::{
 };
 
 use crate::{
+    activity::Activity,
     block::ALIGNMENT,
-    board::{Health, INCARNATIONS, Progress, Roster, TrainingStatus},
+    board::{Health, Progress, Roster, TrainingStatus},
     channel::FullQueue,
     control::{ControlReply, ControlRequest},
     header::MessageHeader,
     process::{Process, ProcessScope},
+    reserve,
     run::{RunFile, SharedMemory},
 };
 
@@ -28,7 +32,7 @@ pub use crate::channel::Channel;
 /// The variant of iceoryx2 in use: between processes, ports usable from any thread.
 pub type Shm = ipc_threadsafe::Service;
 /// A process's place in a run's shared memory.
-pub type RunNode = Node<Shm>;
+pub type RunNode = Arc<Node<Shm>>;
 /// An opened data service.
 pub type DataService = publish_subscribe::PortFactory<Shm, [u8], MessageHeader>;
 /// An opened board.
@@ -38,31 +42,21 @@ pub type ControlService = request_response::PortFactory<Shm, ControlRequest, (),
 /// An opened wake-up service.
 pub type WakeService = event::PortFactory<Shm>;
 
-/// Entries of one incarnation on a board.
-const ENTRIES: u32 = 3;
+/// Board entry of the [`Progress`].
+pub const PROGRESS_KEY: u32 = 0;
+/// Board entry of the [`Health`].
+pub const HEALTH_KEY: u32 = 1;
+/// Board entry of the [`TrainingStatus`].
+pub const TRAINING_KEY: u32 = 2;
+/// Board entry of the [`Activity`].
+pub const ACTIVITY_KEY: u32 = 3;
 /// The one entry of the roster.
 pub const ROSTER_KEY: u32 = 0;
 
-/// Board entry of an incarnation's [`Progress`].
-#[must_use]
-pub const fn progress_key(incarnation: u32) -> u32 {
-    ENTRIES * incarnation
-}
-
-/// Board entry of an incarnation's [`Health`].
-#[must_use]
-pub const fn health_key(incarnation: u32) -> u32 {
-    ENTRIES * incarnation + 1
-}
-
-/// Board entry of an incarnation's [`TrainingStatus`].
-#[must_use]
-pub const fn training_key(incarnation: u32) -> u32 {
-    ENTRIES * incarnation + 2
-}
-
 /// Most processes that open one service at a time: all of a run, a successor for each, and spectators (`caraware ps`).
 const MAX_NODES: usize = 24;
+/// Boards of a process that exist at a time.
+const KEPT_BOARDS: usize = 2;
 /// Readers of one board.
 const MAX_READERS: usize = 32;
 /// Readers of the roster: every reader of a board reads it.
@@ -113,14 +107,17 @@ fn invalid(name: &str) -> impl FnOnce(&dyn std::fmt::Debug) -> ServiceError {
 ///
 /// # Errors
 /// The root directory or prefix is unusable.
-pub fn node(memory: &SharedMemory) -> Result<Node<Shm>, ServiceError> {
+pub fn node(memory: &SharedMemory) -> Result<RunNode, ServiceError> {
     // A supervisor that ends removes the run's files, also those that a spectator has open; iceoryx2 would warn of each.
     iceoryx2::prelude::set_log_level(iceoryx2::prelude::LogLevel::Error);
+    reserve::guard(memory);
     NodeBuilder::new()
         .config(&ipc_config(memory)?)
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<Shm>()
+        .map(Arc::new)
         .map_err(|e| refused("creation", "node")(&e))
+        .inspect(|_| reserve::close_to_others(memory))
 }
 
 /// Takes what dead processes left in the services that others hold open: their places there are free again.
@@ -217,21 +214,46 @@ fn control_builder(
         .max_nodes(MAX_NODES))
 }
 
-/// Opens the board of a process.
-///
-/// # Errors
-/// It does not exist.
-pub fn open_board(
-    node: &Node<Shm>,
-    run: &RunFile,
-    env_index: u32,
-    process: Process,
-) -> Result<BoardService, ServiceError> {
-    let name = service_name(run, env_index, &format!("board/{process}"))?;
-    node.service_builder(&name)
-        .blackboard_opener::<u32>()
-        .open()
-        .map_err(|e| refused("opening", format!("board of {process}"))(&e))
+/// The boards of a process of one environment: each incarnation has its own, because iceoryx2 leaves the entries of a killed writer
+/// locked.
+#[derive(Debug, Clone)]
+pub struct BoardSeries(String);
+
+impl BoardSeries {
+    /// The boards of `process` in environment `env_index`.
+    #[must_use]
+    pub fn new(run: &RunFile, env_index: u32, process: Process) -> Self {
+        Self(format!("caraware/{}/{env_index}/board/{process}", run.name))
+    }
+
+    fn name(&self, incarnation: u32) -> Result<ServiceName, ServiceError> {
+        let name = format!("{}/{incarnation}", self.0);
+        ServiceName::new(&name).map_err(|e| invalid(&name)(&e))
+    }
+
+    /// Opens the board of an incarnation.
+    ///
+    /// # Errors
+    /// It does not exist: the supervisor has not created it yet, or has removed it.
+    pub fn open(&self, node: &Node<Shm>, incarnation: u32) -> Result<BoardService, ServiceError> {
+        node.service_builder(&self.name(incarnation)?)
+            .blackboard_opener::<u32>()
+            .open()
+            .map_err(|e| refused("opening", format!("{}/{incarnation}", self.0))(&e))
+    }
+
+    fn create(&self, node: &Node<Shm>, incarnation: u32) -> Result<BoardService, ServiceError> {
+        node.service_builder(&self.name(incarnation)?)
+            .blackboard_creator::<u32>()
+            .max_readers(MAX_READERS)
+            .max_nodes(MAX_NODES)
+            .add(PROGRESS_KEY, Progress::default())
+            .add(HEALTH_KEY, Health::default())
+            .add(TRAINING_KEY, TrainingStatus::default())
+            .add(ACTIVITY_KEY, Activity::default())
+            .create()
+            .map_err(|e| refused("creation", format!("{}/{incarnation}", self.0))(&e))
+    }
 }
 
 /// Opens the roster: which incarnation of each process counts.
@@ -278,7 +300,9 @@ pub type WakeListener = Listener<Shm>;
 pub struct ServiceHolder {
     /// Data services, in the order of [`Channel::ALL`].
     _data: Vec<DataService>,
-    _boards: Vec<BoardService>,
+    /// Boards of each process, in the order of [`Process::ALL`]: of its newest incarnation, and of the one before, from which readers
+    /// may still have to turn.
+    boards: Vec<VecDeque<BoardService>>,
     roster: BoardService,
     control: ControlService,
     _wakes: Vec<WakeService>,
@@ -295,22 +319,44 @@ impl ServiceHolder {
                 .create()
                 .map_err(|e| refused("creation", channel.name())(&e))
         });
-        let boards = Process::ALL
-            .into_iter()
-            .map(|process| create_board(node, run, env_index, process));
+        let boards = Process::ALL.into_iter().map(|process| {
+            let first = BoardSeries::new(run, env_index, process).create(node, 0)?;
+            Ok(VecDeque::from([first]))
+        });
         let wakes = Process::ALL
             .into_iter()
             .filter(|process| env_index == 0 || process.spec().scope == ProcessScope::Environment)
             .map(|process| create_wake(node, run, env_index, process));
         Ok(Self {
             _data: data.collect::<Result<_, _>>()?,
-            _boards: boards.collect::<Result<_, _>>()?,
+            boards: boards.collect::<Result<_, ServiceError>>()?,
             roster: create_roster(node, run, env_index)?,
             control: control_builder(node, run, env_index)?
                 .create()
                 .map_err(|e| refused("creation", "control")(&e))?,
             _wakes: wakes.collect::<Result<_, _>>()?,
         })
+    }
+
+    /// Creates the board of the next incarnation of `process`, and removes the one before the present one. Call it before the roster
+    /// names that incarnation.
+    ///
+    /// # Errors
+    /// iceoryx2 refuses.
+    pub fn add_board(
+        &mut self,
+        node: &Node<Shm>,
+        run: &RunFile,
+        process: Process,
+        incarnation: u32,
+    ) -> Result<(), ServiceError> {
+        let board = BoardSeries::new(run, run.env_index, process).create(node, incarnation)?;
+        let boards = &mut self.boards[process.index()];
+        boards.push_back(board);
+        while boards.len() > KEPT_BOARDS {
+            boards.pop_front();
+        }
+        Ok(())
     }
 
     /// The service for commands.
@@ -324,29 +370,6 @@ impl ServiceHolder {
     pub fn roster(&self) -> &BoardService {
         &self.roster
     }
-}
-
-fn create_board(
-    node: &Node<Shm>,
-    run: &RunFile,
-    env_index: u32,
-    process: Process,
-) -> Result<BoardService, ServiceError> {
-    let name = service_name(run, env_index, &format!("board/{process}"))?;
-    let board = node
-        .service_builder(&name)
-        .blackboard_creator::<u32>()
-        .max_readers(MAX_READERS)
-        .max_nodes(MAX_NODES);
-    (0..INCARNATIONS)
-        .fold(board, |board, incarnation| {
-            board
-                .add(progress_key(incarnation), Progress::default())
-                .add(health_key(incarnation), Health::default())
-                .add(training_key(incarnation), TrainingStatus::default())
-        })
-        .create()
-        .map_err(|e| refused("creation", format!("board of {process}"))(&e))
 }
 
 fn create_roster(node: &Node<Shm>, run: &RunFile, env_index: u32) -> Result<BoardService, ServiceError> {

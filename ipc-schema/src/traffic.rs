@@ -132,6 +132,14 @@ pub struct VehicleMeta {
     pub vehicle_class: [u8; 16],
     /// SUMO's vehicle type, UTF-8, zero padded; cut.
     pub type_id: [u8; TYPE_ID_BYTES],
+    /// Largest acceleration of SUMO's vehicle type, m/s²; 0 for a person.
+    pub type_accel_mps2: f32,
+    /// Largest deceleration of SUMO's vehicle type, in an emergency too, m/s²; 0 for a person.
+    pub type_decel_mps2: f32,
+    /// Top speed of SUMO's vehicle type, m/s; 0 for a person.
+    pub type_speed_mps: f32,
+    /// Zero.
+    pub reserved: u32,
 }
 
 impl VehicleMeta {

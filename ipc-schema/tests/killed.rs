@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests assert by unwrapping")]
 
+mod common;
+
 use std::{
     path::Path,
     process::{Child, Command},
@@ -11,49 +13,16 @@ use std::{
 
 use ipc_schema::{
     board::State,
-    config::Config,
     header::MessageHeader,
     membership::{INCARNATION, RunMembership},
     ports::{BoardReader, RosterWriter},
     process::Process,
-    run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
+    run::RunFile,
     services::{self, Channel, ServiceHolder},
 };
 
 /// Environment variable with the path of the run file; set for the process that the test kills.
 const VICTIM: &str = "CARAWARE_TEST_VICTIM";
-
-fn run_in(directory: &Path) -> RunFile {
-    let mut config: Config = serde_json::from_str(include_str!("town.json")).unwrap();
-    config.traffic.max_road_users = 8;
-    RunFile {
-        schema_version: ipc_schema::SCHEMA_VERSION,
-        env_index: 0,
-        run_id: 1,
-        name: "killed".into(),
-        run_dir: directory.into(),
-        mode: Mode::Train,
-        supervisor_pid: std::process::id().try_into().unwrap(),
-        shared_memory: SharedMemory {
-            root: directory.into(),
-            prefix: format!("caraware_killed{}_", std::process::id()),
-        },
-        source: Source::Scenario { sumocfg: "none".into() },
-        map: MapInfo {
-            projection: String::new(),
-            net_offset_m: [0.0; 2],
-            bounds_m: [0.0; 4],
-            traffic_lights: 0,
-        },
-        scene_files: SceneFiles::default(),
-        maps: Vec::new(),
-        sumo_home: "none".into(),
-        config,
-        config_hash: String::new(),
-        beginning: None,
-        restart: None,
-    }
-}
 
 /// The process that the test below kills; without the environment variable it does nothing.
 #[test]
@@ -98,10 +67,15 @@ fn eventually(what: &str, condition: impl Fn() -> bool) {
 #[test]
 fn a_killed_trainer_is_replaced_again_and_again() {
     let directory = tempfile::tempdir().unwrap();
-    let run = run_in(directory.path());
+    let mut config = common::town();
+    config.traffic.max_road_users = 8;
+    let run = RunFile {
+        supervisor_pid: std::process::id().try_into().unwrap(),
+        ..common::run_in(directory.path(), "killed", config)
+    };
     let run_file = run.write().unwrap();
     let node = services::node(&run.shared_memory).unwrap();
-    let holder = ServiceHolder::create(&node, &run, 0).unwrap();
+    let mut holder = ServiceHolder::create(&node, &run, 0).unwrap();
     let mut roster = RosterWriter::create(&holder).unwrap();
     let board = BoardReader::open(&node, &run, 0, Process::Trainer).unwrap();
     let mut in_process = run.clone();
@@ -112,7 +86,10 @@ fn a_killed_trainer_is_replaced_again_and_again() {
     let predictions = sensing.subscriber(Channel::Prediction).unwrap();
     let waker = sensing.waker(Process::Trainer).unwrap();
     for incarnation in 0..12 {
-        assert!(roster.set(Process::Trainer, incarnation));
+        if incarnation > 0 {
+            holder.add_board(&node, &run, Process::Trainer, incarnation).unwrap();
+        }
+        roster.set(Process::Trainer, incarnation);
         assert_eq!(
             (board.progress().attached, board.health().state),
             (0, State::Starting as u32)

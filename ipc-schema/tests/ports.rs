@@ -6,6 +6,8 @@
     reason = "tests and measurements assert by unwrapping"
 )]
 
+mod common;
+
 use std::{
     path::Path,
     sync::{Arc, atomic::AtomicBool},
@@ -19,13 +21,13 @@ use ipc_schema::{
     membership::{MembershipError, RunMembership},
     ports::PortError,
     process::Process,
-    run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
+    run::RunFile,
     services::{self, Channel, RunNode, ServiceHolder},
 };
 
 /// The default preset, with small queues.
 fn config() -> Config {
-    let mut config: Config = serde_json::from_str(include_str!("town.json")).unwrap();
+    let mut config = common::town();
     config.run.window_ticks = 4;
     config.run.sub_steps = 2;
     config.traffic.max_road_users = 8;
@@ -58,33 +60,9 @@ impl Drop for Corner {
 impl Corner {
     fn new(run_id: u64) -> Self {
         let directory = tempfile::tempdir().unwrap();
-        let prefix = format!("caraware_test{}_{run_id}_", std::process::id());
         let run = RunFile {
-            schema_version: ipc_schema::SCHEMA_VERSION,
-            env_index: 0,
             run_id,
-            name: "test".into(),
-            run_dir: directory.path().into(),
-            mode: Mode::Train,
-            supervisor_pid: rustix::process::getppid().unwrap().as_raw_nonzero().get(),
-            shared_memory: SharedMemory {
-                root: directory.path().into(),
-                prefix,
-            },
-            source: Source::Scenario { sumocfg: "none".into() },
-            map: MapInfo {
-                projection: String::new(),
-                net_offset_m: [0.0; 2],
-                bounds_m: [0.0; 4],
-                traffic_lights: 0,
-            },
-            scene_files: SceneFiles::default(),
-            maps: Vec::new(),
-            sumo_home: "none".into(),
-            config: config(),
-            config_hash: String::new(),
-            beginning: None,
-            restart: None,
+            ..common::run_in(directory.path(), &format!("test{run_id}_"), config())
         };
         let node = services::node(&run.shared_memory).unwrap();
         let services = ServiceHolder::create(&node, &run, 0).unwrap();

@@ -3,6 +3,7 @@
 use std::{path::Path, time::Instant};
 
 use ipc_schema::{
+    activity::Awaited,
     block::{self, BlockError},
     board::State,
     failure::{Failure, FailureKind},
@@ -77,7 +78,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
         drop(message);
         daemon.membership.consumed(header.tick + 1);
         if header.has(LAST_OF_RUN) {
-            return daemon.wait_for_trainers_end();
+            return daemon.wait_for_consumers_end();
         }
     }
     daemon.write_part()
@@ -101,6 +102,8 @@ struct Daemon {
     ticks: u64,
     /// Ticks below this are in the checkpoint: they are simulated again but not sent.
     committed_ticks: u64,
+    /// The oldest tick of the journal, as the board has it.
+    journal_first: u64,
     vehicle_steps: u64,
     cavs_max: u32,
 }
@@ -143,6 +146,7 @@ impl Daemon {
             counted_from: state.first_tick,
             ticks,
             committed_ticks,
+            journal_first: 0,
             vehicle_steps: state.sensing.observations(),
             cavs_max: state.cavs_max,
         })
@@ -152,9 +156,9 @@ impl Daemon {
     fn next_world(&mut self, world: &Subscriber) -> Result<Option<Message>, Failure> {
         let mut received = Ok(None);
         loop {
-            let waited = self.membership.wait_until(|| {
+            let waited = self.membership.wait_until_for(Awaited::Input(Process::SimCore), || {
                 received = world.receive();
-                !matches!(received, Ok(None)) || self.consumer.as_ref().is_some_and(Delivery::is_behind)
+                !matches!(received, Ok(None)) || self.is_trainer_behind()
             })?;
             if let Some(message) = std::mem::replace(&mut received, Ok(None))? {
                 return Ok(Some(message));
@@ -167,26 +171,34 @@ impl Daemon {
     }
 
     fn catch_up(&mut self) -> Result<(), Failure> {
-        match &mut self.consumer {
-            Some(consumer) => consumer.catch_up(&self.observations),
-            None => Ok(()),
+        let Some(consumer) = &mut self.consumer else {
+            return Ok(());
+        };
+        consumer.catch_up(&self.observations)?;
+        let journal_first = consumer.journal_first();
+        if journal_first != self.journal_first {
+            // The board has the number of ticks that the journal does not hold any more: a trainer reads there whether it can continue.
+            self.membership.committed(journal_first);
+            self.journal_first = journal_first;
         }
+        Ok(())
     }
 
-    /// Waits until `condition` holds for the trainer, and resends what its successors lack. Returns at once in a run without a trainer.
-    fn wait_for_trainer(&mut self, condition: impl Fn(&Delivery, &RunMembership) -> bool) -> Result<Wait, Failure> {
+    /// Waits until `condition` holds; meanwhile it resends what a successor of the trainer lacks.
+    fn wait_serving_trainer(&mut self, condition: impl Fn(&Self) -> bool) -> Result<Wait, Failure> {
         loop {
             self.catch_up()?;
-            let Some(consumer) = &self.consumer else {
-                return Ok(Wait::Ready);
-            };
-            let waited = self
-                .membership
-                .wait_until(|| consumer.is_behind() || condition(consumer, &self.membership))?;
-            if waited == Wait::Stopped || condition(consumer, &self.membership) {
+            let waited = self.membership.wait_until_for(Awaited::Credit(Process::Trainer), || {
+                self.is_trainer_behind() || condition(self)
+            })?;
+            if waited == Wait::Stopped || condition(self) {
                 return Ok(waited);
             }
         }
+    }
+
+    fn is_trainer_behind(&self) -> bool {
+        self.consumer.as_ref().is_some_and(Delivery::is_behind)
     }
 
     /// One tick: assigns slots, scans, waits for credit, samples and publishes.
@@ -218,19 +230,24 @@ impl Daemon {
         Ok(Wait::Ready)
     }
 
-    /// Waits until the tick of `n` slots may be sent, or may be kept in the journal during a handover.
+    /// Waits until the tick of `n` slots may be sent, or may be kept in the journal during a handover, and every other required
+    /// consumer has credit for it.
     fn wait_for_credit(&mut self, n: usize) -> Result<Wait, Failure> {
         let len = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples()).len;
         let since = Instant::now();
-        let waited =
-            self.wait_for_trainer(|consumer, membership| consumer.may_send(membership) || consumer.may_keep(len))?;
+        let waited = self.wait_serving_trainer(|daemon| {
+            daemon.trainer_takes(len) && daemon.other_consumers.have_credit(daemon.ticks)
+        })?;
         if let Some(consumer) = &mut self.consumer {
             consumer.update_handover(since);
         }
-        if waited == Wait::Stopped {
-            return Ok(waited);
-        }
-        Ok(self.membership.wait_for_credit(&self.other_consumers, self.ticks)?)
+        Ok(waited)
+    }
+
+    /// True if the next tick, `len` bytes long, may be sent to the trainer or kept for it. True in a run without a trainer.
+    fn trainer_takes(&self, len: usize) -> bool {
+        let trainer = self.consumer.as_ref();
+        trainer.is_none_or(|trainer| trainer.may_send(&self.membership) || trainer.may_keep(len))
     }
 
     /// Samples the sensors of the surroundings. It runs before the observation is made, because the observation shows their samples.
@@ -328,9 +345,13 @@ impl Daemon {
         });
     }
 
-    /// Waits until the trainer is done: until then it may die, and its successor needs everything since the last commit.
-    fn wait_for_trainers_end(mut self) -> Result<(), Failure> {
-        let waited = self.wait_for_trainer(|consumer, _| consumer.is_done())?;
+    /// Waits until every required consumer is done. Until then the trainer may die, and its successor needs everything since the last
+    /// commit.
+    fn wait_for_consumers_end(mut self) -> Result<(), Failure> {
+        let waited = self.wait_serving_trainer(|daemon| {
+            let is_trainer_done = daemon.consumer.as_ref().is_none_or(Delivery::is_done);
+            is_trainer_done && daemon.other_consumers.have_consumed(daemon.ticks)
+        })?;
         self.write_part()?;
         if waited == Wait::Stopped {
             return Ok(());

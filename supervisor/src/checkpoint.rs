@@ -8,6 +8,7 @@ use std::{
 use ipc_schema::{
     config::{Activation, Config, Network},
     run::{Beginning, RunFile, Start},
+    storage,
 };
 use serde::Deserialize;
 
@@ -223,12 +224,46 @@ impl FoundCheckpoint {
         for entry in std::fs::read_dir(&self.checkpoint).map_err(failed)?.flatten() {
             std::fs::copy(entry.path(), copy.join(entry.file_name())).map_err(failed)?;
         }
-        std::fs::write(folder.join("latest"), name.as_encoded_bytes()).map_err(failed)?;
+        storage::write_whole(&folder.join("latest"), name.as_encoded_bytes()).map_err(failed)?;
         Ok(Beginning {
             checkpoint: copy.clone(),
             ..self.beginning()
         })
     }
+}
+
+/// The directory of the run `named`, a name in `runs` or a directory, if it has no checkpoint yet: it was cut off before its first one.
+///
+/// # Errors
+/// The run was cut off before it was prepared.
+pub fn without_checkpoint(named: &str, runs: &Path) -> Result<Option<PathBuf>, Exit> {
+    let candidates = [runs.join(named), PathBuf::from(named)];
+    let Some(run_dir) = candidates
+        .iter()
+        .find(|run| run.join("logs").is_dir() || run.join("run.json").is_file())
+    else {
+        return Ok(None);
+    };
+    let is_checkpoint = |entry: std::fs::DirEntry| {
+        let name = entry.file_name();
+        !name.to_string_lossy().starts_with('.') && entry.path().join("manifest.json").exists()
+    };
+    let mut entries = std::fs::read_dir(run_dir.join("checkpoints"))
+        .into_iter()
+        .flatten()
+        .flatten();
+    if entries.any(is_checkpoint) {
+        return Ok(None);
+    }
+    if !run_dir.join("run.json").is_file() {
+        return Err(Exit::run(
+            format!("the run in {} ended before it was prepared", run_dir.display()),
+            "remove the directory, and start the run again",
+        ));
+    }
+    std::path::absolute(run_dir)
+        .map(Some)
+        .map_err(|error| Exit::io("resolve", run_dir, &error))
 }
 
 /// The directory of the checkpoint or run that `named` stands for; true if it is a run.
@@ -245,7 +280,7 @@ fn locate(named: &str, runs: &Path) -> Result<(PathBuf, bool), Exit> {
     if let Some(run) = candidates.iter().find(|run| run.join("run.json").is_file()) {
         return Err(Exit::run(
             format!("the run {} has no checkpoint", run.display()),
-            "the run ended before its first checkpoint: start another with `caraware train`",
+            "`caraware train --resume` continues it from its beginning",
         ));
     }
     Err(Exit::config(

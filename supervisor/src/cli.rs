@@ -98,14 +98,18 @@ const HANDOVER: &str = "Examples:
   caraware handover                                      replace the trainer by its present code, after an upgrade
   caraware handover town-1 --set trainer.learning_rate=0.001
   caraware handover --checkpoint runs/town-0/checkpoints/update-000400
+  caraware handover --now --timeout-s 30                 do not wait for the next update
 
 The successor starts beside the old trainer. Once it is ready, the old trainer writes a checkpoint and leaves. If the successor
-fails, the handover is refused and the old trainer continues.";
+fails, the handover is refused and the old trainer continues; if it fails before its first commit, the one before it returns.";
 
 const RESUME: &str = "Examples:
   caraware train                                             the default preset, from the beginning
   caraware train --resume town-1                             continues from its newest sound checkpoint, in runs/town-1
   caraware train --resume runs/town-1/checkpoints/update-000300    starts another run from this checkpoint
+  caraware train --restart                                   resumes the run by itself when its supervisor is killed
+
+A run that was cut off before its first checkpoint resumes from its beginning.
 
 On a CPU a resumed run ends with the same parameters, bit for bit, as a run that was never stopped.
 Trainers that learn together resume together: torchrun … -m caraware.parallel --resume RUN (docs/parallel.md).";
@@ -126,6 +130,9 @@ pub struct TrainArgs {
     /// Continue a run (its name or directory), or begin another run from one of its checkpoints (a directory)
     #[arg(long, value_name = "RUN", conflicts_with_all = ["config", "commands"])]
     pub resume: Option<String>,
+    /// Resume the run by itself if its supervisor is killed; Ctrl-C, `caraware stop` and failures end it as always
+    #[arg(long)]
+    pub restart: bool,
     /// The run.
     #[command(flatten)]
     pub run: RunArgs,
@@ -242,6 +249,12 @@ pub struct HandoverArgs {
     /// Use the parameters of this checkpoint (a directory) instead of the run's newest
     #[arg(long, value_name = "DIRECTORY")]
     pub checkpoint: Option<PathBuf>,
+    /// The old trainer leaves at the next tick, not after its next update: the successor gets again what it has not learnt
+    #[arg(long)]
+    pub now: bool,
+    /// Refuse the handover, and keep the old trainer, if it has not left after this time
+    #[arg(long, value_name = "SECONDS", value_parser = clap::value_parser!(f64))]
+    pub timeout_s: Option<f64>,
 }
 
 const VIEW: &str = "Examples:
@@ -369,6 +382,9 @@ pub struct RunArgs {
     /// Repeat the commands of another run's commands.jsonl, each at its tick
     #[arg(long, value_name = "FILE")]
     pub commands: Option<PathBuf>,
+    /// Let the files of a .sumocfg do all that SUMO can; short for --set traffic.trust_scenario=true
+    #[arg(long)]
+    pub trust_scenario: bool,
     /// Directory that holds run directories
     #[arg(long, default_value = "runs")]
     pub runs: PathBuf,
@@ -386,6 +402,9 @@ impl RunArgs {
     pub fn with_shorthands(&self) -> Self {
         let mut args = self.clone();
         args.set.extend(args.envs.take().map(|envs| format!("run.envs={envs}")));
+        if std::mem::take(&mut args.trust_scenario) {
+            args.set.push("traffic.trust_scenario=true".to_owned());
+        }
         args
     }
 }

@@ -71,8 +71,8 @@ impl ProgressDisplay {
         }
     }
 
-    /// Shows the newest state of the boards.
-    pub fn update(&mut self, environments: &[Environment], ready_at: Option<Instant>) {
+    /// Shows the newest state of the boards, after `notes` on what is wrong at present.
+    pub fn update(&mut self, environments: &[Environment], ready_at: Option<Instant>, notes: &[String]) {
         if self.is_silent {
             return;
         }
@@ -83,7 +83,7 @@ impl ProgressDisplay {
             self.show_table(&table);
             return;
         }
-        let view = ProgressView::read(environments, ready_at);
+        let view = ProgressView::read(environments, ready_at, notes.join(", "));
         if let Some(bar) = &self.bar {
             if bar.length() != view.total_ticks && view.total_ticks.is_some() {
                 bar.set_style(style());
@@ -132,6 +132,8 @@ fn style() -> ProgressStyle {
 
 /// The figures that are shown.
 struct ProgressView {
+    /// What is wrong at present; empty if nothing is.
+    note: String,
     /// Updates of a policy so far.
     updates: u64,
     ticks: u64,
@@ -154,7 +156,7 @@ struct ProgressView {
 
 impl ProgressView {
     /// Sums the boards of all environments. Tick, episode and simulated time are those of the slowest environment.
-    fn read(environments: &[Environment], ready_at: Option<Instant>) -> Self {
+    fn read(environments: &[Environment], ready_at: Option<Instant>, note: String) -> Self {
         let all = |process: Process| {
             let healths = environments
                 .iter()
@@ -197,6 +199,7 @@ impl ProgressView {
         let episodes = first.map(|first| first.run.episodes()).unwrap_or_default();
         let total: Option<u64> = episodes.iter().map(|episode| episode.ticks).sum();
         Self {
+            note,
             updates: training.updates,
             ticks: sensing.ticks,
             total_ticks: total,
@@ -225,7 +228,11 @@ impl ProgressView {
             (_, true) => format!("σ {:.3}  reward {:.3}", self.policy_std, self.reward),
             (_, false) => format!("{measured}  σ {:.3}  reward {:.3}", self.policy_std, self.reward),
         };
-        format!("episode {:3}  {learning}  {rate}  {traffic}", self.episode)
+        let note = match self.note.is_empty() {
+            true => String::new(),
+            false => format!("[{}]  ", self.note),
+        };
+        format!("{note}episode {:3}  {learning}  {rate}  {traffic}", self.episode)
     }
 
     fn rate(&self) -> String {

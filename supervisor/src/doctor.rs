@@ -2,7 +2,7 @@
 
 use std::{net::TcpListener, path::Path, process::Command};
 
-use ipc_schema::process::Process;
+use ipc_schema::{process::Process, reserve::SHARED_MEMORY};
 
 use crate::{failure::Exit, install::Install, prepare::free_bytes, registry};
 
@@ -80,7 +80,7 @@ pub fn doctor(clean: bool) -> Result<(), Exit> {
     check_space(
         &mut checks,
         "shared memory",
-        registry::SHARED_MEMORY,
+        SHARED_MEMORY,
         SHARED_MEMORY_MIB,
         "free it, or enlarge it (Docker: --shm-size=1g)",
     );

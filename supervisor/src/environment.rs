@@ -30,7 +30,7 @@ pub struct Environment {
     /// Path of that file.
     pub run_file: PathBuf,
     /// Publishes the valid incarnation of each process.
-    pub roster: RosterWriter,
+    roster: RosterWriter,
     /// Largest number of ticks that a trainer has committed, or that were sensed in a run without one.
     committed_ticks: u64,
     /// Largest number of ticks that any incarnation of `sensor-daemon` has made.
@@ -142,6 +142,16 @@ impl Environment {
         });
         self.run.write()?;
         Ok(start.episode_tick)
+    }
+
+    /// Makes this incarnation of a process the valid one. Its board is empty until it has joined.
+    ///
+    /// # Errors
+    /// iceoryx2 refuses.
+    pub fn set_incarnation(&mut self, node: &RunNode, process: Process, incarnation: u32) -> Result<(), Exit> {
+        self.services.add_board(node, &self.run, process, incarnation)?;
+        self.roster.set(process, incarnation);
+        Ok(())
     }
 
     /// Publishes whether a handover is in progress.

@@ -10,9 +10,11 @@ use caraware::{
     doctor,
     failure::Exit,
     generate, handover,
+    housekeeping::Housekeeping,
     prepare::{PreparedRun, prepare, prepare_play, prepare_resume},
-    report, status,
+    relaunch, report, status,
     supervisor::{RunEnding, RunOutcome, Supervisor},
+    system_limits,
     view::{self, ViewerProcess},
 };
 use clap::Parser as _;
@@ -20,7 +22,13 @@ use ipc_schema::run::Mode;
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
+    system_limits::raise_open_files();
+    system_limits::protect_files();
     let result = match cli.command {
+        Subcommands::Train(args) if args.restart => match relaunch::train(&args) {
+            Ok(code) => return code,
+            Err(exit) => Err(exit),
+        },
         Subcommands::Train(args) => match &args.resume {
             Some(resumed) => prepare_resume(&args.run, resumed).and_then(run),
             None => prepare(&args.run, Mode::Train).and_then(run),
@@ -57,12 +65,13 @@ fn run(prepared: PreparedRun) -> Result<(), Exit> {
         true => ProgressDisplay::silent(),
         false => ProgressDisplay::new(),
     };
+    let housekeeping = Housekeeping::start(&run);
     let outcome = match Supervisor::new(&prepared.run, prepared.install, prepared.claim) {
         Ok(supervisor) => supervisor.supervise(&mut display),
         Err(exit) => RunOutcome::not_started(exit),
     };
     // Whatever ended the run, its report says so.
-    let written = report::write(&run, &outcome);
+    let written = report::write(&run, &outcome, &housekeeping.finish());
     if let Ok(report) = &written
         && !quiet
     {

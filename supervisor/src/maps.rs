@@ -43,7 +43,7 @@ pub fn build(install: &Install, config: &Config, directory: &Path) -> Result<Vec
     let map = |map: &CurriculumMap| {
         let (source, scene_files) = match map {
             CurriculumMap::Town => built_town(install, directory)?,
-            CurriculumMap::File { path, .. } => user_map(path, directory)?,
+            CurriculumMap::File { path, .. } => user_map(path, directory, config.traffic.trust_scenario)?,
         };
         Ok(RunMap {
             name: map.name().to_owned(),
@@ -71,10 +71,10 @@ fn built_town(install: &Install, directory: &Path) -> Result<(Source, SceneFiles
 
 /// Reads a user's net or scenario. The scene uses its additional files; SUMO does not, because they may also define demand and outputs,
 /// and gets only the town's vehicle types.
-fn user_map(file: &Path, directory: &Path) -> Result<(Source, SceneFiles), Exit> {
+fn user_map(file: &Path, directory: &Path, trusted: bool) -> Result<(Source, SceneFiles), Exit> {
     let scene_files = match file.extension().is_some_and(|ending| ending == "sumocfg") {
         true => {
-            let scenario = scenario::read(file)?;
+            let scenario = scenario::read(file, trusted)?;
             SceneFiles {
                 net_file: scenario.net_file,
                 additional_files: scenario.additional_files,
@@ -85,6 +85,7 @@ fn user_map(file: &Path, directory: &Path) -> Result<(Source, SceneFiles), Exit>
             additional_files: Vec::new(),
         },
     };
+    scenario::check_net(&scene_files.net_file, trusted)?;
     let source = Source::Population {
         net_file: scene_files.net_file.clone(),
         additional_files: vec![town::vehicle_types(directory)?],

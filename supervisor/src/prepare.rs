@@ -5,14 +5,14 @@ use std::path::{Path, PathBuf};
 use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
-    control,
+    control, reserve,
     run::{Beginning, MapInfo, Mode, RunFile, RunMap, SceneFiles, Source, Start},
-    services::Channel,
+    storage,
 };
 use serde_json::Value;
 
 use crate::{
-    checkpoint::FoundCheckpoint,
+    checkpoint::{self, FoundCheckpoint},
     cli::{PlayArgs, RunArgs},
     config::{self, ConfigError, LayeredSettings},
     failure::Exit,
@@ -20,7 +20,8 @@ use crate::{
     maps,
     registry::{self, RunClaim},
     remote, resume,
-    scenario::{self, SumoScenario},
+    scenario::{self, SumoScenario, input_check::require_regular},
+    system_limits,
     view::ViewerRequest,
 };
 
@@ -30,6 +31,9 @@ const SUMO_STEP_S: f64 = 1.0;
 const SUMO_SEED: u64 = 23423;
 /// Road users that shared memory is sized for in a scenario, unless the user sets `traffic.max_road_users`.
 const SCENARIO_ROAD_USERS: u64 = 8192;
+
+/// The key that `--trust-scenario` sets.
+const TRUST_KEY: &str = "traffic.trust_scenario";
 
 /// A run that is ready to be supervised.
 #[derive(Debug)]
@@ -100,24 +104,28 @@ pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
 /// As [`prepare`], or the checkpoint or run does not exist, or a changed setting is one that observations depend on.
 pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<PreparedRun, Exit> {
     let install = Install::find()?;
+    if let Some(run_dir) = checkpoint::without_checkpoint(resumed, &args.runs)? {
+        let old = RunFile::read(&run_dir.join("run.json"))?;
+        if args.name.is_some() {
+            return Err(Exit::config(
+                format!(
+                    "the run {} has no checkpoint that another run could begin with",
+                    old.name
+                ),
+                "leave --name out: the run resumes from its own beginning",
+            ));
+        }
+        let config = resume::changed_config(&old, &args.with_shorthands().set)?;
+        return prepare_in_place(args, None, old, config, install);
+    }
     let found = FoundCheckpoint::newest(&install, resumed, &args.runs)?;
     let old = found.run()?;
-    let mut config = resume::changed_config(&old, &args.with_shorthands().set)?;
+    let config = resume::changed_config(&old, &args.with_shorthands().set)?;
     found.check_fit(&config)?;
+    system_limits::check_open_files(config.run.envs)?;
     // A run is continued in its own directory.
     if found.is_run && args.name.is_none() {
-        remote::check(&mut config.fanout)?;
-        let viewer = ViewerRequest::of(args, &config.fanout)?;
-        registry::sweep();
-        let (run, claim) = resume::resume_in_place(&found, old, config, &install)?;
-        check_shared_memory(&run)?;
-        return Ok(PreparedRun {
-            run,
-            install,
-            claim,
-            quiet: args.quiet,
-            viewer,
-        });
+        return prepare_in_place(args, Some(found.beginning()), old, config, install);
     }
     // A checkpoint is continued by a new run.
     let (_, named) = settings_of_run(&old, &[])?;
@@ -127,11 +135,37 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<PreparedRun, Exit
     Ok(prepared)
 }
 
+/// Prepares a stopped run to continue in its own directory, from `beginning` or, without it, from tick 0.
+fn prepare_in_place(
+    args: &RunArgs,
+    beginning: Option<Beginning>,
+    old: RunFile,
+    mut config: Config,
+    install: Install,
+) -> Result<PreparedRun, Exit> {
+    remote::check(&mut config.fanout)?;
+    let viewer = ViewerRequest::of(args, &config.fanout)?;
+    registry::sweep();
+    system_limits::check_open_files(config.run.envs)?;
+    let (run, claim) = resume::resume_in_place(beginning, old, config, &install)?;
+    reserve_shared_memory(&run)?;
+    Ok(PreparedRun {
+        run,
+        install,
+        claim,
+        quiet: args.quiet,
+        viewer,
+    })
+}
+
 /// The settings of an earlier run with the assignments `set`, and its source of traffic.
 fn settings_of_run(run: &RunFile, set: &[String]) -> Result<(LayeredSettings, TrafficInput), Exit> {
     let settings = LayeredSettings::of(&run.config)?.with_assignments(set)?;
     let named = match &run.source {
-        Source::Scenario { sumocfg } => TrafficInput::Scenario(sumocfg.clone(), scenario::read(sumocfg)?),
+        Source::Scenario { sumocfg } => {
+            let trusted = settings.has_flag(TRUST_KEY);
+            TrafficInput::Scenario(sumocfg.clone(), scenario::read(sumocfg, trusted)?)
+        }
         Source::Population { .. } => TrafficInput::Map,
     };
     Ok((settings, named))
@@ -147,6 +181,7 @@ fn prepare_new(
     install: Install,
 ) -> Result<PreparedRun, Exit> {
     // Checks that leave no traces come first.
+    system_limits::check_open_files(config.run.envs)?;
     check_task(&config, mode, &named)?;
     let origin = config.map.origin_latitude_deg.zip(config.map.origin_longitude_deg);
     let scenario_map = match &named {
@@ -188,8 +223,8 @@ fn resolve_config(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, Stri
         .map_or_else(|| name.to_owned(), |stem| stem.to_string_lossy().into_owned());
     match path.extension().and_then(std::ffi::OsStr::to_str) {
         Some("sumocfg") => {
-            let scenario = scenario::read(path)?;
             let mut settings = defaults.with_assignments(&args.set)?;
+            let scenario = scenario::read(path, settings.has_flag(TRUST_KEY))?;
             apply_scenario_defaults(&mut settings, &scenario, name)?;
             let path = std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error))?;
             Ok((settings, TrafficInput::Scenario(path, scenario), label))
@@ -290,6 +325,7 @@ fn read_command_log(path: &Path) -> Result<String, Exit> {
             "give the commands.jsonl of a run of the same configuration",
         )
     };
+    require_regular(path).map_err(wrong)?;
     let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
     match control::actions(&text) {
         Ok(_) => Ok(text),
@@ -306,7 +342,7 @@ fn write_command_logs(run_dir: &Path, logs: &[(u32, String)]) -> Result<(), Exit
         };
         let path = directory.join(control::COMMAND_REPLAY);
         std::fs::create_dir_all(&directory)
-            .and_then(|()| std::fs::write(&path, text))
+            .and_then(|()| storage::write_whole(&path, text))
             .map_err(|error| Exit::io("write", &path, &error))?;
     }
     Ok(())
@@ -407,6 +443,9 @@ fn assemble(
         let path = run_dir.path.join(part);
         std::fs::create_dir(&path).map_err(|error| Exit::io("create", &path, &error))?;
     }
+    if let TrafficInput::Scenario(_, scenario) = &named {
+        scenario.note_moved_outputs(&run_dir.path)?;
+    }
     let inputs = match (named, scenario_map) {
         (TrafficInput::Scenario(sumocfg, scenario), Some(map)) => MapInputs::of_scenario(sumocfg, scenario, map),
         _ => MapInputs::of_maps(maps::build(install, &config, &run_dir.path.join("map"))?)?,
@@ -415,7 +454,7 @@ fn assemble(
     let config_hash = config::hash(&config)?;
     let path = run_dir.path.join("config.toml");
     let text = format!("# BLAKE3 {config_hash}\n{}", config::to_toml(&config)?);
-    std::fs::write(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
+    storage::write_whole(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
     let run = RunFile {
         schema_version: SCHEMA_VERSION,
         env_index: 0,
@@ -435,21 +474,15 @@ fn assemble(
         beginning: None,
         restart: None,
     };
-    check_shared_memory(&run)?;
+    reserve_shared_memory(&run)?;
     Ok((run, claim))
 }
 
-/// Refuses a run whose largest need of shared memory exceeds what is free: a full `/dev/shm` kills processes with SIGBUS.
-fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
-    let needed: u64 = Channel::ALL
-        .into_iter()
-        .map(|channel| channel.worst_case_bytes(run) as u64)
-        .sum::<u64>()
-        * u64::from(run.config.run.envs);
-    let free = free_bytes(Path::new(registry::SHARED_MEMORY))?;
-    if needed <= free {
+/// Reserves the shared memory of a run.
+fn reserve_shared_memory(run: &RunFile) -> Result<(), Exit> {
+    let Err(error) = reserve::create(run) else {
         return Ok(());
-    }
+    };
     let lidars = match run.config.lidar.vehicles {
         0 => String::new(),
         vehicles => format!(" or `lidar.vehicles` (now {vehicles})"),
@@ -458,21 +491,15 @@ fn check_shared_memory(run: &RunFile) -> Result<(), Exit> {
         1 => String::new(),
         envs => format!(" or `run.envs` (now {envs})"),
     };
-    let mebi = |bytes: u64| bytes.div_ceil(1 << 20);
-    Err(Exit::missing(
-        format!(
-            "{} has {} MiB free, but this run may need {} MiB",
-            registry::SHARED_MEMORY,
-            mebi(free),
-            mebi(needed)
-        ),
-        format!(
+    Err(error
+        .failure()
+        .with_help(format!(
             "lower `traffic.max_road_users` (now {}) or `run.window_ticks` (now {}){environments}{lidars}, or enlarge {} (Docker: --shm-size)",
             run.config.traffic.max_road_users,
             run.config.run.window_ticks,
-            registry::SHARED_MEMORY
-        ),
-    ))
+            reserve::SHARED_MEMORY
+        ))
+        .into())
 }
 
 /// Free bytes of the file system that holds `path`.

@@ -11,12 +11,23 @@ use ipc_schema::{
     failure::Failure,
     ports::{BoardReader, ControlClient},
     process::{OnExit, PROCESSES, Process, ProcessScope, ProcessSpec},
+    reserve,
     run::RunFile,
     services::{self, RunNode},
 };
 use rustix::process::Signal;
 
-use crate::{cores, environment::Environment, failure::Exit, install::Install, running_process::RunningProcess};
+use crate::{
+    cores,
+    environment::Environment,
+    failure::Exit,
+    install::Install,
+    running_process::{LeaveTime, RunningProcess},
+    stall::{LifeSign, ProcessPlace},
+};
+
+/// The module that keeps the trainer's place for a process outside the run, which makes ticks when its user wants some.
+const OUTSIDE_USER: &str = "caraware.envs.outside";
 
 /// A process that has ended.
 #[derive(Debug, Clone, Copy)]
@@ -209,6 +220,20 @@ impl RunProcesses {
         self.running[index] = successor;
     }
 
+    /// Lets `run` be the run of environment 0: restarts of the trainer read it.
+    pub fn set_run(&mut self, run: RunFile) {
+        self.environments[0].run = run;
+    }
+
+    /// The oldest tick that the journal of environment 0 holds.
+    #[must_use]
+    pub fn journal_first(&self) -> u64 {
+        self.environments[0]
+            .board(Process::SensorDaemon)
+            .progress()
+            .committed_ticks
+    }
+
     fn cores_of(&self, row: &ProcessSpec, env_index: u32) -> Option<&[usize]> {
         let plan = self.cores.as_ref()?;
         match row.scope {
@@ -238,6 +263,84 @@ impl RunProcesses {
         running.failure(&self.environments[running.env_index as usize].run, status)
     }
 
+    /// True if the process `index`, which has ended, has reported a failure.
+    #[must_use]
+    pub fn has_reported_failure(&self, index: usize) -> bool {
+        let running = &self.running[index];
+        running.has_reported_failure(&self.environments[running.env_index as usize].run)
+    }
+
+    /// Appends a line of the supervisor to the log of the process `index`.
+    pub fn log(&self, index: usize, line: &str) {
+        let running = &self.running[index];
+        running.log(&self.environments[running.env_index as usize].run, line);
+    }
+
+    /// Index of the running process at `place`.
+    #[must_use]
+    pub fn index_of(&self, place: ProcessPlace) -> Option<usize> {
+        let is_it = |running: &RunningProcess| (running.row.process, running.env_index) == place;
+        self.running.iter().position(is_it)
+    }
+
+    /// Row, name in messages and state of the process `index`.
+    #[must_use]
+    pub fn describe(&self, index: usize) -> (&'static ProcessSpec, String, &'static str) {
+        let running = &self.running[index];
+        let label = running.row.label(&self.environments[running.env_index as usize].run);
+        (running.row, label, running.kernel_state())
+    }
+
+    /// Name in messages of the process at `place`.
+    #[must_use]
+    pub fn label(&self, (process, env_index): ProcessPlace) -> String {
+        process.spec().label(&self.environments[env_index as usize].run)
+    }
+
+    /// Names of the processes that have not ended.
+    pub fn alive(&mut self) -> Vec<String> {
+        let alive = self.running.iter_mut().filter_map(|running| {
+            let place = (running.row.process, running.env_index);
+            running.poll().is_none().then_some(place)
+        });
+        let places: Vec<ProcessPlace> = alive.collect();
+        places.into_iter().map(|place| self.label(place)).collect()
+    }
+
+    /// Kills the process `index`; its end is found like any other.
+    pub fn kill_one(&mut self, index: usize) {
+        self.running[index].signal(Signal::KILL);
+    }
+
+    /// What the boards of all running processes say. A process of the whole run has a board in every environment: the newest note
+    /// counts.
+    pub fn life_signs(&mut self) -> Vec<LifeSign> {
+        let (environments, running) = (&self.environments, &mut self.running);
+        let alive = running.iter_mut().filter_map(|process| {
+            let is_alive = process.poll().is_none();
+            is_alive.then(|| (process.row, process.env_index, process.incarnation, process.queued()))
+        });
+        alive
+            .map(|(row, env_index, incarnation, queued)| {
+                let own = &environments[env_index as usize];
+                let notes = environments
+                    .iter()
+                    .filter(|environment| row.scope == ProcessScope::Run || environment.run.env_index == env_index)
+                    .map(|environment| environment.board(row.process).activity().noted_ns);
+                let state = own.state_of(row.process);
+                let keeps_a_place = row.process == Process::Trainer && own.run.config.trainer.module == OUTSIDE_USER;
+                LifeSign {
+                    place: (row.process, env_index),
+                    incarnation,
+                    noted_ns: notes.max().unwrap_or(0),
+                    queued,
+                    is_starting: state == State::Starting,
+                    is_excused: state == State::Done || keeps_a_place,
+                }
+            })
+            .collect()
+    }
+
     /// True if the process `index` has opened its ports.
     #[must_use]
     pub fn is_attached(&self, index: usize) -> bool {
@@ -246,22 +349,14 @@ impl RunProcesses {
         board.progress().attached == 1
     }
 
-    /// The incarnation that a restart of the process `index` would have.
-    #[must_use]
-    pub fn next_incarnation(&self, index: usize) -> u32 {
-        self.running[index].incarnation + 1
-    }
-
     /// Starts the process `index` again as its next incarnation.
     ///
     /// # Errors
-    /// The run allows no more incarnations, or the program cannot be started.
+    /// iceoryx2 refuses, or the program cannot be started.
     pub fn restart(&mut self, index: usize) -> Result<(), Exit> {
         let (row, env_index) = (self.running[index].row, self.running[index].env_index);
-        let incarnation = self.next_incarnation(index);
-        if !self.set_incarnation(row, env_index, incarnation) {
-            return Err(no_more_incarnations(row, incarnation));
-        }
+        let incarnation = self.running[index].incarnation + 1;
+        self.set_incarnation(row, env_index, incarnation)?;
         self.restarts += 1;
         self.running[index] = self.start(row, env_index, incarnation)?;
         Ok(())
@@ -276,39 +371,41 @@ impl RunProcesses {
     /// tick that is not committed. Returns the first tick of that episode, and the ticks that have been sensed.
     ///
     /// # Errors
-    /// A file cannot be read or written, or the run holds no more incarnations.
+    /// A file cannot be read or written, or iceoryx2 refuses.
     pub fn restart_environment(&mut self, env_index: u32) -> Result<(u64, u64), Exit> {
-        let (mut ended, others) = std::mem::take(&mut self.running)
-            .into_iter()
-            .partition(|running| running.env_index == env_index && running.row.scope == ProcessScope::Environment);
-        self.running = others;
-        let ended: &mut Vec<RunningProcess> = &mut ended;
+        let is_of_environment = |running: &mut RunningProcess| {
+            running.env_index == env_index && running.row.scope == ProcessScope::Environment
+        };
+        let mut ended: Vec<RunningProcess> = self.running.extract_if(.., is_of_environment).collect();
         ended.iter_mut().for_each(RunningProcess::kill);
         self.forget_dead();
         let environment = &mut self.environments[env_index as usize];
         environment.note_progress();
         let sensed_ticks = environment.sensed_ticks();
         let first_tick = environment.prepare_restart()?;
-        for before in ended.iter() {
+        for before in &ended {
             let incarnation = before.incarnation + 1;
-            if !self.set_incarnation(before.row, env_index, incarnation) {
-                return Err(no_more_incarnations(before.row, incarnation));
-            }
+            self.set_incarnation(before.row, env_index, incarnation)?;
             self.incarnations.insert((before.row.process, env_index), incarnation);
         }
         self.restarts += 1;
         Ok((first_tick, sensed_ticks))
     }
 
-    /// Makes this incarnation of a process the valid one in every environment that it belongs to. False if the run allows no more.
-    #[must_use]
-    pub fn set_incarnation(&mut self, row: &ProcessSpec, env_index: u32, incarnation: u32) -> bool {
+    /// Makes this incarnation of a process the valid one in every environment that it belongs to.
+    ///
+    /// # Errors
+    /// iceoryx2 refuses.
+    pub fn set_incarnation(&mut self, row: &ProcessSpec, env_index: u32, incarnation: u32) -> Result<(), Exit> {
+        let node = &self.node;
         let environments = self.environments.iter_mut().filter(|environment| match row.scope {
             ProcessScope::Run => true,
             ProcessScope::Environment => environment.run.env_index == env_index,
         });
-        let mut set = environments.map(|environment| environment.roster.set(row.process, incarnation));
-        set.all(|is_set| is_set)
+        for environment in environments {
+            environment.set_incarnation(node, row.process, incarnation)?;
+        }
+        Ok(())
     }
 
     /// The first required process that is not ready, with its environment.
@@ -349,8 +446,8 @@ impl RunProcesses {
     }
 
     /// Asks the process `index` to leave for its successor.
-    pub fn ask_to_leave(&mut self, index: usize) {
-        self.running[index].ask_to_leave();
+    pub fn ask_to_leave(&mut self, index: usize, when: LeaveTime) {
+        self.running[index].ask_to_leave(when);
     }
 
     /// Kills every process that is left.
@@ -370,19 +467,12 @@ impl RunProcesses {
         self.environments.iter().for_each(Environment::wake_sensing);
     }
 
-    /// Removes the resources of dead processes from the services of the run.
+    /// Removes the resources of dead processes from the services of the run, and reserves the memory that they had.
     pub fn forget_dead(&self) {
         services::forget_dead(&self.node);
+        // At the end of a run no process follows.
+        if !self.running.is_empty() {
+            reserve::refill(self.run());
+        }
     }
-}
-
-fn no_more_incarnations(row: &ProcessSpec, incarnation: u32) -> Exit {
-    Exit::run(
-        format!(
-            "{} has been replaced {} times, the most that a run allows",
-            row.process,
-            incarnation - 1
-        ),
-        "its log in the run directory shows why it ends",
-    )
 }

@@ -14,6 +14,7 @@ use std::{
 
 use ipc_schema::{
     SCHEMA_VERSION,
+    reserve::SHARED_MEMORY,
     run::{RunFile, SharedMemory},
 };
 use rustix::fs::{FlockOperation, OFlags, flock};
@@ -21,8 +22,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::failure::Exit;
 
-/// Where iceoryx2 puts shared memory.
-pub const SHARED_MEMORY: &str = "/dev/shm";
 const LOCK: &str = "lock";
 /// File that marks a directory as one that caraware created.
 const MARKER: &str = "caraware-run.json";

@@ -1,20 +1,28 @@
 //! `report.json`: the results of a run, assembled from the parts that its processes write at their end.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
 use ipc_schema::{
-    metric::{self, METRICS},
+    metric::{self, METRICS, MetricSpec},
     process::Process,
     run::{Mode, RunFile},
+    storage,
 };
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
 use crate::{
     failure::Exit,
+    housekeeping::HousekeepingFigures,
     socket::HandoverReport,
     supervisor::{RunEnding, RunOutcome},
 };
+
+/// Longest wait for space on a full disk at the end of a run.
+const SPACE_WITHIN: Duration = Duration::from_secs(60);
 
 /// The estimators that an evaluation compares, by their prefixes of the report's keys: the policy, the raw fix, the Kalman filter, the
 /// smoother, which also uses later samples, and the policy's network trained by regression.
@@ -49,6 +57,8 @@ struct TrainerFigures {
     evaluation_seeds: Option<u64>,
     policy_std: Option<f64>,
     raw_gnss_mean_error_m: Option<f64>,
+    /// Outputs that a full disk did not take, with the first reason for each.
+    dropped: Option<Value>,
     /// Means and intervals of the estimators, and everything else.
     #[serde(flatten)]
     others: Map<String, Value>,
@@ -105,6 +115,18 @@ struct PartReader {
 }
 
 impl PartReader {
+    /// Processor time and memory of each process, by its name.
+    fn usage(&mut self, run_dir: &Path) -> Map<String, Value> {
+        let mut usage = Map::new();
+        for process in Process::ALL {
+            let part: Option<Value> = self.read(run_dir, process);
+            if let Some(used) = part.as_ref().and_then(|part| part.get("process")) {
+                usage.insert(process.name().to_owned(), used.clone());
+            }
+        }
+        usage
+    }
+
     /// Reads the part of a process of an environment; `None` if the process did not write it, or if it is unreadable.
     fn read<T: serde::de::DeserializeOwned>(&mut self, run_dir: &Path, process: Process) -> Option<T> {
         let path = run_dir.join("parts").join(format!("{process}.json"));
@@ -172,7 +194,7 @@ fn newest_checkpoint(run: &RunFile) -> Option<PathBuf> {
 ///
 /// # Errors
 /// The run directory is not writable.
-pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<WrittenReport, Exit> {
+pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFigures) -> Result<WrittenReport, Exit> {
     let runs: Vec<RunFile> = (0..run.config.run.envs).map(|index| run.environment(index)).collect();
     let mut parts = PartReader::default();
     let sensings: Vec<Sensing> = runs
@@ -205,13 +227,6 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<WrittenReport, Exit>
         env_steps.map(|steps| steps as f64 / outcome.wall_s),
         sensing.ticks as f64 * run.config.run.tick_s,
     );
-    let mut used = Map::new();
-    for process in Process::ALL {
-        let part: Option<Value> = parts.read(&run.run_dir, process);
-        if let Some(usage) = part.as_ref().and_then(|part| part.get("process")) {
-            used.insert(process.name().to_owned(), usage.clone());
-        }
-    }
     let mut report = json!({
         "name": run.name,
         "mode": run.mode,
@@ -251,9 +266,25 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<WrittenReport, Exit>
         "lidar": sensing.lidar,
         "environments": environments,
         "traffic": parts.read::<Value>(&run.run_dir, Process::TrafficBridge),
-        "processes": used,
+        "processes": parts.usage(&run.run_dir),
+        "dropped": trainer.dropped,
+        "disk_full": housekeeping.disk_full,
+        "shortened_logs": housekeeping.shortened_logs,
     });
-    // The task's metric of every estimator, where `report` does not have it yet.
+    add_estimators(&mut report, metric, &trainer);
+    let path = run.run_dir.join("report.json");
+    let text = format!("{report:#}\n");
+    storage::wait_for_space(&path, SPACE_WITHIN, || storage::write_whole(&path, &text))
+        .map_err(|error| Exit::io("write", &path, &error))?;
+    Ok(WrittenReport {
+        report,
+        path,
+        unreadable: parts.unreadable,
+    })
+}
+
+/// Adds the task's metric of every estimator, where the report does not have it yet.
+fn add_estimators(report: &mut Value, metric: &MetricSpec, trainer: &TrainerFigures) {
     for estimator in ESTIMATORS {
         for key in [metric.mean_key(estimator), metric.interval_key(estimator)] {
             if report[&key].is_null() {
@@ -261,13 +292,6 @@ pub fn write(run: &RunFile, outcome: &RunOutcome) -> Result<WrittenReport, Exit>
             }
         }
     }
-    let path = run.run_dir.join("report.json");
-    std::fs::write(&path, format!("{report:#}\n")).map_err(|error| Exit::io("write", &path, &error))?;
-    Ok(WrittenReport {
-        report,
-        path,
-        unreadable: parts.unreadable,
-    })
 }
 
 /// The written report.
@@ -355,6 +379,7 @@ fn summary(report: &Value, path: &Path) -> String {
             lidar["scans"], lidar["points"], lidar["rays"]
         ));
     }
+    lines.extend(resynchronisations(report));
     lines.push(format!(
         "ticks lost {}, duplicated {}; restarts {}; messages that watchers missed {}",
         number(report, "lost_ticks", 0),
@@ -365,6 +390,20 @@ fn summary(report: &Value, path: &Path) -> String {
     lines.extend(hashes(report));
     lines.push(format!("report: {}", path.display()));
     lines.join("\n")
+}
+
+/// How often mirrors were set onto SUMO, in all environments.
+fn resynchronisations(report: &Value) -> Option<String> {
+    let environments = report["environments"].as_array();
+    let parts = environments.map_or(std::slice::from_ref(report), Vec::as_slice);
+    let counts = parts.iter().map(|part| part["dynamics"]["resynchronisations"].as_u64());
+    let set = counts.sum::<Option<u64>>()?;
+    let steps = report["vehicle_steps"].as_f64().filter(|steps| *steps > 0.0)?;
+    #[expect(clippy::cast_precision_loss, reason = "a rate for readers")]
+    let rate = 1e6 * set as f64 / steps;
+    Some(format!(
+        "mirrors set onto SUMO, because no motion leads there: {set} ({rate:.0} per million sensed vehicle-steps)"
+    ))
 }
 
 /// A number of the report with `digits` decimals; a dash if it is missing.

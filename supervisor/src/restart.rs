@@ -1,25 +1,36 @@
 //! Decides when an ended process is started again.
 //!
 //! A watcher that had opened its ports is started again at once. One that had not is started after a growing pause, a limited
-//! number of times. A trainer is replaced as long as its replacements reach new commits.
+//! number of times. A process that the run needs is started again after a pause that grows while it makes no progress; only ends of
+//! its own fault can make the supervisor give it up.
 
-use std::time::{Duration, Instant};
+use std::{
+    os::unix::process::ExitStatusExt as _,
+    process::ExitStatus,
+    time::{Duration, Instant},
+};
+
+use signal_hook::consts::{SIGHUP, SIGINT, SIGKILL, SIGTERM, SIGUSR1};
 
 /// Number of starts in a row, none of which opened its ports, after which a watcher is not started again.
 const MAX_VAIN_STARTS: u32 = 20;
-/// Most replacements of a trainer in a row without a new commit.
-const MAX_VAIN_REPLACEMENTS: u32 = 5;
+/// Most restarts in a row without progress after ends of a process's own fault.
+pub const MAX_VAIN_FAULTS: u32 = 5;
+/// Signals that come from outside.
+const KILLS: [i32; 5] = [SIGKILL, SIGTERM, SIGINT, SIGHUP, SIGUSR1];
 /// Pause after the first start in vain. It doubles with each further one.
 const PAUSE: Duration = Duration::from_millis(100);
 /// Longest pause.
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 
-/// The decision on an ended watcher.
+/// The decision on an ended process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RestartVerdict {
     /// Start it now.
     Start,
-    /// Decide again later.
+    /// Start it after this time.
+    Postpone(Duration),
+    /// Its start is postponed: decide again later.
     Wait,
     /// Never start it again.
     GiveUp,
@@ -52,68 +63,87 @@ impl WatcherRestarts {
     }
 }
 
-/// Restarts of the simulator processes of one environment.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct EnvironmentRestarts {
-    /// Ends since the last new tick.
-    vain: u32,
-    /// Of these, crashes.
-    crashes: u32,
-    /// Most ticks that were sensed at an end.
-    sensed_ticks: u64,
-    due: Option<Instant>,
+/// Whose fault the end of a process is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EndCause {
+    /// Another process, or a user, has killed it.
+    Kill,
+    /// The program itself: a crash, or an exit before its work was done.
+    OwnFault,
 }
 
-impl EnvironmentRestarts {
-    /// What to do about an end that is found at `now`, when `sensed_ticks` had been sensed.
-    pub fn verdict(&mut self, sensed_ticks: u64, is_crash: bool, now: Instant) -> RestartVerdict {
-        let due = match self.due {
-            Some(due) => due,
-            None => {
-                if sensed_ticks > self.sensed_ticks {
-                    (self.sensed_ticks, self.vain, self.crashes) = (sensed_ticks, 0, 0);
-                }
-                let due = now + pause(self.vain);
-                self.vain += 1;
-                self.crashes += u32::from(is_crash);
-                *self.due.insert(due)
-            }
-        };
-        if self.crashes > MAX_VAIN_REPLACEMENTS {
-            return RestartVerdict::GiveUp;
+impl EndCause {
+    /// The cause of an end with this status. The signals of [`KILLS`] come from outside; a program sends itself others when it crashes.
+    #[must_use]
+    pub fn of(status: ExitStatus) -> Self {
+        match status.signal() {
+            Some(signal) if KILLS.contains(&signal) => Self::Kill,
+            _ => Self::OwnFault,
         }
-        if now < due {
-            return RestartVerdict::Wait;
-        }
-        self.due = None;
-        RestartVerdict::Start
     }
 }
 
-/// Replacements of a trainer that was killed.
+/// Restarts of a process, or of the processes of an environment, that the run needs. After a kill it is started again however often
+/// that happens; after [`MAX_VAIN_FAULTS`] ends of its own fault without progress it is not.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct TrainerRestarts {
-    /// Replacements since the last commit.
+pub struct RequiredRestarts {
+    /// Ends since the last progress.
     vain: u32,
-    /// Ticks committed at the last replacement.
-    committed_ticks: u64,
+    /// Of these, ends of its own fault.
+    faults: u32,
+    /// Most ticks that were sensed, or committed, at an end.
+    progress_ticks: u64,
+    due: Option<Instant>,
 }
 
-impl TrainerRestarts {
-    /// Counts a replacement of a trainer that has committed `committed_ticks`.
-    ///
-    /// # Errors
-    /// Too many replacements in a row reached no new commit. The error is their number.
-    pub fn allow(&mut self, committed_ticks: u64) -> Result<(), u32> {
-        if committed_ticks > self.committed_ticks {
-            self.committed_ticks = committed_ticks;
-            self.vain = 0;
+impl RequiredRestarts {
+    /// What to do about an end that is found at `now`, when it had come to `progress_ticks`. The first verdict on an end that has to
+    /// wait is [`RestartVerdict::Postpone`].
+    pub fn verdict(&mut self, progress_ticks: u64, cause: EndCause, now: Instant) -> RestartVerdict {
+        let is_new = self.due.is_none();
+        let due = match self.due {
+            Some(due) => due,
+            None => self.note_end(progress_ticks, cause, now),
+        };
+        if self.faults > MAX_VAIN_FAULTS {
+            return RestartVerdict::GiveUp;
         }
+        match due.saturating_duration_since(now) {
+            Duration::ZERO => {
+                self.due = None;
+                RestartVerdict::Start
+            }
+            left if is_new => RestartVerdict::Postpone(left),
+            _ => RestartVerdict::Wait,
+        }
+    }
+
+    fn note_end(&mut self, progress_ticks: u64, cause: EndCause, now: Instant) -> Instant {
+        if progress_ticks > self.progress_ticks {
+            (self.progress_ticks, self.vain, self.faults) = (progress_ticks, 0, 0);
+        }
+        let due = now + pause(self.vain);
         self.vain += 1;
-        if self.vain > MAX_VAIN_REPLACEMENTS {
-            return Err(MAX_VAIN_REPLACEMENTS);
-        }
-        Ok(())
+        self.faults += u32::from(cause == EndCause::OwnFault);
+        *self.due.insert(due)
+    }
+
+    /// Notes that the postponed start takes place.
+    pub fn start_now(&mut self) {
+        self.due = None;
+    }
+
+    /// Time until the next start, while one is postponed.
+    #[must_use]
+    pub fn wait(&self, now: Instant) -> Option<Duration> {
+        let left = self.due?.saturating_duration_since(now);
+        (!left.is_zero()).then_some(left)
+    }
+
+    /// Ends since the last progress.
+    #[must_use]
+    pub fn vain_ends(&self) -> u32 {
+        self.vain
     }
 }
 
@@ -128,37 +158,68 @@ fn pause(vain: u32) -> Duration {
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_trainer_is_replaced_while_it_commits_and_given_up_after_five_in_vain() {
-        let mut restarts = TrainerRestarts::default();
-        for committed_ticks in [0, 0, 0, 0, 0, 7, 7, 7, 7, 7] {
-            assert_eq!(restarts.allow(committed_ticks), Ok(()));
+    /// The verdict on an end once its pause is over.
+    fn after_pause(restarts: &mut RequiredRestarts, progress_ticks: u64, cause: EndCause) -> RestartVerdict {
+        let now = Instant::now();
+        match restarts.verdict(progress_ticks, cause, now) {
+            RestartVerdict::Postpone(pause) => {
+                assert_eq!(restarts.verdict(progress_ticks, cause, now), RestartVerdict::Wait);
+                assert_eq!(restarts.wait(now), Some(pause));
+                restarts.verdict(progress_ticks, cause, now + pause)
+            }
+            verdict => verdict,
         }
-        assert_eq!(restarts.allow(7), Err(MAX_VAIN_REPLACEMENTS));
     }
 
     #[test]
-    fn a_killed_environment_is_started_ever_less_often_and_a_crashing_one_given_up() {
-        let (mut restarts, now) = (EnvironmentRestarts::default(), Instant::now());
-        assert_eq!(restarts.verdict(5, false, now), RestartVerdict::Start);
+    fn a_killed_process_is_started_ever_less_often_and_never_given_up() {
+        let (mut restarts, now) = (RequiredRestarts::default(), Instant::now());
+        assert_eq!(restarts.verdict(5, EndCause::Kill, now), RestartVerdict::Start);
+        let pauses: Vec<Duration> = (0..1000)
+            .map(|_| match restarts.verdict(5, EndCause::Kill, now) {
+                RestartVerdict::Postpone(pause) => {
+                    assert_eq!(restarts.verdict(5, EndCause::Kill, now + pause), RestartVerdict::Start);
+                    pause
+                }
+                verdict => panic!("{verdict:?}"),
+            })
+            .collect();
+        assert_eq!((pauses[0], pauses[1], pauses[999]), (PAUSE, 2 * PAUSE, LONGEST_PAUSE));
+        assert!(pauses.is_sorted());
         assert_eq!(
-            restarts.verdict(5, false, now),
-            RestartVerdict::Wait,
-            "nothing new since"
+            restarts.verdict(6, EndCause::Kill, now),
+            RestartVerdict::Start,
+            "progress"
         );
-        assert_eq!(restarts.verdict(5, false, now + LONGEST_PAUSE), RestartVerdict::Start);
-        for _ in 0..1000 {
-            restarts.verdict(5, false, now);
-            assert_eq!(restarts.verdict(5, false, now + LONGEST_PAUSE), RestartVerdict::Start);
+    }
+
+    #[test]
+    fn a_process_that_ends_by_its_own_fault_is_given_up_after_five_restarts_without_progress() {
+        let mut restarts = RequiredRestarts::default();
+        for progress_ticks in [0, 7] {
+            for _ in 0..MAX_VAIN_FAULTS {
+                let verdict = after_pause(&mut restarts, progress_ticks, EndCause::OwnFault);
+                assert_eq!(verdict, RestartVerdict::Start);
+                // Kills in between do not count.
+                let verdict = after_pause(&mut restarts, progress_ticks, EndCause::Kill);
+                assert_eq!(verdict, RestartVerdict::Start);
+            }
         }
-        assert_eq!(restarts.verdict(6, true, now), RestartVerdict::Start, "a new tick");
-        let crash = |restarts: &mut EnvironmentRestarts| {
-            restarts.verdict(6, true, now);
-            restarts.verdict(6, true, now + LONGEST_PAUSE)
-        };
-        let verdicts: Vec<_> = (0..MAX_VAIN_REPLACEMENTS).map(|_| crash(&mut restarts)).collect();
-        assert_eq!(verdicts.last(), Some(&RestartVerdict::GiveUp));
-        assert!(verdicts[..4].iter().all(|verdict| *verdict == RestartVerdict::Start));
+        let verdict = after_pause(&mut restarts, 7, EndCause::OwnFault);
+        assert_eq!(verdict, RestartVerdict::GiveUp);
+    }
+
+    #[test]
+    fn a_kill_comes_from_outside_and_a_crash_does_not() {
+        let cause = |wait_status| EndCause::of(ExitStatus::from_raw(wait_status));
+        assert!(
+            [SIGKILL, SIGTERM]
+                .map(cause)
+                .iter()
+                .all(|cause| *cause == EndCause::Kill)
+        );
+        let crashes = [signal_hook::consts::SIGSEGV, signal_hook::consts::SIGABRT, 1 << 8, 0];
+        assert!(crashes.map(cause).iter().all(|cause| *cause == EndCause::OwnFault));
     }
 
     #[test]

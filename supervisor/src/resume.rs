@@ -1,17 +1,23 @@
 //! `caraware train --resume`: continues a stopped run from a checkpoint.
 
-use std::{io::ErrorKind, path::Path};
+use std::{
+    ffi::OsStr,
+    io::ErrorKind,
+    os::unix::ffi::OsStrExt as _,
+    path::{Path, PathBuf},
+    time::{Duration, Instant},
+};
 
 use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
     control::{self, Action, Command},
     episode_state,
-    run::{Beginning, CURRICULUM_LOG, FORMER_CURRICULUM_LOG, Mode, RunFile},
+    run::{Beginning, CURRICULUM_LOG, FORMER_CURRICULUM_LOG, Mode, RunFile, Start},
+    storage,
 };
 
 use crate::{
-    checkpoint::FoundCheckpoint,
     config::{self, LayeredSettings},
     environment::SIMULATORS,
     failure::Exit,
@@ -19,13 +25,18 @@ use crate::{
     registry::{self, RunClaim},
 };
 
+/// Longest time in which the processes of a killed supervisor end: as long as a supervisor waits for them.
+const FORMER_PROCESSES_END_WITHIN: Duration = Duration::from_secs(30);
+
 /// Keys, or prefixes of keys, that a resumed run may change: no observation made so far depends on them.
-const CHANGEABLE: [&str; 7] = [
+const CHANGEABLE: [&str; 9] = [
     "trainer.",
     "fanout.",
     "run.journal_mib",
     "run.window_ticks",
     "run.real_time_factor",
+    "run.stall_s",
+    "run.on_stall",
     "episode.training_episodes",
     "episode.final_evaluations",
 ];
@@ -68,12 +79,12 @@ pub fn changed_config(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
     Ok(LayeredSettings::of(&run.config)?.with_assignments(set)?.validate()?)
 }
 
-/// Prepares a stopped run to continue in its own directory.
+/// Prepares a stopped run to continue in its own directory, from `beginning` or, without it, from tick 0.
 ///
 /// # Errors
 /// The run is alive, a file that it was made from does not exist any more, or its directory is not writable.
 pub fn resume_in_place(
-    found: &FoundCheckpoint,
+    beginning: Option<Beginning>,
     old: RunFile,
     config: Config,
     install: &Install,
@@ -87,6 +98,7 @@ pub fn resume_in_place(
             ),
         ));
     }
+    wait_for_former_processes(&old)?;
     if let Some(missing) = sources(&old).into_iter().find(|file| !file.exists()) {
         return Err(Exit::config(
             format!(
@@ -97,9 +109,18 @@ pub fn resume_in_place(
         ));
     }
     // The logs come first: the curriculum and the commands that were not carried out yet.
-    let beginning = carry_over_logs(&old, &old.run_dir, found.beginning())?;
-    let starts = std::iter::once(&beginning.start).chain(&beginning.others);
-    for (index, start) in (0..old.config.run.envs).zip(starts) {
+    let beginning = match beginning {
+        Some(beginning) => Some(carry_over_logs(&old, &old.run_dir, beginning)?),
+        None => {
+            forget_all_decisions(&old)?;
+            None
+        }
+    };
+    let starts = beginning.iter().flat_map(|beginning| {
+        let first = std::iter::once(&beginning.start);
+        first.chain(&beginning.others).copied()
+    });
+    for (index, start) in (0..old.config.run.envs).zip(starts.chain(std::iter::repeat(Start::default()))) {
         let run_dir = old.environment(index).run_dir;
         remove_end_reports(&run_dir)?;
         for process in SIMULATORS {
@@ -111,7 +132,7 @@ pub fn resume_in_place(
     let config_hash = config::hash(&config)?;
     let path = old.run_dir.join("config.toml");
     let text = format!("# BLAKE3 {config_hash}\n{}", config::to_toml(&config)?);
-    std::fs::write(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
+    storage::write_whole(&path, text).map_err(|error| Exit::io("write", &path, &error))?;
     let run = RunFile {
         schema_version: SCHEMA_VERSION,
         run_id: claim.run_id,
@@ -120,11 +141,68 @@ pub fn resume_in_place(
         sumo_home: install.sumo_home.clone(),
         config,
         config_hash,
-        beginning: Some(beginning),
+        beginning,
         restart: None,
         ..old
     };
     Ok((run, claim))
+}
+
+/// Makes a run that begins again at tick 0 decide its curriculum again, and carry out all its commands again.
+fn forget_all_decisions(old: &RunFile) -> Result<(), Exit> {
+    let stages = old.run_dir.join(CURRICULUM_LOG);
+    if stages.exists() {
+        std::fs::remove_file(&stages).map_err(|error| Exit::io("remove", &stages, &error))?;
+    }
+    for index in 0..old.config.run.envs {
+        let run_dir = old.environment(index).run_dir;
+        repeat_commands(&run_dir, &run_dir, 0)?;
+    }
+    Ok(())
+}
+
+/// Waits until the processes of a run whose supervisor was killed have ended: the trainer may still write a checkpoint.
+fn wait_for_former_processes(old: &RunFile) -> Result<(), Exit> {
+    let deadline = Instant::now() + FORMER_PROCESSES_END_WITHIN;
+    loop {
+        let pids = former_processes(old);
+        if pids.is_empty() {
+            return Ok(());
+        }
+        if Instant::now() > deadline {
+            let within = FORMER_PROCESSES_END_WITHIN.as_secs();
+            return Err(Exit::run(
+                format!(
+                    "processes of the run {} still live after {within} s: {}",
+                    old.name,
+                    pids.join(", ")
+                ),
+                "end these processes, and resume the run again",
+            ));
+        }
+        std::thread::park_timeout(Duration::from_millis(50));
+    }
+}
+
+/// Ids of the processes whose command lines name a run file of the run.
+fn former_processes(old: &RunFile) -> Vec<String> {
+    let directories: Vec<PathBuf> = (0..old.config.run.envs)
+        .map(|index| old.environment(index).run_dir)
+        .collect();
+    let is_run_file = |argument: &[u8]| {
+        let path = Path::new(OsStr::from_bytes(argument));
+        let is_named = path
+            .file_name()
+            .is_some_and(|name| name == "run.json" || name == "run.next.json");
+        is_named && directories.iter().any(|directory| path.parent() == Some(directory))
+    };
+    let entries = std::fs::read_dir("/proc").into_iter().flatten().flatten();
+    let pids = entries.filter_map(|entry| {
+        let line = std::fs::read(entry.path().join("cmdline")).ok()?;
+        let names_it = line.split(|byte| *byte == 0).any(is_run_file);
+        names_it.then(|| entry.file_name().to_string_lossy().into_owned())
+    });
+    pids.collect()
 }
 
 /// Carries the logs of the run `old` over to the run in `run_dir`, which continues it from `beginning`.
@@ -227,7 +305,7 @@ fn write_commands(path: &Path, actions: &[Action]) -> Result<(), Exit> {
     }
     let directory = path.parent().unwrap_or(path);
     std::fs::create_dir_all(directory)
-        .and_then(|()| std::fs::write(path, lines))
+        .and_then(|()| storage::write_whole(path, lines))
         .map_err(failed)
 }
 
@@ -241,7 +319,7 @@ fn sources(run: &RunFile) -> Vec<&Path> {
             additional_files,
         } => std::iter::once(net_file)
             .chain(additional_files)
-            .map(std::path::PathBuf::as_path)
+            .map(PathBuf::as_path)
             .collect(),
     }
 }

@@ -1,16 +1,18 @@
 //! A started process of a run: its output, its exit status, its failure, and its end.
 
 use std::{
-    fs::OpenOptions,
+    fs::{File, OpenOptions},
     io::Write as _,
-    os::unix::process::CommandExt as _,
+    os::unix::process::{CommandExt as _, ExitStatusExt as _},
     path::{Path, PathBuf},
     process::{Child, ChildStdout, Command, ExitStatus, Stdio},
+    time::Duration,
 };
 
 use ipc_schema::{
     failure::{Failure, FailureKind},
     process::{ProcessSpec, Program},
+    reserve::{self, SHARED_MEMORY},
     run::RunFile,
 };
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
@@ -28,6 +30,33 @@ fn command(row: &ProcessSpec, install: &Install, run: &RunFile) -> Result<Comman
             let mut command = Command::new(&install.python);
             command.args(["-m", module(run)]).env("PYTHONUNBUFFERED", "1");
             Ok(command)
+        }
+    }
+}
+
+/// Opens the log of a row, to append to it.
+fn open_log(row: &ProcessSpec, run: &RunFile) -> Result<(File, PathBuf), Exit> {
+    let path = run.run_dir.join("logs").join(format!("{}.log", row.process));
+    let log = OpenOptions::new().create(true).append(true).open(&path);
+    log.map(|log| (log, path.clone()))
+        .map_err(|error| Exit::io("open", &path, &error))
+}
+
+/// When a trainer leaves for its successor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LeaveTime {
+    /// After its next update: nothing is learnt again.
+    NextUpdate,
+    /// At the next tick: what it has not learnt from comes again to the successor.
+    NextTick,
+}
+
+impl LeaveTime {
+    /// The signal that asks for it.
+    fn signal(self) -> Signal {
+        match self {
+            Self::NextUpdate => Signal::USR1,
+            Self::NextTick => Signal::USR2,
         }
     }
 }
@@ -101,12 +130,7 @@ impl RunningProcess {
         incarnation: u32,
         change: impl FnOnce(&mut Command),
     ) -> Result<Self, Exit> {
-        let log_path = run.run_dir.join("logs").join(format!("{}.log", row.process));
-        let log = OpenOptions::new()
-            .create(true)
-            .append(true)
-            .open(&log_path)
-            .map_err(|error| Exit::io("open", &log_path, &error))?;
+        let (log, log_path) = open_log(row, run)?;
         let errors = log.try_clone().map_err(|error| Exit::io("open", &log_path, &error))?;
         let mut command = command(row, install, run)?;
         command
@@ -141,6 +165,28 @@ impl RunningProcess {
         self.exit
     }
 
+    /// What the kernel says of it, for messages.
+    #[must_use]
+    pub fn kernel_state(&self) -> &'static str {
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap_or_default();
+        let state = stat.rsplit_once(") ").and_then(|(_, rest)| rest.chars().next());
+        match state {
+            Some('T' | 't') => "a signal or a debugger has stopped it",
+            Some('R') => "it computes",
+            Some('D') => "it waits for a device",
+            Some('S') => "it sleeps",
+            _ => "it is gone",
+        }
+    }
+
+    /// Time that its main thread has waited for a core: the kernel's second figure in `schedstat`, nanoseconds.
+    #[must_use]
+    pub fn queued(&self) -> Duration {
+        let figures = std::fs::read_to_string(format!("/proc/{}/schedstat", self.child.id())).unwrap_or_default();
+        let queued_ns = figures.split_whitespace().nth(1).and_then(|figure| figure.parse().ok());
+        Duration::from_nanos(queued_ns.unwrap_or(0))
+    }
+
     /// Sends `signal` to its process group, unless it has ended.
     pub fn signal(&mut self, signal: Signal) {
         if self.poll().is_some() {
@@ -162,12 +208,28 @@ impl RunningProcess {
     }
 
     /// Asks it to leave for its successor. Unlike [`RunningProcess::signal`], the signal goes to the process alone, not to its group.
-    pub fn ask_to_leave(&mut self) {
+    pub fn ask_to_leave(&mut self, when: LeaveTime) {
         if self.poll().is_none()
             && let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw)
-            && let Err(error) = kill_process(pid, Signal::USR1)
+            && let Err(error) = kill_process(pid, when.signal())
         {
             tracing::debug!(%error, process = %self.row.process, "cannot signal");
+        }
+    }
+
+    /// True if it has reported a failure.
+    #[must_use]
+    pub fn has_reported_failure(&self, run: &RunFile) -> bool {
+        Failure::read(&run.run_dir, self.row.process.name()).is_some()
+    }
+
+    /// Appends a line of the supervisor to its log.
+    pub fn log(&self, run: &RunFile, line: &str) {
+        let written = open_log(self.row, run).and_then(|(mut log, path)| {
+            writeln!(log, "caraware: {line}").map_err(|error| Exit::io("write", &path, &error))
+        });
+        if let Err(exit) = written {
+            tracing::debug!(?exit, "cannot write a note");
         }
     }
 
@@ -178,6 +240,19 @@ impl RunningProcess {
         if let Some(mut failure) = Failure::read(&run.run_dir, name) {
             failure.message = format!("{}: {}", self.row.label(run), failure.message);
             return failure;
+        }
+        if status.signal() == Some(signal_hook::consts::SIGBUS) {
+            return Failure::new(
+                FailureKind::Missing,
+                format!(
+                    "{} needed more shared memory: {SHARED_MEMORY} has {} MiB free, and the run's reserve is used up",
+                    self.row.label(run),
+                    reserve::free_bytes() >> 20
+                ),
+            )
+            .with_help(format!(
+                "free space in {SHARED_MEMORY}, or enlarge it (Docker: --shm-size)"
+            ));
         }
         let log = run.run_dir.join("logs").join(format!("{name}.log"));
         let text = std::fs::read_to_string(&log).unwrap_or_default();

@@ -1,8 +1,13 @@
-//! Reads the options of a `.sumocfg` and the location of a net, before any process starts.
+//! Reads the options of a `.sumocfg` and the location of a net, before any process starts. A scenario may come from a stranger:
+//! docs/decisions/0028-scenario-files-are-not-trusted.md.
+
+mod configuration;
+pub mod input_check;
+pub mod options;
 
 use std::{
     fs::File,
-    io::{BufRead, BufReader},
+    io::{BufRead, BufReader, Read as _},
     path::{Path, PathBuf},
 };
 
@@ -14,6 +19,9 @@ use quick_xml::{
 };
 
 use crate::{config::ConfigError, failure::Exit};
+use configuration::SumoSetting;
+use input_check::{InputCheck, OutputPlace, TRUST};
+use options::OptionEffect;
 
 /// The options of a `.sumocfg` that the bridge needs.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -26,6 +34,27 @@ pub struct SumoScenario {
     pub step_s: Option<f64>,
     /// `seed`, if set.
     pub seed: Option<u64>,
+    /// Outputs that the files place elsewhere, which SUMO writes into the run's directory: each with its place.
+    pub moved_outputs: Vec<String>,
+}
+
+impl SumoScenario {
+    /// Notes in the log of `traffic-bridge` which outputs are not written where the scenario's files say.
+    ///
+    /// # Errors
+    /// The log cannot be written.
+    pub fn note_moved_outputs(&self, run_dir: &Path) -> Result<(), Exit> {
+        let log = run_dir.join("logs/traffic-bridge.log");
+        if self.moved_outputs.is_empty() {
+            return Ok(());
+        }
+        let place = run_dir.join("sumo");
+        let notes = self
+            .moved_outputs
+            .iter()
+            .map(|output| format!("{output}: written into {} instead\n", place.display()));
+        std::fs::write(&log, notes.collect::<String>()).map_err(|error| Exit::io("write", &log, &error))
+    }
 }
 
 fn problem(path: &Path, message: impl Into<String>, help: impl Into<String>) -> Exit {
@@ -46,38 +75,36 @@ pub(crate) fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> 
         .map(|value| value.into_owned())
 }
 
-/// Reads a `.sumocfg` and checks that every file it names exists.
+/// Reads a `.sumocfg` and checks every file that it names. Unless it is `trusted`, whatever reaches beyond the run's directory is refused.
 ///
 /// # Errors
-/// The file is unreadable or malformed, it names no net, or a file that it names is missing (with the line).
-pub fn read(path: &Path) -> Result<SumoScenario, Exit> {
-    let text = std::fs::read_to_string(path).map_err(|error| {
-        problem(
-            path,
-            format!("cannot be read: {error}"),
-            "give the path of an existing .sumocfg",
-        )
-    })?;
-    let directory = path.parent().unwrap_or(Path::new("."));
-    let mut scenario = SumoScenario::default();
-    let mut reader = Reader::from_str(&text);
-    loop {
-        let line = line_of(&text, reader.buffer_position());
-        match reader.read_event() {
-            Ok(Event::Start(element) | Event::Empty(element)) => {
-                read_option(&mut scenario, &element, path, directory, line)?
-            }
-            Ok(Event::Eof) => break,
-            Ok(_) => {}
-            Err(error) => {
-                return Err(problem(
-                    path,
-                    format!("line {line}: not valid XML: {error}"),
-                    "correct the file; SUMO's own check: `sumo -c FILE`",
-                ));
-            }
-        }
+/// The file is unreadable or malformed, it names no net, a file that it names is missing or no regular file, or an option or an element
+/// makes SUMO connect, listen, load another configuration, or write outside the run's directory. Each error has its file and line.
+pub fn read(path: &Path, trusted: bool) -> Result<SumoScenario, Exit> {
+    let unreadable = |reason: String| problem(path, reason, "give the path of an existing .sumocfg");
+    if path.exists() {
+        input_check::require_regular(path).map_err(unreadable)?;
     }
+    let text = std::fs::read_to_string(path).map_err(|error| unreadable(format!("cannot be read: {error}")))?;
+    let configuration = configuration::parse(&text).map_err(|(line, reason)| {
+        let help = "correct the file; SUMO's own check: `sumo -c FILE`";
+        problem(path, format!("line {line}: not valid XML: {reason}"), help)
+    })?;
+    let mut reader = ScenarioReader {
+        path,
+        directory: path.parent().unwrap_or(Path::new(".")),
+        scenario: SumoScenario::default(),
+        check: (!trusted).then(|| InputCheck::new(OutputPlace::RunDirectory)),
+    };
+    if let (Some(line), false) = (configuration.doctype_line, trusted) {
+        let help = format!("remove <!DOCTYPE …>, {TRUST}");
+        return Err(reader.problem(line, "a document type declaration makes SUMO read other files", help));
+    }
+    for setting in &configuration.settings {
+        reader.read_setting(setting)?;
+    }
+    let mut scenario = reader.scenario;
+    scenario.moved_outputs = reader.check.map(|check| check.moved).unwrap_or_default();
     if scenario.net_file.as_os_str().is_empty() {
         return Err(problem(
             path,
@@ -88,77 +115,122 @@ pub fn read(path: &Path) -> Result<SumoScenario, Exit> {
     Ok(scenario)
 }
 
-/// Line of the first character at or after `position` that is not white space, from 1.
-fn line_of(text: &str, position: u64) -> usize {
-    let end = usize::try_from(position).unwrap_or(usize::MAX).min(text.len());
-    let start = text.as_bytes()[end..]
-        .iter()
-        .take_while(|byte| byte.is_ascii_whitespace())
-        .count();
-    text.as_bytes()[..end + start]
-        .iter()
-        .filter(|byte| **byte == b'\n')
-        .count()
-        + 1
+/// Checks the net of a map with population control, for which SUMO has no directory of outputs.
+///
+/// # Errors
+/// As [`read`]; a net may not write at all.
+pub fn check_net(net: &Path, trusted: bool) -> Result<(), Exit> {
+    match trusted {
+        true => {
+            input_check::require_regular(net).map_err(|reason| problem(net, reason, "give a net built by netconvert"))
+        }
+        false => InputCheck::new(OutputPlace::Anywhere).check_xml(net),
+    }
 }
 
-/// Takes one option of the `.sumocfg` over into `scenario`, or refuses it.
-fn read_option(
-    scenario: &mut SumoScenario,
-    element: &BytesStart<'_>,
-    path: &Path,
-    directory: &Path,
-    line: usize,
-) -> Result<(), Exit> {
-    let name = element.local_name();
-    let name = name.as_ref().to_owned();
-    let Some(value) = attribute(element, "value").or_else(|| attribute(element, "v")) else {
-        return Ok(());
-    };
-    match name.as_str() {
-        "net-file" | "net" | "n" | "route-files" | "routes" | "r" | "additional-files" | "additional" | "a" => {
-            let files = files(&value, directory);
-            if let Some(missing) = files.iter().find(|file| !file.is_file()) {
-                let message = format!("line {line}: {name} names {}, which does not exist", missing.display());
-                return Err(problem(
-                    path,
-                    message,
-                    "paths in a .sumocfg are relative to the .sumocfg itself",
+/// Takes over the options of one `.sumocfg`.
+struct ScenarioReader<'a> {
+    path: &'a Path,
+    directory: &'a Path,
+    scenario: SumoScenario,
+    /// `None` if the scenario is trusted.
+    check: Option<InputCheck>,
+}
+
+impl ScenarioReader<'_> {
+    fn problem(&self, line: usize, message: impl std::fmt::Display, help: impl Into<String>) -> Exit {
+        problem(self.path, format!("line {line}: {message}"), help)
+    }
+
+    /// Takes one option over into the scenario, or refuses it.
+    fn read_setting(&mut self, setting: &SumoSetting) -> Result<(), Exit> {
+        let SumoSetting { name, value, line } = setting;
+        let effect = OptionEffect::of(name);
+        match effect {
+            OptionEffect::ReadsXml | OptionEffect::Reads => self.read_files(setting, effect)?,
+            // No client can connect to a run, trusted or not.
+            OptionEffect::Listens if value.trim() != "0" => {
+                return Err(self.problem(
+                    *line,
+                    format!("remote-port = \"{value}\" makes SUMO wait for a TraCI client, but no client can connect to a run"),
+                    "remove remote-port from the .sumocfg (traffic-bridge steps SUMO in its own process), or keep a copy without it",
                 ));
             }
-            for file in files
-                .iter()
-                .filter(|file| file.extension().is_some_and(|kind| kind == "gz"))
-            {
-                check_gzip(file).map_err(|error| {
-                    let message = format!(
-                        "line {line}: {name} names {}, which cannot be unpacked: {error}",
-                        file.display()
-                    );
-                    problem(path, message, "copy or pack the file again; `gzip -t FILE` checks it")
+            _ => self.check_setting(setting, effect)?,
+        }
+        match name.as_str() {
+            "step-length" => self.scenario.step_s = Some(number(value, name, self.path, *line)?),
+            "seed" => self.scenario.seed = Some(number(value, name, self.path, *line)?),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Refuses an option that reaches beyond the run's directory, unless the scenario is trusted.
+    fn check_setting(&mut self, setting: &SumoSetting, effect: OptionEffect) -> Result<(), Exit> {
+        let SumoSetting { name, value, line } = setting;
+        let Some(check) = &mut self.check else { return Ok(()) };
+        let (message, help) = match effect {
+            OptionEffect::Writes => {
+                let outputs = value
+                    .split(',')
+                    .try_for_each(|output| check.check_output(self.path, name, output));
+                match outputs {
+                    Ok(()) => return Ok(()),
+                    Err(refused) => refused,
+                }
+            }
+            OptionEffect::NamesOutputs if value.contains(['/', '\\', '$']) => (
+                format!("{name} = \"{value}\" may place outputs outside the run's directory"),
+                format!("use a suffix without \"/\" and \"$\", {TRUST}"),
+            ),
+            OptionEffect::Validates if !["never", "local", ""].contains(&value.trim()) => (
+                format!(
+                    "{name} = \"{value}\" makes SUMO load schemas and entities from addresses that its input files name"
+                ),
+                format!("set it to \"local\" or \"never\", {TRUST}"),
+            ),
+            OptionEffect::Escapes if !value.trim().is_empty() => (
+                format!("{name} = \"{value}\" makes SUMO write or load files outside the run's directory"),
+                format!("remove it, {TRUST}"),
+            ),
+            _ => return Ok(()),
+        };
+        Err(self.problem(*line, message, help))
+    }
+
+    /// Checks the files of an option, and takes the net and the additional files over into the scenario.
+    fn read_files(&mut self, setting: &SumoSetting, effect: OptionEffect) -> Result<(), Exit> {
+        let SumoSetting { name, value, line } = setting;
+        let files = files(value, self.directory);
+        for file in &files {
+            let shown = file.display();
+            if !file.exists() {
+                let message = format!("{name} names {shown}, which does not exist");
+                let help = "paths in a .sumocfg are relative to the .sumocfg itself";
+                return Err(self.problem(*line, message, help));
+            }
+            input_check::require_regular(file).map_err(|reason| {
+                let message = format!("{name} names {shown}, which {reason}");
+                self.problem(*line, message, "name a file that SUMO's own tools have written")
+            })?;
+            if file.extension().is_some_and(|kind| kind == "gz") {
+                check_gzip(file, self.check.is_none()).map_err(|error| {
+                    let message = format!("{name} names {shown}, which cannot be unpacked: {error}");
+                    self.problem(*line, message, "copy or pack the file again; `gzip -t FILE` checks it")
                 })?;
             }
-            if name.starts_with('n') {
-                scenario.net_file = files.into_iter().next().unwrap_or_default();
-            } else if name.starts_with('a') {
-                scenario.additional_files = files;
+            if let (Some(check), OptionEffect::ReadsXml) = (&mut self.check, effect) {
+                check.check_xml(file)?;
             }
         }
-        // SUMO would open the port on all interfaces and wait for a client before its first step.
-        "remote-port" if value.trim() != "0" => {
-            return Err(problem(
-                path,
-                format!(
-                    "line {line}: remote-port = \"{value}\" makes SUMO wait for a TraCI client, but no client can connect to a run"
-                ),
-                "remove remote-port from the .sumocfg (traffic-bridge steps SUMO in its own process), or keep a copy without it",
-            ));
+        match name.as_str() {
+            "net-file" | "net" | "n" => self.scenario.net_file = files.into_iter().next().unwrap_or_default(),
+            "additional-files" | "additional" | "a" => self.scenario.additional_files = files,
+            _ => {}
         }
-        "step-length" => scenario.step_s = Some(number(&value, &name, path, line)?),
-        "seed" => scenario.seed = Some(number(&value, &name, path, line)?),
-        _ => {}
+        Ok(())
     }
-    Ok(())
 }
 
 fn files(value: &str, directory: &Path) -> Vec<PathBuf> {
@@ -170,9 +242,18 @@ fn files(value: &str, directory: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Reads a gzip file to its end. SUMO would stop at the damage without naming the file.
-fn check_gzip(file: &Path) -> std::io::Result<u64> {
-    std::io::copy(&mut MultiGzDecoder::new(File::open(file)?), &mut std::io::sink())
+/// Reads a gzip file to its end, or to the limit of what it may unpack to. SUMO would stop at damage without naming the file.
+fn check_gzip(file: &Path, trusted: bool) -> std::io::Result<u64> {
+    let limit = match trusted {
+        true => u64::MAX,
+        false => input_check::unpacked_limit(file.metadata()?.len()),
+    };
+    let mut unpacked = MultiGzDecoder::new(File::open(file)?).take(limit);
+    let bytes = std::io::copy(&mut unpacked, &mut std::io::sink())?;
+    match bytes == limit {
+        true => Err(std::io::Error::other(input_check::UNPACKS_TO_TOO_MUCH)),
+        false => Ok(bytes),
+    }
 }
 
 fn number<T: std::str::FromStr>(value: &str, name: &str, path: &Path, line: usize) -> Result<T, Exit> {
@@ -221,18 +302,48 @@ pub fn map_info(net: &Path, origin_deg: Option<(f64, f64)>) -> Result<MapInfo, E
             Err(error) => return Err(unreadable(&error)),
         }
     };
-    map.traffic_lights = traffic_lights(&mut reader.into_inner()).map_err(|error| unreadable(&error))?;
+    let counts = NetCounts::of(&mut reader.into_inner()).map_err(|error| unreadable(&error))?;
+    if counts.internal_edges > 0 && (counts.inner_connections == 0 || counts.outer_connections == 0) {
+        let message =
+            "has junctions, but no <connection> into them or out of them: SUMO crashes while it reads such a net";
+        return Err(problem(net, message, "build the net again with netconvert"));
+    }
+    map.traffic_lights = counts.traffic_lights;
     Ok(map)
 }
 
-/// Counts the programs of traffic lights in the rest of a net. Large nets have a million elements, so only their names are compared.
-fn traffic_lights(net: &mut impl BufRead) -> std::io::Result<u32> {
-    let (mut element, mut count) = (Vec::new(), 0);
-    while net.read_until(b'>', &mut element)? > 0 {
-        count += u32::from(element.trim_ascii_start().starts_with(b"<tlLogic "));
-        element.clear();
+/// Numbers of elements of a net.
+#[derive(Debug, Default)]
+struct NetCounts {
+    /// Programs of traffic lights.
+    traffic_lights: u32,
+    /// Edges within junctions.
+    internal_edges: u64,
+    /// Connections that begin within a junction.
+    inner_connections: u64,
+    /// Connections that begin on a road.
+    outer_connections: u64,
+}
+
+impl NetCounts {
+    /// Counts in the rest of a net. Large nets have a million elements, so only the beginnings of elements are compared.
+    fn of(net: &mut impl BufRead) -> std::io::Result<Self> {
+        let (mut element, mut counts) = (Vec::new(), Self::default());
+        while net.read_until(b'>', &mut element)? > 0 {
+            let text = element.trim_ascii_start();
+            if text.starts_with(b"<tlLogic ") {
+                counts.traffic_lights += 1;
+            } else if text.starts_with(b"<edge id=\":") {
+                counts.internal_edges += 1;
+            } else if text.starts_with(b"<connection from=\":") {
+                counts.inner_connections += 1;
+            } else if text.starts_with(b"<connection ") {
+                counts.outer_connections += 1;
+            }
+            element.clear();
+        }
+        Ok(counts)
     }
-    Ok(count)
 }
 
 /// Margin around the net for positions outside it, such as GNSS errors and vehicles wider than their lane, metres.
@@ -317,14 +428,15 @@ mod tests {
             "a.sumocfg",
             "<configuration>\n<input>\n<net-file value=\"a.net.xml\"/></input><time><step-length value=\"0.5\"/></time></configuration>",
         );
-        let scenario = read(&cfg).unwrap();
+        let scenario = read(&cfg, false).unwrap();
         assert_eq!(
             scenario,
             SumoScenario {
                 net_file: directory.path().join("a.net.xml"),
                 additional_files: Vec::new(),
                 step_s: Some(0.5),
-                seed: None
+                seed: None,
+                moved_outputs: Vec::new(),
             }
         );
     }
@@ -338,7 +450,7 @@ mod tests {
             "a.sumocfg",
             "<configuration>\n  <input>\n    <net-file value=\"a.net.xml\"/>\n    <route-files value=\"b.rou.xml\"/>\n  </input>\n</configuration>",
         );
-        let (text, help) = message(read(&cfg).unwrap_err());
+        let (text, help) = message(read(&cfg, false).unwrap_err());
         assert!(
             text.contains("line 4: route-files names") && text.contains("b.rou.xml"),
             "{text}"

@@ -1,8 +1,12 @@
 //! The supervisor's socket: a request and its answer are a line of JSON each. Only the user of the run can enter its directory.
 
 use std::{
+    fs::Permissions,
     io::{BufRead as _, BufReader, Read as _, Write as _},
-    os::unix::net::{UnixListener, UnixStream},
+    os::unix::{
+        fs::PermissionsExt as _,
+        net::{UnixListener, UnixStream},
+    },
     path::PathBuf,
     time::Duration,
 };
@@ -44,6 +48,12 @@ pub struct HandoverRequest {
     pub set: Vec<String>,
     /// A checkpoint directory to take parameters from, instead of the newest of the run.
     pub checkpoint: Option<PathBuf>,
+    /// True if the old trainer leaves at the next tick, and not after its next update.
+    #[serde(default)]
+    pub now: bool,
+    /// Longest time to the old trainer's end, seconds; then the handover is refused.
+    #[serde(default)]
+    pub timeout_s: Option<f64>,
 }
 
 /// The supervisor's answer to a [`HandoverRequest`].
@@ -104,6 +114,8 @@ impl ReplySocket {
 pub fn listen(run: &RunFile, take: impl Fn(ReceivedRequest) -> bool + Send + 'static) -> Result<(), Exit> {
     let path = run.control_socket();
     let listener = UnixListener::bind(&path).map_err(|error| Exit::io("listen on", &path, &error))?;
+    std::fs::set_permissions(&path, Permissions::from_mode(0o600))
+        .map_err(|error| Exit::io("close to other users", &path, &error))?;
     let serve = move || {
         for stream in listener.incoming().flatten() {
             match read_request(stream) {

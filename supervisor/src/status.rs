@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use ipc_schema::{
+    activity::Activity,
     board::{Health, Progress, State},
     metric,
     ports::BoardReader,
@@ -37,7 +38,7 @@ pub fn ps(name: Option<&str>) -> Result<(), Exit> {
         return Ok(());
     }
     println!(
-        "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>9}",
+        "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>9} WAITS FOR",
         "RUN", "PROCESS", "STATE", "PID", "TICK", "TICKS/S", "LAG", "DROPS", "RESTARTS", "MEMORY"
     );
     for run in &runs {
@@ -59,6 +60,17 @@ struct ProcessBoard {
 struct BoardReading {
     health: Health,
     progress: Progress,
+    activity: Activity,
+}
+
+impl BoardReading {
+    /// The state of the process for people; a process of `run` without a sign of life for too long hangs.
+    fn state(&self, run: &RunFile) -> &'static str {
+        match State::from_u32(self.health.state) {
+            State::Ready | State::Running if self.activity.age_s() > run.config.run.stall_s => "stalled",
+            state => state.name(),
+        }
+    }
 }
 
 fn read_boards(boards: &[ProcessBoard]) -> Vec<BoardReading> {
@@ -67,6 +79,7 @@ fn read_boards(boards: &[ProcessBoard]) -> Vec<BoardReading> {
         .map(|process| BoardReading {
             health: process.board.health(),
             progress: process.board.progress(),
+            activity: process.board.activity(),
         })
         .collect()
 }
@@ -108,17 +121,18 @@ fn print_run(run: &RunFile) -> Result<(), Exit> {
         #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
         let rate = now.health.ticks.saturating_sub(before.health.ticks) as f64 / MEASURING_TIME.as_secs_f64();
         println!(
-            "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9.0} {:>6} {:>7} {:>9} {:>5} MiB",
+            "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9.0} {:>6} {:>7} {:>9} {:>5} MiB {}",
             run.name,
             process.label,
-            State::from_u32(now.health.state).name(),
+            now.state(run),
             now.health.pid,
             now.health.ticks,
             rate,
             source_ticks.saturating_sub(now.health.ticks),
             now.health.drops,
             now.progress.incarnation,
-            memory_mib(now.health.pid)
+            memory_mib(now.health.pid),
+            now.activity.awaited()
         );
     }
     println!();

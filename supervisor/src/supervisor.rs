@@ -1,20 +1,20 @@
 //! The supervisor: creates the channels of a run, starts and watches its processes, and ends them.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     os::unix::process::ExitStatusExt as _,
     sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel},
     time::{Duration, Instant},
 };
 
 use ipc_schema::{
-    board::INCARNATIONS,
+    config::StallAction,
     failure::{Failure, FailureKind},
-    process::{OnExit, Process, ProcessScope},
+    process::{OnExit, Process, ProcessScope, ProcessSpec},
     run::{Mode, RunFile},
 };
 use signal_hook::{
-    consts::{SIGCHLD, SIGHUP, SIGINT, SIGKILL, SIGTERM},
+    consts::{SIGCHLD, SIGHUP, SIGINT, SIGTERM},
     iterator::{Handle, Signals},
 };
 
@@ -26,8 +26,9 @@ use crate::{
     install::Install,
     processes::{EndedProcess, RunProcesses},
     registry::RunClaim,
-    restart::{EnvironmentRestarts, RestartVerdict, TrainerRestarts, WatcherRestarts},
+    restart::{EndCause, MAX_VAIN_FAULTS, RequiredRestarts, RestartVerdict, WatcherRestarts},
     socket::{self, HandoverReport, ReceivedRequest},
+    stall::{ProcessPlace, READY_WITHIN, StallChange, StallWatch},
 };
 
 /// An event that wakes the supervisor.
@@ -45,8 +46,6 @@ enum SupervisorEvent {
 const CHECK_INTERVAL: Duration = Duration::from_millis(100);
 /// The same while a command waits for its answer, or while a successor opens its ports: the report measures that time.
 const SHORT_CHECK_INTERVAL: Duration = Duration::from_millis(5);
-/// Longest time from start to ready.
-const READY_WITHIN: Duration = Duration::from_secs(120);
 /// Longest time from SIGTERM to the end of a process, before SIGKILL.
 const STOP_WITHIN: Duration = Duration::from_secs(30);
 
@@ -99,9 +98,12 @@ pub struct Supervisor {
     signal_handle: Handle,
     /// Restarts of watchers.
     watcher_restarts: BTreeMap<Process, WatcherRestarts>,
-    trainer_restarts: TrainerRestarts,
+    trainer_restarts: RequiredRestarts,
     /// Restarts of the simulator processes of each environment.
-    environment_restarts: BTreeMap<u32, EnvironmentRestarts>,
+    environment_restarts: BTreeMap<u32, RequiredRestarts>,
+    stalls: StallWatch,
+    /// Processes that were killed because they hung, and have not been started again.
+    killed_stalls: BTreeSet<ProcessPlace>,
     ready_at: Option<Instant>,
     /// Time of the check before the present one. A process that is found ready now became ready after it.
     last_check: Instant,
@@ -138,8 +140,10 @@ impl Supervisor {
             event_sender,
             signal_handle,
             watcher_restarts: BTreeMap::new(),
-            trainer_restarts: TrainerRestarts::default(),
+            trainer_restarts: RequiredRestarts::default(),
             environment_restarts: BTreeMap::new(),
+            stalls: StallWatch::new(run.config.run.stall_s, Instant::now()),
+            killed_stalls: BTreeSet::new(),
             ready_at: None,
             last_check: Instant::now(),
         })
@@ -157,7 +161,7 @@ impl Supervisor {
             .refuse_current(&mut self.processes, "the run is over", "");
         self.controls.end();
         let wall_s = self.ready_at.unwrap_or(started).elapsed().as_secs_f64();
-        display.update(self.processes.environments(), self.ready_at);
+        display.update(self.processes.environments(), self.ready_at, &[]);
         display.finish();
         self.stop_all(&ending);
         RunOutcome {
@@ -177,7 +181,8 @@ impl Supervisor {
             self.handovers.advance(&mut self.processes);
             self.controls.advance()?;
             self.record_ready(started)?;
-            display.update(self.processes.environments(), self.ready_at);
+            self.watch_stalls();
+            display.update(self.processes.environments(), self.ready_at, &self.notes());
             self.last_check = Instant::now();
             if self.processes.have_finished() {
                 return Ok(RunEnding::Completed);
@@ -188,7 +193,7 @@ impl Supervisor {
         }
     }
 
-    /// Handles ended processes: the failure of a required one ends the run; watchers, and a trainer that was killed, are restarted.
+    /// Handles ended processes: a reported failure of a required one ends the run; others are started again.
     fn reap(&mut self) -> Result<(), Exit> {
         for index in 0..self.processes.started() {
             let Some(ended) = self.processes.ended(index) else {
@@ -206,15 +211,19 @@ impl Supervisor {
                 continue;
             }
             let was_killed = ended.status.signal().is_some();
+            let has_reported = self.processes.has_reported_failure(index);
             let left = self.handovers.is_trainer_leaving() && ended.status.success();
             match ended.on_exit {
                 OnExit::Restart => self.restart_watcher(index, &ended)?,
                 // The trainer has written all its results.
                 OnExit::Replace if ended.is_done => {}
-                OnExit::Replace if was_killed => self.replace_trainer(index, &ended)?,
                 OnExit::Replace if left => self.restart(index, &ended)?,
+                OnExit::Replace if was_killed => self.replace_trainer(index, &ended)?,
+                OnExit::Replace if self.handovers.fall_back(&mut self.processes, index, &ended)? => {}
+                // A reported failure would come again.
+                OnExit::Replace if !has_reported => self.replace_trainer(index, &ended)?,
                 // The processes of the environment change places: what else has ended is found at the next check.
-                OnExit::Required if was_killed && self.may_simulate_again(&ended) => {
+                OnExit::Required if was_killed && self.may_simulate_again(ended.row) => {
                     if self.restart_environment(index, &ended)? {
                         return Ok(());
                     }
@@ -229,9 +238,62 @@ impl Supervisor {
 
     /// True if the environment of a killed simulator process can be made again: simulation is a function of configuration, seed and
     /// commands, but heroes' actions are not stored, and a run that plays has no ticks that count.
-    fn may_simulate_again(&self, ended: &EndedProcess) -> bool {
+    fn may_simulate_again(&self, row: &ProcessSpec) -> bool {
         let run = self.processes.run();
-        ended.row.scope == ProcessScope::Environment && run.mode != Mode::Play && !run.config.drives()
+        row.scope == ProcessScope::Environment && run.mode != Mode::Play && !run.config.drives()
+    }
+
+    /// Reports processes that hang, and kills those that are to be replaced: their ends are found like all others.
+    fn watch_stalls(&mut self) {
+        let is_handing_over = self.handovers.is_in_progress();
+        let mut signs = self.processes.life_signs();
+        for sign in &mut signs {
+            // The first start has a deadline of its own, and so has a handover.
+            sign.is_excused |= sign.is_starting && self.ready_at.is_none();
+            sign.is_excused |= sign.place.0 == Process::Trainer && is_handing_over;
+        }
+        for change in self.stalls.check(Instant::now(), &signs) {
+            match change {
+                StallChange::Begins {
+                    place,
+                    silence,
+                    is_starting,
+                } => self.stall_begins(place, silence, is_starting),
+                StallChange::Ends(place) => {
+                    display::notice(&format!("{} continues", self.processes.label(place)));
+                }
+            }
+        }
+    }
+
+    fn stall_begins(&mut self, place: ProcessPlace, silence: Duration, is_starting: bool) {
+        let Some(index) = self.processes.index_of(place) else {
+            return;
+        };
+        let (row, label, state) = self.processes.describe(index);
+        let what = match is_starting {
+            true => format!("{label} was not ready within {} s", READY_WITHIN.as_secs()),
+            false => format!("{label} has made no progress for {:.0} s", silence.as_secs_f64()),
+        };
+        let run = self.processes.run();
+        let may_replace = row.on_exit(run) != OnExit::Required || self.may_simulate_again(row);
+        let is_killed = is_starting || may_replace && run.config.run.on_stall == StallAction::Replace;
+        let end = if is_killed { "; it is killed" } else { "" };
+        let note = format!("{what}: {state}{end}");
+        display::notice(&note);
+        self.processes.log(index, &note);
+        if is_killed {
+            self.killed_stalls.insert(place);
+            self.processes.kill_one(index);
+        }
+    }
+
+    /// Whose fault an end is: a process that was killed because it hung is to blame itself.
+    fn cause_of(&self, ended: &EndedProcess) -> EndCause {
+        match self.killed_stalls.contains(&(ended.row.process, ended.env_index)) {
+            true => EndCause::OwnFault,
+            false => EndCause::of(ended.status),
+        }
     }
 
     /// Starts the simulator processes of an environment again, after a pause that grows while nothing new is sensed. Only ends of the
@@ -239,22 +301,27 @@ impl Supervisor {
     fn restart_environment(&mut self, index: usize, ended: &EndedProcess) -> Result<bool, Exit> {
         let env_index = ended.env_index;
         let sensed_ticks = self.processes.environments()[env_index as usize].sensed_ticks();
-        let is_crash = ended
-            .status
-            .signal()
-            .is_some_and(|signal| signal != SIGKILL && signal != SIGTERM);
+        let cause = self.cause_of(ended);
+        let label = ended.row.label(&self.processes.environments()[env_index as usize].run);
         let restarts = self.environment_restarts.entry(env_index).or_default();
-        match restarts.verdict(sensed_ticks, is_crash, Instant::now()) {
+        match restarts.verdict(sensed_ticks, cause, Instant::now()) {
             RestartVerdict::Wait => return Ok(false),
+            RestartVerdict::Postpone(pause) => {
+                let reason = format!("{label} ended with {}", ended.status);
+                self.note_pause(index, &reason, pause);
+                return Ok(false);
+            }
             RestartVerdict::GiveUp => {
                 let mut failure = self.processes.failure(index, ended.status);
-                failure.message += "\n  it crashed again and again without a new tick";
+                failure.message += "\n  it crashed again and again, or hung, without a new tick";
                 return Err(failure.into());
             }
             RestartVerdict::Start => {}
         }
-        let label = ended.row.label(&self.processes.environments()[env_index as usize].run);
         let (first_tick, sensed_ticks) = self.processes.restart_environment(env_index)?;
+        let is_of_another =
+            |(process, index): &ProcessPlace| *index != env_index || process.spec().scope == ProcessScope::Run;
+        self.killed_stalls.retain(is_of_another);
         display::notice(&format!(
             "{label} ended with {}; the simulation is made again from tick {first_tick} to {sensed_ticks}, and continues",
             ended.status
@@ -266,33 +333,73 @@ impl Supervisor {
     fn restart_watcher(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
         let restarts = self.watcher_restarts.entry(ended.row.process).or_default();
         let verdict = restarts.verdict(self.processes.is_attached(index), Instant::now());
-        if verdict == RestartVerdict::Start && self.processes.next_incarnation(index) < INCARNATIONS {
+        if verdict == RestartVerdict::Start {
             return self.restart(index, ended);
         }
         Ok(())
     }
 
-    /// Replaces a trainer that was killed, unless too many replacements in a row reached no new commit.
+    /// Replaces a trainer that was killed or crashed, after a pause that grows while it reaches no new checkpoint. Only ends of its own
+    /// fault can make it give up.
     fn replace_trainer(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
         let process = ended.row.process;
         let committed_ticks = self.processes.committed_ticks(process);
-        if let Err(replacements) = self.trainer_restarts.allow(committed_ticks) {
-            let mut failure = self.processes.failure(index, ended.status);
-            failure.message = format!(
-                "{}\n  replaced {replacements} times in a row without reaching a new checkpoint",
-                failure.message
-            );
-            return Err(failure.into());
+        let cause = self.cause_of(ended);
+        let reason = format!("{process} ended with {}", ended.status);
+        match self.trainer_restarts.verdict(committed_ticks, cause, Instant::now()) {
+            RestartVerdict::Wait => return Ok(()),
+            RestartVerdict::Postpone(pause) => {
+                self.note_pause(index, &reason, pause);
+                return Ok(());
+            }
+            RestartVerdict::GiveUp => {
+                if self.handovers.fall_back(&mut self.processes, index, ended)? {
+                    self.trainer_restarts = RequiredRestarts::default();
+                    return Ok(());
+                }
+                let mut failure = self.processes.failure(index, ended.status);
+                failure.message += &format!(
+                    "\n  it ended by its own fault again, after {MAX_VAIN_FAULTS} restarts in a row without a new checkpoint"
+                );
+                return Err(failure.into());
+            }
+            RestartVerdict::Start => {}
         }
-        display::notice(&format!(
-            "{process} ended with {}; a successor continues from the newest checkpoint",
-            ended.status
-        ));
+        if self.handovers.fails_its_trial() && self.handovers.fall_back(&mut self.processes, index, ended)? {
+            self.trainer_restarts = RequiredRestarts::default();
+            return Ok(());
+        }
+        display::notice(&format!("{reason}; a successor continues from the newest checkpoint"));
         self.restart(index, ended)
+    }
+
+    /// Reports, here and in the log of the process `index`, that its restart is postponed.
+    fn note_pause(&self, index: usize, reason: &str, pause: Duration) {
+        let note = format!("{reason}; it starts again in {:.1} s", pause.as_secs_f64());
+        display::notice(&note);
+        self.processes.log(index, &note);
+    }
+
+    /// What the progress line says besides the progress: the processes that hang, and the restarts that are postponed.
+    fn notes(&self) -> Vec<String> {
+        let now = Instant::now();
+        let trainer = self.trainer_restarts.wait(now).map(|wait| ("trainer".to_owned(), wait));
+        let environments = self.environment_restarts.iter().filter_map(|(env_index, restarts)| {
+            let wait = restarts.wait(now)?;
+            Some((format!("environment {env_index}"), wait))
+        });
+        let waits = trainer.into_iter().chain(environments);
+        let waits = waits.map(|(what, wait)| format!("{what} starts again in {:.1} s", wait.as_secs_f64()));
+        let stalls = self.stalls.stalls().map(|(place, lasts)| {
+            let label = self.processes.label(place);
+            format!("{label} has made no progress for {:.0} s", lasts.as_secs_f64())
+        });
+        stalls.chain(waits).collect()
     }
 
     fn restart(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
         self.processes.restart(index)?;
+        self.killed_stalls.remove(&(ended.row.process, ended.env_index));
         if ended.row.process == Process::Trainer {
             self.handovers.trainer_restarted();
         }
@@ -363,6 +470,12 @@ impl Supervisor {
         while Instant::now() < deadline && self.processes.is_any_alive() {
             if self.wait_for_event() {
                 break;
+            }
+        }
+        if Instant::now() >= deadline {
+            for label in self.processes.alive() {
+                let within = STOP_WITHIN.as_secs();
+                display::notice(&format!("{label} has not ended within {within} s: it is killed"));
             }
         }
         self.processes.kill();

@@ -14,7 +14,8 @@ use std::{
     time::Duration,
 };
 
-use common::{CURRICULUM, Workplace, sumo_program, text, tool};
+use common::{CURRICULUM, Spectator, Workplace, sumo_program, text, tool, until};
+use ipc_schema::process::Process;
 use rustix::process::{Pid, Signal, kill_process};
 
 const SIMULATORS: [&str; 3] = ["traffic-bridge", "sim-core", "sensor-daemon"];
@@ -148,6 +149,53 @@ fn killed_simulators_of_two_environments_change_nothing_that_is_observed_or_lear
     let paced = "run.real_time_factor=20";
     let disturbed = arguments(&["train", "town", "--name", "killed"], &SMALL, &[two, paced]);
     killed_run(&workplace, &disturbed, "killed", 8);
+    assert_same(&workplace, ["whole", "killed"]);
+    assert_eq!(parameters(&workplace, "whole"), parameters(&workplace, "killed"));
+}
+
+/// Before its first commit a run makes everything again: `sensor-daemon` makes some hundred ticks that it does not send.
+#[test]
+fn a_sensor_daemon_that_is_killed_again_while_it_is_made_again_changes_nothing() {
+    let workplace = Workplace::new();
+    let late = "trainer.checkpoint_interval=1000";
+    workplace.succeed(&arguments(&["train", "town", "--name", "whole"], &SMALL, &[late]));
+    let paced = arguments(
+        &["train", "town", "--name", "killed"],
+        &SMALL,
+        &[late, "run.real_time_factor=20"],
+    );
+    let log = std::fs::File::create(workplace.path().join("said")).unwrap();
+    let command = workplace.command(&paced).stdout(Stdio::null()).stderr(log).spawn();
+    let mut run = command.unwrap();
+    let spectator = Spectator::join(&workplace.path().join("runs/killed/run.json"), &mut run);
+    let (sensing, trainer) = (
+        spectator.board(Process::SensorDaemon),
+        spectator.board(Process::Trainer),
+    );
+    let kill = || kill_process(Pid::from_raw(sensing.health().pid).unwrap(), Signal::KILL).unwrap();
+    until(&mut run, "ticks", || {
+        (trainer.progress().consumed_ticks >= 250).then_some(())
+    });
+    kill();
+    let consumed_ticks = trainer.progress().consumed_ticks;
+    for incarnation in 1..=3 {
+        until(&mut run, "a tick that is made again", || {
+            let is_next = sensing.progress().incarnation == incarnation;
+            (is_next && sensing.health().ticks > 0).then_some(())
+        });
+        let ticks = sensing.health().ticks;
+        kill();
+        assert!(ticks < consumed_ticks, "{ticks} ticks had been made again");
+    }
+    drop((sensing, trainer, spectator));
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("said")).unwrap();
+    assert!(status.success(), "{status}\n{said}");
+    assert_eq!(
+        said.matches("the simulation is made again from tick 0").count(),
+        4,
+        "{said}"
+    );
     assert_same(&workplace, ["whole", "killed"]);
     assert_eq!(parameters(&workplace, "whole"), parameters(&workplace, "killed"));
 }

@@ -10,7 +10,7 @@ mod common;
 
 use std::{
     path::{Path, PathBuf},
-    process::{Child, Stdio},
+    process::{Child, Command, Stdio},
     sync::OnceLock,
     time::{Duration, Instant},
 };
@@ -71,12 +71,11 @@ impl Run {
 
     fn start_with(workplace: &Workplace, name: &str, arguments: &[String]) -> Self {
         let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-        let mut child = workplace
-            .command(&arguments)
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
+        Self::spawn(workplace, name, workplace.command(&arguments))
+    }
+
+    fn spawn(workplace: &Workplace, name: &str, mut command: Command) -> Self {
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let directory = workplace.path().join("runs").join(name);
         let (node, trainer, sensing) = until(&mut child, "boards", || {
             let run = RunFile::read(&directory.join("run.json")).ok()?;
@@ -233,6 +232,45 @@ fn a_trainer_that_is_killed_again_and_again_learns_the_same_policy() {
     assert_nothing_left(&workplace, "killed");
 }
 
+/// Process id of the trainer of the run in `directory`, also while it starts: its command line names the run file.
+fn trainer_pid(directory: &Path) -> Option<Pid> {
+    let run_file = directory.join("run.json").to_string_lossy().into_owned();
+    let mut entries = std::fs::read_dir("/proc").unwrap().flatten();
+    entries.find_map(|entry| {
+        let line = std::fs::read(entry.path().join("cmdline")).ok()?;
+        let line = String::from_utf8_lossy(&line).into_owned();
+        let is_trainer = line.contains("\0caraware.train\0") && line.contains(&run_file);
+        let pid: i32 = entry.file_name().to_str()?.parse().ok()?;
+        is_trainer.then(|| Pid::from_raw(pid)).flatten()
+    })
+}
+
+#[test]
+fn a_trainer_that_is_killed_while_it_starts_is_started_ever_later_but_always_again() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "killed", &[]);
+    let mut killed = Vec::new();
+    while killed.len() < 8 {
+        let directory = run.directory.clone();
+        let pid = until(&mut run.child, "a trainer that starts", || {
+            trainer_pid(&directory).filter(|pid| !killed.contains(pid))
+        });
+        assert_eq!(run.trainer.progress().attached, 0, "the trainer has started already");
+        kill_process(pid, Signal::KILL).unwrap();
+        killed.push(pid);
+    }
+    let log = run.directory.join("logs/trainer.log");
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    let log = std::fs::read_to_string(log).unwrap();
+    for text in [said, log] {
+        assert_eq!(text.matches("it starts again in").count(), 7, "{text}");
+        assert!(text.contains("it starts again in 5.0 s"), "{text}");
+    }
+    assert_undisturbed(&workplace, "killed", 8);
+    assert_nothing_left(&workplace, "killed");
+}
+
 #[test]
 fn a_damaged_newest_checkpoint_is_skipped() {
     let workplace = Workplace::new();
@@ -264,11 +302,11 @@ fn a_damaged_newest_checkpoint_is_skipped() {
 }
 
 #[test]
-fn a_trainer_that_always_dies_at_once_ends_the_run_with_the_end_of_its_log() {
+fn a_trainer_that_always_crashes_at_once_ends_the_run_with_the_end_of_its_log() {
     let workplace = Workplace::new();
     workplace.write(
         "suicide.py",
-        "import os, signal, sys\nprint('no room for me', file=sys.stderr, flush=True)\nos.kill(os.getpid(), signal.SIGKILL)\n",
+        "import os, sys\nprint('no room for me', file=sys.stderr, flush=True)\nos.abort()\n",
     );
     let python = std::env::var("PYTHONPATH").unwrap_or_default();
     let arguments = arguments("vain", &["trainer.module=suicide"]);
@@ -277,16 +315,19 @@ fn a_trainer_that_always_dies_at_once_ends_the_run_with_the_end_of_its_log() {
         .env("PYTHONPATH", format!("{}:{python}", workplace.path().display()))
         .output()
         .unwrap();
-    let said = text(&output);
+    // Messages are wrapped for the terminal.
+    let said = text(&output).replace('│', " ");
+    let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
     assert_eq!(output.status.code(), Some(1), "{said}");
     for words in [
-        "signal: 9",
+        "signal: 6",
         "no room for me",
-        "replaced 5 times in a row",
+        "after 5 restarts in a row without a new checkpoint",
         "trainer.log",
     ] {
         assert!(said.contains(words), "\"{words}\" is missing:\n{said}");
     }
+    assert_eq!(workplace.report("vain")["result"], "failed");
     assert_nothing_left(&workplace, "vain");
 }
 
@@ -438,8 +479,186 @@ fn a_successor_in_another_framework_loses_no_observation() {
         log.contains(&begun) && log.matches("takes over at tick").count() == 2,
         "{log}"
     );
-    assert!(workplace.path().join("runs/framework/sb3_takeover.zip").exists());
+    let models = std::fs::read_dir(workplace.path().join("runs/framework/sb3_takeover")).unwrap();
+    assert_eq!(models.count(), 1, "the model of the newest commit, and no older one");
     assert_nothing_left(&workplace, "framework");
+}
+
+/// What `commits.json` says: which learner has learnt up to which tick.
+fn commits(run: &Path) -> Vec<(String, u64)> {
+    let log: Value = serde_json::from_slice(&std::fs::read(run.join("commits.json")).unwrap()).unwrap();
+    let entry = |commit: &Value| {
+        (
+            commit["learner"].as_str().unwrap().to_owned(),
+            commit["positions"][0]["ticks"].as_u64().unwrap(),
+        )
+    };
+    log["commits"].as_array().unwrap().iter().map(entry).collect()
+}
+
+/// Hands the paused run over to `module`, and lets it learn until it has committed ticks of its own.
+fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, module: &str) {
+    let done = |arguments: &[&str]| {
+        let output = workplace.run(arguments);
+        assert!(output.status.success(), "{arguments:?}: {}", text(&output));
+    };
+    done(&["control", "pause", "--run", name]);
+    done(&["handover", name, "--set", &format!("trainer.module={module}")]);
+    let taken_over = run.trainer.progress().committed_ticks;
+    done(&["control", "resume", "--run", name]);
+    run.until("a commit of its own", |progress, _| {
+        progress.incarnation == incarnation && progress.committed_ticks > taken_over
+    });
+}
+
+#[test]
+fn learners_take_turns_and_every_tick_is_in_one_commit() {
+    let workplace = Workplace::new();
+    let mut run = Run::start(&workplace, "turns", &[PACED]);
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    let modules = [
+        "caraware.examples.sb3_takeover",
+        "caraware.examples.minimal_learner",
+        "caraware.fusion.train",
+        "caraware.train",
+    ];
+    for (incarnation, module) in (1..).zip(modules) {
+        hand_to(&workplace, &mut run, "turns", incarnation, module);
+    }
+    let directory = run.directory.clone();
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    let report = workplace.report("turns");
+    assert_eq!(report["result"], "completed");
+    assert_eq!(report["observation_hash"], undisturbed(&workplace).observation_hash);
+    assert_eq!(
+        (&report["lost_ticks"], &report["duplicated_ticks"]),
+        (&0.into(), &0.into()),
+        "{report:#}"
+    );
+    assert_eq!(report["trainer"]["received_ticks"], report["ticks"], "{report:#}");
+    // Each learner began where the commits of the one before it end.
+    let commits = commits(&directory);
+    let learners: Vec<&str> = commits.iter().map(|(learner, _)| learner.as_str()).collect();
+    assert_eq!(learners, ["ppo", modules[0], modules[1], "fusion", "ppo"]);
+    let handovers = report["handovers"].as_array().unwrap();
+    for ((_, ticks), handover) in commits.iter().zip(handovers) {
+        assert_eq!(handover["first_tick"], *ticks, "{commits:?} {handovers:#?}");
+    }
+    assert!(commits.is_sorted_by(|a, b| a.1 < b.1), "{commits:?}");
+    assert_nothing_left(&workplace, "turns");
+}
+
+/// A module that gets ready, takes over, and ends by `end`; it always ends so.
+fn ending_module(workplace: &Workplace, name: &str, end: &str) {
+    let text = format!(
+        "import os, signal, sys\n\
+         from caraware.run.process import HandoverRole\n\
+         role = HandoverRole.from_environment()\n\
+         if role.gets_ready and not role.wait_for_turn():\n    sys.exit(0)\n\
+         {end}\n"
+    );
+    workplace.write(&format!("{name}.py"), &text);
+}
+
+#[test]
+fn a_successor_that_ends_after_the_go_is_replaced_by_the_learner_before_it() {
+    let workplace = Workplace::new();
+    let ends = [
+        ("raises", "raise ValueError('not today')"),
+        ("leaves", "sys.exit(0)"),
+        ("dies", "os.kill(os.getpid(), signal.SIGKILL)"),
+    ];
+    let python = std::env::var("PYTHONPATH").unwrap_or_default();
+    let arguments = arguments("returned", &[PACED]);
+    let mut command = workplace.command(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+    command.env("PYTHONPATH", format!("{}:{python}", workplace.path().display()));
+    let mut run = Run::spawn(&workplace, "returned", command);
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    for (name, end) in ends {
+        ending_module(&workplace, name, end);
+        let output = workplace.run(&["handover", "returned", "--set", &format!("trainer.module={name}")]);
+        let said = text(&output);
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(said.contains("the learner before it"), "{said}");
+        run.until("the learner before it", |progress, health| {
+            progress.attached == 1 && health.ticks > progress.committed_ticks
+        });
+    }
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    assert_eq!(Result::of(&workplace, "returned"), *undisturbed(&workplace));
+    assert_nothing_left(&workplace, "returned");
+}
+
+#[test]
+fn a_successor_that_does_not_fit_the_run_is_refused_with_the_difference() {
+    let workplace = Workplace::new();
+    let claims = [
+        ("SuccessorClaims(observation_size=3)", "observations of size 3"),
+        ("SuccessorClaims(task='driving')", "task driving"),
+        ("SuccessorClaims(schema_version=1)", "schema version 1"),
+        ("SuccessorClaims(environments=2)", "environments: 2"),
+        (
+            "SuccessorClaims(observation_fields=('speed',))",
+            "takes the fields speed",
+        ),
+    ];
+    let python = std::env::var("PYTHONPATH").unwrap_or_default();
+    let arguments = arguments("misfit", &[PACED]);
+    let mut command = workplace.command(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+    command.env("PYTHONPATH", format!("{}:{python}", workplace.path().display()));
+    let mut run = Run::spawn(&workplace, "misfit", command);
+    run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
+    for (claim, words) in claims {
+        let text_of = format!(
+            "from caraware.run.process import HandoverRole, SuccessorClaims\n\
+             HandoverRole.from_environment().wait_for_turn({claim})\n"
+        );
+        workplace.write("claims.py", &text_of);
+        let output = workplace.run(&["handover", "misfit", "--set", "trainer.module=claims"]);
+        let said = text(&output).replace('│', " ");
+        let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert_eq!(output.status.code(), Some(1), "{said}");
+        assert!(
+            said.contains("the old trainer continues") && said.contains(words),
+            "\"{words}\": {said}"
+        );
+    }
+    assert_eq!(run.trainer.progress().incarnation, 0);
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    assert_undisturbed(&workplace, "misfit", 0);
+}
+
+#[test]
+fn a_handover_now_does_not_wait_for_an_update_and_one_with_a_timeout_gives_up() {
+    let workplace = Workplace::new();
+    // The first update would come after all ticks.
+    let settings = ["trainer.horizon=100000", "episode.evaluation_interval=0", PACED];
+    let python = std::env::var("PYTHONPATH").unwrap_or_default();
+    let arguments = arguments("now", &settings);
+    let mut command = workplace.command(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
+    command.env("PYTHONPATH", format!("{}:{python}", workplace.path().display()));
+    let mut run = Run::spawn(&workplace, "now", command);
+    run.until("a tick", |progress, _| progress.consumed_ticks > 0);
+    ending_module(&workplace, "idle", "import time; time.sleep(1000)");
+    let module = "trainer.module=idle";
+    let output = workplace.run(&["handover", "now", "--set", module, "--timeout-s", "3"]);
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output));
+    assert!(text(&output).contains("within 3 s"), "{}", text(&output));
+    let output = workplace.run(&["handover", "now", "--now"]);
+    assert!(output.status.success(), "{}", text(&output));
+    assert_eq!(run.trainer.progress().committed_ticks, 0, "nothing had been learnt");
+    let (code, said) = run.end();
+    assert_eq!(code, Some(0), "{said}");
+    let report = workplace.report("now");
+    assert_eq!(
+        (&report["lost_ticks"], &report["duplicated_ticks"]),
+        (&0.into(), &0.into())
+    );
+    assert_eq!(report["trainer"]["received_ticks"], report["ticks"]);
+    assert_nothing_left(&workplace, "now");
 }
 
 #[test]

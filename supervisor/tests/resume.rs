@@ -10,10 +10,11 @@ mod common;
 
 use std::{
     path::{Path, PathBuf},
-    process::{Output, Stdio},
+    process::{Child, Output, Stdio},
 };
 
 use common::{CURRICULUM, Workplace, text, until};
+use ipc_schema::{ports::BoardReader, process::Process, run::RunFile, services};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -257,5 +258,114 @@ fn commands_after_the_checkpoint_are_carried_out_again() {
     assert_eq!(beginning("update-000008")["resets"], 2);
     stop_and_resume(&workplace, "cut", &commanded("cut"), "update-000004");
     assert_eq!(outcome(&workplace, "cut"), outcome(&workplace, "whole"));
+    workplace.assert_nothing_left();
+}
+
+/// A pace at which the supervisor can be killed at a given tick: 20 s for the run.
+const SLOW: &str = "run.real_time_factor=8";
+
+/// The supervisor of the run `name` that is none of `before`.
+fn supervisor(workplace: &Workplace, name: &str, run: &mut Child, before: &[Pid]) -> Pid {
+    let run_file = run_dir(workplace, name).join("run.json");
+    until(run, "a supervisor", || {
+        let run = RunFile::read(&run_file).ok()?;
+        Pid::from_raw(run.supervisor_pid).filter(|pid| !before.contains(pid))
+    })
+}
+
+/// Waits until the run under the supervisor `pid` has sensed `ticks` ticks.
+///
+/// Returns the trainer, which would write a checkpoint when its supervisor dies.
+fn until_sensed(workplace: &Workplace, name: &str, run: &mut Child, pid: Pid, ticks: u64) -> Pid {
+    let run_file = run_dir(workplace, name).join("run.json");
+    let (_node, board, trainer) = until(run, "boards", || {
+        let run = RunFile::read(&run_file).ok()?;
+        let node = services::node(&run.shared_memory).ok()?;
+        let board = BoardReader::open(&node, &run, 0, Process::SensorDaemon).ok()?;
+        let trainer = BoardReader::open(&node, &run, 0, Process::Trainer).ok()?;
+        (run.supervisor_pid == pid.as_raw_nonzero().get()).then_some((node, board, trainer))
+    });
+    until(run, "ticks", || (board.health().ticks >= ticks).then_some(()));
+    Pid::from_raw(trainer.health().pid).unwrap()
+}
+
+#[test]
+fn a_run_that_is_killed_before_its_first_checkpoint_resumes_from_its_beginning() {
+    let workplace = Workplace::new();
+    let late = ["trainer.horizon=2400"];
+    workplace.succeed(&arguments("whole", &late));
+    let expected = outcome(&workplace, "whole");
+    let mut command = arguments("cut", &[late[0], SLOW]);
+    // While the processes start, and twice while the first horizon fills, which is 400 ticks long.
+    for ticks in [0, 30, 100] {
+        let mut spawned = workplace.command(&command);
+        let mut run = spawned.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let pid = Pid::from_child(&run);
+        until(&mut run, "the run file", || {
+            let run = RunFile::read(&run_dir(&workplace, "cut").join("run.json")).ok()?;
+            (run.supervisor_pid == pid.as_raw_nonzero().get()).then_some(())
+        });
+        let trainer = (ticks > 0).then(|| until_sensed(&workplace, "cut", &mut run, pid, ticks));
+        if let Some(trainer) = trainer {
+            kill_process(trainer, Signal::STOP).unwrap();
+        }
+        kill_process(pid, Signal::KILL).unwrap();
+        if let Some(trainer) = trainer {
+            kill_process(trainer, Signal::KILL).unwrap();
+        }
+        assert_eq!(run.wait().unwrap().code(), None);
+        command = vec!["train", "--resume", "cut"];
+    }
+    let named = workplace.run(&["train", "--resume", "cut", "--name", "other"]);
+    refused(&named, 2, &["has no checkpoint", "leave --name out"]);
+    workplace.succeed(&["train", "--resume", "cut", "--set", "run.real_time_factor=0"]);
+    assert!(workplace.report("cut")["beginning"].is_null());
+    assert_eq!(outcome(&workplace, "cut"), expected);
+    let hash = |name: &str| workplace.report(name)["observation_hash"].clone();
+    assert_eq!(hash("cut"), hash("whole"));
+    workplace.assert_nothing_left();
+}
+
+#[test]
+fn a_run_with_restart_resumes_by_itself_until_it_is_asked_to_stop() {
+    let workplace = Workplace::new();
+    workplace.succeed(&arguments("whole", &[]));
+    let command = [&arguments("cut", &[SLOW])[..], &["--restart"]].concat();
+    let log = std::fs::File::create(workplace.path().join("said")).unwrap();
+    let mut spawned = workplace.command(&command);
+    let mut run = spawned.stdout(Stdio::null()).stderr(log).spawn().unwrap();
+    // While the processes start, before the first checkpoint (tick 100), and after it.
+    let mut killed = Vec::new();
+    for ticks in [0, 40, 350] {
+        let pid = supervisor(&workplace, "cut", &mut run, &killed);
+        if ticks > 0 {
+            until_sensed(&workplace, "cut", &mut run, pid, ticks);
+        }
+        kill_process(pid, Signal::KILL).unwrap();
+        killed.push(pid);
+    }
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("said")).unwrap();
+    assert!(status.success(), "{status}\n{said}");
+    assert_eq!(
+        said.matches("the supervisor ended with signal 9; the run resumes")
+            .count(),
+        3,
+        "{said}"
+    );
+    assert_eq!(outcome(&workplace, "cut"), outcome(&workplace, "whole"));
+    workplace.assert_nothing_left();
+
+    // A stop on request is final, and a wrong configuration is no death.
+    let command = [&arguments("stopped", &[SLOW])[..], &["--restart"]].concat();
+    let mut spawned = workplace.command(&command);
+    let mut run = spawned.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let pid = supervisor(&workplace, "stopped", &mut run, &[]);
+    until_sensed(&workplace, "stopped", &mut run, pid, 10);
+    kill_process(Pid::from_child(&run), Signal::TERM).unwrap();
+    assert_eq!(run.wait().unwrap().code(), Some(130));
+    assert_eq!(workplace.report("stopped")["result"], "interrupted");
+    let wrong = workplace.run(&["train", "town", "--restart", "--set", "traffic.cavs=-1"]);
+    refused(&wrong, 2, &["traffic.cavs"]);
     workplace.assert_nothing_left();
 }

@@ -2,7 +2,7 @@
 
 use std::{
     collections::BTreeMap,
-    path::Path,
+    path::{Path, PathBuf},
     sync::{Arc, Mutex, MutexGuard, atomic::AtomicBool},
     time::{Duration, Instant},
 };
@@ -354,6 +354,15 @@ impl Attachment {
         };
         let traffic_bridge = membership.waker(Process::TrafficBridge).map_err(membership_failed)?;
         let sensor_daemon = membership.board_of(Process::SensorDaemon).map_err(membership_failed)?;
+        let journal_first = sensor_daemon.progress().committed_ticks;
+        if first_tick < journal_first {
+            return Err(gone(first_tick, journal_first, membership.run.config.run.journal_mib));
+        }
+        // Nothing of an earlier sender is in the new queue: this trainer turns to the present one before it asks for ticks, so that
+        // they come without a poll.
+        let sender = sensor_daemon.current_incarnation();
+        observations.refuse_senders_before(sender);
+        membership.turn_to_sender(sender, first_tick);
         membership.attach_from(first_tick);
         let attached = Attached {
             membership,
@@ -366,7 +375,7 @@ impl Attachment {
             traffic: None,
             consumed_ticks: first_tick,
             sensor_daemon,
-            sender: 0,
+            sender,
             received_ticks: first_tick,
             ended: false,
             outside,
@@ -417,6 +426,14 @@ impl Attachment {
         }
         Ok(blocks)
     }
+}
+
+/// The error of a trainer whose first tick the journal does not hold any more.
+fn gone(first_tick: u64, journal_first: u64, journal_mib: u32) -> PyErr {
+    PyRuntimeError::new_err(format!(
+        "the trainer continues at tick {first_tick}, the journal begins at tick {journal_first}: raise `run.journal_mib` (now \
+         {journal_mib}), or commit more often (`trainer.checkpoint_interval`)"
+    ))
 }
 
 fn unknown_metric(name: &str) -> PyErr {
@@ -591,6 +608,12 @@ fn observation_size(run_file: &str) -> PyResult<usize> {
     Ok(run.config.observation_width())
 }
 
+/// Gives two paths each other's names, from one moment to the next.
+#[pyfunction]
+fn exchange(one: PathBuf, other: PathBuf) -> PyResult<()> {
+    Ok(ipc_schema::storage::exchange(&one, &other)?)
+}
+
 /// The module.
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
@@ -602,6 +625,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Metric>()?;
     module.add_function(wrap_pyfunction!(id_hash, module)?)?;
     module.add_function(wrap_pyfunction!(observation_size, module)?)?;
+    module.add_function(wrap_pyfunction!(exchange, module)?)?;
     module.add("METRICS", PyTuple::new(module.py(), METRICS.iter().map(Metric::of))?)?;
     module.add("SCHEMA_VERSION", ipc_schema::SCHEMA_VERSION)?;
     let layout = ipc_schema::layout::json().map_err(|error| failed(&error))?;

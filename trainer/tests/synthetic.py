@@ -90,6 +90,10 @@ class SyntheticChannel:
         """Remember the newest decision."""
         self.decisions.append((lessons, since, stage))
 
+    def commit(self, tick: int) -> None:
+        """As `committed`: there is no record."""
+        self.committed(tick)
+
     def committed(self, tick: int) -> None:
         """Remember the commit."""
         assert tick >= self.committed_up_to

@@ -282,3 +282,13 @@ def test_the_course_of_training_comes_back_exactly(tmp_path: Path) -> None:
     assert repr(found) == repr(course)
     assert load_checkpoint(written, fresh()) == Counters(1, 7, 0, 9)
     assert load_history(save(tmp_path / "bare", ppo)) == TrainingHistory()
+
+
+def test_a_checkpoint_takes_the_place_of_one_with_its_name(tmp_path: Path) -> None:
+    ppo = fresh()
+    train(ppo, 0, 1)
+    damaged = save(tmp_path, ppo)
+    (damaged / "manifest.json").write_text("damaged")
+    assert save(tmp_path, ppo) == damaged
+    assert read_manifest(damaged).counters == counters(ppo)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["latest", damaged.name]

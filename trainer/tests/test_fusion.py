@@ -22,6 +22,7 @@ from caraware.fusion.train import begin, player
 from caraware.learn.config import ConfigError
 from caraware.run.checkpoint import Keeping, load_checkpoint, save_checkpoint
 from caraware.run.config import RunConfig
+from caraware.run.continuation import Continuation
 from caraware.run.learner import Learner
 from caraware.run.manifest import CheckpointError, Counters, newest_sound_checkpoint
 from caraware.run.player import PlayLoop
@@ -87,7 +88,7 @@ def street_ticks(
 
 
 def learner_of(run: dict[str, Any]) -> FusionLearner:
-    return begin(run, SIZE, None)[1]
+    return begin(run, SIZE, Continuation())[1]
 
 
 def estimates(run: dict[str, Any], learner: FusionLearner, ticks: list[VehicleObservation]) -> torch.Tensor:
@@ -205,7 +206,7 @@ def recorded(run: dict[str, Any], learner: FusionLearner, seed: int) -> Episode:
 def test_a_run_from_the_first_tick_to_the_report(tmp_path: Path) -> None:
     run = street_run(tmp_path)
     channel = SyntheticChannel(run, street_ticks(run, episodes=2))
-    config, learner, beginning = begin(run, SIZE, None)
+    config, learner, beginning = begin(run, SIZE, Continuation())
     assert FusionLoop(channel, config, learner, beginning, lambda: False).run()
     part = json.loads((tmp_path / "parts" / "trainer.json").read_text())
     assert (part["updates"], part["env_steps"], part["untrained_env_steps"]) == (2, 2 * 40 * 6, 0)
@@ -221,7 +222,7 @@ def test_stopped_and_continued_it_ends_with_the_same_bytes_and_the_same_report(t
     def final(folder: Path, *limits: int) -> tuple[torch.Tensor, dict[str, Any]]:
         run = street_run(folder, checkpoint_interval=1)
         for limit in limits:
-            config, learner, beginning = begin(run, SIZE, newest_sound_checkpoint(folder / "checkpoints"))
+            config, learner, beginning = begin(run, SIZE, Continuation(newest_sound_checkpoint(folder / "checkpoints")))
             ticks = (obs for obs in street_ticks(run, episodes=3) if obs.tick > beginning.counters.committed_tick)
             channel = SyntheticChannel(run, ticks)
             stop = lambda channel=channel, limit=limit: channel.consumed_up_to >= limit  # noqa: E731
@@ -239,12 +240,12 @@ def test_stopped_and_continued_it_ends_with_the_same_bytes_and_the_same_report(t
 
 def test_a_simulation_that_resumes_from_its_checkpoint_begins_with_the_next_episode(tmp_path: Path) -> None:
     run = street_run(tmp_path, checkpoint_interval=1)
-    config, learner, beginning = begin(run, SIZE, None)
+    config, learner, beginning = begin(run, SIZE, Continuation())
     channel = SyntheticChannel(run, street_ticks(run, episodes=2))
     FusionLoop(channel, config, learner, beginning, lambda: channel.consumed_up_to >= 45).run()
     newest = newest_sound_checkpoint(tmp_path / "checkpoints")
     run["beginning"] = {"checkpoint": str(newest)}
-    _, resumed, beginning = begin(run, SIZE, None)
+    _, resumed, beginning = begin(run, SIZE, Continuation())
     counters = beginning.counters
     assert (counters.committed_tick, counters.next_episode, counters.next_episode_tick) == (39, 1, 40)
     assert torch.equal(resumed.parameters.values, learner.parameters.values)

@@ -1,6 +1,7 @@
 //! A run without simulator or trainer: real services under private names in shared memory, real messages, the real binary.
 
 use std::{
+    cell::RefCell,
     fs::File,
     io,
     net::TcpListener,
@@ -42,7 +43,7 @@ pub struct Run {
     pub port: u16,
     _reserved_port: ReservedPort,
     path: PathBuf,
-    _holder: ServiceHolder,
+    holder: RefCell<ServiceHolder>,
     node: services::RunNode,
     _dir: TempDir,
     _sweep: SharedMemorySweep,
@@ -107,18 +108,26 @@ impl Run {
             port: port.number,
             _reserved_port: port,
             path,
-            _holder: holder,
+            holder: RefCell::new(holder),
             node,
             _dir: dir,
         }
     }
 
     pub fn start_fanout(&self) -> Fanout {
-        self.start_incarnation(0)
+        self.spawn_fanout(0)
     }
 
-    /// Starts the fan-out as incarnation `incarnation`, counted from 0.
-    pub fn start_incarnation(&self, incarnation: u32) -> Fanout {
+    /// Starts the fan-out again as incarnation `incarnation`, on a board of its own, as `caraware` does.
+    pub fn restart_fanout(&self, incarnation: u32) -> Fanout {
+        self.holder
+            .borrow_mut()
+            .add_board(&self.node, &self.file, Process::Fanout, incarnation)
+            .unwrap();
+        self.spawn_fanout(incarnation)
+    }
+
+    fn spawn_fanout(&self, incarnation: u32) -> Fanout {
         let child = Command::new(env!("CARGO_BIN_EXE_fanout"))
             .arg(&self.path)
             .env(ipc_schema::membership::INCARNATION, incarnation.to_string())

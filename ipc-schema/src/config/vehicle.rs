@@ -19,6 +19,8 @@ pub struct VehicleConfig {
     pub hero_model: VehicleModel,
     /// Models by SUMO class; they have precedence over the three above.
     pub class_models: Vec<ClassModel>,
+    /// How far ahead a mirror sees SUMO's path: so far it is behind SUMO, seconds. At least half a SUMO step.
+    pub preview_s: f64,
     /// Time over which an instantaneous lane change is spread, seconds.
     pub lane_change_s: f64,
     /// Largest road-wheel angle, radians.

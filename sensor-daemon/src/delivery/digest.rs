@@ -46,19 +46,27 @@ impl ObservationDigest {
     }
 
     fn update(&mut self, mut bytes: &[u8]) {
-        while !bytes.is_empty() {
-            if self.pending.len() == GROUP_BYTES {
-                self.close_group();
-            }
-            let (now, later) = bytes.split_at(bytes.len().min(GROUP_BYTES - self.pending.len()));
-            self.pending.extend_from_slice(now);
+        // A group is closed only when a byte follows it.
+        if !self.pending.is_empty() && self.pending.len() + bytes.len() > GROUP_BYTES {
+            let (rest, later) = bytes.split_at(GROUP_BYTES - self.pending.len());
+            let mut group = std::mem::take(&mut self.pending);
+            group.extend_from_slice(rest);
+            self.close_group(&group);
+            group.clear();
+            self.pending = group;
             bytes = later;
         }
+        while bytes.len() > GROUP_BYTES {
+            let (group, later) = bytes.split_at(GROUP_BYTES);
+            self.close_group(group);
+            bytes = later;
+        }
+        self.pending.extend_from_slice(bytes);
     }
 
-    /// Makes the pending bytes, a whole group with more behind it, the next subtree, and merges subtrees of the same size.
-    fn close_group(&mut self) {
-        let mut subtree = self.pending_value();
+    /// Makes `group`, which has more behind it, the next subtree, and merges subtrees of the same size.
+    fn close_group(&mut self, group: &[u8]) {
+        let mut subtree = self.value(group);
         self.groups += 1;
         let mut size = self.groups;
         while size.is_multiple_of(2)
@@ -68,14 +76,13 @@ impl ObservationDigest {
             size /= 2;
         }
         self.subtrees.push(subtree);
-        self.pending.clear();
     }
 
-    /// Chaining value of the pending bytes, which are not the root.
-    fn pending_value(&self) -> ChainingValue {
+    /// Chaining value of `group`, the next one, which is not the root.
+    fn value(&self, group: &[u8]) -> ChainingValue {
         let mut hasher = Hasher::new();
         hasher.set_input_offset(self.groups * GROUP_BYTES as u64);
-        hasher.update(&self.pending).finalize_non_root()
+        hasher.update(group).finalize_non_root()
     }
 
     /// The hash so far, 64 hexadecimal digits.
@@ -85,7 +92,7 @@ impl ObservationDigest {
             return blake3::hash(&self.pending).to_hex().to_string();
         };
         let merge = |right: ChainingValue, left: &ChainingValue| merge_subtrees_non_root(left, &right, Mode::Hash);
-        let right = rest.iter().rev().fold(self.pending_value(), merge);
+        let right = rest.iter().rev().fold(self.value(&self.pending), merge);
         merge_subtrees_root(first, &right, Mode::Hash).to_hex().to_string()
     }
 }

@@ -10,7 +10,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use ipc_schema::header::MessageHeader;
+use ipc_schema::{header::MessageHeader, storage};
 
 /// Longest chunk, bytes, unless one message is longer: short enough to free often, long enough to allocate seldom.
 const CHUNK_BYTES: usize = 4 << 20;
@@ -193,7 +193,10 @@ impl Journal {
             }
             ChunkStorage::File(number) => {
                 let at = *number * self.chunk_bytes as u64 + offset as u64;
-                let written = self.file.as_ref().map_or(Ok(()), |file| file.write_all_at(payload, at));
+                let file = self.file.as_ref();
+                let written = storage::when_there_is_space(&self.directory, || {
+                    file.map_or(Ok(()), |file| file.write_all_at(payload, at))
+                });
                 written.map_err(failed("write", &self.directory))?;
             }
         }
@@ -304,7 +307,8 @@ impl Journal {
             return Ok(ChunkStorage::Memory(Vec::with_capacity(self.chunk_bytes)));
         }
         if self.file.is_none() {
-            self.file = Some(unlinked_file(&self.directory).map_err(failed("create", &self.directory))?);
+            let file = storage::when_there_is_space(&self.directory, || unlinked_file(&self.directory));
+            self.file = Some(file.map_err(failed("create", &self.directory))?);
         }
         self.file_chunks += 1;
         Ok(ChunkStorage::File(self.file_chunks - 1))

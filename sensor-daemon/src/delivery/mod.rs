@@ -260,6 +260,12 @@ impl Delivery {
         self.redelivered
     }
 
+    /// The oldest tick that a trainer can continue at.
+    #[must_use]
+    pub fn journal_first(&self) -> u64 {
+        self.journal.first()
+    }
+
     /// Largest size of the journal so far, MiB.
     #[must_use]
     pub fn journal_mib(&self) -> usize {

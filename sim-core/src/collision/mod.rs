@@ -20,6 +20,7 @@ use crate::scene::{
 
 pub mod body;
 mod broad;
+mod event_log;
 mod record;
 
 use body::{CollisionBody, box_touches_prism, boxes_touch, common_height, common_point};

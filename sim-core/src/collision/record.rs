@@ -1,11 +1,6 @@
 //! Reporting of contacts: a message, a line in the run's directory, a count in its report.
 
-use std::{
-    fs::{File, OpenOptions},
-    io::{BufWriter, Seek as _, SeekFrom, Write as _},
-    path::{Path, PathBuf},
-    sync::Arc,
-};
+use std::{path::PathBuf, sync::Arc};
 
 use ipc_schema::{
     block::{self, BlockError, Section},
@@ -20,7 +15,10 @@ use ipc_schema::{
 };
 use serde::{Deserialize, Serialize};
 
-use super::CollisionDetector;
+use super::{
+    CollisionDetector,
+    event_log::{self, EventLog},
+};
 use crate::scene::{Scene, Solid};
 
 /// Contacts that began in the run, by what was struck.
@@ -36,6 +34,9 @@ pub struct CollisionCounts {
     pub building: u64,
     /// With obstacles and props.
     pub obstacle: u64,
+    /// Of all, those without a line in `events/collisions.jsonl`: the disk was full, or the file had its largest size.
+    #[serde(default)]
+    pub without_line: u64,
 }
 
 impl CollisionCounts {
@@ -96,7 +97,9 @@ pub struct ContactReporter {
     /// Most collisions in one message.
     most: usize,
     path: PathBuf,
-    lines: BufWriter<File>,
+    lines: EventLog,
+    /// Contacts without a line before this process.
+    without_line_before: u64,
     episode: Option<u64>,
     /// SUMO's ids by dense index.
     names: Vec<Box<str>>,
@@ -120,8 +123,9 @@ impl ContactReporter {
         let publisher = membership.publisher(Channel::Event)?;
         let directory = membership.run.run_dir.join("events");
         let path = directory.join("collisions.jsonl");
-        let opened = std::fs::create_dir_all(&directory).and_then(|()| open_at(&path, before.line_bytes));
-        let file = opened.map_err(|source| WriteError {
+        let opened = std::fs::create_dir_all(&directory)
+            .and_then(|()| EventLog::open(&path, before.line_bytes, event_log::LIMIT_BYTES));
+        let lines = opened.map_err(|source| WriteError {
             path: path.clone(),
             source,
         })?;
@@ -130,7 +134,8 @@ impl ContactReporter {
             publisher,
             most: (membership.run.config.traffic.max_road_users as usize).max(1),
             path,
-            lines: BufWriter::new(file),
+            lines,
+            without_line_before: before.counts.without_line,
             episode: None,
             names: Vec::new(),
             counts: before.counts,
@@ -143,10 +148,7 @@ impl ContactReporter {
     /// The file cannot be written.
     pub fn state(&mut self) -> Result<ContactState, Failure> {
         let counts = self.finish()?;
-        let line_bytes = self.lines.get_mut().stream_position().map_err(|source| WriteError {
-            path: self.path.clone(),
-            source,
-        })?;
+        let line_bytes = self.lines.written_bytes();
         Ok(ContactState { counts, line_bytes })
     }
 
@@ -197,13 +199,10 @@ impl ContactReporter {
         for collision in begun {
             self.counts.add(collision.other_class);
             let line = line(header, collision, &self.names, detector.scene());
-            let written = serde_json::to_writer(&mut self.lines, &line).map_err(std::io::Error::from);
-            written
-                .and_then(|()| self.lines.write_all(b"\n"))
-                .map_err(|source| WriteError {
-                    path: self.path.clone(),
-                    source,
-                })?;
+            self.lines.push(&line).map_err(|source| WriteError {
+                path: self.path.clone(),
+                source,
+            })?;
         }
         Ok(())
     }
@@ -217,17 +216,9 @@ impl ContactReporter {
             path: self.path.clone(),
             source,
         })?;
+        self.counts.without_line = self.without_line_before + self.lines.dropped_lines();
         Ok(self.counts)
     }
-}
-
-/// The file at `path` with its first `bytes`, open behind them.
-fn open_at(path: &Path, bytes: u64) -> std::io::Result<File> {
-    let mut file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
-    let bytes = bytes.min(file.metadata()?.len());
-    file.set_len(bytes)?;
-    file.seek(SeekFrom::Start(bytes))?;
-    Ok(file)
 }
 
 fn unreadable(error: BlockError) -> Failure {

@@ -16,16 +16,16 @@ use crate::models::{
     attitude::{BodyLean, FeltMotion},
     dynamic::{DynamicParams, GRAVITY_MPS2},
     kinematic::KinematicParams,
+    parameters::POWER_SHARE,
     state::{ControlInput, ModelState, SubStepMotion},
 };
 
 /// Vehicles in a batch: two registers of AVX-512 or eight of SSE2 for each number.
 pub const BATCH: usize = 16;
 
-/// Shares of a vehicle's friction, steering and power that references use; the tracker uses the rest to follow them.
+/// Shares of a vehicle's friction and steering that references use, as [`POWER_SHARE`] of its power; the tracker uses the rest to follow them.
 const LATERAL_SHARE: f64 = 0.6;
 const LONGITUDINAL_SHARE: f64 = 0.85;
-const POWER_SHARE: f64 = 0.8;
 const CURVATURE_SHARE: f64 = 0.9;
 
 /// Time between two demands of the tracker, seconds.

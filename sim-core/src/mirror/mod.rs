@@ -23,6 +23,7 @@ pub mod road_user;
 pub mod settings;
 pub mod statistics;
 pub mod tracking;
+pub mod window;
 
 use crate::models::{
     catalogue::{ModelCatalogue, MotionModel},
@@ -36,6 +37,7 @@ use prefetch::PrefetchRange;
 use road_user::RoadUser;
 pub use settings::MirrorSettings;
 use statistics::TrackingStatistics;
+use window::StateWindow;
 
 /// A message of `traffic-bridge` cannot be mirrored.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -88,6 +90,8 @@ pub struct Mirror {
     /// Position in `slab` of each road user by dense index, or [`NOWHERE`].
     places: Vec<u32>,
     slab: Vec<RoadUser>,
+    /// The window of each road user of the slab; empty without a preview.
+    windows: Vec<StateWindow>,
     free: Vec<u32>,
     /// Road users of the current frame: dense index and place, in ascending order of the index.
     present: Vec<(u32, u32)>,
@@ -122,6 +126,7 @@ impl Mirror {
             episode: None,
             places: Vec::new(),
             slab: Vec::new(),
+            windows: Vec::new(),
             free: Vec::new(),
             present: Vec::new(),
             in_whole_step: 0,
@@ -197,6 +202,10 @@ impl Mirror {
             }
             None => {
                 self.slab.push(road_user);
+                let states = self.settings.window_states();
+                if states > 1 {
+                    self.windows.push(StateWindow::new(states));
+                }
                 self.slab.len() as u32 - 1
             }
         };
@@ -228,6 +237,7 @@ impl Mirror {
             self.episode = Some(episode);
             self.places.clear();
             self.slab.clear();
+            self.windows.clear();
             self.free.clear();
             self.present.clear();
             self.in_whole_step = 0;
@@ -252,7 +262,8 @@ impl Mirror {
                 return Err(MirrorError::NotFinite { vehicle, tick });
             }
             let road_user = &mut self.slab[place as usize];
-            road_user.accept(now, self.frame, &self.settings);
+            let window = self.windows.get_mut(place as usize);
+            road_user.accept(now, self.frame, window, &self.settings);
             self.in_whole_step += usize::from(road_user.is_in_whole_step());
             self.present.push((vehicle, place));
         }

@@ -109,25 +109,19 @@ impl ReferencePath {
 
     /// Takes the step from `before` to `now`, `step_s` later, of a body of `length_m`.
     pub fn advance(&mut self, before: &TrafficState, now: &TrafficState, length_m: f64, step_s: f64) -> PathJoin {
+        let (joined, jump) = join(before, now, length_m, step_s);
+        if joined == PathJoin::Broken {
+            return PathJoin::Broken;
+        }
         let mut start_m = [before.front_x_m, before.front_y_m];
         let mut moved_m = [now.front_x_m - start_m[0], now.front_y_m - start_m[1]];
         let turn = wrap_angle(f64::from(now.yaw_rad) - f64::from(before.yaw_rad));
-        let speed_mps = f64::from(before.speed_mps.max(now.speed_mps));
-        if let Some(jump) = sideways_jump(moved_m, f64::from(before.yaw_rad) + 0.5 * turn, turn, length_m) {
-            if speed_mps < MOVING_MPS || jump.left_m.abs() > LANE_JUMP_MOST_M {
-                return PathJoin::Broken;
-            }
+        if let Some(jump) = jump {
             for axis in 0..2 {
                 start_m[axis] += jump.vector_m[axis];
                 moved_m[axis] -= jump.vector_m[axis];
             }
-            self.lane_change = LaneChange {
-                offset_m: self.lane_change.remaining()[0] - jump.left_m,
-                phase: 0.0,
-            };
-        }
-        if norm(moved_m) > 2.0 * speed_mps * step_s + UNEXPLAINED_M {
-            return PathJoin::Broken;
+            self.change_lane(jump.left_m);
         }
         self.heading = [f64::from(before.yaw_rad), turn / step_s];
         self.bend(start_m, moved_m, step_s);
@@ -135,6 +129,14 @@ impl ReferencePath {
         let rising = [now.front_z_m - before.front_z_m, slope_change].map(|change| change / step_s);
         self.climb(before, rising, step_s);
         PathJoin::Continued
+    }
+
+    /// Begins to return a lane change to the left, which the path has made at once.
+    pub(super) fn change_lane(&mut self, left_m: f64) {
+        self.lane_change = LaneChange {
+            offset_m: self.lane_change.remaining()[0] - left_m,
+            phase: 0.0,
+        };
     }
 
     /// Continues as in the last step: what a road user does until it is set elsewhere.
@@ -265,11 +267,37 @@ impl ReferencePath {
 }
 
 /// A lane change in one step.
-struct LaneJump {
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct LaneJump {
     /// World frame, metres.
-    vector_m: [f64; 2],
+    pub(super) vector_m: [f64; 2],
     /// Positive to the left, metres.
-    left_m: f64,
+    pub(super) left_m: f64,
+}
+
+/// Whether a vehicle of `length_m` can have moved from `before` to `now` in `step_s`, and its lane change meanwhile.
+pub(super) fn join(
+    before: &TrafficState,
+    now: &TrafficState,
+    length_m: f64,
+    step_s: f64,
+) -> (PathJoin, Option<LaneJump>) {
+    let mut moved_m = [now.front_x_m - before.front_x_m, now.front_y_m - before.front_y_m];
+    let turn = wrap_angle(f64::from(now.yaw_rad) - f64::from(before.yaw_rad));
+    let speed_mps = f64::from(before.speed_mps.max(now.speed_mps));
+    let jump = sideways_jump(moved_m, f64::from(before.yaw_rad) + 0.5 * turn, turn, length_m);
+    if let Some(jump) = &jump {
+        if speed_mps < MOVING_MPS || jump.left_m.abs() > LANE_JUMP_MOST_M {
+            return (PathJoin::Broken, None);
+        }
+        for (moved, jumped) in moved_m.iter_mut().zip(jump.vector_m) {
+            *moved -= jumped;
+        }
+    }
+    match norm(moved_m) > 2.0 * speed_mps * step_s + UNEXPLAINED_M {
+        true => (PathJoin::Broken, None),
+        false => (PathJoin::Continued, jump),
+    }
 }
 
 /// The sideways part of a chord that the heading half-way and the turn do not explain, if it is a lane change.
@@ -295,7 +323,7 @@ pub(crate) fn half_a_step_before(end_m: [f64; 2], chord_mps: [f64; 2], step_s: f
 }
 
 /// Distance of a point from the straight line between two others, metres.
-fn distance_m(point: [f64; 2], from: [f64; 2], to: [f64; 2]) -> f64 {
+pub(super) fn distance_m(point: [f64; 2], from: [f64; 2], to: [f64; 2]) -> f64 {
     let (line, way) = (minus(to, from), minus(point, from));
     let square = dot(line, line);
     let share = if square > 0.0 {

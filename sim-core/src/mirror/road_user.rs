@@ -13,6 +13,7 @@ use super::{
     reference::{PathJoin, ReferencePath},
     settings::MirrorSettings,
     tracking,
+    window::StateWindow,
 };
 use crate::{
     models::{
@@ -61,6 +62,8 @@ pub struct RoadUser {
     mover: Mover,
     before: TrafficState,
     now: TrafficState,
+    /// Distance of the window's mean from SUMO's own path, metres.
+    deviation_m: f32,
     /// Number of the last frame that had it; 0 = none yet.
     seen_frame: u64,
     arrival: Arrival,
@@ -91,22 +94,38 @@ impl RoadUser {
             mover,
             before: TrafficState::default(),
             now: TrafficState::default(),
+            deviation_m: 0.0,
             seen_frame: 0,
             arrival: Arrival::Entering,
             new: true,
         }
     }
 
-    /// Takes SUMO's state at the end of the step in frame number `frame` (counted from 1).
-    pub fn accept(&mut self, now: &TrafficState, frame: u64, settings: &MirrorSettings) {
+    /// Takes SUMO's state at the end of the step in frame number `frame` (counted from 1). With a window the road user follows the mean of
+    /// its last states.
+    pub fn accept(
+        &mut self,
+        now: &TrafficState,
+        frame: u64,
+        window: Option<&mut StateWindow>,
+        settings: &MirrorSettings,
+    ) {
         let known = self.seen_frame != 0 && self.seen_frame + 1 == frame;
-        (self.before, self.now, self.seen_frame) = (self.now, *now, frame);
+        self.seen_frame = frame;
         self.arrival = if !known {
             Arrival::Entering
         } else if now.flags & DISCONTINUOUS != 0 {
             Arrival::Jumping
         } else {
             Arrival::Continuing
+        };
+        let lane_change_m = match window {
+            // The hero is where its own model is, and its driver sees the others there.
+            Some(window) if !matches!(self.mover, Mover::Hero(_)) => self.take_mean(now, window, settings.step_s()),
+            _ => {
+                (self.before, self.now) = (self.now, *now);
+                None
+            }
         };
         match (&mut self.mover, self.arrival) {
             (_, Arrival::Entering) => {}
@@ -118,6 +137,9 @@ impl RoadUser {
             }
             (Mover::Vehicle { path, .. }, Arrival::Jumping) => path.coast(&self.before, settings.step_s()),
             (Mover::Vehicle { path, .. }, Arrival::Continuing) => {
+                if let Some(left_m) = lane_change_m {
+                    path.change_lane(left_m);
+                }
                 if path.advance(&self.before, &self.now, self.dimensions.length_m, settings.step_s())
                     == PathJoin::Broken
                 {
@@ -126,6 +148,26 @@ impl RoadUser {
                 }
             }
         }
+    }
+
+    /// Takes the state into the window, and the window's means as the states that the road user follows. Returns the lane change in this
+    /// step, metres to the left. A step that no vehicle can drive is a jump, and the window begins anew.
+    fn take_mean(&mut self, now: &TrafficState, window: &mut StateWindow, step_s: f64) -> Option<f64> {
+        let step = match self.arrival {
+            Arrival::Continuing => window.advance(now, self.dimensions.length_m, step_s),
+            Arrival::Entering | Arrival::Jumping => None,
+        };
+        let Some(step) = step else {
+            if self.arrival == Arrival::Continuing {
+                self.arrival = Arrival::Jumping;
+            }
+            (self.before, self.now) = (self.now, window.restart(now, step_s));
+            self.deviation_m = 0.0;
+            return None;
+        };
+        (self.before, self.now) = (step.before, step.now);
+        self.deviation_m = window.deviation_m() as f32;
+        step.lane_change_m
     }
 
     /// Sets the control input of a hero from now on; other road users ignore it.
@@ -205,7 +247,7 @@ impl RoadUser {
         *state = state.settled();
         batch.write(member, rows);
         write_moved(state, batch.road(member), path.road(start_s).0, rows, out);
-        out.reference_offset_m = path.offset_m(end_s, settings.step_s()) as f32;
+        out.reference_offset_m = path.offset_m(end_s, settings.step_s()) as f32 + self.deviation_m;
         let target = batch.curve(member).at(settings.tick_s);
         let error = tracking::error(state, front_m, &target);
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;

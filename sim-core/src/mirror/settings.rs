@@ -6,6 +6,7 @@ use ipc_schema::{
     run::RunFile,
 };
 
+use super::window::states_for;
 use crate::models::{catalogue::ModelCatalogue, parameters::ParameterError};
 
 /// Times of a run and limits of its vehicles.
@@ -36,6 +37,12 @@ impl MirrorSettings {
     #[must_use]
     pub fn sub_step_s(&self) -> f64 {
         self.tick_s / f64::from(self.sub_steps)
+    }
+
+    /// States of SUMO whose mean a road user follows.
+    #[must_use]
+    pub fn window_states(&self) -> usize {
+        states_for(self.vehicle.preview_s, self.step_s())
     }
 
     /// Length of a SUMO step, seconds.

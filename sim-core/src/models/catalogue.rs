@@ -11,7 +11,7 @@ use super::{
     dimensions::VehicleDimensions,
     dynamic::DynamicParams,
     kinematic::KinematicParams,
-    parameters::{ParameterCatalogue, ParameterError},
+    parameters::{ParameterCatalogue, ParameterError, TypeLimits},
     rigid_body::RigidBody,
     state::{ControlInput, ModelState, SubStepMotion},
 };
@@ -57,8 +57,8 @@ pub struct SizedModel {
     pub dimensions: VehicleDimensions,
 }
 
-/// Key of a model: parameter set, model, and size (bits of length, width and height).
-type ModelKey = (usize, u8, [u32; 3]);
+/// Key of a model: parameter set, model, and bits of length, width, height and the limits of SUMO's type.
+type ModelKey = (usize, u8, [u32; 6]);
 
 /// All models of a run, one for each kind and size of vehicle.
 #[derive(Debug)]
@@ -104,15 +104,22 @@ impl ModelCatalogue {
         if !choice.known && meta.kind != Kind::Person as u32 {
             self.unknown.entry(class.clone()).or_insert(false);
         }
-        let model = self.model_of(&class, meta.kind);
-        let size = [meta.length_m, meta.width_m, meta.height_m];
-        let key = (choice.set, model as u8, size.map(f32::to_bits));
+        let model = self.model_of(&class, meta.kind, choice.set);
+        let [length, width, height] = [meta.length_m, meta.width_m, meta.height_m];
+        let [accel, decel, speed] = [meta.type_accel_mps2, meta.type_decel_mps2, meta.type_speed_mps];
+        let key = [length, width, height, accel, decel, speed].map(f32::to_bits);
+        let key = (choice.set, model as u8, key);
         if let Some(place) = self.places.get(&key) {
             return *place;
         }
         let place = self.built.len() as u32;
-        let [length, width, height] = size.map(f64::from);
-        let built = self.build(choice.set, model, [length, width, height]);
+        let size = [length, width, height].map(f64::from);
+        let type_limits = TypeLimits {
+            accel_mps2: accel.into(),
+            decel_mps2: decel.into(),
+            speed_mps: speed.into(),
+        };
+        let built = self.build(choice.set, model, size, &type_limits);
         if model == VehicleModel::RigidBody {
             self.add_body(place, choice.set, &built.dimensions);
         }
@@ -134,26 +141,38 @@ impl ModelCatalogue {
         (&self.built[place as usize], self.bodies.get_mut(&place))
     }
 
-    fn build(&self, set: usize, model: VehicleModel, [length, width, height]: [f64; 3]) -> SizedModel {
+    fn build(
+        &self,
+        set: usize,
+        model: VehicleModel,
+        [length, width, height]: [f64; 3],
+        type_limits: &TypeLimits,
+    ) -> SizedModel {
         let set = &self.catalogue.sets()[set];
         let dimensions = set.dimensions(length, width, height);
+        let (set, limits) = (
+            &set.strengthened(type_limits, &dimensions),
+            &type_limits.raised(&self.limits),
+        );
         let model = if model != VehicleModel::Kinematic {
             MotionModel::Dynamic(DynamicParams::new(
                 set,
                 &dimensions,
-                &self.limits,
+                limits,
                 self.surface,
                 self.sub_step_s,
             ))
         } else {
-            MotionModel::Kinematic(KinematicParams::new(set, &self.limits, dimensions.wheelbase_m))
+            MotionModel::Kinematic(KinematicParams::new(set, limits, dimensions.wheelbase_m))
         };
         SizedModel { model, dimensions }
     }
 
-    fn model_of(&self, class: &str, kind: u32) -> VehicleModel {
+    fn model_of(&self, class: &str, kind: u32, set: usize) -> VehicleModel {
         if let Some(model) = self.by_class.get(class) {
             (*model).into()
+        } else if self.catalogue.sets()[set].kinematic {
+            VehicleModel::Kinematic
         } else if kind == Kind::Cav as u32 {
             self.limits.cav_model.into()
         } else if kind == Kind::Hero as u32 {

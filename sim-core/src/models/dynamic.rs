@@ -134,7 +134,7 @@ pub struct DynamicParams {
 }
 
 /// Density of air, kg/m³ (ISO 2533, 15 °C at sea level).
-const AIR_KGPM3: f64 = 1.225;
+pub const AIR_KGPM3: f64 = 1.225;
 
 impl DynamicParams {
     /// A vehicle of this size with a parameter set, none of its limits above the configured ones, on a road that leaves

@@ -1,8 +1,15 @@
 //! Parameter sets of vehicles, read from `data/vehicles.toml`: which set a vehicle of SUMO gets, and how it scales.
 
+use ipc_schema::config::VehicleConfig;
 use serde::Deserialize;
 
-use super::dimensions::VehicleDimensions;
+use super::{
+    dimensions::VehicleDimensions,
+    dynamic::{AIR_KGPM3, GRAVITY_MPS2},
+};
+
+/// Share of the power that references use; the tracker uses the rest to follow them.
+pub const POWER_SHARE: f64 = 0.8;
 
 /// The committed sets.
 const SETS: &str = include_str!("../../data/vehicles.toml");
@@ -31,6 +38,9 @@ pub struct ParameterSet {
     pub default: bool,
     /// SUMO vehicle classes.
     pub classes: Vec<String>,
+    /// True if the kinematic model moves it unless the configuration names another for the class.
+    #[serde(default)]
+    pub kinematic: bool,
     /// Longest vehicle that gets this set, metres.
     pub longest_m: f64,
     /// Bumper to bumper, metres.
@@ -93,7 +103,51 @@ pub struct ParameterSet {
     pub source: String,
 }
 
+/// What SUMO's vehicle type lets a vehicle do. Zeros limit nothing: the type is unknown.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct TypeLimits {
+    /// Largest acceleration, m/s².
+    pub accel_mps2: f64,
+    /// Largest deceleration, in an emergency too, m/s².
+    pub decel_mps2: f64,
+    /// Top speed, m/s.
+    pub speed_mps: f64,
+}
+
+/// What a mirror needs by what SUMO does, so that it can catch up.
+const RESERVE: f64 = 1.1;
+/// Fastest vehicle for which power is provided, m/s: types without a limit have a top speed of thousands.
+const FASTEST_MPS: f64 = 100.0;
+
+impl TypeLimits {
+    /// The configured limits, and at least those of the type.
+    #[must_use]
+    pub fn raised(&self, limits: &VehicleConfig) -> VehicleConfig {
+        VehicleConfig {
+            max_accel_mps2: limits.max_accel_mps2.max(RESERVE * self.accel_mps2),
+            max_decel_mps2: limits.max_decel_mps2.max(self.decel_mps2),
+            ..limits.clone()
+        }
+    }
+}
+
 impl ParameterSet {
+    /// This set for a vehicle of SUMO's type: as strong as its own numbers say, and at least as strong as SUMO drives it. SUMO
+    /// accelerates at the type's acceleration up to the top speed, whatever that takes.
+    #[must_use]
+    pub fn strengthened(&self, limits: &TypeLimits, body: &VehicleDimensions) -> Self {
+        let (mass_kg, speed_mps) = (self.mass_kg(body), limits.speed_mps.min(FASTEST_MPS));
+        let drag_mps2 = 0.5 * AIR_KGPM3 * self.drag_area_m2 / mass_kg * speed_mps * speed_mps;
+        let resistance_mps2 = drag_mps2 + self.rolling_resistance * GRAVITY_MPS2;
+        let power_w = mass_kg * speed_mps * (limits.accel_mps2 + resistance_mps2) / POWER_SHARE;
+        Self {
+            max_accel_mps2: self.max_accel_mps2.max(RESERVE * limits.accel_mps2),
+            max_decel_mps2: self.max_decel_mps2.max(limits.decel_mps2),
+            max_power_w: self.max_power_w.max(RESERVE * power_w),
+            ..self.clone()
+        }
+    }
+
     /// Size and axles of a vehicle of SUMO with this set: lengths along the body scale with its length.
     #[must_use]
     pub fn dimensions(&self, length_m: f64, width_m: f64, height_m: f64) -> VehicleDimensions {

@@ -12,6 +12,7 @@ use std::path::Path;
 use ipc_schema::config::Config;
 use serde_json::{Map, Value};
 
+use crate::scenario::input_check::require_regular;
 pub use error::ConfigError;
 use layer::{LocatedValue, SettingsLayer};
 
@@ -60,11 +61,13 @@ impl LayeredSettings {
     /// The file is unreadable, or as [`layer::parse`].
     pub fn with_file(mut self, path: &Path) -> Result<Self, ConfigError> {
         let name = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|error| ConfigError::File {
+        let unreadable = |reason: String| ConfigError::File {
             path: name.clone(),
-            message: format!("cannot be read: {error}"),
+            message: format!("cannot be read: {reason}"),
             help: format!("give a .toml, a .sumocfg, or one of the presets: {}", preset_names()),
-        })?;
+        };
+        require_regular(path).map_err(unreadable)?;
+        let text = std::fs::read_to_string(path).map_err(|error| unreadable(error.to_string()))?;
         self.0.extend(layer::parse(&name, &text)?);
         Ok(self)
     }
@@ -105,6 +108,13 @@ impl LayeredSettings {
         self.0
             .get(path)
             .is_some_and(|setting| !setting.place.source.name().starts_with("preset "))
+    }
+
+    /// True if the flag `path` is set.
+    #[must_use]
+    pub fn has_flag(&self, path: &str) -> bool {
+        self.setting(path)
+            .is_some_and(|setting| setting.value == Value::Bool(true))
     }
 
     fn setting(&self, path: &str) -> Option<&LocatedValue> {

@@ -144,6 +144,13 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
             "start several runs, each with run.envs = 1",
         ));
     }
+    if config.vehicle.preview_s > 0.0 {
+        return Some((
+            "vehicle.preview_s",
+            "`vehicle.preview_s` puts the traffic around a hero into the past".into(),
+            "set vehicle.preview_s = 0 with task.kind = \"driving\"",
+        ));
+    }
     (config.trainer.module == LOCALISING_TRAINER).then(|| {
         (
             "trainer.module",

@@ -1,31 +1,38 @@
 //! Planned handovers: the supervisor replaces the trainer of a live run by a successor while the simulation continues.
 
+pub mod claims;
 pub mod phases;
 pub mod request;
 
 use std::{
     io::{BufRead as _, BufReader},
     path::PathBuf,
+    sync::mpsc::{Receiver, channel},
 };
 
 use ipc_schema::{
     board::State,
+    config::Config,
     failure::{Failure, FailureKind},
     process::Process,
     run::RunFile,
 };
 
 use crate::{
-    config,
+    config, display,
     failure::Exit,
     handover::{
+        claims::SuccessorClaims,
         phases::{HandoverInProgress, write_run},
         request::changed_config,
     },
-    processes::RunProcesses,
+    processes::{EndedProcess, RunProcesses},
     running_process::RunningProcess,
     socket::{HandoverAnswer, HandoverReport, HandoverRequest, ReplySocket},
 };
+
+/// Restarts that a killed successor gets before its first commit.
+const MAX_TRIAL_RESTARTS: u32 = 3;
 
 /// The handovers of a run: at most one in progress, and the reports of those completed.
 #[derive(Debug, Default)]
@@ -34,6 +41,19 @@ pub struct Handovers {
     /// The supervisor has asked the trainer to leave: its end with success is no failure.
     is_trainer_leaving: bool,
     completed: Vec<HandoverReport>,
+    /// The learners before those that have not committed anything yet: they return if these fail. The oldest first.
+    before: Vec<LearnerSettings>,
+    /// Restarts of a successor that has committed nothing.
+    trial_restarts: u32,
+    /// Ticks that were committed when the newest successor attached.
+    taken_over_at: Option<u64>,
+}
+
+/// The settings with which a learner is started.
+#[derive(Debug)]
+struct LearnerSettings {
+    config: Config,
+    config_hash: String,
 }
 
 impl Handovers {
@@ -53,8 +73,9 @@ impl Handovers {
             return reply.answer(&HandoverAnswer::Refused(failure));
         }
         match start_successor(processes, &request, report_ready) {
-            Ok((run, run_file, successor)) => {
-                self.current = Some(HandoverInProgress::new(request, reply, run, run_file, successor));
+            Ok((run, run_file, successor, ready_line)) => {
+                let handover = HandoverInProgress::new(request, reply, run, run_file, successor, ready_line);
+                self.current = Some(handover);
             }
             Err(Exit::Failure(failure)) => reply.answer(&HandoverAnswer::Refused(failure)),
             Err(exit) => {
@@ -79,16 +100,22 @@ impl Handovers {
         }
     }
 
-    /// Asks the old trainer to leave, because the successor of this incarnation is ready.
+    /// Asks the old trainer to leave, because the successor of this incarnation is ready; refuses one that does not fit the run.
     pub fn successor_ready(&mut self, processes: &mut RunProcesses, incarnation: u32) {
         let Some(handover) = self.current.take() else {
             return;
         };
+        if let Some(reason) = handover.misfit(processes.journal_first()) {
+            let message = format!("the successor is refused, the old trainer continues: {reason}");
+            let help = "start it with settings that fit the run, or start another run for it";
+            return handover.refuse(Failure::new(FailureKind::Run, message).with_help(help));
+        }
         let (handover, leave) = handover.successor_ready(incarnation);
+        let when = handover.leave_time();
         self.current = Some(handover);
         if leave && let Some(index) = processes.replaceable() {
             processes.set_handing_over(true);
-            processes.ask_to_leave(index);
+            processes.ask_to_leave(index, when);
             self.is_trainer_leaving = true;
         }
     }
@@ -96,11 +123,16 @@ impl Handovers {
     /// Handles the end of the trainer: makes the waiting successor the trainer and returns true. Returns false if none waits.
     ///
     /// # Errors
-    /// The run holds no more successors, or the run file cannot be written.
+    /// iceoryx2 refuses, or the run file cannot be written.
     pub fn trainer_ended(&mut self, processes: &mut RunProcesses, index: usize, is_done: bool) -> Result<bool, Exit> {
         let Some(handover) = self.current.take() else {
             return Ok(false);
         };
+        if handover.is_opening() && !is_done {
+            // It is the successor that has ended: it, or the learner before it, is started again.
+            self.current = Some(handover);
+            return Ok(false);
+        }
         if is_done || !handover.is_leaving() {
             self.current = Some(handover);
             self.refuse_current(
@@ -115,18 +147,80 @@ impl Handovers {
         let Some((successor, run)) = left else {
             return Ok(false);
         };
-        if !processes.set_incarnation(successor.row, 0, successor.incarnation) {
-            return Err(Exit::run("a run holds no more successors", "start another run"));
-        }
+        processes.set_incarnation(successor.row, 0, successor.incarnation)?;
         processes.wake_sensing();
         write_run(&run, "run.json")?;
+        let RunFile {
+            config, config_hash, ..
+        } = processes.run().clone();
+        self.before.push(LearnerSettings { config, config_hash });
+        self.trial_restarts = 0;
+        self.taken_over_at = None;
         self.is_trainer_leaving = false;
         processes.install_successor(index, successor, run);
         Ok(true)
     }
 
+    /// Starts the learner before a successor again that has ended before its first commit. Returns false if there is none.
+    ///
+    /// # Errors
+    /// The run file cannot be written, or the learner cannot be started.
+    pub fn fall_back(
+        &mut self,
+        processes: &mut RunProcesses,
+        index: usize,
+        ended: &EndedProcess,
+    ) -> Result<bool, Exit> {
+        let Some(LearnerSettings { config, config_hash }) = self.before.pop() else {
+            return Ok(false);
+        };
+        let mut failure = processes.failure(index, ended.status);
+        failure.message = format!(
+            "the successor is refused, the learner before it returns: {}",
+            failure.message
+        );
+        display::notice(&failure.message);
+        let run = RunFile {
+            config,
+            config_hash,
+            ..processes.run().clone()
+        };
+        write_run(&run, "run.json")?;
+        phases::remove(&Failure::path(&run.run_dir, ended.row.process.name()));
+        processes.set_run(run);
+        if let Some(handover) = self.current.take() {
+            handover.refuse(failure);
+        }
+        processes.set_handing_over(false);
+        self.trial_restarts = 0;
+        self.taken_over_at = None;
+        self.is_trainer_leaving = false;
+        processes.restart(index)?;
+        Ok(true)
+    }
+
+    /// Counts a restart of a successor that has committed nothing. True if there were too many: whatever kills it, the learner before it
+    /// worked.
+    pub fn fails_its_trial(&mut self) -> bool {
+        self.trial_restarts += u32::from(!self.before.is_empty());
+        self.trial_restarts > MAX_TRIAL_RESTARTS
+    }
+
+    /// Forgets the learners before one that has committed ticks of its own.
+    fn note_commits(&mut self, processes: &RunProcesses) {
+        let progress = processes.trainer().progress();
+        if self.before.is_empty() || self.is_opening() || progress.attached == 0 {
+            return;
+        }
+        let taken_over_at = *self.taken_over_at.get_or_insert(progress.committed_ticks);
+        if progress.committed_ticks > taken_over_at {
+            self.before.clear();
+        }
+    }
+
     /// Refuses a successor that failed, and completes the handover once the successor has opened its ports.
     pub fn advance(&mut self, processes: &mut RunProcesses) {
+        self.note_commits(processes);
         let Some(mut handover) = self.current.take() else {
             return;
         };
@@ -138,6 +232,7 @@ impl Handovers {
         let progress = processes.trainer().progress();
         if handover.is_opening() && progress.attached == 1 {
             processes.set_handing_over(false);
+            self.taken_over_at = Some(progress.committed_ticks);
             self.completed.extend(handover.complete(progress.committed_ticks));
         } else {
             self.current = Some(handover);
@@ -155,6 +250,12 @@ impl Handovers {
     /// Drops the handover in progress, which kills its successor.
     pub fn abandon(&mut self) {
         self.current = None;
+    }
+
+    /// True while a handover is in progress.
+    #[must_use]
+    pub fn is_in_progress(&self) -> bool {
+        self.current.is_some()
     }
 
     /// True while a successor opens its ports.
@@ -185,7 +286,7 @@ fn start_successor(
     processes: &RunProcesses,
     request: &HandoverRequest,
     report_ready: impl FnOnce(u32) -> bool + Send + 'static,
-) -> Result<(RunFile, PathBuf, RunningProcess), Exit> {
+) -> Result<(RunFile, PathBuf, RunningProcess, Receiver<String>), Exit> {
     let config = changed_config(processes.run(), &request.set)?;
     let run = RunFile {
         config_hash: config::hash(&config)?,
@@ -195,10 +296,12 @@ fn start_successor(
     let run_file = write_run(&run, "run.next.json")?;
     let (successor, output) = processes.start_successor(&run, &run_file, request.checkpoint.as_ref())?;
     let incarnation = successor.incarnation;
+    let (sender, ready_line) = channel();
     let wait = move || {
         let mut line = String::new();
         let read = output.map(|output| BufReader::new(output).read_line(&mut line));
-        if matches!(read, Some(Ok(_))) && line == "ready\n" && !report_ready(incarnation) {
+        let is_ready = matches!(read, Some(Ok(_))) && SuccessorClaims::of_line(&line).is_some();
+        if is_ready && (sender.send(line).is_err() || !report_ready(incarnation)) {
             tracing::debug!("a successor is ready, but the run is over");
         }
     };
@@ -206,5 +309,5 @@ fn start_successor(
         .name("successor".into())
         .spawn(wait)
         .map_err(|error| Exit::run(format!("cannot wait for the successor: {error}"), ""))?;
-    Ok((run, run_file, successor))
+    Ok((run, run_file, successor, ready_line))
 }

@@ -2,17 +2,20 @@
 
 use std::{
     path::{Path, PathBuf},
+    sync::mpsc::Receiver,
     time::{Duration, Instant},
 };
 
 use ipc_schema::{
     failure::{Failure, FailureKind},
     run::RunFile,
+    storage,
 };
 
 use crate::{
     failure::Exit,
-    running_process::RunningProcess,
+    handover::claims::SuccessorClaims,
+    running_process::{LeaveTime, RunningProcess},
     socket::{HandoverAnswer, HandoverReport, HandoverRequest, ReplySocket},
 };
 
@@ -25,7 +28,7 @@ const SUCCESSOR: &str = "successor";
 #[derive(Debug)]
 enum HandoverPhase {
     /// The successor prepares; the old trainer works.
-    GettingReady { successor: RunningProcess, since: Instant },
+    GettingReady { successor: RunningProcess },
     /// The supervisor has asked the old trainer to leave.
     Leaving { successor: RunningProcess },
     /// The successor is the trainer, and opens its ports.
@@ -41,6 +44,9 @@ pub struct HandoverInProgress {
     run: RunFile,
     /// The file from which the successor reads the run.
     run_file: PathBuf,
+    /// The line with which the successor says that it is ready.
+    ready_line: Receiver<String>,
+    since: Instant,
     phase: HandoverPhase,
 }
 
@@ -53,14 +59,35 @@ impl HandoverInProgress {
         run: RunFile,
         run_file: PathBuf,
         successor: RunningProcess,
+        ready_line: Receiver<String>,
     ) -> Self {
-        let since = Instant::now();
         Self {
             request,
             reply,
             run,
             run_file,
-            phase: HandoverPhase::GettingReady { successor, since },
+            ready_line,
+            since: Instant::now(),
+            phase: HandoverPhase::GettingReady { successor },
+        }
+    }
+
+    /// The reason why the successor does not fit the run, whose journal begins at `journal_first`, if it is ready and says so.
+    #[must_use]
+    pub fn misfit(&self, journal_first: u64) -> Option<String> {
+        let line = self.ready_line.try_recv().ok()?;
+        match SuccessorClaims::of_line(&line)? {
+            Ok(claims) => claims.check(&self.run, journal_first).err(),
+            Err(error) => Some(format!("it reports what cannot be read: {error}")),
+        }
+    }
+
+    /// When the old trainer has to leave.
+    #[must_use]
+    pub fn leave_time(&self) -> LeaveTime {
+        match self.request.now {
+            true => LeaveTime::NextTick,
+            false => LeaveTime::NextUpdate,
         }
     }
 
@@ -68,7 +95,7 @@ impl HandoverInProgress {
     #[must_use]
     pub fn successor_ready(self, incarnation: u32) -> (Self, bool) {
         match self.phase {
-            HandoverPhase::GettingReady { successor, .. } if successor.incarnation == incarnation => {
+            HandoverPhase::GettingReady { successor } if successor.incarnation == incarnation => {
                 let phase = HandoverPhase::Leaving { successor };
                 (Self { phase, ..self }, true)
             }
@@ -76,11 +103,16 @@ impl HandoverInProgress {
         }
     }
 
-    /// The reason of a failed handover: the successor ended, or was not ready in time.
+    /// The reason of a failed handover: the successor ended, or it was not ready or the old trainer had not left in time.
     pub fn failure(&mut self) -> Option<Failure> {
-        let (successor, since) = match &mut self.phase {
-            HandoverPhase::GettingReady { successor, since } => (successor, Some(*since)),
-            HandoverPhase::Leaving { successor } => (successor, None),
+        let asked = self.request.timeout_s.map(Duration::from_secs_f64);
+        let (successor, limit, what) = match &mut self.phase {
+            HandoverPhase::GettingReady { successor } => (
+                successor,
+                Some(asked.unwrap_or(READY_WITHIN)),
+                "the successor was not ready",
+            ),
+            HandoverPhase::Leaving { successor } => (successor, asked, "the old trainer had not left"),
             HandoverPhase::Opening { .. } => return None,
         };
         if let Some(status) = successor.poll() {
@@ -92,9 +124,11 @@ impl HandoverInProgress {
             );
             return Some(failure);
         }
-        since.filter(|since| since.elapsed() > READY_WITHIN).map(|_| {
-            let message = format!("the successor was not ready within {} s", READY_WITHIN.as_secs());
-            Failure::new(FailureKind::Run, message).with_help("its log is logs/trainer.log in the run directory")
+        limit.filter(|limit| self.since.elapsed() > *limit).map(|limit| {
+            let message = format!("{what} within {} s: the old trainer continues", limit.as_secs_f64());
+            Failure::new(FailureKind::Run, message).with_help(
+                "logs/trainer.log in the run directory says what both do; `--now` does not wait for an update",
+            )
         })
     }
 
@@ -165,16 +199,15 @@ impl HandoverInProgress {
 /// The run directory is not writable.
 pub fn write_run(run: &RunFile, name: &str) -> Result<PathBuf, Exit> {
     let path = run.run_dir.join(name);
-    let partial = run.run_dir.join(format!(".{name}.partial"));
     run.to_json()
         .map_err(std::io::Error::from)
-        .and_then(|text| std::fs::write(&partial, text))
-        .and_then(|()| std::fs::rename(&partial, &path))
+        .and_then(|text| storage::write_whole(&path, text))
         .map_err(|error| Exit::io("write", &path, &error))?;
     Ok(path)
 }
 
-fn remove(path: &Path) {
+/// Removes a file, if it is there; an error is only logged.
+pub fn remove(path: &Path) {
     if path.exists()
         && let Err(error) = std::fs::remove_file(path)
     {

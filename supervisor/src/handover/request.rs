@@ -47,6 +47,17 @@ fn checkpoint(path: &Path) -> Result<PathBuf, Exit> {
     ))
 }
 
+/// A timeout that can be met.
+fn timeout_s(seconds: f64) -> Result<f64, Exit> {
+    if std::time::Duration::try_from_secs_f64(seconds).is_ok_and(|timeout| !timeout.is_zero()) {
+        return Ok(seconds);
+    }
+    Err(Exit::config(
+        format!("a timeout of {seconds} s cannot be met"),
+        "`--timeout-s` takes seconds, more than 0",
+    ))
+}
+
 /// Asks the supervisor of a run to replace its trainer, and waits for the answer.
 ///
 /// # Errors
@@ -63,6 +74,8 @@ pub fn handover(args: &HandoverArgs) -> Result<(), Exit> {
     let request = HandoverRequest {
         set: args.set.clone(),
         checkpoint: args.checkpoint.as_deref().map(checkpoint).transpose()?,
+        now: args.now,
+        timeout_s: args.timeout_s.map(timeout_s).transpose()?,
     };
     match socket::send_request(&run, &SupervisorRequest::Handover(request))? {
         HandoverAnswer::Done(report) => {

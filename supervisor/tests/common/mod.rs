@@ -20,7 +20,10 @@ use ipc_schema::{
     run::RunFile,
     services::{self, Channel, RunNode},
 };
-use rustix::fs::inotify;
+use rustix::{
+    fs::inotify,
+    process::{Pid, Signal, kill_process},
+};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -34,6 +37,27 @@ pub struct Workplace {
     registry: OwnedFd,
     names: RefCell<BTreeSet<String>>,
     _turn: MutexGuard<'static, ()>,
+}
+
+impl Drop for Workplace {
+    /// A test that fails may leave a run alive, or what it has in shared memory.
+    fn drop(&mut self) {
+        let is_here = |entry: &std::fs::DirEntry| {
+            let directory = std::fs::read_link(entry.path().join("cwd"));
+            directory.is_ok_and(|directory| directory.starts_with(self.path()))
+        };
+        let alive = std::fs::read_dir("/proc").unwrap().flatten().filter(is_here);
+        let pids = alive.filter_map(|entry| Pid::from_raw(entry.file_name().to_str()?.parse().ok()?));
+        // The processes of a run end with its supervisor.
+        let killed = pids.filter(|pid| kill_process(*pid, Signal::KILL).is_ok()).count();
+        if killed > 0 {
+            eprintln!("{killed} processes were left in {}", self.path().display());
+        }
+        for file in self.shared_memory() {
+            // A process that ends meanwhile removes its own.
+            let _ = std::fs::remove_file(Path::new("/dev/shm").join(file));
+        }
+    }
 }
 
 impl Workplace {

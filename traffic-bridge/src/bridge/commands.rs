@@ -4,7 +4,6 @@ use std::{
     collections::BTreeMap,
     collections::VecDeque,
     fs::{File, OpenOptions},
-    io::Write as _,
     path::{Path, PathBuf},
 };
 
@@ -15,6 +14,7 @@ use ipc_schema::{
     },
     failure::{Failure, FailureKind},
     sensor::SENSORS,
+    storage,
     traffic::{Kind, MetaEvent, VehicleMeta, id_hash},
 };
 
@@ -304,7 +304,7 @@ impl CommandExecutor {
         }
         let line = serde_json::to_string(action).map_err(|error| failed(error.into()))?;
         match &mut self.log {
-            Some(file) => writeln!(file, "{line}").map_err(failed),
+            Some(file) => storage::append_line(file, &self.log_path, &line).map_err(failed),
             None => Ok(()),
         }
     }

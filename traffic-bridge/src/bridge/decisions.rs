@@ -14,6 +14,7 @@ use ipc_schema::{
     ports::BoardReader,
     process::Process,
     run::{CURRICULUM_LOG, FORMER_CURRICULUM_LOG, Mode},
+    storage,
 };
 use serde::{Deserialize, Serialize};
 
@@ -135,7 +136,7 @@ impl StageDecisions {
     fn write(&mut self, decision: StageDecision) -> Result<(), Failure> {
         self.newest = Some(decision);
         let line = serde_json::to_string(&decision).map_err(std::io::Error::from);
-        line.and_then(|line| writeln!(self.log, "{line}"))
+        line.and_then(|line| storage::append_line(&mut self.log, &self.path, &line))
             .map_err(|error| unwritten(&self.path, &error))
     }
 }
@@ -148,6 +149,7 @@ fn begin_log(path: &Path, kept: &[StageDecision]) -> std::io::Result<File> {
     for decision in kept {
         writeln!(log, "{}", serde_json::to_string(decision)?)?;
     }
+    log.sync_all()?;
     std::fs::rename(&partial, path)?;
     Ok(log)
 }

@@ -5,6 +5,7 @@ use ipc_schema::{
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::Wait,
     ports::PortError,
+    process::Process,
     run::{RunFile, Source},
     schedule::Episode,
     sensor::fitted_sensors,
@@ -145,10 +146,13 @@ impl Bridge {
         self.store_state(episode)?;
         let run = &self.membership.run;
         let options = options(run, &self.maps[map].source, episode)?;
+        // A file may crash SUMO, which cannot be caught: the failure is written before, and removed when SUMO has read the files.
+        options.crashed().write(&run.run_dir, Process::TrafficBridge.name());
         let mut sumo = match before {
             None => Sumo::start(options)?,
             Some(before) => Sumo::reload(before.sumo, options)?,
         };
+        Failure::remove(&run.run_dir, Process::TrafficBridge.name());
         let population = population(run, &mut sumo, episode, stage)?;
         self.commands.begin_episode();
         Ok(RunningEpisode {

@@ -101,6 +101,10 @@ impl RoadUserRegister {
             id: [0; ipc_schema::traffic::ID_BYTES],
             vehicle_class: padded(&event.vehicle_class),
             type_id: padded(&event.vehicle_type),
+            type_accel_mps2: convention::single(event.accel),
+            type_decel_mps2: convention::single(event.decel),
+            type_speed_mps: convention::single(event.max_speed),
+            reserved: 0,
         };
         meta.set_id(&event.id);
         meta

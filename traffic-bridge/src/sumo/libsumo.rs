@@ -51,6 +51,10 @@ pub mod ffi {
         length: f64,
         width: f64,
         height: f64,
+        /// Limits of the vehicle type, m/s² and m/s; 0 for persons.
+        accel: f64,
+        decel: f64,
+        max_speed: f64,
     }
 
     /// A traffic light that has changed.

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use ipc_schema::failure::{Failure, FailureKind};
+
 use super::{
     connected::ConnectedRule,
     convention::sumo_seed,
@@ -106,6 +108,20 @@ impl SumoOptions {
 }
 
 impl SumoOptions {
+    /// The failure of a process that SUMO crashes while it reads the files: SUMO itself names none.
+    #[must_use]
+    pub fn crashed(&self) -> Failure {
+        let InputFiles { main, others } = &self.files;
+        let others: Vec<_> = others.iter().map(|file| file.display().to_string()).collect();
+        let others = match others.is_empty() {
+            true => String::new(),
+            false => format!(" or a file that it names ({})", others.join(", ")),
+        };
+        let message = format!("ended while SUMO was reading {}{others}", main.display());
+        Failure::new(FailureKind::Config, message)
+            .with_help("build the net again with netconvert; `sumo` on the same files ends in the same way, which shows the file to correct")
+    }
+
     /// The same with `scale` times the demand, if it is given: SUMO's `--scale`.
     #[must_use]
     pub fn with_scale(mut self, scale: Option<f64>) -> Self {

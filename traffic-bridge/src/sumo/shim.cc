@@ -45,7 +45,7 @@ bool net_has_elevation() {
 }
 
 RawEvent event(RawEventKind kind, std::uint32_t index, bool is_person, const std::string& id) {
-    return RawEvent{kind, index, is_person, rust::String::lossy(id), rust::String(), rust::String(), 0.0, 0.0, 0.0};
+    return RawEvent{kind, index, is_person, rust::String::lossy(id), rust::String(), rust::String(), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
 }
 
 template <typename Species>
@@ -55,6 +55,14 @@ void describe(RawEvent& departure, const std::string& id) {
     departure.length = Species::getLength(id);
     departure.width = Species::getWidth(id);
     departure.height = Species::getHeight(id);
+}
+
+// What the vehicle type lets SUMO do: the mirror must be able to follow.
+void describe_limits(RawEvent& departure, const std::string& id) {
+    const std::string type = libsumo::Vehicle::getTypeID(id);
+    departure.accel = libsumo::VehicleType::getAccel(type);
+    departure.decel = std::max(libsumo::VehicleType::getDecel(type), libsumo::VehicleType::getEmergencyDecel(type));
+    departure.max_speed = libsumo::VehicleType::getMaxSpeed(type);
 }
 
 }  // namespace
@@ -186,6 +194,7 @@ void Simulation::depart(const std::string& id, bool is_person) {
             describe<libsumo::Person>(departure, id);
         } else {
             describe<libsumo::Vehicle>(departure, id);
+            describe_limits(departure, id);
         }
     } catch (const libsumo::TraCIException&) {
         return;  // It departed and left within the step.

@@ -6,6 +6,7 @@ range ValueError.
 """
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import final
 
 from torch import Tensor
@@ -29,6 +30,7 @@ __all__ = [
     "ObservationBlock",
     "PointCloud",
     "SectionView",
+    "exchange",
     "id_hash",
     "observation_size",
 ]
@@ -331,3 +333,6 @@ def id_hash(id: str) -> int:
 
 def observation_size(run_file: str) -> int:
     """Numbers in a row of the observation (d) of the run that `run_file` describes. Raises RuntimeError."""
+
+def exchange(one: Path, other: Path) -> None:
+    """Give two paths each other's names, from one moment to the next. Raises OSError."""

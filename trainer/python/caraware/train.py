@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from caraware.run.process import HandoverRole, StopSignal, read_run, run_process
+from caraware.run.process import HandoverRole, StopSignal, SuccessorClaims, read_run, run_process
 
 if TYPE_CHECKING:
     from caraware.learn.ranks import Ranks
@@ -40,6 +40,9 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
     else:
         learner = _resumed(config, together)
     first_ticks = [learner.first_tick(index) if learner else 0 for index in range(len(config.environments))]
+    if learner is not None:
+        positions = enumerate(position.committed() for position in learner.positions())
+        config.commits.begin(learner.shape().learner, dict(positions))
     channel = Channel(str(run_file), first_ticks[0])
     loop = TrainingLoop(
         channel,
@@ -47,6 +50,7 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
         lambda: stop.requested,
         others=[channel.in_environment(index, tick) for index, tick in enumerate(first_ticks) if index > 0],
         leave_requested=lambda: stop.leave_requested,
+        leave_now_requested=lambda: stop.leave_now_requested,
         learner=learner,
         ranks=together,
     )
@@ -61,36 +65,59 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
 
 def _resumed(config: "RunConfig", ranks: "Ranks") -> "Learner | None":
     """A learner continued from the checkpoint that the run begins with; None if the run starts from the beginning."""
+    from caraware.learn.stored import PPO
     from caraware.run.checkpoint import remove_partial
+    from caraware.run.continuation import Continuation
     from caraware.run.learner import Learner
     from caraware.run.manifest import read_manifest
 
     if config.resume_from is None:
         return None
-    remove_partial(config.run_dir / "checkpoints")
-    learner = Learner.begin(config, read_manifest(config.resume_from).observation_size, ranks)
-    log.info("resumed from %s at tick %d", config.resume_from, learner.first_tick())
+    folder = config.run_dir / "checkpoints"
+    remove_partial(folder)
+    found = Continuation.find(folder, config.commits, PPO)
+    # In a run in which other learners took turns, the checkpoint that it is resumed from may be another's.
+    resume_from = found.checkpoint if found.others else config.resume_from
+    size = read_manifest(config.resume_from).observation_size
+    learner = Learner.begin(replace(config, resume_from=resume_from), size, ranks)
+    learner.follow(found)
+    log.info("resumed from %s at tick %d", resume_from or "the beginning", learner.first_tick())
     return learner
 
 
 def _successor(run_file: Path, config: "RunConfig", role: HandoverRole) -> "Learner | None":
     """A learner continued from the run's newest sound checkpoint; None if the supervisor cancels the handover."""
     from caraware import _native
+    from caraware.learn.stored import PPO
     from caraware.run.checkpoint import remove_partial
+    from caraware.run.continuation import Continuation, remove_uncommitted
     from caraware.run.learner import Learner
-    from caraware.run.manifest import newest_sound_checkpoint
 
     size, folder = _native.observation_size(str(run_file)), config.run_dir / "checkpoints"
     if role.gets_ready:
         # Errors in the settings or the checkpoint show here, while the predecessor is still learning.
-        trial = replace(config, resume_from=role.checkpoint or newest_sound_checkpoint(folder))
-        Learner.begin(trial, size).warm_up()
-        if not role.wait_for_turn():
+        found = Continuation.find(folder, config.commits, PPO)
+        Learner.begin(replace(config, resume_from=role.checkpoint or found.checkpoint), size).warm_up()
+        claims = SuccessorClaims(
+            schema_version=_native.SCHEMA_VERSION,
+            observation_size=size,
+            task=config.task.name,
+            action_size=config.task.actions.size,
+            environments=len(config.environments),
+            decides_lessons=True,
+            first_tick=found.first_tick(),
+        )
+        if not role.wait_for_turn(claims):
             return None
     remove_partial(folder)
-    newest = newest_sound_checkpoint(folder)
-    learner = Learner.begin(replace(config, resume_from=newest or config.resume_from), size)
-    log.info("continues from %s at tick %d", newest.name if newest else "the beginning", learner.first_tick())
+    remove_uncommitted(folder, config.commits, PPO)
+    found = Continuation.find(folder, config.commits, PPO)
+    # Before the first checkpoint of the run it is the one that the run begins with.
+    beginning = None if found.others else config.resume_from
+    learner = Learner.begin(replace(config, resume_from=found.checkpoint or beginning), size)
+    learner.follow(found)
+    name = found.checkpoint.name if found.checkpoint else "the beginning"
+    log.info("continues from %s at tick %d", name, learner.first_tick())
     if role.checkpoint is not None:
         learner.take_parameters(role.checkpoint)
     return learner

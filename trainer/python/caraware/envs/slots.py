@@ -225,9 +225,9 @@ class Slots:
         return self._answered
 
     def commit(self) -> None:
-        """Reports that your checkpoint contains what was learned so far: earlier ticks need not be delivered again."""
+        """Your saved state contains what was learned so far: earlier ticks never come again (`Channel.commit`)."""
         if self._answered >= 0:
-            self.source.channel.committed(self._answered)
+            self.source.channel.commit(self._answered)
 
     def close(self) -> None:
         """Leaves the run."""

@@ -1,7 +1,7 @@
 """Stable-Baselines3's PPO replaces the trainer of a running simulation and continues with its networks.
 
 `caraware handover RUN --set trainer.module=caraware.examples.sb3_takeover`: it gets ready beside the old trainer, takes
-its networks out of its last checkpoint, and continues with the tick after it. docs/environments.md
+its networks out of its last checkpoint, and continues with the first tick that is not committed. docs/learners.md
 """
 
 import json
@@ -18,53 +18,80 @@ from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
 from caraware.envs import CarAwareVecEnv, RunEndedError
+from caraware.envs.settings import FaceSettings
 from caraware.examples.sb3_ppo import ppo
 from caraware.ipc.channel import Channel
-from caraware.run.manifest import newest_sound_checkpoint, read_manifest
-from caraware.run.process import HandoverRole
+from caraware.ipc.commits import CommitLog
+from caraware.ipc.run_file import RunFile
+from caraware.run.continuation import own_checkpoints
+from caraware.run.manifest import read_manifest
+from caraware.run.process import HandoverRole, SuccessorClaims
 
-MODEL, PLACE = "sb3_takeover.zip", "sb3_takeover.json"
-"""In the run directory: the model, and the first tick that it has not learned from."""
+FOLDER = "sb3_takeover"
+"""In the run directory: a model for each of the newest commits, named by the tick up to which it has learnt."""
 
 
 class SaveAndCommit(BaseCallback):
-    """After every update: the model on disk, then the report that earlier ticks need not be delivered again."""
+    """After every update: the model on disk, then the commit of its ticks. What comes after comes again."""
 
-    def __init__(self, env: CarAwareVecEnv, run_dir: Path) -> None:
+    def __init__(self, env: CarAwareVecEnv, folder: Path) -> None:
         super().__init__()
-        self._env, self._run_dir = env, run_dir
+        self._env, self._folder = env, folder
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
+        # A rollout begins behind the update that has learnt from the one before; the first has none before it.
         if self.num_timesteps > 0:
-            save(self.model, self._env, self._run_dir)
+            kept = save(self.model, self._folder, self._env.slots.answered)
             self._env.slots.commit()
+            for old in set(self._folder.glob("*.zip")) - {kept}:
+                old.unlink()
 
 
-def save(model: BaseAlgorithm, env: CarAwareVecEnv, run_dir: Path) -> None:
-    """Both files under temporary names, then renamed; the model first: the place never says too much."""
-    model.save(run_dir / f".partial.{MODEL}")
-    (run_dir / f".partial.{MODEL}").rename(run_dir / MODEL)
-    (run_dir / f".partial.{PLACE}").write_text(json.dumps({"tick": env.slots.answered + 1}))
-    (run_dir / f".partial.{PLACE}").rename(run_dir / PLACE)
+def save(model: BaseAlgorithm, folder: Path, tick: int) -> Path:
+    """Put the model on disk under the name of its newest tick, complete or not at all."""
+    folder.mkdir(exist_ok=True)
+    file, partial = model_file(folder, tick), folder / ".partial"
+    with partial.open("wb") as stream:
+        model.save(stream)
+        stream.flush()
+        os.fsync(stream.fileno())
+    partial.rename(file)
+    return file
 
 
-def first_tick(run_dir: Path) -> int:
-    """The first tick that neither an earlier process of this module nor the trainer before it has learned from."""
-    if (run_dir / PLACE).exists():
-        return int(json.loads((run_dir / PLACE).read_text())["tick"])
-    checkpoint = newest_sound_checkpoint(run_dir / "checkpoints")
-    return read_manifest(checkpoint).counters.committed_tick + 1 if checkpoint else 0
+def model_file(folder: Path, tick: int) -> Path:
+    """The model that has learnt up to `tick`."""
+    return folder / f"{tick}.zip"
+
+
+def fitting_checkpoint(run: RunFile) -> Path | None:
+    """The newest checkpoint of our PPO, whose networks this learner begins with. Exits where they are no MLP."""
+    folder = Path(run["run_dir"], "checkpoints")
+    checkpoint = next(own_checkpoints(folder, CommitLog(run), "ppo"), None)
+    if checkpoint is not None and (network := read_manifest(checkpoint).network) != "mlp":
+        raise SystemExit(f"{checkpoint}: its network is {network}; this example continues from an MLP")
+    return checkpoint
+
+
+def claims(run: RunFile) -> SuccessorClaims:
+    """One environment of any task, without the lessons of a curriculum."""
+    settings = FaceSettings.from_run(run)
+    return SuccessorClaims(
+        observation_size=settings.fields.width,
+        action_size=settings.task.actions.size,
+        task=settings.task.name,
+        environments=1,
+        decides_lessons=False,
+    )
 
 
 def take_networks(model: PPO, checkpoint: Path) -> None:
     """Give the model the networks of a checkpoint of `caraware.train`: their layers, activations and parameters."""
     stored, policy = load_file(checkpoint / "parameters.safetensors"), model.policy
     manifest = read_manifest(checkpoint)
-    if manifest.network != "mlp":
-        raise SystemExit(f"{checkpoint}: its network is {manifest.network}; this example continues from an MLP")
     activation = {"relu": nn.ReLU, "tanh": nn.Tanh}[manifest.activation]
     for name, last, head in (("policy", nn.Tanh, nn.Tanh), ("value", activation, nn.Identity)):
         layers = sum(key.startswith(f"{name}.layer") and key.endswith("weight") for key in stored)
@@ -92,28 +119,26 @@ def take_networks(model: PPO, checkpoint: Path) -> None:
 def main(run_file: str) -> int:
     """Take over the run, and learn until it ends or is stopped."""
     role = HandoverRole.from_environment()
-    if role.gets_ready and not role.wait_for_turn():
+    run: RunFile = json.loads(Path(run_file).read_text())
+    checkpoint = fitting_checkpoint(run)
+    if role.gets_ready and not role.wait_for_turn(claims(run)):
         return 0
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    run_dir = Path(json.loads(Path(run_file).read_text())["run_dir"])
-    begin = first_tick(run_dir)
-    channel = Channel(run_file, begin)
-    trainer = channel.run["config"]["trainer"]
+    # Ticks since the last commit are not learnt: a successor gets them again.
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
+    channel = Channel(run_file)
+    trainer, folder = run["config"]["trainer"], Path(run["run_dir"], FOLDER)
     env = CarAwareVecEnv(channel, evaluation_policy=lambda obs: model.predict(obs, deterministic=True)[0])
     model = ppo(env, trainer["horizon"], trainer["batch_size"])
-    checkpoint = newest_sound_checkpoint(run_dir / "checkpoints")
     if checkpoint is not None:
         take_networks(model, checkpoint)
-    if (run_dir / MODEL).exists():
-        model.set_parameters(str(run_dir / MODEL))
-    print(f"Stable-Baselines3 takes over at tick {begin}", file=sys.stderr, flush=True)
+    if (own := channel.own_tick()) is not None:
+        model.set_parameters(str(model_file(folder, own)))
+    print(f"Stable-Baselines3 takes over at tick {channel.first_tick}", file=sys.stderr, flush=True)
     try:
-        model.learn(sys.maxsize, callback=SaveAndCommit(env, run_dir))
+        model.learn(sys.maxsize, callback=SaveAndCommit(env, folder))
     except RunEndedError:
         print("run complete", file=sys.stderr)
-    finally:
-        save(model, env, run_dir)
-        env.close()
+    env.close()
     return 0
 
 

@@ -20,7 +20,7 @@ from caraware.learn.adam import Adam
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
 from caraware.learn.flat import FlatParameters
 from caraware.learn.ppo import NonFiniteLoss
-from caraware.learn.stored import OPTIMISER, PARAMETERS, RANDOM, LearnerShape, StoredTensors
+from caraware.learn.stored import FUSION, OPTIMISER, PARAMETERS, RANDOM, LearnerShape, StoredTensors
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class FusionLearner:
     def shape(self) -> LearnerShape:
         """See `StoredLearner.shape`."""
         config = self.config
-        return LearnerShape("fusion", self.observation_size, str(config.network), config.hidden, config.activation)
+        return LearnerShape(FUSION, self.observation_size, str(config.network), config.hidden, config.activation)
 
     def schedules(self) -> dict[str, float]:
         """See `StoredLearner.schedules`."""

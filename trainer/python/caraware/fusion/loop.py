@@ -16,11 +16,13 @@ from caraware.fusion.learner import Episode, FusionLearner, FusionStats
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn import rewards
 from caraware.learn.ppo import NonFiniteLoss
+from caraware.learn.stored import FUSION
 from caraware.report.evaluation import Evaluation, Mean
 from caraware.report.metrics import Metrics, TrainingPoint
 from caraware.report.plots import plot_headline
 from caraware.run.checkpoint import Keeping, TrainingHistory, load_checkpoint, load_history, save_checkpoint
 from caraware.run.config import RunConfig
+from caraware.run.continuation import Continuation
 from caraware.run.manifest import Counters
 from caraware.run.report_part import write_part
 from caraware.run.sample_count import SampleCount
@@ -37,13 +39,19 @@ class Beginning:
     """How far training has come when a process begins."""
 
     counters: Counters = field(default_factory=lambda: Counters(0, 0, 0, -1))
-    """The committed tick is always the last of an episode."""
+    """The committed tick is always the last of an episode, unless another learner has committed it."""
     history: TrainingHistory = field(default_factory=TrainingHistory)
 
     @classmethod
     def load(cls, checkpoint: Path, learner: FusionLearner) -> "Beginning":
         """Continue `learner` from a checkpoint. Raises `CheckpointError`."""
         return cls(load_checkpoint(checkpoint, learner), load_history(checkpoint))
+
+    def follow(self, continuation: Continuation, learner: FusionLearner) -> "Beginning":
+        """Continue where other learners have come since."""
+        counters, history = continuation.follow(self.counters, self.history)
+        learner.updates = counters.updates
+        return Beginning(counters, history)
 
 
 @dataclass
@@ -81,11 +89,16 @@ class FusionLoop:
         beginning: Beginning,
         stop_requested: Callable[[], bool],
         leave_requested: Callable[[], bool] = lambda: False,
+        leave_now_requested: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Continue from `beginning`. A request to leave is met where an episode ends, or in an evaluation."""
+        """Continue from `beginning`. A request to leave is met where an episode ends, or in an evaluation.
+
+        It is met at once where no tick comes, and where it is to be met now.
+        """
         assert config.sensors is not None
         self._channel, self._config, self._learner = channel, config, learner
         self._stop_requested, self._leave_requested = stop_requested, leave_requested
+        self._leave_now_requested = leave_now_requested
         centre_x_m, centre_y_m = learner.estimator.centre_m.tolist()
         self._estimating = Estimating(learner, Carrier(config.sensors, (centre_x_m, centre_y_m)))
         counters, history = beginning.counters, beginning.history
@@ -107,7 +120,9 @@ class FusionLoop:
     def run(self) -> bool:
         """Until the last tick or a request to stop. False if it left to a successor instead, after a commit."""
         while not (self._ended or self._left or self._stop_requested()):
-            for obs in self._channel.receive(RECEIVE_TIMEOUT_S):
+            ticks = self._channel.receive(RECEIVE_TIMEOUT_S)
+            self._left = self._leave_now_requested() or (not ticks and self._leave_requested())
+            for obs in () if self._left else ticks:
                 if self._stream.ledger.first_sight(obs.tick):
                     self._process(obs)
                 self._channel.consumed(obs.tick)
@@ -215,6 +230,7 @@ class FusionLoop:
         )
         folder, keep = self._config.run_dir / "checkpoints", Keeping.of(self._config.trainer)
         written = save_checkpoint(folder, self._learner, counters, self._config.config_sha256, keep, history)
+        self._config.commits.record(FUSION, {0: position.committed()})
         self._saved_updates = self._learner.updates
         if position.committed_tick >= 0:
             self._channel.committed(position.committed_tick)

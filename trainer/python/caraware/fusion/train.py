@@ -8,23 +8,26 @@ that continues from it ends in the same bytes. The handover between processes: `
 import logging
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from caraware.fusion.carrier import COLUMNS, Carrier
 from caraware.fusion.estimating import FusionPlayer
 from caraware.fusion.learner import FusionConfig, FusionLearner
 from caraware.fusion.loop import Beginning, FusionLoop
+from caraware.ipc.commits import CommitLog
 from caraware.ipc.run_file import RunFile
 from caraware.learn.config import ConfigError
+from caraware.learn.stored import FUSION
 from caraware.run.checkpoint import load_checkpoint, remove_partial
 from caraware.run.config import RunConfig
-from caraware.run.manifest import newest_sound_checkpoint
-from caraware.run.process import HandoverRole, StopSignal, read_run, run_process
+from caraware.run.continuation import Continuation, remove_uncommitted
+from caraware.run.process import HandoverRole, StopSignal, SuccessorClaims, read_run, run_process
 
 log = logging.getLogger(__name__)
 
 
-def begin(run: RunFile, observation_size: int, resume_from: Path | None) -> tuple[RunConfig, FusionLearner, Beginning]:
+def begin(run: RunFile, observation_size: int, found: Continuation) -> tuple[RunConfig, FusionLearner, Beginning]:
     """The learner of a run file, new or continued. Raises `ConfigError` and `CheckpointError`."""
     config = RunConfig.from_run(run)
     if len(config.environments) > 1:
@@ -33,8 +36,10 @@ def begin(run: RunFile, observation_size: int, resume_from: Path | None) -> tupl
             "start it without --envs",
         )
     learner = _learner(run, config, observation_size)
-    checkpoint = resume_from or config.resume_from
-    return config, learner, Beginning.load(checkpoint, learner) if checkpoint else Beginning()
+    # Before the first checkpoint of the run it is the one that the run begins with.
+    checkpoint = found.checkpoint or (None if found.others else config.resume_from)
+    beginning = Beginning.load(checkpoint, learner) if checkpoint else Beginning()
+    return config, learner, beginning.follow(found, learner)
 
 
 def player(run: RunFile, config: RunConfig, observation_size: int) -> FusionPlayer:
@@ -60,21 +65,46 @@ def train(run_file: Path, stop: StopSignal, role: HandoverRole) -> None:
     from caraware.ipc.channel import Channel as SharedChannel
 
     size, folder = _native.observation_size(str(run_file)), Path(run["run_dir"]) / "checkpoints"
+    commits = CommitLog(run)
     if role.gets_ready:
         # Errors in the settings or the checkpoint show here, while the predecessor is still learning.
-        begin(run, size, role.checkpoint or newest_sound_checkpoint(folder))
-        if not role.wait_for_turn():
+        found = Continuation.find(folder, commits, FUSION)
+        begin(run, size, replace(found, checkpoint=role.checkpoint or found.checkpoint))
+        claims = SuccessorClaims(
+            schema_version=_native.SCHEMA_VERSION,
+            observation_size=size,
+            task="localisation",
+            environments=1,
+            decides_lessons=False,
+            first_tick=found.first_tick(),
+        )
+        if not role.wait_for_turn(claims):
             return
-    # Continue from the run's newest checkpoint, or from the one that the run begins with.
     remove_partial(folder)
-    config, learner, beginning = begin(run, size, newest_sound_checkpoint(folder) if role.replaces else None)
+    if role.replaces:
+        remove_uncommitted(folder, commits, FUSION)
+    found = Continuation.find(folder, commits, FUSION)
+    if not (role.replaces or found.others):
+        # The supervisor has chosen the checkpoint that a resumed run begins with.
+        found = replace(found, checkpoint=None)
+    config, learner, beginning = begin(run, size, found)
     if role.checkpoint is not None:
         updates = learner.updates
         load_checkpoint(role.checkpoint, learner)
         learner.updates = updates
     log.info("%d columns, %s, %s", COLUMNS, config.trainer, learner.fusion)
-    channel = SharedChannel(str(run_file), beginning.counters.committed_tick + 1)
-    loop = FusionLoop(channel, config, learner, beginning, lambda: stop.requested, lambda: stop.leave_requested)
+    position = beginning.history.first_position(beginning.counters).committed()
+    commits.begin(FUSION, {0: position})
+    channel = SharedChannel(str(run_file), position.ticks)
+    loop = FusionLoop(
+        channel,
+        config,
+        learner,
+        beginning,
+        lambda: stop.requested,
+        lambda: stop.leave_requested,
+        lambda: stop.leave_now_requested,
+    )
     if role.checkpoint is not None:
         loop.commit()
     if not loop.run():

@@ -6,6 +6,7 @@ import json
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -15,8 +16,9 @@ from torch import Tensor
 
 from caraware import _native
 from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Scalar, UInt32Array, UInt64Array
+from caraware.ipc.commits import CommitLog, CommittedPosition, EpisodeStarts
 from caraware.ipc.pointcloud import PointCloud
-from caraware.ipc.run_file import RunFile
+from caraware.ipc.run_file import RunFile, setting
 from caraware.ipc.stream import TrainingReport
 
 if TYPE_CHECKING:
@@ -227,23 +229,44 @@ class Channel:
     and may have places in several.
     """
 
-    def __init__(self, run_file: str, first_tick: int = 0, *, outside: bool = False) -> None:
-        """Join the run; ticks come from `first_tick` on, however far the simulation is: all before are committed."""
-        self.first_tick = first_tick
-        self._hold(_native.Attachment(run_file, first_tick, outside=outside))
+    def __init__(
+        self, run_file: str, first_tick: int | None = None, *, learner: str | None = None, outside: bool = False
+    ) -> None:
+        """Join the run; ticks come from the one after the last commit of any learner on, whichever it was.
+
+        `learner` is the name under which this one commits; without, that of its module. A learner whose checkpoint is
+        older than its last commit gives the `first_tick` to begin with: later ones are not learnt, and come again.
+
+        Raises `CommitLogError`, and `RuntimeError` where the tick is not in the journal any more.
+        """
+        run: RunFile = json.loads(Path(run_file).read_text())
+        self.learner = learner or str(setting(run, "trainer.module", str))
+        self._commits = CommitLog(run)
+        begin = self._begin(0, first_tick)
+        self._hold(_native.Attachment(run_file, begin, outside=outside))
+
+    def _begin(self, environment: int, first_tick: int | None) -> int:
+        """Where this environment begins; what has been committed beyond that is not learnt any more."""
+        position = self._commits.positions()[environment]
+        if first_tick is not None and first_tick < position.ticks:
+            position = position.at_most(first_tick)
+            self._commits.begin(self.learner, {environment: position})
+        self._environment, self.first_tick = environment, position.ticks if first_tick is None else first_tick
+        self._starts = EpisodeStarts(position.episode, position.episode_tick)
+        return self.first_tick
 
     def _hold(self, attachment: _native.Attachment) -> None:
         self._attachment = attachment
         self.run: RunFile = json.loads(attachment.run_json)
 
-    def in_environment(self, index: int, first_tick: int = 0) -> Channel:
+    def in_environment(self, index: int, first_tick: int | None = None) -> Channel:
         """This trainer's place in another environment of the run (`run.envs`); this one is environment 0's.
 
         Each has its own ticks, credits and commits. A trainer has to take a place in every environment.
         """
         channel = object.__new__(Channel)
-        channel.first_tick = first_tick
-        channel._hold(self._attachment.in_environment(index, first_tick))
+        channel.learner, channel._commits = self.learner, self._commits
+        channel._hold(self._attachment.in_environment(index, channel._begin(index, first_tick)))
         return channel
 
     def wait_for_any(self, timeout_s: float) -> None:
@@ -259,7 +282,10 @@ class Channel:
         """
         if self._attachment.ended:
             raise StreamEndedError
-        return [Observation(block) for block in self._attachment.receive(timeout_s, busy=busy)]
+        ticks = [Observation(block) for block in self._attachment.receive(timeout_s, busy=busy)]
+        for obs in ticks:
+            self._starts.note(obs)
+        return ticks
 
     def lease(self) -> _native.Lease:
         """The observations one by one, each lent until the next is taken: a microsecond from publish to tensor.
@@ -282,8 +308,24 @@ class Channel:
         """Gives the simulation credit for all ticks up to and including `tick`."""
         self._attachment.consumed(tick)
 
+    def commit(self, tick: int) -> None:
+        """What this learner has learnt from all ticks up to and including `tick` is on disk: they never come again.
+
+        This is the moment that counts: `commits.json` is renamed into place. Save first, under a name that has the
+        tick (`own_tick`), and remove older states afterwards. Raises `OSError` and `CommitLogError`.
+        """
+        episode, episode_tick = self._starts.after(tick)
+        position = CommittedPosition(tick + 1, episode, episode_tick)
+        self._commits.record(self.learner, {self._environment: position})
+        self.committed(tick)
+
+    def own_tick(self) -> int | None:
+        """The newest tick that this learner itself has committed in this run, at any time; None before its first."""
+        own = self._commits.own(self.learner)
+        return own.positions[self._environment].ticks - 1 if own else None
+
     def committed(self, tick: int) -> None:
-        """All ticks up to and including `tick` are in a checkpoint that has been renamed into place."""
+        """Publish a commit that is in the record: the journal need not keep all ticks up to and including `tick`."""
         self._attachment.committed(tick)
 
     def decided(self, lessons: int, since: int, stage: int) -> None:

@@ -148,7 +148,7 @@ class Channel(Protocol):
         """Give the producer credit up to and including `tick`."""
 
     def committed(self, tick: int) -> None:
-        """Say that all ticks up to and including `tick` are in a checkpoint: they need not be delivered again."""
+        """Publish a commit that is in the record: all ticks up to and including `tick` are learnt."""
 
     def decided(self, lessons: int, since: int, stage: int) -> None:
         """Say that all lessons below `lessons` have a stage of the curriculum, those from `since` on `stage`."""

@@ -27,7 +27,7 @@ from caraware.learn.gae import generalised_advantage
 from caraware.learn.networks import GaussianPolicy, entropy, log_probability
 from caraware.learn.prediction import Predictor, RowPredictor
 from caraware.learn.rollout import Horizon
-from caraware.learn.stored import MEMORY, OPTIMISER, PARAMETERS, RANDOM, LearnerShape, StoredTensors
+from caraware.learn.stored import MEMORY, OPTIMISER, PARAMETERS, PPO, RANDOM, LearnerShape, StoredTensors
 from caraware.tasks.contract import Task, TaskStep
 
 SMALLEST_DEVIATION = 1e-8
@@ -552,7 +552,7 @@ class Ppo:
     def shape(self) -> LearnerShape:
         """See `StoredLearner.shape`."""
         config = self.config
-        return LearnerShape("ppo", self.observation_size, str(config.network), config.hidden, config.activation)
+        return LearnerShape(PPO, self.observation_size, str(config.network), config.hidden, config.activation)
 
     def schedules(self) -> dict[str, float]:
         """See `StoredLearner.schedules`; before the first update, those of that one."""

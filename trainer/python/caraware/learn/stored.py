@@ -14,6 +14,9 @@ MEMORY = "memory.safetensors"
 SUPERVISED = "supervised.safetensors"
 """The baseline beside PPO. A checkpoint of a run without it has none; then the baseline starts from the beginning."""
 
+PPO, FUSION = "ppo", "fusion"
+"""The learners of this project: what their checkpoints and commits are named by."""
+
 StoredTensors = dict[str, dict[str, Tensor]]
 """Tensors by file, then by name."""
 
@@ -23,7 +26,7 @@ class LearnerShape:
     """What a checkpoint and the learner that continues from it must agree on."""
 
     learner: str
-    """`ppo` or `fusion`."""
+    """`PPO` or `FUSION`."""
     observation_size: int
     network: str
     hidden: tuple[int, ...]

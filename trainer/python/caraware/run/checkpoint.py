@@ -2,8 +2,8 @@
 
 import hashlib
 import json
-import os
 import shutil
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from caraware import _native
 from caraware.learn.config import TrainerConfig
 from caraware.learn.stored import MEMORY, RANDOM, SUPERVISED, LearnerShape, StoredLearner, StoredTensors
 from caraware.report.evaluation import EvaluationResult
@@ -28,10 +29,12 @@ from caraware.run.manifest import (
     Counters,
     Manifest,
     best_checkpoint,
+    checkpoint_name,
     own_hash,
     read_manifest,
     verified,
 )
+from caraware.run.storage import sync_directory, when_there_is_space, write_synced, write_whole
 from caraware.run.stream_position import StreamPosition
 
 POINTS = "points.safetensors"
@@ -104,13 +107,34 @@ def save_checkpoint(
     keep: Keeping,
     history: TrainingHistory | None = None,
     of_other_ranks: StoredTensors | None = None,
+    stop_requested: Callable[[], bool] = lambda: False,
 ) -> Path:
     """Write `folder/update-NNNNNN`, then point `folder/latest` at it; older ones that `keep` does not name are removed.
 
-    Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there.
+    Everything is on disk under a temporary name before the rename, so a checkpoint is complete or not there. On a full
+    disk it waits until there is space, or until a stop is requested; then it raises `OSError`.
     """
     target = folder / checkpoint_name(counters.updates)
-    temporary = folder / f".{target.name}.partial"
+
+    def save_all() -> None:
+        _save_all(target, learner, counters, config_sha256, history, of_other_ranks)
+
+    when_there_is_space(target, save_all, stop_requested)
+    when_there_is_space(folder / LATEST, lambda: _point(folder, LATEST, target), stop_requested)
+    _remove_old(folder, learner.shape().learner, keep)
+    return target
+
+
+def _save_all(
+    target: Path,
+    learner: StoredLearner,
+    counters: Counters,
+    config_sha256: str,
+    history: TrainingHistory | None,
+    of_other_ranks: StoredTensors | None,
+) -> None:
+    """Write every file of a checkpoint under a temporary name, and rename it. Raises `OSError`."""
+    temporary = target.parent / f".{target.name}.partial"
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     # The tensors of the learner, and of ranks that learn with it.
@@ -136,23 +160,20 @@ def save_checkpoint(
     entries = asdict(manifest)
     _write(temporary / MANIFEST, json.dumps(entries | {OWN_HASH: own_hash(entries)}, indent=2).encode())
     # From one moment to the next it is there under its name.
-    _sync_directory(temporary)
+    sync_directory(temporary)
     if target.exists():
-        shutil.rmtree(target)
-    temporary.rename(target)
-    _point(folder, LATEST, target)
-    _remove_old(folder, keep)
-    return target
-
-
-def checkpoint_name(updates: int) -> str:
-    """Of the directory of the checkpoint after so many updates."""
-    return f"update-{updates:06d}"
+        # The name belongs to one of the two at any moment.
+        _native.exchange(temporary, target)
+        shutil.rmtree(temporary)
+    else:
+        temporary.rename(target)
+    sync_directory(target.parent)
 
 
 def mark_best(checkpoint: Path) -> None:
     """Let `best` name this checkpoint; it stays until another is better."""
-    _point(checkpoint.parent, BEST, checkpoint)
+    folder = checkpoint.parent
+    when_there_is_space(folder / BEST, lambda: _point(folder, BEST, checkpoint))
 
 
 def load_checkpoint(checkpoint: Path, learner: StoredLearner) -> Counters:
@@ -224,31 +245,30 @@ def _read_tensors(file: Path, sha256: str) -> dict[str, Tensor]:
 
 def _point(folder: Path, name: str, checkpoint: Path) -> None:
     """Let the file `name` name a checkpoint, from one moment to the next."""
-    _write(folder / f".{name}.partial", checkpoint.name.encode())
-    (folder / f".{name}.partial").rename(folder / name)
-    _sync_directory(folder)
+    write_whole(folder / name, checkpoint.name.encode())
 
 
 def _write(file: Path, content: bytes) -> str:
     """Write and flush to disk; the SHA-256 of the content."""
-    with file.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
+    write_synced(file, content)
     return hashlib.sha256(content).hexdigest()
 
 
-def _sync_directory(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _remove_old(folder: Path, keep: Keeping) -> None:
+def _remove_old(folder: Path, learner: str, keep: Keeping) -> None:
+    """Only those of `learner`: another one continues from its own when it is handed the run again."""
     best = best_checkpoint(folder)
-    for old in sorted(folder.glob("update-*"))[: -keep.newest]:
+    own = [old for old in sorted(folder.glob("update-*")) if _is_of(old, learner)]
+    for old in own[: -keep.newest]:
         stays = keep.every > 0 and int(old.name.removeprefix("update-")) % keep.every == 0
         if old != best and not stays:
             shutil.rmtree(old)
+
+
+def _is_of(checkpoint: Path, learner: str) -> bool:
+    """Whether a learner wrote it; a checkpoint that cannot be read is of any, and old when its turn comes."""
+    if not checkpoint.name.removeprefix("update-").isdecimal():
+        return False
+    try:
+        return read_manifest(checkpoint).learner == learner
+    except CheckpointError:
+        return True

@@ -1,18 +1,18 @@
 """When and what a training run commits: its environments, on rank 0 those of all ranks, and the best policy."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from caraware.learn.ranks import Ranks
 from caraware.learn.stored import MEMORY, RANDOM, StoredTensors
 from caraware.report.evaluation import EvaluationResult
 from caraware.report.metrics import Metrics
-from caraware.run.checkpoint import Keeping, TrainingHistory, checkpoint_name, mark_best, save_checkpoint
+from caraware.run.checkpoint import Keeping, TrainingHistory, mark_best, save_checkpoint
 from caraware.run.config import RunConfig
 from caraware.run.curriculum import Curriculum
 from caraware.run.environment import Environment
 from caraware.run.learner import Learner
-from caraware.run.manifest import Counters
+from caraware.run.manifest import Counters, checkpoint_name
 from caraware.run.stream_position import StreamPosition
 
 log = logging.getLogger("caraware.run.loop")
@@ -28,10 +28,13 @@ class CheckpointWriter:
         environments: Sequence[Environment],
         curriculum: Curriculum,
         metrics: Metrics,
+        stop_requested: Callable[[], bool] = lambda: False,
     ) -> None:
+        """A request to stop ends the wait for space on a full disk."""
+        self._stop_requested = stop_requested
         self._config, self._ranks, self._environments = config, ranks, environments
         self._curriculum, self._metrics = curriculum, metrics
-        self._folder = config.run_dir / "checkpoints"
+        self._folder, self._commits = config.run_dir / "checkpoints", config.commits
         self.saved_updates = -1
         """Updates in the newest checkpoint; -1 before the first."""
 
@@ -45,8 +48,12 @@ class CheckpointWriter:
         others, of_other_ranks = self._of_other_ranks(learner)
         history = self._history(vehicles, others)
         keep, config_sha256 = Keeping.of(self._config.trainer), self._config.config_sha256
-        saved = save_checkpoint(self._folder, learner, counters, config_sha256, keep, history, of_other_ranks)
+        saved = save_checkpoint(
+            self._folder, learner, counters, config_sha256, keep, history, of_other_ranks, self._stop_requested
+        )
         log.info("checkpoint %s, learned up to tick %d", saved.name, progress.committed_tick)
+        positions = [environment.progress.position().committed() for environment in self._environments]
+        self._commits.record(learner.shape().learner, dict(enumerate(positions)))
         # Ticks may be forgotten when all ranks have written their checkpoints.
         self._ranks.gather(None)
         self.saved_updates = counters.updates

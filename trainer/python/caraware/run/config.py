@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from caraware.baselines.noise import SensorNoise
+from caraware.ipc.commits import CommitLog
 from caraware.ipc.run_file import BlackoutPolicy, RunFile, setting
 from caraware.learn.config import ConfigError, EstimateTimes, MapBounds, TrainerConfig
 from caraware.run.curriculum import Stage
@@ -38,6 +39,8 @@ class RunConfig:
     """The simulation keeps to the wall clock: there is time for what only a watcher sees."""
     resume_from: Path | None
     """A checkpoint directory to continue from."""
+    commits: CommitLog
+    """Which learner has learnt which ticks of the run."""
 
     @classmethod
     def from_run(cls, run: RunFile) -> "RunConfig":
@@ -61,6 +64,7 @@ class RunConfig:
             environments=tuple(range(first_env, first_env + setting(run, "run.envs", int))),
             is_paced=setting(run, "run.real_time_factor", float) > 0.0,
             resume_from=Path(beginning["checkpoint"]) if beginning else None,
+            commits=CommitLog(run),
         )
 
     def shows_estimates(self) -> bool:

@@ -12,6 +12,7 @@ from caraware.learn.stored import SUPERVISED, LearnerShape, StoredTensors
 from caraware.learn.supervised import Supervised
 from caraware.run.checkpoint import TrainingHistory, load_checkpoint, load_history
 from caraware.run.config import RunConfig
+from caraware.run.continuation import Continuation
 from caraware.run.manifest import Counters
 from caraware.run.stream_position import StreamPosition
 from caraware.tasks.localisation import Localisation
@@ -47,6 +48,15 @@ class Learner:
     def load(self, checkpoint: Path) -> None:
         """Continue from a checkpoint. Raises `CheckpointError`."""
         self.counters, self.history = load_checkpoint(checkpoint, self), load_history(checkpoint)
+
+    def follow(self, continuation: Continuation) -> None:
+        """Continue where other learners have come since the checkpoint."""
+        counters, history = continuation.follow(self.counters, self.history)
+        if (counters, history) == (self.counters, self.history):
+            return
+        self.counters, self.history, self.ppo.updates = counters, history, counters.updates
+        # What the networks remember is of the ticks before those that others have learnt.
+        self.ppo.restore_memory({})
 
     def take_parameters(self, checkpoint: Path) -> None:
         """Parameters, moments and generators of any checkpoint; the count of updates and ticks stays this run's."""

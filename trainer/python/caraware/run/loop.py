@@ -43,18 +43,21 @@ class TrainingLoop:
         *,
         others: Sequence[Channel] = (),
         leave_requested: Callable[[], bool] = lambda: False,
+        leave_now_requested: Callable[[], bool] = lambda: False,
         learner: Learner | None = None,
         ranks: Ranks | None = None,
     ) -> None:
         """`channel` is environment 0's, `others` those of the further ones; `ranks` are the trainers learning together.
 
-        Without a `learner`, one begins at the first tick. A request to leave is met where a successor can continue.
+        Without a `learner`, one begins at the first tick. A request to leave is met where nothing has to be learnt
+        again; at once where no tick comes (a paused run), and where it is to be met now.
         """
         self._channel, self._config, self._stop_requested = channel, config, stop_requested
         self._ranks = ranks or Ranks()
         self._environments = [Environment(i, each, config) for i, each in enumerate((channel, *others))]
         self._phases = [EvaluationPhase(config, self._number(i)) for i in range(len(self._environments))]
         self._leave_requested, self._left = leave_requested, False
+        self._leave_now_requested, self._idle_waits = leave_now_requested, 0
         self._task, self._metrics = config.task, Metrics(config.run_dir / "tensorboard", config.task.metrics)
         self._learner: Learner | None = None
         self._samples, self._vehicles = SampleCount(), 0
@@ -66,7 +69,9 @@ class TrainingLoop:
         self._curriculum.begin(learner.history.curriculum if learner else None)
         self._lesson_end: Observation | None = None
         """Last tick of a lesson whose gate is not decided yet."""
-        self._checkpoints = CheckpointWriter(config, self._ranks, self._environments, self._curriculum, self._metrics)
+        self._checkpoints = CheckpointWriter(
+            config, self._ranks, self._environments, self._curriculum, self._metrics, stop_requested
+        )
         self._commit_due = False
         if learner is not None:
             self._start(learner)
@@ -78,6 +83,9 @@ class TrainingLoop:
         """
         while not (self._left or self._ended() or self._stopped()):
             self._receive()
+            if self._leave_now_requested() or (self._idle_waits > 1 and self._leave_requested()):
+                self._left = True
+                break
             self._consume()
         if self._learns and not self._left:
             self._agree(Verdict.STOP if self._stopped() else Verdict.ENDED)
@@ -127,6 +135,7 @@ class TrainingLoop:
         """Queue the ticks that wait in the environments that may continue; wait for a tick if there is none."""
         continuing = [environment for environment in self._environments if self._may_continue(environment)]
         if any(environment.pending for environment in continuing):
+            self._idle_waits = 0
             return
         alone = len(self._environments) == 1
         for environment in continuing:
@@ -135,7 +144,11 @@ class TrainingLoop:
                     # The first tick has the size of the observation, which the networks need.
                     self._start(Learner.begin(self._config, ticks[0].observation.shape[1], self._ranks))
                 environment.admit(list(ticks))
-        if not alone and not any(environment.pending for environment in continuing):
+        if any(environment.pending for environment in continuing):
+            self._idle_waits = 0
+            return
+        self._idle_waits += 1
+        if not alone:
             self._channel.wait_for_any(RECEIVE_TIMEOUT_S)
 
     def _may_continue(self, environment: Environment) -> bool:
@@ -299,8 +312,12 @@ class TrainingLoop:
 
     def _draw(self) -> None:
         folder = self._config.run_dir / "plots"
-        plot_headline(folder, self._task.metrics[0], self._metrics.training, pooled(self._metrics.evaluations))
-        plot_sigma(folder / "sigma.png", self._metrics.training)
+        metrics = self._metrics
+        try:
+            plot_headline(folder, self._task.metrics[0], metrics.training, pooled(metrics.evaluations))
+            plot_sigma(folder / "sigma.png", metrics.training)
+        except OSError as error:
+            metrics.dropped.drop("plots", error)
 
     def _write_part(self) -> None:
         """The trainer's part of the run's report, with the evaluations of all ranks."""
@@ -319,9 +336,10 @@ class TrainingLoop:
             "lost_ticks": sum(ledger.lost for ledger in ledgers),
             "duplicated_ticks": sum(ledger.duplicated for ledger in ledgers),
             "untrained_env_steps": env_steps - self._trained_steps(),
+            "dropped": self._metrics.dropped.report(),
         }
         phases = pooled([result for results, _ in every_rank for result in results])
-        write_part(self._config.run_dir, entries, phases, self._task.metrics[0].name)
+        write_part(self._config.run_dir, entries, phases, self._task.metrics[0].name, self._stop_requested)
 
     def _number(self, index: int) -> int:
         """The index of an environment among those of all ranks."""

@@ -3,10 +3,12 @@
 Imports nothing heavy, so `python -m caraware.run.manifest RUN|CHECKPOINT newest|best` answers at once.
 """
 
+import errno
 import hashlib
 import json
 import logging
 import os
+import stat
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -19,6 +21,8 @@ SCHEMA_VERSION = 2
 EARLIER_FUSION = "caraware-fusion-1"
 """Format of the learned estimator's checkpoints before all learners had one."""
 MANIFEST = "manifest.json"
+NAMED = "update-"
+"""How the names of checkpoint directories begin."""
 COURSE = "course.json"
 """How training went, and where the environments after the first stand."""
 LATEST, BEST = "latest", "best"
@@ -96,6 +100,12 @@ def sound_checkpoints(folder: Path) -> Iterator[Path]:
             log.warning("checkpoint refused, the one before it is used: %s", error)
 
 
+def newest_update(folder: Path) -> int:
+    """The largest number of updates that a checkpoint is named by; 0 without any."""
+    numbers = (name.name.removeprefix("update-") for name in folder.glob("update-*"))
+    return max((int(number) for number in numbers if number.isdecimal()), default=0)
+
+
 def verify_checkpoint(checkpoint: Path) -> Manifest:
     """The manifest of a checkpoint of which every byte is as it was written. Raises `CheckpointError`."""
     manifest = read_manifest(checkpoint)
@@ -108,7 +118,7 @@ def read_manifest(checkpoint: Path) -> Manifest:
     """The manifest of a checkpoint directory. Raises `CheckpointError`."""
     file = checkpoint / MANIFEST
     try:
-        raw = json.loads(file.read_bytes())
+        raw = json.loads(_content(file))
         if "format" in raw and raw["format"] == EARLIER_FUSION:
             raise CheckpointError(file, "is of the learned estimator's earlier format, which is not read any more")
         if raw["schema_version"] != SCHEMA_VERSION:
@@ -117,6 +127,10 @@ def read_manifest(checkpoint: Path) -> Manifest:
         if stated != found:
             raise CheckpointError(file, f"is damaged: SHA-256 {found[:12]}…, it says {stated[:12]}…")
         parts = {"counters": Counters(**raw["counters"])}
+        if checkpoint.name.startswith(NAMED) and checkpoint.name != checkpoint_name(parts["counters"].updates):
+            raise CheckpointError(
+                file, f"belongs to {checkpoint_name(parts['counters'].updates)}, not to this directory"
+            )
         return Manifest(**raw | parts | {"hidden": tuple(raw["hidden"])})
     except OSError as error:
         raise CheckpointError(file, f"cannot be read ({error.strerror})") from error
@@ -127,13 +141,25 @@ def read_manifest(checkpoint: Path) -> Manifest:
 def verified(file: Path, sha256: str) -> bytes:
     """The content of a file of a checkpoint."""
     try:
-        content = file.read_bytes()
+        content = _content(file)
     except OSError as error:
         raise CheckpointError(file, f"cannot be read ({error.strerror})") from error
     found = hashlib.sha256(content).hexdigest()
     if found != sha256:
         raise CheckpointError(file, f"is damaged: SHA-256 {found[:12]}…, the manifest says {sha256[:12]}…")
     return content
+
+
+def _content(file: Path) -> bytes:
+    """The bytes of a regular file: a pipe in its place would be waited for, a device has no end. Raises `OSError`."""
+    if not stat.S_ISREG(file.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is no regular file")
+    return file.read_bytes()
+
+
+def checkpoint_name(updates: int) -> str:
+    """Of the directory of the checkpoint after so many updates."""
+    return f"{NAMED}{updates:06d}"
 
 
 def own_hash(entries: dict[str, Any]) -> str:

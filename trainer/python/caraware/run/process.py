@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 
@@ -37,18 +37,43 @@ class Failure:
 
 
 class StopSignal:
-    """Remembers signals until the loop is between two batches: SIGTERM and SIGINT stop, SIGUSR1 asks for a handover."""
+    """Remembers signals until the loop is between two batches.
+
+    SIGTERM and SIGINT stop; SIGUSR1 asks for a handover after the next update, SIGUSR2 at the next tick.
+    """
 
     def __init__(self) -> None:
-        self.requested = self.leave_requested = False
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
+        self.requested = self.leave_requested = self.leave_now_requested = False
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1, signal.SIGUSR2):
             signal.signal(number, self._remember)
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGUSR1:
+        if number in (signal.SIGUSR1, signal.SIGUSR2):
             self.leave_requested = True
+            self.leave_now_requested |= number == signal.SIGUSR2
         else:
             self.requested = True
+
+
+@dataclass(frozen=True)
+class SuccessorClaims:
+    """What a successor is made for: the supervisor refuses it where the run is another. None says nothing."""
+
+    schema_version: int | None = None
+    observation_size: int | None = None
+    observation_fields: tuple[str, ...] | None = None
+    action_size: int | None = None
+    task: str | None = None
+    environments: int | None = None
+    decides_lessons: bool | None = None
+    """Whether it decides the lessons of a curriculum, for which the simulation waits."""
+    first_tick: int | None = None
+    """The first tick it needs, as far as it knows: the journal must hold it."""
+
+    def line(self) -> bytes:
+        """The line that says that the successor is ready."""
+        said = {name: value for name, value in asdict(self).items() if value is not None}
+        return b"ready " + json.dumps(said).encode() + b"\n"
 
 
 @dataclass
@@ -72,9 +97,12 @@ class HandoverRole:
             checkpoint=Path(checkpoint) if checkpoint else None,
         )
 
-    def wait_for_turn(self) -> bool:
-        """Report that this successor is ready, and wait for the handover; False if the supervisor cancels it."""
-        os.write(1, b"ready\n")
+    def wait_for_turn(self, claims: SuccessorClaims | None = None) -> bool:
+        """Report that this successor is ready, and wait for the handover; False if the supervisor cancels it.
+
+        It compares the `claims` with the run before the old trainer leaves.
+        """
+        os.write(1, (claims or SuccessorClaims()).line())
         os.dup2(2, 1)
         if os.read(0, 16) != b"go\n":
             return False
@@ -129,6 +157,7 @@ def _explain(error: Exception) -> Failure:
         return Failure(
             "missing", f"cannot import {error.name}: {error}", "`make train` installs what the trainer needs"
         )
+    from caraware.ipc.commits import CommitLogError
     from caraware.learn.config import ConfigError
     from caraware.learn.ppo import NonFiniteLoss
     from caraware.learn.ranks import RankError
@@ -141,6 +170,8 @@ def _explain(error: Exception) -> Failure:
     if isinstance(error, NonFiniteLoss):
         saved = f"the batch is in {error.batch_file}; " if error.batch_file else ""
         return Failure("run", str(error), f"{saved}a smaller `trainer.learning_rate` is the usual cure")
+    if isinstance(error, CommitLogError):
+        return Failure("run", str(error), error.help)
     if isinstance(error, RankError):
         return Failure("run", str(error), "all ranks end together; the first to fail says why")
     return Failure("run", f"{type(error).__name__}: {error}", "the traceback is in the trainer's log")

@@ -1,8 +1,8 @@
 """How far the stream of one environment has come: ticks seen, episodes begun, ticks learned and evaluated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from caraware.ipc.stream import Observation
+from caraware.ipc.commits import CommittedPosition, EpisodeStarts
 
 
 class TickLedger:
@@ -25,27 +25,6 @@ class TickLedger:
         return True
 
 
-class EpisodeStarts:
-    """The first ticks of episodes: a simulation that resumes after a tick begins with the episode of the next one."""
-
-    def __init__(self, episode: int = 0, tick: int = 0) -> None:
-        self._starts = [(tick, episode)]
-
-    def note(self, obs: Observation) -> None:
-        """Note a tick of the run, in order."""
-        if obs.episode != self._starts[-1][1]:
-            self._starts.append((obs.tick, obs.episode))
-        if obs.episode_last:
-            self._starts.append((obs.tick + 1, obs.episode + 1))
-
-    def after(self, committed_tick: int) -> tuple[int, int]:
-        """Episode of the tick after `committed_tick`, and its first tick; earlier episodes are forgotten."""
-        while len(self._starts) > 1 and self._starts[1][0] <= committed_tick + 1:
-            del self._starts[0]
-        tick, episode = self._starts[0]
-        return episode, tick
-
-
 @dataclass(frozen=True)
 class StreamPosition:
     """How far one environment has come, up to a checkpoint."""
@@ -61,6 +40,24 @@ class StreamPosition:
     """The episode that the tick after the committed one belongs to: a resumed simulation begins there."""
     next_episode_tick: int = 0
     """The first tick of that episode."""
+
+    def committed(self) -> CommittedPosition:
+        """As the record of commits has it."""
+        return CommittedPosition(self.committed_tick + 1, self.next_episode, self.next_episode_tick)
+
+    def after(self, others: CommittedPosition) -> "StreamPosition":
+        """At least where other learners have come: what they have learnt has been received."""
+        ticks = others.ticks - (self.committed_tick + 1)
+        if ticks <= 0:
+            return self
+        return replace(
+            self,
+            committed_tick=others.ticks - 1,
+            received_ticks=self.received_ticks + ticks,
+            evaluated_tick=max(self.evaluated_tick, others.ticks - 1),
+            next_episode=others.episode,
+            next_episode_tick=others.episode_tick,
+        )
 
 
 class StreamProgress:

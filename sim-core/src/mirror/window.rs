@@ -1,0 +1,255 @@
+//! The window over SUMO's last states. Their mean is a path that a vehicle can follow, because it bends before the lane does.
+//!
+//! SUMO's vehicles turn, brake and start from one step to the next; a real one needs time for each. The mean of the last `n` states
+//! changes as gradually as a driver with a view of the road ahead steers and brakes, and it never leaves the hull of SUMO's positions. It
+//! is `(n − 1) / 2` steps behind the newest state: the mirror sees that much of the path ahead of it.
+
+use ipc_schema::traffic::TrafficState;
+
+use super::reference::{LaneJump, PathJoin, join};
+use crate::trig::wrap_angle;
+
+/// Most states in a window.
+const MOST_STATES: usize = 16;
+
+/// What is averaged: position of the front bumper (metres), heading without jumps and slope (radians), speed (m/s).
+type Sample = [f64; 6];
+
+/// One SUMO step of the mean.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WindowStep {
+    /// The mean before the step. A lane change in the step counts as made long ago.
+    pub before: TrafficState,
+    /// The mean after the step.
+    pub now: TrafficState,
+    /// How far to the left the lane change in this step leads, metres.
+    pub lane_change_m: Option<f64>,
+}
+
+/// The last states of a road user.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StateWindow {
+    samples: Vec<Sample>,
+    /// Place of the oldest sample.
+    oldest: usize,
+    newest: TrafficState,
+}
+
+/// Number of states whose mean, followed half a step behind, is `preview_s` behind SUMO; 1 if a step is too long for that.
+#[must_use]
+pub fn states_for(preview_s: f64, step_s: f64) -> usize {
+    // A little more than the quotient: 0.45 / 0.1 is less than 4.5.
+    let steps = 2.0 * (preview_s - 0.5 * step_s) / step_s + 1e-6;
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "between 0 and MOST_STATES"
+    )]
+    let steps = steps.clamp(0.0, (MOST_STATES - 1) as f64) as usize;
+    steps + 1
+}
+
+impl StateWindow {
+    /// A window of `count` states, of no road user.
+    #[must_use]
+    pub fn new(count: usize) -> Self {
+        Self {
+            samples: vec![[0.0; 6]; count],
+            oldest: 0,
+            newest: TrafficState::default(),
+        }
+    }
+
+    /// Begins with a road user that has come to `now` straight ahead at its speed, in steps of `step_s`. Returns the mean.
+    pub fn restart(&mut self, now: &TrafficState, step_s: f64) -> TrafficState {
+        let newest = sample(now);
+        let (sin, cos) = libm::sincos(newest[3]);
+        let climb = libm::tan(newest[4]);
+        let count = self.samples.len();
+        for (place, slot) in self.samples.iter_mut().enumerate() {
+            let back_m = newest[5] * step_s * (count - 1 - place) as f64;
+            *slot = newest;
+            slot[0] -= back_m * cos;
+            slot[1] -= back_m * sin;
+            slot[2] -= back_m * climb;
+        }
+        (self.oldest, self.newest) = (0, *now);
+        self.mean()
+    }
+
+    /// Takes the next state of a body of `length_m`; `None` if no vehicle moves like that.
+    pub fn advance(&mut self, now: &TrafficState, length_m: f64, step_s: f64) -> Option<WindowStep> {
+        let (joined, jump) = join(&self.newest, now, length_m, step_s);
+        if joined == PathJoin::Broken {
+            return None;
+        }
+        if let Some(LaneJump { vector_m, .. }) = jump {
+            for slot in &mut self.samples {
+                slot[0] += vector_m[0];
+                slot[1] += vector_m[1];
+            }
+        }
+        let before = self.mean();
+        let count = self.samples.len();
+        let last_yaw_rad = self.samples[(self.oldest + count - 1) % count][3];
+        let mut next = sample(now);
+        next[3] = last_yaw_rad + wrap_angle(next[3] - last_yaw_rad);
+        self.samples[self.oldest] = next;
+        self.oldest = (self.oldest + 1) % count;
+        self.newest = *now;
+        Some(WindowStep {
+            before,
+            now: self.mean(),
+            lane_change_m: jump.map(|jump| jump.left_m),
+        })
+    }
+
+    /// Distance of the mean from SUMO's own path: from the nearest of the window's states or of the lines between them, metres.
+    #[must_use]
+    pub fn deviation_m(&self) -> f64 {
+        let mean = self.mean();
+        let point = [mean.front_x_m, mean.front_y_m];
+        let count = self.samples.len();
+        let at = |place: usize| {
+            let sample = self.samples[(self.oldest + place) % count];
+            [sample[0], sample[1]]
+        };
+        // The mean lies beside the middle of the window.
+        let first = (count / 2).saturating_sub(2);
+        let lines = (first..count.saturating_sub(1).min(first + 4)).map(|place| (at(place), at(place + 1)));
+        lines
+            .map(|(from, to)| super::reference::distance_m(point, from, to))
+            .fold(f64::INFINITY, f64::min)
+    }
+
+    fn mean(&self) -> TrafficState {
+        let mut sum = [0.0; 6];
+        for slot in &self.samples {
+            for (total, part) in sum.iter_mut().zip(slot) {
+                *total += part;
+            }
+        }
+        let share = 1.0 / self.samples.len() as f64;
+        TrafficState {
+            front_x_m: sum[0] * share,
+            front_y_m: sum[1] * share,
+            front_z_m: sum[2] * share,
+            yaw_rad: wrap_angle(sum[3] * share) as f32,
+            pitch_rad: (sum[4] * share) as f32,
+            speed_mps: (sum[5] * share) as f32,
+            ..self.newest
+        }
+    }
+}
+
+fn sample(state: &TrafficState) -> Sample {
+    [
+        state.front_x_m,
+        state.front_y_m,
+        state.front_z_m,
+        state.yaw_rad.into(),
+        state.pitch_rad.into(),
+        state.speed_mps.into(),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const STEP_S: f64 = 0.1;
+    const LENGTH_M: f64 = 4.5;
+
+    fn state(x_m: f64, y_m: f64, yaw_rad: f64, speed_mps: f64) -> TrafficState {
+        TrafficState {
+            front_x_m: x_m,
+            front_y_m: y_m,
+            yaw_rad: yaw_rad as f32,
+            speed_mps: speed_mps as f32,
+            ..TrafficState::default()
+        }
+    }
+
+    #[test]
+    fn the_whole_delay_is_the_preview_at_every_step() {
+        for (step_s, count) in [(0.1, 10), (0.2, 5), (0.5, 2), (1.0, 1), (2.0, 1), (0.01, MOST_STATES)] {
+            assert_eq!(states_for(0.5, step_s), count, "{step_s}");
+        }
+        assert_eq!(states_for(0.0, 0.1), 1);
+    }
+
+    proptest! {
+        #[test]
+        fn a_straight_drive_is_followed_at_the_same_distance(speed_mps in 1.0_f64..40.0, yaw_rad in -3.0_f64..3.0) {
+            let (sin, cos) = libm::sincos(yaw_rad);
+            let at = |step: f64| state(speed_mps * step * STEP_S * cos, speed_mps * step * STEP_S * sin, yaw_rad, speed_mps);
+            let mut window = StateWindow::new(10);
+            let mut mean = window.restart(&at(0.0), STEP_S);
+            for step in 0..40 {
+                let expected = at(f64::from(step) - 4.5);
+                let off = (mean.front_x_m - expected.front_x_m).hypot(mean.front_y_m - expected.front_y_m);
+                prop_assert!(off < 1e-5 * speed_mps, "step {}: {} m", step, off);
+                prop_assert!(window.deviation_m() < 1e-4);
+                mean = window.advance(&at(f64::from(step) + 1.0), LENGTH_M, STEP_S).unwrap().now;
+            }
+        }
+    }
+
+    #[test]
+    fn a_lane_change_is_taken_out_of_the_mean_and_reported_once() {
+        let mut window = StateWindow::new(10);
+        window.restart(&state(0.0, 0.0, 0.0, 20.0), STEP_S);
+        for step in 1..30 {
+            let y_m = if step >= 5 { 3.2 } else { 0.0 };
+            let found = window
+                .advance(&state(2.0 * f64::from(step), y_m, 0.0, 20.0), LENGTH_M, STEP_S)
+                .unwrap();
+            let change_m = found.lane_change_m.unwrap_or(0.0);
+            assert!(
+                (change_m - if step == 5 { 3.2 } else { 0.0 }).abs() < 1e-9,
+                "step {step}"
+            );
+            let sideways = [found.before.front_y_m, found.now.front_y_m];
+            assert!(
+                sideways.iter().all(|y| (y - y_m).abs() < 1e-9),
+                "step {step}: {sideways:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_bend_is_taken_gradually_and_its_corner_is_cut_by_little() {
+        // 7 m/s into a quarter of a circle of 9 m: 5.4 m/s² from one step to the next.
+        let (speed, radius) = (7.0, 9.0);
+        let at = |step: u32| {
+            let along = speed * STEP_S * f64::from(step) - 14.0;
+            let angle = (along / radius).clamp(0.0, std::f64::consts::FRAC_PI_2);
+            let (sin, cos) = libm::sincos(angle);
+            let rest = along - angle * radius;
+            state(
+                radius * sin + rest * cos,
+                radius * (1.0 - cos) + rest * sin,
+                angle,
+                speed,
+            )
+        };
+        let mut window = StateWindow::new(10);
+        let mut mean = window.restart(&at(0), STEP_S);
+        let (mut chord, mut accel): (Option<[f64; 2]>, Option<[f64; 2]>) = (None, None);
+        for step in 1..70 {
+            let next = window.advance(&at(step), LENGTH_M, STEP_S).unwrap().now;
+            let now = [
+                (next.front_x_m - mean.front_x_m) / STEP_S,
+                (next.front_y_m - mean.front_y_m) / STEP_S,
+            ];
+            let rate = chord.map(|before| [0, 1].map(|i: usize| (now[i] - before[i]) / STEP_S));
+            if let (Some(before), Some(rate)) = (accel, rate) {
+                let jerk = (rate[0] - before[0]).hypot(rate[1] - before[1]) / STEP_S;
+                assert!(jerk < 8.0, "step {step}: {jerk} m/s³");
+            }
+            assert!(window.deviation_m() < 0.3, "step {step}: {} m", window.deviation_m());
+            (mean, chord, accel) = (next, Some(now), rate.or(accel));
+        }
+    }
+}

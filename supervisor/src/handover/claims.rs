@@ -1,0 +1,110 @@
+//! What a successor says of itself when it is ready, compared with the run before the old trainer leaves.
+
+use ipc_schema::{SCHEMA_VERSION, run::RunFile};
+use serde::Deserialize;
+
+/// The line on a successor's standard output that it is ready begins with this word; its claims may follow as JSON.
+const READY: &str = "ready";
+/// Numbers in an action of every task.
+const ACTION_SIZE: u64 = 2;
+
+/// What a successor is made for. It need not say everything: what is left out is not compared.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub struct SuccessorClaims {
+    schema_version: Option<u32>,
+    observation_size: Option<u64>,
+    observation_fields: Option<Vec<String>>,
+    action_size: Option<u64>,
+    task: Option<String>,
+    environments: Option<u32>,
+    decides_lessons: Option<bool>,
+    first_tick: Option<u64>,
+}
+
+impl SuccessorClaims {
+    /// The claims in the first line of a successor's output; `None` if the line does not say that it is ready.
+    #[must_use]
+    pub fn of_line(line: &str) -> Option<Result<Self, serde_json::Error>> {
+        match line.trim_end().strip_prefix(READY)?.trim_start() {
+            "" => Some(Ok(Self::default())),
+            claims => Some(serde_json::from_str(claims)),
+        }
+    }
+
+    /// The first claim that does not fit `run`, whose journal begins at `journal_first`, as a sentence.
+    ///
+    /// # Errors
+    /// One does not fit.
+    pub fn check(&self, run: &RunFile, journal_first: u64) -> Result<(), String> {
+        let config = &run.config;
+        differ("is built for schema version", self.schema_version, SCHEMA_VERSION)?;
+        differ(
+            "takes observations of size",
+            self.observation_size,
+            config.observation_width() as u64,
+        )?;
+        let fields: Vec<String> = config
+            .observation
+            .fields
+            .iter()
+            .map(|field| field.name().into())
+            .collect();
+        if let Some(claimed) = self.observation_fields.as_ref().filter(|claimed| **claimed != fields) {
+            let message = format!(
+                "it takes the fields {}, the run's are {}",
+                claimed.join(", "),
+                fields.join(", ")
+            );
+            return Err(message);
+        }
+        differ("is for the task", self.task.as_deref(), config.task.kind.name())?;
+        differ("gives actions of size", self.action_size, ACTION_SIZE)?;
+        differ(
+            "learns from this number of environments:",
+            self.environments,
+            config.run.envs,
+        )?;
+        if self.decides_lessons == Some(false) && !config.curriculum.stages.is_empty() {
+            return Err("it decides no lessons, and the run has a curriculum that waits for them".into());
+        }
+        match self.first_tick {
+            Some(tick) if tick < journal_first => Err(format!(
+                "it continues at tick {tick}, the journal begins at tick {journal_first}: its checkpoint is too old"
+            )),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Compares one claim with the run's value.
+fn differ<T: PartialEq + std::fmt::Display>(what: &str, claimed: Option<T>, own: T) -> Result<(), String> {
+    match claimed {
+        Some(claimed) if claimed != own => Err(format!("it {what} {claimed}, the run's is {own}")),
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_successor_may_say_nothing_but_that_it_is_ready() {
+        assert!(SuccessorClaims::of_line("ready\n").is_some_and(|claims| claims.is_ok()));
+        assert!(SuccessorClaims::of_line("ready {\"first_tick\": 3}\n").is_some_and(|claims| claims.is_ok()));
+        assert!(SuccessorClaims::of_line("ready {\"first_tick\": -1}\n").is_some_and(|claims| claims.is_err()));
+        assert!(SuccessorClaims::of_line("hello\n").is_none());
+        assert!(SuccessorClaims::of_line("").is_none());
+    }
+
+    #[test]
+    fn a_difference_names_both_values() {
+        assert_eq!(
+            differ("takes size", Some(3), 4).unwrap_err(),
+            "it takes size 3, the run's is 4"
+        );
+        assert_eq!(differ("takes size", None, 4), Ok(()));
+        assert_eq!(differ("takes size", Some(4), 4), Ok(()));
+    }
+}

@@ -1,0 +1,145 @@
+//! The mirror on nets with netconvert's defaults: every vehicle class of SUMO from rest to its top speed and back, and a grid's corners.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
+mod common;
+
+use std::fmt::Write as _;
+
+use common::{Workplace, sumo_program, tool};
+use ipc_schema::traffic::VEHICLE_CLASSES;
+
+/// A straight road for each class: 8.5 km without a speed limit, then 600 m at walking pace.
+fn write_scenario(workplace: &Workplace, step_s: f64) {
+    let (mut nodes, mut edges, mut routes) = (String::new(), String::new(), String::new());
+    let classes = VEHICLE_CLASSES.iter().filter(|class| **class != "pedestrian");
+    for (road, class) in classes.clone().enumerate() {
+        let y = 60 * road;
+        for (place, x) in [0, 500, 8500, 9100].into_iter().enumerate() {
+            writeln!(nodes, "<node id=\"n{road}_{place}\" x=\"{x}\" y=\"{y}\"/>").unwrap();
+        }
+        for (place, speed) in [100, 100, 2].into_iter().enumerate() {
+            let ends = format!("from=\"n{road}_{place}\" to=\"n{road}_{}\"", place + 1);
+            writeln!(
+                edges,
+                "<edge id=\"e{road}_{place}\" {ends} numLanes=\"1\" speed=\"{speed}\"/>"
+            )
+            .unwrap();
+        }
+        writeln!(routes, "<vType id=\"{class}\" vClass=\"{class}\"/>").unwrap();
+    }
+    for (road, class) in classes.enumerate() {
+        let edges = format!("e{road}_0 e{road}_1 e{road}_2");
+        writeln!(
+            routes,
+            "<vehicle id=\"{class}\" type=\"{class}\" depart=\"0\" departSpeed=\"0\"><route edges=\"{edges}\"/></vehicle>"
+        )
+        .unwrap();
+    }
+    workplace.write("n.nod.xml", &format!("<nodes>{nodes}</nodes>"));
+    workplace.write("n.edg.xml", &format!("<edges>{edges}</edges>"));
+    workplace.write("n.rou.xml", &format!("<routes>{routes}</routes>"));
+    let arguments = ["-n", "n.nod.xml", "-e", "n.edg.xml", "-o", "n.net.xml"];
+    tool(&sumo_program("netconvert"), &arguments, workplace.path());
+    let input = "<net-file value=\"n.net.xml\"/><route-files value=\"n.rou.xml\"/>";
+    let time = format!("<time><end value=\"700\"/><step-length value=\"{step_s}\"/></time>");
+    workplace.write(
+        "n.sumocfg",
+        &format!("<configuration><input>{input}</input>{time}</configuration>"),
+    );
+}
+
+/// One vehicle may be set onto SUMO, once: SUMO's motorcycle brakes at 10 m/s² from 55 m/s, which no tyre holds, and
+/// the mirror does not see a slower road ahead.
+#[test]
+fn every_class_is_followed_from_rest_to_its_top_speed_and_back() {
+    for step_s in [0.1, 1.0] {
+        let workplace = Workplace::new();
+        write_scenario(&workplace, step_s);
+        let settings = [
+            "fanout.enabled=false",
+            "map.origin_latitude_deg=52",
+            "map.origin_longitude_deg=10",
+        ];
+        let settings = settings.iter().flat_map(|setting| ["--set", *setting]);
+        let arguments: Vec<&str> = ["simulate", "n.sumocfg", "--name", "classes"]
+            .into_iter()
+            .chain(settings)
+            .collect();
+        workplace.succeed(&arguments);
+        let dynamics = &workplace.report("classes")["dynamics"];
+        let set = dynamics["resynchronisations"].as_u64().unwrap();
+        assert!(set <= 1, "steps of {step_s} s: {dynamics:#}");
+        let usual_m = dynamics["tracking"]["longitudinal"]["p999_m"].as_f64().unwrap();
+        assert!(usual_m <= 0.6, "steps of {step_s} s: {dynamics:#}");
+        assert!(dynamics["tracking"]["samples"].as_u64().unwrap() > 33 * 2_000);
+    }
+}
+
+/// The corners of a net that was not drawn for the mirror: without a preview it runs wide there and is set back.
+#[test]
+fn with_a_preview_no_vehicle_on_a_default_grid_is_set_onto_sumo() {
+    let workplace = Workplace::new();
+    let grid = [
+        "--grid",
+        "--grid.number",
+        "4",
+        "--no-turnarounds",
+        "--seed",
+        "3",
+        "-o",
+        "g.net.xml",
+    ];
+    tool(&sumo_program("netgenerate"), &grid, workplace.path());
+    let routes = [
+        "A0A1 A1B1 B1B2 B2C2 C2C3",
+        "D3C3 C3C2 C2B2 B2B1 B1A1",
+        "C0C1 C1B1 B1B2 B2A2",
+        "A3B3 B3B2 B2C2 C2C1 C1D1",
+    ];
+    let vehicles: String = (0..60)
+        .zip(routes.iter().cycle())
+        .map(|(index, edges)| {
+            let depart = 2 * index;
+            format!(
+                "<vehicle id=\"{index}\" depart=\"{depart}\" departSpeed=\"max\"><route edges=\"{edges}\"/></vehicle>"
+            )
+        })
+        .collect();
+    workplace.write("g.rou.xml", &format!("<routes>{vehicles}</routes>"));
+    let input = "<net-file value=\"g.net.xml\"/><route-files value=\"g.rou.xml\"/>";
+    let time = "<time><end value=\"180\"/><step-length value=\"0.1\"/></time>";
+    workplace.write(
+        "g.sumocfg",
+        &format!("<configuration><input>{input}</input>{time}</configuration>"),
+    );
+    let run = |name: &str, preview: &str| {
+        let settings = [
+            "fanout.enabled=false",
+            "collision.detect=true",
+            "map.origin_latitude_deg=52",
+            "map.origin_longitude_deg=10",
+            preview,
+        ];
+        let settings = settings.iter().flat_map(|setting| ["--set", *setting]);
+        let arguments: Vec<&str> = ["simulate", "g.sumocfg", "--name", name]
+            .into_iter()
+            .chain(settings)
+            .collect();
+        workplace.succeed(&arguments);
+        workplace.report(name)["dynamics"].clone()
+    };
+    let (without, with) = (
+        run("without", "vehicle.preview_s=0"),
+        run("with", "vehicle.preview_s=0.5"),
+    );
+    // Otherwise the net would show nothing.
+    assert!(without["resynchronisations"].as_u64().unwrap() > 0, "{without:#}");
+    assert_eq!(with["resynchronisations"], 0, "{with:#}");
+    let contacts = |dynamics: &serde_json::Value| dynamics["collisions"]["vehicle"].as_u64().unwrap();
+    assert!(contacts(&with) <= contacts(&without), "{with:#}");
+}
