@@ -20,7 +20,7 @@ use ipc_schema::{
     membership::RunMembership,
     observation::ObservationLayout,
     pointcloud::{PointcloudLayout, Scan},
-    ports::Publisher,
+    ports::{Publisher, RosterWriter},
     prediction::PredictionLayout,
     process::Process,
     run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
@@ -43,6 +43,7 @@ pub struct Run {
     pub port: u16,
     _reserved_port: ReservedPort,
     path: PathBuf,
+    roster: RefCell<RosterWriter>,
     holder: RefCell<ServiceHolder>,
     node: services::RunNode,
     _dir: TempDir,
@@ -108,6 +109,7 @@ impl Run {
             port: port.number,
             _reserved_port: port,
             path,
+            roster: RefCell::new(RosterWriter::create(&holder).unwrap()),
             holder: RefCell::new(holder),
             node,
             _dir: dir,
@@ -124,6 +126,7 @@ impl Run {
             .borrow_mut()
             .add_board(&self.node, &self.file, Process::Fanout, incarnation)
             .unwrap();
+        self.roster.borrow_mut().set(Process::Fanout, incarnation);
         self.spawn_fanout(incarnation)
     }
 
