@@ -96,11 +96,11 @@ fn window(run: &RunFile) -> usize {
     usize::try_from(run.window_ticks()).unwrap_or(usize::MAX)
 }
 
-/// SUMO steps that traffic-bridge may be ahead of sim-core.
-fn traffic_steps(run: &RunFile) -> usize {
-    let per_step = usize::try_from(run.ticks_per_traffic_step()).unwrap_or(usize::MAX);
+/// Messages of `traffic` that traffic-bridge may be ahead of sim-core.
+fn traffic_frames(run: &RunFile) -> usize {
+    let per_frame = usize::try_from(run.ticks_per_frame()).unwrap_or(usize::MAX);
     let window = usize::try_from(run.traffic_window_ticks()).unwrap_or(usize::MAX);
-    window.div_ceil(per_step)
+    window.div_ceil(per_frame)
 }
 
 /// Most road users alive at once.
@@ -140,7 +140,7 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         topics: &[],
         when_full: FullQueue::DropNewest,
         max_payload: |run| TrafficLayout::sized(road_users(run)).len,
-        queue_length: |run| traffic_steps(run) + SPARE_MESSAGES,
+        queue_length: |run| traffic_frames(run) + SPARE_MESSAGES,
         in_hand: |run| two_batches(Channel::Traffic.queue_length(run)),
         is_used: |_| true,
     },
@@ -162,7 +162,7 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         // All heroes may come within one step, each with its route.
         queue_length: |run| {
             let routes = run.config.heroes() * ROUTE_MESSAGES_PER_HERO;
-            traffic_steps(run) * meta_messages(run) + routes + SPARE_MESSAGES
+            traffic_frames(run) * meta_messages(run) + routes + SPARE_MESSAGES
         },
         in_hand: |run| two_batches(Channel::TrafficMeta.queue_length(run)),
         is_used: |_| true,
@@ -301,7 +301,7 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         when_full: FullQueue::DropNewest,
         max_payload: |_| SensorSwitchLayout::sized(MAX_SWITCHES).len,
         // One for each step that is on its way through sim-core.
-        queue_length: |run| traffic_steps(run) + windowful(run),
+        queue_length: |run| traffic_frames(run) + windowful(run),
         in_hand: |run| two_batches(Channel::Switch.queue_length(run)),
         is_used: |_| true,
     },

@@ -144,6 +144,8 @@ pub struct SharedMemory {
 
 /// Least number of SUMO steps under way: one that `sim-core` moves, one that waits for it, and one that SUMO makes meanwhile.
 const STEPS_AHEAD: u64 = 3;
+/// Longest time between two states of a road user that the mirror's window is made of, seconds, where a tick is not longer.
+const FRAME_S: f64 = 0.1;
 /// Longest wait for space on a full disk before the run file is given up.
 const SPACE_WITHIN: Duration = Duration::from_secs(10);
 
@@ -380,6 +382,31 @@ impl RunFile {
         )]
         let ratio = (self.config.traffic.step_s / self.config.run.tick_s).round() as u64;
         ratio.max(1)
+    }
+
+    /// Number of ticks in one message of `traffic`. A mirror that sees the path ahead needs a state every [`FRAME_S`]: where SUMO steps
+    /// more slowly, `traffic-bridge` sends frames between its steps.
+    #[must_use]
+    pub fn ticks_per_frame(&self) -> u64 {
+        let per_step = self.ticks_per_traffic_step();
+        if self.config.vehicle.preview_s <= 0.0 {
+            return per_step;
+        }
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "validated: a tick is positive, and not much shorter than a frame"
+        )]
+        let shortest = (FRAME_S / self.config.run.tick_s - 1e-6).ceil().max(1.0) as u64;
+        let divisors = (shortest..per_step).filter(|ticks| per_step.is_multiple_of(*ticks));
+        divisors.min().unwrap_or(per_step)
+    }
+
+    /// Messages of `traffic` by which the mirrored road users are behind SUMO, half a frame rounded down.
+    #[must_use]
+    pub fn mirror_delay_frames(&self) -> usize {
+        let frame_s = self.config.run.tick_s * self.ticks_per_frame() as f64;
+        self.config.vehicle.window_states(frame_s) / 2
     }
 
     /// Ticks that `sim-core` and `sensor-daemon` may each be ahead of the next process.

@@ -150,6 +150,13 @@ impl VehicleMeta {
         String::from_utf8_lossy(&self.id[..len]).into_owned()
     }
 
+    /// SUMO's vehicle class as text.
+    #[must_use]
+    pub fn class_text(&self) -> String {
+        let class = self.vehicle_class.split(|&byte| byte == 0).next().unwrap_or_default();
+        String::from_utf8_lossy(class).into_owned()
+    }
+
     /// Stores `id`, cut at a character border, with the hash of the whole.
     pub fn set_id(&mut self, id: &str) {
         (self.id, self.id_len) = id_text_bytes(id);

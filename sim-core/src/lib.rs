@@ -12,9 +12,12 @@ mod preset;
 
 pub mod collision;
 pub mod driving;
+mod event_log;
 pub mod geodesy;
 pub mod mirror;
 pub mod models;
+mod names;
 pub mod process;
+mod resynchronisations;
 pub mod scene;
 pub mod trig;

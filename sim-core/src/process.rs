@@ -24,6 +24,8 @@ use crate::{
         Mirror, MirrorError, MirrorSettings,
         statistics::{TrackingStatistics, TrackingSummary},
     },
+    names::RoadUserNames,
+    resynchronisations::{ResynchronisationCounts, ResynchronisationReporter, ResynchronisationState},
     scene::{Scene, chart::Chart},
 };
 
@@ -32,15 +34,18 @@ use crate::{
 struct CoreState {
     tracking: TrackingStatistics,
     resynchronisations: u64,
+    resynchronised: ResynchronisationState,
     vehicle_steps: u64,
     contacts: ContactState,
 }
 
 /// What this process adds to the run's report.
 #[derive(Debug, Serialize)]
-struct CoreReport {
+struct CoreReport<'a> {
     tracking: TrackingSummary,
     resynchronisations: u64,
+    /// By SUMO's class and the cause.
+    resynchronisation_causes: &'a ResynchronisationCounts,
     vehicle_steps: u64,
     drops: u64,
     /// Heroes, in the driving task.
@@ -87,6 +92,8 @@ struct CoreProcess {
     /// By map.
     scenes: Vec<Arc<Scene>>,
     contacts: Option<ContactReporter>,
+    resynchronisations: ResynchronisationReporter,
+    names: RoadUserNames,
     world: Publisher,
     /// The required consumers of `world`.
     consumers: RequiredConsumers,
@@ -103,6 +110,7 @@ impl CoreProcess {
         // Continue where the part of the run before this one stood when the episode began.
         let state: CoreState = membership.stored_episode_state()?.unwrap_or_default();
         let contacts = ContactReporter::open(&membership, &scenes, state.contacts)?;
+        let resynchronisations = ResynchronisationReporter::open(&membership, state.resynchronised)?;
         // Viewers see the run's own map, and heroes have no other.
         let scene = Arc::clone(&scenes[0]);
         draw_chart(&membership, &scene)?;
@@ -123,6 +131,8 @@ impl CoreProcess {
             actions,
             scenes,
             contacts,
+            resynchronisations,
+            names: RoadUserNames::default(),
             world,
             consumers,
             ticks,
@@ -132,10 +142,10 @@ impl CoreProcess {
 
     /// One SUMO step: its events, the states of all road users, and the ticks that lead there.
     fn process_step(&mut self, frame: &Message) -> Result<Wait, Failure> {
-        let ticks_per_step = self.membership.run.ticks_per_traffic_step();
+        let ticks_per_frame = self.membership.run.ticks_per_frame();
         let header = *frame.header();
         // The frame carries the number of the last of its ticks.
-        let first_tick = (header.tick + 1).saturating_sub(ticks_per_step);
+        let first_tick = (header.tick + 1).saturating_sub(ticks_per_frame);
         if first_tick != self.ticks {
             return Err(PortError::Gap {
                 channel: "traffic",
@@ -151,7 +161,7 @@ impl CoreProcess {
         let states: &[TrafficState] =
             block::view(frame.payload(), TrafficLayout::of(&header).states).map_err(unreadable)?;
         self.mirror.accept(&header, states).map_err(unmirrored)?;
-        for tick in 0..u32::try_from(ticks_per_step).unwrap_or(u32::MAX) {
+        for tick in 0..u32::try_from(ticks_per_frame).unwrap_or(u32::MAX) {
             if self
                 .membership
                 .wait_for_credit(&self.consumers, first_tick + u64::from(tick))?
@@ -175,6 +185,7 @@ impl CoreProcess {
         let state = CoreState {
             tracking: self.mirror.tracking().clone(),
             resynchronisations: self.mirror.resynchronisations(),
+            resynchronised: self.resynchronisations.state()?,
             vehicle_steps: self.vehicle_steps,
             contacts: contacts.unwrap_or_default(),
         };
@@ -222,9 +233,7 @@ impl CoreProcess {
                 self.mirror.default_set()
             );
         }
-        if let Some(contacts) = &mut self.contacts {
-            contacts.remember_ids(header, vehicles);
-        }
+        self.names.remember(header, vehicles);
         if let Some(actions) = &mut self.actions {
             let signals = block::view(message.payload(), layout.signals).map_err(unreadable)?;
             actions.add_metas(header, vehicles, signals);
@@ -253,8 +262,10 @@ impl CoreProcess {
         };
         self.mirror.write_tick(tick, draft.payload_mut()).map_err(unmirrored)?;
         if let Some(contacts) = &mut self.contacts {
-            contacts.report_contacts(&header, draft.payload_mut(), layout.states)?;
+            contacts.report_contacts(&header, draft.payload_mut(), layout.states, &self.names)?;
         }
+        let resynchronised = self.mirror.resynchronised();
+        self.resynchronisations.add(&header, resynchronised, &self.names)?;
         let poses = match &mut self.actions {
             Some(actions) => actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?,
             None => Vec::new(),
@@ -301,6 +312,7 @@ impl CoreProcess {
         self.membership.write_part(&CoreReport {
             tracking: self.mirror.tracking().summary(),
             resynchronisations: self.mirror.resynchronisations(),
+            resynchronisation_causes: self.resynchronisations.finish()?,
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
             heroes: self.actions.as_ref().map(HeroPorts::counts),

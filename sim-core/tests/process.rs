@@ -326,7 +326,7 @@ fn contacts_are_not_searched_unless_configured() {
     let (states, collisions) = drive(&run, 60);
     assert_eq!(process.wait().unwrap().code(), Some(0));
     assert!(collisions.is_empty() && states.iter().all(|state| state.flags & COLLIDED == 0));
-    assert!(!run.file.run_dir.join("events").exists());
+    assert!(!run.file.run_dir.join("events/collisions.jsonl").exists());
     let part = std::fs::read_to_string(run.file.run_dir.join("parts/sim-core.json")).unwrap();
     assert_eq!(serde_json::from_str::<Value>(&part).unwrap()["collisions"], Value::Null);
 }

@@ -27,6 +27,8 @@ use crate::{
 
 /// SUMO's own default step, seconds.
 const SUMO_STEP_S: f64 = 1.0;
+/// How far ahead mirrors see SUMO's path on nets that were not drawn for them, seconds.
+const PREVIEW_S: f64 = 0.5;
 /// SUMO's own default seed.
 const SUMO_SEED: u64 = 23423;
 /// Road users that shared memory is sized for in a scenario, unless the user sets `traffic.max_road_users`.
@@ -226,14 +228,17 @@ fn resolve_config(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, Stri
             let mut settings = defaults.with_assignments(&args.set)?;
             let scenario = scenario::read(path, settings.has_flag(TRUST_KEY))?;
             apply_scenario_defaults(&mut settings, &scenario, name)?;
+            suggest_preview(&mut settings, name);
             let path = std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error))?;
             Ok((settings, TrafficInput::Scenario(path, scenario), label))
         }
-        Some("toml") => Ok((
-            defaults.with_file(path)?.with_assignments(&args.set)?,
-            TrafficInput::Map,
-            label,
-        )),
+        Some("toml") => {
+            let mut settings = defaults.with_file(path)?.with_assignments(&args.set)?;
+            if settings.is_set_by_user("curriculum.maps") {
+                suggest_preview(&mut settings, name);
+            }
+            Ok((settings, TrafficInput::Map, label))
+        }
         _ => {
             let settings = defaults.with_preset(name).ok_or_else(|| ConfigError::File {
                 path: name.to_owned(),
@@ -242,6 +247,13 @@ fn resolve_config(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, Stri
             })??;
             Ok((settings.with_assignments(&args.set)?, TrafficInput::Map, label))
         }
+    }
+}
+
+/// Lets mirrors see the path ahead on nets that were not drawn for them, unless the task is to drive among them.
+fn suggest_preview(settings: &mut LayeredSettings, source: &str) {
+    if !settings.has_text("task.kind", "driving") {
+        settings.suggest("vehicle.preview_s", Value::from(PREVIEW_S), source);
     }
 }
 

@@ -1,6 +1,8 @@
 //! `report.json`: the results of a run, assembled from the parts that its processes write at their end.
 
 use std::{
+    cmp::Reverse,
+    collections::BTreeMap,
     path::{Path, PathBuf},
     time::Duration,
 };
@@ -23,6 +25,9 @@ use crate::{
 
 /// Longest wait for space on a full disk at the end of a run.
 const SPACE_WITHIN: Duration = Duration::from_secs(60);
+
+/// Reasons for resynchronisations that the summary names.
+const SHOWN_CAUSES: usize = 3;
 
 /// The estimators that an evaluation compares, by their prefixes of the report's keys: the policy, the raw fix, the Kalman filter, the
 /// smoother, which also uses later samples, and the policy's network trained by regression.
@@ -392,17 +397,41 @@ fn summary(report: &Value, path: &Path) -> String {
     lines.join("\n")
 }
 
-/// How often mirrors were set onto SUMO, in all environments.
+/// How often mirrors were set onto SUMO, in all environments, and the commonest reasons.
 fn resynchronisations(report: &Value) -> Option<String> {
     let environments = report["environments"].as_array();
     let parts = environments.map_or(std::slice::from_ref(report), Vec::as_slice);
-    let counts = parts.iter().map(|part| part["dynamics"]["resynchronisations"].as_u64());
-    let set = counts.sum::<Option<u64>>()?;
-    let steps = report["vehicle_steps"].as_f64().filter(|steps| *steps > 0.0)?;
+    let sum = |key: &str| -> Option<u64> { parts.iter().map(|part| part["dynamics"][key].as_u64()).sum() };
+    let (set, steps) = (
+        sum("resynchronisations")?,
+        sum("vehicle_steps").filter(|&steps| steps > 0)?,
+    );
+    let mut causes: BTreeMap<String, u64> = BTreeMap::new();
+    for part in parts {
+        let classes = part["dynamics"]["resynchronisation_causes"].as_object();
+        for (class, counts) in classes.into_iter().flatten() {
+            for (cause, count) in counts.as_object().into_iter().flatten() {
+                let cause = format!("{class} {}", cause.replace('_', " "));
+                *causes.entry(cause).or_default() += count.as_u64().unwrap_or(0);
+            }
+        }
+    }
+    let mut causes: Vec<(String, u64)> = causes.into_iter().collect();
+    causes.sort_by_key(|(_, count)| Reverse(*count));
+    let most: Vec<String> = causes
+        .iter()
+        .take(SHOWN_CAUSES)
+        .map(|(cause, count)| format!("{cause} {count}"))
+        .collect();
     #[expect(clippy::cast_precision_loss, reason = "a rate for readers")]
-    let rate = 1e6 * set as f64 / steps;
+    let rate = 1e6 * set as f64 / steps as f64;
+    let reasons = if most.is_empty() {
+        String::new()
+    } else {
+        format!(": {}", most.join(", "))
+    };
     Some(format!(
-        "mirrors set onto SUMO, because no motion leads there: {set} ({rate:.0} per million sensed vehicle-steps)"
+        "mirrors set onto SUMO: {set} ({rate:.0} per million vehicle-ticks){reasons}"
     ))
 }
 

@@ -117,15 +117,14 @@ fn with_a_preview_no_vehicle_on_a_default_grid_is_set_onto_sumo() {
         "g.sumocfg",
         &format!("<configuration><input>{input}</input>{time}</configuration>"),
     );
-    let run = |name: &str, preview: &str| {
+    let run = |name: &str, more: &[&'static str]| {
         let settings = [
             "fanout.enabled=false",
             "collision.detect=true",
             "map.origin_latitude_deg=52",
             "map.origin_longitude_deg=10",
-            preview,
         ];
-        let settings = settings.iter().flat_map(|setting| ["--set", *setting]);
+        let settings = settings.iter().chain(more).flat_map(|setting| ["--set", *setting]);
         let arguments: Vec<&str> = ["simulate", "g.sumocfg", "--name", name]
             .into_iter()
             .chain(settings)
@@ -133,13 +132,27 @@ fn with_a_preview_no_vehicle_on_a_default_grid_is_set_onto_sumo() {
         workplace.succeed(&arguments);
         workplace.report(name)["dynamics"].clone()
     };
-    let (without, with) = (
-        run("without", "vehicle.preview_s=0"),
-        run("with", "vehicle.preview_s=0.5"),
-    );
+    let without = run("without", &["vehicle.preview_s=0"]);
+    // A scenario has a preview by default.
+    let with = run("with", &[]);
     // Otherwise the net would show nothing.
     assert!(without["resynchronisations"].as_u64().unwrap() > 0, "{without:#}");
     assert_eq!(with["resynchronisations"], 0, "{with:#}");
+    // Each has its line, and is counted by class and cause.
+    let lines = std::fs::read_to_string(workplace.path().join("runs/without/events/resynchronisations.jsonl")).unwrap();
+    let mut counted = serde_json::Map::new();
+    for line in lines.lines() {
+        let line: serde_json::Value = serde_json::from_str(line).unwrap();
+        assert_eq!(line["class"], "passenger", "{line}");
+        assert!(line["jump_m"].as_f64().unwrap() > 1.0, "{line}");
+        let count = counted.entry(line["cause"].as_str().unwrap()).or_insert(0.into());
+        *count = (count.as_u64().unwrap() + 1).into();
+    }
+    assert_eq!(without["resynchronisations"], lines.lines().count(), "{without:#}");
+    assert_eq!(
+        without["resynchronisation_causes"]["passenger"],
+        serde_json::Value::Object(counted)
+    );
     let contacts = |dynamics: &serde_json::Value| dynamics["collisions"]["vehicle"].as_u64().unwrap();
     assert!(contacts(&with) <= contacts(&without), "{with:#}");
 }

@@ -39,6 +39,30 @@ pub struct VehicleConfig {
     pub leave_path_m: f64,
 }
 
+/// Most SUMO states in a mirror's window.
+const MOST_WINDOW_STATES: usize = 16;
+
+impl VehicleConfig {
+    /// Number of SUMO states, `step_s` apart, whose mean a mirror follows: followed half a step behind, the mean is
+    /// [`preview_s`](Self::preview_s) behind SUMO. 1 if a step is too long for that.
+    #[must_use]
+    pub fn window_states(&self, step_s: f64) -> usize {
+        window_states(self.preview_s, step_s)
+    }
+}
+
+fn window_states(preview_s: f64, step_s: f64) -> usize {
+    // A little more than the quotient: 0.45 / 0.1 is less than 4.5.
+    let steps = 2.0 * (preview_s - 0.5 * step_s) / step_s + 1e-6;
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "between 0 and MOST_WINDOW_STATES"
+    )]
+    let steps = steps.clamp(0.0, (MOST_WINDOW_STATES - 1) as f64) as usize;
+    steps + 1
+}
+
 /// A model that any vehicle may have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -142,5 +166,20 @@ mod tests {
         for text in ["bus", "bus=flying", "bus=rigid_body", "hovercraft=dynamic", "=dynamic"] {
             assert_eq!(text.parse::<ClassModel>(), Err(ClassModelError(text.to_owned())));
         }
+    }
+
+    #[test]
+    fn the_whole_delay_is_the_preview_at_every_step() {
+        for (step_s, states) in [
+            (0.1, 10),
+            (0.2, 5),
+            (0.5, 2),
+            (1.0, 1),
+            (2.0, 1),
+            (0.01, MOST_WINDOW_STATES),
+        ] {
+            assert_eq!(window_states(0.5, step_s), states, "{step_s}");
+        }
+        assert_eq!(window_states(0.0, 0.1), 1);
     }
 }

@@ -20,7 +20,6 @@ use crate::scene::{
 
 pub mod body;
 mod broad;
-mod event_log;
 mod record;
 
 use body::{CollisionBody, box_touches_prism, boxes_touch, common_height, common_point};

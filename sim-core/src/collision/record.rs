@@ -1,6 +1,6 @@
 //! Reporting of contacts: a message, a line in the run's directory, a count in its report.
 
-use std::{path::PathBuf, sync::Arc};
+use std::sync::Arc;
 
 use ipc_schema::{
     block::{self, BlockError, Section},
@@ -10,16 +10,16 @@ use ipc_schema::{
     membership::RunMembership,
     ports::Publisher,
     services::Channel,
-    traffic::{MetaEvent, VehicleMeta},
     world::VehicleState,
 };
 use serde::{Deserialize, Serialize};
 
-use super::{
-    CollisionDetector,
-    event_log::{self, EventLog},
+use super::CollisionDetector;
+use crate::{
+    event_log::EventLog,
+    names::RoadUserNames,
+    scene::{Scene, Solid},
 };
-use crate::scene::{Scene, Solid};
 
 /// Contacts that began in the run, by what was struck.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -73,21 +73,6 @@ struct CollisionLine<'a> {
     relative_speed_mps: f32,
 }
 
-/// The lines cannot be written.
-#[derive(Debug, thiserror::Error)]
-#[error("cannot write {path}")]
-struct WriteError {
-    path: PathBuf,
-    #[source]
-    source: std::io::Error,
-}
-
-impl From<WriteError> for Failure {
-    fn from(error: WriteError) -> Self {
-        Self::from_error(FailureKind::Run, &error).with_help("check free space and permissions of the run directory")
-    }
-}
-
 /// Finds, publishes and counts the contacts of a run.
 #[derive(Debug)]
 pub struct ContactReporter {
@@ -96,13 +81,9 @@ pub struct ContactReporter {
     publisher: Publisher,
     /// Most collisions in one message.
     most: usize,
-    path: PathBuf,
     lines: EventLog,
     /// Contacts without a line before this process.
     without_line_before: u64,
-    episode: Option<u64>,
-    /// SUMO's ids by dense index.
-    names: Vec<Box<str>>,
     counts: CollisionCounts,
 }
 
@@ -121,23 +102,13 @@ impl ContactReporter {
             return Ok(None);
         }
         let publisher = membership.publisher(Channel::Event)?;
-        let directory = membership.run.run_dir.join("events");
-        let path = directory.join("collisions.jsonl");
-        let opened = std::fs::create_dir_all(&directory)
-            .and_then(|()| EventLog::open(&path, before.line_bytes, event_log::LIMIT_BYTES));
-        let lines = opened.map_err(|source| WriteError {
-            path: path.clone(),
-            source,
-        })?;
+        let lines = EventLog::of_run(&membership.run.run_dir, "collisions.jsonl", before.line_bytes)?;
         Ok(Some(Self {
             detectors: scenes.iter().cloned().map(CollisionDetector::new).collect(),
             publisher,
             most: (membership.run.config.traffic.max_road_users as usize).max(1),
-            path,
             lines,
             without_line_before: before.counts.without_line,
-            episode: None,
-            names: Vec::new(),
             counts: before.counts,
         }))
     }
@@ -152,21 +123,6 @@ impl ContactReporter {
         Ok(ContactState { counts, line_bytes })
     }
 
-    /// Remembers the ids of road users that depart.
-    pub fn remember_ids(&mut self, header: &MessageHeader, metas: &[VehicleMeta]) {
-        if self.episode != Some(header.episode) {
-            self.episode = Some(header.episode);
-            self.names.clear();
-        }
-        for meta in metas.iter().filter(|meta| meta.event == MetaEvent::Departed as u32) {
-            let index = meta.vehicle as usize;
-            if self.names.len() <= index {
-                self.names.resize(index + 1, Box::default());
-            }
-            self.names[index] = meta.id_text().into_boxed_str();
-        }
-    }
-
     /// Looks for contacts in the states of a finished tick (section `states` of `payload`), flags them there, and publishes those that begin.
     ///
     /// # Errors
@@ -176,6 +132,7 @@ impl ContactReporter {
         header: &MessageHeader,
         payload: &mut [u8],
         states: Section,
+        names: &RoadUserNames,
     ) -> Result<(), Failure> {
         let states: &mut [VehicleState] = block::view_mut(payload, states).map_err(unreadable)?;
         let map = usize::from(header.map).min(self.detectors.len() - 1);
@@ -198,11 +155,7 @@ impl ContactReporter {
         }
         for collision in begun {
             self.counts.add(collision.other_class);
-            let line = line(header, collision, &self.names, detector.scene());
-            self.lines.push(&line).map_err(|source| WriteError {
-                path: self.path.clone(),
-                source,
-            })?;
+            self.lines.push(&line(header, collision, names, detector.scene()))?;
         }
         Ok(())
     }
@@ -212,10 +165,7 @@ impl ContactReporter {
     /// # Errors
     /// The file cannot be written.
     pub fn finish(&mut self) -> Result<CollisionCounts, Failure> {
-        self.lines.flush().map_err(|source| WriteError {
-            path: self.path.clone(),
-            source,
-        })?;
+        self.lines.flush()?;
         self.counts.without_line = self.without_line_before + self.lines.dropped_lines();
         Ok(self.counts)
     }
@@ -228,10 +178,10 @@ fn unreadable(error: BlockError) -> Failure {
 fn line<'a>(
     header: &MessageHeader,
     collision: &Collision,
-    names: &'a [Box<str>],
+    names: &'a RoadUserNames,
     scene: &'a Scene,
 ) -> CollisionLine<'a> {
-    let name = |index: u32| names.get(index as usize).map_or("", |name| &**name);
+    let name = |index: u32| names.id(index);
     let is = |class: Struck| collision.other_class == class as u32;
     let (what, other) = if is(Struck::Vehicle) {
         ("vehicle", name(collision.other))

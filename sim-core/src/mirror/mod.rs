@@ -19,6 +19,7 @@ pub mod hero;
 pub mod person;
 pub mod prefetch;
 pub mod reference;
+pub mod resynchronisation;
 pub mod road_user;
 pub mod settings;
 pub mod statistics;
@@ -34,6 +35,7 @@ use crate::models::{
 };
 use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch};
 use prefetch::PrefetchRange;
+use resynchronisation::Resynchronisation;
 use road_user::RoadUser;
 pub use settings::MirrorSettings;
 use statistics::TrackingStatistics;
@@ -103,6 +105,8 @@ pub struct Mirror {
     dynamic: ModelBatch<DynamicParams, DYNAMIC>,
     tracking: TrackingStatistics,
     resynchronisations: u64,
+    /// Those of the last tick.
+    resynchronised: Vec<Resynchronisation>,
 }
 
 /// A batch of one model, and where the states of its members belong.
@@ -135,6 +139,7 @@ impl Mirror {
             dynamic: ModelBatch::new(sub_steps),
             tracking: TrackingStatistics::default(),
             resynchronisations: 0,
+            resynchronised: Vec::new(),
         })
     }
 
@@ -165,6 +170,12 @@ impl Mirror {
     #[must_use]
     pub fn resynchronisations(&self) -> u64 {
         self.resynchronisations
+    }
+
+    /// The road users that the last tick set onto SUMO.
+    #[must_use]
+    pub fn resynchronised(&self) -> &[Resynchronisation] {
+        &self.resynchronised
     }
 
     /// Continues counting from statistics of earlier episodes.
@@ -317,6 +328,7 @@ impl Mirror {
         let states: &mut [VehicleState] = cast(states, layout.states.offset)?;
         let rows: &mut [SubStep] = cast(rows, layout.sub_steps.offset)?;
         let mut place_in_message = 0;
+        self.resynchronised.clear();
         for index in 0..self.present.len() {
             let (_, place) = self.present[index];
             let road_user = &mut self.slab[place as usize];
@@ -331,17 +343,18 @@ impl Mirror {
                 let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
                 let models = self.catalogue.with_body(road_user.model());
                 let set = road_user.write_unmoved(tick, &self.settings, models, &mut states[row], sub_steps);
-                self.resynchronisations += u64::from(set);
+                self.resynchronised.extend(set);
             }
         }
         let mut context = BatchContext::new(
             &self.settings,
             &mut self.slab,
             &mut self.tracking,
-            &mut self.resynchronisations,
+            &mut self.resynchronised,
         );
         self.kinematic.advance(tick, &mut context, states, rows);
         self.dynamic.advance(tick, &mut context, states, rows);
+        self.resynchronisations += self.resynchronised.len() as u64;
         Ok(())
     }
 
@@ -354,11 +367,11 @@ impl Mirror {
             kinematic,
             dynamic,
             tracking,
-            resynchronisations,
+            resynchronised,
             ..
         } = self;
         let built = catalogue.at(slab[place as usize].model());
-        let mut context = BatchContext::new(settings, slab, tracking, resynchronisations);
+        let mut context = BatchContext::new(settings, slab, tracking, resynchronised);
         match &built.model {
             MotionModel::Kinematic(params) => {
                 if kinematic.load(tick, params, &mut context, (place, row)) {
@@ -379,7 +392,7 @@ struct BatchContext<'a> {
     settings: &'a MirrorSettings,
     slab: &'a mut [RoadUser],
     tracking: &'a mut TrackingStatistics,
-    resynchronisations: &'a mut u64,
+    resynchronised: &'a mut Vec<Resynchronisation>,
 }
 
 impl<'a> BatchContext<'a> {
@@ -387,13 +400,13 @@ impl<'a> BatchContext<'a> {
         settings: &'a MirrorSettings,
         slab: &'a mut [RoadUser],
         tracking: &'a mut TrackingStatistics,
-        resynchronisations: &'a mut u64,
+        resynchronised: &'a mut Vec<Resynchronisation>,
     ) -> Self {
         Self {
             settings,
             slab,
             tracking,
-            resynchronisations,
+            resynchronised,
         }
     }
 }
@@ -440,7 +453,7 @@ impl<P: BatchModel<N>, const N: usize> ModelBatch<P, N> {
             let sub_steps = &mut rows[row * per_tick..(row + 1) * per_tick];
             let (road_user, out) = (&mut context.slab[place as usize], &mut states[row]);
             let set = road_user.store(tick, context.settings, &self.batch, member, out, sub_steps);
-            *context.resynchronisations += u64::from(set);
+            context.resynchronised.extend(set);
             context.tracking.add(out);
         }
     }

@@ -11,6 +11,7 @@ use super::{
     hero::Hero,
     person::Person,
     reference::{PathJoin, ReferencePath},
+    resynchronisation::{Resynchronisation, ResynchronisationCause},
     settings::MirrorSettings,
     tracking,
     window::StateWindow,
@@ -32,7 +33,7 @@ enum Arrival {
     /// It existed a step ago and keeps moving.
     Continuing,
     /// It existed a step ago and is set to SUMO's state at the end of the step.
-    Jumping,
+    Jumping(ResynchronisationCause),
     /// It exists from the end of the step on.
     Entering,
 }
@@ -115,7 +116,7 @@ impl RoadUser {
         self.arrival = if !known {
             Arrival::Entering
         } else if now.flags & DISCONTINUOUS != 0 {
-            Arrival::Jumping
+            Arrival::Jumping(ResynchronisationCause::MovedBySumo)
         } else {
             Arrival::Continuing
         };
@@ -131,11 +132,11 @@ impl RoadUser {
             (_, Arrival::Entering) => {}
             // SUMO's position of a hero does not matter: its model decides where it is.
             (Mover::Hero(_), _) => self.arrival = Arrival::Continuing,
-            (Mover::Person(person), Arrival::Jumping) => person.coast(&self.before, settings.step_s()),
+            (Mover::Person(person), Arrival::Jumping(_)) => person.coast(&self.before, settings.step_s()),
             (Mover::Person(person), Arrival::Continuing) => {
                 person.advance(&self.before, &self.now, settings.step_s());
             }
-            (Mover::Vehicle { path, .. }, Arrival::Jumping) => path.coast(&self.before, settings.step_s()),
+            (Mover::Vehicle { path, .. }, Arrival::Jumping(_)) => path.coast(&self.before, settings.step_s()),
             (Mover::Vehicle { path, .. }, Arrival::Continuing) => {
                 if let Some(left_m) = lane_change_m {
                     path.change_lane(left_m);
@@ -144,7 +145,7 @@ impl RoadUser {
                     == PathJoin::Broken
                 {
                     path.coast(&self.before, settings.step_s());
-                    self.arrival = Arrival::Jumping;
+                    self.arrival = Arrival::Jumping(ResynchronisationCause::ImpossibleStep);
                 }
             }
         }
@@ -155,11 +156,11 @@ impl RoadUser {
     fn take_mean(&mut self, now: &TrafficState, window: &mut StateWindow, step_s: f64) -> Option<f64> {
         let step = match self.arrival {
             Arrival::Continuing => window.advance(now, self.dimensions.length_m, step_s),
-            Arrival::Entering | Arrival::Jumping => None,
+            Arrival::Entering | Arrival::Jumping(_) => None,
         };
         let Some(step) = step else {
             if self.arrival == Arrival::Continuing {
-                self.arrival = Arrival::Jumping;
+                self.arrival = Arrival::Jumping(ResynchronisationCause::ImpossibleStep);
             }
             (self.before, self.now) = (self.now, window.restart(now, step_s));
             self.deviation_m = 0.0;
@@ -225,7 +226,7 @@ impl RoadUser {
         }
     }
 
-    /// Takes the vehicle from its batch and writes the tick. Returns true if the vehicle was set to its path because it was too far
+    /// Takes the vehicle from its batch and writes the tick. Returns the jump if the vehicle was set to its path because it was too far
     /// away.
     pub fn store<P: BatchModel<N>, const N: usize>(
         &mut self,
@@ -235,11 +236,11 @@ impl RoadUser {
         member: usize,
         out: &mut VehicleState,
         rows: &mut [SubStep],
-    ) -> bool {
+    ) -> Option<Resynchronisation> {
         self.describe(out);
         let front_m = self.dimensions.front_m();
         let Mover::Vehicle { state, path } = &mut self.mover else {
-            return false;
+            return None;
         };
         *state = batch.state(member);
         let start_s = f64::from(tick) * settings.tick_s;
@@ -252,20 +253,29 @@ impl RoadUser {
         let error = tracking::error(state, front_m, &target);
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;
         let limit = settings.vehicle.resynchronise_m;
-        let lost = square > limit * limit || path.undriven_m() > settings.vehicle.leave_path_m;
-        if lost {
+        let lost = if square > limit * limit {
+            Some(ResynchronisationCause::TrackingError)
+        } else if path.undriven_m() > settings.vehicle.leave_path_m {
+            Some(ResynchronisationCause::LeftPath)
+        } else {
+            None
+        };
+        let mut jump_m = 0.0;
+        if lost.is_some() {
+            let before = (state.x_m, state.y_m);
             *state = set_onto(&path.resynchronise(end_s), front_m, path.heading_at(end_s));
+            jump_m = distance_m(before, (state.x_m, state.y_m));
             out.reference_offset_m = 0.0;
             write_set(state, path, end_s, front_m, out, rows);
         } else {
             out.tracking_lateral_m = error.lateral_m as f32;
             out.tracking_longitudinal_m = error.longitudinal_m as f32;
         }
-        self.flag(lost, out)
+        self.flag(lost, jump_m, out)
     }
 
-    /// Writes the tick of a person or a hero, or of a vehicle that is set to SUMO's state in it. Returns true if a road user that
-    /// already existed was set.
+    /// Writes the tick of a person or a hero, or of a vehicle that is set to SUMO's state in it. Returns the jump of a road user that
+    /// already existed.
     pub fn write_unmoved(
         &mut self,
         tick: u32,
@@ -273,9 +283,11 @@ impl RoadUser {
         (built, body): (&SizedModel, Option<&mut RigidBody>),
         out: &mut VehicleState,
         rows: &mut [SubStep],
-    ) -> bool {
+    ) -> Option<Resynchronisation> {
         self.describe(out);
         let set = self.is_set_in(tick, settings);
+        let mut before = (self.before.front_x_m, self.before.front_y_m);
+        let mut now = (self.now.front_x_m, self.now.front_y_m);
         match &mut self.mover {
             Mover::Person(person) => {
                 if set {
@@ -303,18 +315,35 @@ impl RoadUser {
             Mover::Vehicle { state, path } => {
                 let front_m = self.dimensions.front_m();
                 *path = ReferencePath::from_here(&self.now, settings.step_s());
+                before = (state.x_m, state.y_m);
                 *state = set_onto(&path.start(), front_m, f64::from(self.now.yaw_rad));
+                now = (state.x_m, state.y_m);
                 write_set(state, path, 0.0, front_m, out, rows);
             }
         }
-        self.flag(set, out)
+        let cause = match self.arrival {
+            _ if !set => None,
+            Arrival::Jumping(cause) => Some(cause),
+            Arrival::Entering | Arrival::Continuing => Some(ResynchronisationCause::Returned),
+        };
+        self.flag(cause, distance_m(before, now), out)
     }
 
-    /// Flags the first tick and a set pose; returns true if the pose of a road user that already existed was set.
-    fn flag(&mut self, set: bool, out: &mut VehicleState) -> bool {
+    /// Flags the first tick and a set pose; returns the jump of a road user that already existed.
+    fn flag(
+        &mut self,
+        set: Option<ResynchronisationCause>,
+        jump_m: f64,
+        out: &mut VehicleState,
+    ) -> Option<Resynchronisation> {
         let appeared = std::mem::take(&mut self.new);
-        out.flags = if appeared { APPEARED } else { 0 } | if set { RESYNCHRONISED } else { 0 };
-        set && !appeared
+        out.flags = if appeared { APPEARED } else { 0 } | if set.is_some() { RESYNCHRONISED } else { 0 };
+        set.filter(|_| !appeared).map(|cause| Resynchronisation {
+            vehicle: out.vehicle,
+            cause,
+            position_m: [out.x_m, out.y_m, out.z_m],
+            jump_m,
+        })
     }
 
     fn describe(&self, out: &mut VehicleState) {
@@ -339,6 +368,10 @@ impl RoadUser {
             out.rear_overhang_m = rear_overhang_m as f32;
         }
     }
+}
+
+fn distance_m(from: (f64, f64), to: (f64, f64)) -> f64 {
+    libm::hypot(to.0 - from.0, to.1 - from.1)
 }
 
 /// Writes the state at the end of a tick: `road` is that of the lane (see [`VehicleBatch::road`]), `height_m` that of the road under the

@@ -6,7 +6,6 @@ use ipc_schema::{
     run::RunFile,
 };
 
-use super::window::states_for;
 use crate::models::{catalogue::ModelCatalogue, parameters::ParameterError};
 
 /// Times of a run and limits of its vehicles.
@@ -42,7 +41,7 @@ impl MirrorSettings {
     /// States of SUMO whose mean a road user follows.
     #[must_use]
     pub fn window_states(&self) -> usize {
-        states_for(self.vehicle.preview_s, self.step_s())
+        self.vehicle.window_states(self.step_s())
     }
 
     /// Length of a SUMO step, seconds.
@@ -59,7 +58,7 @@ impl MirrorSettings {
             surface: run.config.surface(),
             tick_s: run.config.run.tick_s,
             sub_steps: run.config.run.sub_steps,
-            ticks_per_step: u32::try_from(run.ticks_per_traffic_step()).unwrap_or(u32::MAX),
+            ticks_per_step: u32::try_from(run.ticks_per_frame()).unwrap_or(u32::MAX),
         }
     }
 

@@ -9,9 +9,6 @@ use ipc_schema::traffic::TrafficState;
 use super::reference::{LaneJump, PathJoin, join};
 use crate::trig::wrap_angle;
 
-/// Most states in a window.
-const MOST_STATES: usize = 16;
-
 /// What is averaged: position of the front bumper (metres), heading without jumps and slope (radians), speed (m/s).
 type Sample = [f64; 6];
 
@@ -30,23 +27,11 @@ pub struct WindowStep {
 #[derive(Debug, Clone, PartialEq)]
 pub struct StateWindow {
     samples: Vec<Sample>,
+    /// Lamps of each sample.
+    lamps: Vec<u32>,
     /// Place of the oldest sample.
     oldest: usize,
     newest: TrafficState,
-}
-
-/// Number of states whose mean, followed half a step behind, is `preview_s` behind SUMO; 1 if a step is too long for that.
-#[must_use]
-pub fn states_for(preview_s: f64, step_s: f64) -> usize {
-    // A little more than the quotient: 0.45 / 0.1 is less than 4.5.
-    let steps = 2.0 * (preview_s - 0.5 * step_s) / step_s + 1e-6;
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "between 0 and MOST_STATES"
-    )]
-    let steps = steps.clamp(0.0, (MOST_STATES - 1) as f64) as usize;
-    steps + 1
 }
 
 impl StateWindow {
@@ -55,6 +40,7 @@ impl StateWindow {
     pub fn new(count: usize) -> Self {
         Self {
             samples: vec![[0.0; 6]; count],
+            lamps: vec![0; count],
             oldest: 0,
             newest: TrafficState::default(),
         }
@@ -73,6 +59,7 @@ impl StateWindow {
             slot[1] -= back_m * sin;
             slot[2] -= back_m * climb;
         }
+        self.lamps.fill(now.signals);
         (self.oldest, self.newest) = (0, *now);
         self.mean()
     }
@@ -95,6 +82,7 @@ impl StateWindow {
         let mut next = sample(now);
         next[3] = last_yaw_rad + wrap_angle(next[3] - last_yaw_rad);
         self.samples[self.oldest] = next;
+        self.lamps[self.oldest] = now.signals;
         self.oldest = (self.oldest + 1) % count;
         self.newest = *now;
         Some(WindowStep {
@@ -129,7 +117,8 @@ impl StateWindow {
                 *total += part;
             }
         }
-        let share = 1.0 / self.samples.len() as f64;
+        let count = self.samples.len();
+        let share = 1.0 / count as f64;
         TrafficState {
             front_x_m: sum[0] * share,
             front_y_m: sum[1] * share,
@@ -137,6 +126,8 @@ impl StateWindow {
             yaw_rad: wrap_angle(sum[3] * share) as f32,
             pitch_rad: (sum[4] * share) as f32,
             speed_mps: (sum[5] * share) as f32,
+            // Lamps are as late as the vehicle: they are those of the middle.
+            signals: self.lamps[(self.oldest + (count - 1) / 2) % count],
             ..self.newest
         }
     }
@@ -169,14 +160,6 @@ mod tests {
             speed_mps: speed_mps as f32,
             ..TrafficState::default()
         }
-    }
-
-    #[test]
-    fn the_whole_delay_is_the_preview_at_every_step() {
-        for (step_s, count) in [(0.1, 10), (0.2, 5), (0.5, 2), (1.0, 1), (2.0, 1), (0.01, MOST_STATES)] {
-            assert_eq!(states_for(0.5, step_s), count, "{step_s}");
-        }
-        assert_eq!(states_for(0.0, 0.1), 1);
     }
 
     proptest! {

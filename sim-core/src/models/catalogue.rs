@@ -100,7 +100,7 @@ impl ModelCatalogue {
     /// Index of the model for an announced road user.
     pub fn index_for(&mut self, meta: &VehicleMeta) -> u32 {
         let choice = self.catalogue.choose(&meta.vehicle_class, f64::from(meta.length_m));
-        let class = class_text(meta);
+        let class = meta.class_text();
         if !choice.known && meta.kind != Kind::Person as u32 {
             self.unknown.entry(class.clone()).or_insert(false);
         }
@@ -204,15 +204,6 @@ impl ModelCatalogue {
         })
         .collect()
     }
-}
-
-fn class_text(meta: &VehicleMeta) -> String {
-    let end = meta
-        .vehicle_class
-        .iter()
-        .position(|&byte| byte == 0)
-        .unwrap_or(meta.vehicle_class.len());
-    String::from_utf8_lossy(&meta.vehicle_class[..end]).into_owned()
 }
 
 #[cfg(test)]

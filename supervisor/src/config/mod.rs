@@ -117,6 +117,12 @@ impl LayeredSettings {
             .is_some_and(|setting| setting.value == Value::Bool(true))
     }
 
+    /// True if the key `path` has this text.
+    #[must_use]
+    pub fn has_text(&self, path: &str, text: &str) -> bool {
+        self.setting(path).is_some_and(|setting| setting.value == text)
+    }
+
     fn setting(&self, path: &str) -> Option<&LocatedValue> {
         self.0.get(path)
     }

@@ -16,7 +16,10 @@ use super::{Bridge, commands::CommandContext};
 use crate::{
     heroes,
     population::{Population, PopulationSize, trips::TripSelection},
-    sumo::{Sumo, connected::ConnectedRule, error::SumoError, frame::TrafficFrame, options::SumoOptions},
+    sumo::{
+        Sumo, connected::ConnectedRule, error::SumoError, frame::TrafficFrame, interpolation::StepInterpolation,
+        options::SumoOptions,
+    },
 };
 
 /// SUMO with the road users of one episode.
@@ -24,6 +27,8 @@ pub(super) struct RunningEpisode {
     pub(super) sumo: Sumo,
     population: Option<Population>,
     pub(super) frame: TrafficFrame,
+    /// Where SUMO steps more slowly than the mirror needs.
+    interpolation: Option<StepInterpolation>,
     episode: Episode,
 }
 
@@ -154,11 +159,16 @@ impl Bridge {
         };
         Failure::remove(&run.run_dir, Process::TrafficBridge.name());
         let population = population(run, &mut sumo, episode, stage)?;
+        let interpolation = match self.frames_per_step {
+            1 => None,
+            frames => Some(StepInterpolation::new(sumo.read_lanes()?, frames, sumo.step_s())),
+        };
         self.commands.begin_episode();
         Ok(RunningEpisode {
             sumo,
             population,
             frame: TrafficFrame::default(),
+            interpolation,
             episode: *episode,
         })
     }
@@ -173,6 +183,7 @@ impl Bridge {
             sumo,
             population,
             frame,
+            interpolation,
             episode,
         } = running;
         loop {
@@ -210,6 +221,10 @@ impl Bridge {
                 let points = heroes::take_over(sumo, frame)?;
                 self.outbox.publish_routes(&points, header)?;
             }
+            let header = match interpolation {
+                Some(interpolation) => self.publish_between(interpolation, frame, header)?,
+                None => header,
+            };
             self.publish_step(frame, header)?;
 
             // Close the episode or the segment, or prepare the next step.
@@ -374,8 +389,42 @@ impl Bridge {
         }
     }
 
+    /// Sends the frames between the last step and this one. Returns the header of the step itself.
+    fn publish_between(
+        &mut self,
+        interpolation: &mut StepInterpolation,
+        frame: &TrafficFrame,
+        header: MessageHeader,
+    ) -> Result<MessageHeader, Failure> {
+        interpolation.take_step(frame);
+        let frames = self.frames_per_step;
+        let ticks_per_frame = self.ticks_per_step / frames;
+        let frame_ns = nanoseconds(self.membership.run.config.run.tick_s * ticks_per_frame as f64);
+        let mut between = std::mem::take(&mut self.between);
+        for number in 1..frames {
+            interpolation.fill(number, &mut between);
+            between.step = frame.step;
+            self.signal_delay.apply(&mut between);
+            let left = frames - number;
+            let first = if number == 1 { FIRST_OF_EPISODE } else { 0 };
+            let header = MessageHeader {
+                flags: header.flags & (EVALUATION | first),
+                tick: header.tick - left * ticks_per_frame,
+                sim_time_ns: header.sim_time_ns - left * frame_ns,
+                ..header
+            };
+            self.outbox.publish_step(&between, header)?;
+        }
+        self.between = between;
+        Ok(MessageHeader {
+            flags: header.flags & !FIRST_OF_EPISODE,
+            ..header
+        })
+    }
+
     /// Sends one step, counts it and reports the progress.
-    fn publish_step(&mut self, frame: &TrafficFrame, header: MessageHeader) -> Result<(), Failure> {
+    fn publish_step(&mut self, frame: &mut TrafficFrame, header: MessageHeader) -> Result<(), Failure> {
+        self.signal_delay.apply(frame);
         let header = self.outbox.publish_step(frame, header)?;
         self.totals.add_step(frame, self.ticks_per_step);
         let (totals, drops) = (&self.totals, self.outbox.drops());

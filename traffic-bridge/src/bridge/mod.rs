@@ -7,6 +7,7 @@ mod episode;
 mod lessons;
 mod outbox;
 mod pacing;
+mod signal_delay;
 
 use std::path::Path;
 
@@ -29,6 +30,7 @@ use commands::CommandExecutor;
 use lessons::MapUsage;
 use outbox::Outbox;
 use pacing::Pacing;
+use signal_delay::SignalDelay;
 
 /// Runs all episodes of the run that `run_file` describes, or until the process is asked to stop.
 ///
@@ -62,11 +64,16 @@ struct Bridge {
     /// Poses of the heroes, in the driving task.
     poses: Option<Subscriber>,
     pacing: Pacing,
+    signal_delay: SignalDelay,
     /// The first tick that the clock paces.
     paced_from: u64,
     command_server: ControlServer,
     commands: CommandExecutor,
     ticks_per_step: u64,
+    /// Frames that are sent for each step of SUMO.
+    frames_per_step: u64,
+    /// The frame between two steps that is being sent.
+    between: TrafficFrame,
     /// The maps of the run.
     maps: Vec<RunMap>,
     /// Lessons and ticks on each map, in a run with a curriculum.
@@ -154,9 +161,12 @@ impl Bridge {
             poses,
             paced_from: membership.run.restart.map_or(0, |restart| restart.sensed_ticks),
             pacing: Pacing::new(membership.run.config.run.real_time_factor),
+            signal_delay: SignalDelay::new(membership.run.mirror_delay_frames()),
             command_server: membership.control_server()?,
             commands: CommandExecutor::of_run(&membership.run.run_dir)?,
             ticks_per_step: membership.run.ticks_per_traffic_step(),
+            frames_per_step: membership.run.ticks_per_traffic_step() / membership.run.ticks_per_frame(),
+            between: TrafficFrame::default(),
             map_usage: usage_before.unwrap_or_else(|| maps.iter().map(|map| MapUsage::new(&map.name)).collect()),
             maps,
             membership,

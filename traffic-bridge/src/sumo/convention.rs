@@ -97,6 +97,8 @@ mod tests {
             speed: 3.0,
             previous_speed: 2.0,
             signals: 8,
+            lane: -1,
+            lane_position: 0.0,
             index: 7,
         }
     }

@@ -9,6 +9,8 @@ use ipc_schema::traffic::{
 use super::{
     connected::ConnectedRule,
     convention,
+    interpolation::VehiclePlace,
+    lanes::LanePlace,
     libsumo::ffi::{RawEvent, RawEventKind, RawSignal, RawState},
 };
 
@@ -17,6 +19,8 @@ use super::{
 pub struct TrafficFrame {
     /// All road users on the road, by ascending dense index.
     pub states: Vec<TrafficState>,
+    /// Where each of `states` is on its lane, if lanes are read ([`super::Sumo::read_lanes`]); otherwise empty.
+    pub places: Vec<VehiclePlace>,
     /// Arrivals, departures and teleports of this step.
     pub events: Vec<VehicleMeta>,
     /// Traffic lights that changed in this step; in the first step of an episode all of them.
@@ -33,7 +37,11 @@ pub struct TrafficFrame {
 #[derive(Debug)]
 pub(crate) struct RoadUserRegister {
     rule: ConnectedRule,
+    /// Of each road user, by its dense index.
     kinds: Vec<Kind>,
+    lengths_m: Vec<f64>,
+    /// Fill [`TrafficFrame::places`].
+    pub(crate) reads_lanes: bool,
     /// Connected vehicles that have departed and not arrived.
     cavs: u32,
     types: BTreeMap<String, u32>,
@@ -44,6 +52,8 @@ impl RoadUserRegister {
         Self {
             rule,
             kinds: Vec::new(),
+            lengths_m: Vec::new(),
+            reads_lanes: false,
             cavs: 0,
             types: BTreeMap::new(),
         }
@@ -54,12 +64,16 @@ impl RoadUserRegister {
         frame.events.clear();
         frame.events.extend(events.iter().map(|event| self.meta(event)));
         frame.states.clear();
+        frame.places.clear();
         frame.cavs = 0;
         for raw in states {
             let kind = self.kind(raw.index);
             if let Some(state) = convention::traffic_state(raw, kind, step_s) {
                 frame.cavs += u32::from(matches!(kind, Kind::Cav | Kind::Hero));
                 frame.states.push(state);
+                if self.reads_lanes {
+                    frame.places.push(self.place(raw));
+                }
             }
         }
     }
@@ -68,10 +82,21 @@ impl RoadUserRegister {
         self.kinds.get(index as usize).copied().unwrap_or(Kind::Other)
     }
 
+    fn place(&self, raw: &RawState) -> VehiclePlace {
+        VehiclePlace {
+            lane: u32::try_from(raw.lane).ok().map(|lane| LanePlace {
+                lane,
+                position_m: raw.lane_position,
+            }),
+            length_m: self.lengths_m.get(raw.index as usize).copied().unwrap_or(0.0),
+        }
+    }
+
     fn meta(&mut self, event: &RawEvent) -> VehicleMeta {
         let departed = event.kind == RawEventKind::Departed;
         if departed {
             // The shim assigns indices in order of departure, without gaps.
+            self.lengths_m.push(event.length);
             self.kinds.push(if event.is_person {
                 Kind::Person
             } else {

@@ -29,6 +29,23 @@ pub mod ffi {
         signals: i32,
         /// Dense index within the episode.
         index: u32,
+        /// Place of its lane among `Simulation::net_lanes`; negative if lanes are not read, for persons and off the road.
+        lane: i32,
+        /// Position of the front bumper on that lane, metres of the lane's own length.
+        lane_position: f64,
+    }
+
+    /// A lane of the net, junctions included.
+    #[derive(Debug, Clone, PartialEq)]
+    struct RawNetLane {
+        /// Number of its edge; lanes of one edge lie beside each other.
+        edge: u32,
+        /// The lane's own length, which positions refer to, metres.
+        length: f64,
+        /// x, y, z, x, y, z, … of the centre line.
+        shape: Vec<f64>,
+        /// Places of the lanes that follow.
+        next: Vec<u32>,
     }
 
     /// The kind of an event.
@@ -148,6 +165,9 @@ pub mod ffi {
         fn end_time(self: &Simulation) -> Result<f64>;
         fn step_length(self: &Simulation) -> Result<f64>;
         fn min_expected(self: &Simulation) -> Result<i32>;
+
+        /// All lanes of the net. From now on each step reads on which lane a vehicle is.
+        fn net_lanes(self: Pin<&mut Simulation>) -> Result<Vec<RawNetLane>>;
 
         fn vehicle_class(self: &Simulation, vehicle_type: &str) -> Result<String>;
         fn edges(self: &Simulation, vehicle_class: &str) -> Result<Vec<RawEdge>>;

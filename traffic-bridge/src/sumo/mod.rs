@@ -6,6 +6,8 @@ pub mod convention;
 pub mod error;
 pub mod frame;
 pub mod inputs;
+pub mod interpolation;
+pub mod lanes;
 pub mod libsumo;
 pub mod options;
 
@@ -20,6 +22,7 @@ use cxx::UniquePtr;
 use error::SumoError;
 use frame::{RoadUserRegister, TrafficFrame, signal_meta};
 use inputs::InputFiles;
+use lanes::LaneGraph;
 use libsumo::ffi;
 use options::SumoOptions;
 use serde::{Deserialize, Serialize};
@@ -174,6 +177,16 @@ impl Sumo {
         frame.signals.clear();
         frame.signals.extend(self.simulation.signals().iter().map(signal_meta));
         Ok(())
+    }
+
+    /// From now on frames say where vehicles are on their lanes. Returns the lanes.
+    ///
+    /// # Errors
+    /// SUMO is no longer loaded.
+    pub fn read_lanes(&mut self) -> Result<LaneGraph, SumoError> {
+        let lanes = called("list its lanes", self.simulation.pin_mut().net_lanes())?;
+        self.register.reads_lanes = true;
+        Ok(LaneGraph::new(lanes))
     }
 
     /// Simulated time since the start of the episode, seconds.

@@ -15,8 +15,11 @@
 
 namespace caraware {
 
-// Signals change slowly: the signals of each vehicle are read once in this many steps.
-constexpr std::uint64_t SIGNAL_PERIOD_STEPS = 4;
+// Lamps change slowly: those of each vehicle are read this often.
+constexpr double SIGNAL_PERIOD_S = 0.4;
+
+// A road user that is on no lane of the net.
+constexpr std::int32_t NO_LANE = -1;
 
 // A traffic light changes when SUMO has announced it. Another signal program may start in between (WAUT), so each light is also
 // read once in this many steps.
@@ -89,8 +92,10 @@ void Simulation::start(rust::Slice<const rust::String> arguments) {
     person_places_.clear();
     reading_order_.clear();
     late_ = 0;
+    lane_places_.clear();
     next_index_ = 0;
     steps_ = 0;
+    signal_period_steps_ = static_cast<std::uint64_t>(std::max(1.0, SIGNAL_PERIOD_S / libsumo::Simulation::getDeltaT() + TIME_ROUNDING_S));
     any_gone_ = false;
     has_elevation_ = net_has_elevation();
     signals_.clear();
@@ -204,7 +209,7 @@ void Simulation::depart(const std::string& id, bool is_person) {
     reading_order_.push_back(live_.size());
     ++late_;
     live_.push_back(Live{id, is_person, false});
-    states_.push_back(RawState{invalid, invalid, 0.0, 0.0, 0.0, invalid, invalid, 0, next_index_});
+    states_.push_back(RawState{invalid, invalid, 0.0, 0.0, 0.0, invalid, invalid, 0, next_index_, NO_LANE, 0.0});
     events_.push_back(std::move(departure));
     ++next_index_;
 }
@@ -226,13 +231,19 @@ void Simulation::read_vehicle(const std::string& id, RawState& state) const {
     state.z = position.z;
     state.angle = libsumo::Vehicle::getAngle(id);
     state.speed = libsumo::Vehicle::getSpeed(id);
+    state.lane = NO_LANE;
     if (position.x == libsumo::INVALID_DOUBLE_VALUE) {
         return;
     }
     if (has_elevation_) {
         state.slope = libsumo::Vehicle::getSlope(id);
     }
-    if ((steps_ + state.index) % SIGNAL_PERIOD_STEPS == 0) {
+    if (!lane_places_.empty()) {
+        const auto lane = lane_places_.find(libsumo::Vehicle::getLaneID(id));
+        state.lane = lane == lane_places_.end() ? NO_LANE : lane->second;
+        state.lane_position = libsumo::Vehicle::getLanePosition(id);
+    }
+    if ((steps_ + state.index) % signal_period_steps_ == 0) {
         state.signals = libsumo::Vehicle::getSignals(id);
     }
 }
@@ -311,6 +322,34 @@ void Simulation::forget_gone() {
     }
     reading_order_.erase(std::remove(reading_order_.begin(), reading_order_.end(), GONE), reading_order_.end());
     any_gone_ = false;
+}
+
+rust::Vec<RawNetLane> Simulation::net_lanes() {
+    const std::vector<std::string> ids = libsumo::Lane::getIDList();
+    std::unordered_map<std::string, std::uint32_t> edges;
+    for (std::size_t place = 0; place < ids.size(); ++place) {
+        lane_places_.emplace(ids[place], static_cast<std::int32_t>(place));
+    }
+    rust::Vec<RawNetLane> lanes;
+    lanes.reserve(ids.size());
+    for (const std::string& id : ids) {
+        RawNetLane lane;
+        lane.edge = edges.emplace(libsumo::Lane::getEdgeID(id), static_cast<std::uint32_t>(edges.size())).first->second;
+        lane.length = libsumo::Lane::getLength(id);
+        for (const libsumo::TraCIPosition& point : libsumo::Lane::getShape(id).value) {
+            lane.shape.push_back(point.x);
+            lane.shape.push_back(point.y);
+            lane.shape.push_back(point.z == libsumo::INVALID_DOUBLE_VALUE ? 0.0 : point.z);
+        }
+        for (const libsumo::TraCIConnection& link : libsumo::Lane::getLinks(id)) {
+            const std::string& next = link.approachedInternal.empty() ? link.approachedLane : link.approachedInternal;
+            if (const auto place = lane_places_.find(next); place != lane_places_.end()) {
+                lane.next.push_back(static_cast<std::uint32_t>(place->second));
+            }
+        }
+        lanes.push_back(std::move(lane));
+    }
+    return lanes;
 }
 
 rust::Slice<const RawState> Simulation::states() const { return {states_.data(), states_.size()}; }

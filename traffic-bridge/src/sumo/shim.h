@@ -22,6 +22,7 @@ struct RawEdge;
 struct RawLink;
 struct RawLane;
 struct RawWay;
+struct RawNetLane;
 class ErrorTee;
 
 class Simulation {
@@ -46,6 +47,8 @@ public:
     double end_time() const;
     double step_length() const;
     std::int32_t min_expected() const;
+
+    rust::Vec<RawNetLane> net_lanes();
 
     rust::String vehicle_class(rust::Str vehicle_type) const;
     rust::Vec<RawEdge> edges(rust::Str vehicle_class) const;
@@ -114,8 +117,11 @@ private:
     // Place in `live_` of an id; vehicles and persons have separate names. Never iterated.
     std::unordered_map<std::string, std::size_t> vehicle_places_;
     std::unordered_map<std::string, std::size_t> person_places_;
+    // Place among the net's lanes of an id; empty if lanes are not read. Never iterated.
+    std::unordered_map<std::string, std::int32_t> lane_places_;
     std::uint32_t next_index_ = 0;
     std::uint64_t steps_ = 0;
+    std::uint64_t signal_period_steps_ = 1;
     bool has_elevation_ = false;
     bool any_gone_ = false;
     double seconds_in_step_ = 0.0;

@@ -96,6 +96,45 @@ impl Bench {
         net
     }
 
+    /// A grid of 4 × 4 junctions with one lane in each direction, by netgenerate's defaults.
+    pub fn default_grid(&self) -> PathBuf {
+        let net = self.folder.path().join("default.net.xml");
+        let options = [
+            "--grid",
+            "--grid.number",
+            "4",
+            "--no-turnarounds",
+            "--seed",
+            "3",
+            "--output-file",
+        ];
+        let output = tool("netgenerate").args(options).arg(&net).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        net
+    }
+
+    /// Vehicles that cross the default grid with many turns.
+    pub fn crossing_scenario(&self, net: &Path) -> PathBuf {
+        let routes = [
+            "A0A1 A1B1 B1B2 B2C2 C2C3",
+            "D3C3 C3C2 C2B2 B2B1 B1A1",
+            "C0C1 C1B1 B1B2 B2A2",
+            "A3B3 B3B2 B2C2 C2C1 C1D1",
+        ];
+        let vehicle = |(index, edges): (u32, &&str)| {
+            let depart = 2 * index;
+            format!("<vehicle id=\"{index}\" depart=\"{depart}\"><route edges=\"{edges}\"/></vehicle>")
+        };
+        let vehicles: String = (0..60).zip(routes.iter().cycle()).map(vehicle).collect();
+        self.file("crossing.rou.xml", &format!("<routes>{vehicles}</routes>"));
+        let net = net.display();
+        let input = format!("<net-file value=\"{net}\"/><route-files value=\"crossing.rou.xml\"/>");
+        self.file(
+            "crossing.sumocfg",
+            &format!("<configuration><input>{input}</input></configuration>"),
+        )
+    }
+
     /// Ids of a net's traffic lights, sorted.
     pub fn lights_of(&self, net: &Path) -> Vec<String> {
         let mut ids = Vec::new();

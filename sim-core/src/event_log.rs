@@ -1,4 +1,4 @@
-//! A log of lines that a run does not need: a full disk costs lines, and the file has a largest size.
+//! A log of lines in a run's directory `events`, which the run does not need: a full disk costs lines, and the file has a largest size.
 
 use std::{
     fs::{File, OpenOptions},
@@ -6,12 +6,30 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use ipc_schema::storage;
+use ipc_schema::{
+    failure::{Failure, FailureKind},
+    storage,
+};
 
 /// Largest size of a log, bytes: some two million contacts.
-pub const LIMIT_BYTES: u64 = 512 << 20;
+const LIMIT_BYTES: u64 = 512 << 20;
 /// Bytes that are kept in memory before they are written.
 const BUFFER_BYTES: usize = 64 << 10;
+
+/// The lines cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write {path}")]
+pub struct EventLogError {
+    path: PathBuf,
+    #[source]
+    source: std::io::Error,
+}
+
+impl From<EventLogError> for Failure {
+    fn from(error: EventLogError) -> Self {
+        Self::from_error(FailureKind::Run, &error).with_help("check free space and permissions of the run directory")
+    }
+}
 
 /// The open log.
 #[derive(Debug)]
@@ -27,11 +45,20 @@ pub struct EventLog {
 }
 
 impl EventLog {
-    /// Opens the log with its first `bytes`, and at most `limit_bytes`.
+    /// Opens the log `events/NAME` of a run with its first `bytes`; what lies behind them is removed.
     ///
     /// # Errors
     /// The file cannot be opened.
-    pub fn open(path: &Path, bytes: u64, limit_bytes: u64) -> Result<Self> {
+    pub fn of_run(run_dir: &Path, name: &str, bytes: u64) -> std::result::Result<Self, EventLogError> {
+        let directory = run_dir.join("events");
+        let path = directory.join(name);
+        std::fs::create_dir_all(&directory)
+            .and_then(|()| Self::open(&path, bytes, LIMIT_BYTES))
+            .map_err(|source| EventLogError { path, source })
+    }
+
+    /// Opens the log with its first `bytes`, and at most `limit_bytes`.
+    fn open(path: &Path, bytes: u64, limit_bytes: u64) -> Result<Self> {
         let mut file = OpenOptions::new().create(true).truncate(false).write(true).open(path)?;
         let written_bytes = bytes.min(file.metadata()?.len());
         file.set_len(written_bytes)?;
@@ -51,7 +78,18 @@ impl EventLog {
     ///
     /// # Errors
     /// The file cannot be written, though the disk is not full.
-    pub fn push(&mut self, line: &impl serde::Serialize) -> Result<()> {
+    pub fn push(&mut self, line: &impl serde::Serialize) -> std::result::Result<(), EventLogError> {
+        self.try_push(line).map_err(|source| self.failed(source))
+    }
+
+    fn failed(&self, source: std::io::Error) -> EventLogError {
+        EventLogError {
+            path: self.path.clone(),
+            source,
+        }
+    }
+
+    fn try_push(&mut self, line: &impl serde::Serialize) -> Result<()> {
         let before = self.buffer.len();
         serde_json::to_writer(&mut self.buffer, line)?;
         self.buffer.push(b'\n');
@@ -62,7 +100,7 @@ impl EventLog {
         }
         self.buffered_lines += 1;
         match self.buffer.len() > BUFFER_BYTES {
-            true => self.flush(),
+            true => self.try_flush(),
             false => Ok(()),
         }
     }
@@ -71,7 +109,11 @@ impl EventLog {
     ///
     /// # Errors
     /// The file cannot be written, though the disk is not full.
-    pub fn flush(&mut self) -> Result<()> {
+    pub fn flush(&mut self) -> std::result::Result<(), EventLogError> {
+        self.try_flush().map_err(|source| self.failed(source))
+    }
+
+    fn try_flush(&mut self) -> Result<()> {
         match self.file.write_all(&self.buffer) {
             Ok(()) => self.written_bytes += self.buffer.len() as u64,
             Err(error) if storage::is_full(&error) => {

@@ -1,0 +1,32 @@
+//! Why a mirrored road user was set onto SUMO instead of moving there.
+
+use serde::{Deserialize, Serialize};
+
+/// The reason.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ResynchronisationCause {
+    /// SUMO moved it: a teleport, or `moveToXY` by somebody else's script.
+    MovedBySumo,
+    /// SUMO had it off the road in between, for instance parked or on board.
+    Returned,
+    /// No vehicle moves as far, or as far sideways, in one step as SUMO says.
+    ImpossibleStep,
+    /// Its tracking error exceeded `vehicle.resynchronise_m`.
+    TrackingError,
+    /// What it could drive was farther from SUMO's path than `vehicle.leave_path_m`.
+    LeftPath,
+}
+
+/// A road user that was set onto SUMO.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Resynchronisation {
+    /// Dense index.
+    pub vehicle: u32,
+    /// The reason.
+    pub cause: ResynchronisationCause,
+    /// Where it is now, world frame, metres.
+    pub position_m: [f64; 3],
+    /// How far it was set, metres.
+    pub jump_m: f64,
+}
