@@ -66,4 +66,4 @@ pub mod world;
 extern crate self as ipc_schema;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 15;
+pub const SCHEMA_VERSION: u32 = 16;

@@ -26,11 +26,15 @@ pub const VALID: u32 = 1;
 /// The trajectory that held this slot at the previous tick ended there by arrival, removal, collision, or leaving the road. Never bootstrap
 /// across it.
 pub const TERMINATED: u32 = 1 << 1;
-/// The trajectory that held this slot at the previous tick was cut there by the end of the episode or a hero's time limit. Bootstrap, then
+/// The trajectory that held this slot at the previous tick was cut there by the end of the episode, a hero's time limit, or because its
+/// vehicle was set elsewhere ([`RESYNCHRONISED`]). Bootstrap, then
 /// cut.
 pub const TRUNCATED: u32 = 1 << 2;
 /// At least one field was outside its range and has been clipped.
 pub const CLIPPED: u32 = 1 << 3;
+/// The vehicle did not drive to where it is: it was set onto SUMO's position ([`crate::world::RESYNCHRONISED`]). Its trajectory was cut at
+/// the previous tick ([`TRUNCATED`]), and a new one begins here with fresh sensors.
+pub const RESYNCHRONISED: u32 = 1 << 4;
 
 payload_layout! {
     /// Layout of an `observation` message for `n` slots, `d` numbers in a row and `k` IMU samples in a tick.
@@ -55,7 +59,7 @@ payload_layout! {
         id_hash: u64, [slots];
         /// `u32 [n]`: dense vehicle index within the episode, or [`EMPTY_SLOT`].
         vehicle: u32, [slots];
-        /// `u32 [n]`: bits [`VALID`], [`TERMINATED`], [`TRUNCATED`], [`CLIPPED`].
+        /// `u32 [n]`: bits [`VALID`], [`TERMINATED`], [`TRUNCATED`], [`CLIPPED`], [`RESYNCHRONISED`].
         flags: u32, [slots];
         /// `u32 [n]`: bits of the sensors that deliver ([`crate::sensor::SensorKind::bit`]). A sensor that the carrier lacks never has its bit
         /// set.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     SCHEMA_VERSION,
-    config::Config,
+    config::{Config, PreviewFrames},
     field::{RunField, run_fields},
     process::Process,
     schedule, storage,
@@ -406,7 +406,7 @@ impl RunFile {
     #[must_use]
     pub fn mirror_delay_frames(&self) -> usize {
         let frame_s = self.config.run.tick_s * self.ticks_per_frame() as f64;
-        self.config.vehicle.window_states(frame_s) / 2
+        self.config.vehicle.preview(frame_s).map_or(0, PreviewFrames::delay)
     }
 
     /// Ticks that `sim-core` and `sensor-daemon` may each be ahead of the next process.

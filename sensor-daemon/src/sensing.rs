@@ -8,7 +8,7 @@ use ipc_schema::{
     run::MapInfo,
     sensor::SensorKind,
     traffic::Kind,
-    world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, SubStep, TIME_LIMIT, VehicleState},
+    world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, RESYNCHRONISED, SubStep, TIME_LIMIT, VehicleState},
 };
 use serde::{Deserialize, Serialize};
 use sim_core::geodesy::{GeodesyError, Projection};
@@ -242,6 +242,8 @@ impl Sensing {
 
     /// Gives every connected road user in `states` and in the region its slot. Returns the number of slots, the observation's n.
     ///
+    /// A vehicle that is set onto SUMO's position keeps its slot and begins a new trajectory there.
+    ///
     /// With `collision.ends_trajectory` a vehicle has no slot at the tick in which it collides, as if it had left: its slot is marked
     /// [`ipc_schema::observation::TERMINATED`], and from the next tick on the vehicle begins a new trajectory.
     ///
@@ -265,6 +267,9 @@ impl Sensing {
                 let slot = self.slots.occupy(state.vehicle);
                 if is_cut(state) {
                     self.slots.cut(slot);
+                }
+                if state.flags & RESYNCHRONISED != 0 {
+                    self.slots.restart(slot);
                 }
                 if slot >= self.row_of_slot.len() {
                     self.row_of_slot.resize(slot + 1, None);

@@ -15,8 +15,10 @@ use ipc_schema::{
 };
 use sim_core::mirror::{Mirror, MirrorSettings};
 
-const TICKS: usize = 60;
-const WARM_UP: usize = 10;
+const TICKS: usize = 70;
+const WARM_UP: usize = 20;
+/// As in scenarios. Mirrors appear after so long: before the measured ticks.
+const PREVIEW_S: f64 = 1.5;
 const LENGTH_M: f64 = 4.5;
 
 /// State on a circle or, for every third vehicle, on a straight, at a speed that changes with time.
@@ -51,10 +53,12 @@ fn meta(vehicle: u32, cavs: u32) -> VehicleMeta {
     meta
 }
 
-fn settings() -> MirrorSettings {
-    let vehicle = preset::town().vehicle;
+fn settings(preview_s: f64) -> MirrorSettings {
     MirrorSettings {
-        vehicle,
+        vehicle: config::VehicleConfig {
+            preview_s,
+            ..preset::town().vehicle
+        },
         surface: config::Surface::Dry,
         tick_s: 0.1,
         sub_steps: 10,
@@ -62,8 +66,8 @@ fn settings() -> MirrorSettings {
     }
 }
 
-fn measure(vehicles: u32, cavs: u32) {
-    let mut mirror = match Mirror::new(settings()) {
+fn measure(vehicles: u32, cavs: u32, preview_s: f64) {
+    let mut mirror = match Mirror::new(settings(preview_s)) {
         Ok(mirror) => mirror,
         Err(error) => return eprintln!("{error}"),
     };
@@ -92,7 +96,7 @@ fn measure(vehicles: u32, cavs: u32) {
     costs_us.sort_by(f64::total_cmp);
     let (median, least) = (costs_us[costs_us.len() / 2], costs_us[0]);
     println!(
-        "mirror {vehicles:>6} vehicles, {:>3} % dynamic: median {median:.3} µs, fastest {least:.3} µs per vehicle and tick",
+        "mirror {vehicles:>6} vehicles, {:>3} % dynamic, preview {preview_s} s: median {median:.3} µs, fastest {least:.3} µs per vehicle and tick",
         10 * cavs
     );
     println!("       re-synchronised {}", mirror.resynchronisations());
@@ -107,6 +111,8 @@ fn main() {
     };
     for vehicles in wanted {
         // The town's default mix is 32 connected vehicles of 40.
-        [0, 8, 10].into_iter().for_each(|cavs| measure(vehicles, cavs));
+        for (cavs, preview_s) in [(0, 0.0), (8, 0.0), (10, 0.0), (10, PREVIEW_S)] {
+            measure(vehicles, cavs, preview_s);
+        }
     }
 }

@@ -262,7 +262,7 @@ impl CoreProcess {
         };
         self.mirror.write_tick(tick, draft.payload_mut()).map_err(unmirrored)?;
         if let Some(contacts) = &mut self.contacts {
-            contacts.report_contacts(&header, draft.payload_mut(), layout.states, &self.names)?;
+            contacts.report_contacts(&header, draft.payload_mut(), layout.states, &self.names, &self.mirror)?;
         }
         let resynchronised = self.mirror.resynchronised();
         self.resynchronisations.add(&header, resynchronised, &self.names)?;

@@ -28,7 +28,7 @@ use crate::{
 /// SUMO's own default step, seconds.
 const SUMO_STEP_S: f64 = 1.0;
 /// How far ahead mirrors see SUMO's path on nets that were not drawn for them, seconds.
-const PREVIEW_S: f64 = 0.5;
+const PREVIEW_S: f64 = 1.5;
 /// SUMO's own default seed.
 const SUMO_SEED: u64 = 23423;
 /// Road users that shared memory is sized for in a scenario, unless the user sets `traffic.max_road_users`.

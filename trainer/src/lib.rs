@@ -634,6 +634,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("TERMINATED", ipc_schema::observation::TERMINATED)?;
     module.add("TRUNCATED", ipc_schema::observation::TRUNCATED)?;
     module.add("CLIPPED", ipc_schema::observation::CLIPPED)?;
+    module.add("RESYNCHRONISED", ipc_schema::observation::RESYNCHRONISED)?;
     module.add("EMPTY_SLOT", ipc_schema::observation::EMPTY_SLOT)?;
     module.add("GNSS_COLUMNS", ipc_schema::observation::GNSS_COLUMNS)?;
     module.add("IMU_COLUMNS", ipc_schema::observation::IMU_COLUMNS)?;

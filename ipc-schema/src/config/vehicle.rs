@@ -19,7 +19,7 @@ pub struct VehicleConfig {
     pub hero_model: VehicleModel,
     /// Models by SUMO class; they have precedence over the three above.
     pub class_models: Vec<ClassModel>,
-    /// How far ahead a mirror sees SUMO's path: so far it is behind SUMO, seconds. At least half a SUMO step.
+    /// How far ahead a mirror sees SUMO's path: so far it is behind SUMO, seconds. At least half a frame.
     pub preview_s: f64,
     /// Time over which an instantaneous lane change is spread, seconds.
     pub lane_change_s: f64,
@@ -41,26 +41,55 @@ pub struct VehicleConfig {
 
 /// Most SUMO states in a mirror's window.
 const MOST_WINDOW_STATES: usize = 16;
+/// Most frames that a mirror is behind its window.
+const MOST_LATE_FRAMES: usize = 16;
 
-impl VehicleConfig {
-    /// Number of SUMO states, `step_s` apart, whose mean a mirror follows: followed half a step behind, the mean is
-    /// [`preview_s`](Self::preview_s) behind SUMO. 1 if a step is too long for that.
+/// Share of a preview by which a mirror is behind its path.
+const LATE_SHARE: f64 = 0.55;
+
+/// How a mirror sees the path ahead, in frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PreviewFrames {
+    /// States of SUMO whose mean is the path.
+    pub window_states: usize,
+    /// Frames by which the mirror is behind the newest mean.
+    pub late: usize,
+}
+
+impl PreviewFrames {
+    /// The whole delay behind SUMO, half a frame rounded down.
     #[must_use]
-    pub fn window_states(&self, step_s: f64) -> usize {
-        window_states(self.preview_s, step_s)
+    pub fn delay(self) -> usize {
+        self.window_states / 2 + self.late
+    }
+
+    fn of(preview_s: f64, frame_s: f64) -> Self {
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a small number that is not negative"
+        )]
+        // A little more than the quotient: 0.45 / 0.1 is less than 4.5.
+        let frames = |time_s: f64| (time_s / frame_s + 1e-6).max(0.0) as usize;
+        let late = frames(LATE_SHARE * preview_s).min(MOST_LATE_FRAMES);
+        let rest_s = preview_s - late as f64 * frame_s;
+        let more_states = frames(2.0 * rest_s - frame_s).min(MOST_WINDOW_STATES - 1);
+        Self {
+            window_states: more_states + 1,
+            late,
+        }
     }
 }
 
-fn window_states(preview_s: f64, step_s: f64) -> usize {
-    // A little more than the quotient: 0.45 / 0.1 is less than 4.5.
-    let steps = 2.0 * (preview_s - 0.5 * step_s) / step_s + 1e-6;
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "between 0 and MOST_WINDOW_STATES"
-    )]
-    let steps = steps.clamp(0.0, (MOST_WINDOW_STATES - 1) as f64) as usize;
-    steps + 1
+impl VehicleConfig {
+    /// What [`preview_s`](Self::preview_s) means with frames of `frame_s`: somewhat more than half of it is how far a mirror is behind its
+    /// path, the rest how far the path, the mean of SUMO's states followed half a frame behind, is behind SUMO. `None` without a preview, or if
+    /// a frame is too long for it.
+    #[must_use]
+    pub fn preview(&self, frame_s: f64) -> Option<PreviewFrames> {
+        let preview = PreviewFrames::of(self.preview_s, frame_s);
+        (preview.delay() > 0).then_some(preview)
+    }
 }
 
 /// A model that any vehicle may have.
@@ -169,17 +198,21 @@ mod tests {
     }
 
     #[test]
-    fn the_whole_delay_is_the_preview_at_every_step() {
-        for (step_s, states) in [
-            (0.1, 10),
-            (0.2, 5),
-            (0.5, 2),
-            (1.0, 1),
-            (2.0, 1),
-            (0.01, MOST_WINDOW_STATES),
-        ] {
-            assert_eq!(window_states(0.5, step_s), states, "{step_s}");
+    fn the_whole_delay_is_the_preview_at_every_frame() {
+        let cases = [
+            (1.5, 0.1, (14, 8)),
+            (1.5, 0.2, (7, 4)),
+            (1.5, 0.5, (4, 1)),
+            (0.5, 0.1, (6, 2)),
+            (2.0, 0.01, (MOST_WINDOW_STATES, MOST_LATE_FRAMES)),
+            (0.5, 1.0, (1, 0)),
+            (0.0, 0.1, (1, 0)),
+        ];
+        for (preview_s, frame_s, (window_states, late)) in cases {
+            let expected = PreviewFrames { window_states, late };
+            assert_eq!(PreviewFrames::of(preview_s, frame_s), expected, "{preview_s} {frame_s}");
         }
-        assert_eq!(window_states(0.0, 0.1), 1);
+        // The mean of 14 states, followed half a frame behind, and eight frames.
+        assert_eq!(PreviewFrames::of(1.5, 0.1).delay(), 15);
     }
 }

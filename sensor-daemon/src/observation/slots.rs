@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use ipc_schema::observation::{EMPTY_SLOT, TERMINATED, TRUNCATED};
+use ipc_schema::observation::{EMPTY_SLOT, RESYNCHRONISED, TERMINATED, TRUNCATED};
 
 /// One row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -11,7 +11,8 @@ pub struct Slot {
     pub vehicle: u32,
     /// Ticks since the vehicle took the slot.
     pub step: u32,
-    /// [`TERMINATED`], [`TRUNCATED`]: the trajectory that held this slot at the previous tick ended there.
+    /// [`TERMINATED`], [`TRUNCATED`]: the trajectory that held this slot at the previous tick ended there. [`RESYNCHRONISED`]: because its
+    /// vehicle, which keeps the slot, was set elsewhere.
     pub ended: u32,
     seen: bool,
     /// The trajectory of its vehicle was cut at the last tick, rather than ended.
@@ -85,6 +86,16 @@ impl Slots {
             && number != EMPTY_SLOT
         {
             self.cut(number as usize);
+        }
+    }
+
+    /// Cuts the trajectory in slot `number` at the previous tick and begins another of the same vehicle, which was set elsewhere. A vehicle
+    /// that has just taken its slot has no trajectory to cut.
+    pub fn restart(&mut self, number: usize) {
+        let slot = &mut self.slots[number];
+        if slot.step > 0 {
+            slot.step = 0;
+            slot.ended |= TRUNCATED | RESYNCHRONISED;
         }
     }
 
@@ -237,6 +248,29 @@ mod tests {
         assert_eq!((slots.rows()[1].ended, slots.rows()[0].ended), (TRUNCATED, 0));
         assert_eq!(tick(&mut slots, false, &[0, 1]), [0, 1]);
         assert_eq!((slots.rows()[1].step, slots.rows()[1].ended), (0, 0));
+    }
+
+    #[test]
+    fn a_vehicle_that_is_set_elsewhere_keeps_its_slot_and_begins_anew() {
+        let mut slots = Slots::default();
+        tick(&mut slots, true, &[0, 1]);
+        tick(&mut slots, false, &[0, 1]);
+        slots.begin(false);
+        for vehicle in [0, 1, 2] {
+            let number = slots.occupy(vehicle);
+            if vehicle > 0 {
+                slots.restart(number);
+            }
+        }
+        slots.end();
+        let rows: Vec<(u32, u32, u32)> = slots
+            .rows()
+            .iter()
+            .map(|row| (row.vehicle, row.step, row.ended))
+            .collect();
+        assert_eq!(rows, [(0, 2, 0), (1, 0, TRUNCATED | RESYNCHRONISED), (2, 0, 0)]);
+        tick(&mut slots, false, &[0, 1, 2]);
+        assert_eq!((slots.rows()[1].step, slots.rows()[1].ended), (1, 0));
     }
 
     #[test]

@@ -14,9 +14,10 @@ use ipc_schema::{
 };
 use serde::{Deserialize, Serialize};
 
-use super::CollisionDetector;
+use super::{CollisionDetector, body::boxes_touch};
 use crate::{
     event_log::EventLog,
+    mirror::Mirror,
     names::RoadUserNames,
     scene::{Scene, Solid},
 };
@@ -28,6 +29,9 @@ pub struct CollisionCounts {
     pub total: u64,
     /// With vehicles.
     pub vehicle: u64,
+    /// Of these, those that SUMO's own poses have too.
+    #[serde(default)]
+    pub vehicle_in_sumo: u64,
     /// With persons.
     pub person: u64,
     /// With buildings.
@@ -71,6 +75,9 @@ struct CollisionLine<'a> {
     other: &'a str,
     position_m: [f64; 3],
     relative_speed_mps: f32,
+    /// Of two vehicles: whether SUMO's own poses overlap at that time too.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    in_sumo: Option<bool>,
 }
 
 /// Finds, publishes and counts the contacts of a run.
@@ -133,6 +140,7 @@ impl ContactReporter {
         payload: &mut [u8],
         states: Section,
         names: &RoadUserNames,
+        mirror: &Mirror,
     ) -> Result<(), Failure> {
         let states: &mut [VehicleState] = block::view_mut(payload, states).map_err(unreadable)?;
         let map = usize::from(header.map).min(self.detectors.len() - 1);
@@ -154,8 +162,15 @@ impl ContactReporter {
             draft.send()?;
         }
         for collision in begun {
+            let in_sumo = (collision.other_class == Struck::Vehicle as u32)
+                .then(|| overlap_in_sumo(mirror, [collision.vehicle, collision.other]));
             self.counts.add(collision.other_class);
-            self.lines.push(&line(header, collision, names, detector.scene()))?;
+            self.counts.vehicle_in_sumo += u64::from(in_sumo == Some(true));
+            let line = CollisionLine {
+                in_sumo,
+                ..line(header, collision, names, detector.scene())
+            };
+            self.lines.push(&line)?;
         }
         Ok(())
     }
@@ -169,6 +184,13 @@ impl ContactReporter {
         self.counts.without_line = self.without_line_before + self.lines.dropped_lines();
         Ok(self.counts)
     }
+}
+
+/// True if SUMO itself has both vehicles in one place in the frames that the mirror moves through: SUMO lets bodies overlap where lanes
+/// meet.
+fn overlap_in_sumo(mirror: &Mirror, vehicles: [u32; 2]) -> bool {
+    let [a, b] = vehicles.map(|vehicle| mirror.sumo_boxes(vehicle));
+    a.iter().zip(&b).any(|(a, b)| boxes_touch(a, b))
 }
 
 fn unreadable(error: BlockError) -> Failure {
@@ -204,5 +226,6 @@ fn line<'a>(
         other,
         position_m: collision.position_m,
         relative_speed_mps: collision.relative_speed_mps,
+        in_sumo: None,
     }
 }

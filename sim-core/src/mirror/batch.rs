@@ -14,6 +14,7 @@ use super::{
 };
 use crate::models::{
     attitude::{BodyLean, FeltMotion},
+    catalogue::MotionModel,
     dynamic::{DynamicParams, GRAVITY_MPS2},
     kinematic::KinematicParams,
     parameters::POWER_SHARE,
@@ -111,6 +112,14 @@ impl BatchModel<DYNAMIC> for DynamicParams {
 
     fn empty() -> [f64; DYNAMIC] {
         [0.25; DYNAMIC]
+    }
+}
+
+/// What a vehicle of the model can drive.
+pub(super) fn driving_limits(model: &MotionModel) -> DrivingLimits {
+    match model {
+        MotionModel::Kinematic(params) => params.driving_limits(),
+        MotionModel::Dynamic(params) => params.driving_limits(),
     }
 }
 

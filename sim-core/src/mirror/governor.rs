@@ -37,7 +37,7 @@ pub struct DrivingLimits {
 
 impl DrivingLimits {
     /// Largest acceleration, deceleration and lateral acceleration at a speed, m/s².
-    fn at(&self, speed_mps: f64) -> [f64; 3] {
+    pub(super) fn at(&self, speed_mps: f64) -> [f64; 3] {
         let power =
             self.power_by_mass / speed_mps - self.drag_by_mass_per_m * speed_mps * speed_mps - self.rolling_mps2;
         [

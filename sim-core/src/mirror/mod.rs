@@ -16,8 +16,10 @@ pub mod batch;
 pub mod curve;
 pub mod governor;
 pub mod hero;
+pub mod pace;
 pub mod person;
 pub mod prefetch;
+pub mod preview;
 pub mod reference;
 pub mod resynchronisation;
 pub mod road_user;
@@ -26,20 +28,23 @@ pub mod statistics;
 pub mod tracking;
 pub mod window;
 
-use crate::models::{
-    catalogue::{ModelCatalogue, MotionModel},
-    dynamic::DynamicParams,
-    kinematic::KinematicParams,
-    parameters::ParameterError,
-    state::ControlInput,
+use crate::{
+    models::{
+        catalogue::{ModelCatalogue, MotionModel},
+        dynamic::DynamicParams,
+        kinematic::KinematicParams,
+        parameters::ParameterError,
+        state::ControlInput,
+    },
+    scene::shape::OrientedBox,
 };
-use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch};
+use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch, driving_limits};
 use prefetch::PrefetchRange;
+use preview::PathAhead;
 use resynchronisation::Resynchronisation;
 use road_user::RoadUser;
 pub use settings::MirrorSettings;
 use statistics::TrackingStatistics;
-use window::StateWindow;
 
 /// A message of `traffic-bridge` cannot be mirrored.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
@@ -92,8 +97,8 @@ pub struct Mirror {
     /// Position in `slab` of each road user by dense index, or [`NOWHERE`].
     places: Vec<u32>,
     slab: Vec<RoadUser>,
-    /// The window of each road user of the slab; empty without a preview.
-    windows: Vec<StateWindow>,
+    /// The path ahead of each road user of the slab; empty without a preview.
+    paths: Vec<PathAhead>,
     free: Vec<u32>,
     /// Road users of the current frame: dense index and place, in ascending order of the index.
     present: Vec<(u32, u32)>,
@@ -130,7 +135,7 @@ impl Mirror {
             episode: None,
             places: Vec::new(),
             slab: Vec::new(),
-            windows: Vec::new(),
+            paths: Vec::new(),
             free: Vec::new(),
             present: Vec::new(),
             in_whole_step: 0,
@@ -178,6 +183,14 @@ impl Mirror {
         &self.resynchronised
     }
 
+    /// The boxes in which SUMO has a road user in the frames that the mirror moves through, newest first; empty if it is not known.
+    #[must_use]
+    pub fn sumo_boxes(&self, vehicle: u32) -> Vec<OrientedBox> {
+        let place = self.place(vehicle).map_or(usize::MAX, |place| place as usize);
+        let road_user = self.slab.get(place);
+        road_user.map_or_else(Vec::new, |road_user| road_user.sumo_boxes(self.paths.get(place)))
+    }
+
     /// Continues counting from statistics of earlier episodes.
     pub fn restore_counts(&mut self, tracking: TrackingStatistics, resynchronisations: u64) {
         (self.tracking, self.resynchronisations) = (tracking, resynchronisations);
@@ -213,10 +226,7 @@ impl Mirror {
             }
             None => {
                 self.slab.push(road_user);
-                let states = self.settings.window_states();
-                if states > 1 {
-                    self.windows.push(StateWindow::new(states));
-                }
+                self.paths.extend(self.settings.preview().map(PathAhead::new));
                 self.slab.len() as u32 - 1
             }
         };
@@ -248,7 +258,7 @@ impl Mirror {
             self.episode = Some(episode);
             self.places.clear();
             self.slab.clear();
-            self.windows.clear();
+            self.paths.clear();
             self.free.clear();
             self.present.clear();
             self.in_whole_step = 0;
@@ -273,10 +283,13 @@ impl Mirror {
                 return Err(MirrorError::NotFinite { vehicle, tick });
             }
             let road_user = &mut self.slab[place as usize];
-            let window = self.windows.get_mut(place as usize);
-            road_user.accept(now, self.frame, window, &self.settings);
-            self.in_whole_step += usize::from(road_user.is_in_whole_step());
-            self.present.push((vehicle, place));
+            let path = self.paths.get_mut(place as usize);
+            let ahead = path.map(|path| (path, driving_limits(&self.catalogue.at(road_user.model()).model)));
+            road_user.accept(now, self.frame, ahead, &self.settings);
+            if !road_user.is_hidden() {
+                self.in_whole_step += usize::from(road_user.is_in_whole_step());
+                self.present.push((vehicle, place));
+            }
         }
         self.present.sort_unstable();
         match self.present.windows(2).find(|pair| pair[0].0 == pair[1].0) {

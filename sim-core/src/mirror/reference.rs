@@ -28,8 +28,6 @@ const LANE_JUMP_MOST_M: f64 = 5.0;
 const LANE_JUMP_TURN_RAD: f64 = 0.35;
 /// A step longer than this plus twice the distance at the vehicle's speed is not driving, metres.
 const UNEXPLAINED_M: f64 = 2.0;
-/// Slower than this at both ends of a step, a sideways jump is not a lane change, m/s.
-const MOVING_MPS: f64 = 0.1;
 
 /// A sideways offset on its way to zero.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -287,7 +285,7 @@ pub(super) fn join(
     let speed_mps = f64::from(before.speed_mps.max(now.speed_mps));
     let jump = sideways_jump(moved_m, f64::from(before.yaw_rad) + 0.5 * turn, turn, length_m);
     if let Some(jump) = &jump {
-        if speed_mps < MOVING_MPS || jump.left_m.abs() > LANE_JUMP_MOST_M {
+        if jump.left_m.abs() > LANE_JUMP_MOST_M {
             return (PathJoin::Broken, None);
         }
         for (moved, jumped) in moved_m.iter_mut().zip(jump.vector_m) {

@@ -8,13 +8,14 @@ use ipc_schema::{
 use super::{
     batch::{BatchModel, VehicleBatch},
     curve::ReferenceCurve,
+    governor::DrivingLimits,
     hero::Hero,
     person::Person,
+    preview::PathAhead,
     reference::{PathJoin, ReferencePath},
     resynchronisation::{Resynchronisation, ResynchronisationCause},
     settings::MirrorSettings,
     tracking,
-    window::StateWindow,
 };
 use crate::{
     models::{
@@ -24,6 +25,7 @@ use crate::{
         rigid_body::RigidBody,
         state::{ControlInput, ModelState},
     },
+    scene::shape::OrientedBox,
     trig::wrap_angle,
 };
 
@@ -63,10 +65,12 @@ pub struct RoadUser {
     mover: Mover,
     before: TrafficState,
     now: TrafficState,
-    /// Distance of the window's mean from SUMO's own path, metres.
+    /// Distance of the path that it follows from SUMO's own, metres.
     deviation_m: f32,
     /// Number of the last frame that had it; 0 = none yet.
     seen_frame: u64,
+    /// Frames until its mirror appears: where the road user enters, the others' mirrors are that many frames late.
+    hidden: usize,
     arrival: Arrival,
     /// Not yet written to any tick.
     new: bool,
@@ -97,18 +101,19 @@ impl RoadUser {
             now: TrafficState::default(),
             deviation_m: 0.0,
             seen_frame: 0,
+            hidden: 0,
             arrival: Arrival::Entering,
             new: true,
         }
     }
 
-    /// Takes SUMO's state at the end of the step in frame number `frame` (counted from 1). With a window the road user follows the mean of
-    /// its last states.
+    /// Takes SUMO's state at the end of the step in frame number `frame` (counted from 1). With a path ahead the road user follows that,
+    /// within what its model can do.
     pub fn accept(
         &mut self,
         now: &TrafficState,
         frame: u64,
-        window: Option<&mut StateWindow>,
+        ahead: Option<(&mut PathAhead, DrivingLimits)>,
         settings: &MirrorSettings,
     ) {
         let known = self.seen_frame != 0 && self.seen_frame + 1 == frame;
@@ -120,9 +125,9 @@ impl RoadUser {
         } else {
             Arrival::Continuing
         };
-        let lane_change_m = match window {
+        let lane_change_m = match ahead {
             // The hero is where its own model is, and its driver sees the others there.
-            Some(window) if !matches!(self.mover, Mover::Hero(_)) => self.take_mean(now, window, settings.step_s()),
+            Some(ahead) if !matches!(self.mover, Mover::Hero(_)) => self.follow(now, ahead, settings.step_s()),
             _ => {
                 (self.before, self.now) = (self.now, *now);
                 None
@@ -151,24 +156,66 @@ impl RoadUser {
         }
     }
 
-    /// Takes the state into the window, and the window's means as the states that the road user follows. Returns the lane change in this
-    /// step, metres to the left. A step that no vehicle can drive is a jump, and the window begins anew.
-    fn take_mean(&mut self, now: &TrafficState, window: &mut StateWindow, step_s: f64) -> Option<f64> {
+    /// Takes the state into the path ahead, and the mirror's place on it as the state that the road user follows. Returns the lane change
+    /// in this step, metres to the left. A step that no vehicle can drive is a jump, and the path begins anew.
+    fn follow(
+        &mut self,
+        now: &TrafficState,
+        (path, limits): (&mut PathAhead, DrivingLimits),
+        step_s: f64,
+    ) -> Option<f64> {
+        let limits = match self.mover {
+            Mover::Vehicle { .. } => Some(limits),
+            Mover::Person(_) | Mover::Hero(_) => None,
+        };
         let step = match self.arrival {
-            Arrival::Continuing => window.advance(now, self.dimensions.length_m, step_s),
+            Arrival::Continuing => path.advance(now, self.dimensions.length_m, limits.as_ref(), step_s),
             Arrival::Entering | Arrival::Jumping(_) => None,
         };
         let Some(step) = step else {
             if self.arrival == Arrival::Continuing {
                 self.arrival = Arrival::Jumping(ResynchronisationCause::ImpossibleStep);
             }
-            (self.before, self.now) = (self.now, window.restart(now, step_s));
+            (self.before, self.now) = (self.now, path.restart(now, step_s));
             self.deviation_m = 0.0;
+            if self.arrival == Arrival::Entering {
+                self.hidden = path.delay();
+            }
             return None;
         };
+        if self.hidden > 0 {
+            self.hidden -= 1;
+            self.arrival = Arrival::Entering;
+        }
         (self.before, self.now) = (step.before, step.now);
-        self.deviation_m = window.deviation_m() as f32;
+        self.deviation_m = path.deviation_m() as f32;
         step.lane_change_m
+    }
+
+    /// The boxes in which SUMO has it in the frames that the mirror moves through, newest first.
+    pub fn sumo_boxes(&self, ahead: Option<&PathAhead>) -> Vec<OrientedBox> {
+        let VehicleDimensions {
+            length_m,
+            width_m,
+            height_m,
+            ..
+        } = self.dimensions;
+        let solid = |state: &TrafficState| {
+            let (sin, cos) = libm::sincos(f64::from(state.yaw_rad));
+            OrientedBox {
+                centre_m: [
+                    state.front_x_m - 0.5 * length_m * cos,
+                    state.front_y_m - 0.5 * length_m * sin,
+                ],
+                along: [cos, sin],
+                half_m: [0.5 * length_m, 0.5 * width_m],
+                z_m: [state.front_z_m, state.front_z_m + height_m],
+            }
+        };
+        match ahead {
+            Some(path) => path.recent().map(solid).collect(),
+            None => [self.now, self.before].iter().map(solid).collect(),
+        }
     }
 
     /// Sets the control input of a hero from now on; other road users ignore it.
@@ -176,6 +223,12 @@ impl RoadUser {
         if let Mover::Hero(hero) = &mut self.mover {
             hero.set_input(input);
         }
+    }
+
+    /// True if the road user is in SUMO, but its mirror is not yet in the world.
+    #[must_use]
+    pub fn is_hidden(&self) -> bool {
+        self.hidden > 0
     }
 
     /// True if the road user has a state in all ticks of the current SUMO step, not only in the last.

@@ -1,7 +1,7 @@
 //! Times of a run and limits of its vehicles, as the mirror needs them.
 
 use ipc_schema::{
-    config,
+    config::{self, PreviewFrames},
     header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_LESSON, LAST_OF_RUN, MessageHeader},
     run::RunFile,
 };
@@ -38,10 +38,10 @@ impl MirrorSettings {
         self.tick_s / f64::from(self.sub_steps)
     }
 
-    /// States of SUMO whose mean a road user follows.
+    /// How road users see the path ahead.
     #[must_use]
-    pub fn window_states(&self) -> usize {
-        self.vehicle.window_states(self.step_s())
+    pub fn preview(&self) -> Option<PreviewFrames> {
+        self.vehicle.preview(self.step_s())
     }
 
     /// Length of a SUMO step, seconds.

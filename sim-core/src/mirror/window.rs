@@ -9,6 +9,16 @@ use ipc_schema::traffic::TrafficState;
 use super::reference::{LaneJump, PathJoin, join};
 use crate::trig::wrap_angle;
 
+/// Longest leap over a junction, metres.
+const LEAP_M: f64 = 40.0;
+/// Slowest vehicle that leaps over a junction, m/s: a slower one is moved by a script.
+const LEAP_MPS: f32 = 0.5;
+/// Cosine of the largest angle between a leap and the headings before and after it.
+const LEAST_AHEAD: f64 = 0.2;
+
+/// A window whose ends' headings differ by less is straight: its mean is beside it by millimetres at most, radians.
+const STRAIGHT_RAD: f64 = 0.005;
+
 /// What is averaged: position of the front bumper (metres), heading without jumps and slope (radians), speed (m/s).
 type Sample = [f64; 6];
 
@@ -21,6 +31,8 @@ pub struct WindowStep {
     pub now: TrafficState,
     /// How far to the left the lane change in this step leads, metres.
     pub lane_change_m: Option<f64>,
+    /// The same as a vector, world frame.
+    pub shift_m: [f64; 2],
 }
 
 /// The last states of a road user.
@@ -31,6 +43,9 @@ pub struct StateWindow {
     lamps: Vec<u32>,
     /// Place of the oldest sample.
     oldest: usize,
+    /// Of all samples.
+    sum: Sample,
+    mean: TrafficState,
     newest: TrafficState,
 }
 
@@ -42,6 +57,8 @@ impl StateWindow {
             samples: vec![[0.0; 6]; count],
             lamps: vec![0; count],
             oldest: 0,
+            sum: [0.0; 6],
+            mean: TrafficState::default(),
             newest: TrafficState::default(),
         }
     }
@@ -61,13 +78,20 @@ impl StateWindow {
         }
         self.lamps.fill(now.signals);
         (self.oldest, self.newest) = (0, *now);
-        self.mean()
+        self.sum = [0.0; 6];
+        for slot in &self.samples {
+            for (total, part) in self.sum.iter_mut().zip(slot) {
+                *total += part;
+            }
+        }
+        self.mean = self.mean_of_samples();
+        self.mean
     }
 
     /// Takes the next state of a body of `length_m`; `None` if no vehicle moves like that.
     pub fn advance(&mut self, now: &TrafficState, length_m: f64, step_s: f64) -> Option<WindowStep> {
         let (joined, jump) = join(&self.newest, now, length_m, step_s);
-        if joined == PathJoin::Broken {
+        if joined == PathJoin::Broken && !leaps_ahead(&self.newest, now) {
             return None;
         }
         if let Some(LaneJump { vector_m, .. }) = jump {
@@ -75,27 +99,43 @@ impl StateWindow {
                 slot[0] += vector_m[0];
                 slot[1] += vector_m[1];
             }
+            let count = self.samples.len() as f64;
+            for (axis, part) in vector_m.into_iter().enumerate() {
+                self.sum[axis] += count * part;
+            }
+            self.mean.front_x_m += vector_m[0];
+            self.mean.front_y_m += vector_m[1];
         }
-        let before = self.mean();
+        let before = self.mean;
         let count = self.samples.len();
         let last_yaw_rad = self.samples[(self.oldest + count - 1) % count][3];
         let mut next = sample(now);
         next[3] = last_yaw_rad + wrap_angle(next[3] - last_yaw_rad);
-        self.samples[self.oldest] = next;
+        let left = std::mem::replace(&mut self.samples[self.oldest], next);
+        for (total, (next, left)) in self.sum.iter_mut().zip(next.iter().zip(left)) {
+            *total += next - left;
+        }
         self.lamps[self.oldest] = now.signals;
         self.oldest = (self.oldest + 1) % count;
         self.newest = *now;
+        self.mean = self.mean_of_samples();
         Some(WindowStep {
             before,
-            now: self.mean(),
+            now: self.mean,
             lane_change_m: jump.map(|jump| jump.left_m),
+            shift_m: jump.map_or([0.0; 2], |jump| jump.vector_m),
         })
     }
 
-    /// Distance of the mean from SUMO's own path: from the nearest of the window's states or of the lines between them, metres.
+    /// Distance of the mean from SUMO's own path: from the nearest of the window's states or of the lines between them, metres. Zero
+    /// where the path is straight.
     #[must_use]
     pub fn deviation_m(&self) -> f64 {
-        let mean = self.mean();
+        let (oldest, newest) = (self.oldest, (self.oldest + self.samples.len() - 1) % self.samples.len());
+        if (self.samples[newest][3] - self.samples[oldest][3]).abs() < STRAIGHT_RAD {
+            return 0.0;
+        }
+        let mean = &self.mean;
         let point = [mean.front_x_m, mean.front_y_m];
         let count = self.samples.len();
         let at = |place: usize| {
@@ -110,13 +150,8 @@ impl StateWindow {
             .fold(f64::INFINITY, f64::min)
     }
 
-    fn mean(&self) -> TrafficState {
-        let mut sum = [0.0; 6];
-        for slot in &self.samples {
-            for (total, part) in sum.iter_mut().zip(slot) {
-                *total += part;
-            }
-        }
+    fn mean_of_samples(&self) -> TrafficState {
+        let sum = &self.sum;
         let count = self.samples.len();
         let share = 1.0 / count as f64;
         TrafficState {
@@ -131,6 +166,18 @@ impl StateWindow {
             ..self.newest
         }
     }
+}
+
+/// True if SUMO has moved a vehicle ahead as over a junction without internal lanes: in one step from the end of a lane to the beginning
+/// of the next. The mean drives there, and the mirror is late.
+fn leaps_ahead(before: &TrafficState, now: &TrafficState) -> bool {
+    let leap = [now.front_x_m - before.front_x_m, now.front_y_m - before.front_y_m];
+    let length_m = libm::hypot(leap[0], leap[1]);
+    let is_ahead = |yaw_rad: f32| {
+        let (sin, cos) = libm::sincos(f64::from(yaw_rad));
+        leap[0] * cos + leap[1] * sin > LEAST_AHEAD * length_m
+    };
+    before.speed_mps > LEAP_MPS && length_m < LEAP_M && is_ahead(before.yaw_rad) && is_ahead(now.yaw_rad)
 }
 
 fn sample(state: &TrafficState) -> Sample {

@@ -199,7 +199,7 @@ pub const KEYS: &[ConfigKey] = &[
     other("vehicle.other_model", ValueKind::Choice(&["kinematic", "dynamic"]), "Model of vehicles without sensors."),
     other("vehicle.hero_model", ValueKind::Choice(&["kinematic", "dynamic", "rigid_body"]), "Model of heroes; \"rigid_body\" is a body on four ray-cast wheels."),
     other("vehicle.class_models", ValueKind::TextsOf(TextForm::ClassModel), "Models by SUMO vehicle class, such as [\"truck=kinematic\", \"bus=dynamic\"]; they have precedence over the three above."),
-    float("vehicle.preview_s", "s", 0.0, 2.0, "How far ahead a mirror sees SUMO's path; the mirror is this much behind SUMO, at least half a SUMO step and at most eight. It then bends, brakes and starts as gradually as a vehicle can. With a `.sumocfg`, or with `curriculum.maps`, 0.5 unless you set it or the task is driving."),
+    float("vehicle.preview_s", "s", 0.0, 3.0, "How far ahead a mirror sees SUMO's path, and how far it is behind SUMO, at least half a frame. It then bends, brakes and starts as gradually as a vehicle can, and brakes before a bend that is too fast for it. With a `.sumocfg`, or with `curriculum.maps`, 1.5 unless you set it or the task is driving."),
     float("vehicle.lane_change_s", "s", 0.1, 60.0, "Time over which SUMO's instantaneous lane change is spread."),
     float("vehicle.max_road_wheel_angle_rad", "rad", 0.05, 1.5, "Largest steering angle of the front wheels."),
     float("vehicle.max_road_wheel_rate_radps", "rad/s", 0.05, 20.0, "Largest rate of that angle."),

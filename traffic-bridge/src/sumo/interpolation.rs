@@ -2,7 +2,7 @@
 //!
 //! In a second a vehicle drives through a whole junction: the straight line between its two positions cuts the corner. It moves along
 //! the lanes instead, evenly, as SUMO means it: the speed at the end of a step holds for the whole step. What its positions are beside the
-//! centre lines (sublanes) is kept, and a change of lanes stays a jump from one frame to the next.
+//! centre lines (sublanes) is kept. A change of lanes on a road stays a jump from one frame to the next; at a junction it is driven evenly.
 
 use ipc_schema::traffic::{DISCONTINUOUS, Kind, TrafficState};
 
@@ -271,7 +271,8 @@ fn motion(
     let [Some(mut first), Some(mut last)] = ends else {
         return straight;
     };
-    if (last.left - first.left).abs() > LANE_JUMP_M {
+    // A change of lanes at a junction is a part of the turn: it is driven evenly over the step.
+    if (last.left - first.left).abs() > LANE_JUMP_M && !way.leaves_lane() {
         match way.switch() {
             // The jump is in the first frame, …
             LaneSwitch::AtStart => first = last,

@@ -127,6 +127,12 @@ impl LaneWay {
         self.length_m
     }
 
+    /// True if it leads from one lane onto others.
+    #[must_use]
+    pub fn leaves_lane(&self) -> bool {
+        self.lanes.len() > 1
+    }
+
     /// The change of lanes.
     #[must_use]
     pub fn switch(&self) -> LaneSwitch {

@@ -19,6 +19,7 @@ __all__ = [
     "IMU_COLUMNS",
     "LAYOUT_JSON",
     "METRICS",
+    "RESYNCHRONISED",
     "SCHEMA_VERSION",
     "TERMINATED",
     "TRUNCATED",
@@ -52,6 +53,8 @@ TRUNCATED: int
 """Bit of `flags`: the trajectory that held the slot a tick before was cut there."""
 CLIPPED: int
 """Bit of `flags`: a field of the observation was outside its range."""
+RESYNCHRONISED: int
+"""Bit of `flags`: the vehicle was set onto SUMO's position instead of driving there."""
 EMPTY_SLOT: int
 """Vehicle index of a slot without a vehicle."""
 

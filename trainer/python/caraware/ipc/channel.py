@@ -221,6 +221,11 @@ class Observation:
         """bool [n]: the trajectory in this slot at the previous tick was cut there (end of episode)."""
         return self._flag(_native.TRUNCATED)
 
+    @cached_property
+    def resynchronised(self) -> BoolArray:
+        """bool [n]: the vehicle was set onto SUMO's position instead of driving there; its trajectory was cut."""
+        return self._flag(_native.RESYNCHRONISED)
+
 
 class Channel:
     """A trainer's place in a run. One for each process; opening it lets the simulation start.
@@ -282,10 +287,12 @@ class Channel:
         """
         if self._attachment.ended:
             raise StreamEndedError
-        ticks = [Observation(block) for block in self._attachment.receive(timeout_s, busy=busy)]
-        for obs in ticks:
-            self._starts.note(obs)
-        return ticks
+        blocks = self._attachment.receive(timeout_s, busy=busy)
+        for block in blocks:
+            # Nearly all ticks neither begin nor end an episode, and half a microsecond counts here.
+            if block.episode_last or block.episode != self._starts.newest:
+                self._starts.note(block)
+        return [Observation(block) for block in blocks]
 
     def lease(self) -> _native.Lease:
         """The observations one by one, each lent until the next is taken: a microsecond from publish to tensor.

@@ -74,13 +74,19 @@ class EpisodeStarts:
 
     def __init__(self, episode: int = 0, tick: int = 0) -> None:
         self._starts = [(tick, episode)]
+        self.newest = episode
+        """The newest episode that is known."""
 
     def note(self, obs: EpisodeTick) -> None:
-        """Note a tick of the run, in order."""
-        if obs.episode != self._starts[-1][1]:
-            self._starts.append((obs.tick, obs.episode))
+        """Note a tick of the run, in order. Only the first and the last tick of an episode matter."""
+        if obs.episode != self.newest:
+            self._add(obs.tick, obs.episode)
         if obs.episode_last:
-            self._starts.append((obs.tick + 1, obs.episode + 1))
+            self._add(obs.tick + 1, obs.episode + 1)
+
+    def _add(self, tick: int, episode: int) -> None:
+        self._starts.append((tick, episode))
+        self.newest = episode
 
     def after(self, committed_tick: int) -> tuple[int, int]:
         """Episode of the tick after `committed_tick`, and its first tick; earlier episodes are forgotten."""

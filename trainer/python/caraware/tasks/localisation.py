@@ -21,6 +21,7 @@ ACTIONS = ActionSpec(names=("x", "y"), low=-1.0, high=1.0, is_clipped=False)
 ENDS = (
     EndReason("arrival", EndKind.TERMINATED),
     EndReason("removal", EndKind.TERMINATED),
+    EndReason("resynchronisation", EndKind.TRUNCATED),
     EndReason("end of the run's episode", EndKind.TRUNCATED),
 )
 

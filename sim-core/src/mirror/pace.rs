@@ -1,0 +1,420 @@
+//! The pace at which a mirror follows the path ahead of it: later where the path is too narrow for SUMO's speed, and on time again after it.
+//!
+//! The means of SUMO's last states ([`super::window`]) are the path. The mirror follows them some frames late, so that it knows the path
+//! ahead of it. Where the speed of the means asks for more lateral acceleration than the tyres should give, it brakes *before* the bend
+//! and stays on the path instead of leaving it. It has its place in time as its aim: the distance that it lost is driven faster
+//! afterwards, within what the vehicle can do.
+
+use ipc_schema::traffic::TrafficState;
+
+use super::{governor::DrivingLimits, window::WindowStep};
+use crate::trig::wrap_angle;
+
+/// Most frames by which a mirror may be later than it should be.
+const MOST_LATE: usize = 24;
+/// Share of the lateral limit that the pace asks for: the rest is for tracking.
+const LATERAL_SHARE: f64 = 0.9;
+/// Share of the longitudinal limits that the pace asks for.
+const LONGITUDINAL_SHARE: f64 = 0.7;
+/// Deceleration with which a mirror brakes before a bend, m/s²: firm, not an emergency.
+const BRAKE_MPS2: f64 = 3.5;
+/// Rate at which lost distance is caught up, 1/s.
+const CATCH_UP_PER_S: f64 = 0.5;
+/// Points of the path are at least so far apart, metres: nearer ones have no direction.
+const APART_M: f64 = 0.02;
+
+/// A mean of SUMO's states on the path.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct PathPoint {
+    /// Front bumper.
+    position_m: [f64; 3],
+    yaw_rad: f32,
+    pitch_rad: f32,
+    /// Distance along the path from where it begins, metres.
+    station_m: f64,
+    /// Curvature of the path up to here, 1/m.
+    curvature_per_m: f32,
+    /// Distance from SUMO's own path, metres.
+    deviation_m: f32,
+    lamps: u32,
+}
+
+/// A road user's path and its progress on it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PacedPath {
+    /// A ring; the newest point is at `newest`.
+    points: Vec<PathPoint>,
+    newest: usize,
+    /// Frames by which the aim is behind the newest point.
+    late: usize,
+    /// Station of the mirror and its speed.
+    station_m: f64,
+    speed_mps: f64,
+    /// Frames by which the first point ahead of the mirror is behind the newest.
+    ahead: usize,
+    /// Direction of the path at the newest point, a unit vector; zero where it begins.
+    direction: [f64; 2],
+    now: TrafficState,
+}
+
+impl PacedPath {
+    /// A path whose mirror is `late` frames behind the newest point, of no road user.
+    #[must_use]
+    pub fn new(late: usize) -> Self {
+        Self {
+            points: vec![PathPoint::default(); late + MOST_LATE + 2],
+            newest: 0,
+            late,
+            station_m: 0.0,
+            speed_mps: 0.0,
+            ahead: late,
+            direction: [0.0; 2],
+            now: TrafficState::default(),
+        }
+    }
+
+    /// Begins with a road user that has come to `mean` straight ahead at its speed, in frames of `frame_s`. Returns its state.
+    pub fn restart(&mut self, mean: &TrafficState, frame_s: f64) -> TrafficState {
+        let (sin, cos) = libm::sincos(f64::from(mean.yaw_rad));
+        let climb = libm::tan(f64::from(mean.pitch_rad));
+        let count = self.points.len();
+        let chord_m = f64::from(mean.speed_mps) * frame_s;
+        for (place, point) in self.points.iter_mut().enumerate() {
+            let back_m = chord_m * (count - 1 - place) as f64;
+            *point = PathPoint {
+                position_m: [
+                    mean.front_x_m - back_m * cos,
+                    mean.front_y_m - back_m * sin,
+                    mean.front_z_m - back_m * climb,
+                ],
+                yaw_rad: mean.yaw_rad,
+                pitch_rad: mean.pitch_rad,
+                station_m: -back_m,
+                curvature_per_m: 0.0,
+                deviation_m: 0.0,
+                lamps: mean.signals,
+            };
+        }
+        self.newest = count - 1;
+        self.direction = [0.0; 2];
+        self.ahead = self.late;
+        self.station_m = self.behind(self.late).station_m;
+        self.speed_mps = mean.speed_mps.into();
+        self.find_ahead();
+        self.now = self.state(mean);
+        self.now
+    }
+
+    /// Takes the next mean, `deviation_m` from SUMO's path, and moves the mirror for a frame. Without `limits` it is on time.
+    pub fn advance(
+        &mut self,
+        step: &WindowStep,
+        deviation_m: f64,
+        limits: Option<&DrivingLimits>,
+        frame_s: f64,
+    ) -> WindowStep {
+        let [shift_x, shift_y] = step.shift_m;
+        if step.lane_change_m.is_some() {
+            for point in &mut self.points {
+                point.position_m[0] += shift_x;
+                point.position_m[1] += shift_y;
+            }
+        }
+        self.push(&step.now, deviation_m);
+        self.ahead += 1;
+        let before = TrafficState {
+            front_x_m: self.now.front_x_m + shift_x,
+            front_y_m: self.now.front_y_m + shift_y,
+            ..self.now
+        };
+        let aim_m = self.behind(self.late).station_m;
+        let aim_mps = (aim_m - self.behind(self.late + 1).station_m) / frame_s;
+        (self.station_m, self.speed_mps) = match limits {
+            None => (aim_m, aim_mps),
+            Some(limits) => {
+                let wanted_mps = aim_mps + CATCH_UP_PER_S * (aim_m - self.station_m);
+                let [most_accel, most_decel, _] = limits.at(self.speed_mps.max(1.0));
+                let speed_mps = wanted_mps
+                    .min(self.bend_speed_mps(limits))
+                    .clamp(
+                        self.speed_mps - LONGITUDINAL_SHARE * most_decel * frame_s,
+                        self.speed_mps + LONGITUDINAL_SHARE * most_accel * frame_s,
+                    )
+                    .max(0.0);
+                // On time or later, and never behind the points that are kept.
+                let oldest_m = self.behind(self.points.len() - 2).station_m;
+                let station_m = (self.station_m + speed_mps * frame_s).min(aim_m).max(oldest_m);
+                (station_m, (station_m - self.station_m) / frame_s)
+            }
+        };
+        self.find_ahead();
+        self.now = self.state(&step.now);
+        WindowStep {
+            before,
+            now: self.now,
+            ..*step
+        }
+    }
+
+    /// Distance of the mirror's place on the path from SUMO's own path, metres.
+    #[must_use]
+    pub fn deviation_m(&self) -> f64 {
+        self.behind(self.ahead).deviation_m.into()
+    }
+
+    /// The point `frames` before the newest.
+    fn behind(&self, frames: usize) -> &PathPoint {
+        &self.points[self.place(frames)]
+    }
+
+    /// Position in the ring, for less frames than points.
+    fn place(&self, frames: usize) -> usize {
+        if frames <= self.newest {
+            self.newest - frames
+        } else {
+            self.newest + self.points.len() - frames
+        }
+    }
+
+    fn push(&mut self, mean: &TrafficState, deviation_m: f64) {
+        let last = self.points[self.newest];
+        let position_m = [mean.front_x_m, mean.front_y_m, mean.front_z_m];
+        let chord = [0, 1].map(|axis: usize| position_m[axis] - last.position_m[axis]);
+        let length_m = libm::hypot(chord[0], chord[1]);
+        let mut curvature_per_m = last.curvature_per_m;
+        if length_m > APART_M {
+            let [ahead, left] = chord.map(|part| part / length_m);
+            let [cos, sin] = std::mem::replace(&mut self.direction, [ahead, left]);
+            // The sine of the turn, and twice its half-angle's from a right angle on: no path turns back on the spot.
+            let (dot, cross) = (cos * ahead + sin * left, cos * left - sin * ahead);
+            let turn = if dot >= 0.0 { cross } else { 2.0_f64.copysign(cross) };
+            curvature_per_m = (turn / length_m) as f32;
+        }
+        self.newest = (self.newest + 1) % self.points.len();
+        self.points[self.newest] = PathPoint {
+            position_m,
+            yaw_rad: mean.yaw_rad,
+            pitch_rad: mean.pitch_rad,
+            station_m: last.station_m + length_m,
+            curvature_per_m,
+            deviation_m: deviation_m as f32,
+            lamps: mean.signals,
+        };
+    }
+
+    /// Finds the first point ahead of the mirror, near the one of the frame before.
+    fn find_ahead(&mut self) {
+        let last = self.points.len() - 2;
+        let mut frames = self.ahead.min(last);
+        while frames < last && self.behind(frames + 1).station_m > self.station_m {
+            frames += 1;
+        }
+        while frames > 0 && self.behind(frames).station_m < self.station_m {
+            frames -= 1;
+        }
+        self.ahead = frames;
+    }
+
+    /// The speed from which the mirror can brake to what every bend ahead allows, m/s.
+    fn bend_speed_mps(&self, limits: &DrivingLimits) -> f64 {
+        let lateral_mps2 = LATERAL_SHARE * limits.lateral_mps2;
+        let mut square = f64::INFINITY;
+        let mut next_m = self.behind(0).station_m;
+        for frames in 0..=self.ahead {
+            let point = self.behind(frames);
+            let bend = lateral_mps2 / f64::from(point.curvature_per_m.abs()).max(1e-6);
+            // Braking from this point to the next one ahead.
+            square = bend.min(square + 2.0 * BRAKE_MPS2 * (next_m - point.station_m));
+            next_m = point.station_m;
+        }
+        (square + 2.0 * BRAKE_MPS2 * (next_m - self.station_m).max(0.0)).sqrt()
+    }
+
+    /// The state at the mirror's place; what does not move is that of `newest`.
+    fn state(&self, newest: &TrafficState) -> TrafficState {
+        let (to, from) = (self.behind(self.ahead), self.behind(self.ahead + 1));
+        let way_m = to.station_m - from.station_m;
+        let share = match way_m > 0.0 {
+            true => ((self.station_m - from.station_m) / way_m).clamp(0.0, 1.0),
+            false => 1.0,
+        };
+        let mix = |axis: usize| from.position_m[axis] + share * (to.position_m[axis] - from.position_m[axis]);
+        let turn_rad = wrap_angle(f64::from(to.yaw_rad) - f64::from(from.yaw_rad));
+        TrafficState {
+            front_x_m: mix(0),
+            front_y_m: mix(1),
+            front_z_m: mix(2),
+            yaw_rad: wrap_angle(f64::from(from.yaw_rad) + share * turn_rad) as f32,
+            pitch_rad: from.pitch_rad + share as f32 * (to.pitch_rad - from.pitch_rad),
+            speed_mps: self.speed_mps as f32,
+            signals: to.lamps,
+            ..*newest
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FRAME_S: f64 = 0.1;
+    const LATE: usize = 5;
+    const LIMITS: DrivingLimits = DrivingLimits {
+        lateral_mps2: 6.0,
+        curvature_per_m: 1.0,
+        accel_mps2: 3.0,
+        decel_mps2: 8.0,
+        power_by_mass: 100.0,
+        drag_by_mass_per_m: 3e-4,
+        rolling_mps2: 0.1,
+    };
+
+    /// Means of a vehicle at `speed_mps` that drives 40 m straight, a quarter of a circle, and straight on.
+    fn means(speed_mps: f64, radius_m: f64) -> impl Iterator<Item = TrafficState> {
+        (0..200).map(move |frame| {
+            let along = speed_mps * FRAME_S * f64::from(frame) - 40.0;
+            let angle = (along / radius_m).clamp(0.0, std::f64::consts::FRAC_PI_2);
+            let (sin, cos) = libm::sincos(angle);
+            let rest = along - angle * radius_m;
+            TrafficState {
+                front_x_m: radius_m * sin + rest * cos,
+                front_y_m: radius_m * (1.0 - cos) + rest * sin,
+                yaw_rad: angle as f32,
+                speed_mps: speed_mps as f32,
+                ..TrafficState::default()
+            }
+        })
+    }
+
+    /// The mirror's states along the means.
+    fn paced(means: impl Iterator<Item = TrafficState>, limits: Option<&DrivingLimits>) -> Vec<TrafficState> {
+        let mut path = PacedPath::new(LATE);
+        let mut last: Option<TrafficState> = None;
+        let states = means.map(|mean| {
+            let step = last.replace(mean).map(|before| WindowStep {
+                before,
+                now: mean,
+                lane_change_m: None,
+                shift_m: [0.0; 2],
+            });
+            match step {
+                None => path.restart(&mean, FRAME_S),
+                Some(step) => path.advance(&step, 0.0, limits, FRAME_S).now,
+            }
+        });
+        states.collect()
+    }
+
+    fn gap_m(a: &TrafficState, b: &TrafficState) -> f64 {
+        libm::hypot(a.front_x_m - b.front_x_m, a.front_y_m - b.front_y_m)
+    }
+
+    #[test]
+    fn a_bend_that_can_be_driven_changes_nothing() {
+        let expected: Vec<TrafficState> = means(7.0, 20.0).collect();
+        for limits in [None, Some(&LIMITS)] {
+            let states = paced(means(7.0, 20.0), limits);
+            for (state, expected) in states[LATE..].iter().zip(&expected) {
+                assert!(gap_m(state, expected) < 1e-6, "{state:?} {expected:?}");
+                assert!((state.speed_mps - 7.0).abs() < 0.01, "{state:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_bend_that_is_too_fast_is_driven_later_and_the_time_is_made_good_afterwards() {
+        // 8.2 m/s² of lateral acceleration, where 5.4 are wanted.
+        let (speed_mps, radius_m) = (7.0, 6.0);
+        let expected: Vec<TrafficState> = means(speed_mps, radius_m).collect();
+        let states = paced(means(speed_mps, radius_m), Some(&LIMITS));
+        let mut slowest_mps = f64::INFINITY;
+        for (number, pair) in states.windows(2).enumerate() {
+            let accel_mps2 = f64::from(pair[1].speed_mps - pair[0].speed_mps) / FRAME_S;
+            assert!(
+                accel_mps2 > -LIMITS.decel_mps2 && accel_mps2 < LIMITS.accel_mps2 + 1e-3,
+                "frame {number}: {accel_mps2}"
+            );
+            slowest_mps = slowest_mps.min(pair[1].speed_mps.into());
+            // On the path: on one of the straights or on the circle.
+            let [x, y] = [pair[1].front_x_m, pair[1].front_y_m];
+            let off_m = match (x <= 0.0, y >= radius_m) {
+                (true, _) => y.abs(),
+                (_, true) => (x - radius_m).abs(),
+                _ => (libm::hypot(x, y - radius_m) - radius_m).abs(),
+            };
+            assert!(off_m < 0.02, "frame {number}: {off_m} m from the path");
+        }
+        let allowed_mps = (LATERAL_SHARE * LIMITS.lateral_mps2 * radius_m).sqrt();
+        assert!(
+            (slowest_mps - allowed_mps).abs() < 0.2,
+            "{slowest_mps} m/s, allowed {allowed_mps}"
+        );
+        let late_m = |frame: usize| gap_m(&states[frame], &expected[frame - LATE]);
+        assert!((10..199).map(late_m).fold(0.0, f64::max) > 0.5, "it was never late");
+        assert!(late_m(199) < 0.1, "{} m late at the end", late_m(199));
+    }
+
+    #[test]
+    fn a_stop_is_reached_and_left_without_a_jump() {
+        // Stops at 1 m after braking with 5 m/s², stands, and starts with 6 m/s², which the limits do not allow.
+        let states = || {
+            (0..250).map(|frame| {
+                let time_s = FRAME_S * f64::from(frame);
+                let x_m = match time_s {
+                    time_s if time_s < 2.0 => 10.0 * time_s - 2.5 * time_s * time_s,
+                    time_s if time_s < 4.0 => 10.0,
+                    time_s => {
+                        10.0 + 3.0 * (time_s - 4.0).min(2.0) * ((time_s - 4.0).min(2.0) + 2.0 * (time_s - 6.0).max(0.0))
+                    }
+                };
+                TrafficState {
+                    front_x_m: x_m,
+                    speed_mps: 10.0,
+                    ..TrafficState::default()
+                }
+            })
+        };
+        let expected: Vec<TrafficState> = states().collect();
+        let mirrored = paced(states(), Some(&LIMITS));
+        for (number, three) in mirrored.windows(3).enumerate().skip(LATE) {
+            let [first, second] = [0, 1].map(|i: usize| (three[i + 1].front_x_m - three[i].front_x_m) / FRAME_S);
+            let accel_mps2 = (second - first) / FRAME_S;
+            assert!(second > -1e-9, "frame {number}: {second} m/s");
+            assert!(
+                accel_mps2 < LIMITS.accel_mps2 && accel_mps2 > -LIMITS.decel_mps2,
+                "frame {number}: {accel_mps2} m/s²"
+            );
+            assert!(three[1].front_x_m <= expected[number + 1 - LATE].front_x_m + 1e-9);
+        }
+        assert!(
+            (mirrored[44].front_x_m - 10.0).abs() < 0.2,
+            "{}",
+            mirrored[44].front_x_m
+        );
+        assert!(gap_m(&mirrored[249], &expected[249 - LATE]) < 0.5);
+    }
+
+    #[test]
+    fn a_lane_change_moves_the_whole_path() {
+        let mut path = PacedPath::new(LATE);
+        let at = |x_m: f64, y_m: f64| TrafficState {
+            front_x_m: x_m,
+            front_y_m: y_m,
+            speed_mps: 10.0,
+            ..TrafficState::default()
+        };
+        path.restart(&at(0.0, 0.0), FRAME_S);
+        let step = WindowStep {
+            before: at(0.0, 3.2),
+            now: at(1.0, 3.2),
+            lane_change_m: Some(3.2),
+            shift_m: [0.0, 3.2],
+        };
+        let moved = path.advance(&step, 0.0, Some(&LIMITS), FRAME_S);
+        assert_eq!(moved.lane_change_m, Some(3.2));
+        for state in [moved.before, moved.now] {
+            assert!((state.front_y_m - 3.2).abs() < 1e-9, "{state:?}");
+        }
+        assert!((moved.now.front_x_m - moved.before.front_x_m - 1.0).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,77 @@
+//! What a road user knows of SUMO's path: the mean of SUMO's last states, and how the mirror follows it.
+
+use std::collections::VecDeque;
+
+use ipc_schema::{config::PreviewFrames, traffic::TrafficState};
+
+use super::{
+    governor::DrivingLimits,
+    pace::PacedPath,
+    window::{StateWindow, WindowStep},
+};
+
+/// The path ahead of one road user.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PathAhead {
+    window: StateWindow,
+    path: PacedPath,
+    /// SUMO's own states since the path began, newest first, as far back as the mirror is behind.
+    recent: VecDeque<TrafficState>,
+    /// Frames by which the mirror is behind SUMO.
+    delay: usize,
+}
+
+impl PathAhead {
+    /// Of no road user.
+    #[must_use]
+    pub fn new(frames: PreviewFrames) -> Self {
+        Self {
+            window: StateWindow::new(frames.window_states),
+            path: PacedPath::new(frames.late),
+            recent: VecDeque::with_capacity(frames.delay() + 1),
+            delay: frames.delay(),
+        }
+    }
+
+    /// Begins with a road user that has come to `now` straight ahead at its speed, in frames of `frame_s`. Returns its mirror's state.
+    pub fn restart(&mut self, now: &TrafficState, frame_s: f64) -> TrafficState {
+        self.recent.clear();
+        self.recent.push_front(*now);
+        let mean = self.window.restart(now, frame_s);
+        self.path.restart(&mean, frame_s)
+    }
+
+    /// Takes the next state of a body of `length_m`, and moves its mirror for a frame. `None` if no vehicle moves like that. A road user
+    /// without `limits` is always on time.
+    pub fn advance(
+        &mut self,
+        now: &TrafficState,
+        length_m: f64,
+        limits: Option<&DrivingLimits>,
+        frame_s: f64,
+    ) -> Option<WindowStep> {
+        let step = self.window.advance(now, length_m, frame_s)?;
+        if self.recent.len() == self.recent.capacity() {
+            self.recent.pop_back();
+        }
+        self.recent.push_front(*now);
+        Some(self.path.advance(&step, self.window.deviation_m(), limits, frame_s))
+    }
+
+    /// Frames by which the mirror is behind SUMO.
+    #[must_use]
+    pub fn delay(&self) -> usize {
+        self.delay
+    }
+
+    /// SUMO's own states of the last frames, newest first.
+    pub fn recent(&self) -> impl Iterator<Item = &TrafficState> {
+        self.recent.iter()
+    }
+
+    /// Distance of the mirror's place on the path from SUMO's own path, metres.
+    #[must_use]
+    pub fn deviation_m(&self) -> f64 {
+        self.path.deviation_m()
+    }
+}
