@@ -2,14 +2,14 @@
 
 mod common;
 
-use common::{Road, drive, frame, limits, meta, settings};
+use common::{LENGTH_M, Road, drive, frame, limits, meta, previewing, settings};
 use ipc_schema::{
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     traffic::{Kind, MetaEvent, TrafficState},
     world::{APPEARED, RESYNCHRONISED},
 };
 use proptest::prelude::*;
-use sim_core::mirror::{Mirror, MirrorError};
+use sim_core::mirror::{Mirror, MirrorError, resynchronisation::ResynchronisationCause};
 
 fn header(episode: u64, tick: u64) -> MessageHeader {
     MessageHeader {
@@ -185,4 +185,72 @@ proptest! {
 #[test]
 fn the_limits_are_the_configured_ones() {
     assert_eq!(settings(0.1, 10, 1).vehicle, limits());
+}
+
+#[test]
+fn with_a_preview_a_road_user_appears_where_it_departed_when_the_others_have_come_as_far() {
+    let (delay, speed_mps) = (5_u32, 10.0);
+    let mut mirror = previewing();
+    mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
+    for tick in 0_u32..30 {
+        let station_m = 50.0 + f64::from(tick) * 0.1 * speed_mps;
+        let ticks = frame(
+            &mut mirror,
+            &header(0, u64::from(tick)),
+            &[road().state(0, station_m, speed_mps)],
+        );
+        let states = &ticks[0].states;
+        if tick < delay {
+            assert!(states.is_empty(), "tick {tick}");
+            continue;
+        }
+        assert_eq!(
+            states[0].flags,
+            if tick == delay { APPEARED | RESYNCHRONISED } else { 0 }
+        );
+        let front_m = states[0].x_m + LENGTH_M - f64::from(states[0].rear_overhang_m);
+        assert!(
+            (front_m - (station_m - 0.5 * speed_mps)).abs() < 0.05,
+            "tick {tick}: {front_m} m"
+        );
+        // SUMO's own boxes, from now back to where the mirror is.
+        let boxes = mirror.sumo_boxes(0);
+        assert_eq!(boxes.len(), delay as usize + 1);
+        for (age, solid) in (0..).zip(&boxes) {
+            let expected_m = station_m - f64::from(age) * 0.1 * speed_mps - 0.5 * LENGTH_M;
+            assert!(
+                (solid.centre_m[0] - expected_m).abs() < 1e-6,
+                "{age} frames ago: {solid:?}"
+            );
+        }
+    }
+    assert_eq!(mirror.resynchronisations(), 0);
+    assert!(mirror.sumo_boxes(7).is_empty());
+}
+
+#[test]
+fn a_turn_on_the_spot_is_named_as_the_cause_of_a_resynchronisation() {
+    // A half circle of 1.6 m, as netgenerate's turnarounds, and a wide one.
+    for (radius_m, cause) in [(1.6, Some(ResynchronisationCause::NarrowTurn)), (15.0, None)] {
+        let road = Road::corner(60.0, radius_m, std::f64::consts::PI, 12);
+        let mut mirror = previewing();
+        mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
+        let mut causes = Vec::new();
+        for tick in 0_u32..300 {
+            let station_m = f64::from(tick) * 0.1 * 4.0;
+            if station_m < 110.0 {
+                frame(
+                    &mut mirror,
+                    &header(0, u64::from(tick)),
+                    &[road.state(0, station_m, 4.0)],
+                );
+                causes.extend(mirror.resynchronised().iter().map(|set| (set.cause, set.vehicle)));
+            }
+        }
+        assert_eq!(causes.is_empty(), cause.is_none(), "{radius_m} m: {causes:?}");
+        assert!(
+            causes.iter().all(|found| *found == (cause.unwrap(), 0)),
+            "{radius_m} m: {causes:?}"
+        );
+    }
 }

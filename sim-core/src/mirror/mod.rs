@@ -284,7 +284,7 @@ impl Mirror {
             }
             let road_user = &mut self.slab[place as usize];
             let path = self.paths.get_mut(place as usize);
-            let ahead = path.map(|path| (path, driving_limits(&self.catalogue.at(road_user.model()).model)));
+            let ahead = path.map(|path| (path, driving_limits(self.catalogue.at(road_user.model()))));
             road_user.accept(now, self.frame, ahead, &self.settings);
             if !road_user.is_hidden() {
                 self.in_whole_step += usize::from(road_user.is_in_whole_step());

@@ -20,6 +20,8 @@ const LONGITUDINAL_SHARE: f64 = 0.7;
 const BRAKE_MPS2: f64 = 3.5;
 /// Rate at which lost distance is caught up, 1/s.
 const CATCH_UP_PER_S: f64 = 0.5;
+/// Distance from a narrow turn within which it is the reason for what goes wrong, metres.
+const NARROW_REACH_M: f64 = 12.0;
 /// Points of the path are at least so far apart, metres: nearer ones have no direction.
 const APART_M: f64 = 0.02;
 
@@ -52,6 +54,8 @@ pub struct PacedPath {
     speed_mps: f64,
     /// Frames by which the first point ahead of the mirror is behind the newest.
     ahead: usize,
+    /// Station of the newest point at which the path turns more narrowly than the vehicle can.
+    narrow_m: f64,
     /// Direction of the path at the newest point, a unit vector; zero where it begins.
     direction: [f64; 2],
     now: TrafficState,
@@ -68,6 +72,7 @@ impl PacedPath {
             station_m: 0.0,
             speed_mps: 0.0,
             ahead: late,
+            narrow_m: f64::NEG_INFINITY,
             direction: [0.0; 2],
             now: TrafficState::default(),
         }
@@ -98,6 +103,7 @@ impl PacedPath {
         self.newest = count - 1;
         self.direction = [0.0; 2];
         self.ahead = self.late;
+        self.narrow_m = f64::NEG_INFINITY;
         self.station_m = self.behind(self.late).station_m;
         self.speed_mps = mean.speed_mps.into();
         self.find_ahead();
@@ -122,6 +128,10 @@ impl PacedPath {
         }
         self.push(&step.now, deviation_m);
         self.ahead += 1;
+        let newest = self.behind(0);
+        if limits.is_some_and(|limits| f64::from(newest.curvature_per_m.abs()) > limits.front_curvature_per_m) {
+            self.narrow_m = newest.station_m;
+        }
         let before = TrafficState {
             front_x_m: self.now.front_x_m + shift_x,
             front_y_m: self.now.front_y_m + shift_y,
@@ -154,6 +164,12 @@ impl PacedPath {
             now: self.now,
             ..*step
         }
+    }
+
+    /// True near a turn of the path that is narrower than the vehicle's turning circle.
+    #[must_use]
+    pub fn is_narrow(&self) -> bool {
+        (self.station_m - self.narrow_m).abs() < NARROW_REACH_M
     }
 
     /// Distance of the mirror's place on the path from SUMO's own path, metres.
@@ -262,6 +278,7 @@ mod tests {
     const LIMITS: DrivingLimits = DrivingLimits {
         lateral_mps2: 6.0,
         curvature_per_m: 1.0,
+        front_curvature_per_m: 1.0,
         accel_mps2: 3.0,
         decel_mps2: 8.0,
         power_by_mass: 100.0,

@@ -69,6 +69,12 @@ impl PathAhead {
         self.recent.iter()
     }
 
+    /// True near a turn of the path that is narrower than the vehicle's turning circle.
+    #[must_use]
+    pub fn is_narrow(&self) -> bool {
+        self.path.is_narrow()
+    }
+
     /// Distance of the mirror's place on the path from SUMO's own path, metres.
     #[must_use]
     pub fn deviation_m(&self) -> f64 {

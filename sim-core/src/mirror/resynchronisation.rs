@@ -12,6 +12,8 @@ pub enum ResynchronisationCause {
     Returned,
     /// No vehicle moves as far, or as far sideways, in one step as SUMO says.
     ImpossibleStep,
+    /// SUMO's path turns more narrowly there than the vehicle can: SUMO turns vehicles on the spot.
+    NarrowTurn,
     /// Its tracking error exceeded `vehicle.resynchronise_m`.
     TrackingError,
     /// What it could drive was farther from SUMO's path than `vehicle.leave_path_m`.

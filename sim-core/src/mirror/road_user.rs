@@ -67,6 +67,8 @@ pub struct RoadUser {
     now: TrafficState,
     /// Distance of the path that it follows from SUMO's own, metres.
     deviation_m: f32,
+    /// That path is narrower here than its turning circle.
+    is_narrow: bool,
     /// Number of the last frame that had it; 0 = none yet.
     seen_frame: u64,
     /// Frames until its mirror appears: where the road user enters, the others' mirrors are that many frames late.
@@ -100,6 +102,7 @@ impl RoadUser {
             before: TrafficState::default(),
             now: TrafficState::default(),
             deviation_m: 0.0,
+            is_narrow: false,
             seen_frame: 0,
             hidden: 0,
             arrival: Arrival::Entering,
@@ -189,6 +192,7 @@ impl RoadUser {
         }
         (self.before, self.now) = (step.before, step.now);
         self.deviation_m = path.deviation_m() as f32;
+        self.is_narrow = path.is_narrow();
         step.lane_change_m
     }
 
@@ -272,7 +276,7 @@ impl RoadUser {
                 settings.tick_s,
                 state.speed_mps,
                 spread_s,
-                &params.driving_limits(),
+                &params.driving_limits(self.dimensions.front_m()),
             );
             let rise = path.road(start_s).1;
             batch.load(member, params, state, (&curve, &rise), self.dimensions.front_m());
@@ -313,6 +317,10 @@ impl RoadUser {
         } else {
             None
         };
+        let lost = lost.map(|cause| match self.is_narrow {
+            true => ResynchronisationCause::NarrowTurn,
+            false => cause,
+        });
         let mut jump_m = 0.0;
         if lost.is_some() {
             let before = (state.x_m, state.y_m);

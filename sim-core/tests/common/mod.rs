@@ -27,6 +27,16 @@ pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> MirrorSetti
     }
 }
 
+/// A mirror with frames of 0.1 s with a preview of 0.5 s: five frames behind.
+pub fn previewing() -> Mirror {
+    let settings = settings(0.1, 10, 1);
+    let vehicle = config::VehicleConfig {
+        preview_s: 0.5,
+        ..settings.vehicle
+    };
+    Mirror::new(MirrorSettings { vehicle, ..settings }).unwrap()
+}
+
 pub fn limits() -> config::VehicleConfig {
     config::VehicleConfig {
         cav_model: config::SingleTrackModel::Kinematic,

@@ -8,6 +8,7 @@ the step that one trainer with all the samples would take, and keep equal parame
 """
 
 import hashlib
+import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,11 +17,16 @@ from datetime import timedelta
 from enum import IntEnum
 from typing import Any
 
+import safetensors.torch as safetensors
 import torch
 from torch import Tensor
 
 WAIT_AT_MOST = timedelta(hours=1)
 """For ranks whose simulation is slower. One that has ended is noticed at once: its connections are closed."""
+
+
+MOST_BYTES = 1 << 30
+"""Of a value that ranks exchange: numbers, and what recurrent networks remember."""
 
 
 class RankError(Exception):
@@ -117,8 +123,12 @@ class Ranks:
         return value
 
     def gather(self, value: Any) -> list[Any]:
-        """The values of all ranks, in their order."""
+        """The values of all ranks, in their order; what JSON can hold, and tuples come back as lists."""
         return [value]
+
+    def gather_tensors(self, tensors: dict[str, Tensor]) -> list[dict[str, Tensor]]:
+        """The tensors of all ranks by their names, in the order of the ranks."""
+        return [tensors]
 
     def check_equal(self, what: str, tensors: Sequence[Tensor]) -> None:
         """Raises `RankError` where they are not the same on all ranks, bit for bit."""
@@ -191,10 +201,26 @@ class TorchRanks(Ranks):
 
     def gather(self, value: Any) -> list[Any]:
         """See `Ranks.gather`."""
-        values: list[Any] = [None] * self._dist.get_world_size()
+        return [json.loads(text) for text in self._gather_bytes(json.dumps(value).encode())]
+
+    def gather_tensors(self, tensors: dict[str, Tensor]) -> list[dict[str, Tensor]]:
+        """See `Ranks.gather_tensors`."""
+        own = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+        return [safetensors.load(data) for data in self._gather_bytes(safetensors.save(own))]
+
+    def _gather_bytes(self, own: bytes) -> list[bytes]:
+        """Torch's own exchange of objects unpickles what comes, and a pickle can run code: ranks exchange bytes."""
+        sizes = [torch.zeros(1, dtype=torch.int64) for _ in range(self._dist.get_world_size())]
         with self._together("exchanging values"):
-            self._dist.all_gather_object(values, value)
-        return values
+            self._dist.all_gather(sizes, torch.tensor([len(own)]))
+            longest = max(int(size) for size in sizes)
+            if not 0 < longest <= MOST_BYTES:
+                raise RankError(f"a rank announces a value of {longest} bytes, of {MOST_BYTES} at most")
+            padded = torch.zeros(longest, dtype=torch.uint8)
+            padded[: len(own)] = torch.frombuffer(bytearray(own), dtype=torch.uint8)
+            values = [torch.empty_like(padded) for _ in sizes]
+            self._dist.all_gather(values, padded)
+        return [bytes(value[: int(size)].numpy()) for value, size in zip(values, sizes, strict=True)]
 
     def check_equal(self, what: str, tensors: Sequence[Tensor]) -> None:
         """See `Ranks.check_equal`."""

@@ -2,6 +2,9 @@
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
+
+from torch import Tensor
 
 from caraware.learn.ranks import Ranks
 from caraware.learn.stored import MEMORY, RANDOM, StoredTensors
@@ -87,13 +90,14 @@ class CheckpointWriter:
         self._ranks.check_equal("the parameters", list(ppo.updater.parameters().values()))
         states = {name: generator.get_state() for name, generator in ppo.sampling_generators().items()}
         positions = [environment.progress.position() for environment in self._environments]
-        every_rank = self._ranks.gather((positions, states, ppo.memory_tensors()))
+        of_all = self._ranks.gather([asdict(position) for position in positions])
+        random = self._ranks.gather_tensors(states)
+        memory = self._ranks.gather_tensors(ppo.memory_tensors())
         if self._ranks.rank > 0:
             return [], {}
-        others = [position for theirs, *_ in every_rank[1:] for position in theirs]
-        random = {name: state for _, theirs, _ in every_rank for name, state in theirs.items()}
-        memory = {name: tensor for *_, theirs in every_rank for name, tensor in theirs.items()}
-        return others, {RANDOM: random} | ({MEMORY: memory} if memory else {})
+        others = [StreamPosition(**position) for theirs in of_all[1:] for position in theirs]
+        stored = {RANDOM: _united(random)} | ({MEMORY: _united(memory)} if any(memory) else {})
+        return others, stored
 
     def _history(self, vehicles: int, of_other_ranks: list[StreamPosition]) -> TrainingHistory:
         """How training went, up to what the checkpoint contains."""
@@ -106,3 +110,8 @@ class CheckpointWriter:
             training=self._metrics.training,
             others=[*others, *of_other_ranks],
         )
+
+
+def _united(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """All tensors of all ranks, whose names differ."""
+    return {name: tensor for part in parts for name, tensor in part.items()}

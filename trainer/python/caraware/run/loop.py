@@ -11,7 +11,7 @@ from caraware.ipc.stream import Channel, Observation
 from caraware.learn.batch import Batch, save_batch
 from caraware.learn.ppo import NonFiniteLoss, UpdateStats
 from caraware.learn.ranks import RankError, Ranks, Verdict
-from caraware.report.evaluation import pooled
+from caraware.report.evaluation import EvaluationResult, pooled
 from caraware.report.metrics import Metrics, TrainingPoint
 from caraware.report.plots import plot_headline, plot_sigma
 from caraware.run.checkpoint_writer import CheckpointWriter
@@ -322,7 +322,8 @@ class TrainingLoop:
     def _write_part(self) -> None:
         """The trainer's part of the run's report, with the evaluations of all ranks."""
         env_steps = self._samples.env_steps
-        every_rank = self._ranks.gather((self._metrics.evaluations, env_steps))
+        own = [result.report() for result in self._metrics.evaluations]
+        every_rank = self._ranks.gather((own, env_steps))
         ledgers = [environment.progress.ledger for environment in self._environments] if self._learner else []
         entries = {
             "env_steps": env_steps,
@@ -338,7 +339,7 @@ class TrainingLoop:
             "untrained_env_steps": env_steps - self._trained_steps(),
             "dropped": self._metrics.dropped.report(),
         }
-        phases = pooled([result for results, _ in every_rank for result in results])
+        phases = pooled([EvaluationResult.restored(result) for results, _ in every_rank for result in results])
         write_part(self._config.run_dir, entries, phases, self._task.metrics[0].name, self._stop_requested)
 
     def _number(self, index: int) -> int:
