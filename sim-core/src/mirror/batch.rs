@@ -10,6 +10,7 @@ use ipc_schema::world::SubStep;
 use super::{
     curve::{ReferenceCurve, ReferencePoint, RoadRise},
     governor::DrivingLimits,
+    pace::PathLimits,
     tracking::{self, TrackedVehicle},
 };
 use crate::models::{
@@ -48,7 +49,7 @@ pub trait BatchModel<const N: usize>: Pod {
     /// The state after `dt_s`, and the mean motion over it.
     fn step(&self, state: &ModelState, input: &ControlInput, slope_sin: f64, dt_s: f64) -> (ModelState, SubStepMotion);
     /// The limits that a reference respects.
-    fn driving_limits(&self, front_m: f64) -> DrivingLimits;
+    fn driving_limits(&self) -> DrivingLimits;
     /// Parameters that keep the numbers of an empty member finite.
     fn empty() -> [f64; N];
 }
@@ -69,11 +70,10 @@ impl BatchModel<KINEMATIC> for KinematicParams {
         Self::step(self, state, input, dt_s)
     }
 
-    fn driving_limits(&self, front_m: f64) -> DrivingLimits {
+    fn driving_limits(&self) -> DrivingLimits {
         DrivingLimits {
             lateral_mps2: self.max_lateral_mps2,
             curvature_per_m: CURVATURE_SHARE * self.max_curvature_per_m,
-            front_curvature_per_m: front_curvature_per_m(self.max_curvature_per_m, front_m),
             accel_mps2: self.max_accel_mps2,
             decel_mps2: self.max_decel_mps2,
             power_by_mass: f64::INFINITY,
@@ -98,12 +98,11 @@ impl BatchModel<DYNAMIC> for DynamicParams {
         Self::step(self, state, input, slope_sin, dt_s)
     }
 
-    fn driving_limits(&self, front_m: f64) -> DrivingLimits {
+    fn driving_limits(&self) -> DrivingLimits {
         let friction = self.friction * GRAVITY_MPS2;
         DrivingLimits {
             lateral_mps2: LATERAL_SHARE * friction,
             curvature_per_m: CURVATURE_SHARE * self.max_curvature_per_m,
-            front_curvature_per_m: front_curvature_per_m(self.max_curvature_per_m, front_m),
             accel_mps2: self.max_accel_mps2.min(LONGITUDINAL_SHARE * friction),
             decel_mps2: self.max_decel_mps2.min(LONGITUDINAL_SHARE * friction),
             power_by_mass: POWER_SHARE * self.max_power_by_mass,
@@ -118,18 +117,16 @@ impl BatchModel<DYNAMIC> for DynamicParams {
 }
 
 /// What a vehicle can drive.
-pub(super) fn driving_limits(vehicle: &SizedModel) -> DrivingLimits {
-    let front_m = vehicle.dimensions.front_m();
-    match &vehicle.model {
-        MotionModel::Kinematic(params) => params.driving_limits(front_m),
-        MotionModel::Dynamic(params) => params.driving_limits(front_m),
+pub(super) fn path_limits(vehicle: &SizedModel) -> PathLimits {
+    let (driving, rear_per_m) = match &vehicle.model {
+        MotionModel::Kinematic(params) => (params.driving_limits(), params.max_curvature_per_m),
+        MotionModel::Dynamic(params) => (params.driving_limits(), params.max_curvature_per_m),
+    };
+    let turn = rear_per_m * vehicle.dimensions.front_m();
+    PathLimits {
+        driving,
+        front_curvature_per_m: rear_per_m / (1.0 + turn * turn).sqrt(),
     }
-}
-
-/// Curvature of the circle of a point `front_m` ahead of the rear axle, whose own circle has `curvature_per_m`.
-fn front_curvature_per_m(curvature_per_m: f64, front_m: f64) -> f64 {
-    let turn = curvature_per_m * front_m;
-    curvature_per_m / (1.0 + turn * turn).sqrt()
 }
 
 /// Motion of all members over one sub-step in the order of [`SubStep`]; the first four fields count from the start of the tick.

@@ -21,10 +21,8 @@ const NONE: f64 = 1e-4;
 pub struct DrivingLimits {
     /// Largest lateral acceleration, m/s².
     pub lateral_mps2: f64,
-    /// Largest curvature of the rear axle's path, 1/m.
+    /// Largest curvature, 1/m.
     pub curvature_per_m: f64,
-    /// Largest curvature of the front bumper's path, 1/m.
-    pub front_curvature_per_m: f64,
     /// Largest acceleration, m/s².
     pub accel_mps2: f64,
     /// Largest deceleration, m/s².
@@ -144,7 +142,6 @@ mod tests {
     const ABILITY: DrivingLimits = DrivingLimits {
         lateral_mps2: 7.0,
         curvature_per_m: 0.2,
-        front_curvature_per_m: 0.16,
         accel_mps2: 4.0,
         decel_mps2: 9.0,
         power_by_mass: 60.0,

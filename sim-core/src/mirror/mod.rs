@@ -38,7 +38,8 @@ use crate::{
     },
     scene::shape::OrientedBox,
 };
-use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch, driving_limits};
+use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch, path_limits};
+use pace::PathLimits;
 use prefetch::PrefetchRange;
 use preview::PathAhead;
 use resynchronisation::Resynchronisation;
@@ -99,6 +100,8 @@ pub struct Mirror {
     slab: Vec<RoadUser>,
     /// The path ahead of each road user of the slab; empty without a preview.
     paths: Vec<PathAhead>,
+    /// What the vehicles of each model can drive, by its index in the catalogue; empty without a preview.
+    limits: Vec<PathLimits>,
     free: Vec<u32>,
     /// Road users of the current frame: dense index and place, in ascending order of the index.
     present: Vec<(u32, u32)>,
@@ -136,6 +139,7 @@ impl Mirror {
             places: Vec::new(),
             slab: Vec::new(),
             paths: Vec::new(),
+            limits: Vec::new(),
             free: Vec::new(),
             present: Vec::new(),
             in_whole_step: 0,
@@ -219,6 +223,11 @@ impl Mirror {
         }
         self.dismiss(vehicle);
         let road_user = RoadUser::new(meta, &mut self.catalogue);
+        if self.settings.preview().is_some() {
+            let known = self.limits.len() as u32;
+            let more = (known..=road_user.model()).map(|model| path_limits(self.catalogue.at(model)));
+            self.limits.extend(more);
+        }
         let place = match self.free.pop() {
             Some(place) => {
                 self.slab[place as usize] = road_user;
@@ -284,7 +293,7 @@ impl Mirror {
             }
             let road_user = &mut self.slab[place as usize];
             let path = self.paths.get_mut(place as usize);
-            let ahead = path.map(|path| (path, driving_limits(self.catalogue.at(road_user.model()))));
+            let ahead = path.zip(self.limits.get(road_user.model() as usize));
             road_user.accept(now, self.frame, ahead, &self.settings);
             if !road_user.is_hidden() {
                 self.in_whole_step += usize::from(road_user.is_in_whole_step());

@@ -25,6 +25,15 @@ const NARROW_REACH_M: f64 = 12.0;
 /// Points of the path are at least so far apart, metres: nearer ones have no direction.
 const APART_M: f64 = 0.02;
 
+/// What a vehicle can drive, as its pace needs it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PathLimits {
+    /// Of the vehicle.
+    pub driving: DrivingLimits,
+    /// Largest curvature of the front bumper's path, 1/m.
+    pub front_curvature_per_m: f64,
+}
+
 /// A mean of SUMO's states on the path.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct PathPoint {
@@ -34,8 +43,8 @@ struct PathPoint {
     pitch_rad: f32,
     /// Distance along the path from where it begins, metres.
     station_m: f64,
-    /// Curvature of the path up to here, 1/m.
-    curvature_per_m: f32,
+    /// Square of the speed that the bend up to here allows, m²/s².
+    bend_square: f32,
     /// Distance from SUMO's own path, metres.
     deviation_m: f32,
     lamps: u32,
@@ -95,7 +104,7 @@ impl PacedPath {
                 yaw_rad: mean.yaw_rad,
                 pitch_rad: mean.pitch_rad,
                 station_m: -back_m,
-                curvature_per_m: 0.0,
+                bend_square: f32::INFINITY,
                 deviation_m: 0.0,
                 lamps: mean.signals,
             };
@@ -116,7 +125,7 @@ impl PacedPath {
         &mut self,
         step: &WindowStep,
         deviation_m: f64,
-        limits: Option<&DrivingLimits>,
+        limits: Option<&PathLimits>,
         frame_s: f64,
     ) -> WindowStep {
         let [shift_x, shift_y] = step.shift_m;
@@ -126,12 +135,8 @@ impl PacedPath {
                 point.position_m[1] += shift_y;
             }
         }
-        self.push(&step.now, deviation_m);
+        self.push(&step.now, deviation_m, limits);
         self.ahead += 1;
-        let newest = self.behind(0);
-        if limits.is_some_and(|limits| f64::from(newest.curvature_per_m.abs()) > limits.front_curvature_per_m) {
-            self.narrow_m = newest.station_m;
-        }
         let before = TrafficState {
             front_x_m: self.now.front_x_m + shift_x,
             front_y_m: self.now.front_y_m + shift_y,
@@ -143,9 +148,9 @@ impl PacedPath {
             None => (aim_m, aim_mps),
             Some(limits) => {
                 let wanted_mps = aim_mps + CATCH_UP_PER_S * (aim_m - self.station_m);
-                let [most_accel, most_decel, _] = limits.at(self.speed_mps.max(1.0));
+                let [most_accel, most_decel, _] = limits.driving.at(self.speed_mps.max(1.0));
                 let speed_mps = wanted_mps
-                    .min(self.bend_speed_mps(limits))
+                    .min(self.bend_speed_mps())
                     .clamp(
                         self.speed_mps - LONGITUDINAL_SHARE * most_decel * frame_s,
                         self.speed_mps + LONGITUDINAL_SHARE * most_accel * frame_s,
@@ -192,27 +197,34 @@ impl PacedPath {
         }
     }
 
-    fn push(&mut self, mean: &TrafficState, deviation_m: f64) {
+    fn push(&mut self, mean: &TrafficState, deviation_m: f64, limits: Option<&PathLimits>) {
         let last = self.points[self.newest];
         let position_m = [mean.front_x_m, mean.front_y_m, mean.front_z_m];
         let chord = [0, 1].map(|axis: usize| position_m[axis] - last.position_m[axis]);
-        let length_m = libm::hypot(chord[0], chord[1]);
-        let mut curvature_per_m = last.curvature_per_m;
+        let length_m = (chord[0] * chord[0] + chord[1] * chord[1]).sqrt();
+        let station_m = last.station_m + length_m;
+        let mut bend_square = last.bend_square;
         if length_m > APART_M {
-            let [ahead, left] = chord.map(|part| part / length_m);
+            let per_m = 1.0 / length_m;
+            let [ahead, left] = chord.map(|part| part * per_m);
             let [cos, sin] = std::mem::replace(&mut self.direction, [ahead, left]);
             // The sine of the turn, and twice its half-angle's from a right angle on: no path turns back on the spot.
-            let (dot, cross) = (cos * ahead + sin * left, cos * left - sin * ahead);
-            let turn = if dot >= 0.0 { cross } else { 2.0_f64.copysign(cross) };
-            curvature_per_m = (turn / length_m) as f32;
+            let (dot, cross) = (cos * ahead + sin * left, (cos * left - sin * ahead).abs());
+            let curvature_per_m = if dot >= 0.0 { cross } else { 2.0 } * per_m;
+            if let Some(limits) = limits {
+                bend_square = (LATERAL_SHARE * limits.driving.lateral_mps2 / curvature_per_m.max(1e-6)) as f32;
+                if curvature_per_m > limits.front_curvature_per_m {
+                    self.narrow_m = station_m;
+                }
+            }
         }
         self.newest = (self.newest + 1) % self.points.len();
         self.points[self.newest] = PathPoint {
             position_m,
             yaw_rad: mean.yaw_rad,
             pitch_rad: mean.pitch_rad,
-            station_m: last.station_m + length_m,
-            curvature_per_m,
+            station_m,
+            bend_square,
             deviation_m: deviation_m as f32,
             lamps: mean.signals,
         };
@@ -232,15 +244,14 @@ impl PacedPath {
     }
 
     /// The speed from which the mirror can brake to what every bend ahead allows, m/s.
-    fn bend_speed_mps(&self, limits: &DrivingLimits) -> f64 {
-        let lateral_mps2 = LATERAL_SHARE * limits.lateral_mps2;
+    fn bend_speed_mps(&self) -> f64 {
         let mut square = f64::INFINITY;
         let mut next_m = self.behind(0).station_m;
         for frames in 0..=self.ahead {
             let point = self.behind(frames);
-            let bend = lateral_mps2 / f64::from(point.curvature_per_m.abs()).max(1e-6);
             // Braking from this point to the next one ahead.
-            square = bend.min(square + 2.0 * BRAKE_MPS2 * (next_m - point.station_m));
+            let braking = square + 2.0 * BRAKE_MPS2 * (next_m - point.station_m);
+            square = f64::from(point.bend_square).min(braking);
             next_m = point.station_m;
         }
         (square + 2.0 * BRAKE_MPS2 * (next_m - self.station_m).max(0.0)).sqrt()
@@ -275,15 +286,18 @@ mod tests {
 
     const FRAME_S: f64 = 0.1;
     const LATE: usize = 5;
-    const LIMITS: DrivingLimits = DrivingLimits {
+    const DRIVING: DrivingLimits = DrivingLimits {
         lateral_mps2: 6.0,
         curvature_per_m: 1.0,
-        front_curvature_per_m: 1.0,
         accel_mps2: 3.0,
         decel_mps2: 8.0,
         power_by_mass: 100.0,
         drag_by_mass_per_m: 3e-4,
         rolling_mps2: 0.1,
+    };
+    const LIMITS: PathLimits = PathLimits {
+        driving: DRIVING,
+        front_curvature_per_m: 1.0,
     };
 
     /// Means of a vehicle at `speed_mps` that drives 40 m straight, a quarter of a circle, and straight on.
@@ -304,7 +318,7 @@ mod tests {
     }
 
     /// The mirror's states along the means.
-    fn paced(means: impl Iterator<Item = TrafficState>, limits: Option<&DrivingLimits>) -> Vec<TrafficState> {
+    fn paced(means: impl Iterator<Item = TrafficState>, limits: Option<&PathLimits>) -> Vec<TrafficState> {
         let mut path = PacedPath::new(LATE);
         let mut last: Option<TrafficState> = None;
         let states = means.map(|mean| {
@@ -348,7 +362,7 @@ mod tests {
         for (number, pair) in states.windows(2).enumerate() {
             let accel_mps2 = f64::from(pair[1].speed_mps - pair[0].speed_mps) / FRAME_S;
             assert!(
-                accel_mps2 > -LIMITS.decel_mps2 && accel_mps2 < LIMITS.accel_mps2 + 1e-3,
+                accel_mps2 > -DRIVING.decel_mps2 && accel_mps2 < DRIVING.accel_mps2 + 1e-3,
                 "frame {number}: {accel_mps2}"
             );
             slowest_mps = slowest_mps.min(pair[1].speed_mps.into());
@@ -361,7 +375,7 @@ mod tests {
             };
             assert!(off_m < 0.02, "frame {number}: {off_m} m from the path");
         }
-        let allowed_mps = (LATERAL_SHARE * LIMITS.lateral_mps2 * radius_m).sqrt();
+        let allowed_mps = (LATERAL_SHARE * DRIVING.lateral_mps2 * radius_m).sqrt();
         assert!(
             (slowest_mps - allowed_mps).abs() < 0.2,
             "{slowest_mps} m/s, allowed {allowed_mps}"
@@ -398,7 +412,7 @@ mod tests {
             let accel_mps2 = (second - first) / FRAME_S;
             assert!(second > -1e-9, "frame {number}: {second} m/s");
             assert!(
-                accel_mps2 < LIMITS.accel_mps2 && accel_mps2 > -LIMITS.decel_mps2,
+                accel_mps2 < DRIVING.accel_mps2 && accel_mps2 > -DRIVING.decel_mps2,
                 "frame {number}: {accel_mps2} m/s²"
             );
             assert!(three[1].front_x_m <= expected[number + 1 - LATE].front_x_m + 1e-9);

@@ -5,8 +5,7 @@ use std::collections::VecDeque;
 use ipc_schema::{config::PreviewFrames, traffic::TrafficState};
 
 use super::{
-    governor::DrivingLimits,
-    pace::PacedPath,
+    pace::{PacedPath, PathLimits},
     window::{StateWindow, WindowStep},
 };
 
@@ -47,7 +46,7 @@ impl PathAhead {
         &mut self,
         now: &TrafficState,
         length_m: f64,
-        limits: Option<&DrivingLimits>,
+        limits: Option<&PathLimits>,
         frame_s: f64,
     ) -> Option<WindowStep> {
         let step = self.window.advance(now, length_m, frame_s)?;

@@ -8,8 +8,8 @@ use ipc_schema::{
 use super::{
     batch::{BatchModel, VehicleBatch},
     curve::ReferenceCurve,
-    governor::DrivingLimits,
     hero::Hero,
+    pace::PathLimits,
     person::Person,
     preview::PathAhead,
     reference::{PathJoin, ReferencePath},
@@ -116,7 +116,7 @@ impl RoadUser {
         &mut self,
         now: &TrafficState,
         frame: u64,
-        ahead: Option<(&mut PathAhead, DrivingLimits)>,
+        ahead: Option<(&mut PathAhead, &PathLimits)>,
         settings: &MirrorSettings,
     ) {
         let known = self.seen_frame != 0 && self.seen_frame + 1 == frame;
@@ -164,7 +164,7 @@ impl RoadUser {
     fn follow(
         &mut self,
         now: &TrafficState,
-        (path, limits): (&mut PathAhead, DrivingLimits),
+        (path, limits): (&mut PathAhead, &PathLimits),
         step_s: f64,
     ) -> Option<f64> {
         let limits = match self.mover {
@@ -172,7 +172,7 @@ impl RoadUser {
             Mover::Person(_) | Mover::Hero(_) => None,
         };
         let step = match self.arrival {
-            Arrival::Continuing => path.advance(now, self.dimensions.length_m, limits.as_ref(), step_s),
+            Arrival::Continuing => path.advance(now, self.dimensions.length_m, limits, step_s),
             Arrival::Entering | Arrival::Jumping(_) => None,
         };
         let Some(step) = step else {
@@ -276,7 +276,7 @@ impl RoadUser {
                 settings.tick_s,
                 state.speed_mps,
                 spread_s,
-                &params.driving_limits(self.dimensions.front_m()),
+                &params.driving_limits(),
             );
             let rise = path.road(start_s).1;
             batch.load(member, params, state, (&curve, &rise), self.dimensions.front_m());

@@ -143,8 +143,8 @@ impl StateWindow {
             [sample[0], sample[1]]
         };
         // The mean lies beside the middle of the window.
-        let first = (count / 2).saturating_sub(2);
-        let lines = (first..count.saturating_sub(1).min(first + 4)).map(|place| (at(place), at(place + 1)));
+        let first = (count / 2).saturating_sub(1);
+        let lines = (first..count.saturating_sub(1).min(first + 2)).map(|place| (at(place), at(place + 1)));
         lines
             .map(|(from, to)| super::reference::distance_m(point, from, to))
             .fold(f64::INFINITY, f64::min)
