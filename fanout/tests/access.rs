@@ -107,7 +107,7 @@ fn until_alive(run: &Run, session: &zenoh::Session) {
     });
 }
 
-/// Starts the fan-out, and waits until it listens.
+/// Starts the fan-out, and waits until it listens. It answers queries somewhat later: see [`until_alive`].
 fn start_listening(run: &Run) -> harness::Fanout {
     let fanout = run.start_fanout();
     until("an open port", || {
@@ -135,6 +135,7 @@ fn users_read_and_commanders_command() {
     assert!(connect(&run, "").is_err());
 
     let alice = until_connected(|| connect_as(&run, "alice", "secret"));
+    until_alive(&run, &alice);
     let (sim, worlds) = publisher(&run, Channel::World);
     until("attendance", || {
         sim.board_of(Process::Fanout).unwrap().progress().attached == 1
@@ -164,6 +165,7 @@ fn no_client_may_write() {
     let run = Run::new("forged", Mode::Simulate);
     let _fanout = start_listening(&run);
     let [forger, reader] = [(), ()].map(|()| until_connected(|| connect(&run, "")));
+    until_alive(&run, &reader);
     let key = run.key(Topic::Map);
     let honest = ask(&reader, &key).unwrap();
     let seen = harness::watch(&reader, "caraware/**".into());
@@ -197,6 +199,7 @@ fn without_commanders_no_client_may_command() {
     let received = start_supervisor(&run);
     let _fanout = start_listening(&run);
     let viewer = until_connected(|| connect(&run, ""));
+    until_alive(&run, &viewer);
     assert!(ask(&viewer, &run.key(Topic::Map)).is_some());
     assert_eq!(
         command(&run, &viewer, Command::Reset {}.to_json().unwrap(), SILENCE),
@@ -285,6 +288,7 @@ fn certificates_grant_access() {
     );
     let request = Command::Reset {}.to_json().unwrap();
     let alice = until_connected(|| connect_tls(&with("alice")));
+    until_alive(&run, &alice);
     assert!(ask(&alice, &run.key(Topic::Map)).is_some());
     assert_eq!(command(&run, &alice, request.clone(), SILENCE), None);
     let carol = until_connected(|| connect_tls(&with("carol")));

@@ -137,7 +137,6 @@ fn with_a_preview_no_vehicle_on_a_default_grid_is_set_onto_sumo() {
     let with = run("with", &[]);
     // Otherwise the net would show nothing.
     assert!(without["resynchronisations"].as_u64().unwrap() > 0, "{without:#}");
-    assert_eq!(with["resynchronisations"], 0, "{with:#}");
     // Each has its line, and is counted by class and cause.
     let lines = std::fs::read_to_string(workplace.path().join("runs/without/events/resynchronisations.jsonl")).unwrap();
     let mut counted = serde_json::Map::new();
@@ -153,6 +152,13 @@ fn with_a_preview_no_vehicle_on_a_default_grid_is_set_onto_sumo() {
         without["resynchronisation_causes"]["passenger"],
         serde_json::Value::Object(counted)
     );
-    let contacts = |dynamics: &serde_json::Value| dynamics["collisions"]["vehicle"].as_u64().unwrap();
-    assert!(contacts(&with) <= contacts(&without), "{with:#}");
+    // It brakes before the corners and stays in its lane: a reference that left it would meet oncoming traffic.
+    let farthest_m =
+        |dynamics: &serde_json::Value| dynamics["tracking"]["reference_from_sumo"]["max_m"].as_f64().unwrap();
+    assert!(farthest_m(&without) > 3.0, "{without:#}");
+    for dynamics in [&with, &run("slow", &["traffic.step_s=1"])] {
+        assert_eq!(dynamics["resynchronisations"], 0, "{dynamics:#}");
+        assert_eq!(dynamics["collisions"]["vehicle"], 0, "{dynamics:#}");
+        assert!(farthest_m(dynamics) < 1.2, "{dynamics:#}");
+    }
 }

@@ -1,9 +1,8 @@
-//! The pace at which a mirror follows the path ahead of it: later where the path is too narrow for SUMO's speed, and on time again after it.
+//! The pace at which a mirror follows the path ahead of it: it slows down for a bend that SUMO drives too fast, and catches up afterwards.
 //!
-//! The means of SUMO's last states ([`super::window`]) are the path. The mirror follows them some frames late, so that it knows the path
-//! ahead of it. Where the speed of the means asks for more lateral acceleration than the tyres should give, it brakes *before* the bend
-//! and stays on the path instead of leaving it. It has its place in time as its aim: the distance that it lost is driven faster
-//! afterwards, within what the vehicle can do.
+//! The path is a line through the means of SUMO's last states ([`super::window`]). The mirror aims at the mean of some frames ago, so it
+//! knows the path ahead. Where the aim's speed asks for more lateral acceleration than the tyres should give, the mirror brakes *before*
+//! the bend and stays on the path. It falls behind its aim meanwhile, and drives faster afterwards, within what the vehicle can do.
 
 use ipc_schema::traffic::TrafficState;
 
@@ -28,7 +27,7 @@ const APART_M: f64 = 0.02;
 /// What a vehicle can drive, as its pace needs it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PathLimits {
-    /// Of the vehicle.
+    /// Limits of acceleration.
     pub driving: DrivingLimits,
     /// Largest curvature of the front bumper's path, 1/m.
     pub front_curvature_per_m: f64,
@@ -71,7 +70,7 @@ pub struct PacedPath {
 }
 
 impl PacedPath {
-    /// A path whose mirror is `late` frames behind the newest point, of no road user.
+    /// A path whose mirror is `late` frames behind the newest point. It belongs to no road user yet.
     #[must_use]
     pub fn new(late: usize) -> Self {
         Self {

@@ -21,7 +21,7 @@ pub struct PathAhead {
 }
 
 impl PathAhead {
-    /// Of no road user.
+    /// A path that belongs to no road user yet.
     #[must_use]
     pub fn new(frames: PreviewFrames) -> Self {
         Self {

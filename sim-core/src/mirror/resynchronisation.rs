@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ResynchronisationCause {
-    /// SUMO moved it: a teleport, or `moveToXY` by somebody else's script.
+    /// SUMO moved it: a teleport, or a script's `moveToXY`.
     MovedBySumo,
     /// SUMO had it off the road in between, for instance parked or on board.
     Returned,

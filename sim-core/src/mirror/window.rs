@@ -127,8 +127,8 @@ impl StateWindow {
         })
     }
 
-    /// Distance of the mean from SUMO's own path: from the nearest of the window's states or of the lines between them, metres. Zero
-    /// where the path is straight.
+    /// Distance of the mean from SUMO's own path, the lines between the states in the middle of the window, metres. Zero where the path
+    /// is straight.
     #[must_use]
     pub fn deviation_m(&self) -> f64 {
         let (oldest, newest) = (self.oldest, (self.oldest + self.samples.len() - 1) % self.samples.len());
