@@ -350,7 +350,7 @@ impl Waker {
     /// Wakes `process` of environment `env_index`, for a program that is no process of the run itself.
     ///
     /// # Errors
-    /// The service is not there, or all who may wake it are.
+    /// The service does not exist, or as many processes as may wake it already do.
     pub fn open(
         node: &RunNode,
         run: &RunFile,
@@ -371,7 +371,7 @@ impl Waker {
 /// The socket below counts in microseconds and takes zero of them for ever.
 const SHORTEST_WAIT: Duration = Duration::from_micros(10);
 
-/// Waits until somebody wakes this process or `timeout` has passed. Look for work before waiting, and again after.
+/// Waits until another process wakes this one or `timeout` has passed. Look for work before waiting, and again after.
 ///
 /// # Errors
 /// The listener is broken.

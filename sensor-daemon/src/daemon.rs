@@ -280,7 +280,7 @@ impl Daemon {
             .observe(&header, road_users, draft.payload_mut())
             .map_err(unreadable)?;
         self.digest.add(&header, draft.payload());
-        // Stored before the tick is sent: whoever has received the last tick of an episode can rely on the state of the next one.
+        // Stored before the tick is sent: a process that has received the last tick of an episode can rely on the state of the next one.
         if header.has(LAST_OF_EPISODE) {
             self.store_state(header.tick + 1)?;
         }
