@@ -82,7 +82,7 @@ fn contacts_with_an_obstacle_are_reported_and_end_trajectories_if_configured() {
     let blind = simulate(&workplace, "blind", &["--set", "collision.detect=false"]);
     assert_eq!(blind["observation_hash"], report["observation_hash"]);
     assert_eq!(blind["dynamics"]["collisions"], Value::Null);
-    assert!(!workplace.path().join("runs/blind/events").exists());
+    assert!(!workplace.path().join("runs/blind/events/collisions.jsonl").exists());
 
     // Where a trajectory ends, the observation at the tick of the contact is left out. Traffic stays the same.
     let ended = simulate(&workplace, "ended", &["--set", "collision.ends_trajectory=true"]);
