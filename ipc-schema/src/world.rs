@@ -19,6 +19,9 @@ pub const TIME_LIMIT: u32 = 1 << 5;
 /// The action for this tick was refused; the last valid one was held.
 pub const ACTION_REFUSED: u32 = 1 << 6;
 
+/// It is led along its path as if on rails, because no driving would keep it there.
+pub const GUIDED: u32 = 1 << 7;
+
 /// One road user at the end of a tick.
 ///
 /// World frame: metres in the net's projected coordinates, x east, y north, z up. Body frame: x forward, y left, z up,
@@ -68,7 +71,7 @@ pub struct VehicleState {
     pub kind: u32,
     /// SUMO's signal bits.
     pub signals: u32,
-    /// Bits [`RESYNCHRONISED`], [`APPEARED`], [`COLLIDED`], [`OFF_ROAD`], [`ARRIVED`], [`TIME_LIMIT`], [`ACTION_REFUSED`].
+    /// Bits [`RESYNCHRONISED`], [`APPEARED`], [`COLLIDED`], [`OFF_ROAD`], [`ARRIVED`], [`TIME_LIMIT`], [`ACTION_REFUSED`], [`GUIDED`].
     pub flags: u32,
     /// Distance between the reference and SUMO's own path (lane changes spread in time, kinks rounded), metres.
     pub reference_offset_m: f32,

@@ -35,6 +35,7 @@ struct CoreState {
     tracking: TrackingStatistics,
     resynchronisations: u64,
     resynchronised: ResynchronisationState,
+    guided: ResynchronisationState,
     vehicle_steps: u64,
     contacts: ContactState,
 }
@@ -46,6 +47,8 @@ struct CoreReport<'a> {
     resynchronisations: u64,
     /// By SUMO's class and the cause.
     resynchronisation_causes: &'a ResynchronisationCounts,
+    /// How often vehicles began to be led along their path, by SUMO's class and the cause.
+    guidance_causes: &'a ResynchronisationCounts,
     vehicle_steps: u64,
     drops: u64,
     /// Heroes, in the driving task.
@@ -93,6 +96,7 @@ struct CoreProcess {
     scenes: Vec<Arc<Scene>>,
     contacts: Option<ContactReporter>,
     resynchronisations: ResynchronisationReporter,
+    guidances: ResynchronisationReporter,
     names: RoadUserNames,
     world: Publisher,
     /// The required consumers of `world`.
@@ -110,7 +114,9 @@ impl CoreProcess {
         // Continue where the part of the run before this one stood when the episode began.
         let state: CoreState = membership.stored_episode_state()?.unwrap_or_default();
         let contacts = ContactReporter::open(&membership, &scenes, state.contacts)?;
-        let resynchronisations = ResynchronisationReporter::open(&membership, state.resynchronised)?;
+        let events = |name, state| ResynchronisationReporter::open(&membership, name, state);
+        let resynchronisations = events("resynchronisations.jsonl", state.resynchronised)?;
+        let guidances = events("guidances.jsonl", state.guided)?;
         // Viewers see the run's own map, and heroes have no other.
         let scene = Arc::clone(&scenes[0]);
         draw_chart(&membership, &scene)?;
@@ -132,6 +138,7 @@ impl CoreProcess {
             scenes,
             contacts,
             resynchronisations,
+            guidances,
             names: RoadUserNames::default(),
             world,
             consumers,
@@ -186,6 +193,7 @@ impl CoreProcess {
             tracking: self.mirror.tracking().clone(),
             resynchronisations: self.mirror.resynchronisations(),
             resynchronised: self.resynchronisations.state()?,
+            guided: self.guidances.state()?,
             vehicle_steps: self.vehicle_steps,
             contacts: contacts.unwrap_or_default(),
         };
@@ -266,6 +274,7 @@ impl CoreProcess {
         }
         let resynchronised = self.mirror.resynchronised();
         self.resynchronisations.add(&header, resynchronised, &self.names)?;
+        self.guidances.add(&header, self.mirror.guidances(), &self.names)?;
         let poses = match &mut self.actions {
             Some(actions) => actions.end_tick(&layout, draft.payload_mut()).map_err(unreadable)?,
             None => Vec::new(),
@@ -313,6 +322,7 @@ impl CoreProcess {
             tracking: self.mirror.tracking().summary(),
             resynchronisations: self.mirror.resynchronisations(),
             resynchronisation_causes: self.resynchronisations.finish()?,
+            guidance_causes: self.guidances.finish()?,
             vehicle_steps: self.vehicle_steps,
             drops: self.world.drops(),
             heroes: self.actions.as_ref().map(HeroPorts::counts),

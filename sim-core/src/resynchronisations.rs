@@ -1,4 +1,4 @@
-//! Reporting of mirrors that were set onto SUMO: a line each in the run's directory, and counts in its report.
+//! Reporting of mirrors that were set onto SUMO, or led along their path: a line each in the run's directory, and counts in its report.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     event_log::EventLog,
-    mirror::resynchronisation::{Resynchronisation, ResynchronisationCause},
+    mirror::resynchronisation::{Guidance, Resynchronisation, ResynchronisationCause},
     names::RoadUserNames,
 };
 
@@ -18,11 +18,50 @@ pub type ResynchronisationCounts = BTreeMap<String, BTreeMap<ResynchronisationCa
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ResynchronisationState {
     counts: ResynchronisationCounts,
-    /// Bytes in `events/resynchronisations.jsonl`.
+    /// Bytes in the file of lines.
     line_bytes: u64,
 }
 
-/// A line of `events/resynchronisations.jsonl`.
+/// How far a road user was set onto SUMO, or was from its path when guidance began, metres.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Distance {
+    JumpM(f64),
+    AwayM(f64),
+}
+
+/// What becomes a line.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ReportedEvent {
+    vehicle: u32,
+    cause: ResynchronisationCause,
+    position_m: [f64; 3],
+    distance: Distance,
+}
+
+impl From<&Resynchronisation> for ReportedEvent {
+    fn from(set: &Resynchronisation) -> Self {
+        Self {
+            vehicle: set.vehicle,
+            cause: set.cause,
+            position_m: set.position_m,
+            distance: Distance::JumpM(set.jump_m),
+        }
+    }
+}
+
+impl From<&Guidance> for ReportedEvent {
+    fn from(guidance: &Guidance) -> Self {
+        Self {
+            vehicle: guidance.vehicle,
+            cause: guidance.cause,
+            position_m: guidance.position_m,
+            distance: Distance::AwayM(guidance.away_m),
+        }
+    }
+}
+
+/// A line of `events/resynchronisations.jsonl` or `events/guidances.jsonl`.
 #[derive(Debug, Serialize)]
 struct ResynchronisationLine<'a> {
     tick: u64,
@@ -32,10 +71,11 @@ struct ResynchronisationLine<'a> {
     class: &'a str,
     cause: ResynchronisationCause,
     position_m: [f64; 3],
-    jump_m: f64,
+    #[serde(flatten)]
+    distance: Distance,
 }
 
-/// Counts a run's resynchronisations and writes their lines.
+/// Counts a run's resynchronisations or guidances, and writes their lines.
 #[derive(Debug)]
 pub struct ResynchronisationReporter {
     lines: EventLog,
@@ -43,13 +83,13 @@ pub struct ResynchronisationReporter {
 }
 
 impl ResynchronisationReporter {
-    /// Continues from `before`. Lines behind its own are removed from the file: their ticks are made again.
+    /// Continues the file `events/NAME` from `before`. Lines behind its own are removed from the file: their ticks are made again.
     ///
     /// # Errors
     /// The file cannot be created.
-    pub fn open(membership: &RunMembership, before: ResynchronisationState) -> Result<Self, Failure> {
+    pub fn open(membership: &RunMembership, name: &str, before: ResynchronisationState) -> Result<Self, Failure> {
         Ok(Self {
-            lines: EventLog::of_run(&membership.run.run_dir, "resynchronisations.jsonl", before.line_bytes)?,
+            lines: EventLog::of_run(&membership.run.run_dir, name, before.line_bytes)?,
             counts: before.counts,
         })
     }
@@ -58,13 +98,11 @@ impl ResynchronisationReporter {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn add(
-        &mut self,
-        header: &MessageHeader,
-        resynchronised: &[Resynchronisation],
-        names: &RoadUserNames,
-    ) -> Result<(), Failure> {
-        for set in resynchronised {
+    pub fn add<'a, E>(&mut self, header: &MessageHeader, events: &'a [E], names: &RoadUserNames) -> Result<(), Failure>
+    where
+        ReportedEvent: From<&'a E>,
+    {
+        for set in events.iter().map(ReportedEvent::from) {
             let class = names.class(set.vehicle);
             if !self.counts.contains_key(class) {
                 self.counts.insert(class.to_owned(), BTreeMap::new());
@@ -82,7 +120,7 @@ impl ResynchronisationReporter {
                 class,
                 cause: set.cause,
                 position_m: set.position_m,
-                jump_m: set.jump_m,
+                distance: set.distance,
             })?;
         }
         Ok(())

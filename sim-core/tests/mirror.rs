@@ -6,10 +6,13 @@ use common::{LENGTH_M, Road, drive, frame, limits, meta, previewing, settings};
 use ipc_schema::{
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     traffic::{Kind, MetaEvent, TrafficState},
-    world::{APPEARED, RESYNCHRONISED},
+    world::{APPEARED, GUIDED, RESYNCHRONISED, VehicleState},
 };
 use proptest::prelude::*;
-use sim_core::mirror::{Mirror, MirrorError, resynchronisation::ResynchronisationCause};
+use sim_core::{
+    mirror::{Mirror, MirrorError, resynchronisation::ResynchronisationCause},
+    trig::wrap_angle,
+};
 
 fn header(episode: u64, tick: u64) -> MessageHeader {
     MessageHeader {
@@ -228,29 +231,89 @@ fn with_a_preview_a_road_user_appears_where_it_departed_when_the_others_have_com
     assert!(mirror.sumo_boxes(7).is_empty());
 }
 
+/// Distance of the front bumper from a point, metres.
+fn front_from(state: &VehicleState, [x_m, y_m]: [f64; 2]) -> f64 {
+    let front_m = LENGTH_M - f64::from(state.rear_overhang_m);
+    let (sin, cos) = libm::sincos(state.yaw_rad);
+    libm::hypot(state.x_m + front_m * cos - x_m, state.y_m + front_m * sin - y_m)
+}
+
+/// The largest steps of position (metres) and heading (radians) beyond what the velocity at their beginning explains.
+fn largest_jumps(states: &[VehicleState]) -> [f64; 2] {
+    states.windows(2).fold([0.0; 2], |largest, pair| {
+        let (sin, cos) = libm::sincos(pair[0].yaw_rad);
+        let [along, left, _] = pair[0].velocity_body_mps.map(f64::from);
+        let moved = [pair[1].x_m - pair[0].x_m, pair[1].y_m - pair[0].y_m];
+        let jump_m = libm::hypot(
+            moved[0] - 0.1 * (along * cos - left * sin),
+            moved[1] - 0.1 * (along * sin + left * cos),
+        );
+        let turn_rad =
+            wrap_angle(pair[1].yaw_rad - pair[0].yaw_rad) - 0.1 * f64::from(pair[0].angular_rate_body_radps[2]);
+        [f64::max(largest[0], jump_m), f64::max(largest[1], turn_rad.abs())]
+    })
+}
+
 #[test]
-fn a_turn_on_the_spot_is_named_as_the_cause_of_a_resynchronisation() {
+fn through_a_turn_on_the_spot_a_vehicle_is_led_without_a_jump() {
     // A half circle of 1.6 m, as netgenerate's turnarounds, and a wide one.
     for (radius_m, cause) in [(1.6, Some(ResynchronisationCause::NarrowTurn)), (15.0, None)] {
         let road = Road::corner(60.0, radius_m, std::f64::consts::PI, 12);
         let mut mirror = previewing();
         mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
-        let mut causes = Vec::new();
-        for tick in 0_u32..300 {
+        let (mut causes, mut states) = (Vec::new(), Vec::new());
+        for tick in 0_u32..275 {
             let station_m = f64::from(tick) * 0.1 * 4.0;
-            if station_m < 110.0 {
-                frame(
-                    &mut mirror,
-                    &header(0, u64::from(tick)),
-                    &[road.state(0, station_m, 4.0)],
-                );
-                causes.extend(mirror.resynchronised().iter().map(|set| (set.cause, set.vehicle)));
-            }
+            let ticks = frame(
+                &mut mirror,
+                &header(0, u64::from(tick)),
+                &[road.state(0, station_m, 4.0)],
+            );
+            states.extend(ticks[0].states.iter().copied());
+            causes.extend(
+                mirror
+                    .guidances()
+                    .iter()
+                    .map(|guidance| (guidance.cause, guidance.vehicle)),
+            );
         }
-        assert_eq!(causes.is_empty(), cause.is_none(), "{radius_m} m: {causes:?}");
-        assert!(
-            causes.iter().all(|found| *found == (cause.unwrap(), 0)),
-            "{radius_m} m: {causes:?}"
+        assert_eq!(mirror.resynchronisations(), 0);
+        let guided = states.iter().filter(|state| state.flags & GUIDED != 0).count();
+        assert_eq!(causes, Vec::from_iter(cause.map(|cause| (cause, 0))), "{radius_m} m");
+        assert_eq!(guided > 0, cause.is_some(), "{radius_m} m: {guided} ticks");
+        assert!(guided < 80, "{radius_m} m: {guided} ticks");
+        assert_eq!(
+            states.last().unwrap().flags & GUIDED,
+            0,
+            "{radius_m} m: guidance does not end"
         );
+        // At 4 m/s on 1.6 m the velocity itself turns by 0.25 rad in a tick, and moves by 0.1 m.
+        let [jump_m, jump_rad] = largest_jumps(&states[1..]);
+        assert!(jump_m < 0.15, "{radius_m} m: {jump_m} m");
+        assert!(jump_rad < 0.2, "{radius_m} m: {jump_rad} rad");
     }
+}
+
+#[test]
+fn a_vehicle_that_changes_lanes_while_it_stands_is_led_there() {
+    let mut mirror = previewing();
+    mirror.apply_meta(&header(0, 0), &[meta(0, Kind::Cav)]).unwrap();
+    let mut states = Vec::new();
+    for tick in 0_u32..150 {
+        // It brakes to a stop at 60 m, and stands there in the other lane from the sixth second on.
+        let left_s = (4.0 - 0.1 * f64::from(tick)).max(0.0);
+        let now = TrafficState {
+            front_y_m: if tick < 60 { 0.0 } else { 3.2 },
+            ..road().state(0, 60.0 - 1.5 * left_s * left_s, 3.0 * left_s)
+        };
+        let ticks = frame(&mut mirror, &header(0, u64::from(tick)), &[now]);
+        states.extend(ticks[0].states.iter().copied());
+    }
+    assert_eq!(mirror.resynchronisations(), 0);
+    let [jump_m, jump_rad] = largest_jumps(&states[1..]);
+    assert!(jump_m < 0.06 && jump_rad < 0.02, "{jump_m} m, {jump_rad} rad");
+    assert!(states.iter().any(|state| state.flags & GUIDED != 0));
+    let end = states.last().unwrap();
+    assert!(front_from(end, [60.0, 3.2]) < 0.3, "{end:?}");
+    assert_eq!(end.flags & GUIDED, 0);
 }

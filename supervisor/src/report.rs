@@ -385,6 +385,7 @@ fn summary(report: &Value, path: &Path) -> String {
         ));
     }
     lines.extend(resynchronisations(report));
+    lines.extend(guidances(report));
     lines.push(format!(
         "ticks lost {}, duplicated {}; restarts {}; messages that watchers missed {}",
         number(report, "lost_ticks", 0),
@@ -397,18 +398,48 @@ fn summary(report: &Value, path: &Path) -> String {
     lines.join("\n")
 }
 
+/// The parts of the report that each environment has.
+fn environments(report: &Value) -> &[Value] {
+    let environments = report["environments"].as_array();
+    environments.map_or(std::slice::from_ref(report), Vec::as_slice)
+}
+
 /// How often mirrors were set onto SUMO, in all environments, and the commonest reasons.
 fn resynchronisations(report: &Value) -> Option<String> {
-    let environments = report["environments"].as_array();
-    let parts = environments.map_or(std::slice::from_ref(report), Vec::as_slice);
+    let parts = environments(report);
     let sum = |key: &str| -> Option<u64> { parts.iter().map(|part| part["dynamics"][key].as_u64()).sum() };
     let (set, steps) = (
         sum("resynchronisations")?,
         sum("vehicle_steps").filter(|&steps| steps > 0)?,
     );
+    #[expect(clippy::cast_precision_loss, reason = "a rate for readers")]
+    let rate = 1e6 * set as f64 / steps as f64;
+    let reasons = commonest_causes(parts, "resynchronisation_causes");
+    Some(format!(
+        "mirrors set onto SUMO: {set} ({rate:.0} per million vehicle-ticks){reasons}"
+    ))
+}
+
+/// How long mirrors were led along their paths, in all environments, and the commonest reasons.
+fn guidances(report: &Value) -> Option<String> {
+    let parts = environments(report);
+    let ticks =
+        |of: fn(&Value) -> &Value| -> Option<u64> { parts.iter().map(|part| of(&part["dynamics"]).as_u64()).sum() };
+    let guided = ticks(|dynamics| &dynamics["tracking"]["guided"]).filter(|&guided| guided > 0)?;
+    let steps = ticks(|dynamics| &dynamics["vehicle_steps"])?;
+    #[expect(clippy::cast_precision_loss, reason = "a share for readers")]
+    let share = 100.0 * guided as f64 / steps.max(1) as f64;
+    let reasons = commonest_causes(parts, "guidance_causes");
+    Some(format!(
+        "mirrors led where no vehicle drives like SUMO's: {share:.2} % of vehicle-ticks{reasons}"
+    ))
+}
+
+/// The commonest of `dynamics.KEY`, counts by class and cause, after a colon; empty if there is none.
+fn commonest_causes(parts: &[Value], key: &str) -> String {
     let mut causes: BTreeMap<String, u64> = BTreeMap::new();
     for part in parts {
-        let classes = part["dynamics"]["resynchronisation_causes"].as_object();
+        let classes = part["dynamics"][key].as_object();
         for (class, counts) in classes.into_iter().flatten() {
             for (cause, count) in counts.as_object().into_iter().flatten() {
                 let cause = format!("{class} {}", cause.replace('_', " "));
@@ -423,16 +454,10 @@ fn resynchronisations(report: &Value) -> Option<String> {
         .take(SHOWN_CAUSES)
         .map(|(cause, count)| format!("{cause} {count}"))
         .collect();
-    #[expect(clippy::cast_precision_loss, reason = "a rate for readers")]
-    let rate = 1e6 * set as f64 / steps as f64;
-    let reasons = if most.is_empty() {
-        String::new()
-    } else {
-        format!(": {}", most.join(", "))
-    };
-    Some(format!(
-        "mirrors set onto SUMO: {set} ({rate:.0} per million vehicle-ticks){reasons}"
-    ))
+    match most.is_empty() {
+        true => String::new(),
+        false => format!(": {}", most.join(", ")),
+    }
 }
 
 /// A number of the report with `digits` decimals; a dash if it is missing.

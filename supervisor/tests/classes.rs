@@ -162,3 +162,58 @@ fn with_a_preview_no_vehicle_on_a_default_grid_is_set_onto_sumo() {
         assert!(farthest_m(dynamics) < 1.2, "{dynamics:#}");
     }
 }
+
+/// Netgenerate's defaults: vehicles turn back on 2 m, change lanes in standing queues, and drive on the left.
+#[test]
+fn with_a_preview_vehicles_are_led_where_they_cannot_drive() {
+    let workplace = Workplace::new();
+    let nets: [(&str, &[&str], &str); 2] = [
+        ("turnarounds", &["--seed", "3"], "A0A1 A1A0 A0B0 B0B1 B1B0 B0A0 A0A1"),
+        ("left", &["--lefthand", "-L", "2"], "C2C1 C1B1 B1B0 B0B1 B1C1 C1C2"),
+    ];
+    for (name, options, edges) in nets {
+        let net = format!("{name}.net.xml");
+        let grid = ["--grid", "--grid.number", "3", "-o", &net];
+        tool(
+            &sumo_program("netgenerate"),
+            &[&grid[..], options].concat(),
+            workplace.path(),
+        );
+        let flow = format!("<flow id=\"f\" begin=\"0\" end=\"90\" period=\"3\"><route edges=\"{edges}\"/></flow>");
+        workplace.write("r.rou.xml", &format!("<routes>{flow}</routes>"));
+        let input = format!("<net-file value=\"{net}\"/><route-files value=\"r.rou.xml\"/>");
+        let time = "<time><end value=\"120\"/><step-length value=\"0.1\"/></time>";
+        workplace.write(
+            "s.sumocfg",
+            &format!("<configuration><input>{input}</input>{time}</configuration>"),
+        );
+        let settings = [
+            "fanout.enabled=false",
+            "map.origin_latitude_deg=52",
+            "map.origin_longitude_deg=10",
+        ];
+        let settings = settings.iter().flat_map(|setting| ["--set", *setting]);
+        let arguments: Vec<&str> = ["simulate", "s.sumocfg", "--name", name]
+            .into_iter()
+            .chain(settings)
+            .collect();
+        workplace.succeed(&arguments);
+        let dynamics = workplace.report(name)["dynamics"].clone();
+        assert_eq!(dynamics["resynchronisations"], 0, "{name}: {dynamics:#}");
+        let causes = &dynamics["guidance_causes"]["passenger"];
+        assert!(causes["narrow_turn"].as_u64().unwrap() > 10, "{name}: {dynamics:#}");
+        let lines = workplace.path().join("runs").join(name).join("events/guidances.jsonl");
+        let lines = std::fs::read_to_string(lines).unwrap();
+        let total: u64 = causes
+            .as_object()
+            .unwrap()
+            .values()
+            .map(|count| count.as_u64().unwrap())
+            .sum();
+        assert_eq!(total, lines.lines().count() as u64, "{name}");
+        for axis in ["lateral", "longitudinal"] {
+            let worst_m = dynamics["tracking"][axis]["max_m"].as_f64().unwrap();
+            assert!(worst_m < 1.0, "{name}: {axis} {worst_m} m");
+        }
+    }
+}

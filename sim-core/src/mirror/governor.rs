@@ -11,6 +11,8 @@ use super::curve::ReferenceCurve;
 const RETURN_PER_S: f64 = 1.2;
 /// Below this speed offsets return by distance, m/s.
 const SLOW_MPS: f64 = 3.0;
+/// Least share of the driving time that passes while a reference is moved.
+const LEAST_PACE: f64 = 0.2;
 /// Below this speed nothing is limited, because a slow vehicle can be steered, m/s.
 const CRAWL_MPS: f64 = 1.0;
 /// Offsets and rates below this count as zero, metres and m/s.
@@ -62,6 +64,15 @@ impl ReferenceGovernor {
     #[must_use]
     pub fn distance_m(&self) -> f64 {
         norm(self.offset_m)
+    }
+
+    /// Makes the reference one that is `away_m` from the present one and leaves it at `leaving_mps`, where the path has this speed.
+    pub fn move_reference(&mut self, away_m: [f64; 2], leaving_mps: [f64; 2], speed_mps: f64) {
+        let pace = (speed_mps / SLOW_MPS).clamp(LEAST_PACE, 1.0);
+        for axis in 0..2 {
+            self.offset_m[axis] += away_m[axis];
+            self.rate_mps[axis] += leaving_mps[axis] / pace;
+        }
     }
 
     /// The reference over a tick of `tick_s` for a path over the same tick.

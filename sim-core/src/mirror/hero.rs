@@ -74,7 +74,8 @@ impl Hero {
                 None => model.step(&self.state, &self.input, sub_step_s),
             };
             let to = BodyLean::of(&next, slope(number as f64 + 1.0));
-            *row = sub_step(&next, &motion, [from, to], 1.0 / sub_step_s);
+            // The height is SUMO's, linear over a step: there is no upward acceleration.
+            *row = sub_step(&next, &motion, [from, to], 0.0, 1.0 / sub_step_s);
             row.dz_m = (between(before.front_z_m, now.front_z_m, number as f64 + 1.0) - now.front_z_m) as f32;
             self.state = next;
             states.push(next);
@@ -119,9 +120,15 @@ impl Hero {
     }
 }
 
-fn sub_step(state: &ModelState, motion: &SubStepMotion, leans: [BodyLean; 2], rate_per_s: f64) -> SubStep {
-    // The height is SUMO's, linear over a step: there is no upward acceleration.
-    let felt = FeltMotion::new(leans, motion, 0.0, rate_per_s);
+/// What a sub-step of `1 / rate_per_s` ends with; its pose is left out.
+pub(super) fn sub_step(
+    state: &ModelState,
+    motion: &SubStepMotion,
+    leans: [BodyLean; 2],
+    up_mps2: f64,
+    rate_per_s: f64,
+) -> SubStep {
+    let felt = FeltMotion::new(leans, motion, up_mps2, rate_per_s);
     SubStep {
         roll_rad: leans[1].roll_rad as f32,
         pitch_rad: leans[1].pitch_rad as f32,

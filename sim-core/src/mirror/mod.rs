@@ -9,12 +9,13 @@ use ipc_schema::{
     block::{self, BlockError},
     header::MessageHeader,
     traffic::{MetaEvent, TrafficState, VehicleMeta},
-    world::{SubStep, VehicleState, WorldLayout},
+    world::{GUIDED, SubStep, VehicleState, WorldLayout},
 };
 
 pub mod batch;
 pub mod curve;
 pub mod governor;
+pub mod guidance;
 pub mod hero;
 pub mod pace;
 pub mod person;
@@ -42,7 +43,7 @@ use batch::{BATCH, BatchModel, DYNAMIC, KINEMATIC, VehicleBatch, path_limits};
 use pace::PathLimits;
 use prefetch::PrefetchRange;
 use preview::PathAhead;
-use resynchronisation::Resynchronisation;
+use resynchronisation::{Guidance, Resynchronisation};
 use road_user::RoadUser;
 pub use settings::MirrorSettings;
 use statistics::TrackingStatistics;
@@ -115,6 +116,8 @@ pub struct Mirror {
     resynchronisations: u64,
     /// Those of the last tick.
     resynchronised: Vec<Resynchronisation>,
+    /// The guidances that began in the last tick.
+    guidances: Vec<Guidance>,
 }
 
 /// A batch of one model, and where the states of its members belong.
@@ -149,6 +152,7 @@ impl Mirror {
             tracking: TrackingStatistics::default(),
             resynchronisations: 0,
             resynchronised: Vec::new(),
+            guidances: Vec::new(),
         })
     }
 
@@ -185,6 +189,12 @@ impl Mirror {
     #[must_use]
     pub fn resynchronised(&self) -> &[Resynchronisation] {
         &self.resynchronised
+    }
+
+    /// The guidances that began in the last tick.
+    #[must_use]
+    pub fn guidances(&self) -> &[Guidance] {
+        &self.guidances
     }
 
     /// The boxes in which SUMO has a road user in the frames that the mirror moves through, newest first; empty if it is not known.
@@ -351,6 +361,7 @@ impl Mirror {
         let rows: &mut [SubStep] = cast(rows, layout.sub_steps.offset)?;
         let mut place_in_message = 0;
         self.resynchronised.clear();
+        self.guidances.clear();
         for index in 0..self.present.len() {
             let (_, place) = self.present[index];
             let road_user = &mut self.slab[place as usize];
@@ -366,14 +377,18 @@ impl Mirror {
                 let models = self.catalogue.with_body(road_user.model());
                 let set = road_user.write_unmoved(tick, &self.settings, models, &mut states[row], sub_steps);
                 self.resynchronised.extend(set);
+                if states[row].flags & GUIDED != 0 {
+                    self.tracking.add(&states[row]);
+                }
             }
         }
-        let mut context = BatchContext::new(
-            &self.settings,
-            &mut self.slab,
-            &mut self.tracking,
-            &mut self.resynchronised,
-        );
+        let mut context = BatchContext {
+            settings: &self.settings,
+            slab: &mut self.slab,
+            tracking: &mut self.tracking,
+            resynchronised: &mut self.resynchronised,
+            guidances: &mut self.guidances,
+        };
         self.kinematic.advance(tick, &mut context, states, rows);
         self.dynamic.advance(tick, &mut context, states, rows);
         self.resynchronisations += self.resynchronised.len() as u64;
@@ -390,10 +405,17 @@ impl Mirror {
             dynamic,
             tracking,
             resynchronised,
+            guidances,
             ..
         } = self;
         let built = catalogue.at(slab[place as usize].model());
-        let mut context = BatchContext::new(settings, slab, tracking, resynchronised);
+        let mut context = BatchContext {
+            settings,
+            slab,
+            tracking,
+            resynchronised,
+            guidances,
+        };
         match &built.model {
             MotionModel::Kinematic(params) => {
                 if kinematic.load(tick, params, &mut context, (place, row)) {
@@ -415,22 +437,7 @@ struct BatchContext<'a> {
     slab: &'a mut [RoadUser],
     tracking: &'a mut TrackingStatistics,
     resynchronised: &'a mut Vec<Resynchronisation>,
-}
-
-impl<'a> BatchContext<'a> {
-    fn new(
-        settings: &'a MirrorSettings,
-        slab: &'a mut [RoadUser],
-        tracking: &'a mut TrackingStatistics,
-        resynchronised: &'a mut Vec<Resynchronisation>,
-    ) -> Self {
-        Self {
-            settings,
-            slab,
-            tracking,
-            resynchronised,
-        }
-    }
+    guidances: &'a mut Vec<Guidance>,
 }
 
 impl<P: BatchModel<N>, const N: usize> ModelBatch<P, N> {
@@ -476,6 +483,7 @@ impl<P: BatchModel<N>, const N: usize> ModelBatch<P, N> {
             let (road_user, out) = (&mut context.slab[place as usize], &mut states[row]);
             let set = road_user.store(tick, context.settings, &self.batch, member, out, sub_steps);
             context.resynchronised.extend(set);
+            context.guidances.extend(road_user.guidance(out));
             context.tracking.add(out);
         }
     }

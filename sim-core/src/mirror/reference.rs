@@ -13,8 +13,9 @@
 use ipc_schema::traffic::TrafficState;
 
 use super::{
-    curve::{ReferenceCurve, RoadRise},
+    curve::{ReferenceCurve, ReferencePoint, RoadRise},
     governor::{DrivingLimits, ReferenceGovernor},
+    guidance::{GuidedPath, UNLIMITED},
 };
 use crate::trig::wrap_angle;
 
@@ -203,8 +204,37 @@ impl ReferencePath {
         spread_s: f64,
         ability: &DrivingLimits,
     ) -> ReferenceCurve {
-        let path = self.with_lane_change(start_s, tick_s, speed_mps, spread_s);
+        let curve = self.curve.from_time(start_s);
+        let rate_per_s = LaneChange::rate_per_s(speed_mps, spread_s);
+        let path = match self.lane_change_curve(start_s, tick_s, rate_per_s) {
+            Some(sideways) => curve.plus(&sideways),
+            None => curve,
+        };
         self.governor.tick(&path, tick_s, ability)
+    }
+
+    /// The same for a guided vehicle: the reference, which nothing limits, and the rest of a lane change, whose time passes at any speed.
+    pub fn guided_tick(&mut self, start_s: f64, tick_s: f64, spread_s: f64) -> GuidedPath {
+        let curve = self.curve.from_time(start_s);
+        let sideways = self.lane_change_curve(start_s, tick_s, 1.0 / spread_s.max(tick_s));
+        GuidedPath {
+            curve: self.governor.tick(&curve, tick_s, &UNLIMITED),
+            sideways: sideways.unwrap_or_default(),
+            heading: [self.heading_at(start_s), self.heading[1]],
+            rise: self.rise.from_time(start_s),
+        }
+    }
+
+    /// By how much a heading and its rate differ from SUMO's at `t_s`, rad and rad/s.
+    #[must_use]
+    pub fn turned_from(&self, t_s: f64, [yaw_rad, rate_radps]: [f64; 2]) -> [f64; 2] {
+        [wrap_angle(yaw_rad - self.heading_at(t_s)), rate_radps - self.heading[1]]
+    }
+
+    /// Rest of a lane change, metres.
+    #[must_use]
+    pub fn lane_change_m(&self) -> f64 {
+        self.lane_change.remaining()[0].abs()
     }
 
     /// The path itself at the start of the step.
@@ -220,30 +250,31 @@ impl ReferencePath {
         self.curve.from_time(t_s)
     }
 
+    /// Makes the reference one that is `away_m` from `target`, the present one, and leaves it at `leaving_mps`.
+    pub fn move_reference(&mut self, target: &ReferencePoint, away_m: [f64; 2], leaving_mps: [f64; 2]) {
+        self.governor
+            .move_reference(away_m, leaving_mps, norm(target.velocity_mps));
+    }
+
     /// Distance of the reference from the path without the governor's limits, metres.
     #[must_use]
     pub fn undriven_m(&self) -> f64 {
         self.governor.distance_m()
     }
 
-    fn with_lane_change(&mut self, start_s: f64, tick_s: f64, speed_mps: f64, spread_s: f64) -> ReferenceCurve {
-        let curve = self.curve.from_time(start_s);
+    /// What a lane change, of which `rate` passes per second, adds to the path.
+    fn lane_change_curve(&mut self, start_s: f64, tick_s: f64, rate: f64) -> Option<ReferenceCurve> {
         if self.lane_change.offset_m == 0.0 {
-            return curve;
+            return None;
         }
-        let rate = LaneChange::rate_per_s(speed_mps, spread_s);
         let [from, u0] = self.shift(start_s, rate);
         self.lane_change.phase = (self.lane_change.phase + rate * tick_s).min(1.0);
         let [to, u1] = self.shift(start_s + tick_s, rate);
         if self.lane_change.phase >= 1.0 {
             self.lane_change = LaneChange::default();
         }
-        curve.plus(&ReferenceCurve::hermite(
-            from,
-            [to[0] - from[0], to[1] - from[1]],
-            [u0, u1],
-            tick_s,
-        ))
+        let moved = [to[0] - from[0], to[1] - from[1]];
+        Some(ReferenceCurve::hermite(from, moved, [u0, u1], tick_s))
     }
 
     /// The rest of a lane change, to the left of SUMO's heading at `t_s`: offset and its velocity, world frame.

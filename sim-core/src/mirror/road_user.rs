@@ -2,18 +2,19 @@
 
 use ipc_schema::{
     traffic::{DISCONTINUOUS, Kind, TrafficState, VehicleMeta},
-    world::{APPEARED, RESYNCHRONISED, SubStep, VehicleState},
+    world::{APPEARED, GUIDED, RESYNCHRONISED, SubStep, VehicleState},
 };
 
 use super::{
-    batch::{BatchModel, VehicleBatch},
+    batch::{BatchModel, VehicleBatch, path_limits},
     curve::ReferenceCurve,
+    guidance,
     hero::Hero,
     pace::PathLimits,
     person::Person,
     preview::PathAhead,
     reference::{PathJoin, ReferencePath},
-    resynchronisation::{Resynchronisation, ResynchronisationCause},
+    resynchronisation::{Guidance, Resynchronisation, ResynchronisationCause},
     settings::MirrorSettings,
     tracking,
 };
@@ -55,6 +56,16 @@ enum Mover {
     Hero(Hero),
 }
 
+/// What guidance keeps of a vehicle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct GuidedVehicle {
+    cause: ResynchronisationCause,
+    /// Its distance from the path when guidance began, metres.
+    away_m: f32,
+    /// By how much its heading and the rate differ from SUMO's, rad and rad/s.
+    turned: [f64; 2],
+}
+
 /// One road user.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RoadUser {
@@ -69,6 +80,8 @@ pub struct RoadUser {
     deviation_m: f32,
     /// That path is narrower here than its turning circle.
     is_narrow: bool,
+    /// It is led along its path.
+    guided: Option<GuidedVehicle>,
     /// Number of the last frame that had it; 0 = none yet.
     seen_frame: u64,
     /// Frames until its mirror appears: where the road user enters, the others' mirrors are that many frames late.
@@ -103,6 +116,7 @@ impl RoadUser {
             now: TrafficState::default(),
             deviation_m: 0.0,
             is_narrow: false,
+            guided: None,
             seen_frame: 0,
             hidden: 0,
             arrival: Arrival::Entering,
@@ -245,7 +259,7 @@ impl RoadUser {
     /// takes [`RoadUser::load`] and [`RoadUser::store`], any other [`RoadUser::write_unmoved`].
     #[must_use]
     pub fn moves(&self, tick: u32, settings: &MirrorSettings) -> bool {
-        matches!(self.mover, Mover::Vehicle { .. }) && !self.is_set_in(tick, settings)
+        matches!(self.mover, Mover::Vehicle { .. }) && self.guided.is_none() && !self.is_set_in(tick, settings)
     }
 
     /// True if the road user is set to SUMO's state at the end of this tick.
@@ -284,7 +298,7 @@ impl RoadUser {
     }
 
     /// Takes the vehicle from its batch and writes the tick. Returns the jump if the vehicle was set to its path because it was too far
-    /// away.
+    /// away. A vehicle with a path ahead is led from then on instead ([`GUIDED`]).
     pub fn store<P: BatchModel<N>, const N: usize>(
         &mut self,
         tick: u32,
@@ -309,8 +323,32 @@ impl RoadUser {
         let target = batch.curve(member).at(settings.tick_s);
         let error = tracking::error(state, front_m, &target);
         let square = error.lateral_m * error.lateral_m + error.longitudinal_m * error.longitudinal_m;
+        let away_m = [square.sqrt(), path.undriven_m()];
+        let guided = match settings.vehicle.preview_s > 0.0 {
+            true => guidance::cause(state, away_m, path.lane_change_m(), self.is_narrow),
+            false => None,
+        };
+        if guided.is_some() {
+            let front = state.point_ahead(front_m);
+            let across = state.lateral_mps + front_m * state.yaw_rate_radps;
+            let [cos, sin] = state.heading;
+            let velocity = [
+                state.speed_mps * cos - across * sin,
+                state.speed_mps * sin + across * cos,
+            ];
+            let [away, leaving] = [(front, target.position_m), (velocity, target.velocity_mps)]
+                .map(|(ours, its)| [ours[0] - its[0], ours[1] - its[1]]);
+            path.move_reference(&target, away, leaving);
+            self.guided = guided.map(|cause| GuidedVehicle {
+                cause,
+                away_m: (away_m[0] + away_m[1]) as f32,
+                turned: path.turned_from(end_s, [state.yaw_rad, state.yaw_rate_radps]),
+            });
+        }
         let limit = settings.vehicle.resynchronise_m;
-        let lost = if square > limit * limit {
+        let lost = if guided.is_some() {
+            None
+        } else if square > limit * limit {
             Some(ResynchronisationCause::TrackingError)
         } else if path.undriven_m() > settings.vehicle.leave_path_m {
             Some(ResynchronisationCause::LeftPath)
@@ -332,10 +370,25 @@ impl RoadUser {
             out.tracking_lateral_m = error.lateral_m as f32;
             out.tracking_longitudinal_m = error.longitudinal_m as f32;
         }
-        self.flag(lost, jump_m, out)
+        let set = self.flag(lost, jump_m, out);
+        if guided.is_some() {
+            out.flags |= GUIDED;
+        }
+        set
     }
 
-    /// Writes the tick of a person or a hero, or of a vehicle that is set to SUMO's state in it. Returns the jump of a road user that
+    /// The guidance that began in the tick that [`RoadUser::store`] has written.
+    #[must_use]
+    pub fn guidance(&self, out: &VehicleState) -> Option<Guidance> {
+        self.guided.map(|guided| Guidance {
+            vehicle: out.vehicle,
+            cause: guided.cause,
+            position_m: [out.x_m, out.y_m, out.z_m],
+            away_m: guided.away_m.into(),
+        })
+    }
+
+    /// Writes the tick of a person, a hero or a guided vehicle, or of a vehicle that is set to SUMO's state in it. Returns the jump of a road user that
     /// already existed.
     pub fn write_unmoved(
         &mut self,
@@ -346,7 +399,7 @@ impl RoadUser {
         rows: &mut [SubStep],
     ) -> Option<Resynchronisation> {
         self.describe(out);
-        let set = self.is_set_in(tick, settings);
+        let (set, was_guided) = (self.is_set_in(tick, settings), self.guided.is_some());
         let mut before = (self.before.front_x_m, self.before.front_y_m);
         let mut now = (self.now.front_x_m, self.now.front_y_m);
         match &mut self.mover {
@@ -373,7 +426,22 @@ impl RoadUser {
                     hero.advance(models, road, front_m, settings.sub_step_s(), out, rows);
                 }
             }
+            Mover::Vehicle { state, path } if !set => {
+                let (start_s, end_s) = (f64::from(tick) * settings.tick_s, f64::from(tick + 1) * settings.tick_s);
+                let guided = path.guided_tick(start_s, settings.tick_s, settings.vehicle.lane_change_s);
+                let height_m = path.road(start_s).0;
+                if let Some(vehicle) = &mut self.guided {
+                    let road = guidance::lead(state, &mut vehicle.turned, &guided, built, settings.sub_step_s(), rows);
+                    write_moved(state, road, height_m, rows, out);
+                }
+                out.reference_offset_m = path.offset_m(end_s, settings.step_s()) as f32 + self.deviation_m;
+                let away_m = path.undriven_m() + path.lane_change_m();
+                if guidance::ends(state, away_m, self.is_narrow, &path_limits(built)) {
+                    self.guided = None;
+                }
+            }
             Mover::Vehicle { state, path } => {
+                self.guided = None;
                 let front_m = self.dimensions.front_m();
                 *path = ReferencePath::from_here(&self.now, settings.step_s());
                 before = (state.x_m, state.y_m);
@@ -387,7 +455,11 @@ impl RoadUser {
             Arrival::Jumping(cause) => Some(cause),
             Arrival::Entering | Arrival::Continuing => Some(ResynchronisationCause::Returned),
         };
-        self.flag(cause, distance_m(before, now), out)
+        let set = self.flag(cause, distance_m(before, now), out);
+        if was_guided && cause.is_none() {
+            out.flags |= GUIDED;
+        }
+        set
     }
 
     /// Flags the first tick and a set pose; returns the jump of a road user that already existed.

@@ -1,6 +1,6 @@
 //! Tracking statistics of a run: percentiles from counts, so that millions of samples need no memory.
 
-use ipc_schema::world::{APPEARED, RESYNCHRONISED, VehicleState};
+use ipc_schema::world::{APPEARED, GUIDED, RESYNCHRONISED, VehicleState};
 use serde::{Deserialize, Serialize};
 
 /// Width of a bin, metres.
@@ -80,13 +80,16 @@ pub struct TrackingStatistics {
     lateral: Histogram,
     longitudinal: Histogram,
     reference: Histogram,
+    guided: u64,
 }
 
 /// Tracking as it stands in the report.
 #[derive(Debug, Clone, Serialize)]
 pub struct TrackingSummary {
-    /// Vehicle-ticks counted: those in which the pose was reached by moving.
+    /// Vehicle-ticks counted: those in which the vehicle drove to its pose.
     pub samples: u64,
+    /// Vehicle-ticks in which it was led along its path; only the distance from SUMO's own path counts these as well.
+    pub guided: u64,
     /// Reference minus front bumper, across the heading.
     pub lateral: Option<Percentiles>,
     /// Reference minus front bumper, along the heading.
@@ -102,9 +105,13 @@ impl TrackingStatistics {
         if state.flags & (RESYNCHRONISED | APPEARED) != 0 {
             return;
         }
+        self.reference.add(f64::from(state.reference_offset_m));
+        if state.flags & GUIDED != 0 {
+            self.guided += 1;
+            return;
+        }
         self.lateral.add(f64::from(state.tracking_lateral_m.abs()));
         self.longitudinal.add(f64::from(state.tracking_longitudinal_m.abs()));
-        self.reference.add(f64::from(state.reference_offset_m));
     }
 
     /// For the report.
@@ -112,6 +119,7 @@ impl TrackingStatistics {
     pub fn summary(&self) -> TrackingSummary {
         TrackingSummary {
             samples: self.lateral.count,
+            guided: self.guided,
             lateral: self.lateral.percentiles(),
             longitudinal: self.longitudinal.percentiles(),
             reference_from_sumo: self.reference.percentiles(),

@@ -46,6 +46,27 @@ impl MotionModel {
             Self::Dynamic(params) => params.step(state, input, 0.0, dt_s),
         }
     }
+
+    /// Largest road-wheel angle, radians.
+    #[must_use]
+    pub fn max_road_wheel_angle_rad(&self) -> f64 {
+        match self {
+            Self::Kinematic(params) => params.max_road_wheel_angle_rad,
+            Self::Dynamic(params) => params.max_road_wheel_angle_rad,
+        }
+    }
+
+    /// Roll and pitch on the springs, each with its rate, after a sub-step with this acceleration along the heading and to the left.
+    #[must_use]
+    pub fn lean_after(&self, state: &ModelState, [along_mps2, left_mps2]: [f64; 2]) -> [[f64; 2]; 2] {
+        match self {
+            Self::Kinematic(_) => [[0.0; 2]; 2],
+            Self::Dynamic(params) => [
+                params.roll.after(state.roll, left_mps2),
+                params.pitch.after(state.pitch, along_mps2),
+            ],
+        }
+    }
 }
 
 /// A model for one kind and size of vehicle.

@@ -78,7 +78,7 @@ impl DampedSpring {
     }
 
     #[inline(always)]
-    fn after(&self, [angle, rate]: [f64; 2], input: f64) -> [f64; 2] {
+    pub(super) fn after(&self, [angle, rate]: [f64; 2], input: f64) -> [f64; 2] {
         let rest = self.gain * input;
         let off = angle - rest;
         let [[a, b], [c, d]] = self.step;
