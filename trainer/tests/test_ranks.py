@@ -12,7 +12,7 @@ import pytest
 import torch
 from caraware.learn.build import build_ppo
 from caraware.learn.config import ConfigError, TrainerConfig
-from caraware.learn.ranks import Ranks, SampleUnion
+from caraware.learn.ranks import SECRET, RankError, Ranks, SampleUnion, shared_secret
 from caraware.parallel import RankPlace, command
 from caraware.run.checkpoint import load_history
 from caraware.run.config import RunConfig
@@ -36,13 +36,15 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def launch(folder: Path, *options: str, fault: str = "", more: dict[str, Any] | None = None) -> subprocess.Popen[str]:
+def launch(
+    folder: Path, *options: str, fault: str = "", more: dict[str, Any] | None = None, secret: str = ""
+) -> subprocess.Popen[str]:
     """`torchrun` over the probe with `more` settings of the trainer, started and not waited for."""
     path = os.pathsep.join(filter(None, (str(HERE), os.environ.get("PYTHONPATH"))))
     torchrun = [sys.executable, "-m", "torch.distributed.run", *options]
     return subprocess.Popen(
         [*torchrun, str(HERE / "rank_probe.py"), str(folder), fault],
-        env=os.environ | {"PYTHONPATH": path, "RANK_PROBE_SETTINGS": json.dumps(more or {})},
+        env=os.environ | {"PYTHONPATH": path, "RANK_PROBE_SETTINGS": json.dumps(more or {}), SECRET: secret},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -139,10 +141,43 @@ def test_ranks_share_a_network_of_the_user_s_own(tmp_path: Path) -> None:
 
 def test_two_nodes_meet_at_a_rendezvous_address(tmp_path: Path, alone: Path) -> None:
     meeting = ("--nnodes=2", "--nproc-per-node=1", "--rdzv-backend=c10d", f"--rdzv-endpoint=127.0.0.1:{free_port()}")
-    nodes = [launch(tmp_path, *meeting, "--local-addr=127.0.0.1") for _ in range(2)]
+    nodes = [launch(tmp_path, *meeting, "--local-addr=127.0.0.1", secret="a text of both nodes") for _ in range(2)]
     for node in nodes:
         finish(node)
     assert_the_same(alone, tmp_path / "rank0")
+
+
+def test_a_rank_that_does_not_know_the_secret_ends_the_launch() -> None:
+    meet = """
+from caraware.learn.ranks import RankError, TorchRanks
+try:
+    TorchRanks(2)
+except RankError as error:
+    exit(str(error))
+"""
+    meeting = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, "-c", meet],
+            env=os.environ | meeting | {"RANK": str(rank), SECRET: f"sixteen characters, {secret}"},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank, secret in enumerate(("ours", "not ours"))
+    ]
+    ends = [(rank.communicate(timeout=120)[1], rank.returncode) for rank in ranks]
+    assert [code for _, code in ends] == [1, 1], ends
+    for other, (said, _) in zip((1, 0), ends, strict=True):
+        assert f"rank {other} has another secret" in said, said
+
+
+def test_several_machines_need_a_secret_and_one_has_that_of_torchrun() -> None:
+    assert shared_secret({"GROUP_WORLD_SIZE": "1", "TORCHELASTIC_RUN_ID": "9d3f"}) == b"9d3f"
+    assert shared_secret({"GROUP_WORLD_SIZE": "2", SECRET: "sixteen letters."}) == b"sixteen letters."
+    with pytest.raises(RankError, match=f"set {SECRET} to the same text"):
+        shared_secret({"GROUP_WORLD_SIZE": "2", "TORCHELASTIC_RUN_ID": "none"})
+    with pytest.raises(RankError, match="it needs 16"):
+        shared_secret({SECRET: "short"})
 
 
 @pytest.mark.parametrize(("fault", "says"), [("dies", "exitcode  : 9"), ("differs", "parameters differ")])

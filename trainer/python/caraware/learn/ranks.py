@@ -8,9 +8,11 @@ the step that one trainer with all the samples would take, and keep equal parame
 """
 
 import hashlib
+import hmac
 import json
 import os
-from collections.abc import Iterator, Sequence
+import secrets
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -25,6 +27,10 @@ WAIT_AT_MOST = timedelta(hours=1)
 """For ranks whose simulation is slower. One that has ended is noticed at once: its connections are closed."""
 
 
+SECRET = "CARAWARE_RANKS_SECRET"
+"""Environment variable with a text that the ranks of one launch share, and others do not know."""
+LEAST_SECRET = 16
+"""Characters of it."""
 MOST_BYTES = 1 << 30
 """Of a value that ranks exchange: numbers, and what recurrent networks remember."""
 
@@ -137,6 +143,23 @@ class Ranks:
         """Part from the others, when all are done."""
 
 
+def shared_secret(environment: Mapping[str, str]) -> bytes:
+    """What the ranks of this launch know and others do not. Raises `RankError` where there is nothing.
+
+    On one machine that is the random identity of a `torchrun --standalone`; several machines need `SECRET`.
+    """
+    if secret := environment.get(SECRET, ""):
+        if len(secret) < LEAST_SECRET:
+            raise RankError(f"{SECRET} has {len(secret)} characters; it needs {LEAST_SECRET} (openssl rand -hex 16)")
+        return secret.encode()
+    if int(environment.get("GROUP_WORLD_SIZE", "1")) > 1:
+        raise RankError(
+            f"ranks on several machines prove that they belong together: set {SECRET} to the same text on each"
+            " (openssl rand -hex 16)"
+        )
+    return environment.get("TORCHELASTIC_RUN_ID", "").encode()
+
+
 class TorchRanks(Ranks):
     """A trainer among others that `torchrun` started (`caraware.parallel`)."""
 
@@ -154,6 +177,20 @@ class TorchRanks(Ranks):
             dist.init_process_group(backend, timeout=WAIT_AT_MOST)
             self._groups: dict[str, Any] = {network: dist.new_group() for network in ("policy", "value")}
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
+        self._authenticate(shared_secret(os.environ))
+
+    def _authenticate(self, secret: bytes) -> None:
+        """Each rank proves to each other that it knows the secret. Raises `RankError` if one does not."""
+        # A proof covers the random numbers of all: one that was overheard earlier is worth nothing.
+        nonces = json.dumps(self.gather(secrets.token_hex(16))).encode()
+
+        def proof(rank: int) -> str:
+            return hmac.new(secret, b"%d %s" % (rank, nonces), hashlib.sha256).hexdigest()
+
+        proofs = self.gather(proof(self.rank))
+        for rank, given in enumerate(proofs):
+            if not isinstance(given, str) or not hmac.compare_digest(given, proof(rank)):
+                raise RankError(f"rank {rank} has another secret: set the same {SECRET} on every machine")
 
     @contextmanager
     def _together(self, doing: str) -> Iterator[None]:
