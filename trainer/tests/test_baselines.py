@@ -65,8 +65,9 @@ def test_all_are_measured_on_the_same_valid_rows(tmp_path: Path) -> None:
         if obs.tick % TICKS == 0:
             expected["rts"] += [e for tick in by_hand.finish_episode() for e in tick.error_m]
             by_hand = Baselines(noise)
-        filtered, early = by_hand.add(obs)
-        assert early == []
+        of_filters, early = by_hand.add(obs)
+        assert early == [] and list(of_filters) == ["ekf"]
+        filtered = of_filters["ekf"]
         np.testing.assert_array_equal(filtered.vehicle, np.flatnonzero(obs.valid))
         expected["ekf"] += list(filtered.error_m)
         expected["raw_gnss"] += (obs.gnss_m[:, :2] - obs.truth[:, :2]).norm(dim=1)[obs.valid].tolist()
@@ -80,8 +81,12 @@ def test_all_are_measured_on_the_same_valid_rows(tmp_path: Path) -> None:
 
 def test_the_report_has_every_mean_with_its_interval(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    run_over(tmp_path, episodes(True, False, True, True, True), vehicle_run(str(tmp_path)))
+    net = tmp_path / "far.net.xml"
+    net.write_text('<net><edge id="far"><lane id="far_0" speed="13.9" shape="9000,9000 9050,9000"/></edge></net>')
+    run = vehicle_run(str(tmp_path)) | {"scene_files": {"net_file": str(net)}}
+    run_over(tmp_path, episodes(True, False, True, True, True), run)
     report = part(tmp_path)
+    assert report["map_ekf_mean_error_m"] == report["ekf_mean_error_m"]  # no lane is near
     first, final = report["evaluations"]
     assert (report["evaluation_seeds"], first["episodes"]) == (3, 1)
     for name in ESTIMATORS:
@@ -129,7 +134,7 @@ def test_training_never_runs_a_filter(tmp_path: Path, monkeypatch: pytest.Monkey
     seen: list[bool] = []
 
     class Watched(Baselines):
-        def add(self, obs: Observation) -> tuple[BaselineErrors, list[BaselineErrors]]:
+        def add(self, obs: Observation) -> tuple[dict[str, BaselineErrors], list[BaselineErrors]]:
             seen.append(obs.evaluation)
             return super().add(obs)
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 from caraware.baselines.ekf import Ekf
+from caraware.baselines.lanes import LaneMap, Pieces, read_pieces
+from caraware.baselines.map_ekf import MapEkf, lanes_of_net
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import read_samples
 from caraware.fusion.carrier import COLUMNS, Carried, Carrier
 from caraware.fusion.estimating import Estimating
-from caraware.fusion.lanes import LaneMap, Pieces, read_pieces
 from caraware.fusion.learner import Episode, FusionConfig, FusionLearner
 from caraware.fusion.loop import Beginning, FusionLoop, Recording
 from caraware.fusion.train import begin, player
@@ -94,8 +95,7 @@ def learner_of(run: dict[str, Any]) -> FusionLearner:
 def estimates(run: dict[str, Any], learner: FusionLearner, ticks: list[VehicleObservation]) -> torch.Tensor:
     noise = SensorNoise.from_run(run)
     assert noise is not None
-    x_m, y_m = learner.estimator.centre_m.tolist()
-    estimating = Estimating(learner, Carrier(noise, (x_m, y_m)))
+    estimating = Estimating(learner, learner.carrier(noise))
     return torch.stack([estimating.step(obs)[0] for obs in ticks])
 
 
@@ -106,14 +106,18 @@ def shaken(learner: FusionLearner) -> FusionLearner:
     return learner
 
 
-def test_before_it_learns_it_is_the_filter(tmp_path: Path) -> None:
+@pytest.mark.parametrize("has_map", [True, False])
+def test_before_it_learns_it_is_the_filter_with_the_map_that_it_has(tmp_path: Path, has_map: bool) -> None:
     run = street_run(tmp_path, slow_m=2.0)
+    run["config"]["fusion"]["map"] = has_map
     noise = SensorNoise.from_run(run)
     assert noise is not None
     dark = np.zeros((80, 6), np.uint32)
     dark[30:60, ::2] = 1
     ticks = list(observations(town_track(80, 6, 1), run["config"], dark=dark))
-    ekf, expected = Ekf(noise), []
+    lanes, expected = lanes_of_net(net_file(tmp_path)), []
+    assert lanes is not None
+    ekf = MapEkf(noise, lanes) if has_map else Ekf(noise)
     for obs in ticks:
         ekf.step(read_samples(obs, noise.convention))
         expected.append(ekf.position_m.copy())

@@ -15,6 +15,7 @@ MAY_IMPORT = {
     "run": {"ipc", "baselines", "tasks", "learn", "report"},
     "envs": {"ipc", "tasks", "run"},
     "fusion": {"ipc", "baselines", "tasks", "learn", "report", "run"},
+    "study": {"ipc", "baselines", "tasks", "learn", "report", "run", "fusion"},
     "examples": {"ipc", "tasks", "envs", "run"},
 }
 """Rooms from the bottom up: a room imports only earlier ones, so there is no circle."""

@@ -1,4 +1,4 @@
-"""Classical estimators beside the learner, from the same samples: a tuned EKF, and an RTS smoother as a bound.
+"""Classical estimators beside the learner, from the same samples: an EKF, one with a map, an RTS smoother as a bound.
 
 The smoother sees the future: a bound, not an estimator. Model, equations and tuning: docs/baselines.md.
 """
@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from caraware.baselines.ekf import Ekf
+from caraware.baselines.lanes import LaneMap
+from caraware.baselines.map_ekf import MapEkf
 from caraware.baselines.motion import MotionModel
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.rts import SmoothedTick, Smoother
@@ -15,7 +17,7 @@ from caraware.baselines.samples import read_samples
 from caraware.ipc.arrays import Float64Array, Int64Array
 from caraware.ipc.stream import Observation
 
-__all__ = ["BaselineErrors", "Baselines", "Ekf", "MotionModel", "SensorNoise", "Smoother"]
+__all__ = ["BaselineErrors", "Baselines", "Ekf", "MapEkf", "MotionModel", "SensorNoise", "Smoother"]
 
 
 @dataclass(frozen=True)
@@ -28,19 +30,25 @@ class BaselineErrors:
 
 
 class Baselines:
-    """EKF and smoother over the evaluation episodes of one phase. It copies what it needs of an observation."""
+    """EKFs and smoother over the evaluation episodes of one phase. It copies what it needs of an observation."""
 
-    def __init__(self, noise: SensorNoise) -> None:
-        self._noise = noise
+    def __init__(self, noise: SensorNoise, lanes: LaneMap | None = None) -> None:
+        """Without `lanes` there is no filter with a map."""
+        self._noise, self._lanes = noise, lanes
         self._begin()
 
-    def add(self, obs: Observation) -> tuple[BaselineErrors, list[BaselineErrors]]:
-        """Errors of the EKF at this tick, and of the smoother at ticks that are done, if any."""
-        self._ekf.step(read_samples(obs, self._noise.convention))
+    def add(self, obs: Observation) -> tuple[dict[str, BaselineErrors], list[BaselineErrors]]:
+        """Errors of `ekf` and `map_ekf` at this tick, and of the smoother at ticks that are done, if any."""
+        samples = read_samples(obs, self._noise.convention)
         rows = np.flatnonzero(obs.valid)
         vehicle = obs.vehicle[rows].astype(np.int64)
         truth_m = np.asarray(obs.truth)[rows, :2].astype(np.float64)
-        filtered = BaselineErrors(vehicle, _distance_m(self._ekf.position_m[rows], truth_m))
+        filters = {"ekf": self._ekf} | ({"map_ekf": self._map_ekf} if self._map_ekf else {})
+        for each in filters.values():
+            each.step(samples)
+        filtered = {
+            name: BaselineErrors(vehicle, _distance_m(each.position_m[rows], truth_m)) for name, each in filters.items()
+        }
         return filtered, [_errors(tick) for tick in self._smoother.push((rows, vehicle, truth_m))]
 
     def finish_episode(self) -> list[BaselineErrors]:
@@ -51,6 +59,7 @@ class Baselines:
 
     def _begin(self) -> None:
         self._ekf = Ekf(self._noise)
+        self._map_ekf = MapEkf(self._noise, self._lanes) if self._lanes else None
         self._smoother = Smoother(self._ekf)
 
 

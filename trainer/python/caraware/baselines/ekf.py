@@ -163,6 +163,7 @@ class Ekf:
         self._correct_compass(samples, imu_new & steady)
         self._correct_wheel_speed(samples, wheel_new & steady)
         self._correct_position(samples, fix_new & steady)
+        self._correct_by_map(steady)
         self.belief.mean[YAW] = wrapped(self.belief.mean[YAW])
         if self.started.any():
             self._start(samples)
@@ -273,6 +274,9 @@ class Ekf:
         for axis in (0, 1):
             row, expected = self._fix_row(axis, samples.fix_age_s)
             self.belief.correct(row, samples.fix_m[axis] - expected, variance[axis], use)
+
+    def _correct_by_map(self, use: BoolArray) -> None:
+        """This filter has no map; `caraware.baselines.map_ekf` has one."""
 
     def _fix_row(self, axis: int, age_s: Float64Array) -> tuple[Coefficients, Float64Array]:
         """Jacobian and expectation of a fix's `axis` (0 east, 1 north)."""

@@ -39,7 +39,7 @@ class EvaluationMeans:
     def add(self, episode: int, rows: Rows, mask: BoolArray, action: Float32Array) -> None:
         """Add a tick of an episode and the actions `[N, a]` that answer it."""
         tick = _EvaluatedTick(torch.from_numpy(rows.truth), torch.from_numpy(rows.gnss_m.astype(np.float64)), mask)
-        answers = self._task.answer(torch.from_numpy(action.astype(np.float64)))
+        answers = self._task.answer(torch.from_numpy(action.astype(np.float64)), torch.from_numpy(rows.observation))
         of_policy = self._task.measure_answers(tick, answers)
         if self._metric.name in of_policy:
             references = self._task.measure_references([tick])

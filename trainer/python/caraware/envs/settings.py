@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from gymnasium.spaces import Box
+from torch import Tensor
 
 from caraware.ipc.arrays import Float32Array
 from caraware.ipc.run_file import BlackoutPolicy, ConfigTable, RunFile, is_population, setting
@@ -56,11 +57,11 @@ class FaceSettings:
         actions = self.task.actions
         return Box(actions.low, actions.high, (actions.size,), np.float32)
 
-    def answer(self, action: Float32Array, rows: int) -> Float32Array:
-        """Actions `[N, a]` as the simulation takes them: f32 `[rows, a]`."""
+    def answer(self, action: Float32Array, rows: int, observation: Tensor) -> Float32Array:
+        """Actions `[N, a]` on rows `[rows, d]` as the simulation takes them: f32 `[rows, a]`."""
         answer = np.zeros((rows, self.task.actions.size), np.float32)
         used = min(rows, len(action))
-        answer[:used] = self.task.answer(torch.from_numpy(action[:used].astype(np.float64))).numpy()
+        answer[:used] = self.task.answer(torch.from_numpy(action[:used].astype(np.float64)), observation[:used]).numpy()
         return answer
 
 

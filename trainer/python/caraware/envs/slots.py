@@ -310,7 +310,7 @@ class Slots:
             return
         self.source.current, self._answered = None, obs.tick
         if publish:
-            rows = self.settings.answer(action, len(obs.vehicle))
+            rows = self.settings.answer(action, len(obs.vehicle), obs.observation)
             if self._world_waits:
                 channel.publish_actions(obs, rows)
             else:

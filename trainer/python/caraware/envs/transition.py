@@ -54,7 +54,8 @@ class Transition(Rows):
 
     def to_world_m(self, action: Float32Array) -> Float64Array:
         """Actions `[N, 2]` of the localisation task as positions in world metres."""
-        position_m: Float64Array = self.settings.task.answer(torch.from_numpy(action.astype(np.float64))).numpy()
+        actions, observation = torch.from_numpy(action.astype(np.float64)), torch.from_numpy(self.observation)
+        position_m: Float64Array = self.settings.task.answer(actions, observation).numpy()
         return position_m
 
     @cached_property

@@ -1,8 +1,8 @@
 """What carries an estimate from tick to tick: dead reckoning and the pull of the fixes, from a Kalman filter.
 
-The filter (`caraware.baselines.ekf`) knows nothing of maps. It says how every vehicle moved, how far the newest fix
-pulls and how much that counts. The learned estimator moves its own previous estimate by the first, and
-decides about the rest.
+The filter is the one with a map (`caraware.baselines.map_ekf`), or without lanes the plain one. It says how every
+vehicle moved, how far the newest fix pulls, how much that counts, and how far the lanes pull. The learned estimator
+moves its own previous estimate by the first, and decides about the rest.
 """
 
 from dataclasses import dataclass
@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from caraware.baselines.ekf import Ekf
+from caraware.baselines.lanes import LaneMap
+from caraware.baselines.map_ekf import MapEkf
 from caraware.baselines.motion import SPEED, YAW, X, Y
 from caraware.baselines.noise import SensorNoise
 from caraware.baselines.samples import Samples, read_samples
@@ -25,7 +27,8 @@ _COLUMNS = {
     "filter_m": 2,
     "step_m": 2,
     "pull_m": 2,
-    "gain": 1,
+    "lane_m": 2,
+    "gain": 2,
     "innovation_m": 2,
     "spread_m2": 3,
     "yaw_rad": 1,
@@ -52,8 +55,10 @@ class Carried:
     """How the vehicle moved since the tick before, by dead reckoning."""
     pull_m: Tensor
     """How far the fix moved the filter's estimate."""
+    lane_m: Tensor
+    """How far the lanes moved it after that; 0 without a map."""
     gain: Tensor
-    """How much of a distance to the fix that was: 0, or less than 1."""
+    """How much of a distance to the fix that was, along and across the heading: 0, or less than 1."""
     innovation_m: Tensor
     """A new fix less the filter's prediction; 0 without a new fix."""
     spread_m2: Tensor
@@ -87,13 +92,14 @@ COLUMNS = sum(_COLUMNS.values())
 class Carrier:
     """The filters of all slots. Feed it every tick in order."""
 
-    def __init__(self, noise: SensorNoise, centre_m: tuple[float, float]) -> None:
-        self._noise, self._centre_m = noise, np.array(centre_m)[:, None]
+    def __init__(self, noise: SensorNoise, centre_m: tuple[float, float], lanes: LaneMap | None = None) -> None:
+        """With `lanes` the filter has a map."""
+        self._noise, self._centre_m, self._lanes = noise, np.array(centre_m)[:, None], lanes
         self.reset()
 
     def reset(self) -> None:
         """Forget everything: what comes next is another episode."""
-        self._ekf = Ekf(self._noise)
+        self._ekf = MapEkf(self._noise, self._lanes) if self._lanes else Ekf(self._noise)
         self._ekf.keep_prediction = True
         self._since_s = np.zeros(0)
         self._time_s: float | None = None
@@ -115,17 +121,19 @@ class Carrier:
     def _table(self, samples: Samples, before: Float64Array) -> Float32Array:
         ekf = self._ekf
         mean, predicted = ekf.belief.mean, ekf.predicted.mean
+        fixed = ekf.before_map if isinstance(ekf, MapEkf) else ekf.belief
         covariance, prior = ekf.belief.covariance, ekf.predicted.covariance
         goes_on = ekf.running & ~ekf.started
-        pull_m = mean[:2] - predicted[:2]
-        gain = 1.0 - (covariance[X, X] + covariance[Y, Y]) / np.maximum(prior[X, X] + prior[Y, Y], SMALLEST_VARIANCE_M2)
+        pull_m = fixed.mean[:2] - predicted[:2]
+        left = _spreads(fixed.covariance, mean[YAW]) / np.maximum(_spreads(prior, mean[YAW]), SMALLEST_VARIANCE_M2)
         used = goes_on & samples.fix_on & (samples.fix_age_s < 0.5 * self._noise.tick_s)
         innovation_m = np.where(used, samples.fix_m - predicted[:2], 0.0)
         rows = (
             *(mean[:2] - self._centre_m),
             *np.where(goes_on, predicted[:2] - before, 0.0),
             *np.where(goes_on, pull_m, 0.0),
-            np.where(goes_on, np.clip(gain, 0.0, 1.0), 1.0),
+            *np.where(goes_on, mean[:2] - fixed.mean[:2], 0.0),
+            *np.where(goes_on, np.clip(1.0 - left, 0.0, 1.0), 1.0),
             *innovation_m,
             covariance[X, X],
             covariance[X, Y],
@@ -148,3 +156,11 @@ class Carrier:
     @staticmethod
     def _padded(rows: Float64Array, slots: int) -> Float64Array:
         return np.pad(rows, ((0, 0), (0, slots - rows.shape[1])))
+
+
+def _spreads(covariance: Float64Array, yaw_rad: Float64Array) -> Float64Array:
+    """Variances along and across the heading `[2, n]`."""
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    ee, en, nn = covariance[X, X], covariance[X, Y], covariance[Y, Y]
+    turned = 2.0 * en * cos * sin
+    return np.stack((ee * cos**2 + turned + nn * sin**2, ee * sin**2 - turned + nn * cos**2))

@@ -1,10 +1,10 @@
 """The learned estimator: its own previous estimate by dead reckoning, pulled by fixes and by the map as a network says.
 
     e⁻ = e + step
-    e  = e⁻ + R(ψ) [g · pull + m · (way to the lane) + n · (way to the lane of this heading) + a]
+    e  = e⁻ + R(ψ) [g · pull + r · (pull of lanes) + m · (way to the lane) + n · (way to the lane of this heading) + a]
 
-A GRU sees what is known, in the vehicle's frame, and gives the gains g, m, n and the free correction a. Its last layer
-starts at zero, which means g = 1, m = n = a = 0: the Kalman filter. So training starts there, and can only win.
+A GRU sees what is known, in the vehicle's frame, and gives the gains g, r, m, n and the free correction a. Its last
+layer starts at zero, which means g = r = 1, m = n = a = 0: the Kalman filter, with its map. So training starts there.
 """
 
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from caraware.baselines.lanes import LaneMap, Match, Pieces
 from caraware.fusion.carrier import Carried
-from caraware.fusion.lanes import LaneMap, Match, Pieces
 
 NEAR_M_PER_RAD, TURNING_M_PER_RAD = 4.0, 25.0
 """How much a difference in heading counts against distance: for the next lane, and for the place in a bend that has
@@ -23,9 +23,9 @@ NOSE_M = 3.7
 """From the rear axle to the front of a car: the point that drivers keep on the lane."""
 FREE_M = 0.5
 """The unit of the free correction."""
-GAINS = 8
-"""Outputs: g along and across, m along and across, n along and across, a along and across."""
-OWN, GIVEN, LANE = 6, 12, 6
+GAINS = 10
+"""Outputs: g, m, n, a and r, each along and across."""
+OWN, GIVEN, LANE = 6, 15, 6
 """Inputs that depend on the own estimate, that do not, and of each of the four lanes looked up."""
 INPUTS = OWN + GIVEN + 4 * LANE
 
@@ -54,11 +54,12 @@ class Prepared:
     yaw_rad: Tensor
     """`[..., n]`."""
     pull_m: Tensor
+    lane_m: Tensor
     gain: Tensor
     innovation_m: Tensor
     has_innovation: Tensor
     predicted_m: Tensor
-    """World: the filter's estimate before the pull, with the map's centre added."""
+    """World: the filter's estimate before fix and lanes, with the map's centre added."""
     goes_on: Tensor
 
     def at(self, t: int) -> "Prepared":
@@ -114,6 +115,7 @@ class FusionEstimator:
         given = torch.cat(
             (
                 c.gain * 5.0,
+                _body(c.lane_m, cos, sin),
                 _log_spreads(c.spread_m2, cos, sin),
                 c.speed_mps / 10.0,
                 c.yaw_rate_radps / 0.3,
@@ -133,10 +135,11 @@ class FusionEstimator:
             sin=sin,
             yaw_rad=c.yaw_rad[..., 0],
             pull_m=_body(c.pull_m, cos, sin),
+            lane_m=_body(c.lane_m, cos, sin),
             gain=c.gain,
             innovation_m=_body(c.innovation_m, cos, sin),
             has_innovation=(c.innovation_m != 0).any(-1, keepdim=True).to(c.gain.dtype),
-            predicted_m=c.filter_m - c.pull_m + self.centre_m,
+            predicted_m=c.filter_m - c.pull_m - c.lane_m + self.centre_m,
             goes_on=1.0 - c.begins,
         )
 
@@ -149,8 +152,9 @@ class FusionEstimator:
         raw, hidden = self.network(inputs, state.hidden * p.goes_on)
         # What the fix moved the filter by, it would move the own estimate by less the gain on their difference.
         pull = p.pull_m - p.gain * before
-        g, lane = 2.0 * torch.sigmoid(raw[:, 0:2]), torch.tanh(raw[:, 2:6])
-        moved = g * pull - p.pull_m + lane[:, :2] * near + lane[:, 2:] * turning + FREE_M * raw[:, 6:8]
+        g, r, lane = 2.0 * torch.sigmoid(raw[:, 0:2]), 2.0 * torch.sigmoid(raw[:, 8:10]), torch.tanh(raw[:, 2:6])
+        moved = g * pull - p.pull_m + (r - 1.0) * p.lane_m
+        moved = moved + lane[:, :2] * near + lane[:, 2:] * turning + FREE_M * raw[:, 6:8]
         return State(before_m + _world(moved, p.cos, p.sin), hidden)
 
     def _look(self, p: Prepared, offset_m: Tensor, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:

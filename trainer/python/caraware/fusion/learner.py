@@ -12,9 +12,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from caraware.fusion.carrier import Carried
+from caraware.baselines.lanes import Pieces, read_pieces
+from caraware.baselines.map_ekf import lane_map
+from caraware.baselines.noise import SensorNoise
+from caraware.fusion.carrier import Carried, Carrier
 from caraware.fusion.estimator import FusionEstimator, FusionNetwork, distance_loss
-from caraware.fusion.lanes import Pieces, read_pieces
 from caraware.ipc.run_file import RunFile, config_table
 from caraware.learn.adam import Adam
 from caraware.learn.config import ConfigError, MapBounds, TrainerConfig
@@ -106,6 +108,7 @@ class FusionLearner:
     ) -> None:
         """It reads the raw samples; `observation_size` is that of the run, which a checkpoint must agree with."""
         self.config, self.fusion, self.observation_size = trainer, fusion, observation_size
+        self._pieces = pieces
         self.updates = 0
         self.progress = 0.0
         """Share of all training episodes that is done, as of the newest update."""
@@ -118,6 +121,11 @@ class FusionLearner:
         self.optimiser = Adam(self.parameters)
         centre_m = ((bounds.x_min_m + bounds.x_max_m) / 2, (bounds.y_min_m + bounds.y_max_m) / 2)
         self.estimator = FusionEstimator(network, pieces, centre_m)
+
+    def carrier(self, noise: SensorNoise) -> Carrier:
+        """The filters that the estimator starts as: with the map that it has."""
+        centre_x_m, centre_y_m = self.estimator.centre_m.tolist()
+        return Carrier(noise, (centre_x_m, centre_y_m), lane_map(self._pieces) if len(self._pieces) else None)
 
     def learn(self, episode: Episode, progress: float) -> FusionStats:
         """Some passes over an episode; `progress` is the share of training that is done. Raises `NonFiniteLoss`."""

@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from caraware.fusion.carrier import Carried, Carrier
+from caraware.fusion.carrier import Carried
 from caraware.fusion.estimating import Estimating
 from caraware.fusion.learner import Episode, FusionLearner, FusionStats
 from caraware.ipc.stream import Channel, Observation
@@ -99,8 +99,7 @@ class FusionLoop:
         self._channel, self._config, self._learner = channel, config, learner
         self._stop_requested, self._leave_requested = stop_requested, leave_requested
         self._leave_now_requested = leave_now_requested
-        centre_x_m, centre_y_m = learner.estimator.centre_m.tolist()
-        self._estimating = Estimating(learner, Carrier(config.sensors, (centre_x_m, centre_y_m)))
+        self._estimating = Estimating(learner, learner.carrier(config.sensors))
         counters, history = beginning.counters, beginning.history
         self._samples, self._trained_steps = SampleCount(counters.env_steps), counters.env_steps
         self._stream, self._episode = StreamProgress(history.first_position(counters)), counters.episode
@@ -156,7 +155,9 @@ class FusionLoop:
         if obs.evaluation:
             # A predecessor may have evaluated ticks that it had not learned up to.
             if obs.tick > self._stream.evaluated_tick:
-                self._evaluation = self._evaluation or Evaluation(headline.name, self._config.sensors)
+                self._evaluation = self._evaluation or Evaluation(
+                    headline.name, self._config.sensors, lanes=self._config.lanes()
+                )
                 of_references = {key: references[name] for key, name in reference_names(headline).items()}
                 self._evaluation.add(obs, {"ppo": policy, **of_references})
                 self._evaluation_tick = obs.tick

@@ -1,4 +1,4 @@
-"""`python -m caraware.fusion.study`: trains the preset `fusion` and prints its errors beside the filter's, over seeds.
+"""`python -m caraware.fusion.study`: trains the preset `fusion` and prints its errors beside the filters', over seeds.
 
 Every setting of the sensors has its own training, `--training-seeds` times. Evaluation seeds, and the trips of vehicles
 in evaluations (`traffic.held_out_trips`), are ones that no training episode has seen. Intervals are 95 % (Student's t)
@@ -14,7 +14,13 @@ from caraware.report.statistics import mean_interval
 
 DEFAULT_NOISE = ["gnss.correlated_std_m=0.0", "blackout.enabled=false"]
 SETTINGS = {"default noise": DEFAULT_NOISE, "slow GNSS error and blackouts": []}
-ESTIMATORS = {"ppo": "fusion", "ekf": "EKF", "rts": "RTS (sees the future)", "raw_gnss": "raw GNSS"}
+ESTIMATORS = {
+    "ppo": "fusion",
+    "map_ekf": "EKF with a map",
+    "ekf": "EKF",
+    "rts": "RTS (sees the future)",
+    "raw_gnss": "raw GNSS",
+}
 
 
 def main() -> None:
@@ -25,13 +31,17 @@ def main() -> None:
     parser.add_argument("--training-seeds", type=int, default=1)
     parser.add_argument("--set", action="append", default=[], dest="settings", help="key=value, for every run")
     options = parser.parse_args()
-    print("| sensors | runs | " + " | ".join(f"{label} [m]" for label in ESTIMATORS.values()) + " | fusion / EKF |")
+    print(
+        "| sensors | runs | "
+        + " | ".join(f"{label} [m]" for label in ESTIMATORS.values())
+        + " | fusion / EKF with a map |"
+    )
     print("|---|---|" + "---|" * (len(ESTIMATORS) + 1))
     for label, changes in SETTINGS.items():
         runs = [_seeds_m(options, label, changes, seed) for seed in range(1, options.training_seeds + 1)]
         seeds = [seed for run in runs for seed in run] if len(runs) == 1 else [_mean(run) for run in runs]
         columns = [str(mean_interval([seed[name] for seed in seeds])) for name in ESTIMATORS]
-        ratio = mean_interval([seed["ppo"] / seed["ekf"] for seed in seeds])
+        ratio = mean_interval([seed["ppo"] / seed["map_ekf"] for seed in seeds])
         print(f"| {label} | {len(runs)} × {len(runs[0])} seeds | " + " | ".join(columns) + f" | {ratio} |", flush=True)
 
 

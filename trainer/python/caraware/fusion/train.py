@@ -11,7 +11,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from caraware.fusion.carrier import COLUMNS, Carrier
+from caraware.fusion.carrier import COLUMNS
 from caraware.fusion.estimating import FusionPlayer
 from caraware.fusion.learner import FusionConfig, FusionLearner
 from caraware.fusion.loop import Beginning, FusionLoop
@@ -47,8 +47,7 @@ def player(run: RunFile, config: RunConfig, observation_size: int) -> FusionPlay
     learner = _learner(run, config, observation_size)
     assert config.resume_from is not None and config.sensors is not None
     load_checkpoint(config.resume_from, learner)
-    centre_x_m, centre_y_m = learner.estimator.centre_m.tolist()
-    return FusionPlayer(learner, Carrier(config.sensors, (centre_x_m, centre_y_m)))
+    return FusionPlayer(learner, learner.carrier(config.sensors))
 
 
 def _learner(run: RunFile, config: RunConfig, observation_size: int) -> FusionLearner:

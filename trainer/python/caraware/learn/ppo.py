@@ -400,11 +400,11 @@ class Ppo:
     def score(self, horizon: Horizon, environment: int = 0) -> Batch:
         """Give every sample of one environment's horizon its action, reward and advantage."""
         rows = horizon.valid.flatten().nonzero().squeeze(1)
-        observation = horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device)
+        observation = self.task.network_input(horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device))
         mean, value = self.updater.mean_and_value(observation)
         after = None
         if horizon.bootstrap is not None and self.config.discount > 0.0:
-            after = self.updater.value(horizon.bootstrap.to(self.device)).cpu()
+            after = self.updater.value(self.task.network_input(horizon.bootstrap.to(self.device))).cpu()
         return self._scored(horizon, ForwardPass(rows, observation, mean, value, after), environment)
 
     def _scored(self, horizon: Horizon, forward: ForwardPass, environment: int) -> Batch:
@@ -529,8 +529,13 @@ class Ppo:
         """Predicted positions `[n, 2]` in world metres for each of some `[n, d]` blocks: the policy's mean."""
         if not observations:
             return ()
-        mean = self.updater.mean(*observations)
-        answers: tuple[Tensor, ...] = self.task.answer(mean).cpu().split([len(block) for block in observations])
+        if self.task.is_relative:
+            seen = torch.cat(tuple(observations))
+            mean = self.updater.mean(self.task.network_input(seen))
+            answered = self.task.answer(mean.cpu(), seen)
+        else:
+            answered = self.task.answer(self.updater.mean(*observations)).cpu()
+        answers: tuple[Tensor, ...] = answered.split([len(block) for block in observations])
         return answers
 
     def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> Predictor:

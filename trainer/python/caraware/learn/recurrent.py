@@ -167,7 +167,9 @@ class RecurrentPpo(Ppo):
         rows = horizon.valid.flatten().nonzero().squeeze(1)
         slots = horizon.valid.shape[1]
         steps = Steps(
-            observation=horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device),
+            observation=self.task.network_input(
+                horizon.observation.flatten(0, 1).index_select(0, rows).to(self.device)
+            ),
             slot=(rows % slots).to(self.device),
             goes_on=goes_on.flatten()[rows].to(self.device),
             sizes=horizon.valid.sum(1).tolist(),
@@ -194,7 +196,7 @@ class RecurrentPpo(Ppo):
             return None
         rows = outlives(horizon).nonzero().squeeze(1)
         observation, state = (each.index_select(0, rows.to(each.device)) for each in (horizon.bootstrap, walk.last))
-        value, _ = self.updater.value_network.step(observation.to(self.device), state)
+        value, _ = self.updater.value_network.step(self.task.network_input(observation.to(self.device)), state)
         return torch.zeros(len(horizon.bootstrap)).index_copy_(0, rows, value.squeeze(1).cpu())
 
 
@@ -228,9 +230,10 @@ class SequencePredictor:
         known = memories.get(obs.tick - 1) or Memory.nothing(network.width)
         state = known.before(obs.tick, vehicle, cut_before)
         seen = visible(obs, self._dark_is_nan).index_select(0, rows).to(device)
-        mean, after = network.step(seen, state.index_select(0, rows).to(device))
+        task = self._ppo.task
+        mean, after = network.step(task.network_input(seen), state.index_select(0, rows).to(device))
         memories[obs.tick] = Memory.after(obs.tick, vehicle, valid, state.index_copy_(0, rows, after.cpu()))
-        predicted_m = self._ppo.task.answer(mean).cpu()
+        predicted_m = task.answer(mean, seen).cpu()
         return torch.zeros(len(valid), self._ppo.task.actions.size).index_copy_(0, rows, predicted_m)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from caraware import _native
 from caraware.baselines import BaselineErrors, Baselines, SensorNoise
+from caraware.baselines.lanes import LaneMap
 from caraware.ipc.arrays import Float64Array, FloatArray, Int64Array
 from caraware.ipc.stream import Observation
 from caraware.report.statistics import mean_interval
@@ -23,9 +24,14 @@ ESTIMATORS = {
     "raw_gnss": "raw GNSS",
     "supervised": "regression",
     "ekf": "EKF",
+    "map_ekf": "EKF with a map",
     "rts": "RTS smoother (sees the future: a bound)",
 }
 """Key of each, as in the run's report, and its name for people; the order of the columns of an evaluation's sums."""
+
+
+_COLUMN = {name: column for column, name in enumerate(ESTIMATORS, start=1)}
+"""Of an evaluation's sums; column 0 counts samples."""
 
 
 @dataclass(frozen=True)
@@ -141,16 +147,24 @@ class Evaluation:
     results. Both estimate positions, so they need a task whose metric is a position's error.
     """
 
-    def __init__(self, metric: str, noise: SensorNoise | None = None, *, supervised: bool = False) -> None:
-        """`metric` names what is compared. `supervised`: the values of that baseline will be added too."""
+    def __init__(
+        self,
+        metric: str,
+        noise: SensorNoise | None = None,
+        *,
+        lanes: LaneMap | None = None,
+        supervised: bool = False,
+    ) -> None:
+        """`metric` names what is compared. With `lanes` there is a filter with a map; `supervised`: its values come."""
         self._metric = metric
-        self._baselines = Baselines(noise) if noise else None
-        missing = ("ekf", "rts")[: 0 if noise else 2] + ("supervised",)[: 0 if supervised else 1]
+        self._baselines = Baselines(noise, lanes) if noise else None
+        present = {"ekf": noise, "rts": noise, "map_ekf": noise and lanes, "supervised": supervised}
+        missing = [name for name, given in present.items() if not given]
         self._known = [name for name in ESTIMATORS if name not in missing]
         self._finished: list[Float64Array] = []
         self._episode: int | None = None
         self._sums = np.zeros((0, 1 + len(ESTIMATORS)))
-        """f64 `[vehicle, 6]` of the current episode: samples, and the sum of the metric of each estimator."""
+        """f64 `[vehicle, 7]` of the current episode: samples, and the sum of the metric of each estimator."""
 
     def add(self, obs: Observation, values: Mapping[str, FloatArray]) -> None:
         """Add the metric's values `[v]` on the valid rows of one evaluation tick, by estimator."""
@@ -160,17 +174,18 @@ class Evaluation:
         vehicle = obs.vehicle[obs.valid].astype(np.int64)
         self._make_room(vehicle)
         self._sums[vehicle, 0] += 1.0
-        for column, name in enumerate(ESTIMATORS, start=1):
+        for name, column in _COLUMN.items():
             if name in values:
                 self._sums[vehicle, column] += values[name]
         if self._baselines:
             filtered, smoothed = self._baselines.add(obs)
-            self._sums[filtered.vehicle, 4] += filtered.error_m
+            for name, errors in filtered.items():
+                self._sums[errors.vehicle, _COLUMN[name]] += errors.error_m
             self._add_smoothed(smoothed)
 
     def _add_smoothed(self, ticks: Iterable[BaselineErrors]) -> None:
         for tick in ticks:
-            self._sums[tick.vehicle, 5] += tick.error_m
+            self._sums[tick.vehicle, _COLUMN["rts"]] += tick.error_m
 
     def _make_room(self, vehicle: Int64Array) -> None:
         missing = int(vehicle.max(initial=-1)) + 1 - len(self._sums)

@@ -23,6 +23,7 @@ _EVALUATION_TAGS = {
     "raw_gnss": "raw_gnss_",
     "supervised": "supervised_",
     "ekf": "ekf_",
+    "map_ekf": "map_ekf_",
     "rts": "rts_sees_the_future_",
 }
 """What stands before the unit in the tag of an estimator."""

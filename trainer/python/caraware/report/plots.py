@@ -14,7 +14,7 @@ from caraware.report.metrics import TrainingPoint
 from caraware.tasks.metrics import reference_names
 
 POLICY, EVALUATION, REFERENCE, REWARD = "#7fb3d5", "#1a5276", "#b03a2e", "#ca6f1e"
-EKF, RTS, SUPERVISED = "#e69f00", "#555555", "#009e73"
+EKF, MAP_EKF, RTS, SUPERVISED = "#e69f00", "#cc79a7", "#555555", "#009e73"
 """Colour-blind readers can distinguish them: they differ in lightness, and lines in their dashes and marks."""
 
 
@@ -30,8 +30,9 @@ class _Curve:
 
 
 CURVES = (
-    _Curve("supervised", "the same network, taught the truth", SUPERVISED, "--", "D"),
+    _Curve("supervised", "the same network, taught the truth by as many steps", SUPERVISED, "--", "D"),
     _Curve("ekf", "EKF, same samples", EKF, "-.", "s"),
+    _Curve("map_ekf", "EKF with a map, same samples", MAP_EKF, "-.", "v"),
     _Curve("rts", "RTS smoother, sees the future: a bound", RTS, ":", "^"),
     _Curve("ppo", "policy, evaluation on unseen seeds", EVALUATION, "-", "o"),
 )

@@ -42,7 +42,12 @@ class EvaluationPhase:
         if obs.tick <= progress.evaluated_tick:
             return
         if self._evaluation is None:
-            self._evaluation = Evaluation(self._headline.name, self._config.sensors, supervised=supervised is not None)
+            self._evaluation = Evaluation(
+                self._headline.name,
+                self._config.sensors,
+                lanes=self._config.lanes(),
+                supervised=supervised is not None,
+            )
         values = {"ppo": self._config.task.measure_answers(obs, predicted_m)[self._headline.name]}
         values |= {estimator: references[name] for estimator, name in reference_names(self._headline).items()}
         if supervised is not None:

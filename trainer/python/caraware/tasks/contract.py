@@ -119,8 +119,20 @@ class Task(Protocol):
         """What is measured: rows of `METRICS`. The first is the headline."""
         ...
 
-    def answer(self, action: Tensor) -> Tensor:
-        """What is published for actions `[..., a]`, in the units that the simulation and viewers take."""
+    @property
+    def is_relative(self) -> bool:
+        """Whether actions are relative to what a row holds, so that `answer` needs the rows."""
+        ...
+
+    def answer(self, action: Tensor, observation: Tensor | None = None) -> Tensor:
+        """What is published for actions `[..., a]` on rows `[n, d]`, in the units that the simulation and viewers take.
+
+        Only an action that corrects what a sensor says needs the rows.
+        """
+        ...
+
+    def network_input(self, observation: Tensor) -> Tensor:
+        """Rows `[n, d]` as the networks take them: the same tensor, unless an action is relative to a row."""
         ...
 
     def reward(self, step: TaskStep, action: Tensor) -> Tensor:

@@ -44,6 +44,7 @@ class Driving:
     name: str = "driving"
     actions: ActionSpec = ACTIONS
     sampling: Sampling = Sampling.EACH_TICK
+    is_relative: bool = False
     ends: tuple[EndReason, ...] = ENDS
     metrics: tuple[_native.Metric, ...] = field(default_factory=lambda: metrics_of("driving"))
 
@@ -52,9 +53,13 @@ class Driving:
         """Read the fields of the observation and the length of a tick."""
         return cls(Fields.from_run(run), setting(run, "run.tick_s", float))
 
-    def answer(self, action: Tensor) -> Tensor:
+    def answer(self, action: Tensor, observation: Tensor | None = None) -> Tensor:
         """The demands, clipped to their range."""
         return action.clamp(self.actions.low, self.actions.high)
+
+    def network_input(self, observation: Tensor) -> Tensor:
+        """The rows themselves."""
+        return observation
 
     def reward(self, step: TaskStep, action: Tensor) -> Tensor:
         """Metres along the route, in tens; less for what is beside it; ±10 for the end.

@@ -65,6 +65,10 @@ class Fields:
         unit = (observation[..., self._place(name)].double() - self.low) / (1.0 - self.low)
         return low + unit * (high - low)
 
+    def range(self, name: str) -> tuple[float, float]:
+        """Lower and upper end of field `name` in SI units. Raises `UnknownFieldError`."""
+        return self._range(name)
+
     def _place(self, name: str) -> int:
         return (self.history - 1) * len(self.names) + self.names.index(name)
 

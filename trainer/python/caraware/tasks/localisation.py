@@ -1,7 +1,11 @@
-"""The paper's task: an action is a predicted position of the vehicle, which earns the more, the closer it is."""
+"""The paper's task: an action says where the vehicle is, and earns the more, the closer that is to the truth.
+
+It names a place in the map, as in the paper, or corrects the newest fix (`task.action`).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 import torch
@@ -9,14 +13,27 @@ from torch import Tensor
 
 from caraware import _native
 from caraware.ipc.arrays import FloatArray
-from caraware.ipc.run_file import RunFile, setting
+from caraware.ipc.run_file import RunFile, config_table, setting, typed
 from caraware.ipc.stream import MeasuredTick
 from caraware.tasks import rewards
 from caraware.tasks.bounds import MapBounds
-from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskStep
+from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskRows, TaskStep
+from caraware.tasks.correction import FixCorrection
 from caraware.tasks.metrics import metrics_of
 
 ACTIONS = ActionSpec(names=("x", "y"), low=-1.0, high=1.0, is_clipped=False)
+
+CORRECTIONS = ActionSpec(names=("east", "north"), low=-1.0, high=1.0, is_clipped=False)
+
+
+class LocalisationAction(StrEnum):
+    """Values of `task.action`."""
+
+    PLACE = "place"
+    """A place in the box of the map, as in the paper."""
+    CORRECTION = "correction"
+    """A correction of the newest fix, in its standard deviations."""
+
 
 ENDS = (
     EndReason("arrival", EndKind.TERMINATED),
@@ -28,11 +45,15 @@ ENDS = (
 
 @dataclass(frozen=True)
 class Localisation:
-    """Actions `[..., 2]` are positions in the box of the map: 0 is its middle, ±1 its edge, and beyond lies outside."""
+    """Actions `[..., 2]` are positions in the box of the map: 0 is its middle, ±1 its edge, and beyond lies outside.
+
+    With a `correction` they are the way from the newest fix, in standard deviations of a fix.
+    """
 
     bounds: MapBounds
     reward_name: rewards.RewardName
     reward_scale_m: float
+    correction: FixCorrection | None = None
     name: str = "localisation"
     actions: ActionSpec = ACTIONS
     sampling: Sampling = Sampling.WHEN_FULL
@@ -43,19 +64,44 @@ class Localisation:
     def from_run(cls, run: RunFile) -> "Localisation":
         """Read `map.bounds_m` and the reward. Raises `ConfigError`."""
         reward = setting(run, "trainer.reward", rewards.RewardName)
-        return cls(MapBounds.from_run(run), reward, setting(run, "trainer.reward_scale_m", float))
+        bounds, scale_m = MapBounds.from_run(run), setting(run, "trainer.reward_scale_m", float)
+        # Run files from before the key name places.
+        named = config_table(run, "task").get("action", LocalisationAction.PLACE)
+        if typed("task.action", named, LocalisationAction) is LocalisationAction.PLACE:
+            return cls(bounds, reward, scale_m)
+        return cls(bounds, reward, scale_m, FixCorrection.from_run(run), actions=CORRECTIONS)
 
-    def answer(self, action: Tensor) -> Tensor:
-        """Positions `[..., 2]` (m, world)."""
-        return self.bounds.to_world_m(action)
+    @property
+    def is_relative(self) -> bool:
+        """See `Task.is_relative`."""
+        return self.correction is not None
+
+    def answer(self, action: Tensor, observation: Tensor | None = None) -> Tensor:
+        """Positions `[..., 2]` (m, world). A correction needs the rows `[n, d]`; raises `ValueError` without."""
+        if self.correction is None:
+            return self.bounds.to_world_m(action)
+        if observation is None:
+            raise ValueError("a correction needs the observation that holds the fix")
+        return self.correction.answer(action, observation)
+
+    def metres_per_action(self) -> list[float]:
+        """How far the position moves east and north with an action of 1 (m)."""
+        if self.correction is not None:
+            return [self.correction.unit_m] * 2
+        box = self.bounds
+        return [(box.x_max_m - box.x_min_m) / 2, (box.y_max_m - box.y_min_m) / 2]
+
+    def network_input(self, observation: Tensor) -> Tensor:
+        """See `Task.network_input`."""
+        return observation if self.correction is None else self.correction.network_input(observation)
 
     def reward(self, step: TaskStep, action: Tensor) -> Tensor:
         """The named reward of the distance to the truth; see `Task.reward`."""
-        return rewards.REWARDS[self.reward_name](self.error_m(action, step.truth), self.reward_scale_m)
+        return rewards.REWARDS[self.reward_name](self.error_m(action, step), self.reward_scale_m)
 
     def measure(self, step: TaskStep, action: Tensor) -> dict[str, Tensor]:
         """`error_m`: distance of the position to the truth (m)."""
-        return {"error_m": self.error_m(action, step.truth)}
+        return {"error_m": self.error_m(action, step)}
 
     def measure_answers(self, tick: MeasuredTick, answers: Tensor) -> dict[str, FloatArray]:
         """`error_m`: distance of the published positions to the truth (m)."""
@@ -65,12 +111,13 @@ class Localisation:
         """`raw_gnss_error_m`: distance of the raw GNSS fix to the truth (m)."""
         return {"raw_gnss_error_m": raw_errors_m(ticks)}
 
-    def error_m(self, action: Tensor, truth: Tensor) -> Tensor:
-        """Distances `[...]` of the positions of actions `[..., 2]` to the truth `[n, 4]` (m).
+    def error_m(self, action: Tensor, step: TaskRows) -> Tensor:
+        """Distances `[...]` of the positions of actions `[..., 2]` to the truth of the rows (m).
 
         A learner's rows are float32 and lie on its device; a face's are float64, and numpy measures them.
         """
-        position_m, truth = self.answer(action), truth if action.ndim == truth.ndim else truth.unsqueeze(1)
+        truth = step.truth if action.ndim == step.truth.ndim else step.truth.unsqueeze(1)
+        position_m = self.answer(action, step.observation)
         if position_m.dtype == torch.float64:
             return torch.from_numpy(_distance_m(position_m.numpy(), truth.numpy()))
         return rewards.distance_m(position_m, truth)

@@ -1,4 +1,4 @@
-"""The map that the learned estimator carries: the lanes of the net, and from anywhere the way to the next of them.
+"""The map that an estimator carries: the lanes of the net, and from anywhere the way to the next of them.
 
 A map is what navigation systems have; it says nothing of where a vehicle is. Lanes are cut into straight pieces, and a
 raster over place and heading remembers which piece is nearest, so that a look-up costs the same in any town.
@@ -102,7 +102,11 @@ class LaneMap:
     `metres_per_rad` has one such weight for each question (first dimension of what `match` is asked).
     """
 
-    def __init__(self, pieces: Pieces, metres_per_rad: Sequence[float]) -> None:
+    def __init__(
+        self, pieces: Pieces, metres_per_rad: Sequence[float], other_heading_rad: float = OTHER_HEADING_RAD
+    ) -> None:
+        """`other_heading_rad`: a lane that leads this far away from the heading is not found."""
+        self._other_heading_rad = other_heading_rad
         self._pieces = pieces if len(pieces) else Pieces(*torch.zeros(6, 1))
         low, high = _corners(self._pieces)
         width, height = (high - low).tolist()
@@ -124,7 +128,7 @@ class LaneMap:
         for piece, (x, y, heading, length) in enumerate(table[:count]):
             window, square = self._squares(x, y, heading, length)
             turned = np.abs((heading - headings + math.pi) % (2 * math.pi) - math.pi)
-            for i in np.flatnonzero(turned < OTHER_HEADING_RAD):
+            for i in np.flatnonzero(turned < self._other_heading_rad):
                 here = square + np.float32((metres_per_rad * turned[i]) ** 2)
                 better = (square < REACH_M**2) & (here < cost[i][window])
                 np.copyto(cost[i][window], here, where=better)

@@ -1,0 +1,1 @@
+"""Studies over recorded ticks: every learner and every filter sees the same bytes (docs/reproduce.md)."""

@@ -1,0 +1,155 @@
+"""`trainer.module = "caraware.study.recording"`: in the trainer's place, writes down every tick and learns nothing.
+
+`recording/NNNNNN.npz` in the run's directory holds one episode. `Recording` reads it back as the ticks that a learner
+or a filter takes, so that several of them can be compared on the same bytes.
+"""
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from caraware.ipc.arrays import BoolArray, Float32Array, UInt32Array, UInt64Array
+from caraware.ipc.run_file import RunFile
+from caraware.ipc.stream import EMPTY_SLOT, Observation
+
+FOLDER = "recording"
+TENSORS = ("observation", "truth", "gnss_m", "imu", "speed_steering")
+ARRAYS = ("gnss_quality", "sensors", "vehicle", "age_s", "episode_step", "valid", "terminated", "truncated")
+SCALARS = ("tick", "sim_time_ns", "evaluation", "last", "episode_last", "lesson_last", "stage")
+
+
+@dataclass(frozen=True)
+class RecordedTick:
+    """One tick, as `caraware.ipc.stream.Observation` describes it."""
+
+    episode: int
+    tick: int
+    sim_time_ns: int
+    evaluation: bool
+    last: bool
+    episode_last: bool
+    lesson_last: bool
+    stage: int
+    observation: Tensor
+    truth: Tensor
+    gnss_m: Tensor
+    imu: Tensor
+    speed_steering: Tensor
+    gnss_quality: Float32Array
+    sensors: UInt32Array
+    vehicle: UInt32Array
+    age_s: Float32Array
+    episode_step: UInt32Array
+    valid: BoolArray
+    terminated: BoolArray
+    truncated: BoolArray
+
+    @property
+    def id_hash(self) -> UInt64Array:
+        """u64 `[n]`: not recorded; 0."""
+        return np.zeros(len(self.vehicle), np.uint64)
+
+
+@dataclass
+class EpisodeWriter:
+    """Collects the ticks of an episode and writes them as one file."""
+
+    folder: Path
+    ticks: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, obs: Observation) -> None:
+        """Copy one tick; the last one of an episode writes the file."""
+        row = {name: np.asarray(getattr(obs, name)).copy() for name in (*TENSORS, *ARRAYS)}
+        self.ticks.append(row | {name: getattr(obs, name) for name in SCALARS})
+        if obs.episode_last or obs.last:
+            self.write(obs.episode)
+
+    def write(self, episode: int) -> None:
+        """Write what is there. Slots only become more: earlier ticks are filled up with empty ones."""
+        ticks, self.ticks = self.ticks, []
+        slots = max(len(tick["vehicle"]) for tick in ticks)
+        columns = {name: np.array([tick[name] for tick in ticks]) for name in SCALARS}
+        for name in (*TENSORS, *ARRAYS):
+            first = ticks[0][name]
+            whole = np.zeros((len(ticks), slots, *first.shape[1:]), first.dtype)
+            for row, tick in zip(whole, ticks, strict=True):
+                row[: len(tick[name])] = tick[name]
+                if name == "vehicle":
+                    row[len(tick[name]) :] = EMPTY_SLOT
+            columns[name] = whole
+        self.folder.mkdir(parents=True, exist_ok=True)
+        partial = self.folder / f".{episode:06d}.partial"
+        with partial.open("wb") as stream:
+            np.savez(stream, **columns)
+        partial.rename(self.folder / f"{episode:06d}.npz")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The ticks of a run that `caraware.study.recording` wrote down."""
+
+    run_dir: Path
+
+    def run(self) -> RunFile:
+        """The run file, as the trainer reads it."""
+        run: RunFile = json.loads((self.run_dir / "run.json").read_text())
+        return run
+
+    def episodes(self, *, evaluation: bool) -> Iterator[list[RecordedTick]]:
+        """Episode by episode, in the run's order: those of evaluations, or those of training."""
+        for file in sorted((self.run_dir / FOLDER).glob("*.npz")):
+            with np.load(file) as stored:
+                if bool(stored["evaluation"][0]) == evaluation:
+                    yield _ticks(int(file.stem), {name: stored[name] for name in stored.files})
+
+
+def _ticks(episode: int, columns: dict[str, Any]) -> list[RecordedTick]:
+    ticks: list[RecordedTick] = []
+    for t in range(len(columns["tick"])):
+        values: dict[str, Any] = {name: columns[name][t].item() for name in SCALARS}
+        values |= {name: torch.from_numpy(columns[name][t]) for name in TENSORS}
+        values |= {name: columns[name][t] for name in ARRAYS}
+        ticks.append(RecordedTick(episode=episode, **values))
+    return ticks
+
+
+def main(run_file: str) -> None:
+    """Record one run and write `parts/trainer.json`."""
+    from caraware import _native
+    from caraware.ipc.channel import Observation as SharedObservation
+
+    stop: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, _: stop.append(number))
+    torch.set_num_threads(1)
+    attachment = _native.Attachment(run_file)
+    run_dir = Path(json.loads(attachment.run_json)["run_dir"])
+    writer, env_steps, ticks = EpisodeWriter(run_dir / FOLDER), 0, 0
+    while not attachment.ended and not stop:
+        for obs in map(SharedObservation, attachment.receive(0.2)):
+            writer.add(obs)
+            env_steps, ticks = env_steps + int(obs.valid.sum()), ticks + 1
+            attachment.committed(obs.tick)
+            attachment.consumed(obs.tick)
+    part = {
+        "env_steps": env_steps,
+        "received_ticks": ticks,
+        "recorded_episodes": len(list(writer.folder.glob("*.npz"))),
+    }
+    (run_dir / "parts" / "trainer.json").write_text(json.dumps(part) + "\n")
+    attachment.done()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
+    # torch would take a while to tidy up, and the run ends when this process does.
+    os._exit(0)

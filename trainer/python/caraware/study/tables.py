@@ -1,0 +1,85 @@
+"""The tables of the docs that `caraware reproduce` measures again: what each runs, from which seeds.
+
+A table records a run once (`caraware.study.recording`), then lets every estimator see the same bytes.
+"""
+
+import json
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from caraware.run.program import caraware_program
+from caraware.study.fusing import FusionComparison
+from caraware.study.recording import FOLDER, Recording
+from caraware.study.regression import Comparison
+
+Measured = dict[str, list[float]]
+"""Values of each figure (m), one for each independent seed: of an evaluation, or of a learner."""
+
+FUSION_EVALUATIONS = 5
+DEFAULT_NOISE = ("gnss.correlated_std_m=0.0", "blackout.enabled=false")
+SENSORS: Mapping[str, tuple[str, ...]] = {"default_noise": DEFAULT_NOISE, "faults": ()}
+"""Settings beside the preset `fusion`, which has a slow error of fixes and blackouts."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a table is measured with."""
+
+    runs: Path
+    """Directory of the recorded runs; one that is there already is not made again."""
+    seeds: Sequence[int]
+    """Of learners."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table of the docs."""
+
+    page: str
+    title: str
+    measure: Callable[[Options], Measured]
+
+
+def filters(options: Options) -> Measured:
+    """EKF, the same with a map, and raw GNSS: five evaluation seeds, each one value."""
+    measured: Measured = {}
+    for label, settings in SENSORS.items():
+        recording = recorded(options, "fusion", label, settings)
+        of = FusionComparison(recording, FUSION_EVALUATIONS)
+        measured |= {f"{label}.{name}": values for name, values in of.filters_m().items()}
+        measured[f"{label}.raw_gnss"] = Comparison(recording, FUSION_EVALUATIONS).raw_gnss_m()
+    return measured
+
+
+def fusion(options: Options) -> Measured:
+    """The learned estimator, and its error as a share of the two filters': each learner's seed one value."""
+    of = FusionComparison(recorded(options, "fusion", "faults", SENSORS["faults"]), FUSION_EVALUATIONS)
+    filters_m = {name: float(np.mean(values)) for name, values in of.filters_m().items()}
+    means_m = [float(np.mean(of.errors_m(of.trained(seed)))) for seed in options.seeds]
+    shares = {f"fusion_by_{name}": [mean_m / filter_m for mean_m in means_m] for name, filter_m in filters_m.items()}
+    return {"fusion": means_m} | shares
+
+
+TABLES: Mapping[str, Table] = {
+    "filters": Table("docs/baselines.md", "the filters with and without a map", filters),
+    "fusion": Table("docs/fusion.md", "the learned estimator beside the filters", fusion),
+}
+
+
+def recorded(options: Options, preset: str, label: str, settings: Sequence[str]) -> Recording:
+    """The recorded run of a preset; made unless it is there whole. Raises `CalledProcessError` where it fails."""
+    name = f"recorded-{label}"
+    recording = Recording(options.runs / name)
+    part = recording.run_dir / "parts" / "trainer.json"
+    if part.exists() and json.loads(part.read_text())["recorded_episodes"] == len(
+        list((recording.run_dir / FOLDER).glob("*.npz"))
+    ):
+        return recording
+    sets = ["trainer.module=caraware.study.recording", *settings]
+    command = [str(caraware_program()), "train", preset, "--runs", str(options.runs), "--name", name]
+    subprocess.run([*command, *(word for each in sets for word in ("--set", each))], check=True)
+    return recording
