@@ -6,6 +6,7 @@
 //! (`ipc_schema::config`). The [`lidar`] scans whole ticks (`crate::scanning`), and the [`ultrasonic`]
 //! sensors measure distances; `crate::surroundings` samples both. The [`sky`] belongs to the GNSS receiver.
 
+pub mod camera;
 pub mod gnss;
 pub mod imu;
 pub mod lidar;

@@ -22,13 +22,14 @@ mod raster;
 mod returns;
 mod scan;
 pub(super) mod sensor;
-mod simd;
-mod solids;
-mod targets;
+pub(super) mod simd;
+pub(super) mod solids;
+pub(super) mod targets;
 mod weather;
 
 pub use error::LidarError;
 pub use nearest::nearest_objects;
+pub(in crate::sensors) use random::exp_minus;
 pub use scan::ScanScratch;
 pub use targets::Targets;
 

@@ -141,7 +141,7 @@ pub(super) fn sin_cos_turns<S: Simd>(word: S::U) -> [S::F; 2] {
 
 /// exp(−x) for x ≥ 0: 2^(whole part) by the exponent, the rest by a polynomial (Cephes, `expf`).
 #[inline(always)]
-pub(super) fn exp_minus<S: Simd>(x: S::F) -> S::F {
+pub(in crate::sensors) fn exp_minus<S: Simd>(x: S::F) -> S::F {
     let x = S::min(x, S::splat(80.0));
     let scaled = x * S::splat(-std::f32::consts::LOG2_E);
     // Adding and taking away 1.5 · 2²³ rounds to a whole number, whose bits stand in the mantissa meanwhile.

@@ -7,17 +7,17 @@ pub(in crate::sensors) type Rotation = [[f64; 3]; 3];
 
 /// Sensor at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct SensorPose {
-    pub(super) position_m: [f64; 3],
-    pub(super) world_from_sensor: Rotation,
+pub(in crate::sensors) struct SensorPose {
+    pub(in crate::sensors) position_m: [f64; 3],
+    pub(in crate::sensors) world_from_sensor: Rotation,
 }
 
 /// Mounting of a sensor on its carrier.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct SensorMount {
+pub(in crate::sensors) struct SensorMount {
     position_m: [f64; 3],
     body_from_sensor: Rotation,
-    pub(super) is_upright: bool,
+    pub(in crate::sensors) is_upright: bool,
 }
 
 /// `Rz(yaw) Ry(−pitch) Rx(roll)`: pitch is positive nose up, roll right side down (as in `sim_core::attitude`).
@@ -41,12 +41,12 @@ fn product(a: &Rotation, b: &Rotation) -> Rotation {
 }
 
 /// `rotation · vector`
-pub(super) fn turned(rotation: &Rotation, vector: [f64; 3]) -> [f64; 3] {
+pub(in crate::sensors) fn turned(rotation: &Rotation, vector: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|row| (0..3).map(|i| rotation[row][i] * vector[i]).sum())
 }
 
 impl SensorMount {
-    pub(super) fn new([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Self {
+    pub(in crate::sensors) fn new([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Self {
         Self {
             position_m: [x, y, z],
             body_from_sensor: rotation([roll, pitch, yaw]),
@@ -56,7 +56,7 @@ impl SensorMount {
 
     /// The sensor on a carrier in this pose.
     #[inline(always)]
-    pub(super) fn sensor(&self, carrier: &Pose) -> SensorPose {
+    pub(in crate::sensors) fn sensor(&self, carrier: &Pose) -> SensorPose {
         let world_from_body = rotation(carrier.attitude_rad);
         let arm = turned(&world_from_body, self.position_m);
         SensorPose {
@@ -66,7 +66,7 @@ impl SensorMount {
     }
 
     /// A point of the sensor's frame in the carrier's.
-    pub(super) fn body_from_point(&self, point: [f64; 3]) -> [f64; 3] {
+    pub(in crate::sensors) fn body_from_point(&self, point: [f64; 3]) -> [f64; 3] {
         let turned = turned(&self.body_from_sensor, point);
         std::array::from_fn(|axis| self.position_m[axis] + turned[axis])
     }
@@ -74,7 +74,7 @@ impl SensorMount {
 
 impl SensorPose {
     /// Roll, pitch and heading.
-    pub(super) fn attitude_rad(&self) -> [f64; 3] {
+    pub(in crate::sensors) fn attitude_rad(&self) -> [f64; 3] {
         let r = &self.world_from_sensor;
         [
             libm::atan2(r[2][1], r[2][2]),

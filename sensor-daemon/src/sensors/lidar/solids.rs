@@ -17,40 +17,40 @@ const CELL_M: f64 = 64.0;
 /// Most cells in a row or column.
 const MOST_CELLS: f64 = 2048.0;
 /// Bit in the word of an object that a LIDAR in interest mode keeps.
-pub(super) const INTEREST: u32 = 1 << 15;
+pub(in crate::sensors) const INTEREST: u32 = 1 << 15;
 /// Word of a ray without a hit.
-pub(super) const NOTHING: u32 = 0xFFFF;
+pub(in crate::sensors) const NOTHING: u32 = 0xFFFF;
 /// Shorter walls are left out, metres.
 const SHORTEST_M: f64 = 1e-6;
 
 /// A prism: walls over an outline, a roof, an underside.
 #[derive(Debug, Clone)]
-pub(super) struct StillSolid {
-    pub(super) object: u32,
+pub(in crate::sensors) struct StillSolid {
+    pub(in crate::sensors) object: u32,
     /// Tag, with [`INTEREST`] if the object is of interest.
-    pub(super) word: u32,
+    pub(in crate::sensors) word: u32,
     /// Lowest and highest point, metres.
-    pub(super) z_m: [f64; 2],
-    pub(super) walls: Range<u32>,
-    pub(super) centre_m: Point,
+    pub(in crate::sensors) z_m: [f64; 2],
+    pub(in crate::sensors) walls: Range<u32>,
+    pub(in crate::sensors) centre_m: Point,
     /// Radius of the circle about its outline, metres.
-    pub(super) reach_m: f64,
+    pub(in crate::sensors) reach_m: f64,
 }
 
 /// A wall, from corner to corner counter-clockwise about its prism.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct SolidWall {
-    pub(super) p_m: Point,
-    pub(super) q_m: Point,
+pub(in crate::sensors) struct SolidWall {
+    pub(in crate::sensors) p_m: Point,
+    pub(in crate::sensors) q_m: Point,
     /// Outwards, length 1.
-    pub(super) normal: Point,
+    pub(in crate::sensors) normal: Point,
 }
 
 /// All static solids of a scene.
 #[derive(Debug, Clone, Default)]
-pub(super) struct StillSolids {
-    pub(super) stills: Vec<StillSolid>,
-    pub(super) walls: Vec<SolidWall>,
+pub(in crate::sensors) struct StillSolids {
+    pub(in crate::sensors) stills: Vec<StillSolid>,
+    pub(in crate::sensors) walls: Vec<SolidWall>,
     /// Centres and reaches of `stills`, for the test of distance.
     near: Vec<[f64; 3]>,
     min_m: Point,
@@ -63,7 +63,7 @@ pub(super) struct StillSolids {
 }
 
 /// The wall between two corners; `None` if they coincide.
-pub(super) fn wall(p_m: Point, q_m: Point) -> Option<SolidWall> {
+pub(in crate::sensors) fn wall(p_m: Point, q_m: Point) -> Option<SolidWall> {
     let length_m = distance(p_m, q_m);
     let [x, y] = from_to(p_m, q_m);
     (length_m > SHORTEST_M).then(|| SolidWall {
@@ -74,7 +74,7 @@ pub(super) fn wall(p_m: Point, q_m: Point) -> Option<SolidWall> {
 }
 
 impl StillSolids {
-    pub(super) fn new(lidar: &config::LidarConfig, scene: &Scene) -> Self {
+    pub(in crate::sensors) fn new(lidar: &config::LidarConfig, scene: &Scene) -> Self {
         let interest = interest(lidar);
         let all: Vec<(u32, Solid<'_>, Bounds)> = (0_u32..)
             .zip(scene.bounds())
@@ -162,7 +162,7 @@ impl StillSolids {
 
     /// Calls `found` with the number and the distance of the centre of each solid that may be within `range_m` of `place`.
     #[inline(always)]
-    pub(super) fn within(&self, place: Point, range_m: f64, mut found: impl FnMut(usize, f64)) {
+    pub(in crate::sensors) fn within(&self, place: Point, range_m: f64, mut found: impl FnMut(usize, f64)) {
         if self.stills.is_empty() {
             return;
         }

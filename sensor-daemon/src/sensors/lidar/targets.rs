@@ -13,10 +13,10 @@ const TWO_WHEELER_M: f32 = 1.1;
 
 /// Position and attitude of a body.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Pose {
-    pub(super) position_m: [f64; 3],
+pub(in crate::sensors) struct Pose {
+    pub(in crate::sensors) position_m: [f64; 3],
     /// Roll (right side down), pitch (nose up), heading (counter-clockwise from east).
-    pub(super) attitude_rad: [f64; 3],
+    pub(in crate::sensors) attitude_rad: [f64; 3],
 }
 
 /// Pose at the end of a sub-step: x, y, z and heading relative to the end of the tick, then absolute roll and pitch.
@@ -24,36 +24,36 @@ type Knot = [f32; 6];
 
 /// A road user.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct MovingTarget {
-    pub(super) end: Pose,
+pub(in crate::sensors) struct MovingTarget {
+    pub(in crate::sensors) end: Pose,
     /// Extent from the origin: rear, front, half the width, height.
-    pub(super) rear_m: f64,
-    pub(super) front_m: f64,
-    pub(super) half_width_m: f64,
-    pub(super) height_m: f64,
-    pub(super) object: u32,
-    pub(super) word: u32,
-    pub(super) is_person: bool,
-    pub(super) id_hash: u64,
+    pub(in crate::sensors) rear_m: f64,
+    pub(in crate::sensors) front_m: f64,
+    pub(in crate::sensors) half_width_m: f64,
+    pub(in crate::sensors) height_m: f64,
+    pub(in crate::sensors) object: u32,
+    pub(in crate::sensors) word: u32,
+    pub(in crate::sensors) is_person: bool,
+    pub(in crate::sensors) id_hash: u64,
     /// Keeps its pose for the whole tick, or its motion is not known.
     is_still: bool,
     /// Rates of a knot at the begin of the first sub-step, per second.
     rates: Knot,
     /// Upper bound of the distance of its origin from the end of the tick, metres.
-    pub(super) travel_m: f64,
+    pub(in crate::sensors) travel_m: f64,
     /// Radius of the circle about its footprint, from the centre, metres.
-    pub(super) radius_m: f64,
+    pub(in crate::sensors) radius_m: f64,
 }
 
 /// All moving targets of a tick, for all LIDARs.
 #[derive(Debug, Clone, Default)]
 pub struct Targets {
-    pub(super) movers: Vec<MovingTarget>,
+    pub(in crate::sensors) movers: Vec<MovingTarget>,
     /// Poses at the ends of sub-steps, road user by road user.
     knots: Vec<Knot>,
-    pub(super) sub_steps: usize,
+    pub(in crate::sensors) sub_steps: usize,
     /// Centre and reach of each road user, for the test of distance.
-    pub(super) near: Vec<[f64; 3]>,
+    pub(in crate::sensors) near: Vec<[f64; 3]>,
 }
 
 impl Targets {
@@ -85,7 +85,7 @@ impl Targets {
 
     /// Pose of a road user at share `at` (0 … 1) of a sub-step that takes `dt_s`.
     #[inline(always)]
-    pub(super) fn pose(&self, row: usize, sub_step: usize, at: f64, dt_s: f64) -> Pose {
+    pub(in crate::sensors) fn pose(&self, row: usize, sub_step: usize, at: f64, dt_s: f64) -> Pose {
         let mover = &self.movers[row];
         if mover.is_still {
             return mover.end;
@@ -111,12 +111,12 @@ impl Targets {
     }
 
     /// True if the road user keeps its pose for the whole tick.
-    pub(super) fn is_still(&self, row: usize) -> bool {
+    pub(in crate::sensors) fn is_still(&self, row: usize) -> bool {
         self.movers[row].is_still
     }
 
     /// True if a road user is upright all the tick.
-    pub(super) fn is_upright(&self, row: usize) -> bool {
+    pub(in crate::sensors) fn is_upright(&self, row: usize) -> bool {
         let mover = &self.movers[row];
         let [roll, pitch, _] = mover.end.attitude_rad;
         let knots = &self.knots[row * self.sub_steps..(row + 1) * self.sub_steps];
@@ -194,7 +194,7 @@ impl MovingTarget {
 
     /// Centre of its footprint in a pose.
     #[inline(always)]
-    pub(super) fn centre_m(&self, pose: &Pose) -> [f64; 2] {
+    pub(in crate::sensors) fn centre_m(&self, pose: &Pose) -> [f64; 2] {
         if self.is_person {
             return [pose.position_m[0], pose.position_m[1]];
         }
@@ -205,7 +205,7 @@ impl MovingTarget {
 
     /// Corners, counter-clockwise from the front left.
     #[inline(always)]
-    pub(super) fn corners_m(&self, pose: &Pose) -> [[f64; 2]; 4] {
+    pub(in crate::sensors) fn corners_m(&self, pose: &Pose) -> [[f64; 2]; 4] {
         let (sin, cos) = libm::sincos(pose.attitude_rad[2]);
         let [x, y, _] = pose.position_m;
         let (front, rear, half) = (self.front_m, self.rear_m, self.half_width_m);

@@ -10,14 +10,14 @@ use std::ops::{Add, Div, Mul, Sub};
 
 /// The AVX2 implementation.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Avx2;
+pub(in crate::sensors) struct Avx2;
 
 /// Sixteen floats.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Avx2Floats([__m256; 2]);
+pub(in crate::sensors) struct Avx2Floats([__m256; 2]);
 /// Sixteen words.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Avx2Words([__m256i; 2]);
+pub(in crate::sensors) struct Avx2Words([__m256i; 2]);
 
 #[inline(always)]
 fn two<A: Copy, R>(a: [A; 2], make: impl Fn(A) -> R) -> [R; 2] {

@@ -10,14 +10,14 @@ use std::ops::{Add, Div, Mul, Sub};
 
 /// The AVX-512 implementation.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Avx512;
+pub(in crate::sensors) struct Avx512;
 
 /// Sixteen floats.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Avx512Floats(__m512);
+pub(in crate::sensors) struct Avx512Floats(__m512);
 /// Sixteen words.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Avx512Words(__m512i);
+pub(in crate::sensors) struct Avx512Words(__m512i);
 
 macro_rules! operator {
     ($name:ident, $function:ident, $intrinsic:ident) => {

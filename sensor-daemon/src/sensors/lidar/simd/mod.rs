@@ -9,38 +9,38 @@ use std::ops::{Add, Div, Mul, Sub};
 use ipc_schema::pointcloud::LidarPoint;
 
 #[cfg(target_arch = "x86_64")]
-pub(super) mod avx2;
+pub(in crate::sensors) mod avx2;
 #[cfg(target_arch = "x86_64")]
-pub(super) mod avx512;
-pub(super) mod plain;
+pub(in crate::sensors) mod avx512;
+pub(in crate::sensors) mod plain;
 
 /// Numbers side by side.
-pub(super) const WIDTH: usize = 16;
+pub(in crate::sensors) const WIDTH: usize = 16;
 
 /// Sixteen numbers in memory, on a cache line of their own.
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Floats(pub(super) [f32; WIDTH]);
+pub(in crate::sensors) struct Floats(pub(in crate::sensors) [f32; WIDTH]);
 
 /// Sixteen whole numbers in memory.
 #[repr(C, align(64))]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Words(pub(super) [u32; WIDTH]);
+pub(in crate::sensors) struct Words(pub(in crate::sensors) [u32; WIDTH]);
 
 impl Floats {
-    pub(super) const ZERO: Self = Self([0.0; WIDTH]);
+    pub(in crate::sensors) const ZERO: Self = Self([0.0; WIDTH]);
 }
 
 impl Words {
-    pub(super) const ZERO: Self = Self([0; WIDTH]);
+    pub(in crate::sensors) const ZERO: Self = Self([0; WIDTH]);
 }
 
 /// Multipliers and key steps of Philox4x32 (Salmon et al., SC 2011).
-pub(super) const MULTIPLIERS: [u32; 2] = [0xD251_1F53, 0xCD9E_8D57];
-pub(super) const WEYL: [u32; 2] = [0x9E37_79B9, 0xBB67_AE85];
+pub(in crate::sensors) const MULTIPLIERS: [u32; 2] = [0xD251_1F53, 0xCD9E_8D57];
+pub(in crate::sensors) const WEYL: [u32; 2] = [0x9E37_79B9, 0xBB67_AE85];
 
 /// Operations of the kernels on sixteen numbers.
-pub(super) trait Simd: Copy {
+pub(in crate::sensors) trait Simd: Copy {
     /// Sixteen `f32`.
     type F: Copy + Add<Output = Self::F> + Sub<Output = Self::F> + Mul<Output = Self::F> + Div<Output = Self::F>;
     /// Sixteen `u32`.
@@ -95,7 +95,7 @@ pub(super) trait Simd: Copy {
 }
 
 /// Writes the rows of the elements in `keep` from memory: for any processor, and at the end of the buffer.
-pub(super) fn compact_rows(
+pub(in crate::sensors) fn compact_rows(
     words: &[[u32; WIDTH]; 8],
     keep: u32,
     points: &mut [LidarPoint],

@@ -7,11 +7,11 @@ use std::ops::{Add, Div, Mul, Sub};
 
 /// The array implementation.
 #[derive(Clone, Copy)]
-pub(in super::super) struct Plain;
+pub(in crate::sensors) struct Plain;
 
 /// Sixteen floats.
 #[derive(Clone, Copy)]
-pub(in super::super) struct PlainFloats(pub [f32; WIDTH]);
+pub(in crate::sensors) struct PlainFloats(pub [f32; WIDTH]);
 
 macro_rules! operator {
     ($name:ident, $function:ident, $op:tt) => {

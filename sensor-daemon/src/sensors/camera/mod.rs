@@ -1,0 +1,236 @@
+//! Cameras: depth, instances, classes, colours, boxes. An image is a visibility buffer over the polygons of the scene, see [`raster`](self).
+//!
+//! The result depends on the configuration and the world of the tick alone, not on threads, the order of objects or the processor. How it
+//! works and what it costs: docs/camera.md.
+
+use ipc_schema::config::Config;
+use sim_core::scene::Scene;
+
+mod bodies;
+mod boxes;
+mod ground;
+mod labels;
+mod light;
+mod optics;
+mod raster;
+mod resolve;
+mod surfaces;
+mod view;
+
+pub use bodies::CameraTargets;
+pub use boxes::SeenObject;
+pub use labels::SemanticLabel;
+pub use optics::CameraParams;
+pub use resolve::ImagePlanes;
+pub use surfaces::SKY_INSTANCE;
+
+use crate::sensors::lidar::{
+    ScanPath, Targets,
+    sensor::SensorPose,
+    simd::{self, Simd},
+};
+
+/// A camera and the scene around it; one model serves all vehicles that carry it.
+#[derive(Debug)]
+pub struct CameraModel {
+    optics: optics::CameraOptics,
+    bodies: bodies::StillBodies,
+    ground: ground::GroundMap,
+    light: light::Daylight,
+    /// Colours of the ground, by class.
+    ground_colours: Box<[[f32; 3]; 256]>,
+    ground_m: f64,
+    path: ScanPath,
+}
+
+/// Working memory of one thread: empty at first, then kept.
+#[derive(Debug, Default)]
+pub struct CameraScratch {
+    canvas: raster::Canvas,
+    list: view::DrawList,
+    surfaces: surfaces::SurfaceTable,
+    counts: Vec<resolve::PixelCount>,
+}
+
+/// Position and attitude of a camera in the world.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CameraPose(SensorPose);
+
+impl CameraPose {
+    /// Position, metres.
+    #[must_use]
+    pub fn position_m(&self) -> [f64; 3] {
+        self.0.position_m
+    }
+
+    /// Roll (right side down), pitch (nose up) and heading (counter-clockwise from east), radians.
+    #[must_use]
+    pub fn attitude_rad(&self) -> [f64; 3] {
+        self.0.attitude_rad()
+    }
+}
+
+impl CameraModel {
+    /// A camera in a scene. Props of interest and the weather are those of the configuration.
+    #[must_use]
+    pub fn new(params: &CameraParams, config: &Config, scene: &Scene) -> Self {
+        let light = light::Daylight::new(&config.weather);
+        let mut ground_colours = Box::new([[0.0; 3]; 256]);
+        for label in SemanticLabel::ALL {
+            ground_colours[label as usize] = light.on_ground(label);
+        }
+        Self {
+            optics: optics::CameraOptics::new(params),
+            bodies: bodies::StillBodies::new(&config.lidar, scene),
+            ground: ground::GroundMap::new(scene),
+            light,
+            ground_colours,
+            ground_m: scene.road().flat_height_m().unwrap_or(0.0),
+            path: ScanPath::best(),
+        }
+    }
+
+    /// The same camera with other instructions; unchanged if this processor lacks them.
+    #[must_use]
+    pub fn with_path(mut self, path: ScanPath) -> Self {
+        if path.is_here() {
+            self.path = path;
+        }
+        self
+    }
+
+    /// The instructions it uses.
+    #[must_use]
+    pub fn path(&self) -> ScanPath {
+        self.path
+    }
+
+    /// Columns and rows of an image.
+    #[must_use]
+    pub fn size(&self) -> [usize; 2] {
+        [self.optics.width, self.optics.height]
+    }
+
+    /// Distance of the pinhole from the image, pixels.
+    #[must_use]
+    pub fn focal_px(&self) -> f64 {
+        self.optics.focal_px
+    }
+
+    /// The camera on the road user in `row` at the end of the tick; `None` if there is no such row.
+    #[must_use]
+    pub fn pose_on(&self, targets: &Targets, row: usize) -> Option<CameraPose> {
+        let mover = targets.movers.get(row)?;
+        Some(CameraPose(self.optics.mount.sensor(&mover.end)))
+    }
+
+    /// Takes an image at the end of a tick: fills the planes that are wanted, and `objects` with the road users in the image, in the
+    /// order of their rows. The road user in row `carrier` is invisible. A plane whose length is not that of the image stays as it is.
+    pub fn take(
+        &self,
+        targets: &CameraTargets,
+        carrier: Option<usize>,
+        pose: &CameraPose,
+        scratch: &mut CameraScratch,
+        planes: &mut ImagePlanes<'_>,
+        objects: &mut Vec<SeenObject>,
+    ) {
+        #[cfg(target_arch = "x86_64")]
+        #[expect(
+            unsafe_code,
+            reason = "calls of functions compiled for more than the baseline processor"
+        )]
+        match self.path {
+            // SAFETY: `CameraModel::path` holds only instructions that `ScanPath::is_here` has detected on this processor.
+            ScanPath::Avx512 => return unsafe { self.take_avx512(targets, carrier, pose, scratch, planes, objects) },
+            // SAFETY: as above.
+            ScanPath::Avx2 => return unsafe { self.take_avx2(targets, carrier, pose, scratch, planes, objects) },
+            ScanPath::Plain => {}
+        }
+        self.take_with::<simd::plain::Plain>(targets, carrier, pose, scratch, planes, objects);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx512f,avx512dq,avx512bw,avx512vl")]
+    fn take_avx512(
+        &self,
+        targets: &CameraTargets,
+        carrier: Option<usize>,
+        pose: &CameraPose,
+        scratch: &mut CameraScratch,
+        planes: &mut ImagePlanes<'_>,
+        objects: &mut Vec<SeenObject>,
+    ) {
+        self.take_with::<simd::avx512::Avx512>(targets, carrier, pose, scratch, planes, objects);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn take_avx2(
+        &self,
+        targets: &CameraTargets,
+        carrier: Option<usize>,
+        pose: &CameraPose,
+        scratch: &mut CameraScratch,
+        planes: &mut ImagePlanes<'_>,
+        objects: &mut Vec<SeenObject>,
+    ) {
+        self.take_with::<simd::avx2::Avx2>(targets, carrier, pose, scratch, planes, objects);
+    }
+
+    #[inline(always)]
+    fn take_with<S: Simd>(
+        &self,
+        targets: &CameraTargets,
+        carrier: Option<usize>,
+        pose: &CameraPose,
+        scratch: &mut CameraScratch,
+        planes: &mut ImagePlanes<'_>,
+        objects: &mut Vec<SeenObject>,
+    ) {
+        let view = view::CameraView {
+            optics: &self.optics,
+            pose: pose.0,
+        };
+        let CameraScratch {
+            canvas,
+            list,
+            surfaces,
+            counts,
+        } = scratch;
+        // Gather what may be in the image, and sort it.
+        list.clear();
+        surfaces.begin((!planes.rgb.is_empty()).then_some(self.light));
+        self.bodies.gather(&view, list, surfaces);
+        targets.gather(&view, carrier, list, surfaces);
+        list.sort();
+        // Find the first surface of each pixel.
+        canvas.room_for(&self.optics);
+        canvas.fill::<S>(view.ground(self.ground_m), (1.0 / self.optics.range_m) as f32);
+        canvas.draw::<S>(&list.items, &list.order, &list.edges, &list.cylinders, &view.axes());
+        // Write what that surface shows.
+        counts.clear();
+        counts.resize(surfaces.users.len(), resolve::PixelCount::NONE);
+        let resolver = resolve::Resolver {
+            canvas,
+            view,
+            surfaces,
+            ground: &self.ground,
+            light: &self.light,
+            ground_colours: &self.ground_colours,
+        };
+        resolver.write::<S>(planes, counts);
+        objects.clear();
+        for (row, count) in surfaces.users.iter().zip(counts.iter()) {
+            if count.pixels > 0 {
+                objects.push(SeenObject::new(
+                    &view,
+                    targets,
+                    *row as usize,
+                    targets.body(*row as usize),
+                    count,
+                ));
+            }
+        }
+    }
+}

@@ -1,0 +1,222 @@
+//! From the surface that each pixel sees to the planes of the image, and the boxes of the road users in it.
+
+use super::{
+    ground::GroundMap,
+    labels::SemanticLabel,
+    light::Daylight,
+    raster::{Canvas, GROUND_SURFACE, ImagePlane},
+    surfaces::{NO_USER, SurfaceTable},
+    view::CameraView,
+};
+use crate::sensors::lidar::simd::{Floats, Simd, WIDTH, Words};
+
+/// The planes of an image, row by row from the upper left corner. A plane that is empty is not wanted.
+#[derive(Debug, Default)]
+pub struct ImagePlanes<'a> {
+    /// Distance along the optical axis, metres; the camera's range where it sees the sky.
+    pub depth_m: &'a mut [f32],
+    /// Dense index of the road user; `STATIC_OBJECT` and the number of a building or prop; `GROUND`; or `SKY_INSTANCE`.
+    pub instance: &'a mut [u32],
+    /// A `SemanticLabel`.
+    pub semantic: &'a mut [u8],
+    /// Red, green, blue.
+    pub rgb: &'a mut [[u8; 3]],
+    /// 255 on road users and props of interest, else 0.
+    pub binary: &'a mut [u8],
+}
+
+/// Pixels of a road user that are in the image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct PixelCount {
+    pub(super) pixels: u32,
+    /// Left, top, right and bottom pixel.
+    pub(super) box_px: [u16; 4],
+}
+
+impl PixelCount {
+    pub(super) const NONE: Self = Self {
+        pixels: 0,
+        box_px: [u16::MAX, u16::MAX, 0, 0],
+    };
+
+    /// Adds a run of pixels in a row.
+    fn add(&mut self, first: usize, end: usize, row: usize) {
+        self.pixels += (end - first) as u32;
+        let [left, top, right, bottom] = &mut self.box_px;
+        (*left, *right) = ((*left).min(first as u16), (*right).max(end as u16 - 1));
+        (*top, *bottom) = ((*top).min(row as u16), (*bottom).max(row as u16));
+    }
+}
+
+/// What the planes of an image are made of.
+pub(super) struct Resolver<'a> {
+    pub(super) canvas: &'a Canvas,
+    pub(super) view: CameraView<'a>,
+    pub(super) surfaces: &'a SurfaceTable,
+    pub(super) ground: &'a GroundMap,
+    pub(super) light: &'a Daylight,
+    /// Colours of the ground, by class.
+    pub(super) ground_colours: &'a [[f32; 3]; 256],
+}
+
+/// A run of pixels of one road user.
+#[derive(Clone, Copy)]
+struct UserRun {
+    user: u16,
+    first: usize,
+}
+
+/// Sixteen pixels.
+struct Pixels {
+    depth: Floats,
+    surface: Words,
+    /// Class of the pixels on the ground.
+    label: [u8; WIDTH],
+    /// Share of the light that reaches the camera.
+    clear: Floats,
+}
+
+impl Resolver<'_> {
+    /// Writes the planes and counts the pixels of each road user into `counts`, one for each of the table's.
+    #[inline(always)]
+    pub(super) fn write<S: Simd>(&self, planes: &mut ImagePlanes<'_>, counts: &mut [PixelCount]) {
+        let optics = self.view.optics;
+        let axes = self.view.axes();
+        for row in 0..optics.height {
+            let mut run = UserRun {
+                user: NO_USER,
+                first: 0,
+            };
+            for tile in 0..self.canvas.tiles[0] {
+                let first = tile * WIDTH;
+                let count = (optics.width - first).min(WIDTH);
+                let pixels = self.sixteen::<S>(tile, row, &axes, planes);
+                let at = row * optics.width + first;
+                self.put(&pixels, at, count, planes);
+                for (element, surface) in pixels.surface.0[..count].iter().enumerate() {
+                    let user = self.surfaces.surfaces[*surface as usize].user;
+                    if user != run.user {
+                        end_run(run, first + element, row, counts);
+                        run = UserRun {
+                            user,
+                            first: first + element,
+                        };
+                    }
+                }
+            }
+            end_run(run, optics.width, row, counts);
+        }
+    }
+
+    #[inline(always)]
+    fn sixteen<S: Simd>(&self, tile: usize, row: usize, axes: &[ImagePlane; 3], planes: &ImagePlanes<'_>) -> Pixels {
+        let place = row * self.canvas.tiles[0] + tile;
+        let depth = S::splat(1.0) / S::load(&self.canvas.inverse[place]);
+        let mut pixels = Pixels {
+            depth: Floats::ZERO,
+            surface: self.canvas.surface[place],
+            label: [SemanticLabel::Terrain as u8; WIDTH],
+            clear: Floats::ZERO,
+        };
+        S::store(depth, &mut pixels.depth);
+        let ground = S::equal(S::load_words(&pixels.surface), S::splat_words(GROUND_SURFACE));
+        let needs_class = !planes.semantic.is_empty() || !planes.rgb.is_empty();
+        if needs_class && S::bits(ground) != 0 {
+            self.classes::<S>(depth, tile, row, axes, S::bits(ground), &mut pixels.label);
+        }
+        if !planes.rgb.is_empty() {
+            let clear = crate::sensors::lidar::exp_minus::<S>(depth * S::splat(self.light.extinction_per_m));
+            S::store(clear, &mut pixels.clear);
+        }
+        pixels
+    }
+
+    /// Classes of the ground that the pixels in `ground` see.
+    #[inline(always)]
+    fn classes<S: Simd>(
+        &self,
+        depth: S::F,
+        tile: usize,
+        row: usize,
+        axes: &[ImagePlane; 3],
+        ground: u32,
+        label: &mut [u8; WIDTH],
+    ) {
+        let [x_m, y_m, _] = self.view.pose.position_m;
+        let origin = self.ground.place([x_m, y_m]);
+        let per_m = S::splat(self.ground.cells_per_m() as f32);
+        let (a, b) = (S::load(&self.canvas.a[tile]), S::splat(self.canvas.b[row]));
+        let mut cells = [Words::ZERO; 2];
+        for (axis, cells) in cells.iter_mut().enumerate() {
+            let ray = axes[axis].along::<S>(a) + b * S::splat(axes[axis].0[2]);
+            // Whole cells by adding 2²³: the sum's mantissa holds the nearest whole number. Half a cell makes that the cell's own number.
+            let magic = S::splat(8_388_608.0);
+            let cell = S::max(
+                S::splat((origin[axis] - 0.5) as f32) + ray * depth * per_m,
+                S::splat(0.0),
+            );
+            let cell = S::min(cell, S::splat(8_388_607.0)) + magic;
+            S::store_words(S::minus(S::words(cell), S::splat_words(0x4B00_0000)), cells);
+        }
+        for (element, label) in label.iter_mut().enumerate() {
+            if ground >> element & 1 == 1 {
+                *label = self.ground.class(cells[0].0[element], cells[1].0[element]);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn put(&self, pixels: &Pixels, at: usize, count: usize, planes: &mut ImagePlanes<'_>) {
+        let table = &self.surfaces.surfaces;
+        if let Some(depth) = planes.depth_m.get_mut(at..at + count) {
+            depth.copy_from_slice(&pixels.depth.0[..count]);
+        }
+        if let Some(instance) = planes.instance.get_mut(at..at + count) {
+            for (to, surface) in instance.iter_mut().zip(&pixels.surface.0) {
+                *to = table[*surface as usize].instance;
+            }
+        }
+        if let Some(semantic) = planes.semantic.get_mut(at..at + count) {
+            for (element, to) in semantic.iter_mut().enumerate() {
+                let surface = pixels.surface.0[element];
+                *to = match surface {
+                    GROUND_SURFACE => pixels.label[element],
+                    _ => table[surface as usize].label,
+                };
+            }
+        }
+        if let Some(binary) = planes.binary.get_mut(at..at + count) {
+            for (to, surface) in binary.iter_mut().zip(&pixels.surface.0) {
+                *to = if table[*surface as usize].is_interesting {
+                    255
+                } else {
+                    0
+                };
+            }
+        }
+        if let Some(rgb) = planes.rgb.get_mut(at..at + count) {
+            let sky = self.light.sky();
+            for (element, to) in rgb.iter_mut().enumerate() {
+                let surface = pixels.surface.0[element];
+                let colour = match surface {
+                    GROUND_SURFACE => &self.ground_colours[usize::from(pixels.label[element])],
+                    _ => &table[surface as usize].colour,
+                };
+                let clear = pixels.clear.0[element];
+                *to = [0, 1, 2].map(|i: usize| {
+                    let mixed = sky[i] + clear * (colour[i] - sky[i]);
+                    (mixed * 255.0 + 0.5).clamp(0.0, 255.0) as u8
+                });
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn end_run(run: UserRun, end: usize, row: usize, counts: &mut [PixelCount]) {
+    if let Some(count) = counts.get_mut(usize::from(run.user))
+        && end > run.first
+    {
+        count.add(run.first, end, row);
+    }
+}

@@ -1,0 +1,134 @@
+//! Images of single bodies in closed form.
+
+use sensor_daemon::sensors::camera::{SKY_INSTANCE, SemanticLabel};
+
+use crate::{
+    CameraModel, CameraScratch, GROUND, Kind, Road, Scene, Taken, VehicleState, car, config, params, rectangle,
+    scene_of, take,
+};
+
+fn at(taken: &Taken, u: usize, v: usize) -> (u32, f32, u8, u8) {
+    let pixel = v * 100 + u;
+    (
+        taken.instance[pixel],
+        taken.depth_m[pixel],
+        taken.semantic[pixel],
+        taken.binary[pixel],
+    )
+}
+
+#[test]
+fn a_wall_square_to_the_camera_has_one_depth() {
+    let scene = scene_of(vec![rectangle([12.0, 20.0], [-30.0, 30.0], 4.5)]);
+    let camera = CameraModel::new(&params(100, 100, [2.0, 0.0, 1.5, 0.0, 0.0, 0.0]), &config(), &scene);
+    let (taken, _) = take(&camera, &[car(0, 0.0, 0.0, 0.0)], 0, &mut CameraScratch::default());
+    // f = 50 px: the roof is 3 m above at 10 m, 15 px over the middle; the foot 1.5 m below, 7.5 px under it.
+    for u in 0..100 {
+        for v in 0..100 {
+            let (instance, depth_m, label, binary) = at(&taken, u, v);
+            let below = (v as f64 + 0.5 - 50.0) / 50.0;
+            if below < -0.3 {
+                assert!(
+                    (instance, label) == (SKY_INSTANCE, SemanticLabel::Sky as u8) && (depth_m - 120.0).abs() < 1e-4
+                );
+            } else if below < 0.15 {
+                assert!(instance == 1 << 31 && label == SemanticLabel::Building as u8 && (depth_m - 10.0).abs() < 1e-5);
+            } else {
+                let expected = 1.5 / below;
+                assert!(
+                    instance == GROUND && label == SemanticLabel::Terrain as u8,
+                    "({u}, {v})"
+                );
+                assert!((f64::from(depth_m) - expected).abs() < 1e-5 * expected);
+            }
+            assert_eq!(binary, 0);
+        }
+    }
+}
+
+#[test]
+fn each_kind_of_road_user_has_its_class_and_is_white() {
+    use SemanticLabel::{Bicycle, Bus, Car, Motorcycle, Person, Truck};
+    let of = |length_m: f32, width_m: f32, height_m: f32, kind: Kind| VehicleState {
+        length_m,
+        width_m,
+        height_m,
+        kind: kind as u32,
+        ..car(1, 20.0, 0.0, 0.0)
+    };
+    for (state, expected) in [
+        (of(5.0, 1.8, 1.5, Kind::Other), Car),
+        (of(6.5, 2.16, 2.86, Kind::Other), Truck),
+        (of(7.1, 2.4, 2.4, Kind::Other), Truck),
+        (of(16.5, 2.55, 4.0, Kind::Other), Truck),
+        (of(12.0, 2.5, 3.4, Kind::Other), Bus),
+        (of(2.2, 0.9, 1.5, Kind::Other), Motorcycle),
+        (of(1.6, 0.65, 1.7, Kind::Other), Bicycle),
+        (of(0.5, 0.5, 1.7, Kind::Person), Person),
+    ] {
+        let camera = CameraModel::new(
+            &params(100, 100, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0]),
+            &config(),
+            &scene_of(Vec::new()),
+        );
+        let (taken, _) = take(
+            &camera,
+            &[car(0, 0.0, 0.0, 0.0), state],
+            0,
+            &mut CameraScratch::default(),
+        );
+        let (instance, _, label, binary) = at(&taken, 49, 50);
+        assert_eq!((instance, label, binary), (1, expected as u8, 255));
+        assert_eq!(taken.objects[0].label, expected as u32);
+    }
+}
+
+#[test]
+fn fog_whitens_what_is_far_and_night_darkens_all() {
+    let scene = scene_of(vec![rectangle([52.0, 60.0], [-99.0, 99.0], 40.0)]);
+    let wall = |visibility_m: f64, sun_deg: f64| {
+        let mut config = config();
+        (config.weather.visibility_m, config.weather.sun_elevation_deg) = (visibility_m, sun_deg);
+        config.weather.sunlight = 0.0;
+        let camera = CameraModel::new(&params(100, 100, [2.0, 0.0, 1.5, 0.0, 0.0, 0.0]), &config, &scene);
+        let (taken, _) = take(&camera, &[car(0, 0.0, 0.0, 0.0)], 0, &mut CameraScratch::default());
+        [taken.rgb[40 * 100 + 50], taken.rgb[0]]
+    };
+    let [[clear, sky], [fog, _], [night, _]] = [wall(1e9, 45.0), wall(50.0, 45.0), wall(1e9, -20.0)];
+    for i in 0..3 {
+        // Koschmieder: at the visibility, exp(−3.912) = 2 % of the contrast is left.
+        let expected = f64::from(sky[i]) + 0.02 * (f64::from(clear[i]) - f64::from(sky[i]));
+        assert!((f64::from(fog[i]) - expected).abs() <= 1.5, "{fog:?} {clear:?} {sky:?}");
+        assert!(night[i] * 5 < clear[i], "{night:?} {clear:?}");
+    }
+}
+
+#[test]
+fn odd_positions_do_no_harm() {
+    let scene = scene_of(vec![rectangle([-5.0, 5.0], [-5.0, 5.0], 9.0)]);
+    let camera = CameraModel::new(&params(40, 30, [0.0, 0.0, 1.5, 0.1, 0.0, 0.0]), &config(), &scene);
+    let mut scratch = CameraScratch::default();
+    for [x, y, z] in [
+        [0.0; 3],
+        [5.0, 5.0, 0.0],
+        [5.0, 0.0, 0.0],
+        [5.0 + 1e-9, 1e-9, 7.5],
+        [9.0, 0.0, -30.0],
+        [0.0, 0.0, 90.0],
+    ] {
+        let mut states = [car(0, x, y, 3.0), car(1, x, y, 1.0), car(2, x + 3.0, y, 0.0)];
+        states[0].z_m = z;
+        let (taken, _) = take(&camera, &states, 0, &mut scratch);
+        assert!(
+            taken.depth_m.iter().all(|depth_m| (0.0..=120.001).contains(depth_m)),
+            "{x} {y} {z}"
+        );
+        assert!(z >= 0.0 || !taken.instance.contains(&GROUND));
+    }
+    let none = CameraModel::new(
+        &params(40, 30, [0.0; 6]),
+        &config(),
+        &Scene::new(Road::default(), Vec::new(), Vec::new()),
+    );
+    assert_eq!(take(&none, &[car(0, 0.0, 0.0, 0.0)], 0, &mut scratch).0.objects, []);
+}

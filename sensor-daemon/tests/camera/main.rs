@@ -1,0 +1,101 @@
+//! Images of cameras: against parry3d, on every instruction set, and in closed form.
+
+#![expect(clippy::unwrap_used, reason = "tests assert by unwrapping")]
+
+use ipc_schema::{
+    config::Config,
+    pointcloud::GROUND,
+    traffic::Kind,
+    world::{SubStep, VehicleState},
+};
+use sensor_daemon::sensors::{
+    camera::{CameraModel, CameraParams, CameraPose, CameraScratch, CameraTargets, ImagePlanes, SeenObject},
+    lidar::Targets,
+};
+use sim_core::scene::{Prism, Road, Scene, SolidClass};
+
+mod boxes;
+mod closed_form;
+#[path = "../lidar_city/mod.rs"]
+mod lidar_city;
+mod oracle;
+mod paths;
+
+/// An image with all planes.
+#[derive(Debug, Default, Clone, PartialEq)]
+struct Taken {
+    depth_m: Vec<f32>,
+    instance: Vec<u32>,
+    semantic: Vec<u8>,
+    rgb: Vec<[u8; 3]>,
+    binary: Vec<u8>,
+    objects: Vec<SeenObject>,
+}
+
+fn params(width: usize, height: usize, mount: [f64; 6]) -> CameraParams {
+    CameraParams {
+        width,
+        height,
+        horizontal_fov_deg: 90.0,
+        range_m: 120.0,
+        mount,
+    }
+}
+
+fn config() -> Config {
+    lidar_city::config()
+}
+
+/// Takes an image from the road user in `row`.
+fn take(camera: &CameraModel, states: &[VehicleState], row: usize, scratch: &mut CameraScratch) -> (Taken, CameraPose) {
+    let steps: &[SubStep] = &[];
+    let mut targets = Targets::default();
+    targets.update(states, steps, 0);
+    let mut seen = CameraTargets::default();
+    seen.update(&targets);
+    let [width, height] = camera.size();
+    let pixels = width * height;
+    let mut taken = Taken {
+        depth_m: vec![0.0; pixels],
+        instance: vec![0; pixels],
+        semantic: vec![0; pixels],
+        rgb: vec![[0; 3]; pixels],
+        binary: vec![0; pixels],
+        objects: Vec::new(),
+    };
+    let pose = camera.pose_on(&targets, row).unwrap();
+    let mut planes = ImagePlanes {
+        depth_m: &mut taken.depth_m,
+        instance: &mut taken.instance,
+        semantic: &mut taken.semantic,
+        rgb: &mut taken.rgb,
+        binary: &mut taken.binary,
+    };
+    camera.take(&seen, Some(row), &pose, scratch, &mut planes, &mut taken.objects);
+    (taken, pose)
+}
+
+fn car(number: u32, x: f64, y: f64, yaw: f64) -> VehicleState {
+    VehicleState {
+        x_m: x,
+        y_m: y,
+        yaw_rad: yaw,
+        id_hash: u64::from(number) + 9,
+        length_m: 4.0,
+        width_m: 2.0,
+        height_m: 1.5,
+        rear_overhang_m: 1.0,
+        vehicle: number,
+        kind: Kind::Other as u32,
+        ..VehicleState::default()
+    }
+}
+
+fn rectangle(x: [f64; 2], y: [f64; 2], height_m: f64) -> Prism {
+    let outline = vec![[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]];
+    Prism::new("block".into(), SolidClass::Building, outline, 0.0, height_m).unwrap()
+}
+
+fn scene_of(buildings: Vec<Prism>) -> Scene {
+    Scene::new(Road::default(), buildings, Vec::new())
+}
