@@ -7,9 +7,10 @@ use parry3d_f64::{
     shape::{Cuboid, Cylinder, TriMesh},
 };
 use sensor_daemon::sensors::camera::SKY_INSTANCE;
+use sim_core::scene::{RoadPiece, SurfaceKind};
 
 use crate::{
-    CameraModel, CameraPose, CameraScratch, GROUND, Kind, Scene, VehicleState, config, lidar_city,
+    CameraModel, CameraPose, CameraScratch, GROUND, Kind, Road, Scene, VehicleState, config, lidar_city,
     lidar_city::{Moves, Random, scene, traffic},
     params, take,
 };
@@ -26,8 +27,58 @@ fn parts(state: &VehicleState) -> Vec<[f64; 4]> {
 struct World<'a> {
     buildings: TriMesh,
     owner: Vec<u32>,
+    /// Ground that is not flat.
+    ground: Option<TriMesh>,
     states: &'a [VehicleState],
     range_m: f64,
+}
+
+/// The test city on hills: streets that rise and fall by up to 8 m.
+fn hilly() -> Scene {
+    let height_m = |x: f64, y: f64| 4.0 * (x / 55.0).sin() + 4.0 * (y / 70.0).cos();
+    let streets = (0..17).flat_map(|street| [(street, false), (street, true)]);
+    let pieces = streets.map(|(street, is_north)| {
+        let across = 50.0 * (f64::from(street) - 8.0);
+        let at = |step: u32| {
+            let along = 10.0 * f64::from(step) - 420.0;
+            let [x, y] = if is_north { [across, along] } else { [along, across] };
+            [x, y, height_m(x, y)]
+        };
+        RoadPiece {
+            id: format!("street{street}{is_north}_0"),
+            surface: SurfaceKind::Lane,
+            shape_m: (0..85).map(at).collect(),
+            half_width_m: Some(4.0),
+            junctions: [0; 2],
+        }
+    });
+    Scene::new(
+        Road::new(pieces.collect()),
+        scene(500, 1).buildings().to_vec(),
+        Vec::new(),
+    )
+}
+
+/// The ground as docs/camera.md has it: cells of 5 m, 100 m beyond the outermost road, two triangles each.
+fn relief(scene: &Scene) -> TriMesh {
+    let places: Vec<_> = scene.road().pieces().iter().flat_map(|piece| &piece.shape_m).collect();
+    let low = [0, 1].map(|axis: usize| places.iter().map(|place| place[axis]).fold(f64::INFINITY, f64::min) - 100.0);
+    let high = [0, 1].map(|axis: usize| places.iter().map(|place| place[axis]).fold(0.0, f64::max) + 100.0);
+    let [columns, rows] = [0, 1].map(|axis: usize| ((high[axis] - low[axis]) / 5.0).ceil() as u32 + 1);
+    let corners = (0..columns * rows).map(|corner| {
+        let (x, y) = (
+            low[0] + 5.0 * f64::from(corner % columns),
+            low[1] + 5.0 * f64::from(corner / columns),
+        );
+        Vector::new(x, y, scene.ground_height_m(x, y))
+    });
+    let mut faces = Vec::new();
+    for row in 0..rows - 1 {
+        for at in row * columns..(row + 1) * columns - 1 {
+            faces.extend([[at, at + 1, at + columns], [at + 1, at + columns + 1, at + columns]]);
+        }
+    }
+    TriMesh::new(corners.collect(), faces).unwrap()
 }
 
 impl<'a> World<'a> {
@@ -37,6 +88,7 @@ impl<'a> World<'a> {
         Self {
             buildings: TriMesh::new(vertices, faces).unwrap(),
             owner,
+            ground: (!scene.road().pieces().is_empty()).then(|| relief(scene)),
             states,
             range_m,
         }
@@ -50,13 +102,17 @@ impl<'a> World<'a> {
                 hit = (object, range_m);
             }
         };
-        if ray[2] < 0.0 {
-            offer(-origin[2] / ray[2], GROUND);
-        }
         let cast = Ray::new(
             Vector::new(origin[0], origin[1], origin[2]),
             Vector::new(ray[0], ray[1], ray[2]),
         );
+        if let Some(ground) = &self.ground {
+            if let Some(range_m) = ground.cast_local_ray(&cast, most_m, false) {
+                offer(range_m, GROUND);
+            }
+        } else if ray[2] < 0.0 {
+            offer(-origin[2] / ray[2], GROUND);
+        }
         if let Some(met) = self.buildings.cast_local_ray_and_get_normal(&cast, most_m, false) {
             offer(
                 met.time_of_impact,
@@ -130,9 +186,11 @@ fn axes(pose: &CameraPose) -> [[f64; 3]; 3] {
     })
 }
 
-fn compare(moves: Moves, images: std::ops::Range<usize>, size: [usize; 2], seed: u64) -> Agreement {
-    let scene = scene(500, 1);
-    let (states, _) = traffic(200, 60, moves, 0, seed);
+fn compare(scene: &Scene, moves: Moves, images: std::ops::Range<usize>, size: [usize; 2], seed: u64) -> Agreement {
+    let (mut states, _) = traffic(200, 60, moves, 0, seed);
+    for state in &mut states {
+        state.z_m = scene.ground_height_m(state.x_m, state.y_m);
+    }
     let mut random = Random(seed);
     let mut agreement = Agreement::default();
     let mut scratch = CameraScratch::default();
@@ -148,9 +206,9 @@ fn compare(moves: Moves, images: std::ops::Range<usize>, size: [usize; 2], seed:
             random.between(-3.0, 3.0),
         ];
         let params = params(size[0], size[1], mount);
-        let camera = CameraModel::new(&params, &config(), &scene);
+        let camera = CameraModel::new(&params, &config(), scene);
         let (taken, pose) = take(&camera, &states, row, &mut scratch);
-        let world = World::new(&scene, &states, params.range_m);
+        let world = World::new(scene, &states, params.range_m);
         let [ahead, left, up] = axes(&pose);
         let origin = pose.position_m();
         for pixel in 0..size[0] * size[1] {
@@ -210,18 +268,24 @@ fn check(agreement: &Agreement) {
 
 #[test]
 fn upright_cameras_see_what_parry_sees() {
-    check(&compare(Moves::Straight, 0..6, [160, 120], 2));
+    check(&compare(&scene(500, 1), Moves::Straight, 0..6, [160, 120], 2));
 }
 
 #[test]
 fn leaning_cameras_see_what_parry_sees() {
-    check(&compare(Moves::Wildly, 6..12, [160, 120], 3));
+    check(&compare(&scene(500, 1), Moves::Wildly, 6..12, [160, 120], 3));
+}
+
+#[test]
+fn cameras_on_hills_see_what_parry_sees() {
+    check(&compare(&hilly(), Moves::Wildly, 12..16, [160, 120], 6));
 }
 
 /// Ten million rays: `cargo test --release --test camera -- --ignored ten_million`.
 #[test]
 #[ignore = "minutes of processor time"]
 fn ten_million_rays() {
-    check(&compare(Moves::Straight, 0..100, [320, 160], 4));
-    check(&compare(Moves::Wildly, 100..200, [320, 160], 5));
+    check(&compare(&scene(500, 1), Moves::Straight, 0..80, [320, 160], 4));
+    check(&compare(&scene(500, 1), Moves::Wildly, 80..160, [320, 160], 5));
+    check(&compare(&hilly(), Moves::Wildly, 160..200, [320, 160], 6));
 }

@@ -13,6 +13,7 @@ mod labels;
 mod light;
 mod optics;
 mod raster;
+mod relief;
 mod resolve;
 mod surfaces;
 mod view;
@@ -25,7 +26,7 @@ pub use resolve::ImagePlanes;
 pub use surfaces::SKY_INSTANCE;
 
 use crate::sensors::lidar::{
-    ScanPath, Targets,
+    ScanPath, Targets, flat_ground_m,
     sensor::SensorPose,
     simd::{self, Simd},
 };
@@ -39,7 +40,9 @@ pub struct CameraModel {
     light: light::Daylight,
     /// Colours of the ground, by class.
     ground_colours: Box<[[f32; 3]; 256]>,
-    ground_m: f64,
+    /// Height of flat ground; `None` if it is not flat.
+    ground_m: Option<f64>,
+    relief: Option<relief::Relief>,
     path: ScanPath,
 }
 
@@ -85,7 +88,8 @@ impl CameraModel {
             ground: ground::GroundMap::new(scene),
             light,
             ground_colours,
-            ground_m: scene.road().flat_height_m().unwrap_or(0.0),
+            ground_m: flat_ground_m(scene),
+            relief: relief::Relief::new(scene),
             path: ScanPath::best(),
         }
     }
@@ -203,10 +207,16 @@ impl CameraModel {
         surfaces.begin((!planes.rgb.is_empty()).then_some(self.light));
         self.bodies.gather(&view, list, surfaces);
         targets.gather(&view, carrier, list, surfaces);
+        if let Some(relief) = &self.relief {
+            relief.gather(&view, list);
+        }
         list.sort();
         // Find the first surface of each pixel.
         canvas.room_for(&self.optics);
-        canvas.fill::<S>(view.ground(self.ground_m), (1.0 / self.optics.range_m) as f32);
+        canvas.fill::<S>(
+            self.ground_m.and_then(|ground_m| view.ground(ground_m)),
+            (1.0 / self.optics.range_m) as f32,
+        );
         canvas.draw::<S>(&list.items, &list.order, &list.edges, &list.cylinders, &view.axes());
         // Write what that surface shows.
         counts.clear();

@@ -53,9 +53,7 @@ impl SceneMeshes {
 
     pub(super) fn new(placements: &[MeshPlacement], scene: &Scene) -> Result<Self, LidarError> {
         let mut meshes = Vec::new();
-        if flat_ground_m(scene).is_none() {
-            meshes.extend(ground(scene));
-        }
+        meshes.extend(GroundGrid::new(scene).as_ref().and_then(GroundGrid::mesh));
         let first = (scene.buildings().len() + scene.props().len()) as u32;
         for (number, placement) in (first..).zip(placements) {
             meshes.push(Mesh {
@@ -90,38 +88,77 @@ impl SceneMeshes {
 }
 
 /// Height of the ground if it is flat: in a net without elevation, and without a net.
-pub(super) fn flat_ground_m(scene: &Scene) -> Option<f64> {
+pub(in crate::sensors) fn flat_ground_m(scene: &Scene) -> Option<f64> {
     let road = scene.road();
     road.flat_height_m().or(road.pieces().is_empty().then_some(0.0))
 }
 
-/// The ground between and about the roads, as tall as the nearest road at the corners of a grid.
-fn ground(scene: &Scene) -> Option<Mesh> {
-    let corners = scene.road().pieces().iter().flat_map(|piece| &piece.shape_m);
-    let bounds = Bounds::of(corners.map(|[x, y, _]| [*x, *y])).grown(MARGIN_M);
-    let size = [0, 1].map(|axis: usize| bounds.max_m[axis] - bounds.min_m[axis]);
-    let cell_m = GROUND_CELL_M.max((size[0] * size[1] / GROUND_CELLS).sqrt());
-    let [columns, rows] = size.map(|length_m| (length_m / cell_m).ceil() as u32 + 1);
-    let mut vertices = Vec::new();
-    for row in 0..rows {
-        for column in 0..columns {
-            let x = bounds.min_m[0] + f64::from(column) * cell_m;
-            let y = bounds.min_m[1] + f64::from(row) * cell_m;
-            vertices.push(Vector::new(x, y, scene.ground_height_m(x, y)));
+/// The ground between and about the roads of a net with elevation: heights at the corners of a grid.
+#[derive(Debug, Clone)]
+pub(in crate::sensors) struct GroundGrid {
+    pub(in crate::sensors) min_m: [f64; 2],
+    pub(in crate::sensors) cell_m: f64,
+    /// Corners in a row and in a column, two at least.
+    pub(in crate::sensors) corners: [usize; 2],
+    /// Row by row.
+    heights_m: Vec<f64>,
+}
+
+impl GroundGrid {
+    /// As tall as the nearest road at each corner; `None` if the ground is flat.
+    pub(in crate::sensors) fn new(scene: &Scene) -> Option<Self> {
+        if flat_ground_m(scene).is_some() {
+            return None;
         }
+        let corners = scene.road().pieces().iter().flat_map(|piece| &piece.shape_m);
+        let bounds = Bounds::of(corners.map(|[x, y, _]| [*x, *y])).grown(MARGIN_M);
+        let size = [0, 1].map(|axis: usize| bounds.max_m[axis] - bounds.min_m[axis]);
+        let cell_m = GROUND_CELL_M.max((size[0] * size[1] / GROUND_CELLS).sqrt());
+        let mut grid = Self {
+            min_m: bounds.min_m,
+            cell_m,
+            corners: size.map(|length_m| (length_m / cell_m).ceil() as usize + 1),
+            heights_m: Vec::new(),
+        };
+        let [columns, rows] = grid.corners;
+        let places = (0..columns * rows).map(|corner| grid.place(corner % columns, corner / columns));
+        grid.heights_m = places.map(|[x, y]| scene.ground_height_m(x, y)).collect();
+        Some(grid)
     }
-    let mut triangles = Vec::new();
-    for row in 0..rows - 1 {
-        for column in 0..columns - 1 {
-            let at = row * columns + column;
-            triangles.extend([[at, at + 1, at + columns], [at + 1, at + columns + 1, at + columns]]);
+
+    fn place(&self, column: usize, row: usize) -> [f64; 2] {
+        [
+            self.min_m[0] + column as f64 * self.cell_m,
+            self.min_m[1] + row as f64 * self.cell_m,
+        ]
+    }
+
+    /// A corner in the world.
+    #[inline(always)]
+    pub(in crate::sensors) fn corner(&self, column: usize, row: usize) -> [f64; 3] {
+        let [x, y] = self.place(column, row);
+        [x, y, self.heights_m[row * self.corners[0] + column]]
+    }
+
+    fn mesh(&self) -> Option<Mesh> {
+        let [columns, rows] = self.corners;
+        let corners = (0..columns * rows).map(|corner| {
+            let [x, y, z] = self.corner(corner % columns, corner / columns);
+            Vector::new(x, y, z)
+        });
+        let (width, mut triangles) = (columns as u32, Vec::new());
+        for row in 0..rows as u32 - 1 {
+            for column in 0..width - 1 {
+                let at = row * width + column;
+                triangles.extend([[at, at + 1, at + width], [at + 1, at + width + 1, at + width]]);
+            }
         }
+        let triangles = TriMesh::new(corners.collect(), triangles).ok()?;
+        Some(Mesh {
+            triangles,
+            object: GROUND,
+        })
     }
-    let triangles = TriMesh::new(vertices, triangles).ok()?;
-    Some(Mesh {
-        triangles,
-        object: GROUND,
-    })
 }
 
 /// The triangles of a mesh, in the world.

@@ -28,6 +28,7 @@ pub(super) mod targets;
 mod weather;
 
 pub use error::LidarError;
+pub(in crate::sensors) use mesh::{GroundGrid, flat_ground_m};
 pub use nearest::nearest_objects;
 pub(in crate::sensors) use random::exp_minus;
 pub use scan::ScanScratch;
@@ -114,7 +115,7 @@ impl LidarModel {
             solids: solids::StillSolids::new(lidar, scene),
             receiver: returns::ReturnModel::new(config),
             path: ScanPath::best(),
-            ground_m: mesh::flat_ground_m(scene),
+            ground_m: flat_ground_m(scene),
             is_rolling: lidar.rolling_shutter,
             is_paper: lidar.axes == LidarAxes::Paper,
             range_m: lidar.range_m,
