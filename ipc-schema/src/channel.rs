@@ -5,10 +5,12 @@ use crate::{
     control::{MAX_SWITCHES, SensorSwitchLayout},
     ego::EgoPoseLayout,
     event::CollisionLayout,
+    image::{ImageLayout, ImagePlane, MOST_SEEN},
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
     prediction::{ESTIMATE_COLUMNS, PredictionLayout},
     process::Process::{self, SensorDaemon, SimCore, TrafficBridge, Trainer},
+    radar::{MOST_DETECTIONS, RadarLayout},
     run::RunFile,
     section::SectionSpec,
     traffic::{
@@ -47,6 +49,10 @@ pub enum Channel {
     Pointcloud = 8,
     /// Sensors that commands switch on and off.
     Switch = 9,
+    /// What cameras see: one message for each camera and image.
+    Image = 10,
+    /// What radars detect: one message for each radar and scan.
+    Radar = 11,
 }
 
 /// What happens to a message that finds a subscriber's queue full.
@@ -127,7 +133,7 @@ const fn two_batches(queue_length: usize) -> usize {
 }
 
 /// Every data service, by [`Channel`].
-pub const CHANNELS: [ChannelSpec; 10] = [
+pub const CHANNELS: [ChannelSpec; 12] = [
     ChannelSpec {
         channel: Channel::Traffic,
         name: "traffic",
@@ -304,6 +310,40 @@ pub const CHANNELS: [ChannelSpec; 10] = [
         queue_length: |run| traffic_frames(run) + windowful(run),
         in_hand: |run| two_batches(Channel::Switch.queue_length(run)),
         is_used: |_| true,
+    },
+    ChannelSpec {
+        channel: Channel::Image,
+        name: "image",
+        payload: "`ImageHead`, planes, `[SeenObject]`: one message for each camera and image",
+        sections: ImageLayout::SECTIONS,
+        dimensions: ImageLayout::DIMENSIONS,
+        producer: SensorDaemon,
+        required: &[],
+        window: RunFile::window_ticks,
+        topics: &[],
+        when_full: FullQueue::DropOldest,
+        max_payload: |run| ImageLayout::new(MOST_SEEN, ImagePlane::bytes(&run.config.camera)).len,
+        // The messages of one tick.
+        queue_length: |run| run.config.camera.vehicles as usize + SPARE_MESSAGES,
+        in_hand: |_| SPARE_MESSAGES,
+        is_used: |run| run.config.camera.vehicles > 0,
+    },
+    ChannelSpec {
+        channel: Channel::Radar,
+        name: "radar",
+        payload: "`RadarScan`, `[RadarDetection]`: one message for each radar and scan",
+        sections: RadarLayout::SECTIONS,
+        dimensions: RadarLayout::DIMENSIONS,
+        producer: SensorDaemon,
+        required: &[],
+        window: RunFile::window_ticks,
+        topics: &[],
+        when_full: FullQueue::DropOldest,
+        max_payload: |_| RadarLayout::new(MOST_DETECTIONS).len,
+        // The messages of one tick.
+        queue_length: |run| run.config.radar.vehicles as usize + SPARE_MESSAGES,
+        in_hand: |_| SPARE_MESSAGES,
+        is_used: |run| run.config.radar.vehicles > 0,
     },
 ];
 

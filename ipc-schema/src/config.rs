@@ -3,10 +3,12 @@
 
 use serde::{Deserialize, Serialize};
 
+mod camera;
 mod curriculum;
 mod fanout;
 mod lidar_pattern;
 mod observation;
+mod radar;
 mod region;
 mod scene;
 mod sensors;
@@ -14,10 +16,12 @@ pub(crate) mod text;
 mod trainer;
 mod ultrasonic;
 mod vehicle;
+pub use camera::*;
 pub use curriculum::*;
 pub use fanout::*;
 pub use lidar_pattern::*;
 pub use observation::*;
+pub use radar::*;
 pub use region::*;
 pub use scene::*;
 pub use sensors::*;
@@ -63,6 +67,10 @@ pub struct Config {
     pub lidar: LidarConfig,
     /// Ultrasonic sensors in the bumpers.
     pub ultrasonic: UltrasonicConfig,
+    /// Camera.
+    pub camera: CameraConfig,
+    /// Radar.
+    pub radar: RadarConfig,
     /// What happens while a sensor is dark.
     pub blackout: BlackoutConfig,
     /// Fields and normalisation of the observation.

@@ -16,7 +16,9 @@ use crate::{
     event::Collision,
     field::FIELDS,
     header::MessageHeader,
+    image::{ImageHead, SeenObject},
     pointcloud::{LidarPoint, Scan},
+    radar::{RadarDetection, RadarScan},
     section::{SectionSpec, WireElement, numpy_type},
     sensor::{SENSORS, SensorKind},
     traffic::{RoutePoint, SignalMeta, TrafficState, VehicleMeta},
@@ -218,6 +220,49 @@ pub fn table() -> Vec<TypeLayout> {
             azimuths,
             reserved
         }),
+        layout!(ImageHead {
+            position_m,
+            attitude_rad,
+            id_hash,
+            vehicle,
+            width,
+            height,
+            planes,
+            focal_px,
+            range_m
+        }),
+        layout!(SeenObject {
+            object,
+            label,
+            visible_px,
+            visible_box_px,
+            full_box_px,
+            truncated,
+            depth_m
+        }),
+        layout!(RadarScan {
+            position_m,
+            attitude_rad,
+            id_hash,
+            vehicle,
+            range_m,
+            range_resolution_m,
+            velocity_resolution_mps,
+            velocity_ambiguity_mps,
+            azimuth_resolution_rad
+        }),
+        layout!(RadarDetection {
+            object_id,
+            existence_probability,
+            distance_m,
+            azimuth_rad,
+            elevation_rad,
+            position_rmse,
+            radial_velocity_mps,
+            radial_velocity_rmse_mps,
+            rcs_dbsm,
+            snr_db
+        }),
         layout!(Progress {
             consumed_ticks,
             received_ticks,
@@ -301,6 +346,10 @@ macro_rules! records {
 }
 
 records!(
+    ImageHead,
+    SeenObject,
+    RadarScan,
+    RadarDetection,
     Collision,
     EgoPose,
     HeroView,

@@ -12,12 +12,14 @@
 //! | `event` | `[Collision]` | sim-core | none |
 //! | `pointcloud` | `Scan`, `[LidarPoint]`: one message for each LIDAR and tick | sensor-daemon | none |
 //! | `switch` | `[SensorSwitch]`, from the tick in the header on | traffic-bridge | none |
+//! | `image` | `ImageHead`, planes, `[SeenObject]`: one message for each camera and image | sensor-daemon | none |
+//! | `radar` | `RadarScan`, `[RadarDetection]`: one message for each radar and scan | sensor-daemon | none |
 //! | `control` | [`control::ControlRequest`] → [`control::ControlReply`] | supervisor | traffic-bridge |
 //! | `board` | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`], [`activity::Activity`] | every process | none (newest wins) |
 //! | `roster` | [`board::Roster`]: the current incarnation of each process | supervisor | none (newest wins) |
 //! | `wake` | an event without content | every peer | its process |
 //!
-//! The first ten are [`channel::CHANNELS`]. In the driving task sim-core waits for each `prediction`.
+//! The first twelve are [`channel::CHANNELS`]. In the driving task sim-core waits for each `prediction`.
 //!
 //! Every message has a [`header::MessageHeader`]. The supervisor alone creates the services, in [`services`]; all other processes
 //! open them. `layout.json` holds the layouts, and tests in Rust and Python compare it with the programs.
@@ -38,6 +40,7 @@ pub mod failure;
 pub mod field;
 pub mod flow;
 pub mod header;
+pub mod image;
 pub mod layout;
 pub mod membership;
 pub mod metric;
@@ -48,6 +51,7 @@ pub mod prediction;
 pub mod process;
 mod process_main;
 pub mod props;
+pub mod radar;
 mod required_consumers;
 pub mod reserve;
 pub mod run;
@@ -66,4 +70,4 @@ pub mod world;
 extern crate self as ipc_schema;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 16;
+pub const SCHEMA_VERSION: u32 = 17;

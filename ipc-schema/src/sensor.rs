@@ -21,6 +21,10 @@ pub enum SensorKind {
     Lidar = 3,
     /// Ultrasonic sensors in the bumpers.
     Ultrasonic = 4,
+    /// Camera.
+    Camera = 5,
+    /// Radar.
+    Radar = 6,
 }
 
 /// Which road users carry a sensor.
@@ -52,6 +56,10 @@ pub enum SceneUse {
     Rays,
     /// Distances to buildings and props.
     Solids,
+    /// Images of surfaces and of the ground.
+    Images,
+    /// Surfaces that return echoes.
+    Echoes,
 }
 
 /// A random stream. Its number goes into the counter of every draw, so a new stream takes a number that was never used.
@@ -70,6 +78,8 @@ pub enum NoiseStream {
     Lidar = 5,
     /// Ultrasonic sensors: the range of each.
     Ultrasonic = 6,
+    /// Radar: the key of a scan, and its cells.
+    Radar = 7,
     /// GNSS receiver, correlated noise: east, north, up.
     GnssCorrelated = 32,
     /// IMU, walk of the biases of the accelerometer and of x of the gyroscope.
@@ -88,6 +98,10 @@ pub enum NoiseStream {
     LidarBlackout = 43,
     /// Blackouts of the ultrasonic sensors.
     UltrasonicBlackout = 44,
+    /// Blackouts of the camera.
+    CameraBlackout = 45,
+    /// Blackouts of the radar.
+    RadarBlackout = 46,
 }
 
 /// Lengths and gaps of a sensor's blackouts, shortest and longest, seconds.
@@ -156,7 +170,7 @@ macro_rules! scale_blackouts {
 }
 
 /// Every sensor, by [`SensorKind`].
-pub const SENSORS: [SensorSpec; 5] = [
+pub const SENSORS: [SensorSpec; 7] = [
     SensorSpec {
         kind: SensorKind::Gnss,
         name: "gnss",
@@ -252,6 +266,46 @@ pub const SENSORS: [SensorSpec; 5] = [
         blackouts: blackouts!(ultrasonic),
         scale_noise: |config, factor| config.ultrasonic.scale_noise(factor),
         scale_blackouts: scale_blackouts!(ultrasonic),
+    },
+    SensorSpec {
+        kind: SensorKind::Camera,
+        name: "camera",
+        label: "camera",
+        description: "Camera",
+        carriers: SensorCarriers::Vehicles,
+        noise: &[],
+        blackout_noise: NoiseStream::CameraBlackout,
+        vehicles: |config| config.camera.vehicles,
+        input: SensorInput::Surroundings,
+        scene: |config| match config.camera.vehicles {
+            0 => SceneUse::Unused,
+            _ => SceneUse::Images,
+        },
+        period_s: |config| config.camera.period_s,
+        blackouts: blackouts!(camera),
+        // A curriculum leaves its errors as they are.
+        scale_noise: |_, _| (),
+        scale_blackouts: scale_blackouts!(camera),
+    },
+    SensorSpec {
+        kind: SensorKind::Radar,
+        name: "radar",
+        label: "radar",
+        description: "Radar",
+        carriers: SensorCarriers::Vehicles,
+        noise: &[NoiseStream::Radar],
+        blackout_noise: NoiseStream::RadarBlackout,
+        vehicles: |config| config.radar.vehicles,
+        input: SensorInput::Surroundings,
+        scene: |config| match config.radar.vehicles {
+            0 => SceneUse::Unused,
+            _ => SceneUse::Echoes,
+        },
+        period_s: |config| config.radar.period_s,
+        blackouts: blackouts!(radar),
+        // A curriculum leaves its errors as they are.
+        scale_noise: |_, _| (),
+        scale_blackouts: scale_blackouts!(radar),
     },
 ];
 
@@ -440,7 +494,7 @@ mod tests {
         let refused = serde_json::from_str::<SensorSelection>("\"nose\"").unwrap_err();
         assert_eq!(
             refused.to_string(),
-            "unknown sensor `nose`, expected one of gnss, imu, speed_steering, lidar, ultrasonic, all"
+            "unknown sensor `nose`, expected one of gnss, imu, speed_steering, lidar, ultrasonic, camera, radar, all"
         );
     }
 }

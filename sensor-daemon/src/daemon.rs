@@ -24,7 +24,7 @@ use crate::{
     delivery::handover::HandoverFigures,
     scanning::ScanTotals,
     sensing::{Sensing, SensingState, WorldTick},
-    surroundings::{Surroundings, projection_failure},
+    surroundings::{SightTotals, Surroundings, projection_failure},
 };
 
 /// What this process has counted when an episode begins.
@@ -36,6 +36,7 @@ struct SensorDaemonState {
     cavs_max: u32,
     sensing: SensingState,
     lidar: Option<ScanTotals>,
+    sight: SightTotals,
 }
 
 /// The part of the run's report that this process writes.
@@ -50,6 +51,8 @@ struct SensorDaemonReport {
     raw_gnss_mean_error_m: Option<f64>,
     drops: u64,
     lidar: Option<ScanTotals>,
+    #[serde(flatten)]
+    sight: SightTotals,
     /// Ticks that were sent again to a successor of the trainer.
     redelivered_ticks: u64,
     /// Largest size of the journal so far.
@@ -122,6 +125,7 @@ impl Daemon {
         });
         sensing.restore(&state.sensing);
         surroundings.set_lidar_totals(state.lidar);
+        surroundings.set_sight_totals(state.sight);
         let observations = membership.publisher(Channel::Observation)?;
         let switches = membership.subscriber(Channel::Switch)?;
         let consumer = match membership.run.mode.has_trainer() {
@@ -305,6 +309,7 @@ impl Daemon {
             cavs_max: self.cavs_max.max(cavs),
             sensing,
             lidar: self.surroundings.lidar_totals(),
+            sight: self.surroundings.sight_totals(),
         };
         self.membership.store_episode_state(tick, &state)
     }
@@ -372,6 +377,7 @@ impl Daemon {
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
             drops: self.observations.drops(),
             lidar: self.surroundings.lidar_totals(),
+            sight: self.surroundings.sight_totals(),
             redelivered_ticks: self.consumer.as_ref().map_or(0, Delivery::redelivered),
             journal_mib: self.consumer.as_ref().map_or(0, Delivery::journal_mib),
             handovers: self.consumer.as_ref().map(Delivery::handovers).unwrap_or_default(),

@@ -10,6 +10,8 @@ pub mod blackout;
 pub mod carrier;
 pub mod daemon;
 pub mod delivery;
+pub mod echoing;
+pub mod imaging;
 pub mod noise;
 pub mod observation;
 #[cfg(test)]

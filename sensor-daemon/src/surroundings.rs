@@ -10,12 +10,15 @@ use ipc_schema::{
     sensor::{SENSORS, SceneUse},
     services::Channel,
 };
+use serde::{Deserialize, Serialize};
 use sim_core::{
     geodesy::{GeodesyError, NetPosition, Projection},
     scene::Scene,
 };
 
 use crate::{
+    echoing::RadarScanning,
+    imaging::{CameraImaging, MessageTotals},
     scanning::{LidarScanning, ScanTotals},
     sensing::{Sensing, WorldTick},
     sensors::{sky::SkyMap, ultrasonic::UltrasonicSampling},
@@ -25,6 +28,8 @@ use crate::{
 pub struct Surroundings {
     lidars: Option<LidarScanning>,
     ultrasonic: Option<UltrasonicSampling>,
+    cameras: Option<CameraImaging>,
+    radars: Option<RadarScanning>,
 }
 
 impl Surroundings {
@@ -38,6 +43,8 @@ impl Surroundings {
             return Ok(Self {
                 lidars: None,
                 ultrasonic: None,
+                cameras: None,
+                radars: None,
             });
         }
         let scenes = Scene::of_every_map(&membership.run)?;
@@ -54,7 +61,22 @@ impl Surroundings {
         }
         let ultrasonic = uses.contains(&SceneUse::Solids);
         let ultrasonic = ultrasonic.then(|| UltrasonicSampling::new(&membership.run.config, &scenes));
-        Ok(Self { lidars, ultrasonic })
+        let mut cameras = None;
+        if uses.contains(&SceneUse::Images) {
+            let publisher = membership.publisher(Channel::Image)?;
+            cameras = Some(CameraImaging::new(&membership.run.config, &scenes, publisher));
+        }
+        let mut radars = None;
+        if uses.contains(&SceneUse::Echoes) {
+            let publisher = membership.publisher(Channel::Radar)?;
+            radars = Some(RadarScanning::new(&membership.run.config, &scenes, publisher));
+        }
+        Ok(Self {
+            lidars,
+            ultrasonic,
+            cameras,
+            radars,
+        })
     }
 
     /// Samples every sensor that is due at the tick of the last [`Sensing::assign`], and passes the samples to `sensing`.
@@ -73,6 +95,12 @@ impl Surroundings {
         if let Some(ultrasonic) = &mut self.ultrasonic {
             ultrasonic.sample(header, road_users.states, sensing);
         }
+        if let Some(cameras) = &mut self.cameras {
+            cameras.take(header, road_users.states, sensing)?;
+        }
+        if let Some(radars) = &mut self.radars {
+            radars.scan(header, road_users.states, sensing)?;
+        }
         Ok(())
     }
 
@@ -87,6 +115,36 @@ impl Surroundings {
     #[must_use]
     pub fn lidar_totals(&self) -> Option<ScanTotals> {
         self.lidars.as_ref().map(LidarScanning::totals)
+    }
+}
+
+/// Counts of the images and of the radar scans of a run; `None` without such a sensor.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SightTotals {
+    /// Images.
+    pub camera: Option<MessageTotals>,
+    /// Radar scans.
+    pub radar: Option<MessageTotals>,
+}
+
+impl Surroundings {
+    /// Continues counting images and radar scans from `totals`.
+    pub fn set_sight_totals(&mut self, totals: SightTotals) {
+        if let (Some(cameras), Some(totals)) = (&mut self.cameras, totals.camera) {
+            cameras.set_totals(totals);
+        }
+        if let (Some(radars), Some(totals)) = (&mut self.radars, totals.radar) {
+            radars.set_totals(totals);
+        }
+    }
+
+    /// Counts of images and radar scans.
+    #[must_use]
+    pub fn sight_totals(&self) -> SightTotals {
+        SightTotals {
+            camera: self.cameras.as_ref().map(|cameras| cameras.totals().clone()),
+            radar: self.radars.as_ref().map(|radars| radars.totals().clone()),
+        }
     }
 }
 

@@ -51,6 +51,10 @@ struct Sensing {
     raw_gnss_mean_error_m: Option<f64>,
     #[serde(deserialize_with = "Option::deserialize")]
     lidar: Option<Value>,
+    #[serde(deserialize_with = "Option::deserialize")]
+    camera: Option<Value>,
+    #[serde(deserialize_with = "Option::deserialize")]
+    radar: Option<Value>,
 }
 
 /// The part of the trainer's report that the run's report repeats; a trainer of the user may leave out any of it.
@@ -109,6 +113,8 @@ fn environment_report(run: &RunFile, sensing: &Sensing, dynamics: Option<Value>)
         "redelivered_ticks": sensing.redelivered_ticks,
         "dynamics": dynamics,
         "lidar": sensing.lidar,
+        "camera": sensing.camera,
+        "radar": sensing.radar,
     })
 }
 
@@ -269,6 +275,8 @@ pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFig
         "trainer": parts.read::<Map<_, _>>(&run.run_dir, Process::Trainer).unwrap_or_default(),
         "dynamics": parts.read::<Map<_, _>>(&run.run_dir, Process::SimCore).unwrap_or_default(),
         "lidar": sensing.lidar,
+        "camera": sensing.camera,
+        "radar": sensing.radar,
         "environments": environments,
         "traffic": parts.read::<Value>(&run.run_dir, Process::TrafficBridge),
         "processes": parts.usage(&run.run_dir),
@@ -383,6 +391,13 @@ fn summary(report: &Value, path: &Path) -> String {
             "LIDAR: {} scans, {} points of {} rays",
             lidar["scans"], lidar["points"], lidar["rays"]
         ));
+    }
+    for (name, label, entries) in [("camera", "cameras", "road users"), ("radar", "radars", "detections")] {
+        let totals = &report[name];
+        if !totals.is_null() {
+            let (messages, count) = (&totals["messages"], &totals["entries"]);
+            lines.push(format!("{label}: {messages} messages with {count} {entries}"));
+        }
     }
     lines.extend(resynchronisations(report));
     lines.extend(guidances(report));
@@ -528,7 +543,7 @@ mod tests {
         };
         let mut sensing = json!({
             "observation_hash": "ab", "first_tick": 0, "observations": 3, "ticks": 2, "drops": 0, "redelivered_ticks": 0, "journal_mib": 1,
-            "handovers": [], "cavs_max": 2, "raw_gnss_mean_error_m": null, "lidar": null, "process": {},
+            "handovers": [], "cavs_max": 2, "raw_gnss_mean_error_m": null, "lidar": null, "camera": null, "radar": null, "process": {},
         });
         let mut parts = PartReader::default();
         let read = |parts: &mut PartReader| parts.read::<Sensing>(run_dir.path(), Process::SensorDaemon);

@@ -29,10 +29,12 @@ use pyo3::{
 mod lease;
 mod metrics;
 mod scans;
+mod sights;
 mod view;
 use lease::Lease;
 use metrics::Metric;
 use scans::PointCloud;
+use sights::SightMessage;
 use view::SectionView;
 
 /// Longest time between two checks of Python's signals.
@@ -50,11 +52,34 @@ fn membership_failed(error: MembershipError) -> PyErr {
     failed(&error)
 }
 
+/// The messages that wait in the queue of a sensor's channel, which the first call opens.
+fn sights(
+    py: Python<'_>,
+    queue: &mut Option<Subscriber>,
+    membership: &mut RunMembership,
+    channel: Service,
+) -> PyResult<Vec<SightMessage>> {
+    if queue.is_none() {
+        *queue = Some(membership.subscriber(channel).map_err(membership_failed)?);
+    }
+    let mut messages = Vec::new();
+    while let Some(subscriber) = &queue
+        && let Some(message) = subscriber.receive().map_err(|error| failed(&error))?
+    {
+        messages.push(SightMessage::new(py, channel, &message)?);
+    }
+    Ok(messages)
+}
+
 struct Attached {
     membership: RunMembership,
     observations: Subscriber,
     /// Opened by the first call of `scans`.
     scans: Option<Subscriber>,
+    /// Opened by the first call of `images`.
+    images: Option<Subscriber>,
+    /// Opened by the first call of `detections`.
+    radar: Option<Subscriber>,
     predictions: Publisher,
     /// Wakes `sim-core`, which waits for predictions in the driving task.
     sim_core: Option<Waker>,
@@ -160,6 +185,21 @@ impl Attachment {
             scans.push(PointCloud::new(py, &message)?);
         }
         Ok(scans)
+    }
+
+    /// Images since the last call; only the newest, if there were more than the queue holds. The first call returns none from before it.
+    fn images(&self, py: Python<'_>) -> PyResult<Vec<SightMessage>> {
+        let mut inner = self.lock()?;
+        let Attached { images, membership, .. } = &mut *inner;
+        sights(py, images, membership, Service::Image)
+    }
+
+    /// Radar scans since the last call; only the newest, if there were more than the queue holds. The first call returns none from before
+    /// it.
+    fn detections(&self, py: Python<'_>) -> PyResult<Vec<SightMessage>> {
+        let mut inner = self.lock()?;
+        let Attached { radar, membership, .. } = &mut *inner;
+        sights(py, radar, membership, Service::Radar)
     }
 
     /// Number of ticks that `traffic-bridge` is ahead of the newest tick consumed here.
@@ -368,6 +408,8 @@ impl Attachment {
             membership,
             observations,
             scans: None,
+            images: None,
+            radar: None,
             predictions,
             sim_core,
             traffic_bridge,
@@ -622,6 +664,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Lease>()?;
     module.add_class::<SectionView>()?;
     module.add_class::<PointCloud>()?;
+    module.add_class::<SightMessage>()?;
     module.add_class::<Metric>()?;
     module.add_function(wrap_pyfunction!(id_hash, module)?)?;
     module.add_function(wrap_pyfunction!(observation_size, module)?)?;

@@ -10,6 +10,7 @@ pub mod camera;
 pub mod gnss;
 pub mod imu;
 pub mod lidar;
+pub mod radar;
 pub mod sky;
 pub mod speed_steering;
 pub mod ultrasonic;

@@ -99,6 +99,18 @@ class Attachment:
         With `busy` the call polls on its core instead of sleeping, which saves the wake-up of some 30 µs.
         """
 
+    def images(self) -> list[SightMessage]:
+        """Images since the last call, oldest first; the newest of them if there were more than fit.
+
+        The first call subscribes and gives none. Raises RuntimeError.
+        """
+
+    def detections(self) -> list[SightMessage]:
+        """Radar scans since the last call, oldest first; the newest of them if there were more than fit.
+
+        The first call subscribes and gives none. Raises RuntimeError.
+        """
+
     def scans(self) -> list[PointCloud]:
         """LIDAR scans since the last call, oldest first; the newest of them if there were more than fit.
 
@@ -330,6 +342,22 @@ class PointCloud:
     @property
     def points(self) -> bytes:
         """The bytes of the points, `LidarPoint [count]`."""
+
+@final
+class SightMessage:
+    """What one camera or one radar has sent at a tick, copied out of shared memory."""
+
+    @property
+    def tick(self) -> int:
+        """Tick number, 0-based over the run."""
+
+    @property
+    def sim_time_ns(self) -> int:
+        """Simulated time at the end of the tick, nanoseconds since the start of the episode."""
+
+    @property
+    def sections(self) -> list[bytes]:
+        """The bytes of each section, in the order of the message."""
 
 def id_hash(id: str) -> int:
     """Hash of a SUMO id, as the section `id_hash` of an observation has it."""

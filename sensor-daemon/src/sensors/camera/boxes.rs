@@ -1,63 +1,42 @@
 //! Boxes of the road users in an image, with the fields of KITTI's labels (A. Geiger, P. Lenz and R. Urtasun, *Are we ready for
 //! Autonomous Driving? The KITTI Vision Benchmark Suite*, CVPR 2012).
 
-use bytemuck::{Pod, Zeroable};
+use ipc_schema::image::SeenObject;
 
 use super::{bodies::CameraTargets, resolve::PixelCount, view::CameraView};
 
 /// Nearest depth at which a corner is projected, metres.
 const NEAREST_M: f64 = 0.05;
 
-/// A road user of which an image shows a pixel at least.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
-pub struct SeenObject {
-    /// Dense index of the road user.
-    pub object: u32,
-    /// Its class, a `SemanticLabel`.
-    pub label: u32,
-    /// Pixels that show it.
-    pub visible_px: u32,
-    /// Left, top, right and bottom pixel that show it.
-    pub visible_box_px: [u16; 4],
-    /// Left, top, right and bottom of the whole of it, hidden parts and parts beyond the image included, pixels from the upper left corner.
-    pub full_box_px: [f32; 4],
-    /// Share of the full box that is beyond the image.
-    pub truncated: f32,
-    /// Least and largest depth of its corners, metres.
-    pub depth_m: [f32; 2],
-}
-
-impl SeenObject {
-    pub(super) fn new(
-        view: &CameraView<'_>,
-        targets: &CameraTargets,
-        row: usize,
-        (object, label): (u32, u8),
-        count: &PixelCount,
-    ) -> Self {
-        let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-        let mut depth_m = [f64::INFINITY, f64::NEG_INFINITY];
-        let optics = view.optics;
-        targets.corners(view, row, |[x, y, z]| {
-            depth_m = [depth_m[0].min(x), depth_m[1].max(x)];
-            let inverse = optics.focal_px / x.max(NEAREST_M);
-            let pixel = [optics.centre_px[0] - y * inverse, optics.centre_px[1] - z * inverse];
-            for axis in 0..2 {
-                (low[axis], high[axis]) = (low[axis].min(pixel[axis]), high[axis].max(pixel[axis]));
-            }
-        });
-        let size = [optics.width as f64, optics.height as f64];
-        let inside = |axis: usize| (high[axis].min(size[axis]) - low[axis].max(0.0)).max(0.0);
-        let area = (high[0] - low[0]) * (high[1] - low[1]);
-        Self {
-            object,
-            label: label.into(),
-            visible_px: count.pixels,
-            visible_box_px: count.box_px,
-            full_box_px: [low[0], low[1], high[0], high[1]].map(|pixel| pixel as f32),
-            truncated: (1.0 - inside(0) * inside(1) / area.max(1e-9)).clamp(0.0, 1.0) as f32,
-            depth_m: depth_m.map(|part| part as f32),
+/// The entry of the road user in `row`.
+pub(super) fn seen_object(
+    view: &CameraView<'_>,
+    targets: &CameraTargets,
+    row: usize,
+    (object, label): (u32, u8),
+    count: &PixelCount,
+) -> SeenObject {
+    let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+    let mut depth_m = [f64::INFINITY, f64::NEG_INFINITY];
+    let optics = view.optics;
+    targets.corners(view, row, |[x, y, z]| {
+        depth_m = [depth_m[0].min(x), depth_m[1].max(x)];
+        let inverse = optics.focal_px / x.max(NEAREST_M);
+        let pixel = [optics.centre_px[0] - y * inverse, optics.centre_px[1] - z * inverse];
+        for axis in 0..2 {
+            (low[axis], high[axis]) = (low[axis].min(pixel[axis]), high[axis].max(pixel[axis]));
         }
+    });
+    let size = [optics.width as f64, optics.height as f64];
+    let inside = |axis: usize| (high[axis].min(size[axis]) - low[axis].max(0.0)).max(0.0);
+    let area = (high[0] - low[0]) * (high[1] - low[1]);
+    SeenObject {
+        object,
+        label: label.into(),
+        visible_px: count.pixels,
+        visible_box_px: count.box_px,
+        full_box_px: [low[0], low[1], high[0], high[1]].map(|pixel| pixel as f32),
+        truncated: (1.0 - inside(0) * inside(1) / area.max(1e-9)).clamp(0.0, 1.0) as f32,
+        depth_m: depth_m.map(|part| part as f32),
     }
 }

@@ -19,15 +19,14 @@ mod surfaces;
 mod view;
 
 pub use bodies::CameraTargets;
-pub use boxes::SeenObject;
+pub use ipc_schema::image::{SKY_INSTANCE, SeenObject};
 pub use labels::SemanticLabel;
 pub use optics::CameraParams;
 pub use resolve::ImagePlanes;
-pub use surfaces::SKY_INSTANCE;
 
 use crate::sensors::lidar::{
     ScanPath, Targets, flat_ground_m,
-    sensor::SensorPose,
+    sensor::{SensorPose, turned},
     simd::{self, Simd},
 };
 
@@ -64,6 +63,12 @@ impl CameraPose {
     #[must_use]
     pub fn position_m(&self) -> [f64; 3] {
         self.0.position_m
+    }
+
+    /// A direction of the camera's frame in the world.
+    #[must_use]
+    pub fn world_from_camera(&self, direction: [f64; 3]) -> [f64; 3] {
+        turned(&self.0.world_from_sensor, direction)
     }
 
     /// Roll (right side down), pitch (nose up) and heading (counter-clockwise from east), radians.
@@ -233,7 +238,7 @@ impl CameraModel {
         objects.clear();
         for (row, count) in surfaces.users.iter().zip(counts.iter()) {
             if count.pixels > 0 {
-                objects.push(SeenObject::new(
+                objects.push(boxes::seen_object(
                     &view,
                     targets,
                     *row as usize,

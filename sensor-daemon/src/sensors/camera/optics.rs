@@ -1,5 +1,7 @@
 //! The image of a camera: its size, its field of view, its mounting.
 
+use ipc_schema::config::CameraConfig;
+
 use crate::sensors::lidar::sensor::SensorMount;
 
 /// A pinhole camera with square pixels, as configured.
@@ -15,6 +17,18 @@ pub struct CameraParams {
     pub range_m: f64,
     /// Where it is mounted: x, y, z from the centre of the rear axle on the ground (metres), then roll, pitch (nose up), yaw (radians).
     pub mount: [f64; 6],
+}
+
+impl From<&CameraConfig> for CameraParams {
+    fn from(camera: &CameraConfig) -> Self {
+        Self {
+            width: camera.width as usize,
+            height: camera.height as usize,
+            horizontal_fov_deg: camera.horizontal_fov_deg,
+            range_m: camera.range_m,
+            mount: camera.mount,
+        }
+    }
 }
 
 /// A camera's parameters in the form that the kernel uses.

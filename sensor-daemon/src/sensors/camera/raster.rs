@@ -22,7 +22,7 @@ const ROUNDING: f32 = 1e-6;
 
 /// A function that is linear over the image: its value is `of[0] + a · of[1] + b · of[2]`.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct ImagePlane(pub(super) [f32; 3]);
+pub(super) struct LinearForm(pub(super) [f32; 3]);
 
 /// A part of the image, in tiles: first and last column, first and last row.
 #[derive(Debug, Clone, Copy, Default)]
@@ -46,7 +46,7 @@ pub(super) struct DrawItem {
 #[derive(Debug, Clone, Copy)]
 pub(super) enum DrawShape {
     /// Inverse depth, and the first and one past the last of its edges.
-    Polygon(ImagePlane, [u32; 2]),
+    Polygon(LinearForm, [u32; 2]),
     /// An upright cylinder, by its number.
     Cylinder(u32),
 }
@@ -80,7 +80,7 @@ pub(super) struct Canvas {
     pub(super) room: (usize, usize, f64),
 }
 
-impl ImagePlane {
+impl LinearForm {
     /// Largest and smallest value over a rectangle of `a` and `b`.
     #[inline(always)]
     fn bounds(&self, [a0, a1]: [f32; 2], [b0, b1]: [f32; 2]) -> [f32; 2] {
@@ -133,16 +133,16 @@ impl Canvas {
 
     /// Fills the image with flat ground, of inverse depth `ground`, and with sky, `far` being the inverse depth of the end of the range.
     #[inline(always)]
-    pub(super) fn fill<S: Simd>(&mut self, ground: Option<ImagePlane>, far: f32) {
+    pub(super) fn fill<S: Simd>(&mut self, ground: Option<LinearForm>, far: f32) {
         let [tiles_x, tiles_y] = self.tiles;
         self.least[..tiles_x * tiles_y].fill(far);
         let sky = S::splat(far);
-        let ImagePlane(plane) = ground.unwrap_or(ImagePlane([0.0; 3]));
+        let LinearForm(plane) = ground.unwrap_or(LinearForm([0.0; 3]));
         let [ground_word, sky_word] = [GROUND_SURFACE, SKY_SURFACE].map(|word| S::floats(S::splat_words(word)));
         for row in 0..self.b.len() {
             let by_row = S::splat(self.b[row]) * S::splat(plane[2]);
             for tile in 0..tiles_x {
-                let inverse = ImagePlane(plane).along::<S>(S::load(&self.a[tile])) + by_row;
+                let inverse = LinearForm(plane).along::<S>(S::load(&self.a[tile])) + by_row;
                 let is_ground = S::lt(sky, inverse);
                 let place = row * tiles_x + tile;
                 S::store(S::select(is_ground, inverse, sky), &mut self.inverse[place]);
@@ -155,8 +155,8 @@ impl Canvas {
         }
         for tile_y in 0..tiles_y {
             for tile_x in 0..tiles_x {
-                let [low, _] = ImagePlane(plane).bounds(self.a_bounds[tile_x], self.b_bounds[tile_y]);
-                let low = low - ImagePlane(plane).rounding(1.0, 1.0);
+                let [low, _] = LinearForm(plane).bounds(self.a_bounds[tile_x], self.b_bounds[tile_y]);
+                let low = low - LinearForm(plane).rounding(1.0, 1.0);
                 self.least[tile_y * tiles_x + tile_x] = low.max(far);
             }
         }
@@ -168,9 +168,9 @@ impl Canvas {
         &mut self,
         items: &[DrawItem],
         order: &[u64],
-        edges: &[ImagePlane],
+        edges: &[LinearForm],
         cylinders: &[Cylinder],
-        axes: &[ImagePlane; 3],
+        axes: &[LinearForm; 3],
     ) {
         for key in order {
             let item = &items[*key as u32 as usize];
@@ -184,7 +184,7 @@ impl Canvas {
     }
 
     #[inline(always)]
-    fn polygon<S: Simd>(&mut self, item: &DrawItem, inverse: ImagePlane, edges: &[ImagePlane]) {
+    fn polygon<S: Simd>(&mut self, item: &DrawItem, inverse: LinearForm, edges: &[LinearForm]) {
         let (a_most, b_most) = (
             self.a_bounds[0][1].max(-self.a_bounds[self.tiles[0] - 1][0]),
             self.b_most(),
@@ -250,7 +250,7 @@ impl Canvas {
     }
 
     #[inline(always)]
-    fn cylinder<S: Simd>(&mut self, item: &DrawItem, cylinder: &Cylinder, axes: &[ImagePlane; 3]) {
+    fn cylinder<S: Simd>(&mut self, item: &DrawItem, cylinder: &Cylinder, axes: &[LinearForm; 3]) {
         for tile_y in usize::from(item.tiles.y[0])..=usize::from(item.tiles.y[1]) {
             for tile_x in usize::from(item.tiles.x[0])..=usize::from(item.tiles.x[1]) {
                 let tile = tile_y * self.tiles[0] + tile_x;
@@ -266,7 +266,7 @@ impl Canvas {
         &mut self,
         [tile_x, tile_y]: [usize; 2],
         cylinder: &Cylinder,
-        axes: &[ImagePlane; 3],
+        axes: &[LinearForm; 3],
         surface: u32,
     ) -> f32 {
         let (zero, one) = (S::splat(0.0), S::splat(1.0));

@@ -4,7 +4,7 @@ use super::{
     ground::GroundMap,
     labels::SemanticLabel,
     light::Daylight,
-    raster::{Canvas, GROUND_SURFACE, ImagePlane},
+    raster::{Canvas, GROUND_SURFACE, LinearForm},
     surfaces::{NO_USER, SurfaceTable},
     view::CameraView,
 };
@@ -109,7 +109,7 @@ impl Resolver<'_> {
     }
 
     #[inline(always)]
-    fn sixteen<S: Simd>(&self, tile: usize, row: usize, axes: &[ImagePlane; 3], planes: &ImagePlanes<'_>) -> Pixels {
+    fn sixteen<S: Simd>(&self, tile: usize, row: usize, axes: &[LinearForm; 3], planes: &ImagePlanes<'_>) -> Pixels {
         let place = row * self.canvas.tiles[0] + tile;
         let depth = S::splat(1.0) / S::load(&self.canvas.inverse[place]);
         let mut pixels = Pixels {
@@ -138,7 +138,7 @@ impl Resolver<'_> {
         depth: S::F,
         tile: usize,
         row: usize,
-        axes: &[ImagePlane; 3],
+        axes: &[LinearForm; 3],
         ground: u32,
         label: &mut [u8; WIDTH],
     ) {

@@ -5,10 +5,8 @@ use super::{
     light::Daylight,
     raster::{GROUND_SURFACE, SKY_SURFACE},
 };
-use ipc_schema::pointcloud::GROUND;
+use ipc_schema::{image::SKY_INSTANCE, pointcloud::GROUND};
 
-/// Instance of a pixel that sees the sky.
-pub const SKY_INSTANCE: u32 = u32::MAX - 1;
 /// No road user.
 pub(super) const NO_USER: u16 = u16::MAX;
 

@@ -2,7 +2,7 @@
 
 use super::{
     optics::CameraOptics,
-    raster::{Canvas, Cylinder, DrawItem, DrawShape, ImagePlane, TILE_ROWS, TileRange},
+    raster::{Canvas, Cylinder, DrawItem, DrawShape, LinearForm, TILE_ROWS, TileRange},
 };
 use crate::sensors::lidar::{sensor::SensorPose, simd::WIDTH};
 
@@ -20,7 +20,7 @@ pub(super) struct CameraView<'a> {
 #[derive(Debug, Default)]
 pub(super) struct DrawList {
     pub(super) items: Vec<DrawItem>,
-    pub(super) edges: Vec<ImagePlane>,
+    pub(super) edges: Vec<LinearForm>,
     pub(super) cylinders: Vec<Cylinder>,
     pub(super) order: Vec<u64>,
 }
@@ -61,17 +61,17 @@ impl CameraView<'_> {
     }
 
     /// Rays in world axes: the linear functions x, y and z of the image.
-    pub(super) fn axes(&self) -> [ImagePlane; 3] {
+    pub(super) fn axes(&self) -> [LinearForm; 3] {
         self.pose
             .world_from_sensor
-            .map(|row| ImagePlane(row.map(|part| part as f32)))
+            .map(|row| LinearForm(row.map(|part| part as f32)))
     }
 
     /// Inverse depth of flat ground at height `ground_m`; `None` for a camera below it.
-    pub(super) fn ground(&self, ground_m: f64) -> Option<ImagePlane> {
+    pub(super) fn ground(&self, ground_m: f64) -> Option<LinearForm> {
         let height_m = self.pose.position_m[2] - ground_m;
         let up = self.pose.world_from_sensor[2];
-        (height_m > 0.0).then(|| ImagePlane(up.map(|part| (-part / height_m) as f32)))
+        (height_m > 0.0).then(|| LinearForm(up.map(|part| (-part / height_m) as f32)))
     }
 
     /// True if a body may be in the image.
@@ -143,14 +143,14 @@ impl CameraView<'_> {
         let Some((tiles, most)) = self.tiles(corners) else {
             return;
         };
-        let inverse = ImagePlane(normal.map(|part| (part / offset) as f32));
+        let inverse = LinearForm(normal.map(|part| (part / offset) as f32));
         let first = list.edges.len() as u32;
         let next = corners.iter().skip(1).chain(corners.first());
         list.edges.extend(
             corners
                 .iter()
                 .zip(next)
-                .map(|(p, q)| ImagePlane(cross(q, p).map(|part| part as f32))),
+                .map(|(p, q)| LinearForm(cross(q, p).map(|part| part as f32))),
         );
         list.items.push(DrawItem {
             shape: DrawShape::Polygon(inverse, [first, list.edges.len() as u32]),

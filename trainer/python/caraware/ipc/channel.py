@@ -17,7 +17,9 @@ from torch import Tensor
 from caraware import _native
 from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Scalar, UInt32Array, UInt64Array
 from caraware.ipc.commits import CommitLog, CommittedPosition, EpisodeStarts
+from caraware.ipc.image import Image
 from caraware.ipc.pointcloud import PointCloud
+from caraware.ipc.radar import RadarDetections
 from caraware.ipc.run_file import RunFile, setting
 from caraware.ipc.stream import TrainingReport
 
@@ -310,6 +312,22 @@ class Channel:
         gives none.
         """
         return [PointCloud.of(scan) for scan in self._attachment.scans()]
+
+    def images(self) -> list[Image]:
+        """Images since the last call, oldest first; the newest of them if more came than shared memory holds.
+
+        One for each vehicle that carries a camera (`camera.vehicles`) and each sample. The first call subscribes and
+        gives none.
+        """
+        return [Image.of(image) for image in self._attachment.images()]
+
+    def detections(self) -> list[RadarDetections]:
+        """Radar scans since the last call, oldest first; the newest of them if more came than shared memory holds.
+
+        One for each vehicle that carries a radar (`radar.vehicles`) and each sample. The first call subscribes and
+        gives none.
+        """
+        return [RadarDetections.of(scan) for scan in self._attachment.detections()]
 
     def consumed(self, tick: int) -> None:
         """Gives the simulation credit for all ticks up to and including `tick`."""

@@ -1,0 +1,216 @@
+//! Cameras in a run: publishes the images of every vehicle that carries one, and counts and hashes them.
+
+use std::sync::Arc;
+
+use ipc_schema::{
+    block,
+    config::Config,
+    failure::{Failure, FailureKind},
+    header::MessageHeader,
+    image::{ImageHead, ImageLayout, ImagePlane, MOST_SEEN, SeenObject},
+    ports::Publisher,
+    sensor::SensorKind,
+    world::{SubStep, VehicleState},
+};
+use serde::{Deserialize, Serialize};
+use sim_core::scene::Scene;
+
+use crate::{
+    sensing::Sensing,
+    sensors::{
+        camera::{CameraModel, CameraParams, CameraScratch, CameraTargets, ImagePlanes},
+        lidar::Targets,
+    },
+};
+
+/// Counts of messages for the run's report, and the hash over all of them.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MessageTotals {
+    /// Messages: one for each carrier and sample.
+    pub messages: u64,
+    /// Road users in images, or detections.
+    pub entries: u64,
+    /// BLAKE3 over tick and content of every message, each with the hash before it; empty before the first.
+    pub hash: String,
+}
+
+impl MessageTotals {
+    /// Adds a message with these sections.
+    pub fn add(&mut self, tick: u64, entries: usize, sections: &[&[u8]]) {
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(self.hash.as_bytes()).update(&tick.to_le_bytes());
+        for section in sections {
+            hasher.update(section);
+        }
+        self.hash = hasher.finalize().to_hex().to_string();
+        self.messages += 1;
+        self.entries += entries as u64;
+    }
+}
+
+/// The cameras of a run.
+pub struct CameraImaging {
+    /// One for each map of the run.
+    cameras: Vec<CameraModel>,
+    targets: Targets,
+    seen: CameraTargets,
+    scratch: CameraScratch,
+    objects: Vec<SeenObject>,
+    publisher: Publisher,
+    planes: u32,
+    range_m: f32,
+    plane_bytes: usize,
+    totals: MessageTotals,
+}
+
+impl CameraImaging {
+    /// Cameras as configured, in the scenes of the run's maps.
+    #[must_use]
+    pub fn new(config: &Config, scenes: &[Arc<Scene>], publisher: Publisher) -> Self {
+        let params = CameraParams::from(&config.camera);
+        Self {
+            cameras: scenes
+                .iter()
+                .map(|scene| CameraModel::new(&params, config, scene))
+                .collect(),
+            targets: Targets::default(),
+            seen: CameraTargets::default(),
+            scratch: CameraScratch::default(),
+            objects: Vec::new(),
+            publisher,
+            planes: ImagePlane::wanted(&config.camera),
+            range_m: config.camera.range_m as f32,
+            plane_bytes: ImagePlane::bytes(&config.camera),
+            totals: MessageTotals::default(),
+        }
+    }
+
+    /// Continues counting from `totals`.
+    pub fn set_totals(&mut self, totals: MessageTotals) {
+        self.totals = totals;
+    }
+
+    /// Counts so far.
+    #[must_use]
+    pub fn totals(&self) -> &MessageTotals {
+        &self.totals
+    }
+
+    /// One tick: takes and publishes an image from every vehicle whose camera is due.
+    ///
+    /// # Errors
+    /// Shared memory fails.
+    pub fn take(&mut self, header: &MessageHeader, states: &[VehicleState], sensing: &Sensing) -> Result<(), Failure> {
+        let carriers: Vec<usize> = sensing.carriers_due(SensorKind::Camera).map(|(_, row)| row).collect();
+        if carriers.is_empty() {
+            return Ok(());
+        }
+        let steps: &[SubStep] = &[];
+        self.targets.update(states, steps, 0);
+        self.seen.update(&self.targets);
+        for row in carriers {
+            self.take_one(header, states, row)?;
+        }
+        Ok(())
+    }
+
+    fn take_one(&mut self, header: &MessageHeader, states: &[VehicleState], row: usize) -> Result<(), Failure> {
+        let camera = &self.cameras[usize::from(header.map).min(self.cameras.len() - 1)];
+        let Some(pose) = camera.pose_on(&self.targets, row) else {
+            return Ok(());
+        };
+        let layout = ImageLayout::new(MOST_SEEN, self.plane_bytes);
+        let mut draft = self.publisher.loan_unwritten(*header, layout.len)?;
+        let sections = [layout.head, layout.planes, layout.objects];
+        let [head, planes, listed] = block::split_mut(draft.payload_mut(), &sections).map_err(unreadable)?;
+        let [width, height] = camera.size();
+        let mut planes_of = split_planes(planes, self.planes, width * height);
+        let (seen, scratch) = (&self.seen, &mut self.scratch);
+        camera.take(seen, Some(row), &pose, scratch, &mut planes_of, &mut self.objects);
+        self.objects.truncate(MOST_SEEN);
+        let objects: &[u8] = bytemuck::cast_slice(&self.objects);
+        listed[..objects.len()].copy_from_slice(objects);
+        head.copy_from_slice(bytemuck::bytes_of(&ImageHead {
+            position_m: pose.position_m(),
+            attitude_rad: pose.attitude_rad(),
+            id_hash: states[row].id_hash,
+            vehicle: states[row].vehicle,
+            width: width as u32,
+            height: height as u32,
+            planes: self.planes,
+            focal_px: camera.focal_px() as f32,
+            range_m: self.range_m,
+        }));
+        self.totals
+            .add(header.tick, self.objects.len(), &[head, planes, objects]);
+        *draft.header_mut() = MessageHeader {
+            shape: ImageLayout::new(self.objects.len(), self.plane_bytes).shape,
+            ..*header
+        };
+        draft.send()?;
+        Ok(())
+    }
+}
+
+/// The planes of an image within the bytes of a message.
+fn split_planes(mut bytes: &mut [u8], wanted: u32, pixels: usize) -> ImagePlanes<'_> {
+    let mut of_plane = ImagePlane::ALL.map(|plane| {
+        let length = if plane.bit() & wanted == 0 {
+            0
+        } else {
+            pixels * plane.pixel_bytes()
+        };
+        let (first, rest) = std::mem::take(&mut bytes).split_at_mut(length);
+        bytes = rest;
+        first
+    });
+    let [depth, instance, semantic, rgb, binary] = of_plane.each_mut().map(std::mem::take);
+    ImagePlanes {
+        depth_m: bytemuck::cast_slice_mut(depth),
+        instance: bytemuck::cast_slice_mut(instance),
+        semantic,
+        rgb: bytemuck::cast_slice_mut(rgb),
+        binary,
+    }
+}
+
+fn unreadable(error: block::BlockError) -> Failure {
+    Failure::from_error(FailureKind::Run, &error)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn planes_follow_one_another_and_those_not_wanted_are_empty() {
+        let mut words = [0_u64; 16];
+        let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+        let wanted = ImagePlane::Depth.bit() | ImagePlane::Semantic.bit() | ImagePlane::Rgb.bit();
+        let planes = split_planes(bytes, wanted, 6);
+        let lengths = [
+            planes.depth_m.len(),
+            planes.instance.len(),
+            planes.semantic.len(),
+            planes.rgb.len(),
+            planes.binary.len(),
+        ];
+        assert_eq!(lengths, [6, 0, 6, 6, 0]);
+    }
+
+    #[test]
+    fn the_hash_tells_order_tick_and_content_apart() {
+        let hash = |messages: &[(u64, &[u8])]| {
+            let mut totals = MessageTotals::default();
+            messages
+                .iter()
+                .for_each(|(tick, payload)| totals.add(*tick, 1, &[payload]));
+            (totals.messages, totals.hash)
+        };
+        let one = hash(&[(1, b"a"), (2, b"b")]);
+        assert_eq!(one, hash(&[(1, b"a"), (2, b"b")]));
+        for other in [[(1, b"b"), (2, b"a")], [(1, b"a"), (3, b"b")]] {
+            assert_ne!(one, hash(&other.map(|(tick, payload)| (tick, &payload[..]))));
+        }
+    }
+}

@@ -1,0 +1,115 @@
+"""Images of cameras: depths, objects, classes, colours, and the road users in them."""
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caraware import _native
+from caraware.ipc.arrays import Float32Array
+from caraware.ipc.layout import record
+
+IMAGE = record("ImageHead")
+"""`ImageHead`: the camera in the world at the end of the tick (m; roll, pitch, heading in rad), and its setup."""
+
+SEEN = record("SeenObject")
+"""`SeenObject`: a road user of which an image shows a pixel, its visible and its full box (pixels), its depths (m)."""
+
+SKY = 0xFFFF_FFFE
+"""`instance` of a pixel that sees the sky."""
+
+
+class Label(IntEnum):
+    """Class of a pixel: CityScapes' label ids, and from 40 on classes that it counts as road."""
+
+    STATIC = 4
+    ROAD = 7
+    SIDEWALK = 8
+    RAIL_TRACK = 10
+    BUILDING = 11
+    WALL = 12
+    BARRIER = 14
+    POLE = 17
+    VEGETATION = 21
+    TERRAIN = 22
+    SKY = 23
+    PERSON = 24
+    CAR = 26
+    TRUCK = 27
+    BUS = 28
+    MOTORCYCLE = 32
+    BICYCLE = 33
+    LANE_MARKING = 40
+    STOP_LINE = 41
+    CROSSING = 42
+
+
+PLANES: tuple[tuple[str, str, tuple[int, ...]], ...] = (
+    ("depth_m", "<f4", ()),
+    ("instance", "<u4", ()),
+    ("semantic", "|u1", ()),
+    ("rgb", "|u1", (3,)),
+    ("binary", "|u1", ()),
+)
+"""Name, scalar and shape of a pixel of each plane, in the order in which a message has them; its place is its bit."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """What one camera has seen at a tick; a copy, valid for ever. A plane that the configuration leaves out is None."""
+
+    tick: int
+    sim_time_ns: int
+    vehicle: int
+    """Dense index of the vehicle within its episode, as in `Observation.vehicle`."""
+    head: np.void
+    """`IMAGE`."""
+    objects: NDArray[np.void]
+    """`SEEN [count]`, read-only: the road users in the image."""
+    depth_m: Float32Array | None
+    """f32 [height, width]: distance along the optical axis, m; `head["range_m"]` where the camera sees the sky."""
+    instance: NDArray[np.uint32] | None
+    """u32 [height, width]: dense index of the road user; `STATIC_OBJECT` and a number; `GROUND`; or `SKY`."""
+    semantic: NDArray[np.uint8] | None
+    """u8 [height, width]: a `Label`."""
+    rgb: NDArray[np.uint8] | None
+    """u8 [height, width, 3]."""
+    binary: NDArray[np.uint8] | None
+    """u8 [height, width]: 255 on road users and props of interest, else 0."""
+
+    @classmethod
+    def of(cls, native: _native.SightMessage) -> "Image":
+        """From a message. Raises ValueError for planes that do not fit the image's size."""
+        head_bytes, plane_bytes, object_bytes = native.sections
+        head = np.frombuffer(head_bytes, IMAGE)[0]
+        planes = split_planes(head, plane_bytes)
+        return cls(
+            tick=native.tick,
+            sim_time_ns=native.sim_time_ns,
+            vehicle=int(head["vehicle"]),
+            head=head,
+            objects=np.frombuffer(object_bytes, SEEN),
+            depth_m=planes["depth_m"],
+            instance=planes["instance"],
+            semantic=planes["semantic"],
+            rgb=planes["rgb"],
+            binary=planes["binary"],
+        )
+
+
+def split_planes(head: np.void, planes: bytes) -> dict[str, NDArray[Any] | None]:
+    """The planes of an image by name, each [height, width, ...]; None for those that it lacks."""
+    height, width = int(head["height"]), int(head["width"])
+    found: dict[str, NDArray[Any] | None] = {}
+    at = 0
+    for bit, (name, scalar, shape) in enumerate(PLANES):
+        found[name] = None
+        if int(head["planes"]) >> bit & 1:
+            count = height * width * math.prod(shape)
+            plane = np.frombuffer(planes, np.dtype(scalar), count, at)
+            found[name] = plane.reshape(height, width, *shape)
+            at += plane.nbytes
+    return found
