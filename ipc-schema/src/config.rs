@@ -15,6 +15,7 @@ mod sensors;
 pub(crate) mod text;
 mod trainer;
 mod ultrasonic;
+mod v2x;
 mod vehicle;
 pub use camera::*;
 pub use curriculum::*;
@@ -27,6 +28,7 @@ pub use scene::*;
 pub use sensors::*;
 pub use trainer::*;
 pub use ultrasonic::*;
+pub use v2x::*;
 pub use vehicle::*;
 
 /// One whole configuration.

@@ -1,6 +1,8 @@
 //! A uniform grid over static objects: which of them are near a position. Answers come in ascending order of their number.
 
-use super::shape::{Bounds, Point};
+use std::ops::ControlFlow;
+
+use super::shape::{Bounds, Point, from_to};
 
 /// Most cells of one grid: a very large map gets larger cells instead of more memory.
 const MAX_CELLS: f64 = 4e6;
@@ -95,6 +97,56 @@ impl Grid {
         }
     }
 
+    /// Visits the things of each cell that the segment passes, in its order, until `visit` breaks. A thing in several cells comes several
+    /// times (Amanatides and Woo, "A fast voxel traversal algorithm", Eurographics 1987).
+    pub fn along(&self, from: Point, to: Point, mut visit: impl FnMut(&[u32]) -> ControlFlow<()>) {
+        // In cells.
+        let in_cells = |point: Point| [0, 1].map(|axis: usize| (point[axis] - self.min_m[axis]) * self.cells_per_m);
+        let (start, count) = (in_cells(from), [self.columns, self.rows]);
+        let way = from_to(start, in_cells(to));
+        let (mut enter, mut leave) = (0.0_f64, 1.0_f64);
+        for axis in 0..2 {
+            let last = count[axis] as f64;
+            if way[axis] == 0.0 {
+                if !(0.0..=last).contains(&start[axis]) {
+                    return;
+                }
+                continue;
+            }
+            let (near, far) = (-start[axis] / way[axis], (last - start[axis]) / way[axis]);
+            enter = enter.max(near.min(far));
+            leave = leave.min(near.max(far));
+        }
+        if self.starts.is_empty() || enter > leave {
+            return;
+        }
+        let mut cell = [0, 1].map(|axis: usize| {
+            let at = (start[axis] + enter * way[axis]).max(0.0) as usize;
+            at.min(count[axis].saturating_sub(1))
+        });
+        // Share of the segment at which it enters the next cell along each axis.
+        let border = |cell: usize, axis: usize| {
+            let next = if way[axis] > 0.0 { cell + 1 } else { cell };
+            match way[axis] {
+                0.0 => f64::INFINITY,
+                along => (next as f64 - start[axis]) / along,
+            }
+        };
+        let mut next = [border(cell[0], 0), border(cell[1], 1)];
+        while visit(self.cell(cell[1] * self.columns + cell[0])).is_continue() {
+            let axis = usize::from(next[1] < next[0]);
+            let moved = match way[axis] > 0.0 {
+                true => cell[axis] + 1,
+                false => cell[axis].wrapping_sub(1),
+            };
+            if next[axis] > leave || moved >= count[axis] {
+                return;
+            }
+            cell[axis] = moved;
+            next[axis] = border(moved, axis);
+        }
+    }
+
     /// Things whose bounds may meet `bounds`, into `found` (emptied first), each once.
     pub fn near(&self, bounds: &Bounds, found: &mut Vec<u32>) {
         found.clear();
@@ -133,9 +185,40 @@ mod tests {
         }
     }
 
+    proptest! {
+        #[test]
+        fn nothing_along_a_segment_is_missed(
+            things in prop::collection::vec((prop::array::uniform2(-500.0_f64..500.0), 0.1_f64..60.0), 1..60),
+            from in prop::array::uniform2(-700.0_f64..700.0), to in prop::array::uniform2(-700.0_f64..700.0), cell in 1.0_f64..100.0,
+        ) {
+            let bounds: Vec<Bounds> = things.iter().map(|(centre, reach)| Bounds::about(*centre, *reach)).collect();
+            let grid = Grid::new(&bounds, cell);
+            let mut along = Vec::new();
+            grid.along(from, to, |found| {
+                along.extend_from_slice(found);
+                ControlFlow::Continue(())
+            });
+            // Points of the segment that are well inside a thing.
+            for share in (0..=400).map(|i| f64::from(i) / 400.0) {
+                let point = [0, 1].map(|axis: usize| from[axis] + share * (to[axis] - from[axis]));
+                for (number, thing) in (0_u32..).zip(&bounds) {
+                    prop_assert!(!thing.grown(-1e-6).holds(point) || along.contains(&number));
+                }
+            }
+            // It ends where it is to end.
+            let mut visited = 0;
+            grid.along(from, to, |_| {
+                visited += 1;
+                ControlFlow::Break(())
+            });
+            prop_assert!(visited <= 1);
+        }
+    }
+
     #[test]
     fn an_empty_grid_answers_nothing() {
         let mut found = vec![1];
+        Grid::default().along([0.0; 2], [1.0; 2], |_| panic!("a cell of nothing"));
         Grid::new(&[], 10.0).near(&Bounds::about([0.0; 2], 5.0), &mut found);
         assert!(found.is_empty() && Grid::default().at([0.0; 2]).is_empty());
     }

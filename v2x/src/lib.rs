@@ -1,0 +1,11 @@
+//! Messages between road users: services, channel, local dynamic maps, the block `neighbours`.
+//!
+//! Services, messages and the channel are pure functions without clock, I/O or shared memory.
+
+// Positions of 0.1 microdegrees, tenths of metres, counts: values are limited to the ranges of their message before they are cast.
+#![expect(clippy::cast_possible_truncation, reason = "see above")]
+
+pub mod message;
+pub mod radio;
+pub mod random;
+pub mod services;

@@ -1,0 +1,452 @@
+//! One channel that many stations share: when each sends (carrier sense, IEEE 802.11 outside the context of a BSS), what overlaps at each
+//! receiver, and which messages it decodes. Stations that do not hear each other are hidden and collide.
+
+use std::{cmp::Reverse, collections::BinaryHeap};
+
+use super::{
+    dbm, milliwatts,
+    reception::{air_time_s, decode_probability},
+};
+use crate::random::{LinkKey, RadioDraw, RadioRandom};
+
+/// Length of a slot at 10 MHz, nanoseconds.
+const SLOT_NS: u64 = 13_000;
+/// Idle time before a station sends: SIFS and three slots (access category `AC_VI`), nanoseconds.
+const AIFS_NS: u64 = 32_000 + 3 * SLOT_NS;
+/// Largest number of slots of a backoff, `CWmin` of `AC_VI`.
+const WINDOW_SLOTS: u32 = 7;
+/// Time after its beginning from which a transmission is heard, nanoseconds. Stations that begin within it collide.
+const SENSING_NS: u64 = 8_000;
+/// Signals this far below the noise are neither decoded nor disturb, dB.
+pub const IRRELEVANT_DB: f64 = 12.0;
+
+/// A message that waits to be sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct QueuedMessage {
+    /// Index of the sending radio.
+    pub radio: u32,
+    /// Station id of the sender, and the message's number: key of all draws.
+    pub station: u32,
+    /// Number of the message.
+    pub message: u32,
+    /// Time at which it is handed to the radio, nanoseconds since the beginning of the tick.
+    pub ready_ns: u64,
+    /// Bytes of the frame.
+    pub bytes: u32,
+}
+
+/// Mean power of a sender's messages at one receiver.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MediumLink {
+    /// Index of the receiving radio.
+    pub radio: u32,
+    /// Power with path loss and shadowing, without fast fading, milliwatts.
+    pub power_mw: f32,
+    /// Twice the shape of Nakagami's distribution; 0 = no fast fading.
+    pub twice_shape: u32,
+}
+
+/// A message on air.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Transmission {
+    /// The message; its place in the queue.
+    pub queued: usize,
+    /// Beginning, nanoseconds since the beginning of the tick.
+    pub start_ns: u64,
+    /// End.
+    pub end_ns: u64,
+}
+
+impl Transmission {
+    fn overlap_ns(&self, other: &Self) -> u64 {
+        let (from, to) = (self.start_ns.max(other.start_ns), self.end_ns.min(other.end_ns));
+        to.saturating_sub(from)
+    }
+}
+
+/// Parameters of the channel.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Medium {
+    /// Noise of a receiver, milliwatts.
+    pub noise_mw: f64,
+    /// Power from which the channel is busy, milliwatts.
+    pub busy_mw: f64,
+    /// Length of a tick, nanoseconds. A message that could not be sent within it is dropped: a newer one follows.
+    pub tick_ns: u64,
+}
+
+/// What is on air in a tick.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Schedule {
+    /// Transmissions by their beginning.
+    pub on_air: Vec<Transmission>,
+    /// Messages that found no time to be sent.
+    pub dropped: u32,
+}
+
+/// Links of one radio to a receiver, in the order of their receivers.
+fn link_to(links: &[MediumLink], radio: u32) -> Option<&MediumLink> {
+    links
+        .binary_search_by_key(&radio, |link| link.radio)
+        .ok()
+        .map(|place| &links[place])
+}
+
+impl Medium {
+    /// The channel of receivers with a noise figure, which find it busy from a power on.
+    #[must_use]
+    pub fn new(noise_dbm: f64, busy_dbm: f64, tick_ns: u64) -> Self {
+        Self {
+            noise_mw: milliwatts(noise_dbm),
+            busy_mw: milliwatts(busy_dbm),
+            tick_ns,
+        }
+    }
+
+    /// Power below which a link does not count, dBm.
+    #[must_use]
+    pub fn irrelevant_dbm(&self) -> f64 {
+        dbm(self.noise_mw) - IRRELEVANT_DB
+    }
+
+    /// When each message is sent. `links[radio]` are the links of each radio that has a message, ascending by receiver.
+    #[must_use]
+    pub fn schedule(&self, queue: &[QueuedMessage], links: &[Vec<MediumLink>], random: &RadioRandom) -> Schedule {
+        let mut schedule = Schedule::default();
+        // Attempts in the order of their time; at the same time in the order of the queue.
+        let mut attempts: BinaryHeap<Reverse<(u64, usize, u32)>> = queue
+            .iter()
+            .enumerate()
+            .map(|(place, message)| Reverse((message.ready_ns, place, 0)))
+            .collect();
+        // The first transmission that may still be heard.
+        let mut heard_from = 0;
+        while let Some(Reverse((now_ns, place, attempt))) = attempts.pop() {
+            let message = &queue[place];
+            let air_ns = (air_time_s(message.bytes as usize) * 1e9) as u64;
+            if now_ns + air_ns > self.tick_ns {
+                schedule.dropped += 1;
+                continue;
+            }
+            while schedule
+                .on_air
+                .get(heard_from)
+                .is_some_and(|sent| sent.end_ns + AIFS_NS + self.longest_ns() < now_ns)
+            {
+                heard_from += 1;
+            }
+            let is_heard = |sent: &&Transmission| {
+                let other = &queue[sent.queued];
+                let is_recent = sent.end_ns + AIFS_NS > now_ns;
+                let has_begun = sent.start_ns + SENSING_NS <= now_ns;
+                is_recent
+                    && (other.radio == message.radio
+                        || has_begun
+                            && link_to(&links[other.radio as usize], message.radio)
+                                .is_some_and(|link| f64::from(link.power_mw) >= self.busy_mw))
+            };
+            let busy_until_ns = schedule.on_air[heard_from..]
+                .iter()
+                .filter(is_heard)
+                .map(|sent| sent.end_ns)
+                .max();
+            match busy_until_ns {
+                None => schedule.on_air.push(Transmission {
+                    queued: place,
+                    start_ns: now_ns,
+                    end_ns: now_ns + air_ns,
+                }),
+                Some(end_ns) => {
+                    let key = LinkKey {
+                        sender: message.station,
+                        receiver: 0,
+                        message: message.message,
+                    };
+                    let slots = random.words(key, RadioDraw::Backoff, attempt)[0] % (WINDOW_SLOTS + 1);
+                    let again_ns = end_ns + AIFS_NS + u64::from(slots) * SLOT_NS;
+                    attempts.push(Reverse((again_ns, place, attempt + 1)));
+                }
+            }
+        }
+        schedule
+    }
+
+    /// Longest air time that is looked back for, nanoseconds: 1500 bytes.
+    fn longest_ns(&self) -> u64 {
+        (air_time_s(1500) * 1e9) as u64
+    }
+
+    /// Indices of the radios that decode transmission `number`, ascending, into `decoded`. `stations` are the station ids of the radios.
+    pub fn receivers(
+        &self,
+        number: usize,
+        schedule: &Schedule,
+        queue: &[QueuedMessage],
+        links: &[Vec<MediumLink>],
+        stations: &[u32],
+        random: &RadioRandom,
+        decoded: &mut Vec<u32>,
+    ) {
+        let sent = &schedule.on_air[number];
+        let message = &queue[sent.queued];
+        let overlapping: Vec<&Transmission> = schedule
+            .on_air
+            .iter()
+            .enumerate()
+            .filter(|(other, overlapping)| *other != number && sent.overlap_ns(overlapping) > 0)
+            .map(|(_, overlapping)| overlapping)
+            .collect();
+        decoded.clear();
+        for link in &links[message.radio as usize] {
+            // A radio cannot hear while it sends.
+            if overlapping.iter().any(|other| queue[other.queued].radio == link.radio) {
+                continue;
+            }
+            let receiver = stations[link.radio as usize];
+            let power_mw = |link: &MediumLink, message: &QueuedMessage| {
+                let key = LinkKey {
+                    sender: message.station,
+                    receiver,
+                    message: message.message,
+                };
+                let gain = match link.twice_shape {
+                    0 => 1.0,
+                    halves => super::fading::power_gain(random, key, halves),
+                };
+                f64::from(link.power_mw) * gain
+            };
+            let (mut disturbance_mw, mut disturbed_ns) = (0.0, 0);
+            for other in &overlapping {
+                let disturbing = &queue[other.queued];
+                if let Some(disturber) = link_to(&links[disturbing.radio as usize], link.radio) {
+                    disturbance_mw += power_mw(disturber, disturbing);
+                    disturbed_ns += sent.overlap_ns(other);
+                }
+            }
+            let signal_mw = power_mw(link, message);
+            let share = disturbed_ns as f64 / (sent.end_ns - sent.start_ns) as f64;
+            let probability = self.decodes(signal_mw, disturbance_mw, share.min(1.0), message.bytes as usize);
+            let key = LinkKey {
+                sender: message.station,
+                receiver,
+                message: message.message,
+            };
+            if random.uniforms(key, RadioDraw::Decoding, 0)[0] < probability {
+                decoded.push(link.radio);
+            }
+        }
+    }
+
+    /// Probability that a message is decoded of which a share is disturbed: all disturbers at once during that share.
+    #[must_use]
+    pub fn decodes(&self, signal_mw: f64, disturbance_mw: f64, share: f64, bytes: usize) -> f64 {
+        let disturbed_bytes = (share * bytes as f64).ceil() as usize;
+        let clear = decode_probability(signal_mw / self.noise_mw, bytes - disturbed_bytes.min(bytes));
+        match disturbed_bytes {
+            0 => clear,
+            count => clear * decode_probability(signal_mw / (self.noise_mw + disturbance_mw), count),
+        }
+    }
+
+    /// Share of the tick in which each of `radios` radios finds the channel busy; its own messages count.
+    #[must_use]
+    pub fn channel_load(
+        &self,
+        schedule: &Schedule,
+        queue: &[QueuedMessage],
+        links: &[Vec<MediumLink>],
+        radios: usize,
+    ) -> Vec<f32> {
+        let mut busy_ns = vec![0_u64; radios];
+        let mut busy_until_ns = vec![0_u64; radios];
+        for sent in &schedule.on_air {
+            let message = &queue[sent.queued];
+            let mut hear = |radio: u32| {
+                let radio = radio as usize;
+                // Transmissions come by their beginning: what was busy before overlaps only with the beginning.
+                let from_ns = sent.start_ns.max(busy_until_ns[radio]);
+                busy_ns[radio] += sent.end_ns.saturating_sub(from_ns);
+                busy_until_ns[radio] = busy_until_ns[radio].max(sent.end_ns);
+            };
+            hear(message.radio);
+            for link in &links[message.radio as usize] {
+                if f64::from(link.power_mw) >= self.busy_mw {
+                    hear(link.radio);
+                }
+            }
+        }
+        busy_ns.iter().map(|busy| *busy as f32 / self.tick_ns as f32).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::radio::{fading, noise_dbm};
+
+    const BYTES: u32 = 350;
+    const AIR_NS: u64 = 512_000;
+
+    fn medium() -> Medium {
+        Medium::new(noise_dbm(9.0), -85.0, 100_000_000)
+    }
+
+    fn message(radio: u32, ready_ns: u64) -> QueuedMessage {
+        QueuedMessage {
+            radio,
+            station: radio + 100,
+            message: 7,
+            ready_ns,
+            bytes: BYTES,
+        }
+    }
+
+    /// Links with these powers in dBm, without fading; NaN = none.
+    fn links(power_dbm: &[&[f64]]) -> Vec<Vec<MediumLink>> {
+        let row = |row: &&[f64]| {
+            let link = |(radio, power): (usize, &f64)| {
+                (!power.is_nan()).then(|| MediumLink {
+                    radio: radio as u32,
+                    power_mw: milliwatts(*power) as f32,
+                    twice_shape: 0,
+                })
+            };
+            row.iter().enumerate().filter_map(link).collect()
+        };
+        power_dbm.iter().map(row).collect()
+    }
+
+    #[test]
+    fn a_station_waits_while_it_hears_another_and_then_backs_off() {
+        let links = links(&[&[f64::NAN, -60.0], &[-60.0, f64::NAN]]);
+        let queue = [message(0, 1_000_000), message(1, 1_100_000)];
+        let schedule = medium().schedule(&queue, &links, &RadioRandom::new(1));
+        let [first, second] = schedule.on_air[..] else {
+            panic!("{schedule:?}")
+        };
+        assert_eq!((first.start_ns, first.end_ns), (1_000_000, 1_000_000 + AIR_NS));
+        let waited_ns = second.start_ns - first.end_ns - AIFS_NS;
+        assert!(second.queued == 1 && waited_ns % SLOT_NS == 0 && waited_ns <= 7 * SLOT_NS);
+        // Below the threshold of carrier sense it is not heard.
+        let deaf = super::tests::links(&[&[f64::NAN, -86.0], &[-86.0, f64::NAN]]);
+        let schedule = medium().schedule(&queue, &deaf, &RadioRandom::new(1));
+        assert_eq!(schedule.on_air[1].start_ns, 1_100_000);
+    }
+
+    #[test]
+    fn stations_that_begin_at_once_collide() {
+        let links = links(&[&[f64::NAN, -60.0], &[-60.0, f64::NAN]]);
+        let queue = [message(0, 5_000), message(1, 9_000)];
+        let schedule = medium().schedule(&queue, &links, &RadioRandom::new(1));
+        assert_eq!(schedule.on_air[1].start_ns, 9_000);
+    }
+
+    #[test]
+    fn what_does_not_fit_into_the_tick_is_dropped() {
+        let links = links(&[&[f64::NAN, -60.0], &[-60.0, f64::NAN]]);
+        let queue = [message(0, 99_400_000), message(1, 99_450_000)];
+        let schedule = medium().schedule(&queue, &links, &RadioRandom::new(1));
+        assert_eq!((schedule.on_air.len(), schedule.dropped), (1, 1));
+    }
+
+    fn decoded_by(queue: &[QueuedMessage], links: &[Vec<MediumLink>], number: usize) -> Vec<u32> {
+        let (medium, random) = (medium(), RadioRandom::new(1));
+        let schedule = medium.schedule(queue, links, &random);
+        let stations: Vec<u32> = (100..100 + links.len() as u32).collect();
+        let mut decoded = Vec::new();
+        medium.receivers(number, &schedule, queue, links, &stations, &random, &mut decoded);
+        decoded
+    }
+
+    #[test]
+    fn hidden_stations_disturb_each_other_between_them() {
+        // 0 and 2 do not hear each other; 1 hears both equally strong; 3 hears only 0.
+        let hidden = links(&[
+            &[f64::NAN, -70.0, f64::NAN, -70.0],
+            &[-70.0, f64::NAN, -70.0, f64::NAN],
+            &[f64::NAN, -70.0, f64::NAN, f64::NAN],
+            &[-70.0, f64::NAN, f64::NAN, f64::NAN],
+        ]);
+        let both = [message(0, 1_000_000), message(2, 1_100_000)];
+        assert_eq!(decoded_by(&both, &hidden, 0), [3]);
+        assert_eq!(decoded_by(&both, &hidden, 1), Vec::<u32>::new());
+        let one = [message(0, 1_000_000)];
+        assert_eq!(decoded_by(&one, &hidden, 0), [1, 3]);
+        // 20 dB stronger it is decoded all the same.
+        let mut near = hidden;
+        near[0][0].power_mw *= 100.0;
+        assert_eq!(decoded_by(&both, &near, 0), [1, 3]);
+    }
+
+    #[test]
+    fn a_radio_that_sends_does_not_hear() {
+        let deaf = links(&[&[f64::NAN, -86.0], &[-86.0, f64::NAN]]);
+        let queue = [message(0, 1_000_000), message(1, 1_100_000)];
+        assert_eq!(decoded_by(&queue, &deaf, 0), Vec::<u32>::new());
+        assert_eq!(decoded_by(&queue[..1], &deaf, 0), [1]);
+    }
+
+    #[test]
+    fn the_load_counts_every_busy_time_once() {
+        // 1 hears 0 and 2, which overlap by all but 0.1 ms; 0 hears only itself.
+        let hidden = links(&[&[f64::NAN, -70.0, f64::NAN], &[], &[f64::NAN, -70.0, f64::NAN]]);
+        let queue = [message(0, 1_000_000), message(2, 1_100_000)];
+        let schedule = medium().schedule(&queue, &hidden, &RadioRandom::new(1));
+        let load = medium().channel_load(&schedule, &queue, &hidden, 3);
+        let expected = [AIR_NS, AIR_NS + 100_000, AIR_NS].map(|ns| ns as f32 / 1e8);
+        assert_eq!(load, expected);
+    }
+
+    /// Delivery between two stations beside the integral over the distribution of the fading.
+    #[test]
+    fn two_stations_deliver_as_their_closed_form() {
+        const MESSAGES: u32 = 40_000;
+        let (medium, random) = (medium(), RadioRandom::new(3));
+        let schedule = Schedule {
+            on_air: vec![Transmission {
+                queued: 0,
+                start_ns: 0,
+                end_ns: AIR_NS,
+            }],
+            dropped: 0,
+        };
+        for (mean_snr_db, halves) in [(3.0, 2), (6.0, 2), (12.0, 2), (5.0, 6), (4.5, 0)] {
+            let power_mw = medium.noise_mw * milliwatts(mean_snr_db);
+            let links = vec![
+                vec![MediumLink {
+                    radio: 1,
+                    power_mw: power_mw as f32,
+                    twice_shape: halves,
+                }],
+                Vec::new(),
+            ];
+            let mut decoded = Vec::new();
+            let delivered = (0..MESSAGES).filter(|number| {
+                let queue = [QueuedMessage {
+                    message: *number,
+                    ..message(0, 0)
+                }];
+                medium.receivers(0, &schedule, &queue, &links, &[100, 101], &random, &mut decoded);
+                decoded == [1]
+            });
+            let found = delivered.count() as f64 / f64::from(MESSAGES);
+            let mean = power_mw / medium.noise_mw;
+            // Gamma density of shape m and mean 1; midpoints of 1/1000.
+            let shape = f64::from(halves) / 2.0;
+            let density = |x: f64| shape.powf(shape) * x.powf(shape - 1.0) * (-shape * x).exp() / libm::tgamma(shape);
+            let expected = match halves {
+                0 => decode_probability(mean, BYTES as usize),
+                _ => (0..20_000)
+                    .map(|i| (f64::from(i) + 0.5) / 1000.0)
+                    .map(|x| 0.001 * density(x) * decode_probability(mean * x, BYTES as usize))
+                    .sum(),
+            };
+            let error = 5.0 * (expected * (1.0 - expected) / f64::from(MESSAGES)).sqrt() + 1e-4;
+            assert!(
+                (found - expected).abs() < error,
+                "{mean_snr_db} dB, m {shape}: {found} for {expected}"
+            );
+            assert!(fading::twice_shape(10.0) == 6);
+        }
+    }
+}

@@ -1,0 +1,297 @@
+//! Whether buildings or vehicles stand between two antennas, from the scene and the road users of a tick.
+
+use std::{ops::ControlFlow, sync::Arc};
+
+use ipc_schema::world::VehicleState;
+use sim_core::scene::{
+    Grid, Scene,
+    shape::{Bounds, OrientedBox, Point, cross, edges, from_to},
+};
+
+use super::path_loss::LinkState;
+
+/// Size of the cells of the index over buildings, metres.
+const BUILDING_CELL_M: f64 = 25.0;
+/// Size of the cells of the index over vehicles, metres.
+const VEHICLE_CELL_M: f64 = 20.0;
+
+/// An antenna.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Antenna {
+    /// x and y, world, metres.
+    pub position_m: Point,
+    /// Height, world, metres.
+    pub z_m: f64,
+    /// The road user that carries it, which does not obstruct its own links: its row in the world.
+    pub row: u32,
+}
+
+/// What is between two antennas.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LinkObstruction {
+    /// The state of the link.
+    pub state: LinkState,
+    /// For a link behind vehicles: whether each antenna is higher than the highest of them.
+    pub above: [bool; 2],
+}
+
+/// Obstacles of a tick.
+#[derive(Debug, Default)]
+pub struct Obstacles {
+    scene: Arc<Scene>,
+    buildings: Grid,
+    bodies: Vec<OrientedBox>,
+    vehicles: Grid,
+}
+
+/// The box about a road user.
+#[must_use]
+pub fn body_of(state: &VehicleState) -> OrientedBox {
+    let (sin, cos) = libm::sincos(state.yaw_rad);
+    let half_length_m = 0.5 * f64::from(state.length_m);
+    // From the rear axle; a person's origin is its centre.
+    let ahead_m = match state.kind == ipc_schema::traffic::Kind::Person as u32 {
+        true => 0.0,
+        false => half_length_m - f64::from(state.rear_overhang_m),
+    };
+    OrientedBox {
+        centre_m: [state.x_m + ahead_m * cos, state.y_m + ahead_m * sin],
+        along: [cos, sin],
+        half_m: [half_length_m, 0.5 * f64::from(state.width_m)],
+        z_m: [state.z_m, state.z_m + f64::from(state.height_m)],
+    }
+}
+
+impl Obstacles {
+    /// The buildings of a scene, and no vehicles.
+    #[must_use]
+    pub fn new(scene: Arc<Scene>) -> Self {
+        let bounds: Vec<Bounds> = scene.buildings().iter().map(|building| building.bounds).collect();
+        Self {
+            buildings: Grid::new(&bounds, BUILDING_CELL_M),
+            scene,
+            bodies: Vec::new(),
+            vehicles: Grid::default(),
+        }
+    }
+
+    /// Takes the road users of a tick.
+    pub fn update(&mut self, states: &[VehicleState]) {
+        self.bodies.clear();
+        self.bodies.extend(states.iter().map(body_of));
+        let bounds: Vec<Bounds> = self.bodies.iter().map(OrientedBox::bounds).collect();
+        self.vehicles = Grid::new(&bounds, VEHICLE_CELL_M);
+    }
+
+    /// The boxes about the road users, by row.
+    #[must_use]
+    pub fn bodies(&self) -> &[OrientedBox] {
+        &self.bodies
+    }
+
+    /// What is between two antennas.
+    #[must_use]
+    pub fn between(&self, a: &Antenna, b: &Antenna) -> LinkObstruction {
+        let clear = LinkObstruction {
+            state: LinkState::Clear,
+            above: [true; 2],
+        };
+        if self.meets_building(a, b) {
+            return LinkObstruction {
+                state: LinkState::Building,
+                ..clear
+            };
+        }
+        match self.highest_vehicle_m(a, b) {
+            None => clear,
+            Some(top_m) => LinkObstruction {
+                state: LinkState::Vehicles,
+                above: [a.z_m > top_m, b.z_m > top_m],
+            },
+        }
+    }
+
+    /// True if a building meets the line between two antennas.
+    #[must_use]
+    pub fn meets_building(&self, a: &Antenna, b: &Antenna) -> bool {
+        let line = Bounds::of([a.position_m, b.position_m]);
+        let mut is_met = false;
+        let way = from_to(a.position_m, b.position_m);
+        self.buildings.along(a.position_m, b.position_m, |found| {
+            is_met = found.iter().any(|number| {
+                let building = &self.scene.buildings()[*number as usize];
+                let roof_m = building.z_m()[1];
+                building.bounds.meets(&line)
+                    && edges(&building.outline_m).any(|(from, to)| {
+                        let share = share_of_crossing(a.position_m, way, from, to);
+                        share.is_some_and(|share| a.z_m + share * (b.z_m - a.z_m) < roof_m)
+                    })
+            });
+            if is_met {
+                ControlFlow::Break(())
+            } else {
+                ControlFlow::Continue(())
+            }
+        });
+        is_met
+    }
+
+    /// Top of the highest road user that meets the line between two antennas, metres. Those that carry the antennas do not count.
+    #[must_use]
+    pub fn highest_vehicle_m(&self, a: &Antenna, b: &Antenna) -> Option<f64> {
+        let mut top_m: Option<f64> = None;
+        self.vehicles.along(a.position_m, b.position_m, |found| {
+            for row in found {
+                let body = &self.bodies[*row as usize];
+                if *row == a.row || *row == b.row || top_m.is_some_and(|top| body.z_m[1] <= top) {
+                    continue;
+                }
+                if meets_box(body, a, b) {
+                    top_m = Some(body.z_m[1]);
+                }
+            }
+            ControlFlow::Continue(())
+        });
+        top_m
+    }
+}
+
+/// Share of the way from `a` at which it crosses a wall, if it does.
+fn share_of_crossing(a: Point, way: Point, from: Point, to: Point) -> Option<f64> {
+    let wall = from_to(from, to);
+    let area = cross(way, wall);
+    if area == 0.0 {
+        return None;
+    }
+    let offset = from_to(a, from);
+    let (share, along) = (cross(offset, wall) / area, cross(offset, way) / area);
+    ((0.0..=1.0).contains(&share) && (0.0..=1.0).contains(&along)).then_some(share)
+}
+
+/// True if the line between two antennas passes through a box.
+fn meets_box(body: &OrientedBox, a: &Antenna, b: &Antenna) -> bool {
+    let start = body.local_from_world(a.position_m);
+    let way = from_to(start, body.local_from_world(b.position_m));
+    let (mut enter, mut leave) = (0.0_f64, 1.0_f64);
+    for axis in 0..2 {
+        let half_m = body.half_m[axis];
+        if way[axis] == 0.0 {
+            if start[axis].abs() > half_m {
+                return false;
+            }
+            continue;
+        }
+        let (near, far) = ((-half_m - start[axis]) / way[axis], (half_m - start[axis]) / way[axis]);
+        enter = enter.max(near.min(far));
+        leave = leave.min(near.max(far));
+    }
+    // The line's lowest point over the box.
+    let height_m = |share: f64| a.z_m + share * (b.z_m - a.z_m);
+    enter <= leave && height_m(enter).min(height_m(leave)) < body.z_m[1]
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use sim_core::scene::{Prism, Road, SolidClass};
+
+    use super::*;
+
+    fn house(x_m: f64, y_m: f64, height_m: f64) -> Prism {
+        let outline = vec![
+            [x_m, y_m],
+            [x_m + 10.0, y_m],
+            [x_m + 10.0, y_m + 10.0],
+            [x_m, y_m + 10.0],
+        ];
+        Prism::new("house".into(), SolidClass::Building, outline, 0.0, height_m).unwrap()
+    }
+
+    fn antenna(x_m: f64, y_m: f64, z_m: f64, row: u32) -> Antenna {
+        Antenna {
+            position_m: [x_m, y_m],
+            z_m,
+            row,
+        }
+    }
+
+    fn vehicle(x_m: f64, y_m: f64, height_m: f32) -> VehicleState {
+        VehicleState {
+            x_m,
+            y_m,
+            length_m: 4.0,
+            width_m: 2.0,
+            height_m,
+            rear_overhang_m: 1.0,
+            ..VehicleState::default()
+        }
+    }
+
+    #[test]
+    fn a_house_is_in_the_way_up_to_its_roof() {
+        let scene = Scene::new(Road::default(), vec![house(50.0, -5.0, 8.0)], Vec::new());
+        let obstacles = Obstacles::new(Arc::new(scene));
+        let state = |y_m, z_m| {
+            obstacles
+                .between(&antenna(0.0, y_m, z_m, 0), &antenna(100.0, y_m, z_m, 1))
+                .state
+        };
+        assert_eq!(state(0.0, 1.5), LinkState::Building);
+        assert_eq!(state(0.0, 8.1), LinkState::Clear);
+        assert_eq!(state(5.1, 1.5), LinkState::Clear);
+    }
+
+    #[test]
+    fn a_vehicle_is_in_the_way_and_its_height_counts() {
+        let mut obstacles = Obstacles::default();
+        obstacles.update(&[
+            vehicle(0.0, 0.0, 1.5),
+            vehicle(100.0, 0.0, 1.5),
+            vehicle(50.0, 0.0, 3.5),
+            vehicle(70.0, 0.0, 1.5),
+        ]);
+        let (a, b) = (antenna(1.0, 0.0, 1.6, 0), antenna(101.0, 0.0, 1.6, 1));
+        let between = obstacles.between(&a, &b);
+        assert_eq!((between.state, between.above), (LinkState::Vehicles, [false, false]));
+        // Over the lorry, and past it.
+        let high = obstacles.between(&Antenna { z_m: 5.4, ..a }, &b);
+        assert_eq!((high.state, high.above), (LinkState::Vehicles, [true, false]));
+        assert_eq!(
+            obstacles
+                .between(&Antenna { z_m: 8.0, ..a }, &Antenna { z_m: 8.0, ..b })
+                .state,
+            LinkState::Clear
+        );
+        let aside = |antenna: Antenna| Antenna {
+            position_m: [antenna.position_m[0], 1.1],
+            ..antenna
+        };
+        assert_eq!(obstacles.between(&aside(a), &aside(b)).state, LinkState::Clear);
+    }
+
+    proptest! {
+        /// Beside the plain test of all walls and boxes.
+        #[test]
+        fn the_index_finds_what_a_search_of_everything_finds(
+            houses in prop::collection::vec(prop::array::uniform2(-300.0_f64..300.0), 0..30),
+            cars in prop::collection::vec((prop::array::uniform2(-300.0_f64..300.0), -3.1_f64..3.1, 1.0_f32..4.0), 0..30),
+            from in prop::array::uniform2(-400.0_f64..400.0), to in prop::array::uniform2(-400.0_f64..400.0), z_m in 0.5_f64..4.0,
+        ) {
+            let houses: Vec<Prism> = houses.into_iter().map(|[x, y]| house(x, y, 3.0)).collect();
+            let states: Vec<VehicleState> = cars
+                .into_iter()
+                .map(|([x, y], yaw_rad, height_m)| VehicleState { yaw_rad, ..vehicle(x, y, height_m) })
+                .collect();
+            let (a, b) = (antenna(from[0], from[1], z_m, u32::MAX), antenna(to[0], to[1], 1.5, u32::MAX));
+            let mut obstacles = Obstacles::new(Arc::new(Scene::new(Road::default(), houses.clone(), Vec::new())));
+            obstacles.update(&states);
+            let way = from_to(from, to);
+            let house_met = houses.iter().any(|house| edges(&house.outline_m).any(|(c, d)| {
+                share_of_crossing(from, way, c, d).is_some_and(|share| z_m + share * (1.5 - z_m) < 3.0)
+            }));
+            prop_assert_eq!(obstacles.meets_building(&a, &b), house_met);
+            let tops = states.iter().map(body_of).filter(|body| meets_box(body, &a, &b)).map(|body| body.z_m[1]);
+            prop_assert_eq!(obstacles.highest_vehicle_m(&a, &b), tops.reduce(f64::max));
+        }
+    }
+}

@@ -1,0 +1,206 @@
+//! Messages beside those that independent encoders made of the same values (`data/messages.py`), and bytes that are no messages.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests assert by unwrapping")]
+
+use serde_json::Value;
+use v2x::message::{
+    GeodeticPoint, StationKind,
+    cam::{Cam, PathPoint},
+    cpm::{Cpm, PerceivedObject},
+    geonetworking::{self, BtpPort, PacketHead},
+};
+
+fn vectors() -> Value {
+    serde_json::from_str(include_str!("data/messages.json")).unwrap()
+}
+
+fn bytes(hex: &Value) -> Vec<u8> {
+    let hex = hex.as_str().unwrap();
+    (0..hex.len())
+        .step_by(2)
+        .map(|at| u8::from_str_radix(&hex[at..at + 2], 16).unwrap())
+        .collect()
+}
+
+/// A number, `None` for null.
+fn optional<T: TryFrom<i64>>(value: &Value) -> Option<T> {
+    value.as_i64().and_then(|number| T::try_from(number).ok())
+}
+
+fn number<T: TryFrom<i64>>(value: &Value) -> T {
+    optional(value).unwrap_or_else(|| panic!("{value}"))
+}
+
+fn position(of: &Value) -> GeodeticPoint {
+    GeodeticPoint {
+        latitude: number(&of["latitude"]),
+        longitude: number(&of["longitude"]),
+        accuracy_cm: optional(&of["accuracy_cm"]),
+        altitude_cm: optional(&of["altitude_cm"]),
+    }
+}
+
+fn cam(of: &Value) -> Cam {
+    let point = |point: &Value| PathPoint {
+        delta_latitude: number(&point["delta_latitude"]),
+        delta_longitude: number(&point["delta_longitude"]),
+        time_10ms: optional(&point["time_10ms"]),
+    };
+    Cam {
+        station: number(&of["station"]),
+        kind: StationKind(number(&of["kind"])),
+        generation_delta_ms: number(&of["generation_delta_ms"]),
+        position: position(&of["position"]),
+        heading: optional(&of["heading"]),
+        heading_confidence: optional(&of["heading_confidence"]),
+        speed_cmps: optional(&of["speed_cmps"]),
+        speed_confidence: optional(&of["speed_confidence"]),
+        length_10cm: number(&of["length_10cm"]),
+        width_10cm: number(&of["width_10cm"]),
+        acceleration: optional(&of["acceleration"]),
+        yaw_rate: optional(&of["yaw_rate"]),
+        path: of["path"].as_array().map(|path| path.iter().map(point).collect()),
+    }
+}
+
+fn cpm(of: &Value) -> Cpm {
+    let object = |of: &Value| PerceivedObject {
+        object: number(&of["object"]),
+        delta_ms: number(&of["delta_ms"]),
+        position_cm: [0, 1].map(|axis| number(&of["position_cm"][axis])),
+        position_confidence_cm: number(&of["position_confidence_cm"]),
+        velocity_cmps: [0, 1].map(|axis| number(&of["velocity_cmps"][axis])),
+        velocity_confidence: number(&of["velocity_confidence"]),
+        angle: number(&of["angle"]),
+        size_10cm: [0, 1].map(|axis| number(&of["size_10cm"][axis])),
+        quality: number(&of["quality"]),
+        is_person: of["is_person"].as_bool().unwrap(),
+    };
+    Cpm {
+        station: number(&of["station"]),
+        reference_time_ms: number(&of["reference_time_ms"]),
+        position: position(&of["position"]),
+        heading: number(&of["heading"]),
+        sensor_range_10cm: optional(&of["sensor_range_10cm"]),
+        perceived: number(&of["perceived"]),
+        objects: of["objects"].as_array().unwrap().iter().map(object).collect(),
+    }
+}
+
+#[test]
+fn cams_are_bit_for_bit_those_of_asn1tools_and_pycrate() {
+    let vectors = vectors();
+    for vector in vectors["cam"].as_array().unwrap() {
+        let (ours, theirs) = (cam(&vector["values"]), bytes(&vector["hex"]));
+        assert_eq!(ours.encode(), theirs, "{ours:?}");
+        assert_eq!(Cam::decode(&theirs).unwrap(), ours);
+    }
+}
+
+#[test]
+fn cpms_are_bit_for_bit_those_of_asn1tools() {
+    let vectors = vectors();
+    for vector in vectors["cpm"].as_array().unwrap() {
+        let (ours, theirs) = (cpm(&vector["values"]), bytes(&vector["hex"]));
+        assert_eq!(ours.encode(), theirs, "{ours:?}");
+        assert_eq!(Cpm::decode(&theirs).unwrap(), ours);
+    }
+}
+
+/// A packet with every header field, checked by hand against EN 302 636-4-1, tables 2 to 9.
+#[test]
+fn the_headers_are_those_of_a_single_hop_broadcast() {
+    let head = PacketHead {
+        port: BtpPort::Cam,
+        station: 0x0102_0304,
+        kind: 5,
+        time_ms: 0x1122_3344,
+        latitude: 525_200_000,
+        longitude: -134_000_000,
+        speed_cmps: -300,
+        heading: 2715,
+    };
+    let packet = geonetworking::encode(&head, &[0xAA, 0xBB]);
+    let expected: [&[u8]; 6] = [
+        // Basic header: version 1, common header next; reserved; lifetime 20 × 50 ms; one hop.
+        &[0x11, 0x00, 0x50, 0x01],
+        // Common header: BTP-B; TSB, single hop; class 2; mobile; 6 bytes; one hop; reserved.
+        &[0x20, 0x50, 0x02, 0x80, 0x00, 0x06, 0x01, 0x00],
+        // Address: manual, passenger car; MAC address; time stamp.
+        &[0x94, 0x00, 0x02, 0x00, 0x01, 0x02, 0x03, 0x04, 0x11, 0x22, 0x33, 0x44],
+        // Latitude, longitude, accurate with −300 cm/s in 15 bits, heading.
+        &[0x1F, 0x4D, 0xEA, 0x80, 0xF8, 0x03, 0x52, 0x80, 0xFE, 0xD4, 0x0A, 0x9B],
+        // Media-dependent data; port 2001, no information.
+        &[0x00, 0x00, 0x00, 0x00, 0x07, 0xD1, 0x00, 0x00],
+        &[0xAA, 0xBB],
+    ];
+    assert_eq!(packet, expected.concat());
+    assert_eq!(geonetworking::decode(&packet), Ok((head, &[0xAA, 0xBB][..])));
+}
+
+/// Xorshift: any bytes that repeat.
+struct Mutations(u64);
+
+impl Mutations {
+    fn next(&mut self, below: usize) -> usize {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        (self.0 >> 11) as usize % below
+    }
+
+    /// Flips bits, cuts, lengthens or overwrites.
+    fn mutate(&mut self, bytes: &mut Vec<u8>) {
+        for _ in 0..=self.next(4) {
+            match self.next(4) {
+                0 if !bytes.is_empty() => bytes.truncate(self.next(bytes.len())),
+                1 => bytes.extend([self.next(256) as u8; 3]),
+                2 if !bytes.is_empty() => {
+                    let place = self.next(bytes.len());
+                    bytes[place] = self.next(256) as u8;
+                }
+                _ if !bytes.is_empty() => {
+                    let place = self.next(bytes.len());
+                    bytes[place] ^= 1 << self.next(8);
+                }
+                _ => {}
+            }
+        }
+    }
+}
+
+/// Whatever is read of mutated bytes is a message that is written and read again as the same; nothing panics.
+#[test]
+fn a_hundred_thousand_mutated_messages_are_refused_or_read_without_a_panic() {
+    let vectors = vectors();
+    let of = |kind: &str| {
+        vectors[kind]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|vector| bytes(&vector["hex"]))
+            .collect::<Vec<_>>()
+    };
+    let (cams, cpms) = (of("cam"), of("cpm"));
+    let mut mutations = Mutations(0x9E37_79B9_7F4A_7C15);
+    let (mut read, mut refused) = (0_u32, 0_u32);
+    for round in 0..100_000 {
+        let mut message = match round % 2 {
+            0 => cams[mutations.next(cams.len())].clone(),
+            _ => cpms[mutations.next(cpms.len())].clone(),
+        };
+        mutations.mutate(&mut message);
+        let is_read = match round % 2 {
+            0 => Cam::decode(&message)
+                .map(|cam| assert_eq!(Cam::decode(&cam.encode()).unwrap(), cam))
+                .is_ok(),
+            _ => Cpm::decode(&message)
+                .map(|cpm| assert_eq!(Cpm::decode(&cpm.encode()).unwrap(), cpm))
+                .is_ok(),
+        };
+        let _ = geonetworking::decode(&message);
+        *(if is_read { &mut read } else { &mut refused }) += 1;
+    }
+    // Many mutations only change a value; most break the message.
+    assert!(read > 1000 && refused > 10_000, "{read} read, {refused} refused");
+}
