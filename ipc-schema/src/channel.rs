@@ -6,10 +6,11 @@ use crate::{
     ego::EgoPoseLayout,
     event::CollisionLayout,
     image::{ImageLayout, ImagePlane, MOST_SEEN},
+    neighbours::NeighboursLayout,
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
     prediction::{ESTIMATE_COLUMNS, PredictionLayout},
-    process::Process::{self, SensorDaemon, SimCore, TrafficBridge, Trainer},
+    process::Process::{self, SensorDaemon, SimCore, TrafficBridge, Trainer, V2x},
     radar::{MOST_DETECTIONS, RadarLayout},
     run::RunFile,
     section::SectionSpec,
@@ -53,6 +54,10 @@ pub enum Channel {
     Image = 10,
     /// What radars detect: one message for each radar and scan.
     Radar = 11,
+    /// What connected vehicles sense, for `v2x`: every tick that is made, once.
+    Measurement = 12,
+    /// What connected vehicles know from messages.
+    Neighbours = 13,
 }
 
 /// What happens to a message that finds a subscriber's queue full.
@@ -133,7 +138,7 @@ const fn two_batches(queue_length: usize) -> usize {
 }
 
 /// Every data service, by [`Channel`].
-pub const CHANNELS: [ChannelSpec; 12] = [
+pub const CHANNELS: [ChannelSpec; 14] = [
     ChannelSpec {
         channel: Channel::Traffic,
         name: "traffic",
@@ -196,7 +201,7 @@ pub const CHANNELS: [ChannelSpec; 12] = [
         sections: WorldLayout::SECTIONS,
         dimensions: WorldLayout::DIMENSIONS,
         producer: SimCore,
-        required: &[SensorDaemon],
+        required: &[SensorDaemon, V2x],
         window: RunFile::window_ticks,
         topics: &["world"],
         when_full: FullQueue::DropNewest,
@@ -345,6 +350,44 @@ pub const CHANNELS: [ChannelSpec; 12] = [
         in_hand: |_| SPARE_MESSAGES,
         is_used: |run| run.config.radar.vehicles > 0,
     },
+    ChannelSpec {
+        channel: Channel::Measurement,
+        name: "measurement",
+        payload: "as `observation`, for every tick made",
+        sections: ObservationLayout::SECTIONS,
+        dimensions: ObservationLayout::DIMENSIONS,
+        producer: SensorDaemon,
+        required: &[V2x],
+        window: RunFile::window_ticks,
+        topics: &[],
+        when_full: FullQueue::DropNewest,
+        max_payload: |run| match run.config.v2x.is_on() {
+            true => Channel::Observation.max_payload(run),
+            false => 0,
+        },
+        queue_length: windowful,
+        in_hand: |run| two_batches(windowful(run)),
+        is_used: |run| run.config.v2x.is_on(),
+    },
+    ChannelSpec {
+        channel: Channel::Neighbours,
+        name: "neighbours",
+        payload: "objects known from messages, radios",
+        sections: NeighboursLayout::SECTIONS,
+        dimensions: NeighboursLayout::DIMENSIONS,
+        producer: V2x,
+        required: &[Trainer],
+        window: RunFile::window_ticks,
+        topics: &[],
+        when_full: FullQueue::DropNewest,
+        max_payload: |run| match run.config.v2x.is_on() {
+            true => NeighboursLayout::sized(road_users(run), run.config.v2x.neighbours as usize).len,
+            false => 0,
+        },
+        queue_length: windowful,
+        in_hand: |run| two_batches(windowful(run)),
+        is_used: |run| run.config.v2x.is_on(),
+    },
 ];
 
 /// Each row stands at the place of its channel.
@@ -416,7 +459,7 @@ impl Channel {
         (self.spec().queue_length)(run)
     }
 
-    /// Most messages that can be in use at a time, with every queue of a consumer and the fan-out full; none in a run that does not use
+    /// Most messages that can be in use at a time, with every queue of a required consumer and the fan-out full; none in a run that does not use
     /// the channel.
     #[must_use]
     pub fn worst_case_messages(self, run: &RunFile) -> usize {
@@ -424,7 +467,10 @@ impl Channel {
         if !(spec.is_used)(run) {
             return 0;
         }
-        2 * ((spec.queue_length)(run) + (spec.in_hand)(run)) + SPARE_MESSAGES
+        let required = spec.required.iter().filter(|process| (process.spec().is_wanted)(run));
+        // The required consumers that the run has, at least one subscriber, and the fan-out.
+        let subscribers = required.count().max(1) + 1;
+        subscribers * ((spec.queue_length)(run) + (spec.in_hand)(run)) + SPARE_MESSAGES
     }
 }
 

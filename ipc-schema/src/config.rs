@@ -73,6 +73,8 @@ pub struct Config {
     pub camera: CameraConfig,
     /// Radar.
     pub radar: RadarConfig,
+    /// Messages between road users.
+    pub v2x: V2xConfig,
     /// What happens while a sensor is dark.
     pub blackout: BlackoutConfig,
     /// Fields and normalisation of the observation.

@@ -5,8 +5,10 @@
 //! | `traffic` | `[TrafficState]` | traffic-bridge | sim-core |
 //! | `traffic-meta` | `[VehicleMeta]`, `[SignalMeta]`; or `[RoutePoint]` | traffic-bridge | sim-core |
 //! | `census` | as `traffic-meta`: every road user and every light | traffic-bridge | none |
-//! | `world` | `[VehicleState]`, `[SubStep]`, `[HeroView]` | sim-core | sensor-daemon |
+//! | `world` | `[VehicleState]`, `[SubStep]`, `[HeroView]` | sim-core | sensor-daemon, v2x |
 //! | `observation` | observations, truth, newest samples, slots | sensor-daemon | trainer |
+//! | `measurement` | as `observation`, for every tick made | sensor-daemon | v2x |
+//! | `neighbours` | objects known from messages, radios | v2x | trainer |
 //! | `prediction` | positions or actions, estimates of the filter | trainer | none |
 //! | `ego-pose` | `[EgoPose]` | sim-core | traffic-bridge |
 //! | `event` | `[Collision]` | sim-core | none |
@@ -44,6 +46,7 @@ pub mod image;
 pub mod layout;
 pub mod membership;
 pub mod metric;
+pub mod neighbours;
 pub mod observation;
 pub mod pointcloud;
 pub mod ports;

@@ -257,9 +257,12 @@ impl RunMembership {
             self.source = Some(channel.producer());
         }
         let subscriber = Subscriber::create(&service, channel, &self.run)?;
-        // An observation is addressed to an incarnation of the trainer: a later one refuses it. Other messages are for any incarnation.
+        // What may be sent again is addressed to an incarnation of the trainer: a later one refuses it. Other messages are for any
+        // incarnation.
         Ok(match (channel, self.process) {
-            (Channel::Observation, Process::Trainer) => subscriber.since_incarnation(self.incarnation),
+            (Channel::Observation | Channel::Neighbours, Process::Trainer) => {
+                subscriber.since_incarnation(self.incarnation)
+            }
             _ => subscriber,
         })
     }

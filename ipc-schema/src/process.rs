@@ -16,10 +16,12 @@ pub enum Process {
     SimCore = 1,
     /// Sensors and observations.
     SensorDaemon = 2,
+    /// Messages between road users.
+    V2x = 3,
     /// The learner.
-    Trainer = 3,
+    Trainer = 4,
     /// Shared memory → zenoh.
-    Fanout = 4,
+    Fanout = 5,
 }
 
 /// What a process belongs to.
@@ -77,7 +79,7 @@ const PLAYER: &str = "caraware.play";
 
 /// Every process, by [`Process`], in the order of the data and of starting. `traffic-bridge` comes first because a user's files can make
 /// SUMO fail.
-pub const PROCESSES: [ProcessSpec; 5] = [
+pub const PROCESSES: [ProcessSpec; 6] = [
     ProcessSpec {
         process: Process::TrafficBridge,
         name: "traffic-bridge",
@@ -105,6 +107,16 @@ pub const PROCESSES: [ProcessSpec; 5] = [
         needs: &[Process::TrafficBridge],
         on_exit: OnExit::Required,
         is_wanted: |_| true,
+        holds_up_ticks: |_| true,
+        program: Program::Binary,
+    },
+    ProcessSpec {
+        process: Process::V2x,
+        name: "v2x",
+        scope: ProcessScope::Environment,
+        needs: &[Process::TrafficBridge],
+        on_exit: OnExit::Required,
+        is_wanted: |run| run.config.v2x.is_on(),
         holds_up_ticks: |_| true,
         program: Program::Binary,
     },

@@ -87,6 +87,34 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     daemon.write_part()
 }
 
+/// Delivery to `v2x`: the blocks of observations, each tick once, whatever the trainer has.
+struct Measurements {
+    publisher: Publisher,
+    consumers: RequiredConsumers,
+}
+
+impl Measurements {
+    fn open(membership: &RunMembership) -> Result<Self, Failure> {
+        Ok(Self {
+            publisher: membership.publisher(Channel::Measurement)?,
+            consumers: membership.required_consumers(Channel::Measurement)?,
+        })
+    }
+
+    fn send(&self, header: &MessageHeader, payload: &[u8]) -> Result<(), Failure> {
+        // For any incarnation of its receiver.
+        let header = MessageHeader {
+            addressee: 0,
+            ..*header
+        };
+        let mut draft = self.publisher.loan_unwritten(header, payload.len())?;
+        draft.payload_mut().copy_from_slice(payload);
+        draft.send()?;
+        self.consumers.wake();
+        Ok(())
+    }
+}
+
 struct Daemon {
     membership: RunMembership,
     sensing: Sensing,
@@ -94,6 +122,8 @@ struct Daemon {
     /// Commands that switch sensors on and off.
     switches: Subscriber,
     observations: Publisher,
+    /// Delivery to `v2x`; `None` in a run without messages.
+    measurements: Option<Measurements>,
     /// Delivery to the trainer, which must not miss an observation; `None` in a run without a trainer.
     consumer: Option<Delivery>,
     /// The other required consumers of observations. They receive every tick at least once.
@@ -129,7 +159,11 @@ impl Daemon {
         let observations = membership.publisher(Channel::Observation)?;
         let switches = membership.subscriber(Channel::Switch)?;
         let consumer = match membership.run.mode.has_trainer() {
-            true => Some(Delivery::open(&membership)?),
+            true => Some(Delivery::open(&membership, Channel::Observation)?),
+            false => None,
+        };
+        let measurements = match membership.run.config.v2x.is_on() {
+            true => Some(Measurements::open(&membership)?),
             false => None,
         };
         let required = Channel::Observation.spec().required.iter().copied();
@@ -144,6 +178,7 @@ impl Daemon {
             surroundings,
             switches,
             observations,
+            measurements,
             consumer,
             other_consumers,
             digest: state.digest,
@@ -227,6 +262,12 @@ impl Daemon {
             .map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
         self.scan(world, &road_users)?;
         let is_committed = world.tick < self.committed_ticks;
+        // `v2x` receives committed ticks too: it makes its state again.
+        if self.measurements.is_some()
+            && self.wait_serving_trainer(|daemon| daemon.may_measure(daemon.ticks))? == Wait::Stopped
+        {
+            return Ok(Wait::Stopped);
+        }
         if !is_committed && self.wait_for_credit(n)? == Wait::Stopped {
             return Ok(Wait::Stopped);
         }
@@ -246,6 +287,12 @@ impl Daemon {
             consumer.update_handover(since);
         }
         Ok(waited)
+    }
+
+    /// True if `v2x` has credit for `tick`.
+    fn may_measure(&self, tick: u64) -> bool {
+        let measured = self.measurements.as_ref();
+        measured.is_none_or(|measured| measured.consumers.have_credit(tick))
     }
 
     /// True if the next tick, `len` bytes long, may be sent to the trainer or kept for it. True in a run without a trainer.
@@ -287,6 +334,9 @@ impl Daemon {
         // Stored before the tick is sent: a process that has received the last tick of an episode can rely on the state of the next one.
         if header.has(LAST_OF_EPISODE) {
             self.store_state(header.tick + 1)?;
+        }
+        if let Some(measurements) = &self.measurements {
+            measurements.send(&header, draft.payload())?;
         }
         if self.keep(&header, draft.payload())? {
             draft.send()?;
@@ -355,7 +405,10 @@ impl Daemon {
     fn wait_for_consumers_end(mut self) -> Result<(), Failure> {
         let waited = self.wait_serving_trainer(|daemon| {
             let is_trainer_done = daemon.consumer.as_ref().is_none_or(Delivery::is_done);
-            is_trainer_done && daemon.other_consumers.have_consumed(daemon.ticks)
+            let measured = daemon.measurements.as_ref();
+            is_trainer_done
+                && daemon.other_consumers.have_consumed(daemon.ticks)
+                && measured.is_none_or(|measured| measured.consumers.have_consumed(daemon.ticks))
         })?;
         self.write_part()?;
         if waited == Wait::Stopped {

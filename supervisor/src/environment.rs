@@ -13,8 +13,13 @@ use ipc_schema::{
 
 use crate::{failure::Exit, resume};
 
-/// The processes that simulate an environment.
-pub const SIMULATORS: [Process; 3] = [Process::TrafficBridge, Process::SimCore, Process::SensorDaemon];
+/// The processes that simulate an environment, those of them that a run has.
+pub const SIMULATORS: [Process; 4] = [
+    Process::TrafficBridge,
+    Process::SimCore,
+    Process::SensorDaemon,
+    Process::V2x,
+];
 
 /// The episode that a stored state belongs to.
 #[derive(Debug, Default, serde::Deserialize)]
@@ -106,11 +111,15 @@ impl Environment {
     /// A file cannot be read or written.
     pub fn prepare_restart(&mut self) -> Result<u64, Exit> {
         let run = &self.run;
-        let stored = SIMULATORS.map(|process| episode_state::stored_ticks(&run.run_dir, process));
-        let [first, others @ ..] = &stored;
-        let in_all = |tick: &&u64| others.iter().all(|ticks| ticks.contains(tick));
-        let begins = first
+        let present = SIMULATORS.into_iter().filter(|process| (process.spec().is_wanted)(run));
+        let stored: Vec<Vec<u64>> = present
+            .map(|process| episode_state::stored_ticks(&run.run_dir, process))
+            .collect();
+        let in_all = |tick: &&u64| stored.iter().all(|ticks| ticks.contains(tick));
+        let begins = stored
             .iter()
+            .take(1)
+            .flatten()
             .rev()
             .filter(|tick| **tick <= self.committed_ticks)
             .find(in_all);

@@ -278,6 +278,7 @@ pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFig
         "camera": sensing.camera,
         "radar": sensing.radar,
         "environments": environments,
+        "v2x": parts.read::<Value>(&run.run_dir, Process::V2x),
         "traffic": parts.read::<Value>(&run.run_dir, Process::TrafficBridge),
         "processes": parts.usage(&run.run_dir),
         "dropped": trainer.dropped,

@@ -136,8 +136,8 @@ impl Lease {
         let until = deadline.min(Instant::now() + GIL_HOLD);
         loop {
             for _ in 0..POLLS {
-                if let Some(message) = inner.next_message()? {
-                    return Ok(Some(message));
+                if let Some(messages) = inner.next_message()? {
+                    return Ok(Some(messages.observation));
                 }
                 std::hint::spin_loop();
             }

@@ -8,16 +8,19 @@ use std::{
 };
 
 use ipc_schema::{
+    block::Section,
     board::{State, TrainingStatus},
     clock::monotonic_ns,
     header::{self, MessageHeader},
     membership::{MembershipError, RunMembership},
     metric::{self, METRICS},
+    neighbours::NeighboursLayout,
     observation::ObservationLayout,
-    ports::{BoardReader, Message, Publisher, Subscriber, Waker},
+    ports::{BoardReader, Message, PortError, Publisher, Subscriber, Waker},
     prediction::PredictionLayout,
     process::Process,
     run::RunFile,
+    section::SectionSpec,
     services::Channel as Service,
 };
 use pyo3::{
@@ -74,6 +77,10 @@ fn sights(
 struct Attached {
     membership: RunMembership,
     observations: Subscriber,
+    /// What `v2x` adds to each observation, in a run with messages.
+    neighbours: Option<Subscriber>,
+    /// An observation whose neighbours have not arrived.
+    unpaired: Option<Message>,
     /// Opened by the first call of `scans`.
     scans: Option<Subscriber>,
     /// Opened by the first call of `images`.
@@ -353,6 +360,31 @@ impl Attachment {
     }
 }
 
+/// What a trainer receives of one tick.
+struct TickMessages {
+    observation: Message,
+    /// In a run with messages between road users.
+    neighbours: Option<Message>,
+}
+
+/// The neighbours of the tick of `header`, if they have arrived; those of earlier ticks are repeated, and skipped.
+fn neighbours_of(subscriber: &Subscriber, header: &MessageHeader) -> PyResult<Option<Message>> {
+    while let Some(message) = subscriber.receive().map_err(|error| failed(&error))? {
+        let received = message.header().tick;
+        if received == header.tick {
+            return Ok(Some(message));
+        }
+        if received > header.tick {
+            return Err(failed(&PortError::Gap {
+                channel: subscriber.channel().name(),
+                expected: header.tick,
+                received,
+            }));
+        }
+    }
+    Ok(None)
+}
+
 impl Attached {
     /// Turns to the `sensor-daemon` that counts, once all that an earlier one sent has been received: it sends from there on.
     fn follow_sender(&mut self) {
@@ -360,25 +392,50 @@ impl Attached {
         if sender != self.sender {
             self.sender = sender;
             self.observations.refuse_senders_before(sender);
+            if let Some(neighbours) = &self.neighbours {
+                neighbours.refuse_senders_before(sender);
+            }
+            // Its neighbours died with its sender: the new one sends both again.
+            self.unpaired = None;
             self.membership.turn_to_sender(sender, self.received_ticks);
         }
     }
 
     /// The next observation, if one is waiting. A `sensor-daemon` that was started again sends what it cannot know to have arrived: what
     /// has been received before is skipped.
-    fn next_message(&mut self) -> PyResult<Option<Message>> {
+    fn next_message(&mut self) -> PyResult<Option<TickMessages>> {
         loop {
-            let Some(message) = self.observations.receive().map_err(|error| failed(&error))? else {
+            let observation = match self.unpaired.take() {
+                Some(waiting) => Some(waiting),
+                None => self.observations.receive().map_err(|error| failed(&error))?,
+            };
+            let Some(observation) = observation else {
                 self.follow_sender();
                 return Ok(None);
             };
-            let header = message.header();
+            let header = *observation.header();
             let is_repeated = header.incarnation > 0 && header.tick < self.received_ticks;
-            self.ended |= header.has(header::LAST_OF_RUN);
-            if !is_repeated {
-                self.received_ticks = header.tick + 1;
-                return Ok(Some(message));
+            if is_repeated {
+                self.ended |= header.has(header::LAST_OF_RUN);
+                continue;
             }
+            let neighbours = match &self.neighbours {
+                None => None,
+                Some(subscriber) => match neighbours_of(subscriber, &header)? {
+                    Some(neighbours) => Some(neighbours),
+                    None => {
+                        self.unpaired = Some(observation);
+                        self.follow_sender();
+                        return Ok(None);
+                    }
+                },
+            };
+            self.ended |= header.has(header::LAST_OF_RUN);
+            self.received_ticks = header.tick + 1;
+            return Ok(Some(TickMessages {
+                observation,
+                neighbours,
+            }));
         }
     }
 }
@@ -387,6 +444,10 @@ impl Attachment {
     /// Opens the ports of an attachment.
     fn attach(mut membership: RunMembership, run_json: String, first_tick: u64, outside: bool) -> PyResult<Self> {
         let observations = membership.subscriber(Service::Observation).map_err(membership_failed)?;
+        let neighbours = match membership.run.config.v2x.is_on() {
+            true => Some(membership.subscriber(Service::Neighbours).map_err(membership_failed)?),
+            false => None,
+        };
         let predictions = membership.publisher(Service::Prediction).map_err(membership_failed)?;
         let sim_core = match membership.run.config.drives() {
             true => Some(membership.waker(Process::SimCore).map_err(membership_failed)?),
@@ -402,11 +463,16 @@ impl Attachment {
         // they come without a poll.
         let sender = sensor_daemon.current_incarnation();
         observations.refuse_senders_before(sender);
+        neighbours
+            .iter()
+            .for_each(|neighbours| neighbours.refuse_senders_before(sender));
         membership.turn_to_sender(sender, first_tick);
         membership.attach_from(first_tick);
         let attached = Attached {
             membership,
             observations,
+            neighbours,
+            unpaired: None,
             scans: None,
             images: None,
             radar: None,
@@ -463,8 +529,8 @@ impl Attachment {
     fn take_waiting(&self) -> PyResult<Vec<ObservationBlock>> {
         let mut inner = self.lock()?;
         let mut blocks = Vec::new();
-        while let Some(message) = inner.next_message()? {
-            blocks.push(ObservationBlock::new(message)?);
+        while let Some(messages) = inner.next_message()? {
+            blocks.push(ObservationBlock::new(messages)?);
         }
         Ok(blocks)
     }
@@ -526,11 +592,69 @@ struct ObservationBlock {
     payload_address: usize,
     /// Keeps the payload from being overwritten. Never locked: a message is Send but not Sync, Python wants both.
     _message: Mutex<Message>,
+    neighbours: Option<NeighboursBlock>,
+}
+
+/// The neighbours of a tick in shared memory.
+struct NeighboursBlock {
+    layout: NeighboursLayout,
+    shape: [u32; header::DIMENSIONS],
+    /// Address of the payload; valid as long as `_message` lives.
+    payload_address: usize,
+    /// Keeps the payload from being overwritten.
+    _message: Mutex<Message>,
+}
+
+impl NeighboursBlock {
+    fn new(message: Message) -> PyResult<Self> {
+        let header = *message.header();
+        let layout = NeighboursLayout::of(&header);
+        if layout.len > message.payload().len() {
+            return Err(PyValueError::new_err(format!(
+                "tick {}: the neighbours need {} bytes, but the message has {}",
+                header.tick,
+                layout.len,
+                message.payload().len()
+            )));
+        }
+        Ok(Self {
+            layout,
+            shape: header.shape,
+            payload_address: message.payload().as_ptr().expose_provenance(),
+            _message: Mutex::new(message),
+        })
+    }
+}
+
+/// Scalar, shape and place of the section `name` of a payload.
+fn section_of<const N: usize>(
+    name: &str,
+    specs: &[SectionSpec],
+    named: [(&'static str, Section); N],
+    dimensions: &[&str],
+    sizes: [u32; header::DIMENSIONS],
+) -> PyResult<(Section, String, Vec<usize>)> {
+    let (spec, (_, section)) = specs
+        .iter()
+        .zip(named)
+        .find(|(spec, _)| spec.name == name)
+        .ok_or_else(|| PyKeyError::new_err(name.to_owned()))?;
+    let shape = spec.shape(|dimension| {
+        let mut sizes = dimensions.iter().zip(sizes);
+        sizes
+            .find(|(name, _)| **name == dimension)
+            .map_or(0, |(_, size)| size as usize)
+    });
+    Ok((section, (spec.element)().0, shape))
 }
 
 impl ObservationBlock {
-    fn new(message: Message) -> PyResult<Self> {
+    fn new(messages: TickMessages) -> PyResult<Self> {
         let received_ns = monotonic_ns();
+        let TickMessages {
+            observation: message,
+            neighbours,
+        } = messages;
         let header = *message.header();
         let payload_address = message.payload().as_ptr().expose_provenance();
         let layout = checked_layout(&message)?;
@@ -540,6 +664,7 @@ impl ObservationBlock {
             layout,
             payload_address,
             _message: Mutex::new(message),
+            neighbours: neighbours.map(NeighboursBlock::new).transpose()?,
         })
     }
 }
@@ -622,18 +747,32 @@ impl ObservationBlock {
     /// as a read-only buffer over shared memory.
     fn section(slf: Bound<'_, Self>, name: &str) -> PyResult<SectionView> {
         let block = slf.get();
-        let (spec, (_, section)) = ObservationLayout::SECTIONS
-            .iter()
-            .zip(block.layout.named())
-            .find(|(spec, _)| spec.name == name)
-            .ok_or_else(|| PyKeyError::new_err(name.to_owned()))?;
-        let shape = spec.shape(|dimension| {
-            let mut sizes = ObservationLayout::DIMENSIONS.iter().zip(block.header.shape);
-            sizes
-                .find(|(name, _)| **name == dimension)
-                .map_or(0, |(_, size)| size as usize)
-        });
-        Ok(SectionView::new(slf.unbind(), section, (spec.element)().0, shape))
+        let (section, scalar, shape) = section_of(
+            name,
+            ObservationLayout::SECTIONS,
+            block.layout.named(),
+            ObservationLayout::DIMENSIONS,
+            block.header.shape,
+        )?;
+        let address = block.payload_address;
+        Ok(SectionView::new(slf.unbind(), address, section, scalar, shape))
+    }
+
+    /// The bytes of one array of the neighbours of this tick ("objects", "ids", …: `ipc_schema::neighbours::NeighboursLayout`); `None` in
+    /// a run without messages between road users (`v2x.share`).
+    fn neighbours(slf: Bound<'_, Self>, name: &str) -> PyResult<Option<SectionView>> {
+        let Some(neighbours) = &slf.get().neighbours else {
+            return Ok(None);
+        };
+        let (section, scalar, shape) = section_of(
+            name,
+            NeighboursLayout::SECTIONS,
+            neighbours.layout.named(),
+            NeighboursLayout::DIMENSIONS,
+            neighbours.shape,
+        )?;
+        let address = neighbours.payload_address;
+        Ok(Some(SectionView::new(slf.unbind(), address, section, scalar, shape)))
     }
 }
 

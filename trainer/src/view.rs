@@ -10,16 +10,26 @@ use crate::ObservationBlock;
 /// One array of an observation block as a read-only buffer of bytes.
 #[pyclass(frozen, module = "caraware._native")]
 pub(crate) struct SectionView {
-    block: Py<ObservationBlock>,
+    /// Keeps the message alive.
+    _block: Py<ObservationBlock>,
+    /// Address of the payload that has the section.
+    payload_address: usize,
     section: Section,
     scalar: String,
     shape: Vec<usize>,
 }
 
 impl SectionView {
-    pub(crate) fn new(block: Py<ObservationBlock>, section: Section, scalar: String, shape: Vec<usize>) -> Self {
+    pub(crate) fn new(
+        block: Py<ObservationBlock>,
+        payload_address: usize,
+        section: Section,
+        scalar: String,
+        shape: Vec<usize>,
+    ) -> Self {
         Self {
-            block,
+            _block: block,
+            payload_address,
             section,
             scalar,
             shape,
@@ -45,7 +55,7 @@ impl SectionView {
     #[expect(unsafe_code, reason = "the buffer protocol of CPython works on raw pointers")]
     unsafe fn __getbuffer__(slf: Bound<'_, Self>, view: *mut ffi::Py_buffer, flags: c_int) -> PyResult<()> {
         let this = slf.get();
-        let address = this.block.get().payload_address + this.section.offset;
+        let address = this.payload_address + this.section.offset;
         let memory = std::ptr::with_exposed_provenance_mut::<std::ffi::c_void>(address);
         let length = ffi::Py_ssize_t::try_from(this.section.len)?;
         // SAFETY: `view` is a valid Py_buffer (CPython's contract for this slot). The block checked at its making that all

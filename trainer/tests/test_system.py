@@ -27,9 +27,10 @@ NOISELESS = {
 }
 
 
-def run_with(tmp_path: Path, module: str) -> subprocess.CompletedProcess[str]:
+def run_with(tmp_path: Path, module: str, more: dict[str, object] | None = None) -> subprocess.CompletedProcess[str]:
     """A run whose trainer is a module of this directory."""
-    settings = [f"--set={key}={value}" for key, value in (NOISELESS | {"trainer.module": module}).items()]
+    values = NOISELESS | {"trainer.module": module} | (more or {})
+    settings = [f"--set={key}={value}" for key, value in values.items()]
     command: list[str | Path] = [CARAWARE, "train", "town", "--name", "probe", *settings]
     with tempfile.TemporaryDirectory(prefix="caraware") as short:
         path = os.pathsep.join(filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
@@ -92,3 +93,23 @@ def test_a_lent_tensor_has_the_numbers_of_a_kept_observation(tmp_path: Path, mon
     assert lent["nothing_after_the_last"] and lent["kept"]
     # A tensor for each place in shared memory, not for each tick.
     assert lent["places"] < 100
+
+
+def test_what_arrived_belongs_to_the_observation_and_comes_again_to_a_successor(tmp_path: Path) -> None:
+    more = {"v2x.share": 1.0, "v2x.perception_range_m": 40.0, "traffic.cavs": 12, "episode.training_episodes": 2}
+    finished = run_with(tmp_path, "neighbours_probe", more)
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    run = tmp_path / "runs" / "probe"
+    found = json.loads((run / "parts" / "trainer.json").read_text())
+    # The first trainer committed tick 50 and died at tick 80.
+    assert (found["first_tick"], found["last_tick"]) == (51, 2 * 100 + 20 - 1)
+    assert found["consecutive"] and found["same_vehicles"]
+    assert (found["again"], found["different"]) == (30, 0)
+    assert found["known"] > 1000
+    assert found["self_known"] == 0
+    # Without errors of the fix: those of compass and units, and the centre is up to some metres before the rear axle.
+    assert found["compared"] > 50
+    assert found["farthest_m"] < 4.0
+    report = json.loads((run / "report.json").read_text())
+    assert report["v2x"]["redelivered_ticks"] >= 1
+    assert report["v2x"]["cams"] > 100

@@ -5,7 +5,12 @@
 // Positions of 0.1 microdegrees, tenths of metres, counts: values are limited to the ranges of their message before they are cast.
 #![expect(clippy::cast_possible_truncation, reason = "see above")]
 
+pub mod exchange;
+pub mod local_map;
 pub mod message;
+pub mod parallel;
+pub mod process;
 pub mod radio;
 pub mod random;
 pub mod services;
+pub mod station;

@@ -1,4 +1,5 @@
-//! Sends observations to the trainer, tick by tick, as far as it has credit: live ticks, and ticks of the journal to a successor.
+//! Sends the messages of a channel to the trainer, tick by tick, as far as it has credit: live ticks, and ticks of the journal to a
+//! successor.
 //! During a planned handover live ticks may stay in the journal, so that the simulation continues.
 
 use std::time::Instant;
@@ -23,7 +24,7 @@ use journal::{Journal, JournalError};
 
 const MIB: usize = 1 << 20;
 
-/// Delivery to the trainer, the one required consumer of observations.
+/// Delivery to the trainer, a required consumer of a channel with one message for each tick.
 pub struct Delivery {
     board: BoardReader,
     waker: Waker,
@@ -47,14 +48,14 @@ pub struct Delivery {
 }
 
 impl Delivery {
-    /// Opens the trainer's board and wake-up, with an empty journal.
+    /// Opens the trainer's board and wake-up, with an empty journal of `channel`.
     ///
     /// # Errors
     /// The trainer's board or wake-up cannot be opened.
-    pub fn open(membership: &RunMembership) -> Result<Self, MembershipError> {
+    pub fn open(membership: &RunMembership, channel: Channel) -> Result<Self, MembershipError> {
         let run = &membership.run;
         let limit = run.config.run.journal_mib as usize * MIB;
-        let (longest, committed) = (Channel::Observation.max_payload(run), run.committed_ticks());
+        let (longest, committed) = (channel.max_payload(run), run.committed_ticks());
         let journal = Journal::new(&run.run_dir, limit, longest).beginning_at(committed);
         Ok(Self {
             board: membership.board_of(Process::Trainer)?,

@@ -236,6 +236,13 @@ class ObservationBlock:
         `ipc_schema::observation::ObservationLayout` lists the names. Raises KeyError for any other.
         """
 
+    def neighbours(self, name: str) -> SectionView | None:
+        """The bytes of one array of the neighbours of this tick (`objects`, `ids`, `radio`, …), read-only.
+
+        None in a run without messages between road users (`v2x.share`). `ipc_schema::neighbours::NeighboursLayout`
+        lists the names. Raises KeyError for any other.
+        """
+
 @final
 class SectionView:
     """One array of an observation block as a read-only buffer of bytes; it keeps the block alive."""

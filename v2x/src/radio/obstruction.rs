@@ -89,6 +89,11 @@ impl Obstacles {
         &self.bodies
     }
 
+    /// Rows of the road users whose bounds may meet `bounds`, ascending, into `found`.
+    pub fn road_users_near(&self, bounds: &Bounds, found: &mut Vec<u32>) {
+        self.vehicles.near(bounds, found);
+    }
+
     /// What is between two antennas.
     #[must_use]
     pub fn between(&self, a: &Antenna, b: &Antenna) -> LinkObstruction {

@@ -3,8 +3,9 @@
     pip install asn1tools==0.169.0 pycrate==0.8.1
     python messages.py FOLDER
 
-FOLDER has ETSI's modules as files: `cam_1_4_1.asn`, `cdd_1_3_1_1.asn`, `cpm_2_1_1.asn` and `cdd_2_2_1.asn` (all five modules
-of the collective perception message in one file), as the crate c-its-parser 2.4.2 carries them in `autogen/asn.1`.
+FOLDER has ETSI's modules as files: `cam_1_4_1.asn`, `cdd_1_3_1_1.asn`, `cpm_2_1_1.asn` and `cdd_2_2_1.asn` (all
+five modules of the collective perception message in one file), as the crate c-its-parser 2.4.2 carries them in
+`autogen/asn.1`.
 """
 
 import json

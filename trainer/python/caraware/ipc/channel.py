@@ -141,6 +141,11 @@ class Observation:
         return read_only_tensor(self._array("observation", np.float32))
 
     @cached_property
+    def neighbours(self) -> Neighbours:
+        """What the slots know from messages. Its arrays raise RuntimeError in a run without them (`v2x.share`)."""
+        return Neighbours(self.block)
+
+    @cached_property
     def truth(self) -> Tensor:
         """f32 [n, 4]: x and y of the rear axle (m, world), yaw (rad), speed (m/s). For rewards and errors only."""
         return read_only_tensor(self._array("truth", np.float32))
@@ -227,6 +232,51 @@ class Observation:
     def resynchronised(self) -> BoolArray:
         """bool [n]: the vehicle was set onto SUMO's position instead of driving there; its trajectory was cut."""
         return self._flag(_native.RESYNCHRONISED)
+
+
+class Neighbours:
+    """What the slots of an observation know from messages. n slots, k objects in each, the nearest first.
+
+    All arrays are read-only views over shared memory. `ipc_schema::neighbours` describes the columns.
+    """
+
+    def __init__(self, block: _native.ObservationBlock) -> None:
+        self._block = block
+
+    def _array(self, name: str, scalar: type[Scalar]) -> NDArray[Scalar]:
+        view = self._block.neighbours(name)
+        if view is None:
+            raise RuntimeError("no messages in this run: set `v2x.share` above 0")
+        return np.frombuffer(memoryview(view), dtype=scalar).reshape(view.shape)
+
+    @cached_property
+    def objects(self) -> Tensor:
+        """f32 [n, k, 11]: zeros where there is no object.
+
+        Columns: x, y (m, world, centre), velocity x, y (m/s, world), heading (rad), length, width (m), age (s), then
+        standard deviations: position on each axis (m), velocity on each axis (m/s), heading (rad).
+        """
+        return read_only_tensor(self._array("objects", np.float32))
+
+    @cached_property
+    def ids(self) -> UInt32Array:
+        """u32 [n, k, 3]: station of the object (0: perceived), station heard from, source (1 CAM, 2 CPM, 3 VAM)."""
+        return self._array("ids", np.uint32)
+
+    @cached_property
+    def radio(self) -> UInt32Array:
+        """u32 [n, 5]: 1 with a radio, objects known; messages sent, their bytes, and received in the tick before."""
+        return self._array("radio", np.uint32)
+
+    @cached_property
+    def channel_load(self) -> Tensor:
+        """f32 [n]: share of the tick before in which the radio found the channel busy."""
+        return read_only_tensor(self._array("channel_load", np.float32))
+
+    @cached_property
+    def vehicle(self) -> UInt32Array:
+        """u32 [n]: dense index of the vehicle, as in the observation."""
+        return self._array("vehicle", np.uint32)
 
 
 class Channel:

@@ -1,0 +1,360 @@
+//! The process: receives `world` and `measurement` of each tick, and publishes `neighbours`.
+
+use std::{path::Path, time::Instant};
+
+use ipc_schema::{
+    activity::Awaited,
+    block::{self, BlockError},
+    board::State,
+    config::{Config, ImuConvention},
+    failure::{Failure, FailureKind},
+    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    membership::{RunMembership, Wait},
+    neighbours::{NeighboursLayout, NeighboursSections},
+    observation::{EMPTY_SLOT, ObservationLayout},
+    ports::{Message, PortError, Publisher, Subscriber},
+    process::Process,
+    sensor::SensorKind,
+    services::Channel,
+    world::{VehicleState, WorldLayout},
+};
+use sensor_daemon::delivery::{Delivery, digest::ObservationDigest};
+use serde::{Deserialize, Serialize};
+use sim_core::{geodesy::Projection, scene::Scene};
+
+use crate::{
+    exchange::{ExchangeCounts, MessageExchange, SlotMeasurement},
+    station::OwnMeasurement,
+};
+
+/// What this process has counted when an episode begins.
+#[derive(Debug, Default, Serialize, Deserialize)]
+struct V2xState {
+    digest: ObservationDigest,
+    counts: ExchangeCounts,
+    load_sum: f64,
+    radio_ticks: u64,
+}
+
+/// What this process adds to the run's report.
+#[derive(Debug, Serialize)]
+struct V2xReport {
+    /// BLAKE3 over every block of neighbours.
+    neighbours_hash: String,
+    ticks: u64,
+    #[serde(flatten)]
+    counts: ExchangeCounts,
+    /// Mean share of time in which a radio finds the channel busy.
+    mean_channel_load: Option<f64>,
+    redelivered_ticks: u64,
+    drops: u64,
+}
+
+/// Exchanges messages until the last tick of the run, or until the process is asked to stop.
+///
+/// # Errors
+/// The map's projection is not understood, the scene cannot be read, or a port fails.
+pub fn run(run_file: &Path) -> Result<(), Failure> {
+    let mut membership = RunMembership::join(run_file, Process::V2x)?;
+    let world = membership.subscriber(Channel::World)?;
+    let measurements = membership.subscriber(Channel::Measurement)?;
+    let mut process = V2xProcess::open(membership)?;
+    loop {
+        let Some(world_message) = process.next(&world)? else {
+            break;
+        };
+        let Some(measurement) = process.next(&measurements)? else {
+            break;
+        };
+        if process.tick(&world_message, &measurement)? == Wait::Stopped {
+            break;
+        }
+        let header = *measurement.header();
+        drop((world_message, measurement));
+        process.membership.consumed(header.tick + 1);
+        if header.has(LAST_OF_RUN) {
+            return process.wait_for_trainers_end();
+        }
+    }
+    process.write_part()
+}
+
+struct V2xProcess {
+    membership: RunMembership,
+    exchange: MessageExchange,
+    neighbours: Publisher,
+    /// Delivery to the trainer; `None` in a run without one.
+    trainer: Option<Delivery>,
+    digest: ObservationDigest,
+    load_sum: f64,
+    radio_ticks: u64,
+    /// The next tick.
+    tick: u64,
+    /// Ticks below this are in the checkpoint: they are made again but not sent.
+    committed_ticks: u64,
+}
+
+impl V2xProcess {
+    fn open(mut membership: RunMembership) -> Result<Self, Failure> {
+        let scenes = Scene::of_every_map(&membership.run)?;
+        let maps = membership.run.every_map();
+        let projections: Result<Vec<Projection>, _> = maps.iter().map(|map| Projection::new(&map.info)).collect();
+        let projections = projections.map_err(|error| Failure::from_error(FailureKind::Config, &error))?;
+        let maps = scenes.into_iter().zip(projections).collect();
+        let mut exchange = MessageExchange::new(&membership.run.config, maps);
+        let state: V2xState = membership.stored_episode_state()?.unwrap_or_default();
+        exchange.set_counts(state.counts);
+        let neighbours = membership.publisher(Channel::Neighbours)?;
+        let trainer = match membership.run.mode.has_trainer() {
+            true => Some(Delivery::open(&membership, Channel::Neighbours)?),
+            false => None,
+        };
+        membership.attach();
+        let (tick, committed_ticks) = (membership.run.first_tick(), membership.run.committed_ticks());
+        Ok(Self {
+            membership,
+            exchange,
+            neighbours,
+            trainer,
+            digest: state.digest,
+            load_sum: state.load_sum,
+            radio_ticks: state.radio_ticks,
+            tick,
+            committed_ticks,
+        })
+    }
+
+    /// The next message; meanwhile it resends what a successor of the trainer lacks. `None` once the process is asked to stop.
+    fn next(&mut self, subscriber: &Subscriber) -> Result<Option<Message>, Failure> {
+        let mut received = Ok(None);
+        loop {
+            let waited = self
+                .membership
+                .wait_until_for(Awaited::Input(subscriber.channel().producer()), || {
+                    received = subscriber.receive();
+                    !matches!(received, Ok(None)) || self.is_trainer_behind()
+                })?;
+            if let Some(message) = std::mem::replace(&mut received, Ok(None))? {
+                return Ok(Some(message));
+            }
+            if waited == Wait::Stopped {
+                return Ok(None);
+            }
+            self.catch_up()?;
+        }
+    }
+
+    fn is_trainer_behind(&self) -> bool {
+        self.trainer.as_ref().is_some_and(Delivery::is_behind)
+    }
+
+    fn catch_up(&mut self) -> Result<(), Failure> {
+        match &mut self.trainer {
+            Some(trainer) => trainer.catch_up(&self.neighbours),
+            None => Ok(()),
+        }
+    }
+
+    /// Waits until `condition` holds; meanwhile it resends what a successor of the trainer lacks.
+    fn wait_serving_trainer(&mut self, condition: impl Fn(&Self) -> bool) -> Result<Wait, Failure> {
+        loop {
+            self.catch_up()?;
+            let waited = self.membership.wait_until_for(Awaited::Credit(Process::Trainer), || {
+                self.is_trainer_behind() || condition(self)
+            })?;
+            if waited == Wait::Stopped || condition(self) {
+                return Ok(waited);
+            }
+        }
+    }
+
+    fn tick(&mut self, world: &Message, measurement: &Message) -> Result<Wait, Failure> {
+        let header = *measurement.header();
+        for (channel, received) in [("world", world.header().tick), ("measurement", header.tick)] {
+            if received != self.tick {
+                return Err(PortError::Gap {
+                    channel,
+                    expected: self.tick,
+                    received,
+                }
+                .into());
+            }
+        }
+        if header.has(FIRST_OF_EPISODE) && header.tick == self.membership.run.first_tick() {
+            tracing::debug!("the first episode begins at tick {}", header.tick);
+        }
+        let states: &[VehicleState] =
+            block::view(world.payload(), WorldLayout::of(world.header()).states).map_err(unreadable)?;
+        let slots = slots_of(measurement, &self.membership.run.config).map_err(unreadable)?;
+        let layout = NeighboursLayout::sized(slots.len(), self.membership.run.config.v2x.neighbours as usize);
+        if header.tick >= self.committed_ticks {
+            let since = Instant::now();
+            let waited = self.wait_serving_trainer(|process| process.trainer_takes(layout.len))?;
+            if let Some(trainer) = &mut self.trainer {
+                trainer.update_handover(since);
+            }
+            if waited == Wait::Stopped {
+                return Ok(Wait::Stopped);
+            }
+        }
+        self.publish(&header, &slots, states, &layout)?;
+        self.exchange.send(&header, &slots, states);
+        self.report(&header);
+        Ok(Wait::Ready)
+    }
+
+    /// True if the next block, `len` bytes long, may be sent to the trainer or kept for it. True in a run without a trainer.
+    fn trainer_takes(&self, len: usize) -> bool {
+        let trainer = self.trainer.as_ref();
+        trainer.is_none_or(|trainer| trainer.may_send(&self.membership) || trainer.may_keep(len))
+    }
+
+    /// Writes what the stations know, adds it to the hash, and sends it or keeps it in the journal.
+    fn publish(
+        &mut self,
+        header: &MessageHeader,
+        slots: &[SlotMeasurement],
+        states: &[VehicleState],
+        layout: &NeighboursLayout,
+    ) -> Result<(), Failure> {
+        let ours = self.membership.header();
+        let header = MessageHeader {
+            run_id: ours.run_id,
+            incarnation: ours.incarnation,
+            addressee: 0,
+            shape: layout.shape,
+            ..*header
+        };
+        let header = match &self.trainer {
+            Some(trainer) => trainer.addressed(header),
+            None => header,
+        };
+        let mut draft = self.neighbours.loan(header, layout.len)?;
+        let mut sections = NeighboursSections::split(draft.payload_mut(), layout).map_err(unreadable)?;
+        self.exchange.receive(&header, slots, states, &mut sections);
+        let loads = sections.radio.iter().zip(sections.channel_load.iter());
+        for (_, load) in loads.filter(|([equipped, ..], _)| *equipped == 1) {
+            self.load_sum += f64::from(*load);
+            self.radio_ticks += 1;
+        }
+        self.digest.add(&header, draft.payload());
+        // Stored before the tick is sent: a process that has received the last tick of an episode can rely on the state of the next one.
+        if header.has(LAST_OF_EPISODE) {
+            self.store_state(header.tick + 1)?;
+        }
+        if self.keep(&header, draft.payload())? {
+            draft.send()?;
+        }
+        if let Some(trainer) = &self.trainer {
+            trainer.wake();
+        }
+        Ok(())
+    }
+
+    fn store_state(&self, tick: u64) -> Result<(), Failure> {
+        let state = V2xState {
+            digest: self.digest.clone(),
+            counts: self.exchange.counts(),
+            load_sum: self.load_sum,
+            radio_ticks: self.radio_ticks,
+        };
+        self.membership.store_episode_state(tick, &state)
+    }
+
+    /// Keeps the tick in the journal. Returns false if the trainer has no credit for it: the journal sends it later.
+    fn keep(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<bool, Failure> {
+        if header.tick < self.committed_ticks {
+            return Ok(false);
+        }
+        let Some(trainer) = &mut self.trainer else {
+            return Ok(true);
+        };
+        let is_due = trainer.may_send(&self.membership);
+        trainer.keep(*header, payload)?;
+        if is_due {
+            trainer.count_live();
+        }
+        Ok(is_due)
+    }
+
+    fn report(&mut self, header: &MessageHeader) {
+        self.tick = header.tick + 1;
+        let (ticks, drops) = (self.tick, self.neighbours.drops());
+        self.membership.report(|health| {
+            health.state = State::Running as u32;
+            health.ticks = ticks;
+            health.episode = header.episode;
+            health.sim_time_ns = header.sim_time_ns;
+            health.drops = drops;
+        });
+    }
+
+    /// Waits until the trainer is done. Until then it may die, and its successor needs everything since the last commit.
+    fn wait_for_trainers_end(mut self) -> Result<(), Failure> {
+        let waited = self.wait_serving_trainer(|process| process.trainer.as_ref().is_none_or(Delivery::is_done))?;
+        self.write_part()?;
+        if waited == Wait::Ready {
+            self.membership.report(|health| health.state = State::Done as u32);
+        }
+        Ok(())
+    }
+
+    fn write_part(&self) -> Result<(), Failure> {
+        #[expect(clippy::cast_precision_loss, reason = "a mean in a report")]
+        let mean = (self.radio_ticks > 0).then(|| self.load_sum / self.radio_ticks as f64);
+        self.membership.write_part(&V2xReport {
+            neighbours_hash: self.digest.hex(),
+            ticks: self.tick,
+            counts: self.exchange.counts(),
+            mean_channel_load: mean,
+            redelivered_ticks: self.trainer.as_ref().map_or(0, Delivery::redelivered),
+            drops: self.neighbours.drops(),
+        })
+    }
+}
+
+/// The slots of a `measurement` message: what services may know of their own vehicle.
+fn slots_of(message: &Message, config: &Config) -> Result<Vec<SlotMeasurement>, BlockError> {
+    let (payload, layout) = (message.payload(), ObservationLayout::of(message.header()));
+    let vehicle: &[u32] = block::view(payload, layout.vehicle)?;
+    let id_hash: &[u64] = block::view(payload, layout.id_hash)?;
+    let episode_step: &[u32] = block::view(payload, layout.episode_step)?;
+    let sensors: &[u32] = block::view(payload, layout.sensors)?;
+    let gnss_m: &[[f32; 3]] = block::view(payload, layout.gnss_m)?;
+    let quality: &[[f32; 2]] = block::view(payload, layout.gnss_quality)?;
+    let age_s: &[[f32; 4]] = block::view(payload, layout.age_s)?;
+    let speed_steering: &[[f32; 2]] = block::view(payload, layout.speed_steering)?;
+    let imu: &[[f32; 7]] = block::view(payload, layout.imu)?;
+    let samples = imu.len().checked_div(vehicle.len()).unwrap_or(0);
+    let left_handed = config.imu.convention == ImuConvention::Carla;
+    let slot = |slot: usize| {
+        let fix = gnss_m[slot].map(f64::from);
+        // Before the first fix all of it is zero.
+        let has_fix = fix != [0.0; 3] && samples > 0 && vehicle[slot] != EMPTY_SLOT;
+        let own = has_fix.then(|| {
+            let sample = imu[(slot + 1) * samples - 1].map(f64::from);
+            let delivers = SensorKind::Gnss.is_in(sensors[slot]) && quality[slot][0] > 0.0;
+            OwnMeasurement {
+                fix_m: [fix[0], fix[1]],
+                altitude_m: fix[2],
+                fix_age_s: age_s[slot][SensorKind::Gnss.index()].into(),
+                accuracy_m: delivers.then(|| quality[slot][0].into()),
+                speed_mps: speed_steering[slot][0].into(),
+                heading_rad: std::f64::consts::FRAC_PI_2 - sample[6],
+                accel_mps2: sample[0],
+                yaw_rate_radps: if left_handed { -sample[5] } else { sample[5] },
+            }
+        });
+        SlotMeasurement {
+            vehicle: vehicle[slot],
+            id_hash: id_hash[slot],
+            episode_step: episode_step[slot],
+            own,
+        }
+    };
+    Ok((0..vehicle.len()).map(slot).collect())
+}
+
+fn unreadable(error: BlockError) -> Failure {
+    Failure::from_error(FailureKind::Run, &error)
+}

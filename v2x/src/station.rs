@@ -1,0 +1,382 @@
+//! A station: what it measures of itself, its services, its map, and how its motion becomes a message and back.
+
+use ipc_schema::{
+    config::{Config, ImuConvention},
+    neighbours::NeighbourSource,
+};
+use sim_core::geodesy::{Geodetic, NetPosition, Projection};
+
+use crate::{
+    local_map::{KnownObject, LocalMap},
+    message::{
+        GeodeticPoint, StationKind,
+        cam::Cam,
+        cpm::{Cpm, PerceivedObject},
+        generation_delta_ms, heading_from_yaw, its_time_ms, yaw_from_heading,
+    },
+    services::{MeasuredMotion, cam::CamService, congestion::CongestionControl, cpm::CpmService},
+};
+
+/// Half axis of the ellipse that has a normal position with 95 %, in standard deviations of an axis: √(−2 ln 0.05).
+const ELLIPSE_95: f64 = 2.447_746_830_680_816;
+/// Half of the interval that has a normal number with 95 %, in standard deviations.
+const INTERVAL_95: f64 = 1.959_963_984_540_054;
+/// Deviation of a position of unknown accuracy, metres: the largest that a message can state.
+const UNKNOWN_POSITION_M: f32 = 40.94;
+/// Deviation of a speed of unknown accuracy, m/s, and of a heading, radians: the largest that a message can state.
+const UNKNOWN_SPEED_MPS: f32 = 1.25;
+const UNKNOWN_HEADING_RAD: f32 = 0.22;
+
+/// What a station measures of itself at a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct OwnMeasurement {
+    /// Newest fix of the rear axle: x and y, world, metres.
+    pub fix_m: [f64; 2],
+    /// Altitude of the fix, metres.
+    pub altitude_m: f64,
+    /// Age of the fix, seconds.
+    pub fix_age_s: f64,
+    /// Standard deviation of the fix as a distance, as the receiver reports it, metres; `None` while it does not deliver.
+    pub accuracy_m: Option<f64>,
+    /// Wheel speed, m/s.
+    pub speed_mps: f64,
+    /// Compass, radians counter-clockwise from east.
+    pub heading_rad: f64,
+    /// Longitudinal acceleration, m/s².
+    pub accel_mps2: f64,
+    /// Yaw rate, positive to the left, rad/s.
+    pub yaw_rate_radps: f64,
+}
+
+/// Size of a vehicle, as its station knows it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct VehicleSize {
+    /// Bumper to bumper, metres.
+    pub length_m: f64,
+    /// Metres.
+    pub width_m: f64,
+    /// Rear axle to rear bumper, metres.
+    pub rear_overhang_m: f64,
+}
+
+impl OwnMeasurement {
+    /// The point `ahead_m` before the rear axle by fix and compass, metres.
+    #[must_use]
+    pub fn ahead_m(&self, ahead_m: f64) -> [f64; 2] {
+        let (sin, cos) = libm::sincos(self.heading_rad);
+        [self.fix_m[0] + ahead_m * cos, self.fix_m[1] + ahead_m * sin]
+    }
+
+    /// The middle of the front, which messages name, metres.
+    #[must_use]
+    pub fn front_m(&self, size: &VehicleSize) -> [f64; 2] {
+        self.ahead_m(size.length_m - size.rear_overhang_m)
+    }
+
+    /// The centre, metres.
+    #[must_use]
+    pub fn centre_m(&self, size: &VehicleSize) -> [f64; 2] {
+        self.ahead_m(0.5 * size.length_m - size.rear_overhang_m)
+    }
+
+    /// The motion that generation rules watch.
+    #[must_use]
+    pub fn motion(&self, size: &VehicleSize) -> MeasuredMotion {
+        MeasuredMotion {
+            position_m: self.front_m(size),
+            speed_mps: self.speed_mps,
+            heading_rad: self.heading_rad,
+        }
+    }
+}
+
+/// What a run's sensors are known to deviate by.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SensorDeviations {
+    /// Wheel speed, m/s.
+    pub speed_mps: f64,
+    /// Compass, radians.
+    pub heading_rad: f64,
+    /// The IMU's y and z axes point the other way.
+    pub is_left_handed: bool,
+}
+
+impl SensorDeviations {
+    /// Those of a configuration.
+    #[must_use]
+    pub fn new(config: &Config) -> Self {
+        Self {
+            speed_mps: config.speed_steering.speed_noise_std_mps,
+            heading_rad: config.imu.compass_noise_std_rad,
+            is_left_handed: config.imu.convention == ImuConvention::Carla,
+        }
+    }
+}
+
+/// A station, as long as its vehicle has its slot.
+#[derive(Debug, Clone)]
+pub struct Station {
+    /// Hash of the vehicle's SUMO id.
+    pub id_hash: u64,
+    /// Station id: the low half of the hash, and never 0.
+    pub station: u32,
+    /// It has a radio.
+    pub is_equipped: bool,
+    /// Time within a tick at which its messages are handed to the radio, nanoseconds.
+    pub phase_ns: u64,
+    /// Cooperative awareness.
+    pub cam: CamService,
+    /// Collective perception.
+    pub cpm: CpmService,
+    /// Congestion control.
+    pub congestion: CongestionControl,
+    /// What it knows.
+    pub map: LocalMap,
+}
+
+/// The station id of a vehicle.
+#[must_use]
+pub fn station_id(id_hash: u64) -> u32 {
+    (id_hash as u32).max(1)
+}
+
+fn tenths(value_m: f64) -> f64 {
+    (value_m * 10.0).round()
+}
+
+/// A confidence in the unit of a message: 1 … 125, 126 = more.
+fn confidence(deviation: f64, unit: f64) -> u8 {
+    (INTERVAL_95 * deviation / unit).ceil().clamp(1.0, 126.0) as u8
+}
+
+/// The reference position of a message.
+///
+/// `None` where the map's projection does not reach.
+fn reference(projection: &Projection, own: &OwnMeasurement, size: &VehicleSize) -> Option<GeodeticPoint> {
+    let [x_m, y_m] = own.front_m(size);
+    let place = projection.geodetic_from_net(NetPosition { x_m, y_m }).ok()?;
+    let axis_cm = own
+        .accuracy_m
+        .map(|accuracy| (ELLIPSE_95 * accuracy / std::f64::consts::SQRT_2 * 100.0).round());
+    Some(GeodeticPoint {
+        latitude: (place.latitude_deg * 1e7).round() as i32,
+        longitude: (place.longitude_deg * 1e7).round() as i32,
+        accuracy_cm: axis_cm.map(|axis| axis.clamp(1.0, 4094.0) as u16),
+        altitude_cm: Some((own.altitude_m * 100.0).round().clamp(-100_000.0, 800_000.0) as i32),
+    })
+}
+
+/// Simulated time of the newest fix, ms.
+fn fix_time_ns(now_ns: u64, own: &OwnMeasurement) -> u64 {
+    now_ns.saturating_sub((own.fix_age_s * 1e9) as u64)
+}
+
+/// Composes a cooperative awareness message.
+#[must_use]
+pub fn compose_cam(
+    station: u32,
+    kind: StationKind,
+    now_ns: u64,
+    own: &OwnMeasurement,
+    size: &VehicleSize,
+    deviations: &SensorDeviations,
+    projection: &Projection,
+    has_low_frequency: bool,
+) -> Option<Cam> {
+    Some(Cam {
+        station,
+        kind,
+        generation_delta_ms: generation_delta_ms(its_time_ms(fix_time_ns(now_ns, own))),
+        position: reference(projection, own, size)?,
+        heading: Some(heading_from_yaw(own.heading_rad)),
+        heading_confidence: Some(confidence(deviations.heading_rad.to_degrees(), 0.1)),
+        speed_cmps: Some((own.speed_mps.max(0.0) * 100.0).round().min(16_382.0) as u16),
+        speed_confidence: Some(confidence(deviations.speed_mps, 0.01)),
+        length_10cm: tenths(size.length_m).clamp(1.0, 1022.0) as u16,
+        width_10cm: tenths(size.width_m).clamp(1.0, 61.0) as u8,
+        acceleration: Some((own.accel_mps2 * 10.0).round().clamp(-160.0, 160.0) as i16),
+        yaw_rate: Some(
+            (own.yaw_rate_radps.to_degrees() * 100.0)
+                .round()
+                .clamp(-32_766.0, 32_766.0) as i16,
+        ),
+        // The path driven is not kept.
+        path: has_low_frequency.then(Vec::new),
+    })
+}
+
+/// What a station may be said to perceive: the object in the frame of its own vehicle, with errors.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Perception {
+    /// Number of the object at the station.
+    pub object: u16,
+    /// Its centre before and to the left of the middle of the vehicle's front, metres.
+    pub position_body_m: [f64; 2],
+    /// Velocity along the vehicle and to its left, m/s.
+    pub velocity_body_mps: [f64; 2],
+    /// Heading relative to the vehicle's, radians.
+    pub turn_rad: f64,
+    /// Length and width, metres.
+    pub size_m: [f64; 2],
+    /// It is a person.
+    pub is_person: bool,
+}
+
+impl Perception {
+    /// The object in the world, by the station's own fix and compass.
+    #[must_use]
+    pub fn motion(&self, own: &OwnMeasurement, size: &VehicleSize) -> MeasuredMotion {
+        let front_m = own.front_m(size);
+        let offset_m = rotate(self.position_body_m, own.heading_rad);
+        let [vx, vy] = rotate(self.velocity_body_mps, own.heading_rad);
+        MeasuredMotion {
+            position_m: [front_m[0] + offset_m[0], front_m[1] + offset_m[1]],
+            speed_mps: libm::hypot(vx, vy),
+            heading_rad: own.heading_rad + self.turn_rad,
+        }
+    }
+}
+
+/// A vector turned by an angle.
+#[must_use]
+pub fn rotate([x, y]: [f64; 2], angle_rad: f64) -> [f64; 2] {
+    let (sin, cos) = libm::sincos(angle_rad);
+    [x * cos - y * sin, x * sin + y * cos]
+}
+
+/// Standard deviations of perceived objects, and the range in which a station perceives.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PerceptionSpec {
+    /// Metres.
+    pub range_m: f64,
+    /// On each axis, metres.
+    pub position_std_m: f64,
+    /// On each axis, m/s.
+    pub speed_std_mps: f64,
+}
+
+/// Composes a collective perception message with the objects at `included`.
+#[must_use]
+pub fn compose_cpm(
+    station: u32,
+    now_ns: u64,
+    own: &OwnMeasurement,
+    size: &VehicleSize,
+    projection: &Projection,
+    spec: &PerceptionSpec,
+    perceived: &[Perception],
+    included: &[usize],
+    has_sensor_information: bool,
+) -> Option<Cpm> {
+    let measured_ns = fix_time_ns(now_ns, own);
+    let delta_ms = ((now_ns - measured_ns) / 1_000_000).min(2047) as i16;
+    let objects = included.iter().map(|place| {
+        let object = &perceived[*place];
+        let position = rotate(object.position_body_m, own.heading_rad);
+        let velocity = rotate(object.velocity_body_mps, own.heading_rad);
+        PerceivedObject {
+            object: object.object,
+            delta_ms,
+            position_cm: position.map(|value| (value * 100.0).round().clamp(-131_072.0, 131_071.0) as i32),
+            position_confidence_cm: (INTERVAL_95 * spec.position_std_m * 100.0).ceil().clamp(1.0, 4095.0) as u16,
+            velocity_cmps: velocity.map(|value| (value * 100.0).round().clamp(-16_383.0, 16_382.0) as i16),
+            velocity_confidence: confidence(spec.speed_std_mps, 0.01),
+            angle: ((own.heading_rad + object.turn_rad).to_degrees() * 10.0)
+                .round()
+                .rem_euclid(3600.0) as u16,
+            size_10cm: object.size_m.map(|value| tenths(value).clamp(1.0, 255.0) as u16),
+            quality: 15,
+            is_person: object.is_person,
+        }
+    });
+    Some(Cpm {
+        station,
+        reference_time_ms: its_time_ms(measured_ns),
+        position: reference(projection, own, size)?,
+        heading: heading_from_yaw(own.heading_rad),
+        sensor_range_10cm: has_sensor_information.then(|| tenths(spec.range_m).min(4095.0) as u16),
+        perceived: perceived.len().min(255) as u8,
+        objects: objects.take(255).collect(),
+    })
+}
+
+/// Time since `delta_ms`, the low 16 bits of a time not later than `now_ms`, ms.
+fn age_ms(now_ms: u64, delta_ms: u16) -> i64 {
+    i64::from(generation_delta_ms(now_ms).wrapping_sub(delta_ms))
+}
+
+/// Reference point of a message in the world, metres.
+fn world_from(projection: &Projection, point: &GeodeticPoint) -> Option<[f64; 2]> {
+    let geodetic = Geodetic {
+        latitude_deg: f64::from(point.latitude) * 1e-7,
+        longitude_deg: f64::from(point.longitude) * 1e-7,
+    };
+    let NetPosition { x_m, y_m } = projection.net_from_geodetic(geodetic).ok()?;
+    Some([x_m, y_m])
+}
+
+/// Standard deviation on an axis of a stated accuracy, metres.
+fn position_deviation_m(point: &GeodeticPoint) -> f32 {
+    point
+        .accuracy_cm
+        .map_or(UNKNOWN_POSITION_M, |axis| (f64::from(axis) / 100.0 / ELLIPSE_95) as f32)
+}
+
+/// What a receiver knows of the sender of a cooperative awareness message.
+#[must_use]
+pub fn object_of_cam(cam: &Cam, now_ns: u64, projection: &Projection) -> Option<KnownObject> {
+    let front_m = world_from(projection, &cam.position)?;
+    let heading_rad = yaw_from_heading(cam.heading?);
+    let speed_mps = f64::from(cam.speed_cmps?) / 100.0;
+    let (sin, cos) = libm::sincos(heading_rad);
+    let length_m = f64::from(cam.length_10cm) / 10.0;
+    let deviation = |confidence: Option<u8>, unit: f64, unknown: f32| match confidence {
+        Some(stated) if stated < 126 => (f64::from(stated) * unit / INTERVAL_95) as f32,
+        _ => unknown,
+    };
+    let now_ms = now_ns / 1_000_000;
+    Some(KnownObject {
+        station: cam.station,
+        heard_from: cam.station,
+        object: 0,
+        source: NeighbourSource::Cam,
+        position_m: [front_m[0] - 0.5 * length_m * cos, front_m[1] - 0.5 * length_m * sin],
+        velocity_mps: [speed_mps * cos, speed_mps * sin],
+        heading_rad,
+        size_m: [length_m as f32, f32::from(cam.width_10cm) / 10.0],
+        measured_ms: now_ms as i64 - age_ms(its_time_ms(now_ns), cam.generation_delta_ms),
+        deviations: [
+            position_deviation_m(&cam.position),
+            deviation(cam.speed_confidence, 0.01, UNKNOWN_SPEED_MPS),
+            deviation(cam.heading_confidence, 0.1_f64.to_radians(), UNKNOWN_HEADING_RAD),
+        ],
+    })
+}
+
+/// What a receiver knows from a collective perception message, into `known`.
+pub fn objects_of_cpm(cpm: &Cpm, now_ns: u64, projection: &Projection, known: &mut Vec<KnownObject>) {
+    let Some(reference_m) = world_from(projection, &cpm.position) else {
+        return;
+    };
+    let own_deviation_m = position_deviation_m(&cpm.position);
+    let reference_ms = (now_ns / 1_000_000) as i64 - (its_time_ms(now_ns) as i64 - cpm.reference_time_ms as i64);
+    known.extend(cpm.objects.iter().map(|object| {
+        let position_std_m = f64::from(object.position_confidence_cm) / 100.0 / INTERVAL_95;
+        KnownObject {
+            station: 0,
+            heard_from: cpm.station,
+            object: u32::from(object.object) + 1,
+            source: NeighbourSource::Cpm,
+            position_m: [0, 1].map(|axis: usize| reference_m[axis] + f64::from(object.position_cm[axis]) / 100.0),
+            velocity_mps: object.velocity_cmps.map(|value| f64::from(value) / 100.0),
+            heading_rad: f64::from(object.angle).to_radians() / 10.0,
+            size_m: object.size_10cm.map(|value| f32::from(value) / 10.0),
+            measured_ms: reference_ms + i64::from(object.delta_ms),
+            deviations: [
+                libm::hypotf(own_deviation_m, position_std_m as f32),
+                (f64::from(object.velocity_confidence) * 0.01 / INTERVAL_95) as f32,
+                UNKNOWN_HEADING_RAD,
+            ],
+        }
+    }));
+}

@@ -1,0 +1,233 @@
+//! Ticks of messages between vehicles on an empty plane, or with a house on it.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests assert by unwrapping")]
+
+use std::sync::Arc;
+
+use ipc_schema::{
+    config::Config,
+    header::{FIRST_OF_EPISODE, MessageHeader},
+    neighbours::{NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
+    run::MapInfo,
+    world::VehicleState,
+};
+use sim_core::{
+    geodesy::Projection,
+    scene::{Prism, Road, Scene, SolidClass},
+};
+use v2x::{
+    exchange::{MessageExchange, SlotMeasurement},
+    station::{OwnMeasurement, station_id},
+};
+
+const NEAREST: usize = 8;
+
+/// The preset with radios, without fading.
+fn config() -> Config {
+    let mut config: Config = serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).unwrap();
+    config.v2x.share = 1.0;
+    config.v2x.fading = false;
+    config
+}
+
+fn projection() -> Projection {
+    let map = MapInfo {
+        projection: "+proj=tmerc +lat_0=52.26 +lon_0=10.52 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs".into(),
+        net_offset_m: [129.0, 126.0],
+        bounds_m: [0.0, 0.0, 260.0, 260.0],
+        traffic_lights: 0,
+    };
+    Projection::new(&map).unwrap()
+}
+
+fn car(number: u32, x_m: f64, y_m: f64, speed_mps: f32) -> VehicleState {
+    VehicleState {
+        x_m,
+        y_m,
+        id_hash: 1000 + u64::from(number),
+        velocity_body_mps: [speed_mps, 0.0, 0.0],
+        length_m: 4.5,
+        width_m: 1.8,
+        height_m: 1.5,
+        rear_overhang_m: 1.0,
+        vehicle: number,
+        ..VehicleState::default()
+    }
+}
+
+/// What each slot received, tick by tick.
+#[derive(Debug, Clone, PartialEq)]
+struct Block {
+    objects: Vec<[f32; NEIGHBOUR_COLUMNS]>,
+    ids: Vec<[u32; NEIGHBOUR_ID_COLUMNS]>,
+    radio: Vec<[u32; RADIO_COLUMNS]>,
+    channel_load: Vec<f32>,
+}
+
+impl Block {
+    /// Objects that a slot knows, with the identity of each.
+    fn of(&self, slot: usize) -> Vec<([f32; NEIGHBOUR_COLUMNS], [u32; NEIGHBOUR_ID_COLUMNS])> {
+        let places = slot * NEAREST..(slot + 1) * NEAREST;
+        let rows = places.map(|place| (self.objects[place], self.ids[place]));
+        rows.filter(|(_, ids)| ids[2] != 0).collect()
+    }
+}
+
+/// Runs `ticks` ticks of cars that drive to the east. Every car has the slot of its number and measures without errors.
+fn run(config: &Config, houses: Vec<Prism>, cars: &[VehicleState], ticks: u64) -> (Vec<Block>, MessageExchange) {
+    let scene = Arc::new(Scene::new(Road::default(), houses, Vec::new()));
+    let mut exchange = MessageExchange::new(config, vec![(scene, projection())]);
+    let blocks = (0..ticks).map(|tick| {
+        let moved: Vec<VehicleState> = cars
+            .iter()
+            .map(|car| VehicleState {
+                x_m: car.x_m + 0.1 * tick as f64 * f64::from(car.velocity_body_mps[0]),
+                ..*car
+            })
+            .collect();
+        let slots: Vec<SlotMeasurement> = moved
+            .iter()
+            .map(|car| SlotMeasurement {
+                vehicle: car.vehicle,
+                id_hash: car.id_hash,
+                episode_step: tick as u32,
+                own: Some(OwnMeasurement {
+                    fix_m: [car.x_m, car.y_m],
+                    accuracy_m: Some(1.0),
+                    speed_mps: car.velocity_body_mps[0].into(),
+                    ..OwnMeasurement::default()
+                }),
+            })
+            .collect();
+        let header = MessageHeader {
+            flags: if tick == 0 { FIRST_OF_EPISODE } else { 0 },
+            episode_seed: 11,
+            tick,
+            sim_time_ns: tick * 100_000_000,
+            ..MessageHeader::default()
+        };
+        let count = slots.len();
+        let mut block = Block {
+            objects: vec![[0.0; NEIGHBOUR_COLUMNS]; count * NEAREST],
+            ids: vec![[0; NEIGHBOUR_ID_COLUMNS]; count * NEAREST],
+            radio: vec![[0; RADIO_COLUMNS]; count],
+            channel_load: vec![0.0; count],
+        };
+        let mut sections = NeighboursSections {
+            objects: &mut block.objects,
+            ids: &mut block.ids,
+            radio: &mut block.radio,
+            channel_load: &mut block.channel_load,
+            vehicle: &mut vec![0; count],
+        };
+        exchange.receive(&header, &slots, &moved, &mut sections);
+        exchange.send(&header, &slots, &moved);
+        block
+    });
+    let blocks = blocks.collect();
+    (blocks, exchange)
+}
+
+#[test]
+fn what_a_car_measures_reaches_the_other_a_tick_later() {
+    let cars = [car(0, 0.0, 0.0, 10.0), car(1, 80.0, 30.0, 15.0)];
+    let (blocks, exchange) = run(&config(), Vec::new(), &cars, 3);
+    assert!(blocks[0].of(0).is_empty());
+    let [(numbers, ids)] = blocks[1].of(0)[..] else {
+        panic!("{blocks:?}")
+    };
+    let station = station_id(cars[1].id_hash);
+    assert_eq!(ids, [station, station, 1]);
+    // Centre of the car at tick 0: 1.25 m before its rear axle. A unit of a message is 1.1 cm, and 10 cm of length.
+    let expected = [81.25, 30.0, 15.0, 0.0, 0.0, 4.5, 1.8, 0.1];
+    for (found, expected) in numbers.iter().zip(expected) {
+        assert!((f64::from(*found) - expected).abs() < 0.03, "{numbers:?}");
+    }
+    // A distance of 1 m has 0.71 m on each axis.
+    assert!((numbers[8] - 0.707).abs() < 0.01, "{numbers:?}");
+    // Both sent and received one message of the same length.
+    let [equipped, known, sent, bytes, received] = blocks[1].radio[0];
+    assert_eq!([equipped, known, sent, received], [1, 1, 1, 1]);
+    assert!((100..200).contains(&bytes), "{bytes}");
+    // 4 m at 10 m/s take 0.5 s: nothing was sent at tick 1, and the age grows.
+    assert_eq!(blocks[2].radio[0][2], 0);
+    assert!((blocks[2].of(0)[0].0[7] - 0.2).abs() < 1e-3);
+    assert_eq!(exchange.counts().cams, 2);
+}
+
+#[test]
+fn a_house_is_between_two_cars_and_a_lorry_is_not_enough() {
+    let cars = [car(0, 0.0, 0.0, 0.0), car(1, 200.0, 0.0, 0.0)];
+    let outline = vec![[95.0, -20.0], [105.0, -20.0], [105.0, 20.0], [95.0, 20.0]];
+    let house = Prism::new("house".into(), SolidClass::Building, outline, 0.0, 10.0).unwrap();
+    let (blocks, _) = run(&config(), vec![house], &cars, 2);
+    assert!(blocks[1].of(0).is_empty() && blocks[1].of(1).is_empty());
+    let lorry = VehicleState {
+        height_m: 3.5,
+        ..car(2, 100.0, 0.0, 0.0)
+    };
+    let (blocks, _) = run(&config(), Vec::new(), &[cars[0], cars[1], lorry], 2);
+    assert_eq!(blocks[1].of(0).len(), 2);
+}
+
+#[test]
+fn a_car_without_a_radio_is_known_from_those_that_see_it() {
+    let mut config = config();
+    config.v2x.share = 0.5;
+    config.v2x.perception_range_m = 60.0;
+    config.v2x.perception_position_std_m = 0.0;
+    config.v2x.perception_speed_std_mps = 0.0;
+    let cars: Vec<VehicleState> = (0..12)
+        .map(|number| car(number, 30.0 * f64::from(number), 0.0, 20.0))
+        .collect();
+    let (blocks, _) = run(&config, Vec::new(), &cars, 12);
+    let last = blocks.last().unwrap();
+    let equipped: Vec<usize> = (0..12).filter(|slot| last.radio[*slot][0] == 1).collect();
+    assert!((2..11).contains(&equipped.len()), "{equipped:?}");
+    let mut perceived = 0;
+    for slot in 0..12 {
+        if !equipped.contains(&slot) {
+            assert!(last.of(slot).is_empty() && last.radio[slot][1..] == [0; 4]);
+            continue;
+        }
+        for (numbers, ids) in last.of(slot).iter().filter(|(_, ids)| ids[2] == 2) {
+            // Where one of the cars was when it was measured.
+            let age_s = f64::from(numbers[7]);
+            let at = |car: &VehicleState| car.x_m + 1.25 + 20.0 * (1.1 - age_s);
+            let nearest_m = cars
+                .iter()
+                .map(|car| (at(car) - f64::from(numbers[0])).abs())
+                .fold(f64::MAX, f64::min);
+            assert!(nearest_m < 0.1 && ids[0] == 0, "{nearest_m} m: {numbers:?}");
+            assert!((f64::from(numbers[2]) - 20.0).abs() < 0.02);
+            perceived += 1;
+        }
+    }
+    assert!(perceived > 0);
+}
+
+#[test]
+fn the_number_of_threads_changes_nothing() {
+    let blocks = |threads| {
+        let mut config = config();
+        config.v2x.threads = threads;
+        config.v2x.fading = true;
+        config.v2x.perception_range_m = 50.0;
+        let cars: Vec<VehicleState> = (0..80)
+            .map(|number| {
+                car(
+                    number,
+                    17.0 * f64::from(number % 20),
+                    12.0 * f64::from(number / 20),
+                    (number % 7) as f32 * 5.0,
+                )
+            })
+            .collect();
+        let (blocks, exchange) = run(&config, Vec::new(), &cars, 15);
+        (blocks, exchange.counts())
+    };
+    let one = blocks(1);
+    assert!(one.1.received > 1000 && one.1.cpms > 50, "{:?}", one.1);
+    assert_eq!(one, blocks(2));
+    assert_eq!(one, blocks(4));
+}
