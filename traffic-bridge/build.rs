@@ -16,6 +16,8 @@ fn main() {
         "shim.cc",
         "population.cc",
         "heroes.cc",
+        "over_traci.cc",
+        "engine.h",
         "lanes.h",
         "error_tee.h",
         "text.h",
@@ -31,7 +33,12 @@ fn main() {
         exit(1);
     };
     cxx_build::bridge("src/sumo/libsumo.rs")
-        .files(["src/sumo/shim.cc", "src/sumo/population.cc", "src/sumo/heroes.cc"])
+        .files([
+            "src/sumo/shim.cc",
+            "src/sumo/population.cc",
+            "src/sumo/heroes.cc",
+            "src/sumo/over_traci.cc",
+        ])
         .std("c++17")
         .include(sumo.join("include"))
         .flag_if_supported("-Wno-unused-parameter")
@@ -44,6 +51,7 @@ fn link(sumo: &Path) {
     println!("cargo:rerun-if-changed={}", library.join("libsumocpp.so").display());
     println!("cargo:rustc-link-search=native={}", library.display());
     println!("cargo:rustc-link-lib=dylib=sumocpp");
+    println!("cargo:rustc-link-lib=dylib=tracicpp");
     println!("cargo:rustc-link-arg=-Wl,-rpath,{}", library.display());
     // Tests and examples find the wheel's scenarios and tools here; the program itself reads the path from its run file.
     println!("cargo:rustc-env=CARAWARE_BUILD_SUMO_HOME={}", sumo.display());

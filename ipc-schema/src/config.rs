@@ -192,11 +192,37 @@ pub struct TrafficConfig {
     pub held_out_trips: f64,
     /// Factor on a scenario's demand, SUMO's `--scale` (`.sumocfg`); `None` = as the scenario says.
     pub scale: Option<f64>,
+    /// Where SUMO runs.
+    #[serde(default)]
+    pub engine: TrafficEngine,
+    /// Port of SUMO's own process for TraCI clients; that of environment n is n higher.
+    #[serde(default)]
+    pub traci_port: u16,
+    /// TraCI clients that SUMO's own process waits for, `traffic-bridge` among them.
+    #[serde(default)]
+    pub traci_clients: u32,
+    /// SUMO's time at the begin, seconds (`.sumocfg`); `None` = as the scenario says.
+    pub begin_s: Option<f64>,
+    /// SUMO's time at the end, seconds (`.sumocfg`); `None` = as the scenario says.
+    pub end_s: Option<f64>,
     /// A scenario's files may do all that SUMO can (`.sumocfg`); false = what reaches beyond the run's directory is refused.
     #[serde(default)]
     pub trust_scenario: bool,
     /// Most road users alive at once; shared memory is laid out for them.
     pub max_road_users: u32,
+}
+
+/// Where SUMO runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TrafficEngine {
+    /// In `traffic-bridge`.
+    #[default]
+    Libsumo,
+    /// In a process of its own, over TraCI, with room for other clients.
+    Traci,
+    /// The same with SUMO's window.
+    TraciGui,
 }
 
 /// Geodetic reference of a net that has none.

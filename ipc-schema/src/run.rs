@@ -37,6 +37,8 @@ impl Mode {
 
 /// Log of a curriculum in the run directory: the first lesson and tick of each stage.
 pub const CURRICULUM_LOG: &str = "curriculum.jsonl";
+/// File in the run directory with the ids of a scenario's road users in order of appearance, each a line of JSON.
+pub const VEHICLE_IDS: &str = "ids.jsonl";
 /// Former name of that log. A directory with a file of this name is refused.
 pub const FORMER_CURRICULUM_LOG: &str = "actions.jsonl";
 
@@ -80,7 +82,7 @@ pub struct RestartPoint {
 }
 
 /// Source of the traffic.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Source {
     /// A map with population control: road users on random routes, without end.
@@ -94,7 +96,41 @@ pub enum Source {
     Scenario {
         /// The `.sumocfg`.
         sumocfg: PathBuf,
+        /// What it says.
+        #[serde(default)]
+        own: ScenarioOptions,
     },
+}
+
+/// What a `.sumocfg` itself says: the values that the run replaces only where they differ, and the files that it names.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ScenarioOptions {
+    /// SUMO's step, seconds.
+    pub step_s: f64,
+    /// SUMO's seed. A negative one is carried as the 32 bits that it has in SUMO.
+    pub seed: u64,
+    /// SUMO's time at the begin of every episode, seconds: its `begin` or that of the run, or the time of the saved state.
+    pub begin_s: f64,
+    /// SUMO draws its seed from the clock, unless the run gives one.
+    pub is_random: bool,
+    /// Options of outputs that get another name, because two outputs have the same name in two folders: option and name.
+    pub renamed_outputs: Vec<(String, String)>,
+    /// Files that it names, with variables of the environment replaced.
+    pub inputs: Vec<PathBuf>,
+}
+
+impl Default for ScenarioOptions {
+    /// SUMO's own defaults.
+    fn default() -> Self {
+        Self {
+            step_s: 1.0,
+            seed: 23423,
+            begin_s: 0.0,
+            is_random: false,
+            renamed_outputs: Vec::new(),
+            inputs: Vec::new(),
+        }
+    }
 }
 
 /// Location and size of a map, from its net file.
@@ -102,13 +138,17 @@ pub enum Source {
 pub struct MapInfo {
     /// PROJ string of the net, or of the origin given in the configuration.
     pub projection: String,
-    /// Offset from projected coordinates to net coordinates, metres.
+    /// Offset from projected coordinates to the world frame, metres.
     pub net_offset_m: [f64; 2],
     /// x_min, y_min, x_max, y_max of the net with a margin of 20 m, metres: the range of positions and predictions. In a run with several
     /// maps the box holds all of them.
     pub bounds_m: [f64; 4],
     /// Number of programs of traffic lights in the net, at least the number of traffic lights.
     pub traffic_lights: u32,
+    /// The world frame's (0, 0) in the net's own coordinates, metres. It is (0, 0) unless the net lies so far from its own (0, 0) that
+    /// single precision would lose centimetres, as in raw UTM coordinates. Every other position of the run is in the world frame.
+    #[serde(default)]
+    pub world_origin_m: [f64; 2],
 }
 
 /// The files that the static scene is built from.

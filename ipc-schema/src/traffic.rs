@@ -99,8 +99,11 @@ pub const VEHICLE_CLASSES: [&str; 34] = [
     "ignoring",
 ];
 
-/// Longest id that is carried as text. Longer ids are cut; their hash is that of the whole id.
-pub const ID_BYTES: usize = 64;
+/// Longest id that is carried as it is, as long as those that commands carry. Of a longer one its begin is carried, then
+/// [`CUT_MARK`] and the 16 digits of its hash, so that two ids stay different.
+pub const ID_BYTES: usize = 128;
+/// Stands between the begin of an id that is too long and its hash.
+pub const CUT_MARK: char = '~';
 /// Longest name of a vehicle type that is carried.
 pub const TYPE_ID_BYTES: usize = 32;
 
@@ -143,7 +146,7 @@ pub struct VehicleMeta {
 }
 
 impl VehicleMeta {
-    /// SUMO's id as text (cut to [`ID_BYTES`]).
+    /// SUMO's id as text ([`ID_BYTES`] at most).
     #[must_use]
     pub fn id_text(&self) -> String {
         let len = (self.id_len as usize).min(ID_BYTES);
@@ -157,15 +160,15 @@ impl VehicleMeta {
         String::from_utf8_lossy(class).into_owned()
     }
 
-    /// Stores `id`, cut at a character border, with the hash of the whole.
+    /// Stores `id`, shortened to [`ID_BYTES`], with the hash of the whole.
     pub fn set_id(&mut self, id: &str) {
         (self.id, self.id_len) = id_text_bytes(id);
         self.id_hash = id_hash(id);
     }
 }
 
-/// Most links of one traffic light that are carried.
-pub const SIGNAL_LINKS: usize = 128;
+/// Most links of one traffic light that are carried. SUMO allows 256 at one junction; a light may control several.
+pub const SIGNAL_LINKS: usize = 512;
 
 /// Most events of road users in one `traffic-meta` message; a step with more events sends more messages.
 pub const EVENTS_PER_MESSAGE: usize = 1024;
@@ -186,7 +189,7 @@ pub struct SignalMeta {
     pub signal: u32,
     /// Bytes of `id` in use.
     pub id_len: u32,
-    /// SUMO's id, UTF-8, cut to [`ID_BYTES`].
+    /// SUMO's id, UTF-8, shortened to [`ID_BYTES`].
     pub id: [u8; ID_BYTES],
     /// Links that it controls; those beyond [`SIGNAL_LINKS`] are not carried.
     pub links: u32,
@@ -197,7 +200,7 @@ pub struct SignalMeta {
 }
 
 impl SignalMeta {
-    /// SUMO's id as text (cut to [`ID_BYTES`]).
+    /// SUMO's id as text ([`ID_BYTES`] at most).
     #[must_use]
     pub fn id_text(&self) -> String {
         let len = (self.id_len as usize).min(ID_BYTES);
@@ -205,16 +208,20 @@ impl SignalMeta {
     }
 }
 
-/// `id` cut at a character border to [`ID_BYTES`], zero padded, with the number of bytes in use.
+/// `id` shortened to [`ID_BYTES`] where it is longer, zero padded, with the number of bytes in use.
 #[must_use]
 pub fn id_text_bytes(id: &str) -> ([u8; ID_BYTES], u32) {
-    let mut len = id.len().min(ID_BYTES);
-    while !id.is_char_boundary(len) {
-        len -= 1;
-    }
+    let shortened;
+    let text = if id.len() <= ID_BYTES {
+        id
+    } else {
+        let hash = format!("{CUT_MARK}{:016x}", id_hash(id));
+        shortened = format!("{}{hash}", &id[..id.floor_char_boundary(ID_BYTES - hash.len())]);
+        &shortened
+    };
     let mut bytes = [0; ID_BYTES];
-    bytes[..len].copy_from_slice(&id.as_bytes()[..len]);
-    (bytes, u32::try_from(len).unwrap_or(0))
+    bytes[..text.len()].copy_from_slice(text.as_bytes());
+    (bytes, u32::try_from(text.len()).unwrap_or(0))
 }
 
 payload_layout! {
@@ -278,4 +285,23 @@ pub fn id_hash(id: &str) -> u64 {
     let mut first = [0_u8; 8];
     first.copy_from_slice(&blake3::hash(id.as_bytes()).as_bytes()[..8]);
     u64::from_le_bytes(first)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_ids_that_begin_alike_stay_different() {
+        let long = "\u{e4}".repeat(100);
+        let texts = [format!("{long}1"), format!("{long}2"), long].map(|id| {
+            let (bytes, len) = id_text_bytes(&id);
+            let text = String::from_utf8(bytes[..len as usize].to_vec()).unwrap();
+            assert!(text.ends_with(&format!("{CUT_MARK}{:016x}", id_hash(&id))), "{text}");
+            text
+        });
+        assert!(texts[0] != texts[1] && texts[1] != texts[2]);
+        let whole = "x".repeat(ID_BYTES);
+        assert_eq!(id_text_bytes(&whole), (whole.as_bytes().try_into().unwrap(), 128));
+    }
 }

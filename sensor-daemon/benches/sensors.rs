@@ -116,6 +116,7 @@ fn round(config: &Config) -> f64 {
         net_offset_m: [-385_000.0, -5_815_000.0],
         bounds_m: [0.0, 0.0, 10_000.0, 10_000.0],
         traffic_lights: 0,
+        world_origin_m: [0.0; 2],
     };
     let mut sensing = Sensing::new(config, &map).unwrap_or_else(|error| panic!("{error}"));
     let states = states();

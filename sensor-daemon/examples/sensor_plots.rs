@@ -73,6 +73,7 @@ fn map() -> MapInfo {
         net_offset_m: [0.0, 0.0],
         bounds_m: [-100.0, -60.0, 220.0, 200.0],
         traffic_lights: 0,
+        world_origin_m: [0.0; 2],
     }
 }
 

@@ -36,6 +36,7 @@ fn maps() -> [MapInfo; 2] {
         net_offset_m: [0.0; 2],
         bounds_m: [-100.0, -100.0, 900.0, 700.0],
         traffic_lights: 0,
+        world_origin_m: [0.0; 2],
     };
     [map(), far]
 }

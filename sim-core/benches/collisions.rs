@@ -125,6 +125,7 @@ fn load(files: &str) {
         net_offset_m: [0.0; 2],
         bounds_m: [0.0; 4],
         traffic_lights: 0,
+        world_origin_m: [0.0; 2],
     };
     let mut costs_ms = Vec::new();
     for _ in 0..9 {

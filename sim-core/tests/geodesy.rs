@@ -36,6 +36,7 @@ fn map(definition: &str, net_offset_m: [f64; 2]) -> MapInfo {
         net_offset_m,
         bounds_m: [0.0, 0.0, 1.0, 1.0],
         traffic_lights: 0,
+        world_origin_m: [0.0; 2],
     }
 }
 

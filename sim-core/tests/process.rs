@@ -18,7 +18,7 @@ use ipc_schema::{
     membership::RunMembership,
     ports::{Message, Publisher, Subscriber},
     process::Process,
-    run::{MapInfo, Mode, RunFile, RunMap, SceneFiles, SharedMemory, Source},
+    run::{MapInfo, Mode, RunFile, RunMap, ScenarioOptions, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
     traffic::{Kind, MetaEvent, SignalMeta, TrafficMetaLayout, TrafficState, VehicleMeta, id_hash},
     world::{COLLIDED, VehicleState, WorldLayout},
@@ -65,12 +65,14 @@ impl Run {
             },
             source: Source::Scenario {
                 sumocfg: PathBuf::new(),
+                own: ScenarioOptions::default(),
             },
             map: MapInfo {
                 projection: "!".into(),
                 net_offset_m: [0.0; 2],
                 bounds_m: [0.0, 0.0, 100.0, 100.0],
                 traffic_lights: 0,
+                world_origin_m: [0.0; 2],
             },
             scene_files: SceneFiles {
                 net_file,

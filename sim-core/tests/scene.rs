@@ -14,7 +14,7 @@ use std::{
 
 use ipc_schema::{
     config::Config,
-    run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
+    run::{MapInfo, Mode, RunFile, ScenarioOptions, SceneFiles, SharedMemory, Source},
 };
 use sim_core::scene::{Scene, SceneError, Solid, SurfaceKind, chart::Chart, shape};
 
@@ -80,12 +80,14 @@ fn run(net_file: &Path, additional_files: &[PathBuf]) -> RunFile {
         },
         source: Source::Scenario {
             sumocfg: PathBuf::new(),
+            own: ScenarioOptions::default(),
         },
         map: MapInfo {
             projection: "+proj=utm +zone=33 +ellps=WGS84 +datum=WGS84 +units=m +no_defs".into(),
             net_offset_m: [-402_990.32, -5_794_389.48],
             bounds_m: [0.0, 0.0, 5_000.0, 5_000.0],
             traffic_lights: 0,
+            world_origin_m: [0.0; 2],
         },
         scene_files: SceneFiles {
             net_file: net_file.into(),
@@ -419,4 +421,42 @@ fn the_chart_for_viewers_has_lanes_lights_and_houses() {
     chart.write(&path).unwrap();
     let written: serde_json::Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
     assert_eq!(written["lanes"].as_array().unwrap().len(), chart.lanes.len());
+}
+
+/// A net and its objects as they lie in raw UTM coordinates, and the same files in a run whose world frame begins beside them.
+#[test]
+fn far_nets_trees_and_files_that_include_each_other_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path
+    };
+    let net = write(
+        "a.net.xml",
+        "<net><edge id=\"e\"><lane id=\"e_0\" shape=\"691010,5334010 691110,5334010\" width=\"4\"/></edge></net>",
+    );
+    let first = write(
+        "a.add.xml",
+        "<add><include href=\"b.add.xml\"/><poi id=\"t\" type=\"natural.tree\" x=\"691020\" y=\"5334020\"/>\
+         <poi id=\"s\" type=\"shop\" x=\"691030\" y=\"5334020\"/></add>",
+    );
+    write(
+        "b.add.xml",
+        "<add><include href=\"./a.add.xml\"/><poly id=\"h\" type=\"building\" \
+         shape=\"691050,5334020 691060,5334020 691060,5334030 691050,5334030\"/></add>",
+    );
+    let mut run = run(&net, &[first]);
+    run.map.world_origin_m = [691_000.0, 5_334_000.0];
+    let scene = Scene::of_run(&run).unwrap();
+    assert!(scene.is_on_road(60.0, 11.0) && !scene.is_on_road(60.0, 13.0));
+    assert_eq!(scene.buildings()[0].outline_m[0], [50.0, 20.0]);
+    let trees: Vec<_> = scene
+        .props()
+        .iter()
+        .map(|prop| (prop.kind.name, prop.body.centre_m))
+        .collect();
+    assert_eq!(trees, [("tree", [20.0, 20.0])]);
+    let chart = Chart::of_run(&run, &scene).unwrap();
+    assert_eq!(chart.lanes[0].points_m[0], [10.0, 10.0, 0.0]);
 }

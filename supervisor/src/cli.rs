@@ -8,6 +8,8 @@ use clap::{
 };
 use ipc_schema::sensor::SensorSelection;
 
+use crate::{failure::Exit, scenario_settings};
+
 /// Co-simulation bridge: SUMO traffic with sensing vehicles, for a learner in another process.
 #[derive(Debug, Parser)]
 #[command(name = "caraware", version, about, long_about = LONG, after_help = AFTER, max_term_width = 110)]
@@ -382,6 +384,12 @@ pub struct RunArgs {
     /// Repeat the commands of another run's commands.jsonl, each at its tick
     #[arg(long, value_name = "FILE")]
     pub commands: Option<PathBuf>,
+    /// Begin a .sumocfg at this time of SUMO, in seconds or as H:M:S, as SUMO's own --begin
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    pub begin: Option<String>,
+    /// End a .sumocfg at this time of SUMO, in seconds or as H:M:S, as SUMO's own --end
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    pub end: Option<String>,
     /// Let the files of a .sumocfg do all that SUMO can; short for --set traffic.trust_scenario=true
     #[arg(long)]
     pub trust_scenario: bool,
@@ -398,13 +406,24 @@ pub struct RunArgs {
 
 impl RunArgs {
     /// Returns the arguments with every shorthand option replaced by the setting that it stands for.
-    #[must_use]
-    pub fn with_shorthands(&self) -> Self {
+    ///
+    /// # Errors
+    /// A time is no time.
+    pub fn with_shorthands(&self) -> Result<Self, Exit> {
         let mut args = self.clone();
+        for (option, key, time) in [
+            ("--begin", "traffic.begin_s", args.begin.take()),
+            ("--end", "traffic.end_s", args.end.take()),
+        ] {
+            if let Some(time) = time {
+                let seconds = scenario_settings::time_argument(option, &time)?;
+                args.set.push(format!("{key}={seconds}"));
+            }
+        }
         args.set.extend(args.envs.take().map(|envs| format!("run.envs={envs}")));
         if std::mem::take(&mut args.trust_scenario) {
             args.set.push("traffic.trust_scenario=true".to_owned());
         }
-        args
+        Ok(args)
     }
 }

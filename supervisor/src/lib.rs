@@ -26,6 +26,7 @@ pub mod restart;
 pub mod resume;
 pub mod running_process;
 pub mod scenario;
+pub mod scenario_settings;
 pub mod socket;
 pub mod stall;
 pub mod status;

@@ -72,7 +72,7 @@ fn built_town(install: &Install, directory: &Path) -> Result<(Source, SceneFiles
 /// Reads a user's net or scenario. The scene uses its additional files; SUMO does not, because they may also define demand and outputs,
 /// and gets only the town's vehicle types.
 fn user_map(file: &Path, directory: &Path, trusted: bool) -> Result<(Source, SceneFiles), Exit> {
-    let scene_files = match file.extension().is_some_and(|ending| ending == "sumocfg") {
+    let scene_files = match scenario::is_scenario(file) {
         true => {
             let scenario = scenario::read(file, trusted)?;
             SceneFiles {
@@ -111,17 +111,23 @@ pub fn combine(maps: &[RunMap]) -> Option<MapInfo> {
 #[cfg(test)]
 #[allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 mod tests {
+    use ipc_schema::run::ScenarioOptions;
+
     use super::*;
 
     fn map(bounds_m: [f64; 4], traffic_lights: u32, projection: &str) -> RunMap {
         RunMap {
             name: projection.into(),
-            source: Source::Scenario { sumocfg: "none".into() },
+            source: Source::Scenario {
+                sumocfg: "none".into(),
+                own: ScenarioOptions::default(),
+            },
             info: MapInfo {
                 projection: projection.into(),
                 net_offset_m: [1.0, 2.0],
                 bounds_m,
                 traffic_lights,
+                world_origin_m: [0.0; 2],
             },
             scene_files: SceneFiles::default(),
         }

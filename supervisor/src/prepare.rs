@@ -21,18 +21,12 @@ use crate::{
     registry::{self, RunClaim},
     remote, resume,
     scenario::{self, SumoScenario, input_check::require_regular},
-    system_limits,
+    scenario_settings, system_limits,
     view::ViewerRequest,
 };
 
-/// SUMO's own default step, seconds.
-const SUMO_STEP_S: f64 = 1.0;
 /// How far ahead mirrors see SUMO's path on nets that were not drawn for them, seconds.
 const PREVIEW_S: f64 = 1.5;
-/// SUMO's own default seed.
-const SUMO_SEED: u64 = 23423;
-/// Road users that shared memory is sized for in a scenario, unless the user sets `traffic.max_road_users`.
-const SCENARIO_ROAD_USERS: u64 = 8192;
 
 /// The key that `--trust-scenario` sets.
 const TRUST_KEY: &str = "traffic.trust_scenario";
@@ -60,12 +54,19 @@ enum TrafficInput {
     Scenario(PathBuf, SumoScenario),
 }
 
+impl TrafficInput {
+    fn is_scenario(&self) -> bool {
+        matches!(self, Self::Scenario(..))
+    }
+}
+
 /// Checks everything and claims a run directory and shared memory.
 ///
 /// # Errors
 /// The configuration, the user's files or this machine do not allow the run.
 pub fn prepare(args: &RunArgs, mode: Mode) -> Result<PreparedRun, Exit> {
-    let (settings, named, label) = resolve_config(&args.with_shorthands())?;
+    let (settings, named, label) = resolve_config(&args.with_shorthands()?)?;
+    scenario_settings::check_length(&settings, mode, named.is_scenario())?;
     prepare_new(args, mode, settings.validate()?, named, &label, Install::find()?)
 }
 
@@ -77,8 +78,8 @@ pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
     let install = Install::find()?;
     let found = FoundCheckpoint::best(&install, &args.checkpoint, &args.run.runs)?;
     let (settings, named) = match &args.run.config {
-        Some(_) => resolve_config(&args.run.with_shorthands()).map(|(settings, named, _)| (settings, named))?,
-        None => settings_of_run(&found.run()?, &args.run.with_shorthands().set)?,
+        Some(_) => resolve_config(&args.run.with_shorthands()?).map(|(settings, named, _)| (settings, named))?,
+        None => settings_of_run(&found.run()?, &args.run.with_shorthands()?.set)?,
     };
     let config = settings.validate()?;
     if config.drives() {
@@ -117,12 +118,12 @@ pub fn prepare_resume(args: &RunArgs, resumed: &str) -> Result<PreparedRun, Exit
                 "leave --name out: the run resumes from its own beginning",
             ));
         }
-        let config = resume::changed_config(&old, &args.with_shorthands().set)?;
+        let config = resume::changed_config(&old, &args.with_shorthands()?.set)?;
         return prepare_in_place(args, None, old, config, install);
     }
     let found = FoundCheckpoint::newest(&install, resumed, &args.runs)?;
     let old = found.run()?;
-    let config = resume::changed_config(&old, &args.with_shorthands().set)?;
+    let config = resume::changed_config(&old, &args.with_shorthands()?.set)?;
     found.check_fit(&config)?;
     system_limits::check_open_files(config.run.envs)?;
     // A run is continued in its own directory.
@@ -164,7 +165,7 @@ fn prepare_in_place(
 fn settings_of_run(run: &RunFile, set: &[String]) -> Result<(LayeredSettings, TrafficInput), Exit> {
     let settings = LayeredSettings::of(&run.config)?.with_assignments(set)?;
     let named = match &run.source {
-        Source::Scenario { sumocfg } => {
+        Source::Scenario { sumocfg, .. } => {
             let trusted = settings.has_flag(TRUST_KEY);
             TrafficInput::Scenario(sumocfg.clone(), scenario::read(sumocfg, trusted)?)
         }
@@ -220,14 +221,16 @@ fn resolve_config(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, Stri
     let name = args.config.as_deref().unwrap_or("town");
     let path = Path::new(name);
     let defaults = LayeredSettings::defaults()?;
-    let label = path
-        .file_stem()
-        .map_or_else(|| name.to_owned(), |stem| stem.to_string_lossy().into_owned());
+    let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned());
+    let label = stem
+        .unwrap_or_else(|| name.to_owned())
+        .trim_end_matches(".sumo")
+        .to_owned();
     match path.extension().and_then(std::ffi::OsStr::to_str) {
-        Some("sumocfg") => {
+        _ if scenario::is_scenario(path) => {
             let mut settings = defaults.with_assignments(&args.set)?;
             let scenario = scenario::read(path, settings.has_flag(TRUST_KEY))?;
-            apply_scenario_defaults(&mut settings, &scenario, name)?;
+            scenario_settings::apply(&mut settings, &scenario, name)?;
             suggest_preview(&mut settings, name);
             let path = std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error))?;
             Ok((settings, TrafficInput::Scenario(path, scenario), label))
@@ -257,36 +260,17 @@ fn suggest_preview(settings: &mut LayeredSettings, source: &str) {
     }
 }
 
-/// Takes step and seed from the scenario unless the user sets them. Road users are always the scenario's own.
-fn apply_scenario_defaults(settings: &mut LayeredSettings, scenario: &SumoScenario, source: &str) -> Result<(), Exit> {
-    for (path, none) in [("traffic.cavs", 1), ("traffic.others", 0), ("traffic.pedestrians", 0)] {
-        if settings.is_set_by_user(path) {
-            return Err(Exit::config(
-                format!("`{path}` is for maps with population control, and {source} has its own road users"),
-                "traffic.cav_share and traffic.max_cavs set how many of its vehicles carry sensors; traffic.scale changes its demand",
-            ));
-        }
-        settings.suggest(path, Value::from(none), source);
-    }
-    settings.suggest(
-        "traffic.step_s",
-        Value::from(scenario.step_s.unwrap_or(SUMO_STEP_S)),
-        source,
-    );
-    settings.suggest("run.seed", Value::from(scenario.seed.unwrap_or(SUMO_SEED)), source);
-    settings.suggest("traffic.max_road_users", Value::from(SCENARIO_ROAD_USERS), source);
-    Ok(())
-}
-
 /// Checks that the mode and the source of traffic can do the task: driving needs a trainer and heroes.
 fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), Exit> {
-    if matches!(named, TrafficInput::Map) && (config.episode.whole_scenario || config.traffic.scale.is_some()) {
+    let traffic = &config.traffic;
+    let for_scenarios = traffic.scale.or(traffic.begin_s).or(traffic.end_s);
+    if !named.is_scenario() && (config.episode.whole_scenario || for_scenarios.is_some()) {
         return Err(Exit::config(
-            "`episode.whole_scenario` and `traffic.scale` need a .sumocfg, and CONFIG is not one",
-            "name a .sumocfg in place of the preset, or leave the keys out",
+            "`episode.whole_scenario`, `traffic.scale`, `--begin` and `--end` need a .sumocfg, and CONFIG is not one",
+            "name a .sumocfg in place of the preset, or leave them out (episode.ticks and episode.training_episodes limit a run on a map)",
         ));
     }
-    if matches!(named, TrafficInput::Scenario(..)) && !config.curriculum.stages.is_empty() {
+    if named.is_scenario() && !config.curriculum.stages.is_empty() {
         return Err(Exit::config(
             "the stages of a curriculum set the number of vehicles, but a .sumocfg has its own vehicles",
             "name the .sumocfg in curriculum.maps and give a preset or .toml as CONFIG: its net then runs with population control",
@@ -295,7 +279,6 @@ fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), E
     if !config.drives() {
         return Ok(());
     }
-    let traffic = &config.traffic;
     match (mode, named) {
         (Mode::Simulate, _) => Err(Exit::config(
             "the driving task needs a trainer, and `caraware simulate` has none",
@@ -418,7 +401,10 @@ struct MapInputs {
 impl MapInputs {
     fn of_scenario(sumocfg: PathBuf, scenario: SumoScenario, map: MapInfo) -> Self {
         Self {
-            source: Source::Scenario { sumocfg },
+            source: Source::Scenario {
+                sumocfg,
+                own: scenario.own,
+            },
             map,
             scene_files: SceneFiles {
                 net_file: scenario.net_file,
@@ -459,7 +445,9 @@ fn assemble(
         scenario.note_moved_outputs(&run_dir.path)?;
     }
     let inputs = match (named, scenario_map) {
-        (TrafficInput::Scenario(sumocfg, scenario), Some(map)) => MapInputs::of_scenario(sumocfg, scenario, map),
+        (TrafficInput::Scenario(sumocfg, scenario), Some(map)) => {
+            MapInputs::of_scenario(sumocfg, scenario.beginning_at(config.traffic.begin_s), map)
+        }
         _ => MapInputs::of_maps(maps::build(install, &config, &run_dir.path.join("map"))?)?,
     };
     let claim = RunClaim::new(&run_dir.path)?;

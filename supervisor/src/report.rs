@@ -28,6 +28,8 @@ const SPACE_WITHIN: Duration = Duration::from_secs(60);
 
 /// Reasons for resynchronisations that the summary names.
 const SHOWN_CAUSES: usize = 3;
+/// Vehicle classes that the summary names.
+const SHOWN_CLASSES: usize = 6;
 
 /// The estimators that an evaluation compares, by their prefixes of the report's keys: the policy, the raw fix, the Kalman filter, the
 /// smoother, which also uses later samples, and the policy's network trained by regression.
@@ -400,6 +402,7 @@ fn summary(report: &Value, path: &Path) -> String {
             lines.push(format!("{label}: {messages} messages with {count} {entries}"));
         }
     }
+    lines.extend(traffic(report));
     lines.extend(resynchronisations(report));
     lines.extend(guidances(report));
     lines.push(format!(
@@ -418,6 +421,37 @@ fn summary(report: &Value, path: &Path) -> String {
 fn environments(report: &Value) -> &[Value] {
     let environments = report["environments"].as_array();
     environments.map_or(std::slice::from_ref(report), Vec::as_slice)
+}
+
+/// The road users of the first environment by class, their teleports, and contacts here and in SUMO.
+fn traffic(report: &Value) -> Option<String> {
+    let departed = report["traffic"]["departed"].as_object()?;
+    let mut classes: Vec<(&str, u64)> = departed
+        .iter()
+        .map(|(class, count)| (class.as_str(), count.as_u64().unwrap_or(0)))
+        .collect();
+    classes.sort_by_key(|&(class, count)| (Reverse(count), class));
+    let all: u64 = classes.iter().map(|(_, count)| count).sum();
+    let shown: Vec<String> = classes
+        .iter()
+        .take(SHOWN_CLASSES)
+        .map(|(class, count)| format!("{count} {class}"))
+        .collect();
+    let rest = match classes.len().checked_sub(SHOWN_CLASSES) {
+        Some(more) if more > 0 => format!(" and {more} more classes"),
+        _ => String::new(),
+    };
+    let contacts = match report["dynamics"]["collisions"]["total"].as_u64() {
+        Some(contacts) => format!("contacts {contacts}, in SUMO"),
+        None => "contacts in SUMO".to_owned(),
+    };
+    Some(format!(
+        "road users {all} ({}{rest}); teleports {}; {contacts} {}; resets {}",
+        shown.join(", "),
+        report["traffic"]["teleports"],
+        report["traffic"]["contacts"],
+        report["traffic"]["resets"]
+    ))
 }
 
 /// How often mirrors were set onto SUMO, in all environments, and the commonest reasons.

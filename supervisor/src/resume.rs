@@ -313,7 +313,7 @@ fn write_commands(path: &Path, actions: &[Action]) -> Result<(), Exit> {
 fn sources(run: &RunFile) -> Vec<&Path> {
     use ipc_schema::run::Source;
     match &run.source {
-        Source::Scenario { sumocfg } => vec![sumocfg],
+        Source::Scenario { sumocfg, .. } => vec![sumocfg],
         Source::Population {
             net_file,
             additional_files,

@@ -1,27 +1,39 @@
 //! Reads the options of a `.sumocfg` and the location of a net, before any process starts. A scenario may come from a stranger:
 //! docs/decisions/0028-scenario-files-are-not-trusted.md.
 
-mod configuration;
+pub mod configuration;
 pub mod input_check;
+mod net;
 pub mod options;
+mod outputs;
+mod saved_state;
 
 use std::{
     fs::File,
-    io::{BufRead, BufReader, Read as _},
+    io::Read as _,
     path::{Path, PathBuf},
 };
 
 use flate2::read::MultiGzDecoder;
-use ipc_schema::run::MapInfo;
-use quick_xml::{
-    Reader,
-    events::{BytesStart, Event},
-};
+use ipc_schema::run::ScenarioOptions;
+use quick_xml::events::BytesStart;
 
-use crate::{config::ConfigError, failure::Exit};
+use crate::{config::ConfigError, failure::Exit, install::Install};
 use configuration::SumoSetting;
 use input_check::{InputCheck, OutputPlace, TRUST};
+pub use net::map_info;
 use options::OptionEffect;
+use outputs::OutputNames;
+
+/// Endings of files that are configurations of SUMO.
+const SCENARIO_ENDINGS: [&str; 2] = [".sumocfg", ".cfg"];
+
+/// True if the file name says that the file is a configuration of SUMO: `.sumocfg`, `.sumo.cfg`, `.cfg`.
+#[must_use]
+pub fn is_scenario(path: &Path) -> bool {
+    let name = path.file_name().map(|name| name.to_string_lossy().to_ascii_lowercase());
+    name.is_some_and(|name| SCENARIO_ENDINGS.iter().any(|ending| name.ends_with(ending)))
+}
 
 /// The options of a `.sumocfg` that the bridge needs.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -30,15 +42,22 @@ pub struct SumoScenario {
     pub net_file: PathBuf,
     /// `additional-files`, in order.
     pub additional_files: Vec<PathBuf>,
-    /// `step-length`, if set.
-    pub step_s: Option<f64>,
-    /// `seed`, if set.
-    pub seed: Option<u64>,
+    /// What SUMO takes from the file unless the run says otherwise.
+    pub own: ScenarioOptions,
+    /// Its end, if it names one: SUMO's time, seconds.
+    pub end_s: Option<f64>,
     /// Outputs that the files place elsewhere, which SUMO writes into the run's directory: each with its place.
     pub moved_outputs: Vec<String>,
 }
 
 impl SumoScenario {
+    /// The same, beginning at `begin_s` of SUMO's time if it is given.
+    #[must_use]
+    pub fn beginning_at(mut self, begin_s: Option<f64>) -> Self {
+        self.own.begin_s = begin_s.unwrap_or(self.own.begin_s);
+        self
+    }
+
     /// Notes in the log of `traffic-bridge` which outputs are not written where the scenario's files say.
     ///
     /// # Errors
@@ -85,8 +104,8 @@ pub fn read(path: &Path, trusted: bool) -> Result<SumoScenario, Exit> {
     if path.exists() {
         input_check::require_regular(path).map_err(unreadable)?;
     }
-    let text = std::fs::read_to_string(path).map_err(|error| unreadable(format!("cannot be read: {error}")))?;
-    let configuration = configuration::parse(&text).map_err(|(line, reason)| {
+    let bytes = std::fs::read(path).map_err(|error| unreadable(format!("cannot be read: {error}")))?;
+    let configuration = configuration::parse(&bytes, &variable).map_err(|(line, reason)| {
         let help = "correct the file; SUMO's own check: `sumo -c FILE`";
         problem(path, format!("line {line}: not valid XML: {reason}"), help)
     })?;
@@ -95,6 +114,9 @@ pub fn read(path: &Path, trusted: bool) -> Result<SumoScenario, Exit> {
         directory: path.parent().unwrap_or(Path::new(".")),
         scenario: SumoScenario::default(),
         check: (!trusted).then(|| InputCheck::new(OutputPlace::RunDirectory)),
+        outputs: OutputNames::default(),
+        state_s: None,
+        begin_s: None,
     };
     if let (Some(line), false) = (configuration.doctype_line, trusted) {
         let help = format!("remove <!DOCTYPE …>, {TRUST}");
@@ -104,7 +126,17 @@ pub fn read(path: &Path, trusted: bool) -> Result<SumoScenario, Exit> {
         reader.read_setting(setting)?;
     }
     let mut scenario = reader.scenario;
-    scenario.moved_outputs = reader.check.map(|check| check.moved).unwrap_or_default();
+    // A saved state brings its time along; `begin` has precedence.
+    scenario.own.begin_s = reader.begin_s.or(reader.state_s).unwrap_or(0.0);
+    let mut outputs = reader.outputs;
+    if let Some(check) = reader.check {
+        scenario.moved_outputs = check.moved;
+        outputs.add_elements(check.outputs_of_elements);
+    }
+    scenario.own.renamed_outputs = outputs.renamed().map_err(|message| {
+        let help = "give one of the two outputs another name: all outputs of a run are written into one directory";
+        problem(path, message, help)
+    })?;
     if scenario.net_file.as_os_str().is_empty() {
         return Err(problem(
             path,
@@ -113,6 +145,15 @@ pub fn read(path: &Path, trusted: bool) -> Result<SumoScenario, Exit> {
         ));
     }
     Ok(scenario)
+}
+
+/// A variable that a `.sumocfg` may use. SUMO itself runs with the `SUMO_HOME` of the installation.
+fn variable(name: &str) -> Option<String> {
+    let sumo_home = match name {
+        "SUMO_HOME" => Install::find().map(|install| install.sumo_home).unwrap_or_default(),
+        _ => PathBuf::new(),
+    };
+    configuration::environment(&sumo_home, name)
 }
 
 /// Checks the net of a map with population control, for which SUMO has no directory of outputs.
@@ -135,6 +176,12 @@ struct ScenarioReader<'a> {
     scenario: SumoScenario,
     /// `None` if the scenario is trusted.
     check: Option<InputCheck>,
+    /// Names of all outputs.
+    outputs: OutputNames,
+    /// Time of the saved state that the scenario begins with, seconds.
+    state_s: Option<f64>,
+    /// `begin`, if set, seconds.
+    begin_s: Option<f64>,
 }
 
 impl ScenarioReader<'_> {
@@ -153,17 +200,50 @@ impl ScenarioReader<'_> {
                 return Err(self.problem(
                     *line,
                     format!("remote-port = \"{value}\" makes SUMO wait for a TraCI client, but no client can connect to a run"),
-                    "remove remote-port from the .sumocfg (traffic-bridge steps SUMO in its own process), or keep a copy without it",
+                    "remove remote-port from the .sumocfg, or keep a copy without it; for TraCI scripts set traffic.engine = \"traci\"",
                 ));
             }
             _ => self.check_setting(setting, effect)?,
         }
+        if effect == OptionEffect::Writes {
+            self.outputs.add_option(name, value, *line, self.directory);
+        }
         match name.as_str() {
-            "step-length" => self.scenario.step_s = Some(number(value, name, self.path, *line)?),
-            "seed" => self.scenario.seed = Some(number(value, name, self.path, *line)?),
+            "step-length" => self.scenario.own.step_s = self.time(setting)?,
+            "begin" | "b" => self.begin_s = Some(self.time(setting)?),
+            "end" | "e" => self.scenario.end_s = Some(self.time(setting)?).filter(|end_s| *end_s >= 0.0),
+            "seed" => self.scenario.own.seed = self.seed(setting)?,
+            "random" => self.scenario.own.is_random = configuration::is_true(value),
+            "mesosim" if configuration::is_true(value) => {
+                return Err(self.problem(
+                    *line,
+                    "mesosim = true: SUMO's mesoscopic model moves queues of vehicles from segment to segment and gives them no place \
+                     within a lane, no lane changes and no lateral position, so there is nothing for mirrors and sensors to follow",
+                    "remove mesosim, or run a copy of the .sumocfg without it: the microscopic model takes the same net and routes",
+                ));
+            }
             _ => {}
         }
         Ok(())
+    }
+
+    /// A time in any of SUMO's forms, seconds.
+    fn time(&self, setting: &SumoSetting) -> Result<f64, Exit> {
+        let SumoSetting { name, value, line } = setting;
+        configuration::time_s(value).ok_or_else(|| {
+            let message = format!("{name} = \"{value}\" is no time");
+            self.problem(*line, message, "write seconds such as 0.5, or H:M:S such as 0:10:0")
+        })
+    }
+
+    /// SUMO's seed: a whole number of 32 bits with a sign.
+    fn seed(&self, setting: &SumoSetting) -> Result<u64, Exit> {
+        let SumoSetting { name, value, line } = setting;
+        let seed: i32 = value.trim().parse().map_err(|_| {
+            let message = format!("{name} = \"{value}\" is no seed of SUMO");
+            self.problem(*line, message, "write a whole number from -2147483648 to 2147483647")
+        })?;
+        Ok(u64::from(seed.cast_unsigned()))
     }
 
     /// Refuses an option that reaches beyond the run's directory, unless the scenario is trusted.
@@ -224,9 +304,11 @@ impl ScenarioReader<'_> {
                 check.check_xml(file)?;
             }
         }
+        self.scenario.own.inputs.extend(files.iter().cloned());
         match name.as_str() {
             "net-file" | "net" | "n" => self.scenario.net_file = files.into_iter().next().unwrap_or_default(),
             "additional-files" | "additional" | "a" => self.scenario.additional_files = files,
+            "load-state" => self.state_s = files.first().and_then(|file| saved_state::time_s(file)),
             _ => {}
         }
         Ok(())
@@ -239,6 +321,8 @@ fn files(value: &str, directory: &Path) -> Vec<PathBuf> {
         .map(str::trim)
         .filter(|name| !name.is_empty())
         .map(|name| directory.join(name))
+        // Processes of a resumed run may have another directory.
+        .map(|file| std::path::absolute(&file).unwrap_or(file))
         .collect()
 }
 
@@ -254,147 +338,6 @@ fn check_gzip(file: &Path, trusted: bool) -> std::io::Result<u64> {
         true => Err(std::io::Error::other(input_check::UNPACKS_TO_TOO_MUCH)),
         false => Ok(bytes),
     }
-}
-
-fn number<T: std::str::FromStr>(value: &str, name: &str, path: &Path, line: usize) -> Result<T, Exit> {
-    value.trim().parse().map_err(|_| {
-        problem(
-            path,
-            format!("line {line}: {name} = \"{value}\" is not a number"),
-            "write a plain number",
-        )
-    })
-}
-
-/// Reads the `<location>` of a net file (plain or gzip) and counts its traffic lights. If the net has no projection, `origin_deg` (latitude
-/// and longitude of its origin) replaces it.
-///
-/// # Errors
-/// The file is unreadable, it has no `<location>`, or there is neither a projection nor an origin.
-pub fn map_info(net: &Path, origin_deg: Option<(f64, f64)>) -> Result<MapInfo, Exit> {
-    let unreadable = |error: &dyn std::fmt::Display| {
-        problem(
-            net,
-            format!("cannot be read: {error}"),
-            "give a net built by netconvert",
-        )
-    };
-    let file = File::open(net).map_err(|error| unreadable(&error))?;
-    let mut raw = BufReader::new(file);
-    let gzip = raw
-        .fill_buf()
-        .map_err(|error| unreadable(&error))?
-        .starts_with(&[0x1f, 0x8b]);
-    let input: Box<dyn BufRead> = if gzip {
-        Box::new(BufReader::new(MultiGzDecoder::new(raw)))
-    } else {
-        Box::new(raw)
-    };
-    let mut reader = Reader::from_reader(input);
-    let mut buffer = Vec::new();
-    let mut map = loop {
-        match reader.read_event_into(&mut buffer) {
-            Ok(Event::Start(element) | Event::Empty(element)) if element.local_name().as_ref() == "location" => {
-                break location(&element, net, origin_deg)?;
-            }
-            Ok(Event::Eof) => return Err(problem(net, "has no <location>", "give a net built by netconvert")),
-            Ok(_) => buffer.clear(),
-            Err(error) => return Err(unreadable(&error)),
-        }
-    };
-    let counts = NetCounts::of(&mut reader.into_inner()).map_err(|error| unreadable(&error))?;
-    if counts.internal_edges > 0 && (counts.inner_connections == 0 || counts.outer_connections == 0) {
-        let message =
-            "has junctions, but no <connection> into them or out of them: SUMO crashes while it reads such a net";
-        return Err(problem(net, message, "build the net again with netconvert"));
-    }
-    map.traffic_lights = counts.traffic_lights;
-    Ok(map)
-}
-
-/// Numbers of elements of a net.
-#[derive(Debug, Default)]
-struct NetCounts {
-    /// Programs of traffic lights.
-    traffic_lights: u32,
-    /// Edges within junctions.
-    internal_edges: u64,
-    /// Connections that begin within a junction.
-    inner_connections: u64,
-    /// Connections that begin on a road.
-    outer_connections: u64,
-}
-
-impl NetCounts {
-    /// Counts in the rest of a net. Large nets have a million elements, so only the beginnings of elements are compared.
-    fn of(net: &mut impl BufRead) -> std::io::Result<Self> {
-        let (mut element, mut counts) = (Vec::new(), Self::default());
-        while net.read_until(b'>', &mut element)? > 0 {
-            let text = element.trim_ascii_start();
-            if text.starts_with(b"<tlLogic ") {
-                counts.traffic_lights += 1;
-            } else if text.starts_with(b"<edge id=\":") {
-                counts.internal_edges += 1;
-            } else if text.starts_with(b"<connection from=\":") {
-                counts.inner_connections += 1;
-            } else if text.starts_with(b"<connection ") {
-                counts.outer_connections += 1;
-            }
-            element.clear();
-        }
-        Ok(counts)
-    }
-}
-
-/// Margin around the net for positions outside it, such as GNSS errors and vehicles wider than their lane, metres.
-const MARGIN_M: f64 = 20.0;
-
-fn location(element: &BytesStart<'_>, net: &Path, origin_deg: Option<(f64, f64)>) -> Result<MapInfo, Exit> {
-    let numbers = |name: &str| -> Option<Vec<f64>> {
-        attribute(element, name)?
-            .split(',')
-            .map(|part| part.trim().parse().ok())
-            .collect()
-    };
-    let bad = |name: &str| {
-        problem(
-            net,
-            format!("<location> has no usable {name}"),
-            "give a net built by netconvert",
-        )
-    };
-    let bounds_m: [f64; 4] = numbers("convBoundary")
-        .and_then(|list| list.try_into().ok())
-        .ok_or_else(|| bad("convBoundary"))?;
-    let [x_min, y_min, x_max, y_max] = bounds_m;
-    let bounds_m = [x_min - MARGIN_M, y_min - MARGIN_M, x_max + MARGIN_M, y_max + MARGIN_M];
-    let offset_m: [f64; 2] = numbers("netOffset")
-        .and_then(|list| list.try_into().ok())
-        .ok_or_else(|| bad("netOffset"))?;
-    let projection = attribute(element, "projParameter").unwrap_or_default();
-    if projection.len() > 1 {
-        return Ok(MapInfo {
-            projection,
-            net_offset_m: offset_m,
-            bounds_m,
-            traffic_lights: 0,
-        });
-    }
-    let (latitude, longitude) = origin_deg.ok_or_else(|| {
-        problem(
-            net,
-            "has no projection (projParameter is \"!\"), so GNSS has no latitude and longitude",
-            "give the position of the net's (0, 0): --set map.origin_latitude_deg=52.0 --set map.origin_longitude_deg=10.0",
-        )
-    })?;
-    let projection =
-        format!("+proj=tmerc +lat_0={latitude} +lon_0={longitude} +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs");
-    Ok(MapInfo {
-        projection,
-        net_offset_m: [0.0, 0.0],
-        bounds_m,
-        traffic_lights: 0,
-    })
 }
 
 #[cfg(test)]
@@ -434,8 +377,12 @@ mod tests {
             SumoScenario {
                 net_file: directory.path().join("a.net.xml"),
                 additional_files: Vec::new(),
-                step_s: Some(0.5),
-                seed: None,
+                own: ScenarioOptions {
+                    step_s: 0.5,
+                    inputs: vec![directory.path().join("a.net.xml")],
+                    ..ScenarioOptions::default()
+                },
+                end_s: None,
                 moved_outputs: Vec::new(),
             }
         );
@@ -458,39 +405,56 @@ mod tests {
         assert!(help.contains("relative to the .sumocfg"), "{help}");
     }
 
+    /// All of these run in bare SUMO 1.28.
     #[test]
-    fn location_and_traffic_lights_are_read_from_plain_and_gzip_nets() {
-        use std::io::Write as _;
+    fn whatever_sumo_reads_is_read() {
         let directory = tempfile::tempdir().unwrap();
-        let lights = "\n  <tlLogic id=\"a\">\n  <phase/></tlLogic>\n<tlLogic id=\"b\"/></net>";
-        let net = NET.replace("\"P\"", "\"+proj=utm +zone=32\"").replace("</net>", lights);
-        let plain = write(directory.path(), "a.net.xml", &net);
-        let packed = directory.path().join("a.net.xml.gz");
-        let mut encoder = flate2::write::GzEncoder::new(File::create(&packed).unwrap(), flate2::Compression::fast());
-        encoder.write_all(net.as_bytes()).unwrap();
-        encoder.finish().unwrap();
-        let expected = MapInfo {
-            projection: "+proj=utm +zone=32".into(),
-            net_offset_m: [1.0, -2.5],
-            bounds_m: [-20.0, -20.0, 120.0, 70.0],
-            traffic_lights: 2,
+        write(directory.path(), "my net.net.xml", NET);
+        let options = |text: &str| {
+            let text = format!("<c><net-file value=\"my net.net.xml\"/>{text}</c>");
+            let cfg = write(directory.path(), "run.sumo.cfg", &text);
+            assert!(is_scenario(&cfg));
+            read(&cfg, false).map(|scenario| (scenario.own, scenario.end_s))
         };
-        assert_eq!(map_info(&plain, None).unwrap(), expected);
-        assert_eq!(map_info(&packed, None).unwrap(), expected);
+        let (own, end_s) =
+            options("<step-length value=\"0:0:1\"/><seed value=\"-5\"/><b value=\"0:1:0\"/><end>0:2:0.5</end>")
+                .unwrap();
+        assert_eq!(
+            (own.step_s, own.seed, own.begin_s, end_s),
+            (1.0, 4_294_967_291, 60.0, Some(120.5))
+        );
+        assert!(options("<random value=\"1\"/>").unwrap().0.is_random);
+        assert_eq!(options("<end value=\"-1\"/>").unwrap().1, None);
+        for (text, said) in [
+            (
+                "\n<seed value=\"4294967291\"/>",
+                "line 2: seed = \"4294967291\" is no seed",
+            ),
+            ("<end value=\"0:5\"/>", "end = \"0:5\" is no time"),
+            ("<mesosim value=\"true\"/>", "mesosim = true"),
+        ] {
+            let refused = options(text).unwrap_err().summary().0;
+            assert!(refused.contains(said), "{text}: {refused}");
+        }
+        assert!(options("<mesosim value=\"false\"/>").is_ok());
     }
 
     #[test]
-    fn a_net_without_projection_needs_an_origin() {
+    fn a_saved_state_brings_its_time_along_unless_the_scenario_begins_elsewhere() {
         let directory = tempfile::tempdir().unwrap();
-        let net = write(directory.path(), "a.net.xml", &NET.replace("\"P\"", "\"!\""));
-        let (text, help) = message(map_info(&net, None).unwrap_err());
-        assert!(text.contains("has no projection"), "{text}");
-        assert!(help.contains("map.origin_latitude_deg"), "{help}");
-        assert!(
-            map_info(&net, Some((52.0, 10.0)))
-                .unwrap()
-                .projection
-                .starts_with("+proj=tmerc +lat_0=52 +lon_0=10")
+        write(directory.path(), "a.net.xml", NET);
+        write(
+            directory.path(),
+            "s.xml",
+            "<?xml version=\"1.0\"?>\n<!-- a state -->\n<snapshot version=\"1.28.0\" time=\"600.50\"/>",
         );
+        let begin_s = |more: &str| {
+            let text = format!("<c><net-file value=\"a.net.xml\"/><load-state value=\"s.xml\"/>{more}</c>");
+            read(&write(directory.path(), "a.sumocfg", &text), false)
+                .unwrap()
+                .own
+                .begin_s
+        };
+        assert_eq!((begin_s(""), begin_s("<begin value=\"0:0:7\"/>")), (600.5, 7.0));
     }
 }

@@ -1,5 +1,6 @@
 """How trajectories in slots become episodes of standard faces: hand-made ticks, no simulation."""
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,8 @@ import pytest
 import torch
 from caraware.envs import CarAwareEnv, CarAwareParallelEnv, CarAwareVecEnv, CarAwareVectorEnv, RunEndedError, Transition
 from caraware.envs.slots import RUN_ON_TICKS
-from caraware.ipc.names import Names
+from caraware.ipc.names import VEHICLE_IDS, Names
+from caraware.ipc.run_file import sumo_begin_s
 from caraware.ipc.stream import EMPTY_SLOT, Observation
 from caraware.tasks.fields import Fields, UnknownFieldError
 from synthetic import SyntheticChannel, SyntheticObservation
@@ -420,3 +422,24 @@ def test_the_localisation_reward_is_that_of_the_configuration_at_the_tick_answer
     errors_m = [np.hypot(70, 50), 50.0]
     assert infos["error_m"].tolist() == pytest.approx(errors_m, rel=1e-5)
     assert reward.tolist() == pytest.approx([1 / (1 + error / 5) for error in errors_m], rel=1e-5)
+
+
+def test_ids_of_a_scenario_are_read_as_traffic_bridge_writes_them(tmp_path: Path) -> None:
+    from caraware._native import id_hash
+
+    run = run_file("", 1)
+    run["source"] = {"scenario": {"sumocfg": "a.sumocfg"}}
+    run["run_dir"] = str(tmp_path)
+    assert sumo_begin_s(run) == 0.0
+    run["source"]["scenario"]["own"] = {"begin_s": 54000.0}
+    assert sumo_begin_s(run) == 54000.0
+    names = Names(run)
+    long = "x" * 150 + "\u00e4"
+    hashes = [id_hash(name) for name in ("taxi 1", long, "late")]
+    assert names.of(hashes[0]) == f"0x{hashes[0]:016x}"
+    (tmp_path / VEHICLE_IDS).write_text(f'"taxi 1"\n"ha\n{json.dumps(long)}\n"la', encoding="utf-8")
+    assert [names.of(number) for number in hashes[:2]] == ["taxi 1", long]
+    assert names.of(hashes[2]).startswith("0x")
+    with (tmp_path / VEHICLE_IDS).open("a", encoding="utf-8") as stream:
+        stream.write('te"\n')
+    assert names.of(hashes[2]) == "late"

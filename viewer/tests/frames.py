@@ -72,7 +72,7 @@ def vehicles(tick: int, names: dict[int, str], **fields: int) -> bytes:
     rows = np.zeros(len(names), wire.VEHICLE_META)
     for row, (id_hash, name) in zip(rows, names.items(), strict=True):
         text = name.encode()
-        row["id_hash"], row["id_len"], row["id"] = id_hash, len(text), np.void(text.ljust(64, b"\0"))
+        row["id_hash"], row["id_len"], row["id"] = id_hash, len(text), np.void(text.ljust(128, b"\0"))
     return header(tick, len(names), **fields) + rows.tobytes()
 
 

@@ -23,7 +23,7 @@ use ipc_schema::{
     ports::{Publisher, RosterWriter},
     prediction::PredictionLayout,
     process::Process,
-    run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
+    run::{MapInfo, Mode, RunFile, ScenarioOptions, SceneFiles, SharedMemory, Source},
     services::{self, Channel, ServiceHolder},
     traffic::{SignalMeta, TrafficMetaLayout, VehicleMeta, id_hash},
     world::{VehicleState, WorldLayout},
@@ -360,12 +360,14 @@ fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
         },
         source: Source::Scenario {
             sumocfg: "none.sumocfg".into(),
+            own: ScenarioOptions::default(),
         },
         map: MapInfo {
             projection: "+proj=utm +zone=32 +ellps=WGS84".into(),
             net_offset_m: [0.0, 0.0],
             bounds_m: [0.0, 0.0, 220.0, 200.0],
             traffic_lights: 0,
+            world_origin_m: [0.0; 2],
         },
         scene_files: SceneFiles::default(),
         maps: Vec::new(),

@@ -28,7 +28,7 @@ const TOWN: &str = "town";
 /// The maps of a run that names none.
 const TOWN_ALONE: &[CurriculumMap] = &[CurriculumMap::Town];
 /// Endings of files that are maps.
-const MAP_ENDINGS: [&str; 3] = [".sumocfg", ".net.xml", ".net.xml.gz"];
+const MAP_ENDINGS: [&str; 4] = [".sumocfg", ".sumo.cfg", ".net.xml", ".net.xml.gz"];
 
 /// A map that stages choose from. Configurations and run files write it as "town" or as a path; stages refer to it by its name.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -220,7 +220,12 @@ mod tests {
     #[test]
     fn a_map_is_the_town_or_a_file_that_is_called_by_its_name() {
         assert_eq!("town".parse(), Ok(CurriculumMap::Town));
-        for text in ["city.net.xml", "nets/city.net.xml.gz", "/nets/city.sumocfg"] {
+        for text in [
+            "city.net.xml",
+            "nets/city.net.xml.gz",
+            "/nets/city.sumocfg",
+            "city.sumo.cfg",
+        ] {
             let map: CurriculumMap = text.parse().unwrap();
             assert_eq!((map.name(), map.to_string().as_str()), ("city", text));
         }

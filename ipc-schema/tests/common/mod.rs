@@ -5,7 +5,7 @@ use std::path::Path;
 use ipc_schema::{
     SCHEMA_VERSION,
     config::Config,
-    run::{MapInfo, Mode, RunFile, SceneFiles, SharedMemory, Source},
+    run::{MapInfo, Mode, RunFile, ScenarioOptions, SceneFiles, SharedMemory, Source},
 };
 
 /// The default preset.
@@ -27,12 +27,16 @@ pub fn run_in(directory: &Path, name: &str, config: Config) -> RunFile {
             root: directory.into(),
             prefix: format!("caraware_{name}{}_", std::process::id()),
         },
-        source: Source::Scenario { sumocfg: "none".into() },
+        source: Source::Scenario {
+            sumocfg: "none".into(),
+            own: ScenarioOptions::default(),
+        },
         map: MapInfo {
             projection: String::new(),
             net_offset_m: [0.0; 2],
             bounds_m: [0.0; 4],
             traffic_lights: 0,
+            world_origin_m: [0.0; 2],
         },
         scene_files: SceneFiles::default(),
         maps: Vec::new(),

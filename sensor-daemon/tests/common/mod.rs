@@ -39,6 +39,7 @@ pub fn map() -> MapInfo {
         net_offset_m: [129.0, 126.0],
         bounds_m: [0.0, 0.0, 260.0, 260.0],
         traffic_lights: 0,
+        world_origin_m: [0.0; 2],
     }
 }
 

@@ -244,6 +244,7 @@ mod tests {
                 net_offset_m,
                 bounds_m,
                 traffic_lights: 0,
+                world_origin_m: [0.0; 2],
             };
             let projection = Projection::new(&info).unwrap();
             let series = DisplacementMap::new(&projection, bounds_m).unwrap();
@@ -279,6 +280,7 @@ mod tests {
             net_offset_m: [-402_990.0, -5_794_389.0],
             bounds_m: [0.0; 4],
             traffic_lights: 0,
+            world_origin_m: [0.0; 2],
         };
         let series = DisplacementMap::new(&Projection::new(&info).unwrap(), [0.0, 0.0, 220.0, 220.0]).unwrap();
         assert_eq!(series.nodes.len(), 1);

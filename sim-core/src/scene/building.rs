@@ -1,4 +1,4 @@
-//! Objects beside the road, from polygon files: which polygons are solid, and how high.
+//! Objects beside the road, from polygon files: which polygons are solid, and how high, and which points are trees.
 
 use std::path::{Path, PathBuf};
 
@@ -7,7 +7,7 @@ use quick_xml::events::BytesStart;
 
 use super::{
     SceneError,
-    shape::{Bounds, Point, contains, hull, is_simple, signed_area},
+    shape::{Bounds, Point, contains, from_to, hull, is_simple, signed_area},
     xml::{ElementPosition, XmlTag, attribute, for_each_tag, points},
 };
 use crate::geodesy::{Geodetic, Projection};
@@ -63,6 +63,18 @@ const SOLID_TYPES: [(&str, SolidClass, Option<f64>); 20] = [
     ("man_made.silo", SolidClass::Structure, Some(15.0)),
     ("man_made.storage_tank", SolidClass::Structure, Some(10.0)),
 ];
+
+/// Type of a point that is a tree, as polyconvert names OpenStreetMap's.
+const TREE: &str = "natural.tree";
+
+/// What additional files hold.
+#[derive(Debug, Default)]
+pub(super) struct FoundObjects {
+    /// Solid polygons.
+    pub(super) solids: Vec<Prism>,
+    /// Stems of trees, world, metres.
+    pub(super) trees_m: Vec<Point>,
+}
 
 /// A vertical wall around a simple polygon, with a flat roof.
 #[derive(Debug, Clone, PartialEq)]
@@ -200,8 +212,20 @@ pub(super) fn read(
     map: &MapInfo,
     fallback_m: f64,
     ground_m: &dyn Fn(Point) -> f64,
-    into: &mut Vec<Prism>,
+    into: &mut FoundObjects,
 ) -> Result<(), SceneError> {
+    read_included(&mut vec![path.into()], map, fallback_m, ground_m, into)
+}
+
+/// Reads the last file of `open_files`, each of which includes the next one.
+fn read_included(
+    open_files: &mut Vec<PathBuf>,
+    map: &MapInfo,
+    fallback_m: f64,
+    ground_m: &dyn Fn(Point) -> f64,
+    into: &mut FoundObjects,
+) -> Result<(), SceneError> {
+    let path = &*open_files.last().cloned().unwrap_or_default();
     let mut open: Option<SolidPolygon> = None;
     let mut included: Vec<PathBuf> = Vec::new();
     let mut projection: Option<Projection> = None;
@@ -210,23 +234,68 @@ pub(super) fn read(
             XmlTag::Open(element) => match element.local_name().as_ref() {
                 "poly" | "polygon" => open = Some(SolidPolygon::open(element, place)?),
                 "param" => open.iter_mut().for_each(|polygon| polygon.parameter(element)),
+                "poi" => into.trees_m.extend(tree(element, path, map, &mut projection)?),
                 "include" => included.extend(attribute(element, "href").map(|href| path.with_file_name(href))),
                 _ => {}
             },
             XmlTag::Close("poly" | "polygon") => {
                 if let Some(polygon) = open.take() {
-                    into.extend(prism(polygon, path, map, fallback_m, ground_m, &mut projection)?);
+                    into.solids
+                        .extend(prism(polygon, path, map, fallback_m, ground_m, &mut projection)?);
                 }
             }
             XmlTag::Close(_) => {}
         }
         Ok(())
     })?;
-    // SUMO refuses a file that includes itself.
-    included
-        .iter()
-        .filter(|file| file.as_path() != path)
-        .try_for_each(|file| read(file, map, fallback_m, ground_m, into))
+    for file in included {
+        let is_same = |open: &PathBuf| open.canonicalize().ok() == file.canonicalize().ok();
+        // SUMO refuses a file that includes itself, by whatever way.
+        if !open_files.iter().any(is_same) {
+            open_files.push(file);
+            read_included(open_files, map, fallback_m, ground_m, into)?;
+            open_files.pop();
+        }
+    }
+    Ok(())
+}
+
+/// Where the tree stands that a point is; `None` for another point.
+fn tree(
+    element: &BytesStart<'_>,
+    path: &Path,
+    map: &MapInfo,
+    projection: &mut Option<Projection>,
+) -> Result<Option<Point>, SceneError> {
+    if attribute(element, "type").as_deref() != Some(TREE) {
+        return Ok(None);
+    }
+    let number = |name: &str| {
+        attribute(element, name)?
+            .parse::<f64>()
+            .ok()
+            .filter(|number| number.is_finite())
+    };
+    if let (Some(x), Some(y)) = (number("x"), number("y")) {
+        return Ok(Some(from_to(map.world_origin_m, [x, y])));
+    }
+    let (Some(longitude_deg), Some(latitude_deg)) = (number("lon"), number("lat")) else {
+        return Ok(None);
+    };
+    let geodetic = |source| SceneError::Geodetic {
+        path: path.into(),
+        id: attribute(element, "id").unwrap_or_default(),
+        source,
+    };
+    let projection = match projection {
+        Some(projection) => projection,
+        None => projection.insert(Projection::new(map).map_err(geodetic)?),
+    };
+    let place = projection.net_from_geodetic(Geodetic {
+        latitude_deg,
+        longitude_deg,
+    });
+    place.map(|place| Some([place.x_m, place.y_m])).map_err(geodetic)
 }
 
 fn prism(
@@ -241,6 +310,11 @@ fn prism(
         return Ok(None);
     };
     let mut outline_m: Vec<Point> = polygon.shape.iter().map(|[x, y, _]| [*x, *y]).collect();
+    if !polygon.is_geodetic {
+        for point in &mut outline_m {
+            *point = from_to(map.world_origin_m, *point);
+        }
+    }
     if polygon.is_geodetic {
         let geodetic = |source| SceneError::Geodetic {
             path: path.into(),

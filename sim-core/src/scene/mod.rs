@@ -21,6 +21,7 @@ mod road;
 pub mod shape;
 mod xml;
 
+use building::FoundObjects;
 pub use building::{Prism, SolidClass};
 pub use grid::Grid;
 pub use prop::Prop;
@@ -127,7 +128,8 @@ impl Scene {
     fn of_map(run: &RunFile, files: &SceneFiles, map: &MapInfo) -> Result<Self, SceneError> {
         let config = &run.config.scene;
         let mut scene = Self::read(files, map, config.building_height_m)?;
-        let placed = config.obstacles.iter().map(|obstacle| scene.prop(obstacle)).collect();
+        let placed: Vec<Prop> = config.obstacles.iter().map(|obstacle| scene.prop(obstacle)).collect();
+        let placed = std::mem::take(&mut scene.props).into_iter().chain(placed).collect();
         scene.set_props(placed);
         let random = prop::beside_the_road(&scene, config.random_props, run.config.run.seed);
         let mut all = std::mem::take(&mut scene.props);
@@ -144,14 +146,21 @@ impl Scene {
         let road = if files.net_file.as_os_str().is_empty() {
             Road::default()
         } else {
-            Road::read(&files.net_file)?
+            Road::read(&files.net_file, map.world_origin_m)?
         };
-        let mut buildings = Vec::new();
+        let mut found = FoundObjects::default();
         for file in &files.additional_files {
             let ground_m = |point| ground_height_m(&road, point);
-            building::read(file, map, building_height_m, &ground_m, &mut buildings)?;
+            building::read(file, map, building_height_m, &ground_m, &mut found)?;
         }
-        Ok(Self::new(road, buildings, Vec::new()))
+        let mut scene = Self::new(road, found.solids, Vec::new());
+        let kind = PropKind::by_name("tree");
+        let trees = kind
+            .into_iter()
+            .flat_map(|kind| found.trees_m.iter().map(move |&stem_m| (kind, stem_m)));
+        let trees = trees.map(|(kind, stem_m)| scene.prop_at(kind, stem_m, 0.0)).collect();
+        scene.set_props(trees);
+        Ok(scene)
     }
 
     /// A scene from its parts.
@@ -201,7 +210,7 @@ impl Scene {
         &self.buildings
     }
 
-    /// Obstacles of the configuration, then props placed at random.
+    /// Trees of the additional files, obstacles of the configuration, then props placed at random.
     #[must_use]
     pub fn props(&self) -> &[Prop] {
         &self.props

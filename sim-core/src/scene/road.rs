@@ -259,7 +259,7 @@ impl Road {
     ///
     /// # Errors
     /// Unreadable, malformed, or a shape that is no list of points.
-    pub(super) fn read(net_file: &Path) -> Result<Self, SceneError> {
+    pub(super) fn read(net_file: &Path, world_origin_m: Point) -> Result<Self, SceneError> {
         let mut pieces: Vec<RoadPiece> = Vec::new();
         let mut junctions = Junctions::default();
         let mut function = String::new();
@@ -282,6 +282,10 @@ impl Road {
             pieces.extend(found.map(|(piece, junctions)| RoadPiece { junctions, ..piece }));
             Ok(())
         })?;
+        for point in pieces.iter_mut().flat_map(|piece| &mut piece.shape_m) {
+            point[0] -= world_origin_m[0];
+            point[1] -= world_origin_m[1];
+        }
         Ok(Self::new(pieces))
     }
 

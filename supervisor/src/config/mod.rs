@@ -117,6 +117,12 @@ impl LayeredSettings {
             .is_some_and(|setting| setting.value == Value::Bool(true))
     }
 
+    /// The number that the key `path` has, if it is set.
+    #[must_use]
+    pub fn number(&self, path: &str) -> Option<f64> {
+        self.setting(path).and_then(|setting| setting.value.as_f64())
+    }
+
     /// True if the key `path` has this text.
     #[must_use]
     pub fn has_text(&self, path: &str, text: &str) -> bool {

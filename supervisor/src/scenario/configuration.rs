@@ -1,4 +1,7 @@
-//! Reads a `.sumocfg` into its options exactly as SUMO does: as an attribute `value` or `v`, or as the text of an element.
+//! Reads a `.sumocfg` into its options exactly as SUMO does: as an attribute `value` or `v`, or as the text of an element, in UTF-8 or
+//! ISO-8859-1, with `${NAME}` replaced by variables of the environment. No other program of a run parses a `.sumocfg`.
+
+use std::{borrow::Cow, path::Path};
 
 use quick_xml::{
     Reader, XmlVersion,
@@ -23,6 +26,81 @@ pub struct SumoConfiguration {
     pub settings: Vec<SumoSetting>,
     /// Line of a document type declaration, if there is one.
     pub doctype_line: Option<usize>,
+}
+
+/// A variable of the environment by its name.
+pub type Variables<'a> = &'a dyn Fn(&str) -> Option<String>;
+
+/// The environment of this process, with `SUMO_HOME` as `traffic-bridge` sets it.
+#[must_use]
+pub fn environment(sumo_home: &Path, name: &str) -> Option<String> {
+    match name {
+        "SUMO_HOME" => Some(sumo_home.to_string_lossy().into_owned()),
+        name => std::env::var(name).ok(),
+    }
+}
+
+/// `text` with every `${NAME}` replaced. As in SUMO a variable that is not set is empty.
+#[must_use]
+pub fn with_variables(text: &str, variables: Variables<'_>) -> String {
+    let (mut replaced, mut rest) = (String::new(), text);
+    while let Some((before, name, after)) = rest
+        .split_once("${")
+        .and_then(|(before, tail)| tail.split_once('}').map(|(name, after)| (before, name, after)))
+    {
+        replaced.push_str(before);
+        replaced.push_str(&variables(name).unwrap_or_default());
+        rest = after;
+    }
+    replaced + rest
+}
+
+/// A time as SUMO writes it: seconds, `H:M:S` or `D:H:M:S`. In seconds, to the millisecond that SUMO counts in.
+#[must_use]
+pub fn time_s(text: &str) -> Option<f64> {
+    let parts: Vec<&str> = text.split(':').collect();
+    let number = |part: &str| part.parse::<f64>().ok().filter(|number| number.is_finite());
+    let seconds = match parts.as_slice() {
+        [seconds] => number(seconds)?,
+        [parts @ .., seconds] if (2..=3).contains(&parts.len()) => {
+            let whole: Vec<f64> = parts.iter().map(|part| number(part)).collect::<Option<_>>()?;
+            let [days, hours, minutes] = match *whole.as_slice() {
+                [hours, minutes] => [0.0, hours, minutes],
+                [days, hours, minutes] => [days, hours, minutes],
+                _ => return None,
+            };
+            ((days * 24.0 + hours) * 60.0 + minutes) * 60.0 + number(seconds)?
+        }
+        _ => return None,
+    };
+    Some((seconds * 1000.0).round() / 1000.0)
+}
+
+/// True if `text` is one of SUMO's words for true.
+#[must_use]
+pub fn is_true(text: &str) -> bool {
+    matches!(
+        text.trim().to_ascii_lowercase().as_str(),
+        "true" | "t" | "1" | "yes" | "on" | "x" | "+"
+    )
+}
+
+/// The text of a file that declares its encoding: UTF-8, or one byte for each letter.
+fn decoded(bytes: &[u8]) -> Result<Cow<'_, str>, String> {
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    let first_line = String::from_utf8_lossy(&bytes[..bytes.len().min(200)]).to_ascii_lowercase();
+    let declaration = first_line.split_once("?>").map_or("", |(declaration, _)| declaration);
+    if ["iso-8859-1", "latin1", "windows-1252"]
+        .iter()
+        .any(|name| declaration.contains(name))
+    {
+        return Ok(Cow::Owned(bytes.iter().copied().map(char::from).collect()));
+    }
+    std::str::from_utf8(bytes).map(Cow::Borrowed).map_err(|error| {
+        format!(
+            "{error}: save the file as UTF-8, or declare its encoding: <?xml version=\"1.0\" encoding=\"ISO-8859-1\"?>"
+        )
+    })
 }
 
 /// Collects options. SUMO keeps the name of the newest element until a text has been its value.
@@ -78,11 +156,20 @@ impl OptionCollector {
     }
 }
 
-/// Reads the text of a `.sumocfg`.
+/// Reads the content of a `.sumocfg`.
 ///
 /// # Errors
-/// It is not XML: the line and the reason.
-pub fn parse(text: &str) -> Result<SumoConfiguration, (usize, String)> {
+/// It is not XML, or not in the encoding that it declares: the line and the reason.
+pub fn parse(bytes: &[u8], variables: Variables<'_>) -> Result<SumoConfiguration, (usize, String)> {
+    let text = decoded(bytes).map_err(|reason| (1, reason))?;
+    let mut found = parse_text(&text)?;
+    for setting in &mut found.settings {
+        setting.value = with_variables(&setting.value, variables);
+    }
+    Ok(found)
+}
+
+fn parse_text(text: &str) -> Result<SumoConfiguration, (usize, String)> {
     let mut reader = Reader::from_str(text);
     let mut collector = OptionCollector::default();
     loop {
@@ -132,6 +219,14 @@ fn line_of(text: &str, position: u64) -> usize {
 mod tests {
     use super::*;
 
+    fn variable(name: &str) -> Option<String> {
+        (name == "WHERE").then(|| "/data".to_owned())
+    }
+
+    fn parse(text: &str) -> Result<SumoConfiguration, (usize, String)> {
+        super::parse(text.as_bytes(), &variable)
+    }
+
     fn settings(text: &str) -> Vec<(String, String, usize)> {
         let read = parse(text).unwrap();
         read.settings.into_iter().map(|s| (s.name, s.value, s.line)).collect()
@@ -150,6 +245,46 @@ mod tests {
         ] {
             assert_eq!(settings(form), [("remote-port".into(), "88".into(), 2)], "{form}");
         }
+    }
+
+    /// Each was tried with SUMO 1.28.
+    #[test]
+    fn times_are_read_as_sumo_reads_them() {
+        let times = [
+            ("5", Some(5.0)),
+            ("0.25", Some(0.25)),
+            ("-1", Some(-1.0)),
+            ("1e1", Some(10.0)),
+            ("0:0:1", Some(1.0)),
+            ("0:0:20.5", Some(20.5)),
+            ("1:2:3:4", Some(93_784.0)),
+            ("0:5", None),
+            ("5s", None),
+            ("", None),
+            ("1:2:3:4:5", None),
+        ];
+        for (text, seconds) in times {
+            assert_eq!(time_s(text), seconds, "{text}");
+        }
+    }
+
+    #[test]
+    fn variables_of_the_environment_are_replaced_and_missing_ones_are_empty() {
+        let read = settings("<c><net-file value=\"${WHERE}/${NONE}a b.net.xml\"/><x>${WHERE</x></c>");
+        assert_eq!(
+            (read[0].1.as_str(), read[1].1.as_str()),
+            ("/data/a b.net.xml", "${WHERE")
+        );
+    }
+
+    #[test]
+    fn letters_of_one_byte_are_read_where_the_file_declares_them() {
+        let declared =
+            b"<?xml version=\"1.0\" encoding=\"ISO-8859-1\"?>\n<c><net-file value=\"stra\xdfe.net.xml\"/></c>";
+        let read = super::parse(declared, &variable).unwrap();
+        assert_eq!(read.settings[0].value, "stra\u{df}e.net.xml");
+        let (line, reason) = super::parse(b"<c><net-file value=\"stra\xdfe\"/></c>", &variable).unwrap_err();
+        assert!(line == 1 && reason.contains("save the file as UTF-8"), "{reason}");
     }
 
     #[test]

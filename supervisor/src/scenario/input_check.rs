@@ -14,7 +14,11 @@ use quick_xml::{
     events::{BytesStart, Event},
 };
 
-use super::{attribute, problem};
+use super::{
+    attribute,
+    outputs::{ElementOutput, plain_path},
+    problem,
+};
 use crate::failure::Exit;
 
 /// Bytes that any packed file may unpack to.
@@ -28,7 +32,7 @@ const GZIP: [u8; 2] = [0x1f, 0x8b];
 /// Encodings in which every ASCII character is itself: a check of the ASCII characters sees the same elements as SUMO.
 const ENCODINGS: [&str; 6] = ["utf-8", "utf8", "us-ascii", "ascii", "iso-8859-1", "windows-1252"];
 /// Names with which SUMO opens no file.
-const NO_FILE: [&str; 8] = ["", "NUL", "nul", "/dev/null", "-", "stdout", "STDOUT", "stderr"];
+pub(super) const NO_FILE: [&str; 8] = ["", "NUL", "nul", "/dev/null", "-", "stdout", "STDOUT", "stderr"];
 /// Elements whose attribute `file` is read.
 const READING: [&str; 3] = ["calibrator", "rerouter", "variableSpeedSign"];
 /// The advice for a file that the user knows.
@@ -82,6 +86,8 @@ pub struct InputCheck {
     open: Vec<PathBuf>,
     /// Outputs that a file places outside the run's directory: each with its place in the file.
     pub moved: Vec<String>,
+    /// Outputs that elements of the files name.
+    pub outputs_of_elements: Vec<ElementOutput>,
 }
 
 impl InputCheck {
@@ -93,6 +99,7 @@ impl InputCheck {
             seen: BTreeSet::new(),
             open: Vec::new(),
             moved: Vec::new(),
+            outputs_of_elements: Vec::new(),
         }
     }
 
@@ -239,6 +246,11 @@ impl InputCheck {
         if self.outputs == OutputPlace::Anywhere {
             return refuse("makes a net write a file");
         }
+        if what.starts_with('<') {
+            let file = plain_path(&path.parent().unwrap_or(Path::new(".")).join(value));
+            let named_by = format!("{}: {what}", path.display());
+            self.outputs_of_elements.push(ElementOutput { named_by, file });
+        }
         let leaves = |part: Component<'_>| matches!(part, Component::RootDir | Component::ParentDir);
         if Path::new(value).components().any(leaves) {
             self.moved.push(format!("{}: {what} = \"{value}\"", path.display()));
@@ -274,7 +286,7 @@ fn line_at(path: &Path, position: u64) -> Option<usize> {
 }
 
 /// Opens a file, which may be packed, as ASCII: every other byte becomes `_`.
-fn open(path: &Path) -> io::Result<AsciiReader> {
+pub(super) fn open(path: &Path) -> io::Result<AsciiReader> {
     let mut file = File::open(path)?;
     let packed_bytes = file.metadata()?.len();
     let mut start = Vec::new();
@@ -294,7 +306,7 @@ fn open(path: &Path) -> io::Result<AsciiReader> {
 }
 
 /// A file as ASCII, up to a limit.
-struct AsciiReader {
+pub(super) struct AsciiReader {
     inner: Box<dyn Read>,
     /// Bytes that may still come.
     left: u64,

@@ -1,12 +1,13 @@
 //! The loop over the steps of an episode: waits for credit, steps SUMO, publishes.
 
 use ipc_schema::{
+    config::TrafficEngine,
     failure::{Failure, FailureKind},
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::Wait,
     ports::PortError,
     process::Process,
-    run::{RunFile, Source},
+    run::{RunFile, RunMap, Source},
     schedule::Episode,
     sensor::fitted_sensors,
     services::Channel,
@@ -17,7 +18,12 @@ use crate::{
     heroes,
     population::{Population, PopulationSize, trips::TripSelection},
     sumo::{
-        Sumo, connected::ConnectedRule, error::SumoError, frame::TrafficFrame, interpolation::StepInterpolation,
+        Sumo,
+        connected::ConnectedRule,
+        engine::{Engine, TraciServer},
+        error::SumoError,
+        frame::TrafficFrame,
+        interpolation::StepInterpolation,
         options::SumoOptions,
     },
 };
@@ -78,25 +84,48 @@ pub(super) enum EpisodeEnd {
 }
 
 /// SUMO's options for `episode`.
-fn options(run: &RunFile, source: &Source, episode: &Episode) -> Result<SumoOptions, SumoError> {
+fn options(run: &RunFile, map: &RunMap, episode: &Episode) -> Result<SumoOptions, SumoError> {
     let traffic = &run.config.traffic;
-    match source {
+    let options = match &map.source {
         Source::Population {
             net_file,
             additional_files,
         } => SumoOptions::population(&run.sumo_home, net_file, additional_files, traffic.step_s, episode.seed),
-        Source::Scenario { sumocfg } => {
+        Source::Scenario { sumocfg, own } => {
             let output_dir = run.run_dir.join("sumo");
             let rule = ConnectedRule::Scenario {
                 heroes: traffic.hero_ids.iter().cloned().collect(),
                 cav_share: traffic.cav_share,
                 max_cavs: traffic.max_cavs,
             };
-            let options =
-                SumoOptions::scenario(&run.sumo_home, sumocfg, &output_dir, traffic.step_s, episode.seed, rule)?;
-            Ok(options.with_scale(traffic.scale))
+            let (home, step_s) = (&run.sumo_home, traffic.step_s);
+            let options = SumoOptions::scenario(home, sumocfg, own, &output_dir, step_s, episode.seed, rule)?;
+            Ok(options
+                .with_scale(traffic.scale)
+                .with_span(traffic.begin_s, traffic.end_s))
         }
-    }
+    }?;
+    Ok(options
+        .with_world_origin(map.info.world_origin_m)
+        .with_engine(engine(run)))
+}
+
+/// Where the run's SUMO runs.
+fn engine(run: &RunFile) -> Engine {
+    let traffic = &run.config.traffic;
+    let program = match traffic.engine {
+        TrafficEngine::Libsumo => return Engine::InProcess,
+        TrafficEngine::Traci => "sumo",
+        TrafficEngine::TraciGui => "sumo-gui",
+    };
+    Engine::Traci(TraciServer {
+        program: run.sumo_home.join("bin").join(program),
+        port: traffic
+            .traci_port
+            .saturating_add(u16::try_from(run.env_index).unwrap_or(u16::MAX)),
+        clients: traffic.traci_clients,
+        log: run.run_dir.join("logs/sumo.log"),
+    })
 }
 
 /// Puts road users into an empty net; a scenario brings its own.
@@ -150,7 +179,7 @@ impl Bridge {
     ) -> Result<RunningEpisode, Failure> {
         self.store_state(episode)?;
         let run = &self.membership.run;
-        let options = options(run, &self.maps[map].source, episode)?;
+        let options = options(run, &self.maps[map], episode)?;
         // A file may crash SUMO, which cannot be caught: the failure is written before, and removed when SUMO has read the files.
         options.crashed().write(&run.run_dir, Process::TrafficBridge.name());
         let mut sumo = match before {
@@ -164,6 +193,7 @@ impl Bridge {
             frames => Some(StepInterpolation::new(sumo.read_lanes()?, frames, sumo.step_s())),
         };
         self.commands.begin_episode();
+        self.totals.traffic.episode_contacts = 0;
         Ok(RunningEpisode {
             sumo,
             population,
@@ -199,6 +229,9 @@ impl Bridge {
             // Step SUMO, and determine what ends with the step.
             sumo.step(frame)?;
             self.commands.track_presence(&frame.events);
+            if let Some(ids) = &mut self.ids {
+                ids.add(&frame.departed_ids);
+            }
             let is_reset = self.commands.take_reset();
             let pauses = segment
                 .ticks
@@ -228,6 +261,7 @@ impl Bridge {
             self.publish_step(frame, header)?;
 
             // Close the episode or the segment, or prepare the next step.
+            self.totals.count_contacts(sumo.contacts());
             if ends {
                 self.check_that_road_users_came()?;
                 self.totals.cost = Some(self.totals.cost_before.plus(sumo.cost()));
@@ -249,7 +283,7 @@ impl Bridge {
     /// A scenario in which no vehicle ever drives is a mistake: an end before the first departure, or no routes.
     fn check_that_road_users_came(&self) -> Result<(), Failure> {
         match &self.membership.run.source {
-            Source::Scenario { sumocfg } if self.totals.vehicle_steps == 0 => Err(Failure::new(
+            Source::Scenario { sumocfg, .. } if self.totals.vehicle_steps == 0 => Err(Failure::new(
                 FailureKind::Config,
                 format!("{}: no road user departed before its end", sumocfg.display()),
             )

@@ -4,12 +4,13 @@ pub mod census;
 pub(crate) mod commands;
 mod decisions;
 mod episode;
+mod id_log;
 mod lessons;
 mod outbox;
 mod pacing;
 mod signal_delay;
 
-use std::path::Path;
+use std::{collections::BTreeMap, path::Path};
 
 use ipc_schema::{
     board::State,
@@ -17,7 +18,7 @@ use ipc_schema::{
     membership::{RunMembership, Wait},
     ports::{BoardReader, ControlServer, Subscriber},
     process::Process,
-    run::RunMap,
+    run::{RunMap, Source},
     schedule::Episode,
     services::Channel,
     traffic::MetaEvent,
@@ -27,6 +28,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::sumo::{Sumo, SumoCost, frame::TrafficFrame};
 use commands::CommandExecutor;
+use id_log::IdLog;
 use lessons::MapUsage;
 use outbox::Outbox;
 use pacing::Pacing;
@@ -65,6 +67,8 @@ struct Bridge {
     poses: Option<Subscriber>,
     pacing: Pacing,
     signal_delay: SignalDelay,
+    /// Ids of road users, in a scenario.
+    ids: Option<IdLog>,
     /// The first tick that the clock paces.
     paced_from: u64,
     command_server: ControlServer,
@@ -90,6 +94,22 @@ struct BridgeState {
     repeated_ticks: u64,
     cost: SumoCost,
     map_usage: Vec<MapUsage>,
+    #[serde(default)]
+    traffic: TrafficCounts,
+}
+
+/// What happened to road users, over all episodes.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+struct TrafficCounts {
+    /// Road users that departed, by SUMO's vehicle class; persons are pedestrians.
+    departed: BTreeMap<String, u64>,
+    /// Teleports that SUMO began.
+    teleports: u64,
+    /// Contacts that SUMO reported.
+    contacts: u64,
+    /// Those of the running episode among them.
+    #[serde(skip)]
+    episode_contacts: u64,
 }
 
 /// What the bridge has done so far.
@@ -102,6 +122,7 @@ struct BridgeTotals {
     /// Episodes that a command has reset, and the ticks that these episodes had.
     resets: u64,
     repeated_ticks: u64,
+    traffic: TrafficCounts,
     /// Processor time of SUMO before this process was started.
     cost_before: SumoCost,
     /// Processor time of SUMO over the finished episodes.
@@ -118,6 +139,20 @@ impl BridgeTotals {
             .iter()
             .filter(|meta| meta.event == MetaEvent::Arrived as u32);
         self.arrived += arrivals.count() as u64;
+        for meta in &frame.events {
+            if meta.event == MetaEvent::Departed as u32 {
+                *self.traffic.departed.entry(meta.class_text()).or_default() += 1;
+            } else if meta.event == MetaEvent::Teleported as u32 {
+                self.traffic.teleports += 1;
+            }
+        }
+    }
+
+    /// Takes over the number of contacts that SUMO has reported in the running episode.
+    fn count_contacts(&mut self, episode_contacts: u64) {
+        let counts = &mut self.traffic;
+        counts.contacts += episode_contacts - counts.episode_contacts.min(episode_contacts);
+        counts.episode_contacts = episode_contacts;
     }
 }
 
@@ -132,6 +167,11 @@ struct BridgeReport<'a> {
     signals_s: f64,
     /// Road users, summed over SUMO's steps.
     vehicle_steps: u64,
+    /// Road users that departed, teleports and SUMO's contacts.
+    #[serde(flatten)]
+    traffic: &'a TrafficCounts,
+    /// Episodes that a command has reset.
+    resets: u64,
     /// The maps of a curriculum that has several: lessons on each, and their ticks.
     #[serde(skip_serializing_if = "<[MapUsage]>::is_empty")]
     maps: &'a [MapUsage],
@@ -150,6 +190,7 @@ impl Bridge {
             arrived: counted(|state| state.arrived),
             resets: membership.run.start().resets,
             repeated_ticks: counted(|state| state.repeated_ticks),
+            traffic: state.as_ref().map(|state| state.traffic.clone()).unwrap_or_default(),
             cost_before: state.as_ref().map_or(SumoCost::default(), |state| state.cost),
             cost: None,
         };
@@ -162,6 +203,10 @@ impl Bridge {
             paced_from: membership.run.restart.map_or(0, |restart| restart.sensed_ticks),
             pacing: Pacing::new(membership.run.config.run.real_time_factor),
             signal_delay: SignalDelay::new(membership.run.mirror_delay_frames()),
+            ids: match membership.run.source {
+                Source::Scenario { .. } => Some(IdLog::open(&membership.run.run_dir)),
+                Source::Population { .. } => None,
+            },
             command_server: membership.control_server()?,
             commands: CommandExecutor::of_run(&membership.run.run_dir)?,
             ticks_per_step: membership.run.ticks_per_traffic_step(),
@@ -184,6 +229,7 @@ impl Bridge {
             repeated_ticks: totals.repeated_ticks,
             cost: totals.cost.unwrap_or(totals.cost_before),
             map_usage: self.map_usage.clone(),
+            traffic: totals.traffic.clone(),
         };
         self.membership.store_episode_state(totals.ticks, &state)
     }
@@ -241,6 +287,8 @@ impl Bridge {
             getters_s: cost.getters_s,
             signals_s: cost.signals_s,
             vehicle_steps: self.totals.vehicle_steps,
+            traffic: &self.totals.traffic,
+            resets: self.totals.resets,
             maps: if self.map_usage.len() > 1 { &self.map_usage } else { &[] },
         })
     }

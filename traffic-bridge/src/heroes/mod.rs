@@ -14,7 +14,12 @@ use ipc_schema::{
     traffic::{Kind, MetaEvent, ROUTE_POINTS_PER_MESSAGE, RoutePoint},
 };
 
-use crate::sumo::{Sumo, called, convention::heading_deg_from_yaw_rad, error::SumoError, frame::TrafficFrame};
+use crate::sumo::{
+    Sumo, called,
+    convention::{heading_deg_from_yaw_rad, net_from_world, world_from_net},
+    error::SumoError,
+    frame::TrafficFrame,
+};
 
 /// The poses in a message.
 ///
@@ -43,6 +48,9 @@ pub fn take_over(sumo: &mut Sumo, frame: &TrafficFrame) -> Result<Vec<RoutePoint
         let first_lane = u32::try_from(lane).unwrap_or(0);
         points.extend(route::line(event.vehicle, first_lane, &lanes, &ways));
     }
+    for point in &mut points {
+        [point.x_m, point.y_m] = world_from_net([point.x_m, point.y_m], sumo.world_origin_m());
+    }
     Ok(points)
 }
 
@@ -61,10 +69,10 @@ pub fn apply(sumo: &mut Sumo, frame: &TrafficFrame, poses: &[EgoPose]) -> Result
         if frame.states.iter().all(|state| state.vehicle != pose.vehicle) {
             continue;
         }
-        let step_s = sumo.step_s();
+        let (step_s, world_origin_m) = (sumo.step_s(), sumo.world_origin_m());
         let mut simulation = sumo.simulation_mut();
         let done = if pose.flags == 0 {
-            let [x_m, y_m] = extrapolated_position(pose, step_s);
+            let [x_m, y_m] = net_from_world(extrapolated_position(pose, step_s), world_origin_m);
             simulation.as_mut().move_vehicle(
                 pose.vehicle,
                 x_m,

@@ -1,6 +1,7 @@
 //! SUMO's conventions, here and nowhere else.
 //!
-//! SUMO's net frame is also the project's (x east, y north, z up, metres). The differences: headings are degrees clockwise from
+//! SUMO's net frame is also the project's (x east, y north, z up, metres), except that a net far from its own (0, 0) is moved there
+//! ([`world_from_net`]). The differences: headings are degrees clockwise from
 //! north, slopes are degrees, and a road user that is not on the road has the position −2³⁰. A vehicle's position is
 //! the centre of its front bumper; a person's position is taken as their centre, as SUMO draws them.
 
@@ -38,6 +39,18 @@ pub fn heading_deg_from_yaw_rad(yaw_rad: f64) -> f64 {
     (90.0 - yaw_rad.to_degrees()).rem_euclid(360.0)
 }
 
+/// A place of the net in the world frame, whose (0, 0) lies at `world_origin_m` of the net; metres.
+#[must_use]
+pub fn world_from_net([x_m, y_m]: [f64; 2], world_origin_m: [f64; 2]) -> [f64; 2] {
+    [x_m - world_origin_m[0], y_m - world_origin_m[1]]
+}
+
+/// The inverse of [`world_from_net`].
+#[must_use]
+pub fn net_from_world([x_m, y_m]: [f64; 2], world_origin_m: [f64; 2]) -> [f64; 2] {
+    [x_m + world_origin_m[0], y_m + world_origin_m[1]]
+}
+
 /// SUMO's `--seed` for an episode seed: its low 31 bits.
 #[must_use]
 pub fn sumo_seed(episode_seed: u64) -> u64 {
@@ -45,9 +58,9 @@ pub fn sumo_seed(episode_seed: u64) -> u64 {
 }
 
 /// The state of a road user in the project's units, or `None` while it is off the road (teleporting, riding, parked away).
-/// `step_s` is the time since the state before, seconds.
+/// `step_s` is the time since the state before, seconds; `world_origin_m` as in [`world_from_net`].
 #[must_use]
-pub fn traffic_state(raw: &RawState, kind: Kind, step_s: f64) -> Option<TrafficState> {
+pub fn traffic_state(raw: &RawState, kind: Kind, step_s: f64, world_origin_m: [f64; 2]) -> Option<TrafficState> {
     if raw.x == INVALID || raw.y == INVALID {
         return None;
     }
@@ -58,9 +71,10 @@ pub fn traffic_state(raw: &RawState, kind: Kind, step_s: f64) -> Option<TrafficS
     } else {
         0.0
     };
+    let [front_x_m, front_y_m] = world_from_net([raw.x, raw.y], world_origin_m);
     Some(TrafficState {
-        front_x_m: raw.x,
-        front_y_m: raw.y,
+        front_x_m,
+        front_y_m,
         front_z_m: if raw.z == INVALID { 0.0 } else { raw.z },
         yaw_rad: yaw_rad_from_heading_deg(raw.angle),
         pitch_rad: single(raw.slope.to_radians()),
@@ -114,8 +128,21 @@ mod tests {
     }
 
     #[test]
+    fn a_net_far_away_is_moved_to_the_world_frame_and_back() {
+        let far = RawState {
+            x: 691_234.5,
+            y: 5_334_021.25,
+            ..raw()
+        };
+        let state = traffic_state(&far, Kind::Cav, 0.5, [691_000.0, 5_334_000.0]).unwrap();
+        assert_eq!((state.front_x_m, state.front_y_m), (234.5, 21.25));
+        let back = net_from_world([state.front_x_m, state.front_y_m], [691_000.0, 5_334_000.0]);
+        assert_eq!(back, [far.x, far.y]);
+    }
+
+    #[test]
     fn acceleration_is_the_change_of_speed_over_the_step() {
-        let state = traffic_state(&raw(), Kind::Cav, 0.5).unwrap();
+        let state = traffic_state(&raw(), Kind::Cav, 0.5, [0.0; 2]).unwrap();
         assert_eq!((state.accel_mps2, state.flags, state.front_z_m), (2.0, 0, 0.0));
     }
 
@@ -128,6 +155,7 @@ mod tests {
             },
             Kind::Cav,
             0.5,
+            [0.0; 2],
         )
         .unwrap();
         assert_eq!((state.accel_mps2, state.flags), (0.0, DISCONTINUOUS));
@@ -143,7 +171,8 @@ mod tests {
                     ..raw()
                 },
                 Kind::Other,
-                0.1
+                0.1,
+                [0.0; 2]
             ),
             None
         );
@@ -179,7 +208,7 @@ mod tests {
             previous in prop::option::of(0.0_f64..100.0), signals: i32, step_s in 0.01_f64..10.0,
         ) {
             let previous_speed = previous.unwrap_or(INVALID);
-            let state = traffic_state(&RawState { x, y, angle, speed, previous_speed, signals, ..raw() }, Kind::Cav, step_s).unwrap();
+            let state = traffic_state(&RawState { x, y, angle, speed, previous_speed, signals, ..raw() }, Kind::Cav, step_s, [0.0; 2]).unwrap();
             prop_assert!(state.yaw_rad.is_finite() && state.accel_mps2.is_finite());
             prop_assert!(state.accel_mps2.abs() <= single(100.0 / step_s));
             prop_assert_eq!(state.flags & DISCONTINUOUS != 0, previous.is_none());

@@ -89,6 +89,15 @@ pub enum SumoError {
         /// SUMO's message.
         reason: String,
     },
+    /// SUMO's own process cannot be started (`traffic.engine`).
+    #[error("cannot start {program}")]
+    Server {
+        /// The program.
+        program: PathBuf,
+        /// Why.
+        #[source]
+        source: std::io::Error,
+    },
     /// The output directory cannot be made.
     #[error("cannot create {path}")]
     Output {
@@ -107,7 +116,7 @@ fn named_in(referrer: Option<&PathBuf>) -> String {
 impl SumoError {
     fn kind(&self) -> FailureKind {
         match self {
-            Self::AlreadyRunning | Self::Call { .. } | Self::Output { .. } => FailureKind::Run,
+            Self::AlreadyRunning | Self::Call { .. } | Self::Output { .. } | Self::Server { .. } => FailureKind::Run,
             Self::Missing { .. }
             | Self::Unreadable { .. }
             | Self::Malformed { .. }
@@ -133,6 +142,9 @@ impl SumoError {
                 "use a net whose roads lead everywhere and back (sidewalks and crossings for pedestrians), or ask for none of them"
             }
             Self::HeroRoute { .. } => "name edges that cars may use, each leading to the next (`netedit` shows them)",
+            Self::Server { .. } => {
+                "set traffic.engine to \"libsumo\" or \"traci\", or install the libraries that sumo-gui needs"
+            }
             Self::Output { .. } => "check free space and permissions of the run directory",
             Self::AlreadyRunning | Self::Call { .. } => {
                 "this is a defect of traffic-bridge: please report it with its log"

@@ -23,6 +23,8 @@ pub struct TrafficFrame {
     pub places: Vec<VehiclePlace>,
     /// Arrivals, departures and teleports of this step.
     pub events: Vec<VehicleMeta>,
+    /// Ids of the road users that departed in this step, in the order of `events`.
+    pub departed_ids: Vec<String>,
     /// Traffic lights that changed in this step; in the first step of an episode all of them.
     pub signals: Vec<SignalMeta>,
     /// Simulated time since the start of the episode, seconds.
@@ -37,6 +39,8 @@ pub struct TrafficFrame {
 #[derive(Debug)]
 pub(crate) struct RoadUserRegister {
     rule: ConnectedRule,
+    /// The world frame's (0, 0) in the net's coordinates, metres.
+    world_origin_m: [f64; 2],
     /// Of each road user, by its dense index.
     kinds: Vec<Kind>,
     lengths_m: Vec<f64>,
@@ -48,9 +52,10 @@ pub(crate) struct RoadUserRegister {
 }
 
 impl RoadUserRegister {
-    pub(crate) fn new(rule: ConnectedRule) -> Self {
+    pub(crate) fn new(rule: ConnectedRule, world_origin_m: [f64; 2]) -> Self {
         Self {
             rule,
+            world_origin_m,
             kinds: Vec::new(),
             lengths_m: Vec::new(),
             reads_lanes: false,
@@ -61,6 +66,9 @@ impl RoadUserRegister {
 
     /// Replaces states and events of `frame`.
     pub(crate) fn fill(&mut self, frame: &mut TrafficFrame, states: &[RawState], events: &[RawEvent], step_s: f64) {
+        frame.departed_ids.clear();
+        let departed = events.iter().filter(|event| event.kind == RawEventKind::Departed);
+        frame.departed_ids.extend(departed.map(|event| event.id.clone()));
         frame.events.clear();
         frame.events.extend(events.iter().map(|event| self.meta(event)));
         frame.states.clear();
@@ -68,7 +76,7 @@ impl RoadUserRegister {
         frame.cavs = 0;
         for raw in states {
             let kind = self.kind(raw.index);
-            if let Some(state) = convention::traffic_state(raw, kind, step_s) {
+            if let Some(state) = convention::traffic_state(raw, kind, step_s, self.world_origin_m) {
                 frame.cavs += u32::from(matches!(kind, Kind::Cav | Kind::Hero));
                 frame.states.push(state);
                 if self.reads_lanes {

@@ -4,15 +4,13 @@
 #include <stdexcept>
 #include <utility>
 
-#include <libsumo/libsumo.h>
-
 #include "traffic-bridge/src/sumo/error_tee.h"
 #include "traffic-bridge/src/sumo/lanes.h"
-#include "traffic-bridge/src/sumo/shim.h"
+#include "traffic-bridge/src/sumo/engine.h"
 #include "traffic-bridge/src/sumo/libsumo.rs.h"
 #include "traffic-bridge/src/sumo/text.h"
 
-namespace caraware {
+namespace caraware::CARAWARE_ENGINE {
 
 namespace {
 
@@ -28,7 +26,7 @@ constexpr int MAX_INTERNAL_LANES = 8;
 using LaneShape = rust::Vec<double>;
 
 void append(LaneShape& shape, const std::string& lane) {
-    for (const libsumo::TraCIPosition& point : libsumo::Lane::getShape(lane).value) {
+    for (const libsumo::TraCIPosition& point : engine::Lane::getShape(lane).value) {
         shape.push_back(point.x);
         shape.push_back(point.y);
     }
@@ -45,11 +43,11 @@ struct Light {
 
 // The traffic light of each link, by its lanes.
 std::map<std::pair<std::string, std::string>, Light> lights() {
-    std::vector<std::string> ids = libsumo::TrafficLight::getIDList();
+    std::vector<std::string> ids = engine::TrafficLight::getIDList();
     std::sort(ids.begin(), ids.end());
     std::map<std::pair<std::string, std::string>, Light> result;
     for (std::size_t signal = 0; signal < ids.size(); ++signal) {
-        const auto links = libsumo::TrafficLight::getControlledLinks(ids[signal]);
+        const auto links = engine::TrafficLight::getControlledLinks(ids[signal]);
         for (std::size_t link = 0; link < links.size(); ++link) {
             for (const libsumo::TraCILink& way : links[link]) {
                 result.insert({{way.fromLane, way.toLane},
@@ -61,12 +59,12 @@ std::map<std::pair<std::string, std::string>, Light> lights() {
 }
 
 RawWay way(std::uint32_t edge, const std::string& from, const libsumo::TraCIConnection& link) {
-    RawWay result{edge, number_of(from), number_of(link.approachedLane), libsumo::Lane::getMaxSpeed(from), {}, -1, 0};
+    RawWay result{edge, number_of(from), number_of(link.approachedLane), engine::Lane::getMaxSpeed(from), {}, -1, 0};
     std::string internal = link.approachedInternal;
     for (int count = 0; !internal.empty() && count < MAX_INTERNAL_LANES; ++count) {
         append(result.shape, internal);
-        result.speed_limit = libsumo::Lane::getMaxSpeed(internal);
-        const std::vector<libsumo::TraCIConnection> onward = libsumo::Lane::getLinks(internal);
+        result.speed_limit = engine::Lane::getMaxSpeed(internal);
+        const std::vector<libsumo::TraCIConnection> onward = engine::Lane::getLinks(internal);
         internal = onward.empty() ? std::string() : onward.front().approachedInternal;
     }
     return result;
@@ -74,7 +72,7 @@ RawWay way(std::uint32_t edge, const std::string& from, const libsumo::TraCIConn
 
 }  // namespace
 
-const std::string* Simulation::id_of(std::uint32_t index) const {
+const std::string* EngineSimulation::id_of(std::uint32_t index) const {
     const auto found = std::lower_bound(states_.begin(), states_.end(), index,
                                         [](const RawState& state, std::uint32_t wanted) { return state.index < wanted; });
     if (found == states_.end() || found->index != index) {
@@ -83,7 +81,7 @@ const std::string* Simulation::id_of(std::uint32_t index) const {
     return &live_[static_cast<std::size_t>(found - states_.begin())].id;
 }
 
-const std::string& Simulation::known_id(std::uint32_t index) const {
+const std::string& EngineSimulation::known_id(std::uint32_t index) const {
     const std::string* id = id_of(index);
     if (id == nullptr) {
         throw std::out_of_range("no road user has the index " + std::to_string(index));
@@ -91,44 +89,44 @@ const std::string& Simulation::known_id(std::uint32_t index) const {
     return *id;
 }
 
-void Simulation::add_vehicle_at_start(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) {
+void EngineSimulation::add_vehicle_at_start(rust::Str id, rust::Str vehicle_type, rust::Slice<const rust::String> route) {
     const std::string name = text(id);
-    libsumo::Route::add(name, texts(route));
-    libsumo::Vehicle::add(name, name, text(vehicle_type), "now", "best", "base", "0");
+    engine::Route::add(name, texts(route));
+    engine::Vehicle::add(name, name, text(vehicle_type), "now", "best", "base", "0");
 }
 
-void Simulation::take_over(std::uint32_t index) {
+void EngineSimulation::take_over(std::uint32_t index) {
     const std::string& id = known_id(index);
-    libsumo::Vehicle::setSpeedMode(id, 0);
-    libsumo::Vehicle::setLaneChangeMode(id, 0);
+    engine::Vehicle::setSpeedMode(id, 0);
+    engine::Vehicle::setLaneChangeMode(id, 0);
     // SUMO computes a moved vehicle's speed from the distance it covers, but never above these limits.
-    libsumo::Vehicle::setSpeedFactor(id, UNLIMITED);
-    libsumo::Vehicle::setMaxSpeed(id, UNLIMITED);
-    libsumo::Vehicle::setEmergencyDecel(id, UNLIMITED);
+    engine::Vehicle::setSpeedFactor(id, UNLIMITED);
+    engine::Vehicle::setMaxSpeed(id, UNLIMITED);
+    engine::Vehicle::setEmergencyDecel(id, UNLIMITED);
 }
 
-void Simulation::move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration) {
+void EngineSimulation::move_vehicle(std::uint32_t index, double x, double y, double angle, double speed, double acceleration) {
     const std::string& id = known_id(index);
-    libsumo::Vehicle::moveToXY(id, "", -1, x, y, angle, FREE_MOVEMENT, MATCH_THRESHOLD_M);
-    libsumo::Vehicle::setPreviousSpeed(id, speed, acceleration);
+    engine::Vehicle::moveToXY(id, "", -1, x, y, angle, FREE_MOVEMENT, MATCH_THRESHOLD_M);
+    engine::Vehicle::setPreviousSpeed(id, speed, acceleration);
 }
 
-void Simulation::remove_by_index(std::uint32_t index) {
+void EngineSimulation::remove_by_index(std::uint32_t index) {
     if (const std::string* id = id_of(index); id != nullptr) {
-        libsumo::Vehicle::remove(*id);
+        engine::Vehicle::remove(*id);
     }
 }
 
-std::int32_t Simulation::lane_index(std::uint32_t index) const { return libsumo::Vehicle::getLaneIndex(known_id(index)); }
+std::int32_t EngineSimulation::lane_index(std::uint32_t index) const { return engine::Vehicle::getLaneIndex(known_id(index)); }
 
-rust::Vec<RawLane> Simulation::route_lanes(std::uint32_t index) const {
+rust::Vec<RawLane> EngineSimulation::route_lanes(std::uint32_t index) const {
     const std::string& id = known_id(index);
-    const std::string species = libsumo::Vehicle::getVehicleClass(id);
+    const std::string species = engine::Vehicle::getVehicleClass(id);
     rust::Vec<RawLane> result;
     std::uint32_t place = 0;
-    for (const std::string& edge : libsumo::Vehicle::getRoute(id)) {
+    for (const std::string& edge : engine::Vehicle::getRoute(id)) {
         for (const std::string& lane : lanes_for(edge, species)) {
-            RawLane raw{place, number_of(lane), libsumo::Lane::getMaxSpeed(lane), {}};
+            RawLane raw{place, number_of(lane), engine::Lane::getMaxSpeed(lane), {}};
             append(raw.shape, lane);
             result.push_back(std::move(raw));
         }
@@ -137,16 +135,16 @@ rust::Vec<RawLane> Simulation::route_lanes(std::uint32_t index) const {
     return result;
 }
 
-rust::Vec<RawWay> Simulation::route_ways(std::uint32_t index) const {
+rust::Vec<RawWay> EngineSimulation::route_ways(std::uint32_t index) const {
     const std::string& id = known_id(index);
-    const std::string species = libsumo::Vehicle::getVehicleClass(id);
-    const std::vector<std::string> route = libsumo::Vehicle::getRoute(id);
+    const std::string species = engine::Vehicle::getVehicleClass(id);
+    const std::vector<std::string> route = engine::Vehicle::getRoute(id);
     const auto lit = lights();
     rust::Vec<RawWay> result;
     for (std::size_t place = 0; place + 1 < route.size(); ++place) {
         for (const std::string& lane : lanes_for(route[place], species)) {
-            for (const libsumo::TraCIConnection& link : libsumo::Lane::getLinks(lane)) {
-                if (libsumo::Lane::getEdgeID(link.approachedLane) != route[place + 1] ||
+            for (const libsumo::TraCIConnection& link : engine::Lane::getLinks(lane)) {
+                if (engine::Lane::getEdgeID(link.approachedLane) != route[place + 1] ||
                     !allows(link.approachedLane, species)) {
                     continue;
                 }
@@ -162,4 +160,4 @@ rust::Vec<RawWay> Simulation::route_ways(std::uint32_t index) const {
     return result;
 }
 
-}  // namespace caraware
+}  // namespace caraware::CARAWARE_ENGINE

@@ -1,4 +1,4 @@
-//! The files that a simulation reads: which they are, whether they exist, and which of them SUMO refuses.
+//! The files that a simulation reads: whether they exist, and which of them SUMO refuses. The supervisor has read the `.sumocfg`.
 
 use std::path::{Path, PathBuf};
 
@@ -11,11 +11,6 @@ use super::error::SumoError;
 
 /// Files longer than this are not searched for the origin of an error.
 const SEARCHED_BYTES: u64 = 64 << 20;
-
-/// SUMO's step when a configuration does not name one, seconds.
-const DEFAULT_STEP_S: f64 = 1.0;
-/// SUMO's seed when a configuration does not name one.
-const DEFAULT_SEED: u64 = 23423;
 
 /// The files of one simulation.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -53,8 +48,7 @@ impl InputFiles {
 }
 
 fn require(path: &Path, referenced_by: Option<&PathBuf>) -> Result<(), SumoError> {
-    // SUMO replaces ${…} by environment variables: SUMO itself checks such a path.
-    if path.is_file() || path.to_string_lossy().contains("${") {
+    if path.is_file() {
         return Ok(());
     }
     Err(SumoError::Missing {
@@ -85,64 +79,6 @@ fn line_with(file: &Path, names: &[&str]) -> Option<usize> {
         return None;
     }
     text.lines().position(|line| has(line, first)).map(|index| index + 1)
-}
-
-/// The parts of a `.sumocfg` that the bridge needs before SUMO reads it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ScenarioFile {
-    /// Its files.
-    pub files: InputFiles,
-    /// Its step, seconds.
-    pub step_s: f64,
-    /// Its seed.
-    pub seed: u64,
-}
-
-impl ScenarioFile {
-    /// Reads `sumocfg`.
-    ///
-    /// # Errors
-    /// Missing, unreadable or malformed, or step or seed are no numbers.
-    pub fn read(sumocfg: &Path) -> Result<Self, SumoError> {
-        let folder = sumocfg.parent().unwrap_or(Path::new(""));
-        let mut scenario = Self {
-            files: InputFiles {
-                main: sumocfg.into(),
-                others: Vec::new(),
-            },
-            step_s: DEFAULT_STEP_S,
-            seed: DEFAULT_SEED,
-        };
-        let mut wrong = None;
-        for_each_element(sumocfg, |element| {
-            let Some(value) = attribute(element, "value") else {
-                return;
-            };
-            match element.name().as_ref() {
-                "net-file" | "net" | "route-files" | "routes" | "additional-files" | "additional" => {
-                    let files = value.split([',', ' ']).filter(|name| !name.is_empty());
-                    scenario.files.others.extend(files.map(|name| folder.join(name)));
-                }
-                "step-length" => match value.trim().parse() {
-                    Ok(step_s) => scenario.step_s = step_s,
-                    Err(_) => wrong = Some(("step-length", value)),
-                },
-                "seed" => match value.trim().parse() {
-                    Ok(seed) => scenario.seed = seed,
-                    Err(_) => wrong = Some(("seed", value)),
-                },
-                _ => {}
-            }
-        })?;
-        match wrong {
-            None => Ok(scenario),
-            Some((what, value)) => Err(SumoError::NoNumber {
-                path: sumocfg.into(),
-                what: what.into(),
-                value,
-            }),
-        }
-    }
 }
 
 /// Calls `visit` for every element of an XML file, in order.
@@ -186,43 +122,6 @@ mod tests {
         let path = folder.join(name);
         std::fs::write(&path, text).unwrap();
         path
-    }
-
-    #[test]
-    fn a_configuration_names_its_files_and_its_step() {
-        let folder = tempfile::tempdir().unwrap();
-        let text = "<configuration><input><net-file value=\"a.net.xml\"/><route-files value=\"b.xml, c.xml\"/></input>\
-                    <time><step-length value=\"0.5\"/></time></configuration>";
-        let scenario = ScenarioFile::read(&write(folder.path(), "x.sumocfg", text)).unwrap();
-        assert_eq!((scenario.step_s, scenario.seed), (0.5, 23423));
-        let names: Vec<_> = scenario
-            .files
-            .others
-            .iter()
-            .map(|f| f.file_name().unwrap().to_owned())
-            .collect();
-        assert_eq!(names, ["a.net.xml", "b.xml", "c.xml"]);
-        assert!(matches!(scenario.files.check(), Err(SumoError::Missing { .. })));
-    }
-
-    #[test]
-    fn a_configuration_cut_in_the_middle_is_malformed() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = write(folder.path(), "x.sumocfg", "<configuration><input></configuration>");
-        assert!(matches!(ScenarioFile::read(&path), Err(SumoError::Malformed { .. })));
-    }
-
-    #[test]
-    fn a_step_that_is_no_number_is_named() {
-        let folder = tempfile::tempdir().unwrap();
-        let text = "<configuration><time><step-length value=\"short\"/></time></configuration>";
-        let error = ScenarioFile::read(&write(folder.path(), "x.sumocfg", text)).unwrap_err();
-        assert!(
-            error
-                .to_string()
-                .ends_with("x.sumocfg: step-length \"short\" is no number"),
-            "{error}"
-        );
     }
 
     #[test]

@@ -137,11 +137,16 @@ pub mod ffi {
         /// SUMO, loaded or not.
         type Simulation;
 
+        /// SUMO in this process.
         fn new_simulation() -> UniquePtr<Simulation>;
+        /// SUMO in a process of its own, over TraCI.
+        fn new_remote_simulation() -> UniquePtr<Simulation>;
         /// Sets an environment variable of this process, as SUMO and PROJ read it.
         fn set_environment(name: &str, value: &str);
 
-        fn start(self: Pin<&mut Simulation>, arguments: &[String]) -> Result<()>;
+        /// Starts libsumo with `arguments`, or connects to the SUMO that listens on `port` as the first of `clients` clients: then it
+        /// returns when all of them are there.
+        fn start(self: Pin<&mut Simulation>, arguments: &[String], port: u16, clients: u32) -> Result<()>;
         /// Ends the simulation; its output files are complete afterwards.
         fn close(self: Pin<&mut Simulation>) -> Result<()>;
         /// One simulation step and one pass of getters over all road users.
@@ -160,6 +165,9 @@ pub mod ffi {
         fn seconds_in_step(self: &Simulation) -> f64;
         fn seconds_in_getters(self: &Simulation) -> f64;
         fn seconds_in_signals(self: &Simulation) -> f64;
+
+        /// Contacts that SUMO has reported since the start.
+        fn contacts(self: &Simulation) -> u64;
 
         fn time(self: &Simulation) -> Result<f64>;
         fn end_time(self: &Simulation) -> Result<f64>;

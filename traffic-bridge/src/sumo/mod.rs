@@ -3,6 +3,7 @@
 
 pub mod connected;
 pub mod convention;
+pub mod engine;
 pub mod error;
 pub mod frame;
 pub mod inputs;
@@ -19,6 +20,7 @@ use std::{
 
 use cxx::UniquePtr;
 
+use engine::{Engine, ServerProcess};
 use error::SumoError;
 use frame::{RoadUserRegister, TrafficFrame, signal_meta};
 use inputs::InputFiles;
@@ -85,6 +87,10 @@ pub struct Sumo {
     begin_s: f64,
     end_s: f64,
     steps: u64,
+    /// The world frame's (0, 0) in the net's coordinates, metres.
+    world_origin_m: [f64; 2],
+    /// SUMO's own process, if it has one: dropped after `simulation`, whose destructor closes the connection.
+    server: Option<ServerProcess>,
     // Last: dropped after `simulation`, whose destructor still uses libsumo.
     claim: LibsumoClaim,
 }
@@ -106,7 +112,11 @@ impl Sumo {
     pub fn start(options: SumoOptions) -> Result<Self, SumoError> {
         let claim = LibsumoClaim::take()?;
         set_environment(&options.sumo_home);
-        Self::begin(ffi::new_simulation(), claim, options)
+        let simulation = match &options.engine {
+            Engine::InProcess => ffi::new_simulation(),
+            Engine::Traci(_) => ffi::new_remote_simulation(),
+        };
+        Self::begin(simulation, claim, options)
     }
 
     /// Ends this simulation and starts another in its place: a new episode, where dense indices begin at 0 again.
@@ -115,6 +125,7 @@ impl Sumo {
     /// SUMO refuses its input; SUMO is not running afterwards.
     pub fn reload(mut self, options: SumoOptions) -> Result<Self, SumoError> {
         called("end the simulation", self.simulation.pin_mut().close())?;
+        drop(self.server.take());
         Self::begin(self.simulation, self.claim, options)
     }
 
@@ -123,7 +134,9 @@ impl Sumo {
     /// # Errors
     /// SUMO cannot finish its outputs.
     pub fn close(mut self) -> Result<(), SumoError> {
-        called("end the simulation", self.simulation.pin_mut().close())
+        called("end the simulation", self.simulation.pin_mut().close())?;
+        drop(self.server.take());
+        Ok(())
     }
 
     fn begin(
@@ -132,17 +145,17 @@ impl Sumo {
         options: SumoOptions,
     ) -> Result<Self, SumoError> {
         simulation.pin_mut().take_messages();
-        if let Err(error) = simulation.pin_mut().start(&options.arguments) {
-            let reason = reason(&error, &simulation.pin_mut().take_messages());
-            return Err(SumoError::Refused {
+        let server = connect(&mut simulation, &options).map_err(|failure| match failure {
+            StartFailure::Refused(reason) => SumoError::Refused {
                 place: options.files.place_of(&reason),
                 reason,
-            });
-        }
+            },
+            StartFailure::NoServer(error) => error,
+        })?;
         let step_s = called("report its step", simulation.step_length())?;
         let begin_s = called("report the time", simulation.time())?;
         let end_s = called("report its end", simulation.end_time())?;
-        let register = RoadUserRegister::new(options.rule);
+        let register = RoadUserRegister::new(options.rule, options.world_origin_m);
         Ok(Self {
             simulation,
             register,
@@ -151,6 +164,8 @@ impl Sumo {
             begin_s,
             end_s,
             steps: 0,
+            world_origin_m: options.world_origin_m,
+            server,
             claim,
         })
     }
@@ -184,7 +199,12 @@ impl Sumo {
     /// # Errors
     /// SUMO is no longer loaded.
     pub fn read_lanes(&mut self) -> Result<LaneGraph, SumoError> {
-        let lanes = called("list its lanes", self.simulation.pin_mut().net_lanes())?;
+        let mut lanes = called("list its lanes", self.simulation.pin_mut().net_lanes())?;
+        for lane in &mut lanes {
+            for point in lane.shape.as_chunks_mut::<3>().0 {
+                [point[0], point[1]] = convention::world_from_net([point[0], point[1]], self.world_origin_m);
+            }
+        }
         self.register.reads_lanes = true;
         Ok(LaneGraph::new(lanes))
     }
@@ -195,6 +215,18 @@ impl Sumo {
     /// SUMO is no longer loaded.
     pub fn time_s(&self) -> Result<f64, SumoError> {
         Ok(called("report the time", self.simulation.time())? - self.begin_s)
+    }
+
+    /// The world frame's (0, 0) in the net's coordinates, metres.
+    #[must_use]
+    pub fn world_origin_m(&self) -> [f64; 2] {
+        self.world_origin_m
+    }
+
+    /// Contacts that SUMO has reported since the start of the episode.
+    #[must_use]
+    pub fn contacts(&self) -> u64 {
+        self.simulation.contacts()
     }
 
     /// Length of a step, seconds.
@@ -252,6 +284,40 @@ impl Sumo {
     pub(crate) fn simulation_mut(&mut self) -> Pin<&mut ffi::Simulation> {
         self.simulation.pin_mut()
     }
+}
+
+/// Why a simulation does not start.
+enum StartFailure {
+    /// SUMO refuses its input: its reason.
+    Refused(String),
+    /// SUMO's own process does not start.
+    NoServer(SumoError),
+}
+
+/// Loads SUMO, or starts its process and connects to it.
+fn connect(
+    simulation: &mut UniquePtr<ffi::Simulation>,
+    options: &SumoOptions,
+) -> Result<Option<ServerProcess>, StartFailure> {
+    let Engine::Traci(server) = &options.engine else {
+        return match simulation.pin_mut().start(&options.arguments, 0, 1) {
+            Ok(()) => Ok(None),
+            Err(error) => {
+                let messages = simulation.pin_mut().take_messages();
+                Err(StartFailure::Refused(reason(&error, &messages)))
+            }
+        };
+    };
+    let mut process =
+        ServerProcess::start(server, &options.arguments, &options.sumo_home).map_err(StartFailure::NoServer)?;
+    // SUMO listens once it has read its files.
+    while let Err(error) = simulation.pin_mut().start(&[], server.port, server.clients) {
+        if !process.is_alive() {
+            return Err(StartFailure::Refused(reason(&error, &process.messages())));
+        }
+        ServerProcess::wait_a_moment();
+    }
+    Ok(Some(process))
 }
 
 /// Processor time of this thread, seconds.

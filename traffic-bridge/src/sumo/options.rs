@@ -2,14 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use ipc_schema::failure::{Failure, FailureKind};
-
-use super::{
-    connected::ConnectedRule,
-    convention::sumo_seed,
-    error::SumoError,
-    inputs::{InputFiles, ScenarioFile},
+use ipc_schema::{
+    failure::{Failure, FailureKind},
+    run::ScenarioOptions,
 };
+
+use super::{connected::ConnectedRule, convention::sumo_seed, engine::Engine, error::SumoError, inputs::InputFiles};
 
 /// SUMO teleports a vehicle of the population out of a jam after this long without movement, seconds.
 const POPULATION_TELEPORT_S: u32 = 120;
@@ -24,6 +22,10 @@ pub struct SumoOptions {
     pub(crate) files: InputFiles,
     pub(crate) rule: ConnectedRule,
     pub(crate) sumo_home: PathBuf,
+    /// The world frame's (0, 0) in the net's coordinates, metres.
+    pub(crate) world_origin_m: [f64; 2],
+    /// Where SUMO runs.
+    pub(crate) engine: Engine,
 }
 
 impl SumoOptions {
@@ -61,38 +63,51 @@ impl SumoOptions {
             files,
             rule: ConnectedRule::Population,
             sumo_home: sumo_home.into(),
+            world_origin_m: [0.0; 2],
+            engine: Engine::InProcess,
         })
     }
 
     /// A user's scenario exactly as SUMO runs it, except for its outputs, which go to `output_dir`. `step_s` and `seed` are
-    /// those of the run; they replace the scenario's own only if they differ. `rule` says which vehicles are connected or
+    /// those of the run; they replace the scenario's `own` only if they differ. `rule` says which vehicles are connected or
     /// heroes.
     ///
-    /// The demand is the scenario's own unless [`SumoOptions::with_scale`] says otherwise.
+    /// Demand and span are the scenario's own unless [`SumoOptions::with_scale`] and [`SumoOptions::with_span`] say otherwise.
     ///
     /// # Errors
-    /// A file is missing or malformed, or `output_dir` cannot be made.
+    /// A file is missing, or `output_dir` cannot be made.
     pub fn scenario(
         sumo_home: &Path,
         sumocfg: &Path,
+        own: &ScenarioOptions,
         output_dir: &Path,
         step_s: f64,
         seed: u64,
         rule: ConnectedRule,
     ) -> Result<Self, SumoError> {
-        let scenario = ScenarioFile::read(sumocfg)?;
-        scenario.files.check()?;
+        let files = InputFiles {
+            main: sumocfg.into(),
+            others: own.inputs.clone(),
+        };
+        files.check()?;
         let mut arguments = arguments(&[
             ("--configuration-file", &sumocfg.to_string_lossy()),
             ("--output-prefix", &output_prefix(output_dir)?),
             ("--no-step-log", "true"),
         ]);
         #[expect(clippy::float_cmp, reason = "the run took the number from the same text")]
-        if scenario.step_s != step_s {
+        if own.step_s != step_s {
             arguments.extend(["--step-length".to_owned(), step_s.to_string()]);
         }
-        if scenario.seed != seed {
+        if own.seed != seed {
             arguments.extend(["--seed".to_owned(), sumo_seed(seed).to_string()]);
+        }
+        if own.is_random {
+            // A seed from the clock would be another in every run.
+            arguments.extend(["--random".to_owned(), "false".to_owned()]);
+        }
+        for (option, name) in &own.renamed_outputs {
+            arguments.extend([format!("--{option}"), name.clone()]);
         }
         if matches!(&rule, ConnectedRule::Scenario { heroes, .. } if !heroes.is_empty()) {
             // `sim-core` reports a hero's collisions and ends its episode; SUMO would move the hero out of the way.
@@ -100,9 +115,11 @@ impl SumoOptions {
         }
         Ok(Self {
             arguments,
-            files: scenario.files,
+            files,
             rule,
             sumo_home: sumo_home.into(),
+            world_origin_m: [0.0; 2],
+            engine: Engine::InProcess,
         })
     }
 }
@@ -120,6 +137,31 @@ impl SumoOptions {
         let message = format!("ended while SUMO was reading {}{others}", main.display());
         Failure::new(FailureKind::Config, message)
             .with_help("build the net again with netconvert; `sumo` on the same files ends in the same way, which shows the file to correct")
+    }
+
+    /// The same from and to these times of SUMO, seconds, where they are given: SUMO's `--begin` and `--end`.
+    #[must_use]
+    pub fn with_span(mut self, begin_s: Option<f64>, end_s: Option<f64>) -> Self {
+        for (option, time_s) in [("--begin", begin_s), ("--end", end_s)] {
+            if let Some(time_s) = time_s {
+                self.arguments.extend([option.to_owned(), time_s.to_string()]);
+            }
+        }
+        self
+    }
+
+    /// The same where `engine` says.
+    #[must_use]
+    pub fn with_engine(mut self, engine: Engine) -> Self {
+        self.engine = engine;
+        self
+    }
+
+    /// The same with the world frame's (0, 0) at this place of the net, metres.
+    #[must_use]
+    pub fn with_world_origin(mut self, world_origin_m: [f64; 2]) -> Self {
+        self.world_origin_m = world_origin_m;
+        self
     }
 
     /// The same with `scale` times the demand, if it is given: SUMO's `--scale`.

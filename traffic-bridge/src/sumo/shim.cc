@@ -1,19 +1,18 @@
 // The life of the simulation, and the one pass of getters after each step.
-#include "traffic-bridge/src/sumo/shim.h"
+#include "traffic-bridge/src/sumo/engine.h"
 
 #include <algorithm>
 #include <cstdlib>
 #include <ctime>
 #include <limits>
+#include <set>
 #include <utility>
-
-#include <libsumo/libsumo.h>
 
 #include "traffic-bridge/src/sumo/error_tee.h"
 #include "traffic-bridge/src/sumo/libsumo.rs.h"
 #include "traffic-bridge/src/sumo/text.h"
 
-namespace caraware {
+namespace caraware::CARAWARE_ENGINE {
 
 // Lamps change slowly: those of each vehicle are read this often.
 constexpr double SIGNAL_PERIOD_S = 0.4;
@@ -37,8 +36,8 @@ constexpr double TIME_ROUNDING_S = 0.0005;
 namespace {
 
 bool net_has_elevation() {
-    for (const std::string& lane : libsumo::Lane::getIDList()) {
-        for (const libsumo::TraCIPosition& point : libsumo::Lane::getShape(lane).value) {
+    for (const std::string& lane : engine::Lane::getIDList()) {
+        for (const libsumo::TraCIPosition& point : engine::Lane::getShape(lane).value) {
             if (point.z != 0.0 && point.z != libsumo::INVALID_DOUBLE_VALUE) {
                 return true;
             }
@@ -62,17 +61,17 @@ void describe(RawEvent& departure, const std::string& id) {
 
 // What the vehicle type lets SUMO do: the mirror must be able to follow.
 void describe_limits(RawEvent& departure, const std::string& id) {
-    const std::string type = libsumo::Vehicle::getTypeID(id);
-    departure.accel = libsumo::VehicleType::getAccel(type);
-    departure.decel = std::max(libsumo::VehicleType::getDecel(type), libsumo::VehicleType::getEmergencyDecel(type));
-    departure.max_speed = libsumo::VehicleType::getMaxSpeed(type);
+    const std::string type = engine::Vehicle::getTypeID(id);
+    departure.accel = engine::VehicleType::getAccel(type);
+    departure.decel = std::max(engine::VehicleType::getDecel(type), engine::VehicleType::getEmergencyDecel(type));
+    departure.max_speed = engine::VehicleType::getMaxSpeed(type);
 }
 
 }  // namespace
 
-Simulation::Simulation() : errors_(std::make_unique<ErrorTee>()) {}
+EngineSimulation::EngineSimulation() : errors_(std::make_unique<ErrorTee>()) {}
 
-Simulation::~Simulation() {
+EngineSimulation::~EngineSimulation() {
     try {
         close();
     } catch (const std::exception&) {
@@ -80,11 +79,22 @@ Simulation::~Simulation() {
     }
 }
 
-void Simulation::start(rust::Slice<const rust::String> arguments) {
+void EngineSimulation::start(rust::Slice<const rust::String> arguments, std::uint16_t port, std::uint32_t clients) {
+#ifdef CARAWARE_OVER_TRACI
+    // Rust has started SUMO with the arguments, and tries again while SUMO does not listen yet.
+    static_cast<void>(arguments);
+    engine::Simulation::init(port, 0, "localhost");
+    if (clients > 1) {
+        engine::Simulation::setOrder(1);
+    }
+#else
+    static_cast<void>(port);
+    static_cast<void>(clients);
     std::vector<std::string> command{"sumo"};
     const std::vector<std::string> options = texts(arguments);
     command.insert(command.end(), options.begin(), options.end());
-    libsumo::Simulation::start(command);
+    engine::Simulation::start(command);
+#endif
     live_.clear();
     states_.clear();
     events_.clear();
@@ -95,33 +105,36 @@ void Simulation::start(rust::Slice<const rust::String> arguments) {
     lane_places_.clear();
     next_index_ = 0;
     steps_ = 0;
-    signal_period_steps_ = static_cast<std::uint64_t>(std::max(1.0, SIGNAL_PERIOD_S / libsumo::Simulation::getDeltaT() + TIME_ROUNDING_S));
+    contacts_ = 0;
+    in_contact_.clear();
+    signal_period_steps_ = static_cast<std::uint64_t>(std::max(1.0, SIGNAL_PERIOD_S / engine::Simulation::getDeltaT() + TIME_ROUNDING_S));
     any_gone_ = false;
     has_elevation_ = net_has_elevation();
     signals_.clear();
     lights_.clear();
-    std::vector<std::string> ids = libsumo::TrafficLight::getIDList();
+    std::vector<std::string> ids = engine::TrafficLight::getIDList();
     std::sort(ids.begin(), ids.end());
     for (std::string& id : ids) {
         lights_.push_back(Light{std::move(id), "", libsumo::INVALID_DOUBLE_VALUE});
     }
 }
 
-void Simulation::close() {
-    if (libsumo::Simulation::isLoaded()) {
-        libsumo::Simulation::close("");
+void EngineSimulation::close() {
+    if (engine::Simulation::isLoaded()) {
+        engine::Simulation::close("");
     }
 }
 
-void Simulation::step() {
+void EngineSimulation::step() {
     const double start = processor_seconds();
-    libsumo::Simulation::step();
+    engine::Simulation::step();
     const double stepped = processor_seconds();
     events_.clear();
     // SUMO moves first and inserts last: an id that arrives and departs in one step arrived first.
     note_arrivals();
     note_departures();
     note_teleports();
+    note_contacts();
     read_all();
     const double read = processor_seconds();
     read_signals();
@@ -131,13 +144,13 @@ void Simulation::step() {
     seconds_in_signals_ += processor_seconds() - read;
 }
 
-void Simulation::read_signals() {
+void EngineSimulation::read_signals() {
     signals_.clear();
     if (lights_.empty()) {
         return;
     }
     // The time at which the step began; SUMO's clock stands at its end.
-    const double now = libsumo::Simulation::getTime() - libsumo::Simulation::getDeltaT();
+    const double now = engine::Simulation::getTime() - engine::Simulation::getDeltaT();
     for (std::size_t index = 0; index < lights_.size(); ++index) {
         Light& light = lights_[index];
         const bool may_have_switched = light.next_switch <= now + TIME_ROUNDING_S;
@@ -145,8 +158,8 @@ void Simulation::read_signals() {
         if (!may_have_switched && !is_its_turn) {
             continue;
         }
-        light.next_switch = libsumo::TrafficLight::getNextSwitch(light.id);
-        std::string state = libsumo::TrafficLight::getRedYellowGreenState(light.id);
+        light.next_switch = engine::TrafficLight::getNextSwitch(light.id);
+        std::string state = engine::TrafficLight::getRedYellowGreenState(light.id);
         if (state != light.published) {
             light.published = std::move(state);
             signals_.push_back(RawSignal{static_cast<std::uint32_t>(index), rust::String::lossy(light.id),
@@ -155,13 +168,13 @@ void Simulation::read_signals() {
     }
 }
 
-void Simulation::note_arrivals() {
-    for (const std::string& id : libsumo::Simulation::getArrivedIDList()) {
+void EngineSimulation::note_arrivals() {
+    for (const std::string& id : engine::Simulation::getArrivedIDList()) {
         if (const auto place = vehicle_places_.find(id); place != vehicle_places_.end()) {
             arrive(place->second);
         }
     }
-    for (const std::string& id : libsumo::Simulation::getArrivedPersonIDList()) {
+    for (const std::string& id : engine::Simulation::getArrivedPersonIDList()) {
         if (const auto place = person_places_.find(id); place != person_places_.end()) {
             arrive(place->second);
         }
@@ -169,17 +182,42 @@ void Simulation::note_arrivals() {
     forget_gone();
 }
 
-void Simulation::note_departures() {
-    for (const std::string& id : libsumo::Simulation::getDepartedIDList()) {
+void EngineSimulation::note_departures() {
+    for (const std::string& id : engine::Simulation::getDepartedIDList()) {
         depart(id, false);
     }
-    for (const std::string& id : libsumo::Simulation::getDepartedPersonIDList()) {
+    for (const std::string& id : engine::Simulation::getDepartedPersonIDList()) {
         depart(id, true);
+    }
+    if (steps_ == 0) {
+        note_saved();
     }
 }
 
-void Simulation::note_teleports() {
-    for (const std::string& id : libsumo::Simulation::getStartingTeleportIDList()) {
+// Road users of a saved state are on the road without having departed.
+void EngineSimulation::note_saved() {
+    for (const bool is_person : {false, true}) {
+        std::vector<std::string> ids = is_person ? engine::Person::getIDList() : engine::Vehicle::getIDList();
+        std::sort(ids.begin(), ids.end());
+        for (const std::string& id : ids) {
+            depart(id, is_person);
+        }
+    }
+}
+
+// SUMO lists a contact in every step in which it lasts.
+void EngineSimulation::note_contacts() {
+    std::set<std::pair<std::string, std::string>> now;
+    for (const libsumo::TraCICollision& contact : engine::Simulation::getCollisions()) {
+        const auto pair = std::make_pair(contact.collider, contact.victim);
+        contacts_ += in_contact_.count(pair) == 0 && now.count(pair) == 0 ? 1 : 0;
+        now.insert(pair);
+    }
+    in_contact_.swap(now);
+}
+
+void EngineSimulation::note_teleports() {
+    for (const std::string& id : engine::Simulation::getStartingTeleportIDList()) {
         if (const auto place = vehicle_places_.find(id); place != vehicle_places_.end()) {
             RawState& state = states_[place->second];
             state.speed = libsumo::INVALID_DOUBLE_VALUE;
@@ -188,7 +226,7 @@ void Simulation::note_teleports() {
     }
 }
 
-void Simulation::depart(const std::string& id, bool is_person) {
+void EngineSimulation::depart(const std::string& id, bool is_person) {
     auto& places = is_person ? person_places_ : vehicle_places_;
     if (places.count(id) > 0) {
         return;
@@ -196,9 +234,9 @@ void Simulation::depart(const std::string& id, bool is_person) {
     RawEvent departure = event(RawEventKind::Departed, next_index_, is_person, id);
     try {
         if (is_person) {
-            describe<libsumo::Person>(departure, id);
+            describe<engine::Person>(departure, id);
         } else {
-            describe<libsumo::Vehicle>(departure, id);
+            describe<engine::Vehicle>(departure, id);
             describe_limits(departure, id);
         }
     } catch (const libsumo::TraCIException&) {
@@ -214,7 +252,7 @@ void Simulation::depart(const std::string& id, bool is_person) {
     ++next_index_;
 }
 
-void Simulation::arrive(std::size_t place) {
+void EngineSimulation::arrive(std::size_t place) {
     Live& road_user = live_[place];
     if (!road_user.gone) {
         road_user.gone = true;
@@ -223,35 +261,35 @@ void Simulation::arrive(std::size_t place) {
     }
 }
 
-void Simulation::read_vehicle(const std::string& id, RawState& state) const {
-    const libsumo::TraCIPosition position = libsumo::Vehicle::getPosition3D(id);
+void EngineSimulation::read_vehicle(const std::string& id, RawState& state) const {
+    const libsumo::TraCIPosition position = engine::Vehicle::getPosition3D(id);
     state.previous_speed = state.speed;
     state.x = position.x;
     state.y = position.y;
     state.z = position.z;
-    state.angle = libsumo::Vehicle::getAngle(id);
-    state.speed = libsumo::Vehicle::getSpeed(id);
+    state.angle = engine::Vehicle::getAngle(id);
+    state.speed = engine::Vehicle::getSpeed(id);
     state.lane = NO_LANE;
     if (position.x == libsumo::INVALID_DOUBLE_VALUE) {
         return;
     }
     if (has_elevation_) {
-        state.slope = libsumo::Vehicle::getSlope(id);
+        state.slope = engine::Vehicle::getSlope(id);
     }
     if (!lane_places_.empty()) {
-        const auto lane = lane_places_.find(libsumo::Vehicle::getLaneID(id));
+        const auto lane = lane_places_.find(engine::Vehicle::getLaneID(id));
         state.lane = lane == lane_places_.end() ? NO_LANE : lane->second;
-        state.lane_position = libsumo::Vehicle::getLanePosition(id);
+        state.lane_position = engine::Vehicle::getLanePosition(id);
     }
     if ((steps_ + state.index) % signal_period_steps_ == 0) {
-        state.signals = libsumo::Vehicle::getSignals(id);
+        state.signals = engine::Vehicle::getSignals(id);
     }
 }
 
-void Simulation::read_person(const std::string& id, RawState& state) const {
+void EngineSimulation::read_person(const std::string& id, RawState& state) const {
     // A person in a vehicle is not a road user.
-    const bool afoot = libsumo::Person::getVehicle(id).empty();
-    const libsumo::TraCIPosition position = afoot ? libsumo::Person::getPosition3D(id) : libsumo::TraCIPosition();
+    const bool afoot = engine::Person::getVehicle(id).empty();
+    const libsumo::TraCIPosition position = afoot ? engine::Person::getPosition3D(id) : libsumo::TraCIPosition();
     state.previous_speed = state.speed;
     state.x = position.x;
     state.y = position.y;
@@ -260,14 +298,14 @@ void Simulation::read_person(const std::string& id, RawState& state) const {
         state.speed = libsumo::INVALID_DOUBLE_VALUE;
         return;
     }
-    state.angle = libsumo::Person::getAngle(id);
-    state.speed = libsumo::Person::getSpeed(id);
+    state.angle = engine::Person::getAngle(id);
+    state.speed = engine::Person::getSpeed(id);
     if (has_elevation_) {
-        state.slope = libsumo::Person::getSlope(id);
+        state.slope = engine::Person::getSlope(id);
     }
 }
 
-void Simulation::put_in_order() {
+void EngineSimulation::put_in_order() {
     // Sorting takes longer than it saves if few have departed.
     if (late_ * LATE_SHARE <= reading_order_.size()) {
         return;
@@ -278,7 +316,7 @@ void Simulation::put_in_order() {
     late_ = 0;
 }
 
-void Simulation::read_all() {
+void EngineSimulation::read_all() {
     put_in_order();
     for (const std::size_t place : reading_order_) {
         const Live& road_user = live_[place];
@@ -295,7 +333,7 @@ void Simulation::read_all() {
     forget_gone();
 }
 
-void Simulation::forget_gone() {
+void EngineSimulation::forget_gone() {
     if (!any_gone_) {
         return;
     }
@@ -324,8 +362,8 @@ void Simulation::forget_gone() {
     any_gone_ = false;
 }
 
-rust::Vec<RawNetLane> Simulation::net_lanes() {
-    const std::vector<std::string> ids = libsumo::Lane::getIDList();
+rust::Vec<RawNetLane> EngineSimulation::net_lanes() {
+    const std::vector<std::string> ids = engine::Lane::getIDList();
     std::unordered_map<std::string, std::uint32_t> edges;
     for (std::size_t place = 0; place < ids.size(); ++place) {
         lane_places_.emplace(ids[place], static_cast<std::int32_t>(place));
@@ -334,14 +372,14 @@ rust::Vec<RawNetLane> Simulation::net_lanes() {
     lanes.reserve(ids.size());
     for (const std::string& id : ids) {
         RawNetLane lane;
-        lane.edge = edges.emplace(libsumo::Lane::getEdgeID(id), static_cast<std::uint32_t>(edges.size())).first->second;
-        lane.length = libsumo::Lane::getLength(id);
-        for (const libsumo::TraCIPosition& point : libsumo::Lane::getShape(id).value) {
+        lane.edge = edges.emplace(engine::Lane::getEdgeID(id), static_cast<std::uint32_t>(edges.size())).first->second;
+        lane.length = engine::Lane::getLength(id);
+        for (const libsumo::TraCIPosition& point : engine::Lane::getShape(id).value) {
             lane.shape.push_back(point.x);
             lane.shape.push_back(point.y);
             lane.shape.push_back(point.z == libsumo::INVALID_DOUBLE_VALUE ? 0.0 : point.z);
         }
-        for (const libsumo::TraCIConnection& link : libsumo::Lane::getLinks(id)) {
+        for (const libsumo::TraCIConnection& link : engine::Lane::getLinks(id)) {
             const std::string& next = link.approachedInternal.empty() ? link.approachedLane : link.approachedInternal;
             if (const auto place = lane_places_.find(next); place != lane_places_.end()) {
                 lane.next.push_back(static_cast<std::uint32_t>(place->second));
@@ -352,36 +390,46 @@ rust::Vec<RawNetLane> Simulation::net_lanes() {
     return lanes;
 }
 
-rust::Slice<const RawState> Simulation::states() const { return {states_.data(), states_.size()}; }
+rust::Slice<const RawState> EngineSimulation::states() const { return {states_.data(), states_.size()}; }
 
-rust::Slice<const RawEvent> Simulation::events() const { return {events_.data(), events_.size()}; }
+rust::Slice<const RawEvent> EngineSimulation::events() const { return {events_.data(), events_.size()}; }
 
-rust::Slice<const RawSignal> Simulation::signals() const { return {signals_.data(), signals_.size()}; }
+rust::Slice<const RawSignal> EngineSimulation::signals() const { return {signals_.data(), signals_.size()}; }
 
-rust::String Simulation::take_messages() { return rust::String::lossy(errors_->take()); }
+rust::String EngineSimulation::take_messages() { return rust::String::lossy(errors_->take()); }
 
-double Simulation::seconds_in_step() const { return seconds_in_step_; }
+double EngineSimulation::seconds_in_step() const { return seconds_in_step_; }
 
-double Simulation::seconds_in_getters() const { return seconds_in_getters_; }
+double EngineSimulation::seconds_in_getters() const { return seconds_in_getters_; }
 
-double Simulation::seconds_in_signals() const { return seconds_in_signals_; }
+double EngineSimulation::seconds_in_signals() const { return seconds_in_signals_; }
 
-double Simulation::time() const { return libsumo::Simulation::getTime(); }
+std::uint64_t EngineSimulation::contacts() const { return contacts_; }
 
-double Simulation::end_time() const { return libsumo::Simulation::getEndTime(); }
+double EngineSimulation::time() const { return engine::Simulation::getTime(); }
 
-double Simulation::step_length() const { return libsumo::Simulation::getDeltaT(); }
+double EngineSimulation::end_time() const { return engine::Simulation::getEndTime(); }
 
-std::int32_t Simulation::min_expected() const { return libsumo::Simulation::getMinExpectedNumber(); }
+double EngineSimulation::step_length() const { return engine::Simulation::getDeltaT(); }
 
+std::int32_t EngineSimulation::min_expected() const { return engine::Simulation::getMinExpectedNumber(); }
+
+}  // namespace caraware::CARAWARE_ENGINE
+
+namespace caraware {
+
+#ifdef CARAWARE_OVER_TRACI
+std::unique_ptr<Simulation> new_remote_simulation() { return std::make_unique<over_traci::EngineSimulation>(); }
+#else
 double processor_seconds() {
     timespec now{};
     clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now);
     return static_cast<double>(now.tv_sec) + 1e-9 * static_cast<double>(now.tv_nsec);
 }
 
-std::unique_ptr<Simulation> new_simulation() { return std::make_unique<Simulation>(); }
+std::unique_ptr<Simulation> new_simulation() { return std::make_unique<over_libsumo::EngineSimulation>(); }
 
 void set_environment(rust::Str name, rust::Str value) { setenv(text(name).c_str(), text(value).c_str(), 1); }
+#endif
 
 }  // namespace caraware

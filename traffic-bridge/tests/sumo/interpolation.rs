@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, path::Path};
 
-use crate::support::{Bench, sumo_home};
+use crate::support::{Bench, own_options, sumo_home};
 use traffic_bridge::sumo::{
     Sumo,
     connected::ConnectedRule,
@@ -55,8 +55,9 @@ fn at_steps_of_a_second_vehicles_stay_on_their_lanes_between_the_steps() {
     let sumocfg = bench.crossing_scenario(&net);
     let output = bench.folder.path().join("out");
     let rule = ConnectedRule::connected(1.0);
-    let mut sumo =
-        Sumo::start(SumoOptions::scenario(&sumo_home(), &sumocfg, &output, STEP_S, 1, rule).unwrap()).unwrap();
+    let own = own_options(&net, &[]);
+    let options = SumoOptions::scenario(&sumo_home(), &sumocfg, &own, &output, STEP_S, 1, rule).unwrap();
+    let mut sumo = Sumo::start(options).unwrap();
     let mut between = StepInterpolation::new(sumo.read_lanes().unwrap(), FRAMES, STEP_S);
     let segments = segments(&net);
     let (mut frame, mut part) = (TrafficFrame::default(), TrafficFrame::default());

@@ -166,9 +166,14 @@ fn files_that_are_missing_or_broken_are_named() {
     let home = sumo_home();
     let folder = bench.folder.path();
     let scenario = |name: &str| {
+        let own = match name {
+            "lost.sumocfg" => own_options(&folder.join("lost.net.xml"), &[]),
+            _ => ScenarioOptions::default(),
+        };
         SumoOptions::scenario(
             &home,
             &folder.join(name),
+            &own,
             &folder.join("sumo"),
             1.0,
             23423,

@@ -244,7 +244,7 @@ fn a_scenario_runs_to_its_own_end() {
     let bench = Bench::new();
     let sumocfg =
         bench.scenario("<routes><vehicle id=\"a\" depart=\"0\"><route edges=\"A0B0 B0C0\"/></vehicle></routes>");
-    let run = Run::new(&bench, Source::Scenario { sumocfg }, 1, 1.0);
+    let run = Run::new(&bench, bench.source(sumocfg), 1, 1.0);
     let mut process = run.start();
     let steps = consume(&run);
     assert_eq!(process.exit_code(), Some(0));
@@ -283,7 +283,7 @@ fn wrong_input_ends_the_process_with_a_failure_that_names_the_file() {
     let bench = Bench::new();
     let sumocfg =
         bench.scenario("<routes><vehicle id=\"a\" depart=\"0\"><route edges=\"A0B0 nope\"/></vehicle></routes>");
-    let run = Run::new(&bench, Source::Scenario { sumocfg }, 1, 1.0);
+    let run = Run::new(&bench, bench.source(sumocfg), 1, 1.0);
     assert_eq!(run.start().exit_code(), Some(2));
     let failure = Failure::read(&run.file.run_dir, Process::TrafficBridge.name()).unwrap();
     assert_eq!(failure.kind, FailureKind::Config);
@@ -314,6 +314,7 @@ fn run_file(run_dir: PathBuf, source: Source, ticks: u64, step_s: f64) -> RunFil
             net_offset_m: [0.0; 2],
             bounds_m: [0.0, 0.0, 400.0, 400.0],
             traffic_lights: 0,
+            world_origin_m: [0.0; 2],
         },
         scene_files: SceneFiles::default(),
         maps: Vec::new(),

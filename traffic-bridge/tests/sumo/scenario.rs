@@ -3,7 +3,10 @@
 use std::{collections::BTreeSet, path::Path, time::SystemTime};
 
 use crate::support::{Bench, run, sumo_home};
-use ipc_schema::traffic::{Kind, MetaEvent, VehicleMeta};
+use ipc_schema::{
+    run::ScenarioOptions,
+    traffic::{Kind, MetaEvent, VehicleMeta},
+};
 use traffic_bridge::sumo::{Sumo, connected::ConnectedRule, options::SumoOptions};
 
 /// Files below `folder` with their times of change.
@@ -28,6 +31,10 @@ fn a10kw_runs_and_writes_only_to_the_run_directory() {
     let options = SumoOptions::scenario(
         &sumo_home(),
         &games.join("A10KW.sumocfg"),
+        &ScenarioOptions {
+            step_s: 0.5,
+            ..ScenarioOptions::default()
+        },
         &output,
         0.5,
         23423,

@@ -6,6 +6,7 @@ use std::{
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
+use ipc_schema::run::{ScenarioOptions, Source};
 use tempfile::TempDir;
 use traffic_bridge::sumo::{
     Sumo,
@@ -166,17 +167,33 @@ impl Bench {
         )
     }
 
+    /// The source of traffic that such a scenario is.
+    pub fn source(&self, sumocfg: PathBuf) -> Source {
+        let own = own_options(&self.folder.path().join("grid.net.xml"), &["a.rou.xml"]);
+        Source::Scenario { sumocfg, own }
+    }
+
     /// Options for a scenario whose outputs go to `sumo/`.
     pub fn scenario_options(&self, sumocfg: &Path, step_s: f64) -> SumoOptions {
         SumoOptions::scenario(
             &sumo_home(),
             sumocfg,
+            &own_options(&self.folder.path().join("grid.net.xml"), &["a.rou.xml"]),
             &self.folder.path().join("sumo"),
             step_s,
             23423,
             ConnectedRule::connected(0.5),
         )
         .unwrap()
+    }
+}
+
+/// What the supervisor has read in a scenario of this net and the files `others` beside it.
+pub fn own_options(net: &Path, others: &[&str]) -> ScenarioOptions {
+    let beside = others.iter().map(|name| net.with_file_name(name));
+    ScenarioOptions {
+        inputs: std::iter::once(net.to_owned()).chain(beside).collect(),
+        ..ScenarioOptions::default()
     }
 }
 

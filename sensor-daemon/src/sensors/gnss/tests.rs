@@ -13,6 +13,7 @@ fn projection(definition: &str, net_offset_m: [f64; 2]) -> Projection {
         net_offset_m,
         bounds_m: SMALL_M,
         traffic_lights: 0,
+        world_origin_m: [0.0; 2],
     })
     .unwrap()
 }

@@ -46,8 +46,11 @@ class Pieces:
         return len(self.x_m)
 
 
-def read_pieces(net_file: Path) -> Pieces:
-    """All lanes that cars may use. Raises `OSError` or `xml.etree.ElementTree.ParseError` for a file that is no net."""
+def read_pieces(net_file: Path, world_origin_m: Sequence[float] = (0.0, 0.0)) -> Pieces:
+    """All lanes that cars may use, in the world frame, whose (0, 0) lies at `world_origin_m` of the net.
+
+    Raises `OSError` or `xml.etree.ElementTree.ParseError` for a file that is no net.
+    """
     rows: list[tuple[float, ...]] = []
     with gzip.open(net_file) if net_file.suffix == ".gz" else net_file.open("rb") as stream:
         for _, element in ElementTree.iterparse(stream):
@@ -57,7 +60,10 @@ def read_pieces(net_file: Path) -> Pieces:
                 continue
             if _for_cars(element):
                 rows += _cut(element)
-    columns = torch.tensor(rows, dtype=torch.float64).reshape(-1, 6).T.to(torch.float32)
+    columns = torch.tensor(rows, dtype=torch.float64).reshape(-1, 6).T
+    columns[0] -= world_origin_m[0]
+    columns[1] -= world_origin_m[1]
+    columns = columns.to(torch.float32)
     return Pieces(*columns.contiguous())
 
 

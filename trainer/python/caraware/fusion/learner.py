@@ -56,7 +56,7 @@ class FusionConfig:
         """The lanes of the run's net; none without a map. Raises `OSError`."""
         if not self.map:
             return Pieces(*torch.zeros(6, 0))
-        return read_pieces(Path(run["scene_files"]["net_file"]))
+        return read_pieces(Path(run["scene_files"]["net_file"]), run["map"]["world_origin_m"])
 
 
 @dataclass(frozen=True)

@@ -62,3 +62,8 @@ def typed(key: str, value: object, kind: type) -> Any:
 def is_population(run: RunFile) -> bool:
     """Whether the run is on a map with population control, and not on a scenario of the user's."""
     return "population" in run["source"]
+
+
+def sumo_begin_s(run: RunFile) -> float:
+    """SUMO's clock at the begin of every episode, in s; add it to the time of a tick for SUMO's clock there."""
+    return float(run["source"].get("scenario", {}).get("own", {}).get("begin_s", 0.0))

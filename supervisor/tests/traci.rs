@@ -1,0 +1,155 @@
+//! SUMO in a process of its own: the same bytes as in `traffic-bridge`, and a TraCI script beside the run that changes them.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "tests and measurements assert by unwrapping"
+)]
+
+mod common;
+
+use std::{
+    net::TcpListener,
+    process::{Child, Command, Stdio},
+};
+
+use caraware::install::Install;
+use common::{Workplace, sumo_program, text, tool};
+use serde_json::Value;
+
+/// Keeps every light in its first phase, as the loop of SUMO's tutorial on signals does until a vehicle comes.
+const SCRIPT: &str = "
+import sys
+import traci
+
+traci.connect(port=int(sys.argv[1]), numRetries=60)
+traci.setOrder(2)
+steps = 0
+try:
+    while traci.simulation.getMinExpectedNumber() > 0:
+        for light in traci.trafficlight.getIDList():
+            traci.trafficlight.setPhase(light, 0)
+        traci.simulationStep()
+        steps += 1
+    traci.close()
+except traci.exceptions.FatalTraCIError:
+    pass
+print(steps)
+";
+
+/// A grid with signals, and cars that cross it.
+fn scenario(workplace: &Workplace) {
+    let grid = [
+        "--grid",
+        "--grid.number",
+        "3",
+        "--grid.length",
+        "100",
+        "-j",
+        "traffic_light",
+        "-o",
+        "a.net.xml",
+    ];
+    tool(&sumo_program("netgenerate"), &grid, workplace.path());
+    workplace.write(
+        "a.rou.xml",
+        "<routes><flow id=\"f\" begin=\"0\" end=\"20\" number=\"6\" from=\"A0A1\" to=\"B2C2\"/>\
+         <flow id=\"g\" begin=\"0\" end=\"20\" number=\"6\" from=\"C0B0\" to=\"A1A2\"/></routes>",
+    );
+    workplace.write(
+        "a.sumocfg",
+        "<configuration><net-file value=\"a.net.xml\"/><route-files value=\"a.rou.xml\"/><tripinfo-output value=\"trips.xml\"/>\
+         <step-length value=\"0.5\"/><end value=\"60\"/></configuration>",
+    );
+}
+
+/// Simulates with `more` settings. Returns the report and SUMO's record of trips.
+fn simulate(workplace: &Workplace, name: &str, more: &[String], script: Option<Child>) -> (Value, String) {
+    let settings = [
+        "map.origin_latitude_deg=52",
+        "map.origin_longitude_deg=10",
+        "fanout.enabled=false",
+    ];
+    let settings = settings.into_iter().chain(more.iter().map(String::as_str));
+    let settings = settings.flat_map(|setting| ["--set", setting]);
+    let arguments: Vec<&str> = ["simulate", "a.sumocfg", "--name", name]
+        .into_iter()
+        .chain(settings)
+        .collect();
+    workplace.succeed(&arguments);
+    if let Some(script) = script {
+        let output = script.wait_with_output().unwrap();
+        assert_eq!(
+            String::from_utf8_lossy(&output.stdout).trim(),
+            "120",
+            "{}",
+            text(&output)
+        );
+    }
+    let trips = workplace.path().join("runs").join(name).join("sumo/trips.xml");
+    let trips = std::fs::read_to_string(trips).unwrap();
+    (workplace.report(name), trips.split_once("-->").unwrap().1.to_owned())
+}
+
+#[test]
+fn a_traci_script_runs_beside_a_run_and_changes_it() {
+    let workplace = Workplace::new();
+    scenario(&workplace);
+    let port = TcpListener::bind(("127.0.0.1", 0))
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .port();
+    let engine = |clients: u32| {
+        let settings = [
+            "traffic.engine=traci".to_owned(),
+            format!("traffic.traci_port={port}"),
+            format!("traffic.traci_clients={clients}"),
+        ];
+        settings.to_vec()
+    };
+    let (inside, trips) = simulate(&workplace, "inside", &[], None);
+    let (alone, trips_alone) = simulate(&workplace, "alone", &engine(1), None);
+    assert_eq!(alone["observation_hash"], inside["observation_hash"]);
+    assert_eq!(trips_alone, trips);
+
+    let install = Install::find().unwrap();
+    let path = workplace.write("script.py", SCRIPT);
+    let script = Command::new(&install.python)
+        .arg(path)
+        .arg(port.to_string())
+        .env("PYTHONPATH", install.sumo_home.join("tools"))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let (both, trips_both) = simulate(&workplace, "both", &engine(2), Some(script));
+    assert_eq!(both["ticks"], inside["ticks"]);
+    assert_ne!(both["observation_hash"], inside["observation_hash"]);
+    assert_ne!(trips_both, trips, "the script changed nothing");
+
+    // SUMO refuses its input with its own words, as inside.
+    workplace.write(
+        "a.rou.xml",
+        "<routes><vehicle id=\"v\" depart=\"0\"><route edges=\"A0A1 nope\"/></vehicle></routes>",
+    );
+    let settings = engine(1);
+    let mut arguments = vec![
+        "simulate",
+        "a.sumocfg",
+        "--set",
+        "map.origin_latitude_deg=52",
+        "--set",
+        "map.origin_longitude_deg=10",
+    ];
+    for setting in &settings {
+        arguments.extend(["--set", setting]);
+    }
+    let output = workplace.run(&arguments);
+    assert!(
+        output.status.code() == Some(2) && text(&output).contains("nope"),
+        "{}",
+        text(&output)
+    );
+    workplace.assert_nothing_left();
+}
