@@ -31,6 +31,7 @@ const AFTER: &str = "Examples:
   caraware play town-1                            compare what the run has learnt with a Kalman filter
   caraware ps                                     list the processes of live runs, from another terminal
   caraware view --web                             watch a live run in a browser
+  caraware import quarter.osm quarter            make a scenario from a map: quarter/city.sumocfg
   caraware generate city --vehicles 20000         write a scenario of any size: city/city.sumocfg
   caraware bench lidar                            measure rays per second, compared with Open3D
   caraware handover town-1                        replace the trainer of a live run; nothing is lost
@@ -78,6 +79,9 @@ pub enum Subcommands {
     View(ViewArgs),
     /// Write a city and its traffic, of any size, as a scenario of SUMO
     Generate(GenerateArgs),
+    /// Make a scenario of SUMO from a map: roads, signals, pavements, buildings, trees and traffic
+    #[command(after_help = IMPORT)]
+    Import(ImportArgs),
     /// Measure a part of caraware on this machine, compared with its peers
     #[command(
         disable_help_flag = true,
@@ -331,6 +335,34 @@ pub enum ViewerKind {
     Window,
     /// In a browser; the address is printed
     Web,
+}
+
+const IMPORT: &str = "Examples:
+  caraware import quarter.osm quarter        an extract of OpenStreetMap (its Export page, or osmium)
+  caraware import road.xodr road --duration-s 600 --demand 2
+  caraware simulate quarter/city.sumocfg
+
+The map stays under its own licence: data of OpenStreetMap under the ODbL, with attribution (docs/import.md).";
+
+/// Arguments of `import`.
+#[derive(Debug, Args, Clone)]
+pub struct ImportArgs {
+    /// The map: .osm, .osm.gz or .xodr
+    pub file: PathBuf,
+    /// Where to write city.sumocfg and its files: a new or empty directory
+    pub directory: PathBuf,
+    /// Simulated time, seconds
+    #[arg(long, default_value_t = 3600.0)]
+    pub duration_s: f64,
+    /// Factor on the traffic of every kind
+    #[arg(long, default_value_t = 1.0)]
+    pub demand: f64,
+    /// Seed of the trips and of SUMO: the same seed gives the same trips
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(..0x8000_0000))]
+    pub seed: u32,
+    /// An option for netconvert, such as --netconvert=--lefthand (repeatable)
+    #[arg(long, value_name = "OPTION", allow_hyphen_values = true)]
+    pub netconvert: Vec<String>,
 }
 
 /// Arguments of `generate`.

@@ -13,6 +13,7 @@ pub mod failure;
 pub mod generate;
 pub mod handover;
 pub mod housekeeping;
+pub mod import;
 pub mod install;
 pub mod live_table;
 pub mod maps;

@@ -11,6 +11,7 @@ use caraware::{
     failure::Exit,
     generate, handover,
     housekeeping::Housekeeping,
+    import,
     prepare::{PreparedRun, prepare, prepare_play, prepare_resume},
     relaunch, report, status,
     supervisor::{RunEnding, RunOutcome, Supervisor},
@@ -42,6 +43,7 @@ fn main() -> ExitCode {
         Subcommands::Stop { run } => status::stop(run.as_deref()),
         Subcommands::View(args) => view::view(&args),
         Subcommands::Generate(args) => generate::generate(&args),
+        Subcommands::Import(args) => import::import(&args),
         Subcommands::Bench { arguments } => bench::bench(&arguments),
         Subcommands::Doctor { clean } => doctor::doctor(clean),
     };
