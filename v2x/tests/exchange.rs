@@ -34,6 +34,7 @@ fn projection() -> Projection {
     let map = MapInfo {
         projection: "+proj=tmerc +lat_0=52.26 +lon_0=10.52 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs".into(),
         net_offset_m: [129.0, 126.0],
+        world_origin_m: [0.0; 2],
         bounds_m: [0.0, 0.0, 260.0, 260.0],
         traffic_lights: 0,
     };
