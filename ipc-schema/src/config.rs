@@ -274,12 +274,24 @@ impl TaskKind {
     }
 }
 
+/// What an action of the localisation task names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LocalisationAction {
+    /// A place in the box of the map, as in the paper.
+    Place,
+    /// A correction of the newest fix, in standard deviations of a fix.
+    Correction,
+}
+
 /// What the trainer's output means.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TaskConfig {
     /// Which task.
     pub kind: TaskKind,
+    /// What an action of the localisation task names.
+    pub action: LocalisationAction,
     /// Longest episode of a hero, seconds.
     pub time_limit_s: f64,
 }

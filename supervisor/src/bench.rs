@@ -1,6 +1,6 @@
-//! `caraware bench`: starts the program `caraware-bench`, which lies beside this one.
+//! `caraware bench` and `caraware reproduce`: start the program `caraware-bench`, which lies beside this one, and the studies in Python.
 
-use std::{ffi::OsString, os::unix::process::CommandExt as _, process::Command};
+use std::{ffi::OsString, os::unix::process::CommandExt as _, path::Path, process::Command};
 
 use crate::{failure::Exit, install};
 
@@ -12,4 +12,20 @@ pub fn bench(arguments: &[OsString]) -> Result<(), Exit> {
     let program = install::program(&install::programs()?, "caraware-bench")?;
     let error = Command::new(&program).args(arguments).exec();
     Err(Exit::io("start", &program, &error))
+}
+
+/// Replaces this process by the study that measures a table of the docs again; returns only if that fails.
+///
+/// # Errors
+/// The Python environment is missing, or the system cannot start it.
+pub fn reproduce(arguments: &[OsString]) -> Result<(), Exit> {
+    let bin = install::programs()?;
+    let python = install::python(&bin)?;
+    let program = std::env::current_exe().map_err(|error| Exit::io("find", Path::new("caraware"), &error))?;
+    let error = Command::new(&python)
+        .args(["-m", "caraware.study.reproduce"])
+        .args(arguments)
+        .env("CARAWARE", program)
+        .exec();
+    Err(Exit::io("start", &python, &error))
 }

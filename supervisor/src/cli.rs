@@ -92,6 +92,16 @@ pub enum Subcommands {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENT")]
         arguments: Vec<OsString>,
     },
+    /// Measure a table of the docs again, and fail where a figure leaves its interval
+    #[command(
+        disable_help_flag = true,
+        after_help = "`caraware reproduce --help` lists the tables and the options; docs/reproduce.md describes them."
+    )]
+    Reproduce {
+        /// The table and its options, as the module `caraware.study.reproduce` takes them
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENT")]
+        arguments: Vec<OsString>,
+    },
     /// Report what is missing on this machine and what dead runs left
     Doctor {
         /// Remove what dead runs left in shared memory

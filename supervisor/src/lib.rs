@@ -6,6 +6,7 @@ pub mod cli;
 pub mod config;
 pub mod control;
 pub mod cores;
+pub mod correction;
 pub mod display;
 pub mod doctor;
 pub mod environment;

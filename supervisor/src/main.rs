@@ -45,6 +45,7 @@ fn main() -> ExitCode {
         Subcommands::Generate(args) => generate::generate(&args),
         Subcommands::Import(args) => import::import(&args),
         Subcommands::Bench { arguments } => bench::bench(&arguments),
+        Subcommands::Reproduce { arguments } => bench::reproduce(&arguments),
         Subcommands::Doctor { clean } => doctor::doctor(clean),
     };
     match result {

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use ipc_schema::{
     SCHEMA_VERSION,
-    config::Config,
+    config::{Config, LocalisationAction},
     control, reserve,
     run::{Beginning, MapInfo, Mode, RunFile, RunMap, SceneFiles, Source, Start},
     storage,
@@ -15,6 +15,7 @@ use crate::{
     checkpoint::{self, FoundCheckpoint},
     cli::{PlayArgs, RunArgs},
     config::{self, ConfigError, LayeredSettings},
+    correction::suggest_correction,
     failure::Exit,
     install::Install,
     maps,
@@ -65,8 +66,11 @@ impl TrafficInput {
 /// # Errors
 /// The configuration, the user's files or this machine do not allow the run.
 pub fn prepare(args: &RunArgs, mode: Mode) -> Result<PreparedRun, Exit> {
-    let (settings, named, label) = resolve_config(&args.with_shorthands()?)?;
+    let (mut settings, named, label) = resolve_config(&args.with_shorthands()?)?;
     scenario_settings::check_length(&settings, mode, named.is_scenario())?;
+    if let (Mode::Train, TrafficInput::Scenario(path, _)) = (mode, &named) {
+        suggest_correction(&mut settings, &path.display().to_string());
+    }
     prepare_new(args, mode, settings.validate()?, named, &label, Install::find()?)
 }
 
@@ -78,7 +82,13 @@ pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
     let install = Install::find()?;
     let found = FoundCheckpoint::best(&install, &args.checkpoint, &args.run.runs)?;
     let (settings, named) = match &args.run.config {
-        Some(_) => resolve_config(&args.run.with_shorthands()?).map(|(settings, named, _)| (settings, named))?,
+        Some(name) => {
+            let (mut settings, named, _) = resolve_config(&args.run.with_shorthands()?)?;
+            if found.run()?.config.task.action == LocalisationAction::Correction {
+                suggest_correction(&mut settings, name);
+            }
+            (settings, named)
+        }
         None => settings_of_run(&found.run()?, &args.run.with_shorthands()?.set)?,
     };
     let config = settings.validate()?;

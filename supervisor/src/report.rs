@@ -32,8 +32,8 @@ const SHOWN_CAUSES: usize = 3;
 const SHOWN_CLASSES: usize = 6;
 
 /// The estimators that an evaluation compares, by their prefixes of the report's keys: the policy, the raw fix, the Kalman filter, the
-/// smoother, which also uses later samples, and the policy's network trained by regression.
-const ESTIMATORS: [&str; 5] = ["ppo", "raw_gnss", "ekf", "rts", "supervised"];
+/// same with a map, the smoother, which also uses later samples, and the policy's network trained by regression.
+const ESTIMATORS: [&str; 6] = ["ppo", "raw_gnss", "ekf", "map_ekf", "rts", "supervised"];
 
 /// The part of the report that `sensor-daemon` writes at its end; all zero if `sensor-daemon` was ended before.
 #[derive(Debug, Clone, Deserialize, Default)]
@@ -550,10 +550,16 @@ fn errors(report: &Value) -> Vec<String> {
     }
     if measured("supervised") {
         let by = "the policy's network trained by regression on the truth";
-        lines.push(format!("from the same samples: {by} {}", error("supervised")));
+        lines.push(format!(
+            "from the same samples and gradient steps: {by} {}",
+            error("supervised")
+        ));
     }
     if measured("ekf") {
         let mut line = format!("from the same samples: EKF {}", error("ekf"));
+        if measured("map_ekf") {
+            line += &format!(", EKF with a map {}", error("map_ekf"));
+        }
         if measured("rts") {
             let note = "sees the future: a bound, not an estimator";
             line += &format!(", RTS smoother {} ({note})", error("rts"));

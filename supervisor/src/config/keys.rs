@@ -199,6 +199,7 @@ pub const KEYS: &[ConfigKey] = &[
     other("curriculum.maps", ValueKind::TextsOf(TextForm::Map), "Maps that stages choose from: \"town\", a `.net.xml`, or a `.sumocfg`, of which the net and the buildings are used; all with population control. Evaluations use the first. Predictions and normalised positions are in the smallest box that holds all maps. [] = [\"town\"]."),
     other("curriculum.log", ValueKind::Text, "`curriculum.jsonl` of a run, whose stages `caraware simulate` repeats without a learner; \"\" = none."),
     other("task.kind", ValueKind::Choice(&["localisation", "driving"]), "Meaning of the trainer's output: a position for every connected vehicle, or steering and acceleration for every hero."),
+    other("task.action", ValueKind::Choice(&["place", "correction"]), "What an action of the localisation task names: a place in the box of the map, as in the paper, or a correction of the newest fix. `caraware train SCENARIO` corrects, unless it is set."),
     float("task.time_limit_s", "s", 0.1, 1e6, "Longest trajectory of a hero. Then it is truncated, and another hero starts."),
     other("vehicle.cav_model", ValueKind::Choice(&["kinematic", "dynamic"]), "Model of connected vehicles: without slip, or with tyres, load transfer, roll and pitch."),
     other("vehicle.other_model", ValueKind::Choice(&["kinematic", "dynamic"]), "Model of vehicles without sensors."),

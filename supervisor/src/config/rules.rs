@@ -66,7 +66,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
 }
 
 /// The learner that comes with caraware: it predicts positions.
-const LOCALISING_TRAINER: &str = "caraware.train";
+pub const LOCALISING_TRAINER: &str = "caraware.train";
 
 /// Heroes need the driving task, and the driving task needs heroes.
 fn task(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
