@@ -294,6 +294,24 @@ pub struct TaskConfig {
     pub action: LocalisationAction,
     /// Longest episode of a hero, seconds.
     pub time_limit_s: f64,
+    /// What moves the heroes.
+    pub driver: HeroDriver,
+    /// A hero's episode ends at a red light and when it drives against the traffic.
+    pub ends_at_infractions: bool,
+    /// Reward: "" for the task's own, or "package.module:function".
+    pub reward: String,
+    /// Checkpoint or file of parameters from which a new policy begins; "" for none.
+    pub begin_from: String,
+}
+
+/// What moves the heroes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum HeroDriver {
+    /// The trainer's actions.
+    Actions,
+    /// SUMO's own driver: the trainer only watches, for data sets and comparisons.
+    Sumo,
 }
 
 /// Contacts.

@@ -7,7 +7,7 @@ use crate::{
     config::{Config, TaskKind},
     run::MapInfo,
     sensor::SensorKind,
-    world::{ROUTE_AHEAD_M, SIGHT_M},
+    world::{LONGEST_GAP_S, PERSON_BESIDE_M, ROUTE_AHEAD_M, SENSING_M, SIGHT_M},
 };
 
 /// Range of the distance to the route, metres.
@@ -28,6 +28,8 @@ pub enum FieldSource {
     Delivery(SensorKind),
     /// The route and the traffic on it, which only a hero has.
     Route,
+    /// Road users, junctions, traffic lights and persons around a hero.
+    Around,
 }
 
 /// Which values of a field the normalised range stands for.
@@ -92,7 +94,7 @@ macro_rules! fields {
 }
 
 use FieldRange::{MapX, MapY, PlusMinus, UpTo, Within};
-use FieldSource::{Delivery, Measurement, Route};
+use FieldSource::{Around, Delivery, Measurement, Route};
 use SensorKind::{Gnss, Imu, Lidar, SpeedSteering, Ultrasonic};
 
 const ACCELERATION: FieldRange = PlusMinus(|config| config.observation.accel_range_mps2);
@@ -106,6 +108,18 @@ const OBJECT: FieldRange = PlusMinus(|config| config.lidar.range_m);
 const ECHO: FieldRange = UpTo(|config| config.ultrasonic.range_m);
 /// The end of the range stands for nothing in sight.
 const SIGHT: FieldRange = Within(0.0, SIGHT_M);
+
+/// Within this distance a hero senses road users.
+const NEAR: FieldRange = Within(-SENSING_M, SENSING_M);
+const VELOCITY: FieldRange = PlusMinus(|config| config.observation.speed_range_mps);
+const SINE: FieldRange = Within(-1.0, 1.0);
+const LENGTH: FieldRange = Within(0.0, 20.0);
+const WIDTH: FieldRange = Within(0.0, 4.0);
+/// The end of the range stands for no rival.
+const GAP: FieldRange = Within(0.0, LONGEST_GAP_S);
+const AHEAD: FieldRange = Within(0.0, SENSING_M);
+const BESIDE: FieldRange = Within(-PERSON_BESIDE_M, PERSON_BESIDE_M);
+const WALKING: FieldRange = Within(-3.0, 3.0);
 
 /// Range of the route at the `index`-th of [`ROUTE_AHEAD_M`].
 const fn ahead(index: usize) -> FieldRange {
@@ -223,6 +237,172 @@ fields! {
     UltrasonicAge: "ultrasonic_age", "s", AGE, Delivery(Ultrasonic);
     /// 1 while the ultrasonic sensors deliver, 0 in a blackout.
     UltrasonicValid: "ultrasonic_valid", "", VALIDITY, Delivery(Ultrasonic);
+    /// Nearest road user: its middle, forward of the rear axle.
+    User1X: "user_1_x", "m", NEAR, Around;
+    /// Nearest road user: its middle, to the left of the rear axle.
+    User1Y: "user_1_y", "m", NEAR, Around;
+    /// Nearest road user: cosine of its heading from the hero's.
+    User1Cos: "user_1_cos", "", SINE, Around;
+    /// Nearest road user: sine of its heading from the hero's.
+    User1Sin: "user_1_sin", "", SINE, Around;
+    /// Nearest road user: velocity, forward.
+    User1Forward: "user_1_forward", "m/s", VELOCITY, Around;
+    /// Nearest road user: velocity, to the left.
+    User1Left: "user_1_left", "m/s", VELOCITY, Around;
+    /// Nearest road user: length, 0 for none.
+    User1Length: "user_1_length", "m", LENGTH, Around;
+    /// Nearest road user: width, 0 for none.
+    User1Width: "user_1_width", "m", WIDTH, Around;
+    /// Second nearest road user: its middle, forward of the rear axle.
+    User2X: "user_2_x", "m", NEAR, Around;
+    /// Second nearest road user: its middle, to the left of the rear axle.
+    User2Y: "user_2_y", "m", NEAR, Around;
+    /// Second nearest road user: cosine of its heading from the hero's.
+    User2Cos: "user_2_cos", "", SINE, Around;
+    /// Second nearest road user: sine of its heading from the hero's.
+    User2Sin: "user_2_sin", "", SINE, Around;
+    /// Second nearest road user: velocity, forward.
+    User2Forward: "user_2_forward", "m/s", VELOCITY, Around;
+    /// Second nearest road user: velocity, to the left.
+    User2Left: "user_2_left", "m/s", VELOCITY, Around;
+    /// Second nearest road user: length, 0 for none.
+    User2Length: "user_2_length", "m", LENGTH, Around;
+    /// Second nearest road user: width, 0 for none.
+    User2Width: "user_2_width", "m", WIDTH, Around;
+    /// Third nearest road user: its middle, forward of the rear axle.
+    User3X: "user_3_x", "m", NEAR, Around;
+    /// Third nearest road user: its middle, to the left of the rear axle.
+    User3Y: "user_3_y", "m", NEAR, Around;
+    /// Third nearest road user: cosine of its heading from the hero's.
+    User3Cos: "user_3_cos", "", SINE, Around;
+    /// Third nearest road user: sine of its heading from the hero's.
+    User3Sin: "user_3_sin", "", SINE, Around;
+    /// Third nearest road user: velocity, forward.
+    User3Forward: "user_3_forward", "m/s", VELOCITY, Around;
+    /// Third nearest road user: velocity, to the left.
+    User3Left: "user_3_left", "m/s", VELOCITY, Around;
+    /// Third nearest road user: length, 0 for none.
+    User3Length: "user_3_length", "m", LENGTH, Around;
+    /// Third nearest road user: width, 0 for none.
+    User3Width: "user_3_width", "m", WIDTH, Around;
+    /// Fourth nearest road user: its middle, forward of the rear axle.
+    User4X: "user_4_x", "m", NEAR, Around;
+    /// Fourth nearest road user: its middle, to the left of the rear axle.
+    User4Y: "user_4_y", "m", NEAR, Around;
+    /// Fourth nearest road user: cosine of its heading from the hero's.
+    User4Cos: "user_4_cos", "", SINE, Around;
+    /// Fourth nearest road user: sine of its heading from the hero's.
+    User4Sin: "user_4_sin", "", SINE, Around;
+    /// Fourth nearest road user: velocity, forward.
+    User4Forward: "user_4_forward", "m/s", VELOCITY, Around;
+    /// Fourth nearest road user: velocity, to the left.
+    User4Left: "user_4_left", "m/s", VELOCITY, Around;
+    /// Fourth nearest road user: length, 0 for none.
+    User4Length: "user_4_length", "m", LENGTH, Around;
+    /// Fourth nearest road user: width, 0 for none.
+    User4Width: "user_4_width", "m", WIDTH, Around;
+    /// Fifth nearest road user: its middle, forward of the rear axle.
+    User5X: "user_5_x", "m", NEAR, Around;
+    /// Fifth nearest road user: its middle, to the left of the rear axle.
+    User5Y: "user_5_y", "m", NEAR, Around;
+    /// Fifth nearest road user: cosine of its heading from the hero's.
+    User5Cos: "user_5_cos", "", SINE, Around;
+    /// Fifth nearest road user: sine of its heading from the hero's.
+    User5Sin: "user_5_sin", "", SINE, Around;
+    /// Fifth nearest road user: velocity, forward.
+    User5Forward: "user_5_forward", "m/s", VELOCITY, Around;
+    /// Fifth nearest road user: velocity, to the left.
+    User5Left: "user_5_left", "m/s", VELOCITY, Around;
+    /// Fifth nearest road user: length, 0 for none.
+    User5Length: "user_5_length", "m", LENGTH, Around;
+    /// Fifth nearest road user: width, 0 for none.
+    User5Width: "user_5_width", "m", WIDTH, Around;
+    /// Sixth nearest road user: its middle, forward of the rear axle.
+    User6X: "user_6_x", "m", NEAR, Around;
+    /// Sixth nearest road user: its middle, to the left of the rear axle.
+    User6Y: "user_6_y", "m", NEAR, Around;
+    /// Sixth nearest road user: cosine of its heading from the hero's.
+    User6Cos: "user_6_cos", "", SINE, Around;
+    /// Sixth nearest road user: sine of its heading from the hero's.
+    User6Sin: "user_6_sin", "", SINE, Around;
+    /// Sixth nearest road user: velocity, forward.
+    User6Forward: "user_6_forward", "m/s", VELOCITY, Around;
+    /// Sixth nearest road user: velocity, to the left.
+    User6Left: "user_6_left", "m/s", VELOCITY, Around;
+    /// Sixth nearest road user: length, 0 for none.
+    User6Length: "user_6_length", "m", LENGTH, Around;
+    /// Sixth nearest road user: width, 0 for none.
+    User6Width: "user_6_width", "m", WIDTH, Around;
+    /// Seventh nearest road user: its middle, forward of the rear axle.
+    User7X: "user_7_x", "m", NEAR, Around;
+    /// Seventh nearest road user: its middle, to the left of the rear axle.
+    User7Y: "user_7_y", "m", NEAR, Around;
+    /// Seventh nearest road user: cosine of its heading from the hero's.
+    User7Cos: "user_7_cos", "", SINE, Around;
+    /// Seventh nearest road user: sine of its heading from the hero's.
+    User7Sin: "user_7_sin", "", SINE, Around;
+    /// Seventh nearest road user: velocity, forward.
+    User7Forward: "user_7_forward", "m/s", VELOCITY, Around;
+    /// Seventh nearest road user: velocity, to the left.
+    User7Left: "user_7_left", "m/s", VELOCITY, Around;
+    /// Seventh nearest road user: length, 0 for none.
+    User7Length: "user_7_length", "m", LENGTH, Around;
+    /// Seventh nearest road user: width, 0 for none.
+    User7Width: "user_7_width", "m", WIDTH, Around;
+    /// Eighth nearest road user: its middle, forward of the rear axle.
+    User8X: "user_8_x", "m", NEAR, Around;
+    /// Eighth nearest road user: its middle, to the left of the rear axle.
+    User8Y: "user_8_y", "m", NEAR, Around;
+    /// Eighth nearest road user: cosine of its heading from the hero's.
+    User8Cos: "user_8_cos", "", SINE, Around;
+    /// Eighth nearest road user: sine of its heading from the hero's.
+    User8Sin: "user_8_sin", "", SINE, Around;
+    /// Eighth nearest road user: velocity, forward.
+    User8Forward: "user_8_forward", "m/s", VELOCITY, Around;
+    /// Eighth nearest road user: velocity, to the left.
+    User8Left: "user_8_left", "m/s", VELOCITY, Around;
+    /// Eighth nearest road user: length, 0 for none.
+    User8Length: "user_8_length", "m", LENGTH, Around;
+    /// Eighth nearest road user: width, 0 for none.
+    User8Width: "user_8_width", "m", WIDTH, Around;
+    /// Next junction of the route: distance to its stop line.
+    Junction1Gap: "junction_1_gap", "m", SIGHT, Around;
+    /// Next junction of the route: 1 with right of way, 0 without.
+    Junction1Priority: "junction_1_priority", "", VALIDITY, Around;
+    /// Next junction of the route: time until the next rival reaches the hero's way.
+    Junction1Rival: "junction_1_rival", "s", GAP, Around;
+    /// Second next junction of the route: distance to its stop line.
+    Junction2Gap: "junction_2_gap", "m", SIGHT, Around;
+    /// Second next junction of the route: 1 with right of way, 0 without.
+    Junction2Priority: "junction_2_priority", "", VALIDITY, Around;
+    /// Second next junction of the route: time until the next rival reaches the hero's way.
+    Junction2Rival: "junction_2_rival", "s", GAP, Around;
+    /// Third next junction of the route: distance to its stop line.
+    Junction3Gap: "junction_3_gap", "m", SIGHT, Around;
+    /// Third next junction of the route: 1 with right of way, 0 without.
+    Junction3Priority: "junction_3_priority", "", VALIDITY, Around;
+    /// Third next junction of the route: time until the next rival reaches the hero's way.
+    Junction3Rival: "junction_3_rival", "s", GAP, Around;
+    /// Next traffic light of the route: distance to its stop line.
+    Light1Gap: "light_1_gap", "m", SIGHT, Around;
+    /// Next traffic light of the route: 1 green, ½ yellow, 0 red.
+    Light1Green: "light_1_green", "", VALIDITY, Around;
+    /// Second next traffic light of the route: distance to its stop line.
+    Light2Gap: "light_2_gap", "m", SIGHT, Around;
+    /// Second next traffic light of the route: 1 green, ½ yellow, 0 red.
+    Light2Green: "light_2_green", "", VALIDITY, Around;
+    /// Nearest person beside the route: distance along the route.
+    Person1Ahead: "person_1_ahead", "m", AHEAD, Around;
+    /// Nearest person beside the route: distance to the left of the route.
+    Person1Left: "person_1_left", "m", BESIDE, Around;
+    /// Nearest person beside the route: speed to the left.
+    Person1Speed: "person_1_speed", "m/s", WALKING, Around;
+    /// Second nearest person beside the route: distance along the route.
+    Person2Ahead: "person_2_ahead", "m", AHEAD, Around;
+    /// Second nearest person beside the route: distance to the left of the route.
+    Person2Left: "person_2_left", "m", BESIDE, Around;
+    /// Second nearest person beside the route: speed to the left.
+    Person2Speed: "person_2_speed", "m/s", WALKING, Around;
 }
 
 /// Some fields of a preset.
@@ -256,7 +436,7 @@ const PAPER: PresetPart = PresetPart::Named(&[
 const WHEELS: PresetPart = PresetPart::Named(&[Field::Speed, Field::Steering]);
 
 /// Every preset of `observation.fields`.
-pub const FIELD_PRESETS: [FieldPreset; 4] = [
+pub const FIELD_PRESETS: [FieldPreset; 5] = [
     FieldPreset {
         name: "paper",
         parts: &[PAPER],
@@ -268,6 +448,10 @@ pub const FIELD_PRESETS: [FieldPreset; 4] = [
     FieldPreset {
         name: "driving",
         parts: &[WHEELS, PresetPart::All(Route)],
+    },
+    FieldPreset {
+        name: "driver",
+        parts: &[WHEELS, PresetPart::All(Route), PresetPart::All(Around)],
     },
     FieldPreset {
         name: "ultrasonic",
@@ -302,7 +486,7 @@ impl FieldSource {
     pub fn sensor(self) -> Option<SensorKind> {
         match self {
             Measurement(sensor) | Delivery(sensor) => Some(sensor),
-            Route => None,
+            Route | Around => None,
         }
     }
 
@@ -311,7 +495,7 @@ impl FieldSource {
     pub fn task(self) -> Option<TaskKind> {
         match self {
             Measurement(_) | Delivery(_) => None,
-            Route => Some(TaskKind::Driving),
+            Route | Around => Some(TaskKind::Driving),
         }
     }
 }
@@ -335,12 +519,21 @@ impl Field {
         FIELDS.iter().find(|spec| spec.name == name).map(|spec| spec.field)
     }
 
+    /// Place of the field in [`crate::world::HeroView::around`]; `None` for one that shows something else.
+    #[must_use]
+    pub const fn place_around(self) -> Option<usize> {
+        match self.spec().source {
+            Around => Some(self as usize - Self::User1X as usize),
+            _ => None,
+        }
+    }
+
     /// Bit of the sensor that the field is a measurement of; 0 for what is known while every sensor is dark.
     #[must_use]
     pub const fn measurement_bit(self) -> u32 {
         match self.spec().source {
             Measurement(sensor) => sensor.bit(),
-            Delivery(_) | Route => 0,
+            Delivery(_) | Route | Around => 0,
         }
     }
 }
@@ -388,6 +581,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
+    use crate::world::AROUND;
 
     #[test]
     fn names_are_unique_and_lead_back_to_their_field() {
@@ -440,6 +634,10 @@ mod tests {
             "signal_gap",
         ];
         assert_eq!(names("driving"), driving);
+        let driver = names("driver");
+        assert_eq!(driver[..16], driving);
+        assert_eq!(driver.len(), 16 + AROUND);
+        assert_eq!((driver[16], driver[98]), ("user_1_x", "person_2_speed"));
         let (ultrasonic, caraware) = (names("ultrasonic"), names("caraware"));
         assert_eq!(ultrasonic[..11], caraware);
         assert_eq!(

@@ -168,7 +168,9 @@ pub fn table() -> Vec<TypeLayout> {
             index,
             edge,
             signal,
-            link
+            link,
+            way,
+            reserved
         }),
         layout!(HeroView {
             route_m,
@@ -179,7 +181,7 @@ pub fn table() -> Vec<TypeLayout> {
             leader_speed_mps,
             signal_gap_m,
             vehicle,
-            reserved
+            around
         }),
         layout!(EgoPose {
             front_x_m,

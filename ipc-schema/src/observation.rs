@@ -1,6 +1,6 @@
 //! `observation`: what every connected vehicle senses at a tick, one row for each slot.
 
-use crate::section::payload_layout;
+use crate::{section::payload_layout, world};
 
 /// `vehicle` value of an empty slot.
 pub const EMPTY_SLOT: u32 = u32::MAX;
@@ -35,6 +35,40 @@ pub const CLIPPED: u32 = 1 << 3;
 /// The vehicle did not drive to where it is: it was set onto SUMO's position ([`crate::world::RESYNCHRONISED`]). Its trajectory was cut at
 /// the previous tick ([`TRUNCATED`]), and a new one begins here with fresh sensors.
 pub const RESYNCHRONISED: u32 = 1 << 4;
+/// Beside [`TERMINATED`]: the hero collided.
+pub const ENDED_BY_COLLISION: u32 = 1 << 5;
+/// Beside [`TERMINATED`]: the hero left the road.
+pub const ENDED_OFF_ROAD: u32 = 1 << 6;
+/// Beside [`TERMINATED`]: the hero arrived.
+pub const ENDED_BY_ARRIVAL: u32 = 1 << 7;
+/// Beside [`TERMINATED`]: the hero ran a red light.
+pub const ENDED_AT_RED: u32 = 1 << 8;
+/// Beside [`TERMINATED`]: the hero drove against the traffic.
+pub const ENDED_AGAINST_TRAFFIC: u32 = 1 << 9;
+/// Beside [`TRUNCATED`]: the hero's time limit. Without it, the run's episode ended.
+pub const ENDED_BY_TIME: u32 = 1 << 10;
+
+/// The bits of a slot's end for a hero's bits of [`crate::world::HERO_ENDS`].
+#[must_use]
+pub const fn end_bits(hero_ends: u32) -> u32 {
+    let mut bits = 0;
+    let pairs = [
+        (world::COLLIDED, ENDED_BY_COLLISION),
+        (world::OFF_ROAD, ENDED_OFF_ROAD),
+        (world::ARRIVED, ENDED_BY_ARRIVAL),
+        (world::RED_LIGHT, ENDED_AT_RED),
+        (world::AGAINST_TRAFFIC, ENDED_AGAINST_TRAFFIC),
+        (world::TIME_LIMIT, ENDED_BY_TIME),
+    ];
+    let mut place = 0;
+    while place < pairs.len() {
+        if hero_ends & pairs[place].0 != 0 {
+            bits |= pairs[place].1;
+        }
+        place += 1;
+    }
+    bits
+}
 
 payload_layout! {
     /// Layout of an `observation` message for `n` slots, `d` numbers in a row and `k` IMU samples in a tick.
@@ -59,7 +93,8 @@ payload_layout! {
         id_hash: u64, [slots];
         /// `u32 [n]`: dense vehicle index within the episode, or [`EMPTY_SLOT`].
         vehicle: u32, [slots];
-        /// `u32 [n]`: bits [`VALID`], [`TERMINATED`], [`TRUNCATED`], [`CLIPPED`], [`RESYNCHRONISED`].
+        /// `u32 [n]`: bits [`VALID`], [`TERMINATED`], [`TRUNCATED`], [`CLIPPED`], [`RESYNCHRONISED`], and why a hero's trajectory
+        /// ended.
         flags: u32, [slots];
         /// `u32 [n]`: bits of the sensors that deliver ([`crate::sensor::SensorKind::bit`]). A sensor that the carrier lacks never has its bit
         /// set.

@@ -277,7 +277,19 @@ pub struct RoutePoint {
     pub signal: u32,
     /// Link of that traffic light that controls the hero.
     pub link: u32,
+    /// What begins at this point, from here to the next point with another value: [`ON_EDGE`], or a way across a junction with
+    /// [`RIGHT_OF_WAY`] or [`YIELDS`].
+    pub way: u32,
+    /// Zero.
+    pub reserved: u32,
 }
+
+/// [`RoutePoint::way`] on an edge.
+pub const ON_EDGE: u32 = 0;
+/// [`RoutePoint::way`] across a junction on which the hero has right of way.
+pub const RIGHT_OF_WAY: u32 = 1;
+/// [`RoutePoint::way`] across a junction on which others may have right of way.
+pub const YIELDS: u32 = 2;
 
 /// First eight bytes of the BLAKE3 hash of a SUMO id, little endian.
 #[must_use]

@@ -19,8 +19,12 @@ pub const TIME_LIMIT: u32 = 1 << 5;
 /// The action for this tick was refused; the last valid one was held.
 pub const ACTION_REFUSED: u32 = 1 << 6;
 
+/// The front bumper of a hero has crossed a stop line whose signal is red: its episode ends.
+pub const RED_LIGHT: u32 = 1 << 7;
+/// A hero drives against the direction of the lane it is on: its episode ends.
+pub const AGAINST_TRAFFIC: u32 = 1 << 8;
 /// It is led along its path as if on rails, because no driving would keep it there.
-pub const GUIDED: u32 = 1 << 7;
+pub const GUIDED: u32 = 1 << 9;
 
 /// One road user at the end of a tick.
 ///
@@ -71,7 +75,8 @@ pub struct VehicleState {
     pub kind: u32,
     /// SUMO's signal bits.
     pub signals: u32,
-    /// Bits [`RESYNCHRONISED`], [`APPEARED`], [`COLLIDED`], [`OFF_ROAD`], [`ARRIVED`], [`TIME_LIMIT`], [`ACTION_REFUSED`], [`GUIDED`].
+    /// Bits [`RESYNCHRONISED`], [`APPEARED`], [`COLLIDED`], [`OFF_ROAD`], [`ARRIVED`], [`TIME_LIMIT`], [`ACTION_REFUSED`],
+    /// [`RED_LIGHT`], [`AGAINST_TRAFFIC`], [`GUIDED`].
     pub flags: u32,
     /// Distance between the reference and SUMO's own path (lane changes spread in time, kinks rounded), metres.
     pub reference_offset_m: f32,
@@ -108,16 +113,48 @@ pub struct SubStep {
 }
 
 /// Bits that end a hero's episode; [`TIME_LIMIT`] alone cuts it, the others terminate it.
-pub const HERO_ENDS: u32 = COLLIDED | OFF_ROAD | ARRIVED | TIME_LIMIT;
+pub const HERO_ENDS: u32 = COLLIDED | OFF_ROAD | ARRIVED | TIME_LIMIT | RED_LIGHT | AGAINST_TRAFFIC;
 
 /// Distances ahead, along the route, of the route points that a hero sees, metres.
 pub const ROUTE_AHEAD_M: [f64; 4] = [5.0, 10.0, 20.0, 40.0];
 /// Distance at which a hero sees road users and signals on its route, metres.
 pub const SIGHT_M: f64 = 100.0;
 
+/// Distance within which a hero senses road users around it, metres.
+pub const SENSING_M: f64 = 50.0;
+/// Nearest road users that a hero senses.
+pub const SENSED_USERS: usize = 8;
+/// Numbers for each of them: x and y of its middle (m), cosine and sine of its heading, its velocity forward and to the left (m/s), all in
+/// the hero's body frame; length and width (m). Without a road user: both distances [`SENSING_M`], all others 0.
+pub const USER_COLUMNS: usize = 8;
+/// Next junctions of its route that a hero sees.
+pub const SEEN_CONFLICTS: usize = 3;
+/// Numbers for each of them: distance from the front bumper to its stop line (m), 1 if the hero has right of way there and 0 if not, and the
+/// time until the next rival reaches the hero's way across it (s). Without a junction: [`SIGHT_M`], 1, [`LONGEST_GAP_S`].
+pub const CONFLICT_COLUMNS: usize = 3;
+/// Time to a rival's arrival beyond which there is none, seconds.
+pub const LONGEST_GAP_S: f64 = 10.0;
+/// Next traffic lights of its route that a hero sees.
+pub const SEEN_SIGNALS: usize = 2;
+/// Numbers for each of them: distance from the front bumper to its stop line (m), and 1 for green, ½ for yellow, 0 for red. Without a
+/// traffic light: [`SIGHT_M`], 1.
+pub const SIGNAL_COLUMNS: usize = 2;
+/// Nearest persons beside its route that a hero sees.
+pub const SEEN_PERSONS: usize = 2;
+/// Numbers for each of them: distance along the route from the front bumper (m), to the left of the route (m), and speed to the left (m/s).
+/// Without a person: [`SENSING_M`], [`PERSON_BESIDE_M`], 0.
+pub const PERSON_COLUMNS: usize = 3;
+/// Distance beside its route within which a hero watches persons, metres.
+pub const PERSON_BESIDE_M: f64 = 10.0;
+/// Numbers of [`HeroView::around`]: road users, junctions, traffic lights, persons.
+pub const AROUND: usize = SENSED_USERS * USER_COLUMNS
+    + SEEN_CONFLICTS * CONFLICT_COLUMNS
+    + SEEN_SIGNALS * SIGNAL_COLUMNS
+    + SEEN_PERSONS * PERSON_COLUMNS;
+
 /// A hero's view of its route and of the traffic on it, at the end of a tick.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Default, Pod, Zeroable)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub struct HeroView {
     /// Points of its route [`ROUTE_AHEAD_M`] ahead, forward and left of the rear axle, body frame, metres.
     pub route_m: [[f32; 2]; 4],
@@ -135,8 +172,15 @@ pub struct HeroView {
     pub signal_gap_m: f32,
     /// Dense index of the hero within the episode.
     pub vehicle: u32,
-    /// Zero.
-    pub reserved: u32,
+    /// What is around it: [`SENSED_USERS`] road users, [`SEEN_CONFLICTS`] junctions, [`SEEN_SIGNALS`] traffic lights and [`SEEN_PERSONS`]
+    /// persons, the nearest of each first.
+    pub around: [f32; AROUND],
+}
+
+impl Default for HeroView {
+    fn default() -> Self {
+        Self::zeroed()
+    }
 }
 
 payload_layout! {

@@ -4,11 +4,11 @@ use ipc_schema::{
     block::BlockError,
     config::{BlackoutPolicy, Config},
     header::{FIRST_OF_EPISODE, MessageHeader},
-    observation::{AGE_COLUMNS, CLIPPED, ObservationLayout, ObservationSections, VALID},
+    observation::{AGE_COLUMNS, CLIPPED, ObservationLayout, ObservationSections, VALID, end_bits},
     run::MapInfo,
     sensor::SensorKind,
     traffic::Kind,
-    world::{ARRIVED, COLLIDED, HeroView, OFF_ROAD, RESYNCHRONISED, SubStep, TIME_LIMIT, VehicleState},
+    world::{COLLIDED, HERO_ENDS, HeroView, RESYNCHRONISED, SubStep, TIME_LIMIT, VehicleState},
 };
 use serde::{Deserialize, Serialize};
 use sim_core::geodesy::{GeodesyError, Projection};
@@ -268,6 +268,9 @@ impl Sensing {
                 if is_cut(state) {
                     self.slots.cut(slot);
                 }
+                if self.agents == Kind::Hero {
+                    self.slots.note_end(slot, end_bits(state.flags & HERO_ENDS));
+                }
                 if state.flags & RESYNCHRONISED != 0 {
                     self.slots.restart(slot);
                 }
@@ -511,5 +514,5 @@ fn sub_step(state: &VehicleState) -> SubStep {
 
 /// True if a time limit cuts a hero's trajectory at this tick, rather than an end of its own.
 fn is_cut(state: &VehicleState) -> bool {
-    state.flags & TIME_LIMIT != 0 && state.flags & (COLLIDED | OFF_ROAD | ARRIVED) == 0
+    state.flags & HERO_ENDS == TIME_LIMIT
 }

@@ -63,6 +63,7 @@ fn settings(preview_s: f64) -> MirrorSettings {
         tick_s: 0.1,
         sub_steps: 10,
         ticks_per_step: 1,
+        hero_driver: config::HeroDriver::Actions,
     }
 }
 

@@ -38,6 +38,8 @@ struct CoreState {
     guided: ResynchronisationState,
     vehicle_steps: u64,
     contacts: ContactState,
+    #[serde(default)]
+    heroes: HeroCounts,
 }
 
 /// What this process adds to the run's report.
@@ -121,7 +123,7 @@ impl CoreProcess {
         let scene = Arc::clone(&scenes[0]);
         draw_chart(&membership, &scene)?;
         let actions = match membership.run.config.drives() {
-            true => Some(HeroPorts::open(&mut membership, scene)?),
+            true => Some(HeroPorts::open(&mut membership, scene, state.heroes)?),
             false => None,
         };
         membership.attach();
@@ -196,6 +198,7 @@ impl CoreProcess {
             guided: self.guidances.state()?,
             vehicle_steps: self.vehicle_steps,
             contacts: contacts.unwrap_or_default(),
+            heroes: self.actions.as_ref().map(HeroPorts::counts).unwrap_or_default(),
         };
         self.membership.store_episode_state(self.ticks, &state)
     }

@@ -77,6 +77,7 @@ fn a_tick_allocates_nothing() {
         tick_s: 0.1,
         sub_steps: 10,
         ticks_per_step: 3,
+        hero_driver: config::HeroDriver::Actions,
     };
     let mut mirror = Mirror::new(settings).unwrap();
     let metas: Vec<VehicleMeta> = (0..VEHICLES).map(meta).collect();

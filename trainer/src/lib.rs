@@ -815,6 +815,12 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("VALID", ipc_schema::observation::VALID)?;
     module.add("TERMINATED", ipc_schema::observation::TERMINATED)?;
     module.add("TRUNCATED", ipc_schema::observation::TRUNCATED)?;
+    module.add("ENDED_BY_COLLISION", ipc_schema::observation::ENDED_BY_COLLISION)?;
+    module.add("ENDED_OFF_ROAD", ipc_schema::observation::ENDED_OFF_ROAD)?;
+    module.add("ENDED_BY_ARRIVAL", ipc_schema::observation::ENDED_BY_ARRIVAL)?;
+    module.add("ENDED_AT_RED", ipc_schema::observation::ENDED_AT_RED)?;
+    module.add("ENDED_AGAINST_TRAFFIC", ipc_schema::observation::ENDED_AGAINST_TRAFFIC)?;
+    module.add("ENDED_BY_TIME", ipc_schema::observation::ENDED_BY_TIME)?;
     module.add("CLIPPED", ipc_schema::observation::CLIPPED)?;
     module.add("RESYNCHRONISED", ipc_schema::observation::RESYNCHRONISED)?;
     module.add("EMPTY_SLOT", ipc_schema::observation::EMPTY_SLOT)?;

@@ -99,6 +99,9 @@ impl SensorReadings {
             Field::Ultrasonic12 => f64::from(self.ultrasonic_m[11]),
             Field::UltrasonicAge => f64::from(self.ages_s[SensorKind::Ultrasonic.index()]),
             Field::UltrasonicValid => deliver(SensorKind::Ultrasonic.bit()),
+            around => around
+                .place_around()
+                .map_or(0.0, |place| f64::from(self.route.around[place])),
         }
     }
 }

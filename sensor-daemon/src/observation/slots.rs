@@ -17,6 +17,8 @@ pub struct Slot {
     seen: bool,
     /// The trajectory of its vehicle was cut at the last tick, rather than ended.
     cut: bool,
+    /// Bits that say why its trajectory ends, once its vehicle has gone.
+    why: u32,
 }
 
 const EMPTY: Slot = Slot {
@@ -25,6 +27,7 @@ const EMPTY: Slot = Slot {
     ended: 0,
     seen: false,
     cut: false,
+    why: 0,
 };
 
 /// All slots of a run. The number of slots never shrinks.
@@ -80,6 +83,11 @@ impl Slots {
         self.slots[number].cut = true;
     }
 
+    /// Notes why the trajectory in slot `number` ends at this tick: the slot reports these bits when its vehicle has gone.
+    pub fn note_end(&mut self, number: usize, bits: u32) {
+        self.slots[number].why = bits;
+    }
+
     /// Applies [`Slots::cut`] to the slot of `vehicle`, if it holds one.
     pub fn cut_vehicle(&mut self, vehicle: u32) {
         if let Some(&number) = self.of_vehicle.get(vehicle as usize)
@@ -109,6 +117,7 @@ impl Slots {
             vehicle,
             step: 0,
             cut: false,
+            why: 0,
             ..*slot
         };
         number
@@ -120,7 +129,7 @@ impl Slots {
             if slot.vehicle != EMPTY_SLOT && !slot.seen {
                 self.of_vehicle[slot.vehicle as usize] = EMPTY_SLOT;
                 *slot = Slot {
-                    ended: slot.ended | if slot.cut { TRUNCATED } else { TERMINATED },
+                    ended: slot.ended | slot.why | if slot.cut { TRUNCATED } else { TERMINATED },
                     ..EMPTY
                 };
                 self.leaving.push(number);

@@ -7,14 +7,16 @@ use ipc_schema::{
     ego::EgoPose,
     traffic::{Kind, RoutePoint, SIGNAL_LINKS, SignalMeta},
     world::{
-        ACTION_REFUSED, APPEARED, ARRIVED, COLLIDED, HERO_ENDS, HeroView, OFF_ROAD, ROUTE_AHEAD_M, SIGHT_M, TIME_LIMIT,
-        VehicleState,
+        ACTION_REFUSED, AGAINST_TRAFFIC, APPEARED, ARRIVED, COLLIDED, HERO_ENDS, HeroView, OFF_ROAD, RED_LIGHT,
+        ROUTE_AHEAD_M, SIGHT_M, TIME_LIMIT, VehicleState,
     },
 };
 
 pub mod action;
+pub mod log;
 pub mod ports;
 pub mod route;
+pub mod surroundings;
 
 use crate::{models::state::ControlInput, scene::Scene};
 use action::HeroAction;
@@ -22,6 +24,10 @@ use route::{HeroRoute, RoutePosition};
 
 /// A hero that is beside the road for this long is off the road, seconds.
 const OFF_ROAD_AFTER_S: f64 = 0.5;
+/// A hero that drives against the traffic for this long has done so, seconds.
+const AGAINST_TRAFFIC_AFTER_S: f64 = 1.0;
+/// Speed from which a hero drives against the traffic, m/s.
+const AGAINST_TRAFFIC_FROM_MPS: f32 = 0.5;
 /// A hero has arrived when its front bumper is this near to the end of its route, metres.
 const ARRIVED_WITHIN_M: f64 = 5.0;
 /// Part of the route behind and ahead of its last position that is searched for a hero, metres.
@@ -35,16 +41,23 @@ const PERSON_ROOM_M: f64 = 0.8;
 pub trait DrivableGround {
     /// True if vehicles drive there.
     fn is_on_road(&self, x_m: f64, y_m: f64) -> bool;
+
+    /// True if all lanes there lead against the heading `yaw_rad`.
+    fn is_against_traffic(&self, x_m: f64, y_m: f64, yaw_rad: f64) -> bool;
 }
 
 impl DrivableGround for Arc<Scene> {
     fn is_on_road(&self, x_m: f64, y_m: f64) -> bool {
         Scene::is_on_road(self, x_m, y_m)
     }
+
+    fn is_against_traffic(&self, x_m: f64, y_m: f64, yaw_rad: f64) -> bool {
+        Scene::is_against_traffic(self, x_m, y_m, yaw_rad)
+    }
 }
 
 /// Counts of heroes' episodes and actions, for the run's report.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 pub struct HeroCounts {
     /// Episodes of heroes that began.
     pub episodes: u64,
@@ -56,6 +69,10 @@ pub struct HeroCounts {
     pub arrived: u64,
     /// Cut by the time limit.
     pub time_limit: u64,
+    /// Red lights run, whether or not the episode ends there.
+    pub red_lights: u64,
+    /// Times that a hero drove against the traffic, whether or not its episode ends there.
+    pub against_traffic: u64,
     /// Actions that were refused: not a number, or out of range.
     pub refused_actions: u64,
 }
@@ -82,6 +99,9 @@ struct HeroTrip {
     /// The first refusal has been returned.
     reported: bool,
     off_road_ticks: u32,
+    against_ticks: u32,
+    /// Station of the front bumper at the last tick, metres.
+    front_station_m: Option<f64>,
     ticks: u64,
     over: bool,
 }
@@ -92,6 +112,8 @@ pub struct DrivingTask<G> {
     ground: G,
     limits: config::VehicleConfig,
     off_road_ticks: u32,
+    against_ticks: u32,
+    ends_at_infractions: bool,
     time_limit_ticks: u64,
     episode: Option<u64>,
     trips: BTreeMap<u32, HeroTrip>,
@@ -109,6 +131,8 @@ impl<G: DrivableGround> DrivingTask<G> {
             ground,
             limits: config.vehicle.clone(),
             off_road_ticks: ticks(OFF_ROAD_AFTER_S) as u32,
+            against_ticks: ticks(AGAINST_TRAFFIC_AFTER_S) as u32,
+            ends_at_infractions: config.task.ends_at_infractions,
             time_limit_ticks: ticks(config.task.time_limit_s) as u64,
             episode: None,
             trips: BTreeMap::new(),
@@ -121,6 +145,11 @@ impl<G: DrivableGround> DrivingTask<G> {
     #[must_use]
     pub fn counts(&self) -> HeroCounts {
         self.counts
+    }
+
+    /// Continues from the counts of an earlier process.
+    pub fn restore_counts(&mut self, counts: HeroCounts) {
+        self.counts = counts;
     }
 
     /// Forgets everything when a new episode begins.
@@ -186,7 +215,8 @@ impl<G: DrivableGround> DrivingTask<G> {
             );
             let station_m = trip.follow(&states[row]);
             *view = self.view(&trip.route, station_m, row, states);
-            let flags = self.end_flags(&mut trip, &states[row], view);
+            let infractions = self.infractions(&mut trip, &states[row], station_m);
+            let flags = self.end_flags(&mut trip, &states[row], view, infractions);
             states[row].flags |= flags;
             poses.push(pose(&states[row]));
             self.trips.insert(vehicle, trip);
@@ -194,8 +224,34 @@ impl<G: DrivableGround> DrivingTask<G> {
         poses
     }
 
+    /// Counts the rules that a hero breaks in a tick; their bits, if they end its episode.
+    fn infractions(&mut self, trip: &mut HeroTrip, state: &VehicleState, station_m: f64) -> u32 {
+        let front_station_m = station_m + front_m(state);
+        let before_m = trip.front_station_m.replace(front_station_m);
+        let ran_red = before_m.is_some_and(|before_m| {
+            let crossed = |stop: &&route::StopLine| before_m < stop.station_m && stop.station_m <= front_station_m;
+            let is_red = |stop: &route::StopLine| matches!(self.letter(stop), Some(b'r' | b'R'));
+            trip.route.stop_lines().iter().filter(crossed).any(is_red)
+        });
+        let is_moving = state.velocity_body_mps[0] > AGAINST_TRAFFIC_FROM_MPS;
+        let is_against = is_moving && self.ground.is_against_traffic(state.x_m, state.y_m, state.yaw_rad);
+        trip.against_ticks = if is_against { trip.against_ticks + 1 } else { 0 };
+        let drove_against = trip.against_ticks == self.against_ticks;
+        if !trip.over {
+            self.counts.red_lights += u64::from(ran_red);
+            self.counts.against_traffic += u64::from(drove_against);
+        }
+        let bits = if ran_red { RED_LIGHT } else { 0 } | if drove_against { AGAINST_TRAFFIC } else { 0 };
+        if self.ends_at_infractions { bits } else { 0 }
+    }
+
+    /// The letter of the link at a stop line; `None` if its traffic light is not known.
+    fn letter(&self, stop: &route::StopLine) -> Option<u8> {
+        self.signals.get(&stop.signal)?.get(stop.link as usize).copied()
+    }
+
     /// Flags of a hero at the end of a tick: why its episode ends, and whether its action was refused.
-    fn end_flags(&mut self, trip: &mut HeroTrip, state: &VehicleState, view: &HeroView) -> u32 {
+    fn end_flags(&mut self, trip: &mut HeroTrip, state: &VehicleState, view: &HeroView, infractions: u32) -> u32 {
         let counts = &mut self.counts;
         counts.episodes += u64::from(state.flags & APPEARED != 0);
         let on_road = [0.0, front_m(state)].iter().all(|ahead_m| {
@@ -205,11 +261,12 @@ impl<G: DrivableGround> DrivingTask<G> {
         trip.off_road_ticks = if on_road { 0 } else { trip.off_road_ticks + 1 };
         trip.ticks += 1;
         let has_route = trip.route.length_m() > 0.0;
-        let mut flags = if std::mem::take(&mut trip.refused) {
+        let refused = if std::mem::take(&mut trip.refused) {
             ACTION_REFUSED
         } else {
             0
         };
+        let mut flags = refused | infractions;
         for (bit, holds) in [
             (OFF_ROAD, trip.off_road_ticks >= self.off_road_ticks),
             (ARRIVED, has_route && f64::from(view.route_left_m) <= ARRIVED_WITHIN_M),
@@ -253,20 +310,25 @@ impl<G: DrivableGround> DrivingTask<G> {
             leader_speed_mps: leader_speed_mps as f32,
             signal_gap_m: self.signal_gap_m(route, front_station_m) as f32,
             vehicle: hero.vehicle,
-            reserved: 0,
+            around: surroundings::Surroundings {
+                route,
+                states,
+                row,
+                station_m,
+                front_station_m,
+            }
+            .numbers(|stop| self.letter(stop)),
         }
     }
 
     /// Distance to the next stop line whose signal is not green, metres.
     fn signal_gap_m(&self, route: &HeroRoute, front_station_m: f64) -> f64 {
-        let is_closed = |signal: u32, link: u32| {
-            let letter = self.signals.get(&signal).and_then(|links| links.get(link as usize));
-            letter.is_some_and(|letter| matches!(letter, b'r' | b'R' | b'y' | b'Y' | b'u'))
-        };
+        let is_closed = |stop: &&route::StopLine| matches!(self.letter(stop), Some(b'r' | b'R' | b'y' | b'Y' | b'u'));
+        let ahead = |stop: &&route::StopLine| stop.station_m >= front_station_m;
         route
             .stop_lines()
             .iter()
-            .filter(|stop| stop.station_m >= front_station_m && is_closed(stop.signal, stop.link))
+            .filter(|stop| ahead(stop) && is_closed(stop))
             .map(|stop| stop.station_m - front_station_m)
             .fold(SIGHT_M, f64::min)
     }

@@ -4,6 +4,7 @@ use std::{collections::BTreeMap, sync::Arc};
 
 use ipc_schema::{
     block::{self, BlockError, Section},
+    config::HeroDriver,
     ego::{EgoPose, EgoPoseLayout},
     failure::{Failure, FailureKind},
     header::MessageHeader,
@@ -16,7 +17,10 @@ use ipc_schema::{
     world::{HeroView, VehicleState, WorldLayout},
 };
 
-use super::{DrivingTask, HeroCounts, RefusedAction};
+use super::{
+    DrivingTask, HeroCounts, RefusedAction,
+    log::{ActionLog, LoggedAction},
+};
 use crate::{mirror::Mirror, scene::Scene};
 
 /// Values of an action: steering and acceleration.
@@ -28,6 +32,10 @@ pub struct HeroPorts {
     driving: DrivingTask<Arc<Scene>>,
     /// SUMO's ids of the heroes of this episode, by dense index.
     ids: BTreeMap<u32, String>,
+    driver: HeroDriver,
+    log: ActionLog,
+    /// The episode that is logged.
+    logged_episode: Option<u64>,
     predictions: Subscriber,
     observations: Subscriber,
     poses: Publisher,
@@ -36,14 +44,20 @@ pub struct HeroPorts {
 }
 
 impl HeroPorts {
-    /// Opens the ports before the process is attached, so that the trainer's first prediction is not lost.
+    /// Opens the ports before the process is attached, so that the trainer's first prediction is not lost. `counts` are those of an
+    /// earlier process.
     ///
     /// # Errors
     /// A service cannot be opened.
-    pub fn open(membership: &mut RunMembership, scene: Arc<Scene>) -> Result<Self, Failure> {
+    pub fn open(membership: &mut RunMembership, scene: Arc<Scene>, counts: HeroCounts) -> Result<Self, Failure> {
+        let mut driving = DrivingTask::new(&membership.run.config, scene);
+        driving.restore_counts(counts);
         Ok(Self {
             ids: BTreeMap::new(),
-            driving: DrivingTask::new(&membership.run.config, scene),
+            driving,
+            driver: membership.run.config.task.driver,
+            log: ActionLog::new(&membership.run.run_dir, membership.run.env_index),
+            logged_episode: None,
             predictions: membership.subscriber(Channel::Prediction)?,
             observations: membership.subscriber(Channel::Observation)?,
             poses: membership.publisher(Channel::EgoPose)?,
@@ -72,7 +86,8 @@ impl HeroPorts {
         self.driving.add_signals(signals);
     }
 
-    /// Waits for the prediction to the observation before the tick of `frame`, and applies its actions to the heroes.
+    /// Waits for the prediction to the observation before the tick of `frame`, and applies its actions to the heroes. Actions that an
+    /// earlier process has logged for that tick are applied again.
     ///
     /// # Errors
     /// A port fails, or the prediction does not contain actions.
@@ -83,7 +98,48 @@ impl HeroPorts {
         mirror: &mut Mirror,
     ) -> Result<Wait, Failure> {
         self.driving.enter_episode(frame.episode);
-        let Some(before) = frame.tick.checked_sub(1) else {
+        if self.driver == HeroDriver::Sumo {
+            return Ok(Wait::Ready);
+        }
+        if self.logged_episode != Some(frame.episode) {
+            self.logged_episode = Some(frame.episode);
+            // A resumed run draws anew what it has not learnt; processes that are started again within a run do not.
+            let run = &membership.run;
+            let newest = if run.restart.is_some() {
+                u64::MAX
+            } else {
+                run.committed_ticks()
+            };
+            self.log
+                .begin(frame.episode, newest)
+                .map_err(|error| unlogged(&error))?;
+        }
+        if let Some(actions) = self.log.take(frame.tick) {
+            // The trainer may answer these ticks again: its answers must not fill the queue.
+            while self.predictions.receive()?.is_some() {}
+            while self.observations.receive()?.is_some() {}
+            self.apply(&actions, frame.tick, mirror);
+            return Ok(Wait::Ready);
+        }
+        let run = &membership.run;
+        if run.restart.is_none() && (run.first_tick() + 1..=run.committed_ticks()).contains(&frame.tick) {
+            return Err(Failure::new(
+                FailureKind::Run,
+                format!(
+                    "the actions that moved tick {} are not in the run's directory",
+                    frame.tick
+                ),
+            )
+            .with_help(
+                "resume the run by its name; or start another that begins with task.begin_from = \"CHECKPOINT\"",
+            ));
+        }
+        // The first tick of this process begins an episode: no hero has been seen before it.
+        let Some(before) = frame
+            .tick
+            .checked_sub(1)
+            .filter(|_| frame.tick > membership.run.first_tick())
+        else {
             return Ok(Wait::Ready);
         };
         let Some(answer) = next(membership, &self.predictions, Channel::Prediction, before)? else {
@@ -96,22 +152,31 @@ impl HeroPorts {
         if question.header().episode == frame.episode {
             let actions = actions(&answer, question.header().shape[0])?;
             let vehicles = vehicles(&question).map_err(unreadable)?;
-            for (vehicle, action) in vehicles
+            let of_heroes: Vec<LoggedAction> = vehicles
                 .iter()
                 .zip(actions)
                 .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT)
-            {
-                let (input, refusal) = self.driving.apply_action(*vehicle, *action);
-                mirror.set_input(*vehicle, input);
-                if let Some(RefusedAction { part, value, held }) = refusal {
-                    let (id, tick) = (self.ids.get(vehicle).map_or("", String::as_str), frame.tick);
-                    tracing::warn!(
-                        "hero {id}, tick {tick}: {part} {value} is not a number in -1 … 1; {held:?} is held; further refusals of this hero are only counted"
-                    );
-                }
+                .map(|(&vehicle, &action)| LoggedAction { vehicle, action })
+                .collect();
+            if let Err(error) = self.log.add(frame.tick, &of_heroes) {
+                tracing::warn!("actions of this episode are not logged any more: {error}");
             }
+            self.apply(&of_heroes, frame.tick, mirror);
         }
         Ok(Wait::Ready)
+    }
+
+    fn apply(&mut self, actions: &[LoggedAction], tick: u64, mirror: &mut Mirror) {
+        for LoggedAction { vehicle, action } in actions {
+            let (input, refusal) = self.driving.apply_action(*vehicle, *action);
+            mirror.set_input(*vehicle, input);
+            if let Some(RefusedAction { part, value, held }) = refusal {
+                let id = self.ids.get(vehicle).map_or("", String::as_str);
+                tracing::warn!(
+                    "hero {id}, tick {tick}: {part} {value} is not a number in -1 … 1; {held:?} is held; further refusals of this hero are only counted"
+                );
+            }
+        }
     }
 
     /// Ends the heroes' tick in the `world` message and returns their poses for SUMO.
@@ -199,6 +264,11 @@ fn vehicles(question: &Message) -> Result<&[u32], BlockError> {
     let header = question.header();
     let layout = ObservationLayout::of(header);
     block::view(question.payload(), layout.vehicle)
+}
+
+fn unlogged(error: &std::io::Error) -> Failure {
+    Failure::new(FailureKind::Run, format!("cannot log the actions of heroes: {error}"))
+        .with_help("free space for the run's directory")
 }
 
 fn unreadable(error: BlockError) -> Failure {

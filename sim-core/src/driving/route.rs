@@ -1,6 +1,6 @@
 //! The line that a hero should follow, by arc length ("station").
 
-use ipc_schema::traffic::{NO_SIGNAL, RoutePoint};
+use ipc_schema::traffic::{NO_SIGNAL, ON_EDGE, RIGHT_OF_WAY, RoutePoint};
 
 /// A traffic light on the route.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -11,6 +11,17 @@ pub struct StopLine {
     pub signal: u32,
     /// Its link.
     pub link: u32,
+}
+
+/// A way of the route across a junction.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Crossing {
+    /// Station at which it begins, metres.
+    pub from_m: f64,
+    /// Station at which it ends, metres.
+    pub to_m: f64,
+    /// No other way has precedence, where no traffic light decides.
+    pub has_right_of_way: bool,
 }
 
 /// A position relative to the route.
@@ -31,6 +42,9 @@ pub struct HeroRoute {
     stations_m: Vec<f64>,
     speed_limits_mps: Vec<f32>,
     stop_lines: Vec<StopLine>,
+    crossings: Vec<Crossing>,
+    /// The newest point lies on a way across a junction.
+    crosses: bool,
     first_edge_m: f64,
 }
 
@@ -48,6 +62,18 @@ impl HeroRoute {
         if point.edge == 0 {
             self.first_edge_m = station_m;
         }
+        if let Some(crossing) = self.crossings.last_mut().filter(|_| self.crosses) {
+            crossing.to_m = station_m;
+        }
+        let crosses = point.way != ON_EDGE;
+        if crosses && !self.crosses {
+            self.crossings.push(Crossing {
+                from_m: station_m,
+                to_m: station_m,
+                has_right_of_way: point.way == RIGHT_OF_WAY,
+            });
+        }
+        self.crosses = crosses;
         if point.signal != NO_SIGNAL {
             self.stop_lines.push(StopLine {
                 station_m,
@@ -73,6 +99,12 @@ impl HeroRoute {
     #[must_use]
     pub fn stop_lines(&self) -> &[StopLine] {
         &self.stop_lines
+    }
+
+    /// Ways across junctions in the order of the route.
+    #[must_use]
+    pub fn crossings(&self) -> &[Crossing] {
+        &self.crossings
     }
 
     /// Speed limit at a station, m/s; 0 without points.
@@ -150,6 +182,7 @@ mod tests {
                 speed_limit_mps: 10.0 + index as f32,
                 edge: index as u32,
                 signal: if index == 1 { 3 } else { NO_SIGNAL },
+                way: if index == 1 { RIGHT_OF_WAY } else { ON_EDGE },
                 ..RoutePoint::default()
             });
         }
@@ -167,6 +200,12 @@ mod tests {
             (10.0, 11.0)
         );
         assert_eq!(route.stop_lines()[0].station_m, 100.0);
+        let crossing = Crossing {
+            from_m: 100.0,
+            to_m: 150.0,
+            has_right_of_way: true,
+        };
+        assert_eq!(route.crossings(), [crossing]);
         assert_eq!(HeroRoute::default().at(0.0), None);
     }
 

@@ -10,6 +10,10 @@ impl DrivableGround for Strip {
     fn is_on_road(&self, _: f64, y_m: f64) -> bool {
         y_m.abs() < 2.0
     }
+
+    fn is_against_traffic(&self, _: f64, _: f64, yaw_rad: f64) -> bool {
+        libm::cos(yaw_rad) < -0.5
+    }
 }
 
 fn config() -> config::Config {

@@ -232,7 +232,7 @@ impl Mirror {
             return Err(MirrorError::TooMany { vehicle });
         }
         self.dismiss(vehicle);
-        let road_user = RoadUser::new(meta, &mut self.catalogue);
+        let road_user = RoadUser::new(meta, &mut self.catalogue, self.settings.hero_driver);
         if self.settings.preview().is_some() {
             let known = self.limits.len() as u32;
             let more = (known..=road_user.model()).map(|model| path_limits(self.catalogue.at(model)));

@@ -1,6 +1,7 @@
 //! One road user in the mirror: how it accepts SUMO's states and what it does in every tick between them.
 
 use ipc_schema::{
+    config::HeroDriver,
     traffic::{DISCONTINUOUS, Kind, TrafficState, VehicleMeta},
     world::{APPEARED, GUIDED, RESYNCHRONISED, SubStep, VehicleState},
 };
@@ -94,12 +95,12 @@ pub struct RoadUser {
 impl RoadUser {
     /// A road user that SUMO has announced.
     #[must_use]
-    pub fn new(meta: &VehicleMeta, catalogue: &mut ModelCatalogue) -> Self {
+    pub fn new(meta: &VehicleMeta, catalogue: &mut ModelCatalogue, driver: HeroDriver) -> Self {
         let model = catalogue.index_for(meta);
         let dimensions = catalogue.at(model).dimensions;
         let mover = if meta.kind == Kind::Person as u32 {
             Mover::Person(Person::default())
-        } else if meta.kind == Kind::Hero as u32 {
+        } else if meta.kind == Kind::Hero as u32 && driver == HeroDriver::Actions {
             Mover::Hero(Hero::default())
         } else {
             Mover::Vehicle {

@@ -21,6 +21,8 @@ pub struct MirrorSettings {
     pub sub_steps: u32,
     /// Ticks in a SUMO step.
     pub ticks_per_step: u32,
+    /// What moves the heroes.
+    pub hero_driver: config::HeroDriver,
 }
 
 impl MirrorSettings {
@@ -59,6 +61,7 @@ impl MirrorSettings {
             tick_s: run.config.run.tick_s,
             sub_steps: run.config.run.sub_steps,
             ticks_per_step: u32::try_from(run.ticks_per_frame()).unwrap_or(u32::MAX),
+            hero_driver: run.config.task.driver,
         }
     }
 

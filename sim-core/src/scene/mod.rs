@@ -222,6 +222,17 @@ impl Scene {
         self.road.under([x_m, y_m]).any(|(piece, _)| piece.surface.is_road())
     }
 
+    /// True if there are lanes at a point outside junctions, and all of them lead against the heading `yaw_rad`.
+    #[must_use]
+    pub fn is_against_traffic(&self, x_m: f64, y_m: f64, yaw_rad: f64) -> bool {
+        let (sin, cos) = libm::sincos(yaw_rad);
+        let mut against = self
+            .road
+            .lane_directions([x_m, y_m])
+            .map(|[dx, dy]| cos * dx + sin * dy < -0.5);
+        against.next().is_some_and(|first| first && against.all(|other| other))
+    }
+
     /// Height of the ground: of the road, or of the nearest one. Metres.
     #[must_use]
     pub fn ground_height_m(&self, x_m: f64, y_m: f64) -> f64 {

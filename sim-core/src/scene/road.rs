@@ -306,6 +306,16 @@ impl Road {
         self.parts_under(point).map(|(piece, _, height_m)| (piece, height_m))
     }
 
+    /// Directions, of length one, of the lanes outside junctions that `point` lies on.
+    pub fn lane_directions(&self, point: Point) -> impl Iterator<Item = Point> {
+        self.parts_under(point).filter_map(|(piece, part, _)| {
+            let is_on_edge = piece.surface == SurfaceKind::Lane && !piece.id.starts_with(':');
+            let [from, to] = [piece.shape_m.get(part)?, piece.shape_m.get(part + 1)?].map(|end| flat(*end));
+            let length_m = distance(from, to);
+            (is_on_edge && length_m > 0.0).then(|| from_to(from, to).map(|d| d / length_m))
+        })
+    }
+
     /// As [`Road::under`], with the part of the piece.
     pub(super) fn parts_under(&self, point: Point) -> impl Iterator<Item = (&RoadPiece, usize, f64)> {
         self.index.at(point).iter().filter_map(move |&entry| {

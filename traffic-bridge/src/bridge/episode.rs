@@ -251,7 +251,7 @@ impl Bridge {
                 return Ok(EpisodeEnd::Stopped);
             }
             if self.poses.is_some() {
-                let points = heroes::take_over(sumo, frame)?;
+                let points = heroes::take_over(sumo, frame, self.membership.run.config.task.driver)?;
                 self.outbox.publish_routes(&points, header)?;
             }
             let header = match interpolation {
@@ -362,7 +362,9 @@ impl Bridge {
         let Some(poses) = &self.poses else {
             return Ok(Wait::Ready);
         };
-        let Some(before) = self.totals.ticks.checked_sub(1) else {
+        // No pose comes before the first tick of this process.
+        let is_later = self.totals.ticks > self.membership.run.first_tick();
+        let Some(before) = self.totals.ticks.checked_sub(1).filter(|_| is_later) else {
             return Ok(Wait::Ready);
         };
         let Some(message) = self.membership.next(poses)? else {
@@ -380,7 +382,7 @@ impl Bridge {
         // Poses of the episode before belong to heroes that ended with it.
         if header.episode == self.episode_number(episode) {
             let poses = heroes::poses(&message).map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
-            heroes::apply(sumo, frame, poses)?;
+            heroes::apply(sumo, frame, poses, self.membership.run.config.task.driver)?;
         }
         Ok(Wait::Ready)
     }

@@ -9,6 +9,7 @@ pub mod route;
 
 use ipc_schema::{
     block::{self, BlockError},
+    config::HeroDriver,
     ego::{EgoPose, EgoPoseLayout},
     ports::Message,
     traffic::{Kind, MetaEvent, ROUTE_POINTS_PER_MESSAGE, RoutePoint},
@@ -29,18 +30,20 @@ pub fn poses(message: &Message) -> Result<&[EgoPose], BlockError> {
     block::view(message.payload(), EgoPoseLayout::of(message.header()).poses)
 }
 
-/// Takes control of the heroes that departed in this step and returns the points of their routes.
+/// Takes control of the heroes that departed in this step, unless SUMO drives them, and returns the points of their routes.
 ///
 /// # Errors
 /// SUMO does not know them.
-pub fn take_over(sumo: &mut Sumo, frame: &TrafficFrame) -> Result<Vec<RoutePoint>, SumoError> {
+pub fn take_over(sumo: &mut Sumo, frame: &TrafficFrame, driver: HeroDriver) -> Result<Vec<RoutePoint>, SumoError> {
     let mut points = Vec::new();
     let departed = frame
         .events
         .iter()
         .filter(|event| event.kind == Kind::Hero as u32 && event.event == MetaEvent::Departed as u32);
     for event in departed {
-        called("take over a hero", sumo.simulation_mut().take_over(event.vehicle))?;
+        if driver == HeroDriver::Actions {
+            called("take over a hero", sumo.simulation_mut().take_over(event.vehicle))?;
+        }
         let simulation = sumo.simulation();
         let lane = called("report a hero's lane", simulation.lane_index(event.vehicle))?;
         let lanes = called("list the lanes of a route", simulation.route_lanes(event.vehicle))?;
@@ -59,14 +62,15 @@ pub fn parts(points: &[RoutePoint]) -> impl Iterator<Item = &[RoutePoint]> {
     points.chunks(ROUTE_POINTS_PER_MESSAGE)
 }
 
-/// Moves the heroes of `frame` to their poses for the next step, and removes those whose episodes have ended. Skips a hero that
+/// Moves the heroes of `frame` to their poses for the next step, unless SUMO drives them, and removes those whose episodes have ended. Skips a hero that
 /// SUMO has removed.
 ///
 /// # Errors
 /// SUMO refuses.
-pub fn apply(sumo: &mut Sumo, frame: &TrafficFrame, poses: &[EgoPose]) -> Result<(), SumoError> {
+pub fn apply(sumo: &mut Sumo, frame: &TrafficFrame, poses: &[EgoPose], driver: HeroDriver) -> Result<(), SumoError> {
     for pose in poses {
-        if frame.states.iter().all(|state| state.vehicle != pose.vehicle) {
+        let stays = driver == HeroDriver::Sumo && pose.flags == 0;
+        if stays || frame.states.iter().all(|state| state.vehicle != pose.vehicle) {
             continue;
         }
         let (step_s, world_origin_m) = (sumo.step_s(), sumo.world_origin_m());

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use ipc_schema::traffic::{NO_SIGNAL, RoutePoint};
+use ipc_schema::traffic::{NO_SIGNAL, ON_EDGE, RIGHT_OF_WAY, RoutePoint, YIELDS};
 
 use crate::sumo::{
     convention::single,
@@ -85,7 +85,7 @@ impl RouteLine {
     fn add_edge(&mut self, edge: u32, from: &RawLane, to: &RawLane) {
         if from.lane == to.lane {
             for [x_m, y_m] in pairs(&from.shape) {
-                self.add(edge, [x_m, y_m], from.speed_limit);
+                self.add(edge, [x_m, y_m], from.speed_limit, ON_EDGE);
             }
             return;
         }
@@ -95,7 +95,7 @@ impl RouteLine {
             let over = t * t * (3.0 - 2.0 * t);
             let (a, b) = (along(&from.shape, share), along(&to.shape, share));
             let point = [a[0] + over * (b[0] - a[0]), a[1] + over * (b[1] - a[1])];
-            self.add(edge, point, from.speed_limit);
+            self.add(edge, point, from.speed_limit, ON_EDGE);
         }
     }
 
@@ -103,17 +103,19 @@ impl RouteLine {
         if let (Some(stop_line), Ok(signal)) = (self.points.last_mut(), u32::try_from(way.signal)) {
             (stop_line.signal, stop_line.link) = (signal, way.link);
         }
+        let precedence = if way.has_right_of_way { RIGHT_OF_WAY } else { YIELDS };
         for point in pairs(&way.shape) {
-            self.add(edge, point, way.speed_limit);
+            self.add(edge, point, way.speed_limit, precedence);
         }
     }
 
-    fn add(&mut self, edge: u32, [x_m, y_m]: [f64; 2], speed_limit_mps: f64) {
+    fn add(&mut self, edge: u32, [x_m, y_m]: [f64; 2], speed_limit_mps: f64, way: u32) {
         let speed_limit_mps = single(speed_limit_mps);
         if let Some(last) = self.points.last_mut()
             && (last.x_m - x_m).hypot(last.y_m - y_m) < SAME_POINT_M
         {
             last.speed_limit_mps = speed_limit_mps;
+            last.way = way;
             return;
         }
         self.points.push(RoutePoint {
@@ -125,6 +127,8 @@ impl RouteLine {
             edge,
             signal: NO_SIGNAL,
             link: 0,
+            way,
+            reserved: 0,
         });
     }
 }
@@ -176,6 +180,7 @@ mod tests {
             shape: vec![x, y, x + 10.0, f64::from(to_lane) * 3.0],
             signal,
             link: 7,
+            has_right_of_way: edge == 0,
         }
     }
 
@@ -188,6 +193,8 @@ mod tests {
         let limits: Vec<f32> = points.iter().map(|point| point.speed_limit_mps).collect();
         assert_eq!(limits, [10.0, 5.0, 10.0, 10.0]);
         assert_eq!((points[1].signal, points[1].link), (2, 7));
+        let ways: Vec<u32> = points.iter().map(|point| point.way).collect();
+        assert_eq!(ways, [ON_EDGE, RIGHT_OF_WAY, ON_EDGE, ON_EDGE]);
         assert!(
             points
                 .iter()

@@ -59,7 +59,9 @@ std::map<std::pair<std::string, std::string>, Light> lights() {
 }
 
 RawWay way(std::uint32_t edge, const std::string& from, const libsumo::TraCIConnection& link) {
-    RawWay result{edge, number_of(from), number_of(link.approachedLane), engine::Lane::getMaxSpeed(from), {}, -1, 0};
+    RawWay result{edge, number_of(from), number_of(link.approachedLane), engine::Lane::getMaxSpeed(from), {}, -1, 0,
+                  // SUMO's letter of a link that is major; those of traffic lights follow their program.
+                  link.state == "M"};
     std::string internal = link.approachedInternal;
     for (int count = 0; !internal.empty() && count < MAX_INTERNAL_LANES; ++count) {
         append(result.shape, internal);

@@ -129,6 +129,8 @@ pub mod ffi {
         signal: i32,
         /// Number of the way at that traffic light.
         link: u32,
+        /// No other way has precedence over it.
+        has_right_of_way: bool,
     }
 
     unsafe extern "C++" {

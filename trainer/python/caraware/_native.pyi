@@ -50,6 +50,12 @@ VALID: int
 TERMINATED: int
 """Bit of `flags`: the trajectory that held the slot a tick before ended there."""
 TRUNCATED: int
+ENDED_BY_COLLISION: int
+ENDED_OFF_ROAD: int
+ENDED_BY_ARRIVAL: int
+ENDED_AT_RED: int
+ENDED_AGAINST_TRAFFIC: int
+ENDED_BY_TIME: int
 """Bit of `flags`: the trajectory that held the slot a tick before was cut there."""
 CLIPPED: int
 """Bit of `flags`: a field of the observation was outside its range."""

@@ -1,0 +1,359 @@
+//! What a hero senses around it: road users, the junctions and traffic lights of its route, persons beside it.
+//!
+//! All of it is the truth of this tick within [`SENSING_M`]. A rival of a junction is a vehicle that would cross the hero's way there if
+//! it drove straight on at its speed.
+
+use ipc_schema::{
+    traffic::Kind,
+    world::{
+        AROUND, CONFLICT_COLUMNS, LONGEST_GAP_S, PERSON_BESIDE_M, PERSON_COLUMNS, SEEN_CONFLICTS, SEEN_PERSONS,
+        SEEN_SIGNALS, SENSED_USERS, SENSING_M, SIGHT_M, SIGNAL_COLUMNS, USER_COLUMNS, VehicleState,
+    },
+};
+
+use super::{
+    ahead,
+    route::{Crossing, HeroRoute, StopLine},
+};
+
+/// Half the width of the strip in which a rival would touch the hero, metres.
+const RIVAL_REACH_M: f64 = 2.5;
+/// Slower vehicles are no rivals: they wait, m/s.
+const RIVAL_FROM_MPS: f64 = 0.5;
+/// Places of a way across a junction at which rivals are looked for.
+const PLACES: u32 = 5;
+/// Farthest rival from the hero, metres.
+const RIVAL_SIGHT_M: f64 = 80.0;
+/// A stop line this near to the beginning of a way across a junction is that way's, metres.
+const SAME_LINE_M: f64 = 1.0;
+
+/// A hero among the road users of a tick.
+#[derive(Debug)]
+pub struct Surroundings<'a> {
+    /// Its route.
+    pub route: &'a HeroRoute,
+    /// All road users.
+    pub states: &'a [VehicleState],
+    /// Its row among them.
+    pub row: usize,
+    /// Station of its rear axle, metres.
+    pub station_m: f64,
+    /// Station of its front bumper, metres.
+    pub front_station_m: f64,
+}
+
+/// A road user near the hero.
+#[derive(Debug, Clone, Copy)]
+struct Neighbour<'a> {
+    state: &'a VehicleState,
+    square_m2: f64,
+    /// Its middle, world frame, metres.
+    middle_m: [f64; 2],
+    /// Velocity in the world frame, m/s.
+    velocity_mps: [f64; 2],
+}
+
+impl Surroundings<'_> {
+    /// The numbers of [`ipc_schema::world::HeroView::around`]; `letter` is that of a stop line's link.
+    #[must_use]
+    pub fn numbers(&self, letter: impl Fn(&StopLine) -> Option<u8>) -> [f32; AROUND] {
+        let mut numbers = [0.0; AROUND];
+        let near = self.neighbours();
+        let (users, rest) = numbers.split_at_mut(SENSED_USERS * USER_COLUMNS);
+        let (junctions, rest) = rest.split_at_mut(SEEN_CONFLICTS * CONFLICT_COLUMNS);
+        let (lights, persons) = rest.split_at_mut(SEEN_SIGNALS * SIGNAL_COLUMNS);
+        self.write_users(&near, users);
+        self.write_junctions(&near, &letter, junctions);
+        self.write_lights(&letter, lights);
+        self.write_persons(&near, persons);
+        numbers
+    }
+
+    fn hero(&self) -> &VehicleState {
+        &self.states[self.row]
+    }
+
+    /// Road users within [`RIVAL_SIGHT_M`], the nearest first; of two at one distance the one in the lower row.
+    fn neighbours(&self) -> Vec<Neighbour<'_>> {
+        let hero = self.hero();
+        let here = middle(hero);
+        let others = self.states.iter().enumerate().filter(|(row, _)| *row != self.row);
+        let mut near: Vec<Neighbour<'_>> = others
+            .filter(|(_, other)| {
+                let (dx, dy) = (other.x_m - hero.x_m, other.y_m - hero.y_m);
+                dx * dx + dy * dy < RIVAL_SIGHT_M * RIVAL_SIGHT_M
+            })
+            .map(|(_, state)| {
+                let middle_m = middle(state);
+                let (dx, dy) = (middle_m[0] - here[0], middle_m[1] - here[1]);
+                Neighbour {
+                    state,
+                    square_m2: dx * dx + dy * dy,
+                    middle_m,
+                    velocity_mps: velocity(state),
+                }
+            })
+            .collect();
+        near.sort_by(|a, b| a.square_m2.total_cmp(&b.square_m2));
+        near
+    }
+
+    fn write_users(&self, near: &[Neighbour<'_>], numbers: &mut [f32]) {
+        let hero = self.hero();
+        let (sin, cos) = libm::sincos(hero.yaw_rad);
+        let turned = |[x, y]: [f64; 2]| [cos * x + sin * y, cos * y - sin * x];
+        let mut users = near
+            .iter()
+            .filter(|other| !is_person(other.state) && other.square_m2 <= SENSING_M * SENSING_M);
+        for row in numbers.as_chunks_mut::<USER_COLUMNS>().0 {
+            *row = match users.next() {
+                None => [SENSING_M as f32, SENSING_M as f32, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+                Some(other) => {
+                    let [x, y] = turned([other.middle_m[0] - hero.x_m, other.middle_m[1] - hero.y_m]);
+                    let [forward, left] = turned(other.velocity_mps);
+                    let (sine, cosine) = libm::sincos(other.state.yaw_rad - hero.yaw_rad);
+                    let [x, y, cosine, sine, forward, left] =
+                        [x, y, cosine, sine, forward, left].map(|value| value as f32);
+                    [
+                        x,
+                        y,
+                        cosine,
+                        sine,
+                        forward,
+                        left,
+                        other.state.length_m,
+                        other.state.width_m,
+                    ]
+                }
+            };
+        }
+    }
+
+    fn write_junctions(&self, near: &[Neighbour<'_>], letter: &impl Fn(&StopLine) -> Option<u8>, numbers: &mut [f32]) {
+        let crossings = self.route.crossings();
+        let first = crossings.partition_point(|crossing| crossing.to_m <= self.front_station_m);
+        let mut crossings = crossings[first..]
+            .iter()
+            .filter(|crossing| crossing.from_m - self.front_station_m < SIGHT_M);
+        for row in numbers.as_chunks_mut::<CONFLICT_COLUMNS>().0 {
+            *row = match crossings.next() {
+                None => [SIGHT_M as f32, 1.0, LONGEST_GAP_S as f32],
+                Some(crossing) => {
+                    let stop = self.stop_line(crossing).and_then(letter);
+                    let has_right_of_way = stop.map_or(crossing.has_right_of_way, |letter| letter == b'G');
+                    [
+                        (crossing.from_m - self.front_station_m).max(0.0) as f32,
+                        f32::from(u8::from(has_right_of_way)),
+                        self.rival_s(crossing, near) as f32,
+                    ]
+                }
+            };
+        }
+    }
+
+    fn stop_line(&self, crossing: &Crossing) -> Option<&StopLine> {
+        let is_its = |stop: &&StopLine| (stop.station_m - crossing.from_m).abs() < SAME_LINE_M;
+        self.route.stop_lines().iter().find(is_its)
+    }
+
+    /// Time until the first rival reaches the hero's way across a junction, driving straight on; at most [`LONGEST_GAP_S`].
+    fn rival_s(&self, crossing: &Crossing, near: &[Neighbour<'_>]) -> f64 {
+        let mut soonest_s = LONGEST_GAP_S;
+        for number in 0..PLACES {
+            let share = f64::from(number) / f64::from(PLACES - 1);
+            let station_m = crossing.from_m + share * (crossing.to_m - crossing.from_m);
+            let (Some(place), Some(behind)) = (self.route.at(station_m), self.route.at(station_m - 0.5)) else {
+                continue;
+            };
+            let way = [(place[0] - behind[0]) * 2.0, (place[1] - behind[1]) * 2.0];
+            for rival in near.iter().filter(|other| !is_person(other.state)) {
+                let [vx, vy] = rival.velocity_mps;
+                let speed_mps = libm::sqrt(vx * vx + vy * vy);
+                // What drives along the hero's own way is a leader or a follower.
+                if speed_mps < RIVAL_FROM_MPS || (vx * way[0] + vy * way[1]) > 0.9 * speed_mps {
+                    continue;
+                }
+                let (dx, dy) = (place[0] - rival.middle_m[0], place[1] - rival.middle_m[1]);
+                let (along_m, beside_m) = ((dx * vx + dy * vy) / speed_mps, (dx * vy - dy * vx) / speed_mps);
+                let half_m = 0.5 * f64::from(rival.state.length_m);
+                if beside_m.abs() < RIVAL_REACH_M && along_m > -half_m {
+                    soonest_s = soonest_s.min((along_m - half_m).max(0.0) / speed_mps);
+                }
+            }
+        }
+        soonest_s
+    }
+
+    fn write_lights(&self, letter: &impl Fn(&StopLine) -> Option<u8>, numbers: &mut [f32]) {
+        let is_ahead = |stop: &&StopLine| {
+            stop.station_m >= self.front_station_m && stop.station_m - self.front_station_m < SIGHT_M
+        };
+        let mut stops = self.route.stop_lines().iter().filter(is_ahead);
+        for row in numbers.as_chunks_mut::<SIGNAL_COLUMNS>().0 {
+            *row = match stops.next() {
+                None => [SIGHT_M as f32, 1.0],
+                Some(stop) => {
+                    let green = match letter(stop) {
+                        Some(b'r' | b'R') => 0.0,
+                        Some(b'y' | b'Y' | b'u') => 0.5,
+                        _ => 1.0,
+                    };
+                    [(stop.station_m - self.front_station_m) as f32, green]
+                }
+            };
+        }
+    }
+
+    fn write_persons(&self, near: &[Neighbour<'_>], numbers: &mut [f32]) {
+        let mut persons: Vec<[f64; PERSON_COLUMNS]> = near
+            .iter()
+            .filter(|other| is_person(other.state))
+            .filter_map(|other| {
+                let end_m = self.front_station_m + SENSING_M;
+                let place = self.route.project(other.middle_m, self.station_m, end_m)?;
+                let ahead_m = place.station_m - self.front_station_m;
+                let [dx, dy] = place.direction;
+                let [vx, vy] = other.velocity_mps;
+                let is_beside = ahead_m > 0.0 && ahead_m < SENSING_M && place.left_m.abs() < PERSON_BESIDE_M;
+                is_beside.then_some([ahead_m, place.left_m, dx * vy - dy * vx])
+            })
+            .collect();
+        persons.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        let mut persons = persons.into_iter();
+        for row in numbers.as_chunks_mut::<PERSON_COLUMNS>().0 {
+            *row = persons
+                .next()
+                .unwrap_or([SENSING_M, PERSON_BESIDE_M, 0.0])
+                .map(|value| value as f32);
+        }
+        debug_assert_eq!(numbers.len(), SEEN_PERSONS * PERSON_COLUMNS);
+    }
+}
+
+fn is_person(state: &VehicleState) -> bool {
+    state.kind == Kind::Person as u32
+}
+
+/// The middle of a road user, world frame, metres.
+fn middle(state: &VehicleState) -> [f64; 2] {
+    if is_person(state) {
+        return [state.x_m, state.y_m];
+    }
+    ahead(state, f64::from(0.5 * state.length_m - state.rear_overhang_m))
+}
+
+/// Velocity in the world frame, m/s.
+fn velocity(state: &VehicleState) -> [f64; 2] {
+    let (sin, cos) = libm::sincos(state.yaw_rad);
+    let [forward, left, _] = state.velocity_body_mps.map(f64::from);
+    [cos * forward - sin * left, sin * forward + cos * left]
+}
+
+#[cfg(test)]
+mod tests {
+    use ipc_schema::traffic::{NO_SIGNAL, ON_EDGE, RoutePoint, YIELDS};
+
+    use super::*;
+
+    /// 200 m along x, with a junction from 100 m to 120 m.
+    fn route() -> HeroRoute {
+        let mut route = HeroRoute::default();
+        for (x_m, index, way) in [
+            (0.0, 0, ON_EDGE),
+            (100.0, 1, YIELDS),
+            (120.0, 2, ON_EDGE),
+            (200.0, 3, ON_EDGE),
+        ] {
+            route.push(&RoutePoint {
+                x_m,
+                index,
+                way,
+                signal: if index == 1 { 0 } else { NO_SIGNAL },
+                ..RoutePoint::default()
+            });
+        }
+        route
+    }
+
+    fn user(kind: Kind, [x_m, y_m]: [f64; 2], yaw_rad: f64, speed_mps: f32) -> VehicleState {
+        VehicleState {
+            x_m,
+            y_m,
+            yaw_rad,
+            kind: kind as u32,
+            length_m: 4.0,
+            width_m: 2.0,
+            rear_overhang_m: 2.0,
+            velocity_body_mps: [speed_mps, 0.0, 0.0],
+            ..VehicleState::default()
+        }
+    }
+
+    fn seen(states: &[VehicleState], letter: Option<u8>) -> [f32; AROUND] {
+        let route = route();
+        let hero = Surroundings {
+            route: &route,
+            states,
+            row: 0,
+            station_m: 58.0,
+            front_station_m: 60.0,
+        };
+        hero.numbers(|_| letter)
+    }
+
+    #[test]
+    fn with_nothing_around_every_number_says_so() {
+        let hero = user(Kind::Hero, [58.0, 0.0], 0.0, 10.0);
+        let numbers = seen(&[hero], None);
+        assert_eq!(numbers[..8], [50.0, 50.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(numbers[64..70], [40.0, 0.0, 10.0, 100.0, 1.0, 10.0]);
+        assert_eq!(numbers[73..77], [40.0, 1.0, 100.0, 1.0]);
+        assert_eq!(numbers[77..], [50.0, 10.0, 0.0, 50.0, 10.0, 0.0]);
+    }
+
+    #[test]
+    fn road_users_stand_by_distance_in_the_heros_frame() {
+        let north = std::f64::consts::FRAC_PI_2;
+        let hero = user(Kind::Hero, [58.0, 0.0], north, 10.0);
+        let far = user(Kind::Other, [58.0, 30.0], 0.0, 5.0);
+        let near = user(Kind::Cav, [48.0, 0.0], north, 8.0);
+        let unseen = user(Kind::Other, [58.0, -60.0], 0.0, 5.0);
+        let numbers = seen(&[hero, far, near, unseen], None);
+        let rounded = |from: usize| -> Vec<f32> {
+            numbers[from..from + 8]
+                .iter()
+                .map(|n| (n * 1e3).round() / 1e3)
+                .collect()
+        };
+        // 10 m to the left, driving alike; then 30 m ahead, driving to the right.
+        assert_eq!(rounded(0), [0.0, 10.0, 1.0, 0.0, 8.0, 0.0, 4.0, 2.0]);
+        assert_eq!(rounded(8), [30.0, 0.0, 0.0, -1.0, 0.0, -5.0, 4.0, 2.0]);
+        assert_eq!(numbers[16], 50.0);
+    }
+
+    #[test]
+    fn a_rival_is_what_crosses_the_way_and_a_follower_is_none() {
+        let south = -std::f64::consts::FRAC_PI_2;
+        let hero = user(Kind::Hero, [58.0, 0.0], 0.0, 10.0);
+        // Its front bumper is 40 m from the way, in the middle of the junction.
+        let rival = user(Kind::Other, [110.0, 42.0], south, 10.0);
+        let leader = user(Kind::Other, [90.0, 0.0], 0.0, 10.0);
+        let leaving = user(Kind::Other, [110.0, -20.0], south, 10.0);
+        let waiting = user(Kind::Other, [115.0, 20.0], south, 0.0);
+        let numbers = seen(&[hero, rival, leader, leaving, waiting], None);
+        assert_eq!(numbers[64..67], [40.0, 0.0, 4.0]);
+        assert_eq!(seen(&[hero, leader, leaving, waiting], None)[66], 10.0);
+    }
+
+    #[test]
+    fn lights_decide_right_of_way_and_persons_are_seen_beside_the_route() {
+        let hero = user(Kind::Hero, [58.0, 0.0], 0.0, 10.0);
+        let person = user(Kind::Person, [80.0, -4.0], std::f64::consts::FRAC_PI_2, 1.5);
+        for (letter, priority, green) in [(b'G', 1.0, 1.0), (b'g', 0.0, 1.0), (b'y', 0.0, 0.5), (b'r', 0.0, 0.0)] {
+            let numbers = seen(&[hero, person], Some(letter));
+            assert_eq!((numbers[65], numbers[73], numbers[74]), (priority, 40.0, green));
+            assert_eq!(numbers[77..80], [20.0, -4.0, 1.5]);
+            assert_eq!(numbers[0], 50.0, "a person is no vehicle");
+        }
+    }
+}
