@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 
-use crate::config::{LayeredSettings, rules::LOCALISING_TRAINER};
+use crate::config::{LayeredSettings, rules::OWN_TRAINER};
 
 /// What the policy sees of a scenario's vehicles at each of [`CORRECTING_HISTORY`] ticks: the paper's fields and the wheel speed.
 const CORRECTING_FIELDS: [&str; 10] = [
@@ -22,7 +22,7 @@ pub fn suggest_correction(settings: &mut LayeredSettings, source: &str) {
         "blackout.policy",
     ];
     let localises =
-        settings.has_text("task.kind", "localisation") && settings.has_text("trainer.module", LOCALISING_TRAINER);
+        settings.has_text("task.kind", "localisation") && settings.has_text("trainer.module", OWN_TRAINER);
     if !localises || of_user.iter().any(|key| settings.is_set_by_user(key)) {
         return;
     }

@@ -92,12 +92,6 @@ pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
         None => settings_of_run(&found.run()?, &args.run.with_shorthands()?.set)?,
     };
     let config = settings.validate()?;
-    if config.drives() {
-        return Err(Exit::config(
-            "`caraware play` plays policies of the localisation task, not of the driving task",
-            "use `caraware train` with a driver as trainer.module",
-        ));
-    }
     found.check_fit(&config)?;
     let label = format!("{}-play", found.label());
     let mut prepared = prepare_new(&args.run, Mode::Play, config, named, &label, install)?;

@@ -46,10 +46,10 @@ const CHANGEABLE: [&str; 9] = [
 /// # Errors
 /// A key or value is wrong, observations depend on a changed key, or the run cannot be resumed.
 pub fn changed_config(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
-    if run.mode != Mode::Train || run.config.drives() {
+    if run.mode != Mode::Train {
         return Err(Exit::config(
             format!("{} cannot be resumed", run.name),
-            "only a run of `caraware train` in the localisation task can be resumed",
+            "only a run of `caraware train` can be resumed",
         ));
     }
     let ranks = run.config.trainer.ranks;

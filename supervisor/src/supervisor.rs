@@ -237,7 +237,8 @@ impl Supervisor {
     }
 
     /// True if the environment of a killed simulator process can be made again: simulation is a function of configuration, seed and
-    /// commands, but heroes' actions are not stored, and a run that plays has no ticks that count.
+    /// commands, but in the driving task sim-core would wait for observations that are not sent again, and a run that plays has no ticks
+    /// that count.
     fn may_simulate_again(&self, row: &ProcessSpec) -> bool {
         let run = self.processes.run();
         row.scope == ProcessScope::Environment && run.mode != Mode::Play && !run.config.drives()

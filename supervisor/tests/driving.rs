@@ -239,7 +239,7 @@ fn without_heroes_traffic_is_that_of_bare_sumo() {
 /// A town with one hero that starts at a given place, driven by script.
 fn in_town(workplace: &Workplace, name: &str, script: &str, more: &[&str]) -> Command {
     let settings = [
-        "driving",
+        "lap",
         "--name",
         name,
         "--set",
@@ -343,7 +343,7 @@ fn an_action_that_is_not_finite_or_out_of_range_is_refused_and_the_last_one_is_h
 fn the_scripted_driver_drives_the_same_laps_for_the_same_seed() {
     let workplace = Workplace::new();
     let lap = |name: &str, more: &[&str]| {
-        let settings = ["driving", "--name", name, "--set", "episode.evaluation_ticks=10"];
+        let settings = ["lap", "--name", name, "--set", "episode.evaluation_ticks=10"];
         let mut command = workplace.command(&[&["train"], &settings[..], more, &QUIET].concat());
         command.env(
             "PYTHONPATH",

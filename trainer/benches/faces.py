@@ -18,8 +18,8 @@ from caraware.ipc.channel import Observation
 REPEATS = 6
 CONFIGS = {
     "town, 32 vehicles": ("town", {}),
-    "driving, 1 hero": ("driving", {}),
-    "driving, 32 heroes": ("driving", {"traffic.heroes": 32, "traffic.hero_route": []}),
+    "driving, 1 hero": ("lap", {}),
+    "driving, 32 heroes": ("lap", {"traffic.heroes": 32, "traffic.hero_route": []}),
 }
 
 

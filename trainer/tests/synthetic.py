@@ -58,6 +58,11 @@ class SyntheticObservation:
         """u64 `[n]`."""
         return self.vehicle.astype(np.uint64)
 
+    @property
+    def ended_by(self) -> np.ndarray:
+        """u32 `[n]`: no heroes."""
+        return np.zeros(len(self.vehicle), np.uint32)
+
 
 @dataclass
 class SyntheticChannel:

@@ -75,12 +75,12 @@ def test_gymnasiums_checker_passes_on_one_vehicle() -> None:
 
 
 def test_stable_baselines_checker_passes_on_one_hero() -> None:
-    with make("driving", DRIVING) as simulation:
+    with make("lap", DRIVING) as simulation:
         sb3_check_env(CarAwareEnv(simulation))
 
 
 def test_pettingzoos_api_test_passes_with_heroes_that_come_and_go() -> None:
-    with make("driving", HEROES) as simulation:
+    with make("lap", HEROES) as simulation:
         env = CarAwareParallelEnv(simulation)
         parallel_api_test(env, num_cycles=150)
         assert len(env.possible_agents) > 3 and all(agent.startswith("hero.") for agent in env.possible_agents)
@@ -100,7 +100,7 @@ def episode_of(env: CarAwareVectorEnv, steps: int) -> list[np.ndarray]:
     return seen
 
 
-@pytest.mark.parametrize(("config", "settings"), [("town", TOWN), ("driving", HEROES)])
+@pytest.mark.parametrize(("config", "settings"), [("town", TOWN), ("lap", HEROES)])
 def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(config: str, settings: dict[str, Any]) -> None:
     def run(env: CarAwareVectorEnv, seed: int) -> list[np.ndarray]:
         first, infos = env.reset(seed=seed)
@@ -198,7 +198,7 @@ def test_a_wrong_setting_raises_with_the_message_of_caraware() -> None:
 
 @pytest.mark.parametrize("victim", ["sim-core", "caraware"])
 def test_a_simulation_that_dies_is_an_exception_with_the_reason(victim: str) -> None:
-    with make("driving", DRIVING) as simulation:
+    with make("lap", DRIVING) as simulation:
         env = CarAwareVectorEnv(simulation)
         env.reset()
         prefix = simulation.run["shared_memory"]["prefix"]
@@ -226,7 +226,7 @@ USER = """
     import signal, numpy as np
     from caraware.envs import CarAwareVectorEnv, make
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell in the background starts programs without it
-    simulation = make("driving", {settings!r})
+    simulation = make("lap", {settings!r})
     env = CarAwareVectorEnv(simulation)
     env.reset()
     print(simulation.pid, simulation.run["shared_memory"]["prefix"], flush=True)
@@ -262,7 +262,7 @@ def test_an_interrupted_step_can_be_taken_again() -> None:
 
     before = signal.signal(signal.SIGALRM, ring)
     try:
-        with make("driving", DRIVING) as simulation:
+        with make("lap", DRIVING) as simulation:
             env = CarAwareVectorEnv(simulation)
             env.reset()
             supervisor = processes_of(simulation.pid)
@@ -313,7 +313,7 @@ def test_the_example_in_plain_torch_learns(capsys: pytest.CaptureFixture[str]) -
     errors_m = cleanrl_style.main(6000, settings, **TOWN | {"traffic.cavs": 12})
     # 13 updates of 480 samples; random predictions are about 130 m wrong.
     assert np.mean(errors_m[-3:]) < 0.8 * np.mean(errors_m[:3])
-    assert cleanrl_style.main(200, settings, "driving", **HEROES)
+    assert cleanrl_style.main(200, settings, "lap", **HEROES)
 
 
 def test_the_example_with_stable_baselines_alone(capsys: pytest.CaptureFixture[str]) -> None:

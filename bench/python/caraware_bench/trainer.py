@@ -167,6 +167,11 @@ class FreeTick:
     terminated: BoolArray
     truncated: BoolArray
 
+    @property
+    def ended_by(self) -> UInt32Array:
+        """No heroes."""
+        return np.zeros(len(self.vehicle), np.uint32)
+
 
 @dataclass
 class FreeTicks:

@@ -1,6 +1,6 @@
 //! Rules between keys: rates that must divide each other, sizes that must fit, keys that exclude each other.
 
-use ipc_schema::config::{Config, TaskKind};
+use ipc_schema::config::{Config, HeroDriver, Network, TaskKind, VehicleModel};
 
 mod curriculum;
 mod sensors;
@@ -65,8 +65,8 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
     region(settings, config)
 }
 
-/// The learner that comes with caraware: it predicts positions.
-pub const LOCALISING_TRAINER: &str = "caraware.train";
+/// The learner that comes with caraware.
+pub const OWN_TRAINER: &str = "caraware.train";
 
 /// Heroes need the driving task, and the driving task needs heroes.
 fn task(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
@@ -134,16 +134,6 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
             "set both to the same time, such as 0.1: an action reaches SUMO within a tick",
         ));
     }
-    if config.run.envs > 1 {
-        return Some((
-            "run.envs",
-            format!(
-                "`run.envs` = {}: the driving task runs in one environment",
-                config.run.envs
-            ),
-            "start several runs, each with run.envs = 1",
-        ));
-    }
     if config.vehicle.preview_s > 0.0 {
         return Some((
             "vehicle.preview_s",
@@ -151,11 +141,36 @@ fn undrivable(config: &Config) -> Option<BrokenRule> {
             "set vehicle.preview_s = 0 with task.kind = \"driving\"",
         ));
     }
-    (config.trainer.module == LOCALISING_TRAINER).then(|| {
+    if config.task.driver == HeroDriver::Sumo && config.vehicle.hero_model == VehicleModel::RigidBody {
+        return Some((
+            "vehicle.hero_model",
+            "`vehicle.hero_model` = \"rigid_body\" cannot follow SUMO's driver".into(),
+            "set vehicle.hero_model = \"dynamic\" with task.driver = \"sumo\"",
+        ));
+    }
+    if config.task.driver == HeroDriver::Sumo && config.trainer.module == OWN_TRAINER {
+        return Some((
+            "task.driver",
+            "`task.driver` = \"sumo\" leaves nothing to learn by driving".into(),
+            "set trainer.module = \"caraware.driving.imitate\", or task.driver = \"actions\"",
+        ));
+    }
+    let draws_actions = config.trainer.module == OWN_TRAINER && config.task.driver == HeroDriver::Actions;
+    if draws_actions && config.trainer.network == Network::Gru {
+        return Some((
+            "trainer.network",
+            "`trainer.network` = \"gru\" does not drive: its actions would be drawn without its memory".into(),
+            "set trainer.network = \"mlp\" or a class",
+        ));
+    }
+    (draws_actions && config.trainer.actions_per_observation > 1).then(|| {
         (
-            "trainer.module",
-            format!("`trainer.module` = \"{LOCALISING_TRAINER}\" learns to localise and cannot drive"),
-            "name a module that publishes actions, such as \"caraware.examples.pure_pursuit\"",
+            "trainer.actions_per_observation",
+            format!(
+                "`trainer.actions_per_observation` = {}: a hero takes one action at a time",
+                config.trainer.actions_per_observation
+            ),
+            "set trainer.actions_per_observation = 1 with task.kind = \"driving\"",
         )
     })
 }

@@ -665,14 +665,14 @@ fn heroes_need_the_driving_task_and_the_task_needs_heroes() {
             "set both to the same time",
         ),
         (
-            "task.kind = \"driving\"\ntraffic.heroes = 1\nrun.envs = 2",
-            "`run.envs` = 2: the driving task runs in one environment",
-            "start several runs",
+            "task.kind = \"driving\"\ntraffic.heroes = 1\ntrainer.network = \"gru\"",
+            "`trainer.network` = \"gru\" does not drive",
+            "set trainer.network = \"mlp\"",
         ),
         (
-            "task.kind = \"driving\"\ntraffic.heroes = 1",
-            "`trainer.module` = \"caraware.train\" learns to localise",
-            "caraware.examples.pure_pursuit",
+            "task.kind = \"driving\"\ntraffic.heroes = 1\ntrainer.actions_per_observation = 2",
+            "`trainer.actions_per_observation` = 2: a hero takes one action at a time",
+            "set trainer.actions_per_observation = 1",
         ),
     ];
     for (text, expected, cure) in cases {

@@ -7,7 +7,7 @@ use ipc_schema::{
     metric::PolicyMetric,
 };
 
-use super::{ConfigError, LOCALISING_TRAINER, LayeredSettings, conflict, conflict_in_entry};
+use super::{ConfigError, LayeredSettings, OWN_TRAINER, conflict, conflict_in_entry};
 
 /// Most stages of a curriculum: each prefetches its maps and keeps statistics of its own.
 const MOST_STAGES: usize = 255;
@@ -35,13 +35,13 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
             "set run.envs = 1 and start one trainer, or set curriculum.stages = []".into(),
         );
     }
-    if !stages.is_empty() && config.trainer.module != LOCALISING_TRAINER {
+    if !stages.is_empty() && config.trainer.module != OWN_TRAINER {
         return refuse(
             format!(
                 "`trainer.module` = \"{}\" does not decide lessons, and a curriculum waits for these decisions",
                 config.trainer.module
             ),
-            format!("set trainer.module = \"{LOCALISING_TRAINER}\" or curriculum.stages = []"),
+            format!("set trainer.module = \"{OWN_TRAINER}\" or curriculum.stages = []"),
         );
     }
     for (number, stage) in (1..).zip(stages) {

@@ -75,6 +75,9 @@ class CarAwareParallelEnv(ParallelEnv):  # type: ignore[misc]  # pettingzoo has 
         rewards = {agent: float(reward[slot]) for agent, slot in acting.items()}
         ended = transition.terminated | transition.truncated
         infos = {agent: _info(before if ended[slot] else now, slot) for agent, slot in acting.items()}
+        for agent, slot in acting.items():
+            if ended[slot]:
+                infos[agent] |= transition.end_info(slot)
         self._take_over(now)
         for agent in self.agents:
             if agent not in acting:

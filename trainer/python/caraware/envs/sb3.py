@@ -88,4 +88,5 @@ class CarAwareVecEnv(VecEnv):
             "terminal_observation": transition.observation[slot].copy(),
             "TimeLimit.truncated": bool(transition.truncated[slot]),
             "episode": {"r": float(self._returns[slot]), "l": int(self._lengths[slot]), "t": 0.0},
+            **transition.end_info(slot),
         }

@@ -19,7 +19,8 @@ class CarAwareEnv(gymnasium.Env):
 
     After an end, `reset()` runs on to the next vehicle in the slot. In the middle of an episode it runs on to the
     simulation's next episode. Other slots get action 0: a simulation for this face has one vehicle, `traffic.cavs = 1`
-    or one hero. `info` has `id`, `vehicle` and `truth` of the observation returned.
+    or one hero. `info` has `id`, `vehicle` and `truth` of the observation returned; at the end of
+    a hero's episode also `end`, its reason, `is_success`, and a flag for each reason.
     """
 
     def __init__(self, source: Source | Channel, slot: int = 0, reward: Reward | None = None) -> None:
@@ -53,6 +54,8 @@ class CarAwareEnv(gymnasium.Env):
         terminated, truncated = bool(transition.terminated[slot]), bool(transition.truncated[slot])
         self._ended = terminated or truncated
         info = self._info(before if self._ended else self.slots.now)
+        if self._ended:
+            info |= transition.end_info(slot)
         return transition.next.observation[slot].copy(), float(reward[slot]), terminated, truncated, info
 
     def close(self) -> None:

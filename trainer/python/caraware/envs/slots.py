@@ -24,7 +24,16 @@ from caraware.envs import rewards
 from caraware.envs.evaluation import EvaluationMeans
 from caraware.envs.settings import FaceSettings
 from caraware.envs.transition import Rows, Transition
-from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Scalar, UInt32Array, UInt64Array
+from caraware.ipc.arrays import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    FloatArray,
+    Int64Array,
+    Scalar,
+    UInt32Array,
+    UInt64Array,
+)
 from caraware.ipc.channel import StreamEndedError
 from caraware.ipc.run_file import setting
 from caraware.ipc.stream import EMPTY_SLOT, Channel, Observation
@@ -133,6 +142,8 @@ class Tick:
     terminated: BoolArray
     """Of the trajectory that held the slot a tick before."""
     truncated: BoolArray
+    ended_by: Int64Array
+    """Bits of `caraware.tasks.ends`."""
 
 
 class Slots:
@@ -348,6 +359,7 @@ class Slots:
             id_hash=_padded(getattr(obs, "id_hash", obs.vehicle).astype(np.uint64), n),
             terminated=_padded(obs.terminated, n),
             truncated=_padded(obs.truncated, n),
+            ended_by=_padded(obs.ended_by.astype(np.int64), n),
         )
 
     def _end_of_run(self) -> Tick:
@@ -357,7 +369,7 @@ class Slots:
         vehicle = np.full(n, EMPTY_SLOT, np.uint32)
         ids = np.zeros(n, np.uint64)
         episode, rows = (self._runs + 1, 0), Rows(self.settings, *zeros)
-        return Tick(True, False, 0, episode, rows, none, vehicle, ids, none, none)
+        return Tick(True, False, 0, episode, rows, none, vehicle, ids, none, none, np.zeros(n, np.int64))
 
     def _transition(self, now: Tick, following: Tick | None) -> Transition:
         if following is None:
@@ -368,6 +380,9 @@ class Slots:
             # A slot that changed hands or has a gap without a flag: its trajectory continued unseen.
             truncated = now.mask & ~terminated & (following.truncated | ~same)
             after = _where(terminated | truncated, now.rows, following.rows)
+        ended_by = np.zeros(self.count, np.int64)
+        if following is not None:
+            ended_by = np.where(terminated | truncated, following.ended_by, 0)
         return Transition(
             settings=self.settings,
             observation=now.rows.observation,
@@ -379,6 +394,7 @@ class Slots:
             terminated=terminated,
             truncated=truncated,
             next=after,
+            ended_by=ended_by,
         )
 
     def _show(self) -> None:

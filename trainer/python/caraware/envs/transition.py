@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 
 from caraware.envs.settings import FaceSettings
-from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, UInt32Array, UInt64Array
-from caraware.tasks.contract import TaskOutcome, TaskRows, TaskStep
+from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, Int64Array, UInt32Array, UInt64Array
+from caraware.tasks import ends
+from caraware.tasks.contract import Sampling, TaskOutcome, TaskRows, TaskStep
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,9 @@ class Transition(Rows):
     """bool `[N]`: it was cut after this tick."""
     next: Rows
     """A tick later; for trajectories that ended, this tick again: they have no other."""
+    ended_by: Int64Array | None = None
+    """i64 `[N]`: bits of `caraware.tasks.ends`: why a hero's trajectory ended or was cut, 0 for all others; None where
+    it is not known."""
 
     @property
     def tick_s(self) -> float:
@@ -68,5 +73,17 @@ class Transition(Rows):
                 next=TaskRows(torch.from_numpy(self.next.observation), torch.from_numpy(self.next.truth)),
                 terminated=torch.from_numpy(self.terminated),
                 truncated=torch.from_numpy(self.truncated),
+                ended_by=None if self.ended_by is None else torch.from_numpy(self.ended_by),
             ),
         )
+
+    def end_info(self, slot: int) -> dict[str, Any]:
+        """Why the hero's trajectory in a slot ended, for `infos`: `end` by name, and a flag for each reason.
+
+        Empty where heroes do not drive. `is_success` is the key that Stable-Baselines3 counts.
+        """
+        if self.settings.task.sampling is not Sampling.EACH_TICK or self.ended_by is None:
+            return {}
+        end = ends.name_of(int(self.ended_by[slot]))
+        flags = {name.replace(" ", "_").replace("-", "_"): name == end for name in ends.END_NAMES.values()}
+        return {"end": end, "is_success": end == ends.END_NAMES[ends.ARRIVAL], **flags}

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
 
 from caraware.envs.rewards import Reward, measured
 from caraware.envs.slots import Policy, Slots, Source, Tick
@@ -93,4 +94,10 @@ def _final(transition: Transition, ended: BoolArray) -> dict[str, Any]:
     info: dict[str, Any] = {}
     for key in ("vehicle", "id_hash", "truth"):
         info[key], info[f"_{key}"] = getattr(transition, key), ended
+    words = {int(number): transition.end_info(int(number)) for number in np.flatnonzero(ended)}
+    for key, value in next(iter(words.values())).items():
+        column: NDArray[Any] = np.full(len(ended), type(value)(), dtype=bool if isinstance(value, bool) else object)
+        for number, of_slot in words.items():
+            column[number] = of_slot[key]
+        info[key], info[f"_{key}"] = column, ended
     return {"final_obs": final_obs, "_final_obs": ended, "final_info": info, "_final_info": ended}

@@ -27,6 +27,17 @@ if TYPE_CHECKING:
     from typing_extensions import Buffer
 
 
+ENDED_BY = np.uint32(
+    _native.ENDED_BY_COLLISION
+    | _native.ENDED_OFF_ROAD
+    | _native.ENDED_BY_ARRIVAL
+    | _native.ENDED_AT_RED
+    | _native.ENDED_AGAINST_TRAFFIC
+    | _native.ENDED_BY_TIME
+)
+"""All bits of an observation's flags that say why a hero's trajectory ended."""
+
+
 def _lent_tensor(view: Buffer, slots: int, fields: int) -> Tensor:
     """The tensor over a place in shared memory, f32 [slots, fields], whatever lies there."""
     return read_only_tensor(np.frombuffer(memoryview(view), np.float32).reshape(slots, fields))
@@ -227,6 +238,12 @@ class Observation:
     def truncated(self) -> BoolArray:
         """bool [n]: the trajectory in this slot at the previous tick was cut there (end of episode)."""
         return self._flag(_native.TRUNCATED)
+
+    @cached_property
+    def ended_by(self) -> UInt32Array:
+        """u32 [n]: bits `ENDED_…` of `caraware._native`: why a hero's trajectory in this slot ended."""
+        reasons: UInt32Array = self._flags & ENDED_BY
+        return reasons
 
     @cached_property
     def resynchronised(self) -> BoolArray:

@@ -54,6 +54,10 @@ class LearningTick(MeasuredTick, Protocol):
     def truncated(self) -> BoolArray:
         """bool `[n]`: ... was cut there from outside (episode reset, time limit)."""
 
+    @property
+    def ended_by(self) -> UInt32Array:
+        """u32 `[n]`: bits `ENDED_…` of `caraware._native`: why a hero's trajectory ended there; 0 for others."""
+
 
 class Observation(LearningTick, Protocol):
     """One tick of one environment. The arrays are read-only views, valid while the object lives."""

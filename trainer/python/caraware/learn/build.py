@@ -43,10 +43,10 @@ def build_ppo(
     ranks: Ranks | None = None,
 ) -> Ppo:
     """A new learner of `task` for these environments, counted among those of all `ranks`. Raises `ConfigError`."""
-    if task.sampling is not Sampling.WHEN_FULL:
+    if task.sampling is Sampling.EACH_TICK and config.network is BuiltInNetwork.GRU:
         raise ConfigError(
-            f'`trainer.module` = "caraware.train" with `task.kind` = {task.name!r}',
-            "this learner samples actions when its horizon is full; name another module in trainer.module",
+            f"`trainer.network` = 'gru' with `task.kind` = {task.name!r}",
+            'actions that are drawn tick by tick need a network that sees one moment: "mlp" or a class',
         )
     actions = task.actions.size
     device = configure_torch(config)

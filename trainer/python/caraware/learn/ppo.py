@@ -4,8 +4,9 @@ A horizon of observations is collected; every observation gets a sampled action 
 (from the distance to the truth) and its advantage; then, for some epochs, the policy climbs the clipped surrogate
 objective in minibatches while the value network regresses on the returns.
 
-Actions are sampled when the horizon is full, not tick by tick: predictions do not influence the world. So the
-samples depend on the seed and on the data alone, never on how many ticks happened to arrive together.
+Where predictions do not influence the world, actions are sampled when the horizon is full: so the samples depend on the
+seed and on the data alone, never on how many ticks happened to arrive together. Where the world waits for every action
+(driving), it is drawn when the tick comes (`caraware.learn.drawing`), and its log-probability is stored with it.
 
 Read `Ppo.score`, then `PlainUpdate`. The forms that are faster (`caraware.learn.fast`, `caraware.learn.graphed`) keep
 the contract of `PolicyUpdate`; docs/decisions/0020.
@@ -23,12 +24,13 @@ from torch import Tensor, nn
 from caraware.learn.adam import EPSILON
 from caraware.learn.batch import Batch
 from caraware.learn.config import TrainerConfig
+from caraware.learn.drawing import DrawingPredictor
 from caraware.learn.gae import generalised_advantage
 from caraware.learn.networks import GaussianPolicy, entropy, log_probability
 from caraware.learn.prediction import Predictor, RowPredictor
-from caraware.learn.rollout import Horizon
+from caraware.learn.rollout import DrawnHorizon, DrawnTick, Horizon
 from caraware.learn.stored import MEMORY, OPTIMISER, PARAMETERS, PPO, RANDOM, LearnerShape, StoredTensors
-from caraware.tasks.contract import Task, TaskStep
+from caraware.tasks.contract import Sampling, Task, TaskOutcome, TaskRows, TaskStep
 
 SMALLEST_DEVIATION = 1e-8
 SEED_STRIDE = 0x9E3779B97F4A7C15
@@ -161,6 +163,11 @@ class PlainUpdate:
             name: torch.optim.Adam(network.parameters(), eps=EPSILON)
             for name, network in (("policy", self._policy), ("value", self._value))
         }
+
+    @property
+    def policy(self) -> GaussianPolicy:
+        """The policy's network, for learners beside PPO."""
+        return self._policy
 
     def improve(self, batch: Batch, shuffling: torch.Generator, now: ScheduledValues) -> UpdateFigures:
         """See `PolicyUpdate.improve`. K epochs of minibatches of about M samples (algorithm 1)."""
@@ -390,6 +397,8 @@ class Ppo:
         """Share of all training episodes that is done; schedules follow it."""
         self.shuffling = torch.Generator().manual_seed(config.seed + 1)
         self._environments = tuple(environments)
+        self.held: dict[int, DrawnTick] = {}
+        """By environment: what was drawn before the newest update for the tick after its horizon."""
         self._samplings = [sampling if index == 0 else _sampling(config.seed, index) for index in environments]
 
     def learn(self, horizon: Horizon) -> UpdateStats:
@@ -409,6 +418,8 @@ class Ppo:
 
     def _scored(self, horizon: Horizon, forward: ForwardPass, environment: int) -> Batch:
         """Actions around the policy's means, their rewards and advantages."""
+        if horizon.drawn is not None:
+            return self._scored_as_drawn(horizon, horizon.drawn, forward, environment)
         rows, mean, value, log_std = forward.rows, forward.mean, forward.value, self.updater.log_std
         truth = horizon.truth.flatten(0, 1).index_select(0, rows).to(self.device)
         tries = self.config.actions_per_observation
@@ -431,6 +442,27 @@ class Ppo:
             value_target=value_target,
             truth=truth,
             metrics=self.task.measure(step, mean),
+            vehicle=horizon.vehicle.flatten()[rows],
+            tick=horizon.tick.repeat_interleave(horizon.valid.shape[1])[rows],
+        )
+
+    def _scored_as_drawn(self, horizon: Horizon, drawn: DrawnHorizon, forward: ForwardPass, environment: int) -> Batch:
+        """The actions that moved the world, with the log-probabilities that they were drawn with."""
+        self.held[environment] = drawn.held
+        rows = forward.rows
+        step = _step_of(horizon, drawn, forward)
+        action = drawn.action.flatten(0, 1).index_select(0, rows).to(self.device)
+        reward = self.task.reward(step, action).float()
+        advantage, value_target = self._advantages(horizon, forward, reward)
+        return Batch(
+            observation=forward.observation,
+            action=action,
+            log_probability=drawn.log_probability.flatten()[rows].to(self.device),
+            reward=reward,
+            advantage=advantage,
+            value_target=value_target,
+            truth=step.truth,
+            metrics=self.task.measure(step, action),
             vehicle=horizon.vehicle.flatten()[rows],
             tick=horizon.tick.repeat_interleave(horizon.valid.shape[1])[rows],
         )
@@ -539,7 +571,12 @@ class Ppo:
         return answers
 
     def predictor(self, dark_is_nan: bool, evaluations_alone: bool = True) -> Predictor:
-        """A predictor for the ticks of a stream as they come (`caraware.learn.prediction`)."""
+        """A predictor for the ticks of a stream as they come (`caraware.learn.prediction`).
+
+        With `evaluations_alone`, training ticks are drawn where the world waits for them.
+        """
+        if self.task.sampling is Sampling.EACH_TICK and evaluations_alone:
+            return DrawingPredictor(self, dark_is_nan)
         return RowPredictor(self, dark_is_nan, evaluations_alone)
 
     def sampling_generators(self) -> dict[str, torch.Generator]:
@@ -548,11 +585,26 @@ class Ppo:
         return dict(zip(names, self._samplings, strict=True))
 
     def memory_tensors(self) -> dict[str, Tensor]:
-        """What the networks remember of trajectories up to the newest horizon; nothing, if they see one moment."""
-        return {}
+        """What is remembered of trajectories up to the newest horizon: what was drawn for the tick after it."""
+        memory: dict[str, Tensor] = {}
+        for environment, held in self.held.items():
+            name = f"held{self.numbered(environment)}"
+            memory |= {f"{name}.action": held.action, f"{name}.log_probability": held.log_probability}
+            memory[f"{name}.tick"] = torch.tensor(held.tick)
+        return memory
 
     def restore_memory(self, tensors: dict[str, Tensor]) -> None:
         """Continue with what `memory_tensors` returned; with nothing, forget everything."""
+        self.held = {}
+        for environment in range(len(self._environments)):
+            name = f"held{self.numbered(environment)}"
+            if f"{name}.tick" in tensors:
+                columns = tensors[f"{name}.action"], tensors[f"{name}.log_probability"]
+                self.held[environment] = DrawnTick(int(tensors[f"{name}.tick"]), *columns)
+
+    def numbered(self, environment: int) -> int:
+        """The index, among those of all ranks, of an environment of this trainer."""
+        return self._environments[environment] if environment < len(self._environments) else environment
 
     def shape(self) -> LearnerShape:
         """See `StoredLearner.shape`."""
@@ -607,6 +659,25 @@ def normalised(advantage: Tensor) -> Tensor:
 def mean_columns(rows: Sequence[Sequence[float]]) -> list[float]:
     """The mean of each column."""
     return [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+
+
+def _step_of(horizon: Horizon, drawn: DrawnHorizon, forward: ForwardPass) -> TaskStep:
+    """The samples of a horizon with what followed: a tick later, or of trajectories that ended, the same tick again."""
+    assert horizon.bootstrap is not None, "a world that waits for actions is learnt with its next tick"
+    ended = (horizon.terminated | horizon.truncated).unsqueeze(2)
+
+    def following(grid: Tensor, after: Tensor) -> Tensor:
+        return torch.where(ended, grid, torch.cat((grid[1:], after.unsqueeze(0))))
+
+    def samples(grid: Tensor) -> Tensor:
+        return grid.flatten(0, 1).index_select(0, forward.rows).to(forward.observation.device)
+
+    after = TaskRows(
+        samples(following(horizon.observation, horizon.bootstrap)),
+        samples(following(horizon.truth, drawn.truth_after)),
+    )
+    flags = (samples(grid) for grid in (horizon.terminated, horizon.truncated, drawn.ended_by))
+    return TaskStep(forward.observation, samples(horizon.truth), TaskOutcome(after, *flags))
 
 
 def _sampling(seed: int, environment: int) -> torch.Generator:

@@ -13,6 +13,33 @@ from caraware.ipc.stream import EMPTY_SLOT, LearningTick
 
 
 @dataclass(frozen=True)
+class DrawnTick:
+    """The actions that were drawn for one tick of `n` slots, before the world went on."""
+
+    tick: int
+    action: Tensor
+    """f32 `[n, a]`, as drawn, not clipped; 0 in rows that are not valid."""
+    log_probability: Tensor
+    """f32 `[n]`: of the policy that drew it."""
+
+
+@dataclass(frozen=True)
+class DrawnHorizon:
+    """What was drawn in a horizon, and what followed its last tick."""
+
+    action: Tensor
+    """f32 `[T, N, a]`."""
+    log_probability: Tensor
+    """f32 `[T, N]`."""
+    ended_by: Tensor
+    """i64 `[T, N]`: bits `ENDED_…`: why a trajectory ended with this row."""
+    truth_after: Tensor
+    """f32 `[N, 4]`: of the tick after the last."""
+    held: DrawnTick
+    """Of the tick after the last, which opens the next horizon: drawn by the policy before the update."""
+
+
+@dataclass(frozen=True)
 class Horizon:
     """`T` consecutive training ticks of `N` slots. Row `[t, i]` of every array is the same vehicle at the same tick.
 
@@ -37,6 +64,8 @@ class Horizon:
     """bool `[N]`: the flags of the first tick say that the trajectory in the slot before it ended there."""
     bootstrap: Tensor | None
     """f32 `[N, d]`: what followed the last tick; None where no discount asks for it."""
+    drawn: DrawnHorizon | None = None
+    """None where actions are drawn when the horizon is full."""
 
     def samples(self) -> int:
         """Rows that are samples."""
@@ -54,7 +83,11 @@ class Rollout:
     they were still worth. That tick then opens the next horizon.
     """
 
-    def __init__(self, horizon: int, observation_size: int, *, bootstrap: bool, dark_is_nan: bool = False) -> None:
+    def __init__(
+        self, horizon: int, observation_size: int, *, bootstrap: bool, dark_is_nan: bool = False, drawn_actions: int = 0
+    ) -> None:
+        """`drawn_actions`: numbers of an action that is drawn tick by tick; 0 where none is. It needs `bootstrap`."""
+        self._actions = drawn_actions
         self._horizon, self._size, self._bootstrap = horizon, observation_size, bootstrap
         self._dark_is_nan = dark_is_nan
         self._ticks = 0
@@ -64,8 +97,8 @@ class Rollout:
         self._cut = np.zeros(0, bool)
         self._allocate(ticks=16, slots=1)
 
-    def add(self, obs: LearningTick) -> None:
-        """Copy one training tick. Ticks without a valid row are skipped."""
+    def add(self, obs: LearningTick, drawn: DrawnTick | None = None) -> None:
+        """Copy one training tick, and what was drawn for it. Ticks without a valid row are skipped."""
         self.ended(obs)
         rows = len(obs.vehicle)
         if rows > self._slots:
@@ -86,6 +119,9 @@ class Rollout:
         self._set_row(self._valid[t], obs.valid, False)
         self._terminated[t] = self._truncated[t] = False
         self._tick[t] = obs.tick
+        self._ended_by[t] = 0
+        if drawn is not None:
+            self._action[t, :rows], self._log_probability[t, :rows] = drawn.action, drawn.log_probability
         self._close_changed_slots(t)
         self._ticks, self._last_tick = t + 1, obs.tick
         self._samples, self._newest_samples = self._samples + samples, samples
@@ -100,6 +136,8 @@ class Rollout:
             rows = min(len(obs.vehicle), self._slots)
             self._terminated[t, :rows] |= obs.terminated[:rows]
             self._truncated[t, :rows] |= obs.truncated[:rows] & ~obs.terminated[:rows]
+            if self._actions:
+                self._ended_by[t, :rows] = obs.ended_by[:rows]
         elif obs.tick != self._last_tick:
             self._truncated[t] |= ~self._terminated[t]
 
@@ -125,9 +163,21 @@ class Rollout:
             truncated=torch.from_numpy(self._truncated[:end].copy()),
             cut=torch.from_numpy(np.pad(self._cut, (0, self._slots - len(self._cut)))),
             bootstrap=self._observation[end].clone() if self._bootstrap else None,
+            drawn=self._drawn(end) if self._actions else None,
         )
         self._taken, self._samples = end, self._newest_samples if self._bootstrap else 0
         return horizon
+
+    def _drawn(self, end: int) -> DrawnHorizon:
+        """What was drawn in the `end` first ticks."""
+        held = DrawnTick(int(self._tick[end]), self._action[end].clone(), self._log_probability[end].clone())
+        return DrawnHorizon(
+            action=self._action[:end],
+            log_probability=self._log_probability[:end],
+            ended_by=torch.from_numpy(self._ended_by[:end].astype(np.int64)),
+            truth_after=self._truth[end].clone(),
+            held=held,
+        )
 
     def _discard_taken(self) -> None:
         """Move the tick that only served as a bootstrap, if any, to the front."""
@@ -161,6 +211,9 @@ class Rollout:
             self._terminated,
             self._truncated,
             self._tick,
+            self._action,
+            self._log_probability,
+            self._ended_by,
         )
 
     def _allocate(self, ticks: int, slots: int) -> None:
@@ -172,6 +225,10 @@ class Rollout:
         self._terminated = np.zeros((ticks, slots), bool)
         self._truncated = np.zeros((ticks, slots), bool)
         self._tick = np.zeros(ticks, np.int64)
+        drawn_slots = slots if self._actions else 0
+        self._action = torch.zeros(ticks, drawn_slots, self._actions)
+        self._log_probability = torch.zeros(ticks, drawn_slots)
+        self._ended_by = np.zeros((ticks, drawn_slots), np.uint32)
 
     def _grow(self, ticks: int, slots: int) -> None:
         """More ticks or slots. Rare: the slots in use settle early, the ticks double up to one horizon."""
@@ -182,4 +239,4 @@ class Rollout:
             if array.ndim == 1:
                 new[:t] = array[:t]
             else:
-                new[:t, :wide] = array[:t]
+                new[:t, : min(wide, array.shape[1])] = array[:t]

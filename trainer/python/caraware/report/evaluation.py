@@ -10,7 +10,7 @@ import numpy as np
 from caraware import _native
 from caraware.baselines import BaselineErrors, Baselines, SensorNoise
 from caraware.baselines.lanes import LaneMap
-from caraware.ipc.arrays import Float64Array, FloatArray, Int64Array
+from caraware.ipc.arrays import BoolArray, Float64Array, FloatArray, Int64Array, UInt32Array
 from caraware.ipc.stream import Observation
 from caraware.report.statistics import mean_interval
 from caraware.tasks.metrics import interval_key, mean_key
@@ -124,6 +124,17 @@ def no_headline(metric: str) -> dict[str, float | None]:
     return {**dict.fromkeys(keys), "evaluation_seeds": 0}
 
 
+@dataclass(frozen=True)
+class EvaluatedRows:
+    """Rows of a tick that an evaluation measures without sensors."""
+
+    episode: int
+    vehicle: UInt32Array
+    """u32 `[n]`."""
+    valid: BoolArray
+    """bool `[n]`."""
+
+
 class Mean:
     """Mean of what comes bit by bit; the same bits for the same bits in the same order."""
 
@@ -166,7 +177,7 @@ class Evaluation:
         self._sums = np.zeros((0, 1 + len(ESTIMATORS)))
         """f64 `[vehicle, 7]` of the current episode: samples, and the sum of the metric of each estimator."""
 
-    def add(self, obs: Observation, values: Mapping[str, FloatArray]) -> None:
+    def add(self, obs: Observation | EvaluatedRows, values: Mapping[str, FloatArray]) -> None:
         """Add the metric's values `[v]` on the valid rows of one evaluation tick, by estimator."""
         if obs.episode != self._episode:
             self._finish_episode()
@@ -178,6 +189,7 @@ class Evaluation:
             if name in values:
                 self._sums[vehicle, column] += values[name]
         if self._baselines:
+            assert not isinstance(obs, EvaluatedRows)
             filtered, smoothed = self._baselines.add(obs)
             for name, errors in filtered.items():
                 self._sums[errors.vehicle, _COLUMN[name]] += errors.error_m

@@ -9,7 +9,7 @@ from caraware.baselines.lanes import LaneMap
 from caraware.baselines.map_ekf import lanes_of_net, net_of_run
 from caraware.baselines.noise import SensorNoise
 from caraware.ipc.commits import CommitLog
-from caraware.ipc.run_file import BlackoutPolicy, RunFile, setting
+from caraware.ipc.run_file import BlackoutPolicy, RunFile, config_table, setting
 from caraware.learn.config import ConfigError, EstimateTimes, MapBounds, TrainerConfig
 from caraware.run.curriculum import Stage
 from caraware.tasks.contract import Task
@@ -45,6 +45,8 @@ class RunConfig:
     """A checkpoint directory to continue from."""
     commits: CommitLog
     """Which learner has learnt which ticks of the run."""
+    begin_from: Path | None = None
+    """A checkpoint or file whose parameters a new policy begins with."""
 
     @classmethod
     def from_run(cls, run: RunFile) -> "RunConfig":
@@ -70,6 +72,7 @@ class RunConfig:
             is_paced=setting(run, "run.real_time_factor", float) > 0.0,
             resume_from=Path(beginning["checkpoint"]) if beginning else None,
             commits=CommitLog(run),
+            begin_from=_path(config_table(run, "task").get("begin_from", "")),
         )
 
     def lanes(self) -> LaneMap | None:
@@ -87,3 +90,8 @@ class RunConfig:
         interval = self.evaluation_interval
         trained = episode - episode // (interval + 1) if interval > 0 else episode
         return min(1.0, trained / self.training_episodes)
+
+
+def _path(text: object) -> Path | None:
+    """A path that is set."""
+    return Path(str(text)) if text else None

@@ -7,12 +7,19 @@ environments' own ticks alone, never on how they happen to arrive together.
 
 from collections import deque
 
+from torch import Tensor
+
 from caraware.ipc.arrays import Float32Array
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.rollout import Rollout
 from caraware.run.config import RunConfig
 from caraware.run.estimates import Estimates
 from caraware.run.stream_position import StreamPosition, StreamProgress
+from caraware.run.trips import TripCounts
+from caraware.tasks.contract import Sampling
+
+AWAITED_LAG_TICKS = 4
+"""In lock-step SUMO is two ticks ahead of the one that is consumed; farther ahead, the tick was answered before."""
 
 
 class Environment:
@@ -27,6 +34,20 @@ class Environment:
         shown = config.sensors if config.shows_estimates() else None
         self._estimates = Estimates(shown) if shown else None
         self._received_last = False
+        self.trips = TripCounts()
+        """How the trips of heroes ended."""
+        self.answered: tuple[Observation, Tensor] | None = None
+        """The newest tick with its actions, in a world that waits for them."""
+        self._catches_up = True
+
+    def is_awaited(self, obs: Observation) -> bool:
+        """Whether the world waits for the actions of a tick. Ticks that come again were answered by a predecessor.
+
+        Once the trainer has caught up, every tick is awaited.
+        """
+        if self._catches_up:
+            self._catches_up = self.channel.lag_ticks() > AWAITED_LAG_TICKS
+        return not self._catches_up
 
     def estimates_m(self, obs: Observation) -> Float32Array | None:
         """f32 `[n, 2]`: the Kalman filter's positions (m, world), for viewers; None if it does not run."""
@@ -35,11 +56,14 @@ class Environment:
     def start(self, position: StreamPosition, horizon: int, observation_size: int) -> None:
         """Continue from `position`, collecting `horizon` samples for every update."""
         self.progress = StreamProgress(position)
+        task = self._config.task
+        drawn = task.actions.size if task.sampling is Sampling.EACH_TICK else 0
         self.rollout = Rollout(
             horizon,
             observation_size,
-            bootstrap=self._config.trainer.discount > 0,
+            bootstrap=self._config.trainer.discount > 0 or drawn > 0,
             dark_is_nan=self._config.dark_is_nan,
+            drawn_actions=drawn,
         )
 
     def admit(self, ticks: list[Observation]) -> None:

@@ -14,7 +14,9 @@ from caraware.learn.rewards import distance_m
 from caraware.learn.supervised import Supervised
 from caraware.report.evaluation import Evaluation, EvaluationResult
 from caraware.run.config import RunConfig
+from caraware.run.followed import FollowedTicks
 from caraware.run.stream_position import StreamProgress
+from caraware.tasks.contract import Sampling
 from caraware.tasks.metrics import reference_names
 
 log = logging.getLogger("caraware.run.loop")
@@ -28,6 +30,7 @@ class EvaluationPhase:
         self._config, self._number = config, number
         self._headline = config.task.metrics[0]
         self._evaluation: Evaluation | None = None
+        self._followed = FollowedTicks(config.task) if config.task.sampling is Sampling.EACH_TICK else None
         self._newest_tick = -1
 
     def add(
@@ -40,6 +43,13 @@ class EvaluationPhase:
     ) -> None:
         """Count one tick, unless a predecessor has evaluated it; `references` are the reference metrics by name."""
         if obs.tick <= progress.evaluated_tick:
+            return
+        if self._followed is not None:
+            if self._evaluation is None:
+                self._evaluation = Evaluation(self._headline.name)
+            if (past := self._followed.add(obs)) is not None:
+                self._evaluation.add(past, {"ppo": past.metrics[self._headline.name]})
+            self._newest_tick = obs.tick
             return
         if self._evaluation is None:
             self._evaluation = Evaluation(

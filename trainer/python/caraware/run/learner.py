@@ -4,16 +4,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
 
 from caraware.learn.build import build_ppo
 from caraware.learn.ppo import Ppo
 from caraware.learn.ranks import Ranks
-from caraware.learn.stored import SUPERVISED, LearnerShape, StoredTensors
+from caraware.learn.stored import PARAMETERS, SUPERVISED, LearnerShape, StoredTensors
 from caraware.learn.supervised import Supervised
 from caraware.run.checkpoint import TrainingHistory, load_checkpoint, load_history
 from caraware.run.config import RunConfig
 from caraware.run.continuation import Continuation
-from caraware.run.manifest import Counters
+from caraware.run.manifest import CheckpointError, Counters
 from caraware.run.stream_position import StreamPosition
 from caraware.tasks.localisation import Localisation
 
@@ -39,6 +42,8 @@ class Learner:
         learner = cls(ppo, beside, Counters(0, 0, 0, -1), TrainingHistory())
         if config.resume_from is not None:
             learner.load(config.resume_from)
+        elif config.begin_from is not None:
+            begin_from(ppo.updater.parameters(), config.begin_from)
         return learner
 
     def warm_up(self) -> None:
@@ -97,3 +102,20 @@ class Learner:
         self.ppo.restore(stored, updates)
         if self.supervised is not None and SUPERVISED in stored:
             self.supervised.restore(stored[SUPERVISED])
+
+
+def begin_from(own: dict[str, Tensor], place: Path) -> None:
+    """Fill the parameters of a new policy from a checkpoint or a file. Raises `CheckpointError`.
+
+    Parameters that the file lacks stay as drawn: a clone of a driver has no values.
+    """
+    file = place / PARAMETERS if place.is_dir() else place
+    try:
+        stored = load_file(file)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(file, f"cannot be read: {error}") from error
+    known = {name: tensor for name, tensor in stored.items() if name in own}
+    if not known or any(own[name].shape != tensor.shape for name, tensor in known.items()):
+        raise CheckpointError(file, "does not hold parameters of this run's networks")
+    for name, tensor in known.items():
+        own[name].copy_(tensor)

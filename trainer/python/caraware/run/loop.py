@@ -9,8 +9,10 @@ from torch import Tensor
 from caraware.ipc.arrays import FloatArray
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.batch import Batch, save_batch
+from caraware.learn.drawing import DrawingPredictor
 from caraware.learn.ppo import NonFiniteLoss, UpdateStats
 from caraware.learn.ranks import RankError, Ranks, Verdict
+from caraware.learn.rollout import DrawnTick
 from caraware.report.evaluation import EvaluationResult, pooled
 from caraware.report.metrics import Metrics, TrainingPoint
 from caraware.report.plots import plot_headline, plot_sigma
@@ -23,6 +25,8 @@ from caraware.run.learner import Learner
 from caraware.run.report_part import write_part
 from caraware.run.sample_count import SampleCount
 from caraware.run.stream_position import StreamPosition
+from caraware.run.trips import sum_of
+from caraware.tasks.contract import Sampling
 
 log = logging.getLogger(__name__)
 
@@ -148,6 +152,8 @@ class TrainingLoop:
             self._idle_waits = 0
             return
         self._idle_waits += 1
+        if self._idle_waits > 1:
+            self._answer_again()
         if not alone:
             self._channel.wait_for_any(RECEIVE_TIMEOUT_S)
 
@@ -204,8 +210,11 @@ class TrainingLoop:
         """Publish the prediction of one tick, then evaluate it or collect it."""
         assert self._learner is not None
         channel, progress = environment.channel, environment.progress
-        estimates_m = environment.estimates_m(obs)
-        if estimates_m is None:
+        drawn: DrawnTick | None = None
+        if isinstance(self._predictor, DrawingPredictor):
+            drawn = self._predictor.drawn(environment.index, obs.tick)
+            self._publish_actions(environment, obs, predicted_m)
+        elif (estimates_m := environment.estimates_m(obs)) is None:
             channel.publish_predictions(obs, predicted_m, self._updates())
         else:
             channel.publish_predictions(obs, predicted_m, self._updates(), estimates_m)
@@ -220,7 +229,21 @@ class TrainingLoop:
         self._finish_evaluation(environment)
         self._samples.add(samples, references, learns=self._learns)
         if self._learns:
-            environment.rollout.add(obs)
+            environment.rollout.add(obs, drawn)
+
+    def _publish_actions(self, environment: Environment, obs: Observation, actions: Tensor) -> None:
+        """Publish the actions of one tick, unless the world has gone on with what a predecessor drew."""
+        environment.trips.add(obs)
+        if environment.is_awaited(obs):
+            environment.channel.publish_predictions(obs, actions, self._updates())
+            environment.answered = (obs, actions)
+
+    def _answer_again(self) -> None:
+        """Publish the newest actions again: a simulator that was started again may have lost them."""
+        for environment in self._environments:
+            if environment.answered is not None:
+                obs, actions = environment.answered
+                environment.channel.publish_predictions(obs, actions, self._updates())
 
     def _learn_or_give_up(self, learner: Learner) -> None:
         """Learn if every horizon is full; give up learning if one can never be filled."""
@@ -339,6 +362,11 @@ class TrainingLoop:
             "untrained_env_steps": env_steps - self._trained_steps(),
             "dropped": self._metrics.dropped.report(),
         }
+        if self._task.sampling is Sampling.EACH_TICK and self._learner:
+            entries["trips"] = {
+                phase: sum_of(getattr(environment.trips, phase) for environment in self._environments)
+                for phase in ("training", "evaluation")
+            }
         phases = pooled([EvaluationResult.restored(result) for results, _ in every_rank for result in results])
         write_part(self._config.run_dir, entries, phases, self._task.metrics[0].name, self._stop_requested)
 

@@ -14,14 +14,17 @@ from torch import Tensor
 
 from caraware.baselines import Ekf
 from caraware.baselines.samples import read_samples
-from caraware.ipc.arrays import Float32Array, FloatArray
+from caraware.ipc.arrays import BoolArray, Float32Array, FloatArray, UInt32Array, UInt64Array
 from caraware.ipc.names import Names
 from caraware.ipc.run_file import RunFile
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.prediction import Predictor
 from caraware.report.statistics import mean_interval
 from caraware.run.config import RunConfig
+from caraware.run.followed import FollowedTicks
 from caraware.run.loop import RECEIVE_TIMEOUT_S
+from caraware.tasks.contract import Sampling
+from caraware.tasks.ends import name_of
 from caraware.tasks.metrics import interval_key, mean_key, reference_names
 
 LIVE = "live.json"
@@ -60,6 +63,8 @@ class PlayTally:
     """Means of each whole episode by estimator: each had a seed of its own."""
     vehicles: int = 0
     """Most at a time."""
+    ends: dict[str, int] = field(default_factory=dict)
+    """How the trips of heroes ended, by the name of the end."""
 
     @classmethod
     def read(cls, file: Path) -> "PlayTally":
@@ -104,19 +109,25 @@ class Scoreboard:
             self._ekf, self._of_vehicle = Ekf(self._noise), {}
         self._ekf.step(read_samples(obs, self._noise.convention))
         values, rows = self._measured(obs, predicted_m), np.flatnonzero(obs.valid)
-        self.tally.sums.add(values)
-        self.tally.running.add(values)
         self.tally.tick, self._sim_time_s = obs.tick, obs.sim_time_ns * 1e-9
         self.tally.vehicles = max(self.tally.vehicles, len(rows))
-        self._now = {}
-        for place, row in enumerate(rows):
-            vehicle = int(obs.vehicle[row])
-            if vehicle not in self._of_vehicle:
-                self._of_vehicle[vehicle] = (self._names.of(obs.id_hash[row]), MetricSums())
-            self._of_vehicle[vehicle][1].add({name: of_rows[place : place + 1] for name, of_rows in values.items()})
-            self._now[vehicle] = {name: float(of_rows[place]) for name, of_rows in values.items()}
+        self._count(values, obs.vehicle, obs.id_hash, obs.valid)
         if obs.episode_last:
             self.tally.end_episode()
+
+    def _count(
+        self, values: Mapping[str, FloatArray], vehicles: UInt32Array, id_hashes: UInt64Array, valid: BoolArray
+    ) -> None:
+        """Add the values `[v]` on the valid rows of a tick."""
+        self.tally.sums.add(values)
+        self.tally.running.add(values)
+        self._now = {}
+        for place, row in enumerate(np.flatnonzero(valid)):
+            vehicle = int(vehicles[row])
+            if vehicle not in self._of_vehicle:
+                self._of_vehicle[vehicle] = (self._names.of(id_hashes[row]), MetricSums())
+            self._of_vehicle[vehicle][1].add({name: of_rows[place : place + 1] for name, of_rows in values.items()})
+            self._now[vehicle] = {name: float(of_rows[place]) for name, of_rows in values.items()}
 
     def _measured(self, obs: Observation, predicted_m: Tensor) -> dict[str, FloatArray]:
         """The metric on the valid rows of a tick, by estimator."""
@@ -132,7 +143,7 @@ class Scoreboard:
         mean, names = self.tally.sums.mean, {"ppo": self.metric.name} | self._references
         return {name: mean(estimator) or math.nan for estimator, name in names.items()}
 
-    def estimates_m(self, obs: Observation) -> Float32Array:
+    def estimates_m(self, obs: Observation) -> Float32Array | None:
         """f32 `[n, 2]`: the filter's positions at the tick added last; not-a-number where a row is not valid."""
         position_m = np.asarray(self._ekf.position_m, dtype=np.float32)
         return np.where(np.asarray(obs.valid)[:, None], position_m, np.float32(np.nan))
@@ -164,6 +175,34 @@ class Scoreboard:
         partial.rename(file)
 
 
+class DrivingScoreboard(Scoreboard):
+    """The headline metric of a driving policy, which is measured a tick later; no filter drives beside it."""
+
+    def __init__(self, run: RunFile, config: RunConfig, tally: PlayTally) -> None:
+        super().__init__(run, config, tally)
+        self.estimators = ("ppo",)
+        self._followed = FollowedTicks(config.task)
+
+    def add(self, obs: Observation, predicted_m: Tensor) -> None:
+        """Count what the tick before led to."""
+        if obs.episode != self.tally.episode or self.tally.tick < 0:
+            self.tally.begin_episode(obs.episode)
+            self._of_vehicle = {}
+        self.tally.tick, self._sim_time_s = obs.tick, obs.sim_time_ns * 1e-9
+        self.tally.vehicles = max(self.tally.vehicles, int(np.count_nonzero(obs.valid)))
+        for slot in np.flatnonzero(obs.terminated | obs.truncated):
+            end = name_of(int(obs.ended_by[slot]))
+            self.tally.ends[end] = self.tally.ends.get(end, 0) + 1
+        if (past := self._followed.add(obs)) is not None:
+            self._count({"ppo": past.metrics[self.metric.name]}, past.vehicle, past.id_hash, past.valid)
+        if obs.episode_last:
+            self.tally.end_episode()
+
+    def estimates_m(self, obs: Observation) -> Float32Array | None:
+        """None: there is no position to estimate."""
+        return None
+
+
 class PlayedPolicy(Protocol):
     """A trained policy: `Ppo`, or the learned estimator."""
 
@@ -189,7 +228,9 @@ class PlayLoop:
     ) -> None:
         self._channel, self._config, self._policy, self._stop_requested = channel, config, policy, stop_requested
         self._live = config.run_dir / LIVE
-        self._board = Scoreboard(channel.run, config, PlayTally.read(self._live))
+        self._drives = config.task.sampling is Sampling.EACH_TICK
+        scoreboard = DrivingScoreboard if self._drives else Scoreboard
+        self._board = scoreboard(channel.run, config, PlayTally.read(self._live))
         self._shown_at = -math.inf
         self._predictor = policy.predictor(config.dark_is_nan, evaluations_alone=False)
 
@@ -213,6 +254,10 @@ class PlayLoop:
         updates = self._policy.updates
         for obs, predicted_m in zip(ticks, self._predictor.predict_m({0: ticks})[0], strict=True):
             self._board.add(obs, predicted_m)
+            if self._drives:
+                self._channel.publish_predictions(obs, predicted_m, updates)
+                self._channel.consumed(obs.tick)
+                continue
             self._channel.publish_predictions(obs, predicted_m, updates, self._board.estimates_m(obs))
             self._channel.consumed(obs.tick)
 
@@ -244,6 +289,8 @@ class PlayLoop:
             "evaluation_seeds": len(tally.episodes),
             "episodes": tally.episodes,
         }
+        if self._drives:
+            part["trips"] = tally.ends
         metric = self._board.metric.name
         for name in self._board.estimators:
             part[mean_key(name, metric)] = tally.sums.mean(name)

@@ -81,6 +81,8 @@ class TaskOutcome:
     """bool `[n]`: the trajectory ended with the tick."""
     truncated: Tensor
     """bool `[n]`: it was cut after the tick."""
+    ended_by: Tensor | None = None
+    """i64 `[n]`: bits `ENDED_…` of `caraware._native` that say why it ended; None where it is not known."""
 
 
 @dataclass(frozen=True)

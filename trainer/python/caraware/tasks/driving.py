@@ -1,15 +1,17 @@
 """The driving task: an action is steering and acceleration of a hero, and the world waits for it (docs/driving.md)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 
 import torch
 from torch import Tensor
 
 from caraware import _native
 from caraware.ipc.arrays import FloatArray
-from caraware.ipc.run_file import RunFile, setting
+from caraware.ipc.run_file import ConfigError, RunFile, config_table, setting
 from caraware.ipc.stream import MeasuredTick
+from caraware.tasks import ends
 from caraware.tasks.contract import ActionSpec, EndKind, EndReason, Sampling, TaskOutcome, TaskStep
 from caraware.tasks.fields import Fields
 from caraware.tasks.metrics import metrics_of
@@ -18,6 +20,8 @@ ARRIVED_WITHIN_M = 5.0
 """A hero whose episode ends this near to the end of its route has arrived (docs/driving.md)."""
 FAR_M = 999.0
 """Beyond it `route_left` is at the end of its range and does not tell progress."""
+END_REWARD = 10.0
+"""Of an arrival; any other end of its own costs as much: 100 m of progress."""
 
 
 class OutcomeMissingError(ValueError):
@@ -29,10 +33,59 @@ ACTIONS = ActionSpec(names=("steering", "acceleration"), low=-1.0, high=1.0, is_
 ENDS = (
     EndReason("collision", EndKind.TERMINATED),
     EndReason("off-road", EndKind.TERMINATED),
+    EndReason("red light", EndKind.TERMINATED),
+    EndReason("against traffic", EndKind.TERMINATED),
     EndReason("arrival", EndKind.TERMINATED),
     EndReason("time limit", EndKind.TRUNCATED),
     EndReason("end of the run's episode", EndKind.TRUNCATED),
 )
+
+
+@dataclass(frozen=True)
+class DrivenStep:
+    """What heroes did in a tick, for rewards. Each tensor is f64 `[n]` or bool `[n]`."""
+
+    progress_m: Tensor
+    """Along the route."""
+    offset_m: Tensor
+    """Distance beside the route after the tick, not negative; 0 without the field `route_offset`."""
+    speed_mps: Tensor
+    """After the tick."""
+    speed_limit_mps: Tensor
+    """Infinite without the field `speed_limit`."""
+    accel_mps2: Tensor
+    """Forward, mean over the tick."""
+    lateral_accel_mps2: Tensor
+    """To the left, mean over the tick."""
+    arrived: Tensor
+    failed: Tensor
+    """Ended by a collision, beside the road, at a red light, or against the traffic."""
+    ended: Tensor
+    """Its last tick, for any reason: the action was not used."""
+    ended_by: Tensor
+    """i64 `[n]`: bits of `caraware.tasks.ends`."""
+    action: Tensor
+    """f `[n, 2]`: steering and acceleration as the policy chose them."""
+
+
+DrivingReward = Callable[[DrivenStep], Tensor]
+"""Rewards `[n]` of a step."""
+
+
+def progress_reward(step: DrivenStep) -> Tensor:
+    """Progress along the route in tens of metres, times factors of lane, speed limit and comfort; ±10 for the end.
+
+    The form is that of CaRL (Jaeger et al., arXiv 2504.17838): one term that pays, factors from 0 to 1 that multiply
+    it, and hard infractions that end the episode. The numbers are this project's.
+    """
+    lane = 1 - 0.5 * (step.offset_m / 2).clamp(0, 1)
+    legal = 1 - ((step.speed_mps - step.speed_limit_mps - 1) / 5).clamp(0, 1)
+    felt_mps2 = torch.maximum(step.accel_mps2.abs(), step.lateral_accel_mps2.abs())
+    comfort = 1 - 0.5 * ((felt_mps2 - 3) / 3).clamp(0, 1)
+    progress = step.progress_m / 10
+    paid = torch.where(progress > 0, progress * lane * legal * comfort, progress)
+    end = torch.where(step.arrived, END_REWARD, torch.where(step.failed, -END_REWARD, 0.0))
+    return torch.where(step.ended, end, paid)
 
 
 @dataclass(frozen=True)
@@ -41,6 +94,7 @@ class Driving:
 
     fields: Fields
     tick_s: float
+    reward_of_step: DrivingReward = progress_reward
     name: str = "driving"
     actions: ActionSpec = ACTIONS
     sampling: Sampling = Sampling.EACH_TICK
@@ -50,8 +104,9 @@ class Driving:
 
     @classmethod
     def from_run(cls, run: RunFile) -> "Driving":
-        """Read the fields of the observation and the length of a tick."""
-        return cls(Fields.from_run(run), setting(run, "run.tick_s", float))
+        """Read the fields of the observation, the length of a tick, and the reward. Raises `ConfigError`."""
+        reward = _named(str(config_table(run, "task").get("reward", "")))
+        return cls(Fields.from_run(run), setting(run, "run.tick_s", float), reward)
 
     def answer(self, action: Tensor, observation: Tensor | None = None) -> Tensor:
         """The demands, clipped to their range."""
@@ -62,20 +117,35 @@ class Driving:
         return observation
 
     def reward(self, step: TaskStep, action: Tensor) -> Tensor:
-        """Metres along the route, in tens; less for what is beside it; ±10 for the end.
+        """The reward of the run: `progress_reward`, or the function that `task.reward` names."""
+        return self.reward_of_step(self.driven(step, action))
 
-        A tick of 10 m/s earns 0.1, one 5 m beside the line costs as much. Arrival earns 10, a collision or leaving the
-        road costs 10. A time limit is neither: the trajectory is truncated.
-        """
+    def driven(self, step: TaskStep, action: Tensor) -> DrivenStep:
+        """What the heroes did, from their fields and their true motion."""
         outcome = _outcome(step)
-        offset_m = self.fields.si_tensor(outcome.next.observation, "route_offset").abs()
-        on_the_way = self._progress_m(step, outcome) / 10 - 0.02 * offset_m
-        ended = outcome.terminated | outcome.truncated
-        if not ended.any():
-            return on_the_way
-        of_end = torch.where(outcome.terminated, -10.0, 0.0).double()
-        end = torch.where(self.arrived(step.observation, outcome.terminated), 10.0, of_end)
-        return torch.where(ended, end, on_the_way)
+        before, after = step.truth.double(), outcome.next.truth.double()
+        turned = after[:, 2] - before[:, 2]
+        yaw_rate = torch.atan2(turned.sin(), turned.cos()) / self.tick_s
+        why = outcome.ended_by
+        if why is None:
+            why = torch.where(self._at_the_end(step.observation), ends.ARRIVAL, ends.COLLISION)
+            why = torch.where(outcome.terminated, why, 0)
+        arrived = outcome.terminated & ((why & ends.ARRIVAL) != 0)
+        failed = outcome.terminated & ((why & (ends.COLLISION | ends.OFF_ROAD)) != 0)
+        failed |= outcome.terminated & ((why & (ends.RED_LIGHT | ends.AGAINST_TRAFFIC)) != 0)
+        return DrivenStep(
+            progress_m=self._progress_m(step, outcome),
+            offset_m=self._field(outcome.next.observation, "route_offset", 0.0).abs(),
+            speed_mps=after[:, 3],
+            speed_limit_mps=self._field(outcome.next.observation, "speed_limit", torch.inf),
+            accel_mps2=(after[:, 3] - before[:, 3]) / self.tick_s,
+            lateral_accel_mps2=after[:, 3] * yaw_rate,
+            arrived=arrived & ~failed,
+            failed=failed,
+            ended=outcome.terminated | outcome.truncated,
+            ended_by=why,
+            action=action,
+        )
 
     def measure(self, step: TaskStep, action: Tensor) -> dict[str, Tensor]:
         """`progress_mps`: speed along the route; `route_offset_m`: distance beside it, both after the action.
@@ -99,8 +169,17 @@ class Driving:
 
     def arrived(self, observation: Tensor, terminated: Tensor) -> Tensor:
         """bool `[n]`: the episode ended at the end of the route, and not by a collision or beside the road."""
+        return terminated & self._at_the_end(observation)
+
+    def _at_the_end(self, observation: Tensor) -> Tensor:
         # Within 10 cm: `route_left` is one of 2²⁴ steps of 1000 m.
-        return terminated & (self.fields.si_tensor(observation, "route_left") <= ARRIVED_WITHIN_M + 0.1)
+        return self.fields.si_tensor(observation, "route_left") <= ARRIVED_WITHIN_M + 0.1
+
+    def _field(self, observation: Tensor, name: str, without: float) -> Tensor:
+        """f64 `[n]`: a field in SI units, or `without` where the observation lacks it."""
+        if self.fields.has(name):
+            return self.fields.si_tensor(observation, name)
+        return torch.full(observation.shape[:1], without, dtype=torch.float64, device=observation.device)
 
     def _progress_m(self, step: TaskStep, outcome: TaskOutcome) -> Tensor:
         """f64 `[n]`: metres along the route in the tick."""
@@ -114,3 +193,18 @@ def _outcome(step: TaskStep) -> TaskOutcome:
     if step.outcome is None:
         raise OutcomeMissingError("the driving task rewards what an action did: give the step its outcome")
     return step.outcome
+
+
+def _named(reward: str) -> DrivingReward:
+    """The reward that `task.reward` names. Raises `ConfigError`."""
+    if not reward:
+        return progress_reward
+    module, _, name = reward.partition(":")
+    try:
+        function: DrivingReward = getattr(import_module(module), name)
+        return function
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f"`task.reward` is '{reward}': {error}",
+            "write `package.module:function`, a function of a `DrivenStep`; the module must be in PYTHONPATH",
+        ) from error

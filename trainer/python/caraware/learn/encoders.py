@@ -1,0 +1,87 @@
+"""A network for `observation.fields = "driver"`: each group of fields has an encoder, whose outputs are pooled.
+
+The road users, junctions, traffic lights and persons around a hero are sets of alike things. One small network encodes
+each member of a set, and the maximum over the members is what the layers above see: so the policy treats the third
+nearest vehicle as it treats the first. It is the encoder of PufferDrive and GPUDrive, written anew.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+EGO = 16
+"""Fields of the hero itself and of its route: the preset "driving"."""
+ENCODED = 32
+"""Width of what a group becomes."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Members of one kind, side by side in a row."""
+
+    prefix: str
+    """Their fields are called `prefix_1_…`, `prefix_2_…`."""
+    members: int
+    columns: int
+
+
+GROUPS = (Group("user", 8, 8), Group("junction", 3, 3), Group("light", 2, 2), Group("person", 2, 3))
+"""In the order of the preset "driver" (ipc-schema/src/field.rs)."""
+FIELDS = EGO + sum(group.members * group.columns for group in GROUPS)
+
+
+class GroupEncoder(nn.Module):
+    """Members `[b, m, c]` to `[b, ENCODED]`: two layers for each member, then the maximum over them."""
+
+    def __init__(self, columns: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(columns, ENCODED), nn.ReLU(), nn.Linear(ENCODED, ENCODED))
+
+    def forward(self, members: Tensor) -> Tensor:
+        """See the class."""
+        pooled: Tensor = self.layers(members).amax(1)
+        return pooled
+
+
+class GroupedNetwork(nn.Module):
+    """Rows `[b, inputs]` of the preset "driver" to `[b, outputs]`, through encoders and tanh layers.
+
+    `inputs` is a multiple of the 99 fields if the observation has a history: its ticks are encoded by the same
+    encoders and stand side by side. Raises `ValueError` for rows of other fields.
+    """
+
+    def __init__(self, inputs: int, outputs: int, hidden: tuple[int, ...]) -> None:
+        super().__init__()
+        if inputs == 0 or inputs % FIELDS:
+            raise ValueError(
+                f'rows of {inputs} numbers: this network takes the {FIELDS} of observation.fields = "driver"'
+            )
+        self.ticks = inputs // FIELDS
+        self.ego = nn.Linear(EGO, 2 * ENCODED)
+        self.groups = nn.ModuleList(GroupEncoder(group.columns) for group in GROUPS)
+        widths = (self.ticks * (2 + len(GROUPS)) * ENCODED, *hidden)
+        layers: list[nn.Module] = []
+        for before, after in pairwise(widths):
+            linear = nn.Linear(before, after)
+            nn.init.orthogonal_(linear.weight, 2**0.5)
+            nn.init.zeros_(linear.bias)
+            layers += [linear, nn.Tanh()]
+        head = nn.Linear(widths[-1], outputs)
+        # A policy begins near 0 on every axis, a value near 0.
+        nn.init.orthogonal_(head.weight, 0.01 if outputs > 1 else 1.0)
+        nn.init.zeros_(head.bias)
+        self.trunk = nn.Sequential(*layers, head)
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """See the class."""
+        ticks = rows.view(len(rows) * self.ticks, FIELDS)
+        encoded, at = [self.ego(ticks[:, :EGO])], EGO
+        for group, encoder in zip(GROUPS, self.groups, strict=True):
+            width = group.members * group.columns
+            encoded.append(encoder(ticks[:, at : at + width].reshape(-1, group.members, group.columns)))
+            at += width
+        seen = torch.cat(encoded, 1).relu()
+        out: Tensor = self.trunk(seen.view(len(rows), -1))
+        return out

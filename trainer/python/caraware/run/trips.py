@@ -1,0 +1,39 @@
+"""How the trips of heroes ended, counted from the flags of the tick after."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from caraware.ipc.stream import Observation
+from caraware.tasks.ends import name_of
+
+Trips = Counter[str]
+"""Trips by the name of their end."""
+
+
+@dataclass
+class TripCounts:
+    """Trips that ended in training and in evaluations."""
+
+    training: Trips = field(default_factory=Counter)
+    evaluation: Trips = field(default_factory=Counter)
+
+    def add(self, obs: Observation) -> None:
+        """Count the trips that the flags of one tick end."""
+        ended = np.flatnonzero(obs.terminated | obs.truncated)
+        if not len(ended):
+            return
+        counts = self.evaluation if obs.evaluation else self.training
+        reasons = obs.ended_by
+        for slot in ended:
+            counts[name_of(int(reasons[slot]))] += 1
+
+
+def sum_of(counts: Iterable[Trips]) -> dict[str, int]:
+    """All together."""
+    total: Trips = Counter()
+    for each in counts:
+        total += each
+    return dict(sorted(total.items()))
