@@ -23,9 +23,11 @@ pub enum BenchPart {
     Scale,
     /// Vehicle-steps per second, compared with Python loops over TraCI and libsumo, with MetaDrive and with SMARTS
     Peers,
+    /// Driving: a fixed list of held-out trips with a random driver, the script, SUMO's own driver, and a learnt policy (`--policy`)
+    Driving,
     /// Endurance: kills, stops and replaces every process at random moments, and compares each run with an undisturbed one
     Endurance,
-    /// All of these but endurance, one after the other
+    /// All of these but driving and endurance, one after the other
     All,
 }
 
@@ -37,7 +39,7 @@ impl BenchPart {
 
     /// The parts of `all`: those that measure a speed.
     pub fn speeds() -> impl Iterator<Item = Self> {
-        Self::measured().filter(|part| *part != Self::Endurance)
+        Self::measured().filter(|part| !matches!(part, Self::Driving | Self::Endurance))
     }
 
     /// Its name on the command line.
@@ -72,6 +74,12 @@ pub struct BenchArgs {
     /// Seed of the moments and kinds of `endurance`'s disturbances
     #[arg(long, value_name = "SEED", default_value_t = 1)]
     pub seed: u64,
+    /// Checkpoint, or file of parameters, of the policy that `driving` compares
+    #[arg(long, value_name = "PATH")]
+    pub policy: Option<PathBuf>,
+    /// Trips of each driver in `driving`
+    #[arg(long, value_name = "TRIPS", default_value_t = 480, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub trips: u32,
     /// Python that has the peers installed [default: that of `make peers`, or the project's]
     #[arg(long, value_name = "PATH")]
     pub python: Option<PathBuf>,

@@ -3,6 +3,7 @@
 //! The `caraware` command starts this program with its arguments. Each part has a file, and its result is a [`BenchReport`] (decision 9).
 
 mod cli;
+mod driving;
 mod endurance;
 mod envs;
 mod fanout;
@@ -39,6 +40,10 @@ pub struct BenchOptions {
     pub minutes: u64,
     /// Seed of the disturbances.
     pub seed: u64,
+    /// The policy whose driving is measured.
+    pub policy: Option<PathBuf>,
+    /// Trips of each driver.
+    pub trips: u32,
 }
 
 fn main() -> ExitCode {
@@ -66,6 +71,11 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
         quick: args.quick,
         minutes: args.minutes,
         seed: args.seed,
+        policy: args
+            .policy
+            .as_ref()
+            .map(|path| std::path::absolute(path).unwrap_or_else(|_| path.clone())),
+        trips: args.trips,
     };
     let parts = match args.part {
         BenchPart::All => BenchPart::speeds().collect(),
@@ -106,6 +116,7 @@ fn bench(args: &BenchArgs) -> Result<(), Exit> {
 
 fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit> {
     match part {
+        BenchPart::Driving => driving::measure(options),
         BenchPart::Endurance => endurance::measure(options),
         BenchPart::Envs => envs::measure(options),
         BenchPart::Ipc => ipc::measure(options),

@@ -1,0 +1,169 @@
+"""What surrounds learning to drive: the encoders, the teacher's actions, the trips of the benchmark."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from caraware import _native
+from caraware.driving.imitate import Limits, Teacher, clone
+from caraware.driving.trips import TripLog
+from caraware.ipc.stream import EMPTY_SLOT
+from caraware.learn.config import TrainerConfig
+from caraware.learn.encoders import EGO, FIELDS, GROUPS, GroupedNetwork
+from caraware.learn.networks import GaussianPolicy
+from caraware.learn.ppo import PlainUpdate
+from caraware.run.learner import begin_from
+from caraware.run.manifest import CheckpointError
+from caraware.tasks import ends
+from caraware.tasks.driving import Driving
+from safetensors.torch import save_file
+from synthetic import run_file
+from test_tasks import run_of
+from torch import Tensor, nn
+
+LIMITS = Limits(accel_mps2=3.0, decel_mps2=6.0, angle_rad=0.5, tick_s=0.1)
+
+
+def network(outputs: int = 2) -> GroupedNetwork:
+    torch.manual_seed(1)
+    return GroupedNetwork(FIELDS, outputs, (16, 16))
+
+
+def test_the_order_of_a_groups_members_does_not_matter_and_their_number_is_that_of_the_fields() -> None:
+    assert FIELDS == 99 and EGO == 16
+    rows, mixed = torch.rand(4, FIELDS) * 2 - 1, []
+    at = EGO
+    for group in GROUPS:
+        width = group.members * group.columns
+        members = rows[:, at : at + width].view(4, group.members, group.columns)
+        mixed.append(members.flip(1).reshape(4, width))
+        at += width
+    assert at == FIELDS
+    net = network()
+    assert torch.allclose(net(torch.cat((rows[:, :EGO], *mixed), 1)), net(rows), atol=1e-6)
+    other = rows.clone()
+    other[:, EGO] += 0.5
+    assert not torch.allclose(net(other), net(rows), atol=1e-6), "a member counts"
+    with pytest.raises(ValueError, match=r'observation\.fields = "driver"'):
+        GroupedNetwork(16, 2, (16,))
+
+
+def test_the_teachers_action_is_what_the_next_tick_shows() -> None:
+    # 10 m/s on a circle of 50 m, then harder braking than acceleration, then standing.
+    before = torch.tensor([[0.0, 0.0, 3.1, 10.0], [0.0, 0.0, 0.0, 10.0], [0.0, 0.0, 0.0, 10.0], [0.0, 0.0, 0.0, 0.0]])
+    after = torch.tensor([[1.0, 0.0, -3.1631853, 10.0], [1.0, 0, 0.0, 9.7], [1.0, 0, 0.0, 10.3], [0.0, 0.0, 0.2, 0.0]])
+    action = LIMITS.action(before, after)
+    assert action[0].tolist() == pytest.approx([math.atan(2.7 / 50) / 0.5, 0.0], abs=1e-4), "across ±π"
+    assert action[1].tolist() == pytest.approx([0.0, -0.5], abs=1e-5)
+    assert action[2].tolist() == pytest.approx([0.0, 1.0], abs=1e-5)
+    assert action[3].tolist() == [0.0, 0.0], "a yaw rate at standstill shows no steering"
+
+
+@dataclass
+class Tick:
+    """A tick of heroes."""
+
+    tick: int
+    vehicle: np.ndarray
+    episode: int = 0
+    left_m: float = 400.0
+    ended: dict[int, int] = field(default_factory=dict)
+
+    @property
+    def valid(self) -> np.ndarray:
+        valid: np.ndarray = self.vehicle != EMPTY_SLOT
+        return valid
+
+    @property
+    def observation(self) -> Tensor:
+        return torch.tensor([[self.left_m / 500 - 1, 0.0]] * len(self.vehicle))
+
+    @property
+    def truth(self) -> Tensor:
+        return torch.tensor([[0.0, 0.0, 0.0, 10.0]] * len(self.vehicle))
+
+    @property
+    def id_hash(self) -> np.ndarray:
+        return np.array([_native.id_hash(f"hero.{vehicle}") for vehicle in self.vehicle], np.uint64)
+
+    @property
+    def ended_by(self) -> np.ndarray:
+        return np.array([self.ended.get(slot, 0) for slot in range(len(self.vehicle))], np.uint32)
+
+    @property
+    def terminated(self) -> np.ndarray:
+        return np.array([slot in self.ended for slot in range(len(self.vehicle))])
+
+    @property
+    def truncated(self) -> np.ndarray:
+        return np.zeros(len(self.vehicle), bool)
+
+
+def heroes(*vehicles: int) -> np.ndarray:
+    return np.array([EMPTY_SLOT if vehicle < 0 else vehicle for vehicle in vehicles], np.uint32)
+
+
+def test_a_pair_is_of_a_hero_that_stays_in_its_slot() -> None:
+    teacher = Teacher(LIMITS)
+    for tick in (
+        Tick(0, heroes(0, 1)),
+        Tick(1, heroes(0, 1)),  # two pairs
+        Tick(2, heroes(0, 2)),  # one: another hero took the second slot
+        Tick(4, heroes(0, 2)),  # none: a tick is missing
+        Tick(5, heroes(0, -1), episode=1),  # none: another episode
+        Tick(6, heroes(0, -1), episode=1),  # one
+    ):
+        teacher.add(tick)  # type: ignore[arg-type]  # what the teacher reads of a tick
+    assert teacher.pairs == 4 and teacher.tensors()["observation"].shape == (4, 2)
+
+
+def test_a_clone_comes_nearer_to_its_teacher_than_doing_nothing_and_a_policy_begins_as_it(tmp_path: Any) -> None:
+    generator = torch.Generator().manual_seed(2)
+    observation = torch.rand(8000, FIELDS, generator=generator) * 2 - 1
+    data = {"observation": observation, "action": torch.stack((observation[:, 3], -observation[:, 5]), 1) * 0.5}
+    config = TrainerConfig.from_run(run_file(str(tmp_path)))
+
+    def updater() -> PlainUpdate:
+        return PlainUpdate(
+            config, GaussianPolicy(nn.Sequential(network(), nn.Tanh()), 2, 0.5), network(1), torch.device("cpu")
+        )
+
+    taught = updater()
+    figures = clone(data, taught, generator)
+    assert figures.pairs == 8000
+    assert all(error < 0.7 * none for error, none in zip(figures.error, figures.error_of_zero, strict=True))
+    file, fresh = tmp_path / "clone.safetensors", updater()
+    kept = {name: tensor.clone() for name, tensor in taught.parameters().items() if name.startswith("policy.")}
+    save_file(kept, file)
+    begin_from(fresh.parameters(), file)
+    assert torch.allclose(fresh.mean(observation[:9]), taught.mean(observation[:9]), atol=1e-6)
+    save_file({"policy.0.trunk.0.weight": torch.zeros(2, 2)}, file)
+    with pytest.raises(CheckpointError, match="does not hold parameters of this run's networks"):
+        begin_from(fresh.parameters(), file)
+
+
+def trip_log() -> TripLog:
+    run = run_of("driving")
+    run["config"]["traffic"] |= {"heroes": 2, "cavs": 0, "others": 0, "pedestrians": 0}
+    run["config"]["trainer"] = run_file("/tmp")["config"]["trainer"]
+    return TripLog(run, Driving.from_run(run))
+
+
+def test_a_trip_is_that_of_a_hero_of_the_list_and_counts_once() -> None:
+    log = trip_log()
+    log.add(Tick(0, heroes(0, -1)))  # type: ignore[arg-type]  # what the log reads of a tick
+    log.add(Tick(1, heroes(0, 1)))  # type: ignore[arg-type]
+    log.add(Tick(2, heroes(-1, 1), ended={0: ends.COLLISION | ends.OFF_ROAD}))  # type: ignore[arg-type]
+    log.add(Tick(3, heroes(5, 1)))  # type: ignore[arg-type]  # a hero that replaces another is not of the list
+    log.add(Tick(4, heroes(5, -1), ended={1: ends.ARRIVAL}))  # type: ignore[arg-type]
+    log.add(Tick(5, heroes(0, -1), episode=1, left_m=700.0))  # type: ignore[arg-type]
+    log.add(Tick(6, heroes(-1, -1), episode=2, ended={0: 0}))  # type: ignore[arg-type]
+    found = [(trip.episode, trip.hero, trip.end, round(trip.length_m), round(trip.way_m, 3)) for trip in log.trips]
+    assert found == [
+        (0, "hero.0", "collision", 400, 1.0),
+        (0, "hero.1", "arrival", 400, 2.0),
+        (1, "hero.0", "end of the run's episode", 700, 0.0),
+    ]
