@@ -1,8 +1,9 @@
 //! The life of a real SUMO: its frames, and its failures.
 
-use crate::support::{Bench, run, sumo_home};
+use crate::support::{Bench, own_options, run, sumo_home};
 use ipc_schema::{
     failure::{Failure, FailureKind},
+    run::ScenarioOptions,
     traffic::{DISCONTINUOUS, Kind, MetaEvent},
 };
 use traffic_bridge::sumo::{
