@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from test_ppo import NOISE_M, TOY, fresh
 from test_supervised import beside, train_both
 
 TICKS, VEHICLES = 120, 10
-WRONG_NOISE = {
+WRONG_NOISE: dict[str, dict[str, Any]] = {
     "fixes taken for exact": {"fix_std_m": (0.05, 0.05)},
     "a compass taken for worthless": {"compass_std_rad": 10.0, "gyro_std_radps": 1.0},
     "a wheel taken for worthless": {"wheel_std_mps": 100.0, "accel_std_mps2": 50.0},

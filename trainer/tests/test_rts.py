@@ -182,9 +182,9 @@ def test_the_number_of_slots_may_grow_and_slots_may_be_empty() -> None:
     shown = list(observations(town_track(60, 2, 1), seed=2, dark=dark))
     alone, growing = Baselines(noise), Baselines(noise)
     for obs in shown:
-        one, _ = alone.add(obs)
-        two, _ = growing.add(in_slots(obs, [1, 0], 2 if obs.tick < 30 else 5))
-        np.testing.assert_array_equal(one.error_m, two.error_m[::-1])
-        np.testing.assert_array_equal(two.vehicle, [1, 0])
+        one_each, _ = alone.add(obs)
+        two_each, _ = growing.add(in_slots(obs, [1, 0], 2 if obs.tick < 30 else 5))
+        np.testing.assert_array_equal(one_each["ekf"].error_m, two_each["ekf"].error_m[::-1])
+        np.testing.assert_array_equal(two_each["ekf"].vehicle, [1, 0])
     for one, two in zip(alone.finish_episode(), growing.finish_episode(), strict=True):
         np.testing.assert_allclose(one.error_m, two.error_m[::-1], rtol=1e-9)

@@ -83,7 +83,8 @@ class Supervised:
         if part.share == 0.0:
             self.mlp.parameters.gradient.zero_()
             return torch.zeros((), device=self._device)
-        return self.gradient(*part.own, part.share)
+        observation, truth = part.own
+        return self.gradient(observation, truth, part.share)
 
     @torch.no_grad()
     def gradient(self, observation: Tensor, truth: Tensor, share: float = 1.0) -> Tensor:

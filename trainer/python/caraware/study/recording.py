@@ -77,7 +77,7 @@ class EpisodeWriter:
         """Write what is there. Slots only become more: earlier ticks are filled up with empty ones."""
         ticks, self.ticks = self.ticks, []
         slots = max(len(tick["vehicle"]) for tick in ticks)
-        columns = {name: np.array([tick[name] for tick in ticks]) for name in SCALARS}
+        columns: dict[str, Any] = {name: np.array([tick[name] for tick in ticks]) for name in SCALARS}
         for name in (*TENSORS, *ARRAYS):
             first = ticks[0][name]
             whole = np.zeros((len(ticks), slots, *first.shape[1:]), first.dtype)

@@ -180,4 +180,4 @@ def _mean_error_m(predict: Predict, ticks: Sequence[RecordedTick]) -> float:
     valid = torch.from_numpy(np.concatenate([obs.valid for obs in ticks]))
     observation = torch.cat([obs.observation for obs in ticks])[valid]
     truth = torch.cat([obs.truth for obs in ticks])[valid]
-    return (predict(observation) - truth[:, :2]).double().norm(dim=1).mean().item()
+    return float((predict(observation) - truth[:, :2]).double().norm(dim=1).mean())

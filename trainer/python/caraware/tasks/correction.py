@@ -68,7 +68,8 @@ class FixCorrection:
             way_m = (rows[..., :-1, column] - rows[..., -1:, column]) * ((high - low) / (1.0 - fields.low))
             units = (way_m + moved_m[axis]) / self.unit_m
             rows[..., :-1, column] = units.clamp(-FURTHEST_UNITS, FURTHEST_UNITS)
-        return rows.flatten(-2)
+        seen: Tensor = rows.flatten(-2)
+        return seen
 
     def _moved_m(self, observation: Tensor) -> tuple[Tensor | float, Tensor | float]:
         """East and north `[n, history - 1]`: the way from each older tick to the newest, by wheel speed and compass."""
