@@ -45,7 +45,8 @@ class Lane:
         self._why, self._time_up = np.zeros(HEROES, np.uint32), np.zeros(HEROES, bool)
         self._held = np.ones(HEROES, bool)
         self._ready: LaneTick | None = None
-        self.is_done, self.rewards = False, []
+        self.is_done = False
+        self.rewards: list[float] = []
         self._start(np.arange(HEROES))
         self._make()
 
@@ -99,7 +100,8 @@ class Lane:
         self._time_up = (self._age >= LIMIT_TICKS) & ~off & ~arrived
         why = np.where(off, ends.OFF_ROAD, np.where(arrived, ends.ARRIVAL, np.where(self._time_up, ends.TIME_LIMIT, 0)))
         self._why = np.where(self._held, why, 0).astype(np.uint32)
-        return self._why != 0
+        over: np.ndarray = self._why != 0
+        return over
 
     def receive(self, timeout_s: float) -> Sequence[LaneTick]:
         """The next tick, once."""
