@@ -29,7 +29,7 @@ use crate::{
     parallel,
     radio::{
         fading,
-        medium::{Medium, MediumLink, QueuedMessage, Schedule},
+        medium::{Medium, MediumLink, OnAir, QueuedMessage, Schedule},
         milliwatts, noise_dbm,
         obstruction::{Antenna, Obstacles},
         path_loss::{LinkState, decorrelation_m, path_loss_db, shadowing_std_db, vehicle_loss_db},
@@ -43,7 +43,7 @@ use crate::{
         cpm::{CpmService, ObjectKind, PerceivedMotion},
     },
     station::{
-        OwnMeasurement, Perception, PerceptionSpec, SensorDeviations, Station, VehicleSize, compose_cam, compose_cpm,
+        MessageComposer, OwnMeasurement, Perception, PerceptionSpec, SensorDeviations, Station, VehicleSize,
         object_of_cam, objects_of_cpm, rotate, station_id,
     },
 };
@@ -219,7 +219,7 @@ impl MessageExchange {
         if header.has(FIRST_OF_EPISODE) {
             self.begin_episode(header);
         }
-        self.take_slots(header, slots, states);
+        self.take_slots(slots, states);
         let now_ms = (header.sim_time_ns / 1_000_000) as i64;
         let lifetime_ms = (self.config.object_lifetime_s * 1000.0) as i64;
         let (heard, inbox) = (&self.heard, &self.inbox);
@@ -251,7 +251,7 @@ impl MessageExchange {
     }
 
     /// Gives each slot its station; one whose vehicle is new begins with an empty map.
-    fn take_slots(&mut self, header: &MessageHeader, slots: &[SlotMeasurement], states: &[VehicleState]) {
+    fn take_slots(&mut self, slots: &[SlotMeasurement], states: &[VehicleState]) {
         self.stations.resize(slots.len(), None);
         self.activity.resize(slots.len(), RadioActivity::default());
         self.inbox.resize(slots.len(), Vec::new());
@@ -282,14 +282,14 @@ impl MessageExchange {
                 .as_ref()
                 .is_some_and(|station| station.id_hash == measured.id_hash);
             if !is_same || measured.episode_step == 0 {
-                self.stations[slot] = Some(self.begin_station(measured.id_hash, header));
+                self.stations[slot] = Some(self.begin_station(measured.id_hash));
                 self.activity[slot] = RadioActivity::default();
                 self.inbox[slot].clear();
             }
         }
     }
 
-    fn begin_station(&self, id_hash: u64, header: &MessageHeader) -> Station {
+    fn begin_station(&self, id_hash: u64) -> Station {
         let station = station_id(id_hash);
         let key = LinkKey {
             sender: station,
@@ -297,7 +297,6 @@ impl MessageExchange {
         };
         let [equipped, ..] = self.random.uniforms(key, RadioDraw::Equipped, 0);
         let [phase, ..] = self.random.uniforms(key, RadioDraw::Phase, 0);
-        let _ = header;
         Station {
             id_hash,
             station,
@@ -423,6 +422,15 @@ impl MessageExchange {
                 true => StationKind::HEAVY_TRUCK,
                 false => StationKind::PASSENGER_CAR,
             };
+            let composer = MessageComposer {
+                station: station.station,
+                kind,
+                now_ns,
+                own,
+                size: &size,
+                deviations,
+                projection,
+            };
             let mut emit = |service: u32, port: BtpPort, message: Vec<u8>, place: &crate::message::GeodeticPoint| {
                 let head = PacketHead {
                     port,
@@ -450,23 +458,21 @@ impl MessageExchange {
             // Typical sizes decide the table of congestion control before the message exists.
             let cam_gap_ns = gap(120, &station.congestion);
             if let Some(content) = station.cam.check(now_ns, &own.motion(&size), cam_gap_ns) {
-                let low = content.has_low_frequency;
-                let cam = compose_cam(station.station, kind, now_ns, own, &size, deviations, projection, low);
+                let cam = composer.cam(content.has_low_frequency);
                 if let Some(cam) = cam {
                     emit(0, BtpPort::Cam, cam.encode(), &cam.position);
                 }
             }
             if perception.range_m > 0.0 {
-                let perceived = perceive(
-                    radio,
-                    state,
+                let observer = Observer {
+                    antenna: &radio.antenna,
+                    station: station.station,
+                    tick,
                     states,
                     obstacles,
                     random,
-                    perception,
-                    station.station,
-                    tick,
-                );
+                };
+                let perceived = observer.perceive(perception);
                 let motions: Vec<PerceivedMotion> = perceived
                     .iter()
                     .map(|object| PerceivedMotion {
@@ -482,19 +488,7 @@ impl MessageExchange {
                 let cpm_gap_ns = gap(400, &station.congestion);
                 if let Some(content) = station.cpm.check(now_ns, &motions, cpm_gap_ns) {
                     let has_sensors = content.has_sensor_information;
-                    let included = &content.objects;
-                    let id = station.station;
-                    let cpm = compose_cpm(
-                        id,
-                        now_ns,
-                        own,
-                        &size,
-                        projection,
-                        perception,
-                        &perceived,
-                        included,
-                        has_sensors,
-                    );
+                    let cpm = composer.cpm(perception, &perceived, &content.objects, has_sensors);
                     if let Some(cpm) = cpm {
                         emit(1, BtpPort::Cpm, cpm.encode(), &cpm.position);
                     }
@@ -602,8 +596,14 @@ impl MessageExchange {
         let stations: Vec<u32> = (0..radios.len()).map(|radio| self.station_at(radios, radio)).collect();
         let mut decoded: Vec<Vec<u32>> = vec![Vec::new(); schedule.on_air.len()];
         let (medium, random) = (&self.medium, &self.random);
+        let on_air = OnAir {
+            schedule,
+            queue,
+            links,
+            stations: &stations,
+        };
         parallel::for_each(self.config.threads as usize, &mut decoded, |number, decoded| {
-            medium.receivers(number, schedule, queue, links, &stations, random, decoded);
+            medium.receivers(number, &on_air, random, decoded);
         });
         let (threads, projection) = (self.config.threads as usize, &self.maps[self.at].projection);
         let mut heard: Vec<HeardMessage> = schedule
@@ -669,64 +669,68 @@ fn read_packet(packet: &[u8], now_ns: u64, projection: &Projection, known: &mut 
     }
 }
 
-/// Objects that a vehicle sees: in range, and neither a building nor another road user in the way of its centre.
-fn perceive(
-    radio: &Radio,
-    state: &VehicleState,
-    states: &[VehicleState],
-    obstacles: &Obstacles,
-    random: &RadioRandom,
-    spec: &PerceptionSpec,
+/// A vehicle that perceives others at a tick.
+struct Observer<'a> {
+    antenna: &'a Antenna,
     station: u32,
     tick: u32,
-) -> Vec<Perception> {
-    let bodies = obstacles.bodies();
-    let own = &bodies[radio.antenna.row as usize];
-    let front_m = own.world_from_local([own.half_m[0], 0.0]);
-    let mut near = Vec::new();
-    obstacles.road_users_near(&Bounds::about(own.centre_m, spec.range_m), &mut near);
-    let object = |row: &u32| {
-        let (body, other) = (&bodies[*row as usize], &states[*row as usize]);
-        let [dx, dy] = [0, 1].map(|axis: usize| body.centre_m[axis] - own.centre_m[axis]);
-        if *row == radio.antenna.row || dx * dx + dy * dy > spec.range_m * spec.range_m {
-            return None;
-        }
-        let target = Antenna {
-            position_m: body.centre_m,
-            z_m: body.z_m[1],
-            row: *row,
+    states: &'a [VehicleState],
+    obstacles: &'a Obstacles,
+    random: &'a RadioRandom,
+}
+
+impl Observer<'_> {
+    /// Objects that the vehicle sees: in range, and neither a building nor another road user in the way of their centre.
+    fn perceive(&self, spec: &PerceptionSpec) -> Vec<Perception> {
+        let Self { states, obstacles, .. } = self;
+        let (bodies, state) = (obstacles.bodies(), &states[self.antenna.row as usize]);
+        let own = &bodies[self.antenna.row as usize];
+        let front_m = own.world_from_local([own.half_m[0], 0.0]);
+        let mut near = Vec::new();
+        obstacles.road_users_near(&Bounds::about(own.centre_m, spec.range_m), &mut near);
+        let object = |row: &u32| {
+            let (body, other) = (&bodies[*row as usize], &states[*row as usize]);
+            let [dx, dy] = [0, 1].map(|axis: usize| body.centre_m[axis] - own.centre_m[axis]);
+            if *row == self.antenna.row || dx * dx + dy * dy > spec.range_m * spec.range_m {
+                return None;
+            }
+            let target = Antenna {
+                position_m: body.centre_m,
+                z_m: body.z_m[1],
+                row: *row,
+            };
+            let hidden = obstacles.meets_building(self.antenna, &target)
+                || obstacles.highest_vehicle_m(self.antenna, &target).is_some();
+            if hidden {
+                return None;
+            }
+            let key = LinkKey {
+                sender: self.station,
+                receiver: station_id(other.id_hash),
+                message: self.tick,
+            };
+            let [ex, ey, ev, ew] = self.random.normals(key, RadioDraw::Perception, 0).map(f64::from);
+            let offset = [body.centre_m[0] - front_m[0], body.centre_m[1] - front_m[1]];
+            let [ahead, left] = rotate(offset, -state.yaw_rad);
+            let velocity = rotate(
+                [
+                    f64::from(other.velocity_body_mps[0]),
+                    f64::from(other.velocity_body_mps[1]),
+                ],
+                other.yaw_rad - state.yaw_rad,
+            );
+            Some(Perception {
+                object: (other.vehicle % 65_535) as u16,
+                position_body_m: [ahead + spec.position_std_m * ex, left + spec.position_std_m * ey],
+                velocity_body_mps: [
+                    velocity[0] + spec.speed_std_mps * ev,
+                    velocity[1] + spec.speed_std_mps * ew,
+                ],
+                turn_rad: other.yaw_rad - state.yaw_rad,
+                size_m: [other.length_m.into(), other.width_m.into()],
+                is_person: other.kind == Kind::Person as u32,
+            })
         };
-        let hidden = obstacles.meets_building(&radio.antenna, &target)
-            || obstacles.highest_vehicle_m(&radio.antenna, &target).is_some();
-        if hidden {
-            return None;
-        }
-        let key = LinkKey {
-            sender: station,
-            receiver: station_id(other.id_hash),
-            message: tick,
-        };
-        let [ex, ey, ev, ew] = random.normals(key, RadioDraw::Perception, 0).map(f64::from);
-        let offset = [body.centre_m[0] - front_m[0], body.centre_m[1] - front_m[1]];
-        let [ahead, left] = rotate(offset, -state.yaw_rad);
-        let velocity = rotate(
-            [
-                f64::from(other.velocity_body_mps[0]),
-                f64::from(other.velocity_body_mps[1]),
-            ],
-            other.yaw_rad - state.yaw_rad,
-        );
-        Some(Perception {
-            object: (other.vehicle % 65_535) as u16,
-            position_body_m: [ahead + spec.position_std_m * ex, left + spec.position_std_m * ey],
-            velocity_body_mps: [
-                velocity[0] + spec.speed_std_mps * ev,
-                velocity[1] + spec.speed_std_mps * ew,
-            ],
-            turn_rad: other.yaw_rad - state.yaw_rad,
-            size_m: [other.length_m.into(), other.width_m.into()],
-            is_person: other.kind == Kind::Person as u32,
-        })
-    };
-    near.iter().filter_map(object).collect()
+        near.iter().filter_map(object).collect()
+    }
 }

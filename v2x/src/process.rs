@@ -8,7 +8,7 @@ use ipc_schema::{
     board::State,
     config::{Config, ImuConvention},
     failure::{Failure, FailureKind},
-    header::{FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
+    header::{LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::{RunMembership, Wait},
     neighbours::{NeighboursLayout, NeighboursSections},
     observation::{EMPTY_SLOT, ObservationLayout},
@@ -180,9 +180,6 @@ impl V2xProcess {
                 .into());
             }
         }
-        if header.has(FIRST_OF_EPISODE) && header.tick == self.membership.run.first_tick() {
-            tracing::debug!("the first episode begins at tick {}", header.tick);
-        }
         let states: &[VehicleState] =
             block::view(world.payload(), WorldLayout::of(world.header()).states).map_err(unreadable)?;
         let slots = slots_of(measurement, &self.membership.run.config).map_err(unreadable)?;
@@ -198,7 +195,10 @@ impl V2xProcess {
             }
         }
         self.publish(&header, &slots, states, &layout)?;
-        self.exchange.send(&header, &slots, states);
+        // What is sent after the last tick of an episode arrives nowhere.
+        if !header.has(LAST_OF_EPISODE) {
+            self.exchange.send(&header, &slots, states);
+        }
         self.report(&header);
         Ok(Wait::Ready)
     }

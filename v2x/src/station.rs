@@ -171,40 +171,6 @@ fn fix_time_ns(now_ns: u64, own: &OwnMeasurement) -> u64 {
     now_ns.saturating_sub((own.fix_age_s * 1e9) as u64)
 }
 
-/// Composes a cooperative awareness message.
-#[must_use]
-pub fn compose_cam(
-    station: u32,
-    kind: StationKind,
-    now_ns: u64,
-    own: &OwnMeasurement,
-    size: &VehicleSize,
-    deviations: &SensorDeviations,
-    projection: &Projection,
-    has_low_frequency: bool,
-) -> Option<Cam> {
-    Some(Cam {
-        station,
-        kind,
-        generation_delta_ms: generation_delta_ms(its_time_ms(fix_time_ns(now_ns, own))),
-        position: reference(projection, own, size)?,
-        heading: Some(heading_from_yaw(own.heading_rad)),
-        heading_confidence: Some(confidence(deviations.heading_rad.to_degrees(), 0.1)),
-        speed_cmps: Some((own.speed_mps.max(0.0) * 100.0).round().min(16_382.0) as u16),
-        speed_confidence: Some(confidence(deviations.speed_mps, 0.01)),
-        length_10cm: tenths(size.length_m).clamp(1.0, 1022.0) as u16,
-        width_10cm: tenths(size.width_m).clamp(1.0, 61.0) as u8,
-        acceleration: Some((own.accel_mps2 * 10.0).round().clamp(-160.0, 160.0) as i16),
-        yaw_rate: Some(
-            (own.yaw_rate_radps.to_degrees() * 100.0)
-                .round()
-                .clamp(-32_766.0, 32_766.0) as i16,
-        ),
-        // The path driven is not kept.
-        path: has_low_frequency.then(Vec::new),
-    })
-}
-
 /// What a station may be said to perceive: the object in the frame of its own vehicle, with errors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Perception {
@@ -255,49 +221,93 @@ pub struct PerceptionSpec {
     pub speed_std_mps: f64,
 }
 
-/// Composes a collective perception message with the objects at `included`.
-#[must_use]
-pub fn compose_cpm(
-    station: u32,
-    now_ns: u64,
-    own: &OwnMeasurement,
-    size: &VehicleSize,
-    projection: &Projection,
-    spec: &PerceptionSpec,
-    perceived: &[Perception],
-    included: &[usize],
-    has_sensor_information: bool,
-) -> Option<Cpm> {
-    let measured_ns = fix_time_ns(now_ns, own);
-    let delta_ms = ((now_ns - measured_ns) / 1_000_000).min(2047) as i16;
-    let objects = included.iter().map(|place| {
-        let object = &perceived[*place];
-        let position = rotate(object.position_body_m, own.heading_rad);
-        let velocity = rotate(object.velocity_body_mps, own.heading_rad);
-        PerceivedObject {
-            object: object.object,
-            delta_ms,
-            position_cm: position.map(|value| (value * 100.0).round().clamp(-131_072.0, 131_071.0) as i32),
-            position_confidence_cm: (INTERVAL_95 * spec.position_std_m * 100.0).ceil().clamp(1.0, 4095.0) as u16,
-            velocity_cmps: velocity.map(|value| (value * 100.0).round().clamp(-16_383.0, 16_382.0) as i16),
-            velocity_confidence: confidence(spec.speed_std_mps, 0.01),
-            angle: ((own.heading_rad + object.turn_rad).to_degrees() * 10.0)
-                .round()
-                .rem_euclid(3600.0) as u16,
-            size_10cm: object.size_m.map(|value| tenths(value).clamp(1.0, 255.0) as u16),
-            quality: 15,
-            is_person: object.is_person,
-        }
-    });
-    Some(Cpm {
-        station,
-        reference_time_ms: its_time_ms(measured_ns),
-        position: reference(projection, own, size)?,
-        heading: heading_from_yaw(own.heading_rad),
-        sensor_range_10cm: has_sensor_information.then(|| tenths(spec.range_m).min(4095.0) as u16),
-        perceived: perceived.len().min(255) as u8,
-        objects: objects.take(255).collect(),
-    })
+/// Composes the messages of one station at one tick.
+#[derive(Debug, Clone, Copy)]
+pub struct MessageComposer<'a> {
+    /// Station id.
+    pub station: u32,
+    /// Type of the station.
+    pub kind: StationKind,
+    /// Simulated time, nanoseconds.
+    pub now_ns: u64,
+    /// What the station measures of itself.
+    pub own: &'a OwnMeasurement,
+    /// Size of its vehicle.
+    pub size: &'a VehicleSize,
+    /// What its sensors deviate by.
+    pub deviations: &'a SensorDeviations,
+    /// Projection of the map.
+    pub projection: &'a Projection,
+}
+
+impl MessageComposer<'_> {
+    /// A cooperative awareness message; `None` where the projection does not reach.
+    #[must_use]
+    pub fn cam(&self, has_low_frequency: bool) -> Option<Cam> {
+        let Self { own, size, .. } = self;
+        Some(Cam {
+            station: self.station,
+            kind: self.kind,
+            generation_delta_ms: generation_delta_ms(its_time_ms(fix_time_ns(self.now_ns, own))),
+            position: reference(self.projection, own, size)?,
+            heading: Some(heading_from_yaw(own.heading_rad)),
+            heading_confidence: Some(confidence(self.deviations.heading_rad.to_degrees(), 0.1)),
+            speed_cmps: Some((own.speed_mps.max(0.0) * 100.0).round().min(16_382.0) as u16),
+            speed_confidence: Some(confidence(self.deviations.speed_mps, 0.01)),
+            length_10cm: tenths(size.length_m).clamp(1.0, 1022.0) as u16,
+            width_10cm: tenths(size.width_m).clamp(1.0, 61.0) as u8,
+            acceleration: Some((own.accel_mps2 * 10.0).round().clamp(-160.0, 160.0) as i16),
+            yaw_rate: Some(
+                (own.yaw_rate_radps.to_degrees() * 100.0)
+                    .round()
+                    .clamp(-32_766.0, 32_766.0) as i16,
+            ),
+            // The path driven is not kept.
+            path: has_low_frequency.then(Vec::new),
+        })
+    }
+
+    /// A collective perception message with the objects at `included`; `None` where the projection does not reach.
+    #[must_use]
+    pub fn cpm(
+        &self,
+        spec: &PerceptionSpec,
+        perceived: &[Perception],
+        included: &[usize],
+        has_sensor_information: bool,
+    ) -> Option<Cpm> {
+        let Self { own, size, now_ns, .. } = *self;
+        let measured_ns = fix_time_ns(now_ns, own);
+        let delta_ms = ((now_ns - measured_ns) / 1_000_000).min(2047) as i16;
+        let objects = included.iter().map(|place| {
+            let object = &perceived[*place];
+            let position = rotate(object.position_body_m, own.heading_rad);
+            let velocity = rotate(object.velocity_body_mps, own.heading_rad);
+            PerceivedObject {
+                object: object.object,
+                delta_ms,
+                position_cm: position.map(|value| (value * 100.0).round().clamp(-131_072.0, 131_071.0) as i32),
+                position_confidence_cm: (INTERVAL_95 * spec.position_std_m * 100.0).ceil().clamp(1.0, 4095.0) as u16,
+                velocity_cmps: velocity.map(|value| (value * 100.0).round().clamp(-16_383.0, 16_382.0) as i16),
+                velocity_confidence: confidence(spec.speed_std_mps, 0.01),
+                angle: ((own.heading_rad + object.turn_rad).to_degrees() * 10.0)
+                    .round()
+                    .rem_euclid(3600.0) as u16,
+                size_10cm: object.size_m.map(|value| tenths(value).clamp(1.0, 255.0) as u16),
+                quality: 15,
+                is_person: object.is_person,
+            }
+        });
+        Some(Cpm {
+            station: self.station,
+            reference_time_ms: its_time_ms(measured_ns),
+            position: reference(self.projection, own, size)?,
+            heading: heading_from_yaw(own.heading_rad),
+            sensor_range_10cm: has_sensor_information.then(|| tenths(spec.range_m).min(4095.0) as u16),
+            perceived: perceived.len().min(255) as u8,
+            objects: objects.take(255).collect(),
+        })
+    }
 }
 
 /// Time since `delta_ms`, the low 16 bits of a time not later than `now_ms`, ms.

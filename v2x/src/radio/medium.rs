@@ -18,7 +18,7 @@ const WINDOW_SLOTS: u32 = 7;
 /// Time after its beginning from which a transmission is heard, nanoseconds. Stations that begin within it collide.
 const SENSING_NS: u64 = 8_000;
 /// Signals this far below the noise are neither decoded nor disturb, dB.
-pub const IRRELEVANT_DB: f64 = 12.0;
+pub const IRRELEVANT_DB: f64 = 6.0;
 
 /// A message that waits to be sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -82,6 +82,19 @@ pub struct Schedule {
     pub on_air: Vec<Transmission>,
     /// Messages that found no time to be sent.
     pub dropped: u32,
+}
+
+/// All that is on air in a tick, with the links of each radio that sends and the station ids of all radios.
+#[derive(Debug, Clone, Copy)]
+pub struct OnAir<'a> {
+    /// When each message is sent.
+    pub schedule: &'a Schedule,
+    /// The messages.
+    pub queue: &'a [QueuedMessage],
+    /// Links of each radio, ascending by receiver.
+    pub links: &'a [Vec<MediumLink>],
+    /// Station id of each radio.
+    pub stations: &'a [u32],
 }
 
 /// Links of one radio to a receiver, in the order of their receivers.
@@ -176,17 +189,14 @@ impl Medium {
         (air_time_s(1500) * 1e9) as u64
     }
 
-    /// Indices of the radios that decode transmission `number`, ascending, into `decoded`. `stations` are the station ids of the radios.
-    pub fn receivers(
-        &self,
-        number: usize,
-        schedule: &Schedule,
-        queue: &[QueuedMessage],
-        links: &[Vec<MediumLink>],
-        stations: &[u32],
-        random: &RadioRandom,
-        decoded: &mut Vec<u32>,
-    ) {
+    /// Indices of the radios that decode transmission `number`, ascending, into `decoded`.
+    pub fn receivers(&self, number: usize, on_air: &OnAir, random: &RadioRandom, decoded: &mut Vec<u32>) {
+        let OnAir {
+            schedule,
+            queue,
+            links,
+            stations,
+        } = on_air;
         let sent = &schedule.on_air[number];
         let message = &queue[sent.queued];
         let overlapping: Vec<&Transmission> = schedule
@@ -215,6 +225,18 @@ impl Medium {
                 };
                 f64::from(link.power_mw) * gain
             };
+            let signal_mw = power_mw(link, message);
+            let key = LinkKey {
+                sender: message.station,
+                receiver,
+                message: message.message,
+            };
+            let drawn = random.uniforms(key, RadioDraw::Decoding, 0)[0];
+            // Most links are too weak even without a disturbance, which is dearer to compute.
+            let bytes = message.bytes as usize;
+            if drawn >= decode_probability(signal_mw / self.noise_mw, bytes) {
+                continue;
+            }
             let (mut disturbance_mw, mut disturbed_ns) = (0.0, 0);
             for other in &overlapping {
                 let disturbing = &queue[other.queued];
@@ -223,15 +245,8 @@ impl Medium {
                     disturbed_ns += sent.overlap_ns(other);
                 }
             }
-            let signal_mw = power_mw(link, message);
             let share = disturbed_ns as f64 / (sent.end_ns - sent.start_ns) as f64;
-            let probability = self.decodes(signal_mw, disturbance_mw, share.min(1.0), message.bytes as usize);
-            let key = LinkKey {
-                sender: message.station,
-                receiver,
-                message: message.message,
-            };
-            if random.uniforms(key, RadioDraw::Decoding, 0)[0] < probability {
+            if drawn < self.decodes(signal_mw, disturbance_mw, share.min(1.0), bytes) {
                 decoded.push(link.radio);
             }
         }
@@ -318,17 +333,17 @@ mod tests {
 
     #[test]
     fn a_station_waits_while_it_hears_another_and_then_backs_off() {
-        let links = links(&[&[f64::NAN, -60.0], &[-60.0, f64::NAN]]);
+        let near = links(&[&[f64::NAN, -60.0], &[-60.0, f64::NAN]]);
         let queue = [message(0, 1_000_000), message(1, 1_100_000)];
-        let schedule = medium().schedule(&queue, &links, &RadioRandom::new(1));
+        let schedule = medium().schedule(&queue, &near, &RadioRandom::new(1));
         let [first, second] = schedule.on_air[..] else {
             panic!("{schedule:?}")
         };
         assert_eq!((first.start_ns, first.end_ns), (1_000_000, 1_000_000 + AIR_NS));
         let waited_ns = second.start_ns - first.end_ns - AIFS_NS;
-        assert!(second.queued == 1 && waited_ns % SLOT_NS == 0 && waited_ns <= 7 * SLOT_NS);
+        assert!(second.queued == 1 && waited_ns.is_multiple_of(SLOT_NS) && waited_ns <= 7 * SLOT_NS);
         // Below the threshold of carrier sense it is not heard.
-        let deaf = super::tests::links(&[&[f64::NAN, -86.0], &[-86.0, f64::NAN]]);
+        let deaf = links(&[&[f64::NAN, -86.0], &[-86.0, f64::NAN]]);
         let schedule = medium().schedule(&queue, &deaf, &RadioRandom::new(1));
         assert_eq!(schedule.on_air[1].start_ns, 1_100_000);
     }
@@ -354,7 +369,13 @@ mod tests {
         let schedule = medium.schedule(queue, links, &random);
         let stations: Vec<u32> = (100..100 + links.len() as u32).collect();
         let mut decoded = Vec::new();
-        medium.receivers(number, &schedule, queue, links, &stations, &random, &mut decoded);
+        let on_air = OnAir {
+            schedule: &schedule,
+            queue,
+            links,
+            stations: &stations,
+        };
+        medium.receivers(number, &on_air, &random, &mut decoded);
         decoded
     }
 
@@ -426,7 +447,13 @@ mod tests {
                     message: *number,
                     ..message(0, 0)
                 }];
-                medium.receivers(0, &schedule, &queue, &links, &[100, 101], &random, &mut decoded);
+                let on_air = OnAir {
+                    schedule: &schedule,
+                    queue: &queue,
+                    links: &links,
+                    stations: &[100, 101],
+                };
+                medium.receivers(0, &on_air, &random, &mut decoded);
                 decoded == [1]
             });
             let found = delivered.count() as f64 / f64::from(MESSAGES);
