@@ -78,10 +78,11 @@ fn watch(workplace: &Workplace, name: &str) -> Watched {
             let pixels = (head.width * head.height) as usize;
             assert_eq!(head.planes, ImagePlane::Depth.bit() | ImagePlane::Instance.bit());
             assert_eq!(planes.len(), 8 * pixels);
+            let word = |bytes: &[u8]| u32::from_le_bytes(std::array::from_fn(|i| bytes[i]));
             let seen = Seen {
                 head,
                 objects: block::view(message.payload(), layout.objects).unwrap().to_vec(),
-                instance: bytemuck::pod_collect_to_vec(&planes[4 * pixels..]),
+                instance: planes[4 * pixels..].chunks_exact(4).map(word).collect(),
             };
             watched.images.push((message.header().tick, seen));
             news += 1;
@@ -130,7 +131,7 @@ fn projected(head: &ImageHead, point_m: [f64; 3]) -> [f64; 3] {
 }
 
 #[test]
-fn images_and_detections_show_the_road_users_of_their_tick_and_change_no_observation() {
+fn images_and_detections_show_the_road_users_of_their_tick_and_are_made_again() {
     let workplace = Workplace::new();
     let watched = watch(&workplace, "first");
     assert!(watched.images.len() > 50, "only {} images", watched.images.len());
@@ -189,10 +190,9 @@ fn images_and_detections_show_the_road_users_of_their_tick_and_change_no_observa
     }
     assert!(detected > 100, "only {detected} detections of road users");
 
-    // The same seed: the same images and detections, and the observations of a run without cameras.
+    // The same seed gives the same images and detections, whatever a spectator misses.
     workplace.succeed(&arguments("second", &SIGHTS[..3]));
-    workplace.succeed(&arguments("without", &[]));
-    let [first, second, without] = ["first", "second", "without"].map(|name| workplace.report(name));
+    let [first, second] = ["first", "second"].map(|name| workplace.report(name));
     for sensor in ["camera", "radar"] {
         let messages = first[sensor]["messages"].as_u64().unwrap() as usize;
         assert!(
@@ -201,9 +201,7 @@ fn images_and_detections_show_the_road_users_of_their_tick_and_change_no_observa
             first[sensor]
         );
         assert_eq!(first[sensor], second[sensor]);
-        assert!(without[sensor].is_null());
     }
     assert_eq!(first["observation_hash"], second["observation_hash"]);
-    assert_eq!(first["observation_hash"], without["observation_hash"]);
     workplace.assert_nothing_left();
 }
