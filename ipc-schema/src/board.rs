@@ -4,6 +4,7 @@ use iceoryx2::prelude::ZeroCopySend;
 use serde::Serialize;
 
 use crate::{
+    channel::Channel,
     metric::{self, MetricValues, NOT_MEASURED},
     process::Process,
 };
@@ -31,9 +32,20 @@ pub struct Progress {
     pub stage: u32,
     /// Of a trainer: incarnation of `sensor-daemon` whose observations it receives; it has read all that an earlier one sent.
     pub sender_incarnation: u32,
+    /// Of `recorder`, which consumes several channels: number of ticks consumed of each, in the order of [`Channel::ALL`].
+    pub recorded_ticks: [u64; Channel::COUNT],
 }
 
 impl Progress {
+    /// Number of ticks of `channel` that `process`, of which this is the progress, has consumed.
+    #[must_use]
+    pub fn consumed_of(&self, process: Process, channel: Channel) -> u64 {
+        match process {
+            Process::Recorder => self.recorded_ticks[channel as usize],
+            _ => self.consumed_ticks,
+        }
+    }
+
     /// The stage, counted from 0, that `lesson` belongs to; `None` before that is decided. Only the newest decided lesson and the one
     /// before it have an answer.
     #[must_use]

@@ -10,7 +10,7 @@ use crate::{
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
     prediction::{ESTIMATE_COLUMNS, PredictionLayout},
-    process::Process::{self, SensorDaemon, SimCore, TrafficBridge, Trainer, V2x},
+    process::Process::{self, Recorder, SensorDaemon, SimCore, TrafficBridge, Trainer, V2x},
     radar::{MOST_DETECTIONS, RadarLayout},
     run::RunFile,
     section::SectionSpec,
@@ -84,8 +84,10 @@ pub struct ChannelSpec {
     pub dimensions: &'static [&'static str],
     /// The one process that sends.
     pub producer: Process,
-    /// Processes that must not miss a message: the producer needs the credit of each of them that the run has.
+    /// Processes that must not miss a message: the producer needs the credit of each that the run requires ([`Channel::requires`]).
     pub required: &'static [Process],
+    /// The channel whose credit bounds this one's messages too: its own, or that of the ticks that its messages go with.
+    pub paced_by: Channel,
     /// Ticks that the producer may be ahead of each required consumer.
     pub window: fn(&RunFile) -> u64,
     /// Topics on which `fanout` publishes what this channel carries.
@@ -132,6 +134,26 @@ fn windowful(run: &RunFile) -> usize {
     window(run) + SPARE_MESSAGES
 }
 
+/// Further messages of `channel` that may be on their way to a `recorder` that must not miss one; 0 where none must.
+fn recorded_ahead(run: &RunFile, channel: Channel, messages: usize) -> usize {
+    if run.config.record.is_lossless(channel) {
+        messages
+    } else {
+        0
+    }
+}
+
+/// Messages of `census`, one a simulated second, that may be on their way to a `recorder` that must not miss one.
+fn censuses(run: &RunFile) -> usize {
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a window is a small positive time"
+    )]
+    let seconds = (run.traffic_window_ticks() as f64 * run.config.run.tick_s).ceil() as usize;
+    recorded_ahead(run, Channel::Census, seconds)
+}
+
 /// A batch at work while the next one is taken.
 const fn two_batches(queue_length: usize) -> usize {
     2 * queue_length
@@ -146,7 +168,8 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         sections: TrafficLayout::SECTIONS,
         dimensions: TrafficLayout::DIMENSIONS,
         producer: TrafficBridge,
-        required: &[SimCore],
+        required: &[SimCore, Recorder],
+        paced_by: Channel::Traffic,
         window: RunFile::traffic_window_ticks,
         topics: &[],
         when_full: FullQueue::DropNewest,
@@ -163,6 +186,7 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         dimensions: TrafficMetaLayout::DIMENSIONS,
         producer: TrafficBridge,
         required: &[SimCore],
+        paced_by: Channel::Traffic,
         window: RunFile::traffic_window_ticks,
         topics: &["vehicles", "signals"],
         when_full: FullQueue::DropNewest,
@@ -186,11 +210,12 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         dimensions: TrafficMetaLayout::DIMENSIONS,
         producer: TrafficBridge,
         required: &[],
+        paced_by: Channel::Traffic,
         window: RunFile::window_ticks,
         topics: &["vehicles", "signals"],
         when_full: FullQueue::DropOldest,
         max_payload: |run| TrafficMetaLayout::new(road_users(run), MOST_SIGNALS).len,
-        queue_length: |_| SPARE_MESSAGES,
+        queue_length: |run| censuses(run) + SPARE_MESSAGES,
         in_hand: |_| SPARE_MESSAGES,
         is_used: |run| run.config.fanout.enabled,
     },
@@ -201,7 +226,8 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         sections: WorldLayout::SECTIONS,
         dimensions: WorldLayout::DIMENSIONS,
         producer: SimCore,
-        required: &[SensorDaemon, V2x],
+        required: &[SensorDaemon, V2x, Recorder],
+        paced_by: Channel::World,
         window: RunFile::window_ticks,
         topics: &["world"],
         when_full: FullQueue::DropNewest,
@@ -220,7 +246,8 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         sections: ObservationLayout::SECTIONS,
         dimensions: ObservationLayout::DIMENSIONS,
         producer: SensorDaemon,
-        required: &[Trainer],
+        required: &[Trainer, Recorder],
+        paced_by: Channel::Observation,
         window: RunFile::window_ticks,
         topics: &["observation"],
         when_full: FullQueue::DropNewest,
@@ -241,11 +268,12 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         producer: Trainer,
         // In the driving task sim-core waits for each message, so the trainer is at most one ahead and no queue overflows.
         required: &[],
+        paced_by: Channel::Observation,
         window: RunFile::window_ticks,
         topics: &["prediction"],
         when_full: FullQueue::DropNewest,
         max_payload: |run| PredictionLayout::new(road_users(run), ESTIMATE_COLUMNS, true).len,
-        queue_length: windowful,
+        queue_length: |run| windowful(run) + recorded_ahead(run, Channel::Prediction, 2 * window(run)),
         in_hand: |run| two_batches(windowful(run)),
         is_used: |_| true,
     },
@@ -257,6 +285,7 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         dimensions: EgoPoseLayout::DIMENSIONS,
         producer: SimCore,
         required: &[TrafficBridge],
+        paced_by: Channel::World,
         window: RunFile::window_ticks,
         topics: &[],
         when_full: FullQueue::DropNewest,
@@ -273,6 +302,7 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         dimensions: CollisionLayout::DIMENSIONS,
         producer: SimCore,
         required: &[],
+        paced_by: Channel::World,
         window: RunFile::window_ticks,
         topics: &["event"],
         when_full: FullQueue::DropNewest,
@@ -289,12 +319,16 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         dimensions: PointcloudLayout::DIMENSIONS,
         producer: SensorDaemon,
         required: &[],
+        paced_by: Channel::Observation,
         window: RunFile::window_ticks,
         topics: &["pointcloud"],
         when_full: FullQueue::DropOldest,
         max_payload: |run| PointcloudLayout::new(run.config.lidar.rays_per_tick(run.config.run.tick_s)).len,
         // The scans of one tick.
-        queue_length: |run| run.config.lidar.vehicles as usize + SPARE_MESSAGES,
+        queue_length: |run| {
+            let scans = run.config.lidar.vehicles as usize;
+            scans + recorded_ahead(run, Channel::Pointcloud, scans * window(run)) + SPARE_MESSAGES
+        },
         in_hand: |_| SPARE_MESSAGES,
         is_used: |run| run.config.lidar.vehicles > 0,
     },
@@ -307,6 +341,7 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         producer: TrafficBridge,
         // A switch goes with a tick, whose own credit bounds both.
         required: &[],
+        paced_by: Channel::Traffic,
         window: RunFile::traffic_window_ticks,
         topics: &[],
         when_full: FullQueue::DropNewest,
@@ -324,6 +359,7 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         dimensions: ImageLayout::DIMENSIONS,
         producer: SensorDaemon,
         required: &[],
+        paced_by: Channel::Observation,
         window: RunFile::window_ticks,
         topics: &[],
         when_full: FullQueue::DropOldest,
@@ -341,6 +377,7 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         dimensions: RadarLayout::DIMENSIONS,
         producer: SensorDaemon,
         required: &[],
+        paced_by: Channel::Observation,
         window: RunFile::window_ticks,
         topics: &[],
         when_full: FullQueue::DropOldest,
@@ -357,7 +394,8 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         sections: ObservationLayout::SECTIONS,
         dimensions: ObservationLayout::DIMENSIONS,
         producer: SensorDaemon,
-        required: &[V2x],
+        required: &[V2x, Recorder],
+        paced_by: Channel::Measurement,
         window: RunFile::window_ticks,
         topics: &[],
         when_full: FullQueue::DropNewest,
@@ -376,7 +414,8 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         sections: NeighboursLayout::SECTIONS,
         dimensions: NeighboursLayout::DIMENSIONS,
         producer: V2x,
-        required: &[Trainer],
+        required: &[Trainer, Recorder],
+        paced_by: Channel::Neighbours,
         window: RunFile::window_ticks,
         topics: &[],
         when_full: FullQueue::DropNewest,
@@ -433,18 +472,27 @@ impl Channel {
         self.spec().producer
     }
 
-    /// True if `process` must not miss a message.
-    #[must_use]
-    pub fn requires(self, process: Process) -> bool {
-        self.spec().required.contains(&process)
+    /// The required consumers that `run` has.
+    pub fn required(self, run: &RunFile) -> impl Iterator<Item = Process> {
+        let required = self.spec().required.iter().copied();
+        required.filter(move |process| {
+            let spec = process.spec();
+            (spec.is_wanted)(run) && (spec.must_receive)(run, self)
+        })
     }
 
-    /// Subscribers at a time: each required consumer and its successor, the fan-out, and one spare, which sim-core takes of
-    /// `observation` in the driving task.
+    /// True if `process` must not miss a message in `run`.
     #[must_use]
-    pub const fn max_subscribers(self) -> usize {
-        let required = self.spec().required;
-        if required.is_empty() { 4 } else { 2 * required.len() + 2 }
+    pub fn requires(self, process: Process, run: &RunFile) -> bool {
+        self.required(run).any(|required| required == process)
+    }
+
+    /// Subscribers at a time: each required consumer and its successor, the fan-out, a `recorder` that watches, one beside the run
+    /// (`caraware record`), and one spare, which sim-core takes of `observation` in the driving task.
+    #[must_use]
+    pub fn max_subscribers(self) -> usize {
+        let required = self.spec().required.len();
+        (2 * required + 2).max(5)
     }
 
     /// Longest payload of a run, bytes.
@@ -467,10 +515,14 @@ impl Channel {
         if !(spec.is_used)(run) {
             return 0;
         }
-        let required = spec.required.iter().filter(|process| (process.spec().is_wanted)(run));
         // The required consumers that the run has, at least one subscriber, and the fan-out.
-        let subscribers = required.count().max(1) + 1;
-        subscribers * ((spec.queue_length)(run) + (spec.in_hand)(run)) + SPARE_MESSAGES
+        let subscribers = self.required(run).filter(|&process| process != Recorder).count().max(1) + 1;
+        // A recorder copies each message as it comes, so it has one in hand.
+        let recorded = match run.config.record.records(self) {
+            true => (spec.queue_length)(run) + 1,
+            false => 0,
+        };
+        subscribers * ((spec.queue_length)(run) + (spec.in_hand)(run)) + recorded + SPARE_MESSAGES
     }
 }
 
@@ -516,6 +568,16 @@ mod tests {
                 spec.name
             );
             assert!(!spec.required.contains(&spec.producer), "{}", spec.name);
+        }
+    }
+
+    #[test]
+    fn the_channel_that_paces_another_has_required_consumers_and_paces_itself() {
+        for spec in CHANNELS {
+            let pace = spec.paced_by.spec();
+            assert!(!pace.required.is_empty(), "{}", spec.name);
+            assert_eq!(pace.paced_by, pace.channel, "{}", spec.name);
+            assert!(pace.required.contains(&Recorder), "{}", spec.name);
         }
     }
 }

@@ -9,6 +9,7 @@ mod fanout;
 mod lidar_pattern;
 mod observation;
 mod radar;
+mod record;
 mod region;
 mod scene;
 mod sensors;
@@ -23,6 +24,7 @@ pub use fanout::*;
 pub use lidar_pattern::*;
 pub use observation::*;
 pub use radar::*;
+pub use record::*;
 pub use region::*;
 pub use scene::*;
 pub use sensors::*;
@@ -85,6 +87,8 @@ pub struct Config {
     pub fusion: FusionConfig,
     /// Shared memory → zenoh.
     pub fanout: FanoutConfig,
+    /// Shared memory → a file.
+    pub record: RecordConfig,
 }
 
 impl Config {

@@ -7,7 +7,13 @@ use crate::board::Progress;
 /// `window` ticks may be sent and not yet consumed; nothing may be sent to a consumer that is not attached.
 #[must_use]
 pub fn has_credit(tick: u64, consumer: &Progress, window: u64) -> bool {
-    consumer.attached == 1 && tick < consumer.consumed_ticks.saturating_add(window)
+    has_credit_at(tick, consumer, consumer.consumed_ticks, window)
+}
+
+/// As [`has_credit`] for a consumer that has consumed the ticks of this channel below `consumed_ticks`.
+#[must_use]
+pub fn has_credit_at(tick: u64, consumer: &Progress, consumed_ticks: u64, window: u64) -> bool {
+    consumer.attached == 1 && tick < consumed_ticks.saturating_add(window)
 }
 
 #[cfg(test)]

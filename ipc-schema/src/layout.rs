@@ -274,7 +274,8 @@ pub fn table() -> Vec<TypeLayout> {
             decided_lessons,
             since_lesson,
             stage,
-            sender_incarnation
+            sender_incarnation,
+            recorded_ticks
         }),
         layout!(Health {
             state,

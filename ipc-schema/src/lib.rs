@@ -2,13 +2,13 @@
 //!
 //! | service | payload (64-byte aligned bytes, little endian) | producer | required consumers |
 //! |---|---|---|---|
-//! | `traffic` | `[TrafficState]` | traffic-bridge | sim-core |
+//! | `traffic` | `[TrafficState]` | traffic-bridge | sim-core, recorder |
 //! | `traffic-meta` | `[VehicleMeta]`, `[SignalMeta]`; or `[RoutePoint]` | traffic-bridge | sim-core |
 //! | `census` | as `traffic-meta`: every road user and every light | traffic-bridge | none |
-//! | `world` | `[VehicleState]`, `[SubStep]`, `[HeroView]` | sim-core | sensor-daemon, v2x |
-//! | `observation` | observations, truth, newest samples, slots | sensor-daemon | trainer |
-//! | `measurement` | as `observation`, for every tick made | sensor-daemon | v2x |
-//! | `neighbours` | objects known from messages, radios | v2x | trainer |
+//! | `world` | `[VehicleState]`, `[SubStep]`, `[HeroView]` | sim-core | sensor-daemon, v2x, recorder |
+//! | `observation` | observations, truth, newest samples, slots | sensor-daemon | trainer, recorder |
+//! | `measurement` | as `observation`, for every tick made | sensor-daemon | v2x, recorder |
+//! | `neighbours` | objects known from messages, radios | v2x | trainer, recorder |
 //! | `prediction` | positions or actions, estimates of the filter | trainer | none |
 //! | `ego-pose` | `[EgoPose]` | sim-core | traffic-bridge |
 //! | `event` | `[Collision]` | sim-core | none |
@@ -21,7 +21,8 @@
 //! | `roster` | [`board::Roster`]: the current incarnation of each process | supervisor | none (newest wins) |
 //! | `wake` | an event without content | every peer | its process |
 //!
-//! The first twelve are [`channel::CHANNELS`]. In the driving task sim-core waits for each `prediction`.
+//! The first fourteen are [`channel::CHANNELS`]. `recorder` is a required consumer where a run records without loss. In the driving task
+//! sim-core waits for each `prediction`.
 //!
 //! Every message has a [`header::MessageHeader`]. The supervisor alone creates the services, in [`services`]; all other processes
 //! open them. `layout.json` holds the layouts, and tests in Rust and Python compare it with the programs.
@@ -35,6 +36,7 @@ pub mod clock;
 pub mod config;
 pub mod control;
 mod control_port;
+pub mod digest;
 pub mod ego;
 pub mod episode_state;
 pub mod event;

@@ -252,7 +252,7 @@ impl RunMembership {
     /// The service cannot be opened.
     pub fn subscriber(&mut self, channel: Channel) -> Result<Subscriber, MembershipError> {
         let service = services::open_data(&self.node, &self.run, self.env_index, channel)?;
-        if channel.requires(self.process) {
+        if channel.requires(self.process, &self.run) {
             self.upstream.push(self.waker(channel.producer())?);
             self.source = Some(channel.producer());
         }
@@ -272,29 +272,29 @@ impl RunMembership {
     /// # Errors
     /// A service cannot be opened.
     pub fn required_consumers(&self, channel: Channel) -> Result<RequiredConsumers, MembershipError> {
-        let spec = channel.spec();
-        let present = spec
-            .required
-            .iter()
-            .filter(|process| (process.spec().is_wanted)(&self.run));
-        self.consumers(present.copied(), (spec.window)(&self.run))
+        self.consumers(channel.required(&self.run), channel)
     }
 
-    /// `processes` as consumers, each of which must return credit: the producer may be `window` ticks ahead.
+    /// `processes` as consumers of `channel`, each of which must return credit.
     ///
     /// # Errors
     /// A service cannot be opened.
     pub fn consumers(
         &self,
         processes: impl IntoIterator<Item = Process>,
-        window: u64,
+        channel: Channel,
     ) -> Result<RequiredConsumers, MembershipError> {
         let (mut boards, mut wakers) = (Vec::new(), Vec::new());
         for process in processes {
             boards.push((process, self.board_of(process)?));
             wakers.push(self.waker(process)?);
         }
-        Ok(RequiredConsumers { boards, wakers, window })
+        Ok(RequiredConsumers {
+            boards,
+            wakers,
+            channel,
+            window: (channel.spec().window)(&self.run),
+        })
     }
 
     /// The end that answers commands.
@@ -384,6 +384,19 @@ impl RunMembership {
     pub fn consumed(&mut self, ticks: u64) {
         self.note(Awaited::Nothing);
         self.progress.consumed_ticks = ticks;
+        self.board.set_progress(self.progress);
+        self.wake_upstream();
+    }
+
+    /// Attaches `recorder`, which has consumed of each channel the ticks below those given, in the order of [`Channel::ALL`].
+    pub fn attach_recorder(&mut self, ticks: [u64; Channel::COUNT]) {
+        self.progress.recorded_ticks = ticks;
+        self.attach();
+    }
+
+    /// `recorder` has consumed all ticks of `channel` below `ticks`: its producer gets the credit.
+    pub fn recorded(&mut self, channel: Channel, ticks: u64) {
+        self.progress.recorded_ticks[channel as usize] = ticks;
         self.board.set_progress(self.progress);
         self.wake_upstream();
     }

@@ -3,7 +3,11 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::run::{Mode, RunFile};
+use crate::{
+    channel::Channel,
+    config::{DeathAction, RecordManner},
+    run::{Mode, RunFile},
+};
 
 /// A process that takes part in a run; its number is its place in [`PROCESSES`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -22,6 +26,8 @@ pub enum Process {
     Trainer = 4,
     /// Shared memory → zenoh.
     Fanout = 5,
+    /// Shared memory → a file.
+    Recorder = 6,
 }
 
 /// What a process belongs to.
@@ -47,8 +53,8 @@ pub enum OnExit {
 /// The program of a process. Its one argument is the run file.
 #[derive(Debug, Clone, Copy)]
 pub enum Program {
-    /// The program with the name of the process, beside `caraware`.
-    Binary,
+    /// The program of this name, beside `caraware`.
+    Binary(fn(&RunFile) -> &'static str),
     /// A Python module.
     PythonModule(fn(&RunFile) -> &str),
 }
@@ -66,6 +72,8 @@ pub struct ProcessSpec {
     pub needs: &'static [Process],
     /// What its end means.
     pub on_exit: OnExit,
+    /// Of the channels that name it as a required consumer, those of which a run lets it miss no message.
+    pub must_receive: fn(&RunFile, Channel) -> bool,
     /// Whether a run has it.
     pub is_wanted: fn(&RunFile) -> bool,
     /// Whether a tick of a run waits for it.
@@ -79,16 +87,17 @@ const PLAYER: &str = "caraware.play";
 
 /// Every process, by [`Process`], in the order of the data and of starting. `traffic-bridge` comes first because a user's files can make
 /// SUMO fail.
-pub const PROCESSES: [ProcessSpec; 6] = [
+pub const PROCESSES: [ProcessSpec; 7] = [
     ProcessSpec {
         process: Process::TrafficBridge,
         name: "traffic-bridge",
         scope: ProcessScope::Environment,
         needs: &[],
         on_exit: OnExit::Required,
-        is_wanted: |_| true,
+        must_receive: |_, _| true,
+        is_wanted: |run| run.replay.is_none(),
         holds_up_ticks: |_| true,
-        program: Program::Binary,
+        program: Program::Binary(|_| "traffic-bridge"),
     },
     ProcessSpec {
         process: Process::SimCore,
@@ -96,9 +105,10 @@ pub const PROCESSES: [ProcessSpec; 6] = [
         scope: ProcessScope::Environment,
         needs: &[Process::TrafficBridge],
         on_exit: OnExit::Required,
-        is_wanted: |_| true,
+        must_receive: |_, _| true,
+        is_wanted: |run| run.replay.is_none(),
         holds_up_ticks: |_| true,
-        program: Program::Binary,
+        program: Program::Binary(|_| "sim-core"),
     },
     ProcessSpec {
         process: Process::SensorDaemon,
@@ -106,9 +116,14 @@ pub const PROCESSES: [ProcessSpec; 6] = [
         scope: ProcessScope::Environment,
         needs: &[Process::TrafficBridge],
         on_exit: OnExit::Required,
+        must_receive: |_, _| true,
         is_wanted: |_| true,
         holds_up_ticks: |_| true,
-        program: Program::Binary,
+        // A recording takes the place of the simulators.
+        program: Program::Binary(|run| match run.replay {
+            None => "sensor-daemon",
+            Some(_) => "replay",
+        }),
     },
     ProcessSpec {
         process: Process::V2x,
@@ -116,9 +131,10 @@ pub const PROCESSES: [ProcessSpec; 6] = [
         scope: ProcessScope::Environment,
         needs: &[Process::TrafficBridge],
         on_exit: OnExit::Required,
-        is_wanted: |run| run.config.v2x.is_on(),
+        must_receive: |_, _| true,
+        is_wanted: |run| run.replay.is_none() && run.config.v2x.is_on(),
         holds_up_ticks: |_| true,
-        program: Program::Binary,
+        program: Program::Binary(|_| "v2x"),
     },
     ProcessSpec {
         process: Process::Trainer,
@@ -127,6 +143,7 @@ pub const PROCESSES: [ProcessSpec; 6] = [
         // Python takes as long to import torch as SUMO to read a large net.
         needs: &[],
         on_exit: OnExit::Replace,
+        must_receive: |_, _| true,
         is_wanted: |run| run.mode.has_trainer(),
         holds_up_ticks: |run| run.config.drives(),
         program: Program::PythonModule(|run| match run.mode {
@@ -141,9 +158,21 @@ pub const PROCESSES: [ProcessSpec; 6] = [
         // It shows the scene that sim-core has read.
         needs: &[Process::SimCore],
         on_exit: OnExit::Restart,
+        must_receive: |_, _| true,
         is_wanted: |run| run.config.fanout.enabled,
         holds_up_ticks: |_| false,
-        program: Program::Binary,
+        program: Program::Binary(|_| "fanout"),
+    },
+    ProcessSpec {
+        process: Process::Recorder,
+        name: "recorder",
+        scope: ProcessScope::Environment,
+        needs: &[],
+        on_exit: OnExit::Restart,
+        must_receive: |run, channel| run.config.record.needs_credit(channel),
+        is_wanted: |run| run.config.record.is_on(),
+        holds_up_ticks: |run| run.config.record.manner == RecordManner::Lossless,
+        program: Program::Binary(|_| "recorder"),
     },
 ];
 
@@ -157,19 +186,31 @@ const _: () = {
 };
 
 impl ProcessSpec {
-    /// True if the run lasts until this process is done.
+    /// True if `run` lasts until this process is done.
     #[must_use]
-    pub fn is_required(&self) -> bool {
-        self.on_exit != OnExit::Restart
+    pub fn is_required(&self, run: &RunFile) -> bool {
+        self.on_exit != OnExit::Restart || self.process == Process::Recorder && (self.holds_up_ticks)(run)
     }
 
-    /// What its end means in `run`. Trainers that learn together take every step together, so none of them can be replaced alone.
+    /// What its end means in `run`. Trainers that learn together take every step together, so none of them can be replaced alone; and a
+    /// run may be worth nothing without its recording.
     #[must_use]
     pub fn on_exit(&self, run: &RunFile) -> OnExit {
         match self.on_exit {
             OnExit::Replace if run.config.trainer.ranks > 1 => OnExit::Required,
+            OnExit::Restart
+                if self.process == Process::Recorder && run.config.record.on_death == DeathAction::EndRun =>
+            {
+                OnExit::Required
+            }
             on_exit => on_exit,
         }
+    }
+
+    /// True if it simulates an environment: it is started again with the others of its environment.
+    #[must_use]
+    pub fn is_simulator(&self) -> bool {
+        self.scope == ProcessScope::Environment && self.on_exit == OnExit::Required
     }
 
     /// True if environment `env_index` of `run` has it.

@@ -1,6 +1,7 @@
 //! The required consumers of a channel: a producer waits for their credit, and wakes them.
 
 use crate::{
+    channel::Channel,
     flow,
     ports::{BoardReader, Waker},
     process::Process,
@@ -10,6 +11,8 @@ use crate::{
 pub struct RequiredConsumers {
     pub(crate) boards: Vec<(Process, BoardReader)>,
     pub(crate) wakers: Vec<Waker>,
+    /// The channel that they consume.
+    pub(crate) channel: Channel,
     /// Ticks that the producer may be ahead of each of them.
     pub(crate) window: u64,
 }
@@ -31,11 +34,15 @@ impl RequiredConsumers {
 
     /// The first consumer that has no credit for `tick`.
     pub(crate) fn lacks_credit(&self, tick: u64) -> Option<Process> {
-        self.first(|board| !flow::has_credit(tick, &board.progress(), self.window))
+        self.first(|process, board| {
+            let progress = board.progress();
+            let consumed = progress.consumed_of(process, self.channel);
+            !flow::has_credit_at(tick, &progress, consumed, self.window)
+        })
     }
 
-    fn first(&self, is_wanted: impl Fn(&BoardReader) -> bool) -> Option<Process> {
-        let found = self.boards.iter().find(|(_, board)| is_wanted(board));
+    fn first(&self, is_wanted: impl Fn(Process, &BoardReader) -> bool) -> Option<Process> {
+        let found = self.boards.iter().find(|(process, board)| is_wanted(*process, board));
         found.map(|(process, _)| *process)
     }
 
@@ -47,7 +54,7 @@ impl RequiredConsumers {
 
     /// The first consumer that has not consumed all ticks below `ticks`.
     pub(crate) fn lacks(&self, ticks: u64) -> Option<Process> {
-        self.first(|board| board.progress().consumed_ticks < ticks)
+        self.first(|process, board| board.progress().consumed_of(process, self.channel) < ticks)
     }
 
     /// Wakes every consumer after a message has been sent.

@@ -31,8 +31,8 @@ use crate::{
 
 /// Where iceoryx2 puts shared memory.
 pub const SHARED_MEMORY: &str = "/dev/shm";
-/// Bytes of one environment for iceoryx2's own files: boards (2.5 MB), connections and the settings of services.
-const SERVICE_BYTES: u64 = 4 << 20;
+/// Bytes of one environment for iceoryx2's own files: boards (3 MB), connections and the settings of services.
+const SERVICE_BYTES: u64 = 5 << 20;
 /// Bytes before a payload that iceoryx2 and the message's header take at most.
 const HEADER_BYTES: u64 = 1 << 10;
 /// Unit in which the kernel allocates shared memory.

@@ -230,6 +230,18 @@ pub struct RunFile {
     /// Where the simulator processes of this environment were started again, after one of them had died.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub restart: Option<RestartPoint>,
+    /// The recording that takes the place of the simulators, if one does.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub replay: Option<Replay>,
+}
+
+/// A recording in the place of the simulators of an environment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Replay {
+    /// The recording of this environment.
+    pub file: PathBuf,
+    /// The first tick that is played.
+    pub from_tick: u64,
 }
 
 /// The run file cannot be used.
@@ -370,10 +382,21 @@ impl RunFile {
                 ..beginning
             },
         });
+        let replay = self.replay.clone().map(|replay| match env_index {
+            0 => replay,
+            // The recordings of a run lie as their run directories do.
+            index => {
+                let name = replay.file.file_name().unwrap_or_default();
+                let directory = replay.file.with_file_name(format!("env-{index}"));
+                let file = directory.join(name);
+                Replay { file, ..replay }
+            }
+        });
         Self {
             env_index,
             run_dir,
             beginning,
+            replay,
             restart: None,
             ..self.clone()
         }

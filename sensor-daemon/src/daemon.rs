@@ -6,6 +6,7 @@ use ipc_schema::{
     activity::Awaited,
     block::{self, BlockError},
     board::State,
+    digest::ObservationDigest,
     failure::{Failure, FailureKind},
     header::{LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     membership::{RequiredConsumers, RunMembership, Wait},
@@ -20,7 +21,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     delivery::Delivery,
-    delivery::digest::ObservationDigest,
     delivery::handover::HandoverFigures,
     scanning::ScanTotals,
     sensing::{Sensing, SensingState, WorldTick},
@@ -166,10 +166,9 @@ impl Daemon {
             true => Some(Measurements::open(&membership)?),
             false => None,
         };
-        let required = Channel::Observation.spec().required.iter().copied();
-        let others =
-            required.filter(|process| *process != Process::Trainer && (process.spec().is_wanted)(&membership.run));
-        let other_consumers = membership.consumers(others, membership.run.window_ticks())?;
+        let required = Channel::Observation.required(&membership.run);
+        let others: Vec<Process> = required.filter(|process| *process != Process::Trainer).collect();
+        let other_consumers = membership.consumers(others, Channel::Observation)?;
         membership.attach();
         let (ticks, committed_ticks) = (membership.run.first_tick(), membership.run.committed_ticks());
         Ok(Self {
@@ -213,7 +212,7 @@ impl Daemon {
         let Some(consumer) = &mut self.consumer else {
             return Ok(());
         };
-        consumer.catch_up(&self.observations)?;
+        consumer.catch_up(&self.observations, &self.other_consumers)?;
         let journal_first = consumer.journal_first();
         if journal_first != self.journal_first {
             // The board has the number of ticks that the journal does not hold any more: a trainer reads there whether it can continue.
@@ -237,7 +236,8 @@ impl Daemon {
     }
 
     fn is_trainer_behind(&self) -> bool {
-        self.consumer.as_ref().is_some_and(Delivery::is_behind)
+        let consumer = self.consumer.as_ref();
+        consumer.is_some_and(|consumer| consumer.is_behind(&self.other_consumers))
     }
 
     /// One tick: assigns slots, scans, waits for credit, samples and publishes.

@@ -84,6 +84,7 @@ impl Run {
             config_hash: String::new(),
             beginning: None,
             restart: None,
+            replay: None,
             run_dir,
         };
         file.write().unwrap();

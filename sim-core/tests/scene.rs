@@ -99,6 +99,7 @@ fn run(net_file: &Path, additional_files: &[PathBuf]) -> RunFile {
         config_hash: String::new(),
         beginning: None,
         restart: None,
+        replay: None,
     }
 }
 

@@ -77,6 +77,15 @@ pub enum Subcommands {
     /// Watch a live run: map, vehicles, estimates, point clouds and figures, in a window or a browser
     #[command(after_help = VIEW)]
     View(ViewArgs),
+    /// Record a live run into a file; the run does not wait for it (`train --record` records without loss)
+    Record(RecordArgs),
+    /// Name the first tick and field in which two recordings differ
+    Diff(DiffArgs),
+    /// Write a recording in the format of other tools, one part for each episode, with a data card
+    Export(ExportArgs),
+    /// Play a recording to viewers, or to a trainer in the place of the simulators
+    #[command(after_help = REPLAY)]
+    Replay(ReplayArgs),
     /// Write a city and its traffic, of any size, as a scenario of SUMO
     Generate(GenerateArgs),
     /// Make a scenario of SUMO from a map: roads, signals, pavements, buildings, trees and traffic
@@ -406,6 +415,95 @@ pub struct GenerateArgs {
     pub speed_kmh: f64,
 }
 
+/// Arguments of `export`.
+#[derive(Debug, Args, Clone)]
+pub struct ExportArgs {
+    /// A recording: its file, or the directory or name of its run
+    pub recording: PathBuf,
+    /// Format: tables of vehicle-ticks (parquet, csv), SUMO's floating car data (fcd), or cooperative perception (opv2v)
+    #[arg(long, value_name = "FORMAT", value_parser = ["parquet", "csv", "fcd", "opv2v"])]
+    pub to: String,
+    /// Directory to write to; parts that it has are kept [default: export-FORMAT beside the recording]
+    #[arg(long, value_name = "DIRECTORY")]
+    pub output: Option<PathBuf>,
+    /// Processes that write at a time [default: one for each core]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub jobs: Option<u32>,
+    /// Directory that holds run directories
+    #[arg(long, default_value = "runs")]
+    pub runs: PathBuf,
+}
+
+const REPLAY: &str = "Examples:
+  caraware replay town-1                         show the recording of the run town-1, in real time, to `caraware view`
+  caraware replay runs/town-1/recording.mcap --viewer --speed 4 --from-s 120
+  caraware replay town-1 --learn                 learn from the recording, at full speed
+  caraware replay town-1 --learn --set trainer.learning_rate=1e-3
+
+Learning from a lossless recording ends with the parameters of the recorded run, bit for bit, if no setting is changed.";
+
+/// Arguments of `replay`.
+#[derive(Debug, Args, Clone)]
+pub struct ReplayArgs {
+    /// A recording: its file, or the directory or name of its run
+    pub recording: PathBuf,
+    /// Play it to a trainer, which learns from it
+    #[arg(long)]
+    pub learn: bool,
+    /// Simulated seconds per wall second; 0 = as fast as possible [default: 1, and 0 with --learn]
+    #[arg(long, value_name = "FACTOR", value_parser = clap::value_parser!(f64))]
+    pub speed: Option<f64>,
+    /// Begin at this time of the run, seconds
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.0, conflicts_with = "learn")]
+    pub from_s: f64,
+    /// Change one setting of the trainer or of the fan-out (repeatable)
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Show no progress and no summary, only errors
+    #[arg(long)]
+    pub quiet: bool,
+    /// Name of the replay's own run [default: that of the recorded run, "-replay" and the first free number]
+    #[arg(long)]
+    pub name: Option<String>,
+    /// Directory that holds run directories
+    #[arg(long, default_value = "runs")]
+    pub runs: PathBuf,
+    /// Open a viewer: in a window, or with --viewer=web in a browser
+    #[arg(long, value_name = "WHERE", num_args = 0..=1, require_equals = true, default_missing_value = "window")]
+    pub viewer: Option<ViewerKind>,
+    /// Credentials of that viewer.
+    #[command(flatten)]
+    pub credentials: Credentials,
+}
+
+/// Arguments of `record`.
+#[derive(Debug, Args, Clone)]
+pub struct RecordArgs {
+    /// Name of the run; may be left out if only one is alive
+    pub run: Option<String>,
+    /// The new file [default: recording.mcap in the run's directory, or the next free name]
+    #[arg(long, value_name = "FILE")]
+    pub output: Option<PathBuf>,
+    /// A channel to record (repeatable) [default: those of `record.channels`]
+    #[arg(long, value_name = "NAME")]
+    pub channel: Vec<String>,
+    /// Environment of the run [default: its first]
+    #[arg(long, value_name = "N")]
+    pub env: Option<u32>,
+}
+
+/// Arguments of `diff`.
+#[derive(Debug, Args, Clone)]
+pub struct DiffArgs {
+    /// A recording: its file, or the directory or name of its run
+    pub first: PathBuf,
+    /// Another
+    pub second: PathBuf,
+    /// Directory that holds run directories
+    #[arg(long, default_value = "runs")]
+    pub runs: PathBuf,
+}
+
 /// Arguments of `train` and `simulate`.
 #[derive(Debug, Args, Clone, Default)]
 pub struct RunArgs {
@@ -438,6 +536,10 @@ pub struct RunArgs {
     /// Directory that holds run directories
     #[arg(long, default_value = "runs")]
     pub runs: PathBuf,
+    /// Record the run into recording.mcap, without loss, or with --record=watching as far as `recorder` keeps up; short for --set
+    /// record.manner=…
+    #[arg(long, value_name = "MANNER", num_args = 0..=1, require_equals = true, default_missing_value = "lossless", value_parser = ["lossless", "watching"])]
+    pub record: Option<String>,
     /// Open a viewer, as `caraware view` does: in a window, or with --viewer=web in a browser
     #[arg(long, value_name = "WHERE", num_args = 0..=1, require_equals = true, default_missing_value = "window")]
     pub viewer: Option<ViewerKind>,
@@ -463,6 +565,8 @@ impl RunArgs {
             }
         }
         args.set.extend(args.envs.take().map(|envs| format!("run.envs={envs}")));
+        args.set
+            .extend(args.record.take().map(|manner| format!("record.manner={manner}")));
         if std::mem::take(&mut args.trust_scenario) {
             args.set.push("traffic.trust_scenario=true".to_owned());
         }

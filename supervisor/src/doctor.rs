@@ -98,13 +98,15 @@ pub fn doctor(clean: bool) -> Result<(), Exit> {
 }
 
 fn check_installation(checks: &mut DoctorChecks, install: &Install) {
-    for process in Process::ALL.into_iter().filter(|process| *process != Process::Trainer) {
-        let found = install.binary(process);
+    let processes = Process::ALL.into_iter().filter(|process| *process != Process::Trainer);
+    // A replay has a program of its own in the place of `sensor-daemon`.
+    for name in processes.map(Process::name).chain(["replay"]) {
+        let found = install.binary(name);
         checks.print(
             found
                 .map(|path| path.display().to_string())
                 .map_err(|_| ("not built".into(), "run `make build`".into())),
-            process.name(),
+            name,
         );
     }
     check_libraries(checks, install);

@@ -2,8 +2,6 @@
 
 use std::path::{Path, PathBuf};
 
-use ipc_schema::process::Process;
-
 use crate::failure::Exit;
 
 /// The virtual environment of `make peers`, which holds most peers of the benchmarks.
@@ -32,12 +30,12 @@ impl Install {
         Ok(Self { bin, python, sumo_home })
     }
 
-    /// Path of a process's binary.
+    /// Path of a process's program.
     ///
     /// # Errors
     /// It has not been built.
-    pub fn binary(&self, process: Process) -> Result<PathBuf, Exit> {
-        program(&self.bin, process.name())
+    pub fn binary(&self, name: &str) -> Result<PathBuf, Exit> {
+        program(&self.bin, name)
     }
 
     /// A program of the SUMO wheel ("sumo", "netconvert").

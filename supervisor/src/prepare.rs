@@ -347,13 +347,14 @@ fn write_command_logs(run_dir: &Path, logs: &[(u32, String)]) -> Result<(), Exit
     Ok(())
 }
 
-struct RunDirectory {
-    name: String,
-    path: PathBuf,
+/// A new run directory.
+pub(crate) struct RunDirectory {
+    pub(crate) name: String,
+    pub(crate) path: PathBuf,
 }
 
 /// Creates `runs/<name>`, which must not exist: the given name, or the label with the first free number.
-fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDirectory, Exit> {
+pub(crate) fn create_run_dir(args: &RunArgs, label: &str) -> Result<RunDirectory, Exit> {
     let runs = std::path::absolute(&args.runs).map_err(|error| Exit::io("resolve", &args.runs, &error))?;
     std::fs::create_dir_all(&runs).map_err(|error| Exit::io("create", &runs, &error))?;
     if let Some(name) = &args.name {
@@ -477,13 +478,14 @@ fn assemble(
         config_hash,
         beginning: None,
         restart: None,
+        replay: None,
     };
     reserve_shared_memory(&run)?;
     Ok((run, claim))
 }
 
 /// Reserves the shared memory of a run.
-fn reserve_shared_memory(run: &RunFile) -> Result<(), Exit> {
+pub(crate) fn reserve_shared_memory(run: &RunFile) -> Result<(), Exit> {
     let Err(error) = reserve::create(run) else {
         return Ok(());
     };

@@ -159,7 +159,10 @@ impl RunProcesses {
     /// True if every process that `row` needs is ready: in all environments for a process of the whole run, else in its own.
     fn may_start(&self, row: &ProcessSpec, environment: &Environment) -> bool {
         let is_up = |environment: &Environment| {
-            let mut needs = row.needs.iter();
+            let mut needs = row
+                .needs
+                .iter()
+                .filter(|need| (need.spec().is_wanted)(&environment.run));
             needs.all(|need| environment.state_of(*need) != State::Starting)
         };
         match row.scope {
@@ -373,9 +376,8 @@ impl RunProcesses {
     /// # Errors
     /// A file cannot be read or written, or iceoryx2 refuses.
     pub fn restart_environment(&mut self, env_index: u32) -> Result<(u64, u64), Exit> {
-        let is_of_environment = |running: &mut RunningProcess| {
-            running.env_index == env_index && running.row.scope == ProcessScope::Environment
-        };
+        let is_of_environment =
+            |running: &mut RunningProcess| running.env_index == env_index && running.row.is_simulator();
         let mut ended: Vec<RunningProcess> = self.running.extract_if(.., is_of_environment).collect();
         ended.iter_mut().for_each(RunningProcess::kill);
         self.forget_dead();
@@ -412,7 +414,7 @@ impl RunProcesses {
     #[must_use]
     pub fn first_not_ready(&self) -> Option<(&'static ProcessSpec, &Environment)> {
         self.members()
-            .filter(|(row, _)| row.is_required())
+            .filter(|(row, environment)| row.is_required(&environment.run))
             .find(|(row, environment)| self.is_starting(row, environment))
     }
 
@@ -427,8 +429,12 @@ impl RunProcesses {
 
     /// True once every required process has been started and has ended.
     pub fn have_finished(&mut self) -> bool {
-        let count = self.members().filter(|(row, _)| row.is_required()).count();
-        let required = self.running.iter_mut().filter(|running| running.row.is_required());
+        let members = self.members();
+        let count = members
+            .filter(|(row, environment)| row.is_required(&environment.run))
+            .count();
+        let run = &self.environments[0].run;
+        let required = self.running.iter_mut().filter(|running| running.row.is_required(run));
         required
             .map(|running| usize::from(running.poll().is_some()))
             .sum::<usize>()

@@ -102,7 +102,7 @@ impl Sensing {
 }
 
 /// The results of one environment.
-fn environment_report(run: &RunFile, sensing: &Sensing, dynamics: Option<Value>) -> Value {
+fn environment_report(run: &RunFile, sensing: &Sensing, dynamics: Option<Value>, recording: Option<Value>) -> Value {
     json!({
         "environment": run.env_index,
         "seed": run.seed(),
@@ -117,6 +117,7 @@ fn environment_report(run: &RunFile, sensing: &Sensing, dynamics: Option<Value>)
         "lidar": sensing.lidar,
         "camera": sensing.camera,
         "radar": sensing.radar,
+        "recording": recording,
     })
 }
 
@@ -217,7 +218,10 @@ pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFig
     let environments: Vec<Value> = runs
         .iter()
         .zip(&sensings)
-        .map(|(run, sensing)| environment_report(run, sensing, parts.read(&run.run_dir, Process::SimCore)))
+        .map(|(run, sensing)| {
+            let dynamics = parts.read(&run.run_dir, Process::SimCore);
+            environment_report(run, sensing, dynamics, parts.read(&run.run_dir, Process::Recorder))
+        })
         .collect();
     let sensing = Sensing::total(&sensings);
     let trainer: TrainerFigures = parts.read(&run.run_dir, Process::Trainer).unwrap_or_default();
@@ -403,6 +407,7 @@ fn summary(report: &Value, path: &Path) -> String {
         }
     }
     lines.extend(traffic(report));
+    lines.extend(recordings(report));
     lines.extend(resynchronisations(report));
     lines.extend(guidances(report));
     lines.push(format!(
@@ -452,6 +457,26 @@ fn traffic(report: &Value) -> Option<String> {
         report["traffic"]["contacts"],
         report["traffic"]["resets"]
     ))
+}
+
+/// A line for each recording: its size, and what it lacks.
+fn recordings(report: &Value) -> Vec<String> {
+    let environments = report["environments"].as_array().map_or(&[][..], Vec::as_slice);
+    let recordings = environments.iter().map(|environment| &environment["recording"]);
+    let line = |recording: &Value| {
+        let bytes = |key: &str| recording[key].as_f64().unwrap_or(0.0) / 1e6;
+        format!(
+            "recording: {} ({:.1} MB of {:.1} MB), {} ticks missed{}",
+            recording["file"].as_str().unwrap_or_default(),
+            bytes("file_bytes"),
+            bytes("message_bytes"),
+            recording["missed_ticks"],
+            recording["stopped"]
+                .as_str()
+                .map_or(String::new(), |reason| format!("; it ended early: {reason}"))
+        )
+    };
+    recordings.filter(|recording| !recording.is_null()).map(line).collect()
 }
 
 /// How often mirrors were set onto SUMO, in all environments, and the commonest reasons.

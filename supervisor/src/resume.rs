@@ -63,6 +63,15 @@ pub fn changed_config(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
             format!("resume all ranks together: torchrun --nproc-per-node {ranks} -m caraware.parallel --resume RUN"),
         ));
     }
+    check_changeable(set)?;
+    Ok(LayeredSettings::of(&run.config)?.with_assignments(set)?.validate()?)
+}
+
+/// Checks that no observation depends on the settings that `set` changes.
+///
+/// # Errors
+/// One does.
+pub fn check_changeable(set: &[String]) -> Result<(), Exit> {
     for assignment in set {
         let key = assignment.split('=').next().unwrap_or_default().trim();
         let is_known = config::keys::KEYS.iter().any(|known| known.path == key);
@@ -76,7 +85,7 @@ pub fn changed_config(run: &RunFile, set: &[String]) -> Result<Config, Exit> {
             ));
         }
     }
-    Ok(LayeredSettings::of(&run.config)?.with_assignments(set)?.validate()?)
+    Ok(())
 }
 
 /// Prepares a stopped run to continue in its own directory, from `beginning` or, without it, from tick 0.

@@ -25,7 +25,7 @@ use crate::{failure::Exit, install::Install};
 /// The program has not been built.
 fn command(row: &ProcessSpec, install: &Install, run: &RunFile) -> Result<Command, Exit> {
     match row.program {
-        Program::Binary => install.binary(row.process).map(Command::new),
+        Program::Binary(name) => install.binary(name(run)).map(Command::new),
         Program::PythonModule(module) => {
             let mut command = Command::new(&install.python);
             command.args(["-m", module(run)]).env("PYTHONUNBUFFERED", "1");

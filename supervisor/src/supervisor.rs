@@ -10,7 +10,7 @@ use std::{
 use ipc_schema::{
     config::StallAction,
     failure::{Failure, FailureKind},
-    process::{OnExit, Process, ProcessScope, ProcessSpec},
+    process::{OnExit, Process, ProcessSpec},
     run::{Mode, RunFile},
 };
 use signal_hook::{
@@ -97,7 +97,7 @@ pub struct Supervisor {
     event_sender: Sender<SupervisorEvent>,
     signal_handle: Handle,
     /// Restarts of watchers.
-    watcher_restarts: BTreeMap<Process, WatcherRestarts>,
+    watcher_restarts: BTreeMap<ProcessPlace, WatcherRestarts>,
     trainer_restarts: RequiredRestarts,
     /// Restarts of the simulator processes of each environment.
     environment_restarts: BTreeMap<u32, RequiredRestarts>,
@@ -241,7 +241,7 @@ impl Supervisor {
     /// that count.
     fn may_simulate_again(&self, row: &ProcessSpec) -> bool {
         let run = self.processes.run();
-        row.scope == ProcessScope::Environment && run.mode != Mode::Play && !run.config.drives()
+        row.is_simulator() && run.mode != Mode::Play && run.replay.is_none() && !run.config.drives()
     }
 
     /// Reports processes that hang, and kills those that are to be replaced: their ends are found like all others.
@@ -320,8 +320,7 @@ impl Supervisor {
             RestartVerdict::Start => {}
         }
         let (first_tick, sensed_ticks) = self.processes.restart_environment(env_index)?;
-        let is_of_another =
-            |(process, index): &ProcessPlace| *index != env_index || process.spec().scope == ProcessScope::Run;
+        let is_of_another = |(process, index): &ProcessPlace| *index != env_index || !process.spec().is_simulator();
         self.killed_stalls.retain(is_of_another);
         display::notice(&format!(
             "{label} ended with {}; the simulation is made again from tick {first_tick} to {sensed_ticks}, and continues",
@@ -332,12 +331,17 @@ impl Supervisor {
 
     /// Restarts a watcher, unless none of its last starts opened its ports. Then the run continues without it.
     fn restart_watcher(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
-        let restarts = self.watcher_restarts.entry(ended.row.process).or_default();
+        let place = (ended.row.process, ended.env_index);
+        let restarts = self.watcher_restarts.entry(place).or_default();
         let verdict = restarts.verdict(self.processes.is_attached(index), Instant::now());
-        if verdict == RestartVerdict::Start {
-            return self.restart(index, ended);
+        match verdict {
+            RestartVerdict::Start => self.restart(index, ended),
+            // The run would wait for ever for the credit of a process that never comes.
+            RestartVerdict::GiveUp if ended.row.is_required(self.processes.run()) => {
+                Err(self.processes.failure(index, ended.status).into())
+            }
+            _ => Ok(()),
         }
-        Ok(())
     }
 
     /// Replaces a trainer that was killed or crashed, after a pause that grows while it reaches no new checkpoint. Only ends of its own

@@ -25,11 +25,12 @@ struct CrateRow {
 }
 
 /// Dependencies that only the crates which list them in their last cell may have.
-const HEAVY: [&str; 9] = [
+const HEAVY: [&str; 10] = [
     "clap",
     "cxx",
     "iceoryx2",
     "indicatif",
+    "mcap",
     "nalgebra",
     "parry3d-f64",
     "pyo3",

@@ -15,7 +15,7 @@ use std::{
     process::{Command, Output, Stdio},
 };
 
-use common::{Workplace, text, until};
+use common::{Workplace, text, until, with_mounts};
 use rustix::{
     fs::statvfs,
     process::{Pid, Signal, kill_process},
@@ -39,30 +39,6 @@ const SHORT: [&str; 11] = [
 fn train<'a>(name: &'a str, settings: &[&'a str]) -> Vec<&'a str> {
     let set = SHORT.iter().chain(settings).flat_map(|setting| ["--set", *setting]);
     ["train", "town", "--name", name].into_iter().chain(set).collect()
-}
-
-/// `command` in a mount namespace of its own, after `prepare` in the shell; `None` if this system allows no such namespace.
-fn with_mounts(command: &Command, prepare: &str) -> Option<Command> {
-    let user: &[&str] = if rustix::process::getuid().is_root() {
-        &[]
-    } else {
-        &["--map-root-user"]
-    };
-    let unshare = |script: &str| {
-        let mut unshare = Command::new("unshare");
-        unshare.args(user).args(["--mount", "sh", "-c", script, "sh"]);
-        unshare
-    };
-    let may_mount = unshare("mount -t tmpfs none /mnt")
-        .output()
-        .is_ok_and(|output| output.status.success());
-    may_mount.then(|| {
-        let mut alone = unshare(&format!("{prepare} && exec \"$@\""));
-        alone.arg(command.get_program()).args(command.get_args());
-        alone.current_dir(command.get_current_dir().unwrap());
-        alone.envs(command.get_envs().filter_map(|(key, value)| Some((key, value?))));
-        alone
-    })
 }
 
 /// Process id of the process whose command line has both words.

@@ -31,6 +31,7 @@ use pyo3::{
 
 mod lease;
 mod metrics;
+mod recording;
 mod scans;
 mod sights;
 mod view;
@@ -805,6 +806,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<PointCloud>()?;
     module.add_class::<SightMessage>()?;
     module.add_class::<Metric>()?;
+    module.add_class::<recording::RecordingFile>()?;
     module.add_function(wrap_pyfunction!(id_hash, module)?)?;
     module.add_function(wrap_pyfunction!(observation_size, module)?)?;
     module.add_function(wrap_pyfunction!(exchange, module)?)?;

@@ -376,6 +376,7 @@ fn run_file(name: &str, mode: Mode, run_dir: PathBuf, port: u16) -> RunFile {
         config_hash: String::new(),
         beginning: None,
         restart: None,
+        replay: None,
         run_dir,
     }
 }

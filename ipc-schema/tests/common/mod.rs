@@ -45,5 +45,6 @@ pub fn run_in(directory: &Path, name: &str, config: Config) -> RunFile {
         config_hash: String::new(),
         beginning: None,
         restart: None,
+        replay: None,
     }
 }

@@ -9,13 +9,12 @@ use ipc_schema::{
     failure::{Failure, FailureKind},
     flow,
     header::MessageHeader,
-    membership::{self, MembershipError, RunMembership},
+    membership::{self, MembershipError, RequiredConsumers, RunMembership},
     ports::{BoardReader, Publisher, Waker},
     process::Process,
     services::Channel,
 };
 
-pub mod digest;
 pub mod handover;
 pub mod journal;
 
@@ -75,14 +74,16 @@ impl Delivery {
         })
     }
 
-    /// True if ticks can be sent again, or a new incarnation has attached.
+    /// True if ticks can be sent again, for which all of `others` have credit, or a new incarnation has attached.
     #[must_use]
-    pub fn is_behind(&self) -> bool {
+    pub fn is_behind(&self, others: &RequiredConsumers) -> bool {
         let progress = self.board.progress();
         progress.attached == 1
             && !self.is_trainer_ahead(&progress)
             && (self.incarnation != Some(progress.incarnation)
-                || self.next < self.journal.ticks() && flow::has_credit(self.next, &progress, self.window))
+                || self.next < self.journal.ticks()
+                    && flow::has_credit(self.next, &progress, self.window)
+                    && others.have_credit(self.next))
     }
 
     /// True if the trainer has received more ticks than have been made, or still reads what an earlier incarnation of this process has
@@ -162,11 +163,12 @@ impl Delivery {
         State::from_u32(self.board.health().state) == State::Done
     }
 
-    /// Reads the trainer's commits and incarnation from the board, and resends what a successor lacks and has credit for.
+    /// Reads the trainer's commits and incarnation from the board, and resends what a successor lacks and has credit for. A tick that was
+    /// kept during a handover is new for `others`, which need credit too.
     ///
     /// # Errors
     /// A successor asks for a tick that the journal does not hold, or the port fails.
-    pub fn catch_up(&mut self, observations: &Publisher) -> Result<(), Failure> {
+    pub fn catch_up(&mut self, observations: &Publisher, others: &RequiredConsumers) -> Result<(), Failure> {
         loop {
             let progress = self.board.progress();
             self.follow_incarnation(&progress)
@@ -174,10 +176,12 @@ impl Delivery {
             if self.is_trainer_ahead(&progress)
                 || self.next >= self.journal.ticks()
                 || !flow::has_credit(self.next, &progress, self.window)
+                || !others.have_credit(self.next)
             {
                 return Ok(());
             }
             self.resend(observations)?;
+            others.wake();
         }
     }
 

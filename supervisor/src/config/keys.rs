@@ -415,6 +415,12 @@ pub const KEYS: &[ConfigKey] = &[
     float("fanout.signals_hz", "1/s", 0.0, 1000.0, "Limit of traffic-light frames per wall second, after changes; 0 = none."),
     float("fanout.vehicles_hz", "1/s", 0.0, 1000.0, "Limit of road-user tables per wall second; 0 = none."),
     float("fanout.status_hz", "1/s", 0.0, 1000.0, "Limit of status reports per wall second; 0 = none."),
+    other("record.manner", ValueKind::Choice(&["off", "watching", "lossless"]), "Record the run into a file (docs/recording.md): \"watching\", no process waits for `recorder`, and what it misses is counted; \"lossless\", the run waits for it, and nothing is missed."),
+    other("record.channels", ValueKind::Texts, "Recorded channels, by their names (ipc-schema/src/lib.rs). A channel that the run does not use adds nothing."),
+    integer("record.compression_level", "", 1, 19, "Level of zstd: higher is smaller and slower."),
+    integer("record.chunk_mib", "MiB", 1, 64, "Size of a chunk before compression. A kill loses at most the newest chunk."),
+    other("record.on_full_disk", ValueKind::Choice(&["wait", "stop_recording", "end_run"]), "On a full disk `recorder` waits for space, and with \"lossless\" the run with it (\"wait\"); the recording ends and the run continues (\"stop_recording\"); or the run ends (\"end_run\")."),
+    other("record.on_death", ValueKind::Choice(&["continue", "end_run"]), "After its death `recorder` starts again and records the rest into another file (\"continue\"), or the run ends (\"end_run\")."),
 ];
 
 /// The key of this dotted path.

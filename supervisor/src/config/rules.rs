@@ -1,6 +1,9 @@
 //! Rules between keys: rates that must divide each other, sizes that must fit, keys that exclude each other.
 
-use ipc_schema::config::{Config, HeroDriver, Network, TaskKind, VehicleModel};
+use ipc_schema::{
+    channel::Channel,
+    config::{Config, HeroDriver, Network, TaskKind, VehicleModel},
+};
 
 mod curriculum;
 mod sensors;
@@ -22,6 +25,7 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         }
     }
     sensors::check(settings, config)?;
+    recorded_channels(settings, config)?;
     let trainer = &config.trainer;
     if trainer.batch_size > trainer.horizon {
         return Err(conflict(
@@ -63,6 +67,22 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
         ));
     }
     region(settings, config)
+}
+
+/// Every recorded channel exists, and a recorded run has at least one.
+fn recorded_channels(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> {
+    let record = &config.record;
+    let names = || Channel::ALL.map(Channel::name).join(", ");
+    let refused = |message: String| {
+        let help = format!("name some of: {}", names());
+        Err(conflict(settings, "record.channels", message, help))
+    };
+    let is_channel = |name: &&String| Channel::ALL.iter().any(|channel| channel.name() == name.as_str());
+    match record.channels.iter().find(|name| !is_channel(name)) {
+        Some(name) => refused(format!("`record.channels` names \"{name}\", which is no channel")),
+        None if record.is_on() && record.channels.is_empty() => refused("`record.channels` is empty".to_owned()),
+        None => Ok(()),
+    }
 }
 
 /// The learner that comes with caraware.

@@ -196,6 +196,30 @@ pub fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
 
+/// `command` in a mount namespace of its own, after `prepare` in the shell; `None` if this system allows no such namespace.
+pub fn with_mounts(command: &Command, prepare: &str) -> Option<Command> {
+    let user: &[&str] = if rustix::process::getuid().is_root() {
+        &[]
+    } else {
+        &["--map-root-user"]
+    };
+    let unshare = |script: &str| {
+        let mut unshare = Command::new("unshare");
+        unshare.args(user).args(["--mount", "sh", "-c", script, "sh"]);
+        unshare
+    };
+    let may_mount = unshare("mount -t tmpfs none /mnt")
+        .output()
+        .is_ok_and(|output| output.status.success());
+    may_mount.then(|| {
+        let mut alone = unshare(&format!("{prepare} && exec \"$@\""));
+        alone.arg(command.get_program()).args(command.get_args());
+        alone.current_dir(command.get_current_dir().unwrap());
+        alone.envs(command.get_envs().filter_map(|(key, value)| Some((key, value?))));
+        alone
+    })
+}
+
 /// A program of the SUMO wheel.
 pub fn sumo_program(name: &str) -> PathBuf {
     caraware::install::Install::find()

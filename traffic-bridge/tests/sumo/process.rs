@@ -323,6 +323,7 @@ fn run_file(run_dir: PathBuf, source: Source, ticks: u64, step_s: f64) -> RunFil
         config_hash: String::new(),
         beginning: None,
         restart: None,
+        replay: None,
         run_dir,
     }
 }

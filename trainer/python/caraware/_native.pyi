@@ -30,6 +30,7 @@ __all__ = [
     "Metric",
     "ObservationBlock",
     "PointCloud",
+    "RecordingFile",
     "SectionView",
     "exchange",
     "id_hash",
@@ -380,3 +381,28 @@ def observation_size(run_file: str) -> int:
 
 def exchange(one: Path, other: Path) -> None:
     """Give two paths each other's names, from one moment to the next. Raises OSError."""
+
+@final
+class RecordingFile:
+    """A recording of an environment, as bytes. `caraware.data` gives it as arrays."""
+
+    def __new__(cls, path: str | Path) -> RecordingFile:
+        """Open it; one that was cut off or damaged opens up to there. Raises ValueError with the place or versions."""
+
+    @property
+    def start_json(self) -> str:
+        """Versions, run, seed and channels."""
+
+    def attachment(self, name: str) -> bytes | None:
+        """Content of an attached file of the run, such as "run.json"."""
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks."""
+
+    @property
+    def damage(self) -> tuple[int, str] | None:
+        """Byte and reason, if the file was cut off or its structure is damaged."""
+
+    def chunk(self, index: int) -> list[tuple[str, bytes, bytes]]:
+        """Topic, header and payload of every message of a chunk. Raises ValueError if it is damaged."""

@@ -1,10 +1,10 @@
 //! The observation hash: BLAKE3 over every observation of a run, in order.
 
+use crate::header::MessageHeader;
 use blake3::{
     Hasher,
     hazmat::{ChainingValue, HasherExt as _, Mode, merge_subtrees_non_root, merge_subtrees_root},
 };
-use ipc_schema::header::MessageHeader;
 use serde::{Deserialize, Serialize};
 
 /// Bytes that are hashed together: 16 of BLAKE3's chunks, which fill the widest vectors.

@@ -1,0 +1,313 @@
+//! A recording in the place of the simulators: its messages go to shared memory in their order, to viewers at a chosen speed, and to a trainer
+//! as far as it returns credit. The process takes the place of `sensor-daemon`, so a trainer notices no difference.
+
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
+
+use ipc_schema::{
+    activity::Awaited,
+    block,
+    board::State,
+    channel::Channel,
+    digest::ObservationDigest,
+    failure::{Failure, FailureKind},
+    header::{LAST_OF_RUN, MessageHeader},
+    membership::{RequiredConsumers, RunMembership, Wait},
+    observation::{EMPTY_SLOT, ObservationLayout},
+    ports::Publisher,
+    process::Process,
+    run::Replay,
+};
+use recorder::file::{
+    RecordingError,
+    reader::{ChannelMessage, RecordingReader},
+};
+use sensor_daemon::delivery::Delivery;
+use serde_json::json;
+
+mod census;
+use census::PlayedCensus;
+
+/// Longest wait between two looks at the clock and the request to stop.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Plays the recording that the run file names, until its end or until the process is asked to stop.
+///
+/// # Errors
+/// The recording cannot be read or ends before the run that it is of, or a port failed.
+pub fn run(run_file: &Path) -> Result<(), Failure> {
+    let membership = RunMembership::join(run_file, Process::SensorDaemon)?;
+    let replay = membership.run.replay.clone();
+    let replay = replay.ok_or_else(|| Failure::new(FailureKind::Run, "the run file names no recording"))?;
+    let recording = RecordingReader::open(&replay.file).map_err(unreadable)?;
+    let mut player = Player::open(membership, &replay)?;
+    for message in recording.channel_messages() {
+        let message = message.map_err(unreadable)?;
+        if player.play(&message)? == Wait::Stopped {
+            return player.write_part();
+        }
+    }
+    player.leave(&replay)
+}
+
+fn unreadable(error: RecordingError) -> Failure {
+    Failure::from_error(FailureKind::Run, &error)
+}
+
+struct Player {
+    membership: RunMembership,
+    /// By [`Channel`]; `None` for those that the replay does not send.
+    publishers: Vec<Option<Publisher>>,
+    /// Delivery to the trainer, if the run has one.
+    trainer: Option<Delivery>,
+    /// Other required consumers of observations; a replay has none.
+    others: RequiredConsumers,
+    census: PlayedCensus,
+    from_tick: u64,
+    committed_ticks: u64,
+    journal_first: u64,
+    /// Tick that the clock began with, and when.
+    begun: Option<(u64, Instant)>,
+    digest: ObservationDigest,
+    first_tick: Option<u64>,
+    ticks: u64,
+    vehicle_steps: u64,
+    cavs_max: u32,
+    has_last: bool,
+}
+
+impl Player {
+    fn open(mut membership: RunMembership, replay: &Replay) -> Result<Self, Failure> {
+        let has_trainer = membership.run.mode.has_trainer();
+        let is_sent = |channel: Channel| match channel {
+            // Their only receivers are simulators.
+            Channel::Traffic | Channel::EgoPose | Channel::Switch => false,
+            Channel::Prediction => !has_trainer,
+            Channel::Pointcloud => membership.run.config.lidar.vehicles > 0,
+            Channel::Census => membership.run.config.fanout.enabled,
+            Channel::TrafficMeta | Channel::World | Channel::Observation | Channel::Event => true,
+        };
+        let publisher = |channel: Channel| is_sent(channel).then(|| membership.publisher(channel)).transpose();
+        let publishers = Channel::ALL.into_iter().map(publisher).collect::<Result<_, _>>()?;
+        let trainer = match has_trainer {
+            true => Some(Delivery::open(&membership)?),
+            false => None,
+        };
+        membership.attach();
+        Ok(Self {
+            publishers,
+            trainer,
+            others: membership.consumers([], Channel::Observation)?,
+            census: PlayedCensus::default(),
+            from_tick: replay.from_tick,
+            committed_ticks: membership.run.committed_ticks(),
+            journal_first: 0,
+            begun: None,
+            digest: ObservationDigest::default(),
+            first_tick: None,
+            ticks: 0,
+            vehicle_steps: 0,
+            cavs_max: 0,
+            has_last: false,
+            membership,
+        })
+    }
+
+    fn publisher(&self, channel: Channel) -> Option<&Publisher> {
+        self.publishers[channel as usize].as_ref()
+    }
+
+    /// The header of a recorded message as a message of this run.
+    fn header(&self, recorded: &MessageHeader) -> MessageHeader {
+        let ours = self.membership.header();
+        MessageHeader {
+            schema_version: ours.schema_version,
+            run_id: ours.run_id,
+            incarnation: ours.incarnation,
+            addressee: 0,
+            ..*recorded
+        }
+    }
+
+    /// Sends a message when it is due.
+    fn play(&mut self, message: &ChannelMessage) -> Result<Wait, Failure> {
+        let header = self.header(&message.header);
+        if message.channel == Channel::TrafficMeta {
+            self.census
+                .add(&header, message.payload())
+                .map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
+        }
+        if header.tick < self.from_tick {
+            return Ok(Wait::Ready);
+        }
+        if self.wait_until_due(header.tick)? == Wait::Stopped {
+            return Ok(Wait::Stopped);
+        }
+        if message.channel == Channel::Observation {
+            return self.play_observation(header, message.payload());
+        }
+        if message.channel == Channel::World
+            && let Some(census) = &self.publishers[Channel::Census as usize]
+        {
+            self.census.publish_if_due(census, header)?;
+        }
+        if let Some(publisher) = self.publisher(message.channel) {
+            let mut draft = publisher.loan_unwritten(header, message.payload().len())?;
+            draft.payload_mut().copy_from_slice(message.payload());
+            draft.send()?;
+        }
+        Ok(Wait::Ready)
+    }
+
+    /// Waits until `tick` is due by the clock, in a replay that has a speed.
+    fn wait_until_due(&mut self, tick: u64) -> Result<Wait, Failure> {
+        let run = &self.membership.run.config.run;
+        let (first, begin) = *self.begun.get_or_insert_with(|| (tick, Instant::now()));
+        if run.real_time_factor > 0.0 {
+            #[expect(clippy::cast_precision_loss, reason = "a time on the clock")]
+            let after_s = tick.saturating_sub(first) as f64 * run.tick_s / run.real_time_factor;
+            let after = Duration::from_secs_f64(after_s);
+            while let Some(left) = after.checked_sub(begin.elapsed()).filter(|left| !left.is_zero()) {
+                if self.membership.stopped() {
+                    break;
+                }
+                self.membership.wait(left.min(LOOK))?;
+            }
+        }
+        Ok(if self.membership.stopped() {
+            Wait::Stopped
+        } else {
+            Wait::Ready
+        })
+    }
+
+    /// Sends an observation to viewers, and to the trainer as `sensor-daemon` does.
+    fn play_observation(&mut self, header: MessageHeader, payload: &[u8]) -> Result<Wait, Failure> {
+        let is_committed = header.tick < self.committed_ticks;
+        if !is_committed
+            && self.wait_serving_trainer(|player| {
+                let trainer = player.trainer.as_ref();
+                trainer.is_none_or(|trainer| trainer.may_send(&player.membership) || trainer.may_keep(payload.len()))
+            })? == Wait::Stopped
+        {
+            return Ok(Wait::Stopped);
+        }
+        if let Some(trainer) = &mut self.trainer {
+            trainer.update_handover(Instant::now());
+        }
+        self.digest.add(&header, payload);
+        let is_sent = match &mut self.trainer {
+            _ if is_committed => false,
+            None => true,
+            Some(trainer) => {
+                let is_due = trainer.may_send(&self.membership);
+                trainer.keep(header, payload)?;
+                if is_due {
+                    trainer.count_live();
+                }
+                is_due
+            }
+        };
+        if is_sent && let Some(publisher) = self.publisher(Channel::Observation) {
+            let addressed = self
+                .trainer
+                .as_ref()
+                .map_or(header, |trainer| trainer.addressed(header));
+            let mut draft = publisher.loan_unwritten(addressed, payload.len())?;
+            draft.payload_mut().copy_from_slice(payload);
+            draft.send()?;
+        }
+        if let Some(trainer) = &self.trainer {
+            trainer.wake();
+        }
+        self.report(&header, payload);
+        Ok(Wait::Ready)
+    }
+
+    fn report(&mut self, header: &MessageHeader, payload: &[u8]) {
+        self.first_tick.get_or_insert(header.tick);
+        self.has_last |= header.has(LAST_OF_RUN);
+        self.ticks = header.tick + 1;
+        let vehicles: &[u32] = block::view(payload, ObservationLayout::of(header).vehicle).unwrap_or_default();
+        let cavs = vehicles.iter().filter(|vehicle| **vehicle != EMPTY_SLOT).count() as u32;
+        self.cavs_max = self.cavs_max.max(cavs);
+        self.vehicle_steps += u64::from(cavs);
+        let (ticks, vehicle_steps) = (self.ticks, self.vehicle_steps);
+        self.membership.report(|health| {
+            health.state = State::Running as u32;
+            health.ticks = ticks;
+            health.episode = header.episode;
+            health.sim_time_ns = header.sim_time_ns;
+            health.cavs = cavs;
+            health.vehicle_steps = vehicle_steps;
+        });
+    }
+
+    /// Waits until `condition` holds; meanwhile it resends what a successor of the trainer lacks.
+    fn wait_serving_trainer(&mut self, condition: impl Fn(&Self) -> bool) -> Result<Wait, Failure> {
+        loop {
+            self.catch_up()?;
+            let waited = self.membership.wait_until_for(Awaited::Credit(Process::Trainer), || {
+                let trainer = self.trainer.as_ref();
+                trainer.is_some_and(|trainer| trainer.is_behind(&self.others)) || condition(self)
+            })?;
+            if waited == Wait::Stopped || condition(self) {
+                return Ok(waited);
+            }
+        }
+    }
+
+    fn catch_up(&mut self) -> Result<(), Failure> {
+        let publisher = self.publishers[Channel::Observation as usize].as_ref();
+        let (Some(trainer), Some(publisher)) = (&mut self.trainer, publisher) else {
+            return Ok(());
+        };
+        trainer.catch_up(publisher, &self.others)?;
+        let journal_first = trainer.journal_first();
+        if journal_first != self.journal_first {
+            self.membership.committed(journal_first);
+            self.journal_first = journal_first;
+        }
+        Ok(())
+    }
+
+    /// Leaves once the trainer is done.
+    fn leave(mut self, replay: &Replay) -> Result<(), Failure> {
+        if self.trainer.is_some() && !self.has_last {
+            let file = replay.file.display();
+            return Err(Failure::new(
+                FailureKind::Run,
+                format!(
+                    "{file} ends with tick {}, before the run that it is of: a trainer would wait for more",
+                    self.ticks
+                ),
+            )
+            .with_help("learn from the recording of a run that was completed"));
+        }
+        let waited = self.wait_serving_trainer(|player| player.trainer.as_ref().is_none_or(Delivery::is_done))?;
+        self.write_part()?;
+        if waited == Wait::Ready {
+            self.membership.report(|health| health.state = State::Done as u32);
+        }
+        Ok(())
+    }
+
+    fn write_part(&self) -> Result<(), Failure> {
+        let first_tick = self.first_tick.unwrap_or(0);
+        self.membership.write_part(&json!({
+            "observation_hash": self.digest.hex(),
+            "first_tick": first_tick,
+            "observations": self.vehicle_steps,
+            "ticks": self.ticks.saturating_sub(first_tick),
+            "cavs_max": self.cavs_max,
+            "raw_gnss_mean_error_m": null,
+            "drops": self.publisher(Channel::Observation).map_or(0, Publisher::drops),
+            "lidar": null,
+            "redelivered_ticks": self.trainer.as_ref().map_or(0, Delivery::redelivered),
+            "journal_mib": self.trainer.as_ref().map_or(0, Delivery::journal_mib),
+            "handovers": self.trainer.as_ref().map(Delivery::handovers).unwrap_or_default(),
+        }))
+    }
+}
