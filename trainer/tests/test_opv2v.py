@@ -1,0 +1,119 @@
+"""OPV2V exports by the rules of OpenCOOD's loader: what it computes from them lies on the recorded world."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from caraware.data import Recording, open_recording
+from caraware.data.export.__main__ import export
+from caraware.data.export.opv2v import pose, world_from_pose
+from caraware.ipc.arrays import Float64Array
+from caraware.ipc.pointcloud import rotation
+
+CARAWARE = Path(__file__).parents[2] / "target" / "release" / "caraware"
+SETTINGS = {
+    "traffic.cavs": 6,
+    "traffic.others": 4,
+    "traffic.pedestrians": 3,
+    "episode.ticks": 60,
+    "episode.training_episodes": 1,
+    "fanout.enabled": "false",
+    "lidar.vehicles": 3,
+    "lidar.channels": 16,
+    "lidar.points_per_second": 115200,
+    # Boxes and points then belong to the same moment.
+    "lidar.rolling_shutter": "false",
+    "lidar.range_noise_std_m": 0.0,
+}
+MIRROR = np.diag([1.0, -1.0, 1.0])
+"""CARLA's left-handed frame from ours."""
+
+
+@pytest.fixture(scope="module")
+def run_dir() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="cw-") as short:
+        settings = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
+        command: list[str | Path] = [CARAWARE, "simulate", "town", "--name", "data", "--record", "--quiet", *settings]
+        environment = os.environ | {"CARAWARE_RUNTIME_DIR": f"{short}/r", "CARAWARE_PYTHON": sys.executable}
+        ran = subprocess.run(command, cwd=short, env=environment, capture_output=True, text=True, timeout=600)
+        assert ran.returncode == 0, ran.stdout + ran.stderr
+        yield Path(short, "runs", "data")
+
+
+def _read_pcd(path: Path) -> tuple[Float64Array, Float64Array]:
+    """Points and intensities, as open3d gives them to OpenCOOD: the intensity is the red of the colours."""
+    head, _, data = path.read_bytes().partition(b"DATA binary\n")
+    fields = {line.split()[0]: line.split()[1:] for line in head.decode().splitlines() if not line.startswith("#")}
+    assert fields["FIELDS"] == ["x", "y", "z", "rgb"] and fields["SIZE"] == ["4"] * 4
+    rows = np.frombuffer(data, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+    assert len(rows) == int(fields["POINTS"][0])
+    points = np.stack([rows[name] for name in "xyz"], 1).astype(np.float64)
+    return points, (rows["rgb"] >> 16 & 0xFF) / 255
+
+
+def _scenario(path: Path) -> dict[int, dict[str, Any]]:
+    """Agents of a scenario by number, each with its frames by timestamp: OpenCOOD's `BaseDataset`."""
+    agents = sorted(directory.name for directory in path.iterdir() if directory.is_dir())
+    stamps = {agent: sorted(file.stem for file in (path / agent).glob("*.yaml")) for agent in agents}
+    return {
+        int(agent): {
+            stamp: (
+                yaml.safe_load((path / agent / f"{stamp}.yaml").read_text()),
+                *_read_pcd(path / agent / f"{stamp}.pcd"),
+            )
+            for stamp in stamps[agent]
+        }
+        for agent in agents
+    }
+
+
+def test_a_pose_is_the_same_transform_in_both_frames() -> None:
+    # No symmetry hides a sign here.
+    position_m, attitude_rad = np.array([12.0, -7.0, 1.5]), (0.05, -0.11, 2.2)
+    transform = world_from_pose(pose(position_m, attitude_rad))
+    assert transform[:3, :3] == pytest.approx(MIRROR @ rotation(*attitude_rad) @ MIRROR)
+    assert transform[:3, 3] == pytest.approx(MIRROR @ position_m)
+
+
+def test_points_and_boxes_of_every_agent_meet_in_the_world(run_dir: Path, tmp_path: Path) -> None:
+    recording: Recording = open_recording(run_dir)
+    assert export(run_dir, "opv2v", tmp_path, 1, lambda done, total: None) == 1
+    agents = _scenario(tmp_path / "episode-00000.opv2v")
+    assert len(agents) >= 3
+    scans = {(int(m.section("scan")[0]["vehicle"]), m.tick): m for m in recording.messages("pointcloud")}
+    assert sum(len(frames) for frames in agents.values()) == len(scans)
+    worlds = {message.tick: message.section("states") for message in recording.messages("world")}
+    on_boxes = 0
+    for agent, frames in agents.items():
+        for stamp, (labels, points, intensity) in list(frames.items())[::7]:
+            message = scans[agent, int(stamp)]
+            scan, recorded = message.section("scan")[0], message.section("points")
+            in_world = points @ world_from_pose(labels["lidar_pose"])[:3, :3].T + labels["lidar_pose"][:3]
+            ours = recorded["position_m"] @ rotation(*scan["attitude_rad"]).T + scan["position_m"]
+            assert in_world == pytest.approx(ours @ MIRROR, abs=1e-3)
+            assert intensity == pytest.approx(recorded["intensity"], abs=1 / 255)
+            states = {int(state["vehicle"]): state for state in worlds[int(stamp)]}
+            for vehicle, box in labels["vehicles"].items():
+                assert vehicle != agent and box["speed"] >= 0
+                assert box["extent"][0] == pytest.approx(float(states[vehicle]["length_m"]) / 2)
+                on_it = in_world[recorded["object"] == vehicle]
+                assert len(on_it) == box["points"]
+                # The points that hit a road user lie in its box.
+                centre = np.array(box["location"]) + box["center"]
+                in_box = (on_it - centre) @ world_from_pose([0, 0, 0, *box["angle"]])[:3, :3]
+                assert np.all(np.abs(in_box[:, :2]) < np.array(box["extent"])[:2] + 0.1), (stamp, vehicle)
+                on_boxes += len(on_it)
+            own = states[agent]
+            heading_deg = labels["true_ego_pos"][4]
+            assert heading_deg == pytest.approx(-math.degrees(own["yaw_rad"]))
+    assert on_boxes > 100
