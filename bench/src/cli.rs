@@ -25,6 +25,8 @@ pub enum BenchPart {
     Peers,
     /// Driving: a fixed list of held-out trips with a random driver, the script, SUMO's own driver, and a learnt policy (`--policy`)
     Driving,
+    /// Recording: wall time of a run that is recorded, as a watcher and without loss, compared with the same run alone
+    Record,
     /// Endurance: kills, stops and replaces every process at random moments, and compares each run with an undisturbed one
     Endurance,
     /// All of these but driving and endurance, one after the other

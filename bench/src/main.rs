@@ -13,6 +13,7 @@ mod overhead;
 mod page;
 mod peers;
 mod plots;
+mod record;
 mod report;
 mod scale;
 mod sides;
@@ -126,6 +127,7 @@ fn measure(part: BenchPart, options: &BenchOptions) -> Result<BenchReport, Exit>
         BenchPart::Overhead => overhead::measure(options),
         BenchPart::Scale => scale::measure(options),
         BenchPart::Peers => peers::measure(options),
+        BenchPart::Record => record::measure(options),
         BenchPart::All => Err(Exit::config("`all` is not a part", "")),
     }
 }

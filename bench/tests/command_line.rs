@@ -25,6 +25,7 @@ fn the_help_shows_the_command_and_every_part() {
         "overhead",
         "scale",
         "peers",
+        "record",
         "endurance",
         "all",
     ] {
