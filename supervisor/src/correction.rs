@@ -21,8 +21,7 @@ pub fn suggest_correction(settings: &mut LayeredSettings, source: &str) {
         "observation.history",
         "blackout.policy",
     ];
-    let localises =
-        settings.has_text("task.kind", "localisation") && settings.has_text("trainer.module", OWN_TRAINER);
+    let localises = settings.has_text("task.kind", "localisation") && settings.has_text("trainer.module", OWN_TRAINER);
     if !localises || of_user.iter().any(|key| settings.is_set_by_user(key)) {
         return;
     }

@@ -158,7 +158,16 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
     workplace.assert_nothing_left();
 
     // What was learnt is played, on other seeds.
-    workplace.succeed(&["play", "whole", "--name", "played", "--episodes", "1", "--set", "run.envs=1"]);
+    workplace.succeed(&[
+        "play",
+        "whole",
+        "--name",
+        "played",
+        "--episodes",
+        "1",
+        "--set",
+        "run.envs=1",
+    ]);
     let played = workplace.report("played");
     assert!(played["trainer"]["ppo_mean_progress_mps"].is_number(), "{played:#}");
     assert!(
