@@ -168,9 +168,15 @@ impl ChannelIntake {
 fn ticks_per_message(channel: Channel, run: &RunFile) -> u64 {
     match channel {
         Channel::Traffic => run.ticks_per_frame(),
-        Channel::World | Channel::Observation | Channel::Prediction => 1,
+        Channel::World | Channel::Observation | Channel::Measurement | Channel::Neighbours | Channel::Prediction => 1,
         Channel::EgoPose => u64::from(run.config.drives()),
-        Channel::TrafficMeta | Channel::Census | Channel::Event | Channel::Pointcloud | Channel::Switch => 0,
+        Channel::TrafficMeta
+        | Channel::Census
+        | Channel::Event
+        | Channel::Pointcloud
+        | Channel::Image
+        | Channel::Radar
+        | Channel::Switch => 0,
     }
 }
 

@@ -83,16 +83,18 @@ impl Player {
         let has_trainer = membership.run.mode.has_trainer();
         let is_sent = |channel: Channel| match channel {
             // Their only receivers are simulators.
-            Channel::Traffic | Channel::EgoPose | Channel::Switch => false,
+            Channel::Traffic | Channel::EgoPose | Channel::Switch | Channel::Measurement | Channel::Neighbours => false,
             Channel::Prediction => !has_trainer,
             Channel::Pointcloud => membership.run.config.lidar.vehicles > 0,
+            Channel::Image => membership.run.config.camera.vehicles > 0,
+            Channel::Radar => membership.run.config.radar.vehicles > 0,
             Channel::Census => membership.run.config.fanout.enabled,
             Channel::TrafficMeta | Channel::World | Channel::Observation | Channel::Event => true,
         };
         let publisher = |channel: Channel| is_sent(channel).then(|| membership.publisher(channel)).transpose();
         let publishers = Channel::ALL.into_iter().map(publisher).collect::<Result<_, _>>()?;
         let trainer = match has_trainer {
-            true => Some(Delivery::open(&membership)?),
+            true => Some(Delivery::open(&membership, Channel::Observation)?),
             false => None,
         };
         membership.attach();

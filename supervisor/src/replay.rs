@@ -41,6 +41,12 @@ pub fn prepare_replay(args: &ReplayArgs) -> Result<PreparedRun, Exit> {
     }
     set.extend(args.set.iter().cloned());
     let mut config = LayeredSettings::of(&old.config)?.with_assignments(&set)?.validate()?;
+    if args.learn && config.v2x.is_on() {
+        return Err(Exit::config(
+            "a trainer of a run with messages (`v2x.share`) needs the channel `neighbours`, which a replay does not send yet",
+            "replay it without --learn, or train on a new run",
+        ));
+    }
     system_limits::check_open_files(config.run.envs)?;
     remote::check(&mut config.fanout)?;
     let run_args = RunArgs {

@@ -175,10 +175,10 @@ fn saved_states_riders_and_long_ids_are_mirrored_and_outputs_of_one_name_kept_ap
         "more.rou.xml",
         &format!(
             "<routes><vehicle id=\"{long}1\" depart=\"0\"><route edges=\"A0A1 A1A2\"/></vehicle>\
-             <vehicle id=\"{long}2\" depart=\"1\"><route edges=\"A0A1 A1A2\"/></vehicle>\
              <vehicle id=\"bus\" depart=\"triggered\" departPos=\"20\"><route edges=\"B0B1 B1B2\"/></vehicle>\
              <person id=\"rider\" depart=\"0\"><walk edges=\"B0B1\" arrivalPos=\"20\"/><ride from=\"B0B1\" to=\"B1B2\" lines=\"bus\"/></person>\
-             <container id=\"box\" depart=\"0\"><tranship edges=\"A0B0 B0C0\" speed=\"5\"/></container></routes>"
+             <container id=\"box\" depart=\"0\"><tranship edges=\"A0B0 B0C0\" speed=\"5\"/></container>\
+             <vehicle id=\"{long}2\" depart=\"1\"><route edges=\"A0A1 A1A2\"/></vehicle></routes>"
         ),
     );
     let input = INPUT.replace("cars.rou.xml", "cars.rou.xml,more.rou.xml");
@@ -227,7 +227,7 @@ fn saved_states_riders_and_long_ids_are_mirrored_and_outputs_of_one_name_kept_ap
     scenario(
         &workplace,
         "warm.sumocfg",
-        &format!("{input}<load-state value=\"state.xml.gz\"/><step-length value=\"0.1\"/><end value=\"30\"/>"),
+        &format!("{input}<load-state value=\"saving-state.xml.gz\"/><step-length value=\"0.1\"/><end value=\"30\"/>"),
     );
     let bare = [
         "-c",

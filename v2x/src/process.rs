@@ -7,9 +7,10 @@ use ipc_schema::{
     block::{self, BlockError},
     board::State,
     config::{Config, ImuConvention},
+    digest::ObservationDigest,
     failure::{Failure, FailureKind},
     header::{LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
-    membership::{RunMembership, Wait},
+    membership::{RequiredConsumers, RunMembership, Wait},
     neighbours::{NeighboursLayout, NeighboursSections},
     observation::{EMPTY_SLOT, ObservationLayout},
     ports::{Message, PortError, Publisher, Subscriber},
@@ -18,7 +19,7 @@ use ipc_schema::{
     services::Channel,
     world::{VehicleState, WorldLayout},
 };
-use sensor_daemon::delivery::{Delivery, digest::ObservationDigest};
+use sensor_daemon::delivery::Delivery;
 use serde::{Deserialize, Serialize};
 use sim_core::{geodesy::Projection, scene::Scene};
 
@@ -85,6 +86,8 @@ struct V2xProcess {
     neighbours: Publisher,
     /// Delivery to the trainer; `None` in a run without one.
     trainer: Option<Delivery>,
+    /// The other required consumers. They receive every tick at least once.
+    other_consumers: RequiredConsumers,
     digest: ObservationDigest,
     load_sum: f64,
     radio_ticks: u64,
@@ -109,6 +112,9 @@ impl V2xProcess {
             true => Some(Delivery::open(&membership, Channel::Neighbours)?),
             false => None,
         };
+        let required = Channel::Neighbours.required(&membership.run);
+        let others: Vec<Process> = required.filter(|process| *process != Process::Trainer).collect();
+        let other_consumers = membership.consumers(others, Channel::Neighbours)?;
         membership.attach();
         let (tick, committed_ticks) = (membership.run.first_tick(), membership.run.committed_ticks());
         Ok(Self {
@@ -116,6 +122,7 @@ impl V2xProcess {
             exchange,
             neighbours,
             trainer,
+            other_consumers,
             digest: state.digest,
             load_sum: state.load_sum,
             radio_ticks: state.radio_ticks,
@@ -145,12 +152,13 @@ impl V2xProcess {
     }
 
     fn is_trainer_behind(&self) -> bool {
-        self.trainer.as_ref().is_some_and(Delivery::is_behind)
+        let trainer = self.trainer.as_ref();
+        trainer.is_some_and(|trainer| trainer.is_behind(&self.other_consumers))
     }
 
     fn catch_up(&mut self) -> Result<(), Failure> {
         match &mut self.trainer {
-            Some(trainer) => trainer.catch_up(&self.neighbours),
+            Some(trainer) => trainer.catch_up(&self.neighbours, &self.other_consumers),
             None => Ok(()),
         }
     }
@@ -186,7 +194,9 @@ impl V2xProcess {
         let layout = NeighboursLayout::sized(slots.len(), self.membership.run.config.v2x.neighbours as usize);
         if header.tick >= self.committed_ticks {
             let since = Instant::now();
-            let waited = self.wait_serving_trainer(|process| process.trainer_takes(layout.len))?;
+            let waited = self.wait_serving_trainer(|process| {
+                process.trainer_takes(layout.len) && process.other_consumers.have_credit(header.tick)
+            })?;
             if let Some(trainer) = &mut self.trainer {
                 trainer.update_handover(since);
             }
@@ -248,6 +258,7 @@ impl V2xProcess {
         if let Some(trainer) = &self.trainer {
             trainer.wake();
         }
+        self.other_consumers.wake();
         Ok(())
     }
 
@@ -291,7 +302,10 @@ impl V2xProcess {
 
     /// Waits until the trainer is done. Until then it may die, and its successor needs everything since the last commit.
     fn wait_for_trainers_end(mut self) -> Result<(), Failure> {
-        let waited = self.wait_serving_trainer(|process| process.trainer.as_ref().is_none_or(Delivery::is_done))?;
+        let waited = self.wait_serving_trainer(|process| {
+            process.trainer.as_ref().is_none_or(Delivery::is_done)
+                && process.other_consumers.have_consumed(process.tick)
+        })?;
         self.write_part()?;
         if waited == Wait::Ready {
             self.membership.report(|health| health.state = State::Done as u32);

@@ -24,7 +24,7 @@ pub fn settings(tick_s: f64, sub_steps: u32, ticks_per_step: u32) -> MirrorSetti
         tick_s,
         sub_steps,
         ticks_per_step,
-        hero_driver: ipc_schema::config::HeroDriver::Actions,
+        hero_driver: config::HeroDriver::Actions,
     }
 }
 

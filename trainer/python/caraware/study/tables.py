@@ -14,12 +14,12 @@ import numpy as np
 from caraware.run.program import caraware_program
 from caraware.study.fusing import FusionComparison
 from caraware.study.recording import FOLDER, Recording
-from caraware.study.regression import Comparison
+from caraware.study.regression import Comparison, same_steps
 
 Measured = dict[str, list[float]]
 """Values of each figure (m), one for each independent seed: of an evaluation, or of a learner."""
 
-FUSION_EVALUATIONS = 5
+FUSION_EVALUATIONS, TOWN_EVALUATIONS = 5, 4
 DEFAULT_NOISE = ("gnss.correlated_std_m=0.0", "blackout.enabled=false")
 SENSORS: Mapping[str, tuple[str, ...]] = {"default_noise": DEFAULT_NOISE, "faults": ()}
 """Settings beside the preset `fusion`, which has a slow error of fixes and blackouts."""
@@ -64,8 +64,15 @@ def fusion(options: Options) -> Measured:
     return {"fusion": means_m} | shares
 
 
+def regression(options: Options) -> Measured:
+    """Regression by PPO's samples and gradient steps: each learner's seed one value."""
+    of = Comparison(recorded(options, "town", "town", ()), TOWN_EVALUATIONS)
+    return {"regression": [each.mean_m for seed in options.seeds for each in same_steps(of, seed, ppo=False)]}
+
+
 TABLES: Mapping[str, Table] = {
     "filters": Table("docs/baselines.md", "the filters with and without a map", filters),
+    "regression": Table("docs/baselines.md", "regression with PPO's samples and gradient steps", regression),
     "fusion": Table("docs/fusion.md", "the learned estimator beside the filters", fusion),
 }
 
