@@ -137,15 +137,18 @@ fn a_tick_is_due_once_every_required_consumer_has_credit_for_it() {
     let corner = Corner::new(12);
     let producer = corner.join(Process::SimCore);
     let [mut first, mut second] = [Process::SensorDaemon, Process::Fanout].map(|process| corner.join(process));
-    let consumers = producer.consumers([Process::SensorDaemon, Process::Fanout], 2).unwrap();
+    let consumers = producer
+        .consumers([Process::SensorDaemon, Process::Fanout], Channel::World)
+        .unwrap();
+    let window = corner.run.window_ticks();
     first.attach();
     assert!(!consumers.have_credit(0), "the second is not attached");
     second.attach();
-    assert!(consumers.have_credit(1) && !consumers.have_credit(2));
+    assert!(consumers.have_credit(window - 1) && !consumers.have_credit(window));
     first.consumed(5);
-    assert!(!consumers.have_credit(2), "the second has consumed nothing");
+    assert!(!consumers.have_credit(window), "the second has consumed nothing");
     second.consumed(1);
-    assert!(consumers.have_credit(2) && !consumers.have_credit(3));
+    assert!(consumers.have_credit(window) && !consumers.have_credit(window + 1));
     assert!(consumers.have_consumed(1) && !consumers.have_consumed(2));
     consumers.wake();
     for woken in [&first, &second] {

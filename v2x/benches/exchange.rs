@@ -108,6 +108,7 @@ fn measure(stations: usize, perception_range_m: f64, threads: u32) {
     let map = MapInfo {
         projection: "+proj=tmerc +lat_0=52.26 +lon_0=10.52 +k=1 +x_0=0 +y_0=0 +ellps=WGS84 +units=m +no_defs".into(),
         net_offset_m: [0.0; 2],
+        world_origin_m: [0.0; 2],
         bounds_m: [0.0, 0.0, grid.side_m, grid.side_m],
         traffic_lights: 0,
     };

@@ -268,7 +268,7 @@ mod tests {
                 accuracy_m: 12.5,
                 ..GnssFix::default()
             },
-            ages_s: [2.5, 0.0, 10.0, 0.0, 0.0],
+            ages_s: [2.5, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0],
             delivering: SensorKind::Imu.bit(),
             objects_m: [[80.0, -40.0], [0.0, 0.0], [0.0, 0.0], [20.0, 80.0]],
             ..SensorReadings::default()
