@@ -96,7 +96,8 @@ def test_a_lent_tensor_has_the_numbers_of_a_kept_observation(tmp_path: Path, mon
 
 
 def test_what_arrived_belongs_to_the_observation_and_comes_again_to_a_successor(tmp_path: Path) -> None:
-    more = {"v2x.share": 1.0, "v2x.perception_range_m": 40.0, "traffic.cavs": 12, "episode.training_episodes": 2}
+    more: dict[str, object] = {"v2x.share": 1.0, "v2x.perception_range_m": 40.0, "traffic.cavs": 12}
+    more["episode.training_episodes"] = 2
     finished = run_with(tmp_path, "neighbours_probe", more)
     assert finished.returncode == 0, finished.stdout + finished.stderr
     run = tmp_path / "runs" / "probe"

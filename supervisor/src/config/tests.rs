@@ -72,8 +72,8 @@ fn a_replaced_key_suggests_the_new_one() {
 
 #[test]
 fn an_unknown_table_is_an_unknown_key() {
-    let (message, _) = error_of("[radar]\nchannels = 3\n");
-    assert_eq!(message, "my.toml:1: unknown key `radar`");
+    let (message, _) = error_of("[odometer]\nchannels = 3\n");
+    assert_eq!(message, "my.toml:1: unknown key `odometer`");
 }
 
 #[test]

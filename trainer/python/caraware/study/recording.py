@@ -54,6 +54,11 @@ class RecordedTick:
     truncated: BoolArray
 
     @property
+    def ended_by(self) -> UInt32Array:
+        """u32 `[n]`: not recorded, because only heroes end by themselves; 0."""
+        return np.zeros(len(self.vehicle), np.uint32)
+
+    @property
     def id_hash(self) -> UInt64Array:
         """u64 `[n]`: not recorded; 0."""
         return np.zeros(len(self.vehicle), np.uint64)
