@@ -474,7 +474,10 @@ mod tests {
             .collect();
         numbers.sort_unstable();
         // The numbers that every run so far was drawn with: one that changes changes every observation.
-        assert_eq!(numbers, [1, 2, 3, 4, 5, 6, 7, 32, 33, 34, 35, 40, 41, 42, 43, 44, 45, 46]);
+        assert_eq!(
+            numbers,
+            [1, 2, 3, 4, 5, 6, 7, 32, 33, 34, 35, 40, 41, 42, 43, 44, 45, 46]
+        );
         // A stream has the low eight bits of a word, a part of a sample the others.
         assert!(numbers.iter().all(|number| (1..256).contains(number)));
     }

@@ -307,6 +307,8 @@ impl Player {
             "raw_gnss_mean_error_m": null,
             "drops": self.publisher(Channel::Observation).map_or(0, Publisher::drops),
             "lidar": null,
+            "camera": null,
+            "radar": null,
             "redelivered_ticks": self.trainer.as_ref().map_or(0, Delivery::redelivered),
             "journal_mib": self.trainer.as_ref().map_or(0, Delivery::journal_mib),
             "handovers": self.trainer.as_ref().map(Delivery::handovers).unwrap_or_default(),

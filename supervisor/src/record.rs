@@ -1,10 +1,12 @@
 //! `caraware record`, `diff` and `export`: a recording beside a live run, two recordings compared, and one in other formats.
 
 use std::{
+    cell::Cell,
     os::unix::process::CommandExt as _,
     path::{Path, PathBuf},
     process::Command,
     sync::{Arc, atomic::AtomicBool},
+    time::{Duration, Instant},
 };
 
 use ipc_schema::{channel::Channel, run::RunFile};
@@ -20,6 +22,9 @@ use crate::{
     failure::Exit,
     install, registry,
 };
+
+/// Time between two looks at whether the run is alive.
+const CHECK: Duration = Duration::from_millis(200);
 
 impl From<RecordingError> for Exit {
     fn from(error: RecordingError) -> Self {
@@ -47,6 +52,7 @@ pub fn record(args: &RecordArgs) -> Result<(), Exit> {
             format!("its environments are 0 to {}", run.config.run.envs - 1),
         ));
     }
+    let whole_run_dir = run.run_dir.clone();
     let run = RunFile::read(&run.environment(env).run_dir.join("run.json"))?;
     let channels = chosen_channels(args, &run)?;
     let path = match &args.output {
@@ -63,8 +69,15 @@ pub fn record(args: &RecordArgs) -> Result<(), Exit> {
         run.name,
         path.display()
     );
-    let supervisor = rustix::process::Pid::from_raw(run.supervisor_pid);
-    let is_alive = || supervisor.is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok());
+    // Its lock, not its process: one that has ended is there until its parent has waited for it.
+    let checked = Cell::new(Instant::now());
+    let is_alive = || {
+        if checked.get().elapsed() < CHECK {
+            return true;
+        }
+        checked.set(Instant::now());
+        registry::is_alive(&whole_run_dir)
+    };
     let figures = outside::record(&run, &channels, &path, &stop, is_alive)?;
     #[expect(clippy::cast_precision_loss, reason = "megabytes for people")]
     let megabytes = |bytes: u64| bytes as f64 / 1e6;

@@ -514,7 +514,8 @@ fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, m
 #[test]
 fn learners_take_turns_and_every_tick_is_in_one_commit() {
     let workplace = Workplace::new();
-    let mut run = Run::start(&workplace, "turns", &[PACED]);
+    // Five learners need time to load and to fill a horizon each, also on a machine with other work.
+    let mut run = Run::start(&workplace, "turns", &["run.real_time_factor=8"]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
     let modules = [
         "caraware.examples.sb3_takeover",

@@ -186,10 +186,17 @@ fn a_killed_recorder_loses_a_chunk_at_most_and_the_run_continues_or_ends_as_conf
 #[test]
 fn a_simulator_that_dies_leaves_no_trace_in_the_recording() {
     let workplace = Workplace::new();
-    workplace.succeed(&command("train", "whole", &[], &["--record"]));
+    // A paced run has the filter's estimates in its predictions, and another configuration.
+    let estimates = "trainer.estimates=never";
+    workplace.succeed(&command("train", "whole", &[estimates], &["--record"]));
     let mut run = spawn(
         &workplace,
-        &command("train", "killed", &["run.real_time_factor=60"], &["--record"]),
+        &command(
+            "train",
+            "killed",
+            &["run.real_time_factor=60", estimates],
+            &["--record"],
+        ),
     );
     let directory = run_dir(&workplace, "killed");
     let spectator = Spectator::join(&directory.join("run.json"), &mut run);

@@ -93,10 +93,13 @@ def lane_map(pieces: Pieces, keeping: LaneKeeping | None = None) -> LaneMap:
 
 
 @lru_cache(maxsize=1)
-def lanes_of_net(net_file: Path) -> LaneMap | None:
-    """The lanes of a net as `MapEkf` looks them up; None if it cannot be read, has none, or is too large."""
+def lanes_of_net(net_file: Path, world_origin_m: tuple[float, float] = (0.0, 0.0)) -> LaneMap | None:
+    """The lanes of a net as `MapEkf` looks them up; None if it cannot be read, has none, or is too large.
+
+    The world frame's (0, 0) lies at `world_origin_m` of the net.
+    """
     try:
-        pieces = read_pieces(net_file)
+        pieces = read_pieces(net_file, world_origin_m)
     except (OSError, ElementTree.ParseError) as error:
         log.warning("no filter with a map: %s cannot be read (%s)", net_file, error)
         return None
@@ -111,3 +114,9 @@ def net_of_run(run: RunFile) -> Path | None:
     files = run.get("scene_files") or {}
     several = run["config"].get("curriculum", {}).get("maps")
     return Path(files["net_file"]) if files.get("net_file") and not several else None
+
+
+def world_origin_of_run(run: RunFile) -> tuple[float, float]:
+    """Where the world frame's (0, 0) lies in the net, metres; (0, 0) where the run file does not say."""
+    x_m, y_m = (run.get("map") or {}).get("world_origin_m", (0.0, 0.0))
+    return float(x_m), float(y_m)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from caraware.baselines.lanes import Pieces, read_pieces
-from caraware.baselines.map_ekf import lane_map
+from caraware.baselines.map_ekf import lane_map, world_origin_of_run
 from caraware.baselines.noise import SensorNoise
 from caraware.fusion.carrier import Carried, Carrier
 from caraware.fusion.estimator import FusionEstimator, FusionNetwork, distance_loss
@@ -56,7 +56,7 @@ class FusionConfig:
         """The lanes of the run's net; none without a map. Raises `OSError`."""
         if not self.map:
             return Pieces(*torch.zeros(6, 0))
-        return read_pieces(Path(run["scene_files"]["net_file"]), run["map"]["world_origin_m"])
+        return read_pieces(Path(run["scene_files"]["net_file"]), world_origin_of_run(run))
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from caraware.baselines.lanes import LaneMap
-from caraware.baselines.map_ekf import lanes_of_net, net_of_run
+from caraware.baselines.map_ekf import lanes_of_net, net_of_run, world_origin_of_run
 from caraware.baselines.noise import SensorNoise
 from caraware.ipc.commits import CommitLog
 from caraware.ipc.run_file import BlackoutPolicy, RunFile, config_table, setting
@@ -37,6 +37,8 @@ class RunConfig:
     """Errors of the sensors, which the classical baselines are tuned with; None for a run file without sensors."""
     net_file: Path | None
     """The net of all episodes, for baselines with a map; None where episodes have several."""
+    world_origin_m: tuple[float, float]
+    """Where the world frame's (0, 0) lies in the net."""
     environments: tuple[int, ...]
     """Indices of this run's environments among those of all runs that learn together."""
     is_paced: bool
@@ -68,6 +70,7 @@ class RunConfig:
             evaluation_interval=setting(run, "episode.evaluation_interval", int),
             sensors=SensorNoise.from_run(run),
             net_file=net_of_run(run),
+            world_origin_m=world_origin_of_run(run),
             environments=tuple(range(first_env, first_env + setting(run, "run.envs", int))),
             is_paced=setting(run, "run.real_time_factor", float) > 0.0,
             resume_from=Path(beginning["checkpoint"]) if beginning else None,
@@ -77,7 +80,7 @@ class RunConfig:
 
     def lanes(self) -> LaneMap | None:
         """The map of the baselines, read when the first evaluation begins; None without one."""
-        return lanes_of_net(self.net_file) if self.net_file and self.sensors else None
+        return lanes_of_net(self.net_file, self.world_origin_m) if self.net_file and self.sensors else None
 
     def shows_estimates(self) -> bool:
         """The Kalman filter runs beside the policy. At full speed it would cost more than the policy."""
