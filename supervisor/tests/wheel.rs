@@ -84,12 +84,17 @@ fn sumo_home() -> PathBuf {
 }
 
 /// Configurations of SUMO below a directory.
+/// True for configurations of Python's packaging and of netconvert, which also end in `.cfg`.
+fn is_of_another_tool(path: &Path) -> bool {
+    path.ends_with("setup.cfg") || path.to_string_lossy().ends_with(".netc.cfg")
+}
+
 fn configurations(directory: &Path, found: &mut Vec<PathBuf>) {
     for entry in std::fs::read_dir(directory).unwrap().flatten() {
         let path = entry.path();
         if entry.file_type().unwrap().is_dir() {
             configurations(&path, found);
-        } else if scenario::is_scenario(&path) && !path.ends_with("setup.cfg") {
+        } else if scenario::is_scenario(&path) && !is_of_another_tool(&path) {
             found.push(path);
         }
     }

@@ -310,7 +310,7 @@ impl<G: DrivableGround> DrivingTask<G> {
             leader_speed_mps: leader_speed_mps as f32,
             signal_gap_m: self.signal_gap_m(route, front_station_m) as f32,
             vehicle: hero.vehicle,
-            around: surroundings::Surroundings {
+            around: surroundings::HeroSurroundings {
                 route,
                 states,
                 row,

@@ -29,7 +29,7 @@ const SAME_LINE_M: f64 = 1.0;
 
 /// A hero among the road users of a tick.
 #[derive(Debug)]
-pub struct Surroundings<'a> {
+pub struct HeroSurroundings<'a> {
     /// Its route.
     pub route: &'a HeroRoute,
     /// All road users.
@@ -53,7 +53,7 @@ struct Neighbour<'a> {
     velocity_mps: [f64; 2],
 }
 
-impl Surroundings<'_> {
+impl HeroSurroundings<'_> {
     /// The numbers of [`ipc_schema::world::HeroView::around`]; `letter` is that of a stop line's link.
     #[must_use]
     pub fn numbers(&self, letter: impl Fn(&StopLine) -> Option<u8>) -> [f32; AROUND] {
@@ -291,7 +291,7 @@ mod tests {
 
     fn seen(states: &[VehicleState], letter: Option<u8>) -> [f32; AROUND] {
         let route = route();
-        let hero = Surroundings {
+        let hero = HeroSurroundings {
             route: &route,
             states,
             row: 0,
