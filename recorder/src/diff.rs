@@ -92,6 +92,8 @@ pub struct Comparison {
 struct Side<'a> {
     messages: Box<dyn Iterator<Item = Result<ChannelMessage, RecordingError>> + 'a>,
     waiting: [VecDeque<ChannelMessage>; Channel::COUNT],
+    /// Channels that are compared.
+    channels: &'a [Channel],
     is_over: bool,
     damage: Option<String>,
     newest_tick: u64,
@@ -104,14 +106,15 @@ fn first_tick(recording: &RecordingReader) -> u64 {
 }
 
 impl<'a> Side<'a> {
-    /// The messages of `recording` from tick `begin` on.
-    fn new(recording: &'a RecordingReader, begin: u64) -> Self {
+    /// The messages of `recording` on `channels` from tick `begin` on.
+    fn new(recording: &'a RecordingReader, begin: u64, channels: &'a [Channel]) -> Self {
         let is_early = move |message: &Result<ChannelMessage, _>| {
             message.as_ref().is_ok_and(|message| message.header.tick < begin)
         };
         Self {
             messages: Box::new(recording.channel_messages().filter(move |message| !is_early(message))),
             waiting: std::array::from_fn(|_| VecDeque::new()),
+            channels,
             is_over: false,
             damage: None,
             newest_tick: 0,
@@ -122,7 +125,9 @@ impl<'a> Side<'a> {
         match self.messages.next() {
             Some(Ok(message)) => {
                 self.newest_tick = self.newest_tick.max(message.header.tick);
-                self.waiting[message.channel as usize].push_back(message);
+                if self.channels.contains(&message.channel) {
+                    self.waiting[message.channel as usize].push_back(message);
+                }
             }
             Some(Err(error)) => {
                 self.damage = Some(error.to_string());
@@ -136,17 +141,18 @@ impl<'a> Side<'a> {
 /// Ticks beyond a difference within which an earlier one on another channel may still follow.
 const LATEST_TICKS: u64 = 4096;
 
-/// Compares the channels that both recordings have. Where one began later, the comparison begins with its first message of each channel.
+/// Compares the channels that both recordings have and that are wanted. Where one began later, the comparison begins with its first
+/// message of each channel.
 #[must_use]
-pub fn compare(first: &RecordingReader, second: &RecordingReader) -> Comparison {
+pub fn compare(first: &RecordingReader, second: &RecordingReader, is_wanted: impl Fn(Channel) -> bool) -> Comparison {
     let types = layout::table();
     let is_common = |channel: &Channel| {
         let has = |recording: &RecordingReader| recording.start.channels.iter().any(|name| name == channel.name());
-        has(first) && has(second)
+        is_wanted(*channel) && has(first) && has(second)
     };
     let channels: Vec<Channel> = Channel::ALL.into_iter().filter(is_common).collect();
     let begin = first_tick(first).max(first_tick(second));
-    let mut sides = [Side::new(first, begin), Side::new(second, begin)];
+    let mut sides = [Side::new(first, begin, &channels), Side::new(second, begin, &channels)];
     let mut has_begun = [false; Channel::COUNT];
     let mut found = Comparison::default();
     loop {
@@ -165,7 +171,7 @@ pub fn compare(first: &RecordingReader, second: &RecordingReader) -> Comparison 
     }
     // What a damaged recording lacks is no difference.
     if sides.iter().all(|side| side.damage.is_none()) {
-        for channel in channels {
+        for channel in channels.iter().copied() {
             for (side, is_first) in sides.iter().zip([true, false]) {
                 if let Some(message) = side.waiting[channel as usize].front() {
                     found.note(channel, &message.header, FieldDifference::OnlyIn { is_first });

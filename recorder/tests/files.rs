@@ -268,15 +268,15 @@ fn the_difference_names_tick_section_row_and_values() {
         }
     });
     let open = |path: &Path| RecordingReader::open(path).unwrap();
-    let same = diff::compare(&open(&one), &open(&one));
+    let same = diff::compare(&open(&one), &open(&one), |_| true);
     assert_eq!((same.first, same.compared), (None, TICKS + 6));
     // Between two sections lies what an older message left there, which is no content.
     let gap = place(&directory, "gap.mcap");
     write(&gap, true, |_, payload, layout| {
         payload[layout.truth.offset + layout.truth.len] ^= 1
     });
-    assert_eq!(diff::compare(&open(&one), &open(&gap)).first, None);
-    let difference = diff::compare(&open(&one), &open(&other)).first.unwrap();
+    assert_eq!(diff::compare(&open(&one), &open(&gap), |_| true).first, None);
+    let difference = diff::compare(&open(&one), &open(&other), |_| true).first.unwrap();
     assert_eq!((difference.channel, difference.tick), (Channel::Observation, 31));
     match &difference.field {
         FieldDifference::Value {
@@ -299,7 +299,7 @@ fn the_difference_names_tick_section_row_and_values() {
         writer.add(Channel::Observation, &header, &payload).unwrap();
     }
     writer.finish(0).unwrap();
-    let later = diff::compare(&open(&one), &open(&late)).first.unwrap();
+    let later = diff::compare(&open(&one), &open(&late), |_| true).first.unwrap();
     let only_in_first = FieldDifference::OnlyIn { is_first: true };
     assert_eq!(
         (later.channel, later.tick, later.field),

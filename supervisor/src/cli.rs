@@ -499,6 +499,9 @@ pub struct DiffArgs {
     pub first: PathBuf,
     /// Another
     pub second: PathBuf,
+    /// Compare predictions as well, whose last bits depend on how many ticks were waiting for the network
+    #[arg(long)]
+    pub predictions: bool,
     /// Directory that holds run directories
     #[arg(long, default_value = "runs")]
     pub runs: PathBuf,

@@ -83,12 +83,12 @@ fn sumo_home() -> PathBuf {
     Install::find().unwrap().sumo_home
 }
 
-/// Configurations of SUMO below a directory.
 /// True for configurations of Python's packaging and of netconvert, which also end in `.cfg`.
 fn is_of_another_tool(path: &Path) -> bool {
     path.ends_with("setup.cfg") || path.to_string_lossy().ends_with(".netc.cfg")
 }
 
+/// Configurations of SUMO below a directory.
 fn configurations(directory: &Path, found: &mut Vec<PathBuf>) {
     for entry in std::fs::read_dir(directory).unwrap().flatten() {
         let path = entry.path();
