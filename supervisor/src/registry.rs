@@ -232,6 +232,8 @@ impl RunClaim {
 impl Drop for RunClaim {
     fn drop(&mut self) {
         remove(&self.directory);
+        // A client that was attaching to a run while that run died may have created a file after the sweep at the start.
+        sweep();
         if let Err(error) = remove_base(&base()) {
             tracing::debug!(%error, "cannot remove the runtime directory");
         }
