@@ -99,7 +99,10 @@ fn a_late_joiner_has_the_whole_picture() {
     until("a status with the tick", || {
         let status = ask(&viewer, &run.key(Topic::Status)).unwrap();
         let status: serde_json::Value = serde_json::from_slice(&status).unwrap();
-        status["processes"].as_array().is_some_and(|p| p.len() == Process::COUNT) && status["fanout"]["frames"] != 0
+        status["processes"]
+            .as_array()
+            .is_some_and(|p| p.len() == Process::COUNT)
+            && status["fanout"]["frames"] != 0
     });
 
     let alive = viewer
