@@ -7,14 +7,13 @@ use std::{
 };
 
 use ipc_schema::{
-    activity::Awaited,
     block,
     board::State,
     channel::Channel,
     digest::ObservationDigest,
     failure::{Failure, FailureKind},
     header::{LAST_OF_RUN, MessageHeader},
-    membership::{RequiredConsumers, RunMembership, Wait},
+    membership::{RunMembership, Wait},
     observation::{EMPTY_SLOT, ObservationLayout},
     ports::Publisher,
     process::Process,
@@ -24,7 +23,7 @@ use recorder::file::{
     RecordingError,
     reader::{ChannelMessage, RecordingReader},
 };
-use sensor_daemon::delivery::Delivery;
+use sensor_daemon::delivery::tick_publisher::TickPublisher;
 use serde_json::json;
 
 mod census;
@@ -60,14 +59,9 @@ struct Player {
     membership: RunMembership,
     /// By [`Channel`]; `None` for those that the replay does not send.
     publishers: Vec<Option<Publisher>>,
-    /// Delivery to the trainer, if the run has one.
-    trainer: Option<Delivery>,
-    /// Other required consumers of observations; a replay has none.
-    others: RequiredConsumers,
+    observations: TickPublisher,
     census: PlayedCensus,
     from_tick: u64,
-    committed_ticks: u64,
-    journal_first: u64,
     /// Tick that the clock began with, and when.
     begun: Option<(u64, Instant)>,
     digest: ObservationDigest,
@@ -84,28 +78,24 @@ impl Player {
         let is_sent = |channel: Channel| match channel {
             // Their only receivers are simulators.
             Channel::Traffic | Channel::EgoPose | Channel::Switch | Channel::Measurement | Channel::Neighbours => false,
+            // It has a publisher of its own.
+            Channel::Observation => false,
             Channel::Prediction => !has_trainer,
             Channel::Pointcloud => membership.run.config.lidar.vehicles > 0,
             Channel::Image => membership.run.config.camera.vehicles > 0,
             Channel::Radar => membership.run.config.radar.vehicles > 0,
             Channel::Census => membership.run.config.fanout.enabled,
-            Channel::TrafficMeta | Channel::World | Channel::Observation | Channel::Event => true,
+            Channel::TrafficMeta | Channel::World | Channel::Event => true,
         };
         let publisher = |channel: Channel| is_sent(channel).then(|| membership.publisher(channel)).transpose();
         let publishers = Channel::ALL.into_iter().map(publisher).collect::<Result<_, _>>()?;
-        let trainer = match has_trainer {
-            true => Some(Delivery::open(&membership, Channel::Observation)?),
-            false => None,
-        };
+        let observations = TickPublisher::open(&membership, Channel::Observation)?;
         membership.attach();
         Ok(Self {
             publishers,
-            trainer,
-            others: membership.consumers([], Channel::Observation)?,
+            observations,
             census: PlayedCensus::default(),
             from_tick: replay.from_tick,
-            committed_ticks: membership.run.committed_ticks(),
-            journal_first: 0,
             begun: None,
             digest: ObservationDigest::default(),
             first_tick: None,
@@ -187,43 +177,17 @@ impl Player {
 
     /// Sends an observation to viewers, and to the trainer as `sensor-daemon` does.
     fn play_observation(&mut self, header: MessageHeader, payload: &[u8]) -> Result<Wait, Failure> {
-        let is_committed = header.tick < self.committed_ticks;
-        if !is_committed
-            && self.wait_serving_trainer(|player| {
-                let trainer = player.trainer.as_ref();
-                trainer.is_none_or(|trainer| trainer.may_send(&player.membership) || trainer.may_keep(payload.len()))
-            })? == Wait::Stopped
-        {
+        let waited = self
+            .observations
+            .wait_for_credit(&mut self.membership, header.tick, payload.len())?;
+        if waited == Wait::Stopped {
             return Ok(Wait::Stopped);
         }
-        if let Some(trainer) = &mut self.trainer {
-            trainer.update_handover(Instant::now());
-        }
         self.digest.add(&header, payload);
-        let is_sent = match &mut self.trainer {
-            _ if is_committed => false,
-            None => true,
-            Some(trainer) => {
-                let is_due = trainer.may_send(&self.membership);
-                trainer.keep(header, payload)?;
-                if is_due {
-                    trainer.count_live();
-                }
-                is_due
-            }
-        };
-        if is_sent && let Some(publisher) = self.publisher(Channel::Observation) {
-            let addressed = self
-                .trainer
-                .as_ref()
-                .map_or(header, |trainer| trainer.addressed(header));
-            let mut draft = publisher.loan_unwritten(addressed, payload.len())?;
-            draft.payload_mut().copy_from_slice(payload);
-            draft.send()?;
-        }
-        if let Some(trainer) = &self.trainer {
-            trainer.wake();
-        }
+        let header = self.observations.addressed(header);
+        let mut draft = self.observations.port().loan_unwritten(header, payload.len())?;
+        draft.payload_mut().copy_from_slice(payload);
+        self.observations.publish(&header, draft)?;
         self.report(&header, payload);
         Ok(Wait::Ready)
     }
@@ -247,37 +211,9 @@ impl Player {
         });
     }
 
-    /// Waits until `condition` holds; meanwhile it resends what a successor of the trainer lacks.
-    fn wait_serving_trainer(&mut self, condition: impl Fn(&Self) -> bool) -> Result<Wait, Failure> {
-        loop {
-            self.catch_up()?;
-            let waited = self.membership.wait_until_for(Awaited::Credit(Process::Trainer), || {
-                let trainer = self.trainer.as_ref();
-                trainer.is_some_and(|trainer| trainer.is_behind(&self.others)) || condition(self)
-            })?;
-            if waited == Wait::Stopped || condition(self) {
-                return Ok(waited);
-            }
-        }
-    }
-
-    fn catch_up(&mut self) -> Result<(), Failure> {
-        let publisher = self.publishers[Channel::Observation as usize].as_ref();
-        let (Some(trainer), Some(publisher)) = (&mut self.trainer, publisher) else {
-            return Ok(());
-        };
-        trainer.catch_up(publisher, &self.others)?;
-        let journal_first = trainer.journal_first();
-        if journal_first != self.journal_first {
-            self.membership.committed(journal_first);
-            self.journal_first = journal_first;
-        }
-        Ok(())
-    }
-
     /// Leaves once the trainer is done.
     fn leave(mut self, replay: &Replay) -> Result<(), Failure> {
-        if self.trainer.is_some() && !self.has_last {
+        if self.observations.has_trainer() && !self.has_last {
             let file = replay.file.display();
             return Err(Failure::new(
                 FailureKind::Run,
@@ -288,7 +224,9 @@ impl Player {
             )
             .with_help("learn from the recording of a run that was completed"));
         }
-        let waited = self.wait_serving_trainer(|player| player.trainer.as_ref().is_none_or(Delivery::is_done))?;
+        let waited = self
+            .observations
+            .wait_for_consumers_end(&mut self.membership, self.ticks, || true)?;
         self.write_part()?;
         if waited == Wait::Ready {
             self.membership.report(|health| health.state = State::Done as u32);
@@ -298,6 +236,7 @@ impl Player {
 
     fn write_part(&self) -> Result<(), Failure> {
         let first_tick = self.first_tick.unwrap_or(0);
+        let delivery = self.observations.figures();
         self.membership.write_part(&json!({
             "observation_hash": self.digest.hex(),
             "first_tick": first_tick,
@@ -305,13 +244,13 @@ impl Player {
             "ticks": self.ticks.saturating_sub(first_tick),
             "cavs_max": self.cavs_max,
             "raw_gnss_mean_error_m": null,
-            "drops": self.publisher(Channel::Observation).map_or(0, Publisher::drops),
+            "drops": delivery.drops,
             "lidar": null,
             "camera": null,
             "radar": null,
-            "redelivered_ticks": self.trainer.as_ref().map_or(0, Delivery::redelivered),
-            "journal_mib": self.trainer.as_ref().map_or(0, Delivery::journal_mib),
-            "handovers": self.trainer.as_ref().map(Delivery::handovers).unwrap_or_default(),
+            "redelivered_ticks": delivery.redelivered_ticks,
+            "journal_mib": delivery.journal_mib,
+            "handovers": delivery.handovers,
         }))
     }
 }

@@ -1,9 +1,8 @@
 //! The process: receives `world` messages and publishes one `observation` for each.
 
-use std::{path::Path, time::Instant};
+use std::path::Path;
 
 use ipc_schema::{
-    activity::Awaited,
     block::{self, BlockError},
     board::State,
     digest::ObservationDigest,
@@ -20,8 +19,7 @@ use ipc_schema::{
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    delivery::Delivery,
-    delivery::handover::HandoverFigures,
+    delivery::tick_publisher::{DeliveryFigures, TickPublisher},
     scanning::ScanTotals,
     sensing::{Sensing, SensingState, WorldTick},
     surroundings::{SightTotals, Surroundings, projection_failure},
@@ -49,16 +47,11 @@ struct SensorDaemonReport {
     ticks: u64,
     cavs_max: u32,
     raw_gnss_mean_error_m: Option<f64>,
-    drops: u64,
     lidar: Option<ScanTotals>,
     #[serde(flatten)]
     sight: SightTotals,
-    /// Ticks that were sent again to a successor of the trainer.
-    redelivered_ticks: u64,
-    /// Largest size of the journal so far.
-    journal_mib: usize,
-    /// Planned handovers from one trainer to its successor.
-    handovers: Vec<HandoverFigures>,
+    #[serde(flatten)]
+    delivery: DeliveryFigures,
 }
 
 /// Makes observations until the last tick of the run, or until the supervisor stops the process.
@@ -73,7 +66,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     let surroundings = Surroundings::open(&mut membership, &mut sensing)?;
     let world = membership.subscriber(Channel::World)?;
     let mut daemon = Daemon::open(membership, sensing, surroundings)?;
-    while let Some(message) = daemon.next_world(&world)? {
+    while let Some(message) = daemon.observations.next(&mut daemon.membership, &world)? {
         let header = *message.header();
         if daemon.tick(&message)? == Wait::Stopped {
             break;
@@ -121,22 +114,14 @@ struct Daemon {
     surroundings: Surroundings,
     /// Commands that switch sensors on and off.
     switches: Subscriber,
-    observations: Publisher,
+    observations: TickPublisher,
     /// Delivery to `v2x`; `None` in a run without messages.
     measurements: Option<Measurements>,
-    /// Delivery to the trainer, which must not miss an observation; `None` in a run without a trainer.
-    consumer: Option<Delivery>,
-    /// The other required consumers of observations. They receive every tick at least once.
-    other_consumers: RequiredConsumers,
     digest: ObservationDigest,
     /// The first tick that the digest and the counts cover: the run's own, unless the run resumed without the state of its first part.
     counted_from: u64,
     /// One more than the newest tick made.
     ticks: u64,
-    /// Ticks below this are in the checkpoint: they are simulated again but not sent.
-    committed_ticks: u64,
-    /// The oldest tick of the journal, as the board has it.
-    journal_first: u64,
     vehicle_steps: u64,
     cavs_max: u32,
 }
@@ -156,21 +141,14 @@ impl Daemon {
         sensing.restore(&state.sensing);
         surroundings.set_lidar_totals(state.lidar);
         surroundings.set_sight_totals(state.sight);
-        let observations = membership.publisher(Channel::Observation)?;
+        let observations = TickPublisher::open(&membership, Channel::Observation)?;
         let switches = membership.subscriber(Channel::Switch)?;
-        let consumer = match membership.run.mode.has_trainer() {
-            true => Some(Delivery::open(&membership, Channel::Observation)?),
-            false => None,
-        };
         let measurements = match membership.run.config.v2x.is_on() {
             true => Some(Measurements::open(&membership)?),
             false => None,
         };
-        let required = Channel::Observation.required(&membership.run);
-        let others: Vec<Process> = required.filter(|process| *process != Process::Trainer).collect();
-        let other_consumers = membership.consumers(others, Channel::Observation)?;
         membership.attach();
-        let (ticks, committed_ticks) = (membership.run.first_tick(), membership.run.committed_ticks());
+        let ticks = membership.run.first_tick();
         Ok(Self {
             membership,
             sensing,
@@ -178,66 +156,12 @@ impl Daemon {
             switches,
             observations,
             measurements,
-            consumer,
-            other_consumers,
             digest: state.digest,
             counted_from: state.first_tick,
             ticks,
-            committed_ticks,
-            journal_first: 0,
             vehicle_steps: state.sensing.observations(),
             cavs_max: state.cavs_max,
         })
-    }
-
-    /// Waits for the next `world` message; meanwhile it resends what a successor of the trainer lacks.
-    fn next_world(&mut self, world: &Subscriber) -> Result<Option<Message>, Failure> {
-        let mut received = Ok(None);
-        loop {
-            let waited = self.membership.wait_until_for(Awaited::Input(Process::SimCore), || {
-                received = world.receive();
-                !matches!(received, Ok(None)) || self.is_trainer_behind()
-            })?;
-            if let Some(message) = std::mem::replace(&mut received, Ok(None))? {
-                return Ok(Some(message));
-            }
-            if waited == Wait::Stopped {
-                return Ok(None);
-            }
-            self.catch_up()?;
-        }
-    }
-
-    fn catch_up(&mut self) -> Result<(), Failure> {
-        let Some(consumer) = &mut self.consumer else {
-            return Ok(());
-        };
-        consumer.catch_up(&self.observations, &self.other_consumers)?;
-        let journal_first = consumer.journal_first();
-        if journal_first != self.journal_first {
-            // The board has the number of ticks that the journal does not hold any more: a trainer reads there whether it can continue.
-            self.membership.committed(journal_first);
-            self.journal_first = journal_first;
-        }
-        Ok(())
-    }
-
-    /// Waits until `condition` holds; meanwhile it resends what a successor of the trainer lacks.
-    fn wait_serving_trainer(&mut self, condition: impl Fn(&Self) -> bool) -> Result<Wait, Failure> {
-        loop {
-            self.catch_up()?;
-            let waited = self.membership.wait_until_for(Awaited::Credit(Process::Trainer), || {
-                self.is_trainer_behind() || condition(self)
-            })?;
-            if waited == Wait::Stopped || condition(self) {
-                return Ok(waited);
-            }
-        }
-    }
-
-    fn is_trainer_behind(&self) -> bool {
-        let consumer = self.consumer.as_ref();
-        consumer.is_some_and(|consumer| consumer.is_behind(&self.other_consumers))
     }
 
     /// One tick: assigns slots, scans, waits for credit, samples and publishes.
@@ -261,44 +185,22 @@ impl Daemon {
             .assign(world, road_users.states)
             .map_err(|error| Failure::from_error(FailureKind::Run, &error))?;
         self.scan(world, &road_users)?;
-        let is_committed = world.tick < self.committed_ticks;
         // `v2x` receives committed ticks too: it makes its state again.
-        if self.measurements.is_some()
-            && self.wait_serving_trainer(|daemon| daemon.may_measure(daemon.ticks))? == Wait::Stopped
-        {
-            return Ok(Wait::Stopped);
+        if let Some(measurements) = &self.measurements {
+            let may_measure = |_: &TickPublisher| measurements.consumers.have_credit(world.tick);
+            if self.observations.wait_until(&mut self.membership, may_measure)? == Wait::Stopped {
+                return Ok(Wait::Stopped);
+            }
         }
-        if !is_committed && self.wait_for_credit(n)? == Wait::Stopped {
+        let len = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples()).len;
+        let waited = self
+            .observations
+            .wait_for_credit(&mut self.membership, world.tick, len)?;
+        if waited == Wait::Stopped {
             return Ok(Wait::Stopped);
         }
         self.publish(world, &road_users, n)?;
         Ok(Wait::Ready)
-    }
-
-    /// Waits until the tick of `n` slots may be sent, or may be kept in the journal during a handover, and every other required
-    /// consumer has credit for it.
-    fn wait_for_credit(&mut self, n: usize) -> Result<Wait, Failure> {
-        let len = ObservationLayout::new(n, self.sensing.width(), self.sensing.imu_samples()).len;
-        let since = Instant::now();
-        let waited = self.wait_serving_trainer(|daemon| {
-            daemon.trainer_takes(len) && daemon.other_consumers.have_credit(daemon.ticks)
-        })?;
-        if let Some(consumer) = &mut self.consumer {
-            consumer.update_handover(since);
-        }
-        Ok(waited)
-    }
-
-    /// True if `v2x` has credit for `tick`.
-    fn may_measure(&self, tick: u64) -> bool {
-        let measured = self.measurements.as_ref();
-        measured.is_none_or(|measured| measured.consumers.have_credit(tick))
-    }
-
-    /// True if the next tick, `len` bytes long, may be sent to the trainer or kept for it. True in a run without a trainer.
-    fn trainer_takes(&self, len: usize) -> bool {
-        let trainer = self.consumer.as_ref();
-        trainer.is_none_or(|trainer| trainer.may_send(&self.membership) || trainer.may_keep(len))
     }
 
     /// Samples the sensors of the surroundings. It runs before the observation is made, because the observation shows their samples.
@@ -322,11 +224,8 @@ impl Daemon {
             shape: layout.shape,
             ..*world
         };
-        let header = match &self.consumer {
-            Some(consumer) => consumer.addressed(header),
-            None => header,
-        };
-        let mut draft = self.observations.loan(header, layout.len)?;
+        let header = self.observations.addressed(header);
+        let mut draft = self.observations.port().loan(header, layout.len)?;
         self.sensing
             .observe(&header, road_users, draft.payload_mut())
             .map_err(unreadable)?;
@@ -338,13 +237,7 @@ impl Daemon {
         if let Some(measurements) = &self.measurements {
             measurements.send(&header, draft.payload())?;
         }
-        if self.keep(&header, draft.payload())? {
-            draft.send()?;
-        }
-        if let Some(consumer) = &self.consumer {
-            consumer.wake();
-        }
-        self.other_consumers.wake();
+        self.observations.publish(&header, draft)?;
         self.report_tick(&header, road_users.states.len());
         Ok(())
     }
@@ -364,22 +257,6 @@ impl Daemon {
         self.membership.store_episode_state(tick, &state)
     }
 
-    /// Keeps the tick in the journal. Returns false if the trainer has no credit for it: the journal sends it later.
-    fn keep(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<bool, Failure> {
-        if header.tick < self.committed_ticks {
-            return Ok(false);
-        }
-        let Some(consumer) = &mut self.consumer else {
-            return Ok(true);
-        };
-        let is_due = consumer.may_send(&self.membership);
-        consumer.keep(*header, payload)?;
-        if is_due {
-            consumer.count_live();
-        }
-        Ok(is_due)
-    }
-
     /// Publishes the counters of a tick on the board.
     fn report_tick(&mut self, header: &MessageHeader, road_users: usize) {
         let before = self.vehicle_steps;
@@ -387,7 +264,7 @@ impl Daemon {
         let cavs = (self.vehicle_steps - before) as u32;
         self.cavs_max = self.cavs_max.max(cavs);
         self.ticks += 1;
-        let (ticks, vehicle_steps, drops) = (self.ticks, self.vehicle_steps, self.observations.drops());
+        let (ticks, vehicle_steps, drops) = (self.ticks, self.vehicle_steps, self.observations.port().drops());
         self.membership.report(|health| {
             health.state = State::Running as u32;
             health.ticks = ticks;
@@ -400,16 +277,13 @@ impl Daemon {
         });
     }
 
-    /// Waits until every required consumer is done. Until then the trainer may die, and its successor needs everything since the last
-    /// commit.
+    /// Waits until every required consumer is done.
     fn wait_for_consumers_end(mut self) -> Result<(), Failure> {
-        let waited = self.wait_serving_trainer(|daemon| {
-            let is_trainer_done = daemon.consumer.as_ref().is_none_or(Delivery::is_done);
-            let measured = daemon.measurements.as_ref();
-            is_trainer_done
-                && daemon.other_consumers.have_consumed(daemon.ticks)
-                && measured.is_none_or(|measured| measured.consumers.have_consumed(daemon.ticks))
-        })?;
+        let (ticks, measurements) = (self.ticks, self.measurements.as_ref());
+        let has_measured = || measurements.is_none_or(|measurements| measurements.consumers.have_consumed(ticks));
+        let waited = self
+            .observations
+            .wait_for_consumers_end(&mut self.membership, ticks, has_measured)?;
         self.write_part()?;
         if waited == Wait::Stopped {
             return Ok(());
@@ -428,12 +302,9 @@ impl Daemon {
             ticks: self.ticks - self.counted_from,
             cavs_max: self.cavs_max,
             raw_gnss_mean_error_m: (raw.count > 0).then(|| raw.sum_m / raw.count as f64),
-            drops: self.observations.drops(),
             lidar: self.surroundings.lidar_totals(),
             sight: self.surroundings.sight_totals(),
-            redelivered_ticks: self.consumer.as_ref().map_or(0, Delivery::redelivered),
-            journal_mib: self.consumer.as_ref().map_or(0, Delivery::journal_mib),
-            handovers: self.consumer.as_ref().map(Delivery::handovers).unwrap_or_default(),
+            delivery: self.observations.figures(),
         };
         self.membership.write_part(&part)
     }

@@ -10,19 +10,9 @@ mod common;
 
 use std::{path::PathBuf, process::Output};
 
-use common::{Workplace, sumo_program, text, tool};
+use common::{BARE_NET_SETTINGS, Workplace, sumo_program, text, tool};
 use ipc_schema::run::VEHICLE_IDS;
 use serde_json::Value;
-
-/// Origin of the nets that have none, and no network.
-const SETTINGS: [&str; 6] = [
-    "--set",
-    "map.origin_latitude_deg=52",
-    "--set",
-    "map.origin_longitude_deg=10",
-    "--set",
-    "fanout.enabled=false",
-];
 
 /// A grid, and cars on it that depart in the first ten seconds.
 fn grid(workplace: &Workplace) {
@@ -48,7 +38,7 @@ fn scenario(workplace: &Workplace, name: &str, options: &str) -> PathBuf {
 }
 
 fn start(workplace: &Workplace, sumocfg: &str, name: &str, more: &[&str], variable: Option<&str>) -> Output {
-    let arguments = [&["simulate", sumocfg, "--name", name], &SETTINGS[..], more].concat();
+    let arguments = [&["simulate", sumocfg, "--name", name], &BARE_NET_SETTINGS[..], more].concat();
     let mut command = workplace.command(&arguments);
     if let Some(value) = variable {
         command.env("CARAWARE_TEST_PLACE", value);

@@ -11,18 +11,8 @@ mod common;
 use std::path::{Path, PathBuf};
 
 use caraware::scenario::{self, options::OptionEffect};
-use common::{Workplace, sumo_program, text, tool, tree};
+use common::{BARE_NET_SETTINGS, Workplace, sumo_program, text, tool, tree};
 use quick_xml::events::{BytesStart, Event};
-
-/// The origin that the grid lacks, and no socket.
-const SETTINGS: [&str; 6] = [
-    "--set",
-    "map.origin_latitude_deg=52",
-    "--set",
-    "map.origin_longitude_deg=10",
-    "--set",
-    "fanout.enabled=false",
-];
 
 /// A grid with three vehicles, and a `.sumocfg` that has `options` besides.
 fn scenario(workplace: &Workplace, options: &str) -> PathBuf {
@@ -43,7 +33,7 @@ fn scenario(workplace: &Workplace, options: &str) -> PathBuf {
 }
 
 fn simulate(workplace: &Workplace, more: &[&str]) -> (Option<i32>, String) {
-    let output = workplace.run(&[&["simulate", "a.sumocfg", "--name", "a"], &SETTINGS[..], more].concat());
+    let output = workplace.run(&[&["simulate", "a.sumocfg", "--name", "a"], &BARE_NET_SETTINGS[..], more].concat());
     let said = text(&output).replace(['│', '×', '╰', '─', '▶'], " ");
     (
         output.status.code(),
@@ -289,7 +279,7 @@ fn a_pipe_or_a_device_in_a_files_place_is_refused() {
         &["simulate", "pipe.toml"],
         &["simulate", "town", "--commands", "pipe.jsonl"],
     ] {
-        let output = workplace.run(&[arguments, &SETTINGS[4..]].concat());
+        let output = workplace.run(&[arguments, &BARE_NET_SETTINGS[4..]].concat());
         let said = text(&output);
         assert!(
             output.status.code() == Some(2) && said.contains("named pipe"),
@@ -376,7 +366,13 @@ fn the_games_of_the_wheel_are_harmless() {
     }
     let before = tree(&games);
     let path = games.join("cross.sumocfg").to_string_lossy().into_owned();
-    workplace.succeed(&[&["simulate", &path, "--name", "cross", "--quiet"], &SETTINGS[..]].concat());
+    workplace.succeed(
+        &[
+            &["simulate", &path, "--name", "cross", "--quiet"],
+            &BARE_NET_SETTINGS[..],
+        ]
+        .concat(),
+    );
     assert_eq!(tree(&games), before, "nothing was written into the wheel");
     assert!(workplace.path().join("runs/cross/sumo/tlsstate.xml").is_file());
 }

@@ -18,7 +18,7 @@ use std::{
 };
 
 use caraware::{install::Install, scenario};
-use common::{Workplace, sumo_program, text};
+use common::{BARE_NET_SETTINGS, Workplace, sumo_program, text};
 use ipc_schema::run::VEHICLE_IDS;
 use serde_json::Value;
 
@@ -68,16 +68,6 @@ const RILSA: [&str; 4] = [
 
 /// Scenarios that the short test trains on, and simulates twice: one of clock times and a step of 0.05 s, one of several output files.
 const TRAINED: [&str; 2] = ["tools/game/fokr_bs_demo.sumocfg", "tools/game/square.sumocfg"];
-
-/// Origin of the nets that have none, and no network.
-const SETTINGS: [&str; 6] = [
-    "--set",
-    "map.origin_latitude_deg=52",
-    "--set",
-    "map.origin_longitude_deg=10",
-    "--set",
-    "fanout.enabled=false",
-];
 
 fn sumo_home() -> PathBuf {
     Install::find().unwrap().sumo_home
@@ -139,7 +129,13 @@ fn hash(report: &Value) -> &str {
 /// Simulates the scenario, and compares everything that bare SUMO has made too. Returns the hash.
 fn simulate(workplace: &Workplace, sumocfg: &Path, end: &str, name: &str) -> String {
     let sumocfg = sumocfg.to_str().unwrap();
-    workplace.succeed(&[&["simulate", sumocfg, "--end", end, "--name", name], &SETTINGS[..]].concat());
+    workplace.succeed(
+        &[
+            &["simulate", sumocfg, "--end", end, "--name", name],
+            &BARE_NET_SETTINGS[..],
+        ]
+        .concat(),
+    );
     let report = workplace.report(name);
     let bare = outputs(&workplace.path().join("bare"));
     let fcd = &outputs(&workplace.path().join("fcd"))["bare-fcd.xml"];
@@ -175,7 +171,7 @@ fn train(workplace: &Workplace, sumocfg: &Path, end: &str) {
     let arguments: Vec<&str> = ["train", sumocfg.to_str().unwrap(), "--end", end, "--name", "trained"]
         .into_iter()
         .chain(small)
-        .chain(SETTINGS)
+        .chain(BARE_NET_SETTINGS)
         .collect();
     workplace.succeed(&arguments);
     let report = workplace.report("trained");
@@ -203,7 +199,8 @@ fn every_scenario_of_the_wheel_runs_or_is_refused_as_bare_sumo_does_it() {
             Refused(reason) => {
                 let (succeeded, said) = run_bare(&sumocfg, "1", &workplace.path().join("bare"), &[]);
                 assert!(!succeeded && said.contains(reason), "{name}: {said}");
-                let output = workplace.run(&[&["simulate", sumocfg.to_str().unwrap()], &SETTINGS[..]].concat());
+                let output =
+                    workplace.run(&[&["simulate", sumocfg.to_str().unwrap()], &BARE_NET_SETTINGS[..]].concat());
                 let said = text(&output);
                 assert_eq!(output.status.code(), Some(2), "{name}: {said}");
                 assert!(said.contains(reason), "{name}: {said}");

@@ -1,25 +1,24 @@
 //! The process: receives `world` and `measurement` of each tick, and publishes `neighbours`.
 
-use std::{path::Path, time::Instant};
+use std::path::Path;
 
 use ipc_schema::{
-    activity::Awaited,
     block::{self, BlockError},
     board::State,
     config::{Config, ImuConvention},
     digest::ObservationDigest,
     failure::{Failure, FailureKind},
     header::{LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
-    membership::{RequiredConsumers, RunMembership, Wait},
+    membership::{RunMembership, Wait},
     neighbours::{NeighboursLayout, NeighboursSections},
     observation::{EMPTY_SLOT, ObservationLayout},
-    ports::{Message, PortError, Publisher, Subscriber},
+    ports::{Message, PortError},
     process::Process,
     sensor::SensorKind,
     services::Channel,
     world::{VehicleState, WorldLayout},
 };
-use sensor_daemon::delivery::Delivery;
+use sensor_daemon::delivery::tick_publisher::{DeliveryFigures, TickPublisher};
 use serde::{Deserialize, Serialize};
 use sim_core::{geodesy::Projection, scene::Scene};
 
@@ -47,8 +46,8 @@ struct V2xReport {
     counts: ExchangeCounts,
     /// Mean share of time in which a radio finds the channel busy.
     mean_channel_load: Option<f64>,
-    redelivered_ticks: u64,
-    drops: u64,
+    #[serde(flatten)]
+    delivery: DeliveryFigures,
 }
 
 /// Exchanges messages until the last tick of the run, or until the process is asked to stop.
@@ -61,10 +60,10 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
     let measurements = membership.subscriber(Channel::Measurement)?;
     let mut process = V2xProcess::open(membership)?;
     loop {
-        let Some(world_message) = process.next(&world)? else {
+        let Some(world_message) = process.neighbours.next(&mut process.membership, &world)? else {
             break;
         };
-        let Some(measurement) = process.next(&measurements)? else {
+        let Some(measurement) = process.neighbours.next(&mut process.membership, &measurements)? else {
             break;
         };
         if process.tick(&world_message, &measurement)? == Wait::Stopped {
@@ -74,7 +73,7 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
         drop((world_message, measurement));
         process.membership.consumed(header.tick + 1);
         if header.has(LAST_OF_RUN) {
-            return process.wait_for_trainers_end();
+            return process.wait_for_consumers_end();
         }
     }
     process.write_part()
@@ -83,18 +82,12 @@ pub fn run(run_file: &Path) -> Result<(), Failure> {
 struct V2xProcess {
     membership: RunMembership,
     exchange: MessageExchange,
-    neighbours: Publisher,
-    /// Delivery to the trainer; `None` in a run without one.
-    trainer: Option<Delivery>,
-    /// The other required consumers. They receive every tick at least once.
-    other_consumers: RequiredConsumers,
+    neighbours: TickPublisher,
     digest: ObservationDigest,
     load_sum: f64,
     radio_ticks: u64,
     /// The next tick.
     tick: u64,
-    /// Ticks below this are in the checkpoint: they are made again but not sent.
-    committed_ticks: u64,
 }
 
 impl V2xProcess {
@@ -107,73 +100,18 @@ impl V2xProcess {
         let mut exchange = MessageExchange::new(&membership.run.config, maps);
         let state: V2xState = membership.stored_episode_state()?.unwrap_or_default();
         exchange.set_counts(state.counts);
-        let neighbours = membership.publisher(Channel::Neighbours)?;
-        let trainer = match membership.run.mode.has_trainer() {
-            true => Some(Delivery::open(&membership, Channel::Neighbours)?),
-            false => None,
-        };
-        let required = Channel::Neighbours.required(&membership.run);
-        let others: Vec<Process> = required.filter(|process| *process != Process::Trainer).collect();
-        let other_consumers = membership.consumers(others, Channel::Neighbours)?;
+        let neighbours = TickPublisher::open(&membership, Channel::Neighbours)?;
         membership.attach();
-        let (tick, committed_ticks) = (membership.run.first_tick(), membership.run.committed_ticks());
+        let tick = membership.run.first_tick();
         Ok(Self {
             membership,
             exchange,
             neighbours,
-            trainer,
-            other_consumers,
             digest: state.digest,
             load_sum: state.load_sum,
             radio_ticks: state.radio_ticks,
             tick,
-            committed_ticks,
         })
-    }
-
-    /// The next message; meanwhile it resends what a successor of the trainer lacks. `None` once the process is asked to stop.
-    fn next(&mut self, subscriber: &Subscriber) -> Result<Option<Message>, Failure> {
-        let mut received = Ok(None);
-        loop {
-            let waited = self
-                .membership
-                .wait_until_for(Awaited::Input(subscriber.channel().producer()), || {
-                    received = subscriber.receive();
-                    !matches!(received, Ok(None)) || self.is_trainer_behind()
-                })?;
-            if let Some(message) = std::mem::replace(&mut received, Ok(None))? {
-                return Ok(Some(message));
-            }
-            if waited == Wait::Stopped {
-                return Ok(None);
-            }
-            self.catch_up()?;
-        }
-    }
-
-    fn is_trainer_behind(&self) -> bool {
-        let trainer = self.trainer.as_ref();
-        trainer.is_some_and(|trainer| trainer.is_behind(&self.other_consumers))
-    }
-
-    fn catch_up(&mut self) -> Result<(), Failure> {
-        match &mut self.trainer {
-            Some(trainer) => trainer.catch_up(&self.neighbours, &self.other_consumers),
-            None => Ok(()),
-        }
-    }
-
-    /// Waits until `condition` holds; meanwhile it resends what a successor of the trainer lacks.
-    fn wait_serving_trainer(&mut self, condition: impl Fn(&Self) -> bool) -> Result<Wait, Failure> {
-        loop {
-            self.catch_up()?;
-            let waited = self.membership.wait_until_for(Awaited::Credit(Process::Trainer), || {
-                self.is_trainer_behind() || condition(self)
-            })?;
-            if waited == Wait::Stopped || condition(self) {
-                return Ok(waited);
-            }
-        }
     }
 
     fn tick(&mut self, world: &Message, measurement: &Message) -> Result<Wait, Failure> {
@@ -192,17 +130,11 @@ impl V2xProcess {
             block::view(world.payload(), WorldLayout::of(world.header()).states).map_err(unreadable)?;
         let slots = slots_of(measurement, &self.membership.run.config).map_err(unreadable)?;
         let layout = NeighboursLayout::sized(slots.len(), self.membership.run.config.v2x.neighbours as usize);
-        if header.tick >= self.committed_ticks {
-            let since = Instant::now();
-            let waited = self.wait_serving_trainer(|process| {
-                process.trainer_takes(layout.len) && process.other_consumers.have_credit(header.tick)
-            })?;
-            if let Some(trainer) = &mut self.trainer {
-                trainer.update_handover(since);
-            }
-            if waited == Wait::Stopped {
-                return Ok(Wait::Stopped);
-            }
+        let waited = self
+            .neighbours
+            .wait_for_credit(&mut self.membership, header.tick, layout.len)?;
+        if waited == Wait::Stopped {
+            return Ok(Wait::Stopped);
         }
         self.publish(&header, &slots, states, &layout)?;
         // What is sent after the last tick of an episode arrives nowhere.
@@ -211,12 +143,6 @@ impl V2xProcess {
         }
         self.report(&header);
         Ok(Wait::Ready)
-    }
-
-    /// True if the next block, `len` bytes long, may be sent to the trainer or kept for it. True in a run without a trainer.
-    fn trainer_takes(&self, len: usize) -> bool {
-        let trainer = self.trainer.as_ref();
-        trainer.is_none_or(|trainer| trainer.may_send(&self.membership) || trainer.may_keep(len))
     }
 
     /// Writes what the stations know, adds it to the hash, and sends it or keeps it in the journal.
@@ -235,11 +161,8 @@ impl V2xProcess {
             shape: layout.shape,
             ..*header
         };
-        let header = match &self.trainer {
-            Some(trainer) => trainer.addressed(header),
-            None => header,
-        };
-        let mut draft = self.neighbours.loan(header, layout.len)?;
+        let header = self.neighbours.addressed(header);
+        let mut draft = self.neighbours.port().loan(header, layout.len)?;
         let mut sections = NeighboursSections::split(draft.payload_mut(), layout).map_err(unreadable)?;
         self.exchange.receive(&header, slots, states, &mut sections);
         let loads = sections.radio.iter().zip(sections.channel_load.iter());
@@ -252,14 +175,7 @@ impl V2xProcess {
         if header.has(LAST_OF_EPISODE) {
             self.store_state(header.tick + 1)?;
         }
-        if self.keep(&header, draft.payload())? {
-            draft.send()?;
-        }
-        if let Some(trainer) = &self.trainer {
-            trainer.wake();
-        }
-        self.other_consumers.wake();
-        Ok(())
+        self.neighbours.publish(&header, draft)
     }
 
     fn store_state(&self, tick: u64) -> Result<(), Failure> {
@@ -272,25 +188,9 @@ impl V2xProcess {
         self.membership.store_episode_state(tick, &state)
     }
 
-    /// Keeps the tick in the journal. Returns false if the trainer has no credit for it: the journal sends it later.
-    fn keep(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<bool, Failure> {
-        if header.tick < self.committed_ticks {
-            return Ok(false);
-        }
-        let Some(trainer) = &mut self.trainer else {
-            return Ok(true);
-        };
-        let is_due = trainer.may_send(&self.membership);
-        trainer.keep(*header, payload)?;
-        if is_due {
-            trainer.count_live();
-        }
-        Ok(is_due)
-    }
-
     fn report(&mut self, header: &MessageHeader) {
         self.tick = header.tick + 1;
-        let (ticks, drops) = (self.tick, self.neighbours.drops());
+        let (ticks, drops) = (self.tick, self.neighbours.port().drops());
         self.membership.report(|health| {
             health.state = State::Running as u32;
             health.ticks = ticks;
@@ -300,12 +200,11 @@ impl V2xProcess {
         });
     }
 
-    /// Waits until the trainer is done. Until then it may die, and its successor needs everything since the last commit.
-    fn wait_for_trainers_end(mut self) -> Result<(), Failure> {
-        let waited = self.wait_serving_trainer(|process| {
-            process.trainer.as_ref().is_none_or(Delivery::is_done)
-                && process.other_consumers.have_consumed(process.tick)
-        })?;
+    /// Waits until every required consumer is done.
+    fn wait_for_consumers_end(mut self) -> Result<(), Failure> {
+        let waited = self
+            .neighbours
+            .wait_for_consumers_end(&mut self.membership, self.tick, || true)?;
         self.write_part()?;
         if waited == Wait::Ready {
             self.membership.report(|health| health.state = State::Done as u32);
@@ -321,8 +220,7 @@ impl V2xProcess {
             ticks: self.tick,
             counts: self.exchange.counts(),
             mean_channel_load: mean,
-            redelivered_ticks: self.trainer.as_ref().map_or(0, Delivery::redelivered),
-            drops: self.neighbours.drops(),
+            delivery: self.neighbours.figures(),
         })
     }
 }

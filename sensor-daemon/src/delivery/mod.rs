@@ -17,6 +17,7 @@ use ipc_schema::{
 
 pub mod handover;
 pub mod journal;
+pub mod tick_publisher;
 
 use handover::{HandoverFigures, RunningHandover};
 use journal::{Journal, JournalError};
@@ -28,7 +29,10 @@ pub struct Delivery {
     board: BoardReader,
     waker: Waker,
     journal: Journal,
+    /// Ticks under way while ticks are sent again.
     window: u64,
+    /// Ticks under way otherwise.
+    live_window: u64,
     own_incarnation: u32,
     /// Ticks that an earlier incarnation of this process has made.
     sensed_before: u64,
@@ -62,6 +66,7 @@ impl Delivery {
             journal,
             // Strict lock-step has one tick under way at a time, also when ticks are sent again.
             window: if run.config.drives() { 1 } else { run.window_ticks() },
+            live_window: run.window_ticks(),
             own_incarnation: membership::incarnation(),
             sensed_before: run.restart.map_or(0, |restart| restart.sensed_ticks),
             incarnation: None,
@@ -99,11 +104,11 @@ impl Delivery {
 
     /// True if the trainer has received all earlier ticks and has credit for the live one.
     #[must_use]
-    pub fn may_send(&self, membership: &RunMembership) -> bool {
+    pub fn may_send(&self) -> bool {
         let progress = self.board.progress();
         self.incarnation == Some(progress.incarnation)
             && self.next == self.journal.ticks()
-            && flow::has_credit(self.next, &progress, membership.run.window_ticks())
+            && flow::has_credit(self.next, &progress, self.live_window)
     }
 
     /// True if the live tick may be made and kept until the trainer has credit for it: the trainer has it already, or a planned handover

@@ -365,7 +365,7 @@ fn between_demands(dt_s: f64) -> usize {
 /// Height of the rear axle above the road under the front bumper at the start of the tick, its rate, and the pitch of the road,
 /// `time_s` into the tick. The slope stands for its own sine and tangent: an error of 0.3 % at a slope of 10 %.
 #[inline(always)]
-fn road_at(rise: &RoadRise, front_m: f64, time_s: f64) -> [f64; 3] {
+pub(super) fn road_at(rise: &RoadRise, front_m: f64, time_s: f64) -> [f64; 3] {
     let [height_m, climb_mps, slope_rad, slope_rate] = rise.at(time_s);
     [
         height_m - front_m * slope_rad,

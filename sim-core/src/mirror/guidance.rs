@@ -9,18 +9,21 @@
 use ipc_schema::world::SubStep;
 
 use super::{
+    batch::road_at,
     curve::{ReferenceCurve, ReferencePoint, RoadRise},
     governor::DrivingLimits,
     hero::sub_step,
     pace::PathLimits,
     resynchronisation::ResynchronisationCause,
 };
-use crate::models::{
-    attitude::BodyLean,
-    catalogue::SizedModel,
-    state::{ModelState, SubStepMotion, rotate},
+use crate::{
+    models::{
+        attitude::BodyLean,
+        catalogue::SizedModel,
+        state::{ModelState, SubStepMotion, rotate},
+    },
+    trig::wrap_angle,
 };
-use crate::trig::wrap_angle;
 
 /// Distance from the path at which guidance begins, metres.
 const BEGIN_M: f64 = 0.6;
@@ -36,7 +39,6 @@ const END_M: f64 = 0.3;
 const LEAST_MPS: f64 = 0.3;
 /// Share of the limits that the motion at the end of guidance may need.
 const END_SHARE: f64 = 0.9;
-
 /// Rate at which a difference in heading returns, 1/s.
 const RETURN_PER_S: f64 = 2.0;
 /// Below this speed it returns by distance, m/s.
@@ -103,8 +105,8 @@ pub struct GuidedPath {
 }
 
 /// Leads a vehicle along `curve` in sub-steps of `dt_s`, with SUMO's heading at the start and its rate, and moves it `sideways` as it
-/// stands. `turned` is by how much the vehicle's heading differs from SUMO's, and the rate. Returns height of the rear axle above the road under the front bumper at the
-/// start, its rate, and the pitch of the road, at the end.
+/// stands. `turned` is by how much the vehicle's heading differs from SUMO's, and the rate. Returns, at the end, the height of the rear
+/// axle above the road under the front bumper at the start, its rate, and the pitch of the road.
 pub fn lead(
     state: &mut ModelState,
     turned: &mut [f64; 2],
@@ -119,20 +121,12 @@ pub fn lead(
     rows: &mut [SubStep],
 ) -> [f64; 3] {
     let front_m = vehicle.dimensions.front_m();
-    let road_at = |time_s: f64| {
-        let [height_m, climb_mps, slope_rad, slope_rate] = rise.at(time_s);
-        [
-            height_m - front_m * slope_rad,
-            climb_mps - front_m * slope_rate,
-            slope_rad,
-        ]
-    };
-    let mut road = road_at(0.0);
+    let mut road = road_at(rise, front_m, 0.0);
     let origin = (*state, road[0]);
     let mut states = Vec::with_capacity(rows.len());
     for (number, row) in rows.iter_mut().enumerate() {
         let time_s = (number + 1) as f64 * dt_s;
-        let road_next = road_at(time_s);
+        let road_next = road_at(rise, front_m, time_s);
         let target = curve.at(time_s);
         let pace = (target.velocity_mps[0].abs() + target.velocity_mps[1].abs()).min(RETURN_MPS) / RETURN_MPS;
         let [angle, rate] = *turned;

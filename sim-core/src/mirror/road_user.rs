@@ -389,8 +389,8 @@ impl RoadUser {
         })
     }
 
-    /// Writes the tick of a person, a hero or a guided vehicle, or of a vehicle that is set to SUMO's state in it. Returns the jump of a road user that
-    /// already existed.
+    /// Writes the tick of a person, a hero or a guided vehicle, or of a vehicle that is set to SUMO's state in it. Returns the jump of
+    /// a road user that already existed.
     pub fn write_unmoved(
         &mut self,
         tick: u32,

@@ -27,6 +27,16 @@ use rustix::{
 use serde_json::Value;
 use tempfile::TempDir;
 
+/// For nets that have no origin of their own, and without a socket.
+pub const BARE_NET_SETTINGS: [&str; 6] = [
+    "--set",
+    "map.origin_latitude_deg=52",
+    "--set",
+    "map.origin_longitude_deg=10",
+    "--set",
+    "fanout.enabled=false",
+];
+
 /// Whole runs use all cores and check shared memory, so one test runs at a time.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
