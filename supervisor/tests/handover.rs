@@ -399,10 +399,8 @@ fn a_planned_handover_changes_nothing_but_the_process() {
     assert_eq!(handovers.as_array().unwrap().len(), 2);
     for (incarnation, handover) in (1..).zip(handovers.as_array().unwrap()) {
         assert_eq!(handover["incarnation"], incarnation);
-        // The simulation continues while no trainer is attached: it waits for less than a window, and makes ticks meanwhile if there is time
-        // for any.
+        // The simulation continues while no trainer is attached, if there is time for a window of ticks.
         let figure = |key: &str| handover[key].as_f64().unwrap_or_else(|| panic!("{key}: {handovers:#}"));
-        assert!(figure("stall_ticks") <= 8.0, "{handovers:#}");
         assert!(
             figure("ticks_without_trainer") > 0.0 || figure("pause_s") * PACED_TICKS_PER_S < 8.0,
             "{handovers:#}"
@@ -496,26 +494,37 @@ fn commits(run: &Path) -> Vec<(String, u64)> {
     log["commits"].as_array().unwrap().iter().map(entry).collect()
 }
 
-/// Hands the paused run over to `module`, and lets it learn until it has committed ticks of its own.
+/// Hands the paused run over to `module`, and makes ticks until it has committed some of its own. The run stays paused.
 fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, module: &str) {
-    let done = |arguments: &[&str]| {
-        let output = workplace.run(arguments);
-        assert!(output.status.success(), "{arguments:?}: {}", text(&output));
-    };
-    done(&["control", "pause", "--run", name]);
-    done(&["handover", name, "--set", &format!("trainer.module={module}")]);
+    control(workplace, name, &["pause"]);
+    let output = workplace.run(&["handover", name, "--set", &format!("trainer.module={module}")]);
+    assert!(output.status.success(), "{module}: {}", text(&output));
     let taken_over = run.trainer.progress().committed_ticks;
-    done(&["control", "resume", "--run", name]);
-    run.until("a commit of its own", |progress, _| {
+    let has_committed = |trainer: &BoardReader| {
+        let progress = trainer.progress();
         progress.incarnation == incarnation && progress.committed_ticks > taken_over
-    });
+    };
+    while !has_committed(&run.trainer) {
+        let ticks = run.sensing.health().ticks + 40;
+        control(workplace, name, &["step", "40"]);
+        let Run {
+            child, trainer, sensing, ..
+        } = &mut *run;
+        until(child, "a commit of its own", || {
+            (has_committed(trainer) || sensing.health().ticks >= ticks).then_some(())
+        });
+    }
+}
+
+fn control(workplace: &Workplace, name: &str, command: &[&str]) {
+    let output = workplace.run(&[&["control"], command, &["--run", name]].concat());
+    assert!(output.status.success(), "{command:?}: {}", text(&output));
 }
 
 #[test]
 fn learners_take_turns_and_every_tick_is_in_one_commit() {
     let workplace = Workplace::new();
-    // Five learners need time to load and to fill a horizon each, also on a machine with other work.
-    let mut run = Run::start(&workplace, "turns", &["run.real_time_factor=8"]);
+    let mut run = Run::start(&workplace, "turns", &[PACED]);
     run.until("a first checkpoint", |progress, _| progress.committed_ticks > 0);
     let modules = [
         "caraware.examples.sb3_takeover",
@@ -526,6 +535,7 @@ fn learners_take_turns_and_every_tick_is_in_one_commit() {
     for (incarnation, module) in (1..).zip(modules) {
         hand_to(&workplace, &mut run, "turns", incarnation, module);
     }
+    control(&workplace, "turns", &["resume"]);
     let directory = run.directory.clone();
     let (code, said) = run.end();
     assert_eq!(code, Some(0), "{said}");
