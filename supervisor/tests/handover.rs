@@ -508,7 +508,10 @@ fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, m
         let ticks = run.sensing.health().ticks + 40;
         control(workplace, name, &["step", "40"]);
         let Run {
-            child, trainer, sensing, ..
+            child,
+            trainer,
+            sensing,
+            ..
         } = &mut *run;
         until(child, "a commit of its own", || {
             (has_committed(trainer) || sensing.health().ticks >= ticks).then_some(())

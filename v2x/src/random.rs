@@ -13,16 +13,14 @@ pub enum RadioDraw {
     Phase = 129,
     /// Slots that a station waits after a busy channel.
     Backoff = 130,
-    /// Fast fading of a message at a receiver.
-    Fading = 131,
-    /// Whether a message of a given signal is decoded.
-    Decoding = 132,
     /// Loss of a link behind a vehicle.
     Blocking = 133,
     /// Waves of the field of shadowing.
     Shadowing = 134,
     /// Error of a perceived object.
     Perception = 135,
+    /// Reception of a message: three numbers for its fast fading, and one for whether it is decoded. 131 and 132 were these two.
+    Reception = 136,
 }
 
 /// Random numbers of an episode.
@@ -89,25 +87,25 @@ mod tests {
             receiver: 2,
             message: 3,
         };
-        let reference = RadioRandom::new(7).words(link, RadioDraw::Fading, 0);
+        let reference = RadioRandom::new(7).words(link, RadioDraw::Reception, 0);
         let others = [
-            RadioRandom::new(8).words(link, RadioDraw::Fading, 0),
-            RadioRandom::new(7 << 32).words(link, RadioDraw::Fading, 0),
+            RadioRandom::new(8).words(link, RadioDraw::Reception, 0),
+            RadioRandom::new(7 << 32).words(link, RadioDraw::Reception, 0),
             RadioRandom::new(7).words(
                 LinkKey {
                     sender: 2,
                     receiver: 1,
                     ..link
                 },
-                RadioDraw::Fading,
+                RadioDraw::Reception,
                 0,
             ),
-            RadioRandom::new(7).words(LinkKey { message: 4, ..link }, RadioDraw::Fading, 0),
-            RadioRandom::new(7).words(link, RadioDraw::Decoding, 0),
-            RadioRandom::new(7).words(link, RadioDraw::Fading, 1),
+            RadioRandom::new(7).words(LinkKey { message: 4, ..link }, RadioDraw::Reception, 0),
+            RadioRandom::new(7).words(link, RadioDraw::Backoff, 0),
+            RadioRandom::new(7).words(link, RadioDraw::Reception, 1),
         ];
         assert!(others.iter().all(|other| *other != reference));
-        assert_eq!(RadioRandom::new(7).words(link, RadioDraw::Fading, 0), reference);
+        assert_eq!(RadioRandom::new(7).words(link, RadioDraw::Reception, 0), reference);
     }
 
     #[test]

@@ -147,14 +147,17 @@ impl Grid {
         }
     }
 
+    /// Visits the things of each cell that `bounds` meets. A thing in several cells comes several times.
+    pub fn visit_near(&self, bounds: &Bounds, visit: impl FnMut(&[u32])) {
+        if !self.starts.is_empty() {
+            self.cells(bounds).map(|cell| self.cell(cell)).for_each(visit);
+        }
+    }
+
     /// Things whose bounds may meet `bounds`, into `found` (emptied first), each once.
     pub fn near(&self, bounds: &Bounds, found: &mut Vec<u32>) {
         found.clear();
-        if self.starts.is_empty() {
-            return;
-        }
-        self.cells(bounds)
-            .for_each(|cell| found.extend_from_slice(self.cell(cell)));
+        self.visit_near(bounds, |cell| found.extend_from_slice(cell));
         found.sort_unstable();
         found.dedup();
     }

@@ -1,7 +1,5 @@
 //! Fast fading of a received message: Nakagami's distribution of the amplitude.
 
-use crate::random::{LinkKey, RadioDraw, RadioRandom};
-
 /// Twice the shape m of the distribution by distance: 3 up to 50 m, 1.5 up to 150 m, 1 (Rayleigh's) beyond (Cheng et al., "Mobile
 /// vehicle-to-vehicle narrow-band channel measurement and characterization of the 5.9 GHz DSRC frequency band", JSAC 2007, in the steps of
 /// Torrent-Moreno et al., MSWiM 2006).
@@ -14,44 +12,41 @@ pub fn twice_shape(distance_m: f64) -> u32 {
     }
 }
 
-/// Most values of [`twice_shape`].
-const MOST_HALVES: u32 = 6;
-
-/// Power of a message at a receiver as a share of its mean. The square of Nakagami's amplitude has a gamma distribution of shape m and
-/// mean 1: a sum of 2m squared normal numbers.
+/// Power of a message at a receiver as a share of its mean, from four numbers uniform in (0, 1), of which it leaves the last one. The
+/// square of Nakagami's amplitude has a gamma distribution of shape m and mean 1: a sum of 2m squared normal numbers.
 #[must_use]
-pub fn power_gain(random: &RadioRandom, link: LinkKey, twice_shape: u32) -> f64 {
-    let halves = twice_shape.clamp(1, MOST_HALVES);
-    let [a, b, c, d] = random.uniforms(link, RadioDraw::Fading, 0);
-    // Two squared normal numbers are an exponential one: −2 ln u.
-    let pairs = (halves / 2) as usize;
-    let product: f64 = [a, b, c].iter().take(pairs).product();
-    let mut sum = -2.0 * libm::log(product);
-    if halves % 2 == 1 {
-        // The one that is left, by the Box–Muller transform. Pairs below three use neither `c` nor `d`.
-        let cos = libm::cos(std::f64::consts::TAU * d);
-        sum += -2.0 * libm::log(if pairs < 3 { c } else { 1.0 }) * cos * cos;
+pub fn power_gain([a, b, c, _]: [f64; 4], twice_shape: u32) -> f64 {
+    // Two squared normal numbers are an exponential one: −2 ln u. One is that times a squared cosine, by the Box–Muller transform.
+    match twice_shape {
+        6 => -libm::log(a * b * c) / 3.0,
+        3 => {
+            let cos = libm::cos(std::f64::consts::TAU * c);
+            -2.0 * (libm::log(a) + libm::log(b) * cos * cos) / 3.0
+        }
+        _ => -libm::log(a),
     }
-    sum / f64::from(halves)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::{LinkKey, RadioDraw, RadioRandom};
+
+    fn gain(random: &RadioRandom, message: u32, twice_shape: u32) -> f64 {
+        let link = LinkKey {
+            sender: 1,
+            receiver: 2,
+            message,
+        };
+        power_gain(random.uniforms(link, RadioDraw::Reception, 0), twice_shape)
+    }
 
     #[test]
     fn the_power_has_the_moments_of_its_gamma_distribution() {
         const N: u32 = 200_000;
         let random = RadioRandom::new(5);
-        for halves in [1, 2, 3, 5, 6] {
-            let draw = |message| {
-                let link = LinkKey {
-                    sender: 1,
-                    receiver: 2,
-                    message,
-                };
-                power_gain(&random, link, halves)
-            };
+        for halves in [2, 3, 6] {
+            let draw = |message| gain(&random, message, halves);
             let (n, shape) = (f64::from(N), f64::from(halves) / 2.0);
             let mean = (0..N).map(draw).sum::<f64>() / n;
             let variance = (0..N).map(|i| (draw(i) - mean).powi(2)).sum::<f64>() / n;
@@ -70,14 +65,7 @@ mod tests {
         const N: u32 = 100_000;
         let random = RadioRandom::new(6);
         for threshold in [0.1, 0.5, 1.0, 2.0, 5.0] {
-            let above = (0..N).filter(|message| {
-                let link = LinkKey {
-                    sender: 3,
-                    receiver: 4,
-                    message: *message,
-                };
-                power_gain(&random, link, twice_shape(200.0)) > threshold
-            });
+            let above = (0..N).filter(|message| gain(&random, *message, twice_shape(200.0)) > threshold);
             let (share, n) = (libm::exp(-threshold), f64::from(N));
             let found = above.count() as f64 / n;
             assert!(

@@ -4,7 +4,9 @@
 use std::{cmp::Reverse, collections::BinaryHeap};
 
 use super::{
-    dbm, milliwatts,
+    dbm,
+    fading::power_gain,
+    milliwatts,
     reception::{air_time_s, decode_probability},
 };
 use crate::random::{LinkKey, RadioDraw, RadioRandom};
@@ -46,6 +48,17 @@ pub struct MediumLink {
     pub twice_shape: u32,
 }
 
+impl MediumLink {
+    /// Power of one message, whose draws these are, milliwatts.
+    fn faded_mw(&self, draws: [f64; 4]) -> f64 {
+        let gain = match self.twice_shape {
+            0 => 1.0,
+            halves => power_gain(draws, halves),
+        };
+        f64::from(self.power_mw) * gain
+    }
+}
+
 /// A message on air.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Transmission {
@@ -80,6 +93,8 @@ pub struct Medium {
 pub struct Schedule {
     /// Transmissions by their beginning.
     pub on_air: Vec<Transmission>,
+    /// Longest air time of a message that waits to be sent, nanoseconds.
+    pub longest_ns: u64,
     /// Messages that found no time to be sent.
     pub dropped: u32,
 }
@@ -105,6 +120,26 @@ fn link_to(links: &[MediumLink], radio: u32) -> Option<&MediumLink> {
         .map(|place| &links[place])
 }
 
+impl Schedule {
+    /// Transmissions that overlap with the one of this number, without it.
+    fn overlapping(&self, number: usize) -> impl Iterator<Item = &Transmission> {
+        let sent = self.on_air[number];
+        let from = self
+            .on_air
+            .partition_point(|other| other.start_ns + self.longest_ns <= sent.start_ns);
+        let others = self.on_air[from..].iter().enumerate();
+        others
+            .take_while(move |(_, other)| other.start_ns < sent.end_ns)
+            .filter(move |(place, other)| from + place != number && sent.overlap_ns(other) > 0)
+            .map(|(_, other)| other)
+    }
+}
+
+/// Time on air of a frame, nanoseconds.
+fn air_time_ns(bytes: u32) -> u64 {
+    (air_time_s(bytes as usize) * 1e9) as u64
+}
+
 impl Medium {
     /// The channel of receivers with a noise figure, which find it busy from a power on.
     #[must_use]
@@ -125,7 +160,14 @@ impl Medium {
     /// When each message is sent. `links[radio]` are the links of each radio that has a message, ascending by receiver.
     #[must_use]
     pub fn schedule(&self, queue: &[QueuedMessage], links: &[Vec<MediumLink>], random: &RadioRandom) -> Schedule {
-        let mut schedule = Schedule::default();
+        let mut schedule = Schedule {
+            longest_ns: queue
+                .iter()
+                .map(|message| air_time_ns(message.bytes))
+                .max()
+                .unwrap_or(0),
+            ..Schedule::default()
+        };
         // Attempts in the order of their time; at the same time in the order of the queue.
         let mut attempts: BinaryHeap<Reverse<(u64, usize, u32)>> = queue
             .iter()
@@ -136,7 +178,7 @@ impl Medium {
         let mut heard_from = 0;
         while let Some(Reverse((now_ns, place, attempt))) = attempts.pop() {
             let message = &queue[place];
-            let air_ns = (air_time_s(message.bytes as usize) * 1e9) as u64;
+            let air_ns = air_time_ns(message.bytes);
             if now_ns + air_ns > self.tick_ns {
                 schedule.dropped += 1;
                 continue;
@@ -144,7 +186,7 @@ impl Medium {
             while schedule
                 .on_air
                 .get(heard_from)
-                .is_some_and(|sent| sent.end_ns + AIFS_NS + self.longest_ns() < now_ns)
+                .is_some_and(|sent| sent.end_ns + AIFS_NS <= now_ns)
             {
                 heard_from += 1;
             }
@@ -184,11 +226,6 @@ impl Medium {
         schedule
     }
 
-    /// Longest air time that is looked back for, nanoseconds: 1500 bytes.
-    fn longest_ns(&self) -> u64 {
-        (air_time_s(1500) * 1e9) as u64
-    }
-
     /// Indices of the radios that decode transmission `number`, ascending, into `decoded`.
     pub fn receivers(&self, number: usize, on_air: &OnAir, random: &RadioRandom, decoded: &mut Vec<u32>) {
         let OnAir {
@@ -199,54 +236,37 @@ impl Medium {
         } = on_air;
         let sent = &schedule.on_air[number];
         let message = &queue[sent.queued];
-        let overlapping: Vec<&Transmission> = schedule
-            .on_air
-            .iter()
-            .enumerate()
-            .filter(|(other, overlapping)| *other != number && sent.overlap_ns(overlapping) > 0)
-            .map(|(_, overlapping)| overlapping)
-            .collect();
+        let overlapping: Vec<&Transmission> = schedule.overlapping(number).collect();
         decoded.clear();
         for link in &links[message.radio as usize] {
             // A radio cannot hear while it sends.
             if overlapping.iter().any(|other| queue[other.queued].radio == link.radio) {
                 continue;
             }
-            let receiver = stations[link.radio as usize];
-            let power_mw = |link: &MediumLink, message: &QueuedMessage| {
+            let draws = |message: &QueuedMessage| {
                 let key = LinkKey {
                     sender: message.station,
-                    receiver,
+                    receiver: stations[link.radio as usize],
                     message: message.message,
                 };
-                let gain = match link.twice_shape {
-                    0 => 1.0,
-                    halves => super::fading::power_gain(random, key, halves),
-                };
-                f64::from(link.power_mw) * gain
+                random.uniforms(key, RadioDraw::Reception, 0)
             };
-            let signal_mw = power_mw(link, message);
-            let key = LinkKey {
-                sender: message.station,
-                receiver,
-                message: message.message,
-            };
-            let drawn = random.uniforms(key, RadioDraw::Decoding, 0)[0];
+            let drawn = draws(message);
+            let (signal_mw, bytes) = (link.faded_mw(drawn), message.bytes as usize);
             // Most links are too weak even without a disturbance, which is dearer to compute.
-            let bytes = message.bytes as usize;
-            if drawn >= decode_probability(signal_mw / self.noise_mw, bytes) {
+            if drawn[3] >= decode_probability(signal_mw / self.noise_mw, bytes) {
                 continue;
             }
             let (mut disturbance_mw, mut disturbed_ns) = (0.0, 0);
             for other in &overlapping {
                 let disturbing = &queue[other.queued];
                 if let Some(disturber) = link_to(&links[disturbing.radio as usize], link.radio) {
-                    disturbance_mw += power_mw(disturber, disturbing);
+                    disturbance_mw += disturber.faded_mw(draws(disturbing));
                     disturbed_ns += sent.overlap_ns(other);
                 }
             }
             let share = disturbed_ns as f64 / (sent.end_ns - sent.start_ns) as f64;
-            if drawn < self.decodes(signal_mw, disturbance_mw, share.min(1.0), bytes) {
+            if drawn[3] < self.decodes(signal_mw, disturbance_mw, share.min(1.0), bytes) {
                 decoded.push(link.radio);
             }
         }
@@ -429,6 +449,7 @@ mod tests {
                 start_ns: 0,
                 end_ns: AIR_NS,
             }],
+            longest_ns: AIR_NS,
             dropped: 0,
         };
         for (mean_snr_db, halves) in [(3.0, 2), (6.0, 2), (12.0, 2), (5.0, 6), (4.5, 0)] {

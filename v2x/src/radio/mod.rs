@@ -1,6 +1,7 @@
 //! The radio channel: loss of a link, fading, noise and interference, air time, and which stations send when.
 
 pub mod fading;
+pub mod links;
 pub mod medium;
 pub mod obstruction;
 pub mod path_loss;
@@ -15,7 +16,7 @@ pub const BANDWIDTH_HZ: f64 = 10e6;
 /// Milliwatts of a power in dBm.
 #[must_use]
 pub fn milliwatts(power_dbm: f64) -> f64 {
-    libm::exp10(power_dbm / 10.0)
+    libm::exp(power_dbm * (std::f64::consts::LN_10 / 10.0))
 }
 
 /// Power in dBm of milliwatts.

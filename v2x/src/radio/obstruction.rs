@@ -97,18 +97,23 @@ impl Obstacles {
     /// What is between two antennas.
     #[must_use]
     pub fn between(&self, a: &Antenna, b: &Antenna) -> LinkObstruction {
-        let clear = LinkObstruction {
-            state: LinkState::Clear,
-            above: [true; 2],
-        };
-        if self.meets_building(a, b) {
-            return LinkObstruction {
+        match self.building_between(a, b) {
+            Some(_) => LinkObstruction {
                 state: LinkState::Building,
-                ..clear
-            };
+                above: [true; 2],
+            },
+            None => self.vehicles_between(a, b),
         }
+    }
+
+    /// What is between two antennas that no building obstructs.
+    #[must_use]
+    pub fn vehicles_between(&self, a: &Antenna, b: &Antenna) -> LinkObstruction {
         match self.highest_vehicle_m(a, b) {
-            None => clear,
+            None => LinkObstruction {
+                state: LinkState::Clear,
+                above: [true; 2],
+            },
             Some(top_m) => LinkObstruction {
                 state: LinkState::Vehicles,
                 above: [a.z_m > top_m, b.z_m > top_m],
@@ -119,26 +124,36 @@ impl Obstacles {
     /// True if a building meets the line between two antennas.
     #[must_use]
     pub fn meets_building(&self, a: &Antenna, b: &Antenna) -> bool {
-        let line = Bounds::of([a.position_m, b.position_m]);
-        let mut is_met = false;
-        let way = from_to(a.position_m, b.position_m);
+        self.building_between(a, b).is_some()
+    }
+
+    /// The number of a building that meets the line between two antennas.
+    #[must_use]
+    pub fn building_between(&self, a: &Antenna, b: &Antenna) -> Option<u32> {
+        let mut met = None;
         self.buildings.along(a.position_m, b.position_m, |found| {
-            is_met = found.iter().any(|number| {
-                let building = &self.scene.buildings()[*number as usize];
-                let roof_m = building.z_m()[1];
-                building.bounds.meets(&line)
-                    && edges(&building.outline_m).any(|(from, to)| {
-                        let share = share_of_crossing(a.position_m, way, from, to);
-                        share.is_some_and(|share| a.z_m + share * (b.z_m - a.z_m) < roof_m)
-                    })
-            });
-            if is_met {
-                ControlFlow::Break(())
-            } else {
-                ControlFlow::Continue(())
+            met = found.iter().copied().find(|number| self.building_meets(*number, a, b));
+            match met {
+                Some(_) => ControlFlow::Break(()),
+                None => ControlFlow::Continue(()),
             }
         });
-        is_met
+        met
+    }
+
+    /// True if the building of this number meets the line between two antennas.
+    #[must_use]
+    pub fn building_meets(&self, number: u32, a: &Antenna, b: &Antenna) -> bool {
+        let Some(building) = self.scene.buildings().get(number as usize) else {
+            return false;
+        };
+        let way = from_to(a.position_m, b.position_m);
+        let roof_m = building.z_m()[1];
+        building.bounds.meets(&Bounds::of([a.position_m, b.position_m]))
+            && edges(&building.outline_m).any(|(from, to)| {
+                let share = share_of_crossing(a.position_m, way, from, to);
+                share.is_some_and(|share| a.z_m + share * (b.z_m - a.z_m) < roof_m)
+            })
     }
 
     /// Top of the highest road user that meets the line between two antennas, metres. Those that carry the antennas do not count.

@@ -2,8 +2,6 @@
 
 use ipc_schema::config::V2xPathLoss;
 
-use super::CARRIER_GHZ;
-
 /// What is between two antennas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum LinkState {
@@ -15,6 +13,8 @@ pub enum LinkState {
     Building,
 }
 
+/// Logarithm of the carrier frequency in GHz to base 10.
+const LOG_CARRIER: f64 = 0.770_852_011_642_144_2;
 /// Least distance of the formulas, metres.
 const NEAREST_M: f64 = 1.0;
 
@@ -22,7 +22,7 @@ const NEAREST_M: f64 = 1.0;
 #[must_use]
 pub fn path_loss_db(formulas: V2xPathLoss, state: LinkState, distance_m: f64) -> f64 {
     let log_d = libm::log10(distance_m.max(NEAREST_M));
-    let log_f = libm::log10(CARRIER_GHZ);
+    let log_f = LOG_CARRIER;
     match (state, formulas) {
         (LinkState::Building, _) => 36.85 + 30.0 * log_d + 18.9 * log_f,
         (_, V2xPathLoss::Urban) => 38.77 + 16.7 * log_d + 18.2 * log_f,
@@ -72,6 +72,11 @@ mod tests {
         [100.0, 87.817_040_232_843, 86.199_506_611_887, 111.419_103_020_037],
         [433.25, 100.551_811_660_562, 96.833_040_754_032, 130.521_260_161_615],
     ];
+
+    #[test]
+    fn the_carrier_has_its_logarithm() {
+        assert!((libm::log10(crate::radio::CARRIER_GHZ) - LOG_CARRIER).abs() < 1e-15);
+    }
 
     #[test]
     fn it_is_the_formulas_of_tr_37_885() {

@@ -9,8 +9,11 @@ use sensor_daemon::noise::normals::cos_sin;
 
 use crate::random::{LinkKey, RadioDraw, RadioRandom};
 
-/// Waves in the sum. The kurtosis is 3 − 1.5 / waves.
+/// Waves in the sum, a multiple of [`LANES`]. The kurtosis is 3 − 1.5 / waves.
 const WAVES: usize = 48;
+
+/// Values of the waves that are added at once. The order of the sum is the same on every machine.
+const LANES: usize = 8;
 
 #[derive(Debug, Clone, Copy)]
 struct ShadowWave {
@@ -24,6 +27,14 @@ struct ShadowWave {
 #[derive(Debug, Clone)]
 pub struct ShadowingField {
     waves: Vec<ShadowWave>,
+}
+
+/// Cosine and sine of every wave at one end of a link. The phase of a wave at a link is the sum of its phases at both ends, so a link
+/// needs no trigonometry of its own.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ShadowingEnd {
+    cos: [f32; WAVES],
+    sin: [f32; WAVES],
 }
 
 impl ShadowingField {
@@ -47,20 +58,65 @@ impl ShadowingField {
         Self { waves: waves.collect() }
     }
 
+    /// The waves at the first end of a link, at a position in metres.
+    #[must_use]
+    pub fn first_end(&self, position_m: [f64; 2], decorrelation_m: f64) -> ShadowingEnd {
+        self.end(position_m, decorrelation_m, |wave| {
+            ([wave.turns[0], wave.turns[1]], wave.phase)
+        })
+    }
+
+    /// The waves at the second end of a link, at a position in metres.
+    #[must_use]
+    pub fn second_end(&self, position_m: [f64; 2], decorrelation_m: f64) -> ShadowingEnd {
+        self.end(position_m, decorrelation_m, |wave| {
+            ([wave.turns[2], wave.turns[3]], 0.0)
+        })
+    }
+
+    fn end(
+        &self,
+        position_m: [f64; 2],
+        decorrelation_m: f64,
+        of: impl Fn(&ShadowWave) -> ([f64; 2], f64),
+    ) -> ShadowingEnd {
+        let [x, y] = position_m.map(|value| value / decorrelation_m);
+        let mut end = ShadowingEnd {
+            cos: [0.0; WAVES],
+            sin: [0.0; WAVES],
+        };
+        for (place, wave) in self.waves.iter().enumerate() {
+            let ([kx, ky], phase) = of(wave);
+            let turns = phase + kx * x + ky * y;
+            // The fraction of a turn in 32 bits.
+            let angle = ((turns - libm::floor(turns)) * 4_294_967_296.0) as u32;
+            (end.cos[place], end.sin[place]) = cos_sin(angle);
+        }
+        end
+    }
+
     /// A standard normal number for a link between two positions, in metres; the same in both directions if `a` is always the same end.
     #[must_use]
     pub fn normal(&self, a: [f64; 2], b: [f64; 2], decorrelation_m: f64) -> f64 {
-        let scale = 1.0 / decorrelation_m;
-        let [xa, ya, xb, yb] = [a[0] * scale, a[1] * scale, b[0] * scale, b[1] * scale];
-        let mut sum = 0.0;
-        for wave in &self.waves {
-            let [ka, la, kb, lb] = wave.turns;
-            let turns = wave.phase + ka * xa + la * ya + kb * xb + lb * yb;
-            // The fraction of a turn in 32 bits.
-            let angle = ((turns - turns.floor()) * 4_294_967_296.0) as u32;
-            sum += f64::from(cos_sin(angle).0);
+        self.first_end(a, decorrelation_m)
+            .normal(&self.second_end(b, decorrelation_m))
+    }
+}
+
+impl ShadowingEnd {
+    /// A standard normal number for the link from this first end to a second one.
+    #[must_use]
+    pub fn normal(&self, second: &Self) -> f64 {
+        let mut sums = [0.0_f32; LANES];
+        for from in (0..WAVES).step_by(LANES) {
+            for (lane, sum) in sums.iter_mut().enumerate() {
+                let at = from + lane;
+                // The cosine of the sum of both phases.
+                *sum += self.cos[at] * second.cos[at] - self.sin[at] * second.sin[at];
+            }
         }
-        sum * (2.0 / WAVES as f64).sqrt()
+        let sum: f32 = sums.iter().sum();
+        f64::from(sum) * (2.0 / WAVES as f64).sqrt()
     }
 }
 
@@ -110,6 +166,25 @@ mod tests {
                 (found - expected).abs() < error,
                 "{apart} m: {found} for {expected} ± {error}"
             );
+        }
+    }
+
+    #[test]
+    fn the_ends_of_a_link_give_the_sum_of_its_waves() {
+        let field = ShadowingField::new(&RadioRandom::new(3));
+        for place in 0..200 {
+            let place = f64::from(place);
+            let (a, b) = ([17.3 * place, -400.0 + 3.1 * place], [5000.0 - 9.0 * place, 77.7]);
+            let turns = |wave: &ShadowWave| {
+                let [ka, la, kb, lb] = wave.turns;
+                wave.phase + (ka * a[0] + la * a[1] + kb * b[0] + lb * b[1]) / 13.0
+            };
+            let waves = field
+                .waves
+                .iter()
+                .map(|wave| libm::cos(std::f64::consts::TAU * turns(wave)));
+            let sum = waves.sum::<f64>() * (2.0 / WAVES as f64).sqrt();
+            assert!((field.normal(a, b, 13.0) - sum).abs() < 1e-5);
         }
     }
 

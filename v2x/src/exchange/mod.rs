@@ -1,0 +1,473 @@
+//! One tick of messages: what has arrived goes into the stations' maps, the maps into `neighbours`, and what is due goes on air.
+//!
+//! A message is made from what its station measured at a tick. It is sent and received before the next tick, whose `neighbours` show it.
+
+use std::{ops::Range, sync::Arc};
+
+use ipc_schema::{
+    config::{Config, V2xConfig},
+    header::{FIRST_OF_EPISODE, MessageHeader},
+    neighbours::{NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
+    observation::EMPTY_SLOT,
+    traffic::Kind,
+    world::VehicleState,
+};
+use serde::{Deserialize, Serialize};
+use sim_core::{geodesy::Projection, scene::Scene};
+
+use crate::{
+    local_map::{HeardObjects, KnownObject, LocalMap},
+    message::{
+        cam::Cam,
+        cpm::Cpm,
+        geonetworking::{self, BtpPort},
+    },
+    parallel,
+    radio::{
+        links::{LinkComputer, Radio, RadioTick},
+        medium::{Medium, MediumLink, OnAir, QueuedMessage, Schedule},
+        noise_dbm,
+        obstruction::{Antenna, Obstacles},
+    },
+    random::{LinkKey, RadioDraw, RadioRandom},
+    services::{cam::CamService, congestion::CongestionControl, cpm::CpmService},
+    station::{
+        OwnMeasurement, PerceptionSpec, SensorDeviations, Station, VehicleSize, object_of_cam, objects_of_cpm,
+        station_id,
+    },
+};
+
+mod outgoing;
+mod perception;
+
+use outgoing::{OutgoingMessage, SendingService, StationTick, outgoing};
+
+/// Height of an antenna above the roof, metres.
+const ANTENNA_M: f64 = 0.1;
+/// A slot as it is measured at a tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SlotMeasurement {
+    /// Dense index of its vehicle, or [`EMPTY_SLOT`].
+    pub vehicle: u32,
+    /// Hash of its vehicle's SUMO id.
+    pub id_hash: u64,
+    /// Ticks since the vehicle took the slot.
+    pub episode_step: u32,
+    /// What it measures; `None` before its receiver has delivered a fix.
+    pub own: Option<OwnMeasurement>,
+}
+
+/// Counts of a run.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ExchangeCounts {
+    /// Cooperative awareness messages sent.
+    pub cams: u64,
+    /// Collective perception messages sent.
+    pub cpms: u64,
+    /// Bytes of them, headers included.
+    pub bytes: u64,
+    /// Messages that found no time to be sent.
+    pub dropped: u64,
+    /// Links computed.
+    pub links: u64,
+    /// Receptions, one for each message and receiver.
+    pub received: u64,
+}
+
+/// A message as its receivers read it.
+#[derive(Debug, Clone)]
+struct HeardMessage {
+    /// Slot of its sender.
+    sender: usize,
+    /// Numbers of its objects among all that was heard.
+    objects: Range<u64>,
+}
+
+/// What a slot's radio did in the tick before.
+#[derive(Debug, Clone, Copy, Default)]
+struct RadioActivity {
+    sent: u32,
+    bytes: u32,
+    received: u32,
+    load: f32,
+}
+
+/// A map of the run.
+struct ExchangeMap {
+    obstacles: Obstacles,
+    projection: Projection,
+}
+
+/// The messages of a run.
+pub struct MessageExchange {
+    config: V2xConfig,
+    deviations: SensorDeviations,
+    perception: PerceptionSpec,
+    medium: Medium,
+    maps: Vec<ExchangeMap>,
+    /// Index of the map of the episode.
+    at: usize,
+    random: RadioRandom,
+    links: LinkComputer,
+    /// By slot.
+    stations: Vec<Option<Station>>,
+    activity: Vec<RadioActivity>,
+    /// Objects of the messages that maps may refer to.
+    objects: HeardObjects,
+    /// Messages of the tick before.
+    heard: Vec<HeardMessage>,
+    /// By slot: the messages that it received in the tick before.
+    inbox: Vec<Vec<u32>>,
+    /// Row in the world of each slot's vehicle.
+    rows: Vec<Option<u32>>,
+    counts: ExchangeCounts,
+}
+
+impl MessageExchange {
+    /// The messages of a run with this configuration, on its maps.
+    #[must_use]
+    pub fn new(config: &Config, maps: Vec<(Arc<Scene>, Projection)>) -> Self {
+        let v2x = config.v2x.clone();
+        let random = RadioRandom::new(0);
+        let medium = Medium::new(
+            noise_dbm(v2x.noise_figure_db),
+            v2x.carrier_sense_dbm,
+            (config.run.tick_s * 1e9).round() as u64,
+        );
+        Self {
+            deviations: SensorDeviations::new(config),
+            perception: PerceptionSpec {
+                range_m: v2x.perception_range_m,
+                position_std_m: v2x.perception_position_std_m,
+                speed_std_mps: v2x.perception_speed_std_mps,
+            },
+            maps: maps
+                .into_iter()
+                .map(|(scene, projection)| ExchangeMap {
+                    obstacles: Obstacles::new(scene),
+                    projection,
+                })
+                .collect(),
+            at: 0,
+            links: LinkComputer::new(&v2x, &medium, random),
+            medium,
+            random,
+            stations: Vec::new(),
+            activity: Vec::new(),
+            objects: HeardObjects::default(),
+            heard: Vec::new(),
+            inbox: Vec::new(),
+            rows: Vec::new(),
+            counts: ExchangeCounts::default(),
+            config: v2x,
+        }
+    }
+
+    /// Counts so far.
+    #[must_use]
+    pub fn counts(&self) -> ExchangeCounts {
+        self.counts
+    }
+
+    /// Continues counting.
+    pub fn set_counts(&mut self, counts: ExchangeCounts) {
+        self.counts = counts;
+    }
+
+    /// Slots of the senders of the messages of the last [`MessageExchange::send`], by the beginning of the message.
+    pub fn senders(&self) -> impl Iterator<Item = usize> {
+        self.heard.iter().map(|message| message.sender)
+    }
+
+    /// Places among [`MessageExchange::senders`] of the messages that a slot has received, ascending.
+    #[must_use]
+    pub fn received_by(&self, slot: usize) -> &[u32] {
+        self.inbox.get(slot).map_or(&[], Vec::as_slice)
+    }
+
+    /// What a slot's radio knows; `None` for an empty slot.
+    #[must_use]
+    pub fn map_of(&self, slot: usize) -> Option<&LocalMap> {
+        self.stations.get(slot)?.as_ref().map(|station| &station.map)
+    }
+
+    /// Takes the slots of a tick and what has arrived since the tick before, and writes `neighbours` into zeroed sections.
+    pub fn receive(
+        &mut self,
+        header: &MessageHeader,
+        slots: &[SlotMeasurement],
+        states: &[VehicleState],
+        out: &mut NeighboursSections,
+    ) {
+        if header.has(FIRST_OF_EPISODE) {
+            self.begin_episode(header);
+        }
+        self.take_slots(slots, states);
+        let now_ms = (header.sim_time_ns / 1_000_000) as i64;
+        let lifetime_ms = (self.config.object_lifetime_s * 1000.0) as i64;
+        let (objects, heard, inbox) = (&self.objects, &self.heard, &self.inbox);
+        parallel::for_each(self.config.threads as usize, &mut self.stations, |slot, station| {
+            let Some(station) = station else { return };
+            for message in inbox.get(slot).into_iter().flatten() {
+                station.map.insert(objects, heard[*message as usize].objects.clone());
+            }
+            station.map.forget(now_ms, lifetime_ms);
+        });
+        self.objects.advance(now_ms, lifetime_ms);
+        for (station, activity) in self.stations.iter_mut().zip(&self.activity) {
+            if let Some(station) = station {
+                station.congestion.measure(header.sim_time_ns, activity.load.into());
+            }
+        }
+        self.write(slots, states, now_ms, out);
+    }
+
+    fn begin_episode(&mut self, header: &MessageHeader) {
+        self.random = RadioRandom::new(header.episode_seed);
+        self.links = LinkComputer::new(&self.config, &self.medium, self.random);
+        self.at = usize::from(header.map).min(self.maps.len() - 1);
+        self.stations.fill(None);
+        self.activity.fill(RadioActivity::default());
+        self.objects.clear();
+        self.heard.clear();
+        self.inbox.iter_mut().for_each(Vec::clear);
+    }
+
+    /// Gives each slot its station; one whose vehicle is new begins with an empty map.
+    fn take_slots(&mut self, slots: &[SlotMeasurement], states: &[VehicleState]) {
+        self.stations.resize(slots.len(), None);
+        self.activity.resize(slots.len(), RadioActivity::default());
+        self.inbox.resize(slots.len(), Vec::new());
+        self.rows.clear();
+        self.rows.resize(slots.len(), None);
+        // Dense indices of vehicles → rows.
+        let most = states
+            .iter()
+            .map(|state| state.vehicle)
+            .max()
+            .map_or(0, |most| most as usize + 1);
+        let mut row_of = vec![u32::MAX; most];
+        for (row, state) in (0_u32..).zip(states) {
+            row_of[state.vehicle as usize] = row;
+        }
+        for (slot, measured) in slots.iter().enumerate() {
+            let row = row_of
+                .get(measured.vehicle as usize)
+                .copied()
+                .filter(|row| *row != u32::MAX);
+            self.rows[slot] = row;
+            let is_vehicle = row.is_some_and(|row| states[row as usize].kind != Kind::Person as u32);
+            if measured.vehicle == EMPTY_SLOT || !is_vehicle {
+                self.stations[slot] = None;
+                continue;
+            }
+            let is_same = self.stations[slot]
+                .as_ref()
+                .is_some_and(|station| station.id_hash == measured.id_hash);
+            if !is_same || measured.episode_step == 0 {
+                self.stations[slot] = Some(self.begin_station(measured.id_hash));
+                self.activity[slot] = RadioActivity::default();
+                self.inbox[slot].clear();
+            }
+        }
+    }
+
+    fn begin_station(&self, id_hash: u64) -> Station {
+        let station = station_id(id_hash);
+        let key = LinkKey {
+            sender: station,
+            ..LinkKey::default()
+        };
+        let [equipped, ..] = self.random.uniforms(key, RadioDraw::Equipped, 0);
+        let [phase, ..] = self.random.uniforms(key, RadioDraw::Phase, 0);
+        Station {
+            id_hash,
+            station,
+            is_equipped: equipped < self.config.share,
+            phase_ns: (phase * self.medium.tick_ns as f64) as u64,
+            cam: CamService::default(),
+            cpm: CpmService::default(),
+            congestion: CongestionControl::new(self.config.congestion_control),
+            map: LocalMap::default(),
+        }
+    }
+
+    fn write(&mut self, slots: &[SlotMeasurement], states: &[VehicleState], now_ms: i64, out: &mut NeighboursSections) {
+        let count = self.config.neighbours as usize;
+        struct WrittenRow<'a> {
+            objects: &'a mut [[f32; NEIGHBOUR_COLUMNS]],
+            ids: &'a mut [[u32; NEIGHBOUR_ID_COLUMNS]],
+            radio: &'a mut [u32; RADIO_COLUMNS],
+        }
+        let mut rows: Vec<WrittenRow> = out
+            .objects
+            .chunks_mut(count)
+            .zip(out.ids.chunks_mut(count))
+            .zip(out.radio.iter_mut())
+            .map(|((objects, ids), radio)| WrittenRow { objects, ids, radio })
+            .collect();
+        let (stations, activity, at_row, heard) = (&self.stations, &self.activity, &self.rows, &self.objects);
+        parallel::for_each(self.config.threads as usize, &mut rows, |slot, row| {
+            let Some(station) = &stations[slot] else { return };
+            let done = activity[slot];
+            *row.radio = [
+                station.is_equipped.into(),
+                station.map.len() as u32,
+                done.sent,
+                done.bytes,
+                done.received,
+            ];
+            let (Some(own), Some(world)) = (&slots[slot].own, at_row[slot]) else {
+                return;
+            };
+            let size = size_of(&states[world as usize]);
+            let mut nearest = Vec::new();
+            station.map.nearest(heard, own.centre_m(&size), count, &mut nearest);
+            for (place, object) in nearest.iter().enumerate() {
+                (row.objects[place], row.ids[place]) = object.columns(now_ms);
+            }
+        });
+        for (slot, measured) in slots.iter().enumerate() {
+            out.vehicle[slot] = measured.vehicle;
+            out.channel_load[slot] = self.activity[slot].load;
+        }
+    }
+
+    /// Sends what is due after the tick, and finds out which stations receive it. Call it after [`MessageExchange::receive`].
+    pub fn send(&mut self, header: &MessageHeader, slots: &[SlotMeasurement], states: &[VehicleState]) {
+        self.maps[self.at].obstacles.update(states);
+        let radios = self.radios(states);
+        let ExchangeMap { obstacles, projection } = &self.maps[self.at];
+        let tick = StationTick {
+            now_ns: header.sim_time_ns,
+            tick: (header.sim_time_ns / self.medium.tick_ns) as u32,
+            slots,
+            states,
+            obstacles,
+            projection,
+            random: &self.random,
+            deviations: &self.deviations,
+            perception: &self.perception,
+        };
+        let outgoing = outgoing(&tick, &radios, &mut self.stations, self.config.threads as usize);
+        self.activity.fill(RadioActivity::default());
+        let queue: Vec<QueuedMessage> = outgoing.iter().map(|message| message.queued).collect();
+        let mut sends = vec![false; radios.len()];
+        queue.iter().for_each(|message| sends[message.radio as usize] = true);
+        let links = self.links.links(RadioTick {
+            radios: &radios,
+            sends: &sends,
+            obstacles,
+        });
+        self.counts.links += links.iter().map(|links| links.len() as u64).sum::<u64>();
+        let schedule = self.medium.schedule(&queue, &links, &self.random);
+        self.deliver(header, &outgoing, &queue, &links, &schedule, &radios);
+        let loads = self.medium.channel_load(&schedule, &queue, &links, radios.len());
+        for (radio, load) in radios.iter().zip(loads) {
+            self.activity[radio.slot].load = load;
+        }
+    }
+
+    /// Radios of the equipped stations, by slot.
+    fn radios(&self, states: &[VehicleState]) -> Vec<Radio> {
+        let bodies = self.maps[self.at].obstacles.bodies();
+        let radio = |(slot, station): (usize, &Option<Station>)| {
+            let row = self.rows[slot]?;
+            let station = station.as_ref().filter(|station| station.is_equipped)?;
+            let state = &states[row as usize];
+            Some(Radio {
+                slot,
+                station: station.station,
+                antenna: Antenna {
+                    position_m: bodies[row as usize].centre_m,
+                    z_m: state.z_m + f64::from(state.height_m) + ANTENNA_M,
+                    row,
+                },
+            })
+        };
+        self.stations.iter().enumerate().filter_map(radio).collect()
+    }
+
+    /// Puts what is decoded into the receivers' inboxes.
+    fn deliver(
+        &mut self,
+        header: &MessageHeader,
+        outgoing: &[OutgoingMessage],
+        queue: &[QueuedMessage],
+        links: &[Vec<MediumLink>],
+        schedule: &Schedule,
+        radios: &[Radio],
+    ) {
+        let stations: Vec<u32> = radios.iter().map(|radio| radio.station).collect();
+        let mut decoded: Vec<Vec<u32>> = vec![Vec::new(); schedule.on_air.len()];
+        let (medium, random) = (&self.medium, &self.random);
+        let on_air = OnAir {
+            schedule,
+            queue,
+            links,
+            stations: &stations,
+        };
+        parallel::for_each(self.config.threads as usize, &mut decoded, |number, decoded| {
+            medium.receivers(number, &on_air, random, decoded);
+        });
+        let (threads, projection) = (self.config.threads as usize, &self.maps[self.at].projection);
+        let mut contents: Vec<Vec<KnownObject>> = vec![Vec::new(); schedule.on_air.len()];
+        parallel::for_each(threads, &mut contents, |number, objects| {
+            let packet = &outgoing[schedule.on_air[number].queued].packet;
+            read_packet(packet, header.sim_time_ns, projection, objects);
+        });
+        self.heard.clear();
+        for (sent, contents) in schedule.on_air.iter().zip(contents) {
+            self.heard.push(HeardMessage {
+                sender: radios[queue[sent.queued].radio as usize].slot,
+                objects: self.objects.add(contents),
+            });
+        }
+        self.inbox.iter_mut().for_each(Vec::clear);
+        for (number, (sent, receivers)) in schedule.on_air.iter().zip(&decoded).enumerate() {
+            let message = &queue[sent.queued];
+            let sender = &mut self.activity[radios[message.radio as usize].slot];
+            sender.sent += 1;
+            sender.bytes += message.bytes;
+            for receiver in receivers {
+                let slot = radios[*receiver as usize].slot;
+                self.inbox[slot].push(number as u32);
+                self.activity[slot].received += 1;
+            }
+            match SendingService::of(message.message) {
+                SendingService::Cam => self.counts.cams += 1,
+                SendingService::Cpm => self.counts.cpms += 1,
+            }
+            self.counts.bytes += u64::from(message.bytes);
+            self.counts.received += receivers.len() as u64;
+        }
+        self.counts.dropped += u64::from(schedule.dropped);
+    }
+}
+
+fn size_of(state: &VehicleState) -> VehicleSize {
+    VehicleSize {
+        length_m: state.length_m.into(),
+        width_m: state.width_m.into(),
+        rear_overhang_m: state.rear_overhang_m.into(),
+    }
+}
+
+/// Reads a packet as a receiver does, from its bytes.
+fn read_packet(packet: &[u8], now_ns: u64, projection: &Projection, known: &mut Vec<KnownObject>) {
+    let Ok((head, message)) = geonetworking::decode(packet) else {
+        return;
+    };
+    match head.port {
+        BtpPort::Cam => {
+            let cam = Cam::decode(message);
+            known.extend(cam.ok().and_then(|cam| object_of_cam(&cam, now_ns, projection)));
+        }
+        BtpPort::Cpm => {
+            if let Ok(cpm) = Cpm::decode(message) {
+                objects_of_cpm(&cpm, now_ns, projection, known);
+            }
+        }
+        BtpPort::Denm | BtpPort::Vam => {}
+    }
+}

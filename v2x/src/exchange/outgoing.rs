@@ -1,0 +1,222 @@
+//! What the services of a station send at a tick.
+
+use ipc_schema::world::VehicleState;
+use sim_core::geodesy::Projection;
+
+use super::{SlotMeasurement, perception::Observer, size_of};
+use crate::{
+    message::{
+        GeodeticPoint, StationKind,
+        geonetworking::{self, BtpPort, PacketHead},
+        heading_from_yaw, its_time_ms,
+    },
+    parallel,
+    radio::{
+        links::Radio,
+        medium::QueuedMessage,
+        obstruction::Obstacles,
+        reception::{FRAME_BYTES, air_time_s},
+    },
+    random::RadioRandom,
+    services::{
+        congestion::CongestionControl,
+        cpm::{ObjectKind, PerceivedMotion},
+    },
+    station::{MessageComposer, OwnMeasurement, PerceptionSpec, SensorDeviations, Station},
+};
+
+/// Length from which a vehicle calls itself a lorry, metres.
+const TRUCK_LENGTH_M: f64 = 7.0;
+/// Bytes of a message before it exists, for the table of congestion control: CAM and CPM.
+const TYPICAL_BYTES: [usize; 2] = [120, 400];
+
+/// A service that sends, as the last bit of its messages' numbers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SendingService {
+    /// Cooperative awareness.
+    Cam = 0,
+    /// Collective perception.
+    Cpm = 1,
+}
+
+impl SendingService {
+    /// The service of a message of this number.
+    #[must_use]
+    pub fn of(message: u32) -> Self {
+        match message & 1 {
+            0 => Self::Cam,
+            _ => Self::Cpm,
+        }
+    }
+}
+
+/// A message on its way to the radio.
+pub struct OutgoingMessage {
+    /// The radio's part.
+    pub queued: QueuedMessage,
+    /// Its bytes, from the GeoNetworking header on.
+    pub packet: Vec<u8>,
+}
+
+/// What all stations share at a tick.
+#[derive(Clone, Copy)]
+pub struct StationTick<'a> {
+    /// Simulated time, nanoseconds.
+    pub now_ns: u64,
+    /// Number of the tick.
+    pub tick: u32,
+    /// What each slot measures.
+    pub slots: &'a [SlotMeasurement],
+    /// Road users.
+    pub states: &'a [VehicleState],
+    /// Buildings and road users.
+    pub obstacles: &'a Obstacles,
+    /// Projection of the map.
+    pub projection: &'a Projection,
+    /// Random numbers of the episode.
+    pub random: &'a RadioRandom,
+    /// What sensors deviate by.
+    pub deviations: &'a SensorDeviations,
+    /// What stations perceive.
+    pub perception: &'a PerceptionSpec,
+}
+
+/// A station with a radio, at a tick.
+struct StationTurn<'a> {
+    number: u32,
+    radio: &'a Radio,
+    station: &'a mut Station,
+    messages: Vec<OutgoingMessage>,
+}
+
+/// Messages that the services of all stations with a radio generate, by radio. `radios` ascend by slot.
+pub fn outgoing(
+    tick: &StationTick,
+    radios: &[Radio],
+    stations: &mut [Option<Station>],
+    threads: usize,
+) -> Vec<OutgoingMessage> {
+    let mut next = (0_u32..).zip(radios).peekable();
+    let mut turns: Vec<StationTurn> = Vec::with_capacity(radios.len());
+    for (slot, station) in stations.iter_mut().enumerate() {
+        if let (Some((number, radio)), Some(station)) = (next.next_if(|(_, radio)| radio.slot == slot), station) {
+            turns.push(StationTurn {
+                number,
+                radio,
+                station,
+                messages: Vec::new(),
+            });
+        }
+    }
+    parallel::for_each(threads, &mut turns, |_, turn| turn.generate(tick));
+    turns.into_iter().flat_map(|turn| turn.messages).collect()
+}
+
+impl StationTurn<'_> {
+    fn generate(&mut self, tick: &StationTick) {
+        let Some(own) = &tick.slots[self.radio.slot].own else {
+            return;
+        };
+        let size = size_of(&tick.states[self.radio.antenna.row as usize]);
+        let composer = MessageComposer {
+            station: self.station.station,
+            kind: match size.length_m > TRUCK_LENGTH_M {
+                true => StationKind::HEAVY_TRUCK,
+                false => StationKind::PASSENGER_CAR,
+            },
+            now_ns: tick.now_ns,
+            own,
+            size: &size,
+            deviations: tick.deviations,
+            projection: tick.projection,
+        };
+        self.generate_cam(tick, &composer);
+        if tick.perception.range_m > 0.0 {
+            self.generate_cpm(tick, &composer);
+        }
+    }
+
+    fn generate_cam(&mut self, tick: &StationTick, composer: &MessageComposer) {
+        let gap_ns = self.gap_ns(SendingService::Cam);
+        let motion = composer.own.motion(composer.size);
+        let Some(content) = self.station.cam.check(tick.now_ns, &motion, gap_ns) else {
+            return;
+        };
+        if let Some(cam) = composer.cam(content.has_low_frequency) {
+            self.send(tick, composer, SendingService::Cam, &cam.encode(), &cam.position);
+        }
+    }
+
+    fn generate_cpm(&mut self, tick: &StationTick, composer: &MessageComposer) {
+        let observer = Observer {
+            antenna: &self.radio.antenna,
+            station: self.station.station,
+            tick: tick.tick,
+            states: tick.states,
+            obstacles: tick.obstacles,
+            random: tick.random,
+        };
+        let perceived = observer.perceive(tick.perception);
+        let motions: Vec<PerceivedMotion> = perceived
+            .iter()
+            .map(|object| PerceivedMotion {
+                object: object.object.into(),
+                kind: match object.is_person {
+                    true => ObjectKind::Person,
+                    false => ObjectKind::Vehicle,
+                },
+                motion: object.motion(composer.own, composer.size),
+            })
+            .collect();
+        let gap_ns = self.gap_ns(SendingService::Cpm);
+        let Some(content) = self.station.cpm.check(tick.now_ns, &motions, gap_ns) else {
+            return;
+        };
+        let has_sensors = content.has_sensor_information;
+        if let Some(cpm) = composer.cpm(tick.perception, &perceived, &content.objects, has_sensors) {
+            self.send(tick, composer, SendingService::Cpm, &cpm.encode(), &cpm.position);
+        }
+    }
+
+    /// Least time between two messages of a service, by congestion control, nanoseconds.
+    fn gap_ns(&self, service: SendingService) -> u64 {
+        let congestion: &CongestionControl = &self.station.congestion;
+        congestion.gap_ns(air_time_s(TYPICAL_BYTES[service as usize]))
+    }
+
+    /// Puts headers before a message, and queues it.
+    fn send(
+        &mut self,
+        tick: &StationTick,
+        composer: &MessageComposer,
+        service: SendingService,
+        message: &[u8],
+        place: &GeodeticPoint,
+    ) {
+        let own: &OwnMeasurement = composer.own;
+        let head = PacketHead {
+            port: match service {
+                SendingService::Cam => BtpPort::Cam,
+                SendingService::Cpm => BtpPort::Cpm,
+            },
+            station: composer.station,
+            kind: composer.kind.0,
+            time_ms: its_time_ms(tick.now_ns) as u32,
+            latitude: place.latitude,
+            longitude: place.longitude,
+            speed_cmps: (own.speed_mps * 100.0).round().clamp(-16_384.0, 16_383.0) as i16,
+            heading: heading_from_yaw(own.heading_rad),
+        };
+        let packet = geonetworking::encode(&head, message);
+        self.messages.push(OutgoingMessage {
+            queued: QueuedMessage {
+                radio: self.number,
+                station: composer.station,
+                message: tick.tick << 1 | service as u32,
+                ready_ns: self.station.phase_ns,
+                bytes: (packet.len() + FRAME_BYTES) as u32,
+            },
+            packet,
+        });
+    }
+}
