@@ -18,14 +18,19 @@ train: build ## build everything and learn on the town
 test: prerequisites browser $(VENV)/.installed ## all tests
 	cargo build $(CARGO_FLAGS) --lib --bins --tests --examples
 	$(EXTENSION)
+	$(COMMAND)
 	$(MAKE) --jobs=2 --output-sync=line test-rust test-python
 
 build: prerequisites $(VENV)/.installed ## virtual environment, SUMO, all programs, the Python extension
 	cargo build $(CARGO_FLAGS)
 	$(EXTENSION)
+	$(COMMAND)
 
 # `install` replaces the file, so that a trainer that runs keeps the one it has loaded.
 EXTENSION = install -m 755 target/release/lib_native.so trainer/python/caraware/_native.abi3.so
+
+# `source .venv/bin/activate` then gives `caraware`, which finds the other programs beside the file that the link names.
+COMMAND = ln -sfn ../../target/release/caraware $(VENV)/bin/caraware
 
 prerequisites:
 	@scripts/prerequisites.sh "$(PYTHON)"
