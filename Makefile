@@ -62,18 +62,18 @@ lint: $(VENV)/.installed ## formatting and lints, as errors
 	cargo fmt --all --check
 	cargo clippy $(CARGO_FLAGS) --all-targets -- -D warnings
 	$(VENV)/bin/ruff check trainer viewer bench
-	$(VENV)/bin/ruff check --config trainer/pyproject.toml sim-core sensor-daemon v2x docs maps
+	$(VENV)/bin/ruff check --config trainer/pyproject.toml sim-core sensor-daemon v2x docs maps scripts
 	$(VENV)/bin/ruff format --check trainer viewer bench
-	$(VENV)/bin/ruff format --config trainer/pyproject.toml --check sim-core sensor-daemon v2x docs maps
+	$(VENV)/bin/ruff format --config trainer/pyproject.toml --check sim-core sensor-daemon v2x docs maps scripts
 	cd viewer && ../$(VENV)/bin/mypy
 	cd trainer && ../$(VENV)/bin/mypy
 
 format: $(VENV)/.installed
 	cargo fmt --all
 	$(VENV)/bin/ruff check --fix trainer viewer bench
-	$(VENV)/bin/ruff check --config trainer/pyproject.toml --fix sim-core sensor-daemon v2x docs maps
+	$(VENV)/bin/ruff check --config trainer/pyproject.toml --fix sim-core sensor-daemon v2x docs maps scripts
 	$(VENV)/bin/ruff format trainer viewer bench
-	$(VENV)/bin/ruff format --config trainer/pyproject.toml sim-core sensor-daemon v2x docs maps
+	$(VENV)/bin/ruff format --config trainer/pyproject.toml sim-core sensor-daemon v2x docs maps scripts
 
 deny: ## licences, sources and advisories of all dependencies (needs: cargo install cargo-deny --locked)
 	cargo deny check
