@@ -8,7 +8,7 @@ CARGO_FLAGS := --release --locked
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
 
-.PHONY: train test build prerequisites browser lint format test-rust test-python deny bench peers peers-metadrive peers-smarts clean
+.PHONY: train test build prerequisites browser lint format test-rust test-python deny bench peers peers-metadrive peers-smarts site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -102,6 +102,14 @@ peers-smarts: ## SMARTS for `caraware bench peers`, which needs Python 3.10 (PYT
 	.venv-smarts/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r bench/requirements-smarts.txt
 	$(call OWN_ENVIRONMENT,.venv-smarts)
 
+site: .venv-site/.installed ## a website of all pages, with every link checked: target/site/html
+	.venv-site/bin/python docs/site/build.py
+
+.venv-site/.installed: docs/requirements-site.txt
+	$(PYTHON) -m venv .venv-site
+	.venv-site/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r docs/requirements-site.txt
+	touch $@
+
 clean:
 	cargo clean
-	rm -rf $(VENV) .venv-peers .venv-metadrive .venv-smarts
+	rm -rf $(VENV) .venv-peers .venv-metadrive .venv-smarts .venv-site
