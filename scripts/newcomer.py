@@ -152,7 +152,7 @@ class Shell:
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            env=clean_environment(),
+            env=clean_environment(self.directory),
             start_new_session=True,
         )
         if block.is_background:
@@ -192,9 +192,13 @@ class Shell:
             time.sleep(0.1)
 
 
-def clean_environment() -> dict[str, str]:
-    """The variables of a new terminal: no environment is active, and no directory of PATH has `caraware`."""
+def clean_environment(directory: Path) -> dict[str, str]:
+    """The variables of a new terminal: no environment is active, and no directory of PATH has `caraware`.
+
+    The page has a registry of its own, so that live runs of the same names elsewhere on the machine are not meant.
+    """
     variables = {key: value for key, value in os.environ.items() if key not in ("VIRTUAL_ENV", "PYTHONPATH")}
+    variables["CARAWARE_RUNTIME_DIR"] = str(directory / ".registry")
     directories = variables["PATH"].split(os.pathsep)
     variables["PATH"] = os.pathsep.join(name for name in directories if not (Path(name) / "caraware").exists())
     return variables

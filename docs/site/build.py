@@ -16,6 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 SITE = ROOT / "target" / "site"
 SOURCE = SITE / "source"
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")
+SKIPPED = {"target", "runs", "node_modules"}
+"""Directories without pages of the project."""
 INCLUDED = {"docs/benchmarks/parts.md"}
 """Pages that are a part of another one."""
 
@@ -51,15 +53,12 @@ NAVIGATION = {
 
 
 def pages() -> list[Path]:
-    """Every page of the repository, relative to its root."""
-    listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "*.md"],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    return [Path(name) for name in sorted(set(listed.stdout.split())) if name not in INCLUDED]
+    """Every page of the working tree, relative to its root."""
+    found: list[Path] = []
+    for directory, names, files in os.walk(ROOT):
+        names[:] = [name for name in names if not name.startswith(".") and name not in SKIPPED]
+        found += [Path(directory, file).relative_to(ROOT) for file in files if file.endswith(".md")]
+    return sorted(page for page in found if str(page) not in INCLUDED)
 
 
 def target_of(page: Path, link: str) -> str:
