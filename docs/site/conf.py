@@ -11,6 +11,5 @@ html_show_copyright = False
 html_theme_options = {"navigation_with_keys": True}
 # Headings get the anchors that GitHub gives them.
 myst_heading_anchors = 6
-# `text` blocks show output, and `toml` blocks leave out what does not matter here (…).
-highlight_options = {"default": {"stripall": False}}
+# Blocks may leave out what does not matter there (…), which a highlighter does not understand.
 suppress_warnings = ["misc.highlighting_failure"]
