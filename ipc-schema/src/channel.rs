@@ -274,7 +274,7 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         when_full: FullQueue::DropNewest,
         max_payload: |run| PredictionLayout::new(road_users(run), ESTIMATE_COLUMNS, true).len,
         queue_length: |run| windowful(run) + recorded_ahead(run, Channel::Prediction, 2 * window(run)),
-        in_hand: |run| two_batches(windowful(run)),
+        in_hand: |run| two_batches(Channel::Prediction.queue_length(run)),
         is_used: |_| true,
     },
     ChannelSpec {

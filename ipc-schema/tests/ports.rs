@@ -16,7 +16,7 @@ use std::{
 
 use ipc_schema::{
     board::State,
-    config::Config,
+    config::{Config, RecordManner},
     header::MessageHeader,
     membership::{MembershipError, RunMembership},
     ports::PortError,
@@ -101,6 +101,20 @@ fn a_message_arrives_unchanged_and_aligned_in_the_same_memory() {
     assert_eq!((message.header().tick, message.payload()), (7, [9_u8; 100].as_slice()));
     assert_eq!(message.payload().as_ptr().addr() % 64, 0);
     assert!(subscriber.receive().unwrap().is_none());
+}
+
+/// `fanout` holds what is in a queue until world, observation and prediction of one tick have met.
+#[test]
+fn a_watcher_may_hold_a_whole_queue_of_what_belongs_to_a_tick() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut run = common::run_in(directory.path(), "test", config());
+    for manner in [RecordManner::Watching, RecordManner::Lossless] {
+        run.config.record.manner = manner;
+        for channel in [Channel::World, Channel::Observation, Channel::Prediction] {
+            let spec = channel.spec();
+            assert!((spec.in_hand)(&run) >= (spec.queue_length)(&run), "{manner:?} {}", spec.name);
+        }
+    }
 }
 
 #[test]

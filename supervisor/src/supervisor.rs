@@ -236,12 +236,11 @@ impl Supervisor {
         Ok(())
     }
 
-    /// True if the environment of a killed simulator process can be made again: simulation is a function of configuration, seed and
-    /// commands, but in the driving task sim-core would wait for observations that are not sent again, and a run that plays has no ticks
-    /// that count.
+    /// True if the environment of a killed simulator process can be made again: simulation is a function of configuration, seed,
+    /// commands and, in the driving task, logged actions. A run that plays has no ticks that count.
     fn may_simulate_again(&self, row: &ProcessSpec) -> bool {
         let run = self.processes.run();
-        row.is_simulator() && run.mode != Mode::Play && run.replay.is_none() && !run.config.drives()
+        row.is_simulator() && run.mode != Mode::Play && run.replay.is_none()
     }
 
     /// Reports processes that hang, and kills those that are to be replaced: their ends are found like all others.

@@ -1,4 +1,4 @@
-//! Our PPO in the driving task: whatever is killed, replaced or stopped, the run learns the same.
+//! Our PPO in the driving task: whichever process is killed, replaced or stopped, the run learns the same.
 
 #![allow(
     clippy::unwrap_used,
@@ -127,6 +127,32 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
     assert!(status.success(), "{status}\n{said}");
     assert!(said.contains("a successor continues"), "{said}");
     assert_eq!(outcome(&workplace, "killed"), expected);
+
+    // Each simulator once, and in the end one at the same time as the learner.
+    let mut run = start(
+        &workplace,
+        &arguments("simulated", &["run.real_time_factor=12"]),
+        "simulated.log",
+    );
+    let victims: [(u32, &[&str]); 4] = [
+        (1, &["/sim-core"]),
+        (3, &["/traffic-bridge"]),
+        (5, &["/sensor-daemon"]),
+        (7, &["/sim-core", "caraware.train"]),
+    ];
+    for (updates, words) in victims {
+        wait_for_checkpoint(&workplace, "simulated", updates, &mut run);
+        for word in words {
+            let victim = until(&mut run, "a process", || processes(&workplace, "simulated", word).pop());
+            kill_process(victim, Signal::KILL).unwrap();
+        }
+    }
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("simulated.log")).unwrap();
+    assert!(status.success(), "{status}\n{said}");
+    let again = said.matches("the simulation is made again from tick").count();
+    assert_eq!(again, victims.len(), "{said}");
+    assert_eq!(outcome(&workplace, "simulated"), expected);
 
     // A planned handover to a successor of the same kind.
     let mut run = start(

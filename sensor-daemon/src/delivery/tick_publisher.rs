@@ -223,10 +223,11 @@ impl TickPublisher {
             return Ok(true);
         };
         let is_due = trainer.may_send();
+        let is_shown = is_due || trainer.shows_again(header.tick);
         trainer.keep(*header, payload)?;
         if is_due {
             trainer.count_live();
         }
-        Ok(is_due)
+        Ok(is_shown)
     }
 }

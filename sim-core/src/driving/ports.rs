@@ -134,6 +134,17 @@ impl HeroPorts {
                 "resume the run by its name; or start another that begins with task.begin_from = \"CHECKPOINT\"",
             ));
         }
+        // Ticks that were sensed were made with actions, but for those that were under way.
+        if let Some(restart) = run.restart
+            && frame.tick > run.first_tick()
+            && frame.tick + 2 < restart.sensed_ticks
+        {
+            return Err(Failure::new(
+                FailureKind::Run,
+                format!("the actions that moved tick {} were not logged", frame.tick),
+            )
+            .with_help("free space for the run's directory, then resume the run by its name"));
+        }
         // The first tick of this process begins an episode: no hero has been seen before it.
         let Some(before) = frame
             .tick
@@ -149,20 +160,21 @@ impl HeroPorts {
             return Ok(Wait::Stopped);
         };
         // Actions of the episode before belong to heroes that ended with it.
+        let mut of_heroes = Vec::new();
         if question.header().episode == frame.episode {
             let actions = actions(&answer, question.header().shape[0])?;
             let vehicles = vehicles(&question).map_err(unreadable)?;
-            let of_heroes: Vec<LoggedAction> = vehicles
-                .iter()
-                .zip(actions)
-                .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT)
-                .map(|(&vehicle, &action)| LoggedAction { vehicle, action })
-                .collect();
-            if let Err(error) = self.log.add(frame.tick, &of_heroes) {
-                tracing::warn!("actions of this episode are not logged any more: {error}");
-            }
-            self.apply(&of_heroes, frame.tick, mirror);
+            let pairs = vehicles.iter().zip(actions);
+            of_heroes.extend(
+                pairs
+                    .filter(|(vehicle, _)| **vehicle != EMPTY_SLOT)
+                    .map(|(&vehicle, &action)| LoggedAction { vehicle, action }),
+            );
         }
+        if let Err(error) = self.log.add(frame.tick, &of_heroes) {
+            tracing::warn!("actions of this episode are not logged any more: {error}");
+        }
+        self.apply(&of_heroes, frame.tick, mirror);
         Ok(Wait::Ready)
     }
 
