@@ -81,13 +81,24 @@ def test_stable_baselines_checker_passes_on_one_hero() -> None:
 
 def test_pettingzoos_api_test_passes_with_heroes_that_come_and_go() -> None:
     with make("lap", HEROES) as simulation:
-        env = CarAwareParallelEnv(simulation)
+        env = CarAwareParallelEnv(simulation, agents="ids")
         parallel_api_test(env, num_cycles=150)
         assert len(env.possible_agents) > 3 and all(agent.startswith("hero.") for agent in env.possible_agents)
 
 
-def test_pettingzoos_seed_test_passes() -> None:
-    parallel_seed_test(lambda: CarAwareParallelEnv(make("town", TOWN)), num_cycles=50)
+@pytest.mark.filterwarnings("error:.*[Aa]gent:UserWarning")
+@pytest.mark.parametrize(("config", "settings"), [("town", TOWN), ("lap", HEROES)])
+def test_pettingzoos_api_test_passes_with_slots_as_agents(config: str, settings: dict[str, Any]) -> None:
+    with make(config, settings) as simulation:
+        env = CarAwareParallelEnv(simulation)
+        slots = list(env.possible_agents)
+        parallel_api_test(env, num_cycles=150)
+        assert env.possible_agents == slots
+
+
+@pytest.mark.parametrize("agents", ["slots", "ids"])
+def test_pettingzoos_seed_test_passes(agents: str) -> None:
+    parallel_seed_test(lambda: CarAwareParallelEnv(make("town", TOWN), agents=agents), num_cycles=50)
 
 
 def episode_of(env: CarAwareVectorEnv, steps: int) -> list[np.ndarray]:

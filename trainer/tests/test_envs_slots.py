@@ -325,7 +325,7 @@ def test_the_single_face_ends_with_its_vehicle_and_continues_with_the_next_in_th
 def test_agents_come_and_go_under_their_ids_and_an_episode_ends_with_the_simulations(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, E], terminated=(1,)), tick(2, [1, 3]), tick(3, [1, 3])]
     ticks += [tick(4, [1, 9], truncated=(0, 1), episode=1), tick(5, [1, 9], episode=1)]
-    env = CarAwareParallelEnv(channel_of(ticks, tmp_path, 2), reward=which)
+    env = CarAwareParallelEnv(channel_of(ticks, tmp_path, 2), reward=which, agents="ids")
     observations, _ = env.reset()
     one, two, three = (f"0x{number:016x}" for number in (1, 2, 3))
     assert env.agents == [one, two] and vehicles_of(observations[two]) == 2
@@ -343,6 +343,74 @@ def test_agents_come_and_go_under_their_ids_and_an_episode_ends_with_the_simulat
     assert env.possible_agents == [one, two, three, f"0x{9:016x}"]
 
 
+def test_slots_as_agents_have_one_trajectory_each_and_the_episode_ends_with_the_last_of_them(tmp_path: Path) -> None:
+    ticks = [tick(0, [1, E]), tick(1, [1, 2]), tick(2, [E, 2], terminated=(0,)), tick(3, [3, 2])]
+    ticks += [tick(4, [3, E], truncated=(1,)), tick(5, [3, 4])]
+    channel = channel_of(ticks, tmp_path, 2, drives=True)
+    env = CarAwareParallelEnv(channel, reward=which)
+    assert env.possible_agents == ["slot_0", "slot_1"]
+    ones = dict.fromkeys(env.possible_agents, np.ones(2, np.float32))
+    observations, infos = env.reset()
+    assert env.agents == env.possible_agents and not observations["slot_1"].any()
+    assert infos["slot_0"]["id"] == f"0x{1:016x}" and infos["slot_0"]["mask"]
+    assert (infos["slot_1"]["id"], infos["slot_1"]["vehicle"], infos["slot_1"]["mask"]) == ("", -1, False)
+
+    observations, rewards, terminated, truncated, infos = env.step(ones)
+    assert rewards == {"slot_0": pytest.approx(1.0), "slot_1": 0.0} and not any(terminated.values())
+    assert vehicles_of(observations["slot_1"]) == 2 and infos["slot_1"]["mask"]
+
+    observations, _, terminated, truncated, infos = env.step(ones)
+    assert terminated == {"slot_0": True, "slot_1": False} and env.agents == ["slot_1"]
+    assert (vehicles_of(observations["slot_0"]), when(observations["slot_0"])) == (1, 1)
+    assert infos["slot_0"]["vehicle"] == 1
+
+    observations, *_ = env.step(ones)  # vehicle 3 takes slot 0, whose agent has ended
+    assert list(observations) == ["slot_1"]
+    _, _, _, truncated, _ = env.step(ones)
+    assert truncated == {"slot_1": True} and env.agents == []
+    assert channel.actions[1].tolist() == [[1, 1], [1, 1]]
+    assert channel.actions[3].tolist() == [[0, -1], [1, 1]]  # the vehicle without an agent brakes
+    assert env.step(ones) == ({}, {}, {}, {}, {})
+
+    observations, infos = env.reset()
+    assert env.agents == env.possible_agents and when(observations["slot_0"]) == 4 and not infos["slot_1"]["mask"]
+    with pytest.raises(KeyError, match="slot_7"):
+        env.step({"slot_7": np.zeros(2)})
+
+
+def test_a_slot_without_a_vehicle_ends_with_the_simulations_episode(tmp_path: Path) -> None:
+    ticks = [tick(0, [1, E]), tick(1, [5, 6], truncated=(0,), episode=1), tick(2, [5, 6], episode=1)]
+    env = CarAwareParallelEnv(channel_of(ticks, tmp_path, 2), infos="numbers")
+    _, infos = env.reset()
+    keys = infos["slot_0"].keys()
+    observations, _, _, truncated, infos = env.step({})
+    assert truncated == {"slot_0": True, "slot_1": True} and env.agents == []
+    assert vehicles_of(observations["slot_0"]) == 1 and not observations["slot_1"].any()
+    assert {info.keys() == keys for info in infos.values()} == {True}
+    assert all(isinstance(value, int | np.ndarray) for info in infos.values() for value in info.values())
+    assert [vehicles_of(row) for row in env.reset()[0].values()] == [5, 6]
+
+
+def test_a_policy_drives_the_vehicles_whose_agents_wait_for_the_next_episode(tmp_path: Path) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [3, 2], terminated=(0,)), tick(2, [3, 2])]
+    channel = channel_of(ticks, tmp_path, 2, drives=True)
+    env = CarAwareParallelEnv(channel, reward=which, waiting_policy=lambda observation: observation[:, :2] + 0.5)
+    env.reset()
+    env.step({})
+    env.step({"slot_1": np.ones(2, np.float32)})
+    assert channel.actions[1].tolist() == [pytest.approx([0.503, 0.501]), [1, 1]]
+
+
+def test_agents_infos_and_render_modes_that_are_not_offered_are_refused(tmp_path: Path) -> None:
+    wrong: tuple[dict[str, Any], ...] = ({"agents": "vehicles"}, {"infos": "all"}, {"render_mode": "human"})
+    for arguments in wrong:
+        with pytest.raises(ValueError, match=str(*arguments.values())):
+            CarAwareParallelEnv(channel_of([tick(0, [1, 2])], tmp_path, 2), **arguments)
+    for face in (CarAwareEnv, CarAwareVectorEnv, CarAwareVecEnv):
+        with pytest.raises(ValueError, match="human"):
+            face(channel_of([tick(0, [1, 2])], tmp_path, 2), render_mode="human")
+
+
 def test_stable_baselines_gets_the_last_observation_and_the_sums_of_an_episode(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, E], terminated=(1,)), tick(3, [1, E], truncated=(0,))]
     ticks[3] = replace(tick(3, [1, E], truncated=(0,), episode=1))
@@ -352,7 +420,9 @@ def test_stable_baselines_gets_the_last_observation_and_the_sums_of_an_episode(t
     env.step(NOTHING)
     _, _, done, infos = env.step(NOTHING)
     assert done.tolist() == [False, True] and infos[1]["TimeLimit.truncated"] is False
-    assert infos[1]["episode"] == {"r": 2.0, "l": 2, "t": 0.0} and when(infos[1]["terminal_observation"]) == 1
+    seconds = infos[1]["episode"].pop("t")
+    assert infos[0]["TimeLimit.truncated"] is False and 0.0 < seconds < 60.0
+    assert infos[1]["episode"] == {"r": 2.0, "l": 2} and when(infos[1]["terminal_observation"]) == 1
     _, reward, done, infos = env.step(NOTHING)
     assert reward.tolist() == [1.0, 0.0] and done.tolist() == [True, False]
     assert infos[0]["TimeLimit.truncated"] is True and infos[0]["episode"]["l"] == 3

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
+from caraware.envs.rendering import RENDER_MODES, RgbImage, checked_render_mode
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Policy, Slots, Source
 from caraware.envs.transition import Transition
@@ -18,8 +21,10 @@ class CarAwareVecEnv(VecEnv):
     """Slots as sub-environments that reset themselves.
 
     `infos[i]["mask"]` is False where slot i holds no vehicle: its observation is zero, its action not used, its reward
-    0. Stable-Baselines3 has no way to leave such rows out; they make up the beginning of a trajectory. At the end of
-    one `infos[i]` has `terminal_observation`, `TimeLimit.truncated`, and the `episode` that `Monitor` would give.
+    0. Stable-Baselines3 has no way to leave such rows out; they make up the beginning of a trajectory. Every `infos[i]`
+    has `TimeLimit.truncated`, which is true where a trajectory was cut. At its end it also has `terminal_observation`
+    and the `episode` that `Monitor` would give: `r`, the sum of rewards, `l`, the steps with a vehicle, and `t`, the
+    seconds since this environment was made.
 
     `evaluation_policy` answers the evaluation episodes of a run that `caraware` started.
     """
@@ -30,13 +35,17 @@ class CarAwareVecEnv(VecEnv):
         num_envs: int | None = None,
         reward: Reward | None = None,
         evaluation_policy: Policy | None = None,
+        render_mode: str | None = None,
     ) -> None:
+        """Raises `ValueError` for a `render_mode` other than "rgb_array"."""
+        self.render_mode = checked_render_mode(render_mode)
         self.slots = Slots(source, num_envs, reward, evaluation_policy)
         settings = self.slots.settings
-        self.render_mode = None
+        self._made_s = time.monotonic()
         self._returns = np.zeros(self.slots.count)
         self._lengths = np.zeros(self.slots.count, np.int64)
         super().__init__(self.slots.count, settings.observation_space(), settings.action_space())
+        self.metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": settings.ticks_per_s}
 
     def reset(self) -> Float32Array:
         """First observation `[N, d]`; the seed is the first of those that `seed()` set."""
@@ -56,12 +65,18 @@ class CarAwareVecEnv(VecEnv):
         transition, reward = self.slots.step(self._actions)
         self._returns += reward
         self._lengths += transition.mask
-        infos: list[dict[str, Any]] = [{"mask": held} for held in self.slots.now.mask.tolist()]
+        infos: list[dict[str, Any]] = [
+            {"mask": held, "TimeLimit.truncated": False} for held in self.slots.now.mask.tolist()
+        ]
         done = transition.terminated | transition.truncated
         for slot in np.flatnonzero(done):
             infos[slot] |= self._last_words(transition, int(slot))
         self._returns[done], self._lengths[done] = 0.0, 0
         return self.slots.now.rows.observation, reward.astype(np.float32), done, infos
+
+    def get_images(self) -> Sequence[RgbImage | None]:
+        """One image for all sub-environments, which share a world: `render()` shows it as u8 `[H, W, 3]`."""
+        return [self.slots.render()]
 
     def close(self) -> None:
         """Ends the simulation, or the part in it."""
@@ -87,6 +102,10 @@ class CarAwareVecEnv(VecEnv):
         return {
             "terminal_observation": transition.observation[slot].copy(),
             "TimeLimit.truncated": bool(transition.truncated[slot]),
-            "episode": {"r": float(self._returns[slot]), "l": int(self._lengths[slot]), "t": 0.0},
+            "episode": {
+                "r": round(float(self._returns[slot]), 6),
+                "l": int(self._lengths[slot]),
+                "t": round(time.monotonic() - self._made_s, 6),
+            },
             **transition.end_info(slot),
         }

@@ -48,6 +48,11 @@ class FaceSettings:
             dark_is_nan=setting(run, "blackout.policy", BlackoutPolicy) is BlackoutPolicy.NAN,
         )
 
+    @property
+    def ticks_per_s(self) -> int:
+        """Ticks of a simulated second, at least 1: the frame rate of a video in real time."""
+        return max(1, round(1 / self.tick_s))
+
     def observation_space(self) -> Box:
         """Of one vehicle: f32 `[d]`."""
         return Box(self.fields.low, 1.0, (self.fields.width,), np.float32)

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from caraware.envs.rendering import RENDER_MODES, RgbImage, checked_render_mode
 from caraware.envs.rewards import Reward
 from caraware.envs.slots import Slots, Source, Tick
 from caraware.ipc.arrays import Float32Array, FloatArray
@@ -23,10 +24,19 @@ class CarAwareEnv(gymnasium.Env):
     a hero's episode also `end`, its reason, `is_success`, and a flag for each reason.
     """
 
-    def __init__(self, source: Source | Channel, slot: int = 0, reward: Reward | None = None) -> None:
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 10}  # noqa: RUF012, as Gymnasium wants it
+
+    def __init__(
+        self,
+        source: Source | Channel,
+        slot: int = 0,
+        reward: Reward | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Raises `ValueError` for a `render_mode` other than "rgb_array"."""
+        self.render_mode = checked_render_mode(render_mode)
         self.slots = Slots(source, None if slot == 0 else slot + 1, reward)
-        self.metadata = {"render_modes": []}
-        self.render_mode = None
+        self.metadata = self.metadata | {"render_fps": self.slots.settings.ticks_per_s}
         self.observation_space = self.slots.settings.observation_space()
         self.action_space = self.slots.settings.action_space()
         self._slot, self._names = slot, Names(self.slots.source.channel.run)
@@ -57,6 +67,10 @@ class CarAwareEnv(gymnasium.Env):
         if self._ended:
             info |= transition.end_info(slot)
         return transition.next.observation[slot].copy(), float(reward[slot]), terminated, truncated, info
+
+    def render(self) -> RgbImage | None:
+        """The map from above with this vehicle in another colour: u8 `[H, W, 3]`; None without a `render_mode`."""
+        return None if self.render_mode is None else self.slots.render(self._slot)
 
     def close(self) -> None:
         """Ends the simulation, or the part in it."""

@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from caraware.envs import rewards
 from caraware.envs.evaluation import EvaluationMeans
+from caraware.envs.rendering import RgbImage
 from caraware.envs.settings import FaceSettings
 from caraware.envs.transition import Rows, Transition
 from caraware.ipc.arrays import (
@@ -38,6 +39,9 @@ from caraware.ipc.channel import StreamEndedError
 from caraware.ipc.run_file import setting
 from caraware.ipc.stream import EMPTY_SLOT, Channel, Observation
 from caraware.tasks.contract import Sampling
+
+if TYPE_CHECKING:
+    from caraware.envs.picture import MapPicture
 
 log = logging.getLogger(__name__)
 
@@ -170,9 +174,10 @@ class Slots:
         self._untouched, self._stepped, self._warned_narrow = True, True, False
         self._now: Tick | None = None
         self._env_steps, self._reported = 0, (time.monotonic(), 0)
+        self._picture: MapPicture | None = None
 
     @property
-    def _world_waits(self) -> bool:
+    def world_waits(self) -> bool:
         """The simulation waits for the action of every tick."""
         return self.task.sampling is Sampling.EACH_TICK
 
@@ -180,7 +185,7 @@ class Slots:
     def now(self) -> Tick:
         """The tick to be answered next."""
         if self._now is None:
-            raise RuntimeError("call reset() before step()")
+            raise RuntimeError("call reset() before step() and render()")
         return self._now
 
     @property
@@ -229,6 +234,14 @@ class Slots:
         self._now = self._settle(following)
         self._show()
         return transition, np.where(now.mask, rewards_, 0.0)
+
+    def render(self, slot: int | None = None) -> RgbImage:
+        """The map from above with the vehicles of the tick, that in `slot` in another colour: u8 `[H, W, 3]`."""
+        if self._picture is None:
+            from caraware.envs.picture import MapPicture  # a learner that draws nothing needs no drawing libraries
+
+            self._picture = MapPicture(self.source.channel.run)
+        return self._picture.draw(self.now.rows, self.now.mask, slot)
 
     @property
     def answered(self) -> int:
@@ -306,7 +319,7 @@ class Slots:
     def _evaluate(self, tick: Tick) -> None:
         """Answers a tick of an evaluation; no learner sees it."""
         if self._evaluation_policy is None:
-            self._answer(self._idle, publish=self._world_waits)
+            self._answer(self._idle, publish=self.world_waits)
             return
         if self._evaluation.episode is None or tick.episode[1] > self._evaluation.episode + 1:
             self._evaluation = EvaluationMeans(self.task)
@@ -322,7 +335,7 @@ class Slots:
         self.source.current, self._answered = None, obs.tick
         if publish:
             rows = self.settings.answer(action, len(obs.vehicle), obs.observation)
-            if self._world_waits:
+            if self.world_waits:
                 channel.publish_actions(obs, rows)
             else:
                 channel.publish_predictions(obs, torch.from_numpy(rows), 0)

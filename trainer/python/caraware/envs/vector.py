@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from caraware.envs.rendering import RENDER_MODES, RgbImage, checked_render_mode
 from caraware.envs.rewards import Reward, measured
 from caraware.envs.slots import Policy, Slots, Source, Tick
 from caraware.envs.transition import Transition
@@ -28,17 +29,28 @@ class CarAwareVectorEnv(VectorEnv):
     answers the evaluation episodes of a run that `caraware` started; those are neither stepped nor learned from.
     """
 
+    metadata: dict[str, Any] = {  # noqa: RUF012, as Gymnasium wants it
+        "render_modes": RENDER_MODES,
+        "render_fps": 10,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+    autoreset_mode = AutoresetMode.SAME_STEP
+    """The same beside `metadata`: TorchRL reads it where Gymnasium's own vector environments have it."""
+
     def __init__(
         self,
         source: Source | Channel,
         num_envs: int | None = None,
         reward: Reward | None = None,
         evaluation_policy: Policy | None = None,
+        render_mode: str | None = None,
     ) -> None:
+        """Raises `ValueError` for a `render_mode` other than "rgb_array"."""
+        self.render_mode = checked_render_mode(render_mode)
         self.slots = Slots(source, num_envs, reward, evaluation_policy)
         self.num_envs = self.slots.count
-        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
-        self.render_mode, self.spec = None, None
+        self.metadata = self.metadata | {"render_fps": self.slots.settings.ticks_per_s}
+        self.spec = None
         self.single_observation_space = self.slots.settings.observation_space()
         self.single_action_space = self.slots.settings.action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -74,16 +86,30 @@ class CarAwareVectorEnv(VectorEnv):
             infos |= _final(transition, ended)
         return tick.rows.observation, reward, transition.terminated, transition.truncated, infos
 
+    def render(self) -> tuple[RgbImage, ...] | None:
+        """For each slot the map from above with its vehicle in another colour: N times u8 `[H, W, 3]`.
+
+        None without a `render_mode`.
+        """
+        return None if self.render_mode is None else tuple(self.slots.render(slot) for slot in range(self.num_envs))
+
     def close_extras(self, **kwargs: Any) -> None:
         """Ends the simulation, or the part in it."""
         self.slots.close()
 
     def _info(self, tick: Tick) -> dict[str, Any]:
-        known = {"vehicle": tick.vehicle, "id_hash": tick.id_hash, "truth": tick.rows.truth}
         infos: dict[str, Any] = {"mask": tick.mask, "_mask": self._all}
-        for key, value in known.items():
+        for key, value in _named(tick, tick.rows.truth).items():
             infos[key], infos[f"_{key}"] = value, tick.mask
         return infos
+
+
+def _named(rows: Tick | Transition, truth: Float32Array) -> dict[str, NDArray[Any]]:
+    """Which vehicles the rows are of, in types that torch can index: i64 `[N]` and `[N]`, f32 `[N, 4]`.
+
+    `id_hash` has the 64 bits of the hash.
+    """
+    return {"vehicle": rows.vehicle.astype(np.int64), "id_hash": rows.id_hash.view(np.int64), "truth": truth}
 
 
 def _final(transition: Transition, ended: BoolArray) -> dict[str, Any]:
@@ -92,8 +118,8 @@ def _final(transition: Transition, ended: BoolArray) -> dict[str, Any]:
     for slot in np.flatnonzero(ended):
         final_obs[slot] = transition.observation[slot].copy()
     info: dict[str, Any] = {}
-    for key in ("vehicle", "id_hash", "truth"):
-        info[key], info[f"_{key}"] = getattr(transition, key), ended
+    for key, value in _named(transition, transition.truth).items():
+        info[key], info[f"_{key}"] = value, ended
     words = {int(number): transition.end_info(int(number)) for number in np.flatnonzero(ended)}
     for key, value in next(iter(words.values())).items():
         column: NDArray[Any] = np.full(len(ended), type(value)(), dtype=bool if isinstance(value, bool) else object)
