@@ -1,10 +1,13 @@
 """Standard faces of a simulation for other learners: Gymnasium, PettingZoo, Stable-Baselines3.
 
 `make` starts a simulation; a face is put on it, or on the `Channel` of a trainer that the supervisor started.
-docs/environments.md says which face is for what.
+docs/environments.md says which face is for what. Importing this package registers the ids of
+`caraware.envs.registration` with Gymnasium, where Gymnasium is installed.
 """
 
+import os
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -49,3 +52,10 @@ def __getattr__(name: str) -> object:
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+
+
+# The process that keeps a trainer's place (`caraware.envs.outside.LINE`) starts faster without Gymnasium.
+if "CARAWARE_OUTSIDE" not in os.environ and find_spec("gymnasium") is not None:
+    from caraware.envs.registration import register_environments
+
+    register_environments()
