@@ -79,12 +79,13 @@ def test_an_id_takes_config_set_and_seed_and_closing_ends_its_simulation() -> No
 def test_an_id_makes_a_vector_of_vehicles_in_one_world_or_of_worlds() -> None:
     env = gymnasium.make_vec("CarAware/Town-v0", num_envs=5, set=TOWN)
     face: Any = env.unwrapped
-    assert isinstance(face, CarAwareVectorEnv) and face.slots.source.run["config"]["traffic"]["cavs"] == 5
+    assert isinstance(face, CarAwareVectorEnv)
+    assert face.slots.source.channel.run["config"]["traffic"]["cavs"] == 5
     observation, _ = env.reset(seed=2)
     assert len(observation) == 5 and env.observation_space.contains(observation)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     env.close()
-    worlds = gymnasium.make_vec("CarAware/Town-v0", num_envs=2, vectorization_mode="sync", set=TOWN)
+    worlds: Any = gymnasium.make_vec("CarAware/Town-v0", num_envs=2, vectorization_mode="sync", set=TOWN)
     observation, _ = worlds.reset(seed=[4, 5])
     assert observation.shape[0] == 2 and not np.array_equal(observation[0], observation[1])
     worlds.step(worlds.action_space.sample())
