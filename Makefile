@@ -8,7 +8,8 @@ CARGO_FLAGS := --release --locked
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
 
-.PHONY: train test build prerequisites browser lint format test-rust test-python deny bench peers peers-metadrive peers-smarts site clean
+.PHONY: train test build prerequisites browser lint format test-rust test-python deny bench peers peers-metadrive peers-smarts \
+	faces site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -110,6 +111,13 @@ site: .venv-site/.installed ## a website of all pages, with every link checked: 
 	.venv-site/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r docs/requirements-site.txt
 	touch $@
 
+faces: build ## RLlib for `caraware.examples.rllib_ppo`, in an environment of its own that sees the project's packages: 380 MB on disk
+	$(VENV)/bin/python -m venv .venv-faces
+	echo '*' > .venv-faces/.gitignore
+	($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))'; echo "$(CURDIR)/trainer/python") \
+		> $$(.venv-faces/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/project.pth
+	.venv-faces/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r trainer/requirements-faces.txt
+
 clean:
 	cargo clean
-	rm -rf $(VENV) .venv-peers .venv-metadrive .venv-smarts .venv-site
+	rm -rf $(VENV) .venv-peers .venv-metadrive .venv-smarts .venv-faces .venv-site
