@@ -428,6 +428,25 @@ def test_stable_baselines_gets_the_last_observation_and_the_sums_of_an_episode(t
     assert infos[0]["TimeLimit.truncated"] is True and infos[0]["episode"]["l"] == 3
 
 
+@pytest.mark.parametrize("face", [CarAwareVectorEnv, CarAwareVecEnv])
+def test_a_learner_may_change_what_it_gets_in_place(
+    face: type[CarAwareVectorEnv] | type[CarAwareVecEnv], tmp_path: Path
+) -> None:
+    ticks = [tick(0, [1, 2]), tick(1, [1, 2]), tick(2, [1, E], terminated=(1,)), tick(3, [1, 3])]
+    env: Any = face(channel_of(ticks, tmp_path, 2), reward=which)
+    first = env.reset()
+    (first[0] if isinstance(first, tuple) else first)[:] = 0.7
+    for expected in (2.0, 2.001):
+        observation, reward, *_, infos = env.step(NOTHING)
+        assert reward[1] == pytest.approx(expected)
+        last, observation[:] = observation.copy(), 0.7
+        if isinstance(infos, dict):
+            infos["truth"][:] = 0.7
+    assert last[1].tolist() == [0, 0, 0]
+    final = infos["final_obs"][1] if isinstance(infos, dict) else infos[1]["terminal_observation"]
+    assert (vehicles_of(final), when(final)) == (2, 1)
+
+
 def test_a_reward_of_the_wrong_shape_is_refused(tmp_path: Path) -> None:
     ticks = [tick(0, [1, 2]), tick(1, [1, 2])]
     env = CarAwareVectorEnv(channel_of(ticks, tmp_path, 2), reward=lambda obs, action: np.ones(1))

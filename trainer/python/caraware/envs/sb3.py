@@ -54,7 +54,7 @@ class CarAwareVecEnv(VecEnv):
         self._reset_options()
         self._returns[:], self._lengths[:] = 0.0, 0
         self.reset_infos = [{"mask": bool(held)} for held in tick.mask]
-        return tick.rows.observation
+        return tick.rows.observation.copy()
 
     def step_async(self, actions: FloatArray) -> None:
         """Remembers the actions; in the driving task the world waits for them in `step_wait`."""
@@ -72,7 +72,7 @@ class CarAwareVecEnv(VecEnv):
         for slot in np.flatnonzero(done):
             infos[slot] |= self._last_words(transition, int(slot))
         self._returns[done], self._lengths[done] = 0.0, 0
-        return self.slots.now.rows.observation, reward.astype(np.float32), done, infos
+        return self.slots.now.rows.observation.copy(), reward.astype(np.float32), done, infos
 
     def get_images(self) -> Sequence[RgbImage | None]:
         """One image for all sub-environments, which share a world: `render()` shows it as u8 `[H, W, 3]`."""

@@ -52,7 +52,7 @@ class CarAwareEnv(gymnasium.Env):
             self.slots.reset(seed)
         tick = self.slots.seek(self._slot)
         self._ended = False
-        return tick.rows.observation[self._slot], self._info(tick)
+        return tick.rows.observation[self._slot].copy(), self._info(tick)
 
     def step(self, action: FloatArray) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
         """One tick. At the end of an episode the observation is the vehicle's last once more."""
@@ -81,5 +81,5 @@ class CarAwareEnv(gymnasium.Env):
         return {
             "id": self._names.of(tick.id_hash[slot]),
             "vehicle": int(tick.vehicle[slot]),
-            "truth": tick.rows.truth[slot],
+            "truth": tick.rows.truth[slot].copy(),
         }

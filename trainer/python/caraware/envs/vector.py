@@ -72,7 +72,7 @@ class CarAwareVectorEnv(VectorEnv):
             seed = seed[0]
         super().reset(seed=seed)
         tick = self.slots.reset(seed)
-        return tick.rows.observation, self._info(tick)
+        return tick.rows.observation.copy(), self._info(tick)
 
     def step(self, actions: FloatArray) -> tuple[Float32Array, Float64Array, BoolArray, BoolArray, dict[str, Any]]:
         """Observations `[N, d]`, rewards, terminated, truncated `[N]`, infos."""
@@ -84,7 +84,7 @@ class CarAwareVectorEnv(VectorEnv):
         ended = transition.terminated | transition.truncated
         if ended.any():
             infos |= _final(transition, ended)
-        return tick.rows.observation, reward, transition.terminated, transition.truncated, infos
+        return tick.rows.observation.copy(), reward, transition.terminated, transition.truncated, infos
 
     def render(self) -> tuple[RgbImage, ...] | None:
         """For each slot the map from above with its vehicle in another colour: N times u8 `[H, W, 3]`.
@@ -109,7 +109,7 @@ def _named(rows: Tick | Transition, truth: Float32Array) -> dict[str, NDArray[An
 
     `id_hash` has the 64 bits of the hash.
     """
-    return {"vehicle": rows.vehicle.astype(np.int64), "id_hash": rows.id_hash.view(np.int64), "truth": truth}
+    return {"vehicle": rows.vehicle.astype(np.int64), "id_hash": rows.id_hash.view(np.int64), "truth": truth.copy()}
 
 
 def _final(transition: Transition, ended: BoolArray) -> dict[str, Any]:
