@@ -92,6 +92,24 @@ def test_an_id_makes_a_vector_of_vehicles_in_one_world_or_of_worlds() -> None:
     worlds.close()
 
 
+def test_ids_and_images_work_on_a_scenario_that_decides_itself_how_many_vehicles_there_are(tmp_path: Path) -> None:
+    generate = [str(ROOT / "target" / "release" / "caraware"), "generate", str(tmp_path / "city")]
+    subprocess.run(
+        [*generate, "--vehicles", "6", "--junctions", "3", "--duration-s", "60"], check=True, capture_output=True
+    )
+    config = tmp_path / "city" / "city.sumocfg"
+    env = gymnasium.make("CarAware/Town-v0", config=config, render_mode="rgb_array")
+    observation, info = env.reset()
+    assert observation in env.observation_space and info["vehicle"] >= 0
+    image = env.render()
+    assert isinstance(image, np.ndarray) and image.shape == (512, 512, 3) and chosen(image) > 10
+    env.close()
+    vector = gymnasium.make_vec("CarAware/Town-v0", num_envs=4, config=config)
+    _, infos = vector.reset()
+    assert infos["mask"].sum() == 4
+    vector.close()
+
+
 def test_the_vector_face_keeps_gymnasiums_contract_of_same_step_autoreset() -> None:
     """What `check_env` examines of one environment, here of a vector; Gymnasium has no checker of its own for it."""
     env = gymnasium.make_vec("CarAware/Driving-v0", num_envs=3, config="lap", set=HEROES)

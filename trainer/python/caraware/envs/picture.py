@@ -24,7 +24,7 @@ REAR_OVERHANG_M = 0.9
 """From the rear bumper to the rear axle, where the truth's position lies."""
 SHORTEST_M = 0.1
 """A place of the observation without a vehicle has length 0, give or take the steps of a normalised f32."""
-SMALLEST_PX = 6.0
+SMALLEST_PX = 9.0
 """A vehicle is drawn at least this long, however large the map is."""
 GROUND, ROAD, PATH = "#e3e6d8", "#5c6066", "#c9c5bd"
 VEHICLE, CHOSEN, SEEN = "#2f6fd6", "#d62f2f", "#f2f2ee"

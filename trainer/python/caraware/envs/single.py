@@ -35,7 +35,7 @@ class CarAwareEnv(gymnasium.Env):
     ) -> None:
         """Raises `ValueError` for a `render_mode` other than "rgb_array"."""
         self.render_mode = checked_render_mode(render_mode)
-        self.slots = Slots(source, None if slot == 0 else slot + 1, reward)
+        self.slots = Slots(source, None if slot == 0 else slot + 1, reward, of_scenario=1)
         self.metadata = self.metadata | {"render_fps": self.slots.settings.ticks_per_s}
         self.observation_space = self.slots.settings.observation_space()
         self.action_space = self.slots.settings.action_space()

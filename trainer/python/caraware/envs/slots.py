@@ -159,11 +159,17 @@ class Slots:
         num_envs: int | None = None,
         reward: rewards.Reward | None = None,
         evaluation_policy: Policy | None = None,
+        *,
+        of_scenario: int | None = None,
     ) -> None:
+        """`of_scenario` is the number of slots where neither `num_envs` nor the configuration says one.
+
+        Raises `ValueError` where none of the three does.
+        """
         self.source: Source = source if hasattr(source, "can_restart") else GivenChannel(source)  # type: ignore[assignment]
         self.settings = FaceSettings.from_run(self.source.channel.run)
         self.task = self.settings.task
-        wanted = num_envs or self.settings.slots
+        wanted = num_envs or self.settings.slots or of_scenario
         if not wanted:
             raise ValueError("a scenario does not say how many vehicles sense at a time: give num_envs")
         self.count = int(wanted)
