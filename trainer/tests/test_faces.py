@@ -12,7 +12,7 @@ import caraware.envs
 import gymnasium
 import numpy as np
 import pytest
-from caraware.envs import CarAwareParallelEnv, CarAwareVecEnv, CarAwareVectorEnv, SimulationError, make
+from caraware.envs import CarAwareParallelEnv, CarAwareVecEnv, CarAwareVectorEnv, SimulationError, Transition, make
 from caraware.envs.outside import LINE
 from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.env_checker import data_equivalence as equal
@@ -204,6 +204,26 @@ def test_every_face_draws_the_map_with_its_vehicles() -> None:
         whole = parallel.render()
         assert whole is not None and whole.shape == images[0].shape and others(whole) > 30
         assert CarAwareParallelEnv(simulation).render() is None
+
+
+@pytest.mark.parametrize(("fields", "drawn"), [("driver", True), (["user_1_x", "user_1_y", "speed"], False)])
+def test_vehicles_that_a_hero_observes_are_drawn_where_the_observation_says_all_of_them(
+    fields: object, drawn: bool
+) -> None:
+    settings = {"traffic.others": 30, "observation.fields": fields}
+    env = gymnasium.make("CarAware/Driving-v0", set=settings, seed=1, render_mode="rgb_array", reward=nothing)
+    env.reset(seed=1)
+    for _ in range(10):
+        env.step(np.zeros(2, np.float32))
+    image = env.render()
+    assert isinstance(image, np.ndarray) and chosen(image) > 10
+    assert (coloured(image, range(235, 256), range(230, 256)) > 10) == drawn
+    env.close()
+
+
+def nothing(obs: Transition, action: np.ndarray) -> np.ndarray:
+    """A reward of 0: the task's own needs fields of the route."""
+    return np.zeros(len(action))
 
 
 def test_agents_of_slots_carry_sumos_ids_and_their_episodes_follow_in_one_world() -> None:

@@ -26,6 +26,8 @@ SHORTEST_M = 0.1
 """A place of the observation without a vehicle has length 0, give or take the steps of a normalised f32."""
 SMALLEST_PX = 9.0
 """A vehicle is drawn at least this long, however large the map is."""
+SEEN_FIELDS = ("x", "y", "cos", "sin", "length", "width")
+"""What an observation must hold of a vehicle that is to be drawn: `user_1_x` and so on, as docs/driving.md has them."""
 GROUND, ROAD, PATH = "#e3e6d8", "#5c6066", "#c9c5bd"
 VEHICLE, CHOSEN, SEEN = "#2f6fd6", "#d62f2f", "#f2f2ee"
 """Colours: of vehicles with a slot, of the one whose image it is, and of the vehicles that they see."""
@@ -98,10 +100,9 @@ def _seen(rows: Rows, mask: BoolArray) -> list[tuple[Float64Array, float, tuple[
     held = np.flatnonzero(mask)
     seen: list[tuple[Float64Array, float, tuple[float, float]]] = []
     x_m, y_m, yaw_rad = rows.truth[held, :3].astype(np.float64).T
-    for number in takewhile(lambda number: rows.settings.fields.has(f"user_{number}_x"), count(1)):
-        ahead, left, cos, sin, length, width = (
-            rows.si(f"user_{number}_{name}")[held] for name in ("x", "y", "cos", "sin", "length", "width")
-        )
+    has = rows.settings.fields.has
+    for number in takewhile(lambda number: all(has(f"user_{number}_{name}") for name in SEEN_FIELDS), count(1)):
+        ahead, left, cos, sin, length, width = (rows.si(f"user_{number}_{name}")[held] for name in SEEN_FIELDS)
         east_m = x_m + ahead * np.cos(yaw_rad) - left * np.sin(yaw_rad)
         north_m = y_m + ahead * np.sin(yaw_rad) + left * np.cos(yaw_rad)
         heading_rad = yaw_rad + np.arctan2(sin, cos)
