@@ -112,7 +112,11 @@ fn a_watcher_may_hold_a_whole_queue_of_what_belongs_to_a_tick() {
         run.config.record.manner = manner;
         for channel in [Channel::World, Channel::Observation, Channel::Prediction] {
             let spec = channel.spec();
-            assert!((spec.in_hand)(&run) >= (spec.queue_length)(&run), "{manner:?} {}", spec.name);
+            assert!(
+                (spec.in_hand)(&run) >= (spec.queue_length)(&run),
+                "{manner:?} {}",
+                spec.name
+            );
         }
     }
 }

@@ -71,7 +71,7 @@ pub enum Subcommands {
     Control(ControlArgs),
     /// End a run in order: the trainer writes a checkpoint and a report
     Stop {
-        /// Name of the run; may be left out if only one is alive
+        /// Name of the run, or its directory; may be left out if only one is alive
         run: Option<String>,
     },
     /// Watch a live run: map, vehicles, estimates, point clouds and figures, in a window or a browser
@@ -192,7 +192,7 @@ Every command takes effect at a tick, which the answer names. The run's commands
 /// Arguments of `control`.
 #[derive(Debug, Args, Clone)]
 pub struct ControlArgs {
-    /// Name of the run; may be left out if only one is alive
+    /// Name of the run, or its directory; may be left out if only one is alive
     #[arg(long, global = true, value_name = "NAME")]
     pub run: Option<String>,
     /// Environment of the run [default: all of them]
@@ -266,7 +266,7 @@ pub enum SwitchState {
 /// Arguments of `handover`.
 #[derive(Debug, Args, Clone)]
 pub struct HandoverArgs {
-    /// Name of the run; may be left out if only one is alive
+    /// Name of the run, or its directory; may be left out if only one is alive
     pub run: Option<String>,
     /// Change one setting of the trainer, e.g. --set trainer.learning_rate=0.001 (repeatable)
     #[arg(long, value_name = "KEY=VALUE")]
@@ -479,7 +479,7 @@ pub struct ReplayArgs {
 /// Arguments of `record`.
 #[derive(Debug, Args, Clone)]
 pub struct RecordArgs {
-    /// Name of the run; may be left out if only one is alive
+    /// Name of the run, or its directory; may be left out if only one is alive
     pub run: Option<String>,
     /// The new file [default: recording.mcap in the run's directory, or the next free name]
     #[arg(long, value_name = "FILE")]

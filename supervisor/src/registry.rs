@@ -366,37 +366,102 @@ pub fn is_alive(run_dir: &Path) -> bool {
     entries().iter().any(is_there)
 }
 
-/// The live run called `name`, or the only live run if `name` is `None`.
+/// The live run called `name`, or the only live run if `name` is `None`. A name may also be the run's directory. Of several runs with a
+/// name the one in `runs/` of this directory is meant.
 ///
 /// # Errors
-/// No such run is alive, or several are and `name` is `None`.
+/// No such run is alive, or several are.
 pub fn find(name: Option<&str>) -> Result<RunFile, Exit> {
     let mut runs: Vec<RunFile> = entries()
         .into_iter()
         .filter(|entry| entry.alive)
         .filter_map(|entry| entry.run)
         .collect();
-    let names = runs.iter().map(|run| run.name.clone()).collect::<Vec<_>>().join(", ");
-    if let Some(name) = name {
-        runs.retain(|run| run.name == name);
-    }
-    match (runs.len(), name) {
-        (1, _) => runs.pop().ok_or_else(|| Exit::run("no run", "")),
-        (0, Some(name)) => Err(Exit::config(
-            format!("no run named `{name}` is alive"),
-            format!("alive: {}", if names.is_empty() { "none" } else { &names }),
-        )),
-        (0, None) => Err(Exit::config("no run is alive", "start one with `caraware train`")),
-        _ => Err(Exit::config(
-            "several runs are alive",
-            format!("name one of them: {names}"),
-        )),
+    let places: Vec<(&str, &Path)> = runs
+        .iter()
+        .map(|run| (run.name.as_str(), run.run_dir.as_path()))
+        .collect();
+    let here = std::env::current_dir().unwrap_or_default();
+    let chosen = choose(&places, name, &here)?;
+    Ok(runs.swap_remove(chosen))
+}
+
+/// Which of the runs, given by name and directory, is meant by `name` in the directory `here`.
+fn choose(runs: &[(&str, &Path)], name: Option<&str>, here: &Path) -> Result<usize, Exit> {
+    let listed = |(name, directory): &(&str, &Path)| {
+        let is_repeated = runs.iter().filter(|(other, _)| other == name).count() > 1;
+        if is_repeated {
+            directory.display().to_string()
+        } else {
+            (*name).to_owned()
+        }
+    };
+    let all = || runs.iter().map(listed).collect::<Vec<_>>().join(", ");
+    let Some(name) = name else {
+        return match runs {
+            [_] => Ok(0),
+            [] => Err(Exit::config("no run is alive", "start one with `caraware train`")),
+            _ => Err(Exit::config(
+                "several runs are alive",
+                format!("name one of them: {}", all()),
+            )),
+        };
+    };
+    let of_name: Vec<usize> = (0..runs.len()).filter(|place| runs[*place].0 == name).collect();
+    let within = |directory: PathBuf| {
+        let directory = std::fs::canonicalize(&directory).unwrap_or(directory);
+        runs.iter().position(|(_, path)| *path == directory)
+    };
+    match of_name[..] {
+        [only] => Ok(only),
+        [] => within(here.join(name)).ok_or_else(|| {
+            Exit::config(
+                format!("no run named `{name}` is alive"),
+                format!("alive: {}", if runs.is_empty() { "none".into() } else { all() }),
+            )
+        }),
+        _ => within(here.join("runs").join(name)).ok_or_else(|| {
+            Exit::config(
+                format!("several runs named `{name}` are alive"),
+                format!("give the directory of one of them: {}", all()),
+            )
+        }),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_run_is_meant_by_its_name_by_its_directory_or_by_the_directory_that_one_is_in() {
+        let [here, there] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+        let directory = |base: &tempfile::TempDir, name: &str| {
+            let path = base.path().join("runs").join(name);
+            std::fs::create_dir_all(&path).unwrap();
+            std::fs::canonicalize(path).unwrap()
+        };
+        let paths = [
+            directory(&here, "town-1"),
+            directory(&there, "town-1"),
+            directory(&there, "other"),
+        ];
+        let runs: Vec<(&str, &Path)> = ["town-1", "town-1", "other"]
+            .into_iter()
+            .zip(paths.iter().map(PathBuf::as_path))
+            .collect();
+        let chosen = |runs: &[(&str, &Path)], name: Option<&str>, at: &Path| choose(runs, name, at).ok();
+        assert_eq!(chosen(&runs, Some("other"), here.path()), Some(2));
+        assert_eq!(chosen(&runs, Some("town-1"), here.path()), Some(0));
+        assert_eq!(chosen(&runs, Some("town-1"), there.path()), Some(1));
+        assert_eq!(chosen(&runs, paths[1].to_str(), here.path()), Some(1));
+        assert_eq!(chosen(&runs, Some("runs/town-1"), there.path()), Some(1));
+        assert_eq!(chosen(&runs[2..], None, here.path()), Some(0));
+        let refusal = |name, at: &Path| format!("{:?}", choose(&runs, name, at).unwrap_err());
+        assert!(refusal(Some("third"), here.path()).contains("no run named `third`"));
+        assert!(refusal(Some("town-1"), Path::new("/")).contains("several runs named `town-1`"));
+        assert!(refusal(None, here.path()).contains("several runs are alive"));
+    }
 
     /// Makes a directory called `name` as a dead run leaves it; `change` alters the marker.
     fn make_dead(base: &Path, name: &str, change: impl FnOnce(&mut RunMarker)) -> PathBuf {

@@ -216,7 +216,7 @@ pub fn stop(name: Option<&str>) -> Result<(), Exit> {
     let deadline = Instant::now() + STOP_WITHIN;
     while Instant::now() < deadline {
         wait(Duration::from_millis(100));
-        if registry::find(Some(&run.name)).is_err() {
+        if !registry::is_alive(&run.run_dir) {
             println!("{} has stopped; its results are in {}", run.name, run.run_dir.display());
             return Ok(());
         }

@@ -210,7 +210,8 @@ impl Supervisor {
             {
                 continue;
             }
-            let was_killed = ended.status.signal().is_some();
+            // A simulator that ends by itself was asked to, by a signal that was not the run's.
+            let was_killed = ended.status.signal().is_some() || ended.row.is_simulator() && ended.status.success();
             let has_reported = self.processes.has_reported_failure(index);
             let left = self.handovers.is_trainer_leaving() && ended.status.success();
             match ended.on_exit {
@@ -292,6 +293,7 @@ impl Supervisor {
     fn cause_of(&self, ended: &EndedProcess) -> EndCause {
         match self.killed_stalls.contains(&(ended.row.process, ended.env_index)) {
             true => EndCause::OwnFault,
+            false if ended.row.is_simulator() && ended.status.success() => EndCause::Kill,
             false => EndCause::of(ended.status),
         }
     }

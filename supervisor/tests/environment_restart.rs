@@ -72,7 +72,12 @@ fn kill_while(workplace: &Workplace, name: &str, run: &mut Child, most: usize) -
         }
         let pids = simulators(workplace, name);
         if let Some(pid) = pids.get((random >> 40) as usize % pids.len().max(1)) {
-            killed += usize::from(kill_process(*pid, Signal::KILL).is_ok());
+            // A process that is asked to end ends by itself, with success.
+            let signal = match random >> 50 & 1 {
+                0 => Signal::KILL,
+                _ => Signal::TERM,
+            };
+            killed += usize::from(kill_process(*pid, signal).is_ok());
         }
     }
     killed

@@ -37,7 +37,7 @@ class Environment:
         self.trips = TripCounts()
         """How the trips of heroes ended."""
         self.answered: tuple[Observation, Tensor] | None = None
-        """The newest tick with its actions, in a world that waits for them."""
+        """The newest tick with its actions, in a task that draws them tick by tick."""
         self._catches_up = True
 
     def is_awaited(self, obs: Observation) -> bool:

@@ -234,9 +234,10 @@ class TrainingLoop:
     def _publish_actions(self, environment: Environment, obs: Observation, actions: Tensor) -> None:
         """Publish the actions of one tick, unless the world has gone on with what a predecessor drew."""
         environment.trips.add(obs)
+        # Kept in any case: if the world waits for this answer after all, it is sent as soon as no further tick comes.
+        environment.answered = (obs, actions)
         if environment.is_awaited(obs):
             environment.channel.publish_predictions(obs, actions, self._updates())
-            environment.answered = (obs, actions)
 
     def _answer_again(self) -> None:
         """Publish the newest actions again: a simulator that was started again may have lost them."""
