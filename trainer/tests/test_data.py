@@ -161,6 +161,19 @@ def test_parquet_and_csv_have_the_values_of_the_messages(recording: Recording, r
         assert np.float32(line["truth_x_m"]) == np.float32(columns["truth_x_m"][row])
 
 
+def test_an_interrupted_export_of_two_jobs_continues_as_a_command(run_dir: Path, tmp_path: Path) -> None:
+    # What a kill leaves: a part that is not whole, which is a directory in some formats.
+    (tmp_path / ".episode-00001.parquet.partial").mkdir()
+    module = [sys.executable, "-m", "caraware.data.export", str(run_dir), "--to", "parquet", "--jobs", "2"]
+    ran = subprocess.run([*module, "--output", str(tmp_path)], capture_output=True, text=True, timeout=300)
+    assert ran.returncode == 0, ran.stderr
+    assert "3 episodes written as Parquet" in ran.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "README.md",
+        *(f"episode-{number:05}.parquet" for number in range(3)),
+    ]
+
+
 def test_sumo_reads_the_floating_car_data_and_it_lies_on_sumos_own_positions(
     recording: Recording, run_dir: Path, tmp_path: Path
 ) -> None:

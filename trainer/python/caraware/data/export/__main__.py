@@ -7,58 +7,12 @@ import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from caraware.data.export import fcd, opv2v, tables
 from caraware.data.export.card import write_card
-from caraware.data.recording import Episode, Recording, RecordingError, open_recording
-
-
-@dataclass(frozen=True)
-class ExportFormat:
-    """A format: its name for people, what a part holds, its ending, and what writes the part of an episode."""
-
-    title: str
-    meaning: str
-    ending: str
-    write: Callable[[Recording, Episode, Path], None]
-
-
-FORMATS = {
-    "parquet": ExportFormat("Parquet", tables.MEANING, "parquet", tables.write_parquet),
-    "csv": ExportFormat("CSV", tables.MEANING, "csv", tables.write_csv),
-    "fcd": ExportFormat(
-        "SUMO floating car data",
-        "Every road user at every tick, in SUMO's conventions: front bumper, degrees clockwise from north.",
-        "fcd.xml",
-        fcd.write_fcd,
-    ),
-    "opv2v": ExportFormat(
-        "OPV2V",
-        "Cooperative perception: a directory for each agent with its points, poses and labels, in CARLA's frame.",
-        "opv2v",
-        opv2v.write_opv2v,
-    ),
-}
-"""Every format of `--to`."""
-
-
-def part_name(episode: int, ending: str) -> str:
-    """Name of the part of an episode."""
-    return f"episode-{episode:05}.{ending}"
-
-
-def write_part(recording_path: Path, format_name: str, number: int, directory: Path) -> str:
-    """Write the part of one episode under another name, and rename it when it is whole."""
-    recording, chosen = open_recording(recording_path), FORMATS[format_name]
-    episode = next(episode for episode in recording.episodes() if episode.number == number)
-    name = part_name(number, chosen.ending)
-    partial = directory / f".{name}.partial"
-    chosen.write(recording, episode, partial)
-    os.replace(partial, directory / name)
-    return name
+from caraware.data.export.parts import FORMATS, part_name, write_part
+from caraware.data.recording import RecordingError, open_recording
 
 
 def export(recording_path: Path, format_name: str, directory: Path, jobs: int, show: Callable[[int, int], None]) -> int:

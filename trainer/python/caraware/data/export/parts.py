@@ -1,0 +1,72 @@
+"""Parts of an export, one for each episode: the table of formats, and what worker processes call.
+
+A spawned process does not import `__main__`, so what it calls lies here.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from caraware.data.export import fcd, opv2v, tables
+from caraware.data.recording import Episode, Recording, open_recording
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format: its name for people, what a part holds, its ending, and what writes the part of an episode."""
+
+    title: str
+    meaning: str
+    ending: str
+    write: Callable[[Recording, Episode, Path], None]
+
+
+FORMATS = {
+    "parquet": ExportFormat("Parquet", tables.MEANING, "parquet", tables.write_parquet),
+    "csv": ExportFormat("CSV", tables.MEANING, "csv", tables.write_csv),
+    "fcd": ExportFormat(
+        "SUMO floating car data",
+        "Every road user at every tick, in SUMO's conventions: front bumper, degrees clockwise from north.",
+        "fcd.xml",
+        fcd.write_fcd,
+    ),
+    "opv2v": ExportFormat(
+        "OPV2V",
+        "Cooperative perception: a directory for each agent with its points, poses and labels, in CARLA's frame.",
+        "opv2v",
+        opv2v.write_opv2v,
+    ),
+}
+"""Every format of `--to`."""
+
+
+def part_name(episode: int, ending: str) -> str:
+    """Name of the part of an episode."""
+    return f"episode-{episode:05}.{ending}"
+
+
+def write_part(recording_path: Path, format_name: str, number: int, directory: Path) -> str:
+    """Write the part of one episode under another name, and rename it when it is whole; return its name.
+
+    What an interrupted export left of it is removed first. Raises `RecordingError` and `OSError`.
+    """
+    recording, chosen = open_recording(recording_path), FORMATS[format_name]
+    episode = next(episode for episode in recording.episodes() if episode.number == number)
+    name = part_name(number, chosen.ending)
+    partial = directory / f".{name}.partial"
+    _remove(partial)
+    chosen.write(recording, episode, partial)
+    os.replace(partial, directory / name)
+    return name
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or a directory, if there is one."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
