@@ -120,9 +120,12 @@ def main(run_file: str) -> int:
     """Take over the run, and learn until it ends or is stopped."""
     role = HandoverRole.from_environment()
     run: RunFile = json.loads(Path(run_file).read_text())
+    if role.gets_ready:
+        fitting_checkpoint(run)  # where it does not fit, the old trainer continues
+        if not role.wait_for_turn(claims(run)):
+            return 0
+    # The old trainer has left its last checkpoint. A restart chooses the same one, so that the saved model fits it.
     checkpoint = fitting_checkpoint(run)
-    if role.gets_ready and not role.wait_for_turn(claims(run)):
-        return 0
     # Ticks since the last commit are not learnt: a successor gets them again.
     signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
     channel = Channel(run_file)
@@ -133,7 +136,8 @@ def main(run_file: str) -> int:
         take_networks(model, checkpoint)
     if (own := channel.own_tick()) is not None:
         model.set_parameters(str(model_file(folder, own)))
-    print(f"Stable-Baselines3 takes over at tick {channel.first_tick}", file=sys.stderr, flush=True)
+    networks = f"the networks of {checkpoint.name}" if checkpoint else "new networks"
+    print(f"Stable-Baselines3 takes over at tick {channel.first_tick} with {networks}", file=sys.stderr, flush=True)
     try:
         model.learn(sys.maxsize, callback=SaveAndCommit(env, folder))
     except RunEndedError:
