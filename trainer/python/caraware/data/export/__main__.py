@@ -44,6 +44,8 @@ def export(recording_path: Path, format_name: str, directory: Path, jobs: int, s
             for part in as_completed(parts):
                 part.result()
                 show(done := done + 1, len(names))
+    if chosen.join is not None:
+        chosen.join(recording, directory, list(names.values()))
     write_card(recording, directory, chosen.title, chosen.meaning, list(names.values()))
     return len(due)
 

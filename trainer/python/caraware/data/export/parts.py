@@ -11,18 +11,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from caraware.data.export import fcd, opv2v, tables
+from caraware.data.export import fcd, minari, opv2v, tables
 from caraware.data.recording import Episode, Recording, open_recording
 
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """A format: its name for people, what a part holds, its ending, and what writes the part of an episode."""
+    """A format: its name for people, what it holds, the ending of its parts, and what writes the part of an episode."""
 
     title: str
     meaning: str
     ending: str
     write: Callable[[Recording, Episode, Path], None]
+    join: Callable[[Recording, Path, list[str]], None] | None = None
+    """Makes one data set of all parts in a directory, for formats that need it."""
 
 
 FORMATS = {
@@ -33,6 +35,13 @@ FORMATS = {
         "Every road user at every tick, in SUMO's conventions: front bumper, degrees clockwise from north.",
         "fcd.xml",
         fcd.write_fcd,
+    ),
+    "minari": ExportFormat(
+        "Minari",
+        "Offline reinforcement learning: a trajectory of observations, actions and rewards for each vehicle.",
+        "minari",
+        minari.write_minari,
+        minari.join_parts,
     ),
     "opv2v": ExportFormat(
         "OPV2V",

@@ -12,6 +12,7 @@ import torch
 from caraware import _native
 from caraware.data.names import RoadUsers
 from caraware.data.recording import Episode, Recording
+from caraware.ipc.arrays import Float32Array
 from caraware.ipc.layout import SENSOR_BITS
 from caraware.ipc.run_file import setting
 from caraware.tasks import rewards
@@ -95,28 +96,36 @@ def _predictions(recording: Recording, ticks: Any, lengths: Any, kept: Any, trut
     """
     if "prediction" not in recording.channels:
         return {}
-    answers = _by_tick(recording, "prediction", ticks, lengths)
+    answers = by_tick(recording, "prediction", ticks, lengths)
     columns: Columns = {}
     if answers is not None and str(recording.run["config"]["task"]["kind"]) == "localisation" and answers.shape[1] == 2:
         predicted = answers[kept]
         columns |= {"predicted_x_m": predicted[:, 0], "predicted_y_m": predicted[:, 1]}
-        distance_m = rewards.distance_m(torch.from_numpy(predicted), torch.from_numpy(np.array(truth)))
-        name = setting(recording.run, "trainer.reward", rewards.RewardName)
-        scale_m = setting(recording.run, "trainer.reward_scale_m", float)
-        columns |= {
-            "predicted_error_m": distance_m.numpy(),
-            "reward": rewards.REWARDS[name](distance_m, scale_m).numpy(),
-        }
+        columns["predicted_error_m"], columns["reward"] = localisation_reward(recording, predicted, truth)
     elif answers is not None:
         columns |= {f"action_{place}": answers[kept, place] for place in range(answers.shape[1])}
-    estimates = _by_tick(recording, "estimate_m", ticks, lengths)
+    estimates = by_tick(recording, "estimate_m", ticks, lengths)
     if estimates is not None:
         columns |= {"ekf_x_m": estimates[kept, 0], "ekf_y_m": estimates[kept, 1]}
     return columns
 
 
-def _by_tick(recording: Recording, name: str, ticks: Any, lengths: Any) -> Any:
-    """Rows of a section of `prediction` beside those of the observations of `ticks`, which have `lengths` slots."""
+def localisation_reward(recording: Recording, predicted: Any, truth: Any) -> tuple[Float32Array, Float32Array]:
+    """Distances (m) of positions [n, 2] to the truth [n, 4], and the rewards of the run: f32 [n] each.
+
+    Raises `ConfigError` for a reward that this program does not know.
+    """
+    distance_m = rewards.distance_m(torch.from_numpy(predicted), torch.from_numpy(np.array(truth)))
+    name = setting(recording.run, "trainer.reward", rewards.RewardName)
+    scale_m = setting(recording.run, "trainer.reward_scale_m", float)
+    return distance_m.numpy(), rewards.REWARDS[name](distance_m, scale_m).numpy()
+
+
+def by_tick(recording: Recording, name: str, ticks: Any, lengths: Any) -> Any:
+    """Rows of a section of `prediction` beside those of the observations of `ticks`, which have `lengths` slots.
+
+    f32 [sum of `lengths`, …], not-a-number where a tick was not answered; None if the recording has no such row.
+    """
     rows, offsets = recording.rows("prediction", name), recording.offsets("prediction", name)
     if len(rows) == 0:
         return None
