@@ -420,9 +420,9 @@ pub struct GenerateArgs {
 pub struct ExportArgs {
     /// A recording: its file, or the directory or name of its run
     pub recording: PathBuf,
-    /// Format: tables of vehicle-ticks (parquet, csv), SUMO's floating car data (fcd), cooperative perception (opv2v), or offline
-    /// reinforcement learning (minari)
-    #[arg(long, value_name = "FORMAT", value_parser = ["parquet", "csv", "fcd", "opv2v", "minari"])]
+    /// Format: tables of vehicle-ticks (parquet, csv), SUMO's floating car data (fcd), cooperative perception (opv2v), points
+    /// and images with boxes (kitti), or offline reinforcement learning (minari)
+    #[arg(long, value_name = "FORMAT", value_parser = ["parquet", "csv", "fcd", "opv2v", "kitti", "minari"])]
     pub to: String,
     /// Directory to write to; parts that it has are kept [default: export-FORMAT beside the recording]
     #[arg(long, value_name = "DIRECTORY")]

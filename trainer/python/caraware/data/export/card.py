@@ -8,7 +8,7 @@ from typing import Any
 from caraware import _native
 from caraware.data.recording import Recording
 
-SENSORS = ("gnss", "imu", "speed_steering", "lidar", "ultrasonic")
+SENSORS = ("gnss", "imu", "speed_steering", "lidar", "ultrasonic", "camera")
 """Tables of the configuration that describe sensors."""
 
 

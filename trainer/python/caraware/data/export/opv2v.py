@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from caraware.data.export.scans import forward_m, require_channels
 from caraware.data.names import Kind
 from caraware.data.recording import Array, Episode, Message, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
@@ -41,10 +42,7 @@ def world_from_pose(values: list[float]) -> Float64Array:
 
 def _points(scan: np.void, points: Array) -> Array:
     """f32 [count, 3]: points in the sensor's left-handed frame, x forward, y right, z up."""
-    position_m = points["position_m"]
-    if scan["axes"] == 1:  # the paper's: y backward, x left, z down
-        position_m = np.stack((-position_m[:, 1], position_m[:, 0], -position_m[:, 2]), 1)
-    left_handed: Array = position_m * np.array([1, -1, 1], np.float32)
+    left_handed: Array = forward_m(scan, points) * np.array([1, -1, 1], np.float32)
     return left_handed
 
 
@@ -108,9 +106,7 @@ def _yaml(scan: np.void, points: Array, states: Array) -> str:
 
 def write_opv2v(recording: Recording, episode: Episode, path: Path) -> None:
     """Write one episode. Raises `RecordingError` if the recording has no `world` or no `pointcloud`."""
-    for channel in ("world", "pointcloud"):
-        if channel not in recording.channels:
-            raise RecordingError(f"{recording.path} has no channel {channel!r}: record it with record.channels")
+    require_channels(recording, "world", "pointcloud")
     path.mkdir(parents=True)
     world: dict[int, Array] = {}
     scans: list[Message] = []

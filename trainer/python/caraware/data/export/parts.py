@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from caraware.data.export import fcd, minari, opv2v, tables
+from caraware.data.export import fcd, kitti, minari, opv2v, tables
 from caraware.data.recording import Episode, Recording, open_recording
 
 
@@ -35,6 +35,12 @@ FORMATS = {
         "Every road user at every tick, in SUMO's conventions: front bumper, degrees clockwise from north.",
         "fcd.xml",
         fcd.write_fcd,
+    ),
+    "kitti": ExportFormat(
+        "KITTI",
+        "Objects: a directory for each vehicle with a LIDAR, with points, calibration, labels and images.",
+        "kitti",
+        kitti.write_kitti,
     ),
     "minari": ExportFormat(
         "Minari",
