@@ -13,7 +13,11 @@ use ipc_schema::{
     run::Mode,
 };
 
-use crate::{environment::Environment, live_table::LiveTable};
+use crate::{
+    environment::Environment,
+    live_table::LiveTable,
+    phase::{PhaseShares, RunPhase},
+};
 
 /// Time between two lines when there is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
@@ -42,6 +46,19 @@ pub struct ProgressDisplay {
     is_silent: bool,
     last_line: Instant,
     last_text: String,
+    shares: PhaseShares,
+    /// When the first tick of this start was seen, and what had been made before it.
+    begin: Option<ProgressBegin>,
+    /// Ticks of all environments, and since when they are so many.
+    newest: Option<(u64, Instant)>,
+}
+
+/// Where the rates of a run begin: a resumed one continues the counts of its earlier parts.
+#[derive(Debug, Clone, Copy)]
+struct ProgressBegin {
+    at: Instant,
+    steps: u64,
+    ticks: u64,
 }
 
 impl ProgressDisplay {
@@ -57,6 +74,9 @@ impl ProgressDisplay {
             is_silent: false,
             last_line: Instant::now(),
             last_text: String::new(),
+            shares: PhaseShares::new(),
+            begin: None,
+            newest: None,
         }
     }
 
@@ -68,6 +88,9 @@ impl ProgressDisplay {
             is_silent: true,
             last_line: Instant::now(),
             last_text: String::new(),
+            shares: PhaseShares::new(),
+            begin: None,
+            newest: None,
         }
     }
 
@@ -83,7 +106,7 @@ impl ProgressDisplay {
             self.show_table(&table);
             return;
         }
-        let view = ProgressView::read(environments, ready_at, notes.join(", "));
+        let view = self.view(environments, ready_at, notes);
         if let Some(bar) = &self.bar {
             if bar.length() != view.total_ticks && view.total_ticks.is_some() {
                 bar.set_style(style());
@@ -96,6 +119,35 @@ impl ProgressDisplay {
             notice(&view.line());
         }
         self.last_text = view.line();
+    }
+
+    fn view(&mut self, environments: &[Environment], ready_at: Option<Instant>, notes: &[String]) -> ProgressView {
+        let mut view = ProgressView::read(environments);
+        if ready_at.is_some() && view.all_ticks > 0 {
+            let now = Instant::now();
+            if self.newest.is_none_or(|(ticks, _)| ticks != view.all_ticks) {
+                self.newest = Some((view.all_ticks, now));
+            }
+            let silence = self
+                .newest
+                .map_or(Duration::ZERO, |(_, since)| now.saturating_duration_since(since));
+            let phase = RunPhase::of(environments, view.is_evaluation, silence);
+            self.shares.count(phase, now);
+            view.shares = self.shares.text();
+            if phase != RunPhase::Simulating {
+                view.note = phase.name().to_owned();
+            }
+            let begin = *self.begin.get_or_insert(ProgressBegin {
+                at: now,
+                steps: view.steps,
+                ticks: view.all_ticks,
+            });
+            view.set_rates(&begin, now);
+        }
+        if !notes.is_empty() {
+            view.note = notes.join(", ");
+        }
+        view
     }
 
     /// Shows the errors of each vehicle: a table on a terminal, otherwise a line.
@@ -132,11 +184,17 @@ fn style() -> ProgressStyle {
 
 /// The figures that are shown.
 struct ProgressView {
-    /// What is wrong at present; empty if nothing is.
+    /// What is wrong at present, or what the run does but to simulate; empty if there is nothing to say.
     note: String,
+    /// Shares of the time that the run has spent on what else it does.
+    shares: String,
+    is_evaluation: bool,
     /// Updates of a policy so far.
     updates: u64,
     ticks: u64,
+    /// Of all environments.
+    all_ticks: u64,
+    tick_s: f64,
     total_ticks: Option<u64>,
     episode: u64,
     sim_time_s: f64,
@@ -156,7 +214,7 @@ struct ProgressView {
 
 impl ProgressView {
     /// Sums the boards of all environments. Tick, episode and simulated time are those of the slowest environment.
-    fn read(environments: &[Environment], ready_at: Option<Instant>, note: String) -> Self {
+    fn read(environments: &[Environment]) -> Self {
         let all = |process: Process| {
             let healths = environments
                 .iter()
@@ -188,20 +246,21 @@ impl ProgressView {
         if first.is_some_and(|first| first.run.mode.has_trainer()) {
             lags.push(behind(&all(Process::Trainer)));
         }
-        // Rates since all processes were ready.
-        let tick_s = first.map_or(0.0, |first| first.run.config.run.tick_s);
-        let wall_s = ready_at.map_or(0.0, |ready| ready.elapsed().as_secs_f64());
         #[expect(clippy::cast_precision_loss, reason = "for display")]
-        let (steps, sim_time_s) = (sensing.vehicle_steps as f64, sensing.sim_time_ns as f64 * 1e-9);
-        #[expect(clippy::cast_precision_loss, reason = "for display")]
-        let simulated_s = tick_s * sensings.iter().map(|health| health.ticks).sum::<u64>() as f64;
-        let per_second = |amount: f64| if wall_s > 0.0 { amount / wall_s } else { 0.0 };
+        let sim_time_s = sensing.sim_time_ns as f64 * 1e-9;
         let episodes = first.map(|first| first.run.episodes()).unwrap_or_default();
         let total: Option<u64> = episodes.iter().map(|episode| episode.ticks).sum();
+        let now = usize::try_from(sensing.episode)
+            .ok()
+            .and_then(|index| episodes.get(index));
         Self {
-            note,
+            note: String::new(),
+            shares: String::new(),
+            is_evaluation: now.is_some_and(|episode| episode.evaluation),
             updates: training.updates,
             ticks: sensing.ticks,
+            all_ticks: sensings.iter().map(|health| health.ticks).sum(),
+            tick_s: first.map_or(0.0, |first| first.run.config.run.tick_s),
             total_ticks: total,
             episode: sensing.episode,
             sim_time_s,
@@ -210,12 +269,25 @@ impl ProgressView {
             arrived: sources.iter().map(|health| health.arrived).sum(),
             lags,
             steps: sensing.vehicle_steps,
-            steps_per_s: per_second(steps),
-            real_time_factor: per_second(simulated_s),
+            steps_per_s: 0.0,
+            real_time_factor: 0.0,
             policy_std: training.policy_std,
             reward: training.reward,
             metrics: training.metrics,
         }
+    }
+
+    /// Rates since `begin`.
+    fn set_rates(&mut self, begin: &ProgressBegin, now: Instant) {
+        let wall_s = now.saturating_duration_since(begin.at).as_secs_f64();
+        if wall_s <= 0.0 {
+            return;
+        }
+        #[expect(clippy::cast_precision_loss, reason = "for display")]
+        let [steps, ticks] = [(self.steps, begin.steps), (self.all_ticks, begin.ticks)]
+            .map(|(now, before)| now.saturating_sub(before) as f64);
+        self.steps_per_s = steps / wall_s;
+        self.real_time_factor = self.tick_s * ticks / wall_s;
     }
 
     fn text(&self) -> String {
@@ -232,7 +304,14 @@ impl ProgressView {
             true => String::new(),
             false => format!("[{}]  ", self.note),
         };
-        format!("{note}episode {:3}  {learning}  {rate}  {traffic}", self.episode)
+        let shares = match self.shares.is_empty() {
+            true => String::new(),
+            false => format!("  {}", self.shares),
+        };
+        format!(
+            "{note}episode {:3}  {learning}  {rate}  {traffic}{shares}",
+            self.episode
+        )
     }
 
     fn rate(&self) -> String {

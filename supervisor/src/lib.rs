@@ -18,6 +18,7 @@ pub mod import;
 pub mod install;
 pub mod live_table;
 pub mod maps;
+pub mod phase;
 pub mod prepare;
 pub mod processes;
 pub mod record;

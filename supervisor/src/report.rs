@@ -204,6 +204,24 @@ fn newest_checkpoint(run: &RunFile) -> Option<PathBuf> {
     Some(folder.join(name.trim()))
 }
 
+/// Share of the run's ticks that this start has made: a resumed run continues the counts of its earlier parts, but not their time.
+fn share_made(runs: &[RunFile], sensings: &[Sensing]) -> f64 {
+    let made = |(run, sensing): (&RunFile, &Sensing)| {
+        let begin = run
+            .beginning
+            .as_ref()
+            .map_or(0, |beginning| beginning.start.episode_tick);
+        (sensing.first_tick + sensing.ticks)
+            .saturating_sub(begin)
+            .min(sensing.ticks)
+    };
+    let made: u64 = runs.iter().zip(sensings).map(made).sum();
+    let all: u64 = sensings.iter().map(|sensing| sensing.ticks).sum();
+    #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+    let share = made as f64 / all.max(1) as f64;
+    share
+}
+
 /// Assembles the report and writes it.
 ///
 /// # Errors
@@ -239,9 +257,10 @@ pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFig
         Mode::Train | Mode::Play => [trainer.lost_ticks, trainer.duplicated_ticks],
         Mode::Simulate => [Some(0); 2],
     };
+    let share = share_made(&runs, &sensings);
     #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
     let (rate, simulated_s) = (
-        env_steps.map(|steps| steps as f64 / outcome.wall_s),
+        env_steps.map(|steps| share * steps as f64 / outcome.wall_s),
         sensing.ticks as f64 * run.config.run.tick_s,
     );
     let mut report = json!({
@@ -274,7 +293,7 @@ pub fn write(run: &RunFile, outcome: &RunOutcome, housekeeping: &HousekeepingFig
         "vehicle_steps": sensing.observations,
         "ticks": sensing.ticks,
         "simulated_s": simulated_s,
-        "real_time_factor": simulated_s / outcome.wall_s,
+        "real_time_factor": share * simulated_s / outcome.wall_s,
         "beginning": run.beginning,
         "seed": run.seed(),
         "config_hash": run.config_hash,
@@ -542,6 +561,19 @@ fn number(report: &Value, key: &str, digits: usize) -> String {
         .map_or("–".into(), |value| format!("{value:.digits$}"))
 }
 
+/// When the last evaluation was, if the run ended before another one: " after 12000 of 40000 samples".
+fn evaluated_before(report: &Value) -> String {
+    let last = report["trainer"]["evaluations"]
+        .as_array()
+        .and_then(|evaluations| evaluations.last()?["env_steps"].as_u64());
+    match (last, report["env_steps"].as_u64()) {
+        (Some(last), Some(all)) if last < all && report["result"] != "completed" => {
+            format!(" after {last} of {all} samples")
+        }
+        _ => String::new(),
+    }
+}
+
 /// Means of the task's metric for the policy and for the estimators that it is compared with.
 fn errors(report: &Value) -> Vec<String> {
     let Some(metric) = METRICS.iter().find(|metric| report["metric"] == metric.name) else {
@@ -566,8 +598,9 @@ fn errors(report: &Value) -> Vec<String> {
             .filter(|other| other.reference_for == Some(metric.name))
             .map(|other| format!(", {} {}", other.label, error(other.estimator())));
         lines.push(format!(
-            "mean {} on {seeds}: policy {}{}   (policy σ {})",
+            "mean {} on {seeds}{}: policy {}{}   (policy σ {})",
             metric.label,
+            evaluated_before(report),
             error("ppo"),
             references.collect::<String>(),
             number(report, "policy_std", 3)
@@ -598,6 +631,18 @@ fn errors(report: &Value) -> Vec<String> {
 #[allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_evaluation_of_long_ago_is_named_as_such() {
+        let report = |evaluated: u64, result: &str| {
+            let evaluations = [json!({"env_steps": 5}), json!({"env_steps": evaluated})];
+            json!({"env_steps": 40, "result": result, "trainer": {"evaluations": evaluations}})
+        };
+        assert_eq!(evaluated_before(&report(12, "interrupted")), " after 12 of 40 samples");
+        assert_eq!(evaluated_before(&report(40, "interrupted")), "");
+        assert_eq!(evaluated_before(&report(12, "completed")), "");
+        assert_eq!(evaluated_before(&json!({})), "");
+    }
 
     #[test]
     fn the_error_names_an_unreadable_part_and_a_missing_part_is_none() {

@@ -212,7 +212,10 @@ pub fn stop(name: Option<&str>) -> Result<(), Exit> {
         .ok_or_else(|| Exit::run("the run has no supervisor", "`caraware doctor --clean`"))?;
     kill_process(pid, Signal::TERM)
         .map_err(|error| Exit::run(format!("cannot signal process {}: {error}", run.supervisor_pid), ""))?;
-    println!("stopping {}: the trainer writes a checkpoint", run.name);
+    match run.mode.has_trainer() {
+        true => println!("stopping {}: the trainer writes a checkpoint", run.name),
+        false => println!("stopping {}", run.name),
+    }
     let deadline = Instant::now() + STOP_WITHIN;
     while Instant::now() < deadline {
         wait(Duration::from_millis(100));

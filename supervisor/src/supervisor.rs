@@ -460,16 +460,16 @@ impl Supervisor {
 
     /// Asks every process to end and waits; kills the rest after a time limit or a second Ctrl-C.
     fn stop_all(&mut self, ending: &RunEnding) {
+        let what = match self.processes.run().mode.has_trainer() {
+            true => ": the trainer writes a checkpoint",
+            false => "",
+        };
         match ending {
             RunEnding::Completed => {}
-            RunEnding::Interrupted => {
-                display::notice("stopping: the trainer writes a checkpoint (press Ctrl-C again to kill)");
-            }
+            RunEnding::Interrupted => display::notice(&format!("stopping{what} (press Ctrl-C again to kill)")),
             // Nothing has been simulated or learnt yet.
             RunEnding::Failed(_) if self.ready_at.is_none() => return self.processes.kill(),
-            RunEnding::Failed(_) => {
-                display::notice("the run has failed: the trainer writes a checkpoint (press Ctrl-C to kill)");
-            }
+            RunEnding::Failed(_) => display::notice(&format!("the run has failed{what} (press Ctrl-C to kill)")),
         }
         self.processes.terminate();
         let deadline = Instant::now() + STOP_WITHIN;

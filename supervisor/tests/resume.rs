@@ -128,8 +128,17 @@ fn a_resumed_run_ends_with_the_results_of_one_that_was_never_stopped() {
         "{}",
         text(&output)
     );
-    let beginning = workplace.report("cut")["beginning"].clone();
+    let resumed = workplace.report("cut");
+    let beginning = resumed["beginning"].clone();
     assert!(beginning["episode"].as_u64().unwrap() > 0, "{beginning}");
+    // Its rates are those of what it has made itself, its counts those of the whole run.
+    let figure = |key: &str| resumed[key].as_f64().unwrap();
+    let made_s = figure("real_time_factor") * figure("wall_s");
+    let earlier_s = 0.1 * beginning["episode_tick"].as_f64().unwrap();
+    assert!(
+        (made_s - (figure("simulated_s") - earlier_s)).abs() < 0.1,
+        "{made_s}: {resumed:#}"
+    );
     assert!(beginning["committed_ticks"].as_u64().unwrap() > beginning["episode_tick"].as_u64().unwrap());
     assert_eq!(outcome(&workplace, "cut"), expected);
 

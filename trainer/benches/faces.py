@@ -77,7 +77,7 @@ def sb3(simulation: Simulation, seconds: float) -> tuple[float, float]:
 
 def parallel(simulation: Simulation, seconds: float) -> tuple[float, float]:
     """PettingZoo's ParallelEnv."""
-    env, rng = CarAwareParallelEnv(simulation), np.random.default_rng(0)
+    env, rng = CarAwareParallelEnv(simulation, agents="ids"), np.random.default_rng(0)
     env.reset()
 
     def step() -> int:

@@ -357,7 +357,7 @@ mod tests {
                 })
                 .collect();
             let sends: Vec<bool> = (0..radios.len())
-                .map(|radio| (radio + tick as usize) % 3 != 0)
+                .map(|radio| !(radio + tick as usize).is_multiple_of(3))
                 .collect();
             let radio_tick = RadioTick {
                 radios: &radios,
