@@ -38,6 +38,8 @@ pub struct TickPublisher {
     others: RequiredConsumers,
     /// Ticks below this are in the checkpoint: they are made again but not sent.
     committed_ticks: u64,
+    /// The trainer's next answer may be to the newest committed tick, which `sim-core` needs then, as in [`Delivery::shows_again`].
+    shows_committed: bool,
     /// The oldest tick of the journal, as the board has it.
     journal_first: u64,
 }
@@ -59,6 +61,7 @@ impl TickPublisher {
             trainer,
             others: membership.consumers(others, channel)?,
             committed_ticks: membership.run.committed_ticks(),
+            shows_committed: membership.run.restart.is_some() && membership.run.config.drives(),
             journal_first: 0,
         })
     }
@@ -217,7 +220,7 @@ impl TickPublisher {
     /// Keeps the tick in the journal. Returns false if it is not to be sent now.
     fn keep(&mut self, header: &MessageHeader, payload: &[u8]) -> Result<bool, Failure> {
         if header.tick < self.committed_ticks {
-            return Ok(false);
+            return Ok(self.shows_committed && header.tick + 1 == self.committed_ticks);
         }
         let Some(trainer) = &mut self.trainer else {
             return Ok(true);

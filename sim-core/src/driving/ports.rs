@@ -141,9 +141,12 @@ impl HeroPorts {
         {
             return Err(Failure::new(
                 FailureKind::Run,
-                format!("the actions that moved tick {} were not logged", frame.tick),
+                format!(
+                    "the actions that moved tick {} are not in the run's directory, which keeps those of the newest episodes",
+                    frame.tick
+                ),
             )
-            .with_help("free space for the run's directory, then resume the run by its name"));
+            .with_help("let the learner commit more often, or free space for the run's directory"));
         }
         // The first tick of this process begins an episode: no hero has been seen before it.
         let Some(before) = frame

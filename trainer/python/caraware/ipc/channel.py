@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 import numpy as np
 import torch
@@ -36,6 +37,9 @@ ENDED_BY = np.uint32(
     | _native.ENDED_BY_TIME
 )
 """All bits of an observation's flags that say why a hero's trajectory ended."""
+
+ANSWER_AGAIN_S = 0.2
+"""Time without a tick after which the newest actions are sent again. `sim-core` skips what it has."""
 
 
 def _lent_tensor(view: Buffer, slots: int, fields: int) -> Tensor:
@@ -296,6 +300,15 @@ class Neighbours:
         return self._array("vehicle", np.uint32)
 
 
+class _Answer(NamedTuple):
+    """Actions that were sent, until others are."""
+
+    observation: Observation
+    rows: bytes
+    policy_version: int
+    sent_s: float
+
+
 class Channel:
     """A trainer's place in a run. One for each process; opening it lets the simulation start.
 
@@ -332,6 +345,7 @@ class Channel:
     def _hold(self, attachment: _native.Attachment) -> None:
         self._attachment = attachment
         self.run: RunFile = json.loads(attachment.run_json)
+        self._answer: _Answer | None = None
 
     def in_environment(self, index: int, first_tick: int | None = None) -> Channel:
         """This trainer's place in another environment of the run (`run.envs`); this one is environment 0's.
@@ -357,6 +371,8 @@ class Channel:
         if self._attachment.ended:
             raise StreamEndedError
         blocks = self._attachment.receive(timeout_s, busy=busy)
+        if not blocks and self._answer is not None:
+            self._answer_again(self._answer)
         for block in blocks:
             # Nearly all ticks neither begin nor end an episode, and half a microsecond counts here.
             if block.episode_last or block.episode != self._starts.newest:
@@ -452,7 +468,17 @@ class Channel:
         rows = np.ascontiguousarray(actions, dtype=np.float32)
         if rows.shape != (observation.block.slots, 2):
             raise ValueError(f"actions of shape {rows.shape}, the task takes ({observation.block.slots}, 2)")
-        self._attachment.publish_predictions(observation.block, rows.tobytes(), 2, policy_version)
+        self._answer = _Answer(observation, rows.tobytes(), policy_version, time.monotonic())
+        self._send(self._answer)
+
+    def _send(self, answer: _Answer) -> None:
+        self._attachment.publish_predictions(answer.observation.block, answer.rows, 2, answer.policy_version)
+
+    def _answer_again(self, answer: _Answer) -> None:
+        """Send the newest actions again if no tick has come for long: a simulator that died may have lost them."""
+        if time.monotonic() - answer.sent_s > ANSWER_AGAIN_S:
+            self._answer = answer._replace(sent_s=time.monotonic())
+            self._send(self._answer)
 
     def report(self, **status: Unpack[TrainingReport]) -> None:
         """Shows how training goes; what is left out keeps its last value."""
