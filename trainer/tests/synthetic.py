@@ -124,6 +124,12 @@ class SyntheticChannel:
         self.predictions[observation.tick] = predictions.clone()
         self.versions[observation.tick] = policy_version
 
+    def publish_actions(
+        self, observation: SyntheticObservation, actions: np.ndarray, policy_version: int = 0, *, now: bool = True
+    ) -> None:
+        """Remember the actions as predictions."""
+        self.publish_predictions(observation, torch.from_numpy(actions), policy_version)
+
     def report(self, **status: Unpack[TrainingReport]) -> None:
         """Remember the status."""
         self.reports.append(status)

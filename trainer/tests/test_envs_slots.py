@@ -77,7 +77,9 @@ class DrivingChannel(SyntheticChannel):
     def __post_init__(self) -> None:
         self.actions: dict[int, np.ndarray] = {}
 
-    def publish_actions(self, observation: SyntheticObservation, actions: np.ndarray, policy_version: int = 0) -> None:
+    def publish_actions(
+        self, observation: SyntheticObservation, actions: np.ndarray, policy_version: int = 0, *, now: bool = True
+    ) -> None:
         """Remember the actions; each tick is answered once."""
         assert observation.tick not in self.actions
         assert actions.shape == (len(observation.vehicle), 2)

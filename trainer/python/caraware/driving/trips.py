@@ -163,7 +163,7 @@ def drive_trips(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
             if obs.evaluation:
                 trips.add(obs)
             valid = torch.from_numpy(obs.valid).unsqueeze(1)
-            channel.publish_predictions(obs, torch.where(valid, driver(obs).clamp(-1, 1), 0.0), 0)
+            channel.publish_actions(obs, torch.where(valid, driver(obs).clamp(-1, 1), 0.0).detach().numpy())
             channel.consumed(obs.tick)
             ended, steps = obs.last, steps + int(obs.valid.sum())
     part = {"env_steps": steps, "driver": name, "trips": [asdict(trip) for trip in trips.trips]}

@@ -458,18 +458,24 @@ class Channel:
         beside = None if estimates is None else np.ascontiguousarray(estimates, dtype=np.float32).tobytes()
         self._attachment.publish_predictions(observation.block, rows.tobytes(), rows.shape[1], policy_version, beside)
 
-    def publish_actions(self, observation: Observation, actions: FloatArray, policy_version: int = 0) -> None:
+    def publish_actions(
+        self, observation: Observation, actions: FloatArray, policy_version: int = 0, *, now: bool = True
+    ) -> None:
         """Actions of the driving task: steering (left is positive) and acceleration, each in -1 ... 1.
 
         f32 [n, 2], a row for every slot; rows of empty slots are not read. The simulation waits for the actions of
         every tick and makes the next one with them. What is no number or out of range is refused: the last valid action
         of that vehicle is held.
+
+        The newest actions are sent again while no tick comes, because a simulator that died may have lost them. Without
+        `now` they are only sent then: another learner has answered the tick, as far as is known.
         """
         rows = np.ascontiguousarray(actions, dtype=np.float32)
         if rows.shape != (observation.block.slots, 2):
             raise ValueError(f"actions of shape {rows.shape}, the task takes ({observation.block.slots}, 2)")
         self._answer = _Answer(observation, rows.tobytes(), policy_version, time.monotonic())
-        self._send(self._answer)
+        if now:
+            self._send(self._answer)
 
     def _send(self, answer: _Answer) -> None:
         self._attachment.publish_predictions(answer.observation.block, answer.rows, 2, answer.policy_version)

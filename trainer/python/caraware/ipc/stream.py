@@ -5,7 +5,7 @@ from typing import Any, Protocol, TypedDict, Unpack
 
 from torch import Tensor
 
-from caraware.ipc.arrays import BoolArray, Float32Array, UInt32Array, UInt64Array
+from caraware.ipc.arrays import BoolArray, Float32Array, FloatArray, UInt32Array, UInt64Array
 from caraware.ipc.run_file import RunFile
 
 EMPTY_SLOT = 0xFFFFFFFF
@@ -165,6 +165,11 @@ class Channel(Protocol):
         estimates: Float32Array | None = None,
     ) -> None:
         """Send f32 `[n, 2]` predicted positions in world metres for the tick of `observation`, and a filter's."""
+
+    def publish_actions(
+        self, observation: Any, actions: FloatArray, policy_version: int = 0, *, now: bool = True
+    ) -> None:
+        """Send f32 `[n, 2]` actions for the tick of `observation`, at once or, without `now`, if no tick comes."""
 
     def lag_ticks(self) -> int:
         """Ticks that the traffic is ahead of the newest one consumed."""

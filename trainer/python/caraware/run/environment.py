@@ -7,8 +7,6 @@ environments' own ticks alone, never on how they happen to arrive together.
 
 from collections import deque
 
-from torch import Tensor
-
 from caraware.ipc.arrays import Float32Array
 from caraware.ipc.stream import Channel, Observation
 from caraware.learn.rollout import Rollout
@@ -36,8 +34,6 @@ class Environment:
         self._received_last = False
         self.trips = TripCounts()
         """How the trips of heroes ended."""
-        self.answered: tuple[Observation, Tensor] | None = None
-        """The newest tick with its actions, in a task that draws them tick by tick."""
         self._catches_up = True
 
     def is_awaited(self, obs: Observation) -> bool:

@@ -152,8 +152,6 @@ class TrainingLoop:
             self._idle_waits = 0
             return
         self._idle_waits += 1
-        if self._idle_waits > 1:
-            self._answer_again()
         if not alone:
             self._channel.wait_for_any(RECEIVE_TIMEOUT_S)
 
@@ -234,17 +232,9 @@ class TrainingLoop:
     def _publish_actions(self, environment: Environment, obs: Observation, actions: Tensor) -> None:
         """Publish the actions of one tick, unless the world has gone on with what a predecessor drew."""
         environment.trips.add(obs)
-        # Kept in any case: if the world waits for this answer after all, it is sent as soon as no further tick comes.
-        environment.answered = (obs, actions)
-        if environment.is_awaited(obs):
-            environment.channel.publish_predictions(obs, actions, self._updates())
-
-    def _answer_again(self) -> None:
-        """Publish the newest actions again: a simulator that was started again may have lost them."""
-        for environment in self._environments:
-            if environment.answered is not None:
-                obs, actions = environment.answered
-                environment.channel.publish_predictions(obs, actions, self._updates())
+        # If the world waits for these after all, they are sent as soon as no further tick comes.
+        awaited = environment.is_awaited(obs)
+        environment.channel.publish_actions(obs, actions.detach().numpy(), self._updates(), now=awaited)
 
     def _learn_or_give_up(self, learner: Learner) -> None:
         """Learn if every horizon is full; give up learning if one can never be filled."""
