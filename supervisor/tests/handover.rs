@@ -495,6 +495,7 @@ fn commits(run: &Path) -> Vec<(String, u64)> {
 }
 
 /// Hands the paused run over to `module`, and makes ticks until it has committed some of its own. The run stays paused.
+/// No step is asked for before the learner has consumed the one before: a slow one would otherwise find the run at its end.
 fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, module: &str) {
     control(workplace, name, &["pause"]);
     let output = workplace.run(&["handover", name, "--set", &format!("trainer.module={module}")]);
@@ -514,7 +515,9 @@ fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, m
             ..
         } = &mut *run;
         until(child, "a commit of its own", || {
-            (has_committed(trainer) || sensing.health().ticks >= ticks).then_some(())
+            let made = sensing.health().ticks;
+            let all_consumed = made >= ticks && trainer.progress().consumed_ticks >= made;
+            (has_committed(trainer) || all_consumed).then_some(())
         });
     }
 }
