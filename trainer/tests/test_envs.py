@@ -164,8 +164,25 @@ def test_close_leaves_nothing_and_a_closed_simulation_raises() -> None:
     env.close()
     assert all(gone(process) for process in processes)
     assert not left_in_shared_memory(run["shared_memory"]["prefix"]) and not Path(run["run_dir"]).exists()
+    for seed in (None, 4):
+        with pytest.raises(SimulationError, match="closed"):
+            env.reset(seed=seed)
     with pytest.raises(SimulationError, match="closed"):
-        env.reset(seed=4)
+        env.step(np.zeros((4, 2), np.float32))
+
+
+def test_a_second_face_continues_a_simulation_that_waits_for_an_action() -> None:
+    with make("lap", HEROES, seed=3) as simulation:
+        first = CarAwareVectorEnv(simulation)
+        start = first.reset(seed=3)[0].copy()
+        for _ in range(20):
+            first.step(np.full((3, 2), 0.5, np.float32))
+        second = CarAwareVectorEnv(simulation)
+        assert np.array_equal(second.reset(seed=3)[0], start), "a run that was stepped starts again with its seed"
+        for _ in range(5):
+            second.step(np.full((3, 2), 0.5, np.float32))
+        third = CarAwareVectorEnv(simulation)
+        assert third.reset()[0].shape == start.shape
 
 
 def test_kept_runs_have_a_report(tmp_path: Path) -> None:

@@ -277,6 +277,7 @@ class Restartable:
         self.seeds.append(self.seed)
         self.channel.consumed_up_to = self.channel.committed_up_to = -1
         self._ticks = self._make(self.seed)
+        self.current = None
 
     def close(self, part: dict[str, Any] | None = None) -> None:
         """Nothing to close."""

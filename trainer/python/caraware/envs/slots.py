@@ -24,6 +24,7 @@ from caraware.envs import rewards
 from caraware.envs.evaluation import EvaluationMeans
 from caraware.envs.rendering import RgbImage
 from caraware.envs.settings import FaceSettings
+from caraware.envs.simulation import SimulationError
 from caraware.envs.transition import Rows, Transition
 from caraware.ipc.arrays import (
     BoolArray,
@@ -77,7 +78,7 @@ class Source(Protocol):
         """The next tick, or None after the last of the run."""
 
     def restart(self, seed: int | None = None) -> None:
-        """Begin another run, where that is possible."""
+        """Begin another run, where that is possible; there is no current tick then until one is received."""
 
     def close(self, part: dict[str, Any] | None = None) -> None:
         """Leave the run; `part` goes into its report."""
@@ -177,7 +178,9 @@ class Slots:
         self._evaluation_policy, self._evaluation = evaluation_policy, EvaluationMeans(self.task)
         self._idle = np.zeros((self.count, self.task.actions.size), np.float32)
         self._runs, self._answered = 0, -1
-        self._untouched, self._stepped, self._warned_narrow = True, True, False
+        # Another face may have stepped the source before.
+        self._untouched = self.source.current is None or self.source.current.tick == 0
+        self._stepped, self._warned_narrow, self._closed = True, False, False
         self._now: Tick | None = None
         self._env_steps, self._reported = 0, (time.monotonic(), 0)
         self._picture: MapPicture | None = None
@@ -190,6 +193,7 @@ class Slots:
     @property
     def now(self) -> Tick:
         """The tick to be answered next."""
+        self._refuse_closed()
         if self._now is None:
             raise RuntimeError("call reset() before step() and render()")
         return self._now
@@ -201,12 +205,14 @@ class Slots:
 
     def reset(self, seed: int | None) -> Tick:
         """The first tick of a run with `seed`; without, of the next episode."""
+        self._refuse_closed()
         if seed is not None and not (self._untouched and seed == self.source.seed):
             self._reseed(int(seed))
         self._refuse_end()
         if self._now is None:
-            self._now = self._settle(self._take())
-        elif self._stepped and not self._untouched:
+            waiting = self.source.current
+            self._now = self._settle(self._take() if waiting is None else self._copied(waiting))
+        if self._stepped and not self._untouched and not self.over:
             self._now = self._next_episode(self._now)
         self._stepped = False
         self._refuse_end()
@@ -260,7 +266,8 @@ class Slots:
             self.source.channel.commit(self._answered)
 
     def close(self) -> None:
-        """Leaves the run."""
+        """Leaves the run; what the environment is asked for after that is refused."""
+        self._closed, self._now = True, None
         self.source.close(self._part())
 
     def _reseed(self, seed: int) -> None:
@@ -280,6 +287,10 @@ class Slots:
                 f"actions of shape {action.shape}, {self.count} slots take ({self.count}, {self.task.actions.size})"
             )
         return action
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise SimulationError("the environment has been closed: make another one")
 
     def _refuse_end(self) -> None:
         if self.over:
