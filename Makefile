@@ -8,24 +8,32 @@ CARGO_FLAGS := --release --locked
 # Extra arguments of `make train`, e.g. make train ARGS="--set run.seed=7"
 ARGS ?=
 
-.PHONY: train test build prerequisites browser lint format test-rust test-python deny bench peers peers-metadrive peers-smarts \
-	faces site clean
+.PHONY: train test build programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-python \
+	deny bench peers peers-metadrive peers-smarts faces site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
 
-# One selection of targets for the tests and the extension: another one would give third-party crates other features, and compile
-# them again. Rust's and Python's tests run side by side: both start whole runs, which wait a lot.
-test: prerequisites browser $(VENV)/.installed ## all tests
-	cargo build $(CARGO_FLAGS) --lib --bins --tests --examples
+# Rust's and Python's tests run side by side: both start whole runs, which wait a lot.
+test: prerequisites browser $(VENV)/.sumo ## all tests
+	@$(MAKE) --no-print-directory --jobs=2 $(VENV)/.installed programs-and-tests
 	$(EXTENSION)
 	$(COMMAND)
 	$(MAKE) --jobs=2 --output-sync=line test-rust test-python
 
-build: prerequisites $(VENV)/.installed ## virtual environment, SUMO, all programs, the Python extension
-	cargo build $(CARGO_FLAGS)
+# Python's packages are downloaded and unpacked while Rust's are compiled.
+build: prerequisites $(VENV)/.sumo ## virtual environment, SUMO, all programs, the Python extension
+	@$(MAKE) --no-print-directory --jobs=2 $(VENV)/.installed programs
 	$(EXTENSION)
 	$(COMMAND)
+
+programs:
+	cargo build $(CARGO_FLAGS)
+
+# One selection of targets for the tests and the extension: another one would give third-party crates other features, and compile
+# them again.
+programs-and-tests:
+	cargo build $(CARGO_FLAGS) --lib --bins --tests --examples
 
 # `install` replaces the file, so that a trainer that runs keeps the one it has loaded.
 EXTENSION = install -m 755 target/release/lib_native.so trainer/python/caraware/_native.abi3.so
@@ -39,10 +47,16 @@ prerequisites:
 browser: ## a Chromium for the viewer's test
 	@scripts/browser.sh
 
-# The pins are in requirements.lock; the packages of this project are installed in place.
-$(VENV)/.installed: requirements.lock trainer/pyproject.toml viewer/pyproject.toml bench/pyproject.toml
+# SUMO comes before the other packages: `traffic-bridge` is compiled against it.
+$(VENV)/.sumo: requirements.lock
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --disable-pip-version-check --quiet --progress-bar on -r requirements.lock
+	$(VENV)/bin/pip install --disable-pip-version-check --quiet $$(grep '^eclipse-sumo==' requirements.lock)
+	touch $@
+
+# The pins are in requirements.lock; the packages of this project are installed in place.
+$(VENV)/.installed: $(VENV)/.sumo requirements.lock trainer/pyproject.toml viewer/pyproject.toml bench/pyproject.toml
+	@echo "installing Python's packages into $(VENV): 7 GB on disk"
+	$(VENV)/bin/pip install --disable-pip-version-check --quiet -r requirements.lock
 	printf '%s\n' "$(CURDIR)/trainer/python" "$(CURDIR)/bench/python" \
 		> $$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/caraware.pth
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable ./viewer
@@ -59,9 +73,13 @@ test-python:
 	$(VENV)/bin/python -m pytest -q maps/town/tests
 	$(VENV)/bin/python -m pytest -q sim-core/tests
 
-lint: $(VENV)/.installed ## formatting and lints, as errors
+lint: lint-rust lint-python ## formatting and lints, as errors
+
+lint-rust: prerequisites $(VENV)/.sumo
 	cargo fmt --all --check
 	cargo clippy $(CARGO_FLAGS) --all-targets -- -D warnings
+
+lint-python: $(VENV)/.installed
 	$(VENV)/bin/ruff check trainer viewer bench
 	$(VENV)/bin/ruff check --config trainer/pyproject.toml sim-core sensor-daemon v2x docs maps scripts
 	$(VENV)/bin/ruff format --check trainer viewer bench
