@@ -2,6 +2,7 @@
 //!
 //! The `caraware` command starts this program with its arguments. Each part has a file, and its result is a [`BenchReport`] (decision 9).
 
+mod allocator;
 mod cli;
 mod driving;
 mod endurance;

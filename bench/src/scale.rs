@@ -4,7 +4,7 @@ use caraware::{failure::Exit, generate::GeneratedCity, install::Install};
 
 use super::{
     BenchOptions, BenchReport, CurveLine, ReportCurve, ReportTable,
-    sides::{BenchDirectory, ComparedScenario, OurRun, ProcessCost, compare_results},
+    sides::{BareAllocator, BenchDirectory, ComparedScenario, OurRun, ProcessCost, compare_results},
     stages::StageTimes,
 };
 
@@ -26,10 +26,12 @@ const MOTORWAY_SCALES: [f64; 2] = [1.0, 3.0];
 /// Room for the road users of the motorway at the largest factor.
 const MOTORWAY_ROAD_USERS: u32 = 8192;
 
-/// One case, measured with bare SUMO and with caraware.
+/// One case, measured with bare SUMO, with either allocator, and with caraware.
 struct ScaleCase {
     vehicles: u32,
     bare: ProcessCost,
+    /// Bare SUMO with the allocator of `traffic-bridge`.
+    with_mimalloc: ProcessCost,
     ours: OurRun,
     stages: StageTimes,
     /// Peak memory of the three processes that hold vehicles, KiB for each vehicle. Shared memory counts in every process that uses it.
@@ -38,9 +40,11 @@ struct ScaleCase {
 
 impl ScaleCase {
     fn measure(scenario: &ComparedScenario, vehicles: u32) -> Result<Self, Exit> {
-        let (bare, results) = scenario.bare()?;
+        let (bare, results) = scenario.bare(BareAllocator::System)?;
+        let (with_mimalloc, also) = scenario.bare(BareAllocator::Mimalloc)?;
         let ours = scenario.ours()?;
         compare_results(&results, &ours.results)?;
+        compare_results(&also, &ours.results)?;
         let stages = StageTimes::of(&ours)?;
         let mut mib = 0.0;
         for process in ["traffic-bridge", "sim-core", "sensor-daemon"] {
@@ -49,6 +53,7 @@ impl ScaleCase {
         Ok(Self {
             vehicles,
             bare,
+            with_mimalloc,
             ours,
             stages,
             memory_kib: 1024.0 * mib / f64::from(vehicles),
@@ -61,7 +66,7 @@ impl ScaleCase {
     }
 }
 
-/// Runs all cases, each once on both sides.
+/// Runs all cases, each once on all sides.
 ///
 /// # Errors
 /// A run fails, or SUMO's results differ.
@@ -73,7 +78,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         "Generated cities with ten vehicles on a kilometre of lane (`caraware generate`). Every vehicle moves dynamically at 100 Hz and senses \
          every 0.1 s, and its observations are delivered to a consumer's tensor. The cost is processor time in the loop for each sensed \
          vehicle-step, without loading. Memory is the peak of `traffic-bridge` (with SUMO), `sim-core` and `sensor-daemon` for each vehicle; \
-         shared memory counts in each of them.",
+         shared memory counts in each of them. Bare `sumo` runs with the system's allocator and with that of `traffic-bridge`, mimalloc.",
     );
     let cities = if options.quick { &QUICK[..] } else { &CITIES[..] };
     let mut cases = Vec::new();
@@ -133,6 +138,7 @@ fn costs(cases: &[ScaleCase]) -> ReportTable {
             "all outside SUMO",
             "KiB per vehicle",
             "wall, × sumo",
+            "wall, × sumo with mimalloc",
         ],
     );
     for case in cases {
@@ -148,6 +154,7 @@ fn costs(cases: &[ScaleCase]) -> ReportTable {
             each(case.stages.outside_s()),
             format!("{:.1}", case.memory_kib),
             format!("{:.2}", case.ours.taken.wall_s / case.bare.wall_s),
+            format!("{:.2}", case.ours.taken.wall_s / case.with_mimalloc.wall_s),
         ]);
     }
     table
@@ -188,8 +195,10 @@ fn large(options: &BenchOptions, place: &BenchDirectory, report: &mut BenchRepor
             "vehicle-steps/s",
             "× real time",
             "sumo, s",
+            "sumo with mimalloc, s",
             "ours, s",
-            "ratio",
+            "ours / sumo",
+            "ours / sumo with mimalloc",
         ],
     );
     let (vehicles, duration_s) = if options.quick { LONG_STEPS_QUICK } else { LONG_STEPS };
@@ -221,7 +230,7 @@ fn large(options: &BenchOptions, place: &BenchDirectory, report: &mut BenchRepor
     Ok(())
 }
 
-fn row(name: &str, case: &ScaleCase) -> Result<[String; 8], Exit> {
+fn row(name: &str, case: &ScaleCase) -> Result<[String; 10], Exit> {
     let ours = &case.ours;
     Ok([
         name.to_owned(),
@@ -230,7 +239,9 @@ fn row(name: &str, case: &ScaleCase) -> Result<[String; 8], Exit> {
         format!("{:.0}", ours.number("/env_steps_per_s")?),
         format!("{:.1}", ours.number("/real_time_factor")?),
         format!("{:.2}", case.bare.wall_s),
+        format!("{:.2}", case.with_mimalloc.wall_s),
         format!("{:.2}", ours.taken.wall_s),
         format!("{:.2}", ours.taken.wall_s / case.bare.wall_s),
+        format!("{:.2}", ours.taken.wall_s / case.with_mimalloc.wall_s),
     ])
 }

@@ -15,7 +15,7 @@ use rustix::{
 };
 use serde_json::Value;
 
-use super::BenchOptions;
+use super::{BenchOptions, allocator::SharedMimalloc};
 
 /// Vehicle-ticks that a run may be ahead of the consumer: with 5 000 vehicles, as long as the consumer takes to import torch.
 const WINDOW_VEHICLE_TICKS: u32 = 64 * 5000;
@@ -29,6 +29,15 @@ pub struct ProcessCost {
     pub wall_s: f64,
     /// Processor time of the program and of all processes that it started, seconds.
     pub cpu_s: f64,
+}
+
+/// What bare SUMO allocates its memory with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BareAllocator {
+    /// The system's allocator, as SUMO comes.
+    System,
+    /// mimalloc, as in `traffic-bridge`.
+    Mimalloc,
 }
 
 /// A finished run of caraware.
@@ -101,6 +110,7 @@ impl Drop for BenchDirectory {
 pub struct ComparedScenario<'a> {
     place: &'a BenchDirectory,
     install: Install,
+    mimalloc: SharedMimalloc,
     program: PathBuf,
     sumocfg: PathBuf,
     /// Factor on its demand.
@@ -112,7 +122,7 @@ impl<'a> ComparedScenario<'a> {
     /// Prepares `sumocfg` with `scale` times its demand and at most `max_road_users` at once.
     ///
     /// # Errors
-    /// The program `caraware` is not built.
+    /// The program `caraware` is not built, or SUMO does not run with mimalloc.
     pub fn new(
         options: &BenchOptions,
         place: &'a BenchDirectory,
@@ -124,6 +134,7 @@ impl<'a> ComparedScenario<'a> {
         Ok(Self {
             place,
             program: install::program(&options.bin, "caraware")?,
+            mimalloc: SharedMimalloc::new(place.path(), &install.sumo_program("sumo"))?,
             install,
             sumocfg,
             scale,
@@ -135,7 +146,7 @@ impl<'a> ComparedScenario<'a> {
     ///
     /// # Errors
     /// SUMO fails.
-    pub fn bare(&self) -> Result<(ProcessCost, PathBuf), Exit> {
+    pub fn bare(&self, allocator: BareAllocator) -> Result<(ProcessCost, PathBuf), Exit> {
         let (results, prefix) = self.results("bare")?;
         let mut command = Command::new(self.install.sumo_program("sumo"));
         command
@@ -143,6 +154,9 @@ impl<'a> ComparedScenario<'a> {
             .arg(&self.sumocfg)
             .args(["--output-prefix", &prefix])
             .args(["--scale", &self.scale.to_string(), "--no-step-log", "true"]);
+        if allocator == BareAllocator::Mimalloc {
+            self.mimalloc.preload(&mut command);
+        }
         self.set_sumo_environment(&mut command);
         Ok((self.run_measured(&mut command)?, results))
     }

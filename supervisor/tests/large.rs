@@ -28,7 +28,11 @@ fn the_bench_compares_the_result_files_of_bare_sumo_and_of_a_run() {
     let report: Value = serde_json::from_str(&text).unwrap();
     let figures = &report["figures"];
     assert_eq!(figures["result files compared"], 2.0, "{report:#}");
-    for figure in ["ratio of wall times", "SUMO's own step, µs per vehicle-step"] {
+    for figure in [
+        "ratio of wall times",
+        "ratio of wall times, same allocator",
+        "SUMO's own step, µs per vehicle-step",
+    ] {
         assert!(figures[figure].as_f64().unwrap() > 0.0, "{figure}: {report:#}");
     }
     workplace.assert_nothing_left();
