@@ -41,8 +41,10 @@ const BARE: usize = 4_000;
 /// value, so that the contents of its caches do not depend on the size.
 const TURNS: usize = 40;
 /// Messages of a turn, and those at its beginning that are not measured.
-const MESSAGES: usize = 50;
-const WARM_UP: usize = 10;
+const MESSAGES: usize = 60;
+const WARM_UP: usize = 12;
+/// Ways of receiving, which take messages in turn.
+const WAYS: usize = 3;
 /// Pause after a message was taken, until the receiver polls again.
 const PAUSE: Duration = Duration::from_micros(100);
 /// Longest wait for the receiver.
@@ -90,6 +92,8 @@ struct OurLatencies {
     tensor: LatenciesBySize,
     /// Until Python has the tensor of an observation that it may keep.
     received: LatenciesBySize,
+    /// The same, where the receiver slept until the message came.
+    asleep: LatenciesBySize,
     /// As `tensor`, where the sender wrote only two values of the block.
     two_values_written: LatenciesBySize,
 }
@@ -99,7 +103,7 @@ fn rows(bytes: usize) -> usize {
     bytes / (ObservationLayout::new(1024, FIELDS, 1).len / 1024)
 }
 
-/// Sends blocks of every size through the services of a real run to a trainer process that polls.
+/// Sends blocks of every size through the services of a real run to a trainer process.
 fn measure_ours() -> Result<OurLatencies, Exit> {
     // A real run without processes: its services, its roster and its run file.
     let directory = tempfile::tempdir().map_err(|error| Exit::io("create", &std::env::temp_dir(), &error))?;
@@ -136,11 +140,11 @@ fn measure_ours() -> Result<OurLatencies, Exit> {
     let of = |way: &str, which: usize, first_turn: usize| -> LatenciesBySize {
         let measured = |bytes: usize| {
             let all = latencies.get(way).and_then(|by_rows| by_rows.get(&rows(bytes)));
-            let turns = all.map_or(&[][..], Vec::as_slice).chunks(MESSAGES / 2);
+            let turns = all.map_or(&[][..], Vec::as_slice).chunks(MESSAGES / WAYS);
             turns
                 .skip(first_turn)
                 .step_by(2)
-                .flat_map(|turn| turn.iter().skip(WARM_UP / 2))
+                .flat_map(|turn| turn.iter().skip(WARM_UP / WAYS))
                 .map(|latencies| latencies[which])
                 .collect()
         };
@@ -150,6 +154,7 @@ fn measure_ours() -> Result<OurLatencies, Exit> {
         taken: of("lent", 0, 0),
         tensor: of("lent", 1, 0),
         received: of("received", 1, 0),
+        asleep: of("asleep", 1, 0),
         two_values_written: of("lent", 1, 1),
     })
 }
@@ -191,6 +196,7 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) 
         RunMembership::join_from_outside(run.clone(), Process::SensorDaemon, 0, Arc::new(AtomicBool::new(false)))
             .map_err(failed)?;
     let publisher = membership.publisher(Channel::Observation).map_err(failed)?;
+    let waker = membership.waker(Process::Trainer).map_err(failed)?;
     let turns = (0..TURNS).flat_map(|turn| SIZES.map(|bytes| (rows(bytes), turn % 2 == 0)));
     let messages = turns.flat_map(|turn| std::iter::repeat_n(turn, MESSAGES));
     let last = (TURNS * SIZES.len() * MESSAGES - 1) as u64;
@@ -227,6 +233,7 @@ fn send_all(run: &RunFile, board: &BoardReader, receiver: &mut ReceiverProcess) 
         // The time is written last, right before the message is sent.
         draft.header_mut().sim_time_ns = monotonic_ns();
         draft.send()?;
+        waker.wake();
     }
     Ok(())
 }

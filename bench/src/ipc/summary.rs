@@ -50,12 +50,16 @@ type PercentilesBySize = BTreeMap<usize, LatencyPercentiles>;
 type LatencySelector = fn(&OurLatencies) -> &LatenciesBySize;
 
 /// The ways that the report shows, with their labels.
-const WAYS: [(&str, LatencySelector); 4] = [
+const WAYS: [(&str, LatencySelector); 5] = [
     ("taken", |ours| &ours.taken),
     ("tensor", |ours| &ours.tensor),
     ("tensor of an observation to keep", |ours| &ours.received),
+    ("tensor of an observation to keep, asleep", |ours| &ours.asleep),
     ("tensor, two values written", |ours| &ours.two_values_written),
 ];
+
+/// End of the name of a peer that polls (`caraware_bench.ipc_peers`).
+const POLLS: &str = ", polling";
 
 /// The report over all rounds.
 ///
@@ -66,15 +70,17 @@ pub(super) fn report(rounds: &[LatencyRound], peers: &BTreeMap<String, Latencies
         "ipc",
         "Observation hop",
         format!(
-            "One-way latency in microseconds, from right before publish in one process; both processes poll. Ours is the channel `observation` \
-             of a run. `Channel.lease` reads it in place, whatever the size: \"taken\" is the time until the receiver has the block, \"tensor\" the \
-             time until Python has a torch tensor over it, which is lent until the next block is taken. Every other tick is received by \
-             `Channel.receive(busy=True)`, which gives a tensor of an observation that may be kept. The sender writes the whole block before it \
+            "One-way latency in microseconds, from right before publish in one process to the other. Ours is the channel `observation` of a run. \
+             `Channel.lease` polls and reads it in place, whatever the size: \"taken\" is the time until the receiver has the block, \"tensor\" \
+             the time until Python has a torch tensor over it, which is lent until the next block is taken. In turn with it, \
+             `Channel.receive(busy=True)` polls and gives a tensor of an observation that may be kept, and `Channel.receive` gives the same, but \
+             sleeps until it is woken. The sender writes the whole block before it \
              publishes, as `sensor-daemon` does; after 16 MiB it publishes later. In the rows \"two values written\" it writes only the first and \
              the last value, so that only the size differs. The bare message is eight bytes between two Rust processes that poll iceoryx2. Bare \
              message and ours alternate in {ROUNDS} rounds, and the sizes take turns within a round. A ratio compares medians of one round; it \
              is that of the median round (smallest–largest). The peers send the same number of bytes from Python to Python and make a tensor of \
-             the message without further copies; they sleep until the kernel wakes them. One message is under way at a time."
+             the message without further copies, asleep until the kernel wakes them or, where it says so, polling without a pause. A peer that polls \
+             stands beside our tensors that polled, a peer that sleeps beside ours that slept. One message is under way at a time."
         ),
     );
     let bare = LatencyPercentiles::of(rounds.iter().flat_map(|round| round.bare.clone()).collect())?;
@@ -89,13 +95,22 @@ pub(super) fn report(rounds: &[LatencyRound], peers: &BTreeMap<String, Latencies
     for (peer, by_size) in peers {
         all.push((peer.clone(), pooled(std::iter::once(by_size))?));
     }
-    let tensor = all[1].1.clone();
     let mut ratios = own_ratios(&mut report, rounds)?;
-    for (peer, by_size) in &all[WAYS.len()..] {
-        for bytes in [1 << 10, 1 << 20, 1 << 24] {
-            if let (Some(theirs), Some(ours)) = (by_size.get(&bytes), tensor.get(&bytes)) {
-                let ratio = format!("{:.0} ×", theirs.median / ours.median);
-                ratios.row([format!("{peer} to our tensor, {}", name(bytes)), ratio]);
+    let (ours, theirs) = all.split_at(WAYS.len());
+    for (peer, by_size) in theirs {
+        // Like with like: `WAYS` by the manner in which they wait.
+        let like = if peer.ends_with(POLLS) {
+            &[("tensor", &ours[1].1), ("tensor to keep", &ours[2].1)][..]
+        } else {
+            &[("tensor to keep, asleep", &ours[3].1)][..]
+        };
+        for ((way, ours), bytes) in like
+            .iter()
+            .flat_map(|ours| [1 << 10, 1 << 20, 1 << 24].map(|bytes| (ours, bytes)))
+        {
+            if let (Some(theirs), Some(ours)) = (by_size.get(&bytes), ours.get(&bytes)) {
+                let ratio = format!("{:.1} ×", theirs.median / ours.median);
+                ratios.row([format!("{peer}, to our {way}, {}", name(bytes)), ratio]);
             }
         }
     }
