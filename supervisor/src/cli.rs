@@ -31,6 +31,7 @@ const AFTER: &str = "Examples:
   caraware play town-1                            compare what the run has learnt with a Kalman filter
   caraware ps                                     list the processes of live runs, from another terminal
   caraware view --web                             watch a live run in a browser
+  caraware panel                                  start, steer and compare runs in a browser
   caraware import quarter.osm quarter            make a scenario from a map: quarter/city.sumocfg
   caraware generate city --vehicles 20000         write a scenario of any size: city/city.sumocfg
   caraware bench lidar                            measure rays per second, compared with Open3D
@@ -38,7 +39,7 @@ const AFTER: &str = "Examples:
   caraware stop                                   end the run; the trainer writes a checkpoint first
 
 Exit codes: 0 done, 1 the run failed, 2 usage or configuration, 3 something is missing on this machine, 130 interrupted.
-All configuration keys: configs/README.md";
+All configuration keys: configs/README.md, or `caraware keys`";
 
 /// The subcommands.
 #[derive(Debug, Subcommand)]
@@ -55,6 +56,9 @@ pub enum Subcommands {
     Ps {
         /// Name of a run; all live runs if not given
         run: Option<String>,
+        /// Print JSON, for other programs
+        #[arg(long)]
+        json: bool,
     },
     /// Replace the trainer of a live run; the simulation continues, and no observation is lost
     #[command(after_help = HANDOVER)]
@@ -77,6 +81,19 @@ pub enum Subcommands {
     /// Watch a live run: map, vehicles, estimates, point clouds and figures, in a window or a browser
     #[command(after_help = VIEW)]
     View(ViewArgs),
+    /// Start, steer and compare runs in a browser on this machine; each of its actions is a command, which it shows
+    #[command(after_help = PANEL)]
+    Panel(PanelArgs),
+    /// List the configuration keys: default, allowed values, unit and meaning
+    Keys {
+        /// A key, or the beginning of keys, such as `trainer`; all keys if not given
+        prefix: Option<String>,
+        /// Print JSON, with the presets, for other programs
+        #[arg(long, conflicts_with = "prefix")]
+        json: bool,
+    },
+    /// Show in which settings and results runs differ
+    Compare(CompareArgs),
     /// Record a live run into a file; the run does not wait for it (`train --record` records without loss)
     Record(RecordArgs),
     /// Name the first tick and field in which two recordings differ
@@ -324,6 +341,35 @@ pub struct ViewArgs {
     /// Credentials of the viewer.
     #[command(flatten)]
     pub credentials: Credentials,
+}
+
+const PANEL: &str = "Examples:
+  caraware panel                    print an address, for a browser on this machine
+  caraware panel --port 9191
+
+The address holds a key that allows commands in your name: keep it to yourself. Ctrl-C ends the panel, and in order the runs and
+viewers that it has started. Runs that were started elsewhere continue (docs/panel.md).";
+
+/// Arguments of `panel`.
+#[derive(Debug, Args, Clone)]
+pub struct PanelArgs {
+    /// Port of its address, on loopback [default: 9091 if it is free]
+    #[arg(long, value_name = "PORT", value_parser = clap::value_parser!(u16).range(1..))]
+    pub port: Option<u16>,
+    /// Directory that holds run directories
+    #[arg(long, default_value = "runs")]
+    pub runs: PathBuf,
+}
+
+/// Arguments of `compare`.
+#[derive(Debug, Args, Clone)]
+pub struct CompareArgs {
+    /// Names or directories of two or more runs; a live run has no results yet
+    #[arg(required = true, num_args = 2.., value_name = "RUN")]
+    pub compared: Vec<String>,
+    /// Directory that holds run directories
+    #[arg(long, default_value = "runs")]
+    pub runs: PathBuf,
 }
 
 /// Credentials of a viewer, if the run requires them (docs/remote.md).

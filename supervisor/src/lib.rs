@@ -1,8 +1,10 @@
 //! The `caraware` command: configuration, process table, supervisor, status, doctor.
 
 pub mod bench;
+pub mod catalogue;
 pub mod checkpoint;
 pub mod cli;
+pub mod compare;
 pub mod config;
 pub mod control;
 pub mod cores;
@@ -18,6 +20,7 @@ pub mod import;
 pub mod install;
 pub mod live_table;
 pub mod maps;
+pub mod panel;
 pub mod phase;
 pub mod prepare;
 pub mod processes;

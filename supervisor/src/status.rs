@@ -1,6 +1,9 @@
 //! `caraware ps` and `caraware stop`: lists and stops runs from another terminal.
 
-use std::time::{Duration, Instant};
+use std::{
+    path::PathBuf,
+    time::{Duration, Instant},
+};
 
 use ipc_schema::{
     activity::Activity,
@@ -8,10 +11,11 @@ use ipc_schema::{
     metric,
     ports::BoardReader,
     process::{PROCESSES, Process, ProcessScope},
-    run::RunFile,
+    run::{Mode, RunFile},
     services,
 };
 use rustix::process::{Pid, Signal, kill_process};
+use serde::Serialize;
 
 use crate::{failure::Exit, registry};
 
@@ -20,11 +24,11 @@ const MEASURING_TIME: Duration = Duration::from_millis(500);
 /// Longest time that `stop` waits for the run to end.
 const STOP_WITHIN: Duration = Duration::from_secs(60);
 
-/// Prints the process table of every live run.
+/// Prints the process table of every live run, or the same as JSON.
 ///
 /// # Errors
 /// The run named is not alive, or its shared memory cannot be opened.
-pub fn ps(name: Option<&str>) -> Result<(), Exit> {
+pub fn ps(name: Option<&str>, json: bool) -> Result<(), Exit> {
     let runs: Vec<RunFile> = match name {
         Some(name) => vec![registry::find(Some(name))?],
         None => registry::entries()
@@ -33,6 +37,14 @@ pub fn ps(name: Option<&str>) -> Result<(), Exit> {
             .filter_map(|entry| entry.run)
             .collect(),
     };
+    if json {
+        // A run may end while the others are measured.
+        let measured: Vec<RunMeasurement> = runs.iter().filter_map(|run| RunMeasurement::take(run).ok()).collect();
+        let text = serde_json::to_string(&measured)
+            .map_err(|error| Exit::run(format!("the table has no form in JSON: {error}"), ""))?;
+        println!("{text}");
+        return Ok(());
+    }
     if runs.is_empty() {
         println!("no run is alive");
         return Ok(());
@@ -42,9 +54,64 @@ pub fn ps(name: Option<&str>) -> Result<(), Exit> {
         "RUN", "PROCESS", "STATE", "PID", "TICK", "TICKS/S", "LAG", "DROPS", "RESTARTS", "MEMORY"
     );
     for run in &runs {
-        print_run(run)?;
+        RunMeasurement::take(run)?.print();
     }
     Ok(())
+}
+
+/// The processes of a run and their rates, as `caraware ps` shows them.
+#[derive(Debug, Serialize)]
+struct RunMeasurement {
+    run: String,
+    directory: PathBuf,
+    mode: Mode,
+    /// Where viewers connect; `None` without a fan-out.
+    endpoint: Option<String>,
+    /// True if a viewer must authenticate.
+    needs_credentials: bool,
+    supervisor_pid: i32,
+    supervisor_memory_mib: u64,
+    processes: Vec<ProcessRow>,
+    environments: Vec<EnvironmentRow>,
+    training: Option<TrainingRow>,
+}
+
+/// A process.
+#[derive(Debug, Serialize)]
+struct ProcessRow {
+    process: String,
+    state: &'static str,
+    pid: i32,
+    tick: u64,
+    ticks_per_s: f64,
+    /// Ticks behind the `traffic-bridge` of its environment.
+    lag: u64,
+    drops: u64,
+    restarts: u32,
+    memory_mib: u64,
+    waits_for: String,
+}
+
+/// An environment: its episode, its road users and its rates.
+#[derive(Debug, Serialize)]
+struct EnvironmentRow {
+    environment: u32,
+    episode: u64,
+    sim_time_s: f64,
+    cavs: u32,
+    road_users: u32,
+    arrived: u64,
+    steps_per_s: f64,
+    real_time_factor: f64,
+}
+
+/// What the trainer has reported.
+#[derive(Debug, Serialize)]
+struct TrainingRow {
+    updates: u64,
+    metrics: String,
+    reward: f64,
+    policy_std: f64,
 }
 
 /// A process of a run with the reader of its board.
@@ -84,108 +151,163 @@ fn read_boards(boards: &[ProcessBoard]) -> Vec<BoardReading> {
         .collect()
 }
 
-fn print_run(run: &RunFile) -> Result<(), Exit> {
-    let node = services::node(&run.shared_memory)?;
-    let mut boards = Vec::new();
-    for environment in (0..run.config.run.envs).map(|index| run.environment(index)) {
-        for row in PROCESSES
-            .iter()
-            .filter(|row| row.is_in(&environment, environment.env_index))
-        {
-            let board = BoardReader::open(&node, run, environment.env_index, row.process)?;
-            let label = row.label(&environment);
-            boards.push(ProcessBoard {
-                label,
-                process: row.process,
-                env_index: environment.env_index,
-                scope: row.scope,
-                board,
-            });
+impl RunMeasurement {
+    /// Reads the boards of a run twice, [`MEASURING_TIME`] apart.
+    fn take(run: &RunFile) -> Result<Self, Exit> {
+        let node = services::node(&run.shared_memory)?;
+        let mut boards = Vec::new();
+        for environment in (0..run.config.run.envs).map(|index| run.environment(index)) {
+            for row in PROCESSES
+                .iter()
+                .filter(|row| row.is_in(&environment, environment.env_index))
+            {
+                let board = BoardReader::open(&node, run, environment.env_index, row.process)?;
+                let label = row.label(&environment);
+                boards.push(ProcessBoard {
+                    label,
+                    process: row.process,
+                    env_index: environment.env_index,
+                    scope: row.scope,
+                    board,
+                });
+            }
+        }
+        // Processes of the whole run come last.
+        boards.sort_by_key(|process| process.scope == ProcessScope::Run);
+        // Rates are differences of two readings.
+        let first = read_boards(&boards);
+        wait(MEASURING_TIME);
+        let second = read_boards(&boards);
+        let fanout = &run.config.fanout;
+        Ok(Self {
+            run: run.name.clone(),
+            directory: run.run_dir.clone(),
+            mode: run.mode,
+            endpoint: fanout.enabled.then(|| fanout.listen.on_this_machine().to_string()),
+            needs_credentials: fanout.users.is_some() || fanout.tls_client_ca.is_some(),
+            supervisor_pid: run.supervisor_pid,
+            supervisor_memory_mib: memory_mib(run.supervisor_pid),
+            processes: process_rows(run, &boards, [&first, &second]),
+            environments: environment_rows(run, &boards, [&first, &second]),
+            training: training_row(&boards),
+        })
+    }
+
+    fn print(&self) {
+        println!(
+            "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>5} MiB",
+            self.run, "supervisor", "running", self.supervisor_pid, "", "", "", "", "", self.supervisor_memory_mib
+        );
+        for row in &self.processes {
+            println!(
+                "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9.0} {:>6} {:>7} {:>9} {:>5} MiB {}",
+                self.run,
+                row.process,
+                row.state,
+                row.pid,
+                row.tick,
+                row.ticks_per_s,
+                row.lag,
+                row.drops,
+                row.restarts,
+                row.memory_mib,
+                row.waits_for
+            );
+        }
+        println!();
+        for row in &self.environments {
+            println!(
+                "{:<16} environment {}: episode {}, {:.1} s, {} of {} road users sensing, {} arrived, {:.0} steps/s, {:.1} × real time",
+                self.run,
+                row.environment,
+                row.episode,
+                row.sim_time_s,
+                row.cavs,
+                row.road_users,
+                row.arrived,
+                row.steps_per_s,
+                row.real_time_factor,
+            );
+        }
+        if let Some(row) = &self.training {
+            println!(
+                "{:<16} trainer: {} updates, {}, reward {:.3}",
+                self.run, row.updates, row.metrics, row.reward
+            );
         }
     }
-    // Processes of the whole run come last.
-    boards.sort_by_key(|process| process.scope == ProcessScope::Run);
-    // Rates are differences of two readings.
-    let first = read_boards(&boards);
-    wait(MEASURING_TIME);
-    let second = read_boards(&boards);
-    let supervisor = memory_mib(run.supervisor_pid);
-    println!(
-        "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>5} MiB",
-        run.name, "supervisor", "running", run.supervisor_pid, "", "", "", "", "", supervisor
-    );
-    for ((process, before), now) in boards.iter().zip(&first).zip(&second) {
-        // The first process of an environment is its `traffic-bridge`, whose tick all others follow.
-        let source = boards.iter().position(|other| other.env_index == process.env_index);
-        let source_ticks = source.map_or(0, |source| second[source].health.ticks);
-        #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
-        let rate = now.health.ticks.saturating_sub(before.health.ticks) as f64 / MEASURING_TIME.as_secs_f64();
-        println!(
-            "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9.0} {:>6} {:>7} {:>9} {:>5} MiB {}",
-            run.name,
-            process.label,
-            now.state(run),
-            now.health.pid,
-            now.health.ticks,
-            rate,
-            source_ticks.saturating_sub(now.health.ticks),
-            now.health.drops,
-            now.progress.incarnation,
-            memory_mib(now.health.pid),
-            now.activity.awaited()
-        );
-    }
-    println!();
-    print_environments(run, &boards, [&first, &second]);
-    print_training(run, &boards);
-    Ok(())
 }
 
-/// Prints a line for each environment: its episode and simulated time, its road users, and its rates.
-fn print_environments(run: &RunFile, boards: &[ProcessBoard], [before, now]: [&[BoardReading]; 2]) {
-    for env_index in 0..run.config.run.envs {
+/// Increase per second from one reading to the next.
+fn per_second(now: u64, before: u64) -> f64 {
+    #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+    let increase = now.saturating_sub(before) as f64;
+    increase / MEASURING_TIME.as_secs_f64()
+}
+
+fn process_rows(run: &RunFile, boards: &[ProcessBoard], [before, now]: [&[BoardReading]; 2]) -> Vec<ProcessRow> {
+    let row = |((process, before), now_of_it): ((&ProcessBoard, &BoardReading), &BoardReading)| {
+        // The first process of an environment is its `traffic-bridge`, whose tick all others follow.
+        let source = boards.iter().position(|other| other.env_index == process.env_index);
+        let source_ticks = source.map_or(0, |source| now[source].health.ticks);
+        let health = now_of_it.health;
+        ProcessRow {
+            process: process.label.clone(),
+            state: now_of_it.state(run),
+            pid: health.pid,
+            tick: health.ticks,
+            ticks_per_s: per_second(health.ticks, before.health.ticks),
+            lag: source_ticks.saturating_sub(health.ticks),
+            drops: health.drops,
+            restarts: now_of_it.progress.incarnation,
+            memory_mib: memory_mib(health.pid),
+            waits_for: now_of_it.activity.awaited().to_string(),
+        }
+    };
+    boards.iter().zip(before).zip(now).map(row).collect()
+}
+
+/// A row for each environment: its episode and simulated time, its road users, and its rates.
+fn environment_rows(
+    run: &RunFile,
+    boards: &[ProcessBoard],
+    [before, now]: [&[BoardReading]; 2],
+) -> Vec<EnvironmentRow> {
+    let row = |env_index: u32| {
         let index_of = |process: Process| {
             let is_it = |other: &ProcessBoard| other.env_index == env_index && other.process == process;
             boards.iter().position(is_it)
         };
-        let indices = [Process::TrafficBridge, Process::SimCore, Process::SensorDaemon].map(index_of);
-        let [Some(bridge), Some(core), Some(daemon)] = indices else {
-            continue;
-        };
+        let bridge = index_of(Process::TrafficBridge)?;
+        let core = index_of(Process::SimCore)?;
+        let daemon = index_of(Process::SensorDaemon)?;
         let (traffic, world, sensing) = (now[bridge].health, now[core].health, now[daemon].health);
         let sensing_before = before[daemon].health;
-        let per_second = |now: u64, before: u64| {
-            #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
-            let increase = now.saturating_sub(before) as f64;
-            increase / MEASURING_TIME.as_secs_f64()
-        };
-        println!(
-            "{:<16} environment {env_index}: episode {}, {:.1} s, {} of {} road users sensing, {} arrived, {:.0} steps/s, {:.1} × real time",
-            run.name,
-            sensing.episode,
-            Duration::from_nanos(sensing.sim_time_ns).as_secs_f64(),
-            sensing.cavs,
-            world.road_users,
-            traffic.arrived,
-            per_second(sensing.vehicle_steps, sensing_before.vehicle_steps),
-            per_second(sensing.ticks, sensing_before.ticks) * run.config.run.tick_s,
-        );
-    }
+        Some(EnvironmentRow {
+            environment: env_index,
+            episode: sensing.episode,
+            sim_time_s: Duration::from_nanos(sensing.sim_time_ns).as_secs_f64(),
+            cavs: sensing.cavs,
+            road_users: world.road_users,
+            arrived: traffic.arrived,
+            steps_per_s: per_second(sensing.vehicle_steps, sensing_before.vehicle_steps),
+            real_time_factor: per_second(sensing.ticks, sensing_before.ticks) * run.config.run.tick_s,
+        })
+    };
+    (0..run.config.run.envs).filter_map(row).collect()
 }
 
-/// Prints a line for the trainer once it reports metrics: its updates, its metrics and its reward.
-fn print_training(run: &RunFile, boards: &[ProcessBoard]) {
-    let Some(trainer) = boards.iter().find(|board| board.process == Process::Trainer) else {
-        return;
-    };
+/// The trainer's updates, metrics and reward, once it reports metrics.
+fn training_row(boards: &[ProcessBoard]) -> Option<TrainingRow> {
+    let trainer = boards.iter().find(|board| board.process == Process::Trainer)?;
     let training = trainer.board.training();
-    let measured = metric::summary(&training.metrics);
-    if !measured.is_empty() {
-        println!(
-            "{:<16} trainer: {} updates, {measured}, reward {:.3}",
-            run.name, training.updates, training.reward
-        );
-    }
+    let metrics = metric::summary(&training.metrics);
+    (!metrics.is_empty()).then_some(TrainingRow {
+        updates: training.updates,
+        metrics,
+        reward: training.reward,
+        policy_std: training.policy_std,
+    })
 }
 
 /// Resident memory of a process, MiB.

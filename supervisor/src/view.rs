@@ -132,9 +132,13 @@ fn viewer_command(target: &ViewTarget) -> Result<Command, Exit> {
     Ok(command)
 }
 
-fn check_installed(python: &Path) -> Result<(), Exit> {
+/// Checks that the viewer and what it needs are installed for `python`.
+///
+/// # Errors
+/// Something is missing, or Python does not start.
+pub fn check_installed(python: &Path) -> Result<(), Exit> {
     let script = format!(
-        "import importlib.util as u, sys; sys.exit(' '.join(p for p in ('{MODULE}', 'rerun', 'zenoh') if u.find_spec(p) is None))"
+        "import importlib.util as u, sys; sys.exit(' '.join(p for p in ('{MODULE}', 'rerun', 'werkzeug', 'zenoh') if u.find_spec(p) is None))"
     );
     let help = "run `make build`; on a machine with only Python: pip install ./viewer";
     let output = Command::new(python)

@@ -124,6 +124,12 @@ impl LayeredSettings {
         self.setting(path).and_then(|setting| setting.value.as_f64())
     }
 
+    /// The value of the key `path`; null if it is unset.
+    #[must_use]
+    pub fn value(&self, path: &str) -> Value {
+        self.setting(path).map_or(Value::Null, |setting| setting.value.clone())
+    }
+
     /// True if the key `path` has this text.
     #[must_use]
     pub fn has_text(&self, path: &str, text: &str) -> bool {
