@@ -39,7 +39,8 @@ def security_policy(grpc_port: int) -> str:
             "worker-src 'self' blob:",
             f"connect-src 'self' http://127.0.0.1:{grpc_port} http://localhost:{grpc_port}",
             "base-uri 'none'",
-            "frame-ancestors 'self'",
+            # `caraware panel` embeds the page; its port is not known here.
+            "frame-ancestors 'self' http://127.0.0.1:* http://localhost:*",
         ]
     )
 
