@@ -3,6 +3,11 @@
 import { byId, h, quoted } from "./dom.js";
 
 const NUMBERS = new Set(["float", "integer"]);
+/** Kinds of `caraware keys --json` as the form names them. */
+const TYPES = { float: "number", integer: "whole number", flag: "switch", choice: "one of", floats: "numbers", integers: "whole numbers",
+  span: "shortest and longest", texts: "list", tables: "list" };
+/** Longest list of allowed values that is shown. */
+const LONG = 200;
 
 let catalogue = { presets: [], keys: [] };
 /** Values that differ from the preset's, as texts, by key. */
@@ -48,10 +53,11 @@ function row(key) {
   input.id = `key-${key.path}`;
   const name = key.path.slice(key.path.indexOf(".") + 1);
   const unit = key.unit ? ` ${key.unit}` : "";
+  const allowed = key.allowed.length > LONG ? `${key.allowed.slice(0, LONG)} …` : key.allowed;
   const element = h("div", { className: "key" },
     h("label", {}, h("span", { textContent: name }), h("span", {}, input, unit)),
     h("div", { className: "help", textContent: key.meaning }),
-    h("div", { className: "help", textContent: `allowed: ${key.allowed.length > 200 ? `${key.allowed.slice(0, 200)} …` : key.allowed}${unit}` }));
+    h("div", { className: "help", textContent: `${TYPES[key.kind] ?? key.kind}: ${allowed}${unit}; default ${asText(key.default) || "none"}` }));
   element.dataset.path = key.path;
   input.addEventListener("input", () => {
     if (input.value === asText(presetValue(key))) changed.delete(key.path);
