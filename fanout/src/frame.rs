@@ -5,10 +5,11 @@ use ipc_schema::{
     block::{BlockError, Section, view},
     event::CollisionLayout,
     header::{DIMENSIONS, MessageHeader},
-    observation::ObservationLayout,
+    observation::{EMPTY_SLOT, ObservationLayout},
     pointcloud::{LidarPoint, PointcloudLayout, Scan},
     prediction::PredictionLayout,
     services::Channel,
+    traffic::Kind,
     world::{VehicleState, WorldLayout},
 };
 
@@ -43,8 +44,9 @@ pub struct EncodedFrame {
 
 /// Encodes a message of `channel` as a frame.
 ///
-/// A frame of `world` has neither sub-steps nor views of heroes. If there are more road users or points than fit, it has every second (third, …)
-/// of them. Observations and predictions are cut to their first slots.
+/// A frame of `world` has neither sub-steps nor views of heroes. If there are more road users or slots of an observation than fit, it has
+/// those that come first by [`sampling_order`], in every tick the same; of more points than fit, every second (third, …).
+/// A prediction has the slots of its observation ([`encode_prediction`]); alone, its first ones.
 ///
 /// # Errors
 /// The payload is shorter than its header promises, or the frame is too long.
@@ -52,31 +54,101 @@ pub fn encode(channel: Channel, header: &MessageHeader, payload: &[u8]) -> Resul
     match channel {
         Channel::World => encode_world(header, payload),
         Channel::Observation => {
-            let [_, fields, imu_samples] = dimensions(header);
-            encode_slots(header, payload, |rows| {
-                let layout = ObservationLayout::sized(rows, fields, imu_samples);
-                (
-                    layout.named().map(|(_, section)| section).to_vec(),
-                    layout.shape,
-                    layout.len,
-                )
-            })
+            let chosen = chosen_slots(header, payload)?;
+            encode_slots(header, payload, chosen.as_deref(), observation_layout(header))
         }
-        Channel::Prediction => {
-            let [_, numbers, estimates] = dimensions(header);
-            encode_slots(header, payload, |rows| {
-                // A filter that runs has an estimate for each slot, so that fewer slots have fewer of them.
-                let layout = PredictionLayout::sized(rows, numbers, estimates.min(rows));
-                (
-                    layout.named().map(|(_, section)| section).to_vec(),
-                    layout.shape,
-                    layout.len,
-                )
-            })
-        }
+        Channel::Prediction => encode_prediction(header, payload, None),
         Channel::Pointcloud => encode_scan(header, payload),
         _ => encode_collisions(header, payload),
     }
+}
+
+/// Where a road user stands in the order in which frames take road users when not all fit: a function of its id alone, so that the
+/// same road users are shown in every tick.
+#[must_use]
+pub fn sampling_order(id_hash: u64) -> u64 {
+    id_hash.wrapping_mul(0x9e37_79b9_7f4a_7c15)
+}
+
+/// Indices of the `count` rows with the lowest `order`, ascending.
+fn first_by_order(order: impl Iterator<Item = u64>, count: usize) -> Vec<usize> {
+    let mut rows: Vec<(u64, usize)> = order.zip(0..).collect();
+    if count < rows.len() {
+        rows.select_nth_unstable(count);
+        rows.truncate(count);
+    }
+    let mut indices: Vec<usize> = rows.into_iter().map(|(_, index)| index).collect();
+    indices.sort_unstable();
+    indices
+}
+
+/// The slots that a frame of this observation keeps, ascending; `None` if all fit. Empty slots come last.
+///
+/// # Errors
+/// The payload is shorter than its header promises.
+pub fn chosen_slots(header: &MessageHeader, payload: &[u8]) -> Result<Option<Vec<usize>>, FrameError> {
+    let layout = ObservationLayout::of(header);
+    let whole: &[u8] = view(
+        payload,
+        Section {
+            offset: 0,
+            len: layout.len,
+        },
+    )?;
+    if HEADER_BYTES + layout.len <= MAX_FRAME_BYTES {
+        return Ok(None);
+    }
+    let ids: &[u64] = view(whole, layout.id_hash)?;
+    let vehicles: &[u32] = view(whole, layout.vehicle)?;
+    let order = ids
+        .iter()
+        .zip(vehicles)
+        .map(|(id_hash, vehicle)| match *vehicle == EMPTY_SLOT {
+            true => u64::MAX,
+            false => sampling_order(*id_hash),
+        });
+    let kept = slots_that_fit(header.rows(), layout.len, layout.named().len());
+    Ok(Some(first_by_order(order, kept)))
+}
+
+/// Encodes a prediction with the slots of its observation's frame, so that the rows of both stay pairs. Without `chosen` it has all
+/// slots, or its first ones.
+///
+/// # Errors
+/// As [`encode`].
+pub fn encode_prediction(
+    header: &MessageHeader,
+    payload: &[u8],
+    chosen: Option<&[usize]>,
+) -> Result<EncodedFrame, FrameError> {
+    let [_, numbers, estimates] = dimensions(header);
+    encode_slots(header, payload, chosen, |rows| {
+        // A filter that runs has an estimate for each slot, so that fewer slots have fewer of them.
+        let layout = PredictionLayout::sized(rows, numbers, estimates.min(rows));
+        (
+            layout.named().map(|(_, section)| section).to_vec(),
+            layout.shape,
+            layout.len,
+        )
+    })
+}
+
+/// Sections, shape and length of an observation with a number of slots.
+fn observation_layout(header: &MessageHeader) -> impl Fn(usize) -> (Vec<Section>, [u32; DIMENSIONS], usize) {
+    let [_, fields, imu_samples] = dimensions(header);
+    move |rows| {
+        let layout = ObservationLayout::sized(rows, fields, imu_samples);
+        (
+            layout.named().map(|(_, section)| section).to_vec(),
+            layout.shape,
+            layout.len,
+        )
+    }
+}
+
+/// Slots of `rows` that fit into a frame if all of them take `len` bytes in `sections` sections, each padded to its alignment.
+fn slots_that_fit(rows: usize, len: usize, sections: usize) -> usize {
+    rows * MAX_FRAME_BYTES.saturating_sub(HEADER_BYTES + 64 * sections) / len
 }
 
 /// The header with another number of rows.
@@ -92,32 +164,45 @@ fn dimensions(header: &MessageHeader) -> [usize; 3] {
     [first as usize, second as usize, third as usize]
 }
 
-/// Encodes a block whose sections have a row for each slot, cut to the slots that fit. `layout_of` gives sections, shape and length of a
-/// block with a number of slots.
+/// Encodes a block whose sections have a row for each slot: the `chosen` slots; without a choice all, or as many of the first as fit.
+/// `layout_of` gives sections, shape and length of a block with a number of slots.
 fn encode_slots(
     header: &MessageHeader,
     payload: &[u8],
+    chosen: Option<&[usize]>,
     layout_of: impl Fn(usize) -> (Vec<Section>, [u32; DIMENSIONS], usize),
 ) -> Result<EncodedFrame, FrameError> {
     let rows = header.rows();
     let (sections, _, len) = layout_of(rows);
     let bytes: &[u8] = view(payload, Section { offset: 0, len })?;
-    if HEADER_BYTES + len <= MAX_FRAME_BYTES {
+    if chosen.is_none() && HEADER_BYTES + len <= MAX_FRAME_BYTES {
         return Ok(EncodedFrame {
             bytes: [bytes_of(header), bytes].concat(),
             left_out: 0,
         });
     }
-    // Each section is padded to its alignment: leave room for that.
-    let room = MAX_FRAME_BYTES.saturating_sub(HEADER_BYTES + 64 * sections.len());
-    let kept = rows * room / len;
+    let first: Vec<usize>;
+    let chosen = match chosen {
+        Some(chosen) => chosen,
+        None => {
+            first = (0..slots_that_fit(rows, len, sections.len())).collect();
+            &first
+        }
+    };
+    let kept = chosen.len();
     let (shorter, shape, len) = layout_of(kept);
     let mut bytes = bytes_of(&MessageHeader { shape, ..*header }).to_vec();
     bytes.resize(HEADER_BYTES + len, 0);
     for (from, to) in sections.into_iter().zip(shorter) {
-        let kept_rows = Section { len: to.len, ..from };
-        let start = HEADER_BYTES + to.offset;
-        bytes[start..start + to.len].copy_from_slice(view(payload, kept_rows)?);
+        let row_bytes = to.len / kept.max(1);
+        for (index, slot) in chosen.iter().enumerate().take(to.len / row_bytes.max(1)) {
+            let row = Section {
+                offset: from.offset + slot * row_bytes,
+                len: row_bytes,
+            };
+            let start = HEADER_BYTES + to.offset + index * row_bytes;
+            bytes[start..start + row_bytes].copy_from_slice(view(payload, row)?);
+        }
     }
     if bytes.len() > MAX_FRAME_BYTES {
         return Err(FrameError::TooLong(bytes.len()));
@@ -149,7 +234,20 @@ fn encode_world(header: &MessageHeader, payload: &[u8]) -> Result<EncodedFrame, 
         shape: layout.shape,
         ..*header
     };
-    Ok(thinned(&header, &[], states, MAX_FRAME_BYTES))
+    let max_rows = (MAX_FRAME_BYTES - HEADER_BYTES) / size_of::<VehicleState>();
+    if states.len() <= max_rows {
+        return Ok(thinned(&header, &[], states, MAX_FRAME_BYTES));
+    }
+    // Heroes are few, and a viewer follows them.
+    let order = states.iter().map(|state| match state.kind == Kind::Hero as u32 {
+        true => 0,
+        false => sampling_order(state.id_hash),
+    });
+    let kept: Vec<VehicleState> = first_by_order(order, max_rows).iter().map(|row| states[*row]).collect();
+    Ok(EncodedFrame {
+        left_out: states.len() - kept.len(),
+        ..thinned(&header, &[], &kept, MAX_FRAME_BYTES)
+    })
 }
 
 /// Encodes a scan: where the sensor was, and the points that fit.

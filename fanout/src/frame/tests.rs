@@ -1,4 +1,7 @@
-use bytemuck::cast_slice;
+use std::collections::BTreeSet;
+
+use bytemuck::{cast_slice, cast_slice_mut};
+use ipc_schema::traffic::id_hash;
 use proptest::prelude::*;
 
 use super::*;
@@ -18,6 +21,7 @@ fn states(count: usize) -> Vec<VehicleState> {
         .map(|i| VehicleState {
             x_m: i as f64,
             vehicle: u32::try_from(i).unwrap(),
+            id_hash: id_hash(&format!("cav.{i}")),
             ..VehicleState::default()
         })
         .collect()
@@ -42,14 +46,91 @@ fn world_keeps_every_state_and_no_sub_step() {
 }
 
 #[test]
-fn a_crowd_is_thinned_evenly_and_counted() {
-    let crowd = states(20_000);
-    let frame = encode(Channel::World, &header([20_000, 0, 0, 0]), cast_slice(&crowd)).unwrap();
-    let (head, body) = decode(&frame.bytes).unwrap();
-    assert!(frame.bytes.len() <= MAX_FRAME_BYTES);
-    assert_eq!((head.rows(), frame.left_out), (5_000, 15_000));
-    let second: VehicleState = pod_read_unaligned(&body[136..272]);
-    assert_eq!(second.vehicle, 4);
+fn a_crowd_is_sampled_by_id_and_counted() {
+    let shown = |crowd: &[VehicleState]| -> BTreeSet<u64> {
+        let shape = [u32::try_from(crowd.len()).unwrap(), 0, 0, 0];
+        let frame = encode(Channel::World, &header(shape), cast_slice(crowd)).unwrap();
+        let (head, body) = decode(&frame.bytes).unwrap();
+        assert!(frame.bytes.len() <= MAX_FRAME_BYTES);
+        assert_eq!((head.rows() + frame.left_out, head.rows()), (crowd.len(), 6_616));
+        let rows = body.chunks_exact(136).map(pod_read_unaligned::<VehicleState>);
+        rows.map(|state| state.id_hash).collect()
+    };
+    let mut crowd = states(20_000);
+    crowd[7_777].kind = Kind::Hero as u32;
+    let before = shown(&crowd);
+    assert!(before.contains(&crowd[7_777].id_hash), "heroes are always shown");
+    // A tick later some have left and the rows are others: those shown before and still present are shown again.
+    crowd.rotate_left(3_333);
+    crowd.truncate(19_900);
+    let present: BTreeSet<u64> = crowd.iter().map(|state| state.id_hash).collect();
+    let after = shown(&crowd);
+    assert!(before.intersection(&present).all(|id_hash| after.contains(id_hash)));
+    // Over the map they are as evenly spread as all are.
+    let western = before.iter().filter(|id_hash| {
+        crowd
+            .iter()
+            .any(|state| state.id_hash == **id_hash && state.x_m < 10_000.0)
+    });
+    let share = western.count() as f64 / before.len() as f64;
+    assert!((0.45..0.55).contains(&share), "{share}");
+}
+
+#[test]
+fn a_prediction_has_the_slots_of_its_observation() {
+    let layout = ObservationLayout::new(10_000, 9, 1);
+    let mut words = payload(layout.len);
+    let bytes: &mut [u8] = cast_slice_mut(&mut words);
+    for slot in 0..10_000_usize {
+        let of_id = id_hash(&format!("cav.{slot}")).to_le_bytes();
+        bytes[layout.id_hash.offset + 8 * slot..][..8].copy_from_slice(&of_id);
+        let vehicle = if slot < 2_000 {
+            EMPTY_SLOT
+        } else {
+            u32::try_from(slot).unwrap()
+        };
+        bytes[layout.vehicle.offset + 4 * slot..][..4].copy_from_slice(&vehicle.to_le_bytes());
+    }
+    let observed = encode(Channel::Observation, &header(layout.shape), bytes).unwrap();
+    let chosen = chosen_slots(&header(layout.shape), bytes).unwrap().unwrap();
+    let (head, body) = decode(&observed.bytes).unwrap();
+    let short = ObservationLayout::of(&head);
+    assert_eq!((head.rows(), observed.left_out), (chosen.len(), 10_000 - chosen.len()));
+    assert!((850_000..=MAX_FRAME_BYTES).contains(&observed.bytes.len()));
+    let vehicles: Vec<u32> = body[short.vehicle.offset..][..short.vehicle.len]
+        .chunks_exact(4)
+        .map(pod_read_unaligned)
+        .collect();
+    // Of vehicles and empty slots, the vehicles.
+    assert!(
+        vehicles
+            .iter()
+            .zip(&chosen)
+            .all(|(vehicle, slot)| *vehicle as usize == *slot && *slot >= 2_000)
+    );
+    for ((_, from), (name, to)) in layout.named().into_iter().zip(short.named()) {
+        let row = to.len / chosen.len();
+        let kept = chosen.iter().map(|slot| &bytes[from.offset + slot * row..][..row]);
+        assert!(kept.eq(body[to.offset..][..to.len].chunks_exact(row)), "{name}");
+    }
+    let layout = PredictionLayout::new(10_000, 2, true);
+    let words: Vec<u64> = (0..layout.len as u64 / 8).collect();
+    let predicted = encode_prediction(&header(layout.shape), cast_slice(&words), Some(&chosen)).unwrap();
+    let (head, body) = decode(&predicted.bytes).unwrap();
+    let short = PredictionLayout::of(&head);
+    assert_eq!(head.rows(), chosen.len());
+    let [(_, first), (_, second)] = short.named();
+    for (section, begin) in [(first, 0), (second, layout.named()[1].1.offset / 8)] {
+        let rows: Vec<u64> = body[section.offset..][..section.len]
+            .chunks_exact(8)
+            .map(pod_read_unaligned)
+            .collect();
+        assert!(
+            rows.iter()
+                .zip(&chosen)
+                .all(|(row, slot)| *row == (begin + slot) as u64)
+        );
+    }
 }
 
 #[test]
@@ -70,9 +151,9 @@ fn a_dense_scan_is_thinned_and_keeps_where_the_sensor_was() {
     assert_eq!(body.len(), layout.points.offset + kept * size_of::<LidarPoint>());
 }
 
-/// The frame holds as many slots as fit, each as in the block.
+/// The frame holds as many slots as fit.
 #[test]
-fn long_observations_are_cut_to_their_first_slots() {
+fn long_observations_are_cut_to_the_slots_that_fit() {
     let layout = ObservationLayout::new(20_000, 9, 1);
     let words = payload(layout.len);
     let frame = encode(Channel::Observation, &header(layout.shape), cast_slice(&words)).unwrap();
@@ -84,10 +165,7 @@ fn long_observations_are_cut_to_their_first_slots() {
         "{}",
         frame.bytes.len()
     );
-    for ((_, from), (name, to)) in layout.named().into_iter().zip(short.named()) {
-        let whole = &cast_slice::<_, u8>(&words)[from.offset..from.offset + to.len];
-        assert_eq!(&body[to.offset..to.offset + to.len], whole, "{name}");
-    }
+    assert_eq!(body.len(), short.len);
 }
 
 #[test]

@@ -163,6 +163,7 @@ impl TickTopics {
         counters: &mut FanoutCounters,
     ) -> Result<(), FanoutError> {
         self.measure(ticks);
+        let chosen = self.chosen_slots(ticks);
         // Encode what is due, and give the messages back to shared memory.
         let mut longest = 0;
         let mut encoded = Vec::new();
@@ -173,7 +174,10 @@ impl TickTopics {
             };
             let header = *message.header();
             let is_due = stream.budget.allows(now);
-            let framed = is_due.then(|| frame::encode(stream.feed.channel(), &header, message.payload()));
+            let framed = is_due.then(|| match stream.topic {
+                Topic::Prediction => frame::encode_prediction(&header, message.payload(), chosen.as_deref()),
+                _ => frame::encode(stream.feed.channel(), &header, message.payload()),
+            });
             stream.feed.release(tick);
             if header.tick >= self.newest.tick {
                 self.newest = header;
@@ -202,6 +206,16 @@ impl TickTopics {
             publisher.publish(topic, frame.bytes)?;
         }
         Ok(())
+    }
+
+    /// The slots of the observation that its frame keeps, if it does not keep all: the prediction of the same tick has the same ones.
+    fn chosen_slots(&self, ticks: &[Option<u64>]) -> Option<Vec<usize>> {
+        let [_, observed, predicted] = ticks else { return None };
+        if observed != predicted {
+            return None;
+        }
+        let message = self.streams.get(1)?.feed.fresh((*observed)?)?;
+        frame::chosen_slots(message.header(), message.payload()).ok().flatten()
     }
 
     /// Takes the figures of the status from the ticks that are about to be published.
