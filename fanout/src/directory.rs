@@ -1,4 +1,4 @@
-//! The directory of road users and traffic lights, kept up to date from a census each simulated second and the changes between.
+//! The directory of road users, traffic lights and heroes' routes, kept up to date from a census each simulated second and the changes between.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use bytemuck::bytes_of;
 use ipc_schema::{
     block::{BlockError, view},
     header::MessageHeader,
-    traffic::{MetaEvent, SignalMeta, TrafficMetaLayout, VehicleMeta},
+    traffic::{MetaEvent, RoutePoint, SignalMeta, TrafficMetaLayout, VehicleMeta},
 };
 
 /// A fact and the tick from which it is known.
@@ -22,9 +22,12 @@ pub struct RoadUserDirectory {
     header: MessageHeader,
     vehicles: BTreeMap<u32, Dated<VehicleMeta>>,
     signals: BTreeMap<u32, Dated<SignalMeta>>,
+    /// Points of each hero's route. A census has none, so that a restarted fan-out learns of a route when its hero departs next.
+    routes: BTreeMap<u32, Vec<RoutePoint>>,
     /// The tick at which each road user left, of those that left since the last census.
     gone: BTreeMap<u32, u64>,
     signals_changed: bool,
+    routes_changed: bool,
 }
 
 impl RoadUserDirectory {
@@ -46,10 +49,12 @@ impl RoadUserDirectory {
                 self.vehicles.insert(fact.vehicle, dated);
             } else if fact.event == MetaEvent::Arrived as u32 {
                 self.vehicles.remove(&fact.vehicle);
+                self.routes_changed |= self.routes.remove(&fact.vehicle).is_some();
                 self.gone.insert(fact.vehicle, header.tick);
             }
         }
         self.enter_signals(header, signals);
+        self.enter_routes(view(payload, TrafficMetaLayout::of(header).route)?);
         Ok(())
     }
 
@@ -105,6 +110,18 @@ impl RoadUserDirectory {
         }
     }
 
+    /// Appends points to the routes of their heroes; the first point of a route replaces the hero's former one.
+    fn enter_routes(&mut self, points: &[RoutePoint]) {
+        for point in points {
+            let route = self.routes.entry(point.vehicle).or_default();
+            if point.index == 0 {
+                route.clear();
+            }
+            route.push(*point);
+        }
+        self.routes_changed |= !points.is_empty();
+    }
+
     /// Header of the newest message applied.
     #[must_use]
     pub fn header(&self) -> &MessageHeader {
@@ -137,6 +154,12 @@ impl RoadUserDirectory {
             .flat_map(|dated| bytes_of(&dated.fact))
             .copied()
             .collect()
+    }
+
+    /// All points of heroes' routes as bytes, hero by hero, if one has changed since the last call.
+    pub fn take_route_rows(&mut self) -> Option<Vec<u8>> {
+        std::mem::take(&mut self.routes_changed)
+            .then(|| self.routes.values().flatten().flat_map(bytes_of).copied().collect())
     }
 
     /// All traffic lights as bytes, in rows by ascending index, if one has changed since the last call.
@@ -200,6 +223,41 @@ mod tests {
 
     fn known(directory: &RoadUserDirectory) -> Vec<u32> {
         directory.vehicles.keys().copied().collect()
+    }
+
+    #[test]
+    fn a_route_is_kept_until_its_hero_leaves_or_gets_another() {
+        let mut directory = RoadUserDirectory::default();
+        let mut drive = |tick, hero: u32, indices: std::ops::Range<u32>| {
+            let points: Vec<RoutePoint> = indices
+                .map(|index| RoutePoint {
+                    vehicle: hero,
+                    index,
+                    ..RoutePoint::default()
+                })
+                .collect();
+            let layout = TrafficMetaLayout::sized(0, 0, points.len());
+            let header = MessageHeader {
+                tick,
+                shape: layout.shape,
+                ..MessageHeader::default()
+            };
+            directory.apply_changes(&header, bytemuck::cast_slice(&points)).unwrap();
+            directory
+                .take_route_rows()
+                .map(|rows| rows.len() / size_of::<RoutePoint>())
+        };
+        assert_eq!(drive(1, 3, 0..4), Some(4));
+        assert_eq!(drive(2, 3, 4..6), Some(6));
+        assert_eq!(drive(3, 8, 0..2), Some(8));
+        assert_eq!(drive(4, 3, 0..1), Some(3));
+        assert_eq!(drive(5, 3, 0..0), None);
+        let (header, words) = message(0, 6, &[vehicle(3, MetaEvent::Arrived)], &[]);
+        directory.apply_changes(&header, bytemuck::cast_slice(&words)).unwrap();
+        assert_eq!(
+            directory.take_route_rows().map(|rows| rows.len()),
+            Some(2 * size_of::<RoutePoint>())
+        );
     }
 
     #[test]

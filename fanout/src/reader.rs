@@ -7,7 +7,7 @@ use ipc_schema::{
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
     prediction::PredictionLayout,
-    traffic::{SignalMeta, VehicleMeta},
+    traffic::{RoutePoint, SignalMeta, VehicleMeta},
     world::VehicleState,
 };
 
@@ -43,7 +43,7 @@ pub enum SampleRefusal {
 /// # Errors
 /// The sample must be refused.
 pub fn check(topic: &str, bytes: &[u8], run_id: Option<u64>) -> Result<Option<MessageHeader>, SampleRefusal> {
-    if matches!(topic, "map" | "status") {
+    if matches!(topic, "map" | "status" | "learning") {
         return check_json(bytes).map(|()| None);
     }
     let short = |promised| SampleRefusal::Short {
@@ -80,6 +80,7 @@ fn promised(topic: &str, header: &MessageHeader) -> Option<usize> {
     Some(match topic {
         "world" => rows_of(size_of::<VehicleState>()),
         "vehicles" => rows_of(size_of::<VehicleMeta>()),
+        "routes" => rows_of(size_of::<RoutePoint>()),
         "signals" => rows_of(size_of::<SignalMeta>()),
         "event" => rows_of(size_of::<Collision>()),
         "prediction" => PredictionLayout::of(header).len,

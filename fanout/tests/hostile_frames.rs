@@ -17,7 +17,7 @@ use ipc_schema::{
     services::Channel,
 };
 
-const TOPICS: [&str; 12] = [
+const TOPICS: [&str; 14] = [
     "world",
     "observation",
     "prediction",
@@ -27,8 +27,10 @@ const TOPICS: [&str; 12] = [
     "collision",
     "vehicles",
     "signals",
+    "routes",
     "map",
     "status",
+    "learning",
     "no/such",
 ];
 

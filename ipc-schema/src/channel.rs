@@ -188,7 +188,7 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         required: &[SimCore],
         paced_by: Channel::Traffic,
         window: RunFile::traffic_window_ticks,
-        topics: &["vehicles", "signals"],
+        topics: &["vehicles", "signals", "routes"],
         when_full: FullQueue::DropNewest,
         max_payload: |_| {
             let metas = TrafficMetaLayout::new(EVENTS_PER_MESSAGE, SIGNALS_PER_MESSAGE).len;

@@ -140,6 +140,20 @@ def test_tensorboard_has_every_tag_with_finite_values(tmp_path: Path) -> None:
         assert all(math.isfinite(point.value) for point in points), tag
 
 
+def test_the_course_of_training_has_every_update_and_evaluation(tmp_path: Path) -> None:
+    loop_over(tmp_path, with_evaluation(100, 20, 16, 5.0, seed=1))
+    lines = [json.loads(line) for line in (tmp_path / "learning.jsonl").read_text().splitlines()]
+    updates = [line for line in lines if "training" in line]
+    assert [line["update"] for line in updates] == [1, 2, 3, 4, 5, 6]
+    for name in ("env_steps", "tick"):
+        numbers = [line[name] for line in updates]
+        assert numbers == sorted(set(numbers)), name
+    assert {"sigma", "reward", "error_m", "raw_gnss_error_m"} <= updates[0]["training"].keys()
+    evaluations = [line["evaluation"] for line in lines if "evaluation" in line]
+    assert len(evaluations) == 2
+    assert {"ppo", "raw_gnss"} <= evaluations[0].keys()
+
+
 def test_a_prediction_comes_from_the_newest_policy(tmp_path: Path) -> None:
     channel = loop_over(tmp_path, with_evaluation(64, 1, 16, 5.0, 2), group=64)
     assert [channel.versions[tick] for tick in (0, 16, 17, 32, 33, 65)] == [0, 0, 1, 1, 2, 4]

@@ -1,9 +1,12 @@
 """Files on a disk that is full: what the run needs waits, what it does not need is dropped and reported once."""
 
 import errno
+import json
 import logging
+import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from caraware.report.metrics import Metrics, TrainingPoint
@@ -53,6 +56,41 @@ def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
 @dataclass(frozen=True)
 class _Stats:
     loss: float
+
+
+def lines_of(file: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+def test_the_course_of_training_is_a_line_for_each_update_and_goes_on_after_a_resume(tmp_path: Path) -> None:
+    def update(metrics: Metrics, env_steps: int) -> None:
+        point = TrainingPoint(env_steps, 0.5, math.nan, {"error_m": env_steps / 100}, 1000.0)
+        metrics.updated(point, _Stats(1.0), tick=env_steps // 10)
+
+    first = Metrics(tmp_path / "tensorboard", ())
+    for env_steps in (100, 200, 300):
+        update(first, env_steps)
+    first.close()
+    file = tmp_path / "learning.jsonl"
+    assert lines_of(file)[1] == {
+        "env_steps": 200,
+        "tick": 20,
+        "update": 2,
+        "training": {"sigma": 0.5, "error_m": 2.0},
+    }
+    # A successor continues after the checkpoint at 200 steps; the process was killed in the middle of a line.
+    with file.open("a") as output:
+        output.write('{"env_steps":4')
+    second = Metrics(tmp_path / "tensorboard", ())
+    second.resume(first.training[:2], [], 200)
+    update(second, 250)
+    second.close()
+    assert [line["env_steps"] for line in lines_of(file)] == [100, 200, 250]
+    # A learner that begins anew has no predecessor's lines.
+    third = Metrics(tmp_path / "tensorboard", ())
+    update(third, 50)
+    third.close()
+    assert [line["env_steps"] for line in lines_of(file)] == [50]
 
 
 def test_events_that_cannot_be_written_are_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

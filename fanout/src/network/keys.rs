@@ -13,10 +13,14 @@ pub enum Topic {
     Map,
     /// State of the run, as JSON.
     Status,
+    /// The course of training, as JSON; queries are answered with the whole.
+    Learning,
     /// Table of road users, as a frame.
     Vehicles,
     /// Traffic lights, as a frame.
     Signals,
+    /// Routes of heroes, as a frame.
+    Routes,
     /// Poses and motion of road users, as a frame.
     World,
     /// What connected vehicles sense, with the truth, as a frame.
@@ -29,11 +33,13 @@ pub enum Topic {
 
 impl Topic {
     /// All topics.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 10] = [
         Self::Map,
         Self::Status,
+        Self::Learning,
         Self::Vehicles,
         Self::Signals,
+        Self::Routes,
         Self::World,
         Self::Observation,
         Self::Prediction,
@@ -46,8 +52,10 @@ impl Topic {
         match self {
             Self::Map => "map",
             Self::Status => "status",
+            Self::Learning => "learning",
             Self::Vehicles => "vehicles",
             Self::Signals => "signals",
+            Self::Routes => "routes",
             Self::World => Channel::World.name(),
             Self::Observation => Channel::Observation.name(),
             Self::Prediction => Channel::Prediction.name(),
@@ -121,13 +129,13 @@ mod tests {
     use proptest::prelude::*;
     use zenoh::key_expr::KeyExpr;
 
-    /// The topics of the channels are those that a run publishes, beside `map`, `status` and the scans.
+    /// The topics of the channels are those that a run publishes, beside `map`, `status`, `learning` and the scans.
     #[test]
     fn every_topic_of_a_channel_is_published() {
         let of_channels: BTreeSet<&str> = CHANNELS.iter().flat_map(|channel| channel.topics).copied().collect();
         let names = Topic::ALL.map(Topic::name);
         let published: BTreeSet<&str> = names.into_iter().chain([Channel::Pointcloud.name()]).collect();
-        let of_the_run = BTreeSet::from([Topic::Map.name(), Topic::Status.name()]);
+        let of_the_run = BTreeSet::from([Topic::Map, Topic::Status, Topic::Learning].map(Topic::name));
         assert_eq!(&published - &of_the_run, of_channels);
     }
 

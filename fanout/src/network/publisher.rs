@@ -286,16 +286,16 @@ pub fn read_attachment(bytes: &[u8]) -> Option<(u64, u64)> {
 /// Each priority has its own queues, so that short and urgent samples overtake long ones.
 fn priority(topic: Topic) -> Priority {
     match topic {
-        Topic::Map | Topic::Status | Topic::Signals | Topic::Event => Priority::InteractiveLow,
+        Topic::Map | Topic::Status | Topic::Learning | Topic::Signals | Topic::Event => Priority::InteractiveLow,
         Topic::Prediction => Priority::DataHigh,
         Topic::World => Priority::Data,
-        Topic::Observation | Topic::Vehicles => Priority::DataLow,
+        Topic::Observation | Topic::Vehicles | Topic::Routes => Priority::DataLow,
     }
 }
 
 fn encoding(topic: Topic) -> Encoding {
     match topic {
-        Topic::Status | Topic::Map => Encoding::APPLICATION_JSON,
+        Topic::Status | Topic::Learning | Topic::Map => Encoding::APPLICATION_JSON,
         _ => Encoding::APPLICATION_OCTET_STREAM,
     }
 }

@@ -2,12 +2,14 @@
 
 use std::time::{Duration, Instant};
 
-use ipc_schema::{board::State, membership::RunMembership, ports::PortError, services::Channel};
+use ipc_schema::{board::State, membership::RunMembership, ports::PortError, run::RunFile, services::Channel};
 
 use crate::{
     error::FanoutError,
     network::{access, commands::CommandGateway, keys::RunKeys, keys::Topic, publisher::EnvironmentPublisher},
-    relay::{reporter::StatusReporter, scans::ScanTopics, slow::SlowTopics, ticks::TickTopics},
+    relay::{
+        learning::LearningCourse, reporter::StatusReporter, scans::ScanTopics, slow::SlowTopics, ticks::TickTopics,
+    },
     status::{self, FanoutCounters},
 };
 
@@ -22,6 +24,7 @@ pub struct EnvironmentRelay {
     slow: SlowTopics,
     scans: Option<ScanTopics>,
     reporter: StatusReporter,
+    learning: LearningCourse,
     publisher: EnvironmentPublisher,
     commands: CommandGateway,
     counters: FanoutCounters,
@@ -32,11 +35,17 @@ pub struct EnvironmentRelay {
 }
 
 impl EnvironmentRelay {
-    /// Opens the channels and declares the keys of environment `env_index`.
+    /// Opens the channels and declares the keys of environment `env_index`; `first_run` is the run of environment 0, whose directory
+    /// has the course of training.
     ///
     /// # Errors
     /// A service of the run is missing, or zenoh refuses.
-    pub fn open(mut membership: RunMembership, env_index: u32, zenoh: &zenoh::Session) -> Result<Self, FanoutError> {
+    pub fn open(
+        mut membership: RunMembership,
+        env_index: u32,
+        zenoh: &zenoh::Session,
+        first_run: &RunFile,
+    ) -> Result<Self, FanoutError> {
         let run = &membership.run;
         let keys = RunKeys::new(&run.name, env_index);
         let publisher = EnvironmentPublisher::open(zenoh.clone(), &keys, &status::map_json(run, env_index)?)?;
@@ -46,6 +55,7 @@ impl EnvironmentRelay {
             slow: SlowTopics::open(&mut membership)?,
             scans: ScanTopics::open(&mut membership)?,
             reporter: StatusReporter::open(&membership, env_index)?,
+            learning: LearningCourse::new(first_run),
             membership,
             started: Instant::now(),
             publisher,
@@ -117,7 +127,12 @@ impl EnvironmentRelay {
         };
         let status = self.reporter.status(&self.membership.run, now, &self.ticks, counters);
         let json = serde_json::to_vec(&status)?;
-        Ok(self.publisher.publish(Topic::Status, json)?)
+        self.publisher.publish(Topic::Status, json)?;
+        if let Some((newest, whole)) = self.learning.read_new() {
+            self.publisher
+                .publish_part(Topic::Learning, newest.into(), Some(whole.into()))?;
+        }
+        Ok(())
     }
 
     /// True once the last tick of the run has been published, or [`LAST_TICK_LIMIT`] has passed since it was produced.

@@ -4,6 +4,7 @@
 //! are published together, [`slow`] ones change seldom, and [`scans`] are published on demand.
 
 pub mod environment;
+pub mod learning;
 pub mod pace;
 pub mod reporter;
 pub mod scans;
@@ -34,13 +35,14 @@ impl RunRelay {
     pub fn open(membership: RunMembership) -> Result<Self, FanoutError> {
         let zenoh = endpoint::listen(&membership.run.config.fanout)?;
         let poll_interval = PollInterval::new(Channel::World.queue_length(&membership.run));
+        let first_run = membership.run.clone();
         let others: Vec<RunMembership> = (1..membership.run.config.run.envs)
             .map(|env_index| membership.in_environment(env_index))
             .collect::<Result<_, _>>()?;
         let environments = std::iter::once(membership)
             .chain(others)
             .zip(0..)
-            .map(|(membership, env_index)| EnvironmentRelay::open(membership, env_index, &zenoh))
+            .map(|(membership, env_index)| EnvironmentRelay::open(membership, env_index, &zenoh, &first_run))
             .collect::<Result<_, _>>()?;
         Ok(Self {
             zenoh,

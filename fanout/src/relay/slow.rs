@@ -1,4 +1,5 @@
-//! The topics that change slowly: `vehicles` (the table of road users), `signals` (traffic lights) and `event` (contacts).
+//! The topics that change slowly: `vehicles` (the table of road users), `signals` (traffic lights), `routes` (of heroes) and `event`
+//! (contacts).
 
 use std::{collections::VecDeque, time::Duration};
 
@@ -7,7 +8,7 @@ use ipc_schema::{
     membership::{MembershipError, RunMembership},
     ports::PortError,
     services::Channel,
-    traffic::{SignalMeta, VehicleMeta},
+    traffic::{RoutePoint, SignalMeta, VehicleMeta},
 };
 
 use crate::{
@@ -23,7 +24,7 @@ use crate::{
 /// Most messages of contacts that wait to be published; the oldest are dropped.
 const MAX_WAITING_CONTACTS: usize = 64;
 
-/// The topics `vehicles`, `signals` and `event`.
+/// The topics `vehicles`, `signals`, `routes` and `event`.
 pub struct SlowTopics {
     directory: RoadUserDirectory,
     census: ChannelWatcher,
@@ -33,9 +34,12 @@ pub struct SlowTopics {
     max_drained: usize,
     vehicles: TableStream,
     signals: TableStream,
+    routes: TableStream,
     event_budget: RateBudget,
     /// Traffic lights that are not published yet.
     signal_rows: Option<Vec<u8>>,
+    /// Points of routes that are not published yet.
+    route_rows: Option<Vec<u8>>,
     /// Encoded contacts that are not published yet.
     contact_frames: VecDeque<Vec<u8>>,
 }
@@ -71,8 +75,10 @@ impl SlowTopics {
             contacts: ChannelWatcher::open(membership, Channel::Event)?,
             vehicles: TableStream::new(settings.vehicles_hz),
             signals: TableStream::new(settings.signals_hz),
+            routes: TableStream::new(settings.vehicles_hz),
             event_budget: RateBudget::new(settings.event_hz),
             signal_rows: None,
+            route_rows: None,
             contact_frames: VecDeque::new(),
         })
     }
@@ -158,6 +164,19 @@ impl SlowTopics {
                 self.signal_rows = Some(rows);
             }
             publisher.publish_part(Topic::Signals, part.into(), Some(whole.into()))?;
+        }
+        // Routes, after a change.
+        self.route_rows = self.directory.take_route_rows().or(self.route_rows.take());
+        if self.routes.budget.allows(now)
+            && let Some(rows) = self.route_rows.take()
+        {
+            self.routes.budget.spend(0);
+            let (part, whole) = frame::table(&header, &rows, size_of::<RoutePoint>(), &mut self.routes.next_row);
+            counters.frames += 1;
+            if part.len() < whole.len() {
+                self.route_rows = Some(rows);
+            }
+            publisher.publish_part(Topic::Routes, part.into(), Some(whole.into()))?;
         }
         // Contacts, one message at a time.
         if self.event_budget.allows(now)

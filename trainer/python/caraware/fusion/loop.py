@@ -194,7 +194,8 @@ class FusionLoop:
         error_m, self._of_policy = self._of_policy.value(), Mean()
         reward = float(self._reward(torch.tensor(error_m), self._config.trainer.reward_scale_m))
         metrics = {self._headline.name: error_m, **references}
-        self._metrics.updated(TrainingPoint(self._samples.env_steps, 0.0, reward, metrics, rate), stats)
+        point = TrainingPoint(self._samples.env_steps, 0.0, reward, metrics, rate)
+        self._metrics.updated(point, stats, tick=self._stream.committed_tick)
         self._channel.report(
             episode=episode,
             env_steps=self._samples.env_steps,

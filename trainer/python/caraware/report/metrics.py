@@ -1,6 +1,9 @@
-"""The course of training: TensorBoard events, and a history for the plots."""
+"""The course of training: TensorBoard events, a file of JSON lines, and a history for the plots."""
 
+import json
 import logging
+import math
+import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -27,6 +30,9 @@ _EVALUATION_TAGS = {
     "rts": "rts_sees_the_future_",
 }
 """What stands before the unit in the tag of an estimator."""
+
+COURSE = "learning.jsonl"
+"""File of a run: a line for each update and each evaluation. `fanout` sends it to viewers (`docs/fanout.md`)."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +75,49 @@ class DroppedOutput:
         return dict(self._reasons)
 
 
+class Course:
+    """Writes the lines of `learning.jsonl`; a learner that continues from a checkpoint drops the lines after it."""
+
+    def __init__(self, file: Path, dropped: DroppedOutput) -> None:
+        self._file, self._dropped = file, dropped
+        self._kept_env_steps = -1
+        self._begun = False
+
+    def resume(self, env_steps: int) -> None:
+        """Keep the lines up to `env_steps`."""
+        self._kept_env_steps = env_steps
+
+    def add(self, line: Mapping[str, object]) -> None:
+        """Append a line; what a full disk does not take is dropped."""
+        try:
+            if not self._begun:
+                self._begin()
+            with self._file.open("a", encoding="utf-8") as output:
+                output.write(json.dumps(line, separators=(",", ":"), allow_nan=False) + "\n")
+        except OSError as error:
+            self._dropped.drop(COURSE, error)
+
+    def _begin(self) -> None:
+        """Replace the file by the lines that still count, in one step, so that a reader never sees a part of them."""
+        kept = []
+        if self._kept_env_steps >= 0 and self._file.exists():
+            kept = [line for line in self._file.read_text(encoding="utf-8").splitlines() if self._counts(line)]
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        beside = self._file.with_suffix(".new")
+        beside.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+        os.replace(beside, self._file)
+        self._begun = True
+
+    def _counts(self, line: str) -> bool:
+        """False for a line of an abandoned future, or one that was cut off when its process was killed."""
+        try:
+            return int(json.loads(line)["env_steps"]) <= self._kept_env_steps
+        except (ValueError, KeyError, TypeError):
+            return False
+
+
 class Metrics:
-    """Writes TensorBoard events to `folder` and keeps one point per update and per evaluation."""
+    """Writes TensorBoard events to `folder`, JSON lines beside it, and keeps a point per update and per evaluation."""
 
     def __init__(self, folder: Path, task_metrics: Sequence[_native.Metric]) -> None:
         """`task_metrics` are those of the task (`Task.metrics`)."""
@@ -80,15 +127,23 @@ class Metrics:
         self._purge_step: int | None = None
         self.dropped = DroppedOutput()
         self._writer: SummaryWriter | None = None
+        self._course = Course(folder.parent / COURSE, self.dropped)
+        self._tick = 0
 
     def resume(self, training: list[TrainingPoint], evaluations: list[EvaluationResult], env_steps: int) -> None:
         """Go on after `env_steps`: events that a predecessor recorded beyond are void."""
         self.training, self.evaluations = list(training), list(evaluations)
         self._purge_step = env_steps + 1
+        self._course.resume(env_steps)
 
-    def updated(self, point: TrainingPoint, stats: "DataclassInstance", lag_ticks: int = 0) -> None:
-        """Record one update, after which the simulation was `lag_ticks` ahead."""
+    def updated(self, point: TrainingPoint, stats: "DataclassInstance", lag_ticks: int = 0, tick: int = 0) -> None:
+        """Record one update on the ticks up to `tick`, after which the simulation was `lag_ticks` ahead."""
         self.training.append(point)
+        self._tick = tick
+        figures = {"sigma": point.sigma, "reward": point.reward, **point.metrics}
+        self._course.add(
+            {"env_steps": point.env_steps, "tick": tick, "update": len(self.training), "training": _finite(figures)}
+        )
         values = {f"update/{name}": value for name, value in asdict(stats).items()}
         for metric in self._task_metrics:
             if metric.name in point.metrics:
@@ -103,6 +158,8 @@ class Metrics:
         means = {suffix: result.mean(name) for name, suffix in _EVALUATION_TAGS.items()}
         values = {f"{quantity}/evaluation_{suffix}{unit}": mean for suffix, mean in means.items() if mean is not None}
         self._write(values, result.env_steps)
+        figures = {name: mean for name in _EVALUATION_TAGS if (mean := result.mean(name)) is not None}
+        self._course.add({"env_steps": result.env_steps, "tick": self._tick, "evaluation": _finite(figures)})
 
     def _write(self, values: Mapping[str, float], env_steps: int) -> None:
         """Add events; those that a full disk does not take are dropped, and later ones go to a new file."""
@@ -131,6 +188,11 @@ class Metrics:
         except OSError as error:
             self._writer = None
             self.dropped.drop("tensorboard", error)
+
+
+def _finite(figures: Mapping[str, float]) -> dict[str, float]:
+    """The figures that JSON can hold."""
+    return {name: float(value) for name, value in figures.items() if math.isfinite(value)}
 
 
 def _tag(metric: _native.Metric, phase: str) -> str:

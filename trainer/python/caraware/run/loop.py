@@ -271,7 +271,8 @@ class TrainingLoop:
         metrics = {**of_policy, **of_references}
         env_steps = self._samples.env_steps
         point = TrainingPoint(env_steps, stats.sigma, stats.reward_mean, metrics, rate)
-        self._metrics.updated(point, stats, self._channel.lag_ticks())
+        tick = self._environments[0].progress.committed_tick
+        self._metrics.updated(point, stats, self._channel.lag_ticks(), tick)
         self._channel.report(
             episode=self._episode(),
             env_steps=env_steps,
