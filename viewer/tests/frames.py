@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -76,8 +77,19 @@ def vehicles(tick: int, names: dict[int, str], **fields: int) -> bytes:
     return header(tick, len(names), **fields) + rows.tobytes()
 
 
-def signals(tick: int, letters: dict[int, str]) -> bytes:
+def routes(tick: int, points: dict[int, list[tuple[float, float, int, int]]], **fields: int) -> bytes:
+    """Routes by the index of the hero: x, y, traffic light, link."""
+    rows = np.zeros(sum(map(len, points.values())), wire.ROUTE_POINT)
+    every = ((vehicle, index, *point) for vehicle, route in points.items() for index, point in enumerate(route))
+    for row, values in zip(rows, every, strict=True):
+        for name, value in zip(("vehicle", "index", "x_m", "y_m", "signal", "link"), values, strict=True):
+            row[name] = value
+    return header(tick, len(rows), **fields) + rows.tobytes()
+
+
+def signals(tick: int, letters: dict[int, str], indices: Sequence[int] = ()) -> bytes:
     rows = np.zeros(len(letters), wire.SIGNAL_META)
+    rows["signal"] = indices or np.arange(len(letters))
     for row, (id_hash, state) in zip(rows, letters.items(), strict=True):
         row["id_hash"], row["links"], row["state"] = id_hash, len(state), np.void(state.encode().ljust(128, b"\0"))
     return header(tick, len(letters)) + rows.tobytes()

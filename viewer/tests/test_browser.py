@@ -1,6 +1,7 @@
 """The whole chain: a run on the town, `caraware view --web`, and the page in a real browser.
 
-`CARAWARE_SCREENSHOT=docs/images/viewer.png pytest viewer/tests/test_browser.py` makes the README's picture.
+`CARAWARE_SCREENSHOT=docs/images/viewer.png pytest viewer/tests/test_browser.py -k train` makes the README's picture,
+and with `CARAWARE_SCREENSHOT_MODE=drive` that of another mode.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -24,22 +26,22 @@ from numpy.typing import NDArray
 from PIL import Image
 from ports import free_port
 
-from caraware_viewer import plots, scene, space, static_map, top
+from caraware_viewer import course, plots, scene, space, static_map, top
 
 ROOT = Path(__file__).parents[2]
 COMMAND = ROOT / "target" / "release" / "caraware"
 PICTURE = os.environ.get("CARAWARE_SCREENSHOT")
-SIZE = (1000, 600)
+PICTURE_MODE = os.environ.get("CARAWARE_SCREENSHOT_MODE", "train")
+SIZE = (1000, 640)
 # Paced, so that the browser's software renderer keeps up and the filter runs. Small batches make the learner update
 # after seconds.
 SETTINGS = (
     "run.real_time_factor=1.0",
-    "lidar.vehicles=4",
-    "trainer.horizon=1024",
-    "trainer.batch_size=256",
-    *(f"fanout.{topic}_hz=2" for topic in ("world", "observation", "prediction", "pointcloud", "status")),
+    "trainer.horizon=512",
+    "trainer.batch_size=128",
+    *(f"fanout.{topic}_hz=1" for topic in ("world", "observation", "prediction", "pointcloud", "status")),
 )
-PICTURE_LIMIT_S = 300.0
+PICTURE_LIMIT_S = 400.0
 
 Picture = NDArray[np.uint8]
 
@@ -73,29 +75,73 @@ def wait_for_line(log: Path, pattern: str, process: subprocess.Popen[bytes], tim
     raise TimeoutError(f"{pattern!r} is not in: {log.read_text(errors='replace')}")
 
 
+@dataclass(frozen=True)
+class Mode:
+    """A mode of a run, how it is started, and what its picture must show."""
+
+    name: str
+    arguments: tuple[str, ...]
+    plots: tuple[str, ...]
+    """Roots of the plots, from top to bottom."""
+    positions: tuple[list[int], ...]
+    """Colours of the positions in the top view."""
+
+
+MODES = (
+    Mode(
+        "train",
+        ("train", "town", "--set", "lidar.vehicles=4"),
+        ("learning/m", "learning/reward", "learning/sigma", plots.ERRORS, plots.STEPS),
+        (top.GNSS_COLOR, top.PREDICTION_COLOR, top.ESTIMATE_COLOR),
+    ),
+    Mode(
+        "drive",
+        ("train", "driving", "--set", "collision.detect=true"),
+        ("learning/mps", "learning/m", "learning/reward", plots.SPEED, plots.ERRORS),
+        (top.GNSS_COLOR, top.ROUTE_COLOR),
+    ),
+    Mode(
+        "simulate",
+        ("simulate", "town"),
+        (plots.SPEED, plots.ERRORS, plots.ROAD_USERS, plots.REAL_TIME),
+        (top.GNSS_COLOR,),
+    ),
+    Mode(
+        "play",
+        ("play", "town-1"),
+        (plots.SPEED, plots.ERRORS, plots.ROAD_USERS, plots.REAL_TIME),
+        (top.GNSS_COLOR, top.PREDICTION_COLOR),
+    ),
+)
+
+
 def part(picture: Picture, left: float, right: float, upper: float = 0.08, lower: float = 0.95) -> Picture:
-    """A region of the picture, by fractions of its size. The blueprint's columns are as 5 : 3 : 3."""
+    """A region of the picture, by fractions of its size. The blueprint's columns are as 5 : 3.4 : 2.6."""
     height, width, _ = picture.shape
     return picture[int(upper * height) : int(lower * height), int(left * width) : int(right * width)]
 
 
 def map_of(picture: Picture) -> Picture:
-    return part(picture, 0.0, 5 / 11)
+    return part(picture, 0.0, 5 / 11, 0.1, 0.85)
+
+
+def legend_of(picture: Picture) -> Picture:
+    return part(picture, 0.0, 5 / 11, 0.85, 1.0)
 
 
 def hud_of(picture: Picture) -> Picture:
-    return part(picture, 5 / 11, 8 / 11, 0.08, 0.5)
+    return part(picture, 5 / 11, 8.4 / 11, 0.1, 0.46)
 
 
 def space_of(picture: Picture) -> Picture:
-    return part(picture, 5 / 11, 8 / 11, 0.65, 0.95)
+    return part(picture, 5 / 11, 8.4 / 11, 0.55, 0.95)
 
 
 def plots_of(picture: Picture) -> Picture:
-    return part(picture, 8 / 11, 1.0)
+    return part(picture, 8.4 / 11, 1.0)
 
 
-def of_color(region: Picture, rgb: list[int] | tuple[int, ...], tolerance: int = 20) -> NDArray[np.bool_]:
+def of_color(region: Picture, rgb: Sequence[int], tolerance: int = 20) -> NDArray[np.bool_]:
     """Pixels near a colour."""
     near: NDArray[np.bool_] = (np.abs(region.astype(int) - np.array(rgb)) <= tolerance).all(axis=-1)
     return near
@@ -105,33 +151,52 @@ def rgb(rgba: int) -> tuple[int, ...]:
     return tuple((int(rgba) >> shift) & 0xFF for shift in (24, 16, 8))
 
 
-CAV = rgb(top.KIND_COLORS[0])
+CAV, HERO = rgb(top.KIND_COLORS[0]), rgb(top.KIND_COLORS[3])
+SERIES = {path: color for path, (_, color) in plots.SERIES.items()} | {
+    course.training_path(name): course.COLORS[name] for name in course.COLORS if "_" in name or name in course.UNITLESS
+}
 
 
-def missing(picture: Picture) -> list[str]:
+def drawn_in(region: Picture, root: str) -> int:
+    """Pixels of the curves of a plot."""
+    colors = [color for path, color in SERIES.items() if path == root or path.startswith(root + "/")]
+    return sum(int(of_color(region, color).sum()) for color in colors)
+
+
+def missing(picture: Picture, mode: Mode) -> list[str]:
     """What the picture does not show (yet)."""
+    users = HERO if mode.name == "drive" else CAV
     seen = {
         "roads": of_color(map_of(picture), static_map.ROAD_COLOR, 5).sum() > 3000,
         "sidewalks": of_color(map_of(picture), static_map.WALK_COLOR, 6).sum() > 500,
         "buildings": of_color(map_of(picture), static_map.BUILDING_COLOR, 6).sum() > 3000,
-        "connected vehicles": of_color(map_of(picture), CAV).sum() > 60,
-        "GNSS fixes": of_color(map_of(picture), top.GNSS_COLOR).sum() > 20,
-        "predictions": of_color(map_of(picture), top.PREDICTION_COLOR).sum() > 20,
-        "estimates": of_color(map_of(picture), top.ESTIMATE_COLOR).sum() > 10,
+        "vehicles": of_color(map_of(picture), users).sum() > 60,
+        "scale": of_color(map_of(picture), static_map.SCALE_COLOR, 8).sum() > 50,
+        "legend": all(of_color(legend_of(picture), color).sum() > 10 for color in (CAV, HERO, top.GNSS_COLOR)),
         "text": (hud_of(picture).min(axis=-1) > 170).sum() > 800,
-        "vehicles in 3-D": of_color(space_of(picture), CAV, 60).sum() > 30,
-        "error of GNSS": of_color(plots_of(picture), top.GNSS_COLOR).sum() > 20,
-        "error of the policy": of_color(plots_of(picture), top.PREDICTION_COLOR).sum() > 20,
-        "error of the filter": of_color(plots_of(picture), top.ESTIMATE_COLOR).sum() > 10,
-        "real-time factor": of_color(plots_of(picture), plots.SERIES[plots.REAL_TIME][1]).sum() > 10,
+        "vehicles in 3-D": of_color(space_of(picture), users, 60).sum() > 30,
+        "solid ground, road or walls in 3-D": (space_of(picture).std(axis=(0, 1)).max() > 8),
     }
+    for color in mode.positions:
+        seen[f"positions of colour {color}"] = of_color(map_of(picture), color).sum() > 10
+    height = picture.shape[0]
+    edges = np.linspace(PLOTS_TOP_PX, height - PLOTS_BOTTOM_PX, len(mode.plots) + 1).astype(int)
+    column = picture[:, int(8.4 / 11 * picture.shape[1]) :]
+    for root, upper, lower in zip(mode.plots, edges[:-1], edges[1:], strict=True):
+        # Below the title, and right of the legend.
+        seen[f"curves of {root}"] = drawn_in(column[upper + 28 : lower, 20:], root) > 20
     return [what for what, there in seen.items() if not there]
 
 
-def unmoved(before: Picture, after: Picture) -> list[str]:
+PLOTS_TOP_PX, PLOTS_BOTTOM_PX = 36, 28
+"""rerun's bars above and below the views."""
+
+
+def unmoved(before: Picture, after: Picture, mode: Mode) -> list[str]:
     """What has not moved between two pictures."""
+    users = HERO if mode.name == "drive" else CAV
     moved = {
-        "vehicles": (of_color(map_of(before), CAV) ^ of_color(map_of(after), CAV)).sum() > 30,
+        "vehicles": (of_color(map_of(before), users) ^ of_color(map_of(after), users)).sum() > 30,
         "text": (hud_of(before) != hud_of(after)).any(axis=-1).sum() > 20,
         "plots": (plots_of(before) != plots_of(after)).any(axis=-1).sum() > 50,
     }
@@ -153,37 +218,64 @@ def wait_for_picture(browser: Browser, find_missing: Callable[[Picture], list[st
         time.sleep(0.5)
 
 
-def test_a_browser_shows_the_run_and_it_moves(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the runs are; it has the run `town-1`, of which a policy can be played."""
     assert COMMAND.exists(), "run `make build` first"
-    environment = os.environ | {
-        "CARAWARE_RUNTIME_DIR": f"/tmp/caraware-t{os.getpid()}",
-        "CARAWARE_PYTHON": sys.executable,
-    }
+    directory = tmp_path_factory.mktemp("runs")
+    settings = [
+        "episode.ticks=40",
+        "episode.training_episodes=1",
+        "episode.final_evaluations=1",
+        "episode.evaluation_ticks=20",
+        "trainer.horizon=512",
+        "trainer.batch_size=128",
+        "fanout.enabled=false",
+    ]
+    arguments = [str(COMMAND), "train", "town", "--name", "town-1", "--runs", str(directory)]
+    arguments += [part for setting in settings for part in ("--set", setting)]
+    subprocess.run(arguments, env=environment(), cwd=ROOT, check=True, timeout=600, stdout=subprocess.DEVNULL)
+    return directory
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"CARAWARE_RUNTIME_DIR": f"/tmp/caraware-t{os.getpid()}", "CARAWARE_PYTHON": sys.executable}
+
+
+@pytest.mark.parametrize("mode", MODES, ids=[mode.name for mode in MODES])
+def test_a_browser_shows_every_panel_of_a_mode_and_it_moves(mode: Mode, runs: Path, tmp_path: Path) -> None:
     settings = [
         part for setting in (*SETTINGS, f"fanout.listen=tcp/127.0.0.1:{free_port()}") for part in ("--set", setting)
     ]
-    run = [str(COMMAND), "train", "town", *settings, "--runs", str(tmp_path / "runs")]
+    run = [str(COMMAND), *mode.arguments, *settings, "--runs", str(runs)]
     recorded = tmp_path / "run.rrd"
     view = [str(COMMAND), "view", "--web", "--web-port", str(free_port()), "--save", str(recorded), "--lidar", "all"]
-    with started(run, tmp_path / "run.log", environment) as running:
-        wait_for_line(tmp_path / "run.log", r"(error \d)", running, 300)
-        with started(view, tmp_path / "view.log", environment) as viewing:
+    with started(run, tmp_path / "run.log", environment()) as running:
+        wait_for_line(tmp_path / "run.log", READY[mode.name], running, 300)
+        with started(view, tmp_path / "view.log", environment()) as viewing:
             url = wait_for_line(tmp_path / "view.log", r"open (http://\S+) in a browser", viewing, 120)
             with Browser(*SIZE) as browser:
                 browser.open(f"{url}?renderer=webgl")
                 browser.wait_for("window._handle !== undefined", 180)
-                first = wait_for_picture(browser, missing, "not in the picture")
+                first = wait_for_picture(browser, lambda picture: missing(picture, mode), "not in the picture")
                 second = wait_for_picture(
-                    browser, lambda picture: missing(picture) + unmoved(first, picture), "not moving"
+                    browser,
+                    lambda picture: missing(picture, mode) + unmoved(first, picture, mode),
+                    "not moving",
                 )
                 hosts = {urlsplit(address).hostname for address in browser.requests}
             assert viewing.poll() is None
         assert viewing.returncode == 130, (tmp_path / "view.log").read_text()
         assert running.poll() is None, "the run ended with its viewer"
     assert hosts <= {"127.0.0.1", None}, "the page sent requests to other hosts"
-    if PICTURE:
+    if PICTURE and mode.name == PICTURE_MODE:
         Image.fromarray(second).quantize(192, dither=Image.Dither.NONE).save(ROOT / PICTURE, optimize=True)
-    check_recording(recorded)
+    if mode.name == "train":
+        check_recording(recorded)
+
+
+READY = {"train": r"(error \d)", "drive": r"(progress \d)", "simulate": r"(sensing)", "play": r"(sensing|error)"}
+"""What the progress line shows once a picture can be whole."""
 
 
 def check_recording(path: Path) -> None:
@@ -193,8 +285,8 @@ def check_recording(path: Path) -> None:
         plots.POLICY_ERROR,
         plots.EKF_ERROR,
         plots.GNSS_ERROR,
-        plots.STD,
-        plots.REWARD,
+        course.REWARD,
+        course.SIGMA,
         plots.STEPS,
         plots.REAL_TIME,
     ]
@@ -216,6 +308,8 @@ def check_recording(path: Path) -> None:
         static_map.MARKINGS,
         static_map.CROSSINGS,
         static_map.BUILDINGS,
+        static_map.SPACE_GROUND,
+        static_map.SPACE_ROADS,
         static_map.SPACE_BUILDINGS,
     ):
         assert found[entity].rows[0][0] == recordings.ALWAYS, entity

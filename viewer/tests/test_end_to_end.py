@@ -18,12 +18,13 @@ import pytest
 import zenoh
 from ports import free_port
 
-from caraware_viewer import canvas, plots, scene, static_map, top
+from caraware_viewer import canvas, course, plots, scene, static_map, top
 from caraware_viewer.link import LatestFrames, RunKey, Sample, encoded
 
 RUN = RunKey("a run/with #odd? $name*", 0)
 MAP = {"run": RUN.run, "tick_s": 0.1, "map": {"bounds_m": [0.0, 0.0, 220.0, 200.0]}}
-STATUS = {"tick": 2, "training": {"updates": 3, "policy_std": 0.5, "reward": 0.25}, "processes": []}
+STATUS = {"tick": 2, "real_time_factor": 2.0, "training": {"updates": 3, "policy_std": 0.5, "reward": 0.25}}
+COURSE = {"updates": [{"env_steps": 8, "tick": 1, "training": {"reward": 0.25}}], "evaluations": []}
 TRUTH = np.array([[10.0, 20.0], [30.0, 40.0]], np.float32)
 VEHICLE = "flow#1/car *?$ ü"
 PATIENCE_S = 120.0
@@ -49,6 +50,10 @@ class StandIn:
         self.sent = 0
         key = f"{RUN.prefix}/map"
         self._map = self.session.declare_queryable(key, lambda query: query.reply(key, json.dumps(MAP)))
+        learning = f"{RUN.prefix}/learning"
+        self._learning = self.session.declare_queryable(
+            learning, lambda query: query.reply(learning, json.dumps(COURSE))
+        )
         self.token = self.session.liveliness().declare_token(f"{RUN.prefix}/alive")
 
     def put(self, topic: str, payload: bytes) -> None:
@@ -123,7 +128,7 @@ def test_a_run_becomes_a_recording(fanout: StandIn, tmp_path: Path) -> None:
     rerun("verify", str(file))
     listing = rerun("print", "-vv", str(file))
     drawn = [top.OUTLINES, top.GNSS, top.PREDICTIONS, top.CLOUD, plots.POLICY_ERROR, plots.GNSS_ERROR, scene.HUD]
-    for path in [*drawn, static_map.BOUNDS, plots.STD, plots.REWARD]:
+    for path in [*drawn, static_map.BOUNDS, course.REWARD, plots.REAL_TIME]:
         assert f"/{path}" in listing, path
     assert canvas.TIMELINE in listing
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caraware_viewer import cloud, geometry, static_map, wire
+from caraware_viewer import cloud, geometry, solid, static_map, wire
 from caraware_viewer.canvas import on_screen
 from caraware_viewer.documents import Lane
 
@@ -71,13 +71,6 @@ def test_hatching_fills_a_polygon_with_a_notch() -> None:
     area = sum(0.1 * float(segment[1, 0] - segment[0, 0]) for segment in segments)
     assert area == pytest.approx(10 * 10 - 2 * 6, rel=0.01)
     assert not any(y > 4 and left < 5 < right for (left, y), (right, _) in segments)
-
-
-def test_a_prism_has_a_foot_a_top_and_corners() -> None:
-    strips = geometry.frame_m(np.array([[0, 0], [2, 0], [2, 1]]), 3.0, 4.0)
-    assert [len(strip) for strip in strips] == [4, 4, 2, 2, 2]
-    assert [set(strip[:, 2]) for strip in strips] == [{3.0}, {7.0}, *[{3.0, 7.0}] * 3]
-    np.testing.assert_array_equal(strips[3], [[2, 0, 3], [2, 0, 7]])
 
 
 def test_a_dashed_line_is_in_pieces_along_its_bends() -> None:
@@ -149,3 +142,38 @@ def test_points_of_interest_are_on_road_users_and_lost_loads() -> None:
 
 def test_up_on_the_screen_is_north() -> None:
     np.testing.assert_array_equal(on_screen(np.array([[1.0, 2.0]])), [[1, -2]])
+
+
+def area_m2(triangles: np.ndarray) -> float:
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    return float(np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).sum() / 2)
+
+
+def test_triangles_fill_a_concave_polygon_and_nothing_else() -> None:
+    horseshoe = np.array([[0, 0], [6, 0], [6, 5], [4, 5], [4, 2], [2, 2], [2, 4], [0, 4]])
+    found = solid.triangles_m(horseshoe)
+    assert area_m2(found) == pytest.approx(6 * 2 + 2 * 3 + 2 * 2)
+    centres = found.mean(axis=1)
+    assert not ((centres[:, 0] > 2) & (centres[:, 0] < 4) & (centres[:, 1] > 2)).any()
+    angles, radii = np.arange(10) * np.pi / 5, np.array([2, 1] * 5)
+    star = np.column_stack([np.cos(angles) * radii, np.sin(angles) * radii])
+    assert area_m2(solid.triangles_m(star)) == pytest.approx(5 * 2 * np.sin(np.pi / 5))
+    assert len(solid.triangles_m(np.array([[0, 0], [1, 0], [2, 0]]))) == 0
+
+
+def test_a_building_has_a_roof_and_a_wall_for_each_side() -> None:
+    square = [[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]]
+    surface = solid.buildings([{"points_m": square, "base_m": 2.0, "height_m": 8.0}], [200, 100, 50])
+    assert len(surface.corners_m) == 2 + 4 * 2
+    roof, walls = surface.corners_m[:2], surface.corners_m[2:]
+    assert (roof[..., 2] == 10).all()
+    assert (walls[..., 2].min(), walls[..., 2].max()) == (2, 10)
+    # The side that faces north-east is lighter than the one that faces south-west.
+    brightness = surface.colors[2::2].sum(axis=1)
+    assert brightness[2] > brightness[0]
+    assert (surface.colors[:2] == [200, 100, 50]).all()
+
+
+@pytest.mark.parametrize(("width_m", "expected_m"), [(220, 50), (4100, 1000), (900, 200), (3, 1), (81, 20)])
+def test_the_scale_is_a_round_length(width_m: float, expected_m: float) -> None:
+    assert static_map.scale_m(width_m) == expected_m

@@ -40,5 +40,5 @@ def test_a_display_that_has_stopped_is_abandoned() -> None:
         recording.log("point", rr.Points2D([[1.0, 1.0]]))
         drawing = threading.Thread(target=lambda: None)
         drawing.start()
-        _finish(recording, drawing, display)
+        _finish([recording], drawing, display)
         assert server.poll() is not None

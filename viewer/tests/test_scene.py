@@ -13,11 +13,10 @@ import pytest
 import recordings
 import rerun as rr
 
-from caraware_viewer import plots, scene, space, static_map, top, wire
+from caraware_viewer import detail, plots, scene, space, static_map, top, wire
 from caraware_viewer.documents import RunMap
 from caraware_viewer.link import Sample
 from caraware_viewer.scene import Scene
-from caraware_viewer.views import blueprint
 
 TRUTH = np.array([[10.0, 20.0], [30.0, 40.0]], np.float32)
 SCENE: dict[str, list[dict[str, Any]]] = {
@@ -84,7 +83,7 @@ def drawn(tmp_path: Path) -> Drawn:
     def draw(*samples: tuple[str, bytes], run_map: dict[str, Any] = MAP, **options: Any) -> Drawing:
         recording = rr.RecordingStream("test", recording_id="test")
         path = tmp_path / "run.rrd"
-        recording.save(path, default_blueprint=blueprint(run_map["map"]["bounds_m"]))
+        recording.save(path)
         drawing = Scene(recording, cast(RunMap, run_map), **options)
         for topic, payload in samples:
             drawing.draw(topic, Sample(payload))
@@ -108,9 +107,13 @@ def test_the_static_map_is_drawn_once(drawn: Drawn) -> None:
     assert len(found[static_map.CROSSINGS].newest("LineStrips2D:strips")) == 20
     for path in (static_map.JUNCTIONS, static_map.WALKS + "/areas", static_map.BUILDINGS, static_map.BOUNDS):
         assert found[path].newest("LineStrips2D:strips")
-    strips = found[static_map.SPACE_BUILDINGS].newest("LineStrips3D:strips")
-    heights = {point[2] for strip in strips for point in strip}
-    assert heights == {1.0, 9.0}
+    corners = np.array(found[static_map.SPACE_BUILDINGS].newest("Mesh3D:vertex_positions"))
+    assert set(corners[:, 2]) == {1.0, 9.0}
+    road = np.array(found[static_map.SPACE_ROADS].newest("Mesh3D:vertex_positions"))
+    np.testing.assert_allclose([road.min(axis=0), road.max(axis=0)], [[0, -0.6, 0.5], [20, 2.6, 0.5]], atol=1e-6)
+    ground = np.array(found[static_map.SPACE_GROUND].newest("Mesh3D:vertex_positions"))
+    assert ground[:, 2].max() < 0.5
+    assert found[static_map.SCALE + "/length"].newest("Points2D:labels") == ["50 m"]
     near(found[static_map.SPACE_OBSTACLES], "Boxes3D:centers", [[1, 2, 0.35]])
     assert all(at == recordings.ALWAYS for at, _ in found[static_map.ROADS].rows)
 
@@ -131,8 +134,28 @@ def test_vehicles_are_a_few_entities_whatever_their_number(drawn: Drawn) -> None
     _, few = drawn(("world", frames.world(0, 3)))
     _, many = drawn(("world", frames.world(0, 2000)))
     assert few.keys() == many.keys()
-    assert len(many[top.OUTLINES].newest("LineStrips2D:strips")) == 2000
-    assert len(many[top.OUTLINES].newest("LineStrips2D:colors")) == 2000
+    assert len(many[top.OUTLINES].newest("LineStrips2D:strips")) == detail.MAX_SHAPES
+    assert len(many[top.MARKS].newest("Points2D:positions")) == 2000
+    assert "400 as boxes, the others as dots" in many[scene.HUD].newest("TextDocument:text")[0]
+
+
+def test_of_a_crowd_the_fixes_of_the_same_vehicles_are_drawn_in_every_tick(drawn: Drawn) -> None:
+    truth = np.column_stack([10.0 * np.arange(1000), np.full(1000, 50.0)]).astype(np.float32)
+    rows = np.arange(1000)
+    drawing: list[tuple[str, bytes]] = []
+    for tick, order in ((0, rows), (1, rows[::-1])):
+        drawing.append(("world", frames.world(tick, 1000, kind=0, id_hash=7 + 1000 * order, x_m=10.0 * order)))
+        ids = np.array(7 + 1000 * order, np.uint64)
+        drawing.append(("observation", frames.observation(tick, truth[order], truth[order] + 1, id_hash=ids)))
+    _, found = drawn(*drawing)
+    shown = [sorted(row["Points2D:positions"]) for _, row in found[top.GNSS].rows if "Points2D:positions" in row]
+    assert len(shown[0]) == detail.MAX_POSITIONS
+    assert shown[0] == shown[1]
+
+
+def test_a_region_is_all_that_is_drawn(drawn: Drawn) -> None:
+    _, found = drawn(("world", frames.world(0, 100)), region=(95.0, 0.0, 205.0, 100.0))
+    assert len(found[top.OUTLINES].newest("LineStrips2D:strips")) == 11
 
 
 def test_kinds_have_colours_of_their_own(drawn: Drawn) -> None:
@@ -156,6 +179,7 @@ def test_signals_of_vehicles_and_lights_are_drawn(drawn: Drawn) -> None:
         ("signals", frames.signals(0, {9: "rGy", 10: "rrr"})),
         ("signals", frames.signals(1, {9: "Gru"})),
     )
+    near(found[space.SIGNALS], "Points3D:positions", [[48, 3, 2.5], [48, 6, 2.5]])
     assert len(found[top.BLINKERS].newest("Points2D:positions")) == 2
     assert len(found[top.BRAKES].newest("Points2D:positions")) == 2
     near(found[top.SIGNALS], "Points2D:positions", [[48, -3], [48, -6]])
@@ -241,11 +265,29 @@ def test_contacts_stay_for_a_while(drawn: Drawn) -> None:
         ("world", frames.world(56)),
     )
     assert [len(row["Points2D:positions"]) for _, row in found[top.CONTACTS].rows] == [1, 1, 0]
+    assert [len(row["Points3D:positions"]) for _, row in found[space.CONTACTS].rows] == [1, 1, 0]
+
+
+def test_routes_of_heroes_and_their_lights_are_drawn_while_they_are_on_the_road(drawn: Drawn) -> None:
+    route = [(0.0, 5.0, wire.NO_SIGNAL, 0), (10.0, 5.0, 4, 1), (20.0, 5.0, wire.NO_SIGNAL, 0)]
+    _, found = drawn(
+        ("signals", frames.signals(0, {9: "rG"}, indices=[4])),
+        ("routes", frames.routes(0, {1: route, 2: route[:2]})),
+        ("world", frames.world(0, 2, kind=[wire.CAV, wire.HERO])),
+        ("world", frames.world(1, 1, kind=wire.CAV)),
+    )
+    near(found[top.ROUTES], "LineStrips2D:strips", [])
+    first = found[top.ROUTES].rows[0][1]["LineStrips2D:strips"]
+    np.testing.assert_allclose(first, [[[0, -5], [10, -5], [20, -5]]])
+    lights = found[top.ROUTE_SIGNALS].rows[0][1]
+    np.testing.assert_allclose(lights["Points2D:positions"], [[10, -5]])
+    assert lights["Points2D:colors"] == [top.SIGNAL_COLORS["G"]]
+    assert len(found[space.ROUTES].rows[0][1]["LineStrips3D:strips"]) == 1
 
 
 def test_the_status_is_plotted_and_in_the_hud(drawn: Drawn) -> None:
     _, found = drawn(("status", json.dumps(STATUS).encode()), ("world", frames.world(2)))
-    for path, value in ((plots.STD, 0.5), (plots.REWARD, 0.25), (plots.STEPS, 250.0), (plots.REAL_TIME, 5.0)):
+    for path, value in ((plots.STEPS, 250.0), (plots.REAL_TIME, 5.0), (plots.VEHICLES, 6.0), (plots.PERSONS, 0.0)):
         near(found[path], "Scalars:scalars", [value])
     text = found[scene.HUD].newest("TextDocument:text")[0]
     for part in (
@@ -262,7 +304,7 @@ def test_the_status_is_plotted_and_in_the_hud(drawn: Drawn) -> None:
 
 def test_a_run_without_a_learner_has_no_policy_plots(drawn: Drawn) -> None:
     _, found = drawn(("status", json.dumps(STATUS | {"training": None}).encode()))
-    assert not [row for _, row in found[plots.STD].rows if "Scalars:scalars" in row]
+    assert not [row for _, row in found[plots.STEPS].rows if "Scalars:scalars" in row]
 
 
 def test_every_topic_may_be_missing(drawn: Drawn) -> None:
@@ -294,7 +336,8 @@ def test_random_bytes_are_refused_on_every_topic(drawn: Drawn) -> None:
     random = np.random.default_rng(3)
     recording = rr.RecordingStream("test", recording_id="garbage")
     drawing = Scene(recording, cast(RunMap, MAP))
-    for topic in ("world", "observation", "prediction", "status", "vehicles", "signals", "event", "pointcloud/a"):
+    topics = ("world", "observation", "prediction", "status", "learning", "vehicles", "signals", "routes", "event")
+    for topic in (*topics, "pointcloud/a"):
         for size in (0, 1, 95, 96, 500, 4000):
             with pytest.raises(wire.FrameError):
                 drawing.draw(topic, Sample(random.bytes(size)))

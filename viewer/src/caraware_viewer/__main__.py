@@ -118,6 +118,20 @@ def _add_scene(group: argparse._ArgumentGroup) -> None:
         "(default: a hero, else a vehicle with a LIDAR, else the first with sensors)",
     )
     group.add_argument(
+        "--rate",
+        type=_seconds,
+        default=10.0,
+        metavar="HZ",
+        help="most frames drawn per second (default %(default)s); fewer for a slow browser",
+    )
+    group.add_argument(
+        "--region",
+        metavar="M",
+        type=float,
+        nargs=4,
+        help="show the rectangle from x, y to x, y alone (four numbers, world metres), in full detail",
+    )
+    group.add_argument(
         "--lidar",
         choices=("interest", "all", "off"),
         default="interest",

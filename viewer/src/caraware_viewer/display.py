@@ -24,8 +24,10 @@ from caraware_viewer.page import Page
 HOST = "127.0.0.1"
 GRPC_PORT = 9876
 WEB_PORT = 9090
-SERVER_MEMORY = "256MiB"
+SERVER_MEMORY = "128MiB"
 """Most data that rerun's server keeps for browsers that join later; it drops the oldest."""
+WINDOW_MEMORY = "1GiB"
+"""Most memory of a window, which drops the oldest data. A browser has no such setting: there rerun's is 2.3 GiB."""
 
 _START_LIMIT_S = 30.0
 _POLL_INTERVAL_S = 0.05
@@ -66,7 +68,9 @@ class Display:
     def window(cls) -> Display:
         """Opens a window."""
         port = free_port(GRPC_PORT)
-        process = _start("--port", str(port), "--hide-welcome-screen", "--expect-data-soon")
+        process = _start(
+            "--port", str(port), "--hide-welcome-screen", "--expect-data-soon", "--memory-limit", WINDOW_MEMORY
+        )
         _wait_for(process, port)
         return cls(process, port)
 
@@ -89,6 +93,11 @@ class Display:
             process.kill()
             raise
         return cls(process, grpc_port, page)
+
+    @property
+    def pid(self) -> int:
+        """Identity of rerun's process: the window, or the server for browsers."""
+        return self._process.pid
 
     @property
     def closed(self) -> bool:

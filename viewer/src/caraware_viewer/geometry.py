@@ -96,14 +96,6 @@ def hatching_m(outline_m: Points, spacing_m: float) -> list[NDArray[np.float32]]
     return segments
 
 
-def frame_m(outline_m: Points, base_m: float, height_m: float) -> list[NDArray[np.float32]]:
-    """Edges of a prism over a polygon `[n, 2]`, as strips `[·, 3]`: its base, its top, and its vertical edges."""
-    closed = np.vstack([outline_m, outline_m[:1]])
-    levels = [np.column_stack([closed, np.full(len(closed), z)]) for z in (base_m, base_m + height_m)]
-    corners = np.stack([level[:-1] for level in levels], axis=1)
-    return [strip.astype(np.float32) for strip in (*levels, *corners)]
-
-
 def _rear_m(states: NDArray[np.void]) -> NDArray[np.float32]:
     """Distance `[n]` from the rear end to the origin; the origin of a person is its centre."""
     return np.where(states["kind"] == wire.PERSON, states["length_m"] / 2, states["rear_overhang_m"])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caraware_viewer import wire
+from caraware_viewer.detail import sampling_order
 from caraware_viewer.documents import RunMap, RunStatus, TrainingStatus
 from caraware_viewer.layout import SENSORS
 from caraware_viewer.pairing import mean_m
@@ -34,6 +35,12 @@ class ViewerFigures:
     """Samples that were lost on the network."""
     refused: int = 0
     """Samples that were refused."""
+    skipped: int = 0
+    """Samples that were not drawn because newer ones had arrived."""
+    memory_mb: float = math.nan
+    """Memory of the viewer's process, MB."""
+    display_mb: float = math.nan
+    """Memory of rerun's process: the window, or the server for browsers, MB."""
 
 
 def hud(picture: Picture, run_map: RunMap, followed: Sequence[int], viewer: ViewerFigures) -> str:
@@ -71,7 +78,17 @@ def _run(picture: Picture, run_map: RunMap, viewer: ViewerFigures) -> str:
     if picture.collisions:
         rows.append(("contacts", f"{picture.collisions} since this viewer joined"))
     rows.append(("viewer", _viewer(viewer)))
+    if math.isfinite(viewer.memory_mb):
+        rows.append(("memory", _memory(viewer)))
+    if picture.thinned:
+        rows.append(("shown", picture.thinned))
     return title + "\n" + _table(rows[0], rows[1:])
+
+
+def _memory(viewer: ViewerFigures) -> str:
+    parts = [f"viewer {viewer.memory_mb:.0f} MB"]
+    parts += [f"display {viewer.display_mb:.0f} MB"] if math.isfinite(viewer.display_mb) else []
+    return " · ".join(parts)
 
 
 def _speed(status: RunStatus, training: TrainingStatus) -> str:
@@ -108,6 +125,7 @@ def _viewer(viewer: ViewerFigures) -> str:
     parts = [f"{_number(viewer.frames_per_s, 1)} frames/s", f"{_number(viewer.age_ms, 0)} ms old"]
     parts += [f"{viewer.lost} lost"] if viewer.lost else []
     parts += [f"{viewer.refused} refused"] if viewer.refused else []
+    parts += [f"{viewer.skipped} skipped"] if viewer.skipped else []
     return " · ".join(parts)
 
 
@@ -142,21 +160,24 @@ def compass_letters(compass_rad: float) -> str:
 
 
 def _errors(picture: Picture, followed: Sequence[int]) -> str:
-    """The table of each vehicle's errors; the followed vehicles come first, then the others by slot."""
+    """The table of each vehicle's errors: the followed ones first; of many, the same ones in every tick."""
     observation, distances = picture.observation, picture.distances
     if observation is None or distances is None:
         return ""
     slots = np.flatnonzero(observation.valid)
     if not len(slots):
         return ""
-    ordered = sorted(slots.tolist(), key=lambda slot: int(observation.id_hash[slot]) not in followed)
+    order = sampling_order(observation.id_hash)
+    chosen = sorted(slots.tolist(), key=lambda slot: (int(observation.id_hash[slot]) not in followed, order[slot]))
+    names = {slot: picture.name(int(observation.id_hash[slot])) for slot in chosen[:MAX_VEHICLES]}
+    ordered = sorted(names, key=lambda slot: (int(observation.id_hash[slot]) not in followed, names[slot]))
     rows = [
         (
-            picture.name(int(observation.id_hash[slot])),
+            names[slot],
             *(_NO_VALUE if d is None else _number(float(d[slot]), 2) for d in (distances.policy, distances.ekf)),
             _number(float(distances.raw_gnss[slot]), 2),
         )
-        for slot in ordered[:MAX_VEHICLES]
+        for slot in ordered
     ]
     rest = f"\n\n… and {len(slots) - MAX_VEHICLES} more" if len(slots) > MAX_VEHICLES else ""
     return "#### error (m)\n" + _table(("vehicle", "policy", "EKF", "GNSS"), rows) + rest

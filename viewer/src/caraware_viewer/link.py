@@ -1,4 +1,4 @@
-"""The zenoh side: finds a run, subscribes to it, and keeps the newest frame of each topic.
+"""The zenoh side: finds a run, subscribes to it, and keeps the newest frames: those of one tick together.
 
 zenoh's callbacks only store: a slow display skips frames, and never delays the network or the run.
 """
@@ -19,8 +19,12 @@ import zenoh
 from caraware_viewer import access
 from caraware_viewer.documents import RunMap
 from caraware_viewer.layout import SCHEMA_VERSION
+from caraware_viewer.sets import TICK_TOPICS, TickSets
+from caraware_viewer.wire import FrameError, decode_header
 
-TOPICS = ("world", "observation", "prediction", "status", "vehicles", "signals", "event")
+TOPICS = (*TICK_TOPICS, "status", "learning", "vehicles", "signals", "routes", "event")
+WHOLE_COURSE = "learning/whole"
+"""Name under which the answer to a query for `learning` is stored."""
 CLOUD_PREFIX = "pointcloud/"
 """Beginning of the topics of point clouds; a vehicle's id follows."""
 
@@ -84,10 +88,14 @@ class Sample:
 
 
 class LatestFrames:
-    """The newest sample of each topic, until it is taken; counts the samples that were replaced and that were lost."""
+    """The newest sample of each topic, until it is taken; counts the samples that were replaced and that were lost.
+
+    Of `world`, `observation` and `prediction` it has the samples of the newest tick that arrived on all of them.
+    """
 
     def __init__(self) -> None:
         self._frames: dict[str, Sample] = {}
+        self._sets: TickSets[Sample] = TickSets()
         self._changed = threading.Condition()
         self._closed = False
         self.ended = False
@@ -106,22 +114,40 @@ class LatestFrames:
                 # After a jump back, the samples are of a restarted fan-out.
                 self.lost += max(0, sample.sequence - before - 1)
                 self._newest[topic] = sample.sequence
-            self.skipped[topic] += topic in self._frames
-            self._frames[topic] = sample
+            if not self._add_to_set(topic, sample):
+                self.skipped[topic] += topic in self._frames
+                self._frames[topic] = sample
             self._changed.notify()
 
     def add(self, topic: str, sample: Sample) -> None:
         """Stores a sample that is older than the subscription, unless there is a newer one."""
         with self._changed:
-            self._frames.setdefault(topic, sample)
+            if not self._add_to_set(topic, sample):
+                self._frames.setdefault(topic, sample)
             self._changed.notify()
 
+    def _add_to_set(self, topic: str, sample: Sample) -> bool:
+        """True if the sample belongs to a tick. One without a readable header is kept apart, and refused later."""
+        if topic not in TICK_TOPICS:
+            return False
+        try:
+            header = decode_header(sample.payload)
+        except FrameError:
+            return False
+        self._sets.add(topic, (header.run_id, header.tick), sample)
+        return True
+
     def take(self, timeout_s: float) -> dict[str, Sample]:
-        """The newest samples since the last call; waits at most `timeout_s` for one."""
+        """The newest samples since the last call, those of a tick last; waits at most `timeout_s` for one."""
         with self._changed:
-            self._changed.wait_for(lambda: bool(self._frames) or self._closed, timeout_s)
+            self._changed.wait_for(lambda: bool(self._frames) or self._sets.ready() or self._closed, timeout_s)
             frames, self._frames = self._frames, {}
-            return frames
+            return frames | self._sets.take(at_once=self._closed)
+
+    def wait_for_close(self, timeout_s: float) -> None:
+        """Waits at most `timeout_s` for the end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed, max(0.0, timeout_s))
 
     def close(self) -> None:
         """Ends the wait of `take`: the viewer needs no more frames."""
@@ -133,6 +159,11 @@ class LatestFrames:
         """Marks the run as ended, and ends the wait of `take`."""
         self.ended = True
         self.close()
+
+    @property
+    def skipped_ticks(self) -> int:
+        """Frames of ticks that were not returned because newer ones had arrived."""
+        return self._sets.skipped
 
     @property
     def closed(self) -> bool:
@@ -228,7 +259,8 @@ class RunLink:
                 continue
             topic = str(reply.ok.key_expr).removeprefix(f"{self.run.prefix}/")
             if topic in TOPICS:
-                self.frames.add(topic, Sample.of(reply.ok))
+                # Samples of this topic have the newest points only, the answer has all.
+                self.frames.add(WHOLE_COURSE if topic == "learning" else topic, Sample.of(reply.ok))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         """Ends the run when its token has been away for `RESTART_LIMIT_S`."""

@@ -28,9 +28,16 @@ class Picture:
     status: RunStatus = field(default_factory=RunStatus)
     signals: dict[int, str] = field(default_factory=dict)
     """State of each traffic light, a letter for each link, by the hash of its id."""
+    lights: dict[int, str] = field(default_factory=dict)
+    """The same by the index of the traffic light (`SignalMeta.signal`)."""
+    routes: dict[int, NDArray[np.void]] = field(default_factory=dict)
+    """Points of each hero's route, `ROUTE_POINT [n]`, by the hero's index."""
+    thinned: str = ""
+    """What is left out of a crowd."""
     collisions: int = 0
     """Contacts seen since the viewer joined."""
     _last_default: int | None = None
+    _routes_of: int | None = None
     _names_of: tuple[int, int] | None = None
 
     def enter_names(self, frame: wire.Table) -> None:
@@ -41,6 +48,23 @@ class Picture:
             self._names_of = episode
         for row in frame.rows:
             self.names[int(row["id_hash"])] = wire.decode_text(row["id"], int(row["id_len"]))
+
+    def enter_routes(self, frame: wire.Table) -> None:
+        """Enters routes, each of which is whole in a frame; a new episode has other heroes."""
+        if frame.header.episode != self._routes_of:
+            self.routes.clear()
+            self._routes_of = frame.header.episode
+        for vehicle in np.unique(frame.rows["vehicle"]):
+            points = frame.rows[frame.rows["vehicle"] == vehicle]
+            self.routes[int(vehicle)] = points[np.argsort(points["index"])]
+
+    def shown_routes(self) -> list[NDArray[np.void]]:
+        """Routes of the heroes that are on the road."""
+        if self.world is None or not self.routes:
+            return []
+        states = self.world.states
+        heroes = {int(vehicle) for vehicle in states["vehicle"][states["kind"] == wire.HERO]}
+        return [points for vehicle, points in self.routes.items() if vehicle in heroes]
 
     def name(self, id_hash: int) -> str:
         """SUMO id of a road user, or four digits of its hash until the id is known."""

@@ -1,4 +1,4 @@
-"""Plots figures over simulated time."""
+"""Plots the figures of the present over simulated time; `course` has those of the whole run."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from caraware_viewer.top import ESTIMATE_COLOR, GNSS_COLOR, PREDICTION_COLOR
 
 ERRORS = "plots/error_m"
 POLICY_ERROR, EKF_ERROR, GNSS_ERROR = f"{ERRORS}/policy", f"{ERRORS}/ekf", f"{ERRORS}/raw_gnss"
-STD, REWARD, STEPS, REAL_TIME = "plots/std", "plots/reward", "plots/steps_per_s", "plots/real_time_factor"
+SPEED, STEPS, REAL_TIME = "plots/speed_mps", "plots/steps_per_s", "plots/real_time_factor"
+ROAD_USERS = "plots/road_users"
+VEHICLES, PERSONS = f"{ROAD_USERS}/vehicles", f"{ROAD_USERS}/persons"
 
-SERIES = {
+SERIES: dict[str, tuple[str, list[int]]] = {
     POLICY_ERROR: ("policy", PREDICTION_COLOR),
     EKF_ERROR: ("EKF", ESTIMATE_COLOR),
     GNSS_ERROR: ("raw GNSS", GNSS_COLOR),
-    STD: ("σ", [120, 200, 255]),
-    REWARD: ("reward", [255, 210, 90]),
+    SPEED: ("followed vehicle", [255, 79, 216]),
+    VEHICLES: ("vehicles", [63, 167, 255]),
+    PERSONS: ("pedestrians", [242, 193, 78]),
     STEPS: ("steps/s", [150, 230, 150]),
     REAL_TIME: ("× real time", [255, 150, 200]),
 }
@@ -36,10 +39,12 @@ def plot_errors(canvas: Canvas, distances: Distances) -> None:
 
 
 def plot_status(canvas: Canvas, status: RunStatus, steps_per_s: float | None) -> None:
-    """Plots the progress of learning and the speed; before the first update the policy has no figures."""
+    """Plots the speed of the simulation, and its size."""
     training = status.get("training") or {}
     if training.get("updates"):
-        canvas.scalar(STD, training["policy_std"])
-        canvas.scalar(REWARD, training["reward"])
-    canvas.scalar(STEPS, steps_per_s)
+        canvas.scalar(STEPS, steps_per_s)
     canvas.scalar(REAL_TIME, status.get("real_time_factor"))
+    users = status.get("road_users")
+    if users:
+        canvas.scalar(VEHICLES, float(users.get("cav", 0) + users.get("other", 0) + users.get("hero", 0)))
+        canvas.scalar(PERSONS, float(users.get("person", 0)))

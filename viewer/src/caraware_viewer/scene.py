@@ -11,11 +11,14 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from caraware_viewer import cloud, geometry, plots, space, top, wire
+from caraware_viewer import cloud, detail, geometry, memory, plots, space, top, wire
 from caraware_viewer.canvas import Canvas
+from caraware_viewer.course import Course
+from caraware_viewer.detail import Detail, Region
 from caraware_viewer.documents import RoadUserCounts, RunMap, RunStatus
 from caraware_viewer.hud import ViewerFigures, hud
-from caraware_viewer.link import CLOUD_PREFIX, Sample
+from caraware_viewer.legend import draw_legend
+from caraware_viewer.link import CLOUD_PREFIX, WHOLE_COURSE, Sample
 from caraware_viewer.pairing import Pairing, distances, mean_m
 from caraware_viewer.picture import Picture
 from caraware_viewer.static_map import draw_map
@@ -25,6 +28,9 @@ HUD = "hud"
 
 _CONTACT_S = 5.0
 """Simulated time for which a contact stays on the map."""
+_MEMORY_INTERVAL_S = 2.0
+_REPEAT_BYTES = 48_000_000
+"""After so many bytes the map and the curves are sent to the display again: rerun's server keeps the newest 256 MiB."""
 _RATE_FRAMES = 20
 """Number of frames over which the rate of drawing is measured."""
 
@@ -38,14 +44,23 @@ class Scene:
 
     def __init__(
         self,
-        recording: rr.RecordingStream,
+        recording: rr.RecordingStream | None,
         run_map: RunMap,
         wanted: list[str] | None = None,
         lidar: str = "interest",
         clock: Callable[[], float] = time.monotonic,
+        *,
+        live: rr.RecordingStream | None = None,
+        region: Region | None = None,
+        display_pid: int | None = None,
     ) -> None:
+        """`recording` keeps the history of the run, and `live` shows its present; either may be missing.
+
+        `display_pid` is rerun's process, whose memory the HUD shows.
+        """
         try:
-            self._canvas = Canvas(recording, float(run_map["tick_s"]))
+            self._canvas = Canvas(recording, float(run_map["tick_s"]), live)
+            x_min, y_min, x_max, y_max = (float(value) for value in run_map["map"]["bounds_m"])
         except (KeyError, TypeError, ValueError) as error:
             raise FrameError(f"the map cannot be read: {error!r}") from error
         self._map = run_map
@@ -55,14 +70,25 @@ class Scene:
         self._pairing = Pairing()
         self._clouds: dict[int, wire.PointCloud] = {}
         self._contacts: list[tuple[int, NDArray[np.float64]]] = []
+        self._course = Course()
+        self._region, self._extent_m = region, max(x_max - x_min, y_max - y_min)
+        self._detail: Detail | None = None
+        self._routes_drawn = False
+        self._display_pid = display_pid
+        self._memory_mb = (float("nan"), float("nan"))
+        self._memory_at_s = float("-inf")
+        self._repeated_bytes = 0
         self._drawn_at: deque[float] = deque(maxlen=_RATE_FRAMES)
         self._age_ms = float("nan")
         self.lost = 0
         """Samples that were lost on the network, as the link counts them."""
         self.refused = 0
         """Samples that were refused."""
+        self.skipped = 0
+        """Frames that were not drawn because newer ones had arrived, as the link counts them."""
         self._stop_lines = _stop_lines(run_map)
         draw_map(self._canvas, run_map)
+        draw_legend(self._canvas)
         plots.name_series(self._canvas)
 
     def cloud_vehicles(self) -> list[str]:
@@ -76,6 +102,10 @@ class Scene:
         if topic == "status":
             self._draw_status(sample.payload)
             return
+        if topic in ("learning", WHOLE_COURSE):
+            self._course.merge(sample.payload)
+            self._course.draw(self._canvas)
+            return
         self._check_run(wire.decode_header(sample.payload))
         match topic:
             case "world":
@@ -88,10 +118,22 @@ class Scene:
                 self._picture.enter_names(wire.decode_table(sample.payload, wire.VEHICLE_META))
             case "signals":
                 self._draw_signals(wire.decode_table(sample.payload, wire.SIGNAL_META))
+            case "routes":
+                self._picture.enter_routes(wire.decode_table(sample.payload, wire.ROUTE_POINT))
             case "event":
                 self._draw_event(wire.decode_table(sample.payload, wire.COLLISION))
             case _ if topic.startswith(CLOUD_PREFIX):
                 self._draw_cloud(wire.decode_cloud(sample.payload))
+
+    @property
+    def figures(self) -> frozenset[str]:
+        """Paths that have data: the layout shows the views of these."""
+        return frozenset(self._canvas.figures)
+
+    @property
+    def driving(self) -> bool:
+        """True in a run with heroes."""
+        return self._picture.driving
 
     def _check_run(self, header: wire.Header) -> None:
         expected = self._map.get("run_id")
@@ -108,22 +150,42 @@ class Scene:
         self._age_ms = sample.age_ms()
         followed = self._picture.followed()
         rows = [row for row in map(self._picture.row, followed) if row is not None]
-        top.draw_road_users(self._canvas, world.states, self._picture.names, followed)
+        self._detail = detail.choose(world.states, rows[0] if rows else None, self._extent_m, self._region)
+        self._picture.thinned = _left_out(self._detail)
+        top.draw_road_users(self._canvas, world.states, self._detail, self._picture.names, followed)
         top.draw_followed(self._canvas, rows)
         space.draw_space(self._canvas, world.states, rows[0] if rows else None)
         self._draw_contacts(world.header)
+        self._draw_routes(rows[0] if rows else None)
+        if rows:
+            self._canvas.scalar(plots.SPEED, float(np.hypot(*rows[0]["velocity_body_mps"][:2])))
         text = hud(self._picture, self._map, followed, self._figures())
         self._canvas.log(HUD, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        if self._canvas.live_bytes - self._repeated_bytes > _REPEAT_BYTES:
+            self._canvas.repeat_static()
+            self._course.repeat(self._canvas)
+            self._repeated_bytes = self._canvas.live_bytes
 
     def _figures(self) -> ViewerFigures:
         times = self._drawn_at
         rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else float("nan")
-        return ViewerFigures(rate, self._age_ms, self.lost, self.refused)
+        now_s = self._clock()
+        if now_s - self._memory_at_s > _MEMORY_INTERVAL_S:
+            self._memory_at_s = now_s
+            self._memory_mb = (memory.resident_mb(), memory.resident_mb(self._display_pid))
+        return ViewerFigures(rate, self._age_ms, self.lost, self.refused, self.skipped, *self._memory_mb)
+
+    def _shown(self, observation: wire.Observation) -> NDArray[np.bool_]:
+        """Slots `[n]` whose positions are drawn."""
+        if self._detail is None or not self._detail.thinned:
+            return np.ones(observation.header.rows, np.bool_)
+        shown: NDArray[np.bool_] = np.isin(observation.id_hash, self._detail.positioned)
+        return shown
 
     def _draw_observation(self, observation: wire.Observation) -> None:
         self._picture.observation = observation
         self._set_tick(observation.header)
-        top.draw_observation(self._canvas, observation)
+        top.draw_observation(self._canvas, observation, self._shown(observation))
         pair = self._pairing.observation(observation)
         if pair is None:
             # Only the fixes have errors until the prediction arrives, if the run has a policy at all.
@@ -141,15 +203,20 @@ class Scene:
         self._set_tick(observation.header)
         driving = self._picture.driving
         if not driving:
-            top.draw_estimates(self._canvas, top.PREDICTIONS, observation, prediction.position_m)
+            top.draw_estimates(
+                self._canvas, top.PREDICTIONS, observation, prediction.position_m, self._shown(observation)
+            )
         if prediction.estimate_m is not None:
-            top.draw_estimates(self._canvas, top.ESTIMATES, observation, prediction.estimate_m)
+            top.draw_estimates(
+                self._canvas, top.ESTIMATES, observation, prediction.estimate_m, self._shown(observation)
+            )
         self._picture.distances = distances(observation, prediction, driving=driving)
         plots.plot_errors(self._canvas, self._picture.distances)
 
     def _draw_signals(self, frame: wire.Table) -> None:
         for row in frame.rows:
-            self._picture.signals[int(row["id_hash"])] = wire.decode_text(row["state"], min(int(row["links"]), 128))
+            letters = wire.decode_text(row["state"], min(int(row["links"]), 128))
+            self._picture.signals[int(row["id_hash"])] = self._picture.lights[int(row["signal"])] = letters
         self._set_tick(frame.header)
         lights = [
             (position_m, letters[link])
@@ -158,6 +225,7 @@ class Scene:
             if link < len(letters)
         ]
         top.draw_signals(self._canvas, lights)
+        space.draw_signals(self._canvas, lights)
 
     def _draw_event(self, frame: wire.Table) -> None:
         self._picture.collisions += len(frame.rows)
@@ -167,7 +235,27 @@ class Scene:
         oldest = header.tick - _CONTACT_S / float(self._map["tick_s"])
         if self._contacts:
             self._contacts = [(tick, at) for tick, at in self._contacts if tick >= oldest]
-            top.draw_contacts(self._canvas, np.array([at[:2] for _, at in self._contacts]).reshape(-1, 2))
+            positions_m = np.array([at for _, at in self._contacts]).reshape(-1, 3)
+            top.draw_contacts(self._canvas, positions_m[:, :2])
+            space.draw_contacts(self._canvas, positions_m)
+
+    def _draw_routes(self, followed: np.void | None) -> None:
+        """Draws the routes of the heroes on the road, and the traffic lights that control them."""
+        routes = self._picture.shown_routes()
+        if not routes and not self._routes_drawn:
+            return
+        self._routes_drawn = bool(routes)
+        lights = []
+        for points in routes:
+            for point in points[points["signal"] != wire.NO_SIGNAL]:
+                letters, link = self._picture.lights.get(int(point["signal"]), ""), int(point["link"])
+                if link < len(letters):
+                    lights.append(([float(point["x_m"]), float(point["y_m"])], letters[link]))
+        if followed is not None:
+            routes.sort(key=lambda points: int(points["vehicle"][0]) != int(followed["vehicle"]))
+        lines = [np.column_stack([points["x_m"], points["y_m"]]) for points in routes]
+        top.draw_routes(self._canvas, lines, lights)
+        space.draw_routes(self._canvas, lines, 0.0 if followed is None else float(followed["z_m"]))
 
     def _draw_cloud(self, seen: wire.PointCloud) -> None:
         id_hash = int(seen.scan["id_hash"])
@@ -206,6 +294,16 @@ class Scene:
 
     def _set_tick(self, header: wire.Header) -> None:
         self._canvas.set_tick(header.tick, header.episode)
+
+
+def _left_out(chosen: Detail) -> str:
+    """What is left out of a crowd, for the HUD."""
+    parts = []
+    if not chosen.shaped.all():
+        parts.append(f"{int(chosen.shaped.sum())} as boxes, the others as dots")
+    if chosen.thinned:
+        parts.append(f"fixes and estimates of {len(chosen.positioned)}")
+    return " · ".join(parts)
 
 
 def _steps_per_s(status: RunStatus) -> float | None:

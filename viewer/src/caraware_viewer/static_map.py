@@ -1,16 +1,17 @@
-"""Draws the static map once: roads with their markings, sidewalks, crossings, buildings, obstacles."""
+"""Draws the static map once: roads with their markings, sidewalks, crossings, buildings, obstacles, scale."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from caraware_viewer import solid
 from caraware_viewer.canvas import Canvas, on_screen
 from caraware_viewer.documents import Area, Building, Lane, Obstacle, RunMap, SceneDocument
-from caraware_viewer.geometry import frame_m, hatching_m, quaternions
+from caraware_viewer.geometry import hatching_m, quaternions
 from caraware_viewer.wire import FrameError
 
 BOUNDS = "top/map/bounds"
@@ -21,13 +22,20 @@ CROSSINGS = "top/map/crossings"
 MARKINGS = "top/map/markings"
 BUILDINGS = "top/map/buildings"
 OBSTACLES = "top/map/obstacles"
+SCALE = "top/scale"
+SPACE_GROUND = "space/world/ground"
 SPACE_ROADS = "space/world/roads"
+SPACE_JUNCTIONS = "space/world/junctions"
+SPACE_WALKS = "space/world/walks"
+SPACE_CROSSINGS = "space/world/crossings"
+SPACE_MARKINGS = "space/world/markings"
 SPACE_BUILDINGS = "space/world/buildings"
 SPACE_OBSTACLES = "space/world/obstacles"
 
 ROAD_COLOR, WALK_COLOR, CROSSING_COLOR = [52, 56, 64], [84, 82, 78], [150, 150, 146]
 MARKING_COLOR, BUILDING_COLOR, WALL_COLOR = [196, 198, 200], [104, 88, 74], [150, 128, 108]
-OBSTACLE_COLOR, BOUNDS_COLOR = [255, 127, 80], [70, 74, 84]
+OBSTACLE_COLOR, BOUNDS_COLOR, SCALE_COLOR = [255, 127, 80], [70, 74, 84], [210, 214, 220]
+GROUND_COLOR, ROOF_COLOR = [38, 42, 44], [142, 120, 100]
 
 _ROAD_KINDS = ("car", "bus", "bicycle", "rail")
 _MARKING_M = 0.12
@@ -36,6 +44,8 @@ _STRIPE_M = 0.5
 _MAX_HATCHES = 60_000
 """Most segments that fill polygons; a larger map has its rows farther apart."""
 _MIN_SPACING_M = 0.5
+SCALE_BELOW = 0.035
+"""Distance of the scale bar from the map, as a share of its height."""
 
 
 def draw_map(canvas: Canvas, run_map: RunMap) -> None:
@@ -49,6 +59,8 @@ def draw_map(canvas: Canvas, run_map: RunMap) -> None:
         _draw_polygons(canvas, WALKS + "/areas", [a for a in areas if a["kind"] == "walking_area"], WALK_COLOR, 2.5)
         _draw_buildings(canvas, scene.get("buildings", []))
         _draw_obstacles(canvas, scene.get("obstacles", []))
+        _draw_scale(canvas, run_map["map"]["bounds_m"])
+        _draw_surfaces(canvas, run_map["map"]["bounds_m"], scene)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise FrameError(f"the map cannot be read: {error!r}") from error
 
@@ -68,19 +80,68 @@ def _draw_lanes(canvas: Canvas, lanes: list[Lane]) -> None:
     _segments(canvas, CROSSINGS, stripes, CROSSING_COLOR, _STRIPE_M / 2, 4.0)
     markings = [piece for lane in roads if not lane["inside"] for piece in markings_m(lane)]
     _segments(canvas, MARKINGS, markings, MARKING_COLOR, _MARKING_M / 2, 5.0)
-    if roads:
-        edges = [edge_m(lane, side) for lane in roads for side in (-1, 1) if not lane["inside"]]
-        strips = [_lifted(edge, lane) for edge, lane in zip(edges, _once_for_each_side(roads), strict=True)]
-        canvas.log(SPACE_ROADS, rr.LineStrips3D(strips, colors=MARKING_COLOR, radii=_MARKING_M / 2), static=True)
 
 
-def _once_for_each_side(lanes: list[Lane]) -> Iterable[Lane]:
-    return (lane for lane in lanes if not lane["inside"] for _ in range(2))
+def _draw_scale(canvas: Canvas, bounds_m: list[float]) -> None:
+    """Draws a bar of a round length below the map, with its length beside it."""
+    x_min, y_min, x_max, y_max = bounds_m
+    length_m = scale_m(x_max - x_min)
+    y_m = y_min - SCALE_BELOW * (y_max - y_min)
+    tick_m = 0.008 * (y_max - y_min)
+    corner = np.array([x_min, y_m])
+    bar = corner + np.array([[0, tick_m], [0, 0], [length_m, 0], [length_m, tick_m]])
+    label = f"{length_m:g} m" if length_m < 1000 else f"{length_m / 1000:g} km"
+    radii = rr.Radius.ui_points(1.2)
+    canvas.log(SCALE, rr.LineStrips2D([on_screen(bar)], colors=SCALE_COLOR, radii=radii, draw_order=40.0), static=True)
+    end = on_screen(np.array([[x_min + length_m / 2, y_m]]))
+    text = rr.Points2D(
+        end, labels=[label], show_labels=True, radii=rr.Radius.ui_points(0.0), colors=SCALE_COLOR, draw_order=40.0
+    )
+    canvas.log(SCALE + "/length", text, static=True)
 
 
-def _lifted(edge_points_m: NDArray[np.float64], lane: Lane) -> NDArray[np.float32]:
-    height_m = np.asarray(lane["points_m"], np.float64)[:, 2]
-    return np.column_stack([edge_points_m, height_m]).astype(np.float32)
+def scale_m(width_m: float) -> float:
+    """The longest of 1, 2, 5, 10, … m that is at most a quarter of `width_m`."""
+    longest = max(width_m / 4, 1.0)
+    power = 10.0 ** np.floor(np.log10(longest))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= longest))
+
+
+def _draw_surfaces(canvas: Canvas, bounds_m: list[float], scene: SceneDocument) -> None:
+    """Draws the surfaces of the 3-D view, each a little above the one below, so that the nearer one is seen."""
+    lanes, polygons, buildings = scene.get("lanes", []), scene.get("areas", []), scene.get("buildings", [])
+    roads = [lane for lane in lanes if lane["kind"] in _ROAD_KINDS]
+    heights_m = [point[2] for lane in lanes for point in lane["points_m"]]
+    surfaces = {
+        SPACE_GROUND: solid.ground(bounds_m, min(heights_m, default=0.0) - 0.1, GROUND_COLOR),
+        SPACE_ROADS: solid.strips(roads, ROAD_COLOR, 0.0),
+        SPACE_JUNCTIONS: solid.areas([a for a in polygons if a["kind"] == "junction"], ROAD_COLOR, 0.01),
+        SPACE_WALKS: solid.strips([lane for lane in lanes if lane["kind"] == "sidewalk"], WALK_COLOR, 0.02),
+        SPACE_WALKS + "/areas": solid.areas([a for a in polygons if a["kind"] == "walking_area"], WALK_COLOR, 0.03),
+        SPACE_BUILDINGS: solid.buildings(buildings, ROOF_COLOR),
+    }
+    for path, surface in surfaces.items():
+        if len(surface.corners_m):
+            canvas.log(path, surface.mesh(), static=True)
+    painted = {
+        SPACE_MARKINGS: ([(lane, markings_m(lane)) for lane in roads if not lane["inside"]], MARKING_COLOR, _MARKING_M),
+        SPACE_CROSSINGS: (
+            [(lane, stripes_m(lane)) for lane in lanes if lane["kind"] == "crossing"],
+            CROSSING_COLOR,
+            _STRIPE_M,
+        ),
+    }
+    for path, (lines, color, width_m) in painted.items():
+        strips = [_lifted(line, lane) for lane, pieces in lines for line in pieces]
+        if strips:
+            canvas.log(path, rr.LineStrips3D(strips, colors=color, radii=width_m / 2), static=True)
+
+
+def _lifted(line_m: NDArray[np.float64], lane: Lane) -> NDArray[np.float32]:
+    """A painted line `[n, 3]`, just above its lane at the nearest point of the centre line."""
+    centre_m = np.asarray(lane["points_m"], np.float64)
+    distance_m = np.linalg.norm(line_m[:, None] - centre_m[None, :, :2], axis=-1)
+    return np.column_stack([line_m, centre_m[distance_m.argmin(axis=1), 2] + 0.05]).astype(np.float32)
 
 
 def edge_m(lane: Lane, side: int) -> NDArray[np.float64]:
@@ -159,16 +220,6 @@ def _draw_buildings(canvas: Canvas, buildings: list[Building]) -> None:
     _draw_polygons(canvas, BUILDINGS, buildings, BUILDING_COLOR, 6.0)
     outlines = [np.asarray(building["points_m"], np.float64)[:, :2] for building in buildings]
     _segments(canvas, BUILDINGS + "/walls", [np.vstack([o, o[:1]]) for o in outlines], WALL_COLOR, 0.25, 6.5)
-    if not buildings:
-        return
-    # Edges only: filled walls would hide the vehicle from the camera behind it.
-    strips = [
-        strip
-        for building, outline in zip(buildings, outlines, strict=True)
-        for strip in frame_m(outline, building["base_m"], building["height_m"])
-    ]
-    frames = rr.LineStrips3D(strips, colors=WALL_COLOR, radii=rr.Radius.ui_points(0.7))
-    canvas.log(SPACE_BUILDINGS, frames, static=True)
 
 
 def _draw_obstacles(canvas: Canvas, obstacles: list[Obstacle]) -> None:

@@ -1,31 +1,89 @@
-"""The arrangement of the views, which is sent with the recording."""
+"""The arrangement of the views, which is sent with the recording: by what a run has, so that no view is empty."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
+import rerun as rr
 import rerun.blueprint as rrb
 
-from caraware_viewer import plots
+from caraware_viewer import course, plots, space
 from caraware_viewer.canvas import TIMELINE
+from caraware_viewer.detail import Region
+from caraware_viewer.legend import LEGEND
+from caraware_viewer.static_map import SCALE_BELOW
 
 _MARGIN = 0.02
-_PLOT_WINDOW_S = 60.0
 _BACKGROUND = [20, 23, 29]
+MAX_PLOTS = 5
+"""Most plots beside one another; the first rows of `PLOTS` come first."""
 
 
-def blueprint(bounds_m: Sequence[float], real_time_factor: float = 0.0) -> rrb.Blueprint:
-    """Top view of the map (`bounds_m`: x_min, y_min, x_max, y_max), HUD, 3-D view, and plots.
+@dataclass(frozen=True)
+class Plot:
+    """A plot of figures over time."""
 
-    In a run paced at `real_time_factor`, the plots show the last minute of wall time; otherwise they show everything.
+    title: str
+    path: str
+    """Root of its figures; it is shown once one of them has a value."""
+    modes: tuple[str, ...]
+    """Modes that show it: `train`, `drive` (train with heroes), `simulate`, `play`."""
+
+
+PLOTS = (
+    Plot("Error over the whole run (m)", f"{course.ROOT}/m", ("train",)),
+    Plot("Progress over the whole run (m/s)", f"{course.ROOT}/mps", ("drive",)),
+    Plot("Beside the route over the whole run (m)", f"{course.ROOT}/m", ("drive",)),
+    Plot("Reward over the whole run", f"{course.ROOT}/reward", ("train", "drive")),
+    Plot("σ of the policy over the whole run", f"{course.ROOT}/sigma", ("train",)),
+    Plot("Speed of the followed vehicle (m/s)", plots.SPEED, ("drive", "play", "simulate")),
+    Plot("Mean error of each tick (m)", plots.ERRORS, ("train", "drive", "play", "simulate")),
+    Plot("Road users", plots.ROAD_USERS, ("simulate", "play")),
+    Plot("Vehicle-steps per second", plots.STEPS, ("train", "drive")),
+    Plot("Real-time factor", plots.REAL_TIME, ("simulate", "play", "train")),
+)
+"""Every plot, the most important of each mode first."""
+
+
+def mode_of(mode: str, *, driving: bool) -> str:
+    """Name of the layout for a mode of the map, which is the same for both tasks."""
+    return "drive" if driving and mode == "train" else mode
+
+
+def shown_plots(mode: str, figures: Collection[str]) -> tuple[Plot, ...]:
+    """The plots of a mode that have data."""
+    of_mode = [plot for plot in PLOTS if mode in plot.modes]
+    return tuple(plot for plot in of_mode if any(_is_under(path, plot.path) for path in figures))[:MAX_PLOTS]
+
+
+def layout_of(mode: str, figures: Collection[str]) -> tuple[object, ...]:
+    """What a layout depends on: two equal ones need no second blueprint."""
+    return (mode, shown_plots(mode, figures), space.VEHICLES in figures)
+
+
+def blueprint(
+    bounds_m: Sequence[float], mode: str = "train", figures: Collection[str] = (), region: Region | None = None
+) -> rrb.Blueprint:
+    """Top view of the map (`bounds_m`: x_min, y_min, x_max, y_max) or of a region, legend, HUD, 3-D view, and plots.
+
+    `figures` are the paths that have data; a view without any is left out.
     """
+    plotted = [_plot(plot) for plot in shown_plots(mode, figures)]
+    columns: list[rrb.Container | rrb.View] = [
+        rrb.Vertical(_top_view(bounds_m if region is None else region), _legend(), row_shares=[10, 1.2])
+    ]
+    shares: list[float] = [5]
+    middle: list[rrb.View] = [_hud()]
+    if space.VEHICLES in figures:
+        middle.append(_space())
+    columns.append(rrb.Vertical(*middle, row_shares=[5, 6][: len(middle)]))
+    shares.append(3.4)
+    if plotted:
+        columns.append(rrb.Vertical(*plotted))
+        shares.append(2.6)
     return rrb.Blueprint(
-        rrb.Horizontal(
-            _top_view(bounds_m),
-            rrb.Vertical(_hud(), _space(), row_shares=[3, 2]),
-            rrb.Vertical(*_plots(real_time_factor)),
-            column_shares=[5, 3, 3],
-        ),
+        rrb.Horizontal(*columns, column_shares=shares),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
@@ -34,14 +92,26 @@ def blueprint(bounds_m: Sequence[float], real_time_factor: float = 0.0) -> rrb.B
     )
 
 
+def _is_under(path: str, root: str) -> bool:
+    return path == root or path.startswith(root + "/")
+
+
 def _top_view(bounds_m: Sequence[float]) -> rrb.Spatial2DView:
     x_min, y_min, x_max, y_max = bounds_m
     x_margin, y_margin = _MARGIN * (x_max - x_min), _MARGIN * (y_max - y_min)
+    below = 2 * SCALE_BELOW * (y_max - y_min)
     visible = rrb.VisualBounds2D(
         x_range=[x_min - x_margin, x_max + x_margin],
-        y_range=[-y_max - y_margin, -y_min + y_margin],
+        y_range=[-y_max - y_margin, -y_min + y_margin + below],
     )
     return rrb.Spatial2DView(name="Top view", origin="/top", background=_BACKGROUND, visual_bounds=visible)
+
+
+def _legend() -> rrb.Spatial2DView:
+    visible = rrb.VisualBounds2D(x_range=[0.0, LEGEND.width], y_range=[0.0, LEGEND.height])
+    return rrb.Spatial2DView(
+        name="Legend", origin="/legend", background=_BACKGROUND, visual_bounds=visible, titlebar=False
+    )
 
 
 def _hud() -> rrb.TextDocumentView:
@@ -50,26 +120,25 @@ def _hud() -> rrb.TextDocumentView:
 
 def _space() -> rrb.Spatial3DView:
     eye = rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital, position=(-18.0, -9.0, 12.0), look_target=(6.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
+        kind=rrb.Eye3DKind.Orbital, position=(-26.0, -7.0, 21.0), look_target=(9.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)
     )
     return rrb.Spatial3DView(
-        name="Vehicle and its LIDAR", origin="/space", background=_BACKGROUND, line_grid=False, eye_controls=eye
+        name="Around the followed vehicle",
+        origin="/space",
+        background=_BACKGROUND,
+        line_grid=False,
+        eye_controls=eye,
     )
 
 
-def _plots(real_time_factor: float) -> list[rrb.TimeSeriesView]:
-    ranges = None
-    if real_time_factor > 0:
-        ranges = rrb.VisibleTimeRanges(
-            timeline=TIMELINE,
-            start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_PLOT_WINDOW_S * real_time_factor),
-            end=rrb.TimeRangeBoundary.cursor_relative(seconds=0),
-        )
-    views = {
-        "Mean error (m)": plots.ERRORS,
-        "Policy: σ": plots.STD,
-        "Reward": plots.REWARD,
-        "Vehicle-steps per second": plots.STEPS,
-        "Real-time factor": plots.REAL_TIME,
-    }
-    return [rrb.TimeSeriesView(name=name, origin=f"/{path}", time_ranges=ranges) for name, path in views.items()]
+def _plot(plot: Plot) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        name=plot.title,
+        origin=f"/{plot.path}",
+        background=rrb.archetypes.PlotBackground(color=_BACKGROUND),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+        # Without a range, rerun shows a part around the cursor.
+        axis_x=rrb.TimeAxis(
+            view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+        ),
+    )

@@ -7,18 +7,20 @@ import contextlib
 import os
 import sys
 import threading
-from collections.abc import Iterator
+import time
 
 import rerun as rr
 
 from caraware_viewer import access
+from caraware_viewer.detail import Region
 from caraware_viewer.display import Display, has_screen
+from caraware_viewer.documents import RunMap
 from caraware_viewer.link import RunLink, connect, find_run
 from caraware_viewer.scene import Scene
-from caraware_viewer.views import blueprint
+from caraware_viewer.views import blueprint, layout_of, mode_of
 from caraware_viewer.wire import FrameError
 
-_POLL_INTERVAL_S = 0.25
+_POLL_INTERVAL_S = 0.1
 _FLUSH_LIMIT_S = 5.0
 
 
@@ -32,24 +34,31 @@ def watch_run(options: argparse.Namespace) -> int:
         raise
     with RunLink(session, run) as link, _open_display(options) as display:
         run_map = link.map(options.timeout)
-        recording = rr.RecordingStream("caraware", recording_id=f"{run.run}/{run.env}")
-        views = blueprint(run_map["map"]["bounds_m"], run_map.get("real_time_factor", 0.0))
-        recording.set_sinks(*_sinks(options, display), default_blueprint=views)
+        kept, live = _recordings(options, display, f"{run.run}/{run.env}")
+        recordings = [recording for recording in (kept, live) if recording is not None]
         print(f"watching run {run.run} at {options.endpoint}", file=sys.stderr)
         if display is not None and display.page is not None:
             print(f"open {display.page.url} in a browser", file=sys.stderr)
+        scene = Scene(
+            kept,
+            run_map,
+            options.vehicle,
+            options.lidar,
+            live=live,
+            region=options.region,
+            display_pid=None if display is None else display.pid,
+        )
+        layout = Layout(recordings, run_map, options.region)
+        layout.arrange(scene)
         drawing = threading.Thread(
-            target=_draw_frames,
-            args=(link, Scene(recording, run_map, options.vehicle, options.lidar)),
-            name="draw",
-            daemon=True,
+            target=_draw_frames, args=(link, scene, layout, options.rate), name="draw", daemon=True
         )
         drawing.start()
         try:
             _wait_for_end(drawing, link, display)
         finally:
             link.frames.close()
-            _finish(recording, drawing, display)
+            _finish(recordings, drawing, display)
     print(f"run {run.run} has ended" if link.frames.ended else "the display was closed", file=sys.stderr)
     return 0
 
@@ -60,12 +69,13 @@ def _wait_for_end(drawing: threading.Thread, link: RunLink, display: Display | N
         drawing.join(_POLL_INTERVAL_S)
 
 
-def _finish(recording: rr.RecordingStream, drawing: threading.Thread, display: Display | None) -> None:
-    """Writes the rest of the recording. Abandons a display that accepts no data, for which rerun waits without end."""
+def _finish(recordings: list[rr.RecordingStream], drawing: threading.Thread, display: Display | None) -> None:
+    """Writes the rest of the recordings. Abandons a display that accepts no data, for which rerun waits without end."""
 
     def write() -> None:
         drawing.join()
-        recording.disconnect()
+        for recording in recordings:
+            recording.disconnect()
 
     writing = threading.Thread(target=write, name="write", daemon=True)
     writing.start()
@@ -81,12 +91,32 @@ def _finish(recording: rr.RecordingStream, drawing: threading.Thread, display: D
     writing.join(_FLUSH_LIMIT_S)
 
 
-def _draw_frames(link: RunLink, scene: Scene) -> None:
+class Layout:
+    """Arranges the views of all recordings by what the run has so far."""
+
+    def __init__(self, recordings: list[rr.RecordingStream], run_map: RunMap, region: Region | None) -> None:
+        self._recordings, self._map, self._region = recordings, run_map, region
+        self._shown: object = None
+
+    def arrange(self, scene: Scene) -> None:
+        """Sends a new arrangement if another view has data, or one has lost its place."""
+        mode = mode_of(str(self._map.get("mode", "train")), driving=scene.driving)
+        shown = layout_of(mode, scene.figures)
+        if shown == self._shown:
+            return
+        self._shown = shown
+        views = blueprint(self._map["map"]["bounds_m"], mode, scene.figures, self._region)
+        for recording in self._recordings:
+            recording.send_blueprint(views, make_active=True, make_default=True)
+
+
+def _draw_frames(link: RunLink, scene: Scene, layout: Layout, rate_hz: float) -> None:
     reported: set[str] = set()
     while True:
+        begun_s = time.monotonic()
         # Read before taking, so that everything stored before the end is drawn.
         closed = link.frames.closed
-        scene.lost = link.frames.lost
+        scene.lost, scene.skipped = link.frames.lost, link.frames.skipped_ticks
         for topic, sample in link.frames.take(_POLL_INTERVAL_S).items():
             try:
                 scene.draw(topic, sample)
@@ -97,18 +127,28 @@ def _draw_frames(link: RunLink, scene: Scene) -> None:
                         f"caraware-viewer: {topic}: {error} (later ones are refused without a message)", file=sys.stderr
                     )
                 reported.add(topic)
+        layout.arrange(scene)
         if closed:
             return
         link.subscribe_clouds(scene.cloud_vehicles())
+        # Meanwhile newer frames replace those that wait.
+        link.frames.wait_for_close(1 / rate_hz - (time.monotonic() - begun_s))
 
 
-def _sinks(options: argparse.Namespace, display: Display | None) -> Iterator[rr.GrpcSink | rr.FileSink]:
+def _recordings(
+    options: argparse.Namespace, display: Display | None, recording_id: str
+) -> tuple[rr.RecordingStream | None, rr.RecordingStream | None]:
+    """The recording that keeps the history, in a file, and the one that shows the present."""
+    kept = live = None
     if options.save:
-        yield rr.FileSink(options.save)
-    if options.connect:
-        yield rr.GrpcSink(options.connect)
-    if display is not None:
-        yield rr.GrpcSink(display.url)
+        kept = rr.RecordingStream("caraware", recording_id=recording_id)
+        kept.set_sinks(rr.FileSink(options.save))
+    urls = [options.connect] if options.connect else []
+    urls += [display.url] if display is not None else []
+    if urls:
+        live = rr.RecordingStream("caraware", recording_id=recording_id)
+        live.set_sinks(*(rr.GrpcSink(url) for url in urls))
+    return kept, live
 
 
 def _open_display(options: argparse.Namespace) -> contextlib.AbstractContextManager[Display | None]:

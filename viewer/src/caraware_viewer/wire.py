@@ -39,6 +39,10 @@ VEHICLE_META = RECORDS["VehicleMeta"]
 """Id, type and size of a road user."""
 SIGNAL_META = RECORDS["SignalMeta"]
 """State of a traffic light, a letter for each link."""
+ROUTE_POINT = RECORDS["RoutePoint"]
+"""A point of a hero's route; routes follow one another, each from its point 0."""
+NO_SIGNAL = 0xFFFF_FFFF
+"""`RoutePoint.signal` where there is no traffic light."""
 COLLISION = RECORDS["Collision"]
 """A contact that begins."""
 SCAN = RECORDS["Scan"]
@@ -129,7 +133,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Table:
-    """A frame of `VEHICLE_META`, `SIGNAL_META` or `COLLISION` rows."""
+    """A frame of `VEHICLE_META`, `SIGNAL_META`, `ROUTE_POINT` or `COLLISION` rows."""
 
     header: Header
     rows: NDArray[np.void]
@@ -168,7 +172,7 @@ def decode_world(frame: bytes) -> World:
 
 
 def decode_table(frame: bytes, row: np.dtype[np.void]) -> Table:
-    """A frame of `vehicles`, `signals` or `event`."""
+    """A frame of `vehicles`, `signals`, `routes` or `event`."""
     header = decode_header(frame)
     return Table(header, _array(frame, 0, row, (header.rows,)))
 

@@ -1,0 +1,57 @@
+"""The legend: a strip below the top view, with a sign and a name for each thing that it shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import rerun as rr
+
+from caraware_viewer import top
+from caraware_viewer.canvas import Canvas
+
+SIGNS = "legend/signs"
+
+_ROWS: tuple[tuple[tuple[str, int], ...], ...] = (
+    (
+        ("connected", int(top.KIND_COLORS[0])),
+        ("other vehicle", int(top.KIND_COLORS[1])),
+        ("pedestrian", int(top.KIND_COLORS[2])),
+        ("hero, route", int(top.KIND_COLORS[3])),
+    ),
+    (
+        ("GNSS fix", top.rgba(top.GNSS_COLOR)),
+        ("policy", top.rgba(top.PREDICTION_COLOR)),
+        ("EKF", top.rgba(top.ESTIMATE_COLOR)),
+        ("contact", top.rgba(top.CONTACT_COLOR)),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class LegendSize:
+    """Extent of the legend in its own units."""
+
+    width: float
+    height: float
+
+
+LEGEND = LegendSize(width=100.0, height=13.0)
+
+
+def draw_legend(canvas: Canvas) -> None:
+    """Draws the legend once."""
+    places, names, colors = [], [], []
+    for row, signs in enumerate(_ROWS):
+        for column, (name, color) in enumerate(signs):
+            places.append((LEGEND.width * (column + 0.5) / len(signs), LEGEND.height * (row + 0.25) / len(_ROWS)))
+            names.append(name)
+            colors.append(color)
+    points = rr.Points2D(
+        np.array(places, np.float32),
+        colors=np.array(colors, np.uint32),
+        labels=names,
+        show_labels=True,
+        radii=rr.Radius.ui_points(4.0),
+    )
+    canvas.log(SIGNS, points, static=True)
