@@ -91,6 +91,11 @@ class Browser:
         self.call("Emulation.setDeviceMetricsOverride", **metrics)
         self.call("Page.addScriptToEvaluateOnNewDocument", source=QUIET)
 
+    @property
+    def pid(self) -> int:
+        """Identity of the browser's main process."""
+        return self._process.pid
+
     def open(self, url: str) -> None:
         """Opens an address."""
         self.call("Page.navigate", url=url)

@@ -6,6 +6,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 import rerun as rr
@@ -31,12 +32,49 @@ _CONTACT_S = 5.0
 _MEMORY_INTERVAL_S = 2.0
 _REPEAT_BYTES = 48_000_000
 """After so many bytes the map and the curves are sent to the display again: rerun's server keeps the newest 256 MiB."""
+_AGES = 20_000
+"""Newest frames whose ages count in the summary."""
 _RATE_FRAMES = 20
 """Number of frames over which the rate of drawing is measured."""
 
 
 class AnotherRunError(FrameError):
     """A frame of a new run of the same name, whose map the viewer does not have."""
+
+
+@dataclass
+class Tally:
+    """What the viewer has drawn since it started."""
+
+    frames: int = 0
+    begun_s: float = 0.0
+    ended_s: float = 0.0
+    ages_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_AGES))
+    memory_mb: float = float("nan")
+    display_mb: float = float("nan")
+
+    def add(self, now_s: float, age_ms: float, figures: ViewerFigures) -> None:
+        """Adds a frame, `age_ms` old once it is handed to rerun."""
+        self.begun_s = self.begun_s if self.frames else now_s
+        self.frames, self.ended_s = self.frames + 1, now_s
+        self.ages_ms.append(age_ms)
+        self.memory_mb = float(np.fmax(self.memory_mb, figures.memory_mb))
+        self.display_mb = float(np.fmax(self.display_mb, figures.display_mb))
+
+    def text(self) -> str:
+        """One line for the end of the viewer."""
+        if self.frames < 2:
+            return ""
+        parts = [
+            f"drew {self.frames} frames, {(self.frames - 1) / max(self.ended_s - self.begun_s, 1e-9):.1f} per second"
+        ]
+        ages_ms = [age for age in self.ages_ms if np.isfinite(age)]
+        if ages_ms:
+            parts.append(f"{np.median(ages_ms):.0f} ms old (95 %: {np.quantile(ages_ms, 0.95):.0f} ms)")
+        parts.append(f"memory at most {self.memory_mb:.0f} MB")
+        if np.isfinite(self.display_mb):
+            parts.append(f"rerun {self.display_mb:.0f} MB")
+        return ", ".join(parts)
 
 
 class Scene:
@@ -80,6 +118,7 @@ class Scene:
         self._repeated_bytes = 0
         self._drawn_at: deque[float] = deque(maxlen=_RATE_FRAMES)
         self._age_ms = float("nan")
+        self._tally = Tally()
         self.lost = 0
         """Samples that were lost on the network, as the link counts them."""
         self.refused = 0
@@ -130,6 +169,10 @@ class Scene:
         """Paths that have data: the layout shows the views of these."""
         return frozenset(self._canvas.figures)
 
+    def summary(self) -> str:
+        """What was drawn, how fast, how old, and in how much memory; empty if nothing was drawn."""
+        return self._tally.text()
+
     @property
     def driving(self) -> bool:
         """True in a run with heroes."""
@@ -159,7 +202,9 @@ class Scene:
         self._draw_routes(rows[0] if rows else None)
         if rows:
             self._canvas.scalar(plots.SPEED, float(np.hypot(*rows[0]["velocity_body_mps"][:2])))
-        text = hud(self._picture, self._map, followed, self._figures())
+        figures = self._figures()
+        self._tally.add(self._drawn_at[-1], sample.age_ms(), figures)
+        text = hud(self._picture, self._map, followed, figures)
         self._canvas.log(HUD, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
         if self._canvas.live_bytes - self._repeated_bytes > _REPEAT_BYTES:
             self._canvas.repeat_static()

@@ -59,6 +59,8 @@ def watch_run(options: argparse.Namespace) -> int:
         finally:
             link.frames.close()
             _finish(recordings, drawing, display)
+            if scene.summary():
+                print(scene.summary(), file=sys.stderr)
     print(f"run {run.run} has ended" if link.frames.ended else "the display was closed", file=sys.stderr)
     return 0
 
