@@ -36,7 +36,7 @@ RUN = RunKey("crowd", 0)
 MAX_ROWS, MAX_SLOTS = 6616, 2300
 """Rows of `world` and slots of `observation` (9 fields, 10 samples of the IMU) that fit into a frame."""
 SIDE_M, SPACING_M = 5000.0, 250.0
-RATE_HZ = 10.0
+RATE_HZ, STATUS_TICKS = 10.0, 5
 COUNT_FRAMES = """window.rendered = 0;
 const before = window.requestAnimationFrame.bind(window);
 window.requestAnimationFrame = draw => before(time => { window.rendered++; draw(time); });"""
@@ -82,11 +82,12 @@ def publish(port: int, vehicles: int, stop: float) -> None:
         fixes = truth + random.normal(0, 5, truth.shape)
         sent["observation"] = frames.observation(tick, truth, fixes, id_hash=ids[:slots])
         sent["prediction"] = frames.prediction(tick, truth + 1)
-        if tick % 5 == 0:
+        if tick % STATUS_TICKS == 0:
             users = {"cav": rows, "other": 0, "person": 0, "hero": 0}
             sent["status"] = json.dumps({"tick": tick, "real_time_factor": 1.0, "road_users": users}).encode()
         for topic, payload in sent.items():
-            session.put(f"{RUN.prefix}/{topic}", payload, attachment=struct.pack("<QQ", tick, time.time_ns()))
+            sequence = tick // STATUS_TICKS if topic == "status" else tick
+            session.put(f"{RUN.prefix}/{topic}", payload, attachment=struct.pack("<QQ", sequence, time.time_ns()))
         tick += 1
         time.sleep(max(0.0, begun + tick / RATE_HZ - time.time()))
     queryable.undeclare()

@@ -122,7 +122,7 @@ def part(picture: Picture, left: float, right: float, upper: float = 0.08, lower
 
 
 def map_of(picture: Picture) -> Picture:
-    return part(picture, 0.0, 5 / 11, 0.1, 0.85)
+    return part(picture, 0.0, 5 / 11, 0.06, 0.86)
 
 
 def legend_of(picture: Picture) -> Picture:
@@ -130,11 +130,11 @@ def legend_of(picture: Picture) -> Picture:
 
 
 def hud_of(picture: Picture) -> Picture:
-    return part(picture, 5 / 11, 8.4 / 11, 0.1, 0.46)
+    return part(picture, 5 / 11, 8.4 / 11, 0.06, 0.43)
 
 
 def space_of(picture: Picture) -> Picture:
-    return part(picture, 5 / 11, 8.4 / 11, 0.55, 0.95)
+    return part(picture, 5 / 11, 8.4 / 11, 0.52, 0.95)
 
 
 def plots_of(picture: Picture) -> Picture:
@@ -188,7 +188,7 @@ def missing(picture: Picture, mode: Mode) -> list[str]:
     return [what for what, there in seen.items() if not there]
 
 
-PLOTS_TOP_PX, PLOTS_BOTTOM_PX = 36, 28
+PLOTS_TOP_PX, PLOTS_BOTTOM_PX = 0, 28
 """rerun's bars above and below the views."""
 
 

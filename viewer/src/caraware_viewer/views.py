@@ -46,6 +46,10 @@ PLOTS = (
 """Every plot, the most important of each mode first."""
 
 
+_SHARED = (f"{course.ROOT}/m", plots.ERRORS, plots.ROAD_USERS)
+"""Plots with several curves, which need a legend; the title of the others says what they show."""
+
+
 def mode_of(mode: str, *, driving: bool) -> str:
     """Name of the layout for a mode of the map, which is the same for both tasks."""
     return "drive" if driving and mode == "train" else mode
@@ -84,6 +88,7 @@ def blueprint(
         shares.append(2.6)
     return rrb.Blueprint(
         rrb.Horizontal(*columns, column_shares=shares),
+        rrb.TopPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
@@ -136,7 +141,7 @@ def _plot(plot: Plot) -> rrb.TimeSeriesView:
         name=plot.title,
         origin=f"/{plot.path}",
         background=rrb.archetypes.PlotBackground(color=_BACKGROUND),
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=plot.path in _SHARED),
         # Without a range, rerun shows a part around the cursor.
         axis_x=rrb.TimeAxis(
             view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
