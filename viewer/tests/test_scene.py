@@ -13,7 +13,7 @@ import pytest
 import recordings
 import rerun as rr
 
-from caraware_viewer import detail, plots, scene, space, static_map, top, wire
+from caraware_viewer import course, detail, plots, scene, space, static_map, top, wire
 from caraware_viewer.documents import RunMap
 from caraware_viewer.link import Sample
 from caraware_viewer.scene import Scene
@@ -71,6 +71,7 @@ STATUS = {
         "metrics": [{"name": "progress_mps", "label": "progress", "unit": "m/s", "value": 8.25}],
     },
 }
+COURSE = json.dumps({"updates": [{"env_steps": 8, "tick": 1, "training": {"reward": 0.5}}], "evaluations": []}).encode()
 
 Drawing = tuple[Scene, dict[str, recordings.Entity]]
 Drawn = Callable[..., Drawing]
@@ -315,6 +316,34 @@ def test_every_topic_may_be_missing(drawn: Drawn) -> None:
 def test_seeking_is_in_simulated_time_over_episodes(drawn: Drawn) -> None:
     _, found = drawn(*(("world", frames.world(tick)) for tick in (0, 9, 99)))
     assert [at for at, _ in found[top.OUTLINES].rows] == pytest.approx([0.1, 1.0, 10.0])
+
+
+def test_the_live_picture_replaces_its_frames_and_the_kept_one_has_their_history(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene, "_REPEAT_BYTES", 100_000)
+    recordings_of = {name: rr.RecordingStream("test", recording_id="test") for name in ("kept", "live")}
+    for name, recording in recordings_of.items():
+        recording.save(tmp_path / name)
+    drawing = Scene(recordings_of["kept"], cast(RunMap, MAP), live=recordings_of["live"])
+    drawing.draw("learning/whole", Sample(COURSE))
+    for tick in range(40):
+        drawing.draw("world", Sample(frames.world(tick, 100)))
+        drawing.draw("status", Sample(json.dumps(STATUS | {"tick": tick}).encode()))
+    for recording in recordings_of.values():
+        recording.flush()
+        recording.disconnect()
+    kept, live = (recordings.read(tmp_path / name) for name in ("kept", "live"))
+    for path in (top.OUTLINES, space.VEHICLES, scene.HUD):
+        assert len({at for at, _ in kept[path].rows}) == 40, path
+        assert {at for at, _ in live[path].rows} == {recordings.ALWAYS}, path
+    assert len({at for at, _ in live[plots.REAL_TIME].rows if at > 0}) == 40
+    # The map and the curves are sent again, because rerun's server drops the oldest data.
+    assert len(kept[static_map.ROADS].rows) == 1
+    assert len(live[static_map.ROADS].rows) > 2
+    assert len([at for at, _ in kept[course.REWARD].rows if at > 0]) == 1
+    assert len([at for at, _ in live[course.REWARD].rows if at > 0]) > 2
+    assert drawing.summary().startswith("drew 40 frames")
 
 
 def test_frames_of_another_run_are_refused(drawn: Drawn) -> None:
