@@ -243,6 +243,50 @@ fn ids_lights_and_scans_reach_viewers_whatever_the_ids() {
     assert!(ask(&late, &run.scan_key(IDS[2])).is_none());
 }
 
+/// A viewer that joins late gets the course of training from its start, also after the fan-out was killed; later updates follow.
+#[test]
+fn a_late_viewer_gets_the_whole_course_of_training() {
+    let run = Run::new("course", Mode::Simulate);
+    let append = |env_steps: u64| {
+        let mut file = std::fs::File::options()
+            .create(true)
+            .append(true)
+            .open(run.file.run_dir.join("learning.jsonl"))
+            .unwrap();
+        writeln!(
+            file,
+            "{{\"env_steps\":{env_steps},\"tick\":1,\"training\":{{\"reward\":0.5}}}}"
+        )
+        .unwrap();
+    };
+    let steps = |document: &[u8]| -> Vec<u64> {
+        assert_eq!(
+            fanout::reader::check("learning", document, Some(run.file.run_id)),
+            Ok(None)
+        );
+        let document: serde_json::Value = serde_json::from_slice(document).unwrap();
+        let lines = document["updates"].as_array().unwrap().iter();
+        lines.map(|line| line["env_steps"].as_u64().unwrap()).collect()
+    };
+    (0..100).for_each(append);
+    let mut fanout = run.start_fanout();
+    fanout.0.kill().unwrap();
+    fanout.0.wait().unwrap();
+    run.forget_dead();
+    let _fanout = run.restart_fanout(1);
+    let late = run.attach();
+    let newest = watch(&late, run.key(Topic::Learning));
+    until("the whole course", || {
+        ask(&late, &run.key(Topic::Learning)).is_some_and(|document| steps(&document) == Vec::from_iter(0..100))
+    });
+    append(100);
+    until("the newest update", || {
+        let sample = newest.recv_timeout(PATIENCE).unwrap().unwrap();
+        let steps = steps(&sample.payload().to_bytes());
+        steps.len() <= 32 && steps.last() == Some(&100)
+    });
+}
+
 /// Random bytes on the port and on every key, and another version in shared memory, are counted, and the run's frames still arrive.
 #[test]
 fn garbage_is_counted_and_not_fatal() {

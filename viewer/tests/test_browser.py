@@ -230,7 +230,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "episode.evaluation_ticks=20",
         "trainer.horizon=512",
         "trainer.batch_size=128",
-        "fanout.enabled=false",
+        f"fanout.listen=tcp/127.0.0.1:{free_port()}",
     ]
     arguments = [str(COMMAND), "train", "town", "--name", "town-1", "--runs", str(directory)]
     arguments += [part for setting in settings for part in ("--set", setting)]

@@ -7,6 +7,8 @@ pub const FULL_RATE_FRAME_BYTES: usize = 500_000;
 
 /// Sets that may be saved up. The half above one absorbs the jitter of a run paced at the rate; it is too little for a burst.
 const BURST_FRAMES: f64 = 1.5;
+/// Sets that a topic must have saved to go out with others.
+const JOINING_SETS: f64 = 0.5;
 
 /// A token bucket: at most `rate_hz` sets of frames per second in the long run.
 #[derive(Debug, Clone)]
@@ -33,6 +35,13 @@ impl RateBudget {
         self.at = self.at.max(now);
         self.tokens = (self.tokens + elapsed_s * self.rate_hz).min(BURST_FRAMES);
         self.tokens >= 1.0
+    }
+
+    /// True if a set of other topics that is due may take this one along: it is then at most half a set ahead of its rate. So topics of
+    /// one rate go out with the same tick again after one of them went out alone.
+    #[must_use]
+    pub fn joins(&self) -> bool {
+        self.tokens >= JOINING_SETS
     }
 
     /// Fills the budget, so that a set may be published at once; a rate of 0 still allows none.
@@ -111,6 +120,39 @@ mod tests {
                 budget.spend(100_000);
             }
         }
+    }
+
+    #[test]
+    fn topics_of_one_rate_fall_into_step_and_keep_the_rate() {
+        let (mut world, mut prediction) = (RateBudget::new(10.0), RateBudget::new(10.0));
+        let (mut together, mut alone, mut predictions) = (0, 0, 0);
+        for step in 0..1000_u32 {
+            let now = Duration::from_millis(10) * step;
+            // The first prediction is late, so that it goes out without the world of its tick.
+            let (world_due, prediction_due) = (world.allows(now), prediction.allows(now) && step > 3);
+            if !world_due && !prediction_due {
+                continue;
+            }
+            let both = [
+                world_due || world.joins(),
+                step > 3 && (prediction_due || prediction.joins()),
+            ];
+            if both[0] {
+                world.spend(0);
+            }
+            if both[1] {
+                prediction.spend(0);
+                predictions += 1;
+            }
+            if both == [true, true] {
+                together += 1;
+            } else {
+                alone += 1;
+            }
+        }
+        assert!(alone <= 3 && together >= 97, "{alone} {together}");
+        assert!((98..=102).contains(&predictions), "{predictions}");
+        assert!(!RateBudget::new(0.0).joins());
     }
 
     #[test]

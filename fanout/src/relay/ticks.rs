@@ -173,7 +173,7 @@ impl TickTopics {
                 continue;
             };
             let header = *message.header();
-            let is_due = stream.budget.allows(now);
+            let is_due = stream.budget.allows(now) || stream.budget.joins();
             let framed = is_due.then(|| match stream.topic {
                 Topic::Prediction => frame::encode_prediction(&header, message.payload(), chosen.as_deref()),
                 _ => frame::encode(stream.feed.channel(), &header, message.payload()),
