@@ -46,7 +46,7 @@ impl SparseLines {
                 index % 2 == 1
             });
         }
-        if (self.seen - 1) % self.stride() == 0 {
+        if (self.seen - 1).is_multiple_of(self.stride()) {
             self.kept.push(line.clone());
         }
         self.newest = Some(line);
