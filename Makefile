@@ -71,6 +71,7 @@ test-python:
 	$(VENV)/bin/python -m pytest -q bench/tests
 	cd viewer && ../$(VENV)/bin/python -m pytest -q tests
 	$(VENV)/bin/python -m pytest -q maps/town/tests
+	$(VENV)/bin/python -m pytest -q maps/valley/tests
 	$(VENV)/bin/python -m pytest -q sim-core/tests
 
 lint: lint-rust lint-python ## formatting and lints, as errors

@@ -22,7 +22,14 @@ INCLUDED = {"docs/benchmarks/parts.md"}
 """Pages that are a part of another one."""
 
 NAVIGATION = {
-    "First steps": ["docs/capabilities", "docs/peers", "docs/glossary", "configs/README", "maps/town/README"],
+    "First steps": [
+        "docs/capabilities",
+        "docs/peers",
+        "docs/glossary",
+        "configs/README",
+        "maps/town/README",
+        "maps/valley/README",
+    ],
     "Tutorials": [
         "docs/tutorials/your-scenario",
         "docs/tutorials/your-reward",
