@@ -6,6 +6,7 @@ use crate::{
     ego::EgoPoseLayout,
     event::CollisionLayout,
     image::{ImageLayout, ImagePlane, MOST_SEEN},
+    lane_position::LanePositionLayout,
     neighbours::NeighboursLayout,
     observation::ObservationLayout,
     pointcloud::PointcloudLayout,
@@ -58,6 +59,8 @@ pub enum Channel {
     Measurement = 12,
     /// What connected vehicles know from messages.
     Neighbours = 13,
+    /// Where road users are on SUMO's lanes and routes, and SUMO's time.
+    LanePosition = 14,
 }
 
 /// What happens to a message that finds a subscriber's queue full.
@@ -160,7 +163,7 @@ const fn two_batches(queue_length: usize) -> usize {
 }
 
 /// Every data service, by [`Channel`].
-pub const CHANNELS: [ChannelSpec; 14] = [
+pub const CHANNELS: [ChannelSpec; 15] = [
     ChannelSpec {
         channel: Channel::Traffic,
         name: "traffic",
@@ -426,6 +429,30 @@ pub const CHANNELS: [ChannelSpec; 14] = [
         queue_length: windowful,
         in_hand: |run| two_batches(windowful(run)),
         is_used: |run| run.config.v2x.is_on(),
+    },
+    ChannelSpec {
+        channel: Channel::LanePosition,
+        name: "lane-position",
+        payload: "SUMO's time, `[LanePosition]`",
+        sections: LanePositionLayout::SECTIONS,
+        dimensions: LanePositionLayout::DIMENSIONS,
+        producer: TrafficBridge,
+        required: &[],
+        paced_by: Channel::Traffic,
+        window: RunFile::traffic_window_ticks,
+        topics: &[],
+        when_full: FullQueue::DropOldest,
+        max_payload: |run| match run.config.traffic.lane_positions {
+            true => LanePositionLayout::new(road_users(run)).len,
+            false => 0,
+        },
+        // A trainer that reads them with each observation misses none: the ticks between SUMO and it are bounded by credit.
+        queue_length: |run| match run.config.traffic.lane_positions {
+            true => traffic_frames(run) + 2 * windowful(run),
+            false => SPARE_MESSAGES,
+        },
+        in_hand: |_| SPARE_MESSAGES,
+        is_used: |run| run.config.traffic.lane_positions,
     },
 ];
 

@@ -199,12 +199,21 @@ pub struct TrafficConfig {
     /// Where SUMO runs.
     #[serde(default)]
     pub engine: TrafficEngine,
+    /// Host of a SUMO that runs already; empty = `traffic-bridge` starts SUMO.
+    #[serde(default)]
+    pub traci_host: String,
+    /// Place of `traffic-bridge` among the clients of that SUMO.
+    #[serde(default)]
+    pub traci_order: u32,
     /// Port of SUMO's own process for TraCI clients; that of environment n is n higher.
     #[serde(default)]
     pub traci_port: u16,
     /// TraCI clients that SUMO's own process waits for, `traffic-bridge` among them.
     #[serde(default)]
     pub traci_clients: u32,
+    /// The channel `lane-position` is sent.
+    #[serde(default)]
+    pub lane_positions: bool,
     /// SUMO's time at the begin, seconds (`.sumocfg`); `None` = as the scenario says.
     pub begin_s: Option<f64>,
     /// SUMO's time at the end, seconds (`.sumocfg`); `None` = as the scenario says.

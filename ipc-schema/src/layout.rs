@@ -17,6 +17,7 @@ use crate::{
     field::FIELDS,
     header::MessageHeader,
     image::{ImageHead, SeenObject},
+    lane_position::LanePosition,
     pointcloud::{LidarPoint, Scan},
     radar::{RadarDetection, RadarScan},
     section::{SectionSpec, WireElement, numpy_type},
@@ -222,6 +223,17 @@ pub fn table() -> Vec<TypeLayout> {
             azimuths,
             reserved
         }),
+        layout!(LanePosition {
+            id_hash,
+            lane_position_m,
+            odometer_m,
+            vehicle,
+            lane,
+            edge,
+            route_edge,
+            carrier,
+            reserved
+        }),
         layout!(ImageHead {
             position_m,
             attitude_rad,
@@ -356,6 +368,7 @@ records!(
     Collision,
     EgoPose,
     HeroView,
+    LanePosition,
     LidarPoint,
     RoutePoint,
     Scan,

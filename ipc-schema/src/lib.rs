@@ -16,12 +16,13 @@
 //! | `switch` | `[SensorSwitch]`, from the tick in the header on | traffic-bridge | none |
 //! | `image` | `ImageHead`, planes, `[SeenObject]`: one message for each camera and image | sensor-daemon | none |
 //! | `radar` | `RadarScan`, `[RadarDetection]`: one message for each radar and scan | sensor-daemon | none |
+//! | `lane-position` | SUMO's time, `[LanePosition]` | traffic-bridge | none |
 //! | `control` | [`control::ControlRequest`] → [`control::ControlReply`] | supervisor | traffic-bridge |
 //! | `board` | [`board::Progress`], [`board::Health`], [`board::TrainingStatus`], [`activity::Activity`] | every process | none (newest wins) |
 //! | `roster` | [`board::Roster`]: the current incarnation of each process | supervisor | none (newest wins) |
 //! | `wake` | an event without content | every peer | its process |
 //!
-//! The first fourteen are [`channel::CHANNELS`]. `recorder` is a required consumer where a run records without loss. In the driving task
+//! The first fifteen are [`channel::CHANNELS`]. `recorder` is a required consumer where a run records without loss. In the driving task
 //! sim-core waits for each `prediction`.
 //!
 //! Every message has a [`header::MessageHeader`]. The supervisor alone creates the services, in [`services`]; all other processes
@@ -45,6 +46,7 @@ pub mod field;
 pub mod flow;
 pub mod header;
 pub mod image;
+pub mod lane_position;
 pub mod layout;
 pub mod membership;
 pub mod metric;
@@ -75,4 +77,4 @@ pub mod world;
 extern crate self as ipc_schema;
 
 /// Version of every payload and of the run file; raised when any of them changes.
-pub const SCHEMA_VERSION: u32 = 17;
+pub const SCHEMA_VERSION: u32 = 18;

@@ -167,7 +167,7 @@ impl ChannelIntake {
 /// Ticks from one message of `channel` to the next; 0 if they come at other times.
 fn ticks_per_message(channel: Channel, run: &RunFile) -> u64 {
     match channel {
-        Channel::Traffic => run.ticks_per_frame(),
+        Channel::Traffic | Channel::LanePosition => run.ticks_per_frame(),
         Channel::World | Channel::Observation | Channel::Measurement | Channel::Neighbours | Channel::Prediction => 1,
         Channel::EgoPose => u64::from(run.config.drives()),
         Channel::TrafficMeta

@@ -83,6 +83,7 @@ impl Player {
             Channel::Prediction => !has_trainer,
             Channel::Pointcloud => membership.run.config.lidar.vehicles > 0,
             Channel::Image => membership.run.config.camera.vehicles > 0,
+            Channel::LanePosition => membership.run.config.traffic.lane_positions,
             Channel::Radar => membership.run.config.radar.vehicles > 0,
             Channel::Census => membership.run.config.fanout.enabled,
             Channel::TrafficMeta | Channel::World | Channel::Event => true,

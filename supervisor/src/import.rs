@@ -16,7 +16,7 @@ use crate::{
     display,
     failure::Exit,
     install::Install,
-    scenario::{self, input_check::require_regular},
+    scenario::{self, ScenarioReading, input_check::require_regular},
 };
 use demand::ImportedDemand;
 
@@ -157,7 +157,7 @@ pub fn import(args: &ImportArgs) -> Result<(), Exit> {
     tools.write(SUMOCFG, &configuration(args, has_polygons, &demand))?;
     stage(4, "the files as a run reads them");
     let sumocfg = directory.join(SUMOCFG);
-    let scenario = scenario::read(&sumocfg, false)?;
+    let scenario = scenario::read(&sumocfg, ScenarioReading::Checked)?;
     let counts = net::MapCounts::of(&tools, NET, has_polygons.then_some(POLYGONS))?;
     let projected = scenario::map_info(&scenario.net_file, None);
     stage(5, "the first two minutes in bare SUMO");

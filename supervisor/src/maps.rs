@@ -7,7 +7,12 @@ use ipc_schema::{
     run::{MapInfo, RunMap, SceneFiles, Source},
 };
 
-use crate::{failure::Exit, install::Install, scenario, town};
+use crate::{
+    failure::Exit,
+    install::Install,
+    scenario::{self, ScenarioReading},
+    town,
+};
 
 /// Checks that every file of `curriculum.maps` exists, and makes its path absolute.
 ///
@@ -74,7 +79,7 @@ fn built_town(install: &Install, directory: &Path) -> Result<(Source, SceneFiles
 fn user_map(file: &Path, directory: &Path, trusted: bool) -> Result<(Source, SceneFiles), Exit> {
     let scene_files = match scenario::is_scenario(file) {
         true => {
-            let scenario = scenario::read(file, trusted)?;
+            let scenario = scenario::read(file, ScenarioReading::of(trusted, ""))?;
             SceneFiles {
                 net_file: scenario.net_file,
                 additional_files: scenario.additional_files,

@@ -21,7 +21,7 @@ use crate::{
     maps,
     registry::{self, RunClaim},
     remote, resume,
-    scenario::{self, SumoScenario, input_check::require_regular},
+    scenario::{self, ScenarioReading, SumoScenario, input_check::require_regular},
     scenario_settings, system_limits,
     view::ViewerRequest,
 };
@@ -171,7 +171,8 @@ fn settings_of_run(run: &RunFile, set: &[String]) -> Result<(LayeredSettings, Tr
     let named = match &run.source {
         Source::Scenario { sumocfg, .. } => {
             let trusted = settings.has_flag(TRUST_KEY);
-            TrafficInput::Scenario(sumocfg.clone(), scenario::read(sumocfg, trusted)?)
+            let reading = ScenarioReading::of(trusted, &run.config.traffic.traci_host);
+            TrafficInput::Scenario(sumocfg.clone(), scenario::read(sumocfg, reading)?)
         }
         Source::Population { .. } => TrafficInput::Map,
     };
@@ -233,7 +234,9 @@ fn resolve_config(args: &RunArgs) -> Result<(LayeredSettings, TrafficInput, Stri
     match path.extension().and_then(std::ffi::OsStr::to_str) {
         _ if scenario::is_scenario(path) => {
             let mut settings = defaults.with_assignments(&args.set)?;
-            let scenario = scenario::read(path, settings.has_flag(TRUST_KEY))?;
+            let host = settings.text("traffic.traci_host").unwrap_or_default();
+            let reading = ScenarioReading::of(settings.has_flag(TRUST_KEY), host);
+            let scenario = scenario::read(path, reading)?;
             scenario_settings::apply(&mut settings, &scenario, name)?;
             suggest_preview(&mut settings, name);
             let path = std::path::absolute(path).map_err(|error| Exit::io("resolve", path, &error))?;
@@ -272,6 +275,14 @@ fn check_task(config: &Config, mode: Mode, named: &TrafficInput) -> Result<(), E
         return Err(Exit::config(
             "`episode.whole_scenario`, `traffic.scale`, `--begin` and `--end` need a .sumocfg, and CONFIG is not one",
             "name a .sumocfg in place of the preset, or leave them out (episode.ticks and episode.training_episodes limit a run on a map)",
+        ));
+    }
+    let runs_once = named.is_scenario() && (mode == Mode::Simulate || config.episode.whole_scenario);
+    let attaches = !traffic.traci_host.is_empty();
+    if attaches && !runs_once {
+        return Err(Exit::config(
+            "a SUMO that runs already (`traffic.traci_host`) has one scenario and runs it once",
+            "give its .sumocfg to `caraware simulate`, or train with episode.whole_scenario = true",
         ));
     }
     if named.is_scenario() && !config.curriculum.stages.is_empty() {

@@ -469,8 +469,14 @@ fn traffic(report: &Value) -> Option<String> {
         Some(contacts) => format!("contacts {contacts}, in SUMO"),
         None => "contacts in SUMO".to_owned(),
     };
+    let carried = [("rides", "rides of persons"), ("container_loads", "containers loaded")]
+        .map(|(key, label)| match report["traffic"][key].as_u64() {
+            Some(count) if count > 0 => format!("; {label} {count}"),
+            _ => String::new(),
+        })
+        .concat();
     Some(format!(
-        "road users {all} ({}{rest}); teleports {}; {contacts} {}; resets {}",
+        "road users {all} ({}{rest}){carried}; teleports {}; {contacts} {}; resets {}",
         shown.join(", "),
         report["traffic"]["teleports"],
         report["traffic"]["contacts"],

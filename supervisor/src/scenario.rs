@@ -99,7 +99,8 @@ pub(crate) fn attribute(element: &BytesStart<'_>, name: &str) -> Option<String> 
 /// # Errors
 /// The file is unreadable or malformed, it names no net, a file that it names is missing or no regular file, or an option or an element
 /// makes SUMO connect, listen, load another configuration, or write outside the run's directory. Each error has its file and line.
-pub fn read(path: &Path, trusted: bool) -> Result<SumoScenario, Exit> {
+pub fn read(path: &Path, reading: ScenarioReading) -> Result<SumoScenario, Exit> {
+    let trusted = reading != ScenarioReading::Checked;
     let unreadable = |reason: String| problem(path, reason, "give the path of an existing .sumocfg");
     if path.exists() {
         input_check::require_regular(path).map_err(unreadable)?;
@@ -113,6 +114,7 @@ pub fn read(path: &Path, trusted: bool) -> Result<SumoScenario, Exit> {
         path,
         directory: path.parent().unwrap_or(Path::new(".")),
         scenario: SumoScenario::default(),
+        reading,
         check: (!trusted).then(|| InputCheck::new(OutputPlace::RunDirectory)),
         outputs: OutputNames::default(),
         state_s: None,
@@ -169,11 +171,35 @@ pub fn check_net(net: &Path, trusted: bool) -> Result<(), Exit> {
     }
 }
 
+/// How much the files of a scenario may do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ScenarioReading {
+    /// What reaches beyond the run's directory is refused.
+    Checked,
+    /// The user trusts them: all that SUMO can do without a client.
+    Trusted,
+    /// The user has started SUMO with them; the run attaches to it.
+    Attached,
+}
+
+impl ScenarioReading {
+    /// The reading of a run with `traffic.trust_scenario` and `traffic.traci_host`.
+    #[must_use]
+    pub fn of(trusted: bool, traci_host: &str) -> Self {
+        match (traci_host.is_empty(), trusted) {
+            (false, _) => Self::Attached,
+            (true, true) => Self::Trusted,
+            (true, false) => Self::Checked,
+        }
+    }
+}
+
 /// Takes over the options of one `.sumocfg`.
 struct ScenarioReader<'a> {
     path: &'a Path,
     directory: &'a Path,
     scenario: SumoScenario,
+    reading: ScenarioReading,
     /// `None` if the scenario is trusted.
     check: Option<InputCheck>,
     /// Names of all outputs.
@@ -195,12 +221,13 @@ impl ScenarioReader<'_> {
         let effect = OptionEffect::of(name);
         match effect {
             OptionEffect::ReadsXml | OptionEffect::Reads => self.read_files(setting, effect)?,
-            // No client can connect to a run, trusted or not.
-            OptionEffect::Listens if value.trim() != "0" => {
+            // No client can connect to a SUMO of the run's own, trusted or not.
+            OptionEffect::Listens if value.trim() != "0" && self.reading != ScenarioReading::Attached => {
                 return Err(self.problem(
                     *line,
                     format!("remote-port = \"{value}\" makes SUMO wait for a TraCI client, but no client can connect to a run"),
-                    "remove remote-port from the .sumocfg, or keep a copy without it; for TraCI scripts set traffic.engine = \"traci\"",
+                    "remove remote-port from the .sumocfg, or keep a copy without it; for TraCI scripts set traffic.engine = \"traci\", and \
+                     traffic.traci_host = \"localhost\" to attach to a SUMO that you start",
                 ));
             }
             _ => self.check_setting(setting, effect)?,
@@ -371,7 +398,7 @@ mod tests {
             "a.sumocfg",
             "<configuration>\n<input>\n<net-file value=\"a.net.xml\"/></input><time><step-length value=\"0.5\"/></time></configuration>",
         );
-        let scenario = read(&cfg, false).unwrap();
+        let scenario = read(&cfg, ScenarioReading::Checked).unwrap();
         assert_eq!(
             scenario,
             SumoScenario {
@@ -397,7 +424,7 @@ mod tests {
             "a.sumocfg",
             "<configuration>\n  <input>\n    <net-file value=\"a.net.xml\"/>\n    <route-files value=\"b.rou.xml\"/>\n  </input>\n</configuration>",
         );
-        let (text, help) = message(read(&cfg, false).unwrap_err());
+        let (text, help) = message(read(&cfg, ScenarioReading::Checked).unwrap_err());
         assert!(
             text.contains("line 4: route-files names") && text.contains("b.rou.xml"),
             "{text}"
@@ -414,7 +441,7 @@ mod tests {
             let text = format!("<c><net-file value=\"my net.net.xml\"/>{text}</c>");
             let cfg = write(directory.path(), "run.sumo.cfg", &text);
             assert!(is_scenario(&cfg));
-            read(&cfg, false).map(|scenario| (scenario.own, scenario.end_s))
+            read(&cfg, ScenarioReading::Checked).map(|scenario| (scenario.own, scenario.end_s))
         };
         let (own, end_s) =
             options("<step-length value=\"0:0:1\"/><seed value=\"-5\"/><b value=\"0:1:0\"/><end>0:2:0.5</end>")
@@ -450,7 +477,7 @@ mod tests {
         );
         let begin_s = |more: &str| {
             let text = format!("<c><net-file value=\"a.net.xml\"/><load-state value=\"s.xml\"/>{more}</c>");
-            read(&write(directory.path(), "a.sumocfg", &text), false)
+            read(&write(directory.path(), "a.sumocfg", &text), ScenarioReading::Checked)
                 .unwrap()
                 .own
                 .begin_s

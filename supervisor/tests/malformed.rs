@@ -13,7 +13,11 @@ use std::{
     time::{Duration, Instant},
 };
 
-use caraware::{config::LayeredSettings, failure::Exit, scenario};
+use caraware::{
+    config::LayeredSettings,
+    failure::Exit,
+    scenario::{self, ScenarioReading},
+};
 use common::{Workplace, sumo_program, text, tool};
 use ipc_schema::{failure::FailureKind, run::RunFile};
 
@@ -146,7 +150,7 @@ fn damaged_nets_routes_and_scenarios_are_read_or_refused() {
     for path in &files {
         let original = std::fs::read(path).unwrap();
         each_damaged(&original, path, 60, || {
-            let scenario = scenario::read(&files[3], false);
+            let scenario = scenario::read(&files[3], ScenarioReading::Checked);
             match scenario.and_then(|scenario| scenario::map_info(&scenario.net_file, Some((52.0, 10.0)))) {
                 Ok(_) => read += 1,
                 Err(exit) => {

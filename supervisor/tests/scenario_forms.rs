@@ -195,6 +195,11 @@ fn saved_states_riders_and_long_ids_are_mirrored_and_outputs_of_one_name_kept_ap
     let seen = fcd.matches("<vehicle ").count() + fcd.matches("<person ").count() - riding;
     assert_eq!(report["traffic"]["vehicle_steps"], seen, "{report:#}");
     assert_eq!(report["traffic"]["departed"]["passenger"], 8, "{report:#}");
+    assert_eq!(
+        (&report["traffic"]["rides"], &report["traffic"]["container_loads"]),
+        (&1.into(), &0.into()),
+        "the box is carried by no vehicle: {report:#}"
+    );
     let ids = std::fs::read_to_string(workplace.path().join("runs/all").join(VEHICLE_IDS)).unwrap();
     assert!(
         ids.contains(&format!("\"{long}1\"\n")) && ids.contains(&format!("\"{long}2\"\n")),
@@ -247,6 +252,70 @@ fn saved_states_riders_and_long_ids_are_mirrored_and_outputs_of_one_name_kept_ap
         run["source"]["scenario"]["own"]["begin_s"], 20.0,
         "SUMO's time of the saved state"
     );
+}
+
+/// Containers as in SUMO's own tests: at stops, by line, more than a vehicle holds, on a vehicle that waits for one, and moved by none.
+#[test]
+fn containers_are_carried_as_in_bare_sumo_and_counted() {
+    let workplace = Workplace::new();
+    grid(&workplace);
+    workplace.write(
+        "stops.add.xml",
+        "<additional><containerStop id=\"first\" lane=\"A0A1_1\" startPos=\"30\" endPos=\"60\"/>\
+         <containerStop id=\"second\" lane=\"B1B2_1\" startPos=\"30\" endPos=\"60\"/></additional>",
+    );
+    workplace.write(
+        "boxes.rou.xml",
+        "<routes><vType id=\"truck\" vClass=\"truck\" containerCapacity=\"2\"/>\
+         <vehicle id=\"waits\" type=\"truck\" depart=\"0\"><route edges=\"C0C1 C1C2\"/>\
+         <stop lane=\"C0C1_1\" startPos=\"20\" endPos=\"40\" triggered=\"container\" parking=\"false\"/></vehicle>\
+         <container id=\"a\" depart=\"0\" departPos=\"50\"><transport from=\"A0A1\" containerStop=\"second\" lines=\"l1\"/>\
+         <tranship edges=\"B1B2 B2C2\" speed=\"5\"/></container>\
+         <container id=\"b\" depart=\"0\" departPos=\"50\"><transport from=\"A0A1\" containerStop=\"second\" lines=\"l1\"/></container>\
+         <container id=\"c\" depart=\"0\" departPos=\"50\"><transport from=\"A0A1\" containerStop=\"second\" lines=\"l1\"/></container>\
+         <container id=\"alone\" depart=\"0\"><tranship edges=\"A0B0 B0C0\" speed=\"5\"/></container>\
+         <flow id=\"shuttle\" type=\"truck\" line=\"l1\" begin=\"0\" end=\"60\" number=\"2\"><route edges=\"A0A1 A1B1 B1B2 B2C2\"/>\
+         <stop containerStop=\"first\" duration=\"20\"/><stop containerStop=\"second\" duration=\"20\"/></flow>\
+         <container id=\"awaited\" depart=\"5\" departPos=\"40\"><transport from=\"C0C1\" to=\"C1C2\" lines=\"waits\"/></container></routes>",
+    );
+    let input = INPUT.replace(
+        "cars.rou.xml\"/>",
+        "cars.rou.xml,boxes.rou.xml\"/><additional-files value=\"stops.add.xml\"/>",
+    );
+    scenario(
+        &workplace,
+        "boxes.sumocfg",
+        &format!(
+            "{input}<tripinfo-output value=\"trips.xml\"/><fcd-output value=\"fcd.xml\"/>\
+             <fcd-output.attributes value=\"x,y,vehicle\"/><end value=\"900\"/>"
+        ),
+    );
+    let bare = ["-c", "boxes.sumocfg", "--no-step-log", "--output-prefix", "bare-"];
+    tool(&sumo_program("sumo"), &bare, workplace.path());
+    let report = simulate(&workplace, "boxes.sumocfg", "boxes", &[]);
+    let body = |path: PathBuf| {
+        let text = std::fs::read_to_string(path).unwrap();
+        text.split_once("-->").unwrap().1.to_owned()
+    };
+    let ours = workplace.path().join("runs/boxes/sumo");
+    for name in ["trips.xml", "fcd.xml"] {
+        let theirs = body(workplace.path().join(format!("bare-{name}")));
+        assert!(body(ours.join(name)) == theirs, "{name} differs from bare SUMO's");
+    }
+    let trips = body(ours.join("trips.xml"));
+    assert_eq!(
+        report["traffic"]["container_loads"],
+        trips.matches("<transport ").count(),
+        "{trips}"
+    );
+    assert_eq!(report["traffic"]["container_loads"], 4, "{trips}");
+    // Only what moves by itself is mirrored.
+    assert_eq!(
+        report["traffic"]["vehicle_steps"],
+        body(ours.join("fcd.xml")).matches("<vehicle ").count(),
+        "{report:#}"
+    );
+    workplace.assert_nothing_left();
 }
 
 #[test]

@@ -10,7 +10,7 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use caraware::scenario::{self, options::OptionEffect};
+use caraware::scenario::{self, ScenarioReading, options::OptionEffect};
 use common::{BARE_NET_SETTINGS, Workplace, sumo_program, text, tool, tree};
 use quick_xml::events::{BytesStart, Event};
 
@@ -206,7 +206,7 @@ fn an_option_that_reaches_beyond_the_run_directory_is_refused_with_its_line() {
     ] {
         let path = scenario(&workplace, option);
         assert_refused(&workplace, &[&["a.sumocfg", "line 5"], &parts[..]].concat());
-        let trusted = scenario::read(&path, true);
+        let trusted = scenario::read(&path, ScenarioReading::Trusted);
         assert_eq!(
             trusted.is_ok(),
             !option.contains("remote-port"),
@@ -361,7 +361,7 @@ fn the_games_of_the_wheel_are_harmless() {
         .join("tools/game");
     for name in ["A10KW", "bs3d", "DRT", "cross", "grid6", "corridor"] {
         let path = games.join(name).with_extension("sumocfg");
-        let read = scenario::read(&path, false);
+        let read = scenario::read(&path, ScenarioReading::Checked);
         assert!(read.is_ok(), "{name}: {read:?}");
     }
     let before = tree(&games);

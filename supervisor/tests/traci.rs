@@ -10,7 +10,7 @@ mod common;
 
 use std::{
     net::TcpListener,
-    process::{Child, Command, Stdio},
+    process::{Child, Command, Output, Stdio},
 };
 
 use caraware::install::Install;
@@ -88,15 +88,138 @@ fn simulate(workplace: &Workplace, name: &str, more: &[String], script: Option<C
     (workplace.report(name), trips.split_once("-->").unwrap().1.to_owned())
 }
 
+/// Starts SUMO by itself, as a user does, listening for so many clients.
+fn start_sumo(workplace: &Workplace, port: u16, clients: &str) -> Child {
+    Command::new(sumo_program("sumo"))
+        .args(["-c", "a.sumocfg", "--no-step-log", "--num-clients", clients])
+        .args(["--remote-port", &port.to_string()])
+        .current_dir(workplace.path())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap()
+}
+
+/// Waits until SUMO has ended, and returns its record of trips.
+fn finish_sumo(workplace: &Workplace, sumo: Child) -> String {
+    let output = sumo.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", text(&output));
+    let trips = std::fs::read_to_string(workplace.path().join("trips.xml")).unwrap();
+    trips.split_once("-->").unwrap().1.to_owned()
+}
+
+/// What a command printed, without the line breaks and bars of a report.
+fn said(output: &Output) -> String {
+    let text = text(output).replace('\u{2502}', " ");
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+fn free_port() -> u16 {
+    TcpListener::bind(("127.0.0.1", 0))
+        .unwrap()
+        .local_addr()
+        .unwrap()
+        .port()
+}
+
+/// The arguments of a run that attaches to the SUMO on `port`.
+fn attached(port: u16, order: u32) -> Vec<String> {
+    vec![
+        "traffic.engine=traci".to_owned(),
+        "traffic.traci_host=localhost".to_owned(),
+        format!("traffic.traci_port={port}"),
+        format!("traffic.traci_order={order}"),
+    ]
+}
+
+#[test]
+fn a_run_attaches_to_a_sumo_that_runs_already() {
+    let workplace = Workplace::new();
+    scenario(&workplace);
+    let simulate_at = |name: &str, settings: &[String]| {
+        let settings = settings.iter().flat_map(|setting| ["--set", setting]);
+        let arguments: Vec<&str> = ["simulate", "a.sumocfg", "--name", name]
+            .into_iter()
+            .chain(common::BARE_NET_SETTINGS)
+            .chain(settings)
+            .collect();
+        workplace.run(&arguments)
+    };
+    let (inside, trips) = simulate(&workplace, "inside", &[], None);
+
+    // Alone with it, the run has the bytes of libsumo.
+    let port = free_port();
+    let sumo = start_sumo(&workplace, port, "1");
+    let output = simulate_at("alone", &attached(port, 1));
+    assert!(output.status.success(), "{}", text(&output));
+    assert_eq!(finish_sumo(&workplace, sumo), trips);
+    let alone = workplace.report("alone");
+    assert_eq!(alone["observation_hash"], inside["observation_hash"]);
+    assert!(
+        !workplace.path().join("runs/alone/sumo/trips.xml").exists(),
+        "SUMO's outputs are the user's"
+    );
+
+    // A script is another client of the same SUMO.
+    let install = Install::find().unwrap();
+    let port = free_port();
+    let sumo = start_sumo(&workplace, port, "2");
+    let path = workplace.write("script.py", SCRIPT);
+    let script = Command::new(&install.python)
+        .arg(path)
+        .arg(port.to_string())
+        .env("PYTHONPATH", install.sumo_home.join("tools"))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let output = simulate_at("both", &attached(port, 1));
+    assert!(output.status.success(), "{}", text(&output));
+    let steps = script.wait_with_output().unwrap();
+    assert!(steps.status.success(), "{}", text(&steps));
+    assert_ne!(finish_sumo(&workplace, sumo), trips, "the script changed nothing");
+    let both = workplace.report("both");
+    assert_ne!(both["observation_hash"], inside["observation_hash"]);
+
+    // Another simulation than that of the run's .sumocfg is refused.
+    let port = free_port();
+    let sumo = start_sumo(&workplace, port, "1");
+    let settings = [attached(port, 1), vec!["traffic.step_s=0.1".to_owned()]].concat();
+    let output = simulate_at("other", &settings);
+    assert_eq!(output.status.code(), Some(2), "{}", text(&output));
+    assert!(
+        said(&output).contains("its step is 0.5 s, and that of the run 0.1 s"),
+        "{}",
+        text(&output)
+    );
+    sumo.wait_with_output().unwrap();
+
+    // What cannot be is refused before anything is started.
+    for (setting, reason) in [
+        ("traffic.engine=libsumo", "needs `traffic.engine`"),
+        ("traffic.end_s=10", "is an option of SUMO"),
+        ("run.envs=2", "is one environment"),
+    ] {
+        let settings = [attached(port, 1), vec![setting.to_owned()]].concat();
+        let output = simulate_at("refused", &settings);
+        assert_eq!(output.status.code(), Some(2), "{setting}: {}", text(&output));
+        assert!(said(&output).contains(reason), "{setting}: {}", text(&output));
+    }
+    let output = simulate_at("nowhere", &attached(free_port(), 1));
+    assert_eq!(output.status.code(), Some(2), "{}", text(&output));
+    assert!(
+        said(&output).contains("cannot attach to SUMO at localhost:"),
+        "{}",
+        text(&output)
+    );
+    workplace.assert_nothing_left();
+}
+
 #[test]
 fn a_traci_script_runs_beside_a_run_and_changes_it() {
     let workplace = Workplace::new();
     scenario(&workplace);
-    let port = TcpListener::bind(("127.0.0.1", 0))
-        .unwrap()
-        .local_addr()
-        .unwrap()
-        .port();
+    let port = free_port();
     let engine = |clients: u32| {
         let settings = [
             "traffic.engine=traci".to_owned(),

@@ -88,6 +88,8 @@ struct Attached {
     images: Option<Subscriber>,
     /// Opened by the first call of `detections`.
     radar: Option<Subscriber>,
+    /// Opened by the first call of `lane_positions`.
+    lanes: Option<Subscriber>,
     predictions: Publisher,
     /// Wakes `sim-core`, which waits for predictions in the driving task.
     sim_core: Option<Waker>,
@@ -208,6 +210,14 @@ impl Attachment {
         let mut inner = self.lock()?;
         let Attached { radar, membership, .. } = &mut *inner;
         sights(py, radar, membership, Service::Radar)
+    }
+
+    /// Messages of `lane-position` since the last call; only the newest, if there were more than the queue holds. The first call returns none
+    /// from before it.
+    fn lane_positions(&self, py: Python<'_>) -> PyResult<Vec<SightMessage>> {
+        let mut inner = self.lock()?;
+        let Attached { lanes, membership, .. } = &mut *inner;
+        sights(py, lanes, membership, Service::LanePosition)
     }
 
     /// Number of ticks that `traffic-bridge` is ahead of the newest tick consumed here.
@@ -477,6 +487,7 @@ impl Attachment {
             scans: None,
             images: None,
             radar: None,
+            lanes: None,
             predictions,
             sim_core,
             traffic_bridge,

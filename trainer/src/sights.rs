@@ -1,16 +1,17 @@
-//! Images and radar scans for Python, copied out of shared memory: one that Python keeps does not block the next one.
+//! Images, radar scans and lane positions for Python, copied out of shared memory: one that Python keeps does not block the next one.
 
 use ipc_schema::{
     block::{self, BlockError, Section},
     header::MessageHeader,
     image::ImageLayout,
+    lane_position::LanePositionLayout,
     ports::Message,
     radar::RadarLayout,
     services::Channel,
 };
 use pyo3::{exceptions::PyValueError, prelude::*, types::PyBytes};
 
-/// What one camera or one radar has sent at a tick.
+/// What one camera or one radar has sent at a tick, or where all road users are on their lanes.
 #[pyclass(frozen, module = "caraware._native")]
 pub(crate) struct SightMessage {
     header: MessageHeader,
@@ -20,12 +21,19 @@ pub(crate) struct SightMessage {
 impl SightMessage {
     pub(crate) fn new(py: Python<'_>, channel: Channel, message: &Message) -> PyResult<Self> {
         let header = *message.header();
-        let sections: Vec<Section> = if channel == Channel::Image {
-            let layout = ImageLayout::of(&header);
-            vec![layout.head, layout.planes, layout.objects]
-        } else {
-            let layout = RadarLayout::of(&header);
-            vec![layout.scan, layout.detections]
+        let sections: Vec<Section> = match channel {
+            Channel::Image => {
+                let layout = ImageLayout::of(&header);
+                vec![layout.head, layout.planes, layout.objects]
+            }
+            Channel::LanePosition => {
+                let layout = LanePositionLayout::of(&header);
+                vec![layout.sumo_time_s, layout.positions]
+            }
+            _ => {
+                let layout = RadarLayout::of(&header);
+                vec![layout.scan, layout.detections]
+            }
         };
         let bytes = |section| {
             block::view::<u8>(message.payload(), section)

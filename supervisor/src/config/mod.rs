@@ -130,6 +130,12 @@ impl LayeredSettings {
         self.setting(path).map_or(Value::Null, |setting| setting.value.clone())
     }
 
+    /// The text that the key `path` has, if it is set.
+    #[must_use]
+    pub fn text(&self, path: &str) -> Option<&str> {
+        self.setting(path).and_then(|setting| setting.value.as_str())
+    }
+
     /// True if the key `path` has this text.
     #[must_use]
     pub fn has_text(&self, path: &str, text: &str) -> bool {

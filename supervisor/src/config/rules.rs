@@ -2,7 +2,7 @@
 
 use ipc_schema::{
     channel::Channel,
-    config::{Config, HeroDriver, Network, TaskKind, VehicleModel},
+    config::{Config, HeroDriver, Network, TaskKind, TrafficEngine, VehicleModel},
 };
 
 mod curriculum;
@@ -40,6 +40,9 @@ pub(super) fn check(settings: &LayeredSettings, config: &Config) -> Result<(), C
     }
     task(settings, config)?;
     curriculum::check(settings, config)?;
+    if let Some((path, message, help)) = unattachable(config) {
+        return Err(conflict(settings, path, message, help.into()));
+    }
     let traffic = &config.traffic;
     let road_users = traffic.cavs + traffic.others + traffic.pedestrians + traffic.heroes;
     if road_users > config.traffic.max_road_users {
@@ -103,6 +106,45 @@ fn task(settings: &LayeredSettings, config: &Config) -> Result<(), ConfigError> 
 
 /// Key, message and help of a broken rule.
 type BrokenRule = (&'static str, String, &'static str);
+
+/// A SUMO that runs already has its own options, and begins once.
+fn unattachable(config: &Config) -> Option<BrokenRule> {
+    let traffic = &config.traffic;
+    if traffic.traci_host.is_empty() {
+        return None;
+    }
+    if traffic.engine != TrafficEngine::Traci {
+        return Some((
+            "traffic.traci_host",
+            "`traffic.traci_host` needs `traffic.engine` = \"traci\": over TraCI a run attaches to a SUMO that runs already, with or \
+             without a window"
+                .into(),
+            "set traffic.engine = \"traci\", or leave traffic.traci_host out",
+        ));
+    }
+    let own = [
+        ("traffic.scale", traffic.scale),
+        ("traffic.begin_s", traffic.begin_s),
+        ("traffic.end_s", traffic.end_s),
+    ];
+    if let Some((path, _)) = own.into_iter().find(|(_, value)| value.is_some()) {
+        return Some((
+            path,
+            format!("`{path}` is an option of SUMO, and the SUMO at `traffic.traci_host` has been started already"),
+            "give that SUMO the option, and leave it out here",
+        ));
+    }
+    (config.run.envs > 1).then(|| {
+        (
+            "run.envs",
+            format!(
+                "`run.envs` = {}: a SUMO that runs already is one environment",
+                config.run.envs
+            ),
+            "set run.envs = 1, or leave traffic.traci_host out",
+        )
+    })
+}
 
 fn heroes_without_a_driver(config: &Config) -> Option<BrokenRule> {
     let traffic = &config.traffic;

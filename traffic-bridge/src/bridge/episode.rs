@@ -13,14 +13,14 @@ use ipc_schema::{
     services::Channel,
 };
 
-use super::{Bridge, commands::CommandContext};
+use super::{Bridge, EpisodeCounts, commands::CommandContext};
 use crate::{
     heroes,
     population::{Population, PopulationSize, trips::TripSelection},
     sumo::{
         Sumo,
         connected::ConnectedRule,
-        engine::{Engine, TraciServer},
+        engine::{Engine, RunningServer, TraciServer},
         error::SumoError,
         frame::TrafficFrame,
         interpolation::StepInterpolation,
@@ -107,12 +107,20 @@ fn options(run: &RunFile, map: &RunMap, episode: &Episode) -> Result<SumoOptions
     }?;
     Ok(options
         .with_world_origin(map.info.world_origin_m)
+        .with_net_bounds(map.info.bounds_m)
         .with_engine(engine(run)))
 }
 
 /// Where the run's SUMO runs.
 fn engine(run: &RunFile) -> Engine {
     let traffic = &run.config.traffic;
+    if !traffic.traci_host.is_empty() {
+        return Engine::Attached(RunningServer {
+            host: traffic.traci_host.clone(),
+            port: traffic.traci_port,
+            order: traffic.traci_order,
+        });
+    }
     let program = match traffic.engine {
         TrafficEngine::Libsumo => return Engine::InProcess,
         TrafficEngine::Traci => "sumo",
@@ -126,6 +134,14 @@ fn engine(run: &RunFile) -> Engine {
         clients: traffic.traci_clients,
         log: run.run_dir.join("logs/sumo.log"),
     })
+}
+
+/// The name of a map, or of the scenario that has its own.
+fn map_name(map: &RunMap) -> String {
+    match &map.source {
+        Source::Scenario { sumocfg, .. } => sumocfg.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+        Source::Population { .. } => map.name.clone(),
+    }
 }
 
 /// Puts road users into an empty net; a scenario brings its own.
@@ -188,12 +204,20 @@ impl Bridge {
         };
         Failure::remove(&run.run_dir, Process::TrafficBridge.name());
         let population = population(run, &mut sumo, episode, stage)?;
-        let interpolation = match self.frames_per_step {
-            1 => None,
-            frames => Some(StepInterpolation::new(sumo.read_lanes()?, frames, sumo.step_s())),
+        let reads_positions = self.outbox.lanes.is_some();
+        let lanes = match reads_positions || self.frames_per_step > 1 {
+            true => Some(sumo.read_lanes()?),
+            false => None,
         };
+        if let (Some(lanes), Some(feed)) = (&lanes, &mut self.outbox.lanes) {
+            sumo.read_positions();
+            feed.begin_episode(sumo.begin_s(), &map_name(&self.maps[map]), lanes.ids())?;
+        }
+        let interpolation = lanes
+            .filter(|_| self.frames_per_step > 1)
+            .map(|lanes| StepInterpolation::new(lanes, self.frames_per_step, sumo.step_s()));
         self.commands.begin_episode();
-        self.totals.traffic.episode_contacts = 0;
+        self.totals.traffic.of_episode = EpisodeCounts::default();
         Ok(RunningEpisode {
             sumo,
             population,
@@ -261,7 +285,11 @@ impl Bridge {
             self.publish_step(frame, header)?;
 
             // Close the episode or the segment, or prepare the next step.
-            self.totals.count_contacts(sumo.contacts());
+            self.totals.take_counts(EpisodeCounts {
+                contacts: sumo.contacts(),
+                rides: sumo.rides(),
+                container_loads: sumo.container_loads(),
+            });
             if ends {
                 self.check_that_road_users_came()?;
                 self.totals.cost = Some(self.totals.cost_before.plus(sumo.cost()));

@@ -5,6 +5,7 @@ pub(crate) mod commands;
 mod decisions;
 mod episode;
 mod id_log;
+mod lane_feed;
 mod lessons;
 mod outbox;
 mod pacing;
@@ -107,9 +108,23 @@ struct TrafficCounts {
     teleports: u64,
     /// Contacts that SUMO reported.
     contacts: u64,
-    /// Those of the running episode among them.
+    /// Times that a person boarded a vehicle.
+    #[serde(default)]
+    rides: u64,
+    /// Times that a container was loaded onto a vehicle.
+    #[serde(default)]
+    container_loads: u64,
+    /// What SUMO has counted in the running episode so far.
     #[serde(skip)]
-    episode_contacts: u64,
+    of_episode: EpisodeCounts,
+}
+
+/// What SUMO counts in an episode.
+#[derive(Debug, Clone, Copy, Default)]
+struct EpisodeCounts {
+    contacts: u64,
+    rides: u64,
+    container_loads: u64,
 }
 
 /// What the bridge has done so far.
@@ -148,11 +163,13 @@ impl BridgeTotals {
         }
     }
 
-    /// Takes over the number of contacts that SUMO has reported in the running episode.
-    fn count_contacts(&mut self, episode_contacts: u64) {
+    /// Takes over what SUMO has counted in the running episode.
+    fn take_counts(&mut self, now: EpisodeCounts) {
         let counts = &mut self.traffic;
-        counts.contacts += episode_contacts - counts.episode_contacts.min(episode_contacts);
-        counts.episode_contacts = episode_contacts;
+        counts.contacts += now.contacts - counts.of_episode.contacts.min(now.contacts);
+        counts.rides += now.rides - counts.of_episode.rides.min(now.rides);
+        counts.container_loads += now.container_loads - counts.of_episode.container_loads.min(now.container_loads);
+        counts.of_episode = now;
     }
 }
 

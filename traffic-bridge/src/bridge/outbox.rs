@@ -11,7 +11,7 @@ use ipc_schema::{
     traffic::{EVENTS_PER_MESSAGE, RoutePoint, SIGNALS_PER_MESSAGE, TrafficLayout, TrafficMetaLayout},
 };
 
-use super::census::Census;
+use super::{census::Census, lane_feed::LaneFeed};
 use crate::{heroes, sumo::frame::TrafficFrame};
 
 /// The publishers of the process.
@@ -20,6 +20,8 @@ pub(super) struct Outbox {
     meta: Publisher,
     /// Whole state once a second, in a run that viewers may watch.
     census: Option<(Publisher, Census)>,
+    /// Road users in SUMO's terms, in a run that asks for them.
+    pub(super) lanes: Option<LaneFeed>,
     /// Sensors that commands switch.
     switches: Publisher,
     /// The required consumers of `traffic`.
@@ -34,7 +36,12 @@ impl Outbox {
             true => Some((membership.publisher(Channel::Census)?, Census::default())),
             false => None,
         };
+        let lanes = match membership.run.config.traffic.lane_positions {
+            true => Some(LaneFeed::open(membership)?),
+            false => None,
+        };
         Ok(Self {
+            lanes,
             traffic: membership.publisher(Channel::Traffic)?,
             meta: membership.publisher(Channel::TrafficMeta)?,
             census,
@@ -67,6 +74,10 @@ impl Outbox {
             meta_messages: self.meta_messages,
             ..header
         };
+        // Before the states: a process that has a tick's states finds its positions.
+        if let Some(lanes) = &mut self.lanes {
+            lanes.publish(frame, header)?;
+        }
         send(&self.traffic, header, layout.len, layout.states, &frame.states)?;
         self.consumers.wake();
         if let Some((publisher, census)) = &mut self.census {
@@ -143,7 +154,7 @@ fn send<T: bytemuck::Pod>(
 }
 
 /// The user can settle this failure: the configuration reserves room for fewer road users than there are.
-fn too_many(error: PortError) -> Failure {
+pub(super) fn too_many(error: PortError) -> Failure {
     match &error {
         PortError::TooLong { .. } => Failure::from_error(FailureKind::Config, &error)
             .with_help("raise `traffic.max_road_users`, or use a scenario with fewer road users at the same time"),

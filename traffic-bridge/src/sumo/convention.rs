@@ -61,7 +61,7 @@ pub fn sumo_seed(episode_seed: u64) -> u64 {
 /// `step_s` is the time since the state before, seconds; `world_origin_m` as in [`world_from_net`].
 #[must_use]
 pub fn traffic_state(raw: &RawState, kind: Kind, step_s: f64, world_origin_m: [f64; 2]) -> Option<TrafficState> {
-    if raw.x == INVALID || raw.y == INVALID {
+    if !is_on_road(raw) {
         return None;
     }
     let continuous = raw.previous_speed != INVALID && raw.speed != INVALID;
@@ -85,6 +85,18 @@ pub fn traffic_state(raw: &RawState, kind: Kind, step_s: f64, world_origin_m: [f
         signals: u32::try_from(raw.signals).unwrap_or(0),
         flags: if continuous { 0 } else { DISCONTINUOUS },
     })
+}
+
+/// False while a road user is off the road (teleporting, riding, parked away).
+#[must_use]
+pub fn is_on_road(raw: &RawState) -> bool {
+    raw.x != INVALID && raw.y != INVALID
+}
+
+/// A number of SUMO's, `None` for its "invalid" value.
+#[must_use]
+pub fn valid(value: f64) -> Option<f64> {
+    (value != INVALID).then_some(value)
 }
 
 /// The nearest single-precision number: angles, speeds and sizes are carried in it.
@@ -113,6 +125,10 @@ mod tests {
             signals: 8,
             lane: -1,
             lane_position: 0.0,
+            edge: -1,
+            route_index: -1,
+            odometer: INVALID,
+            carrier: -1,
             index: 7,
         }
     }

@@ -4,6 +4,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <map>
 #include <memory>
 #include <set>
 #include <string>
@@ -38,7 +39,7 @@ public:
     EngineSimulation();
     ~EngineSimulation() override;
 
-    void start(rust::Slice<const rust::String> arguments, std::uint16_t port, std::uint32_t clients) override;
+    void start(rust::Slice<const rust::String> arguments, rust::Str host, std::uint16_t port, std::uint32_t order) override;
     void close() override;
     void step() override;
     rust::Slice<const RawState> states() const override;
@@ -53,9 +54,13 @@ public:
     double time() const override;
     double end_time() const override;
     double step_length() const override;
+    rust::Vec<double> net_boundary() const override;
     std::int32_t min_expected() const override;
 
     rust::Vec<RawNetLane> net_lanes() override;
+    void read_positions() override;
+    std::uint64_t rides() const override;
+    std::uint64_t loads() const override;
 
     rust::String vehicle_class(rust::Str vehicle_type) const override;
     rust::Vec<RawEdge> edges(rust::Str vehicle_class) const override;
@@ -94,10 +99,11 @@ private:
     void note_teleports();
     void note_saved();
     void note_contacts();
+    void note_loads();
     void depart(const std::string& id, bool is_person);
     void arrive(std::size_t place);
     void read_vehicle(const std::string& id, RawState& state) const;
-    void read_person(const std::string& id, RawState& state) const;
+    void read_person(const std::string& id, RawState& state);
     void read_all();
     void put_in_order();
     void read_signals();
@@ -128,6 +134,16 @@ private:
     std::unordered_map<std::string, std::size_t> person_places_;
     // Place among the net's lanes of an id; empty if lanes are not read. Never iterated.
     std::unordered_map<std::string, std::int32_t> lane_places_;
+    // The same for edges.
+    std::unordered_map<std::string, std::int32_t> edge_places_;
+    // Of each lane of the net, by its place, that of its edge.
+    std::vector<std::int32_t> lane_edges_;
+    bool reads_positions_ = false;
+    // Times that a person has boarded a vehicle.
+    std::uint64_t rides_ = 0;
+    // Containers on each vehicle that has some, and the times that one was loaded.
+    std::map<std::string, std::set<std::string>> cargo_;
+    std::uint64_t loads_ = 0;
     // Collider and victim of the contacts that SUMO listed in the last step, and the number of all that began.
     std::set<std::pair<std::string, std::string>> in_contact_;
     std::uint64_t contacts_ = 0;

@@ -16,6 +16,8 @@ use super::error::SumoError;
 
 /// Longest time that SUMO may take to end by itself, once the connection is closed.
 const END_WITHIN: Duration = Duration::from_secs(10);
+/// Longest time that a SUMO that runs already may take to listen: it reads its files first.
+pub(super) const LISTENS_WITHIN: Duration = Duration::from_secs(20);
 /// Time between two looks.
 const LOOK: Duration = Duration::from_millis(20);
 
@@ -27,6 +29,25 @@ pub enum Engine {
     InProcess,
     /// A process of its own, over TraCI.
     Traci(TraciServer),
+    /// A SUMO that runs already, over TraCI.
+    Attached(RunningServer),
+}
+
+/// A SUMO that the user has started.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RunningServer {
+    /// Its host.
+    pub host: String,
+    /// The port that it listens on.
+    pub port: u16,
+    /// Place of this process among its clients.
+    pub order: u32,
+}
+
+impl std::fmt::Display for RunningServer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}:{}", self.host, self.port)
+    }
 }
 
 /// A SUMO that listens for TraCI clients.

@@ -98,6 +98,14 @@ pub enum SumoError {
         #[source]
         source: std::io::Error,
     },
+    /// There is no SUMO to attach to, or it is another simulation than the run's (`traffic.traci_host`).
+    #[error("the run cannot attach to SUMO at {address}: {reason}")]
+    Unattachable {
+        /// Host and port.
+        address: String,
+        /// Why.
+        reason: String,
+    },
     /// The output directory cannot be made.
     #[error("cannot create {path}")]
     Output {
@@ -124,7 +132,8 @@ impl SumoError {
             | Self::Refused { .. }
             | Self::Step { .. }
             | Self::NoRoads { .. }
-            | Self::HeroRoute { .. } => FailureKind::Config,
+            | Self::HeroRoute { .. }
+            | Self::Unattachable { .. } => FailureKind::Config,
         }
     }
 
@@ -144,6 +153,9 @@ impl SumoError {
             Self::HeroRoute { .. } => "name edges that cars may use, each leading to the next (`netedit` shows them)",
             Self::Server { .. } => {
                 "set traffic.engine to \"libsumo\" or \"traci\", or install the libraries that sumo-gui needs"
+            }
+            Self::Unattachable { .. } => {
+                "start it first, on the same .sumocfg: `sumo -c FILE --remote-port PORT --num-clients N` (docs/traci.md)"
             }
             Self::Output { .. } => "check free space and permissions of the run directory",
             Self::AlreadyRunning | Self::Call { .. } => {

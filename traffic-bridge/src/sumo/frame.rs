@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use ipc_schema::traffic::{
-    Kind, MetaEvent, SIGNAL_LINKS, SignalMeta, TrafficState, VehicleMeta, id_hash, id_text_bytes,
+use ipc_schema::{
+    lane_position::{LanePosition, NO_INDEX},
+    traffic::{Kind, MetaEvent, SIGNAL_LINKS, SignalMeta, TrafficState, VehicleMeta, id_hash, id_text_bytes},
 };
 
 use super::{
@@ -21,6 +22,9 @@ pub struct TrafficFrame {
     pub states: Vec<TrafficState>,
     /// Where each of `states` is on its lane, if lanes are read ([`super::Sumo::read_lanes`]); otherwise empty.
     pub places: Vec<VehiclePlace>,
+    /// The road users in SUMO's terms and the persons in vehicles, by ascending dense index, if they are read
+    /// ([`super::Sumo::read_positions`]); otherwise empty.
+    pub positions: Vec<LanePosition>,
     /// Arrivals, departures and teleports of this step.
     pub events: Vec<VehicleMeta>,
     /// Ids of the road users that departed in this step, in the order of `events`.
@@ -46,6 +50,9 @@ pub(crate) struct RoadUserRegister {
     lengths_m: Vec<f64>,
     /// Fill [`TrafficFrame::places`].
     pub(crate) reads_lanes: bool,
+    /// Fill [`TrafficFrame::positions`].
+    pub(crate) reads_positions: bool,
+    id_hashes: Vec<u64>,
     /// Connected vehicles that have departed and not arrived.
     cavs: u32,
     types: BTreeMap<String, u32>,
@@ -59,6 +66,8 @@ impl RoadUserRegister {
             kinds: Vec::new(),
             lengths_m: Vec::new(),
             reads_lanes: false,
+            reads_positions: false,
+            id_hashes: Vec::new(),
             cavs: 0,
             types: BTreeMap::new(),
         }
@@ -73,9 +82,13 @@ impl RoadUserRegister {
         frame.events.extend(events.iter().map(|event| self.meta(event)));
         frame.states.clear();
         frame.places.clear();
+        frame.positions.clear();
         frame.cavs = 0;
         for raw in states {
             let kind = self.kind(raw.index);
+            if self.reads_positions {
+                frame.positions.extend(self.position(raw));
+            }
             if let Some(state) = convention::traffic_state(raw, kind, step_s, self.world_origin_m) {
                 frame.cavs += u32::from(matches!(kind, Kind::Cav | Kind::Hero));
                 frame.states.push(state);
@@ -88,6 +101,35 @@ impl RoadUserRegister {
 
     fn kind(&self, index: u32) -> Kind {
         self.kinds.get(index as usize).copied().unwrap_or(Kind::Other)
+    }
+
+    /// The road user in SUMO's terms; `None` if it is neither on the road nor in a vehicle.
+    fn position(&self, raw: &RawState) -> Option<LanePosition> {
+        let index = |place: i32| u32::try_from(place).unwrap_or(NO_INDEX);
+        let carrier = index(raw.carrier);
+        let nowhere = LanePosition {
+            id_hash: self.id_hashes.get(raw.index as usize).copied().unwrap_or(0),
+            lane_position_m: f64::NAN,
+            odometer_m: f64::NAN,
+            vehicle: raw.index,
+            lane: NO_INDEX,
+            edge: NO_INDEX,
+            route_edge: NO_INDEX,
+            carrier,
+            reserved: 0,
+        };
+        if !convention::is_on_road(raw) {
+            return (carrier != NO_INDEX).then_some(nowhere);
+        }
+        let edge = index(raw.edge);
+        Some(LanePosition {
+            lane_position_m: if edge == NO_INDEX { f64::NAN } else { raw.lane_position },
+            odometer_m: convention::valid(raw.odometer).unwrap_or(f64::NAN),
+            lane: index(raw.lane),
+            edge,
+            route_edge: index(raw.route_index),
+            ..nowhere
+        })
     }
 
     fn place(&self, raw: &RawState) -> VehiclePlace {
@@ -140,6 +182,9 @@ impl RoadUserRegister {
             reserved: 0,
         };
         meta.set_id(&event.id);
+        if departed {
+            self.id_hashes.push(meta.id_hash);
+        }
         meta
     }
 

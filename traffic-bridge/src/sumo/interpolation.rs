@@ -4,7 +4,10 @@
 //! the lanes instead, evenly, as SUMO means it: the speed at the end of a step holds for the whole step. What its positions are beside the
 //! centre lines (sublanes) is kept. A change of lanes on a road stays a jump from one frame to the next; at a junction it is driven evenly.
 
-use ipc_schema::traffic::{DISCONTINUOUS, Kind, TrafficState};
+use ipc_schema::{
+    lane_position::{LanePosition, NO_INDEX},
+    traffic::{DISCONTINUOUS, Kind, TrafficState},
+};
 
 use super::{
     convention::single,
@@ -70,6 +73,8 @@ pub struct StepInterpolation {
     frames: u64,
     step_s: f64,
     before: Vec<PlacedState>,
+    /// [`TrafficFrame::positions`] of the step before and of this one.
+    positions: [Vec<LanePosition>; 2],
     moving: Vec<MovingState>,
 }
 
@@ -82,6 +87,7 @@ impl StepInterpolation {
             frames,
             step_s,
             before: Vec::new(),
+            positions: [Vec::new(), Vec::new()],
             moving: Vec::new(),
         }
     }
@@ -117,6 +123,8 @@ impl StepInterpolation {
         let placed = frame.states.iter().zip(&frame.places);
         self.before
             .extend(placed.map(|(&state, &place)| PlacedState { state, place }));
+        self.positions.swap(0, 1);
+        self.positions[1].clone_from(&frame.positions);
     }
 
     /// Fills `frame` with the road users of frame number `number` of the step, counted from 1. The last frame is SUMO's own.
@@ -125,6 +133,7 @@ impl StepInterpolation {
         frame.signals.clear();
         frame.states.clear();
         frame.places.clear();
+        frame.positions.clear();
         frame.cavs = 0;
         let share = number as f64 / self.frames as f64;
         for moving in &self.moving {
@@ -132,6 +141,57 @@ impl StepInterpolation {
                 frame.cavs += u32::from(state.kind == Kind::Cav as u32 || state.kind == Kind::Hero as u32);
                 frame.states.push(state);
             }
+        }
+        self.fill_positions(share, &mut frame.positions);
+    }
+
+    /// The road users in SUMO's terms after a share of the step.
+    fn fill_positions(&self, share: f64, positions: &mut Vec<LanePosition>) {
+        let [before, now] = &self.positions;
+        // All are in ascending order of the index.
+        let (mut moving, mut now) = (self.moving.iter().peekable(), now.iter().peekable());
+        for from in before {
+            while moving.next_if(|moving| moving.from.vehicle < from.vehicle).is_some() {}
+            while now.next_if(|now| now.vehicle < from.vehicle).is_some() {}
+            let to = now.next_if(|now| now.vehicle == from.vehicle);
+            match moving.next_if(|moving| moving.from.vehicle == from.vehicle) {
+                Some(moving) => positions.push(self.position(moving, from, to, share)),
+                // It rides in a vehicle.
+                None if from.carrier != NO_INDEX => positions.push(*from),
+                None => {}
+            }
+        }
+    }
+
+    /// A road user in SUMO's terms after a share of the step: on its way, or as in the nearer step.
+    fn position(
+        &self,
+        moving: &MovingState,
+        from: &LanePosition,
+        to: Option<&LanePosition>,
+        share: f64,
+    ) -> LanePosition {
+        let (way, driven_m) = match &moving.motion {
+            StepMotion::Lanes { way, .. } => (way, share * way.length_m()),
+            StepMotion::RollOut { way } => (way, f64::from(moving.from.speed_mps) * share * self.step_s),
+            StepMotion::Straight { .. } | StepMotion::Coast => {
+                return *to.filter(|_| share >= 0.5).unwrap_or(from);
+            }
+        };
+        let Some(on_way) = self.lanes.place(way, driven_m) else {
+            return *from;
+        };
+        let odometer_m = match to {
+            Some(to) => from.odometer_m + share * (to.odometer_m - from.odometer_m),
+            None => from.odometer_m + driven_m,
+        };
+        LanePosition {
+            lane_position_m: on_way.place.position_m,
+            odometer_m,
+            lane: on_way.place.lane,
+            edge: self.lanes.edge(on_way.place.lane),
+            route_edge: from.route_edge.saturating_add(on_way.entered_edges),
+            ..*from
         }
     }
 

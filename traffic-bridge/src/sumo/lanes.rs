@@ -1,5 +1,7 @@
 //! The lanes of a net as a graph: the way that a vehicle took between two of SUMO's steps.
 
+use serde::Serialize;
+
 use super::libsumo::ffi::RawNetLane;
 
 /// Most lanes on the way of one step: junctions of short lanes have a few each.
@@ -80,7 +82,10 @@ impl CentreLine {
 
 #[derive(Debug, Clone, PartialEq)]
 struct Lane {
+    id: String,
     edge: u32,
+    /// On a junction: its edge is in no route.
+    is_internal: bool,
     /// What positions refer to; the centre line may be longer or shorter.
     length_m: f64,
     line: CentreLine,
@@ -95,6 +100,34 @@ impl Lane {
             false => 0.0,
         }
     }
+
+    /// The position on the lane of a distance along the centre line: the inverse of [`Lane::station_m`].
+    fn position_m(&self, station_m: f64) -> f64 {
+        match self.line.length_m() > 0.0 {
+            true => station_m * self.length_m / self.line.length_m(),
+            false => 0.0,
+        }
+    }
+}
+
+/// A place on a way.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WayPlace {
+    /// The lane and the position on it.
+    pub place: LanePlace,
+    /// Edges of the vehicle's route that it has entered since the beginning of the way.
+    pub entered_edges: u32,
+}
+
+/// Ids of a net's lanes and edges by their indices.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LaneIds {
+    /// Of each lane, by its index: its id.
+    pub lanes: Vec<String>,
+    /// Of each lane, by its index: the index of its edge.
+    pub edge_of_lane: Vec<u32>,
+    /// Of each edge, by its index: its id.
+    pub edges: Vec<String>,
 }
 
 /// A change of lanes within a step, which SUMO makes at once.
@@ -146,6 +179,7 @@ pub struct LaneGraph {
     lanes: Vec<Lane>,
     /// Lanes of each edge.
     edges: Vec<Vec<u32>>,
+    edge_ids: Vec<String>,
 }
 
 impl LaneGraph {
@@ -155,9 +189,13 @@ impl LaneGraph {
             let edge = lane.edge as usize;
             if graph.edges.len() <= edge {
                 graph.edges.resize(edge + 1, Vec::new());
+                graph.edge_ids.resize(edge + 1, String::new());
             }
             graph.edges[edge].push(place);
+            graph.edge_ids[edge].clone_from(&lane.edge_id);
             graph.lanes.push(Lane {
+                is_internal: lane.id.starts_with(':'),
+                id: lane.id,
                 edge: lane.edge,
                 length_m: lane.length,
                 line: CentreLine::new(&lane.shape),
@@ -251,6 +289,47 @@ impl LaneGraph {
         point
     }
 
+    /// The place at a distance from the beginning of a way; `None` if the way has no lane.
+    #[must_use]
+    pub fn place(&self, way: &LaneWay, travelled_m: f64) -> Option<WayPlace> {
+        let mut station_m = way.start_m + travelled_m;
+        let mut entered_edges = 0;
+        let mut found = None;
+        for (number, &lane) in way.lanes.iter().enumerate() {
+            let Lane { is_internal, line, .. } = &self.lanes[lane as usize];
+            entered_edges += u32::from(number > 0 && !is_internal);
+            found = Some(WayPlace {
+                place: LanePlace {
+                    lane,
+                    position_m: self.lanes[lane as usize].position_m(station_m),
+                },
+                entered_edges,
+            });
+            if station_m < line.length_m() {
+                break;
+            }
+            station_m -= line.length_m();
+        }
+        // Behind the last lane the way has ended.
+        found
+    }
+
+    /// Index of a lane's edge.
+    #[must_use]
+    pub fn edge(&self, lane: u32) -> u32 {
+        self.lanes[lane as usize].edge
+    }
+
+    /// Ids of all lanes and edges.
+    #[must_use]
+    pub fn ids(&self) -> LaneIds {
+        LaneIds {
+            lanes: self.lanes.iter().map(|lane| lane.id.clone()).collect(),
+            edge_of_lane: self.lanes.iter().map(|lane| lane.edge).collect(),
+            edges: self.edge_ids.clone(),
+        }
+    }
+
     /// The rest of a lane behind a place, metres along the centre line.
     #[must_use]
     pub fn rest_m(&self, place: LanePlace) -> f64 {
@@ -280,6 +359,8 @@ mod tests {
 
     fn lane(edge: u32, length: f64, shape: &[[f64; 2]], next: &[u32]) -> RawNetLane {
         RawNetLane {
+            id: format!("lane {edge}"),
+            edge_id: format!("edge {edge}"),
             edge,
             length,
             shape: shape.iter().flat_map(|[x, y]| [*x, *y, 1.0]).collect(),

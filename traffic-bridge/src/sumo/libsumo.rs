@@ -33,11 +33,21 @@ pub mod ffi {
         lane: i32,
         /// Position of the front bumper on that lane, metres of the lane's own length.
         lane_position: f64,
+        /// Place of its edge among the edges of `Simulation::net_lanes`; negative as `lane`. Persons have it if positions are read.
+        edge: i32,
+        /// Place of its edge in its route; negative if positions are not read, for persons and off the road.
+        route_index: i32,
+        /// Metres since departure, if positions are read; SUMO's "invalid" value for persons.
+        odometer: f64,
+        /// Index of the vehicle in which a person rides; negative afoot.
+        carrier: i32,
     }
 
     /// A lane of the net, junctions included.
     #[derive(Debug, Clone, PartialEq)]
     struct RawNetLane {
+        id: String,
+        edge_id: String,
         /// Number of its edge; lanes of one edge lie beside each other.
         edge: u32,
         /// The lane's own length, which positions refer to, metres.
@@ -146,9 +156,9 @@ pub mod ffi {
         /// Sets an environment variable of this process, as SUMO and PROJ read it.
         fn set_environment(name: &str, value: &str);
 
-        /// Starts libsumo with `arguments`, or connects to the SUMO that listens on `port` as the first of `clients` clients: then it
-        /// returns when all of them are there.
-        fn start(self: Pin<&mut Simulation>, arguments: &[String], port: u16, clients: u32) -> Result<()>;
+        /// Starts libsumo with `arguments`, or connects to the SUMO that listens on `port` of `host`, as number `order` of its clients
+        /// (0: the only one): then it returns when all of them are there.
+        fn start(self: Pin<&mut Simulation>, arguments: &[String], host: &str, port: u16, order: u32) -> Result<()>;
         /// Ends the simulation; its output files are complete afterwards.
         fn close(self: Pin<&mut Simulation>) -> Result<()>;
         /// One simulation step and one pass of getters over all road users.
@@ -174,10 +184,18 @@ pub mod ffi {
         fn time(self: &Simulation) -> Result<f64>;
         fn end_time(self: &Simulation) -> Result<f64>;
         fn step_length(self: &Simulation) -> Result<f64>;
+        /// x_min, y_min, x_max, y_max of the net, metres.
+        fn net_boundary(self: &Simulation) -> Result<Vec<f64>>;
         fn min_expected(self: &Simulation) -> Result<i32>;
 
         /// All lanes of the net. From now on each step reads on which lane a vehicle is.
         fn net_lanes(self: Pin<&mut Simulation>) -> Result<Vec<RawNetLane>>;
+        /// From now on each step also reads positions on routes, and the lanes of persons. Call `net_lanes` before.
+        fn read_positions(self: Pin<&mut Simulation>);
+        /// Times that a person has boarded a vehicle since the start.
+        fn rides(self: &Simulation) -> u64;
+        /// Times that a container has been loaded onto a vehicle since the start.
+        fn loads(self: &Simulation) -> u64;
 
         fn vehicle_class(self: &Simulation, vehicle_type: &str) -> Result<String>;
         fn edges(self: &Simulation, vehicle_class: &str) -> Result<Vec<RawEdge>>;

@@ -16,11 +16,12 @@ use std::{
     path::Path,
     pin::Pin,
     sync::atomic::{AtomicBool, Ordering},
+    time::Instant,
 };
 
 use cxx::UniquePtr;
 
-use engine::{Engine, ServerProcess};
+use engine::{Engine, LISTENS_WITHIN, RunningServer, ServerProcess};
 use error::SumoError;
 use frame::{RoadUserRegister, TrafficFrame, signal_meta};
 use inputs::InputFiles;
@@ -34,6 +35,13 @@ static TAKEN: AtomicBool = AtomicBool::new(false);
 
 /// The text of libsumo's exception when the reason went to standard error.
 const SAYS_NOTHING: &str = "Process Error";
+
+/// Difference of two steps that are the same, seconds.
+const TIME_TOLERANCE_S: f64 = 1e-6;
+/// The box of a run's net is larger than the net by this on each side, metres.
+const NET_MARGIN_M: f64 = 20.0;
+/// Difference of the corners of two nets that are the same, metres.
+const NET_TOLERANCE_M: f64 = 0.5;
 
 /// Holds libsumo for one [`Sumo`].
 #[derive(Debug)]
@@ -114,7 +122,7 @@ impl Sumo {
         set_environment(&options.sumo_home);
         let simulation = match &options.engine {
             Engine::InProcess => ffi::new_simulation(),
-            Engine::Traci(_) => ffi::new_remote_simulation(),
+            Engine::Traci(_) | Engine::Attached(_) => ffi::new_remote_simulation(),
         };
         Self::begin(simulation, claim, options)
     }
@@ -124,6 +132,12 @@ impl Sumo {
     /// # Errors
     /// SUMO refuses its input; SUMO is not running afterwards.
     pub fn reload(mut self, options: SumoOptions) -> Result<Self, SumoError> {
+        if let Engine::Attached(running) = &options.engine {
+            return Err(SumoError::Unattachable {
+                address: running.to_string(),
+                reason: "it cannot begin again".to_owned(),
+            });
+        }
         called("end the simulation", self.simulation.pin_mut().close())?;
         drop(self.server.take());
         Self::begin(self.simulation, self.claim, options)
@@ -209,6 +223,19 @@ impl Sumo {
         Ok(LaneGraph::new(lanes))
     }
 
+    /// From now on frames say where road users are in SUMO's terms ([`TrafficFrame::positions`]). Call [`Sumo::read_lanes`] before, whose
+    /// indices they use.
+    pub fn read_positions(&mut self) {
+        self.simulation.pin_mut().read_positions();
+        self.register.reads_positions = true;
+    }
+
+    /// SUMO's time at the start of the episode, seconds.
+    #[must_use]
+    pub fn begin_s(&self) -> f64 {
+        self.begin_s
+    }
+
     /// Simulated time since the start of the episode, seconds.
     ///
     /// # Errors
@@ -227,6 +254,18 @@ impl Sumo {
     #[must_use]
     pub fn contacts(&self) -> u64 {
         self.simulation.contacts()
+    }
+
+    /// Times that a person has boarded a vehicle since the start of the episode.
+    #[must_use]
+    pub fn rides(&self) -> u64 {
+        self.simulation.rides()
+    }
+
+    /// Times that a container has been loaded onto a vehicle since the start of the episode.
+    #[must_use]
+    pub fn container_loads(&self) -> u64 {
+        self.simulation.loads()
     }
 
     /// Length of a step, seconds.
@@ -299,25 +338,84 @@ fn connect(
     simulation: &mut UniquePtr<ffi::Simulation>,
     options: &SumoOptions,
 ) -> Result<Option<ServerProcess>, StartFailure> {
-    let Engine::Traci(server) = &options.engine else {
-        return match simulation.pin_mut().start(&options.arguments, 0, 1) {
-            Ok(()) => Ok(None),
-            Err(error) => {
-                let messages = simulation.pin_mut().take_messages();
-                Err(StartFailure::Refused(reason(&error, &messages)))
-            }
-        };
+    let server = match &options.engine {
+        Engine::InProcess => {
+            return match simulation.pin_mut().start(&options.arguments, "", 0, 0) {
+                Ok(()) => Ok(None),
+                Err(error) => {
+                    let messages = simulation.pin_mut().take_messages();
+                    Err(StartFailure::Refused(reason(&error, &messages)))
+                }
+            };
+        }
+        Engine::Attached(running) => {
+            return attach(simulation, running, options).map(|()| None).map_err(|reason| {
+                StartFailure::NoServer(SumoError::Unattachable {
+                    address: running.to_string(),
+                    reason,
+                })
+            });
+        }
+        Engine::Traci(server) => server,
     };
+    let order = u32::from(server.clients > 1);
     let mut process =
         ServerProcess::start(server, &options.arguments, &options.sumo_home).map_err(StartFailure::NoServer)?;
     // SUMO listens once it has read its files.
-    while let Err(error) = simulation.pin_mut().start(&[], server.port, server.clients) {
+    while let Err(error) = simulation.pin_mut().start(&[], "localhost", server.port, order) {
         if !process.is_alive() {
             return Err(StartFailure::Refused(reason(&error, &process.messages())));
         }
         ServerProcess::wait_a_moment();
     }
     Ok(Some(process))
+}
+
+/// Connects to a SUMO that runs already, and checks that it is the simulation that the run was prepared for.
+fn attach(
+    simulation: &mut UniquePtr<ffi::Simulation>,
+    running: &RunningServer,
+    options: &SumoOptions,
+) -> Result<(), String> {
+    let since = Instant::now();
+    while let Err(error) = simulation
+        .pin_mut()
+        .start(&[], &running.host, running.port, running.order)
+    {
+        if since.elapsed() > LISTENS_WITHIN {
+            return Err(reason(&error, ""));
+        }
+        ServerProcess::wait_a_moment();
+    }
+    let failed = |error: cxx::Exception| reason(&error, "");
+    let step_s = simulation.step_length().map_err(failed)?;
+    if (step_s - options.step_s).abs() > TIME_TOLERANCE_S {
+        return Err(format!(
+            "its step is {step_s} s, and that of the run {} s",
+            options.step_s
+        ));
+    }
+    let corners = simulation.net_boundary().map_err(failed)?;
+    let [x_min, y_min, x_max, y_max] = options.net_bounds_m;
+    let expected = [
+        [x_min + NET_MARGIN_M, y_min + NET_MARGIN_M],
+        [x_max - NET_MARGIN_M, y_max - NET_MARGIN_M],
+    ];
+    let is_same = corners
+        .as_chunks::<2>()
+        .0
+        .iter()
+        .zip(expected)
+        .all(|(corner, expected)| {
+            let [x, y] = convention::world_from_net(*corner, options.world_origin_m);
+            (x - expected[0]).abs() < NET_TOLERANCE_M && (y - expected[1]).abs() < NET_TOLERANCE_M
+        });
+    match is_same {
+        true => Ok(()),
+        false => Err(format!(
+            "its net has the corners {corners:?}, and is not that of the run's .sumocfg"
+        )),
+    }
 }
 
 /// Processor time of this thread, seconds.

@@ -24,6 +24,10 @@ pub struct SumoOptions {
     pub(crate) sumo_home: PathBuf,
     /// The world frame's (0, 0) in the net's coordinates, metres.
     pub(crate) world_origin_m: [f64; 2],
+    /// x_min, y_min, x_max, y_max of the net with a margin, world, metres.
+    pub(crate) net_bounds_m: [f64; 4],
+    /// Length of a step, seconds.
+    pub(crate) step_s: f64,
     /// Where SUMO runs.
     pub(crate) engine: Engine,
 }
@@ -64,6 +68,8 @@ impl SumoOptions {
             rule: ConnectedRule::Population,
             sumo_home: sumo_home.into(),
             world_origin_m: [0.0; 2],
+            net_bounds_m: [0.0; 4],
+            step_s,
             engine: Engine::InProcess,
         })
     }
@@ -119,6 +125,8 @@ impl SumoOptions {
             rule,
             sumo_home: sumo_home.into(),
             world_origin_m: [0.0; 2],
+            net_bounds_m: [0.0; 4],
+            step_s,
             engine: Engine::InProcess,
         })
     }
@@ -161,6 +169,13 @@ impl SumoOptions {
     #[must_use]
     pub fn with_world_origin(mut self, world_origin_m: [f64; 2]) -> Self {
         self.world_origin_m = world_origin_m;
+        self
+    }
+
+    /// The same on a net with these bounds (x_min, y_min, x_max, y_max, with a margin; world, metres).
+    #[must_use]
+    pub fn with_net_bounds(mut self, net_bounds_m: [f64; 4]) -> Self {
+        self.net_bounds_m = net_bounds_m;
         self
     }
 

@@ -4,8 +4,10 @@
 #include <algorithm>
 #include <cstdlib>
 #include <ctime>
+#include <iterator>
 #include <limits>
 #include <set>
+#include <sstream>
 #include <utility>
 
 #include "traffic-bridge/src/sumo/error_tee.h"
@@ -17,8 +19,9 @@ namespace caraware::CARAWARE_ENGINE {
 // Lamps change slowly: those of each vehicle are read this often.
 constexpr double SIGNAL_PERIOD_S = 0.4;
 
-// A road user that is on no lane of the net.
+// A road user that is on no lane of the net, or in no vehicle.
 constexpr std::int32_t NO_LANE = -1;
+constexpr std::int32_t AFOOT = -1;
 
 // A traffic light changes when SUMO has announced it. Another signal program may start in between (WAUT), so each light is also
 // read once in this many steps.
@@ -79,17 +82,18 @@ EngineSimulation::~EngineSimulation() {
     }
 }
 
-void EngineSimulation::start(rust::Slice<const rust::String> arguments, std::uint16_t port, std::uint32_t clients) {
+void EngineSimulation::start(rust::Slice<const rust::String> arguments, rust::Str host, std::uint16_t port, std::uint32_t order) {
 #ifdef CARAWARE_OVER_TRACI
-    // Rust has started SUMO with the arguments, and tries again while SUMO does not listen yet.
+    // SUMO runs already. Rust tries again while it does not listen yet.
     static_cast<void>(arguments);
-    engine::Simulation::init(port, 0, "localhost");
-    if (clients > 1) {
-        engine::Simulation::setOrder(1);
+    engine::Simulation::init(port, 0, text(host));
+    if (order > 0) {
+        engine::Simulation::setOrder(static_cast<int>(order));
     }
 #else
+    static_cast<void>(host);
     static_cast<void>(port);
-    static_cast<void>(clients);
+    static_cast<void>(order);
     std::vector<std::string> command{"sumo"};
     const std::vector<std::string> options = texts(arguments);
     command.insert(command.end(), options.begin(), options.end());
@@ -103,6 +107,12 @@ void EngineSimulation::start(rust::Slice<const rust::String> arguments, std::uin
     reading_order_.clear();
     late_ = 0;
     lane_places_.clear();
+    edge_places_.clear();
+    lane_edges_.clear();
+    reads_positions_ = false;
+    rides_ = 0;
+    cargo_.clear();
+    loads_ = 0;
     next_index_ = 0;
     steps_ = 0;
     contacts_ = 0;
@@ -135,6 +145,7 @@ void EngineSimulation::step() {
     note_departures();
     note_teleports();
     note_contacts();
+    note_loads();
     read_all();
     const double read = processor_seconds();
     read_signals();
@@ -216,6 +227,22 @@ void EngineSimulation::note_contacts() {
     in_contact_.swap(now);
 }
 
+// libsumo has no calls for containers, but a vehicle names those that it carries. They change while it stops.
+void EngineSimulation::note_loads() {
+    for (const std::string& id : engine::Simulation::getStopEndingVehiclesIDList()) {
+        if (vehicle_places_.count(id) == 0 || engine::Vehicle::getParameter(id, "has.container.device") != "true") {
+            continue;
+        }
+        std::istringstream names(engine::Vehicle::getParameter(id, "device.container.IDList"));
+        const std::set<std::string> now{std::istream_iterator<std::string>(names), std::istream_iterator<std::string>()};
+        std::set<std::string>& cargo = cargo_[id];
+        for (const std::string& container : now) {
+            loads_ += cargo.count(container) == 0 ? 1 : 0;
+        }
+        cargo = now;
+    }
+}
+
 void EngineSimulation::note_teleports() {
     for (const std::string& id : engine::Simulation::getStartingTeleportIDList()) {
         if (const auto place = vehicle_places_.find(id); place != vehicle_places_.end()) {
@@ -247,7 +274,7 @@ void EngineSimulation::depart(const std::string& id, bool is_person) {
     reading_order_.push_back(live_.size());
     ++late_;
     live_.push_back(Live{id, is_person, false});
-    states_.push_back(RawState{invalid, invalid, 0.0, 0.0, 0.0, invalid, invalid, 0, next_index_, NO_LANE, 0.0});
+    states_.push_back(RawState{invalid, invalid, 0.0, 0.0, 0.0, invalid, invalid, 0, next_index_, NO_LANE, 0.0, NO_LANE, NO_LANE, invalid, AFOOT});
     events_.push_back(std::move(departure));
     ++next_index_;
 }
@@ -258,6 +285,9 @@ void EngineSimulation::arrive(std::size_t place) {
         road_user.gone = true;
         any_gone_ = true;
         events_.push_back(event(RawEventKind::Arrived, states_[place].index, road_user.is_person, road_user.id));
+        if (!road_user.is_person) {
+            cargo_.erase(road_user.id);
+        }
     }
 }
 
@@ -281,14 +311,25 @@ void EngineSimulation::read_vehicle(const std::string& id, RawState& state) cons
         state.lane = lane == lane_places_.end() ? NO_LANE : lane->second;
         state.lane_position = engine::Vehicle::getLanePosition(id);
     }
+    if (reads_positions_) {
+        state.edge = state.lane == NO_LANE ? NO_LANE : lane_edges_[static_cast<std::size_t>(state.lane)];
+        state.route_index = engine::Vehicle::getRouteIndex(id);
+        state.odometer = engine::Vehicle::getDistance(id);
+    }
     if ((steps_ + state.index) % signal_period_steps_ == 0) {
         state.signals = engine::Vehicle::getSignals(id);
     }
 }
 
-void EngineSimulation::read_person(const std::string& id, RawState& state) const {
+void EngineSimulation::read_person(const std::string& id, RawState& state) {
     // A person in a vehicle is not a road user.
-    const bool afoot = engine::Person::getVehicle(id).empty();
+    const std::string carrier = engine::Person::getVehicle(id);
+    const bool afoot = carrier.empty();
+    if (!afoot && state.carrier == AFOOT) {
+        ++rides_;
+    }
+    const auto place = afoot ? vehicle_places_.end() : vehicle_places_.find(carrier);
+    state.carrier = place == vehicle_places_.end() ? AFOOT : static_cast<std::int32_t>(states_[place->second].index);
     const libsumo::TraCIPosition position = afoot ? engine::Person::getPosition3D(id) : libsumo::TraCIPosition();
     state.previous_speed = state.speed;
     state.x = position.x;
@@ -297,6 +338,13 @@ void EngineSimulation::read_person(const std::string& id, RawState& state) const
     if (position.x == libsumo::INVALID_DOUBLE_VALUE) {
         state.speed = libsumo::INVALID_DOUBLE_VALUE;
         return;
+    }
+    if (reads_positions_) {
+        const auto lane = lane_places_.find(engine::Person::getLaneID(id));
+        const auto edge = edge_places_.find(engine::Person::getRoadID(id));
+        state.lane = lane == lane_places_.end() ? NO_LANE : lane->second;
+        state.edge = edge == edge_places_.end() ? NO_LANE : edge->second;
+        state.lane_position = engine::Person::getLanePosition(id);
     }
     state.angle = engine::Person::getAngle(id);
     state.speed = engine::Person::getSpeed(id);
@@ -363,8 +411,9 @@ void EngineSimulation::forget_gone() {
 }
 
 rust::Vec<RawNetLane> EngineSimulation::net_lanes() {
-    const std::vector<std::string> ids = engine::Lane::getIDList();
-    std::unordered_map<std::string, std::uint32_t> edges;
+    std::vector<std::string> ids = engine::Lane::getIDList();
+    // The same indices for the same net, whatever the order in which SUMO keeps its lanes.
+    std::sort(ids.begin(), ids.end());
     for (std::size_t place = 0; place < ids.size(); ++place) {
         lane_places_.emplace(ids[place], static_cast<std::int32_t>(place));
     }
@@ -372,7 +421,12 @@ rust::Vec<RawNetLane> EngineSimulation::net_lanes() {
     lanes.reserve(ids.size());
     for (const std::string& id : ids) {
         RawNetLane lane;
-        lane.edge = edges.emplace(engine::Lane::getEdgeID(id), static_cast<std::uint32_t>(edges.size())).first->second;
+        const std::string edge = engine::Lane::getEdgeID(id);
+        const std::int32_t edge_place = edge_places_.emplace(edge, static_cast<std::int32_t>(edge_places_.size())).first->second;
+        lane_edges_.push_back(edge_place);
+        lane.id = rust::String::lossy(id);
+        lane.edge_id = rust::String::lossy(edge);
+        lane.edge = static_cast<std::uint32_t>(edge_place);
         lane.length = engine::Lane::getLength(id);
         for (const libsumo::TraCIPosition& point : engine::Lane::getShape(id).value) {
             lane.shape.push_back(point.x);
@@ -389,6 +443,12 @@ rust::Vec<RawNetLane> EngineSimulation::net_lanes() {
     }
     return lanes;
 }
+
+void EngineSimulation::read_positions() { reads_positions_ = true; }
+
+std::uint64_t EngineSimulation::rides() const { return rides_; }
+
+std::uint64_t EngineSimulation::loads() const { return loads_; }
 
 rust::Slice<const RawState> EngineSimulation::states() const { return {states_.data(), states_.size()}; }
 
@@ -411,6 +471,15 @@ double EngineSimulation::time() const { return engine::Simulation::getTime(); }
 double EngineSimulation::end_time() const { return engine::Simulation::getEndTime(); }
 
 double EngineSimulation::step_length() const { return engine::Simulation::getDeltaT(); }
+
+rust::Vec<double> EngineSimulation::net_boundary() const {
+    rust::Vec<double> corners;
+    for (const libsumo::TraCIPosition& corner : engine::Simulation::getNetBoundary().value) {
+        corners.push_back(corner.x);
+        corners.push_back(corner.y);
+    }
+    return corners;
+}
 
 std::int32_t EngineSimulation::min_expected() const { return engine::Simulation::getMinExpectedNumber(); }
 

@@ -29,8 +29,8 @@ public:
     Simulation(const Simulation&) = delete;
     Simulation& operator=(const Simulation&) = delete;
 
-    // libsumo takes SUMO's options; libtraci connects to this port, as the first of so many clients.
-    virtual void start(rust::Slice<const rust::String> arguments, std::uint16_t port, std::uint32_t clients) = 0;
+    // libsumo takes SUMO's options; libtraci connects to this host and port, as this client in the order (0: the only one).
+    virtual void start(rust::Slice<const rust::String> arguments, rust::Str host, std::uint16_t port, std::uint32_t order) = 0;
     virtual void close() = 0;
     virtual void step() = 0;
     virtual rust::Slice<const RawState> states() const = 0;
@@ -45,9 +45,13 @@ public:
     virtual double time() const = 0;
     virtual double end_time() const = 0;
     virtual double step_length() const = 0;
+    virtual rust::Vec<double> net_boundary() const = 0;
     virtual std::int32_t min_expected() const = 0;
 
     virtual rust::Vec<RawNetLane> net_lanes() = 0;
+    virtual void read_positions() = 0;
+    virtual std::uint64_t rides() const = 0;
+    virtual std::uint64_t loads() const = 0;
 
     virtual rust::String vehicle_class(rust::Str vehicle_type) const = 0;
     virtual rust::Vec<RawEdge> edges(rust::Str vehicle_class) const = 0;

@@ -125,6 +125,12 @@ class Attachment:
         The first call subscribes and gives none. Raises RuntimeError.
         """
 
+    def lane_positions(self) -> list[SightMessage]:
+        """Messages of `lane-position` since the last call, oldest first; the newest if there were more than fit.
+
+        The first call subscribes and gives none. Raises RuntimeError.
+        """
+
     def scans(self) -> list[PointCloud]:
         """LIDAR scans since the last call, oldest first; the newest of them if there were more than fit.
 

@@ -19,6 +19,7 @@ from caraware import _native
 from caraware.ipc.arrays import BoolArray, Float32Array, Float64Array, FloatArray, Scalar, UInt32Array, UInt64Array
 from caraware.ipc.commits import CommitLog, CommittedPosition, EpisodeStarts
 from caraware.ipc.image import Image
+from caraware.ipc.lane_positions import LanePositions
 from caraware.ipc.pointcloud import PointCloud
 from caraware.ipc.radar import RadarDetections
 from caraware.ipc.run_file import RunFile, setting
@@ -411,6 +412,14 @@ class Channel:
         gives none.
         """
         return [RadarDetections.of(scan) for scan in self._attachment.detections()]
+
+    def lane_positions(self) -> list[LanePositions]:
+        """SUMO's lanes, edges and route positions since the last call, oldest first (`traffic.lane_positions`).
+
+        The first call subscribes and gives none. Call it after each `receive`: every tick from then on comes once, with
+        the number of its observation, except ticks that a restarted trainer receives again.
+        """
+        return [LanePositions.of(message) for message in self._attachment.lane_positions()]
 
     def consumed(self, tick: int) -> None:
         """Gives the simulation credit for all ticks up to and including `tick`."""

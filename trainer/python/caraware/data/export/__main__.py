@@ -27,8 +27,9 @@ def export(recording_path: Path, format_name: str, directory: Path, jobs: int, s
         recording.headers("world")
     if "traffic-meta" in recording.channels:
         recording.headers("traffic-meta")
-    if "prediction" in recording.channels:
-        recording.headers("prediction")
+    for channel in ("prediction", "lane-position"):
+        if channel in recording.channels:
+            recording.headers(channel)
     directory.mkdir(parents=True, exist_ok=True)
     names = {episode.number: part_name(episode.number, chosen.ending) for episode in episodes}
     due = [number for number, name in names.items() if not (directory / name).exists()]

@@ -10,6 +10,7 @@ import pyarrow as pa
 import torch
 
 from caraware import _native
+from caraware.data.lanes import has_lanes, lane_columns
 from caraware.data.names import RoadUsers
 from caraware.data.recording import Episode, Recording
 from caraware.ipc.arrays import Float32Array
@@ -65,6 +66,8 @@ def table(recording: Recording, episode: Episode, users: RoadUsers) -> pa.Table:
         columns[f"is_{name.lower()}"] = (flags & getattr(_native, name)) != 0
     for name, names in SPLIT.items():
         columns |= {column: part[name][kept, place] for place, column in enumerate(names)}
+    if has_lanes(recording):
+        columns |= lane_columns(recording, columns["tick"], part["vehicle"][kept].astype(np.int64))
     imu = part["imu"][kept]
     columns |= {name: imu[:, -1, place] for place, name in enumerate(IMU)}
     for name, bit in SENSOR_BITS.items():
