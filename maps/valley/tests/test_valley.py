@@ -131,4 +131,4 @@ def test_it_is_simulated_with_trams_and_bicycles_that_sense(built: Path) -> None
     assert departed["tram"] == 2 and departed["bicycle"] > 10 and departed["passenger"] > 30, departed
     assert report["traffic"]["teleports"] == 0
     # Mirrors follow SUMO up the hill and over the bridges without being set onto it.
-    assert report["dynamics"]["resynchronisations"]["total"] == 0, report["dynamics"]
+    assert report["dynamics"]["resynchronisations"] == 0, report["dynamics"]
