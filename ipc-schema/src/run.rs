@@ -520,7 +520,8 @@ impl RunFile {
                 Source::Scenario { .. } => None,
             };
             let seed = self.seed();
-            return Box::new((0..episodes.unwrap_or(u64::MAX)).map(move |index| schedule::play(seed, index, ticks)));
+            let indices = episode.saturating_sub(resets)..episodes.unwrap_or(u64::MAX);
+            return Box::new(indices.map(move |index| schedule::play(seed, index, ticks)));
         }
         Box::new(
             self.episodes()

@@ -91,8 +91,10 @@ pub fn prepare_play(args: &PlayArgs) -> Result<PreparedRun, Exit> {
         }
         None => settings_of_run(&found.run()?, &args.run.with_shorthands()?.set)?,
     };
-    let config = settings.validate()?;
+    let mut config = settings.validate()?;
     found.check_fit(&config)?;
+    // A player shows one environment, however many the policy has learnt in.
+    config.run.envs = 1;
     let label = format!("{}-play", found.label());
     let mut prepared = prepare_new(&args.run, Mode::Play, config, named, &label, install)?;
     prepared.run.beginning = Some(Beginning {

@@ -11,7 +11,7 @@ use ipc_schema::{
     config::StallAction,
     failure::{Failure, FailureKind},
     process::{OnExit, Process, ProcessSpec},
-    run::{Mode, RunFile},
+    run::RunFile,
 };
 use signal_hook::{
     consts::{SIGCHLD, SIGHUP, SIGINT, SIGTERM},
@@ -238,10 +238,9 @@ impl Supervisor {
     }
 
     /// True if the environment of a killed simulator process can be made again: simulation is a function of configuration, seed,
-    /// commands and, in the driving task, logged actions. A run that plays has no ticks that count.
+    /// commands and, in the driving task, logged actions.
     fn may_simulate_again(&self, row: &ProcessSpec) -> bool {
-        let run = self.processes.run();
-        row.is_simulator() && run.mode != Mode::Play && run.replay.is_none()
+        row.is_simulator() && self.processes.run().replay.is_none()
     }
 
     /// Reports processes that hang, and kills those that are to be replaced: their ends are found like all others.

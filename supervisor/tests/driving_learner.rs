@@ -184,21 +184,37 @@ fn killed_learners_stopped_runs_and_handovers_end_as_if_nothing_had_happened() {
     workplace.assert_nothing_left();
 
     // What was learnt is played, on other seeds.
-    workplace.succeed(&[
-        "play",
-        "whole",
-        "--name",
-        "played",
-        "--episodes",
-        "1",
-        "--set",
-        "run.envs=1",
-    ]);
+    workplace.succeed(&["play", "whole", "--name", "played", "--episodes", "4"]);
     let played = workplace.report("played");
     assert!(played["trainer"]["ppo_mean_progress_mps"].is_number(), "{played:#}");
     assert!(
         !played["trainer"]["trips"].as_object().unwrap().is_empty(),
         "{played:#}"
     );
+
+    // The same with simulators that die.
+    let paced = ["--episodes", "4", "--set", "run.real_time_factor=8"];
+    let mut run = start(
+        &workplace,
+        &[&["play", "whole", "--name", "replayed"], paced.as_slice()].concat(),
+        "replayed.log",
+    );
+    let live = workplace.path().join("runs/replayed/live.json");
+    for (episode, word) in [(0, "/sim-core"), (1, "/traffic-bridge"), (2, "/sensor-daemon")] {
+        until(&mut run, "an episode", || {
+            let live: Value = serde_json::from_str(&std::fs::read_to_string(&live).ok()?).ok()?;
+            (live["table"]["episode"].as_u64()? >= episode).then_some(())
+        });
+        let victim = until(&mut run, "a process", || processes(&workplace, "replayed", word).pop());
+        kill_process(victim, Signal::KILL).unwrap();
+    }
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("replayed.log")).unwrap();
+    assert!(status.success(), "{status}\n{said}");
+    assert_eq!(said.matches("the simulation is made again").count(), 3, "{said}");
+    let again = workplace.report("replayed");
+    assert_eq!(again["observation_hash"], played["observation_hash"]);
+    assert_eq!(again["trainer"]["trips"], played["trainer"]["trips"]);
+    assert_eq!(again["trainer"]["episodes"], played["trainer"]["episodes"]);
     workplace.assert_nothing_left();
 }

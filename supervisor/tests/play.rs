@@ -11,7 +11,7 @@ mod common;
 use std::process::{Output, Stdio};
 
 use common::{Spectator, Workplace, caught, text, until};
-use ipc_schema::services::Channel;
+use ipc_schema::{process::Process, services::Channel};
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -140,4 +140,70 @@ fn a_checkpoint_plays_until_it_is_stopped_and_learns_nothing() {
     for words in ["RUN|CHECKPOINT", "--episodes", "Kalman", "Examples"] {
         assert!(help.contains(words), "{help}");
     }
+}
+
+/// Simulators of a playing run die at moments of which none is between two episodes.
+#[test]
+fn simulators_that_die_change_nothing_that_a_player_counts() {
+    let workplace = Workplace::new();
+    train(&workplace);
+    workplace.succeed(&["play", "learnt", "--episodes", "4", "--name", "whole"]);
+    let log = std::fs::File::create(workplace.path().join("said")).unwrap();
+    let paced = ["--episodes", "4", "--set", "run.real_time_factor=5"];
+    let mut run = workplace
+        .command(&[&["play", "learnt", "--name", "killed"], paced.as_slice()].concat())
+        .stdout(Stdio::null())
+        .stderr(log)
+        .spawn()
+        .unwrap();
+    let spectator = Spectator::join(&workplace.path().join("runs/killed/run.json"), &mut run);
+    for (ticks, process) in [
+        (40, Process::SimCore),
+        (180, Process::TrafficBridge),
+        (300, Process::SensorDaemon),
+        (420, Process::SimCore),
+    ] {
+        let (player, victim) = (spectator.board(Process::Trainer), spectator.board(process));
+        until(&mut run, "ticks", || {
+            (player.progress().consumed_ticks >= ticks).then_some(())
+        });
+        let pid = until(&mut run, "a process", || Pid::from_raw(victim.health().pid));
+        kill_process(pid, Signal::KILL).unwrap();
+    }
+    drop(spectator);
+    let status = run.wait().unwrap();
+    let said = std::fs::read_to_string(workplace.path().join("said")).unwrap();
+    assert!(status.success(), "{status}\n{said}");
+    assert_eq!(
+        said.matches("the simulation is made again from tick").count(),
+        4,
+        "{said}"
+    );
+    let [whole, killed] = ["whole", "killed"].map(|name| workplace.report(name));
+    for key in [
+        "result",
+        "observation_hash",
+        "ticks",
+        "vehicle_steps",
+        "evaluation_seeds",
+    ] {
+        assert_eq!(whole[key], killed[key], "{key}");
+    }
+    for key in ["ekf_mean_error_m", "raw_gnss_mean_error_m", "vehicles"] {
+        assert!(!whole["trainer"][key].is_null(), "{key}");
+        assert_eq!(whole["trainer"][key], killed["trainer"][key], "{key}");
+    }
+    // The last bits of a network's answer depend on how many ticks were waiting when it was asked.
+    let policy_m = |report: &Value| {
+        let episodes = report["trainer"]["episodes"].as_array().unwrap().iter();
+        episodes
+            .map(|episode| (episode["ppo"].as_f64().unwrap() * 1e4).round())
+            .collect::<Vec<f64>>()
+    };
+    assert_eq!(policy_m(&whole), policy_m(&killed));
+    assert_eq!(
+        (&killed["lost_ticks"], &killed["duplicated_ticks"]),
+        (&0.into(), &0.into())
+    );
+    workplace.assert_nothing_left();
 }

@@ -255,7 +255,8 @@ class PlayLoop:
         for obs, predicted_m in zip(ticks, self._predictor.predict_m({0: ticks})[0], strict=True):
             self._board.add(obs, predicted_m)
             if self._drives:
-                self._channel.publish_predictions(obs, predicted_m, updates)
+                # Sent again while no tick comes: a simulator that died may have lost them.
+                self._channel.publish_actions(obs, predicted_m.detach().numpy(), updates)
                 self._channel.consumed(obs.tick)
                 continue
             self._channel.publish_predictions(obs, predicted_m, updates, self._board.estimates_m(obs))
