@@ -9,7 +9,7 @@ CARGO_FLAGS := --release --locked
 ARGS ?=
 
 .PHONY: train test build programs programs-and-tests prerequisites browser lint lint-rust lint-python format test-rust test-python \
-	deny bench peers peers-metadrive peers-smarts faces site clean
+	model deny bench peers peers-metadrive peers-smarts faces site clean
 
 train: build ## build everything and learn on the town
 	target/release/caraware train $(ARGS)
@@ -73,6 +73,18 @@ test-python:
 	$(VENV)/bin/python -m pytest -q maps/town/tests
 	$(VENV)/bin/python -m pytest -q maps/valley/tests
 	$(VENV)/bin/python -m pytest -q sim-core/tests
+
+# The tests look at fewer deaths, preemptions and frames. Miri needs a nightly toolchain: rustup toolchain install nightly --component miri,rust-src
+model: prerequisites $(VENV)/.installed ## the models and the parsers for longer than in the tests, the unsafe parts under Miri: about an hour
+	CARAWARE_MODEL_DEATHS=3,3 cargo test $(CARGO_FLAGS) --test protocol_model
+	CARAWARE_LOOM_PREEMPTIONS=4 cargo test $(CARGO_FLAGS) --test boards_under_loom
+	CARAWARE_FUZZ_FRAMES=100000000 cargo test $(CARGO_FLAGS) --test hostile_frames
+	CARAWARE_FUZZ_FRAMES=100000000 cargo test $(CARGO_FLAGS) --test messages
+	cd viewer && CARAWARE_FUZZ_FRAMES=7000000 ../$(VENV)/bin/python -m pytest -q tests/test_hostile_frames.py
+	$(MIRI) -- --skip noise::
+	export MIRIFLAGS="-Zmiri-disable-data-race-detector -Zmiri-many-seeds=0..64"; $(MIRI) --features racing-board -- a_board_that
+
+MIRI = cd sensor-daemon/tests/miri && RUSTFLAGS=-Ctarget-feature=+avx2 CARGO_TARGET_DIR=$(CURDIR)/target/miri cargo +nightly miri test
 
 lint: lint-rust lint-python ## formatting and lints, as errors
 

@@ -169,9 +169,14 @@ impl Mutations {
     }
 }
 
-/// Whatever is read of mutated bytes is a message that is written and read again as the same; nothing panics.
+fn variable(name: &str, default: u64) -> u64 {
+    std::env::var(name).map_or(default, |text| text.parse().unwrap())
+}
+
+/// Whatever is read of mutated bytes is a message that is written and read again as the same; nothing panics. A third of the frames are
+/// whole packets, mutated anywhere. `CARAWARE_FUZZ_FRAMES` and `CARAWARE_FUZZ_SEED` choose more frames, and others.
 #[test]
-fn a_hundred_thousand_mutated_messages_are_refused_or_read_without_a_panic() {
+fn a_million_mutated_messages_and_packets_are_refused_or_read_without_a_panic() {
     let vectors = vectors();
     let of = |kind: &str| {
         vectors[kind]
@@ -181,26 +186,52 @@ fn a_hundred_thousand_mutated_messages_are_refused_or_read_without_a_panic() {
             .map(|vector| bytes(&vector["hex"]))
             .collect::<Vec<_>>()
     };
-    let (cams, cpms) = (of("cam"), of("cpm"));
-    let mut mutations = Mutations(0x9E37_79B9_7F4A_7C15);
-    let (mut read, mut refused) = (0_u32, 0_u32);
-    for round in 0..100_000 {
-        let mut message = match round % 2 {
-            0 => cams[mutations.next(cams.len())].clone(),
-            _ => cpms[mutations.next(cpms.len())].clone(),
-        };
-        mutations.mutate(&mut message);
-        let is_read = match round % 2 {
-            0 => Cam::decode(&message)
+    let messages = [(BtpPort::Cam, of("cam")), (BtpPort::Cpm, of("cpm"))];
+    let frames = variable("CARAWARE_FUZZ_FRAMES", 1_000_000);
+    let seed = variable("CARAWARE_FUZZ_SEED", 1);
+    let mut mutations = Mutations(0x9E37_79B9_7F4A_7C15_u64.wrapping_mul(2 * seed + 1));
+    // Messages and packets that were read, and both that were not.
+    let (mut read, mut unpacked, mut refused) = (0_u64, 0_u64, 0_u64);
+    for _ in 0..frames {
+        let (port, examples) = &messages[mutations.next(2)];
+        let mut message = examples[mutations.next(examples.len())].clone();
+        if mutations.next(3) == 0 {
+            let head = PacketHead {
+                port: *port,
+                station: 7,
+                kind: 5,
+                time_ms: 1,
+                latitude: 525_200_000,
+                longitude: -134_000_000,
+                speed_cmps: -300,
+                heading: 2715,
+            };
+            let mut packet = geonetworking::encode(&head, &message);
+            mutations.mutate(&mut packet);
+            match geonetworking::decode(&packet) {
+                Ok((_, content)) => message = content.to_vec(),
+                Err(_) => {
+                    refused += 1;
+                    continue;
+                }
+            }
+            unpacked += 1;
+        } else {
+            mutations.mutate(&mut message);
+        }
+        let is_read = match port {
+            BtpPort::Cam => Cam::decode(&message)
                 .map(|cam| assert_eq!(Cam::decode(&cam.encode()).unwrap(), cam))
                 .is_ok(),
             _ => Cpm::decode(&message)
                 .map(|cpm| assert_eq!(Cpm::decode(&cpm.encode()).unwrap(), cpm))
                 .is_ok(),
         };
-        let _ = geonetworking::decode(&message);
         *(if is_read { &mut read } else { &mut refused }) += 1;
     }
     // Many mutations only change a value; most break the message.
-    assert!(read > 1000 && refused > 10_000, "{read} read, {refused} refused");
+    assert!(
+        read > frames / 100 && unpacked > frames / 100 && refused > frames / 10,
+        "{read} read, {unpacked} unpacked, {refused} refused"
+    );
 }

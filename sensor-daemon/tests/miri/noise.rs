@@ -1,0 +1,6 @@
+//! The room of the noise generators.
+
+#[path = "../../src/noise/normals.rs"]
+pub mod normals;
+
+pub use normals::philox4x32;
