@@ -1,7 +1,7 @@
 """Our PPO learns to drive: in a world of one lane that listens to actions, with heroes that come and go."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from caraware.run.config import RunConfig
 from caraware.run.loop import TrainingLoop
+from caraware.run.player import DrivingScoreboard, PlayTally
 from caraware.tasks import ends
 from synthetic import SyntheticObservation, run_file
+from synthetic_vehicle import sensor_tables
 from torch import Tensor
 
 HEROES, TICK_S, LANE_M, ROUTE_M, LIMIT_TICKS = 8, 0.1, 2.0, 60.0, 120
@@ -144,8 +146,8 @@ class Lane:
             self.rewards.append(status["reward"])
 
 
-def drive(folder: Path, learning_rate: float) -> tuple[list[float], dict[str, int]]:
-    """The rewards of all updates, and how trips ended in the last third."""
+def lane_run(folder: Path, learning_rate: float) -> dict[str, Any]:
+    """A run file for the lane."""
     run = run_file(
         str(folder),
         network="mlp",
@@ -168,6 +170,12 @@ def drive(folder: Path, learning_rate: float) -> tuple[list[float], dict[str, in
     run["config"]["observation"] = {"fields": list(RANGES), "history": 1, "scale": "minus_one_to_one"}
     run["config"]["run"] |= {"tick_s": TICK_S}
     run["observation_fields"] = [{"name": name, "unit": "", "range": list(ends_)} for name, ends_ in RANGES.items()]
+    return run
+
+
+def drive(folder: Path, learning_rate: float) -> tuple[list[float], dict[str, int]]:
+    """The rewards of all updates, and how trips ended in the last third."""
+    run = lane_run(folder, learning_rate)
     lane = Lane(run, 3200)
     loop = TrainingLoop(lane, RunConfig.from_run(run), lambda: False)
     early: dict[str, int] = {}
@@ -194,3 +202,18 @@ def test_a_learner_learns_to_stay_in_its_lane_and_arrive_and_one_without_steps_d
     assert np.mean(rewards[-4:]) > np.mean(rewards[:4]) + 0.05, rewards
     _, still = drive(tmp_path / "stays", 1e-9)
     assert share(still) < 0.6, f"without steps nothing is learnt: {still}"
+
+
+def test_the_table_of_a_player_is_empty_when_an_episode_begins(tmp_path: Path) -> None:
+    """What a tick leads to is known at the next one: the first tick of an episode shows no vehicle."""
+    run = lane_run(tmp_path, 1e-3)
+    run["config"] = sensor_tables() | run["config"]
+    lane = Lane(run, 10)
+    board = DrivingScoreboard(lane.run, RunConfig.from_run(run), PlayTally())
+    rows = []
+    for episode in (0, 0, 1, 1):
+        (obs,) = lane.receive(0.0)
+        board.add(replace(obs, episode=episode), torch.zeros(HEROES, 2))
+        rows.append(len(board.table()["vehicles"]))
+        lane.publish_actions(obs, np.zeros((HEROES, 2)))
+    assert rows == [0, HEROES, 0, HEROES]

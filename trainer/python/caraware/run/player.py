@@ -187,7 +187,7 @@ class DrivingScoreboard(Scoreboard):
         """Count what the tick before led to."""
         if obs.episode != self.tally.episode or self.tally.tick < 0:
             self.tally.begin_episode(obs.episode)
-            self._of_vehicle = {}
+            self._of_vehicle, self._now = {}, {}
         self.tally.tick, self._sim_time_s = obs.tick, obs.sim_time_ns * 1e-9
         self.tally.vehicles = max(self.tally.vehicles, int(np.count_nonzero(obs.valid)))
         for slot in np.flatnonzero(obs.terminated | obs.truncated):
