@@ -1,6 +1,7 @@
 //! Disturbs runs at random moments, and compares each with an undisturbed run: the same observations, the same parameters, nothing lost.
 
 mod case;
+mod disk;
 mod run;
 mod target;
 
@@ -16,6 +17,7 @@ use serde_json::Value;
 
 use self::{
     case::EnduranceCase,
+    disk::SmallDisk,
     run::{DisturbedRun, EnduranceCounts, EndurancePlace},
 };
 use super::{BenchOptions, BenchReport, MedianSpread, ReportTable, sides::BenchDirectory};
@@ -26,20 +28,27 @@ use super::{BenchOptions, BenchReport, MedianSpread, ReportTable, sides::BenchDi
 /// A program is missing, a file cannot be read, or an undisturbed run fails. What a disturbance breaks is in the report's faults.
 pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
     let directory = BenchDirectory::new("endurance")?;
+    let disk = SmallDisk::mount(directory.path())?;
     let place = EndurancePlace {
         caraware: install::program(&options.bin, "caraware")?,
         watch: install::program(&options.bin, "fanout-watch")?,
         directory: directory.path().to_owned(),
+        has_small_disk: disk.is_some(),
         is_quick: options.quick,
     };
     let mut report = BenchReport::new(
         "endurance",
         "Endurance",
         "Small runs are disturbed at random moments until each has completed: processes are killed (the supervisor too: then the run is \
-         resumed) or stopped for up to 1.5 s, trainers are replaced, viewers come, stop and die. Each is compared with the undisturbed \
-         run of the same seed. `town` has one environment and a step of 0.1 s; `grid` is a generated `.sumocfg` with a step of 1 s and \
-         two environments. Not disturbed: the disk, the memory, the driving task.",
+         resumed) or stopped for up to 1.5 s, trainers are replaced, viewers come, stop and die, the disk is full for up to 1.5 s. Each \
+         is compared with the undisturbed run of the same seed. `town` has one environment, a step of 0.1 s and messages between \
+         vehicles; `grid` is a generated `.sumocfg` with a step of 1 s, two environments and a lossless recording. Not disturbed: the \
+         memory, the driving task.",
     );
+    if disk.is_none() {
+        report.text += " ";
+        report.text += disk::NO_DISK;
+    }
     report.command = format!(
         "caraware bench endurance --minutes {} --seed {}",
         options.minutes, options.seed
@@ -118,7 +127,9 @@ impl Outcome {
         let text = fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
         let report = serde_json::from_str(&text);
         let report = report.map_err(|error| Exit::run(format!("{}: {error}", path.display()), ""))?;
-        Self::read(&place.run(&name), &report)
+        let outcome = Self::read(&place.run(&name), &report)?;
+        remove(&place.run(&name))?;
+        Ok(outcome)
     }
 
     fn read(directory: &Path, report: &Value) -> Result<Self, Exit> {

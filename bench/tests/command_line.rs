@@ -40,7 +40,7 @@ fn an_unknown_part_is_refused_as_wrong_usage() {
     assert!(text.contains("possible values: lidar"), "{text}");
 }
 
-/// Every kind of disturbance may happen: the runs must end as the undisturbed ones.
+/// Every kind of disturbance happens: the runs must end as the undisturbed ones.
 #[test]
 fn disturbed_runs_end_as_if_nothing_had_happened() {
     let file = tempfile::NamedTempFile::new().unwrap();
@@ -55,7 +55,7 @@ fn disturbed_runs_end_as_if_nothing_had_happened() {
     assert_eq!(code, Some(0), "{text}");
     let report: serde_json::Value = serde_json::from_reader(file).unwrap();
     let figures = report["figures"].as_object().unwrap();
-    for case in ["town", "grid"] {
+    for (case, own) in [("town", "v2x"), ("grid", "recorder")] {
         assert_eq!(figures[&format!("{case}: runs completed")], 1.0, "{text}");
         for process in [
             "traffic-bridge",
@@ -64,8 +64,12 @@ fn disturbed_runs_end_as_if_nothing_had_happened() {
             "trainer",
             "fanout",
             "supervisor",
+            own,
         ] {
             assert_eq!(figures[&format!("{case}: {process} killed")], 1.0, "{text}");
         }
+        let may_mount = !report["text"].as_str().unwrap().contains("may not mount");
+        let filled = figures.get(&format!("{case}: disk filled")).cloned();
+        assert_eq!(filled, may_mount.then(|| 1.0.into()), "{text}");
     }
 }

@@ -7,6 +7,8 @@ use std::{
 
 use caraware::{failure::Exit, install::Install};
 
+use super::target::Target;
+
 /// Settings of both cases: few road users, short episodes with evaluations between, a checkpoint after every second update.
 const SETTINGS: [&str; 6] = [
     "episode.training_episodes=6",
@@ -16,15 +18,17 @@ const SETTINGS: [&str; 6] = [
     "trainer.checkpoint_interval=2",
     "trainer.matmul_precision=float32",
 ];
-const TOWN: [&str; 5] = [
+const TOWN: [&str; 6] = [
+    "v2x.share=0.5",
     "traffic.cavs=6",
     "traffic.others=3",
     "traffic.pedestrians=3",
     "episode.ticks=300",
     "episode.evaluation_ticks=50",
 ];
-const GRID: [&str; 5] = [
+const GRID: [&str; 6] = [
     "run.envs=2",
+    "record.manner=lossless",
     "episode.ticks=200",
     "episode.evaluation_ticks=50",
     "map.origin_latitude_deg=52",
@@ -49,6 +53,8 @@ pub struct EnduranceCase {
     settings: &'static [&'static str],
     /// Number of environments.
     pub envs: u32,
+    /// The process that the other case's runs do not have.
+    own: Target,
 }
 
 impl EnduranceCase {
@@ -64,14 +70,22 @@ impl EnduranceCase {
                 input: "town".into(),
                 settings: &TOWN,
                 envs: 1,
+                own: Target::V2x,
             },
             Self {
                 name: "grid",
                 input: sumocfg,
                 settings: &GRID,
                 envs: 2,
+                own: Target::Recorder,
             },
         ])
+    }
+
+    /// True if its runs have such a process.
+    #[must_use]
+    pub fn has(&self, target: Target) -> bool {
+        self.own == target || !matches!(target, Target::V2x | Target::Recorder)
     }
 
     /// Arguments that train on it as the run `name`, at `pace` simulated seconds per second (0: as fast as possible), with the fan-out

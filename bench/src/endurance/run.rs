@@ -3,6 +3,7 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     fs::{self, File},
+    io::Write as _,
     os::unix::process::ExitStatusExt as _,
     path::{Path, PathBuf},
     process::{Child, Command, ExitStatus, Stdio},
@@ -10,7 +11,12 @@ use std::{
 };
 
 use caraware::failure::Exit;
-use ipc_schema::{ports::BoardReader, process::Process, run::RunFile, services};
+use ipc_schema::{
+    ports::BoardReader,
+    process::Process,
+    run::RunFile,
+    services::{self, RunNode},
+};
 use rustix::process::{Pid, Signal};
 use serde_json::Value;
 
@@ -28,22 +34,25 @@ const DEADLINE: Duration = Duration::from_secs(300);
 /// Longest pause of a stopped process, seconds.
 const LONGEST_PAUSE_S: f64 = 1.5;
 /// Cards of the deck that a run draws.
-const DISTURBANCES: usize = 12;
+const DISTURBANCES: usize = 14;
 /// Mean distance of two disturbances, seconds.
 const MEAN_S: f64 = 1.2;
 /// Viewers at once.
 const VIEWERS: usize = 3;
 /// What is done, and how many cards of the deck each has.
-const DECK: [(Disturbance, usize); 9] = [
+const DECK: [(Disturbance, usize); 12] = [
     (Disturbance::Kill(Target::Trainer), 6),
     (Disturbance::Kill(Target::TrafficBridge), 2),
     (Disturbance::Kill(Target::SimCore), 2),
     (Disturbance::Kill(Target::SensorDaemon), 2),
+    (Disturbance::Kill(Target::V2x), 2),
     (Disturbance::Kill(Target::Fanout), 2),
+    (Disturbance::Kill(Target::Recorder), 2),
     (Disturbance::Kill(Target::Supervisor), 1),
     (Disturbance::Pause, 2),
     (Disturbance::Handover, 2),
     (Disturbance::Viewer, 3),
+    (Disturbance::FullDisk, 2),
 ];
 
 /// What is done to a run.
@@ -57,6 +66,8 @@ enum Disturbance {
     Handover,
     /// A viewer is started, or one is killed or stopped.
     Viewer,
+    /// The disk of the runs is full for a while.
+    FullDisk,
 }
 
 /// What was done to the runs of a case, and what was measured.
@@ -88,6 +99,8 @@ pub struct EndurancePlace {
     pub caraware: PathBuf,
     pub watch: PathBuf,
     pub directory: PathBuf,
+    /// True if the directory is a small disk of its own, which can be filled.
+    pub has_small_disk: bool,
     /// True if only one run of each case is disturbed.
     pub is_quick: bool,
 }
@@ -118,6 +131,25 @@ impl EndurancePlace {
     }
 }
 
+/// The boards of `sensor-daemon` in all environments. They are opened while a run starts and kept until its end: a node that is opened
+/// while a run ends would leave files behind.
+struct WatchedBoards {
+    boards: Vec<BoardReader>,
+    _node: RunNode,
+}
+
+impl WatchedBoards {
+    /// Opens the boards of a run; `None` while they are not there.
+    fn open(run: &RunFile, envs: u32) -> Option<Self> {
+        let node = services::node(&run.shared_memory).ok()?;
+        let board = |env| BoardReader::open(&node, run, env, Process::SensorDaemon).ok();
+        Some(Self {
+            boards: (0..envs).map(board).collect::<Option<_>>()?,
+            _node: node,
+        })
+    }
+}
+
 /// A run in the background that is disturbed. Dropping it ends the run and its viewers.
 pub struct DisturbedRun<'a> {
     place: &'a EndurancePlace,
@@ -129,6 +161,7 @@ pub struct DisturbedRun<'a> {
     handovers: Vec<Child>,
     /// Prefixes of its files in shared memory: one for each start.
     prefixes: BTreeSet<String>,
+    watched: Option<WatchedBoards>,
     /// What is still to be done to it, in reverse order.
     cards: Vec<Disturbance>,
     random: fastrand::Rng,
@@ -162,7 +195,7 @@ impl<'a> DisturbedRun<'a> {
         counts: &'a mut EnduranceCounts,
     ) -> Result<Self, Exit> {
         let port = free_port()?;
-        let cards = draw_cards(place.is_quick, &mut random);
+        let cards = draw_cards(place, case, &mut random);
         Ok(Self {
             child: start(place, name, &case.arguments(name, PACE, Some(port)))?,
             place,
@@ -172,6 +205,7 @@ impl<'a> DisturbedRun<'a> {
             viewers: Vec::new(),
             handovers: Vec::new(),
             prefixes: BTreeSet::new(),
+            watched: None,
             cards,
             random,
             counts,
@@ -242,6 +276,11 @@ impl<'a> DisturbedRun<'a> {
     fn look(&mut self) {
         let directory = self.directory();
         if let Ok(run) = RunFile::read(&directory.join("run.json")) {
+            // The file of a killed supervisor is there until its successor has written its own.
+            let is_of_child = run.supervisor_pid == pid(&self.child).as_raw_nonzero().get();
+            if self.watched.is_none() && is_of_child {
+                self.watched = WatchedBoards::open(&run, self.case.envs);
+            }
             self.prefixes.insert(run.shared_memory.prefix);
         }
         for target in Target::ALL {
@@ -264,6 +303,7 @@ impl<'a> DisturbedRun<'a> {
             Disturbance::Pause => self.pause_process(),
             Disturbance::Handover => self.hand_over(),
             Disturbance::Viewer => self.disturb_viewers(),
+            Disturbance::FullDisk => self.fill_disk(),
         }
     }
 
@@ -283,15 +323,8 @@ impl<'a> DisturbedRun<'a> {
 
     /// Ticks that each environment has sensed; empty if the run has no boards now.
     fn sensed_ticks(&self) -> Vec<u64> {
-        let ticks = || {
-            let run = RunFile::read(&self.directory().join("run.json")).ok()?;
-            let node = services::node(&run.shared_memory).ok()?;
-            let boards = (0..self.case.envs).map(|env| BoardReader::open(&node, &run, env, Process::SensorDaemon));
-            boards
-                .map(|board| Some(board.ok()?.health().ticks))
-                .collect::<Option<Vec<u64>>>()
-        };
-        ticks().unwrap_or_default()
+        let boards = self.watched.iter().flat_map(|watched| &watched.boards);
+        boards.map(|board| board.health().ticks).collect()
     }
 
     /// Waits until every environment has made a new tick, or the run ends.
@@ -319,6 +352,7 @@ impl<'a> DisturbedRun<'a> {
             return Ok(false);
         }
         self.counts.count("supervisor killed");
+        self.watched = None;
         let status = self.child.wait();
         status.map_err(|error| Exit::io("wait for", &self.place.caraware, &error))?;
         Ok(true)
@@ -358,9 +392,12 @@ impl<'a> DisturbedRun<'a> {
         Ok(is_stopped)
     }
 
-    /// Asks for a handover. It may be refused, for instance because another one is in progress.
+    /// Asks for a handover, after the next update or at once. It may be refused, for instance because another one is in progress.
     fn hand_over(&mut self) -> Result<bool, Exit> {
-        let arguments = ["handover", &self.name].map(str::to_owned);
+        let mut arguments = vec!["handover".to_owned(), self.name.clone()];
+        if self.random.bool() {
+            arguments.push("--now".into());
+        }
         let client = self.place.command(&arguments).stderr(Stdio::null()).spawn();
         self.handovers
             .push(client.map_err(|error| Exit::io("start", &self.place.caraware, &error))?);
@@ -395,9 +432,32 @@ impl<'a> DisturbedRun<'a> {
         Ok(true)
     }
 
+    /// Leaves no byte on the disk for a while, also if the run removes files.
+    fn fill_disk(&mut self) -> Result<bool, Exit> {
+        let path = self.place.directory.join("ballast");
+        let failed = |error: &std::io::Error| Exit::io("write", &path, error);
+        let mut ballast = File::create(&path).map_err(|error| failed(&error))?;
+        let until = Instant::now() + Duration::from_secs_f64(LONGEST_PAUSE_S * self.random.f64());
+        loop {
+            for bytes in [1 << 20, 4096, 1] {
+                let block = vec![0; bytes];
+                while ballast.write_all(&block).is_ok() {}
+            }
+            if Instant::now() >= until {
+                break;
+            }
+            pause();
+        }
+        self.counts.count("disk filled");
+        drop(ballast);
+        fs::remove_file(&path).map_err(|error| failed(&error))?;
+        Ok(true)
+    }
+
     /// Checks what a completed run leaves behind, and reads its report.
     fn finish(mut self) -> Result<Option<Value>, Exit> {
         self.counts.runs += 1;
+        self.watched = None;
         for mut client in std::mem::take(&mut self.handovers) {
             let status = client.wait();
             let status = status.map_err(|error| Exit::io("wait for", &self.place.caraware, &error))?;
@@ -441,10 +501,17 @@ impl<'a> DisturbedRun<'a> {
 }
 
 /// What is done to a run: some cards of the shuffled deck, or each kind once if the measurement is quick.
-fn draw_cards(is_quick: bool, random: &mut fastrand::Rng) -> Vec<Disturbance> {
-    let of_kind =
-        |(disturbance, count): (Disturbance, usize)| std::iter::repeat_n(disturbance, if is_quick { 1 } else { count });
-    let mut cards: Vec<Disturbance> = DECK.into_iter().flat_map(of_kind).collect();
+fn draw_cards(place: &EndurancePlace, case: &EnduranceCase, random: &mut fastrand::Rng) -> Vec<Disturbance> {
+    let is_possible = |(disturbance, _): &(Disturbance, usize)| match disturbance {
+        Disturbance::Kill(target) => case.has(*target),
+        Disturbance::FullDisk => place.has_small_disk,
+        Disturbance::Pause | Disturbance::Handover | Disturbance::Viewer => true,
+    };
+    let of_kind = |(disturbance, count): (Disturbance, usize)| {
+        std::iter::repeat_n(disturbance, if place.is_quick { 1 } else { count })
+    };
+    let possible = DECK.into_iter().filter(is_possible);
+    let mut cards: Vec<Disturbance> = possible.flat_map(of_kind).collect();
     random.shuffle(&mut cards);
     cards.truncate(DISTURBANCES);
     cards

@@ -10,19 +10,23 @@ pub enum Target {
     TrafficBridge,
     SimCore,
     SensorDaemon,
+    V2x,
     Trainer,
     Fanout,
+    Recorder,
     Supervisor,
 }
 
 impl Target {
     /// Every target.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 8] = [
         Self::TrafficBridge,
         Self::SimCore,
         Self::SensorDaemon,
+        Self::V2x,
         Self::Trainer,
         Self::Fanout,
+        Self::Recorder,
         Self::Supervisor,
     ];
 
@@ -33,8 +37,10 @@ impl Target {
             Self::TrafficBridge => "traffic-bridge",
             Self::SimCore => "sim-core",
             Self::SensorDaemon => "sensor-daemon",
+            Self::V2x => "v2x",
             Self::Trainer => "trainer",
             Self::Fanout => "fanout",
+            Self::Recorder => "recorder",
             Self::Supervisor => "supervisor",
         }
     }
@@ -42,7 +48,10 @@ impl Target {
     /// True if it belongs to one environment.
     #[must_use]
     pub const fn is_simulator(self) -> bool {
-        matches!(self, Self::TrafficBridge | Self::SimCore | Self::SensorDaemon)
+        matches!(
+            self,
+            Self::TrafficBridge | Self::SimCore | Self::SensorDaemon | Self::V2x
+        )
     }
 
     /// Live processes of this kind that belong to the run in `directory`. The supervisor is a child of this program and not found here.
