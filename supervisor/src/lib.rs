@@ -20,6 +20,7 @@ pub mod import;
 pub mod install;
 pub mod live_table;
 pub mod maps;
+pub mod memory_limit;
 pub mod panel;
 pub mod phase;
 pub mod prepare;

@@ -19,6 +19,7 @@ use crate::{
     failure::Exit,
     install::Install,
     maps,
+    memory_limit::{MemoryGroups, MemoryLimit},
     registry::{self, RunClaim},
     remote, resume,
     scenario::{self, ScenarioReading, SumoScenario, input_check::require_regular},
@@ -497,8 +498,25 @@ fn assemble(
     Ok((run, claim))
 }
 
+/// Refuses a run whose shared memory alone is more than a limit on memory leaves: the kernel would end one of its processes.
+fn check_memory_limit(needed_bytes: u64, limit: Option<MemoryLimit>) -> Result<(), Exit> {
+    match limit {
+        Some(limit) if limit.free_bytes < needed_bytes => Err(Exit::missing(
+            format!(
+                "the limit on memory of this container or job ({} MiB) leaves {} MiB, but this run needs {} MiB of shared memory alone",
+                limit.limit_bytes >> 20,
+                limit.free_bytes >> 20,
+                needed_bytes.div_ceil(1 << 20)
+            ),
+            "raise the limit (Docker: --memory, Slurm: --mem), or lower `traffic.max_road_users`, `run.window_ticks` or `run.envs`",
+        )),
+        _ => Ok(()),
+    }
+}
+
 /// Reserves the shared memory of a run.
 pub(crate) fn reserve_shared_memory(run: &RunFile) -> Result<(), Exit> {
+    check_memory_limit(reserve::needed_bytes(run), MemoryGroups::own().tightest())?;
     let Err(error) = reserve::create(run) else {
         return Ok(());
     };

@@ -24,6 +24,7 @@ use crate::{
     failure::Exit,
     handover::Handovers,
     install::Install,
+    memory_limit::MemoryGroups,
     processes::{EndedProcess, RunProcesses},
     registry::RunClaim,
     restart::{EndCause, MAX_VAIN_FAULTS, RequiredRestarts, RestartVerdict, WatcherRestarts},
@@ -102,8 +103,14 @@ pub struct Supervisor {
     /// Restarts of the simulator processes of each environment.
     environment_restarts: BTreeMap<u32, RequiredRestarts>,
     stalls: StallWatch,
-    /// Processes that were killed because they hung, and have not been started again.
-    killed_stalls: BTreeSet<ProcessPlace>,
+    /// Processes that were killed because they hung or took too much memory, and have not been started again.
+    killed_for_cause: BTreeSet<ProcessPlace>,
+    /// What limits the memory of this run.
+    memory: MemoryGroups,
+    /// Processes that the kernel had ended because of such a limit at the last look.
+    memory_kills: u64,
+    /// The newest of these ends.
+    memory_note: Option<String>,
     ready_at: Option<Instant>,
     /// Time of the check before the present one. A process that is found ready now became ready after it.
     last_check: Instant,
@@ -131,6 +138,7 @@ impl Supervisor {
             sender.send(SupervisorEvent::Request(request)).is_ok()
         })?;
         let processes = RunProcesses::create(run, install)?;
+        let memory = MemoryGroups::own();
         Ok(Self {
             handovers: Handovers::default(),
             controls: ControlRelay::new(processes.control_clients()?),
@@ -143,7 +151,10 @@ impl Supervisor {
             trainer_restarts: RequiredRestarts::default(),
             environment_restarts: BTreeMap::new(),
             stalls: StallWatch::new(run.config.run.stall_s, Instant::now()),
-            killed_stalls: BTreeSet::new(),
+            killed_for_cause: BTreeSet::new(),
+            memory_kills: memory.kills(),
+            memory,
+            memory_note: None,
             ready_at: None,
             last_check: Instant::now(),
         })
@@ -203,6 +214,7 @@ impl Supervisor {
                 continue;
             }
             self.processes.forget_dead();
+            self.note_memory_kill(index, &ended);
             if ended.on_exit == OnExit::Replace
                 && self
                     .handovers
@@ -283,14 +295,47 @@ impl Supervisor {
         display::notice(&note);
         self.processes.log(index, &note);
         if is_killed {
-            self.killed_stalls.insert(place);
+            self.killed_for_cause.insert(place);
             self.processes.kill_one(index);
         }
     }
 
-    /// Whose fault an end is: a process that was killed because it hung is to blame itself.
+    /// Notes that the kernel has killed a process because a limit on memory was reached.
+    fn note_memory_kill(&mut self, index: usize, ended: &EndedProcess) {
+        let place = (ended.row.process, ended.env_index);
+        if ended.status.signal() != Some(signal_hook::consts::SIGKILL) || self.killed_for_cause.contains(&place) {
+            return;
+        }
+        let kills = self.memory.kills();
+        if kills <= self.memory_kills {
+            return;
+        }
+        self.memory_kills = kills;
+        self.killed_for_cause.insert(place);
+        let limit = self.memory.tightest();
+        let limit = limit.map_or_else(String::new, |limit| format!(" of {} MiB", limit.limit_bytes >> 20));
+        let note = format!(
+            "the kernel has ended {}: the limit on memory{limit} was reached",
+            self.processes.label(place)
+        );
+        display::notice(&note);
+        self.processes.log(index, &note);
+        self.memory_note = Some(note);
+    }
+
+    /// A failure of a process that is given up, with a limit on memory if that was met.
+    fn given_up(&self, index: usize, ended: &EndedProcess, reason: &str) -> Exit {
+        let mut failure = self.processes.failure(index, ended.status);
+        for line in std::iter::once(reason).chain(self.memory_note.as_deref()) {
+            failure.message += "\n  ";
+            failure.message += line;
+        }
+        failure.into()
+    }
+
+    /// Whose fault an end is: a process that was killed because it hung or took too much memory is to blame itself.
     fn cause_of(&self, ended: &EndedProcess) -> EndCause {
-        match self.killed_stalls.contains(&(ended.row.process, ended.env_index)) {
+        match self.killed_for_cause.contains(&(ended.row.process, ended.env_index)) {
             true => EndCause::OwnFault,
             false if ended.row.is_simulator() && ended.status.success() => EndCause::Kill,
             false => EndCause::of(ended.status),
@@ -313,15 +358,14 @@ impl Supervisor {
                 return Ok(false);
             }
             RestartVerdict::GiveUp => {
-                let mut failure = self.processes.failure(index, ended.status);
-                failure.message += "\n  it crashed again and again, or hung, without a new tick";
-                return Err(failure.into());
+                let reason = "it crashed again and again, or hung, without a new tick";
+                return Err(self.given_up(index, ended, reason));
             }
             RestartVerdict::Start => {}
         }
         let (first_tick, sensed_ticks) = self.processes.restart_environment(env_index)?;
         let is_of_another = |(process, index): &ProcessPlace| *index != env_index || !process.spec().is_simulator();
-        self.killed_stalls.retain(is_of_another);
+        self.killed_for_cause.retain(is_of_another);
         display::notice(&format!(
             "{label} ended with {}; the simulation is made again from tick {first_tick} to {sensed_ticks}, and continues",
             ended.status
@@ -362,11 +406,10 @@ impl Supervisor {
                     self.trainer_restarts = RequiredRestarts::default();
                     return Ok(());
                 }
-                let mut failure = self.processes.failure(index, ended.status);
-                failure.message += &format!(
-                    "\n  it ended by its own fault again, after {MAX_VAIN_FAULTS} restarts in a row without a new checkpoint"
+                let reason = format!(
+                    "it ended by its own fault again, after {MAX_VAIN_FAULTS} restarts in a row without a new checkpoint"
                 );
-                return Err(failure.into());
+                return Err(self.given_up(index, ended, &reason));
             }
             RestartVerdict::Start => {}
         }
@@ -404,7 +447,7 @@ impl Supervisor {
 
     fn restart(&mut self, index: usize, ended: &EndedProcess) -> Result<(), Exit> {
         self.processes.restart(index)?;
-        self.killed_stalls.remove(&(ended.row.process, ended.env_index));
+        self.killed_for_cause.remove(&(ended.row.process, ended.env_index));
         if ended.row.process == Process::Trainer {
             self.handovers.trainer_restarted();
         }
