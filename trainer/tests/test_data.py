@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,10 +20,9 @@ from caraware.data import Recording, RecordingError, TickDataset, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.fcd import angle_deg
 from caraware.data.names import RoadUsers
+from recorded_run import recorded_run, unseen
 from torch.utils.data import DataLoader
 
-ROOT = Path(__file__).parents[2]
-CARAWARE = ROOT / "target" / "release" / "caraware"
 SETTINGS = {
     "traffic.cavs": 5,
     "traffic.others": 3,
@@ -47,13 +44,8 @@ SETTINGS = {
 
 @pytest.fixture(scope="module")
 def run_dir() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="cw-") as short:
-        settings = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
-        command: list[str | Path] = [CARAWARE, "train", "town", "--name", "data", "--record", "--quiet", *settings]
-        environment = os.environ | {"CARAWARE_RUNTIME_DIR": f"{short}/r", "CARAWARE_PYTHON": sys.executable}
-        ran = subprocess.run(command, cwd=short, env=environment, capture_output=True, text=True, timeout=600)
-        assert ran.returncode == 0, ran.stdout + ran.stderr
-        yield Path(short, "runs", "data")
+    with recorded_run("train", SETTINGS) as run_dir:
+        yield run_dir
 
 
 @pytest.fixture(scope="module")
@@ -144,14 +136,14 @@ def test_parquet_and_csv_have_the_values_of_the_messages(recording: Recording, r
     # What is there is kept: an export continues where it was interrupted.
     (directory / "episode-00001.parquet").unlink()
     kept = (directory / "episode-00000.parquet").stat().st_mtime_ns
-    assert export(run_dir, "parquet", directory, 1, lambda done, total: None) == 1
+    assert export(run_dir, "parquet", directory, 1, unseen) == 1
     assert (directory / "episode-00000.parquet").stat().st_mtime_ns == kept
     card = (directory / "README.md").read_text()
     assert recording.end is not None
     for word in (recording.end["observation_hash"], recording.start["config_hash"], "noise_std_deg", "Licence"):
         assert word in card, word
 
-    assert export(run_dir, "csv", tmp_path / "csv", 1, lambda done, total: None) == 3
+    assert export(run_dir, "csv", tmp_path / "csv", 1, unseen) == 3
     with (tmp_path / "csv" / "episode-00002.csv").open() as file:
         lines = list(csv.DictReader(file))
     last = [row for row in range(table.num_rows) if columns["episode"][row] == 2]
@@ -177,7 +169,7 @@ def test_an_interrupted_export_of_two_jobs_continues_as_a_command(run_dir: Path,
 def test_sumo_reads_the_floating_car_data_and_it_lies_on_sumos_own_positions(
     recording: Recording, run_dir: Path, tmp_path: Path
 ) -> None:
-    export(run_dir, "fcd", tmp_path, 1, lambda done, total: None)
+    export(run_dir, "fcd", tmp_path, 1, unseen)
     parts = sorted(tmp_path.glob("*.fcd.xml"))
     assert len(parts) == 3
     attributes = ["id", "x", "y", "angle"]

@@ -1,14 +1,11 @@
 """KITTI exports, read by the rules of the object benchmark's devkit and compared with the recorded world.
 
 The reader below is written from the devkit's `readme.txt` (columns, frames) and `computeBox3D.m` (corners), and shares
-nothing with the export. Both sensors are mounted off-centre and turned, so that no symmetry hides a sign.
+nothing with the export.
 """
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,54 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from caraware.data import Recording, RecordingError, open_recording
+from caraware.data import RecordingError, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.names import RoadUsers
-from caraware.data.recording import Array, Message
+from caraware.data.recording import Array
 from caraware.ipc.arrays import Float64Array
 from caraware.ipc.image import split_planes
-from caraware.ipc.pointcloud import rotation
 from PIL import Image
-
-CARAWARE = Path(__file__).parents[2] / "target" / "release" / "caraware"
-SETTINGS = {
-    "traffic.cavs": 12,
-    "traffic.others": 20,
-    "traffic.pedestrians": 10,
-    "episode.ticks": 160,
-    "episode.training_episodes": 1,
-    "fanout.enabled": "false",
-    # At full speed the recorder misses most images.
-    "run.real_time_factor": 4,
-    "lidar.vehicles": 3,
-    "lidar.channels": 32,
-    "lidar.points_per_second": 230400,
-    "lidar.mount": "[0.8, 0.3, 1.9, 0.0, 0.05, 0.4]",
-    "lidar.axes": "paper",
-    # Boxes and points then belong to the same moment.
-    "lidar.rolling_shutter": "false",
-    "lidar.range_noise_std_m": 0.0,
-    "camera.vehicles": 2,
-    "camera.rgb": "true",
-    "camera.width": 320,
-    "camera.height": 120,
-    "camera.mount": "[1.4, -0.2, 1.5, 0.0, 0.0, -0.15]",
-    "record.channels": '["world", "observation", "pointcloud", "image", "traffic-meta"]',
-}
+from recorded_run import ASKEW, RecordedFrame, in_world_m, recorded_run, unseen
 
 TILT_M = 0.15
 """How far a corner of a box is off since KITTI's boxes only turn about the camera's y axis: braking cars nod by 1°."""
-
-
-@pytest.fixture(scope="module")
-def run_dir() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="cw-") as short:
-        settings = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
-        command: list[str | Path] = [CARAWARE, "simulate", "town", "--name", "data", "--record", "--quiet", *settings]
-        environment = os.environ | {"CARAWARE_RUNTIME_DIR": f"{short}/r", "CARAWARE_PYTHON": sys.executable}
-        ran = subprocess.run(command, cwd=short, env=environment, capture_output=True, text=True, timeout=600)
-        assert ran.returncode == 0, ran.stdout + ran.stderr
-        yield Path(short, "runs", "data")
 
 
 @dataclass(frozen=True)
@@ -151,86 +111,69 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """The messages of a frame."""
+class Compared(RecordedFrame):
+    """The messages of a frame beside its files."""
 
     sample: Sample
-    scan: np.void
-    points: Array
-    states: Array
-    image: Message | None
+
+    @property
+    def camera(self) -> np.void:
+        """The pose of the camera; without one the LIDAR's."""
+        pose: np.void = self.scan if self.image is None else self.image.section("head")[0]
+        return pose
+
+    def world_of(self, in_camera_m: Float64Array) -> Float64Array:
+        """f64 [count, 3]: points of KITTI's camera frame in the world."""
+        along = np.stack((in_camera_m[:, 2], -in_camera_m[:, 0], -in_camera_m[:, 1]), 1)
+        return in_world_m(self.camera, along)
 
 
 @pytest.fixture(scope="module")
-def frames(run_dir: Path) -> Iterator[list[Recorded]]:
+def frames(askew_run: Path, askew_frames: dict[tuple[int, int], RecordedFrame]) -> Iterator[list[Compared]]:
     """Every frame of every carrier beside its messages."""
-    recording: Recording = open_recording(run_dir)
-    worlds = {message.tick: message.section("states") for message in recording.messages("world")}
-    scans = {(int(m.section("scan")[0]["vehicle"]), m.tick): m for m in recording.messages("pointcloud")}
-    images = {(int(m.section("head")[0]["vehicle"]), m.tick): m for m in recording.messages("image")}
     with tempfile.TemporaryDirectory() as directory:
-        assert export(run_dir, "kitti", Path(directory), 1, lambda done, total: None) == 1
+        assert export(askew_run, "kitti", Path(directory), 1, unseen) == 1
         part = Path(directory) / "episode-00000.kitti"
         read = []
         for carrier in sorted(part.iterdir()):
             names = (carrier / "ImageSets" / "train.txt").read_text().split()
             vehicle, ticks = int(carrier.name), {int(name) for name in names}
             # A carrier with a camera has the frames with an image, another one has all its scans.
-            filmed = {tick for number, tick in images if number == vehicle}
-            scanned = {tick for number, tick in scans if number == vehicle}
-            assert ticks == (scanned & filmed if filmed else scanned) and len(ticks) > 20
+            own = {tick: frame for (number, tick), frame in askew_frames.items() if number == vehicle}
+            filmed = {tick for tick, frame in own.items() if frame.image is not None}
+            assert ticks == (filmed or set(own)) and len(ticks) > 20
             for name in names:
-                scan, image = scans[vehicle, int(name)], images.get((vehicle, int(name)))
                 sample = Sample.read(carrier / "training", name)
-                read.append(Recorded(sample, scan.section("scan")[0], scan.section("points"), worlds[int(name)], image))
+                read.append(Compared(**vars(own[int(name)]), sample=sample))
         yield read
 
 
-def _world_of(pose: np.void, in_camera_m: Float64Array) -> Float64Array:
-    """f64 [count, 3]: points of KITTI's camera frame in the world; `pose` is of a camera with x along its axis."""
-    along = np.stack((in_camera_m[:, 2], -in_camera_m[:, 0], -in_camera_m[:, 1]), 1)
-    world: Float64Array = along @ rotation(*pose["attitude_rad"]).T + pose["position_m"]
-    return world
-
-
-def _camera(frame: Recorded) -> np.void:
-    """The pose of the camera; without one the LIDAR's."""
-    pose: np.void = frame.scan if frame.image is None else frame.image.section("head")[0]
-    return pose
-
-
-def test_points_lie_where_they_were_recorded(frames: list[Recorded]) -> None:
+def test_points_lie_where_they_were_recorded(frames: list[Compared]) -> None:
     assert {frame.image is None for frame in frames} == {True, False}
     for frame in frames[::5]:
-        recorded = frame.points["position_m"]
-        assert frame.scan["axes"] == 1
-        forward = np.stack((-recorded[:, 1], recorded[:, 0], -recorded[:, 2]), 1)
-        assert np.array_equal(frame.sample.points[:, :3], forward)
+        assert np.array_equal(frame.sample.points[:, :3], frame.forward_m)
         assert np.array_equal(frame.sample.points[:, 3], frame.points["intensity"])
-        in_world = forward @ rotation(*frame.scan["attitude_rad"]).T + frame.scan["position_m"]
         in_camera = frame.sample.in_camera_m(frame.sample.points)
-        assert np.allclose(_world_of(_camera(frame), in_camera), in_world, rtol=0, atol=1e-4)
+        assert np.allclose(frame.world_of(in_camera), frame.world_m, rtol=0, atol=1e-4)
         # The origin of "imu" is the carrier's: the rear axle on the ground.
-        own = frame.states[frame.states["vehicle"] == frame.scan["vehicle"]][0]
-        origin = frame.sample.calibration["Tr_imu_to_velo"][:, 3]
-        origin_m = rotation(*frame.scan["attitude_rad"]) @ origin + frame.scan["position_m"]
+        own = frame.own
+        origin_m = in_world_m(frame.scan, frame.sample.calibration["Tr_imu_to_velo"][:, 3])
         assert origin_m == pytest.approx([own["x_m"], own["y_m"], own["z_m"]], abs=1e-4)
 
 
-def test_labels_are_the_boxes_of_the_world_and_hold_its_points(frames: list[Recorded], run_dir: Path) -> None:
-    users = RoadUsers(open_recording(run_dir))
+def test_labels_are_the_boxes_of_the_world_and_hold_its_points(frames: list[Compared], askew_run: Path) -> None:
+    users = RoadUsers(open_recording(askew_run))
     on_boxes, classes, turned = 0, set(), set()
     for frame in frames:
-        hit = set(np.unique(frame.points["object"]).tolist())
         seen = set() if frame.image is None else set(frame.image.section("objects")["object"].tolist())
-        states = [s for s in frame.states if s["vehicle"] != frame.scan["vehicle"] and int(s["vehicle"]) in hit | seen]
+        states = frame.labelled()
         assert len(states) == len(frame.sample.labels)
         in_camera = frame.sample.in_camera_m(frame.sample.points)
         for state, label in zip(states, frame.sample.labels, strict=True):
             assert label.size_m == pytest.approx([state["height_m"], state["width_m"], state["length_m"]], abs=1e-3)
             # The heading of the box is that of the road user, in the world.
             ahead = np.array([[np.cos(label.rotation_y), 0, -np.sin(label.rotation_y)], [0, 0, 0]])
-            ahead_m = -np.diff(_world_of(_camera(frame), ahead), axis=0)[0]
+            ahead_m = -np.diff(frame.world_of(ahead), axis=0)[0]
             heading = [np.cos(state["yaw_rad"]), np.sin(state["yaw_rad"])]
             assert ahead_m[:2] == pytest.approx(heading, abs=0.02)
             viewed_from = np.arctan2(label.location_m[0], label.location_m[2])
@@ -251,7 +194,7 @@ def test_labels_are_the_boxes_of_the_world_and_hold_its_points(frames: list[Reco
     assert classes == {("Car", "passenger"), ("Van", "delivery"), ("Pedestrian", "pedestrian")}
 
 
-def test_the_image_shows_what_labels_and_points_project_to(frames: list[Recorded]) -> None:
+def test_the_image_shows_what_labels_and_points_project_to(frames: list[Compared]) -> None:
     boxes, hidden = 0, set()
     on_object: dict[bool, list[Array]] = {False: [], True: []}
     for frame in frames:
@@ -264,12 +207,9 @@ def test_the_image_shows_what_labels_and_points_project_to(frames: list[Recorded
         assert instance is not None and rgb is not None
         assert np.array_equal(np.asarray(Image.open(frame.sample.image)), rgb)
         # The corners of a label project to the recorded box, counted from the middle of the first pixel.
-        hit = set(np.unique(frame.points["object"]).tolist())
         seen = {int(user["object"]): user for user in objects}
-        labelled = [int(s["vehicle"]) for s in frame.states if s["vehicle"] != frame.scan["vehicle"]]
-        labelled = [vehicle for vehicle in labelled if vehicle in hit or vehicle in seen]
-        for vehicle, label in zip(labelled, frame.sample.labels, strict=True):
-            if vehicle not in seen:
+        for state, label in zip(frame.labelled(), frame.sample.labels, strict=True):
+            if (vehicle := int(state["vehicle"])) not in seen:
                 continue
             user, corners = seen[vehicle], label.corners_m()
             assert label.truncated == pytest.approx(float(user["truncated"]), abs=0.01)
@@ -301,13 +241,9 @@ def test_the_image_shows_what_labels_and_points_project_to(frames: list[Recorded
     assert len(straight) > 300 and straight.mean() > 0.75 and mirrored.mean() < 0.4
 
 
-def test_a_recording_without_points_is_refused(run_dir: Path, tmp_path: Path) -> None:
-    settings = [
-        word for pair in {**SETTINGS, "lidar.vehicles": 0}.items() for word in ("--set", f"{pair[0]}={pair[1]}")
-    ]
-    environment = os.environ | {"CARAWARE_RUNTIME_DIR": f"{run_dir.parents[1]}/r2", "CARAWARE_PYTHON": sys.executable}
-    command: list[str | Path] = [CARAWARE, "simulate", "town", "--name", "dark", "--record", "--quiet", *settings]
-    ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    with pytest.raises(RecordingError, match=r"lidar\.vehicles"):
-        export(tmp_path / "runs" / "dark", "kitti", tmp_path / "out", 1, lambda done, total: None)
+def test_a_recording_without_points_is_refused(tmp_path: Path) -> None:
+    with (
+        recorded_run("simulate", ASKEW | {"lidar.vehicles": 0}) as run_dir,
+        pytest.raises(RecordingError, match=r"lidar\.vehicles"),
+    ):
+        export(run_dir, "kitti", tmp_path / "out", 1, unseen)

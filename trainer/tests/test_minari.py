@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,8 +14,8 @@ from caraware.data import Recording, RecordingError, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.rows import table
 from caraware.data.names import RoadUsers
+from recorded_run import recorded_run, unseen
 
-CARAWARE = Path(__file__).parents[2] / "target" / "release" / "caraware"
 SETTINGS = {
     "episode.ticks": 150,
     "episode.training_episodes": 2,
@@ -34,30 +30,21 @@ LOCALISATION = {"traffic.cavs": 5, "traffic.others": 3, "traffic.pedestrians": 2
 DRIVING = {"traffic.heroes": 4, "traffic.others": 10, "traffic.pedestrians": 2, "task.time_limit_s": 6}
 
 
-def _recorded(preset: str, settings: dict[str, Any]) -> Iterator[Path]:
-    """The directory of a recorded run."""
-    with tempfile.TemporaryDirectory(prefix="cw-") as short:
-        words = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
-        command: list[str | Path] = [CARAWARE, "train", preset, "--name", "a.run", "--record", "--quiet", *words]
-        environment = os.environ | {"CARAWARE_RUNTIME_DIR": f"{short}/r", "CARAWARE_PYTHON": sys.executable}
-        ran = subprocess.run(command, cwd=short, env=environment, capture_output=True, text=True, timeout=600)
-        assert ran.returncode == 0, ran.stdout + ran.stderr
-        yield Path(short, "runs", "a.run")
-
-
 @pytest.fixture(scope="module")
 def localisation() -> Iterator[Path]:
-    yield from _recorded("town", SETTINGS | LOCALISATION)
+    with recorded_run("train", SETTINGS | LOCALISATION, name="a.run") as run_dir:
+        yield run_dir
 
 
 @pytest.fixture(scope="module")
 def driving() -> Iterator[Path]:
-    yield from _recorded("driving", SETTINGS | DRIVING)
+    with recorded_run("train", SETTINGS | DRIVING, preset="driving", name="a.run") as run_dir:
+        yield run_dir
 
 
 def _load(run_dir: Path, directory: Path, monkeypatch: pytest.MonkeyPatch) -> minari.MinariDataset:
     """Export a run, and let Minari find the data set by its name."""
-    assert export(run_dir, "minari", directory, 2, lambda done, total: None) == 3
+    assert export(run_dir, "minari", directory, 2, unseen) == 3
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(directory))
     assert list(minari.list_local_datasets(compatible_minari_version=True)) == ["a_run-v0"]
     return minari.load_dataset("a_run-v0")
@@ -131,7 +118,7 @@ def test_an_export_that_continues_makes_the_same_data_set(
 ) -> None:
     before = [episode.rewards.sum() for episode in _load(localisation, tmp_path, monkeypatch)]
     (tmp_path / "episode-00001.minari").rename(tmp_path / ".episode-00001.minari.partial")
-    assert export(localisation, "minari", tmp_path, 1, lambda done, total: None) == 1
+    assert export(localisation, "minari", tmp_path, 1, unseen) == 1
     assert [episode.rewards.sum() for episode in minari.load_dataset("a_run-v0")] == before
     assert not list(tmp_path.glob(".*"))
 
@@ -160,6 +147,5 @@ def test_heroes_have_the_rewards_and_ends_of_their_task(
 
 def test_a_recording_without_predictions_is_refused(tmp_path: Path) -> None:
     settings = SETTINGS | LOCALISATION | {"record.channels": '["observation"]'}
-    for run_dir in _recorded("town", settings):
-        with pytest.raises(RecordingError, match="prediction"):
-            export(run_dir, "minari", tmp_path, 1, lambda done, total: None)
+    with recorded_run("train", settings) as run_dir, pytest.raises(RecordingError, match="prediction"):
+        export(run_dir, "minari", tmp_path, 1, unseen)

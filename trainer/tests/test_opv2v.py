@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from caraware.data import Recording, open_recording
 from caraware.data.export.__main__ import export
 from caraware.data.export.opv2v import pose, world_from_pose
 from caraware.ipc.arrays import Float64Array
 from caraware.ipc.pointcloud import rotation
+from recorded_run import of_carriers, recorded_run, unseen
 
-CARAWARE = Path(__file__).parents[2] / "target" / "release" / "caraware"
 SETTINGS = {
     "traffic.cavs": 6,
     "traffic.others": 4,
@@ -41,13 +36,8 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 
 @pytest.fixture(scope="module")
 def run_dir() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="cw-") as short:
-        settings = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
-        command: list[str | Path] = [CARAWARE, "simulate", "town", "--name", "data", "--record", "--quiet", *settings]
-        environment = os.environ | {"CARAWARE_RUNTIME_DIR": f"{short}/r", "CARAWARE_PYTHON": sys.executable}
-        ran = subprocess.run(command, cwd=short, env=environment, capture_output=True, text=True, timeout=600)
-        assert ran.returncode == 0, ran.stdout + ran.stderr
-        yield Path(short, "runs", "data")
+    with recorded_run("simulate", SETTINGS) as run_dir:
+        yield run_dir
 
 
 def _read_pcd(path: Path) -> tuple[Float64Array, Float64Array]:
@@ -86,23 +76,21 @@ def test_a_pose_is_the_same_transform_in_both_frames() -> None:
 
 
 def test_points_and_boxes_of_every_agent_meet_in_the_world(run_dir: Path, tmp_path: Path) -> None:
-    recording: Recording = open_recording(run_dir)
-    assert export(run_dir, "opv2v", tmp_path, 1, lambda done, total: None) == 1
+    assert export(run_dir, "opv2v", tmp_path, 1, unseen) == 1
     agents = _scenario(tmp_path / "episode-00000.opv2v")
     assert len(agents) >= 3
-    scans = {(int(m.section("scan")[0]["vehicle"]), m.tick): m for m in recording.messages("pointcloud")}
+    scans = of_carriers(run_dir)
     assert sum(len(frames) for frames in agents.values()) == len(scans)
-    worlds = {message.tick: message.section("states") for message in recording.messages("world")}
     on_boxes = 0
     for agent, frames in agents.items():
         for stamp, (labels, points, intensity) in list(frames.items())[::7]:
-            message = scans[agent, int(stamp)]
-            scan, recorded = message.section("scan")[0], message.section("points")
+            frame = scans[agent, int(stamp)]
+            scan, recorded = frame.scan, frame.points
             in_world = points @ world_from_pose(labels["lidar_pose"])[:3, :3].T + labels["lidar_pose"][:3]
             ours = recorded["position_m"] @ rotation(*scan["attitude_rad"]).T + scan["position_m"]
             assert in_world == pytest.approx(ours @ MIRROR, abs=1e-3)
             assert intensity == pytest.approx(recorded["intensity"], abs=1 / 255)
-            states = {int(state["vehicle"]): state for state in worlds[int(stamp)]}
+            states = {int(state["vehicle"]): state for state in frame.states}
             for vehicle, box in labels["vehicles"].items():
                 assert vehicle != agent and box["speed"] >= 0
                 assert box["extent"][0] == pytest.approx(float(states[vehicle]["length_m"]) / 2)

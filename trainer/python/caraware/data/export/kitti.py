@@ -6,25 +6,28 @@ numbered by ticks. The camera's frame is KITTI's: x right, y down, z forward; wi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from caraware.data.export.scans import forward_m, require_channels
+from caraware.data.export.scans import (
+    OPTICAL,
+    Frame,
+    box_middle,
+    forward_m,
+    frames,
+    inverse,
+    pose,
+    projection,
+    rotated,
+    upright_pose,
+    vehicle_pose,
+)
 from caraware.data.names import Kind, RoadUsers
-from caraware.data.recording import Array, Episode, Message, Recording, RecordingError
+from caraware.data.recording import Episode, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
-from caraware.ipc.image import split_planes
-from caraware.ipc.pointcloud import rotation
-
-OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""KITTI's camera frame from ours (x along the optical axis, y left, z up)."""
-
-MOST_TICKS_APART = 256
-"""A message that waits for another one of its tick is dropped after so many ticks."""
 
 CLASSES = {
     "Van": ("delivery",),
@@ -38,17 +41,6 @@ CLASSES = {
 
 LARGELY_HIDDEN, PARTLY_HIDDEN = 0.25, 0.6
 """Share of the pixels of a road user's box that show it, below which KITTI's `occluded` is 2 and 1."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """What belongs to one frame of one carrier."""
-
-    scan: Message
-    states: Array
-    """All road users (`VehicleState`)."""
-    image: Message | None
-    """None for a carrier without a camera."""
 
 
 @dataclass(frozen=True)
@@ -67,17 +59,14 @@ class Calibration:
     @classmethod
     def of(cls, frame: Frame) -> Calibration:
         """From the poses that the messages hold."""
-        scan = frame.scan.section("scan")[0]
-        lidar = _pose(scan["position_m"], scan["attitude_rad"])
-        head = None if frame.image is None else frame.image.section("head")[0]
-        camera = lidar if head is None else _pose(head["position_m"], head["attitude_rad"])
-        own = frame.states[frame.states["vehicle"] == scan["vehicle"]][0]
-        camera_from_world = _rotated(OPTICAL) @ _inverse(camera)
+        lidar, head = frame.world_from_lidar, frame.camera
+        camera = lidar if head is None else pose(head["position_m"], head["attitude_rad"])
+        camera_from_world = rotated(OPTICAL) @ inverse(camera)
         return cls(
-            np.eye(3, 4) if head is None else _projection(head),
+            np.eye(3, 4) if head is None else projection(head),
             camera_from_world[:3],
             (camera_from_world @ lidar)[:3],
-            (_inverse(lidar) @ _vehicle_pose(own))[:3],
+            (inverse(lidar) @ vehicle_pose(frame.own))[:3],
         )
 
     def text(self) -> str:
@@ -89,39 +78,6 @@ class Calibration:
             ("Tr_imu_to_velo", self.lidar_from_vehicle),
         ]
         return "".join(f"{name}: {' '.join(f'{value:.12e}' for value in rows.ravel())}\n" for name, rows in matrices)
-
-
-def _pose(position_m: Array, attitude_rad: Array) -> Float64Array:
-    """f64 [4, 4]: world from a frame at this position (m) with this roll, pitch and heading (rad)."""
-    transform = _rotated(rotation(*(float(angle) for angle in attitude_rad)))
-    transform[:3, 3] = position_m
-    return transform
-
-
-def _vehicle_pose(state: np.void) -> Float64Array:
-    """f64 [4, 4]: world from the frame of a road user."""
-    position_m = np.array([state["x_m"], state["y_m"], state["z_m"]])
-    return _pose(position_m, np.array([state["roll_rad"], state["pitch_rad"], state["yaw_rad"]]))
-
-
-def _rotated(matrix: Float64Array) -> Float64Array:
-    """f64 [4, 4]: a rotation as a transform."""
-    transform = np.eye(4)
-    transform[:3, :3] = matrix
-    return transform
-
-
-def _inverse(transform: Float64Array) -> Float64Array:
-    """The inverse of a rigid transform [4, 4]."""
-    inverse = _rotated(transform[:3, :3].T)
-    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
-    return inverse
-
-
-def _projection(head: np.void) -> Float64Array:
-    """f64 [3, 4]: the pinhole of an image (docs/camera.md)."""
-    focal, width, height = float(head["focal_px"]), int(head["width"]), int(head["height"])
-    return np.array([[focal, 0, (width - 1) / 2, 0], [0, focal, (height - 1) / 2, 0], [0, 0, 1, 0]])
 
 
 def kitti_class(state: np.void, vehicle_class: str) -> str:
@@ -139,12 +95,9 @@ def kitti_class(state: np.void, vehicle_class: str) -> str:
 
 def _place(state: np.void, camera_from_world: Float64Array) -> tuple[Float64Array, float]:
     """Middle of a box's lower face (m) and `rotation_y` (rad), both in the camera's frame."""
-    ahead_m = 0.0
-    if state["kind"] != Kind.PERSON:
-        ahead_m = float(state["length_m"]) / 2 - float(state["rear_overhang_m"])
-    in_camera = camera_from_world @ _vehicle_pose(state)
+    in_camera = camera_from_world @ upright_pose(state)
     heading = in_camera[:, 0]
-    return in_camera @ [ahead_m, 0, 0, 1], float(np.arctan2(-heading[2], heading[0]))
+    return in_camera @ box_middle(state), float(np.arctan2(-heading[2], heading[0]))
 
 
 def _image_part(seen: np.void, head: np.void) -> tuple[str, str]:
@@ -160,77 +113,27 @@ def _image_part(seen: np.void, head: np.void) -> tuple[str, str]:
 
 def _labels(frame: Frame, calibration: Calibration, users: RoadUsers) -> str:
     """The file of `label_2/`: every road user with a point of the LIDAR, or with a pixel of the image."""
-    scan = frame.scan.section("scan")[0]
-    shown = set(np.unique(frame.scan.section("points")["object"]).tolist())
-    seen: dict[int, np.void] = {}
-    if frame.image is not None:
-        seen = {int(user["object"]): user for user in frame.image.section("objects")}
+    seen, head = frame.seen, frame.camera
     lines = []
-    for state in frame.states:
+    for state in frame.labelled():
         vehicle = int(state["vehicle"])
-        if vehicle == int(scan["vehicle"]) or not (vehicle in shown or vehicle in seen):
-            continue
         (x, y, z), rotation_y = _place(state, calibration.camera_from_world)
         alpha = float(np.mod(rotation_y - np.arctan2(x, z) + np.pi, 2 * np.pi) - np.pi)
         name = kitti_class(state, users.of(state["id_hash"]).vehicle_class)
         hidden, box = "-1 3", "-1 -1 -1 -1"
-        if frame.image is not None and vehicle in seen:
-            hidden, box = _image_part(seen[vehicle], frame.image.section("head")[0])
+        if head is not None and vehicle in seen:
+            hidden, box = _image_part(seen[vehicle], head)
         size = " ".join(f"{float(state[key]):.4f}" for key in ("height_m", "width_m", "length_m"))
         lines.append(f"{name} {hidden} {alpha:.4f} {box} {size} {x:.4f} {y:.4f} {z:.4f} {rotation_y:.4f}\n")
     return "".join(lines)
 
 
-def _frames(recording: Recording, episode: Episode) -> Iterator[Frame]:
-    """The frames of one episode, each as soon as its messages are there.
-
-    Of a carrier with a camera only scans with an image of the same tick are frames: a recorder misses images.
-    """
-    with_image: set[tuple[int, int]] = set()
-    channels = ["world", "pointcloud"]
-    if "image" in recording.channels:
-        channels.append("image")
-        with_image = {
-            (int(message.section("head")[0]["vehicle"]), message.tick)
-            for message in recording.messages("image")
-            if int(message.header["episode"]) == episode.number
-        }
-    cameras = {vehicle for vehicle, _ in with_image}
-    states: dict[int, Array] = {}
-    scans: dict[tuple[int, int], Message] = {}
-    images: dict[tuple[int, int], Message] = {}
-    for message in recording.messages(*channels):
-        if int(message.header["episode"]) != episode.number:
-            continue
-        # Put it beside what waits for it.
-        if message.channel == "world":
-            states[message.tick] = message.section("states")
-            due = [key for key in scans if key[1] == message.tick]
-        else:
-            section, waiting = ("scan", scans) if message.channel == "pointcloud" else ("head", images)
-            key = (int(message.section(section)[0]["vehicle"]), message.tick)
-            if message.channel == "pointcloud" and key[0] in cameras and key not in with_image:
-                continue
-            waiting[key] = message
-            due = [key]
-        # Give the frames that are complete now.
-        for key in due:
-            if key in scans and key[1] in states and (key in images or key not in with_image):
-                yield Frame(scans.pop(key), states[key[1]], images.pop(key, None))
-        for old in [tick for tick in states if tick < message.tick - MOST_TICKS_APART]:
-            del states[old]
-        for messages in (scans, images):
-            for key in [key for key in messages if key[1] < message.tick - MOST_TICKS_APART]:
-                del messages[key]
-
-
 def write_kitti(recording: Recording, episode: Episode, path: Path) -> None:
     """Write one episode. Raises `RecordingError` if the recording has no `world`, no `pointcloud`, or no scan."""
-    require_channels(recording, "world", "pointcloud")
     path.mkdir(parents=True)
     users = RoadUsers(recording)
-    for frame in _frames(recording, episode):
-        _write_frame(path / str(int(frame.scan.section("scan")[0]["vehicle"])), frame, users)
+    for frame in frames(recording, episode):
+        _write_frame(path / str(frame.carrier), frame, users)
     if not any(path.iterdir()):
         raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles")
     for carrier in path.iterdir():
@@ -244,13 +147,10 @@ def _write_frame(carrier: Path, frame: Frame, users: RoadUsers) -> None:
     training, name = carrier / "training", f"{frame.scan.tick:06}"
     for folder in ("velodyne", "calib", "label_2", *(["image_2"] if frame.image is not None else [])):
         (training / folder).mkdir(parents=True, exist_ok=True)
-    scan, points = frame.scan.section("scan")[0], frame.scan.section("points")
-    rows = np.concatenate((forward_m(scan, points), points["intensity"][:, None]), 1).astype("<f4")
+    rows = np.concatenate((forward_m(frame.head, frame.points), frame.points["intensity"][:, None]), 1).astype("<f4")
     (training / "velodyne" / f"{name}.bin").write_bytes(rows.tobytes())
     calibration = Calibration.of(frame)
     (training / "calib" / f"{name}.txt").write_text(calibration.text(), encoding="utf-8")
     (training / "label_2" / f"{name}.txt").write_text(_labels(frame, calibration, users), encoding="utf-8")
-    if frame.image is not None:
-        planes = split_planes(frame.image.section("head")[0], frame.image.section("planes").tobytes())
-        if planes["rgb"] is not None:
-            Image.fromarray(planes["rgb"]).save(training / "image_2" / f"{name}.png")
+    if (rgb := frame.rgb) is not None:
+        Image.fromarray(rgb).save(training / "image_2" / f"{name}.png")

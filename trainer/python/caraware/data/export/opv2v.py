@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from caraware.data.export.scans import forward_m, require_channels
-from caraware.data.names import Kind
+from caraware.data.export.scans import box_middle, forward_m, require_channels
 from caraware.data.recording import Array, Episode, Message, Recording, RecordingError
 from caraware.ipc.arrays import Float64Array
 
@@ -61,9 +60,7 @@ def write_pcd(path: Path, position_m: Array, intensity: Array) -> None:
 
 def _box(state: np.void) -> dict[str, Any]:
     """OPV2V's label of a road user: its box stands on the ground at `location`."""
-    ahead_m = 0.0
-    if state["kind"] != Kind.PERSON:
-        ahead_m = float(state["length_m"]) / 2 - float(state["rear_overhang_m"])
+    ahead_m = float(box_middle(state)[0])
     x = float(state["x_m"]) + ahead_m * float(np.cos(state["yaw_rad"]))
     y = float(state["y_m"]) + ahead_m * float(np.sin(state["yaw_rad"]))
     angles = pose((x, y, state["z_m"]), (state["roll_rad"], state["pitch_rad"], state["yaw_rad"]))

@@ -1,10 +1,23 @@
-"""What the formats with LIDAR points share."""
+"""What the formats with LIDAR points share: frames of a carrier, poses as matrices, the camera's frame."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import numpy as np
 
-from caraware.data.recording import Array, Recording, RecordingError
+from caraware.data.names import Kind
+from caraware.data.recording import Array, Episode, Message, Recording, RecordingError
+from caraware.ipc.arrays import Float64Array
+from caraware.ipc.image import split_planes
+from caraware.ipc.pointcloud import rotation
+
+OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""KITTI's camera frame from ours (x along the optical axis, y left, z up)."""
+
+MOST_TICKS_APART = 256
+"""A message that waits for another one of its tick is dropped after so many ticks."""
 
 
 def require_channels(recording: Recording, *channels: str) -> None:
@@ -20,3 +33,176 @@ def forward_m(scan: np.void, points: Array) -> Array:
     if scan["axes"] == 1:  # the paper's: y backward, x left, z down
         position_m = np.stack((-position_m[:, 1], position_m[:, 0], -position_m[:, 2]), 1)
     return position_m
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What belongs to one frame of one carrier."""
+
+    scan: Message
+    states: Array
+    """All road users (`VehicleState`)."""
+    image: Message | None
+    """None for a carrier without a camera."""
+
+    @property
+    def carrier(self) -> int:
+        """Number of the carrier within the episode."""
+        return int(self.head["vehicle"])
+
+    @property
+    def head(self) -> np.void:
+        """The LIDAR (`Scan`)."""
+        head: np.void = self.scan.section("scan")[0]
+        return head
+
+    @property
+    def points(self) -> Array:
+        """`LidarPoint [count]`."""
+        return self.scan.section("points")
+
+    @property
+    def own(self) -> np.void:
+        """The state of the carrier."""
+        own: np.void = self.states[self.states["vehicle"] == self.head["vehicle"]][0]
+        return own
+
+    @property
+    def world_from_lidar(self) -> Float64Array:
+        """f64 [4, 4]: from x forward, y left, z up."""
+        return pose(self.head["position_m"], self.head["attitude_rad"])
+
+    @property
+    def camera(self) -> np.void | None:
+        """The camera (`ImageHead`)."""
+        return None if self.image is None else self.image.section("head")[0]
+
+    @property
+    def rgb(self) -> Array | None:
+        """u8 [height, width, 3]; None without a camera, and if colours are not recorded."""
+        if self.image is None:
+            return None
+        return split_planes(self.image.section("head")[0], self.image.section("planes").tobytes())["rgb"]
+
+    @property
+    def seen(self) -> dict[int, np.void]:
+        """`SeenObject` by number: the road users of which the image shows a pixel."""
+        if self.image is None:
+            return {}
+        return {int(user["object"]): user for user in self.image.section("objects")}
+
+    def labelled(self) -> list[np.void]:
+        """The states of all other road users with a point of the LIDAR, or with a pixel of the image."""
+        shown = set(np.unique(self.points["object"]).tolist()) | set(self.seen)
+        return [s for s in self.states if s["vehicle"] != self.head["vehicle"] and int(s["vehicle"]) in shown]
+
+
+def box_middle(state: np.void) -> Float64Array:
+    """f64 [4]: the middle of the lower face of a road user's box (`upright_pose`); of a person its place."""
+    ahead_m = 0.0
+    if state["kind"] != Kind.PERSON:
+        ahead_m = float(state["length_m"]) / 2 - float(state["rear_overhang_m"])
+    return np.array([ahead_m, 0.0, 0.0, 1.0])
+
+
+def pose(position_m: Array, attitude_rad: Array) -> Float64Array:
+    """f64 [4, 4]: world from a frame at this position (m) with this roll, pitch and heading (rad)."""
+    transform = rotated(rotation(*(float(angle) for angle in attitude_rad)))
+    transform[:3, 3] = position_m
+    return transform
+
+
+def vehicle_pose(state: np.void) -> Float64Array:
+    """f64 [4, 4]: world from the frame of a road user."""
+    position_m = np.array([state["x_m"], state["y_m"], state["z_m"]])
+    return pose(position_m, np.array([state["roll_rad"], state["pitch_rad"], state["yaw_rad"]]))
+
+
+def upright_pose(state: np.void) -> Float64Array:
+    """f64 [4, 4]: world from the box of a road user, which LIDARs and cameras see upright whatever its tilt is."""
+    return pose(np.array([state["x_m"], state["y_m"], state["z_m"]]), np.array([0.0, 0.0, state["yaw_rad"]]))
+
+
+def rotated(matrix: Float64Array) -> Float64Array:
+    """f64 [4, 4]: a rotation as a transform."""
+    transform = np.eye(4)
+    transform[:3, :3] = matrix
+    return transform
+
+
+def inverse(transform: Float64Array) -> Float64Array:
+    """The inverse of a rigid transform [4, 4]."""
+    inverse = rotated(transform[:3, :3].T)
+    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
+    return inverse
+
+
+def quaternion(rotation: Float64Array) -> list[float]:
+    """w, x, y, z of a rotation [3, 3], with w ≥ 0."""
+    # The eigenvector of the largest eigenvalue (Bar-Itzhack 2000): no case distinction, exact for rotations.
+    m = rotation
+    symmetric = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[1, 0] + m[0, 1], m[2, 0] + m[0, 2]],
+            [m[0, 2] - m[2, 0], m[1, 0] + m[0, 1], m[1, 1] - m[0, 0] - m[2, 2], m[2, 1] + m[1, 2]],
+            [m[1, 0] - m[0, 1], m[2, 0] + m[0, 2], m[2, 1] + m[1, 2], m[2, 2] - m[0, 0] - m[1, 1]],
+        ]
+    )
+    vector = np.linalg.eigh(symmetric)[1][:, -1]
+    return [float(value) for value in (vector if vector[0] >= 0 else -vector)]
+
+
+def projection(head: np.void) -> Float64Array:
+    """f64 [3, 4]: the pinhole of an image (docs/camera.md)."""
+    focal, width, height = float(head["focal_px"]), int(head["width"]), int(head["height"])
+    return np.array([[focal, 0, (width - 1) / 2, 0], [0, focal, (height - 1) / 2, 0], [0, 0, 1, 0]])
+
+
+def filmed(recording: Recording, episode: Episode) -> set[tuple[int, int]]:
+    """Vehicle and tick of every recorded image of an episode."""
+    if "image" not in recording.channels:
+        return set()
+    return {
+        (int(message.section("head")[0]["vehicle"]), message.tick)
+        for message in recording.messages("image")
+        if int(message.header["episode"]) == episode.number
+    }
+
+
+def frames(recording: Recording, episode: Episode, *, every_scan: bool = False) -> Iterator[Frame]:
+    """The frames of one episode, each as soon as its messages are there; of one carrier in the order of ticks.
+
+    Of a carrier with a camera only scans with an image of the same tick are frames, unless `every_scan` is asked for:
+    a recorder misses images. Raises `RecordingError` without `world` or `pointcloud`.
+    """
+    require_channels(recording, "world", "pointcloud")
+    channels = ["world", "pointcloud", *(["image"] if "image" in recording.channels else [])]
+    with_image = filmed(recording, episode)
+    cameras = {vehicle for vehicle, _ in with_image}
+    states: dict[int, Array] = {}
+    scans: dict[tuple[int, int], Message] = {}
+    images: dict[tuple[int, int], Message] = {}
+    for message in recording.messages(*channels):
+        if int(message.header["episode"]) != episode.number:
+            continue
+        # Put it beside what waits for it.
+        if message.channel == "world":
+            states[message.tick] = message.section("states")
+            due = [key for key in scans if key[1] == message.tick]
+        else:
+            section, waiting = ("scan", scans) if message.channel == "pointcloud" else ("head", images)
+            key = (int(message.section(section)[0]["vehicle"]), message.tick)
+            if message.channel == "pointcloud" and not every_scan and key[0] in cameras and key not in with_image:
+                continue
+            waiting[key] = message
+            due = [key]
+        # Give the frames that are complete now.
+        for key in due:
+            if key in scans and key[1] in states and (key in images or key not in with_image):
+                yield Frame(scans.pop(key), states[key[1]], images.pop(key, None))
+        for old in [tick for tick in states if tick < message.tick - MOST_TICKS_APART]:
+            del states[old]
+        for messages in (scans, images):
+            for key in [key for key in messages if key[1] < message.tick - MOST_TICKS_APART]:
+                del messages[key]

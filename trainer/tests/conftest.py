@@ -1,0 +1,22 @@
+"""Runs that several test modules read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from recorded_run import ASKEW, RecordedFrame, of_carriers, recorded_run
+
+
+@pytest.fixture(scope="session")
+def askew_run() -> Iterator[Path]:
+    """A recorded run of three carriers with sensors that are mounted off-centre and turned."""
+    with recorded_run("simulate", ASKEW) as run_dir:
+        yield run_dir
+
+
+@pytest.fixture(scope="session")
+def askew_frames(askew_run: Path) -> dict[tuple[int, int], RecordedFrame]:
+    """Its frames by vehicle and tick."""
+    return of_carriers(askew_run)
