@@ -54,9 +54,10 @@ $(VENV)/.sumo: requirements.lock
 	touch $@
 
 # The pins are in requirements.lock; the packages of this project are installed in place.
-$(VENV)/.installed: $(VENV)/.sumo requirements.lock trainer/pyproject.toml viewer/pyproject.toml bench/pyproject.toml
+$(VENV)/.installed: $(VENV)/.sumo requirements.lock trainer/requirements-devkits.txt trainer/pyproject.toml viewer/pyproject.toml bench/pyproject.toml
 	@echo "installing Python's packages into $(VENV): 7 GB on disk"
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet -r requirements.lock
+	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps -r trainer/requirements-devkits.txt
 	printf '%s\n' "$(CURDIR)/trainer/python" "$(CURDIR)/bench/python" \
 		> $$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/caraware.pth
 	$(VENV)/bin/pip install --disable-pip-version-check --quiet --no-deps --no-build-isolation --editable ./viewer

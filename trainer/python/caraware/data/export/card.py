@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from caraware import _native
-from caraware.data.recording import Recording
+from caraware.data.recording import Episode, Recording
 
 SENSORS = ("gnss", "imu", "speed_steering", "lidar", "ultrasonic", "camera")
 """Tables of the configuration that describe sensors."""
@@ -57,6 +57,21 @@ def card(recording: Recording, format_name: str, meaning: str, parts: list[str])
         "",
     ]
     return "\n".join(lines)
+
+
+def source(recording: Recording, episode: Episode) -> dict[str, str]:
+    """What a part of an export is of, for formats whose files have room for it."""
+    start = recording.start
+    about = {
+        "caraware.run": start["run"],
+        "caraware.seed": start["seed"],
+        "caraware.episode": episode.number,
+        "caraware.episode_seed": episode.seed,
+        "caraware.config_hash": start["config_hash"],
+        "caraware.schema_version": start["schema_version"],
+        "caraware.program_version": start["program_version"],
+    }
+    return {name: str(value) for name, value in about.items()}
 
 
 def _settings(values: dict[str, Any]) -> list[str]:

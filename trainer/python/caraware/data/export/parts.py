@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from caraware.data.export import fcd, kitti, minari, opv2v, tables
+from caraware.data.export import fcd, foxglove, kitti, minari, nuscenes, opv2v, ros2, tables
 from caraware.data.recording import Episode, Recording, open_recording
 
 
@@ -36,6 +36,12 @@ FORMATS = {
         "fcd.xml",
         fcd.write_fcd,
     ),
+    "foxglove": ExportFormat(
+        "Foxglove MCAP",
+        "Messages in Foxglove's schemas: transforms, boxes, true motion, GNSS, points and images.",
+        "foxglove.mcap",
+        foxglove.write_foxglove,
+    ),
     "kitti": ExportFormat(
         "KITTI",
         "Objects: a directory for each vehicle with a LIDAR, with points, calibration, labels and images.",
@@ -49,11 +55,24 @@ FORMATS = {
         minari.write_minari,
         minari.join_parts,
     ),
+    "nuscenes": ExportFormat(
+        "nuScenes",
+        "Perception: a scene for each vehicle with a LIDAR and each episode, with sweeps, images, poses and boxes.",
+        "nuscenes",
+        nuscenes.write_nuscenes,
+        nuscenes.join_parts,
+    ),
     "opv2v": ExportFormat(
         "OPV2V",
         "Cooperative perception: a directory for each agent with its points, poses and labels, in CARLA's frame.",
         "opv2v",
         opv2v.write_opv2v,
+    ),
+    "ros2": ExportFormat(
+        "ROS 2 bag",
+        "A bag in MCAP with common messages: transforms, markers, odometry, GNSS, IMU, points and images.",
+        "ros2",
+        ros2.write_ros2,
     ),
 }
 """Every format of `--to`."""

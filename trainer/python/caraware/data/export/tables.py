@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
+from caraware.data.export.card import source
 from caraware.data.export.rows import table
 from caraware.data.names import RoadUsers
 from caraware.data.recording import Episode, Recording
@@ -19,15 +20,7 @@ MEANING = "One row for each vehicle-tick: truth, sensors, observation, predictio
 def _described(recording: Recording, episode: Episode) -> pa.Table:
     """The table of an episode, with what it is of in its schema."""
     rows = table(recording, episode, RoadUsers(recording))
-    start = recording.start
-    about = {
-        "caraware.run": start["run"],
-        "caraware.seed": start["seed"],
-        "caraware.episode_seed": episode.seed,
-        "caraware.config_hash": start["config_hash"],
-        "caraware.schema_version": start["schema_version"],
-    }
-    return rows.replace_schema_metadata({name: str(value) for name, value in about.items()})
+    return rows.replace_schema_metadata(source(recording, episode))
 
 
 def write_parquet(recording: Recording, episode: Episode, path: Path) -> None:

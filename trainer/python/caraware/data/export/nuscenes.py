@@ -1,0 +1,353 @@
+"""nuScenes: a scene for each vehicle with a LIDAR in each episode, with its sweeps, images, poses and boxes.
+
+A part is a directory of one episode with its files and its rows of the tables; the data set is made of all parts: the
+tables of nuScenes' devkit in `v1.0-caraware/`, whose file names are those of the parts. Frames are nuScenes': the ego
+frame is ours; the LIDAR's has x right and y forward; the camera's has x right, y down and z forward.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from caraware.data.export.scans import (
+    OPTICAL,
+    Frame,
+    box_middle,
+    filmed,
+    forward_m,
+    frames,
+    inverse,
+    pose,
+    projection,
+    quaternion,
+    rotated,
+    upright_pose,
+    vehicle_pose,
+)
+from caraware.data.names import Kind, RoadUsers
+from caraware.data.recording import Episode, Recording, RecordingError
+from caraware.ipc.arrays import Float64Array
+
+VERSION = "v1.0-caraware"
+"""Directory of the tables, and `version` of the devkit's `NuScenes`."""
+
+KEY_FRAME_S = 0.5
+"""Least time between two key frames, as in nuScenes; the scans between are sweeps."""
+
+MOVING_MPS = 0.2
+"""Speed from which a road user has the attribute that says so."""
+
+LIDAR_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""Ours (x forward, y left) from the frame of `LIDAR_TOP` (x right, y forward)."""
+
+CATEGORIES = {
+    "human.pedestrian.adult": ("pedestrian",),
+    "human.pedestrian.wheelchair": ("wheelchair",),
+    "vehicle.bicycle": ("bicycle",),
+    "vehicle.bus.bendy": ("tram", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car"),
+    "vehicle.bus.rigid": ("bus", "coach"),
+    "vehicle.car": (),
+    "vehicle.emergency.ambulance": ("emergency",),
+    "vehicle.emergency.police": ("authority",),
+    "vehicle.motorcycle": ("motorcycle", "moped", "scooter"),
+    "vehicle.truck": ("truck", "trailer"),
+}
+"""nuScenes' categories by SUMO's classes; the classes that are missing are cars. Trams have no category there."""
+
+ATTRIBUTES = {
+    "vehicle": ("vehicle.moving", "vehicle.stopped"),
+    "cycle": ("cycle.with_rider", "cycle.with_rider"),
+    "pedestrian": ("pedestrian.moving", "pedestrian.standing"),
+}
+"""Attributes of road users that move and that do not, by group."""
+
+VISIBILITIES = {"1": "v0-40", "2": "v40-60", "3": "v60-80", "4": "v80-100"}
+"""Levels of visibility by their tokens."""
+
+SENSORS = {"LIDAR_TOP": "lidar", "CAM_FRONT": "camera"}
+"""Modalities by channel."""
+
+TABLES = (
+    *("category", "attribute", "visibility", "instance", "sensor", "calibrated_sensor", "ego_pose"),
+    *("log", "scene", "sample", "sample_data", "sample_annotation", "map"),
+)
+"""The tables of the devkit."""
+
+Row = dict[str, Any]
+
+
+def token(*words: object) -> str:
+    """The token of a row: 32 hexadecimal digits, the same for the same words."""
+    return blake2b("/".join(str(word) for word in words).encode(), digest_size=16).hexdigest()
+
+
+def category(state: np.void, vehicle_class: str) -> str:
+    """nuScenes' category of a road user, from SUMO's class or, where that is not recorded, from its size."""
+    if state["kind"] == Kind.PERSON and vehicle_class != "wheelchair":
+        return "human.pedestrian.adult"
+    if vehicle_class:
+        return next((name for name, classes in CATEGORIES.items() if vehicle_class in classes), "vehicle.car")
+    if state["width_m"] < 1.1:
+        return "vehicle.bicycle" if state["length_m"] < 1.9 else "vehicle.motorcycle"
+    if state["length_m"] >= 10 and state["height_m"] < 3.7:
+        return "vehicle.bus.rigid"
+    return "vehicle.truck" if state["length_m"] > 6 or state["height_m"] > 2.1 else "vehicle.car"
+
+
+def attribute(state: np.void, category_name: str) -> str:
+    """nuScenes' attribute of a road user."""
+    group = "cycle" if category_name in ("vehicle.bicycle", "vehicle.motorcycle") else category_name.split(".")[0]
+    moving, still = ATTRIBUTES["pedestrian" if group == "human" else group]
+    return moving if float(np.hypot(*state["velocity_body_mps"][:2])) >= MOVING_MPS else still
+
+
+def _visibility(frame: Frame, vehicle: int) -> str:
+    """The token of the share of a road user's box that the image shows; empty for a carrier without a camera."""
+    camera = frame.camera
+    if camera is None:
+        return ""
+    if vehicle not in frame.seen:
+        return "1"
+    seen = frame.seen[vehicle]
+    left, top, right, bottom = np.clip(seen["full_box_px"], 0, [camera["width"], camera["height"]] * 2)
+    share = float(seen["visible_px"]) / max(float((right - left) * (bottom - top)), 1.0)
+    return str(1 + sum(share >= least for least in (0.4, 0.6, 0.8)))
+
+
+@dataclass
+class _Scene:
+    """The rows of one carrier in an episode, in the order in which they are written."""
+
+    name: str
+    run: str
+    part: Path
+    """Directory of the files."""
+    log_token: str
+    """Of the episode."""
+    tick_s: float
+    with_camera: bool
+    """Its key frames have an image."""
+    users: RoadUsers
+    rows: dict[str, list[Row]] = field(default_factory=lambda: {table: [] for table in TABLES})
+    key_tick: int | None = None
+    """Of the newest key frame."""
+    waiting: list[Row] = field(default_factory=list)
+    """Files since the newest key frame: they belong to the next."""
+    newest: dict[str, Row] = field(default_factory=dict)
+    """The newest row of each chain."""
+    instances: dict[str, Row] = field(default_factory=dict)
+    """Road users with a box, by their tokens."""
+
+    def token(self, *words: object) -> str:
+        """A token of this scene."""
+        return token(self.run, self.name, *words)
+
+    def add(self, frame: Frame) -> None:
+        """Add a frame: a key frame if it is time for one and every sensor of the carrier has delivered."""
+        tick, rgb = frame.scan.tick, frame.rgb
+        is_due = self.key_tick is None or (tick - self.key_tick) * self.tick_s >= KEY_FRAME_S - 1e-9
+        is_key = is_due and (rgb is not None or not self.with_camera)
+        points = np.zeros((len(frame.points), 5), "<f4")
+        points[:, :3] = forward_m(frame.head, frame.points) @ LIDAR_AXES
+        points[:, 3], points[:, 4] = frame.points["intensity"] * 255, frame.points["channel"]
+        lidar = frame.world_from_lidar @ rotated(LIDAR_AXES)
+        self._file(frame, "LIDAR_TOP", is_key, lidar, "pcd.bin").write_bytes(points.tobytes())
+        if rgb is not None and frame.camera is not None:
+            camera = pose(frame.camera["position_m"], frame.camera["attitude_rad"]) @ rotated(OPTICAL.T)
+            Image.fromarray(rgb).save(self._file(frame, "CAM_FRONT", is_key, camera, "png"))
+        if is_key:
+            self.key_tick = tick
+            self._sample(frame)
+
+    def finish(self) -> None:
+        """Give the last sweeps to the last key frame, and write what is known only now."""
+        samples = self.rows["sample"]
+        if not samples:
+            # No frame had all sensors: the scene has no key frame, and the devkit has no place for it.
+            for table in self.rows.values():
+                table.clear()
+            return
+        for row in self.waiting:
+            row["sample_token"] = samples[-1]["token"]
+        self.rows["instance"] = list(self.instances.values())
+        self.rows["scene"].append(
+            {
+                "token": self.token(),
+                "log_token": self.log_token,
+                "nbr_samples": len(samples),
+                "first_sample_token": samples[0]["token"],
+                "last_sample_token": samples[-1]["token"],
+                "name": self.name,
+                "description": f"{self.run}, {self.name}",
+            }
+        )
+
+    def _link(self, table: str, chain: str, row: Row) -> None:
+        """Append a row to a table and to a chain of rows, which `prev` and `next` link."""
+        before = self.newest.get(chain)
+        row |= {"prev": "" if before is None else before["token"], "next": ""}
+        if before is not None:
+            before["next"] = row["token"]
+        self.newest[chain] = row
+        self.rows[table].append(row)
+
+    def _file(self, frame: Frame, channel: str, is_key: bool, world_from_sensor: Float64Array, ending: str) -> Path:
+        """Add the row of a file of a sensor, with the pose of the carrier and of the sensor on it; return its path."""
+        tick = frame.scan.tick
+        name = Path("samples" if is_key else "sweeps") / channel / f"{self.name}__{channel}__{tick:06}.{ending}"
+        path = self.part / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        timestamp = round(tick * self.tick_s * 1e6)
+        ego = self.token("ego_pose", channel, tick)
+        world_from_ego = vehicle_pose(frame.own)
+        self.rows["ego_pose"].append({"token": ego, "timestamp": timestamp, **_placed(world_from_ego)})
+        camera = frame.camera if channel == "CAM_FRONT" else None
+        row = {
+            "token": self.token(channel, tick),
+            "sample_token": "",
+            "ego_pose_token": ego,
+            "calibrated_sensor_token": self._calibration(channel, inverse(world_from_ego) @ world_from_sensor, camera),
+            "timestamp": timestamp,
+            "fileformat": ending.split(".")[0],
+            "is_key_frame": is_key,
+            "height": 0 if camera is None else int(camera["height"]),
+            "width": 0 if camera is None else int(camera["width"]),
+            "filename": str(name),
+        }
+        self._link("sample_data", channel, row)
+        self.waiting.append(row)
+        return path
+
+    def _calibration(self, channel: str, ego_from_sensor: Float64Array, camera: np.void | None) -> str:
+        """The token of a sensor's mounting; one that has not changed by more than the rounding of poses is the same."""
+        intrinsic = [] if camera is None else projection(camera)[:, :3].tolist()
+        known = self.token(channel, np.round(ego_from_sensor, 4).tolist(), intrinsic)
+        if all(row["token"] != known for row in self.rows["calibrated_sensor"]):
+            row = {"token": known, "sensor_token": token(channel), **_placed(ego_from_sensor)}
+            self.rows["calibrated_sensor"].append(row | {"camera_intrinsic": intrinsic})
+        return known
+
+    def _sample(self, frame: Frame) -> None:
+        """Add a key frame with its boxes, to which the files since the one before belong."""
+        sample = self.token("sample", frame.scan.tick)
+        for row in self.waiting:
+            row["sample_token"] = sample
+        self.waiting.clear()
+        timestamp = round(frame.scan.tick * self.tick_s * 1e6)
+        self._link("sample", "sample", {"token": sample, "timestamp": timestamp, "scene_token": self.token()})
+        hit, counts = np.unique(frame.points["object"], return_counts=True)
+        points_on = dict(zip(hit.tolist(), counts.tolist(), strict=True))
+        for state in frame.labelled():
+            self._annotate(frame, state, sample, points_on.get(int(state["vehicle"]), 0))
+
+    def _annotate(self, frame: Frame, state: np.void, sample: str, points: int) -> None:
+        """Add the box of a road user in a key frame, and count it for its instance."""
+        vehicle = int(state["vehicle"])
+        name = category(state, self.users.of(state["id_hash"]).vehicle_class)
+        # Numbers of vehicles are used again, ids are not.
+        instance, row = self.token("instance", state["id_hash"]), self.token("box", sample, state["id_hash"])
+        world_from_box = upright_pose(state)
+        centre = world_from_box @ (box_middle(state) + np.array([0, 0, float(state["height_m"]) / 2, 0]))
+        self._link(
+            "sample_annotation",
+            f"instance {instance}",
+            {
+                "token": row,
+                "sample_token": sample,
+                "instance_token": instance,
+                "visibility_token": _visibility(frame, vehicle),
+                "attribute_tokens": [token(attribute(state, name))],
+                "translation": [float(value) for value in centre[:3]],
+                "size": [float(state[key]) for key in ("width_m", "length_m", "height_m")],
+                "rotation": quaternion(world_from_box[:3, :3]),
+                "num_lidar_pts": points,
+                "num_radar_pts": 0,
+            },
+        )
+        of_instance = self.instances.setdefault(
+            instance,
+            {"token": instance, "category_token": token(name), "nbr_annotations": 0, "first_annotation_token": row},
+        )
+        of_instance |= {"nbr_annotations": of_instance["nbr_annotations"] + 1, "last_annotation_token": row}
+
+
+def _placed(transform: Float64Array) -> Row:
+    """A transform [4, 4] as the tables have it."""
+    return {"translation": [float(value) for value in transform[:3, 3]], "rotation": quaternion(transform[:3, :3])}
+
+
+def write_nuscenes(recording: Recording, episode: Episode, path: Path) -> None:
+    """Write one episode. Raises `RecordingError` if the recording has no `world`, no `pointcloud`, or no scan."""
+    path.mkdir(parents=True)
+    users, run = RoadUsers(recording), str(recording.start["run"])
+    log = token(run, "log", episode.number)
+    has_colours = bool(recording.run["config"]["camera"]["rgb"])
+    cameras = {vehicle for vehicle, _ in filmed(recording, episode)} if has_colours else set()
+    scenes: dict[int, _Scene] = {}
+    for frame in frames(recording, episode, every_scan=True):
+        vehicle = frame.carrier
+        if vehicle not in scenes:
+            name = f"scene-{episode.number:05}-{vehicle}"
+            scenes[vehicle] = _Scene(name, run, path, log, recording.tick_s, vehicle in cameras, users)
+        scenes[vehicle].add(frame)
+    if not scenes:
+        raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles")
+    rows: dict[str, list[Row]] = {table: [] for table in TABLES}
+    for scene in scenes.values():
+        scene.finish()
+        for table, added in scene.rows.items():
+            rows[table] += added
+    rows["log"].append(
+        {"token": log, "logfile": run, "vehicle": "caraware", "date_captured": "", "location": run}
+        | {"is_evaluation": episode.is_evaluation, "seed": episode.seed}
+    )
+    (path / "tables.json").write_text(json.dumps(rows), encoding="utf-8")
+
+
+def join_parts(recording: Recording, directory: Path, parts: Sequence[str]) -> None:
+    """Make the tables of the devkit of all parts, with the scenes of training and of evaluation as its splits."""
+    tables: dict[str, list[Row]] = {table: [] for table in TABLES}
+    splits: dict[str, list[str]] = {"training": [], "evaluation": []}
+    for part in parts:
+        rows: dict[str, list[Row]] = json.loads((directory / part / "tables.json").read_text(encoding="utf-8"))
+        for row in rows["sample_data"]:
+            row["filename"] = f"{part}/{row['filename']}"
+        for table, added in rows.items():
+            tables[table] += added
+        is_evaluation = rows["log"][0]["is_evaluation"]
+        splits["evaluation" if is_evaluation else "training"] += [scene["name"] for scene in rows["scene"]]
+    attributes = sorted({name for names in ATTRIBUTES.values() for name in names})
+    tables["category"] = [{"token": token(name), "name": name, "description": ""} for name in CATEGORIES]
+    tables["attribute"] = [{"token": token(name), "name": name, "description": ""} for name in attributes]
+    tables["visibility"] = [
+        {"token": level, "level": name, "description": f"visibility {name[1:]} %"}
+        for level, name in VISIBILITIES.items()
+    ]
+    tables["sensor"] = [
+        {"token": token(channel), "channel": channel, "modality": modality} for channel, modality in SENSORS.items()
+    ]
+    # The devkit wants a raster map; a recording has none, so it is one pixel of background.
+    mask = f"{VERSION}/map.png"
+    logs = [row["token"] for row in tables["log"]]
+    tables["map"] = [
+        {"token": token("map"), "log_tokens": logs, "category": "semantic_prior", "filename": mask},
+    ]
+    partial = directory / f".{VERSION}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    for table, whole in tables.items():
+        (partial / f"{table}.json").write_text(json.dumps(whole), encoding="utf-8")
+    (partial / "splits.json").write_text(json.dumps(splits), encoding="utf-8")
+    Image.new("L", (1, 1)).save(partial / "map.png")
+    shutil.rmtree(directory / VERSION, ignore_errors=True)
+    os.replace(partial, directory / VERSION)
