@@ -6,8 +6,6 @@ nothing with the export.
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +13,14 @@ import numpy as np
 import pytest
 from caraware.data import RecordingError, open_recording
 from caraware.data.export.__main__ import export
+from caraware.data.export.oxts import Geodesy
 from caraware.data.names import RoadUsers
 from caraware.data.recording import Array
 from caraware.ipc.arrays import Float64Array
 from caraware.ipc.image import split_planes
+from caraware.ipc.pointcloud import rotation
 from PIL import Image
+from pykitti.utils import load_oxts_packets_and_poses
 from recorded_run import ASKEW, RecordedFrame, in_world_m, recorded_run, unseen
 
 TILT_M = 0.15
@@ -129,23 +130,28 @@ class Compared(RecordedFrame):
 
 
 @pytest.fixture(scope="module")
-def frames(askew_run: Path, askew_frames: dict[tuple[int, int], RecordedFrame]) -> Iterator[list[Compared]]:
+def kitti(askew_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The exported episode."""
+    directory = tmp_path_factory.mktemp("kitti")
+    assert export(askew_run, "kitti", directory, 1, unseen) == 1
+    return directory / "episode-00000.kitti"
+
+
+@pytest.fixture(scope="module")
+def frames(kitti: Path, askew_frames: dict[tuple[int, int], RecordedFrame]) -> list[Compared]:
     """Every frame of every carrier beside its messages."""
-    with tempfile.TemporaryDirectory() as directory:
-        assert export(askew_run, "kitti", Path(directory), 1, unseen) == 1
-        part = Path(directory) / "episode-00000.kitti"
-        read = []
-        for carrier in sorted(part.iterdir()):
-            names = (carrier / "ImageSets" / "train.txt").read_text().split()
-            vehicle, ticks = int(carrier.name), {int(name) for name in names}
-            # A carrier with a camera has the frames with an image, another one has all its scans.
-            own = {tick: frame for (number, tick), frame in askew_frames.items() if number == vehicle}
-            filmed = {tick for tick, frame in own.items() if frame.image is not None}
-            assert ticks == (filmed or set(own)) and len(ticks) > 20
-            for name in names:
-                sample = Sample.read(carrier / "training", name)
-                read.append(Compared(**vars(own[int(name)]), sample=sample))
-        yield read
+    read = []
+    for carrier in sorted(kitti.iterdir()):
+        names = (carrier / "ImageSets" / "train.txt").read_text().split()
+        vehicle, ticks = int(carrier.name), {int(name) for name in names}
+        # A carrier with a camera has the frames with an image, another one has all its scans.
+        own = {tick: frame for (number, tick), frame in askew_frames.items() if number == vehicle}
+        filmed = {tick for tick, frame in own.items() if frame.image is not None}
+        assert ticks == (filmed or set(own)) and len(ticks) > 20
+        for name in names:
+            sample = Sample.read(carrier / "training", name)
+            read.append(Compared(**vars(own[int(name)]), sample=sample))
+    return read
 
 
 def test_points_lie_where_they_were_recorded(frames: list[Compared]) -> None:
@@ -239,6 +245,48 @@ def test_the_image_shows_what_labels_and_points_project_to(frames: list[Compared
     straight, mirrored = (np.concatenate(on_object[is_mirrored]) for is_mirrored in (False, True))
     assert boxes > 30 and 0 in hidden and len(hidden) > 1
     assert len(straight) > 300 and straight.mean() > 0.75 and mirrored.mean() < 0.4
+
+
+def test_pykitti_reads_the_true_motion_of_the_carrier(
+    kitti: Path, askew_run: Path, askew_frames: dict[tuple[int, int], RecordedFrame]
+) -> None:
+    recording = open_recording(askew_run)
+    for carrier in sorted(kitti.iterdir()):
+        files = sorted((carrier / "training" / "oxts").iterdir())
+        own = [askew_frames[int(carrier.name), int(file.stem)].own for file in files]
+        times_s = np.loadtxt(carrier / "training" / "times.txt")
+        assert times_s == pytest.approx([int(file.stem) * recording.tick_s for file in files])
+        read = load_oxts_packets_and_poses([str(file) for file in files])
+        first_m = np.array([own[0]["x_m"], own[0]["y_m"], own[0]["z_m"]])
+        for (packet, pose), state in zip(read, own, strict=True):
+            # pykitti's Mercator projection is the world's, but for the origin and for its sphere: 0.5 % of the way.
+            place_m = np.array([state["x_m"], state["y_m"], state["z_m"]])
+            assert pose[:3, 3] == pytest.approx(place_m - first_m, abs=0.005 * np.linalg.norm(place_m - first_m) + 1e-3)
+            attitude = rotation(state["roll_rad"], state["pitch_rad"], state["yaw_rad"])
+            assert np.allclose(pose[:3, :3], attitude, atol=1e-6)
+            # Velocities of the level frame and of the map are the same motion.
+            moved = np.array([packet.ve, packet.vn, packet.vu])
+            assert np.allclose(attitude @ state["velocity_body_mps"], moved, atol=1e-6)
+            ahead = [np.cos(packet.yaw), np.sin(packet.yaw)]
+            assert np.dot(ahead, moved[:2]) == pytest.approx(packet.vf, abs=1e-6)
+            assert np.dot([-ahead[1], ahead[0]], moved[:2]) == pytest.approx(packet.vl, abs=1e-6)
+            measured = np.array([packet.ax, packet.ay, packet.az]) - state["accel_body_mps2"]
+            assert np.allclose(attitude @ measured, [0, 0, 9.80665], atol=1e-5)
+            rate = np.array([packet.wx, packet.wy, packet.wz])
+            assert np.allclose(rate, state["angular_rate_body_radps"], atol=1e-6)
+        assert np.linalg.norm(read[-1].T_w_imu[:3, 3]) > 20
+
+
+def test_latitudes_are_those_of_the_gnss_receivers(askew_run: Path) -> None:
+    """A recorded fix has its place in the world and on the ellipsoid, which another program computed."""
+    recording = open_recording(askew_run)
+    geodesy, compared = Geodesy(recording), 0
+    for message in list(recording.messages("observation"))[::20]:
+        for place, geodetic in zip(message.section("gnss_m"), message.section("gnss_geodetic"), strict=True):
+            if np.isfinite(geodetic).all():
+                assert geodesy.of(*place[:2].tolist()) == pytest.approx(geodetic[:2], abs=2e-9 + 1e-3 / 111e3)
+                compared += 1
+    assert compared > 50
 
 
 def test_a_recording_without_points_is_refused(tmp_path: Path) -> None:

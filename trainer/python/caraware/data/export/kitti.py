@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from caraware.data.export.oxts import Geodesy, packet
 from caraware.data.export.scans import (
     OPTICAL,
     Frame,
@@ -131,9 +132,11 @@ def _labels(frame: Frame, calibration: Calibration, users: RoadUsers) -> str:
 def write_kitti(recording: Recording, episode: Episode, path: Path) -> None:
     """Write one episode. Raises `RecordingError` if the recording has no `world`, no `pointcloud`, or no scan."""
     path.mkdir(parents=True)
-    users = RoadUsers(recording)
+    users, geodesy = RoadUsers(recording), Geodesy(recording)
     for frame in frames(recording, episode):
-        _write_frame(path / str(frame.carrier), frame, users)
+        carrier = path / str(frame.carrier)
+        _write_frame(carrier, frame, users)
+        (carrier / "training" / "oxts" / f"{frame.scan.tick:06}.txt").write_text(packet(frame.own, geodesy))
     if not any(path.iterdir()):
         raise RecordingError(f"{recording.path}: no vehicle carries a LIDAR: set lidar.vehicles")
     for carrier in path.iterdir():
@@ -141,11 +144,14 @@ def write_kitti(recording: Recording, episode: Episode, path: Path) -> None:
         sets = carrier / "ImageSets"
         sets.mkdir()
         (sets / "train.txt").write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+        # As KITTI's odometry benchmark has it: seconds, a line for each frame.
+        times = "".join(f"{int(name) * recording.tick_s:e}\n" for name in names)
+        (carrier / "training" / "times.txt").write_text(times, encoding="utf-8")
 
 
 def _write_frame(carrier: Path, frame: Frame, users: RoadUsers) -> None:
     training, name = carrier / "training", f"{frame.scan.tick:06}"
-    for folder in ("velodyne", "calib", "label_2", *(["image_2"] if frame.image is not None else [])):
+    for folder in ("velodyne", "calib", "label_2", "oxts", *(["image_2"] if frame.image is not None else [])):
         (training / folder).mkdir(parents=True, exist_ok=True)
     rows = np.concatenate((forward_m(frame.head, frame.points), frame.points["intensity"][:, None]), 1).astype("<f4")
     (training / "velodyne" / f"{name}.bin").write_bytes(rows.tobytes())
