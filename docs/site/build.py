@@ -53,7 +53,14 @@ NAVIGATION = {
         "docs/paper",
         "docs/reproduce",
     ],
-    "Watching and recording": ["docs/viewer", "docs/panel", "docs/remote", "docs/fanout", "docs/recording"],
+    "Watching and recording": [
+        "docs/viewer",
+        "docs/panel",
+        "docs/remote",
+        "docs/fanout",
+        "docs/metrics",
+        "docs/recording",
+    ],
     "Inside": ["ARCHITECTURE", "docs/extending", "docs/benchmarks", "docs/decisions/README"],
 }
 """The menu: heading -> pages, by their paths without `.md`."""

@@ -60,6 +60,19 @@ pub enum Subcommands {
         #[arg(long)]
         json: bool,
     },
+    /// Print how a live run fares as lines of JSON, or serve it to Prometheus
+    #[command(after_help = METRICS)]
+    Metrics(MetricsArgs),
+    /// Write what runs have reached, with plots and a comparison, as Markdown or HTML
+    #[command(
+        disable_help_flag = true,
+        after_help = "`caraware report --help` lists the options; docs/metrics.md describes what is written."
+    )]
+    Report {
+        /// The runs and the options, as the module `caraware.report.document` takes them
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENT")]
+        arguments: Vec<OsString>,
+    },
     /// Replace the trainer of a live run; the simulation continues, and no observation is lost
     #[command(after_help = HANDOVER)]
     Handover(HandoverArgs),
@@ -461,14 +474,43 @@ pub struct GenerateArgs {
     pub speed_kmh: f64,
 }
 
+const METRICS: &str = "Examples:
+  caraware metrics                               a line of JSON each second until the run ends
+  caraware metrics town-1 --interval-s 10 > town-1.jsonl
+  caraware metrics --prometheus                  http://127.0.0.1:9464/metrics
+
+What has no password listens on this machine alone, unless you give another address.";
+
+/// Arguments of `metrics`.
+#[derive(Debug, Args, Clone)]
+pub struct MetricsArgs {
+    /// Name of the run, or its directory; may be left out if only one is alive
+    pub run: Option<String>,
+    /// Wall time between two measurements, seconds
+    #[arg(long, value_name = "SECONDS", default_value = "1", value_parser = interval)]
+    pub interval_s: f64,
+    /// Answer Prometheus at this address until the run ends
+    #[arg(long, value_name = "HOST:PORT", num_args = 0..=1, require_equals = true, default_missing_value = "127.0.0.1:9464")]
+    pub prometheus: Option<String>,
+}
+
+/// Parses a time between two measurements.
+fn interval(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if (0.5..=86_400.0).contains(&seconds) => Ok(seconds),
+        _ => Err("0.5 to 86400 seconds".to_owned()),
+    }
+}
+
 /// Arguments of `export`.
 #[derive(Debug, Args, Clone)]
 pub struct ExportArgs {
     /// A recording: its file, or the directory or name of its run
     pub recording: PathBuf,
     /// Format: tables of vehicle-ticks (parquet, csv), SUMO's floating car data (fcd), cooperative perception (opv2v), points
-    /// and images with boxes (kitti), or offline reinforcement learning (minari)
-    #[arg(long, value_name = "FORMAT", value_parser = ["parquet", "csv", "fcd", "opv2v", "kitti", "minari"])]
+    /// and images with boxes (kitti, nuscenes), offline reinforcement learning (minari), or messages for the tools of robotics
+    /// (foxglove, ros2)
+    #[arg(long, value_name = "FORMAT", value_parser = ["parquet", "csv", "fcd", "opv2v", "kitti", "nuscenes", "minari", "foxglove", "ros2"])]
     pub to: String,
     /// Directory to write to; parts that it has are kept [default: export-FORMAT beside the recording]
     #[arg(long, value_name = "DIRECTORY")]

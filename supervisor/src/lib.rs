@@ -21,6 +21,7 @@ pub mod install;
 pub mod live_table;
 pub mod maps;
 pub mod memory_limit;
+pub mod metrics;
 pub mod panel;
 pub mod phase;
 pub mod prepare;

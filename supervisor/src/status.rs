@@ -8,7 +8,7 @@ use std::{
 use ipc_schema::{
     activity::Activity,
     board::{Health, Progress, State},
-    metric,
+    metric::{self, MetricValues},
     ports::BoardReader,
     process::{PROCESSES, Process, ProcessScope},
     run::{Mode, RunFile},
@@ -109,7 +109,11 @@ struct EnvironmentRow {
 #[derive(Debug, Serialize)]
 struct TrainingRow {
     updates: u64,
+    env_steps: u64,
+    env_steps_per_s: f64,
     metrics: String,
+    #[serde(serialize_with = "metric::serialize_measured")]
+    measured: MetricValues,
     reward: f64,
     policy_std: f64,
 }
@@ -304,7 +308,10 @@ fn training_row(boards: &[ProcessBoard]) -> Option<TrainingRow> {
     let metrics = metric::summary(&training.metrics);
     (!metrics.is_empty()).then_some(TrainingRow {
         updates: training.updates,
+        env_steps: training.env_steps,
+        env_steps_per_s: training.env_steps_per_s,
         metrics,
+        measured: training.metrics,
         reward: training.reward,
         policy_std: training.policy_std,
     })
