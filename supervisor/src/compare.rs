@@ -156,7 +156,9 @@ mod tests {
     fn the_table_has_the_settings_and_results_that_differ() {
         let runs = tempfile::tempdir().unwrap();
         let report = |error_m: f64| {
-            format!(r#"{{"result":"completed","name":"x","ppo_mean_error_m":{error_m},"seed":1,"trainer":{{"a":1}}}}"#)
+            format!(
+                r#"{{"result":"completed","name":"x","ppo_mean_error_m":{error_m:?},"seed":1,"trainer":{{"a":1}}}}"#
+            )
         };
         run(runs.path(), "first", 8, Some(&report(4.25)));
         run(runs.path(), "second", 32, Some(&report(5.0)));
