@@ -434,6 +434,10 @@ impl<'a> DisturbedRun<'a> {
 
     /// Leaves no byte on the disk for a while, also if the run removes files.
     fn fill_disk(&mut self) -> Result<bool, Exit> {
+        // A run that is not prepared yet is refused on a full disk.
+        if !self.directory().join("run.json").exists() {
+            return Ok(false);
+        }
         let path = self.place.directory.join("ballast");
         let failed = |error: &std::io::Error| Exit::io("write", &path, error);
         let mut ballast = File::create(&path).map_err(|error| failed(&error))?;

@@ -181,17 +181,20 @@ impl Chart {
         })
     }
 
-    /// Writes it, whole or not at all.
+    /// Writes it, whole or not at all. Waits while the disk is full.
     ///
     /// # Errors
     /// Not writable.
     pub fn write(&self, path: &Path) -> std::io::Result<()> {
-        if let Some(directory) = path.parent() {
-            std::fs::create_dir_all(directory)?;
-        }
+        let text = serde_json::to_vec(self)?;
         let partial = path.with_extension("partial");
-        std::fs::write(&partial, serde_json::to_vec(self)?)?;
-        std::fs::rename(&partial, path)
+        ipc_schema::storage::when_there_is_space(path, || {
+            if let Some(directory) = path.parent() {
+                std::fs::create_dir_all(directory)?;
+            }
+            std::fs::write(&partial, &text)?;
+            std::fs::rename(&partial, path)
+        })
     }
 }
 
