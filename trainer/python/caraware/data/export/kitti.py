@@ -17,6 +17,7 @@ from caraware.data.export.scans import (
     OPTICAL,
     Frame,
     box_middle,
+    class_by_size,
     forward_m,
     frames,
     inverse,
@@ -85,13 +86,8 @@ def kitti_class(state: np.void, vehicle_class: str) -> str:
     """KITTI's class of a road user, from SUMO's class or, where that is not recorded, from its size."""
     if state["kind"] == Kind.PERSON:
         return "Pedestrian"
-    if vehicle_class:
-        return next((name for name, classes in CLASSES.items() if vehicle_class in classes), "Car")
-    if state["width_m"] < 1.1:
-        return "Cyclist" if state["length_m"] < 1.9 else "Misc"
-    if state["length_m"] >= 10 and state["height_m"] < 3.7:
-        return "Misc"
-    return "Truck" if state["length_m"] > 6 or state["height_m"] > 2.1 else "Car"
+    vehicle_class = vehicle_class or class_by_size(state)
+    return next((name for name, classes in CLASSES.items() if vehicle_class in classes), "Car")
 
 
 def _place(state: np.void, camera_from_world: Float64Array) -> tuple[Float64Array, float]:

@@ -23,6 +23,7 @@ from caraware.data.export.scans import (
     OPTICAL,
     Frame,
     box_middle,
+    class_by_size,
     filmed,
     forward_m,
     frames,
@@ -95,13 +96,8 @@ def category(state: np.void, vehicle_class: str) -> str:
     """nuScenes' category of a road user, from SUMO's class or, where that is not recorded, from its size."""
     if state["kind"] == Kind.PERSON and vehicle_class != "wheelchair":
         return "human.pedestrian.adult"
-    if vehicle_class:
-        return next((name for name, classes in CATEGORIES.items() if vehicle_class in classes), "vehicle.car")
-    if state["width_m"] < 1.1:
-        return "vehicle.bicycle" if state["length_m"] < 1.9 else "vehicle.motorcycle"
-    if state["length_m"] >= 10 and state["height_m"] < 3.7:
-        return "vehicle.bus.rigid"
-    return "vehicle.truck" if state["length_m"] > 6 or state["height_m"] > 2.1 else "vehicle.car"
+    vehicle_class = vehicle_class or class_by_size(state)
+    return next((name for name, classes in CATEGORIES.items() if vehicle_class in classes), "vehicle.car")
 
 
 def attribute(state: np.void, category_name: str) -> str:
