@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -63,7 +64,7 @@ class Net:
         self.edges.append(f'<edge id="{name}" from="{start}" to="{end}" type="{kind}"{drawn}/>')
         self.ids.append(name)
 
-    def street(self, name: str, a: str, b: str, kind: str, between: list[tuple[float, float, float]]) -> None:
+    def street(self, name: str, a: str, b: str, kind: str, between: Sequence[tuple[float, float, float]]) -> None:
         """Adds both directions of a street, with points between its ends."""
 
         def ends(node: str) -> tuple[float, float, float]:

@@ -34,7 +34,7 @@ def built() -> Iterator[Path]:
         copy = Path(short)
         for name in SOURCES:
             shutil.copy(VALLEY / name, copy / name)
-        command = [BIN / "netconvert", "-c", copy / "valley.netccfg", "-o", copy / "valley.net.xml"]
+        command: list[str | Path] = [BIN / "netconvert", "-c", copy / "valley.netccfg", "-o", copy / "valley.net.xml"]
         built = subprocess.run(command, capture_output=True, text=True, check=True)
         assert "Warning" not in built.stderr + built.stdout, built.stderr
         yield copy
@@ -95,8 +95,17 @@ def test_the_bypass_crosses_the_climbing_streets_on_a_bridge(net: ET.Element) ->
 
 
 def test_an_hours_traffic_begins_without_jam_or_collision(built: Path) -> None:
-    outputs = ["--statistic-output", built / "stats.xml", "--tripinfo-output", built / "trips.xml"]
-    command = [BIN / "sumo", "-c", built / "valley.sumocfg", "--end", "900", "--no-step-log", "--step-length", "0.5"]
+    outputs: list[str | Path] = ["--statistic-output", built / "stats.xml", "--tripinfo-output", built / "trips.xml"]
+    command: list[str | Path] = [
+        BIN / "sumo",
+        "-c",
+        built / "valley.sumocfg",
+        "--end",
+        "900",
+        "--no-step-log",
+        "--step-length",
+        "0.5",
+    ]
     subprocess.run([*command, *outputs, "--collision.check-junctions"], check=True, capture_output=True)
     stats = ET.parse(built / "stats.xml").getroot()
     counts = {name: stats.find(name) for name in ("teleports", "safety", "vehicles")}

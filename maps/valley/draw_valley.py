@@ -1,4 +1,4 @@
-"""Draws a built valley, its streets coloured by their height, into valley.png: `python draw.py VALLEY.net.xml`."""
+"""Draws a built valley, its streets in the colour of their height, into valley.png: `draw_valley.py VALLEY.net.xml`."""
 
 import sys
 import xml.etree.ElementTree as ET
