@@ -1,14 +1,15 @@
 """What surrounds learning to drive: the encoders, the teacher's actions, the trips of the benchmark."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from caraware import _native
-from caraware.driving.imitate import Limits, Teacher, clone
+from caraware.driving.imitate import Teacher, clone
+from caraware.driving.lessons import Lessons, Limits
 from caraware.driving.trips import TripLog
 from caraware.ipc.stream import EMPTY_SLOT
 from caraware.learn.config import TrainerConfig
@@ -19,6 +20,7 @@ from caraware.run.learner import begin_from
 from caraware.run.manifest import CheckpointError
 from caraware.tasks import ends
 from caraware.tasks.driving import Driving
+from caraware.tasks.fields import Fields
 from safetensors.torch import save_file
 from synthetic import run_file
 from test_tasks import run_of
@@ -51,15 +53,17 @@ def test_the_order_of_a_groups_members_does_not_matter_and_their_number_is_that_
         GroupedNetwork(16, 2, (16,))
 
 
-def test_the_teachers_action_is_what_the_next_tick_shows() -> None:
+def test_the_teachers_action_is_what_the_ticks_after_it_show() -> None:
     # 10 m/s on a circle of 50 m, then harder braking than acceleration, then standing.
     before = torch.tensor([[0.0, 0.0, 3.1, 10.0], [0.0, 0.0, 0.0, 10.0], [0.0, 0.0, 0.0, 10.0], [0.0, 0.0, 0.0, 0.0]])
-    after = torch.tensor([[1.0, 0.0, -3.1631853, 10.0], [1.0, 0, 0.0, 9.7], [1.0, 0, 0.0, 10.3], [0.0, 0.0, 0.2, 0.0]])
-    action = LIMITS.action(before, after)
+    after = torch.tensor([[1.0, 0.0, -3.1631853, 10.0], [1.0, 0, 0.0, 9.0], [1.0, 0, 0.0, 10.3], [0.0, 0.0, 0.2, 0.0]])
+    later = torch.tensor([[9.0, 0.0, -2.0, 10.0], [9.0, 0, 0.0, 7.0], [9.0, 0, 0.0, 13.0], [0.0, 0.0, 0.2, 0.0]])
+    action = LIMITS.action(before, after, later)
     assert action[0].tolist() == pytest.approx([math.atan(2.7 / 50) / 0.5, 0.0], abs=1e-4), "across ±π"
-    assert action[1].tolist() == pytest.approx([0.0, -0.5], abs=1e-5)
+    assert action[1].tolist() == pytest.approx([0.0, -0.5], abs=1e-5), "3 m/s less after a second, not in the tick"
     assert action[2].tolist() == pytest.approx([0.0, 1.0], abs=1e-5)
-    assert action[3].tolist() == [0.0, 0.0], "a yaw rate at standstill shows no steering"
+    assert action[3, 0] == 0.0, "a yaw rate at standstill shows no steering"
+    assert action[3, 1] == pytest.approx(-0.5 / 6), "what stands brakes"
 
 
 @dataclass
@@ -107,17 +111,56 @@ def heroes(*vehicles: int) -> np.ndarray:
 
 
 def test_a_pair_is_of_a_hero_that_stays_in_its_slot() -> None:
-    teacher = Teacher(LIMITS)
+    teacher = Teacher(replace(LIMITS, tick_s=0.5))
     for tick in (
         Tick(0, heroes(0, 1)),
-        Tick(1, heroes(0, 1)),  # two pairs
-        Tick(2, heroes(0, 2)),  # one: another hero took the second slot
-        Tick(4, heroes(0, 2)),  # none: a tick is missing
-        Tick(5, heroes(0, -1), episode=1),  # none: another episode
-        Tick(6, heroes(0, -1), episode=1),  # one
+        Tick(1, heroes(0, 1)),
+        Tick(2, heroes(0, 2)),  # one pair: another hero took the second slot
+        Tick(3, heroes(0, 2)),  # one, for the same reason
+        Tick(5, heroes(0, 2)),  # none: a tick is missing
+        Tick(6, heroes(0, 2)),
+        Tick(7, heroes(0, -1), episode=1),  # none: another episode
+        Tick(8, heroes(0, -1), episode=1),
+        Tick(9, heroes(0, -1), episode=1),  # one
     ):
         teacher.add(tick)  # type: ignore[arg-type]  # what the teacher reads of a tick
-    assert teacher.pairs == 4 and teacher.tensors()["observation"].shape == (4, 2)
+    assert teacher.pairs == 3 and teacher.tensors()["observation"].shape == (3, 2)
+
+
+NAMES = ("speed", "steering", *(f"route_{xy}_{d}" for d in (5, 10, 20, 40) for xy in "xy"), "route_offset")
+USER = tuple(f"user_1_{name}" for name in ("x", "y", "cos", "sin", "forward", "left", "length", "width"))
+
+
+def test_a_displaced_hero_sees_what_it_would_see_there_and_is_taught_the_way_back() -> None:
+    # Straight on at 10 m/s; a vehicle 20 m ahead and 3 m to the left comes towards the hero.
+    seen = [10.0, 0.0, 5.0, 0.0, 10.0, 0.0, 20.0, 0.0, 40.0, 0.0, 0.0, 20.0, 3.0, -1.0, 0.0, -8.0, 0.0, 4.0, 2.0]
+    ranges = dict.fromkeys((*NAMES, *USER), (-50.0, 50.0))
+    fields = Fields((*NAMES, *USER), 1, -1.0, ranges)
+    count, lessons = 4000, Lessons(fields, LIMITS)
+    rows, action = torch.tensor([seen] * count) / 50, torch.zeros(count, 2)
+
+    def there(name: str, of: Tensor) -> Tensor:
+        return fields.si_tensor(of, name)
+
+    moved, taught = lessons.displaced(rows, action, torch.Generator().manual_seed(3))
+    aside_m = -there("route_offset", moved)
+    assert aside_m.std().item() == pytest.approx(0.4, rel=0.1)
+    # From the route it still is as far to the place 20 m ahead and to the vehicle, and the two see each other alike.
+    along, beside = there("route_x_20", moved), there("route_y_20", moved)
+    assert torch.allclose(along.square() + beside.square(), 400 + aside_m.square(), atol=1e-2)
+    x, y = there("user_1_x", moved), there("user_1_y", moved)
+    assert torch.allclose(x.square() + y.square(), 400 + (3 - aside_m).square(), atol=1e-2)
+    assert torch.allclose(there("user_1_forward", moved), 8 * there("user_1_cos", moved), atol=1e-3)
+    # To the left of the route and not turned, the way back is to the right; too fast, it is braking.
+    straight = (there("user_1_sin", moved).abs() < 0.02) & (aside_m > 0.3)
+    assert straight.any() and (taught[straight, 0] < -0.02).all()
+    faster = there("speed", moved) > 11
+    assert faster.any() and (taught[faster, 1] <= -1 / 6 + 1e-5).all()
+    # A place without a vehicle stays as it is; and rows without a route are taught as they are.
+    rows[:, len(NAMES) :] = torch.tensor([50, 50, 0, 0, 0, 0, 0, 0]) / 50
+    assert torch.equal(lessons.displaced(rows, action, torch.Generator())[0][:, len(NAMES) :], rows[:, len(NAMES) :])
+    other = Lessons(Fields(("speed",), 1, -1.0, {"speed": (0.0, 30.0)}), LIMITS)
+    assert other.displaced(rows, action, torch.Generator())[0] is rows
 
 
 def test_a_clone_comes_nearer_to_its_teacher_than_doing_nothing_and_a_policy_begins_as_it(tmp_path: Any) -> None:
@@ -132,7 +175,7 @@ def test_a_clone_comes_nearer_to_its_teacher_than_doing_nothing_and_a_policy_beg
         )
 
     taught = updater()
-    figures = clone(data, taught, generator)
+    figures = clone(data, taught, generator, Lessons(Fields((), 1, -1.0, {}), LIMITS))
     assert figures.pairs == 8000
     assert all(error < 0.7 * none for error, none in zip(figures.error, figures.error_of_zero, strict=True))
     file, fresh = tmp_path / "clone.safetensors", updater()

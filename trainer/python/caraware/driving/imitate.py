@@ -8,6 +8,7 @@ directory; `task.begin_from` names the latter for a policy that begins as the cl
 import json
 import logging
 import sys
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,82 +17,59 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
+from caraware.driving.lessons import Lessons, Limits
+from caraware.ipc.arrays import BoolArray, UInt32Array
 from caraware.ipc.channel import Channel, Observation
-from caraware.ipc.run_file import ConfigError, RunFile, config_table, setting
+from caraware.ipc.run_file import ConfigError, setting
 from caraware.learn.build import build_ppo, configure_torch
 from caraware.learn.config import TrainerConfig
 from caraware.learn.ppo import PlainUpdate
 from caraware.run.process import HandoverRole, StopSignal, read_run, run_process
+from caraware.tasks.fields import Fields
 from caraware.tasks.table import task_of_run
 
 log = logging.getLogger(__name__)
 
 DATA, CLONE = "teacher.safetensors", "clone.safetensors"
-WHEELBASE_M = 2.7
-"""Of a passenger car: the steering follows from speed and yaw rate by the single-track model without slip."""
-STEERING_FROM_MPS = 1.0
-"""Below it a yaw rate does not show the steering: such a pair teaches 0."""
-EPOCHS, BATCH, HELD_OUT = 8, 256, 0.1
+EPOCHS, BATCH, HELD_OUT = 12, 1024, 0.1
 
 
 @dataclass(frozen=True)
-class Limits:
-    """What an action of 1 stands for."""
+class _Moment:
+    """What is kept of a tick."""
 
-    accel_mps2: float
-    decel_mps2: float
-    angle_rad: float
-    tick_s: float
-
-    @classmethod
-    def from_run(cls, run: RunFile) -> "Limits":
-        """Of the run's vehicles."""
-        vehicle = config_table(run, "vehicle")
-        angle = float(vehicle["max_road_wheel_angle_rad"])
-        limits = float(vehicle["max_accel_mps2"]), float(vehicle["max_decel_mps2"]), angle
-        return cls(*limits, setting(run, "run.tick_s", float))
-
-    def action(self, before: Tensor, after: Tensor) -> Tensor:
-        """The actions f32 `[n, 2]` that lead from truth `[n, 4]` to that of the tick after, within their range."""
-        speed_mps = after[:, 3]
-        accel_mps2 = (speed_mps - before[:, 3]) / self.tick_s
-        turned_rad = after[:, 2] - before[:, 2]
-        yaw_rate = torch.atan2(turned_rad.sin(), turned_rad.cos()) / self.tick_s
-        angle_rad = torch.atan(WHEELBASE_M * yaw_rate / speed_mps.clamp_min(STEERING_FROM_MPS))
-        steering = torch.where(speed_mps > STEERING_FROM_MPS, angle_rad / self.angle_rad, 0.0)
-        demand = accel_mps2 / torch.where(accel_mps2 > 0, self.accel_mps2, self.decel_mps2)
-        return torch.stack((steering, demand), 1).clamp(-1, 1)
+    tick: int
+    episode: int
+    vehicle: UInt32Array
+    valid: BoolArray
+    observation: Tensor
+    truth: Tensor
 
 
 class Teacher:
-    """Collects pairs: a tick's observation, and the action that the next tick shows."""
+    """Collects pairs: a tick's observation, and the action that the ticks after it show."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._before: tuple[int, int, np.ndarray, np.ndarray, Tensor, Tensor] | None = None
+        self._moments: deque[_Moment] = deque(maxlen=limits.ahead_ticks + 1)
         self._observations: list[Tensor] = []
         self._actions: list[Tensor] = []
         self.pairs = 0
 
     def add(self, obs: Observation) -> None:
-        """Take a tick; pairs are those of heroes that held their slots from the tick before."""
-        before = self._before
-        self._before = (
-            obs.tick,
-            obs.episode,
-            obs.vehicle.copy(),
-            obs.valid.copy(),
-            obs.observation.clone(),
-            obs.truth.clone(),
-        )
-        if before is None or before[:2] != (obs.tick - 1, obs.episode):
+        """Take a tick; pairs are those of heroes that held their slots since `AHEAD_S` before."""
+        if self._moments and (obs.tick, obs.episode) != (self._moments[-1].tick + 1, self._moments[-1].episode):
+            self._moments.clear()
+        rows = obs.vehicle.copy(), obs.valid.copy(), obs.observation.clone(), obs.truth.clone()
+        self._moments.append(_Moment(obs.tick, obs.episode, *rows))
+        if len(self._moments) <= self._limits.ahead_ticks:
             return
-        _, _, vehicle, valid, observation, truth = before
-        wide = min(len(vehicle), len(obs.vehicle))
-        stays = valid[:wide] & obs.valid[:wide] & (vehicle[:wide] == obs.vehicle[:wide])
+        first, second, last = self._moments[0], self._moments[1], self._moments[-1]
+        wide = len(first.vehicle)
+        stays = first.valid & last.valid[:wide] & (first.vehicle == last.vehicle[:wide])
         at = torch.from_numpy(np.flatnonzero(stays))
-        self._observations.append(observation[at])
-        self._actions.append(self._limits.action(truth[at], obs.truth[at]))
+        self._observations.append(first.observation[at])
+        self._actions.append(self._limits.action(first.truth[at], second.truth[at], last.truth[at]))
         self.pairs += len(at)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -110,8 +88,11 @@ class CloneFigures:
     """The same of a driver that always answers (0, 0)."""
 
 
-def clone(data: dict[str, Tensor], updater: PlainUpdate, generator: torch.Generator) -> CloneFigures:
-    """Teach the policy of `updater` the actions of the data set by regression."""
+def clone(data: dict[str, Tensor], updater: PlainUpdate, generator: torch.Generator, lessons: Lessons) -> CloneFigures:
+    """Teach the policy of `updater` by regression what the teacher does, and how to get back to where it drives.
+
+    The figures are of the teacher's own places, and of its own actions.
+    """
     count = len(data["action"])
     taught = max(1, int(count * (1 - HELD_OUT)))
     policy = updater.policy
@@ -120,7 +101,8 @@ def clone(data: dict[str, Tensor], updater: PlainUpdate, generator: torch.Genera
         for group in optimiser.param_groups:
             group["lr"] = 1e-3 * (1 - epoch / EPOCHS)
         for rows in torch.randperm(taught, generator=generator).split(BATCH):
-            loss = (policy(data["observation"][rows]) - data["action"][rows]).square().mean()
+            observation, action = lessons.displaced(data["observation"][rows], data["action"][rows], generator)
+            loss = (policy(observation) - action).square().mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -137,7 +119,8 @@ def imitate(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
         raise ConfigError(
             '`task.driver` is not "sumo": nothing drives that could be imitated', 'set task.driver = "sumo"'
         )
-    channel, teacher, ended = Channel(str(run_file)), Teacher(Limits.from_run(run)), False
+    limits = Limits.from_run(run)
+    channel, teacher, ended = Channel(str(run_file)), Teacher(limits), False
     while not ended and not stop.requested:
         for obs in channel.receive(0.2):
             if not obs.evaluation:
@@ -154,8 +137,11 @@ def imitate(run_file: Path, stop: StopSignal, _role: HandoverRole) -> None:
         raise ConfigError(
             f"`trainer.network` is '{config.network}'", "a clone needs a network of a class, which learns by autograd"
         )
-    figures = clone(data, ppo.updater, torch.Generator().manual_seed(config.seed))
-    save_file({n: t.clone() for n, t in ppo.updater.parameters().items() if n.startswith("policy.")}, folder / CLONE)
+    lessons = Lessons(Fields.from_run(run), limits)
+    figures = clone(data, ppo.updater, torch.Generator().manual_seed(config.seed), lessons)
+    # Without the standard deviation, which no teacher shows: `trainer.initial_std` holds for the learner, too.
+    taught = {n: t.clone() for n, t in ppo.updater.parameters().items() if n.startswith("policy.")}
+    save_file({n: t for n, t in taught.items() if n != "policy.log_std"}, folder / CLONE)
     log.info(
         "%d pairs; errors of the clone %s, of doing nothing %s", figures.pairs, figures.error, figures.error_of_zero
     )
