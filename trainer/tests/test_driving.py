@@ -188,6 +188,19 @@ def test_a_clone_comes_nearer_to_its_teacher_than_doing_nothing_and_a_policy_beg
         begin_from(fresh.parameters(), file)
 
 
+def test_a_policy_on_a_gpu_acts_by_a_copy_on_the_cpu_that_follows_it(tmp_path: Any) -> None:
+    config = TrainerConfig.from_run(run_file(str(tmp_path)))
+    policy = GaussianPolicy(nn.Sequential(network(), nn.Tanh()), 2, 0.5)
+    updater, rows = PlainUpdate(config, policy, network(1), torch.device("cpu")), torch.rand(9, FIELDS)
+    # No GPU is needed to see which of the two answers: the policy is said to be elsewhere.
+    updater.device = torch.device("cuda")
+    first = updater.mean(rows)
+    assert first.equal(policy(rows).detach())
+    with torch.no_grad():
+        updater.parameters()["policy.0.trunk.0.weight"].add_(0.1)
+    assert updater.mean(rows).equal(policy(rows).detach()) and not updater.mean(rows).equal(first)
+
+
 def trip_log() -> TripLog:
     run = run_of("driving")
     run["config"]["traffic"] |= {"heroes": 2, "cavs": 0, "others": 0, "pedestrians": 0}

@@ -29,6 +29,7 @@ class DrawingPredictor:
     def __init__(self, ppo: "Ppo", dark_is_nan: bool) -> None:
         self._ppo, self._dark_is_nan = ppo, dark_is_nan
         self._generator = torch.Generator()
+        self._version, self._log_std_here = (-1, -1), torch.zeros(0)
         self._newest: dict[int, dict[int, DrawnTick]] = {}
 
     def predict_m(self, ticks: Ticks) -> dict[int, list[Tensor]]:
@@ -56,11 +57,19 @@ class DrawingPredictor:
         return torch.where(valid, ppo.task.answer(drawn.action), 0.0)
 
     def _draw(self, environment: int, tick: int, mean: Tensor, valid: Tensor) -> DrawnTick:
-        log_std = self._ppo.updater.log_std.cpu()
+        log_std = self._log_std()
         self._generator.manual_seed(_key(self._ppo.config.seed, self._ppo.numbered(environment), tick))
         noise = torch.randn(mean.shape, generator=self._generator)
         action = torch.where(valid, mean + log_std.exp() * noise, 0.0)
         return DrawnTick(tick, action, log_probability(action, mean, log_std))
+
+    def _log_std(self) -> Tensor:
+        """Logarithm of the standard deviation, on the CPU; read from a GPU once an update."""
+        there = self._ppo.updater.log_std
+        version = self._ppo.updates, there._version
+        if version != self._version:
+            self._version, self._log_std_here = version, there.cpu().clone()
+        return self._log_std_here
 
 
 def _key(seed: int, environment: int, tick: int) -> int:

@@ -12,6 +12,7 @@ Read `Ppo.score`, then `PlainUpdate`. The forms that are faster (`caraware.learn
 the contract of `PolicyUpdate`; docs/decisions/0020.
 """
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ from caraware.learn.rollout import DrawnHorizon, DrawnTick, Horizon
 from caraware.learn.stored import MEMORY, OPTIMISER, PARAMETERS, PPO, RANDOM, LearnerShape, StoredTensors
 from caraware.tasks.contract import Sampling, Task, TaskOutcome, TaskRows, TaskStep
 
+ACTING_ROWS = 512
+"""So many observations or fewer are quicker on the CPU than the way to a GPU and back."""
 SMALLEST_DEVIATION = 1e-8
 SEED_STRIDE = 0x9E3779B97F4A7C15
 """Between the seeds of neighbouring environments: 2^64 over the golden ratio, so that they look nothing alike."""
@@ -159,6 +162,7 @@ class PlainUpdate:
         self.device = device
         self._config = config
         self._policy, self._value = policy.to(device), value.to(device)
+        self._acting, self._acting_version = self._policy, -1
         self._adam = {
             name: torch.optim.Adam(network.parameters(), eps=EPSILON)
             for name, network in (("policy", self._policy), ("value", self._value))
@@ -172,6 +176,7 @@ class PlainUpdate:
     def improve(self, batch: Batch, shuffling: torch.Generator, now: ScheduledValues) -> UpdateFigures:
         """See `PolicyUpdate.improve`. K epochs of minibatches of about M samples (algorithm 1)."""
         minibatches = max(1, round(len(batch.reward) / self._config.batch_size))
+        self._acting_version = -1
         policy_steps: list[list[float]] = []
         value_steps: list[list[float]] = []
         policy_epochs, is_near = 0, True
@@ -265,9 +270,22 @@ class PlainUpdate:
 
     @torch.no_grad()
     def mean(self, *observations: Tensor) -> Tensor:
-        """See `PolicyUpdate.mean`."""
-        mean: Tensor = self._policy(torch.cat([block.to(self.device) for block in observations]))
+        """See `PolicyUpdate.mean`. On the CPU where few rows come from there."""
+        if sum(map(len, observations)) <= ACTING_ROWS and all(block.device.type == "cpu" for block in observations):
+            mean: Tensor = self._on_cpu()(torch.cat(observations))
+        else:
+            mean = self._policy(torch.cat([block.to(self.device) for block in observations]))
         return mean
+
+    def _on_cpu(self) -> nn.Module:
+        """The policy on the CPU: itself, or a copy of what it is now."""
+        if self.device.type == "cpu":
+            return self._policy
+        # Whatever fills or moves a tensor in place counts up its version.
+        version = sum(tensor._version for tensor in self._policy.state_dict().values())
+        if version != self._acting_version:
+            self._acting, self._acting_version = copy.deepcopy(self._policy).cpu(), version
+        return self._acting
 
     @torch.no_grad()
     def value(self, observation: Tensor) -> Tensor:

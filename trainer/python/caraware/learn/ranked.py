@@ -41,6 +41,7 @@ class RankedUpdate(PlainUpdate):
 
     def improve(self, batch: Batch, shuffling: torch.Generator, now: ScheduledValues) -> UpdateFigures:
         """See `PolicyUpdate.improve`. The samples of all ranks are shuffled and cut alike on each."""
+        self._acting_version = -1
         union = self._ranks.union(batch.advantage, batch.reward, batch.value_target)
         parts = minibatches(union, self._config, self._ranks)
         own_rows = torch.arange(union.own, device=self.device)

@@ -170,10 +170,14 @@ class TorchRanks(Ranks):
         self._dist = dist
         if (started := int(os.environ.get("WORLD_SIZE", "0"))) != ranks:
             raise RankError(f"`trainer.ranks` is {ranks}, and torchrun started {started} processes")
+        self._is_shared = False
+        """Several ranks learn on one GPU, which NCCL refuses: what they add up goes through the CPU."""
         if torch.cuda.is_available():
             torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
+            self._is_shared = int(os.environ.get("LOCAL_WORLD_SIZE", "1")) > torch.cuda.device_count()
         with self._together("meeting"):
-            backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
+            nccl = torch.cuda.is_available() and not self._is_shared
+            backend = "cpu:gloo,cuda:nccl" if nccl else "gloo"
             dist.init_process_group(backend, timeout=WAIT_AT_MOST)
             self._groups: dict[str, Any] = {network: dist.new_group() for network in ("policy", "value")}
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
@@ -229,8 +233,11 @@ class TorchRanks(Ranks):
 
     def add_up(self, network: str, values: Tensor) -> None:
         """See `Ranks.add_up`."""
+        there = values.cpu() if self._is_shared else values
         with self._together("adding up gradients"):
-            self._dist.all_reduce(values, group=self._groups[network])
+            self._dist.all_reduce(there, group=self._groups[network])
+        if there is not values:
+            values.copy_(there)
 
     def largest(self, value: float) -> float:
         """See `Ranks.largest`."""
