@@ -17,7 +17,7 @@ from caraware.tasks import ends
 from caraware.tasks.driving import DrivenStep, Driving, progress_reward
 from synthetic import SyntheticObservation, run_file
 from test_tasks import run_of
-from torch import Tensor
+from torch import Tensor, nn
 
 SLOTS, FIELDS = 3, 2
 
@@ -59,6 +59,13 @@ def learner(**trainer: object) -> Ppo:
     return build_ppo(config, FIELDS, Driving.from_run(run))
 
 
+class OneLayer(nn.Linear):
+    """A network of a class."""
+
+    def __init__(self, inputs: int, outputs: int, hidden: tuple[int, ...]) -> None:
+        super().__init__(inputs, outputs)
+
+
 SETTINGS: dict[str, object] = {
     "hidden": [8],
     "discount": 0.9,
@@ -93,6 +100,12 @@ def test_a_tick_that_comes_again_gets_the_same_action_and_another_tick_another()
     assert answers(5).equal(answers(5)) and not answers(5).equal(answers(6))
     assert answers(5)[2].tolist() == [0.0, 0.0], "an empty slot has no action"
     assert answers(5).abs().max() <= 1
+
+
+def test_steering_begins_with_less_noise_than_acceleration_in_any_network() -> None:
+    for network in ("mlp", "test_drawing:OneLayer"):
+        ppo = learner(**SETTINGS | {"initial_std": 0.4, "network": network})
+        assert ppo.updater.log_std.exp().tolist() == pytest.approx([0.1, 0.4]), network
 
 
 def test_an_evaluation_takes_the_mean_and_draws_nothing() -> None:

@@ -57,14 +57,22 @@ def build_ppo(
         return RecurrentPpo(config, task, observation_size, sequences, sampling, environments)
     if config.network is BuiltInNetwork.MLP:
         policy, value = paper_networks(config, observation_size, actions, sampling)
+        _spread(policy, task)
         fast = fast_update(config, policy, value, device, ranks)
         return Ppo(config, task, observation_size, fast, sampling, environments)
     own_policy, own_value = _own_networks(config.network, config, observation_size, actions, sampling)
+    _spread(own_policy, task)
     plain = PlainUpdate(config, own_policy, own_value, device)
     if ranks is not None and ranks.size > 1:
         _refuse_batch_statistics(config, own_policy, own_value)
         plain = RankedUpdate(config, own_policy, own_value, device, ranks)
     return Ppo(config, task, observation_size, plain, sampling, environments)
+
+
+def _spread(policy: GaussianPolicy, task: Task) -> None:
+    """Give each number of an action the share of `trainer.initial_std` that the task says."""
+    if task.actions.spread:
+        policy.log_std.data += torch.tensor(task.actions.spread).log()
 
 
 def paper_networks(

@@ -37,6 +37,8 @@ class ActionSpec:
     high: float
     is_clipped: bool
     """Values beyond the range are clipped before they are published; else they are published as they are."""
+    spread: tuple[float, ...] = ()
+    """Factor on `trainer.initial_std` for each number; empty: 1 for all."""
 
     @property
     def size(self) -> int:

@@ -28,7 +28,14 @@ class OutcomeMissingError(ValueError):
     """The driving task rewards what an action did: a step without its outcome has no reward."""
 
 
-ACTIONS = ActionSpec(names=("steering", "acceleration"), low=-1.0, high=1.0, is_clipped=True)
+ACTIONS = ActionSpec(
+    names=("steering", "acceleration"),
+    low=-1.0,
+    high=1.0,
+    is_clipped=True,
+    # Noise that tries out braking leaves the road within seconds if it steers.
+    spread=(0.25, 1.0),
+)
 
 ENDS = (
     EndReason("collision", EndKind.TERMINATED),
