@@ -36,7 +36,7 @@ fn payload(len: usize) -> Vec<u64> {
 fn world_keeps_every_state_and_no_sub_step() {
     let layout = WorldLayout::new(3, 10);
     let mut words = payload(layout.len);
-    let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+    let bytes: &mut [u8] = cast_slice_mut(&mut words);
     bytes[..layout.states.len].copy_from_slice(cast_slice(&states(3)));
     let frame = encode(Channel::World, &header(layout.shape), bytes).unwrap();
     let (head, body) = decode(&frame.bytes).unwrap();
@@ -137,7 +137,7 @@ fn a_prediction_has_the_slots_of_its_observation() {
 fn a_dense_scan_is_thinned_and_keeps_where_the_sensor_was() {
     let layout = PointcloudLayout::new(40_000);
     let mut words = payload(layout.len);
-    let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
+    let bytes: &mut [u8] = cast_slice_mut(&mut words);
     let scan = Scan {
         id_hash: 9,
         ..Scan::default()
