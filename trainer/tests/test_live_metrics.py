@@ -164,7 +164,7 @@ def test_prometheus_reads_what_ps_shows(live: LiveRun) -> None:
         with pytest.raises((URLError, OSError)):
             urlopen(f"http://{_own_address()}:{port}/metrics", timeout=5)
         process.send_signal(signal.SIGINT)
-        process.wait(PATIENCE_S)
+        assert process.wait(PATIENCE_S) == 130
 
 
 def _own_address() -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -137,6 +138,9 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--interval-s", type=float, default=1.0)
     parser.add_argument("--prometheus", metavar="HOST:PORT")
     options = parser.parse_args(arguments)
+    # A shell that starts it in the background has Ctrl-C ignored: a signal that is sent ends it nevertheless.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     try:
         if options.prometheus:
             return serve(options.run, options.interval_s, options.prometheus)
