@@ -495,7 +495,7 @@ fn commits(run: &Path) -> Vec<(String, u64)> {
 }
 
 /// Hands the paused run over to `module`, and makes ticks until it has committed some of its own. The run stays paused.
-/// No step is asked for before the learner has consumed the one before: a slow one would otherwise find the run at its end.
+/// The learner may be one step behind, as it consumes ticks by the dozen: a slow one would otherwise find the run at its end.
 fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, module: &str) {
     control(workplace, name, &["pause"]);
     let output = workplace.run(&["handover", name, "--set", &format!("trainer.module={module}")]);
@@ -506,7 +506,7 @@ fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, m
         progress.incarnation == incarnation && progress.committed_ticks > taken_over
     };
     while !has_committed(&run.trainer) {
-        let ticks = run.sensing.health().ticks + 40;
+        let before = run.sensing.health().ticks;
         control(workplace, name, &["step", "40"]);
         let Run {
             child,
@@ -515,9 +515,8 @@ fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, m
             ..
         } = &mut *run;
         until(child, "a commit of its own", || {
-            let made = sensing.health().ticks;
-            let all_consumed = made >= ticks && trainer.progress().consumed_ticks >= made;
-            (has_committed(trainer) || all_consumed).then_some(())
+            let follows = sensing.health().ticks >= before + 40 && trainer.progress().consumed_ticks >= before;
+            (has_committed(trainer) || follows).then_some(())
         });
     }
 }

@@ -131,10 +131,9 @@ fn kill_recorder(workplace: &Workplace, name: &str, on_death: &str) -> (Option<i
     let spectator = Spectator::join(&directory.join("run.json"), &mut run);
     let board = spectator.board(Process::Recorder);
     let file = directory.join("recording.mcap");
-    until(&mut run, "some chunks", || {
-        std::fs::metadata(&file)
-            .is_ok_and(|data| data.len() > 300_000)
-            .then_some(())
+    until(&mut run, "a chunk with observations", || {
+        let recording = RecordingReader::open(&file).ok()?;
+        (!ticks(&recording, Channel::Observation).is_empty()).then_some(())
     });
     let pid = Pid::from_raw(board.health().pid).unwrap();
     kill_process(pid, Signal::KILL).unwrap();

@@ -274,7 +274,7 @@ def test_a_browser_shows_every_panel_of_a_mode_and_it_moves(mode: Mode, runs: Pa
         check_recording(recorded)
 
 
-READY = {"train": r"(error \d)", "drive": r"(progress \d)", "simulate": r"(sensing)", "play": r"(sensing|error)"}
+READY = {"train": r"(error \d)", "drive": r"(progress \d)", "simulate": r"(sensing)", "play": r"(policy \d)"}
 """What the progress line shows once a picture can be whole."""
 
 
