@@ -82,6 +82,7 @@ fn run(prepared: PreparedRun) -> Result<(), Exit> {
         Ok(supervisor) => supervisor.supervise(&mut display),
         Err(exit) => RunOutcome::not_started(exit),
     };
+    handover::phases::remove_successor_run_file(&run);
     // Whatever ended the run, its report says so.
     let written = report::write(&run, &outcome, &housekeeping.finish());
     if let Ok(report) = &written

@@ -500,6 +500,8 @@ fn hand_to(workplace: &Workplace, run: &mut Run, name: &str, incarnation: u32, m
     control(workplace, name, &["pause"]);
     let output = workplace.run(&["handover", name, "--set", &format!("trainer.module={module}")]);
     assert!(output.status.success(), "{module}: {}", text(&output));
+    let run_file = run.directory.join("run.next.json");
+    assert!(run_file.exists(), "the successor may read its run file at any time");
     let taken_over = run.trainer.progress().committed_ticks;
     let has_committed = |trainer: &BoardReader| {
         let progress = trainer.progress();

@@ -293,7 +293,7 @@ fn start_successor(
         config,
         ..processes.run().clone()
     };
-    let run_file = write_run(&run, "run.next.json")?;
+    let run_file = write_run(&run, phases::SUCCESSOR_RUN_FILE)?;
     let (successor, output) = processes.start_successor(&run, &run_file, request.checkpoint.as_ref())?;
     let incarnation = successor.incarnation;
     let (sender, ready_line) = channel();

@@ -163,7 +163,6 @@ impl HandoverInProgress {
     /// The successor has received its first tick: sends the answer and returns the report.
     #[must_use]
     pub fn complete(self, first_tick: u64) -> Option<HandoverReport> {
-        remove(&self.run_file);
         let HandoverPhase::Opening { left, incarnation } = self.phase else {
             return None;
         };
@@ -191,6 +190,14 @@ impl HandoverInProgress {
         remove(&Failure::path(&run.run_dir, SUCCESSOR));
         reply.answer(&HandoverAnswer::Refused(failure));
     }
+}
+
+/// The run file that a successor is started with. It stays until the run ends: a learner may read it at any time.
+pub const SUCCESSOR_RUN_FILE: &str = "run.next.json";
+
+/// Removes the run file of the last successor of a run that has ended.
+pub fn remove_successor_run_file(run: &RunFile) {
+    remove(&run.run_dir.join(SUCCESSOR_RUN_FILE));
 }
 
 /// Writes a run file to `run_dir/<name>` atomically, and returns its path.
