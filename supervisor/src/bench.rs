@@ -1,6 +1,7 @@
-//! `caraware bench`, `caraware reproduce` and `caraware report`: start the program `caraware-bench`, which lies beside this one, and the studies in Python.
+//! `caraware bench`, `caraware reproduce` and `caraware report`: start the program `caraware-bench`, which lies beside this one, and
+//! modules of Python.
 
-use std::{ffi::OsString, os::unix::process::CommandExt as _, path::Path, process::Command};
+use std::{ffi::OsString, os::unix::process::CommandExt as _, process::Command};
 
 use crate::{failure::Exit, install};
 
@@ -19,7 +20,7 @@ pub fn bench(arguments: &[OsString]) -> Result<(), Exit> {
 /// # Errors
 /// The Python environment is missing, or the system cannot start it.
 pub fn reproduce(arguments: &[OsString]) -> Result<(), Exit> {
-    module("caraware.study.reproduce", arguments)
+    install::become_module("caraware.study.reproduce", arguments)
 }
 
 /// Replaces this process by the program that writes what runs have reached; returns only if that fails.
@@ -27,17 +28,5 @@ pub fn reproduce(arguments: &[OsString]) -> Result<(), Exit> {
 /// # Errors
 /// The Python environment is missing, or the system cannot start it.
 pub fn report(arguments: &[OsString]) -> Result<(), Exit> {
-    module("caraware.report.document", arguments)
-}
-
-fn module(name: &str, arguments: &[OsString]) -> Result<(), Exit> {
-    let bin = install::programs()?;
-    let python = install::python(&bin)?;
-    let program = std::env::current_exe().map_err(|error| Exit::io("find", Path::new("caraware"), &error))?;
-    let error = Command::new(&python)
-        .args(["-m", name])
-        .args(arguments)
-        .env("CARAWARE", program)
-        .exec();
-    Err(Exit::io("start", &python, &error))
+    install::become_module("caraware.report.document", arguments)
 }

@@ -1,6 +1,11 @@
 //! Finds the installed parts of caraware: the programs, the Python environment, and SUMO.
 
-use std::path::{Path, PathBuf};
+use std::{
+    ffi::OsStr,
+    os::unix::process::CommandExt as _,
+    path::{Path, PathBuf},
+    process::Command,
+};
 
 use crate::failure::Exit;
 
@@ -86,6 +91,21 @@ pub fn environment_python(bin: &Path, environment: &str) -> Option<PathBuf> {
     bin.ancestors()
         .map(|directory| directory.join(environment).join("bin/python"))
         .find(|path| path.exists())
+}
+
+/// Replaces this process by a module of the Python environment, which finds this program in `CARAWARE`; returns only if that fails.
+///
+/// # Errors
+/// The Python environment is missing, or the system cannot start it.
+pub fn become_module(name: &str, arguments: impl IntoIterator<Item = impl AsRef<OsStr>>) -> Result<(), Exit> {
+    let python = python(&programs()?)?;
+    let program = std::env::current_exe().map_err(|error| Exit::io("find", Path::new("caraware"), &error))?;
+    let error = Command::new(&python)
+        .args(["-m", name])
+        .args(arguments)
+        .env("CARAWARE", program)
+        .exec();
+    Err(Exit::io("start", &python, &error))
 }
 
 /// Python of the project's virtual environment, or the one that `CARAWARE_PYTHON` names.

@@ -2,9 +2,8 @@
 
 use std::{
     cell::Cell,
-    os::unix::process::CommandExt as _,
+    ffi::OsString,
     path::{Path, PathBuf},
-    process::Command,
     sync::{Arc, atomic::AtomicBool},
     time::{Duration, Instant},
 };
@@ -160,20 +159,12 @@ pub fn diff(args: &DiffArgs) -> Result<(), Exit> {
 pub fn export(args: &ExportArgs) -> Result<(), Exit> {
     let path = recording_path(&args.recording, &args.runs);
     RecordingReader::open(&path)?;
-    let mut command = Command::new(install::python(&install::programs()?)?);
-    command
-        .args(["-m", "caraware.data.export"])
-        .arg(&path)
-        .args(["--to", &args.to]);
-    command.args(
+    let mut arguments: Vec<OsString> = vec![path.into(), "--to".into(), args.to.clone().into()];
+    arguments.extend(
         args.output
             .iter()
-            .map(|directory| format!("--output={}", directory.display())),
+            .map(|directory| format!("--output={}", directory.display()).into()),
     );
-    command.args(args.jobs.map(|jobs| format!("--jobs={jobs}")));
-    let error = command.exec();
-    Err(Exit::missing(
-        format!("cannot start {}: {error}", command.get_program().to_string_lossy()),
-        "run `make build`, then `caraware doctor`",
-    ))
+    arguments.extend(args.jobs.map(|jobs| format!("--jobs={jobs}").into()));
+    install::become_module("caraware.data.export", arguments)
 }

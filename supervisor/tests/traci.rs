@@ -132,6 +132,19 @@ fn attached(port: u16, order: u32) -> Vec<String> {
     ]
 }
 
+/// Starts the user's script, a client of the SUMO at `port`.
+fn start_script(workplace: &Workplace, port: u16) -> Child {
+    let install = Install::find().unwrap();
+    Command::new(&install.python)
+        .arg(workplace.write("script.py", SCRIPT))
+        .arg(port.to_string())
+        .env("PYTHONPATH", install.sumo_home.join("tools"))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap()
+}
+
 #[test]
 fn a_run_attaches_to_a_sumo_that_runs_already() {
     let workplace = Workplace::new();
@@ -161,18 +174,9 @@ fn a_run_attaches_to_a_sumo_that_runs_already() {
     );
 
     // A script is another client of the same SUMO.
-    let install = Install::find().unwrap();
     let port = free_port();
     let sumo = start_sumo(&workplace, port, "2");
-    let path = workplace.write("script.py", SCRIPT);
-    let script = Command::new(&install.python)
-        .arg(path)
-        .arg(port.to_string())
-        .env("PYTHONPATH", install.sumo_home.join("tools"))
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
+    let script = start_script(&workplace, port);
     let output = simulate_at("both", &attached(port, 1));
     assert!(output.status.success(), "{}", text(&output));
     let steps = script.wait_with_output().unwrap();
@@ -233,16 +237,7 @@ fn a_traci_script_runs_beside_a_run_and_changes_it() {
     assert_eq!(alone["observation_hash"], inside["observation_hash"]);
     assert_eq!(trips_alone, trips);
 
-    let install = Install::find().unwrap();
-    let path = workplace.write("script.py", SCRIPT);
-    let script = Command::new(&install.python)
-        .arg(path)
-        .arg(port.to_string())
-        .env("PYTHONPATH", install.sumo_home.join("tools"))
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
+    let script = start_script(&workplace, port);
     let (both, trips_both) = simulate(&workplace, "both", &engine(2), Some(script));
     assert_eq!(both["ticks"], inside["ticks"]);
     assert_ne!(both["observation_hash"], inside["observation_hash"]);

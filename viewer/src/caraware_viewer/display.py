@@ -6,19 +6,18 @@ rerun's own Python functions for this listen on every network interface.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
-import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
 import rerun_cli  # type: ignore[import-untyped]  # the wheel that holds the program has no stubs
 
+from caraware_viewer.child import end_with_parent
 from caraware_viewer.page import Page
 
 HOST = "127.0.0.1"
@@ -31,7 +30,6 @@ WINDOW_MEMORY = "1GiB"
 
 _START_LIMIT_S = 30.0
 _POLL_INTERVAL_S = 0.05
-_PR_SET_PDEATHSIG = 1
 
 
 class DisplayError(RuntimeError):
@@ -132,20 +130,8 @@ def _start(*arguments: str) -> subprocess.Popen[bytes]:
         [str(program), "--bind", HOST, *arguments],
         env=environment,
         stdout=subprocess.DEVNULL,
-        preexec_fn=_end_with_parent(),
+        preexec_fn=end_with_parent(),
     )
-
-
-def _end_with_parent() -> Callable[[], None] | None:
-    """Makes Linux end the child even if this process is killed; other systems cannot."""
-    if not sys.platform.startswith("linux"):
-        return None
-    libc = ctypes.CDLL(None)
-
-    def request_signal() -> None:
-        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-
-    return request_signal
 
 
 def _wait_for(process: subprocess.Popen[bytes], port: int) -> None:

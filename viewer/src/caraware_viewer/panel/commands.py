@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import itertools
 import os
 import re
 import shlex
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypedDict
+
+from caraware_viewer.child import end_with_parent
 
 ALLOWED = (
     "compare",
@@ -45,7 +45,6 @@ END_LIMIT_S = 90.0
 """Longest wait for a command to end after Ctrl-C. A run writes a checkpoint and its report meanwhile."""
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
-_PR_SET_PDEATHSIG = 1
 
 
 class RefusedCommandError(ValueError):
@@ -222,17 +221,5 @@ class CommandLog:
             env=os.environ | {"NO_COLOR": "1", "PYTHONUNBUFFERED": "1"},
             # Ctrl-C in the terminal reaches the panel alone, which then ends its commands in order.
             start_new_session=True,
-            preexec_fn=_end_with_panel(),
+            preexec_fn=end_with_parent(),
         )
-
-
-def _end_with_panel() -> Callable[[], None] | None:
-    """Makes Linux end a command in order if the panel is killed; other systems cannot."""
-    if not sys.platform.startswith("linux"):
-        return None
-    libc = ctypes.CDLL(None)
-
-    def request_signal() -> None:
-        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-
-    return request_signal
