@@ -34,6 +34,10 @@ pub struct Progress {
     pub sender_incarnation: u32,
     /// Of `recorder`, which consumes several channels: number of ticks consumed of each, in the order of [`Channel::ALL`].
     pub recorded_ticks: [u64; Channel::COUNT],
+    /// Of `recorder`: incarnation of the sender whose ticks are counted, of each channel; `u32::MAX` before the first message.
+    pub recorded_senders: [u32; Channel::COUNT],
+    /// Of `recorder`: incarnation that these ticks were addressed to.
+    pub recorded_addressees: [u32; Channel::COUNT],
 }
 
 impl Progress {
@@ -43,6 +47,15 @@ impl Progress {
         match process {
             Process::Recorder => self.recorded_ticks[channel as usize],
             _ => self.consumed_ticks,
+        }
+    }
+
+    /// Of `recorder`: the stream of `channel` whose ticks it has counted last.
+    #[must_use]
+    pub fn recorded_stream(&self, channel: Channel) -> MessageStream {
+        MessageStream {
+            sender: self.recorded_senders[channel as usize],
+            addressee: self.recorded_addressees[channel as usize],
         }
     }
 
@@ -58,6 +71,23 @@ impl Progress {
             }
         })
     }
+}
+
+/// Messages of a channel that follow each other: those of one sender to one addressee. Another stream may begin with ticks of this one again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct MessageStream {
+    /// Incarnation of the sender.
+    pub sender: u32,
+    /// Incarnation that the messages are addressed to; 0 where it does not matter.
+    pub addressee: u32,
+}
+
+impl MessageStream {
+    /// None: no message has come.
+    pub const NONE: Self = Self {
+        sender: u32::MAX,
+        addressee: u32::MAX,
+    };
 }
 
 /// Which incarnation of each process counts, in the order of [`crate::process::Process::ALL`]; written by the supervisor alone.

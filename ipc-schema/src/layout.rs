@@ -287,7 +287,9 @@ pub fn table() -> Vec<TypeLayout> {
             since_lesson,
             stage,
             sender_incarnation,
-            recorded_ticks
+            recorded_ticks,
+            recorded_senders,
+            recorded_addressees
         }),
         layout!(Health {
             state,

@@ -12,12 +12,13 @@ use std::{
 use crate::{
     SCHEMA_VERSION,
     activity::{Activity, Awaited},
-    board::{Health, Progress, State},
+    board::{Health, MessageStream, Progress, State},
     clock, episode_state,
     failure::{Failure, FailureKind},
     header::MessageHeader,
     ports::{BoardError, BoardReader, BoardWriter, ControlServer, PortError, Publisher, Subscriber, Waker, wait},
     process::Process,
+    required_consumers::SentStream,
     run::{RunFile, RunFileError},
     scheduling,
     services::{self, BoardSeries, Channel, RunNode, ServiceError, WakeListener},
@@ -294,6 +295,7 @@ impl RunMembership {
             wakers,
             channel,
             window: (channel.spec().window)(&self.run),
+            stream: SentStream::of(incarnation()),
         })
     }
 
@@ -391,12 +393,16 @@ impl RunMembership {
     /// Attaches `recorder`, which has consumed of each channel the ticks below those given, in the order of [`Channel::ALL`].
     pub fn attach_recorder(&mut self, ticks: [u64; Channel::COUNT]) {
         self.progress.recorded_ticks = ticks;
+        self.progress.recorded_senders = [MessageStream::NONE.sender; Channel::COUNT];
+        self.progress.recorded_addressees = [MessageStream::NONE.addressee; Channel::COUNT];
         self.attach();
     }
 
-    /// `recorder` has consumed all ticks of `channel` below `ticks`: its producer gets the credit.
-    pub fn recorded(&mut self, channel: Channel, ticks: u64) {
+    /// `recorder` has consumed all ticks of `channel` below `ticks` that `stream` has: its producer gets the credit.
+    pub fn recorded(&mut self, channel: Channel, stream: MessageStream, ticks: u64) {
         self.progress.recorded_ticks[channel as usize] = ticks;
+        self.progress.recorded_senders[channel as usize] = stream.sender;
+        self.progress.recorded_addressees[channel as usize] = stream.addressee;
         self.board.set_progress(self.progress);
         self.wake_upstream();
     }
@@ -535,7 +541,10 @@ impl RunMembership {
     }
 
     /// Waits while `lacking` names what this process waits for, until it is asked to stop. Notes every look on the board.
-    fn wait_while(&self, mut lacking: impl FnMut() -> Option<Awaited>) -> Result<Wait, MembershipError> {
+    ///
+    /// # Errors
+    /// The wake-up is broken.
+    pub fn wait_while(&self, mut lacking: impl FnMut() -> Option<Awaited>) -> Result<Wait, MembershipError> {
         let mut has_waited = false;
         loop {
             let Some(awaited) = lacking() else {

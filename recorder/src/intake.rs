@@ -1,6 +1,7 @@
 //! The messages of one channel on their way into a recording: each once, with what is missing counted.
 
 use ipc_schema::{
+    board::MessageStream,
     channel::Channel,
     header::MessageHeader,
     ports::{PortError, Subscriber},
@@ -86,8 +87,10 @@ pub struct ChannelIntake {
     order: MessageOrder,
     ticks_per_message: u64,
     queue_length: usize,
-    /// One more than the newest tick received, repeated or not.
+    /// One more than the newest tick received.
     received_ticks: u64,
+    /// The newest stream of which a message came, and one more than its newest tick, repeated or not.
+    stream: (MessageStream, u64),
     newest: MessageHeader,
 }
 
@@ -102,6 +105,7 @@ impl ChannelIntake {
             ticks_per_message: ticks_per_message(channel, run),
             queue_length: channel.queue_length(run),
             received_ticks: 0,
+            stream: (MessageStream::NONE, 0),
             newest: MessageHeader::default(),
         }
     }
@@ -129,6 +133,7 @@ impl ChannelIntake {
         {
             received += 1;
             let header = message.header();
+            self.follow(header);
             let is_new = match self.channel {
                 Channel::TrafficMeta => self.order.is_new_meta(header),
                 _ => self.order.is_new(header, self.ticks_per_message),
@@ -143,6 +148,26 @@ impl ChannelIntake {
             }
         }
         Ok(received)
+    }
+
+    /// What the sender has credit for: repeated messages fill the queue too.
+    fn follow(&mut self, header: &MessageHeader) {
+        let stream = MessageStream {
+            sender: header.incarnation,
+            addressee: header.addressee,
+        };
+        let (before, ticks) = self.stream;
+        if before == MessageStream::NONE || stream > before {
+            self.stream = (stream, header.tick + 1);
+        } else if stream == before {
+            self.stream.1 = ticks.max(header.tick + 1);
+        }
+    }
+
+    /// The newest stream, and one more than the newest tick received of it.
+    #[must_use]
+    pub fn stream(&self) -> (MessageStream, u64) {
+        self.stream
     }
 
     /// One more than the newest tick received; 0 before the first.

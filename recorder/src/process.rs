@@ -6,7 +6,7 @@ use std::{
 };
 
 use ipc_schema::{
-    board::State,
+    board::{MessageStream, State},
     channel::Channel,
     config::{FullDiskAction, RecordManner},
     failure::{Failure, FailureKind},
@@ -73,8 +73,8 @@ struct RunRecorder {
     waits_for_space: bool,
     /// Boards of the processes that send.
     producers: Vec<BoardReader>,
-    /// Credit that was given, by [`Channel`], ticks.
-    credited: [u64; Channel::COUNT],
+    /// Credit that was given, by [`Channel`]: the stream, and its ticks.
+    credited: [(MessageStream, u64); Channel::COUNT],
     poll: Duration,
 }
 
@@ -151,12 +151,11 @@ impl RunRecorder {
             writer: None,
             report_of_stopped: None,
             producers,
-            credited: [0; Channel::COUNT],
+            credited: [(MessageStream::NONE, 0); Channel::COUNT],
             poll: POLL[0],
         };
         recorder.create_file(&path, &start, &run, options)?;
         let ticks = recorder.first_ticks(&run)?;
-        recorder.credited = ticks;
         recorder.membership.attach_recorder(ticks);
         Ok(recorder)
     }
@@ -252,11 +251,12 @@ impl RunRecorder {
         }
         // Only now: what goes with a tick is in the chunk before the producer gets credit for another.
         for intake in &self.intakes {
-            let (channel, ticks) = (intake.channel(), intake.received_ticks());
-            let is_due = ticks > self.credited[channel as usize];
+            let (channel, newest) = (intake.channel(), intake.stream());
+            let is_due = newest != self.credited[channel as usize];
             if is_due && self.membership.run.config.record.needs_credit(channel) {
-                self.credited[channel as usize] = ticks;
-                self.membership.recorded(channel, ticks);
+                self.credited[channel as usize] = newest;
+                let (stream, ticks) = newest;
+                self.membership.recorded(channel, stream, ticks);
             }
         }
         Ok(fullest)

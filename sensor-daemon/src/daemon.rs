@@ -103,7 +103,7 @@ impl Measurements {
         let mut draft = self.publisher.loan_unwritten(header, payload.len())?;
         draft.payload_mut().copy_from_slice(payload);
         draft.send()?;
-        self.consumers.wake();
+        self.consumers.sent(header.tick);
         Ok(())
     }
 }

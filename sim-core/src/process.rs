@@ -283,7 +283,7 @@ impl CoreProcess {
             None => Vec::new(),
         };
         draft.send()?;
-        self.consumers.wake();
+        self.consumers.sent(header.tick);
         if let Some(actions) = &self.actions {
             actions.send_poses(&header, &poses)?;
         }

@@ -16,7 +16,7 @@ use std::{
 };
 
 use common::{Spectator, Workplace, text, until, with_mounts};
-use ipc_schema::{channel::Channel, process::Process};
+use ipc_schema::{activity::Awaited, channel::Channel, process::Process};
 use recorder::file::reader::RecordingReader;
 use rustix::process::{Pid, Signal, kill_process};
 
@@ -188,29 +188,39 @@ fn a_simulator_that_dies_leaves_no_trace_in_the_recording() {
     // A paced run has the filter's estimates in its predictions, and another configuration.
     let estimates = "trainer.estimates=never";
     workplace.succeed(&command("train", "whole", &[estimates], &["--record"]));
-    let mut run = spawn(
-        &workplace,
-        &command(
-            "train",
-            "killed",
-            &["run.real_time_factor=60", estimates],
-            &["--record"],
-        ),
-    );
-    let directory = run_dir(&workplace, "killed");
-    let spectator = Spectator::join(&directory.join("run.json"), &mut run);
-    let board = spectator.board(Process::SimCore);
-    until(&mut run, "the second episode", || {
-        (board.health().ticks > 200).then_some(())
-    });
-    let pid = Pid::from_raw(board.health().pid).unwrap();
-    kill_process(pid, Signal::KILL).unwrap();
-    drop((board, spectator));
-    let output = run.wait_with_output().unwrap();
-    assert!(output.status.success(), "{}", text(&output));
-    assert_eq!(workplace.report("killed")["restarts"], 1);
-    let equal = workplace.run(&["diff", "whole", "killed"]);
-    assert!(equal.status.success(), "{}", text(&equal));
+    for (name, recorder_stands) in [("killed", false), ("behind", true)] {
+        let paced = ["run.real_time_factor=60", estimates];
+        let mut run = spawn(&workplace, &command("train", name, &paced, &["--record"]));
+        let directory = run_dir(&workplace, name);
+        let spectator = Spectator::join(&directory.join("run.json"), &mut run);
+        let boards = [Process::SimCore, Process::Recorder].map(|process| spectator.board(process));
+        // 0 until a process has reported.
+        let pid_of = |board: usize| Pid::from_raw(boards[board].health().pid);
+        until(&mut run, "the second episode", || {
+            (boards[0].health().ticks > 200).then_some(())
+        });
+        let (simulator, recorder) = (pid_of(0).unwrap(), pid_of(1).unwrap());
+        if recorder_stands {
+            // Messages lie in its queues until it continues, and those that are made again come on top.
+            kill_process(recorder, Signal::STOP).unwrap();
+        }
+        kill_process(simulator, Signal::KILL).unwrap();
+        if recorder_stands {
+            until(&mut run, "a simulator that waits for the recorder", || {
+                let simulators = [Process::TrafficBridge, Process::SimCore, Process::SensorDaemon];
+                let waits =
+                    |process| spectator.board(process).activity().awaited() == Awaited::Credit(Process::Recorder);
+                (pid_of(0).is_some_and(|pid| pid != simulator) && simulators.into_iter().any(waits)).then_some(())
+            });
+            kill_process(recorder, Signal::CONT).unwrap();
+        }
+        drop((boards, spectator));
+        let output = run.wait_with_output().unwrap();
+        assert!(output.status.success(), "{}", text(&output));
+        assert_eq!(workplace.report(name)["restarts"], 1);
+        let equal = workplace.run(&["diff", "whole", name]);
+        assert!(equal.status.success(), "{name}: {}", text(&equal));
+    }
 }
 
 #[test]

@@ -186,6 +186,7 @@ impl Delivery {
             let progress = self.board.progress();
             self.follow_incarnation(&progress)
                 .map_err(|error| journal_failure(&error))?;
+            others.turn_to(self.incarnation.unwrap_or(0));
             if self.is_trainer_ahead(&progress)
                 || self.next >= self.journal.ticks()
                 || !flow::has_credit(self.next, &progress, self.window)
@@ -193,8 +194,9 @@ impl Delivery {
             {
                 return Ok(());
             }
+            let tick = self.next;
             self.resend(observations)?;
-            others.wake();
+            others.sent(tick);
         }
     }
 

@@ -150,11 +150,13 @@ impl TickPublisher {
     pub fn publish(&mut self, header: &MessageHeader, draft: Draft) -> Result<(), Failure> {
         if self.keep(header, draft.payload())? {
             draft.send()?;
+            self.others.sent(header.tick);
+        } else {
+            self.others.wake();
         }
         if let Some(trainer) = &self.trainer {
             trainer.wake();
         }
-        self.others.wake();
         Ok(())
     }
 

@@ -227,7 +227,7 @@ impl HeroPorts {
         let written = block::view_mut(draft.payload_mut(), layout.poses).map_err(unreadable)?;
         written.copy_from_slice(poses);
         draft.send()?;
-        self.pose_consumers.wake();
+        self.pose_consumers.sent(header.tick);
         Ok(())
     }
 }

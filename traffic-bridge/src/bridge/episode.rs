@@ -1,6 +1,7 @@
 //! The loop over the steps of an episode: waits for credit, steps SUMO, publishes.
 
 use ipc_schema::{
+    activity::Awaited,
     config::TrafficEngine,
     failure::{Failure, FailureKind},
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
@@ -346,7 +347,7 @@ impl Bridge {
         self.commands.replay(&mut context)?;
         let (commands, server, consumers) = (&mut self.commands, &self.command_server, self.outbox.consumers());
         let mut failure = None;
-        let waited = self.membership.wait_until(|| {
+        let waited = self.membership.wait_while(|| {
             while failure.is_none() {
                 match server.serve(|command| commands.answer(command, &mut context)) {
                     Ok(true) => {}
@@ -354,7 +355,13 @@ impl Bridge {
                     Err(error) => failure = Some(error),
                 }
             }
-            failure.is_some() || !commands.holds(context.tick) && consumers.have_credit(tick)
+            if failure.is_some() {
+                return None;
+            }
+            match commands.holds(context.tick) {
+                true => Some(Awaited::Other),
+                false => consumers.lacks_credit(tick).map(Awaited::Credit),
+            }
         })?;
         match (failure, waited) {
             (Some(failure), _) => Err(failure),

@@ -79,7 +79,7 @@ impl Outbox {
             lanes.publish(frame, header)?;
         }
         send(&self.traffic, header, layout.len, layout.states, &frame.states)?;
-        self.consumers.wake();
+        self.consumers.sent(header.tick);
         if let Some((publisher, census)) = &mut self.census {
             census.add_step(frame);
             census.publish_if_due(publisher, header)?;
