@@ -254,7 +254,7 @@ def test_thirty_actions_in_a_browser_steer_a_live_run(tmp_path: Path) -> None:
         started = psutil.Process(panel.process.pid).children(recursive=True)
         assert started, "the played run is alive"
         panel.process.send_signal(signal.SIGINT)
-        assert panel.process.wait(PATIENCE_S) == 130
+        assert panel.process.wait(PATIENCE_S) == 130, (tmp_path / "panel.log").read_text()
         page.wait("document.querySelector('#connection').textContent.includes('does not answer')")
         page.did("Ctrl-C ends the panel")
     assert [child for child in started if child.is_running() and child.status() != psutil.STATUS_ZOMBIE] == []

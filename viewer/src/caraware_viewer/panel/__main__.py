@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import os
 import queue
 import secrets
@@ -15,11 +16,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from caraware_viewer.display import DisplayError, free_port
-from caraware_viewer.panel.commands import CommandLog
+from caraware_viewer.panel.commands import END_LIMIT_S, CommandLog
 from caraware_viewer.panel.server import HOST, Panel, serve
 
 PORT = 9091
 INTERRUPTED = 130
+CLOSE_LIMIT_S = 20.0
+"""Longest time from the end of the last command to the end of the panel."""
 _KEY_BYTES = 24
 
 
@@ -49,12 +52,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     threading.Thread(target=server.serve_forever, name="server", daemon=True).start()
     print(f"open http://{HOST}:{port}/#{key} in a browser on this machine", flush=True)
     print("The address allows commands in your name. Ctrl-C ends the panel and what it has started.", flush=True)
-    signals.get()
+    _wait_for(signals)
+    # A panel that does not end prints where each thread is, and ends; Linux then ends what it has started.
+    faulthandler.dump_traceback_later(END_LIMIT_S + CLOSE_LIMIT_S, exit=True)
     _end(commands, signals)
     server.shutdown()
     server.server_close()
     panel.live.close()
-    return INTERRUPTED
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Threads of zenoh may still call Python, which aborts a process that tidies up.
+    os._exit(INTERRUPTED)
+
+
+def _wait_for(signals: queue.SimpleQueue[int]) -> None:
+    """Waits for a signal. Linux may give it to any thread, and then wakes no main thread that waits without a limit."""
+    while True:
+        with contextlib.suppress(queue.Empty):
+            signals.get(timeout=0.2)
+            return
 
 
 def _end(commands: CommandLog, signals: queue.SimpleQueue[int]) -> None:
