@@ -157,7 +157,7 @@ pub fn control(args: &ControlArgs) -> Result<(), Exit> {
     };
     match socket::send_request(&run, &request)? {
         Reply::Done(done) => {
-            println!("{}: tick {}: {}", run.name, done.tick, done.message);
+            crate::say!("{}: tick {}: {}", run.name, done.tick, done.message);
             Ok(())
         }
         Reply::Refused(refusal) => Err(refused(refusal)),

@@ -55,10 +55,10 @@ impl DoctorChecks {
     /// Prints the result of one check: what was found, or what is missing and how to get it.
     fn print(&mut self, result: Result<String, (String, String)>, what: &str) {
         match result {
-            Ok(text) => println!("ok       {what}: {text}"),
+            Ok(text) => crate::say!("ok       {what}: {text}"),
             Err((text, fix)) => {
                 self.missing += 1;
-                println!("MISSING  {what}: {text}\n         → {fix}");
+                crate::say!("MISSING  {what}: {text}\n         → {fix}");
             }
         }
     }
@@ -189,8 +189,8 @@ fn print_extras() {
             .flat_map(|directory| names.iter().map(move |name| directory.join(name)))
             .find(|path| path.is_file());
         match found {
-            Some(path) => println!("ok       {purpose}: {}", path.display()),
-            None => println!(
+            Some(path) => crate::say!("ok       {purpose}: {}", path.display()),
+            None => crate::say!(
                 "note     {purpose}: no {}\n         → apt-get install {package}",
                 names.join(" or ")
             ),
@@ -204,20 +204,20 @@ fn print_runs(clean: bool) {
         let name = entry.run.as_ref().map_or("(unreadable)", |run| run.name.as_str());
         let size = entry.shared_memory_bytes() >> 10;
         match (entry.alive, clean) {
-            (true, _) => println!("ok       run {name}: alive, {size} KiB of shared memory"),
-            (false, false) => println!(
+            (true, _) => crate::say!("ok       run {name}: alive, {size} KiB of shared memory"),
+            (false, false) => crate::say!(
                 "note     run {name}: dead, left {size} KiB of shared memory; removed by the next run or `caraware doctor --clean`"
             ),
             (false, true) => {
                 entry.clean();
-                println!("cleaned  run {name}: {size} KiB of shared memory removed");
+                crate::say!("cleaned  run {name}: {size} KiB of shared memory removed");
             }
         }
     }
     if entries.is_empty() {
-        println!("ok       no stale run");
+        crate::say!("ok       no stale run");
     }
     for path in registry::foreign_paths() {
-        println!("note     {}: not a run of caraware; it is not touched", path.display());
+        crate::say!("note     {}: not a run of caraware; it is not touched", path.display());
     }
 }

@@ -22,6 +22,7 @@ pub mod live_table;
 pub mod maps;
 pub mod memory_limit;
 pub mod metrics;
+pub mod output;
 pub mod panel;
 pub mod phase;
 pub mod prepare;

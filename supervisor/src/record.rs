@@ -63,7 +63,7 @@ pub fn record(args: &RecordArgs) -> Result<(), Exit> {
         signal_hook::flag::register(signal, Arc::clone(&stop))
             .map_err(|error| Exit::run(format!("cannot watch signals: {error}"), ""))?;
     }
-    println!(
+    crate::say!(
         "recording {} into {} until it ends, or until Ctrl-C",
         run.name,
         path.display()
@@ -80,7 +80,7 @@ pub fn record(args: &RecordArgs) -> Result<(), Exit> {
     let figures = outside::record(&run, &channels, &path, &stop, is_alive)?;
     #[expect(clippy::cast_precision_loss, reason = "megabytes for people")]
     let megabytes = |bytes: u64| bytes as f64 / 1e6;
-    println!(
+    crate::say!(
         "{}: {:.1} MB of {:.1} MB, {} ticks missed",
         path.display(),
         megabytes(figures.file_bytes),
@@ -129,20 +129,21 @@ pub fn diff(args: &DiffArgs) -> Result<(), Exit> {
     let open = |argument: &PathBuf| RecordingReader::open(&recording_path(argument, &args.runs));
     let (first, second) = (open(&args.first)?, open(&args.second)?);
     if first.start.config_hash != second.start.config_hash {
-        println!(
+        crate::say!(
             "the configurations differ (BLAKE3 {} and {})",
-            first.start.config_hash, second.start.config_hash
+            first.start.config_hash,
+            second.start.config_hash
         );
     }
     // A network's last bits depend on how many ticks were waiting when it was asked.
     let is_wanted = |channel| args.predictions || channel != Channel::Prediction;
     let comparison = diff::compare(&first, &second, is_wanted);
     if let Some(damage) = &comparison.damage {
-        println!("compared up to here: {damage}");
+        crate::say!("compared up to here: {damage}");
     }
     match comparison.first {
         None => {
-            println!("{} messages are equal", comparison.compared);
+            crate::say!("{} messages are equal", comparison.compared);
             Ok(())
         }
         Some(difference) => Err(Exit::run(

@@ -42,16 +42,25 @@ pub fn ps(name: Option<&str>, json: bool) -> Result<(), Exit> {
         let measured: Vec<RunMeasurement> = runs.iter().filter_map(|run| RunMeasurement::take(run).ok()).collect();
         let text = serde_json::to_string(&measured)
             .map_err(|error| Exit::run(format!("the table has no form in JSON: {error}"), ""))?;
-        println!("{text}");
+        crate::say!("{text}");
         return Ok(());
     }
     if runs.is_empty() {
-        println!("no run is alive");
+        crate::say!("no run is alive");
         return Ok(());
     }
-    println!(
+    crate::say!(
         "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>9} WAITS FOR",
-        "RUN", "PROCESS", "STATE", "PID", "TICK", "TICKS/S", "LAG", "DROPS", "RESTARTS", "MEMORY"
+        "RUN",
+        "PROCESS",
+        "STATE",
+        "PID",
+        "TICK",
+        "TICKS/S",
+        "LAG",
+        "DROPS",
+        "RESTARTS",
+        "MEMORY"
     );
     for run in &runs {
         RunMeasurement::take(run)?.print();
@@ -198,12 +207,21 @@ impl RunMeasurement {
     }
 
     fn print(&self) {
-        println!(
+        crate::say!(
             "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9} {:>6} {:>7} {:>9} {:>5} MiB",
-            self.run, "supervisor", "running", self.supervisor_pid, "", "", "", "", "", self.supervisor_memory_mib
+            self.run,
+            "supervisor",
+            "running",
+            self.supervisor_pid,
+            "",
+            "",
+            "",
+            "",
+            "",
+            self.supervisor_memory_mib
         );
         for row in &self.processes {
-            println!(
+            crate::say!(
                 "{:<16} {:<16} {:<9} {:>8} {:>10} {:>9.0} {:>6} {:>7} {:>9} {:>5} MiB {}",
                 self.run,
                 row.process,
@@ -218,9 +236,9 @@ impl RunMeasurement {
                 row.waits_for
             );
         }
-        println!();
+        crate::say!("");
         for row in &self.environments {
-            println!(
+            crate::say!(
                 "{:<16} environment {}: episode {}, {:.1} s, {} of {} road users sensing, {} arrived, {:.0} steps/s, {:.1} × real time",
                 self.run,
                 row.environment,
@@ -234,9 +252,12 @@ impl RunMeasurement {
             );
         }
         if let Some(row) = &self.training {
-            println!(
+            crate::say!(
                 "{:<16} trainer: {} updates, {}, reward {:.3}",
-                self.run, row.updates, row.metrics, row.reward
+                self.run,
+                row.updates,
+                row.metrics,
+                row.reward
             );
         }
     }
@@ -342,14 +363,14 @@ pub fn stop(name: Option<&str>) -> Result<(), Exit> {
     kill_process(pid, Signal::TERM)
         .map_err(|error| Exit::run(format!("cannot signal process {}: {error}", run.supervisor_pid), ""))?;
     match run.mode.has_trainer() {
-        true => println!("stopping {}: the trainer writes a checkpoint", run.name),
-        false => println!("stopping {}", run.name),
+        true => crate::say!("stopping {}: the trainer writes a checkpoint", run.name),
+        false => crate::say!("stopping {}", run.name),
     }
     let deadline = Instant::now() + STOP_WITHIN;
     while Instant::now() < deadline {
         wait(Duration::from_millis(100));
         if !registry::is_alive(&run.run_dir) {
-            println!("{} has stopped; its results are in {}", run.name, run.run_dir.display());
+            crate::say!("{} has stopped; its results are in {}", run.name, run.run_dir.display());
             return Ok(());
         }
     }

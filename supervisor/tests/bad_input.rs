@@ -8,7 +8,7 @@
 
 mod common;
 
-use std::net::TcpListener;
+use std::{net::TcpListener, process::Stdio};
 
 use common::{Workplace, sumo_program, text, tool, tree};
 
@@ -436,6 +436,29 @@ fn commands_to_a_run_that_is_not_alive() {
         &refused(&workplace, &["ps", "ghost"], 2),
         &["no run named `ghost` is alive"],
     );
+}
+
+#[test]
+fn a_reader_that_closes_the_pipe_is_no_error() {
+    let workplace = Workplace::new();
+    for arguments in [&["ps"][..], &["keys"], &["doctor"], &["--help"]] {
+        let (reader, writer) = std::io::pipe().unwrap();
+        // As `caraware ps | head -0` does, but for certain before the first line.
+        drop(reader);
+        let output = workplace
+            .command(arguments)
+            .stdout(writer)
+            .stderr(Stdio::piped())
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(
+            output.status.code().is_some_and(|code| code < 2),
+            "{arguments:?}: {:?} {said}",
+            output.status
+        );
+        assert!(!said.contains("panicked"), "{arguments:?}: {said}");
+    }
 }
 
 #[test]

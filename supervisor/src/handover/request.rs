@@ -79,9 +79,12 @@ pub fn handover(args: &HandoverArgs) -> Result<(), Exit> {
     };
     match socket::send_request(&run, &SupervisorRequest::Handover(request))? {
         HandoverAnswer::Done(report) => {
-            println!(
+            crate::say!(
                 "{}: trainer {} continues from tick {}; the handover took {:.2} s",
-                run.name, report.incarnation, report.first_tick, report.pause_s
+                run.name,
+                report.incarnation,
+                report.first_tick,
+                report.pause_s
             );
             Ok(())
         }
