@@ -22,7 +22,7 @@ const DENSITIES: [f64; 3] = [0.5, 1.0, 1.5];
 /// Other vehicles of the preset.
 const OTHERS: f64 = 20.0;
 /// Longest trip, seconds.
-const TIME_LIMIT_S: u32 = 120;
+const TIME_LIMIT_S: u32 = 300;
 /// A trip is long from here on, metres.
 const LONG_M: f64 = 500.0;
 /// Normal quantile of a two-sided 95 % interval.
@@ -49,10 +49,56 @@ struct TripDriver {
 
 #[derive(Debug, Clone, Deserialize)]
 struct Trip {
+    episode: u64,
+    hero: String,
     length_m: f64,
     end: String,
     time_s: f64,
     way_m: f64,
+    /// At the end.
+    manoeuvre: String,
+    /// Stop lines passed, by manoeuvre.
+    passed: BTreeMap<String, u32>,
+    /// Of a trip that ended by a collision.
+    #[serde(default)]
+    is_at_fault: bool,
+}
+
+/// A line of a run's `events/collisions.jsonl`, as far as fault depends on it.
+#[derive(Debug, Deserialize)]
+struct Contact {
+    episode: u64,
+    vehicle: String,
+    other: String,
+    #[serde(flatten)]
+    own: ContactBody,
+    other_body: Option<ContactBody>,
+}
+
+/// How a road user was in a contact.
+#[derive(Debug, Deserialize)]
+struct ContactBody {
+    speed_mps: f64,
+    side: String,
+}
+
+/// A vehicle that is slower stands.
+const STANDS_MPS: f64 = 0.05;
+
+impl Contact {
+    /// Whether `hero` is at fault, or `None` if it is not in the contact.
+    ///
+    /// After nuPlan's classes of collisions (Caesar et al., arXiv 2106.11810): what stands is not at fault, what is struck in its rear is
+    /// not, what strikes with its front is, and what strikes with its side is unless the other strikes with its front.
+    fn is_fault_of(&self, hero: &str) -> Option<bool> {
+        let (own, other) = match (self.vehicle == hero, self.other == hero, &self.other_body) {
+            (true, _, other) => (&self.own, other.as_ref()),
+            (false, true, Some(own)) => (own, Some(&self.own)),
+            _ => return None,
+        };
+        let is_struck = other.is_some_and(|other| other.side == "front" && other.speed_mps > STANDS_MPS);
+        Some(own.speed_mps > STANDS_MPS && own.side != "rear" && (own.side == "front" || !is_struck))
+    }
 }
 
 /// A directory for the runs. Dropping it removes the directory.
@@ -82,16 +128,27 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         format!(
             "Each driver drives the same {} trips: {HEROES} heroes that begin each of {episodes} evaluation episodes, at {} times the \
              traffic of the preset `driving`, at most {TIME_LIMIT_S} s. Their seeds are used by no training. A trip that does not end \
-             in time, or by a contact, beside the road, at a red light or against the traffic, is no arrival. Intervals are Wilson's, \
-             95 %. `sumo` is SUMO's own driver in the hero's place, seen by the same checks.",
+             in time, or by a contact, beside the road, at a red light or against the traffic, is no arrival. Fault is that of nuPlan: a \
+             hero that moves and strikes with its front, or with its side what does not strike with its own front. Intervals are \
+             Wilson's, 95 %. `sumo` is SUMO's own driver in the hero's place, seen by the same checks.",
             episodes * HEROES * densities.len() as u32,
             densities.iter().map(f64::to_string).collect::<Vec<_>>().join(", ")
         ),
     );
     let mut columns = vec!["driver", "trips", "arrived", "95 % interval"];
     columns.extend(&ENDS[1..]);
-    columns.extend(["collisions per 1 000 km", "m/s on the way"]);
+    columns.extend(["collisions per 1 000 km", "of these at fault", "m/s on the way"]);
     let mut all = ReportTable::new("All trips", &columns);
+    let mut manoeuvres = ReportTable::new(
+        "Collisions by manoeuvre",
+        &[
+            "driver",
+            "manoeuvre",
+            "stop lines passed",
+            "collisions",
+            "of these at fault",
+        ],
+    );
     let mut long = ReportTable::new(format!("Trips of {LONG_M} m and more"), &columns);
     for driver in drivers(options) {
         let mut driven = Vec::new();
@@ -99,6 +156,9 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
             driven.extend(drive(&driver, *density, episodes, &caraware, &runs.0)?);
         }
         all.push(row(&driver, &driven));
+        for cells in manoeuvre_rows(&driver, &driven) {
+            manoeuvres.push(cells);
+        }
         let longer: Vec<Trip> = driven.iter().filter(|trip| trip.length_m >= LONG_M).cloned().collect();
         long.push(row(&driver, &longer));
         let (share, [low, high]) = arrivals(&driven);
@@ -106,7 +166,7 @@ pub fn measure(options: &BenchOptions) -> Result<BenchReport, Exit> {
         report.figure(format!("{}, arrived, lower end", driver.key), low);
         report.figure(format!("{}, arrived, upper end", driver.key), high);
     }
-    report.tables.extend([all, long]);
+    report.tables.extend([all, long, manoeuvres]);
     Ok(report)
 }
 
@@ -166,9 +226,25 @@ fn drive(driver: &TripDriver, density: f64, episodes: u32, caraware: &Path, runs
     let text = fs::read_to_string(&path).map_err(|error| Exit::io("read", &path, &error))?;
     let unreadable = |error: serde_json::Error| Exit::run(format!("{}: {error}", path.display()), "");
     let result: serde_json::Value = serde_json::from_str(&text).map_err(unreadable)?;
-    let trips = serde_json::from_value(result["trainer"]["trips"].clone()).map_err(unreadable)?;
+    let mut trips: Vec<Trip> = serde_json::from_value(result["trainer"]["trips"].clone()).map_err(unreadable)?;
+    find_faults(&mut trips, &run.join("events/collisions.jsonl"))?;
     fs::remove_dir_all(&run).map_err(|error| Exit::io("remove", &run, &error))?;
     Ok(trips)
+}
+
+/// Says of the trips that ended by a collision whether the hero was at fault: by the last contact of the hero in that episode.
+fn find_faults(trips: &mut [Trip], lines: &Path) -> Result<(), Exit> {
+    let text = fs::read_to_string(lines).map_err(|error| Exit::io("read", lines, &error))?;
+    let contacts = text.lines().map(serde_json::from_str::<Contact>);
+    let contacts: Vec<Contact> =
+        Result::from_iter(contacts).map_err(|error| Exit::run(format!("{}: {error}", lines.display()), ""))?;
+    for trip in trips.iter_mut().filter(|trip| trip.end == "collision") {
+        let of_episode = contacts.iter().filter(|contact| contact.episode == trip.episode);
+        let faults = of_episode.filter_map(|contact| contact.is_fault_of(&trip.hero));
+        // Without a line the hero counts as at fault: its contact was with what no line has.
+        trip.is_at_fault = faults.last().unwrap_or(true);
+    }
+    Ok(())
 }
 
 fn row(driver: &TripDriver, trips: &[Trip]) -> Vec<String> {
@@ -188,9 +264,31 @@ fn row(driver: &TripDriver, trips: &[Trip]) -> Vec<String> {
         format!("{:.1} – {:.1} %", 100.0 * low, 100.0 * high),
     ];
     cells.extend(ENDS[1..].iter().map(|end| count(end).to_string()));
-    cells.push(format!("{:.0}", count("collision") as f64 / (way_m / 1e6).max(1e-9)));
+    let faults = trips.iter().filter(|trip| trip.is_at_fault).count();
+    cells.extend([count("collision"), faults].map(|count| format!("{:.0}", count as f64 / (way_m / 1e6).max(1e-9))));
     cells.push(format!("{:.1}", way_m / f64::max(time_s, 1e-9)));
     cells
+}
+
+/// One row for each manoeuvre that was driven, and for the ways between them.
+fn manoeuvre_rows(driver: &TripDriver, trips: &[Trip]) -> Vec<Vec<String>> {
+    let mut counts: BTreeMap<&str, [u32; 3]> = BTreeMap::new();
+    for trip in trips {
+        for (manoeuvre, passed) in &trip.passed {
+            counts.entry(manoeuvre).or_default()[0] += passed;
+        }
+        if trip.end == "collision" {
+            let counts = counts.entry(&trip.manoeuvre).or_default();
+            counts[1] += 1;
+            counts[2] += u32::from(trip.is_at_fault);
+        }
+    }
+    let row = |(manoeuvre, counts): (&str, [u32; 3])| {
+        let mut cells = vec![driver.name.to_owned(), manoeuvre.to_owned()];
+        cells.extend(counts.map(|count| count.to_string()));
+        cells
+    };
+    counts.into_iter().map(row).collect()
 }
 
 /// Share of arrivals, with its interval.
@@ -237,24 +335,101 @@ mod tests {
         assert_eq!(wilson(0.0, 0.0), [0.0, 1.0]);
     }
 
-    #[test]
-    fn a_row_counts_every_end() {
-        let trip = |end: &str| Trip {
+    fn trip(end: &str, is_at_fault: bool) -> Trip {
+        Trip {
+            episode: 0,
+            hero: "hero.0".into(),
             length_m: 600.0,
             end: end.into(),
             time_s: 50.0,
             way_m: 500.0,
-        };
-        let trips: Vec<Trip> = ["arrival", "arrival", "collision", "time limit"].map(trip).into();
-        let driver = TripDriver {
+            manoeuvre: "left turn, yielding".into(),
+            passed: BTreeMap::from([("left turn, yielding".into(), 2)]),
+            is_at_fault,
+        }
+    }
+
+    fn driver() -> TripDriver {
+        TripDriver {
             name: "d",
             key: "d",
             settings: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn rows_count_every_end_and_every_manoeuvre() {
+        let trips = [
+            trip("arrival", false),
+            trip("collision", false),
+            trip("collision", true),
+            trip("time limit", false),
+        ];
+        let cells = row(&driver(), &trips);
+        assert_eq!(cells[1..3], ["4", "25.0 %"]);
+        assert_eq!(cells[4..10], ["2", "0", "0", "0", "1", "0"]);
+        // Two collisions in 2 km, one of them at fault, 2 km in 200 s.
+        assert_eq!(cells[10..], ["1000", "500", "10.0"]);
+        assert_eq!(
+            manoeuvre_rows(&driver(), &trips),
+            [["d", "left turn, yielding", "8", "2", "1"]]
+        );
+    }
+
+    #[test]
+    fn what_strikes_with_its_front_is_at_fault_and_what_stands_or_is_struck_is_not() {
+        let line = |own: &str, own_mps: f64, other: &str, other_mps: f64| {
+            let other_body = match other {
+                "" => String::new(),
+                side => format!(r#","other_body":{{"speed_mps":{other_mps},"side":"{side}"}}"#),
+            };
+            let line = format!(
+                r#"{{"tick":1,"episode":0,"vehicle":"hero.0","what":"vehicle","other":"car.1","speed_mps":{own_mps},"side":"{own}"{other_body}}}"#
+            );
+            serde_json::from_str::<Contact>(&line).unwrap()
         };
-        let cells = row(&driver, &trips);
-        assert_eq!(cells[1..3], ["4", "50.0 %"]);
-        assert_eq!(cells[4..10], ["1", "0", "0", "0", "1", "0"]);
-        // One collision in 2 km, 2 km in 200 s.
-        assert_eq!(cells[10..], ["500", "10.0"]);
+        for (contact, of_hero, of_other) in [
+            (line("front", 5.0, "rear", 2.0), Some(true), Some(false)),
+            (line("front", 0.0, "front", 2.0), Some(false), Some(true)),
+            (line("front", 5.0, "front", 2.0), Some(true), Some(true)),
+            (line("left", 5.0, "front", 2.0), Some(false), Some(true)),
+            (line("left", 5.0, "right", 2.0), Some(true), Some(true)),
+            (line("right", 5.0, "front", 0.0), Some(true), Some(false)),
+            (line("rear", 5.0, "front", 9.0), Some(false), Some(true)),
+            // A building.
+            (line("left", 5.0, "", 0.0), Some(true), None),
+        ] {
+            let found = [contact.is_fault_of("hero.0"), contact.is_fault_of("car.1")];
+            assert_eq!(found, [of_hero, of_other], "{contact:?}");
+        }
+        assert_eq!(line("front", 5.0, "rear", 2.0).is_fault_of("hero.7"), None);
+    }
+
+    #[test]
+    fn the_last_contact_of_a_trips_hero_in_its_episode_decides_on_fault() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("collisions.jsonl");
+        let line = |episode: u64, vehicle: &str, side: &str| {
+            format!(r#"{{"episode":{episode},"vehicle":"{vehicle}","other":"x","speed_mps":5.0,"side":"{side}"}}"#)
+        };
+        let lines = [
+            line(0, "hero.0", "rear"),
+            line(1, "hero.0", "front"),
+            line(0, "hero.1", "front"),
+        ];
+        fs::write(&path, lines.join("\n")).unwrap();
+        let mut trips = [
+            trip("collision", true),
+            trip("arrival", false),
+            Trip {
+                hero: "hero.1".into(),
+                ..trip("collision", false)
+            },
+        ];
+        find_faults(&mut trips, &path).unwrap();
+        assert_eq!(trips.map(|trip| trip.is_at_fault), [false, false, true]);
+        fs::write(&path, "{}").unwrap();
+        let error = find_faults(&mut [], &path).unwrap_err();
+        assert!(format!("{error:?}").contains("collisions.jsonl"), "{error:?}");
     }
 }

@@ -10,6 +10,7 @@ import torch
 from caraware import _native
 from caraware.driving.imitate import Teacher, clone
 from caraware.driving.lessons import Lessons, Limits
+from caraware.driving.manoeuvres import BETWEEN, NEEDED, Manoeuvres
 from caraware.driving.trips import TripLog
 from caraware.ipc.stream import EMPTY_SLOT
 from caraware.learn.config import TrainerConfig
@@ -223,3 +224,39 @@ def test_a_trip_is_that_of_a_hero_of_the_list_and_counts_once() -> None:
         (0, "hero.1", "arrival", 400, 2.0),
         (1, "hero.0", "end of the run's episode", 700, 0.0),
     ]
+
+
+def test_a_manoeuvre_is_how_the_hero_turns_and_who_has_the_right_of_way_until_the_junction_is_behind() -> None:
+    fields = Fields(NEEDED, 1, 0.0, {name: (-100.0, 100.0) for name in NEEDED})
+
+    def row(gap_m: float, priority: float, light_m: float, turn_rad: float) -> Tensor:
+        ahead = 20 * math.cos(turn_rad), 20 * math.sin(turn_rad)
+        values = [gap_m, priority, light_m, 20.0, 0.0, 20 + ahead[0], ahead[1]]
+        return (torch.tensor(values) + 100) / 200
+
+    seen = Manoeuvres()
+    for gap_m, priority, light_m, turn_rad, expected in [
+        (20, 0, 20, 1.6, BETWEEN),
+        (2, 0, 2, 1.6, BETWEEN),
+        # Behind the stop line: the next junction is far, and what is ahead of the hero does not matter any more.
+        (60, 1, 100, 0.0, "left turn, green, yielding"),
+        (50, 1, 100, 0.0, "left turn, green, yielding"),
+        (40, 1, 100, 0.0, "left turn, green, yielding"),
+        (30, 1, 100, 0.0, "left turn, green, yielding"),
+        (19, 1, 100, 0.0, BETWEEN),
+        (4, 1, 100, -0.1, BETWEEN),
+        (30, 0, 100, 0.0, "straight on, right of way"),
+        # A second junction, nearer than the end of the first; on it the gap is 0 and the turn is not ahead any more.
+        (3, 0, 100, -1.5, "straight on, right of way"),
+        (0, 1, 100, 0.0, "right turn, yielding"),
+        (0, 1, 100, 0.0, "right turn, yielding"),
+        (100, 0, 3, 3.0, "right turn, yielding"),
+    ]:
+        seen.add(fields, row(gap_m, priority, light_m, turn_rad), 10.0)
+        assert seen.now == expected, (gap_m, priority)
+    assert seen.passed == dict.fromkeys(
+        ("left turn, green, yielding", "straight on, right of way", "right turn, yielding"), 1
+    )
+    without = Manoeuvres()
+    without.add(Fields(("speed",), 1, 0.0, {"speed": (0.0, 30.0)}), torch.zeros(1), 10.0)
+    assert without.now == BETWEEN and not without.passed

@@ -14,12 +14,18 @@ use ipc_schema::{
 };
 use serde::{Deserialize, Serialize};
 
-use super::{CollisionDetector, body::boxes_touch};
+use super::{
+    CollisionDetector,
+    body::{CollisionBody, boxes_touch},
+};
 use crate::{
     event_log::EventLog,
     mirror::Mirror,
     names::RoadUserNames,
-    scene::{Scene, Solid},
+    scene::{
+        Scene, Solid,
+        shape::{OrientedBox, Point},
+    },
 };
 
 /// Contacts that began in the run, by what was struck.
@@ -75,9 +81,45 @@ struct CollisionLine<'a> {
     other: &'a str,
     position_m: [f64; 3],
     relative_speed_mps: f32,
+    #[serde(flatten)]
+    own: ContactBody,
+    #[serde(rename = "other_body", skip_serializing_if = "Option::is_none")]
+    struck: Option<ContactBody>,
     /// Of two vehicles: whether SUMO's own poses overlap at that time too.
     #[serde(skip_serializing_if = "Option::is_none")]
     in_sumo: Option<bool>,
+}
+
+/// How a road user was in a contact.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+struct ContactBody {
+    /// Speed over the ground, m/s.
+    speed_mps: f32,
+    /// Side of its outline that is next to the point of contact.
+    side: &'static str,
+}
+
+impl ContactBody {
+    fn of(state: &VehicleState, position_m: [f64; 3]) -> Self {
+        let [forward_mps, left_mps, _] = state.velocity_body_mps;
+        Self {
+            speed_mps: libm::hypotf(forward_mps, left_mps),
+            side: nearest_side(&CollisionBody::of(state).solid, [position_m[0], position_m[1]]),
+        }
+    }
+}
+
+/// The side of an outline that is nearest to a point in it.
+fn nearest_side(outline: &OrientedBox, point: Point) -> &'static str {
+    let [ahead_m, left_m] = outline.local_from_world(point);
+    let [half_length_m, half_width_m] = outline.half_m;
+    let is_at_end = half_length_m - ahead_m.abs() < half_width_m - left_m.abs();
+    match (is_at_end, ahead_m >= 0.0, left_m >= 0.0) {
+        (true, true, _) => "front",
+        (true, false, _) => "rear",
+        (false, _, true) => "left",
+        (false, _, false) => "right",
+    }
 }
 
 /// Finds, publishes and counts the contacts of a run.
@@ -166,11 +208,29 @@ impl ContactReporter {
                 .then(|| overlap_in_sumo(mirror, [collision.vehicle, collision.other]));
             self.counts.add(collision.other_class);
             self.counts.vehicle_in_sumo += u64::from(in_sumo == Some(true));
-            let line = CollisionLine {
-                in_sumo,
-                ..line(header, collision, names, detector.scene())
+            let body = |vehicle: u32| {
+                let state = states.iter().find(|state| state.vehicle == vehicle);
+                state.map(|state| ContactBody::of(state, collision.position_m))
             };
-            self.lines.push(&line)?;
+            let Some(own) = body(collision.vehicle) else { continue };
+            let is_road_user = [Struck::Vehicle, Struck::Person]
+                .map(|class| class as u32)
+                .contains(&collision.other_class);
+            let struck = is_road_user.then(|| body(collision.other)).flatten();
+            let (what, other) = struck_object(collision, names, detector.scene());
+            self.lines.push(&CollisionLine {
+                tick: header.tick,
+                episode: header.episode,
+                sim_time_s: sim_time_s(header),
+                vehicle: names.id(collision.vehicle),
+                what,
+                other,
+                position_m: collision.position_m,
+                relative_speed_mps: collision.relative_speed_mps,
+                own,
+                struck,
+                in_sumo,
+            })?;
         }
         Ok(())
     }
@@ -197,15 +257,16 @@ fn unreadable(error: BlockError) -> Failure {
     Failure::from_error(FailureKind::Run, &error)
 }
 
-fn line<'a>(
-    header: &MessageHeader,
-    collision: &Collision,
-    names: &'a RoadUserNames,
-    scene: &'a Scene,
-) -> CollisionLine<'a> {
+#[expect(clippy::cast_precision_loss, reason = "a time for human readers")]
+fn sim_time_s(header: &MessageHeader) -> f64 {
+    header.sim_time_ns as f64 / 1e9
+}
+
+/// What was struck: its class and its name.
+fn struck_object<'a>(collision: &Collision, names: &'a RoadUserNames, scene: &'a Scene) -> (&'static str, &'a str) {
     let name = |index: u32| names.id(index);
     let is = |class: Struck| collision.other_class == class as u32;
-    let (what, other) = if is(Struck::Vehicle) {
+    if is(Struck::Vehicle) {
         ("vehicle", name(collision.other))
     } else if is(Struck::Person) {
         ("person", name(collision.other))
@@ -214,18 +275,31 @@ fn line<'a>(
             Solid::Building(building) => ("building", building.id.as_str()),
             Solid::Prop(prop) => ("obstacle", prop.kind.name),
         }
-    };
-    #[expect(clippy::cast_precision_loss, reason = "a time for human readers")]
-    let sim_time_s = header.sim_time_ns as f64 / 1e9;
-    CollisionLine {
-        tick: header.tick,
-        episode: header.episode,
-        sim_time_s,
-        vehicle: name(collision.vehicle),
-        what,
-        other,
-        position_m: collision.position_m,
-        relative_speed_mps: collision.relative_speed_mps,
-        in_sumo: None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_side_of_a_contact_is_the_nearest_of_four() {
+        // 4 m long and 2 m wide, heading north.
+        let outline = OrientedBox {
+            centre_m: [10.0, 20.0],
+            along: [0.0, 1.0],
+            half_m: [2.0, 1.0],
+            z_m: [0.0, 1.5],
+        };
+        for (point, side) in [
+            ([10.2, 21.9], "front"),
+            ([9.5, 18.1], "rear"),
+            ([9.1, 20.5], "left"),
+            ([10.9, 19.0], "right"),
+            // A corner that the front has a little less of.
+            ([10.95, 21.9], "right"),
+        ] {
+            assert_eq!(nearest_side(&outline, point), side, "{point:?}");
+        }
     }
 }

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from caraware.driving.manoeuvres import BETWEEN, Manoeuvres
 from caraware.examples import pure_pursuit
 from caraware.ipc.channel import Channel, Observation
 from caraware.ipc.names import Names
@@ -48,6 +49,10 @@ class Trip:
     """Driven."""
     harshest_mps2: float
     """Largest change of speed in a tick."""
+    manoeuvre: str
+    """At the end: see `caraware.driving.manoeuvres`."""
+    passed: dict[str, int]
+    """Stop lines passed, by manoeuvre."""
 
 
 class TripLog:
@@ -58,6 +63,7 @@ class TripLog:
         self._heroes = {f"hero.{number}" for number in range(setting(run, "traffic.heroes", int))}
         self._open: dict[int, Trip] = {}
         self._speed: dict[int, float] = {}
+        self._manoeuvres: dict[int, Manoeuvres] = {}
         self._episode = -1
         self.trips: list[Trip] = []
 
@@ -70,7 +76,7 @@ class TripLog:
         for ended in np.flatnonzero(obs.terminated | obs.truncated):
             if (trip := self._open.pop(int(ended), None)) is not None:
                 trip.end = name_of(int(obs.ended_by[ended]))
-                self.trips.append(trip)
+                self._close(int(ended), trip)
         for slot in map(int, np.flatnonzero(obs.valid)):
             speed = float(obs.truth[slot, 3])
             if slot in self._open:
@@ -80,8 +86,16 @@ class TripLog:
                 trip.way_m += speed * tick_s
             elif (hero := self._names.of(obs.id_hash[slot])) in self._heroes and not self._has_driven(hero):
                 left_m = float(self._task.fields.si_tensor(obs.observation[slot : slot + 1], "route_left")[0])
-                self._open[slot] = Trip(obs.episode, hero, left_m, "", 0.0, 0.0, 0.0)
+                self._open[slot] = Trip(obs.episode, hero, left_m, "", 0.0, 0.0, 0.0, BETWEEN, {})
+                self._manoeuvres[slot] = Manoeuvres()
+            if slot in self._open:
+                self._manoeuvres[slot].add(self._task.fields, obs.observation[slot], speed * tick_s)
             self._speed[slot] = speed
+
+    def _close(self, slot: int, trip: Trip) -> None:
+        manoeuvres = self._manoeuvres.pop(slot)
+        trip.manoeuvre, trip.passed = manoeuvres.now, manoeuvres.passed
+        self.trips.append(trip)
 
     def _has_driven(self, hero: str) -> bool:
         return any(trip.hero == hero and trip.episode == self._episode for trip in self.trips)
@@ -91,7 +105,7 @@ class TripLog:
         for slot, trip in sorted(self._open.items()):
             ended = slot < len(obs.ended_by) and (obs.terminated[slot] or obs.truncated[slot])
             trip.end = name_of(int(obs.ended_by[slot])) if ended else name_of(0)
-            self.trips.append(trip)
+            self._close(slot, trip)
         self._open.clear()
 
 
