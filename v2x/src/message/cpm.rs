@@ -151,8 +151,7 @@ impl Cpm {
         let containers = input.integer("cpmContainers", CONTAINERS)?;
         for _ in 0..containers {
             let id = input.integer("containerId", CONTAINER_ID)?;
-            let content = input.open_type()?;
-            let mut content = BitReader::new(&content);
+            let mut content = input.open_type()?;
             match id {
                 ORIGINATING_VEHICLE => cpm.heading = read_vehicle(&mut content)?,
                 SENSOR_INFORMATION => cpm.sensor_range_10cm = Some(read_sensor(&mut content)?),

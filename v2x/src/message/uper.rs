@@ -6,22 +6,24 @@ use super::MessageError;
 #[derive(Debug, Clone, Default)]
 pub struct BitWriter {
     bytes: Vec<u8>,
-    /// Bits used of the last byte; 0 = all.
-    used: u32,
+    /// Bits that do not fill a byte yet, in the low end; what is above them does not count.
+    rest: u64,
+    /// How many they are, below 8.
+    held: u32,
 }
 
 impl BitWriter {
-    /// The low `count` bits of `value`.
+    /// The low `count` bits of `value`, at most 64.
     pub fn bits(&mut self, value: u64, count: u32) {
-        for place in (0..count).rev() {
-            if self.used == 0 {
-                self.bytes.push(0);
-            }
-            let bit = (value >> place & 1) as u8;
-            if let Some(last) = self.bytes.last_mut() {
-                *last |= bit << (7 - self.used);
-            }
-            self.used = (self.used + 1) % 8;
+        if count > 32 {
+            self.bits(value >> 32, count - 32);
+            return self.bits(value, 32);
+        }
+        self.rest = self.rest << count | value & ((1 << count) - 1);
+        self.held += count;
+        while self.held >= 8 {
+            self.held -= 8;
+            self.bytes.push((self.rest >> self.held) as u8);
         }
     }
 
@@ -38,6 +40,9 @@ impl BitWriter {
 
     /// The bytes, the last one filled with zeros; at least one, as an open type needs.
     pub fn finish(mut self) -> Vec<u8> {
+        if self.held > 0 {
+            self.bits(0, 8 - self.held);
+        }
         if self.bytes.is_empty() {
             self.bytes.push(0);
         }
@@ -48,7 +53,11 @@ impl BitWriter {
     pub fn open_type(&mut self, content: Self) {
         let bytes = content.finish();
         self.length(bytes.len());
-        bytes.iter().for_each(|byte| self.bits((*byte).into(), 8));
+        let (words, last) = bytes.as_chunks::<4>();
+        words
+            .iter()
+            .for_each(|word| self.bits(u32::from_be_bytes(*word).into(), 32));
+        last.iter().for_each(|byte| self.bits((*byte).into(), 8));
     }
 
     /// A length without a range below 16 384 (X.691, 11.9.3.6 and 11.9.3.7).
@@ -66,32 +75,50 @@ const fn width(range: [i64; 2]) -> u32 {
     64 - span.leading_zeros()
 }
 
-/// Reads bits.
+/// Reads bits of a message, or of an open type within it.
 #[derive(Debug, Clone)]
 pub struct BitReader<'a> {
     bytes: &'a [u8],
+    /// Next bit, and one past the last, of `bytes`.
     bit: usize,
+    end: usize,
+    /// Bits that there are.
+    length: usize,
 }
 
 impl<'a> BitReader<'a> {
     /// Reads `bytes` from the first bit.
     pub fn new(bytes: &'a [u8]) -> Self {
-        Self { bytes, bit: 0 }
+        let length = 8 * bytes.len();
+        Self {
+            bytes,
+            bit: 0,
+            end: length,
+            length,
+        }
     }
 
-    /// The next `count` bits, at most 64.
+    /// The next `count` bits, at most 57.
     pub fn bits(&mut self, count: u32) -> Result<u64, MessageError> {
-        let end = self.bit + count as usize;
-        if end > self.bytes.len() * 8 {
-            return Err(MessageError::Short {
-                bit: self.bytes.len() * 8,
-            });
+        if count as usize > self.end - self.bit {
+            return Err(MessageError::Short { bit: self.length });
         }
-        let mut value = 0;
-        for bit in self.bit..end {
-            value = value << 1 | u64::from(self.bytes[bit / 8] >> (7 - bit % 8) & 1);
+        if count == 0 {
+            return Ok(0);
         }
-        self.bit = end;
+        // The eight bytes from the one that has the next bit; zeros behind the last.
+        let first = self.bit / 8;
+        let word = match self.bytes.get(first..).and_then(<[u8]>::first_chunk) {
+            Some(eight) => u64::from_be_bytes(*eight),
+            None => {
+                let mut eight = [0; 8];
+                let rest = &self.bytes[first..];
+                eight[..rest.len()].copy_from_slice(rest);
+                u64::from_be_bytes(eight)
+            }
+        };
+        let value = word << (self.bit % 8) >> (64 - count);
+        self.bit += count as usize;
         Ok(value)
     }
 
@@ -131,20 +158,25 @@ impl<'a> BitReader<'a> {
         }
     }
 
-    /// The bytes of an open type.
-    pub fn open_type(&mut self) -> Result<Vec<u8>, MessageError> {
-        let length = self.length()?;
-        if self.bit + 8 * length > 8 * self.bytes.len() {
-            return Err(MessageError::Short {
-                bit: self.bytes.len() * 8,
-            });
+    /// The content of an open type.
+    pub fn open_type(&mut self) -> Result<Self, MessageError> {
+        let length = 8 * self.length()?;
+        if length > self.end - self.bit {
+            return Err(MessageError::Short { bit: self.length });
         }
-        (0..length).map(|_| Ok(self.bits(8)? as u8)).collect()
+        let (bit, end) = (self.bit, self.bit + length);
+        self.bit = end;
+        Ok(Self {
+            bytes: self.bytes,
+            bit,
+            end,
+            length,
+        })
     }
 
     /// Nothing but the filling of the last byte follows.
     pub fn end(&self) -> Result<(), MessageError> {
-        match self.bytes.len() - self.bit.div_ceil(8) {
+        match (self.end - self.bit) / 8 {
             0 => Ok(()),
             bytes => Err(MessageError::Trailing { bytes }),
         }
@@ -162,7 +194,50 @@ mod tests {
         assert_eq!(widths, [0, 1, 12, 7, 9, 32]);
     }
 
+    /// Bits one after the other: the first in the highest bit of the first byte.
+    fn one_by_one(values: &[(u64, u32)]) -> Vec<u8> {
+        let bits: Vec<bool> = values
+            .iter()
+            .flat_map(|(value, count)| (0..*count).rev().map(move |place| value >> place & 1 == 1))
+            .collect();
+        let mut bytes = vec![0; bits.len().div_ceil(8).max(1)];
+        for (place, _) in bits.iter().enumerate().filter(|(_, bit)| **bit) {
+            bytes[place / 8] |= 0x80 >> (place % 8);
+        }
+        bytes
+    }
+
     proptest! {
+        #[test]
+        fn words_are_written_and_read_as_bits_one_by_one(
+            values in prop::collection::vec((any::<u64>(), 0_u32..58), 0..40),
+            content in prop::collection::vec(any::<u8>(), 1..200),
+        ) {
+            let mut writer = BitWriter::default();
+            values.iter().for_each(|(value, count)| writer.bits(*value, *count));
+            let mut inner = BitWriter::default();
+            content.iter().for_each(|byte| inner.bits((*byte).into(), 8));
+            writer.open_type(inner);
+            let length = match content.len() {
+                short @ 0..128 => (short as u64, 8),
+                long => (0x8000 | long as u64, 16),
+            };
+            let content = content.iter().map(|byte| (u64::from(*byte), 8));
+            let all: Vec<(u64, u32)> = values.iter().copied().chain([length]).chain(content).collect();
+            let bytes = writer.finish();
+            prop_assert_eq!(&bytes, &one_by_one(&all));
+            let mut reader = BitReader::new(&bytes);
+            for (value, count) in &values {
+                prop_assert_eq!(reader.bits(*count), Ok(value & ((1 << count) - 1)));
+            }
+            let mut inner = reader.open_type().unwrap();
+            for (value, count) in &all[values.len() + 1..] {
+                prop_assert_eq!(inner.bits(*count), Ok(*value));
+            }
+            prop_assert_eq!((inner.end(), reader.end()), (Ok(()), Ok(())));
+            prop_assert_eq!(inner.bits(1), Err(MessageError::Short { bit: inner.length }));
+        }
+
         #[test]
         fn what_is_written_is_read(values in prop::collection::vec((any::<i32>(), 0_u32..40), 0..40)) {
             let mut writer = BitWriter::default();
