@@ -1,10 +1,11 @@
 //! Delivery over distance, channel load and age of information in a grid of streets with houses between them, and the cost of it.
 //!
-//! `cargo bench -p v2x --bench exchange -- [STATIONS …]`: CAMs alone, then CAMs and CPMs.
+//! `cargo bench -p v2x --bench exchange -- [STATIONS …] [--threads=N] [--cam]`: CAMs alone, then CAMs and CPMs (not with `--cam`). The hash
+//! is over every block of neighbours: what is computed in another way has the same.
 
 #![allow(clippy::unwrap_used, reason = "a measurement asserts by unwrapping")]
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Instant};
 
 use ipc_schema::{
     config::Config,
@@ -99,6 +100,13 @@ struct Delivery {
     received: u64,
 }
 
+/// FNV-1a over bytes.
+fn hash(before: u64, bytes: &[u8]) -> u64 {
+    bytes.iter().fold(before, |hash, byte| {
+        (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01B3)
+    })
+}
+
 fn measure(stations: usize, perception_range_m: f64, threads: u32) {
     let grid = StreetGrid::new(stations);
     let mut config: Config = serde_json::from_str(include_str!("../../ipc-schema/tests/town.json")).unwrap();
@@ -114,10 +122,11 @@ fn measure(stations: usize, perception_range_m: f64, threads: u32) {
     };
     let scene = Arc::new(Scene::new(Road::default(), grid.houses(), Vec::new()));
     let mut exchange = MessageExchange::new(&config, vec![(Arc::clone(&scene), Projection::new(&map).unwrap())]);
-    let mut obstacles = Obstacles::new(scene);
+    let mut obstacles = Obstacles::new(&scene);
     let nearest = config.v2x.neighbours as usize;
     let mut bins = [[Delivery::default(); 10]; 3];
-    let (mut work_s, mut load, mut age_s, mut known) = (0.0, 0.0, Vec::new(), 0_u64);
+    let (mut work_s, mut wall_s, mut load, mut age_s, mut known) = (0.0, 0.0, 0.0, Vec::new(), 0_u64);
+    let mut blocks = 0xCBF2_9CE4_8422_2325;
     let mut before = exchange.counts();
     for tick in 0..(SECONDS + 1) * 10 {
         let states: Vec<VehicleState> = (0..stations)
@@ -161,15 +170,21 @@ fn measure(stations: usize, perception_range_m: f64, threads: u32) {
             channel_load: &mut channel_load,
             vehicle: &mut vehicle,
         };
-        let start_s = usage::processor_time_s();
+        let (start_s, start) = (usage::processor_time_s(), Instant::now());
         exchange.receive(&header, &slots, &states, &mut sections);
         exchange.send(&header, &slots, &states);
         let took_s = usage::processor_time_s() - start_s;
+        let passed_s = start.elapsed().as_secs_f64();
+        blocks = hash(blocks, bytemuck::cast_slice(&objects));
+        blocks = hash(blocks, bytemuck::cast_slice(&ids));
+        blocks = hash(blocks, bytemuck::cast_slice(&radio));
+        blocks = hash(blocks, bytemuck::cast_slice(&channel_load));
         if tick < 10 {
             before = exchange.counts();
             continue;
         }
         work_s += took_s;
+        wall_s += passed_s;
         load += channel_load.iter().map(|load| f64::from(*load)).sum::<f64>() / stations as f64;
         let rows = objects.iter().zip(&ids).filter(|(_, ids)| ids[2] != 0);
         age_s.extend(rows.map(|(numbers, _)| numbers[7]));
@@ -186,10 +201,11 @@ fn measure(stations: usize, perception_range_m: f64, threads: u32) {
     age_s.sort_unstable_by(f32::total_cmp);
     let share = |share: f64| age_s[((age_s.len() - 1) as f64 * share) as usize];
     println!(
-        "{stations} stations, {} with {threads} thread(s): {:.2} ms of processor time per simulated second ({:.1} x real time on one core), {:.0} links/s, {:.0} ns a link",
+        "{stations} stations, {} with {threads} thread(s): {:.2} ms of processor time and {:.2} ms per simulated second ({:.1} x real time), {:.0} links/s, {:.0} ns a link; hash {blocks:016x}",
         if perception_range_m > 0.0 { "CAM and CPM" } else { "CAM" },
         1e3 * work_s / SECONDS as f64,
-        SECONDS as f64 / work_s,
+        1e3 * wall_s / SECONDS as f64,
+        SECONDS as f64 / wall_s,
         per_s(links),
         1e9 * work_s / links as f64,
     );
@@ -246,10 +262,17 @@ fn count(exchange: &MessageExchange, obstacles: &Obstacles, states: &[VehicleSta
 }
 
 fn main() {
-    let counts: Vec<usize> = std::env::args().filter_map(|argument| argument.parse().ok()).collect();
+    let arguments: Vec<String> = std::env::args().collect();
+    let counts: Vec<usize> = arguments.iter().filter_map(|argument| argument.parse().ok()).collect();
     let counts = if counts.is_empty() { vec![250, 1000] } else { counts };
+    let threads = arguments
+        .iter()
+        .find_map(|argument| argument.strip_prefix("--threads="));
+    let threads = threads.map_or(1, |count| count.parse().unwrap());
     for stations in counts {
-        measure(stations, 0.0, 1);
-        measure(stations, 80.0, 1);
+        measure(stations, 0.0, threads);
+        if !arguments.iter().any(|argument| argument == "--cam") {
+            measure(stations, 80.0, threads);
+        }
     }
 }

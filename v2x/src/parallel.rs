@@ -7,17 +7,32 @@ const RUN: usize = 32;
 
 /// Calls `work` for each item with its place. Threads take runs of items as they become free, because items differ in their work.
 pub fn for_each<T: Send>(threads: usize, items: &mut [T], work: impl Fn(usize, &mut T) + Sync) {
+    for_each_with(threads, items, || (), |(), place, item| work(place, item));
+}
+
+/// The same with a room for each thread, which `room` makes: memory that items use one after the other.
+pub fn for_each_with<T: Send, R>(
+    threads: usize,
+    items: &mut [T],
+    room: impl Fn() -> R + Sync,
+    work: impl Fn(&mut R, usize, &mut T) + Sync,
+) {
     if threads <= 1 || items.len() <= RUN {
-        items.iter_mut().enumerate().for_each(|(place, item)| work(place, item));
+        let mut own = room();
+        items
+            .iter_mut()
+            .enumerate()
+            .for_each(|(place, item)| work(&mut own, place, item));
         return;
     }
     let threads = threads.min(items.len().div_ceil(RUN));
     let runs = Mutex::new(items.chunks_mut(RUN).enumerate());
     let next = || runs.lock().unwrap_or_else(PoisonError::into_inner).next();
     let take_runs = || {
+        let mut own = room();
         while let Some((number, items)) = next() {
             for (place, item) in items.iter_mut().enumerate() {
-                work(number * RUN + place, item);
+                work(&mut own, number * RUN + place, item);
             }
         }
     };

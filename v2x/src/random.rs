@@ -49,7 +49,14 @@ impl RadioRandom {
         }
     }
 
-    fn counter(link: LinkKey, purpose: RadioDraw, part: u32) -> [u32; 4] {
+    /// Key of all numbers of the episode.
+    pub(crate) fn key(&self) -> [u32; 2] {
+        self.key
+    }
+
+    /// The block of four words that has a number; 24 bits of `part` count.
+    #[inline(always)]
+    pub(crate) fn counter(link: LinkKey, purpose: RadioDraw, part: u32) -> [u32; 4] {
         [link.message, purpose as u32 | (part << 8), link.sender, link.receiver]
     }
 

@@ -38,8 +38,9 @@ pub fn philox4x32(counter: [u32; 4], key: [u32; 2]) -> [u32; 4] {
 }
 
 /// −2 ln u for u in (0, 1], relative error below 3e-7.
+#[must_use]
 #[inline(always)]
-fn minus_two_ln(u: f32) -> f32 {
+pub fn minus_two_ln(u: f32) -> f32 {
     const HALF_ROOT_BITS: u32 = std::f32::consts::FRAC_1_SQRT_2.to_bits();
     // u = m 2^e with m in [√½, √2): where u is close to 1 the logarithm of m is small and keeps its digits.
     let bits = u.to_bits().wrapping_sub(HALF_ROOT_BITS);

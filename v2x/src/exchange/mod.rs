@@ -24,6 +24,7 @@ use crate::{
     },
     parallel,
     radio::{
+        delivery::{DecodingTable, Receptions},
         links::{LinkComputer, Radio, RadioTick},
         medium::{Medium, MediumLink, OnAir, QueuedMessage, Schedule},
         noise_dbm,
@@ -80,7 +81,7 @@ struct HeardMessage {
     /// Slot of its sender.
     sender: usize,
     /// Numbers of its objects among all that was heard.
-    objects: Range<u64>,
+    objects: Range<u32>,
 }
 
 /// What a slot's radio did in the tick before.
@@ -104,6 +105,7 @@ pub struct MessageExchange {
     deviations: SensorDeviations,
     perception: PerceptionSpec,
     medium: Medium,
+    decoding: DecodingTable,
     maps: Vec<ExchangeMap>,
     /// Index of the map of the episode.
     at: usize,
@@ -144,13 +146,14 @@ impl MessageExchange {
             maps: maps
                 .into_iter()
                 .map(|(scene, projection)| ExchangeMap {
-                    obstacles: Obstacles::new(scene),
+                    obstacles: Obstacles::new(&scene),
                     projection,
                 })
                 .collect(),
             at: 0,
             links: LinkComputer::new(&v2x, &medium, random),
             medium,
+            decoding: DecodingTable::default(),
             random,
             stations: Vec::new(),
             activity: Vec::new(),
@@ -211,7 +214,7 @@ impl MessageExchange {
             for message in inbox.get(slot).into_iter().flatten() {
                 station.map.insert(objects, heard[*message as usize].objects.clone());
             }
-            station.map.forget(now_ms, lifetime_ms);
+            station.map.forget(objects, now_ms, lifetime_ms);
         });
         self.objects.advance(now_ms, lifetime_ms);
         for (station, activity) in self.stations.iter_mut().zip(&self.activity) {
@@ -399,17 +402,14 @@ impl MessageExchange {
         radios: &[Radio],
     ) {
         let stations: Vec<u32> = radios.iter().map(|radio| radio.station).collect();
-        let mut decoded: Vec<Vec<u32>> = vec![Vec::new(); schedule.on_air.len()];
-        let (medium, random) = (&self.medium, &self.random);
         let on_air = OnAir {
             schedule,
             queue,
             links,
             stations: &stations,
         };
-        parallel::for_each(self.config.threads as usize, &mut decoded, |number, decoded| {
-            medium.receivers(number, &on_air, random, decoded);
-        });
+        let decoded =
+            Receptions::new(&self.medium, &self.decoding, on_air, &self.random).decoded(self.config.threads as usize);
         let (threads, projection) = (self.config.threads as usize, &self.maps[self.at].projection);
         let mut contents: Vec<Vec<KnownObject>> = vec![Vec::new(); schedule.on_air.len()];
         parallel::for_each(threads, &mut contents, |number, objects| {
@@ -420,26 +420,25 @@ impl MessageExchange {
         for (sent, contents) in schedule.on_air.iter().zip(contents) {
             self.heard.push(HeardMessage {
                 sender: radios[queue[sent.queued].radio as usize].slot,
-                objects: self.objects.add(contents),
+                objects: self.objects.add(&contents),
             });
         }
-        self.inbox.iter_mut().for_each(Vec::clear);
-        for (number, (sent, receivers)) in schedule.on_air.iter().zip(&decoded).enumerate() {
+        for sent in &schedule.on_air {
             let message = &queue[sent.queued];
             let sender = &mut self.activity[radios[message.radio as usize].slot];
             sender.sent += 1;
             sender.bytes += message.bytes;
-            for receiver in receivers {
-                let slot = radios[*receiver as usize].slot;
-                self.inbox[slot].push(number as u32);
-                self.activity[slot].received += 1;
-            }
             match SendingService::of(message.message) {
                 SendingService::Cam => self.counts.cams += 1,
                 SendingService::Cpm => self.counts.cpms += 1,
             }
             self.counts.bytes += u64::from(message.bytes);
-            self.counts.received += receivers.len() as u64;
+        }
+        self.inbox.iter_mut().for_each(Vec::clear);
+        for (radio, decoded) in radios.iter().zip(decoded) {
+            self.activity[radio.slot].received += decoded.len() as u32;
+            self.counts.received += decoded.len() as u64;
+            self.inbox[radio.slot] = decoded;
         }
         self.counts.dropped += u64::from(schedule.dropped);
     }

@@ -1,6 +1,10 @@
 //! Links between the radios of a tick. Both directions of a link are the same, so each pair of radios is computed once.
 
 use ipc_schema::config::V2xConfig;
+use sensor_daemon::{
+    noise::normals::minus_two_ln,
+    wide::{VectorPath, VectorWork},
+};
 use sim_core::scene::{Grid, shape::Bounds};
 
 use super::{
@@ -27,42 +31,85 @@ pub struct Radio {
     pub antenna: Antenna,
 }
 
-/// A building that was between two slots when they were last looked at: it is tried first, because it mostly still is.
+/// A wall that was between two slots when they were last looked at: it is tried first, because it mostly still is.
 #[derive(Debug, Clone, Copy)]
 struct Witness {
     /// The later slot.
     slot: usize,
-    building: u32,
+    wall: u32,
 }
 
-/// The waves of shadowing at a radio, as either end of a link, in and out of a clear line of sight.
+/// The waves of shadowing at all radios, as either end of a link, in and out of a clear line of sight.
+#[derive(Default)]
 struct RadioShadows {
-    clear: [ShadowingEnd; 2],
-    obstructed: [ShadowingEnd; 2],
+    clear: [Vec<ShadowingEnd>; 2],
+    obstructed: [Vec<ShadowingEnd>; 2],
 }
 
 impl RadioShadows {
-    fn new(field: &ShadowingField, config: &V2xConfig, position_m: [f64; 2]) -> Self {
-        let ends = |state| {
+    fn new(field: &ShadowingField, config: &V2xConfig, radios: &[Radio]) -> Self {
+        let ends = |state, end: usize| {
             let decorrelation = decorrelation_m(config.path_loss, state);
-            [
-                field.first_end(position_m, decorrelation),
-                field.second_end(position_m, decorrelation),
-            ]
+            let mut ends = vec![ShadowingEnd::default(); radios.len()];
+            parallel::for_each(config.threads as usize, &mut ends, |radio, at| {
+                let position_m = radios[radio].antenna.position_m;
+                *at = match end {
+                    0 => field.first_end(position_m, decorrelation),
+                    _ => field.second_end(position_m, decorrelation),
+                };
+            });
+            ends
         };
         Self {
-            clear: ends(LinkState::Clear),
-            obstructed: ends(LinkState::Building),
+            clear: [ends(LinkState::Clear, 0), ends(LinkState::Clear, 1)],
+            obstructed: [ends(LinkState::Building, 0), ends(LinkState::Building, 1)],
         }
     }
+}
 
-    /// A standard normal number for the link from this first radio to a second one.
-    fn normal(&self, second: &Self, state: LinkState) -> f64 {
-        match state {
-            LinkState::Clear => self.clear[0].normal(&second.clear[1]),
-            LinkState::Vehicles | LinkState::Building => self.obstructed[0].normal(&second.obstructed[1]),
+/// Standard normal numbers for the links from a first radio to those after it.
+struct ShadowedPairs<'a> {
+    shadows: &'a RadioShadows,
+    first: usize,
+    pairs: &'a mut [RadioPair],
+}
+
+impl VectorWork for ShadowedPairs<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let [clear_first, clear_second] = &self.shadows.clear;
+        let [obstructed_first, obstructed_second] = &self.shadows.obstructed;
+        for pair in self.pairs {
+            let second = pair.second as usize;
+            pair.normal = match pair.between.state {
+                LinkState::Clear => clear_first[self.first].normal(&clear_second[second]),
+                LinkState::Vehicles | LinkState::Building => {
+                    obstructed_first[self.first].normal(&obstructed_second[second])
+                }
+            };
         }
     }
+}
+
+/// A pair of radios within range.
+#[derive(Debug, Clone, Copy)]
+struct RadioPair {
+    second: u32,
+    /// Square of the distance on the ground, m².
+    flat2_m2: f64,
+    between: LinkObstruction,
+    /// Its standard normal number of shadowing.
+    normal: f64,
+}
+
+/// What a thread uses for one radio after the other.
+#[derive(Default)]
+struct PairRoom {
+    near: Vec<u64>,
+    pairs: Vec<RadioPair>,
+    witnesses: Vec<Witness>,
 }
 
 /// Computes the links of an episode, tick by tick.
@@ -72,6 +119,9 @@ pub struct LinkComputer {
     field: ShadowingField,
     /// Power below which a link does not count, dBm.
     least_dbm: f64,
+    /// By state of the link: path loss at 1 m, and for each decade of distance, dB.
+    losses_db: [[f32; 2]; 3],
+    path: VectorPath,
     /// By slot, ascending by the later slot.
     witnesses: Vec<Vec<Witness>>,
 }
@@ -102,6 +152,11 @@ impl LinkComputer {
             random,
             field: ShadowingField::new(&random),
             least_dbm: medium.irrelevant_dbm(),
+            losses_db: [LinkState::Clear, LinkState::Vehicles, LinkState::Building].map(|state| {
+                let [near, far] = [1.0, 10.0].map(|distance_m| path_loss_db(config.path_loss, state, distance_m));
+                [near as f32, (far - near) as f32]
+            }),
+            path: VectorPath::widest(),
             witnesses: Vec::new(),
         }
     }
@@ -118,17 +173,28 @@ impl LinkComputer {
                 witnesses: std::mem::take(&mut self.witnesses[radio.slot]),
             })
             .collect();
-        let shadows = self.shadows(radios);
+        let shadows = match self.config.fading {
+            true => RadioShadows::new(&self.field, &self.config, radios),
+            false => RadioShadows::default(),
+        };
         let bounds: Vec<Bounds> = radios
             .iter()
             .map(|radio| Bounds::about(radio.antenna.position_m, 0.0))
             .collect();
-        let index = Grid::new(&bounds, 0.5 * self.config.range_m);
+        let index = Grid::new(&bounds, 0.25 * self.config.range_m);
         let this = &*self;
-        parallel::for_each(this.config.threads as usize, &mut turns, |first, turn| {
-            let near = Bounds::about(radios[first].antenna.position_m, this.config.range_m);
-            let seconds = ascending_after(first, radios.len(), |visit| index.visit_near(&near, visit));
-            this.pairs(&tick, &shadows, first, seconds, turn);
+        let threads = this.config.threads as usize;
+        parallel::for_each_with(threads, &mut turns, PairRoom::default, |room, first, turn| {
+            this.near(&tick, &index, first, turn, room);
+            this.obstruct(&tick, first, turn, room);
+            if this.config.fading {
+                this.path.run(ShadowedPairs {
+                    shadows: &shadows,
+                    first,
+                    pairs: &mut room.pairs,
+                });
+            }
+            this.link(&tick, first, turn, room);
         });
         // By radio: first those before it, then those after it.
         let mut links: Vec<Vec<MediumLink>> = vec![Vec::new(); radios.len()];
@@ -149,60 +215,91 @@ impl LinkComputer {
         links
     }
 
-    /// The waves at every radio; none if the channel does not fade.
-    fn shadows(&self, radios: &[Radio]) -> Vec<RadioShadows> {
-        if !self.config.fading {
-            return Vec::new();
+    /// Pairs of the radio `first` with those after it that are in range and of which one sends, ascending.
+    fn near(&self, tick: &RadioTick, index: &Grid, first: usize, turn: &PairTurn, room: &mut PairRoom) {
+        let (sends, a) = (tick.sends[first], &tick.radios[first].antenna);
+        // A bit for each radio is cheaper than sorting.
+        room.near.clear();
+        room.near.resize(tick.radios.len().div_ceil(64), 0);
+        index.visit_near(&Bounds::about(a.position_m, self.config.range_m), |numbers| {
+            for number in numbers.iter().map(|number| *number as usize) {
+                room.near[number / 64] |= u64::from(number > first) << (number % 64);
+            }
+        });
+        room.pairs.clear();
+        room.witnesses.clear();
+        let mut before = turn.witnesses.iter().peekable();
+        for (place, mut word) in room.near.iter().copied().enumerate() {
+            while word != 0 {
+                let second = 64 * place + word.trailing_zeros() as usize;
+                word &= word - 1;
+                let b = &tick.radios[second];
+                if !sends && !tick.sends[second] {
+                    // What is known of it is kept.
+                    while before.next_if(|witness| witness.slot < b.slot).is_some() {}
+                    room.witnesses.extend(before.next_if(|witness| witness.slot == b.slot));
+                    continue;
+                }
+                let [dx, dy] = [
+                    b.antenna.position_m[0] - a.position_m[0],
+                    b.antenna.position_m[1] - a.position_m[1],
+                ];
+                let flat2_m2 = dx * dx + dy * dy;
+                if flat2_m2 <= self.config.range_m * self.config.range_m {
+                    room.pairs.push(RadioPair {
+                        second: second as u32,
+                        flat2_m2,
+                        between: LinkObstruction::CLEAR,
+                        normal: 0.0,
+                    });
+                }
+            }
         }
-        let shadows = radios.iter().map(|radio| radio.antenna.position_m);
-        shadows
-            .map(|position_m| RadioShadows::new(&self.field, &self.config, position_m))
-            .collect()
     }
 
-    /// Pairs of the radio `first` with `seconds`, ascending.
-    fn pairs(
-        &self,
-        tick: &RadioTick,
-        shadows: &[RadioShadows],
-        first: usize,
-        seconds: impl Iterator<Item = usize>,
-        turn: &mut PairTurn,
-    ) {
-        let before = std::mem::take(&mut turn.witnesses);
-        let mut before = before.iter().peekable();
-        let a = &tick.radios[first];
-        for second in seconds {
-            let b = &tick.radios[second];
-            while before.next_if(|witness| witness.slot < b.slot).is_some() {}
-            let known = before.next_if(|witness| witness.slot == b.slot);
-            if !tick.sends[first] && !tick.sends[second] {
-                turn.witnesses.extend(known);
-                continue;
+    /// Finds what is between the radios of each pair.
+    fn obstruct(&self, tick: &RadioTick, first: usize, turn: &mut PairTurn, room: &mut PairRoom) {
+        let a = &tick.radios[first].antenna;
+        let mut before = turn.witnesses.iter().peekable();
+        let mut kept = room.witnesses.iter().peekable();
+        let mut witnesses = Vec::with_capacity(turn.witnesses.len() + 16);
+        for pair in &mut room.pairs {
+            let Radio { slot, antenna: b, .. } = &tick.radios[pair.second as usize];
+            while let Some(witness) = kept.next_if(|witness| witness.slot < *slot) {
+                witnesses.push(*witness);
             }
-            let [dx, dy] = [0, 1].map(|axis: usize| b.antenna.position_m[axis] - a.antenna.position_m[axis]);
-            if dx * dx + dy * dy > self.config.range_m * self.config.range_m {
-                continue;
-            }
-            let building = known
-                .map(|witness| witness.building)
-                .filter(|building| tick.obstacles.building_meets(*building, &a.antenna, &b.antenna))
-                .or_else(|| tick.obstacles.building_between(&a.antenna, &b.antenna));
-            let between = match building {
-                Some(building) => {
-                    turn.witnesses.push(Witness { slot: b.slot, building });
+            while before.next_if(|witness| witness.slot < *slot).is_some() {}
+            let known = before.next_if(|witness| witness.slot == *slot);
+            let wall = known
+                .and_then(|witness| tick.obstacles.wall_beside(witness.wall, a, b))
+                .or_else(|| tick.obstacles.wall_between(a, b));
+            pair.between = match wall {
+                Some(wall) => {
+                    witnesses.push(Witness { slot: *slot, wall });
                     LinkObstruction {
                         state: LinkState::Building,
                         above: [true; 2],
                     }
                 }
-                None => tick.obstacles.vehicles_between(&a.antenna, &b.antenna),
+                None => tick.obstacles.vehicles_between(a, b),
             };
-            let distance_m = (dx * dx + dy * dy + (b.antenna.z_m - a.antenna.z_m).powi(2)).sqrt();
-            let normal = || shadows[first].normal(&shadows[second], between.state);
-            if let Some(power_dbm) = self.power_dbm([a, b], between, distance_m, normal) {
+        }
+        witnesses.extend(kept);
+        turn.witnesses = witnesses;
+    }
+
+    /// Makes links of the pairs that count.
+    fn link(&self, tick: &RadioTick, first: usize, turn: &mut PairTurn, room: &PairRoom) {
+        let a = &tick.radios[first];
+        for pair in &room.pairs {
+            if self.config.fading && self.is_surely_weak(pair) {
+                continue;
+            }
+            let b = &tick.radios[pair.second as usize];
+            let distance_m = (pair.flat2_m2 + (b.antenna.z_m - a.antenna.z_m).powi(2)).sqrt();
+            if let Some(power_dbm) = self.power_dbm([a, b], pair.between, distance_m, || pair.normal) {
                 turn.links.push(MediumLink {
-                    radio: second as u32,
+                    radio: pair.second,
                     power_mw: milliwatts(power_dbm) as f32,
                     twice_shape: if self.config.fading {
                         fading::twice_shape(distance_m)
@@ -212,6 +309,18 @@ impl LinkComputer {
                 });
             }
         }
+    }
+
+    /// True if a pair does not count, by more than f32 may be wrong: most pairs, which need no exact logarithm. What height and vehicles
+    /// add to its loss is left out.
+    fn is_surely_weak(&self, pair: &RadioPair) -> bool {
+        const ERROR_DB: f32 = 0.01;
+        let state = pair.between.state;
+        let [at_1_m, decade] = self.losses_db[state as usize];
+        let log10 = -0.5 * std::f32::consts::LOG10_E * minus_two_ln((pair.flat2_m2 as f32).max(1.0));
+        let mean_dbm = self.config.power_dbm as f32 - (at_1_m + 0.5 * decade * log10);
+        let shadowing_db = shadowing_std_db(state) as f32 * pair.normal as f32;
+        mean_dbm + shadowing_db < self.least_dbm as f32 - ERROR_DB
     }
 
     /// Power of a link, dBm, if it counts. `shadowing` is its standard normal number.
@@ -248,32 +357,8 @@ impl LinkComputer {
     }
 }
 
-/// The numbers after `first` that `visit_all` visits, ascending, each once. All are below `count`. A bit for each is cheaper than sorting.
-fn ascending_after(
-    first: usize,
-    count: usize,
-    visit_all: impl FnOnce(&mut dyn FnMut(&[u32])),
-) -> impl Iterator<Item = usize> {
-    let mut words = vec![0_u64; count.div_ceil(64)];
-    visit_all(&mut |numbers| {
-        for number in numbers.iter().map(|number| *number as usize) {
-            words[number / 64] |= u64::from(number > first) << (number % 64);
-        }
-    });
-    words.into_iter().enumerate().flat_map(|(place, mut word)| {
-        std::iter::from_fn(move || {
-            let bit = word.trailing_zeros();
-            // Takes the lowest bit away; a word without bits has none left.
-            word &= word.checked_sub(1)?;
-            Some(64 * place + bit as usize)
-        })
-    })
-}
-
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use ipc_schema::{config::Config, world::VehicleState};
     use sim_core::scene::{Prism, Road, Scene, SolidClass};
 
@@ -330,8 +415,8 @@ mod tests {
         let houses = (0..36)
             .map(|place| house(f64::from(place % 6) * 70.0, f64::from(place / 6) * 70.0))
             .collect();
-        let scene = Arc::new(Scene::new(Road::default(), houses, Vec::new()));
-        let mut obstacles = Obstacles::new(scene);
+        let scene = Scene::new(Road::default(), houses, Vec::new());
+        let mut obstacles = Obstacles::new(&scene);
         let medium = Medium::new(noise_dbm(9.0), -85.0, 100_000_000);
         let computer = |threads| {
             let mut config = config.v2x.clone();

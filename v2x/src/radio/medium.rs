@@ -48,15 +48,13 @@ pub struct MediumLink {
     pub twice_shape: u32,
 }
 
-impl MediumLink {
-    /// Power of one message, whose draws these are, milliwatts.
-    fn faded_mw(&self, draws: [f64; 4]) -> f64 {
-        let gain = match self.twice_shape {
-            0 => 1.0,
-            halves => power_gain(draws, halves),
-        };
-        f64::from(self.power_mw) * gain
-    }
+/// Power of one message on a link with this mean power, whose draws these are, milliwatts.
+pub(super) fn faded_mw(power_mw: f32, twice_shape: u32, draws: [f64; 4]) -> f64 {
+    let gain = match twice_shape {
+        0 => 1.0,
+        halves => power_gain(draws, halves),
+    };
+    f64::from(power_mw) * gain
 }
 
 /// A message on air.
@@ -71,9 +69,17 @@ pub struct Transmission {
 }
 
 impl Transmission {
-    fn overlap_ns(&self, other: &Self) -> u64 {
+    /// Time during which another one is on air too, nanoseconds.
+    #[must_use]
+    pub fn overlap_ns(&self, other: &Self) -> u64 {
         let (from, to) = (self.start_ns.max(other.start_ns), self.end_ns.min(other.end_ns));
         to.saturating_sub(from)
+    }
+
+    /// Share of its time on air of a time within it, at most 1.
+    #[must_use]
+    pub fn share_of(&self, time_ns: u64) -> f64 {
+        (time_ns as f64 / (self.end_ns - self.start_ns) as f64).min(1.0)
     }
 }
 
@@ -118,21 +124,6 @@ fn link_to(links: &[MediumLink], radio: u32) -> Option<&MediumLink> {
         .binary_search_by_key(&radio, |link| link.radio)
         .ok()
         .map(|place| &links[place])
-}
-
-impl Schedule {
-    /// Transmissions that overlap with the one of this number, without it.
-    fn overlapping(&self, number: usize) -> impl Iterator<Item = &Transmission> {
-        let sent = self.on_air[number];
-        let from = self
-            .on_air
-            .partition_point(|other| other.start_ns + self.longest_ns <= sent.start_ns);
-        let others = self.on_air[from..].iter().enumerate();
-        others
-            .take_while(move |(_, other)| other.start_ns < sent.end_ns)
-            .filter(move |(place, other)| from + place != number && sent.overlap_ns(other) > 0)
-            .map(|(_, other)| other)
-    }
 }
 
 /// Time on air of a frame, nanoseconds.
@@ -226,61 +217,21 @@ impl Medium {
         schedule
     }
 
-    /// Indices of the radios that decode transmission `number`, ascending, into `decoded`.
-    pub fn receivers(&self, number: usize, on_air: &OnAir, random: &RadioRandom, decoded: &mut Vec<u32>) {
-        let OnAir {
-            schedule,
-            queue,
-            links,
-            stations,
-        } = on_air;
-        let sent = &schedule.on_air[number];
-        let message = &queue[sent.queued];
-        let overlapping: Vec<&Transmission> = schedule.overlapping(number).collect();
-        decoded.clear();
-        for link in &links[message.radio as usize] {
-            // A radio cannot hear while it sends.
-            if overlapping.iter().any(|other| queue[other.queued].radio == link.radio) {
-                continue;
-            }
-            let draws = |message: &QueuedMessage| {
-                let key = LinkKey {
-                    sender: message.station,
-                    receiver: stations[link.radio as usize],
-                    message: message.message,
-                };
-                random.uniforms(key, RadioDraw::Reception, 0)
-            };
-            let drawn = draws(message);
-            let (signal_mw, bytes) = (link.faded_mw(drawn), message.bytes as usize);
-            // Most links are too weak even without a disturbance, which is dearer to compute.
-            if drawn[3] >= decode_probability(signal_mw / self.noise_mw, bytes) {
-                continue;
-            }
-            let (mut disturbance_mw, mut disturbed_ns) = (0.0, 0);
-            for other in &overlapping {
-                let disturbing = &queue[other.queued];
-                if let Some(disturber) = link_to(&links[disturbing.radio as usize], link.radio) {
-                    disturbance_mw += disturber.faded_mw(draws(disturbing));
-                    disturbed_ns += sent.overlap_ns(other);
-                }
-            }
-            let share = disturbed_ns as f64 / (sent.end_ns - sent.start_ns) as f64;
-            if drawn[3] < self.decodes(signal_mw, disturbance_mw, share.min(1.0), bytes) {
-                decoded.push(link.radio);
-            }
-        }
-    }
-
     /// Probability that a message is decoded of which a share is disturbed: all disturbers at once during that share.
     #[must_use]
     pub fn decodes(&self, signal_mw: f64, disturbance_mw: f64, share: f64, bytes: usize) -> f64 {
-        let disturbed_bytes = (share * bytes as f64).ceil() as usize;
+        let disturbed_bytes = Self::disturbed_bytes(share, bytes);
         let clear = decode_probability(signal_mw / self.noise_mw, bytes - disturbed_bytes.min(bytes));
         match disturbed_bytes {
             0 => clear,
             count => clear * decode_probability(signal_mw / (self.noise_mw + disturbance_mw), count),
         }
+    }
+
+    /// Bytes of a message that are disturbed during a share of it.
+    #[must_use]
+    pub fn disturbed_bytes(share: f64, bytes: usize) -> usize {
+        (share * bytes as f64).ceil() as usize
     }
 
     /// Share of the tick in which each of `radios` radios finds the channel busy; its own messages count.
@@ -316,8 +267,76 @@ impl Medium {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
-    use crate::radio::{fading, noise_dbm};
+    use crate::radio::{
+        delivery::{DecodingTable, Receptions},
+        fading, noise_dbm,
+    };
+
+    impl Schedule {
+        /// Transmissions that overlap with the one of this number, without it.
+        fn overlapping(&self, number: usize) -> impl Iterator<Item = &Transmission> {
+            let sent = self.on_air[number];
+            let from = self
+                .on_air
+                .partition_point(|other| other.start_ns + self.longest_ns <= sent.start_ns);
+            let others = self.on_air[from..].iter().enumerate();
+            others
+                .take_while(move |(_, other)| other.start_ns < sent.end_ns)
+                .filter(move |(place, other)| from + place != number && sent.overlap_ns(other) > 0)
+                .map(|(_, other)| other)
+        }
+    }
+
+    impl Medium {
+        /// Message by message: indices of the radios that decode transmission `number`, ascending, into `decoded`.
+        fn receivers(&self, number: usize, on_air: &OnAir, random: &RadioRandom, decoded: &mut Vec<u32>) {
+            let OnAir {
+                schedule,
+                queue,
+                links,
+                stations,
+            } = on_air;
+            let sent = &schedule.on_air[number];
+            let message = &queue[sent.queued];
+            let overlapping: Vec<&Transmission> = schedule.overlapping(number).collect();
+            decoded.clear();
+            for link in &links[message.radio as usize] {
+                // A radio cannot hear while it sends.
+                if overlapping.iter().any(|other| queue[other.queued].radio == link.radio) {
+                    continue;
+                }
+                let draws = |message: &QueuedMessage| {
+                    let key = LinkKey {
+                        sender: message.station,
+                        receiver: stations[link.radio as usize],
+                        message: message.message,
+                    };
+                    random.uniforms(key, RadioDraw::Reception, 0)
+                };
+                let drawn = draws(message);
+                let (signal_mw, bytes) = (faded_mw(link.power_mw, link.twice_shape, drawn), message.bytes as usize);
+                // Most links are too weak even without a disturbance, which is dearer to compute.
+                if drawn[3] >= decode_probability(signal_mw / self.noise_mw, bytes) {
+                    continue;
+                }
+                let (mut disturbance_mw, mut disturbed_ns) = (0.0, 0);
+                for other in &overlapping {
+                    let disturbing = &queue[other.queued];
+                    if let Some(disturber) = link_to(&links[disturbing.radio as usize], link.radio) {
+                        disturbance_mw += faded_mw(disturber.power_mw, disturber.twice_shape, draws(disturbing));
+                        disturbed_ns += sent.overlap_ns(other);
+                    }
+                }
+                let share = disturbed_ns as f64 / (sent.end_ns - sent.start_ns) as f64;
+                if drawn[3] < self.decodes(signal_mw, disturbance_mw, share.min(1.0), bytes) {
+                    decoded.push(link.radio);
+                }
+            }
+        }
+    }
 
     const BYTES: u32 = 350;
     const AIR_NS: u64 = 512_000;
@@ -396,7 +415,65 @@ mod tests {
             stations: &stations,
         };
         medium.receivers(number, &on_air, &random, &mut decoded);
+        let table = DecodingTable::default();
+        let by_receiver = Receptions::new(&medium, &table, on_air, &random).decoded(1);
+        let receivers = (0..links.len() as u32).filter(|radio| by_receiver[*radio as usize].contains(&(number as u32)));
+        assert_eq!(receivers.collect::<Vec<_>>(), decoded);
         decoded
+    }
+
+    proptest! {
+        /// Receiver by receiver, with bounds, beside message by message, with the formulas.
+        #[test]
+        fn both_ways_decode_the_same(seed in any::<u64>(), stations in 2_usize..24, busy in 1_u64..40) {
+            let random = RadioRandom::new(seed);
+            let draw = |radio: usize, other: usize, part: u32| {
+                let key = LinkKey { sender: radio.min(other) as u32, receiver: radio.max(other) as u32, message: 0 };
+                random.uniforms(key, RadioDraw::Shadowing, part)
+            };
+            let links: Vec<Vec<MediumLink>> = (0..stations)
+                .map(|radio| {
+                    let others = (0..stations).filter(|other| *other != radio);
+                    let link = |other: usize| {
+                        let [power, shape, exists, _] = draw(radio, other, 0);
+                        (exists < 0.8).then(|| MediumLink {
+                            radio: other as u32,
+                            power_mw: milliwatts(-102.0 + 35.0 * power * power) as f32,
+                            twice_shape: [0, 2, 3, 6][(4.0 * shape) as usize],
+                        })
+                    };
+                    others.filter_map(link).collect()
+                })
+                .collect();
+            let queue: Vec<QueuedMessage> = (0..2 * stations)
+                .map(|place| {
+                    let [ready, bytes, ..] = draw(place, place, 1);
+                    QueuedMessage {
+                        radio: (place / 2) as u32,
+                        station: (place / 2) as u32 + 100,
+                        message: 2 * 7 + (place as u32 & 1),
+                        ready_ns: (ready * busy as f64 * 1e6) as u64,
+                        bytes: 100 + (bytes * 900.0) as u32,
+                    }
+                })
+                .collect();
+            let medium = medium();
+            let schedule = medium.schedule(&queue, &links, &random);
+            let stations: Vec<u32> = (100..100 + stations as u32).collect();
+            let on_air = OnAir { schedule: &schedule, queue: &queue, links: &links, stations: &stations };
+            let table = DecodingTable::default();
+            let receptions = Receptions::new(&medium, &table, on_air, &random);
+            let by_receiver = receptions.decoded(1);
+            prop_assert_eq!(&by_receiver, &receptions.decoded(3));
+            let mut decoded = Vec::new();
+            for number in 0..schedule.on_air.len() {
+                medium.receivers(number, &on_air, &random, &mut decoded);
+                for radio in 0..stations.len() as u32 {
+                    let is_decoded = by_receiver[radio as usize].binary_search(&(number as u32)).is_ok();
+                    prop_assert_eq!(is_decoded, decoded.contains(&radio));
+                }
+            }
+        }
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The radio channel: loss of a link, fading, noise and interference, air time, and which stations send when.
 
+pub mod delivery;
 pub mod fading;
 pub mod links;
 pub mod medium;

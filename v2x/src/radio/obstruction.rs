@@ -1,11 +1,11 @@
 //! Whether buildings or vehicles stand between two antennas, from the scene and the road users of a tick.
 
-use std::{ops::ControlFlow, sync::Arc};
+use std::ops::{ControlFlow, Range};
 
 use ipc_schema::world::VehicleState;
 use sim_core::scene::{
     Grid, Scene,
-    shape::{Bounds, OrientedBox, Point, cross, edges, from_to},
+    shape::{Bounds, OrientedBox, Point, cross, dot, edges, from_to},
 };
 
 use super::path_loss::LinkState;
@@ -35,12 +35,51 @@ pub struct LinkObstruction {
     pub above: [bool; 2],
 }
 
+impl LinkObstruction {
+    /// Nothing.
+    pub const CLEAR: Self = Self {
+        state: LinkState::Clear,
+        above: [true; 2],
+    };
+}
+
+/// A wall of a building.
+#[derive(Debug, Clone, Copy)]
+struct BuildingWall {
+    from_m: Point,
+    to_m: Point,
+    /// Top of the building, metres.
+    roof_m: f64,
+    building: u32,
+}
+
+/// A building as links see it.
+#[derive(Debug, Clone)]
+struct WalledBuilding {
+    bounds: Bounds,
+    /// Its walls among all.
+    walls: Range<u32>,
+}
+
+/// A circle about a road user.
+#[derive(Debug, Clone, Copy)]
+struct RoadUserCircle {
+    centre_m: Point,
+    /// Square of a radius that is a little too large, m².
+    radius2_m2: f64,
+    /// Top of the road user, metres.
+    top_m: f64,
+}
+
 /// Obstacles of a tick.
 #[derive(Debug, Default)]
 pub struct Obstacles {
-    scene: Arc<Scene>,
-    buildings: Grid,
+    buildings: Vec<WalledBuilding>,
+    walls: Vec<BuildingWall>,
+    building_grid: Grid,
     bodies: Vec<OrientedBox>,
+    /// By row, as `bodies`.
+    circles: Vec<RoadUserCircle>,
     vehicles: Grid,
 }
 
@@ -65,20 +104,37 @@ pub fn body_of(state: &VehicleState) -> OrientedBox {
 impl Obstacles {
     /// The buildings of a scene, and no vehicles.
     #[must_use]
-    pub fn new(scene: Arc<Scene>) -> Self {
-        let bounds: Vec<Bounds> = scene.buildings().iter().map(|building| building.bounds).collect();
-        Self {
-            buildings: Grid::new(&bounds, BUILDING_CELL_M),
-            scene,
-            bodies: Vec::new(),
-            vehicles: Grid::default(),
+    pub fn new(scene: &Scene) -> Self {
+        let mut obstacles = Self::default();
+        for (number, building) in (0_u32..).zip(scene.buildings()) {
+            let from = obstacles.walls.len() as u32;
+            let walls = edges(&building.outline_m).map(|(from_m, to_m)| BuildingWall {
+                from_m,
+                to_m,
+                roof_m: building.z_m()[1],
+                building: number,
+            });
+            obstacles.walls.extend(walls);
+            obstacles.buildings.push(WalledBuilding {
+                bounds: building.bounds,
+                walls: from..obstacles.walls.len() as u32,
+            });
         }
+        let bounds: Vec<Bounds> = obstacles.buildings.iter().map(|building| building.bounds).collect();
+        obstacles.building_grid = Grid::new(&bounds, BUILDING_CELL_M);
+        obstacles
     }
 
     /// Takes the road users of a tick.
     pub fn update(&mut self, states: &[VehicleState]) {
         self.bodies.clear();
         self.bodies.extend(states.iter().map(body_of));
+        self.circles.clear();
+        self.circles.extend(self.bodies.iter().map(|body| RoadUserCircle {
+            centre_m: body.centre_m,
+            radius2_m2: dot(body.half_m, body.half_m) * (1.0 + 1e-6) + 1e-6,
+            top_m: body.z_m[1],
+        }));
         let bounds: Vec<Bounds> = self.bodies.iter().map(OrientedBox::bounds).collect();
         self.vehicles = Grid::new(&bounds, VEHICLE_CELL_M);
     }
@@ -97,7 +153,7 @@ impl Obstacles {
     /// What is between two antennas.
     #[must_use]
     pub fn between(&self, a: &Antenna, b: &Antenna) -> LinkObstruction {
-        match self.building_between(a, b) {
+        match self.wall_between(a, b) {
             Some(_) => LinkObstruction {
                 state: LinkState::Building,
                 above: [true; 2],
@@ -110,10 +166,7 @@ impl Obstacles {
     #[must_use]
     pub fn vehicles_between(&self, a: &Antenna, b: &Antenna) -> LinkObstruction {
         match self.highest_vehicle_m(a, b) {
-            None => LinkObstruction {
-                state: LinkState::Clear,
-                above: [true; 2],
-            },
+            None => LinkObstruction::CLEAR,
             Some(top_m) => LinkObstruction {
                 state: LinkState::Vehicles,
                 above: [a.z_m > top_m, b.z_m > top_m],
@@ -124,15 +177,18 @@ impl Obstacles {
     /// True if a building meets the line between two antennas.
     #[must_use]
     pub fn meets_building(&self, a: &Antenna, b: &Antenna) -> bool {
-        self.building_between(a, b).is_some()
+        self.wall_between(a, b).is_some()
     }
 
-    /// The number of a building that meets the line between two antennas.
+    /// The number of a wall that meets the line between two antennas.
     #[must_use]
-    pub fn building_between(&self, a: &Antenna, b: &Antenna) -> Option<u32> {
+    pub fn wall_between(&self, a: &Antenna, b: &Antenna) -> Option<u32> {
+        let line = Bounds::of([a.position_m, b.position_m]);
         let mut met = None;
-        self.buildings.along(a.position_m, b.position_m, |found| {
-            met = found.iter().copied().find(|number| self.building_meets(*number, a, b));
+        self.building_grid.along(a.position_m, b.position_m, |found| {
+            met = found
+                .iter()
+                .find_map(|number| self.wall_of(&self.buildings[*number as usize], &line, a, b));
             match met {
                 Some(_) => ControlFlow::Break(()),
                 None => ControlFlow::Continue(()),
@@ -141,38 +197,70 @@ impl Obstacles {
         met
     }
 
-    /// True if the building of this number meets the line between two antennas.
+    /// The number of a wall that meets the line between two antennas, if one of the building with the wall `known` does.
     #[must_use]
-    pub fn building_meets(&self, number: u32, a: &Antenna, b: &Antenna) -> bool {
-        let Some(building) = self.scene.buildings().get(number as usize) else {
-            return false;
-        };
+    pub fn wall_beside(&self, known: u32, a: &Antenna, b: &Antenna) -> Option<u32> {
+        let wall = self.walls.get(known as usize)?;
+        if wall.surely_meets(a, b) {
+            return Some(known);
+        }
+        let line = Bounds::of([a.position_m, b.position_m]);
+        self.wall_of(&self.buildings[wall.building as usize], &line, a, b)
+    }
+
+    /// The number of a wall of a building that meets the line between two antennas, whose bounds are `line`.
+    fn wall_of(&self, building: &WalledBuilding, line: &Bounds, a: &Antenna, b: &Antenna) -> Option<u32> {
+        if !building.bounds.meets(line) {
+            return None;
+        }
         let way = from_to(a.position_m, b.position_m);
-        let roof_m = building.z_m()[1];
-        building.bounds.meets(&Bounds::of([a.position_m, b.position_m]))
-            && edges(&building.outline_m).any(|(from, to)| {
-                let share = share_of_crossing(a.position_m, way, from, to);
-                share.is_some_and(|share| a.z_m + share * (b.z_m - a.z_m) < roof_m)
-            })
+        building.walls.clone().find(|number| {
+            let wall = &self.walls[*number as usize];
+            share_of_crossing(a.position_m, way, wall.from_m, wall.to_m)
+                .is_some_and(|share| a.z_m + share * (b.z_m - a.z_m) < wall.roof_m)
+        })
     }
 
     /// Top of the highest road user that meets the line between two antennas, metres. Those that carry the antennas do not count.
     #[must_use]
     pub fn highest_vehicle_m(&self, a: &Antenna, b: &Antenna) -> Option<f64> {
         let mut top_m: Option<f64> = None;
+        let way = from_to(a.position_m, b.position_m);
+        let length2 = dot(way, way);
         self.vehicles.along(a.position_m, b.position_m, |found| {
             for row in found {
-                let body = &self.bodies[*row as usize];
-                if *row == a.row || *row == b.row || top_m.is_some_and(|top| body.z_m[1] <= top) {
+                let circle = &self.circles[*row as usize];
+                // Most are beside the line.
+                let area = cross(way, from_to(a.position_m, circle.centre_m));
+                if area * area > circle.radius2_m2 * length2 {
                     continue;
                 }
-                if meets_box(body, a, b) {
-                    top_m = Some(body.z_m[1]);
+                if *row == a.row || *row == b.row || top_m.is_some_and(|top| circle.top_m <= top) {
+                    continue;
+                }
+                if meets_box(&self.bodies[*row as usize], a, b) {
+                    top_m = Some(circle.top_m);
                 }
             }
             ControlFlow::Continue(())
         });
         top_m
+    }
+}
+
+impl BuildingWall {
+    /// True if the line between two antennas crosses the wall away from its ends and below the roof: [`share_of_crossing`] finds it too,
+    /// whatever is rounded. The most frequent answer, without a division.
+    fn surely_meets(&self, a: &Antenna, b: &Antenna) -> bool {
+        const MARGIN: f64 = 1e-6;
+        let way = from_to(a.position_m, b.position_m);
+        let wall = from_to(self.from_m, self.to_m);
+        let area = cross(way, wall);
+        let offset = from_to(a.position_m, self.from_m);
+        let (share, along) = (cross(offset, wall) * area.signum(), cross(offset, way) * area.signum());
+        let area = area.abs();
+        let inside = MARGIN * area..(1.0 - MARGIN) * area;
+        area > MARGIN && inside.contains(&share) && inside.contains(&along) && a.z_m.max(b.z_m) < self.roof_m - MARGIN
     }
 }
 
@@ -250,7 +338,7 @@ mod tests {
     #[test]
     fn a_house_is_in_the_way_up_to_its_roof() {
         let scene = Scene::new(Road::default(), vec![house(50.0, -5.0, 8.0)], Vec::new());
-        let obstacles = Obstacles::new(Arc::new(scene));
+        let obstacles = Obstacles::new(&scene);
         let state = |y_m, z_m| {
             obstacles
                 .between(&antenna(0.0, y_m, z_m, 0), &antenna(100.0, y_m, z_m, 1))
@@ -303,13 +391,24 @@ mod tests {
                 .map(|([x, y], yaw_rad, height_m)| VehicleState { yaw_rad, ..vehicle(x, y, height_m) })
                 .collect();
             let (a, b) = (antenna(from[0], from[1], z_m, u32::MAX), antenna(to[0], to[1], 1.5, u32::MAX));
-            let mut obstacles = Obstacles::new(Arc::new(Scene::new(Road::default(), houses.clone(), Vec::new())));
+            let mut obstacles = Obstacles::new(&Scene::new(Road::default(), houses.clone(), Vec::new()));
             obstacles.update(&states);
             let way = from_to(from, to);
             let house_met = houses.iter().any(|house| edges(&house.outline_m).any(|(c, d)| {
                 share_of_crossing(from, way, c, d).is_some_and(|share| z_m + share * (1.5 - z_m) < 3.0)
             }));
             prop_assert_eq!(obstacles.meets_building(&a, &b), house_met);
+            // Each wall, as one that was met before.
+            for number in 0..obstacles.walls.len() as u32 {
+                let wall = &obstacles.walls[number as usize];
+                let meets = |wall: &BuildingWall| {
+                    share_of_crossing(from, way, wall.from_m, wall.to_m).is_some_and(|share| z_m + share * (1.5 - z_m) < 3.0)
+                };
+                prop_assert!(meets(wall) || !wall.surely_meets(&a, &b));
+                let met = obstacles.wall_beside(number, &a, &b);
+                prop_assert!(met.is_none_or(|met| meets(&obstacles.walls[met as usize])));
+                prop_assert!(met.is_some() || !meets(wall));
+            }
             let tops = states.iter().map(body_of).filter(|body| meets_box(body, &a, &b)).map(|body| body.z_m[1]);
             prop_assert_eq!(obstacles.highest_vehicle_m(&a, &b), tops.reduce(f64::max));
         }

@@ -32,10 +32,10 @@ const ERROR_WEIGHTS: [f64; 9] = [
     134_365_911.0,
 ];
 
-/// Ratio of signal to noise below which the bound is 0.
-const HOPELESS: f64 = 1.1;
-/// Ratio of signal to noise above which the bound rounds to 1.
-const CERTAIN: f64 = 20.0;
+/// Ratio of signal to noise below which no frame is received.
+pub const HOPELESS: f64 = 1.1;
+/// Ratio of signal to noise above which the probability of reception rounds to 1.
+pub const CERTAIN: f64 = 20.0;
 
 /// Probability that a frame of `bytes` bytes is received without an error at a ratio of signal to noise and interference.
 ///
@@ -51,16 +51,25 @@ pub fn decode_probability(signal_to_noise: f64, bytes: usize) -> f64 {
 
 /// The probability without shortcuts.
 fn union_bound(signal_to_noise: f64, bytes: usize) -> f64 {
+    match log_bit_success(signal_to_noise) {
+        f64::NEG_INFINITY => 0.0,
+        log => libm::exp(8.0 * bytes as f64 * log),
+    }
+}
+
+/// Logarithm of the probability that a bit is received without an error.
+#[must_use]
+pub fn log_bit_success(signal_to_noise: f64) -> f64 {
     let bit = 0.5 * libm::erfc((0.5 * signal_to_noise.max(0.0)).sqrt());
     let d2 = 4.0 * bit * (1.0 - bit);
     // Beyond this the bound is over 1.
     if d2 > 0.5 {
-        return 0.0;
+        return f64::NEG_INFINITY;
     }
     let series = ERROR_WEIGHTS.iter().rev().fold(0.0, |sum, weight| sum * d2 + weight);
     let d10 = d2 * d2 * d2 * d2 * d2;
     let coded = (0.5 * series * d10).min(1.0);
-    libm::exp(8.0 * bytes as f64 * libm::log1p(-coded))
+    libm::log1p(-coded)
 }
 
 #[cfg(test)]

@@ -5,7 +5,10 @@
 //! link that moves by Δ and Δ' at its ends is exp(−(|Δ| + |Δ'|)/d) (Wang, Tameh, Nix, "Joint shadowing process in urban peer-to-peer radio
 //! channels", IEEE Trans. Veh. Technol. 2008; the exponential of Gudmundson 1991, which TR 37.885 takes).
 
-use sensor_daemon::noise::normals::cos_sin;
+use sensor_daemon::{
+    noise::normals::cos_sin,
+    wide::{VectorPath, VectorWork},
+};
 
 use crate::random::{LinkKey, RadioDraw, RadioRandom};
 
@@ -15,18 +18,20 @@ const WAVES: usize = 48;
 /// Values of the waves that are added at once. The order of the sum is the same on every machine.
 const LANES: usize = 8;
 
-#[derive(Debug, Clone, Copy)]
-struct ShadowWave {
-    /// Turns per decorrelation distance along x and y of the first and of the second station.
-    turns: [f64; 4],
-    /// Phase at the origin, turns.
-    phase: f64,
+/// The waves at one end of a link.
+#[derive(Debug, Clone)]
+struct ShadowWaves {
+    /// Turns per decorrelation distance along x and y.
+    turns: [[f64; WAVES]; 2],
+    /// Phase at the origin, turns: the first end has it.
+    phase: [f64; WAVES],
 }
 
 /// The shadowing of an episode.
 #[derive(Debug, Clone)]
 pub struct ShadowingField {
-    waves: Vec<ShadowWave>,
+    /// Of the first and of the second end.
+    ends: [ShadowWaves; 2],
 }
 
 /// Cosine and sine of every wave at one end of a link. The phase of a wave at a link is the sum of its phases at both ends, so a link
@@ -37,62 +42,59 @@ pub struct ShadowingEnd {
     sin: [f32; WAVES],
 }
 
+impl Default for ShadowingEnd {
+    fn default() -> Self {
+        Self {
+            cos: [0.0; WAVES],
+            sin: [0.0; WAVES],
+        }
+    }
+}
+
 impl ShadowingField {
     /// The field of an episode.
     #[must_use]
     pub fn new(random: &RadioRandom) -> Self {
-        let waves = (0..WAVES as u32).map(|wave| {
+        let none = ShadowWaves {
+            turns: [[0.0; WAVES]; 2],
+            phase: [0.0; WAVES],
+        };
+        let mut ends = [none.clone(), none];
+        for place in 0..WAVES {
             let link = LinkKey {
-                message: wave,
+                message: place as u32,
                 ..LinkKey::default()
             };
             let [length_a, angle_a, length_b, angle_b] = random.uniforms(link, RadioDraw::Shadowing, 0);
             let [phase, ..] = random.uniforms(link, RadioDraw::Shadowing, 1);
-            let [xa, ya] = wave_vector(length_a, angle_a);
-            let [xb, yb] = wave_vector(length_b, angle_b);
-            ShadowWave {
-                turns: [xa, ya, xb, yb],
-                phase,
+            ends[0].phase[place] = phase;
+            for (end, wave) in ends
+                .iter_mut()
+                .zip([wave_vector(length_a, angle_a), wave_vector(length_b, angle_b)])
+            {
+                (end.turns[0][place], end.turns[1][place]) = (wave[0], wave[1]);
             }
-        });
-        Self { waves: waves.collect() }
+        }
+        Self { ends }
     }
 
     /// The waves at the first end of a link, at a position in metres.
     #[must_use]
     pub fn first_end(&self, position_m: [f64; 2], decorrelation_m: f64) -> ShadowingEnd {
-        self.end(position_m, decorrelation_m, |wave| {
-            ([wave.turns[0], wave.turns[1]], wave.phase)
-        })
+        self.end(0, position_m, decorrelation_m)
     }
 
     /// The waves at the second end of a link, at a position in metres.
     #[must_use]
     pub fn second_end(&self, position_m: [f64; 2], decorrelation_m: f64) -> ShadowingEnd {
-        self.end(position_m, decorrelation_m, |wave| {
-            ([wave.turns[2], wave.turns[3]], 0.0)
-        })
+        self.end(1, position_m, decorrelation_m)
     }
 
-    fn end(
-        &self,
-        position_m: [f64; 2],
-        decorrelation_m: f64,
-        of: impl Fn(&ShadowWave) -> ([f64; 2], f64),
-    ) -> ShadowingEnd {
-        let [x, y] = position_m.map(|value| value / decorrelation_m);
-        let mut end = ShadowingEnd {
-            cos: [0.0; WAVES],
-            sin: [0.0; WAVES],
-        };
-        for (place, wave) in self.waves.iter().enumerate() {
-            let ([kx, ky], phase) = of(wave);
-            let turns = phase + kx * x + ky * y;
-            // The fraction of a turn in 32 bits.
-            let angle = ((turns - libm::floor(turns)) * 4_294_967_296.0) as u32;
-            (end.cos[place], end.sin[place]) = cos_sin(angle);
-        }
-        end
+    fn end(&self, end: usize, position_m: [f64; 2], decorrelation_m: f64) -> ShadowingEnd {
+        VectorPath::widest().run(WavesAt {
+            waves: &self.ends[end],
+            position: position_m.map(|value| value / decorrelation_m),
+        })
     }
 
     /// A standard normal number for a link between two positions, in metres; the same in both directions if `a` is always the same end.
@@ -103,9 +105,37 @@ impl ShadowingField {
     }
 }
 
+/// Cosine and sine of waves at a position in decorrelation distances.
+struct WavesAt<'a> {
+    waves: &'a ShadowWaves,
+    position: [f64; 2],
+}
+
+impl VectorWork for WavesAt<'_> {
+    type Output = ShadowingEnd;
+
+    #[inline(always)]
+    fn run(self) -> ShadowingEnd {
+        let ShadowWaves { turns: [kx, ky], phase } = self.waves;
+        let [x, y] = self.position;
+        let mut angles = [0_u32; WAVES];
+        for (place, angle) in angles.iter_mut().enumerate() {
+            let turns = phase[place] + kx[place] * x + ky[place] * y;
+            // The fraction of a turn in 32 bits.
+            *angle = ((turns - turns.floor()) * 4_294_967_296.0) as u32;
+        }
+        let mut end = ShadowingEnd::default();
+        for (place, angle) in angles.iter().enumerate() {
+            (end.cos[place], end.sin[place]) = cos_sin(*angle);
+        }
+        end
+    }
+}
+
 impl ShadowingEnd {
     /// A standard normal number for the link from this first end to a second one.
     #[must_use]
+    #[inline(always)]
     pub fn normal(&self, second: &Self) -> f64 {
         let mut sums = [0.0_f32; LANES];
         for from in (0..WAVES).step_by(LANES) {
@@ -115,7 +145,10 @@ impl ShadowingEnd {
                 *sum += self.cos[at] * second.cos[at] - self.sin[at] * second.sin[at];
             }
         }
-        let sum: f32 = sums.iter().sum();
+        let mut sum = 0.0;
+        for part in sums {
+            sum += part;
+        }
         f64::from(sum) * (2.0 / WAVES as f64).sqrt()
     }
 }
@@ -175,14 +208,12 @@ mod tests {
         for place in 0..200 {
             let place = f64::from(place);
             let (a, b) = ([17.3 * place, -400.0 + 3.1 * place], [5000.0 - 9.0 * place, 77.7]);
-            let turns = |wave: &ShadowWave| {
-                let [ka, la, kb, lb] = wave.turns;
-                wave.phase + (ka * a[0] + la * a[1] + kb * b[0] + lb * b[1]) / 13.0
+            let [first, second] = &field.ends;
+            let turns = |wave: usize| {
+                let of = |end: &ShadowWaves, at: [f64; 2]| end.turns[0][wave] * at[0] + end.turns[1][wave] * at[1];
+                first.phase[wave] + (of(first, a) + of(second, b)) / 13.0
             };
-            let waves = field
-                .waves
-                .iter()
-                .map(|wave| libm::cos(std::f64::consts::TAU * turns(wave)));
+            let waves = (0..WAVES).map(|wave| libm::cos(std::f64::consts::TAU * turns(wave)));
             let sum = waves.sum::<f64>() * (2.0 / WAVES as f64).sqrt();
             assert!((field.normal(a, b, 13.0) - sum).abs() < 1e-5);
         }
