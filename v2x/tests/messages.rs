@@ -5,9 +5,12 @@
 use serde_json::Value;
 use v2x::message::{
     GeodeticPoint, StationKind,
+    bsm::BsmCore,
     cam::{Cam, PathPoint},
     cpm::{Cpm, PerceivedObject},
+    denm::{Denm, DenmEvent, DenmTermination},
     geonetworking::{self, BtpPort, PacketHead},
+    vam::{Vam, VamProfile},
 };
 
 fn vectors() -> Value {
@@ -87,6 +90,75 @@ fn cpm(of: &Value) -> Cpm {
     }
 }
 
+fn denm(of: &Value) -> Denm {
+    let event = |event: &Value| DenmEvent {
+        quality: number(&event["quality"]),
+        cause: [0, 1].map(|place| number(&event["cause"][place])),
+        speed_cmps: optional(&event["speed_cmps"]),
+        heading: optional(&event["heading"]),
+    };
+    Denm {
+        station: number(&of["station"]),
+        kind: StationKind(number(&of["kind"])),
+        originator: number(&of["originator"]),
+        sequence: number(&of["sequence"]),
+        detected_ms: number(&of["detected_ms"]),
+        reference_ms: number(&of["reference_ms"]),
+        termination: of["termination"].as_i64().map(|termination| match termination {
+            0 => DenmTermination::Cancellation,
+            _ => DenmTermination::Negation,
+        }),
+        position: position(&of["position"]),
+        relevance: optional(&of["relevance"]),
+        traffic: optional(&of["traffic"]),
+        validity_s: number(&of["validity_s"]),
+        interval_ms: optional(&of["interval_ms"]),
+        event: Some(&of["event"]).filter(|value| !value.is_null()).map(event),
+    }
+}
+
+fn vam(of: &Value) -> Vam {
+    let profile = |profile: &Value| VamProfile {
+        subprofile: number(&profile["subprofile"]),
+        size_class: number(&profile["size_class"]),
+    };
+    Vam {
+        station: number(&of["station"]),
+        kind: StationKind(number(&of["kind"])),
+        generation_delta_ms: number(&of["generation_delta_ms"]),
+        position: position(&of["position"]),
+        heading: optional(&of["heading"]),
+        heading_confidence: optional(&of["heading_confidence"]),
+        speed_cmps: optional(&of["speed_cmps"]),
+        speed_confidence: optional(&of["speed_confidence"]),
+        acceleration: optional(&of["acceleration"]),
+        profile: Some(&of["profile"]).filter(|value| !value.is_null()).map(profile),
+    }
+}
+
+fn bsm(of: &Value) -> BsmCore {
+    let axes = of["accuracy_5cm"].as_array();
+    let brakes = of["wheel_brakes"].as_array();
+    BsmCore {
+        count: number(&of["count"]),
+        id: number(&of["id"]),
+        second_mark_ms: optional(&of["second_mark_ms"]),
+        latitude: optional(&of["latitude"]),
+        longitude: optional(&of["longitude"]),
+        elevation_10cm: optional(&of["elevation_10cm"]),
+        accuracy_5cm: axes.map(|axes| [0, 1].map(|place: usize| number(&axes[place]))),
+        transmission: number(&of["transmission"]),
+        speed: optional(&of["speed"]),
+        heading: optional(&of["heading"]),
+        steering_wheel: optional(&of["steering_wheel"]),
+        acceleration: [0, 1].map(|place| optional(&of["acceleration"][place])),
+        yaw_rate: number(&of["yaw_rate"]),
+        wheel_brakes: brakes.map(|brakes| [0, 1, 2, 3].map(|place: usize| brakes[place].as_bool().unwrap())),
+        width_cm: number(&of["width_cm"]),
+        length_cm: number(&of["length_cm"]),
+    }
+}
+
 #[test]
 fn cams_are_bit_for_bit_those_of_asn1tools_and_pycrate() {
     let vectors = vectors();
@@ -104,6 +176,33 @@ fn cpms_are_bit_for_bit_those_of_asn1tools() {
         let (ours, theirs) = (cpm(&vector["values"]), bytes(&vector["hex"]));
         assert_eq!(ours.encode(), theirs, "{ours:?}");
         assert_eq!(Cpm::decode(&theirs).unwrap(), ours);
+    }
+}
+
+#[test]
+fn denms_are_bit_for_bit_those_of_asn1tools_and_pycrate() {
+    for vector in vectors()["denm"].as_array().unwrap() {
+        let (ours, theirs) = (denm(&vector["values"]), bytes(&vector["hex"]));
+        assert_eq!(ours.encode(), theirs, "{ours:?}");
+        assert_eq!(Denm::decode(&theirs).unwrap(), ours);
+    }
+}
+
+#[test]
+fn vams_are_bit_for_bit_those_of_asn1tools_and_pycrate() {
+    for vector in vectors()["vam"].as_array().unwrap() {
+        let (ours, theirs) = (vam(&vector["values"]), bytes(&vector["hex"]));
+        assert_eq!(ours.encode(), theirs, "{ours:?}");
+        assert_eq!(Vam::decode(&theirs).unwrap(), ours);
+    }
+}
+
+#[test]
+fn bsms_are_bit_for_bit_those_of_asn1tools_and_pycrate() {
+    for vector in vectors()["bsm"].as_array().unwrap() {
+        let (ours, theirs) = (bsm(&vector["values"]), bytes(&vector["hex"]));
+        assert_eq!(ours.encode(), theirs, "{ours:?}");
+        assert_eq!(BsmCore::decode(&theirs).unwrap(), ours);
     }
 }
 
@@ -186,14 +285,22 @@ fn a_million_mutated_messages_and_packets_are_refused_or_read_without_a_panic() 
             .map(|vector| bytes(&vector["hex"]))
             .collect::<Vec<_>>()
     };
-    let messages = [(BtpPort::Cam, of("cam")), (BtpPort::Cpm, of("cpm"))];
+    // A BSM has no port of its own: its bytes come in the packets of CAMs.
+    let messages = [
+        ("cam", BtpPort::Cam),
+        ("cpm", BtpPort::Cpm),
+        ("denm", BtpPort::Denm),
+        ("vam", BtpPort::Vam),
+        ("bsm", BtpPort::Cam),
+    ]
+    .map(|(kind, port)| (kind, port, of(kind)));
     let frames = variable("CARAWARE_FUZZ_FRAMES", 1_000_000);
     let seed = variable("CARAWARE_FUZZ_SEED", 1);
     let mut mutations = Mutations(0x9E37_79B9_7F4A_7C15_u64.wrapping_mul(2 * seed + 1));
     // Messages and packets that were read, and both that were not.
     let (mut read, mut unpacked, mut refused) = (0_u64, 0_u64, 0_u64);
     for _ in 0..frames {
-        let (port, examples) = &messages[mutations.next(2)];
+        let (kind, port, examples) = &messages[mutations.next(messages.len())];
         let mut message = examples[mutations.next(examples.len())].clone();
         if mutations.next(3) == 0 {
             let head = PacketHead {
@@ -219,12 +326,21 @@ fn a_million_mutated_messages_and_packets_are_refused_or_read_without_a_panic() 
         } else {
             mutations.mutate(&mut message);
         }
-        let is_read = match port {
-            BtpPort::Cam => Cam::decode(&message)
+        let is_read = match *kind {
+            "cam" => Cam::decode(&message)
                 .map(|cam| assert_eq!(Cam::decode(&cam.encode()).unwrap(), cam))
                 .is_ok(),
-            _ => Cpm::decode(&message)
+            "cpm" => Cpm::decode(&message)
                 .map(|cpm| assert_eq!(Cpm::decode(&cpm.encode()).unwrap(), cpm))
+                .is_ok(),
+            "denm" => Denm::decode(&message)
+                .map(|denm| assert_eq!(Denm::decode(&denm.encode()).unwrap(), denm))
+                .is_ok(),
+            "vam" => Vam::decode(&message)
+                .map(|vam| assert_eq!(Vam::decode(&vam.encode()).unwrap(), vam))
+                .is_ok(),
+            _ => BsmCore::decode(&message)
+                .map(|bsm| assert_eq!(BsmCore::decode(&bsm.encode()).unwrap(), bsm))
                 .is_ok(),
         };
         *(if is_read { &mut read } else { &mut refused }) += 1;

@@ -3,11 +3,14 @@
 //! Only what is sent here is written; what is read may also have optional parts of the same version that are skipped. Bytes that are no
 //! such message are an error, never a panic.
 
+pub mod bsm;
 pub mod cam;
 pub mod cpm;
+pub mod denm;
 pub mod geonetworking;
 mod its;
 mod uper;
+pub mod vam;
 
 pub use its::{GeodeticPoint, StationKind, generation_delta_ms, heading_from_yaw, its_time_ms, yaw_from_heading};
 
