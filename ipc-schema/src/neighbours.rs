@@ -25,6 +25,8 @@ pub enum NeighbourSource {
     Cpm = 2,
     /// Vulnerable road user awareness message: the object's own.
     Vam = 3,
+    /// Basic safety message: the object's own.
+    Bsm = 4,
 }
 
 payload_layout! {

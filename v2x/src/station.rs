@@ -10,11 +10,24 @@ use crate::{
     local_map::{KnownObject, LocalMap},
     message::{
         GeodeticPoint, StationKind,
+        bsm::BsmCore,
         cam::Cam,
         cpm::{Cpm, PerceivedObject},
-        generation_delta_ms, heading_from_yaw, its_time_ms, yaw_from_heading,
+        denm::{DANGEROUS_SITUATION, Denm, DenmEvent, DenmTermination, EMERGENCY_BRAKE_ENGAGED},
+        generation_delta_ms, heading_from_yaw, its_time_ms,
+        vam::{Vam, VamProfile},
+        yaw_from_heading,
     },
-    services::{MeasuredMotion, cam::CamService, congestion::CongestionControl, cpm::CpmService},
+    services::{
+        MS, MeasuredMotion,
+        bsm::BsmService,
+        cam::CamService,
+        congestion::CongestionControl,
+        cpm::CpmService,
+        denm::{DenmContent, DenmKind, DenmService, REPETITION_NS, VALIDITY_NS},
+        turn,
+        vam::VamService,
+    },
 };
 
 /// Half axis of the ellipse that has a normal position with 95 %, in standard deviations of an axis: √(−2 ln 0.05).
@@ -26,6 +39,11 @@ const UNKNOWN_POSITION_M: f32 = 40.94;
 /// Deviation of a speed of unknown accuracy, m/s, and of a heading, radians: the largest that a message can state.
 const UNKNOWN_SPEED_MPS: f32 = 1.25;
 const UNKNOWN_HEADING_RAD: f32 = 0.22;
+
+/// Size of a person on foot in a map: messages of people do not state one, metres.
+const PERSON_M: [f32; 2] = [0.5, 0.5];
+/// Deviation of the velocity of a person whose message states none, on each axis, m/s.
+const WALKING_MPS: f32 = 1.5;
 
 /// What a station measures of itself at a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -120,6 +138,8 @@ pub struct Station {
     pub id_hash: u64,
     /// Station id: the low half of the hash, and never 0.
     pub station: u32,
+    /// It is a person's.
+    pub is_person: bool,
     /// It has a radio.
     pub is_equipped: bool,
     /// Time within a tick at which its messages are handed to the radio, nanoseconds.
@@ -128,6 +148,14 @@ pub struct Station {
     pub cam: CamService,
     /// Collective perception.
     pub cpm: CpmService,
+    /// Basic safety.
+    pub bsm: BsmService,
+    /// Awareness of a person.
+    pub vam: VamService,
+    /// Warnings.
+    pub denm: DenmService,
+    /// The warning that is repeated.
+    pub warning: Option<Denm>,
     /// Congestion control.
     pub congestion: CongestionControl,
     /// What it knows.
@@ -152,8 +180,7 @@ fn confidence(deviation: f64, unit: f64) -> u8 {
 /// The reference position of a message.
 ///
 /// `None` where the map's projection does not reach.
-fn reference(projection: &Projection, own: &OwnMeasurement, size: &VehicleSize) -> Option<GeodeticPoint> {
-    let [x_m, y_m] = own.front_m(size);
+fn reference(projection: &Projection, own: &OwnMeasurement, [x_m, y_m]: [f64; 2]) -> Option<GeodeticPoint> {
     let place = projection.geodetic_from_net(NetPosition { x_m, y_m }).ok()?;
     let axis_cm = own
         .accuracy_m
@@ -241,6 +268,111 @@ pub struct MessageComposer<'a> {
 }
 
 impl MessageComposer<'_> {
+    /// The middle of the front of the vehicle, which messages name.
+    fn front(&self) -> Option<GeodeticPoint> {
+        reference(self.projection, self.own, self.own.front_m(self.size))
+    }
+
+    /// The middle of the road user.
+    fn centre(&self) -> Option<GeodeticPoint> {
+        reference(self.projection, self.own, self.own.centre_m(self.size))
+    }
+
+    /// A warning of the own emergency braking, and the place that its packet names: as the last one, `before`, where that is repeated.
+    /// `None` where the projection does not reach.
+    #[must_use]
+    pub fn denm(&self, content: &DenmContent, before: Option<Denm>) -> Option<Denm> {
+        let is_news = matches!(content.kind, DenmKind::New | DenmKind::Update);
+        if let Some(before) = before.filter(|before| !is_news && before.sequence == content.sequence) {
+            return Some(match content.kind {
+                DenmKind::Cancellation => Denm {
+                    reference_ms: its_time_ms(self.now_ns),
+                    termination: Some(DenmTermination::Cancellation),
+                    event: None,
+                    ..before
+                },
+                _ => before,
+            });
+        }
+        Some(Denm {
+            station: self.station,
+            kind: self.kind,
+            originator: self.station,
+            sequence: content.sequence,
+            detected_ms: its_time_ms(content.detected_ns),
+            reference_ms: its_time_ms(self.now_ns),
+            termination: None,
+            position: self.front()?,
+            // Below 500 m, traffic that comes from behind.
+            relevance: Some(3),
+            traffic: Some(1),
+            validity_s: (VALIDITY_NS / (1000 * MS)) as u32,
+            interval_ms: Some((REPETITION_NS / MS) as u16),
+            event: Some(DenmEvent {
+                quality: 0,
+                cause: [DANGEROUS_SITUATION, EMERGENCY_BRAKE_ENGAGED],
+                speed_cmps: Some(self.speed_cmps()),
+                heading: Some(heading_from_yaw(self.own.heading_rad)),
+            }),
+        })
+    }
+
+    /// A person's awareness message; `None` where the projection does not reach. A phone measures no speed.
+    #[must_use]
+    pub fn vam(&self, has_low_frequency: bool) -> Option<Vam> {
+        Some(Vam {
+            station: self.station,
+            kind: StationKind::PEDESTRIAN,
+            generation_delta_ms: generation_delta_ms(its_time_ms(fix_time_ns(self.now_ns, self.own))),
+            position: self.centre()?,
+            heading: Some(heading_from_yaw(self.own.heading_rad)),
+            heading_confidence: Some(confidence(self.deviations.heading_rad.to_degrees(), 0.1)),
+            speed_cmps: None,
+            speed_confidence: None,
+            acceleration: None,
+            profile: has_low_frequency.then_some(VamProfile {
+                subprofile: 1,
+                size_class: 0,
+            }),
+        })
+    }
+
+    /// The core of a basic safety message; `None` where the projection does not reach.
+    #[must_use]
+    pub fn bsm(&self, count: u8) -> Option<BsmCore> {
+        let Self { own, size, .. } = self;
+        let place = self.centre()?;
+        let units = |value: f64, unit: f64, range: [f64; 2]| (value / unit).round().clamp(range[0], range[1]);
+        // Half axes at one standard deviation, of which the fix has one on both axes.
+        let axis = own
+            .accuracy_m
+            .map(|accuracy| units(accuracy / std::f64::consts::SQRT_2, 0.05, [0.0, 254.0]) as u8);
+        let measured_ms = its_time_ms(fix_time_ns(self.now_ns, own));
+        Some(BsmCore {
+            count,
+            id: self.station,
+            second_mark_ms: Some((measured_ms % 60_000) as u16),
+            latitude: Some(place.latitude),
+            longitude: Some(place.longitude),
+            elevation_10cm: Some(units(own.altitude_m, 0.1, [-4095.0, 61_439.0]) as i32),
+            accuracy_5cm: axis.map(|axis| [axis; 2]),
+            transmission: 7,
+            speed: Some(units(own.speed_mps.max(0.0), 0.02, [0.0, 8190.0]) as u16),
+            heading: Some(units(90.0 - own.heading_rad.to_degrees(), 0.0125, [-1e9, 1e9]).rem_euclid(28_800.0) as u16),
+            steering_wheel: None,
+            acceleration: [Some(units(own.accel_mps2, 0.01, [-2000.0, 2000.0]) as i16), None],
+            // Positive to the right.
+            yaw_rate: units(-own.yaw_rate_radps.to_degrees(), 0.01, [-32_767.0, 32_767.0]) as i16,
+            wheel_brakes: None,
+            width_cm: units(size.width_m, 0.01, [1.0, 1023.0]) as u16,
+            length_cm: units(size.length_m, 0.01, [1.0, 4095.0]) as u16,
+        })
+    }
+
+    fn speed_cmps(&self) -> u16 {
+        (self.own.speed_mps.max(0.0) * 100.0).round().min(16_382.0) as u16
+    }
+
     /// A cooperative awareness message; `None` where the projection does not reach.
     #[must_use]
     pub fn cam(&self, has_low_frequency: bool) -> Option<Cam> {
@@ -249,10 +381,10 @@ impl MessageComposer<'_> {
             station: self.station,
             kind: self.kind,
             generation_delta_ms: generation_delta_ms(its_time_ms(fix_time_ns(self.now_ns, own))),
-            position: reference(self.projection, own, size)?,
+            position: self.front()?,
             heading: Some(heading_from_yaw(own.heading_rad)),
             heading_confidence: Some(confidence(self.deviations.heading_rad.to_degrees(), 0.1)),
-            speed_cmps: Some((own.speed_mps.max(0.0) * 100.0).round().min(16_382.0) as u16),
+            speed_cmps: Some(self.speed_cmps()),
             speed_confidence: Some(confidence(self.deviations.speed_mps, 0.01)),
             length_10cm: tenths(size.length_m).clamp(1.0, 1022.0) as u16,
             width_10cm: tenths(size.width_m).clamp(1.0, 61.0) as u8,
@@ -276,7 +408,7 @@ impl MessageComposer<'_> {
         included: &[usize],
         has_sensor_information: bool,
     ) -> Option<Cpm> {
-        let Self { own, size, now_ns, .. } = *self;
+        let Self { own, now_ns, .. } = *self;
         let measured_ns = fix_time_ns(now_ns, own);
         let delta_ms = ((now_ns - measured_ns) / 1_000_000).min(2047) as i16;
         let objects = included.iter().map(|place| {
@@ -301,7 +433,7 @@ impl MessageComposer<'_> {
         Some(Cpm {
             station: self.station,
             reference_time_ms: its_time_ms(measured_ns),
-            position: reference(self.projection, own, size)?,
+            position: self.front()?,
             heading: heading_from_yaw(own.heading_rad),
             sensor_range_10cm: has_sensor_information.then(|| tenths(spec.range_m).min(4095.0) as u16),
             perceived: perceived.len().min(255) as u8,
@@ -340,10 +472,6 @@ pub fn object_of_cam(cam: &Cam, now_ns: u64, projection: &Projection) -> Option<
     let speed_mps = f64::from(cam.speed_cmps?) / 100.0;
     let (sin, cos) = libm::sincos(heading_rad);
     let length_m = f64::from(cam.length_10cm) / 10.0;
-    let deviation = |confidence: Option<u8>, unit: f64, unknown: f32| match confidence {
-        Some(stated) if stated < 126 => (f64::from(stated) * unit / INTERVAL_95) as f32,
-        _ => unknown,
-    };
     let now_ms = now_ns / 1_000_000;
     Some(KnownObject {
         station: cam.station,
@@ -357,10 +485,78 @@ pub fn object_of_cam(cam: &Cam, now_ns: u64, projection: &Projection) -> Option<
         measured_ms: now_ms as i64 - age_ms(its_time_ms(now_ns), cam.generation_delta_ms),
         deviations: [
             position_deviation_m(&cam.position),
-            deviation(cam.speed_confidence, 0.01, UNKNOWN_SPEED_MPS),
-            deviation(cam.heading_confidence, 0.1_f64.to_radians(), UNKNOWN_HEADING_RAD),
+            stated_deviation(cam.speed_confidence, 0.01, UNKNOWN_SPEED_MPS),
+            stated_deviation(cam.heading_confidence, 0.1_f64.to_radians(), UNKNOWN_HEADING_RAD),
         ],
     })
+}
+
+/// What a receiver knows of the person that sends an awareness message.
+#[must_use]
+pub fn object_of_vam(vam: &Vam, now_ns: u64, projection: &Projection) -> Option<KnownObject> {
+    let position_m = world_from(projection, &vam.position)?;
+    let heading_rad = yaw_from_heading(vam.heading?);
+    let (sin, cos) = libm::sincos(heading_rad);
+    let speed_mps = vam.speed_cmps.map_or(0.0, |speed| f64::from(speed) / 100.0);
+    let now_ms = now_ns / 1_000_000;
+    Some(KnownObject {
+        station: vam.station,
+        heard_from: vam.station,
+        object: 0,
+        source: NeighbourSource::Vam,
+        position_m,
+        velocity_mps: [speed_mps * cos, speed_mps * sin],
+        heading_rad,
+        size_m: PERSON_M,
+        measured_ms: now_ms as i64 - age_ms(its_time_ms(now_ns), vam.generation_delta_ms),
+        deviations: [
+            position_deviation_m(&vam.position),
+            match vam.speed_cmps {
+                Some(_) => stated_deviation(vam.speed_confidence, 0.01, UNKNOWN_SPEED_MPS),
+                None => WALKING_MPS,
+            },
+            stated_deviation(vam.heading_confidence, 0.1_f64.to_radians(), UNKNOWN_HEADING_RAD),
+        ],
+    })
+}
+
+/// What a receiver knows of the sender of a basic safety message.
+#[must_use]
+pub fn object_of_bsm(bsm: &BsmCore, now_ns: u64, projection: &Projection) -> Option<KnownObject> {
+    let point = GeodeticPoint {
+        latitude: bsm.latitude?,
+        longitude: bsm.longitude?,
+        ..GeodeticPoint::default()
+    };
+    let heading_rad = yaw_from_heading(0) - f64::from(bsm.heading?) * 0.0125_f64.to_radians();
+    let (sin, cos) = libm::sincos(heading_rad);
+    let speed_mps = f64::from(bsm.speed?) * 0.02;
+    let position_std_m = bsm
+        .accuracy_5cm
+        .map_or(UNKNOWN_POSITION_M, |axes| 0.05 * f32::from(axes[0]));
+    // Milliseconds of the minute, not later than now.
+    let its_ms = its_time_ms(now_ns);
+    let age_ms = (its_ms % 60_000 + 60_000 - u64::from(bsm.second_mark_ms?) % 60_000) % 60_000;
+    Some(KnownObject {
+        station: bsm.id,
+        heard_from: bsm.id,
+        object: 0,
+        source: NeighbourSource::Bsm,
+        position_m: world_from(projection, &point)?,
+        velocity_mps: [speed_mps * cos, speed_mps * sin],
+        heading_rad: turn(0.0, heading_rad),
+        size_m: [f32::from(bsm.length_cm) / 100.0, f32::from(bsm.width_cm) / 100.0],
+        measured_ms: (now_ns / 1_000_000) as i64 - age_ms as i64,
+        deviations: [position_std_m, UNKNOWN_SPEED_MPS, UNKNOWN_HEADING_RAD],
+    })
+}
+
+/// Standard deviation that a confidence states in its unit; `unknown` where it states none.
+fn stated_deviation(confidence: Option<u8>, unit: f64, unknown: f32) -> f32 {
+    match confidence {
+        Some(stated) if stated < 126 => (f64::from(stated) * unit / INTERVAL_95) as f32,
+        _ => unknown,
+    }
 }
 
 /// What a receiver knows from a collective perception message, into `known`.

@@ -5,10 +5,11 @@
 use std::sync::Arc;
 
 use ipc_schema::{
-    config::Config,
+    config::{Config, V2xAwareness},
     header::{FIRST_OF_EPISODE, MessageHeader},
     neighbours::{NEIGHBOUR_COLUMNS, NEIGHBOUR_ID_COLUMNS, NeighboursSections, RADIO_COLUMNS},
     run::MapInfo,
+    traffic::Kind,
     world::VehicleState,
 };
 use sim_core::{
@@ -76,6 +77,17 @@ impl Block {
 
 /// Runs `ticks` ticks of cars that drive to the east. Every car has the slot of its number and measures without errors.
 fn run(config: &Config, houses: Vec<Prism>, cars: &[VehicleState], ticks: u64) -> (Vec<Block>, MessageExchange) {
+    run_with(config, houses, cars, ticks, |_, _| 0.0)
+}
+
+/// The same with the acceleration in m/s² that the car of a number measures at a tick.
+fn run_with(
+    config: &Config,
+    houses: Vec<Prism>,
+    cars: &[VehicleState],
+    ticks: u64,
+    accel_mps2: impl Fn(u32, u64) -> f64,
+) -> (Vec<Block>, MessageExchange) {
     let scene = Arc::new(Scene::new(Road::default(), houses, Vec::new()));
     let mut exchange = MessageExchange::new(config, vec![(scene, projection())]);
     let blocks = (0..ticks).map(|tick| {
@@ -96,6 +108,7 @@ fn run(config: &Config, houses: Vec<Prism>, cars: &[VehicleState], ticks: u64) -
                     fix_m: [car.x_m, car.y_m],
                     accuracy_m: Some(1.0),
                     speed_mps: car.velocity_body_mps[0].into(),
+                    accel_mps2: accel_mps2(car.vehicle, tick),
                     ..OwnMeasurement::default()
                 }),
             })
@@ -205,6 +218,82 @@ fn a_car_without_a_radio_is_known_from_those_that_see_it() {
         }
     }
     assert!(perceived > 0);
+}
+
+#[test]
+fn a_pedestrian_with_a_phone_is_known_from_its_own_messages() {
+    let mut config = config();
+    let person = VehicleState {
+        kind: Kind::Person as u32,
+        length_m: 0.5,
+        width_m: 0.5,
+        height_m: 1.7,
+        rear_overhang_m: 0.0,
+        ..car(1, 30.0, 5.0, 1.5)
+    };
+    let cars = [car(0, 0.0, 0.0, 0.0), person];
+    let (blocks, exchange) = run(&config, Vec::new(), &cars, 3);
+    assert!(blocks[2].of(0).is_empty() && exchange.counts().vams == 0);
+    config.v2x.vam = true;
+    // 1.5 m/s are 4 m in 2.7 s: three messages in 6 s, after which the lifetime of one has passed.
+    let (blocks, exchange) = run(&config, Vec::new(), &cars, 60);
+    assert_eq!((exchange.counts().vams, blocks[1].radio[1][0]), (3, 1));
+    let [(numbers, ids)] = blocks[1].of(0)[..] else {
+        panic!("{:?}", blocks[1])
+    };
+    let station = station_id(cars[1].id_hash);
+    assert_eq!(ids, [station, station, 3]);
+    // A phone states no speed; the size is that of a person.
+    let expected = [30.0, 5.0, 0.0, 0.0, 0.0, 0.5, 0.5, 0.1];
+    for (found, expected) in numbers.iter().zip(expected) {
+        assert!((f64::from(*found) - expected).abs() < 0.03, "{numbers:?}");
+    }
+    assert_eq!(blocks[1].of(1).len(), 1);
+    assert!(blocks[20].of(0).is_empty() && blocks[28].of(0).len() == 1);
+}
+
+#[test]
+fn basic_safety_messages_take_the_place_of_cams() {
+    let mut config = config();
+    config.v2x.awareness = V2xAwareness::Bsm;
+    let cars = [car(0, 0.0, 0.0, 10.0), car(1, 80.0, 30.0, 15.0)];
+    let (blocks, exchange) = run(&config, Vec::new(), &cars, 3);
+    assert_eq!((exchange.counts().cams, exchange.counts().bsms), (0, 6));
+    let [(numbers, ids)] = blocks[2].of(0)[..] else {
+        panic!("{blocks:?}")
+    };
+    let station = station_id(cars[1].id_hash);
+    assert_eq!(ids, [station, station, 4]);
+    // Measured at tick 1.
+    let expected = [82.75, 30.0, 15.0, 0.0, 0.0, 4.5, 1.8, 0.1];
+    for (found, expected) in numbers.iter().zip(expected) {
+        assert!((f64::from(*found) - expected).abs() < 0.03, "{numbers:?}");
+    }
+    // 37 bytes of core data, three of their frame, four of the short header, and what is around them on air.
+    assert_eq!(blocks[2].radio[0][3], 37 + 3 + 4 + 38);
+}
+
+#[test]
+fn emergency_braking_is_warned_of_where_it_is_configured() {
+    let cars = [car(0, 0.0, 0.0, 20.0), car(1, 80.0, 0.0, 20.0)];
+    // The second car brakes hard from 0.2 s to 0.5 s, and accelerates at 0.8 s.
+    let brakes = |number: u32, tick: u64| match (number, tick) {
+        (1, 2..=5) => -8.0,
+        (1, 8) => 1.0,
+        _ => 0.0,
+    };
+    let (blocks, exchange) = run_with(&config(), Vec::new(), &cars, 12, brakes);
+    assert_eq!(exchange.counts().denms, 0);
+    let mut config = config();
+    config.v2x.denm = true;
+    let (warned, exchange) = run_with(&config, Vec::new(), &cars, 12, brakes);
+    // New at 0.2 s, repeated five times, and cancelled at 0.8 s.
+    assert_eq!(exchange.counts().denms, 7);
+    let sent = |blocks: &[Block]| -> Vec<u32> { blocks.iter().map(|block| block.radio[1][2]).collect() };
+    let more: Vec<u32> = sent(&warned).iter().zip(sent(&blocks)).map(|(a, b)| a - b).collect();
+    assert_eq!(more, [0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 0, 0]);
+    // Maps are of objects: a warning adds none.
+    assert!(warned.iter().zip(&blocks).all(|(a, b)| a.of(0).len() == b.of(0).len()));
 }
 
 #[test]

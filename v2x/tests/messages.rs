@@ -285,7 +285,7 @@ fn a_million_mutated_messages_and_packets_are_refused_or_read_without_a_panic() 
             .map(|vector| bytes(&vector["hex"]))
             .collect::<Vec<_>>()
     };
-    // A BSM has no port of its own: its bytes come in the packets of CAMs.
+    // A BSM has no port: here its bytes come in the packets of CAMs.
     let messages = [
         ("cam", BtpPort::Cam),
         ("cpm", BtpPort::Cpm),

@@ -24,12 +24,28 @@ pub enum V2xCongestionControl {
     Adaptive,
 }
 
+/// The message by which vehicles make themselves known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum V2xAwareness {
+    /// Cooperative awareness messages of ETSI.
+    Cam,
+    /// Basic safety messages of SAE.
+    Bsm,
+}
+
 /// Messages between road users.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct V2xConfig {
     /// Share of the connected road users that have a radio; 0 = no messages and no process.
     pub share: f64,
+    /// The message by which vehicles make themselves known.
+    pub awareness: V2xAwareness,
+    /// Vehicles warn of their emergency braking.
+    pub denm: bool,
+    /// Pedestrians with a smartphone have radios too, and send awareness messages.
+    pub vam: bool,
     /// Nearest known objects in a row of `neighbours`.
     pub neighbours: u32,
     /// Formulas of path loss.

@@ -18,9 +18,12 @@ use sim_core::{geodesy::Projection, scene::Scene};
 use crate::{
     local_map::{HeardObjects, KnownObject, LocalMap},
     message::{
+        bsm::BsmCore,
         cam::Cam,
         cpm::Cpm,
         geonetworking::{self, BtpPort},
+        vam::Vam,
+        wsmp,
     },
     parallel,
     radio::{
@@ -31,10 +34,13 @@ use crate::{
         obstruction::{Antenna, Obstacles},
     },
     random::{LinkKey, RadioDraw, RadioRandom},
-    services::{cam::CamService, congestion::CongestionControl, cpm::CpmService},
+    services::{
+        bsm::BsmService, cam::CamService, congestion::CongestionControl, cpm::CpmService, denm::DenmService,
+        vam::VamService,
+    },
     station::{
-        OwnMeasurement, PerceptionSpec, SensorDeviations, Station, VehicleSize, object_of_cam, objects_of_cpm,
-        station_id,
+        OwnMeasurement, PerceptionSpec, SensorDeviations, Station, VehicleSize, object_of_bsm, object_of_cam,
+        object_of_vam, objects_of_cpm, station_id,
     },
 };
 
@@ -65,6 +71,12 @@ pub struct ExchangeCounts {
     pub cams: u64,
     /// Collective perception messages sent.
     pub cpms: u64,
+    /// Warnings sent, repetitions included.
+    pub denms: u64,
+    /// Awareness messages of people sent.
+    pub vams: u64,
+    /// Basic safety messages sent.
+    pub bsms: u64,
     /// Bytes of them, headers included.
     pub bytes: u64,
     /// Messages that found no time to be sent.
@@ -259,8 +271,9 @@ impl MessageExchange {
                 .copied()
                 .filter(|row| *row != u32::MAX);
             self.rows[slot] = row;
-            let is_vehicle = row.is_some_and(|row| states[row as usize].kind != Kind::Person as u32);
-            if measured.vehicle == EMPTY_SLOT || !is_vehicle {
+            let state = row.map(|row| &states[row as usize]);
+            let is_person = state.is_some_and(|state| state.kind == Kind::Person as u32);
+            if measured.vehicle == EMPTY_SLOT || state.is_none() || is_person && !self.config.vam {
                 self.stations[slot] = None;
                 continue;
             }
@@ -268,14 +281,14 @@ impl MessageExchange {
                 .as_ref()
                 .is_some_and(|station| station.id_hash == measured.id_hash);
             if !is_same || measured.episode_step == 0 {
-                self.stations[slot] = Some(self.begin_station(measured.id_hash));
+                self.stations[slot] = Some(self.begin_station(measured.id_hash, is_person));
                 self.activity[slot] = RadioActivity::default();
                 self.inbox[slot].clear();
             }
         }
     }
 
-    fn begin_station(&self, id_hash: u64) -> Station {
+    fn begin_station(&self, id_hash: u64, is_person: bool) -> Station {
         let station = station_id(id_hash);
         let key = LinkKey {
             sender: station,
@@ -286,10 +299,15 @@ impl MessageExchange {
         Station {
             id_hash,
             station,
+            is_person,
             is_equipped: equipped < self.config.share,
             phase_ns: (phase * self.medium.tick_ns as f64) as u64,
             cam: CamService::default(),
             cpm: CpmService::default(),
+            bsm: BsmService::default(),
+            vam: VamService::default(),
+            denm: DenmService::default(),
+            warning: None,
             congestion: CongestionControl::new(self.config.congestion_control),
             map: LocalMap::default(),
         }
@@ -351,6 +369,7 @@ impl MessageExchange {
             random: &self.random,
             deviations: &self.deviations,
             perception: &self.perception,
+            config: &self.config,
         };
         let outgoing = outgoing(&tick, &radios, &mut self.stations, self.config.threads as usize);
         self.activity.fill(RadioActivity::default());
@@ -431,6 +450,9 @@ impl MessageExchange {
             match SendingService::of(message.message) {
                 SendingService::Cam => self.counts.cams += 1,
                 SendingService::Cpm => self.counts.cpms += 1,
+                SendingService::Denm => self.counts.denms += 1,
+                SendingService::Vam => self.counts.vams += 1,
+                SendingService::Bsm => self.counts.bsms += 1,
             }
             self.counts.bytes += u64::from(message.bytes);
         }
@@ -445,15 +467,25 @@ impl MessageExchange {
 }
 
 fn size_of(state: &VehicleState) -> VehicleSize {
+    let length_m = f64::from(state.length_m);
     VehicleSize {
-        length_m: state.length_m.into(),
+        length_m,
         width_m: state.width_m.into(),
-        rear_overhang_m: state.rear_overhang_m.into(),
+        // A person's origin is its centre.
+        rear_overhang_m: match state.kind == Kind::Person as u32 {
+            true => 0.5 * length_m,
+            false => state.rear_overhang_m.into(),
+        },
     }
 }
 
 /// Reads a packet as a receiver does, from its bytes.
 fn read_packet(packet: &[u8], now_ns: u64, projection: &Projection, known: &mut Vec<KnownObject>) {
+    if let Ok(message) = wsmp::decode(packet) {
+        let bsm = BsmCore::decode(message);
+        known.extend(bsm.ok().and_then(|bsm| object_of_bsm(&bsm, now_ns, projection)));
+        return;
+    }
     let Ok((head, message)) = geonetworking::decode(packet) else {
         return;
     };
@@ -467,6 +499,11 @@ fn read_packet(packet: &[u8], now_ns: u64, projection: &Projection, known: &mut 
                 objects_of_cpm(&cpm, now_ns, projection, known);
             }
         }
-        BtpPort::Denm | BtpPort::Vam => {}
+        BtpPort::Vam => {
+            let vam = Vam::decode(message);
+            known.extend(vam.ok().and_then(|vam| object_of_vam(&vam, now_ns, projection)));
+        }
+        // A warning is of an event, not of an object.
+        BtpPort::Denm => {}
     }
 }

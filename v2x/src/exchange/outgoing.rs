@@ -1,6 +1,9 @@
 //! What the services of a station send at a tick.
 
-use ipc_schema::world::VehicleState;
+use ipc_schema::{
+    config::{V2xAwareness, V2xConfig},
+    world::VehicleState,
+};
 use sim_core::geodesy::Projection;
 
 use super::{SlotMeasurement, perception::Observer, size_of};
@@ -8,7 +11,7 @@ use crate::{
     message::{
         GeodeticPoint, StationKind,
         geonetworking::{self, BtpPort, PacketHead},
-        heading_from_yaw, its_time_ms,
+        heading_from_yaw, its_time_ms, wsmp,
     },
     parallel,
     radio::{
@@ -19,6 +22,7 @@ use crate::{
     },
     random::RadioRandom,
     services::{
+        MeasuredMotion,
         congestion::CongestionControl,
         cpm::{ObjectKind, PerceivedMotion},
     },
@@ -27,25 +31,66 @@ use crate::{
 
 /// Length from which a vehicle calls itself a lorry, metres.
 const TRUCK_LENGTH_M: f64 = 7.0;
-/// Bytes of a message before it exists, for the table of congestion control: CAM and CPM.
-const TYPICAL_BYTES: [usize; 2] = [120, 400];
+/// Bit of the number of a message of the services behind the first two.
+const LATER_SERVICE: u32 = 1 << 31;
 
-/// A service that sends, as the last bit of its messages' numbers.
+/// A service that sends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SendingService {
     /// Cooperative awareness.
-    Cam = 0,
+    Cam,
     /// Collective perception.
-    Cpm = 1,
+    Cpm,
+    /// Warnings.
+    Denm,
+    /// Awareness of people.
+    Vam,
+    /// Basic safety.
+    Bsm,
 }
 
 impl SendingService {
+    /// Number of the message that the service sends at a tick. Random numbers depend on it.
+    fn number(self, tick: u32) -> u32 {
+        match self {
+            Self::Cam => tick << 1,
+            Self::Cpm => tick << 1 | 1,
+            Self::Denm => LATER_SERVICE | tick << 2,
+            Self::Vam => LATER_SERVICE | tick << 2 | 1,
+            Self::Bsm => LATER_SERVICE | tick << 2 | 2,
+        }
+    }
+
     /// The service of a message of this number.
     #[must_use]
     pub fn of(message: u32) -> Self {
-        match message & 1 {
-            0 => Self::Cam,
-            _ => Self::Cpm,
+        match (message & LATER_SERVICE != 0, message & 3) {
+            (false, 0 | 2) => Self::Cam,
+            (false, _) => Self::Cpm,
+            (true, 0) => Self::Denm,
+            (true, 1) => Self::Vam,
+            (true, _) => Self::Bsm,
+        }
+    }
+
+    /// Bytes of a message before it exists, for the table of congestion control.
+    fn typical_bytes(self) -> usize {
+        match self {
+            Self::Cam => 120,
+            Self::Cpm => 400,
+            Self::Denm => 130,
+            Self::Vam | Self::Bsm => 110,
+        }
+    }
+
+    /// Its port; none for basic safety, which has packets of its own.
+    fn port(self) -> Option<BtpPort> {
+        match self {
+            Self::Cam => Some(BtpPort::Cam),
+            Self::Cpm => Some(BtpPort::Cpm),
+            Self::Denm => Some(BtpPort::Denm),
+            Self::Vam => Some(BtpPort::Vam),
+            Self::Bsm => None,
         }
     }
 }
@@ -54,7 +99,7 @@ impl SendingService {
 pub struct OutgoingMessage {
     /// The radio's part.
     pub queued: QueuedMessage,
-    /// Its bytes, from the GeoNetworking header on.
+    /// Its bytes, from the header of the network on.
     pub packet: Vec<u8>,
 }
 
@@ -79,6 +124,8 @@ pub struct StationTick<'a> {
     pub deviations: &'a SensorDeviations,
     /// What stations perceive.
     pub perception: &'a PerceptionSpec,
+    /// Which messages are sent.
+    pub config: &'a V2xConfig,
 }
 
 /// A station with a radio, at a tick.
@@ -120,9 +167,10 @@ impl StationTurn<'_> {
         let size = size_of(&tick.states[self.radio.antenna.row as usize]);
         let composer = MessageComposer {
             station: self.station.station,
-            kind: match size.length_m > TRUCK_LENGTH_M {
-                true => StationKind::HEAVY_TRUCK,
-                false => StationKind::PASSENGER_CAR,
+            kind: match size.length_m {
+                _ if self.station.is_person => StationKind::PEDESTRIAN,
+                length_m if length_m > TRUCK_LENGTH_M => StationKind::HEAVY_TRUCK,
+                _ => StationKind::PASSENGER_CAR,
             },
             now_ns: tick.now_ns,
             own,
@@ -130,7 +178,17 @@ impl StationTurn<'_> {
             deviations: tick.deviations,
             projection: tick.projection,
         };
-        self.generate_cam(tick, &composer);
+        if self.station.is_person {
+            self.generate_vam(tick, &composer);
+            return;
+        }
+        if tick.config.denm {
+            self.generate_denm(tick, &composer);
+        }
+        match tick.config.awareness {
+            V2xAwareness::Cam => self.generate_cam(tick, &composer),
+            V2xAwareness::Bsm => self.generate_bsm(tick, &composer),
+        }
         if tick.perception.range_m > 0.0 {
             self.generate_cpm(tick, &composer);
         }
@@ -144,6 +202,43 @@ impl StationTurn<'_> {
         };
         if let Some(cam) = composer.cam(content.has_low_frequency) {
             self.send(tick, composer, SendingService::Cam, &cam.encode(), &cam.position);
+        }
+    }
+
+    fn generate_denm(&mut self, tick: &StationTick, composer: &MessageComposer) {
+        let own = composer.own;
+        let Some(content) = self.station.denm.check(tick.now_ns, own.speed_mps, own.accel_mps2) else {
+            return;
+        };
+        self.station.warning = composer.denm(&content, self.station.warning);
+        if let Some(denm) = self.station.warning {
+            self.send(tick, composer, SendingService::Denm, &denm.encode(), &denm.position);
+        }
+    }
+
+    fn generate_vam(&mut self, tick: &StationTick, composer: &MessageComposer) {
+        let gap_ns = self.gap_ns(SendingService::Vam);
+        // A phone measures no speed.
+        let motion = MeasuredMotion {
+            position_m: composer.own.centre_m(composer.size),
+            speed_mps: 0.0,
+            heading_rad: composer.own.heading_rad,
+        };
+        let Some(content) = self.station.vam.check(tick.now_ns, &motion, gap_ns) else {
+            return;
+        };
+        if let Some(vam) = composer.vam(content.has_low_frequency) {
+            self.send(tick, composer, SendingService::Vam, &vam.encode(), &vam.position);
+        }
+    }
+
+    fn generate_bsm(&mut self, tick: &StationTick, composer: &MessageComposer) {
+        let gap_ns = self.gap_ns(SendingService::Bsm);
+        let Some(count) = self.station.bsm.check(tick.now_ns, gap_ns) else {
+            return;
+        };
+        if let Some(bsm) = composer.bsm(count) {
+            self.queue(tick, SendingService::Bsm, wsmp::encode(&bsm.encode()));
         }
     }
 
@@ -181,7 +276,7 @@ impl StationTurn<'_> {
     /// Least time between two messages of a service, by congestion control, nanoseconds.
     fn gap_ns(&self, service: SendingService) -> u64 {
         let congestion: &CongestionControl = &self.station.congestion;
-        congestion.gap_ns(air_time_s(TYPICAL_BYTES[service as usize]))
+        congestion.gap_ns(air_time_s(service.typical_bytes()))
     }
 
     /// Puts headers before a message, and queues it.
@@ -194,11 +289,9 @@ impl StationTurn<'_> {
         place: &GeodeticPoint,
     ) {
         let own: &OwnMeasurement = composer.own;
+        let Some(port) = service.port() else { return };
         let head = PacketHead {
-            port: match service {
-                SendingService::Cam => BtpPort::Cam,
-                SendingService::Cpm => BtpPort::Cpm,
-            },
+            port,
             station: composer.station,
             kind: composer.kind.0,
             time_ms: its_time_ms(tick.now_ns) as u32,
@@ -207,12 +300,15 @@ impl StationTurn<'_> {
             speed_cmps: (own.speed_mps * 100.0).round().clamp(-16_384.0, 16_383.0) as i16,
             heading: heading_from_yaw(own.heading_rad),
         };
-        let packet = geonetworking::encode(&head, message);
+        self.queue(tick, service, geonetworking::encode(&head, message));
+    }
+
+    fn queue(&mut self, tick: &StationTick, service: SendingService, packet: Vec<u8>) {
         self.messages.push(OutgoingMessage {
             queued: QueuedMessage {
                 radio: self.number,
-                station: composer.station,
-                message: tick.tick << 1 | service as u32,
+                station: self.station.station,
+                message: service.number(tick.tick),
                 ready_ns: self.station.phase_ns,
                 bytes: (packet.len() + FRAME_BYTES) as u32,
             },

@@ -49,8 +49,10 @@ pub fn encode(head: &PacketHead, message: &[u8]) -> Vec<u8> {
     // Basic header: version 1, a common header follows; lifetime 1 s (20 × 50 ms: multiplier 20 in units of 50 ms); one hop.
     out.extend([0x11, 0, 20 << 2, 1]);
     let length = (message.len() + 4) as u16;
-    // Common header: BTP-B follows; single-hop broadcast; traffic class 2 (CAM); mobile; length of what follows; one hop.
-    out.extend([0x20, 0x50, 0x02, 0x80]);
+    // Common header: BTP-B follows; single-hop broadcast; traffic class 1 for warnings and 2 for all else; mobile; length of what follows;
+    // one hop.
+    let traffic_class = if head.port == BtpPort::Denm { 1 } else { 2 };
+    out.extend([0x20, 0x50, traffic_class, 0x80]);
     out.extend(length.to_be_bytes());
     out.extend([1, 0]);
     // Long position vector of the sender. Address: set by hand, the type of the station, a local MAC address.

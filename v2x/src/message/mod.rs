@@ -11,6 +11,7 @@ pub mod geonetworking;
 mod its;
 mod uper;
 pub mod vam;
+pub mod wsmp;
 
 pub use its::{GeodeticPoint, StationKind, generation_delta_ms, heading_from_yaw, its_time_ms, yaw_from_heading};
 

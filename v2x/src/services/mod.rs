@@ -1,5 +1,6 @@
 //! When a station sends which message: the generation rules of the standards, as functions of measured motion and time.
 
+pub mod bsm;
 pub mod cam;
 pub mod congestion;
 pub mod cpm;

@@ -282,7 +282,7 @@ class Neighbours:
 
     @cached_property
     def ids(self) -> UInt32Array:
-        """u32 [n, k, 3]: station of the object (0: perceived), station heard from, source (1 CAM, 2 CPM, 3 VAM)."""
+        """u32 [n, k, 3]: station of the object (0: perceived), station heard from, 1 CAM, 2 CPM, 3 VAM or 4 BSM."""
         return self._array("ids", np.uint32)
 
     @cached_property
