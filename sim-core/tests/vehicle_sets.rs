@@ -2,6 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
 
+#[path = "common/page.rs"]
+mod page;
+
 use std::fmt::Write as _;
 
 use ipc_schema::traffic::VEHICLE_CLASSES;
@@ -9,9 +12,6 @@ use sim_core::{
     models::dynamic::GRAVITY_MPS2,
     models::parameters::{ParameterCatalogue, ParameterSet},
 };
-
-const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/vehicle-model.md");
-const MARKS: [&str; 2] = ["<!-- sets -->\n", "<!-- end of sets -->"];
 
 /// A row of the table: its name, its unit, and the value for a set.
 type Row = (&'static str, &'static str, fn(&ParameterSet) -> String);
@@ -86,16 +86,7 @@ fn table(sets: &[ParameterSet]) -> String {
 
 #[test]
 fn the_page_shows_the_sets() {
-    let page = std::fs::read_to_string(PAGE).unwrap();
-    let (before, rest) = page.split_once(MARKS[0]).unwrap();
-    let (_, after) = rest.split_once(MARKS[1]).unwrap();
-    let table = table(ParameterCatalogue::new().unwrap().sets());
-    let wanted = format!("{before}{}{table}{}{after}", MARKS[0], MARKS[1]);
-    if std::env::var_os("CARAWARE_BLESS").is_some() {
-        std::fs::write(PAGE, wanted).unwrap();
-    } else {
-        assert!(page == wanted, "bring {PAGE} up to date with CARAWARE_BLESS=1");
-    }
+    page::shows("sets", &table(ParameterCatalogue::new().unwrap().sets()));
 }
 
 #[test]
