@@ -149,7 +149,7 @@ fn round(config: &Config) -> f64 {
 /// Microseconds per sample of the IMU, including its random numbers: 16 vehicles, ten samples a tick.
 fn imu_alone(config: &Config) -> f64 {
     const RUNS: u32 = 5000;
-    let unit = ImuModel::new(&config.imu, SUB_STEPS);
+    let unit = ImuModel::new(&config.imu, SUB_STEPS, config.run.tick_s);
     let mut draws = NormalDraws::default();
     let rows = [SubStep::default(); SUB_STEPS];
     let body = ImuMotion {

@@ -58,7 +58,7 @@ impl SensorSuite {
         Ok(Self {
             gnss: GnssReceiver::new(&config.gnss, projection, bounds_m)?,
             sky: None,
-            imu: ImuModel::new(&config.imu, config.imu_samples()),
+            imu: ImuModel::new(&config.imu, config.imu_samples(), config.run.tick_s),
             speed_steering: SpeedSteeringModel::new(&config.speed_steering, config.vehicle.steering_ratio),
             schedules: schedules(config, tick_ns),
             periods: SENSORS.map(|spec| ticks((spec.period_s)(config))),

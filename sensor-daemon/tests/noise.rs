@@ -135,6 +135,115 @@ fn correlated_fixes_forget_in_their_correlation_time() {
     }
 }
 
+/// A unit of docs/sensor-models.md, "Typical values": keys, and the data sheet that they stand for.
+struct Unit {
+    name: &'static str,
+    /// `gyro_noise_density` and `gyro_bias_walk`.
+    gyro: [f64; 2],
+    /// `accel_noise_density` and `accel_bias_walk`.
+    accel: [f64; 2],
+    /// Data sheet: angle random walk, rad/√s, and the lowest Allan deviation, rad/s.
+    gyro_sheet: [f64; 2],
+    /// Data sheet: velocity random walk, m/s/√s, and the lowest Allan deviation, m/s².
+    accel_sheet: [f64; 2],
+}
+
+const MICRO_G: f64 = 9.806_65e-6;
+
+/// The Bosch BMI160's data sheet has no lowest point: 20 °/h and 80 µg are typical of its class.
+fn units() -> [Unit; 3] {
+    let per_hour = |degrees: f64| degrees.to_radians() / 3600.0;
+    [
+        Unit {
+            name: "consumer (BMI160)",
+            gyro: [1.2e-4, 6.7e-5],
+            accel: [1.8e-3, 3.0e-4],
+            gyro_sheet: [0.007_f64.to_radians(), per_hour(20.0)],
+            accel_sheet: [180.0 * MICRO_G, 80.0 * MICRO_G],
+        },
+        Unit {
+            name: "industrial (ADIS16470)",
+            gyro: [1.4e-4, 9.3e-6],
+            accel: [9.8e-4, 1.4e-5],
+            gyro_sheet: [0.008_f64.to_radians(), per_hour(8.0)],
+            accel_sheet: [100.0 * MICRO_G, 13.0 * MICRO_G],
+        },
+        Unit {
+            name: "tactical (STIM300)",
+            gyro: [4.4e-5, 1.2e-7],
+            accel: [1.0e-3, 2.1e-4],
+            gyro_sheet: [0.15_f64.to_radians() / 60.0, per_hour(0.5)],
+            accel_sheet: [0.06 / 60.0, 50.0 * MICRO_G],
+        },
+    ]
+}
+
+/// The noise of units with published data, as delivered: the density from the Allan deviation of short spans, where it falls with √τ,
+/// and its lowest point where the walk is on a scale that a run shows.
+#[test]
+fn units_of_the_docs_have_the_allan_deviations_of_their_data_sheets() {
+    for unit in units() {
+        let mut config = fast();
+        config.imu.gyro_noise_density = [unit.gyro[0]; 3];
+        config.imu.gyro_bias_walk = [unit.gyro[1]; 3];
+        config.imu.accel_noise_density = [unit.accel[0]; 3];
+        config.imu.accel_bias_walk = [unit.accel[1]; 3];
+        for (axis, keys, sheet) in [(1, unit.accel, unit.accel_sheet), (5, unit.gyro, unit.gyro_sheet)] {
+            // Seconds from one sample to 1 024 of them.
+            let curve = deviations(&config, axis, 30, 1_000, &[1, 4, 16, 64, 256, 1_024]);
+            // √τ times the deviation of a span of 0.04 s: the density, on a data sheet to two digits.
+            let density = curve[1].1 * curve[1].0.sqrt();
+            assert!(
+                (density / sheet[0] - 1.0).abs() < 0.1,
+                "{}, axis {axis}: density {density}, data sheet {}",
+                unit.name,
+                sheet[0]
+            );
+            for (tau_s, deviation) in &curve {
+                let expected = (keys[0] * keys[0] / tau_s + keys[1] * keys[1] * tau_s / 3.0).sqrt();
+                // 30 vehicles with 10 independent spans of the longest: five standard errors of 1/√(2·300) are 20 %.
+                assert!(
+                    (deviation / expected - 1.0).abs() < 0.2,
+                    "{}, axis {axis}: {deviation} instead of {expected} at {tau_s} s",
+                    unit.name
+                );
+            }
+            // The lowest point, √(2 N K / √3), is the data sheet's.
+            let lowest = (2.0 * keys[0] * keys[1] / 3.0_f64.sqrt()).sqrt();
+            assert!(
+                (lowest / sheet[1] - 1.0).abs() < 0.1,
+                "{}, axis {axis}: lowest {lowest}, data sheet {}",
+                unit.name,
+                sheet[1]
+            );
+        }
+    }
+}
+
+/// The circle in which half of the fixes lie (CEP) is that of the receiver's data sheet: docs/sensor-models.md, "Typical values".
+#[test]
+fn receivers_of_the_docs_have_the_circle_of_their_data_sheets() {
+    const VEHICLES: u32 = 4_000;
+    // White and correlated deviation by axis, and the data sheet's CEP, metres.
+    for (white_m, correlated_m, cep_m) in [(0.5, 2.0, 2.5), (0.3, 1.2, 1.5), (0.008, 0.005, 0.01), (1.5, 4.0, 4.9)] {
+        let mut config = quiet();
+        config.gnss.noise_std_m = [white_m; 3];
+        config.gnss.correlated_std_m = [correlated_m; 3];
+        let mut run = Run::new(&config);
+        let states = cavs(VEHICLES);
+        let fixes: Vec<[f32; 3]> = run.tick(&states).section("gnss_m");
+        let mut away: Vec<f64> = fixes
+            .iter()
+            .zip(&states)
+            .map(|(fix, state)| (f64::from(fix[0]) - state.x_m).hypot(f64::from(fix[1]) - state.y_m))
+            .collect();
+        away.sort_by(f64::total_cmp);
+        let found = away[away.len() / 2];
+        // Five standard errors of the median are 7 %; the docs round the deviations to a digit or two.
+        assert!((found / cep_m - 1.0).abs() < 0.15, "{found} m instead of {cep_m} m");
+    }
+}
+
 /// All errors on, so that every random stream and every memory has an effect.
 fn everything() -> Config {
     let mut config = config();

@@ -34,6 +34,7 @@ const COMPASS: usize = 6;
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImuModel {
     samples: usize,
+    tick_s: f32,
     /// Sign of each axis; 0 for an element of a sub-step that is no axis.
     signs: Pair,
     gravity_mps2: f32,
@@ -82,9 +83,9 @@ fn full_scale(range: f64, resolution: f64) -> f64 {
 }
 
 impl ImuModel {
-    /// An IMU that takes `samples` samples in a tick (1 if its period is longer than a tick).
+    /// An IMU that takes `samples` samples in a tick of `tick_s` seconds (1 if its period is longer than a tick).
     #[must_use]
-    pub fn new(params: &Params, samples: usize) -> Self {
+    pub fn new(params: &Params, samples: usize, tick_s: f64) -> Self {
         let white = |std: [f64; 3], density: [f64; 3]| {
             [0, 1, 2].map(|i: usize| (std[i] * std[i] + density[i] * density[i] / params.period_s).sqrt())
         };
@@ -105,6 +106,7 @@ impl ImuModel {
         let any = |axes: &Pair| axes.iter().any(|std| *std > 0.0);
         Self {
             samples: samples.max(1),
+            tick_s: tick_s as f32,
             signs: twice(signs(params.convention)),
             gravity_mps2: match params.convention {
                 ImuConvention::Kinematic => 0.0,
@@ -150,7 +152,8 @@ impl ImuModel {
 
     /// Writes the samples of a tick to `out`, oldest first, with the planned numbers; `walk` is the random walk of the biases so far.
     ///
-    /// A sample over several sub-steps is the mean of their accelerations and rates; gravity and heading are those at its end.
+    /// A sample over several sub-steps is the mean of their accelerations and rates, with the gravity half-way; the heading is that at
+    /// its end.
     #[inline]
     pub fn sample(
         &self,
@@ -204,7 +207,8 @@ impl VectorWork for Samples<'_> {
             let gravity = if unit.gravity_mps2 == 0.0 {
                 [[0.0; BATCH]; 3]
             } else {
-                gravity_body(unit.gravity_mps2, some.len(), &rows_of)
+                let sub_step_s = unit.tick_s / rows.len() as f32;
+                gravity_body(unit.gravity_mps2, sub_step_s, some.len(), &rows_of)
             };
             for i in 0..some.len() {
                 let felt = if steps == 1 {
@@ -343,25 +347,56 @@ fn signs(convention: ImuConvention) -> ImuAxes {
     }
 }
 
-/// Gravity as an accelerometer measures it at the end of each sample: the upward reaction, turned into the vehicle's frame (for any
-/// roll and pitch).
+/// Gravity as an accelerometer measures it half-way through each sample: the upward reaction, turned into the vehicle's frame (for any
+/// roll and pitch). The acceleration is a mean over the sample in the axes half-way; with gravity in those at its end, a navigator
+/// would take half of what a lean changes in a sample for a velocity of its own.
 #[inline(always)]
-fn gravity_body<'r>(gravity_mps2: f32, samples: usize, rows_of: &impl Fn(usize) -> &'r [SubStep]) -> [[f32; BATCH]; 3] {
+fn gravity_body<'r>(
+    gravity_mps2: f32,
+    sub_step_s: f32,
+    samples: usize,
+    rows_of: &impl Fn(usize) -> &'r [SubStep],
+) -> [[f32; BATCH]; 3] {
     let (mut roll, mut pitch): ([u32; BATCH], [u32; BATCH]) = ([0; BATCH], [0; BATCH]);
+    // The rotation from half-way to the end of the middle sub-step; of an even number of sub-steps, half-way is the end of one.
+    let mut left = [[0.0; BATCH]; 3];
     for (i, (roll, pitch)) in roll.iter_mut().zip(&mut pitch).take(samples).enumerate() {
-        if let Some(end) = rows_of(i).last() {
-            (*roll, *pitch) = (turns(end.roll_rad), turns(end.pitch_rad));
+        let rows = rows_of(i);
+        let middle = rows[(rows.len() - 1) / 2];
+        (*roll, *pitch) = (turns(middle.roll_rad), turns(middle.pitch_rad));
+        if rows.len() & 1 == 1 {
+            for (left, rate) in left.iter_mut().zip(middle.angular_rate_body_radps) {
+                left[i] = 0.5 * sub_step_s * rate;
+            }
         }
     }
     let mut gravity = [[0.0; BATCH]; 3];
     for member in 0..BATCH {
         let (cos_pitch, sin_pitch) = cos_sin(pitch[member]);
         let (cos_roll, sin_roll) = cos_sin(roll[member]);
-        gravity[0][member] = gravity_mps2 * sin_pitch;
-        gravity[1][member] = gravity_mps2 * cos_pitch * sin_roll;
-        gravity[2][member] = gravity_mps2 * cos_pitch * cos_roll;
+        let end = [
+            gravity_mps2 * sin_pitch,
+            gravity_mps2 * cos_pitch * sin_roll,
+            gravity_mps2 * cos_pitch * cos_roll,
+        ];
+        // Turned back to the second order of the angle.
+        let angle = left.map(|axis| axis[member]);
+        let first = cross(angle, end);
+        let second = cross(angle, first);
+        for axis in 0..3 {
+            gravity[axis][member] = end[axis] + (first[axis] + 0.5 * second[axis]);
+        }
     }
     gravity
+}
+
+#[inline(always)]
+fn cross(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
+    [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
 }
 
 /// An angle in units of 2⁻³² turns, without whole turns. The last bit of a number between 2²⁰ and 2²¹ is one such unit: the addition

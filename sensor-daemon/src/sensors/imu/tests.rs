@@ -25,7 +25,7 @@ fn sample(params: &Params, rows: &[SubStep]) -> ImuSample {
 }
 
 fn samples(params: &Params, rows: &[SubStep], count: usize) -> Vec<ImuSample> {
-    let unit = ImuModel::new(params, count);
+    let unit = ImuModel::new(params, count, 0.1);
     let mut out = vec![[9.0; 7]; count];
     let body = ImuMotion {
         yaw_rad: FRAC_PI_2,
@@ -66,6 +66,25 @@ fn at_rest_it_feels_gravity_as_configured() {
     for convention in [ImuConvention::SpecificForce, ImuConvention::Carla] {
         let felt = sample(&with(convention), &rest);
         assert_eq!(felt, [0.0, 0.0, g, 0.0, 0.0, 0.0, 0.0], "{convention:?}");
+    }
+}
+
+/// A body rolls at 0.4 rad/s through 0.2 rad to the end of the sample, which takes 0.1 s: half-way it leans by 0.18 rad, whatever the
+/// number of sub-steps.
+#[test]
+fn gravity_is_that_half_way_through_the_sample() {
+    for sub_steps in [1_u8, 2, 5, 10] {
+        let rows: Vec<SubStep> = (1..=sub_steps)
+            .map(|step| SubStep {
+                roll_rad: 0.16 + 0.04 * f32::from(step) / f32::from(sub_steps),
+                angular_rate_body_radps: [0.4, 0.0, 0.0],
+                ..SubStep::default()
+            })
+            .collect();
+        let felt = sample(&with(ImuConvention::SpecificForce), &rows);
+        let g = GRAVITY_MPS2 as f32;
+        let off = [felt[1] - g * 0.18_f32.sin(), felt[2] - g * 0.18_f32.cos()];
+        assert!(off.iter().all(|off| off.abs() < 2e-5), "{sub_steps} sub-steps: {off:?}");
     }
 }
 
@@ -113,12 +132,27 @@ fn every_convention_by_hand() {
     };
     let kinematic = sample(&with(ImuConvention::Kinematic), &[row]);
     assert_eq!(kinematic, [-2.0, 3.0, 0.5, 0.1, 0.2, 0.3, 0.0]);
-    let z = 0.5 + GRAVITY_MPS2 as f32;
-    let specific = sample(&with(ImuConvention::SpecificForce), &[row]);
-    assert_eq!(specific, [-2.0, 3.0, z, 0.1, 0.2, 0.3, 0.0]);
+    // Level at the end of 0.1 s: half-way it still rolls by 0.005 rad to the left and pitches by 0.01 rad up.
+    let g = GRAVITY_MPS2 as f32;
+    let felt = [-2.0 + 0.01 * g, 3.0 - 0.005 * g, 0.5 + g];
+    let near = |sample: ImuSample, expected: ImuSample| {
+        let off = sample
+            .iter()
+            .zip(expected)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max);
+        assert!(off < 1e-3, "{sample:?} is not {expected:?}");
+    };
+    let [x, y, z] = felt;
+    near(
+        sample(&with(ImuConvention::SpecificForce), &[row]),
+        [x, y, z, 0.1, 0.2, 0.3, 0.0],
+    );
     // y to the right: the bend pushes to −y; rolling to the left, nose down and turning to the right are positive.
-    let carla = sample(&with(ImuConvention::Carla), &[row]);
-    assert_eq!(carla, [-2.0, -3.0, z, -0.1, 0.2, -0.3, 0.0]);
+    near(
+        sample(&with(ImuConvention::Carla), &[row]),
+        [x, -y, z, -0.1, 0.2, -0.3, 0.0],
+    );
 }
 
 #[test]
@@ -190,7 +224,7 @@ fn white_noise_has_the_configured_level_on_every_axis() {
         compass_bias_rad: 1.0,
         ..town().imu
     };
-    let unit = ImuModel::new(&params, N);
+    let unit = ImuModel::new(&params, N, 0.1);
     let mut out = vec![[0.0; 7]; N];
     let body = ImuMotion {
         yaw_rad: FRAC_PI_2,
@@ -236,7 +270,7 @@ fn biases_walk_and_remember() {
         gyro_bias_walk: [0.0, 0.0, 0.1],
         ..quiet()
     };
-    let (short, long) = (ImuModel::new(&params, 10), ImuModel::new(&params, 100));
+    let (short, long) = (ImuModel::new(&params, 10, 0.1), ImuModel::new(&params, 100, 0.1));
     let body = ImuMotion {
         yaw_rad: 0.0,
         rows: &[SubStep::default()],
@@ -276,7 +310,7 @@ fn biases_walk_and_remember() {
 
 #[test]
 fn streams_are_independent_of_how_many_are_asked_for() {
-    let unit = ImuModel::new(&town().imu, 1);
+    let unit = ImuModel::new(&town().imu, 1, 0.1);
     let alone = blocks(&unit, 3, 77);
     let stream = RandomStream {
         episode_seed: 1,
@@ -311,7 +345,7 @@ fn every_path_gives_the_same_samples() {
         })
         .collect();
     for samples in [1, 10, 20, 40] {
-        let unit = ImuModel::new(&params, samples);
+        let unit = ImuModel::new(&params, samples, 0.1);
         let normals = blocks(&unit, 3, 100);
         let on = |path| {
             let (mut walk, mut out) = ([0.5; 8], vec![[0.0; 7]; samples]);
