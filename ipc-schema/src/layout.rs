@@ -145,7 +145,9 @@ pub fn table() -> Vec<TypeLayout> {
             kind,
             signals,
             flags,
-            reference_offset_m
+            reference_offset_m,
+            steering_ratio,
+            rear_wheel_slip
         }),
         layout!(SubStep {
             dx_m,

@@ -80,6 +80,11 @@ pub struct VehicleState {
     pub flags: u32,
     /// Distance between the reference and SUMO's own path (lane changes spread in time, kinks rounded), metres.
     pub reference_offset_m: f32,
+    /// Steering-wheel angle by road-wheel angle of its parameter set; 0 for persons.
+    pub steering_ratio: f32,
+    /// Longitudinal slip of the rear wheels, `(wheel speed − speed) / speed`: positive when they drive, negative when they brake; 0
+    /// without tyres, and for road users that carry no sensors.
+    pub rear_wheel_slip: f32,
 }
 
 /// Motion at one sub-step; the last sub-step of a tick coincides with its [`VehicleState`].

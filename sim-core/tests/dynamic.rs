@@ -152,6 +152,42 @@ fn a_step_of_the_steering_settles_with_its_roll() {
     }
 }
 
+/// In a steady bend a two-wheeler leans into it by the balance of a thin wheel, `atan(a / g)`, linearised: too far by `(a / g)³ / 3`. An
+/// accelerometer across its body then feels next to nothing, where that of a car feels the bend and its own roll.
+#[test]
+fn two_wheelers_lean_into_the_bend_until_nothing_pulls_sideways() {
+    for (name, params) in every_kind() {
+        for lateral in [1.0, 2.5] {
+            let speed = 9.0;
+            let gradient = (1.0 / params.stiffness_per_rad[0] - 1.0 / params.stiffness_per_rad[1]) / GRAVITY_MPS2;
+            let angle = (params.wheelbase_m / (speed * speed) + gradient) * lateral;
+            let end = *run(&params, rolling(speed), steering(angle), 12.0, DT_S)
+                .last()
+                .unwrap();
+            let accel = end.speed_mps * end.yaw_rate_radps;
+            let across = accel * end.roll[0].cos() + GRAVITY_MPS2 * end.roll[0].sin();
+            if ["motorcycle", "bicycle"].contains(&name.as_str()) {
+                let share = accel / GRAVITY_MPS2;
+                let off = -end.roll[0] - share.atan();
+                assert!(
+                    off.abs() < share.powi(3) / 3.0 + 0.002,
+                    "{name} leans {off} rad too far"
+                );
+                assert!(
+                    across.abs() < 0.02 * accel + GRAVITY_MPS2 * share.powi(3) / 3.0,
+                    "{name}: {across} m/s²"
+                );
+            } else {
+                assert!(
+                    end.roll[0] > 0.0 && across > accel,
+                    "{name} leans out of the bend: {:?}",
+                    end.roll
+                );
+            }
+        }
+    }
+}
+
 /// With actuators that follow at once, the error falls with the square of the sub-step.
 #[test]
 fn halving_the_sub_step_quarters_the_error() {
@@ -177,6 +213,40 @@ fn halving_the_sub_step_quarters_the_error() {
     let (coarse, medium, fine) = (error(200), error(400), error(800));
     assert!(coarse / medium > 3.4 && medium / fine > 3.4, "{coarse} {medium} {fine}");
     assert!(medium < 0.002, "{medium} m at 10 ms");
+}
+
+/// Slip of the rear wheels: at small forces the force by the stiffness, driven forwards, braked backwards, none without a force; at the
+/// limit that of the saturating tyre.
+#[test]
+fn rear_wheels_slip_as_the_tyre_gives_its_force() {
+    for (name, params) in every_kind() {
+        let at = |accel_mps2: f64, speed_mps: f64, slope_sin: f64| {
+            let state = ModelState {
+                accel_mps2,
+                ..rolling(speed_mps)
+            };
+            params.rear_wheel_slip(&state, slope_sin)
+        };
+        assert_eq!(at(-3.0, 0.0, 0.0), 0.0, "{name}: it stands");
+        let resistance = params.drag_by_mass_per_m * 225.0 + params.rolling_mps2;
+        assert_eq!(at(-resistance, 15.0, 0.0), 0.0, "{name}: it rolls");
+        assert!(
+            at(-resistance, 15.0, 0.05) >= 0.0 && at(-resistance, 15.0, -0.05) <= 0.0,
+            "{name}"
+        );
+        let force = -0.5 - (-resistance);
+        let share = 1.0 - params.share_front[usize::from(force <= 0.0)];
+        let linear = share * force / (params.stiffness_per_rad[1] * params.loads_mps2(-0.5)[1]);
+        assert!(
+            (at(-0.5, 15.0, 0.0) / linear - 1.0).abs() < 0.02,
+            "{name}: {} {linear}",
+            at(-0.5, 15.0, 0.0)
+        );
+        // Braked at the limit: 0.95 of the friction, so 0.95 / √(1 − 0.95²) of μ / C.
+        let locked = at(-30.0, 15.0, 0.0);
+        let expected = -0.95 / (1.0_f64 - 0.95 * 0.95).sqrt() * params.friction / params.stiffness_per_rad[1];
+        assert!((locked / expected - 1.0).abs() < 1e-9, "{name}: {locked} {expected}");
+    }
 }
 
 #[test]

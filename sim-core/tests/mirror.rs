@@ -1,16 +1,19 @@
 //! The mirror as a collection: episodes, announcements, order, headers, persons.
 
+#![allow(clippy::unwrap_used, reason = "tests assert by unwrapping")]
+
 mod common;
 
 use common::{LENGTH_M, Road, drive, frame, limits, meta, previewing, settings};
 use ipc_schema::{
+    config,
     header::{EVALUATION, FIRST_OF_EPISODE, LAST_OF_EPISODE, LAST_OF_RUN, MessageHeader},
     traffic::{Kind, MetaEvent, TrafficState},
     world::{APPEARED, GUIDED, RESYNCHRONISED, VehicleState},
 };
 use proptest::prelude::*;
 use sim_core::{
-    mirror::{Mirror, MirrorError, resynchronisation::ResynchronisationCause},
+    mirror::{Mirror, MirrorError, MirrorSettings, resynchronisation::ResynchronisationCause},
     trig::wrap_angle,
 };
 
@@ -180,6 +183,49 @@ proptest! {
                 let one = &frame(mirror, &header(0, tick as u64), &[drives[v][tick]])[0];
                 prop_assert_eq!(all.states[v], one.states[0]);
                 prop_assert_eq!(&all.rows[10 * v..10 * v + 10], &one.rows[..]);
+            }
+        }
+    }
+}
+
+/// A vehicle that speeds up and brakes, of this class and kind; all ticks in which it was moved.
+fn moved(class: &str, kind: Kind) -> Vec<VehicleState> {
+    let settings = settings(0.1, 10, 1);
+    let vehicle = config::VehicleConfig {
+        cav_model: config::SingleTrackModel::Dynamic,
+        ..settings.vehicle
+    };
+    let mut mirror = Mirror::new(MirrorSettings { vehicle, ..settings }).unwrap();
+    let mut announced = meta(0, kind);
+    announced.vehicle_class = Default::default();
+    announced.vehicle_class[..class.len()].copy_from_slice(class.as_bytes());
+    mirror.apply_meta(&header(0, 0), &[announced]).unwrap();
+    let speeds: Vec<f64> = (0..160)
+        .map(|i| 5.0 + 0.08 * f64::from(80 - (i - 80_i32).abs()))
+        .collect();
+    let states = drive(&road(), 50.0, 0.1, &speeds);
+    let ticks = states
+        .iter()
+        .enumerate()
+        .flat_map(|(tick, state)| frame(&mut mirror, &header(0, tick as u64), &[*state]));
+    ticks.skip(5).map(|tick| tick.states[0]).collect()
+}
+
+#[test]
+fn the_world_has_the_steering_ratio_of_each_set_and_the_slip_of_the_wheels_of_carriers() {
+    for (class, ratio) in [("passenger", 15.0), ("bus", 22.0), ("truck", 20.0), ("bicycle", 1.0)] {
+        for kind in [Kind::Cav, Kind::Other] {
+            let states = moved(class, kind);
+            assert!(states.iter().all(|state| state.steering_ratio == ratio), "{class}");
+            let slips = || states.iter().map(|state| state.rear_wheel_slip);
+            let (least, most) = (slips().fold(0.0, f32::min), slips().fold(0.0, f32::max));
+            if kind == Kind::Cav {
+                assert!(
+                    -0.05 < least && least < -5e-4 && 1e-3 < most && most < 0.05,
+                    "{class}: {least} {most}"
+                );
+            } else {
+                assert_eq!((least, most), (0.0, 0.0), "{class}: no sensor reads it");
             }
         }
     }

@@ -52,8 +52,10 @@ fn a_crowd_is_sampled_by_id_and_counted() {
         let frame = encode(Channel::World, &header(shape), cast_slice(crowd)).unwrap();
         let (head, body) = decode(&frame.bytes).unwrap();
         assert!(frame.bytes.len() <= MAX_FRAME_BYTES);
-        assert_eq!((head.rows() + frame.left_out, head.rows()), (crowd.len(), 6_616));
-        let rows = body.chunks_exact(136).map(pod_read_unaligned::<VehicleState>);
+        assert_eq!((head.rows() + frame.left_out, head.rows()), (crowd.len(), 6_249));
+        let rows = body
+            .chunks_exact(size_of::<VehicleState>())
+            .map(pod_read_unaligned::<VehicleState>);
         rows.map(|state| state.id_hash).collect()
     };
     let mut crowd = states(20_000);

@@ -136,6 +136,8 @@ pub struct SpeedSteeringConfig {
     pub steering_scale_std: f64,
     /// Constant error of the steering-wheel angle, radians.
     pub steering_bias_rad: f64,
+    /// The wheels slip: the speed is theirs, not that of the ground under them.
+    pub wheel_slip: bool,
     /// Length of a blackout, shortest and longest, seconds; [0, 0] = none.
     pub blackout_length_s: [f64; 2],
     /// Time between two blackouts, shortest and longest, seconds.

@@ -31,7 +31,7 @@ pub struct VehicleConfig {
     pub max_accel_mps2: f64,
     /// Largest deceleration of the mirror, m/s².
     pub max_decel_mps2: f64,
-    /// Steering-wheel angle per road-wheel angle.
+    /// Steering-wheel angle per road-wheel angle of every vehicle; 0 = each that of its parameter set.
     pub steering_ratio: f64,
     /// Tracking error beyond which the mirror is set onto SUMO, metres.
     pub resynchronise_m: f64,

@@ -1,4 +1,4 @@
-//! Speed and steering sensor: wheel speed, and steering-wheel angle from the road-wheel angle and the steering ratio.
+//! Speed and steering sensor: speed of the rear wheels, and steering-wheel angle from the road-wheel angle and the steering ratio.
 
 use ipc_schema::{config::SpeedSteeringConfig as Params, sensor::NoiseStream, world::VehicleState};
 
@@ -42,7 +42,7 @@ pub struct SpeedSteeringModel {
 }
 
 impl SpeedSteeringModel {
-    /// The sensor of vehicles with this steering ratio (steering-wheel angle over road-wheel angle).
+    /// The sensor of vehicles with this steering ratio (steering-wheel angle over road-wheel angle); 0: each that of its parameter set.
     #[must_use]
     pub fn new(params: &Params, steering_ratio: f64) -> Self {
         Self {
@@ -86,8 +86,18 @@ impl SpeedSteeringModel {
         normals: &NormalBlock,
     ) -> SpeedSteeringSample {
         let params = &self.params;
-        let true_speed = f64::from(state.velocity_body_mps[0]).abs();
-        let true_steering = f64::from(state.road_wheel_angle_rad) * self.steering_ratio;
+        let slip = if params.wheel_slip {
+            f64::from(state.rear_wheel_slip)
+        } else {
+            0.0
+        };
+        let true_speed = f64::from(state.velocity_body_mps[0]).abs() * (1.0 + slip);
+        let ratio = if self.steering_ratio > 0.0 {
+            self.steering_ratio
+        } else {
+            state.steering_ratio.into()
+        };
+        let true_steering = f64::from(state.road_wheel_angle_rad) * ratio;
         SpeedSteeringSample {
             speed_mps: (true_speed * scales.speed + params.speed_noise_std_mps * f64::from(normals[0])).max(0.0),
             steering_rad: true_steering * scales.steering
@@ -154,6 +164,33 @@ mod tests {
                 steering_rad: -1.5
             }
         );
+    }
+
+    #[test]
+    fn wheels_slip_and_each_set_has_its_steering_ratio_if_configured() {
+        let params = Params {
+            speed_noise_std_mps: 0.0,
+            steering_noise_std_rad: 0.0,
+            ..town().speed_steering
+        };
+        let state = VehicleState {
+            velocity_body_mps: [20.0, 0.0, 0.0],
+            road_wheel_angle_rad: 0.1,
+            steering_ratio: 22.0,
+            rear_wheel_slip: -0.05,
+            ..VehicleState::default()
+        };
+        let sample = |params: &Params, ratio| SpeedSteeringModel::new(params, ratio).sample(&EXACT, &state, &[0.0; 4]);
+        let plain = sample(&params, 15.0);
+        assert!((plain.speed_mps - 20.0).abs() < 1e-6 && (plain.steering_rad - 1.5).abs() < 1e-6);
+        let slipping = sample(
+            &Params {
+                wheel_slip: true,
+                ..params
+            },
+            0.0,
+        );
+        assert!((slipping.speed_mps - 19.0).abs() < 1e-6 && (slipping.steering_rad - 2.2).abs() < 1e-6);
     }
 
     #[test]

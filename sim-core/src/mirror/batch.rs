@@ -48,6 +48,8 @@ pub trait BatchModel<const N: usize>: Pod {
     fn demand(&self, front_m: f64, state: &ModelState, target: &ReferencePoint) -> ControlInput;
     /// The state after `dt_s`, and the mean motion over it.
     fn step(&self, state: &ModelState, input: &ControlInput, slope_sin: f64, dt_s: f64) -> (ModelState, SubStepMotion);
+    /// Longitudinal slip of the rear wheels.
+    fn rear_wheel_slip(&self, state: &ModelState, slope_sin: f64) -> f64;
     /// The limits that a reference respects.
     fn driving_limits(&self) -> DrivingLimits;
     /// Parameters that keep the numbers of an empty member finite.
@@ -68,6 +70,10 @@ impl BatchModel<KINEMATIC> for KinematicParams {
     #[inline(always)]
     fn step(&self, state: &ModelState, input: &ControlInput, _: f64, dt_s: f64) -> (ModelState, SubStepMotion) {
         Self::step(self, state, input, dt_s)
+    }
+
+    fn rear_wheel_slip(&self, _: &ModelState, _: f64) -> f64 {
+        0.0
     }
 
     fn driving_limits(&self) -> DrivingLimits {
@@ -96,6 +102,10 @@ impl BatchModel<DYNAMIC> for DynamicParams {
     #[inline(always)]
     fn step(&self, state: &ModelState, input: &ControlInput, slope_sin: f64, dt_s: f64) -> (ModelState, SubStepMotion) {
         Self::step(self, state, input, slope_sin, dt_s)
+    }
+
+    fn rear_wheel_slip(&self, state: &ModelState, slope_sin: f64) -> f64 {
+        Self::rear_wheel_slip(self, state, slope_sin)
     }
 
     fn driving_limits(&self) -> DrivingLimits {
@@ -226,6 +236,13 @@ impl<P: BatchModel<N>, const N: usize> VehicleBatch<P, N> {
     #[inline(always)]
     pub fn state(&self, member: usize) -> ModelState {
         gather(&self.state, member)
+    }
+
+    /// The parameters of a member.
+    #[must_use]
+    #[inline(always)]
+    pub fn params(&self, member: usize) -> P {
+        gather(&self.params, member)
     }
 
     /// The reference of a member.

@@ -34,6 +34,12 @@ impl Default for Hero {
 }
 
 impl Hero {
+    /// Longitudinal slip of the rear wheels on a road with this sine of the slope.
+    #[must_use]
+    pub fn rear_wheel_slip(&self, model: &MotionModel, slope_sin: f64) -> f64 {
+        model.rear_wheel_slip(&self.state, slope_sin)
+    }
+
     /// Sets the control input from now on.
     pub fn set_input(&mut self, input: ControlInput) {
         self.input = input;

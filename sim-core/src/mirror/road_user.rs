@@ -74,6 +74,8 @@ pub struct RoadUser {
     /// Index of its model in the [`ModelCatalogue`].
     model: u32,
     dimensions: VehicleDimensions,
+    /// Steering-wheel angle by road-wheel angle; 0 for a person.
+    steering_ratio: f32,
     mover: Mover,
     before: TrafficState,
     now: TrafficState,
@@ -97,7 +99,11 @@ impl RoadUser {
     #[must_use]
     pub fn new(meta: &VehicleMeta, catalogue: &mut ModelCatalogue, driver: HeroDriver) -> Self {
         let model = catalogue.index_for(meta);
-        let dimensions = catalogue.at(model).dimensions;
+        let SizedModel {
+            dimensions,
+            steering_ratio,
+            ..
+        } = *catalogue.at(model);
         let mover = if meta.kind == Kind::Person as u32 {
             Mover::Person(Person::default())
         } else if meta.kind == Kind::Hero as u32 && driver == HeroDriver::Actions {
@@ -112,6 +118,10 @@ impl RoadUser {
             id_hash: meta.id_hash,
             model,
             dimensions,
+            steering_ratio: match mover {
+                Mover::Person(_) => 0.0,
+                Mover::Vehicle { .. } | Mover::Hero(_) => steering_ratio as f32,
+            },
             mover,
             before: TrafficState::default(),
             now: TrafficState::default(),
@@ -319,7 +329,12 @@ impl RoadUser {
         let end_s = start_s + settings.tick_s;
         *state = state.settled();
         batch.write(member, rows);
-        write_moved(state, batch.road(member), path.road(start_s).0, rows, out);
+        let road = batch.road(member);
+        write_moved(state, road, path.road(start_s).0, rows, out);
+        // Only their own sensors read it.
+        if out.kind != Kind::Other as u32 {
+            out.rear_wheel_slip = batch.params(member).rear_wheel_slip(state, road[2]) as f32;
+        }
         out.reference_offset_m = path.offset_m(end_s, settings.step_s()) as f32 + self.deviation_m;
         let target = batch.curve(member).at(settings.tick_s);
         let error = tracking::error(state, front_m, &target);
@@ -425,6 +440,7 @@ impl RoadUser {
                     let road = [&self.before, &self.now];
                     let models = (&built.model, body);
                     hero.advance(models, road, front_m, settings.sub_step_s(), out, rows);
+                    out.rear_wheel_slip = hero.rear_wheel_slip(&built.model, self.now.pitch_rad.into()) as f32;
                 }
             }
             Mover::Vehicle { state, path } if !set => {
@@ -494,6 +510,7 @@ impl RoadUser {
         out.vehicle = self.now.vehicle;
         out.kind = self.now.kind;
         out.signals = self.now.signals;
+        out.steering_ratio = self.steering_ratio;
         out.length_m = length_m as f32;
         out.width_m = width_m as f32;
         out.height_m = height_m as f32;

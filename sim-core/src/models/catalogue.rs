@@ -56,6 +56,16 @@ impl MotionModel {
         }
     }
 
+    /// Longitudinal slip of the rear wheels on a road with this sine of the slope: see [`DynamicParams::rear_wheel_slip`]. Wheels of
+    /// the kinematic model do not slip.
+    #[must_use]
+    pub fn rear_wheel_slip(&self, state: &ModelState, slope_sin: f64) -> f64 {
+        match self {
+            Self::Kinematic(_) => 0.0,
+            Self::Dynamic(params) => params.rear_wheel_slip(state, slope_sin),
+        }
+    }
+
     /// Roll and pitch on the springs, each with its rate, after a sub-step with this acceleration along the heading and to the left.
     #[must_use]
     pub fn lean_after(&self, state: &ModelState, [along_mps2, left_mps2]: [f64; 2]) -> [[f64; 2]; 2] {
@@ -76,6 +86,8 @@ pub struct SizedModel {
     pub model: MotionModel,
     /// Its size.
     pub dimensions: VehicleDimensions,
+    /// Steering-wheel angle by road-wheel angle.
+    pub steering_ratio: f64,
 }
 
 /// Key of a model: parameter set, model, and bits of length, width, height and the limits of SUMO's type.
@@ -186,7 +198,11 @@ impl ModelCatalogue {
         } else {
             MotionModel::Kinematic(KinematicParams::new(set, limits, dimensions.wheelbase_m))
         };
-        SizedModel { model, dimensions }
+        SizedModel {
+            model,
+            dimensions,
+            steering_ratio: set.steering_ratio,
+        }
     }
 
     fn model_of(&self, class: &str, kind: u32, set: usize) -> VehicleModel {

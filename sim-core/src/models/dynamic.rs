@@ -244,6 +244,22 @@ impl DynamicParams {
         [front, pick(driving, rear, handed_over)]
     }
 
+    /// Longitudinal slip of the rear wheels, `(wheel speed − speed) / speed`, on a road with this sine of the slope: that at which the
+    /// tyre gives the axle's force, `X = D sin(atan(C N κ / D))` with `D = μ N`. The longitudinal stiffness is the cornering stiffness:
+    /// 22.3 and 21.9 by load for the tyre of commonroad-vehicle-models. The resistance of cornering is left out.
+    #[must_use]
+    pub fn rear_wheel_slip(&self, state: &ModelState, slope_sin: f64) -> f64 {
+        if state.speed_mps <= 0.0 {
+            return 0.0;
+        }
+        let resistance =
+            self.drag_by_mass_per_m * state.speed_mps * state.speed_mps + self.rolling_mps2 + GRAVITY_MPS2 * slope_sin;
+        let loads = self.loads_mps2(state.accel_mps2);
+        let [_, rear] = self.axle_forces(state.accel_mps2 + resistance, loads);
+        let used = rear / (self.friction * loads[1]);
+        rear / (self.stiffness_per_rad[1] * loads[1] * (1.0 - used * used).sqrt())
+    }
+
     /// The state after `dt_s` on a road with this sine of the slope (positive uphill), and the mean motion over it.
     #[must_use]
     #[inline(always)]
