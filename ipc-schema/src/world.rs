@@ -83,7 +83,7 @@ pub struct VehicleState {
     /// Steering-wheel angle by road-wheel angle of its parameter set; 0 for persons.
     pub steering_ratio: f32,
     /// Longitudinal slip of the rear wheels, `(wheel speed − speed) / speed`: positive when they drive, negative when they brake; 0
-    /// without tyres, and for road users that carry no sensors.
+    /// without `speed_steering.wheel_slip`, without tyres, and for road users that carry no sensors.
     pub rear_wheel_slip: f32,
 }
 

@@ -78,6 +78,7 @@ fn a_tick_allocates_nothing() {
         sub_steps: 10,
         ticks_per_step: 3,
         hero_driver: config::HeroDriver::Actions,
+        wheel_slip: false,
     };
     let mut mirror = Mirror::new(settings).unwrap();
     let metas: Vec<VehicleMeta> = (0..VEHICLES).map(meta).collect();

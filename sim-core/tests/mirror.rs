@@ -195,7 +195,12 @@ fn moved(class: &str, kind: Kind) -> Vec<VehicleState> {
         cav_model: config::SingleTrackModel::Dynamic,
         ..settings.vehicle
     };
-    let mut mirror = Mirror::new(MirrorSettings { vehicle, ..settings }).unwrap();
+    let settings = MirrorSettings {
+        vehicle,
+        wheel_slip: true,
+        ..settings
+    };
+    let mut mirror = Mirror::new(settings).unwrap();
     let mut announced = meta(0, kind);
     announced.vehicle_class = Default::default();
     announced.vehicle_class[..class.len()].copy_from_slice(class.as_bytes());

@@ -332,7 +332,7 @@ impl RoadUser {
         let road = batch.road(member);
         write_moved(state, road, path.road(start_s).0, rows, out);
         // Only their own sensors read it.
-        if out.kind != Kind::Other as u32 {
+        if settings.wheel_slip && out.kind != Kind::Other as u32 {
             out.rear_wheel_slip = batch.params(member).rear_wheel_slip(state, road[2]) as f32;
         }
         out.reference_offset_m = path.offset_m(end_s, settings.step_s()) as f32 + self.deviation_m;
@@ -440,7 +440,9 @@ impl RoadUser {
                     let road = [&self.before, &self.now];
                     let models = (&built.model, body);
                     hero.advance(models, road, front_m, settings.sub_step_s(), out, rows);
-                    out.rear_wheel_slip = hero.rear_wheel_slip(&built.model, self.now.pitch_rad.into()) as f32;
+                    if settings.wheel_slip {
+                        out.rear_wheel_slip = hero.rear_wheel_slip(&built.model, self.now.pitch_rad.into()) as f32;
+                    }
                 }
             }
             Mover::Vehicle { state, path } if !set => {

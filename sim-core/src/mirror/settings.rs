@@ -23,6 +23,8 @@ pub struct MirrorSettings {
     pub ticks_per_step: u32,
     /// What moves the heroes.
     pub hero_driver: config::HeroDriver,
+    /// An odometer counts the turns of wheels that slip: the world says by how much.
+    pub wheel_slip: bool,
 }
 
 impl MirrorSettings {
@@ -62,6 +64,7 @@ impl MirrorSettings {
             sub_steps: run.config.run.sub_steps,
             ticks_per_step: u32::try_from(run.ticks_per_frame()).unwrap_or(u32::MAX),
             hero_driver: run.config.task.driver,
+            wheel_slip: run.config.speed_steering.wheel_slip,
         }
     }
 
