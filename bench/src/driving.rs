@@ -240,9 +240,9 @@ fn find_faults(trips: &mut [Trip], lines: &Path) -> Result<(), Exit> {
         Result::from_iter(contacts).map_err(|error| Exit::run(format!("{}: {error}", lines.display()), ""))?;
     for trip in trips.iter_mut().filter(|trip| trip.end == "collision") {
         let of_episode = contacts.iter().filter(|contact| contact.episode == trip.episode);
-        let faults = of_episode.filter_map(|contact| contact.is_fault_of(&trip.hero));
+        let mut faults = of_episode.filter_map(|contact| contact.is_fault_of(&trip.hero));
         // Without a line the hero counts as at fault: its contact was with what no line has.
-        trip.is_at_fault = faults.last().unwrap_or(true);
+        trip.is_at_fault = faults.next_back().unwrap_or(true);
     }
     Ok(())
 }
